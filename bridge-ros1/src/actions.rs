@@ -11,31 +11,32 @@ use std::sync::{Arc, PoisonError};
 use std::time::Duration;
 
 use bridge_node::actions::{
-    ActionClient, ActionGraph, ActionServer, CancelAnswer, CancelRequest, CancelWhat, GoalEvent,
-    GoalId, NewGoal, SentGoal, ServedGoal, ServerEvent, Waits,
+    ActionGraph, GraphActionClient, GraphActionServer, GraphCancelRequest, GraphCancelResponse,
+    GraphCancelSelection, GraphGoalEvent, GraphGoalId, GraphNewGoal, GraphServerEvent, SentGoal,
+    ServedGoal, Waits,
 };
-use bridge_node::{CallFault, GraphError, Ran};
+use bridge_node::{CallFault, GraphError, MayHaveRun};
 use bytes::Bytes;
 use md5::{Digest, Md5};
 use messages::{
-    ActionCalls, ActionType, DefinitionError, MessageType, NoFields, Plan, Selection, TextKind,
-    TypeName, Wire,
+    ActionCalls, ActionType, DefinitionError, MessagePlan, MessageType, NoFields, Selection,
+    TextKind, TypeName, Wire,
 };
 use tcpros::TopicType;
 use tcpros::actionlib::{
-    ActionClientOptions, ActionServerOptions, CancelSent, CommState, GoalHandle, GoalResult,
-    LostReason, ServerGoal, Status,
+    ActionlibClientOptions, ActionlibGoal, ActionlibServerGoal, ActionlibServerOptions,
+    ActionlibStatus, CancelSent, CommState, GoalLoss, GoalResult,
 };
 use tokio::sync::Mutex;
 use tokio::time::{Instant, timeout_at};
 use tracing::warn;
 
-use crate::definitions::Definitions;
-use crate::ends::{self, Server};
+use crate::definitions::Ros1Definitions;
+use crate::ends::{self, SharedActionServer};
 use crate::services::Ros1Graph;
 
 impl ActionGraph for Ros1Graph<'_> {
-    type Sender = Sender;
+    type Sender = GoalSender;
     type Taker = Taker;
 
     fn action_calls(&mut self, name: &TypeName) -> Result<Arc<ActionCalls>, GraphError> {
@@ -48,22 +49,22 @@ impl ActionGraph for Ros1Graph<'_> {
         action: &str,
         type_name: &TypeName,
         waits: Waits,
-    ) -> Result<Sender, GraphError> {
+    ) -> Result<GoalSender, GraphError> {
         let found = self.definitions.action(type_name);
         let action_type = found.map_err(|error| unknown(self.definitions, type_name, &error))?;
-        let options = ActionClientOptions {
+        let options = ActionlibClientOptions {
             acknowledge_timeout: waits.answer,
             silence_timeout: waits.silence,
             reconnect_timeout: waits.silence.min(RECONNECT),
-            ..ActionClientOptions::default()
+            ..ActionlibClientOptions::default()
         };
         let md5 = action_type.action().md5();
         let client = ends::shared(&mut self.ends.clients, (action, md5), || {
             let types = types(&action_type);
-            tcpros::actionlib::ActionClient::new(self.node, action, types, options)
+            tcpros::actionlib::ActionlibClient::new(self.node, action, types, options)
         })?;
         let unsent = Unsent::default();
-        Ok(Sender {
+        Ok(GoalSender {
             client,
             waits,
             unsent,
@@ -76,9 +77,10 @@ impl ActionGraph for Ros1Graph<'_> {
         let empty_result = empty(action_type.result())?;
         let md5 = action_type.action().md5();
         let server = ends::shared(&mut self.ends.servers, (action, md5), || {
-            let options = ActionServerOptions::new(empty_result.clone());
+            let options = ActionlibServerOptions::new(empty_result.clone());
             let types = types(&action_type);
-            tcpros::actionlib::ActionServer::new(self.node, action, types, options).map(Mutex::new)
+            tcpros::actionlib::ActionlibServer::new(self.node, action, types, options)
+                .map(Mutex::new)
         })?;
         Ok(Taker {
             server,
@@ -87,7 +89,11 @@ impl ActionGraph for Ros1Graph<'_> {
     }
 }
 
-fn unknown(definitions: &mut Definitions, name: &TypeName, error: &DefinitionError) -> GraphError {
+fn unknown(
+    definitions: &mut Ros1Definitions,
+    name: &TypeName,
+    error: &DefinitionError,
+) -> GraphError {
     let wanted = format!(
         "action connections do not carry the definition of the goal: a folder below ROS_PACKAGE_PATH must \
          contain {}/action/{}.action",
@@ -98,13 +104,13 @@ fn unknown(definitions: &mut Definitions, name: &TypeName, error: &DefinitionErr
 }
 
 /// Returns the types of the topics of an action.
-fn types(action: &ActionType) -> tcpros::actionlib::ActionType {
+fn types(action: &ActionType) -> tcpros::actionlib::ActionlibTypes {
     let of = |message_type: &MessageType| TopicType {
         name: message_type.name().to_string(),
         md5sum: message_type.md5().to_owned(),
         definition: message_type.definition().to_owned(),
     };
-    tcpros::actionlib::ActionType {
+    tcpros::actionlib::ActionlibTypes {
         goal: of(action.action_goal()),
         result: of(action.action_result()),
         feedback: of(action.action_feedback()),
@@ -117,14 +123,14 @@ fn empty(message_type: &Arc<MessageType>) -> Result<Bytes, GraphError> {
         fields: Vec::new(),
         rest: BTreeMap::new(),
     };
-    let plan = Plan::compile(message_type, &nothing, Wire::Ros1)?;
+    let plan = MessagePlan::compile(message_type, &nothing, Wire::Ros1)?;
     let mut bytes = Vec::new();
     plan.write(&mut NoFields, &mut bytes)?;
     Ok(bytes.into())
 }
 
 /// Returns the text of a goal id of the space in actionlib.
-fn spelled(id: GoalId) -> String {
+fn spelled(id: GraphGoalId) -> String {
     use std::fmt::Write as _;
     id.iter().fold(String::with_capacity(32), |mut text, byte| {
         // Writing to a String does not fail.
@@ -134,7 +140,7 @@ fn spelled(id: GoalId) -> String {
 }
 
 /// Returns the 16 bytes of a goal id of the graph.
-fn read(id: &str) -> GoalId {
+fn read(id: &str) -> GraphGoalId {
     let is_ours = id.len() == 32
         && id
             .bytes()
@@ -147,8 +153,8 @@ fn read(id: &str) -> GoalId {
 
 /// Sends goals to an action server.
 #[derive(Debug)]
-pub(crate) struct Sender {
-    client: Arc<tcpros::actionlib::ActionClient>,
+pub(crate) struct GoalSender {
+    client: Arc<tcpros::actionlib::ActionlibClient>,
     waits: Waits,
     unsent: Unsent,
 }
@@ -156,15 +162,15 @@ pub(crate) struct Sender {
 /// The goals that wait for the connection of their server, and whether each was withdrawn in the
 /// meantime.
 #[derive(Debug, Clone, Default)]
-struct Unsent(Arc<std::sync::Mutex<BTreeMap<GoalId, bool>>>);
+struct Unsent(Arc<std::sync::Mutex<BTreeMap<GraphGoalId, bool>>>);
 
 impl Unsent {
-    fn lock(&self) -> std::sync::MutexGuard<'_, BTreeMap<GoalId, bool>> {
+    fn lock(&self) -> std::sync::MutexGuard<'_, BTreeMap<GraphGoalId, bool>> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// Withdraws a goal. Returns false for a goal that is not waiting.
-    fn withdraw(&self, id: GoalId) -> bool {
+    fn withdraw(&self, id: GraphGoalId) -> bool {
         let mut waiting = self.lock();
         waiting.get_mut(&id).is_some_and(|withdrawn| {
             *withdrawn = true;
@@ -173,17 +179,22 @@ impl Unsent {
     }
 
     /// Ends the wait of a goal. Returns true if the goal was withdrawn in the meantime.
-    fn take(&self, id: GoalId) -> bool {
+    fn take(&self, id: GraphGoalId) -> bool {
         self.lock().remove(&id).unwrap_or_default()
     }
 }
 
-impl ActionClient for Sender {
-    type Goal = Sent;
+impl GraphActionClient for GoalSender {
+    type Goal = SentActionlibGoal;
 
-    fn send_goal(&self, id: GoalId, body: &[u8], start_by: std::time::Instant) -> Sent {
+    fn send_goal(
+        &self,
+        id: GraphGoalId,
+        body: &[u8],
+        start_by: std::time::Instant,
+    ) -> SentActionlibGoal {
         self.unsent.lock().insert(id, false);
-        let mut goal = Sent {
+        let mut goal = SentActionlibGoal {
             client: Arc::clone(&self.client),
             id,
             unsent: self.unsent.clone(),
@@ -203,17 +214,17 @@ impl ActionClient for Sender {
         goal
     }
 
-    async fn cancel(&self, what: CancelWhat) -> Result<CancelAnswer, CallFault> {
+    async fn cancel(&self, what: GraphCancelSelection) -> Result<GraphCancelResponse, CallFault> {
         let unheard = || CallFault {
             text: format!(
                 "no node subscribes to requests to cancel goals of {}",
                 self.client.name()
             ),
             may_pass: true,
-            ran: Ran::No,
+            ran: MayHaveRun::No,
         };
         let (code, goals) = match what {
-            CancelWhat::All => {
+            GraphCancelSelection::All => {
                 self.unsent
                     .lock()
                     .values_mut()
@@ -224,7 +235,7 @@ impl ActionClient for Sender {
                 }
                 (0, open.iter().map(|id| read(id)).collect())
             }
-            CancelWhat::Goal(id) => match self.client.cancel_goal(&spelled(id)) {
+            GraphCancelSelection::Goal(id) => match self.client.cancel_goal(&spelled(id)) {
                 CancelSent::Asked => (0, vec![id]),
                 CancelSent::NotFollowed if self.unsent.withdraw(id) => (0, vec![id]),
                 CancelSent::NotFollowed => (2, Vec::new()),
@@ -232,15 +243,15 @@ impl ActionClient for Sender {
                 CancelSent::NoServer => return Err(unheard()),
             },
         };
-        Ok(CancelAnswer { code, goals })
+        Ok(GraphCancelResponse { code, goals })
     }
 }
 
 /// A goal that is sent to a server, or waits for it.
 #[derive(Debug)]
-pub(crate) struct Sent {
-    client: Arc<tcpros::actionlib::ActionClient>,
-    id: GoalId,
+pub(crate) struct SentActionlibGoal {
+    client: Arc<tcpros::actionlib::ActionlibClient>,
+    id: GraphGoalId,
     unsent: Unsent,
     /// How long the server may leave the goal pending.
     patience: Duration,
@@ -248,7 +259,7 @@ pub(crate) struct Sent {
     accepted: bool,
     /// The time at which a goal that is pending at its server counts as accepted.
     undecided: Option<Instant>,
-    events: VecDeque<GoalEvent>,
+    events: VecDeque<GraphGoalEvent>,
 }
 
 #[derive(Debug)]
@@ -260,12 +271,12 @@ enum Stage {
         /// The time after which the goal is not sent.
         start_by: std::time::Instant,
     },
-    Sent(GoalHandle),
+    Sent(ActionlibGoal),
     Ended,
 }
 
-impl SentGoal for Sent {
-    async fn recv(&mut self) -> Option<GoalEvent> {
+impl SentGoal for SentActionlibGoal {
+    async fn recv(&mut self) -> Option<GraphGoalEvent> {
         loop {
             if let Some(event) = self.events.pop_front() {
                 return Some(event);
@@ -275,7 +286,7 @@ impl SentGoal for Sent {
                     let left = until.saturating_duration_since(after(Duration::ZERO));
                     match self.client.wait_for_server(left).await {
                         Ok(_) => self.send(),
-                        Err(error) => self.lose(error.to_string(), Ran::No),
+                        Err(error) => self.lose(error.to_string(), MayHaveRun::No),
                     }
                 }
                 Stage::Sent(handle) => {
@@ -296,13 +307,13 @@ impl SentGoal for Sent {
     }
 }
 
-impl Drop for Sent {
+impl Drop for SentActionlibGoal {
     fn drop(&mut self) {
         self.unsent.take(self.id);
     }
 }
 
-impl Sent {
+impl SentActionlibGoal {
     fn send(&mut self) {
         let stage = std::mem::replace(&mut self.stage, Stage::Ended);
         let Stage::Waiting { body, start_by, .. } = stage else {
@@ -311,44 +322,45 @@ impl Sent {
         if self.unsent.take(self.id) {
             return self.lose(
                 "the goal was withdrawn before it was sent".to_owned(),
-                Ran::No,
+                MayHaveRun::No,
             );
         }
         if bridge_node::now().monotonic > start_by {
             return self.lose(
                 "the goal was not sent: the time until which it may start has passed".to_owned(),
-                Ran::No,
+                MayHaveRun::No,
             );
         }
         match self.client.send_goal_as(spelled(self.id), &body) {
             Ok(handle) => self.stage = Stage::Sent(handle),
             Err(error) => self
                 .events
-                .push_back(GoalEvent::Rejected(error.to_string())),
+                .push_back(GraphGoalEvent::Rejected(error.to_string())),
         }
     }
 
-    fn lose(&mut self, text: String, ran: Ran) {
+    fn lose(&mut self, text: String, ran: MayHaveRun) {
         self.stage = Stage::Ended;
-        self.events.push_back(GoalEvent::Lost { text, ran });
+        self.events.push_back(GraphGoalEvent::Lost { text, ran });
     }
 
     fn accept(&mut self) {
         if !self.accepted {
             self.accepted = true;
             let now = bridge_node::now().utc;
-            self.events.push_back(GoalEvent::Accepted(now));
+            self.events.push_back(GraphGoalEvent::Accepted(now));
         }
     }
 
-    fn heard(&mut self, event: tcpros::actionlib::GoalEvent) {
-        use tcpros::actionlib::GoalEvent as Heard;
+    fn heard(&mut self, event: tcpros::actionlib::ActionlibGoalEvent) {
+        use tcpros::actionlib::ActionlibGoalEvent as Heard;
         match event {
             Heard::State(state) => self.went(state),
             Heard::Feedback(feedback) => {
                 // Feedback has a connection of its own and may arrive before the status.
                 self.accept();
-                self.events.push_back(GoalEvent::Feedback(feedback.body));
+                self.events
+                    .push_back(GraphGoalEvent::Feedback(feedback.body));
             }
             Heard::FeedbackDropped(count) => {
                 warn!(
@@ -359,8 +371,12 @@ impl Sent {
             }
             Heard::Done(result) => self.done(result),
             Heard::Lost(reason) => {
-                let unsent = matches!(reason, LostReason::NoServer { .. });
-                let ran = if unsent { Ran::No } else { Ran::Perhaps };
+                let unsent = matches!(reason, GoalLoss::NoServer { .. });
+                let ran = if unsent {
+                    MayHaveRun::No
+                } else {
+                    MayHaveRun::Perhaps
+                };
                 self.lose(reason.to_string(), ran);
             }
         }
@@ -373,14 +389,14 @@ impl Sent {
             CommState::Pending => self.undecided = Some(after(self.patience)),
             CommState::Active => {
                 self.accept();
-                self.events.push_back(GoalEvent::Status(EXECUTING));
+                self.events.push_back(GraphGoalEvent::Status(EXECUTING));
             }
             CommState::Preempting => {
                 self.accept();
-                self.events.push_back(GoalEvent::Status(CANCELING));
+                self.events.push_back(GraphGoalEvent::Status(CANCELING));
             }
             CommState::Recalling if self.accepted => {
-                self.events.push_back(GoalEvent::Status(CANCELING));
+                self.events.push_back(GraphGoalEvent::Status(CANCELING));
             }
             CommState::WaitingForGoalAck
             | CommState::WaitingForCancelAck
@@ -397,36 +413,36 @@ impl Sent {
             text => text.to_owned(),
         };
         let status = match ended.status {
-            Status::Succeeded => SUCCEEDED,
-            Status::Preempted => CANCELED,
-            Status::Recalled if self.accepted => CANCELED,
-            Status::Aborted => ABORTED,
-            Status::Rejected if self.accepted => ABORTED,
-            Status::Recalled => {
+            ActionlibStatus::Succeeded => SUCCEEDED,
+            ActionlibStatus::Preempted => CANCELED,
+            ActionlibStatus::Recalled if self.accepted => CANCELED,
+            ActionlibStatus::Aborted => ABORTED,
+            ActionlibStatus::Rejected if self.accepted => ABORTED,
+            ActionlibStatus::Recalled => {
                 let why = said("the goal was cancelled before its server started it");
-                self.events.push_back(GoalEvent::Rejected(why));
+                self.events.push_back(GraphGoalEvent::Rejected(why));
                 return;
             }
-            Status::Rejected => {
+            ActionlibStatus::Rejected => {
                 let why = said("the action server rejected the goal");
-                self.events.push_back(GoalEvent::Rejected(why));
+                self.events.push_back(GraphGoalEvent::Rejected(why));
                 return;
             }
-            Status::Pending
-            | Status::Active
-            | Status::Preempting
-            | Status::Recalling
-            | Status::Lost => {
+            ActionlibStatus::Pending
+            | ActionlibStatus::Active
+            | ActionlibStatus::Preempting
+            | ActionlibStatus::Recalling
+            | ActionlibStatus::Lost => {
                 let text = format!(
                     "the server of {} sent a result for a goal that has not ended",
                     self.client.name()
                 );
-                self.lose(text, Ran::Perhaps);
+                self.lose(text, MayHaveRun::Perhaps);
                 return;
             }
         };
         self.accept();
-        self.events.push_back(GoalEvent::Ended {
+        self.events.push_back(GraphGoalEvent::Ended {
             status,
             message: ended.text,
             result: ended.body,
@@ -442,38 +458,42 @@ fn after(wait: Duration) -> Instant {
 /// An action server for an action of another space.
 #[derive(Debug)]
 pub(crate) struct Taker {
-    server: Arc<Server>,
+    server: Arc<SharedActionServer>,
     empty_result: Bytes,
 }
 
-impl ActionServer for Taker {
-    type New = New;
-    type Cancel = Cancel;
+impl GraphActionServer for Taker {
+    type New = NewGraphGoal;
+    type Cancel = GoalCancel;
 
-    async fn recv(&mut self) -> ServerEvent<New, Cancel> {
+    async fn recv(&mut self) -> GraphServerEvent<NewGraphGoal, GoalCancel> {
         let event = self.server.lock().await.recv().await;
         match event {
-            tcpros::actionlib::ServerEvent::Goal(goal) => ServerEvent::Goal(New {
-                goal: Some(goal),
-                empty_result: self.empty_result.clone(),
-            }),
-            tcpros::actionlib::ServerEvent::Cancel(id) => ServerEvent::Cancel(Cancel(read(&id.id))),
+            tcpros::actionlib::ActionlibServerEvent::Goal(goal) => {
+                GraphServerEvent::Goal(NewGraphGoal {
+                    goal: Some(goal),
+                    empty_result: self.empty_result.clone(),
+                })
+            }
+            tcpros::actionlib::ActionlibServerEvent::Cancel(id) => {
+                GraphServerEvent::Cancel(GoalCancel(read(&id.id)))
+            }
         }
     }
 }
 
 /// A goal of the graph that is not accepted or rejected yet.
 #[derive(Debug)]
-pub(crate) struct New {
+pub(crate) struct NewGraphGoal {
     /// `None` once the goal is accepted or rejected.
-    goal: Option<ServerGoal>,
+    goal: Option<ActionlibServerGoal>,
     empty_result: Bytes,
 }
 
-impl NewGoal for New {
-    type Goal = Served;
+impl GraphNewGoal for NewGraphGoal {
+    type Goal = ServedActionlibGoal;
 
-    fn id(&self) -> GoalId {
+    fn id(&self) -> GraphGoalId {
         let goal = self.goal.as_ref();
         goal.map(|goal| read(&goal.goal_id().id))
             .unwrap_or_default()
@@ -481,13 +501,15 @@ impl NewGoal for New {
 
     fn body(&self) -> &Bytes {
         static NOTHING: Bytes = Bytes::new();
-        self.goal.as_ref().map_or(&NOTHING, ServerGoal::body)
+        self.goal
+            .as_ref()
+            .map_or(&NOTHING, ActionlibServerGoal::body)
     }
 
-    async fn accept(mut self) -> Result<Served, GraphError> {
+    async fn accept(mut self) -> Result<ServedActionlibGoal, GraphError> {
         let goal = self.goal.take().ok_or(GraphError::GoalAnswered)?;
         goal.accept("").map_err(GraphError::library)?;
-        Ok(Served {
+        Ok(ServedActionlibGoal {
             goal,
             empty_result: std::mem::take(&mut self.empty_result),
         })
@@ -500,7 +522,7 @@ impl NewGoal for New {
     }
 }
 
-impl Drop for New {
+impl Drop for NewGraphGoal {
     fn drop(&mut self) {
         if let Some(goal) = self.goal.take() {
             reject(&goal, "the goal was neither accepted nor rejected in time");
@@ -508,7 +530,7 @@ impl Drop for New {
     }
 }
 
-fn reject(goal: &ServerGoal, why: &str) {
+fn reject(goal: &ActionlibServerGoal, why: &str) {
     // A goal that was recalled in the meantime has already ended.
     if let Err(error) = goal.reject(why) {
         tracing::debug!("cannot reject a goal: {error}");
@@ -518,10 +540,10 @@ fn reject(goal: &ServerGoal, why: &str) {
 /// A request of a client to cancel its goal. actionlib has no response to this request; the client
 /// sees how the goal ends.
 #[derive(Debug)]
-pub(crate) struct Cancel(GoalId);
+pub(crate) struct GoalCancel(GraphGoalId);
 
-impl CancelRequest for Cancel {
-    fn id(&self) -> GoalId {
+impl GraphCancelRequest for GoalCancel {
+    fn id(&self) -> GraphGoalId {
         self.0
     }
 
@@ -534,12 +556,12 @@ impl CancelRequest for Cancel {
 
 /// A goal of the graph that another space executes.
 #[derive(Debug)]
-pub(crate) struct Served {
-    goal: ServerGoal,
+pub(crate) struct ServedActionlibGoal {
+    goal: ActionlibServerGoal,
     empty_result: Bytes,
 }
 
-impl ServedGoal for Served {
+impl ServedGoal for ServedActionlibGoal {
     // The goal is active from its acceptance.
     fn execute(&self) {}
 

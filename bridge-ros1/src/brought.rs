@@ -8,12 +8,12 @@ use messages::{MessageType, PeerDefinitions, TypeName};
 /// The types received from publishers, the oldest first.
 #[derive(Debug, Default)]
 pub(crate) struct Brought {
-    entries: Vec<Entry>,
+    entries: Vec<TypeEntry>,
 }
 
 /// A type, with its definitions in the registry.
 #[derive(Debug)]
-pub(crate) struct Entry {
+pub(crate) struct TypeEntry {
     pub(crate) name: TypeName,
     pub(crate) definitions: PeerDefinitions,
     md5: String,
@@ -24,20 +24,25 @@ pub(crate) struct Entry {
 
 /// The result of a request for room for a type.
 #[derive(Debug)]
-pub(crate) enum Room {
+pub(crate) enum TypeRoom {
     /// The type is already stored.
     Known(Arc<MessageType>),
     /// The type is new, and these unused entries are to be removed from the registry.
-    After(Vec<Entry>),
+    After(Vec<TypeEntry>),
     /// All stored types are in use.
     None,
 }
 
 impl Brought {
     /// Makes room for a type with `names` definitions. With `must`, there is always room.
-    pub(crate) fn room_for(&mut self, found: &Arc<MessageType>, names: usize, must: bool) -> Room {
+    pub(crate) fn room_for(
+        &mut self,
+        found: &Arc<MessageType>,
+        names: usize,
+        must: bool,
+    ) -> TypeRoom {
         let mut entries = self.entries.iter_mut();
-        let same = |entry: &&mut Entry| entry.name == *found.name() && entry.md5 == found.md5();
+        let same = |entry: &&mut TypeEntry| entry.name == *found.name() && entry.md5 == found.md5();
         if let Some(known) = entries.find(same) {
             // Types with the same MD5 sum have the same fields and constants; only their comments
             // may differ.
@@ -45,7 +50,7 @@ impl Brought {
                 known.message_type = Arc::downgrade(found);
                 Arc::clone(found)
             });
-            return Room::Known(message_type);
+            return TypeRoom::Known(message_type);
         }
         let mut bytes = weight(found);
         let mut names = names;
@@ -65,16 +70,16 @@ impl Brought {
             }
         }
         if !must && (bytes > MAX_BYTES || names > MAX_NAMES) {
-            return Room::None;
+            return TypeRoom::None;
         }
         // Removal from the back keeps the other positions valid.
         let gone = unused.into_iter().rev().map(|at| self.entries.remove(at));
-        Room::After(gone.collect())
+        TypeRoom::After(gone.collect())
     }
 
     /// Stores a type after room was made for it.
     pub(crate) fn take(&mut self, found: &Arc<MessageType>, definitions: PeerDefinitions) {
-        self.entries.push(Entry {
+        self.entries.push(TypeEntry {
             name: found.name().clone(),
             md5: found.md5().to_owned(),
             message_type: Arc::downgrade(found),

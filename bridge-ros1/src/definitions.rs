@@ -4,29 +4,29 @@
 use std::path::PathBuf;
 use std::sync::Arc;
 
-use bridge_node::{Environment, TypePaths};
+use bridge_node::{RosEnvironment, TypePaths};
 use messages::{
-    ActionCalls, ActionType, DefinitionError, Dialect, MessageType, NameError, PeerDefinitions,
-    ServiceType, TextKind, TypeName,
+    ActionCalls, ActionType, DefinitionError, Dialect, MessageType, PeerDefinitions, ServiceType,
+    TextKind, TypeName, TypeNameError,
 };
 use tcpros::ConnectionHeader;
 use uadp::BuiltinType;
 
-use crate::brought::{Brought, MAX_BYTES, Room};
+use crate::brought::{Brought, MAX_BYTES, TypeRoom};
 
 /// Finds message types by name. A found type is kept, except types of publishers that have
 /// disconnected.
 #[derive(Debug)]
-pub(crate) struct Definitions {
+pub(crate) struct Ros1Definitions {
     known: bridge_node::Definitions,
     brought: Brought,
 }
 
-impl Definitions {
+impl Ros1Definitions {
     /// Creates the definitions with the `type_paths` of the mapping, and the package folders in
     /// `ROS_PACKAGE_PATH`.
     pub(crate) fn new(types: Arc<TypePaths>, packages: Vec<PathBuf>) -> Self {
-        let environment = Environment {
+        let environment = RosEnvironment {
             ros1: packages,
             ros2: Vec::new(),
         };
@@ -48,7 +48,7 @@ impl Definitions {
         &mut self,
         header: &ConnectionHeader,
         mapped: bool,
-    ) -> Result<Arc<MessageType>, Unusable> {
+    ) -> Result<Arc<MessageType>, UnusableMessages> {
         let name: TypeName = header.type_name().unwrap_or_default().parse()?;
         let md5sum = header.md5sum().unwrap_or("*");
         let fits = |found: &MessageType| md5sum == "*" || found.md5() == md5sum;
@@ -75,7 +75,7 @@ impl Definitions {
                         .get(&name)
                         .is_ok_and(|known| fits(&known)) => {}
                 Ok((found, _)) => {
-                    return Err(Unusable::Checksum {
+                    return Err(UnusableMessages::Checksum {
                         name,
                         theirs: md5sum.to_owned(),
                         ours: found.md5().to_owned(),
@@ -89,7 +89,7 @@ impl Definitions {
             Ok(known)
         } else {
             let ours = known.md5().to_owned();
-            Err(Unusable::Checksum {
+            Err(UnusableMessages::Checksum {
                 name,
                 theirs: md5sum.to_owned(),
                 ours,
@@ -103,11 +103,11 @@ impl Definitions {
         found: Arc<MessageType>,
         definitions: PeerDefinitions,
         mapped: bool,
-    ) -> Result<Arc<MessageType>, Unusable> {
+    ) -> Result<Arc<MessageType>, UnusableMessages> {
         let gone = match self.brought.room_for(&found, definitions.len(), mapped) {
-            Room::Known(known) => return Ok(known),
-            Room::After(gone) => gone,
-            Room::None => return Err(Unusable::Full),
+            TypeRoom::Known(known) => return Ok(known),
+            TypeRoom::After(gone) => gone,
+            TypeRoom::None => return Err(UnusableMessages::Full),
         };
         for entry in &gone {
             self.known.registry_mut().forget(&entry.definitions);
@@ -176,9 +176,9 @@ impl Definitions {
 
 /// The reason why messages of a publisher cannot be read.
 #[derive(Debug, thiserror::Error)]
-pub(crate) enum Unusable {
+pub(crate) enum UnusableMessages {
     #[error(transparent)]
-    Name(#[from] NameError),
+    Name(#[from] TypeNameError),
     #[error(transparent)]
     Definition(#[from] DefinitionError),
     #[error(
@@ -213,7 +213,7 @@ mod tests {
 
     #[test]
     fn a_type_nobody_has_heard_of_is_learned_from_its_publisher() {
-        let mut definitions = Definitions::new(Arc::default(), vec![]);
+        let mut definitions = Ros1Definitions::new(Arc::default(), vec![]);
         let text = "robot_msgs/Joint[] joints\n\
             ================================================================================\n\
             MSG: robot_msgs/Joint\nstring name\nfloat64 angle\n";
@@ -229,7 +229,7 @@ mod tests {
 
     #[test]
     fn a_publisher_without_a_text_is_known_by_its_checksum() {
-        let mut definitions = Definitions::new(Arc::default(), vec![]);
+        let mut definitions = Ros1Definitions::new(Arc::default(), vec![]);
         let string = "992ce8a1687cec8c8bd883ec73ca41d1";
         let found = definitions
             .of_publisher(&header("std_msgs/String", string, ""), false)
@@ -237,16 +237,16 @@ mod tests {
         assert_eq!(found.md5(), string);
         let other =
             definitions.of_publisher(&header("std_msgs/String", &"0".repeat(32), ""), false);
-        assert!(matches!(other, Err(Unusable::Checksum { .. })));
+        assert!(matches!(other, Err(UnusableMessages::Checksum { .. })));
     }
 
     #[test]
     fn a_text_that_is_not_that_of_the_checksum_is_not_believed() {
-        let mut definitions = Definitions::new(Arc::default(), vec![]);
+        let mut definitions = Ros1Definitions::new(Arc::default(), vec![]);
         let lie = header("robot_msgs/Arm", &"0".repeat(32), "int32 a\n");
         assert!(matches!(
             definitions.of_publisher(&lie, false),
-            Err(Unusable::Checksum { .. })
+            Err(UnusableMessages::Checksum { .. })
         ));
         let bool = definitions.get(&"std_msgs/Bool".parse().unwrap()).unwrap();
         let wrong_text = header("std_msgs/Bool", bool.md5(), "int32 a\n");
@@ -261,7 +261,7 @@ mod tests {
 
     #[test]
     fn a_message_without_fields_has_a_type() {
-        let found = Definitions::new(Arc::default(), vec![])
+        let found = Ros1Definitions::new(Arc::default(), vec![])
             .of_publisher(&header("std_msgs/Empty", EMPTY, ""), false);
         assert_eq!(found.unwrap().leaves().len(), 0);
     }
@@ -285,7 +285,7 @@ mod tests {
 
     #[test]
     fn publishers_that_come_and_go_with_ever_new_types_leave_no_more_than_has_room() {
-        let mut definitions = Definitions::new(Arc::default(), vec![]);
+        let mut definitions = Ros1Definitions::new(Arc::default(), vec![]);
         let built_in = definitions.known.registry().names().count();
         for number in 0..20 {
             drop(definitions.of_publisher(&bulky(number), false).unwrap());
@@ -299,11 +299,11 @@ mod tests {
 
     #[test]
     fn types_in_use_stay_and_only_the_mapping_has_room_beside_them() {
-        let mut definitions = Definitions::new(Arc::default(), vec![]);
+        let mut definitions = Ros1Definitions::new(Arc::default(), vec![]);
         let first = definitions.of_publisher(&bulky(0), false).unwrap();
         let _second = definitions.of_publisher(&bulky(1), false).unwrap();
         let refused = definitions.of_publisher(&bulky(2), false);
-        assert!(matches!(refused, Err(Unusable::Full)));
+        assert!(matches!(refused, Err(UnusableMessages::Full)));
         assert!(definitions.of_publisher(&bulky(2), true).is_ok());
         // A publisher of the same type reconnects, or another publisher of the type connects.
         let again = definitions.of_publisher(&bulky(0), false).unwrap();
@@ -319,7 +319,7 @@ mod tests {
         let folder = root.join("src/repository/robot_msgs/msg");
         std::fs::create_dir_all(&folder).unwrap();
         std::fs::write(folder.join("Leg.msg"), "float64 knee\n").unwrap();
-        let found = Definitions::new(Arc::default(), vec![root.clone()])
+        let found = Ros1Definitions::new(Arc::default(), vec![root.clone()])
             .get(&"robot_msgs/Leg".parse().unwrap());
         std::fs::remove_dir_all(&root).unwrap();
         assert_eq!(found.unwrap().leaves()[0].path, "knee");

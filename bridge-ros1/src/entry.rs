@@ -7,8 +7,8 @@ use std::process::ExitCode;
 
 use bridge_core::Local;
 use bridge_node::{
-    Arguments, Carried, Context, Failure, FailureKind, Program, Rank, RedundancyArguments,
-    SharedProgram,
+    Arguments, Carried, Context, Failure, FailureKind, Program, RedundancyArguments,
+    RedundancyRank, SharedProgram,
 };
 use clap::{ArgMatches, Command, CommandFactory, FromArgMatches, Parser};
 use mappings::{Mapping, SpaceId};
@@ -18,7 +18,7 @@ use plant_keys::KeyArguments;
 use tcpros::{ArgumentError, NodeError, NodeOptions};
 use tracing::warn;
 
-use crate::{PortOptions, Ros1Port};
+use crate::{Ros1Port, Ros1PortOptions};
 
 /// Runs `bridge-ros1` from its command line to its end. `arguments` begin with the name of the
 /// program.
@@ -142,7 +142,7 @@ impl Program for BridgeRos1 {
         self.flags.redundancy.part()
     }
 
-    fn rank(&self) -> Option<Rank> {
+    fn rank(&self) -> Option<RedundancyRank> {
         self.flags.redundancy.rank
     }
 
@@ -166,7 +166,7 @@ impl Program for BridgeRos1 {
     }
 
     async fn start(&self, context: Context) -> Result<Ros1Port, Failure> {
-        let options = PortOptions {
+        let options = Ros1PortOptions {
             node: self
                 .node_options()
                 .map_err(|error| Failure::new(FailureKind::Usage, error.to_string()))?,

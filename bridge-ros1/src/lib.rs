@@ -15,4 +15,4 @@ mod sink;
 mod source;
 mod watcher;
 
-pub use port::{PortOptions, Ros1Port};
+pub use port::{Ros1Port, Ros1PortOptions};

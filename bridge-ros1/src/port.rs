@@ -1,9 +1,9 @@
 //! The port: connects the topics of a ROS 1 graph with the values of the space.
 //!
 //! A single task owns all state; [`Ros1Port::recv`](Port::recv) is its only wait. The port wires
-//! types that own their state: the subscribed topics ([`Sources`]), the published topics
-//! ([`Sinks`]), and services and actions ([`Ros1Requests`]). They share the node and its view of
-//! the graph ([`Ros1Side`]).
+//! types that own their state: the subscribed topics ([`SubscribedTopics`]), the published topics
+//! ([`AdvertisedTopics`]), and services and actions ([`Ros1Requests`]). They share the node and its
+//! view of the graph ([`Ros1Side`]).
 
 mod action_servers;
 mod awaited;
@@ -19,26 +19,26 @@ use std::sync::Arc;
 
 use bridge_node::policy::{Policy, TYPE_CHANGES, is_bad, type_changes};
 use bridge_node::{
-    Answered, AskId, AwaitedPeers, CallDescription, Delivery, Described, Execution, ExecutionId,
-    Handover, Port, PortEvent, TypePaths,
+    AskId, AwaitedPeers, CallDescription, CallResponse, Execution, ExecutionId, Handover,
+    LocalDelivery, Port, PortEvent, TopicMetaData, TypePaths,
 };
 use bytes::Bytes;
 use mappings::{Mapping, SpaceId, TopicId, Variable};
-use tcpros::{Graph, Node, NodeError, NodeOptions};
+use tcpros::{MasterGraph, Node, NodeError, NodeOptions};
 use tracing::info;
 use uadp::{BuiltinType, Timestamp};
 
-use self::awaited::Missing;
+use self::awaited::Ros1MissingPeers;
 use self::requests::Ros1Requests;
 use self::side::Ros1Side;
-use self::sinks::Sinks;
-use self::sources::Sources;
-use crate::definitions::Definitions;
-use crate::watcher::{Seen, Watcher};
+use self::sinks::AdvertisedTopics;
+use self::sources::SubscribedTopics;
+use crate::definitions::Ros1Definitions;
+use crate::watcher::{MasterWatcher, WatcherEvent};
 
 /// The options of a [`Ros1Port`].
 #[derive(Debug, Clone)]
-pub struct PortOptions {
+pub struct Ros1PortOptions {
     /// The options of the node, including the URI of the master.
     pub node: NodeOptions,
     /// The space of the values produced in the graph.
@@ -56,12 +56,12 @@ pub struct PortOptions {
 pub struct Ros1Port {
     side: Ros1Side,
     /// The subscribed topics.
-    sources: Sources,
+    sources: SubscribedTopics,
     /// The published topics.
-    sinks: Sinks,
+    sinks: AdvertisedTopics,
     /// Services and actions in both directions.
     requests: Ros1Requests,
-    watcher: Watcher,
+    watcher: MasterWatcher,
     /// The number of comparisons since the last search for topics in the graph.
     unsearched: u32,
     /// The address of this node as other nodes see it; `None` if it is a host name.
@@ -75,8 +75,8 @@ impl Ros1Port {
     ///
     /// # Errors
     /// [`NodeError`] if the node cannot be started or a name is invalid.
-    pub fn start(options: PortOptions) -> Result<Self, NodeError> {
-        let PortOptions {
+    pub fn start(options: Ros1PortOptions) -> Result<Self, NodeError> {
+        let Ros1PortOptions {
             node,
             own,
             mapping,
@@ -87,10 +87,10 @@ impl Ros1Port {
         let address = node.hostname.parse().ok();
         let node = Node::start(node)?;
         info!(node = node.name(), uri = node.uri(), master, space = %own, "started the ROS 1 node");
-        let mut definitions = Definitions::new(types, packages);
+        let mut definitions = Ros1Definitions::new(types, packages);
         let (requests, bound) = Ros1Requests::start(&node, &mut definitions, (own, &mapping));
         let mut port = Self {
-            watcher: Watcher::of(&node),
+            watcher: MasterWatcher::of(&node),
             side: Ros1Side {
                 node,
                 policy: Policy::new(own, mapping),
@@ -99,8 +99,8 @@ impl Ros1Port {
                 has_master: false,
                 events: bound.into(),
             },
-            sources: Sources::new(),
-            sinks: Sinks::default(),
+            sources: SubscribedTopics::new(),
+            sinks: AdvertisedTopics::default(),
             requests,
             unsearched: 0,
             address,
@@ -129,7 +129,7 @@ impl Ros1Port {
 
     /// Compares the graph with the open topics. `None` stands for an unavailable master; then the
     /// topics stay unchanged.
-    fn look(&mut self, graph: Option<Arc<Graph>>) {
+    fn look(&mut self, graph: Option<Arc<MasterGraph>>) {
         self.side.has_master = graph.is_some();
         if let Some(graph) = graph {
             // An unchanged graph is searched too, but less often: a subscription may be lost, and a
@@ -172,8 +172,8 @@ impl Port for Ros1Port {
                 biased;
                 () = self.sinks.wait() => self.sinks.flush(&mut self.side),
                 seen = self.watcher.recv() => match seen {
-                    Seen::Graph(graph) => self.look(graph),
-                    Seen::Ended(reason) => {
+                    WatcherEvent::Graph(graph) => self.look(graph),
+                    WatcherEvent::Ended(reason) => {
                         let name = self.side.node.name();
                         return PortEvent::Ended(format!("the ROS master or another node shut down the ROS 1 node \
                                                          {name}: {reason}"));
@@ -187,7 +187,7 @@ impl Port for Ros1Port {
         }
     }
 
-    fn publish(&mut self, sample: Delivery) -> Result<(), &'static str> {
+    fn publish(&mut self, sample: LocalDelivery) -> Result<(), &'static str> {
         if type_changes(&self.side.events, sample.topic) {
             return Err(TYPE_CHANGES);
         }
@@ -209,7 +209,7 @@ impl Port for Ros1Port {
         &mut self,
         topic: TopicId,
         shape: &[(BuiltinType, bool)],
-        described: Option<&Described>,
+        described: Option<&TopicMetaData>,
     ) {
         let policy = &self.side.policy;
         let for_service = |variable: &Variable| variable.service.is_some();
@@ -245,7 +245,7 @@ impl Port for Ros1Port {
         self.requests.gone(topic);
     }
 
-    fn answered(&mut self, ask: AskId, _: TopicId, answer: Answered<Bytes>) {
+    fn answered(&mut self, ask: AskId, _: TopicId, answer: CallResponse<Bytes>) {
         self.requests.answered(ask, answer);
     }
 
@@ -280,7 +280,7 @@ impl Port for Ros1Port {
     }
 
     fn add_awaited(&self, missing: &mut AwaitedPeers) {
-        let found = Missing {
+        let found = Ros1MissingPeers {
             side: &self.side,
             address: self.address,
             sources: &self.sources,

@@ -5,7 +5,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
 use bridge_node::{
-    Asker, CallFault, CallGraph, ExecutorGraph, GraphError, Ran, ServiceCall, ServiceGraph,
+    Asker, CallFault, CallGraph, ExecutorGraph, GraphError, MayHaveRun, ServiceCall, ServiceGraph,
 };
 use bytes::Bytes;
 use messages::{MessageType, ServiceType, TextKind, TypeName, Wire};
@@ -15,18 +15,18 @@ use tcpros::{
 use tokio::sync::Mutex;
 use uadp::BuiltinType;
 
-use crate::definitions::Definitions;
+use crate::definitions::Ros1Definitions;
 use crate::ends::Ends;
 
 /// A node with its message definitions and action clients and servers.
 pub(crate) struct Ros1Graph<'p> {
     pub(crate) node: &'p Node,
-    pub(crate) definitions: &'p mut Definitions,
+    pub(crate) definitions: &'p mut Ros1Definitions,
     pub(crate) ends: &'p mut Ends,
 }
 
 impl ServiceGraph for Ros1Graph<'_> {
-    type Client = Client;
+    type Client = ServiceCaller;
 
     const WIRE: Wire = Wire::Ros1;
 
@@ -58,7 +58,7 @@ impl ServiceGraph for Ros1Graph<'_> {
         service: &str,
         service_type: &ServiceType,
         timeout: Duration,
-    ) -> Result<Client, GraphError> {
+    ) -> Result<ServiceCaller, GraphError> {
         let options = ServiceClientOptions {
             md5sum: Some(service_type.md5().to_owned()),
             type_name: Some(service_type.name().to_string()),
@@ -67,7 +67,7 @@ impl ServiceGraph for Ros1Graph<'_> {
             ..ServiceClientOptions::default()
         };
         let client = self.node.service_client(service, options);
-        client.map(Client::from).map_err(GraphError::library)
+        client.map(ServiceCaller::from).map_err(GraphError::library)
     }
 }
 
@@ -82,7 +82,7 @@ impl CallGraph for Ros1Graph<'_> {
         service_type: &Arc<ServiceType>,
         asker: Asker,
     ) -> Result<ServiceServer, GraphError> {
-        let service_type = tcpros::ServiceType {
+        let service_type = tcpros::ServiceTypeSum {
             name: service_type.name().to_string(),
             md5sum: service_type.md5().to_owned(),
             request_type: service_type.request().name().to_string(),
@@ -101,14 +101,14 @@ impl CallGraph for Ros1Graph<'_> {
 }
 
 impl ExecutorGraph for Ros1Graph<'_> {
-    type Executor = Executor;
+    type Executor = ServiceExecutor;
 
     fn executor(
         &mut self,
         service: &str,
         service_type: &ServiceType,
         timeout: Duration,
-    ) -> Result<Executor, GraphError> {
+    ) -> Result<ServiceExecutor, GraphError> {
         let client = |persistent| {
             let options = ServiceClientOptions {
                 md5sum: Some(service_type.md5().to_owned()),
@@ -118,9 +118,9 @@ impl ExecutorGraph for Ros1Graph<'_> {
                 ..ServiceClientOptions::default()
             };
             let client = self.node.service_client(service, options);
-            client.map(Client::from).map_err(GraphError::library)
+            client.map(ServiceCaller::from).map_err(GraphError::library)
         };
-        Ok(Executor {
+        Ok(ServiceExecutor {
             kept: client(true)?,
             more: client(false)?,
             turn: Mutex::new(()),
@@ -131,13 +131,13 @@ impl ExecutorGraph for Ros1Graph<'_> {
 /// Calls a service over a persistent connection, and over further connections while it is in use,
 /// because a connection carries one call at a time.
 #[derive(Debug)]
-pub(crate) struct Executor {
-    kept: Client,
-    more: Client,
+pub(crate) struct ServiceExecutor {
+    kept: ServiceCaller,
+    more: ServiceCaller,
     turn: Mutex<()>,
 }
 
-impl ServiceCall for Executor {
+impl ServiceCall for ServiceExecutor {
     fn service(&self) -> &str {
         self.kept.service()
     }
@@ -152,13 +152,13 @@ impl ServiceCall for Executor {
 
 /// Calls a service.
 #[derive(Debug)]
-pub(crate) struct Client {
+pub(crate) struct ServiceCaller {
     client: ServiceClient,
     /// The requests that had been sent when the last call began.
     sent_before: AtomicU64,
 }
 
-impl From<ServiceClient> for Client {
+impl From<ServiceClient> for ServiceCaller {
     fn from(client: ServiceClient) -> Self {
         Self {
             client,
@@ -167,7 +167,7 @@ impl From<ServiceClient> for Client {
     }
 }
 
-impl ServiceCall for Client {
+impl ServiceCall for ServiceCaller {
     fn service(&self) -> &str {
         self.client.service()
     }
@@ -184,11 +184,11 @@ impl ServiceCall for Client {
             text: error.to_string(),
             may_pass: may_pass(&error),
             ran: if matches!(error, ServiceError::Failed { .. }) {
-                Ran::Yes
+                MayHaveRun::Yes
             } else if error.may_have_run() {
-                Ran::Perhaps
+                MayHaveRun::Perhaps
             } else {
-                Ran::No
+                MayHaveRun::No
             },
         })
     }

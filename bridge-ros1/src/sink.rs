@@ -8,16 +8,16 @@ use bridge_node::policy::{Choice, Destination};
 use bytes::{Bytes, BytesMut};
 use mappings::Lasting;
 use messages::{MessageType, TypeName};
-use tcpros::{Latched, Publisher, PublisherOptions, RosTime};
+use tcpros::{Latched, Publisher, PublisherOptions, Ros1Time};
 
 /// The destination of the values of a topic of another space.
 #[derive(Debug)]
-pub(crate) struct Sink {
+pub(crate) struct Ros1Sink {
     pub(crate) ros_topic: String,
     /// The choice of the message type.
     pub(crate) choice: Choice,
     /// The publisher of the topic, if it is open.
-    pub(crate) open: Option<Open>,
+    pub(crate) open: Option<OpenPublisher>,
     /// The time at which the writer in the space timed out.
     pub(crate) silent: Option<Instant>,
     lasting: Lasting,
@@ -25,7 +25,7 @@ pub(crate) struct Sink {
 
 /// A publisher and its type.
 #[derive(Debug)]
-pub(crate) struct Open {
+pub(crate) struct OpenPublisher {
     pub(crate) message_type: Arc<MessageType>,
     pub(crate) publisher: Publisher,
     /// Number of reported losses of slow subscribers.
@@ -36,19 +36,19 @@ pub(crate) struct Open {
     /// other than the stamp.
     pub(crate) stamps: bool,
     /// Events that wait for subscribers to connect.
-    pub(crate) opening: Option<Opening>,
+    pub(crate) opening: Option<TopicOpening>,
 }
 
 /// Events of a topic that was advertised a moment ago. The master knew subscribers of the topic by
 /// then, which have yet to connect.
 #[derive(Debug)]
-pub(crate) struct Opening {
+pub(crate) struct TopicOpening {
     subscribers: Vec<String>,
     until: Instant,
     waiting: VecDeque<(Bytes, Latched)>,
 }
 
-impl Opening {
+impl TopicOpening {
     /// Returns `None` where the topic has no subscriber but the node `own`.
     pub(crate) fn of(subscribers: Option<&Vec<String>>, own: &str, now: Instant) -> Option<Self> {
         let others = subscribers
@@ -88,7 +88,7 @@ impl Opening {
     }
 }
 
-impl Open {
+impl OpenPublisher {
     /// Publishes an event, or queues it while subscribers connect. Returns the number of events
     /// that had no subscriber.
     pub(crate) fn publish_once(&mut self, event: (Bytes, Latched), now: Instant) -> u64 {
@@ -128,7 +128,7 @@ impl Open {
     }
 
     /// Returns the message with the time in its header, if the header is not part of the value.
-    pub(crate) fn stamped(&self, message: Bytes, now: RosTime) -> Bytes {
+    pub(crate) fn stamped(&self, message: Bytes, now: Ros1Time) -> Bytes {
         if !self.stamps {
             return message;
         }
@@ -145,7 +145,7 @@ impl Open {
     }
 }
 
-impl Sink {
+impl Ros1Sink {
     pub(crate) fn new(destination: Destination) -> Self {
         let Destination {
             ros_topic,
@@ -207,7 +207,7 @@ const MOST_WAITING: usize = 512;
 
 #[cfg(test)]
 mod tests {
-    use bridge_node::policy::{Step, Word};
+    use bridge_node::policy::{PortStep, Word};
     use mappings::Overflow;
     use messages::Selection;
 
@@ -215,7 +215,7 @@ mod tests {
 
     #[test]
     fn a_subscriber_decides_before_the_standard_type() {
-        let mut sink = Sink::new(Destination {
+        let mut sink = Ros1Sink::new(Destination {
             ros_topic: "/ua_2_2_3".to_owned(),
             mapped: None,
             overflow: Overflow::KeepLatest,
@@ -225,7 +225,7 @@ mod tests {
             standard: Some("std_msgs/Float64".parse().unwrap()),
             ..Word::default()
         };
-        assert_eq!(sink.choice.hear(word, None), Step::Open);
+        assert_eq!(sink.choice.hear(word, None), PortStep::Open);
         assert_eq!(sink.candidates(None), ["std_msgs/Float64".parse().unwrap()]);
         let asked: [TypeName; 2] = [
             "std_msgs/Float32".parse().unwrap(),
@@ -238,7 +238,7 @@ mod tests {
 
     #[test]
     fn an_event_is_not_latched() {
-        let sink = Sink::new(Destination {
+        let sink = Ros1Sink::new(Destination {
             ros_topic: "/button".to_owned(),
             mapped: Some(("std_msgs/Bool".parse().unwrap(), Selection::Whole)),
             overflow: Overflow::DropOldest(8.try_into().unwrap()),
@@ -251,10 +251,10 @@ mod tests {
     fn events_wait_until_the_subscribers_that_the_master_knows_are_connected() {
         let now = bridge_node::now().monotonic;
         let nodes = |names: &[&str]| names.iter().map(|name| (*name).to_owned()).collect();
-        assert!(Opening::of(None, "/bridge", now).is_none());
-        assert!(Opening::of(Some(&nodes(&["/bridge"])), "/bridge", now).is_none());
+        assert!(TopicOpening::of(None, "/bridge", now).is_none());
+        assert!(TopicOpening::of(Some(&nodes(&["/bridge"])), "/bridge", now).is_none());
         let known = nodes(&["/arm", "/bridge", "/gripper"]);
-        let mut opening = Opening::of(Some(&known), "/bridge", now).unwrap();
+        let mut opening = TopicOpening::of(Some(&known), "/bridge", now).unwrap();
         assert!(!opening.is_over(|_| false, now));
         assert!(!opening.is_over(|node| node == "/arm", now));
         assert!(opening.is_over(|node| node != "/bridge", now));

@@ -6,11 +6,11 @@ use bridge_node::PublisherKey;
 use bytes::Bytes;
 use mappings::TopicId;
 use messages::{MessageType, Selection, TypeName};
-use tcpros::{Peer, Subscription};
+use tcpros::{ConnectionPeer, Subscription};
 
 /// A topic that is or may be published, and the values that its messages contain.
 #[derive(Debug)]
-pub(crate) struct Source {
+pub(crate) struct Ros1Source {
     pub(crate) ros_topic: String,
     /// The type in the mapping; without it the first publisher decides.
     pub(crate) expected: Option<TypeName>,
@@ -25,9 +25,9 @@ pub(crate) struct Source {
     /// The type with which the values are bridged.
     pub(crate) bound: Option<Arc<MessageType>>,
     /// Connected publishers of this type.
-    peers: Vec<Arc<Peer>>,
+    peers: Vec<Arc<ConnectionPeer>>,
     /// Connected publishers of another type; their messages cannot be read.
-    strangers: Vec<Arc<Peer>>,
+    strangers: Vec<Arc<ConnectionPeer>>,
     /// Latching publishers that have sent a message, including disconnected publishers.
     latched: Vec<LatchedPeer>,
     /// The key of the next latching publisher.
@@ -47,7 +47,7 @@ struct LatchedPeer {
     looks: u32,
 }
 
-impl Source {
+impl Ros1Source {
     pub(crate) const fn new(
         ros_topic: String,
         expected: Option<TypeName>,
@@ -90,7 +90,7 @@ impl Source {
 
     /// Removes a disconnected latching publisher if the limit is reached and `peer` is a new
     /// latching publisher. Returns the key of the removed publisher.
-    pub(crate) fn make_room(&mut self, peer: &Peer) -> Option<PublisherKey> {
+    pub(crate) fn make_room(&mut self, peer: &ConnectionPeer) -> Option<PublisherKey> {
         let known = |latched: &LatchedPeer| latched.caller_id == peer.caller_id;
         if self.latched.len() < MAX_LATCHED
             || !peer.header.latching()
@@ -107,7 +107,11 @@ impl Source {
 
     /// Returns the key of the publisher of a message for the Router, if the publisher latches and
     /// the limit is not reached. The key stays the same over a reconnection.
-    pub(crate) fn latched_by(&mut self, peer: &Peer, message: &Bytes) -> Option<PublisherKey> {
+    pub(crate) fn latched_by(
+        &mut self,
+        peer: &ConnectionPeer,
+        message: &Bytes,
+    ) -> Option<PublisherKey> {
         if !peer.header.latching() {
             return None;
         }
@@ -154,7 +158,7 @@ impl Source {
     }
 
     /// Returns true if messages of a publisher can be read; `None` if the publisher is new.
-    pub(crate) fn knows(&self, peer: &Arc<Peer>) -> Option<bool> {
+    pub(crate) fn knows(&self, peer: &Arc<ConnectionPeer>) -> Option<bool> {
         if self.peers.iter().any(|known| Arc::ptr_eq(known, peer)) {
             Some(true)
         } else if self.strangers.iter().any(|known| Arc::ptr_eq(known, peer)) {
@@ -170,7 +174,11 @@ impl Source {
     }
 
     /// Adds a publisher. `found` is its type, `None` if the type cannot be read.
-    pub(crate) fn meet(&mut self, peer: &Arc<Peer>, found: Option<Arc<MessageType>>) -> Met {
+    pub(crate) fn meet(
+        &mut self,
+        peer: &Arc<ConnectionPeer>,
+        found: Option<Arc<MessageType>>,
+    ) -> AddedPublisher {
         let expected = |found: &Arc<MessageType>| {
             self.expected
                 .as_ref()
@@ -178,7 +186,7 @@ impl Source {
         };
         let Some(found) = found.filter(expected) else {
             self.strangers.push(Arc::clone(peer));
-            return Met::Stranger;
+            return AddedPublisher::Stranger;
         };
         let same = self
             .bound
@@ -186,18 +194,18 @@ impl Source {
             .is_some_and(|bound| bound.md5() == found.md5() && bound.name() == found.name());
         if !same && !self.peers.is_empty() {
             self.strangers.push(Arc::clone(peer));
-            return Met::Stranger;
+            return AddedPublisher::Stranger;
         }
         self.peers.push(Arc::clone(peer));
         if same {
-            return Met::Known;
+            return AddedPublisher::Known;
         }
         self.bound = Some(Arc::clone(&found));
-        Met::Bound(found)
+        AddedPublisher::Bound(found)
     }
 
     /// Removes a publisher that disconnected; `publishers` is the number of remaining connections.
-    pub(crate) fn part(&mut self, peer: &Arc<Peer>, publishers: usize) {
+    pub(crate) fn part(&mut self, peer: &Arc<ConnectionPeer>, publishers: usize) {
         self.peers
             .retain(|known| publishers > 0 && !Arc::ptr_eq(known, peer));
         self.strangers
@@ -223,7 +231,7 @@ pub(crate) const MAX_LATCHED: usize = 256;
 
 /// The result of adding a publisher.
 #[derive(Debug)]
-pub(crate) enum Met {
+pub(crate) enum AddedPublisher {
     /// The publisher has the type with which the values are bridged.
     Known,
     /// The values are bridged with the type of this publisher from now on.
@@ -234,13 +242,13 @@ pub(crate) enum Met {
 
 #[cfg(test)]
 mod tests {
-    use messages::{Dialect, Registry};
+    use messages::{Dialect, TypeRegistry};
     use tcpros::ConnectionHeader;
 
     use super::*;
 
-    fn peer() -> Arc<Peer> {
-        Arc::new(Peer {
+    fn peer() -> Arc<ConnectionPeer> {
+        Arc::new(ConnectionPeer {
             caller_id: "/p".to_owned(),
             header: ConnectionHeader::default(),
         })
@@ -248,14 +256,14 @@ mod tests {
 
     fn of(name: &str) -> Option<Arc<MessageType>> {
         Some(
-            Registry::bundle(Dialect::Ros1)
+            TypeRegistry::bundle(Dialect::Ros1)
                 .get(&name.parse().unwrap())
                 .unwrap(),
         )
     }
 
-    fn source(expected: Option<&str>) -> Source {
-        Source::new(
+    fn source(expected: Option<&str>) -> Ros1Source {
+        Ros1Source::new(
             "/t".to_owned(),
             expected.map(|name| name.parse().unwrap()),
             Vec::new(),
@@ -268,15 +276,15 @@ mod tests {
         let (first, second, third) = (peer(), peer(), peer());
         assert!(matches!(
             source.meet(&first, of("std_msgs/Bool")),
-            Met::Bound(_)
+            AddedPublisher::Bound(_)
         ));
         assert!(matches!(
             source.meet(&second, of("std_msgs/Bool")),
-            Met::Known
+            AddedPublisher::Known
         ));
         assert!(matches!(
             source.meet(&third, of("std_msgs/String")),
-            Met::Stranger
+            AddedPublisher::Stranger
         ));
         assert_eq!(
             (source.knows(&second), source.knows(&third)),
@@ -293,12 +301,12 @@ mod tests {
         assert!(!source.is_live());
         assert!(matches!(
             source.meet(&second, of("std_msgs/String")),
-            Met::Bound(_)
+            AddedPublisher::Bound(_)
         ));
     }
 
-    fn latching(name: &str) -> Arc<Peer> {
-        Arc::new(Peer {
+    fn latching(name: &str) -> Arc<ConnectionPeer> {
+        Arc::new(ConnectionPeer {
             caller_id: name.to_owned(),
             header: ConnectionHeader::default().with("latching", "1"),
         })
@@ -366,12 +374,15 @@ mod tests {
         let mut source = source(Some("std_msgs/String"));
         assert!(matches!(
             source.meet(&peer(), of("std_msgs/Bool")),
-            Met::Stranger
+            AddedPublisher::Stranger
         ));
-        assert!(matches!(source.meet(&peer(), None), Met::Stranger));
+        assert!(matches!(
+            source.meet(&peer(), None),
+            AddedPublisher::Stranger
+        ));
         assert!(matches!(
             source.meet(&peer(), of("std_msgs/String")),
-            Met::Bound(_)
+            AddedPublisher::Bound(_)
         ));
     }
 }

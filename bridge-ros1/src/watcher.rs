@@ -3,28 +3,28 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use tcpros::{Graph, Node};
+use tcpros::{MasterGraph, Node};
 use tokio::sync::mpsc;
 use tokio::task::JoinSet;
 
 /// An event of the watcher.
 #[derive(Debug)]
-pub(crate) enum Seen {
+pub(crate) enum WatcherEvent {
     /// The graph, the same `Arc` as before if it has not changed; `None` while the master is
     /// unavailable.
-    Graph(Option<Arc<Graph>>),
+    Graph(Option<Arc<MasterGraph>>),
     /// The node was requested to shut down, with the reason.
     Ended(String),
 }
 
 /// Two small tasks that end when the watcher is dropped.
 #[derive(Debug)]
-pub(crate) struct Watcher {
-    seen: mpsc::Receiver<Seen>,
+pub(crate) struct MasterWatcher {
+    seen: mpsc::Receiver<WatcherEvent>,
     _tasks: JoinSet<()>,
 }
 
-impl Watcher {
+impl MasterWatcher {
     pub(crate) fn of(node: &Node) -> Self {
         // A graph that was not received yet delays the next poll, so at most one graph waits.
         let (sender, seen) = mpsc::channel(1);
@@ -34,12 +34,12 @@ impl Watcher {
         tasks.spawn(async move {
             let reason = asked.await;
             // The port may already be dropped.
-            drop(ends.send(Seen::Ended(reason)).await);
+            drop(ends.send(WatcherEvent::Ended(reason)).await);
         });
         let mut graph = node.graph_reader();
         tasks.spawn(async move {
             while sender
-                .send(Seen::Graph(graph.read_again().await.ok()))
+                .send(WatcherEvent::Graph(graph.read_again().await.ok()))
                 .await
                 .is_ok()
             {
@@ -53,7 +53,7 @@ impl Watcher {
     }
 
     /// Returns the next event. Cancel-safe.
-    pub(crate) async fn recv(&mut self) -> Seen {
+    pub(crate) async fn recv(&mut self) -> WatcherEvent {
         match self.seen.recv().await {
             Some(seen) => seen,
             None => std::future::pending().await,

@@ -5,10 +5,10 @@ use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::sync::Arc;
 
-use bridge_node::{Environment, TypePaths};
+use bridge_node::{RosEnvironment, TypePaths};
 use messages::{
     ActionCalls, ActionMessages, ActionTypeHashes, DefinitionError, DescribedType, Dialect,
-    MessageType, Registry, ServiceType, ServiceTypeHashes, TextKind, TypeHash, TypeName,
+    MessageType, ServiceType, ServiceTypeHashes, TextKind, TypeHash, TypeName, TypeRegistry,
 };
 use ros2_node::type_description::TypeSource;
 use uadp::BuiltinType;
@@ -18,16 +18,16 @@ use uadp::BuiltinType;
 /// A name may have several definitions: the local definition, and definitions that nodes described.
 /// Their hashes distinguish them.
 #[derive(Debug)]
-pub(crate) struct Definitions {
+pub(crate) struct Ros2Definitions {
     known: bridge_node::Definitions,
     /// The requested definitions of `known`.
-    found: BTreeMap<TypeName, Definition>,
-    told: BTreeMap<(TypeName, TypeHash), Told>,
+    found: BTreeMap<TypeName, TypeDefinition>,
+    told: BTreeMap<(TypeName, TypeHash), DescribedDefinition>,
 }
 
 /// A definition of a type.
 #[derive(Debug, Clone)]
-pub(crate) struct Definition {
+pub(crate) struct TypeDefinition {
     pub(crate) message_type: Arc<MessageType>,
     /// `None` for a type that ROS 2 cannot express and that has no hash.
     pub(crate) hash: Option<TypeHash>,
@@ -35,7 +35,7 @@ pub(crate) struct Definition {
     pub(crate) from: Arc<str>,
 }
 
-impl Definition {
+impl TypeDefinition {
     pub(crate) fn name(&self) -> &TypeName {
         self.message_type.name()
     }
@@ -52,11 +52,11 @@ impl Definition {
     }
 }
 
-impl Definitions {
+impl Ros2Definitions {
     /// Creates the definitions from the built-in types, the mapping's `type_paths`, and the
     /// prefixes of ROS 2 installations in the order of `AMENT_PREFIX_PATH`.
     pub(crate) fn new(types: Arc<TypePaths>, prefixes: Vec<PathBuf>) -> Self {
-        let environment = Environment {
+        let environment = RosEnvironment {
             ros1: Vec::new(),
             ros2: prefixes,
         };
@@ -78,7 +78,7 @@ impl Definitions {
     /// that is temporarily unreadable changes nothing.
     pub(crate) fn is_current(
         &mut self,
-        definition: &Definition,
+        definition: &TypeDefinition,
         announced: Option<TypeHash>,
     ) -> bool {
         let now = self.announced(definition.name(), announced);
@@ -90,7 +90,7 @@ impl Definitions {
     ///
     /// # Errors
     /// [`DefinitionError`].
-    pub(crate) fn get(&mut self, name: &TypeName) -> Result<Definition, DefinitionError> {
+    pub(crate) fn get(&mut self, name: &TypeName) -> Result<TypeDefinition, DefinitionError> {
         let error = match self.here(name) {
             Ok(found) => return Ok(found),
             Err(error) => error,
@@ -111,7 +111,7 @@ impl Definitions {
         &mut self,
         name: &TypeName,
         hash: Option<TypeHash>,
-    ) -> Result<Definition, DefinitionError> {
+    ) -> Result<TypeDefinition, DefinitionError> {
         match hash {
             Some(hash) => match self.of_hash(name, hash) {
                 Some(found) => Ok(found),
@@ -122,7 +122,7 @@ impl Definitions {
     }
 
     /// Returns the definition with the hash.
-    pub(crate) fn of_hash(&mut self, name: &TypeName, hash: TypeHash) -> Option<Definition> {
+    pub(crate) fn of_hash(&mut self, name: &TypeName, hash: TypeHash) -> Option<TypeDefinition> {
         let here = self.here(name).ok();
         here.filter(|found| found.hash == Some(hash)).or_else(|| {
             let told = self.told.get(&(name.clone(), hash));
@@ -134,11 +134,11 @@ impl Definitions {
     ///
     /// # Errors
     /// [`DefinitionError`].
-    pub(crate) fn here(&mut self, name: &TypeName) -> Result<Definition, DefinitionError> {
+    pub(crate) fn here(&mut self, name: &TypeName) -> Result<TypeDefinition, DefinitionError> {
         if let Some(found) = self.found.get(name) {
             return Ok(found.clone());
         }
-        let found = Definition {
+        let found = TypeDefinition {
             message_type: self.known.find(name)?,
             hash: self.known.registry().type_hash(name).ok(),
             from: self.known.source(name).into(),
@@ -160,9 +160,9 @@ impl Definitions {
     ) -> Result<(), DefinitionError> {
         // In a separate registry: the referenced types may differ from the local types of the same
         // name.
-        let message_type = Registry::empty(Dialect::Ros2).add_described(name, types, hash)?;
-        let told = Told {
-            definition: Definition {
+        let message_type = TypeRegistry::empty(Dialect::Ros2).add_described(name, types, hash)?;
+        let told = DescribedDefinition {
+            definition: TypeDefinition {
                 message_type,
                 hash: Some(hash),
                 from: from.into(),
@@ -305,8 +305,8 @@ impl Definitions {
 
 /// A node's description of a type.
 #[derive(Debug)]
-struct Told {
-    definition: Definition,
+struct DescribedDefinition {
+    definition: TypeDefinition,
     types: Vec<DescribedType>,
 }
 
@@ -322,7 +322,7 @@ mod tests {
         std::fs::write(folder.join("Arm.msg"), "robot_msgs/Joint[] joints\n").unwrap();
         std::fs::write(folder.join("Joint.msg"), "string name\nfloat64 angle\n").unwrap();
 
-        let found = Definitions::new(Arc::default(), vec![prefix.clone()])
+        let found = Ros2Definitions::new(Arc::default(), vec![prefix.clone()])
             .get(&"robot_msgs/Arm".parse().unwrap());
         std::fs::remove_dir_all(&prefix).unwrap();
         assert_eq!(found.unwrap().message_type.leaves()[0].path, "joints");
@@ -330,7 +330,7 @@ mod tests {
 
     #[test]
     fn a_type_nobody_defines_is_named_in_the_error() {
-        let error = Definitions::new(Arc::default(), vec![])
+        let error = Ros2Definitions::new(Arc::default(), vec![])
             .get(&"robot_msgs/Arm".parse().unwrap())
             .unwrap_err();
         assert!(error.to_string().contains("robot_msgs/Arm"), "{error}");
@@ -340,9 +340,9 @@ mod tests {
     fn a_definition_without_a_hash_is_another_when_it_is_made_of_other_fields() {
         let name: TypeName = "robot_msgs/Arm".parse().unwrap();
         let without = |text| {
-            let mut registry = Registry::empty(Dialect::Ros2);
+            let mut registry = TypeRegistry::empty(Dialect::Ros2);
             registry.add(&name, text).unwrap();
-            Definition {
+            TypeDefinition {
                 message_type: registry.get(&name).unwrap(),
                 hash: None,
                 from: "a file".into(),
@@ -351,7 +351,7 @@ mod tests {
         let (old, new) = (without("float64 angle\n"), without("float32 angle\n"));
         assert!(old.is_same(&without("float64 angle # in rad\n")));
         assert!(!old.is_same(&new));
-        let mut definitions = Definitions::new(Arc::default(), vec![]);
+        let mut definitions = Ros2Definitions::new(Arc::default(), vec![]);
         definitions.found.insert(name.clone(), new.clone());
         assert!(definitions.is_current(&new, None));
         assert!(!definitions.is_current(&old, None));
@@ -359,7 +359,7 @@ mod tests {
 
     /// Returns the description and the hash of a type, as a node would send it.
     fn told(name: &TypeName, text: &str) -> (Vec<DescribedType>, TypeHash) {
-        let mut registry = Registry::empty(Dialect::Ros2);
+        let mut registry = TypeRegistry::empty(Dialect::Ros2);
         registry.add(name, text).unwrap();
         let hash = registry.type_hash(name).unwrap();
         (registry.describe(name).unwrap(), hash)
@@ -368,7 +368,7 @@ mod tests {
     #[test]
     fn definitions_of_one_name_are_kept_apart_by_their_hashes() {
         let name: TypeName = "robot_msgs/Arm".parse().unwrap();
-        let mut definitions = Definitions::new(Arc::default(), vec![]);
+        let mut definitions = Ros2Definitions::new(Arc::default(), vec![]);
         let (old, old_hash) = told(&name, "float64 angle\n");
         let (new, new_hash) = told(&name, "float32 speed\nfloat64 angle\n");
         definitions
@@ -391,7 +391,7 @@ mod tests {
     #[test]
     fn what_is_told_leaves_what_is_known_here_as_it_was() {
         let name: TypeName = "std_msgs/Bool".parse().unwrap();
-        let mut definitions = Definitions::new(Arc::default(), vec![]);
+        let mut definitions = Ros2Definitions::new(Arc::default(), vec![]);
         let here = definitions.get(&name).unwrap();
         let (other, hash) = told(&name, "string data\n");
         definitions

@@ -14,7 +14,7 @@ pub(crate) struct Descriptors {
 
 /// The number of endpoints for which file descriptors are free.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) struct Free {
+pub(crate) struct FreeDescriptors {
     /// For topics of the mapping, services and actions.
     pub(crate) mapped: usize,
     /// For topics that the mapping does not name. A quarter of all descriptors is reserved for
@@ -37,16 +37,16 @@ impl Descriptors {
 
     /// Returns the number of endpoints for which descriptors are free. The lowest free descriptor
     /// shows how many are open.
-    pub(crate) fn free(self) -> Free {
+    pub(crate) fn free(self) -> FreeDescriptors {
         let open = File::open("/dev/null").map(|file| file.as_raw_fd());
         // Without a free descriptor, the file cannot be opened.
         let open = open.ok().and_then(|open| usize::try_from(open).ok());
         self.free_beside(open.unwrap_or(self.limit))
     }
 
-    const fn free_beside(self, open: usize) -> Free {
+    const fn free_beside(self, open: usize) -> FreeDescriptors {
         let left = self.limit.saturating_sub(open);
-        Free {
+        FreeDescriptors {
             mapped: left.saturating_sub(RESERVE) / OF_ENDPOINT,
             found: left.saturating_sub(self.limit / 4) / OF_ENDPOINT,
         }
@@ -69,28 +69,28 @@ mod tests {
         let free = |open| descriptors.free_beside(open);
         assert_eq!(
             free(24),
-            Free {
+            FreeDescriptors {
                 mapped: 187,
                 found: 148
             }
         );
         assert_eq!(
             free(768),
-            Free {
+            FreeDescriptors {
                 mapped: 38,
                 found: 0
             }
         );
         assert_eq!(
             free(960),
-            Free {
+            FreeDescriptors {
                 mapped: 0,
                 found: 0
             }
         );
         assert_eq!(
             free(5_000),
-            Free {
+            FreeDescriptors {
                 mapped: 0,
                 found: 0
             }

@@ -11,8 +11,8 @@ use std::sync::LazyLock;
 
 use bridge_core::Local;
 use bridge_node::{
-    Arguments, Carried, Context, Failure, FailureKind, Program, Rank, RedundancyArguments,
-    SharedProgram,
+    Arguments, Carried, Context, Failure, FailureKind, Program, RedundancyArguments,
+    RedundancyRank, SharedProgram,
 };
 use clap::Parser;
 use mappings::{Mapping, SpaceId};
@@ -23,12 +23,12 @@ use ros2_node::discovery_info::GidLength;
 use ros2_node::domain::{DiscoveryRange, DomainError, DomainOptions};
 use ros2_node::limits;
 use ros2_node::node::NodeOptions;
-use ros2_node::security::Security;
+use ros2_node::security::RequestedSecurity;
 use tracing::{info, warn};
 use transport::{Interface, InterfaceError};
 
 use crate::ros_args::RosArgs;
-use crate::{PortOptions, Ros2Port, environment};
+use crate::{Ros2Port, Ros2PortOptions, environment};
 
 /// Runs `bridge-ros2` from its command line to its end. `arguments` begin with the name of the
 /// program.
@@ -106,12 +106,12 @@ impl BridgeRos2 {
     }
 
     /// Returns the security settings of the ROS 2 side.
-    fn security(&self) -> Result<Security, Failure> {
+    fn security(&self) -> Result<RequestedSecurity, Failure> {
         let enclave = self.ros_args()?.enclave;
         let variable = |name: &str| std::env::var(name).ok();
-        let security = Security::from_env(variable, enclave.as_deref())
+        let security = RequestedSecurity::from_env(variable, enclave.as_deref())
             .map_err(|error| Failure::new(FailureKind::Configuration, error.to_string()))?;
-        if let Security::Refrained(why) = &security {
+        if let RequestedSecurity::Refrained(why) = &security {
             warn!(
                 "ROS_SECURITY_ENABLE is true, but the bridge runs WITHOUT security: {why}. Correct this, or \
                  set ROS_SECURITY_STRATEGY=Enforce to refuse such a start"
@@ -276,7 +276,7 @@ impl Program for BridgeRos2 {
         self.redundancy.part()
     }
 
-    fn rank(&self) -> Option<Rank> {
+    fn rank(&self) -> Option<RedundancyRank> {
         self.redundancy.rank
     }
 
@@ -311,7 +311,7 @@ impl Program for BridgeRos2 {
                 warn!("{warning}");
             }
         }
-        let options = PortOptions {
+        let options = Ros2PortOptions {
             domain: DomainOptions {
                 domain: self.domain(own, &mapping),
                 networks: self.networks()?,

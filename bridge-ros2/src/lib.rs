@@ -12,4 +12,4 @@ mod ros_args;
 mod sink;
 mod source;
 
-pub use port::{PortOptions, Ros2Port};
+pub use port::{Ros2Port, Ros2PortOptions};

@@ -4,9 +4,9 @@
 //! in [`Ros2Port::reconcile`], which compares the endpoints of the domain with the open endpoints:
 //! every 200 ms, and shortly after RustDDS reports a change.
 //!
-//! The port wires types that own their state: the topics that the bridge reads ([`Sources`]), the
-//! topics that it writes ([`Sinks`]), and services and actions ([`Ros2Requests`]). They share the
-//! node and its view of the domain ([`Ros2Side`]).
+//! The port wires types that own their state: the topics that the bridge reads ([`ReadTopics`]),
+//! the topics that it writes ([`WrittenTopics`]), and services and actions ([`Ros2Requests`]). They
+//! share the node and its view of the domain ([`Ros2Side`]).
 
 mod action_graph;
 mod awaited;
@@ -31,8 +31,8 @@ use std::task::{Context, Poll};
 
 use bridge_node::policy::{Policy, TYPE_CHANGES, type_changes};
 use bridge_node::{
-    Answered, AskId, AwaitedPeers, CallDescription, Delivery, Described, Execution, ExecutionId,
-    Handover, Port, PortEvent, Reason, TypePaths, hear_log,
+    AskId, AwaitedPeers, CallDescription, CallResponse, Execution, ExecutionId, Handover,
+    LocalDelivery, Port, PortEvent, Reason, TopicMetaData, TypePaths, hear_log,
 };
 use bytes::Bytes;
 use futures_util::StreamExt;
@@ -50,21 +50,21 @@ use tokio::time::Instant;
 use tracing::{info, warn};
 use uadp::BuiltinType;
 
-use self::awaited::Missing;
-use self::descriptions::Descriptions;
+use self::awaited::Ros2MissingPeers;
+use self::descriptions::TypeDescriptions;
 use self::drops::Drops;
 use self::requests::Ros2Requests;
 use self::schedule::Schedule;
 use self::side::Ros2Side;
-use self::sinks::Sinks;
-use self::sources::Sources;
-use crate::definitions::Definitions;
+use self::sinks::WrittenTopics;
+use self::sources::ReadTopics;
+use crate::definitions::Ros2Definitions;
 use crate::descriptors::Descriptors;
 use crate::entry::NAME;
 
 /// The options with which a [`Ros2Port`] starts.
 #[derive(Debug, Clone)]
-pub struct PortOptions {
+pub struct Ros2PortOptions {
     /// The DDS domain to join.
     pub domain: DomainOptions,
     /// The space of the values that are produced in this domain.
@@ -82,9 +82,9 @@ pub struct PortOptions {
 pub struct Ros2Port {
     side: Ros2Side,
     /// The topics that this bridge reads.
-    sources: Sources,
+    sources: ReadTopics,
     /// The topics that this bridge writes.
-    sinks: Sinks,
+    sinks: WrittenTopics,
     /// Services and actions in both directions.
     requests: Ros2Requests,
     discovery: DomainParticipantStatusListener,
@@ -102,8 +102,8 @@ impl Ros2Port {
     ///
     /// # Errors
     /// [`DomainError`].
-    pub fn start(options: PortOptions) -> Result<Self, DomainError> {
-        let PortOptions {
+    pub fn start(options: Ros2PortOptions) -> Result<Self, DomainError> {
+        let Ros2PortOptions {
             domain: domain_options,
             own,
             mapping,
@@ -124,19 +124,19 @@ impl Ros2Port {
             hear_log(NAME, &log);
         }
         let presence = domain.announce_bridge(own.into())?;
-        let mut definitions = Definitions::new(types, prefixes);
+        let mut definitions = Ros2Definitions::new(types, prefixes);
         let peers = ServicePeers::new(&domain);
         let declared =
             services::parameters(own, domain_options.domain, domain_options.node.use_sim_time);
         let parameters = ParameterServer::open(&domain, &peers, declared)?;
         let told_types = TypeServer::open(&domain, &peers)?;
-        let descriptions = Descriptions::new(peers.clone());
+        let descriptions = TypeDescriptions::new(peers.clone());
         let (requests, bound) =
             Ros2Requests::start(&domain, peers, &mut definitions, (own, &mapping));
         let mut port = Self {
             discovery: domain.status_listener(),
-            sources: Sources::new(),
-            sinks: Sinks::new(domain.clock()),
+            sources: ReadTopics::new(),
+            sinks: WrittenTopics::new(domain.clock()),
             requests,
             side: Ros2Side {
                 domain,
@@ -349,7 +349,7 @@ impl Port for Ros2Port {
         poll_fn(|cx| self.poll_event(cx)).await
     }
 
-    fn publish(&mut self, sample: Delivery) -> Result<(), &'static str> {
+    fn publish(&mut self, sample: LocalDelivery) -> Result<(), &'static str> {
         if type_changes(&self.side.events, sample.topic) {
             return Err(TYPE_CHANGES);
         }
@@ -368,7 +368,7 @@ impl Port for Ros2Port {
         &mut self,
         topic: TopicId,
         shape: &[(BuiltinType, bool)],
-        described: Option<&Described>,
+        described: Option<&TopicMetaData>,
     ) {
         let side = &mut self.side;
         let at_home = topic.space == side.policy.own() || side.is_at_home(topic.space);
@@ -398,7 +398,7 @@ impl Port for Ros2Port {
         self.requests.gone(topic);
     }
 
-    fn answered(&mut self, ask: AskId, _: TopicId, answer: Answered<Bytes>) {
+    fn answered(&mut self, ask: AskId, _: TopicId, answer: CallResponse<Bytes>) {
         self.requests.answered(ask, answer);
     }
 
@@ -430,7 +430,7 @@ impl Port for Ros2Port {
     }
 
     fn add_awaited(&self, missing: &mut AwaitedPeers) {
-        let found = Missing {
+        let found = Ros2MissingPeers {
             side: &self.side,
             sources: &self.sources,
             sinks: &self.sinks,

@@ -7,32 +7,32 @@ use bridge_node::policy::{Choice, Destination};
 use bytes::{Bytes, BytesMut};
 use mappings::{Lasting, Overflow};
 use messages::TypeName;
-use ros2_node::clock::RosTime;
+use ros2_node::clock::Ros2Time;
 use ros2_node::compatibility::finite_deadline;
-use ros2_node::graph::{Endpoint, dds_topic};
+use ros2_node::graph::{RemoteEndpoint, dds_topic};
 use ros2_node::outlet::Outlet;
 use ros2_node::qos::Offered;
 use rustdds::Duration;
 
-use crate::definitions::Definition;
+use crate::definitions::TypeDefinition;
 
 /// The destination of the values of a topic of another space.
 #[derive(Debug)]
-pub(crate) struct Sink {
+pub(crate) struct Ros2Sink {
     pub(crate) dds_topic: String,
     pub(crate) offered: Offered,
     /// The choice of the type.
     pub(crate) choice: Choice,
     /// The open writer of the topic.
-    pub(crate) open: Option<Open>,
+    pub(crate) open: Option<OpenWriter>,
     /// The time at which its publisher in the space fell silent.
     pub(crate) silent: Option<Instant>,
 }
 
 /// A writer and its type.
 #[derive(Debug)]
-pub(crate) struct Open {
-    pub(crate) definition: Definition,
+pub(crate) struct OpenWriter {
+    pub(crate) definition: TypeDefinition,
     pub(crate) outlet: Outlet,
     /// The shortest deadline that readers requested, which the writer offers.
     pub(crate) deadline: Option<Duration>,
@@ -43,9 +43,9 @@ pub(crate) struct Open {
     pub(crate) stamps: bool,
 }
 
-impl Open {
+impl OpenWriter {
     /// Returns the message with the time in its header, if the stamp is not part of the value.
-    pub(crate) fn stamped(&self, message: Bytes, now: impl Fn() -> RosTime) -> Bytes {
+    pub(crate) fn stamped(&self, message: Bytes, now: impl Fn() -> Ros2Time) -> Bytes {
         if !self.stamps {
             return message;
         }
@@ -55,7 +55,7 @@ impl Open {
         // After the encapsulation header, std_msgs/Header: stamp, then frame_id. Written messages
         // are little endian.
         if let Some(stamp) = message.get_mut(4..12) {
-            let RosTime { sec, nanosec } = now();
+            let Ros2Time { sec, nanosec } = now();
             let (secs, nanos) = stamp.split_at_mut(4);
             secs.copy_from_slice(&sec.to_le_bytes());
             nanos.copy_from_slice(&nanosec.to_le_bytes());
@@ -64,7 +64,7 @@ impl Open {
     }
 
     /// Returns a deadline that a reader requests and the writer does not offer yet.
-    pub(crate) fn shorter_deadline(&self, readers: &[Endpoint]) -> Option<Duration> {
+    pub(crate) fn shorter_deadline(&self, readers: &[RemoteEndpoint]) -> Option<Duration> {
         shortest_deadline(readers)
             .filter(|wanted| self.deadline.is_none_or(|offered| *wanted < offered))
             .filter(|_| self.tightened < MOST_TIGHTENED)
@@ -72,12 +72,12 @@ impl Open {
 }
 
 /// Returns the shortest deadline that the readers request.
-pub(crate) fn shortest_deadline(readers: &[Endpoint]) -> Option<Duration> {
+pub(crate) fn shortest_deadline(readers: &[RemoteEndpoint]) -> Option<Duration> {
     let deadlines = readers.iter().map(|reader| finite_deadline(&reader.qos));
     deadlines.flatten().min()
 }
 
-impl Sink {
+impl Ros2Sink {
     pub(crate) fn new(destination: Destination) -> Self {
         let Destination {
             ros_topic,
@@ -103,7 +103,7 @@ impl Sink {
 
     /// Returns the candidate types, best first; among the types that subscribers request, the
     /// written type comes first.
-    pub(crate) fn candidates(&self, readers: &[Endpoint]) -> Vec<TypeName> {
+    pub(crate) fn candidates(&self, readers: &[RemoteEndpoint]) -> Vec<TypeName> {
         let asked_for = readers
             .iter()
             .filter_map(|reader| TypeName::from_dds(&reader.type_name).ok());
@@ -119,10 +119,10 @@ impl Sink {
     /// Returns whether the open writer serves a subscriber or there is no subscriber, so that it is
     /// not given up for another type. A subscriber with an unknown definition, which no node
     /// describes, is not served by ours: it may misread the values.
-    pub(crate) fn serves(&self, readers: &[Endpoint]) -> bool {
+    pub(crate) fn serves(&self, readers: &[RemoteEndpoint]) -> bool {
         self.open.as_ref().is_some_and(|open| {
             let dds_type = open.definition.name().dds();
-            let served = |reader: &Endpoint| reader.is_of(&dds_type, open.definition.hash);
+            let served = |reader: &RemoteEndpoint| reader.is_of(&dds_type, open.definition.hash);
             readers.is_empty() || readers.iter().any(served)
         })
     }
@@ -149,14 +149,14 @@ fn offered(overflow: Overflow, lasting: Lasting) -> Offered {
 
 #[cfg(test)]
 mod tests {
-    use bridge_node::policy::{Step, Word};
+    use bridge_node::policy::{PortStep, Word};
     use messages::Selection;
     use rustdds::GUID;
 
     use super::*;
 
-    fn reader(name: &str) -> Endpoint {
-        Endpoint {
+    fn reader(name: &str) -> RemoteEndpoint {
+        RemoteEndpoint {
             guid: GUID::GUID_UNKNOWN,
             type_name: name.parse::<TypeName>().unwrap().dds(),
             reliable: true,
@@ -170,8 +170,8 @@ mod tests {
         candidates.iter().map(ToString::to_string).collect()
     }
 
-    fn sink(ros_topic: &str, mapped: Option<&str>) -> Sink {
-        Sink::new(Destination {
+    fn sink(ros_topic: &str, mapped: Option<&str>) -> Ros2Sink {
+        Ros2Sink::new(Destination {
             ros_topic: ros_topic.to_owned(),
             mapped: mapped.map(|name| (name.parse().unwrap(), Selection::Whole)),
             overflow: Overflow::KeepLatest,
@@ -186,7 +186,7 @@ mod tests {
             standard: Some("std_msgs/Float64".parse().unwrap()),
             ..Word::default()
         };
-        assert_eq!(sink.choice.hear(word, None), Step::Open);
+        assert_eq!(sink.choice.hear(word, None), PortStep::Open);
         assert_eq!(names(&sink.candidates(&[])), ["std_msgs/Float64"]);
         assert_eq!(
             names(&sink.candidates(&[reader("std_msgs/Float32")])),

@@ -6,27 +6,27 @@ use bridge_node::PublisherKey;
 use bytes::Bytes;
 use mappings::TopicId;
 use messages::{Selection, TypeHash, TypeName};
-use ros2_node::graph::Endpoint;
+use ros2_node::graph::RemoteEndpoint;
 use ros2_node::inbox::SlotId;
 use ros2_node::qos::Requested;
 use rustdds::{GUID, RTPSEntity};
 
-use crate::definitions::Definition;
+use crate::definitions::TypeDefinition;
 
 /// A topic that other nodes write, and the values of our space that it holds.
 #[derive(Debug)]
-pub(crate) struct Source {
+pub(crate) struct Ros2Source {
     pub(crate) dds_topic: String,
     pub(crate) message_type: TypeName,
     /// The hash of the type that applies among the announced hashes; writers with another hash are
     /// strangers.
     pub(crate) announced: Option<TypeHash>,
     /// The definition with which the topic is read.
-    pub(crate) definition: Option<Definition>,
+    pub(crate) definition: Option<TypeDefinition>,
     /// The values made of a message; a single value unless the mapping binds several variables to
     /// the topic.
     pub(crate) values: Vec<(TopicId, Selection)>,
-    pub(crate) reading: Reading,
+    pub(crate) reading: ReaderState,
     /// Whether the topic has a publisher of our type.
     pub(crate) live: bool,
     /// Writers of this topic with another type or another definition of it, with the reason for
@@ -52,14 +52,14 @@ struct Latched {
 
 /// The state of the reader.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Reading {
+pub(crate) enum ReaderState {
     /// Created when there is room for another endpoint.
     Pending,
     /// In the inbox.
     Open { slot: SlotId, requested: Requested },
 }
 
-impl Source {
+impl Ros2Source {
     pub(crate) fn new(dds_topic: String, message_type: TypeName) -> Self {
         Self {
             dds_topic,
@@ -67,7 +67,7 @@ impl Source {
             announced: None,
             definition: None,
             values: Vec::new(),
-            reading: Reading::Pending,
+            reading: ReaderState::Pending,
             live: false,
             strangers: BTreeMap::new(),
             latched: BTreeMap::new(),
@@ -79,7 +79,7 @@ impl Source {
 
     /// Returns the Router's key of the sample's writer, if the writer is transient-local.
     pub(crate) fn latched_by(&mut self, writer: GUID, sample: &Bytes) -> Option<PublisherKey> {
-        let Reading::Open { requested, .. } = self.reading else {
+        let ReaderState::Open { requested, .. } = self.reading else {
             return None;
         };
         // A transient-local reader is matched only with transient-local writers, whether recorded
@@ -106,7 +106,7 @@ impl Source {
     }
 
     /// Returns the transient-local writers that were lost; `writers` are present.
-    pub(crate) fn gone(&mut self, writers: &[Endpoint]) -> Vec<PublisherKey> {
+    pub(crate) fn gone(&mut self, writers: &[RemoteEndpoint]) -> Vec<PublisherKey> {
         let mut gone = Vec::new();
         let lapsed = &mut self.lapsed;
         self.latched.retain(|guid, latched| {
@@ -125,7 +125,7 @@ impl Source {
 
     /// Returns the transient-local writers among `writers` that were lost and not read after their
     /// return.
-    pub(crate) fn returned(&self, writers: &[Endpoint]) -> Vec<GUID> {
+    pub(crate) fn returned(&self, writers: &[RemoteEndpoint]) -> Vec<GUID> {
         let returned = writers.iter().map(|writer| writer.guid);
         returned.filter(|guid| self.lapsed.contains(guid)).collect()
     }
@@ -136,13 +136,13 @@ impl Source {
     }
 
     /// Sorts the present writers of the topic into ours and strangers; returns ours.
-    pub(crate) fn meet(&mut self, writers: &[Endpoint]) -> Vec<Endpoint> {
+    pub(crate) fn meet(&mut self, writers: &[RemoteEndpoint]) -> Vec<RemoteEndpoint> {
         let dds_type = self.message_type.dds();
         let (ours, strangers): (Vec<_>, Vec<_>) = writers
             .iter()
             .cloned()
             .partition(|writer| writer.is_of(&dds_type, self.announced));
-        let why = |writer: &Endpoint| match writer.type_name == dds_type {
+        let why = |writer: &RemoteEndpoint| match writer.type_name == dds_type {
             true => OTHER_DEFINITION,
             false => OTHER_TYPE,
         };

@@ -6,13 +6,15 @@
 
 mod report;
 
-use self::report::Report;
+use self::report::BatchReport;
 use crate::pace::Speed;
-use crate::stage::{Failure, LOOPBACK, MES_WHO, MesCell, Show, Stop, Who, watched};
+use crate::stage::{
+    DemoFailure, EventSource, LOOPBACK, MES_WHO, MesCell, Show, StopReason, watched,
+};
 
 /// The options of the scenario.
 #[derive(Clone, Debug)]
-pub(crate) struct Plan {
+pub(crate) struct BatchOptions {
     pub(crate) speed: Speed,
     pub(crate) json: bool,
 }
@@ -56,17 +58,21 @@ const MES: &str = "mes: mes\napplication_uri: urn:example:mes\nnamespace: 50\n\
                    endpoint: opc.tcp://127.0.0.1:0\nsecurity: [None]\nrecipes: [batch.xml]\n";
 
 /// Plays the scenario and prints it. Returns the exit code.
-pub(crate) async fn play(plan: Plan) -> u8 {
+pub(crate) async fn play(plan: BatchOptions) -> u8 {
     let mut show = Show::open(plan.json);
-    let mut report = Report {
+    let mut report = BatchReport {
         speed: plan.speed.factor(),
-        ..Report::default()
+        ..BatchReport::default()
     };
     let outcome = perform(&plan, &mut show, &mut report).await;
     show.conclude(&outcome, &report, &report.table())
 }
 
-async fn perform(plan: &Plan, show: &mut Show, report: &mut Report) -> Result<(), Failure> {
+async fn perform(
+    plan: &BatchOptions,
+    show: &mut Show,
+    report: &mut BatchReport,
+) -> Result<(), DemoFailure> {
     let ports = MODULES.each_ref().map(|module| module.port);
     let title = "Batch: three simulated process modules, and a recipe of BatchML";
     let (cell, mut reports) = MesCell::prepare(&ports, show, title, plan.speed)?;
@@ -86,14 +92,14 @@ async fn perform(plan: &Plan, show: &mut Show, report: &mut Report) -> Result<()
 }
 
 struct Story<'a> {
-    plan: &'a Plan,
+    plan: &'a BatchOptions,
     cell: MesCell,
     show: &'a mut Show,
-    report: &'a mut Report,
+    report: &'a mut BatchReport,
 }
 
 impl Story<'_> {
-    async fn play(&mut self) -> Result<(), Stop> {
+    async fn play(&mut self) -> Result<(), StopReason> {
         self.start_all()?;
         let ms = self.cell.mes.planned(PROCESS, true).await?;
         self.report.planned_ms = Some(ms);
@@ -108,14 +114,14 @@ impl Story<'_> {
         followed.await?;
         if !self.report.overlap() {
             let why = "the reactor was not heated while the liquid was dosed or stirred";
-            return Err(Stop::Broken(why.to_owned()));
+            return Err(StopReason::Broken(why.to_owned()));
         }
         let text = "the batch is done; the reactor was heated meanwhile".to_owned();
-        self.show.note(Who::DEMO, text)?;
+        self.show.note(EventSource::DEMO, text)?;
         Ok(())
     }
 
-    fn start_all(&mut self) -> Result<(), Failure> {
+    fn start_all(&mut self) -> Result<(), DemoFailure> {
         self.cell.write("mes.yaml", MES)?;
         self.cell.write("batch.xml", RECIPE)?;
         self.cell.start_mes("mes.yaml")?;

@@ -8,7 +8,7 @@ use std::io::{self, Write as _};
 use serde::{Deserialize, Serialize};
 
 use crate::clock::wall_nanos;
-use crate::line::Name;
+use crate::line::LineValueName;
 use crate::plug::NodeEvent;
 use crate::robots::niryo::NiryoEvent;
 use crate::robots::turtlebot::TurtlebotEvent;
@@ -18,13 +18,13 @@ use crate::skilled::MachineEvent;
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Stamped {
     pub(crate) at_ns: i64,
-    pub(crate) event: Event,
+    pub(crate) event: ChildEvent,
 }
 
 /// An event in a child process.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(untagged)]
-pub(crate) enum Event {
+pub(crate) enum ChildEvent {
     Master(MasterEvent),
     Niryo(NiryoEvent),
     Turtlebot(TurtlebotEvent),
@@ -47,7 +47,7 @@ pub(crate) enum SupervisorEvent {
     Connected,
     /// The server has no values of these names yet.
     Awaits {
-        names: Vec<Name>,
+        names: Vec<LineValueName>,
     },
     /// The server has all values, but not the Method that switches the conveyor.
     AwaitsSwitch,
@@ -60,20 +60,20 @@ pub(crate) enum SupervisorEvent {
     },
     /// The server has a new value; the timestamp is the server's.
     Saw {
-        name: Name,
-        value: Value,
+        name: LineValueName,
+        value: LineValue,
     },
 }
 
 /// A value of the line.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(untagged)]
-pub(crate) enum Value {
+pub(crate) enum LineValue {
     Boolean(bool),
     Number(u32),
 }
 
-impl std::fmt::Display for Value {
+impl std::fmt::Display for LineValue {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         match self {
             Self::Boolean(value) => value.fmt(f),
@@ -83,12 +83,12 @@ impl std::fmt::Display for Value {
 }
 
 /// Prints an event that happens at this moment. Fails if standard output is closed.
-pub(crate) fn tell(event: impl Into<Event>) -> io::Result<()> {
+pub(crate) fn tell(event: impl Into<ChildEvent>) -> io::Result<()> {
     tell_at(wall_nanos(), event)
 }
 
 /// Prints an event that happened at `at_ns`.
-pub(crate) fn tell_at(at_ns: i64, event: impl Into<Event>) -> io::Result<()> {
+pub(crate) fn tell_at(at_ns: i64, event: impl Into<ChildEvent>) -> io::Result<()> {
     let mut line = serde_json::to_vec(&Stamped {
         at_ns,
         event: event.into(),
@@ -99,37 +99,37 @@ pub(crate) fn tell_at(at_ns: i64, event: impl Into<Event>) -> io::Result<()> {
     out.flush()
 }
 
-impl From<MasterEvent> for Event {
+impl From<MasterEvent> for ChildEvent {
     fn from(event: MasterEvent) -> Self {
         Self::Master(event)
     }
 }
 
-impl From<NiryoEvent> for Event {
+impl From<NiryoEvent> for ChildEvent {
     fn from(event: NiryoEvent) -> Self {
         Self::Niryo(event)
     }
 }
 
-impl From<TurtlebotEvent> for Event {
+impl From<TurtlebotEvent> for ChildEvent {
     fn from(event: TurtlebotEvent) -> Self {
         Self::Turtlebot(event)
     }
 }
 
-impl From<SupervisorEvent> for Event {
+impl From<SupervisorEvent> for ChildEvent {
     fn from(event: SupervisorEvent) -> Self {
         Self::Supervisor(event)
     }
 }
 
-impl From<MachineEvent> for Event {
+impl From<MachineEvent> for ChildEvent {
     fn from(event: MachineEvent) -> Self {
         Self::Machine(event)
     }
 }
 
-impl From<NodeEvent> for Event {
+impl From<NodeEvent> for ChildEvent {
     fn from(event: NodeEvent) -> Self {
         Self::Node(event)
     }
@@ -142,7 +142,7 @@ mod tests {
 
     #[test]
     fn every_kind_of_event_comes_back_as_it_was_told() {
-        let events: [Event; 7] = [
+        let events: [ChildEvent; 7] = [
             MachineEvent::Arrives { at: [2.0, 0.5] }.into(),
             MasterEvent::Listening {
                 uri: "http://127.0.0.1:1/".to_owned(),
@@ -155,13 +155,13 @@ mod tests {
             NiryoEvent::StorageEmpty.into(),
             TurtlebotEvent::Unloaded { total: 3 }.into(),
             SupervisorEvent::Saw {
-                name: Name::ParkBusy,
-                value: Value::Boolean(true),
+                name: LineValueName::ParkBusy,
+                value: LineValue::Boolean(true),
             }
             .into(),
             SupervisorEvent::Saw {
-                name: Name::CoversInStorage,
-                value: Value::Number(4),
+                name: LineValueName::CoversInStorage,
+                value: LineValue::Number(4),
             }
             .into(),
         ];

@@ -6,33 +6,35 @@ mod report;
 
 use serde_json::Value as Json;
 
-use self::report::{Insertion, Report};
+use self::report::{FuseInsertion, FusesReport};
 use crate::pace::Speed;
-use crate::stage::{Failure, MES_WHO, MesCell, Show, StepRun, Stop, Who, watched};
+use crate::stage::{
+    DemoFailure, EventSource, MES_WHO, MesCell, Show, StepRun, StopReason, watched,
+};
 
 /// The options of the scenario.
 #[derive(Clone, Debug)]
-pub(crate) struct Plan {
+pub(crate) struct FusesOptions {
     pub(crate) speed: Speed,
     pub(crate) json: bool,
 }
 
 /// The YAML of a component of the example plant.
-struct Part {
+struct FusesComponent {
     name: &'static str,
     yaml: &'static str,
 }
 
-const UR5: Part = Part {
+const UR5: FusesComponent = FusesComponent {
     name: "ur5",
     yaml: include_str!("../../examples/plant/ur5.yaml"),
 };
 /// The arm of another make.
-const OTHER: Part = Part {
+const OTHER: FusesComponent = FusesComponent {
     name: "fuse-arm",
     yaml: include_str!("../../examples/plant/fuse-arm.yaml"),
 };
-const GRIPPER: Part = Part {
+const GRIPPER: FusesComponent = FusesComponent {
     name: "robotiq-2f85",
     yaml: include_str!("../../examples/plant/robotiq-2f85.yaml"),
 };
@@ -54,9 +56,9 @@ const SEAT: f64 = 0.23;
 const NEAR: f64 = 0.001;
 
 /// Plays the scenario and prints it. Returns the exit code.
-pub(crate) async fn play(plan: Plan) -> u8 {
+pub(crate) async fn play(plan: FusesOptions) -> u8 {
     let mut show = Show::open(plan.json);
-    let mut report = Report {
+    let mut report = FusesReport {
         speed: plan.speed.factor(),
         insertions: Vec::new(),
     };
@@ -64,7 +66,11 @@ pub(crate) async fn play(plan: Plan) -> u8 {
     show.conclude(&outcome, &report, &report.table())
 }
 
-async fn perform(plan: &Plan, show: &mut Show, report: &mut Report) -> Result<(), Failure> {
+async fn perform(
+    plan: &FusesOptions,
+    show: &mut Show,
+    report: &mut FusesReport,
+) -> Result<(), DemoFailure> {
     let title = "Fuses: an arm inserts a fuse with a limited force, then an arm of another make";
     let (cell, mut reports) = MesCell::prepare(&PORTS, show, title, plan.speed)?;
     let mut story = Story {
@@ -83,14 +89,14 @@ async fn perform(plan: &Plan, show: &mut Show, report: &mut Report) -> Result<()
 }
 
 struct Story<'a> {
-    plan: &'a Plan,
+    plan: &'a FusesOptions,
     cell: MesCell,
     show: &'a mut Show,
-    report: &'a mut Report,
+    report: &'a mut FusesReport,
 }
 
 impl Story<'_> {
-    async fn play(&mut self) -> Result<(), Stop> {
+    async fn play(&mut self) -> Result<(), StopReason> {
         self.start_all()?;
         self.insert(&UR5).await?;
         self.cell.unplug(UR5.name, self.show)?;
@@ -100,11 +106,11 @@ impl Story<'_> {
         self.cell.plug_in(OTHER.name, self.show)?;
         self.insert(&OTHER).await?;
         let text = "both arms have inserted a fuse by the same process".to_owned();
-        self.show.note(Who::DEMO, text)?;
+        self.show.note(EventSource::DEMO, text)?;
         Ok(())
     }
 
-    fn start_all(&mut self) -> Result<(), Failure> {
+    fn start_all(&mut self) -> Result<(), DemoFailure> {
         let files = [
             ("mes.yaml", MES),
             ("capabilities.ttl", CAPABILITIES),
@@ -130,7 +136,7 @@ impl Story<'_> {
     }
 
     /// Runs the process with the arm that is plugged in, and checks where the fuse is.
-    async fn insert(&mut self, arm: &Part) -> Result<(), Stop> {
+    async fn insert(&mut self, arm: &FusesComponent) -> Result<(), StopReason> {
         let ms = self.cell.mes.planned(PROCESS, true).await?;
         let text = format!("each step of the process has a skill after {ms:.0} ms");
         self.show.note(MES_WHO, text)?;
@@ -143,14 +149,14 @@ impl Story<'_> {
             .follow(number, self.show, &names, &mut steps)
             .await;
         let insertion = insertion(arm.name, steps);
-        let checked = followed.and_then(|()| checked(&insertion).map_err(Stop::Broken));
+        let checked = followed.and_then(|()| checked(&insertion).map_err(StopReason::Broken));
         self.report.insertions.push(insertion);
         checked
     }
 }
 
 /// Returns the report of a run of the process.
-fn insertion(arm: &'static str, steps: Vec<StepRun>) -> Insertion {
+fn insertion(arm: &'static str, steps: Vec<StepRun>) -> FuseInsertion {
     let tries = steps.iter().filter(|step| step.step.starts_with("insert"));
     let blocked = |step: &&StepRun| step.results.get("ForceExceeded") == Some(&Json::Bool(true));
     let (count, resisted) = (tries.clone().count(), tries.clone().filter(blocked).count());
@@ -161,7 +167,7 @@ fn insertion(arm: &'static str, steps: Vec<StepRun>) -> Insertion {
     let height = last.and_then(|position| position.get(2)?.as_f64());
     let first = steps.iter().map(|step| step.started_ms).min();
     let last = steps.iter().filter_map(|step| step.ended_ms).max();
-    Insertion {
+    FuseInsertion {
         arm,
         tries: count,
         resisted,
@@ -175,8 +181,8 @@ fn insertion(arm: &'static str, steps: Vec<StepRun>) -> Insertion {
 }
 
 /// Checks that the fuse is in its seat after a second try, and was released there by this arm.
-fn checked(insertion: &Insertion) -> Result<(), String> {
-    let Insertion {
+fn checked(insertion: &FuseInsertion) -> Result<(), String> {
+    let FuseInsertion {
         arm,
         tries,
         resisted,

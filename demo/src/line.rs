@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 /// A value of the line.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "PascalCase")]
-pub(crate) enum Name {
+pub(crate) enum LineValueName {
     /// Boolean, from Niryo Ned.
     ConveyorRunning,
     /// UInt32, from Niryo Ned.
@@ -21,7 +21,7 @@ pub(crate) enum Name {
     BucketBusy,
 }
 
-impl Name {
+impl LineValueName {
     pub(crate) const ALL: [Self; 6] = [
         Self::ConveyorRunning,
         Self::CoversInStorage,
@@ -67,7 +67,7 @@ impl Name {
     }
 }
 
-impl std::fmt::Display for Name {
+impl std::fmt::Display for LineValueName {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         std::fmt::Debug::fmt(self, f)
     }
@@ -109,8 +109,8 @@ mod tests {
             .iter()
             .map(|variable| (variable.name.clone(), variable))
             .collect();
-        assert_eq!(mapped.len(), Name::ALL.len());
-        for name in Name::ALL {
+        assert_eq!(mapped.len(), LineValueName::ALL.len());
+        for name in LineValueName::ALL {
             let variable = mapped[&name.to_string()];
             assert_eq!(variable.node.namespace, 2, "{name}");
             assert_eq!(

@@ -38,7 +38,7 @@ use std::process::ExitCode;
 
 use clap::{Args, Parser, Subcommand};
 
-use crate::orchestra::Plan;
+use crate::orchestra::OrchestraOptions;
 use crate::pace::Speed;
 
 /// Plays a story with simulated robots on this machine. Nothing leaves the loopback interface.
@@ -192,7 +192,7 @@ fn play(plan: PlanArguments, runtime: &tokio::runtime::Runtime) -> u8 {
     } = plan;
     match scenario {
         Scenario::LineByTopics => {
-            let plan = Plan {
+            let plan = OrchestraOptions {
                 covers,
                 speed,
                 conveyor_off_at,
@@ -202,7 +202,7 @@ fn play(plan: PlanArguments, runtime: &tokio::runtime::Runtime) -> u8 {
             runtime.block_on(Box::pin(orchestra::play(plan)))
         }
         Scenario::PlugAndProduce => {
-            let plan = plug::Plan {
+            let plan = plug::PlugOptions {
                 speed,
                 open,
                 json,
@@ -211,7 +211,7 @@ fn play(plan: PlanArguments, runtime: &tokio::runtime::Runtime) -> u8 {
             runtime.block_on(Box::pin(plug::play(plan)))
         }
         Scenario::AssemblyLine => {
-            let plan = skilled::Plan {
+            let plan = skilled::SkilledOptions {
                 covers,
                 speed,
                 open,
@@ -220,19 +220,19 @@ fn play(plan: PlanArguments, runtime: &tokio::runtime::Runtime) -> u8 {
             runtime.block_on(Box::pin(skilled::play(plan)))
         }
         Scenario::Batch => {
-            let plan = batch::Plan { speed, json };
+            let plan = batch::BatchOptions { speed, json };
             runtime.block_on(Box::pin(batch::play(plan)))
         }
         Scenario::Fuses => {
-            let plan = fuses::Plan { speed, json };
+            let plan = fuses::FusesOptions { speed, json };
             runtime.block_on(Box::pin(fuses::play(plan)))
         }
         Scenario::Terminals => {
-            let plan = terminals::Plan { speed, json };
+            let plan = terminals::TerminalsOptions { speed, json };
             runtime.block_on(Box::pin(terminals::play(plan)))
         }
         Scenario::ToolChange => {
-            let plan = tools::Plan {
+            let plan = tools::ToolsOptions {
                 speed,
                 open,
                 json,

@@ -12,19 +12,20 @@ use tokio::sync::mpsc;
 use tokio::time::{Instant, interval, sleep_until};
 
 use self::describe::describe;
-use self::story::Story;
+use self::story::LineStory;
 use crate::clock::wall_nanos;
-use crate::event::{Event, MasterEvent};
+use crate::event::{ChildEvent, MasterEvent};
 use crate::line::{DOMAIN, ENDPOINT};
 use crate::pace::{Speed, overdue_after};
 use crate::stage::{
-    Failure, Hops, Interrupt, LOOPBACK, Program, Programs, Report, Stage, Timeline, Who, address,
-    exit_code, find, free_port, must_be_free, open_when_served, status_of,
+    ChildReport, DemoFailure, EventPrinter, EventSource, Interrupt, LOOPBACK, ProgramStart,
+    RobotHops, RunningPrograms, Stage, address, exit_code, find, free_port, must_be_free,
+    open_when_served, status_of,
 };
 
 /// The options of the scenario.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Plan {
+pub(crate) struct OrchestraOptions {
     pub(crate) covers: u32,
     pub(crate) speed: Speed,
     /// In seconds of the scenario.
@@ -35,34 +36,34 @@ pub(crate) struct Plan {
 }
 
 /// Plays the scenario and prints it. Returns the exit code.
-pub(crate) async fn play(plan: Plan) -> u8 {
-    let mut timeline = Timeline::open(plan.json);
-    let mut story = Story::new(plan.covers, plan.speed);
-    let mut hops = Hops::default();
+pub(crate) async fn play(plan: OrchestraOptions) -> u8 {
+    let mut timeline = EventPrinter::open(plan.json);
+    let mut story = LineStory::new(plan.covers, plan.speed);
+    let mut hops = RobotHops::default();
     let outcome = perform(plan, &mut timeline, &mut story, &mut hops).await;
     let printed = conclude(plan, &mut timeline, (&story, hops), outcome.as_ref().err());
     exit_code(&outcome, &printed)
 }
 
 fn conclude(
-    plan: Plan,
-    timeline: &mut Timeline,
-    (story, hops): (&Story, Hops),
-    failure: Option<&Failure>,
+    plan: OrchestraOptions,
+    timeline: &mut EventPrinter,
+    (story, hops): (&LineStory, RobotHops),
+    failure: Option<&DemoFailure>,
 ) -> std::io::Result<()> {
     timeline.print_all(&|at| story.seconds(at))?;
-    let report = report::Report::of(story, hops);
+    let report = report::OrchestraReport::of(story, hops);
     let table = (story.delivered() > 0).then(|| report.table(story));
     let failure = failure.map(ToString::to_string);
     timeline.conclude(table.as_deref(), failure.as_deref(), (&report, plan.json))
 }
 
 async fn perform(
-    plan: Plan,
-    timeline: &mut Timeline,
-    story: &mut Story,
-    hops: &mut Hops,
-) -> Result<(), Failure> {
+    plan: OrchestraOptions,
+    timeline: &mut EventPrinter,
+    story: &mut LineStory,
+    hops: &mut RobotHops,
+) -> Result<(), DemoFailure> {
     let (demo, [bridge_ros1, bridge_ros2, server]) =
         find(["bridge-ros1", "bridge-ros2", "ua-server"])?;
     let binaries = Binaries {
@@ -73,8 +74,8 @@ async fn perform(
     };
     let interrupt = Interrupt::listen()?;
     must_be_free(4840, "OPC UA server")?;
-    let (programs, reports) =
-        Programs::prepare().map_err(Failure::io("cannot make a directory for the logs"))?;
+    let (programs, reports) = RunningPrograms::prepare()
+        .map_err(DemoFailure::io("cannot make a directory for the logs"))?;
     let mut stage = Director {
         plan,
         binaries,
@@ -101,19 +102,19 @@ struct Binaries {
 
 /// The state of a run of the scenario.
 struct Director<'a> {
-    plan: Plan,
+    plan: OrchestraOptions,
     binaries: Binaries,
-    programs: Programs,
+    programs: RunningPrograms,
     /// The ports of the status pages of the bridges and of the server.
     ports: [u16; 3],
-    reports: mpsc::Receiver<Report>,
+    reports: mpsc::Receiver<ChildReport>,
     interrupt: Interrupt,
-    timeline: &'a mut Timeline,
-    story: &'a mut Story,
+    timeline: &'a mut EventPrinter,
+    story: &'a mut LineStory,
 }
 
 impl Director<'_> {
-    async fn direct(&mut self, hops: &mut Hops) -> Result<(), Failure> {
+    async fn direct(&mut self, hops: &mut RobotHops) -> Result<(), DemoFailure> {
         let begin_by = Instant::now() + BEGIN_WITHIN;
         self.introduce()?;
         self.start_own("ros-master", &["master"], &[], Stage::Master)?;
@@ -125,21 +126,21 @@ impl Director<'_> {
         self.watch(begin_by, |story| story.began()).await?;
         let overdue = overdue_after(self.plan.covers, self.plan.conveyor_off_at);
         let finish_by = Instant::now() + self.plan.speed.real(overdue) + SPARE;
-        self.watch(finish_by, Story::finished).await?;
+        self.watch(finish_by, LineStory::finished).await?;
         // The last counts may still be on their way to the server. The covers have arrived in any
         // case.
-        match self.watch(Instant::now() + SPARE, Story::settled).await {
-            Ok(()) | Err(Failure::Stuck { .. }) => {}
+        match self.watch(Instant::now() + SPARE, LineStory::settled).await {
+            Ok(()) | Err(DemoFailure::Stuck { .. }) => {}
             Err(failure) => return Err(failure),
         }
-        let (measured, missing) = Hops::ask([ros1_port, ros2_port]).await;
+        let (measured, missing) = RobotHops::ask([ros1_port, ros2_port]).await;
         *hops = measured;
         missing.into_iter().for_each(|why| self.note(why));
         Ok(())
     }
 
-    fn introduce(&mut self) -> Result<(), Failure> {
-        let Plan {
+    fn introduce(&mut self) -> Result<(), DemoFailure> {
+        let OrchestraOptions {
             covers,
             speed,
             conveyor_off_at,
@@ -155,12 +156,12 @@ impl Director<'_> {
         );
         self.timeline
             .print_text(&text)
-            .map_err(Failure::io("cannot print"))
+            .map_err(DemoFailure::io("cannot print"))
     }
 
-    async fn master_uri(&mut self, by: Instant) -> Result<String, Failure> {
+    async fn master_uri(&mut self, by: Instant) -> Result<String, DemoFailure> {
         while let Some(report) = self.next_report(by).await? {
-            if let Event::Master(MasterEvent::Listening { uri }) = report {
+            if let ChildEvent::Master(MasterEvent::Listening { uri }) = report {
                 return Ok(uri);
             }
         }
@@ -168,9 +169,9 @@ impl Director<'_> {
     }
 
     /// Starts all programs except the master.
-    fn start_cell(&mut self, master_uri: &str) -> Result<(), Failure> {
+    fn start_cell(&mut self, master_uri: &str) -> Result<(), DemoFailure> {
         let mapping = self.programs.directory().join("assembly-line.yaml");
-        fs::write(&mapping, MAPPING).map_err(Failure::io("cannot write the mapping"))?;
+        fs::write(&mapping, MAPPING).map_err(DemoFailure::io("cannot write the mapping"))?;
         let mapping = mapping.display().to_string();
         let pki = |of: &str| self.programs.directory().join(of).display().to_string();
         let (server_pki, client_pki) = (pki("server-pki"), pki("supervisor-pki"));
@@ -223,8 +224,8 @@ impl Director<'_> {
         arguments: &[&str],
         environment: &[(&'static str, &str)],
         stage: Stage,
-    ) -> Result<(), Failure> {
-        self.programs.start(Program {
+    ) -> Result<(), DemoFailure> {
+        self.programs.start(ProgramStart {
             name,
             path: self.binaries.demo.clone(),
             arguments: arguments.iter().copied().map(str::to_owned).collect(),
@@ -242,8 +243,8 @@ impl Director<'_> {
         path: PathBuf,
         arguments: &[&str],
         environment: &[(&'static str, &str)],
-    ) -> Result<(), Failure> {
-        self.programs.start(Program {
+    ) -> Result<(), DemoFailure> {
+        self.programs.start(ProgramStart {
             name,
             path,
             arguments: arguments.iter().copied().map(str::to_owned).collect(),
@@ -256,7 +257,11 @@ impl Director<'_> {
     }
 
     /// Processes events until the condition is met.
-    async fn watch(&mut self, by: Instant, there: impl Fn(&Story) -> bool) -> Result<(), Failure> {
+    async fn watch(
+        &mut self,
+        by: Instant,
+        there: impl Fn(&LineStory) -> bool,
+    ) -> Result<(), DemoFailure> {
         while !there(self.story) {
             if self.next_report(by).await?.is_none() {
                 return Err(if self.story.began() {
@@ -270,58 +275,58 @@ impl Director<'_> {
     }
 
     /// Returns the next event, or `None` after the time limit. Prints due lines meanwhile.
-    async fn next_report(&mut self, by: Instant) -> Result<Option<Event>, Failure> {
+    async fn next_report(&mut self, by: Instant) -> Result<Option<ChildEvent>, DemoFailure> {
         let mut print = interval(PRINT_EVERY);
         loop {
             tokio::select! {
                 report = self.reports.recv() => match report {
-                    Some(Report::Told(stamped)) => {
+                    Some(ChildReport::Told(stamped)) => {
                         self.story.observe(&stamped);
                         if let Some((who, what)) = describe(&stamped.event) {
                             self.timeline.note(stamped.at_ns, who, what);
                         }
                         return Ok(Some(stamped.event));
                     }
-                    Some(Report::Garbled { name, line }) => {
+                    Some(ChildReport::Garbled { name, line }) => {
                         self.note(format!("{name} printed a line that is no event: {line}"));
                     }
-                    Some(Report::Ended { name, status }) => {
+                    Some(ChildReport::Ended { name, status }) => {
                         let last_lines = self.programs.last_lines(name);
                         let logs = self.programs.directory().to_owned();
-                        return Err(Failure::ChildEnded { name, status, last_lines, logs });
+                        return Err(DemoFailure::ChildEnded { name, status, last_lines, logs });
                     }
                     // No program of this scenario is killed.
-                    Some(Report::Killed { .. }) => {}
+                    Some(ChildReport::Killed { .. }) => {}
                     // The programs hold a sender, so the channel does not close before them.
                     None => return Ok(None),
                 },
                 () = sleep_until(by) => return Ok(None),
                 () = self.interrupt.come() => {
-                    return Err(Failure::Interrupted { standing: self.story.standing() });
+                    return Err(DemoFailure::Interrupted { standing: self.story.standing() });
                 }
                 _ = print.tick() => {
                     self.timeline
                         .print_before(wall_nanos(), &|at| self.story.seconds(at))
-                        .map_err(Failure::io("cannot print"))?;
+                        .map_err(DemoFailure::io("cannot print"))?;
                 }
             }
         }
     }
 
     fn note(&mut self, what: String) {
-        self.timeline.note(wall_nanos(), Who::DEMO, what);
+        self.timeline.note(wall_nanos(), EventSource::DEMO, what);
     }
 
-    fn not_begun(&self) -> Failure {
-        Failure::NotBegun {
+    fn not_begun(&self) -> DemoFailure {
+        DemoFailure::NotBegun {
             seconds: BEGIN_WITHIN.as_secs(),
             standing: self.story.standing(),
             logs: self.programs.directory().to_owned(),
         }
     }
 
-    fn stuck(&self) -> Failure {
-        Failure::Stuck {
+    fn stuck(&self) -> DemoFailure {
+        DemoFailure::Stuck {
             standing: self.story.standing(),
             logs: self.programs.directory().to_owned(),
         }

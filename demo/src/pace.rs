@@ -49,7 +49,7 @@ impl std::str::FromStr for Speed {
 /// that time. Two covers go by conveyor and two by TurtleBot3. The last cycle is long, because
 /// TurtleBot3 is away with the third cover.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) struct Pace {
+pub(crate) struct LinePace {
     /// Before the first cycle.
     pub(crate) first_rest: Duration,
     /// Between two cycles.
@@ -68,7 +68,7 @@ pub(crate) struct Pace {
     pub(crate) report_age: Duration,
 }
 
-impl Pace {
+impl LinePace {
     /// Returns all durations at a speed.
     pub(crate) fn at(speed: Speed) -> Self {
         Self {
@@ -106,7 +106,7 @@ mod tests {
 
     #[test]
     fn cycles_take_seven_and_five_seconds_in_turn() {
-        let pace = Pace::at(Speed::new(1.0).unwrap());
+        let pace = LinePace::at(Speed::new(1.0).unwrap());
         assert_eq!(pace.half_cycle(0) * 2, Duration::from_secs(7));
         assert_eq!(pace.half_cycle(1) * 2, Duration::from_secs(5));
     }
@@ -114,7 +114,7 @@ mod tests {
     #[test]
     fn speed_divides_times() {
         let speed: Speed = "20".parse().unwrap();
-        assert_eq!(Pace::at(speed).drive, Duration::from_millis(350));
+        assert_eq!(LinePace::at(speed).drive, Duration::from_millis(350));
         assert!((speed.story_seconds(1_250_000_000) - 25.0).abs() < 1e-9);
     }
 

@@ -32,23 +32,24 @@ use tokio::time::{Instant, interval, sleep_until, timeout};
 
 use self::describe::describe;
 pub(crate) use self::fact::NodeEvent;
-use self::fact::{Asked, Fact, Part};
-use self::files::{Manifest, PROCESS};
-use self::pages::{Dated, Page};
-use self::story::{Act, Order, Story};
+use self::fact::{CanRunAnswer, Fact, PlugComponent};
+use self::files::{ModuleManifest, PROCESS};
+use self::pages::{Dated, StatusPageKind};
+use self::story::{Act, ActStart, PlugStory};
 use self::watchers::Watchers;
 use crate::clock::wall_nanos;
-use crate::event::{Event, MasterEvent};
+use crate::event::{ChildEvent, MasterEvent};
 use crate::line::DOMAIN;
 use crate::pace::Speed;
 use crate::stage::{
-    Failure, Interrupt, LOOPBACK, Program, Programs, Report, Stage, Timeline, Who, address,
-    command, exit_code, find, free_port, must_be_free, open_when_served, status_of,
+    ChildReport, DemoFailure, EventPrinter, EventSource, Interrupt, LOOPBACK, ProgramStart,
+    RunningPrograms, Stage, address, command, exit_code, find, free_port, must_be_free,
+    open_when_served, status_of,
 };
 
 /// The options of the scenario.
 #[derive(Clone, Debug)]
-pub(crate) struct Plan {
+pub(crate) struct PlugOptions {
     pub(crate) speed: Speed,
     /// Whether the page is opened in a browser.
     pub(crate) open: bool,
@@ -58,14 +59,14 @@ pub(crate) struct Plan {
 }
 
 /// Plays the scenario and prints it. Returns the exit code.
-pub(crate) async fn play(plan: Plan) -> u8 {
+pub(crate) async fn play(plan: PlugOptions) -> u8 {
     let mut show = Show {
-        timeline: Timeline::open(plan.json),
-        story: Story::new(),
+        timeline: EventPrinter::open(plan.json),
+        story: PlugStory::new(),
         began_at: wall_nanos(),
     };
-    let manifest =
-        Manifest::read(plan.manifest.as_deref()).map_err(Failure::io("cannot read the manifest"));
+    let manifest = ModuleManifest::read(plan.manifest.as_deref())
+        .map_err(DemoFailure::io("cannot read the manifest"));
     let (name, outcome) = match manifest {
         Ok(manifest) => {
             let outcome = perform(&plan, &manifest, &mut show).await;
@@ -74,7 +75,7 @@ pub(crate) async fn play(plan: Plan) -> u8 {
         Err(failure) => (String::new(), Err(failure)),
     };
     let failure = outcome.as_ref().err();
-    let report = report::Report::of(
+    let report = report::PlugReport::of(
         &show.story,
         plan.speed,
         &name,
@@ -86,8 +87,8 @@ pub(crate) async fn play(plan: Plan) -> u8 {
 
 fn conclude(
     show: &mut Show,
-    report: &report::Report,
-    failure: Option<&Failure>,
+    report: &report::PlugReport,
+    failure: Option<&DemoFailure>,
     json: bool,
 ) -> std::io::Result<()> {
     show.print(None)?;
@@ -99,8 +100,8 @@ fn conclude(
 
 /// The story and its timeline.
 struct Show {
-    timeline: Timeline,
-    story: Story,
+    timeline: EventPrinter,
+    story: PlugStory,
     began_at: i64,
 }
 
@@ -123,7 +124,11 @@ impl Show {
     }
 }
 
-async fn perform(plan: &Plan, manifest: &Manifest, show: &mut Show) -> Result<(), Failure> {
+async fn perform(
+    plan: &PlugOptions,
+    manifest: &ModuleManifest,
+    show: &mut Show,
+) -> Result<(), DemoFailure> {
     let (demo, [lds, server, component, mes, bridge_ros1, bridge_ros2, tool]) = find([
         "ua-lds",
         "ua-server",
@@ -146,8 +151,8 @@ async fn perform(plan: &Plan, manifest: &Manifest, show: &mut Show) -> Result<()
     let interrupt = Interrupt::listen()?;
     must_be_free(LDS_PORT, "discovery server")?;
     must_be_free(SERVER_PORT, "OPC UA server")?;
-    let (programs, reports) =
-        Programs::prepare().map_err(Failure::io("cannot make a directory for the logs"))?;
+    let (programs, reports) = RunningPrograms::prepare()
+        .map_err(DemoFailure::io("cannot make a directory for the logs"))?;
     let (watchers, facts) = Watchers::new();
     let mut director = Director {
         plan,
@@ -182,11 +187,11 @@ struct Binaries {
 
 /// The state of a run of the scenario.
 struct Director<'a> {
-    plan: &'a Plan,
-    manifest: &'a Manifest,
+    plan: &'a PlugOptions,
+    manifest: &'a ModuleManifest,
     binaries: Binaries,
-    programs: Programs,
-    reports: mpsc::Receiver<Report>,
+    programs: RunningPrograms,
+    reports: mpsc::Receiver<ChildReport>,
     watchers: Watchers,
     facts: mpsc::Receiver<Dated>,
     interrupt: Interrupt,
@@ -196,7 +201,7 @@ struct Director<'a> {
 }
 
 impl Director<'_> {
-    async fn direct(&mut self) -> Result<(), Failure> {
+    async fn direct(&mut self) -> Result<(), DemoFailure> {
         self.introduce()?;
         let begin_by = Instant::now() + limit(Act::Cell);
         self.start_own("ros-master", &["master"], &[], Stage::Master)?;
@@ -205,14 +210,14 @@ impl Director<'_> {
         loop {
             self.watch().await?;
             let order = self.show.story.advance();
-            if order == Order::End {
+            if order == ActStart::End {
                 return Ok(());
             }
             self.obey(order).await?;
         }
     }
 
-    fn introduce(&mut self) -> Result<(), Failure> {
+    fn introduce(&mut self) -> Result<(), DemoFailure> {
         let text = format!(
             "Plug and produce: a robot and a gripper are plugged into a cell that knows nothing of \
              them; speed {}.\nTimes are seconds since the beginning; the module is {}, the logs \
@@ -224,13 +229,13 @@ impl Director<'_> {
         self.show
             .timeline
             .print_text(&text)
-            .map_err(Failure::io("cannot print"))
+            .map_err(DemoFailure::io("cannot print"))
     }
 
-    async fn master_uri(&mut self, by: Instant) -> Result<String, Failure> {
+    async fn master_uri(&mut self, by: Instant) -> Result<String, DemoFailure> {
         loop {
             match self.next(by).await? {
-                Next::Told(Event::Master(MasterEvent::Listening { uri })) => return Ok(uri),
+                Next::Told(ChildEvent::Master(MasterEvent::Listening { uri })) => return Ok(uri),
                 Next::Told(_) | Next::Seen => {}
                 Next::Late => {
                     let lacks = vec!["the ROS master does not listen".to_owned()];
@@ -241,10 +246,10 @@ impl Director<'_> {
     }
 
     /// Starts all programs that run before the first component.
-    fn start_cell(&mut self, master: &str) -> Result<(), Failure> {
+    fn start_cell(&mut self, master: &str) -> Result<(), DemoFailure> {
         let directory = self.programs.directory().to_owned();
         files::write(&directory, self.plan.speed, self.manifest)
-            .map_err(Failure::io("cannot write the files of the programs"))?;
+            .map_err(DemoFailure::io("cannot write the files of the programs"))?;
         self.questions = free_port()?;
         let path = |name: &str| directory.join(name).display().to_string();
 
@@ -254,7 +259,7 @@ impl Director<'_> {
         let binary = self.binaries.lds.clone();
         let arguments = ["--endpoint", &endpoint, "--metrics", &metrics];
         self.start("ua-lds", binary, &arguments, &[])?;
-        self.watchers.page("ua-lds", Page::Lds, port);
+        self.watchers.page("ua-lds", StatusPageKind::Lds, port);
 
         let port = free_port()?;
         let metrics = format!("{LOOPBACK}:{port}");
@@ -269,14 +274,16 @@ impl Director<'_> {
         let arguments = [&arguments[..], &own, &status].concat();
         self.start("ua-server", binary, &arguments, &[])?;
         self.tell_page(port)?;
-        self.watchers.page("ua-server", Page::Server, port);
+        self.watchers
+            .page("ua-server", StatusPageKind::Server, port);
 
         let binary = self.binaries.mes.clone();
         let yaml = files::of_mes(&directory).display().to_string();
         let sparql = format!("{LOOPBACK}:{}", self.questions);
         let arguments = [&yaml, "--interface", LOOPBACK, "--sparql", &sparql];
         self.start("ua-mes", binary, &arguments, &[])?;
-        self.watchers.page("ua-mes", Page::Mes, self.questions);
+        self.watchers
+            .page("ua-mes", StatusPageKind::Mes, self.questions);
 
         let ros1 = [("ROS_MASTER_URI", master), ("ROS_HOSTNAME", LOOPBACK)];
         let domain = DOMAIN.to_string();
@@ -298,34 +305,34 @@ impl Director<'_> {
             let metrics = format!("{LOOPBACK}:{port}");
             let arguments = ["--interface", LOOPBACK, "--metrics", &metrics];
             self.start(name, binary, &arguments, &environment)?;
-            self.watchers.page(name, Page::Bridge, port);
+            self.watchers.page(name, StatusPageKind::Bridge, port);
         }
         self.start_own("ros1-node", &["ros1-node"], &ros1, Stage::Robots)?;
         self.start_own("ros2-node", &["ros2-node"], &ros2, Stage::Robots)?;
         self.watchers
             .group()
-            .map_err(Failure::io("cannot listen in the PubSub group"))?;
+            .map_err(DemoFailure::io("cannot listen in the PubSub group"))?;
         self.watchers.graph(master.to_owned());
         Ok(())
     }
 
     /// Prints the address of the page, and opens it if wanted.
-    fn tell_page(&mut self, port: u16) -> Result<(), Failure> {
+    fn tell_page(&mut self, port: u16) -> Result<(), DemoFailure> {
         let text = format!("The page of the cell is at {}\n\n", address(port));
         let printed = self.show.timeline.print_text(&text);
         open_when_served(port, self.plan.open);
-        printed.map_err(Failure::io("cannot print"))
+        printed.map_err(DemoFailure::io("cannot print"))
     }
 
-    async fn obey(&mut self, order: Order) -> Result<(), Failure> {
+    async fn obey(&mut self, order: ActStart) -> Result<(), DemoFailure> {
         match order {
-            Order::Plug(part) => self.plug(part),
-            Order::Grasp(ros) => self
+            ActStart::Plug(part) => self.plug(part),
+            ActStart::Grasp(ros) => self
                 .programs
                 .tell(ros.node(), "grasp")
                 .await
-                .map_err(Failure::io("a node cannot be told what to do")),
-            Order::Run(number) => {
+                .map_err(DemoFailure::io("a node cannot be told what to do")),
+            ActStart::Run(number) => {
                 let tool = self.binaries.tool.clone();
                 let facts = self.watchers.facts();
                 self.watchers.spawn(async move {
@@ -340,11 +347,11 @@ impl Director<'_> {
                 });
                 Ok(())
             }
-            Order::Kill(part) => {
+            ActStart::Kill(part) => {
                 self.programs.kill(part.name());
                 Ok(())
             }
-            Order::Ask => {
+            ActStart::Ask => {
                 let tool = self.binaries.tool.clone();
                 let url = format!("http://{LOOPBACK}:{}", self.questions);
                 let asked = timeout(TOOL_LIMIT, ask(&tool, &url)).await;
@@ -355,16 +362,16 @@ impl Director<'_> {
                 }
                 Ok(())
             }
-            Order::End => Ok(()),
+            ActStart::End => Ok(()),
         }
     }
 
-    fn plug(&mut self, part: Part) -> Result<(), Failure> {
+    fn plug(&mut self, part: PlugComponent) -> Result<(), DemoFailure> {
         let yaml = files::of_part(self.programs.directory(), part);
         let arguments = [yaml.display().to_string()]
             .into_iter()
             .chain(["--interface", LOOPBACK].map(str::to_owned));
-        let started = self.programs.start(Program {
+        let started = self.programs.start(ProgramStart {
             name: part.name(),
             path: self.binaries.component.clone(),
             arguments: arguments.collect(),
@@ -383,8 +390,8 @@ impl Director<'_> {
         path: PathBuf,
         arguments: &[&str],
         environment: &[(&'static str, &str)],
-    ) -> Result<(), Failure> {
-        self.programs.start(Program {
+    ) -> Result<(), DemoFailure> {
+        self.programs.start(ProgramStart {
             name,
             path,
             arguments: arguments.iter().copied().map(str::to_owned).collect(),
@@ -402,8 +409,8 @@ impl Director<'_> {
         arguments: &[&str],
         environment: &[(&'static str, &str)],
         stage: Stage,
-    ) -> Result<(), Failure> {
-        self.programs.start(Program {
+    ) -> Result<(), DemoFailure> {
+        self.programs.start(ProgramStart {
             name,
             path: self.binaries.demo.clone(),
             arguments: arguments.iter().copied().map(str::to_owned).collect(),
@@ -416,7 +423,7 @@ impl Director<'_> {
     }
 
     /// Processes facts until the act is over.
-    async fn watch(&mut self) -> Result<(), Failure> {
+    async fn watch(&mut self) -> Result<(), DemoFailure> {
         let act = self.show.story.act();
         let by = Instant::now() + limit(act);
         loop {
@@ -431,30 +438,30 @@ impl Director<'_> {
     }
 
     /// Returns the next event. Prints due lines meanwhile.
-    async fn next(&mut self, by: Instant) -> Result<Next, Failure> {
+    async fn next(&mut self, by: Instant) -> Result<Next, DemoFailure> {
         let mut print = interval(PRINT_EVERY);
         loop {
             tokio::select! {
                 report = self.reports.recv() => match report {
-                    Some(Report::Told(told)) => {
-                        if let Event::Node(event) = &told.event {
+                    Some(ChildReport::Told(told)) => {
+                        if let ChildEvent::Node(event) = &told.event {
                             self.show.takes(told.at_ns, &Fact::Node(event.clone()));
                         }
                         return Ok(Next::Told(told.event));
                     }
-                    Some(Report::Garbled { name, line }) => {
+                    Some(ChildReport::Garbled { name, line }) => {
                         self.note(format!("{name} printed a line that is no event: {line}"));
                     }
-                    Some(Report::Killed { name, at_ns }) => {
-                        if let Some(part) = Part::of_name(name) {
+                    Some(ChildReport::Killed { name, at_ns }) => {
+                        if let Some(part) = PlugComponent::of_name(name) {
                             self.show.takes(at_ns, &Fact::Killed(part));
                             return Ok(Next::Seen);
                         }
                     }
-                    Some(Report::Ended { name, status }) => {
+                    Some(ChildReport::Ended { name, status }) => {
                         let last_lines = self.programs.last_lines(name);
                         let logs = self.programs.directory().to_owned();
-                        return Err(Failure::ChildEnded { name, status, last_lines, logs });
+                        return Err(DemoFailure::ChildEnded { name, status, last_lines, logs });
                     }
                     // The programs hold a sender, so the channel does not close before them.
                     None => return Ok(Next::Late),
@@ -466,31 +473,33 @@ impl Director<'_> {
                 () = sleep_until(by) => return Ok(Next::Late),
                 () = self.interrupt.come() => {
                     let standing = self.show.story.missing().map_or_else(|why| why, |lacks| lacks.join("; "));
-                    return Err(Failure::Interrupted { standing });
+                    return Err(DemoFailure::Interrupted { standing });
                 }
                 _ = print.tick() => {
                     self.show
                         .print(Some(wall_nanos()))
-                        .map_err(Failure::io("cannot print"))?;
+                        .map_err(DemoFailure::io("cannot print"))?;
                 }
             }
         }
     }
 
     fn note(&mut self, what: String) {
-        self.show.timeline.note(wall_nanos(), Who::DEMO, what);
+        self.show
+            .timeline
+            .note(wall_nanos(), EventSource::DEMO, what);
     }
 
-    fn missed(&self, act: Act, lacks: Vec<String>) -> Failure {
-        Failure::Missed {
+    fn missed(&self, act: Act, lacks: Vec<String>) -> DemoFailure {
+        DemoFailure::Missed {
             seconds: limit(act).as_secs(),
             lacks,
             logs: self.programs.directory().to_owned(),
         }
     }
 
-    fn broken(&self, why: String) -> Failure {
-        Failure::Broken {
+    fn broken(&self, why: String) -> DemoFailure {
+        DemoFailure::Broken {
             why,
             logs: self.programs.directory().to_owned(),
         }
@@ -500,7 +509,7 @@ impl Director<'_> {
 /// The next event.
 enum Next {
     /// An event of a process of the demo.
-    Told(Event),
+    Told(ChildEvent),
     /// A fact was observed, and the story has processed it.
     Seen,
     /// The time limit has passed.
@@ -532,7 +541,7 @@ async fn call(tool: &Path) -> (bool, String) {
 }
 
 /// Queries which skills and services can run.
-async fn ask(tool: &Path, url: &str) -> Result<Asked, String> {
+async fn ask(tool: &Path, url: &str) -> Result<CanRunAnswer, String> {
     let output = command(tool)
         .args(["ask", "what-can-run", "--url", url, "--json"])
         .stdin(Stdio::null())
@@ -564,7 +573,7 @@ struct Answer {
 impl Answer {
     /// Counts skills and services, and lists incomplete rows: without capability, parameters or
     /// endpoint.
-    fn count(&self) -> Asked {
+    fn count(&self) -> CanRunAnswer {
         let text = |row: &Map<String, Value>, column: &str| {
             let value = row.get(column).and_then(Value::as_str);
             value.unwrap_or_default().to_owned()
@@ -584,7 +593,7 @@ impl Answer {
             let has_capability = list("capabilities").is_some_and(|list| !list.is_empty());
             !has_capability || list("parameters").is_none() || text(row, "endpoint").is_empty()
         };
-        Asked {
+        CanRunAnswer {
             skills: of_kind("skill"),
             services: of_kind("service"),
             incomplete: self
@@ -658,7 +667,7 @@ mod tests {
             row("service", "Dose", &["urn:dose"], None),
         ]});
         let answer: Answer = serde_json::from_value(answer).unwrap();
-        let expected = Asked {
+        let expected = CanRunAnswer {
             skills: 3,
             services: 1,
             incomplete: vec!["c Release".to_owned(), "c Dose".to_owned()],

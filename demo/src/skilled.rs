@@ -26,27 +26,28 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use serde::Deserialize;
-use skills::{ClientOptions, Detector, Runs, SkillClient, TypeName};
+use skills::{ClientOptions, Detector, ParameterType, RunnableSkill, SkillClient};
 use tokio::sync::{mpsc, watch};
 use tokio::time::{Instant, interval, sleep, timeout};
 
 use self::cell::{CONVEYOR, MAPPING, PARTS};
 pub(crate) use self::fact::MachineEvent;
-use self::line::{Line, Teller};
-use self::report::{Report, Run};
-use self::world::World;
+use self::line::{ProgressReporter, SkilledLine};
+use self::report::{SkilledReport, SkilledRun};
+use self::world::CoverLocations;
 use crate::clock::{millis, wall_nanos};
-use crate::event::{Event, MasterEvent};
+use crate::event::{ChildEvent, MasterEvent};
 use crate::line::DOMAIN;
 use crate::pace::Speed;
 use crate::stage::{
-    Failure, Hops, Interrupt, LOOPBACK, Program, Programs, Report as Told, Stage, Stop, Timeline,
-    Who, address, exit_code, fetch, find, free_port, must_be_free, open_when_served, status_of,
+    ChildReport as Told, DemoFailure, EventPrinter, EventSource, Interrupt, LOOPBACK, ProgramStart,
+    RobotHops, RunningPrograms, Stage, StopReason, address, exit_code, fetch, find, free_port,
+    must_be_free, open_when_served, status_of,
 };
 
 /// The options of the scenario.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Plan {
+pub(crate) struct SkilledOptions {
     pub(crate) covers: u32,
     pub(crate) speed: Speed,
     /// Whether the page is opened in a browser.
@@ -55,13 +56,13 @@ pub(crate) struct Plan {
 }
 
 /// Plays the scenario and prints it. Returns the exit code.
-pub(crate) async fn play(plan: Plan) -> u8 {
+pub(crate) async fn play(plan: SkilledOptions) -> u8 {
     let show = Show {
-        timeline: RefCell::new(Timeline::open(plan.json)),
-        report: RefCell::new(Report {
+        timeline: RefCell::new(EventPrinter::open(plan.json)),
+        report: RefCell::new(SkilledReport {
             speed: plan.speed.factor(),
             covers: plan.covers,
-            ..Report::default()
+            ..SkilledReport::default()
         }),
         began_at: wall_nanos(),
         under_way: Cell::new(UnderWay::now()),
@@ -77,8 +78,8 @@ pub(crate) async fn play(plan: Plan) -> u8 {
 
 /// The printed output.
 struct Show {
-    timeline: RefCell<Timeline>,
-    report: RefCell<Report>,
+    timeline: RefCell<EventPrinter>,
+    report: RefCell<SkilledReport>,
     began_at: i64,
     /// The current or last run.
     under_way: Cell<UnderWay>,
@@ -106,11 +107,11 @@ impl UnderWay {
 }
 
 impl Show {
-    fn note(&self, who: Who, what: String) {
+    fn note(&self, who: EventSource, what: String) {
         self.note_at(wall_nanos(), who, what);
     }
 
-    fn note_at(&self, at_ns: i64, who: Who, what: String) {
+    fn note_at(&self, at_ns: i64, who: EventSource, what: String) {
         let mut timeline = self.timeline.borrow_mut();
         timeline.note(at_ns, who, what);
         let began_at = self.began_at;
@@ -128,7 +129,7 @@ impl Show {
     }
 }
 
-impl Teller for Show {
+impl ProgressReporter for Show {
     fn begins(&self, skill: &str, what: &str) {
         self.under_way.set(UnderWay::now());
         self.note(LINE, format!("{skill} begins: {what}"));
@@ -138,7 +139,7 @@ impl Teller for Show {
         let UnderWay {
             since, acted_ms, ..
         } = self.under_way.get();
-        let run = Run {
+        let run = SkilledRun {
             skill: skill.to_owned(),
             what: what.to_owned(),
             message: message.to_owned(),
@@ -156,7 +157,7 @@ impl Teller for Show {
     }
 }
 
-async fn perform(plan: Plan, show: &Show) -> Result<(), Failure> {
+async fn perform(plan: SkilledOptions, show: &Show) -> Result<(), DemoFailure> {
     let (demo, [lds, component, bridge_ros1, bridge_ros2, tool]) = find([
         "ua-lds",
         "ua-component",
@@ -166,10 +167,10 @@ async fn perform(plan: Plan, show: &Show) -> Result<(), Failure> {
     ])?;
     let mut interrupt = Interrupt::listen()?;
     must_be_free(LDS_PORT, "discovery server")?;
-    let (programs, reports) =
-        Programs::prepare().map_err(Failure::io("cannot make a directory for the logs"))?;
+    let (programs, reports) = RunningPrograms::prepare()
+        .map_err(DemoFailure::io("cannot make a directory for the logs"))?;
     let transport = plan.speed.real(TRANSPORT_SECONDS);
-    let (seen, world) = watch::channel(World::new(plan.covers, transport));
+    let (seen, world) = watch::channel(CoverLocations::new(plan.covers, transport));
     let mut story = Story {
         plan,
         binaries: Binaries {
@@ -198,16 +199,16 @@ async fn perform(plan: Plan, show: &Show) -> Result<(), Failure> {
     let (master, killed) = (watcher.master.subscribe(), watcher.killed.subscribe());
     let played = tokio::select! {
         played = story.play(master, killed) => played,
-        (name, status) = watcher.watch() => Err(Stop::Ended(name, status)),
-        () = interrupt.come() => Err(Stop::Interrupted),
+        (name, status) = watcher.watch() => Err(StopReason::Ended(name, status)),
+        () = interrupt.come() => Err(StopReason::Interrupted),
     };
     watcher.reports.close();
     let outcome = played.map_err(|stop| story.failure(stop));
     if outcome.is_ok() {
-        let (hops, missing) = Hops::ask(story.bridges).await;
+        let (hops, missing) = RobotHops::ask(story.bridges).await;
         show.report.borrow_mut().hops = hops;
         for why in missing {
-            show.note(Who::DEMO, why);
+            show.note(EventSource::DEMO, why);
         }
     }
     {
@@ -223,7 +224,7 @@ async fn perform(plan: Plan, show: &Show) -> Result<(), Failure> {
 /// Receives the events of the machines and updates the world.
 struct Watcher<'a> {
     reports: mpsc::Receiver<Told>,
-    seen: watch::Sender<World>,
+    seen: watch::Sender<CoverLocations>,
     /// The URI of the ROS master.
     master: watch::Sender<Option<String>>,
     /// Time at which the conveyor was killed, in nanoseconds since 1970.
@@ -241,7 +242,7 @@ impl Watcher<'_> {
                     Some(Told::Ended { name, status }) => return (name, status),
                     Some(Told::Told(stamped)) => self.heard(&stamped.event, stamped.at_ns),
                     Some(Told::Garbled { name, line }) => {
-                        self.show.note(Who::DEMO, format!("{name} printed a line that is no event: {line}"));
+                        self.show.note(EventSource::DEMO, format!("{name} printed a line that is no event: {line}"));
                     }
                     Some(Told::Killed { name, at_ns }) if name == BELT_NODE => {
                         self.see(MachineEvent::Belt { runs: false }, at_ns);
@@ -256,13 +257,16 @@ impl Watcher<'_> {
         }
     }
 
-    fn heard(&self, event: &Event, at_ns: i64) {
+    fn heard(&self, event: &ChildEvent, at_ns: i64) {
         match event {
-            Event::Master(MasterEvent::Listening { uri }) => {
+            ChildEvent::Master(MasterEvent::Listening { uri }) => {
                 self.master.send_replace(Some(uri.clone()));
             }
-            Event::Machine(event) => self.see(*event, at_ns),
-            Event::Niryo(_) | Event::Turtlebot(_) | Event::Supervisor(_) | Event::Node(_) => {}
+            ChildEvent::Machine(event) => self.see(*event, at_ns),
+            ChildEvent::Niryo(_)
+            | ChildEvent::Turtlebot(_)
+            | ChildEvent::Supervisor(_)
+            | ChildEvent::Node(_) => {}
         }
     }
 
@@ -279,7 +283,7 @@ impl Watcher<'_> {
     }
 }
 
-fn describe(event: MachineEvent) -> (Who, String) {
+fn describe(event: MachineEvent) -> (EventSource, String) {
     match event {
         MachineEvent::Grasps { .. } => (ARM, "closes its gripper".to_owned()),
         MachineEvent::Releases { .. } => (ARM, "opens its gripper".to_owned()),
@@ -301,9 +305,9 @@ struct Binaries {
 }
 
 struct Story<'a> {
-    plan: Plan,
+    plan: SkilledOptions,
     binaries: Binaries,
-    programs: Programs,
+    programs: RunningPrograms,
     /// The port of the status page of the discovery server.
     page: u16,
     /// The port of the page of the cell.
@@ -311,7 +315,7 @@ struct Story<'a> {
     /// The ports of the status pages of the ROS 1 bridge and of the ROS 2 bridge.
     bridges: [u16; 2],
     transport: Duration,
-    world: watch::Receiver<World>,
+    world: watch::Receiver<CoverLocations>,
     show: &'a Show,
 }
 
@@ -328,8 +332,8 @@ struct Registered {
 }
 
 /// The skills of the line, and the sessions that run them.
-struct Found {
-    line: Line,
+struct LineSessions {
+    line: SkilledLine,
     sessions: Vec<SkillClient>,
 }
 
@@ -338,11 +342,11 @@ impl Story<'_> {
         &mut self,
         master: watch::Receiver<Option<String>>,
         killed: watch::Receiver<Option<i64>>,
-    ) -> Result<(), Stop> {
+    ) -> Result<(), StopReason> {
         self.introduce()?;
         self.start_all(master).await?;
         let began = Instant::now();
-        let Found { line, sessions } = self.find(began).await?;
+        let LineSessions { line, sessions } = self.find(began).await?;
         self.show.report.borrow_mut().found_ms = Some(elapsed(began));
         let text = format!("all skills are found after {:.0} ms", elapsed(began));
         self.show.note(LINE, text);
@@ -364,21 +368,23 @@ impl Story<'_> {
         for session in sessions {
             session.close().await;
         }
-        done.map_err(Stop::Broken)?;
+        done.map_err(StopReason::Broken)?;
         let mut world = self.world.clone();
         let arrived = world.wait_for(|world| world.delivered() == covers);
         match timeout(SPARE, arrived).await {
             Ok(Ok(_)) => {}
             Ok(Err(_)) | Err(_) => {
                 let standing = self.world.borrow().standing();
-                return Err(Stop::Broken(format!("the line is done, and {standing}")));
+                return Err(StopReason::Broken(format!(
+                    "the line is done, and {standing}"
+                )));
             }
         }
-        show.note(Who::DEMO, "all covers have arrived".to_owned());
+        show.note(EventSource::DEMO, "all covers have arrived".to_owned());
         Ok(())
     }
 
-    fn introduce(&self) -> Result<(), Failure> {
+    fn introduce(&self) -> Result<(), DemoFailure> {
         let text = format!(
             "The fault-tolerant product assembly line: {} covers, a conveyor that dies, speed {}.\nTimes are seconds since the beginning; the \
              page of the cell is at {}, the logs are in {}.\n\n",
@@ -388,18 +394,24 @@ impl Story<'_> {
             self.programs.directory().display()
         );
         let printed = self.show.timeline.borrow_mut().print_text(&text);
-        printed.map_err(Failure::io("cannot print"))
+        printed.map_err(DemoFailure::io("cannot print"))
     }
 
-    async fn start_all(&mut self, mut master: watch::Receiver<Option<String>>) -> Result<(), Stop> {
+    async fn start_all(
+        &mut self,
+        mut master: watch::Receiver<Option<String>>,
+    ) -> Result<(), StopReason> {
         let directory = self.programs.directory().to_owned();
-        cell::write(&directory).map_err(Failure::io("cannot write the files of the programs"))?;
+        cell::write(&directory)
+            .map_err(DemoFailure::io("cannot write the files of the programs"))?;
         self.start_own("ros-master", &["master"], &[], Stage::Master)?;
         let listens = timeout(SPARE, master.wait_for(Option::is_some)).await;
         let master = match listens {
             Ok(Ok(uri)) => uri.clone().unwrap_or_default(),
             Ok(Err(_)) | Err(_) => {
-                return Err(Stop::Broken("the ROS master does not listen".to_owned()));
+                return Err(StopReason::Broken(
+                    "the ROS master does not listen".to_owned(),
+                ));
             }
         };
         let domain = DOMAIN.to_string();
@@ -469,7 +481,7 @@ impl Story<'_> {
         arguments: &[&str],
         environment: &[(&'static str, &str)],
         stage: Stage,
-    ) -> Result<(), Failure> {
+    ) -> Result<(), DemoFailure> {
         let demo = self.binaries.demo.clone();
         self.program((name, demo), arguments, environment, (stage, true))
     }
@@ -480,7 +492,7 @@ impl Story<'_> {
         arguments: &[&str],
         environment: &[(&'static str, &str)],
         stage: Stage,
-    ) -> Result<(), Failure> {
+    ) -> Result<(), DemoFailure> {
         self.program(program, arguments, environment, (stage, false))
     }
 
@@ -490,9 +502,9 @@ impl Story<'_> {
         arguments: &[&str],
         environment: &[(&'static str, &str)],
         (stage, tells): (Stage, bool),
-    ) -> Result<(), Failure> {
+    ) -> Result<(), DemoFailure> {
         let environment = environment.iter();
-        self.programs.start(Program {
+        self.programs.start(ProgramStart {
             name,
             path,
             arguments: arguments.iter().copied().map(str::to_owned).collect(),
@@ -507,7 +519,7 @@ impl Story<'_> {
     }
 
     /// Finds the skills of the line by their types, in any component.
-    async fn find(&self, began: Instant) -> Result<Found, Stop> {
+    async fn find(&self, began: Instant) -> Result<LineSessions, StopReason> {
         let detector = Detector::new(ClientOptions {
             application_name: "assembly line".to_owned(),
             ..ClientOptions::default()
@@ -516,13 +528,13 @@ impl Story<'_> {
         let told = self.tell_of_servers(&detector);
         let found = async {
             let mut sessions = Vec::new();
-            let mut skills: Vec<Arc<dyn Runs>> = Vec::new();
+            let mut skills: Vec<Arc<dyn RunnableSkill>> = Vec::new();
             for of in [
                 "PickAndPlaceSkillType",
                 "RunConveyorSkillType",
                 "NavigateToSkillType",
             ] {
-                let of = TypeName::own(of);
+                let of = ParameterType::own(of);
                 let one = detector.one(&of, FOUND, |_| true).await?;
                 let (session, handle) = detector.open(&one).await?;
                 sessions.push(session);
@@ -532,12 +544,12 @@ impl Story<'_> {
         };
         let (sessions, skills) = tokio::select! {
             found = found => found.map_err(|fault| {
-                Stop::Broken(format!("the line is not complete after {:.0} ms: {fault}", elapsed(began)))
+                StopReason::Broken(format!("the line is not complete after {:.0} ms: {fault}", elapsed(began)))
             })?,
-            () = told => return Err(Stop::Broken("the demo looks no longer".to_owned())),
+            () = told => return Err(StopReason::Broken("the demo looks no longer".to_owned())),
         };
         if let Ok([pick_and_place, conveyor, base]) = <[_; 3]>::try_from(skills) {
-            line = Some(Line {
+            line = Some(SkilledLine {
                 pick_and_place,
                 conveyor,
                 base,
@@ -545,8 +557,9 @@ impl Story<'_> {
                 within: WITHIN,
             });
         }
-        let line = line.ok_or_else(|| Stop::Broken("there are not three skills".to_owned()))?;
-        Ok(Found { line, sessions })
+        let line =
+            line.ok_or_else(|| StopReason::Broken("there are not three skills".to_owned()))?;
+        Ok(LineSessions { line, sessions })
     }
 
     /// Reports the registered servers to a detector until the future is dropped.
@@ -567,14 +580,19 @@ impl Story<'_> {
         }
     }
 
-    fn failure(&self, stop: Stop) -> Failure {
+    fn failure(&self, stop: StopReason) -> DemoFailure {
         stop.failure(&self.programs, || self.world.borrow().standing())
     }
 }
 
 /// Kills the machine and the component of the conveyor while the arm carries the third cover to it,
 /// or the last cover if there are fewer.
-async fn strike(programs: &Programs, mut world: watch::Receiver<World>, covers: u32, show: &Show) {
+async fn strike(
+    programs: &RunningPrograms,
+    mut world: watch::Receiver<CoverLocations>,
+    covers: u32,
+    show: &Show,
+) {
     let left = covers.saturating_sub(STRIKES_AT);
     let carried = world.wait_for(|world| world.is_held() && world.in_storage() <= left);
     if carried.await.is_ok() {
@@ -588,7 +606,11 @@ async fn strike(programs: &Programs, mut world: watch::Receiver<World>, covers: 
 }
 
 /// Records the time until the line detects the loss of the conveyor.
-async fn learn(conveyor: &dyn Runs, mut killed: watch::Receiver<Option<i64>>, show: &Show) {
+async fn learn(
+    conveyor: &dyn RunnableSkill,
+    mut killed: watch::Receiver<Option<i64>>,
+    show: &Show,
+) {
     let why = conveyor.lost().await;
     let now = wall_nanos();
     show.note(LINE, format!("the conveyor is lost: {why}"));
@@ -603,10 +625,10 @@ fn elapsed(since: Instant) -> f64 {
     since.elapsed().as_secs_f64() * 1e3
 }
 
-const LINE: Who = Who("line", "35");
-const ARM: Who = Who("Niryo Ned", "33");
-const BELT: Who = Who("conveyor", "31");
-const BASE: Who = Who("TurtleBot3", "36");
+const LINE: EventSource = EventSource("line", "35");
+const ARM: EventSource = EventSource("Niryo Ned", "33");
+const BELT: EventSource = EventSource("conveyor", "31");
+const BASE: EventSource = EventSource("TurtleBot3", "36");
 /// The machine of the conveyor.
 const BELT_NODE: &str = "conveyor";
 const LDS_PORT: u16 = 4840;

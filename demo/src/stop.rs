@@ -8,14 +8,14 @@ use tokio::signal::unix::{Signal, SignalKind, signal};
 use tokio::time::{Interval, interval};
 
 /// Waits for a reason to end.
-pub(crate) struct Stop {
+pub(crate) struct EndSignal {
     terminate: Signal,
     interrupt: Signal,
     parent: Option<Pid>,
     look: Interval,
 }
 
-impl Stop {
+impl EndSignal {
     pub(crate) fn new() -> io::Result<Self> {
         Ok(Self {
             terminate: signal(SignalKind::terminate())?,

@@ -16,14 +16,14 @@ use tokio::sync::mpsc;
 use tokio::time::{Instant, sleep, sleep_until, timeout};
 
 use crate::clock::wall_nanos;
-use crate::event::{SupervisorEvent, Value, tell, tell_at};
-use crate::line::{ENDPOINT, NAMESPACE, Name, SWITCH_NODE};
-use crate::stop::Stop;
+use crate::event::{LineValue, SupervisorEvent, tell, tell_at};
+use crate::line::{ENDPOINT, LineValueName, NAMESPACE, SWITCH_NODE};
+use crate::stop::EndSignal;
 
 /// Starts the line when the server has all its values and its switch. Switches the conveyor off
 /// after `off_after`, and monitors the values until the process is stopped.
 pub(crate) async fn run(off_after: Duration, pki: PathBuf) -> anyhow::Result<()> {
-    let mut stop = Stop::new()?;
+    let mut stop = EndSignal::new()?;
     tokio::select! {
         result = supervise(off_after, pki) => result,
         () = stop.wait() => Ok(()),
@@ -121,11 +121,11 @@ async fn namespace_index(session: &Session) -> anyhow::Result<u16> {
 async fn subscribe(
     session: &Session,
     namespace: u16,
-) -> anyhow::Result<mpsc::Receiver<(Name, DataValue)>> {
+) -> anyhow::Result<mpsc::Receiver<(LineValueName, DataValue)>> {
     let (sender, receiver) = mpsc::channel(1024);
     let callback = DataChangeCallback::new(move |value, item: &MonitoredItem| {
         let node = &item.item_to_monitor().node_id;
-        let name = Name::ALL.into_iter().find(|name| is(node, *name));
+        let name = LineValueName::ALL.into_iter().find(|name| is(node, *name));
         if let Some(name) = name
             && sender.try_send((name, value)).is_err()
         {
@@ -136,7 +136,7 @@ async fn subscribe(
         .create_subscription(PUBLISHING_INTERVAL, 1000, 100, 0, 0, true, callback)
         .await
         .map_err(|error| anyhow!("no subscription at the OPC UA server: {error}"))?;
-    let items = Name::ALL.into_iter().map(|name| {
+    let items = LineValueName::ALL.into_iter().map(|name| {
         MonitoredItemCreateRequest::new(
             NodeId::new(namespace, name.node()).into(),
             MonitoringMode::Reporting,
@@ -153,7 +153,7 @@ async fn subscribe(
         .create_monitored_items(subscription, TimestampsToReturn::Both, items.collect())
         .await
         .map_err(|error| anyhow!("the values cannot be monitored: {error}"))?;
-    for (name, item) in Name::ALL.into_iter().zip(created) {
+    for (name, item) in LineValueName::ALL.into_iter().zip(created) {
         let status = item.result.status_code;
         if !status.is_good() {
             bail!("{name} cannot be monitored: {status}");
@@ -162,7 +162,7 @@ async fn subscribe(
     Ok(receiver)
 }
 
-fn is(node: &NodeId, name: Name) -> bool {
+fn is(node: &NodeId, name: LineValueName) -> bool {
     matches!(&node.identifier, Identifier::Numeric(number) if *number == name.node())
 }
 
@@ -253,7 +253,7 @@ async fn object_of(session: &Session, method: &NodeId) -> anyhow::Result<Option<
 
 /// The last value of each variable.
 struct Watch {
-    last: std::collections::BTreeMap<Name, Value>,
+    last: std::collections::BTreeMap<LineValueName, LineValue>,
 }
 
 impl Watch {
@@ -268,15 +268,15 @@ impl Watch {
         self.missing().is_empty()
     }
 
-    fn missing(&self) -> Vec<Name> {
-        Name::ALL
+    fn missing(&self) -> Vec<LineValueName> {
+        LineValueName::ALL
             .into_iter()
             .filter(|name| !self.last.contains_key(name))
             .collect()
     }
 
     /// Reports a value if it is good and new.
-    fn see(&mut self, name: Name, data: &DataValue) -> anyhow::Result<()> {
+    fn see(&mut self, name: LineValueName, data: &DataValue) -> anyhow::Result<()> {
         let status = data.status.unwrap_or(StatusCode::Good);
         if !status.is_good() {
             tracing::info!(%name, %status, "received a value that is not Good");
@@ -288,8 +288,8 @@ impl Watch {
             return Ok(());
         }
         let value = match data.value {
-            Some(Variant::Boolean(value)) => Value::Boolean(value),
-            Some(Variant::UInt32(value)) => Value::Number(value),
+            Some(Variant::Boolean(value)) => LineValue::Boolean(value),
+            Some(Variant::UInt32(value)) => LineValue::Number(value),
             _ => bail!(
                 "{name} is {:?} at the OPC UA server, no Boolean or UInt32",
                 data.value
@@ -337,9 +337,9 @@ mod tests {
     #[test]
     fn the_line_starts_when_all_values_are_there() {
         let mut watch = Watch::new();
-        for name in Name::ALL {
+        for name in LineValueName::ALL {
             assert!(!watch.complete(), "{name}");
-            watch.last.insert(name, Value::Number(0));
+            watch.last.insert(name, LineValue::Number(0));
         }
         assert!(watch.complete());
     }

@@ -5,14 +5,14 @@
 mod report;
 mod tip;
 
-use self::report::{Report, Visit};
+use self::report::{BlockVisit, TerminalsReport};
 use self::tip::Tip;
 use crate::pace::Speed;
-use crate::stage::{Failure, MES_WHO, MesCell, Show, Stop, Who, watched};
+use crate::stage::{DemoFailure, EventSource, MES_WHO, MesCell, Show, StopReason, watched};
 
 /// The options of the scenario.
 #[derive(Clone, Debug)]
-pub(crate) struct Plan {
+pub(crate) struct TerminalsOptions {
     pub(crate) speed: Speed,
     pub(crate) json: bool,
 }
@@ -50,17 +50,21 @@ const BLOCKS: [[[f64; 3]; 2]; 3] = [
 const NEAR_MM: f64 = 0.1;
 
 /// Plays the scenario and prints it. Returns the exit code.
-pub(crate) async fn play(plan: Plan) -> u8 {
+pub(crate) async fn play(plan: TerminalsOptions) -> u8 {
     let mut show = Show::open(plan.json);
-    let mut report = Report {
+    let mut report = TerminalsReport {
         speed: plan.speed.factor(),
-        ..Report::default()
+        ..TerminalsReport::default()
     };
     let outcome = perform(&plan, &mut show, &mut report).await;
     show.conclude(&outcome, &report, &report.table())
 }
 
-async fn perform(plan: &Plan, show: &mut Show, report: &mut Report) -> Result<(), Failure> {
+async fn perform(
+    plan: &TerminalsOptions,
+    show: &mut Show,
+    report: &mut TerminalsReport,
+) -> Result<(), DemoFailure> {
     let title = "Terminals: a robot, a tool changer and a gripper place terminal blocks on a rail";
     let (cell, mut reports) = MesCell::prepare(&PORTS, show, title, plan.speed)?;
     let mut story = Story {
@@ -79,20 +83,20 @@ async fn perform(plan: &Plan, show: &mut Show, report: &mut Report) -> Result<()
 }
 
 struct Story<'a> {
-    plan: &'a Plan,
+    plan: &'a TerminalsOptions,
     cell: MesCell,
     show: &'a mut Show,
-    report: &'a mut Report,
+    report: &'a mut TerminalsReport,
 }
 
 impl Story<'_> {
-    async fn play(&mut self) -> Result<(), Stop> {
+    async fn play(&mut self) -> Result<(), StopReason> {
         self.start_all()?;
         let ms = self.cell.mes.planned(PROCESS, true).await?;
         let text = format!("each step of the process has a skill after {ms:.0} ms");
         self.show.note(MES_WHO, text)?;
         let tip = Tip::follow(BLOCKS.into_iter().flatten().collect()).await;
-        let tip = tip.map_err(|why| Stop::Broken(format!("the simulated robot: {why}")))?;
+        let tip = tip.map_err(|why| StopReason::Broken(format!("the simulated robot: {why}")))?;
         let number = self.cell.mes.start(PROCESS).await?;
         let names = PARTS.map(|(name, _)| name);
         let followed = self
@@ -104,14 +108,14 @@ impl Story<'_> {
         followed?;
         let far = self.report.visits.iter().find(|visit| visit.is_far());
         if let Some(far) = far {
-            return Err(Stop::Broken(format!("the fingers were not at {far}")));
+            return Err(StopReason::Broken(format!("the fingers were not at {far}")));
         }
         let text = "three terminal blocks are on the rail".to_owned();
-        self.show.note(Who::DEMO, text)?;
+        self.show.note(EventSource::DEMO, text)?;
         Ok(())
     }
 
-    fn start_all(&mut self) -> Result<(), Failure> {
+    fn start_all(&mut self) -> Result<(), DemoFailure> {
         self.cell.write("mes.yaml", MES)?;
         self.cell.write("capabilities.ttl", CAPABILITIES)?;
         for (name, text) in PARTS {
@@ -135,11 +139,11 @@ impl Story<'_> {
 }
 
 /// Returns the visits of the fingers, by the smallest distances from the blocks and their places.
-fn visits(nearest_mm: &[f64]) -> Vec<Visit> {
+fn visits(nearest_mm: &[f64]) -> Vec<BlockVisit> {
     let pairs = nearest_mm.chunks(2).zip(1..);
     let visits = pairs.flat_map(|(pair, block)| {
         let names = ["its magazine", "the rail"];
-        pair.iter().zip(names).map(move |(mm, at)| Visit {
+        pair.iter().zip(names).map(move |(mm, at)| BlockVisit {
             block,
             at,
             nearest_mm: *mm,
@@ -148,7 +152,7 @@ fn visits(nearest_mm: &[f64]) -> Vec<Visit> {
     visits.collect()
 }
 
-impl Visit {
+impl BlockVisit {
     fn is_far(&self) -> bool {
         self.nearest_mm > NEAR_MM
     }

@@ -20,21 +20,22 @@ use std::time::Duration;
 use plant_opcua::client::SecurityChoice;
 use serde_json::Value as Json;
 use skills::{
-    ClientOptions, Outcome, Runs as _, SkillClient, SkillFault, SkillHandle, TypeName, Value,
+    ClientOptions, ParameterType, RunOutcome, RunnableSkill as _, SkillClient, SkillFault,
+    SkillHandle, SkillValue,
 };
 use tokio::time::{Instant, sleep, timeout};
 
-use self::cell::{CHANGER, DEVICE_PORTS, FINGERS, HANDLING, PARTS, Part, VACUUM};
-use self::report::{Report, Run};
+use self::cell::{CHANGER, DEVICE_PORTS, FINGERS, HANDLING, PARTS, ToolsComponent, VACUUM};
+use self::report::{ToolsReport, ToolsRun};
 use crate::pace::Speed;
 use crate::stage::{
-    Failure, LOOPBACK, Programs, Show, Stage, Stop, Who, address, fetch, find, free_port,
-    must_be_free, open_when_served, watched,
+    DemoFailure, EventSource, LOOPBACK, RunningPrograms, Show, Stage, StopReason, address, fetch,
+    find, free_port, must_be_free, open_when_served, watched,
 };
 
 /// The options of the scenario.
 #[derive(Clone, Debug)]
-pub(crate) struct Plan {
+pub(crate) struct ToolsOptions {
     pub(crate) speed: Speed,
     /// Whether the page is opened in a browser.
     pub(crate) open: bool,
@@ -44,26 +45,30 @@ pub(crate) struct Plan {
 }
 
 /// Plays the scenario and prints it. Returns the exit code.
-pub(crate) async fn play(plan: Plan) -> u8 {
+pub(crate) async fn play(plan: ToolsOptions) -> u8 {
     let mut show = Show::open(plan.json);
-    let mut report = Report {
+    let mut report = ToolsReport {
         speed: plan.speed.factor(),
         swapped: plan.swapped,
-        ..Report::default()
+        ..ToolsReport::default()
     };
     let outcome = perform(&plan, &mut show, &mut report).await;
     show.conclude(&outcome, &report, &report.table())
 }
 
-async fn perform(plan: &Plan, show: &mut Show, report: &mut Report) -> Result<(), Failure> {
+async fn perform(
+    plan: &ToolsOptions,
+    show: &mut Show,
+    report: &mut ToolsReport,
+) -> Result<(), DemoFailure> {
     let (_, [lds, component, tool]) = find(["ua-lds", "ua-component", "ua-space"])?;
     must_be_free(LDS_PORT, "discovery server")?;
     let ports = PARTS.iter().filter_map(|part| part.port);
     for port in ports.chain(DEVICE_PORTS) {
         must_be_free(port, "component or simulator")?;
     }
-    let (programs, mut reports) =
-        Programs::prepare().map_err(Failure::io("cannot make a directory for the logs"))?;
+    let (programs, mut reports) = RunningPrograms::prepare()
+        .map_err(DemoFailure::io("cannot make a directory for the logs"))?;
     let mut story = Story {
         plan,
         lds,
@@ -81,21 +86,21 @@ async fn perform(plan: &Plan, show: &mut Show, report: &mut Report) -> Result<()
 }
 
 struct Story<'a> {
-    plan: &'a Plan,
+    plan: &'a ToolsOptions,
     lds: PathBuf,
     component: PathBuf,
     tool: PathBuf,
-    programs: Programs,
+    programs: RunningPrograms,
     /// The port of the status page of the discovery server.
     page: u16,
     /// The port of the page of the cell.
     browser: u16,
     show: &'a mut Show,
-    report: &'a mut Report,
+    report: &'a mut ToolsReport,
 }
 
 impl Story<'_> {
-    async fn play(&mut self) -> Result<(), Stop> {
+    async fn play(&mut self) -> Result<(), StopReason> {
         let text = format!(
             "Tool change: a robot, two grippers and a tool changer; speed {}{}.\nTimes are seconds since the beginning; the page \
              of the cell is at {}, the logs are in {}.\n\n",
@@ -126,15 +131,16 @@ impl Story<'_> {
             .run((CHANGER, "DetachTool"), "no tool", Vec::new())
             .await?;
         must(&detached)?;
-        self.show.note(Who::DEMO, "all of it happened".to_owned())?;
+        self.show
+            .note(EventSource::DEMO, "all of it happened".to_owned())?;
         Ok(())
     }
 
-    async fn start_all(&mut self) -> Result<(), Stop> {
+    async fn start_all(&mut self) -> Result<(), StopReason> {
         let directory = self.programs.directory().to_owned();
         cell::write(&directory, self.plan.speed, self.plan.swapped)
             .and_then(|()| cell::trust_each_other(&directory))
-            .map_err(Failure::io("cannot write the files of the programs"))?;
+            .map_err(DemoFailure::io("cannot write the files of the programs"))?;
         let endpoint = format!("opc.tcp://{LOOPBACK}:{LDS_PORT}");
         let metrics = format!("{LOOPBACK}:{}", self.page);
         let store = cell::store(&directory, cell::LDS).display().to_string();
@@ -155,11 +161,11 @@ impl Story<'_> {
         }
         let began = Instant::now();
         while !cell::trust_discovery(&directory)
-            .map_err(Failure::io("cannot trust the discovery server"))?
+            .map_err(DemoFailure::io("cannot trust the discovery server"))?
         {
             if began.elapsed() > FOUND {
                 let why = format!("ua-lds has no certificate within {FOUND:?}");
-                return Err(Stop::Broken(why));
+                return Err(StopReason::Broken(why));
             }
             sleep(POLL).await;
         }
@@ -169,7 +175,7 @@ impl Story<'_> {
         Ok(())
     }
 
-    fn plug_in(&mut self, name: &'static str) -> Result<(), Failure> {
+    fn plug_in(&mut self, name: &'static str) -> Result<(), DemoFailure> {
         let directory = self.programs.directory();
         let yaml = directory.join(format!("{name}.yaml")).display().to_string();
         let store = cell::store(directory, name).display().to_string();
@@ -177,11 +183,12 @@ impl Story<'_> {
         let component = self.component.clone();
         self.programs
             .launch(name, component, &arguments, Stage::Components)?;
-        self.show.note(Who(name, "36"), "is plugged in".to_owned())
+        self.show
+            .note(EventSource(name, "36"), "is plugged in".to_owned())
     }
 
     /// Waits until a component is registered, and its skills are available if its port is known.
-    async fn found(&mut self, part: &Part, began: Instant) -> Result<(), Stop> {
+    async fn found(&mut self, part: &ToolsComponent, began: Instant) -> Result<(), StopReason> {
         loop {
             let page: Json = fetch(self.page).await.unwrap_or_default();
             let servers = page.get("servers").and_then(Json::as_array);
@@ -195,11 +202,11 @@ impl Story<'_> {
             };
             if answers {
                 let text = format!("is found after {:.0} ms", elapsed(began));
-                self.show.note(Who(part.name, "36"), text)?;
+                self.show.note(EventSource(part.name, "36"), text)?;
                 return Ok(());
             }
             if began.elapsed() > FOUND {
-                return Err(Stop::Broken(format!(
+                return Err(StopReason::Broken(format!(
                     "{} is not found within {FOUND:?}",
                     part.name
                 )));
@@ -216,10 +223,10 @@ impl Story<'_> {
     }
 
     /// Counts the robots in the cell. The scenario uses one of two.
-    async fn count_robots(&mut self) -> Result<(), Stop> {
-        let page: Json = fetch(self.page)
-            .await
-            .map_err(|error| Stop::Broken(format!("cannot list the servers of ua-lds: {error}")))?;
+    async fn count_robots(&mut self) -> Result<(), StopReason> {
+        let page: Json = fetch(self.page).await.map_err(|error| {
+            StopReason::Broken(format!("cannot list the servers of ua-lds: {error}"))
+        })?;
         let servers = page.get("servers").and_then(Json::as_array);
         let robots = ["urn:example:ur5", "urn:example:robot"];
         self.report.robots = servers
@@ -231,7 +238,7 @@ impl Story<'_> {
         Ok(())
     }
 
-    async fn change(&mut self, tool: &'static str) -> Result<(), Stop> {
+    async fn change(&mut self, tool: &'static str) -> Result<(), StopReason> {
         let uri = PARTS
             .iter()
             .find(|part| part.name == tool)
@@ -246,7 +253,7 @@ impl Story<'_> {
     }
 
     /// Moves the part with the attached tool.
-    async fn handle(&mut self, way: ([f64; 6], [f64; 6])) -> Result<(), Stop> {
+    async fn handle(&mut self, way: ([f64; 6], [f64; 6])) -> Result<(), StopReason> {
         let run = self
             .run((HANDLING, PLACE_SKILL), "a part", places(way))
             .await?;
@@ -254,7 +261,7 @@ impl Story<'_> {
     }
 
     /// Kills the vacuum gripper while the robot carries the part, and starts it again.
-    async fn lose_and_plug_in(&mut self) -> Result<(), Stop> {
+    async fn lose_and_plug_in(&mut self) -> Result<(), StopReason> {
         let client = self.connect_to(HANDLING).await?;
         let handle = handle_of(&client, PLACE_SKILL).await?;
         let began = Instant::now();
@@ -272,16 +279,17 @@ impl Story<'_> {
                 self.programs.kill(VACUUM);
                 killed = Some(Instant::now());
                 self.show.note(
-                    Who(VACUUM, "31"),
+                    EventSource(VACUUM, "31"),
                     "is killed while the robot carries the part".to_owned(),
                 )?;
             }
         };
         client.close().await;
-        let outcome = outcome.map_err(|fault| Stop::Broken(format!("{PLACE_SKILL}: {fault}")))?;
+        let outcome =
+            outcome.map_err(|fault| StopReason::Broken(format!("{PLACE_SKILL}: {fault}")))?;
         let run = self.ran((HANDLING, PLACE_SKILL), "a part", (outcome, steps.0, began))?;
         let Some(killed) = killed else {
-            return Err(Stop::Broken(
+            return Err(StopReason::Broken(
                 "the run was over before the gripper was killed".to_owned(),
             ));
         };
@@ -291,7 +299,7 @@ impl Story<'_> {
             || !run.message.contains("has retreated")
         {
             let told = run.message;
-            return Err(Stop::Broken(format!(
+            return Err(StopReason::Broken(format!(
                 "the run does not say that the gripper was lost: {told}"
             )));
         }
@@ -309,12 +317,12 @@ impl Story<'_> {
         &mut self,
         (component, skill): (&'static str, &'static str),
         what: &str,
-        parameters: Vec<(String, Value)>,
-    ) -> Result<Run, Stop> {
+        parameters: Vec<(String, SkillValue)>,
+    ) -> Result<ToolsRun, StopReason> {
         let client = self.connect_to(component).await?;
         let handle = handle_of(&client, skill).await?;
         let text = format!("{skill} begins: {what}");
-        self.show.note(Who(component, "36"), text)?;
+        self.show.note(EventSource(component, "36"), text)?;
         let began = Instant::now();
         let mut steps = Steps::default();
         let running = handle.run(parameters, WITHIN);
@@ -328,7 +336,7 @@ impl Story<'_> {
         };
         client.close().await;
         let outcome =
-            outcome.map_err(|fault| Stop::Broken(format!("{component}.{skill}: {fault}")))?;
+            outcome.map_err(|fault| StopReason::Broken(format!("{component}.{skill}: {fault}")))?;
         self.ran((component, skill), what, (outcome, steps.0, began))
     }
 
@@ -336,9 +344,9 @@ impl Story<'_> {
         &mut self,
         (component, skill): (&'static str, &'static str),
         what: &str,
-        (outcome, steps, began): (Outcome, Vec<String>, Instant),
-    ) -> Result<Run, Stop> {
-        let run = Run {
+        (outcome, steps, began): (RunOutcome, Vec<String>, Instant),
+    ) -> Result<ToolsRun, StopReason> {
+        let run = ToolsRun {
             skill: format!("{component}.{skill}"),
             what: what.to_owned(),
             succeeded: outcome.succeeded,
@@ -352,7 +360,7 @@ impl Story<'_> {
             &run.message
         };
         self.show
-            .note(Who(component, "36"), format!("{skill}: {ended}"))?;
+            .note(EventSource(component, "36"), format!("{skill}: {ended}"))?;
         self.report.runs.push(run.clone());
         Ok(run)
     }
@@ -369,14 +377,14 @@ impl Story<'_> {
         SkillClient::connect(&format!("opc.tcp://{LOOPBACK}:{port}"), &options).await
     }
 
-    async fn connect_to(&self, component: &'static str) -> Result<SkillClient, Stop> {
+    async fn connect_to(&self, component: &'static str) -> Result<SkillClient, StopReason> {
         let part = PARTS.iter().find(|part| part.name == component);
         let port = part.and_then(|part| part.port).unwrap_or_default();
         let connected = self.connect(port).await;
-        connected.map_err(|fault| Stop::Broken(format!("{component}: {fault}")))
+        connected.map_err(|fault| StopReason::Broken(format!("{component}: {fault}")))
     }
 
-    fn failure(&self, stop: Stop) -> Failure {
+    fn failure(&self, stop: StopReason) -> DemoFailure {
         stop.failure(&self.programs, || {
             format!("{} runs were over", self.report.runs.len())
         })
@@ -399,28 +407,29 @@ impl Steps {
     }
 }
 
-async fn handle_of(client: &SkillClient, skill: &str) -> Result<SkillHandle, Stop> {
-    let of = TypeName::own("SkillType");
+async fn handle_of(client: &SkillClient, skill: &str) -> Result<SkillHandle, StopReason> {
+    let of = ParameterType::own("SkillType");
     let found = client.skills_of(&of).await;
-    let found = found.map_err(|fault| Stop::Broken(format!("{}: {fault}", client.endpoint())))?;
+    let found =
+        found.map_err(|fault| StopReason::Broken(format!("{}: {fault}", client.endpoint())))?;
     let skill = found
         .iter()
         .find(|found| found.name == skill)
-        .ok_or_else(|| Stop::Broken(format!("{} has no {skill}", client.endpoint())))?;
+        .ok_or_else(|| StopReason::Broken(format!("{} has no {skill}", client.endpoint())))?;
     Ok(client.handle(skill))
 }
 
-fn places((pick, place): ([f64; 6], [f64; 6])) -> Vec<(String, Value)> {
+fn places((pick, place): ([f64; 6], [f64; 6])) -> Vec<(String, SkillValue)> {
     vec![
         ("PickPosition".to_owned(), pick.into()),
         ("PlacePosition".to_owned(), place.into()),
     ]
 }
 
-fn must(run: &Run) -> Result<(), Stop> {
+fn must(run: &ToolsRun) -> Result<(), StopReason> {
     match run.succeeded {
         true => Ok(()),
-        false => Err(Stop::Broken(format!(
+        false => Err(StopReason::Broken(format!(
             "{} failed: {}",
             run.skill, run.message
         ))),

@@ -5,9 +5,9 @@ use std::collections::BTreeMap;
 use std::time::Duration;
 
 use uadp::action::{
-    ActionAddress, ActionDialect, ActionEncoding, ActionFields, ActionMessage, ActionRequest,
-    ActionToSend, CallId, ExecutionId, Heard, Outcome, Refusal, Requested, Requestor,
-    RequestorSettings, Responder, ResponderSettings,
+    ActionAddress, ActionDialect, ActionEncoding, ActionFields, ActionMessage, ActionOutcome,
+    ActionRequest, ActionToSend, CallId, ExecutionId, Refusal, Requestor, RequestorSettings,
+    RequiredAction, Responder, ResponderSettings, ResponseMeaning,
 };
 use uadp::{Extras, NetworkHeader, NetworkMessage, OwnedPublisherId, StatusCode};
 
@@ -172,12 +172,15 @@ impl World {
     }
 
     fn hear(&mut self, message: &ActionMessage<'_>) {
-        if let Ok(Requested::Execute(id)) = self.responder.handle_request(message, (), self.now) {
+        if let Ok(RequiredAction::Execute(id)) =
+            self.responder.handle_request(message, (), self.now)
+        {
             self.executions.push(id);
             let number = message.fields.bytes().get(3).copied().unwrap_or_default();
             *self.executed.entry(number).or_default() += 1;
         }
-        if let Ok(Heard::Done(id, _)) = self.requestor.handle_response(message, self.now) {
+        if let Ok(ResponseMeaning::Done(id, _)) = self.requestor.handle_response(message, self.now)
+        {
             self.end(id);
         }
     }
@@ -188,8 +191,8 @@ impl World {
             return;
         };
         let outcome = match refusal {
-            Some(refusal) => Outcome::Refused(refusal),
-            None => Outcome::Answered {
+            Some(refusal) => ActionOutcome::Refused(refusal),
+            None => ActionOutcome::Answered {
                 status: StatusCode(u32::from(input.byte()) << 24),
                 fields: ActionFields::Variants(input.bytes()),
             },

@@ -3,8 +3,8 @@
 use std::time::Duration;
 
 use uadp::{
-    ChunkBudget, Chunks, Extras, NetworkHeader, NetworkMessage, NetworkMessageType, PublisherId,
-    Reassembler, ReassemblyLimits, Whole,
+    ChunkBudget, ChunkEncoder, Extras, NetworkHeader, NetworkMessage, NetworkMessageType,
+    PublisherId, Reassembler, ReassemblyLimits, Whole,
 };
 
 use crate::input::Input;
@@ -88,7 +88,7 @@ fn split(input: &mut Input<'_>, wholes: &mut Vec<Vec<u8>>, sent: &mut Vec<Sent>)
         publisher_id: Some(PublisherId::Byte(2)),
         ..NetworkHeader::default()
     };
-    let Ok(mut chunks) = Chunks::new(&header, &Extras::default(), whole, budget) else {
+    let Ok(mut chunks) = ChunkEncoder::new(&header, &Extras::default(), whole, budget) else {
         return;
     };
     let mut buffer = Vec::new();

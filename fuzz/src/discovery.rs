@@ -1,6 +1,6 @@
 //! Fuzzes probes and announcements with arbitrary bytes.
 
-use uadp::discovery::{Announced, Announcement, Probe};
+use uadp::discovery::{AnnouncedContent, Announcement, Probe};
 
 /// Decodes a probe or an announcement. Its encoding must decode and encode to the same bytes.
 pub fn discovery(body: &[u8]) {
@@ -15,7 +15,7 @@ pub fn discovery(body: &[u8]) {
     let Ok(announcement) = Announcement::decode_body(body) else {
         return;
     };
-    if let Announced::DataSetMetaData { meta_data, .. } = &announcement.announced {
+    if let AnnouncedContent::DataSetMetaData { meta_data, .. } = &announcement.announced {
         for field in meta_data.fields.iter() {
             let _ = (field.builtin_type(), field.array_dimensions.iter().count());
             let _ = meta_data.schema.structure(field.data_type);

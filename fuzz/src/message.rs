@@ -3,22 +3,23 @@
 use std::collections::BTreeMap;
 use std::sync::LazyLock;
 
-use messages::{Dialect, Plan, ReadError, Registry, Selection, Wire, WriteFault};
+use messages::{Dialect, MessagePlan, ReadError, Selection, TypeRegistry, Wire, WriteFault};
 
-use crate::tape::{Player, Recorder};
+use crate::tape::{EventPlayer, Recorder};
 
 /// The plans by the digit of the ROS version and the name of the type.
-static PLANS: LazyLock<BTreeMap<String, Plan>> = LazyLock::new(|| {
+static PLANS: LazyLock<BTreeMap<String, MessagePlan>> = LazyLock::new(|| {
     let ways = [
         (Dialect::Ros1, Wire::Ros1, 1),
         (Dialect::Ros2, Wire::Cdr, 2),
     ];
     ways.into_iter()
         .flat_map(|(dialect, wire, digit)| {
-            let registry = Registry::bundle(dialect);
+            let registry = TypeRegistry::bundle(dialect);
             let plans = registry.names().map(|name| {
                 let message = registry.get(name).expect("the bundle is whole");
-                let plan = Plan::compile(&message, &Selection::Whole, wire).expect("of its ROS");
+                let plan =
+                    MessagePlan::compile(&message, &Selection::Whole, wire).expect("of its ROS");
                 (format!("{digit}{name}"), plan)
             });
             plans.collect::<Vec<_>>()
@@ -56,7 +57,7 @@ pub fn message(input: &[u8]) {
     let most = 4 * payload.len() + 4096;
     assert!(fields.events.len() <= most, "{}", fields.events.len());
     let mut written = Vec::new();
-    if let Err(error) = plan.write(&mut Player::new(&fields.events), &mut written) {
+    if let Err(error) = plan.write(&mut EventPlayer::new(&fields.events), &mut written) {
         assert!(written.is_empty(), "a message that failed left bytes");
         match error.fault {
             // Such text is accepted from other writers but not encoded.
@@ -70,7 +71,7 @@ pub fn message(input: &[u8]) {
     plan.read(&written, &mut again)
         .expect("what was written can be read");
     let mut twice = Vec::new();
-    plan.write(&mut Player::new(&again.events), &mut twice)
+    plan.write(&mut EventPlayer::new(&again.events), &mut twice)
         .expect("it was written before");
     assert_eq!(written, twice, "writing is not canonical");
 }

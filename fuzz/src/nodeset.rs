@@ -2,12 +2,12 @@
 
 use opcua::server::address_space::AddressSpace;
 use opcua::types::NamespaceMap;
-use plant_opcua::nodeset::{NodeSetError, NodeSets};
+use plant_opcua::nodeset::{ImportedNodeSets, NodeSetError};
 
 /// Imports a file, which succeeds or gives a fatal finding. Each finding has a line of the file,
 /// and imported nodes exist in the address space.
 pub fn nodeset(input: &[u8]) {
-    let (sets, faults) = NodeSets::of_document("fuzz.xml", input);
+    let (sets, faults) = ImportedNodeSets::of_document("fuzz.xml", input);
     let is_fatal = faults.iter().any(|fault| fault.error.is_fatal());
     assert!(faults.len() <= input.len() + 1, "findings are bounded");
     // A file has no more lines than bytes.

@@ -6,8 +6,8 @@ use std::net::{IpAddr, Ipv4Addr};
 use std::time::{Duration, Instant};
 
 use registry::{
-    Announcement, ApplicationType, Asked, Channel, Event, MdnsConfiguration, Outcome, Registry,
-    Settings,
+    AnnouncedServer, ApplicationType, Channel, MdnsConfiguration, ProbeOutcome,
+    RegistrationRequest, RegistryEvent, RegistrySettings, ServerRegistry,
 };
 
 use crate::input::Input;
@@ -17,14 +17,14 @@ const MOST: usize = 6;
 /// Runs operations on the registry. Each server is reported once when it is registered and once
 /// when it is removed, lists are bounded, record ids rise, and no timeout is in the past.
 pub fn registry(operations: &[u8]) {
-    let settings = Settings {
+    let settings = RegistrySettings {
         allow_unsecured: true,
         forget_after: Duration::from_secs(20),
         most: MOST,
-        ..Settings::default()
+        ..RegistrySettings::default()
     };
     let mut played = Played {
-        registry: Registry::new(settings),
+        registry: ServerRegistry::new(settings),
         now: begin(),
         registered: BTreeSet::new(),
         seen: BTreeSet::new(),
@@ -50,7 +50,7 @@ fn begin() -> Instant {
 }
 
 struct Played {
-    registry: Registry,
+    registry: ServerRegistry,
     now: Instant,
     /// The registered servers, according to the events.
     registered: BTreeSet<String>,
@@ -81,7 +81,7 @@ impl Played {
                 drop(self.registry.register(asked, &channel, there, now));
             }
             1 => {
-                let announcement = Announcement {
+                let announcement = AnnouncedServer {
                     instance: name(which),
                     url: url(input.byte()),
                     capabilities: Vec::new(),
@@ -105,7 +105,7 @@ impl Played {
 
     /// Replaces the servers that a Global Discovery Server lists.
     fn listed(&mut self, which: u8, input: &mut Input<'_>) {
-        let servers = (0..which % 4).map(|_| Announcement {
+        let servers = (0..which % 4).map(|_| AnnouncedServer {
             instance: name(input.byte()),
             url: url(input.byte()),
             capabilities: Vec::new(),
@@ -141,23 +141,23 @@ impl Played {
     fn take_events(&mut self) {
         while let Some(event) = self.registry.poll_event() {
             match event {
-                Event::Registered { server_uri, .. } => {
+                RegistryEvent::Registered { server_uri, .. } => {
                     self.registered.insert(server_uri);
                 }
-                Event::Gone { server_uri, .. } => {
+                RegistryEvent::Gone { server_uri, .. } => {
                     assert!(self.registered.remove(&server_uri), "{server_uri} was not");
                 }
-                Event::Seen(record) => {
+                RegistryEvent::Seen(record) => {
                     self.seen.insert(record.announcement.instance);
                 }
-                Event::Vanished { record, .. } => {
+                RegistryEvent::Vanished { record, .. } => {
                     let name = record.announcement.instance;
                     assert!(self.seen.remove(&name), "{name} was not seen");
                 }
-                Event::Announce(announcement) => {
+                RegistryEvent::Announce(announcement) => {
                     self.ours.insert(announcement.instance);
                 }
-                Event::Withdraw { instance } => {
+                RegistryEvent::Withdraw { instance } => {
                     assert!(self.ours.remove(&instance), "{instance} was not announced");
                 }
                 _ => {}
@@ -201,22 +201,22 @@ fn url(which: u8) -> String {
     format!("opc.tcp://10.0.0.{}:4840", which % 8)
 }
 
-fn outcome(which: u8) -> Outcome {
+fn outcome(which: u8) -> ProbeOutcome {
     match which % 6 {
-        0 => Outcome::Refused,
-        1 => Outcome::Silent,
-        2 => Outcome::Hanging,
-        3 => Outcome::Untried,
-        4 => Outcome::Alive { start_time: None },
-        _ => Outcome::Alive {
+        0 => ProbeOutcome::Refused,
+        1 => ProbeOutcome::Silent,
+        2 => ProbeOutcome::Hanging,
+        3 => ProbeOutcome::Untried,
+        4 => ProbeOutcome::Alive { start_time: None },
+        _ => ProbeOutcome::Alive {
             start_time: Some(i64::from(which)),
         },
     }
 }
 
-fn asked(which: u8, how: u8, input: &mut Input<'_>) -> Asked {
+fn asked(which: u8, how: u8, input: &mut Input<'_>) -> RegistrationRequest {
     let urls = usize::from(input.byte() % 3);
-    Asked {
+    RegistrationRequest {
         server_uri: uri(which),
         product_uri: String::new(),
         names: vec![(String::new(), "n".to_owned())],

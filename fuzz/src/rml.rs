@@ -1,6 +1,6 @@
 //! Fuzzes RML mappings and the XML files that they map with arbitrary text.
 
-use rml::{FileFault, Files, Mapping};
+use rml::{Files, MappingFileFault, RmlMapping};
 
 /// Reads a mapping, and runs it with the file that follows it after a line of three dashes.
 pub fn rml(input: &[u8]) {
@@ -8,7 +8,7 @@ pub fn rml(input: &[u8]) {
         return;
     };
     let (mapping, file) = text.split_once("\n---\n").unwrap_or((text, "<a/>"));
-    let Ok(mapping) = Mapping::read(mapping) else {
+    let Ok(mapping) = RmlMapping::read(mapping) else {
         return;
     };
     let Ok(output) = mapping.run(&mut Every(file.as_bytes())) else {
@@ -25,7 +25,7 @@ pub fn rml(input: &[u8]) {
 struct Every<'f>(&'f [u8]);
 
 impl Files for Every<'_> {
-    fn read(&mut self, _name: &str) -> Result<Vec<u8>, FileFault> {
+    fn read(&mut self, _name: &str) -> Result<Vec<u8>, MappingFileFault> {
         Ok(self.0.to_vec())
     }
 }

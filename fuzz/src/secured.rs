@@ -3,8 +3,8 @@
 use std::time::Duration;
 
 use uadp::{
-    DataSetHeader, Extras, Keys, NetworkHeader, NetworkMessage, NetworkMessageEncoder, Opener,
-    PublisherId, Scalar, Sealer, SecurityMode, SecurityPolicy,
+    DataSetHeader, Extras, NetworkHeader, NetworkMessage, NetworkMessageEncoder, Opener,
+    PublisherId, Scalar, Sealer, SecurityMode, SecurityPolicy, TokenKeys,
 };
 
 use crate::input::Input;
@@ -143,14 +143,14 @@ fn refuse(datagram: &[u8], opener: &mut Opener) {
 
 /// Returns keys that depend on the input: a fuzzer combines parts of inputs, and a message sealed
 /// in another input would be genuine with common keys.
-fn keys(policy: SecurityPolicy, own: u64) -> Vec<Keys> {
+fn keys(policy: SecurityPolicy, own: u64) -> Vec<TokenKeys> {
     (0..3_u8)
         .map(|token| {
             let own = own.to_le_bytes();
             let data: Vec<u8> = (0..policy.key_data_length())
                 .map(|at| own[at % own.len()] ^ token.wrapping_mul(37).wrapping_add(at as u8))
                 .collect();
-            Keys::from_bytes(policy, &data).expect("the length the policy asks for")
+            TokenKeys::from_bytes(policy, &data).expect("the length the policy asks for")
         })
         .collect()
 }

@@ -7,7 +7,7 @@ use std::str::FromStr;
 
 use crate::broker::Broker;
 use crate::ethernet::EthernetGroup;
-use crate::topic::{Part, SpaceId, TopicError, decimal};
+use crate::topic::{NamePart, SpaceId, TopicError, decimal};
 
 /// A carrier of a mapping that lists its carriers.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -89,7 +89,7 @@ impl FromStr for ForwardedName {
     fn from_str(text: &str) -> Result<Self, TopicError> {
         let rest = text.strip_prefix("ua_").ok_or(TopicError::Prefix)?;
         let mut parts = rest.split('_');
-        let space = decimal(Part::Space, parts.next().unwrap_or_default())?;
+        let space = decimal(NamePart::Space, parts.next().unwrap_or_default())?;
         let mut number = |part| match parts.next().map(|text| decimal(part, text)) {
             None => Ok(None),
             Some(Ok(0)) => Err(TopicError::Range(part)),
@@ -97,9 +97,9 @@ impl FromStr for ForwardedName {
             Some(Err(error)) => Err(error),
         };
         let name = Self {
-            space: SpaceId::new(space).ok_or(TopicError::Range(Part::Space))?,
-            namespace: number(Part::Namespace)?,
-            identifier: number(Part::Identifier)?,
+            space: SpaceId::new(space).ok_or(TopicError::Range(NamePart::Space))?,
+            namespace: number(NamePart::Namespace)?,
+            identifier: number(NamePart::Identifier)?,
         };
         match parts.next() {
             None => Ok(name),

@@ -37,15 +37,15 @@ use messages::{DefinitionTexts, Dialect, NoTexts, TextKind, TypeName};
 use crate::code::Code;
 use crate::diagnostic::{Diagnostic, Severity};
 use crate::document::Document;
-use crate::findings::Findings;
+use crate::findings::MappingFindings;
 use crate::include::Loader;
 use crate::mapping::{Mapping, Server};
-use crate::read::{At, Field};
+use crate::read::{Located, OptionalKey};
 use crate::surroundings::{Alone, Surroundings};
 use crate::topic::SpaceId;
-use crate::tree::Place;
+use crate::tree::TextSpan;
 
-use self::types::Types;
+use self::types::MessageTypes;
 
 /// Result of checking a document.
 #[derive(Clone, Debug)]
@@ -58,7 +58,7 @@ pub struct Checked {
     /// Message types that the document names, and the origin of each definition.
     pub types: Vec<TypeUse>,
     /// Texts that were read.
-    pub sources: Vec<Source>,
+    pub sources: Vec<CheckedText>,
     /// Spaces that each error concerns. An empty entry concerns all programs.
     errors: BTreeSet<Vec<SpaceId>>,
     /// The mapping for programs that none of the errors concerns, if there are errors.
@@ -90,12 +90,12 @@ pub enum TypeOrigin {
 }
 
 /// Definition files, as [`Surroundings::types`] opens them.
-pub trait TypeFiles: DefinitionTexts {
+pub trait OpenTypeFiles: DefinitionTexts {
     /// Returns the faults of the `type_paths`; called once.
     fn faults(&mut self) -> Vec<PathFault>;
 }
 
-impl TypeFiles for NoTexts {
+impl OpenTypeFiles for NoTexts {
     fn faults(&mut self) -> Vec<PathFault> {
         Vec::new()
     }
@@ -122,7 +122,7 @@ pub enum PathFaultKind {
 
 /// A text that was checked.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Source {
+pub struct CheckedText {
     /// Name of the text in findings.
     pub name: Arc<str>,
     /// Content of the file.
@@ -227,7 +227,7 @@ impl Mapping {
     /// findings, and paths in the text are relative to its folder.
     #[must_use]
     pub fn from_text(text: &str, file: &str, around: &dyn Surroundings) -> Checked {
-        let mut findings = Findings::new(file);
+        let mut findings = MappingFindings::new(file);
         let (document, sources) = Loader::new(around, &mut findings).load(text, file);
         let mut used = Vec::new();
         let mapping = document.map(|document| compile(document, around, &mut findings, &mut used));
@@ -250,9 +250,9 @@ impl Mapping {
 
 /// Returns the sound entries and their positions; faulty entries are left out.
 fn type_paths(
-    entries: &Field<Vec<At<String>>>,
-    findings: &mut Findings,
-) -> (Vec<PathBuf>, Vec<Place>) {
+    entries: &OptionalKey<Vec<Located<String>>>,
+    findings: &mut MappingFindings,
+) -> (Vec<PathBuf>, Vec<TextSpan>) {
     let entries = entries.as_ref().and_then(|at| at.value.as_deref());
     let entries = entries.unwrap_or_default();
     if let Some(first) = entries.get(MAX_TYPE_PATHS) {
@@ -279,7 +279,7 @@ fn type_paths(
         .unzip()
 }
 
-fn note_faults(faults: Vec<PathFault>, places: &[Place], findings: &mut Findings) {
+fn note_faults(faults: Vec<PathFault>, places: &[TextSpan], findings: &mut MappingFindings) {
     for PathFault { path, what } in faults {
         let Some(place) = places.get(path) else {
             continue;
@@ -298,13 +298,13 @@ fn note_faults(faults: Vec<PathFault>, places: &[Place], findings: &mut Findings
 fn compile(
     document: Document,
     around: &dyn Surroundings,
-    findings: &mut Findings,
+    findings: &mut MappingFindings,
     used: &mut Vec<TypeUse>,
 ) -> Mapping {
     let (paths, places) = type_paths(&document.type_paths, findings);
     let mut files = around.types(&paths);
     note_faults(files.faults(), &places, findings);
-    let mut types = Types::new(files);
+    let mut types = MessageTypes::new(files);
     let spaces = cell::spaces(document.spaces.as_ref(), findings);
     let namespaces = cell::namespaces(document.namespaces.as_ref(), findings);
     let pubsub = network::pubsub(document.pubsub.as_ref(), findings);
@@ -334,7 +334,7 @@ fn compile(
     let calls = match &document.calls {
         Some(entries) => {
             let entries = entries.value.as_deref().unwrap_or_default();
-            let known = calls::Known {
+            let known = calls::CallContext {
                 spaces: &spaces,
                 namespaces: &namespaces,
                 variables: &variables,
@@ -377,7 +377,7 @@ fn compile(
 impl Document {
     /// Returns `true` if the mapping contains each entry of the document.
     fn has_all_of(&self, mapping: &Mapping) -> bool {
-        fn count<T>(entries: &Field<Vec<T>>) -> usize {
+        fn count<T>(entries: &OptionalKey<Vec<T>>) -> usize {
             let entries = entries.as_ref().and_then(|at| at.value.as_ref());
             entries.map_or(0, Vec::len)
         }
@@ -400,12 +400,12 @@ struct Declared<T> {
 /// Returns the value of a key that has no default; notes a missing key. `owner` is the position of
 /// the map's beginning.
 fn required<'d, T>(
-    field: &'d Field<T>,
+    field: &'d OptionalKey<T>,
     key: &str,
     of: &str,
-    owner: Place,
-    findings: &mut Findings,
-) -> Option<(&'d T, Place)> {
+    owner: TextSpan,
+    findings: &mut MappingFindings,
+) -> Option<(&'d T, TextSpan)> {
     match field {
         Some(at) => Some((at.value.as_ref()?, at.place)),
         None => {

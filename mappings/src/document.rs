@@ -13,9 +13,9 @@ use schemars::JsonSchema;
 use crate::call::Assigned;
 use crate::code::Code;
 use crate::mapping::UaField;
-use crate::read::{At, Read, Reader, choice, document, help_octal, is_octal, short};
+use crate::read::{FromNode, Located, NodeReader, choice, document, help_octal, is_octal, short};
 use crate::server_entries::{FindSkillsEntry, FromEntry, RemoteServerEntry, ToEntry};
-use crate::tree::{Kind, Node, Place};
+use crate::tree::{TextSpan, YamlKind, YamlNode};
 
 pub(crate) use alarm::{AcknowledgesEntry, AlarmEntry, ReportsEntry};
 pub(crate) use carriers::{CarrierEntry, EthernetEntry, PubSubForm, UdpEntry};
@@ -31,32 +31,32 @@ document! {
         /// `*` in the last part matches any characters, as in robots/*.yaml.
         include: Includes,
         /// The ROS sides of the cell. The OPC UA side is space 0 and always exists.
-        spaces: Vec<At<SpaceEntry>>,
+        spaces: Vec<Located<SpaceEntry>>,
         /// Folders with ROS packages, or single files, with definitions (.msg, .srv, .action, .idl)
         /// that take precedence over built-in definitions; relative to this file. At most 256.
-        type_paths: Vec<At<String>>,
+        type_paths: Vec<Located<String>>,
         /// How values travel between the spaces: a map, or a list of carriers.
         pubsub: PubSubForm,
         /// Groups of programs that may read and write messages: SecurityGroups of OPC UA PubSub, at
         /// most 64. Default: every program of the network may.
-        security: Vec<At<GroupEntry>>,
+        security: Vec<Located<GroupEntry>>,
         /// The OPC UA server of the cell.
         server: ServerEntry,
         /// Existing OPC UA servers, such as the servers of PLCs, at most 256: variables come `from`
         /// them or go `to` them, and their Methods execute calls.
-        servers: Vec<At<RemoteServerEntry>>,
+        servers: Vec<Located<RemoteServerEntry>>,
         /// Namespace index in node ids -> namespace URI. A server may use other indexes; the URI
         /// identifies the namespace.
         #[schemars(with = "Option<BTreeMap<u16, String>>")]
         namespaces: Namespaces,
         /// The values of the cell, at most 100 000.
-        variables: Vec<At<VariableEntry>>,
+        variables: Vec<Located<VariableEntry>>,
         /// Patterns of topics that become values when they appear, at most 1000. The first matching
         /// pattern applies; an entry of `variables` with the same topic takes precedence.
-        patterns: Vec<At<PatternEntry>>,
+        patterns: Vec<Located<PatternEntry>>,
         /// Calls: executed in one space and requested from the others, at most 5000. ROS services
         /// and actions with a name of the space (/ua_1_2_61) need no entry.
-        calls: Vec<At<CallEntry>>,
+        calls: Vec<Located<CallEntry>>,
     }
 
     /// A ROS side.
@@ -178,13 +178,13 @@ document! {
         application_uri: String,
         /// ApplicationUris of two or three redundant servers, by their `--rank`, instead of
         /// `application_uri`.
-        redundant: Vec<At<String>>,
+        redundant: Vec<Located<String>>,
         /// Endpoints of the servers of `redundant`, in the same order. Each server has the endpoint
         /// of its rank unless `--endpoint` gives another, and lists the others in FindServers.
-        redundant_endpoints: Vec<At<String>>,
+        redundant_endpoints: Vec<Located<String>>,
         /// Security policies that the server offers. Default: all, and `None` only if the endpoint
         /// is a loopback address.
-        security: Vec<At<SecurityEntry>>,
+        security: Vec<Located<SecurityEntry>>,
         /// Role of anonymous users: `off` (refused), `observer`, `operator` or `engineer`. Default:
         /// observer; operator if the endpoint is a loopback address and the server has no users.
         anonymous: AnonymousEntry,
@@ -204,7 +204,7 @@ document! {
         /// as opc.tcp://192.168.0.30:4841; at most 16. With hosts other than this one, the defaults
         /// of `security` and `anonymous` are those of an endpoint that other hosts reach.
         #[schemars(length(max = 16))]
-        reverse_connect: Vec<At<String>>,
+        reverse_connect: Vec<Located<String>>,
         /// Limits of the history of the server.
         history: HistoryEntry,
         /// Limits for clients.
@@ -216,7 +216,7 @@ document! {
         /// NodeSet2 files with further nodes of the server, in any order, relative to this file; at
         /// most 64. A variable whose `node` is one of these nodes gives it values; `namespaces`
         /// lists its namespace.
-        nodesets: Vec<At<String>>,
+        nodesets: Vec<Located<String>>,
     }
 
     /// Limits of the history that the server keeps in memory, and its file.
@@ -288,7 +288,7 @@ document! {
         /// Unit of the value in OPC UA: a symbol such as m/s, a UNECE code such as MTS, or a name.
         unit: String,
         /// Lowest and highest expected value in OPC UA, such as [0, 1.5].
-        range: Vec<At<f64>>,
+        range: Vec<Located<f64>>,
         /// Texts for the numbers of the value, such as {0: idle, 1: moving}.
         #[schemars(with = "Option<BTreeMap<String, String>>")]
         r#enum: EnumTexts,
@@ -422,7 +422,7 @@ document! {
         #[schemars(required, regex(pattern = r"^/.*\*"))]
         topics: String,
         /// Excluded topics or patterns, such as [/robot9/**].
-        exclude: Vec<At<String>>,
+        exclude: Vec<Located<String>>,
         /// The ROS space of the topics.
         #[schemars(required, range(min = 1, max = 1))]
         origin: u16,
@@ -740,10 +740,10 @@ pub(crate) const EXPANDED_NODE_ID: &str = r"^(ns=[0-9]+;|nsu=[^;]+;)?[isgb]=";
 pub(crate) const DURATION: &str = r"^[0-9]+(\.[0-9]+)?(ms|s|min|h)$";
 
 /// Index and URI, each with its position.
-pub(crate) type Namespaces = Vec<(At<u16>, At<String>)>;
+pub(crate) type Namespaces = Vec<(Located<u16>, Located<String>)>;
 
-impl Read for Namespaces {
-    fn read(node: &Node<'_>, reader: &mut Reader<'_>) -> Option<Self> {
+impl FromNode for Namespaces {
+    fn read(node: &YamlNode<'_>, reader: &mut NodeReader<'_>) -> Option<Self> {
         let pairs = reader.pairs(node, "a map of namespace index and URI")?;
         let read = pairs.into_iter().map(|pair| {
             let key =
@@ -759,7 +759,7 @@ impl Read for Namespaces {
                 help_octal(note, pair.key);
             }
             (
-                At {
+                Located {
                     place: pair.place,
                     value: key,
                 },
@@ -771,10 +771,10 @@ impl Read for Namespaces {
 }
 
 /// Value and text, each with its position.
-pub(crate) type EnumTexts = Vec<(At<i64>, At<String>)>;
+pub(crate) type EnumTexts = Vec<(Located<i64>, Located<String>)>;
 
-impl Read for EnumTexts {
-    fn read(node: &Node<'_>, reader: &mut Reader<'_>) -> Option<Self> {
+impl FromNode for EnumTexts {
+    fn read(node: &YamlNode<'_>, reader: &mut NodeReader<'_>) -> Option<Self> {
         let pairs = reader.pairs(node, "a map of value and text, as {0: idle, 1: moving}")?;
         let read = pairs.into_iter().map(|pair| {
             let value = pair.key.parse().ok().filter(|_| !is_octal(pair.key));
@@ -784,7 +784,7 @@ impl Read for EnumTexts {
                 help_octal(note, pair.key);
             }
             let place = pair.place;
-            (At { place, value }, reader.at(pair.value))
+            (Located { place, value }, reader.at(pair.value))
         });
         Some(read.collect())
     }
@@ -792,10 +792,10 @@ impl Read for EnumTexts {
 
 /// Constants of a request: path of the field, its position, and the value.
 #[derive(Clone, Debug)]
-pub(crate) struct Request(pub(crate) Vec<(String, Place, Literal)>);
+pub(crate) struct Request(pub(crate) Vec<(String, TextSpan, Literal)>);
 
-impl Read for Request {
-    fn read(node: &Node<'_>, reader: &mut Reader<'_>) -> Option<Self> {
+impl FromNode for Request {
+    fn read(node: &YamlNode<'_>, reader: &mut NodeReader<'_>) -> Option<Self> {
         let mut found = Vec::new();
         constants(node, "", reader, &mut found)?;
         Some(Self(found))
@@ -804,28 +804,28 @@ impl Read for Request {
 
 /// Returns `None` for faulty constants, which are noted. Maps nest no deeper than documents do.
 fn constants(
-    node: &Node<'_>,
+    node: &YamlNode<'_>,
     prefix: &str,
-    reader: &mut Reader<'_>,
-    found: &mut Vec<(String, Place, Literal)>,
+    reader: &mut NodeReader<'_>,
+    found: &mut Vec<(String, TextSpan, Literal)>,
 ) -> Option<()> {
     let mut sound = Some(());
     for pair in reader.pairs(node, "a map of field and value")? {
         let path = format!("{prefix}{}", pair.key);
         let literal = match &pair.value.kind {
-            Kind::Map(_) => {
+            YamlKind::Map(_) => {
                 let inner = constants(pair.value, &format!("{path}."), reader, found);
                 sound = sound.and(inner);
                 continue;
             }
-            Kind::Scalar(text) => Some(Literal::One(text.clone().into_owned())),
-            Kind::List(items) => {
+            YamlKind::Scalar(text) => Some(Literal::One(text.clone().into_owned())),
+            YamlKind::List(items) => {
                 let texts = items
                     .iter()
                     .map(|item| reader.text(item, "a single value").map(str::to_owned));
                 texts.collect::<Option<_>>().map(Literal::List)
             }
-            Kind::Null => {
+            YamlKind::Null => {
                 reader.wrong(pair.value, "a value, a list or a map");
                 None
             }
@@ -865,16 +865,16 @@ pub(crate) enum OnLossEntry {
     Call(StopCallEntry),
 }
 
-impl Read for OnLossEntry {
-    fn read(node: &Node<'_>, reader: &mut Reader<'_>) -> Option<Self> {
+impl FromNode for OnLossEntry {
+    fn read(node: &YamlNode<'_>, reader: &mut NodeReader<'_>) -> Option<Self> {
         match &node.kind {
-            Kind::Scalar(text) if text == "zero" => Some(Self::Zero),
-            Kind::Scalar(text) => Some(Self::Value(Literal::One(text.clone().into_owned()))),
-            Kind::Map(pairs) if pairs.iter().any(|(key, _)| is_scalar(key, "call")) => {
+            YamlKind::Scalar(text) if text == "zero" => Some(Self::Zero),
+            YamlKind::Scalar(text) => Some(Self::Value(Literal::One(text.clone().into_owned()))),
+            YamlKind::Map(pairs) if pairs.iter().any(|(key, _)| is_scalar(key, "call")) => {
                 StopCallEntry::read(node, reader).map(Self::Call)
             }
-            Kind::Map(_) => Request::read(node, reader).map(Self::Fields),
-            Kind::Null | Kind::List(_) => {
+            YamlKind::Map(_) => Request::read(node, reader).map(Self::Fields),
+            YamlKind::Null | YamlKind::List(_) => {
                 reader.wrong(
                     node,
                     "`zero`, a value, the fields of a message as {linear.x: 0.1}, or {call: ns=2;i=48}",
@@ -885,8 +885,8 @@ impl Read for OnLossEntry {
     }
 }
 
-fn is_scalar(node: &Node<'_>, wanted: &str) -> bool {
-    matches!(&node.kind, Kind::Scalar(text) if text == wanted)
+fn is_scalar(node: &YamlNode<'_>, wanted: &str) -> bool {
+    matches!(&node.kind, YamlKind::Scalar(text) if text == wanted)
 }
 
 impl JsonSchema for OnLossEntry {
@@ -917,16 +917,16 @@ pub(crate) enum ConfirmedEntry {
     Map(Box<ConfirmEntry>),
 }
 
-impl Read for ConfirmedEntry {
-    fn read(node: &Node<'_>, reader: &mut Reader<'_>) -> Option<Self> {
+impl FromNode for ConfirmedEntry {
+    fn read(node: &YamlNode<'_>, reader: &mut NodeReader<'_>) -> Option<Self> {
         match &node.kind {
-            Kind::Scalar(text) if text == "bridge" => Some(Self::Bridge),
-            Kind::Scalar(text) if text == "none" => Some(Self::None),
-            Kind::Map(_) => {
+            YamlKind::Scalar(text) if text == "bridge" => Some(Self::Bridge),
+            YamlKind::Scalar(text) if text == "none" => Some(Self::None),
+            YamlKind::Map(_) => {
                 let read = ConfirmEntry::read(node, reader);
                 read.map(|read| Self::Map(Box::new(read)))
             }
-            Kind::Scalar(_) | Kind::Null | Kind::List(_) => {
+            YamlKind::Scalar(_) | YamlKind::Null | YamlKind::List(_) => {
                 reader.wrong(
                     node,
                     "`bridge`, `none`, {within: 2s}, or {by: ns=2;i=31, within: 2s}",
@@ -956,10 +956,10 @@ impl JsonSchema for ConfirmedEntry {
 
 /// Sources of fields: path of the field, its position, and the source.
 #[derive(Clone, Debug)]
-pub(crate) struct FieldMapEntry(pub(crate) Vec<(String, Place, Assigned)>);
+pub(crate) struct FieldMapEntry(pub(crate) Vec<(String, TextSpan, Assigned)>);
 
-impl Read for FieldMapEntry {
-    fn read(node: &Node<'_>, reader: &mut Reader<'_>) -> Option<Self> {
+impl FromNode for FieldMapEntry {
+    fn read(node: &YamlNode<'_>, reader: &mut NodeReader<'_>) -> Option<Self> {
         let mut found = Vec::new();
         assignments(node, "", reader, &mut found)?;
         Some(Self(found))
@@ -968,10 +968,10 @@ impl Read for FieldMapEntry {
 
 /// Returns `None` for faulty assignments, which are noted. Maps nest no deeper than documents do.
 fn assignments(
-    node: &Node<'_>,
+    node: &YamlNode<'_>,
     prefix: &str,
-    reader: &mut Reader<'_>,
-    found: &mut Vec<(String, Place, Assigned)>,
+    reader: &mut NodeReader<'_>,
+    found: &mut Vec<(String, TextSpan, Assigned)>,
 ) -> Option<()> {
     let mut sound = Some(());
     for pair in reader.pairs(
@@ -980,10 +980,10 @@ fn assignments(
     )? {
         let path = format!("{prefix}{}", pair.key);
         let assigned = match &pair.value.kind {
-            Kind::Map(pairs) => {
+            YamlKind::Map(pairs) => {
                 if let [(key, value)] = &pairs[..]
-                    && matches!(&key.kind, Kind::Scalar(key) if key == "field")
-                    && let Kind::Scalar(text) = &value.kind
+                    && matches!(&key.kind, YamlKind::Scalar(key) if key == "field")
+                    && let YamlKind::Scalar(text) = &value.kind
                 {
                     Some(Assigned::Field(text.clone().into_owned()))
                 } else {
@@ -992,15 +992,17 @@ fn assignments(
                     continue;
                 }
             }
-            Kind::Scalar(text) => Some(Assigned::Constant(Literal::One(text.clone().into_owned()))),
-            Kind::List(items) => {
+            YamlKind::Scalar(text) => {
+                Some(Assigned::Constant(Literal::One(text.clone().into_owned())))
+            }
+            YamlKind::List(items) => {
                 let texts = items
                     .iter()
                     .map(|item| reader.text(item, "a single value").map(str::to_owned));
                 let texts: Option<Vec<String>> = texts.collect();
                 texts.map(|texts| Assigned::Constant(Literal::List(texts)))
             }
-            Kind::Null => {
+            YamlKind::Null => {
                 reader.wrong(pair.value, "a value, a list, or {field: name}");
                 None
             }
@@ -1029,14 +1031,14 @@ impl JsonSchema for FieldMapEntry {
 
 /// A service or action of a call, or a list of them.
 #[derive(Clone, Debug)]
-pub(crate) struct CallBindings(pub(crate) Vec<At<CallBindingEntry>>);
+pub(crate) struct CallBindings(pub(crate) Vec<Located<CallBindingEntry>>);
 
-impl Read for CallBindings {
-    fn read(node: &Node<'_>, reader: &mut Reader<'_>) -> Option<Self> {
+impl FromNode for CallBindings {
+    fn read(node: &YamlNode<'_>, reader: &mut NodeReader<'_>) -> Option<Self> {
         match &node.kind {
-            Kind::List(_) => Vec::read(node, reader).map(Self),
-            Kind::Map(_) => Some(Self(vec![reader.at(node)])),
-            Kind::Null | Kind::Scalar(_) => {
+            YamlKind::List(_) => Vec::read(node, reader).map(Self),
+            YamlKind::Map(_) => Some(Self(vec![reader.at(node)])),
+            YamlKind::Null | YamlKind::Scalar(_) => {
                 reader.wrong(
                     node,
                     "a service such as `{service: /a/b, type: std_srvs/SetBool}`, or a list of them",
@@ -1066,8 +1068,8 @@ impl JsonSchema for CallBindings {
 #[derive(Clone, Debug)]
 pub(crate) struct UaFieldEntry(pub(crate) UaField);
 
-impl Read for UaFieldEntry {
-    fn read(node: &Node<'_>, reader: &mut Reader<'_>) -> Option<Self> {
+impl FromNode for UaFieldEntry {
+    fn read(node: &YamlNode<'_>, reader: &mut NodeReader<'_>) -> Option<Self> {
         let wanted = "the place of a field as 2, or its name as Temperature";
         let text = reader.text(node, wanted)?;
         if !text.is_empty() && text.bytes().all(|b| b.is_ascii_digit()) {
@@ -1105,14 +1107,14 @@ const MAX_FIELD_NAME: usize = 255;
 
 /// A path or a list of paths.
 #[derive(Clone, Debug)]
-pub(crate) struct Includes(pub(crate) Vec<At<String>>);
+pub(crate) struct Includes(pub(crate) Vec<Located<String>>);
 
-impl Read for Includes {
-    fn read(node: &Node<'_>, reader: &mut Reader<'_>) -> Option<Self> {
+impl FromNode for Includes {
+    fn read(node: &YamlNode<'_>, reader: &mut NodeReader<'_>) -> Option<Self> {
         match &node.kind {
-            Kind::List(_) => Vec::read(node, reader).map(Self),
-            Kind::Scalar(_) => Some(Self(vec![reader.at(node)])),
-            Kind::Null | Kind::Map(_) => {
+            YamlKind::List(_) => Vec::read(node, reader).map(Self),
+            YamlKind::Scalar(_) => Some(Self(vec![reader.at(node)])),
+            YamlKind::Null | YamlKind::Map(_) => {
                 reader.wrong(node, "a path such as `robots.yaml`, or a list of them");
                 None
             }
@@ -1137,14 +1139,14 @@ impl JsonSchema for Includes {
 
 /// A role or a list of roles.
 #[derive(Clone, Debug)]
-pub(crate) struct RoleList(pub(crate) Vec<At<RoleEntry>>);
+pub(crate) struct RoleList(pub(crate) Vec<Located<RoleEntry>>);
 
-impl Read for RoleList {
-    fn read(node: &Node<'_>, reader: &mut Reader<'_>) -> Option<Self> {
+impl FromNode for RoleList {
+    fn read(node: &YamlNode<'_>, reader: &mut NodeReader<'_>) -> Option<Self> {
         match &node.kind {
-            Kind::List(_) => Vec::read(node, reader).map(Self),
-            Kind::Scalar(_) => Some(Self(vec![reader.at(node)])),
-            Kind::Null | Kind::Map(_) => {
+            YamlKind::List(_) => Vec::read(node, reader).map(Self),
+            YamlKind::Scalar(_) => Some(Self(vec![reader.at(node)])),
+            YamlKind::Null | YamlKind::Map(_) => {
                 reader.wrong(node, "a role such as `engineer`, or a list of them");
                 None
             }
@@ -1169,19 +1171,19 @@ impl JsonSchema for RoleList {
 
 /// Several fields of a message.
 #[derive(Clone, Debug)]
-pub(crate) struct FieldList(pub(crate) Vec<At<FieldEntry>>);
+pub(crate) struct FieldList(pub(crate) Vec<Located<FieldEntry>>);
 
-impl Read for FieldList {
-    fn read(node: &Node<'_>, reader: &mut Reader<'_>) -> Option<Self> {
-        let Kind::List(items) = &node.kind else {
+impl FromNode for FieldList {
+    fn read(node: &YamlNode<'_>, reader: &mut NodeReader<'_>) -> Option<Self> {
+        let YamlKind::List(items) = &node.kind else {
             reader.wrong(node, "a list of fields such as `[linear.x, angular.z]`");
             return None;
         };
         let read = items.iter().map(|item| match &item.kind {
-            Kind::Scalar(text) => At {
+            YamlKind::Scalar(text) => Located {
                 place: item.place,
                 value: Some(FieldEntry {
-                    field: Some(At {
+                    field: Some(Located {
                         place: item.place,
                         value: Some(text.clone().into_owned()),
                     }),
@@ -1191,7 +1193,7 @@ impl Read for FieldList {
                     out_of_range: None,
                 }),
             },
-            Kind::Null | Kind::List(_) | Kind::Map(_) => reader.at(item),
+            YamlKind::Null | YamlKind::List(_) | YamlKind::Map(_) => reader.at(item),
         });
         Some(Self(read.collect()))
     }
@@ -1214,14 +1216,14 @@ impl JsonSchema for FieldList {
 
 /// A binding or a list of bindings.
 #[derive(Clone, Debug)]
-pub(crate) struct Bindings(pub(crate) Vec<At<BindingEntry>>);
+pub(crate) struct Bindings(pub(crate) Vec<Located<BindingEntry>>);
 
-impl Read for Bindings {
-    fn read(node: &Node<'_>, reader: &mut Reader<'_>) -> Option<Self> {
+impl FromNode for Bindings {
+    fn read(node: &YamlNode<'_>, reader: &mut NodeReader<'_>) -> Option<Self> {
         match &node.kind {
-            Kind::List(_) => Vec::read(node, reader).map(Self),
-            Kind::Map(_) => Some(Self(vec![reader.at(node)])),
-            Kind::Null | Kind::Scalar(_) => {
+            YamlKind::List(_) => Vec::read(node, reader).map(Self),
+            YamlKind::Map(_) => Some(Self(vec![reader.at(node)])),
+            YamlKind::Null | YamlKind::Scalar(_) => {
                 reader.wrong(node, "a binding such as `{topic: /a/b, type: std_msgs/Bool, field: data}`, or a list of them");
                 None
             }
@@ -1254,11 +1256,11 @@ pub(crate) enum Queue {
     DropOldest(#[schemars(range(min = 1, max = 65535))] u16),
 }
 
-impl Read for Queue {
-    fn read(node: &Node<'_>, reader: &mut Reader<'_>) -> Option<Self> {
+impl FromNode for Queue {
+    fn read(node: &YamlNode<'_>, reader: &mut NodeReader<'_>) -> Option<Self> {
         match &node.kind {
-            Kind::Scalar(text) if text == "keep_latest" => Some(Self::KeepLatest),
-            Kind::Map(_) => {
+            YamlKind::Scalar(text) if text == "keep_latest" => Some(Self::KeepLatest),
+            YamlKind::Map(_) => {
                 let [size] = reader.keys(node, ["drop_oldest"])?;
                 let size = reader.field::<u16>(size);
                 match size.as_ref().map(|at| (at.value, at.place)) {
@@ -1281,7 +1283,7 @@ impl Read for Queue {
                     }
                 }
             }
-            Kind::Null | Kind::Scalar(_) | Kind::List(_) => {
+            YamlKind::Null | YamlKind::Scalar(_) | YamlKind::List(_) => {
                 let note = reader.findings.error(
                     Code::WrongValue,
                     node.place,
@@ -1297,10 +1299,10 @@ impl Read for Queue {
     }
 }
 
-fn found(node: &Node<'_>) -> String {
+fn found(node: &YamlNode<'_>) -> String {
     match &node.kind {
-        Kind::Scalar(text) => format!("`{}`", short(text)),
-        Kind::Null | Kind::List(_) | Kind::Map(_) => node.kind.name().to_owned(),
+        YamlKind::Scalar(text) => format!("`{}`", short(text)),
+        YamlKind::Null | YamlKind::List(_) | YamlKind::Map(_) => node.kind.name().to_owned(),
     }
 }
 
@@ -1324,8 +1326,11 @@ impl Default for Document {
 }
 
 /// Reads the whole document; an empty text is a document without any key.
-pub(crate) fn read(root: &Node<'_>, reader: &mut Reader<'_>) -> Option<(Document, Place)> {
-    if matches!(root.kind, Kind::Null) {
+pub(crate) fn read(
+    root: &YamlNode<'_>,
+    reader: &mut NodeReader<'_>,
+) -> Option<(Document, TextSpan)> {
+    if matches!(root.kind, YamlKind::Null) {
         // A file that another file includes may be empty.
         if root.place.file == 0 {
             let message = "the document is empty: it declares no spaces, values or calls";

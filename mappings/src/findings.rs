@@ -9,19 +9,19 @@ use crate::key_text::without_keys;
 use crate::read::short;
 use crate::secret;
 use crate::topic::SpaceId;
-use crate::tree::Place;
+use crate::tree::TextSpan;
 
 /// Maximum number of findings that are kept; further findings are counted.
 const MAX: usize = 200;
 
-pub(crate) struct Findings {
+pub(crate) struct MappingFindings {
     /// Names of the files, by the file numbers of positions.
     files: Vec<Arc<str>>,
     found: Vec<(u16, Diagnostic)>,
     /// Findings that exist already: an alias puts a node and its faults into several positions.
-    seen: HashSet<(Code, Place, String)>,
+    seen: HashSet<(Code, TextSpan, String)>,
     /// Positions of values that are unknown, so that nothing is reported about them.
-    unknown: HashSet<Place>,
+    unknown: HashSet<TextSpan>,
     /// Values from the environment, which are secret, and the texts that are shown instead.
     secrets: BTreeMap<String, String>,
     /// Spaces of the part of the document that is being checked.
@@ -31,7 +31,7 @@ pub(crate) struct Findings {
     left_out: usize,
 }
 
-impl Findings {
+impl MappingFindings {
     pub(crate) fn new(file: &str) -> Self {
         Self {
             files: vec![file.into()],
@@ -61,7 +61,7 @@ impl Findings {
 
     /// Returns the line of a position, seen from another position: `line 6`, with the file name if
     /// the files differ.
-    pub(crate) fn line(&self, of: Place, at: Place) -> String {
+    pub(crate) fn line(&self, of: TextSpan, at: TextSpan) -> String {
         if of.file == at.file {
             format!("line {}", of.line)
         } else {
@@ -70,7 +70,7 @@ impl Findings {
     }
 
     /// Suppresses other findings about the position.
-    pub(crate) fn is_unknown(&mut self, place: Place) {
+    pub(crate) fn is_unknown(&mut self, place: TextSpan) {
         self.unknown.insert(place);
     }
 
@@ -90,7 +90,7 @@ impl Findings {
     pub(crate) fn error(
         &mut self,
         code: Code,
-        place: Place,
+        place: TextSpan,
         message: impl Into<String>,
     ) -> Note<'_> {
         self.push(code, Severity::Error, place, message.into())
@@ -99,13 +99,19 @@ impl Findings {
     pub(crate) fn warning(
         &mut self,
         code: Code,
-        place: Place,
+        place: TextSpan,
         message: impl Into<String>,
     ) -> Note<'_> {
         self.push(code, Severity::Warning, place, message.into())
     }
 
-    fn push(&mut self, code: Code, severity: Severity, place: Place, message: String) -> Note<'_> {
+    fn push(
+        &mut self,
+        code: Code,
+        severity: Severity,
+        place: TextSpan,
+        message: String,
+    ) -> Note<'_> {
         let needed_by = if severity == Severity::Error && code.lies_in_definitions() {
             self.part.clone()
         } else {
@@ -124,7 +130,7 @@ impl Findings {
         if !self.seen.insert((code, place, message.clone())) {
             return Note(None);
         }
-        let Place {
+        let TextSpan {
             file,
             line,
             column,
@@ -181,9 +187,9 @@ impl Findings {
         }
         if self.left_out > 0 {
             let message = format!("{} more findings are not shown", self.left_out);
-            let Place {
+            let TextSpan {
                 line, column, len, ..
-            } = Place::START;
+            } = TextSpan::START;
             let at = Span {
                 file: self.files.into_iter().next().unwrap_or_default(),
                 line,

@@ -1,22 +1,22 @@
 //! A document and the files that it includes, as one document.
 
-use crate::check::Source;
+use crate::check::CheckedText;
 use crate::code::Code;
 use crate::document::{self, Document, PubSubForm};
-use crate::findings::Findings;
-use crate::read::{At, Field, Reader};
-use crate::surroundings::{Readers, Surroundings, beside, fits};
-use crate::tree::{self, MAX_BYTES, MAX_EXPANDED, Place};
+use crate::findings::MappingFindings;
+use crate::read::{Located, NodeReader, OptionalKey};
+use crate::surroundings::{FileReaders, Surroundings, beside, fits};
+use crate::tree::{self, MAX_BYTES, MAX_EXPANDED, TextSpan};
 
 /// Reads files into one document.
 pub(crate) struct Loader<'a> {
     pub(crate) around: &'a dyn Surroundings,
-    pub(crate) findings: &'a mut Findings,
-    pub(crate) sources: Vec<Source>,
+    pub(crate) findings: &'a mut MappingFindings,
+    pub(crate) sources: Vec<CheckedText>,
     /// Files that are being read, the outermost first.
     open: Vec<String>,
     /// Files that have been read, each with the position that names it.
-    read: Vec<(String, Place)>,
+    read: Vec<(String, TextSpan)>,
     bytes: usize,
     /// Bytes of the values of variables in all files.
     expanded: usize,
@@ -26,7 +26,7 @@ pub(crate) struct Loader<'a> {
 }
 
 impl<'a> Loader<'a> {
-    pub(crate) fn new(around: &'a dyn Surroundings, findings: &'a mut Findings) -> Self {
+    pub(crate) fn new(around: &'a dyn Surroundings, findings: &'a mut MappingFindings) -> Self {
         Self {
             around,
             findings,
@@ -42,10 +42,10 @@ impl<'a> Loader<'a> {
 
     /// Returns the document of the text with all files that it includes, and the texts that were
     /// read. The document is `None` if the text itself is faulty.
-    pub(crate) fn load(mut self, text: &str, name: &str) -> (Option<Document>, Vec<Source>) {
+    pub(crate) fn load(mut self, text: &str, name: &str) -> (Option<Document>, Vec<CheckedText>) {
         // An included file may include this file in turn, by its path.
         let path = beside("", name);
-        self.read.push((path.clone(), Place::START));
+        self.read.push((path.clone(), TextSpan::START));
         let read = self.add(text, name, (path, 0));
         if self.partial {
             // A declaration that is missing here may be in a file that could not be read.
@@ -57,7 +57,7 @@ impl<'a> Loader<'a> {
     }
 
     fn add(&mut self, text: &str, name: &str, (path, file): (String, u16)) -> Option<()> {
-        self.sources.push(Source {
+        self.sources.push(CheckedText {
             name: name.into(),
             text: text.to_owned(),
         });
@@ -75,9 +75,9 @@ impl<'a> Loader<'a> {
         self.secrets(&tree.secrets, &path);
         self.expanded = self.expanded.saturating_add(tree.expanded);
         if self.expanded > MAX_EXPANDED {
-            let place = Place {
+            let place = TextSpan {
                 file,
-                ..Place::START
+                ..TextSpan::START
             };
             self.note(tree::too_expanded(place));
             return None;
@@ -87,10 +87,10 @@ impl<'a> Loader<'a> {
             self.note(fault);
             self.findings.is_unknown(place);
         }
-        let (mut document, _) = document::read(&tree.root, &mut Reader::new(self.findings))?;
+        let (mut document, _) = document::read(&tree.root, &mut NodeReader::new(self.findings))?;
         let includes = document.include.take();
         let type_paths = document.type_paths.as_mut();
-        for At { place, value } in type_paths
+        for Located { place, value } in type_paths
             .and_then(|at| at.value.as_mut())
             .into_iter()
             .flatten()
@@ -114,7 +114,8 @@ impl<'a> Loader<'a> {
         }
         self.take(document);
         self.open.push(path);
-        for At { place, value } in includes.and_then(|at| at.value).map_or(Vec::new(), |i| i.0) {
+        for Located { place, value } in includes.and_then(|at| at.value).map_or(Vec::new(), |i| i.0)
+        {
             if let Some(named) = value {
                 self.include(&named, place);
             }
@@ -127,7 +128,7 @@ impl<'a> Loader<'a> {
     fn nodesets(&mut self, document: &mut Document, path: &str) {
         let server = document.server.as_mut().and_then(|at| at.value.as_mut());
         let files = server.and_then(|server| server.nodesets.as_mut()?.value.as_mut());
-        for At { place, value } in files.into_iter().flatten() {
+        for Located { place, value } in files.into_iter().flatten() {
             if value.as_ref().is_some_and(|named| named.contains("://")) {
                 let note = self.findings.error(Code::NodeSet, *place, URL);
                 note.help(
@@ -143,7 +144,7 @@ impl<'a> Loader<'a> {
     }
 
     /// Notes passwords in a file, at the first of them.
-    fn secrets(&mut self, found: &[Place], path: &str) {
+    fn secrets(&mut self, found: &[TextSpan], path: &str) {
         let Some((place, more)) = found.split_first() else {
             return;
         };
@@ -160,21 +161,21 @@ impl<'a> Loader<'a> {
             return;
         };
         let (who, mode) = match readers {
-            Readers::Group => ("the group of the file", "g-r"),
-            Readers::Everybody => ("every user of this host", "go-r"),
+            FileReaders::Group => ("the group of the file", "g-r"),
+            FileReaders::Everybody => ("every user of this host", "go-r"),
         };
         let help = format!("{apart}, or restrict the file to its owner: chmod {mode} {path}");
         note.label(format!("{who} can read it")).help(help);
     }
 
-    fn note(&mut self, fault: tree::Fault) {
+    fn note(&mut self, fault: tree::YamlFault) {
         let note = self.findings.error(fault.code, fault.place, fault.message);
         if let Some(help) = fault.help {
             note.help(help);
         }
     }
 
-    fn include(&mut self, named: &str, place: Place) {
+    fn include(&mut self, named: &str, place: TextSpan) {
         if named.contains("://") {
             let note = self.findings.error(Code::Include, place, URL);
             note.help("give a path relative to the folder of this file; only local files are read");
@@ -221,7 +222,7 @@ impl<'a> Loader<'a> {
         }
     }
 
-    fn file(&mut self, path: String, place: Place) {
+    fn file(&mut self, path: String, place: TextSpan) {
         if self.open.contains(&path) {
             let mut way: Vec<&str> = self.open.iter().map(String::as_str).collect();
             way.push(&path);
@@ -325,14 +326,14 @@ fn files(document: &mut Document) -> impl Iterator<Item = &mut String> {
 }
 
 /// Returns the value of a faulty entry.
-const fn missing<T>() -> At<T> {
-    At {
-        place: Place::START,
+const fn missing<T>() -> Located<T> {
+    Located {
+        place: TextSpan::START,
         value: None,
     }
 }
 
-fn append<T>(whole: &mut Field<Vec<T>>, part: Field<Vec<T>>) {
+fn append<T>(whole: &mut OptionalKey<Vec<T>>, part: OptionalKey<Vec<T>>) {
     match (whole, part) {
         (_, None) => {}
         (whole @ None, part) => *whole = part,
@@ -344,7 +345,12 @@ fn append<T>(whole: &mut Field<Vec<T>>, part: Field<Vec<T>>) {
     }
 }
 
-fn once<T>(key: &str, whole: &mut Field<T>, part: Field<T>, findings: &mut Findings) {
+fn once<T>(
+    key: &str,
+    whole: &mut OptionalKey<T>,
+    part: OptionalKey<T>,
+    findings: &mut MappingFindings,
+) {
     match (&whole, part) {
         (None, part) => *whole = part,
         (Some(_), None) => {}

@@ -41,7 +41,9 @@ pub use call::{
     MethodTarget,
 };
 pub use carriers::{CarrierMedium, ConfiguredCarrier, ForwardedName, UdpGroup};
-pub use check::{Checked, PathFault, PathFaultKind, Source, TypeFiles, TypeOrigin, TypeUse};
+pub use check::{
+    Checked, CheckedText, OpenTypeFiles, PathFault, PathFaultKind, TypeOrigin, TypeUse,
+};
 pub use code::{Code, UnknownCode};
 pub use diagnostic::{Diagnostic, Severity, Span};
 pub use difference::Difference;
@@ -52,20 +54,21 @@ pub use ethernet::{EthernetGroup, MacAddress};
 
 pub use loss::{Loss, LossAction, Motion};
 pub use mapping::{
-    Binding, Lasting, Mapping, Meaning, Overflow, PubSub, Publish, PublisherIdRule, SecurityPolicy,
-    Server, ServerLimits, ServiceBinding, ServiceRole, Space, Trigger, UaField, Variable,
+    Binding, Lasting, Mapping, Meaning, Overflow, PubSub, Publish, PublisherIdRule, Server,
+    ServerLimits, ServerSecurityPolicy, ServiceBinding, ServiceRole, Space, Trigger, UaField,
+    Variable,
 };
 pub use node_id::{ExpandedNodeIdText, Identifier, NamespaceText, NodeIdError, NodeIdText};
 pub use nodesets::{NodeSetFault, NodeSetNode, NodeSetType, NodeSets};
 pub use pattern::{Pattern, PatternFault, PatternReason, PatternVariable};
 pub use permission::{Anonymous, Permissions, Role};
-pub use quality::{Ages, Answer, Confirm, History};
+pub use quality::{Ages, Confirm, ConfirmingValues, History};
 pub use remote::{
     Access, FindSkills, NodeSource, NodeTarget, Password, RemoteServer, SkillsPlace, User,
 };
 pub use schema::schema;
 pub use secret::masked;
-pub use security::{GroupMode, GroupPolicy, KeySource, Replay, SecurityGroup, Served};
-pub use surroundings::{Readers, Surroundings};
-pub use topic::{Part, SpaceId, TopicError, TopicId};
+pub use security::{GroupMode, GroupPolicy, KeySource, Replay, SecurityGroup, ServedKeys};
+pub use surroundings::{FileReaders, Surroundings};
+pub use topic::{NamePart, SpaceId, TopicError, TopicId};
 pub use unit::Unit;

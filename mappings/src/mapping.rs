@@ -483,7 +483,7 @@ pub struct Server {
     pub redundant_endpoints: Vec<Endpoint>,
     /// Security policies that it offers, without repetition and not empty; `None` if the document
     /// names none.
-    pub security: Option<Vec<SecurityPolicy>>,
+    pub security: Option<Vec<ServerSecurityPolicy>>,
     /// Permission of anonymous users.
     pub anonymous: Anonymous,
     /// `true` if the server refuses other servers at hosts that their trusted certificates do not
@@ -529,14 +529,15 @@ pub struct ServerLimits {
 
 impl Server {
     /// Returns the security policies that it offers. If the document names none, these are all
-    /// policies, and [`SecurityPolicy::None`] only for a server that listens on a loopback address.
+    /// policies, and [`ServerSecurityPolicy::None`] only for a server that listens on a loopback
+    /// address.
     #[must_use]
-    pub fn policies(&self, is_loopback: bool) -> Vec<SecurityPolicy> {
+    pub fn policies(&self, is_loopback: bool) -> Vec<ServerSecurityPolicy> {
         if let Some(told) = &self.security {
             return told.clone();
         }
-        let all = SecurityPolicy::ALL.iter().copied();
-        all.filter(|policy| is_loopback || *policy != SecurityPolicy::None)
+        let all = ServerSecurityPolicy::ALL.iter().copied();
+        all.filter(|policy| is_loopback || *policy != ServerSecurityPolicy::None)
             .collect()
     }
 
@@ -601,7 +602,7 @@ impl Default for Server {
 
 /// A SecurityPolicy of OPC 10000-7.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
-pub enum SecurityPolicy {
+pub enum ServerSecurityPolicy {
     /// Neither signed nor encrypted.
     None,
     /// `http://opcfoundation.org/UA/SecurityPolicy#Basic256Sha256`
@@ -612,7 +613,7 @@ pub enum SecurityPolicy {
     Aes256Sha256RsaPss,
 }
 
-impl SecurityPolicy {
+impl ServerSecurityPolicy {
     /// Every policy, in ascending order of strength.
     pub const ALL: &'static [Self] = &[
         Self::None,

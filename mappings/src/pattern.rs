@@ -14,9 +14,9 @@ pub struct Pattern {
     pub(crate) topics: Glob,
     pub(crate) exclude: Vec<Glob>,
     pub(crate) origin: SpaceId,
-    pub(crate) node: Template,
-    pub(crate) alias: Option<Template>,
-    pub(crate) name: Template,
+    pub(crate) node: NameTemplate,
+    pub(crate) alias: Option<NameTemplate>,
+    pub(crate) name: NameTemplate,
     pub(crate) message_type: Option<TypeName>,
     pub(crate) selection: Selection,
 }
@@ -253,7 +253,7 @@ fn take_part(pieces: &[String], part: &str, found: &mut Vec<String>) -> Option<(
 
 /// A text with `{1}`, `{2}`... for captured texts.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub(crate) struct Template(Vec<Piece>);
+pub(crate) struct NameTemplate(Vec<Piece>);
 
 #[derive(Clone, Debug, PartialEq, Eq)]
 enum Piece {
@@ -262,7 +262,7 @@ enum Piece {
     Capture(usize),
 }
 
-impl Template {
+impl NameTemplate {
     /// Reads a template. `captures` is the number of captures. `Err` is the faulty part of the
     /// text.
     pub(crate) fn parse(text: &str, captures: usize) -> Result<Self, String> {
@@ -345,13 +345,13 @@ mod tests {
 
     #[test]
     fn a_template_names_captures_that_exist() {
-        let template = Template::parse("ns=2;i=10{1}_{2}{1}", 2).unwrap();
+        let template = NameTemplate::parse("ns=2;i=10{1}_{2}{1}", 2).unwrap();
         let captures = ["a".to_owned(), "b".to_owned()];
         assert_eq!(template.render(&captures), "ns=2;i=10a_ba");
-        assert!(template.varies() && !Template::parse("x", 2).unwrap().varies());
+        assert!(template.varies() && !NameTemplate::parse("x", 2).unwrap().varies());
         for text in ["{0}", "{3}", "{}", "{x}", "{01}"] {
-            assert_eq!(Template::parse(text, 2), Err(text.to_owned()));
+            assert_eq!(NameTemplate::parse(text, 2), Err(text.to_owned()));
         }
-        assert_eq!(Template::parse("a{1", 2), Err("{1".to_owned()));
+        assert_eq!(NameTemplate::parse("a{1", 2), Err("{1".to_owned()));
     }
 }

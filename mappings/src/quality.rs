@@ -36,12 +36,12 @@ pub struct Confirm {
     /// Longest time for the confirmation.
     pub within: Duration,
     /// Values that are a confirmation.
-    pub answer: Answer,
+    pub answer: ConfirmingValues,
 }
 
 /// Values that confirm a written value.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub enum Answer {
+pub enum ConfirmingValues {
     /// A value that equals the written value.
     Same,
     /// Every value that comes.

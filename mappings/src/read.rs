@@ -7,8 +7,8 @@ use std::rc::Rc;
 use schemars::{JsonSchema, Schema, SchemaGenerator};
 
 use crate::code::Code;
-use crate::findings::{Findings, Note};
-use crate::tree::{Kind, Node, Place};
+use crate::findings::{MappingFindings, Note};
+use crate::tree::{TextSpan, YamlKind, YamlNode};
 use documents::nearest;
 
 /// Maximum number of nodes that are read: aliases may lead to one node many times.
@@ -19,22 +19,22 @@ const FEW: usize = 16;
 
 /// A value and its position in the text.
 #[derive(Clone, Debug)]
-pub(crate) struct At<T> {
-    pub(crate) place: Place,
+pub(crate) struct Located<T> {
+    pub(crate) place: TextSpan,
     /// `None` for a faulty value; the fault has been noted.
     pub(crate) value: Option<T>,
 }
 
 /// Value of a key that may be left out.
-pub(crate) type Field<T> = Option<At<T>>;
+pub(crate) type OptionalKey<T> = Option<Located<T>>;
 
 /// Returns the value of a key, if it is given and sound.
-pub(crate) fn given<T>(field: &Field<T>) -> Option<(&T, Place)> {
+pub(crate) fn given<T>(field: &OptionalKey<T>) -> Option<(&T, TextSpan)> {
     let field = field.as_ref()?;
     Some((field.value.as_ref()?, field.place))
 }
 
-impl<T: JsonSchema> JsonSchema for At<T> {
+impl<T: JsonSchema> JsonSchema for Located<T> {
     fn inline_schema() -> bool {
         T::inline_schema()
     }
@@ -53,22 +53,22 @@ impl<T: JsonSchema> JsonSchema for At<T> {
 }
 
 /// A value that can be read from a node.
-pub(crate) trait Read: Sized {
+pub(crate) trait FromNode: Sized {
     /// Returns `None` for a faulty node, which is noted.
-    fn read(node: &Node<'_>, reader: &mut Reader<'_>) -> Option<Self>;
+    fn read(node: &YamlNode<'_>, reader: &mut NodeReader<'_>) -> Option<Self>;
 }
 
-pub(crate) struct Reader<'f> {
-    pub(crate) findings: &'f mut Findings,
+pub(crate) struct NodeReader<'f> {
+    pub(crate) findings: &'f mut MappingFindings,
     read: usize,
 }
 
-impl<'f> Reader<'f> {
-    pub(crate) const fn new(findings: &'f mut Findings) -> Self {
+impl<'f> NodeReader<'f> {
+    pub(crate) const fn new(findings: &'f mut MappingFindings) -> Self {
         Self { findings, read: 0 }
     }
 
-    pub(crate) fn at<T: Read>(&mut self, node: &Node<'_>) -> At<T> {
+    pub(crate) fn at<T: FromNode>(&mut self, node: &YamlNode<'_>) -> Located<T> {
         self.read += 1;
         let value = if self.read <= MAX_READ {
             T::read(node, self)
@@ -79,20 +79,20 @@ impl<'f> Reader<'f> {
             }
             None
         };
-        At {
+        Located {
             place: node.place,
             value,
         }
     }
 
     /// Notes that `wanted` (with its article) is expected instead of the node.
-    pub(crate) fn wrong(&mut self, node: &Node<'_>, wanted: &str) {
+    pub(crate) fn wrong(&mut self, node: &YamlNode<'_>, wanted: &str) {
         let message = format!("expected {wanted}, found {}", node.kind.name());
         self.findings.error(Code::WrongValue, node.place, message);
     }
 
-    pub(crate) fn text<'n>(&mut self, node: &'n Node<'n>, wanted: &str) -> Option<&'n str> {
-        if let Kind::Scalar(text) = &node.kind {
+    pub(crate) fn text<'n>(&mut self, node: &'n YamlNode<'n>, wanted: &str) -> Option<&'n str> {
+        if let YamlKind::Scalar(text) = &node.kind {
             return Some(text);
         }
         self.wrong(node, wanted);
@@ -100,25 +100,29 @@ impl<'f> Reader<'f> {
     }
 
     /// Returns the pairs of a map with texts as keys, each key once.
-    pub(crate) fn pairs<'n>(&mut self, node: &'n Node<'n>, wanted: &str) -> Option<Vec<Pair<'n>>> {
+    pub(crate) fn pairs<'n>(
+        &mut self,
+        node: &'n YamlNode<'n>,
+        wanted: &str,
+    ) -> Option<Vec<KeyPair<'n>>> {
         self.pairs_of(node, || wanted.to_owned())
     }
 
     /// Returns pairs as [`pairs`](Self::pairs) does; `wanted` is created only for a fault.
     fn pairs_of<'n>(
         &mut self,
-        node: &'n Node<'n>,
+        node: &'n YamlNode<'n>,
         wanted: impl FnOnce() -> String,
-    ) -> Option<Vec<Pair<'n>>> {
-        let Kind::Map(pairs) = &node.kind else {
+    ) -> Option<Vec<KeyPair<'n>>> {
+        let YamlKind::Map(pairs) = &node.kind else {
             self.wrong(node, &wanted());
             return None;
         };
-        let mut found: Vec<Pair<'n>> = Vec::with_capacity(pairs.len());
+        let mut found: Vec<KeyPair<'n>> = Vec::with_capacity(pairs.len());
         // A map with few keys is searched faster than a table.
-        let mut first: HashMap<&str, Place> = HashMap::new();
+        let mut first: HashMap<&str, TextSpan> = HashMap::new();
         for (key, value) in pairs {
-            let Kind::Scalar(text) = &key.kind else {
+            let YamlKind::Scalar(text) = &key.kind else {
                 let message = format!("expected a key, found {}", key.kind.name());
                 self.findings.error(Code::WrongValue, key.place, message);
                 continue;
@@ -140,7 +144,7 @@ impl<'f> Reader<'f> {
                 }
                 continue;
             }
-            found.push(Pair {
+            found.push(KeyPair {
                 key: text,
                 place: key.place,
                 value,
@@ -153,13 +157,13 @@ impl<'f> Reader<'f> {
     /// is then read as the key that it resembles, so that no missing key is reported.
     pub(crate) fn keys<'n, const N: usize>(
         &mut self,
-        node: &'n Node<'n>,
+        node: &'n YamlNode<'n>,
         keys: [&'static str; N],
-    ) -> Option<[Option<&'n Node<'n>>; N]> {
+    ) -> Option<[Option<&'n YamlNode<'n>>; N]> {
         let mut values = [None; N];
         let wanted = || format!("a map with {}", list(&keys));
         let mut misspelt = Vec::new();
-        for Pair { key, place, value } in self.pairs_of(node, wanted)? {
+        for KeyPair { key, place, value } in self.pairs_of(node, wanted)? {
             if let Some((_, slot)) = keys
                 .iter()
                 .zip(&mut values)
@@ -187,16 +191,16 @@ impl<'f> Reader<'f> {
     }
 
     /// Returns the value of a key; a key without a value counts as left out.
-    pub(crate) fn field<T: Read>(&mut self, node: Option<&Node<'_>>) -> Field<T> {
-        let node = node.filter(|node| !matches!(node.kind, Kind::Null))?;
+    pub(crate) fn field<T: FromNode>(&mut self, node: Option<&YamlNode<'_>>) -> OptionalKey<T> {
+        let node = node.filter(|node| !matches!(node.kind, YamlKind::Null))?;
         Some(self.at(node))
     }
 }
 
-pub(crate) struct Pair<'n> {
+pub(crate) struct KeyPair<'n> {
     pub(crate) key: &'n str,
-    pub(crate) place: Place,
-    pub(crate) value: &'n Rc<Node<'n>>,
+    pub(crate) place: TextSpan,
+    pub(crate) value: &'n Rc<YamlNode<'n>>,
 }
 
 /// Returns `a`, `b`, `c` in backticks.
@@ -208,14 +212,14 @@ pub(crate) fn list(names: &[impl AsRef<str>]) -> String {
     names.join(", ")
 }
 
-impl Read for String {
-    fn read(node: &Node<'_>, reader: &mut Reader<'_>) -> Option<Self> {
+impl FromNode for String {
+    fn read(node: &YamlNode<'_>, reader: &mut NodeReader<'_>) -> Option<Self> {
         reader.text(node, "a text").map(str::to_owned)
     }
 }
 
-impl Read for u16 {
-    fn read(node: &Node<'_>, reader: &mut Reader<'_>) -> Option<Self> {
+impl FromNode for u16 {
+    fn read(node: &YamlNode<'_>, reader: &mut NodeReader<'_>) -> Option<Self> {
         let text = reader.text(node, "a number")?;
         let number = text
             .parse()
@@ -230,8 +234,8 @@ impl Read for u16 {
     }
 }
 
-impl Read for f64 {
-    fn read(node: &Node<'_>, reader: &mut Reader<'_>) -> Option<Self> {
+impl FromNode for f64 {
+    fn read(node: &YamlNode<'_>, reader: &mut NodeReader<'_>) -> Option<Self> {
         let text = reader.text(node, "a number")?;
         // `inf` and `nan` are numbers in Rust, and in YAML with a dot before them.
         let number = text
@@ -247,8 +251,8 @@ impl Read for f64 {
     }
 }
 
-impl Read for bool {
-    fn read(node: &Node<'_>, reader: &mut Reader<'_>) -> Option<Self> {
+impl FromNode for bool {
+    fn read(node: &YamlNode<'_>, reader: &mut NodeReader<'_>) -> Option<Self> {
         match reader.text(node, "true or false")? {
             "true" => Some(true),
             "false" => Some(false),
@@ -261,9 +265,9 @@ impl Read for bool {
     }
 }
 
-impl<T: Read> Read for Vec<At<T>> {
-    fn read(node: &Node<'_>, reader: &mut Reader<'_>) -> Option<Self> {
-        let Kind::List(items) = &node.kind else {
+impl<T: FromNode> FromNode for Vec<Located<T>> {
+    fn read(node: &YamlNode<'_>, reader: &mut NodeReader<'_>) -> Option<Self> {
+        let YamlKind::List(items) = &node.kind else {
             reader.wrong(node, "a list (each entry begins with `- `)");
             return None;
         };
@@ -317,10 +321,10 @@ macro_rules! document {
         #[derive(Clone, Debug, schemars::JsonSchema)]
         $(#[$meta])*
         #[schemars(deny_unknown_fields)]
-        pub(crate) struct $name { $($(#[$field_meta])* pub(crate) $field: $crate::read::Field<$type>,)* }
+        pub(crate) struct $name { $($(#[$field_meta])* pub(crate) $field: $crate::read::OptionalKey<$type>,)* }
 
-        impl $crate::read::Read for $name {
-            fn read(node: &$crate::tree::Node<'_>, reader: &mut $crate::read::Reader<'_>) -> Option<Self> {
+        impl $crate::read::FromNode for $name {
+            fn read(node: &$crate::tree::YamlNode<'_>, reader: &mut $crate::read::NodeReader<'_>) -> Option<Self> {
                 const KEYS: [&str; [$(stringify!($field)),*].len()] =
                     [$($crate::read::plain(stringify!($field))),*];
                 let [$($field),*] = reader.keys(node, KEYS)?;
@@ -337,8 +341,8 @@ macro_rules! choice {
         $(#[$meta])*
         pub(crate) enum $name { $($(#[$variant_meta])* #[schemars(rename = $word)] $variant,)* }
 
-        impl $crate::read::Read for $name {
-            fn read(node: &$crate::tree::Node<'_>, reader: &mut $crate::read::Reader<'_>) -> Option<Self> {
+        impl $crate::read::FromNode for $name {
+            fn read(node: &$crate::tree::YamlNode<'_>, reader: &mut $crate::read::NodeReader<'_>) -> Option<Self> {
                 let words = [$($word),*];
                 let wanted = format!("one of {}", $crate::read::list(&words));
                 let text = reader.text(node, &wanted)?;

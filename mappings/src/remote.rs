@@ -6,7 +6,7 @@ use std::ops::RangeInclusive;
 use std::time::Duration;
 
 use crate::endpoint::Endpoint;
-use crate::mapping::SecurityPolicy;
+use crate::mapping::ServerSecurityPolicy;
 use crate::node_id::ExpandedNodeIdText;
 
 /// An existing OPC UA server, such as that of a PLC: an entry of `servers`.
@@ -43,7 +43,7 @@ pub struct FindSkills {
     pub most: u16,
     /// Security policy of the sessions; `None` for the best policy that each server offers and both
     /// sides know.
-    pub security: Option<SecurityPolicy>,
+    pub security: Option<ServerSecurityPolicy>,
     /// `true` if other hosts may run the skills too.
     pub open: bool,
     /// IPv4 networks outside the subnets of the interface whose servers are accepted too, such as
@@ -81,7 +81,7 @@ pub struct Access {
     pub endpoint: Endpoint,
     /// Security policy of the session; `None` for the best policy that the server offers and both
     /// sides know.
-    pub security: Option<SecurityPolicy>,
+    pub security: Option<ServerSecurityPolicy>,
     /// User of the session; anonymous without a user.
     pub user: Option<User>,
 }

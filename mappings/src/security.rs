@@ -65,14 +65,14 @@ pub enum KeySource {
     /// Name of a file in the credentials directory that systemd provides to the program.
     Credential(String),
     /// The cell's own server, which makes and distributes the keys.
-    Own(Served),
+    Own(ServedKeys),
     /// Another Security Key Service, which distributes the keys.
     Sks(Endpoint),
 }
 
 /// Settings for the keys of a group that the cell's own server makes.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Served {
+pub struct ServedKeys {
     /// Endpoint of the server.
     pub endpoint: Endpoint,
     /// Lifetime of each key.

@@ -1,7 +1,7 @@
 //! `servers` of the document, and the keys of variables that refer to them.
 
 use crate::document::{DURATION, EXPANDED_NODE_ID, SecurityEntry};
-use crate::read::{At, document};
+use crate::read::{Located, document};
 
 document! {
     /// An existing OPC UA server, such as the server of a PLC. The server of the cell is its
@@ -37,7 +37,7 @@ document! {
         /// The ApplicationUris of the servers; `*` at the end matches any characters, as in
         /// urn:vendor:*. 1 to 64.
         #[schemars(required, length(min = 1, max = 64))]
-        uris: Vec<At<String>>,
+        uris: Vec<Located<String>>,
         /// The first of the namespaces that are reserved for their skills. A namespace with an
         /// ApplicationUri in `namespaces` belongs to the server with this URI; the others are
         /// assigned when servers are found.
@@ -55,7 +55,7 @@ document! {
         /// Networks behind routers, such as 10.77.0.0/16, with servers that are also accepted.
         /// Default: only servers with addresses in the subnets of the interface, because any host
         /// can announce any address.
-        networks: Vec<At<String>>,
+        networks: Vec<Located<String>>,
     }
 
     /// The node of another server that the value comes from.

@@ -5,7 +5,7 @@ use std::path::{Component, Path, PathBuf};
 
 use messages::NoTexts;
 
-use crate::check::TypeFiles;
+use crate::check::OpenTypeFiles;
 use crate::environment::Environment;
 use crate::nodesets::NodeSets;
 
@@ -28,14 +28,14 @@ pub trait Surroundings {
 
     /// Returns the readers of a file beside its owner; `None` if there are no others, or if they
     /// are not known.
-    fn readers(&self, file: &str) -> Option<Readers> {
+    fn readers(&self, file: &str) -> Option<FileReaders> {
         let _ = file;
         None
     }
 
     /// Returns definition files beside the built-in definitions. `paths` are the `type_paths` of
     /// the document; a relative path is below the folder of the file that contains it.
-    fn types(&self, paths: &[PathBuf]) -> Box<dyn TypeFiles> {
+    fn types(&self, paths: &[PathBuf]) -> Box<dyn OpenTypeFiles> {
         let _ = paths;
         Box::new(NoTexts)
     }
@@ -55,7 +55,7 @@ pub trait Surroundings {
 
 /// Readers of a file beside its owner.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Readers {
+pub enum FileReaders {
     /// Users of its group.
     Group,
     /// Every user of the host.

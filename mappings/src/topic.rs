@@ -50,7 +50,7 @@ impl TryFrom<u16> for SpaceId {
     type Error = TopicError;
 
     fn try_from(id: u16) -> Result<Self, TopicError> {
-        Self::new(id).ok_or(TopicError::Range(Part::Space))
+        Self::new(id).ok_or(TopicError::Range(NamePart::Space))
     }
 }
 
@@ -118,19 +118,20 @@ impl FromStr for TopicId {
         else {
             return Err(TopicError::Parts);
         };
-        let space = decimal(Part::Space, space)?;
-        let namespace = decimal(Part::Namespace, namespace)?;
-        let identifier = decimal(Part::Identifier, identifier)?;
+        let space = decimal(NamePart::Space, space)?;
+        let namespace = decimal(NamePart::Namespace, namespace)?;
+        let identifier = decimal(NamePart::Identifier, identifier)?;
         Ok(Self {
-            space: SpaceId::new(space).ok_or(TopicError::Range(Part::Space))?,
-            namespace: NonZeroU16::new(namespace).ok_or(TopicError::Range(Part::Namespace))?,
-            identifier: NonZeroU16::new(identifier).ok_or(TopicError::Range(Part::Identifier))?,
+            space: SpaceId::new(space).ok_or(TopicError::Range(NamePart::Space))?,
+            namespace: NonZeroU16::new(namespace).ok_or(TopicError::Range(NamePart::Namespace))?,
+            identifier: NonZeroU16::new(identifier)
+                .ok_or(TopicError::Range(NamePart::Identifier))?,
         })
     }
 }
 
 /// Reads a number; each number has one spelling: digits only, no sign, no leading zero.
-pub(crate) fn decimal(part: Part, text: &str) -> Result<u16, TopicError> {
+pub(crate) fn decimal(part: NamePart, text: &str) -> Result<u16, TopicError> {
     let canonical = !text.is_empty()
         && text.bytes().all(|b| b.is_ascii_digit())
         && (text == "0" || !text.starts_with('0'));
@@ -152,15 +153,15 @@ pub enum TopicError {
     Parts,
     /// A part is not a plain decimal number.
     #[error("the {0} is not a decimal number without sign and leading zeros")]
-    Number(Part),
+    Number(NamePart),
     /// A number is outside its range.
     #[error("the {0} is outside {range}", range = .0.range())]
-    Range(Part),
+    Range(NamePart),
 }
 
 /// Part of a name: one of its three numbers.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Part {
+pub enum NamePart {
     /// PublisherId.
     Space,
     /// WriterGroupId.
@@ -169,7 +170,7 @@ pub enum Part {
     Identifier,
 }
 
-impl Part {
+impl NamePart {
     /// Returns the range of the number, as text.
     #[must_use]
     pub const fn range(self) -> &'static str {
@@ -180,7 +181,7 @@ impl Part {
     }
 }
 
-impl fmt::Display for Part {
+impl fmt::Display for NamePart {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self {
             Self::Space => "space",
@@ -214,17 +215,26 @@ mod tests {
             parse("ua_232_65535_65535").unwrap().triple(),
             (232, 65535, 65535)
         );
-        assert_eq!(parse("ua_233_1_1"), Err(TopicError::Range(Part::Space)));
-        assert_eq!(parse("ua_65536_1_1"), Err(TopicError::Range(Part::Space)));
-        assert_eq!(parse("ua_1_0_1"), Err(TopicError::Range(Part::Namespace)));
+        assert_eq!(parse("ua_233_1_1"), Err(TopicError::Range(NamePart::Space)));
+        assert_eq!(
+            parse("ua_65536_1_1"),
+            Err(TopicError::Range(NamePart::Space))
+        );
+        assert_eq!(
+            parse("ua_1_0_1"),
+            Err(TopicError::Range(NamePart::Namespace))
+        );
         assert_eq!(
             parse("ua_1_65536_1"),
-            Err(TopicError::Range(Part::Namespace))
+            Err(TopicError::Range(NamePart::Namespace))
         );
-        assert_eq!(parse("ua_1_1_0"), Err(TopicError::Range(Part::Identifier)));
+        assert_eq!(
+            parse("ua_1_1_0"),
+            Err(TopicError::Range(NamePart::Identifier))
+        );
         assert_eq!(
             parse("ua_1_1_99999999999999999999"),
-            Err(TopicError::Range(Part::Identifier))
+            Err(TopicError::Range(NamePart::Identifier))
         );
     }
 
@@ -238,14 +248,24 @@ mod tests {
             "ua_ 1_1_1",
             "ua_x_1_1",
         ] {
-            assert_eq!(parse(text), Err(TopicError::Number(Part::Space)), "{text}");
+            assert_eq!(
+                parse(text),
+                Err(TopicError::Number(NamePart::Space)),
+                "{text}"
+            );
         }
-        assert_eq!(parse("ua_1__1"), Err(TopicError::Number(Part::Namespace)));
-        assert_eq!(parse("ua_1_1_"), Err(TopicError::Number(Part::Identifier)));
+        assert_eq!(
+            parse("ua_1__1"),
+            Err(TopicError::Number(NamePart::Namespace))
+        );
+        assert_eq!(
+            parse("ua_1_1_"),
+            Err(TopicError::Number(NamePart::Identifier))
+        );
         // Digits of another script.
         assert_eq!(
             parse("ua_1_1_\u{661}"),
-            Err(TopicError::Number(Part::Identifier))
+            Err(TopicError::Number(NamePart::Identifier))
         );
     }
 
@@ -266,11 +286,11 @@ mod tests {
         }
         assert_eq!(
             parse("ua_1_1_1 "),
-            Err(TopicError::Number(Part::Identifier))
+            Err(TopicError::Number(NamePart::Identifier))
         );
         assert_eq!(
             parse("ua_1_1_1/x"),
-            Err(TopicError::Number(Part::Identifier))
+            Err(TopicError::Number(NamePart::Identifier))
         );
     }
 
@@ -279,7 +299,10 @@ mod tests {
         assert!(!SpaceId::UA.is_ros2() && !SpaceId::ROS1.is_ros2());
         assert!(SpaceId::new(2).unwrap().is_ros2() && SpaceId::MAX.is_ros2());
         assert_eq!(SpaceId::new(233), None);
-        assert_eq!(SpaceId::try_from(300), Err(TopicError::Range(Part::Space)));
+        assert_eq!(
+            SpaceId::try_from(300),
+            Err(TopicError::Range(NamePart::Space))
+        );
     }
 
     proptest! {

@@ -29,7 +29,7 @@ const LONG_KEY: usize = 64;
 
 /// Position in the text, within one line; lines and characters are counted from 1.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
-pub(crate) struct Place {
+pub(crate) struct TextSpan {
     /// Number of the file, in reading order; 0 is the document itself.
     pub(crate) file: u16,
     pub(crate) line: usize,
@@ -37,7 +37,7 @@ pub(crate) struct Place {
     pub(crate) len: usize,
 }
 
-impl Place {
+impl TextSpan {
     /// Beginning of the text.
     pub(crate) const START: Self = Self {
         file: 0,
@@ -49,26 +49,26 @@ impl Place {
 
 /// Node of the tree. Scalars without variables are borrowed from the text.
 #[derive(Debug)]
-pub(crate) struct Node<'t> {
-    pub(crate) place: Place,
-    pub(crate) kind: Kind<'t>,
+pub(crate) struct YamlNode<'t> {
+    pub(crate) place: TextSpan,
+    pub(crate) kind: YamlKind<'t>,
     depth: usize,
 }
 
 /// Keys and values of a map.
-type Pairs<'t> = Vec<(Rc<Node<'t>>, Rc<Node<'t>>)>;
+type Pairs<'t> = Vec<(Rc<YamlNode<'t>>, Rc<YamlNode<'t>>)>;
 
 #[derive(Debug)]
-pub(crate) enum Kind<'t> {
+pub(crate) enum YamlKind<'t> {
     /// No value, `~` or `null`.
     Null,
     Scalar(Cow<'t, str>),
-    List(Vec<Rc<Node<'t>>>),
+    List(Vec<Rc<YamlNode<'t>>>),
     /// Pairs in the order of the text, repeated keys included.
     Map(Pairs<'t>),
 }
 
-impl Kind<'_> {
+impl YamlKind<'_> {
     /// Returns the name with its article.
     pub(crate) const fn name(&self) -> &'static str {
         match self {
@@ -82,25 +82,25 @@ impl Kind<'_> {
 
 /// Reason that a text makes no tree.
 #[derive(Debug, PartialEq, Eq)]
-pub(crate) struct Fault {
+pub(crate) struct YamlFault {
     pub(crate) code: Code,
-    pub(crate) place: Place,
+    pub(crate) place: TextSpan,
     pub(crate) message: String,
     pub(crate) help: Option<&'static str>,
 }
 
 /// Tree of a text.
-pub(crate) struct Tree<'t> {
+pub(crate) struct YamlTree<'t> {
     /// Root; null if the text contains only comments.
-    pub(crate) root: Rc<Node<'t>>,
+    pub(crate) root: Rc<YamlNode<'t>>,
     /// Faults of references to variables; their texts stay as written.
-    pub(crate) faults: Vec<Fault>,
+    pub(crate) faults: Vec<YamlFault>,
     /// Values of variables, and the references in the text.
     pub(crate) values: BTreeMap<String, String>,
     /// Number of bytes of the values of variables, summed over every reference.
     pub(crate) expanded: usize,
     /// Positions of values with a password that the text contains in clear.
-    pub(crate) secrets: Vec<Place>,
+    pub(crate) secrets: Vec<TextSpan>,
 }
 
 /// Reads the text of a file; all positions have the number `file`. `variable` looks up the
@@ -109,9 +109,9 @@ pub(crate) fn parse<'t>(
     text: &'t str,
     file: u16,
     variable: &dyn Fn(&str) -> Option<String>,
-) -> Result<Tree<'t>, Fault> {
-    read(text, variable, file).map_err(|fault| Fault {
-        place: Place {
+) -> Result<YamlTree<'t>, YamlFault> {
+    read(text, variable, file).map_err(|fault| YamlFault {
+        place: TextSpan {
             file,
             ..fault.place
         },
@@ -123,13 +123,13 @@ fn read<'t>(
     text: &'t str,
     variable: &dyn Fn(&str) -> Option<String>,
     file: u16,
-) -> Result<Tree<'t>, Fault> {
+) -> Result<YamlTree<'t>, YamlFault> {
     if text.len() > MAX_BYTES {
         let message = format!(
             "the document has {} bytes; at most {MAX_BYTES} are read",
             text.len()
         );
-        return Err(too_large(Place::START, message));
+        return Err(too_large(TextSpan::START, message));
     }
     let options = granit_parser::options! {
         emit_comments: false,
@@ -160,23 +160,23 @@ fn read<'t>(
                 Some("remove the tag; the key determines the type of its value"),
             ));
         }
-        let place = Place {
+        let place = TextSpan {
             file,
             ..place(text, marks)
         };
         builder.event(event, place)?;
     }
     let root = builder.root.unwrap_or_else(|| {
-        Rc::new(Node {
-            place: Place {
+        Rc::new(YamlNode {
+            place: TextSpan {
                 file,
-                ..Place::START
+                ..TextSpan::START
             },
-            kind: Kind::Null,
+            kind: YamlKind::Null,
             depth: 0,
         })
     });
-    Ok(Tree {
+    Ok(YamlTree {
         root,
         faults: builder.faults,
         values: builder.values,
@@ -187,27 +187,27 @@ fn read<'t>(
 
 struct Builder<'v, 't> {
     open: Vec<Open<'t>>,
-    anchors: HashMap<usize, Rc<Node<'t>>>,
-    root: Option<Rc<Node<'t>>>,
+    anchors: HashMap<usize, Rc<YamlNode<'t>>>,
+    root: Option<Rc<YamlNode<'t>>>,
     documents: usize,
     nodes: usize,
-    faults: Vec<Fault>,
+    faults: Vec<YamlFault>,
     values: BTreeMap<String, String>,
     expanded: usize,
-    secrets: Vec<Place>,
+    secrets: Vec<TextSpan>,
     variable: &'v dyn Fn(&str) -> Option<String>,
 }
 
 /// A list or map that has not been read to its end yet.
 struct Open<'t> {
     anchor: usize,
-    place: Place,
+    place: TextSpan,
     map: bool,
-    children: Vec<Rc<Node<'t>>>,
+    children: Vec<Rc<YamlNode<'t>>>,
 }
 
 impl<'t> Builder<'_, 't> {
-    fn event(&mut self, event: Event<'t>, place: Place) -> Result<(), Fault> {
+    fn event(&mut self, event: Event<'t>, place: TextSpan) -> Result<(), YamlFault> {
         match event {
             Event::DocumentStart(..) => {
                 self.documents += 1;
@@ -233,7 +233,11 @@ impl<'t> Builder<'_, 't> {
                 };
                 let null = style == ScalarStyle::Plain
                     && matches!(&*text, "" | "~" | "null" | "Null" | "NULL");
-                let kind = if null { Kind::Null } else { Kind::Scalar(text) };
+                let kind = if null {
+                    YamlKind::Null
+                } else {
+                    YamlKind::Scalar(text)
+                };
                 self.close(anchor, place, kind, 0)
             }
             Event::SequenceStart(_, anchor, _) => {
@@ -282,7 +286,7 @@ impl<'t> Builder<'_, 't> {
         }
     }
 
-    fn end(&mut self, open: Open<'t>) -> Result<(), Fault> {
+    fn end(&mut self, open: Open<'t>) -> Result<(), YamlFault> {
         let depth = open
             .children
             .iter()
@@ -295,9 +299,9 @@ impl<'t> Builder<'_, 't> {
             while let (Some(key), Some(value)) = (children.next(), children.next()) {
                 pairs.push((key, value));
             }
-            Kind::Map(self.merge(pairs)?)
+            YamlKind::Map(self.merge(pairs)?)
         } else {
-            Kind::List(open.children)
+            YamlKind::List(open.children)
         };
         self.close(open.anchor, open.place, kind, depth)
     }
@@ -309,9 +313,9 @@ impl<'t> Builder<'_, 't> {
     }
 
     /// Returns a key as it is written; notes a variable in it.
-    fn key(&mut self, text: Cow<'t, str>, place: Place) -> Cow<'t, str> {
+    fn key(&mut self, text: Cow<'t, str>, place: TextSpan) -> Cow<'t, str> {
         if text.contains("${") {
-            self.faults.push(Fault {
+            self.faults.push(YamlFault {
                 code: Code::EnvironmentVariable,
                 place,
                 message: "a key contains an environment variable".to_owned(),
@@ -322,7 +326,7 @@ impl<'t> Builder<'_, 't> {
     }
 
     /// Notes an unquoted value that is a variable in shell syntax, such as `$NAME` or `$(NAME)`.
-    fn look_for_bare_variable(&mut self, text: &str, style: ScalarStyle, place: Place) {
+    fn look_for_bare_variable(&mut self, text: &str, style: ScalarStyle, place: TextSpan) {
         let Some(behind) = text
             .strip_prefix('$')
             .filter(|_| style == ScalarStyle::Plain)
@@ -334,7 +338,7 @@ impl<'t> Builder<'_, 't> {
             .and_then(|name| name.strip_suffix(')'));
         let name = inside.unwrap_or(behind);
         if variables::is_name(name) {
-            self.faults.push(Fault {
+            self.faults.push(YamlFault {
                 code: Code::EnvironmentVariable,
                 place,
                 message: format!("`{text}` is read as a text here, not as an environment variable"),
@@ -344,7 +348,7 @@ impl<'t> Builder<'_, 't> {
     }
 
     /// Returns a scalar with the values of its variables.
-    fn expand(&mut self, text: Cow<'t, str>, place: Place) -> Result<Cow<'t, str>, Fault> {
+    fn expand(&mut self, text: Cow<'t, str>, place: TextSpan) -> Result<Cow<'t, str>, YamlFault> {
         // Most scalars contain no variable, and a search by bytes is faster.
         if !text.as_bytes().contains(&b'$') || !text.contains("${") {
             return Ok(text);
@@ -368,7 +372,7 @@ impl<'t> Builder<'_, 't> {
                 Cow::Owned(expanded)
             }
             Err((message, help)) => {
-                self.faults.push(Fault {
+                self.faults.push(YamlFault {
                     code: Code::EnvironmentVariable,
                     place,
                     message,
@@ -381,8 +385,8 @@ impl<'t> Builder<'_, 't> {
 
     /// Returns the pairs of a map with the pairs of its merge keys. If several maps have a key, the
     /// map itself takes precedence, then the first merged map.
-    fn merge(&mut self, pairs: Pairs<'t>) -> Result<Pairs<'t>, Fault> {
-        let is_merge = |(key, _): &(Rc<Node<'_>>, Rc<Node<'_>>)| matches!(&key.kind, Kind::Scalar(text) if text == "<<");
+    fn merge(&mut self, pairs: Pairs<'t>) -> Result<Pairs<'t>, YamlFault> {
+        let is_merge = |(key, _): &(Rc<YamlNode<'_>>, Rc<YamlNode<'_>>)| matches!(&key.kind, YamlKind::Scalar(text) if text == "<<");
         if !pairs.iter().any(is_merge) {
             return Ok(pairs);
         }
@@ -390,13 +394,15 @@ impl<'t> Builder<'_, 't> {
         let mut known: HashSet<String> = own.iter().filter_map(|(key, _)| name(key)).collect();
         for (merge, value) in &merges {
             let maps = match &value.kind {
-                Kind::List(maps) => maps.as_slice(),
-                Kind::Map(_) | Kind::Scalar(_) | Kind::Null => std::slice::from_ref(value),
+                YamlKind::List(maps) => maps.as_slice(),
+                YamlKind::Map(_) | YamlKind::Scalar(_) | YamlKind::Null => {
+                    std::slice::from_ref(value)
+                }
             };
             for map in maps {
                 self.count(1, merge.place)?;
-                let Kind::Map(brought) = &map.kind else {
-                    self.faults.push(Fault {
+                let YamlKind::Map(brought) = &map.kind else {
+                    self.faults.push(YamlFault {
                         code: Code::MergeKey,
                         place: map.place,
                         message: format!("`<<` takes the keys of a map, found {}", map.kind.name()),
@@ -407,7 +413,7 @@ impl<'t> Builder<'_, 't> {
                     continue;
                 };
                 for (key, value) in brought {
-                    let Kind::Scalar(text) = &key.kind else {
+                    let YamlKind::Scalar(text) = &key.kind else {
                         self.count(1, merge.place)?;
                         continue;
                     };
@@ -425,7 +431,7 @@ impl<'t> Builder<'_, 't> {
     }
 
     /// Counts more nodes, up to the maximum.
-    fn count(&mut self, nodes: usize, place: Place) -> Result<(), Fault> {
+    fn count(&mut self, nodes: usize, place: TextSpan) -> Result<(), YamlFault> {
         self.nodes = self.nodes.saturating_add(nodes);
         if self.nodes > MAX_NODES {
             return Err(too_large(place, format!("more than {MAX_NODES} values")));
@@ -436,11 +442,11 @@ impl<'t> Builder<'_, 't> {
     fn close(
         &mut self,
         anchor: usize,
-        place: Place,
-        kind: Kind<'t>,
+        place: TextSpan,
+        kind: YamlKind<'t>,
         depth: usize,
-    ) -> Result<(), Fault> {
-        let node = Rc::new(Node { place, kind, depth });
+    ) -> Result<(), YamlFault> {
+        let node = Rc::new(YamlNode { place, kind, depth });
         if anchor != 0 {
             self.anchors.insert(anchor, Rc::clone(&node));
         }
@@ -448,7 +454,7 @@ impl<'t> Builder<'_, 't> {
     }
 
     /// Adds a finished node to its list or map, or makes it the root.
-    fn place(&mut self, node: Rc<Node<'t>>, place: Place) -> Result<(), Fault> {
+    fn place(&mut self, node: Rc<YamlNode<'t>>, place: TextSpan) -> Result<(), YamlFault> {
         self.count(1, place)?;
         if self.open.len() + node.depth > MAX_DEPTH {
             let message = format!("values nest deeper than {MAX_DEPTH} levels");
@@ -463,14 +469,14 @@ impl<'t> Builder<'_, 't> {
 }
 
 /// Returns the fault of values of variables that are too long together.
-pub(crate) fn too_expanded(place: Place) -> Fault {
+pub(crate) fn too_expanded(place: TextSpan) -> YamlFault {
     let message =
         format!("the values of its environment variables have more than {MAX_EXPANDED} bytes");
     too_large(place, message)
 }
 
-fn too_large(place: Place, message: String) -> Fault {
-    Fault {
+fn too_large(place: TextSpan, message: String) -> YamlFault {
+    YamlFault {
         code: Code::TooLarge,
         place,
         message,
@@ -478,15 +484,15 @@ fn too_large(place: Place, message: String) -> Fault {
     }
 }
 
-fn name(key: &Node<'_>) -> Option<String> {
+fn name(key: &YamlNode<'_>) -> Option<String> {
     match &key.kind {
-        Kind::Scalar(text) => Some(text.clone().into_owned()),
-        Kind::Null | Kind::List(_) | Kind::Map(_) => None,
+        YamlKind::Scalar(text) => Some(text.clone().into_owned()),
+        YamlKind::Null | YamlKind::List(_) | YamlKind::Map(_) => None,
     }
 }
 
-fn fault(place: Place, message: String, help: Option<&'static str>) -> Fault {
-    Fault {
+fn fault(place: TextSpan, message: String, help: Option<&'static str>) -> YamlFault {
+    YamlFault {
         code: Code::Syntax,
         place,
         message,
@@ -494,7 +500,7 @@ fn fault(place: Place, message: String, help: Option<&'static str>) -> Fault {
     }
 }
 
-fn syntax(text: &str, error: &ScanError) -> Fault {
+fn syntax(text: &str, error: &ScanError) -> YamlFault {
     let place = place(text, Marks::empty(*error.marker()));
     let before = place.line.saturating_sub(LINES_BEFORE);
     let lines: Vec<(usize, &str)> = (1..)
@@ -515,7 +521,7 @@ fn syntax(text: &str, error: &ScanError) -> Fault {
         if line == place.line {
             return fault(place, error.info(), help);
         }
-        let at = Place {
+        let at = TextSpan {
             line,
             column: column + 1,
             len: 1,
@@ -538,9 +544,9 @@ fn syntax(text: &str, error: &ScanError) -> Fault {
 const LINES_BEFORE: usize = 3;
 
 /// Returns the position of the first line of a marked range.
-fn place(text: &str, marks: Marks) -> Place {
+fn place(text: &str, marks: Marks) -> TextSpan {
     let SourceSpan { line, column, len } = SourceSpan::of(text, marks);
-    Place {
+    TextSpan {
         file: 0,
         line,
         column,

@@ -3,8 +3,8 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use mappings::{
-    Assigned, Assignment, Call, CallKind, Checked, Code, ExecutedBy, Mapping, PathFault, SpaceId,
-    Surroundings, TopicId, TypeFiles,
+    Assigned, Assignment, Call, CallKind, Checked, Code, ExecutedBy, Mapping, OpenTypeFiles,
+    PathFault, SpaceId, Surroundings, TopicId,
 };
 use messages::{DefinitionText, DefinitionTexts, Dialect, Language, Literal, TextKind, TypeName};
 
@@ -41,7 +41,7 @@ impl DefinitionTexts for Files {
     }
 }
 
-impl TypeFiles for Files {
+impl OpenTypeFiles for Files {
     fn faults(&mut self) -> Vec<PathFault> {
         Vec::new()
     }
@@ -62,7 +62,7 @@ impl Surroundings for Beside {
         None
     }
 
-    fn types(&self, _: &[PathBuf]) -> Box<dyn TypeFiles> {
+    fn types(&self, _: &[PathBuf]) -> Box<dyn OpenTypeFiles> {
         Box::new(Files)
     }
 }

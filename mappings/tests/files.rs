@@ -1,14 +1,14 @@
 //! Documents of several files, with environment variables and with anchors and aliases of YAML.
 use std::collections::BTreeMap;
 
-use mappings::{Checked, Code, Mapping, Readers, Surroundings};
+use mappings::{Checked, Code, FileReaders, Mapping, Surroundings};
 
 /// Files and variables, by name.
 #[derive(Default)]
 struct Beside {
     files: BTreeMap<String, String>,
     variables: BTreeMap<String, String>,
-    readers: Option<Readers>,
+    readers: Option<FileReaders>,
 }
 
 impl Beside {
@@ -43,7 +43,7 @@ impl Surroundings for Beside {
         self.variables.get(name).cloned()
     }
 
-    fn readers(&self, file: &str) -> Option<Readers> {
+    fn readers(&self, file: &str) -> Option<FileReaders> {
         self.readers.filter(|_| file == "plant/cameras.yaml")
     }
 }
@@ -341,12 +341,12 @@ fn a_password_in_a_file_is_told_with_who_can_read_it_and_never_shown() {
             "write ${NAME}, and set this environment variable for the program",
         ),
         (
-            Some(Readers::Group),
+            Some(FileReaders::Group),
             " the group of the file can read it",
             "chmod g-r plant/cameras.yaml",
         ),
         (
-            Some(Readers::Everybody),
+            Some(FileReaders::Everybody),
             " every user of this host can read it",
             "chmod go-r plant/cameras.yaml",
         ),

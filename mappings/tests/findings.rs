@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use mappings::{
     Access, Checked, Code, Endpoint, Environment, Identifier, LiveNode, LiveRemote, LiveServer,
     LiveSpace, LiveTopic, Mapping, MethodTarget, NodeSetFault, NodeSetNode, NodeSetType, NodeSets,
-    PathFault, PathFaultKind, Severity, SpaceId, Surroundings, TypeFiles, TypeOrigin,
+    OpenTypeFiles, PathFault, PathFaultKind, Severity, SpaceId, Surroundings, TypeOrigin,
 };
 use messages::{DefinitionText, DefinitionTexts, Dialect, Language, TextKind, TypeName};
 use uadp::BuiltinType;
@@ -50,12 +50,12 @@ impl Surroundings for Around {
         (name == "PLC_PASSWORD").then(|| "correct horse".to_owned())
     }
 
-    fn types(&self, paths: &[PathBuf]) -> Box<dyn TypeFiles> {
+    fn types(&self, paths: &[PathBuf]) -> Box<dyn OpenTypeFiles> {
         Box::new(Folder(paths.to_vec()))
     }
 
     fn nodesets(&self, files: &[PathBuf]) -> Option<Box<dyn NodeSets>> {
-        Some(Box::new(Line(files.to_vec())))
+        Some(Box::new(LineNodeSet(files.to_vec())))
     }
 
     fn environment(&self) -> Option<&Environment> {
@@ -64,9 +64,9 @@ impl Surroundings for Around {
 }
 
 /// The NodeSet of a line, in the file line.xml; there is no other file.
-struct Line(Vec<PathBuf>);
+struct LineNodeSet(Vec<PathBuf>);
 
-impl NodeSets for Line {
+impl NodeSets for LineNodeSet {
     fn faults(&mut self) -> Vec<NodeSetFault> {
         let files = self.0.iter().enumerate();
         files
@@ -141,7 +141,7 @@ impl DefinitionTexts for Folder {
     }
 }
 
-impl TypeFiles for Folder {
+impl OpenTypeFiles for Folder {
     fn faults(&mut self) -> Vec<PathFault> {
         let fault = |(path, place): (usize, &PathBuf)| {
             let what = match place.to_str() {

@@ -6,9 +6,9 @@ use std::time::Duration;
 
 use mappings::{
     CarrierMedium, Checked, Code, EthernetGroup, KeySource, Mapping, Overflow, PubSub,
-    PublisherIdRule, SecurityPolicy, ServiceRole, SpaceId, TopicId, Trigger, UaField,
+    PublisherIdRule, ServerSecurityPolicy, ServiceRole, SpaceId, TopicId, Trigger, UaField,
 };
-use messages::{Conversion, Leaf, Literal, Part, Rank, Selected, Selection};
+use messages::{ArrayPart, ArrayRank, Conversion, Leaf, Literal, Selected, Selection};
 use proptest::prelude::*;
 use uadp::BuiltinType;
 
@@ -163,7 +163,7 @@ fn everything_of_the_network_can_be_said() {
     );
     assert_eq!(
         mapping.server().policies(true),
-        [SecurityPolicy::Basic256Sha256]
+        [ServerSecurityPolicy::Basic256Sha256]
     );
     let v6 = sound("pubsub: {address: \"opc.udp://[ff05::40]\"}");
     assert_eq!(
@@ -246,18 +246,18 @@ fn a_server_without_security_is_one_of_its_own_host_unless_the_mapping_says_so()
         silent
             .server()
             .policies(true)
-            .contains(&SecurityPolicy::None)
+            .contains(&ServerSecurityPolicy::None)
     );
     let elsewhere = silent.server().policies(false);
     assert_eq!(elsewhere.len(), 3);
-    assert!(!elsewhere.contains(&SecurityPolicy::None));
+    assert!(!elsewhere.contains(&ServerSecurityPolicy::None));
     let told = sound("server: {security: [None, Aes128_Sha256_RsaOaep, Aes256_Sha256_RsaPss]}");
     assert_eq!(
         told.server().policies(false),
         [
-            SecurityPolicy::None,
-            SecurityPolicy::Aes128Sha256RsaOaep,
-            SecurityPolicy::Aes256Sha256RsaPss
+            ServerSecurityPolicy::None,
+            ServerSecurityPolicy::Aes128Sha256RsaOaep,
+            ServerSecurityPolicy::Aes256Sha256RsaPss
         ]
     );
 }
@@ -270,7 +270,7 @@ fn a_variable_without_a_binding_goes_by_its_name_in_the_space() {
     assert!(variable.bindings.is_empty());
     assert_eq!(variable.value_type, Some((BuiltinType::Double, true)));
     assert_eq!(variable.fields.len(), 1);
-    assert_eq!(variable.fields[0].rank, Rank::Array { fixed: None });
+    assert_eq!(variable.fields[0].rank, ArrayRank::Array { fixed: None });
     assert_eq!(
         mapping.variable(topic("ua_1_2_10")),
         None,
@@ -389,11 +389,11 @@ fn a_part_of_an_array_and_a_converted_value_have_the_type_they_have_in_opc_ua() 
         conversion,
     };
     let none = Conversion::default();
-    let name = Part::Named {
+    let name = ArrayPart::Named {
         by: "name".to_owned(),
         name: "a b".to_owned(),
     };
-    let slice = Part::Slice { from: 0, to: 90 };
+    let slice = ArrayPart::Slice { from: 0, to: 90 };
     assert_eq!(*selections[0], value("position", Some(name), none));
     assert_eq!(*selections[1], value("ranges", Some(slice), none));
     let tenth = none.scaled(0.1, 0.0).to(double);

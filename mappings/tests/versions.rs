@@ -3,7 +3,7 @@ use std::collections::BTreeSet;
 use std::fmt::Write as _;
 
 use mappings::{Code, Mapping};
-use messages::{Dialect, Registry, TypeName};
+use messages::{Dialect, TypeName, TypeRegistry};
 
 /// Types of both bundles that do not cross unchanged, and the reason, as `ua-space check` reports
 /// it. All other types have the same fields in the same order: `Header.seq` is left out, times and
@@ -31,8 +31,8 @@ const TOLD: [(&str, &str); 6] = [
 ];
 
 fn common() -> Vec<TypeName> {
-    let ros2 = Registry::bundle(Dialect::Ros2);
-    let ros1 = Registry::bundle(Dialect::Ros1);
+    let ros2 = TypeRegistry::bundle(Dialect::Ros2);
+    let ros1 = TypeRegistry::bundle(Dialect::Ros1);
     let both = ros1
         .names()
         .filter(|name| ros2.names().any(|other| other == *name));

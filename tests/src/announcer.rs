@@ -5,11 +5,11 @@ use std::net::UdpSocket;
 use std::time::{Duration, Instant};
 
 /// A participant of domain 2 on this host with a lease of one second.
-pub struct Announcer {
+pub struct LeasedParticipant {
     socket: UdpSocket,
 }
 
-impl Announcer {
+impl LeasedParticipant {
     /// Opens the participant's socket.
     ///
     /// # Panics

@@ -5,13 +5,13 @@ use std::time::Duration;
 use serde_json::{Value, json};
 
 use crate::cell::{ROSCPP, compiled};
-use crate::{Cell, Child, Distribution, SERVER_ENDPOINT, Started, program};
+use crate::{Cell, Child, Distribution, SERVER_ENDPOINT, StartedChild, program};
 
 /// The timeout of an order, longer than the longest order of a test takes.
 const PATIENCE: Duration = Duration::from_secs(90);
 
 /// A caller: `peers/calls/ros1_asker.py` or another script that takes the same orders.
-pub struct Asker {
+pub struct CallerScript {
     peer: Child,
     asked: u64,
 }
@@ -21,7 +21,7 @@ pub struct Counting(Child);
 
 /// The kinds of callers in `peers/calls`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Asking {
+pub enum CallerKind {
     /// A rospy client.
     Rospy,
     /// A roscpp client.
@@ -105,26 +105,26 @@ impl Cell {
 
     /// Starts these callers in parallel.
     #[must_use]
-    pub fn askers(&self, askers: &[Asking]) -> Vec<Asker> {
+    pub fn askers(&self, askers: &[CallerKind]) -> Vec<CallerScript> {
         let started = askers.iter().map(|of| self.asker_started(*of).told());
-        let started: Vec<Child> = started.map(Started::start).collect();
-        started.into_iter().map(Asker::of).collect()
+        let started: Vec<Child> = started.map(StartedChild::start).collect();
+        started.into_iter().map(CallerScript::of).collect()
     }
 
-    fn asker_started(&self, of: Asking) -> Started {
+    fn asker_started(&self, of: CallerKind) -> StartedChild {
         match of {
-            Asking::Rospy => self.rospy_started("calls/ros1_asker.py", &[]),
-            Asking::Roscpp => self.roscpp_started(&["ask"]),
-            Asking::Rclpy(distribution, domain) => self
+            CallerKind::Rospy => self.rospy_started("calls/ros1_asker.py", &[]),
+            CallerKind::Roscpp => self.roscpp_started(&["ask"]),
+            CallerKind::Rclpy(distribution, domain) => self
                 .rclpy_started(distribution, "calls/ros2_asker.py", &[])
                 .env("ROS_DOMAIN_ID", domain.to_string()),
-            Asking::Cyclone(domain) => {
+            CallerKind::Cyclone(domain) => {
                 let args = ["ask", "--domain", &domain.to_string()];
                 self.cyclone_started("calls/cyclone.py", &args)
             }
-            Asking::Asyncua => self.asyncua_started("calls/opcua_asker.py", &[SERVER_ENDPOINT]),
-            Asking::NodeOpcua => self.node_opcua_started("ask.js", &[SERVER_ENDPOINT]),
-            Asking::UaSpace => self
+            CallerKind::Asyncua => self.asyncua_started("calls/opcua_asker.py", &[SERVER_ENDPOINT]),
+            CallerKind::NodeOpcua => self.node_opcua_started("ask.js", &[SERVER_ENDPOINT]),
+            CallerKind::UaSpace => self
                 .asyncua_started("calls/ua_space_asker.py", &[])
                 .args([program("ua-space")]),
         }
@@ -132,15 +132,15 @@ impl Cell {
 
     /// Returns the roscpp peer, not started yet.
     #[must_use]
-    pub fn roscpp_started(&self, args: &[&str]) -> Started {
-        self.with_ros1(Started::new(ROSCPP, &compiled(ROSCPP)))
+    pub fn roscpp_started(&self, args: &[&str]) -> StartedChild {
+        self.with_ros1(StartedChild::new(ROSCPP, &compiled(ROSCPP)))
             .args(args)
     }
 
     /// Starts a rospy client of the cases in `peers/calls/cases.py`.
     #[must_use]
-    pub fn rospy_asker(&self) -> Asker {
-        Asker::of(
+    pub fn rospy_asker(&self) -> CallerScript {
+        CallerScript::of(
             self.rospy_started("calls/ros1_asker.py", &[])
                 .told()
                 .start(),
@@ -149,9 +149,9 @@ impl Cell {
 
     /// Starts an rclpy client of the cases in `peers/calls/cases.py`.
     #[must_use]
-    pub fn rclpy_asker(&self, distribution: Distribution) -> Asker {
+    pub fn rclpy_asker(&self, distribution: Distribution) -> CallerScript {
         let peer = self.rclpy_started(distribution, "calls/ros2_asker.py", &[]);
-        Asker::of(peer.told().start())
+        CallerScript::of(peer.told().start())
     }
 
     /// Starts a rospy server of services, each `CASE=/name`, with options.
@@ -163,7 +163,7 @@ impl Cell {
 
     /// Starts these executors in parallel.
     #[must_use]
-    pub fn executors(&self, started: impl IntoIterator<Item = Started>) -> Vec<Counting> {
+    pub fn executors(&self, started: impl IntoIterator<Item = StartedChild>) -> Vec<Counting> {
         let started = started.into_iter().map(|started| started.told().start());
         let started: Vec<Child> = started.collect();
         let ready = started.into_iter().map(|child| child.ready(PATIENCE));
@@ -178,7 +178,7 @@ impl Cell {
     }
 }
 
-impl Asking {
+impl CallerKind {
     /// Returns the name of the caller in the tables of `docs/calls.md`.
     #[must_use]
     pub const fn name(self) -> &'static str {
@@ -195,7 +195,7 @@ impl Asking {
     }
 }
 
-impl Asker {
+impl CallerScript {
     fn of(peer: Child) -> Self {
         Self {
             peer: peer.ready(PATIENCE),

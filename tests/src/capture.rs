@@ -12,13 +12,13 @@ const DISSECTOR: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../docs/wireshark/
 /// A capture file in the classic pcap format: IPv4 packets with a UDP datagram each, a millisecond
 /// apart.
 #[derive(Debug, Clone)]
-pub struct Capture {
+pub struct CaptureFile {
     port: u16,
     /// The datagrams, each with the number of its captured bytes.
     datagrams: Vec<(Vec<u8>, usize)>,
 }
 
-impl Capture {
+impl CaptureFile {
     /// Returns a capture of these datagrams, sent to [`GROUP`].
     #[must_use]
     pub fn of<D: Into<Vec<u8>>>(datagrams: impl IntoIterator<Item = D>) -> Self {
@@ -93,7 +93,7 @@ impl Cell {
     /// # Panics
     /// Panics if tshark fails or prints a line about Lua, as it does if the dissector has an error.
     #[must_use]
-    pub fn dissect(&self, capture: &Capture, args: &[&str]) -> Vec<Dissected> {
+    pub fn dissect(&self, capture: &CaptureFile, args: &[&str]) -> Vec<Dissected> {
         let json = ["-T", "json", "--no-duplicate-keys", "-J", "uadp"];
         let output = self.tshark(capture, &[&json, args].concat());
         let packets: Vec<Value> = serde_json::from_str(&output).unwrap();
@@ -110,7 +110,7 @@ impl Cell {
     /// # Panics
     /// Panics as [`dissect`](Self::dissect) does.
     #[must_use]
-    pub fn columns(&self, capture: &Capture, args: &[&str]) -> Vec<String> {
+    pub fn columns(&self, capture: &CaptureFile, args: &[&str]) -> Vec<String> {
         let columns = "-T fields -E separator=/s -e _ws.col.Protocol -e _ws.col.Info";
         let columns: Vec<&str> = columns.split(' ').collect();
         let output = self.tshark(capture, &[&columns, args].concat());
@@ -123,7 +123,7 @@ impl Cell {
     /// # Panics
     /// Panics as [`dissect`](Self::dissect) does.
     #[must_use]
-    pub fn fields(&self, capture: &Capture, fields: &[&str]) -> Vec<String> {
+    pub fn fields(&self, capture: &CaptureFile, fields: &[&str]) -> Vec<String> {
         let mut args = vec!["-T", "fields"];
         for field in fields {
             args.extend(["-e", field]);
@@ -132,7 +132,7 @@ impl Cell {
         output.lines().map(str::to_owned).collect()
     }
 
-    fn tshark(&self, capture: &Capture, args: &[&str]) -> String {
+    fn tshark(&self, capture: &CaptureFile, args: &[&str]) -> String {
         let path = self.folder().join("datagrams.pcap");
         fs::write(&path, capture.bytes()).unwrap();
         self.tshark_of(&path, args)
@@ -288,7 +288,7 @@ mod tests {
 
     #[test]
     fn a_capture_keeps_the_length_of_what_it_cuts() {
-        let bytes = Capture::cut([(vec![7; 10], 4)]).bytes();
+        let bytes = CaptureFile::cut([(vec![7; 10], 4)]).bytes();
         let (file, packet) = bytes.split_at(24);
         assert_eq!(file[20..], LINKTYPE_RAW.to_le_bytes());
         assert_eq!((packet[8], packet[12]), (32, 38));

@@ -16,7 +16,7 @@ use nix::{
 };
 use serde_json::Value;
 
-use crate::{Cable, Host, Site};
+use crate::{Cable, Host, PlantSite};
 
 /// Time between the signal that asks a process to end and SIGKILL. A bridge waits 5 s for pending
 /// cancellations; the rest is for a loaded machine.
@@ -28,14 +28,14 @@ const KEPT: usize = 200_000;
 const SHOWN: usize = 60;
 
 /// A process to start: its program, arguments and environment.
-pub struct Started {
+pub struct StartedChild {
     name: String,
     command: Command,
     ends_on: Signal,
     told: bool,
 }
 
-impl Started {
+impl StartedChild {
     /// Creates a process that runs `program`; `name` is its name in messages of a failing test.
     #[must_use]
     pub fn new(name: &str, program: &Path) -> Self {
@@ -93,7 +93,7 @@ impl Started {
 
     /// Runs the process at `site` instead of on the cell's host.
     #[must_use]
-    pub fn at(self, site: &Site) -> Self {
+    pub fn at(self, site: &PlantSite) -> Self {
         self.in_network(&site.path())
     }
 
@@ -216,7 +216,7 @@ impl Child {
             before,
             &format!("an answer to `{line}`"),
             deadline,
-            Line::json,
+            OutputLine::json,
         )
     }
 
@@ -224,7 +224,7 @@ impl Child {
         &mut self,
         what: &str,
         deadline: Duration,
-        pick: impl FnMut(&Line) -> Option<T>,
+        pick: impl FnMut(&OutputLine) -> Option<T>,
     ) -> T {
         self.wait_after(0, what, deadline, pick)
     }
@@ -234,7 +234,7 @@ impl Child {
         mut seen: usize,
         what: &str,
         deadline: Duration,
-        mut pick: impl FnMut(&Line) -> Option<T>,
+        mut pick: impl FnMut(&OutputLine) -> Option<T>,
     ) -> T {
         let start = Instant::now();
         loop {
@@ -284,7 +284,7 @@ impl Child {
     #[must_use]
     pub fn json_lines(&self) -> Vec<Value> {
         let lines = self.output.lines.lock().unwrap();
-        lines.kept.iter().filter_map(Line::json).collect()
+        lines.kept.iter().filter_map(OutputLine::json).collect()
     }
 
     /// Returns the `value`s of the JSON lines so far: the values that a subscriber received.
@@ -413,12 +413,12 @@ impl Stream {
     }
 }
 
-struct Line {
+struct OutputLine {
     stream: Stream,
     text: String,
 }
 
-impl Line {
+impl OutputLine {
     fn json(&self) -> Option<Value> {
         if self.stream == Stream::Out && self.text.starts_with('{') {
             serde_json::from_str(&self.text).ok()
@@ -430,7 +430,7 @@ impl Line {
 
 #[derive(Default)]
 struct Lines {
-    kept: Vec<Line>,
+    kept: Vec<OutputLine>,
     not_kept: usize,
 }
 
@@ -457,7 +457,7 @@ fn collect(
             bytes.clear();
             let mut lines = output.lines.lock().unwrap();
             if lines.kept.len() < KEPT {
-                lines.kept.push(Line { stream, text });
+                lines.kept.push(OutputLine { stream, text });
             } else {
                 lines.not_kept += 1;
             }

@@ -5,7 +5,7 @@ use std::os::unix::fs::FileExt as _;
 use std::path::PathBuf;
 
 use crate::cell::{CLOCK, Cell, compiled};
-use crate::child::Started;
+use crate::child::StartedChild;
 
 /// A wall clock that runs at the speed of the machine's clock with an offset.
 #[derive(Debug)]
@@ -32,7 +32,7 @@ impl WallClock {
     }
 }
 
-impl Started {
+impl StartedChild {
     /// Runs the process with that clock.
     #[must_use]
     pub fn by(self, clock: &WallClock) -> Self {

@@ -5,12 +5,12 @@ use std::time::{Duration, Instant};
 
 use socket2::SockRef;
 use uadp::action::{
-    ActionAddress, ActionDialect, ActionFields, ActionRequest, CallId, Heard, Outcome, Requestor,
-    RequestorSettings,
+    ActionAddress, ActionDialect, ActionFields, ActionOutcome, ActionRequest, CallId, Requestor,
+    RequestorSettings, ResponseMeaning,
 };
 use uadp::{Extras, NetworkHeader, NetworkMessage, OwnedPublisherId};
 
-use crate::{GROUP, Triple, UadpSocket};
+use crate::{GROUP, TopicTriple, UadpSocket};
 
 /// A requestor with the PublisherId of a space.
 pub struct CodecAsker {
@@ -21,7 +21,7 @@ pub struct CodecAsker {
 
 /// The end of a call.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Ended {
+pub enum CallEnd {
     /// Executed; the bytes of the response fields.
     Answered(Vec<u8>),
     /// Refused without execution.
@@ -49,7 +49,7 @@ impl CodecAsker {
     /// Panics if the requestor refuses the call.
     pub fn call(
         &mut self,
-        (space, namespace, id): Triple,
+        (space, namespace, id): TopicTriple,
         fields: &[u8],
         timeout: Duration,
     ) -> CallId {
@@ -71,7 +71,7 @@ impl CodecAsker {
     ///
     /// # Panics
     /// Panics if the group cannot be read or written.
-    pub fn turn(&mut self) -> Vec<(CallId, Ended)> {
+    pub fn turn(&mut self) -> Vec<(CallId, CallEnd)> {
         let now = self.start.elapsed();
         self.requestor.handle_timeout(now);
         while let Some(request) = self.requestor.poll_transmit(now) {
@@ -86,7 +86,7 @@ impl CodecAsker {
             self.hear(&datagram, &mut ended);
         }
         while let Some((call, _)) = self.requestor.poll_given_up() {
-            ended.push((call, Ended::Unknown));
+            ended.push((call, CallEnd::Unknown));
         }
         ended
     }
@@ -97,7 +97,7 @@ impl CodecAsker {
         self.requestor.counters().dropped
     }
 
-    fn hear(&mut self, datagram: &[u8], ended: &mut Vec<(CallId, Ended)>) {
+    fn hear(&mut self, datagram: &[u8], ended: &mut Vec<(CallId, CallEnd)>) {
         let Ok(message) = NetworkMessage::decode(datagram) else {
             return;
         };
@@ -106,15 +106,17 @@ impl CodecAsker {
         };
         for message in messages.flatten() {
             let now = self.start.elapsed();
-            if let Ok(Heard::Done(call, outcome)) = self.requestor.handle_response(&message, now) {
+            if let Ok(ResponseMeaning::Done(call, outcome)) =
+                self.requestor.handle_response(&message, now)
+            {
                 ended.push((
                     call,
                     match outcome {
-                        Outcome::Answered { fields, .. } => {
-                            Ended::Answered(fields.bytes().to_vec())
+                        ActionOutcome::Answered { fields, .. } => {
+                            CallEnd::Answered(fields.bytes().to_vec())
                         }
-                        Outcome::Refused(_) => Ended::Refused,
-                        Outcome::Unknown(_) => Ended::Unknown,
+                        ActionOutcome::Refused(_) => CallEnd::Refused,
+                        ActionOutcome::Unknown(_) => CallEnd::Unknown,
                     },
                 ));
             }

@@ -12,7 +12,7 @@ use std::{
 
 use socket2::{Domain, Protocol, Socket, Type};
 
-use crate::{Cell, GROUP, Host, Peer, Started, WIRE, peers::cyclone_uri, program};
+use crate::{Cell, GROUP, Host, Peer, StartedChild, WIRE, peers::cyclone_uri, program};
 
 /// A keystore with a single certificate authority and the enclaves `/bridge` and `/peer`, which may
 /// read and write all topics of all domains.
@@ -211,7 +211,7 @@ impl Cell {
     /// Returns bridge-ros2 in domain 2, which starts only as the enclave `/bridge`. Not started
     /// yet.
     #[must_use]
-    pub fn secured_bridge(&self, keystore: &Keystore, args: &[&str]) -> Started {
+    pub fn secured_bridge(&self, keystore: &Keystore, args: &[&str]) -> StartedChild {
         self.bridge_ros2_started(args)
             .args(["--ros-args", "--enclave", "/bridge", "--"])
             .env("ROS_SECURITY_ENABLE", "true")
@@ -221,20 +221,25 @@ impl Cell {
 
     /// Returns the Cyclone DDS peer in C as the enclave `/peer`, not started yet.
     #[must_use]
-    pub fn secured_cyclone(&self, keystore: &Keystore, args: &[&str]) -> Started {
+    pub fn secured_cyclone(&self, keystore: &Keystore, args: &[&str]) -> StartedChild {
         let started = self.cyclone_c_started(args);
         Self::as_peer(started, keystore, &cyclone_uri("lo", ""))
     }
 
     /// Returns the Cyclone DDS peer in C as the enclave `/peer` on another host, not started yet.
     #[must_use]
-    pub fn secured_cyclone_on(&self, host: &Host, keystore: &Keystore, args: &[&str]) -> Started {
+    pub fn secured_cyclone_on(
+        &self,
+        host: &Host,
+        keystore: &Keystore,
+        args: &[&str],
+    ) -> StartedChild {
         let started = host.cyclone_c_started(self, args);
         Self::as_peer(started, keystore, &cyclone_uri(WIRE, ""))
     }
 
     /// Adds the enclave to the configuration.
-    fn as_peer(started: Started, keystore: &Keystore, configuration: &str) -> Started {
+    fn as_peer(started: StartedChild, keystore: &Keystore, configuration: &str) -> StartedChild {
         let folder = keystore.enclave("peer");
         let file = |name: &str| format!("file:{}", folder.join(name).display());
         let library = |kind: &str, call: &str| {
@@ -266,7 +271,7 @@ impl Cell {
 
     /// Returns the Fast DDS peer as the enclave `/peer`, not started yet.
     #[must_use]
-    pub fn secured_fastdds(&self, keystore: &Keystore, args: &[&str]) -> Started {
+    pub fn secured_fastdds(&self, keystore: &Keystore, args: &[&str]) -> StartedChild {
         self.fastdds_started(args)
             .args(["--enclave".into(), keystore.enclave("peer")])
     }

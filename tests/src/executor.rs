@@ -7,18 +7,19 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use uadp::action::{
-    ActionDialect, ActionFields, ExecutionId, Outcome, Requested, Responder, ResponderSettings,
+    ActionDialect, ActionFields, ActionOutcome, ExecutionId, RequiredAction, Responder,
+    ResponderSettings,
 };
 use uadp::discovery::{
-    ActionMetaData, ActionTargetDataType, Announced, Announcement, DataSetMetaDataType,
-    FieldMetaData, List,
+    ActionMetaData, ActionTargetDataType, AnnouncedContent, Announcement, DataSetMetaDataType,
+    FieldMetaData, WireArray,
 };
 use uadp::{
     BuiltinType, ConfigurationVersion, Extras, NetworkHeader, NetworkMessage, NodeId, PublisherId,
     SecurityHeader, StatusCode,
 };
 
-use crate::{Triple, UadpSocket};
+use crate::{TopicTriple, UadpSocket};
 
 /// Announces a call without inputs and with the outputs `success`, `message` and `run`, and
 /// executes it.
@@ -40,7 +41,7 @@ pub enum Executes {
 }
 
 struct Work {
-    triple: Triple,
+    triple: TopicTriple,
     name: String,
     socket: UadpSocket,
     responder: Responder<()>,
@@ -56,7 +57,7 @@ impl Executor {
     /// Announces the call at once and every `ANNOUNCED_EVERY`, until this is dropped. With `copies`
     /// above 1, every datagram in both directions is duplicated.
     #[must_use]
-    pub fn start(triple: Triple, name: &str, executes: Executes, copies: usize) -> Self {
+    pub fn start(triple: TopicTriple, name: &str, executes: Executes, copies: usize) -> Self {
         let stop = Arc::<AtomicBool>::default();
         let [executed, abandoned] = [(), ()].map(|()| Arc::<AtomicU32>::default());
         let mut work = Work {
@@ -146,8 +147,8 @@ impl Work {
             }
             // Messages that the responder does not take, such as its own responses, are ignored.
             match self.responder.handle_request(&request, (), now) {
-                Ok(Requested::Execute(execution)) => self.execute(execution, now),
-                Ok(Requested::Abandoned(_)) => {
+                Ok(RequiredAction::Execute(execution)) => self.execute(execution, now),
+                Ok(RequiredAction::Abandoned(_)) => {
                     self.abandoned.fetch_add(1, Ordering::Relaxed);
                 }
                 Ok(_) | Err(_) => {}
@@ -165,7 +166,7 @@ impl Work {
         fields.extend(self.name.as_bytes());
         fields.push(7);
         fields.extend(run.to_le_bytes());
-        let outcome = Outcome::Answered {
+        let outcome = ActionOutcome::Answered {
             status: StatusCode::GOOD,
             fields: ActionFields::Variants(&fields),
         };
@@ -201,7 +202,7 @@ impl Work {
         ];
         let of = |fields| DataSetMetaDataType {
             name: Some(&name),
-            fields: List::new(fields),
+            fields: WireArray::new(fields),
             configuration_version: ConfigurationVersion { major: 1, minor: 1 },
             ..DataSetMetaDataType::default()
         };
@@ -211,12 +212,12 @@ impl Work {
         }];
         let announcement = Announcement {
             sequence_number: 0,
-            announced: Announced::ActionMetaData(ActionMetaData {
+            announced: AnnouncedContent::ActionMetaData(ActionMetaData {
                 writer_id: id,
-                action_targets: List::new(&target),
+                action_targets: WireArray::new(&target),
                 request: of(&[]),
                 response: of(&fields),
-                action_methods: List::default(),
+                action_methods: WireArray::default(),
             }),
         };
         let mut datagram = Vec::new();

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 
 use uadp::{MessageKind, NetworkMessage, PublisherId, Scalar, SequenceOrder, Variant};
 
-use crate::{Triple, UadpSocket, eventually};
+use crate::{TopicTriple, UadpSocket, eventually};
 
 /// Receives the numbers of a topic in the group. A message with a sequence number that was received
 /// before is not accepted (OPC 10000-14, 7.2.3).
@@ -21,7 +21,7 @@ pub struct GroupNumbers {
 impl GroupNumbers {
     /// Joins the group on the interface with this address.
     #[must_use]
-    pub fn of(triple: Triple, interface: Ipv4Addr) -> Self {
+    pub fn of(triple: TopicTriple, interface: Ipv4Addr) -> Self {
         let accepted = Arc::new(Mutex::new(Vec::new()));
         let ends = Arc::new(AtomicBool::new(false));
         let socket = UadpSocket::join_on(interface).of_one_interface();
@@ -86,7 +86,11 @@ impl Drop for GroupNumbers {
 }
 
 /// Returns the number in a value of the topic, unless its sequence number was received before.
-fn accept(datagram: &[u8], (space, group, writer): Triple, last: &mut Option<u16>) -> Option<u32> {
+fn accept(
+    datagram: &[u8],
+    (space, group, writer): TopicTriple,
+    last: &mut Option<u16>,
+) -> Option<u32> {
     let message = NetworkMessage::decode(datagram).ok()?;
     let is_ours = message.publisher_id() == Some(PublisherId::UInt16(space))
         && message.group().and_then(|group| group.writer_group_id) == Some(group);

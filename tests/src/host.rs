@@ -14,10 +14,10 @@ use std::{
 
 use nix::sched::{CloneFlags, setns, unshare};
 
-use wire::Orders;
-pub use wire::Wire;
+pub use wire::WireEffect;
+use wire::WireOrders;
 
-use crate::{Cell, Started, UaSide, UadpSocket};
+use crate::{Cell, StartedChild, UaSide, UadpSocket};
 
 /// The address of the cell's end of the wire.
 pub const HERE: &str = "10.77.0.1";
@@ -26,10 +26,10 @@ pub const THERE: &str = "10.77.0.2";
 /// The interface name of both ends.
 pub const WIRE: &str = "wire0";
 
-/// The other host. [`Started::on`] starts programs on it.
+/// The other host. [`StartedChild::on`] starts programs on it.
 pub struct Host {
     namespace: Namespace,
-    orders: Arc<Orders>,
+    orders: Arc<WireOrders>,
     wire: Option<JoinHandle<()>>,
 }
 
@@ -40,7 +40,7 @@ impl Cell {
     /// # Panics
     /// Panics if the network cannot be created.
     #[must_use]
-    pub fn host(&self, wire: Wire) -> Host {
+    pub fn host(&self, wire: WireEffect) -> Host {
         let (here, middle, there) = (Namespace::current(), Namespace::fresh(), Namespace::fresh());
         here.join("near", &middle, HERE);
         there.join("far", &middle, THERE);
@@ -52,7 +52,7 @@ impl Cell {
         for end in ["near", "far"] {
             middle.ip(&["link", "set", end, "mtu", "1500", "up"]);
         }
-        let orders = Arc::new(Orders::default());
+        let orders = Arc::new(WireOrders::default());
         let asked = Arc::clone(&orders);
         let wire = std::thread::Builder::new()
             .name("wire".to_owned())
@@ -180,7 +180,7 @@ impl Host {
 
     /// Returns the Fast DDS peer on this host, in domain 2, not started yet.
     #[must_use]
-    pub fn fastdds_started(&self, cell: &Cell, args: &[&str]) -> Started {
+    pub fn fastdds_started(&self, cell: &Cell, args: &[&str]) -> StartedChild {
         cell.fastdds_started(args)
             .args(["--interface", THERE])
             .on(self)
@@ -188,14 +188,14 @@ impl Host {
 
     /// Returns the Cyclone DDS peer in C on this host, in domain 2, not started yet.
     #[must_use]
-    pub fn cyclone_c_started(&self, cell: &Cell, args: &[&str]) -> Started {
+    pub fn cyclone_c_started(&self, cell: &Cell, args: &[&str]) -> StartedChild {
         self.cyclone_c_with(cell, "", args)
     }
 
     /// Returns the Cyclone DDS peer in C with more XML elements in the section `Discovery` of its
     /// configuration.
     #[must_use]
-    pub fn cyclone_c_with(&self, cell: &Cell, discovery: &str, args: &[&str]) -> Started {
+    pub fn cyclone_c_with(&self, cell: &Cell, discovery: &str, args: &[&str]) -> StartedChild {
         cell.cyclone_c_started(args)
             .env("CYCLONEDDS_URI", crate::peers::cyclone_uri(WIRE, discovery))
             .on(self)

@@ -41,20 +41,20 @@ mod ua_side;
 mod usage;
 mod wait;
 
-pub use announcer::Announcer;
+pub use announcer::LeasedParticipant;
 pub use arrows::{forbidden, tree};
-pub use asker::{Asker, Asking, Counting};
+pub use asker::{CallerKind, CallerScript, Counting};
 pub use bare_node::{BareNode, BareSubscription, PATIENCE, string_frame};
 pub use browser::{Browser, EventStream, WebAnswer};
-pub use capture::{Capture, Dissected, hex, is_true};
+pub use capture::{CaptureFile, Dissected, hex, is_true};
 pub use cell::{Cell, Distribution, Peer};
-pub use child::{Child, Started};
+pub use child::{Child, StartedChild};
 pub use clock::WallClock;
-pub use codec_asker::{CodecAsker, Ended, send_from};
+pub use codec_asker::{CallEnd, CodecAsker, send_from};
 pub use enclave::{Governance, Keystore, Wiretap, has_security};
 pub use executor::{Executes, Executor};
 pub use group_numbers::GroupNumbers;
-pub use host::{Cable, HERE, Host, THERE, WIRE, Wire};
+pub use host::{Cable, HERE, Host, THERE, WIRE, WireEffect};
 pub use judge::Judge;
 pub use mosquitto::{BROKER, Bridged};
 pub use nats::NatsCluster;
@@ -64,16 +64,16 @@ pub use net::{
 };
 pub use numbered::{Numbered, numbered};
 pub use peers::MASTER;
-pub use plant::{Segment, Site};
+pub use plant::{PlantSite, Segment};
 pub use programs::{
     METRICS_CELL, METRICS_ROS1, METRICS_ROS2, METRICS_SERVER, SERVER_ENDPOINT, drops,
     drops_by_reason, number, program,
 };
-pub use relay::{OTHER_GROUP, Relay, Weather};
+pub use relay::{GroupRelay, OTHER_GROUP, Weather};
 pub use rtps::{Mutator, announced, claims_too_much, queued};
-pub use shape::Shape;
-pub use stamp::{Stamp, now};
+pub use shape::ArrayShape;
+pub use stamp::{TextStamp, now};
 pub use times::{Times, micros, per_message, processor_time};
-pub use ua_side::{Triple, UaSide};
+pub use ua_side::{TopicTriple, UaSide};
 pub use usage::{SystemCalls, anonymous, cpu_share, peak, resident, threads, wake_ups};
 pub use wait::{eventually, holds_for};

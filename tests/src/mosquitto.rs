@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use nix::sys::signal::Signal;
 
-use crate::{Cell, Child, Started};
+use crate::{Cell, Child, StartedChild};
 
 pub(crate) const MOSQUITTO: &str = "/usr/sbin/mosquitto";
 pub(crate) const MOSQUITTO_SUB: &str = "/usr/bin/mosquitto_sub";
@@ -36,7 +36,7 @@ impl Cell {
     fn mosquitto_named(&self, name: &str, configuration: &str) -> Child {
         let text = format!("user root\nlog_dest stderr\n{configuration}");
         let file = self.file(&format!("{name}.conf"), &text);
-        let mut broker = Started::new("mosquitto", Path::new(MOSQUITTO))
+        let mut broker = StartedChild::new("mosquitto", Path::new(MOSQUITTO))
             .args(["-v", "-c", file.to_str().unwrap()])
             .start();
         broker.wait_for_line("running", START);
@@ -71,7 +71,7 @@ impl Cell {
     }
 
     fn mosquitto_sub_as(&self, format: &str, args: &[&str]) -> Child {
-        Started::new("mosquitto_sub", Path::new(MOSQUITTO_SUB))
+        StartedChild::new("mosquitto_sub", Path::new(MOSQUITTO_SUB))
             .args(["-h", "127.0.0.1", "-V", "5", "-F", format])
             .args(args)
             .ends_on(Signal::SIGINT)

@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use nix::sys::signal::Signal;
 
-use crate::{Cell, Child, Started};
+use crate::{Cell, Child, StartedChild};
 
 pub(crate) const NATS: &str = "/usr/sbin/nats-server";
 
@@ -57,8 +57,8 @@ impl NatsCluster<'_> {
         for (number, node) in missing.filter(|(_, node)| node.is_none()) {
             let text = configuration(self.cell.folder(), number) + &self.more;
             let file = self.cell.file(&format!("nats-{number}.conf"), &text);
-            let mut started =
-                Started::new("nats-server", Path::new(NATS)).args(["-c", file.to_str().unwrap()]);
+            let mut started = StartedChild::new("nats-server", Path::new(NATS))
+                .args(["-c", file.to_str().unwrap()]);
             for user in users {
                 let name = user.to_uppercase().replace('-', "_");
                 started = started.env(&format!("{name}_PASSWORD"), "word");

@@ -9,7 +9,7 @@ use std::{
 use nix::sys::signal::Signal;
 
 use crate::{
-    Cell, Child, GROUP, Started,
+    Cell, Child, GROUP, StartedChild,
     cell::{CYCLONE, Distribution, FASTDDS, NODE_OPCUA, compiled},
     eventually, program, xml_rpc,
 };
@@ -59,9 +59,12 @@ impl Cell {
 
     fn roscore_unwatched(&self) -> Child {
         let port = MASTER.rsplit(':').next().unwrap_or("11311");
-        self.with_ros1(Started::new("rosmaster", Path::new("/usr/bin/rosmaster")))
-            .args(["--core", "-p", port])
-            .start()
+        self.with_ros1(StartedChild::new(
+            "rosmaster",
+            Path::new("/usr/bin/rosmaster"),
+        ))
+        .args(["--core", "-p", port])
+        .start()
     }
 
     /// Starts a rospy script of `peers/` and waits until it is ready.
@@ -72,8 +75,8 @@ impl Cell {
 
     /// Returns a rospy script of `peers/`, not started yet.
     #[must_use]
-    pub fn rospy_started(&self, script: &str, args: &[&str]) -> Started {
-        self.with_ros1(Started::new(script, Path::new("/usr/bin/python3")))
+    pub fn rospy_started(&self, script: &str, args: &[&str]) -> StartedChild {
+        self.with_ros1(StartedChild::new(script, Path::new("/usr/bin/python3")))
             .args([peer_script(script)])
             .args(args)
     }
@@ -81,9 +84,9 @@ impl Cell {
     /// Returns a program of ROS 1 under `/usr`, such as `bin/rostopic` or
     /// `lib/topic_tools/throttle`, not started yet.
     #[must_use]
-    pub fn ros1_started(&self, program: &str, args: &[&str]) -> Started {
+    pub fn ros1_started(&self, program: &str, args: &[&str]) -> StartedChild {
         let name = program.rsplit('/').next().unwrap_or(program);
-        self.with_ros1(Started::new(name, &Path::new("/usr").join(program)))
+        self.with_ros1(StartedChild::new(name, &Path::new("/usr").join(program)))
             .args(args)
             .ends_on(Signal::SIGINT)
     }
@@ -96,7 +99,10 @@ impl Cell {
     #[must_use]
     pub fn ros1_tool(&self, name: &str, args: &[&str]) -> Vec<String> {
         let path = Path::new("/usr/bin").join(name);
-        let mut tool = self.with_ros1(Started::new(name, &path)).args(args).start();
+        let mut tool = self
+            .with_ros1(StartedChild::new(name, &path))
+            .args(args)
+            .start();
         let status = tool.wait_for_end(START);
         assert!(status.success(), "{name} ended with {status}: {tool}");
         tool.lines()
@@ -106,7 +112,7 @@ impl Cell {
     #[must_use]
     pub fn topic_tools_relay(&self, from: &str, to: &str) -> Child {
         // On SIGTERM, roscpp leaves its registrations in the master.
-        self.with_ros1(Started::new(
+        self.with_ros1(StartedChild::new(
             "relay",
             Path::new("/usr/lib/topic_tools/relay"),
         ))
@@ -118,7 +124,7 @@ impl Cell {
     /// Starts a rosrust publisher or subscriber of `std_msgs/String` and waits until it is ready.
     #[must_use]
     pub fn rosrust(&self, args: &[&str]) -> Child {
-        self.with_ros1(Started::new("rosrust-peer", &program("rosrust-peer")))
+        self.with_ros1(StartedChild::new("rosrust-peer", &program("rosrust-peer")))
             .args(args)
             .start()
             .ready(START)
@@ -132,7 +138,7 @@ impl Cell {
 
     /// Returns a Cyclone DDS script of `peers/`, not started yet.
     #[must_use]
-    pub fn cyclone_started(&self, script: &str, args: &[&str]) -> Started {
+    pub fn cyclone_started(&self, script: &str, args: &[&str]) -> StartedChild {
         self.python(script, args)
             .env("CYCLONEDDS_URI", cyclone_uri("lo", ""))
     }
@@ -146,8 +152,8 @@ impl Cell {
 
     /// Returns the Fast DDS peer in domain 2, not started yet.
     #[must_use]
-    pub fn fastdds_started(&self, args: &[&str]) -> Started {
-        Started::new("fastdds-peer", &compiled(FASTDDS))
+    pub fn fastdds_started(&self, args: &[&str]) -> StartedChild {
+        StartedChild::new("fastdds-peer", &compiled(FASTDDS))
             .args(args)
             .args(["--domain", "2"])
             .told()
@@ -162,8 +168,8 @@ impl Cell {
 
     /// Returns the Cyclone DDS peer in C in domain 2, not started yet.
     #[must_use]
-    pub fn cyclone_c_started(&self, args: &[&str]) -> Started {
-        Started::new("cyclone-peer", &compiled(CYCLONE))
+    pub fn cyclone_c_started(&self, args: &[&str]) -> StartedChild {
+        StartedChild::new("cyclone-peer", &compiled(CYCLONE))
             .env("CYCLONEDDS_URI", cyclone_uri("lo", ""))
             .args(args)
             .args(["--domain", "2"])
@@ -185,8 +191,8 @@ impl Cell {
         distribution: Distribution,
         script: &str,
         args: &[&str],
-    ) -> Started {
-        Started::new(script, &distribution.python())
+    ) -> StartedChild {
+        StartedChild::new(script, &distribution.python())
             .env("PYTHONUNBUFFERED", "1")
             .env("ROS_DOMAIN_ID", "2")
             .env("ROS_HOME", self.folder().join("ros"))
@@ -203,7 +209,7 @@ impl Cell {
 
     /// Returns an asyncua script of `peers/`, not started yet.
     #[must_use]
-    pub fn asyncua_started(&self, script: &str, args: &[&str]) -> Started {
+    pub fn asyncua_started(&self, script: &str, args: &[&str]) -> StartedChild {
         self.python(script, args)
     }
 
@@ -250,9 +256,9 @@ impl Cell {
 
     /// Returns a node-opcua script of `peers/node-opcua`, not started yet.
     #[must_use]
-    pub fn node_opcua_started(&self, script: &str, args: &[&str]) -> Started {
+    pub fn node_opcua_started(&self, script: &str, args: &[&str]) -> StartedChild {
         let modules = compiled(NODE_OPCUA).join("node_modules");
-        Started::new(script, Path::new("node"))
+        StartedChild::new(script, Path::new("node"))
             .env("NODE_PATH", modules)
             // node-opcua prints warnings about its environment, and keeps its certificates below
             // HOME.
@@ -287,8 +293,8 @@ impl Cell {
         prefix
     }
 
-    fn python(&self, script: &str, args: &[&str]) -> Started {
-        Started::new(script, &self.python)
+    fn python(&self, script: &str, args: &[&str]) -> StartedChild {
+        StartedChild::new(script, &self.python)
             .env("PYTHONUNBUFFERED", "1")
             .args([peer_script(script)])
             .args(args)
@@ -323,7 +329,7 @@ impl Cell {
 
     /// Adds the environment of a ROS 1 program in this cell.
     #[must_use]
-    pub fn with_ros1(&self, started: Started) -> Started {
+    pub fn with_ros1(&self, started: StartedChild) -> StartedChild {
         started
             .env("PATH", "/usr/bin:/bin")
             .env("PYTHONUNBUFFERED", "1")

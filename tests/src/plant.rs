@@ -6,7 +6,7 @@ use crate::Cell;
 use crate::host::Namespace;
 
 /// A host with its own loopback, and otherwise only the networks it is plugged into.
-pub struct Site(Namespace);
+pub struct PlantSite(Namespace);
 
 /// A network of level 2: a bridge.
 pub struct Segment(Namespace);
@@ -14,8 +14,8 @@ pub struct Segment(Namespace);
 impl Cell {
     /// Creates a host.
     #[must_use]
-    pub fn site(&self) -> Site {
-        Site(Namespace::fresh())
+    pub fn site(&self) -> PlantSite {
+        PlantSite(Namespace::fresh())
     }
 
     /// Creates a network without hosts.
@@ -42,7 +42,7 @@ impl Segment {
     ///
     /// # Panics
     /// Panics if the host has an interface with this name.
-    pub fn plug(&self, site: &Site, interface: &str, address: &str) {
+    pub fn plug(&self, site: &PlantSite, interface: &str, address: &str) {
         let Self(here) = self;
         let end = end_of(address);
         let path = site.path();
@@ -96,7 +96,7 @@ fn end_of(address: &str) -> String {
     format!("p{}", address.replace('.', "-"))
 }
 
-impl Site {
+impl PlantSite {
     pub(crate) fn path(&self) -> PathBuf {
         self.0.path()
     }

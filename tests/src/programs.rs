@@ -9,7 +9,7 @@ use std::{
 
 use serde_json::Value;
 
-use crate::{Cell, Child, Started, eventually, metrics};
+use crate::{Cell, Child, StartedChild, eventually, metrics};
 
 /// The metrics address of a cell's bridge-ros1.
 pub const METRICS_ROS1: &str = "127.0.0.1:9101";
@@ -36,14 +36,14 @@ impl Cell {
 
     /// Returns bridge-ros1, not started yet.
     #[must_use]
-    pub fn bridge_ros1_started(&self, args: &[&str]) -> Started {
+    pub fn bridge_ros1_started(&self, args: &[&str]) -> StartedChild {
         self.bridge_ros1_at(args, METRICS_ROS1)
     }
 
     /// Returns bridge-ros1 with another metrics address, not started yet.
     #[must_use]
-    pub fn bridge_ros1_at(&self, args: &[&str], metrics: &str) -> Started {
-        self.with_ros1(Started::new("bridge-ros1", &program("bridge-ros1")))
+    pub fn bridge_ros1_at(&self, args: &[&str], metrics: &str) -> StartedChild {
+        self.with_ros1(StartedChild::new("bridge-ros1", &program("bridge-ros1")))
             .args(args)
             .args(["--interface", "lo", "--metrics", metrics])
     }
@@ -51,8 +51,8 @@ impl Cell {
     /// Returns several programs in one process, with bridge-ros2 in domain 2, not started yet.
     /// `args` follow the arguments that every cell needs.
     #[must_use]
-    pub fn ua_cell_started(&self, args: &[&str]) -> Started {
-        self.with_ros1(Started::new("ua-cell", &program("ua-cell")))
+    pub fn ua_cell_started(&self, args: &[&str]) -> StartedChild {
+        self.with_ros1(StartedChild::new("ua-cell", &program("ua-cell")))
             .env("ROS_DOMAIN_ID", "2")
             .env("UA_PKI", self.folder().join("pki"))
             .args(args)
@@ -63,7 +63,7 @@ impl Cell {
     /// topic. It does not report when it is ready.
     #[must_use]
     pub fn tcpros_relay(&self, node: &str, pairs: &[(String, String)]) -> Child {
-        self.with_ros1(Started::new("relay", &program("examples/relay")))
+        self.with_ros1(StartedChild::new("relay", &program("examples/relay")))
             .args([format!("__name:={node}")])
             .args(pairs.iter().flat_map(|(from, to)| [from, to]))
             .start()
@@ -80,20 +80,20 @@ impl Cell {
 
     /// Returns bridge-ros2 in domain 2, not started yet.
     #[must_use]
-    pub fn bridge_ros2_started(&self, args: &[&str]) -> Started {
+    pub fn bridge_ros2_started(&self, args: &[&str]) -> StartedChild {
         self.bridge_ros2_alone(args).args(["--domain", "2"])
     }
 
     /// Returns bridge-ros2 in the domain of `args` or of the mapping, not started yet.
     #[must_use]
-    pub fn bridge_ros2_alone(&self, args: &[&str]) -> Started {
+    pub fn bridge_ros2_alone(&self, args: &[&str]) -> StartedChild {
         self.bridge_ros2_at(args, METRICS_ROS2)
     }
 
     /// Returns bridge-ros2 with another metrics address, not started yet.
     #[must_use]
-    pub fn bridge_ros2_at(&self, args: &[&str], metrics: &str) -> Started {
-        Started::new("bridge-ros2", &program("bridge-ros2"))
+    pub fn bridge_ros2_at(&self, args: &[&str], metrics: &str) -> StartedChild {
+        StartedChild::new("bridge-ros2", &program("bridge-ros2"))
             .args(args)
             .args(["--interface", "lo", "--metrics", metrics])
     }
@@ -101,8 +101,8 @@ impl Cell {
     /// Returns the example of bridge-ros2 that republishes a topic of domain 2 as another topic,
     /// not started yet.
     #[must_use]
-    pub fn ros2_relay_started(&self, from: &str, to: &str) -> Started {
-        Started::new("relay", &program("examples/ros2_relay")).args([from, to, "2"])
+    pub fn ros2_relay_started(&self, from: &str, to: &str) -> StartedChild {
+        StartedChild::new("relay", &program("examples/ros2_relay")).args([from, to, "2"])
     }
 
     /// Starts ua-server and waits until it answers. `args` follow the arguments that every cell
@@ -116,8 +116,8 @@ impl Cell {
 
     /// Returns ua-server, not started yet.
     #[must_use]
-    pub fn ua_server_started(&self, args: &[&str]) -> Started {
-        Started::new("ua-server", &program("ua-server"))
+    pub fn ua_server_started(&self, args: &[&str]) -> StartedChild {
+        StartedChild::new("ua-server", &program("ua-server"))
             .args(args)
             .args(["--pki".into(), self.folder().join("pki")])
             .args(["--interface", "lo", "--metrics", METRICS_SERVER])

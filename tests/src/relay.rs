@@ -15,7 +15,7 @@ use socket2::SockRef;
 
 use crate::{GROUP, group_member};
 
-/// The group on the other side of a [`Relay`].
+/// The group on the other side of a [`GroupRelay`].
 pub const OTHER_GROUP: SocketAddrV4 = SocketAddrV4::new(Ipv4Addr::new(239, 192, 0, 41), 4840);
 
 /// The effect of a relay on datagrams, in each direction. Shares are 0 to 1.
@@ -32,7 +32,7 @@ pub struct Weather {
 }
 
 /// Carries datagrams between [`GROUP`] and [`OTHER_GROUP`] until it is dropped.
-pub struct Relay {
+pub struct GroupRelay {
     stop: Arc<AtomicBool>,
     silent: Arc<AtomicBool>,
     bad: Arc<AtomicU32>,
@@ -62,7 +62,7 @@ impl Weather {
     };
 }
 
-impl Relay {
+impl GroupRelay {
     /// Starts the relay.
     ///
     /// # Panics
@@ -112,7 +112,7 @@ impl Relay {
     }
 }
 
-impl Drop for Relay {
+impl Drop for GroupRelay {
     fn drop(&mut self) {
         self.stop.store(true, Ordering::Relaxed);
         for thread in self.threads.drain(..) {

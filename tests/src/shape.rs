@@ -1,11 +1,11 @@
 //! Messages with a large array of bytes: images and point clouds.
 
-use crate::Stamp;
+use crate::TextStamp;
 
 /// A message type with an array of bytes, and the bytes around the array. The array ends with a
-/// [`Stamp`] and a zero.
+/// [`TextStamp`] and a zero.
 #[derive(Debug)]
-pub struct Shape {
+pub struct ArrayShape {
     /// The ROS type, such as `sensor_msgs/Image`.
     pub message_type: &'static str,
     ros1_head: &'static [u8],
@@ -13,7 +13,7 @@ pub struct Shape {
     tail: &'static [u8],
 }
 
-impl Shape {
+impl ArrayShape {
     /// `sensor_msgs/Image`: header, height, width, encoding, `is_bigendian`, step, data.
     pub const IMAGE: Self = Self {
         message_type: "sensor_msgs/Image",
@@ -54,15 +54,15 @@ impl Shape {
         let array = self.array_at();
         let end = frame.len().saturating_sub(self.behind());
         if let Some(text) = frame.get_mut(array..end) {
-            Stamp::renew(text, number);
+            TextStamp::renew(text, number);
         }
     }
 
     /// Returns the stamp of a message of ROS 1.
     #[must_use]
-    pub fn stamp_of(&self, message: &[u8]) -> Option<Stamp> {
+    pub fn stamp_of(&self, message: &[u8]) -> Option<TextStamp> {
         let end = message.len().checked_sub(self.behind())?;
-        Stamp::of(message.get(..end)?)
+        TextStamp::of(message.get(..end)?)
     }
 
     /// Returns the arguments for the commands `pace` and `meter` of the Fast DDS peer.

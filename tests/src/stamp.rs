@@ -7,7 +7,7 @@ use nix::time::{ClockId, clock_gettime};
 
 /// The topic, the number and the time of sending of a text.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Stamp {
+pub struct TextStamp {
     /// The index of the topic among the topics of its sender, from 0.
     pub topic: usize,
     /// The number, counted by the sender.
@@ -16,7 +16,7 @@ pub struct Stamp {
     pub sent: Duration,
 }
 
-impl Stamp {
+impl TextStamp {
     /// Returns a text of `size` characters with a stamp of the current time.
     #[must_use]
     pub fn text(topic: usize, number: u64, size: usize) -> String {

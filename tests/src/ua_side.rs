@@ -10,7 +10,7 @@ use uadp::{
 use crate::UadpSocket;
 
 /// PublisherId, WriterGroupId and DataSetWriterId of a value.
-pub type Triple = (u16, u16, u16);
+pub type TopicTriple = (u16, u16, u16);
 
 /// The time that Python peers need on a busy machine.
 const PATIENCE: Duration = Duration::from_secs(30);
@@ -46,7 +46,7 @@ impl UaSide {
     /// Panics if there is no such value in time, with the text `what` in the message.
     pub fn hear<T>(
         &self,
-        triple: Triple,
+        triple: TopicTriple,
         what: &str,
         pick: impl Fn(&[Variant<'_>]) -> Option<T>,
     ) -> T {
@@ -71,7 +71,7 @@ impl UaSide {
     ///
     /// # Panics
     /// Panics if the value does not arrive in time.
-    pub fn hear_scalar(&self, triple: Triple, expected: Scalar<'_>) {
+    pub fn hear_scalar(&self, triple: TopicTriple, expected: Scalar<'_>) {
         self.hear(triple, &format!("{expected:?}"), |fields| {
             matches!(fields, [Variant::Scalar(found)] if *found == expected).then_some(())
         });
@@ -81,7 +81,7 @@ impl UaSide {
     ///
     /// # Panics
     /// Panics if the value cannot be sent.
-    pub fn write(&mut self, triple: Triple, value: Scalar<'_>) {
+    pub fn write(&mut self, triple: TopicTriple, value: Scalar<'_>) {
         self.write_fields(triple, &[value]);
     }
 
@@ -89,7 +89,7 @@ impl UaSide {
     ///
     /// # Panics
     /// Panics if the value cannot be sent.
-    pub fn write_fields(&mut self, (space, namespace, id): Triple, values: &[Scalar<'_>]) {
+    pub fn write_fields(&mut self, (space, namespace, id): TopicTriple, values: &[Scalar<'_>]) {
         self.sequence = self.sequence.wrapping_add(1);
         let header = NetworkHeader {
             publisher_id: Some(PublisherId::UInt16(space)),
@@ -121,7 +121,7 @@ impl UaSide {
 
     /// Returns the triples of all values received within `window`.
     #[must_use]
-    pub fn triples_for(&self, window: Duration) -> Vec<Triple> {
+    pub fn triples_for(&self, window: Duration) -> Vec<TopicTriple> {
         let datagrams = self.socket.receive_for(window);
         let messages = datagrams.iter().map(|d| NetworkMessage::decode(d).unwrap());
         messages
@@ -136,7 +136,7 @@ impl UaSide {
 }
 
 /// Returns the values of a NetworkMessage; a keep-alive has no fields.
-fn values<'a>(message: &NetworkMessage<'a>) -> Vec<(Triple, Vec<Variant<'a>>)> {
+fn values<'a>(message: &NetworkMessage<'a>) -> Vec<(TopicTriple, Vec<Variant<'a>>)> {
     let header = message.header();
     let group = header.group.and_then(|group| group.writer_group_id);
     let (Some(PublisherId::UInt16(space)), Some(group)) = (header.publisher_id, group) else {

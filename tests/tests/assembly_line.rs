@@ -3,12 +3,12 @@
 
 use std::time::Duration;
 
-use system_tests::{Cell, Started, program};
+use system_tests::{Cell, StartedChild, program};
 
 #[test]
 fn the_conveyor_is_switched_by_a_call_and_the_line_goes_on_without_it() {
     let Some(_cell) = Cell::with(&[]) else { return };
-    let mut demo = Started::new("demo", &program("demo"))
+    let mut demo = StartedChild::new("demo", &program("demo"))
         .args(["--scenario", "line-by-topics", "--speed", "10", "--json"])
         .start();
     let ended = demo.wait_for_end(Duration::from_secs(180));
@@ -28,7 +28,7 @@ fn the_conveyor_is_switched_by_a_call_and_the_line_goes_on_without_it() {
 #[test]
 fn a_line_of_skills_takes_back_what_a_dead_conveyor_was_to_carry_and_goes_on_without_it() {
     let Some(_cell) = Cell::with(&[]) else { return };
-    let mut demo = Started::new("demo", &program("demo"))
+    let mut demo = StartedChild::new("demo", &program("demo"))
         .args(["--speed", "10", "--json"])
         .start();
     let ended = demo.wait_for_end(Duration::from_secs(180));

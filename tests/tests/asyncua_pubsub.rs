@@ -5,7 +5,7 @@ use std::time::{Duration, SystemTime};
 
 use serde_json::{Value, json};
 use system_tests::{Cell, Child, GROUP, Peer, SERVER_ENDPOINT, eventually};
-use transport::{Options, Udp};
+use transport::{Udp, UdpOptions};
 use uadp::{
     Array, BuiltinType, DataSetHeader, DataSetMessage, DataValue, DateTime, EncodeError,
     FieldEncoder, FieldEncoding, GroupHeader, Guid, LocalizedText, Matrix, MessageKind,
@@ -29,9 +29,9 @@ const GUID: Guid = Guid::from_fields(
 const UNCERTAIN_SUB_NORMAL: StatusCode = StatusCode(0x4095_0000);
 
 fn group() -> Udp {
-    Udp::open(&Options {
+    Udp::open(&UdpOptions {
         interface: Some("lo".to_owned()),
-        ..Options::new(GROUP.into())
+        ..UdpOptions::new(GROUP.into())
     })
     .unwrap()
 }

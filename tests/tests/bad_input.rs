@@ -10,7 +10,7 @@ use std::{
 
 use serde_json::Value;
 use system_tests::{
-    Cell, Child, GROUP, METRICS_ROS1, METRICS_ROS2, METRICS_SERVER, Peer, Started, UadpSocket,
+    Cell, Child, GROUP, METRICS_ROS1, METRICS_ROS2, METRICS_SERVER, Peer, StartedChild, UadpSocket,
     drops, eventually, metrics,
 };
 
@@ -42,7 +42,7 @@ fn goes_on(heard: &Child) {
     });
 }
 
-fn ends(started: Started) -> (ExitStatus, String) {
+fn ends(started: StartedChild) -> (ExitStatus, String) {
     let mut child = started.start();
     let status = child.wait_for_end(SOON);
     (status, child.lines().join("\n"))
@@ -291,7 +291,7 @@ fn a_missing_interface_is_named_beside_those_that_are_there() {
     };
     let arguments = ["--interface", "robot0"];
     for name in ["bridge-ros1", "bridge-ros2", "ua-server"] {
-        let mut started = Started::new(name, &system_tests::program(name)).args(arguments);
+        let mut started = StartedChild::new(name, &system_tests::program(name)).args(arguments);
         if name == "bridge-ros2" {
             started = started.args(["--domain", "2"]);
         }

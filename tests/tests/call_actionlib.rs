@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use nix::sys::signal::Signal;
 use serde_json::{Value, json};
-use system_tests::{Cell, Child, Distribution, Peer, Started, eventually, program};
+use system_tests::{Cell, Child, Distribution, Peer, StartedChild, eventually, program};
 
 /// The time that rospy and rclpy need to start on a busy machine.
 const SOON: Duration = Duration::from_secs(60);
@@ -215,7 +215,7 @@ fn a_goal_goes_on_without_its_client_and_ends_without_its_server() {
 
 /// Starts `ua-space call` of an action, with its events as JSON.
 fn ask(words: &[&str]) -> Child {
-    Started::new("ua-space", &program("ua-space"))
+    StartedChild::new("ua-space", &program("ua-space"))
         .args(
             [
                 &["call"],
@@ -529,7 +529,7 @@ fn skills(cell: &Cell, url: &str) -> Child {
 
 fn component(cell: &Cell, yaml: &str, url: &str) -> Child {
     let file = cell.file("component.yaml", yaml);
-    let child = Started::new("ua-component", &program("ua-component"))
+    let child = StartedChild::new("ua-component", &program("ua-component"))
         .args([file.to_str().unwrap(), "--endpoint", url, "--lds", "none"])
         .args(["--interface", "lo", "--metrics", "127.0.0.1:9855"])
         .start();

@@ -5,7 +5,9 @@ use std::time::Duration;
 
 use nix::sys::signal::Signal;
 use serde_json::{Value, json};
-use system_tests::{Cell, Child, Distribution, Judge, Peer, Started, eventually, metrics, program};
+use system_tests::{
+    Cell, Child, Distribution, Judge, Peer, StartedChild, eventually, metrics, program,
+};
 
 /// The time that programs of ROS need to start on a busy machine.
 const SOON: Duration = Duration::from_secs(60);
@@ -19,7 +21,7 @@ fn bridge(space: u16, domain: u16, args: &[&str]) -> Child {
     let name = format!("bridge_of_{space}");
     let address = format!("127.0.0.1:{}", 9200 + space);
     let (space, domain) = (space.to_string(), domain.to_string());
-    let started = Started::new(&name, &program("bridge-ros2"))
+    let started = StartedChild::new(&name, &program("bridge-ros2"))
         .args(args)
         .args(["--domain", &domain, "--space", &space, "--interface", "lo"])
         .args(["--metrics", &address, "--ros-args", "-r"])
@@ -29,7 +31,7 @@ fn bridge(space: u16, domain: u16, args: &[&str]) -> Child {
     started
 }
 
-fn rclpy(cell: &Cell, distribution: Distribution, domain: &str, args: &[&str]) -> Started {
+fn rclpy(cell: &Cell, distribution: Distribution, domain: &str, args: &[&str]) -> StartedChild {
     cell.rclpy_started(distribution, SCRIPT, args)
         .env("ROS_DOMAIN_ID", domain)
         .told()

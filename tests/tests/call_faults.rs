@@ -7,9 +7,9 @@ use std::time::{Duration, Instant};
 use nix::sys::signal::Signal;
 use serde_json::{Value, json};
 use system_tests::{
-    Asker, Cell, CodecAsker, Counting, Distribution, Ended, Executes, Executor, METRICS_ROS1,
-    METRICS_ROS2, OTHER_GROUP, Peer, Relay, UadpSocket, Weather, drops, eventually, metrics,
-    send_from,
+    CallEnd, CallerScript, Cell, CodecAsker, Counting, Distribution, Executes, Executor,
+    GroupRelay, METRICS_ROS1, METRICS_ROS2, OTHER_GROUP, Peer, UadpSocket, Weather, drops,
+    eventually, metrics, send_from,
 };
 use uadp::action::{
     ActionAddress, ActionDialect, ActionFields, ActionHeader, ActionKind, ActionState, ActionToSend,
@@ -28,7 +28,7 @@ fn order(case: &str, first: u32, count: u32, at_once: u32) -> Value {
     json!({"case": case, "service": SERVICE, "first": first, "count": count, "at_once": at_once})
 }
 
-fn one_right(asker: &mut Asker, number: u32) {
+fn one_right(asker: &mut CallerScript, number: u32) {
     let told = asker.ask(order("files", number, 1, 1));
     assert_eq!(told["right"], 1, "{told}");
 }
@@ -52,7 +52,7 @@ fn a_thousand_calls_over_a_bad_network_are_executed_once_each_and_answered_right
     let Some(cell) = Cell::with(BOTH) else {
         return;
     };
-    let relay = Relay::start(Weather {
+    let relay = GroupRelay::start(Weather {
         lost: 0.05,
         doubled: 0.05,
         late: 0.05,
@@ -166,7 +166,7 @@ fn a_killed_bridge_and_the_next_one_execute_once(killed: Killed) {
     let Some(cell) = Cell::with(BOTH) else {
         return;
     };
-    let relay = Relay::start(Weather::FAIR);
+    let relay = GroupRelay::start(Weather::FAIR);
     let one = cell.call_mapping(1, "");
     // A request is repeated for this time.
     let two = format!("pubsub: {{address: \"opc.udp://{OTHER_GROUP}\", receive_timeout: 40s}}\n");
@@ -271,7 +271,7 @@ fn a_requestor_that_is_killed_has_its_calls_executed_once_and_the_next_one_is_no
 }
 
 /// Waits until each requestor has `count` ended calls, and returns the ends.
-fn ended(askers: &mut [CodecAsker], count: usize) -> Vec<Vec<Ended>> {
+fn ended(askers: &mut [CodecAsker], count: usize) -> Vec<Vec<CallEnd>> {
     let mut all = vec![Vec::new(); askers.len()];
     eventually("all calls end", SOON, || {
         for (asker, ended) in askers.iter_mut().zip(&mut all) {
@@ -305,7 +305,7 @@ fn two_requestors_with_equal_correlation_data_each_get_their_own_answer() {
         asker.call(SERVICE_ID, NOTHING, SOON);
     }
     for ended in ended(&mut askers, 2) {
-        assert!(matches!(ended[..], [Ended::Answered(_)]), "{ended:?}");
+        assert!(matches!(ended[..], [CallEnd::Answered(_)]), "{ended:?}");
     }
     each_executed(&mut executor, 2);
 }
@@ -321,13 +321,13 @@ fn an_answer_after_its_deadline_is_dropped_and_counted_and_answers_no_other_call
     announced(&cell, SERVICE);
     let mut asker = [CodecAsker::new(5, 7)];
     asker[0].call(SERVICE_ID, NOTHING, Duration::from_secs(1));
-    assert_eq!(ended(&mut asker, 1), [[Ended::Unknown]]);
+    assert_eq!(ended(&mut asker, 1), [[CallEnd::Unknown]]);
     running(&mut executor, 0);
     asker[0].call(SERVICE_ID, NOTHING, SOON);
     let [ended] = &ended(&mut asker, 1)[..] else {
         panic!("one asker")
     };
-    assert!(matches!(ended[..], [Ended::Answered(_)]), "{ended:?}");
+    assert!(matches!(ended[..], [CallEnd::Answered(_)]), "{ended:?}");
     each_executed(&mut executor, 2);
 }
 

@@ -6,7 +6,9 @@
 mod actions;
 
 use serde_json::{Value, json};
-use system_tests::{Asker, Asking, Cell, Child, Distribution, Peer, Started, program};
+use system_tests::{
+    CallerKind, CallerScript, Cell, Child, Distribution, Peer, StartedChild, program,
+};
 
 /// The letter of each case in the table of the page, and its name in `peers/calls/cases.py`.
 const CASES: [(char, &str); 5] = [
@@ -18,15 +20,15 @@ const CASES: [(char, &str); 5] = [
 ];
 /// Number of calls of each caller, for each case of each executor.
 const COUNT: u64 = 2;
-const ASKING: [Asking; 8] = [
-    Asking::Rospy,
-    Asking::Roscpp,
-    Asking::Rclpy(Distribution::Jazzy, 3),
-    Asking::Rclpy(Distribution::Kilted, 3),
-    Asking::Cyclone(3),
-    Asking::Asyncua,
-    Asking::NodeOpcua,
-    Asking::UaSpace,
+const ASKING: [CallerKind; 8] = [
+    CallerKind::Rospy,
+    CallerKind::Roscpp,
+    CallerKind::Rclpy(Distribution::Jazzy, 3),
+    CallerKind::Rclpy(Distribution::Kilted, 3),
+    CallerKind::Cyclone(3),
+    CallerKind::Asyncua,
+    CallerKind::NodeOpcua,
+    CallerKind::UaSpace,
 ];
 const PLC: &str = "opc.tcp://127.0.0.1:4841";
 
@@ -123,11 +125,11 @@ impl Executing {
 
 /// Returns whether a caller needs neither a bridge nor the server: nodes of the same ROS, and OPC
 /// UA clients of a server's Methods.
-fn is_at_home(asking: Asking, executing: &Executing) -> bool {
+fn is_at_home(asking: CallerKind, executing: &Executing) -> bool {
     match asking {
-        Asking::Rospy | Asking::Roscpp => executing.space == 1,
-        Asking::Asyncua | Asking::NodeOpcua => executing.name == METHOD,
-        Asking::Rclpy(..) | Asking::Cyclone(_) | Asking::UaSpace => false,
+        CallerKind::Rospy | CallerKind::Roscpp => executing.space == 1,
+        CallerKind::Asyncua | CallerKind::NodeOpcua => executing.name == METHOD,
+        CallerKind::Rclpy(..) | CallerKind::Cyclone(_) | CallerKind::UaSpace => false,
     }
 }
 
@@ -188,7 +190,7 @@ fn component(cell: &Cell) -> Child {
         env!("CARGO_MANIFEST_DIR"),
         "/../examples/plant/parallel-gripper.yaml"
     );
-    Started::new("ua-component", &program("ua-component"))
+    StartedChild::new("ua-component", &program("ua-component"))
         .args([yaml, "--interface", "lo", "--lds", "none"])
         .args(["--pki".into(), cell.folder().join("pki-component")])
         .start()
@@ -196,15 +198,20 @@ fn component(cell: &Cell) -> Child {
 
 /// Has all callers make a call at once. Returns for each caller whether every answer was right, or
 /// `None` for a caller without a bridge.
-fn asked(askers: &mut [(Asking, Asker)], executing: &Executing, call: &Call) -> Vec<Option<bool>> {
-    let away = |asking: &Asking| !is_at_home(*asking, executing);
+fn asked(
+    askers: &mut [(CallerKind, CallerScript)],
+    executing: &Executing,
+    call: &Call,
+) -> Vec<Option<bool>> {
+    let away = |asking: &CallerKind| !is_at_home(*asking, executing);
     for ((asking, asker), turn) in askers.iter_mut().zip(0..).filter(|((of, _), _)| away(of)) {
         let service = match asking {
-            Asking::Asyncua | Asking::NodeOpcua => &call.method,
-            Asking::UaSpace => &call.topic,
-            Asking::Rospy | Asking::Roscpp | Asking::Rclpy(..) | Asking::Cyclone(_) => {
-                &call.service
-            }
+            CallerKind::Asyncua | CallerKind::NodeOpcua => &call.method,
+            CallerKind::UaSpace => &call.topic,
+            CallerKind::Rospy
+            | CallerKind::Roscpp
+            | CallerKind::Rclpy(..)
+            | CallerKind::Cyclone(_) => &call.service,
         };
         asker.begin(json!({
             "case": call.case, "service": service, "first": 10 * turn, "count": executing.count(),
@@ -226,7 +233,7 @@ fn asked(askers: &mut [(Asking, Asker)], executing: &Executing, call: &Call) -> 
 }
 
 /// Returns the row of the table for the observed results, with a word for each caller.
-fn row(askers: &mut [(Asking, Asker)], executing: &Executing) -> Vec<String> {
+fn row(askers: &mut [(CallerKind, CallerScript)], executing: &Executing) -> Vec<String> {
     let mut cells = vec![executing.name.to_owned()];
     cells.extend(askers.iter().map(|_| String::new()));
     // Callers of a skill take turns: the skill refuses calls that its state does not allow, or

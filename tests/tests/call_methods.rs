@@ -6,7 +6,7 @@ use nix::sys::signal::Signal;
 use serde_json::{Value, json};
 use system_tests::{
     Cell, Child, Counting, Distribution, Executes, Executor, METRICS_SERVER, Peer, SERVER_ENDPOINT,
-    Started, eventually, metrics, program,
+    StartedChild, eventually, metrics, program,
 };
 
 /// The time that rospy, rclpy and asyncua need to start on a busy machine.
@@ -190,7 +190,7 @@ fn a_skill_of_a_component_is_started_by_clients_that_know_only_the_server() {
     let component = |name: &str, metrics: &str| {
         let plant = concat!(env!("CARGO_MANIFEST_DIR"), "/../examples/plant");
         let args = ["--lds", "none", "--interface", "lo", "--metrics", metrics];
-        Started::new("ua-component", &program("ua-component"))
+        StartedChild::new("ua-component", &program("ua-component"))
             .args([format!("{plant}/{name}.yaml")])
             .args(args)
             .start()
@@ -301,7 +301,7 @@ fn reset(number: u16) -> String {
 
 /// Starts `ua-space call`, which ends by itself.
 fn ua_space_call(words: &[&str]) -> Child {
-    Started::new("ua-space", &program("ua-space"))
+    StartedChild::new("ua-space", &program("ua-space"))
         .args(["call"])
         .args(words)
         .args([

@@ -10,7 +10,8 @@ use std::time::Duration;
 use nix::sys::signal::Signal;
 use serde_json::{Value, json};
 use system_tests::{
-    Cell, Child, Distribution, Judge, MASTER, Peer, Started, eventually, metrics, program, xml_rpc,
+    Cell, Child, Distribution, Judge, MASTER, Peer, StartedChild, eventually, metrics, program,
+    xml_rpc,
 };
 
 /// The time that rospy and rclpy need to start on a busy machine.
@@ -165,7 +166,7 @@ fn of_two_bridges_in_one_domain_one_asks_and_a_call_is_executed_once() {
     let _core = cell.roscore();
     let mut server = cell.rospy("ros1_serve.py", &[OF_ROS1]);
     let _bridges = (cell.bridge_ros1(&[]), cell.bridge_ros2(&[]));
-    let _second = Started::new("the second bridge", &program("bridge-ros2"))
+    let _second = StartedChild::new("the second bridge", &program("bridge-ros2"))
         .args(["--domain", "2", "--space", "3", "--interface", "lo"])
         .args(["--metrics", METRICS, "--ros-args", "-r", "__node:=second"])
         .start();

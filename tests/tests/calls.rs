@@ -2,10 +2,10 @@
 
 use std::time::{Duration, Instant};
 
-use messages::{Dialect, Registry};
+use messages::{Dialect, TypeRegistry};
 use serde_json::{Value, json};
 use system_tests::{
-    Cell, Distribution, Executes, Executor, Judge, Peer, Started, eventually, program,
+    Cell, Distribution, Executes, Executor, Judge, Peer, StartedChild, eventually, program,
 };
 
 const START: (u16, u16, u16) = (0, 7, 105);
@@ -93,7 +93,7 @@ fn an_rclpy_client_sees_and_asks_for_a_call_and_is_told_when_its_executor_is_kil
     // The bridge describes the type of the service as a node of ROS with such a service does.
     judge.ask(json!({"serve": "/own", "type": "std_srvs/srv/Trigger", "value": {}}));
     let trigger = "std_srvs/Trigger".parse().unwrap();
-    let hashes = Registry::bundle(Dialect::Ros2).service_type_hashes(&trigger);
+    let hashes = TypeRegistry::bundle(Dialect::Ros2).service_type_hashes(&trigger);
     let asked = json!({"type_name": "std_srvs/srv/Trigger", "type_hash": hashes.unwrap().service.to_string()});
     let answer = json!({"success": true, "message": NAME});
     assert_eq!(judge_calls(&mut judge), answer);
@@ -137,7 +137,7 @@ fn a_skill_of_a_component_is_started_from_ros_2_and_from_ros_1() {
         env!("CARGO_MANIFEST_DIR"),
         "/../examples/plant/parallel-gripper.yaml"
     );
-    let _component = Started::new("ua-component", &program("ua-component"))
+    let _component = StartedChild::new("ua-component", &program("ua-component"))
         .args([yaml, "--interface", "lo", "--lds", "none"])
         .args(["--pki".into(), cell.folder().join("pki")])
         .start();

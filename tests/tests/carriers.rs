@@ -8,13 +8,13 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use bridge_node::carrier_rules;
-use broker::{Identity, Mqtt};
+use broker::{BrokerIdentity, Mqtt};
 use mappings::{Broker, BrokerAddress, Mapping, MqttVersion, PubSub};
 use system_tests::{
     BROKER, Bridged, Cell, Child, GROUP, HERE, NatsCluster, Peer, UadpSocket, WIRE,
 };
 use tokio::time::timeout;
-use transport::{BUFFER, Carrier, Carriers, Options, Outgoing, SendError, Udp};
+use transport::{BUFFER, Carrier, Carriers, OutgoingMessage, SendError, Udp, UdpOptions};
 use uadp::{
     DataSetHeader, GroupHeader, NetworkHeader, NetworkMessage, NetworkMessageEncoder, PublisherId,
     Scalar, Variant,
@@ -36,9 +36,9 @@ struct Multicast;
 
 impl Network for Multicast {
     fn join(&self, _publisher: u16) -> Box<dyn Carrier> {
-        let options = Options {
+        let options = UdpOptions {
             interface: Some("lo".to_owned()),
-            ..Options::new(PubSub::ADDRESS)
+            ..UdpOptions::new(PubSub::ADDRESS)
         };
         Box::new(Udp::open(&options).unwrap())
     }
@@ -83,7 +83,7 @@ impl Network for Mosquitto<'_> {
 fn mqtt(address: &str, version: MqttVersion, publisher: u16) -> Box<dyn Carrier> {
     let mut broker = Broker::new(BrokerAddress::parse(address).unwrap());
     broker.version = Some(version);
-    let identity = Identity {
+    let identity = BrokerIdentity {
         program: "test".to_owned(),
         publisher: Some(publisher),
     };
@@ -218,7 +218,7 @@ async fn meet(sender: &mut dyn Carrier, publisher: u16, receivers: &mut [&mut Bo
                 "the receiver joins: {:?}",
                 receiver.lost()
             );
-            let _not_yet = sender.try_send(&Outgoing::new(&value(publisher, WARM_UP, 0)));
+            let _not_yet = sender.try_send(&OutgoingMessage::new(&value(publisher, WARM_UP, 0)));
             let _change = (sender.follow(), receiver.follow());
             let wait = timeout(Duration::from_millis(50), receiver.recv(&mut buffer));
             if let Ok(Ok(received)) = wait.await {
@@ -241,7 +241,7 @@ fn send(
     number: u32,
     padding: usize,
 ) -> Result<(), SendError> {
-    carrier.try_send(&Outgoing::new(&value(publisher, number, padding)))
+    carrier.try_send(&OutgoingMessage::new(&value(publisher, number, padding)))
 }
 
 /// The faults of a network that the suite allows.
@@ -523,7 +523,8 @@ fn burst() -> Vec<Vec<u8>> {
 /// Sends a burst in both directions of a cable, and expects no own datagram.
 async fn exchange(here: &mut Udp, there: &UadpSocket) {
     let burst = burst();
-    let messages: Vec<Outgoing<'_>> = burst.iter().map(|of| Outgoing::new(of)).collect();
+    let messages: Vec<OutgoingMessage<'_>> =
+        burst.iter().map(|of| OutgoingMessage::new(of)).collect();
     let errors = Carrier::try_send_all(here, &messages);
     assert!(errors.is_empty(), "{errors:?}");
     for datagram in &burst {
@@ -551,15 +552,15 @@ fn bursts_of_fragmented_datagrams_cross_a_cable_without_echo() {
     let there = cable.socket();
     run(async {
         for interface in [Some(WIRE.to_owned()), None] {
-            let options = Options {
+            let options = UdpOptions {
                 interface,
-                ..Options::new(GROUP.into())
+                ..UdpOptions::new(GROUP.into())
             };
             let mut here = Udp::open(&options).unwrap();
             exchange(&mut here, &there).await;
         }
         // The address of the host changes.
-        let mut here = Udp::open(&Options::new(GROUP.into())).unwrap();
+        let mut here = Udp::open(&UdpOptions::new(GROUP.into())).unwrap();
         let new = format!("{NEW_ADDRESS}/24");
         let old = format!("{HERE}/24");
         for args in [

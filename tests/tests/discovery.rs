@@ -22,8 +22,8 @@ use std::time::{Duration, Instant};
 use nix::sys::signal::Signal;
 use serde_json::{Value, json};
 use system_tests::{
-    Capture, Cell, Child, HERE, Peer, Started, THERE, WIRE, Wire, eventually, group_member,
-    metrics, number, program, resident,
+    CaptureFile, Cell, Child, HERE, Peer, StartedChild, THERE, WIRE, WireEffect, eventually,
+    group_member, metrics, number, program, resident,
 };
 
 const LDS: &str = "opc.tcp://127.0.0.1:4840";
@@ -34,7 +34,7 @@ const SOON: Duration = Duration::from_secs(30);
 const MDNS: SocketAddrV4 = SocketAddrV4::new(Ipv4Addr::new(224, 0, 0, 251), 5353);
 
 fn lds(args: &[&str]) -> Child {
-    let lds = Started::new("ua-lds", &program("ua-lds"));
+    let lds = StartedChild::new("ua-lds", &program("ua-lds"));
     let child = lds.args(["--metrics", STATUS]).args(args).start();
     eventually("ua-lds answers", SOON, || metrics(STATUS));
     child
@@ -45,8 +45,8 @@ fn who(args: &[&str]) -> Child {
     who_started(args).start().ready(SOON)
 }
 
-fn who_started(args: &[&str]) -> Started {
-    Started::new("who", &program("examples/who")).args(args)
+fn who_started(args: &[&str]) -> StartedChild {
+    StartedChild::new("who", &program("examples/who")).args(args)
 }
 
 /// A listener that accepts connections but serves no client.
@@ -400,7 +400,7 @@ fn node_opcuas_discovery_server_and_ours_see_what_the_other_announces() {
     let Some(cell) = Cell::with(&[Peer::NodeOpcua]) else {
         return;
     };
-    let host = cell.host(Wire::default());
+    let host = cell.host(WireEffect::default());
     let _lds = lds(&["--interface", WIRE]);
     let mut node = cell
         .node_opcua_started("lds.js", &["4841"])
@@ -497,7 +497,7 @@ fn tshark_reads_the_announcement_and_the_goodbye() {
         "dns.srv.port",
         "dns.a",
     ];
-    let lines = cell.fields(&Capture::of(packets).to_port(MDNS.port()), &fields);
+    let lines = cell.fields(&CaptureFile::of(packets).to_port(MDNS.port()), &fields);
     let announcement = lines
         .iter()
         .find(|line| line.contains("path=/arm") && line.contains("4500"));

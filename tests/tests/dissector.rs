@@ -8,15 +8,15 @@ mod time;
 mod vectors;
 mod wrong;
 
-use system_tests::{Capture, Cell, Dissected, Peer};
-use vectors::Vector;
+use system_tests::{CaptureFile, Cell, Dissected, Peer};
+use vectors::DissectorVector;
 
 /// A chunk that is wrong only in its context: its bytes are equal to the bytes of a valid chunk.
 const LOOKS_RIGHT: &str = "asyncua_chunk";
 
 /// Returns tshark's view of a datagram.
 fn dissected(cell: &Cell, datagram: &[u8]) -> Dissected {
-    cell.dissect(&Capture::of([datagram]), &[]).remove(0)
+    cell.dissect(&CaptureFile::of([datagram]), &[]).remove(0)
 }
 
 #[test]
@@ -24,8 +24,8 @@ fn every_vector_is_shown_as_described() {
     let Some(cell) = Cell::with(&[Peer::Tshark]) else {
         return;
     };
-    let vectors = Vector::all();
-    let capture = Capture::of(vectors.iter().map(|vector| vector.datagram.clone()));
+    let vectors = DissectorVector::all();
+    let capture = CaptureFile::of(vectors.iter().map(|vector| vector.datagram.clone()));
     let shown = cell.dissect(&capture, &[]);
     let mut differences = Vec::new();
     let mut malformed = 0;

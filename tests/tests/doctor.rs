@@ -6,13 +6,15 @@ use std::time::Duration;
 
 use nix::sys::signal::Signal;
 use serde_json::{Value, json};
-use system_tests::{Cell, METRICS_ROS1, METRICS_ROS2, Peer, Started, eventually, metrics, program};
+use system_tests::{
+    Cell, METRICS_ROS1, METRICS_ROS2, Peer, StartedChild, eventually, metrics, program,
+};
 
 const SOON: Duration = Duration::from_secs(30);
 
 /// Runs `ua-space` with variables. Returns the exit code, and the last JSON object of the output.
 fn ua_space(words: &[&str], variables: &[(&str, &str)]) -> (i32, Value) {
-    let mut started = Started::new("ua-space", &program("ua-space")).args(words);
+    let mut started = StartedChild::new("ua-space", &program("ua-space")).args(words);
     for (name, value) in variables {
         started = started.env(name, value);
     }
@@ -119,7 +121,7 @@ fn doctor_finds_two_bridges_of_a_space_and_mappings_that_differ() {
     let _first = cell.bridge_ros2(&[first.to_str().unwrap()]);
     let healthy = codes(&[]);
     assert!(!healthy.contains(&"D030".to_owned()), "{healthy:?}");
-    let _second = Started::new("bridge-ros2", &program("bridge-ros2"))
+    let _second = StartedChild::new("bridge-ros2", &program("bridge-ros2"))
         .args([second.to_str().unwrap(), "--domain", "2"])
         .args(["--interface", "lo", "--metrics", METRICS_ROS1])
         .start();
@@ -190,7 +192,7 @@ fn doctor_finds_a_network_bridge_without_a_querier_and_mends_it() {
             "mount -t sysfs sysfs /sys && exec {} doctor --seconds 0.5 --json {more}",
             program("ua-space").display()
         );
-        let mut child = Started::new("doctor", Path::new("/usr/bin/unshare"))
+        let mut child = StartedChild::new("doctor", Path::new("/usr/bin/unshare"))
             .args(["--mount", "sh", "-c", &script])
             .start();
         child.wait_for_end(SOON);
@@ -239,7 +241,7 @@ fn doctor_packs_a_report_without_secrets() {
     let (code, found) = ua_space(&words, &[]);
     assert!(code <= 1 && found["findings"].is_array(), "{code} {found}");
     let listed = |words: &[&str]| {
-        let mut tar = Started::new("tar", Path::new("/bin/tar"))
+        let mut tar = StartedChild::new("tar", Path::new("/bin/tar"))
             .args(words)
             .args([&report])
             .start();

@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use mappings::{ExecutedBy, Mapping};
 use serde_json::Value;
-use system_tests::{Cell, Child, Peer, SERVER_ENDPOINT, Started, eventually, program};
+use system_tests::{Cell, Child, Peer, SERVER_ENDPOINT, StartedChild, eventually, program};
 
 const SOON: Duration = Duration::from_secs(40);
 const ALL: &[Peer] = &[Peer::Ros1, Peer::Python];
@@ -39,7 +39,7 @@ impl Ended {
 }
 
 fn ua_space(args: &[&str]) -> Ended {
-    let mut child = Started::new("ua-space", &program("ua-space"))
+    let mut child = StartedChild::new("ua-space", &program("ua-space"))
         .args(args)
         .env("ROS_MASTER_URI", "http://127.0.0.1:11311")
         .start();

@@ -4,8 +4,8 @@
 use std::time::{Duration, Instant};
 
 use system_tests::{
-    BareNode, Cable, Cell, Child, HERE, METRICS_ROS1, METRICS_ROS2, Started, Triple, UaSide, WIRE,
-    eventually, http_answer, http_get, metrics, program, string_frame,
+    BareNode, Cable, Cell, Child, HERE, METRICS_ROS1, METRICS_ROS2, StartedChild, TopicTriple,
+    UaSide, WIRE, eventually, http_answer, http_get, metrics, program, string_frame,
 };
 use tcpros::Core;
 use uadp::Scalar;
@@ -16,8 +16,8 @@ const START: Duration = Duration::from_secs(20);
 /// The interfaces are polled each second and values repeated each second; the rest is for a loaded
 /// machine.
 const SOON: Duration = Duration::from_secs(20);
-const OUT: (Triple, &str) = ((1, 2, 10), "/ua_1_2_10");
-const IN: (Triple, &str) = ((2, 2, 20), "ua_2_2_20");
+const OUT: (TopicTriple, &str) = ((1, 2, 10), "/ua_1_2_10");
+const IN: (TopicTriple, &str) = ((2, 2, 20), "ua_2_2_20");
 
 /// A ROS 1 graph on loopback with a published topic, for a bridge whose PubSub network is
 /// elsewhere.
@@ -43,7 +43,7 @@ impl Graph {
 
 /// Starts a bridge that announces this address to other nodes.
 fn bridge_ros1(address: &str, more: &[&str]) -> Child {
-    let bridge = Started::new("bridge-ros1", &program("bridge-ros1"))
+    let bridge = StartedChild::new("bridge-ros1", &program("bridge-ros1"))
         .env("ROS_MASTER_URI", "http://127.0.0.1:11311")
         .env("ROS_IP", address)
         .args(["--metrics", METRICS_ROS1])

@@ -5,8 +5,8 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 
 use knowledge::{
-    Answer, ComponentFacts, Knowledge, NodeName, ParameterFacts, QUESTIONS, Question, SkillFacts,
-    Source, SourceKind, TypeFacts, nodeset,
+    ComponentFacts, Knowledge, KnowledgeSource, NamedQuestion, NodeName, ParameterFacts, QUESTIONS,
+    QuestionAnswer, SkillFacts, SourceKind, TypeFacts, nodeset,
 };
 use serde_json::{Value, json};
 use system_tests::{Cell, Peer};
@@ -87,7 +87,7 @@ fn plant(manifests: &[(&str, String)], node_sets: &[String]) -> Knowledge {
         let (triples, _) = facts.triples();
         knowledge
             .replace(
-                &Source::new(SourceKind::Component, &facts.application_uri),
+                &KnowledgeSource::new(SourceKind::Component, &facts.application_uri),
                 &triples,
                 1,
             )
@@ -97,20 +97,20 @@ fn plant(manifests: &[(&str, String)], node_sets: &[String]) -> Knowledge {
         let module = mtp::Module::read(text).unwrap();
         let triples = module.triples(&format!("urn:ua-bridge:mtp:{name}"), &BTreeMap::new());
         knowledge
-            .replace(&Source::new(SourceKind::Mtp, name), &triples, 1)
+            .replace(&KnowledgeSource::new(SourceKind::Mtp, name), &triples, 1)
             .unwrap();
     }
     for text in node_sets {
         let read = nodeset::read(text).unwrap();
         knowledge
             .replace(
-                &Source::new(SourceKind::NodeSet, &read.namespace),
+                &KnowledgeSource::new(SourceKind::NodeSet, &read.namespace),
                 &read.triples,
                 1,
             )
             .unwrap();
     }
-    let units = Source::new(SourceKind::File, "units");
+    let units = KnowledgeSource::new(SourceKind::File, "units");
     knowledge
         .replace(&units, &knowledge::units::triples(), 1)
         .unwrap();
@@ -121,7 +121,7 @@ fn plant(manifests: &[(&str, String)], node_sets: &[String]) -> Knowledge {
     );
     knowledge
         .replace_turtle(
-            &Source::new(SourceKind::File, "capabilities.ttl"),
+            &KnowledgeSource::new(SourceKind::File, "capabilities.ttl"),
             &classes,
             1,
         )
@@ -130,7 +130,7 @@ fn plant(manifests: &[(&str, String)], node_sets: &[String]) -> Knowledge {
 }
 
 /// Returns sorted rows, with numbers as floats and lists sorted.
-fn comparable(question: Question, columns: &[String], rows: Vec<Vec<Value>>) -> Vec<String> {
+fn comparable(question: NamedQuestion, columns: &[String], rows: Vec<Vec<Value>>) -> Vec<String> {
     let lists: Vec<&str> = question.lists().collect();
     let value = |(column, value): (&String, Value)| {
         let parts = match &value {
@@ -161,7 +161,7 @@ fn comparable(question: Question, columns: &[String], rows: Vec<Vec<Value>>) -> 
     rows
 }
 
-fn of_store(question: Question, answer: Answer) -> Vec<String> {
+fn of_store(question: NamedQuestion, answer: QuestionAnswer) -> Vec<String> {
     let rows = answer.rows.into_iter().map(|mut row| {
         answer
             .columns
@@ -210,7 +210,7 @@ fn rdflib_answers_every_question_alike_about_data_of_other_makers() {
 /// Compares the answers of all queries, some of them with parameters; `device` is a type with
 /// subtypes.
 fn are_answered_alike(cell: &Cell, knowledge: &Knowledge, device: &str) {
-    let asked: Vec<(Question, Vec<(String, String)>)> = QUESTIONS
+    let asked: Vec<(NamedQuestion, Vec<(String, String)>)> = QUESTIONS
         .iter()
         .map(|question| (*question, Vec::new()))
         .chain(
@@ -232,7 +232,7 @@ fn are_answered_alike(cell: &Cell, knowledge: &Knowledge, device: &str) {
             ]
             .map(|(question, parameter, value)| {
                 (
-                    Question::of(question).unwrap(),
+                    NamedQuestion::of(question).unwrap(),
                     vec![(parameter.to_owned(), value.to_owned())],
                 )
             }),
@@ -302,9 +302,9 @@ fn owlrl_derives_the_same_statements_before_and_after_a_source_is_removed() {
     let stage = read_own("mtp/stage.aml");
     let knowledge = plant(&[("one", stage.clone()), ("two", stage)], &node_sets);
     knowledge.set_rules(true).unwrap();
-    let ontology = Source::new(SourceKind::File, "ontology.ttl");
+    let ontology = KnowledgeSource::new(SourceKind::File, "ontology.ttl");
     knowledge.replace_turtle(&ontology, ONTOLOGY, 1).unwrap();
-    let cell_file = Source::new(SourceKind::File, "cell.ttl");
+    let cell_file = KnowledgeSource::new(SourceKind::File, "cell.ttl");
     knowledge.replace_turtle(&cell_file, CELL, 1).unwrap();
     let all = are_derived_alike(&cell, &knowledge);
     assert!(all > 80, "{all} statements are derived");

@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 
 use system_tests::{Cell, METRICS_ROS1, Peer, UadpSocket, eventually, metrics};
 use uadp::{
-    ChunkBudget, Chunks, DataSetHeader, DataSetMessage, Extras, GroupHeader, NetworkHeader,
+    ChunkBudget, ChunkEncoder, DataSetHeader, DataSetMessage, Extras, GroupHeader, NetworkHeader,
     NetworkMessage, NetworkMessageEncoder, NetworkMessageType, PublisherId, Reassembler,
     ReassemblyLimits, Scalar, Timestamp, Variant, Whole,
 };
@@ -161,7 +161,7 @@ fn send_image(group: &UadpSocket, data: &[u8], sequence: u16) {
         trailer: 0,
     };
     let extras = Extras::default();
-    let mut chunks = Chunks::new(&header, &extras, whole, budget).unwrap();
+    let mut chunks = ChunkEncoder::new(&header, &extras, whole, budget).unwrap();
     let mut datagram = Vec::new();
     while let Some(written) = chunks.append(&mut datagram, &extras) {
         written.unwrap();

@@ -13,7 +13,7 @@ use std::time::Duration;
 
 use nix::sys::signal::Signal;
 use serde_json::Value;
-use system_tests::{Cell, Child, Peer, Started, eventually, http_get, program};
+use system_tests::{Cell, Child, Peer, StartedChild, eventually, http_get, program};
 
 const SOON: Duration = Duration::from_secs(30);
 const EXAMPLES: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../examples/plant");
@@ -30,7 +30,7 @@ fn start(cell: &Cell, name: &str, file: &str, changes: &[(&str, &str)], more: &[
         text.replace(from, to)
     });
     let path = cell.file(file, &text);
-    Started::new(file, &program(name))
+    StartedChild::new(file, &program(name))
         .args([path.to_str().unwrap(), "--interface", "lo", "--lds", "none"])
         .args(more)
         .start()
@@ -548,7 +548,7 @@ fn modules(cell: &Cell) -> Vec<Child> {
         let manifest = cell.folder().join(&file);
         fs::copy(Path::new(EXAMPLES).join(&file), &manifest).unwrap();
         let listen = format!("opc.tcp://127.0.0.1:{port}");
-        let pea = Started::new(module, &program("ua-space"))
+        let pea = StartedChild::new(module, &program("ua-space"))
             .args(["pea", manifest.to_str().unwrap(), "--listen", &listen])
             .args(["--acting", "0.05", "--executing", "0.5"])
             .start();
@@ -569,7 +569,7 @@ fn a_recipe_of_batchml_runs_as_a_job_order_of_an_opcua_client() {
     let text = "mes: mes\napplication_uri: urn:example:mes\nnamespace: 50\n\
                 endpoint: opc.tcp://127.0.0.1:48401\nsecurity: [None]\nrecipes: [batch.xml]\n";
     let path = cell.file("mes.yaml", text);
-    let _mes = Started::new("mes", &program("ua-mes"))
+    let _mes = StartedChild::new("mes", &program("ua-mes"))
         .args([path.to_str().unwrap(), "--interface", "lo", "--lds", "none"])
         .start();
     let _modules = modules(&cell);

@@ -5,12 +5,12 @@ use std::collections::BTreeMap;
 use std::process::{Command, Output};
 use std::time::Duration;
 
-use knowledge::{Knowledge, Question, Source, SourceKind};
+use knowledge::{Knowledge, KnowledgeSource, NamedQuestion, SourceKind};
 use mtp::Module;
 use mtp::state::{Command as ServiceCommand, State};
 use nix::sys::signal::Signal;
 use serde_json::{Value, json};
-use system_tests::{Cell, Child, Peer, Started, eventually, http_get, program};
+use system_tests::{Cell, Child, Peer, StartedChild, eventually, http_get, program};
 use test_data::{foreign, own};
 
 const SOON: Duration = Duration::from_secs(30);
@@ -119,7 +119,7 @@ fn are_answered(cell: &Cell, paths: &[String]) {
     for (number, path) in paths.iter().enumerate() {
         let module = Module::from_bytes(&std::fs::read(path).unwrap()).unwrap();
         let triples = module.triples(&format!("urn:m:{number}"), &BTreeMap::new());
-        let source = Source::new(SourceKind::Mtp, &number.to_string());
+        let source = KnowledgeSource::new(SourceKind::Mtp, &number.to_string());
         knowledge.replace(&source, &triples, 1).unwrap();
         services_of.insert(number, module.services);
     }
@@ -238,7 +238,7 @@ fn variables_are(knowledge: &Knowledge, module: &str, wanted: &Value) {
 
 /// Checks state-of, skills-for, transitions-now, parameters-of and outputs-of for the skills of a
 /// service.
-fn service_is(knowledge: &Knowledge, service_iri: &str, known: &mtp::Service, wanted: &Value) {
+fn service_is(knowledge: &Knowledge, service_iri: &str, known: &mtp::MtpService, wanted: &Value) {
     let capability = format!("{service_iri}/capability");
     let skills = rows(knowledge, "skills-for", &[("capability", &capability)]);
     let procedures = wanted["procedures"].as_array().unwrap();
@@ -342,7 +342,7 @@ fn verbs_show_manifests_and_report_what_is_left_out() {
         "urn:example:column",
     ]));
     let knowledge = Knowledge::new().unwrap();
-    let source = Source::new(SourceKind::File, "column.nt");
+    let source = KnowledgeSource::new(SourceKind::File, "column.nt");
     knowledge.replace_turtle(&source, &rdf, 1).unwrap();
     assert_eq!(rows(&knowledge, "services-of", &[]).len(), 3);
 
@@ -366,7 +366,7 @@ fn verbs_show_manifests_and_report_what_is_left_out() {
 /// Starts the simulated module of a manifest of the tests.
 fn simulated(manifest: &str, more: &[&str]) -> Child {
     let path = own(&format!("mtp/{manifest}")).display().to_string();
-    let mut child = Started::new("pea", &program("ua-space"))
+    let mut child = StartedChild::new("pea", &program("ua-space"))
         .args(["pea", &path, "--listen", "opc.tcp://127.0.0.1:4840"])
         .args(["--acting", "0.05", "--executing", "0.2"])
         .args(more)
@@ -383,7 +383,7 @@ fn component(cell: &Cell, manifest: &str, capabilities: &str) -> Child {
          device:\n  mtp:\n    manifest: {path}\n    capabilities: {capabilities}\n"
     );
     let path = cell.file("module.yaml", &text).display().to_string();
-    Started::new("component", &program("ua-component"))
+    StartedChild::new("component", &program("ua-component"))
         .args([&path, "--interface", "lo", "--lds", "none"])
         .start()
 }
@@ -430,7 +430,7 @@ fn a_manifest_in_a_folder_is_a_component_until_it_is_removed() {
     let _module = simulated("stage.aml", &[]);
     let folder = cell.folder().join("modules");
     std::fs::create_dir(&folder).unwrap();
-    let supervisor = Started::new("modules", &program("ua-component"))
+    let supervisor = StartedChild::new("modules", &program("ua-component"))
         .args(["modules", folder.to_str().unwrap(), "--first", "51", "--"])
         .args(["--interface", "lo", "--lds", "none", "--pki"])
         .args([cell.folder().join("pki")])
@@ -490,7 +490,7 @@ fn a_service_is_run_once_by_a_command_that_ctrl_c_stops() {
         let refused = run(wrong);
         assert_eq!(refused.status.code(), Some(64), "{refused:?}");
     }
-    let mut waltz = Started::new("waltz", &program("ua-space"))
+    let mut waltz = StartedChild::new("waltz", &program("ua-space"))
         .args(["mtp", "run", &stage, "Duet", "--procedure", "Waltz"])
         .start();
     waltz.wait_for_line("Execute", SOON);
@@ -593,7 +593,7 @@ fn a_service_of_a_module_is_a_step_of_a_process_and_its_state_is_in_the_graph() 
          processes:\n  - process: urn:example:process:show\n    wait: 60 s\n    steps:\n      - {{step: dance, needs: {{skill: {dance}}}}}\n"
     );
     let path = cell.file("mes.yaml", &text).display().to_string();
-    let _mes = Started::new("mes", &program("ua-mes"))
+    let _mes = StartedChild::new("mes", &program("ua-mes"))
         .args([&path, "--interface", "lo", "--lds", "none"])
         .args(["--run", "urn:example:process:show"])
         .start();
@@ -667,6 +667,9 @@ fn nine_questions_have_names() {
         "access-of",
         "modules-with",
     ] {
-        assert!(!Question::of(name).unwrap().about().is_empty(), "{name}");
+        assert!(
+            !NamedQuestion::of(name).unwrap().about().is_empty(),
+            "{name}"
+        );
     }
 }

@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use nix::sys::signal::Signal;
 use serde_json::{Value, json};
-use system_tests::{Cell, Child, Peer, Started, program};
+use system_tests::{Cell, Child, Peer, StartedChild, program};
 
 const SOON: Duration = Duration::from_secs(30);
 const MAPPING: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../mappings/moveit.yaml");
@@ -17,7 +17,7 @@ const DEFINITIONS: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/data/moveit");
 
 fn ask(words: &[&str]) -> Child {
     let more = ["--interface", "lo", "--wait", "30", "--json"];
-    Started::new("ua-space", &program("ua-space"))
+    StartedChild::new("ua-space", &program("ua-space"))
         .args([&["call"], words, &more].concat())
         .ends_on(Signal::SIGINT)
         .start()
@@ -45,7 +45,7 @@ fn an_arm_with_moveit_is_moved_by_skills() {
     let mut group = cell.cyclone("calls/ros2_moveit.py", &["/move_action"]);
     let bridge = cell.bridge_ros2_alone(&[MAPPING]);
     let _bridge = bridge.env("AMENT_PREFIX_PATH", DEFINITIONS).start();
-    let _component = Started::new("ua-component", &program("ua-component"))
+    let _component = StartedChild::new("ua-component", &program("ua-component"))
         .args([ARM, "--interface", "lo", "--lds", "none"])
         .start();
     let reset = |skill: &str| {

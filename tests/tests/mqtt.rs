@@ -14,7 +14,7 @@ use system_tests::{
     eventually, holds_for, http_answer, metrics, program,
 };
 use uadp::NetworkMessage;
-use uadp::discovery::{Announced, Announcement, ConnectionState};
+use uadp::discovery::{AnnouncedContent, Announcement, ConnectionState};
 
 use commanded::{COMMAND, Commanded};
 
@@ -231,7 +231,8 @@ fn status_of_ros1() -> Option<ConnectionState> {
         .collect();
     let bytes = bytes?;
     let message = NetworkMessage::decode(&bytes).ok()?;
-    let Announced::ApplicationStatus { state, .. } = Announcement::decode(&message).ok()?.announced
+    let AnnouncedContent::ApplicationStatus { state, .. } =
+        Announcement::decode(&message).ok()?.announced
     else {
         return None;
     };

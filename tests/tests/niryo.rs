@@ -3,12 +3,13 @@
 
 use std::{path::Path, time::Duration};
 
-use messages::{Dialect, Literal, NoFields, Plan, Registry, Selection, Wire};
+use messages::{Dialect, Literal, MessagePlan, NoFields, Selection, TypeRegistry, Wire};
 use serde_json::{Value, json};
 use system_tests::{
-    Cell, Child, MASTER, METRICS_ROS1, Peer, Started, UaSide, eventually, metrics, number, program,
+    Cell, Child, MASTER, METRICS_ROS1, Peer, StartedChild, UaSide, eventually, metrics, number,
+    program,
 };
-use tcpros::actionlib::{self, ActionClient, ActionClientOptions, ClientType};
+use tcpros::actionlib::{self, ActionlibClient, ActionlibClientOptions, ClientType};
 use tcpros::{Node, NodeOptions, TopicType};
 use uadp::{Scalar, Variant};
 
@@ -36,22 +37,22 @@ fn calls(robot: &Child, service: &str) -> Vec<Value> {
         .collect()
 }
 
-pub(crate) struct Line {
+pub(crate) struct NiryoLine {
     pub(crate) side: UaSide,
     pub(crate) robot: Child,
     bridge: Child,
     _master: Child,
 }
 
-pub(crate) fn start(cell: &Cell) -> Line {
+pub(crate) fn start(cell: &Cell) -> NiryoLine {
     start_with(cell, MAPPING)
 }
 
-fn start_with(cell: &Cell, mapping: &str) -> Line {
+fn start_with(cell: &Cell, mapping: &str) -> NiryoLine {
     let master = cell.roscore();
     let side = UaSide::join();
     let robot = cell.rospy("niryo.py", &[&definitions().unwrap()]);
-    Line {
+    NiryoLine {
         side,
         robot,
         bridge: bridge(cell, mapping),
@@ -240,11 +241,11 @@ fn a_niryos_actions_are_there_for_a_client_that_knows_their_definitions() {
         options.advertise_as("127.0.0.1");
         let node = Node::start(options).unwrap();
         let (goal_type, goal) = move_goal("cmd.cmd_type", "LINEAR_POSE");
-        let client = ActionClient::new(
+        let client = ActionlibClient::new(
             &node,
             "/niryo_robot_arm_commander/robot_action",
             ClientType::of_goal(goal_type),
-            ActionClientOptions::default(),
+            ActionlibClientOptions::default(),
         )
         .unwrap();
         client.wait_for_server(SOON).await.unwrap();
@@ -254,7 +255,7 @@ fn a_niryos_actions_are_there_for_a_client_that_knows_their_definitions() {
         outcome
     });
     let result = outcome.unwrap();
-    assert_eq!(result.status, actionlib::Status::Succeeded);
+    assert_eq!(result.status, actionlib::ActionlibStatus::Succeeded);
     // int32 status, 1 of niryo_robot_msgs/CommandStatus, before its text.
     assert_eq!(result.body[..4], 1i32.to_le_bytes());
     let told = robot.json_lines();
@@ -273,12 +274,12 @@ fn the_arm_its_gripper_and_its_conveyor_are_run_by_skills() {
         env!("CARGO_MANIFEST_DIR"),
         "/../examples/plant/niryo-ned.yaml"
     );
-    let _component = Started::new("ua-component", &program("ua-component"))
+    let _component = StartedChild::new("ua-component", &program("ua-component"))
         .args([example, "--interface", "lo", "--lds", "none"])
         .start();
     let call = |words: &[&str]| {
         let words = [&["call"], words, &["--interface", "lo", "--wait", "30"]].concat();
-        let mut asking = Started::new("ua-space", &program("ua-space"))
+        let mut asking = StartedChild::new("ua-space", &program("ua-space"))
             .args(words)
             .start();
         let code = asking.wait_for_end(SOON).code();
@@ -312,7 +313,7 @@ fn the_arm_its_gripper_and_its_conveyor_are_run_by_skills() {
 
 /// Returns the type of RobotMove's goal topic, and a goal with a single field set.
 fn move_goal(path: &str, value: &str) -> (TopicType, Vec<u8>) {
-    let mut registry = Registry::bundle(Dialect::Ros1);
+    let mut registry = TypeRegistry::bundle(Dialect::Ros1);
     let definitions = definitions().unwrap();
     for (folder, name, kind) in [
         ("niryo_robot_arm_commander", "RobotMove", "action"),
@@ -336,7 +337,7 @@ fn move_goal(path: &str, value: &str) -> (TopicType, Vec<u8>) {
         fields: Vec::new(),
         rest,
     };
-    let plan = Plan::compile(action.goal(), &template, Wire::Ros1).unwrap();
+    let plan = MessagePlan::compile(action.goal(), &template, Wire::Ros1).unwrap();
     let mut goal = Vec::new();
     plan.write(&mut NoFields, &mut goal).unwrap();
     let goal_type = TopicType {

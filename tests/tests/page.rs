@@ -8,8 +8,8 @@ use std::time::Duration;
 
 use serde_json::{Value, json};
 use system_tests::{
-    Browser, Cell, Child, METRICS_SERVER, Peer, SERVER_ENDPOINT, Started, UadpSocket, eventually,
-    holds_for, http_get, program, resident,
+    Browser, Cell, Child, METRICS_SERVER, Peer, SERVER_ENDPOINT, StartedChild, UadpSocket,
+    eventually, holds_for, http_get, program, resident,
 };
 use uadp::{DataSetHeader, GroupHeader, NetworkHeader, NetworkMessageEncoder, PublisherId, Scalar};
 
@@ -41,7 +41,7 @@ fn datagram_of(id: u16, value: Scalar<'_>) -> Vec<u8> {
 }
 
 fn page_of_space(cell: &Cell, args: &[&str]) -> Child {
-    let page = Started::new("ua-space", &program("ua-space"))
+    let page = StartedChild::new("ua-space", &program("ua-space"))
         .args([&["page", "--interface", "lo"], args].concat())
         .in_folder(cell.folder())
         .start();
@@ -112,7 +112,7 @@ fn events_are_shown_live_and_from_a_recording() {
     let mut page = page_of_space(&cell, &[]);
     let group = UadpSocket::join();
     // The probes of the page are messages too.
-    let mut recording = Started::new("ua-space", &program("ua-space"))
+    let mut recording = StartedChild::new("ua-space", &program("ua-space"))
         .args(["record", name, "--count", "40", "--interface", "lo"])
         .start();
     let mut value = false;
@@ -415,7 +415,7 @@ fn an_operator_starts_a_skill_and_others_are_refused() {
     let server = cell.ua_server(&[]);
     let yaml =
         Path::new(env!("CARGO_MANIFEST_DIR")).join("../examples/plant/parallel-gripper.yaml");
-    let _component = Started::new("ua-component", &program("ua-component"))
+    let _component = StartedChild::new("ua-component", &program("ua-component"))
         .args([yaml.to_str().unwrap(), "--interface", "lo", "--lds", "none"])
         .args(["--pki".into(), cell.folder().join("component-pki")])
         .start();
@@ -482,7 +482,7 @@ fn the_mes_is_queried_on_the_page_and_an_engineer_loads_a_file() {
     let text = "mes: mes\napplication_uri: urn:example:mes\nnamespace: 50\n\
                 endpoint: opc.tcp://127.0.0.1:48401\nsecurity: [None]\n";
     let of_mes = cell.folder().join("mes-pki");
-    let _mes = Started::new("ua-mes", &program("ua-mes"))
+    let _mes = StartedChild::new("ua-mes", &program("ua-mes"))
         .args([cell.file("mes.yaml", text).to_str().unwrap(), "--pki"])
         .args([
             of_mes.to_str().unwrap(),

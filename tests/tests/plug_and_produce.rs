@@ -4,14 +4,14 @@
 use std::time::Duration;
 
 use serde_json::Value;
-use system_tests::{Cell, Started, program};
+use system_tests::{Cell, StartedChild, program};
 
 const MANIFEST: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/data/mtp/stage.aml");
 
 #[test]
 fn components_are_found_run_lost_and_replaced_within_the_published_times() {
     let Some(_cell) = Cell::with(&[]) else { return };
-    let mut demo = Started::new("demo", &program("demo"))
+    let mut demo = StartedChild::new("demo", &program("demo"))
         .args(["--scenario", "plug-and-produce", "--speed", "8", "--json"])
         .args(["--manifest", MANIFEST])
         .start();
@@ -62,7 +62,7 @@ fn are_in_order(seen: &Value, steps: &[&str]) -> bool {
 }
 
 fn tool_change(more: &[&str]) -> Value {
-    let mut demo = Started::new("demo", &program("demo"))
+    let mut demo = StartedChild::new("demo", &program("demo"))
         .args(["--scenario", "tool-change", "--speed", "16", "--json"])
         .args(more)
         .start();
@@ -145,7 +145,7 @@ fn a_robot_changes_its_tools_and_survives_the_loss_of_one_wherever_they_hang() {
 
 /// Plays a story of processes to its end, and returns its report.
 fn told(scenario: &str, speed: &str) -> Value {
-    let mut demo = Started::new("demo", &program("demo"))
+    let mut demo = StartedChild::new("demo", &program("demo"))
         .args(["--scenario", scenario, "--speed", speed, "--json"])
         .start();
     let ended = demo.wait_for_end(Duration::from_secs(170));

@@ -6,7 +6,9 @@ use std::process::Command;
 use std::time::{Duration, Instant};
 
 use serde_json::{Value, json};
-use system_tests::{Cell, Child, MASTER, Peer, Started, UaSide, eventually, holds_for, program};
+use system_tests::{
+    Cell, Child, MASTER, Peer, StartedChild, UaSide, eventually, holds_for, program,
+};
 use uadp::Scalar;
 
 const SOON: Duration = Duration::from_secs(30);
@@ -14,8 +16,8 @@ const JOINTS: &str = "sensor_msgs/JointState";
 const TWIST: &str = "geometry_msgs/Twist";
 
 /// Returns `ua-space` in the network of the cell, not started yet.
-fn ua_space(words: &[&str]) -> Started {
-    Started::new("ua-space", &program("ua-space"))
+fn ua_space(words: &[&str]) -> StartedChild {
+    StartedChild::new("ua-space", &program("ua-space"))
         .args(words)
         .args(["--interface", "lo"])
 }
@@ -230,7 +232,7 @@ fn a_full_disk_and_a_signal_end_a_recording_with_whole_messages() {
 
 /// Runs a verb without a network to its end.
 fn ended_alone(words: &[&str]) -> (i32, Child) {
-    let ua_space = Started::new("ua-space", &program("ua-space")).args(words);
+    let ua_space = StartedChild::new("ua-space", &program("ua-space")).args(words);
     let mut child = ua_space.start();
     let code = child.wait_for_end(SOON).code().unwrap();
     (code, child)

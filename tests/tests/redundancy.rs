@@ -11,8 +11,8 @@ use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 use nix::sys::signal::Signal;
 use serde_json::Value;
 use system_tests::{
-    Cell, Child, GroupNumbers, METRICS_ROS1, METRICS_ROS2, Peer, Started, UadpSocket, eventually,
-    metrics, program,
+    Cell, Child, GroupNumbers, METRICS_ROS1, METRICS_ROS2, Peer, StartedChild, UadpSocket,
+    eventually, metrics, program,
 };
 use uadp::{
     DataSetHeader, GroupHeader, NetworkHeader, NetworkMessageEncoder, PublisherId, Scalar,
@@ -37,7 +37,7 @@ struct Pair {
 }
 
 impl Pair {
-    fn start(bridges: [Started; 2], metrics: [&'static str; 2]) -> Self {
+    fn start(bridges: [StartedChild; 2], metrics: [&'static str; 2]) -> Self {
         let [first, second] = bridges;
         let pair = Self {
             bridges: [Some(first.start()), Some(second.start())],
@@ -365,7 +365,7 @@ fn a_redundant_bridge_takes_calls_and_refuses_values_of_services() {
                   std_srvs/SetBool, field: data}}\n";
     for (name, text, code) in [("calls", calls, 0), ("values", values, 78)] {
         let mapping = cell.file(&format!("{name}.yaml"), &format!("{head}{text}"));
-        let mut checked = Started::new("bridge-ros1", &program("bridge-ros1"))
+        let mut checked = StartedChild::new("bridge-ros1", &program("bridge-ros1"))
             .args(["--check", "--rank", "1"])
             .args([&mapping])
             .start();
@@ -382,7 +382,7 @@ fn a_bridge_without_a_rank_goes_on_after_a_request_to_switch_over() {
         return;
     };
     let mapping = cell.file("plain.yaml", "spaces: [{id: 1}]\n");
-    let mut bridge = Started::new("bridge-ros1", &program("bridge-ros1"))
+    let mut bridge = StartedChild::new("bridge-ros1", &program("bridge-ros1"))
         .args([&mapping])
         .start();
     bridge.wait_for_line("bridge-ros1 starts", SOON);

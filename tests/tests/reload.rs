@@ -61,10 +61,13 @@ fn about(key: &str) -> Value {
 
 /// The received values: for each route, sequence numbers and sent numbers. Repeated events are
 /// recorded once.
-type Heard = BTreeMap<u16, Vec<(u16, u16)>>;
+type ReceivedNumbers = BTreeMap<u16, Vec<(u16, u16)>>;
 
 /// Receives from the group on a separate thread until `ended`.
-fn listen(heard: &Arc<Mutex<Heard>>, ended: &Arc<AtomicBool>) -> std::thread::JoinHandle<()> {
+fn listen(
+    heard: &Arc<Mutex<ReceivedNumbers>>,
+    ended: &Arc<AtomicBool>,
+) -> std::thread::JoinHandle<()> {
     let socket = UadpSocket::join();
     let (heard, ended) = (Arc::clone(heard), Arc::clone(ended));
     std::thread::spawn(move || {
@@ -156,7 +159,7 @@ fn of_500_routes_at_50_hz_only_the_edited_one_notices_the_edit() {
     let cool = Instant::now() + Duration::from_millis(500);
     send(&mut streams, &mut said, || Instant::now() > cool);
     eventually("the last are heard", SOON, || {
-        let heard: std::sync::MutexGuard<'_, Heard> = heard.lock().unwrap();
+        let heard: std::sync::MutexGuard<'_, ReceivedNumbers> = heard.lock().unwrap();
         let is_last = |of: &Vec<(u16, u16)>| of.last().is_some_and(|(_, last)| *last == said);
         heard.values().all(is_last).then_some(())
     });
@@ -409,7 +412,7 @@ fn bridge_ros2_leaves_the_routes_alone_that_an_edit_does_not_name() {
         )
     };
     let heard_of = |route: u16| {
-        let heard: std::sync::MutexGuard<'_, Heard> = heard.lock().unwrap();
+        let heard: std::sync::MutexGuard<'_, ReceivedNumbers> = heard.lock().unwrap();
         heard.get(&route).map_or(0, Vec::len)
     };
     let _sends = [sends("/r1"), sends("/r2"), sends("/moved")];
@@ -491,7 +494,7 @@ fn of_500_routes_from_dds_at_50_hz_only_the_edited_one_notices_the_edit() {
 
     let sending = std::thread::spawn(move || (paced(&mut sends, TICKS), sends));
     let heard_of = |route: u16| {
-        let heard: std::sync::MutexGuard<'_, Heard> = heard.lock().unwrap();
+        let heard: std::sync::MutexGuard<'_, ReceivedNumbers> = heard.lock().unwrap();
         heard.get(&route).map_or(0, Vec::len)
     };
     eventually("all are heard", REPAIRED, || {
@@ -508,7 +511,7 @@ fn of_500_routes_from_dds_at_50_hz_only_the_edited_one_notices_the_edit() {
     let ((first, _), mut sends) = sending.join().unwrap();
     let last = first + TICKS - 1;
     eventually("the last are heard", REPAIRED, || {
-        let heard: std::sync::MutexGuard<'_, Heard> = heard.lock().unwrap();
+        let heard: std::sync::MutexGuard<'_, ReceivedNumbers> = heard.lock().unwrap();
         let is_last = |(route, of): (&u16, &Vec<(u16, u16)>)| {
             let last = if *route == 1 { other } else { last };
             of.last().is_some_and(|(_, said)| *said == last)

@@ -8,9 +8,9 @@ use nix::sys::signal::Signal;
 use serde_json::{Value, json};
 use system_tests::{Cell, Child, MASTER, Peer, eventually};
 use tcpros::actionlib::{
-    ActionClient, ActionClientOptions, ActionServer, ActionServerOptions, ActionType, CancelSent,
-    ClientType, CommState, GoalEvent, GoalHandle, LostReason, ServerEvent, ServerGoal,
-    SimpleActionServer, Status,
+    ActionlibClient, ActionlibClientOptions, ActionlibGoal, ActionlibGoalEvent, ActionlibServer,
+    ActionlibServerEvent, ActionlibServerGoal, ActionlibServerOptions, ActionlibStatus,
+    ActionlibTypes, CancelSent, ClientType, CommState, GoalLoss, SimpleActionServer,
 };
 use tcpros::{Node, NodeOptions, TopicType};
 use tokio::runtime::{Builder, Runtime};
@@ -27,8 +27,8 @@ fn topic_type(part: &str, md5sum: &str) -> TopicType {
     }
 }
 
-fn action() -> ActionType {
-    ActionType {
+fn action() -> ActionlibTypes {
+    ActionlibTypes {
         goal: topic_type("Goal", "348369c5b403676156094e8c159720bf"),
         result: topic_type("Result", "3d669e3a63aa986c667ea7b0f46ce85e"),
         feedback: topic_type("Feedback", "6d3d0bf7fb3dda24779c010a9f3eb7cb"),
@@ -52,14 +52,14 @@ fn node(name: &str) -> Node {
     Node::start(options).unwrap()
 }
 
-fn serve(node: &Node) -> ActionServer {
-    let options = ActionServerOptions::new(Bytes::from_static(&[0; 4]));
-    ActionServer::new(node, "count", action(), options).unwrap()
+fn serve(node: &Node) -> ActionlibServer {
+    let options = ActionlibServerOptions::new(Bytes::from_static(&[0; 4]));
+    ActionlibServer::new(node, "count", action(), options).unwrap()
 }
 
-fn client(node: &Node) -> ActionClient {
-    let options = ActionClientOptions::default();
-    ActionClient::new(node, "count", action(), options).unwrap()
+fn client(node: &Node) -> ActionlibClient {
+    let options = ActionlibClientOptions::default();
+    ActionlibClient::new(node, "count", action(), options).unwrap()
 }
 
 fn number(body: &[u8]) -> i32 {
@@ -67,7 +67,7 @@ fn number(body: &[u8]) -> i32 {
 }
 
 /// Executes a goal as the rospy server does.
-async fn work(goal: ServerGoal) {
+async fn work(goal: ActionlibServerGoal) {
     let n = number(goal.body());
     if n == -2 {
         goal.reject("no").unwrap();
@@ -86,9 +86,9 @@ async fn work(goal: ServerGoal) {
     }
 }
 
-async fn serve_many(mut server: ActionServer) {
+async fn serve_many(mut server: ActionlibServer) {
     loop {
-        if let ServerEvent::Goal(goal) = server.recv().await {
+        if let ActionlibServerEvent::Goal(goal) = server.recv().await {
             tokio::spawn(work(goal));
         }
     }
@@ -191,28 +191,28 @@ fn a_simple_actionlib_client_preempts_its_goal_with_the_next_one() {
     );
 }
 
-fn send(client: &ActionClient, goal: i32) -> GoalHandle {
+fn send(client: &ActionlibClient, goal: i32) -> ActionlibGoal {
     client.send_goal(&goal.to_le_bytes())
 }
 
 /// Returns the result of a goal: status, text and number.
-async fn outcome(handle: &mut GoalHandle) -> (Status, String, i32) {
+async fn outcome(handle: &mut ActionlibGoal) -> (ActionlibStatus, String, i32) {
     let result = timeout(SOON, handle.outcome()).await.unwrap().unwrap();
     (result.status, result.text, number(&result.body))
 }
 
-async fn state(handle: &mut GoalHandle, wanted: CommState) {
+async fn state(handle: &mut ActionlibGoal, wanted: CommState) {
     timeout(SOON, async {
-        while !matches!(handle.recv().await.unwrap(), GoalEvent::State(state) if state == wanted) {}
+        while !matches!(handle.recv().await.unwrap(), ActionlibGoalEvent::State(state) if state == wanted) {}
     })
     .await
     .unwrap();
 }
 
-async fn progress(handle: &mut GoalHandle) -> i32 {
+async fn progress(handle: &mut ActionlibGoal) -> i32 {
     let feedback = timeout(SOON, async {
         loop {
-            if let GoalEvent::Feedback(feedback) = handle.recv().await.unwrap() {
+            if let ActionlibGoalEvent::Feedback(feedback) = handle.recv().await.unwrap() {
                 return feedback;
             }
         }
@@ -220,14 +220,14 @@ async fn progress(handle: &mut GoalHandle) -> i32 {
     number(&feedback.await.unwrap().body)
 }
 
-async fn every_kind_of_end(client: &ActionClient) {
+async fn every_kind_of_end(client: &ActionlibClient) {
     let done = outcome(&mut send(client, 5)).await;
-    assert_eq!(done, (Status::Succeeded, "done".to_owned(), 10));
+    assert_eq!(done, (ActionlibStatus::Succeeded, "done".to_owned(), 10));
     let aborted = outcome(&mut send(client, -1)).await;
-    assert_eq!(aborted, (Status::Aborted, "failed".to_owned(), 3));
+    assert_eq!(aborted, (ActionlibStatus::Aborted, "failed".to_owned(), 3));
     let rejected = outcome(&mut send(client, -2)).await;
-    assert_eq!(rejected, (Status::Rejected, "no".to_owned(), 2));
-    let stopped = (Status::Preempted, "stopped".to_owned(), 7);
+    assert_eq!(rejected, (ActionlibStatus::Rejected, "no".to_owned(), 2));
+    let stopped = (ActionlibStatus::Preempted, "stopped".to_owned(), 7);
     let mut held = [100, 101, 102, 103].map(|goal| send(client, goal));
     for (handle, goal) in held.iter_mut().zip(100..) {
         assert_eq!(progress(handle).await, goal + 1);
@@ -287,7 +287,7 @@ fn a_goal_under_an_id_of_our_choice_is_known_to_its_server_and_cancelled_by_it()
         assert_eq!(open, ["a1", "b2"]);
         assert_eq!(client.cancel_goal("c3"), CancelSent::NotFollowed);
         assert_eq!(client.cancel_goal("b2"), CancelSent::Asked);
-        let stopped = (Status::Preempted, "stopped".to_owned(), 7);
+        let stopped = (ActionlibStatus::Preempted, "stopped".to_owned(), 7);
         assert_eq!(outcome(&mut second).await, stopped);
         assert_eq!(client.cancel_goal("b2"), CancelSent::Ended);
         assert_eq!(client.open_goals(), ["a1"]);
@@ -311,7 +311,8 @@ fn a_simple_actionlib_server_gives_our_first_goal_up_for_the_second() {
     let _server = cell.rospy("ros1_action_server.py", &["count", "--simple"]);
     let here = node("here");
     let open = ClientType::of_goal(action().goal);
-    let client = ActionClient::new(&here, "count", open, ActionClientOptions::default()).unwrap();
+    let client =
+        ActionlibClient::new(&here, "count", open, ActionlibClientOptions::default()).unwrap();
     runtime.block_on(async {
         client.wait_for_server(START).await.unwrap();
         let mut first = send(&client, 100);
@@ -319,12 +320,12 @@ fn a_simple_actionlib_server_gives_our_first_goal_up_for_the_second() {
         let mut second = send(&client, 4);
         assert_eq!(
             outcome(&mut first).await,
-            (Status::Preempted, "stopped".to_owned(), 7)
+            (ActionlibStatus::Preempted, "stopped".to_owned(), 7)
         );
         let result = second.outcome().await.unwrap();
         assert_eq!(
             (result.status, number(&result.body)),
-            (Status::Succeeded, 8)
+            (ActionlibStatus::Succeeded, 8)
         );
         assert_eq!(
             result.peer.header.type_name(),
@@ -350,7 +351,10 @@ fn a_client_of_ours_and_one_of_actionlib_at_one_server_get_their_own_results() {
     for n in 0..10 {
         other.tell(&format!("send {n}"));
         let ours = runtime.block_on(outcome(&mut send(&client, 50 + n)));
-        assert_eq!(ours, (Status::Succeeded, "done".to_owned(), 2 * (50 + n)));
+        assert_eq!(
+            ours,
+            (ActionlibStatus::Succeeded, "done".to_owned(), 2 * (50 + n))
+        );
     }
     for n in 0..10 {
         assert_eq!(end(&mut other, n), json!(["SUCCEEDED", "done", 2 * n]));
@@ -369,11 +373,11 @@ fn a_goal_whose_server_is_killed_or_hangs_is_lost_in_time_and_the_next_goal_work
     let here = node("here");
     let client = client(&here);
     let name = "/rospy_action_server".to_owned();
-    let silent = LostReason::Silent {
+    let silent = GoalLoss::Silent {
         server: name.clone(),
         silence: Duration::from_secs(5),
     };
-    let gone = LostReason::Disconnected { server: name };
+    let gone = GoalLoss::Disconnected { server: name };
     for (signal, reason) in [(Signal::SIGKILL, gone), (Signal::SIGSTOP, silent)] {
         let server = cell.rospy("ros1_action_server.py", &["count"]);
         runtime.block_on(client.wait_for_server(START)).unwrap();

@@ -8,7 +8,7 @@ use serde_json::{Value, json};
 use system_tests::{Cell, Child, MASTER, Peer, UadpSocket, eventually, xml_rpc};
 use tcpros::{
     Inbox, InboxEvent, MasterState, Node, NodeOptions, ParamSubscription, ParamValue,
-    PublisherOptions, RosTime, SubscriberOptions, TopicType, Wanted,
+    PublisherOptions, RequestedType, Ros1Time, SubscriberOptions, TopicType,
 };
 use tokio::runtime::Runtime;
 
@@ -282,7 +282,7 @@ fn time_is_that_of_a_rospy_clock_while_use_sim_time_is_true() {
     let mut time_is = |secs: u32, nsecs: u32| {
         tell(&mut rospy, &json!({"clock": [secs, nsecs]}));
         eventually("the time", SOON, || {
-            (ours.node().now() == RosTime { secs, nsecs }).then_some(())
+            (ours.node().now() == Ros1Time { secs, nsecs }).then_some(())
         });
     };
     time_is(1000, 5);
@@ -300,7 +300,7 @@ fn time_is_that_of_a_rospy_clock_while_use_sim_time_is_true() {
     simulated(true);
     let late = Ours::start(&["__name:=late"]);
     assert!(late.node().clock().is_simulated());
-    assert_eq!(late.node().now(), RosTime::default());
+    assert_eq!(late.node().now(), Ros1Time::default());
     rosparam(&cell, &["set", "/use_sim_time", "false"]);
     simulated(false);
 }
@@ -347,7 +347,7 @@ fn a_rospy_node_of_our_name_has_us_leave_without_losing_anything_of_its_own() {
         let options = SubscriberOptions::default();
         listener
             .node()
-            .subscribe("/t", Wanted::default(), options, (), &inbox)
+            .subscribe("/t", RequestedType::default(), options, (), &inbox)
             .unwrap()
     });
     assert_eq!(
@@ -456,7 +456,7 @@ fn topics_go_to_and_from_rospy_over_ipv6() {
     let _heard = ours.runtime.block_on(async {
         let options = SubscriberOptions::default();
         ours.node()
-            .subscribe("/up", Wanted::default(), options, (), &inbox)
+            .subscribe("/up", RequestedType::default(), options, (), &inbox)
             .unwrap()
     });
     let rospy = |script: &str, args: &[&str]| {

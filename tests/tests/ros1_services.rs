@@ -12,7 +12,7 @@ use serde_json::{Value, json};
 use system_tests::{Cell, MASTER, Peer, eventually, xml_rpc};
 use tcpros::{
     CallPhase, ConnectionHeader, Node, NodeOptions, ServiceClient, ServiceClientOptions,
-    ServiceError, ServiceOptions, ServiceServer, ServiceType,
+    ServiceError, ServiceOptions, ServiceServer, ServiceTypeSum,
 };
 use tokio::runtime::Runtime;
 
@@ -47,7 +47,7 @@ impl Ours {
 
     /// Offers `std_srvs/SetBool`: true succeeds, false fails.
     fn offer(&self, service: &str) -> ServiceServer {
-        let service_type = ServiceType {
+        let service_type = ServiceTypeSum {
             name: "std_srvs/SetBool".to_owned(),
             md5sum: MD5.to_owned(),
             request_type: "std_srvs/SetBoolRequest".to_owned(),

@@ -12,19 +12,19 @@ use std::time::Duration;
 
 use nix::sys::signal::Signal;
 use ros2_node::action::{
-    Action, ActionClient, ActionClientOptions, CancelCode, CancelWhat, GoalEvent, GoalHandle,
-    GoalId, IdInUse, LostReason, Outcome, Status,
+    ActionClient, ActionClientOptions, ActionName, CancelCode, CancelWhat, GoalEvent, GoalHandle,
+    GoalId, GoalStatusCode, IdInUse, LostReason, Outcome,
 };
 use system_tests::{Cell, Child, Peer};
 use tokio::time::timeout;
 
-use fibonacci::{ACTION, Ours, SOON, goal, numbers, until};
+use fibonacci::{ACTION, ActionParticipant, SOON, goal, numbers, until};
 
-fn client(ours: &Ours) -> ActionClient {
+fn client(ours: &ActionParticipant) -> ActionClient {
     client_of(ours, &fibonacci::action())
 }
 
-fn client_of(ours: &Ours, action: &Action) -> ActionClient {
+fn client_of(ours: &ActionParticipant, action: &ActionName) -> ActionClient {
     let options = ActionClientOptions::default();
     ActionClient::open(&ours.domain, &ours.peers, action, options).unwrap()
 }
@@ -39,7 +39,7 @@ async fn outcome(goal: &mut GoalHandle) -> Outcome {
 }
 
 /// Returns the status and the numbers of a goal's result.
-async fn done(goal: &mut GoalHandle) -> (Status, Vec<i32>) {
+async fn done(goal: &mut GoalHandle) -> (GoalStatusCode, Vec<i32>) {
     match outcome(goal).await {
         Outcome::Done { status, result } => (status, numbers(&result, 4)),
         other => panic!("{other:?}"),
@@ -48,7 +48,7 @@ async fn done(goal: &mut GoalHandle) -> (Status, Vec<i32>) {
 
 /// Returns the result of the next goal that is not lost with the previous server. Until its lease
 /// ends, the previous server receives requests, too.
-async fn next(client: &ActionClient) -> (Status, Vec<i32>) {
+async fn next(client: &ActionClient) -> (GoalStatusCode, Vec<i32>) {
     let served = async {
         loop {
             let mut next = client.send_goal(&goal(3));
@@ -97,7 +97,7 @@ async fn a_server_of_cyclone_ends_our_goals_in_every_way() {
     let Some(cell) = Cell::with(&[Peer::Python]) else {
         return;
     };
-    let ours = Ours::join();
+    let ours = ActionParticipant::join();
     let client = client(&ours);
     // Sent before a server exists: the client waits for the server.
     let mut early = client.send_goal(&goal(5));
@@ -106,9 +106,9 @@ async fn a_server_of_cyclone_ends_our_goals_in_every_way() {
     assert_eq!(told[0], "accepted");
     assert_eq!(
         done(&mut early).await,
-        (Status::Succeeded, vec![1, 1, 2, 3, 5])
+        (GoalStatusCode::Succeeded, vec![1, 1, 2, 3, 5])
     );
-    assert_eq!(early.status(), Status::Succeeded);
+    assert_eq!(early.status(), GoalStatusCode::Succeeded);
     // Feedback is volatile, and the server may have started before it knew our reader.
     let known = async {
         while !told.iter().any(|one| one == "[1, 1, 2, 3, 5]") {
@@ -127,7 +127,7 @@ async fn a_server_of_cyclone_ends_our_goals_in_every_way() {
         assert!(told.iter().any(|one| one == numbers), "{told:?}");
     }
     let mut aborted = client.send_goal(&goal(-2));
-    assert_eq!(done(&mut aborted).await, (Status::Aborted, vec![]));
+    assert_eq!(done(&mut aborted).await, (GoalStatusCode::Aborted, vec![]));
     let mut rejected = client.send_goal(&goal(-1));
     assert_eq!(outcome(&mut rejected).await, Outcome::Rejected);
     assert_eq!(story(&mut rejected).await, [""; 0]);
@@ -136,7 +136,10 @@ async fn a_server_of_cyclone_ends_our_goals_in_every_way() {
     let answer = stopped.cancel().await.unwrap();
     assert_eq!(answer.code, CancelCode::None);
     assert_eq!(answer.goals[0].id, stopped.id());
-    assert_eq!(done(&mut stopped).await, (Status::Canceled, vec![1, 1, 2]));
+    assert_eq!(
+        done(&mut stopped).await,
+        (GoalStatusCode::Canceled, vec![1, 1, 2])
+    );
     assert_eq!(client.counters().malformed, 0);
 }
 
@@ -145,7 +148,7 @@ async fn a_server_of_cyclone_is_asked_to_cancel_one_some_and_all() {
     let Some(cell) = Cell::with(&[Peer::Python]) else {
         return;
     };
-    let ours = Ours::join();
+    let ours = ActionParticipant::join();
     let client = client(&ours);
     let _server = cyclone(&cell, &[]);
     let mut goals = Vec::new();
@@ -171,16 +174,16 @@ async fn a_server_of_cyclone_is_asked_to_cancel_one_some_and_all() {
         answer.goals.iter().map(|info| info.id).collect()
     };
     assert_eq!(ids(&some), [goals[0].id()]);
-    assert_eq!(done(&mut goals[0]).await.0, Status::Canceled);
+    assert_eq!(done(&mut goals[0]).await.0, GoalStatusCode::Canceled);
     let ended = goals[0].cancel().await.unwrap();
     assert_eq!(ended.code, CancelCode::Terminated);
     let all = client.cancel(CancelWhat::All).await.unwrap();
     assert_eq!(ids(&all), [goals[2].id()]);
-    assert_eq!(done(&mut goals[2]).await.0, Status::Canceled);
+    assert_eq!(done(&mut goals[2]).await.0, GoalStatusCode::Canceled);
     let nobody = GoalId::from_bytes([9; 16]);
     let unknown = client.cancel(CancelWhat::Goal(nobody)).await.unwrap();
     assert_eq!(unknown.code, CancelCode::UnknownGoal);
-    assert_eq!(goals[1].status(), Status::Executing);
+    assert_eq!(goals[1].status(), GoalStatusCode::Executing);
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 1)]
@@ -188,7 +191,7 @@ async fn a_goal_has_the_id_that_was_chosen_for_it_and_there_is_one_of_each() {
     let Some(cell) = Cell::with(&[Peer::Python]) else {
         return;
     };
-    let ours = Ours::join();
+    let ours = ActionParticipant::join();
     let client = client(&ours);
     let _server = cyclone(&cell, &[]);
     let id = GoalId::from_bytes(*b"chosen elsewhere");
@@ -199,7 +202,10 @@ async fn a_goal_has_the_id_that_was_chosen_for_it_and_there_is_one_of_each() {
     // Cancelled by its id as known to the server.
     let cancelled = client.cancel(CancelWhat::Goal(id)).await.unwrap();
     assert_eq!(cancelled.goals[0].id, id);
-    assert_eq!(done(&mut first).await, (Status::Canceled, vec![1, 1, 2]));
+    assert_eq!(
+        done(&mut first).await,
+        (GoalStatusCode::Canceled, vec![1, 1, 2])
+    );
     drop(first);
     let mut again = client.send_goal_as(id, &goal(2)).unwrap();
     // The server remembers the goal id.
@@ -211,7 +217,7 @@ async fn what_a_server_says_before_it_answers_is_told_after() {
     let Some(cell) = Cell::with(&[Peer::Python]) else {
         return;
     };
-    let ours = Ours::join();
+    let ours = ActionParticipant::join();
     let client = client(&ours);
     let _server = cyclone(&cell, &["--hasty"]);
     let mut goal = client.send_goal(&goal(2));
@@ -226,8 +232,8 @@ async fn many_goals_of_two_clients_run_at_once_and_hear_of_themselves_alone() {
     let Some(cell) = Cell::with(&[Peer::Python]) else {
         return;
     };
-    let ours = Ours::join();
-    let others = Ours::join();
+    let ours = ActionParticipant::join();
+    let others = ActionParticipant::join();
     let clients = [client(&ours), client(&others)];
     let _server = cyclone(&cell, &[]);
     let mut goals = Vec::new();
@@ -238,7 +244,7 @@ async fn many_goals_of_two_clients_run_at_once_and_hear_of_themselves_alone() {
     }
     for (order, goal) in &mut goals {
         let (status, numbers) = done(goal).await;
-        assert_eq!((status, numbers.len()), (Status::Succeeded, *order));
+        assert_eq!((status, numbers.len()), (GoalStatusCode::Succeeded, *order));
     }
     for client in &clients {
         let counters = client.counters();
@@ -252,7 +258,7 @@ async fn a_goal_whose_server_is_killed_is_lost_and_the_next_one_is_served_again(
     let Some(cell) = Cell::with(&[Peer::Python]) else {
         return;
     };
-    let ours = Ours::join();
+    let ours = ActionParticipant::join();
     let client = client(&ours);
     let server = cyclone(&cell, &["--lease", "3"]);
     let mut running = client.send_goal(&goal(100));
@@ -261,7 +267,10 @@ async fn a_goal_whose_server_is_killed_is_lost_and_the_next_one_is_served_again(
     // A new server at once: it does not know the goal, and the lease of the old server may not have
     // ended.
     let _server = cyclone(&cell, &[]);
-    assert_eq!(next(&client).await, (Status::Succeeded, vec![1, 1, 2]));
+    assert_eq!(
+        next(&client).await,
+        (GoalStatusCode::Succeeded, vec![1, 1, 2])
+    );
     let lost = outcome(&mut running).await;
     let Outcome::Lost(reason @ LostReason::ServerLost(_)) = &lost else {
         panic!("{lost:?}");
@@ -274,7 +283,7 @@ async fn a_goal_without_a_server_is_lost_in_time_and_was_not_sent() {
     let Some(_cell) = Cell::with(&[Peer::Python]) else {
         return;
     };
-    let ours = Ours::join();
+    let ours = ActionParticipant::join();
     let options = ActionClientOptions {
         server_timeout: Duration::from_millis(500),
         ..ActionClientOptions::default()
@@ -305,11 +314,14 @@ async fn feedback_and_statuses_that_do_not_read_are_counted() {
     let Some(cell) = Cell::with(&[Peer::Python]) else {
         return;
     };
-    let ours = Ours::join();
+    let ours = ActionParticipant::join();
     let client = client(&ours);
     let _server = cyclone(&cell, &[]);
     let _garbage = cell.cyclone("ros2_action.py", &["garbage", ACTION, "--domain", "2"]);
     until("garbage is counted", || client.counters().malformed >= 4).await;
     let mut goal = client.send_goal(&goal(3));
-    assert_eq!(done(&mut goal).await, (Status::Succeeded, vec![1, 1, 2]));
+    assert_eq!(
+        done(&mut goal).await,
+        (GoalStatusCode::Succeeded, vec![1, 1, 2])
+    );
 }

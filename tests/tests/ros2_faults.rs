@@ -5,8 +5,8 @@ use std::time::{Duration, Instant};
 
 use nix::sys::signal::Signal;
 use system_tests::{
-    Announcer, Cell, Child, METRICS_ROS2, Peer, Started, Triple, UaSide, anonymous, cpu_share,
-    eventually, metrics, program, resident, threads,
+    Cell, Child, LeasedParticipant, METRICS_ROS2, Peer, StartedChild, TopicTriple, UaSide,
+    anonymous, cpu_share, eventually, metrics, program, resident, threads,
 };
 use uadp::Scalar;
 
@@ -14,14 +14,14 @@ const SOON: Duration = Duration::from_secs(30);
 const BOTH: &[Peer] = &[Peer::FastDds, Peer::CycloneC];
 const STRING: &str = "std_msgs/String";
 /// A value of the space, and a value of the domain.
-const THERE: (Triple, &str) = ((1, 2, 10), "/ua_1_2_10");
-const BACK: (Triple, &str) = ((2, 2, 20), "/ua_2_2_20");
+const THERE: (TopicTriple, &str) = ((1, 2, 10), "/ua_1_2_10");
+const BACK: (TopicTriple, &str) = ((2, 2, 20), "/ua_2_2_20");
 
 type Peers = [fn(&Cell, &[&str]) -> Child; 2];
 const MAKERS: Peers = [Cell::fastdds, Cell::cyclone_c];
 
 /// Writes the text to the space ten times a second until it is the newest value of all readers.
-fn reaches(ua: &mut UaSide, triple: Triple, text: &str, readers: &mut [&mut Child]) {
+fn reaches(ua: &mut UaSide, triple: TopicTriple, text: &str, readers: &mut [&mut Child]) {
     let mut written: Option<Instant> = None;
     eventually(&format!("all readers have `{text}`"), SOON, || {
         if written.is_none_or(|at| at.elapsed() > Duration::from_millis(100)) {
@@ -143,7 +143,7 @@ fn a_participant_that_was_lost_and_has_not_lost_us_is_asked_with_counts_that_go_
         return;
     };
     let _bridge = cell.bridge_ros2(&[]);
-    let node = Announcer::open();
+    let node = LeasedParticipant::open();
     node.announce();
     // Meanwhile the node's lease of a second ends, which is checked every two seconds.
     let before = node.asked(Duration::from_secs(4), |_| false);
@@ -282,7 +282,7 @@ fn five_thousand_routes_of_a_mapping_take_little_memory() {
 /// Starts a second bridge on the domain, for the values of that space, and waits until it answers.
 fn second_bridge(space: &str) -> Child {
     const METRICS: &str = "127.0.0.1:9202";
-    let bridge = Started::new("the second bridge", &program("bridge-ros2"))
+    let bridge = StartedChild::new("the second bridge", &program("bridge-ros2"))
         .args(["--domain", "2", "--space", space, "--interface", "lo"])
         .args(["--metrics", METRICS])
         .start();

@@ -4,7 +4,7 @@
 use std::collections::BTreeSet;
 use std::time::Duration;
 
-use ros2_node::clock::RosTime;
+use ros2_node::clock::Ros2Time;
 use ros2_node::discovery_info::{GidLength, NodeEntities};
 use ros2_node::domain::{Domain, DomainOptions, can_announce_type_hashes};
 use ros2_node::node::NodeOptions;
@@ -347,7 +347,7 @@ fn simulated_time_is_what_clock_says() {
         use_sim_time: true,
         ..NodeOptions::from("bridge")
     });
-    assert_eq!(domain.clock().now(), RosTime::default());
+    assert_eq!(domain.clock().now(), Ros2Time::default());
     let _clock = cell.cyclone(
         "ros2_pub.py",
         &[
@@ -364,7 +364,7 @@ fn simulated_time_is_what_clock_says() {
         ],
     );
     eventually("the clock shows it", SOON, || {
-        (domain.clock().now() == RosTime { sec: 7, nanosec: 9 }).then_some(())
+        (domain.clock().now() == Ros2Time { sec: 7, nanosec: 9 }).then_some(())
     });
 }
 

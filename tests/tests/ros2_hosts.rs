@@ -4,7 +4,7 @@
 use std::time::{Duration, Instant};
 
 use system_tests::{
-    Cell, Child, HERE, Host, Numbered, Peer, Triple, UaSide, Wire, eventually, numbered,
+    Cell, Child, HERE, Host, Numbered, Peer, TopicTriple, UaSide, WireEffect, eventually, numbered,
 };
 use uadp::{Scalar, Variant};
 
@@ -14,18 +14,18 @@ const BOTH: &[Peer] = &[Peer::FastDds, Peer::CycloneC];
 const PLANT: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/cells/plant.yaml");
 const STRING: &str = "std_msgs/String";
 /// Events in both directions: every value counts.
-const EVENTS: (Triple, &str) = ((1, 2, 12), "/ua_1_2_12");
-const EVENTS_BACK: (Triple, &str) = ((2, 2, 22), "/ua_2_2_22");
+const EVENTS: (TopicTriple, &str) = ((1, 2, 12), "/ua_1_2_12");
+const EVENTS_BACK: (TopicTriple, &str) = ((2, 2, 22), "/ua_2_2_22");
 /// A state: only the last value counts.
-const STATE: (Triple, &str) = ((1, 2, 10), "/ua_1_2_10");
+const STATE: (TopicTriple, &str) = ((1, 2, 10), "/ua_1_2_10");
 
-const CLEAN: Wire = Wire {
+const CLEAN: WireEffect = WireEffect {
     loss: 0.0,
     delay: Duration::ZERO,
 };
 
-const fn lossy(loss: f64) -> Wire {
-    Wire {
+const fn lossy(loss: f64) -> WireEffect {
+    WireEffect {
         loss,
         delay: Duration::from_millis(20),
     }
@@ -99,7 +99,7 @@ fn hear_all(ua: &UaSide, firsts: [u32; 2], count: u32) {
     assert_eq!(heard.bad, 0);
 }
 
-fn nothing_is_lost_on(wire: Wire) {
+fn nothing_is_lost_on(wire: WireEffect) {
     const COUNT: u32 = 400;
     let Some(cell) = Cell::with(BOTH) else {
         return;
@@ -257,7 +257,7 @@ fn the_last_state_of_best_effort_writers_reaches_the_space_on_a_wire_that_loses_
 const LEASE: &str = "<LeaseDuration>2s</LeaseDuration>";
 
 /// Returns whether the topic is repeated; a latched value is repeated every second.
-fn is_repeated(ua: &UaSide, triple: Triple) -> bool {
+fn is_repeated(ua: &UaSide, triple: TopicTriple) -> bool {
     ua.drain();
     ua.triples_for(Duration::from_millis(2500))
         .contains(&triple)
@@ -266,7 +266,7 @@ fn is_repeated(ua: &UaSide, triple: Triple) -> bool {
 /// A robot writes its map once, and then the radio link is down for longer than the robot's lease.
 #[test]
 fn a_latched_value_is_back_after_the_wire_was_cut_for_longer_than_the_lease() {
-    const MAP: (Triple, &str) = ((2, 2, 20), "/ua_2_2_20");
+    const MAP: (TopicTriple, &str) = ((2, 2, 20), "/ua_2_2_20");
     let Some(cell) = Cell::with(&[Peer::CycloneC]) else {
         return;
     };

@@ -7,14 +7,14 @@ use std::time::{Duration, Instant};
 
 use ros2_node::domain::{Domain, DomainOptions};
 use ros2_node::graph::Graph;
-use ros2_node::inbox::{Inbox, Taken};
+use ros2_node::inbox::{Inbox, InboxTurn};
 use ros2_node::limits;
-use ros2_node::outlet::{Outlet, Refusal};
+use ros2_node::outlet::{Outlet, OutletRefusal};
 use ros2_node::qos::{Offered, Requested};
 use ros2_node::raw::Payload;
 use system_tests::{
-    BareNode, Cell, Child, HERE, Host, METRICS_ROS1, METRICS_ROS2, Peer, Shape, THERE, UaSide,
-    WIRE, Wire, eventually, metrics, numbered, resident,
+    ArrayShape, BareNode, Cell, Child, HERE, Host, METRICS_ROS1, METRICS_ROS2, Peer, THERE, UaSide,
+    WIRE, WireEffect, eventually, metrics, numbered, resident,
 };
 use uadp::Scalar;
 
@@ -114,7 +114,7 @@ fn inbox(domain: &Domain, topic: &str) -> Inbox<()> {
 /// Returns the text of the next sample.
 async fn text(inbox: &mut Inbox<()>) -> String {
     match tokio::time::timeout(SOON, inbox.recv()).await.unwrap() {
-        Taken::Sample {
+        InboxTurn::Sample {
             payload, missing, ..
         } => {
             assert_eq!(missing, 0);
@@ -122,7 +122,7 @@ async fn text(inbox: &mut Inbox<()>) -> String {
             let length = u32::from_le_bytes(bytes[4..8].try_into().unwrap()) as usize - 1;
             String::from_utf8(bytes[8..8 + length].to_vec()).unwrap()
         }
-        Taken::Unreadable { why, .. } => panic!("{why}"),
+        InboxTurn::Unreadable { why, .. } => panic!("{why}"),
     }
 }
 
@@ -274,7 +274,7 @@ async fn texts_of_every_length_cross_an_ethernet() {
     let Some(cell) = Cell::with(BOTH) else {
         return;
     };
-    let host = cell.host(Wire::default());
+    let host = cell.host(WireEffect::default());
     let reads = ["sub", TOPIC.0, TEXT, "--counts"];
     let mut readers = [
         host.fastdds_started(&cell, &reads),
@@ -301,7 +301,7 @@ async fn large_samples_survive_a_wire_that_loses() {
     let Some(cell) = Cell::with(BOTH) else {
         return;
     };
-    let host = cell.host(Wire {
+    let host = cell.host(WireEffect {
         loss: 0.05,
         delay: Duration::from_millis(20),
     });
@@ -331,7 +331,7 @@ async fn large_samples_of_others_survive_a_wire_that_loses() {
     };
     // Fast DDS sends 64 kB in a datagram: with a packet loss of 5 %, nine in ten datagrams would be
     // lost.
-    let host = cell.host(Wire {
+    let host = cell.host(WireEffect {
         loss: 0.01,
         delay: Duration::from_millis(20),
     });
@@ -409,7 +409,7 @@ async fn a_sample_beyond_the_limit_is_refused_by_name() {
     let mut outlet = outlet(&domain, EVENTS, 1);
     let limit = limits::sample_size(Graph::snapshot(domain.participant()).readers(TOPIC.1));
     let refused = outlet.offer(payload(&numbered(7, limit)), None, now());
-    assert_eq!(refused, Err(Refusal::TooLarge(limit)));
+    assert_eq!(refused, Err(OutletRefusal::TooLarge(limit)));
     write(&mut outlet, [limit - 64], 1).await;
     have_all(&mut reader, 1);
 }
@@ -435,7 +435,7 @@ fn a_listed_peer_is_found_without_multicast() {
     let Some(cell) = Cell::with(&[Peer::CycloneC]) else {
         return;
     };
-    let host = cell.host(Wire::default());
+    let host = cell.host(WireEffect::default());
     let reader = without_multicast(&cell, &host, &["sub", "/ua_1_1_1", TEXT]);
     let mut ua = UaSide::join();
     let _bridge = cell.bridge_ros2(&["--ros-interface", HERE, "--ros-peer", THERE]);
@@ -465,7 +465,7 @@ fn images_from_ros_1_reach_a_reliable_reader_of_ros_2_whole_and_in_order() {
     let mapping = cell.file("camera.yaml", CAMERA);
     let mapping = [mapping.to_str().unwrap()];
     let _bridges = [cell.bridge_ros1(&mapping), cell.bridge_ros2(&mapping)];
-    let shape = Shape::IMAGE;
+    let shape = ArrayShape::IMAGE;
     let arguments = shape.arguments();
     let mut reads = vec!["meter", "/camera_there", "--depth", "10"];
     reads.extend(arguments.iter().map(String::as_str));

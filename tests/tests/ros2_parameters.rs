@@ -4,7 +4,7 @@
 use std::time::Duration;
 
 use ros2_node::domain::{Domain, DomainOptions};
-use ros2_node::parameters::{Parameter, ParameterServer, ParameterValue};
+use ros2_node::parameters::{DeclaredParameter, ParameterServer, ParameterValue};
 use ros2_node::service::ServicePeers;
 use serde_json::{Value, json};
 use system_tests::{Cell, Child, METRICS_ROS2, Peer, eventually, metrics, number};
@@ -130,7 +130,7 @@ async fn who_listens_to_parameter_events_is_told_what_was_set_and_of_which_node(
     })
     .unwrap();
     let peers = ServicePeers::new(&domain);
-    let parameter = |name: &str, read_only| Parameter {
+    let parameter = |name: &str, read_only| DeclaredParameter {
         name: name.to_owned(),
         value: ParameterValue::Bool(false),
         description: String::new(),

@@ -13,18 +13,18 @@ use std::{
 };
 
 use system_tests::{
-    Cell, Child, Governance, HERE, Keystore, METRICS_ROS2, Peer, Started, Triple, UaSide, Wire,
-    Wiretap, drops, eventually, has_security, metrics,
+    Cell, Child, Governance, HERE, Keystore, METRICS_ROS2, Peer, StartedChild, TopicTriple, UaSide,
+    WireEffect, Wiretap, drops, eventually, has_security, metrics,
 };
 use uadp::Scalar;
 
 const SOON: Duration = Duration::from_secs(30);
 const STRING: &str = "std_msgs/String";
 /// A value of the space, and a value of the domain.
-const THERE: (Triple, &str) = ((1, 2, 10), "/ua_1_2_10");
-const BACK: (Triple, &str) = ((2, 2, 20), "/ua_2_2_20");
+const THERE: (TopicTriple, &str) = ((1, 2, 10), "/ua_1_2_10");
+const BACK: (TopicTriple, &str) = ((2, 2, 20), "/ua_2_2_20");
 
-type Secured = fn(&Cell, &Keystore, &[&str]) -> Started;
+type Secured = fn(&Cell, &Keystore, &[&str]) -> StartedChild;
 
 fn sends<'a>(topic: &'a str, text: &'a str) -> [&'a str; 9] {
     [
@@ -46,7 +46,7 @@ fn reaches(ua: &mut UaSide, text: &str, reader: &Child) {
     });
 }
 
-fn answering(bridge: Started) -> Child {
+fn answering(bridge: StartedChild) -> Child {
     let bridge = bridge.start();
     eventually("the bridge answers", SOON, || metrics(METRICS_ROS2));
     bridge
@@ -135,7 +135,7 @@ fn secured_peers_get_each_others_keys_although_datagrams_are_lost() {
     let Some(cell) = Cell::secured(&[Peer::CycloneC]) else {
         return;
     };
-    let host = cell.host(Wire {
+    let host = cell.host(WireEffect {
         loss: 0.1,
         delay: Duration::from_millis(5),
     });
@@ -210,7 +210,7 @@ fn who_is_not_of_the_enclave_gets_and_gives_nothing_and_is_told_of() {
 }
 
 /// Returns the exit code and the output of a bridge that must refuse to run.
-fn refusal(started: Started) -> (Option<i32>, String) {
+fn refusal(started: StartedChild) -> (Option<i32>, String) {
     let mut bridge = started.start();
     let code = bridge.wait_for_end(SOON).code();
     (code, bridge.lines().join("\n"))

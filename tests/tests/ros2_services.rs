@@ -10,19 +10,21 @@ use bytes::Bytes;
 use futures_util::future::join_all;
 use nix::sys::signal::Signal;
 use ros2_node::service::{
-    CallPhase, Service, ServiceClient, ServiceClientOptions, ServiceError, ServiceOptions,
+    CallPhase, ServiceClient, ServiceClientOptions, ServiceError, ServiceName, ServiceOptions,
     ServiceServer,
 };
 use serde_json::json;
 use system_tests::{Cell, Peer};
 use tokio::time::Instant;
 
-use peer::{DONE, Ours, SET_BOOL, SOON, Vendor, cyclone_calls, cyclone_serves, until};
+use peer::{
+    DONE, SET_BOOL, SOON, ServiceParticipant, Vendor, cyclone_calls, cyclone_serves, until,
+};
 
 const GRIP: &str = "/arm/grip";
 
-fn grip() -> Service {
-    Service::new(GRIP, &SET_BOOL.parse().unwrap())
+fn grip() -> ServiceName {
+    ServiceName::new(GRIP, &SET_BOOL.parse().unwrap())
 }
 
 fn within(timeout: Duration) -> ServiceClientOptions {
@@ -37,12 +39,12 @@ fn set(on: bool) -> Bytes {
     Bytes::from(vec![0, 1, 0, 0, u8::from(on)])
 }
 
-fn client(ours: &Ours, options: ServiceClientOptions) -> ServiceClient {
+fn client(ours: &ServiceParticipant, options: ServiceClientOptions) -> ServiceClient {
     ServiceClient::open(&ours.domain, &ours.peers, &grip(), options).unwrap()
 }
 
 /// Creates a server that answers `done` to true and nothing to false.
-fn server(ours: &Ours, options: ServiceOptions) -> ServiceServer {
+fn server(ours: &ServiceParticipant, options: ServiceOptions) -> ServiceServer {
     let handler = async |on: Option<u8>| match on {
         Some(1) => Ok(Bytes::from_static(DONE)),
         Some(_) => Err("the valve is stuck".to_owned()),
@@ -62,7 +64,7 @@ async fn a_server_of_theirs_answers(vendor: Vendor) {
     let Some(cell) = Cell::with(vendor.needs()) else {
         return;
     };
-    let ours = Ours::join();
+    let ours = ServiceParticipant::join();
     let client = client(&ours, within(SOON));
     // Called before a server exists: the client waits for the server.
     let early = tokio::spawn({
@@ -95,7 +97,7 @@ async fn a_hundred_calls_at_once(vendor: Vendor) {
     let Some(cell) = Cell::with(vendor.needs()) else {
         return;
     };
-    let ours = Ours::join();
+    let ours = ServiceParticipant::join();
     let theirs = vendor.serves(&cell, GRIP);
     let client = client(&ours, within(SOON));
     let calls = (0..100).map(|_| client.call(set(true)));
@@ -119,7 +121,7 @@ async fn a_client_of_theirs_is_answered(vendor: Vendor) {
     let Some(cell) = Cell::with(vendor.needs()) else {
         return;
     };
-    let ours = Ours::join();
+    let ours = ServiceParticipant::join();
     let server = server(&ours, ServiceOptions::default());
     let client = vendor.calls(&cell, GRIP, 100);
     until("the client is done", || vendor.answers(&client).is_some()).await;
@@ -143,7 +145,7 @@ async fn a_client_finds_a_killed_server_again_even_as_one_of_another_vendor() {
     let Some(cell) = Cell::with(&[Peer::Python, Peer::FastDds]) else {
         return;
     };
-    let ours = Ours::join();
+    let ours = ServiceParticipant::join();
     let client = client(&ours, within(Duration::from_secs(1)));
     for vendor in [Vendor::Cyclone, Vendor::FastDds, Vendor::Cyclone] {
         let server = vendor.serves(&cell, GRIP);
@@ -162,7 +164,7 @@ async fn a_call_whose_server_is_killed_ends_in_time_and_may_have_run() {
     let Some(cell) = Cell::with(Vendor::Cyclone.needs()) else {
         return;
     };
-    let ours = Ours::join();
+    let ours = ServiceParticipant::join();
     let server = cyclone_serves(&cell, GRIP, &["--silent"]);
     let limit = Duration::from_secs(2);
     let client = client(&ours, within(limit));
@@ -190,7 +192,7 @@ async fn a_call_whose_server_leaves_ends_at_once() {
     let Some(cell) = Cell::with(Vendor::Cyclone.needs()) else {
         return;
     };
-    let ours = Ours::join();
+    let ours = ServiceParticipant::join();
     let mut server = cyclone_serves(&cell, GRIP, &["--silent", "--leave"]);
     let no_limit = ServiceClientOptions {
         timeout: None,
@@ -212,7 +214,7 @@ async fn a_call_without_a_server_says_so_and_has_not_run() {
     let Some(_cell) = Cell::with(&[]) else {
         return;
     };
-    let ours = Ours::join();
+    let ours = ServiceParticipant::join();
     // Our own server does not count: it is the server that we offer to others.
     let _server = server(&ours, ServiceOptions::default());
     let client = client(&ours, within(Duration::from_secs(1)));
@@ -229,7 +231,7 @@ async fn a_server_of_another_type_is_named() {
     let Some(cell) = Cell::with(Vendor::Cyclone.needs()) else {
         return;
     };
-    let ours = Ours::join();
+    let ours = ServiceParticipant::join();
     let _server = cell.cyclone(
         "ros2_service.py",
         &["serve", GRIP, "std_srvs/Trigger", "--domain", "2"],
@@ -247,7 +249,7 @@ async fn a_failed_call_gets_no_answer_and_the_next_one_does() {
     let Some(cell) = Cell::with(Vendor::Cyclone.needs()) else {
         return;
     };
-    let ours = Ours::join();
+    let ours = ServiceParticipant::join();
     let server = server(&ours, ServiceOptions::default());
     let values = [
         "--value",
@@ -278,7 +280,7 @@ async fn garbage_is_counted_and_does_no_harm() {
     let Some(cell) = Cell::with(Vendor::Cyclone.needs()) else {
         return;
     };
-    let ours = Ours::join();
+    let ours = ServiceParticipant::join();
     let server = server(&ours, ServiceOptions::default());
     for form in ["short", "bare"] {
         let more = ["garbage", GRIP, SET_BOOL, "--domain", "2", "--form", form];
@@ -307,7 +309,7 @@ async fn clients_of_both_vendors_are_answered_by_one_server_of_ours() {
     let Some(cell) = Cell::with(&[Peer::Python, Peer::FastDds]) else {
         return;
     };
-    let ours = Ours::join();
+    let ours = ServiceParticipant::join();
     let server = server(&ours, ServiceOptions::default());
     let both = [
         Vendor::Cyclone,
@@ -335,7 +337,7 @@ async fn each_more_client_of_one_cyclone_participant_is_answered() {
     let Some(cell) = Cell::with(Vendor::Cyclone.needs()) else {
         return;
     };
-    let ours = Ours::join();
+    let ours = ServiceParticipant::join();
     let server = server(&ours, ServiceOptions::default());
     let how = ["--anew", "--settle", "0"];
     let requests = [["--value", r#"{"data":true}"#]; CLIENTS].concat();
@@ -353,7 +355,7 @@ async fn servers_of_both_vendors_are_each_asked_in_their_way() {
     let Some(cell) = Cell::with(&[Peer::Python, Peer::FastDds]) else {
         return;
     };
-    let ours = Ours::join();
+    let ours = ServiceParticipant::join();
     let servers =
         [Vendor::Cyclone, Vendor::FastDds].map(|vendor| (vendor, vendor.serves(&cell, GRIP)));
     let client = client(&ours, within(SOON));
@@ -372,8 +374,8 @@ async fn of_more_requests_than_may_wait_the_oldest_go() {
     let Some(_cell) = Cell::with(&[]) else {
         return;
     };
-    let ours = Ours::join();
-    let others = Ours::join();
+    let ours = ServiceParticipant::join();
+    let others = ServiceParticipant::join();
     let options = ServiceOptions {
         max_handled: 1,
         max_waiting: 2,
@@ -400,7 +402,7 @@ async fn more_calls_than_allowed_are_refused_and_others_go_on() {
     let Some(_cell) = Cell::with(&[Peer::Python]) else {
         return;
     };
-    let ours = Ours::join();
+    let ours = ServiceParticipant::join();
     let options = ServiceClientOptions {
         timeout: Some(Duration::from_millis(500)),
         max_calls: 3,
@@ -422,7 +424,7 @@ async fn a_server_of_ours_says_when_it_knows_a_client() {
     let Some(_cell) = Cell::with(&[]) else {
         return;
     };
-    let (ours, others) = (Ours::join(), Ours::join());
+    let (ours, others) = (ServiceParticipant::join(), ServiceParticipant::join());
     let client = client(&ours, within(SOON));
     let server = server(&others, ServiceOptions::default());
     until("it says that it knows us", || client.acquainted() == 1).await;
@@ -436,7 +438,7 @@ async fn a_request_is_not_sent_to_a_server_that_comes_after_its_time() {
     let Some(_cell) = Cell::with(&[]) else {
         return;
     };
-    let (ours, others) = (Ours::join(), Ours::join());
+    let (ours, others) = (ServiceParticipant::join(), ServiceParticipant::join());
     let client = client(&ours, within(SOON));
     let start_by = Instant::now() + Duration::from_millis(100);
     let late = tokio::spawn({

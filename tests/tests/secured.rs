@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use serde_json::{Value, json};
 use system_tests::{
-    Cell, METRICS_ROS1, METRICS_ROS2, Peer, Started, UaSide, UadpSocket, eventually, metrics,
+    Cell, METRICS_ROS1, METRICS_ROS2, Peer, StartedChild, UaSide, UadpSocket, eventually, metrics,
     program,
 };
 use uadp::{NetworkMessage, Scalar};
@@ -157,7 +157,7 @@ fn skills_of_a_secured_group_are_run_by_who_has_its_keys_and_by_nobody_else() {
     let _master = cell.roscore();
     let _bridge = cell.bridge_ros1(&secured);
     let of_component = [GRIPPER, "--lds", "none", "--interface", "lo"];
-    let _component = Started::new("ua-component", &program("ua-component"))
+    let _component = StartedChild::new("ua-component", &program("ua-component"))
         .args(of_component)
         .args(["--metrics", METRICS_COMPONENT])
         .args(secured)

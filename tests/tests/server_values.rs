@@ -12,7 +12,7 @@ use system_tests::{
     peak, resident,
 };
 use uadp::{
-    ChunkBudget, Chunks, DataSetHeader, Extras, FieldEncoder, GroupHeader, NetworkHeader,
+    ChunkBudget, ChunkEncoder, DataSetHeader, Extras, FieldEncoder, GroupHeader, NetworkHeader,
     NetworkMessage, NetworkMessageEncoder, NetworkMessageType, NodeId, PublisherId, Reassembler,
     ReassemblyLimits, Scalar, Timestamp, Variant, Whole,
 };
@@ -111,7 +111,7 @@ fn send_array(group: &UadpSocket, writer: u16, sequence: u16, elements: &[u8]) {
         trailer: 0,
     };
     let (header, extras) = (header(), Extras::default());
-    let mut chunks = Chunks::new(&header, &extras, whole, budget).unwrap();
+    let mut chunks = ChunkEncoder::new(&header, &extras, whole, budget).unwrap();
     let mut datagram = Vec::new();
     while let Some(written) = chunks.append(&mut datagram, &extras) {
         written.unwrap();

@@ -2,7 +2,7 @@
 
 use std::{io::ErrorKind, os::unix::net::UnixDatagram, time::Duration};
 
-use system_tests::{Cell, Child, Started, program};
+use system_tests::{Cell, Child, StartedChild, program};
 
 const SOON: Duration = Duration::from_secs(60);
 
@@ -23,7 +23,7 @@ impl ServiceManager {
         }
     }
 
-    fn start(&self, program: Started) -> Child {
+    fn start(&self, program: StartedChild) -> Child {
         program
             .env("NOTIFY_SOCKET", &self.path)
             .env("WATCHDOG_USEC", "2000000")
@@ -47,7 +47,7 @@ impl ServiceManager {
     }
 
     /// Runs a program until it is ready and has sent a keep-alive, and ends it.
-    fn follows(&self, program: Started) {
+    fn follows(&self, program: StartedChild) {
         let mut child = self.start(program);
         self.expect("READY=1");
         self.expect("WATCHDOG=1");
@@ -64,5 +64,5 @@ fn a_bridge_and_a_discovery_server_notify_when_they_are_ready_and_when_they_end(
     manager.follows(cell.bridge_ros2_started(&[]));
     manager.follows(cell.ua_server_started(&[]));
     let endpoint = ["--endpoint", "opc.tcp://127.0.0.1:4841"];
-    manager.follows(Started::new("ua-lds", &program("ua-lds")).args(endpoint));
+    manager.follows(StartedChild::new("ua-lds", &program("ua-lds")).args(endpoint));
 }

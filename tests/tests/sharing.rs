@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use serde_json::Value;
 use system_tests::{
-    Capture, Cell, Child, METRICS_ROS2, Peer, Stamp, UadpSocket, eventually, metrics,
+    CaptureFile, Cell, Child, METRICS_ROS2, Peer, TextStamp, UadpSocket, eventually, metrics,
     number as number_of,
 };
 use uadp::{DataSetMessage, NetworkMessage};
@@ -59,7 +59,7 @@ fn pacer(cell: &Cell) -> Child {
 }
 
 fn number(text: &str) -> Option<u64> {
-    Stamp::of(text.as_bytes()).map(|stamp| stamp.number)
+    TextStamp::of(text.as_bytes()).map(|stamp| stamp.number)
 }
 
 /// Returns the samples that asyncua received so far: writer, and numbers in their order.
@@ -116,7 +116,7 @@ fn what_shares_datagrams_is_read_by_asyncua_and_shown_by_wireshark() {
     let datagrams = waiting(&group);
     let mut shared = datagrams.iter().filter(|datagram| ids(datagram).len() > 1);
     let one = shared.next().expect("no datagram was shared");
-    let shown = cell.dissect(&Capture::of([&one[..]]), &[]).remove(0);
+    let shown = cell.dissect(&CaptureFile::of([&one[..]]), &[]).remove(0);
     assert!(!shown.has("uadp.malformed"), "{:?}", shown.expert_infos());
     let topics: Vec<String> = ids(one).iter().map(|id| format!("ua_2_2_{id}")).collect();
     assert_eq!(shown.all("uadp.topic"), topics);
@@ -159,7 +159,7 @@ fn texts(datagram: &[u8]) -> Vec<(u16, u64)> {
     let messages = message.messages().flatten();
     // A message ends with its last field.
     let stamped = |message: DataSetMessage<'_>| {
-        Some((message.writer_id?, Stamp::of(message.payload())?.number))
+        Some((message.writer_id?, TextStamp::of(message.payload())?.number))
     };
     messages.filter_map(stamped).collect()
 }

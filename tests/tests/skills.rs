@@ -5,7 +5,7 @@ use std::path::Path;
 use std::time::Duration;
 
 use serde_json::{Value, json};
-use system_tests::{Cell, Child, Peer, Started, eventually, program};
+use system_tests::{Cell, Child, Peer, StartedChild, eventually, program};
 
 const SOON: Duration = Duration::from_secs(30);
 const ENDPOINT: &str = "opc.tcp://127.0.0.1:4855";
@@ -44,8 +44,8 @@ const TRANSITIONS: [(&str, &str, &str, &str); 9] = [
     ("ReadyToHalted", "i=2424", "Ready", "Halted"),
 ];
 
-fn component_started(file: &Path, args: &[&str]) -> Started {
-    Started::new("ua-component", &program("ua-component"))
+fn component_started(file: &Path, args: &[&str]) -> StartedChild {
+    StartedChild::new("ua-component", &program("ua-component"))
         .args([file])
         .args(args)
 }
@@ -361,7 +361,7 @@ fn a_type_of_another_maker_is_loaded_found_by_its_supertype_and_run_by_other_cli
     let Some(cell) = Cell::with(&[Peer::Python, Peer::NodeOpcua]) else {
         return;
     };
-    let mut printed = Started::new("ua-component", &program("ua-component"))
+    let mut printed = StartedChild::new("ua-component", &program("ua-component"))
         .args(["--nodeset"])
         .start();
     assert!(printed.wait_for_end(SOON).success());
@@ -442,7 +442,7 @@ fn a_yaml_with_faults_is_refused_with_all_of_them() {
 
 /// Starts a simulator of a device, and returns its address.
 fn simulator(args: &[&str]) -> (Child, String) {
-    let child = Started::new("ua-component", &program("ua-component"))
+    let child = StartedChild::new("ua-component", &program("ua-component"))
         .args(["simulate"])
         .args(args)
         .start();

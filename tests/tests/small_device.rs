@@ -3,7 +3,7 @@
 
 use std::time::Duration;
 
-use system_tests::{Cell, Peer, Started, program};
+use system_tests::{Cell, Peer, StartedChild, program};
 
 #[test]
 fn a_value_of_a_small_device_reaches_ros() {
@@ -13,7 +13,7 @@ fn a_value_of_a_small_device_reaches_ros() {
     let _master = cell.roscore();
     let _bridge = cell.bridge_ros1(&[]);
     let mut receives = cell.rospy("ros1_sub.py", &["/ua_3_5_11", "std_msgs/Float64"]);
-    let _device = Started::new("publisher", &program("examples/publisher")).start();
+    let _device = StartedChild::new("publisher", &program("examples/publisher")).start();
     let celsius = receives.wait_for_json("a temperature", Duration::from_secs(30), |line| {
         line["value"]["data"].as_f64()
     });

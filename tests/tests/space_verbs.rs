@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use serde_json::{Value, json};
 use system_tests::{
-    Capture, Cell, METRICS_ROS1, Peer, Started, UadpSocket, eventually, metrics, program,
+    CaptureFile, Cell, METRICS_ROS1, Peer, StartedChild, UadpSocket, eventually, metrics, program,
 };
 
 const SOON: Duration = Duration::from_secs(30);
@@ -14,7 +14,7 @@ const TWIST: &str = "geometry_msgs/Twist";
 
 /// Runs `ua-space` in the cell's network. Returns the exit code and the output.
 fn ua_space(words: &[&str]) -> (i32, Vec<String>) {
-    let mut child = Started::new("ua-space", &program("ua-space"))
+    let mut child = StartedChild::new("ua-space", &program("ua-space"))
         .args(words)
         .args(["--interface", "lo"])
         .start();
@@ -197,7 +197,7 @@ fn starting_files_are_accepted_by_their_programs() {
         return;
     };
     let run = |name: &str, words: &[&str]| {
-        let mut child = Started::new(name, &program(name)).args(words).start();
+        let mut child = StartedChild::new(name, &program(name)).args(words).start();
         (child.wait_for_end(SOON).code().unwrap(), child.lines())
     };
     for (kind, checker, verb) in [
@@ -232,7 +232,7 @@ fn a_skill_of_a_component_is_found_and_run_to_its_result() {
     };
     let yaml =
         Path::new(env!("CARGO_MANIFEST_DIR")).join("../examples/plant/parallel-gripper.yaml");
-    let _component = Started::new("ua-component", &program("ua-component"))
+    let _component = StartedChild::new("ua-component", &program("ua-component"))
         .args([yaml.to_str().unwrap(), "--interface", "lo", "--lds", "none"])
         .args(["--pki".into(), cell.folder().join("pki")])
         .start();
@@ -299,7 +299,7 @@ fn completed(line: &[&str]) -> Vec<String> {
         words.join(" "),
         line.len(),
     );
-    let mut child = Started::new("bash", Path::new("/bin/bash"))
+    let mut child = StartedChild::new("bash", Path::new("/bin/bash"))
         .args(["--norc", "-c", &script])
         .start();
     assert!(child.wait_for_end(SOON).success(), "{child}");
@@ -323,7 +323,7 @@ fn skills_of_two_components_are_told_run_watched_and_completed_by_their_names() 
     };
     let examples = Path::new(env!("CARGO_MANIFEST_DIR")).join("../examples/plant");
     let _components = ["parallel-gripper.yaml", "vacuum-gripper.yaml"].map(|yaml| {
-        Started::new("ua-component", &program("ua-component"))
+        StartedChild::new("ua-component", &program("ua-component"))
             .args([examples.join(yaml)])
             .args(["--interface", "lo", "--lds", "none"])
             .args(["--pki".into(), cell.folder().join("pki")])
@@ -341,7 +341,7 @@ fn skills_of_two_components_are_told_run_watched_and_completed_by_their_names() 
     assert_eq!(completed(&["skills", "--interface", "lo", "w"]), ["watch"]);
     completes_names();
 
-    let mut watch = Started::new("ua-space", &program("ua-space"))
+    let mut watch = StartedChild::new("ua-space", &program("ua-space"))
         .args(["skills", "watch", "vacuum-gripper", "--json"])
         .args(["--interface", "lo"])
         .start();
@@ -420,7 +420,7 @@ fn tshark_reads_what_a_component_and_its_caller_say() {
     let group = UadpSocket::join();
     let yaml =
         Path::new(env!("CARGO_MANIFEST_DIR")).join("../examples/plant/parallel-gripper.yaml");
-    let _component = Started::new("ua-component", &program("ua-component"))
+    let _component = StartedChild::new("ua-component", &program("ua-component"))
         .args([yaml.to_str().unwrap(), "--interface", "lo", "--lds", "none"])
         .args(["--pki".into(), cell.folder().join("pki")])
         .start();
@@ -429,7 +429,7 @@ fn tshark_reads_what_a_component_and_its_caller_say() {
     });
     assert_eq!(ua_space(&["call", "parallel-gripper.Grasp"]).0, 0);
     let heard = group.receive_for(Duration::from_millis(200));
-    let shown = cell.dissect(&Capture::of(heard), &[]);
+    let shown = cell.dissect(&CaptureFile::of(heard), &[]);
     for shown in &shown {
         let wrong = shown.has("uadp.malformed") || shown.has("uadp.dissector_bug");
         assert!(!wrong, "{:?}: {shown:?}", shown.expert_infos());

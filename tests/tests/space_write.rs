@@ -6,7 +6,7 @@ use std::time::Duration;
 use nix::sys::signal::Signal;
 use serde_json::{Value, json};
 use system_tests::{
-    Cell, Child, METRICS_ROS1, Peer, SERVER_ENDPOINT, Started, eventually, program,
+    Cell, Child, METRICS_ROS1, Peer, SERVER_ENDPOINT, StartedChild, eventually, program,
 };
 
 const SOON: Duration = Duration::from_secs(30);
@@ -21,7 +21,7 @@ server: {security: [None]}
 
 /// Runs `ua-space write`. Returns the exit code, the objects of stdout, and all output.
 fn write(words: &[&str]) -> (i32, Vec<Value>, String) {
-    let mut child = Started::new("ua-space", &program("ua-space"))
+    let mut child = StartedChild::new("ua-space", &program("ua-space"))
         .args(["write"])
         .args(words)
         .args(["--json", "--interface", "lo"])
@@ -157,7 +157,7 @@ fn beside_a_server_a_value_is_written_at_the_server() {
 
 /// Starts `ua-space tap` at the bridge.
 fn tap(words: &[&str]) -> Child {
-    Started::new("ua-space", &program("ua-space"))
+    StartedChild::new("ua-space", &program("ua-space"))
         .args(["tap", "--metrics", METRICS_ROS1, "--json"])
         .args(words)
         .ends_on(Signal::SIGINT)
@@ -255,7 +255,7 @@ fn the_samples_of_a_topic_are_followed_and_written_as_a_trace_and_a_drawing() {
             "--interface",
             "lo",
         ];
-        let mut child = Started::new("ua-space", &program("ua-space"))
+        let mut child = StartedChild::new("ua-space", &program("ua-space"))
             .args(words)
             .args(files)
             .start();

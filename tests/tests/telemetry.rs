@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use nix::sys::signal::Signal;
 use serde_json::{Value, json};
-use system_tests::{Cell, Peer, Started, program};
+use system_tests::{Cell, Peer, StartedChild, program};
 
 const SOON: Duration = Duration::from_secs(60);
 
@@ -55,7 +55,7 @@ fn a_collector_parses_the_counters_delays_and_sampled_traces_of_a_cell() {
     let _node = cell.rospy("ros1_pub.py", &words);
     let mut collector = cell.asyncua("otlp_collector.py", &[]);
     let words = ["trace", "--otlp", "http://127.0.0.1:4318", "--traces", "2"];
-    let mut exporter = Started::new("ua-space", &program("ua-space"))
+    let mut exporter = StartedChild::new("ua-space", &program("ua-space"))
         .args(words)
         .args(["--seconds", "0.5", "--interface", "lo"])
         .start();

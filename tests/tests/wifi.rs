@@ -4,7 +4,7 @@
 use std::time::Duration;
 
 use serde_json::Value;
-use system_tests::{Cell, HERE, Peer, Started, THERE, Wire, program};
+use system_tests::{Cell, HERE, Peer, StartedChild, THERE, WireEffect, program};
 
 const SOON: Duration = Duration::from_secs(60);
 const TOPIC: [&str; 2] = ["/ua_1_5_10", "std_msgs/String"];
@@ -25,14 +25,14 @@ fn arrive_with(loss: f64, missing: usize) {
     let Some(cell) = Cell::with(&[Peer::Ros1, Peer::Python]) else {
         return;
     };
-    let host = cell.host(Wire {
+    let host = cell.host(WireEffect {
         loss,
         delay: Duration::from_millis(3),
     });
     let _master = cell.roscore();
     let here = mapping(&cell, "here.yaml", [HERE, THERE]);
     let there = mapping(&cell, "there.yaml", [THERE, HERE]);
-    let bridge = |name: &str| Started::new(name, &program(name));
+    let bridge = |name: &str| StartedChild::new(name, &program(name));
     let _ros1 = cell.with_ros1(bridge("bridge-ros1")).args([here]).start();
     let _ros2 = bridge("bridge-ros2")
         .args([&there[..], "--domain", "2"])

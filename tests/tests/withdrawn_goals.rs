@@ -6,7 +6,7 @@ use std::time::Duration;
 use nix::sys::signal::Signal;
 use serde_json::{Value, json};
 use system_tests::{
-    Cell, Child, Distribution, METRICS_ROS2, Peer, Started, eventually, metrics, program,
+    Cell, Child, Distribution, METRICS_ROS2, Peer, StartedChild, eventually, metrics, program,
 };
 use system_tests::{METRICS_SERVER, SERVER_ENDPOINT};
 
@@ -42,7 +42,7 @@ fn cancelled(server: &mut Child, order: i32) {
 }
 
 fn call(words: &[&str]) -> Child {
-    Started::new("ua-space", &program("ua-space"))
+    StartedChild::new("ua-space", &program("ua-space"))
         .args(["call"])
         .args(words)
         .args(["--interface", "lo", "--wait", "30", "--json"])
@@ -137,7 +137,7 @@ skills:
   - {name: Leaving, type: GraspSkillType, driver: {action: {name: ua_2_2_80, goal: {order: 204}, results: {Gripped: true}}}}
 ",
     );
-    let mut component = Started::new("ua-component", &program("ua-component"))
+    let mut component = StartedChild::new("ua-component", &program("ua-component"))
         .args([&component])
         .args(["--interface", "lo", "--metrics", COMPONENT_METRICS])
         .start();

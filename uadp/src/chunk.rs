@@ -1,6 +1,6 @@
 //! Sends messages that exceed a NetworkMessage in chunks (OPC 10000-14, 7.2.4.4.4).
 
-use crate::header_writer::{self, Extras, Form, PayloadHeader};
+use crate::header_writer::{self, Extras, MessageForm, PayloadHeader};
 use crate::{EncodeError, NetworkHeader, NetworkMessageType};
 use alloc::vec::Vec;
 
@@ -49,9 +49,9 @@ pub struct PlacedChunk {
 /// ```
 /// use std::time::Duration;
 /// use uadp::{
-///     ChunkBudget, Chunks, DataSetHeader, DataSetMessage, Extras, NetworkHeader, NetworkMessage,
-///     NetworkMessageEncoder, NetworkMessageType, PublisherId, Reassembler, Scalar, Variant, Whole,
-/// };
+///     ChunkBudget, ChunkEncoder, DataSetHeader, DataSetMessage, Extras, NetworkHeader,
+///     NetworkMessage, NetworkMessageEncoder, NetworkMessageType, PublisherId, Reassembler, Scalar,
+///     Variant, Whole, };
 ///
 /// // A DataSetMessage alone: what stands behind the smallest NetworkMessage header, its one byte of flags.
 /// let mut encoded = Vec::new();
@@ -69,7 +69,7 @@ pub struct PlacedChunk {
 /// };
 ///
 /// let header = NetworkHeader { publisher_id: Some(PublisherId::UInt16(2)), ..NetworkHeader::default() };
-/// let mut chunks = Chunks::new(&header, &Extras::default(), whole, ChunkBudget::IPV4)?;
+/// let mut chunks = ChunkEncoder::new(&header, &Extras::default(), whole, ChunkBudget::IPV4)?;
 /// let mut datagrams = Vec::new();
 /// let mut buffer = Vec::new();
 /// while let Some(chunk) = chunks.append(&mut buffer, &Extras::default()) {
@@ -91,7 +91,7 @@ pub struct PlacedChunk {
 /// # Ok::<(), Box<dyn std::error::Error>>(())
 /// ```
 #[derive(Debug, Clone)]
-pub struct Chunks<'a> {
+pub struct ChunkEncoder<'a> {
     header: NetworkHeader<'a>,
     whole: Whole<'a>,
     total_size: u32,
@@ -145,7 +145,7 @@ impl ChunkBudget {
     }
 }
 
-impl<'a> Chunks<'a> {
+impl<'a> ChunkEncoder<'a> {
     /// Prepares the chunks. `header` is the header of the first chunk. `extras` have the size of
     /// the extras of each chunk, including the length of the nonce.
     ///
@@ -280,7 +280,7 @@ fn write_headers(
     whole: Whole<'_>,
     extras: &Extras<'_>,
 ) -> Result<(), EncodeError> {
-    let form = Form {
+    let form = MessageForm {
         message_type: whole.message_type,
         chunk: true,
         action: false,

@@ -1,6 +1,6 @@
 //! DataSetMessage: decodes the header and iterates over the fields.
 
-use crate::reader::Reader;
+use crate::reader::ByteReader;
 use crate::{DataValue, DateTime, DecodeError, DeltaNull, Variant};
 
 /// A DataSetMessage with decoded header (OPC 10000-14, 7.2.4.5.4).
@@ -13,7 +13,7 @@ pub struct DataSetMessage<'a> {
     /// Kind of the payload.
     pub kind: MessageKind,
     head: Head<'a>,
-    payload: Reader<'a>,
+    payload: ByteReader<'a>,
 }
 
 /// The header fields of a DataSetMessage. Fields that are `None` are not encoded.
@@ -72,7 +72,7 @@ pub enum FieldEncoding {
 #[derive(Debug, Clone)]
 pub struct Fields<'a> {
     block: &'a [u8],
-    reader: Reader<'a>,
+    reader: ByteReader<'a>,
     count: u16,
     left: u16,
 }
@@ -80,7 +80,7 @@ pub struct Fields<'a> {
 /// Iterator over the fields of a DataSetMessage, except RawData. It ends like [`Fields`].
 #[derive(Debug, Clone)]
 pub struct FieldValues<'a> {
-    reader: Reader<'a>,
+    reader: ByteReader<'a>,
     next: u16,
     left: u16,
     indexed: bool,
@@ -117,14 +117,14 @@ impl<'a> DataSetMessage<'a> {
     /// # Errors
     /// Fails like an item of [`NetworkMessage::messages`](crate::NetworkMessage::messages).
     pub fn decode(writer_id: Option<u16>, bytes: &'a [u8]) -> Result<Self, DecodeError> {
-        Self::read(writer_id, Reader::new(bytes))
+        Self::read(writer_id, ByteReader::new(bytes))
     }
 
     /// Decodes the header of the message. `reader` holds exactly this message.
     #[inline]
     pub(crate) fn read(
         writer_id: Option<u16>,
-        mut reader: Reader<'a>,
+        mut reader: ByteReader<'a>,
     ) -> Result<Self, DecodeError> {
         let flags1 = reader.u8("DataSetFlags1")?;
         let valid = flags1 & VALID != 0;
@@ -159,7 +159,7 @@ impl<'a> DataSetMessage<'a> {
         match self.head.flags1 & SEQUENCE_NUMBER {
             0 => None,
             // It is the first field.
-            _ => Reader::new(self.head.fields)
+            _ => ByteReader::new(self.head.fields)
                 .u16("DataSetMessageSequenceNumber")
                 .ok(),
         }
@@ -270,7 +270,7 @@ impl<'a> FieldValues<'a> {
 
     fn stop(&mut self) {
         self.left = 0;
-        self.reader = Reader::new(&[]);
+        self.reader = ByteReader::new(&[]);
     }
 }
 
@@ -308,7 +308,7 @@ impl FieldValue<'_> {
 impl<'a> Fields<'a> {
     const NONE: Self = Self {
         block: &[0, 0],
-        reader: Reader::new(&[]),
+        reader: ByteReader::new(&[]),
         count: 0,
         left: 0,
     };
@@ -320,7 +320,7 @@ impl<'a> Fields<'a> {
     /// Fails if the FieldCount is truncated or exceeds the number of following bytes.
     #[inline]
     pub fn parse(block: &'a [u8]) -> Result<Self, DecodeError> {
-        let mut reader = Reader::new(block);
+        let mut reader = ByteReader::new(block);
         let count = reader.u16("FieldCount")?;
         if usize::from(count) > reader.remaining() {
             return Err(DecodeError::Limit {
@@ -381,7 +381,7 @@ impl<'a> Fields<'a> {
     /// # Errors
     /// Fails with the error of the first invalid field.
     pub fn checked_bytes(&self) -> Result<&'a [u8], DecodeError> {
-        let start = Reader::new(self.block);
+        let start = ByteReader::new(self.block);
         let mut reader = start;
         reader.u16("FieldCount")?;
         for _ in 0..self.count {
@@ -403,14 +403,14 @@ impl<'a> Iterator for Fields<'a> {
                 let field = Variant::read(&mut self.reader);
                 if field.is_err() {
                     self.left = 0;
-                    self.reader = Reader::new(&[]);
+                    self.reader = ByteReader::new(&[]);
                 }
                 Some(field)
             }
             None if self.reader.remaining() == 0 => None,
             None => {
                 let padding = self.reader.rest();
-                self.reader = Reader::new(&[]);
+                self.reader = ByteReader::new(&[]);
                 check_padding(padding).err().map(Err)
             }
         }
@@ -439,7 +439,7 @@ impl<'a> Head<'a> {
     #[inline]
     pub(crate) fn read<K>(
         flags1: u8,
-        reader: &mut Reader<'a>,
+        reader: &mut ByteReader<'a>,
         read_kind: impl FnOnce(u8) -> Result<K, DecodeError>,
     ) -> Result<(Self, K), DecodeError> {
         let flags2 = match flags1 & FLAGS2 {
@@ -503,7 +503,7 @@ impl<'a> Head<'a> {
 
     #[inline]
     fn read_fields(&self) -> Result<DataSetHeader, DecodeError> {
-        let mut reader = Reader::new(self.fields);
+        let mut reader = ByteReader::new(self.fields);
         let sequence_number = match self.flags1 & SEQUENCE_NUMBER {
             0 => None,
             _ => Some(reader.u16("DataSetMessageSequenceNumber")?),

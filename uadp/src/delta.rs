@@ -16,7 +16,7 @@ pub enum DeltaNull {
 
 /// Result of applying a delta frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
-pub struct Merged {
+pub struct MergedFrame {
     /// Entries that replaced a field.
     pub applied: usize,
     /// Entries ignored as filler.
@@ -39,21 +39,21 @@ impl DeltaNull {
     /// Replaces the fields of the last key frame with the entries, each a FieldIndex and a value.
     /// `is_null` returns true for the null Variant.
     /// ```
-    /// use uadp::{DeltaNull, Merged, Scalar, Variant};
+    /// use uadp::{DeltaNull, MergedFrame, Scalar, Variant};
     ///
     /// let mut fields = [Variant::Scalar(Scalar::Boolean(true)), Variant::Scalar(Scalar::Int32(1))];
     /// let entries = [(1, Variant::Scalar(Scalar::Int32(2))), (0, Variant::Null)];
     /// let merged = DeltaNull::Filler.merge(&mut fields, entries, |value| *value == Variant::Null);
     /// assert_eq!(fields, [Scalar::Boolean(true), Scalar::Int32(2)].map(Variant::Scalar));
-    /// assert_eq!(merged, Merged { applied: 1, filler: 1, unknown: 0 });
+    /// assert_eq!(merged, MergedFrame { applied: 1, filler: 1, unknown: 0 });
     /// ```
     pub fn merge<T>(
         self,
         fields: &mut [T],
         entries: impl IntoIterator<Item = (u16, T)>,
         is_null: impl Fn(&T) -> bool,
-    ) -> Merged {
-        let mut merged = Merged::default();
+    ) -> MergedFrame {
+        let mut merged = MergedFrame::default();
         for (index, value) in entries {
             if !self.applies(index, is_null(&value)) {
                 merged.filler += 1;

@@ -2,9 +2,10 @@
 //! 7.2.4.6).
 //!
 //! A [`Probe`] or [`Announcement`] is the payload of a [`NetworkMessage`] of a separate
-//! [type](crate::NetworkMessageType). Decoding allocates nothing: arrays are [`List`]s over the
-//! checked bytes of the datagram, and ExtensionObjects are decoded on demand with the [`Settings`]
-//! of UADP and datagrams. The same structures are encoded, with lists that borrow slices.
+//! [type](crate::NetworkMessageType). Decoding allocates nothing: arrays are [`WireArray`]s over
+//! the checked bytes of the datagram, and ExtensionObjects are decoded on demand with the
+//! [`SettingsStructure`] of UADP and datagrams. The same structures are encoded, with lists that
+//! borrow slices.
 //!
 //! A message larger than DiscoveryMaxMessageSize (4096 bytes unless configured: OPC 10000-14,
 //! 6.4.1.2.4) is sent in chunks of the bytes that [`encode_body`](Announcement::encode_body)
@@ -17,11 +18,9 @@
 //! # Announcing the content of a DataSet
 //! ```
 //! use uadp::discovery::{
-//!     Announced, Announcement, ConfigurationVersion, DataSetMetaDataType, FieldMetaData, List, VersionMatch,
-//! };
-//! use uadp::{
-//!     BuiltinType, DataSetHeader, DecodeError, Guid, NetworkMessage, NodeId, PublisherId, SecurityHeader, StatusCode,
-//! };
+//!     AnnouncedContent, Announcement, ConfigurationVersion, DataSetMetaDataType, FieldMetaData,
+//!     WireArray, VersionMatch, }; use uadp::{ BuiltinType, DataSetHeader, DecodeError, Guid,
+//!     NetworkMessage, NodeId, PublisherId, SecurityHeader, StatusCode, };
 //!
 //! let fields = [
 //!     FieldMetaData {
@@ -37,17 +36,17 @@
 //!         built_in_type: BuiltinType::Double.id(),
 //!         data_type: NodeId::numeric(0, 11),
 //!         value_rank: 1,
-//!         array_dimensions: List::new(&[3]),
+//!         array_dimensions: WireArray::new(&[3]),
 //!         ..FieldMetaData::default()
 //!     },
 //! ];
 //! let announcement = Announcement {
 //!     sequence_number: 7,
-//!     announced: Announced::DataSetMetaData {
+//!     announced: AnnouncedContent::DataSetMetaData {
 //!         writer_id: 10,
 //!         meta_data: DataSetMetaDataType {
 //!             name: Some("robot_status"),
-//!             fields: List::new(&fields),
+//!             fields: WireArray::new(&fields),
 //!             configuration_version: ConfigurationVersion { major: 700_000_000, minor: 700_000_000 },
 //!             ..DataSetMetaDataType::default()
 //!         },
@@ -61,12 +60,10 @@
 //! assert_eq!(message.header().publisher_id, Some(PublisherId::UInt16(2)));
 //! let heard = Announcement::decode(&message)?;
 //! assert_eq!(heard.sequence_number, 7);
-//! let Announced::DataSetMetaData { writer_id: 10, meta_data, status: StatusCode::GOOD } = heard.announced else {
-//!     panic!("{heard:?}");
-//! };
-//! let (index, pose) = meta_data.field_by_name("pose").unwrap();
-//! assert_eq!((index, pose.builtin_type()), (1, Some(BuiltinType::Double)));
-//! assert_eq!(pose.array_dimensions.iter().collect::<Vec<_>>(), [3]);
+//! let AnnouncedContent::DataSetMetaData { writer_id: 10, meta_data, status: StatusCode::GOOD } =
+//! heard.announced else { panic!("{heard:?}"); }; let (index, pose) =
+//! meta_data.field_by_name("pose").unwrap(); assert_eq!((index, pose.builtin_type()), (1,
+//! Some(BuiltinType::Double))); assert_eq!(pose.array_dimensions.iter().collect::<Vec<_>>(), [3]);
 //!
 //! let header = DataSetHeader { major_version: Some(700_000_000), ..DataSetHeader::default() };
 //! assert_eq!(meta_data.configuration_version.compare(&header), VersionMatch::Same);
@@ -87,12 +84,12 @@ mod wire;
 
 pub use crate::ConfigurationVersion;
 pub use announcement::{
-    ActionMetaData, ActionMethodDataType, ActionTargetDataType, Announced, Announcement,
+    ActionMetaData, ActionMethodDataType, ActionTargetDataType, AnnouncedContent, Announcement,
     ConnectionState, CyclicStatus,
 };
 pub use announcer::{
-    AnnounceCounters, AnnounceLimits, AnnounceRefusal, Announcer, DueAnnouncement, Included,
-    Subject,
+    AnnounceCounters, AnnounceLimits, AnnounceRefusal, AnnouncedSubject, Announcer,
+    DueAnnouncement, Included,
 };
 pub use configuration::{
     DataSetReaderDataType, DataSetWriterDataType, KeyValuePair, PubSubConnectionDataType,
@@ -102,7 +99,7 @@ pub use endpoint::{
     ApplicationDescription, ApplicationType, EndpointDescription, MessageSecurityMode,
     UserTokenPolicy, UserTokenType,
 };
-pub use list::{List, ListIter};
+pub use list::{ListIter, WireArray};
 pub use meta_data::{
     DataSetMetaDataType, DataTypeSchemaHeader, EnumDefinition, EnumDescription, EnumField,
     FieldMetaData, SimpleTypeDescription, StructureDefinition, StructureDescription,
@@ -114,11 +111,11 @@ pub use property::{EUInformation, EnumValueType, Range, enum_strings, strings};
 pub use settings::{
     DataSetOrderingType, DatagramConnectionTransport2DataType, DatagramConnectionTransportDataType,
     DatagramWriterGroupTransport2DataType, DatagramWriterGroupTransportDataType,
-    NetworkAddressUrlDataType, Settings, UadpDataSetWriterMessageDataType,
+    NetworkAddressUrlDataType, SettingsStructure, UadpDataSetWriterMessageDataType,
     UadpWriterGroupMessageDataType,
 };
 
-use crate::header_writer::{self, Extras, Form, PayloadHeader};
+use crate::header_writer::{self, Extras, MessageForm, PayloadHeader};
 use crate::{
     DecodeError, EncodeError, NetworkHeader, NetworkMessage, NetworkMessageType, PublisherId,
     SecurityHeader,
@@ -150,7 +147,7 @@ fn write_headers(
         publisher_id: Some(publisher_id),
         ..NetworkHeader::default()
     };
-    let form = Form {
+    let form = MessageForm {
         message_type,
         chunk: false,
         action: false,

@@ -3,7 +3,7 @@
 use crate::action::ActionHeader;
 use crate::data_set_message as message;
 use crate::field_encoder::{DataValueEncoder, DeltaEncoder, FieldEncoder};
-use crate::header_writer::{self, Extras, Form, PayloadHeader};
+use crate::header_writer::{self, Extras, MessageForm, PayloadHeader};
 use crate::writer::flag;
 use crate::{DataSetHeader, EncodeError, NetworkHeader, NetworkMessageType, Seal, writer};
 use alloc::vec::Vec;
@@ -16,7 +16,7 @@ use alloc::vec::Vec;
 #[must_use = "a message is complete with `finish`"]
 pub struct NetworkMessageEncoder<'b> {
     pub(crate) buf: &'b mut Vec<u8>,
-    pub(crate) progress: Progress,
+    pub(crate) progress: PayloadProgress,
     timestamp_at: Option<usize>,
     /// Offsets of the NetworkMessage and of its payload in the buffer.
     start: usize,
@@ -30,7 +30,7 @@ pub struct NetworkMessageEncoder<'b> {
 
 /// Progress of the payload.
 #[derive(Debug)]
-pub(crate) struct Progress {
+pub(crate) struct PayloadProgress {
     /// Number of DataSetMessages that the payload header announces.
     announced: usize,
     written: usize,
@@ -42,7 +42,7 @@ pub(crate) struct Progress {
     configured_size: usize,
 }
 
-impl Progress {
+impl PayloadProgress {
     /// Counts the DataSetMessage at the end of the buffer and patches its size.
     #[inline]
     pub(crate) fn message_finished(&mut self, buf: &mut Vec<u8>) -> Result<(), EncodeError> {
@@ -122,7 +122,7 @@ impl<'b> NetworkMessageEncoder<'b> {
             buf,
             header,
             ids,
-            Form {
+            MessageForm {
                 message_type: NetworkMessageType::DataSet,
                 chunk: false,
                 action: action.is_some(),
@@ -139,7 +139,7 @@ impl<'b> NetworkMessageEncoder<'b> {
             buf.resize(sizes_at + announced * 2, 0);
             sizes_at
         });
-        let progress = Progress {
+        let progress = PayloadProgress {
             announced,
             written: 0,
             sizes_at,
@@ -356,7 +356,7 @@ impl<'b> NetworkMessageEncoder<'b> {
 
     #[inline]
     const fn check_finished(&self) -> Result<(), EncodeError> {
-        let Progress {
+        let PayloadProgress {
             announced,
             written,
             end,
@@ -385,7 +385,7 @@ impl<'b> NetworkMessageEncoder<'b> {
 
     #[inline]
     pub(crate) fn begin_message(&mut self) -> Result<(), EncodeError> {
-        let Progress {
+        let PayloadProgress {
             announced,
             written,
             end,
@@ -404,7 +404,7 @@ impl<'b> NetworkMessageEncoder<'b> {
 
 /// Offsets in the buffer of header fields that are patched when a message is sent again.
 #[derive(Debug, Clone, Copy, Default)]
-pub(crate) struct Offsets {
+pub(crate) struct HeaderOffsets {
     pub(crate) sequence_number: Option<usize>,
     pub(crate) timestamp: Option<usize>,
 }
@@ -417,7 +417,7 @@ pub(crate) fn write_data_set_header(
     kind: u8,
     encoding: u8,
     counted: bool,
-) -> Offsets {
+) -> HeaderOffsets {
     let flags2 = kind
         | flag(header.timestamp.is_some(), message::TIMESTAMP)
         | flag(header.picoseconds.is_some(), message::PICOSECONDS);
@@ -459,7 +459,7 @@ pub(crate) fn write_data_set_header(
         if counted {
             fixed.put([0; 2]);
         }
-        Offsets {
+        HeaderOffsets {
             sequence_number,
             timestamp,
         }

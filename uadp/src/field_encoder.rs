@@ -1,6 +1,6 @@
 //! Encodes the fields of a key frame, including structures.
 
-use crate::encoder::{Offsets, Progress};
+use crate::encoder::{HeaderOffsets, PayloadProgress};
 use crate::scalar::{BINARY_BODY, Scalar};
 use crate::{BuiltinType, DataValue, EncodeError, NodeId, Variant, variant, writer};
 use alloc::vec::Vec;
@@ -14,8 +14,8 @@ use alloc::vec::Vec;
 #[must_use = "a message is complete with `finish`"]
 pub struct FieldEncoder<'m> {
     buf: &'m mut Vec<u8>,
-    progress: &'m mut Progress,
-    offsets: Offsets,
+    progress: &'m mut PayloadProgress,
+    offsets: HeaderOffsets,
     /// Offset of the FieldCount.
     count_at: usize,
     fields: usize,
@@ -60,7 +60,11 @@ impl<'m> FieldEncoder<'m> {
 
     /// Creates an encoder. The buffer ends with the space for the FieldCount.
     #[inline]
-    pub(crate) fn new(buf: &'m mut Vec<u8>, progress: &'m mut Progress, offsets: Offsets) -> Self {
+    pub(crate) fn new(
+        buf: &'m mut Vec<u8>,
+        progress: &'m mut PayloadProgress,
+        offsets: HeaderOffsets,
+    ) -> Self {
         let count_at = buf.len().saturating_sub(2);
         Self {
             buf,

@@ -1,6 +1,6 @@
 //! The headers of a NetworkMessage and their flags.
 
-use crate::reader::Reader;
+use crate::reader::ByteReader;
 use crate::{DateTime, DecodeError, Guid};
 
 /// The header fields before the payload. Fields that are `None` are not encoded.
@@ -75,15 +75,15 @@ pub struct GroupHeader {
 
 /// The first one to three bytes; an omitted byte is 0.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Flags {
+pub(crate) struct HeaderFlags {
     pub(crate) uadp: u8,
     pub(crate) extended1: u8,
     pub(crate) extended2: u8,
 }
 
-impl Flags {
+impl HeaderFlags {
     #[inline]
-    pub(crate) fn read(reader: &mut Reader<'_>) -> Result<Self, DecodeError> {
+    pub(crate) fn read(reader: &mut ByteReader<'_>) -> Result<Self, DecodeError> {
         let uadp = reader.u8("UADPFlags")?;
         if uadp & VERSION_MASK != VERSION {
             return Err(reserved("UADPVersion", uadp & VERSION_MASK));
@@ -116,7 +116,7 @@ impl Flags {
     }
 }
 
-fn read_extended_flags2(reader: &mut Reader<'_>) -> Result<u8, DecodeError> {
+fn read_extended_flags2(reader: &mut ByteReader<'_>) -> Result<u8, DecodeError> {
     let flags = reader.u8("ExtendedFlags2")?;
     if flags & EXTENDED2_RESERVED != 0 {
         return Err(reserved("ExtendedFlags2", flags & EXTENDED2_RESERVED));
@@ -142,7 +142,7 @@ fn reserved(field: &'static str, value: u8) -> DecodeError {
 impl<'a> PublisherId<'a> {
     /// Skips and checks an id.
     #[inline]
-    pub(crate) fn skip(id_type: u8, reader: &mut Reader<'a>) -> Result<(), DecodeError> {
+    pub(crate) fn skip(id_type: u8, reader: &mut ByteReader<'a>) -> Result<(), DecodeError> {
         let size = match id_type {
             PUBLISHER_ID_BYTE => 1,
             PUBLISHER_ID_UINT16 => 2,
@@ -154,7 +154,7 @@ impl<'a> PublisherId<'a> {
     }
 
     #[inline]
-    pub(crate) fn read(id_type: u8, reader: &mut Reader<'a>) -> Result<Self, DecodeError> {
+    pub(crate) fn read(id_type: u8, reader: &mut ByteReader<'a>) -> Result<Self, DecodeError> {
         Ok(match id_type {
             PUBLISHER_ID_BYTE => Self::Byte(reader.u8("PublisherId")?),
             PUBLISHER_ID_UINT16 => Self::UInt16(reader.u16("PublisherId")?),
@@ -187,7 +187,7 @@ impl<'a> PublisherId<'a> {
 impl GroupHeader {
     /// Skips and checks a group header.
     #[inline]
-    pub(crate) fn skip(reader: &mut Reader<'_>) -> Result<(), DecodeError> {
+    pub(crate) fn skip(reader: &mut ByteReader<'_>) -> Result<(), DecodeError> {
         let mut ahead = *reader;
         let flags = ahead.u8("GroupFlags")?;
         let size = usize::from(flags & WRITER_GROUP_ID) * 2
@@ -203,7 +203,7 @@ impl GroupHeader {
     }
 
     #[inline]
-    pub(crate) fn read(reader: &mut Reader<'_>) -> Result<Self, DecodeError> {
+    pub(crate) fn read(reader: &mut ByteReader<'_>) -> Result<Self, DecodeError> {
         let flags = reader.u8("GroupFlags")?;
         let reserved = flags & GROUP_RESERVED;
         if reserved != 0 {
@@ -254,7 +254,7 @@ impl<'a> SecurityHeader<'a> {
         self.signed || self.encrypted
     }
 
-    pub(crate) fn read(reader: &mut Reader<'a>) -> Result<Self, DecodeError> {
+    pub(crate) fn read(reader: &mut ByteReader<'a>) -> Result<Self, DecodeError> {
         let flags = reader.u8("SecurityFlags")?;
         let unknown = flags & !(SIGNED | ENCRYPTED | FOOTER | KEY_RESET);
         if unknown != 0 {

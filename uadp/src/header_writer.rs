@@ -3,7 +3,7 @@
 use crate::header::{
     self, GroupHeader, NetworkHeader, NetworkMessageType, PublisherId, SecurityHeader,
 };
-use crate::writer::{self, Room, flag};
+use crate::writer::{self, ReservedSpace, flag};
 use crate::{EncodeError, Variant};
 use alloc::vec::Vec;
 
@@ -29,7 +29,7 @@ pub(crate) enum PayloadHeader<'a> {
 
 /// Properties of a NetworkMessage that differ from a plain message with DataSetMessages.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Form<'a> {
+pub(crate) struct MessageForm<'a> {
     pub(crate) message_type: NetworkMessageType,
     pub(crate) chunk: bool,
     /// The payload starts with an ActionHeader.
@@ -40,7 +40,7 @@ pub(crate) struct Form<'a> {
 /// Maximum number of contiguous bytes of fixed size: flags, PublisherId, DataSetClassId, group
 /// header, a single DataSetWriterId, Timestamp and PicoSeconds.
 const ROOM: usize = 64;
-type Fixed<'b> = Room<'b, ROOM>;
+type Fixed<'b> = ReservedSpace<'b, ROOM>;
 
 /// Appends all headers before the payload. Returns the offset of the Timestamp, if there is a
 /// Timestamp.
@@ -49,7 +49,7 @@ pub(crate) fn write(
     buf: &mut Vec<u8>,
     header: &NetworkHeader<'_>,
     payload_header: PayloadHeader<'_>,
-    form: Form<'_>,
+    form: MessageForm<'_>,
 ) -> Result<Option<usize>, EncodeError> {
     let start = buf.len();
     let timestamp_at = match (header.publisher_id, payload_header) {
@@ -80,7 +80,7 @@ fn write_in_parts(
     buf: &mut Vec<u8>,
     header: &NetworkHeader<'_>,
     payload_header: PayloadHeader<'_>,
-    form: Form<'_>,
+    form: MessageForm<'_>,
 ) -> Result<Option<usize>, EncodeError> {
     writer::with_room(buf, |fixed| {
         write_flags(fixed, header, payload_header, form);
@@ -151,7 +151,7 @@ fn write_flags(
     fixed: &mut Fixed<'_>,
     header: &NetworkHeader<'_>,
     payload_header: PayloadHeader<'_>,
-    form: Form<'_>,
+    form: MessageForm<'_>,
 ) {
     let extended2 = flag(form.chunk, header::CHUNK)
         | flag(form.action, header::ACTION_HEADER)

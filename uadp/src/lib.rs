@@ -9,7 +9,7 @@
 //! | fields as Variants or DataValues, in key frames, delta frames and events | [`DataSetMessage::fields`], [`DataSetMessage::values`] |
 //! | fields as RawData, decoded with their DataSetMetaData | [`RawLayout`] |
 //! | encoding into a buffer of the caller | [`NetworkMessageEncoder`] |
-//! | chunks | [`Chunks`], [`Reassembler`] |
+//! | chunks | [`ChunkEncoder`], [`Reassembler`] |
 //! | message security: PubSub-Aes128-CTR and PubSub-Aes256-CTR | [`Opener`], [`Sealer`] |
 //! | probes and announcements, DataSetMetaData | [`discovery`] |
 //! | requests and responses of Actions | [`action`] |
@@ -105,20 +105,20 @@ mod variant;
 mod writer;
 
 pub use builtin::{BuiltinType, Guid, StatusCode};
-pub use chunk::{ChunkBudget, ChunkError, Chunks, PlacedChunk, Whole};
+pub use chunk::{ChunkBudget, ChunkEncoder, ChunkError, PlacedChunk, Whole};
 pub use configuration_version::ConfigurationVersion;
 pub use data_set_message::{
     DataSetHeader, DataSetMessage, FieldEncoding, FieldValue, FieldValues, Fields, MessageKind,
 };
-pub use delta::{DeltaNull, Merged};
+pub use delta::{DeltaNull, MergedFrame};
 pub use encoder::NetworkMessageEncoder;
 pub use error::{DecodeError, EncodeError};
 pub use field_encoder::{DataValueEncoder, DeltaEncoder, FieldEncoder};
 pub use header::{GroupHeader, NetworkHeader, NetworkMessageType, PublisherId, SecurityHeader};
 pub use header_writer::Extras;
-pub use nested::{DataValue, DiagnosticInfo, Encoded, MAX_NESTING};
+pub use nested::{DataValue, DiagnosticInfo, MAX_NESTING, Nested};
 pub use network_message::{Chunk, Messages, NetworkMessage, PromotedFields};
-pub use node_id::{ExpandedNodeId, Identifier, NodeId};
+pub use node_id::{ExpandedNodeId, NodeId, NodeIdValue};
 pub use publisher_id::OwnedPublisherId;
 pub use raw::{
     RawArray, RawDialect, RawElements, RawField, RawFields, RawLayout, RawLayoutError,
@@ -126,12 +126,13 @@ pub use raw::{
     RawWriteFault,
 };
 pub use reassembler::{
-    ChunkRefusal, GiveUp, GivenUp, Reassembled, Reassembler, ReassemblyCounters, ReassemblyLimits,
+    ChunkRefusal, GiveUp, IncompleteWhole, Reassembled, Reassembler, ReassemblyCounters,
+    ReassemblyLimits,
 };
 pub use scalar::{ExtensionBody, ExtensionObject, LocalizedText, QualifiedName, Scalar};
 pub use security::{
-    CountedBy, KeyError, Keys, Opened, Opener, OpenerOptions, Seal, SealError, Sealer,
-    SecurityError, SecurityMode, SecurityPolicy,
+    CountedBy, KeyError, OpenedMessage, Opener, OpenerOptions, Seal, SealError, Sealer,
+    SecurityError, SecurityMode, SecurityPolicy, TokenKeys,
 };
 pub use sequence::SequenceOrder;
 pub use state::PubSubState;

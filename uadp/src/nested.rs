@@ -4,7 +4,7 @@ use alloc::vec::Vec;
 use core::fmt;
 use core::marker::PhantomData;
 
-use crate::reader::Reader;
+use crate::reader::ByteReader;
 use crate::{DateTime, DecodeError, EncodeError, StatusCode, Variant, writer};
 
 /// DataValue (OPC 10000-6, 5.2.2.17): a value with its quality and its times. Fields that are
@@ -42,25 +42,25 @@ pub struct DiagnosticInfo<'a> {
     /// StatusCode of the underlying system.
     pub inner_status_code: Option<StatusCode>,
     /// DiagnosticInfo of the underlying system.
-    pub inner: Option<Encoded<'a, Self>>,
+    pub inner: Option<Nested<'a, Self>>,
 }
 
 /// A value of type `T` in encoded form, checked when it was created. Nesting therefore needs no
 /// allocation.
 ///
 /// Equality compares the bytes.
-pub struct Encoded<'a, T> {
+pub struct Nested<'a, T> {
     bytes: &'a [u8],
     value: PhantomData<fn() -> T>,
 }
 
 /// A value that can be nested in another value.
 pub(crate) trait Nest<'a>: Sized {
-    fn read_nested(reader: &mut Reader<'a>, depth: Depth) -> Result<Self, DecodeError>;
+    fn read_nested(reader: &mut ByteReader<'a>, depth: Depth) -> Result<Self, DecodeError>;
 
     /// Skips and checks a value.
     #[inline]
-    fn skip(reader: &mut Reader<'a>, depth: Depth) -> Result<(), DecodeError> {
+    fn skip(reader: &mut ByteReader<'a>, depth: Depth) -> Result<(), DecodeError> {
         Self::read_nested(reader, depth).map(|_| ())
     }
 }
@@ -98,7 +98,7 @@ impl Depth {
 /// Skips `count` values.
 pub(crate) fn skip<'a, T: Nest<'a>>(
     count: usize,
-    reader: &mut Reader<'a>,
+    reader: &mut ByteReader<'a>,
     depth: Depth,
 ) -> Result<(), DecodeError> {
     for _ in 0..count {
@@ -108,13 +108,13 @@ pub(crate) fn skip<'a, T: Nest<'a>>(
 }
 
 #[expect(private_bounds, reason = "the three values that nest are all of them")]
-impl<'a, T: Nest<'a>> Encoded<'a, T> {
+impl<'a, T: Nest<'a>> Nested<'a, T> {
     /// Checks that the bytes are exactly a single value.
     ///
     /// # Errors
     /// Fails as decoding the value, and for bytes behind it.
     pub fn new(bytes: &'a [u8]) -> Result<Self, DecodeError> {
-        let mut reader = Reader::new(bytes);
+        let mut reader = ByteReader::new(bytes);
         let encoded = Self::read(&mut reader, Depth::FULL)?;
         match reader.remaining() {
             0 => Ok(encoded),
@@ -127,10 +127,10 @@ impl<'a, T: Nest<'a>> Encoded<'a, T> {
     /// # Errors
     /// Does not fail, because the bytes were checked before. The `Result` avoids a panic.
     pub fn get(self) -> Result<T, DecodeError> {
-        T::read_nested(&mut Reader::new(self.bytes), Depth::Checked)
+        T::read_nested(&mut ByteReader::new(self.bytes), Depth::Checked)
     }
 
-    pub(crate) fn read(reader: &mut Reader<'a>, depth: Depth) -> Result<Self, DecodeError> {
+    pub(crate) fn read(reader: &mut ByteReader<'a>, depth: Depth) -> Result<Self, DecodeError> {
         if depth == Depth::Checked {
             return Ok(Self::written(reader.take_rest()));
         }
@@ -140,7 +140,7 @@ impl<'a, T: Nest<'a>> Encoded<'a, T> {
     }
 }
 
-impl<'a, T> Encoded<'a, T> {
+impl<'a, T> Nested<'a, T> {
     /// Returns the encoded value.
     #[must_use]
     pub const fn bytes(self) -> &'a [u8] {
@@ -148,7 +148,7 @@ impl<'a, T> Encoded<'a, T> {
     }
 }
 
-impl<'a> Encoded<'a, Variant<'a>> {
+impl<'a> Nested<'a, Variant<'a>> {
     /// Encodes a Variant to the start of `buffer`, as an element of an array of Variants.
     ///
     /// # Errors
@@ -160,7 +160,7 @@ impl<'a> Encoded<'a, Variant<'a>> {
     }
 }
 
-impl<'a> Encoded<'a, DataValue<'a>> {
+impl<'a> Nested<'a, DataValue<'a>> {
     /// Encodes a DataValue to the start of `buffer`.
     ///
     /// # Errors
@@ -172,7 +172,7 @@ impl<'a> Encoded<'a, DataValue<'a>> {
     }
 }
 
-impl<'a> Encoded<'a, DiagnosticInfo<'a>> {
+impl<'a> Nested<'a, DiagnosticInfo<'a>> {
     /// Encodes a DiagnosticInfo to the start of `buffer`.
     ///
     /// # Errors
@@ -187,7 +187,7 @@ impl<'a> Encoded<'a, DiagnosticInfo<'a>> {
     }
 }
 
-impl<'a, T> Encoded<'a, T> {
+impl<'a, T> Nested<'a, T> {
     const fn written(bytes: &'a [u8]) -> Self {
         Self {
             bytes,
@@ -196,23 +196,23 @@ impl<'a, T> Encoded<'a, T> {
     }
 }
 
-impl<T> Clone for Encoded<'_, T> {
+impl<T> Clone for Nested<'_, T> {
     fn clone(&self) -> Self {
         *self
     }
 }
 
-impl<T> Copy for Encoded<'_, T> {}
+impl<T> Copy for Nested<'_, T> {}
 
-impl<T> PartialEq for Encoded<'_, T> {
+impl<T> PartialEq for Nested<'_, T> {
     fn eq(&self, other: &Self) -> bool {
         self.bytes == other.bytes
     }
 }
 
-impl<T> Eq for Encoded<'_, T> {}
+impl<T> Eq for Nested<'_, T> {}
 
-impl<'a, T: Nest<'a> + fmt::Debug> fmt::Debug for Encoded<'a, T> {
+impl<'a, T: Nest<'a> + fmt::Debug> fmt::Debug for Nested<'a, T> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self.get() {
             Ok(value) => value.fmt(f),
@@ -222,29 +222,29 @@ impl<'a, T: Nest<'a> + fmt::Debug> fmt::Debug for Encoded<'a, T> {
 }
 
 impl<'a> Nest<'a> for Variant<'a> {
-    fn read_nested(reader: &mut Reader<'a>, depth: Depth) -> Result<Self, DecodeError> {
+    fn read_nested(reader: &mut ByteReader<'a>, depth: Depth) -> Result<Self, DecodeError> {
         Self::read_at(reader, depth)
     }
 
     #[inline]
-    fn skip(reader: &mut Reader<'a>, depth: Depth) -> Result<(), DecodeError> {
+    fn skip(reader: &mut ByteReader<'a>, depth: Depth) -> Result<(), DecodeError> {
         Self::skip_at(reader, depth)
     }
 }
 
 impl<'a> Nest<'a> for DataValue<'a> {
-    fn read_nested(reader: &mut Reader<'a>, depth: Depth) -> Result<Self, DecodeError> {
+    fn read_nested(reader: &mut ByteReader<'a>, depth: Depth) -> Result<Self, DecodeError> {
         Self::read_at(reader, depth)
     }
 }
 
 impl<'a> DataValue<'a> {
     #[inline]
-    pub(crate) fn read(reader: &mut Reader<'a>) -> Result<Self, DecodeError> {
+    pub(crate) fn read(reader: &mut ByteReader<'a>) -> Result<Self, DecodeError> {
         Self::read_at(reader, Depth::FULL)
     }
 
-    fn read_at(reader: &mut Reader<'a>, depth: Depth) -> Result<Self, DecodeError> {
+    fn read_at(reader: &mut ByteReader<'a>, depth: Depth) -> Result<Self, DecodeError> {
         let mask = reader.u8("DataValue")?;
         let reserved = mask & DATA_VALUE_RESERVED;
         if reserved != 0 {
@@ -327,7 +327,7 @@ fn size_behind_value(mask: u8) -> usize {
 fn read_time(
     timestamp: u8,
     picoseconds: u8,
-    reader: &mut Reader<'_>,
+    reader: &mut ByteReader<'_>,
 ) -> Result<(Option<DateTime>, Option<u16>), DecodeError> {
     let timestamp = match timestamp {
         0 => None,
@@ -350,7 +350,7 @@ fn write_time(timestamp: Option<DateTime>, picoseconds: Option<u16>, out: &mut V
 }
 
 impl<'a> Nest<'a> for DiagnosticInfo<'a> {
-    fn read_nested(reader: &mut Reader<'a>, depth: Depth) -> Result<Self, DecodeError> {
+    fn read_nested(reader: &mut ByteReader<'a>, depth: Depth) -> Result<Self, DecodeError> {
         let mask = reader.u8("DiagnosticInfo")?;
         if mask & DIAGNOSTIC_RESERVED != 0 {
             return Err(DecodeError::Reserved {
@@ -376,7 +376,7 @@ impl<'a> Nest<'a> for DiagnosticInfo<'a> {
         };
         let inner = match mask & INNER {
             0 => None,
-            _ => Some(Encoded::read(reader, depth.inner()?)?),
+            _ => Some(Nested::read(reader, depth.inner()?)?),
         };
         Ok(Self {
             symbolic_id,
@@ -455,7 +455,7 @@ mod tests {
         for picoseconds in [9_998_u16, 10_000] {
             bytes.extend_from_slice(&picoseconds.to_le_bytes());
         }
-        let value = DataValue::read(&mut Reader::new(&bytes)).unwrap();
+        let value = DataValue::read(&mut ByteReader::new(&bytes)).unwrap();
         assert_eq!(value.source_picoseconds, Some(9_998));
         assert_eq!(value.server_picoseconds, Some(9_999));
     }

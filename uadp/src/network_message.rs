@@ -2,8 +2,8 @@
 
 use crate::action::{ActionDialect, Actions};
 use crate::data_set_message::check_padding;
-use crate::header::{self, Flags};
-use crate::reader::Reader;
+use crate::header::{self, HeaderFlags};
+use crate::reader::ByteReader;
 use crate::{
     DataSetMessage, DateTime, DecodeError, GroupHeader, Guid, NetworkHeader, NetworkMessageType,
     PublisherId, SecurityHeader, Variant,
@@ -17,14 +17,14 @@ use crate::{
 #[derive(Debug, Clone)]
 pub struct NetworkMessage<'a> {
     datagram: &'a [u8],
-    flags: Flags,
+    flags: HeaderFlags,
     /// Offsets of the header fields, which are all within the datagram.
     publisher_at: usize,
     group_at: usize,
     timestamp_at: usize,
     payload_at: usize,
     writer_ids: Option<&'a [[u8; 2]]>,
-    payload: Reader<'a>,
+    payload: ByteReader<'a>,
     rest: Option<Rest<'a>>,
 }
 
@@ -61,7 +61,7 @@ pub struct Chunk<'a> {
 /// the first `Err`.
 #[derive(Debug, Clone)]
 pub struct PromotedFields<'a> {
-    reader: Reader<'a>,
+    reader: ByteReader<'a>,
 }
 
 /// Iterator over the DataSetMessages of a [`NetworkMessage`], in the order of the DataSetWriterIds.
@@ -72,7 +72,7 @@ pub struct PromotedFields<'a> {
 #[derive(Debug, Clone)]
 pub struct Messages<'a> {
     step: Step<'a>,
-    payload: Reader<'a>,
+    payload: ByteReader<'a>,
 }
 
 #[derive(Debug, Clone)]
@@ -101,9 +101,9 @@ impl<'a> NetworkMessage<'a> {
     /// Fails if a header is truncated, has a reserved value, or announces an unsupported feature.
     #[inline]
     pub fn decode(datagram: &'a [u8]) -> Result<Self, DecodeError> {
-        let start = Reader::new(datagram);
+        let start = ByteReader::new(datagram);
         let mut reader = start;
-        let flags = Flags::read(&mut reader)?;
+        let flags = HeaderFlags::read(&mut reader)?;
         let publisher_at = reader.since_start(&start);
         if flags.uadp & header::PUBLISHER_ID != 0 {
             PublisherId::skip(flags.extended1 & header::PUBLISHER_ID_TYPE, &mut reader)?;
@@ -204,8 +204,8 @@ impl<'a> NetworkMessage<'a> {
     }
 
     #[inline]
-    fn reader_at(&self, at: usize) -> Reader<'a> {
-        Reader::new(self.datagram.get(at..).unwrap_or_default())
+    fn reader_at(&self, at: usize) -> ByteReader<'a> {
+        ByteReader::new(self.datagram.get(at..).unwrap_or_default())
     }
 
     /// Returns the DataSetWriterIds of the payload header, at least one; `None` without payload
@@ -263,7 +263,7 @@ impl<'a> NetworkMessage<'a> {
     pub fn promoted_fields(&self) -> Option<PromotedFields<'a>> {
         let promoted = self.rest?.promoted?;
         Some(PromotedFields {
-            reader: Reader::new(promoted),
+            reader: ByteReader::new(promoted),
         })
     }
 
@@ -292,7 +292,7 @@ impl<'a> NetworkMessage<'a> {
         'a: 'b,
     {
         NetworkMessage {
-            payload: Reader::new(payload),
+            payload: ByteReader::new(payload),
             rest: self.rest.map(|rest| Rest {
                 sealed: false,
                 footer,
@@ -390,7 +390,7 @@ impl<'a> NetworkMessage<'a> {
         let start = offset.checked_sub(headers).ok_or(cut)?;
         let end = start.checked_add(size).ok_or(cut)?;
         let message = self.payload().get(start..end).ok_or(cut)?;
-        DataSetMessage::read(None, Reader::new(message))
+        DataSetMessage::read(None, ByteReader::new(message))
     }
 
     /// Returns the requests or responses of an Action message (OPC 10000-14, 7.2.4.5.9 and
@@ -424,7 +424,7 @@ impl<'a> Rest<'a> {
     /// Reads PromotedFields, SecurityHeader, and the SecurityFooter if the message is neither
     /// signed nor encrypted.
     #[cold]
-    fn read(flags: Flags, reader: &mut Reader<'a>) -> Result<Self, DecodeError> {
+    fn read(flags: HeaderFlags, reader: &mut ByteReader<'a>) -> Result<Self, DecodeError> {
         let promoted = match flags.extended2 & header::PROMOTED_FIELDS {
             0 => None,
             _ => {
@@ -437,7 +437,7 @@ impl<'a> Rest<'a> {
             _ => Some(SecurityHeader::read(reader)?),
         };
         let sealed = security.is_some_and(|security| security.is_secured());
-        let mut footer = Reader::new(&[]);
+        let mut footer = ByteReader::new(&[]);
         if !sealed && let Some(size) = security.and_then(|security| security.footer_size) {
             (*reader, footer) = reader.split_end(size.into(), "SecurityFooter")?;
         }
@@ -528,7 +528,10 @@ impl<'a> Messages<'a> {
         };
         self.step = Step::Sized { writer_ids, sizes };
         let writer_id = u16::from_le_bytes(*writer_id);
-        Some(DataSetMessage::read(Some(writer_id), Reader::new(message)))
+        Some(DataSetMessage::read(
+            Some(writer_id),
+            ByteReader::new(message),
+        ))
     }
 }
 
@@ -543,7 +546,7 @@ impl<'a> Iterator for PromotedFields<'a> {
         }
         let field = Variant::read(&mut self.reader);
         if field.is_err() {
-            self.reader = Reader::new(&[]);
+            self.reader = ByteReader::new(&[]);
         }
         Some(field)
     }
@@ -553,7 +556,7 @@ impl core::iter::FusedIterator for PromotedFields<'_> {}
 
 /// Reads Count, which is never 0 (OPC 10000-14, 7.2.4.5.2), and DataSetWriterIds.
 #[inline]
-fn read_writer_ids<'a>(reader: &mut Reader<'a>) -> Result<&'a [[u8; 2]], DecodeError> {
+fn read_writer_ids<'a>(reader: &mut ByteReader<'a>) -> Result<&'a [[u8; 2]], DecodeError> {
     match reader.u8("DataSetMessage Count")? {
         0 => Err(DecodeError::Reserved {
             field: "DataSetMessage Count",

@@ -1,6 +1,6 @@
 //! NodeId and ExpandedNodeId.
 
-use crate::reader::Reader;
+use crate::reader::ByteReader;
 use crate::{DecodeError, EncodeError, Guid, writer};
 use alloc::vec::Vec;
 
@@ -11,13 +11,13 @@ pub struct NodeId<'a> {
     /// Index into the sender's namespace array.
     pub namespace: u16,
     /// Identifier of the node within the namespace.
-    pub identifier: Identifier<'a>,
+    pub identifier: NodeIdValue<'a>,
 }
 
 /// Identifier part of a [`NodeId`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 #[expect(missing_docs, reason = "the names are those of the standard's IdType")]
-pub enum Identifier<'a> {
+pub enum NodeIdValue<'a> {
     Numeric(u32),
     String(Option<&'a str>),
     Guid(Guid),
@@ -44,7 +44,7 @@ impl<'a> NodeId<'a> {
     pub const fn numeric(namespace: u16, identifier: u32) -> Self {
         Self {
             namespace,
-            identifier: Identifier::Numeric(identifier),
+            identifier: NodeIdValue::Numeric(identifier),
         }
     }
 
@@ -53,40 +53,40 @@ impl<'a> NodeId<'a> {
     pub const fn string(namespace: u16, identifier: &'a str) -> Self {
         Self {
             namespace,
-            identifier: Identifier::String(Some(identifier)),
+            identifier: NodeIdValue::String(Some(identifier)),
         }
     }
 
-    pub(crate) fn read(reader: &mut Reader<'a>) -> Result<Self, DecodeError> {
+    pub(crate) fn read(reader: &mut ByteReader<'a>) -> Result<Self, DecodeError> {
         let encoding = reader.u8("NodeId")?;
         Self::read_encoded(encoding, reader)
     }
 
-    fn read_encoded(encoding: u8, reader: &mut Reader<'a>) -> Result<Self, DecodeError> {
+    fn read_encoded(encoding: u8, reader: &mut ByteReader<'a>) -> Result<Self, DecodeError> {
         let (namespace, identifier) = match encoding {
             TWO_BYTE => (
                 0,
-                Identifier::Numeric(reader.u8("NodeId identifier")?.into()),
+                NodeIdValue::Numeric(reader.u8("NodeId identifier")?.into()),
             ),
             FOUR_BYTE => (
                 reader.u8("NodeId namespace")?.into(),
-                Identifier::Numeric(reader.u16("NodeId identifier")?.into()),
+                NodeIdValue::Numeric(reader.u16("NodeId identifier")?.into()),
             ),
             NUMERIC => (
                 reader.u16("NodeId namespace")?,
-                Identifier::Numeric(reader.u32("NodeId identifier")?),
+                NodeIdValue::Numeric(reader.u32("NodeId identifier")?),
             ),
             STRING => (
                 reader.u16("NodeId namespace")?,
-                Identifier::String(reader.text("NodeId identifier")?),
+                NodeIdValue::String(reader.text("NodeId identifier")?),
             ),
             GUID => (
                 reader.u16("NodeId namespace")?,
-                Identifier::Guid(Guid(reader.array("NodeId identifier")?)),
+                NodeIdValue::Guid(Guid(reader.array("NodeId identifier")?)),
             ),
             OPAQUE => (
                 reader.u16("NodeId namespace")?,
-                Identifier::Opaque(reader.byte_string("NodeId identifier")?),
+                NodeIdValue::Opaque(reader.byte_string("NodeId identifier")?),
             ),
             _ => {
                 return Err(DecodeError::Reserved {
@@ -108,7 +108,7 @@ impl<'a> NodeId<'a> {
     fn write_flagged(&self, flags: u8, out: &mut Vec<u8>) -> Result<(), EncodeError> {
         let [low, high] = self.namespace.to_le_bytes();
         match self.identifier {
-            Identifier::Numeric(identifier) => {
+            NodeIdValue::Numeric(identifier) => {
                 let [a, b, c, d] = identifier.to_le_bytes();
                 match (high, low, [b, c, d]) {
                     (0, 0, [0, 0, 0]) => out.extend_from_slice(&[flags | TWO_BYTE, a]),
@@ -117,16 +117,16 @@ impl<'a> NodeId<'a> {
                 }
                 Ok(())
             }
-            Identifier::String(text) => {
+            NodeIdValue::String(text) => {
                 out.extend_from_slice(&[flags | STRING, low, high]);
                 writer::byte_string(out, text.map(str::as_bytes), "NodeId identifier")
             }
-            Identifier::Guid(guid) => {
+            NodeIdValue::Guid(guid) => {
                 out.extend_from_slice(&[flags | GUID, low, high]);
                 out.extend_from_slice(&guid.0);
                 Ok(())
             }
-            Identifier::Opaque(bytes) => {
+            NodeIdValue::Opaque(bytes) => {
                 out.extend_from_slice(&[flags | OPAQUE, low, high]);
                 writer::byte_string(out, bytes, "NodeId identifier")
             }
@@ -145,7 +145,7 @@ impl<'a> From<NodeId<'a>> for ExpandedNodeId<'a> {
 }
 
 impl<'a> ExpandedNodeId<'a> {
-    pub(crate) fn read(reader: &mut Reader<'a>) -> Result<Self, DecodeError> {
+    pub(crate) fn read(reader: &mut ByteReader<'a>) -> Result<Self, DecodeError> {
         let encoding = reader.u8("ExpandedNodeId")?;
         let node_id = NodeId::read_encoded(encoding & !(HAS_URI | HAS_SERVER), reader)?;
         let namespace_uri = match encoding & HAS_URI {

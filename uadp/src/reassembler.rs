@@ -10,7 +10,7 @@ use crate::publisher_id::OwnedPublisherId;
 use crate::{
     Chunk, DataSetMessage, DecodeError, NetworkHeader, NetworkMessage, NetworkMessageType,
 };
-use open::{Done, Insertion, KeyRef, Open};
+use open::{ChunkInsertion, CompletedWhole, KeyRef, OpenWhole};
 
 /// Collects chunk NetworkMessages until a whole is complete (OPC 10000-14, 7.2.4.4.4).
 ///
@@ -39,21 +39,21 @@ use open::{Done, Insertion, KeyRef, Open};
 /// discovery message may be such a message: decode its [`bytes`](Reassembled::bytes) with
 /// [`NetworkMessage::decode`].
 ///
-/// See [`Chunks`](crate::Chunks) for an example.
+/// See [`Chunks`](crate::ChunkEncoder) for an example.
 #[derive(Debug)]
 pub struct Reassembler<S = ()> {
     limits: ReassemblyLimits,
     /// Incomplete wholes, oldest first.
-    open: VecDeque<Open<S>>,
+    open: VecDeque<OpenWhole<S>>,
     /// Completed wholes, in the order of completion, to detect repeated chunks.
-    done: VecDeque<Done<S>>,
+    done: VecDeque<CompletedWhole<S>>,
     /// Cost of all entries in `open` and `done`.
     held: usize,
     /// The last completed whole.
     whole: Vec<u8>,
     counters: ReassemblyCounters,
     /// Wholes to return from [`poll_given_up`](Self::poll_given_up).
-    given_up: VecDeque<GivenUp<S>>,
+    given_up: VecDeque<IncompleteWhole<S>>,
 }
 
 /// Limits of a [`Reassembler`].
@@ -161,7 +161,7 @@ pub struct ReassemblyCounters {
 
 /// An incomplete whole that was given up.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct GivenUp<S = ()> {
+pub struct IncompleteWhole<S = ()> {
     /// Sender of its chunks.
     pub sender: S,
     /// PublisherId in its chunks.
@@ -296,7 +296,7 @@ impl<S> Reassembler<S> {
     /// Returns the next whole that was given up. Call it after each
     /// [`receive_from`](Self::receive_from) and [`expire`](Self::expire) until it returns `None`.
     /// About [`ReassemblyLimits::open`] entries are kept; older entries are dropped.
-    pub fn poll_given_up(&mut self) -> Option<GivenUp<S>> {
+    pub fn poll_given_up(&mut self) -> Option<IncompleteWhole<S>> {
         self.given_up.pop_front()
     }
 
@@ -342,7 +342,7 @@ impl<S> Reassembler<S> {
         Ok(())
     }
 
-    fn remember(&mut self, done: Done<S>) {
+    fn remember(&mut self, done: CompletedWhole<S>) {
         if self.done.len() >= self.limits.open {
             self.forget_oldest();
         }
@@ -432,7 +432,7 @@ impl<S: Copy + Ord> Reassembler<S> {
             Some(at) => self.extend(at, &chunk, &key, now)?,
             None if chunk.data.len() == chunk.total_size as usize => {
                 self.whole.clear();
-                self.remember(Done::alone(key.to_key(), &chunk, now));
+                self.remember(CompletedWhole::alone(key.to_key(), &chunk, now));
                 return Ok((chunk, Step::Alone));
             }
             None => self.begin(&key, &chunk, now)?,
@@ -467,14 +467,14 @@ impl<S: Copy + Ord> Reassembler<S> {
         }
         let before = open.cost();
         match open.insert(chunk, pieces) {
-            Insertion::Taken => {
+            ChunkInsertion::Taken => {
                 self.held += open.cost() - before;
                 Ok(at)
             }
-            Insertion::Duplicate => Err(ChunkRefusal::Duplicate),
-            Insertion::Overlap => Err(ChunkRefusal::Overlap),
-            Insertion::TooMany => Err(ChunkRefusal::TooManyPieces),
-            Insertion::Contradiction => {
+            ChunkInsertion::Duplicate => Err(ChunkRefusal::Duplicate),
+            ChunkInsertion::Overlap => Err(ChunkRefusal::Overlap),
+            ChunkInsertion::TooMany => Err(ChunkRefusal::TooManyPieces),
+            ChunkInsertion::Contradiction => {
                 self.give_up(at, GiveUp::Contradicted);
                 self.begin(key, chunk, now)
             }
@@ -488,17 +488,17 @@ impl<S: Copy + Ord> Reassembler<S> {
         chunk: &Chunk<'_>,
         now: Duration,
     ) -> Result<usize, ChunkRefusal> {
-        let mut open = Open::new(key.to_key(), chunk.total_size, now);
-        if let Insertion::TooMany = open.insert(chunk, self.limits.pieces) {
+        let mut open = OpenWhole::new(key.to_key(), chunk.total_size, now);
+        if let ChunkInsertion::TooMany = open.insert(chunk, self.limits.pieces) {
             return Err(ChunkRefusal::TooManyPieces);
         }
-        let of_writer = |other: &Open<S>| key.is_writer_of(&other.key);
+        let of_writer = |other: &OpenWhole<S>| key.is_writer_of(&other.key);
         if self.open.iter().filter(|open| of_writer(open)).count() >= self.limits.open_per_writer
             && let Some(oldest) = self.open.iter().position(of_writer)
         {
             self.give_up(oldest, GiveUp::Superseded);
         }
-        let of_sender = |other: &Open<S>| other.key.sender == key.sender;
+        let of_sender = |other: &OpenWhole<S>| other.key.sender == key.sender;
         if self.open.iter().filter(|open| of_sender(open)).count() >= self.limits.open_per_sender
             && let Some(oldest) = self.open.iter().position(of_sender)
         {
@@ -520,8 +520,13 @@ impl<S: Copy + Ord> Reassembler<S> {
     fn make_room(&mut self, sender: S) {
         let most = self.limits.total_per_sender;
         while self.held > most {
-            let of_sender = |open: &&Open<S>| open.key.sender == sender;
-            let held: usize = self.open.iter().filter(of_sender).map(Open::cost).sum();
+            let of_sender = |open: &&OpenWhole<S>| open.key.sender == sender;
+            let held: usize = self
+                .open
+                .iter()
+                .filter(of_sender)
+                .map(OpenWhole::cost)
+                .sum();
             let oldest = self.open.iter().position(|open| of_sender(&open));
             let Some(oldest) = oldest.filter(|_| held > most) else {
                 break;
@@ -532,7 +537,7 @@ impl<S: Copy + Ord> Reassembler<S> {
             if self.forget_oldest() {
                 continue;
             }
-            let Some(oldest) = self.oldest_of_greediest(sender, Open::cost) else {
+            let Some(oldest) = self.oldest_of_greediest(sender, OpenWhole::cost) else {
                 return;
             };
             self.give_up(oldest, GiveUp::OutOfBytes);
@@ -542,14 +547,18 @@ impl<S: Copy + Ord> Reassembler<S> {
     /// Returns the oldest whole of the sender with the greatest sum of `weight`. If several senders
     /// have the greatest sum and `sender` is among them, it is `sender`: no other sender makes
     /// space for a sender that holds as much.
-    fn oldest_of_greediest(&self, sender: S, weight: impl Fn(&Open<S>) -> usize) -> Option<usize> {
+    fn oldest_of_greediest(
+        &self,
+        sender: S,
+        weight: impl Fn(&OpenWhole<S>) -> usize,
+    ) -> Option<usize> {
         let mut sums: BTreeMap<S, usize> = BTreeMap::new();
         for open in &self.open {
             *sums.entry(open.key.sender).or_default() += weight(open);
         }
         let most = sums.values().max()?;
-        let greediest = |open: &Open<S>| sums.get(&open.key.sender) == Some(most);
-        let own = |open: &Open<S>| open.key.sender == sender && greediest(open);
+        let greediest = |open: &OpenWhole<S>| sums.get(&open.key.sender) == Some(most);
+        let own = |open: &OpenWhole<S>| open.key.sender == sender && greediest(open);
         let mut open = self.open.iter();
         let oldest = open.position(own);
         oldest.or_else(|| self.open.iter().position(greediest))

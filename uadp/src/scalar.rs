@@ -1,8 +1,8 @@
 //! A single value of a builtin type.
 
-use crate::nested::{self, DataValue, Depth, DiagnosticInfo, Encoded};
+use crate::nested::{self, DataValue, Depth, DiagnosticInfo, Nested};
 use crate::node_id::{ExpandedNodeId, NodeId};
-use crate::reader::Reader;
+use crate::reader::ByteReader;
 use crate::{BuiltinType, DateTime, DecodeError, EncodeError, Guid, StatusCode, Variant, writer};
 use alloc::vec::Vec;
 
@@ -35,11 +35,11 @@ pub enum Scalar<'a> {
     QualifiedName(QualifiedName<'a>),
     LocalizedText(LocalizedText<'a>),
     ExtensionObject(ExtensionObject<'a>),
-    DataValue(Encoded<'a, DataValue<'a>>),
+    DataValue(Nested<'a, DataValue<'a>>),
     /// Only as an element of an array: a Variant does not contain a Variant directly (OPC 10000-6,
     /// 5.2.2.16).
-    Variant(Encoded<'a, Variant<'a>>),
-    DiagnosticInfo(Encoded<'a, DiagnosticInfo<'a>>),
+    Variant(Nested<'a, Variant<'a>>),
+    DiagnosticInfo(Nested<'a, DiagnosticInfo<'a>>),
 }
 
 /// QualifiedName (OPC 10000-6, 5.2.2.13).
@@ -116,7 +116,10 @@ impl<'a> Scalar<'a> {
 
     /// Decodes a value in the binary encoding of OPC 10000-6, 5.2.2.
     #[inline]
-    pub(crate) fn read(builtin: BuiltinType, reader: &mut Reader<'a>) -> Result<Self, DecodeError> {
+    pub(crate) fn read(
+        builtin: BuiltinType,
+        reader: &mut ByteReader<'a>,
+    ) -> Result<Self, DecodeError> {
         Self::read_at(builtin, reader, Depth::FULL)
     }
 
@@ -124,7 +127,7 @@ impl<'a> Scalar<'a> {
     #[inline]
     pub(crate) fn read_at(
         builtin: BuiltinType,
-        reader: &mut Reader<'a>,
+        reader: &mut ByteReader<'a>,
         depth: Depth,
     ) -> Result<Self, DecodeError> {
         Ok(match builtin {
@@ -151,10 +154,10 @@ impl<'a> Scalar<'a> {
             BuiltinType::QualifiedName => Self::QualifiedName(QualifiedName::read(reader)?),
             BuiltinType::LocalizedText => Self::LocalizedText(LocalizedText::read(reader)?),
             BuiltinType::ExtensionObject => Self::ExtensionObject(ExtensionObject::read(reader)?),
-            BuiltinType::DataValue => Self::DataValue(Encoded::read(reader, depth.inner()?)?),
-            BuiltinType::Variant => Self::Variant(Encoded::read(reader, depth.inner()?)?),
+            BuiltinType::DataValue => Self::DataValue(Nested::read(reader, depth.inner()?)?),
+            BuiltinType::Variant => Self::Variant(Nested::read(reader, depth.inner()?)?),
             BuiltinType::DiagnosticInfo => {
-                Self::DiagnosticInfo(Encoded::read(reader, depth.inner()?)?)
+                Self::DiagnosticInfo(Nested::read(reader, depth.inner()?)?)
             }
         })
     }
@@ -163,7 +166,7 @@ impl<'a> Scalar<'a> {
     pub(crate) fn skip(
         builtin: BuiltinType,
         count: usize,
-        reader: &mut Reader<'a>,
+        reader: &mut ByteReader<'a>,
         depth: Depth,
     ) -> Result<(), DecodeError> {
         if builtin == BuiltinType::Variant {
@@ -259,7 +262,7 @@ fn write_text<const TAGGED: bool>(
 }
 
 impl<'a> QualifiedName<'a> {
-    pub(crate) fn read(reader: &mut Reader<'a>) -> Result<Self, DecodeError> {
+    pub(crate) fn read(reader: &mut ByteReader<'a>) -> Result<Self, DecodeError> {
         Ok(Self {
             namespace: reader.u16("QualifiedName NamespaceIndex")?,
             name: reader.text("QualifiedName Name")?,
@@ -273,7 +276,7 @@ impl<'a> QualifiedName<'a> {
 }
 
 impl<'a> LocalizedText<'a> {
-    pub(crate) fn read(reader: &mut Reader<'a>) -> Result<Self, DecodeError> {
+    pub(crate) fn read(reader: &mut ByteReader<'a>) -> Result<Self, DecodeError> {
         let mask = reader.u8("LocalizedText")?;
         let reserved = mask & !(HAS_LOCALE | HAS_TEXT);
         if reserved != 0 {
@@ -313,7 +316,7 @@ impl<'a> LocalizedText<'a> {
 }
 
 impl<'a> ExtensionObject<'a> {
-    pub(crate) fn read(reader: &mut Reader<'a>) -> Result<Self, DecodeError> {
+    pub(crate) fn read(reader: &mut ByteReader<'a>) -> Result<Self, DecodeError> {
         let type_id = NodeId::read(reader)?;
         let body = match reader.u8("ExtensionObject encoding")? {
             NO_BODY => ExtensionBody::None,

@@ -1,6 +1,6 @@
 //! Message security: signatures and encryption of NetworkMessages (OPC 10000-14, 7.2.4.4.3).
 //!
-//! The keys of a SecurityGroup are a list of [`Keys`], each with a SecurityTokenId, which the
+//! The keys of a SecurityGroup are a list of [`TokenKeys`], each with a SecurityTokenId, which the
 //! members of the group get from a Security Key Service. A Subscriber has an [`Opener`] for the
 //! group, a Publisher has a [`Sealer`].
 
@@ -13,8 +13,8 @@ mod sealer;
 mod securing;
 
 pub use error::{KeyError, SealError, SecurityError};
-pub use keys::Keys;
-pub use opener::{CountedBy, Opened, Opener, OpenerOptions};
+pub use keys::TokenKeys;
+pub use opener::{CountedBy, OpenedMessage, Opener, OpenerOptions};
 pub use sealer::{Seal, Sealer};
 
 /// Algorithms of a SecurityGroup: HMAC-SHA2-256 signs, AES in counter mode encrypts (OPC 10000-7).

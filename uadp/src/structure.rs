@@ -1,13 +1,13 @@
 //! Decodes the body of a structure with known fields.
 
-use crate::reader::Reader;
+use crate::reader::ByteReader;
 use crate::{Array, BuiltinType, DecodeError, Scalar};
 
 /// Reads the binary body of an [`ExtensionObject`](crate::ExtensionObject) field by field: values
 /// without the encoding byte of a Variant (OPC 10000-6, 5.2.6). The caller has to know the fields.
 #[derive(Debug, Clone)]
 pub struct StructureReader<'a> {
-    reader: Reader<'a>,
+    reader: ByteReader<'a>,
 }
 
 impl<'a> StructureReader<'a> {
@@ -18,7 +18,7 @@ impl<'a> StructureReader<'a> {
     #[must_use]
     pub const fn new(body: &'a [u8]) -> Self {
         Self {
-            reader: Reader::new(body),
+            reader: ByteReader::new(body),
         }
     }
 

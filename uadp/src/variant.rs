@@ -1,7 +1,7 @@
 //! Variant: a value with its type, or an array of values in one or more dimensions.
 
 use crate::nested::Depth;
-use crate::reader::Reader;
+use crate::reader::ByteReader;
 use crate::scalar::Scalar;
 use crate::{BuiltinType, DecodeError, EncodeError, writer};
 use alloc::vec::Vec;
@@ -47,7 +47,7 @@ pub struct Array<'a> {
 pub struct Elements<'a> {
     element: BuiltinType,
     left: usize,
-    reader: Reader<'a>,
+    reader: ByteReader<'a>,
 }
 
 impl<'a> Variant<'a> {
@@ -63,13 +63,13 @@ impl<'a> Variant<'a> {
     }
 
     #[inline]
-    pub(crate) fn read(reader: &mut Reader<'a>) -> Result<Self, DecodeError> {
+    pub(crate) fn read(reader: &mut ByteReader<'a>) -> Result<Self, DecodeError> {
         Self::read_at(reader, Depth::FULL)
     }
 
     /// Decodes a nested Variant as [`read`](Self::read).
     #[inline]
-    pub(crate) fn read_at(reader: &mut Reader<'a>, depth: Depth) -> Result<Self, DecodeError> {
+    pub(crate) fn read_at(reader: &mut ByteReader<'a>, depth: Depth) -> Result<Self, DecodeError> {
         let encoding = reader.u8("Variant")?;
         let builtin = match BuiltinType::from_id(encoding & TYPE_ID) {
             Some(builtin) => builtin,
@@ -92,7 +92,7 @@ impl<'a> Variant<'a> {
 
     /// Skips and checks a Variant.
     #[inline]
-    pub(crate) fn skip_at(reader: &mut Reader<'a>, depth: Depth) -> Result<(), DecodeError> {
+    pub(crate) fn skip_at(reader: &mut ByteReader<'a>, depth: Depth) -> Result<(), DecodeError> {
         let encoding = reader.rest().first().copied().unwrap_or_default();
         let size = match (encoding, BuiltinType::from_id(encoding)) {
             (0, _) => Some(0),
@@ -207,7 +207,7 @@ impl<'a> Matrix<'a> {
     /// Reads the array of elements, then the array of dimensions.
     fn read_at(
         element: BuiltinType,
-        reader: &mut Reader<'a>,
+        reader: &mut ByteReader<'a>,
         depth: Depth,
     ) -> Result<Self, DecodeError> {
         // Only decoding the elements reveals where the dimensions start.
@@ -263,7 +263,7 @@ impl<'a> Array<'a> {
     /// # Errors
     /// Fails if the bytes are not exactly `len` well-formed elements.
     pub fn new(element: BuiltinType, len: usize, bytes: &'a [u8]) -> Result<Self, DecodeError> {
-        let mut reader = Reader::new(bytes);
+        let mut reader = ByteReader::new(bytes);
         let array = Self::read_elements(element, len, &mut reader, Depth::FULL)?;
         match reader.remaining() {
             0 => Ok(array),
@@ -311,18 +311,21 @@ impl<'a> Array<'a> {
         Elements {
             element: self.element,
             left: self.len,
-            reader: Reader::new(self.bytes),
+            reader: ByteReader::new(self.bytes),
         }
     }
 
     /// Reads an Int32 length and the elements (OPC 10000-6, 5.2.5).
-    pub(crate) fn read(element: BuiltinType, reader: &mut Reader<'a>) -> Result<Self, DecodeError> {
+    pub(crate) fn read(
+        element: BuiltinType,
+        reader: &mut ByteReader<'a>,
+    ) -> Result<Self, DecodeError> {
         Self::read_at(element, reader, Depth::FULL)
     }
 
     fn read_at(
         element: BuiltinType,
-        reader: &mut Reader<'a>,
+        reader: &mut ByteReader<'a>,
         depth: Depth,
     ) -> Result<Self, DecodeError> {
         match reader.length("array length")? {
@@ -334,7 +337,7 @@ impl<'a> Array<'a> {
     fn read_elements(
         element: BuiltinType,
         len: usize,
-        reader: &mut Reader<'a>,
+        reader: &mut ByteReader<'a>,
         depth: Depth,
     ) -> Result<Self, DecodeError> {
         let limit = DecodeError::Limit {

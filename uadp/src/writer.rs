@@ -5,12 +5,12 @@ use alloc::vec::Vec;
 
 /// Space at the end of a buffer for a few small values. Checking the capacity for every value costs
 /// more.
-pub(crate) struct Room<'b, const CAPACITY: usize> {
+pub(crate) struct ReservedSpace<'b, const CAPACITY: usize> {
     bytes: &'b mut [u8; CAPACITY],
     len: usize,
 }
 
-impl<const CAPACITY: usize> Room<'_, CAPACITY> {
+impl<const CAPACITY: usize> ReservedSpace<'_, CAPACITY> {
     /// Returns the number of used bytes.
     #[inline]
     pub(crate) const fn len(&self) -> usize {
@@ -34,12 +34,12 @@ impl<const CAPACITY: usize> Room<'_, CAPACITY> {
 #[inline]
 pub(crate) fn with_room<const CAPACITY: usize, T>(
     out: &mut Vec<u8>,
-    fill: impl FnOnce(&mut Room<'_, CAPACITY>) -> T,
+    fill: impl FnOnce(&mut ReservedSpace<'_, CAPACITY>) -> T,
 ) -> Option<T> {
     let start = out.len();
     out.extend_from_slice(&[0; CAPACITY]);
     let bytes = out.get_mut(start..)?.first_chunk_mut()?;
-    let mut room = Room { bytes, len: 0 };
+    let mut room = ReservedSpace { bytes, len: 0 };
     let filled = fill(&mut room);
     let end = start + room.len;
     out.truncate(end);

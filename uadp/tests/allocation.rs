@@ -5,7 +5,7 @@ use crate::everything;
 use allocation_counter::measure;
 use everything::read_everything;
 use uadp::{
-    Array, BuiltinType, DataSetHeader, DataValue, DateTime, Encoded, GroupHeader, Matrix,
+    Array, BuiltinType, DataSetHeader, DataValue, DateTime, GroupHeader, Matrix, Nested,
     NetworkHeader, NetworkMessage, NetworkMessageEncoder, NodeId, PublisherId, Scalar, StatusCode,
     Variant,
 };
@@ -88,7 +88,7 @@ fn write(datagram: &mut Vec<u8>, inner: &mut Vec<u8>) {
     write_key_frame(&mut encoder, &data_set_header);
     let mut fields = encoder.event(&data_set_header).unwrap();
     let value = DataValue::from(Variant::from(Scalar::Boolean(true)));
-    let value = Encoded::data_value(&value, inner).unwrap();
+    let value = Nested::data_value(&value, inner).unwrap();
     fields.scalar(Scalar::DataValue(value)).unwrap();
     fields.finish().unwrap();
     let mut fields = encoder.delta_frame(&data_set_header).unwrap();
@@ -124,10 +124,10 @@ fn write_key_frame(encoder: &mut NetworkMessageEncoder<'_>, header: &DataSetHead
     fields.element(Scalar::String(Some("text"))).unwrap();
     fields.array(BuiltinType::Variant, 2).unwrap();
     for bytes in [&[3, 7][..], &[0x98, 2, 0, 0, 0, 0, 4, 1, 1]] {
-        let value = Encoded::new(bytes).unwrap();
+        let value = Nested::new(bytes).unwrap();
         fields.element(Scalar::Variant(value)).unwrap();
     }
-    let info = Encoded::new(&[0x40, 0x41, 1, 0, 0, 0, 0]).unwrap();
+    let info = Nested::new(&[0x40, 0x41, 1, 0, 0, 0, 0]).unwrap();
     fields.scalar(Scalar::DiagnosticInfo(info)).unwrap();
     fields.structures(2).unwrap();
     for _ in 0..2 {

@@ -7,10 +7,10 @@ use allocation_counter::measure;
 use proptest::collection::vec;
 use proptest::prelude::*;
 use uadp::{
-    ChunkBudget, ChunkError, ChunkRefusal, Chunks, DataSetHeader, DataSetMessage, DecodeError,
-    Extras, GiveUp, GroupHeader, MessageKind, NetworkHeader, NetworkMessage, NetworkMessageEncoder,
-    NetworkMessageType, PublisherId, Reassembler, ReassemblyLimits, Scalar, SecurityHeader,
-    Variant, Whole,
+    ChunkBudget, ChunkEncoder, ChunkError, ChunkRefusal, DataSetHeader, DataSetMessage,
+    DecodeError, Extras, GiveUp, GroupHeader, MessageKind, NetworkHeader, NetworkMessage,
+    NetworkMessageEncoder, NetworkMessageType, PublisherId, Reassembler, ReassemblyLimits, Scalar,
+    SecurityHeader, Variant, Whole,
 };
 
 const START: Duration = Duration::ZERO;
@@ -81,7 +81,7 @@ fn split(
         network_message: budget,
         trailer: 0,
     };
-    let mut chunks = Chunks::new(header, &extras, whole, budget)?;
+    let mut chunks = ChunkEncoder::new(header, &extras, whole, budget)?;
     let mut datagrams = Vec::new();
     let mut buffer = vec![0xA5; 3];
     while let Some(chunk) = chunks.append(&mut buffer, &extras) {
@@ -201,7 +201,7 @@ fn chunks_written_one_at_a_time_are_those_written_at_once() {
     let mut datagrams = Vec::new();
     let mut offset = 0;
     loop {
-        let chunks = Chunks::new(&header(), &extras, whole(&bytes), budget).unwrap();
+        let chunks = ChunkEncoder::new(&header(), &extras, whole(&bytes), budget).unwrap();
         let mut chunks = chunks.resumed_at(offset);
         let mut datagram = Vec::new();
         let Some(written) = chunks.append(&mut datagram, &extras) else {
@@ -295,7 +295,7 @@ fn a_secured_chunk_leaves_room_for_its_signature_and_says_what_to_encrypt() {
         ..Extras::default()
     });
     let budget = ChunkBudget::IPV4.with_trailer(32);
-    let mut chunks = Chunks::new(&header(), &extras[0], whole(&bytes), budget).unwrap();
+    let mut chunks = ChunkEncoder::new(&header(), &extras[0], whole(&bytes), budget).unwrap();
     assert_eq!(chunks.remaining(), 3);
     let mut buffer = Vec::new();
     let mut sealed = Vec::new();
@@ -324,7 +324,7 @@ fn a_longer_nonce_than_was_reckoned_with_is_refused_and_leaves_the_buffer_alone(
         }),
         ..Extras::default()
     };
-    let mut chunks = Chunks::new(
+    let mut chunks = ChunkEncoder::new(
         &header(),
         &secured(&[1; 8]),
         whole(&[0; 100]),
@@ -533,7 +533,7 @@ fn a_discovery_announcement_comes_back_as_bytes_and_not_as_a_data_set_message() 
         network_message: 80,
         trailer: 0,
     };
-    let mut chunks = Chunks::new(&header(), &extras, announcement, budget).unwrap();
+    let mut chunks = ChunkEncoder::new(&header(), &extras, announcement, budget).unwrap();
     let mut buffer = Vec::new();
     let mut reassembler = Reassembler::default();
     let first = chunks.append(&mut buffer, &extras).unwrap().unwrap();

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use serde_json::Value;
 use uadp::MessageKind::KeyFrame;
-use uadp::{DeltaNull, Merged, NetworkMessage};
+use uadp::{DeltaNull, MergedFrame, NetworkMessage};
 
 #[test]
 fn the_delta_frames_of_open62541_are_taken_and_their_filler_wipes_nothing() {
@@ -48,7 +48,7 @@ fn by_the_tables_a_null_in_a_delta_frame_is_a_value() {
     assert_eq!(fields, [None, Some(2), None]);
     assert_eq!(
         merged,
-        Merged {
+        MergedFrame {
             applied: 2,
             filler: 0,
             unknown: 1

@@ -6,15 +6,15 @@ use crate::model;
 use crate::rewrite;
 
 use everything::read_everything;
-use model::{Sample, Value, sample, value};
+use model::{ModelDataValue, ModelVariant, sample, value};
 use proptest::collection::vec;
 use proptest::option;
 use proptest::prelude::*;
 use rewrite::{rewrite, rewrite_message};
 use uadp::{
     BuiltinType, DataSetHeader, DataSetMessage, DataValue, DateTime, DecodeError, DiagnosticInfo,
-    Encoded, Extras, FieldEncoder, FieldEncoding, FieldValue, Fields, GroupHeader, Guid,
-    MessageKind, NetworkHeader, NetworkMessage, NetworkMessageEncoder, PublisherId, SecurityHeader,
+    Extras, FieldEncoder, FieldEncoding, FieldValue, Fields, GroupHeader, Guid, MessageKind,
+    Nested, NetworkHeader, NetworkMessage, NetworkMessageEncoder, PublisherId, SecurityHeader,
     Variant,
 };
 
@@ -23,7 +23,7 @@ struct Network {
     header: NetworkHeader<'static>,
     publisher_name: Option<String>,
     payload_header: bool,
-    promoted: Option<Vec<Value>>,
+    promoted: Option<Vec<ModelVariant>>,
     security: Option<Security>,
     messages: Vec<Message>,
 }
@@ -47,18 +47,18 @@ struct Message {
 #[derive(Debug, Clone)]
 enum Payload {
     KeepAlive,
-    KeyFrame(Vec<Value>),
-    Event(Vec<Value>),
-    Delta(Vec<(u16, Value)>),
-    Samples(Vec<Sample>),
-    SampleDelta(Vec<(u16, Sample)>),
+    KeyFrame(Vec<ModelVariant>),
+    Event(Vec<ModelVariant>),
+    Delta(Vec<(u16, ModelVariant)>),
+    Samples(Vec<ModelDataValue>),
+    SampleDelta(Vec<(u16, ModelDataValue)>),
     Raw(Vec<u8>),
 }
 
 /// An encoded field.
 enum Sent<'s> {
-    Value(&'s Value),
-    Sample(&'s Sample),
+    Value(&'s ModelVariant),
+    Sample(&'s ModelDataValue),
 }
 
 impl Network {
@@ -94,7 +94,7 @@ impl Network {
         let promoted = self
             .promoted
             .as_deref()
-            .map(|values| -> Vec<_> { values.iter().map(Value::variant).collect() });
+            .map(|values| -> Vec<_> { values.iter().map(ModelVariant::variant).collect() });
         let extras = Extras {
             promoted_fields: promoted.as_deref(),
             security: self.security.as_ref().map(Security::header),
@@ -284,7 +284,7 @@ impl Sent<'_> {
     }
 }
 
-fn write_fields(mut out: FieldEncoder<'_>, values: &[Value]) {
+fn write_fields(mut out: FieldEncoder<'_>, values: &[ModelVariant]) {
     for value in values {
         write_field(&mut out, value);
     }
@@ -292,12 +292,12 @@ fn write_fields(mut out: FieldEncoder<'_>, values: &[Value]) {
 }
 
 /// Writes a field. Arrays are written element by element, as by a caller without their encoding.
-fn write_field(out: &mut FieldEncoder<'_>, value: &Value) {
+fn write_field(out: &mut FieldEncoder<'_>, value: &ModelVariant) {
     let elements = match value {
-        Value::Null => return out.null().unwrap(),
-        Value::Scalar(seed) => return out.scalar(seed.scalar()).unwrap(),
-        Value::Matrix(..) => return out.variant(&value.variant()).unwrap(),
-        Value::Array(elements) => elements,
+        ModelVariant::Null => return out.null().unwrap(),
+        ModelVariant::Scalar(seed) => return out.scalar(seed.scalar()).unwrap(),
+        ModelVariant::Matrix(..) => return out.variant(&value.variant()).unwrap(),
+        ModelVariant::Array(elements) => elements,
     };
     let Some(seeds) = &elements.seeds else {
         return out.variant(&value.variant()).unwrap();
@@ -652,7 +652,7 @@ proptest! {
         len in any::<prop::sample::Index>(),
     ) {
         let mut bytes = Vec::new();
-        Encoded::variant(&sent.variant(), &mut bytes).unwrap();
+        Nested::variant(&sent.variant(), &mut bytes).unwrap();
         bytes.extend([1, 2]);
         for (at, byte) in changes {
             let at = at.index(bytes.len());
@@ -662,16 +662,16 @@ proptest! {
         let block = [&[1, 0], &bytes[..]].concat();
         // The value is read as a field, and skipped as an element.
         let read = Fields::parse(&block).map(|mut fields| fields.next());
-        let passed = Encoded::<Variant<'_>>::new(&bytes);
+        let passed = Nested::<Variant<'_>>::new(&bytes);
         match (read, passed) {
             (Ok(Some(Ok(read))), Ok(passed)) => {
                 let mut again = Vec::new();
                 prop_assert_eq!(&passed.get().map(|value| format!("{value:?}")), &Ok(format!("{read:?}")));
-                let again = Encoded::variant(&read, &mut again).unwrap();
+                let again = Nested::variant(&read, &mut again).unwrap();
                 prop_assert_eq!(again.get().map(|_| ()), Ok(()));
             }
             (Ok(Some(Ok(_))), Err(DecodeError::TrailingBytes(left))) => {
-                let whole = Encoded::<Variant<'_>>::new(&bytes[..bytes.len() - left]);
+                let whole = Nested::<Variant<'_>>::new(&bytes[..bytes.len() - left]);
                 prop_assert!(whole.is_ok());
             }
             (Ok(Some(Err(read))), Err(passed)) => prop_assert_eq!(read, passed),
@@ -684,14 +684,14 @@ proptest! {
     fn what_bytes_mean_is_written_in_one_way(bytes in vec(any::<u8>(), 0..60)) {
         let mut buffers = [(); 4].map(|()| Vec::new());
         let [first, second, third, fourth] = &mut buffers;
-        if let Ok(value) = Encoded::<DataValue<'_>>::new(&bytes) {
-            let once = Encoded::data_value(&value.get().unwrap(), first).unwrap();
-            let twice = Encoded::data_value(&once.get().unwrap(), second).unwrap();
+        if let Ok(value) = Nested::<DataValue<'_>>::new(&bytes) {
+            let once = Nested::data_value(&value.get().unwrap(), first).unwrap();
+            let twice = Nested::data_value(&once.get().unwrap(), second).unwrap();
             prop_assert_eq!(once, twice);
         }
-        if let Ok(info) = Encoded::<DiagnosticInfo<'_>>::new(&bytes) {
-            let once = Encoded::diagnostic_info(&info.get().unwrap(), third).unwrap();
-            let twice = Encoded::diagnostic_info(&once.get().unwrap(), fourth).unwrap();
+        if let Ok(info) = Nested::<DiagnosticInfo<'_>>::new(&bytes) {
+            let once = Nested::diagnostic_info(&info.get().unwrap(), third).unwrap();
+            let twice = Nested::diagnostic_info(&once.get().unwrap(), fourth).unwrap();
             prop_assert_eq!(once, twice);
         }
     }

@@ -499,7 +499,7 @@ fn packed(tree: &Tree, field: &RawField<'_>, form: Form) -> Option<(Vec<u8>, usi
         match field.structure {
             None => lay_out_leaf(leaf, field, Form::Plain, &mut bytes),
             Some(structure) => {
-                let uadp::Identifier::Numeric(id) = structure.type_id().identifier else {
+                let uadp::NodeIdValue::Numeric(id) = structure.type_id().identifier else {
                     return None;
                 };
                 let [a, b, c, d] = id.to_le_bytes();

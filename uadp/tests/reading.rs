@@ -2,7 +2,7 @@
 
 use uadp::{
     Array, BuiltinType, Chunk, DataSetMessage, DataValue, DateTime, DecodeError, DiagnosticInfo,
-    Encoded, ExpandedNodeId, FieldEncoding, FieldValue, Fields, LocalizedText, Matrix, MessageKind,
+    ExpandedNodeId, FieldEncoding, FieldValue, Fields, LocalizedText, Matrix, MessageKind, Nested,
     NetworkMessage, NetworkMessageType, NodeId, PublisherId, QualifiedName, Scalar, SecurityHeader,
     StatusCode, Variant,
 };
@@ -449,7 +449,7 @@ fn the_innermost_of_ten_levels_is_reached() {
     assert_eq!(value, Scalar::Byte(7).into());
 
     let infos = nested(9, &[0x41, 9, 0, 0, 0], &[0x01, 5, 0, 0, 0], &[]);
-    let mut info = Encoded::<DiagnosticInfo<'_>>::new(&infos).unwrap();
+    let mut info = Nested::<DiagnosticInfo<'_>>::new(&infos).unwrap();
     for _ in 0..9 {
         info = info.get().unwrap().inner.unwrap();
     }
@@ -582,8 +582,8 @@ fn a_data_value_is_what_its_mask_says() {
         1, 0, 0, 0, 0, 0, 0, 0, 2, 0, // SourceTimestamp and its PicoSeconds
         3, 0, 0, 0, 0, 0, 0, 0, 4, 0, // ServerTimestamp and its PicoSeconds
     ];
-    let read = |bytes: &'static [u8]| Encoded::<DataValue<'_>>::new(bytes).unwrap().get();
-    let value = Encoded::<DataValue<'_>>::new(&full).unwrap().get().unwrap();
+    let read = |bytes: &'static [u8]| Nested::<DataValue<'_>>::new(bytes).unwrap().get();
+    let value = Nested::<DataValue<'_>>::new(&full).unwrap().get().unwrap();
     assert_eq!(
         value,
         DataValue {
@@ -604,7 +604,7 @@ fn a_data_value_is_what_its_mask_says() {
     };
     assert_eq!(read(&[0x20, 5, 0]), Ok(picoseconds), "without a timestamp");
     for len in 0..full.len() {
-        let error = Encoded::<DataValue<'_>>::new(full.get(..len).unwrap()).unwrap_err();
+        let error = Nested::<DataValue<'_>>::new(full.get(..len).unwrap()).unwrap_err();
         assert!(matches!(error, DecodeError::Truncated { .. }), "{error}");
     }
 }
@@ -615,14 +615,11 @@ fn a_data_value_around_an_array_ends_behind_its_timestamps() {
         0x06, 0, 0, 0, 0x80, 9, 0, 0, 0, 0, 0, 0, 0, // Status Bad, SourceTimestamp
     ];
     let with_array = [&[0x07, 0x8C, 1, 0, 0, 0, 1, 0, 0, 0, b'x'], &bytes[1..]].concat();
-    let with_value = Encoded::<DataValue<'_>>::new(&with_array)
+    let with_value = Nested::<DataValue<'_>>::new(&with_array)
         .unwrap()
         .get()
         .unwrap();
-    let without = Encoded::<DataValue<'_>>::new(&bytes)
-        .unwrap()
-        .get()
-        .unwrap();
+    let without = Nested::<DataValue<'_>>::new(&bytes).unwrap().get().unwrap();
     let text = [1, 0, 0, 0, b'x'];
     let array = Array::new(BuiltinType::String, 1, &text).unwrap();
     assert_eq!(
@@ -642,7 +639,7 @@ fn a_diagnostic_info_is_what_its_mask_says() {
         0, 0, 0x34, 0x80, // InnerStatusCode
         0x10, 0xFF, 0xFF, 0xFF, 0xFF, // InnerDiagnosticInfo of a null AdditionalInfo
     ];
-    let info = Encoded::<DiagnosticInfo<'_>>::new(&bytes)
+    let info = Nested::<DiagnosticInfo<'_>>::new(&bytes)
         .unwrap()
         .get()
         .unwrap();
@@ -700,7 +697,7 @@ fn each_index_of_a_diagnostic_info_has_its_bit() {
         ),
     ] {
         let bytes = [mask, 9, 0, 0, 0];
-        let info = Encoded::<DiagnosticInfo<'_>>::new(&bytes).unwrap().get();
+        let info = Nested::<DiagnosticInfo<'_>>::new(&bytes).unwrap().get();
         assert_eq!(info, Ok(expected), "mask {mask:#x}");
     }
 }

@@ -10,16 +10,16 @@ mod sealing;
 use std::time::Duration;
 
 use uadp::{
-    DataSetHeader, EncodeError, Extras, GroupHeader, Keys, NetworkHeader, NetworkMessage,
+    DataSetHeader, EncodeError, Extras, GroupHeader, NetworkHeader, NetworkMessage,
     NetworkMessageEncoder, Opener, OpenerOptions, PublisherId, Scalar, Seal, SecurityError,
-    SecurityMode, SecurityPolicy,
+    SecurityMode, SecurityPolicy, TokenKeys,
 };
 
 const START: Duration = Duration::ZERO;
 
 /// Returns keys that repeat a single byte.
-fn keys(byte: u8) -> Keys {
-    Keys::from_bytes(SecurityPolicy::PubSubAes128Ctr, &[byte; 52]).unwrap()
+fn keys(byte: u8) -> TokenKeys {
+    TokenKeys::from_bytes(SecurityPolicy::PubSubAes128Ctr, &[byte; 52]).unwrap()
 }
 
 /// Returns an opener with the current key `keys(1)` of token 1.

@@ -1,9 +1,9 @@
 //! Calls that an encoder accepts, and calls that it rejects.
 
 use uadp::{
-    BuiltinType, DataSetHeader, DataValue, DateTime, DecodeError, EncodeError, Encoded,
-    ExtensionBody, Extras, FieldEncoder, Fields, NetworkHeader, NetworkMessage,
-    NetworkMessageEncoder, NodeId, Scalar, SecurityHeader, StatusCode, Variant,
+    BuiltinType, DataSetHeader, DataValue, DateTime, DecodeError, EncodeError, ExtensionBody,
+    Extras, FieldEncoder, Fields, Nested, NetworkHeader, NetworkMessage, NetworkMessageEncoder,
+    NodeId, Scalar, SecurityHeader, StatusCode, Variant,
 };
 
 /// Encodes a key frame behind the smallest header. Returns the bytes behind the header, or the
@@ -201,7 +201,7 @@ fn calls_out_of_place_are_refused() {
     });
     misplaced(|fields| fields.fields_block(&[0]));
     misplaced(|fields| {
-        let value = Encoded::new(&[0]).unwrap();
+        let value = Nested::new(&[0]).unwrap();
         fields.scalar(Scalar::Variant(value))
     });
 }
@@ -472,13 +472,13 @@ fn events_and_raw_data_say_what_they_are() {
 fn an_array_of_variants_holds_any_of_them() {
     let (mut first, mut second) = (Vec::new(), Vec::new());
     let inner = Variant::from(Scalar::Byte(7));
-    let inner = Encoded::variant(&inner, &mut first).unwrap();
+    let inner = Nested::variant(&inner, &mut first).unwrap();
     let bytes = block(|fields| {
         fields.array(BuiltinType::Variant, 2)?;
         fields.element(Scalar::Variant(inner))?;
-        let info = Encoded::new(&[0]).unwrap();
+        let info = Nested::new(&[0]).unwrap();
         let info = Variant::from(Scalar::DiagnosticInfo(info));
-        let info = Encoded::variant(&info, &mut second)?;
+        let info = Nested::variant(&info, &mut second)?;
         fields.element(Scalar::Variant(info))
     });
     assert_eq!(bytes.unwrap(), [1, 0, 0x98, 2, 0, 0, 0, 3, 7, 25, 0]);
@@ -486,13 +486,13 @@ fn an_array_of_variants_holds_any_of_them() {
 
 #[test]
 fn what_is_given_as_encoded_has_to_be_one_value() {
-    assert!(Encoded::<Variant<'_>>::new(&[3, 7]).is_ok());
+    assert!(Nested::<Variant<'_>>::new(&[3, 7]).is_ok());
     assert_eq!(
-        Encoded::<Variant<'_>>::new(&[3, 7, 0]),
+        Nested::<Variant<'_>>::new(&[3, 7, 0]),
         Err(DecodeError::TrailingBytes(1))
     );
     assert_eq!(
-        Encoded::<Variant<'_>>::new(&[]),
+        Nested::<Variant<'_>>::new(&[]),
         Err(DecodeError::Truncated {
             field: "Variant",
             expected: 1,

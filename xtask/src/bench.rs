@@ -10,29 +10,29 @@ use anyhow::{Context as _, ensure};
 
 use crate::{
     chart, instructions, links,
-    namespace::{Namespaces, REFUSED},
+    namespace::{NamespacePermission, REFUSED},
     patches::Patched,
     peers,
-    shell::{Ended, run as must, step},
+    shell::{CommandOutcome, run as must, step},
     workspace::{SHIPPED, Workspace},
 };
 
 /// Measures one hop of each bridge, with the floor and the relay of roscpp in the same run.
-pub(crate) fn hop(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<Ended> {
+pub(crate) fn hop(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<CommandOutcome> {
     let packages = ["bridge-ros1", "bridge-ros2", "system-tests"];
     measured(workspace, "bench-hop", &packages, arguments)
 }
 
 /// Measures relays of ROS 1 messages with a raw echo, and bridge-ros1 with many topics, all in one
 /// run.
-pub(crate) fn ros1(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<Ended> {
+pub(crate) fn ros1(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<CommandOutcome> {
     let packages = ["tcpros", "bridge-ros1", "system-tests"];
     measured(workspace, "bench-ros1", &packages, arguments)
 }
 
 /// Measures relays of DDS samples with a UDP echo, and both bridges between ROS 1 and ROS 2, all in
 /// one run.
-pub(crate) fn ros2(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<Ended> {
+pub(crate) fn ros2(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<CommandOutcome> {
     let packages = [
         "bridge-ros1",
         "bridge-ros2",
@@ -45,7 +45,7 @@ pub(crate) fn ros2(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<
 
 /// Measures ua-server with servers of other vendors, and values from the space to clients, all in
 /// one run.
-pub(crate) fn opcua(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<Ended> {
+pub(crate) fn opcua(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<CommandOutcome> {
     measured(
         workspace,
         "bench-opcua",
@@ -55,24 +55,27 @@ pub(crate) fn opcua(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result
 }
 
 /// Measures the gaps of random faults of two redundant bridges.
-pub(crate) fn redundancy(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<Ended> {
+pub(crate) fn redundancy(
+    workspace: &Workspace,
+    arguments: &[&str],
+) -> anyhow::Result<CommandOutcome> {
     let packages = ["bridge-ros1", "system-tests"];
     measured(workspace, "bench-redundancy", &packages, arguments)
 }
 
 /// Runs all programs of a cell for hours with random faults.
-pub(crate) fn soak(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<Ended> {
+pub(crate) fn soak(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<CommandOutcome> {
     let packages = [links::TARGET, "bridge-ros1", "bridge-ros2", "system-tests"];
     measured(workspace, "soak", &packages, arguments)
 }
 
 /// Measures many cells at one broker.
-pub(crate) fn plant(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<Ended> {
+pub(crate) fn plant(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<CommandOutcome> {
     measured(workspace, "bench-plant", &["system-tests"], arguments)
 }
 
 /// Measures the response times of skills, and a server with many skills.
-pub(crate) fn skills(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<Ended> {
+pub(crate) fn skills(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<CommandOutcome> {
     measured(
         workspace,
         "bench-skills",
@@ -82,14 +85,20 @@ pub(crate) fn skills(workspace: &Workspace, arguments: &[&str]) -> anyhow::Resul
 }
 
 /// Measures manifests, NodeSets and questions of the knowledge of the plant.
-pub(crate) fn knowledge(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<Ended> {
+pub(crate) fn knowledge(
+    workspace: &Workspace,
+    arguments: &[&str],
+) -> anyhow::Result<CommandOutcome> {
     let packages = [links::TARGET, "system-tests"];
     measured(workspace, "bench-knowledge", &packages, arguments)
 }
 
 /// Measures conversions between ROS bytes and UADP fields, and Python serializers for the ROS half
 /// of the conversion.
-pub(crate) fn messages(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<Ended> {
+pub(crate) fn messages(
+    workspace: &Workspace,
+    arguments: &[&str],
+) -> anyhow::Result<CommandOutcome> {
     instructions::run(workspace, "messages", arguments, |bench| {
         step("the same messages in Python, without UADP");
         let dump = Command::new(bench).arg("dump").output()?;
@@ -121,11 +130,11 @@ fn measured(
     bench: &str,
     packages: &[&str],
     arguments: &[&str],
-) -> anyhow::Result<Ended> {
-    let namespaces = Namespaces::try_out();
-    ensure!(namespaces != Namespaces::Refused, "{REFUSED}");
+) -> anyhow::Result<CommandOutcome> {
+    let namespaces = NamespacePermission::try_out();
+    ensure!(namespaces != NamespacePermission::Refused, "{REFUSED}");
     ensure!(
-        peers::install(workspace) == Ended::WELL,
+        peers::install(workspace) == CommandOutcome::WELL,
         "the measurement needs all peers"
     );
     step("building the programs with optimisation (some minutes the first time)");

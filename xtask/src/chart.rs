@@ -16,23 +16,23 @@ use std::{
 use anyhow::{Context as _, bail, ensure};
 
 use crate::{
-    shell::{Ended, step},
+    shell::{CommandOutcome, step},
     workspace::Workspace,
 };
 
 /// Draws the pictures of docs/benchmarks.md, or only checks that they are current.
-pub(crate) fn run(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<Ended> {
+pub(crate) fn run(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<CommandOutcome> {
     let check = match arguments {
         [] => false,
         ["--check"] => true,
         _ => {
             eprintln!("xtask: bench charts takes --check");
-            return Ok(Ended::USAGE);
+            return Ok(CommandOutcome::USAGE);
         }
     };
     let page = workspace.root.join("docs/benchmarks.md");
     let text = fs::read_to_string(&page).with_context(|| page.display().to_string())?;
-    let mut ended = Ended::WELL;
+    let mut ended = CommandOutcome::WELL;
     for (name, picture) in pictures(&text)? {
         let file = workspace.root.join(format!("docs/images/{name}.svg"));
         if !check {
@@ -42,7 +42,7 @@ pub(crate) fn run(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<E
                 "{} is not the picture of its table; `cargo xtask bench charts` draws it",
                 file.display()
             );
-            ended = Ended::BADLY;
+            ended = CommandOutcome::BADLY;
         }
     }
     Ok(ended)
@@ -53,7 +53,7 @@ pub(crate) fn measured(
     command: &mut Command,
     workspace: &Workspace,
     bench: &str,
-) -> anyhow::Result<Ended> {
+) -> anyhow::Result<CommandOutcome> {
     let mut child = command.stdout(Stdio::piped()).spawn()?;
     let mut text = String::new();
     if let Some(output) = child.stdout.take() {

@@ -5,11 +5,11 @@ use std::process::Command;
 use crate::{
     links,
     patches::Patched,
-    shell::{Ended, run as must, status, step},
+    shell::{CommandOutcome, run as must, status, step},
     workspace::Workspace,
 };
 
-pub(crate) fn run(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<Ended> {
+pub(crate) fn run(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<CommandOutcome> {
     build(workspace)?;
     step("running the demo");
     let mut demo = Command::new(workspace.target.join("debug/demo"));

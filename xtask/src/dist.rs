@@ -17,15 +17,15 @@ use std::{
 use anyhow::{Context as _, ensure};
 
 use self::{
-    package::{MAINTAINER, Package},
+    package::{DebianPackage, MAINTAINER},
     sysroot::Machine,
-    tree::Tree,
+    tree::PackageFiles,
 };
 use crate::{
     help::{Help, output},
     links,
     patches::Patched,
-    shell::{Ended, run as must, step},
+    shell::{CommandOutcome, run as must, step},
     workspace::{SHIPPED, Workspace},
 };
 
@@ -33,7 +33,7 @@ use crate::{
 const PROGRAMS: [&str; 3] = ["bridge-ros1", "bridge-ros2", links::TARGET];
 
 /// Builds the programs without optimisation into `target/debug`.
-pub(crate) fn build(workspace: &Workspace) -> anyhow::Result<Ended> {
+pub(crate) fn build(workspace: &Workspace) -> anyhow::Result<CommandOutcome> {
     let patched = Patched::prepare(workspace)?;
     step("building the programs (some minutes the first time)");
     let mut build = patched.cargo(workspace, &["build", "--locked", "--bins"]);
@@ -42,7 +42,7 @@ pub(crate) fn build(workspace: &Workspace) -> anyhow::Result<Ended> {
     }
     must(&mut build)?;
     links::make(&workspace.target.join("debug"))?;
-    Ok(Ended::WELL)
+    Ok(CommandOutcome::WELL)
 }
 
 /// Builds the programs with optimisation and puts them into `target/dist`, as packages if the
@@ -50,10 +50,10 @@ pub(crate) fn build(workspace: &Workspace) -> anyhow::Result<Ended> {
 ///
 /// # Errors
 /// Returns an error if a program cannot be built, or a package cannot be written.
-pub(crate) fn run(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<Ended> {
-    let Some(wanted) = Wanted::parse(arguments) else {
+pub(crate) fn run(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<CommandOutcome> {
+    let Some(wanted) = DistArguments::parse(arguments) else {
         eprintln!("xtask: dist takes {USAGE}, not `{}`", arguments.join(" "));
-        return Ok(Ended::USAGE);
+        return Ok(CommandOutcome::USAGE);
     };
     if wanted.formats.is_empty() {
         return programs(workspace);
@@ -67,7 +67,7 @@ pub(crate) fn run(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<E
     let tree = tree(workspace, &patched, (wanted.machine, &commit), &program)?;
     let folder = workspace.target.join("dist");
     fs::create_dir_all(&folder).with_context(|| folder.display().to_string())?;
-    let package = Package {
+    let package = DebianPackage {
         workspace,
         machine: wanted.machine,
         version: commit.version(),
@@ -84,7 +84,7 @@ pub(crate) fn run(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<E
         println!("{}", path.display());
     }
     println!("installed: {:.1} MB", tree.size() as f64 / 1e6);
-    Ok(Ended::WELL)
+    Ok(CommandOutcome::WELL)
 }
 
 const USAGE: &str =
@@ -100,14 +100,14 @@ enum Format {
 
 /// The command line.
 #[derive(Debug, PartialEq, Eq)]
-struct Wanted {
+struct DistArguments {
     formats: Vec<Format>,
     machine: Machine,
     /// An `ua-bridge` that was built elsewhere.
     program: Option<PathBuf>,
 }
 
-impl Wanted {
+impl DistArguments {
     fn parse(arguments: &[&str]) -> Option<Self> {
         let mut wanted = Self {
             formats: Vec::new(),
@@ -225,8 +225,8 @@ fn tree(
     patched: &Patched,
     (machine, commit): (Machine, &Commit),
     program: &Path,
-) -> anyhow::Result<Tree> {
-    let mut tree = Tree::default();
+) -> anyhow::Result<PackageFiles> {
+    let mut tree = PackageFiles::default();
     let read = |path: &Path| fs::read(path).with_context(|| path.display().to_string());
     let text = |path: &str| {
         let path = workspace.root.join(path);
@@ -340,7 +340,7 @@ fn pages(
     workspace: &Workspace,
     (machine, commit): (Machine, &Commit),
     program: &Path,
-    tree: &mut Tree,
+    tree: &mut PackageFiles,
 ) -> anyhow::Result<()> {
     let folder = runnable(workspace, machine, program)?;
     let all = Help::all(&folder)?;
@@ -391,7 +391,7 @@ fn documents(
     workspace: &Workspace,
     patched: &Patched,
     (machine, commit): (Machine, &Commit),
-    tree: &mut Tree,
+    tree: &mut PackageFiles,
 ) -> anyhow::Result<()> {
     let text = |path: &str| {
         let path = workspace.root.join(path);
@@ -448,7 +448,7 @@ fn documents(
 }
 
 /// Builds the programs as separate files, for this machine.
-fn programs(workspace: &Workspace) -> anyhow::Result<Ended> {
+fn programs(workspace: &Workspace) -> anyhow::Result<CommandOutcome> {
     let patched = Patched::prepare(workspace)?;
     step("building the programs with optimisation (some minutes the first time)");
     let mut build = patched.cargo(
@@ -471,5 +471,5 @@ fn programs(workspace: &Workspace) -> anyhow::Result<Ended> {
     for link in links::paths(&folder) {
         println!("{} -> {}", link.display(), links::TARGET);
     }
-    Ok(Ended::WELL)
+    Ok(CommandOutcome::WELL)
 }

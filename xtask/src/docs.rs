@@ -9,7 +9,7 @@ use crate::{
     dist,
     help::{Help, output},
     markdown,
-    shell::{Ended, step},
+    shell::{CommandOutcome, step},
     workspace::Workspace,
 };
 
@@ -29,13 +29,13 @@ const METRICS: [(&str, &str, &str); 3] = [
 ///
 /// # Errors
 /// Returns an error if a program cannot be built or run, or a page cannot be written.
-pub(crate) fn run(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<Ended> {
+pub(crate) fn run(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<CommandOutcome> {
     let unknown = arguments
         .iter()
         .find(|argument| !["--check", "--no-build"].contains(argument));
     if let Some(unknown) = unknown {
         eprintln!("xtask: docs takes --check and --no-build, not {unknown}");
-        return Ok(Ended::USAGE);
+        return Ok(CommandOutcome::USAGE);
     }
     let check = arguments.contains(&"--check");
     if !arguments.contains(&"--no-build") {
@@ -82,13 +82,13 @@ pub(crate) fn run(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<E
         eprintln!("xtask: {fault}");
     }
     if !faults.is_empty() {
-        return Ok(Ended::BADLY);
+        return Ok(CommandOutcome::BADLY);
     }
     step(match check {
         true => "the reference pages are current",
         false => "the reference pages are written",
     });
-    Ok(Ended::WELL)
+    Ok(CommandOutcome::WELL)
 }
 
 /// Returns the page of all commands: the help of each program and of its verbs.

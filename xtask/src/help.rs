@@ -55,8 +55,8 @@ impl Help {
     }
 
     /// Returns the parts of the text.
-    pub(crate) fn parts(&self) -> Parts<'_> {
-        Parts::of(&self.text)
+    pub(crate) fn parts(&self) -> HelpParts<'_> {
+        HelpParts::of(&self.text)
     }
 }
 
@@ -102,17 +102,17 @@ pub(crate) fn output(programs: &Path, words: &[&str]) -> anyhow::Result<String> 
 
 /// The parts of a help text.
 #[derive(Debug, Default, PartialEq, Eq)]
-pub(crate) struct Parts<'a> {
+pub(crate) struct HelpParts<'a> {
     /// The paragraphs before and after the sections.
     pub(crate) about: Vec<&'a str>,
     pub(crate) usage: &'a str,
     /// Sections such as `Options`, with their items.
-    pub(crate) sections: Vec<(&'a str, Vec<Item<'a>>)>,
+    pub(crate) sections: Vec<(&'a str, Vec<HelpItem<'a>>)>,
 }
 
 /// An argument, option or verb with its explanation.
 #[derive(Debug, Default, PartialEq, Eq)]
-pub(crate) struct Item<'a> {
+pub(crate) struct HelpItem<'a> {
     /// The argument as it is typed, such as `-o, --out <FILE>`.
     pub(crate) head: &'a str,
     pub(crate) text: Vec<&'a str>,
@@ -121,7 +121,7 @@ pub(crate) struct Item<'a> {
 /// Continuation lines of an item are indented at least so far.
 const BODY: usize = 8;
 
-impl<'a> Parts<'a> {
+impl<'a> HelpParts<'a> {
     fn of(help: &'a str) -> Self {
         let mut parts = Self::default();
         let mut in_section = false;
@@ -144,7 +144,7 @@ impl<'a> Parts<'a> {
             } else if let Some((_, items)) = parts.sections.last_mut() {
                 match items.last_mut() {
                     Some(item) if indent >= BODY => item.text.push(text),
-                    _ => items.push(Item::of(text)),
+                    _ => items.push(HelpItem::of(text)),
                 }
             }
         }
@@ -152,7 +152,7 @@ impl<'a> Parts<'a> {
     }
 
     /// Returns the options, each with its long name and its values, if there is a list of them.
-    pub(crate) fn options(&self) -> impl Iterator<Item = (&'a str, &Item<'a>)> {
+    pub(crate) fn options(&self) -> impl Iterator<Item = (&'a str, &HelpItem<'a>)> {
         let options = self
             .sections
             .iter()
@@ -162,7 +162,7 @@ impl<'a> Parts<'a> {
     }
 }
 
-impl<'a> Item<'a> {
+impl<'a> HelpItem<'a> {
     fn of(line: &'a str) -> Self {
         match line.split_once("  ") {
             Some((head, text)) => Self {
@@ -257,7 +257,7 @@ Options:
 
     #[test]
     fn a_long_help_has_paragraphs_and_items_with_lines() {
-        let parts = Parts::of(LONG);
+        let parts = HelpParts::of(LONG);
         assert_eq!(
             parts.about,
             [
@@ -279,7 +279,7 @@ Options:
 
     #[test]
     fn a_short_help_has_an_item_in_each_line() {
-        let parts = Parts::of(SHORT);
+        let parts = HelpParts::of(SHORT);
         let options: Vec<_> = parts.options().collect();
         assert_eq!(options[0].0, "--policy");
         assert_eq!(options[0].1.values(), ["a", "b"]);

@@ -12,7 +12,7 @@ use std::{
 use anyhow::{Context as _, bail, ensure};
 
 use crate::{
-    shell::{Ended, run as must, step, succeeds},
+    shell::{CommandOutcome, run as must, step, succeeds},
     workspace::{SHIPPED, Workspace},
 };
 
@@ -30,14 +30,14 @@ pub(crate) fn run(
     of: &str,
     arguments: &[&str],
     after: impl FnOnce(&Path) -> anyhow::Result<()>,
-) -> anyhow::Result<Ended> {
+) -> anyhow::Result<CommandOutcome> {
     let (wall, update) = match arguments {
         [] => (true, false),
         ["--instructions"] => (false, false),
         ["--update"] => (false, true),
         _ => {
             eprintln!("xtask: bench {of} takes --instructions or --update");
-            return Ok(Ended::USAGE);
+            return Ok(CommandOutcome::USAGE);
         }
     };
     let package = format!("{of}-bench");
@@ -61,7 +61,7 @@ pub(crate) fn run(
     let list = List::of(workspace, of);
     if update {
         list.write(&counted)?;
-        return Ok(Ended::WELL);
+        return Ok(CommandOutcome::WELL);
     }
     list.compare(&counted)
 }
@@ -134,24 +134,24 @@ impl List {
             .collect()
     }
 
-    fn compare(&self, counted: &BTreeMap<String, u64>) -> anyhow::Result<Ended> {
+    fn compare(&self, counted: &BTreeMap<String, u64>) -> anyhow::Result<CommandOutcome> {
         let listed = self.read()?;
-        let mut ended = Ended::WELL;
+        let mut ended = CommandOutcome::WELL;
         for (name, count) in counted {
             let verdict = match listed.get(name) {
                 Some(before) if *count > limit(*before) => {
-                    ended = Ended::BADLY;
+                    ended = CommandOutcome::BADLY;
                     format!("TOO MANY, {before} are listed")
                 }
                 Some(before) => format!("{before} listed"),
                 None => {
-                    ended = Ended::BADLY;
+                    ended = CommandOutcome::BADLY;
                     "not listed".to_owned()
                 }
             };
             println!("{count:6} {name:<32} {verdict}");
         }
-        if ended != Ended::WELL {
+        if ended != CommandOutcome::WELL {
             println!(
                 "the list is {}; `cargo xtask bench {} --update` writes it anew",
                 self.path.display(),

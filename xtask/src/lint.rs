@@ -11,7 +11,7 @@ use anyhow::Context as _;
 use crate::{
     comments,
     patches::Patched,
-    shell::{Ended, line, run as must, status, step, succeeds},
+    shell::{CommandOutcome, line, run as must, status, step, succeeds},
     workspace::Workspace,
 };
 
@@ -23,7 +23,7 @@ const FETCH: Duration = Duration::from_secs(120);
 ///
 /// # Errors
 /// Returns an error if cargo cannot be started or the patched sources cannot be prepared.
-pub(crate) fn run(workspace: &Workspace) -> anyhow::Result<Ended> {
+pub(crate) fn run(workspace: &Workspace) -> anyhow::Result<CommandOutcome> {
     let patched = Patched::prepare(workspace)?;
     let mut checks = Checks::default();
     checks.run(
@@ -58,7 +58,7 @@ pub(crate) fn run(workspace: &Workspace) -> anyhow::Result<Ended> {
 ///
 /// # Errors
 /// Returns an error if cargo cannot be started or cargo-deny cannot be built.
-pub(crate) fn dependencies(workspace: &Workspace) -> anyhow::Result<Ended> {
+pub(crate) fn dependencies(workspace: &Workspace) -> anyhow::Result<CommandOutcome> {
     let mut checks = Checks::default();
     let published = ["clippy", "--workspace", "--lib", "--bins", "--examples"];
     checks.run(
@@ -99,15 +99,15 @@ impl Checks {
         Ok(())
     }
 
-    fn ended(self) -> Ended {
+    fn ended(self) -> CommandOutcome {
         for command in &self.failed {
             eprintln!("xtask: failed: {command}");
         }
         if self.failed.is_empty() {
             step("no findings");
-            return Ended::WELL;
+            return CommandOutcome::WELL;
         }
-        Ended::BADLY
+        CommandOutcome::BADLY
     }
 }
 

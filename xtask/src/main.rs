@@ -27,7 +27,7 @@ mod workspace;
 
 use std::process::ExitCode;
 
-use crate::{shell::Ended, workspace::Workspace};
+use crate::{shell::CommandOutcome, workspace::Workspace};
 
 const VERBS: &str = "\
 cargo xtask <verb>
@@ -75,11 +75,11 @@ fn main() -> ExitCode {
     }
 }
 
-fn run(arguments: &[&str]) -> anyhow::Result<Ended> {
+fn run(arguments: &[&str]) -> anyhow::Result<CommandOutcome> {
     match arguments {
         [] | ["help" | "--help" | "-h"] => {
             print!("{VERBS}");
-            Ok(Ended::WELL)
+            Ok(CommandOutcome::WELL)
         }
         ["demo", rest @ ..] => demo::run(&Workspace::find()?, rest),
         ["test", rest @ ..] => test::run(&Workspace::find()?, rest),
@@ -114,7 +114,7 @@ fn run(arguments: &[&str]) -> anyhow::Result<Ended> {
         ["bench", "ros2", rest @ ..] => bench::ros2(&Workspace::find()?, rest),
         _ => {
             eprint!("xtask: there is no `{}`\n\n{VERBS}", arguments.join(" "));
-            Ok(Ended::USAGE)
+            Ok(CommandOutcome::USAGE)
         }
     }
 }

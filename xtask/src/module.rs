@@ -4,7 +4,7 @@ use std::process::Command;
 
 use crate::{
     demo, peers,
-    shell::{Ended, status, step},
+    shell::{CommandOutcome, status, step},
     workspace::Workspace,
 };
 
@@ -12,7 +12,7 @@ use crate::{
 ///
 /// # Errors
 /// Returns an error if Python 3.13 is missing, or the programs cannot be built.
-pub(crate) fn run(workspace: &Workspace) -> anyhow::Result<Ended> {
+pub(crate) fn run(workspace: &Workspace) -> anyhow::Result<CommandOutcome> {
     let python = peers::mtppy2(workspace)?;
     demo::build(workspace)?;
     step("reading and running a module of MTP 2.0 with MTPPy2.0");

@@ -6,7 +6,7 @@ use crate::shell::succeeds;
 
 /// The way in which a program gets the permission to create network namespaces.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Namespaces {
+pub(crate) enum NamespacePermission {
     /// The user has the permission.
     Allowed,
     /// The program runs in a user namespace with the user as root.
@@ -15,7 +15,7 @@ pub(crate) enum Namespaces {
     Refused,
 }
 
-impl Namespaces {
+impl NamespacePermission {
     /// Tests the permissions of this user on this machine.
     pub(crate) fn try_out() -> Self {
         if succeeds("unshare", &["--net", "true"]) {

@@ -4,7 +4,7 @@ use std::process::Command;
 
 use crate::{
     demo, peers,
-    shell::{Ended, status, step},
+    shell::{CommandOutcome, status, step},
     workspace::Workspace,
 };
 
@@ -13,7 +13,7 @@ use crate::{
 ///
 /// # Errors
 /// Returns an error if Chromium cannot be installed or the programs cannot be built.
-pub(crate) fn run(workspace: &Workspace) -> anyhow::Result<Ended> {
+pub(crate) fn run(workspace: &Workspace) -> anyhow::Result<CommandOutcome> {
     let browser = peers::browser(workspace)?;
     demo::build(workspace)?;
     step("driving the page in Chromium");

@@ -19,13 +19,13 @@ use anyhow::{Context as _, bail, ensure};
 use serde_json::Value;
 
 use crate::{
-    shell::{Ended, line, step, succeeds},
+    shell::{CommandOutcome, line, step, succeeds},
     workspace::Workspace,
 };
 
 /// All patched sources, ready for builds.
 pub(crate) struct Patched {
-    sources: Vec<Source>,
+    sources: Vec<PatchedCrate>,
     features: [&'static str; 2],
 }
 
@@ -46,12 +46,12 @@ impl Patched {
         let published = Published::all(workspace)?;
         let sources = subfolders(&workspace.root.join("patches"))?
             .iter()
-            .map(|folder| Source::prepare(workspace, folder, &published))
+            .map(|folder| PatchedCrate::prepare(workspace, folder, &published))
             .collect::<anyhow::Result<_>>()?;
         Ok(Self { sources, features })
     }
 
-    pub(crate) fn sources(&self) -> &[Source] {
+    pub(crate) fn sources(&self) -> &[PatchedCrate] {
         &self.sources
     }
 
@@ -83,7 +83,7 @@ impl Patched {
 }
 
 /// A patched crate.
-pub(crate) struct Source {
+pub(crate) struct PatchedCrate {
     /// `NAME-VERSION`.
     name: String,
     folder: PathBuf,
@@ -91,7 +91,7 @@ pub(crate) struct Source {
     tests: Vec<String>,
 }
 
-impl Source {
+impl PatchedCrate {
     fn prepare(
         workspace: &Workspace,
         patches: &Path,
@@ -181,7 +181,7 @@ fn features() -> [&'static str; 2] {
 }
 
 /// Prepares the sources and prints the command for manual builds.
-pub(crate) fn run(workspace: &Workspace) -> anyhow::Result<Ended> {
+pub(crate) fn run(workspace: &Workspace) -> anyhow::Result<CommandOutcome> {
     let patched = Patched::prepare(workspace)?;
     let [config, paths] = patched.configuration();
     println!(
@@ -190,7 +190,7 @@ pub(crate) fn run(workspace: &Workspace) -> anyhow::Result<Ended> {
         paths.display(),
         patched.features.join(" ")
     );
-    Ok(Ended::WELL)
+    Ok(CommandOutcome::WELL)
 }
 
 /// A published crate.

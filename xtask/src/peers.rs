@@ -12,7 +12,7 @@ use std::{
 use anyhow::{Context as _, ensure};
 
 use crate::{
-    shell::{Ended, line, run as must, step, succeeds},
+    shell::{CommandOutcome, line, run as must, step, succeeds},
     workspace::Workspace,
 };
 
@@ -152,12 +152,12 @@ const VALIDATOR_PROGRAM: &str = "node_modules/.bin/html-validate";
 
 /// Installs missing peers. Failures are printed; the tests of these peers then skip themselves, or
 /// fail with `CI=true`.
-pub(crate) fn install(workspace: &Workspace) -> Ended {
-    let mut ended = Ended::WELL;
+pub(crate) fn install(workspace: &Workspace) -> CommandOutcome {
+    let mut ended = CommandOutcome::WELL;
     let mut told = |which: &str, result: anyhow::Result<()>| {
         if let Err(error) = result {
             eprintln!("xtask: the peers {which} are not complete: {error:#}");
-            ended = Ended::BADLY;
+            ended = CommandOutcome::BADLY;
         }
     };
     told("from apt", apt());
@@ -170,9 +170,9 @@ pub(crate) fn install(workspace: &Workspace) -> Ended {
 }
 
 /// `cargo xtask peers`: installs the peers and prints whether all are installed.
-pub(crate) fn run(workspace: &Workspace) -> Ended {
+pub(crate) fn run(workspace: &Workspace) -> CommandOutcome {
     let ended = install(workspace);
-    if ended == Ended::WELL {
+    if ended == CommandOutcome::WELL {
         step("all peers of the tests are there");
     }
     ended
@@ -182,8 +182,8 @@ pub(crate) fn run(workspace: &Workspace) -> Ended {
 ///
 /// # Errors
 /// Returns an error if a package cannot be installed.
-pub(crate) fn for_building() -> anyhow::Result<Ended> {
-    apt_install(APT_BUILD).map(|()| Ended::WELL)
+pub(crate) fn for_building() -> anyhow::Result<CommandOutcome> {
+    apt_install(APT_BUILD).map(|()| CommandOutcome::WELL)
 }
 
 /// Installs node-opcua in the versions of `tests/peers/node-opcua`, without the install scripts of

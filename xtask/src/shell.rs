@@ -6,23 +6,23 @@ use anyhow::{Context as _, bail};
 
 /// The outcome of a command, which gives the exit code of this program.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) struct Ended(u8);
+pub(crate) struct CommandOutcome(u8);
 
-impl Ended {
+impl CommandOutcome {
     pub(crate) const WELL: Self = Self(0);
     pub(crate) const BADLY: Self = Self(1);
     pub(crate) const USAGE: Self = Self(64);
 }
 
-impl From<ExitStatus> for Ended {
+impl From<ExitStatus> for CommandOutcome {
     fn from(status: ExitStatus) -> Self {
         let code = status.code().and_then(|code| u8::try_from(code).ok());
         code.map_or(Self::BADLY, Self)
     }
 }
 
-impl From<Ended> for ExitCode {
-    fn from(ended: Ended) -> Self {
+impl From<CommandOutcome> for ExitCode {
+    fn from(ended: CommandOutcome) -> Self {
         Self::from(ended.0)
     }
 }

@@ -19,15 +19,15 @@ use anyhow::Context as _;
 
 use crate::{
     links,
-    namespace::{Namespaces, REFUSED},
-    patches::{Patched, Source},
+    namespace::{NamespacePermission, REFUSED},
+    patches::{Patched, PatchedCrate},
     peers,
-    shell::{Ended, is_ci, step},
+    shell::{CommandOutcome, is_ci, step},
     workspace::Workspace,
 };
-use job::{Job, Lanes, Report};
-use outcome::Outcome;
-use programs::Program;
+use job::{JobReport, JobSlots, TestJob};
+use outcome::TestOutcome;
+use programs::TestProgram;
 
 /// The targets of a test run. All commands build the same packages, so nothing is built twice.
 const TARGETS: &[&str] = &["--workspace", "--locked"];
@@ -42,14 +42,14 @@ const BESIDE: usize = 3;
 /// project; more failures indicate a fault.
 const MOST_FLAKY: usize = 2;
 
-pub(crate) fn run(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<Ended> {
+pub(crate) fn run(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<CommandOutcome> {
     let (options, filters): (Vec<&str>, Vec<&str>) = arguments
         .iter()
         .copied()
         .partition(|argument| argument.starts_with('-'));
     if let Some(unknown) = options.iter().find(|option| **option != "--no-install") {
         eprintln!("xtask: test takes --no-install and names of tests, not {unknown}");
-        return Ok(Ended::USAGE);
+        return Ok(CommandOutcome::USAGE);
     }
     if options.is_empty() {
         // Tests of missing peers skip themselves, or fail with CI=true; the other tests run.
@@ -72,22 +72,22 @@ pub(crate) fn run(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<E
         Err(error) if error.kind() == ErrorKind::NotFound => String::new(),
         Err(error) => return Err(error).with_context(|| format!("{}", skipped.display())),
     };
-    let outcome = Outcome::new(&report, reasons.lines().collect(), MOST_FLAKY);
+    let outcome = TestOutcome::new(&report, reasons.lines().collect(), MOST_FLAKY);
     step(&format!("tested in {}", minutes(start.elapsed())));
     print!("{outcome}");
     Ok(outcome.ended())
 }
 
 /// Runs only the tests that the patches add to their crates.
-pub(crate) fn of_all_patches(workspace: &Workspace) -> anyhow::Result<Ended> {
+pub(crate) fn of_all_patches(workspace: &Workspace) -> anyhow::Result<CommandOutcome> {
     let patched = Patched::prepare(workspace)?;
     let programs = of_patches(workspace, &patched)?;
-    let namespaces = Namespaces::try_out();
+    let namespaces = NamespacePermission::try_out();
     let jobs = programs.iter();
     let jobs = jobs.map(|(source, program)| job_of_patches(source, program, namespaces));
-    let mut report = Report::default();
-    report.take(Lanes(1).run(jobs.collect())?);
-    let outcome = Outcome::new(&report, Vec::new(), 0);
+    let mut report = JobReport::default();
+    report.take(JobSlots(1).run(jobs.collect())?);
+    let outcome = TestOutcome::new(&report, Vec::new(), 0);
     print!("{outcome}");
     Ok(outcome.ended())
 }
@@ -96,7 +96,7 @@ pub(crate) fn of_all_patches(workspace: &Workspace) -> anyhow::Result<Ended> {
 fn of_patches<'a>(
     workspace: &Workspace,
     patched: &'a Patched,
-) -> anyhow::Result<Vec<(&'a Source, Program)>> {
+) -> anyhow::Result<Vec<(&'a PatchedCrate, TestProgram)>> {
     let mut all = Vec::new();
     for source in patched.sources() {
         // Without test names the program would run all tests of the crate.
@@ -111,22 +111,22 @@ fn of_patches<'a>(
 /// The jobs, grouped by their concurrency.
 struct Plan {
     /// Jobs that run in sequence, because they use all cores themselves.
-    programs: Vec<Job>,
+    programs: Vec<TestJob>,
     /// Jobs that run with the concurrency [`BESIDE`].
-    beside: Vec<Job>,
-    alone: Vec<Job>,
+    beside: Vec<TestJob>,
+    alone: Vec<TestJob>,
 }
 
 impl Plan {
     fn of(
         workspace: &Workspace,
         patched: &Patched,
-        programs: &[Program],
+        programs: &[TestProgram],
         filters: &[&str],
         skipped: &Path,
     ) -> anyhow::Result<Self> {
-        let namespaces = Namespaces::try_out();
-        if namespaces == Namespaces::Refused {
+        let namespaces = NamespacePermission::try_out();
+        if namespaces == NamespacePermission::Refused {
             eprintln!("xtask: {REFUSED}");
             if is_ci() {
                 eprintln!("xtask: with CI=true no test is skipped, so the system tests fail");
@@ -138,7 +138,7 @@ impl Plan {
                 .env("UA_PEERS_PYTHON", peers::python(workspace))
                 .env("UA_PEERS", workspace.peers())
                 .env("UA_SKIPPED", skipped);
-            if namespaces == Namespaces::Refused {
+            if namespaces == NamespacePermission::Refused {
                 command.env("UA_NO_NETWORK", REFUSED);
             }
             command
@@ -153,7 +153,7 @@ impl Plan {
             if program.package != SYSTEM_TESTS {
                 let mut command = command();
                 command.args(filters);
-                plan.programs.push(Job::new(program.label(), command));
+                plan.programs.push(TestJob::new(program.label(), command));
                 continue;
             }
             for test in program.tests(filters)? {
@@ -161,7 +161,7 @@ impl Plan {
                 command.args(["--exact", &test]);
                 let module = test.split("::").next().unwrap_or_default();
                 let alone = ALONE.contains(&module);
-                let job = Job::new(test, command).with_peers();
+                let job = TestJob::new(test, command).with_peers();
                 match alone {
                     true => plan.alone.push(job),
                     false => plan.beside.push(job),
@@ -170,36 +170,40 @@ impl Plan {
         }
         let mut documents = surround(patched.cargo(workspace, &[&["test"][..], TARGETS].concat()));
         documents.args(["--doc", "--"]).args(filters);
-        plan.programs.push(Job::new(
+        plan.programs.push(TestJob::new(
             "examples in the documentation".to_owned(),
             documents,
         ));
         Ok(plan)
     }
 
-    fn run(self) -> anyhow::Result<Report> {
-        let mut report = Report::default();
+    fn run(self) -> anyhow::Result<JobReport> {
+        let mut report = JobReport::default();
         step("tests without peers");
-        report.take(Lanes(1).run(self.programs)?);
+        report.take(JobSlots(1).run(self.programs)?);
         step(&format!(
             "tests with peers, each in a network of its own, {BESIDE} at a time"
         ));
-        report.take(Lanes(BESIDE).run(self.beside)?);
+        report.take(JobSlots(BESIDE).run(self.beside)?);
         step("tests that take the machine for themselves");
-        report.take(Lanes(1).run(self.alone)?);
+        report.take(JobSlots(1).run(self.alone)?);
         let again = report.failed_with_peers(MOST_RETRIED);
         if !again.is_empty() {
             step("tests with peers that failed, once more and alone");
-            report.retry(Lanes(1).run(again)?);
+            report.retry(JobSlots(1).run(again)?);
         }
         Ok(report)
     }
 }
 
-fn job_of_patches(source: &Source, program: &Program, namespaces: Namespaces) -> Job {
+fn job_of_patches(
+    source: &PatchedCrate,
+    program: &TestProgram,
+    namespaces: NamespacePermission,
+) -> TestJob {
     let mut command = program.alone(namespaces);
     command.args(source.tests());
-    Job::new(format!("{}, what patches/ adds", source.name()), command)
+    TestJob::new(format!("{}, what patches/ adds", source.name()), command)
 }
 
 /// Maximum number of failures that are retried. More failures are not accidents of a peer, and

@@ -19,7 +19,7 @@ use tokio::time::timeout;
 use tracing::{debug, info, warn};
 
 use crate::host_name;
-use crate::interface::Interface;
+use crate::interface::MdnsInterface;
 use crate::servers::MdnsFault;
 
 /// The command line option for the announcement of a bridge.
@@ -69,7 +69,7 @@ pub enum Telling {
     /// No network.
     Nowhere,
     /// The network of this interface.
-    On(Interface),
+    On(MdnsInterface),
 }
 
 impl FromStr for Telling {
@@ -79,7 +79,7 @@ impl FromStr for Telling {
         Ok(match text {
             "none" => Self::Nowhere,
             "group" => Self::Group,
-            interface => Self::On(Interface::parse(interface)),
+            interface => Self::On(MdnsInterface::parse(interface)),
         })
     }
 }
@@ -108,7 +108,7 @@ pub fn tell_bridge(bridge: &Bridge, telling: &Telling, group: Option<&str>) -> O
     let interface = match telling {
         Telling::Nowhere => return None,
         Telling::On(interface) => interface.clone(),
-        Telling::Group => group.map_or(Interface::LOOPBACK, Interface::parse),
+        Telling::Group => group.map_or(MdnsInterface::LOOPBACK, MdnsInterface::parse),
     };
     match told(bridge, &interface) {
         Ok(told) => Some(told),
@@ -119,7 +119,7 @@ pub fn tell_bridge(bridge: &Bridge, telling: &Telling, group: Option<&str>) -> O
     }
 }
 
-fn told(bridge: &Bridge, interface: &Interface) -> Result<ToldBridge, MdnsFault> {
+fn told(bridge: &Bridge, interface: &MdnsInterface) -> Result<ToldBridge, MdnsFault> {
     let fault = |source| MdnsFault::new(interface, source);
     let addresses = interface.addresses();
     let Some(first) = addresses.first() else {
@@ -180,7 +180,7 @@ fn info_of(
 }
 
 /// Logs a warning if nothing is sent, as on a network without multicast.
-async fn look(monitor: Receiver<DaemonEvent>, interface: Interface) {
+async fn look(monitor: Receiver<DaemonEvent>, interface: MdnsInterface) {
     let why = match timeout(ANNOUNCED_WITHIN, announced(&monitor)).await {
         Ok(Ok(name)) => return info!(?name, "announced by mDNS on {interface}"),
         Ok(Err(why)) => why,
@@ -226,7 +226,7 @@ impl Drop for ToldBridge {
     reason = "the crate reports further events; two of them concern presence"
 )]
 pub async fn heard_bridges(
-    interface: &Interface,
+    interface: &MdnsInterface,
     limit: Duration,
 ) -> Result<Vec<HeardBridge>, MdnsFault> {
     let fault = |source| MdnsFault::new(interface, source);
@@ -331,6 +331,9 @@ mod tests {
     fn where_it_is_told_of_is_a_word() {
         assert_eq!("none".parse(), Ok(Telling::Nowhere));
         assert_eq!("group".parse(), Ok(Telling::Group));
-        assert_eq!("eth0".parse(), Ok(Telling::On(Interface::parse("eth0"))));
+        assert_eq!(
+            "eth0".parse(),
+            Ok(Telling::On(MdnsInterface::parse("eth0")))
+        );
     }
 }

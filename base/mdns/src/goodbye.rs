@@ -8,10 +8,10 @@ use registry::label;
 use socket2::{Domain, Protocol, Socket, Type};
 use tokio::net::UdpSocket;
 
-use crate::interface::Interface;
+use crate::interface::MdnsInterface;
 
 /// Opens a socket for the packets of the mDNS group on one interface.
-pub fn listen(interface: &Interface) -> std::io::Result<UdpSocket> {
+pub fn listen(interface: &MdnsInterface) -> std::io::Result<UdpSocket> {
     let socket = Socket::new(Domain::IPV4, Type::DGRAM, Some(Protocol::UDP))?;
     socket.set_reuse_address(true)?;
     socket.set_reuse_port(true)?;

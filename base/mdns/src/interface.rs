@@ -13,7 +13,7 @@ use crate::url::Url;
 /// A network interface, by name or by an address it has. Each level of a plant is a network of its
 /// own: announcements on a network do not appear on another network.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
-pub struct Interface {
+pub struct MdnsInterface {
     which: Which,
     /// Networks behind routers, from which announcements are accepted too.
     beyond: Vec<Range>,
@@ -25,7 +25,7 @@ enum Which {
     Address(IpAddr),
 }
 
-impl Interface {
+impl MdnsInterface {
     /// The loopback interface, for this host only.
     pub const LOOPBACK: Self = Self::of(Which::Address(IpAddr::V4(Ipv4Addr::LOCALHOST)));
 
@@ -172,7 +172,7 @@ impl Subnets {
     }
 }
 
-impl std::fmt::Display for Interface {
+impl std::fmt::Display for MdnsInterface {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         match &self.which {
             Which::Name(name) => f.write_str(name),
@@ -189,7 +189,7 @@ mod tests {
 
     #[tokio::test]
     async fn a_url_outside_the_subnets_of_the_interface_is_not_accepted() {
-        let loopback = Interface::LOOPBACK;
+        let loopback = MdnsInterface::LOOPBACK;
         assert!(loopback.accepts("opc.tcp://127.0.0.1:4840/a").await);
         for url in [
             "opc.tcp://192.0.2.7:4840",
@@ -209,6 +209,10 @@ mod tests {
         subnets.beyond.push("10.77.0.0/24".parse().unwrap());
         assert!(subnets.contains(Ipv4Addr::new(10, 77, 0, 9)));
         assert!(!subnets.contains(Ipv4Addr::new(10, 78, 0, 9)));
-        assert!(Interface::LOOPBACK.subnets().contains(Ipv4Addr::LOCALHOST));
+        assert!(
+            MdnsInterface::LOOPBACK
+                .subnets()
+                .contains(Ipv4Addr::LOCALHOST)
+        );
     }
 }

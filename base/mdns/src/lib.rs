@@ -16,9 +16,11 @@ pub use bridges::{
     Bridge, HeardBridge, Telling, TellingArguments, ToldBridge, heard_bridges, tell_bridge,
 };
 pub use goodbye::{goodbyes, listen};
-pub use interface::{Interface, Subnets};
+pub use interface::{MdnsInterface, Subnets};
 pub use range::{Range, RangeFault};
-pub use servers::{Aside, Heard, Mdns, MdnsFault, Ours, SERVICE, heard, is_own, same_place};
+pub use servers::{
+    Aside, Mdns, MdnsEvent, MdnsFault, OwnAnnouncement, SERVICE, heard, is_own, same_place,
+};
 pub use url::Url;
 
 /// Returns the name of this host, without a domain.

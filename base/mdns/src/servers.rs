@@ -15,14 +15,14 @@ use mdns_sd::{
     DaemonEvent, IfKind, MDNS_PORT, Receiver, ResolvedService, ServiceDaemon, ServiceEvent,
     ServiceInfo,
 };
-use registry::{Announcement, label, renamed};
+use registry::{AnnouncedServer, label, renamed};
 use tokio::net::UdpSocket;
 use tokio::time::{Instant, sleep_until};
 use tracing::{debug, info, warn};
 
 use crate::goodbye::{goodbyes, listen};
 use crate::host_name;
-use crate::interface::{Interface, Subnets};
+use crate::interface::{MdnsInterface, Subnets};
 use crate::url::Url;
 
 /// Error of starting the mDNS daemon.
@@ -35,7 +35,7 @@ pub struct MdnsFault {
 }
 
 impl MdnsFault {
-    pub(crate) fn new(interface: &Interface, source: mdns_sd::Error) -> Self {
+    pub(crate) fn new(interface: &MdnsInterface, source: mdns_sd::Error) -> Self {
         Self {
             interface: interface.to_string(),
             source,
@@ -45,11 +45,11 @@ impl MdnsFault {
 
 /// Event on the network.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Heard {
+pub enum MdnsEvent {
     /// A server was announced for the first time or with changes.
     Announced {
         /// Announcement of the server.
-        announcement: Announcement,
+        announcement: AnnouncedServer,
         /// Additional properties of programs of this project.
         aside: Aside,
     },
@@ -69,9 +69,9 @@ pub enum Heard {
 
 /// An announcement of this program.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Ours {
+pub struct OwnAnnouncement {
     /// The standard part of the announcement.
-    pub announcement: Announcement,
+    pub announcement: AnnouncedServer,
     /// The keys that programs of this project add.
     pub aside: Aside,
 }
@@ -97,7 +97,7 @@ impl Aside {
 
 /// mDNS on one interface, with a thread of its own for queries and responses.
 pub struct Mdns {
-    interface: Interface,
+    interface: MdnsInterface,
     daemon: ServiceDaemon,
     events: Receiver<ServiceEvent>,
     monitor: Option<Receiver<DaemonEvent>>,
@@ -111,15 +111,15 @@ pub struct Mdns {
     left: Vec<String>,
     /// Instances on the network, as announced last. A new instance has not received the
     /// announcements of this program.
-    there: BTreeMap<String, (Announcement, Aside)>,
+    there: BTreeMap<String, (AnnouncedServer, Aside)>,
     /// Instances with a goodbye that the daemon has not reported yet, with a deadline for its
     /// report. The goodbye may be that of another host with the same name, or the server may be
     /// back at once. The daemon reports no event for a record that stays in its cache.
-    doubted: BTreeMap<String, (Announcement, Aside, Instant)>,
+    doubted: BTreeMap<String, (AnnouncedServer, Aside, Instant)>,
     /// Instances that the daemon reports as outdated without a goodbye, with the time at which they
     /// are reported. The daemon treats a clock that is set forward as a sleep of the machine,
     /// clears its cache, and receives the announcements again in a moment.
-    outdated: BTreeMap<String, (Announcement, Aside, Instant)>,
+    outdated: BTreeMap<String, (AnnouncedServer, Aside, Instant)>,
     /// Networks of announced servers, and the time at which they were read.
     subnets: (Subnets, Instant),
     ignored: u64,
@@ -129,7 +129,7 @@ pub struct Mdns {
 
 #[derive(Debug)]
 struct Announced {
-    ours: Ours,
+    ours: OwnAnnouncement,
     fullname: String,
     /// The URL in the received announcement: with an address in place of a host name.
     place: String,
@@ -139,11 +139,11 @@ struct Announced {
 
 impl Mdns {
     /// Opens an interface and starts to receive announcements at once.
-    pub fn open(interface: &Interface) -> Result<Self, MdnsFault> {
+    pub fn open(interface: &MdnsInterface) -> Result<Self, MdnsFault> {
         Self::open_at(interface, MDNS_PORT)
     }
 
-    fn open_at(interface: &Interface, port: u16) -> Result<Self, MdnsFault> {
+    fn open_at(interface: &MdnsInterface, port: u16) -> Result<Self, MdnsFault> {
         let fault = |source| MdnsFault::new(interface, source);
         let daemon = ServiceDaemon::new_with_port(port).map_err(fault)?;
         daemon.disable_interface(IfKind::All).map_err(fault)?;
@@ -170,7 +170,7 @@ impl Mdns {
     }
 
     /// Announces a server at once, in place of the previous announcement of its name.
-    pub fn put(&mut self, ours: Ours) {
+    pub fn put(&mut self, ours: OwnAnnouncement) {
         let Some(info) = self.info(&ours) else {
             warn!(
                 name = ours.announcement.instance,
@@ -213,11 +213,11 @@ impl Mdns {
     }
 
     /// Returns the next event. Cancel-safe.
-    pub async fn next(&mut self) -> Heard {
+    pub async fn next(&mut self) -> MdnsEvent {
         loop {
             while let Some(instance) = self.left.pop() {
                 if self.outdated.remove(&instance).is_some() {
-                    return Heard::Withdrawn { instance };
+                    return MdnsEvent::Withdrawn { instance };
                 }
                 if !self.ours.contains_key(&instance)
                     && let Some((announcement, aside)) = self.there.remove(&instance)
@@ -228,7 +228,7 @@ impl Mdns {
                         self.doubted
                             .insert(instance.clone(), (announcement, aside, until));
                     }
-                    return Heard::Withdrawn { instance };
+                    return MdnsEvent::Withdrawn { instance };
                 }
             }
             if let Some(heard) = self.still_there().or_else(|| self.not_heard_again()) {
@@ -275,7 +275,7 @@ impl Mdns {
     }
 
     /// Returns a server with a goodbye that the daemon has kept for longer than a server that left.
-    fn still_there(&mut self) -> Option<Heard> {
+    fn still_there(&mut self) -> Option<MdnsEvent> {
         let now = Instant::now();
         let mut due = self
             .doubted
@@ -284,14 +284,14 @@ impl Mdns {
         let instance = due.next()?.0.clone();
         let (announcement, aside, _) = self.doubted.remove(&instance)?;
         self.there.insert(instance, (announcement.clone(), aside));
-        Some(Heard::Announced {
+        Some(MdnsEvent::Announced {
             announcement,
             aside,
         })
     }
 
     /// Returns an outdated server that was not announced again.
-    fn not_heard_again(&mut self) -> Option<Heard> {
+    fn not_heard_again(&mut self) -> Option<MdnsEvent> {
         let now = Instant::now();
         let mut due = self
             .outdated
@@ -299,7 +299,7 @@ impl Mdns {
             .filter(|(_, (_, _, until))| *until <= now);
         let instance = due.next()?.0.clone();
         self.outdated.remove(&instance);
-        Some(Heard::Withdrawn { instance })
+        Some(MdnsEvent::Withdrawn { instance })
     }
 
     fn take_goodbyes(&mut self, heard: std::io::Result<usize>) {
@@ -377,7 +377,7 @@ impl Mdns {
         clippy::wildcard_enum_match_arm,
         reason = "the crate may report further events; two of them concern presence"
     )]
-    fn take(&mut self, event: ServiceEvent) -> Option<Heard> {
+    fn take(&mut self, event: ServiceEvent) -> Option<MdnsEvent> {
         match event {
             ServiceEvent::ServiceResolved(service) => {
                 self.read_subnets();
@@ -388,7 +388,7 @@ impl Mdns {
                 if let Some(ours) = self.ours.get(&announcement.instance) {
                     let theirs = &announcement.url;
                     return if same_place(&ours.place, theirs) {
-                        Some(Heard::Announced {
+                        Some(MdnsEvent::Announced {
                             announcement,
                             aside,
                         })
@@ -411,7 +411,7 @@ impl Mdns {
                 let is_as_before = outdated.is_some_and(|(before, beside, _)| {
                     (before, beside) == (announcement.clone(), aside)
                 });
-                (!is_as_before).then_some(Heard::Announced {
+                (!is_as_before).then_some(MdnsEvent::Announced {
                     announcement,
                     aside,
                 })
@@ -430,7 +430,7 @@ impl Mdns {
                 }
                 // If this program still announces the name, the goodbye is that of another server
                 // of the same name.
-                (!self.ours.contains_key(&instance)).then_some(Heard::Withdrawn { instance })
+                (!self.ours.contains_key(&instance)).then_some(MdnsEvent::Withdrawn { instance })
             }
             _ => None,
         }
@@ -470,7 +470,7 @@ impl Mdns {
     /// Resolves a conflict for a name of this program (RFC 6762, 9). Of two programs of this
     /// project, the program with the later URL gives way. A program that does not give way in spite
     /// of repeated announcements is of another manufacturer, and keeps the name.
-    fn conflict(&mut self, from: &str, theirs: &str) -> Option<Heard> {
+    fn conflict(&mut self, from: &str, theirs: &str) -> Option<MdnsEvent> {
         let announced = self.ours.get_mut(from)?;
         announced.contested += 1;
         let first = *announced.place < *theirs;
@@ -492,7 +492,7 @@ impl Mdns {
         ours.announcement.instance.clone_from(&to);
         drop(self.take_back(from));
         self.put(ours);
-        Some(Heard::Renamed {
+        Some(MdnsEvent::Renamed {
             from: from.to_owned(),
             to,
         })
@@ -500,8 +500,8 @@ impl Mdns {
 
     /// Returns an announcement for the daemon, or `None` if the server listens on no address of the
     /// interface.
-    fn info(&self, ours: &Ours) -> Option<ServiceInfo> {
-        let Announcement {
+    fn info(&self, ours: &OwnAnnouncement) -> Option<ServiceInfo> {
+        let AnnouncedServer {
             instance,
             url,
             capabilities,
@@ -558,7 +558,7 @@ impl Drop for Mdns {
     }
 }
 
-fn hear_goodbyes(interface: &Interface) -> Option<UdpSocket> {
+fn hear_goodbyes(interface: &MdnsInterface) -> Option<UdpSocket> {
     let socket = listen(interface);
     let why = socket.as_ref().err();
     if let Some(error) = why {
@@ -585,7 +585,7 @@ pub fn same_place(one: &str, other: &str) -> bool {
 }
 
 /// Converts a received announcement for the registry.
-pub fn heard(service: &ResolvedService, subnets: &Subnets) -> Option<(Announcement, Aside)> {
+pub fn heard(service: &ResolvedService, subnets: &Subnets) -> Option<(AnnouncedServer, Aside)> {
     let instance = instance(&service.fullname)?;
     let text = |key| service.get_property_val(key).flatten();
     let path = match text("path").map(std::str::from_utf8) {
@@ -609,7 +609,7 @@ pub fn heard(service: &ResolvedService, subnets: &Subnets) -> Option<(Announceme
     let capabilities = capabilities
         .filter(|code| is_code(code))
         .take(MOST_CAPABILITIES);
-    let announcement = Announcement {
+    let announcement = AnnouncedServer {
         instance,
         url,
         capabilities: capabilities.map(str::to_owned).collect(),

@@ -19,7 +19,7 @@ pub enum ApplicationType {
 
 /// A RegisteredServer (OPC 10000-4, 7.32) with its MdnsDiscoveryConfiguration.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Asked {
+pub struct RegistrationRequest {
     /// The ApplicationUri.
     pub server_uri: String,
     /// The ProductUri; may be empty.
@@ -126,7 +126,7 @@ impl RegisterFault {
     }
 }
 
-impl Asked {
+impl RegistrationRequest {
     /// Validates a request, in the order of Part 4.
     pub(crate) fn check(
         &self,

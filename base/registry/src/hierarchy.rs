@@ -8,6 +8,6 @@ mod choice;
 mod place;
 mod roster;
 
-pub use choice::{Candidate, Choice, ChoiceFault, Chosen, Pattern};
-pub use place::{Place, PlaceFault};
-pub use roster::{Change, Roster};
+pub use choice::{ChoiceFault, ChosenServer, NamePattern, ServerCandidate, ServerChoice};
+pub use place::{PlaceFault, PlantLocation};
+pub use roster::{Roster, RosterChange};

@@ -4,13 +4,13 @@
 //! The listing has no socket and no clock. Send a query when [`Listing::due`] has passed, pass its
 //! result to [`Listing::answered`] or [`Listing::failed`], and call [`Listing::expire`] when
 //! [`Listing::expires`] has passed. [`Listing::answered`] returns the servers for
-//! [`Registry::listed`](crate::Registry::listed).
+//! [`Registry::listed`](crate::ServerRegistry::listed).
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::{Duration, Instant};
 
 use crate::name::label;
-use crate::network::{Announcement, host, place};
+use crate::network::{AnnouncedServer, host, place};
 
 /// The settings of a listing.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -116,7 +116,7 @@ impl Listing {
 
     /// Handles a complete answer, and returns its usable servers. They replace those of the answer
     /// before.
-    pub fn answered(&mut self, servers: Vec<ListedServer>, now: Instant) -> Vec<Announcement> {
+    pub fn answered(&mut self, servers: Vec<ListedServer>, now: Instant) -> Vec<AnnouncedServer> {
         self.due = now + self.settings.every;
         self.failures = 0;
         self.fault = None;
@@ -193,7 +193,7 @@ impl Listing {
         &self,
         server: ListedServer,
         places: &BTreeSet<String>,
-    ) -> Result<Announcement, Ignored> {
+    ) -> Result<AnnouncedServer, Ignored> {
         let ListedServer {
             name,
             url,
@@ -225,7 +225,7 @@ impl Listing {
             return Err(Ignored::TooMany);
         }
         let capabilities = capabilities.iter().take(MOST_CAPABILITIES);
-        Ok(Announcement {
+        Ok(AnnouncedServer {
             instance,
             url,
             capabilities: capabilities.map(|code| label(code)).collect(),

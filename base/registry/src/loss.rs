@@ -2,7 +2,7 @@
 
 /// Reason for the loss of a server.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub enum Loss {
+pub enum ServerLoss {
     /// The server withdrew its registration.
     Unregistered,
     /// The server sent a goodbye by mDNS, or its announcement expired.
@@ -23,7 +23,7 @@ pub enum Loss {
     Superseded,
 }
 
-impl Loss {
+impl ServerLoss {
     /// Returns the label for logs and counters.
     #[must_use]
     pub fn label(self) -> &'static str {

@@ -5,7 +5,7 @@ use std::time::Instant;
 
 /// A server as announced by mDNS, resolved to a URL.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Announcement {
+pub struct AnnouncedServer {
     /// The instance name, without the service and the domain.
     pub instance: String,
     /// `opc.tcp://host:port/path`, from the SRV record and the key `path` of the TXT record.
@@ -20,7 +20,7 @@ pub struct NetworkRecord {
     /// Ascending and never reused, so that a client can continue after the last record.
     pub record_id: u32,
     /// The announcement.
-    pub announcement: Announcement,
+    pub announcement: AnnouncedServer,
     /// The source of the announcement.
     pub source: RecordSource,
 }
@@ -50,7 +50,7 @@ impl RecordSource {
 
 /// Records by instance name in lower case: names of DNS that differ only in case are equal.
 #[derive(Debug, Default)]
-pub(crate) struct Network {
+pub(crate) struct NetworkRecords {
     records: BTreeMap<String, NetworkRecord>,
     /// First announcement of each name.
     arrivals: BTreeMap<String, FirstAnnouncement>,
@@ -68,12 +68,12 @@ pub(crate) struct FirstAnnouncement {
     pub(crate) place: String,
 }
 
-impl Network {
+impl NetworkRecords {
     /// Adds a record. A changed record gets a new id. Returns the replaced record, or the record
     /// itself if it is unchanged.
     pub(crate) fn put(
         &mut self,
-        announcement: Announcement,
+        announcement: AnnouncedServer,
         source: RecordSource,
         now: Instant,
     ) -> Option<NetworkRecord> {

@@ -7,14 +7,14 @@ mod room;
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::time::{Duration, Instant};
 
-use crate::asked::{Asked, Channel, RegisterFault};
-use crate::loss::Loss;
-use crate::network::{Announcement, Network, NetworkRecord, RecordSource, place};
-use crate::watch::{EndpointWatch, Outcome, Patience, Probe, Sign};
+use crate::asked::{Channel, RegisterFault, RegistrationRequest};
+use crate::loss::ServerLoss;
+use crate::network::{AnnouncedServer, NetworkRecord, NetworkRecords, RecordSource, place};
+use crate::watch::{EndpointProbe, EndpointWatch, Patience, ProbeOutcome, Sign};
 
 /// Limits and time limits of a registry.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Settings {
+pub struct RegistrySettings {
     /// Whether a server may register over a channel that is not secured. The standard requires a
     /// refusal (OPC 10000-12, 4.2.2).
     pub allow_unsecured: bool,
@@ -38,7 +38,7 @@ pub struct Settings {
     pub most: usize,
 }
 
-impl Default for Settings {
+impl Default for RegistrySettings {
     fn default() -> Self {
         Self {
             allow_unsecured: false,
@@ -68,7 +68,7 @@ pub enum Registered {
 /// Event of a registry.
 #[derive(Debug, Clone, PartialEq, Eq)]
 #[non_exhaustive]
-pub enum Event {
+pub enum RegistryEvent {
     /// A server registered, or changed its registration.
     Registered {
         /// Its ApplicationUri.
@@ -88,17 +88,17 @@ pub enum Event {
         /// Its ApplicationUri.
         server_uri: String,
         /// Reason of the loss.
-        loss: Loss,
+        loss: ServerLoss,
     },
     /// A server on the network is lost.
     Vanished {
         /// Its record.
         record: NetworkRecord,
         /// Reason of the loss.
-        loss: Loss,
+        loss: ServerLoss,
     },
     /// A server requests to be announced by this program.
-    Announce(Announcement),
+    Announce(AnnouncedServer),
     /// An announcement of this program has to be withdrawn with a goodbye.
     Withdraw {
         /// The instance name.
@@ -108,18 +108,18 @@ pub enum Event {
 
 /// The available servers. The page of the crate describes its use.
 #[derive(Debug)]
-pub struct Registry {
-    settings: Settings,
+pub struct ServerRegistry {
+    settings: RegistrySettings,
     servers: BTreeMap<String, Server>,
     /// Registered and unreachable servers. They are listed again if they answer before their
     /// registration expires.
     away: BTreeMap<String, Server>,
-    network: Network,
+    network: NetworkRecords,
     /// The servers that a Global Discovery Server lists, by host and port. Those that answer have a
     /// record, unless another source reports them.
-    listed: BTreeMap<String, Announcement>,
+    listed: BTreeMap<String, AnnouncedServer>,
     watch: EndpointWatch,
-    events: VecDeque<Event>,
+    events: VecDeque<RegistryEvent>,
     refused: u64,
     displaced: u64,
     last_arrival: u64,
@@ -127,10 +127,10 @@ pub struct Registry {
 
 #[derive(Debug, Clone)]
 struct Server {
-    asked: Asked,
+    asked: RegistrationRequest,
     /// The announcement of this program for the server: the requested announcement, with another
     /// name if the requested name was taken.
-    announced: Option<Announcement>,
+    announced: Option<AnnouncedServer>,
     /// Whether the registration was made with a certificate.
     certified: bool,
     /// The address that sent the registration.
@@ -143,15 +143,15 @@ struct Server {
     forget_at: Instant,
 }
 
-impl Registry {
+impl ServerRegistry {
     /// Creates an empty registry.
     #[must_use]
-    pub fn new(settings: Settings) -> Self {
+    pub fn new(settings: RegistrySettings) -> Self {
         Self {
             settings,
             servers: BTreeMap::new(),
             away: BTreeMap::new(),
-            network: Network::default(),
+            network: NetworkRecords::default(),
             listed: BTreeMap::new(),
             watch: EndpointWatch::default(),
             events: VecDeque::new(),
@@ -168,7 +168,7 @@ impl Registry {
     /// [`RegisterFault`], with the status of the response; a previous registration stays.
     pub fn register(
         &mut self,
-        asked: Asked,
+        asked: RegistrationRequest,
         channel: &Channel,
         semaphore_is_there: Option<bool>,
         now: Instant,
@@ -178,7 +178,7 @@ impl Registry {
         self.check_certified(&asked, certified)?;
         if !asked.is_online {
             self.forget_away(&asked.server_uri);
-            self.end(&asked.server_uri.clone(), Loss::Unregistered);
+            self.end(&asked.server_uri.clone(), ServerLoss::Unregistered);
             return Ok(Registered::Withdrawn);
         }
         if semaphore_is_there == Some(false) {
@@ -221,7 +221,11 @@ impl Registry {
 
     /// Refuses to change a registration with a certificate without this certificate, as long as the
     /// registration is valid.
-    fn check_certified(&self, asked: &Asked, certified: bool) -> Result<(), RegisterFault> {
+    fn check_certified(
+        &self,
+        asked: &RegistrationRequest,
+        certified: bool,
+    ) -> Result<(), RegisterFault> {
         let known = self.servers.get(&asked.server_uri);
         let known = known.or_else(|| self.away.get(&asked.server_uri));
         match known {
@@ -244,7 +248,7 @@ impl Registry {
             announced.filter(|old| wished.as_ref().map(|new| &new.instance) != Some(&old.instance))
         {
             self.network.remove(&old.instance);
-            self.events.push_back(Event::Withdraw {
+            self.events.push_back(RegistryEvent::Withdraw {
                 instance: old.instance.clone(),
             });
         }
@@ -258,7 +262,7 @@ impl Registry {
                 self.watch.answers_during_calls(url);
             }
         }
-        self.events.push_back(Event::Registered {
+        self.events.push_back(RegistryEvent::Registered {
             server_uri,
             discovery_urls: discovery_urls.clone(),
         });
@@ -269,14 +273,14 @@ impl Registry {
             self.supersede(&wished.instance);
             self.network
                 .put(wished.clone(), RecordSource::Registration, now);
-            self.events.push_back(Event::Announce(wished));
+            self.events.push_back(RegistryEvent::Announce(wished));
         }
     }
 
     /// Handles the removal of a registered server's semaphore file.
     pub fn semaphore_gone(&mut self, server_uri: &str) {
         self.forget_away(server_uri);
-        self.end(server_uri, Loss::SemaphoreGone);
+        self.end(server_uri, ServerLoss::SemaphoreGone);
     }
 
     /// Returns whether an endpoint is supervised.
@@ -302,7 +306,7 @@ impl Registry {
     }
 
     /// Returns the next endpoint to probe, if any is due. Has to be called until it returns `None`.
-    pub fn poll_probe(&mut self, now: Instant) -> Option<Probe> {
+    pub fn poll_probe(&mut self, now: Instant) -> Option<EndpointProbe> {
         self.watch.next(self.settings.probe_every, now)
     }
 
@@ -363,17 +367,17 @@ impl Registry {
             .collect();
         let urls: Vec<String> = urls.into_iter().cloned().collect();
         self.events
-            .extend(urls.into_iter().map(|url| Event::Restarted { url }));
+            .extend(urls.into_iter().map(|url| RegistryEvent::Restarted { url }));
     }
 
     /// Handles the result of a probe.
-    pub fn probed(&mut self, url: &str, outcome: Outcome, now: Instant) {
+    pub fn probed(&mut self, url: &str, outcome: ProbeOutcome, now: Instant) {
         match outcome {
-            Outcome::Alive { .. } => self.welcome_back(url, now),
+            ProbeOutcome::Alive { .. } => self.welcome_back(url, now),
             // The host is available and the program has ended: its next run registers again, and
             // another program that gets its port is not the same server.
-            Outcome::Refused => self.forget_away_at(url),
-            Outcome::Silent | Outcome::Hanging | Outcome::Untried => {}
+            ProbeOutcome::Refused => self.forget_away_at(url),
+            ProbeOutcome::Silent | ProbeOutcome::Hanging | ProbeOutcome::Untried => {}
         }
         let patience = Patience {
             every: self.settings.probe_every,
@@ -384,9 +388,9 @@ impl Registry {
         match self.watch.probed(url, outcome, patience, now) {
             Sign::Nothing => {}
             Sign::Restarted => self.restarted(url),
-            Sign::Lost(loss) => self.lose(url, loss, outcome == Outcome::Refused, now),
+            Sign::Lost(loss) => self.lose(url, loss, outcome == ProbeOutcome::Refused, now),
         }
-        if matches!(outcome, Outcome::Alive { .. }) {
+        if matches!(outcome, ProbeOutcome::Alive { .. }) {
             self.show_listed(&place(url), now);
         }
     }
@@ -408,7 +412,7 @@ impl Registry {
             .map(|(uri, _)| uri.clone())
             .collect();
         for uri in expired {
-            self.end(&uri, Loss::Expired);
+            self.end(&uri, ServerLoss::Expired);
         }
     }
 
@@ -422,13 +426,16 @@ impl Registry {
     }
 
     /// Returns the next event, oldest first.
-    pub fn poll_event(&mut self) -> Option<Event> {
+    pub fn poll_event(&mut self) -> Option<RegistryEvent> {
         self.events.pop_front()
     }
 
     /// Returns the registered servers with their time of registration, all or with these URIs:
     /// FindServers.
-    pub fn find_servers(&self, uris: &[&str]) -> impl Iterator<Item = (&Asked, Instant)> {
+    pub fn find_servers(
+        &self,
+        uris: &[&str],
+    ) -> impl Iterator<Item = (&RegistrationRequest, Instant)> {
         self.servers
             .values()
             .filter(move |server| uris.is_empty() || uris.contains(&&*server.asked.server_uri))
@@ -461,7 +468,7 @@ impl Registry {
     }
 
     /// Removes all registrations and records of the endpoint of a URL, which does not answer.
-    fn lose(&mut self, url: &str, loss: Loss, ended: bool, now: Instant) {
+    fn lose(&mut self, url: &str, loss: ServerLoss, ended: bool, now: Instant) {
         let place_of_url = place(url);
         let is_there = |known: &String| place(known) == place_of_url;
         let had_answered = self.watch.has_answered(url);
@@ -486,7 +493,7 @@ impl Registry {
             if server.asked.discovery_urls.iter().all(is_there) {
                 // An unverified server is not kept for its return. A program that hangs accepts
                 // connections, so it exists.
-                let is_verified = had_answered || certified || loss == Loss::Hanging;
+                let is_verified = had_answered || certified || loss == ServerLoss::Hanging;
                 self.leave(&uri, loss, ended || !is_verified);
                 continue;
             }
@@ -498,7 +505,8 @@ impl Registry {
                 announced.url.clone_from(other);
                 self.network
                     .put(announced.clone(), RecordSource::Registration, now);
-                self.events.push_back(Event::Announce(announced.clone()));
+                self.events
+                    .push_back(RegistryEvent::Announce(announced.clone()));
             }
         }
         for instance in records {
@@ -520,7 +528,7 @@ impl Registry {
 
     /// Removes an unreachable registered server. Unless it has ended, its program may still run
     /// behind a disconnected cable, and would register again only after some minutes.
-    fn leave(&mut self, server_uri: &str, loss: Loss, ended: bool) {
+    fn leave(&mut self, server_uri: &str, loss: ServerLoss, ended: bool) {
         let server = self.servers.get(server_uri).cloned();
         self.end(server_uri, loss);
         let room = !ended && self.away.len() < self.settings.most;
@@ -571,13 +579,13 @@ impl Registry {
         }
     }
 
-    fn end(&mut self, server_uri: &str, loss: Loss) {
+    fn end(&mut self, server_uri: &str, loss: ServerLoss) {
         let Some(server) = self.servers.remove(server_uri) else {
             return;
         };
         if let Some(announcement) = server.announced {
             self.network.remove(&announcement.instance);
-            self.events.push_back(Event::Withdraw {
+            self.events.push_back(RegistryEvent::Withdraw {
                 instance: announcement.instance,
             });
         }
@@ -586,16 +594,17 @@ impl Registry {
             // If it is announced on the network as well, its record is checked at once.
             self.watch.hasten(url);
         }
-        self.events.push_back(Event::Gone {
+        self.events.push_back(RegistryEvent::Gone {
             server_uri: server_uri.to_owned(),
             loss,
         });
     }
 
-    fn vanish(&mut self, instance: &str, loss: Loss) {
+    fn vanish(&mut self, instance: &str, loss: ServerLoss) {
         if let Some(record) = self.network.remove(instance) {
             self.unwatch(&record.announcement.url);
-            self.events.push_back(Event::Vanished { record, loss });
+            self.events
+                .push_back(RegistryEvent::Vanished { record, loss });
         }
     }
 

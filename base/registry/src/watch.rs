@@ -3,20 +3,20 @@
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
-use crate::loss::Loss;
+use crate::loss::ServerLoss;
 use crate::network::place;
 
 /// An endpoint to probe: open a connection to it, and pass the result to
-/// [`Registry::probed`](crate::Registry::probed).
+/// [`Registry::probed`](crate::ServerRegistry::probed).
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Probe {
+pub struct EndpointProbe {
     /// The URL as registered or announced.
     pub url: String,
 }
 
 /// Result of a probe.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Outcome {
+pub enum ProbeOutcome {
     /// The server answers, with the StartTime of its ServerStatus if it was read, in 100 ns since
     /// 1601.
     Alive {
@@ -42,7 +42,7 @@ pub(crate) enum Sign {
     /// The program was restarted.
     Restarted,
     /// The server has ended, or has not answered for too long.
-    Lost(Loss),
+    Lost(ServerLoss),
 }
 
 /// Time limits of the supervision.
@@ -154,7 +154,7 @@ impl EndpointWatch {
 
     /// Returns the next endpoint to probe, if any is due; its next probe is after `every`, or later
     /// with many endpoints. Live endpoints come first.
-    pub(crate) fn next(&mut self, every: Duration, now: Instant) -> Option<Probe> {
+    pub(crate) fn next(&mut self, every: Duration, now: Instant) -> Option<EndpointProbe> {
         let every = self.pace(every);
         if self.taken_until.is_some_and(|until| until > now + BURST) {
             return None;
@@ -170,7 +170,7 @@ impl EndpointWatch {
         let url = watched.url.clone();
         let from = self.taken_until.map_or(now, |until| until.max(now));
         self.taken_until = Some(from + LEAST_APART);
-        Some(Probe { url })
+        Some(EndpointProbe { url })
     }
 
     /// Schedules the probe of a URL for the next opportunity.
@@ -236,12 +236,12 @@ impl EndpointWatch {
     pub(crate) fn probed(
         &mut self,
         url: &str,
-        outcome: Outcome,
+        outcome: ProbeOutcome,
         patience: Patience,
         now: Instant,
     ) -> Sign {
         let place = place(url);
-        let is_alive = matches!(outcome, Outcome::Alive { .. });
+        let is_alive = matches!(outcome, ProbeOutcome::Alive { .. });
         let had_answered = self
             .endpoints
             .get(&place)
@@ -254,7 +254,7 @@ impl EndpointWatch {
             return Sign::Nothing;
         };
         match outcome {
-            Outcome::Alive { start_time } => {
+            ProbeOutcome::Alive { start_time } => {
                 watched.answered = now;
                 watched.has_answered = true;
                 let before = watched.start_time;
@@ -264,18 +264,18 @@ impl EndpointWatch {
                     _ => Sign::Nothing,
                 }
             }
-            Outcome::Refused => Sign::Lost(Loss::Unreachable),
-            Outcome::Silent => {
+            ProbeOutcome::Refused => Sign::Lost(ServerLoss::Unreachable),
+            ProbeOutcome::Silent => {
                 // Probed again soon, so that two probes that time out fit into the time limit.
                 let again = patience.every / 10;
                 watched.waits(
                     patience.silent,
-                    Loss::Unreachable,
+                    ServerLoss::Unreachable,
                     (patience.every, again),
                     now,
                 )
             }
-            Outcome::Hanging => {
+            ProbeOutcome::Hanging => {
                 let is_running = watched.has_answered || watched.has_announced;
                 let (most, again) = match (watched.answers_during_calls, is_running) {
                     (true, true) => (patience.hanging, patience.every / 10),
@@ -285,9 +285,9 @@ impl EndpointWatch {
                     // A busy server accepts no connections, and its queue is short.
                     (false, _) => (patience.busy, patience.every),
                 };
-                watched.waits(most, Loss::Hanging, (patience.every, again), now)
+                watched.waits(most, ServerLoss::Hanging, (patience.every, again), now)
             }
-            Outcome::Untried => {
+            ProbeOutcome::Untried => {
                 // An unknown name is not resolved each second.
                 watched.try_at = now + patience.every * UNTRIED;
                 Sign::Nothing
@@ -342,7 +342,7 @@ impl Watched {
     fn waits(
         &mut self,
         most: Duration,
-        loss: Loss,
+        loss: ServerLoss,
         (every, again): (Duration, Duration),
         now: Instant,
     ) -> Sign {

@@ -7,37 +7,40 @@
 use std::time::{Duration, Instant};
 
 use registry::{
-    Announcement, ApplicationType, Asked, Channel, Event, Loss, MdnsConfiguration, Outcome,
-    RecordSource, Registry, Settings,
+    AnnouncedServer, ApplicationType, Channel, MdnsConfiguration, ProbeOutcome, RecordSource,
+    RegistrationRequest, RegistryEvent, RegistrySettings, ServerLoss, ServerRegistry,
 };
 
 const SECOND: Duration = Duration::from_secs(1);
-const ALIVE: Outcome = Outcome::Alive { start_time: None };
+const ALIVE: ProbeOutcome = ProbeOutcome::Alive { start_time: None };
 const URL: &str = "opc.tcp://10.1.0.5:4840/arm";
 
-fn start() -> (Registry, Instant) {
-    (Registry::new(Settings::default()), Instant::now())
+fn start() -> (ServerRegistry, Instant) {
+    (
+        ServerRegistry::new(RegistrySettings::default()),
+        Instant::now(),
+    )
 }
 
-fn arm(url: &str) -> Announcement {
-    Announcement {
+fn arm(url: &str) -> AnnouncedServer {
+    AnnouncedServer {
         instance: "arm".to_owned(),
         url: url.to_owned(),
         capabilities: vec!["DA".to_owned()],
     }
 }
 
-fn shown(registry: &Registry) -> Vec<(String, RecordSource)> {
+fn shown(registry: &ServerRegistry) -> Vec<(String, RecordSource)> {
     let records = registry.find_servers_on_network(0, 0, &[]).into_iter();
     records
         .map(|record| (record.announcement.instance.clone(), record.source))
         .collect()
 }
 
-fn losses(registry: &mut Registry) -> Vec<Loss> {
+fn losses(registry: &mut ServerRegistry) -> Vec<ServerLoss> {
     let mut losses = Vec::new();
     while let Some(event) = registry.poll_event() {
-        if let Event::Vanished { loss, .. } = event {
+        if let RegistryEvent::Vanished { loss, .. } = event {
             losses.push(loss);
         }
     }
@@ -58,14 +61,14 @@ fn a_listed_server_is_shown_while_it_answers_and_is_listed() {
     assert_eq!(shown(&registry), of_gds("arm"));
     registry.withdrawn("arm");
     assert_eq!(shown(&registry), of_gds("arm"), "mDNS does not withdraw it");
-    registry.probed(URL, Outcome::Refused, now + SECOND);
-    assert_eq!(losses(&mut registry), [Loss::Unreachable]);
+    registry.probed(URL, ProbeOutcome::Refused, now + SECOND);
+    assert_eq!(losses(&mut registry), [ServerLoss::Unreachable]);
     let again = registry.poll_probe(now + 4 * SECOND).unwrap();
     assert_eq!(again.url, URL, "a listed server is still probed");
     registry.probed(URL, ALIVE, now + 4 * SECOND);
     assert_eq!(shown(&registry), of_gds("arm"));
     registry.listed(Vec::new(), now + 5 * SECOND);
-    assert_eq!(losses(&mut registry), [Loss::Unlisted]);
+    assert_eq!(losses(&mut registry), [ServerLoss::Unlisted]);
     assert_eq!(shown(&registry), []);
     assert!(!registry.watches(URL));
 }
@@ -75,14 +78,14 @@ fn multicast_takes_the_place_of_the_list_and_the_list_returns_afterwards() {
     let (mut registry, now) = start();
     registry.listed(vec![arm(URL)], now);
     registry.probed(URL, ALIVE, now);
-    let announced = Announcement {
+    let announced = AnnouncedServer {
         instance: "arm-pc".to_owned(),
         ..arm(URL)
     };
     registry.announced(announced, now);
     let multicast = |name: &str| vec![(name.to_owned(), RecordSource::Multicast)];
     assert_eq!(shown(&registry), multicast("arm-pc"));
-    assert_eq!(losses(&mut registry), [Loss::Superseded]);
+    assert_eq!(losses(&mut registry), [ServerLoss::Superseded]);
     registry.probed(URL, ALIVE, now);
     registry.listed(vec![arm(URL)], now);
     assert_eq!(shown(&registry), multicast("arm-pc"), "one record each");
@@ -105,7 +108,7 @@ fn a_server_that_registers_takes_the_place_of_the_list() {
     let (mut registry, now) = start();
     registry.listed(vec![arm(URL)], now);
     registry.probed(URL, ALIVE, now);
-    let asked = Asked {
+    let asked = RegistrationRequest {
         server_uri: "urn:arm".to_owned(),
         product_uri: String::new(),
         names: vec![("en".to_owned(), "Arm".to_owned())],
@@ -129,10 +132,10 @@ fn a_server_that_registers_takes_the_place_of_the_list() {
         .unwrap();
     let registered = vec![("arm".to_owned(), RecordSource::Registration)];
     assert_eq!(shown(&registry), registered);
-    assert_eq!(losses(&mut registry), [Loss::Superseded]);
+    assert_eq!(losses(&mut registry), [ServerLoss::Superseded]);
     registry.probed(URL, ALIVE, now);
     assert_eq!(shown(&registry), registered, "one record each");
-    let offline = Asked {
+    let offline = RegistrationRequest {
         is_online: false,
         ..asked
     };
@@ -143,13 +146,13 @@ fn a_server_that_registers_takes_the_place_of_the_list() {
 
 #[test]
 fn a_full_table_of_announced_servers_has_no_listed_server() {
-    let settings = Settings {
+    let settings = RegistrySettings {
         most: 4,
-        ..Settings::default()
+        ..RegistrySettings::default()
     };
-    let (now, mut registry) = (Instant::now(), Registry::new(settings));
+    let (now, mut registry) = (Instant::now(), ServerRegistry::new(settings));
     for number in 0..4 {
-        let announcement = Announcement {
+        let announcement = AnnouncedServer {
             instance: format!("robot-{number}"),
             ..arm(&format!("opc.tcp://10.0.{number}.1:4840"))
         };

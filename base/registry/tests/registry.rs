@@ -7,8 +7,8 @@
 use std::time::{Duration, Instant};
 
 use registry::{
-    Announcement, ApplicationType, Asked, Channel, Event, Loss, MdnsConfiguration, Outcome,
-    RegisterFault, Registered, Registry, Settings,
+    AnnouncedServer, ApplicationType, Channel, MdnsConfiguration, ProbeOutcome, RegisterFault,
+    Registered, RegistrationRequest, RegistryEvent, RegistrySettings, ServerLoss, ServerRegistry,
 };
 
 const SECOND: Duration = Duration::from_secs(1);
@@ -21,8 +21,8 @@ fn secured(uri: &str) -> Channel {
     }
 }
 
-fn gripper() -> Asked {
-    Asked {
+fn gripper() -> RegistrationRequest {
+    RegistrationRequest {
         server_uri: "urn:cell:gripper".to_owned(),
         product_uri: "urn:maker:2f85".to_owned(),
         names: vec![("en".to_owned(), "Gripper".to_owned())],
@@ -38,8 +38,8 @@ fn gripper() -> Asked {
     }
 }
 
-fn robot() -> Announcement {
-    Announcement {
+fn robot() -> AnnouncedServer {
+    AnnouncedServer {
         instance: "robot-pc-4842".to_owned(),
         url: "opc.tcp://pc:4842/robot".to_owned(),
         capabilities: vec!["NA".to_owned(), "Skills".to_owned()],
@@ -47,20 +47,23 @@ fn robot() -> Announcement {
 }
 
 fn register(
-    registry: &mut Registry,
-    asked: &Asked,
+    registry: &mut ServerRegistry,
+    asked: &RegistrationRequest,
     now: Instant,
 ) -> Result<Registered, RegisterFault> {
     let channel = secured("urn:cell:gripper");
     registry.register(asked.clone(), &channel, None, now)
 }
 
-fn events(registry: &mut Registry) -> Vec<Event> {
+fn events(registry: &mut ServerRegistry) -> Vec<RegistryEvent> {
     std::iter::from_fn(|| registry.poll_event()).collect()
 }
 
-fn start() -> (Registry, Instant) {
-    (Registry::new(Settings::default()), Instant::now())
+fn start() -> (ServerRegistry, Instant) {
+    (
+        ServerRegistry::new(RegistrySettings::default()),
+        Instant::now(),
+    )
 }
 
 #[test]
@@ -76,7 +79,7 @@ fn a_server_that_registers_is_listed_announced_and_looked_after() {
     );
     let happened = events(&mut registry);
     assert!(
-        matches!(&*happened, [Event::Registered { .. }, Event::Announce(wish)] if wish.instance == "gripper-pc-4841"),
+        matches!(&*happened, [RegistryEvent::Registered { .. }, RegistryEvent::Announce(wish)] if wish.instance == "gripper-pc-4841"),
         "{happened:?}"
     );
     assert_eq!(registry.find_servers(&[]).count(), 1);
@@ -95,7 +98,7 @@ fn a_server_that_registers_is_listed_announced_and_looked_after() {
 #[test]
 fn each_fault_has_its_status() {
     let (mut registry, now) = start();
-    let mut fault = |change: &dyn Fn(&mut Asked), channel: &Channel, semaphore| {
+    let mut fault = |change: &dyn Fn(&mut RegistrationRequest), channel: &Channel, semaphore| {
         let mut asked = gripper();
         change(&mut asked);
         registry
@@ -169,7 +172,7 @@ fn taking_the_registration_back_removes_it_at_once() {
     let (mut registry, now) = start();
     register(&mut registry, &gripper(), now).unwrap();
     events(&mut registry);
-    let offline = Asked {
+    let offline = RegistrationRequest {
         is_online: false,
         ..gripper()
     };
@@ -181,12 +184,12 @@ fn taking_the_registration_back_removes_it_at_once() {
     assert_eq!(
         happened,
         [
-            Event::Withdraw {
+            RegistryEvent::Withdraw {
                 instance: "gripper-pc-4841".to_owned()
             },
-            Event::Gone {
+            RegistryEvent::Gone {
                 server_uri: "urn:cell:gripper".to_owned(),
-                loss: Loss::Unregistered
+                loss: ServerLoss::Unregistered
             }
         ]
     );
@@ -198,7 +201,7 @@ fn taking_the_registration_back_removes_it_at_once() {
 fn who_registers_no_more_is_forgotten_unless_a_semaphore_file_keeps_it() {
     let (mut registry, now) = start();
     register(&mut registry, &gripper(), now).unwrap();
-    let installed = Asked {
+    let installed = RegistrationRequest {
         server_uri: "urn:cell:installed".to_owned(),
         semaphore_file_path: "/run/installed".to_owned(),
         mdns: None,
@@ -210,7 +213,7 @@ fn who_registers_no_more_is_forgotten_unless_a_semaphore_file_keeps_it() {
         .register(installed, &channel, Some(true), now)
         .unwrap();
     events(&mut registry);
-    let later = now + Settings::default().forget_after;
+    let later = now + RegistrySettings::default().forget_after;
     registry.handle_timeout(later - SECOND);
     assert_eq!(registry.find_servers(&[]).count(), 2);
     registry.handle_timeout(later);
@@ -219,9 +222,9 @@ fn who_registers_no_more_is_forgotten_unless_a_semaphore_file_keeps_it() {
         .map(|(asked, _)| &*asked.server_uri)
         .collect();
     assert_eq!(left, ["urn:cell:installed"]);
-    assert!(events(&mut registry).contains(&Event::Gone {
+    assert!(events(&mut registry).contains(&RegistryEvent::Gone {
         server_uri: "urn:cell:gripper".to_owned(),
-        loss: Loss::Expired
+        loss: ServerLoss::Expired
     }));
     registry.semaphore_gone("urn:cell:installed");
     assert_eq!(registry.find_servers(&[]).count(), 0);
@@ -231,7 +234,7 @@ fn who_registers_no_more_is_forgotten_unless_a_semaphore_file_keeps_it() {
 fn a_killed_server_is_lost_within_two_seconds_without_a_goodbye() {
     let (mut registry, now) = start();
     registry.announced(robot(), now);
-    assert!(matches!(&*events(&mut registry), [Event::Seen(_)]));
+    assert!(matches!(&*events(&mut registry), [RegistryEvent::Seen(_)]));
     // It is probed each second. It is killed right after the first answer, and its host disappears,
     // too.
     let mut lost_after = None;
@@ -239,14 +242,14 @@ fn a_killed_server_is_lost_within_two_seconds_without_a_goodbye() {
         let time = now + SECOND / 10 * tenth;
         while let Some(probe) = registry.poll_probe(time) {
             let outcome = if time <= now + SECOND {
-                Outcome::Alive { start_time: None }
+                ProbeOutcome::Alive { start_time: None }
             } else {
-                Outcome::Silent
+                ProbeOutcome::Silent
             };
             registry.probed(&probe.url, outcome, time);
         }
-        if let Some(Event::Vanished { loss, .. }) = registry.poll_event() {
-            assert_eq!(loss, Loss::Unreachable);
+        if let Some(RegistryEvent::Vanished { loss, .. }) = registry.poll_event() {
+            assert_eq!(loss, ServerLoss::Unreachable);
             lost_after.get_or_insert(time - now - SECOND);
         }
     }
@@ -266,16 +269,16 @@ fn a_program_that_takes_connections_and_says_nothing_hangs() {
     events(&mut registry);
     let url = robot().url;
     registry.answers_during_calls(&url);
-    registry.probed(&url, Outcome::Alive { start_time: None }, now);
-    registry.probed(&url, Outcome::Hanging, now + SECOND * 2);
+    registry.probed(&url, ProbeOutcome::Alive { start_time: None }, now);
+    registry.probed(&url, ProbeOutcome::Hanging, now + SECOND * 2);
     assert_eq!(registry.poll_event(), None, "it may compute");
-    registry.probed(&url, Outcome::Hanging, now + SECOND * 3);
+    registry.probed(&url, ProbeOutcome::Hanging, now + SECOND * 3);
     let happened = events(&mut registry);
     assert!(
         matches!(
             &*happened,
-            [Event::Vanished {
-                loss: Loss::Hanging,
+            [RegistryEvent::Vanished {
+                loss: ServerLoss::Hanging,
                 ..
             }]
         ),
@@ -289,21 +292,21 @@ fn a_server_that_may_be_busy_with_a_method_is_kept_while_its_host_accepts_connec
     register(&mut registry, &gripper(), now).unwrap();
     events(&mut registry);
     let url = gripper().discovery_urls[0].clone();
-    registry.probed(&url, Outcome::Alive { start_time: None }, now);
+    registry.probed(&url, ProbeOutcome::Alive { start_time: None }, now);
     for second in 1..59 {
-        registry.probed(&url, Outcome::Hanging, now + SECOND * second);
+        registry.probed(&url, ProbeOutcome::Hanging, now + SECOND * second);
         assert_eq!(registry.poll_event(), None, "after {second} s");
     }
     // Its host has disappeared: that is detected as fast as for any other server.
     let answered = now + SECOND * 59;
-    registry.probed(&url, Outcome::Alive { start_time: None }, answered);
-    registry.probed(&url, Outcome::Silent, answered + SECOND * 2);
+    registry.probed(&url, ProbeOutcome::Alive { start_time: None }, answered);
+    registry.probed(&url, ProbeOutcome::Silent, answered + SECOND * 2);
     let happened = events(&mut registry);
-    let is_gone = |event: &Event| {
+    let is_gone = |event: &RegistryEvent| {
         matches!(
             event,
-            Event::Gone {
-                loss: Loss::Unreachable,
+            RegistryEvent::Gone {
+                loss: ServerLoss::Unreachable,
                 ..
             }
         )
@@ -314,21 +317,21 @@ fn a_server_that_may_be_busy_with_a_method_is_kept_while_its_host_accepts_connec
 #[test]
 fn a_server_of_ours_answers_during_calls_and_hangs_after_three_seconds() {
     let (mut registry, now) = start();
-    let ours = Asked {
+    let ours = RegistrationRequest {
         product_uri: "urn:ua-bridge:plant".to_owned(),
         ..gripper()
     };
     register(&mut registry, &ours, now).unwrap();
     events(&mut registry);
     let url = ours.discovery_urls[0].clone();
-    registry.probed(&url, Outcome::Alive { start_time: None }, now);
-    registry.probed(&url, Outcome::Hanging, now + SECOND * 3);
+    registry.probed(&url, ProbeOutcome::Alive { start_time: None }, now);
+    registry.probed(&url, ProbeOutcome::Hanging, now + SECOND * 3);
     let happened = events(&mut registry);
-    let hangs = |event: &Event| {
+    let hangs = |event: &RegistryEvent| {
         matches!(
             event,
-            Event::Gone {
-                loss: Loss::Hanging,
+            RegistryEvent::Gone {
+                loss: ServerLoss::Hanging,
                 ..
             }
         )
@@ -344,10 +347,10 @@ fn one_that_listens_and_has_never_answered_is_given_time_to_start() {
     let url = robot().url;
     registry.answers_during_calls(&url);
     for second in 1..30 {
-        registry.probed(&url, Outcome::Hanging, now + SECOND * second);
+        registry.probed(&url, ProbeOutcome::Hanging, now + SECOND * second);
         assert_eq!(registry.poll_event(), None, "after {second} s");
     }
-    registry.probed(&url, Outcome::Hanging, now + SECOND * 30);
+    registry.probed(&url, ProbeOutcome::Hanging, now + SECOND * 30);
     assert_eq!(events(&mut registry).len(), 1, "it hangs");
 }
 
@@ -357,11 +360,11 @@ fn the_time_in_which_nobody_listened_is_held_against_nobody() {
     registry.announced(robot(), now);
     events(&mut registry);
     let url = robot().url;
-    registry.probed(&url, Outcome::Alive { start_time: None }, now);
+    registry.probed(&url, ProbeOutcome::Alive { start_time: None }, now);
     registry.stood_still(SECOND * 10);
-    registry.probed(&url, Outcome::Silent, now + SECOND * 11);
+    registry.probed(&url, ProbeOutcome::Silent, now + SECOND * 11);
     assert_eq!(registry.poll_event(), None, "a second of it counts");
-    registry.probed(&url, Outcome::Silent, now + SECOND * 12);
+    registry.probed(&url, ProbeOutcome::Silent, now + SECOND * 12);
     assert_eq!(events(&mut registry).len(), 1, "two seconds do");
 }
 
@@ -370,7 +373,7 @@ fn a_connection_that_broke_off_has_its_server_tried_at_once() {
     let (mut registry, now) = start();
     registry.announced(robot(), now);
     let url = robot().url;
-    registry.probed(&url, Outcome::Alive { start_time: None }, now);
+    registry.probed(&url, ProbeOutcome::Alive { start_time: None }, now);
     assert_eq!(registry.poll_probe(now), None);
     registry.suspect(&url);
     assert_eq!(registry.poll_probe(now).unwrap().url, url);
@@ -381,12 +384,12 @@ fn a_connection_that_broke_off_has_its_server_tried_at_once() {
 
 #[test]
 fn many_servers_are_tried_in_turn_and_less_often() {
-    let settings = Settings {
+    let settings = RegistrySettings {
         most: 2000,
-        ..Settings::default()
+        ..RegistrySettings::default()
     };
-    let (mut registry, now) = (Registry::new(settings), Instant::now());
-    let tries_in = |registry: &mut Registry, from: u32, to: u32| {
+    let (mut registry, now) = (ServerRegistry::new(settings), Instant::now());
+    let tries_in = |registry: &mut ServerRegistry, from: u32, to: u32| {
         let mut most_at_once = 0;
         let mut tries = 0;
         for tick in from..to {
@@ -399,7 +402,7 @@ fn many_servers_are_tried_in_turn_and_less_often() {
     };
     for (from, to) in [(0, 100), (100, 2000)] {
         for number in from..to {
-            let announcement = Announcement {
+            let announcement = AnnouncedServer {
                 instance: format!("robot-{number}"),
                 url: format!("opc.tcp://10.0.0.1:{}", 10_000 + number),
                 capabilities: Vec::new(),
@@ -432,12 +435,12 @@ fn what_is_announced_for_a_server_follows_when_it_is_called_otherwise() {
     assert_eq!(records.len(), 1);
     assert_eq!(records[0].announcement.instance, "gripper-pc-4841 (2)");
     assert!(records[0].record_id > before.record_id);
-    let offline = Asked {
+    let offline = RegistrationRequest {
         is_online: false,
         ..gripper()
     };
     register(&mut registry, &offline, now).unwrap();
-    assert!(events(&mut registry).contains(&Event::Withdraw {
+    assert!(events(&mut registry).contains(&RegistryEvent::Withdraw {
         instance: "gripper-pc-4841 (2)".to_owned()
     }));
     assert!(registry.find_servers_on_network(0, 0, &[]).is_empty());
@@ -449,12 +452,12 @@ fn a_host_that_refuses_the_connection_tells_at_once() {
     register(&mut registry, &gripper(), now).unwrap();
     registry.announced(robot(), now);
     events(&mut registry);
-    registry.probed("opc.tcp://127.0.0.1:4841", Outcome::Refused, now);
+    registry.probed("opc.tcp://127.0.0.1:4841", ProbeOutcome::Refused, now);
     let happened = events(&mut registry);
     assert!(
-        happened.contains(&Event::Gone {
+        happened.contains(&RegistryEvent::Gone {
             server_uri: "urn:cell:gripper".to_owned(),
-            loss: Loss::Unreachable
+            loss: ServerLoss::Unreachable
         }),
         "{happened:?}"
     );
@@ -474,14 +477,14 @@ fn a_host_that_refuses_the_connection_tells_at_once() {
 fn a_server_with_two_endpoints_is_there_while_one_answers() {
     let (mut registry, now) = start();
     let urls = ["opc.tcp://10.0.0.1:4841", "opc.tcp://10.1.0.1:4841"];
-    let asked = Asked {
+    let asked = RegistrationRequest {
         discovery_urls: urls.map(str::to_owned).to_vec(),
         ..gripper()
     };
     register(&mut registry, &asked, now).unwrap();
-    registry.probed(urls[0], Outcome::Refused, now);
+    registry.probed(urls[0], ProbeOutcome::Refused, now);
     assert_eq!(registry.find_servers(&[]).count(), 1);
-    registry.probed(urls[1], Outcome::Refused, now);
+    registry.probed(urls[1], ProbeOutcome::Refused, now);
     assert_eq!(registry.find_servers(&[]).count(), 0);
 }
 
@@ -491,7 +494,7 @@ fn another_start_time_is_a_restart() {
     registry.announced(robot(), now);
     events(&mut registry);
     let url = robot().url;
-    let alive = |start_time| Outcome::Alive { start_time };
+    let alive = |start_time| ProbeOutcome::Alive { start_time };
     registry.probed(&url, alive(Some(5)), now);
     registry.probed(&url, alive(None), now);
     registry.probed(&url, alive(Some(5)), now);
@@ -499,7 +502,7 @@ fn another_start_time_is_a_restart() {
     registry.probed(&url, alive(Some(6)), now);
     assert_eq!(
         registry.poll_event(),
-        Some(Event::Restarted { url: url.clone() })
+        Some(RegistryEvent::Restarted { url: url.clone() })
     );
     registry.started(&url, 4);
     registry.probed(&url, alive(Some(4)), now);
@@ -509,7 +512,10 @@ fn another_start_time_is_a_restart() {
         "the same run, told another way"
     );
     registry.probed(&url, alive(Some(7)), now);
-    assert_eq!(registry.poll_event(), Some(Event::Restarted { url }));
+    assert_eq!(
+        registry.poll_event(),
+        Some(RegistryEvent::Restarted { url })
+    );
 }
 
 #[test]
@@ -524,9 +530,9 @@ fn goodbye_takes_a_record_away_and_ids_are_never_given_twice() {
         matches!(
             &*happened,
             [
-                Event::Seen(_),
-                Event::Vanished {
-                    loss: Loss::Goodbye,
+                RegistryEvent::Seen(_),
+                RegistryEvent::Vanished {
+                    loss: ServerLoss::Goodbye,
                     ..
                 }
             ]
@@ -559,7 +565,7 @@ fn nobody_takes_back_on_the_network_what_a_registered_server_has_us_announce() {
     let (mut registry, now) = start();
     register(&mut registry, &gripper(), now).unwrap();
     events(&mut registry);
-    let forged = Announcement {
+    let forged = AnnouncedServer {
         instance: "gripper-pc-4841".to_owned(),
         url: "opc.tcp://10.9.9.9:1".to_owned(),
         capabilities: Vec::new(),
@@ -584,11 +590,11 @@ fn nobody_takes_the_record_of_another_by_registering_under_its_name() {
         asked.mdns.as_mut().unwrap().name = name.to_owned();
         asked
     };
-    let urls = |registry: &Registry| -> Vec<(String, String)> {
+    let urls = |registry: &ServerRegistry| -> Vec<(String, String)> {
         let found = registry.find_servers_on_network(0, 0, &[]).into_iter();
         found
             .map(|record| {
-                let Announcement { instance, url, .. } = record.announcement.clone();
+                let AnnouncedServer { instance, url, .. } = record.announcement.clone();
                 (instance, url)
             })
             .collect()
@@ -605,10 +611,10 @@ fn nobody_takes_the_record_of_another_by_registering_under_its_name() {
         registry.register(asked, &secured(uri), None, now).unwrap();
         let happened = events(&mut registry);
         assert!(
-            matches!(&*happened, [Event::Registered { .. }, Event::Announce(wish)] if wish.instance == counted),
+            matches!(&*happened, [RegistryEvent::Registered { .. }, RegistryEvent::Announce(wish)] if wish.instance == counted),
             "{happened:?}"
         );
-        let offline = Asked {
+        let offline = RegistrationRequest {
             is_online: false,
             ..named(uri, name, "opc.tcp://10.9.9.9:1")
         };
@@ -616,7 +622,7 @@ fn nobody_takes_the_record_of_another_by_registering_under_its_name() {
             registry
                 .register(offline, &secured(uri), None, now)
                 .unwrap();
-            assert!(events(&mut registry).contains(&Event::Withdraw {
+            assert!(events(&mut registry).contains(&RegistryEvent::Withdraw {
                 instance: counted.to_owned()
             }));
         }
@@ -633,10 +639,13 @@ fn nobody_takes_the_record_of_another_by_registering_under_its_name() {
         .unwrap();
     assert!(matches!(
         &*events(&mut registry),
-        [Event::Registered { .. }]
+        [RegistryEvent::Registered { .. }]
     ));
     registry.withdrawn(&robot().instance);
-    assert!(matches!(&*events(&mut registry), [Event::Vanished { .. }]));
+    assert!(matches!(
+        &*events(&mut registry),
+        [RegistryEvent::Vanished { .. }]
+    ));
 }
 
 #[test]
@@ -644,21 +653,21 @@ fn what_cannot_be_tried_is_not_lost_for_it() {
     let (mut registry, now) = start();
     registry.announced(robot(), now);
     for second in 1..10_u32 {
-        registry.probed(&robot().url, Outcome::Untried, now + SECOND * second);
+        registry.probed(&robot().url, ProbeOutcome::Untried, now + SECOND * second);
     }
-    assert!(matches!(&*events(&mut registry), [Event::Seen(_)]));
+    assert!(matches!(&*events(&mut registry), [RegistryEvent::Seen(_)]));
 }
 
 #[test]
 fn made_up_servers_take_no_more_room_than_there_is() {
-    let settings = Settings {
+    let settings = RegistrySettings {
         most: 3,
-        ..Settings::default()
+        ..RegistrySettings::default()
     };
-    let (mut registry, now) = (Registry::new(settings), Instant::now());
+    let (mut registry, now) = (ServerRegistry::new(settings), Instant::now());
     register(&mut registry, &gripper(), now).unwrap();
     for number in 0..10 {
-        let announcement = Announcement {
+        let announcement = AnnouncedServer {
             instance: format!("made-up-{number}"),
             ..robot()
         };
@@ -676,14 +685,14 @@ fn made_up_servers_take_no_more_room_than_there_is() {
 #[test]
 fn who_was_behind_a_cut_cable_is_listed_again_and_who_ended_is_not() {
     let url = &gripper().discovery_urls[0];
-    let alive = Outcome::Alive { start_time: None };
+    let alive = ProbeOutcome::Alive { start_time: None };
     for (what, then, back) in [
         ("it answers again", alive, 1),
-        ("its program has ended by then", Outcome::Refused, 0),
+        ("its program has ended by then", ProbeOutcome::Refused, 0),
     ] {
         let (mut registry, now) = start();
         register(&mut registry, &gripper(), now).unwrap();
-        registry.probed(url, Outcome::Silent, now + SECOND * 3);
+        registry.probed(url, ProbeOutcome::Silent, now + SECOND * 3);
         assert_eq!(registry.find_servers(&[]).count(), 0, "{what}");
         events(&mut registry);
         let again = registry
@@ -693,10 +702,10 @@ fn who_was_behind_a_cut_cable_is_listed_again_and_who_ended_is_not() {
         // A program at the port of an ended server is not the same server.
         registry.probed(&again.url, alive, now + SECOND * 5);
         assert_eq!(registry.find_servers(&[]).count(), back, "{what}");
-        let announced = |event: &Event| matches!(event, Event::Announce(_));
+        let announced = |event: &RegistryEvent| matches!(event, RegistryEvent::Announce(_));
         let happened = events(&mut registry);
         assert_eq!(happened.iter().filter(|one| announced(one)).count(), back);
-        registry.handle_timeout(now + Settings::default().forget_after);
+        registry.handle_timeout(now + RegistrySettings::default().forget_after);
         assert_eq!(
             registry.find_servers(&[]).count(),
             0,
@@ -710,11 +719,11 @@ fn who_is_away_for_longer_than_the_registration_counts_is_forgotten() {
     let (mut registry, now) = start();
     register(&mut registry, &gripper(), now).unwrap();
     let url = &gripper().discovery_urls[0];
-    registry.probed(url, Outcome::Silent, now + SECOND * 3);
-    let later = now + Settings::default().forget_after;
+    registry.probed(url, ProbeOutcome::Silent, now + SECOND * 3);
+    let later = now + RegistrySettings::default().forget_after;
     registry.handle_timeout(later);
     assert_eq!(registry.poll_probe(later), None);
-    registry.probed(url, Outcome::Alive { start_time: None }, later);
+    registry.probed(url, ProbeOutcome::Alive { start_time: None }, later);
     assert_eq!(registry.find_servers(&[]).count(), 0);
 }
 
@@ -727,7 +736,7 @@ fn what_a_certificate_registered_nobody_changes_without_one() {
         certificate_uri: None,
         peer: None,
     };
-    let offline = Asked {
+    let offline = RegistrationRequest {
         is_online: false,
         ..gripper()
     };
@@ -738,7 +747,7 @@ fn what_a_certificate_registered_nobody_changes_without_one() {
     }
     assert_eq!(registry.find_servers(&[]).count(), 1);
     // A withdrawal contains the URI, and some servers send nothing else.
-    let bare = Asked {
+    let bare = RegistrationRequest {
         names: Vec::new(),
         discovery_urls: Vec::new(),
         ..offline

@@ -9,16 +9,16 @@ use std::net::{IpAddr, Ipv4Addr};
 use std::time::{Duration, Instant};
 
 use registry::{
-    Announcement, ApplicationType, Asked, Channel, Event, Loss, Outcome, RegisterFault, Registered,
-    Registry, Settings,
+    AnnouncedServer, ApplicationType, Channel, ProbeOutcome, RegisterFault, Registered,
+    RegistrationRequest, RegistryEvent, RegistrySettings, ServerLoss, ServerRegistry,
 };
 
 const SECOND: Duration = Duration::from_secs(1);
-const ALIVE: Outcome = Outcome::Alive { start_time: None };
+const ALIVE: ProbeOutcome = ProbeOutcome::Alive { start_time: None };
 const ROBOT: &str = "opc.tcp://10.9.0.2:4840/";
 
-fn announcement(instance: &str, url: &str) -> Announcement {
-    Announcement {
+fn announcement(instance: &str, url: &str) -> AnnouncedServer {
+    AnnouncedServer {
         instance: instance.to_owned(),
         url: url.to_owned(),
         capabilities: vec!["DA".to_owned()],
@@ -26,20 +26,20 @@ fn announcement(instance: &str, url: &str) -> Announcement {
 }
 
 /// Settings of a small registry, for short floods.
-const SETTINGS: fn() -> Settings = || Settings {
+const SETTINGS: fn() -> RegistrySettings = || RegistrySettings {
     most: 128,
-    ..Settings::default()
+    ..RegistrySettings::default()
 };
 
 /// Returns a registry with a robot that has answered.
-fn start() -> (Registry, Instant) {
-    let (mut registry, now) = (Registry::new(SETTINGS()), Instant::now());
+fn start() -> (ServerRegistry, Instant) {
+    let (mut registry, now) = (ServerRegistry::new(SETTINGS()), Instant::now());
     registry.announced(announcement("robot", ROBOT), now);
     registry.probed(ROBOT, ALIVE, now);
     (registry, now)
 }
 
-fn names(registry: &Registry) -> Vec<String> {
+fn names(registry: &ServerRegistry) -> Vec<String> {
     let records = registry.find_servers_on_network(0, 0, &[]).into_iter();
     records
         .map(|record| record.announcement.instance.clone())
@@ -48,9 +48,9 @@ fn names(registry: &Registry) -> Vec<String> {
 
 /// Advances the time. Each probe gets its result at once. Returns the probed URLs.
 fn pass(
-    registry: &mut Registry,
+    registry: &mut ServerRegistry,
     (from, to): (Instant, Instant),
-    outcome: impl Fn(&str) -> Outcome,
+    outcome: impl Fn(&str) -> ProbeOutcome,
 ) -> Vec<String> {
     let mut probed = Vec::new();
     let mut now = from;
@@ -85,11 +85,11 @@ fn forged_names_of_many_hosts_keep_no_live_server_off_the_list() {
     for live in ["robot", "plc"] {
         assert!(all.contains(&live.to_owned()), "{live}");
     }
-    let lost = |event: &Event| {
-        matches!(event, Event::Vanished { record, loss }
-            if *loss != Loss::Displaced || record.announcement.instance == "robot")
+    let lost = |event: &RegistryEvent| {
+        matches!(event, RegistryEvent::Vanished { record, loss }
+            if *loss != ServerLoss::Displaced || record.announcement.instance == "robot")
     };
-    let wrong: Vec<Event> = std::iter::from_fn(|| registry.poll_event())
+    let wrong: Vec<RegistryEvent> = std::iter::from_fn(|| registry.poll_event())
         .filter(lost)
         .collect();
     assert!(wrong.is_empty(), "{wrong:?}");
@@ -118,7 +118,7 @@ fn forged_names_at_the_endpoint_of_a_live_server_displace_neither_it_nor_a_new_o
     let killed = later + SECOND * 5;
     let refused = |url: &str| {
         if url == ROBOT {
-            Outcome::Refused
+            ProbeOutcome::Refused
         } else {
             ALIVE
         }
@@ -129,8 +129,12 @@ fn forged_names_at_the_endpoint_of_a_live_server_displace_neither_it_nor_a_new_o
 
 #[test]
 fn an_endpoint_that_never_answers_is_probed_with_growing_pauses_whatever_its_names() {
-    for outcome in [Outcome::Silent, Outcome::Refused, Outcome::Hanging] {
-        let (mut registry, now) = (Registry::new(SETTINGS()), Instant::now());
+    for outcome in [
+        ProbeOutcome::Silent,
+        ProbeOutcome::Refused,
+        ProbeOutcome::Hanging,
+    ] {
+        let (mut registry, now) = (ServerRegistry::new(SETTINGS()), Instant::now());
         let mut probed = 0;
         for second in 0..120 {
             let at = now + SECOND * second;
@@ -144,7 +148,7 @@ fn an_endpoint_that_never_answers_is_probed_with_growing_pauses_whatever_its_nam
 
 #[test]
 fn an_announcement_proves_no_life() {
-    let (mut registry, now) = (Registry::new(SETTINGS()), Instant::now());
+    let (mut registry, now) = (ServerRegistry::new(SETTINGS()), Instant::now());
     registry.announced(announcement("forged", ROBOT), now);
     registry.announced_start("forged", 17);
     assert!(!registry.has_answered(ROBOT));
@@ -154,14 +158,14 @@ fn an_announcement_proves_no_life() {
     while registry.poll_event().is_some() {}
     registry.announced(announcement("second", &format!("{ROBOT}x")), now);
     registry.announced_start("second", 18);
-    let restarted = |event: Event| matches!(event, Event::Restarted { .. });
+    let restarted = |event: RegistryEvent| matches!(event, RegistryEvent::Restarted { .. });
     assert!(!std::iter::from_fn(|| registry.poll_event()).any(restarted));
     registry.announced_start("forged", 19);
     assert!(std::iter::from_fn(|| registry.poll_event()).any(restarted));
 }
 
-fn asked(uri: &str, url: &str) -> Asked {
-    Asked {
+fn asked(uri: &str, url: &str) -> RegistrationRequest {
+    RegistrationRequest {
         server_uri: uri.to_owned(),
         product_uri: String::new(),
         names: vec![("en".to_owned(), uri.to_owned())],
@@ -184,8 +188,8 @@ fn channel(certificate_uri: Option<&str>) -> Channel {
 
 #[test]
 fn registrations_that_nothing_verifies_give_way_and_others_stay() {
-    let (mut registry, now) = (Registry::new(SETTINGS()), Instant::now());
-    let register = |registry: &mut Registry, uri: &str, port: u16, certified: bool| {
+    let (mut registry, now) = (ServerRegistry::new(SETTINGS()), Instant::now());
+    let register = |registry: &mut ServerRegistry, uri: &str, port: u16, certified: bool| {
         let url = format!("opc.tcp://127.0.0.1:{port}");
         let channel = channel(certified.then_some(uri));
         registry.register(asked(uri, &url), &channel, None, now)
@@ -216,7 +220,7 @@ fn registrations_that_nothing_verifies_give_way_and_others_stay() {
 
 #[test]
 fn one_endpoint_has_few_registrations_without_a_certificate() {
-    let (mut registry, now) = (Registry::new(SETTINGS()), Instant::now());
+    let (mut registry, now) = (ServerRegistry::new(SETTINGS()), Instant::now());
     let mut full = 0;
     for number in 0..100 {
         let url = format!("opc.tcp://127.0.0.1:6000/{number}");
@@ -234,7 +238,7 @@ fn one_endpoint_has_few_registrations_without_a_certificate() {
 
 #[test]
 fn a_url_that_no_server_is_at_cannot_be_registered() {
-    let (mut registry, now) = (Registry::new(SETTINGS()), Instant::now());
+    let (mut registry, now) = (ServerRegistry::new(SETTINGS()), Instant::now());
     for url in [
         "file:///etc/passwd",
         "opc.tcp://host:0",
@@ -260,14 +264,23 @@ fn a_url_that_no_server_is_at_cannot_be_registered() {
 
 /// Lets the probes of an endpoint fail, each after a second, until its loss. Returns the event of
 /// the loss and its time.
-fn lost(registry: &mut Registry, from: Instant, outcome: Outcome) -> (Event, Instant) {
+fn lost(
+    registry: &mut ServerRegistry,
+    from: Instant,
+    outcome: ProbeOutcome,
+) -> (RegistryEvent, Instant) {
     let mut now = from;
     while now < from + SECOND * 10 {
         if let Some(probe) = registry.poll_probe(now) {
             now += SECOND;
             registry.probed(&probe.url, outcome, now);
         }
-        let is_loss = |event: &Event| matches!(event, Event::Vanished { .. } | Event::Gone { .. });
+        let is_loss = |event: &RegistryEvent| {
+            matches!(
+                event,
+                RegistryEvent::Vanished { .. } | RegistryEvent::Gone { .. }
+            )
+        };
         if let Some(event) = std::iter::from_fn(|| registry.poll_event()).find(is_loss) {
             return (event, now);
         }
@@ -281,16 +294,16 @@ fn a_server_that_fails_before_its_first_answer_is_missed_as_soon_as_any_other() 
     for port in 4840..4940 {
         let url = format!("opc.tcp://10.9.0.2:{port}/");
         for (outcome, loss, most) in [
-            (Outcome::Silent, Loss::Unreachable, SECOND * 3),
-            (Outcome::Hanging, Loss::Hanging, SECOND * 4),
+            (ProbeOutcome::Silent, ServerLoss::Unreachable, SECOND * 3),
+            (ProbeOutcome::Hanging, ServerLoss::Hanging, SECOND * 4),
         ] {
-            let (mut registry, now) = (Registry::new(SETTINGS()), Instant::now());
+            let (mut registry, now) = (ServerRegistry::new(SETTINGS()), Instant::now());
             registry.announced(announcement("gripper", &url), now);
             registry.answers_during_calls(&url);
             registry.announced_start("gripper", 17);
             let (event, at) = lost(&mut registry, now, outcome);
             assert!(
-                matches!(&event, Event::Vanished { loss: told, .. } if *told == loss),
+                matches!(&event, RegistryEvent::Vanished { loss: told, .. } if *told == loss),
                 "{event:?}"
             );
             assert!(at - now < most, "{url}: {loss:?} after {:?}", at - now);
@@ -301,9 +314,9 @@ fn a_server_that_fails_before_its_first_answer_is_missed_as_soon_as_any_other() 
 #[test]
 fn a_program_that_hangs_before_its_first_answer_is_registered_again_when_it_goes_on() {
     let url = "opc.tcp://127.0.0.1:4841/";
-    for (outcome, is_kept) in [(Outcome::Hanging, true), (Outcome::Silent, false)] {
-        let (mut registry, now) = (Registry::new(SETTINGS()), Instant::now());
-        let gripper = Asked {
+    for (outcome, is_kept) in [(ProbeOutcome::Hanging, true), (ProbeOutcome::Silent, false)] {
+        let (mut registry, now) = (ServerRegistry::new(SETTINGS()), Instant::now());
+        let gripper = RegistrationRequest {
             product_uri: "urn:ua-bridge:gripper".to_owned(),
             ..asked("urn:gripper", url)
         };

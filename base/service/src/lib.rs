@@ -1,7 +1,7 @@
 //! What every program needs: exit codes, logging, status pages, signals, the watchdog of the
 //! service manager, and restarts.
 //!
-//! A program of the plant that carries no space implements [`Service`], and its `main` is
+//! A program of the plant that carries no space implements [`ServiceProgram`], and its `main` is
 //! [`run_service`]. The programs of the space start with `bridge_node::run`, which uses the same
 //! parts.
 
@@ -19,7 +19,7 @@ pub use exit::{Failure, FailureKind};
 pub use hyper::StatusCode;
 pub use logging::{LogArguments, LogFormat};
 pub use pages::{
-    Ask, BoxFuture, LiveAnswer, LivePage, PageBody, Pages, Requests, RunLoops, Secure, Site,
-    Statuses, Stream, Told, Visit, full, loops, never, serve_pages, serve_secure,
+    Ask, BoxFuture, LiveAnswer, LivePage, PageBody, PageState, Pages, Requests, RunLoops, Secure,
+    Site, Statuses, Stream, Visit, full, loops, never, serve_pages, serve_secure,
 };
-pub use run::{Service, parse, run_service};
+pub use run::{ServiceProgram, parse, run_service};

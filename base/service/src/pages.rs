@@ -31,7 +31,7 @@ use crate::clock::fault_of_host;
 use crate::exit::{Failure, FailureKind};
 
 /// The state of a program at one moment, as the pages show it.
-pub trait Told: Send + 'static {
+pub trait PageState: Send + 'static {
     /// Returns a JSON object, for /status.
     fn json(&self) -> String;
 
@@ -157,11 +157,14 @@ pub fn never<T>() -> Requests<T> {
     mpsc::channel(1).1
 }
 
-/// Listens at `address` for requests to [`Told`] pages. Without an address there are no requests.
+/// Listens at `address` for requests to [`PageState`] pages. Without an address there are no
+/// requests.
 ///
 /// # Errors
 /// The address cannot be bound.
-pub async fn serve_pages<T: Told>(address: Option<SocketAddr>) -> Result<Requests<T>, Failure> {
+pub async fn serve_pages<T: PageState>(
+    address: Option<SocketAddr>,
+) -> Result<Requests<T>, Failure> {
     let pages = Pages::alone("", None);
     let RunLoops { asks, mut requests } = loops(1);
     pages.run("", asks);
@@ -191,7 +194,7 @@ impl<T> fmt::Debug for Pages<T> {
     }
 }
 
-impl<T: Told> Pages<T> {
+impl<T: PageState> Pages<T> {
     /// Returns the pages of a program that does not run yet. They end with its run loops.
     #[must_use]
     pub fn alone(program: &'static str, live: Option<Arc<dyn LivePage>>) -> Self {
@@ -275,7 +278,7 @@ impl<T: Told> Pages<T> {
 }
 
 /// Serves all pages until the run loops end; in a cell, until the program ends.
-async fn serve_all<T: Told>(listener: TcpListener, served: Served<T>) {
+async fn serve_all<T: PageState>(listener: TcpListener, served: Served<T>) {
     let (parts, is_cell) = (served.parts.clone(), served.is_cell);
     let respond = move |request, visit| -> BoxFuture<_> {
         let served = served.clone();
@@ -450,7 +453,7 @@ async fn answer(stream: impl Stream + 'static, respond: Arc<Respond>, visit: Vis
     }
 }
 
-async fn page<T: Told>(
+async fn page<T: PageState>(
     request: Request<Incoming>,
     served: Served<T>,
     visit: Visit,
@@ -506,7 +509,7 @@ async fn page<T: Told>(
 }
 
 /// Returns the answer of a page with the newest events.
-async fn answered<T: Told>(
+async fn answered<T: PageState>(
     request: &Request<Incoming>,
     peer: SocketAddr,
     (parts, live): (&PageParts<T>, &Arc<dyn LivePage>),
@@ -551,7 +554,7 @@ mod tests {
 
     struct Nothing;
 
-    impl Told for Nothing {
+    impl PageState for Nothing {
         fn json(&self) -> String {
             "{}".to_owned()
         }

@@ -13,7 +13,7 @@ use crate::logging::{self, LogFormat};
 use crate::{descriptors, restart, service_manager, signals};
 
 /// The parts of a program, for [`run_service`].
-pub trait Service: Parser {
+pub trait ServiceProgram: Parser {
     /// Log directives that suppress noisy messages of a library.
     const QUIET: &'static str = "";
 
@@ -34,7 +34,7 @@ pub trait Service: Parser {
 /// Runs a program from its command line to its end, on one thread. `arguments` start with the name
 /// of the program, as in [`std::env::args_os`].
 #[must_use]
-pub fn run_service<S: Service>(arguments: impl IntoIterator<Item = OsString>) -> ExitCode {
+pub fn run_service<S: ServiceProgram>(arguments: impl IntoIterator<Item = OsString>) -> ExitCode {
     let service: S = match parse(arguments) {
         Ok(service) => service,
         Err(code) => return code,
@@ -50,7 +50,7 @@ pub fn run_service<S: Service>(arguments: impl IntoIterator<Item = OsString>) ->
     })
 }
 
-fn serve<S: Service>(service: S) -> Result<(), Failure> {
+fn serve<S: ServiceProgram>(service: S) -> Result<(), Failure> {
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_all()
         .build()

@@ -31,15 +31,15 @@ use crate::certificate::{
     CLIENT_AUTH, COMMON_NAME, Certificate, ORGANIZATION, SERVER_AUTH, Serial, key_id, name_of,
 };
 use crate::crl::{Crl, Revoked};
-use crate::request::{Request, alternatives};
+use crate::request::{CertificateSigningRequest, alternatives};
 
 /// An authority that issues certificates to applications.
-pub struct Authority {
+pub struct CertificateAuthority {
     certificate: Certificate,
     signer: SigningKey<Sha256>,
 }
 
-impl fmt::Debug for Authority {
+impl fmt::Debug for CertificateAuthority {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.debug_struct("Authority")
             .field("certificate", &self.certificate)
@@ -58,7 +58,7 @@ pub struct Issue {
     pub until: Duration,
 }
 
-impl Authority {
+impl CertificateAuthority {
     /// Creates a self-signed root authority, with a private key in the DER of PKCS #8.
     ///
     /// # Errors
@@ -118,7 +118,11 @@ impl Authority {
     ///
     /// # Errors
     /// Returns an error for invalid names or times.
-    pub fn issue(&self, request: &Request, issue: &Issue) -> Result<Certificate, Unfit> {
+    pub fn issue(
+        &self,
+        request: &CertificateSigningRequest,
+        issue: &Issue,
+    ) -> Result<Certificate, Unfit> {
         let (_, last) = self.certificate.validity();
         let issue = Issue {
             until: issue.until.min(last),

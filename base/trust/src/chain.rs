@@ -8,7 +8,7 @@ use crate::crl::Crl;
 
 /// The trusted certificates, the issuer certificates and the revocation lists for a validation.
 #[derive(Debug, Clone, Default)]
-pub struct Known {
+pub struct TrustedCertificates {
     /// Trusted certificates: of applications, and of authorities together with all certificates
     /// that they issue.
     pub trusted: Vec<Certificate>,
@@ -19,7 +19,7 @@ pub struct Known {
     pub crls: Vec<Crl>,
 }
 
-impl Known {
+impl TrustedCertificates {
     /// Returns whether an authority is trusted.
     #[must_use]
     pub fn trusts_authorities(&self) -> bool {
@@ -31,10 +31,10 @@ impl Known {
     }
 }
 
-/// The fault of a certificate, in the order of the checks. The faults up to [`Fault::Untrusted`]
-/// are not revealed to the peer.
+/// The fault of a certificate, in the order of the checks. The faults up to
+/// [`CertificateFault::Untrusted`] are not revealed to the peer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, thiserror::Error)]
-pub enum Fault {
+pub enum CertificateFault {
     /// The certificate cannot be decoded, or its key or signature is invalid.
     #[error("the certificate is damaged, or its signature is not from its issuer")]
     Invalid,
@@ -81,7 +81,7 @@ pub enum Fault {
     IssuerRevoked,
 }
 
-impl Fault {
+impl CertificateFault {
     /// Returns the OPC UA StatusCode (OPC 10000-4, table of 6.1.3).
     #[must_use]
     pub const fn status(self) -> u32 {
@@ -112,7 +112,7 @@ impl Fault {
 
 /// The names that a certificate must contain, if known.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub struct Names<'n> {
+pub struct RequiredNames<'n> {
     /// The host of the server's URL: a DNS name or an IP address.
     pub host: Option<&'n str>,
     /// The ApplicationUri that the peer claims.
@@ -130,10 +130,10 @@ pub struct Names<'n> {
 pub fn check(
     certificate: &Certificate,
     sent: &[Certificate],
-    known: &Known,
+    known: &TrustedCertificates,
     now: Duration,
-) -> Result<(), Fault> {
-    check_named(certificate, sent, known, (Names::default(), now))
+) -> Result<(), CertificateFault> {
+    check_named(certificate, sent, known, (RequiredNames::default(), now))
 }
 
 /// Validates a certificate that must contain these names, such as the certificate of a server that
@@ -144,35 +144,35 @@ pub fn check(
 pub fn check_named(
     certificate: &Certificate,
     sent: &[Certificate],
-    known: &Known,
-    (names, now): (Names<'_>, Duration),
-) -> Result<(), Fault> {
+    known: &TrustedCertificates,
+    (names, now): (RequiredNames<'_>, Duration),
+) -> Result<(), CertificateFault> {
     let chain = chain(certificate, sent, known)?;
     let is_strong = |one: &&Certificate| {
         one.key_bits().is_some_and(|bits| KEY_BITS.contains(&bits)) && one.has_strong_signature()
     };
     if !chain.iter().all(is_strong) {
-        return Err(Fault::Policy);
+        return Err(CertificateFault::Policy);
     }
     if !chain.iter().any(|one| known.is_trusted(one)) {
-        return Err(Fault::Untrusted);
+        return Err(CertificateFault::Untrusted);
     }
     let issuers = chain.get(1..).unwrap_or_default();
     if !certificate.is_valid_at(now) {
-        return Err(Fault::Time);
+        return Err(CertificateFault::Time);
     }
     if !issuers.iter().all(|one| one.is_valid_at(now)) {
-        return Err(Fault::IssuerTime);
+        return Err(CertificateFault::IssuerTime);
     }
     if names
         .host
         .is_some_and(|host| !certificate.is_for_host(host))
     {
-        return Err(Fault::Host);
+        return Err(CertificateFault::Host);
     }
     let uri = names.application_uri;
     if uri.is_some() && certificate.application_uri().as_deref() != uri {
-        return Err(Fault::Uri);
+        return Err(CertificateFault::Uri);
     }
     used(certificate, issuers)?;
     revoked(&chain, known, now)
@@ -182,8 +182,8 @@ pub fn check_named(
 fn chain<'c>(
     certificate: &'c Certificate,
     sent: &'c [Certificate],
-    known: &'c Known,
-) -> Result<Vec<&'c Certificate>, Fault> {
+    known: &'c TrustedCertificates,
+) -> Result<Vec<&'c Certificate>, CertificateFault> {
     let mut chain = vec![certificate];
     let mut last = certificate;
     while !last.is_self_signed() {
@@ -196,12 +196,12 @@ fn chain<'c>(
             return match () {
                 // This very certificate is explicitly trusted.
                 () if chain.len() == 1 && known.is_trusted(certificate) && !is_named => Ok(chain),
-                () if is_named => Err(Fault::Invalid),
-                () => Err(Fault::Incomplete),
+                () if is_named => Err(CertificateFault::Invalid),
+                () => Err(CertificateFault::Incomplete),
             };
         };
         if chain.len() >= LONGEST_CHAIN || chain.contains(&issuer) {
-            return Err(Fault::Incomplete);
+            return Err(CertificateFault::Incomplete);
         }
         chain.push(issuer);
         last = issuer;
@@ -210,24 +210,24 @@ fn chain<'c>(
 }
 
 /// Checks the key usages of the chain.
-fn used(certificate: &Certificate, issuers: &[&Certificate]) -> Result<(), Fault> {
+fn used(certificate: &Certificate, issuers: &[&Certificate]) -> Result<(), CertificateFault> {
     let signs = certificate
         .usage()
         .is_none_or(|usage| usage.digital_signature());
     if !signs || !certificate.is_for_applications() {
-        return Err(Fault::Use);
+        return Err(CertificateFault::Use);
     }
     for (between, issuer) in issuers.iter().enumerate() {
         let constraints = issuer
             .constraints()
             .filter(|one| one.ca)
-            .ok_or(Fault::IssuerUse)?;
+            .ok_or(CertificateFault::IssuerUse)?;
         let is_short = constraints
             .path_len_constraint
             .is_none_or(|most| between <= usize::from(most));
         let may_sign = issuer.usage().is_none_or(|usage| usage.key_cert_sign());
         if !is_short || !may_sign {
-            return Err(Fault::IssuerUse);
+            return Err(CertificateFault::IssuerUse);
         }
     }
     Ok(())
@@ -235,13 +235,23 @@ fn used(certificate: &Certificate, issuers: &[&Certificate]) -> Result<(), Fault
 
 /// Checks that each authority has a current revocation list, and that no certificate of the chain
 /// is revoked.
-fn revoked(chain: &[&Certificate], known: &Known, now: Duration) -> Result<(), Fault> {
+fn revoked(
+    chain: &[&Certificate],
+    known: &TrustedCertificates,
+    now: Duration,
+) -> Result<(), CertificateFault> {
     let mut unknown = None;
     for (place, pair) in chain.windows(2).enumerate() {
         let [below, authority] = pair else { continue };
         let (missing, revoked) = match place {
-            0 => (Fault::RevocationUnknown, Fault::Revoked),
-            _ => (Fault::IssuerRevocationUnknown, Fault::IssuerRevoked),
+            0 => (
+                CertificateFault::RevocationUnknown,
+                CertificateFault::Revoked,
+            ),
+            _ => (
+                CertificateFault::IssuerRevocationUnknown,
+                CertificateFault::IssuerRevoked,
+            ),
         };
         let of_it: Vec<&Crl> = known
             .crls

@@ -2,8 +2,8 @@
 //!
 //! [`check`] validates a certificate with trusted certificates, issuer certificates and revocation
 //! lists (OPC 10000-4, 6.1.3): the chain to its root, trust, times, usages and revocations.
-//! [`Authority`] issues certificates for [`Request`]s (OPC 10000-6, 6.2.2) and signs the revocation
-//! list. [`Renewal`] schedules the renewal of a certificate.
+//! [`CertificateAuthority`] issues certificates for [`CertificateSigningRequest`]s (OPC 10000-6,
+//! 6.2.2) and signs the revocation list. [`Renewal`] schedules the renewal of a certificate.
 //!
 //! Times are parameters, as durations since 1970. Random data is a parameter too: keys and serial
 //! numbers. This crate uses no file, no clock and no socket. It supports RSA keys only, as required
@@ -17,13 +17,13 @@ mod fingerprint;
 mod renewal;
 mod request;
 
-pub use authority::{Authority, Issue};
+pub use authority::{CertificateAuthority, Issue};
 pub use certificate::{Certificate, Serial};
-pub use chain::{Fault, Known, Names, check, check_named};
+pub use chain::{CertificateFault, RequiredNames, TrustedCertificates, check, check_named};
 pub use crl::{Crl, Revoked};
 pub use fingerprint::{Fingerprint, NoFingerprint};
-pub use renewal::{Renewal, Step, is_near_end};
-pub use request::Request;
+pub use renewal::{Renewal, RenewalStep, is_near_end};
+pub use request::CertificateSigningRequest;
 
 /// An invalid or unsupported certificate, request, revocation list or key.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]

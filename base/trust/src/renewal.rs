@@ -6,7 +6,7 @@ use crate::certificate::Certificate;
 
 /// The next step of a renewal.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Step {
+pub enum RenewalStep {
     /// Wait until a later time.
     Wait {
         /// The time of the next check.
@@ -69,16 +69,16 @@ impl Renewal {
 
     /// Returns the next step.
     #[must_use]
-    pub fn step(&self, now: Duration) -> Step {
+    pub fn step(&self, now: Duration) -> RenewalStep {
         let again = self.failed.map(|(at, times)| at + self.pause(times));
         let next = again.map_or_else(|| self.due(), |again| again.max(self.due()));
         if now < next {
-            return Step::Wait { until: next };
+            return RenewalStep::Wait { until: next };
         }
         if now > self.until {
-            Step::Late
+            RenewalStep::Late
         } else {
-            Step::Ask
+            RenewalStep::Ask
         }
     }
 

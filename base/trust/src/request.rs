@@ -23,7 +23,7 @@ use crate::{Fingerprint, KEY_BITS, Unfit};
 
 /// A request that is signed with the key of the requested certificate.
 #[derive(Clone)]
-pub struct Request {
+pub struct CertificateSigningRequest {
     pub(crate) subject: Name,
     pub(crate) key: SubjectPublicKeyInfoOwned,
     application_uri: String,
@@ -33,7 +33,7 @@ pub struct Request {
 }
 
 /// Omits the challengePassword, which is a secret.
-impl fmt::Debug for Request {
+impl fmt::Debug for CertificateSigningRequest {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.debug_struct("Request")
             .field("application_uri", &self.application_uri)
@@ -42,7 +42,7 @@ impl fmt::Debug for Request {
     }
 }
 
-impl Request {
+impl CertificateSigningRequest {
     /// Creates a request for an application with a name and an organization at `hosts`, with a
     /// private key in the DER of PKCS #8.
     ///

@@ -8,8 +8,9 @@
 use std::time::Duration;
 
 use trust::{
-    Authority, Certificate, Crl, Fault, Issue, Known, Names, Renewal, Request, Revoked, Serial,
-    Step, Unfit, check, check_named,
+    Certificate, CertificateAuthority, CertificateFault, CertificateSigningRequest, Crl, Issue,
+    Renewal, RenewalStep, RequiredNames, Revoked, Serial, TrustedCertificates, Unfit, check,
+    check_named,
 };
 use x509_cert::der::pem;
 
@@ -33,24 +34,25 @@ fn issue(number: u8, from: Duration, until: Duration) -> Issue {
     }
 }
 
-fn authority(pem: &[u8], name: &str) -> Authority {
+fn authority(pem: &[u8], name: &str) -> CertificateAuthority {
     let life = issue(1, NOW - DAY * 100, NOW + DAY * 100);
-    Authority::make(&key(pem), (name, "Plant"), &life).unwrap()
+    CertificateAuthority::make(&key(pem), (name, "Plant"), &life).unwrap()
 }
 
-fn request() -> Request {
+fn request() -> CertificateSigningRequest {
     let hosts = [
         "cell-1".to_owned(),
         "192.0.2.7".to_owned(),
         "[::1]".to_owned(),
     ];
-    Request::make(&key(DEVICE), "urn:cell:robot", ("Robot", "Plant"), &hosts).unwrap()
+    CertificateSigningRequest::make(&key(DEVICE), "urn:cell:robot", ("Robot", "Plant"), &hosts)
+        .unwrap()
 }
 
 struct Cell {
-    authority: Authority,
+    authority: CertificateAuthority,
     device: Certificate,
-    known: Known,
+    known: TrustedCertificates,
 }
 
 fn cell() -> Cell {
@@ -58,10 +60,10 @@ fn cell() -> Cell {
     let device = authority
         .issue(&request(), &issue(7, NOW - DAY, NOW + DAY))
         .unwrap();
-    let known = Known {
+    let known = TrustedCertificates {
         trusted: vec![authority.certificate().clone()],
         crls: vec![authority.crl(&[], 1, (NOW - DAY, NOW + DAY)).unwrap()],
-        ..Known::default()
+        ..TrustedCertificates::default()
     };
     Cell {
         authority,
@@ -103,65 +105,74 @@ fn each_fault_has_its_status() {
         device,
         known,
     } = cell();
-    let without_list = Known {
+    let without_list = TrustedCertificates {
         crls: Vec::new(),
         ..known.clone()
     };
     assert_eq!(
         check(&device, &[], &without_list, NOW),
-        Err(Fault::RevocationUnknown)
+        Err(CertificateFault::RevocationUnknown)
     );
     assert_eq!(
-        check(&device, &[], &Known::default(), NOW),
-        Err(Fault::Incomplete)
+        check(&device, &[], &TrustedCertificates::default(), NOW),
+        Err(CertificateFault::Incomplete)
     );
-    assert_eq!(check(&device, &[], &known, NOW + DAY * 2), Err(Fault::Time));
+    assert_eq!(
+        check(&device, &[], &known, NOW + DAY * 2),
+        Err(CertificateFault::Time)
+    );
     // The certificate is still valid, but the revocation list has expired.
     let long = authority
         .issue(&request(), &issue(8, NOW - DAY, NOW + DAY * 100))
         .unwrap();
     assert_eq!(
         check(&long, &[], &known, NOW + DAY * 2),
-        Err(Fault::RevocationUnknown)
+        Err(CertificateFault::RevocationUnknown)
     );
     let revoked = [Revoked {
         serial: device.serial(),
         since: NOW,
     }];
     let list = authority.crl(&revoked, 2, (NOW, NOW + DAY)).unwrap();
-    let listed = Known {
+    let listed = TrustedCertificates {
         crls: vec![list],
         ..known.clone()
     };
-    assert_eq!(check(&device, &[], &listed, NOW), Err(Fault::Revoked));
+    assert_eq!(
+        check(&device, &[], &listed, NOW),
+        Err(CertificateFault::Revoked)
+    );
     assert_eq!(check(&long, &[], &listed, NOW), Ok(()), "the others stay");
     // Another authority with the same name.
     let impostor = self::authority(OTHER, "Plant authority");
     let forged = impostor
         .issue(&request(), &issue(7, NOW - DAY, NOW + DAY))
         .unwrap();
-    assert_eq!(check(&forged, &[], &known, NOW), Err(Fault::Invalid));
+    assert_eq!(
+        check(&forged, &[], &known, NOW),
+        Err(CertificateFault::Invalid)
+    );
     let sent = [impostor.certificate().clone()];
     assert_eq!(
         check(&forged, &sent, &known, NOW),
-        Err(Fault::Untrusted),
+        Err(CertificateFault::Untrusted),
         "what is sent along is not trusted for it"
     );
     // The revocation list of another authority does not count.
     let list = impostor.crl(&[], 9, (NOW, NOW + DAY)).unwrap();
-    let foreign = Known {
+    let foreign = TrustedCertificates {
         crls: vec![list],
         ..known
     };
     assert_eq!(
         check(&device, &[], &foreign, NOW),
-        Err(Fault::RevocationUnknown)
+        Err(CertificateFault::RevocationUnknown)
     );
-    assert_eq!(Fault::Revoked.status(), 0x801D_0000);
+    assert_eq!(CertificateFault::Revoked.status(), 0x801D_0000);
     assert!(
-        Fault::Revoked.may_be_told()
-            && !Fault::Untrusted.may_be_told()
-            && !Fault::Invalid.may_be_told()
+        CertificateFault::Revoked.may_be_told()
+            && !CertificateFault::Untrusted.may_be_told()
+            && !CertificateFault::Invalid.may_be_told()
     );
 }
 
@@ -169,7 +180,7 @@ fn each_fault_has_its_status() {
 fn the_certificate_of_a_server_is_for_its_host_and_of_its_application() {
     let Cell { device, known, .. } = cell();
     let named = |host, application_uri, now| {
-        let names = Names {
+        let names = RequiredNames {
             host,
             application_uri,
         };
@@ -178,12 +189,18 @@ fn the_certificate_of_a_server_is_for_its_host_and_of_its_application() {
     let (host, uri) = (Some("cell-1"), Some("urn:cell:robot"));
     assert_eq!(named(host, uri, NOW), Ok(()));
     assert_eq!(named(Some("[0:0::1]"), None, NOW), Ok(()));
-    assert_eq!(named(Some("cell-2"), uri, NOW), Err(Fault::Host));
-    assert_eq!(named(host, Some("urn:cell:other"), NOW), Err(Fault::Uri));
+    assert_eq!(named(Some("cell-2"), uri, NOW), Err(CertificateFault::Host));
+    assert_eq!(
+        named(host, Some("urn:cell:other"), NOW),
+        Err(CertificateFault::Uri)
+    );
     // The earlier check decides.
-    assert_eq!(named(Some("cell-2"), uri, NOW + DAY * 2), Err(Fault::Time));
-    assert_eq!(Fault::Host.status(), 0x8016_0000);
-    assert_eq!(Fault::Uri.status(), 0x8017_0000);
+    assert_eq!(
+        named(Some("cell-2"), uri, NOW + DAY * 2),
+        Err(CertificateFault::Time)
+    );
+    assert_eq!(CertificateFault::Host.status(), 0x8016_0000);
+    assert_eq!(CertificateFault::Uri.status(), 0x8017_0000);
 }
 
 #[test]
@@ -191,9 +208,9 @@ fn one_that_is_trusted_itself_needs_no_authority_but_is_refused_when_it_is_revok
     let Cell {
         authority, device, ..
     } = cell();
-    let mut known = Known {
+    let mut known = TrustedCertificates {
         trusted: vec![device.clone()],
-        ..Known::default()
+        ..TrustedCertificates::default()
     };
     assert_eq!(check(&device, &[], &known, NOW), Ok(()));
     let revoked = [Revoked {
@@ -204,26 +221,33 @@ fn one_that_is_trusted_itself_needs_no_authority_but_is_refused_when_it_is_revok
     known
         .crls
         .push(authority.crl(&revoked, 2, (NOW, NOW + DAY)).unwrap());
-    assert_eq!(check(&device, &[], &known, NOW), Err(Fault::Revoked));
+    assert_eq!(
+        check(&device, &[], &known, NOW),
+        Err(CertificateFault::Revoked)
+    );
 }
 
 #[test]
 fn what_an_application_issued_is_refused() {
     let Cell { device, known, .. } = cell();
     // A forged authority with the key and the name of the device.
-    let fake = Authority::make(
+    let fake = CertificateAuthority::make(
         &key(DEVICE),
         ("Robot", "Plant"),
         &issue(2, NOW - DAY, NOW + DAY),
     )
     .unwrap();
     assert!(matches!(
-        Authority::open(device, &key(DEVICE)),
+        CertificateAuthority::open(device, &key(DEVICE)),
         Err(Unfit::Key)
     ));
-    let other = Request::make(&key(OTHER), "urn:cell:other", ("Other", ""), &[]).unwrap();
+    let other =
+        CertificateSigningRequest::make(&key(OTHER), "urn:cell:other", ("Other", ""), &[]).unwrap();
     let issued = fake.issue(&other, &issue(9, NOW - DAY, NOW + DAY)).unwrap();
-    assert_eq!(check(&issued, &[], &known, NOW), Err(Fault::Incomplete));
+    assert_eq!(
+        check(&issued, &[], &known, NOW),
+        Err(CertificateFault::Incomplete)
+    );
 }
 
 #[test]
@@ -239,21 +263,24 @@ fn an_authority_that_is_over_is_told_of() {
         "it ends with its authority"
     );
     let after = NOW + DAY * 101;
-    assert_eq!(check(&device, &[], &known, after), Err(Fault::Time));
+    assert_eq!(
+        check(&device, &[], &known, after),
+        Err(CertificateFault::Time)
+    );
     // A certificate beyond the validity of its authority, as issued by other software.
-    let short = Authority::make(
+    let short = CertificateAuthority::make(
         &key(AUTHORITY),
         ("Plant authority", "Plant"),
         &issue(3, NOW - DAY, NOW + DAY),
     )
     .unwrap();
-    let known = Known {
+    let known = TrustedCertificates {
         trusted: vec![short.certificate().clone()],
         ..known
     };
     assert_eq!(
         check(&device, &[], &known, NOW + DAY * 2),
-        Err(Fault::IssuerTime)
+        Err(CertificateFault::IssuerTime)
     );
 }
 
@@ -277,7 +304,7 @@ fn a_chain_is_read_as_it_is_sent() {
 #[test]
 fn a_request_is_taken_of_who_has_the_key_and_names_an_application() {
     let made = request();
-    let read = Request::read(made.der()).unwrap();
+    let read = CertificateSigningRequest::read(made.der()).unwrap();
     assert_eq!(
         (read.application_uri(), read.hosts()),
         ("urn:cell:robot", made.hosts())
@@ -288,14 +315,18 @@ fn a_request_is_taken_of_who_has_the_key_and_names_an_application() {
         .position(|five| five == b"robot")
         .unwrap();
     changed[at] = b'R';
-    assert!(matches!(Request::read(&changed), Err(Unfit::Signature)));
-    let short = Request::make(&key(SHORT), "urn:cell:robot", ("Robot", ""), &[]);
+    assert!(matches!(
+        CertificateSigningRequest::read(&changed),
+        Err(Unfit::Signature)
+    ));
+    let short = CertificateSigningRequest::make(&key(SHORT), "urn:cell:robot", ("Robot", ""), &[]);
     assert!(matches!(short, Err(Unfit::Length(1024))));
     assert!(matches!(
-        Request::read(b"-----BEGIN nothing"),
+        CertificateSigningRequest::read(b"-----BEGIN nothing"),
         Err(Unfit::Unreadable)
     ));
-    let long = Request::make(&key(DEVICE), "urn:cell:robot", (&"x".repeat(65), ""), &[]);
+    let long =
+        CertificateSigningRequest::make(&key(DEVICE), "urn:cell:robot", (&"x".repeat(65), ""), &[]);
     assert!(matches!(long, Err(Unfit::Name)));
 }
 
@@ -329,24 +360,31 @@ fn a_certificate_is_asked_for_at_four_fifths_of_its_life_and_again_while_that_fa
     let Cell { device, .. } = cell();
     let mut plan = Renewal::of(&device);
     let due = NOW - DAY + DAY * 2 / 5 * 4;
-    assert_eq!(plan.step(NOW), Step::Wait { until: due });
-    assert_eq!(plan.step(due), Step::Ask);
+    assert_eq!(plan.step(NOW), RenewalStep::Wait { until: due });
+    assert_eq!(plan.step(due), RenewalStep::Ask);
     plan.failed(due);
     assert_eq!(
         plan.step(due),
-        Step::Wait {
+        RenewalStep::Wait {
             until: due + Duration::from_secs(30)
         }
     );
     let mut at = due;
     for _ in 0..40 {
-        let Step::Wait { until } = plan.step(at) else {
+        let RenewalStep::Wait { until } = plan.step(at) else {
             panic!("it was asked for just now")
         };
         assert!(until > at && until - at <= Duration::from_secs(3600));
         at = until;
         let over = at > device.validity().1;
-        assert_eq!(plan.step(at), if over { Step::Late } else { Step::Ask });
+        assert_eq!(
+            plan.step(at),
+            if over {
+                RenewalStep::Late
+            } else {
+                RenewalStep::Ask
+            }
+        );
         plan.failed(at);
     }
 }
@@ -358,9 +396,9 @@ fn a_certificate_that_an_application_made_itself_is_replaced_at_once() {
     let mut at = NOW;
     let mut pauses = Vec::new();
     for _ in 0..40 {
-        assert_eq!(plan.step(at), Step::Ask);
+        assert_eq!(plan.step(at), RenewalStep::Ask);
         plan.failed(at);
-        let Step::Wait { until } = plan.step(at) else {
+        let RenewalStep::Wait { until } = plan.step(at) else {
             panic!("it was requested just now")
         };
         pauses.push((until - at).as_secs());
@@ -376,7 +414,7 @@ proptest::proptest! {
         drop(Certificate::read(&bytes));
         drop(Certificate::read_chain(&bytes));
         drop(Crl::read(&bytes));
-        drop(Request::read(&bytes));
+        drop(CertificateSigningRequest::read(&bytes));
     }
 }
 
@@ -385,8 +423,13 @@ fn a_request_carries_a_challenge_that_debug_output_leaves_out() {
     let hosts = ["cell-1".to_owned()];
     let names = ("Robot", "Plant");
     let with = |challenge| {
-        let made = Request::make_with(&key(DEVICE), ("urn:cell:robot", &hosts), names, challenge);
-        Request::read(made.unwrap().der()).unwrap()
+        let made = CertificateSigningRequest::make_with(
+            &key(DEVICE),
+            ("urn:cell:robot", &hosts),
+            names,
+            challenge,
+        );
+        CertificateSigningRequest::read(made.unwrap().der()).unwrap()
     };
     let invited = with(Some("3f9a-secret"));
     assert_eq!(invited.challenge(), Some("3f9a-secret"));
@@ -404,7 +447,8 @@ fn a_request_carries_a_challenge_that_debug_output_leaves_out() {
 fn people_are_warned_of_the_end_of_an_authority_while_they_can_replace_it() {
     let ends = |days: u32, left: u32| {
         let life = issue(1, NOW - DAY * (days - left), NOW + DAY * left);
-        let made = Authority::make(&key(AUTHORITY), ("Plant authority", ""), &life).unwrap();
+        let made =
+            CertificateAuthority::make(&key(AUTHORITY), ("Plant authority", ""), &life).unwrap();
         trust::is_near_end(made.certificate(), NOW)
     };
     assert!(!ends(3650, 731) && ends(3650, 729));

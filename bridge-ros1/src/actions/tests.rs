@@ -3,7 +3,7 @@
 use std::collections::BTreeSet;
 use std::net::SocketAddr;
 
-use messages::{Dialect, Registry};
+use messages::{Dialect, TypeRegistry};
 use tcpros::{Core, Node, NodeOptions};
 use tokio::time::timeout;
 
@@ -12,7 +12,7 @@ use crate::ends::Ends;
 
 #[test]
 fn an_id_of_the_space_comes_back_from_its_text_and_others_have_one_of_their_own() {
-    let id: GoalId = *b"\x00\x01goal of a plant"[..16].first_chunk().unwrap();
+    let id: GraphGoalId = *b"\x00\x01goal of a plant"[..16].first_chunk().unwrap();
     assert_eq!(spelled(id).len(), 32);
     assert_eq!(read(&spelled(id)), id);
     let texts = [
@@ -22,13 +22,13 @@ fn an_id_of_the_space_comes_back_from_its_text_and_others_have_one_of_their_own(
         "0123456789ABCDEF0123456789abcdef",
         "+123456789abcdef0123456789abcdef",
     ];
-    let read: BTreeSet<GoalId> = texts.iter().map(|id| read(id)).collect();
+    let read: BTreeSet<GraphGoalId> = texts.iter().map(|id| read(id)).collect();
     assert_eq!(read.len(), texts.len());
 }
 
 #[test]
 fn a_result_with_nothing_in_it_has_the_length_of_its_type() {
-    let registry = Registry::bundle(Dialect::Ros1);
+    let registry = TypeRegistry::bundle(Dialect::Ros1);
     let of = |name: &str| {
         let action = registry.action(&name.parse().unwrap()).unwrap();
         empty(action.result()).unwrap().to_vec()
@@ -43,13 +43,13 @@ const WAITS: Waits = Waits {
     answer: Duration::from_secs(5),
     silence: Duration::from_secs(5),
 };
-const ID: GoalId = [0xa5; 16];
+const ID: GraphGoalId = [0xa5; 16];
 
 struct Cell {
     _core: Core,
     bridge: Node,
     robot: Node,
-    definitions: Definitions,
+    definitions: Ros1Definitions,
     ends: Ends,
 }
 
@@ -67,7 +67,7 @@ impl Cell {
             bridge: node("bridge"),
             robot: node("robot"),
             _core: core,
-            definitions: Definitions::new(Arc::default(), Vec::new()),
+            definitions: Ros1Definitions::new(Arc::default(), Vec::new()),
             ends: Ends::default(),
         }
     }
@@ -80,15 +80,16 @@ impl Cell {
         }
     }
 
-    fn sender(&mut self, waits: Waits) -> Sender {
+    fn sender(&mut self, waits: Waits) -> GoalSender {
         let made = self.graph().action_client("/count", &test(), waits);
         made.unwrap()
     }
 
     /// Returns an action server of the robot.
-    fn server(&self) -> tcpros::actionlib::ActionServer {
-        let options = ActionServerOptions::new(Bytes::from_static(&[0; 4]));
-        tcpros::actionlib::ActionServer::new(&self.robot, "/count", test_types(), options).unwrap()
+    fn server(&self) -> tcpros::actionlib::ActionlibServer {
+        let options = ActionlibServerOptions::new(Bytes::from_static(&[0; 4]));
+        tcpros::actionlib::ActionlibServer::new(&self.robot, "/count", test_types(), options)
+            .unwrap()
     }
 }
 
@@ -96,8 +97,8 @@ fn test() -> TypeName {
     "actionlib/Test".parse().unwrap()
 }
 
-fn test_types() -> tcpros::actionlib::ActionType {
-    types(&Registry::bundle(Dialect::Ros1).action(&test()).unwrap())
+fn test_types() -> tcpros::actionlib::ActionlibTypes {
+    types(&TypeRegistry::bundle(Dialect::Ros1).action(&test()).unwrap())
 }
 
 async fn within<T>(what: &str, future: impl Future<Output = T>) -> T {
@@ -107,10 +108,10 @@ async fn within<T>(what: &str, future: impl Future<Output = T>) -> T {
     }
 }
 
-async fn next_goal(server: &mut tcpros::actionlib::ActionServer) -> ServerGoal {
+async fn next_goal(server: &mut tcpros::actionlib::ActionlibServer) -> ActionlibServerGoal {
     within("a goal", async {
         loop {
-            if let tcpros::actionlib::ServerEvent::Goal(goal) = server.recv().await {
+            if let tcpros::actionlib::ActionlibServerEvent::Goal(goal) = server.recv().await {
                 return goal;
             }
         }
@@ -119,11 +120,11 @@ async fn next_goal(server: &mut tcpros::actionlib::ActionServer) -> ServerGoal {
 }
 
 /// Returns the next event except statuses, which may arrive at any time.
-async fn heard(goal: &mut Sent) -> Option<GoalEvent> {
+async fn heard(goal: &mut SentActionlibGoal) -> Option<GraphGoalEvent> {
     within("an event", async {
         loop {
             match goal.recv().await {
-                Some(GoalEvent::Status(_)) => {}
+                Some(GraphGoalEvent::Status(_)) => {}
                 event => return event,
             }
         }
@@ -136,13 +137,16 @@ fn later() -> std::time::Instant {
     bridge_node::now().monotonic + Duration::from_secs(3600)
 }
 
-async fn is_accepted(goal: &mut Sent) {
+async fn is_accepted(goal: &mut SentActionlibGoal) {
     let event = heard(goal).await;
-    assert!(matches!(event, Some(GoalEvent::Accepted(_))), "{event:?}");
+    assert!(
+        matches!(event, Some(GraphGoalEvent::Accepted(_))),
+        "{event:?}"
+    );
 }
 
-fn ended(status: i8, message: &str, result: i32) -> Option<GoalEvent> {
-    Some(GoalEvent::Ended {
+fn ended(status: i8, message: &str, result: i32) -> Option<GraphGoalEvent> {
+    Some(GraphGoalEvent::Ended {
         status,
         message: message.to_owned(),
         result: Bytes::copy_from_slice(&result.to_le_bytes()),
@@ -158,7 +162,7 @@ async fn a_goal_waits_for_its_server_to_connect_and_is_followed_to_its_end() {
     let mut goal = sender.send_goal(ID, &5i32.to_le_bytes(), later());
     let events = tokio::spawn(async move {
         is_accepted(&mut goal).await;
-        let report = Some(GoalEvent::Feedback(Bytes::from_static(&[7, 0, 0, 0])));
+        let report = Some(GraphGoalEvent::Feedback(Bytes::from_static(&[7, 0, 0, 0])));
         assert_eq!(heard(&mut goal).await, report);
         assert_eq!(heard(&mut goal).await, ended(SUCCEEDED, "there", 10));
         assert_eq!(heard(&mut goal).await, None);
@@ -180,7 +184,7 @@ async fn a_goal_is_rejected_with_the_words_of_its_server_and_one_left_undecided_
     let mut goal = sender.send_goal(ID, &1i32.to_le_bytes(), later());
     let events = tokio::spawn(async move { heard(&mut goal).await });
     next_goal(&mut server).await.reject("no way").unwrap();
-    let rejected = Some(GoalEvent::Rejected("no way".to_owned()));
+    let rejected = Some(GraphGoalEvent::Rejected("no way".to_owned()));
     assert_eq!(within("the answer", events).await.unwrap(), rejected);
 
     let mut goal = sender.send_goal([1; 16], &1i32.to_le_bytes(), later());
@@ -196,7 +200,7 @@ async fn goals_are_cancelled_one_by_one_and_all_together() {
     let mut cell = Cell::start();
     let mut server = cell.server();
     let sender = cell.sender(WAITS);
-    let ids: [GoalId; 3] = [[1; 16], [2; 16], [3; 16]];
+    let ids: [GraphGoalId; 3] = [[1; 16], [2; 16], [3; 16]];
     let mut sent = Vec::new();
     let mut taken = Vec::new();
     for id in ids {
@@ -211,18 +215,27 @@ async fn goals_are_cancelled_one_by_one_and_all_together() {
         sent.push(within("its word", accepted).await.unwrap());
     }
     let cancel = async |what| within("the answer", sender.cancel(what)).await.unwrap();
-    let told = |code, goals: &[GoalId]| CancelAnswer {
+    let told = |code, goals: &[GraphGoalId]| GraphCancelResponse {
         code,
         goals: goals.to_vec(),
     };
-    assert_eq!(cancel(CancelWhat::Goal([9; 16])).await, told(2, &[]));
-    assert_eq!(cancel(CancelWhat::Goal(ids[1])).await, told(0, &ids[1..2]));
+    assert_eq!(
+        cancel(GraphCancelSelection::Goal([9; 16])).await,
+        told(2, &[])
+    );
+    assert_eq!(
+        cancel(GraphCancelSelection::Goal(ids[1])).await,
+        told(0, &ids[1..2])
+    );
     within("the request", taken[1].cancel_requested()).await;
     assert!(!taken[0].is_cancel_requested());
     taken[1].cancelled(Some(&[4, 0, 0, 0]), "stopped").unwrap();
     assert_eq!(heard(&mut sent[1]).await, ended(CANCELED, "stopped", 4));
-    assert_eq!(cancel(CancelWhat::Goal(ids[1])).await, told(3, &[]));
-    let mut all = cancel(CancelWhat::All).await;
+    assert_eq!(
+        cancel(GraphCancelSelection::Goal(ids[1])).await,
+        told(3, &[])
+    );
+    let mut all = cancel(GraphCancelSelection::All).await;
     all.goals.sort_unstable();
     assert_eq!(all, told(0, &[ids[0], ids[2]]));
     for goal in [&taken[0], &taken[2]] {
@@ -240,7 +253,11 @@ async fn a_goal_without_a_server_was_not_executed_and_a_client_is_shared() {
     let sender = cell.sender(waits);
     let mut goal = sender.send_goal(ID, &[], later());
     let event = heard(&mut goal).await;
-    let Some(GoalEvent::Lost { text, ran: Ran::No }) = event else {
+    let Some(GraphGoalEvent::Lost {
+        text,
+        ran: MayHaveRun::No,
+    }) = event
+    else {
         panic!("{event:?}");
     };
     assert!(text.contains("/count"), "{text}");
@@ -264,7 +281,11 @@ async fn a_goal_is_not_sent_to_a_server_that_connects_after_its_time() {
     tokio::time::sleep_until(start_by.into()).await;
     let mut server = cell.server();
     let event = within("the end", lost).await.unwrap();
-    let Some(GoalEvent::Lost { text, ran: Ran::No }) = event else {
+    let Some(GraphGoalEvent::Lost {
+        text,
+        ran: MayHaveRun::No,
+    }) = event
+    else {
         panic!("{event:?}");
     };
     assert!(text.contains("the time until which it may start"), "{text}");
@@ -274,7 +295,7 @@ async fn a_goal_is_not_sent_to_a_server_that_connects_after_its_time() {
     assert_eq!(first.goal_id().id, spelled([1; 16]));
     first.accept("").unwrap();
     let accepted = within("the answer", followed).await.unwrap();
-    assert!(matches!(accepted, Some(GoalEvent::Accepted(_))));
+    assert!(matches!(accepted, Some(GraphGoalEvent::Accepted(_))));
 }
 
 #[tokio::test]
@@ -285,9 +306,10 @@ async fn goals_of_the_graph_are_decided_about_and_ended_here() {
     // step.
     let again = cell.graph().serve_action("/count", &test());
     drop(std::mem::replace(&mut taker, again.unwrap()));
-    let options = ActionClientOptions::default();
+    let options = ActionlibClientOptions::default();
     let client =
-        tcpros::actionlib::ActionClient::new(&cell.robot, "/count", test_types(), options).unwrap();
+        tcpros::actionlib::ActionlibClient::new(&cell.robot, "/count", test_types(), options)
+            .unwrap();
     within("the server", client.wait_for_server(SOON))
         .await
         .unwrap();
@@ -295,14 +317,14 @@ async fn goals_of_the_graph_are_decided_about_and_ended_here() {
     let mut asked = [1, 2, 3, 4].map(send);
     let mut taken = Vec::new();
     while taken.len() < 4 {
-        if let ServerEvent::Goal(goal) = within("a goal", taker.recv()).await {
+        if let GraphServerEvent::Goal(goal) = within("a goal", taker.recv()).await {
             taken.push(goal);
         }
     }
-    let ids: Vec<GoalId> = asked.iter().map(|goal| read(&goal.goal_id().id)).collect();
-    assert_eq!(taken.iter().map(NewGoal::id).collect::<Vec<_>>(), ids);
+    let ids: Vec<GraphGoalId> = asked.iter().map(|goal| read(&goal.goal_id().id)).collect();
+    assert_eq!(taken.iter().map(GraphNewGoal::id).collect::<Vec<_>>(), ids);
     assert_eq!(taken[2].body().as_ref(), 3i32.to_le_bytes());
-    let [first, second, third, fourth] = <[New; 4]>::try_from(taken).unwrap();
+    let [first, second, third, fourth] = <[NewGraphGoal; 4]>::try_from(taken).unwrap();
     first.reject("not that");
     drop(second);
     let (third, fourth) = (
@@ -314,7 +336,7 @@ async fn goals_of_the_graph_are_decided_about_and_ended_here() {
     assert!(third.end(SUCCEEDED, "", None).is_err(), "it has ended");
     assert!(asked[3].cancel());
     let event = within("the request", taker.recv()).await;
-    let ServerEvent::Cancel(cancel) = event else {
+    let GraphServerEvent::Cancel(cancel) = event else {
         panic!("{event:?}");
     };
     assert_eq!(cancel.id(), ids[3]);
@@ -329,14 +351,22 @@ async fn goals_of_the_graph_are_decided_about_and_ended_here() {
     assert_eq!(
         ends,
         [
-            (Status::Rejected, "not that".to_owned(), nothing.clone()),
             (
-                Status::Rejected,
+                ActionlibStatus::Rejected,
+                "not that".to_owned(),
+                nothing.clone()
+            ),
+            (
+                ActionlibStatus::Rejected,
                 "the goal was neither accepted nor rejected in time".to_owned(),
                 nothing.clone()
             ),
-            (Status::Succeeded, "done".to_owned(), vec![6, 0, 0, 0]),
-            (Status::Preempted, "stopped".to_owned(), nothing),
+            (
+                ActionlibStatus::Succeeded,
+                "done".to_owned(),
+                vec![6, 0, 0, 0]
+            ),
+            (ActionlibStatus::Preempted, "stopped".to_owned(), nothing),
         ]
     );
 }

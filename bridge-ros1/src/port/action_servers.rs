@@ -1,10 +1,10 @@
 //! The action servers of the graph: nodes with the topics of an action.
 
 use messages::TypeName;
-use tcpros::Graph;
+use tcpros::MasterGraph;
 
 /// Returns the actions that nodes other than `own` serve.
-pub(super) fn served<'g>(graph: &'g Graph, own: &str) -> impl Iterator<Item = &'g str> {
+pub(super) fn served<'g>(graph: &'g MasterGraph, own: &str) -> impl Iterator<Item = &'g str> {
     let goals = graph.subscribers.keys();
     let actions = goals.filter_map(|topic| topic.strip_suffix("/goal"));
     actions.filter(move |action| server(graph, own, action).is_some())
@@ -12,13 +12,13 @@ pub(super) fn served<'g>(graph: &'g Graph, own: &str) -> impl Iterator<Item = &'
 
 /// Returns another node that serves the action: it subscribes to goal and cancel, and publishes
 /// status, feedback and result.
-pub(super) fn server<'g>(graph: &'g Graph, own: &str, action: &str) -> Option<&'g str> {
+pub(super) fn server<'g>(graph: &'g MasterGraph, own: &str, action: &str) -> Option<&'g str> {
     server_of(graph, |node| node != own, action)
 }
 
 /// Returns a node for which `is_other` holds and that serves the action.
 pub(super) fn server_of<'g>(
-    graph: &'g Graph,
+    graph: &'g MasterGraph,
     is_other: impl Fn(&str) -> bool,
     action: &str,
 ) -> Option<&'g str> {
@@ -38,7 +38,7 @@ pub(super) fn server_of<'g>(
 
 /// Returns the type of an action from the types of its topics, as far as the master knows them. The
 /// master has the type `*` for a topic without publishers that is subscribed with any type.
-pub(super) fn type_of(graph: &Graph, action: &str) -> Option<TypeName> {
+pub(super) fn type_of(graph: &MasterGraph, action: &str) -> Option<TypeName> {
     let parts = [
         ("goal", "ActionGoal"),
         ("result", "ActionResult"),
@@ -54,10 +54,10 @@ pub(super) fn type_of(graph: &Graph, action: &str) -> Option<TypeName> {
 mod tests {
     use super::*;
 
-    fn graph(nodes: [&str; 5]) -> Graph {
+    fn graph(nodes: [&str; 5]) -> MasterGraph {
         let named = |topic: &str, node: &str| (format!("/count/{topic}"), vec![node.to_owned()]);
         let [goal, cancel, status, feedback, result] = nodes;
-        Graph {
+        MasterGraph {
             subscribers: [named("goal", goal), named("cancel", cancel)].into(),
             publishers: [
                 named("status", status),
@@ -65,7 +65,7 @@ mod tests {
                 named("result", result),
             ]
             .into(),
-            ..Graph::default()
+            ..MasterGraph::default()
         }
     }
 

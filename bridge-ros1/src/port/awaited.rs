@@ -2,27 +2,27 @@
 
 use std::net::IpAddr;
 
-use bridge_node::{Actions, AwaitedPeers, Executing, near};
+use bridge_node::{AwaitedPeers, BridgeActions, ExecutedServices, near};
 use mappings::{Mapping, ServiceRole, SpaceId};
 
 use super::action_servers::{served, server};
 use super::side::Ros1Side;
-use super::sinks::Sinks;
-use super::sources::Sources;
-use crate::services::Executor;
-use crate::sink::Sink;
-use crate::source::Source;
+use super::sinks::AdvertisedTopics;
+use super::sources::SubscribedTopics;
+use crate::services::ServiceExecutor;
+use crate::sink::Ros1Sink;
+use crate::source::Ros1Source;
 
 /// The node and its topics, for the search of missing peers.
-pub(super) struct Missing<'p> {
+pub(super) struct Ros1MissingPeers<'p> {
     pub(super) side: &'p Ros1Side,
     /// The address of this node as other nodes see it; `None` if it is a host name.
     pub(super) address: Option<IpAddr>,
-    pub(super) sources: &'p Sources,
-    pub(super) sinks: &'p Sinks,
+    pub(super) sources: &'p SubscribedTopics,
+    pub(super) sinks: &'p AdvertisedTopics,
 }
 
-impl Missing<'_> {
+impl Ros1MissingPeers<'_> {
     /// Adds the missing peers.
     pub(super) fn add(&self, missing: &mut AwaitedPeers) {
         if let Some(address) = self.address.filter(|address| !is_local(*address)) {
@@ -51,7 +51,7 @@ impl Missing<'_> {
     }
 
     /// Adds the publisher of a topic that the mapping subscribes to.
-    fn add_publisher(&self, source: &Source, missing: &mut AwaitedPeers) {
+    fn add_publisher(&self, source: &Ros1Source, missing: &mut AwaitedPeers) {
         if source.found || source.values.is_empty() || source.is_live() {
             return;
         }
@@ -80,7 +80,7 @@ impl Missing<'_> {
 
     /// Adds a topic that the mapping publishes and no node subscribes to, if another node publishes
     /// it or subscribes to a topic with a similar name.
-    fn add_mistaken(&self, sink: &Sink, missing: &mut AwaitedPeers) {
+    fn add_mistaken(&self, sink: &Ros1Sink, missing: &mut AwaitedPeers) {
         let topic = sink.ros_topic.as_str();
         let subscribers = &self.side.graph.subscribers;
         if self.side.others(subscribers, topic).next().is_some() {
@@ -102,7 +102,7 @@ impl Missing<'_> {
 
     /// Adds the subscribers of a topic of this node that are registered at the master and do not
     /// connect.
-    fn add_subscribers(&self, sink: &Sink, missing: &mut AwaitedPeers) {
+    fn add_subscribers(&self, sink: &Ros1Sink, missing: &mut AwaitedPeers) {
         let Some(open) = &sink.open else { return };
         let publisher = &open.publisher;
         let others = self
@@ -135,14 +135,15 @@ impl Missing<'_> {
     /// Adds the services and actions that the mapping calls and no node serves.
     fn add_servers(&self, missing: &mut AwaitedPeers) {
         let (mapping, services) = (self.side.policy.mapping(), &self.side.graph.services);
-        let executed = Executing::<Executor>::mapped(mapping, &self.side.policy).into_iter();
+        let executed =
+            ExecutedServices::<ServiceExecutor>::mapped(mapping, &self.side.policy).into_iter();
         for service in executed.chain(called(mapping, self.side.policy.own())) {
             if self.side.others(services, service).next().is_none() {
                 let known = self.side.names(services);
                 missing.add_named(("service", service), "no server", known);
             }
         }
-        for action in Actions::mapped(mapping, &self.side.policy) {
+        for action in BridgeActions::mapped(mapping, &self.side.policy) {
             if server(&self.side.graph, self.side.node.name(), action).is_none() {
                 let known = served(&self.side.graph, self.side.node.name());
                 missing.add_named(("action", action), "no server", known);

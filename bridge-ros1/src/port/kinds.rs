@@ -9,7 +9,7 @@ use tokio::task::JoinSet;
 
 /// The types of services, which only their servers know.
 #[derive(Debug, Default)]
-pub(super) struct Kinds {
+pub(super) struct ServiceTypeLookup {
     known: BTreeMap<String, Kind>,
     asking: JoinSet<(String, Result<TypeName, String>)>,
     faults: Vec<(String, String)>,
@@ -25,7 +25,7 @@ struct Kind {
     asked: bool,
 }
 
-impl Kinds {
+impl ServiceTypeLookup {
     /// Returns the type of a service, if its server has reported it.
     pub(super) fn of(&self, service: &str) -> Option<&TypeName> {
         self.known.get(service)?.type_name.as_ref()

@@ -6,37 +6,37 @@ use std::future::poll_fn;
 use std::sync::Arc;
 
 use bridge_node::{
-    Actions, Answered, AskId, CallDescription, Delivery, Executing, Execution, ExecutionId,
-    Handover, PortEvent, Present, RosRequests, now,
+    AskId, BridgeActions, CallDescription, CallResponse, ExecutedServices, Execution, ExecutionId,
+    Handover, LocalDelivery, PortEvent, Present, RosRequests, now,
 };
 use bytes::Bytes;
 use mappings::{Mapping, SpaceId, TopicId};
 use tcpros::{Node, ServiceServer};
 
 use super::action_servers::{server, server_of, type_of};
-use super::kinds::Kinds;
+use super::kinds::ServiceTypeLookup;
 use super::side::Ros1Side;
-use crate::definitions::Definitions;
+use crate::definitions::Ros1Definitions;
 use crate::ends::Ends;
-use crate::services::{Executor, Ros1Graph};
+use crate::services::{Ros1Graph, ServiceExecutor};
 
 /// The services and actions in both directions.
 #[derive(Debug)]
 pub(super) struct Ros1Requests {
-    both: RosRequests<ServiceServer, Executor>,
+    both: RosRequests<ServiceServer, ServiceExecutor>,
     /// Whether this bridge is one of several redundant bridges of its space.
     is_redundant: bool,
     /// The action clients and servers.
     ends: Ends,
     /// The types of services with a name of the space.
-    kinds: Kinds,
+    kinds: ServiceTypeLookup,
 }
 
 impl Ros1Requests {
     /// Starts the services that values call. Returns the events about their types too.
     pub(super) fn start(
         node: &Node,
-        definitions: &mut Definitions,
+        definitions: &mut Ros1Definitions,
         (own, mapping): (SpaceId, &Mapping),
     ) -> (Self, Vec<PortEvent>) {
         let mut ends = Ends::default();
@@ -50,7 +50,7 @@ impl Ros1Requests {
             both,
             is_redundant: false,
             ends,
-            kinds: Kinds::default(),
+            kinds: ServiceTypeLookup::default(),
         };
         (requests, bound)
     }
@@ -71,7 +71,7 @@ impl Ros1Requests {
     pub(super) fn publish(
         &mut self,
         side: &mut Ros1Side,
-        sample: &Delivery,
+        sample: &LocalDelivery,
     ) -> Option<Result<(), &'static str>> {
         self.both.publish(&side.policy, sample, &mut side.events)
     }
@@ -109,7 +109,7 @@ impl Ros1Requests {
     }
 
     /// Answers a request of the graph.
-    pub(super) fn answered(&mut self, ask: AskId, answer: Answered<Bytes>) {
+    pub(super) fn answered(&mut self, ask: AskId, answer: CallResponse<Bytes>) {
         self.both.answered(ask, answer);
     }
 
@@ -224,9 +224,9 @@ impl Ros1Requests {
         let others = services.filter(|(_, nodes)| nodes.iter().any(|node| node != own));
         let policy = &side.policy;
         let mapping = Arc::clone(policy.mapping());
-        let mapped = Executing::<Executor>::mapped(&mapping, policy);
+        let mapped = ExecutedServices::<ServiceExecutor>::mapped(&mapping, policy);
         let wanted = others.filter(|(service, _)| {
-            let named = || Executing::<Executor>::is_named(policy, service);
+            let named = || ExecutedServices::<ServiceExecutor>::is_named(policy, service);
             service.len() <= MAX_NAME && (mapped.contains(service.as_str()) || named())
         });
         let others: BTreeMap<&str, &[String]> = wanted
@@ -295,14 +295,14 @@ impl Ros1Requests {
     /// actions of lost servers.
     fn find_actions(&mut self, side: &mut Ros1Side) {
         let mapping = Arc::clone(side.policy.mapping());
-        let mapped = Actions::mapped(&mapping, &side.policy);
+        let mapped = BridgeActions::mapped(&mapping, &side.policy);
         let (graph, own) = (&side.graph, side.node.name());
         let mut present = Present::new();
         for topic in graph.subscribers.keys() {
             let Some(action) = topic.strip_suffix("/goal") else {
                 continue;
             };
-            let wanted = mapped.contains(action) || Actions::is_named(&side.policy, action);
+            let wanted = mapped.contains(action) || BridgeActions::is_named(&side.policy, action);
             if action.len() > MAX_NAME || !wanted || server(graph, own, action).is_none() {
                 continue;
             }

@@ -6,17 +6,17 @@ use std::sync::Arc;
 use bridge_node::policy::Policy;
 use bridge_node::{PortEvent, Reason};
 use mappings::TopicId;
-use tcpros::{Graph, Node};
+use tcpros::{MasterGraph, Node};
 
-use crate::definitions::Definitions;
+use crate::definitions::Ros1Definitions;
 
 /// The node, the graph around it, and the events for the run loop.
 #[derive(Debug)]
 pub(super) struct Ros1Side {
     pub(super) node: Node,
     pub(super) policy: Policy,
-    pub(super) definitions: Definitions,
-    pub(super) graph: Arc<Graph>,
+    pub(super) definitions: Ros1Definitions,
+    pub(super) graph: Arc<MasterGraph>,
     /// True if the master responded to the last query.
     pub(super) has_master: bool,
     /// The events that `recv` returns next; filled by a message or by a comparison with the graph.

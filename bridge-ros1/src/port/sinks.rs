@@ -4,31 +4,31 @@ use std::collections::{BTreeSet, HashMap, HashSet};
 use std::sync::Arc;
 use std::time::Duration;
 
-use bridge_node::policy::{Admission, NO_SUBSCRIBER, Policy, Step, Word};
-use bridge_node::{Delivery, Described, Handover, Kept, PortEvent, Reason, now};
+use bridge_node::policy::{Admission, NO_SUBSCRIBER, Policy, PortStep, Word};
+use bridge_node::{Handover, LocalDelivery, PortEvent, Reason, TopicMetaData, ValueRelation, now};
 use mappings::TopicId;
 use messages::{ActionCalls, DefinitionError, Selection, TextKind, TypeName};
-use tcpros::{Graph, Latched, TopicType};
+use tcpros::{Latched, MasterGraph, TopicType};
 use tokio::time::{Instant, sleep_until};
 use tracing::{debug, info};
 use uadp::{BuiltinType, Timestamp};
 
 use super::side::Ros1Side;
-use crate::sink::{Open, Opening, Sink};
+use crate::sink::{OpenPublisher, Ros1Sink, TopicOpening};
 
 /// The published topics.
 #[derive(Debug, Default)]
-pub(super) struct Sinks {
-    topics: HashMap<TopicId, Sink>,
+pub(super) struct AdvertisedTopics {
+    topics: HashMap<TopicId, Ros1Sink>,
     /// When to look at events that wait for subscribers to connect.
     flush_at: Option<Instant>,
     /// The values with such events.
     opening: BTreeSet<TopicId>,
 }
 
-impl Sinks {
+impl AdvertisedTopics {
     /// Returns the values with their topics.
-    pub(super) fn iter(&self) -> impl Iterator<Item = (&TopicId, &Sink)> {
+    pub(super) fn iter(&self) -> impl Iterator<Item = (&TopicId, &Ros1Sink)> {
         self.topics.iter()
     }
 
@@ -42,7 +42,7 @@ impl Sinks {
 
     /// Publishes the values of another space on the topic of the mapping.
     pub(super) fn take_up(&mut self, side: &mut Ros1Side, topic: TopicId) {
-        let sink = Sink::new(side.policy.destination(topic));
+        let sink = Ros1Sink::new(side.policy.destination(topic));
         self.topics.insert(topic, sink);
         self.open(side, topic);
     }
@@ -63,11 +63,11 @@ impl Sinks {
     pub(super) fn publish(
         &mut self,
         side: &mut Ros1Side,
-        sample: Delivery,
+        sample: LocalDelivery,
     ) -> Result<(), &'static str> {
         let variable = side.policy.mapping().variable(sample.topic);
         let is_confirmed = variable.is_some_and(|variable| variable.confirmed_within.is_some());
-        let Some(Sink {
+        let Some(Ros1Sink {
             open: Some(open), ..
         }) = self.topics.get_mut(&sample.topic)
         else {
@@ -82,9 +82,9 @@ impl Sinks {
         };
         open.publisher.set_latching(sample.lasting);
         let latched = match sample.kept {
-            Kept::Alone => Latched::Alone(key),
-            Kept::Beside => Latched::Beside(key),
-            Kept::Again => {
+            ValueRelation::Alone => Latched::Alone(key),
+            ValueRelation::Beside => Latched::Beside(key),
+            ValueRelation::Again => {
                 open.publisher.latch(key, payload);
                 return Ok(());
             }
@@ -129,7 +129,7 @@ impl Sinks {
         side: &mut Ros1Side,
         topic: TopicId,
         shape: &[(BuiltinType, bool)],
-        described: Option<&Described>,
+        described: Option<&TopicMetaData>,
     ) {
         if !self.take_in(side, topic) {
             return;
@@ -149,9 +149,9 @@ impl Sinks {
         let open = sink.open.as_ref();
         let written = open.map(|open| (open.message_type.name(), open.publisher.subscribers() > 0));
         match sink.choice.hear(word, written) {
-            Step::Stay => {}
-            Step::Open => self.open(side, topic),
-            Step::Select(selection) => {
+            PortStep::Stay => {}
+            PortStep::Open => self.open(side, topic),
+            PortStep::Select(selection) => {
                 let Some(open) = &mut sink.open else { return };
                 open.stamps = sink.choice.stamps(&open.message_type);
                 side.events.push_back(PortEvent::Bound {
@@ -177,7 +177,7 @@ impl Sinks {
 
     /// Removes a latched value.
     pub(super) fn retired(&self, topic: TopicId, instance: Timestamp) {
-        if let Some(Sink {
+        if let Some(Ros1Sink {
             open: Some(open), ..
         }) = self.topics.get(&topic)
         {
@@ -304,13 +304,13 @@ impl Sinks {
                     definition = side.definitions.source(message_type.name()),
                     "advertised"
                 );
-                let open = Open {
+                let open = OpenPublisher {
                     message_type: Arc::clone(&message_type),
                     publisher,
                     reported: 0,
                     reached: false,
                     stamps: sink.choice.stamps(&message_type),
-                    opening: Opening::of(
+                    opening: TopicOpening::of(
                         side.graph.subscribers.get(&ros_topic),
                         side.node.name(),
                         now().monotonic,
@@ -338,7 +338,7 @@ impl Sinks {
         if self.topics.contains_key(&topic) {
             return true;
         }
-        let sink = Sink::new(side.policy.destination(topic));
+        let sink = Ros1Sink::new(side.policy.destination(topic));
         if side
             .policy
             .is_stray(topic, is_subscribed(&sink, &side.graph))
@@ -389,7 +389,7 @@ impl Sinks {
             });
             policy.is_for_service(*topic)
                 || outdated
-                || !sink.is_like(&Sink::new(policy.destination(*topic)))
+                || !sink.is_like(&Ros1Sink::new(policy.destination(*topic)))
         });
         // The publishers end here, so their topics can be advertised with another type.
         let gone = gone.map(|(topic, _)| PortEvent::Unbound { topic });
@@ -402,7 +402,7 @@ impl Sinks {
 fn learned(
     side: &mut Ros1Side,
     topic: TopicId,
-    described: &Described,
+    described: &TopicMetaData,
 ) -> Option<(TypeName, Selection)> {
     if ActionCalls::is_value(&described.message_type) {
         // Values of actions are handled by the action server.
@@ -426,7 +426,7 @@ fn tell_unknown(side: &mut Ros1Side, topic: &str, what: &str, error: &Definition
     });
 }
 
-fn is_subscribed(sink: &Sink, graph: &Graph) -> bool {
+fn is_subscribed(sink: &Ros1Sink, graph: &MasterGraph) -> bool {
     let open = sink.open.as_ref();
     open.is_some_and(|open| open.publisher.subscribers() > 0)
         || graph.subscribers.contains_key(&sink.ros_topic)

@@ -10,16 +10,18 @@ use std::time::Instant;
 use bridge_node::{PortEvent, Reason, timestamp};
 use mappings::TopicId;
 use messages::{MessageType, Selection, TypeName};
-use tcpros::{Inbox, InboxEvent, Message, NodeError, Peer, SubscriberOptions, Wanted};
+use tcpros::{
+    ConnectionPeer, Inbox, InboxEvent, InboxMessage, NodeError, RequestedType, SubscriberOptions,
+};
 
 use super::side::Ros1Side;
-use crate::source::{MAX_LATCHED, Met, Source};
+use crate::source::{AddedPublisher, MAX_LATCHED, Ros1Source};
 
 /// The subscribed topics.
 #[derive(Debug)]
-pub(super) struct Sources {
+pub(super) struct SubscribedTopics {
     /// The topics, identified by their index. The index of a removed topic is reused.
-    list: Vec<Source>,
+    list: Vec<Ros1Source>,
     /// The indexes free for reuse.
     vacant: Vec<usize>,
     by_name: BTreeMap<String, usize>,
@@ -39,7 +41,7 @@ struct Refused {
     told: Option<Instant>,
 }
 
-impl Sources {
+impl SubscribedTopics {
     pub(super) fn new() -> Self {
         Self {
             list: Vec::new(),
@@ -70,7 +72,7 @@ impl Sources {
     }
 
     /// Returns all topics, and unused entries without values.
-    pub(super) fn iter(&self) -> impl Iterator<Item = &Source> {
+    pub(super) fn iter(&self) -> impl Iterator<Item = &Ros1Source> {
         self.list.iter()
     }
 
@@ -79,11 +81,11 @@ impl Sources {
         if let Some(index) = self.by_name.get(&ros_topic) {
             return *index;
         }
-        let source = Source::new(ros_topic.clone(), expected, Vec::new());
+        let source = Ros1Source::new(ros_topic.clone(), expected, Vec::new());
         let index = match self.vacant.pop() {
             Some(index) if index < self.list.len() => index,
             _ => {
-                self.list.push(Source::vacant());
+                self.list.push(Ros1Source::vacant());
                 self.list.len() - 1
             }
         };
@@ -104,7 +106,7 @@ impl Sources {
         };
         // The subscription accepts any MD5 sum, so a publisher of another type connects and is
         // logged with the expected type, instead of refusing the connection.
-        let wanted = Wanted {
+        let wanted = RequestedType {
             type_name: source.expected.as_ref().map(ToString::to_string),
             md5sum: None,
         };
@@ -122,7 +124,7 @@ impl Sources {
             return;
         };
         // Messages queued for the source do not come out of the inbox any more.
-        let source = std::mem::replace(place, Source::vacant());
+        let source = std::mem::replace(place, Ros1Source::vacant());
         self.by_name.remove(&source.ros_topic);
         self.vacant.push(index);
         // A source that was never bound is not reported as unbound.
@@ -165,8 +167,8 @@ impl Sources {
         }
     }
 
-    fn message(&mut self, side: &mut Ros1Side, index: usize, message: Message) {
-        let Message {
+    fn message(&mut self, side: &mut Ros1Side, index: usize, message: InboxMessage) {
+        let InboxMessage {
             bytes,
             peer,
             received,
@@ -211,7 +213,7 @@ impl Sources {
     }
 
     /// Adds a publisher. Returns true if its messages can be read.
-    fn meet(&mut self, side: &mut Ros1Side, index: usize, peer: &Arc<Peer>) -> bool {
+    fn meet(&mut self, side: &mut Ros1Side, index: usize, peer: &Arc<ConnectionPeer>) -> bool {
         let Some(source) = self
             .list
             .get_mut(index)
@@ -231,9 +233,9 @@ impl Sources {
         let was_live = source.is_live();
         let understood = found.is_ok();
         match source.meet(peer, found.ok()) {
-            Met::Known => {}
-            Met::Bound(message_type) => report_bound(source, side, &message_type),
-            Met::Stranger => {
+            AddedPublisher::Known => {}
+            AddedPublisher::Bound(message_type) => report_bound(source, side, &message_type),
+            AddedPublisher::Stranger => {
                 if understood {
                     tell_stranger(source, side, peer);
                 }
@@ -273,7 +275,7 @@ impl Sources {
     }
 }
 
-fn report_bound(source: &Source, side: &mut Ros1Side, message_type: &Arc<MessageType>) {
+fn report_bound(source: &Ros1Source, side: &mut Ros1Side, message_type: &Arc<MessageType>) {
     for (topic, selection) in &source.values {
         side.events.push_back(PortEvent::Bound {
             topic: *topic,
@@ -284,7 +286,7 @@ fn report_bound(source: &Source, side: &mut Ros1Side, message_type: &Arc<Message
 }
 
 /// Reports that a topic has become live, or is no longer live.
-fn report_live(source: &Source, side: &mut Ros1Side, before: bool) {
+fn report_live(source: &Ros1Source, side: &mut Ros1Side, before: bool) {
     let live = source.is_live();
     if live == before {
         return;
@@ -296,7 +298,7 @@ fn report_live(source: &Source, side: &mut Ros1Side, before: bool) {
     }));
 }
 
-fn tell_stranger(source: &Source, side: &mut Ros1Side, peer: &Peer) {
+fn tell_stranger(source: &Ros1Source, side: &mut Ros1Side, peer: &ConnectionPeer) {
     let bound = source.bound.as_deref();
     let ours = source
         .expected

@@ -7,7 +7,7 @@ use bridge_node::{
     AskError, AskErrorKind, AskId, CallDescription, CallField, CallRole, Port, PortEvent,
 };
 use bytes::Bytes;
-use messages::{Dialect, Registry};
+use messages::{Dialect, TypeRegistry};
 use tcpros::{ServiceClient, ServiceClientOptions, ServiceError};
 use uadp::{BuiltinType, StatusCode};
 
@@ -34,7 +34,7 @@ fn start() -> Arc<CallDescription> {
 /// Returns a service client of the robot for the call.
 fn client(cell: &Cell) -> ServiceClient {
     let name = "std_srvs/Trigger";
-    let found = Registry::bundle(Dialect::Ros1).service(&name.parse().unwrap());
+    let found = TypeRegistry::bundle(Dialect::Ros1).service(&name.parse().unwrap());
     let options = ServiceClientOptions {
         md5sum: Some(found.unwrap().md5().to_owned()),
         type_name: Some(name.to_owned()),

@@ -12,14 +12,14 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Duration;
 
-use bridge_node::{Delivery, Kept, Port, PortEvent, TypePaths};
-use bridge_ros1::{PortOptions, Ros1Port};
+use bridge_node::{LocalDelivery, Port, PortEvent, TypePaths, ValueRelation};
+use bridge_ros1::{Ros1Port, Ros1PortOptions};
 use bytes::Bytes;
 use mappings::{Mapping, SpaceId, TopicId};
-use messages::{Dialect, Registry, Selection};
+use messages::{Dialect, Selection, TypeRegistry};
 use tcpros::{
-    Core, Inbox, InboxEvent, Message, Node, NodeOptions, Publisher, PublisherOptions,
-    SubscriberOptions, TopicType, Wanted,
+    Core, Inbox, InboxEvent, InboxMessage, Node, NodeOptions, Publisher, PublisherOptions,
+    RequestedType, SubscriberOptions, TopicType,
 };
 use tokio::time::timeout;
 use uadp::BuiltinType;
@@ -42,7 +42,7 @@ fn cell(mapping: &str) -> Cell {
         options
     };
     let mapping = parsed(mapping);
-    let port = Ros1Port::start(PortOptions {
+    let port = Ros1Port::start(Ros1PortOptions {
         node: options("bridge"),
         own: SpaceId::ROS1,
         types: types(&mapping),
@@ -109,7 +109,7 @@ fn id(text: &str) -> TopicId {
 }
 
 fn advertise(node: &Node, topic: &str, name: &str, latch: bool) -> Publisher {
-    let found = Registry::bundle(Dialect::Ros1)
+    let found = TypeRegistry::bundle(Dialect::Ros1)
         .get(&name.parse().unwrap())
         .unwrap();
     let topic_type = TopicType {
@@ -128,15 +128,15 @@ fn advertise(node: &Node, topic: &str, name: &str, latch: bool) -> Publisher {
     .unwrap()
 }
 
-fn delivery(topic: &str, payload: &'static [u8]) -> Delivery {
+fn delivery(topic: &str, payload: &'static [u8]) -> LocalDelivery {
     let payload = Bytes::from_static(payload);
-    Delivery {
+    LocalDelivery {
         topic: id(topic),
         payload,
         source: None,
         status: 0,
         instance: None,
-        kept: Kept::Alone,
+        kept: ValueRelation::Alone,
         lasting: true,
     }
 }
@@ -212,7 +212,7 @@ async fn run_until(port: &mut Ros1Port, what: &str, condition: impl Fn() -> bool
     .await;
 }
 
-async fn message(port: &mut Ros1Port, inbox: &mut Inbox<()>) -> Message {
+async fn message(port: &mut Ros1Port, inbox: &mut Inbox<()>) -> InboxMessage {
     within("a message", async {
         loop {
             tokio::select! {
@@ -305,7 +305,7 @@ async fn a_value_of_another_space_appears_under_its_mapped_topic_and_is_latched(
     );
     assert_eq!(port.publish(delivery("ua_2_2_3", b"\x01")), Ok(()));
     let mut inbox = Inbox::new();
-    let wanted = Wanted {
+    let wanted = RequestedType {
         type_name: Some("std_msgs/Bool".to_owned()),
         md5sum: None,
     };
@@ -315,10 +315,10 @@ async fn a_value_of_another_space_appears_under_its_mapped_topic_and_is_latched(
     let got = message(&mut port, &mut inbox).await;
     assert_eq!(got.bytes, b"\x01".as_slice());
     assert_eq!(got.peer.caller_id, "/bridge");
-    let bad = Delivery {
+    let bad = LocalDelivery {
         status: 0x8000,
         instance: None,
-        kept: Kept::Alone,
+        kept: ValueRelation::Alone,
         ..delivery("ua_2_2_3", b"\x00")
     };
     assert_eq!(port.publish(bad), Err("bad status"));
@@ -342,7 +342,7 @@ async fn a_value_nobody_mapped_gets_the_standard_type_or_the_one_a_subscriber_as
     );
 
     let mut inbox = Inbox::new();
-    let pose = Wanted {
+    let pose = RequestedType {
         type_name: Some("geometry_msgs/Point".to_owned()),
         md5sum: None,
     };
@@ -382,10 +382,10 @@ async fn a_subscriber_of_another_type_gets_its_way_while_nobody_else_listens() {
         events(&mut port, 1).await,
         ["ua_2_1_1 is std_msgs/Float64 whole"]
     );
-    let float = Registry::bundle(Dialect::Ros1)
+    let float = TypeRegistry::bundle(Dialect::Ros1)
         .get(&"std_msgs/Float32".parse().unwrap())
         .unwrap();
-    let wanted = Wanted {
+    let wanted = RequestedType {
         type_name: Some("std_msgs/Float32".to_owned()),
         md5sum: Some(float.md5().to_owned()),
     };

@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use bridge_node::Port;
 use bytes::Bytes;
-use tcpros::{Inbox, SubscriberOptions, Wanted};
+use tcpros::{Inbox, RequestedType, SubscriberOptions};
 use tokio::time::timeout;
 
 use crate::services::{event, offer};
@@ -127,7 +127,7 @@ async fn a_topic_that_is_written_may_change_its_type_and_may_come_under_its_own_
         ["ua_2_2_3 is std_msgs/Bool data"]
     );
     let inbox = &mut Inbox::new();
-    let wanted = Wanted {
+    let wanted = RequestedType {
         type_name: None,
         md5sum: None,
     };

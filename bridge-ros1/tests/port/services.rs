@@ -5,8 +5,8 @@ use std::time::Duration;
 
 use bridge_node::{Port, PortEvent};
 use bytes::Bytes;
-use messages::{Dialect, Registry};
-use tcpros::{Node, ServiceOptions, ServiceServer, ServiceType};
+use messages::{Dialect, TypeRegistry};
+use tcpros::{Node, ServiceOptions, ServiceServer, ServiceTypeSum};
 use tokio::time::timeout;
 
 use crate::{Cell, cell, delivery, line, within};
@@ -35,10 +35,10 @@ pub(crate) fn offer(
     service: &str,
     name: &str,
 ) -> (ServiceServer, Arc<Mutex<Vec<Bytes>>>) {
-    let found = Registry::bundle(Dialect::Ros1)
+    let found = TypeRegistry::bundle(Dialect::Ros1)
         .service(&name.parse().unwrap())
         .unwrap();
-    let service_type = ServiceType {
+    let service_type = ServiceTypeSum {
         name: name.to_owned(),
         md5sum: found.md5().to_owned(),
         request_type: found.request().name().to_string(),

@@ -5,25 +5,28 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use bridge_node::actions::{
-    ActionClient as Sends, ActionGraph, ActionServer as Takes, CancelAnswer, CancelRequest,
-    CancelWhat, GoalEvent, GoalId, NewGoal, SentGoal, ServedGoal, ServerEvent, Waits,
+    ActionGraph, GraphActionClient as Sends, GraphActionServer as Takes, GraphCancelRequest,
+    GraphCancelResponse, GraphCancelSelection, GraphGoalEvent, GraphGoalId, GraphNewGoal,
+    GraphServerEvent, SentGoal, ServedGoal, Waits,
 };
-use bridge_node::{CallFault, GraphError, Ran};
+use bridge_node::{CallFault, GraphError, MayHaveRun};
 use bytes::Bytes;
-use messages::{ActionCalls, MessageType, NoFields, Plan, Selection, TextKind, TypeName, Wire};
-use ros2_node::action::{
-    self, Action, ActionClientOptions, ActionServerOptions, GoalError, GoalHandle, LostReason,
-    Outcome, Status,
+use messages::{
+    ActionCalls, MessagePlan, MessageType, NoFields, Selection, TextKind, TypeName, Wire,
 };
-use ros2_node::clock::RosTime;
+use ros2_node::action::{
+    self, ActionClientOptions, ActionName, ActionServerOptions, GoalError, GoalHandle,
+    GoalStatusCode, LostReason, Outcome,
+};
+use ros2_node::clock::Ros2Time;
 use tracing::debug;
 use uadp::Timestamp;
 
 use super::services::Ros2Graph;
 
 impl ActionGraph for Ros2Graph<'_> {
-    type Sender = Client;
-    type Taker = Server;
+    type Sender = DomainActionClient;
+    type Taker = DomainActionServer;
 
     fn action_calls(&mut self, name: &TypeName) -> Result<Arc<ActionCalls>, GraphError> {
         let found = self.definitions.action_calls(name);
@@ -44,7 +47,7 @@ impl ActionGraph for Ros2Graph<'_> {
         action: &str,
         type_name: &TypeName,
         waits: Waits,
-    ) -> Result<Client, GraphError> {
+    ) -> Result<DomainActionClient, GraphError> {
         let action = self.action(action, type_name);
         let options = ActionClientOptions {
             server_timeout: waits.silence,
@@ -53,11 +56,15 @@ impl ActionGraph for Ros2Graph<'_> {
             ..ActionClientOptions::default()
         };
         action::ActionClient::open(self.domain, self.peers, &action, options)
-            .map(Client)
+            .map(DomainActionClient)
             .map_err(GraphError::library)
     }
 
-    fn serve_action(&mut self, action: &str, type_name: &TypeName) -> Result<Server, GraphError> {
+    fn serve_action(
+        &mut self,
+        action: &str,
+        type_name: &TypeName,
+    ) -> Result<DomainActionServer, GraphError> {
         let messages = self.definitions.action_messages(type_name)?;
         let empty_result = empty(messages.result_response())?;
         let action = self.action(action, type_name);
@@ -67,15 +74,15 @@ impl ActionGraph for Ros2Graph<'_> {
             ..ActionServerOptions::new(empty_result)
         };
         action::ActionServer::open(self.domain, self.peers, &action, options)
-            .map(Server)
+            .map(DomainActionServer)
             .map_err(GraphError::library)
     }
 }
 
 impl Ros2Graph<'_> {
     /// Returns the action; its type hashes are announced in the domain.
-    fn action(&self, name: &str, type_name: &TypeName) -> Action {
-        let action = Action::new(name, type_name);
+    fn action(&self, name: &str, type_name: &TypeName) -> ActionName {
+        let action = ActionName::new(name, type_name);
         if let Some(hashes) = self.definitions.action_type_hashes(type_name) {
             action.announce(self.domain, &hashes);
         }
@@ -89,7 +96,7 @@ fn empty(message: &Arc<MessageType>) -> Result<Bytes, GraphError> {
         fields: Vec::new(),
         rest: BTreeMap::new(),
     };
-    let plan = Plan::compile(message, &nothing, Wire::Cdr)?;
+    let plan = MessagePlan::compile(message, &nothing, Wire::Cdr)?;
     let mut bytes = Vec::new();
     plan.write(&mut NoFields, &mut bytes)?;
     Ok(bytes.into())
@@ -97,33 +104,35 @@ fn empty(message: &Arc<MessageType>) -> Result<Bytes, GraphError> {
 
 /// Sends goals to an action of the domain.
 #[derive(Debug)]
-pub(super) struct Client(action::ActionClient);
+pub(super) struct DomainActionClient(action::ActionClient);
 
-impl Sends for Client {
-    type Goal = Goal;
+impl Sends for DomainActionClient {
+    type Goal = DomainGoal;
 
-    fn send_goal(&self, id: GoalId, body: &[u8], start_by: Instant) -> Goal {
+    fn send_goal(&self, id: GraphGoalId, body: &[u8], start_by: Instant) -> DomainGoal {
         let id = action::GoalId::from_bytes(id);
         match self.0.send_goal_by(id, body, Some(start_by.into())) {
-            Ok(handle) => Goal::Sent(handle),
-            Err(in_use) => Goal::NotSent(Some(in_use.to_string())),
+            Ok(handle) => DomainGoal::Sent(handle),
+            Err(in_use) => DomainGoal::NotSent(Some(in_use.to_string())),
         }
     }
 
-    async fn cancel(&self, what: CancelWhat) -> Result<CancelAnswer, CallFault> {
+    async fn cancel(&self, what: GraphCancelSelection) -> Result<GraphCancelResponse, CallFault> {
         let what = match what {
-            CancelWhat::All => action::CancelWhat::All,
-            CancelWhat::Goal(id) => action::CancelWhat::Goal(action::GoalId::from_bytes(id)),
+            GraphCancelSelection::All => action::CancelWhat::All,
+            GraphCancelSelection::Goal(id) => {
+                action::CancelWhat::Goal(action::GoalId::from_bytes(id))
+            }
         };
         let answer = self.0.cancel(what).await.map_err(|error| CallFault {
             text: error.to_string(),
             may_pass: false,
             ran: match error.may_have_run() {
-                true => Ran::Perhaps,
-                false => Ran::No,
+                true => MayHaveRun::Perhaps,
+                false => MayHaveRun::No,
             },
         })?;
-        Ok(CancelAnswer {
+        Ok(GraphCancelResponse {
             code: answer.code.code(),
             goals: answer.goals.iter().map(|goal| goal.id.to_bytes()).collect(),
         })
@@ -132,33 +141,33 @@ impl Sends for Client {
 
 /// A goal of this bridge at an action server of the domain.
 #[derive(Debug)]
-pub(super) enum Goal {
+pub(super) enum DomainGoal {
     Sent(GoalHandle),
     /// The goal was not sent. Holds the reason until it is reported.
     NotSent(Option<String>),
 }
 
-impl SentGoal for Goal {
-    async fn recv(&mut self) -> Option<GoalEvent> {
+impl SentGoal for DomainGoal {
+    async fn recv(&mut self) -> Option<GraphGoalEvent> {
         let handle = match self {
             Self::Sent(handle) => handle,
-            Self::NotSent(why) => return why.take().map(GoalEvent::Rejected),
+            Self::NotSent(why) => return why.take().map(GraphGoalEvent::Rejected),
         };
         loop {
             let event = match handle.recv().await? {
-                action::GoalEvent::Accepted(stamp) => GoalEvent::Accepted(timestamp(stamp)),
-                action::GoalEvent::Status(status) => GoalEvent::Status(status.code()),
-                action::GoalEvent::Feedback(body) => GoalEvent::Feedback(body),
+                action::GoalEvent::Accepted(stamp) => GraphGoalEvent::Accepted(timestamp(stamp)),
+                action::GoalEvent::Status(status) => GraphGoalEvent::Status(status.code()),
+                action::GoalEvent::Feedback(body) => GraphGoalEvent::Feedback(body),
                 action::GoalEvent::FeedbackDropped(count) => {
                     let goal = handle.id();
                     debug!(%goal, count, "dropped feedback in favour of newer feedback");
                     continue;
                 }
-                action::GoalEvent::Overdue(limit) => GoalEvent::Overdue(format!(
+                action::GoalEvent::Overdue(limit) => GraphGoalEvent::Overdue(format!(
                     "the action server has not accepted or rejected the goal within {limit:?}; the bridge \
                      cancels it as soon as it is accepted"
                 )),
-                action::GoalEvent::CancelRefused => GoalEvent::CancelRefused,
+                action::GoalEvent::CancelRefused => GraphGoalEvent::CancelRefused,
                 action::GoalEvent::Ended(outcome) => ended(outcome),
             };
             return Some(event);
@@ -166,10 +175,12 @@ impl SentGoal for Goal {
     }
 }
 
-fn ended(outcome: Outcome) -> GoalEvent {
+fn ended(outcome: Outcome) -> GraphGoalEvent {
     match outcome {
-        Outcome::Rejected => GoalEvent::Rejected("the action server rejected the goal".to_owned()),
-        Outcome::Done { status, result } => GoalEvent::Ended {
+        Outcome::Rejected => {
+            GraphGoalEvent::Rejected("the action server rejected the goal".to_owned())
+        }
+        Outcome::Done { status, result } => GraphGoalEvent::Ended {
             status: status.code(),
             message: String::new(),
             result,
@@ -178,46 +189,46 @@ fn ended(outcome: Outcome) -> GoalEvent {
     }
 }
 
-fn lost(reason: &LostReason) -> GoalEvent {
-    GoalEvent::Lost {
+fn lost(reason: &LostReason) -> GraphGoalEvent {
+    GraphGoalEvent::Lost {
         text: reason.to_string(),
         ran: match reason.may_run() {
-            true => Ran::Perhaps,
-            false => Ran::No,
+            true => MayHaveRun::Perhaps,
+            false => MayHaveRun::No,
         },
     }
 }
 
 /// Converts a time; times outside the range of OPC UA are clamped.
-fn timestamp(time: RosTime) -> Timestamp {
+fn timestamp(time: Ros2Time) -> Timestamp {
     let nanos = i128::from(time.sec) * NANOS + i128::from(time.nanosec);
     Timestamp::from_unix_nanos(nanos)
 }
 
 /// Receives goals from the domain.
 #[derive(Debug)]
-pub(super) struct Server(action::ActionServer);
+pub(super) struct DomainActionServer(action::ActionServer);
 
-impl Takes for Server {
-    type New = New;
-    type Cancel = Cancel;
+impl Takes for DomainActionServer {
+    type New = NewDomainGoal;
+    type Cancel = DomainCancel;
 
-    async fn recv(&mut self) -> ServerEvent<New, Cancel> {
+    async fn recv(&mut self) -> GraphServerEvent<NewDomainGoal, DomainCancel> {
         match self.0.recv().await {
-            action::ServerEvent::Goal(goal) => ServerEvent::Goal(New(goal)),
-            action::ServerEvent::Cancel(request) => ServerEvent::Cancel(Cancel(request)),
+            action::ServerEvent::Goal(goal) => GraphServerEvent::Goal(NewDomainGoal(goal)),
+            action::ServerEvent::Cancel(request) => GraphServerEvent::Cancel(DomainCancel(request)),
         }
     }
 }
 
 /// A goal of an action client of the domain.
 #[derive(Debug)]
-pub(super) struct New(action::NewGoal);
+pub(super) struct NewDomainGoal(action::NewGoal);
 
-impl NewGoal for New {
-    type Goal = Served;
+impl GraphNewGoal for NewDomainGoal {
+    type Goal = ServedDomainGoal;
 
-    fn id(&self) -> GoalId {
+    fn id(&self) -> GraphGoalId {
         self.0.id().to_bytes()
     }
 
@@ -225,9 +236,9 @@ impl NewGoal for New {
         self.0.body()
     }
 
-    async fn accept(self) -> Result<Served, GraphError> {
+    async fn accept(self) -> Result<ServedDomainGoal, GraphError> {
         let goal = self.0.accept().await.map_err(GraphError::library)?;
-        Ok(Served(goal))
+        Ok(ServedDomainGoal(goal))
     }
 
     fn reject(self, why: &str) {
@@ -239,10 +250,10 @@ impl NewGoal for New {
 
 /// A cancel request of an action client of the domain.
 #[derive(Debug)]
-pub(super) struct Cancel(action::CancelRequest);
+pub(super) struct DomainCancel(action::CancelRequest);
 
-impl CancelRequest for Cancel {
-    fn id(&self) -> GoalId {
+impl GraphCancelRequest for DomainCancel {
+    fn id(&self) -> GraphGoalId {
         self.0.id().to_bytes()
     }
 
@@ -257,13 +268,13 @@ impl CancelRequest for Cancel {
 
 /// A goal of an action client of the domain that another space executes.
 #[derive(Debug)]
-pub(super) struct Served(action::ServerGoal);
+pub(super) struct ServedDomainGoal(action::ServerGoal);
 
-impl Served {
+impl ServedDomainGoal {
     /// Takes the transitions before a terminal state: a goal does not end from accepted, and
     /// becomes canceled from canceling only.
     fn step(&self, status: i8) -> Result<(), GoalError> {
-        if self.0.status() == Status::Accepted {
+        if self.0.status() == GoalStatusCode::Accepted {
             self.0.execute()?;
         }
         match status {
@@ -273,9 +284,9 @@ impl Served {
     }
 }
 
-impl ServedGoal for Served {
+impl ServedGoal for ServedDomainGoal {
     fn execute(&self) {
-        if self.0.status() == Status::Accepted
+        if self.0.status() == GoalStatusCode::Accepted
             && let Err(error) = self.0.execute()
         {
             debug!(%error, "work on a goal that has ended");
@@ -306,8 +317,8 @@ impl ServedGoal for Served {
     }
 }
 
-const SUCCEEDED: i8 = Status::Succeeded.code();
-const CANCELED: i8 = Status::Canceled.code();
+const SUCCEEDED: i8 = GoalStatusCode::Succeeded.code();
+const CANCELED: i8 = GoalStatusCode::Canceled.code();
 /// How long results are kept; the same time applies to results of the space.
 const KEPT: Duration = Duration::from_secs(15 * 60);
 /// How long the executing server of another space may take to decide about a cancel request.
@@ -316,14 +327,14 @@ const NANOS: i128 = 1_000_000_000;
 
 #[cfg(test)]
 mod tests {
-    use messages::{Dialect, Registry};
+    use messages::{Dialect, TypeRegistry};
 
     use super::*;
 
     #[test]
     fn an_empty_result_has_all_its_fields() {
         let name = "demo_msgs/Count".parse().unwrap();
-        let mut registry = Registry::bundle(Dialect::Ros2);
+        let mut registry = TypeRegistry::bundle(Dialect::Ros2);
         let text = "int32 order\n---\nint32[] sequence\nfloat64 share\n---\nint32 done\n";
         registry.add_action(&name, text).unwrap();
         let messages = registry.action_messages(&name).unwrap();
@@ -335,17 +346,17 @@ mod tests {
     #[test]
     fn what_nobody_had_did_not_run() {
         for (reason, ran) in [
-            (LostReason::Busy(1), Ran::No),
-            (LostReason::Unknown, Ran::Perhaps),
+            (LostReason::Busy(1), MayHaveRun::No),
+            (LostReason::Unknown, MayHaveRun::Perhaps),
         ] {
             let text = reason.to_string();
-            assert_eq!(lost(&reason), GoalEvent::Lost { text, ran });
+            assert_eq!(lost(&reason), GraphGoalEvent::Lost { text, ran });
         }
     }
 
     #[test]
     fn a_time_before_1970_is_one() {
-        let time = RosTime {
+        let time = Ros2Time {
             sec: -1,
             nanosec: 500,
         };

@@ -3,30 +3,30 @@
 use std::collections::BTreeSet;
 use std::net::IpAddr;
 
-use bridge_node::{Actions, AwaitedPeers, Executing, near};
+use bridge_node::{AwaitedPeers, BridgeActions, ExecutedServices, near};
 use mappings::ServiceRole;
-use ros2_node::graph::{Endpoint, ros_topic};
+use ros2_node::graph::{RemoteEndpoint, ros_topic};
 use ros2_node::service::ServicePeers;
 use tokio::time::Instant;
 
-use super::services::Client;
+use super::services::DomainServiceClient;
 use super::side::Ros2Side;
-use super::sinks::Sinks;
-use super::sources::Sources;
-use crate::sink::Sink;
-use crate::source::Source;
+use super::sinks::WrittenTopics;
+use super::sources::ReadTopics;
+use crate::sink::Ros2Sink;
+use crate::source::Ros2Source;
 
 /// The node and its topics, for the search of missing peers.
-pub(super) struct Missing<'p> {
+pub(super) struct Ros2MissingPeers<'p> {
     pub(super) side: &'p Ros2Side,
-    pub(super) sources: &'p Sources,
-    pub(super) sinks: &'p Sinks,
+    pub(super) sources: &'p ReadTopics,
+    pub(super) sinks: &'p WrittenTopics,
     pub(super) peers: &'p ServicePeers,
     /// The addresses to which RustDDS binds its sockets; empty means all addresses.
     pub(super) networks: &'p [IpAddr],
 }
 
-impl Missing<'_> {
+impl Ros2MissingPeers<'_> {
     /// Adds the missing peers.
     pub(super) fn add(&self, missing: &mut AwaitedPeers) {
         let bridges = self.side.graph.bridges().count();
@@ -61,7 +61,7 @@ impl Missing<'_> {
     }
 
     /// Adds the publisher of a topic that the mapping reads.
-    fn add_publisher(&self, source: &Source, missing: &mut AwaitedPeers) {
+    fn add_publisher(&self, source: &Ros2Source, missing: &mut AwaitedPeers) {
         let mapping = self.side.policy.mapping();
         let mut values = source.values.iter();
         if source.live || !values.any(|(topic, _)| mapping.variable(*topic).is_some()) {
@@ -90,7 +90,7 @@ impl Missing<'_> {
 
     /// Adds a topic that the mapping writes and no node reads, if another node publishes it or
     /// reads a topic with a similar name.
-    fn add_mistaken(&self, sink: &Sink, missing: &mut AwaitedPeers) {
+    fn add_mistaken(&self, sink: &Ros2Sink, missing: &mut AwaitedPeers) {
         let Some(name) = ros_topic(&sink.dds_topic) else {
             return;
         };
@@ -116,7 +116,7 @@ impl Missing<'_> {
     /// Adds the services and actions that the mapping calls and no node serves.
     fn add_servers(&self, missing: &mut AwaitedPeers) {
         let mapping = self.side.policy.mapping();
-        let services = Executing::<Client>::mapped(mapping, &self.side.policy);
+        let services = ExecutedServices::<DomainServiceClient>::mapped(mapping, &self.side.policy);
         let called = mapping.services(self.side.policy.own());
         let called = called.filter_map(|(_, binding)| match &binding.role {
             ServiceRole::Call { service, .. } | ServiceRole::Poll { service, .. } => {
@@ -125,7 +125,7 @@ impl Missing<'_> {
             ServiceRole::Answer { .. } => None,
         });
         let services: Vec<&str> = services.into_iter().chain(called).collect();
-        let actions = Actions::mapped(mapping, &self.side.policy);
+        let actions = BridgeActions::mapped(mapping, &self.side.policy);
         if services.is_empty() && actions.is_empty() {
             return;
         }
@@ -139,9 +139,9 @@ impl Missing<'_> {
     /// Returns the names of the servers that are not bridges.
     fn of_nodes<'s>(
         &self,
-        served: impl Iterator<Item = (&'s str, &'s [Endpoint])>,
+        served: impl Iterator<Item = (&'s str, &'s [RemoteEndpoint])>,
     ) -> BTreeSet<&'s str> {
-        let is_node = |one: &Endpoint| !self.side.graph.is_bridge(one.guid);
+        let is_node = |one: &RemoteEndpoint| !self.side.graph.is_bridge(one.guid);
         let of_nodes = served.filter(|(_, servers)| servers.iter().any(is_node));
         of_nodes.map(|(name, _)| name).collect()
     }

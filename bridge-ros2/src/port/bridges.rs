@@ -59,7 +59,7 @@ pub(super) fn is_at_home(graph: &Graph, mapping: &Mapping, space: SpaceId, domai
 
 /// The identity of this bridge among the bridges of its domain.
 #[derive(Clone, Copy)]
-pub(super) struct Bridge {
+pub(super) struct BridgeIdentity {
     /// The space that this bridge serves.
     pub(super) space: SpaceId,
     /// The participant of this bridge.
@@ -68,7 +68,7 @@ pub(super) struct Bridge {
     pub(super) is_redundant: bool,
 }
 
-impl Bridge {
+impl BridgeIdentity {
     /// Returns whether another bridge that precedes this bridge offers a call of a third space
     /// under the same name: a client would call both, and the call would be executed twice.
     pub(super) fn is_second(
@@ -113,7 +113,7 @@ fn hex(participant: &ParticipantPrefix) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use ros2_node::graph::{BRIDGE_TYPE, Endpoint};
+    use ros2_node::graph::{BRIDGE_TYPE, RemoteEndpoint};
 
     fn guid(first: u8) -> GUID {
         GUID::from_bytes([first; 16])
@@ -123,7 +123,7 @@ mod tests {
     /// these bytes.
     fn domain_with(bridges: &[(u16, u8)]) -> Graph {
         let markers = bridges.iter().map(|(space, first)| {
-            let endpoint = Endpoint {
+            let endpoint = RemoteEndpoint {
                 guid: guid(*first),
                 type_name: BRIDGE_TYPE.into(),
                 reliable: true,
@@ -138,13 +138,13 @@ mod tests {
 
     #[test]
     fn of_two_bridges_one_comes_first_unless_the_other_has_the_call_under_another_name() {
-        let bridge = |space, first| Bridge {
+        let bridge = |space, first| BridgeIdentity {
             space: SpaceId::new(space).unwrap(),
             participant: guid(first),
             is_redundant: false,
         };
         let mapping = Mapping::default();
-        let second = |one: Bridge, others: &[(u16, u8)], service: &str| {
+        let second = |one: BridgeIdentity, others: &[(u16, u8)], service: &str| {
             let topic = "ua_1_2_61".parse().unwrap();
             one.is_second(&domain_with(others), &mapping, (topic, service), 2)
         };

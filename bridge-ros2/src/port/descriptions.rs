@@ -10,26 +10,26 @@ use tokio::time::Instant;
 use super::inquiry::Inquiry;
 
 /// The requested type descriptions and the state of each inquiry.
-pub(super) struct Descriptions {
+pub(super) struct TypeDescriptions {
     pub(super) peers: ServicePeers,
-    pub(super) asked: BTreeMap<Wanted, Inquiry>,
+    pub(super) asked: BTreeMap<WantedType, Inquiry>,
     pub(super) calls: PendingCalls,
 }
 
 /// The pending calls.
 #[derive(Default)]
 pub(super) struct PendingCalls {
-    tasks: JoinSet<Answer>,
+    tasks: JoinSet<DescriptionAnswer>,
     /// The type and the service of each pending call.
-    asking: HashMap<Id, (Wanted, String)>,
+    asking: HashMap<Id, (WantedType, String)>,
 }
 
 /// A type as an endpoint announces it.
-pub(super) type Wanted = (TypeName, TypeHash);
+pub(super) type WantedType = (TypeName, TypeHash);
 /// The type with the types that it references, or the reason for the failure.
-pub(super) type Answer = Result<Vec<DescribedType>, String>;
+pub(super) type DescriptionAnswer = Result<Vec<DescribedType>, String>;
 
-impl Descriptions {
+impl TypeDescriptions {
     pub(super) fn new(peers: ServicePeers) -> Self {
         Self {
             peers,
@@ -48,9 +48,9 @@ impl PendingCalls {
     /// Begins a call of a service for the description of a type.
     pub(super) fn begin(
         &mut self,
-        wanted: Wanted,
+        wanted: WantedType,
         service: String,
-        call: impl Future<Output = Answer> + Send + 'static,
+        call: impl Future<Output = DescriptionAnswer> + Send + 'static,
     ) {
         let task = self.tasks.spawn(call);
         self.asking.insert(task.id(), (wanted, service));
@@ -63,7 +63,7 @@ impl PendingCalls {
 
     /// Returns a finished call: the requested type, the called service, and the response. An
     /// aborted call counts as failed, so that no endpoint waits for it forever.
-    pub(super) fn ended(&mut self) -> Option<(Wanted, String, Answer)> {
+    pub(super) fn ended(&mut self) -> Option<(WantedType, String, DescriptionAnswer)> {
         loop {
             let (task, answer) = match self.tasks.try_join_next_with_id()? {
                 Ok(ended) => ended,
@@ -82,9 +82,9 @@ mod tests {
 
     #[tokio::test]
     async fn a_call_that_is_broken_off_has_failed() {
-        let wanted = |name: &str| -> Wanted {
+        let wanted = |name: &str| -> WantedType {
             let name: TypeName = name.parse().unwrap();
-            let hash = messages::Registry::bundle(messages::Dialect::Ros2).type_hash(&name);
+            let hash = messages::TypeRegistry::bundle(messages::Dialect::Ros2).type_hash(&name);
             (name, hash.unwrap())
         };
         let (panics, hangs) = (wanted("std_msgs/Bool"), wanted("std_msgs/String"));

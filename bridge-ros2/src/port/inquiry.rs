@@ -42,7 +42,7 @@ enum State {
 
 /// The outcome of a call, or of a request without a node to call.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Outcome {
+pub(super) enum InquiryOutcome {
     Told,
     /// The inquiry continues.
     GoesOn,
@@ -90,13 +90,13 @@ impl Inquiry {
         endpoints: impl IntoIterator<Item = GUID>,
         is_there: impl Fn(GUID) -> bool,
         now: Instant,
-    ) -> Outcome {
+    ) -> InquiryOutcome {
         let lapsed = now.duration_since(self.looked) > OFFERED_WITHIN;
         self.looked = now;
         // Endpoints are not recorded during a call: an endpoint that appears then is new at the
         // next pass.
         if matches!(self.state, State::Asking { .. } | State::Told) {
-            return Outcome::GoesOn;
+            return InquiryOutcome::GoesOn;
         }
         let new: Vec<GUID> = endpoints
             .into_iter()
@@ -109,7 +109,7 @@ impl Inquiry {
         }
         let anew = lapsed || self.seen.is_empty();
         self.seen.extend(new);
-        let mut outcome = Outcome::GoesOn;
+        let mut outcome = InquiryOutcome::GoesOn;
         if anew {
             self.cut_short = if unanswered {
                 self.cut_short.saturating_add(1)
@@ -149,20 +149,20 @@ impl Inquiry {
     }
 
     /// Records that no node offers the service.
-    pub(super) fn nobody(&mut self, now: Instant) -> Outcome {
+    pub(super) fn nobody(&mut self, now: Instant) -> InquiryOutcome {
         let State::Waiting { since, .. } = self.state else {
-            return Outcome::GoesOn;
+            return InquiryOutcome::GoesOn;
         };
         if now.duration_since(since) < OFFERED_WITHIN {
-            return Outcome::GoesOn;
+            return InquiryOutcome::GoesOn;
         }
         self.untold(now)
     }
 
     /// Records that the call failed.
-    pub(super) fn failed(&mut self, now: Instant) -> Outcome {
+    pub(super) fn failed(&mut self, now: Instant) -> InquiryOutcome {
         let State::Asking { tries } = self.state else {
-            return Outcome::GoesOn;
+            return InquiryOutcome::GoesOn;
         };
         let tries = tries.saturating_add(1);
         if tries >= MOST_TRIES {
@@ -173,24 +173,24 @@ impl Inquiry {
             next: now + PAUSE * u32::from(tries),
             tries,
         };
-        Outcome::GoesOn
+        InquiryOutcome::GoesOn
     }
 
-    pub(super) fn told(&mut self) -> Outcome {
+    pub(super) fn told(&mut self) -> InquiryOutcome {
         self.state = State::Told;
         self.seen.clear();
-        Outcome::Told
+        InquiryOutcome::Told
     }
 
     /// Records that no node describes the type for the time being.
-    pub(super) fn untold(&mut self, now: Instant) -> Outcome {
+    pub(super) fn untold(&mut self, now: Instant) -> InquiryOutcome {
         let before = self.pause;
         let pause = before.map_or(AGAIN_FIRST, |before| (before * 2).min(AGAIN_MOST));
         self.pause = Some(pause);
         self.state = State::Untold { again: now + pause };
         match before {
-            None => Outcome::Untold,
-            Some(_) => Outcome::UntoldAgain,
+            None => InquiryOutcome::Untold,
+            Some(_) => InquiryOutcome::UntoldAgain,
         }
     }
 }
@@ -234,11 +234,11 @@ mod tests {
         let mut inquiry = Inquiry::new(began);
         inquiry.meet(OLD, |_| true, began);
         assert_eq!(inquiry.due(began), Some(0));
-        assert_eq!(inquiry.nobody(began), Outcome::GoesOn);
+        assert_eq!(inquiry.nobody(began), InquiryOutcome::GoesOn);
         assert!(inquiry.is_waited_for());
         let now = began + OFFERED_WITHIN;
         inquiry.meet(OLD, |_| true, now);
-        assert_eq!(inquiry.nobody(now), Outcome::Untold);
+        assert_eq!(inquiry.nobody(now), InquiryOutcome::Untold);
         (inquiry, now)
     }
 
@@ -265,7 +265,7 @@ mod tests {
             pauses.push(due.duration_since(now).as_secs());
             now = due + OFFERED_WITHIN;
             inquiry.meet(OLD, |_| true, now);
-            assert_eq!(inquiry.nobody(now), Outcome::UntoldAgain);
+            assert_eq!(inquiry.nobody(now), InquiryOutcome::UntoldAgain);
         }
         assert_eq!(pauses, [10, 20, 40, 80, 160, 300, 300]);
     }
@@ -290,8 +290,8 @@ mod tests {
         let now = untold + LOOK;
         inquiry.meet([guid(2)], |one| one == guid(2), now);
         assert!(inquiry.is_waited_for());
-        assert_eq!(inquiry.nobody(now), Outcome::GoesOn);
-        assert_eq!(inquiry.nobody(now + OFFERED_WITHIN), Outcome::Untold);
+        assert_eq!(inquiry.nobody(now), InquiryOutcome::GoesOn);
+        assert_eq!(inquiry.nobody(now + OFFERED_WITHIN), InquiryOutcome::Untold);
     }
 
     #[test]
@@ -301,8 +301,11 @@ mod tests {
         inquiry.meet(OLD, |_| true, began);
         let back = began + Duration::from_secs(600);
         inquiry.meet(OLD, |_| true, back);
-        assert_eq!(inquiry.nobody(back), Outcome::GoesOn);
-        assert_eq!(inquiry.nobody(back + OFFERED_WITHIN), Outcome::Untold);
+        assert_eq!(inquiry.nobody(back), InquiryOutcome::GoesOn);
+        assert_eq!(
+            inquiry.nobody(back + OFFERED_WITHIN),
+            InquiryOutcome::Untold
+        );
     }
 
     #[test]
@@ -315,14 +318,21 @@ mod tests {
                 let one = guid(number);
                 let first = inquiry.meet([one], |it| it == one, now);
                 let is_last = number == MOST_CUT_SHORT;
-                assert_eq!(first == Outcome::Untold, is_last, "{number}: {first:?}");
+                assert_eq!(
+                    first == InquiryOutcome::Untold,
+                    is_last,
+                    "{number}: {first:?}"
+                );
                 // It is asked nevertheless.
                 assert_eq!(inquiry.due(now), Some(0));
                 assert_eq!(inquiry.is_waited_for(), number < MOST_CUT_SHORT, "{number}");
-                assert_eq!(inquiry.nobody(now), Outcome::GoesOn);
+                assert_eq!(inquiry.nobody(now), InquiryOutcome::GoesOn);
                 now += life;
-                assert_eq!(inquiry.meet([one], |it| it == one, now), Outcome::GoesOn);
-                assert_eq!(inquiry.nobody(now), Outcome::GoesOn);
+                assert_eq!(
+                    inquiry.meet([one], |it| it == one, now),
+                    InquiryOutcome::GoesOn
+                );
+                assert_eq!(inquiry.nobody(now), InquiryOutcome::GoesOn);
                 now += away;
             }
             // A node that stays and does not respond has had its time; endpoints wait for the next
@@ -331,7 +341,7 @@ mod tests {
             inquiry.meet([stays], |it| it == stays, now);
             now += OFFERED_WITHIN;
             inquiry.meet([stays], |it| it == stays, now);
-            assert_eq!(inquiry.nobody(now), Outcome::UntoldAgain);
+            assert_eq!(inquiry.nobody(now), InquiryOutcome::UntoldAgain);
             inquiry.meet([guid(101)], |it| it == guid(101), now + LOOK);
             assert!(inquiry.is_waited_for());
         }
@@ -350,7 +360,11 @@ mod tests {
             inquiry.meet([OLD[0], guid(2)], |_| true, now);
             let last = tries + 1 == MOST_TRIES;
             let outcome = inquiry.failed(now);
-            assert_eq!(outcome == Outcome::Untold, last, "{tries}: {outcome:?}");
+            assert_eq!(
+                outcome == InquiryOutcome::Untold,
+                last,
+                "{tries}: {outcome:?}"
+            );
         }
         assert_eq!(inquiry.due(now), None);
         inquiry.meet([OLD[0], guid(2)], |_| true, now);
@@ -363,7 +377,7 @@ mod tests {
         let mut inquiry = Inquiry::new(now);
         inquiry.meet(OLD, |_| true, now);
         inquiry.asked();
-        assert_eq!(inquiry.told(), Outcome::Told);
+        assert_eq!(inquiry.told(), InquiryOutcome::Told);
         let later = now + 2 * AGAIN_MOST;
         inquiry.meet([guid(2)], |_| true, later);
         assert_eq!(inquiry.due(later), None);

@@ -6,8 +6,8 @@ use std::task::{Context, Poll};
 
 use bridge_node::policy::Policy;
 use bridge_node::{
-    Actions, Answered, AskId, CallDescription, CallRole, Delivery, Executing, Execution,
-    ExecutionId, Handover, PortEvent, RosRequests, now,
+    AskId, BridgeActions, CallDescription, CallResponse, CallRole, ExecutedServices, Execution,
+    ExecutionId, Handover, LocalDelivery, PortEvent, RosRequests, now,
 };
 use bytes::Bytes;
 use mappings::{Mapping, SpaceId, TopicId};
@@ -19,14 +19,14 @@ use ros2_node::service::{
 use rustdds::RTPSEntity;
 use tokio::time::Instant;
 
-use super::bridges::{Bridge, is_at_home};
-use super::services::{Client, Ros2Graph};
-use super::side::{Kind, Ros2Side, SETTLED};
-use crate::definitions::Definitions;
+use super::bridges::{BridgeIdentity, is_at_home};
+use super::services::{DomainServiceClient, Ros2Graph};
+use super::side::{Ros2Side, SETTLED, ServerKind};
+use crate::definitions::Ros2Definitions;
 
 /// The services and actions in both directions.
 pub(super) struct Ros2Requests {
-    both: RosRequests<ServiceServer, Client>,
+    both: RosRequests<ServiceServer, DomainServiceClient>,
     /// The endpoints of other participants on the topics of services and actions.
     peers: ServicePeers,
     /// Whether this bridge is one of several redundant bridges of its space.
@@ -38,7 +38,7 @@ impl Ros2Requests {
     pub(super) fn start(
         domain: &Domain,
         peers: ServicePeers,
-        definitions: &mut Definitions,
+        definitions: &mut Ros2Definitions,
         (own, mapping): (SpaceId, &Mapping),
     ) -> (Self, Vec<PortEvent>) {
         let mut graph = Ros2Graph {
@@ -66,7 +66,7 @@ impl Ros2Requests {
     pub(super) fn publish(
         &mut self,
         side: &mut Ros2Side,
-        sample: &Delivery,
+        sample: &LocalDelivery,
     ) -> Option<Result<(), &'static str>> {
         self.both.publish(&side.policy, sample, &mut side.events)
     }
@@ -103,7 +103,7 @@ impl Ros2Requests {
     }
 
     /// Answers a request of the domain.
-    pub(super) fn answered(&mut self, ask: AskId, answer: Answered<Bytes>) {
+    pub(super) fn answered(&mut self, ask: AskId, answer: CallResponse<Bytes>) {
         self.both.answered(ask, answer);
     }
 
@@ -229,11 +229,12 @@ impl Ros2Requests {
     fn find_services(&mut self, side: &mut Ros2Side) {
         let snapshot = self.peers.current(Instant::now());
         let mapping = Arc::clone(side.policy.mapping());
-        let mapped = Executing::<Client>::mapped(&mapping, &side.policy);
+        let mapped = ExecutedServices::<DomainServiceClient>::mapped(&mapping, &side.policy);
         let is_wanted = |policy: &Policy, service: &str| {
-            Executing::<Client>::is_named(policy, service) || mapped.contains(service)
+            ExecutedServices::<DomainServiceClient>::is_named(policy, service)
+                || mapped.contains(service)
         };
-        let kind = Kind {
+        let kind = ServerKind {
             noun: "service",
             told: "type of the service",
             type_of: service_type,
@@ -267,8 +268,8 @@ impl Ros2Requests {
     }
 
     /// Returns the identity of this bridge.
-    fn bridge(&self, side: &Ros2Side) -> Bridge {
-        Bridge {
+    fn bridge(&self, side: &Ros2Side) -> BridgeIdentity {
+        BridgeIdentity {
             space: side.policy.own(),
             participant: side.domain.participant().guid(),
             is_redundant: self.is_redundant,
@@ -328,11 +329,11 @@ impl Ros2Requests {
     fn find_actions(&mut self, side: &mut Ros2Side) {
         let snapshot = self.peers.current(Instant::now());
         let mapping = Arc::clone(side.policy.mapping());
-        let mapped = Actions::mapped(&mapping, &side.policy);
+        let mapped = BridgeActions::mapped(&mapping, &side.policy);
         let is_wanted = |policy: &Policy, action: &str| {
-            Actions::is_named(policy, action) || mapped.contains(action)
+            BridgeActions::is_named(policy, action) || mapped.contains(action)
         };
-        let kind = Kind {
+        let kind = ServerKind {
             noun: "action",
             told: "type of the action",
             type_of: action_type,
@@ -357,7 +358,7 @@ impl Ros2Requests {
 struct Left<'p> {
     graph: &'p Graph,
     mapping: &'p Mapping,
-    bridge: Bridge,
+    bridge: BridgeIdentity,
     domain: u16,
     /// The names that another node offers.
     taken: Vec<String>,

@@ -5,30 +5,30 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use bridge_node::{
-    Asker, CallFault, CallGraph, ExecutorGraph, GraphError, Ran, ServiceCall, ServiceGraph,
+    Asker, CallFault, CallGraph, ExecutorGraph, GraphError, MayHaveRun, ServiceCall, ServiceGraph,
 };
 use bytes::Bytes;
 use mappings::SpaceId;
 use messages::{MessageType, ServiceType, TextKind, TypeName, Wire};
 use ros2_node::domain::Domain;
-use ros2_node::parameters::{Parameter, ParameterValue};
+use ros2_node::parameters::{DeclaredParameter, ParameterValue};
 use ros2_node::service::{
-    Recall, Service, ServiceClient, ServiceClientOptions, ServiceError, ServiceOptions,
+    Recall, ServiceClient, ServiceClientOptions, ServiceError, ServiceName, ServiceOptions,
     ServicePeers, ServiceRequest, ServiceServer,
 };
 use uadp::BuiltinType;
 
-use crate::definitions::Definitions;
+use crate::definitions::Ros2Definitions;
 
 /// A DDS domain and the known type definitions.
 pub(super) struct Ros2Graph<'p> {
     pub(super) domain: &'p Domain,
     pub(super) peers: &'p ServicePeers,
-    pub(super) definitions: &'p mut Definitions,
+    pub(super) definitions: &'p mut Ros2Definitions,
 }
 
 impl ServiceGraph for Ros2Graph<'_> {
-    type Client = Client;
+    type Client = DomainServiceClient;
 
     const WIRE: Wire = Wire::Cdr;
 
@@ -60,8 +60,8 @@ impl ServiceGraph for Ros2Graph<'_> {
         service: &str,
         service_type: &ServiceType,
         timeout: Duration,
-    ) -> Result<Client, GraphError> {
-        let service = Service::new(service, service_type.name());
+    ) -> Result<DomainServiceClient, GraphError> {
+        let service = ServiceName::new(service, service_type.name());
         if let Some(hashes) = self.definitions.service_type_hashes(service_type.name()) {
             service.announce(self.domain, &hashes);
         }
@@ -70,20 +70,20 @@ impl ServiceGraph for Ros2Graph<'_> {
             ..ServiceClientOptions::default()
         };
         ServiceClient::open(self.domain, self.peers, &service, options)
-            .map(Client::from)
+            .map(DomainServiceClient::from)
             .map_err(GraphError::library)
     }
 }
 
 impl ExecutorGraph for Ros2Graph<'_> {
-    type Executor = Client;
+    type Executor = DomainServiceClient;
 
     fn executor(
         &mut self,
         service: &str,
         service_type: &ServiceType,
         timeout: Duration,
-    ) -> Result<Client, GraphError> {
+    ) -> Result<DomainServiceClient, GraphError> {
         self.client(service, service_type, timeout)
     }
 }
@@ -100,7 +100,7 @@ impl CallGraph for Ros2Graph<'_> {
         service_type: &Arc<ServiceType>,
         asker: Asker,
     ) -> Result<ServiceServer, GraphError> {
-        let service = Service::new(service, service_type.name());
+        let service = ServiceName::new(service, service_type.name());
         if let Some(hashes) = self.definitions.service_type_hashes(service_type.name()) {
             service.announce(self.domain, &hashes);
         }
@@ -117,8 +117,8 @@ impl CallGraph for Ros2Graph<'_> {
 }
 
 /// Returns the parameters of the bridge, as `ros2 param` lists them.
-pub(super) fn parameters(own: SpaceId, domain: u16, sim_time: bool) -> Vec<Parameter> {
-    let parameter = |name: &str, value, description: &str, read_only| Parameter {
+pub(super) fn parameters(own: SpaceId, domain: u16, sim_time: bool) -> Vec<DeclaredParameter> {
+    let parameter = |name: &str, value, description: &str, read_only| DeclaredParameter {
         name: name.to_owned(),
         value,
         description: description.to_owned(),
@@ -149,13 +149,13 @@ pub(super) fn parameters(own: SpaceId, domain: u16, sim_time: bool) -> Vec<Param
 
 /// Calls a service.
 #[derive(Debug)]
-pub(super) struct Client {
+pub(super) struct DomainServiceClient {
     client: ServiceClient,
     /// The most recent call.
     under_way: Mutex<Recall>,
 }
 
-impl From<ServiceClient> for Client {
+impl From<ServiceClient> for DomainServiceClient {
     fn from(client: ServiceClient) -> Self {
         Self {
             client,
@@ -164,7 +164,7 @@ impl From<ServiceClient> for Client {
     }
 }
 
-impl Client {
+impl DomainServiceClient {
     fn under_way(&self) -> MutexGuard<'_, Recall> {
         // The handle is consistent between statements.
         let lock = self.under_way.lock();
@@ -172,7 +172,7 @@ impl Client {
     }
 }
 
-impl ServiceCall for Client {
+impl ServiceCall for DomainServiceClient {
     fn service(&self) -> &str {
         self.client.service()
     }
@@ -197,8 +197,8 @@ impl ServiceCall for Client {
                     | ServiceError::OtherType { .. }
             ),
             ran: match error.may_have_run() {
-                true => Ran::Perhaps,
-                false => Ran::No,
+                true => MayHaveRun::Perhaps,
+                false => MayHaveRun::No,
             },
         })
     }

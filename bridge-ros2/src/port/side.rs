@@ -4,20 +4,20 @@ use std::collections::{BTreeSet, VecDeque};
 use std::convert::Infallible;
 use std::time::Duration;
 
-use bridge_node::policy::{Found, Policy, Read};
-use bridge_node::{Actions, PortEvent, Present, Reason};
+use bridge_node::policy::{Policy, Read, TopicMeaning};
+use bridge_node::{BridgeActions, PortEvent, Present, Reason};
 use mappings::{Mapping, TopicId};
 use messages::{DefinitionError, Selection, TextKind, TypeName};
 use ros2_node::compatibility::Incompatibility;
 use ros2_node::domain::{Domain, DomainError};
-use ros2_node::graph::{Endpoint, Graph, dds_topic, ros_topic};
+use ros2_node::graph::{Graph, RemoteEndpoint, dds_topic, ros_topic};
 use ros2_node::type_description::TypeServer;
 use rustdds::GUID;
 use tokio::time::Instant;
 
-use super::descriptions::Descriptions;
+use super::descriptions::TypeDescriptions;
 use super::schedule::Schedule;
-use crate::definitions::{Definition, Definitions};
+use crate::definitions::{Ros2Definitions, TypeDefinition};
 use crate::descriptors::Descriptors;
 
 /// The node, the domain around it, and the events for the run loop.
@@ -27,8 +27,8 @@ pub(super) struct Ros2Side {
     pub(super) joined: Instant,
     pub(super) graph: Graph,
     pub(super) policy: Policy,
-    pub(super) definitions: Definitions,
-    pub(super) descriptions: Descriptions,
+    pub(super) definitions: Ros2Definitions,
+    pub(super) descriptions: TypeDescriptions,
     /// Serves the descriptions of the types that this bridge reads and writes.
     pub(super) told_types: TypeServer,
     /// Endpoints that may be created before the next pass.
@@ -44,7 +44,7 @@ pub(super) struct Ros2Side {
 
 /// A kind of servers: services or actions.
 #[derive(Clone, Copy)]
-pub(super) struct Kind {
+pub(super) struct ServerKind {
     /// The noun in log messages.
     pub(super) noun: &'static str,
     /// The key under which an unusable type is logged once.
@@ -113,7 +113,8 @@ impl Ros2Side {
         let mut known = None;
         for writer in &writers {
             // A pattern may apply to a single type.
-            if known.is_some() || self.found(dds_topic, &writer.type_name) == Found::Nothing {
+            if known.is_some() || self.found(dds_topic, &writer.type_name) == TopicMeaning::Nothing
+            {
                 continue;
             }
             let found = match TypeName::from_dds(&writer.type_name) {
@@ -143,9 +144,9 @@ impl Ros2Side {
     ) -> Option<(String, TopicId, Selection)> {
         let writers = self.graph.writers(&dds_topic).iter();
         let mut found = writers.map(|writer| self.found(&dds_topic, &writer.type_name));
-        match found.find(|found| *found != Found::Nothing)? {
-            Found::Named(topic) => Some((dds_topic, topic, Selection::Whole)),
-            Found::Tied(topic) => {
+        match found.find(|found| *found != TopicMeaning::Nothing)? {
+            TopicMeaning::Named(topic) => Some((dds_topic, topic, Selection::Whole)),
+            TopicMeaning::Tied(topic) => {
                 self.policy.told.once(&dds_topic, "tied elsewhere", || {
                     format!("ignored this topic: by the mapping, {topic} comes from another ROS topic or a service")
                 });
@@ -153,31 +154,31 @@ impl Ros2Side {
             }
             // Other publishers on a topic to which the bridge writes values of other spaces are no
             // value of ours.
-            Found::Made(_) | Found::Fault(_) if is_written(&dds_topic) => None,
-            Found::Made(made) => Some((dds_topic, made.topic, made.selection)),
-            Found::Fault(fault) => {
+            TopicMeaning::Made(_) | TopicMeaning::Fault(_) if is_written(&dds_topic) => None,
+            TopicMeaning::Made(made) => Some((dds_topic, made.topic, made.selection)),
+            TopicMeaning::Fault(fault) => {
                 self.policy
                     .told
                     .once(&dds_topic, "pattern", || fault.to_string());
                 None
             }
-            Found::Nothing => None,
+            TopicMeaning::Nothing => None,
         }
     }
 
     /// Classifies a topic that the mapping does not name, written with the DDS type. No pattern
     /// applies to a type that is not a ROS type.
-    pub(super) fn found(&self, dds_topic: &str, dds_type: &str) -> Found {
+    pub(super) fn found(&self, dds_topic: &str, dds_type: &str) -> TopicMeaning {
         let Some(name) = ros_topic(dds_topic) else {
-            return Found::Nothing;
+            return TopicMeaning::Nothing;
         };
         let message_type = TypeName::from_dds(dds_type).ok();
         let found = self
             .policy
             .found(&format!("/{name}"), message_type.as_ref());
-        let by_pattern = matches!(found, Found::Made(_) | Found::Fault(_));
+        let by_pattern = matches!(found, TopicMeaning::Made(_) | TopicMeaning::Fault(_));
         match by_pattern && message_type.is_none() {
-            true => Found::Nothing,
+            true => TopicMeaning::Nothing,
             false => found,
         }
     }
@@ -229,7 +230,7 @@ impl Ros2Side {
 
     /// Sets the type hash that the domain announces with the next endpoints of the definition's
     /// type, and serves the description of the type.
-    pub(super) fn announce_type(&self, definition: &Definition) {
+    pub(super) fn announce_type(&self, definition: &TypeDefinition) {
         let (name, Some(hash)) = (definition.name(), definition.hash) else {
             return;
         };
@@ -268,11 +269,11 @@ impl Ros2Side {
     /// called.
     pub(super) fn present<'s>(
         &mut self,
-        offered: impl Iterator<Item = (&'s str, &'s [Endpoint])>,
-        kind: Kind,
+        offered: impl Iterator<Item = (&'s str, &'s [RemoteEndpoint])>,
+        kind: ServerKind,
         is_wanted: impl Fn(&Policy, &str) -> bool,
     ) -> Present {
-        let Kind {
+        let ServerKind {
             noun,
             told,
             type_of,
@@ -290,7 +291,7 @@ impl Ros2Side {
                 Some(name) if types.len() == 1 => name.parse().ok(),
                 Some(_) => None,
             };
-            if type_name.is_none() && Actions::is_named(&self.policy, &name) {
+            if type_name.is_none() && BridgeActions::is_named(&self.policy, &name) {
                 let types: Vec<String> = types.into_iter().collect();
                 self.policy.told.once(&name, told, || {
                     format!(

@@ -5,14 +5,14 @@ mod writers;
 use std::collections::{BTreeSet, HashMap, VecDeque};
 use std::sync::Arc;
 
-use bridge_node::policy::{NO_SUBSCRIBER, Step, Word, is_bad};
-use bridge_node::{Delivery, Described, Handover, Kept, PortEvent, Reason, now};
+use bridge_node::policy::{NO_SUBSCRIBER, PortStep, Word, is_bad};
+use bridge_node::{Handover, LocalDelivery, PortEvent, Reason, TopicMetaData, ValueRelation, now};
 use mappings::TopicId;
 use messages::{ActionCalls, Selection, TypeName};
-use ros2_node::clock::RosClock;
+use ros2_node::clock::Ros2Clock;
 use ros2_node::graph::Graph;
 use ros2_node::limits;
-use ros2_node::outlet::{Former, Progress, Refusal};
+use ros2_node::outlet::{Former, OutletProgress, OutletRefusal};
 use ros2_node::raw::Payload;
 use rustdds::GUID;
 use tokio::time::Instant;
@@ -20,22 +20,22 @@ use tracing::debug;
 use uadp::BuiltinType;
 
 use super::side::{Ros2Side, lost};
-use crate::sink::{Open, Sink};
+use crate::sink::{OpenWriter, Ros2Sink};
 
 /// The topics that this bridge writes.
-pub(super) struct Sinks {
+pub(super) struct WrittenTopics {
     /// The sinks are boxed because the table reserves room for up to twice the number of entries.
-    topics: HashMap<TopicId, Box<Sink>>,
+    topics: HashMap<TopicId, Box<Ros2Sink>>,
     /// Writers that were given up while their readers may still miss samples.
     former: VecDeque<Former>,
     /// Remote readers that were logged and counted because their definition of a type differs from
     /// ours.
     misreading: BTreeSet<GUID>,
-    clock: RosClock,
+    clock: Ros2Clock,
 }
 
-impl Sinks {
-    pub(super) fn new(clock: RosClock) -> Self {
+impl WrittenTopics {
+    pub(super) fn new(clock: Ros2Clock) -> Self {
         Self {
             topics: HashMap::new(),
             former: VecDeque::new(),
@@ -45,7 +45,7 @@ impl Sinks {
     }
 
     /// Returns the values with their topics.
-    pub(super) fn iter(&self) -> impl Iterator<Item = (&TopicId, &Sink)> {
+    pub(super) fn iter(&self) -> impl Iterator<Item = (&TopicId, &Ros2Sink)> {
         self.topics.iter().map(|(topic, sink)| (topic, &**sink))
     }
 
@@ -57,7 +57,7 @@ impl Sinks {
     /// Adds sinks for the values of other spaces that the mapping binds to topics of this domain.
     pub(super) fn take_up(&mut self, side: &Ros2Side) {
         for topic in side.policy.written() {
-            let sink = || Box::new(Sink::new(side.policy.destination(topic)));
+            let sink = || Box::new(Ros2Sink::new(side.policy.destination(topic)));
             self.topics.entry(topic).or_insert_with(sink);
         }
     }
@@ -71,7 +71,7 @@ impl Sinks {
             });
             policy.is_for_service(*topic)
                 || outdated
-                || !sink.is_like(&Sink::new(policy.destination(*topic)))
+                || !sink.is_like(&Ros2Sink::new(policy.destination(*topic)))
         });
         // Their writers are disposed here, or once their readers have received all samples.
         let now = Instant::now();
@@ -108,9 +108,9 @@ impl Sinks {
     pub(super) fn publish(
         &mut self,
         side: &mut Ros2Side,
-        sample: Delivery,
+        sample: LocalDelivery,
     ) -> Result<(), &'static str> {
-        let Delivery {
+        let LocalDelivery {
             topic,
             payload,
             source,
@@ -119,7 +119,7 @@ impl Sinks {
             lasting,
             ..
         } = sample;
-        if kept == Kept::Again {
+        if kept == ValueRelation::Again {
             // A writer of depth 1 has room for the newest value only.
             let sink = self.topics.get(&topic).and_then(|sink| sink.open.as_ref());
             let stores_newer =
@@ -135,7 +135,7 @@ impl Sinks {
             // Subscribers of this domain receive from the node that produces the value.
             return Err("served by another bridge of this domain");
         }
-        let Some(Sink {
+        let Some(Ros2Sink {
             open: Some(open),
             dds_topic,
             ..
@@ -157,14 +157,14 @@ impl Sinks {
         side.schedule.note_waiting(topic, open.outlet.is_waiting());
         let offered = match offered {
             // An older sample was lost: the new sample must not be offered again.
-            Err(Refusal::Overflow) if confirmed.is_some() => {
-                let cause = cause(Refusal::Overflow);
+            Err(OutletRefusal::Overflow) if confirmed.is_some() => {
+                let cause = cause(OutletRefusal::Overflow);
                 side.events.push_back(lost(topic, cause, 1));
                 Ok(())
             }
             offered => offered,
         };
-        if let Err(Refusal::TooLarge(limit)) = offered {
+        if let Err(OutletRefusal::TooLarge(limit)) = offered {
             let dds_topic = dds_topic.clone();
             side.policy.told.once(&dds_topic, "too large", || {
                 format!(
@@ -184,7 +184,7 @@ impl Sinks {
         side: &mut Ros2Side,
         topic: TopicId,
         shape: &[(BuiltinType, bool)],
-        described: Option<&Described>,
+        described: Option<&TopicMetaData>,
     ) {
         side.schedule.look_next();
         if !self.take_in(side, topic) {
@@ -207,9 +207,9 @@ impl Sinks {
             (open.definition.name(), subscribed)
         });
         match sink.choice.hear(word, open) {
-            Step::Stay => {}
-            Step::Open => self.open_sink(side, topic, Instant::now()),
-            Step::Select(selection) => {
+            PortStep::Stay => {}
+            PortStep::Open => self.open_sink(side, topic, Instant::now()),
+            PortStep::Select(selection) => {
                 let Some(open) = &mut sink.open else { return };
                 let message_type = Arc::clone(&open.definition.message_type);
                 open.stamps = sink.choice.stamps(&message_type);
@@ -228,7 +228,7 @@ impl Sinks {
         &mut self,
         side: &mut Ros2Side,
         topic: TopicId,
-        described: &Described,
+        described: &TopicMetaData,
     ) -> Option<(TypeName, Selection)> {
         let name = &described.message_type;
         if ActionCalls::is_value(name) {
@@ -316,7 +316,7 @@ impl Sinks {
         lost: &BTreeSet<GUID>,
         now: Instant,
     ) -> usize {
-        let is_lost = |sink: &Sink| {
+        let is_lost = |sink: &Ros2Sink| {
             let open = sink.open.as_ref();
             open.is_some_and(|open| lost.contains(&open.outlet.guid()))
         };
@@ -334,34 +334,34 @@ impl Sinks {
     }
 }
 
-impl std::fmt::Debug for Sinks {
+impl std::fmt::Debug for WrittenTopics {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         f.debug_map().entries(self.iter()).finish()
     }
 }
 
 /// Returns the counter and the label under which a refusal is counted.
-fn cause(refusal: Refusal) -> (Reason, &'static str) {
+fn cause(refusal: OutletRefusal) -> (Reason, &'static str) {
     match refusal {
-        Refusal::Overflow => (Reason::Overflow, refusal.label()),
-        Refusal::NoReader => (Reason::NoSubscriber, NO_SUBSCRIBER),
-        Refusal::TooLarge(_) | Refusal::Late | Refusal::Failed => {
+        OutletRefusal::Overflow => (Reason::Overflow, refusal.label()),
+        OutletRefusal::NoReader => (Reason::NoSubscriber, NO_SUBSCRIBER),
+        OutletRefusal::TooLarge(_) | OutletRefusal::Late | OutletRefusal::Failed => {
             (Reason::NotPublished, refusal.label())
         }
     }
 }
 
 /// Returns the handover of a value by the progress of its writer.
-const fn handover(progress: Progress) -> Handover {
+const fn handover(progress: OutletProgress) -> Handover {
     match progress {
-        Progress::NoReader => Handover::Nobody,
-        Progress::Waiting => Handover::Waiting,
-        Progress::Written => Handover::Done,
+        OutletProgress::NoReader => Handover::Nobody,
+        OutletProgress::Waiting => Handover::Waiting,
+        OutletProgress::Written => Handover::Done,
     }
 }
 
 /// Returns the loss of the values that still wait in a writer that is given up.
-fn unwritten(topic: TopicId, open: &Open) -> Option<PortEvent> {
+fn unwritten(topic: TopicId, open: &OpenWriter) -> Option<PortEvent> {
     let waiting = open.outlet.waiting();
     (waiting > 0).then(|| {
         lost(

@@ -9,29 +9,29 @@ use std::task::{Context, Poll};
 use bridge_node::policy::Read;
 use bridge_node::{PortEvent, Reason, now};
 use messages::TypeName;
-use ros2_node::inbox::{Inbox, Taken};
-use ros2_node::raw::Reader;
+use ros2_node::inbox::{Inbox, InboxTurn};
+use ros2_node::raw::PayloadReader;
 use tokio::time::Instant;
 use tracing::debug;
 
 use super::side::{Ros2Side, lost};
-use crate::source::{Source, same_participant};
+use crate::source::{Ros2Source, same_participant};
 
 /// The topics that this bridge reads.
-pub(super) struct Sources {
+pub(super) struct ReadTopics {
     /// The topics. A source is never removed, so its index identifies it.
     #[expect(
         clippy::vec_box,
         reason = "a vector that grows has room for twice what is in it"
     )]
-    list: Vec<Box<Source>>,
+    list: Vec<Box<Ros2Source>>,
     by_name: BTreeMap<String, usize>,
     inbox: Inbox<usize>,
     /// Replaced readers, which receive until their successors are matched.
-    retired: VecDeque<(Instant, Reader)>,
+    retired: VecDeque<(Instant, PayloadReader)>,
 }
 
-impl Sources {
+impl ReadTopics {
     pub(super) fn new() -> Self {
         Self {
             list: Vec::new(),
@@ -54,7 +54,7 @@ impl Sources {
     }
 
     /// Returns all topics.
-    pub(super) fn iter(&self) -> impl Iterator<Item = &Source> {
+    pub(super) fn iter(&self) -> impl Iterator<Item = &Ros2Source> {
         self.list.iter().map(Box::as_ref)
     }
 
@@ -63,21 +63,21 @@ impl Sources {
         let next = self.list.len();
         let index = *self.by_name.entry(dds_topic.clone()).or_insert(next);
         if index == next {
-            let source = Source::new(dds_topic, message_type);
+            let source = Ros2Source::new(dds_topic, message_type);
             self.list.push(Box::new(source));
         }
         index
     }
 
     /// Polls for the next sample.
-    pub(super) fn poll_recv(&mut self, cx: &mut Context<'_>) -> Poll<Taken<usize>> {
+    pub(super) fn poll_recv(&mut self, cx: &mut Context<'_>) -> Poll<InboxTurn<usize>> {
         self.inbox.poll_recv(cx)
     }
 
     /// Handles a sample.
-    pub(super) fn handle(&mut self, side: &mut Ros2Side, taken: Taken<usize>) {
+    pub(super) fn handle(&mut self, side: &mut Ros2Side, taken: InboxTurn<usize>) {
         match taken {
-            Taken::Sample {
+            InboxTurn::Sample {
                 key,
                 payload,
                 writer,
@@ -120,7 +120,7 @@ impl Sources {
                     });
                 }
             }
-            Taken::Unreadable { key, why } => {
+            InboxTurn::Unreadable { key, why } => {
                 let Some(source) = self.list.get(key) else {
                     return;
                 };
@@ -144,7 +144,7 @@ impl Sources {
     }
 }
 
-impl std::fmt::Debug for Sources {
+impl std::fmt::Debug for ReadTopics {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         f.debug_list().entries(&self.list).finish()
     }

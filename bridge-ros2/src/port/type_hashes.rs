@@ -4,15 +4,15 @@
 use std::time::Duration;
 
 use messages::{DescribedType, TypeHash, TypeName};
-use ros2_node::graph::Endpoint;
+use ros2_node::graph::RemoteEndpoint;
 use ros2_node::service::{ServiceClient, ServiceClientOptions};
 use ros2_node::type_description;
 use rustdds::GUID;
 use tokio::time::Instant;
 use tracing::{debug, info, warn};
 
-use super::descriptions::Wanted;
-use super::inquiry::{Inquiry, Outcome};
+use super::descriptions::WantedType;
+use super::inquiry::{Inquiry, InquiryOutcome};
 use super::side::Ros2Side;
 
 impl Ros2Side {
@@ -30,7 +30,7 @@ impl Ros2Side {
     pub(super) fn hash_that_counts(
         &mut self,
         name: &TypeName,
-        endpoints: &[Endpoint],
+        endpoints: &[RemoteEndpoint],
         current: Option<TypeHash>,
         now: Instant,
     ) -> Option<Option<TypeHash>> {
@@ -60,7 +60,12 @@ impl Ros2Side {
 
     /// Returns whether the type of the hash is known or no node describes it; `false` while a node
     /// is asked for the first time.
-    fn is_settled(&mut self, wanted: Wanted, endpoints: &[Endpoint], now: Instant) -> bool {
+    fn is_settled(
+        &mut self,
+        wanted: WantedType,
+        endpoints: &[RemoteEndpoint],
+        now: Instant,
+    ) -> bool {
         let full = self.descriptions.asked.len() >= MOST_ASKED;
         let mut inquiry = match self.descriptions.asked.remove(&wanted) {
             Some(inquiry) => inquiry,
@@ -69,7 +74,7 @@ impl Ros2Side {
         };
         let (name, hash) = &wanted;
         let dds_type = name.dds();
-        let alike = |endpoint: &&Endpoint| {
+        let alike = |endpoint: &&RemoteEndpoint| {
             endpoint.type_hash.as_ref() == Some(hash) && endpoint.type_name == dds_type
         };
         let alike: Vec<GUID> = endpoints.iter().filter(alike).map(|it| it.guid).collect();
@@ -86,7 +91,7 @@ impl Ros2Side {
     }
 
     /// Sends a request to a node of these endpoints, if it is due and a node offers the service.
-    fn ask(&mut self, wanted: &Wanted, alike: &[GUID], inquiry: &mut Inquiry, now: Instant) {
+    fn ask(&mut self, wanted: &WantedType, alike: &[GUID], inquiry: &mut Inquiry, now: Instant) {
         let Some(turn) = inquiry.due(now) else {
             return;
         };
@@ -163,7 +168,7 @@ impl Ros2Side {
     /// Adds the types if they match the hash.
     fn described(
         &mut self,
-        (name, hash): &Wanted,
+        (name, hash): &WantedType,
         service: &str,
         types: &[DescribedType],
     ) -> Result<(), String> {
@@ -174,8 +179,8 @@ impl Ros2Side {
         Ok(())
     }
 
-    fn tell_untold(&mut self, (name, hash): &Wanted, outcome: Outcome, why: &str) {
-        if outcome != Outcome::Untold {
+    fn tell_untold(&mut self, (name, hash): &WantedType, outcome: InquiryOutcome, why: &str) {
+        if outcome != InquiryOutcome::Untold {
             return;
         }
         let ours = self.definitions.here(name).ok();

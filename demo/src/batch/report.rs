@@ -8,7 +8,7 @@ use crate::stage::StepRun;
 
 /// The report.
 #[derive(Clone, Debug, Default, Serialize)]
-pub(super) struct Report {
+pub(super) struct BatchReport {
     pub(super) speed: f64,
     /// Time from the start of the programs until each step had a skill.
     pub(super) planned_ms: Option<f64>,
@@ -16,7 +16,7 @@ pub(super) struct Report {
     pub(super) steps: Vec<StepRun>,
 }
 
-impl Report {
+impl BatchReport {
     /// Returns whether two steps ran at the same time.
     pub(super) fn overlap(&self) -> bool {
         self.steps.iter().enumerate().any(|(number, one)| {
@@ -57,9 +57,9 @@ mod tests {
             ended_ms,
             ..StepRun::default()
         };
-        let report = |steps| Report {
+        let report = |steps| BatchReport {
             steps,
-            ..Report::default()
+            ..BatchReport::default()
         };
         let in_turn = vec![step(1, Some(5)), step(5, Some(9))];
         assert!(!report(in_turn).overlap());

@@ -8,14 +8,14 @@ use crate::stage::StepRun;
 
 /// The report.
 #[derive(Clone, Debug, Serialize)]
-pub(super) struct Report {
+pub(super) struct FusesReport {
     pub(super) speed: f64,
-    pub(super) insertions: Vec<Insertion>,
+    pub(super) insertions: Vec<FuseInsertion>,
 }
 
 /// The insertion of a fuse.
 #[derive(Clone, Debug, Serialize)]
-pub(super) struct Insertion {
+pub(super) struct FuseInsertion {
     pub(super) arm: &'static str,
     pub(super) tries: usize,
     /// Number of tries that ended at the force limit.
@@ -28,7 +28,7 @@ pub(super) struct Insertion {
     pub(super) steps: Vec<StepRun>,
 }
 
-impl Report {
+impl FusesReport {
     /// Returns the table for people.
     pub(super) fn table(&self) -> String {
         let mut out = String::from("\n");

@@ -1,28 +1,28 @@
 //! The texts of the timeline for the events of the line.
 
-use crate::event::{Event, SupervisorEvent};
+use crate::event::{ChildEvent, SupervisorEvent};
 use crate::robots::niryo::{NiryoEvent, WaitCause};
 use crate::robots::turtlebot::TurtlebotEvent;
-use crate::stage::Who;
+use crate::stage::EventSource;
 
 /// Returns the source and the text of an event, or `None` if it is not shown.
-pub(crate) fn describe(event: &Event) -> Option<(Who, String)> {
+pub(crate) fn describe(event: &ChildEvent) -> Option<(EventSource, String)> {
     match event {
-        Event::Master(_)
-        | Event::Supervisor(SupervisorEvent::Awaits { .. } | SupervisorEvent::AwaitsSwitch)
-        | Event::Node(_)
-        | Event::Machine(_) => None,
-        Event::Niryo(event) => Some((NIRYO, niryo(*event))),
-        Event::Turtlebot(event) => Some((TURTLEBOT, turtlebot(*event))),
-        Event::Supervisor(SupervisorEvent::Connected) => Some((
+        ChildEvent::Master(_)
+        | ChildEvent::Supervisor(SupervisorEvent::Awaits { .. } | SupervisorEvent::AwaitsSwitch)
+        | ChildEvent::Node(_)
+        | ChildEvent::Machine(_) => None,
+        ChildEvent::Niryo(event) => Some((NIRYO, niryo(*event))),
+        ChildEvent::Turtlebot(event) => Some((TURTLEBOT, turtlebot(*event))),
+        ChildEvent::Supervisor(SupervisorEvent::Connected) => Some((
             SUPERVISOR,
             "has a session with the OPC UA server".to_owned(),
         )),
-        Event::Supervisor(SupervisorEvent::Switched { on, .. }) => {
+        ChildEvent::Supervisor(SupervisorEvent::Switched { on, .. }) => {
             let state = if *on { "on" } else { "off" };
             Some((SUPERVISOR, format!("calls Conveyor.Switch: {state}")))
         }
-        Event::Supervisor(SupervisorEvent::Saw { name, value }) => {
+        ChildEvent::Supervisor(SupervisorEvent::Saw { name, value }) => {
             Some((SERVER, format!("{name} = {value}")))
         }
     }
@@ -66,7 +66,7 @@ fn turtlebot(event: TurtlebotEvent) -> String {
     }
 }
 
-const SUPERVISOR: Who = Who("supervisor", "35");
-const NIRYO: Who = Who("Niryo Ned", "33");
-const TURTLEBOT: Who = Who("TurtleBot3", "36");
-const SERVER: Who = Who("OPC UA server", "32");
+const SUPERVISOR: EventSource = EventSource("supervisor", "35");
+const NIRYO: EventSource = EventSource("Niryo Ned", "33");
+const TURTLEBOT: EventSource = EventSource("TurtleBot3", "36");
+const SERVER: EventSource = EventSource("OPC UA server", "32");

@@ -2,12 +2,12 @@
 
 use serde::Serialize;
 
-use super::story::Story;
-use crate::stage::{Hop, Hops, delays, micros};
+use super::story::LineStory;
+use crate::stage::{BridgeHop, RobotHops, delays, micros};
 
 /// The outcome, as printed by `--json`.
 #[derive(Clone, Debug, PartialEq, Serialize)]
-pub(crate) struct Report {
+pub(crate) struct OrchestraReport {
     covers: u32,
     delivered: u32,
     by_conveyor: u32,
@@ -15,15 +15,15 @@ pub(crate) struct Report {
     /// In seconds of the scenario; `null` if it was not switched off before the last cover arrived.
     conveyor_off_at_s: Option<f64>,
     finished: bool,
-    hops: Hops,
+    hops: RobotHops,
     /// Duration of each call of the switch, from the client's call to its response.
     switch_answered_us: Vec<f64>,
     /// `null` if the conveyor was not switched off, or was not running at that time.
     server_saw_conveyor_off_after_us: Option<f64>,
 }
 
-impl Report {
-    pub(crate) fn of(story: &Story, hops: Hops) -> Self {
+impl OrchestraReport {
+    pub(crate) fn of(story: &LineStory, hops: RobotHops) -> Self {
         Self {
             covers: story.covers(),
             delivered: story.delivered(),
@@ -43,7 +43,7 @@ impl Report {
     }
 
     /// Returns the table for people.
-    pub(crate) fn table(&self, story: &Story) -> String {
+    pub(crate) fn table(&self, story: &LineStory) -> String {
         let mut text = format!(
             "\n{} of {} covers arrived: {} by conveyor, {} by TurtleBot3\n\n",
             self.delivered, self.covers, self.by_conveyor, self.by_turtlebot
@@ -55,22 +55,22 @@ impl Report {
             ("tPB2, in the ROS 2 bridge", self.hops.pb2, "-"),
             (
                 "Conveyor.Switch called to answered",
-                Hop::of(story.switch_answered_after()),
+                BridgeHop::of(story.switch_answered_after()),
                 "-",
             ),
             (
                 "conveyor off at Niryo Ned to server",
-                Hop::of(&saw_off),
+                BridgeHop::of(&saw_off),
                 "2 s",
             ),
             (
                 "cover placed to counter at server",
-                Hop::of(&story.place_to_counter()),
+                BridgeHop::of(&story.place_to_counter()),
                 "4 s",
             ),
             (
                 "placed on TurtleBot3 to it moves *",
-                Hop::of(&story.place_to_move()),
+                BridgeHop::of(&story.place_to_move()),
                 "about 10 s",
             ),
         ];
@@ -87,20 +87,20 @@ mod tests {
 
     #[test]
     fn the_json_has_the_names_people_were_told() {
-        let story = Story::new(4, Speed::new(1.0).unwrap());
-        let hop = Hop {
+        let story = LineStory::new(4, Speed::new(1.0).unwrap());
+        let hop = BridgeHop {
             p50_us: 41.0,
             p99_us: 99.5,
             max_us: 120.0,
             count: 7,
         };
-        let hops = Hops {
+        let hops = RobotHops {
             pb1: Some(hop),
             tr0: None,
             pb2: None,
         };
         assert_eq!(
-            serde_json::to_string(&Report::of(&story, hops)).unwrap(),
+            serde_json::to_string(&OrchestraReport::of(&story, hops)).unwrap(),
             r#"{"covers":4,"delivered":0,"by_conveyor":0,"by_turtlebot":0,"conveyor_off_at_s":null,"finished":false,"hops":{"tPB1":{"p50_us":41.0,"p99_us":99.5,"max_us":120.0,"count":7},"tTR0":null,"tPB2":null},"switch_answered_us":[],"server_saw_conveyor_off_after_us":null}"#
         );
     }

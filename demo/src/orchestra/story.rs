@@ -3,15 +3,15 @@
 
 use std::collections::BTreeMap;
 
-use crate::event::{Event, Stamped, SupervisorEvent, Value};
-use crate::line::Name;
+use crate::event::{ChildEvent, LineValue, Stamped, SupervisorEvent};
+use crate::line::LineValueName;
 use crate::pace::Speed;
 use crate::robots::niryo::{NiryoEvent, WaitCause};
 use crate::robots::turtlebot::TurtlebotEvent;
 
 /// The state of the line. Events of different processes may arrive in any order.
 #[derive(Debug)]
-pub(crate) struct Story {
+pub(crate) struct LineStory {
     covers: u32,
     speed: Speed,
     /// Time of the first call of the switch: second 0.
@@ -22,8 +22,8 @@ pub(crate) struct Story {
     placed_on_turtlebot: BTreeMap<u32, i64>,
     left_park: BTreeMap<u32, i64>,
     unloaded: u32,
-    server: BTreeMap<Name, Vec<(i64, Value)>>,
-    awaited: Vec<Name>,
+    server: BTreeMap<LineValueName, Vec<(i64, LineValue)>>,
+    awaited: Vec<LineValueName>,
     awaits_switch: bool,
     /// Nanoseconds from each call of the switch to its response.
     switch_answered: Vec<i64>,
@@ -32,7 +32,7 @@ pub(crate) struct Story {
     turtlebot: &'static str,
 }
 
-impl Story {
+impl LineStory {
     pub(crate) const fn new(covers: u32, speed: Speed) -> Self {
         Self {
             covers,
@@ -57,13 +57,15 @@ impl Story {
     pub(crate) fn observe(&mut self, stamped: &Stamped) {
         let at = stamped.at_ns;
         match &stamped.event {
-            Event::Master(_) | Event::Node(_) | Event::Machine(_) => {}
-            Event::Niryo(event) => self.observe_niryo(*event, at),
-            Event::Turtlebot(event) => self.observe_turtlebot(*event, at),
-            Event::Supervisor(SupervisorEvent::Connected) => self.connected = true,
-            Event::Supervisor(SupervisorEvent::Awaits { names }) => self.awaited.clone_from(names),
-            Event::Supervisor(SupervisorEvent::AwaitsSwitch) => self.awaits_switch = true,
-            Event::Supervisor(SupervisorEvent::Switched {
+            ChildEvent::Master(_) | ChildEvent::Node(_) | ChildEvent::Machine(_) => {}
+            ChildEvent::Niryo(event) => self.observe_niryo(*event, at),
+            ChildEvent::Turtlebot(event) => self.observe_turtlebot(*event, at),
+            ChildEvent::Supervisor(SupervisorEvent::Connected) => self.connected = true,
+            ChildEvent::Supervisor(SupervisorEvent::Awaits { names }) => {
+                self.awaited.clone_from(names)
+            }
+            ChildEvent::Supervisor(SupervisorEvent::AwaitsSwitch) => self.awaits_switch = true,
+            ChildEvent::Supervisor(SupervisorEvent::Switched {
                 on,
                 answered_after_ns,
             }) => {
@@ -73,7 +75,7 @@ impl Story {
                     self.switched_off_at.get_or_insert(at);
                 }
             }
-            Event::Supervisor(SupervisorEvent::Saw { name, value }) => {
+            ChildEvent::Supervisor(SupervisorEvent::Saw { name, value }) => {
                 self.awaited.retain(|awaited| awaited != name);
                 self.server.entry(*name).or_default().push((at, *value));
             }
@@ -149,11 +151,14 @@ impl Story {
     pub(crate) fn settled(&self) -> bool {
         let at_server = |name, count| {
             let last = self.server.get(&name).and_then(|values| values.last());
-            last.is_some_and(|(_, value)| *value == Value::Number(count))
+            last.is_some_and(|(_, value)| *value == LineValue::Number(count))
         };
         self.finished()
-            && at_server(Name::CoversOnConveyor, self.by_conveyor())
-            && at_server(Name::CoversOnTurtleBot3, last(&self.placed_on_turtlebot))
+            && at_server(LineValueName::CoversOnConveyor, self.by_conveyor())
+            && at_server(
+                LineValueName::CoversOnTurtleBot3,
+                last(&self.placed_on_turtlebot),
+            )
     }
 
     /// Returns the time at which the supervisor switched the conveyor off, in seconds of the
@@ -166,8 +171,9 @@ impl Story {
     /// value at the server.
     pub(crate) fn server_saw_off_after(&self) -> Option<i64> {
         let stopped = self.conveyor_stopped_at?;
-        let values = self.server.get(&Name::ConveyorRunning)?;
-        let off = |(at, value): &&(i64, Value)| *value == Value::Boolean(false) && *at >= stopped;
+        let values = self.server.get(&LineValueName::ConveyorRunning)?;
+        let off =
+            |(at, value): &&(i64, LineValue)| *value == LineValue::Boolean(false) && *at >= stopped;
         values.iter().find(off).map(|(at, _)| at - stopped)
     }
 
@@ -179,8 +185,8 @@ impl Story {
     /// Returns the nanoseconds from each placed cover to the count at the server.
     pub(crate) fn place_to_counter(&self) -> Vec<i64> {
         [
-            (&self.placed_on_conveyor, Name::CoversOnConveyor),
-            (&self.placed_on_turtlebot, Name::CoversOnTurtleBot3),
+            (&self.placed_on_conveyor, LineValueName::CoversOnConveyor),
+            (&self.placed_on_turtlebot, LineValueName::CoversOnTurtleBot3),
         ]
         .into_iter()
         .flat_map(|(placed, name)| {
@@ -190,7 +196,7 @@ impl Story {
                 .map(Vec::as_slice)
                 .unwrap_or_default();
             placed.iter().filter_map(move |(count, placed_at)| {
-                let value = Value::Number(*count);
+                let value = LineValue::Number(*count);
                 seen.iter()
                     .find(|(_, seen)| *seen == value)
                     .map(|(at, _)| at - placed_at)
@@ -247,8 +253,8 @@ fn last(counts: &BTreeMap<u32, i64>) -> u32 {
 mod tests {
     use super::*;
 
-    fn told(events: &[(i64, Event)]) -> Story {
-        let mut story = Story::new(2, Speed::new(1.0).unwrap());
+    fn told(events: &[(i64, ChildEvent)]) -> LineStory {
+        let mut story = LineStory::new(2, Speed::new(1.0).unwrap());
         for (at_ns, event) in events {
             story.observe(&Stamped {
                 at_ns: *at_ns,
@@ -258,11 +264,11 @@ mod tests {
         story
     }
 
-    fn saw(name: Name, value: Value) -> Event {
+    fn saw(name: LineValueName, value: LineValue) -> ChildEvent {
         SupervisorEvent::Saw { name, value }.into()
     }
 
-    fn switched(on: bool) -> Event {
+    fn switched(on: bool) -> ChildEvent {
         let answered_after_ns = 7;
         SupervisorEvent::Switched {
             on,
@@ -281,8 +287,14 @@ mod tests {
         events.push((3, TurtlebotEvent::Unloaded { total: 1 }.into()));
         let story = told(&events);
         assert!(story.finished() && !story.settled());
-        events.push((4, saw(Name::CoversOnConveyor, Value::Number(1))));
-        events.push((5, saw(Name::CoversOnTurtleBot3, Value::Number(1))));
+        events.push((
+            4,
+            saw(LineValueName::CoversOnConveyor, LineValue::Number(1)),
+        ));
+        events.push((
+            5,
+            saw(LineValueName::CoversOnTurtleBot3, LineValue::Number(1)),
+        ));
         assert!(told(&events).settled());
     }
 
@@ -290,9 +302,15 @@ mod tests {
     fn delays_do_not_depend_on_the_order_in_which_events_are_read() {
         let mut events = vec![
             (100, NiryoEvent::PlacedOnConveyor { total: 1 }.into()),
-            (130, saw(Name::CoversOnConveyor, Value::Number(1))),
+            (
+                130,
+                saw(LineValueName::CoversOnConveyor, LineValue::Number(1)),
+            ),
             (200, NiryoEvent::PlacedOnTurtlebot { total: 1 }.into()),
-            (270, saw(Name::CoversOnTurtleBot3, Value::Number(1))),
+            (
+                270,
+                saw(LineValueName::CoversOnTurtleBot3, LineValue::Number(1)),
+            ),
             (900, TurtlebotEvent::LeavesPark { placed: 1 }.into()),
         ];
         for _ in 0..2 {
@@ -306,9 +324,15 @@ mod tests {
     #[test]
     fn the_conveyor_standing_still_at_first_is_not_the_stop() {
         let story = told(&[
-            (10, saw(Name::ConveyorRunning, Value::Boolean(false))),
+            (
+                10,
+                saw(LineValueName::ConveyorRunning, LineValue::Boolean(false)),
+            ),
             (20, switched(true)),
-            (30, saw(Name::ConveyorRunning, Value::Boolean(true))),
+            (
+                30,
+                saw(LineValueName::ConveyorRunning, LineValue::Boolean(true)),
+            ),
             (25_000_000_020, switched(false)),
             (
                 25_000_000_100,
@@ -319,7 +343,7 @@ mod tests {
             ),
             (
                 25_000_000_400,
-                saw(Name::ConveyorRunning, Value::Boolean(false)),
+                saw(LineValueName::ConveyorRunning, LineValue::Boolean(false)),
             ),
         ]);
         assert_eq!(story.server_saw_off_after(), Some(300));
@@ -330,12 +354,12 @@ mod tests {
     #[test]
     fn who_is_waited_for_is_named() {
         let awaits = SupervisorEvent::Awaits {
-            names: vec![Name::ParkBusy, Name::BucketBusy],
+            names: vec![LineValueName::ParkBusy, LineValueName::BucketBusy],
         };
         let story = told(&[
             (1, SupervisorEvent::Connected.into()),
             (2, awaits.into()),
-            (3, saw(Name::BucketBusy, Value::Boolean(false))),
+            (3, saw(LineValueName::BucketBusy, LineValue::Boolean(false))),
         ]);
         assert_eq!(
             story.standing(),

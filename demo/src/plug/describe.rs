@@ -1,14 +1,14 @@
 //! The texts of the timeline for facts.
 
-use super::fact::{Fact, Level, NodeEvent, Part, Ros, Run};
-use super::story::Story;
-use crate::stage::Who;
+use super::fact::{Fact, MesRun, NodeEvent, PlugComponent, Ros, VisibilityLevel};
+use super::story::PlugStory;
+use crate::stage::EventSource;
 
 /// Returns the sources and the texts of a fact. Facts that are known already or not for people have
 /// no text. Must be called before the story observes the fact.
-pub(crate) fn describe(story: &Story, fact: &Fact) -> Vec<(Who, String)> {
+pub(crate) fn describe(story: &PlugStory, fact: &Fact) -> Vec<(EventSource, String)> {
     match fact {
-        Fact::Ready(program) => vec![(Who::DEMO, format!("{program} runs"))],
+        Fact::Ready(program) => vec![(EventSource::DEMO, format!("{program} runs"))],
         Fact::Started(part) => vec![(who(*part), "is plugged in: its process starts".to_owned())],
         Fact::Reached(part, level) if !story.reached.contains_key(&(*part, *level)) => {
             vec![(who(*part), reached(*part, *level))]
@@ -29,7 +29,7 @@ pub(crate) fn describe(story: &Story, fact: &Fact) -> Vec<(Who, String)> {
             } else {
                 format!("ua-space call: {why}")
             };
-            vec![(Who::DEMO, what)]
+            vec![(EventSource::DEMO, what)]
         }
         Fact::Asked(asked) => vec![(
             MES,
@@ -41,19 +41,22 @@ pub(crate) fn describe(story: &Story, fact: &Fact) -> Vec<(Who, String)> {
     }
 }
 
-fn reached(part: Part, level: Level) -> String {
+fn reached(part: PlugComponent, level: VisibilityLevel) -> String {
     let namespace = part.namespace();
     match level {
-        Level::Announced | Level::Registered | Level::Listed | Level::InGraph => {
-            level.label().to_owned()
+        VisibilityLevel::Announced
+        | VisibilityLevel::Registered
+        | VisibilityLevel::Listed
+        | VisibilityLevel::InGraph => level.label().to_owned(),
+        VisibilityLevel::InSpace => format!("{}: ua_0_{namespace}_101 ...", level.label()),
+        VisibilityLevel::AtServer => level.label().to_owned(),
+        VisibilityLevel::Ros1 | VisibilityLevel::Ros2 => {
+            format!("/ua_0_{namespace}_101 is {}", level.label())
         }
-        Level::InSpace => format!("{}: ua_0_{namespace}_101 ...", level.label()),
-        Level::AtServer => level.label().to_owned(),
-        Level::Ros1 | Level::Ros2 => format!("/ua_0_{namespace}_101 is {}", level.label()),
     }
 }
 
-fn node(story: &Story, event: &NodeEvent) -> Vec<(Who, String)> {
+fn node(story: &PlugStory, event: &NodeEvent) -> Vec<(EventSource, String)> {
     let (ros, what) = match event {
         NodeEvent::Up { ros } => (*ros, "listens".to_owned()),
         NodeEvent::State {
@@ -62,17 +65,17 @@ fn node(story: &Story, event: &NodeEvent) -> Vec<(Who, String)> {
             state,
             ..
         } => {
-            let Some(part) = Part::of_namespace(*namespace) else {
+            let Some(part) = PlugComponent::of_namespace(*namespace) else {
                 return Vec::new();
             };
             let level = match ros {
-                Ros::Ros1 => Level::Ros1,
-                Ros::Ros2 => Level::Ros2,
+                Ros::Ros1 => VisibilityLevel::Ros1,
+                Ros::Ros2 => VisibilityLevel::Ros2,
             };
             if !story.reached.contains_key(&(part, level)) {
                 return vec![(who(part), reached(part, level))];
             }
-            if part != Part::Gripper || !story.is_new_state(*ros, state) {
+            if part != PlugComponent::Gripper || !story.is_new_state(*ros, state) {
                 return Vec::new();
             }
             (*ros, format!("/ua_0_7_101: {state}"))
@@ -108,7 +111,7 @@ fn node(story: &Story, event: &NodeEvent) -> Vec<(Who, String)> {
 }
 
 /// Returns the changes of a run.
-fn changes(known: Option<&Run>, run: &Run) -> Vec<String> {
+fn changes(known: Option<&MesRun>, run: &MesRun) -> Vec<String> {
     let mut new = Vec::new();
     if known.is_none() {
         new.push(format!("runs {}", run.process));
@@ -128,7 +131,7 @@ fn changes(known: Option<&Run>, run: &Run) -> Vec<String> {
         }
         let known_ran = known.map_or(0, |known| known.ran.len());
         for ran in plan.ran.iter().skip(known_ran) {
-            let part = Part::of_uri(&ran.component);
+            let part = PlugComponent::of_uri(&ran.component);
             let component = part.map_or(ran.component.as_str(), |part| part.name());
             new.push(format!("{} by {component}", ran.step));
         }
@@ -166,44 +169,44 @@ fn need(what: &str) -> &str {
         .map_or(what, |(need, _)| need)
 }
 
-const fn who(part: Part) -> Who {
+const fn who(part: PlugComponent) -> EventSource {
     match part {
-        Part::Robot => Who("robot", "33"),
-        Part::Gripper => Who("gripper", "36"),
-        Part::Vacuum => Who("vacuum gripper", "34"),
+        PlugComponent::Robot => EventSource("robot", "33"),
+        PlugComponent::Gripper => EventSource("gripper", "36"),
+        PlugComponent::Vacuum => EventSource("vacuum gripper", "34"),
     }
 }
 
-const fn node_of(ros: Ros) -> Who {
+const fn node_of(ros: Ros) -> EventSource {
     match ros {
-        Ros::Ros1 => Who("ROS 1 node", "32"),
-        Ros::Ros2 => Who("ROS 2 node", "32"),
+        Ros::Ros1 => EventSource("ROS 1 node", "32"),
+        Ros::Ros2 => EventSource("ROS 2 node", "32"),
     }
 }
 
-const MES: Who = Who("ua-mes", "35");
+const MES: EventSource = EventSource("ua-mes", "35");
 
 #[cfg(test)]
 mod tests {
-    use super::super::fact::{Plan, Ran};
+    use super::super::fact::{ExecutedSkill, RunPlan};
     use super::*;
 
     #[test]
     fn of_a_run_only_what_is_new_is_said() {
-        let ran = |step: &str| Ran {
+        let ran = |step: &str| ExecutedSkill {
             step: step.to_owned(),
-            component: Part::Gripper.uri().to_owned(),
-            ..Ran::default()
+            component: PlugComponent::Gripper.uri().to_owned(),
+            ..ExecutedSkill::default()
         };
-        let mut run = Run {
+        let mut run = MesRun {
             process: "urn:p".to_owned(),
             outcome: "running".to_owned(),
-            plans: vec![Plan {
+            plans: vec![RunPlan {
                 outcome: "running".to_owned(),
                 ran: vec![ran("Grasp")],
-                ..Plan::default()
+                ..RunPlan::default()
             }],
-            ..Run::default()
+            ..MesRun::default()
         };
         assert_eq!(
             changes(None, &run),

@@ -7,13 +7,13 @@ use super::skill_messages::{SkillResult, SkillState};
 /// A component of the scenario.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-pub(crate) enum Part {
+pub(crate) enum PlugComponent {
     Robot,
     Gripper,
     Vacuum,
 }
 
-impl Part {
+impl PlugComponent {
     pub(crate) const ALL: [Self; 3] = [Self::Robot, Self::Gripper, Self::Vacuum];
 
     /// Returns the name in its YAML, which is the name of its log too.
@@ -61,7 +61,7 @@ impl Part {
 /// A place where a component becomes known, or stops being known.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-pub(crate) enum Level {
+pub(crate) enum VisibilityLevel {
     /// Its mDNS announcement was received.
     Announced,
     /// It is registered at the discovery server.
@@ -80,7 +80,7 @@ pub(crate) enum Level {
     Ros2,
 }
 
-impl Level {
+impl VisibilityLevel {
     pub(crate) const ALL: [Self; 8] = [
         Self::Announced,
         Self::Registered,
@@ -195,7 +195,7 @@ impl NodeEvent {
         match self {
             Self::State {
                 namespace, state, ..
-            } if *namespace == Part::Gripper.namespace() => Some(state == "Halted"),
+            } if *namespace == PlugComponent::Gripper.namespace() => Some(state == "Halted"),
             Self::State { .. }
             | Self::Up { .. }
             | Self::Resets { .. }
@@ -222,15 +222,15 @@ pub(crate) enum Fact {
     /// The status page of a program is available.
     Ready(&'static str),
     /// The process of a component was started.
-    Started(Part),
-    Reached(Part, Level),
+    Started(PlugComponent),
+    Reached(PlugComponent, VisibilityLevel),
     /// A component is no longer known at this level.
-    Left(Part, Level),
+    Left(PlugComponent, VisibilityLevel),
     Node(NodeEvent),
     /// A component was killed.
-    Killed(Part),
+    Killed(PlugComponent),
     /// The MES has a new state of a run, counted from 0.
-    Run(usize, Run),
+    Run(usize, MesRun),
     /// `ua-space call` has ended, for the run with this number.
     CallEnded {
         run: usize,
@@ -238,38 +238,38 @@ pub(crate) enum Fact {
         why: String,
     },
     /// The result of the query.
-    Asked(Asked),
+    Asked(CanRunAnswer),
 }
 
 /// A run of the MES, with the fields of its status page that the scenario needs.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Deserialize)]
 #[serde(default)]
-pub(crate) struct Run {
+pub(crate) struct MesRun {
     pub(crate) process: String,
     pub(crate) started_ms: u64,
     pub(crate) ended_ms: Option<u64>,
     pub(crate) outcome: String,
     pub(crate) reason: Option<String>,
     pub(crate) waits_for: Option<String>,
-    pub(crate) plans: Vec<Plan>,
+    pub(crate) plans: Vec<RunPlan>,
 }
 
 /// A plan of a run.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Deserialize)]
 #[serde(default)]
-pub(crate) struct Plan {
+pub(crate) struct RunPlan {
     pub(crate) at_ms: u64,
     pub(crate) ended_ms: Option<u64>,
     pub(crate) outcome: String,
     pub(crate) reason: Option<String>,
     pub(crate) retreated: Option<bool>,
-    pub(crate) ran: Vec<Ran>,
+    pub(crate) ran: Vec<ExecutedSkill>,
 }
 
 /// A skill that a plan has run.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Deserialize)]
 #[serde(default)]
-pub(crate) struct Ran {
+pub(crate) struct ExecutedSkill {
     pub(crate) step: String,
     /// The ApplicationUri.
     pub(crate) component: String,
@@ -280,7 +280,7 @@ pub(crate) struct Ran {
 
 /// The result of `ua-space ask what-can-run`.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
-pub(crate) struct Asked {
+pub(crate) struct CanRunAnswer {
     pub(crate) skills: usize,
     pub(crate) services: usize,
     /// Rows without capabilities, endpoint or name.

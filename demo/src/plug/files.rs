@@ -4,18 +4,18 @@ use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
 
-use super::fact::Part;
+use super::fact::PlugComponent;
 use crate::pace::Speed;
 
 /// The manifest of a module.
 #[derive(Clone, Debug)]
-pub(crate) struct Manifest {
+pub(crate) struct ModuleManifest {
     /// The name as printed.
     pub(crate) name: String,
     pub(crate) text: Vec<u8>,
 }
 
-impl Manifest {
+impl ModuleManifest {
     /// Reads the manifest from a file, or returns the manifest of the example plant.
     ///
     /// # Errors
@@ -38,8 +38,8 @@ impl Manifest {
 ///
 /// # Errors
 /// A file cannot be written.
-pub(crate) fn write(directory: &Path, speed: Speed, manifest: &Manifest) -> io::Result<()> {
-    for part in Part::ALL {
+pub(crate) fn write(directory: &Path, speed: Speed, manifest: &ModuleManifest) -> io::Result<()> {
+    for part in PlugComponent::ALL {
         fs::write(of_part(directory, part), scaled(yaml(part), speed))?;
     }
     fs::write(directory.join("vacuum-gripper.xml"), VACUUM_NODESET)?;
@@ -49,7 +49,7 @@ pub(crate) fn write(directory: &Path, speed: Speed, manifest: &Manifest) -> io::
 }
 
 /// Returns the path of the YAML of a component.
-pub(crate) fn of_part(directory: &Path, part: Part) -> PathBuf {
+pub(crate) fn of_part(directory: &Path, part: PlugComponent) -> PathBuf {
     directory.join(format!("{}.yaml", part.name()))
 }
 
@@ -58,11 +58,11 @@ pub(crate) fn of_mes(directory: &Path) -> PathBuf {
     directory.join("mes.yaml")
 }
 
-const fn yaml(part: Part) -> &'static str {
+const fn yaml(part: PlugComponent) -> &'static str {
     match part {
-        Part::Robot => include_str!("../../../examples/plant/robot.yaml"),
-        Part::Gripper => include_str!("../../../examples/plant/parallel-gripper.yaml"),
-        Part::Vacuum => include_str!("../../../examples/plant/vacuum-gripper.yaml"),
+        PlugComponent::Robot => include_str!("../../../examples/plant/robot.yaml"),
+        PlugComponent::Gripper => include_str!("../../../examples/plant/parallel-gripper.yaml"),
+        PlugComponent::Vacuum => include_str!("../../../examples/plant/vacuum-gripper.yaml"),
     }
 }
 
@@ -95,7 +95,7 @@ mod tests {
 
     #[test]
     fn the_examples_are_those_of_the_story() {
-        for part in Part::ALL {
+        for part in PlugComponent::ALL {
             let text = yaml(part);
             for line in [
                 format!("component: {}", part.name()),

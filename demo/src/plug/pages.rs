@@ -6,14 +6,14 @@ use serde::Deserialize;
 use serde_json::Value;
 
 use super::STATE;
-use super::fact::{Fact, Level, Part, Run};
+use super::fact::{Fact, MesRun, PlugComponent, VisibilityLevel};
 
 /// A fact and its time, in nanoseconds since 1970.
 pub(crate) type Dated = (i64, Fact);
 
 /// The kind of a status page.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Page {
+pub(crate) enum StatusPageKind {
     Lds,
     Mes,
     Server,
@@ -23,12 +23,12 @@ pub(crate) enum Page {
 
 /// The last state of a status page.
 #[derive(Debug)]
-pub(crate) struct Reader {
+pub(crate) struct StatusPageReader {
     program: &'static str,
-    page: Page,
+    page: StatusPageKind,
     ready: bool,
-    there: BTreeSet<(Part, Level)>,
-    runs: BTreeMap<usize, Run>,
+    there: BTreeSet<(PlugComponent, VisibilityLevel)>,
+    runs: BTreeMap<usize, MesRun>,
 }
 
 #[derive(Debug, Default, Deserialize)]
@@ -54,7 +54,7 @@ struct Announced {
 #[serde(default)]
 struct MesPage {
     components: Vec<Component>,
-    runs: Vec<Run>,
+    runs: Vec<MesRun>,
 }
 
 #[derive(Debug, Deserialize)]
@@ -77,8 +77,8 @@ struct Topic {
     delivered: u64,
 }
 
-impl Reader {
-    pub(crate) const fn new(program: &'static str, page: Page) -> Self {
+impl StatusPageReader {
+    pub(crate) const fn new(program: &'static str, page: StatusPageKind) -> Self {
         Self {
             program,
             page,
@@ -90,7 +90,7 @@ impl Reader {
 
     /// Returns whether the page provides no further facts.
     pub(crate) fn is_done(&self) -> bool {
-        self.page == Page::Bridge && self.ready
+        self.page == StatusPageKind::Bridge && self.ready
     }
 
     /// Returns the changes of the page at `now_ns`.
@@ -109,10 +109,10 @@ impl Reader {
             facts.push((now_ns, Fact::Ready(self.program)));
         }
         match self.page {
-            Page::Lds => self.read_lds(now_ns, &part(page), &mut facts),
-            Page::Mes => self.read_mes(now_ns, part(page), &mut facts),
-            Page::Server => self.read_server(now_ns, &part(page), &mut facts),
-            Page::Bridge => {}
+            StatusPageKind::Lds => self.read_lds(now_ns, &part(page), &mut facts),
+            StatusPageKind::Mes => self.read_mes(now_ns, part(page), &mut facts),
+            StatusPageKind::Server => self.read_server(now_ns, &part(page), &mut facts),
+            StatusPageKind::Bridge => {}
         }
         facts
     }
@@ -121,33 +121,33 @@ impl Reader {
         let registered = page
             .servers
             .iter()
-            .filter_map(|server| Some((Part::of_uri(&server.uri)?, server.since_ms)));
-        self.tell(now_ns, Level::Registered, registered, facts);
+            .filter_map(|server| Some((PlugComponent::of_uri(&server.uri)?, server.since_ms)));
+        self.tell(now_ns, VisibilityLevel::Registered, registered, facts);
         // The mDNS name is the name of the server with a suffix that makes it unique.
         let announced = page.network.iter().filter_map(|record| {
-            let part = Part::ALL.into_iter().find(|part| {
+            let part = PlugComponent::ALL.into_iter().find(|part| {
                 let rest = record.name.strip_prefix(part.name());
                 rest.is_some_and(|rest| rest.is_empty() || rest.starts_with('-'))
             })?;
             Some((part, record.since_ms))
         });
-        self.tell(now_ns, Level::Announced, announced, facts);
+        self.tell(now_ns, VisibilityLevel::Announced, announced, facts);
     }
 
     fn read_mes(&mut self, now_ns: i64, page: MesPage, facts: &mut Vec<Dated>) {
-        let of = |component: &Component| Part::of_uri(&component.application_uri);
+        let of = |component: &Component| PlugComponent::of_uri(&component.application_uri);
         let listed = page.components.iter().filter_map(|component| {
             Some((
                 of(component)?,
                 component.listed_ms.unwrap_or(component.since_ms),
             ))
         });
-        self.tell(now_ns, Level::Listed, listed, facts);
+        self.tell(now_ns, VisibilityLevel::Listed, listed, facts);
         let known = page
             .components
             .iter()
             .filter_map(|component| Some((of(component)?, component.since_ms)));
-        self.tell(now_ns, Level::InGraph, known, facts);
+        self.tell(now_ns, VisibilityLevel::InGraph, known, facts);
         for (number, run) in page.runs.into_iter().enumerate() {
             if self.runs.get(&number) != Some(&run) {
                 facts.push((now_ns, Fact::Run(number, run.clone())));
@@ -157,14 +157,14 @@ impl Reader {
     }
 
     fn read_server(&mut self, now_ns: i64, page: &ServerPage, facts: &mut Vec<Dated>) {
-        for part in Part::ALL {
+        for part in PlugComponent::ALL {
             let topic = format!("ua_0_{}_{STATE}", part.namespace());
             let has_value = page
                 .topics
                 .get(&topic)
                 .is_some_and(|topic| topic.delivered > 0);
-            if has_value && self.there.insert((part, Level::AtServer)) {
-                facts.push((now_ns, Fact::Reached(part, Level::AtServer)));
+            if has_value && self.there.insert((part, VisibilityLevel::AtServer)) {
+                facts.push((now_ns, Fact::Reached(part, VisibilityLevel::AtServer)));
             }
         }
     }
@@ -172,17 +172,17 @@ impl Reader {
     fn tell(
         &mut self,
         now_ns: i64,
-        level: Level,
-        there: impl Iterator<Item = (Part, u64)>,
+        level: VisibilityLevel,
+        there: impl Iterator<Item = (PlugComponent, u64)>,
         facts: &mut Vec<Dated>,
     ) {
-        let there: BTreeMap<Part, u64> = there.collect();
+        let there: BTreeMap<PlugComponent, u64> = there.collect();
         for (part, since_ms) in &there {
             if self.there.insert((*part, level)) {
                 facts.push((nanos(*since_ms), Fact::Reached(*part, level)));
             }
         }
-        for part in Part::ALL {
+        for part in PlugComponent::ALL {
             if !there.contains_key(&part) && self.there.remove(&(part, level)) {
                 facts.push((now_ns, Fact::Left(part, level)));
             }
@@ -212,19 +212,25 @@ mod tests {
 
     #[test]
     fn a_component_comes_once_and_goes_once() {
-        let mut lds = Reader::new("ua-lds", Page::Lds);
+        let mut lds = StatusPageReader::new("ua-lds", StatusPageKind::Lds);
         let page = json!({
             "program": "ua-lds", "not_ready": [], "since_ms": 1,
             "servers": [{"uri": "urn:example:gripper", "name": "parallel-gripper", "urls": [], "since_ms": 5}],
             "network": [{"record_id": 1, "name": "parallel-gripper-host-4711", "url": "", "since_ms": 4}],
         });
-        let gripper = Part::Gripper;
+        let gripper = PlugComponent::Gripper;
         assert_eq!(
             lds.read(9, &page),
             [
                 (9, Fact::Ready("ua-lds")),
-                (5_000_000, Fact::Reached(gripper, Level::Registered)),
-                (4_000_000, Fact::Reached(gripper, Level::Announced)),
+                (
+                    5_000_000,
+                    Fact::Reached(gripper, VisibilityLevel::Registered)
+                ),
+                (
+                    4_000_000,
+                    Fact::Reached(gripper, VisibilityLevel::Announced)
+                ),
             ]
         );
         assert_eq!(lds.read(10, &page), []);
@@ -232,8 +238,8 @@ mod tests {
         assert_eq!(
             lds.read(11, &gone),
             [
-                (11, Fact::Left(gripper, Level::Registered)),
-                (11, Fact::Left(gripper, Level::Announced)),
+                (11, Fact::Left(gripper, VisibilityLevel::Registered)),
+                (11, Fact::Left(gripper, VisibilityLevel::Announced)),
             ]
         );
         assert_eq!(lds.read(12, &gone), []);
@@ -241,14 +247,14 @@ mod tests {
 
     #[test]
     fn names_that_only_begin_alike_are_others() {
-        let mut lds = Reader::new("ua-lds", Page::Lds);
+        let mut lds = StatusPageReader::new("ua-lds", StatusPageKind::Lds);
         let page = json!({"network": [{"name": "robotics-host-1", "since_ms": 4}]});
         assert_eq!(lds.read(9, &page), [(9, Fact::Ready("ua-lds"))]);
     }
 
     #[test]
     fn a_program_that_says_why_it_is_not_ready_is_not() {
-        let mut bridge = Reader::new("bridge-ros2", Page::Bridge);
+        let mut bridge = StatusPageReader::new("bridge-ros2", StatusPageKind::Bridge);
         let page = |why: &[&str]| json!([{"not_ready": []}, {"not_ready": why}]);
         assert_eq!(bridge.read(1, &page(&["no master"])), []);
         assert!(!bridge.is_done());
@@ -261,7 +267,7 @@ mod tests {
 
     #[test]
     fn a_run_is_told_when_it_changes() {
-        let mut mes = Reader::new("ua-mes", Page::Mes);
+        let mut mes = StatusPageReader::new("ua-mes", StatusPageKind::Mes);
         let page = |outcome: &str| {
             json!({
                 "components": [{"application_uri": "urn:example:robot", "name": "robot", "skills": 2, "since_ms": 8, "listed_ms": 7}],
@@ -270,8 +276,14 @@ mod tests {
             })
         };
         let facts = mes.read(1, &page("running"));
-        assert!(facts.contains(&(7_000_000, Fact::Reached(Part::Robot, Level::Listed))));
-        assert!(facts.contains(&(8_000_000, Fact::Reached(Part::Robot, Level::InGraph))));
+        assert!(facts.contains(&(
+            7_000_000,
+            Fact::Reached(PlugComponent::Robot, VisibilityLevel::Listed)
+        )));
+        assert!(facts.contains(&(
+            8_000_000,
+            Fact::Reached(PlugComponent::Robot, VisibilityLevel::InGraph)
+        )));
         let run = facts.iter().find_map(|(_, fact)| {
             if let Fact::Run(0, run) = fact {
                 Some(run)
@@ -289,13 +301,16 @@ mod tests {
 
     #[test]
     fn the_server_has_seen_a_component_when_it_has_a_value_of_it() {
-        let mut server = Reader::new("ua-server", Page::Server);
+        let mut server = StatusPageReader::new("ua-server", StatusPageKind::Server);
         let page =
             |delivered: u64| json!({"topics": {"ua_0_8_101": {"delivered": delivered, "sent": 0}}});
         assert_eq!(server.read(1, &page(0)), [(1, Fact::Ready("ua-server"))]);
         assert_eq!(
             server.read(2, &page(1)),
-            [(2, Fact::Reached(Part::Vacuum, Level::AtServer))]
+            [(
+                2,
+                Fact::Reached(PlugComponent::Vacuum, VisibilityLevel::AtServer)
+            )]
         );
     }
 }

@@ -5,25 +5,25 @@ use std::fmt::Write as _;
 
 use serde::Serialize;
 
-use super::fact::{Asked, Level, Part, Ros};
-use super::story::{Grasp, LOST_FROM, Story};
+use super::fact::{CanRunAnswer, PlugComponent, Ros, VisibilityLevel};
+use super::story::{Grasp, LOST_FROM, PlugStory};
 use crate::pace::Speed;
 
 /// The outcome, as printed by `--json`. Times are in milliseconds; `null` for events that have not
 /// happened.
 #[derive(Clone, Debug, PartialEq, Serialize)]
-pub(crate) struct Report {
+pub(crate) struct PlugReport {
     finished: bool,
     failure: Option<String>,
     speed: f64,
     manifest: String,
     /// By component: time from the start of its process until it is known at a level.
-    components: BTreeMap<Part, BTreeMap<Level, Option<f64>>>,
+    components: BTreeMap<PlugComponent, BTreeMap<VisibilityLevel, Option<f64>>>,
     /// By node: times from its request.
     grasps: BTreeMap<Ros, GraspTimes>,
     runs: Vec<RunTimes>,
     loss: Loss,
-    question: Option<Asked>,
+    question: Option<CanRunAnswer>,
 }
 
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
@@ -48,18 +48,23 @@ struct RunTimes {
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 struct Loss {
     /// Time from the signal until the gripper is no longer known at a level.
-    lost_ms: BTreeMap<Level, Option<f64>>,
+    lost_ms: BTreeMap<VisibilityLevel, Option<f64>>,
     /// Time from the signal to the end of the plan, including the retreat of the robot.
     halted_and_retreated_ms: Option<f64>,
     /// Time from the start of the other gripper's process to the next plan.
     planned_anew_ms: Option<f64>,
 }
 
-impl Report {
-    pub(crate) fn of(story: &Story, speed: Speed, manifest: &str, failure: Option<String>) -> Self {
+impl PlugReport {
+    pub(crate) fn of(
+        story: &PlugStory,
+        speed: Speed,
+        manifest: &str,
+        failure: Option<String>,
+    ) -> Self {
         let levels = |part| {
             let level = |level| (level, story.after_start(part, level));
-            Level::ALL.into_iter().map(level).collect()
+            VisibilityLevel::ALL.into_iter().map(level).collect()
         };
         let runs = story.runs.values().map(|run| RunTimes {
             outcome: run.outcome.clone(),
@@ -76,7 +81,7 @@ impl Report {
             failure,
             speed: speed.factor(),
             manifest: manifest.to_owned(),
-            components: Part::ALL
+            components: PlugComponent::ALL
                 .into_iter()
                 .map(|part| (part, levels(part)))
                 .collect(),
@@ -115,15 +120,15 @@ impl Report {
             ["robot", "gripper", "vacuum"],
             "published",
         );
-        let known = |level: Level| Part::ALL.map(|part| self.known(part, level));
+        let known = |level: VisibilityLevel| PlugComponent::ALL.map(|part| self.known(part, level));
         let published = |level| {
-            if level == Level::Announced {
+            if level == VisibilityLevel::Announced {
                 "under 1 s, and 7 s"
             } else {
                 "-"
             }
         };
-        for level in Level::ALL {
+        for level in VisibilityLevel::ALL {
             let label = format!("process start to {}", short(level));
             row(
                 &mut text,
@@ -132,10 +137,10 @@ impl Report {
                 published(level),
             );
         }
-        let listed = Part::ALL.map(|part| {
-            let announced = self.known(part, Level::Announced)?;
-            let registered = self.known(part, Level::Registered)?;
-            Some((self.known(part, Level::Listed)? - announced.min(registered)).max(0.0))
+        let listed = PlugComponent::ALL.map(|part| {
+            let announced = self.known(part, VisibilityLevel::Announced)?;
+            let registered = self.known(part, VisibilityLevel::Registered)?;
+            Some((self.known(part, VisibilityLevel::Listed)? - announced.min(registered)).max(0.0))
         });
         row(
             &mut text,
@@ -183,7 +188,7 @@ impl Report {
         text
     }
 
-    fn known(&self, part: Part, level: Level) -> Option<f64> {
+    fn known(&self, part: PlugComponent, level: VisibilityLevel) -> Option<f64> {
         self.components.get(&part)?.get(&level).copied().flatten()
     }
 }
@@ -211,16 +216,16 @@ impl GraspTimes {
 }
 
 /// Returns a short label of a level.
-const fn short(level: Level) -> &'static str {
+const fn short(level: VisibilityLevel) -> &'static str {
     match level {
-        Level::Announced => "heard by mDNS",
-        Level::Registered => "registered",
-        Level::Listed => "skills listed",
-        Level::InGraph => "in the graph",
-        Level::InSpace => "in the space",
-        Level::AtServer => "seen by ua-server",
-        Level::Ros1 => "in ROS 1",
-        Level::Ros2 => "in ROS 2",
+        VisibilityLevel::Announced => "heard by mDNS",
+        VisibilityLevel::Registered => "registered",
+        VisibilityLevel::Listed => "skills listed",
+        VisibilityLevel::InGraph => "in the graph",
+        VisibilityLevel::InSpace => "in the space",
+        VisibilityLevel::AtServer => "seen by ua-server",
+        VisibilityLevel::Ros1 => "in ROS 1",
+        VisibilityLevel::Ros2 => "in ROS 2",
     }
 }
 
@@ -259,14 +264,23 @@ mod tests {
     use super::super::fact::{Fact, NodeEvent};
     use super::*;
 
-    fn story() -> Story {
-        let mut story = Story::new();
+    fn story() -> PlugStory {
+        let mut story = PlugStory::new();
         let ms = 1_000_000;
         for (at, fact) in [
-            (100, Fact::Started(Part::Gripper)),
-            (190, Fact::Reached(Part::Gripper, Level::Registered)),
-            (250, Fact::Reached(Part::Gripper, Level::Announced)),
-            (330, Fact::Reached(Part::Gripper, Level::Listed)),
+            (100, Fact::Started(PlugComponent::Gripper)),
+            (
+                190,
+                Fact::Reached(PlugComponent::Gripper, VisibilityLevel::Registered),
+            ),
+            (
+                250,
+                Fact::Reached(PlugComponent::Gripper, VisibilityLevel::Announced),
+            ),
+            (
+                330,
+                Fact::Reached(PlugComponent::Gripper, VisibilityLevel::Listed),
+            ),
             (500, Fact::Node(NodeEvent::Asks { ros: Ros::Ros1 })),
             (
                 512,
@@ -285,7 +299,7 @@ mod tests {
     #[test]
     fn the_json_has_a_time_for_all_that_happened_and_null_for_the_rest() {
         let speed = Speed::new(4.0).unwrap();
-        let report = Report::of(&story(), speed, "a.aml", Some("stuck".to_owned()));
+        let report = PlugReport::of(&story(), speed, "a.aml", Some("stuck".to_owned()));
         let json = serde_json::to_value(&report).unwrap();
         assert_eq!(json["finished"], false);
         assert_eq!(json["failure"], "stuck");
@@ -315,7 +329,7 @@ mod tests {
 
     #[test]
     fn skills_are_listed_after_the_first_word_of_the_component() {
-        let table = Report::of(&story(), Speed::new(1.0).unwrap(), "a.aml", None).table();
+        let table = PlugReport::of(&story(), Speed::new(1.0).unwrap(), "a.aml", None).table();
         let line = table
             .lines()
             .find(|line| line.starts_with("announced to skills listed"));

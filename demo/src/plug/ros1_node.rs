@@ -4,26 +4,26 @@
 use anyhow::Context as _;
 use bytes::Bytes;
 use tcpros::{
-    Inbox, InboxEvent, Node, NodeOptions, ServiceClient, ServiceClientOptions, SubscriberOptions,
-    Subscription, Wanted,
+    Inbox, InboxEvent, Node, NodeOptions, RequestedType, ServiceClient, ServiceClientOptions,
+    SubscriberOptions, Subscription,
 };
 use tokio::io::{AsyncBufReadExt as _, BufReader};
 
-use super::fact::{NodeEvent, Part, Ros};
+use super::fact::{NodeEvent, PlugComponent, Ros};
 use super::skill_messages::{SkillResult, SkillState, TRIGGER, trigger_response};
 use super::{CALL_LIMIT, RESET, RESULT, START, STATE, topic};
 use crate::event::tell;
-use crate::stop::Stop;
+use crate::stop::EndSignal;
 
 const ROS: Ros = Ros::Ros1;
 
 /// The namespace and the identifier of a message.
-type Place = (u16, u16);
+type TopicNumbers = (u16, u16);
 
 /// Runs the node until the process is stopped. A line on its standard input starts the gripper's
 /// first skill.
 pub(crate) async fn run() -> anyhow::Result<()> {
-    let mut stop = Stop::new()?;
+    let mut stop = EndSignal::new()?;
     let node = Node::start(NodeOptions::from_env("old_robot"))?;
     let mut inbox = Inbox::new();
     let _subscriptions = subscribe(&node, &inbox)?;
@@ -33,7 +33,12 @@ pub(crate) async fn run() -> anyhow::Result<()> {
         timeout: CALL_LIMIT,
         ..ServiceClientOptions::default()
     };
-    let client = |id| node.service_client(&topic(Part::Gripper.namespace(), id), options.clone());
+    let client = |id| {
+        node.service_client(
+            &topic(PlugComponent::Gripper.namespace(), id),
+            options.clone(),
+        )
+    };
     let (reset, start) = (client(RESET)?, client(START)?);
     let mut halted = false;
     let mut orders = BufReader::new(tokio::io::stdin()).lines();
@@ -89,10 +94,11 @@ async fn trigger(client: &ServiceClient) -> (bool, String) {
     }
 }
 
-fn subscribe(node: &Node, inbox: &Inbox<Place>) -> anyhow::Result<Vec<Subscription>> {
-    let states = Part::ALL.map(|part| (part.namespace(), STATE, "SkillState", SkillState::MD5));
+fn subscribe(node: &Node, inbox: &Inbox<TopicNumbers>) -> anyhow::Result<Vec<Subscription>> {
+    let states =
+        PlugComponent::ALL.map(|part| (part.namespace(), STATE, "SkillState", SkillState::MD5));
     let result = (
-        Part::Gripper.namespace(),
+        PlugComponent::Gripper.namespace(),
         RESULT,
         "SkillResult",
         SkillResult::MD5,
@@ -101,7 +107,7 @@ fn subscribe(node: &Node, inbox: &Inbox<Place>) -> anyhow::Result<Vec<Subscripti
         .into_iter()
         .chain([result])
         .map(|(namespace, id, type_name, md5)| {
-            let wanted = Wanted {
+            let wanted = RequestedType {
                 type_name: Some(format!("ua_msgs/{type_name}")),
                 md5sum: Some(md5.to_owned()),
             };
@@ -117,7 +123,7 @@ fn subscribe(node: &Node, inbox: &Inbox<Place>) -> anyhow::Result<Vec<Subscripti
         .collect()
 }
 
-fn heard((namespace, id): Place, event: &InboxEvent) -> Option<NodeEvent> {
+fn heard((namespace, id): TopicNumbers, event: &InboxEvent) -> Option<NodeEvent> {
     let InboxEvent::Message(message) = event else {
         return None;
     };

@@ -17,12 +17,12 @@ use serde::{Deserialize, Serialize};
 use tokio::io::{AsyncBufReadExt as _, BufReader};
 use tokio::time::timeout;
 
-use super::fact::{NodeEvent, Part, Ros};
+use super::fact::{NodeEvent, PlugComponent, Ros};
 use super::skill_messages::{SkillResult, SkillState};
 use super::{CALL_LIMIT, RESET, RESULT, START, STATE, topic};
 use crate::event::tell;
 use crate::line::DOMAIN;
-use crate::stop::Stop;
+use crate::stop::EndSignal;
 
 const ROS: Ros = Ros::Ros2;
 
@@ -50,9 +50,9 @@ type Events = Pin<Box<dyn Stream<Item = NodeEvent>>>;
 /// Runs the node until the process is stopped. A line on its standard input starts the gripper's
 /// first skill.
 pub(crate) async fn run() -> anyhow::Result<()> {
-    let mut stop = Stop::new()?;
+    let mut stop = EndSignal::new()?;
     let mut node = join()?;
-    let states: Vec<(u16, Subscription<SkillState>)> = Part::ALL
+    let states: Vec<(u16, Subscription<SkillState>)> = PlugComponent::ALL
         .into_iter()
         .map(|part| {
             let namespace = part.namespace();
@@ -62,7 +62,7 @@ pub(crate) async fn run() -> anyhow::Result<()> {
             ))
         })
         .collect::<anyhow::Result<_>>()?;
-    let gripper = Part::Gripper.namespace();
+    let gripper = PlugComponent::Gripper.namespace();
     let results: Subscription<SkillResult> =
         subscription(&mut node, (gripper, RESULT), "SkillResult")?;
     let (reset, start) = (client(&mut node, RESET)?, client(&mut node, START)?);
@@ -214,7 +214,7 @@ fn subscription<M: Message + DeserializeOwned + 'static>(
 fn client(node: &mut Node, id: u16) -> anyhow::Result<Trigger> {
     node.create_client(
         ServiceMapping::Enhanced,
-        &ros_name(Part::Gripper.namespace(), id)?,
+        &ros_name(PlugComponent::Gripper.namespace(), id)?,
         &ServiceTypeName::new("std_srvs", "Trigger"),
         LISTENS,
         LISTENS,

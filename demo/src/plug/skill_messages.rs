@@ -107,13 +107,13 @@ pub(crate) const TRIGGER: (&str, &str) = ("std_srvs/Trigger", "937c9679a518e3a18
 
 #[cfg(test)]
 mod tests {
-    use messages::{Dialect, Registry};
+    use messages::{Dialect, TypeRegistry};
 
     use super::*;
 
     #[test]
     fn the_checksums_are_those_of_the_definitions() {
-        let registry = Registry::bundle(Dialect::Ros1);
+        let registry = TypeRegistry::bundle(Dialect::Ros1);
         for (name, md5) in [
             ("ua_msgs/SkillState", SkillState::MD5),
             ("ua_msgs/SkillResult", SkillResult::MD5),

@@ -3,7 +3,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use super::fact::{Asked, Fact, Level, NodeEvent, Part, Ros, Run};
+use super::fact::{CanRunAnswer, Fact, MesRun, NodeEvent, PlugComponent, Ros, VisibilityLevel};
 use super::pages::nanos;
 use super::report::millis;
 
@@ -30,12 +30,12 @@ pub(crate) enum Act {
 
 /// The action at the start of an act.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Order {
-    Plug(Part),
+pub(crate) enum ActStart {
+    Plug(PlugComponent),
     Grasp(Ros),
     /// Runs the process with the MES, as the run with this number, from 0.
     Run(usize),
-    Kill(Part),
+    Kill(PlugComponent),
     Ask,
     /// The scenario is complete.
     End,
@@ -43,18 +43,18 @@ pub(crate) enum Order {
 
 /// All observed facts, and the current act.
 #[derive(Debug)]
-pub(crate) struct Story {
+pub(crate) struct PlugStory {
     act: Act,
     ready: BTreeSet<&'static str>,
     up: BTreeSet<Ros>,
-    pub(crate) started: BTreeMap<Part, i64>,
-    pub(crate) reached: BTreeMap<(Part, Level), i64>,
-    pub(crate) left: BTreeMap<(Part, Level), i64>,
+    pub(crate) started: BTreeMap<PlugComponent, i64>,
+    pub(crate) reached: BTreeMap<(PlugComponent, VisibilityLevel), i64>,
+    pub(crate) left: BTreeMap<(PlugComponent, VisibilityLevel), i64>,
     pub(crate) killed_at: Option<i64>,
     pub(crate) grasps: BTreeMap<Ros, Grasp>,
-    pub(crate) runs: BTreeMap<usize, Run>,
+    pub(crate) runs: BTreeMap<usize, MesRun>,
     calls: BTreeMap<usize, Result<(), String>>,
-    pub(crate) asked: Option<Asked>,
+    pub(crate) asked: Option<CanRunAnswer>,
 }
 
 /// A grasp that was started from ROS, as observed by its node.
@@ -70,7 +70,7 @@ pub(crate) struct Grasp {
     before: Option<(i64, String, u32)>,
 }
 
-impl Story {
+impl PlugStory {
     pub(crate) fn new() -> Self {
         Self {
             act: Act::Cell,
@@ -107,7 +107,7 @@ impl Story {
             Fact::Reached(part, level) => earliest(&mut self.reached, (*part, *level), at_ns),
             // Before the act of the loss, no component is lost.
             Fact::Left(part, level) => {
-                if self.act >= Act::Loss && *part == Part::Gripper {
+                if self.act >= Act::Loss && *part == PlugComponent::Gripper {
                     earliest(&mut self.left, (*part, *level), at_ns);
                 }
             }
@@ -141,12 +141,12 @@ impl Story {
                 state,
                 run,
             } => {
-                let Some(part) = Part::of_namespace(*namespace) else {
+                let Some(part) = PlugComponent::of_namespace(*namespace) else {
                     return;
                 };
                 let level = level(*ros);
                 earliest(&mut self.reached, (part, level), at_ns);
-                if part == Part::Gripper {
+                if part == PlugComponent::Gripper {
                     self.grasp(*ros).saw(at_ns, state, *run);
                 }
             }
@@ -178,7 +178,10 @@ impl Story {
                     .before
                     .as_ref()
                     .is_none_or(|(_, _, before)| run > before);
-                if *namespace == Part::Gripper.namespace() && grasp.asked_at.is_some() && is_new {
+                if *namespace == PlugComponent::Gripper.namespace()
+                    && grasp.asked_at.is_some()
+                    && is_new
+                {
                     let outcome = succeeded.then_some(()).ok_or_else(|| message.clone());
                     grasp.result.get_or_insert((at_ns, outcome));
                 }
@@ -192,15 +195,15 @@ impl Story {
 
     /// Returns the milliseconds from the start of a component's process until it is known at a
     /// level.
-    pub(crate) fn after_start(&self, part: Part, level: Level) -> Option<f64> {
+    pub(crate) fn after_start(&self, part: PlugComponent, level: VisibilityLevel) -> Option<f64> {
         let reached = self.reached.get(&(part, level))?;
         Some(millis(reached - self.started.get(&part)?))
     }
 
     /// Returns the milliseconds from the kill of the gripper until it is no longer known at a
     /// level.
-    pub(crate) fn after_kill(&self, level: Level) -> Option<f64> {
-        let left = self.left.get(&(Part::Gripper, level))?;
+    pub(crate) fn after_kill(&self, level: VisibilityLevel) -> Option<f64> {
+        let left = self.left.get(&(PlugComponent::Gripper, level))?;
         Some(millis(left - self.killed_at?))
     }
 
@@ -213,12 +216,16 @@ impl Story {
     /// Returns the milliseconds from the start of the other gripper's process to the plan with it.
     pub(crate) fn planned_anew_after(&self) -> Option<f64> {
         let plan = self.runs.get(&1)?.plans.get(1)?;
-        Some(millis(nanos(plan.at_ms) - self.started.get(&Part::Vacuum)?))
+        Some(millis(
+            nanos(plan.at_ms) - self.started.get(&PlugComponent::Vacuum)?,
+        ))
     }
 
     /// Returns whether the loss of a component at this level is expected and not known yet.
-    pub(crate) fn loses(&self, part: Part, level: Level) -> bool {
-        self.act >= Act::Loss && part == Part::Gripper && !self.left.contains_key(&(part, level))
+    pub(crate) fn loses(&self, part: PlugComponent, level: VisibilityLevel) -> bool {
+        self.act >= Act::Loss
+            && part == PlugComponent::Gripper
+            && !self.left.contains_key(&(part, level))
     }
 
     /// Returns whether a state of the gripper, as reported by a node, is new in a grasp of this
@@ -245,15 +252,15 @@ impl Story {
     pub(crate) fn missing(&self) -> Result<Vec<String>, String> {
         match self.act {
             Act::Cell => Ok(self.cell_lacks()),
-            Act::Robot => Ok(self.part_lacks(Part::Robot)),
-            Act::Gripper => Ok(self.part_lacks(Part::Gripper)),
+            Act::Robot => Ok(self.part_lacks(PlugComponent::Robot)),
+            Act::Gripper => Ok(self.part_lacks(PlugComponent::Gripper)),
             Act::GraspFromRos2 => self.grasp_lacks(Ros::Ros2),
             Act::GraspFromRos1 => self.grasp_lacks(Ros::Ros1),
             Act::FirstRun => self.run_lacks(0, 1),
             Act::SecondRun => self.holding_lacks(),
             Act::Loss => self.loss_lacks(),
             Act::Vacuum => {
-                let mut lacks = self.part_lacks(Part::Vacuum);
+                let mut lacks = self.part_lacks(PlugComponent::Vacuum);
                 lacks.extend(self.run_lacks(1, 2)?);
                 Ok(lacks)
             }
@@ -263,18 +270,18 @@ impl Story {
     }
 
     /// Proceeds to the next act. Returns its action.
-    pub(crate) fn advance(&mut self) -> Order {
+    pub(crate) fn advance(&mut self) -> ActStart {
         let (act, order) = match self.act {
-            Act::Cell => (Act::Robot, Order::Plug(Part::Robot)),
-            Act::Robot => (Act::Gripper, Order::Plug(Part::Gripper)),
-            Act::Gripper => (Act::GraspFromRos2, Order::Grasp(Ros::Ros2)),
-            Act::GraspFromRos2 => (Act::GraspFromRos1, Order::Grasp(Ros::Ros1)),
-            Act::GraspFromRos1 => (Act::FirstRun, Order::Run(0)),
-            Act::FirstRun => (Act::SecondRun, Order::Run(1)),
-            Act::SecondRun => (Act::Loss, Order::Kill(Part::Gripper)),
-            Act::Loss => (Act::Vacuum, Order::Plug(Part::Vacuum)),
-            Act::Vacuum => (Act::Question, Order::Ask),
-            Act::Question | Act::End => (Act::End, Order::End),
+            Act::Cell => (Act::Robot, ActStart::Plug(PlugComponent::Robot)),
+            Act::Robot => (Act::Gripper, ActStart::Plug(PlugComponent::Gripper)),
+            Act::Gripper => (Act::GraspFromRos2, ActStart::Grasp(Ros::Ros2)),
+            Act::GraspFromRos2 => (Act::GraspFromRos1, ActStart::Grasp(Ros::Ros1)),
+            Act::GraspFromRos1 => (Act::FirstRun, ActStart::Run(0)),
+            Act::FirstRun => (Act::SecondRun, ActStart::Run(1)),
+            Act::SecondRun => (Act::Loss, ActStart::Kill(PlugComponent::Gripper)),
+            Act::Loss => (Act::Vacuum, ActStart::Plug(PlugComponent::Vacuum)),
+            Act::Vacuum => (Act::Question, ActStart::Ask),
+            Act::Question | Act::End => (Act::End, ActStart::End),
         };
         self.act = act;
         order
@@ -292,8 +299,8 @@ impl Story {
         programs.chain(nodes).collect()
     }
 
-    fn part_lacks(&self, part: Part) -> Vec<String> {
-        Level::ALL
+    fn part_lacks(&self, part: PlugComponent) -> Vec<String> {
+        VisibilityLevel::ALL
             .into_iter()
             .filter(|level| !self.reached.contains_key(&(part, *level)))
             .map(|level| format!("{}: not {}", part.name(), level.label()))
@@ -367,7 +374,7 @@ impl Story {
                 standing(run)
             ));
         }
-        let carries = |plan: &super::fact::Plan| {
+        let carries = |plan: &super::fact::RunPlan| {
             let mut steps = plan.ran.iter().map(|ran| ran.step.as_str());
             steps.any(|step| CARRYING.contains(&step))
         };
@@ -381,8 +388,14 @@ impl Story {
     fn loss_lacks(&self) -> Result<Vec<String>, String> {
         let mut lacks: Vec<String> = LOST_FROM
             .into_iter()
-            .filter(|level| !self.left.contains_key(&(Part::Gripper, *level)))
-            .map(|level| format!("{} is still {}", Part::Gripper.name(), level.label()))
+            .filter(|level| !self.left.contains_key(&(PlugComponent::Gripper, *level)))
+            .map(|level| {
+                format!(
+                    "{} is still {}",
+                    PlugComponent::Gripper.name(),
+                    level.label()
+                )
+            })
             .collect();
         let plan = self.runs.get(&1).and_then(|run| run.plans.first());
         match plan.map(|plan| (plan.outcome.as_str(), &plan.reason, plan.retreated)) {
@@ -439,10 +452,10 @@ impl Grasp {
     }
 }
 
-const fn level(ros: Ros) -> Level {
+const fn level(ros: Ros) -> VisibilityLevel {
     match ros {
-        Ros::Ros1 => Level::Ros1,
-        Ros::Ros2 => Level::Ros2,
+        Ros::Ros1 => VisibilityLevel::Ros1,
+        Ros::Ros2 => VisibilityLevel::Ros2,
     }
 }
 
@@ -454,7 +467,7 @@ fn earliest<K: Ord>(times: &mut BTreeMap<K, i64>, key: K, at_ns: i64) {
 }
 
 /// Describes the state of a run for people.
-fn standing(run: &Run) -> String {
+fn standing(run: &MesRun) -> String {
     if let Some(what) = &run.waits_for {
         return format!("it waits for {what}");
     }
@@ -479,11 +492,11 @@ pub(crate) const PROGRAMS: [&str; 5] = [
 ];
 
 /// The levels at which a killed component must no longer be known.
-pub(crate) const LOST_FROM: [Level; 4] = [
-    Level::Announced,
-    Level::Registered,
-    Level::InGraph,
-    Level::Ros1,
+pub(crate) const LOST_FROM: [VisibilityLevel; 4] = [
+    VisibilityLevel::Announced,
+    VisibilityLevel::Registered,
+    VisibilityLevel::InGraph,
+    VisibilityLevel::Ros1,
 ];
 
 /// Steps of the composite in which the gripper holds the part without running a skill.

@@ -4,15 +4,15 @@ use std::net::{Ipv4Addr, SocketAddr, SocketAddrV4};
 use std::time::Duration;
 
 use serde_json::Value;
-use tcpros::Graph;
+use tcpros::MasterGraph;
 use tokio::sync::mpsc;
 use tokio::task::JoinSet;
 use tokio::time::{MissedTickBehavior, interval};
-use transport::{Options, Udp};
+use transport::{Udp, UdpOptions};
 use uadp::{NetworkMessage, PublisherId};
 
-use super::fact::{Fact, Level, Part};
-use super::pages::{Dated, Page, Reader};
+use super::fact::{Fact, PlugComponent, VisibilityLevel};
+use super::pages::{Dated, StatusPageKind, StatusPageReader};
 use super::{START, topic};
 use crate::clock::wall_nanos;
 use crate::stage::{LOOPBACK, fetch};
@@ -42,8 +42,12 @@ impl Watchers {
     }
 
     /// Observes the status page of a program at a port.
-    pub(crate) fn page(&mut self, program: &'static str, page: Page, port: u16) {
-        self.spawn(watch_page(Reader::new(program, page), port, self.facts()));
+    pub(crate) fn page(&mut self, program: &'static str, page: StatusPageKind, port: u16) {
+        self.spawn(watch_page(
+            StatusPageReader::new(program, page),
+            port,
+            self.facts(),
+        ));
     }
 
     /// Listens in the PubSub group on the loopback interface.
@@ -51,9 +55,9 @@ impl Watchers {
     /// # Errors
     /// The group cannot be joined.
     pub(crate) fn group(&mut self) -> std::io::Result<()> {
-        let options = Options {
+        let options = UdpOptions {
             interface: Some(LOOPBACK.to_owned()),
-            ..Options::new(GROUP)
+            ..UdpOptions::new(GROUP)
         };
         let udp = Udp::open(&options).map_err(std::io::Error::other)?;
         self.spawn(listen(udp, self.facts()));
@@ -66,7 +70,7 @@ impl Watchers {
     }
 }
 
-async fn watch_page(mut reader: Reader, port: u16, facts: mpsc::Sender<Dated>) {
+async fn watch_page(mut reader: StatusPageReader, port: u16, facts: mpsc::Sender<Dated>) {
     let mut ticks = interval(LOOK_EVERY);
     ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
     while !reader.is_done() {
@@ -86,7 +90,7 @@ async fn watch_page(mut reader: Reader, port: u16, facts: mpsc::Sender<Dated>) {
 async fn listen(mut udp: Udp, facts: mpsc::Sender<Dated>) {
     let mut buffer = vec![0; MOST_BYTES];
     let mut heard = Vec::new();
-    while heard.len() < Part::ALL.len() {
+    while heard.len() < PlugComponent::ALL.len() {
         let Ok((length, _)) = udp.recv(&mut buffer).await else {
             tokio::time::sleep(LOOK_EVERY).await;
             continue;
@@ -96,7 +100,7 @@ async fn listen(mut udp: Udp, facts: mpsc::Sender<Dated>) {
         };
         if !heard.contains(&part) {
             heard.push(part);
-            let fact = (wall_nanos(), Fact::Reached(part, Level::InSpace));
+            let fact = (wall_nanos(), Fact::Reached(part, VisibilityLevel::InSpace));
             if facts.send(fact).await.is_err() {
                 return;
             }
@@ -105,12 +109,12 @@ async fn listen(mut udp: Udp, facts: mpsc::Sender<Dated>) {
 }
 
 /// Returns the component of the values in a datagram, if any.
-fn value_of(datagram: &[u8]) -> Option<Part> {
+fn value_of(datagram: &[u8]) -> Option<PlugComponent> {
     let message = NetworkMessage::decode(datagram).ok()?;
     if message.publisher_id() != Some(PublisherId::UInt16(0)) || message.is_action() {
         return None;
     }
-    let part = Part::of_namespace(message.group()?.writer_group_id?)?;
+    let part = PlugComponent::of_namespace(message.group()?.writer_group_id?)?;
     let mut messages = message.messages();
     messages
         .any(|message| {
@@ -123,18 +127,21 @@ fn value_of(datagram: &[u8]) -> Option<Part> {
 }
 
 async fn watch_graph(master: String, facts: mpsc::Sender<Dated>) {
-    let service = topic(Part::Gripper.namespace(), START);
+    let service = topic(PlugComponent::Gripper.namespace(), START);
     let mut ticks = interval(LOOK_EVERY);
     ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
     let mut was_there = false;
     loop {
         ticks.tick().await;
-        let Ok(graph) = Graph::of_master(&master, "/demo").await else {
+        let Ok(graph) = MasterGraph::of_master(&master, "/demo").await else {
             continue;
         };
         let is_there = graph.services.contains_key(&service);
         if was_there && !is_there {
-            let fact = (wall_nanos(), Fact::Left(Part::Gripper, Level::Ros1));
+            let fact = (
+                wall_nanos(),
+                Fact::Left(PlugComponent::Gripper, VisibilityLevel::Ros1),
+            );
             if facts.send(fact).await.is_err() {
                 return;
             }

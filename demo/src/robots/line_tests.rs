@@ -3,9 +3,9 @@
 use std::collections::VecDeque;
 use std::time::Duration;
 
-use super::niryo::{Heard, Niryo, NiryoEvent};
+use super::niryo::{ArmInput, Niryo, NiryoEvent};
 use super::turtlebot::{Turtlebot, TurtlebotEvent};
-use crate::pace::{Pace, Speed};
+use crate::pace::{LinePace, Speed};
 
 /// The outcome of a run of the line.
 #[derive(Debug, Default)]
@@ -41,7 +41,7 @@ impl<T> Channel<T> {
 /// Simulates the line in steps of 10 ms. Every `keep`th of the repeated reports arrives, the others
 /// are lost.
 fn play(covers: u32, off_at: u64, delay: Duration, keep: u32) -> Outcome {
-    let pace = Pace::at(Speed::new(1.0).unwrap());
+    let pace = LinePace::at(Speed::new(1.0).unwrap());
     let (mut niryo, mut turtlebot) = (Niryo::new(covers, pace), Turtlebot::new(pace));
     let mut counts = Channel {
         delay,
@@ -56,14 +56,14 @@ fn play(covers: u32, off_at: u64, delay: Duration, keep: u32) -> Outcome {
     for tick in 0..100_000_u32 {
         let now = Duration::from_millis(10) * tick;
         let on = now < Duration::from_secs(off_at);
-        let mut told = niryo.handle(Heard::Switch(on), now);
+        let mut told = niryo.handle(ArmInput::Switch(on), now);
         if tick.is_multiple_of(50) && (tick / 50).is_multiple_of(keep) {
             counts.send(niryo.counts().on_turtlebot, now);
             status.send(turtlebot.status(), now);
         }
         while let Some(status) = status.due(now) {
-            told.extend(niryo.handle(Heard::Park(status.park_busy), now));
-            told.extend(niryo.handle(Heard::Bucket(status.bucket_busy), now));
+            told.extend(niryo.handle(ArmInput::Park(status.park_busy), now));
+            told.extend(niryo.handle(ArmInput::Bucket(status.bucket_busy), now));
         }
         let mut done = turtlebot.handle(None, now);
         while let Some(count) = counts.due(now) {

@@ -7,11 +7,11 @@ use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
-use crate::pace::Pace;
+use crate::pace::LinePace;
 
 /// An input of the arm.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Heard {
+pub(crate) enum ArmInput {
     /// The switch of the conveyor is on or off.
     Switch(bool),
     /// TurtleBot3 is at the park, or is not.
@@ -24,7 +24,7 @@ pub(crate) enum Heard {
 
 /// The outputs of the arm for the line.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) struct Counts {
+pub(crate) struct ArmOutputs {
     pub(crate) conveyor_running: bool,
     pub(crate) in_storage: u32,
     /// Number of covers placed on the conveyor.
@@ -61,8 +61,8 @@ pub(crate) enum WaitCause {
 /// The arm and its conveyor.
 #[derive(Clone, Debug)]
 pub(crate) struct Niryo {
-    pace: Pace,
-    counts: Counts,
+    pace: LinePace,
+    counts: ArmOutputs,
     arm: Arm,
     cycle: u32,
     switch: Option<bool>,
@@ -104,10 +104,10 @@ enum Bucket {
 }
 
 impl Niryo {
-    pub(crate) const fn new(covers: u32, pace: Pace) -> Self {
+    pub(crate) const fn new(covers: u32, pace: LinePace) -> Self {
         Self {
             pace,
-            counts: Counts {
+            counts: ArmOutputs {
                 conveyor_running: false,
                 in_storage: covers,
                 on_conveyor: 0,
@@ -121,13 +121,13 @@ impl Niryo {
         }
     }
 
-    pub(crate) fn handle(&mut self, heard: Heard, now: Duration) -> Vec<NiryoEvent> {
+    pub(crate) fn handle(&mut self, heard: ArmInput, now: Duration) -> Vec<NiryoEvent> {
         let mut events = Vec::new();
         match heard {
-            Heard::Switch(on) => self.hear_switch(on, now, &mut events),
-            Heard::Park(busy) => self.hear_park(busy),
-            Heard::Bucket(busy) => self.hear_bucket(busy, now),
-            Heard::Nothing => {}
+            ArmInput::Switch(on) => self.hear_switch(on, now, &mut events),
+            ArmInput::Park(busy) => self.hear_park(busy),
+            ArmInput::Bucket(busy) => self.hear_bucket(busy, now),
+            ArmInput::Nothing => {}
         }
         while let Some(event) = self.step(now) {
             events.extend(event);
@@ -135,7 +135,7 @@ impl Niryo {
         events
     }
 
-    pub(crate) const fn counts(&self) -> Counts {
+    pub(crate) const fn counts(&self) -> ArmOutputs {
         self.counts
     }
 
@@ -258,7 +258,7 @@ mod tests {
     use crate::pace::Speed;
 
     fn niryo(covers: u32) -> Niryo {
-        Niryo::new(covers, Pace::at(Speed::new(1.0).unwrap()))
+        Niryo::new(covers, LinePace::at(Speed::new(1.0).unwrap()))
     }
 
     /// Lets time pass until `end`, calling the arm at each of its timeouts.
@@ -267,7 +267,7 @@ mod tests {
         while let Some(at) = niryo.timeout().filter(|at| *at <= end) {
             events.extend(
                 niryo
-                    .handle(Heard::Nothing, at)
+                    .handle(ArmInput::Nothing, at)
                     .into_iter()
                     .map(|event| (at, event)),
             );
@@ -282,11 +282,11 @@ mod tests {
     #[test]
     fn it_does_not_begin_before_the_switch_is_heard() {
         let mut arm = niryo(4);
-        arm.handle(Heard::Park(true), s(1));
-        arm.handle(Heard::Bucket(false), s(1));
+        arm.handle(ArmInput::Park(true), s(1));
+        arm.handle(ArmInput::Bucket(false), s(1));
         assert_eq!(arm.timeout(), None);
         assert_eq!(
-            arm.handle(Heard::Switch(true), s(2)),
+            arm.handle(ArmInput::Switch(true), s(2)),
             [NiryoEvent::ConveyorStarted]
         );
         assert_eq!(arm.timeout(), Some(s(4)));
@@ -295,15 +295,15 @@ mod tests {
     #[test]
     fn a_repeated_switch_is_no_news() {
         let mut arm = niryo(4);
-        arm.handle(Heard::Switch(true), s(0));
-        assert_eq!(arm.handle(Heard::Switch(true), s(1)), []);
+        arm.handle(ArmInput::Switch(true), s(0));
+        assert_eq!(arm.handle(ArmInput::Switch(true), s(1)), []);
         assert_eq!(arm.timeout(), Some(s(2)), "the first rest goes on");
     }
 
     #[test]
     fn with_a_running_conveyor_every_cover_goes_there() {
         let mut arm = niryo(2);
-        arm.handle(Heard::Switch(true), s(0));
+        arm.handle(ArmInput::Switch(true), s(0));
         let events = run_until(&mut arm, s(100));
         assert_eq!(
             events,
@@ -323,13 +323,13 @@ mod tests {
     #[test]
     fn a_cover_held_while_the_conveyor_stops_goes_to_turtlebot3() {
         let mut arm = niryo(4);
-        arm.handle(Heard::Park(true), s(0));
-        arm.handle(Heard::Bucket(false), s(0));
-        arm.handle(Heard::Switch(true), s(0));
+        arm.handle(ArmInput::Park(true), s(0));
+        arm.handle(ArmInput::Bucket(false), s(0));
+        arm.handle(ArmInput::Switch(true), s(0));
         run_until(&mut arm, s(25));
         assert_eq!(arm.counts().on_conveyor, 2);
         assert_eq!(
-            arm.handle(Heard::Switch(false), s(25)),
+            arm.handle(ArmInput::Switch(false), s(25)),
             [NiryoEvent::ConveyorStopped {
                 holding_cover: true
             }]
@@ -346,16 +346,20 @@ mod tests {
     #[test]
     fn with_an_empty_park_it_waits_until_turtlebot3_stands_there() {
         let mut arm = niryo(1);
-        arm.handle(Heard::Park(false), s(0));
-        arm.handle(Heard::Bucket(false), s(0));
-        arm.handle(Heard::Switch(false), s(0));
+        arm.handle(ArmInput::Park(false), s(0));
+        arm.handle(ArmInput::Bucket(false), s(0));
+        arm.handle(ArmInput::Switch(false), s(0));
         let waits = NiryoEvent::Waits {
             cause: WaitCause::ParkFree,
         };
         assert_eq!(run_until(&mut arm, s(60)).last(), Some(&(s(9), waits)));
-        assert_eq!(arm.handle(Heard::Park(false), s(61)), [], "it says so once");
         assert_eq!(
-            arm.handle(Heard::Park(true), s(62)),
+            arm.handle(ArmInput::Park(false), s(61)),
+            [],
+            "it says so once"
+        );
+        assert_eq!(
+            arm.handle(ArmInput::Park(true), s(62)),
             [NiryoEvent::PlacedOnTurtlebot { total: 1 }]
         );
     }
@@ -363,13 +367,13 @@ mod tests {
     #[test]
     fn a_busy_bucket_makes_it_wait() {
         let mut arm = niryo(1);
-        arm.handle(Heard::Park(true), s(0));
-        arm.handle(Heard::Bucket(true), s(0));
-        arm.handle(Heard::Switch(false), s(0));
+        arm.handle(ArmInput::Park(true), s(0));
+        arm.handle(ArmInput::Bucket(true), s(0));
+        arm.handle(ArmInput::Switch(false), s(0));
         run_until(&mut arm, s(60));
         assert_eq!(arm.counts().on_turtlebot, 0);
         assert_eq!(
-            arm.handle(Heard::Bucket(false), s(62)),
+            arm.handle(ArmInput::Bucket(false), s(62)),
             [NiryoEvent::PlacedOnTurtlebot { total: 1 }]
         );
     }
@@ -377,8 +381,8 @@ mod tests {
     #[test]
     fn not_knowing_turtlebot3_is_no_permission() {
         let mut arm = niryo(1);
-        arm.handle(Heard::Switch(false), s(0));
-        arm.handle(Heard::Park(true), s(1));
+        arm.handle(ArmInput::Switch(false), s(0));
+        arm.handle(ArmInput::Park(true), s(1));
         let waits = NiryoEvent::Waits {
             cause: WaitCause::Unknown,
         };
@@ -388,9 +392,9 @@ mod tests {
     /// Returns an arm that has just placed its first of two covers on TurtleBot3, at second 9.
     fn after_the_first_on_turtlebot3() -> Niryo {
         let mut arm = niryo(2);
-        arm.handle(Heard::Park(true), s(0));
-        arm.handle(Heard::Bucket(false), s(0));
-        arm.handle(Heard::Switch(false), s(0));
+        arm.handle(ArmInput::Park(true), s(0));
+        arm.handle(ArmInput::Bucket(false), s(0));
+        arm.handle(ArmInput::Switch(false), s(0));
         run_until(&mut arm, s(9));
         assert_eq!(arm.counts().on_turtlebot, 1);
         arm
@@ -399,8 +403,8 @@ mod tests {
     #[test]
     fn a_late_report_of_a_free_bucket_brings_no_second_cover_into_it() {
         let mut arm = after_the_first_on_turtlebot3();
-        arm.handle(Heard::Bucket(false), s(10));
-        arm.handle(Heard::Park(true), s(10));
+        arm.handle(ArmInput::Bucket(false), s(10));
+        arm.handle(ArmInput::Park(true), s(10));
         run_until(&mut arm, s(20));
         assert_eq!(arm.counts().on_turtlebot, 1);
     }
@@ -410,19 +414,19 @@ mod tests {
         let mut arm = after_the_first_on_turtlebot3();
         run_until(&mut arm, s(20));
         // All reports of busy and away were lost; this report is much later.
-        let events = arm.handle(Heard::Bucket(false), s(40));
+        let events = arm.handle(ArmInput::Bucket(false), s(40));
         assert_eq!(events, [NiryoEvent::PlacedOnTurtlebot { total: 2 }]);
     }
 
     #[test]
     fn a_bucket_that_comes_back_free_takes_the_next_cover() {
         let mut arm = after_the_first_on_turtlebot3();
-        arm.handle(Heard::Bucket(true), s(10));
-        arm.handle(Heard::Park(false), s(11));
+        arm.handle(ArmInput::Bucket(true), s(10));
+        arm.handle(ArmInput::Park(false), s(11));
         run_until(&mut arm, s(20));
-        arm.handle(Heard::Bucket(false), s(21));
+        arm.handle(ArmInput::Bucket(false), s(21));
         assert_eq!(arm.counts().on_turtlebot, 1, "the park is free");
-        let events = arm.handle(Heard::Park(true), s(28));
+        let events = arm.handle(ArmInput::Park(true), s(28));
         assert_eq!(events, [NiryoEvent::PlacedOnTurtlebot { total: 2 }]);
         assert_eq!(
             run_until(&mut arm, s(40)).last(),
@@ -434,10 +438,10 @@ mod tests {
     #[test]
     fn a_conveyor_that_runs_again_is_used_again() {
         let mut arm = niryo(1);
-        arm.handle(Heard::Switch(false), s(0));
+        arm.handle(ArmInput::Switch(false), s(0));
         run_until(&mut arm, s(60));
         assert_eq!(
-            arm.handle(Heard::Switch(true), s(61)),
+            arm.handle(ArmInput::Switch(true), s(61)),
             [
                 NiryoEvent::ConveyorStarted,
                 NiryoEvent::PlacedOnConveyor { total: 1 }

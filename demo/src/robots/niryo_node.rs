@@ -5,23 +5,23 @@ use std::io;
 use anyhow::Context as _;
 use bytes::Bytes;
 use tcpros::{
-    Inbox, InboxEvent, Node, NodeOptions, Publisher, PublisherOptions, ServiceOptions,
-    ServiceServer, ServiceType, SubscriberOptions, Subscription, TopicType, Wanted,
+    Inbox, InboxEvent, Node, NodeOptions, Publisher, PublisherOptions, RequestedType,
+    ServiceOptions, ServiceServer, ServiceTypeSum, SubscriberOptions, Subscription, TopicType,
 };
 use tokio::sync::{mpsc, oneshot};
 use tokio::time::{Instant, interval, sleep_until};
 
-use super::niryo::{Counts, Heard, Niryo, NiryoEvent};
+use super::niryo::{ArmInput, ArmOutputs, Niryo, NiryoEvent};
 use super::{REPEAT, far_away};
 use crate::clock::wall_nanos;
 use crate::event::tell_at;
-use crate::line::{Name, SWITCH};
-use crate::pace::{Pace, Speed};
-use crate::stop::Stop;
+use crate::line::{LineValueName, SWITCH};
+use crate::pace::{LinePace, Speed};
+use crate::stop::EndSignal;
 
 /// Runs the node until the process is stopped.
 pub(crate) async fn run(covers: u32, speed: Speed) -> anyhow::Result<()> {
-    let mut stop = Stop::new()?;
+    let mut stop = EndSignal::new()?;
     let node = Node::start(NodeOptions::from_env("niryo_ned"))?;
     let outputs = Outputs::advertise(&node)?;
     let mut inbox = Inbox::new();
@@ -29,7 +29,7 @@ pub(crate) async fn run(covers: u32, speed: Speed) -> anyhow::Result<()> {
     let (sender, mut orders) = mpsc::channel(MOST_ORDERS);
     let _switch = serve_switch(&node, sender)?;
     let started = Instant::now();
-    let mut niryo = Niryo::new(covers, Pace::at(speed));
+    let mut niryo = Niryo::new(covers, LinePace::at(speed));
     let mut repeat = interval(REPEAT);
     loop {
         let wake = niryo
@@ -39,10 +39,10 @@ pub(crate) async fn run(covers: u32, speed: Speed) -> anyhow::Result<()> {
         let heard = tokio::select! {
             Some(order) = orders.recv() => {
                 done = Some(order.done);
-                Some(Heard::Switch(order.on))
+                Some(ArmInput::Switch(order.on))
             }
             (name, event) = inbox.recv() => heard(name, &event),
-            () = sleep_until(wake) => Some(Heard::Nothing),
+            () = sleep_until(wake) => Some(ArmInput::Nothing),
             _ = repeat.tick() => { outputs.publish(niryo.counts()); None }
             () = stop.wait() => break,
         };
@@ -68,7 +68,7 @@ fn tell(stamp: i64, events: &[NiryoEvent]) -> io::Result<()> {
     events.iter().try_for_each(|event| tell_at(stamp, *event))
 }
 
-fn heard(name: Name, event: &InboxEvent) -> Option<Heard> {
+fn heard(name: LineValueName, event: &InboxEvent) -> Option<ArmInput> {
     let InboxEvent::Message(message) = event else {
         return None;
     };
@@ -77,12 +77,12 @@ fn heard(name: Name, event: &InboxEvent) -> Option<Heard> {
         return None;
     };
     match name {
-        Name::ParkBusy => Some(Heard::Park(value)),
-        Name::BucketBusy => Some(Heard::Bucket(value)),
-        Name::ConveyorRunning
-        | Name::CoversInStorage
-        | Name::CoversOnConveyor
-        | Name::CoversOnTurtleBot3 => None,
+        LineValueName::ParkBusy => Some(ArmInput::Park(value)),
+        LineValueName::BucketBusy => Some(ArmInput::Bucket(value)),
+        LineValueName::ConveyorRunning
+        | LineValueName::CoversInStorage
+        | LineValueName::CoversOnConveyor
+        | LineValueName::CoversOnTurtleBot3 => None,
     }
 }
 
@@ -93,12 +93,12 @@ pub(crate) fn read_bool(message: &[u8]) -> Option<bool> {
     }
 }
 
-fn subscribe(node: &Node, inbox: &Inbox<Name>) -> anyhow::Result<Vec<Subscription>> {
-    let wanted = Wanted {
+fn subscribe(node: &Node, inbox: &Inbox<LineValueName>) -> anyhow::Result<Vec<Subscription>> {
+    let wanted = RequestedType {
         type_name: Some(BOOL.0.to_owned()),
         md5sum: Some(BOOL.1.to_owned()),
     };
-    [Name::ParkBusy, Name::BucketBusy]
+    [LineValueName::ParkBusy, LineValueName::BucketBusy]
         .into_iter()
         .map(|name| {
             let topic = format!("/{}", name.ros_topic());
@@ -117,7 +117,7 @@ struct Order {
 
 /// Advertises the switch of the conveyor, a service that responds when the conveyor has followed.
 fn serve_switch(node: &Node, orders: mpsc::Sender<Order>) -> anyhow::Result<ServiceServer> {
-    let service_type = ServiceType {
+    let service_type = ServiceTypeSum {
         name: SET_BOOL.0.to_owned(),
         md5sum: SET_BOOL.1.to_owned(),
         request_type: format!("{}Request", SET_BOOL.0),
@@ -162,27 +162,28 @@ struct Outputs {
 
 impl Outputs {
     fn advertise(node: &Node) -> anyhow::Result<Self> {
-        let advertise = |name: Name, (type_name, md5sum, definition): (&str, &str, &str)| {
-            let topic_type = TopicType {
-                name: type_name.to_owned(),
-                md5sum: md5sum.to_owned(),
-                definition: definition.to_owned(),
+        let advertise =
+            |name: LineValueName, (type_name, md5sum, definition): (&str, &str, &str)| {
+                let topic_type = TopicType {
+                    name: type_name.to_owned(),
+                    md5sum: md5sum.to_owned(),
+                    definition: definition.to_owned(),
+                };
+                let options = PublisherOptions {
+                    latch: true,
+                    ..PublisherOptions::default()
+                };
+                node.advertise(&format!("/{}", name.ros_topic()), topic_type, options)
             };
-            let options = PublisherOptions {
-                latch: true,
-                ..PublisherOptions::default()
-            };
-            node.advertise(&format!("/{}", name.ros_topic()), topic_type, options)
-        };
         Ok(Self {
-            running: advertise(Name::ConveyorRunning, BOOL)?,
-            storage: advertise(Name::CoversInStorage, UINT32)?,
-            conveyor: advertise(Name::CoversOnConveyor, UINT32)?,
-            turtlebot: advertise(Name::CoversOnTurtleBot3, UINT32)?,
+            running: advertise(LineValueName::ConveyorRunning, BOOL)?,
+            storage: advertise(LineValueName::CoversInStorage, UINT32)?,
+            conveyor: advertise(LineValueName::CoversOnConveyor, UINT32)?,
+            turtlebot: advertise(LineValueName::CoversOnTurtleBot3, UINT32)?,
         })
     }
 
-    fn publish(&self, counts: Counts) {
+    fn publish(&self, counts: ArmOutputs) {
         let running = Bytes::copy_from_slice(&[u8::from(counts.conveyor_running)]);
         let number = |count: u32| Bytes::copy_from_slice(&count.to_le_bytes());
         for (publisher, message) in [

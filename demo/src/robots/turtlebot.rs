@@ -7,11 +7,11 @@ use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
-use crate::pace::Pace;
+use crate::pace::LinePace;
 
 /// The outputs of TurtleBot3 for the line.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) struct Status {
+pub(crate) struct TurtlebotOutputs {
     /// Whether it is at the park.
     pub(crate) park_busy: bool,
     /// Whether there is a cover in its bucket.
@@ -39,15 +39,15 @@ pub(crate) enum TurtlebotEvent {
 /// The state of the robot between park and worker.
 #[derive(Clone, Debug)]
 pub(crate) struct Turtlebot {
-    pace: Pace,
+    pace: LinePace,
     placed: u32,
     delivered: u32,
-    place: Place,
+    place: TurtlebotActivity,
 }
 
 /// The location and the activity. Times are relative to the start of the program.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Place {
+enum TurtlebotActivity {
     Park,
     Loading { until: Duration },
     ToWorker { until: Duration, placed: u32 },
@@ -57,12 +57,12 @@ enum Place {
 
 impl Turtlebot {
     /// Creates a robot at the park with an empty bucket.
-    pub(crate) const fn new(pace: Pace) -> Self {
+    pub(crate) const fn new(pace: LinePace) -> Self {
         Self {
             pace,
             placed: 0,
             delivered: 0,
-            place: Place::Park,
+            place: TurtlebotActivity::Park,
         }
     }
 
@@ -78,9 +78,12 @@ impl Turtlebot {
         events
     }
 
-    pub(crate) const fn status(&self) -> Status {
-        Status {
-            park_busy: matches!(self.place, Place::Park | Place::Loading { .. }),
+    pub(crate) const fn status(&self) -> TurtlebotOutputs {
+        TurtlebotOutputs {
+            park_busy: matches!(
+                self.place,
+                TurtlebotActivity::Park | TurtlebotActivity::Loading { .. }
+            ),
             bucket_busy: self.placed > self.delivered,
         }
     }
@@ -88,11 +91,11 @@ impl Turtlebot {
     /// Returns the time of the next call of `handle` without an input.
     pub(crate) const fn timeout(&self) -> Option<Duration> {
         match self.place {
-            Place::Park => None,
-            Place::Loading { until }
-            | Place::ToWorker { until, .. }
-            | Place::AtWorker { until, .. }
-            | Place::ToPark { until } => Some(until),
+            TurtlebotActivity::Park => None,
+            TurtlebotActivity::Loading { until }
+            | TurtlebotActivity::ToWorker { until, .. }
+            | TurtlebotActivity::AtWorker { until, .. }
+            | TurtlebotActivity::ToPark { until } => Some(until),
         }
     }
 
@@ -101,17 +104,17 @@ impl Turtlebot {
             return None;
         }
         let (place, event) = match self.place {
-            Place::Park if self.status().bucket_busy => (
-                Place::Loading {
+            TurtlebotActivity::Park if self.status().bucket_busy => (
+                TurtlebotActivity::Loading {
                     until: now + self.pace.load,
                 },
                 TurtlebotEvent::CoverInBucket {
                     placed: self.placed,
                 },
             ),
-            Place::Park => return None,
-            Place::Loading { .. } => (
-                Place::ToWorker {
+            TurtlebotActivity::Park => return None,
+            TurtlebotActivity::Loading { .. } => (
+                TurtlebotActivity::ToWorker {
                     until: now + self.pace.drive,
                     placed: self.placed,
                 },
@@ -119,23 +122,25 @@ impl Turtlebot {
                     placed: self.placed,
                 },
             ),
-            Place::ToWorker { placed, .. } => {
-                self.place = Place::AtWorker {
+            TurtlebotActivity::ToWorker { placed, .. } => {
+                self.place = TurtlebotActivity::AtWorker {
                     until: now + self.pace.unload,
                     placed,
                 };
                 return self.step(now);
             }
-            Place::AtWorker { placed, .. } => {
+            TurtlebotActivity::AtWorker { placed, .. } => {
                 self.delivered = placed;
                 (
-                    Place::ToPark {
+                    TurtlebotActivity::ToPark {
                         until: now + self.pace.drive,
                     },
                     TurtlebotEvent::Unloaded { total: placed },
                 )
             }
-            Place::ToPark { .. } => (Place::Park, TurtlebotEvent::BackAtPark),
+            TurtlebotActivity::ToPark { .. } => {
+                (TurtlebotActivity::Park, TurtlebotEvent::BackAtPark)
+            }
         };
         self.place = place;
         Some(event)
@@ -152,7 +157,7 @@ mod tests {
     }
 
     fn turtlebot() -> Turtlebot {
-        Turtlebot::new(Pace::at(Speed::new(1.0).unwrap()))
+        Turtlebot::new(LinePace::at(Speed::new(1.0).unwrap()))
     }
 
     fn run_until(robot: &mut Turtlebot, end: Duration) -> Vec<(Duration, TurtlebotEvent)> {
@@ -169,7 +174,7 @@ mod tests {
         assert_eq!(robot.handle(Some(0), s(1)), []);
         assert_eq!(
             robot.status(),
-            Status {
+            TurtlebotOutputs {
                 park_busy: true,
                 bucket_busy: false
             }
@@ -186,7 +191,7 @@ mod tests {
         );
         assert_eq!(
             robot.status(),
-            Status {
+            TurtlebotOutputs {
                 park_busy: true,
                 bucket_busy: true
             }
@@ -197,7 +202,7 @@ mod tests {
         );
         assert_eq!(
             robot.status(),
-            Status {
+            TurtlebotOutputs {
                 park_busy: false,
                 bucket_busy: true
             }
@@ -208,7 +213,7 @@ mod tests {
         );
         assert_eq!(
             robot.status(),
-            Status {
+            TurtlebotOutputs {
                 park_busy: false,
                 bucket_busy: false
             }
@@ -219,7 +224,7 @@ mod tests {
         );
         assert_eq!(
             robot.status(),
-            Status {
+            TurtlebotOutputs {
                 park_busy: true,
                 bucket_busy: false
             }
@@ -236,7 +241,7 @@ mod tests {
         }
         assert_eq!(
             robot.status(),
-            Status {
+            TurtlebotOutputs {
                 park_busy: true,
                 bucket_busy: false
             }

@@ -12,26 +12,26 @@ use ros2_client::{
 use rustdds::DomainParticipantBuilder;
 use tokio::time::{Instant, interval, sleep_until};
 
-use super::turtlebot::{Status, Turtlebot};
+use super::turtlebot::{Turtlebot, TurtlebotOutputs};
 use super::{REPEAT, far_away};
 use crate::clock::wall_nanos;
 use crate::event::tell_at;
-use crate::line::{DOMAIN, Name};
-use crate::pace::{Pace, Speed};
-use crate::stop::Stop;
+use crate::line::{DOMAIN, LineValueName};
+use crate::pace::{LinePace, Speed};
+use crate::stop::EndSignal;
 
 /// Runs the node until the process is stopped.
 pub(crate) async fn run(speed: Speed) -> anyhow::Result<()> {
-    let mut stop = Stop::new()?;
+    let mut stop = EndSignal::new()?;
     let mut node = join()?;
     let outputs = Outputs {
-        park: publisher(&mut node, Name::ParkBusy)?,
-        bucket: publisher(&mut node, Name::BucketBusy)?,
+        park: publisher(&mut node, LineValueName::ParkBusy)?,
+        bucket: publisher(&mut node, LineValueName::BucketBusy)?,
     };
     let covers = subscription(&mut node)?;
     let mut covers = std::pin::pin!(covers.async_stream());
     let started = Instant::now();
-    let mut robot = Turtlebot::new(Pace::at(speed));
+    let mut robot = Turtlebot::new(LinePace::at(speed));
     let mut repeat = interval(REPEAT);
     loop {
         let wake = robot
@@ -87,7 +87,7 @@ const STATE: QosProfile = QosProfile::publisher_default()
     .durability(Durability::TransientLocal)
     .history(History::KeepLast { depth: 1 });
 
-fn topic(node: &Node, name: Name, type_name: &str) -> anyhow::Result<rustdds::Topic> {
+fn topic(node: &Node, name: LineValueName, type_name: &str) -> anyhow::Result<rustdds::Topic> {
     let ros_name = RosName::parse(&format!("/{}", name.ros_topic()))
         .map_err(|error| anyhow!("{name} has no ROS 2 name: {error:?}"))?;
     node.create_topic(
@@ -98,14 +98,14 @@ fn topic(node: &Node, name: Name, type_name: &str) -> anyhow::Result<rustdds::To
     .map_err(|error| anyhow!("cannot make the topic of {name}: {error}"))
 }
 
-fn publisher(node: &mut Node, name: Name) -> anyhow::Result<Publisher<bool>> {
+fn publisher(node: &mut Node, name: LineValueName) -> anyhow::Result<Publisher<bool>> {
     let topic = topic(node, name, "Bool")?;
     node.create_publisher(&topic, Some(STATE))
         .map_err(|error| anyhow!("cannot publish {name}: {error}"))
 }
 
 fn subscription(node: &mut Node) -> anyhow::Result<Subscription<u32>> {
-    let name = Name::CoversOnTurtleBot3;
+    let name = LineValueName::CoversOnTurtleBot3;
     let topic = topic(node, name, "UInt32")?;
     node.create_subscription(&topic, Some(STATE))
         .map_err(|error| anyhow!("cannot subscribe {name}: {error}"))
@@ -117,10 +117,10 @@ struct Outputs {
 }
 
 impl Outputs {
-    fn publish(&self, status: Status) {
+    fn publish(&self, status: TurtlebotOutputs) {
         for (name, publisher, value) in [
-            (Name::BucketBusy, &self.bucket, status.bucket_busy),
-            (Name::ParkBusy, &self.park, status.park_busy),
+            (LineValueName::BucketBusy, &self.bucket, status.bucket_busy),
+            (LineValueName::ParkBusy, &self.park, status.park_busy),
         ] {
             if let Err(error) = publisher.publish(value) {
                 // The state is repeated soon.

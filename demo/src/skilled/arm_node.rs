@@ -4,9 +4,10 @@ use std::time::Duration;
 
 use anyhow::{Context as _, anyhow};
 use bytes::Bytes;
-use messages::{Dialect, Registry};
+use messages::{Dialect, TypeRegistry};
 use tcpros::actionlib::{
-    ActionServer, ActionServerOptions, ActionType, ServerGoal, SimpleActionServer,
+    ActionlibServer, ActionlibServerGoal, ActionlibServerOptions, ActionlibTypes,
+    SimpleActionServer,
 };
 use tcpros::{Node, NodeOptions, TopicType};
 use tokio::time::sleep;
@@ -14,11 +15,11 @@ use tokio::time::sleep;
 use super::fact::MachineEvent;
 use crate::event::tell;
 use crate::pace::Speed;
-use crate::stop::Stop;
+use crate::stop::EndSignal;
 
 /// Runs the node until the process is stopped.
 pub(crate) async fn run(speed: Speed) -> anyhow::Result<()> {
-    let mut stop = Stop::new()?;
+    let mut stop = EndSignal::new()?;
     let node = Node::start(NodeOptions::from_env("niryo_ned"))?;
     let mut moves = serve(&node, MOVE, MOVED)?;
     let mut grasps = serve(&node, GRASP, GRASPED)?;
@@ -58,7 +59,11 @@ pub(crate) async fn run(speed: Speed) -> anyhow::Result<()> {
 }
 
 /// Works for a duration. Returns false if the goal was preempted; the goal has ended then.
-async fn works(server: &mut SimpleActionServer, goal: &ServerGoal, lasts: Duration) -> bool {
+async fn works(
+    server: &mut SimpleActionServer,
+    goal: &ActionlibServerGoal,
+    lasts: Duration,
+) -> bool {
     tokio::select! {
         () = sleep(lasts) => true,
         () = server.preempted(goal) => {
@@ -69,7 +74,7 @@ async fn works(server: &mut SimpleActionServer, goal: &ServerGoal, lasts: Durati
     }
 }
 
-fn succeed(goal: &ServerGoal, result: &[u8]) {
+fn succeed(goal: &ActionlibServerGoal, result: &[u8]) {
     if let Err(error) = goal.succeed(result, "") {
         tracing::warn!(%error, "a goal has ended otherwise");
     }
@@ -81,16 +86,16 @@ fn serve(
     (name, type_name): (&str, &str),
     empty: usize,
 ) -> anyhow::Result<SimpleActionServer> {
-    let options = ActionServerOptions::new(Bytes::from(vec![0; empty]));
-    let server = ActionServer::new(node, name, action_type(type_name)?, options)?;
+    let options = ActionlibServerOptions::new(Bytes::from(vec![0; empty]));
+    let server = ActionlibServer::new(node, name, action_type(type_name)?, options)?;
     Ok(SimpleActionServer::new(server))
 }
 
-fn action_type(name: &str) -> anyhow::Result<ActionType> {
+fn action_type(name: &str) -> anyhow::Result<ActionlibTypes> {
     let name = format!("ua_msgs/{name}")
         .parse()
         .map_err(|error| anyhow!("{name}: {error}"))?;
-    let action = Registry::bundle(Dialect::Ros1)
+    let action = TypeRegistry::bundle(Dialect::Ros1)
         .action(&name)
         .with_context(|| format!("{name} is not built in"))?;
     let of = |part: &messages::MessageType| TopicType {
@@ -98,7 +103,7 @@ fn action_type(name: &str) -> anyhow::Result<ActionType> {
         md5sum: part.md5().to_owned(),
         definition: part.definition().to_owned(),
     };
-    Ok(ActionType {
+    Ok(ActionlibTypes {
         goal: of(action.action_goal()),
         result: of(action.action_result()),
         feedback: of(action.action_feedback()),

@@ -19,8 +19,8 @@ use tokio::time::{sleep, timeout};
 use super::fact::MachineEvent;
 use crate::event::tell;
 use crate::line::DOMAIN;
-use crate::pace::{Pace, Speed};
-use crate::stop::Stop;
+use crate::pace::{LinePace, Speed};
+use crate::stop::EndSignal;
 
 /// The goal of `ua_msgs/NavigateTo`.
 #[derive(Clone, Debug, Serialize, Deserialize)]
@@ -53,13 +53,13 @@ type Server = AsyncActionServer<Goal, Reached, OnTheWay>;
 
 /// Runs the node until the process is stopped.
 pub(crate) async fn run(speed: Speed) -> anyhow::Result<()> {
-    let mut stop = Stop::new()?;
+    let mut stop = EndSignal::new()?;
     let mut node = join()?;
     let spinner = node
         .spinner()
         .map_err(|error| anyhow!("the node cannot watch its domain: {error}"))?;
     let server = serve(&mut node)?;
-    let lasts = Pace::at(speed).drive;
+    let lasts = LinePace::at(speed).drive;
     tokio::select! {
         ended = spinner.spin() => Err(anyhow!("the node does not watch its domain any more: {ended:?}")),
         ended = drive(&server, lasts) => ended,

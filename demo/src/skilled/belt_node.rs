@@ -2,19 +2,19 @@
 
 use anyhow::Context as _;
 use bytes::Bytes;
-use tcpros::{Node, NodeOptions, ServiceOptions, ServiceType};
+use tcpros::{Node, NodeOptions, ServiceOptions, ServiceTypeSum};
 
 use super::fact::MachineEvent;
 use crate::event::tell;
 use crate::line::SWITCH;
 use crate::robots::niryo_node::{SET_BOOL, read_bool, set_bool_response};
-use crate::stop::Stop;
+use crate::stop::EndSignal;
 
 /// Runs the node until the process is stopped.
 pub(crate) async fn run() -> anyhow::Result<()> {
-    let mut stop = Stop::new()?;
+    let mut stop = EndSignal::new()?;
     let node = Node::start(NodeOptions::from_env("conveyor"))?;
-    let service_type = ServiceType {
+    let service_type = ServiceTypeSum {
         name: SET_BOOL.0.to_owned(),
         md5sum: SET_BOOL.1.to_owned(),
         request_type: format!("{}Request", SET_BOOL.0),

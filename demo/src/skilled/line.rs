@@ -4,17 +4,17 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use skills::{Outcome, Runs, SkillFault, Value};
+use skills::{RunOutcome, RunnableSkill, SkillFault, SkillValue};
 use tokio::time::sleep;
 
 use super::world::{BELT, BUCKET, PARK, STORAGE, WORKER};
 
 /// The skills of the line.
-pub(super) struct Line {
+pub(super) struct SkilledLine {
     /// Moves objects from one pose to another.
-    pub(super) pick_and_place: Arc<dyn Runs>,
-    pub(super) conveyor: Arc<dyn Runs>,
-    pub(super) base: Arc<dyn Runs>,
+    pub(super) pick_and_place: Arc<dyn RunnableSkill>,
+    pub(super) conveyor: Arc<dyn RunnableSkill>,
+    pub(super) base: Arc<dyn RunnableSkill>,
     /// Time that the conveyor takes to move a cover from its start to its end.
     pub(super) transport: Duration,
     /// Time limit of a run of a skill.
@@ -22,7 +22,7 @@ pub(super) struct Line {
 }
 
 /// Receives the progress of the line: the skill and its purpose.
-pub(super) trait Teller {
+pub(super) trait ProgressReporter {
     /// A run starts.
     fn begins(&self, skill: &str, what: &str);
     /// A run has ended, with or without success.
@@ -31,13 +31,17 @@ pub(super) trait Teller {
     fn turns(&self, why: &str);
 }
 
-impl Line {
+impl SkilledLine {
     /// Brings all covers to the worker: by the conveyor while it is available, then by the mobile
     /// robot.
     ///
     /// # Errors
     /// The reason why an indispensable skill failed, as text for people.
-    pub(super) async fn run(&self, covers: u32, teller: &dyn Teller) -> Result<(), String> {
+    pub(super) async fn run(
+        &self,
+        covers: u32,
+        teller: &dyn ProgressReporter,
+    ) -> Result<(), String> {
         let mut conveyor = self.switch_on(teller).await;
         for number in 1..=covers {
             if let Err(why) = &conveyor {
@@ -59,13 +63,13 @@ impl Line {
         Ok(())
     }
 
-    async fn switch_on(&self, teller: &dyn Teller) -> Result<(), String> {
-        let on = vec![("On".to_owned(), Value::from(true))];
+    async fn switch_on(&self, teller: &dyn ProgressReporter) -> Result<(), String> {
+        let on = vec![("On".to_owned(), SkillValue::from(true))];
         ran(&*self.conveyor, on, ("runs", self.within), teller).await
     }
 
     /// Waits until the conveyor has delivered its covers, and then checks that it still runs.
-    async fn carried_away(&self, teller: &dyn Teller) -> Result<(), String> {
+    async fn carried_away(&self, teller: &dyn ProgressReporter) -> Result<(), String> {
         tokio::select! {
             why = self.conveyor.lost() => return Err(format!("{} is lost: {why}", self.conveyor.name())),
             () = sleep(self.transport) => {}
@@ -77,12 +81,12 @@ impl Line {
         &self,
         pick: [f64; 6],
         place: [f64; 6],
-        teller: &dyn Teller,
+        teller: &dyn ProgressReporter,
     ) -> Result<(), String> {
         let what = format!("from the {} to the {}", place_name(pick), place_name(place));
         let parameters = vec![
-            ("PickPosition".to_owned(), Value::from(pick)),
-            ("PlacePosition".to_owned(), Value::from(place)),
+            ("PickPosition".to_owned(), SkillValue::from(pick)),
+            ("PlacePosition".to_owned(), SkillValue::from(place)),
         ];
         ran(
             &*self.pick_and_place,
@@ -94,9 +98,9 @@ impl Line {
     }
 
     /// Sends the mobile robot with its cover to the worker and back.
-    async fn deliver(&self, teller: &dyn Teller) -> Result<(), String> {
+    async fn deliver(&self, teller: &dyn ProgressReporter) -> Result<(), String> {
         for (what, [x, y, heading]) in [("to the worker", WORKER), ("to the park", PARK)] {
-            let goal = Value::from(vec![x, y, heading]);
+            let goal = SkillValue::from(vec![x, y, heading]);
             let goal = vec![("Goal".to_owned(), goal)];
             ran(&*self.base, goal, (what, self.within), teller).await?;
         }
@@ -105,10 +109,10 @@ impl Line {
 }
 
 async fn ran(
-    skill: &dyn Runs,
-    parameters: Vec<(String, Value)>,
+    skill: &dyn RunnableSkill,
+    parameters: Vec<(String, SkillValue)>,
     (what, within): (&str, Duration),
-    teller: &dyn Teller,
+    teller: &dyn ProgressReporter,
 ) -> Result<(), String> {
     let name = skill.name();
     teller.begins(&name, what);
@@ -118,7 +122,7 @@ async fn ran(
     done
 }
 
-fn done(name: &str, ran: Result<Outcome, SkillFault>) -> Result<(), String> {
+fn done(name: &str, ran: Result<RunOutcome, SkillFault>) -> Result<(), String> {
     match ran {
         Ok(outcome) if outcome.succeeded => Ok(()),
         Ok(outcome) => Err(format!("{name} failed: {}", outcome.message)),

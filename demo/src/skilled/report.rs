@@ -4,11 +4,11 @@ use std::fmt::Write as _;
 
 use serde::Serialize;
 
-use crate::stage::{Hops, delays};
+use crate::stage::{RobotHops, delays};
 
 /// The report.
 #[derive(Clone, Debug, Default, Serialize)]
-pub(super) struct Report {
+pub(super) struct SkilledReport {
     pub(super) finished: bool,
     pub(super) failure: Option<String>,
     pub(super) speed: f64,
@@ -23,14 +23,14 @@ pub(super) struct Report {
     pub(super) found_ms: Option<f64>,
     /// Time from the signal that killed the conveyor until the line detected the loss.
     pub(super) told_lost_ms: Option<f64>,
-    pub(super) runs: Vec<Run>,
+    pub(super) runs: Vec<SkilledRun>,
     /// Delays of the values beside the skills, such as the feedback of an action.
-    pub(super) hops: Hops,
+    pub(super) hops: RobotHops,
 }
 
 /// A run of a skill.
 #[derive(Clone, Debug, Serialize)]
-pub(super) struct Run {
+pub(super) struct SkilledRun {
     /// The skill, as `line-handling.PickAndPlace`.
     pub(super) skill: String,
     /// The purpose of the run.
@@ -44,7 +44,7 @@ pub(super) struct Run {
     pub(super) lasted_ms: f64,
 }
 
-impl Report {
+impl SkilledReport {
     /// Returns the table for people.
     pub(super) fn table(&self) -> String {
         let mut out = String::from("\n");
@@ -85,7 +85,7 @@ impl Report {
             ms(self.found_ms),
             ms(self.told_lost_ms)
         );
-        let Hops { pb1, tr0, pb2 } = self.hops;
+        let RobotHops { pb1, tr0, pb2 } = self.hops;
         out.push('\n');
         out.push_str(&delays(&[
             ("tPB1, in the ROS 1 bridge", pb1, "2 s"),

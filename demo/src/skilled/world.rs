@@ -18,7 +18,7 @@ pub(super) const WORKER: [f64; 3] = [2.0, 1.0, 0.0];
 
 /// The locations of the covers.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub(super) struct World {
+pub(super) struct CoverLocations {
     in_storage: u32,
     is_held: bool,
     belt_runs: bool,
@@ -36,7 +36,7 @@ pub(super) struct World {
     fallen: u32,
 }
 
-impl World {
+impl CoverLocations {
     /// Creates a world with all covers in the storage, the conveyor stopped and the mobile robot at
     /// the park. `transport` is the time that the conveyor takes.
     pub(super) fn new(covers: u32, transport: Duration) -> Self {
@@ -172,8 +172,8 @@ mod tests {
         [x, y, z]
     }
 
-    fn world(events: &[(i64, MachineEvent)]) -> World {
-        let mut world = World::new(2, Duration::from_secs(3));
+    fn world(events: &[(i64, MachineEvent)]) -> CoverLocations {
+        let mut world = CoverLocations::new(2, Duration::from_secs(3));
         for (seconds, event) in events {
             world.see(*event, seconds * SECOND);
         }
@@ -236,6 +236,6 @@ mod tests {
             (1, MachineEvent::Releases { at: at(BELT) }),
         ]);
         assert!(!world.is_held());
-        assert_eq!(world, World::new(2, Duration::from_secs(3)));
+        assert_eq!(world, CoverLocations::new(2, Duration::from_secs(3)));
     }
 }

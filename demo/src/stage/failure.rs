@@ -8,7 +8,7 @@ use thiserror::Error;
 
 /// The error, with a hint for its solution.
 #[derive(Debug, Error)]
-pub(crate) enum Failure {
+pub(crate) enum DemoFailure {
     #[error(
         "these programs are missing beside the demo: {}; `cargo xtask demo` builds them and runs \
          the demo", list(.0)
@@ -55,7 +55,7 @@ pub(crate) enum Failure {
     Interrupted { standing: String },
 }
 
-impl Failure {
+impl DemoFailure {
     /// Returns a converter for `map_err` of IO errors.
     pub(crate) fn io(what: &'static str) -> impl FnOnce(io::Error) -> Self {
         move |source| Self::Io { what, source }
@@ -78,7 +78,7 @@ impl Failure {
 }
 
 /// Returns the exit code of a scenario whose end was printed, or not.
-pub(crate) fn exit_code(outcome: &Result<(), Failure>, printed: &io::Result<()>) -> u8 {
+pub(crate) fn exit_code(outcome: &Result<(), DemoFailure>, printed: &io::Result<()>) -> u8 {
     match (outcome, printed) {
         (Err(failure), _) => failure.exit_code(),
         // Standard output is closed, for example by `| head`.

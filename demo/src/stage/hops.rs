@@ -10,13 +10,13 @@ use super::pages::{PageError, fetch};
 /// The part of a bridge's status page with the delays per hop, by the names of the bridge: `out`,
 /// `origin`, `network`, `in`.
 #[derive(Debug, Default, Deserialize)]
-pub(crate) struct Status {
-    pub(crate) hops: BTreeMap<String, Hop>,
+pub(crate) struct BridgeStatus {
+    pub(crate) hops: BTreeMap<String, BridgeHop>,
 }
 
 /// The delays of a hop, as measured by a bridge.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
-pub(crate) struct Hop {
+pub(crate) struct BridgeHop {
     pub(crate) p50_us: f64,
     pub(crate) p99_us: f64,
     pub(crate) max_us: f64,
@@ -25,22 +25,22 @@ pub(crate) struct Hop {
 
 /// The hops of the paper between robots of ROS 1 and ROS 2. `None` if a bridge did not respond.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
-pub(crate) struct Hops {
+pub(crate) struct RobotHops {
     /// In the ROS 1 bridge.
     #[serde(rename = "tPB1")]
-    pub(crate) pb1: Option<Hop>,
+    pub(crate) pb1: Option<BridgeHop>,
     /// On the PubSub network.
     #[serde(rename = "tTR0")]
-    pub(crate) tr0: Option<Hop>,
+    pub(crate) tr0: Option<BridgeHop>,
     /// In the ROS 2 bridge.
     #[serde(rename = "tPB2")]
-    pub(crate) pb2: Option<Hop>,
+    pub(crate) pb2: Option<BridgeHop>,
 }
 
-impl Hops {
+impl RobotHops {
     /// Reads the status pages of both bridges. Returns the hops and the errors, as text for people.
     pub(crate) async fn ask([ros1, ros2]: [u16; 2]) -> (Self, Vec<String>) {
-        let (ros1, ros2) = tokio::join!(fetch::<Status>(ros1), fetch::<Status>(ros2));
+        let (ros1, ros2) = tokio::join!(fetch::<BridgeStatus>(ros1), fetch::<BridgeStatus>(ros2));
         let (mut hops, mut missing) = (Self::default(), Vec::new());
         let mut no_figures = |bridge: &str, error: PageError| {
             missing.push(format!("{bridge} gives no figures: {error}"));
@@ -60,7 +60,7 @@ impl Hops {
     }
 }
 
-impl Hop {
+impl BridgeHop {
     /// Calculates the statistics of delays in nanoseconds; `None` if there are no delays.
     pub(crate) fn of(nanos: &[i64]) -> Option<Self> {
         let mut sorted = nanos.to_vec();
@@ -80,7 +80,7 @@ impl Hop {
 }
 
 /// Formats a table of delays: label, measured values and the value of the paper.
-pub(crate) fn delays(rows: &[(&str, Option<Hop>, &str)]) -> String {
+pub(crate) fn delays(rows: &[(&str, Option<BridgeHop>, &str)]) -> String {
     let mut text = String::new();
     row(&mut text, "delay", ["p50", "p99", "max", "count"], "paper");
     for (label, hop, paper) in rows {
@@ -132,12 +132,12 @@ mod tests {
 
     #[test]
     fn quantiles_of_a_few_delays_are_delays_that_were_measured() {
-        let hop = Hop::of(&[3000, 1000, 2000, 9000]).unwrap();
+        let hop = BridgeHop::of(&[3000, 1000, 2000, 9000]).unwrap();
         assert_eq!(
             (hop.p50_us, hop.p99_us, hop.max_us, hop.count),
             (2.0, 9.0, 9.0, 4)
         );
-        assert_eq!(Hop::of(&[]), None);
+        assert_eq!(BridgeHop::of(&[]), None);
     }
 
     #[test]

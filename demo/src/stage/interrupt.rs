@@ -2,7 +2,7 @@
 
 use tokio::signal::unix::{Signal, SignalKind, signal};
 
-use super::Failure;
+use super::DemoFailure;
 
 /// Waits for a signal to stop the demo.
 pub(crate) struct Interrupt {
@@ -11,8 +11,8 @@ pub(crate) struct Interrupt {
 }
 
 impl Interrupt {
-    pub(crate) fn listen() -> Result<Self, Failure> {
-        let listen = |kind| signal(kind).map_err(Failure::io("cannot listen for Ctrl-C"));
+    pub(crate) fn listen() -> Result<Self, DemoFailure> {
+        let listen = |kind| signal(kind).map_err(DemoFailure::io("cannot listen for Ctrl-C"));
         let (interrupt, terminate) = (
             listen(SignalKind::interrupt())?,
             listen(SignalKind::terminate())?,

@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 use tokio::time::{Instant, sleep, timeout};
 
-use super::{LOOPBACK, Show, Stop, Who, command, fetch};
+use super::{EventSource, LOOPBACK, Show, StopReason, command, fetch};
 
 /// A MES that answers on this host.
 pub(crate) struct Mes {
@@ -57,7 +57,7 @@ impl Mes {
 
     /// Waits until the plan of a process has a skill for each step or, without `complete`, until a
     /// step has no skill. Returns the waiting time in ms.
-    pub(crate) async fn planned(&self, process: &str, complete: bool) -> Result<f64, Stop> {
+    pub(crate) async fn planned(&self, process: &str, complete: bool) -> Result<f64, StopReason> {
         let began = Instant::now();
         loop {
             let planned = self.run_tool(&["plan", process, "--json"]).await?;
@@ -67,7 +67,7 @@ impl Mes {
             if began.elapsed() > FOUND {
                 let why = String::from_utf8_lossy(&planned.stdout).into_owned();
                 let not = if complete { "no" } else { "still a" };
-                return Err(Stop::Broken(format!(
+                return Err(StopReason::Broken(format!(
                     "the process has {not} complete plan after {FOUND:?}: {why}"
                 )));
             }
@@ -76,7 +76,7 @@ impl Mes {
     }
 
     /// Starts a job. Returns the number of its run.
-    pub(crate) async fn start(&self, process: &str) -> Result<u64, Stop> {
+    pub(crate) async fn start(&self, process: &str) -> Result<u64, StopReason> {
         let ran = self.run_tool(&["job", "start", process]).await?;
         let said = String::from_utf8_lossy(&ran.stdout).into_owned();
         let number = said
@@ -85,7 +85,7 @@ impl Mes {
         let number = number.and_then(|(number, _)| number.parse().ok());
         number.ok_or_else(|| {
             let why = String::from_utf8_lossy(&ran.stderr).into_owned();
-            Stop::Broken(format!("the process is not started: {said}{why}"))
+            StopReason::Broken(format!("the process is not started: {said}{why}"))
         })
     }
 
@@ -100,13 +100,13 @@ impl Mes {
         show: &mut Show,
         names: &[&'static str],
         steps: &mut Vec<StepRun>,
-    ) -> Result<(), Stop> {
+    ) -> Result<(), StopReason> {
         let end = format!("-{number}");
         let began = Instant::now();
         loop {
             let page: Page = fetch(self.port)
                 .await
-                .map_err(|error| Stop::Broken(format!("ua-mes does not answer: {error}")))?;
+                .map_err(|error| StopReason::Broken(format!("ua-mes does not answer: {error}")))?;
             let run = page.runs.into_iter().find(|run| run.run.ends_with(&end));
             if let Some(run) = run {
                 let now: Vec<StepRun> = run.plans.into_iter().flat_map(|plan| plan.ran).collect();
@@ -119,12 +119,12 @@ impl Mes {
                     "done" => return Ok(()),
                     other => {
                         let why = run.reason.unwrap_or_default();
-                        return Err(Stop::Broken(format!("the process is {other}: {why}")));
+                        return Err(StopReason::Broken(format!("the process is {other}: {why}")));
                     }
                 }
             }
             if began.elapsed() > RUN_LIMIT {
-                return Err(Stop::Broken(format!(
+                return Err(StopReason::Broken(format!(
                     "the process does not end within {RUN_LIMIT:?}"
                 )));
             }
@@ -133,7 +133,7 @@ impl Mes {
     }
 
     /// Runs `ua-space` to its end.
-    async fn run_tool(&self, arguments: &[&str]) -> Result<Output, Stop> {
+    async fn run_tool(&self, arguments: &[&str]) -> Result<Output, StopReason> {
         let url = format!("http://{LOOPBACK}:{}", self.port);
         let run = command(&self.tool)
             .args(arguments)
@@ -141,8 +141,8 @@ impl Mes {
             .stdin(Stdio::null())
             .output();
         let ran = timeout(TOOL_LIMIT, run).await;
-        let ran = ran.map_err(|_late| Stop::Broken("`ua-space` does not end".to_owned()))?;
-        ran.map_err(|error| Stop::Broken(format!("cannot run `ua-space`: {error}")))
+        let ran = ran.map_err(|_late| StopReason::Broken("`ua-space` does not end".to_owned()))?;
+        ran.map_err(|error| StopReason::Broken(format!("cannot run `ua-space`: {error}")))
     }
 }
 
@@ -152,9 +152,9 @@ fn describe(
     before: Option<&StepRun>,
     show: &mut Show,
     names: &[&'static str],
-) -> Result<(), Stop> {
+) -> Result<(), StopReason> {
     let name = names.iter().find(|name| step.component.contains(**name));
-    let who = Who(name.copied().unwrap_or("component"), "36");
+    let who = EventSource(name.copied().unwrap_or("component"), "36");
     if before.is_none() {
         let parameters = Value::from(step.parameters.clone());
         show.note(who, format!("`{}` begins with {parameters}", step.step))?;
@@ -174,7 +174,7 @@ fn describe(
 }
 
 /// The name of the MES in the timeline.
-pub(crate) const MES_WHO: Who = Who("ua-mes", "35");
+pub(crate) const MES_WHO: EventSource = EventSource("ua-mes", "35");
 const POLL: Duration = Duration::from_millis(100);
 const TOOL_LIMIT: Duration = Duration::from_secs(20);
 /// Time limit until all skills are found, and until a component is lost.

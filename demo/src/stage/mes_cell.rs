@@ -6,12 +6,15 @@ use std::path::PathBuf;
 use tokio::sync::mpsc;
 
 use super::mes::Mes;
-use super::{Failure, LOOPBACK, Programs, Report, Show, Stage, Who, find, free_port, must_be_free};
+use super::{
+    ChildReport, DemoFailure, EventSource, LOOPBACK, RunningPrograms, Show, Stage, find, free_port,
+    must_be_free,
+};
 use crate::pace::Speed;
 
 /// The programs of a cell whose MES runs processes.
 pub(crate) struct MesCell {
-    pub(crate) programs: Programs,
+    pub(crate) programs: RunningPrograms,
     pub(crate) mes: Mes,
     binaries: Binaries,
     /// The port at which the MES answers.
@@ -33,16 +36,16 @@ impl MesCell {
         show: &mut Show,
         title: &str,
         speed: Speed,
-    ) -> Result<(Self, mpsc::Receiver<Report>), Failure> {
+    ) -> Result<(Self, mpsc::Receiver<ChildReport>), DemoFailure> {
         let (_, [lds, component, mes, tool]) =
             find(["ua-lds", "ua-component", "ua-mes", "ua-space"])?;
         must_be_free(LDS_PORT, "discovery server")?;
         for port in ports {
             must_be_free(*port, "component or simulator")?;
         }
-        let prepared = Programs::prepare();
+        let prepared = RunningPrograms::prepare();
         let (programs, reports) =
-            prepared.map_err(Failure::io("cannot make a directory for the logs"))?;
+            prepared.map_err(DemoFailure::io("cannot make a directory for the logs"))?;
         show.text(&format!(
             "{title}; speed {}.\nTimes are seconds since the beginning; the logs are in {}.\n\n",
             speed.factor(),
@@ -64,13 +67,13 @@ impl MesCell {
     }
 
     /// Writes an input file of a program.
-    pub(crate) fn write(&self, name: &str, text: &str) -> Result<(), Failure> {
+    pub(crate) fn write(&self, name: &str, text: &str) -> Result<(), DemoFailure> {
         let written = fs::write(self.programs.directory().join(name), text);
-        written.map_err(Failure::io("cannot write the files of the programs"))
+        written.map_err(DemoFailure::io("cannot write the files of the programs"))
     }
 
     /// Starts the discovery server, and the MES of a file.
-    pub(crate) fn start_mes(&mut self, file: &str) -> Result<(), Failure> {
+    pub(crate) fn start_mes(&mut self, file: &str) -> Result<(), DemoFailure> {
         let endpoint = format!("opc.tcp://{LOOPBACK}:{LDS_PORT}");
         let lds = self.binaries.lds.clone();
         let arguments = ["--endpoint", &endpoint];
@@ -89,7 +92,7 @@ impl MesCell {
         &mut self,
         name: &'static str,
         arguments: &[&str],
-    ) -> Result<(), Failure> {
+    ) -> Result<(), DemoFailure> {
         let arguments = [&["simulate"], arguments].concat();
         let component = self.binaries.component.clone();
         self.programs
@@ -102,7 +105,7 @@ impl MesCell {
         name: &'static str,
         manifest: &str,
         arguments: &[&str],
-    ) -> Result<(), Failure> {
+    ) -> Result<(), DemoFailure> {
         let manifest = self.path(manifest);
         let arguments = [&["pea", &manifest], arguments].concat();
         let tool = self.binaries.tool.clone();
@@ -110,19 +113,23 @@ impl MesCell {
     }
 
     /// Starts the component of a file `NAME.yaml`.
-    pub(crate) fn plug_in(&mut self, name: &'static str, show: &mut Show) -> Result<(), Failure> {
+    pub(crate) fn plug_in(
+        &mut self,
+        name: &'static str,
+        show: &mut Show,
+    ) -> Result<(), DemoFailure> {
         let yaml = self.path(&format!("{name}.yaml"));
         let arguments = [&yaml, "--interface", LOOPBACK];
         let component = self.binaries.component.clone();
         self.programs
             .launch(name, component, &arguments, Stage::Components)?;
-        show.note(Who(name, "36"), "is plugged in".to_owned())
+        show.note(EventSource(name, "36"), "is plugged in".to_owned())
     }
 
     /// Kills a component, as in a power failure.
-    pub(crate) fn unplug(&self, name: &'static str, show: &mut Show) -> Result<(), Failure> {
+    pub(crate) fn unplug(&self, name: &'static str, show: &mut Show) -> Result<(), DemoFailure> {
         self.programs.kill(name);
-        show.note(Who(name, "31"), "is unplugged".to_owned())
+        show.note(EventSource(name, "31"), "is unplugged".to_owned())
     }
 
     fn path(&self, file: &str) -> String {

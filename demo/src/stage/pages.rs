@@ -59,9 +59,9 @@ mod tests {
     use tokio::net::TcpListener;
 
     use super::*;
-    use crate::stage::hops::{Hop, Status};
+    use crate::stage::hops::{BridgeHop, BridgeStatus};
 
-    async fn answered(answer: &'static str) -> Result<Status, PageError> {
+    async fn answered(answer: &'static str) -> Result<BridgeStatus, PageError> {
         let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
         let port = listener.local_addr().unwrap().port();
         let serve = async {
@@ -80,7 +80,7 @@ mod tests {
             {\"program\":\"bridge-ros1\",\"hops\":{\"out\":{\"count\":3,\"negative\":0,\
             \"p50_us\":1.5,\"p99_us\":2.5,\"max_us\":3.5}}}";
         let status = answered(page).await.unwrap();
-        let hop = Hop {
+        let hop = BridgeHop {
             p50_us: 1.5,
             p99_us: 2.5,
             max_us: 3.5,

@@ -14,13 +14,13 @@ use tokio::sync::{Notify, mpsc, watch};
 use tokio::task::JoinSet;
 use tokio::time::timeout;
 
-use super::failure::Failure;
+use super::failure::DemoFailure;
 use crate::clock::wall_nanos;
 use crate::event::Stamped;
 
 /// A report of a child process.
 #[derive(Debug)]
-pub(crate) enum Report {
+pub(crate) enum ChildReport {
     Told(Stamped),
     /// A line that is not an event.
     Garbled {
@@ -39,7 +39,7 @@ pub(crate) enum Report {
 }
 
 /// A program to start.
-pub(crate) struct Program {
+pub(crate) struct ProgramStart {
     pub(crate) name: &'static str,
     pub(crate) path: PathBuf,
     pub(crate) arguments: Vec<String>,
@@ -71,18 +71,18 @@ struct Running {
 }
 
 /// The running programs. Dropping this value kills them.
-pub(crate) struct Programs {
+pub(crate) struct RunningPrograms {
     directory: PathBuf,
-    reports: mpsc::Sender<Report>,
+    reports: mpsc::Sender<ChildReport>,
     end: watch::Sender<Option<Stage>>,
     running: Vec<Running>,
     listeners: JoinSet<()>,
 }
 
-impl Programs {
+impl RunningPrograms {
     /// Creates the directory for logs, and the receiver of the reports. If reports are not
     /// received, the children block on sending them.
-    pub(crate) fn prepare() -> io::Result<(Self, mpsc::Receiver<Report>)> {
+    pub(crate) fn prepare() -> io::Result<(Self, mpsc::Receiver<ChildReport>)> {
         // Process identifiers are reused, and the logs of failed runs are kept.
         let name = format!(
             "ua-bridge-demo-{}-{}",
@@ -111,14 +111,14 @@ impl Programs {
     }
 
     /// Starts a program. Returns the time of the start, in nanoseconds since 1970.
-    pub(crate) fn start(&mut self, program: Program) -> Result<i64, Failure> {
+    pub(crate) fn start(&mut self, program: ProgramStart) -> Result<i64, DemoFailure> {
         let log =
-            File::create(self.log(program.name)).map_err(Failure::io("cannot write a log"))?;
+            File::create(self.log(program.name)).map_err(DemoFailure::io("cannot write a log"))?;
         let stdout = if program.tells {
             Stdio::piped()
         } else {
             log.try_clone()
-                .map_err(Failure::io("cannot write a log"))?
+                .map_err(DemoFailure::io("cannot write a log"))?
                 .into()
         };
         let stdin = if program.hears {
@@ -134,7 +134,7 @@ impl Programs {
             .stdout(stdout)
             .stderr(log)
             .spawn()
-            .map_err(Failure::io("cannot start a program"))?;
+            .map_err(DemoFailure::io("cannot start a program"))?;
         let mut tasks = JoinSet::new();
         if let Some(stdout) = child.stdout.take() {
             self.listeners
@@ -166,8 +166,8 @@ impl Programs {
         path: PathBuf,
         arguments: &[&str],
         stage: Stage,
-    ) -> Result<(), Failure> {
-        let program = Program {
+    ) -> Result<(), DemoFailure> {
+        let program = ProgramStart {
             name,
             path,
             arguments: arguments.iter().map(|&text| text.to_owned()).collect(),
@@ -179,8 +179,8 @@ impl Programs {
         self.start(program).map(drop)
     }
 
-    /// Sends SIGKILL to a program, as in a power failure. [`Report::Killed`] contains the time.
-    /// Does nothing if the program has ended.
+    /// Sends SIGKILL to a program, as in a power failure. [`ChildReport::Killed`] contains the
+    /// time. Does nothing if the program has ended.
     pub(crate) fn kill(&self, name: &str) {
         for running in self.running.iter().filter(|running| running.name == name) {
             running.kill.notify_one();
@@ -257,12 +257,12 @@ pub(crate) fn command(path: &Path) -> Command {
 }
 
 /// Forwards the events of a child until it closes its standard output.
-async fn listen(name: &'static str, stdout: ChildStdout, reports: mpsc::Sender<Report>) {
+async fn listen(name: &'static str, stdout: ChildStdout, reports: mpsc::Sender<ChildReport>) {
     let mut lines = BufReader::new(stdout).lines();
     while let Ok(Some(line)) = lines.next_line().await {
         let report = match serde_json::from_str(&line) {
-            Ok(stamped) => Report::Told(stamped),
-            Err(_) => Report::Garbled { name, line },
+            Ok(stamped) => ChildReport::Told(stamped),
+            Err(_) => ChildReport::Garbled { name, line },
         };
         if reports.send(report).await.is_err() {
             return;
@@ -275,7 +275,7 @@ async fn attend(
     name: &'static str,
     mut child: Child,
     (stage, mut end, kill): (Stage, watch::Receiver<Option<Stage>>, Arc<Notify>),
-    reports: mpsc::Sender<Report>,
+    reports: mpsc::Sender<ChildReport>,
 ) {
     let ended = async {
         // The sender lives as long as this task.
@@ -287,13 +287,13 @@ async fn attend(
         status = child.wait() => {
             if let Ok(status) = status {
                 // If the receiver is closed, the scenario has ended.
-                reports.send(Report::Ended { name, status }).await.ok();
+                reports.send(ChildReport::Ended { name, status }).await.ok();
             }
         }
         () = kill.notified() => {
             let at_ns = wall_nanos();
             if child.kill().await.is_ok() {
-                reports.send(Report::Killed { name, at_ns }).await.ok();
+                reports.send(ChildReport::Killed { name, at_ns }).await.ok();
             }
         }
         _ = ended => {
@@ -326,10 +326,10 @@ const LAST_LINES: usize = 15;
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::event::{Event, MasterEvent};
+    use crate::event::{ChildEvent, MasterEvent};
 
-    fn shell(name: &'static str, script: &str, tells: bool) -> Program {
-        Program {
+    fn shell(name: &'static str, script: &str, tells: bool) -> ProgramStart {
+        ProgramStart {
             name,
             path: "/bin/sh".into(),
             arguments: vec!["-c".to_owned(), script.to_owned()],
@@ -340,7 +340,7 @@ mod tests {
         }
     }
 
-    async fn next(reports: &mut mpsc::Receiver<Report>) -> Report {
+    async fn next(reports: &mut mpsc::Receiver<ChildReport>) -> ChildReport {
         timeout(Duration::from_secs(10), reports.recv())
             .await
             .unwrap()
@@ -349,7 +349,7 @@ mod tests {
 
     #[tokio::test]
     async fn children_are_heard_missed_and_ended() {
-        let (mut programs, mut reports) = Programs::prepare().unwrap();
+        let (mut programs, mut reports) = RunningPrograms::prepare().unwrap();
         let line = r#"{"at_ns":7,"event":{"master":"listening","uri":"http://127.0.0.1:1/"}}"#;
         programs
             .start(shell(
@@ -358,20 +358,20 @@ mod tests {
                 true,
             ))
             .unwrap();
-        let event = Event::Master(MasterEvent::Listening {
+        let event = ChildEvent::Master(MasterEvent::Listening {
             uri: "http://127.0.0.1:1/".to_owned(),
         });
         let expected = Stamped { at_ns: 7, event };
-        assert!(matches!(next(&mut reports).await, Report::Told(told) if told == expected));
+        assert!(matches!(next(&mut reports).await, ChildReport::Told(told) if told == expected));
         let garbled = next(&mut reports).await;
-        assert!(matches!(garbled, Report::Garbled { name: "teller", line } if line == "?"));
+        assert!(matches!(garbled, ChildReport::Garbled { name: "teller", line } if line == "?"));
 
         programs
             .start(shell("mortal", "echo out; echo last >&2; exit 3", false))
             .unwrap();
         let ended = next(&mut reports).await;
         assert!(
-            matches!(ended, Report::Ended { name: "mortal", status } if status.code() == Some(3))
+            matches!(ended, ChildReport::Ended { name: "mortal", status } if status.code() == Some(3))
         );
         assert_eq!(programs.last_lines("mortal"), "out\nlast");
 
@@ -384,13 +384,13 @@ mod tests {
             .unwrap();
         assert!(matches!(
             next(&mut reports).await,
-            Report::Garbled {
+            ChildReport::Garbled {
                 name: "stubborn",
                 ..
             }
         ));
         programs
-            .start(Program {
+            .start(ProgramStart {
                 hears: true,
                 ..shell(
                     "listener",
@@ -401,10 +401,12 @@ mod tests {
             .unwrap();
         programs.tell("listener", "grasp").await.unwrap();
         let heard = next(&mut reports).await;
-        assert!(matches!(heard, Report::Garbled { name: "listener", line } if line == "\"grasp\""));
+        assert!(
+            matches!(heard, ChildReport::Garbled { name: "listener", line } if line == "\"grasp\"")
+        );
         programs.kill("listener");
         let killed = next(&mut reports).await;
-        assert!(matches!(killed, Report::Killed { name: "listener", at_ns } if at_ns > 0));
+        assert!(matches!(killed, ChildReport::Killed { name: "listener", at_ns } if at_ns > 0));
 
         timeout(GRACE * 3, programs.end())
             .await

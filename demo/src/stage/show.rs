@@ -4,12 +4,12 @@ use std::io;
 
 use serde::Serialize;
 
-use super::{Failure, Timeline, Who, exit_code};
+use super::{DemoFailure, EventPrinter, EventSource, exit_code};
 use crate::clock::{millis, wall_nanos};
 
 /// Prints the events of a scenario, and its report at the end.
 pub(crate) struct Show {
-    timeline: Timeline,
+    timeline: EventPrinter,
     began_at: i64,
     json: bool,
 }
@@ -27,31 +27,31 @@ impl Show {
     /// Begins the timeline. With `json`, standard output is for the report.
     pub(crate) fn open(json: bool) -> Self {
         Self {
-            timeline: Timeline::open(json),
+            timeline: EventPrinter::open(json),
             began_at: wall_nanos(),
             json,
         }
     }
 
     /// Prints text unchanged.
-    pub(crate) fn text(&mut self, text: &str) -> Result<(), Failure> {
+    pub(crate) fn text(&mut self, text: &str) -> Result<(), DemoFailure> {
         let printed = self.timeline.print_text(text);
-        printed.map_err(Failure::io("cannot print"))
+        printed.map_err(DemoFailure::io("cannot print"))
     }
 
     /// Prints an event.
-    pub(crate) fn note(&mut self, who: Who, what: String) -> Result<(), Failure> {
+    pub(crate) fn note(&mut self, who: EventSource, what: String) -> Result<(), DemoFailure> {
         self.timeline.note(wall_nanos(), who, what);
         let began_at = self.began_at;
         let seconds = |at_ns: i64| Some(millis(at_ns - began_at) / 1e3);
         let printed = self.timeline.print_all(&seconds);
-        printed.map_err(Failure::io("cannot print"))
+        printed.map_err(DemoFailure::io("cannot print"))
     }
 
     /// Prints the report: its table for people, and JSON if requested. Returns the exit code.
     pub(crate) fn conclude<R: Serialize>(
         mut self,
-        outcome: &Result<(), Failure>,
+        outcome: &Result<(), DemoFailure>,
         report: &R,
         table: &str,
     ) -> u8 {
@@ -61,7 +61,7 @@ impl Show {
 
     fn print<R: Serialize>(
         &mut self,
-        outcome: &Result<(), Failure>,
+        outcome: &Result<(), DemoFailure>,
         report: &R,
         table: &str,
     ) -> io::Result<()> {

@@ -8,7 +8,7 @@ use serde::Serialize;
 
 /// Prints events. Events are delayed for a short time, so that events of different processes can be
 /// sorted.
-pub(crate) struct Timeline {
+pub(crate) struct EventPrinter {
     out: Box<dyn Write>,
     colour: bool,
     held: BinaryHeap<Reverse<Entry>>,
@@ -20,19 +20,19 @@ pub(crate) struct Timeline {
 struct Entry {
     at_ns: i64,
     number: u64,
-    who: Who,
+    who: EventSource,
     what: String,
 }
 
 /// The source of an event: its name, and its colour as a code of SGR.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub(crate) struct Who(pub(crate) &'static str, pub(crate) &'static str);
+pub(crate) struct EventSource(pub(crate) &'static str, pub(crate) &'static str);
 
-impl Who {
+impl EventSource {
     pub(crate) const DEMO: Self = Self("demo", "2");
 }
 
-impl Timeline {
+impl EventPrinter {
     /// Prints to standard output, or to standard error if standard output is used for JSON.
     pub(crate) fn open(json: bool) -> Self {
         let (out, terminal): (Box<dyn Write>, bool) = if json {
@@ -50,7 +50,7 @@ impl Timeline {
     }
 
     /// Adds a line.
-    pub(crate) fn note(&mut self, at_ns: i64, who: Who, what: String) {
+    pub(crate) fn note(&mut self, at_ns: i64, who: EventSource, what: String) {
         self.number += 1;
         self.held.push(Reverse(Entry {
             at_ns,
@@ -125,7 +125,7 @@ fn line(entry: &Entry, seconds: Seconds<'_>, colour: bool) -> String {
         Some(seconds) if seconds >= 0.0 => format!("{seconds:>9.3}"),
         Some(_) | None => format!("{:>9}", "-"),
     };
-    let Who(who, code) = entry.who;
+    let EventSource(who, code) = entry.who;
     if colour {
         format!(
             "\x1b[2m{time}\x1b[0m  \x1b[{code}m{who:<13}\x1b[0m  {}\n",
@@ -162,16 +162,20 @@ mod tests {
     fn events_are_printed_in_the_order_in_which_they_happened() {
         let page = Page::default();
         let out = Box::new(page.clone());
-        let mut timeline = Timeline {
+        let mut timeline = EventPrinter {
             out,
             colour: false,
             held: BinaryHeap::new(),
             number: 0,
         };
-        let robot = Who("Niryo Ned", "33");
+        let robot = EventSource("Niryo Ned", "33");
         for (at_ns, who, what) in [
-            (5_000_000_000, Who::DEMO, "begins"),
-            (5_902_000_000, Who("OPC UA server", "32"), "has the count"),
+            (5_000_000_000, EventSource::DEMO, "begins"),
+            (
+                5_902_000_000,
+                EventSource("OPC UA server", "32"),
+                "has the count",
+            ),
             (5_900_000_000, robot, "places a cover"),
             (4_000_000_000, robot, "is there"),
         ] {

@@ -8,24 +8,24 @@ use crate::stage::StepRun;
 
 /// The report.
 #[derive(Clone, Debug, Default, Serialize)]
-pub(super) struct Report {
+pub(super) struct TerminalsReport {
     pub(super) speed: f64,
     /// The runs of skills, in the order in which they began.
     pub(super) steps: Vec<StepRun>,
     /// The distances of the fingers from the blocks and from their places, by the simulated robot.
-    pub(super) visits: Vec<Visit>,
+    pub(super) visits: Vec<BlockVisit>,
 }
 
 /// The smallest distance of the fingers from the place of a block.
 #[derive(Clone, Debug, Serialize)]
-pub(super) struct Visit {
+pub(super) struct BlockVisit {
     /// The number of the block, from 1.
     pub(super) block: usize,
     pub(super) at: &'static str,
     pub(super) nearest_mm: f64,
 }
 
-impl fmt::Display for Visit {
+impl fmt::Display for BlockVisit {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Self {
             block,
@@ -36,7 +36,7 @@ impl fmt::Display for Visit {
     }
 }
 
-impl Report {
+impl TerminalsReport {
     /// Returns the table for people.
     pub(super) fn table(&self) -> String {
         let mut out = String::from("\n");

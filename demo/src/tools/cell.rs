@@ -12,7 +12,7 @@ use crate::pace::Speed;
 use crate::stage::LOOPBACK;
 
 /// A component: its name, its ApplicationUri, its YAML and the port of its endpoint.
-pub(super) struct Part {
+pub(super) struct ToolsComponent {
     pub(super) name: &'static str,
     pub(super) uri: &'static str,
     yaml: &'static str,
@@ -20,38 +20,38 @@ pub(super) struct Part {
 }
 
 /// The components. The last is a second robot, which is not used.
-pub(super) const PARTS: [Part; 6] = [
-    Part {
+pub(super) const PARTS: [ToolsComponent; 6] = [
+    ToolsComponent {
         name: "ur5",
         uri: "urn:example:ur5",
         yaml: include_str!("../../../examples/plant/ur5.yaml"),
         port: Some(24_840),
     },
-    Part {
+    ToolsComponent {
         name: FINGERS,
         uri: "urn:example:robotiq-2f85",
         yaml: include_str!("../../../examples/plant/robotiq-2f85.yaml"),
         port: Some(10_254),
     },
-    Part {
+    ToolsComponent {
         name: VACUUM,
         uri: "urn:example:schmalz-ecbpi",
         yaml: include_str!("../../../examples/plant/schmalz-ecbpi.yaml"),
         port: Some(10_255),
     },
-    Part {
+    ToolsComponent {
         name: CHANGER,
         uri: "urn:example:tool-changer",
         yaml: include_str!("../../../examples/plant/tool-changer.yaml"),
         port: Some(14_840),
     },
-    Part {
+    ToolsComponent {
         name: HANDLING,
         uri: "urn:example:handling",
         yaml: include_str!("../../../examples/plant/handling.yaml"),
         port: Some(12_346),
     },
-    Part {
+    ToolsComponent {
         name: "robot",
         uri: "urn:example:robot",
         yaml: include_str!("../../../examples/plant/robot.yaml"),

@@ -6,14 +6,14 @@ use serde::Serialize;
 
 /// The report.
 #[derive(Clone, Debug, Default, Serialize)]
-pub(super) struct Report {
+pub(super) struct ToolsReport {
     pub(super) speed: f64,
     pub(super) swapped: bool,
     /// Number of robots in the cell.
     pub(super) robots: usize,
     /// Time from the start of the components until all their skills were found.
     pub(super) found_ms: Option<f64>,
-    pub(super) runs: Vec<Run>,
+    pub(super) runs: Vec<ToolsRun>,
     /// Time from the signal that killed a component until the run reported it, and until the
     /// component was found again after its restart.
     pub(super) told_lost_ms: Option<f64>,
@@ -22,7 +22,7 @@ pub(super) struct Report {
 
 /// A run of a skill.
 #[derive(Clone, Debug, Serialize)]
-pub(super) struct Run {
+pub(super) struct ToolsRun {
     /// The skill, as `tool-changer.ChangeTool`.
     pub(super) skill: String,
     /// The purpose of the run.
@@ -34,7 +34,7 @@ pub(super) struct Run {
     pub(super) steps: Vec<String>,
 }
 
-impl Report {
+impl ToolsReport {
     /// Returns the table for people.
     pub(super) fn table(&self) -> String {
         let mut out = String::from("\n");

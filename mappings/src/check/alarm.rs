@@ -11,11 +11,11 @@ use super::types::{self, ValueType};
 use crate::alarm::{Alarm, AlarmLimits, AlarmTrigger, AlarmValue};
 use crate::code::Code;
 use crate::document::{AlarmEntry, ReportsEntry, VariableEntry};
-use crate::findings::Findings;
+use crate::findings::MappingFindings;
 use crate::mapping::{Binding, Variable};
-use crate::read::{At, Field, given, short};
+use crate::read::{Located, OptionalKey, given, short};
 use crate::topic::{SpaceId, TopicId};
-use crate::tree::Place;
+use crate::tree::TextSpan;
 
 /// Properties of the variable of an alarm.
 struct Subject<'a> {
@@ -42,7 +42,7 @@ impl<'a> Subject<'a> {
 pub(super) fn check<'d>(
     entries: impl Iterator<Item = (TopicId, &'d VariableEntry)>,
     variables: &mut [Variable],
-    findings: &mut Findings,
+    findings: &mut MappingFindings,
 ) {
     let has_alarm = |entry: &VariableEntry| entry.alarm.is_some() || entry.reports.is_some();
     let entries: HashMap<TopicId, &VariableEntry> =
@@ -71,7 +71,11 @@ pub(super) fn check<'d>(
 }
 
 /// Returns `None` without an alarm, and for a faulty entry, which is noted.
-fn alarm(entry: &VariableEntry, subject: &Subject<'_>, findings: &mut Findings) -> Option<Alarm> {
+fn alarm(
+    entry: &VariableEntry,
+    subject: &Subject<'_>,
+    findings: &mut MappingFindings,
+) -> Option<Alarm> {
     let at = entry.alarm.as_ref()?;
     let said = at.value.as_ref()?;
     let trigger = trigger((said, at.place), subject, findings);
@@ -90,7 +94,7 @@ fn alarm(entry: &VariableEntry, subject: &Subject<'_>, findings: &mut Findings) 
     })
 }
 
-fn severity(said: &AlarmEntry, findings: &mut Findings) -> Option<u16> {
+fn severity(said: &AlarmEntry, findings: &mut MappingFindings) -> Option<u16> {
     let Some((severity, place)) = given(&said.severity) else {
         return said.severity.is_none().then_some(USUAL_SEVERITY);
     };
@@ -103,7 +107,7 @@ fn severity(said: &AlarmEntry, findings: &mut Findings) -> Option<u16> {
     None
 }
 
-fn message(said: &AlarmEntry, findings: &mut Findings) -> Option<Option<String>> {
+fn message(said: &AlarmEntry, findings: &mut MappingFindings) -> Option<Option<String>> {
     let Some((text, place)) = given(&said.message) else {
         return said.message.is_none().then_some(None);
     };
@@ -117,9 +121,9 @@ fn message(said: &AlarmEntry, findings: &mut Findings) -> Option<Option<String>>
 
 /// Returns the only trigger of the entry.
 fn trigger(
-    (said, place): (&AlarmEntry, Place),
+    (said, place): (&AlarmEntry, TextSpan),
     subject: &Subject<'_>,
-    findings: &mut Findings,
+    findings: &mut MappingFindings,
 ) -> Option<AlarmTrigger> {
     let limits = [&said.low_low, &said.low, &said.high, &said.high_high];
     let has_limits = limits.iter().any(|limit| limit.is_some());
@@ -175,7 +179,7 @@ fn trigger(
 fn reports(
     entry: &VariableEntry,
     (origin, subject): (SpaceId, &Subject<'_>),
-    findings: &mut Findings,
+    findings: &mut MappingFindings,
 ) -> Option<()> {
     let at = entry.reports.as_ref()?;
     let ReportsEntry::Alarms = at.value.as_ref()?;
@@ -199,7 +203,12 @@ fn reports(
 
 impl Subject<'_> {
     /// Notes a value that is no whole DiagnosticArray, for a key that needs one.
-    fn is_diagnostics(&self, key: &str, place: Place, findings: &mut Findings) -> Option<()> {
+    fn is_diagnostics(
+        &self,
+        key: &str,
+        place: TextSpan,
+        findings: &mut MappingFindings,
+    ) -> Option<()> {
         let is_array = |binding: &Binding| binding.message_type.to_string() == DIAGNOSTICS;
         let is_status =
             |leaf: &Leaf| leaf.path == "status" && leaf.builtin == BuiltinType::ExtensionObject;
@@ -216,10 +225,10 @@ impl Subject<'_> {
 }
 
 fn levels(
-    (said, place): (&AlarmEntry, Place),
-    limits: [&Field<f64>; 4],
+    (said, place): (&AlarmEntry, TextSpan),
+    limits: [&OptionalKey<f64>; 4],
     subject: &Subject<'_>,
-    findings: &mut Findings,
+    findings: &mut MappingFindings,
 ) -> Option<AlarmLimits> {
     let is_number = matches!(subject.value_type, Some((builtin, false)) if builtin.is_number());
     if !is_number {
@@ -265,10 +274,10 @@ fn levels(
 }
 
 fn values(
-    texts: &[At<String>],
-    place: Place,
+    texts: &[Located<String>],
+    place: TextSpan,
     subject: &Subject<'_>,
-    findings: &mut Findings,
+    findings: &mut MappingFindings,
 ) -> Option<Vec<AlarmValue>> {
     if texts.is_empty() || texts.len() > MOST_VALUES {
         let message = format!("{} values trigger the alarm", texts.len());
@@ -288,9 +297,9 @@ fn values(
 /// Returns a text as a value of the variable.
 fn value(
     text: &str,
-    place: Place,
+    place: TextSpan,
     subject: &Subject<'_>,
-    findings: &mut Findings,
+    findings: &mut MappingFindings,
 ) -> Option<AlarmValue> {
     let named = || {
         let mut texts = subject.texts.iter();

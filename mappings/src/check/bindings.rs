@@ -7,25 +7,25 @@ use std::sync::Arc;
 use messages::{DefinitionError, Dialect, Leaf, MessageType, Selection, TextKind, TypeName};
 
 use super::names::{mended, topic_fault};
-use super::selection::{self, Chosen};
-use super::services::{self, Calls, Kind, Known, Service};
+use super::selection::{self, SelectionKeys};
+use super::services::{self, BindingKind, CheckedService, DocumentCalls, ServiceContext};
 use super::several;
-use super::shaping::Way;
-use super::types::{self, Types, ValueType, dialect};
+use super::shaping::ValueDirection;
+use super::types::{self, MessageTypes, ValueType, dialect};
 use super::{Declared, required, variables};
 use crate::code::Code;
 use crate::document::{self, BindingEntry};
-use crate::findings::Findings;
+use crate::findings::MappingFindings;
 use crate::mapping::{Binding, Space};
-use crate::read::{At, list, short};
+use crate::read::{Located, list, short};
 use crate::topic::{SpaceId, TopicId};
-use crate::tree::Place;
+use crate::tree::TextSpan;
 
 /// Maximum number of fields that a help lists.
 const TOLD: usize = 12;
 
 /// Variable of the bindings that are checked.
-pub(super) struct Subject {
+pub(super) struct BoundVariable {
     pub(super) topic: Option<TopicId>,
     pub(super) origin: Option<SpaceId>,
     pub(super) declared: Option<ValueType>,
@@ -37,24 +37,24 @@ pub(super) struct Bound {
     pub(super) bindings: Vec<Binding>,
     /// `None` if the type of no binding is known.
     pub(super) fields: Option<Vec<Leaf>>,
-    pub(super) service: Option<Service>,
+    pub(super) service: Option<CheckedService>,
 }
 
 /// A binding, with the parts that are known.
-struct Found {
+struct ReadBinding {
     binding: Binding,
-    place: Place,
+    place: TextSpan,
     fields: Option<Vec<Leaf>>,
 }
 
 /// Position of a binding in the document.
-pub(super) struct Site<'s> {
-    pub(super) place: Place,
+pub(super) struct BindingSite<'s> {
+    pub(super) place: TextSpan,
     pub(super) space: Option<SpaceId>,
-    pub(super) subject: &'s Subject,
+    pub(super) subject: &'s BoundVariable,
 }
 
-impl Site<'_> {
+impl BindingSite<'_> {
     pub(super) fn dialect(&self) -> Dialect {
         self.space.map_or(Dialect::Ros1, dialect)
     }
@@ -62,25 +62,25 @@ impl Site<'_> {
 
 /// Use of one ROS topic of one space by a variable.
 struct Use {
-    place: Place,
+    place: TextSpan,
     reads: bool,
     message_type: TypeName,
 }
 
-pub(super) struct Bindings<'c> {
+pub(super) struct VariableBindings<'c> {
     spaces: &'c Declared<Vec<Space>>,
-    types: &'c mut Types,
-    calls: Calls,
+    types: &'c mut MessageTypes,
+    calls: DocumentCalls,
     uses: HashMap<(SpaceId, String), Vec<Use>>,
     /// Topics in the order of the document, so that findings have this order too.
     order: Vec<(SpaceId, String)>,
 }
 
-impl<'c> Bindings<'c> {
+impl<'c> VariableBindings<'c> {
     pub(super) fn new(
         spaces: &'c Declared<Vec<Space>>,
-        calls: Calls,
-        types: &'c mut Types,
+        calls: DocumentCalls,
+        types: &'c mut MessageTypes,
     ) -> Self {
         Self {
             spaces,
@@ -92,19 +92,19 @@ impl<'c> Bindings<'c> {
     }
 
     /// Returns the types that bindings name.
-    pub(super) const fn types(&mut self) -> &mut Types {
+    pub(super) const fn types(&mut self) -> &mut MessageTypes {
         self.types
     }
 
     pub(super) fn check(
         &mut self,
-        entries: Option<&At<document::Bindings>>,
-        subject: &Subject,
-        findings: &mut Findings,
+        entries: Option<&Located<document::Bindings>>,
+        subject: &BoundVariable,
+        findings: &mut MappingFindings,
     ) -> Bound {
-        let mut found: Vec<Found> = Vec::new();
-        let mut service: Option<Service> = None;
-        let mut spaces: HashMap<SpaceId, Place> = HashMap::new();
+        let mut found: Vec<ReadBinding> = Vec::new();
+        let mut service: Option<CheckedService> = None;
+        let mut spaces: HashMap<SpaceId, TextSpan> = HashMap::new();
         let entries = entries
             .and_then(|at| at.value.as_ref())
             .map_or(&[][..], |bindings| &bindings.0);
@@ -124,16 +124,16 @@ impl<'c> Bindings<'c> {
                 );
                 continue;
             }
-            let site = Site {
+            let site = BindingSite {
                 place: at.place,
                 space,
                 subject,
             };
             findings.of_part(space);
             match services::kind(entry, at.place, findings) {
-                Some(Kind::Topic) => found.extend(self.binding(entry, &site, findings)),
+                Some(BindingKind::Topic) => found.extend(self.binding(entry, &site, findings)),
                 Some(kind) => {
-                    let mut known = Known {
+                    let mut known = ServiceContext {
                         types: self.types,
                         calls: &self.calls,
                     };
@@ -177,10 +177,10 @@ impl<'c> Bindings<'c> {
     fn space(
         &self,
         entry: &BindingEntry,
-        owner: Place,
-        subject: &Subject,
-        findings: &mut Findings,
-    ) -> (Option<SpaceId>, Place) {
+        owner: TextSpan,
+        subject: &BoundVariable,
+        findings: &mut MappingFindings,
+    ) -> (Option<SpaceId>, TextSpan) {
         let Some(at) = &entry.space else {
             if subject.origin == Some(SpaceId::UA) {
                 let note = findings.error(Code::MissingKey, owner, "the binding has no `space`");
@@ -210,18 +210,18 @@ impl<'c> Bindings<'c> {
     fn binding(
         &mut self,
         entry: &BindingEntry,
-        site: &Site<'_>,
-        findings: &mut Findings,
-    ) -> Option<Found> {
+        site: &BindingSite<'_>,
+        findings: &mut MappingFindings,
+    ) -> Option<ReadBinding> {
         let topic = required(&entry.topic, "topic", "the binding", site.place, findings);
         let topic = topic.and_then(|(text, place)| topic_name(text, place, site, findings));
         let named = self.type_name(entry, site, findings);
         let (name, place) = named?;
         let space = site.space?;
         let message_type = self.message_type(&name, place, site, findings);
-        let chosen = Chosen::from(entry);
+        let chosen = SelectionKeys::from(entry);
         let place = chosen.place().unwrap_or(place);
-        let way = Way {
+        let way = ValueDirection {
             // If no origin is known, that is the finding.
             reads: site.subject.origin.is_none_or(|origin| origin == space),
             declared: site.subject.declared,
@@ -247,7 +247,7 @@ impl<'c> Bindings<'c> {
             message_type: name,
             selection,
         };
-        Some(Found {
+        Some(ReadBinding {
             binding,
             place,
             fields,
@@ -257,9 +257,9 @@ impl<'c> Bindings<'c> {
     fn type_name(
         &self,
         entry: &BindingEntry,
-        site: &Site<'_>,
-        findings: &mut Findings,
-    ) -> Option<(TypeName, Place)> {
+        site: &BindingSite<'_>,
+        findings: &mut MappingFindings,
+    ) -> Option<(TypeName, TextSpan)> {
         if let Some(at) = &entry.r#type {
             let text = at.value.as_ref()?;
             let name = text.parse().ok();
@@ -279,7 +279,7 @@ impl<'c> Bindings<'c> {
             }
             return None;
         };
-        let name = Types::registry(dialect(site.space?)).standard_type(builtin, array);
+        let name = MessageTypes::registry(dialect(site.space?)).standard_type(builtin, array);
         if name.is_none() {
             let message = format!(
                 "the binding has no `type`, and no type of std_msgs holds {}",
@@ -296,9 +296,9 @@ impl<'c> Bindings<'c> {
     fn message_type(
         &mut self,
         name: &TypeName,
-        place: Place,
-        site: &Site<'_>,
-        findings: &mut Findings,
+        place: TextSpan,
+        site: &BindingSite<'_>,
+        findings: &mut MappingFindings,
     ) -> Option<Arc<MessageType>> {
         let space = site.space?;
         let dialect = dialect(space);
@@ -378,7 +378,7 @@ impl<'c> Bindings<'c> {
         None
     }
 
-    fn note_use(&mut self, found: &Found, subject: &Subject) {
+    fn note_use(&mut self, found: &ReadBinding, subject: &BoundVariable) {
         let Some(origin) = subject.origin else { return };
         let Binding {
             space,
@@ -401,7 +401,7 @@ impl<'c> Bindings<'c> {
     }
 
     /// Notes conflicts between variables that share a topic.
-    pub(super) fn conflicts(&self, findings: &mut Findings) {
+    pub(super) fn conflicts(&self, findings: &mut MappingFindings) {
         for key in &self.order {
             let uses = self.uses.get(key).map_or(&[][..], Vec::as_slice);
             let Some((first, others)) = uses.split_first() else {
@@ -420,7 +420,7 @@ impl<'c> Bindings<'c> {
     }
 }
 
-fn conflict(first: &Use, other: &Use, topic: &str, findings: &mut Findings) {
+fn conflict(first: &Use, other: &Use, topic: &str, findings: &mut MappingFindings) {
     let label = format!("first at {}", findings.line(first.place, other.place));
     if first.reads != other.reads {
         let message = format!("{topic} is read for one variable and written for another");
@@ -447,10 +447,10 @@ fn conflict(first: &Use, other: &Use, topic: &str, findings: &mut Findings) {
 
 fn topic_name(
     text: &str,
-    place: Place,
-    site: &Site<'_>,
-    findings: &mut Findings,
-) -> Option<(String, Place)> {
+    place: TextSpan,
+    site: &BindingSite<'_>,
+    findings: &mut MappingFindings,
+) -> Option<(String, TextSpan)> {
     let dialect = site.dialect();
     ros_name(text, place, (dialect, "topic"), findings)?;
     if let Some(other) = text
@@ -475,9 +475,9 @@ fn topic_name(
 /// Returns `None` for a text that is not the name of a topic or service, which is noted.
 pub(super) fn ros_name(
     text: &str,
-    place: Place,
+    place: TextSpan,
     (dialect, what): (Dialect, &str),
-    findings: &mut Findings,
+    findings: &mut MappingFindings,
 ) -> Option<()> {
     if let Some(fault) = topic_fault(text, dialect) {
         let note = findings
@@ -515,9 +515,9 @@ pub(super) fn told(paths: &[&str]) -> String {
 pub(super) fn compare(
     fields: &[Leaf],
     name: &TypeName,
-    subject: &Subject,
-    place: Place,
-    findings: &mut Findings,
+    subject: &BoundVariable,
+    place: TextSpan,
+    findings: &mut MappingFindings,
 ) {
     let Some(declared) = subject.declared else {
         return;
@@ -563,7 +563,7 @@ fn differ_as_bytes(a: &Binding, b: &Binding) -> bool {
 }
 
 /// Notes bindings with fields that cannot stand for each other.
-fn differences(found: &[Found], findings: &mut Findings) {
+fn differences(found: &[ReadBinding], findings: &mut MappingFindings) {
     let mut known = found
         .iter()
         .filter_map(|one| Some((one, one.fields.as_ref()?)));
@@ -622,10 +622,10 @@ fn differences(found: &[Found], findings: &mut Findings) {
 }
 
 /// A whole message with its fields, which are matched by position.
-type Side<'f> = (&'f Found, &'f [Leaf]);
+type Side<'f> = (&'f ReadBinding, &'f [Leaf]);
 
 /// Notes fields of the same types with names that do not match.
-fn versions(first: Side<'_>, other: Side<'_>, findings: &mut Findings) {
+fn versions(first: Side<'_>, other: Side<'_>, findings: &mut MappingFindings) {
     let whole =
         |(found, fields): Side<'_>| found.binding.selection == Selection::Whole && fields.len() > 1;
     if !whole(first) || !whole(other) {
@@ -651,7 +651,7 @@ fn versions(first: Side<'_>, other: Side<'_>, findings: &mut Findings) {
 /// lower case with underscores, while ROS 1 allows names such as `D`.
 fn sides((first, a): Side<'_>, (other, b): Side<'_>) -> Option<String> {
     let plain = |leaf: &Leaf| leaf.path.to_ascii_lowercase().replace('_', "");
-    let only = |found: &Found, these: &[Leaf], those: &[Leaf]| {
+    let only = |found: &ReadBinding, these: &[Leaf], those: &[Leaf]| {
         let those: HashSet<String> = those.iter().map(plain).collect();
         let only = these.iter().filter(|leaf| !those.contains(&plain(leaf)));
         let only: Vec<&str> = only.map(|leaf| leaf.path.as_str()).collect();

@@ -6,13 +6,13 @@ use super::network::{duration, within};
 use crate::broker::{Broker, BrokerAddress, MessageMapping, MqttVersion, TopicForm};
 use crate::code::Code;
 use crate::document::{EncodingEntry, MqttEntry, MqttVersionEntry, PubSubEntry, TopicFormEntry};
-use crate::findings::Findings;
-use crate::read::{Field, given, short};
+use crate::findings::MappingFindings;
+use crate::read::{OptionalKey, given, short};
 use crate::secret::has_user;
-use crate::tree::Place;
+use crate::tree::TextSpan;
 
 /// Returns the broker of the mapping; `None` if the messages are carried by UDP.
-pub(super) fn check(entry: &PubSubEntry, findings: &mut Findings) -> Option<Box<Broker>> {
+pub(super) fn check(entry: &PubSubEntry, findings: &mut MappingFindings) -> Option<Box<Broker>> {
     let address = given(&entry.address).filter(|(text, _)| BrokerAddress::is_mqtt(text));
     let Some((text, place)) = address else {
         if let Some(at) = &entry.mqtt {
@@ -38,9 +38,9 @@ pub(super) fn check(entry: &PubSubEntry, findings: &mut Findings) -> Option<Box<
 
 /// Returns the broker at an address.
 pub(super) fn at(
-    (text, place): (&str, Place),
+    (text, place): (&str, TextSpan),
     entry: Option<&MqttEntry>,
-    findings: &mut Findings,
+    findings: &mut MappingFindings,
 ) -> Option<Box<Broker>> {
     let Some(address) = BrokerAddress::parse(text) else {
         let message = format!("`{}` is not an address of a broker", short(text));
@@ -91,8 +91,8 @@ pub(super) fn at(
 }
 
 /// Sets the files for TLS and for the log-in.
-fn files(mqtt: &MqttEntry, broker: &mut Broker, findings: &mut Findings) {
-    let path = |field: &Field<String>| given(field).map(|(file, _)| PathBuf::from(file));
+fn files(mqtt: &MqttEntry, broker: &mut Broker, findings: &mut MappingFindings) {
+    let path = |field: &OptionalKey<String>| given(field).map(|(file, _)| PathBuf::from(file));
     broker.ca = path(&mqtt.ca);
     broker.credentials = path(&mqtt.credentials);
     broker.client = match (path(&mqtt.certificate), path(&mqtt.key)) {
@@ -136,7 +136,7 @@ fn is_loopback(host: &str) -> bool {
 }
 
 /// Reads levels of a topic.
-fn levels(field: &Field<String>, findings: &mut Findings) -> Option<String> {
+fn levels(field: &OptionalKey<String>, findings: &mut MappingFindings) -> Option<String> {
     let (text, place) = given(field)?;
     if Broker::is_prefix(text) {
         return Some(text.clone());

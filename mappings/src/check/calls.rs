@@ -7,21 +7,21 @@ mod method;
 use std::collections::{BTreeMap, HashMap};
 use std::time::Duration;
 
-use self::bindings::Found;
+use self::bindings::FoundBinding;
 use super::network::duration;
 use super::servers::Servers;
-use super::types::Types;
-use super::variables::{NAMESPACE_ZERO, Namespaces, Spaces, checked_name, node_id, space};
+use super::types::MessageTypes;
+use super::variables::{CheckedNamespaces, NAMESPACE_ZERO, Spaces, checked_name, node_id, space};
 use super::{permissions, required};
 use crate::call::{Call, CallBinding, CallKind, ExecutedBy, MethodTarget};
 use crate::code::Code;
 use crate::document::{AcknowledgesEntry, CallEntry};
-use crate::findings::Findings;
+use crate::findings::MappingFindings;
 use crate::mapping::{Server, Variable};
 use crate::node_id::NodeIdText;
-use crate::read::{At, given, short};
+use crate::read::{Located, given, short};
 use crate::topic::{SpaceId, TopicId};
-use crate::tree::Place;
+use crate::tree::TextSpan;
 
 /// Maximum number of calls of one document.
 const MAX_CALLS: usize = 5_000;
@@ -29,9 +29,9 @@ const MAX_CALLS: usize = 5_000;
 const TIMEOUT: Duration = Duration::from_secs(30);
 
 /// Context that calls are checked against.
-pub(super) struct Known<'k> {
+pub(super) struct CallContext<'k> {
     pub(super) spaces: &'k Spaces,
-    pub(super) namespaces: &'k Namespaces,
+    pub(super) namespaces: &'k CheckedNamespaces,
     pub(super) variables: &'k [Variable],
     /// The cell's own server.
     pub(super) server: &'k Server,
@@ -39,10 +39,10 @@ pub(super) struct Known<'k> {
 }
 
 pub(super) fn check(
-    entries: &[At<CallEntry>],
-    known: Known<'_>,
-    types: &mut Types,
-    findings: &mut Findings,
+    entries: &[Located<CallEntry>],
+    known: CallContext<'_>,
+    types: &mut MessageTypes,
+    findings: &mut MappingFindings,
 ) -> Vec<Call> {
     if let Some(first) = entries.get(MAX_CALLS) {
         let message = format!("{} calls; at most {MAX_CALLS} are read", entries.len());
@@ -67,19 +67,24 @@ pub(super) fn check(
 }
 
 struct Checker<'c> {
-    known: &'c Known<'c>,
-    types: &'c mut Types,
+    known: &'c CallContext<'c>,
+    types: &'c mut MessageTypes,
     values: BTreeMap<TopicId, &'c str>,
     nodes: HashMap<&'c NodeIdText, &'c str>,
     /// Topics and nodes of the calls before, and their positions.
-    topics: HashMap<TopicId, Place>,
-    call_nodes: HashMap<NodeIdText, Place>,
+    topics: HashMap<TopicId, TextSpan>,
+    call_nodes: HashMap<NodeIdText, TextSpan>,
     /// Names of services and actions, and their positions.
-    targets: HashMap<(SpaceId, CallKind, String), Place>,
+    targets: HashMap<(SpaceId, CallKind, String), TextSpan>,
 }
 
 impl Checker<'_> {
-    fn call(&mut self, entry: &CallEntry, place: Place, findings: &mut Findings) -> Option<Call> {
+    fn call(
+        &mut self,
+        entry: &CallEntry,
+        place: TextSpan,
+        findings: &mut MappingFindings,
+    ) -> Option<Call> {
         let title = match given(&entry.name).or_else(|| given(&entry.node)) {
             Some((text, _)) => format!("the call `{}`", short(text)),
             None => "the call".to_owned(),
@@ -136,9 +141,9 @@ impl Checker<'_> {
     fn topic(
         &mut self,
         entry: &CallEntry,
-        (node, place): (&NodeIdText, Place),
+        (node, place): (&NodeIdText, TextSpan),
         (space, kind): (SpaceId, CallKind),
-        findings: &mut Findings,
+        findings: &mut MappingFindings,
     ) -> Option<TopicId> {
         let alias = given(&entry.alias).and_then(|(alias, _)| std::num::NonZeroU16::new(*alias));
         let Some(identifier) = node.writer_id().or(alias) else {
@@ -192,8 +197,8 @@ impl Checker<'_> {
     fn free_node(
         &mut self,
         node: &NodeIdText,
-        place: Place,
-        findings: &mut Findings,
+        place: TextSpan,
+        findings: &mut MappingFindings,
     ) -> Option<()> {
         let label = match (
             self.nodes.get(node),
@@ -215,11 +220,11 @@ impl Checker<'_> {
 /// Separates the executor of a call from the bindings that offer it, and compares their types.
 fn settle(
     origin: SpaceId,
-    found: Vec<Found>,
+    found: Vec<FoundBinding>,
     method: Option<MethodTarget>,
-    findings: &mut Findings,
+    findings: &mut MappingFindings,
 ) -> Option<(ExecutedBy, Vec<CallBinding>)> {
-    let (executes, asks): (Vec<Found>, Vec<Found>) =
+    let (executes, asks): (Vec<FoundBinding>, Vec<FoundBinding>) =
         found.into_iter().partition(|one| one.space == origin);
     let executor = executes.into_iter().next();
     if let Some(executor) = &executor
@@ -239,7 +244,7 @@ fn settle(
         findings.of_part([origin, one.space]);
         fields::compare(executor.as_ref(), &one, findings);
         findings.of_part(None);
-        let of = |map: Option<(crate::call::FieldMap, Place)>| {
+        let of = |map: Option<(crate::call::FieldMap, TextSpan)>| {
             map.map_or_else(Default::default, |(map, _)| map)
         };
         asked.push(CallBinding {
@@ -263,7 +268,7 @@ fn settle(
 fn acknowledges(
     entry: &CallEntry,
     (origin, kind): (SpaceId, CallKind),
-    findings: &mut Findings,
+    findings: &mut MappingFindings,
 ) -> Option<bool> {
     let Some(at) = &entry.acknowledges else {
         return Some(false);

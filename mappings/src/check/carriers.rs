@@ -8,13 +8,17 @@ use crate::broker::{Broker, BrokerAddress};
 use crate::carriers::{CarrierMedium, ConfiguredCarrier, ForwardedName, UdpGroup};
 use crate::code::Code;
 use crate::document::{CarrierEntry, MqttEntry, PubSubEntry, UdpEntry};
-use crate::findings::Findings;
+use crate::findings::MappingFindings;
 use crate::mapping::PubSub;
-use crate::read::{At, given, short};
-use crate::tree::Place;
+use crate::read::{Located, given, short};
+use crate::tree::TextSpan;
 
 /// Returns the settings of a list of carriers.
-pub(super) fn check(entries: &[At<CarrierEntry>], place: Place, findings: &mut Findings) -> PubSub {
+pub(super) fn check(
+    entries: &[Located<CarrierEntry>],
+    place: TextSpan,
+    findings: &mut MappingFindings,
+) -> PubSub {
     let mut pubsub = common(entries, findings);
     let mut carriers: Vec<ConfiguredCarrier> = Vec::new();
     let mut names: Vec<Listed> = Vec::new();
@@ -95,8 +99,8 @@ fn adopt(pubsub: &mut PubSub, carriers: Vec<ConfiguredCarrier>) {
 }
 
 /// Returns the settings of all carriers.
-fn common(entries: &[At<CarrierEntry>], findings: &mut Findings) -> PubSub {
-    let of = |at: &'_ At<CarrierEntry>| at.value.as_ref()?.settings.clone();
+fn common(entries: &[Located<CarrierEntry>], findings: &mut MappingFindings) -> PubSub {
+    let of = |at: &'_ Located<CarrierEntry>| at.value.as_ref()?.settings.clone();
     let mut all = entries.iter().filter_map(of);
     let Some(first) = all.next() else {
         return PubSub::default();
@@ -138,7 +142,11 @@ fn common(entries: &[At<CarrierEntry>], findings: &mut Findings) -> PubSub {
 }
 
 /// Returns the network of an entry; `None` for an entry with settings, and for a faulty entry.
-fn medium(entry: &CarrierEntry, place: Place, findings: &mut Findings) -> Option<CarrierMedium> {
+fn medium(
+    entry: &CarrierEntry,
+    place: TextSpan,
+    findings: &mut MappingFindings,
+) -> Option<CarrierMedium> {
     match (&entry.udp, &entry.mqtt, &entry.eth, &entry.settings) {
         (Some(udp), None, None, None) => {
             udp_group(udp.value.as_ref()?, findings).map(CarrierMedium::Udp)
@@ -168,7 +176,7 @@ fn medium(entry: &CarrierEntry, place: Place, findings: &mut Findings) -> Option
     }
 }
 
-fn udp_group(entry: &UdpEntry, findings: &mut Findings) -> Option<UdpGroup> {
+fn udp_group(entry: &UdpEntry, findings: &mut MappingFindings) -> Option<UdpGroup> {
     let url = match given(&entry.address) {
         None if entry.address.is_some() => return None,
         None => Some(PubSub::ADDRESS),
@@ -186,7 +194,7 @@ fn udp_group(entry: &UdpEntry, findings: &mut Findings) -> Option<UdpGroup> {
 }
 
 /// Reads the hosts that datagrams are sent to.
-fn peers(entry: &UdpEntry, own: SocketAddr, findings: &mut Findings) -> Vec<SocketAddr> {
+fn peers(entry: &UdpEntry, own: SocketAddr, findings: &mut MappingFindings) -> Vec<SocketAddr> {
     let Some((listed, place)) = given(&entry.peers) else {
         return Vec::new();
     };
@@ -204,7 +212,7 @@ fn peers(entry: &UdpEntry, own: SocketAddr, findings: &mut Findings) -> Vec<Sock
         note.help("use multicast, or a broker");
     }
     let mut peers: Vec<SocketAddr> = Vec::new();
-    for At { place, value } in listed {
+    for Located { place, value } in listed {
         let Some(text) = value else { continue };
         match text.parse::<SocketAddr>() {
             Ok(peer) if peer.is_ipv4() && peer.port() != 0 && !peer.ip().is_multicast() => {
@@ -225,7 +233,11 @@ fn peers(entry: &UdpEntry, own: SocketAddr, findings: &mut Findings) -> Vec<Sock
 /// The most hosts that each datagram is sent to.
 const MOST_PEERS: usize = 64;
 
-fn listed_broker(entry: &MqttEntry, place: Place, findings: &mut Findings) -> Option<Box<Broker>> {
+fn listed_broker(
+    entry: &MqttEntry,
+    place: TextSpan,
+    findings: &mut MappingFindings,
+) -> Option<Box<Broker>> {
     let Some(at) = &entry.address else {
         let message = "a broker in a list needs its `address`";
         let note = findings.error(Code::MissingKey, place, message);
@@ -257,7 +269,7 @@ fn is_same_network(one: &CarrierMedium, other: &CarrierMedium) -> bool {
 /// A name under `forward`.
 struct Listed {
     name: ForwardedName,
-    place: Place,
+    place: TextSpan,
     /// The number of the entry.
     number: usize,
 }
@@ -267,7 +279,7 @@ fn forwarded(
     entry: &CarrierEntry,
     number: usize,
     names: &mut Vec<Listed>,
-    findings: &mut Findings,
+    findings: &mut MappingFindings,
 ) -> Vec<ForwardedName> {
     let mut own = Vec::new();
     let Some((entries, place)) = given(&entry.forward) else {

@@ -5,19 +5,19 @@ use std::collections::BTreeMap;
 use super::{Declared, required};
 use crate::code::Code;
 use crate::document::{Namespaces, SpaceEntry};
-use crate::findings::Findings;
+use crate::findings::MappingFindings;
 use crate::mapping::Space;
-use crate::read::{At, given};
+use crate::read::{Located, given};
 use crate::secret::has_user;
 use crate::topic::SpaceId;
-use crate::tree::Place;
+use crate::tree::TextSpan;
 
 /// Highest DDS domain with ports that fit into 16 bits (DDSI-RTPS 2.3, 9.6.1.1).
 const MAX_DOMAIN: u16 = 232;
 
 pub(super) fn spaces(
-    entries: Option<&At<Vec<At<SpaceEntry>>>>,
-    findings: &mut Findings,
+    entries: Option<&Located<Vec<Located<SpaceEntry>>>>,
+    findings: &mut MappingFindings,
 ) -> Declared<Vec<Space>> {
     let mut declared = Declared {
         known: Vec::new(),
@@ -64,7 +64,11 @@ pub(super) fn spaces(
     declared
 }
 
-fn id(entry: &SpaceEntry, owner: Place, findings: &mut Findings) -> Option<(SpaceId, Place)> {
+fn id(
+    entry: &SpaceEntry,
+    owner: TextSpan,
+    findings: &mut MappingFindings,
+) -> Option<(SpaceId, TextSpan)> {
     let (number, place) = required(&entry.id, "id", "the space", owner, findings)?;
     let Some(id) = SpaceId::new(*number).filter(|id| *id != SpaceId::UA) else {
         let what = if *number == 0 {
@@ -99,9 +103,9 @@ fn id(entry: &SpaceEntry, owner: Place, findings: &mut Findings) -> Option<(Spac
 fn domain(
     entry: &SpaceEntry,
     id: SpaceId,
-    owner: Place,
-    findings: &mut Findings,
-) -> (Option<u16>, Place) {
+    owner: TextSpan,
+    findings: &mut MappingFindings,
+) -> (Option<u16>, TextSpan) {
     let default = id.is_ros2().then_some(u16::from(id));
     let Some((domain, place)) = given(&entry.domain) else {
         return (default, owner);
@@ -122,8 +126,8 @@ fn domain(
 }
 
 pub(super) fn namespaces(
-    entries: Option<&At<Namespaces>>,
-    findings: &mut Findings,
+    entries: Option<&Located<Namespaces>>,
+    findings: &mut MappingFindings,
 ) -> Declared<BTreeMap<u16, String>> {
     let mut declared = Declared {
         known: BTreeMap::new(),
@@ -133,8 +137,8 @@ pub(super) fn namespaces(
         return declared;
     };
     declared.partial = entries.value.is_none();
-    let mut uris: BTreeMap<&str, (u16, Place)> = BTreeMap::new();
-    let mut places: BTreeMap<u16, Place> = BTreeMap::new();
+    let mut uris: BTreeMap<&str, (u16, TextSpan)> = BTreeMap::new();
+    let mut places: BTreeMap<u16, TextSpan> = BTreeMap::new();
     for (index, uri) in entries.value.iter().flatten() {
         let (Some(number), Some(text)) = (index.value, uri.value.as_deref()) else {
             declared.partial = true;

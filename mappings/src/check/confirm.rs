@@ -8,19 +8,19 @@ use uadp::BuiltinType;
 use super::{network, required, types};
 use crate::code::Code;
 use crate::document::{ConfirmEntry, ConfirmWhenEntry, ConfirmedEntry, VariableEntry};
-use crate::findings::Findings;
+use crate::findings::MappingFindings;
 use crate::mapping::{Lasting, ServiceRole, Variable};
 use crate::node_id::NodeIdText;
-use crate::quality::{Answer, Confirm};
+use crate::quality::{Confirm, ConfirmingValues};
 use crate::read::{given, short};
 use crate::topic::{SpaceId, TopicId};
-use crate::tree::Place;
+use crate::tree::TextSpan;
 
 /// Sets the confirmation of each variable. Faults are noted.
 pub(super) fn check<'d>(
     entries: impl Iterator<Item = (TopicId, &'d VariableEntry)>,
     variables: &mut [Variable],
-    findings: &mut Findings,
+    findings: &mut MappingFindings,
 ) {
     for variable in &mut *variables {
         variable.confirmed_within = is_command(variable).then_some(CONFIRMED_WITHIN);
@@ -85,9 +85,9 @@ fn is_command(variable: &Variable) -> bool {
 /// noted.
 fn by_bridges(
     entry: Option<&ConfirmEntry>,
-    place: Place,
+    place: TextSpan,
     written: &Variable,
-    findings: &mut Findings,
+    findings: &mut MappingFindings,
 ) -> Option<Duration> {
     let answers = entry.and_then(|entry| {
         let when = entry.when.as_ref().map(|when| when.place);
@@ -139,10 +139,10 @@ fn by_bridges(
 
 /// Returns `None` for a faulty entry, which is noted.
 fn confirm(
-    (entry, place): (&ConfirmEntry, Place),
+    (entry, place): (&ConfirmEntry, TextSpan),
     written: &Variable,
     by_node: &HashMap<&NodeIdText, &Variable>,
-    findings: &mut Findings,
+    findings: &mut MappingFindings,
 ) -> Option<Confirm> {
     if !is_written(written) {
         findings
@@ -188,9 +188,9 @@ fn confirm(
 fn answer(
     entry: &ConfirmEntry,
     (written, by): (&Variable, &Variable),
-    place: Place,
-    findings: &mut Findings,
-) -> Option<Answer> {
+    place: TextSpan,
+    findings: &mut MappingFindings,
+) -> Option<ConfirmingValues> {
     if let Some((text, at)) = given(&entry.equals) {
         if entry.when.is_some() {
             findings
@@ -210,10 +210,10 @@ fn answer(
                 .help("it must be one Boolean, number or text; bind a single `field`");
             return None;
         }
-        return Some(Answer::Equals(text.clone()));
+        return Some(ConfirmingValues::Equals(text.clone()));
     }
     match given(&entry.when) {
-        Some((ConfirmWhenEntry::Any, _)) => Some(Answer::Any),
+        Some((ConfirmWhenEntry::Any, _)) => Some(ConfirmingValues::Any),
         Some((ConfirmWhenEntry::Same, _)) | None => {
             if !are_comparable(written, by) {
                 findings
@@ -235,7 +235,7 @@ fn answer(
                     )
                     .help("remove `publish: on_change` and `deadband` of the confirming variable");
             }
-            Some(Answer::Same)
+            Some(ConfirmingValues::Same)
         }
     }
 }

@@ -7,11 +7,11 @@ use super::types;
 use crate::code::Code;
 use crate::document::{BindingEntry, Document, VariableEntry};
 use crate::environment::{Environment, LiveNode, LiveServer, LiveSpace, LiveTopic};
-use crate::findings::Findings;
+use crate::findings::MappingFindings;
 use crate::mapping::{Binding, Mapping, ServiceRole, Variable};
 use crate::read::{given, short};
 use crate::topic::SpaceId;
-use crate::tree::Place;
+use crate::tree::TextSpan;
 use documents::nearest;
 
 /// Checks the environment. `mapping` is made of `document` and has no errors: it has a variable or
@@ -20,7 +20,7 @@ pub(super) fn check(
     document: &Document,
     mapping: &Mapping,
     environment: &Environment,
-    findings: &mut Findings,
+    findings: &mut MappingFindings,
 ) {
     let entries = document.variables.as_ref().and_then(|at| at.value.as_ref());
     let entries = entries.into_iter().flatten();
@@ -79,7 +79,7 @@ fn binding_entry<'d>(
     entries.next()
 }
 
-fn topic_place(entry: &VariableEntry, variable: &Variable, space: SpaceId) -> Option<Place> {
+fn topic_place(entry: &VariableEntry, variable: &Variable, space: SpaceId) -> Option<TextSpan> {
     let binding = binding_entry(entry, variable, space)?;
     given(&binding.topic).map(|(_, place)| place)
 }
@@ -88,8 +88,8 @@ fn topic(
     variable: &Variable,
     binding: &Binding,
     space: &LiveSpace,
-    place: Place,
-    findings: &mut Findings,
+    place: TextSpan,
+    findings: &mut MappingFindings,
 ) {
     let name = &binding.ros_topic;
     let read = binding.space == variable.topic.space;
@@ -138,8 +138,8 @@ fn service(
     entry: &VariableEntry,
     variable: &Variable,
     environment: &Environment,
-    place: Place,
-    findings: &mut Findings,
+    place: TextSpan,
+    findings: &mut MappingFindings,
 ) {
     let Some(bound) = &variable.service else {
         return;
@@ -192,8 +192,8 @@ fn unmatched(
     mapping: &Mapping,
     pattern: &crate::Pattern,
     space: &LiveSpace,
-    place: Place,
-    findings: &mut Findings,
+    place: TextSpan,
+    findings: &mut MappingFindings,
 ) {
     let published = space.topics.iter().filter(|(_, topic)| topic.published);
     let (mut other_types, mut fits) = (None, false);
@@ -234,7 +234,13 @@ fn unmatched(
     });
 }
 
-fn namespace(index: u16, uri: &str, place: Place, server: &LiveServer, findings: &mut Findings) {
+fn namespace(
+    index: u16,
+    uri: &str,
+    place: TextSpan,
+    server: &LiveServer,
+    findings: &mut MappingFindings,
+) {
     let there = server.namespaces.get(usize::from(index));
     if there.is_some_and(|there| there == uri) {
         return;
@@ -263,7 +269,7 @@ fn node(
     variable: &Variable,
     mapping: &Mapping,
     server: &LiveServer,
-    findings: &mut Findings,
+    findings: &mut MappingFindings,
 ) {
     let text = variable.node.to_string();
     let uri = mapping.namespaces().get(&variable.node.namespace);

@@ -5,12 +5,15 @@ use crate::carriers::{CarrierMedium, ConfiguredCarrier};
 use crate::code::Code;
 use crate::document::{EthernetEntry, PubSubEntry};
 use crate::ethernet::{EthernetGroup, EthernetUrl, EthernetUrlFault};
-use crate::findings::Findings;
-use crate::read::{Field, given, short};
-use crate::tree::Place;
+use crate::findings::MappingFindings;
+use crate::read::{OptionalKey, given, short};
+use crate::tree::TextSpan;
 
 /// Returns the only carrier of a mapping if it is Ethernet.
-pub(super) fn alone(entry: &PubSubEntry, findings: &mut Findings) -> Option<ConfiguredCarrier> {
+pub(super) fn alone(
+    entry: &PubSubEntry,
+    findings: &mut MappingFindings,
+) -> Option<ConfiguredCarrier> {
     let at = entry.eth.as_ref()?;
     let PubSubEntry {
         address,
@@ -42,8 +45,8 @@ pub(super) fn alone(entry: &PubSubEntry, findings: &mut Findings) -> Option<Conf
 /// Returns the group of an entry; `None` for a faulty entry.
 pub(super) fn group(
     entry: &EthernetEntry,
-    place: Place,
-    findings: &mut Findings,
+    place: TextSpan,
+    findings: &mut MappingFindings,
 ) -> Option<EthernetGroup> {
     let interface = name(entry, place, findings);
     let url = match given(&entry.address) {
@@ -82,7 +85,7 @@ pub(super) fn group(
 }
 
 /// Returns the name of the interface.
-fn name(entry: &EthernetEntry, place: Place, findings: &mut Findings) -> Option<String> {
+fn name(entry: &EthernetEntry, place: TextSpan, findings: &mut MappingFindings) -> Option<String> {
     let Some(at) = &entry.interface else {
         let message = "Ethernet needs the `interface`";
         let note = findings.error(Code::MissingKey, place, message);
@@ -99,7 +102,7 @@ fn name(entry: &EthernetEntry, place: Place, findings: &mut Findings) -> Option<
     Some(name)
 }
 
-fn address(text: &str, place: Place, findings: &mut Findings) -> Option<EthernetUrl> {
+fn address(text: &str, place: TextSpan, findings: &mut MappingFindings) -> Option<EthernetUrl> {
     let fault = match EthernetUrl::parse(text) {
         Ok(url) => return Some(url),
         Err(fault) => fault,
@@ -124,9 +127,9 @@ fn address(text: &str, place: Place, findings: &mut Findings) -> Option<Ethernet
 }
 
 fn number(
-    field: &Field<u16>,
+    field: &OptionalKey<u16>,
     (what, range): (&str, std::ops::RangeInclusive<u16>),
-    findings: &mut Findings,
+    findings: &mut MappingFindings,
 ) -> Option<u16> {
     let (number, place) = given(field)?;
     if range.contains(number) {

@@ -9,16 +9,19 @@ use super::servers::Servers;
 use crate::call::Call;
 use crate::code::Code;
 use crate::document::ServerEntry;
-use crate::findings::Findings;
+use crate::findings::MappingFindings;
 use crate::mapping::Variable;
-use crate::read::{At, given, short};
+use crate::read::{Located, given, short};
 use crate::remote::FindSkills;
 use crate::topic::SpaceId;
-use crate::tree::Place;
+use crate::tree::TextSpan;
 
 /// Returns the rule for the servers with skills that the cell's server represents when they are
 /// found. `None` for a faulty entry, which is noted.
-pub(super) fn check(of: Option<&At<ServerEntry>>, findings: &mut Findings) -> Option<FindSkills> {
+pub(super) fn check(
+    of: Option<&Located<ServerEntry>>,
+    findings: &mut MappingFindings,
+) -> Option<FindSkills> {
     const OF: &str = "`find_skills`";
     let server = of?.value.as_ref()?;
     let (entry, owner) = given(&server.find_skills)?;
@@ -53,7 +56,11 @@ pub(super) fn check(of: Option<&At<ServerEntry>>, findings: &mut Findings) -> Op
 
 /// Reads IPv4 networks of at most 65536 addresses. Returns `None` for a faulty network, which is
 /// noted.
-fn networks(entries: &[At<String>], place: Place, findings: &mut Findings) -> Option<Vec<String>> {
+fn networks(
+    entries: &[Located<String>],
+    place: TextSpan,
+    findings: &mut MappingFindings,
+) -> Option<Vec<String>> {
     if entries.len() > MOST_NETWORKS {
         let message = format!(
             "{} networks; at most {MOST_NETWORKS} are read",
@@ -85,9 +92,9 @@ fn networks(entries: &[At<String>], place: Place, findings: &mut Findings) -> Op
 
 /// Reads ApplicationUris, or prefixes of them. Returns `None` for a faulty entry, which is noted.
 fn application_uris(
-    entries: &[At<String>],
-    place: Place,
-    findings: &mut Findings,
+    entries: &[Located<String>],
+    place: TextSpan,
+    findings: &mut MappingFindings,
 ) -> Option<Vec<String>> {
     if entries.is_empty() || entries.len() > MOST_URIS {
         let message = format!(
@@ -122,10 +129,10 @@ fn application_uris(
 /// Notes variables, calls and servers in the namespaces that are reserved for servers that are
 /// found.
 pub(super) fn alone(
-    (entry, found): (Option<&At<ServerEntry>>, Option<&FindSkills>),
+    (entry, found): (Option<&Located<ServerEntry>>, Option<&FindSkills>),
     servers: &Servers,
     (variables, calls): (&[Variable], &[Call]),
-    findings: &mut Findings,
+    findings: &mut MappingFindings,
 ) {
     let entry = entry.and_then(|at| at.value.as_ref());
     let place = entry.and_then(|entry| given(&entry.find_skills));

@@ -3,27 +3,27 @@
 use std::collections::{BTreeMap, HashMap};
 use std::sync::Arc;
 
-use messages::{MessageType, Plan, Selection, TypeName, Wire};
+use messages::{MessagePlan, MessageType, Selection, TypeName, Wire};
 
-use super::types::{Types, dialect};
+use super::types::{MessageTypes, dialect};
 use super::{network, required};
 use crate::code::Code;
 use crate::document::{OnLossEntry, Request, VariableEntry};
-use crate::findings::Findings;
+use crate::findings::MappingFindings;
 use crate::loss::{Loss, LossAction, Motion};
 use crate::mapping::{Binding, Lasting, ServiceRole, Variable};
 use crate::node_id::NodeIdText;
 use crate::read::short;
 use crate::topic::{SpaceId, TopicId};
-use crate::tree::Place;
+use crate::tree::TextSpan;
 
 /// Reads `on_loss` and `hold`, and warns of commands that move a robot without an end. Faults are
 /// noted.
 pub(super) fn check<'d>(
     entries: impl Iterator<Item = (TopicId, &'d VariableEntry)>,
     variables: &mut [Variable],
-    types: &mut Types,
-    findings: &mut Findings,
+    types: &mut MessageTypes,
+    findings: &mut MappingFindings,
 ) {
     let by_node: HashMap<NodeIdText, TopicId> = variables
         .iter()
@@ -47,8 +47,8 @@ pub(super) fn check<'d>(
 fn loss(
     entry: &VariableEntry,
     variable: &Variable,
-    (by_node, types): (&HashMap<NodeIdText, TopicId>, &mut Types),
-    findings: &mut Findings,
+    (by_node, types): (&HashMap<NodeIdText, TopicId>, &mut MessageTypes),
+    findings: &mut MappingFindings,
 ) -> Option<Loss> {
     let hold = network::duration(&entry.hold, findings);
     let Some(at) = &entry.on_loss else {
@@ -99,9 +99,9 @@ fn loss(
 /// Returns the variable whose service stops the robot.
 fn stop_call(
     call: &crate::document::StopCallEntry,
-    place: Place,
+    place: TextSpan,
     by_node: &HashMap<NodeIdText, TopicId>,
-    findings: &mut Findings,
+    findings: &mut MappingFindings,
 ) -> Option<TopicId> {
     let (node, at) = required(&call.call, "call", "`on_loss`", place, findings)?;
     let found = node.parse::<NodeIdText>().ok();
@@ -122,8 +122,8 @@ fn stop_call(
 fn fits(
     binding: &Binding,
     action: &LossAction,
-    (place, types): (Place, &mut Types),
-    findings: &mut Findings,
+    (place, types): (TextSpan, &mut MessageTypes),
+    findings: &mut MappingFindings,
 ) -> Option<()> {
     let Some(template) = action.template(&binding.selection) else {
         findings
@@ -156,8 +156,8 @@ fn fits(
 fn fits_request(
     (space, service_type, request): (SpaceId, &TypeName, &Selection),
     action: &LossAction,
-    (place, types): (Place, &mut Types),
-    findings: &mut Findings,
+    (place, types): (TextSpan, &mut MessageTypes),
+    findings: &mut MappingFindings,
 ) -> Option<()> {
     let Some(template) = action.template(request) else {
         findings
@@ -180,14 +180,14 @@ fn fits_request(
 fn can_be_made(
     message: &Arc<MessageType>,
     template: &Selection,
-    (space, place): (SpaceId, Place),
-    findings: &mut Findings,
+    (space, place): (SpaceId, TextSpan),
+    findings: &mut MappingFindings,
 ) -> Option<()> {
     let wire = match space {
         SpaceId::ROS1 => Wire::Ros1,
         _ => Wire::Cdr,
     };
-    match Plan::compile(message, template, wire) {
+    match MessagePlan::compile(message, template, wire) {
         Ok(_) => Some(()),
         Err(error) => {
             findings.of_part([space]);
@@ -232,7 +232,7 @@ fn is_stop_call(variable: &Variable) -> bool {
 
 /// Warns of a motion that continues after the loss of its commander, and of a motion that is stored
 /// for late subscribers.
-fn warn(entry: &VariableEntry, variable: &Variable, findings: &mut Findings) {
+fn warn(entry: &VariableEntry, variable: &Variable, findings: &mut MappingFindings) {
     let Some(place) = entry.ros.as_ref().map(|at| at.place) else {
         return;
     };

@@ -7,10 +7,10 @@ use uadp::BuiltinType;
 use super::types::{self, ValueType};
 use crate::code::Code;
 use crate::document::VariableEntry;
-use crate::findings::Findings;
+use crate::findings::MappingFindings;
 use crate::mapping::Meaning;
-use crate::read::{At, given, short};
-use crate::tree::Place;
+use crate::read::{Located, given, short};
+use crate::tree::TextSpan;
 use crate::unit::Unit;
 
 /// Maximum number of texts of one variable.
@@ -21,7 +21,7 @@ const MAX_TEXTS: usize = 1000;
 pub(super) fn check(
     entry: &VariableEntry,
     value: (Option<ValueType>, bool),
-    findings: &mut Findings,
+    findings: &mut MappingFindings,
 ) -> Option<Meaning> {
     let mut sound = Some(());
     let mut unit = None;
@@ -97,7 +97,7 @@ pub(super) fn check(
 fn precision(
     entry: &VariableEntry,
     value: (Option<ValueType>, bool),
-    findings: &mut Findings,
+    findings: &mut MappingFindings,
 ) -> Option<Option<u8>> {
     let Some((digits, place)) = given(&entry.precision) else {
         return Some(None);
@@ -114,7 +114,7 @@ fn precision(
 }
 
 /// Returns `None` for a faulty description, which is noted.
-fn description(entry: &VariableEntry, findings: &mut Findings) -> Option<Option<String>> {
+fn description(entry: &VariableEntry, findings: &mut MappingFindings) -> Option<Option<String>> {
     let Some((text, place)) = given(&entry.description) else {
         return Some(None);
     };
@@ -129,8 +129,8 @@ fn description(entry: &VariableEntry, findings: &mut Findings) -> Option<Option<
 /// Notes a value that is not a number, for a key that needs one.
 fn numbers(
     value: (Option<ValueType>, bool),
-    (key, code, place): (&str, Code, Place),
-    findings: &mut Findings,
+    (key, code, place): (&str, Code, TextSpan),
+    findings: &mut MappingFindings,
 ) -> Option<()> {
     let number = value.0.is_none_or(|(builtin, _)| builtin.is_number());
     if number && !value.1 {
@@ -150,7 +150,11 @@ fn told((value_type, several): (Option<ValueType>, bool)) -> String {
     }
 }
 
-fn limits(bounds: &[At<f64>], place: Place, findings: &mut Findings) -> Option<(f64, f64)> {
+fn limits(
+    bounds: &[Located<f64>],
+    place: TextSpan,
+    findings: &mut MappingFindings,
+) -> Option<(f64, f64)> {
     let bounds: Vec<f64> = bounds.iter().map(|at| at.value).collect::<Option<_>>()?;
     match bounds[..] {
         [low, high] if low.is_finite() && high.is_finite() && low < high => Some((low, high)),

@@ -14,15 +14,18 @@ use crate::document::{
     ServerEntry,
 };
 use crate::endpoint::Endpoint;
-use crate::findings::Findings;
-use crate::mapping::{PubSub, PublisherIdRule, SecurityPolicy, Server, ServerLimits};
+use crate::findings::MappingFindings;
+use crate::mapping::{PubSub, PublisherIdRule, Server, ServerLimits, ServerSecurityPolicy};
 use crate::quality::History;
-use crate::read::{At, Field, given, short};
+use crate::read::{Located, OptionalKey, given, short};
 use crate::secret::has_user;
-use crate::tree::Place;
+use crate::tree::TextSpan;
 
-pub(super) fn pubsub(entry: Option<&At<PubSubForm>>, findings: &mut Findings) -> PubSub {
-    let Some(At { place, value }) = entry else {
+pub(super) fn pubsub(
+    entry: Option<&Located<PubSubForm>>,
+    findings: &mut MappingFindings,
+) -> PubSub {
+    let Some(Located { place, value }) = entry else {
         return PubSub::default();
     };
     match value {
@@ -37,7 +40,7 @@ pub(super) fn pubsub(entry: Option<&At<PubSubForm>>, findings: &mut Findings) ->
 }
 
 /// Returns the settings of a single carrier.
-pub(super) fn settings(entry: &PubSubEntry, findings: &mut Findings) -> PubSub {
+pub(super) fn settings(entry: &PubSubEntry, findings: &mut MappingFindings) -> PubSub {
     let default = PubSub::default();
     let broker = broker::check(entry, findings);
     let address = given(&entry.address)
@@ -81,7 +84,7 @@ pub(super) fn settings(entry: &PubSubEntry, findings: &mut Findings) -> PubSub {
     pubsub
 }
 
-pub(super) fn ttl(field: &Field<u16>, findings: &mut Findings) -> Option<u8> {
+pub(super) fn ttl(field: &OptionalKey<u16>, findings: &mut MappingFindings) -> Option<u8> {
     let (number, place) = given(field)?;
     let ttl = u8::try_from(*number).ok();
     if ttl.is_none() {
@@ -94,10 +97,10 @@ pub(super) fn ttl(field: &Field<u16>, findings: &mut Findings) -> Option<u8> {
 }
 
 pub(super) fn within(
-    field: &Field<u16>,
+    field: &OptionalKey<u16>,
     range: RangeInclusive<u16>,
     unit: &str,
-    findings: &mut Findings,
+    findings: &mut MappingFindings,
 ) -> Option<u16> {
     let (number, place) = given(field)?;
     if range.contains(number) {
@@ -111,8 +114,8 @@ pub(super) fn within(
     None
 }
 
-fn timing(entry: &PubSubEntry, pubsub: &PubSub, findings: &mut Findings) {
-    let faulty = |field: &Field<String>| {
+fn timing(entry: &PubSubEntry, pubsub: &PubSub, findings: &mut MappingFindings) {
+    let faulty = |field: &OptionalKey<String>| {
         field
             .as_ref()
             .is_some_and(|at| at.value.as_deref().and_then(parse_duration).is_none())
@@ -142,7 +145,11 @@ fn timing(entry: &PubSubEntry, pubsub: &PubSub, findings: &mut Findings) {
 }
 
 /// Reads `opc.udp://host:port`; the default port is 4840 (OPC 10000-14, 7.3.2).
-pub(super) fn address(text: &str, place: Place, findings: &mut Findings) -> Option<SocketAddr> {
+pub(super) fn address(
+    text: &str,
+    place: TextSpan,
+    findings: &mut MappingFindings,
+) -> Option<SocketAddr> {
     let Some(address) = PubSub::parse_address(text) else {
         let message = format!("`{}` is not a PubSub address", short(text));
         let mut note = findings.error(Code::Address, place, message);
@@ -200,7 +207,11 @@ pub(super) fn address(text: &str, place: Place, findings: &mut Findings) -> Opti
 /// Longest name of a network interface of Linux.
 const MAX_INTERFACE: usize = 15;
 
-pub(super) fn interface(text: &str, place: Place, findings: &mut Findings) -> Option<String> {
+pub(super) fn interface(
+    text: &str,
+    place: TextSpan,
+    findings: &mut MappingFindings,
+) -> Option<String> {
     let named = !text.is_empty()
         && text.len() <= MAX_INTERFACE
         && !text.contains(|c: char| c.is_whitespace() || c.is_control() || c == '/');
@@ -220,7 +231,10 @@ pub(super) fn interface(text: &str, place: Place, findings: &mut Findings) -> Op
 const SHORTEST: Duration = Duration::from_millis(10);
 const LONGEST: Duration = Duration::from_secs(3600);
 
-pub(super) fn duration(field: &Field<String>, findings: &mut Findings) -> Option<Duration> {
+pub(super) fn duration(
+    field: &OptionalKey<String>,
+    findings: &mut MappingFindings,
+) -> Option<Duration> {
     let (text, place) = given(field)?;
     let duration = parse_duration(text);
     if duration.is_none() {
@@ -257,7 +271,10 @@ fn parse_duration(text: &str) -> Option<Duration> {
     (SHORTEST..=LONGEST).contains(&duration).then_some(duration)
 }
 
-pub(super) fn server(entry: Option<&At<ServerEntry>>, findings: &mut Findings) -> Server {
+pub(super) fn server(
+    entry: Option<&Located<ServerEntry>>,
+    findings: &mut MappingFindings,
+) -> Server {
     let default = Server::default();
     let Some(entry) = entry.and_then(|at| at.value.as_ref()) else {
         return default;
@@ -315,7 +332,10 @@ pub(super) fn server(entry: Option<&At<ServerEntry>>, findings: &mut Findings) -
 }
 
 /// Reads the ApplicationUris of redundant servers.
-fn redundant(field: &Field<Vec<At<String>>>, findings: &mut Findings) -> Vec<String> {
+fn redundant(
+    field: &OptionalKey<Vec<Located<String>>>,
+    findings: &mut MappingFindings,
+) -> Vec<String> {
     let Some((entries, place)) = given(field) else {
         return Vec::new();
     };
@@ -349,15 +369,15 @@ fn redundant(field: &Field<Vec<At<String>>>, findings: &mut Findings) -> Vec<Str
 
 /// Reads the endpoints of redundant servers, one for each of their ApplicationUris.
 fn redundant_endpoints(
-    field: &Field<Vec<At<String>>>,
+    field: &OptionalKey<Vec<Located<String>>>,
     servers: usize,
-    findings: &mut Findings,
+    findings: &mut MappingFindings,
 ) -> Vec<Endpoint> {
     let Some((entries, place)) = given(field) else {
         return Vec::new();
     };
     let mut endpoints: Vec<Endpoint> = Vec::new();
-    for At { place, value } in entries {
+    for Located { place, value } in entries {
         let Some(text) = value else {
             return Vec::new();
         };
@@ -385,7 +405,10 @@ fn redundant_endpoints(
 }
 
 /// Returns the clients to which the server connects.
-fn reverse_connect(field: &Field<Vec<At<String>>>, findings: &mut Findings) -> Vec<Endpoint> {
+fn reverse_connect(
+    field: &OptionalKey<Vec<Located<String>>>,
+    findings: &mut MappingFindings,
+) -> Vec<Endpoint> {
     let Some((entries, place)) = given(field) else {
         return Vec::new();
     };
@@ -395,7 +418,7 @@ fn reverse_connect(field: &Field<Vec<At<String>>>, findings: &mut Findings) -> V
         return Vec::new();
     }
     let mut clients: Vec<Endpoint> = Vec::new();
-    for At { place, value } in entries {
+    for Located { place, value } in entries {
         let Some(text) = value else { continue };
         let Some(client) = remote_endpoint(text, *place, findings) else {
             continue;
@@ -413,7 +436,7 @@ fn reverse_connect(field: &Field<Vec<At<String>>>, findings: &mut Findings) -> V
 /// Maximum number of clients to which the server connects.
 const MAX_REVERSE: usize = 16;
 
-fn history(field: &Field<HistoryEntry>, findings: &mut Findings) -> History {
+fn history(field: &OptionalKey<HistoryEntry>, findings: &mut MappingFindings) -> History {
     let usual = History::default();
     let Some((entry, _)) = given(field) else {
         return usual;
@@ -425,7 +448,7 @@ fn history(field: &Field<HistoryEntry>, findings: &mut Findings) -> History {
     }
 }
 
-fn limits(field: &Field<LimitsEntry>, findings: &mut Findings) -> ServerLimits {
+fn limits(field: &OptionalKey<LimitsEntry>, findings: &mut MappingFindings) -> ServerLimits {
     let Some((entry, _)) = given(field) else {
         return ServerLimits::default();
     };
@@ -453,8 +476,8 @@ fn limits(field: &Field<LimitsEntry>, findings: &mut Findings) -> ServerLimits {
 /// Reads the endpoint of another server. Returns `None` for a faulty endpoint, which is noted.
 pub(super) fn remote_endpoint(
     text: &str,
-    place: Place,
-    findings: &mut Findings,
+    place: TextSpan,
+    findings: &mut MappingFindings,
 ) -> Option<Endpoint> {
     let endpoint = Endpoint::parse(text);
     if endpoint.is_none() {
@@ -475,10 +498,10 @@ pub(super) fn is_own(endpoint: &Endpoint, own: &Server) -> bool {
 }
 
 fn security(
-    entries: &[At<SecurityEntry>],
-    place: Place,
-    findings: &mut Findings,
-) -> Option<Vec<SecurityPolicy>> {
+    entries: &[Located<SecurityEntry>],
+    place: TextSpan,
+    findings: &mut MappingFindings,
+) -> Option<Vec<ServerSecurityPolicy>> {
     if entries.is_empty() {
         let message = "a server without a security policy has no endpoint";
         findings
@@ -503,12 +526,12 @@ fn security(
     Some(policies)
 }
 
-pub(super) const fn policy(entry: SecurityEntry) -> SecurityPolicy {
+pub(super) const fn policy(entry: SecurityEntry) -> ServerSecurityPolicy {
     match entry {
-        SecurityEntry::None => SecurityPolicy::None,
-        SecurityEntry::Basic256Sha256 => SecurityPolicy::Basic256Sha256,
-        SecurityEntry::Aes128Sha256RsaOaep => SecurityPolicy::Aes128Sha256RsaOaep,
-        SecurityEntry::Aes256Sha256RsaPss => SecurityPolicy::Aes256Sha256RsaPss,
+        SecurityEntry::None => ServerSecurityPolicy::None,
+        SecurityEntry::Basic256Sha256 => ServerSecurityPolicy::Basic256Sha256,
+        SecurityEntry::Aes128Sha256RsaOaep => ServerSecurityPolicy::Aes128Sha256RsaOaep,
+        SecurityEntry::Aes256Sha256RsaPss => ServerSecurityPolicy::Aes256Sha256RsaPss,
     }
 }
 

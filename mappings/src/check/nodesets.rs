@@ -5,19 +5,19 @@ use std::path::PathBuf;
 use super::types::{print, value_type};
 use crate::code::Code;
 use crate::document::{Document, ServerEntry, VariableEntry};
-use crate::findings::Findings;
+use crate::findings::MappingFindings;
 use crate::mapping::{Mapping, Variable};
 use crate::nodesets::{NodeSetNode, NodeSets};
-use crate::read::{At, given, short};
+use crate::read::{Located, given, short};
 use crate::surroundings::Surroundings;
 use crate::topic::SpaceId;
-use crate::tree::Place;
+use crate::tree::TextSpan;
 
 /// Returns the files and their positions. Faulty entries are left out.
 pub(super) fn files(
-    entry: Option<&At<ServerEntry>>,
-    findings: &mut Findings,
-) -> (Vec<PathBuf>, Vec<Place>) {
+    entry: Option<&Located<ServerEntry>>,
+    findings: &mut MappingFindings,
+) -> (Vec<PathBuf>, Vec<TextSpan>) {
     let entries = entry.and_then(|at| given(&at.value.as_ref()?.nodesets));
     let entries = entries.map_or(&[][..], |(entries, _)| entries);
     if let Some(first) = entries.get(MOST) {
@@ -44,9 +44,9 @@ pub(super) fn files(
 pub(super) fn check(
     document: &Document,
     mapping: &Mapping,
-    places: &[Place],
+    places: &[TextSpan],
     around: &dyn Surroundings,
-    findings: &mut Findings,
+    findings: &mut MappingFindings,
 ) {
     let files = &mapping.server().nodesets;
     if files.is_empty() {
@@ -79,9 +79,9 @@ pub(super) fn check(
 /// Notes a file with nodes of the server's own namespace, which is reserved for the server.
 fn own_namespace(
     mapping: &Mapping,
-    places: &[Place],
+    places: &[TextSpan],
     sets: &dyn NodeSets,
-    findings: &mut Findings,
+    findings: &mut MappingFindings,
 ) {
     let own = &mapping.server().application_uri;
     if let Some(place) = places.first()
@@ -97,7 +97,12 @@ fn own_namespace(
 }
 
 /// Compares the mapping's nodes with the nodes of the files. Checks nothing if an entry is faulty.
-fn nodes(document: &Document, mapping: &Mapping, sets: &dyn NodeSets, findings: &mut Findings) {
+fn nodes(
+    document: &Document,
+    mapping: &Mapping,
+    sets: &dyn NodeSets,
+    findings: &mut MappingFindings,
+) {
     if !document.has_all_of(mapping) {
         return;
     }
@@ -133,7 +138,7 @@ fn nodes(document: &Document, mapping: &Mapping, sets: &dyn NodeSets, findings: 
     }
 }
 
-fn created(node: &str, uri: &str, place: Place, findings: &mut Findings) {
+fn created(node: &str, uri: &str, place: TextSpan, findings: &mut MappingFindings) {
     let message = format!(
         "no NodeSet has a node `{}` of `{}`",
         short(node),
@@ -148,8 +153,8 @@ fn created(node: &str, uri: &str, place: Place, findings: &mut Findings) {
 fn variable(
     entry: &VariableEntry,
     one: &Variable,
-    (node, place): (NodeSetNode, Place),
-    findings: &mut Findings,
+    (node, place): (NodeSetNode, TextSpan),
+    findings: &mut MappingFindings,
 ) {
     let id = one.node.to_string();
     let NodeSetNode::Variable(..) = node else {

@@ -4,28 +4,28 @@ use std::collections::BTreeMap;
 
 use messages::{Selection, TypeName};
 
-use super::selection::{self, Chosen};
-use super::shaping::Way;
-use super::types::{Types, dialect};
+use super::selection::{self, SelectionKeys};
+use super::shaping::ValueDirection;
+use super::types::{MessageTypes, dialect};
 use super::{Declared, required, variables};
 use crate::code::Code;
 use crate::document::PatternEntry;
-use crate::findings::Findings;
+use crate::findings::MappingFindings;
 use crate::mapping::Space;
 use crate::node_id::NodeIdText;
-use crate::pattern::{Glob, Pattern, Template};
-use crate::read::{At, given, short};
+use crate::pattern::{Glob, NameTemplate, Pattern};
+use crate::read::{Located, given, short};
 use crate::topic::SpaceId;
-use crate::tree::Place;
+use crate::tree::TextSpan;
 
 /// Maximum number of patterns of one document: each pattern is matched with every topic.
 const MAX_PATTERNS: usize = 1000;
 
 pub(super) fn check(
-    entries: &[At<PatternEntry>],
+    entries: &[Located<PatternEntry>],
     (spaces, namespaces): (&Declared<Vec<Space>>, &Declared<BTreeMap<u16, String>>),
-    types: &mut Types,
-    findings: &mut Findings,
+    types: &mut MessageTypes,
+    findings: &mut MappingFindings,
 ) -> Vec<Pattern> {
     if let Some(first) = entries.get(MAX_PATTERNS) {
         let message = format!(
@@ -79,9 +79,9 @@ pub(super) fn check(
 
 fn origin_of(
     number: u16,
-    place: Place,
+    place: TextSpan,
     spaces: &Declared<Vec<Space>>,
-    findings: &mut Findings,
+    findings: &mut MappingFindings,
 ) -> Option<SpaceId> {
     let origin = variables::space(number, place, "origin", spaces, findings)?;
     if origin == SpaceId::UA {
@@ -97,16 +97,16 @@ fn origin_of(
 struct Texts {
     topics: Glob,
     exclude: Vec<Glob>,
-    node: Template,
-    alias: Option<Template>,
-    name: Template,
+    node: NameTemplate,
+    alias: Option<NameTemplate>,
+    name: NameTemplate,
 }
 
 fn texts(
     entry: &PatternEntry,
-    owner: Place,
+    owner: TextSpan,
     namespaces: &Declared<BTreeMap<u16, String>>,
-    findings: &mut Findings,
+    findings: &mut MappingFindings,
 ) -> Option<Texts> {
     let topics = required(&entry.topics, "topics", "the pattern", owner, findings);
     let node = required(&entry.node, "node", "the pattern", owner, findings);
@@ -147,7 +147,7 @@ fn texts(
     })
 }
 
-fn glob(text: &str, place: Place, findings: &mut Findings) -> Option<Glob> {
+fn glob(text: &str, place: TextSpan, findings: &mut MappingFindings) -> Option<Glob> {
     match Glob::parse(text) {
         Ok(glob) => Some(glob),
         Err(why) => {
@@ -162,11 +162,11 @@ fn glob(text: &str, place: Place, findings: &mut Findings) -> Option<Glob> {
 
 fn template(
     text: &str,
-    place: Place,
+    place: TextSpan,
     captures: usize,
-    findings: &mut Findings,
-) -> Option<Template> {
-    match Template::parse(text, captures) {
+    findings: &mut MappingFindings,
+) -> Option<NameTemplate> {
+    match NameTemplate::parse(text, captures) {
         Ok(template) => Some(template),
         Err(piece) => {
             let message = format!("`{}` does not refer to a wildcard", short(&piece));
@@ -183,10 +183,10 @@ fn template(
 /// Reads a text that has to differ from topic to topic.
 fn numbered(
     text: &str,
-    place: Place,
+    place: TextSpan,
     captures: usize,
-    findings: &mut Findings,
-) -> Option<Template> {
+    findings: &mut MappingFindings,
+) -> Option<NameTemplate> {
     let template = template(text, place, captures, findings)?;
     if !template.varies() {
         let message = format!("`{}` is the same for every topic", short(text));
@@ -200,11 +200,11 @@ fn numbered(
 
 fn node(
     text: &str,
-    place: Place,
+    place: TextSpan,
     (captures, alias): (usize, bool),
     namespaces: &Declared<BTreeMap<u16, String>>,
-    findings: &mut Findings,
-) -> Option<Template> {
+    findings: &mut MappingFindings,
+) -> Option<NameTemplate> {
     let template = numbered(text, place, captures, findings)?;
     let example = template.render(&vec!["1".to_owned(); captures]);
     let fixed = text.split(';').next().is_some_and(|ns| !ns.contains('{'));
@@ -239,15 +239,15 @@ fn node(
 
 /// Returns type and selection.
 fn kind(
-    (entry, owner): (&PatternEntry, Place),
+    (entry, owner): (&PatternEntry, TextSpan),
     origin: Option<SpaceId>,
-    types: &mut Types,
-    findings: &mut Findings,
+    types: &mut MessageTypes,
+    findings: &mut MappingFindings,
 ) -> Option<(Option<TypeName>, Selection)> {
-    let chosen = Chosen::from(entry);
-    let chosen_at = |or: Place| chosen.place().unwrap_or(or);
+    let chosen = SelectionKeys::from(entry);
+    let chosen_at = |or: TextSpan| chosen.place().unwrap_or(or);
     // A pattern makes values of its own space, without a declared type.
-    let way = Way {
+    let way = ValueDirection {
         reads: true,
         declared: None,
         alone: false,

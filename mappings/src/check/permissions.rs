@@ -5,17 +5,17 @@ use crate::document::{
     AnonymousEntry, CallPermissionsEntry, PermissionsEntry, RoleEntry, RoleList, SecurityEntry,
     ServerEntry,
 };
-use crate::findings::Findings;
+use crate::findings::MappingFindings;
 use crate::mapping::Server;
 use crate::permission::{Anonymous, Permissions, Role};
-use crate::read::{Field, given};
+use crate::read::{OptionalKey, given};
 use crate::topic::SpaceId;
 
 /// Returns `None` for a faulty entry, which is noted.
 pub(super) fn of_variable(
-    field: &Field<PermissionsEntry>,
+    field: &OptionalKey<PermissionsEntry>,
     origin: Option<SpaceId>,
-    findings: &mut Findings,
+    findings: &mut MappingFindings,
 ) -> Option<Permissions> {
     let Some(at) = field else {
         return Some(Permissions::default());
@@ -36,15 +36,18 @@ pub(super) fn of_variable(
 
 /// Returns the roles that may call; the outer `None` marks a faulty entry.
 pub(super) fn of_call(
-    field: &Field<CallPermissionsEntry>,
-    findings: &mut Findings,
+    field: &OptionalKey<CallPermissionsEntry>,
+    findings: &mut MappingFindings,
 ) -> Option<Option<Vec<Role>>> {
     let Some(at) = field else { return Some(None) };
     roles(&at.value.as_ref()?.call, findings)
 }
 
 /// Returns the roles; the outer `None` marks a faulty entry, the inner an entry that is left out.
-fn roles(field: &Field<RoleList>, findings: &mut Findings) -> Option<Option<Vec<Role>>> {
+fn roles(
+    field: &OptionalKey<RoleList>,
+    findings: &mut MappingFindings,
+) -> Option<Option<Vec<Role>>> {
     let Some(at) = field else { return Some(None) };
     let RoleList(entries) = at.value.as_ref()?;
     if entries.is_empty() {
@@ -93,7 +96,7 @@ pub(super) fn anonymous(entry: &ServerEntry) -> Anonymous {
 }
 
 /// Reports permissions that are open to other hosts that reach the server.
-pub(super) fn left_open(entry: &ServerEntry, server: &Server, findings: &mut Findings) {
+pub(super) fn left_open(entry: &ServerEntry, server: &Server, findings: &mut MappingFindings) {
     if server.is_local() {
         return;
     }

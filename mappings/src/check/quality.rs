@@ -5,19 +5,19 @@ use std::time::Duration;
 use super::network;
 use crate::code::Code;
 use crate::document::VariableEntry;
-use crate::findings::Findings;
+use crate::findings::MappingFindings;
 use crate::mapping::Publish;
 use crate::quality::Ages;
 use crate::read::given;
 use crate::topic::SpaceId;
-use crate::tree::Place;
+use crate::tree::TextSpan;
 
 /// Returns `None` for a faulty entry, which is noted.
 pub(super) fn check(
     entry: &VariableEntry,
     origin: Option<SpaceId>,
     publish: Option<&Publish>,
-    findings: &mut Findings,
+    findings: &mut MappingFindings,
 ) -> Option<Ages> {
     let deadline = deadline(entry, publish, findings)?;
     let is_by_clients = origin == Some(SpaceId::UA) && entry.from.is_none();
@@ -66,7 +66,7 @@ pub(super) fn check(
 fn deadline(
     entry: &VariableEntry,
     publish: Option<&Publish>,
-    findings: &mut Findings,
+    findings: &mut MappingFindings,
 ) -> Option<Option<Duration>> {
     let Some((_, place)) = given(&entry.deadline) else {
         return Some(None);
@@ -81,9 +81,9 @@ fn deadline(
 /// change are a warning.
 fn is_frequent(
     publish: &Publish,
-    (after, place): (Duration, Place),
+    (after, place): (Duration, TextSpan),
     key: &str,
-    findings: &mut Findings,
+    findings: &mut MappingFindings,
 ) -> bool {
     if publish.on_change {
         findings

@@ -4,17 +4,17 @@ use super::servers::{self, Servers};
 use super::types::ValueType;
 use crate::code::Code;
 use crate::document::VariableEntry;
-use crate::findings::Findings;
+use crate::findings::MappingFindings;
 use crate::node_id::NodeIdText;
 use crate::read::given;
 use crate::remote::{NodeSource, NodeTarget};
 use crate::topic::SpaceId;
 
 /// Source and target of a variable at other servers.
-pub(super) type Remote = (Option<Box<NodeSource>>, Option<Box<NodeTarget>>);
+pub(super) type RemoteKeys = (Option<Box<NodeSource>>, Option<Box<NodeTarget>>);
 
 /// Properties of the variable that are known.
-pub(super) struct Subject<'s> {
+pub(super) struct RemoteVariable<'s> {
     pub(super) origin: Option<SpaceId>,
     pub(super) node: Option<&'s NodeIdText>,
     /// `true` for a variable with one value, and for a variable whose fields are not known.
@@ -27,10 +27,10 @@ pub(super) struct Subject<'s> {
 /// Returns `None` for a faulty entry, which is noted.
 pub(super) fn check(
     entry: &VariableEntry,
-    subject: &Subject<'_>,
+    subject: &RemoteVariable<'_>,
     servers: &Servers,
-    findings: &mut Findings,
-) -> Option<Remote> {
+    findings: &mut MappingFindings,
+) -> Option<RemoteKeys> {
     let from = match &entry.from {
         None => None,
         Some(at) => {
@@ -73,7 +73,11 @@ pub(super) fn check(
 }
 
 /// Returns `true` if its values can come from another server.
-fn may_come(entry: &VariableEntry, subject: &Subject<'_>, findings: &mut Findings) -> bool {
+fn may_come(
+    entry: &VariableEntry,
+    subject: &RemoteVariable<'_>,
+    findings: &mut MappingFindings,
+) -> bool {
     let Some(place) = entry.from.as_ref().map(|at| at.place) else {
         return true;
     };

@@ -12,12 +12,12 @@ use crate::document::{
     Document, GroupEntry, GroupModeEntry, GroupPolicyEntry, KeysEntry, ReplayEntry, SksEntry,
 };
 use crate::endpoint::Endpoint;
-use crate::findings::Findings;
+use crate::findings::MappingFindings;
 use crate::key_text::is_key;
-use crate::mapping::{Mapping, SecurityPolicy, Server};
-use crate::read::{At, given, short};
-use crate::security::{GroupMode, GroupPolicy, KeySource, Replay, SecurityGroup, Served};
-use crate::tree::Place;
+use crate::mapping::{Mapping, Server, ServerSecurityPolicy};
+use crate::read::{Located, given, short};
+use crate::security::{GroupMode, GroupPolicy, KeySource, Replay, SecurityGroup, ServedKeys};
+use crate::tree::TextSpan;
 
 /// Maximum number of groups of a document.
 const MAX_GROUPS: usize = 64;
@@ -28,17 +28,17 @@ const LEAST_LIFETIME: Duration = Duration::from_secs(2);
 
 /// Checks the groups. `server` is the cell's own server.
 pub(super) fn check(
-    entries: &[At<GroupEntry>],
+    entries: &[Located<GroupEntry>],
     server: &Server,
-    findings: &mut Findings,
+    findings: &mut MappingFindings,
 ) -> Vec<SecurityGroup> {
     if let Some(first) = entries.get(MAX_GROUPS) {
         let message = format!("{} groups; at most {MAX_GROUPS} are read", entries.len());
         findings.error(Code::TooLarge, first.place, message);
         return Vec::new();
     }
-    let mut ids: BTreeMap<String, Place> = BTreeMap::new();
-    let mut taken: BTreeMap<Option<u16>, Place> = BTreeMap::new();
+    let mut ids: BTreeMap<String, TextSpan> = BTreeMap::new();
+    let mut taken: BTreeMap<Option<u16>, TextSpan> = BTreeMap::new();
     let mut groups = Vec::new();
     for at in entries {
         let Some(entry) = &at.value else { continue };
@@ -63,12 +63,12 @@ pub(super) fn check(
 /// Notes namespaces that two groups claim.
 fn claim(
     entry: &GroupEntry,
-    owner: Place,
-    taken: &mut BTreeMap<Option<u16>, Place>,
-    findings: &mut Findings,
+    owner: TextSpan,
+    taken: &mut BTreeMap<Option<u16>, TextSpan>,
+    findings: &mut MappingFindings,
 ) {
     let listed = entry.namespaces.as_ref().and_then(|at| at.value.as_deref());
-    let listed: Vec<(Option<u16>, Place)> = match listed {
+    let listed: Vec<(Option<u16>, TextSpan)> = match listed {
         Some(list) => {
             let sound = list.iter().filter(|at| at.value.is_some());
             sound.map(|at| (at.value, at.place)).collect()
@@ -92,9 +92,9 @@ fn claim(
 
 fn group(
     entry: &GroupEntry,
-    owner: Place,
+    owner: TextSpan,
     server: &Server,
-    findings: &mut Findings,
+    findings: &mut MappingFindings,
 ) -> Option<SecurityGroup> {
     let (id, place) = required(&entry.group, "group", "the entry", owner, findings)?;
     if id.is_empty() || id.chars().count() > 128 || id.chars().any(char::is_control) {
@@ -149,9 +149,9 @@ fn group(
 
 fn keys(
     entry: &GroupEntry,
-    (mode, owner): (GroupMode, Place),
+    (mode, owner): (GroupMode, TextSpan),
     server: &Server,
-    findings: &mut Findings,
+    findings: &mut MappingFindings,
 ) -> Option<KeySource> {
     let Some(at) = &entry.keys else {
         if mode != GroupMode::None {
@@ -179,9 +179,9 @@ fn keys(
 
 fn source(
     keys: &KeysEntry,
-    place: Place,
+    place: TextSpan,
     server: &Server,
-    findings: &mut Findings,
+    findings: &mut MappingFindings,
 ) -> Option<KeySource> {
     let count = usize::from(keys.file.is_some())
         + usize::from(keys.credential.is_some())
@@ -223,9 +223,9 @@ fn source(
 
 fn service(
     entry: &SksEntry,
-    place: Place,
+    place: TextSpan,
     server: &Server,
-    findings: &mut Findings,
+    findings: &mut MappingFindings,
 ) -> Option<KeySource> {
     let lifetime = duration(&entry.key_lifetime, findings);
     if let Some(short) = lifetime.filter(|time| *time < LEAST_LIFETIME)
@@ -243,7 +243,7 @@ fn service(
         .filter_map(|at| at.value.clone())
         .collect();
     let own = || {
-        KeySource::Own(Served {
+        KeySource::Own(ServedKeys {
             endpoint: server.first_endpoint().clone(),
             lifetime: lifetime.unwrap_or(LIFETIME),
             members: members.clone(),
@@ -283,7 +283,7 @@ fn service(
 }
 
 /// Reports the parts of a partly secured cell that are not secured.
-pub(super) fn left_open(mapping: &Mapping, document: &Document, findings: &mut Findings) {
+pub(super) fn left_open(mapping: &Mapping, document: &Document, findings: &mut MappingFindings) {
     own_service(mapping, document, findings);
     let secured = |group: &SecurityGroup| group.mode != GroupMode::None;
     let Some(at) = &document.security else { return };
@@ -324,7 +324,7 @@ pub(super) fn left_open(mapping: &Mapping, document: &Document, findings: &mut F
 }
 
 /// Reports a configuration that keeps programs from getting the keys of the cell's own server.
-fn own_service(mapping: &Mapping, document: &Document, findings: &mut Findings) {
+fn own_service(mapping: &Mapping, document: &Document, findings: &mut MappingFindings) {
     let own = |group: &&SecurityGroup| matches!(group.keys, Some(KeySource::Own(_)));
     let (Some(at), Some(group)) = (&document.security, mapping.security().iter().find(own)) else {
         return;
@@ -339,7 +339,7 @@ fn own_service(mapping: &Mapping, document: &Document, findings: &mut Findings) 
             without_members(entry.place, group, server, findings);
         }
     }
-    if server.policies(server.is_local()) == [SecurityPolicy::None] {
+    if server.policies(server.is_local()) == [ServerSecurityPolicy::None] {
         let message = format!(
             "the server provides the keys of the group `{}` over encrypted sessions only, but offers no encryption",
             short(&group.id)
@@ -375,7 +375,12 @@ fn own_service(mapping: &Mapping, document: &Document, findings: &mut Findings) 
 }
 
 /// Reports a group without `members`: only programs of the cell get its keys.
-fn without_members(place: Place, group: &SecurityGroup, server: &Server, findings: &mut Findings) {
+fn without_members(
+    place: TextSpan,
+    group: &SecurityGroup,
+    server: &Server,
+    findings: &mut MappingFindings,
+) {
     let Some(KeySource::Own(served)) = &group.keys else {
         return;
     };
@@ -397,7 +402,7 @@ fn without_members(place: Place, group: &SecurityGroup, server: &Server, finding
 }
 
 /// Returns the position of a call.
-fn place_of(document: &Document, call: &Call) -> Option<Place> {
+fn place_of(document: &Document, call: &Call) -> Option<TextSpan> {
     let entries = document.calls.as_ref()?.value.as_deref()?;
     let mut named = entries
         .iter()

@@ -7,24 +7,24 @@ use messages::{Leaf, MessageType, Selection};
 
 use super::bindings::told;
 use super::several;
-use super::shaping::{self, Keys, Way};
+use super::shaping::{self, ConversionKeys, ValueDirection};
 use crate::code::Code;
 use crate::document::{AsEntry, BindingEntry, FieldList, PatternEntry};
-use crate::findings::Findings;
-use crate::read::{Field, given, short};
-use crate::tree::Place;
+use crate::findings::MappingFindings;
+use crate::read::{OptionalKey, given, short};
+use crate::tree::TextSpan;
 use documents::nearest;
 
 /// Keys of a binding or a pattern that select fields.
 #[derive(Clone, Copy)]
-pub(super) struct Chosen<'e> {
-    pub(super) field: &'e Field<String>,
-    pub(super) fields: &'e Field<FieldList>,
-    pub(super) r#as: &'e Field<AsEntry>,
-    keys: Keys<'e>,
+pub(super) struct SelectionKeys<'e> {
+    pub(super) field: &'e OptionalKey<String>,
+    pub(super) fields: &'e OptionalKey<FieldList>,
+    pub(super) r#as: &'e OptionalKey<AsEntry>,
+    keys: ConversionKeys<'e>,
 }
 
-impl<'e> From<&'e BindingEntry> for Chosen<'e> {
+impl<'e> From<&'e BindingEntry> for SelectionKeys<'e> {
     fn from(entry: &'e BindingEntry) -> Self {
         Self {
             field: &entry.field,
@@ -35,7 +35,7 @@ impl<'e> From<&'e BindingEntry> for Chosen<'e> {
     }
 }
 
-impl<'e> From<&'e PatternEntry> for Chosen<'e> {
+impl<'e> From<&'e PatternEntry> for SelectionKeys<'e> {
     fn from(entry: &'e PatternEntry) -> Self {
         Self {
             field: &entry.field,
@@ -46,9 +46,9 @@ impl<'e> From<&'e PatternEntry> for Chosen<'e> {
     }
 }
 
-impl Chosen<'_> {
+impl SelectionKeys<'_> {
     /// Returns the position of `field` or `fields`, or else of `as`.
-    pub(super) fn place(&self) -> Option<Place> {
+    pub(super) fn place(&self) -> Option<TextSpan> {
         let field = self.field.as_ref().map(|at| at.place);
         let fields = self.fields.as_ref().map(|at| at.place);
         let r#as = self.r#as.as_ref().map(|at| at.place);
@@ -61,7 +61,7 @@ impl Chosen<'_> {
     }
 
     /// Notes a conversion key if there is no value to convert.
-    pub(super) fn converts_nothing(&self, findings: &mut Findings) -> Option<()> {
+    pub(super) fn converts_nothing(&self, findings: &mut MappingFindings) -> Option<()> {
         shaping::shaping(self.keys, findings)?.of_nothing(findings)
     }
 
@@ -69,8 +69,8 @@ impl Chosen<'_> {
     pub(super) fn selection(
         self,
         message_type: Option<&MessageType>,
-        (place, way): (Place, Way),
-        findings: &mut Findings,
+        (place, way): (TextSpan, ValueDirection),
+        findings: &mut MappingFindings,
     ) -> Option<Selection> {
         let shaping = shaping::shaping(self.keys, findings)?;
         if let Some(at) = self.fields {
@@ -121,8 +121,8 @@ impl Chosen<'_> {
 pub(super) fn leaves(
     message_type: &Arc<MessageType>,
     selection: &Selection,
-    (place, way): (Place, Way),
-    findings: &mut Findings,
+    (place, way): (TextSpan, ValueDirection),
+    findings: &mut MappingFindings,
 ) -> Option<Vec<Leaf>> {
     match selection {
         Selection::Bytes => Some(vec![Leaf::bytes()]),
@@ -145,8 +145,8 @@ pub(super) fn leaves(
 pub(super) fn field(
     message_type: &MessageType,
     path: &str,
-    place: Place,
-    findings: &mut Findings,
+    place: TextSpan,
+    findings: &mut MappingFindings,
 ) -> Option<Vec<Leaf>> {
     if let Some(leaf) = message_type.leaf(path) {
         return Some(vec![leaf.clone()]);

@@ -4,19 +4,19 @@ use std::collections::HashMap;
 use std::num::NonZeroU16;
 
 use super::network::{duration, is_own, policy, remote_endpoint};
-use super::variables::Namespaces;
+use super::variables::CheckedNamespaces;
 use super::{Declared, required};
 use crate::call::Call;
 use crate::code::Code;
 use crate::endpoint::Endpoint;
-use crate::findings::Findings;
-use crate::mapping::{SecurityPolicy, Server, Variable};
+use crate::findings::MappingFindings;
+use crate::mapping::{Server, ServerSecurityPolicy, Variable};
 use crate::node_id::ExpandedNodeIdText;
-use crate::read::{At, Field, given, short};
+use crate::read::{Located, OptionalKey, given, short};
 use crate::remote::{Access, NodeSource, NodeTarget, Password, RemoteServer, SkillsPlace, User};
 use crate::server_entries::{FromEntry, RemoteServerEntry, ToEntry};
 use crate::topic::SpaceId;
-use crate::tree::Place;
+use crate::tree::TextSpan;
 
 /// Maximum number of entries of `servers`.
 const MAX_SERVERS: usize = 256;
@@ -25,9 +25,9 @@ pub(super) type Servers = Declared<Vec<RemoteServer>>;
 
 /// Checks the servers; `own` is the cell's own server.
 pub(super) fn check(
-    entries: Option<&At<Vec<At<RemoteServerEntry>>>>,
-    (own, namespaces): (&Server, &Namespaces),
-    findings: &mut Findings,
+    entries: Option<&Located<Vec<Located<RemoteServerEntry>>>>,
+    (own, namespaces): (&Server, &CheckedNamespaces),
+    findings: &mut MappingFindings,
 ) -> Servers {
     let mut servers = Servers {
         known: Vec::new(),
@@ -46,8 +46,8 @@ pub(super) fn check(
         servers.partial = true;
         return servers;
     }
-    let mut names: HashMap<String, Place> = HashMap::new();
-    let mut numbers: HashMap<u16, Place> = HashMap::new();
+    let mut names: HashMap<String, TextSpan> = HashMap::new();
+    let mut numbers: HashMap<u16, TextSpan> = HashMap::new();
     for at in entries {
         let entry = at.value.as_ref();
         let known = (own, namespaces, &mut numbers);
@@ -70,10 +70,10 @@ pub(super) fn check(
 
 fn server(
     entry: &RemoteServerEntry,
-    place: Place,
-    (own, namespaces, numbers): (&Server, &Namespaces, &mut HashMap<u16, Place>),
-    findings: &mut Findings,
-) -> Option<(RemoteServer, Place)> {
+    place: TextSpan,
+    (own, namespaces, numbers): (&Server, &CheckedNamespaces, &mut HashMap<u16, TextSpan>),
+    findings: &mut MappingFindings,
+) -> Option<(RemoteServer, TextSpan)> {
     const OF: &str = "the server";
     let name = required(&entry.name, "name", OF, place, findings)
         .and_then(|(name, place)| Some((name_of(name, place, findings)?, place)));
@@ -82,7 +82,7 @@ fn server(
     let security = given(&entry.security).map(|(entry, place)| (policy(*entry), place));
     let skills = skills(entry, namespaces, numbers, findings);
     let user = user(entry, findings)?;
-    if let (Some((SecurityPolicy::None, place)), Some(_)) = (security, &user) {
+    if let (Some((ServerSecurityPolicy::None, place)), Some(_)) = (security, &user) {
         let message = "the password of a user is sent in a session without security";
         findings
             .warning(Code::OpenUser, place, message)
@@ -107,9 +107,9 @@ fn server(
 #[expect(clippy::option_option, reason = "faulty, left out or present")]
 fn skills(
     entry: &RemoteServerEntry,
-    namespaces: &Namespaces,
-    numbers: &mut HashMap<u16, Place>,
-    findings: &mut Findings,
+    namespaces: &CheckedNamespaces,
+    numbers: &mut HashMap<u16, TextSpan>,
+    findings: &mut MappingFindings,
 ) -> Option<Option<SkillsPlace>> {
     let open = match (&entry.open, given(&entry.open)) {
         (None, _) => false,
@@ -153,8 +153,8 @@ pub(super) fn alone(
     servers: &Servers,
     variables: &[Variable],
     calls: &[Call],
-    entries: Option<&At<Vec<At<RemoteServerEntry>>>>,
-    findings: &mut Findings,
+    entries: Option<&Located<Vec<Located<RemoteServerEntry>>>>,
+    findings: &mut MappingFindings,
 ) {
     let all = variables
         .iter()
@@ -186,7 +186,7 @@ pub(super) fn alone(
     }
 }
 
-fn name_of(name: &str, place: Place, findings: &mut Findings) -> Option<String> {
+fn name_of(name: &str, place: TextSpan, findings: &mut MappingFindings) -> Option<String> {
     let plain = |c: char| c.is_ascii_alphanumeric() || "_-.".contains(c);
     if !name.is_empty() && name.len() <= 64 && name.chars().all(plain) {
         return Some(name.to_owned());
@@ -199,9 +199,9 @@ fn name_of(name: &str, place: Place, findings: &mut Findings) -> Option<String> 
 
 /// Reads an endpoint that differs from the endpoints of the cell's own server.
 fn other_endpoint(
-    (text, place): (&str, Place),
+    (text, place): (&str, TextSpan),
     own: &Server,
-    findings: &mut Findings,
+    findings: &mut MappingFindings,
 ) -> Option<Endpoint> {
     let endpoint = remote_endpoint(text, place, findings)?;
     if is_own(&endpoint, own) {
@@ -216,7 +216,7 @@ fn other_endpoint(
 
 /// Returns `None` for a faulty entry, which is noted.
 #[expect(clippy::option_option, reason = "faulty, left out or present")]
-fn user(entry: &RemoteServerEntry, findings: &mut Findings) -> Option<Option<User>> {
+fn user(entry: &RemoteServerEntry, findings: &mut MappingFindings) -> Option<Option<User>> {
     match (&entry.user, &entry.password) {
         (None, None) => Some(None),
         (Some(user), Some(password)) => {
@@ -256,9 +256,9 @@ fn user(entry: &RemoteServerEntry, findings: &mut Findings) -> Option<Option<Use
 /// Returns the server of that name. `None` if no server has it, which is noted.
 pub(super) fn named<'s>(
     name: &str,
-    place: Place,
+    place: TextSpan,
     servers: &'s Servers,
-    findings: &mut Findings,
+    findings: &mut MappingFindings,
 ) -> Option<&'s RemoteServer> {
     let found = servers.known.iter().find(|server| server.name == name);
     // A faulty entry may have had the missing name.
@@ -279,10 +279,10 @@ pub(super) fn named<'s>(
 
 /// Reads a node of another server. Returns `None` for a faulty node, which is noted.
 pub(super) fn node(
-    field: &Field<String>,
+    field: &OptionalKey<String>,
     (key, of): (&str, &str),
-    owner: Place,
-    findings: &mut Findings,
+    owner: TextSpan,
+    findings: &mut MappingFindings,
 ) -> Option<ExpandedNodeIdText> {
     let (text, place) = required(field, key, of, owner, findings)?;
     match text.parse() {
@@ -299,9 +299,9 @@ pub(super) fn node(
 
 /// Reads `from` of a variable. Returns `None` for a faulty entry, which is noted.
 pub(super) fn source(
-    at: &At<FromEntry>,
+    at: &Located<FromEntry>,
     servers: &Servers,
-    findings: &mut Findings,
+    findings: &mut MappingFindings,
 ) -> Option<NodeSource> {
     let entry = at.value.as_ref()?;
     let server = required(&entry.server, "server", "`from`", at.place, findings);
@@ -347,9 +347,9 @@ pub(super) fn source(
 
 /// Reads `to` of a variable. Returns `None` for a faulty entry, which is noted.
 pub(super) fn target(
-    at: &At<ToEntry>,
+    at: &Located<ToEntry>,
     servers: &Servers,
-    findings: &mut Findings,
+    findings: &mut MappingFindings,
 ) -> Option<NodeTarget> {
     let entry = at.value.as_ref()?;
     let server = required(&entry.server, "server", "`to`", at.place, findings);

@@ -5,25 +5,25 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use messages::{
-    Dialect, Leaf, Literal, MessageType, Plan, PlanError, Selected, Selection, ServiceType,
+    Dialect, Leaf, Literal, MessagePlan, MessageType, PlanError, Selected, Selection, ServiceType,
     TextKind, TypeName, Wire,
 };
 use uadp::BuiltinType;
 
-use super::bindings::{Site, compare, ros_name, told};
+use super::bindings::{BindingSite, compare, ros_name, told};
 use super::network::duration;
-use super::selection::{self, Chosen};
+use super::selection::{self, SelectionKeys};
 use super::several;
-use super::shaping::Way;
-use super::types::{self, Types, ValueType};
+use super::shaping::ValueDirection;
+use super::types::{self, MessageTypes, ValueType};
 use crate::code::Code;
 use crate::document::{self, BindingEntry, Request};
-use crate::findings::Findings;
+use crate::findings::MappingFindings;
 use crate::mapping::{ServiceBinding, ServiceRole, Trigger};
 use crate::node_id::NodeIdText;
-use crate::read::{At, Field, given, short};
+use crate::read::{Located, OptionalKey, given, short};
 use crate::topic::{SpaceId, TopicId};
-use crate::tree::Place;
+use crate::tree::TextSpan;
 use documents::nearest;
 
 const TIMEOUT: Duration = Duration::from_secs(5);
@@ -31,14 +31,14 @@ const EVERY: Duration = Duration::from_secs(1);
 
 /// Kind of a binding.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Kind {
+pub(super) enum BindingKind {
     Topic,
     Call,
     Answer,
     Poll,
 }
 
-impl Kind {
+impl BindingKind {
     const fn key(self) -> &'static str {
         match self {
             Self::Topic => "topic",
@@ -50,18 +50,18 @@ impl Kind {
 }
 
 /// A service binding, with the parts that are known.
-pub(super) struct Service {
+pub(super) struct CheckedService {
     pub(super) binding: ServiceBinding,
     /// `None` if the type of the service is not known or no value crosses.
     pub(super) fields: Option<Vec<Leaf>>,
-    place: Place,
+    place: TextSpan,
     /// The literal of `when`.
-    when: Option<(String, Place)>,
+    when: Option<(String, TextSpan)>,
 }
 
-impl Service {
+impl CheckedService {
     /// Notes values of the variable's topics that differ in type from the values of the service.
-    pub(super) fn compare(&self, topics: &[Leaf], own: &[Leaf], findings: &mut Findings) {
+    pub(super) fn compare(&self, topics: &[Leaf], own: &[Leaf], findings: &mut MappingFindings) {
         let shape =
             |fields: &[Leaf]| -> Vec<ValueType> { fields.iter().map(types::value_type).collect() };
         if shape(topics) == shape(own) {
@@ -85,7 +85,7 @@ impl Service {
     pub(super) fn settled(
         mut self,
         value_type: Option<ValueType>,
-        findings: &mut Findings,
+        findings: &mut MappingFindings,
     ) -> ServiceBinding {
         if let ServiceRole::Call {
             request: Selection::Template { fields, .. },
@@ -116,11 +116,11 @@ impl Service {
 fn check_when(
     text: &str,
     value_type: ValueType,
-    (space, place): (SpaceId, Place),
-    findings: &mut Findings,
+    (space, place): (SpaceId, TextSpan),
+    findings: &mut MappingFindings,
 ) {
     let dialect = types::dialect(space);
-    let registry = Types::registry(dialect);
+    let registry = MessageTypes::registry(dialect);
     let carrier = registry.standard_type(value_type.0, value_type.1);
     let carrier = carrier.and_then(|name| registry.get(&name).ok());
     let data = ("data".to_owned(), Literal::One(text.to_owned()));
@@ -128,7 +128,7 @@ fn check_when(
         fields: Vec::new(),
         rest: BTreeMap::from([data]),
     };
-    let fits = |carrier| Plan::compile(&carrier, &template, wire(dialect)).is_ok();
+    let fits = |carrier| MessagePlan::compile(&carrier, &template, wire(dialect)).is_ok();
     if !carrier.is_some_and(fits) {
         let told = types::print(value_type);
         let message = format!("`{}` is not a value of type {told}", short(text));
@@ -139,7 +139,7 @@ fn check_when(
 }
 
 /// Calls of a document, by the node of their variable.
-pub(super) struct Calls(HashMap<NodeIdText, Call>);
+pub(super) struct DocumentCalls(HashMap<NodeIdText, Call>);
 
 struct Call {
     /// `None` if a part of the variable is faulty.
@@ -147,9 +147,15 @@ struct Call {
     service_type: Option<TypeName>,
 }
 
-impl Calls {
+impl DocumentCalls {
     pub(super) fn of<'d>(
-        variables: impl Iterator<Item = (&'d NodeIdText, Option<TopicId>, &'d At<document::Bindings>)>,
+        variables: impl Iterator<
+            Item = (
+                &'d NodeIdText,
+                Option<TopicId>,
+                &'d Located<document::Bindings>,
+            ),
+        >,
     ) -> Self {
         let calls = variables.filter_map(|(node, topic, bindings)| {
             let bindings = bindings.value.as_ref().map_or(&[][..], |all| &all.0);
@@ -170,9 +176,9 @@ impl Calls {
 }
 
 /// Context that bindings are checked against.
-pub(super) struct Known<'k> {
-    pub(super) types: &'k mut Types,
-    pub(super) calls: &'k Calls,
+pub(super) struct ServiceContext<'k> {
+    pub(super) types: &'k mut MessageTypes,
+    pub(super) calls: &'k DocumentCalls,
 }
 
 /// Reads a type name. `package/srv/Name` is another spelling of `package/Name`.
@@ -182,12 +188,16 @@ pub(super) fn type_name(text: &str) -> Option<TypeName> {
 
 /// Returns `None` if the binding is not exactly one of the kinds, which is noted. Keys of other
 /// kinds are noted too.
-pub(super) fn kind(entry: &BindingEntry, owner: Place, findings: &mut Findings) -> Option<Kind> {
+pub(super) fn kind(
+    entry: &BindingEntry,
+    owner: TextSpan,
+    findings: &mut MappingFindings,
+) -> Option<BindingKind> {
     let keys = [
-        (Kind::Topic, &entry.topic),
-        (Kind::Call, &entry.call),
-        (Kind::Answer, &entry.answer),
-        (Kind::Poll, &entry.poll),
+        (BindingKind::Topic, &entry.topic),
+        (BindingKind::Call, &entry.call),
+        (BindingKind::Answer, &entry.answer),
+        (BindingKind::Poll, &entry.poll),
     ];
     let mut said = keys
         .iter()
@@ -206,13 +216,13 @@ pub(super) fn kind(entry: &BindingEntry, owner: Place, findings: &mut Findings) 
         );
         return None;
     }
-    let place = |at: &Field<String>| at.as_ref().map(|at| at.place);
-    let (call, poll) = (kind == Kind::Call, kind == Kind::Poll);
-    let topic = kind == Kind::Topic;
+    let place = |at: &OptionalKey<String>| at.as_ref().map(|at| at.place);
+    let (call, poll) = (kind == BindingKind::Call, kind == BindingKind::Poll);
+    let topic = kind == BindingKind::Topic;
     let request = entry.request.as_ref().map(|at| at.place);
     let r#as = entry.r#as.as_ref().map(|at| at.place);
     let strange = [
-        ("type", place(&entry.r#type), kind == Kind::Answer),
+        ("type", place(&entry.r#type), kind == BindingKind::Answer),
         ("as", r#as, !topic),
         ("request", request, !call && !poll),
         ("when", place(&entry.when), !call),
@@ -232,19 +242,21 @@ pub(super) fn kind(entry: &BindingEntry, owner: Place, findings: &mut Findings) 
 
 /// Returns `None` for a faulty binding.
 pub(super) fn check(
-    kind: Kind,
+    kind: BindingKind,
     entry: &BindingEntry,
-    site: &Site<'_>,
-    known: &mut Known<'_>,
-    findings: &mut Findings,
-) -> Option<Service> {
+    site: &BindingSite<'_>,
+    known: &mut ServiceContext<'_>,
+    findings: &mut MappingFindings,
+) -> Option<CheckedService> {
     let space = space_of(kind, site, findings);
     let checked = match kind {
-        Kind::Answer => answer(entry, site, known, findings),
-        Kind::Topic | Kind::Call | Kind::Poll => asked(kind, entry, site, known.types, findings),
+        BindingKind::Answer => answer(entry, site, known, findings),
+        BindingKind::Topic | BindingKind::Call | BindingKind::Poll => {
+            asked(kind, entry, site, known.types, findings)
+        }
     };
     let (role, fields, when) = checked?;
-    Some(Service {
+    Some(CheckedService {
         binding: ServiceBinding {
             space: space?,
             role,
@@ -255,19 +267,23 @@ pub(super) fn check(
     })
 }
 
-type Checked = (ServiceRole, Option<Vec<Leaf>>, Option<(String, Place)>);
+type Checked = (ServiceRole, Option<Vec<Leaf>>, Option<(String, TextSpan)>);
 
 /// Returns the space of the service, if a service can be bound there.
-fn space_of(kind: Kind, site: &Site<'_>, findings: &mut Findings) -> Option<SpaceId> {
+fn space_of(
+    kind: BindingKind,
+    site: &BindingSite<'_>,
+    findings: &mut MappingFindings,
+) -> Option<SpaceId> {
     let (space, origin) = (site.space?, site.subject.origin);
-    let (message, help) = if kind == Kind::Call && origin == Some(space) {
+    let (message, help) = if kind == BindingKind::Call && origin == Some(space) {
         (
             format!(
                 "the value comes from space {space}, so it cannot call a service of this space"
             ),
             "`call` requires a value of another space; use `poll` for a value that the service returns",
         )
-    } else if kind != Kind::Call && origin.is_some_and(|origin| origin != space) {
+    } else if kind != BindingKind::Call && origin.is_some_and(|origin| origin != space) {
         (
             format!("the response of a service of space {space} is a value of this space"),
             "set `origin` to the space of the service",
@@ -283,9 +299,9 @@ fn space_of(kind: Kind, site: &Site<'_>, findings: &mut Findings) -> Option<Spac
 
 fn answer(
     entry: &BindingEntry,
-    site: &Site<'_>,
-    known: &mut Known<'_>,
-    findings: &mut Findings,
+    site: &BindingSite<'_>,
+    known: &mut ServiceContext<'_>,
+    findings: &mut MappingFindings,
 ) -> Option<Checked> {
     let (text, place) = given(&entry.answer)?;
     let Ok(node) = text.parse::<NodeIdText>() else {
@@ -315,13 +331,13 @@ fn answer(
 
 /// Checks a call or a poll.
 fn asked(
-    kind: Kind,
+    kind: BindingKind,
     entry: &BindingEntry,
-    site: &Site<'_>,
-    types: &mut Types,
-    findings: &mut Findings,
+    site: &BindingSite<'_>,
+    types: &mut MessageTypes,
+    findings: &mut MappingFindings,
 ) -> Option<Checked> {
-    let name = if kind == Kind::Call {
+    let name = if kind == BindingKind::Call {
         &entry.call
     } else {
         &entry.poll
@@ -336,9 +352,9 @@ fn asked(
     let dialect = site.dialect();
     let known = built_in(&service_type, (dialect, place), types, findings);
     let request_type = known.as_ref().map(|service| service.request());
-    if kind == Kind::Call {
-        let chosen = Chosen::from(entry);
-        let way = Way {
+    if kind == BindingKind::Call {
+        let chosen = SelectionKeys::from(entry);
+        let way = ValueDirection {
             reads: false,
             declared: site.subject.declared,
             alone: true,
@@ -389,10 +405,10 @@ fn asked(
 
 fn service_type(
     entry: &BindingEntry,
-    kind: Kind,
-    owner: Place,
-    findings: &mut Findings,
-) -> Option<(TypeName, Place)> {
+    kind: BindingKind,
+    owner: TextSpan,
+    findings: &mut MappingFindings,
+) -> Option<(TypeName, TextSpan)> {
     let Some(at) = &entry.r#type else {
         let message = format!("the binding has a `{}` and no `type`", kind.key());
         findings
@@ -414,9 +430,9 @@ fn service_type(
 /// Returns the service type; `None` for an unknown type, which is noted.
 pub(super) fn built_in(
     name: &TypeName,
-    (dialect, place): (Dialect, Place),
-    types: &mut Types,
-    findings: &mut Findings,
+    (dialect, place): (Dialect, TextSpan),
+    types: &mut MessageTypes,
+    findings: &mut MappingFindings,
 ) -> Option<Arc<ServiceType>> {
     let known = types.service((dialect, place), name, findings);
     if known.is_none() {
@@ -457,12 +473,12 @@ pub(super) const fn wire(dialect: Dialect) -> Wire {
 fn response_field(
     entry: &BindingEntry,
     response: Option<&Arc<MessageType>>,
-    place: Place,
-    site: &Site<'_>,
-    findings: &mut Findings,
+    place: TextSpan,
+    site: &BindingSite<'_>,
+    findings: &mut MappingFindings,
 ) -> Option<(Selection, Option<Vec<Leaf>>)> {
-    let chosen = Chosen::from(entry);
-    let way = Way {
+    let chosen = SelectionKeys::from(entry);
+    let way = ValueDirection {
         reads: true,
         declared: site.subject.declared,
         alone: true,
@@ -494,7 +510,7 @@ fn template(
     entry: &BindingEntry,
     fields: Vec<Selected>,
     (dialect, request): (Dialect, Option<&Arc<MessageType>>),
-    findings: &mut Findings,
+    findings: &mut MappingFindings,
 ) -> Option<Selection> {
     let constants = match &entry.request {
         None => &[][..],
@@ -514,7 +530,7 @@ fn template(
                     fields: Vec::new(),
                     rest: BTreeMap::from([(path.clone(), literal.clone())]),
                 };
-                let error = Plan::compile(request, &one, wire(dialect)).err()?;
+                let error = MessagePlan::compile(request, &one, wire(dialect)).err()?;
                 Some(told_fault(path, error))
             })
         };

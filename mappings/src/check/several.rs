@@ -3,25 +3,25 @@
 use std::collections::HashSet;
 use std::sync::Arc;
 
-use messages::{Leaf, MessageType, Rank, Selected, Selection};
+use messages::{ArrayRank, Leaf, MessageType, Selected, Selection};
 use uadp::BuiltinType;
 
-use super::selection::{self, Chosen};
-use super::shaping::{self, Way};
+use super::selection::{self, SelectionKeys};
+use super::shaping::{self, ValueDirection};
 use crate::code::Code;
 use crate::document::FieldList;
-use crate::findings::Findings;
+use crate::findings::MappingFindings;
 use crate::mapping::Binding;
-use crate::read::{At, given, short};
-use crate::tree::Place;
+use crate::read::{Located, given, short};
+use crate::tree::TextSpan;
 
 /// Returns the fields of a binding; `None` for a faulty entry, which is noted.
 pub(super) fn fields(
-    chosen: Chosen<'_>,
-    at: &At<FieldList>,
+    chosen: SelectionKeys<'_>,
+    at: &Located<FieldList>,
     message_type: Option<&MessageType>,
-    way: Way,
-    findings: &mut Findings,
+    way: ValueDirection,
+    findings: &mut MappingFindings,
 ) -> Option<Selection> {
     let list = at.value.as_ref()?;
     let beside = [
@@ -67,7 +67,7 @@ pub(super) fn fields(
         let field = shaping::part(text, place, findings)?;
         let shaping = shaping::shaping(entry.into(), findings)?;
         // The variable has several values, so there is no single type to convert them to.
-        let way = Way {
+        let way = ValueDirection {
             declared: None,
             alone: false,
             ..way
@@ -109,8 +109,8 @@ pub(super) fn selected(selection: Selection) -> Option<Vec<Selected>> {
 pub(super) fn leaves(
     message_type: &Arc<MessageType>,
     selected: &[Selected],
-    (place, way): (Place, Way),
-    findings: &mut Findings,
+    (place, way): (TextSpan, ValueDirection),
+    findings: &mut MappingFindings,
 ) -> Option<Vec<Leaf>> {
     let mut all = Vec::new();
     let mut places = Vec::new();
@@ -162,14 +162,14 @@ pub(super) fn leaves(
 pub(super) fn structure(
     message_type: &MessageType,
     path: &str,
-    place: Place,
-    findings: &mut Findings,
+    place: TextSpan,
+    findings: &mut MappingFindings,
 ) -> Option<Vec<Leaf>> {
     if message_type.message_at(path).is_some() {
         return Some(vec![Leaf {
             path: path.to_owned(),
             builtin: BuiltinType::ExtensionObject,
-            rank: Rank::Scalar,
+            rank: ArrayRank::Scalar,
         }]);
     }
     selection::field(message_type, path, place, findings)?;
@@ -184,7 +184,7 @@ pub(super) fn structure(
 }
 
 /// Notes structures of different types on both sides.
-pub(super) fn compare(a: &Binding, b: &Binding, place: Place, findings: &mut Findings) {
+pub(super) fn compare(a: &Binding, b: &Binding, place: TextSpan, findings: &mut MappingFindings) {
     if let (Selection::Structure(None), Selection::Structure(None)) = (&a.selection, &b.selection)
         && a.message_type != b.message_type
     {

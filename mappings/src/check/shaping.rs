@@ -2,22 +2,22 @@
 //! `out_of_range`.
 
 use messages::{
-    Conversion, Leaf, MessageType, Part, Plan, PlanError, Selection, Wire, is_lossless,
+    ArrayPart, Conversion, Leaf, MessagePlan, MessageType, PlanError, Selection, Wire, is_lossless,
 };
 use uadp::BuiltinType;
 
 use super::types::ValueType;
 use crate::code::Code;
 use crate::document::{BindingEntry, FieldEntry, OutOfRangeEntry, PatternEntry};
-use crate::findings::Findings;
-use crate::read::{Field, given, short};
-use crate::tree::Place;
+use crate::findings::MappingFindings;
+use crate::read::{OptionalKey, given, short};
+use crate::tree::TextSpan;
 
 /// Conversion keys of a binding with one value.
 pub(super) struct Shaping {
     conversion: Conversion,
     /// Position of the first conversion key.
-    place: Option<Place>,
+    place: Option<TextSpan>,
     scaled: bool,
     /// `out_of_range` is given.
     said: bool,
@@ -25,14 +25,14 @@ pub(super) struct Shaping {
 
 /// Keys that convert a value.
 #[derive(Clone, Copy)]
-pub(super) struct Keys<'k> {
-    scale: &'k Field<f64>,
-    offset: &'k Field<f64>,
-    invert: &'k Field<bool>,
-    out_of_range: &'k Field<OutOfRangeEntry>,
+pub(super) struct ConversionKeys<'k> {
+    scale: &'k OptionalKey<f64>,
+    offset: &'k OptionalKey<f64>,
+    invert: &'k OptionalKey<bool>,
+    out_of_range: &'k OptionalKey<OutOfRangeEntry>,
 }
 
-impl<'k> From<&'k BindingEntry> for Keys<'k> {
+impl<'k> From<&'k BindingEntry> for ConversionKeys<'k> {
     fn from(entry: &'k BindingEntry) -> Self {
         Self {
             scale: &entry.scale,
@@ -43,7 +43,7 @@ impl<'k> From<&'k BindingEntry> for Keys<'k> {
     }
 }
 
-impl<'k> From<&'k PatternEntry> for Keys<'k> {
+impl<'k> From<&'k PatternEntry> for ConversionKeys<'k> {
     fn from(entry: &'k PatternEntry) -> Self {
         Self {
             scale: &entry.scale,
@@ -54,7 +54,7 @@ impl<'k> From<&'k PatternEntry> for Keys<'k> {
     }
 }
 
-impl<'k> From<&'k FieldEntry> for Keys<'k> {
+impl<'k> From<&'k FieldEntry> for ConversionKeys<'k> {
     fn from(entry: &'k FieldEntry) -> Self {
         Self {
             scale: &entry.scale,
@@ -67,7 +67,7 @@ impl<'k> From<&'k FieldEntry> for Keys<'k> {
 
 /// Direction of the value, and its type in OPC UA.
 #[derive(Clone, Copy)]
-pub(super) struct Way {
+pub(super) struct ValueDirection {
     pub(super) reads: bool,
     pub(super) declared: Option<ValueType>,
     /// The value is the only value of its variable, so the variable may have a `type`.
@@ -77,10 +77,10 @@ pub(super) struct Way {
 /// Returns the field and its part; `None` for a faulty text, which is noted.
 pub(super) fn part(
     text: &str,
-    place: Place,
-    findings: &mut Findings,
-) -> Option<(String, Option<Part>)> {
-    let split = Part::split(text);
+    place: TextSpan,
+    findings: &mut MappingFindings,
+) -> Option<(String, Option<ArrayPart>)> {
+    let split = ArrayPart::split(text);
     if split.is_none() {
         let message = format!("`{}` is not a part of an array field", short(text));
         findings
@@ -92,7 +92,7 @@ pub(super) fn part(
 }
 
 /// Returns `None` for a faulty key, which is noted.
-pub(super) fn shaping(keys: Keys<'_>, findings: &mut Findings) -> Option<Shaping> {
+pub(super) fn shaping(keys: ConversionKeys<'_>, findings: &mut MappingFindings) -> Option<Shaping> {
     let mut sound = Some(());
     let mut conversion = Conversion::default();
     let (scale, offset) = (given(keys.scale), given(keys.offset));
@@ -168,10 +168,10 @@ impl Shaping {
     /// known. Returns `None` for a fault, which is noted.
     pub(super) fn select(
         self,
-        (field, part): (String, Option<Part>),
+        (field, part): (String, Option<ArrayPart>),
         message_type: Option<&MessageType>,
-        (place, way): (Place, Way),
-        findings: &mut Findings,
+        (place, way): (TextSpan, ValueDirection),
+        findings: &mut MappingFindings,
     ) -> Option<Selection> {
         if part.is_some() && !way.reads {
             let note = findings.error(
@@ -185,7 +185,7 @@ impl Shaping {
         let leaf = message_type.and_then(|message| message.leaf(&field));
         let element = match &part {
             // The type of a field inside of messages follows from the type of the messages.
-            Some(inside @ Part::Inside { .. }) => message_type
+            Some(inside @ ArrayPart::Inside { .. }) => message_type
                 .and_then(|message| inner(message, &field, inside))
                 .map(|leaf| leaf.builtin),
             Some(_) | None => leaf.map(|leaf| element(leaf, part.as_ref())),
@@ -202,7 +202,7 @@ impl Shaping {
     }
 
     /// Notes a conversion key beside `fields`: it belongs to one of the fields.
-    pub(super) fn of_fields(&self, findings: &mut Findings) -> Option<()> {
+    pub(super) fn of_fields(&self, findings: &mut MappingFindings) -> Option<()> {
         let Some(place) = self.place else {
             return Some(());
         };
@@ -217,7 +217,7 @@ impl Shaping {
     }
 
     /// Notes a conversion key if no value crosses.
-    pub(super) fn of_nothing(&self, findings: &mut Findings) -> Option<()> {
+    pub(super) fn of_nothing(&self, findings: &mut MappingFindings) -> Option<()> {
         let Some(place) = self.place else {
             return Some(());
         };
@@ -232,7 +232,7 @@ impl Shaping {
     }
 
     /// Notes a conversion key if a whole message crosses.
-    pub(super) fn of_several(&self, findings: &mut Findings) -> Option<()> {
+    pub(super) fn of_several(&self, findings: &mut MappingFindings) -> Option<()> {
         let Some(place) = self.place else {
             return Some(());
         };
@@ -249,8 +249,8 @@ impl Shaping {
     fn conversion(
         &self,
         element: Option<BuiltinType>,
-        (place, way): (Place, Way),
-        findings: &mut Findings,
+        (place, way): (TextSpan, ValueDirection),
+        findings: &mut MappingFindings,
     ) -> Option<Conversion> {
         let mut conversion = self.conversion;
         let declared = way.declared.map(|(builtin, _)| builtin);
@@ -302,17 +302,19 @@ impl Shaping {
 }
 
 /// Returns the field of one message of an array.
-fn inner(message_type: &MessageType, array: &str, part: &Part) -> Option<Leaf> {
-    let Part::Inside { field, .. } = part else {
+fn inner(message_type: &MessageType, array: &str, part: &ArrayPart) -> Option<Leaf> {
+    let ArrayPart::Inside { field, .. } = part else {
         return None;
     };
     message_type.leaf_inside(array, field)
 }
 
 /// Returns the builtin type of one element, or of the whole field.
-fn element(leaf: &Leaf, part: Option<&Part>) -> BuiltinType {
+fn element(leaf: &Leaf, part: Option<&ArrayPart>) -> BuiltinType {
     match (leaf.builtin, part) {
-        (BuiltinType::ByteString, Some(Part::Element(_) | Part::Named { .. })) => BuiltinType::Byte,
+        (BuiltinType::ByteString, Some(ArrayPart::Element(_) | ArrayPart::Named { .. })) => {
+            BuiltinType::Byte
+        }
         (builtin, _) => builtin,
     }
 }
@@ -322,8 +324,8 @@ fn element(leaf: &Leaf, part: Option<&Part>) -> BuiltinType {
 pub(super) fn leaves(
     message_type: &std::sync::Arc<MessageType>,
     selection: &Selection,
-    place: Place,
-    findings: &mut Findings,
+    place: TextSpan,
+    findings: &mut MappingFindings,
 ) -> Option<Vec<Leaf>> {
     let (field, part) = match selection {
         Selection::Value { field, part, .. } => (field, part),
@@ -349,10 +351,11 @@ pub(super) fn leaves(
         Some(_) => Code::FieldPart,
         None => Code::Conversion,
     };
-    let found = Plan::compile(message_type, &alone, wire)
+    let found = MessagePlan::compile(message_type, &alone, wire)
         .map_err(|error| (code, error))
         .and_then(|_| {
-            Plan::compile(message_type, selection, wire).map_err(|error| (Code::Conversion, error))
+            MessagePlan::compile(message_type, selection, wire)
+                .map_err(|error| (Code::Conversion, error))
         });
     let (code, error) = match found {
         Ok(plan) => return Some(plan.leaves().to_vec()),

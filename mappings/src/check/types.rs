@@ -4,17 +4,17 @@ use std::collections::HashMap;
 use std::sync::{Arc, LazyLock};
 
 use messages::{
-    ActionCalls, DefinitionError, Dialect, Leaf, Library, MessageType, Noted, Rank, Registry,
-    ServiceType, TextKind, TypeName,
+    ActionCalls, ArrayRank, DefinitionError, Dialect, Leaf, Library, MessageType, Noted,
+    ServiceType, TextKind, TypeName, TypeRegistry,
 };
 use uadp::BuiltinType;
 
 use super::bindings::told;
-use super::{TypeFiles, TypeOrigin, TypeUse};
+use super::{OpenTypeFiles, TypeOrigin, TypeUse};
 use crate::code::Code;
-use crate::findings::Findings;
+use crate::findings::MappingFindings;
 use crate::topic::SpaceId;
-use crate::tree::Place;
+use crate::tree::TextSpan;
 use documents::nearest;
 
 /// Builtin type, and `true` for an array.
@@ -33,7 +33,7 @@ pub(super) fn print((builtin, array): ValueType) -> String {
 }
 
 pub(super) fn value_type(leaf: &Leaf) -> ValueType {
-    (leaf.builtin, matches!(leaf.rank, Rank::Array { .. }))
+    (leaf.builtin, matches!(leaf.rank, ArrayRank::Array { .. }))
 }
 
 /// Returns the builtin type that an unknown name may mean: a misspelt name, or the word of another
@@ -84,8 +84,8 @@ pub(super) const fn dialect(space: SpaceId) -> Dialect {
 type Answer = Result<Arc<MessageType>, Box<DefinitionError>>;
 
 /// Message types that are built in or in files.
-pub(super) struct Types {
-    files: Box<dyn TypeFiles>,
+pub(super) struct MessageTypes {
+    files: Box<dyn OpenTypeFiles>,
     /// Libraries of ROS 1 and of ROS 2, created with the first query.
     libraries: [Option<Library>; 2],
     asked: HashMap<(Dialect, TypeName), Answer>,
@@ -94,11 +94,11 @@ pub(super) struct Types {
     used: Vec<TypeUse>,
 }
 
-static ROS1: LazyLock<Registry> = LazyLock::new(|| Registry::bundle(Dialect::Ros1));
-static ROS2: LazyLock<Registry> = LazyLock::new(|| Registry::bundle(Dialect::Ros2));
+static ROS1: LazyLock<TypeRegistry> = LazyLock::new(|| TypeRegistry::bundle(Dialect::Ros1));
+static ROS2: LazyLock<TypeRegistry> = LazyLock::new(|| TypeRegistry::bundle(Dialect::Ros2));
 
-impl Types {
-    pub(super) fn new(files: Box<dyn TypeFiles>) -> Self {
+impl MessageTypes {
+    pub(super) fn new(files: Box<dyn OpenTypeFiles>) -> Self {
         Self {
             files,
             libraries: [None, None],
@@ -110,7 +110,7 @@ impl Types {
     }
 
     /// Returns the built-in definitions.
-    pub(super) fn registry(dialect: Dialect) -> &'static Registry {
+    pub(super) fn registry(dialect: Dialect) -> &'static TypeRegistry {
         match dialect {
             Dialect::Ros1 => &ROS1,
             Dialect::Ros2 => &ROS2,
@@ -120,7 +120,7 @@ impl Types {
     fn library(
         &mut self,
         dialect: Dialect,
-    ) -> (&mut Library, &mut Box<dyn TypeFiles>, &mut Vec<TypeUse>) {
+    ) -> (&mut Library, &mut Box<dyn OpenTypeFiles>, &mut Vec<TypeUse>) {
         let [ros1, ros2] = &mut self.libraries;
         let library = match dialect {
             Dialect::Ros1 => ros1,
@@ -133,9 +133,9 @@ impl Types {
     /// Returns a known service type; notes faults of its file.
     pub(super) fn service(
         &mut self,
-        (dialect, place): (Dialect, Place),
+        (dialect, place): (Dialect, TextSpan),
         name: &TypeName,
-        findings: &mut Findings,
+        findings: &mut MappingFindings,
     ) -> Option<Arc<ServiceType>> {
         if let Some(known) = self.services.get(&(dialect, name.clone())) {
             return known.clone();
@@ -156,9 +156,9 @@ impl Types {
     /// Returns a known action type as calls and values; notes faults of its files.
     pub(super) fn action(
         &mut self,
-        (dialect, place): (Dialect, Place),
+        (dialect, place): (Dialect, TextSpan),
         name: &TypeName,
-        findings: &mut Findings,
+        findings: &mut MappingFindings,
     ) -> Option<Arc<ActionCalls>> {
         if let Some(known) = self.actions.get(&(dialect, name.clone())) {
             return known.clone();
@@ -180,9 +180,9 @@ impl Types {
     /// Returns a message type; notes faults of its files.
     pub(super) fn get(
         &mut self,
-        (dialect, place): (Dialect, Place),
+        (dialect, place): (Dialect, TextSpan),
         name: &TypeName,
-        findings: &mut Findings,
+        findings: &mut MappingFindings,
     ) -> Answer {
         if let Some(known) = self.asked.get(&(dialect, name.clone())) {
             return known.clone();
@@ -235,7 +235,7 @@ fn origin(library: &Library, kind: TextKind, name: &TypeName, known: bool) -> Ty
     }
 }
 
-fn note(noted: Vec<Noted>, place: Place, findings: &mut Findings) {
+fn note(noted: Vec<Noted>, place: TextSpan, findings: &mut MappingFindings) {
     for one in noted {
         match one {
             Noted::Read { .. } => {}

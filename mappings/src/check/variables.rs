@@ -5,23 +5,23 @@ use std::num::NonZeroU16;
 use std::ops::RangeInclusive;
 use std::time::Duration;
 
-use messages::{Leaf, Rank};
+use messages::{ArrayRank, Leaf};
 
-use super::bindings::{self, Bindings};
+use super::bindings::{self, VariableBindings};
 use super::servers::Servers;
-use super::services::Calls;
-use super::types::{self, Types, ValueType};
+use super::services::DocumentCalls;
+use super::types::{self, MessageTypes, ValueType};
 use super::{Declared, alarm, confirm, loss, meaning, permissions, quality, remote, required};
 use crate::code::Code;
 use crate::document::{PublishEntry, Queue, UaFieldEntry, VariableEntry};
-use crate::findings::Findings;
+use crate::findings::MappingFindings;
 use crate::mapping::{
     Binding, Lasting, Overflow, Publish, ServiceBinding, ServiceRole, Space, UaField, Variable,
 };
 use crate::node_id::{Identifier, NodeIdText};
-use crate::read::{At, given, short};
+use crate::read::{Located, given, short};
 use crate::topic::{SpaceId, TopicId};
-use crate::tree::Place;
+use crate::tree::TextSpan;
 
 /// Maximum number of variables of one document.
 const MAX_VARIABLES: usize = 100_000;
@@ -30,14 +30,14 @@ const MAX_VARIABLES: usize = 100_000;
 /// which no server uses as an index.
 pub(super) const NAMESPACE_ZERO: NonZeroU16 = NonZeroU16::MAX;
 
-pub(super) type Namespaces = Declared<BTreeMap<u16, String>>;
+pub(super) type CheckedNamespaces = Declared<BTreeMap<u16, String>>;
 pub(super) type Spaces = Declared<Vec<Space>>;
 
 /// Parts of an entry that could be read; the entry is a map.
 struct Draft<'d> {
     entry: &'d VariableEntry,
-    place: Place,
-    node: Option<(NodeIdText, Place)>,
+    place: TextSpan,
+    node: Option<(NodeIdText, TextSpan)>,
     origin: Option<SpaceId>,
     alias: Option<NonZeroU16>,
 }
@@ -60,10 +60,10 @@ impl Draft<'_> {
 }
 
 pub(super) fn check(
-    entries: &[At<VariableEntry>],
-    (spaces, namespaces, servers): (&Spaces, &Namespaces, &Servers),
-    types: &mut Types,
-    findings: &mut Findings,
+    entries: &[Located<VariableEntry>],
+    (spaces, namespaces, servers): (&Spaces, &CheckedNamespaces, &Servers),
+    types: &mut MessageTypes,
+    findings: &mut MappingFindings,
 ) -> Vec<Variable> {
     if let Some(first) = entries.get(MAX_VARIABLES) {
         let message = format!(
@@ -87,11 +87,11 @@ pub(super) fn check(
         .collect();
     aliases(&drafts, findings);
     unique(&drafts, findings);
-    let calls = Calls::of(drafts.iter().filter_map(|draft| {
+    let calls = DocumentCalls::of(drafts.iter().filter_map(|draft| {
         let (node, _) = draft.node.as_ref()?;
         Some((node, draft.topic(), draft.entry.ros.as_ref()?))
     }));
-    let mut bindings = Bindings::new(spaces, calls, types);
+    let mut bindings = VariableBindings::new(spaces, calls, types);
     let variables = drafts
         .iter()
         .filter_map(|draft| variable(draft, servers, &mut bindings, findings));
@@ -110,10 +110,10 @@ pub(super) fn check(
 
 fn draft<'d>(
     entry: &'d VariableEntry,
-    place: Place,
+    place: TextSpan,
     spaces: &Spaces,
-    namespaces: &Namespaces,
-    findings: &mut Findings,
+    namespaces: &CheckedNamespaces,
+    findings: &mut MappingFindings,
 ) -> Draft<'d> {
     let node = required(&entry.node, "node", &title(entry), place, findings);
     let node = node.and_then(|(text, place)| node_id(text, place, namespaces, findings));
@@ -146,10 +146,10 @@ fn title(entry: &VariableEntry) -> String {
 
 pub(super) fn node_id(
     text: &str,
-    place: Place,
-    namespaces: &Namespaces,
-    findings: &mut Findings,
-) -> Option<(NodeIdText, Place)> {
+    place: TextSpan,
+    namespaces: &CheckedNamespaces,
+    findings: &mut MappingFindings,
+) -> Option<(NodeIdText, TextSpan)> {
     let node: NodeIdText = match text.parse() {
         Ok(node) => node,
         Err(error) => {
@@ -177,10 +177,10 @@ pub(super) fn node_id(
 /// Returns the OPC UA side, or a declared space.
 pub(super) fn space(
     number: u16,
-    place: Place,
+    place: TextSpan,
     key: &str,
     spaces: &Spaces,
-    findings: &mut Findings,
+    findings: &mut MappingFindings,
 ) -> Option<SpaceId> {
     let Some(id) = SpaceId::new(number) else {
         let message = format!("{key} {number} is not a space");
@@ -210,7 +210,7 @@ pub(super) fn space(
     None
 }
 
-fn aliases(drafts: &[Draft<'_>], findings: &mut Findings) {
+fn aliases(drafts: &[Draft<'_>], findings: &mut MappingFindings) {
     let used: HashSet<TopicId> = drafts.iter().filter_map(Draft::topic).collect();
     // The numbers that have not been proposed yet.
     let mut next: HashMap<(SpaceId, NonZeroU16), RangeInclusive<u16>> = HashMap::new();
@@ -269,10 +269,10 @@ fn why_alias(node: &NodeIdText) -> &'static str {
     }
 }
 
-fn unique(drafts: &[Draft<'_>], findings: &mut Findings) {
-    let mut nodes: HashMap<&NodeIdText, Place> = HashMap::new();
-    let mut topics: HashMap<TopicId, Place> = HashMap::new();
-    let mut names: HashMap<(u16, &str), Place> = HashMap::new();
+fn unique(drafts: &[Draft<'_>], findings: &mut MappingFindings) {
+    let mut nodes: HashMap<&NodeIdText, TextSpan> = HashMap::new();
+    let mut topics: HashMap<TopicId, TextSpan> = HashMap::new();
+    let mut names: HashMap<(u16, &str), TextSpan> = HashMap::new();
     for draft in drafts {
         let Some((node, place)) = &draft.node else {
             continue;
@@ -336,15 +336,15 @@ fn queue(entry: &VariableEntry, is_command: bool) -> Option<(Overflow, Lasting)>
 fn variable(
     draft: &Draft<'_>,
     servers: &Servers,
-    bindings: &mut Bindings<'_>,
-    findings: &mut Findings,
+    bindings: &mut VariableBindings<'_>,
+    findings: &mut MappingFindings,
 ) -> Option<Variable> {
     let entry = draft.entry;
     let name = required(&entry.name, "name", &title(entry), draft.place, findings);
     let name = name.and_then(|(name, place)| checked_name(name, place, findings));
     let declared =
         given(&entry.r#type).and_then(|(text, place)| declared_type(text, place, findings));
-    let subject = bindings::Subject {
+    let subject = bindings::BoundVariable {
         topic: draft.topic(),
         origin: draft.origin,
         declared,
@@ -378,7 +378,7 @@ fn variable(
         findings,
     );
     let is_origin = |space: SpaceId| draft.origin == Some(space);
-    let subject = remote::Subject {
+    let subject = remote::RemoteVariable {
         origin: draft.origin,
         node: draft.node.as_ref().map(|(node, _)| node),
         single: !several,
@@ -423,7 +423,7 @@ fn ua_field(
     draft: &Draft<'_>,
     bindings: &[Binding],
     (service, fields): (Option<&ServiceBinding>, usize),
-    findings: &mut Findings,
+    findings: &mut MappingFindings,
 ) -> Option<Option<UaField>> {
     let Some(at) = &draft.entry.ua_field else {
         return Some(None);
@@ -456,7 +456,7 @@ fn ua_field(
 fn publish(
     entry: &VariableEntry,
     (value_type, fields): (Option<ValueType>, &[Leaf]),
-    findings: &mut Findings,
+    findings: &mut MappingFindings,
 ) -> Option<Publish> {
     let mut on_change = matches!(given(&entry.publish), Some((PublishEntry::OnChange, _)));
     let (mut deadband, mut sound) = (0.0, Some(()));
@@ -519,9 +519,9 @@ fn rate(text: &str) -> Option<Duration> {
 /// Returns the field of the std_msgs type of a value.
 fn only_field((builtin, array): ValueType) -> Leaf {
     let rank = if array {
-        Rank::Array { fixed: None }
+        ArrayRank::Array { fixed: None }
     } else {
-        Rank::Scalar
+        ArrayRank::Scalar
     };
     Leaf {
         path: "data".to_owned(),
@@ -530,7 +530,11 @@ fn only_field((builtin, array): ValueType) -> Leaf {
     }
 }
 
-pub(super) fn checked_name(name: &str, place: Place, findings: &mut Findings) -> Option<String> {
+pub(super) fn checked_name(
+    name: &str,
+    place: TextSpan,
+    findings: &mut MappingFindings,
+) -> Option<String> {
     let fault = if name.trim().is_empty() {
         "is empty"
     } else if name.chars().count() > 512 {
@@ -546,7 +550,7 @@ pub(super) fn checked_name(name: &str, place: Place, findings: &mut Findings) ->
     None
 }
 
-fn declared_type(text: &str, place: Place, findings: &mut Findings) -> Option<ValueType> {
+fn declared_type(text: &str, place: TextSpan, findings: &mut MappingFindings) -> Option<ValueType> {
     let declared = types::parse_value_type(text);
     if declared.is_none() {
         let message = format!("`{}` is not an OPC UA builtin type", short(text));

@@ -3,8 +3,8 @@
 use schemars::JsonSchema;
 
 use crate::document::DURATION;
-use crate::read::{At, Read, Reader, choice, document};
-use crate::tree::{Kind, Node};
+use crate::read::{FromNode, Located, NodeReader, choice, document};
+use crate::tree::{YamlKind, YamlNode};
 
 document! {
     /// An alarm of the value at the server of the cell (OPC 10000-9): limits of a number, `normal`
@@ -66,14 +66,14 @@ choice! {
 
 /// A value or a list of values, as texts.
 #[derive(Clone, Debug)]
-pub(crate) struct ValueList(pub(crate) Vec<At<String>>);
+pub(crate) struct ValueList(pub(crate) Vec<Located<String>>);
 
-impl Read for ValueList {
-    fn read(node: &Node<'_>, reader: &mut Reader<'_>) -> Option<Self> {
+impl FromNode for ValueList {
+    fn read(node: &YamlNode<'_>, reader: &mut NodeReader<'_>) -> Option<Self> {
         match &node.kind {
-            Kind::List(_) => Vec::read(node, reader).map(Self),
-            Kind::Scalar(_) => Some(Self(vec![reader.at(node)])),
-            Kind::Null | Kind::Map(_) => {
+            YamlKind::List(_) => Vec::read(node, reader).map(Self),
+            YamlKind::Scalar(_) => Some(Self(vec![reader.at(node)])),
+            YamlKind::Null | YamlKind::Map(_) => {
                 reader.wrong(node, "a value such as `3`, or a list of them");
                 None
             }

@@ -3,8 +3,8 @@
 use schemars::JsonSchema;
 
 use super::{MqttEntry, PubSubEntry};
-use crate::read::{At, Field, Read, Reader, document};
-use crate::tree::{Kind, Node};
+use crate::read::{FromNode, Located, NodeReader, OptionalKey, document};
+use crate::tree::{YamlKind, YamlNode};
 
 document! {
     /// A carrier of the space, or the settings of all carriers.
@@ -18,7 +18,7 @@ document! {
         /// Names of publishers at this carrier, whose messages are forwarded to the other carriers:
         /// a space (ua_1), a namespace of it (ua_1_2) or a topic (ua_1_2_10), at most 1000. Requests
         /// of calls and confirmations of commands cross in the other direction. Default: none.
-        forward: Vec<At<String>>,
+        forward: Vec<Located<String>>,
         /// Settings of all carriers, in an entry without a carrier.
         settings: PubSubEntry,
     }
@@ -50,7 +50,7 @@ document! {
         /// Other hosts by address and port, such as [10.0.0.2:4840], for networks that carry
         /// multicast badly: each datagram is sent to each of them. `address` is then the address
         /// and port of this host.
-        peers: Vec<At<String>>,
+        peers: Vec<Located<String>>,
         /// Hops a multicast datagram may travel. Default 1: it stays on the link.
         #[schemars(range(max = 255))]
         ttl: u16,
@@ -61,13 +61,16 @@ document! {
 #[derive(Clone, Debug)]
 pub(crate) enum PubSubForm {
     One(Box<PubSubEntry>),
-    Several(Vec<At<CarrierEntry>>),
+    Several(Vec<Located<CarrierEntry>>),
 }
 
 impl PubSubForm {
     /// Returns the settings of the brokers.
     pub(crate) fn brokers(&mut self) -> impl Iterator<Item = &mut MqttEntry> {
-        let (one, several): (Option<&mut Field<MqttEntry>>, &mut [At<CarrierEntry>]) = match self {
+        let (one, several): (
+            Option<&mut OptionalKey<MqttEntry>>,
+            &mut [Located<CarrierEntry>],
+        ) = match self {
             Self::One(entry) => (Some(&mut entry.mqtt), &mut []),
             Self::Several(entries) => (None, entries.as_mut_slice()),
         };
@@ -77,11 +80,11 @@ impl PubSubForm {
     }
 }
 
-impl Read for PubSubForm {
-    fn read(node: &Node<'_>, reader: &mut Reader<'_>) -> Option<Self> {
+impl FromNode for PubSubForm {
+    fn read(node: &YamlNode<'_>, reader: &mut NodeReader<'_>) -> Option<Self> {
         match &node.kind {
-            Kind::List(_) => Vec::read(node, reader).map(Self::Several),
-            Kind::Scalar(_) | Kind::Null | Kind::Map(_) => {
+            YamlKind::List(_) => Vec::read(node, reader).map(Self::Several),
+            YamlKind::Scalar(_) | YamlKind::Null | YamlKind::Map(_) => {
                 PubSubEntry::read(node, reader).map(|entry| Self::One(Box::new(entry)))
             }
         }

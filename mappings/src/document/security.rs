@@ -1,6 +1,6 @@
 //! SecurityGroups in the document: permission to write and read the messages.
 
-use crate::read::{At, choice, document};
+use crate::read::{Located, choice, document};
 
 document! {
     /// A SecurityGroup of OPC UA PubSub: the programs that have its keys.
@@ -19,7 +19,7 @@ document! {
         /// The namespaces with the values, events and calls of the group, such as [2, 3]. Default:
         /// all namespaces that no other group lists, and messages without a namespace, such as
         /// probes and announcements.
-        namespaces: Vec<At<u16>>,
+        namespaces: Vec<Located<u16>>,
         /// Detection of repeated messages (replay). Default: `sender`.
         replay: ReplayEntry,
     }
@@ -50,7 +50,7 @@ document! {
         /// With the server of the cell: the ApplicationUris, from the certificates, of the programs
         /// that get the keys; `*` at the end matches any characters. The server and the bridges of
         /// the cell always get the keys.
-        members: Vec<At<String>>,
+        members: Vec<Located<String>>,
     }
 }
 

@@ -1,25 +1,25 @@
 use super::*;
 
-fn parse(text: &str) -> Result<Rc<Node<'_>>, Fault> {
+fn parse(text: &str) -> Result<Rc<YamlNode<'_>>, YamlFault> {
     super::parse(text, 0, &|_| None).map(|tree| tree.root)
 }
 use proptest::prelude::*;
 
-fn map<'n>(node: &'n Node<'n>) -> Vec<(&'n str, &'n Node<'n>)> {
-    let Kind::Map(pairs) = &node.kind else {
+fn map<'n>(node: &'n YamlNode<'n>) -> Vec<(&'n str, &'n YamlNode<'n>)> {
+    let YamlKind::Map(pairs) = &node.kind else {
         panic!("{node:?}")
     };
     pairs
         .iter()
         .map(|(key, value)| match &key.kind {
-            Kind::Scalar(text) => (&**text, &**value),
-            Kind::Null | Kind::List(_) | Kind::Map(_) => panic!("{key:?}"),
+            YamlKind::Scalar(text) => (&**text, &**value),
+            YamlKind::Null | YamlKind::List(_) | YamlKind::Map(_) => panic!("{key:?}"),
         })
         .collect()
 }
 
-fn at(line: usize, column: usize, len: usize) -> Place {
-    Place {
+fn at(line: usize, column: usize, len: usize) -> TextSpan {
+    TextSpan {
         file: 0,
         line,
         column,
@@ -33,14 +33,14 @@ fn every_node_knows_its_place_in_characters() {
         .unwrap();
     let root = map(&root);
     assert_eq!(root[1].1.place, at(4, 7, 3));
-    let Kind::List(items) = &root[0].1.kind else {
+    let YamlKind::List(items) = &root[0].1.kind else {
         panic!()
     };
     assert_eq!((items[0].place.line, items[0].place.column), (3, 5));
     let item = map(&items[0]);
     assert_eq!(item[0].1.place, at(3, 10, 1));
     assert_eq!(item[1].1.place, at(3, 18, 4));
-    assert!(matches!(&root[2].1.kind, Kind::Scalar(text) if text == "long\ner\n"));
+    assert!(matches!(&root[2].1.kind, YamlKind::Scalar(text) if text == "long\ner\n"));
 }
 
 #[test]
@@ -61,7 +61,10 @@ fn nothing_is_null_and_quotes_make_a_text() {
         ["nothing", "nothing", "a single value", "a single value"]
     );
     for text in ["", "# only a comment\n", "---\n", "\u{feff}# with a mark\n"] {
-        assert!(matches!(parse(text).unwrap().kind, Kind::Null), "{text:?}");
+        assert!(
+            matches!(parse(text).unwrap().kind, YamlKind::Null),
+            "{text:?}"
+        );
     }
 }
 

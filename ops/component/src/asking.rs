@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
-use bridge_node::{Answered, AskError, AskId, CallDescription, CallRole, PortEvent};
+use bridge_node::{AskError, AskId, CallDescription, CallResponse, CallRole, PortEvent};
 use bytes::Bytes;
 use mappings::TopicId;
 use tokio::sync::{mpsc, oneshot, watch};
@@ -16,7 +16,7 @@ type Known = BTreeMap<TopicId, Arc<CallDescription>>;
 
 /// The sender of the drivers' requests to the space.
 #[derive(Debug, Clone)]
-pub(crate) struct Asks {
+pub(crate) struct RequestSender {
     known: watch::Receiver<Known>,
     wish: mpsc::Sender<Wish>,
     next: Arc<AtomicU64>,
@@ -29,7 +29,7 @@ enum Wish {
         topic: TopicId,
         request: Bytes,
         timeout: Duration,
-        answer: oneshot::Sender<Answered<Bytes>>,
+        answer: oneshot::Sender<CallResponse<Bytes>>,
     },
     GiveUp(AskId),
 }
@@ -37,10 +37,10 @@ enum Wish {
 /// The receiver of the drivers' requests. The port reports the requests and passes the answers on.
 #[derive(Debug)]
 pub(crate) struct Asking {
-    asks: Asks,
+    asks: RequestSender,
     known: watch::Sender<Known>,
     wishes: mpsc::Receiver<Wish>,
-    asked: HashMap<AskId, oneshot::Sender<Answered<Bytes>>>,
+    asked: HashMap<AskId, oneshot::Sender<CallResponse<Bytes>>>,
     /// The calls that drivers need.
     wanted: BTreeSet<TopicId>,
     events: VecDeque<PortEvent>,
@@ -51,7 +51,7 @@ impl Asking {
         let (known, hears) = watch::channel(Known::new());
         let (wish, wishes) = mpsc::channel(MOST_WISHES);
         Self {
-            asks: Asks {
+            asks: RequestSender {
                 known: hears,
                 wish,
                 next: Arc::default(),
@@ -65,7 +65,7 @@ impl Asking {
     }
 
     /// Returns a sender for a driver that needs this call.
-    pub(crate) fn asks(&mut self, topic: TopicId) -> Asks {
+    pub(crate) fn asks(&mut self, topic: TopicId) -> RequestSender {
         self.want(topic);
         self.asks.clone()
     }
@@ -137,7 +137,7 @@ impl Asking {
             .send_if_modified(|known| known.remove(&topic).is_some());
     }
 
-    pub(crate) fn answered(&mut self, ask: AskId, answer: Answered<Bytes>) {
+    pub(crate) fn answered(&mut self, ask: AskId, answer: CallResponse<Bytes>) {
         if let Some(asked) = self.asked.remove(&ask) {
             // The driver may have abandoned the request.
             drop(asked.send(answer));
@@ -145,7 +145,7 @@ impl Asking {
     }
 }
 
-impl Asks {
+impl RequestSender {
     /// Waits until a call has an executor, and returns its description.
     ///
     /// # Errors

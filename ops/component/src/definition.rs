@@ -2,9 +2,9 @@
 //! feedback in the space. Both follow from the same table of skill types.
 
 use bridge_core::CallField;
-use messages::{Leaf, Rank};
+use messages::{ArrayRank, Leaf};
 use skills::model::{NAMESPACE, SKILL_TYPE, SkillType, find};
-use skills::{Builtin, Parameter, Shape, TypeName, Value};
+use skills::{Builtin, ParameterType, SkillParameter, SkillValue, ValueShape};
 use uadp::BuiltinType;
 
 use crate::fields;
@@ -45,7 +45,7 @@ pub fn action_name(skill_type: &SkillType) -> &'static str {
 /// Returns the action type of a skill: the action of its type, or of its nearest supertype in the
 /// namespace of the built-in skill types.
 #[must_use]
-pub fn action_type(types: &[TypeName]) -> Option<String> {
+pub fn action_type(types: &[ParameterType]) -> Option<String> {
     let ours = types.iter().filter(|of| of.namespace == NAMESPACE);
     let nearest = ours.filter_map(|of| find(&of.name)).next()?;
     Some(format!("{PACKAGE}/{}", action_name(nearest)))
@@ -102,7 +102,7 @@ pub fn definition(skill_type: &'static SkillType) -> String {
 }
 
 /// Returns the unit, range and default of a parameter, as far as it has them.
-fn note(parameter: &Parameter) -> String {
+fn note(parameter: &SkillParameter) -> String {
     let mut note = String::new();
     // Some tools of ROS 1 read only ASCII.
     let unit = parameter
@@ -114,17 +114,17 @@ fn note(parameter: &Parameter) -> String {
         note.push_str(&format!(" From {low} to {high}{unit}."));
     }
     match &parameter.default {
-        Some(Value::Boolean(_)) | None => {}
+        Some(SkillValue::Boolean(_)) | None => {}
         Some(default) if is_nothing(default) => {}
-        Some(Value::Array(_, elements)) if elements.iter().all(is_nothing) => {}
-        Some(Value::String(text)) => note.push_str(&format!(" \"\" is {text:?}.")),
-        Some(Value::Array(..)) => note.push_str(" Has a default, where it is empty."),
+        Some(SkillValue::Array(_, elements)) if elements.iter().all(is_nothing) => {}
+        Some(SkillValue::String(text)) => note.push_str(&format!(" \"\" is {text:?}.")),
+        Some(SkillValue::Array(..)) => note.push_str(" Has a default, where it is empty."),
         Some(number) => note.push_str(&format!(" 0 is {number}{unit}.")),
     }
     note
 }
 
-fn field(parameter: &Parameter, about: &str) -> String {
+fn field(parameter: &SkillParameter, about: &str) -> String {
     let suffix = match (parameter.shape.array, parameter.length) {
         (false, _) => String::new(),
         (true, None) => "[]".to_owned(),
@@ -157,27 +157,27 @@ const fn ros(builtin: Builtin) -> &'static str {
 }
 
 /// Returns true if a value is the default value of a ROS message.
-pub(crate) fn is_nothing(value: &Value) -> bool {
+pub(crate) fn is_nothing(value: &SkillValue) -> bool {
     match value {
         // A Boolean that is not set cannot be distinguished from a Boolean that is set.
-        Value::Boolean(_) => false,
-        Value::String(text) => text.is_empty(),
-        Value::Array(_, elements) => elements.is_empty(),
-        Value::SByte(_)
-        | Value::Byte(_)
-        | Value::Int16(_)
-        | Value::UInt16(_)
-        | Value::Int32(_)
-        | Value::UInt32(_)
-        | Value::Int64(_)
-        | Value::UInt64(_)
-        | Value::Float(_)
-        | Value::Double(_) => value.as_f64() == Some(0.0),
+        SkillValue::Boolean(_) => false,
+        SkillValue::String(text) => text.is_empty(),
+        SkillValue::Array(_, elements) => elements.is_empty(),
+        SkillValue::SByte(_)
+        | SkillValue::Byte(_)
+        | SkillValue::Int16(_)
+        | SkillValue::UInt16(_)
+        | SkillValue::Int32(_)
+        | SkillValue::UInt32(_)
+        | SkillValue::Int64(_)
+        | SkillValue::UInt64(_)
+        | SkillValue::Float(_)
+        | SkillValue::Double(_) => value.as_f64() == Some(0.0),
     }
 }
 
 /// Returns the fields of a goal.
-pub(crate) fn goal_fields(parameters: &[Parameter]) -> Vec<CallField> {
+pub(crate) fn goal_fields(parameters: &[SkillParameter]) -> Vec<CallField> {
     let fields = parameters.iter().map(|parameter| {
         let field = call_field(parameter);
         match parameter.default {
@@ -189,7 +189,7 @@ pub(crate) fn goal_fields(parameters: &[Parameter]) -> Vec<CallField> {
 }
 
 /// Returns the fields of a result.
-pub(crate) fn result_fields(results: &[Parameter]) -> Vec<CallField> {
+pub(crate) fn result_fields(results: &[SkillParameter]) -> Vec<CallField> {
     let run = CallField::scalar(RUN, BuiltinType::UInt32);
     [run]
         .into_iter()
@@ -202,15 +202,15 @@ pub(crate) fn feedback_fields() -> Vec<Leaf> {
     let leaves = FEEDBACK.iter().map(|(name, builtin, _)| Leaf {
         path: (*name).to_owned(),
         builtin: fields::builtin(*builtin),
-        rank: Rank::Scalar,
+        rank: ArrayRank::Scalar,
     });
     leaves.collect()
 }
 
-fn call_field(parameter: &Parameter) -> CallField {
+fn call_field(parameter: &SkillParameter) -> CallField {
     let rank = match parameter.shape.array {
-        false => Rank::Scalar,
-        true => Rank::Array {
+        false => ArrayRank::Scalar,
+        true => ArrayRank::Array {
             fixed: parameter.length,
         },
     };
@@ -224,25 +224,25 @@ fn call_field(parameter: &Parameter) -> CallField {
 }
 
 /// Returns the empty value of a result.
-pub(crate) fn nothing(of: &Parameter) -> Value {
-    let Shape { builtin, array } = of.shape;
+pub(crate) fn nothing(of: &SkillParameter) -> SkillValue {
+    let ValueShape { builtin, array } = of.shape;
     let one = match builtin {
-        Builtin::Boolean => Value::Boolean(false),
-        Builtin::SByte => Value::SByte(0),
-        Builtin::Byte => Value::Byte(0),
-        Builtin::Int16 => Value::Int16(0),
-        Builtin::UInt16 => Value::UInt16(0),
-        Builtin::Int32 => Value::Int32(0),
-        Builtin::UInt32 => Value::UInt32(0),
-        Builtin::Int64 => Value::Int64(0),
-        Builtin::UInt64 => Value::UInt64(0),
-        Builtin::Float => Value::Float(0.0),
-        Builtin::Double => Value::Double(0.0),
-        Builtin::String => Value::String(String::new()),
+        Builtin::Boolean => SkillValue::Boolean(false),
+        Builtin::SByte => SkillValue::SByte(0),
+        Builtin::Byte => SkillValue::Byte(0),
+        Builtin::Int16 => SkillValue::Int16(0),
+        Builtin::UInt16 => SkillValue::UInt16(0),
+        Builtin::Int32 => SkillValue::Int32(0),
+        Builtin::UInt32 => SkillValue::UInt32(0),
+        Builtin::Int64 => SkillValue::Int64(0),
+        Builtin::UInt64 => SkillValue::UInt64(0),
+        Builtin::Float => SkillValue::Float(0.0),
+        Builtin::Double => SkillValue::Double(0.0),
+        Builtin::String => SkillValue::String(String::new()),
     };
     if !array {
         return one;
     }
     let count = of.length.unwrap_or_default();
-    Value::Array(builtin, (0..count).map(|_| one.clone()).collect())
+    SkillValue::Array(builtin, (0..count).map(|_| one.clone()).collect())
 }

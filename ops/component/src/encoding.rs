@@ -1,9 +1,9 @@
 //! Encodes the fields of requests and goals: values of skills, and structures of them.
 
 use bridge_node::{CallField, CallStructure};
-use messages::Rank;
+use messages::ArrayRank;
 use serde_json::Value as Json;
-use skills::{Builtin, Shape, Value};
+use skills::{Builtin, SkillValue, ValueShape};
 use uadp::BuiltinType;
 
 use crate::fields;
@@ -21,8 +21,8 @@ pub(crate) fn encoded(field: &CallField, value: &Json, namespace: u16) -> Result
         format!("a {:?} cannot be written in a component", field.builtin)
     };
     let builtin = Builtin::of_id(u32::from(field.builtin as u8)).ok_or_else(none)?;
-    let array = field.rank != Rank::Scalar;
-    let shape = Shape { builtin, array };
+    let array = field.rank != ArrayRank::Scalar;
+    let shape = ValueShape { builtin, array };
     let value = match value.as_array() {
         Some(elements) => elements
             .iter()
@@ -31,7 +31,7 @@ pub(crate) fn encoded(field: &CallField, value: &Json, namespace: u16) -> Result
         None => typed(builtin, value),
     };
     let value = shape.read_json(&value)?;
-    if let Value::Array(_, elements) = &value {
+    if let SkillValue::Array(_, elements) = &value {
         has_length(field.rank, elements.len())?;
     }
     let one = fields::block(&[value]);
@@ -88,10 +88,10 @@ pub(crate) fn nothing(field: &CallField) -> Option<Vec<u8>> {
     };
     let id = field.builtin as u8;
     match field.rank {
-        Rank::Scalar if width == 0 => None,
-        Rank::Scalar => Some([vec![id], one].concat()),
-        Rank::Array { fixed: Some(_) } if width == 0 => None,
-        Rank::Array { fixed } => {
+        ArrayRank::Scalar if width == 0 => None,
+        ArrayRank::Scalar => Some([vec![id], one].concat()),
+        ArrayRank::Array { fixed: Some(_) } if width == 0 => None,
+        ArrayRank::Array { fixed } => {
             let count = fixed.unwrap_or_default();
             if usize::try_from(count).is_ok_and(|count| count > MOST_ELEMENTS) {
                 return None;
@@ -117,7 +117,7 @@ pub(crate) fn block(variants: &[Vec<u8>]) -> Vec<u8> {
 
 /// Encodes messages as a Variant: a scalar or an array of ExtensionObjects.
 fn structures(
-    rank: Rank,
+    rank: ArrayRank,
     structure: &CallStructure,
     value: &Json,
     namespace: u16,
@@ -136,7 +136,7 @@ fn structures(
         Ok::<_, String>(object)
     };
     let id = BuiltinType::ExtensionObject as u8;
-    if rank == Rank::Scalar {
+    if rank == ArrayRank::Scalar {
         return Ok([vec![id], one(value)?].concat());
     }
     let elements = list(rank, value)?;
@@ -182,8 +182,12 @@ fn body(structure: &CallStructure, value: &Json) -> Result<Vec<u8>, String> {
 }
 
 /// Encodes messages within a message.
-fn inline(rank: Rank, structure: &CallStructure, value: Option<&Json>) -> Result<Vec<u8>, String> {
-    let Rank::Array { fixed } = rank else {
+fn inline(
+    rank: ArrayRank,
+    structure: &CallStructure,
+    value: Option<&Json>,
+) -> Result<Vec<u8>, String> {
+    let ArrayRank::Array { fixed } = rank else {
         return body(structure, value.unwrap_or(&Json::Null));
     };
     let count = usize::try_from(fixed.unwrap_or_default()).unwrap_or(usize::MAX);
@@ -201,20 +205,20 @@ fn inline(rank: Rank, structure: &CallStructure, value: Option<&Json>) -> Result
     Ok(bytes)
 }
 
-fn list(rank: Rank, value: &Json) -> Result<&Vec<Json>, String> {
+fn list(rank: ArrayRank, value: &Json) -> Result<&Vec<Json>, String> {
     let elements = value.as_array().ok_or("a list of messages is needed")?;
     has_length(rank, elements.len())?;
     Ok(elements)
 }
 
-fn has_length(rank: Rank, given: usize) -> Result<(), String> {
+fn has_length(rank: ArrayRank, given: usize) -> Result<(), String> {
     match rank {
-        Rank::Array {
+        ArrayRank::Array {
             fixed: Some(length),
         } if u32::try_from(given) != Ok(length) => {
             Err(format!("it has {length} values, and {given} are given"))
         }
-        Rank::Array { .. } | Rank::Scalar => Ok(()),
+        ArrayRank::Array { .. } | ArrayRank::Scalar => Ok(()),
     }
 }
 
@@ -333,7 +337,7 @@ mod tests {
     #[test]
     fn fixed_arrays_in_each_other_are_refused_before_they_fill_the_memory() {
         let fixed = |name: &str, of: BuiltinType, structure| CallField {
-            rank: Rank::Array {
+            rank: ArrayRank::Array {
                 fixed: Some(60_000),
             },
             structure,

@@ -12,11 +12,11 @@ use bridge_node::{
 };
 use mappings::{Mapping, SpaceId};
 use plant_opcua::enrolment::GdsArguments;
-use skills::yaml::Code;
-use skills::{Component, Lds, Security};
+use skills::yaml::YamlFindingCode;
+use skills::{Component, ComponentSecurity, Lds};
 
 use crate::reload::{ComponentFile, Overrides, ReadComponent, Version};
-use crate::{ComponentPort, Options, made, modules, simulate};
+use crate::{ComponentOptions, ComponentPort, made, modules, simulate};
 
 /// A component of the cell: an OPC UA server with skills, which are values and calls of the space too.
 #[derive(Debug, clap::Parser)]
@@ -144,19 +144,21 @@ impl UaComponent {
         self.pki.clone().unwrap_or_else(usual)
     }
 
-    fn options(&self, file: &Arc<ComponentFile>) -> Options {
+    fn options(&self, file: &Arc<ComponentFile>) -> ComponentOptions {
         let Version { component, text } = &**file.started();
-        let is_secured =
-            self.gds.gds.is_some() || component.security.contains(&Security::Basic256Sha256);
+        let is_secured = self.gds.gds.is_some()
+            || component
+                .security
+                .contains(&ComponentSecurity::Basic256Sha256);
         let usual = || self.pki_root(component);
         let pki = self.pki.clone().or_else(|| is_secured.then(usual));
         let interface = self.arguments.0.flags.interface.as_deref();
         let mdns = match interface {
-            None => discovery::Interface::LOOPBACK,
-            Some(interface) => discovery::Interface::parse(interface),
+            None => discovery::MdnsInterface::LOOPBACK,
+            Some(interface) => discovery::MdnsInterface::parse(interface),
         };
         let mdns = mdns.with_networks(self.networks.iter().copied());
-        Options {
+        ComponentOptions {
             pki,
             trust_any_client: self.trust_any_client_certificate,
             mdns: Some(mdns),
@@ -173,7 +175,7 @@ impl UaComponent {
 /// Returns the meaning of a code, or of all codes.
 fn explained(wanted: &str) -> Result<String, Failure> {
     let all = wanted == "all";
-    let codes = Code::ALL.iter();
+    let codes = YamlFindingCode::ALL.iter();
     let told: String = codes
         .filter(|code| all || code.as_str().eq_ignore_ascii_case(wanted))
         .map(|code| format!("{code}: {}\n", code.explanation()))
@@ -233,11 +235,13 @@ impl Program for UaComponent {
     /// store.
     fn key_service(&self, _mapping: &Mapping) -> Option<Arc<dyn KeyService>> {
         let component = self.component().ok()?;
-        Some(Arc::new(plant_keys::Service::new(plant_keys::Identity {
-            application_uri: component.application_uri.clone(),
-            application_name: component.name.clone(),
-            pki: self.pki_root(component),
-        })))
+        Some(Arc::new(plant_keys::KeyFetcher::new(
+            plant_keys::KeyClientIdentity {
+                application_uri: component.application_uri.clone(),
+                application_name: component.name.clone(),
+                pki: self.pki_root(component),
+            },
+        )))
     }
 
     fn owned(mapping: &Mapping) -> Owned {
@@ -252,7 +256,7 @@ impl Program for UaComponent {
         let read = self.read()?;
         let gds = self.gds.invitation();
         let gds = gds.map_err(|fault| Failure::new(FailureKind::Usage, fault.to_string()))?;
-        let options = Options {
+        let options = ComponentOptions {
             gds,
             ..self.options(read)
         };

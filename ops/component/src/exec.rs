@@ -12,7 +12,7 @@ use std::time::Duration;
 use async_trait::async_trait;
 use rustix::process::{Pid, Signal, kill_process_group};
 use serde_json::{Value as Json, json};
-use skills::{Component, Driver, DriverError, DriverSetup, ExecWork, Results, Value, Work};
+use skills::{Component, Driver, DriverError, DriverSetup, ExecWork, RunResults, SkillValue, Work};
 use tokio::io::{
     AsyncBufRead, AsyncBufReadExt as _, AsyncReadExt as _, AsyncWriteExt as _, BufReader,
 };
@@ -49,7 +49,7 @@ struct Program {
 /// The end of a program.
 enum Ended {
     /// The program has reported the results, or why the work is not done.
-    Told(Result<Results, String>),
+    Told(Result<RunResults, String>),
     /// The program has not obeyed, or has ended without a result: the state of the machine is
     /// unknown.
     Unknown(String),
@@ -62,7 +62,7 @@ impl Driver for Program {
         Some(self.work.halt_timeout + STOP_WITHIN + ENDS_WITHIN)
     }
 
-    async fn run(&self, work: Work) -> Result<Results, DriverError> {
+    async fn run(&self, work: Work) -> Result<RunResults, DriverError> {
         let child = start(&self.work.command, &self.work.folder, [Stdio::piped; 2]);
         let mut child = child.map_err(DriverError::reported)?;
         let group = group_of(&child);
@@ -318,7 +318,7 @@ enum Report {
         step: Option<String>,
         note: Option<String>,
     },
-    Ended(Result<Results, String>),
+    Ended(Result<RunResults, String>),
 }
 
 /// The keys of a line of a program.
@@ -345,7 +345,7 @@ fn reported(text: &str) -> Result<Report, String> {
     match line.get("result") {
         Some(Json::Object(results)) => {
             let results = results.iter().map(|(name, value)| {
-                let value = Value::of_json(value);
+                let value = SkillValue::of_json(value);
                 let value = value
                     .ok_or_else(|| wrong(&format!("has a result `{name}` of a wrong type")))?;
                 Ok((name.clone(), value))

@@ -2,29 +2,31 @@
 
 use std::sync::Arc;
 
-use program::Method;
-use skills::{Facts, Mirror, Outcome, Owner, Shown, Skill, Value};
+use program::ProgramMethod;
+use skills::{
+    MirroredSkill, RunOutcome, Skill, SkillDescription, SkillOwner, SkillSnapshot, SkillValue,
+};
 
 use crate::fields;
 
 /// An executable skill. Clones refer to the same skill.
 #[derive(Debug, Clone)]
-pub(crate) enum Executor {
+pub(crate) enum SkillExecutor {
     /// Executed by this program.
     Own(Skill),
     /// Executed by a server that is not a participant of the space.
-    Theirs(Mirror),
+    Theirs(MirroredSkill),
 }
 
-impl Executor {
-    pub(crate) fn facts(&self) -> &Arc<Facts> {
+impl SkillExecutor {
+    pub(crate) fn facts(&self) -> &Arc<SkillDescription> {
         match self {
             Self::Own(skill) => skill.facts(),
             Self::Theirs(mirror) => mirror.facts(),
         }
     }
 
-    pub(crate) fn shown(&self) -> Arc<Shown> {
+    pub(crate) fn shown(&self) -> Arc<SkillSnapshot> {
         match self {
             Self::Own(skill) => skill.shown(),
             Self::Theirs(mirror) => mirror.shown(),
@@ -32,7 +34,7 @@ impl Executor {
     }
 
     /// Returns the outcome of a run, if it is one of the latest.
-    pub(crate) fn outcome(&self, run: u32) -> Option<Arc<Outcome>> {
+    pub(crate) fn outcome(&self, run: u32) -> Option<Arc<RunOutcome>> {
         match self {
             Self::Own(skill) => skill.outcome(run),
             Self::Theirs(mirror) => mirror.outcome(run),
@@ -43,7 +45,7 @@ impl Executor {
     ///
     /// # Errors
     /// Returns the name of a StatusCode and the reason as text for the operator.
-    pub(crate) async fn call(&self, by: Owner, method: Method) -> Result<u32, String> {
+    pub(crate) async fn call(&self, by: SkillOwner, method: ProgramMethod) -> Result<u32, String> {
         match self {
             Self::Own(skill) => skill.call(by, method).await.map_err(|why| why.to_string()),
             Self::Theirs(mirror) => theirs(mirror, method, Vec::new()).await,
@@ -56,28 +58,34 @@ impl Executor {
     /// Returns the errors of [`call`](Self::call).
     pub(crate) async fn start_with(
         &self,
-        by: Owner,
-        parameters: Vec<(String, Value)>,
+        by: SkillOwner,
+        parameters: Vec<(String, SkillValue)>,
     ) -> Result<u32, String> {
         match self {
             Self::Own(skill) => {
                 let started = skill.start_with(by, parameters).await;
                 started.map_err(|why| why.to_string())
             }
-            Self::Theirs(mirror) => theirs(mirror, Method::Start, parameters).await,
+            Self::Theirs(mirror) => theirs(mirror, ProgramMethod::Start, parameters).await,
         }
     }
 
     /// Executes a call of the space and returns its response: success, message and run.
-    pub(crate) async fn answer(&self, by: Owner, method: Method, request: &[u8]) -> [Value; 3] {
+    pub(crate) async fn answer(
+        &self,
+        by: SkillOwner,
+        method: ProgramMethod,
+        request: &[u8],
+    ) -> [SkillValue; 3] {
         let answer = match method {
-            Method::Start => match self.parameters(request) {
+            ProgramMethod::Start => match self.parameters(request) {
                 Ok(parameters) => self.start_with(by, parameters).await,
                 Err(why) => Err(format!("BadInvalidArgument: {why}")),
             },
-            Method::Suspend | Method::Resume | Method::Halt | Method::Reset => {
-                self.call(by, method).await
-            }
+            ProgramMethod::Suspend
+            | ProgramMethod::Resume
+            | ProgramMethod::Halt
+            | ProgramMethod::Reset => self.call(by, method).await,
         };
         match answer {
             Ok(run) => [true.into(), "".into(), run.into()],
@@ -87,7 +95,7 @@ impl Executor {
 
     /// Decodes the parameters of a request: a field for each parameter of the type, in its order,
     /// or no field at all. Null fields are not set.
-    fn parameters(&self, request: &[u8]) -> Result<Vec<(String, Value)>, String> {
+    fn parameters(&self, request: &[u8]) -> Result<Vec<(String, SkillValue)>, String> {
         let values = fields::values(request)?;
         let declared = &self.facts().parameters;
         if values.is_empty() {
@@ -108,9 +116,9 @@ impl Executor {
 }
 
 async fn theirs(
-    mirror: &Mirror,
-    method: Method,
-    parameters: Vec<(String, Value)>,
+    mirror: &MirroredSkill,
+    method: ProgramMethod,
+    parameters: Vec<(String, SkillValue)>,
 ) -> Result<u32, String> {
     let called = mirror.call(method, parameters).await;
     called.map_err(|fault| fault.to_string())

@@ -1,12 +1,12 @@
 //! Values in the encoding of the space: a block of fields is their number (UInt16) and a Variant
 //! for each field (OPC 10000-6, 5.2.2.16).
 
-use messages::Rank;
-use skills::{Builtin, Shape, Value};
+use messages::ArrayRank;
+use skills::{Builtin, SkillValue, ValueShape};
 use uadp::{BuiltinType, Fields, Scalar, Variant};
 
 /// Encodes a block of values.
-pub(crate) fn block(values: &[Value]) -> Vec<u8> {
+pub(crate) fn block(values: &[SkillValue]) -> Vec<u8> {
     // A skill has a few hundred values at most.
     let mut out = Vec::from(
         u16::try_from(values.len())
@@ -30,7 +30,7 @@ pub(crate) fn no_value(status: u32) -> Vec<u8> {
 ///
 /// # Errors
 /// Returns the unsupported type or the encoding error, as text for the operator.
-pub(crate) fn values(block: &[u8]) -> Result<Vec<Option<Value>>, String> {
+pub(crate) fn values(block: &[u8]) -> Result<Vec<Option<SkillValue>>, String> {
     let fields = Fields::parse(block).map_err(|error| error.to_string())?;
     fields
         .map(|field| value(&field.map_err(|error| error.to_string())?))
@@ -56,16 +56,16 @@ pub(crate) fn builtin(of: Builtin) -> BuiltinType {
 }
 
 /// Returns the rank of a field.
-pub(crate) fn rank(of: Shape) -> Rank {
+pub(crate) fn rank(of: ValueShape) -> ArrayRank {
     if of.array {
-        Rank::Array { fixed: None }
+        ArrayRank::Array { fixed: None }
     } else {
-        Rank::Scalar
+        ArrayRank::Scalar
     }
 }
 
-fn variant(value: &Value, out: &mut Vec<u8>) {
-    let Value::Array(builtin, elements) = value else {
+fn variant(value: &SkillValue, out: &mut Vec<u8>) {
+    let SkillValue::Array(builtin, elements) = value else {
         out.push(value.shape().builtin.id());
         scalar(value, out);
         return;
@@ -77,25 +77,25 @@ fn variant(value: &Value, out: &mut Vec<u8>) {
     }
 }
 
-fn scalar(value: &Value, out: &mut Vec<u8>) {
+fn scalar(value: &SkillValue, out: &mut Vec<u8>) {
     match value {
-        Value::Boolean(value) => out.push(u8::from(*value)),
-        Value::SByte(value) => out.extend(value.to_le_bytes()),
-        Value::Byte(value) => out.push(*value),
-        Value::Int16(value) => out.extend(value.to_le_bytes()),
-        Value::UInt16(value) => out.extend(value.to_le_bytes()),
-        Value::Int32(value) => out.extend(value.to_le_bytes()),
-        Value::UInt32(value) => out.extend(value.to_le_bytes()),
-        Value::Int64(value) => out.extend(value.to_le_bytes()),
-        Value::UInt64(value) => out.extend(value.to_le_bytes()),
-        Value::Float(value) => out.extend(value.to_le_bytes()),
-        Value::Double(value) => out.extend(value.to_le_bytes()),
-        Value::String(text) => {
+        SkillValue::Boolean(value) => out.push(u8::from(*value)),
+        SkillValue::SByte(value) => out.extend(value.to_le_bytes()),
+        SkillValue::Byte(value) => out.push(*value),
+        SkillValue::Int16(value) => out.extend(value.to_le_bytes()),
+        SkillValue::UInt16(value) => out.extend(value.to_le_bytes()),
+        SkillValue::Int32(value) => out.extend(value.to_le_bytes()),
+        SkillValue::UInt32(value) => out.extend(value.to_le_bytes()),
+        SkillValue::Int64(value) => out.extend(value.to_le_bytes()),
+        SkillValue::UInt64(value) => out.extend(value.to_le_bytes()),
+        SkillValue::Float(value) => out.extend(value.to_le_bytes()),
+        SkillValue::Double(value) => out.extend(value.to_le_bytes()),
+        SkillValue::String(text) => {
             length(text.len(), out);
             out.extend(text.as_bytes());
         }
         // Arrays contain scalars only.
-        Value::Array(..) => {}
+        SkillValue::Array(..) => {}
     }
 }
 
@@ -107,7 +107,7 @@ fn length(of: usize, out: &mut Vec<u8>) {
 ///
 /// # Errors
 /// Returns the errors of [`values`].
-pub(crate) fn value(field: &Variant<'_>) -> Result<Option<Value>, String> {
+pub(crate) fn value(field: &Variant<'_>) -> Result<Option<SkillValue>, String> {
     match field {
         Variant::Null => Ok(None),
         Variant::Scalar(scalar) => single(scalar).map(Some),
@@ -119,9 +119,9 @@ pub(crate) fn value(field: &Variant<'_>) -> Result<Option<Value>, String> {
                     array.element()
                 )
             })?;
-            let elements: Result<Vec<Value>, String> =
+            let elements: Result<Vec<SkillValue>, String> =
                 array.iter().map(|element| single(&element)).collect();
-            Ok(Some(Value::Array(of, elements?)))
+            Ok(Some(SkillValue::Array(of, elements?)))
         }
         Variant::Matrix(_) => {
             Err("an array of several dimensions is nothing that a skill is told".to_owned())
@@ -133,20 +133,20 @@ pub(crate) fn value(field: &Variant<'_>) -> Result<Option<Value>, String> {
     clippy::wildcard_enum_match_arm,
     reason = "of the types of the space those that a skill can be told in are named"
 )]
-fn single(scalar: &Scalar<'_>) -> Result<Value, String> {
+fn single(scalar: &Scalar<'_>) -> Result<SkillValue, String> {
     Ok(match scalar {
-        Scalar::Boolean(value) => Value::Boolean(*value),
-        Scalar::SByte(value) => Value::SByte(*value),
-        Scalar::Byte(value) => Value::Byte(*value),
-        Scalar::Int16(value) => Value::Int16(*value),
-        Scalar::UInt16(value) => Value::UInt16(*value),
-        Scalar::Int32(value) => Value::Int32(*value),
-        Scalar::UInt32(value) => Value::UInt32(*value),
-        Scalar::Int64(value) => Value::Int64(*value),
-        Scalar::UInt64(value) => Value::UInt64(*value),
-        Scalar::Float(value) => Value::Float(*value),
-        Scalar::Double(value) => Value::Double(*value),
-        Scalar::String(text) => Value::String(text.unwrap_or_default().to_owned()),
+        Scalar::Boolean(value) => SkillValue::Boolean(*value),
+        Scalar::SByte(value) => SkillValue::SByte(*value),
+        Scalar::Byte(value) => SkillValue::Byte(*value),
+        Scalar::Int16(value) => SkillValue::Int16(*value),
+        Scalar::UInt16(value) => SkillValue::UInt16(*value),
+        Scalar::Int32(value) => SkillValue::Int32(*value),
+        Scalar::UInt32(value) => SkillValue::UInt32(*value),
+        Scalar::Int64(value) => SkillValue::Int64(*value),
+        Scalar::UInt64(value) => SkillValue::UInt64(*value),
+        Scalar::Float(value) => SkillValue::Float(*value),
+        Scalar::Double(value) => SkillValue::Double(*value),
+        Scalar::String(text) => SkillValue::String(text.unwrap_or_default().to_owned()),
         other => {
             return Err(format!(
                 "{:?} is nothing that a skill is told",
@@ -165,21 +165,21 @@ mod tests {
     #[test]
     fn values_are_the_same_after_their_way_through_the_space() {
         let all = vec![
-            Value::from(true),
-            Value::SByte(-1),
-            Value::Byte(200),
-            Value::Int16(-300),
-            Value::UInt16(60_000),
-            Value::from(-70_000),
-            Value::from(70_000_u32),
-            Value::Int64(i64::MIN),
-            Value::UInt64(u64::MAX),
-            Value::from(0.5_f32),
-            Value::from(0.1),
-            Value::from("J\u{f8}rg"),
-            Value::from([0.25; 6]),
-            Value::Array(Builtin::String, vec!["a".into(), "".into()]),
-            Value::Array(Builtin::Boolean, Vec::new()),
+            SkillValue::from(true),
+            SkillValue::SByte(-1),
+            SkillValue::Byte(200),
+            SkillValue::Int16(-300),
+            SkillValue::UInt16(60_000),
+            SkillValue::from(-70_000),
+            SkillValue::from(70_000_u32),
+            SkillValue::Int64(i64::MIN),
+            SkillValue::UInt64(u64::MAX),
+            SkillValue::from(0.5_f32),
+            SkillValue::from(0.1),
+            SkillValue::from("J\u{f8}rg"),
+            SkillValue::from([0.25; 6]),
+            SkillValue::Array(Builtin::String, vec!["a".into(), "".into()]),
+            SkillValue::Array(Builtin::Boolean, Vec::new()),
         ];
         let read = values(&block(&all)).unwrap();
         assert_eq!(read, all.into_iter().map(Some).collect::<Vec<_>>());

@@ -9,23 +9,31 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use bridge_node::actions::{
-    ActionClient, CancelAnswer, CancelWhat, GoalEvent, GoalId, OwnAction, SentGoal,
+    GraphActionClient, GraphCancelResponse, GraphCancelSelection, GraphGoalEvent, GraphGoalId,
+    OwnAction, SentGoal,
 };
-use bridge_node::{CallFault, Ran, now};
+use bridge_node::{CallFault, MayHaveRun, now};
 use bytes::Bytes;
 use mappings::TopicId;
-use program::{Method, State};
-use skills::{Facts, Observer, Outcome, Owner, Parameters, Shown, Told, Value};
+use program::{ProgramMachineState, ProgramMethod};
+use skills::{
+    Parameters, RunOutcome, SkillDescription, SkillEvent, SkillObserver, SkillOwner, SkillSnapshot,
+    SkillValue,
+};
 use tokio::sync::broadcast;
 use tokio::task::JoinHandle;
 use tokio::time::{Instant, sleep_until};
 
 use crate::definition;
-use crate::executor::Executor;
+use crate::executor::SkillExecutor;
 use crate::fields;
 
 /// Returns the action of a skill. The first part of the tuple is the name of the component.
-pub(crate) fn action(topic: TopicId, (component, open): (&str, bool), facts: &Facts) -> OwnAction {
+pub(crate) fn action(
+    topic: TopicId,
+    (component, open): (&str, bool),
+    facts: &SkillDescription,
+) -> OwnAction {
     let of = facts.types.first();
     let of = of.map(|of| format!("{} nsu={}", of.name, of.namespace));
     // A Program that is not a skill has the action of the base type of all skills.
@@ -43,12 +51,12 @@ pub(crate) fn action(topic: TopicId, (component, open): (&str, bool), facts: &Fa
 }
 
 /// Encodes the fields of a result. Missing values are empty.
-fn result(facts: &Facts, (run, given): (u32, &[(String, Value)])) -> Bytes {
+fn result(facts: &SkillDescription, (run, given): (u32, &[(String, SkillValue)])) -> Bytes {
     let values = facts.results.iter().map(|declared| {
         let found = given.iter().find(|(name, _)| *name == declared.name);
         found.map_or_else(|| definition::nothing(declared), |(_, value)| value.clone())
     });
-    let values: Vec<Value> = [Value::from(run)].into_iter().chain(values).collect();
+    let values: Vec<SkillValue> = [SkillValue::from(run)].into_iter().chain(values).collect();
     Bytes::from(fields::block(&values))
 }
 
@@ -57,11 +65,11 @@ fn result(facts: &Facts, (run, given): (u32, &[(String, Value)])) -> Bytes {
 enum Heard {
     Stands {
         run: u32,
-        feedback: [Value; 4],
+        feedback: [SkillValue; 4],
         /// True if only the progress has changed.
         passing: bool,
     },
-    Ended(Arc<Outcome>),
+    Ended(Arc<RunOutcome>),
     /// The state of the runs is unknown from now on.
     Lost(String),
 }
@@ -76,13 +84,15 @@ impl Reporter {
     }
 }
 
-impl Observer for Reporter {
-    fn told(&self, what: Told<'_>, shown: &Shown) {
+impl SkillObserver for Reporter {
+    fn told(&self, what: SkillEvent<'_>, shown: &SkillSnapshot) {
         let heard = match what {
-            Told::Transition(_) | Told::Step | Told::Pending(_) => stands(shown, false),
-            Told::Progress => stands(shown, true),
-            Told::Outcome(outcome) => Heard::Ended(Arc::new(outcome.clone())),
-            Told::Parameters(_) | Told::Called => return,
+            SkillEvent::Transition(_) | SkillEvent::Step | SkillEvent::Pending(_) => {
+                stands(shown, false)
+            }
+            SkillEvent::Progress => stands(shown, true),
+            SkillEvent::Outcome(outcome) => Heard::Ended(Arc::new(outcome.clone())),
+            SkillEvent::Parameters(_) | SkillEvent::Called => return,
         };
         // Without goals there is no receiver.
         let _heard_by = self.0.send(heard);
@@ -93,7 +103,7 @@ impl Observer for Reporter {
     }
 }
 
-fn stands(shown: &Shown, passing: bool) -> Heard {
+fn stands(shown: &SkillSnapshot, passing: bool) -> Heard {
     let feedback = [
         shown.state.name().into(),
         shown.progress.into(),
@@ -110,7 +120,7 @@ fn stands(shown: &Shown, passing: bool) -> Heard {
 /// Executes goals with a skill.
 #[derive(Debug)]
 pub(crate) struct Doer {
-    skill: Executor,
+    skill: SkillExecutor,
     reporter: Reporter,
     doing: Arc<Mutex<Doing>>,
 }
@@ -120,13 +130,13 @@ pub(crate) struct Doer {
 struct Doing {
     current: Option<Current>,
     /// Goals with a run that is about to start, and if each goal was cancelled in the meantime.
-    beginning: HashMap<GoalId, bool>,
+    beginning: HashMap<GraphGoalId, bool>,
 }
 
 impl Doing {
     /// Handles that a run has started or failed to start. Returns true if its goal was cancelled in
     /// the meantime.
-    fn begun(&mut self, id: GoalId) -> bool {
+    fn begun(&mut self, id: GraphGoalId) -> bool {
         self.beginning.remove(&id).unwrap_or_default()
     }
 }
@@ -134,13 +144,13 @@ impl Doing {
 /// The goal with the latest run among the runs that goals started.
 #[derive(Debug, Clone, Copy)]
 struct Current {
-    id: GoalId,
+    id: GraphGoalId,
     run: u32,
     cancelled: bool,
 }
 
 impl Doer {
-    pub(crate) fn new(skill: Executor, reporter: Reporter) -> Self {
+    pub(crate) fn new(skill: SkillExecutor, reporter: Reporter) -> Self {
         Self {
             skill,
             reporter,
@@ -149,10 +159,15 @@ impl Doer {
     }
 }
 
-impl ActionClient for Doer {
-    type Goal = Sent;
+impl GraphActionClient for Doer {
+    type Goal = SentSkillGoal;
 
-    fn send_goal(&self, id: GoalId, body: &[u8], start_by: std::time::Instant) -> Sent {
+    fn send_goal(
+        &self,
+        id: GraphGoalId,
+        body: &[u8],
+        start_by: std::time::Instant,
+    ) -> SentSkillGoal {
         // The subscription starts before the run, so that no notification is missed.
         let heard = self.reporter.0.subscribe();
         let (skill, body) = (self.skill.clone(), body.to_vec());
@@ -179,11 +194,11 @@ impl ActionClient for Doer {
             };
             if cancelled && run.is_ok() {
                 // The end of the run shows if it could be halted.
-                let _halted = skill.call(OWNER, Method::Halt).await;
+                let _halted = skill.call(OWNER, ProgramMethod::Halt).await;
             }
             run
         });
-        Sent {
+        SentSkillGoal {
             skill: self.skill.clone(),
             doing: Arc::clone(&self.doing),
             heard,
@@ -195,32 +210,32 @@ impl ActionClient for Doer {
         }
     }
 
-    async fn cancel(&self, what: CancelWhat) -> Result<CancelAnswer, CallFault> {
+    async fn cancel(&self, what: GraphCancelSelection) -> Result<GraphCancelResponse, CallFault> {
         let none = |code| {
-            Ok(CancelAnswer {
+            Ok(GraphCancelResponse {
                 code,
                 goals: Vec::new(),
             })
         };
         let wanted = |current: &Current| match what {
-            CancelWhat::All => true,
-            CancelWhat::Goal(id) => current.id == id,
+            GraphCancelSelection::All => true,
+            GraphCancelSelection::Goal(id) => current.id == id,
         };
         let open = {
             let mut doing = lock(&self.doing);
             let beginning = doing.beginning.iter_mut();
             let meant = beginning.filter(|(id, _)| match what {
-                CancelWhat::All => true,
-                CancelWhat::Goal(wanted) => **id == wanted,
+                GraphCancelSelection::All => true,
+                GraphCancelSelection::Goal(wanted) => **id == wanted,
             });
-            let goals: Vec<GoalId> = meant
+            let goals: Vec<GraphGoalId> = meant
                 .map(|(id, cancelled)| {
                     *cancelled = true;
                     *id
                 })
                 .collect();
             if !goals.is_empty() {
-                return Ok(CancelAnswer { code: NONE, goals });
+                return Ok(GraphCancelResponse { code: NONE, goals });
             }
             let current = doing.current.as_mut().filter(|current| wanted(current));
             let open = current.filter(|current| self.skill.outcome(current.run).is_none());
@@ -231,12 +246,12 @@ impl ActionClient for Doer {
         };
         let Some(open) = open else {
             return none(match what {
-                CancelWhat::All => NONE,
-                CancelWhat::Goal(_) => UNKNOWN_GOAL,
+                GraphCancelSelection::All => NONE,
+                GraphCancelSelection::Goal(_) => UNKNOWN_GOAL,
             });
         };
-        match self.skill.call(OWNER, Method::Halt).await {
-            Ok(_) => Ok(CancelAnswer {
+        match self.skill.call(OWNER, ProgramMethod::Halt).await {
+            Ok(_) => Ok(GraphCancelResponse {
                 code: NONE,
                 goals: vec![open.id],
             }),
@@ -254,7 +269,7 @@ impl ActionClient for Doer {
 }
 
 /// Starts a run and returns its number.
-async fn begin(skill: &Executor, body: &[u8]) -> Result<u32, String> {
+async fn begin(skill: &SkillExecutor, body: &[u8]) -> Result<u32, String> {
     let given =
         parameters(skill.facts(), body).map_err(|why| format!("BadInvalidArgument: {why}"))?;
     // The parameters are checked before the machine moves; Start checks them again.
@@ -267,15 +282,15 @@ async fn begin(skill: &Executor, body: &[u8]) -> Result<u32, String> {
             shown.run
         ));
     }
-    if shown.state == State::Halted {
-        skill.call(OWNER, Method::Reset).await?;
+    if shown.state == ProgramMachineState::Halted {
+        skill.call(OWNER, ProgramMethod::Reset).await?;
     }
     skill.start_with(OWNER, given).await
 }
 
 /// Decodes the parameters of a goal. Null values are not set. Zero or empty values of parameters
 /// with a default are not set either, because all fields of a ROS message have a value.
-fn parameters(facts: &Facts, body: &[u8]) -> Result<Vec<(String, Value)>, String> {
+fn parameters(facts: &SkillDescription, body: &[u8]) -> Result<Vec<(String, SkillValue)>, String> {
     let values = fields::values(body)?;
     let declared = &facts.parameters;
     if values.len() > declared.len() {
@@ -296,18 +311,18 @@ fn parameters(facts: &Facts, body: &[u8]) -> Result<Vec<(String, Value)>, String
 
 /// A goal that was sent.
 #[derive(Debug)]
-pub(crate) struct Sent {
-    skill: Executor,
+pub(crate) struct SentSkillGoal {
+    skill: SkillExecutor,
     doing: Arc<Mutex<Doing>>,
     heard: broadcast::Receiver<Heard>,
     stage: Stage,
-    events: VecDeque<GoalEvent>,
+    events: VecDeque<GraphGoalEvent>,
     /// Progress that is held back, because the previous feedback was sent a moment ago.
-    passing: Option<[Value; 4]>,
+    passing: Option<[SkillValue; 4]>,
     /// Time of the last feedback, and its values in `last`. Feedback is repeated, so that late
     /// subscribers receive it while nothing changes.
     told: Option<Instant>,
-    last: Option<[Value; 4]>,
+    last: Option<[SkillValue; 4]>,
 }
 
 #[derive(Debug)]
@@ -315,12 +330,12 @@ enum Stage {
     Begins(JoinHandle<Result<u32, String>>),
     Runs(u32),
     /// The run has ended; the end is reported at this time.
-    Cancelled(Arc<Outcome>, Instant),
+    Cancelled(Arc<RunOutcome>, Instant),
     Ended,
 }
 
-impl SentGoal for Sent {
-    async fn recv(&mut self) -> Option<GoalEvent> {
+impl SentGoal for SentSkillGoal {
+    async fn recv(&mut self) -> Option<GraphGoalEvent> {
         loop {
             if let Some(event) = self.events.pop_front() {
                 return Some(event);
@@ -362,17 +377,17 @@ async fn at(time: Option<Instant>) {
     }
 }
 
-impl Sent {
+impl SentSkillGoal {
     fn begun(&mut self, begun: Result<u32, String>) {
         match begun {
             Ok(run) => {
                 self.stage = Stage::Runs(run);
-                self.events.push_back(GoalEvent::Accepted(now().utc));
-                self.events.push_back(GoalEvent::Status(EXECUTING));
+                self.events.push_back(GraphGoalEvent::Accepted(now().utc));
+                self.events.push_back(GraphGoalEvent::Status(EXECUTING));
             }
             Err(why) => {
                 self.stage = Stage::Ended;
-                self.events.push_back(GoalEvent::Rejected(why));
+                self.events.push_back(GraphGoalEvent::Rejected(why));
             }
         }
     }
@@ -397,7 +412,7 @@ impl Sent {
                     true => {
                         let until = Instant::now() + BEHIND_CANCEL;
                         self.stage = Stage::Cancelled(outcome, until);
-                        self.events.push_back(GoalEvent::Status(CANCELING));
+                        self.events.push_back(GraphGoalEvent::Status(CANCELING));
                     }
                     false => self.end(&outcome),
                 }
@@ -419,18 +434,18 @@ impl Sent {
 
     fn lost(&mut self, text: String) {
         self.stage = Stage::Ended;
-        let ran = Ran::Perhaps;
-        self.events.push_back(GoalEvent::Lost { text, ran });
+        let ran = MayHaveRun::Perhaps;
+        self.events.push_back(GraphGoalEvent::Lost { text, ran });
     }
 
     /// Sends this feedback, or else the held-back progress, or else the last feedback again.
-    fn tell(&mut self, feedback: Option<[Value; 4]>) {
+    fn tell(&mut self, feedback: Option<[SkillValue; 4]>) {
         let waited = self.passing.take();
         if let Some(feedback) = feedback.or(waited).or_else(|| self.last.clone()) {
             self.told = Some(Instant::now());
             self.last = Some(feedback.clone());
             let body = Bytes::from(fields::block(&feedback));
-            self.events.push_back(GoalEvent::Feedback(body));
+            self.events.push_back(GraphGoalEvent::Feedback(body));
         }
     }
 
@@ -439,7 +454,7 @@ impl Sent {
         current.is_some_and(|of| of.run == run && of.cancelled)
     }
 
-    fn end(&mut self, outcome: &Outcome) {
+    fn end(&mut self, outcome: &RunOutcome) {
         if let Some(passing) = self.passing.take() {
             self.tell(Some(passing));
         }
@@ -452,7 +467,7 @@ impl Sent {
             (false, false) => ABORTED,
         };
         self.stage = Stage::Ended;
-        self.events.push_back(GoalEvent::Ended {
+        self.events.push_back(GraphGoalEvent::Ended {
             status,
             message: outcome.message.clone(),
             result: result(self.skill.facts(), (outcome.run, &outcome.results)),
@@ -466,7 +481,7 @@ fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 }
 
 /// Goals have no owner: any client may cancel them, as in ROS.
-const OWNER: Owner = Owner::Local("a goal of the space");
+const OWNER: SkillOwner = SkillOwner::Local("a goal of the space");
 /// Largest number of notifications that wait for a goal.
 const MOST_HEARD: usize = 256;
 /// Shortest interval between two feedbacks of progress only: 20 a second.

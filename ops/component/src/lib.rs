@@ -30,5 +30,5 @@ mod verb;
 mod work;
 
 pub use mirrors::{Foreign, ForeignFaults, ForeignSkills};
-pub use port::{ComponentPort, Options, check, made, print};
+pub use port::{ComponentOptions, ComponentPort, check, made, print};
 pub use reload::{ComponentFile, Overrides, ReadComponent, Version};

@@ -8,18 +8,18 @@ use std::time::Duration;
 use bridge_node::actions::OwnActions;
 use bridge_node::{Executed, Execution, ExecutionId, PortEvent, Refusal, now};
 use mappings::TopicId;
-use plant_opcua::client::{Client, Link};
-use program::Method;
-use skills::{Facts, Mirrors, Observer, Owner, SkillClient, Watchable};
+use plant_opcua::client::{Link, OpcUaClient};
+use program::ProgramMethod;
+use skills::{Mirrors, SkillClient, SkillDescription, SkillObserver, SkillOwner, Watchable};
 use tokio::sync::mpsc;
 use tokio::task::AbortHandle;
 use tracing::{info, warn};
 
-use crate::executor::Executor;
+use crate::executor::SkillExecutor;
 use crate::fields;
 use crate::goals::{self, Doer, Reporter};
 use crate::port::run_number_of_now;
-use crate::space::{GOAL, MOST_IN_SPACE, Outbox, Place, Speaker};
+use crate::space::{ComponentOutbox, ComponentPlace, GOAL, MOST_IN_SPACE, Speaker};
 
 /// A server with skills that is not a participant of the space.
 #[derive(Clone)]
@@ -37,7 +37,7 @@ pub struct Foreign {
     /// The endpoint, as text for the operator.
     pub endpoint: String,
     /// The session with the server.
-    pub client: Client,
+    pub client: OpcUaClient,
 }
 
 impl Foreign {
@@ -61,7 +61,7 @@ pub type ForeignFaults = BTreeMap<String, String>;
 /// The skills of such servers, for the port of the program that represents them.
 pub struct ForeignSkills {
     servers: HashMap<String, Server>,
-    outbox: Outbox,
+    outbox: ComponentOutbox,
     first: VecDeque<PortEvent>,
     actions: OwnActions,
     heard: mpsc::Receiver<News>,
@@ -84,7 +84,7 @@ struct Server {
 struct Shown {
     /// The full name, as in `press.Grasp`.
     name: String,
-    executor: Executor,
+    executor: SkillExecutor,
     values: Vec<TopicId>,
     calls: Vec<TopicId>,
 }
@@ -112,7 +112,7 @@ impl Default for ForeignSkills {
         let (executes, executed) = mpsc::channel(MOST_EXECUTIONS);
         Self {
             servers: HashMap::new(),
-            outbox: Outbox::default(),
+            outbox: ComponentOutbox::default(),
             first: VecDeque::new(),
             actions: OwnActions::default(),
             heard,
@@ -206,7 +206,7 @@ impl ForeignSkills {
         let Ok(room) = self.executes.clone().try_reserve_owned() else {
             return false;
         };
-        let by = Owner::Local("a call of the space");
+        let by = SkillOwner::Local("a call of the space");
         let Execution {
             id,
             request,
@@ -229,8 +229,8 @@ impl ForeignSkills {
         true
     }
 
-    fn skill(&self, topic: TopicId) -> Option<(Executor, Method)> {
-        let (number, method) = Place::call(topic)?;
+    fn skill(&self, topic: TopicId) -> Option<(SkillExecutor, ProgramMethod)> {
+        let (number, method) = ComponentPlace::call(topic)?;
         let namespace = topic.namespace.get();
         let mut servers = self.servers.values();
         let server = servers.find(|server| server.of.namespace == namespace)?;
@@ -252,7 +252,11 @@ impl ForeignSkills {
                 let method = name
                     .strip_prefix(&*shown.name)
                     .and_then(|rest| rest.strip_prefix('.'));
-                method.is_some_and(|method| Method::ALL.iter().any(|known| known.name() == method))
+                method.is_some_and(|method| {
+                    ProgramMethod::ALL
+                        .iter()
+                        .any(|known| known.name() == method)
+                })
             });
             let Some(same) = same.map(|shown| shown.name.clone()) else {
                 continue;
@@ -314,7 +318,7 @@ impl ForeignSkills {
 fn show(
     server: &mut Server,
     found: &Watchable,
-    outbox: &Outbox,
+    outbox: &ComponentOutbox,
     (actions, first): (&mut OwnActions, &mut VecDeque<PortEvent>),
 ) {
     let of = server.of.clone();
@@ -340,7 +344,7 @@ fn show(
         first.extend(place.announce(named.number, &facts, &methods.unwrap_or_default()));
         let reporter = Reporter::new();
         reporters.push(Some(reporter.clone()));
-        let mut observers: Vec<Box<dyn Observer>> = vec![Box::new(reporter)];
+        let mut observers: Vec<Box<dyn SkillObserver>> = vec![Box::new(reporter)];
         if let Some(speaker) = Speaker::new(outbox.clone(), &place, named.number) {
             speaker.at_first(&facts, None);
             observers.push(Box::new(speaker));
@@ -352,12 +356,16 @@ fn show(
             continue;
         };
         let place = named.place(&of);
-        let executor = Executor::Theirs(mirror.clone());
+        let executor = SkillExecutor::Theirs(mirror.clone());
         let topic = |n| place.topic(named.number, n);
         let mut calls: Vec<TopicId> = (5..10).filter_map(topic).collect();
         let mut values: Vec<TopicId> = (1..5).filter_map(topic).collect();
         // An action needs Halt to cancel goals, and Reset after a run has ended.
-        let runs = [Method::Start, Method::Halt, Method::Reset];
+        let runs = [
+            ProgramMethod::Start,
+            ProgramMethod::Halt,
+            ProgramMethod::Reset,
+        ];
         if let Some(goal) = topic(GOAL)
             && runs.iter().all(|method| mirror.methods().contains(method))
         {
@@ -408,16 +416,16 @@ struct Named {
 }
 
 impl Named {
-    fn place(&self, of: &Foreign) -> Place {
-        Place {
+    fn place(&self, of: &Foreign) -> ComponentPlace {
+        ComponentPlace {
             component: self.component.clone(),
             namespace: of.namespace,
             open: of.open,
         }
     }
 
-    fn facts(&self, facts: &Facts) -> Facts {
-        Facts {
+    fn facts(&self, facts: &SkillDescription) -> SkillDescription {
+        SkillDescription {
             name: self.skill.clone(),
             ..facts.clone()
         }

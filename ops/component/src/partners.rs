@@ -1,12 +1,12 @@
 //! Discovers the components on which skills of this component depend.
 
-use discovery::{Found, Interface, WatchSettings, watch};
+use discovery::{MdnsInterface, ServerChange, WatchSettings, watch};
 use skills::PeerAccess;
 use tokio::task::JoinSet;
 use tracing::warn;
 
 /// Starts to discover other components if a skill needs them, for as long as the tasks are kept.
-pub(crate) fn look(peers: &PeerAccess, mdns: Option<&Interface>) -> JoinSet<()> {
+pub(crate) fn look(peers: &PeerAccess, mdns: Option<&MdnsInterface>) -> JoinSet<()> {
     let mut tasks = JoinSet::new();
     let Some(detector) = peers.detector.clone() else {
         return tasks;
@@ -26,10 +26,10 @@ pub(crate) fn look(peers: &PeerAccess, mdns: Option<&Interface>) -> JoinSet<()> 
         while let Some(found) = watcher.next().await {
             let known = found.known();
             match &found {
-                Found::Gone { .. } => detector.gone(&known.name),
-                Found::Seen(_) | Found::Restarted(_) if known.is_lds() => {}
-                Found::Seen(_) => detector.seen(&known.name, &known.url),
-                Found::Restarted(_) => {
+                ServerChange::Gone { .. } => detector.gone(&known.name),
+                ServerChange::Seen(_) | ServerChange::Restarted(_) if known.is_lds() => {}
+                ServerChange::Seen(_) => detector.seen(&known.name, &known.url),
+                ServerChange::Restarted(_) => {
                     detector.gone(&known.name);
                     detector.seen(&known.name, &known.url);
                 }

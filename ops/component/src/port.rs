@@ -8,20 +8,21 @@ use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use bridge_node::actions::OwnActions;
 use bridge_node::{
-    Answered, Application, AskId, CallDescription, Delivery, Described, Executed, Execution,
-    ExecutionId, Failure, FailureKind, LinkState, Port, PortEvent, TypePaths,
+    Application, AskId, CallDescription, CallResponse, Executed, Execution, ExecutionId, Failure,
+    FailureKind, LinkState, LocalDelivery, Port, PortEvent, TopicMetaData, TypePaths,
 };
 use bytes::Bytes;
-use discovery::{AnnounceSettings, Announced, Interface};
+use discovery::{AnnounceSettings, MdnsInterface, ServerAnnouncement};
 use mappings::{Mapping, PubSub, TopicId};
 use plant_opcua::endpoint::EndpointUrl;
 use plant_opcua::enrolment::{Enrolment, Invitation};
 use plant_opcua::own;
 use plant_opcua::supervision::Supervision;
-use program::{Method, State};
+use program::{ProgramMachineState, ProgramMethod};
 use skills::server::{ComponentServer, PowerOff, ServeFault, ServeSettings};
 use skills::{
-    Component, DriverSetup, LiveValue, Owner, PeerAccess, Security, Skill, Takes, ValueSource,
+    Component, ComponentSecurity, DriverSetup, LiveValue, PeerAccess, Skill, SkillOwner, Takes,
+    ValueSource,
 };
 use tokio::sync::mpsc;
 use tokio::task::{AbortHandle, JoinSet};
@@ -29,25 +30,25 @@ use tracing::{info, warn};
 use uadp::BuiltinType;
 
 use crate::asking::Asking;
-use crate::executor::Executor;
+use crate::executor::SkillExecutor;
 use crate::fields;
 use crate::goals::{self, Doer, Reporter};
 use crate::idle::{Usage, restart_when_idle};
 use crate::partners;
 use crate::reload::{ComponentFile, Version};
-use crate::space::{GOAL, MOST_IN_SPACE, Outbox, Place, Speaker};
+use crate::space::{ComponentOutbox, ComponentPlace, GOAL, MOST_IN_SPACE, Speaker};
 use crate::topics::Topics;
 use crate::work::with_drivers;
 
 /// The options of a component beside its definition.
 #[derive(Debug, Clone, Default)]
-pub struct Options {
+pub struct ComponentOptions {
     /// The certificate store, which Basic256Sha256 needs.
     pub pki: Option<PathBuf>,
     /// Trusts every client certificate. For tests and demonstrations only.
     pub trust_any_client: bool,
     /// The network interface for announcements by mDNS; `None` for no announcements.
-    pub mdns: Option<Interface>,
+    pub mdns: Option<MdnsInterface>,
     /// The announced capability codes of OPC 10000-12, annex D.
     pub capabilities: Vec<String>,
     /// The Global Discovery Server that issues the certificate. Needs `pki`.
@@ -73,8 +74,8 @@ pub fn made(component: &Component) -> Mapping {
 /// A running component.
 pub struct ComponentPort {
     server: ComponentServer,
-    announced: Option<Announced>,
-    outbox: Outbox,
+    announced: Option<ServerAnnouncement>,
+    outbox: ComponentOutbox,
     /// Events that are reported before all others: announcements and refused requests.
     first: VecDeque<PortEvent>,
     executed: mpsc::Receiver<PortEvent>,
@@ -107,13 +108,13 @@ impl ComponentPort {
     /// # Errors
     /// Returns an error if the definition has faults, which are printed before; if the address
     /// cannot be bound; or if the certificates cannot be used.
-    pub fn start(component: &Component, options: &Options) -> Result<Self, Failure> {
-        let place = Place {
+    pub fn start(component: &Component, options: &ComponentOptions) -> Result<Self, Failure> {
+        let place = ComponentPlace {
             component: component.name.clone(),
             namespace: component.namespace,
             open: component.open,
         };
-        let outbox = Outbox::default();
+        let outbox = ComponentOutbox::default();
         let mut first = VecDeque::new();
         let peers = PeerAccess::of_component(component, options.pki.as_deref());
         let mut looks = partners::look(&peers, options.mdns.as_ref());
@@ -133,11 +134,11 @@ impl ComponentPort {
         let server = ComponentServer::build(component, &settings, |number, facts| {
             let reporter = Reporter::new();
             reporters.push(reporter.clone());
-            first.extend(place.announce(number, facts, &Method::ALL));
+            first.extend(place.announce(number, facts, &ProgramMethod::ALL));
             let Some(speaker) = Speaker::new(outbox.clone(), &place, number) else {
                 return vec![Box::new(reporter)];
             };
-            speaker.at_first(facts, Some(State::Halted));
+            speaker.at_first(facts, Some(ProgramMachineState::Halted));
             vec![Box::new(speaker), Box::new(reporter)]
         });
         let server = server.map_err(|fault| failure(fault, options))?;
@@ -146,7 +147,10 @@ impl ComponentPort {
             if let Some(topic) = place.topic(number, GOAL) {
                 let with = (&*place.component, place.open);
                 let action = goals::action(topic, with, skill.facts());
-                let added = actions.add(&action, Doer::new(Executor::Own(skill.clone()), reporter));
+                let added = actions.add(
+                    &action,
+                    Doer::new(SkillExecutor::Own(skill.clone()), reporter),
+                );
                 first.extend(added.unwrap_or_default());
             }
         }
@@ -230,8 +234,8 @@ impl ComponentPort {
         Vec::new()
     }
 
-    fn skill(&self, topic: TopicId) -> Option<(Skill, Method)> {
-        let (number, method) = Place::call(topic)?;
+    fn skill(&self, topic: TopicId) -> Option<(Skill, ProgramMethod)> {
+        let (number, method) = ComponentPlace::call(topic)?;
         let skill = self
             .server
             .skills()
@@ -269,7 +273,7 @@ impl Port for ComponentPort {
     }
 
     /// Takes the values that the component shows. Other values do not count as losses.
-    fn publish(&mut self, sample: Delivery) -> Result<(), &'static str> {
+    fn publish(&mut self, sample: LocalDelivery) -> Result<(), &'static str> {
         self.topics.received(&sample);
         Ok(())
     }
@@ -278,7 +282,7 @@ impl Port for ComponentPort {
         &mut self,
         _topic: TopicId,
         _shape: &[(BuiltinType, bool)],
-        _described: Option<&Described>,
+        _described: Option<&TopicMetaData>,
     ) {
         // Values of others have no type here: they are fields.
     }
@@ -316,7 +320,7 @@ impl Port for ComponentPort {
         self.asking.gone(topic);
     }
 
-    fn answered(&mut self, ask: AskId, _topic: TopicId, answer: Answered<Bytes>) {
+    fn answered(&mut self, ask: AskId, _topic: TopicId, answer: CallResponse<Bytes>) {
         self.asking.answered(ask, answer);
     }
 
@@ -340,11 +344,11 @@ impl Port for ComponentPort {
         };
         let by = execution
             .requestor
-            .map_or(Owner::Local("a tool in the space"), |space| {
-                Owner::Space(space.get().into())
+            .map_or(SkillOwner::Local("a tool in the space"), |space| {
+                SkillOwner::Space(space.get().into())
             });
         let Execution { id, request, .. } = execution;
-        let skill = Executor::Own(skill);
+        let skill = SkillExecutor::Own(skill);
         drop(tokio::spawn(async move {
             let answer = skill.answer(by, method, &request).await;
             let outcome = Executed::Answered(fields::block(&answer));
@@ -412,7 +416,7 @@ impl Port for ComponentPort {
 ///
 /// # Errors
 /// Returns the errors of [`ComponentPort::start`].
-pub fn check(component: &Component, options: &Options) -> Result<(), Failure> {
+pub fn check(component: &Component, options: &ComponentOptions) -> Result<(), Failure> {
     built_and_stopped(component)?.map_err(|fault| failure(fault, options))
 }
 
@@ -421,7 +425,7 @@ pub fn check(component: &Component, options: &Options) -> Result<(), Failure> {
 pub(crate) fn built_and_stopped(component: &Component) -> Result<Result<(), ServeFault>, Failure> {
     let component = Component {
         endpoint: "opc.tcp://127.0.0.1:0".to_owned(),
-        security: vec![Security::None],
+        security: vec![ComponentSecurity::None],
         ..with_drivers(component, &mut Asking::new(), &mut Topics::default())
     };
     let runtime = tokio::runtime::Builder::new_current_thread()
@@ -497,7 +501,7 @@ pub(crate) fn run_number_of_now() -> u32 {
     u32::try_from(number % (1 << 32)).unwrap_or_default()
 }
 
-fn failure(fault: ServeFault, options: &Options) -> Failure {
+fn failure(fault: ServeFault, options: &ComponentOptions) -> Failure {
     match fault {
         ServeFault::Findings(findings) => {
             let (text, file) = options.source.clone().unwrap_or_default();
@@ -532,8 +536,12 @@ pub fn print(text: &str) {
 }
 
 /// Returns the description of the component for discovery.
-fn told_of(component: &Component, url: &str, options: &Options) -> discovery::Server {
-    discovery::Server {
+fn told_of(
+    component: &Component,
+    url: &str,
+    options: &ComponentOptions,
+) -> discovery::ServerDescription {
+    discovery::ServerDescription {
         application_uri: component.application_uri.clone(),
         product_uri: "urn:ua-bridge:plant".to_owned(),
         name: component.name.clone(),
@@ -544,7 +552,7 @@ fn told_of(component: &Component, url: &str, options: &Options) -> discovery::Se
 }
 
 /// Returns the announcements of the values.
-fn announced_values(server: &ComponentServer, place: &Place) -> Vec<PortEvent> {
+fn announced_values(server: &ComponentServer, place: &ComponentPlace) -> Vec<PortEvent> {
     let values = (1..).zip(server.values());
     let announced = values.flat_map(|(number, value)| place.announce_value(number, value.facts()));
     announced.collect()
@@ -554,7 +562,7 @@ fn announced_values(server: &ComponentServer, place: &Place) -> Vec<PortEvent> {
 fn show_values(
     component: &Component,
     server: &ComponentServer,
-    (place, outbox): (&Place, &Outbox),
+    (place, outbox): (&ComponentPlace, &ComponentOutbox),
     tasks: &mut JoinSet<()>,
 ) -> Vec<LiveValue> {
     for (number, value) in (1..).zip(server.values()) {
@@ -598,8 +606,8 @@ fn log_served(component: &Component, server: &ComponentServer) {
 /// Renews the certificate of the component at the Global Discovery Server.
 fn enrol(
     tasks: &mut JoinSet<()>,
-    (component, announced): (&Component, &discovery::Server),
-    options: &Options,
+    (component, announced): (&Component, &discovery::ServerDescription),
+    options: &ComponentOptions,
     server: &ComponentServer,
 ) {
     let (Some(root), Some(gds)) = (&options.pki, &options.gds) else {
@@ -622,10 +630,15 @@ fn enrol(
 }
 
 /// Returns the description of the component for the group.
-fn application(server: &discovery::Server, security: &[Security]) -> Application {
+fn application(
+    server: &discovery::ServerDescription,
+    security: &[ComponentSecurity],
+) -> Application {
     let ways = security.iter().flat_map(|security| match security {
-        Security::None => plant_opcua::server::Security::None.ways(),
-        Security::Basic256Sha256 => plant_opcua::server::Security::Basic256Sha256.ways(),
+        ComponentSecurity::None => plant_opcua::server::ServerSecurity::None.ways(),
+        ComponentSecurity::Basic256Sha256 => {
+            plant_opcua::server::ServerSecurity::Basic256Sha256.ways()
+        }
     });
     Application {
         uri: server.application_uri.clone(),
@@ -639,11 +652,11 @@ fn application(server: &discovery::Server, security: &[Security]) -> Application
 }
 
 fn announce(
-    server: discovery::Server,
+    server: discovery::ServerDescription,
     component: &Component,
-    options: &Options,
+    options: &ComponentOptions,
     supervision: Supervision,
-) -> Option<Announced> {
+) -> Option<ServerAnnouncement> {
     let lds = component.lds.option(discovery::DEFAULT_LDS);
     if lds.is_none() && options.mdns.is_none() {
         return None;

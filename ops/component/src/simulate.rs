@@ -5,7 +5,7 @@ use std::process::ExitCode;
 use std::sync::Arc;
 use std::time::Duration;
 
-use devices::{Faults, Line, Registers, Serving, kelvin, robotiq, schmalz, ur};
+use devices::{LineFaults, ModbusLine, Registers, ServedDevice, kelvin, robotiq, schmalz, ur};
 use skills::simulated::Hole;
 use tokio::process::{Child, Command};
 use tokio::signal::unix::{SignalKind, signal};
@@ -32,7 +32,7 @@ enum Device {
     Robotiq {
         /// tcp://host:port, rtu+tcp://host:port, or serial:PATH, which is made a link to a new pseudo-terminal
         #[arg(long, value_name = "LINE", default_value = "tcp://127.0.0.1:1502")]
-        listen: Line,
+        listen: ModbusLine,
         /// The number of the unit
         #[arg(long, default_value_t = robotiq::UNIT)]
         unit: u8,
@@ -80,7 +80,7 @@ enum Device {
     Changer {
         /// tcp://host:port, rtu+tcp://host:port, or serial:PATH
         #[arg(long, value_name = "LINE", default_value = "tcp://127.0.0.1:1503")]
-        listen: Line,
+        listen: ModbusLine,
         /// The number of the unit
         #[arg(long, default_value_t = 1)]
         unit: u8,
@@ -151,16 +151,16 @@ fn empty_dock(text: &str) -> Result<kelvin::simulator::Docked, &'static str> {
 }
 
 /// Switches the programs of tools: each runs while its tool is locked.
-async fn supply(changer: kelvin::simulator::Simulator, tools: Vec<Powered>, boot: Duration) {
+async fn supply(changer: kelvin::simulator::KelvinSimulator, tools: Vec<Powered>, boot: Duration) {
     let mut running: Option<(u8, Child)> = None;
     let mut locked: Option<(u8, Instant)> = None;
     loop {
         tokio::time::sleep(SUPPLY_LOOK).await;
         let now = match changer.reading() {
-            kelvin::Reading::Tool(number) => Some(number),
+            kelvin::ChangerReading::Tool(number) => Some(number),
             // The contacts are still closed while the ring turns.
-            kelvin::Reading::Intermediate => locked.map(|(number, _)| number),
-            kelvin::Reading::Ready | kelvin::Reading::NoTool => None,
+            kelvin::ChangerReading::Intermediate => locked.map(|(number, _)| number),
+            kelvin::ChangerReading::Ready | kelvin::ChangerReading::NoTool => None,
         };
         if locked.map(|(number, _)| number) != now {
             locked = now.map(|number| (number, Instant::now()));
@@ -251,11 +251,11 @@ async fn simulated(device: Device) -> io::Result<()> {
             object,
             pace,
         } => {
-            let settings = robotiq::simulator::Settings {
+            let settings = robotiq::simulator::RobotiqSettings {
                 object: (object > 0.0).then_some(object),
                 time_scale: pace.speed,
             };
-            let simulator = robotiq::simulator::Simulator::new(settings);
+            let simulator = robotiq::simulator::RobotiqSimulator::new(settings);
             Box::new(modbus("robotiq-2f85", &listen, unit, Arc::new(simulator)).await?)
         }
         Device::Schmalz {
@@ -264,13 +264,13 @@ async fn simulated(device: Device) -> io::Result<()> {
             no_part,
             pace,
         } => {
-            let settings = schmalz::simulator::Settings {
+            let settings = schmalz::simulator::SchmalzSettings {
                 alias,
                 part: !no_part,
                 time_scale: pace.speed,
             };
-            let simulator = schmalz::simulator::Simulator::new(settings);
-            let serving = schmalz::simulator::Serving::start(&simulator, &listen).await?;
+            let simulator = schmalz::simulator::SchmalzSimulator::new(settings);
+            let serving = schmalz::simulator::ServedMaster::start(&simulator, &listen).await?;
             told(&format!("schmalz-ecbpi at http://{}", serving.address()))?;
             Box::new(serving)
         }
@@ -281,14 +281,14 @@ async fn simulated(device: Device) -> io::Result<()> {
             hole,
             pace,
         } => {
-            let settings = ur::simulator::Settings {
+            let settings = ur::simulator::UrSimulatorSettings {
                 time_scale: pace.speed,
                 surface,
                 hole,
-                ..ur::simulator::Settings::default()
+                ..ur::simulator::UrSimulatorSettings::default()
             };
-            let simulator = ur::simulator::Simulator::new(settings);
-            let serving = ur::simulator::Serving::start(&simulator, &rtde, &secondary).await?;
+            let simulator = ur::simulator::UrSimulator::new(settings);
+            let serving = ur::simulator::ServedRobot::start(&simulator, &rtde, &secondary).await?;
             let (rtde, secondary) = (serving.rtde(), serving.secondary());
             let at = format!("universal-robot at rtde {rtde}, secondary {secondary}");
             told(&at)?;
@@ -304,7 +304,7 @@ async fn simulated(device: Device) -> io::Result<()> {
             boot_delay,
         } => {
             let docks = tools.into_iter().chain(docks).collect();
-            let simulator = kelvin::simulator::Simulator::new(docks);
+            let simulator = kelvin::simulator::KelvinSimulator::new(docks);
             let boot = Duration::from_secs_f64(boot_delay);
             let mut supplying = JoinSet::new();
             supplying.spawn(supply(simulator.clone(), powered, boot));
@@ -322,11 +322,11 @@ async fn simulated(device: Device) -> io::Result<()> {
 
 async fn modbus(
     name: &str,
-    listen: &Line,
+    listen: &ModbusLine,
     unit: u8,
     registers: Arc<dyn Registers>,
-) -> io::Result<Serving> {
-    let serving = Serving::start(listen, unit, registers, Faults::default()).await?;
+) -> io::Result<ServedDevice> {
+    let serving = ServedDevice::start(listen, unit, registers, LineFaults::default()).await?;
     told(&format!("{name} at {} unit {unit}", serving.line()))?;
     Ok(serving)
 }

@@ -6,16 +6,16 @@ use std::num::NonZeroU16;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
-use bridge_core::{CallDescription, CallField, CallRole, FieldNote, Offered, ValueDescription};
+use bridge_core::{CallDescription, CallField, CallRole, FieldNote, OfferedCall, ValueDescription};
 use bridge_node::{PortEvent, Reason, now};
 use bytes::Bytes;
 use mappings::{Overflow, TopicId};
-use messages::{Leaf, Rank, TypeName};
-use program::{Method, State};
+use messages::{ArrayRank, Leaf, TypeName};
+use program::{ProgramMachineState, ProgramMethod};
 use skills::server::value_status;
 use skills::{
-    Builtin, Facts, LiveValue, Observer, Outcome, Parameter, Parameters, Shown, Told, Transitioned,
-    Value, ValueFacts,
+    Builtin, LiveValue, Parameters, RunOutcome, SkillDescription, SkillEvent, SkillObserver,
+    SkillParameter, SkillSnapshot, SkillValue, Transitioned, ValueFacts,
 };
 use tokio::sync::Notify;
 use tokio::time::Instant;
@@ -29,12 +29,12 @@ pub(crate) const EVENTS: u16 = 2;
 pub(crate) const PARAMETERS: u16 = 3;
 pub(crate) const RESULT: u16 = 4;
 /// The methods of a skill, by their identifiers.
-pub(crate) const CALLS: [(u16, Method); 5] = [
-    (5, Method::Start),
-    (6, Method::Halt),
-    (7, Method::Suspend),
-    (8, Method::Resume),
-    (9, Method::Reset),
+pub(crate) const CALLS: [(u16, ProgramMethod); 5] = [
+    (5, ProgramMethod::Start),
+    (6, ProgramMethod::Halt),
+    (7, ProgramMethod::Suspend),
+    (8, ProgramMethod::Resume),
+    (9, ProgramMethod::Reset),
 ];
 
 /// The goals of a skill as an action. The next four identifiers are its cancel, result, feedback
@@ -43,7 +43,7 @@ pub(crate) const GOAL: u16 = 10;
 
 /// The location of a component in the space.
 #[derive(Debug, Clone)]
-pub(crate) struct Place {
+pub(crate) struct ComponentPlace {
     /// The name of the component in the space.
     pub(crate) component: String,
     /// The namespace number of the component.
@@ -52,7 +52,7 @@ pub(crate) struct Place {
     pub(crate) open: bool,
 }
 
-impl Place {
+impl ComponentPlace {
     /// Returns the topic of a value or call of skill `number`. Returns `None` for namespace 0.
     pub(crate) fn topic(&self, number: u16, n: u16) -> Option<TopicId> {
         TopicId::new(
@@ -63,7 +63,7 @@ impl Place {
     }
 
     /// Returns the skill and the method of a topic.
-    pub(crate) fn call(topic: TopicId) -> Option<(u16, Method)> {
+    pub(crate) fn call(topic: TopicId) -> Option<(u16, ProgramMethod)> {
         let identifier = topic.identifier.get();
         let (number, n) = (identifier / PER_SKILL, identifier % PER_SKILL);
         let (_, method) = CALLS.into_iter().find(|(known, _)| *known == n)?;
@@ -74,8 +74,8 @@ impl Place {
     pub(crate) fn announce(
         &self,
         number: u16,
-        facts: &Facts,
-        methods: &[Method],
+        facts: &SkillDescription,
+        methods: &[ProgramMethod],
     ) -> Vec<PortEvent> {
         let mut events = Vec::new();
         for (n, description) in self.values(facts) {
@@ -92,7 +92,7 @@ impl Place {
                 let open = self.open;
                 events.push(PortEvent::Offer {
                     topic,
-                    offered: Offered { description, open },
+                    offered: OfferedCall { description, open },
                 });
             }
         }
@@ -129,7 +129,7 @@ impl Place {
         ]
     }
 
-    fn values(&self, facts: &Facts) -> [(u16, ValueDescription); 4] {
+    fn values(&self, facts: &SkillDescription) -> [(u16, ValueDescription); 4] {
         let name = |what: &str| format!("{}.{}.{what}", self.component, facts.name);
         let own_type = facts.types.first();
         let of_type = own_type
@@ -145,16 +145,16 @@ impl Place {
             }
         };
         let (text, texts) = (
-            (BuiltinType::String, Rank::Scalar),
-            (BuiltinType::String, Rank::Array { fixed: None }),
+            (BuiltinType::String, ArrayRank::Scalar),
+            (BuiltinType::String, ArrayRank::Array { fixed: None }),
         );
-        let run = ("run", (BuiltinType::UInt32, Rank::Scalar));
-        let byte = (BuiltinType::Byte, Rank::Scalar);
+        let run = ("run", (BuiltinType::UInt32, ArrayRank::Scalar));
+        let byte = (BuiltinType::Byte, ArrayRank::Scalar);
         let state = leaves([
             ("state", text),
             ("number", byte),
             ("last_transition", text),
-            ("progress", (BuiltinType::Float, Rank::Scalar)),
+            ("progress", (BuiltinType::Float, ArrayRank::Scalar)),
             ("step", text),
             run,
         ]);
@@ -169,7 +169,7 @@ impl Place {
         let parameters = leaves([run, ("names", texts), ("values", texts)]);
         let result = leaves([
             run,
-            ("succeeded", (BuiltinType::Boolean, Rank::Scalar)),
+            ("succeeded", (BuiltinType::Boolean, ArrayRank::Scalar)),
             ("message", text),
             ("names", texts),
             ("values", texts),
@@ -207,9 +207,9 @@ impl Place {
         ]
     }
 
-    fn method(&self, facts: &Facts, method: Method) -> CallDescription {
+    fn method(&self, facts: &SkillDescription, method: ProgramMethod) -> CallDescription {
         let request = match method {
-            Method::Start => facts
+            ProgramMethod::Start => facts
                 .parameters
                 .iter()
                 .map(|parameter| {
@@ -228,7 +228,10 @@ impl Place {
                     }
                 })
                 .collect(),
-            Method::Suspend | Method::Resume | Method::Halt | Method::Reset => Vec::new(),
+            ProgramMethod::Suspend
+            | ProgramMethod::Resume
+            | ProgramMethod::Halt
+            | ProgramMethod::Reset => Vec::new(),
         };
         CallDescription {
             name: format!("{}.{}.{method}", self.component, facts.name),
@@ -284,7 +287,7 @@ fn about_value(facts: &ValueFacts) -> String {
 }
 
 /// Returns the meaning of a parameter for users.
-fn note(parameter: &Parameter) -> FieldNote {
+fn note(parameter: &SkillParameter) -> FieldNote {
     let default = parameter.default.as_ref().map(ToString::to_string);
     FieldNote {
         unit: parameter.unit.clone().unwrap_or_default(),
@@ -294,8 +297,8 @@ fn note(parameter: &Parameter) -> FieldNote {
     }
 }
 
-fn leaves<const N: usize>(fields: [(&str, (BuiltinType, Rank)); N]) -> Vec<Leaf> {
-    let leaf = |(name, (builtin, rank)): (&str, (BuiltinType, Rank))| Leaf {
+fn leaves<const N: usize>(fields: [(&str, (BuiltinType, ArrayRank)); N]) -> Vec<Leaf> {
+    let leaf = |(name, (builtin, rank)): (&str, (BuiltinType, ArrayRank))| Leaf {
         path: name.to_owned(),
         builtin,
         rank,
@@ -306,7 +309,7 @@ fn leaves<const N: usize>(fields: [(&str, (BuiltinType, Rank)); N]) -> Vec<Leaf>
 /// Values to be sent to the space, in the order of their creation. The queue is bounded: if it is
 /// full, the oldest value is dropped and counted.
 #[derive(Debug, Clone, Default)]
-pub(crate) struct Outbox {
+pub(crate) struct ComponentOutbox {
     inner: Arc<Mutex<Waiting>>,
     more: Arc<Notify>,
 }
@@ -328,7 +331,7 @@ struct Sample {
     status: u16,
 }
 
-impl Outbox {
+impl ComponentOutbox {
     /// Waits for the next value, or for the loss of values before it.
     pub(crate) async fn next(&self) -> PortEvent {
         loop {
@@ -396,7 +399,7 @@ impl Outbox {
         }
     }
 
-    fn put(&self, topic: TopicId, values: &[Value], passing: bool) {
+    fn put(&self, topic: TopicId, values: &[SkillValue], passing: bool) {
         self.push(Sample {
             topic,
             payload: Bytes::from(fields::block(values)),
@@ -443,7 +446,7 @@ impl Outbox {
 /// Puts the changes of a skill into the outbox.
 #[derive(Debug)]
 pub(crate) struct Speaker {
-    outbox: Outbox,
+    outbox: ComponentOutbox,
     topics: [TopicId; 4],
     /// Time of the last report of progress only.
     progressed: Mutex<Option<Instant>>,
@@ -452,7 +455,11 @@ pub(crate) struct Speaker {
 impl Speaker {
     /// Creates the speaker of skill `number`. Returns `None` if the skill has no identifiers in the
     /// space.
-    pub(crate) fn new(outbox: Outbox, place: &Place, number: u16) -> Option<Self> {
+    pub(crate) fn new(
+        outbox: ComponentOutbox,
+        place: &ComponentPlace,
+        number: u16,
+    ) -> Option<Self> {
         let topic = |n| place.topic(number, n);
         let topics = [
             topic(STATE)?,
@@ -468,13 +475,13 @@ impl Speaker {
     }
 
     /// Publishes the values before the first run, and the state if it is known.
-    pub(crate) fn at_first(&self, facts: &Facts, state: Option<State>) {
+    pub(crate) fn at_first(&self, facts: &SkillDescription, state: Option<ProgramMachineState>) {
         let defaults = facts
             .parameters
             .iter()
             .filter_map(|of| Some((of.name.clone(), of.default.clone()?)));
         self.parameters(0, &defaults.collect::<Vec<_>>());
-        self.result(&Outcome {
+        self.result(&RunOutcome {
             run: 0,
             succeeded: false,
             unknown: false,
@@ -489,24 +496,24 @@ impl Speaker {
         }
     }
 
-    fn state(&self, shown: &Shown, passing: bool) {
+    fn state(&self, shown: &SkillSnapshot, passing: bool) {
         let [state, ..] = self.topics;
         let last = shown.last.map_or("", |last| last.name);
         let values = state_of(shown.state, last, (shown.progress, &shown.step, shown.run));
         self.outbox.put(state, &values, passing);
     }
 
-    fn parameters(&self, run: u32, of: &[(String, Value)]) {
+    fn parameters(&self, run: u32, of: &[(String, SkillValue)]) {
         let [_, _, parameters, _] = self.topics;
         let [names, values] = named(of);
         self.outbox
             .put(parameters, &[run.into(), names, values], false);
     }
 
-    fn result(&self, outcome: &Outcome) {
+    fn result(&self, outcome: &RunOutcome) {
         let [.., result] = self.topics;
         let [names, values] = named(&outcome.results);
-        let Outcome {
+        let RunOutcome {
             run,
             succeeded,
             message,
@@ -532,7 +539,7 @@ impl Speaker {
         } = happened;
         let values = [
             transition.name.into(),
-            Value::Byte(u8::try_from(transition.number).unwrap_or_default()),
+            SkillValue::Byte(u8::try_from(transition.number).unwrap_or_default()),
             transition.from.name().into(),
             transition.to.name().into(),
             (*run).into(),
@@ -542,16 +549,18 @@ impl Speaker {
     }
 }
 
-impl Observer for Speaker {
-    fn told(&self, what: Told<'_>, shown: &Shown) {
+impl SkillObserver for Speaker {
+    fn told(&self, what: SkillEvent<'_>, shown: &SkillSnapshot) {
         match what {
-            Told::Parameters(parameters) => self.parameters(shown.run, Parameters::all(parameters)),
-            Told::Transition(happened) => {
+            SkillEvent::Parameters(parameters) => {
+                self.parameters(shown.run, Parameters::all(parameters))
+            }
+            SkillEvent::Transition(happened) => {
                 self.event(happened);
                 self.state(shown, false);
             }
-            Told::Step | Told::Pending(_) => self.state(shown, false),
-            Told::Progress => {
+            SkillEvent::Step | SkillEvent::Pending(_) => self.state(shown, false),
+            SkillEvent::Progress => {
                 let mut progressed = self
                     .progressed
                     .lock()
@@ -562,16 +571,20 @@ impl Observer for Speaker {
                     self.state(shown, true);
                 }
             }
-            Told::Outcome(outcome) => self.result(outcome),
-            Told::Called => {}
+            SkillEvent::Outcome(outcome) => self.result(outcome),
+            SkillEvent::Called => {}
         }
     }
 }
 
-fn state_of(state: State, last: &str, (progress, step, run): (f32, &str, u32)) -> [Value; 6] {
+fn state_of(
+    state: ProgramMachineState,
+    last: &str,
+    (progress, step, run): (f32, &str, u32),
+) -> [SkillValue; 6] {
     [
         state.name().into(),
-        Value::Byte(u8::try_from(state.number()).unwrap_or_default()),
+        SkillValue::Byte(u8::try_from(state.number()).unwrap_or_default()),
         last.into(),
         progress.into(),
         step.into(),
@@ -580,18 +593,18 @@ fn state_of(state: State, last: &str, (progress, step, run): (f32, &str, u32)) -
 }
 
 /// Returns the names and the values, each value as JSON.
-fn named(of: &[(String, Value)]) -> [Value; 2] {
+fn named(of: &[(String, SkillValue)]) -> [SkillValue; 2] {
     let names = of
         .iter()
-        .map(|(name, _)| Value::from(name.as_str()))
+        .map(|(name, _)| SkillValue::from(name.as_str()))
         .collect();
     let values = of
         .iter()
-        .map(|(_, value)| Value::String(value.to_string()))
+        .map(|(_, value)| SkillValue::String(value.to_string()))
         .collect();
     [
-        Value::Array(Builtin::String, names),
-        Value::Array(Builtin::String, values),
+        SkillValue::Array(Builtin::String, names),
+        SkillValue::Array(Builtin::String, values),
     ]
 }
 

@@ -5,15 +5,15 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use async_trait::async_trait;
-use bridge_node::Delivery;
+use bridge_node::LocalDelivery;
 use mappings::TopicId;
-use skills::{Component, Measured, Sensor, Value, ValueSource};
+use skills::{Component, Measured, SkillValue, ValueSensor, ValueSource};
 use tokio::sync::watch;
 
 use crate::fields;
 
 /// The fields of the newest message of a topic, or the reason why they are unknown.
-type Fields = Result<Arc<Vec<Option<Value>>>, String>;
+type Fields = Result<Arc<Vec<Option<SkillValue>>>, String>;
 
 /// The topics that sensors of the component need.
 #[derive(Debug, Default)]
@@ -43,7 +43,7 @@ impl Topics {
     }
 
     /// Takes a message of another participant.
-    pub(crate) fn received(&self, sample: &Delivery) {
+    pub(crate) fn received(&self, sample: &LocalDelivery) {
         let Some(fields) = self.0.get(&sample.topic) else {
             return;
         };
@@ -74,7 +74,7 @@ struct TopicSensor {
 }
 
 #[async_trait]
-impl Sensor for TopicSensor {
+impl ValueSensor for TopicSensor {
     async fn measure(&self, _period: Duration, out: &Measured) -> String {
         let mut fields = self.fields.clone();
         loop {
@@ -97,7 +97,7 @@ impl Sensor for TopicSensor {
 }
 
 impl TopicSensor {
-    fn value(&self, fields: &[Option<Value>]) -> Result<Value, String> {
+    fn value(&self, fields: &[Option<SkillValue>]) -> Result<SkillValue, String> {
         match fields.get(self.field) {
             Some(Some(value)) => Ok(value.clone()),
             Some(None) => Err(format!("field {} of {} is null", self.field, self.topic)),
@@ -118,7 +118,7 @@ const BAD: u16 = 0x8000;
 mod tests {
     use std::path::Path;
 
-    use bridge_node::Kept;
+    use bridge_node::ValueRelation;
     use bytes::Bytes;
     use skills::server::{ComponentServer, ServeSettings};
 
@@ -134,13 +134,13 @@ mod tests {
         let served = ComponentServer::build(&component, &settings, |_, _| Vec::new()).unwrap();
         let mut readings = served.values()[0].watch();
         let topic: TopicId = "ua_1_2_5".parse().unwrap();
-        let sample = |fields: &[Value], status| Delivery {
+        let sample = |fields: &[SkillValue], status| LocalDelivery {
             topic,
             payload: Bytes::from(fields::block(fields)),
             source: None,
             status,
             instance: None,
-            kept: Kept::Alone,
+            kept: ValueRelation::Alone,
             lasting: true,
         };
         let mut until = async |wanted: Result<f64, &str>| {

@@ -12,13 +12,13 @@ use bytes::Bytes;
 use mappings::TopicId;
 use serde_json::Value as Json;
 use skills::{
-    Asked, Builtin, Component, Driver, DriverError, DriverSetup, Parameters, Results, Shape,
-    SpaceWork, Stopped, Value, Work,
+    Builtin, Component, Driver, DriverError, DriverSetup, Parameters, RequestKind, RunResults,
+    SkillValue, SpaceWork, Stopped, ValueShape, Work,
 };
 use tokio::time::sleep;
 use uadp::Fields;
 
-use crate::asking::{Asking, Asks};
+use crate::asking::{Asking, RequestSender};
 use crate::definition::field_name;
 use crate::encoding::{NULL, block, bytes, encoded, no_time, nothing};
 use crate::fields;
@@ -52,7 +52,7 @@ pub(crate) fn with_drivers(
 struct SpaceDriver {
     work: SpaceWork,
     topic: TopicId,
-    asks: Asks,
+    asks: RequestSender,
 }
 
 #[async_trait]
@@ -61,10 +61,10 @@ impl Driver for SpaceDriver {
         Some(self.work.halt_timeout)
     }
 
-    async fn run(&self, work: Work) -> Result<Results, DriverError> {
+    async fn run(&self, work: Work) -> Result<RunResults, DriverError> {
         let ended = match self.work.asked {
-            Asked::Call => self.call(&work).await,
-            Asked::Action => self.act(&work).await,
+            RequestKind::Call => self.call(&work).await,
+            RequestKind::Action => self.act(&work).await,
         };
         ended.map_err(DriverError::reported)
     }
@@ -79,7 +79,7 @@ enum NotSent {
 }
 
 impl SpaceDriver {
-    async fn call(&self, work: &Work) -> Result<Results, String> {
+    async fn call(&self, work: &Work) -> Result<RunResults, String> {
         let call = tokio::select! {
             () = work.stopped() => return Err(Stopped.to_string()),
             call = self.asks.known(self.topic, self.work.within) => call?,
@@ -107,7 +107,7 @@ impl SpaceDriver {
         self.outcome(&answer, "", work.parameters())
     }
 
-    async fn act(&self, work: &Work) -> Result<Results, String> {
+    async fn act(&self, work: &Work) -> Result<RunResults, String> {
         let id = new_id();
         let sending = OnceLock::new();
         let sent = tokio::select! {
@@ -160,7 +160,7 @@ impl SpaceDriver {
         work: &Work,
         action: &Action,
         (id, why): ([u8; 16], &str),
-    ) -> Result<Results, String> {
+    ) -> Result<RunResults, String> {
         work.pending(format!(
             "cancellation pending: the goal at {} has not ended",
             self.topic
@@ -371,7 +371,7 @@ impl SpaceDriver {
         answer: &Answer,
         prefix: &str,
         parameters: &Parameters,
-    ) -> Result<Results, String> {
+    ) -> Result<RunResults, String> {
         let of = |name: &str| field(answer, &format!("{prefix}{name}")).cloned();
         let message = of("message").and_then(|message| message.as_str().map(str::to_owned));
         let no = |name: &str, value: &Json| match &message {
@@ -502,8 +502,8 @@ fn is(value: &Json, wanted: &str) -> bool {
 
 /// Converts a value of an answer into the widest type of its kind. The type of the skill narrows
 /// it.
-fn plain(value: &Json) -> Option<Value> {
-    let of = |builtin| Shape::scalar(builtin).read_json(value).ok();
+fn plain(value: &Json) -> Option<SkillValue> {
+    let of = |builtin| ValueShape::scalar(builtin).read_json(value).ok();
     match value {
         Json::Bool(_) => of(Builtin::Boolean),
         Json::String(_) => of(Builtin::String),
@@ -515,7 +515,7 @@ fn plain(value: &Json) -> Option<Value> {
                 Some(Json::String(_)) => Builtin::String,
                 Some(_) | None => Builtin::Double,
             };
-            Shape::array(builtin).read_json(value).ok()
+            ValueShape::array(builtin).read_json(value).ok()
         }
         Json::Null | Json::Object(_) => None,
     }
@@ -597,7 +597,7 @@ mod tests {
         }
     }
 
-    fn parameters(of: &str, given: Vec<(&str, Value)>) -> Parameters {
+    fn parameters(of: &str, given: Vec<(&str, SkillValue)>) -> Parameters {
         let declared = model::find(of).unwrap().parameters();
         let given = given
             .into_iter()
@@ -606,7 +606,7 @@ mod tests {
     }
 
     /// Returns the fields of an encoded request.
-    fn asked(block: &[u8]) -> Vec<Option<Value>> {
+    fn asked(block: &[u8]) -> Vec<Option<SkillValue>> {
         let fields = Fields::parse(block).unwrap();
         fields
             .map(|field| fields::value(&field.unwrap()).unwrap_or(None))
@@ -637,17 +637,20 @@ mod tests {
         let target = [0.25, 0.5, 0.75, 1.0, 1.25, 1.5];
         let given = parameters(
             "PtpMoveSkillType",
-            vec![("TargetPosition", Value::from(target))],
+            vec![("TargetPosition", SkillValue::from(target))],
         );
         let block = driver.request(&takes, &given, Some([7; 16])).unwrap();
         let fields = asked(&block);
         assert_eq!(fields.len(), takes.len());
-        assert_eq!(fields[1], Some(Value::Int32(1)));
+        assert_eq!(fields[1], Some(SkillValue::Int32(1)));
         for (place, value) in target.iter().enumerate() {
-            assert_eq!(fields[2 + place], Some(Value::Double(*value)));
+            assert_eq!(fields[2 + place], Some(SkillValue::Double(*value)));
         }
         assert_eq!(fields[8], Some("".into()));
-        assert_eq!(fields[11], Some(Value::Array(Builtin::Double, Vec::new())));
+        assert_eq!(
+            fields[11],
+            Some(SkillValue::Array(Builtin::Double, Vec::new()))
+        );
         let wrong = driver
             .request(&takes[..3], &given, Some([7; 16]))
             .unwrap_err();
@@ -668,12 +671,12 @@ mod tests {
         let block = driver.request(&takes, &given, None).unwrap();
         assert_eq!(
             asked(&block),
-            [Some(true.into()), Some(Value::Int16(0)), None]
+            [Some(true.into()), Some(SkillValue::Int16(0)), None]
         );
         let move_to = [scalar("target_position", BuiltinType::Double)];
         let target = parameters(
             "PtpMoveSkillType",
-            vec![("TargetPosition", Value::from([1.0; 6]))],
+            vec![("TargetPosition", SkillValue::from([1.0; 6]))],
         );
         let wrong = driver.request(&move_to, &target, None).unwrap_err();
         assert!(

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use messages::{Dialect, Registry, TypeName};
+use messages::{Dialect, TypeName, TypeRegistry};
 use skills::model::TYPES;
 use ua_component::definition::{PACKAGE, action_name, action_type, definition, field_name};
 
@@ -81,7 +81,7 @@ fn the_actions_that_are_built_in_are_those_of_the_package() {
 #[test]
 fn either_ros_takes_the_definitions_as_they_are_shipped() {
     for dialect in [Dialect::Ros1, Dialect::Ros2] {
-        let mut registry = Registry::bundle(dialect);
+        let mut registry = TypeRegistry::bundle(dialect);
         for (name, text) in definitions() {
             let name: TypeName = format!("test_{PACKAGE}/{name}").parse().unwrap();
             registry.add_action(&name, &text).unwrap();

@@ -6,20 +6,20 @@ use std::collections::VecDeque;
 use opcua::types::NodeId;
 use trust::Fingerprint;
 
-use crate::records::Record;
+use crate::records::GdsRecord;
 use crate::service::OWN;
 
 /// The applicants, oldest first. The oldest are dropped if there are too many; they can register
 /// again.
 #[derive(Debug, Default)]
 pub(crate) struct Applicants {
-    all: VecDeque<(NodeId, Record)>,
+    all: VecDeque<(NodeId, GdsRecord)>,
 }
 
 impl Applicants {
     /// Adds an application and returns its provisional ApplicationId. The id depends on the key, so
     /// that an applicant cannot change the record of another applicant.
-    pub(crate) fn put(&mut self, record: Record, key: Fingerprint) -> NodeId {
+    pub(crate) fn put(&mut self, record: GdsRecord, key: Fingerprint) -> NodeId {
         let of = Fingerprint::of(format!("{key} {}", record.uri).as_bytes());
         let id = NodeId::new(OWN, format!("applicant-{of}"));
         self.all.retain(|(known, _)| *known != id);
@@ -31,7 +31,7 @@ impl Applicants {
     }
 
     /// Returns the application of a provisional ApplicationId.
-    pub(crate) fn get(&self, id: &NodeId) -> Option<&Record> {
+    pub(crate) fn get(&self, id: &NodeId) -> Option<&GdsRecord> {
         let found = self.all.iter().find(|(known, _)| known == id);
         found.map(|(_, record)| record)
     }

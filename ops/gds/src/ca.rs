@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use plant_opcua::own::day;
 use service::{Failure, FailureKind};
-use trust::{Certificate, Request, Serial};
+use trust::{Certificate, CertificateSigningRequest, Serial};
 
 use crate::Folders;
 use crate::serve::of_store;
@@ -150,9 +150,9 @@ pub(crate) fn open(folders: &Folders) -> Result<AuthorityStore, Failure> {
     AuthorityStore::open(&folders.authority()).map_err(|fault| of_store(&fault))
 }
 
-fn read_request(file: &Path) -> Result<Request, Failure> {
+fn read_request(file: &Path) -> Result<CertificateSigningRequest, Failure> {
     let bytes = read(file)?;
-    Request::read(&bytes).map_err(|why| {
+    CertificateSigningRequest::read(&bytes).map_err(|why| {
         let message = format!("{} is not a signing request: {why}", file.display());
         Failure::new(FailureKind::Usage, message)
     })
@@ -173,7 +173,7 @@ fn with_key(
     name: &str,
     hosts: &[String],
     file: Option<&Path>,
-) -> Result<Request, Failure> {
+) -> Result<CertificateSigningRequest, Failure> {
     let usage = |why: String| Failure::new(FailureKind::Usage, why);
     let Some(file) = file else {
         return Err(usage("--key FILE: give the file for the key".to_owned()));
@@ -181,7 +181,7 @@ fn with_key(
     let key = new_key(KEY_BITS).map_err(|fault| of_store(&fault))?;
     let name = if name.is_empty() { uri } else { name };
     let name: String = name.chars().take(LONGEST_NAME).collect();
-    let wanted = Request::make(&key, uri, (&name, ""), hosts);
+    let wanted = CertificateSigningRequest::make(&key, uri, (&name, ""), hosts);
     let wanted =
         wanted.map_err(|why| usage(format!("cannot issue a certificate for {uri:?}: {why}")))?;
     let pem = pem_of(&key).map_err(|fault| of_store(&fault))?;

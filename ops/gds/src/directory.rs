@@ -1,10 +1,10 @@
 //! The register of applications (OPC 10000-12, 6.6).
 
 use opcua::types::{ExtensionObject, NodeId, StatusCode, UAString, Variant};
-use plant_opcua::server::{Caller, MethodRequest};
+use plant_opcua::server::{MethodRequest, SessionCaller};
 use tracing::info;
 
-use crate::records::{Query, Record, check};
+use crate::records::{ApplicationQuery, GdsRecord, check};
 use crate::service::{
     CallerStanding, Gds, MethodResult, id, number, refused, texts, time, unregistered,
 };
@@ -23,7 +23,7 @@ pub(crate) fn find(gds: &Gds, request: &MethodRequest) -> MethodResult {
 
 /// RegisterApplication: returns the ApplicationId.
 pub(crate) fn register(gds: &Gds, request: &MethodRequest) -> MethodResult {
-    let id = gds.register(&request.caller, Record::of(record(request)?, 0))?;
+    let id = gds.register(&request.caller, GdsRecord::of(record(request)?, 0))?;
     Ok(vec![Variant::from(id)])
 }
 
@@ -31,7 +31,7 @@ pub(crate) fn register(gds: &Gds, request: &MethodRequest) -> MethodResult {
 pub(crate) fn update(gds: &Gds, request: &MethodRequest) -> MethodResult {
     let told = record(request)?;
     let known = gds.own(&request.caller, &told.application_id)?;
-    gds.update(&request.caller, Record::of(told, known.number))?;
+    gds.update(&request.caller, GdsRecord::of(told, known.number))?;
     Ok(Vec::new())
 }
 
@@ -43,8 +43,8 @@ impl Gds {
     /// The status for the caller.
     pub(crate) fn register(
         &self,
-        caller: &Caller,
-        mut record: Record,
+        caller: &SessionCaller,
+        mut record: GdsRecord,
     ) -> Result<NodeId, StatusCode> {
         match self.standing(caller, &record.uri)? {
             CallerStanding::Administrator => record.confirm(&record.hosts()),
@@ -67,7 +67,11 @@ impl Gds {
     ///
     /// # Errors
     /// The status for the caller.
-    pub(crate) fn update(&self, caller: &Caller, mut record: Record) -> Result<(), StatusCode> {
+    pub(crate) fn update(
+        &self,
+        caller: &SessionCaller,
+        mut record: GdsRecord,
+    ) -> Result<(), StatusCode> {
         if self.is_administrator(caller) {
             record.confirm(&record.hosts());
         }
@@ -169,13 +173,13 @@ fn looked_for<'q>(
     (after, most, kinds): (u32, u32, u32),
     [name, uri, product_uri]: [&'q UAString; 3],
     capabilities: &'q [String],
-) -> Result<Query<'q>, StatusCode> {
+) -> Result<ApplicationQuery<'q>, StatusCode> {
     // Every client may send queries, and each character of a pattern is compared with each
     // character of a name.
     if name.as_ref().len() > LONGEST_PATTERN {
         return Err(StatusCode::BadInvalidArgument);
     }
-    Ok(Query {
+    Ok(ApplicationQuery {
         after,
         most,
         name: name.as_ref(),
@@ -186,7 +190,7 @@ fn looked_for<'q>(
     })
 }
 
-fn told(record: &Record) -> ExtensionObject {
+fn told(record: &GdsRecord) -> ExtensionObject {
     ExtensionObject::new(record.told(id(record.number)))
 }
 

@@ -5,12 +5,12 @@
 use std::net::IpAddr;
 
 use opcua::types::StatusCode;
-use plant_opcua::server::{Caller, Refusal};
+use plant_opcua::server::{MethodRefusal, SessionCaller};
 use tracing::warn;
 use trust::Certificate;
 
 use crate::manager::unfit;
-use crate::records::{Record, has_host};
+use crate::records::{GdsRecord, has_host};
 use crate::service::{Gds, refused};
 
 /// The outcome for the hosts of a request without an administrator.
@@ -44,10 +44,10 @@ impl Gds {
     /// A host that is in no DiscoveryUrl of the application.
     pub(crate) fn unconfirmed_hosts(
         &self,
-        caller: &Caller,
-        record: &Record,
+        caller: &SessionCaller,
+        record: &GdsRecord,
         hosts: &[String],
-    ) -> Result<Vec<String>, Refusal> {
+    ) -> Result<Vec<String>, MethodRefusal> {
         if self.is_administrator(caller) {
             return Ok(Vec::new());
         }
@@ -66,7 +66,7 @@ impl Gds {
     /// The issued certificates cannot be read.
     pub(crate) fn are_confirmed(
         &self,
-        caller: &Caller,
+        caller: &SessionCaller,
         uri: &str,
         hosts: &[String],
     ) -> Result<bool, StatusCode> {
@@ -80,9 +80,9 @@ impl Gds {
     /// A host that they do not name.
     pub(crate) fn require_registered_hosts(
         &self,
-        record: &Record,
+        record: &GdsRecord,
         hosts: &[String],
-    ) -> Result<(), Refusal> {
+    ) -> Result<(), MethodRefusal> {
         let issued = self.issued_hosts(&record.uri)?;
         match HostCheck::of(hosts, &record.hosts(), &issued) {
             HostCheck::Confirmed | HostCheck::Unconfirmed(_) => Ok(()),
@@ -91,7 +91,7 @@ impl Gds {
     }
 
     /// Logs which hosts of a request wait, and which command approves the request.
-    pub(crate) fn report_unconfirmed(&self, record: &Record, number: u32, hosts: &[String]) {
+    pub(crate) fn report_unconfirmed(&self, record: &GdsRecord, number: u32, hosts: &[String]) {
         if hosts.is_empty() {
             return;
         }
@@ -106,7 +106,11 @@ impl Gds {
 
     /// Returns the hosts that an administrator, the latest certificate from here, or the trusted
     /// certificate of the caller confirms.
-    fn confirmed_hosts(&self, caller: &Caller, uri: &str) -> Result<Vec<String>, StatusCode> {
+    fn confirmed_hosts(
+        &self,
+        caller: &SessionCaller,
+        uri: &str,
+    ) -> Result<Vec<String>, StatusCode> {
         let mut hosts = self.issued_hosts(uri)?;
         // An untrusted certificate of the same key may name any host.
         let shown = Self::proof(caller, uri).filter(|shown| self.is_trusted(shown));
@@ -133,7 +137,7 @@ fn is_loopback(host: &str) -> bool {
     }
 }
 
-fn unregistered(record: &Record, host: &str) -> Refusal {
+fn unregistered(record: &GdsRecord, host: &str) -> MethodRefusal {
     unfit(
         record,
         &format!(
@@ -152,9 +156,9 @@ mod tests {
 
     use log_limit::LogLimit;
     use opcua::sync::Mutex;
-    use plant_opcua::judge::Judge;
-    use plant_opcua::users::{Access, Role, Roles};
-    use trust::{Authority, Issue, Request, Serial};
+    use plant_opcua::judge::CertificateJudge;
+    use plant_opcua::users::{Roles, UserAccess, UserRole};
+    use trust::{CertificateAuthority, CertificateSigningRequest, Issue, Serial};
 
     use super::*;
     use crate::invitations::{self, Invitations, RANDOM};
@@ -184,17 +188,17 @@ mod tests {
             let pki = folder.join("pki");
             fs::create_dir_all(&pki).unwrap();
             let records = Records::open(folder.join("applications.json"), now().as_secs());
-            let administrators = Roles::of(&[Role::SecurityAdmin]);
+            let administrators = Roles::of(&[UserRole::SecurityAdmin]);
             let gds = Gds {
                 store: Mutex::new(store),
                 records: Mutex::new(records.unwrap()),
                 applicants: Mutex::default(),
                 keys: Mutex::default(),
                 folder: folder.clone(),
-                judge: Judge::of(&pki, false),
+                judge: CertificateJudge::of(&pki, false),
                 logged: Mutex::new(LogLimit::every(YEAR)),
                 known: Mutex::default(),
-                access: Arc::new(Access::of_store(None, administrators).unwrap()),
+                access: Arc::new(UserAccess::of_store(None, administrators).unwrap()),
                 pki,
                 life: YEAR,
                 namespace: 2,
@@ -203,13 +207,13 @@ mod tests {
             Self { folder, gds, key }
         }
 
-        fn request(&self, hosts: &[&str]) -> Request {
+        fn request(&self, hosts: &[&str]) -> CertificateSigningRequest {
             let hosts: Vec<String> = hosts.iter().map(|host| (*host).to_owned()).collect();
-            Request::make(&self.key, URI, ("Robot", ""), &hosts).unwrap()
+            CertificateSigningRequest::make(&self.key, URI, ("Robot", ""), &hosts).unwrap()
         }
 
         /// The application, with a certificate that the authority issued for these hosts.
-        fn robot(&self, hosts: &[&str]) -> Caller {
+        fn robot(&self, hosts: &[&str]) -> SessionCaller {
             let store = self.gds.store.lock();
             let issued = store.issue(&self.request(hosts), now(), YEAR).unwrap();
             drop(store);
@@ -223,25 +227,26 @@ mod tests {
                 from: now().saturating_sub(YEAR),
                 until: now() + YEAR,
             };
-            let authority = Authority::make(&self.key, ("Laboratory", ""), &issue).unwrap();
+            let authority =
+                CertificateAuthority::make(&self.key, ("Laboratory", ""), &issue).unwrap();
             authority.issue(&self.request(hosts), &issue).unwrap()
         }
 
         /// Requests a certificate, and returns the number of the request.
-        fn ask(&self, caller: &Caller, hosts: &[&str]) -> Result<u32, Refusal> {
+        fn ask(&self, caller: &SessionCaller, hosts: &[&str]) -> Result<u32, MethodRefusal> {
             let (record, standing) = self.registered(caller);
             let asked = (&record, standing);
             self.gds.ask(caller, asked, self.request(hosts))
         }
 
         /// Fetches the certificate of a request, and returns its hosts.
-        fn fetch(&self, caller: &Caller, number: u32) -> Result<Vec<String>, Refusal> {
+        fn fetch(&self, caller: &SessionCaller, number: u32) -> Result<Vec<String>, MethodRefusal> {
             let (record, standing) = self.registered(caller);
             let issued = self.gds.fetch(caller, (&record, standing), number);
             issued.map(|issued| issued.hosts())
         }
 
-        fn registered(&self, caller: &Caller) -> (Record, CallerStanding) {
+        fn registered(&self, caller: &SessionCaller) -> (GdsRecord, CallerStanding) {
             let record = self.gds.records.lock().of_uri(URI).next().cloned();
             (record.unwrap(), self.gds.standing(caller, URI).unwrap())
         }
@@ -263,15 +268,15 @@ mod tests {
     }
 
     /// The application, with that certificate.
-    fn shows(certificate: &Certificate) -> Caller {
-        Caller {
+    fn shows(certificate: &Certificate) -> SessionCaller {
+        SessionCaller {
             certificate: Some(Arc::from(certificate.der())),
             ..caller("robot")
         }
     }
 
-    fn caller(user: &str) -> Caller {
-        Caller {
+    fn caller(user: &str) -> SessionCaller {
+        SessionCaller {
             session: 1,
             user: user.to_owned(),
             application_uri: URI.to_owned(),
@@ -281,9 +286,9 @@ mod tests {
         }
     }
 
-    fn record(number: u32, hosts: &[&str]) -> Record {
+    fn record(number: u32, hosts: &[&str]) -> GdsRecord {
         let url = |host: &&str| format!("opc.tcp://{host}:4840");
-        Record {
+        GdsRecord {
             number,
             uri: URI.to_owned(),
             kind: 0,
@@ -295,7 +300,7 @@ mod tests {
         }
     }
 
-    fn waits() -> Result<Vec<String>, Refusal> {
+    fn waits() -> Result<Vec<String>, MethodRefusal> {
         Err(StatusCode::BadRequestNotComplete.into())
     }
 
@@ -340,7 +345,7 @@ mod tests {
         let request = site.ask(&robot, &both).unwrap();
         assert_eq!(site.fetch(&robot, request).unwrap(), both);
         // A host without DiscoveryUrl is refused.
-        let refused: Result<u32, Refusal> = Err(StatusCode::BadInvalidArgument.into());
+        let refused: Result<u32, MethodRefusal> = Err(StatusCode::BadInvalidArgument.into());
         assert_eq!(site.ask(&robot, &["lab.cell"]), refused);
     }
 
@@ -374,7 +379,12 @@ mod tests {
         let token = token.unwrap();
         let hosts = ["robot.cell".to_owned()];
         let names = ("Robot", "");
-        let wanted = Request::make_with(&site.key, (URI, &hosts), names, Some(token.secret()));
+        let wanted = CertificateSigningRequest::make_with(
+            &site.key,
+            (URI, &hosts),
+            names,
+            Some(token.secret()),
+        );
         let asked = (&applicant, standing);
         let request = gds.ask(&stranger, asked, wanted.unwrap()).unwrap();
         assert_eq!(site.fetch(&stranger, request).unwrap(), hosts);

@@ -25,8 +25,8 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 use std::time::Duration;
 
-use ::service::{Failure, FailureKind, LogArguments, LogFormat, Service, run_service};
-use discovery::Interface;
+use ::service::{Failure, FailureKind, LogArguments, LogFormat, ServiceProgram, run_service};
+use discovery::MdnsInterface;
 use plant_opcua::pki::default_root;
 use plant_opcua::server::EndpointUrl;
 
@@ -110,7 +110,7 @@ pub fn run(arguments: Vec<OsString>) -> ExitCode {
     run_service::<UaGds>(arguments)
 }
 
-impl Service for UaGds {
+impl ServiceProgram for UaGds {
     const QUIET: &'static str = plant_opcua::QUIET;
 
     fn log(&self) -> LogFormat {
@@ -133,7 +133,7 @@ impl Service for UaGds {
             endpoint: self.endpoint,
             life: Duration::from_secs(u64::from(self.days) * 86_400),
             lds: self.lds,
-            interface: self.interface.as_deref().map(Interface::parse),
+            interface: self.interface.as_deref().map(MdnsInterface::parse),
         };
         serve(settings, stop).await
     }

@@ -5,14 +5,17 @@ use std::sync::Arc;
 
 use async_trait::async_trait;
 use opcua::types::{ByteString, Identifier, NodeId, ObjectTypeId, StatusCode, UAString, Variant};
-use plant_opcua::server::{Caller, MethodHandler, MethodRequest, Refusal};
+use plant_opcua::server::{MethodHandler, MethodRefusal, MethodRequest, SessionCaller};
 use tokio::time::Instant;
 use tracing::{info, warn};
-use trust::{Certificate, Fault, Fingerprint, Known, Renewal, Request, Step};
+use trust::{
+    Certificate, CertificateFault, CertificateSigningRequest, Fingerprint, Renewal, RenewalStep,
+    TrustedCertificates,
+};
 
 use crate::invitations::{self, Invitations, Shows};
 use crate::kept;
-use crate::records::Record;
+use crate::records::GdsRecord;
 use crate::requests::{self, NewRequest, RequestState, SigningRequest, SigningRequests};
 use crate::service::{CallerStanding, Gds, MethodResult, OWN, now, number, refused, texts, time};
 use crate::store::{new_key, pem_of};
@@ -32,7 +35,8 @@ pub(crate) fn start_signing(gds: &Gds, request: &MethodRequest) -> MethodResult 
     let (record, standing) = gds.asking(caller, application)?;
     is_ours(gds, group, kind)?;
     let wanted = wanted.value.as_deref().unwrap_or_default();
-    let wanted = Request::read(wanted).map_err(|why| unfit(&record, &why.to_string()))?;
+    let wanted =
+        CertificateSigningRequest::read(wanted).map_err(|why| unfit(&record, &why.to_string()))?;
     if wanted.application_uri() != record.uri {
         return Err(unfit(&record, "it is for another ApplicationUri"));
     }
@@ -73,7 +77,8 @@ impl MethodHandler for StartNewKeyPair {
         let made = tokio::task::spawn_blocking(|| new_key(KEY_BITS)).await;
         let key = made.map_err(|_| StatusCode::BadInternalError)?;
         let key = key.map_err(|fault| refused(&fault))?;
-        let wanted = Request::make(&key, &record.uri, (&name, &organization), &hosts);
+        let wanted =
+            CertificateSigningRequest::make(&key, &record.uri, (&name, &organization), &hosts);
         let wanted = wanted.map_err(|why| unfit(&record, &why.to_string()))?;
         let key = pem_of(&key).map_err(|fault| refused(&fault))?;
         let number = gds.keep_checked(&request.caller, &record, (wanted, &waiting))?;
@@ -179,7 +184,7 @@ pub(crate) fn status(gds: &Gds, request: &MethodRequest) -> MethodResult {
     let issued = issued.map_err(|fault| refused(&fault))?;
     let is_due = issued.first().is_none_or(|latest| {
         let step = Renewal::of(latest).step(now());
-        !matches!(step, Step::Wait { .. })
+        !matches!(step, RenewalStep::Wait { .. })
     });
     Ok(vec![Variant::Boolean(is_due)])
 }
@@ -194,7 +199,7 @@ pub(crate) fn check(gds: &Gds, request: &MethodRequest) -> MethodResult {
     let certificate = certificate(bytes).ok_or(StatusCode::BadCertificateInvalid)?;
     let store = gds.store.lock();
     let list = store.current_list(now());
-    let known = Known {
+    let known = TrustedCertificates {
         trusted: vec![store.certificate().clone()],
         issuers: Vec::new(),
         crls: list.iter().cloned().collect(),
@@ -204,7 +209,9 @@ pub(crate) fn check(gds: &Gds, request: &MethodRequest) -> MethodResult {
     let status = match trust::check(&certificate, &[], &known, now()) {
         Ok(()) => StatusCode::Good,
         // The status of certificates of another authority is unknown.
-        Err(Fault::Incomplete | Fault::Untrusted) => StatusCode::BadCertificateRevocationUnknown,
+        Err(CertificateFault::Incomplete | CertificateFault::Untrusted) => {
+            StatusCode::BadCertificateRevocationUnknown
+        }
         Err(fault) => StatusCode::from(fault.status()),
     };
     let until = list.times().1.unwrap_or_default();
@@ -214,7 +221,11 @@ pub(crate) fn check(gds: &Gds, request: &MethodRequest) -> MethodResult {
 impl Gds {
     /// Returns the application for which a caller requests a certificate: a registered application,
     /// or an applicant for its first certificate.
-    fn asking(&self, caller: &Caller, id: &NodeId) -> Result<(Record, CallerStanding), StatusCode> {
+    fn asking(
+        &self,
+        caller: &SessionCaller,
+        id: &NodeId,
+    ) -> Result<(GdsRecord, CallerStanding), StatusCode> {
         self.is_unread(caller)?;
         let known = number(id).and_then(|number| self.records.lock().get(number).cloned());
         let record = match known {
@@ -238,10 +249,10 @@ impl Gds {
     /// The refusal for the caller.
     pub(crate) fn ask(
         &self,
-        caller: &Caller,
-        (record, standing): (&Record, CallerStanding),
-        wanted: Request,
-    ) -> Result<u32, Refusal> {
+        caller: &SessionCaller,
+        (record, standing): (&GdsRecord, CallerStanding),
+        wanted: CertificateSigningRequest,
+    ) -> Result<u32, MethodRefusal> {
         match standing {
             CallerStanding::Applicant(key) => self.apply(record, wanted, key),
             CallerStanding::Administrator | CallerStanding::Itself | CallerStanding::Stranger => {
@@ -261,10 +272,10 @@ impl Gds {
     /// its hosts wait for an administrator.
     fn keep_checked(
         &self,
-        caller: &Caller,
-        record: &Record,
-        (wanted, waiting): (Request, &[String]),
-    ) -> Result<u32, Refusal> {
+        caller: &SessionCaller,
+        record: &GdsRecord,
+        (wanted, waiting): (CertificateSigningRequest, &[String]),
+    ) -> Result<u32, MethodRefusal> {
         let approved = waiting.is_empty();
         let by = approved.then(|| format!("{} {}", caller.user, caller.application_uri));
         let number = self.keep_request(wanted, (None, by))?;
@@ -278,10 +289,10 @@ impl Gds {
     /// The refusal for the caller.
     pub(crate) fn fetch(
         &self,
-        caller: &Caller,
-        (record, standing): (&Record, CallerStanding),
+        caller: &SessionCaller,
+        (record, standing): (&GdsRecord, CallerStanding),
         number: u32,
-    ) -> Result<Certificate, Refusal> {
+    ) -> Result<Certificate, MethodRefusal> {
         let requests: SigningRequests =
             kept::read(&self.folder.join(requests::FILE)).map_err(|error| unkept(&error))?;
         let asked = requests.get(number, now());
@@ -317,7 +328,12 @@ impl Gds {
 
     /// Handles the request of an application without a trusted certificate. With the token of an
     /// invitation it is approved, otherwise it waits for an administrator.
-    fn apply(&self, record: &Record, wanted: Request, key: Fingerprint) -> Result<u32, Refusal> {
+    fn apply(
+        &self,
+        record: &GdsRecord,
+        wanted: CertificateSigningRequest,
+        key: Fingerprint,
+    ) -> Result<u32, MethodRefusal> {
         if wanted.key_fingerprint() != key {
             return Err(unfit(record, "its key differs from the key of the channel"));
         }
@@ -328,7 +344,12 @@ impl Gds {
     }
 
     /// Stores a request until an administrator decides.
-    fn wait(&self, record: &Record, wanted: Request, key: Fingerprint) -> Result<u32, Refusal> {
+    fn wait(
+        &self,
+        record: &GdsRecord,
+        wanted: CertificateSigningRequest,
+        key: Fingerprint,
+    ) -> Result<u32, MethodRefusal> {
         let number = self.keep_request(wanted, (Some(record.clone()), None))?;
         if let Some(suppressed) = self.another(&format!("waits {number}")) {
             info!(
@@ -342,10 +363,10 @@ impl Gds {
     /// Issues a certificate for the token of an invitation.
     fn redeem(
         &self,
-        record: &Record,
-        wanted: &Request,
+        record: &GdsRecord,
+        wanted: &CertificateSigningRequest,
         (token, key): (&str, Fingerprint),
-    ) -> Result<u32, Refusal> {
+    ) -> Result<u32, MethodRefusal> {
         self.require_registered_hosts(record, wanted.hosts())?;
         let shows = Shows {
             uri: &record.uri,
@@ -376,9 +397,9 @@ impl Gds {
     /// Stores a request in the file and returns its number.
     fn keep_request(
         &self,
-        request: Request,
-        (record, approved): (Option<Record>, Option<String>),
-    ) -> Result<u32, Refusal> {
+        request: CertificateSigningRequest,
+        (record, approved): (Option<GdsRecord>, Option<String>),
+    ) -> Result<u32, MethodRefusal> {
         let wanted = NewRequest {
             request,
             record,
@@ -395,7 +416,7 @@ impl Gds {
     }
 
     /// Issues the certificate of an approved request.
-    fn issue(&self, asked: &SigningRequest, by: &str) -> Result<Certificate, Refusal> {
+    fn issue(&self, asked: &SigningRequest, by: &str) -> Result<Certificate, MethodRefusal> {
         let request = asked.request().ok_or(StatusCode::BadNotFound)?;
         let issued = self.register_and_issue(asked.record.as_ref(), &request, by)?;
         let path = self.folder.join(requests::FILE);
@@ -410,15 +431,15 @@ impl Gds {
     /// its certificate.
     fn register_and_issue(
         &self,
-        record: Option<&Record>,
-        request: &Request,
+        record: Option<&GdsRecord>,
+        request: &CertificateSigningRequest,
         by: &str,
-    ) -> Result<Certificate, Refusal> {
+    ) -> Result<Certificate, MethodRefusal> {
         let uri = request.application_uri();
         let mut records = self.records.lock();
         let known = records.of_uri(uri).next().cloned();
         let number = known.as_ref().map(|one| one.number);
-        let approved = record.map(|record| Record {
+        let approved = record.map(|record| GdsRecord {
             number: number.unwrap_or_default(),
             confirmed: Vec::new(),
             ..record.clone()
@@ -458,7 +479,7 @@ impl Gds {
     ///
     /// # Errors
     /// Returns the status for the caller.
-    pub(crate) fn may_read_list(&self, caller: &Caller) -> Result<(), StatusCode> {
+    pub(crate) fn may_read_list(&self, caller: &SessionCaller) -> Result<(), StatusCode> {
         self.is_unread(caller)?;
         let uri = &caller.application_uri;
         let registered = self.records.lock().of_uri(uri).next().is_some();
@@ -489,7 +510,7 @@ pub(crate) fn kind() -> NodeId {
     ObjectTypeId::RsaSha256ApplicationCertificateType.into()
 }
 
-pub(crate) fn unfit(record: &Record, why: &str) -> Refusal {
+pub(crate) fn unfit(record: &GdsRecord, why: &str) -> MethodRefusal {
     info!(application = ?record.uri, "refused a certificate request: {why}");
     StatusCode::BadInvalidArgument.into()
 }
@@ -519,7 +540,7 @@ fn certificate(bytes: &ByteString) -> Option<Certificate> {
 
 /// Returns the common name and the organization of a subject, as `CN=Robot,O=Plant` or
 /// `CN=Robot/O=Plant`.
-fn parts(subject: &UAString, record: &Record) -> (String, String) {
+fn parts(subject: &UAString, record: &GdsRecord) -> (String, String) {
     let text = subject.as_ref();
     let part = |wanted: &str| {
         let each = text.split([',', '/', ';']);

@@ -14,7 +14,7 @@ use plant_opcua::directory::ApplicationRecord;
 /// An application.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(crate) struct Record {
+pub(crate) struct GdsRecord {
     /// Unique number of the application, which is never reused.
     pub(crate) number: u32,
     pub(crate) uri: String,
@@ -51,7 +51,7 @@ pub(crate) enum RecordFault {
 
 /// A query. Empty fields match every application.
 #[derive(Debug, Clone, Default)]
-pub(crate) struct Query<'q> {
+pub(crate) struct ApplicationQuery<'q> {
     /// Only applications with a larger number match.
     pub(crate) after: u32,
     /// Largest number of results; 0 for the limit of the server.
@@ -67,18 +67,18 @@ pub(crate) struct Query<'q> {
 
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-struct Kept {
+struct StoredRecords {
     /// Start of the numbering, in seconds since 1970.
     since: u64,
     last: u32,
-    records: Vec<Record>,
+    records: Vec<GdsRecord>,
 }
 
 /// All registered applications.
 #[derive(Debug)]
 pub(crate) struct Records {
     path: PathBuf,
-    kept: Kept,
+    kept: StoredRecords,
 }
 
 impl Records {
@@ -89,7 +89,7 @@ impl Records {
                 path: path.clone(),
                 source: error.into(),
             })?,
-            Err(error) if error.kind() == io::ErrorKind::NotFound => Kept {
+            Err(error) if error.kind() == io::ErrorKind::NotFound => StoredRecords {
                 since: now,
                 last: 0,
                 records: Vec::new(),
@@ -108,16 +108,16 @@ impl Records {
         self.kept.records.len()
     }
 
-    pub(crate) fn get(&self, number: u32) -> Option<&Record> {
+    pub(crate) fn get(&self, number: u32) -> Option<&GdsRecord> {
         self.kept.records.iter().find(|one| one.number == number)
     }
 
-    pub(crate) fn of_uri(&self, uri: &str) -> impl Iterator<Item = &Record> {
+    pub(crate) fn of_uri(&self, uri: &str) -> impl Iterator<Item = &GdsRecord> {
         self.kept.records.iter().filter(move |one| one.uri == uri)
     }
 
     /// Registers an application and returns its number.
-    pub(crate) fn register(&mut self, record: Record) -> Result<u32, RecordFault> {
+    pub(crate) fn register(&mut self, record: GdsRecord) -> Result<u32, RecordFault> {
         check(&record)?;
         if self.of_uri(&record.uri).next().is_some() {
             return Err(RecordFault::Present);
@@ -126,7 +126,7 @@ impl Records {
             return Err(RecordFault::Full);
         }
         let number = self.kept.last.checked_add(1).ok_or(RecordFault::Full)?;
-        self.kept.records.push(Record { number, ..record });
+        self.kept.records.push(GdsRecord { number, ..record });
         self.kept.last = number;
         self.save().inspect_err(|_| {
             self.kept.records.pop();
@@ -136,7 +136,7 @@ impl Records {
 
     /// Puts a record in the place of that of its number. The ApplicationUri stays, and so do the
     /// confirmed hosts that the DiscoveryUrls still name.
-    pub(crate) fn update(&mut self, mut record: Record) -> Result<(), RecordFault> {
+    pub(crate) fn update(&mut self, mut record: GdsRecord) -> Result<(), RecordFault> {
         check(&record)?;
         let all = &mut self.kept.records;
         let known = all.iter_mut().find(|one| one.number == record.number);
@@ -159,7 +159,7 @@ impl Records {
     }
 
     /// Removes an application.
-    pub(crate) fn remove(&mut self, number: u32) -> Result<Record, RecordFault> {
+    pub(crate) fn remove(&mut self, number: u32) -> Result<GdsRecord, RecordFault> {
         let mut places = self.kept.records.iter();
         let place = places.position(|one| one.number == number);
         let place = place.ok_or(RecordFault::Unknown)?;
@@ -171,7 +171,7 @@ impl Records {
 
     /// Returns the matching applications, and the number after which the next query continues, or 0
     /// if there are no more.
-    pub(crate) fn query(&self, query: &Query<'_>) -> (Vec<&Record>, u32) {
+    pub(crate) fn query(&self, query: &ApplicationQuery<'_>) -> (Vec<&GdsRecord>, u32) {
         let most = match usize::try_from(query.most).unwrap_or(MOST_AT_ONCE) {
             0 => MOST_AT_ONCE,
             most => most.min(MOST_AT_ONCE),
@@ -181,7 +181,7 @@ impl Records {
             .records
             .iter()
             .filter(|one| one.number > query.after && one.fits(query));
-        let found: Vec<&Record> = fitting.by_ref().take(most).collect();
+        let found: Vec<&GdsRecord> = fitting.by_ref().take(most).collect();
         let next = match (fitting.next(), found.last()) {
             (Some(_), Some(last)) => last.number,
             _ => 0,
@@ -200,7 +200,7 @@ impl Records {
     }
 }
 
-impl Record {
+impl GdsRecord {
     /// Converts the record of a client.
     pub(crate) fn of(told: &ApplicationRecord, number: u32) -> Self {
         let texts = |all: &Option<Vec<UAString>>| -> Vec<String> {
@@ -294,7 +294,7 @@ impl Record {
         }
     }
 
-    fn fits(&self, query: &Query<'_>) -> bool {
+    fn fits(&self, query: &ApplicationQuery<'_>) -> bool {
         let kind = match query.kinds {
             0 | 3 => true,
             1 => self.is_server(),
@@ -340,7 +340,7 @@ fn host(url: &str) -> Option<String> {
 }
 
 /// Checks if the record of a client can be stored.
-pub(crate) fn check(record: &Record) -> Result<(), RecordFault> {
+pub(crate) fn check(record: &GdsRecord) -> Result<(), RecordFault> {
     let fits = |ok: bool, why: &'static str| ok.then_some(()).ok_or(RecordFault::Unfit(why));
     let short = |text: &String| text.len() <= LONGEST_TEXT;
     fits(!record.uri.is_empty(), "it has no ApplicationUri")?;
@@ -431,8 +431,8 @@ mod tests {
         Records::open(path, 1_795_000_000).unwrap()
     }
 
-    fn robot(number: u32) -> Record {
-        Record {
+    fn robot(number: u32) -> GdsRecord {
+        GdsRecord {
             number: 0,
             uri: format!("urn:cell:robot-{number}"),
             kind: 0,
@@ -465,44 +465,44 @@ mod tests {
         for number in 1..=5 {
             all.register(robot(number)).unwrap();
         }
-        let numbers = |query: &Query<'_>| {
+        let numbers = |query: &ApplicationQuery<'_>| {
             let (found, next) = all.query(query);
             (found.iter().map(|one| one.number).collect::<Vec<_>>(), next)
         };
-        let two = |after| Query {
+        let two = |after| ApplicationQuery {
             after,
             most: 2,
-            ..Query::default()
+            ..ApplicationQuery::default()
         };
         assert_eq!(numbers(&two(0)), (vec![1, 2], 2));
         assert_eq!(numbers(&two(2)), (vec![3, 4], 4));
         assert_eq!(numbers(&two(4)), (vec![5], 0));
         let filters = [
             (
-                Query {
+                ApplicationQuery {
                     name: "%bot 3",
-                    ..Query::default()
+                    ..ApplicationQuery::default()
                 },
                 vec![3],
             ),
             (
-                Query {
+                ApplicationQuery {
                     uri: "urn:cell:robot-4",
-                    ..Query::default()
+                    ..ApplicationQuery::default()
                 },
                 vec![4],
             ),
             (
-                Query {
+                ApplicationQuery {
                     kinds: 2,
-                    ..Query::default()
+                    ..ApplicationQuery::default()
                 },
                 vec![],
             ),
             (
-                Query {
+                ApplicationQuery {
                     capabilities: vec!["hd", "GDS"],
-                    ..Query::default()
+                    ..ApplicationQuery::default()
                 },
                 vec![],
             ),
@@ -515,7 +515,7 @@ mod tests {
 
     #[test]
     fn the_hosts_of_an_application_are_those_of_its_urls() {
-        let record = Record {
+        let record = GdsRecord {
             urls: [
                 "opc.tcp://robot:4840/a",
                 "opc.tcp://[fe80::1]:4840",
@@ -535,7 +535,7 @@ mod tests {
         let mut first = robot(1);
         first.confirm(&["ROBOT-1".to_owned(), "mes".to_owned()]);
         let number = all.register(first).unwrap();
-        let renamed = |hosts: &[&str]| Record {
+        let renamed = |hosts: &[&str]| GdsRecord {
             number,
             urls: hosts
                 .iter()
@@ -556,26 +556,26 @@ mod tests {
     fn a_register_without_confirmed_hosts_is_read() {
         let text = serde_json::to_string(&robot(1)).unwrap();
         assert!(!text.contains("confirmed"), "{text}");
-        assert_eq!(serde_json::from_str::<Record>(&text).unwrap(), robot(1));
+        assert_eq!(serde_json::from_str::<GdsRecord>(&text).unwrap(), robot(1));
     }
 
     #[test]
     fn what_cannot_be_kept_is_refused_with_the_reason() {
         let mut all = records("unfit");
         let unfit = [
-            Record {
+            GdsRecord {
                 uri: String::new(),
                 ..robot(1)
             },
-            Record {
+            GdsRecord {
                 names: vec![],
                 ..robot(1)
             },
-            Record {
+            GdsRecord {
                 urls: vec![],
                 ..robot(1)
             },
-            Record {
+            GdsRecord {
                 urls: vec!["u".repeat(LONGEST_TEXT + 1)],
                 ..robot(1)
             },

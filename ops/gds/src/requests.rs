@@ -4,9 +4,9 @@
 use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
-use trust::{Certificate, Fingerprint, Request};
+use trust::{Certificate, CertificateSigningRequest, Fingerprint};
 
-use crate::records::Record;
+use crate::records::GdsRecord;
 
 /// All requests, oldest first.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -26,7 +26,7 @@ pub(crate) struct SigningRequest {
     /// The SHA-256 of the key.
     pub(crate) key: String,
     /// The record to be registered; `None` for a registered application.
-    pub(crate) record: Option<Record>,
+    pub(crate) record: Option<GdsRecord>,
     /// The request in hexadecimal digits, without a challengePassword.
     request: String,
     /// Time of the request, of the decision, or of the issue, in seconds since 1970.
@@ -54,8 +54,8 @@ pub(crate) enum RequestState {
 /// A new request.
 #[derive(Debug, Clone)]
 pub(crate) struct NewRequest {
-    pub(crate) request: Request,
-    pub(crate) record: Option<Record>,
+    pub(crate) request: CertificateSigningRequest,
+    pub(crate) record: Option<GdsRecord>,
     /// The user or invitation that has approved the request.
     pub(crate) approved: Option<String>,
 }
@@ -124,7 +124,7 @@ impl SigningRequests {
     /// contains a secret.
     pub(crate) fn put_issued(
         &mut self,
-        (request, certificate): (&Request, &Certificate),
+        (request, certificate): (&CertificateSigningRequest, &Certificate),
         now: Duration,
     ) -> u32 {
         self.all.retain(|one| one.is_kept(now));
@@ -192,8 +192,8 @@ impl SigningRequests {
 
 impl SigningRequest {
     /// Reads the request.
-    pub(crate) fn request(&self) -> Option<Request> {
-        Request::read(&unhex(&self.request)?).ok()
+    pub(crate) fn request(&self) -> Option<CertificateSigningRequest> {
+        CertificateSigningRequest::read(&unhex(&self.request)?).ok()
     }
 
     /// Reads the issued certificate.
@@ -209,7 +209,7 @@ impl SigningRequest {
         self.key.parse() == Ok(key)
     }
 
-    fn is_like(&self, other: &Request) -> bool {
+    fn is_like(&self, other: &CertificateSigningRequest) -> bool {
         self.request().is_some_and(|own| {
             own.application_uri() == other.application_uri() && own.hosts() == other.hosts()
         })
@@ -256,7 +256,7 @@ mod tests {
     fn wanted(key: &[u8], uri: &str, host: &str, approved: Option<&str>) -> NewRequest {
         let hosts = [host.to_owned()];
         NewRequest {
-            request: Request::make(key, uri, ("Robot", ""), &hosts).unwrap(),
+            request: CertificateSigningRequest::make(key, uri, ("Robot", ""), &hosts).unwrap(),
             record: None,
             approved: approved.map(str::to_owned),
         }
@@ -301,7 +301,7 @@ mod tests {
             from: life.0,
             until: life.1,
         };
-        let authority = trust::Authority::make(&key, ("Plant", ""), &issue).unwrap();
+        let authority = trust::CertificateAuthority::make(&key, ("Plant", ""), &issue).unwrap();
         all.issued(number, authority.certificate(), later);
         let kept = all.get(number, later + DAY / 2).unwrap();
         assert_eq!(kept.certificate().as_ref(), Some(authority.certificate()));

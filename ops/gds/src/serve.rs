@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use ::service::{Failure, FailureKind};
-use discovery::{AnnounceSettings, Announced, Interface, announce};
+use discovery::{AnnounceSettings, MdnsInterface, ServerAnnouncement, announce};
 use log_limit::LogLimit;
 use opcua::sync::Mutex;
 use opcua::types::{NodeId, Variant};
@@ -13,18 +13,18 @@ use plant_opcua::certificates;
 use plant_opcua::door::UnknownClients;
 use plant_opcua::enrolment::own_key;
 use plant_opcua::file::FileMethod;
-use plant_opcua::judge::Judge;
-use plant_opcua::own::{self, Cause};
+use plant_opcua::judge::CertificateJudge;
+use plant_opcua::own::{self, CertificateCause};
 use plant_opcua::pki::Pki;
 use plant_opcua::server::{
-    EndpointUrl, MethodHandler, MethodRequest, Security, Server, ServerBuilder, ServerConfig,
-    method,
+    EndpointUrl, MethodHandler, MethodRequest, OpcUaServer, ServerBuilder, ServerConfig,
+    ServerSecurity, method,
 };
 use plant_opcua::trust_file::TrustFile;
-use plant_opcua::users::{self, Access, Permissions, Roles, Rules};
+use plant_opcua::users::{self, NodePermissions, PermissionRules, Roles, UserAccess};
 use tokio::time::{MissedTickBehavior, interval};
 use tracing::{info, warn};
-use trust::{Renewal, Request, Step};
+use trust::{CertificateSigningRequest, Renewal, RenewalStep};
 
 use crate::kept;
 use crate::manager::{self, StartNewKeyPair, TRUST_LIST};
@@ -32,7 +32,7 @@ use crate::records::Records;
 use crate::service::{Gds, GroupList, MethodResult, now};
 use crate::store::{AuthorityStore, AuthorityStoreFault, claim};
 use crate::{directory, service};
-use plant_opcua::directory::{NAMESPACE, Types};
+use plant_opcua::directory::{NAMESPACE, RecordTypes};
 
 /// The settings of the server.
 #[derive(Debug)]
@@ -42,7 +42,7 @@ pub(crate) struct GdsSettings {
     pub(crate) authority: PathBuf,
     pub(crate) life: Duration,
     pub(crate) lds: Option<String>,
-    pub(crate) interface: Option<Interface>,
+    pub(crate) interface: Option<MdnsInterface>,
 }
 
 /// Runs the server until `stop` is ready.
@@ -79,7 +79,7 @@ pub(crate) async fn serve(
 
 struct Serving {
     gds: Arc<Gds>,
-    server: Server,
+    server: OpcUaServer,
 }
 
 impl Serving {
@@ -98,15 +98,15 @@ impl Serving {
         trusted?;
         let uri = own_uri();
         ensure_own(&store, &settings.pki, &settings.endpoint, now())?;
-        let access = Access::new(Some(settings.pki.join(users::FOLDER)), false);
+        let access = UserAccess::new(Some(settings.pki.join(users::FOLDER)), false);
         let access = Arc::new(access.map_err(|error| io(error.to_string()))?);
         let config = ServerConfig {
             product_uri: "urn:ua-bridge:gds".to_owned(),
             security: vec![
-                Security::None,
-                Security::Basic256Sha256,
-                Security::Aes128Sha256RsaOaep,
-                Security::Aes256Sha256RsaPss,
+                ServerSecurity::None,
+                ServerSecurity::Basic256Sha256,
+                ServerSecurity::Aes128Sha256RsaOaep,
+                ServerSecurity::Aes256Sha256RsaPss,
             ],
             pki: Some(settings.pki.clone()),
             // An application without a certificate of the plant requests its certificate here.
@@ -116,7 +116,7 @@ impl Serving {
         let server = ServerBuilder::new(config)
             .nodeset_str("the NodeSet of the GDS", include_str!("gds.xml"))
             .users(Arc::clone(&access))
-            .types(Arc::new(Types))
+            .types(Arc::new(RecordTypes))
             .build();
         let server =
             server.map_err(|error| Failure::new(FailureKind::Unavailable, error.to_string()))?;
@@ -134,7 +134,7 @@ impl Serving {
             applicants: Mutex::default(),
             keys: Mutex::default(),
             folder: settings.authority.clone(),
-            judge: Judge::of(&settings.pki, false),
+            judge: CertificateJudge::of(&settings.pki, false),
             logged: Mutex::new(LogLimit::every(LOGGED_EVERY)),
             known: Mutex::default(),
             access: Arc::clone(&access),
@@ -182,16 +182,16 @@ impl Serving {
 
     /// Registers the handler of each method. Every client may call the methods; each handler checks
     /// its caller itself.
-    fn methods(&self) -> Rules {
-        let mut rules = Rules::default();
+    fn methods(&self) -> PermissionRules {
+        let mut rules = PermissionRules::default();
         let mut add = |object: u32, ids: &[u32], handler: Arc<dyn MethodHandler>| {
             let id = |number| NodeId::new(self.gds.namespace, number);
             for number in ids {
                 self.server
                     .on_call(&id(object), &id(*number), Arc::clone(&handler));
-                let permissions = Permissions {
+                let permissions = NodePermissions {
                     call: Roles::ALL,
-                    ..Permissions::default()
+                    ..NodePermissions::default()
                 };
                 rules.nodes.insert(id(*number), permissions);
             }
@@ -239,11 +239,11 @@ impl Serving {
         }
     }
 
-    fn tell(&self, settings: &GdsSettings) -> Result<Option<Announced>, Failure> {
+    fn tell(&self, settings: &GdsSettings) -> Result<Option<ServerAnnouncement>, Failure> {
         if settings.lds.is_none() && settings.interface.is_none() {
             return Ok(None);
         }
-        let server = discovery::Server {
+        let server = discovery::ServerDescription {
             application_uri: self.server.application_uri().to_owned(),
             product_uri: "urn:ua-bridge:gds".to_owned(),
             name: NAME.to_owned(),
@@ -307,7 +307,10 @@ fn renew_own(
     let is_due = if certificate.is_self_signed() {
         trust::is_near_end(&certificate, now)
     } else {
-        !matches!(Renewal::of(&certificate).step(now), Step::Wait { .. })
+        !matches!(
+            Renewal::of(&certificate).step(now),
+            RenewalStep::Wait { .. }
+        )
     };
     // If the authority expires first, a renewal would not extend the certificate and be repeated
     // without end.
@@ -331,12 +334,14 @@ fn issue_own(
             hosts.push(host.to_owned());
         }
     }
-    let request = Request::make(&key, &own_uri(), (NAME, ""), &hosts);
+    let request = CertificateSigningRequest::make(&key, &own_uri(), (NAME, ""), &hosts);
     let request = request.map_err(AuthorityStoreFault::Request)?;
     let issued = store.issue(&request, now, OWN_LIFE)?;
-    own::replace(pki, &issued, &Cause::Authority).map_err(|source| AuthorityStoreFault::Io {
-        path: pki.to_owned(),
-        source,
+    own::replace(pki, &issued, &CertificateCause::Authority).map_err(|source| {
+        AuthorityStoreFault::Io {
+            path: pki.to_owned(),
+            source,
+        }
     })
 }
 

@@ -12,19 +12,19 @@ use opcua::sync::Mutex;
 use opcua::types::{
     ByteString, DateTime, Identifier, NodeId, StatusCode, TrustListDataType, Variant,
 };
-use plant_opcua::judge::Judge;
-use plant_opcua::server::{Caller, Refusal};
+use plant_opcua::judge::CertificateJudge;
+use plant_opcua::server::{MethodRefusal, SessionCaller};
 use plant_opcua::trust_file::{TrustList, masks};
-use plant_opcua::users::{Access, Role};
+use plant_opcua::users::{UserAccess, UserRole};
 use tracing::{info, warn};
 use trust::{Certificate, Fingerprint};
 
 use crate::applicants::Applicants;
-use crate::records::{Record, RecordFault, Records};
+use crate::records::{GdsRecord, RecordFault, Records};
 use crate::store::{AuthorityStore, AuthorityStoreFault};
 
 /// The result of a method.
-pub(crate) type MethodResult = Result<Vec<Variant>, Refusal>;
+pub(crate) type MethodResult = Result<Vec<Variant>, MethodRefusal>;
 
 /// The register and the authority.
 pub(crate) struct Gds {
@@ -38,12 +38,12 @@ pub(crate) struct Gds {
     /// The folder of the authority, with the lists that the command line shares.
     pub(crate) folder: PathBuf,
     /// Checks the certificates of callers with the store of the server.
-    pub(crate) judge: Judge,
+    pub(crate) judge: CertificateJudge,
     /// Limits the log entries that unauthenticated clients can cause.
     pub(crate) logged: Mutex<LogLimit>,
     /// The revocation list in the store of the server itself.
     pub(crate) known: Mutex<Vec<u8>>,
-    pub(crate) access: Arc<Access>,
+    pub(crate) access: Arc<UserAccess>,
     /// The certificate store of the server itself.
     pub(crate) pki: PathBuf,
     /// The life of issued certificates.
@@ -58,7 +58,7 @@ impl Gds {
     ///
     /// # Errors
     /// Returns the status for the caller.
-    pub(crate) fn may(&self, caller: &Caller, uri: &str) -> Result<(), StatusCode> {
+    pub(crate) fn may(&self, caller: &SessionCaller, uri: &str) -> Result<(), StatusCode> {
         match self.standing(caller, uri)? {
             CallerStanding::Administrator | CallerStanding::Itself => Ok(()),
             CallerStanding::Applicant(_) | CallerStanding::Stranger => {
@@ -73,7 +73,7 @@ impl Gds {
     /// Returns `BadSecurityModeInsufficient` if the channel is not encrypted.
     pub(crate) fn standing(
         &self,
-        caller: &Caller,
+        caller: &SessionCaller,
         uri: &str,
     ) -> Result<CallerStanding, StatusCode> {
         self.is_unread(caller)?;
@@ -92,7 +92,7 @@ impl Gds {
     }
 
     /// Returns the certificate of a caller if it has the ApplicationUri. It may be untrusted.
-    pub(crate) fn proof(caller: &Caller, uri: &str) -> Option<Certificate> {
+    pub(crate) fn proof(caller: &SessionCaller, uri: &str) -> Option<Certificate> {
         let shown = caller.certificate.as_deref();
         let shown = shown.filter(|_| caller.proven && caller.application_uri == uri);
         Certificate::read(shown?).ok()
@@ -119,7 +119,7 @@ impl Gds {
     ///
     /// # Errors
     /// Returns `BadSecurityModeInsufficient` if others could read the messages.
-    pub(crate) fn is_unread(&self, caller: &Caller) -> Result<(), StatusCode> {
+    pub(crate) fn is_unread(&self, caller: &SessionCaller) -> Result<(), StatusCode> {
         if caller.encrypted {
             Ok(())
         } else {
@@ -127,21 +127,21 @@ impl Gds {
         }
     }
 
-    pub(crate) fn is_administrator(&self, caller: &Caller) -> bool {
+    pub(crate) fn is_administrator(&self, caller: &SessionCaller) -> bool {
         // No user can have the name of this token.
         let name = match caller.user.as_str() {
             "anonymous" => ANONYMOUS_USER_TOKEN_ID,
             name => name,
         };
         let token = UserToken(name.to_owned());
-        self.access.roles(&token).contains(Role::SecurityAdmin)
+        self.access.roles(&token).contains(UserRole::SecurityAdmin)
     }
 
     /// Returns the application with an ApplicationId that the caller may change.
     ///
     /// # Errors
     /// Returns the status for the caller.
-    pub(crate) fn own(&self, caller: &Caller, id: &NodeId) -> Result<Record, StatusCode> {
+    pub(crate) fn own(&self, caller: &SessionCaller, id: &NodeId) -> Result<GdsRecord, StatusCode> {
         self.is_unread(caller)?;
         let known = number(id).and_then(|number| self.records.lock().get(number).cloned());
         let Some(record) = known else {
@@ -254,7 +254,7 @@ pub(crate) fn refused(fault: &AuthorityStoreFault) -> StatusCode {
 }
 
 /// Logs a fault of the register and returns the status for the caller.
-pub(crate) fn unregistered(fault: &RecordFault, caller: &Caller) -> StatusCode {
+pub(crate) fn unregistered(fault: &RecordFault, caller: &SessionCaller) -> StatusCode {
     warn!(application = ?caller.application_uri, user = ?caller.user, "refused data of an application from a client: {fault}");
     match fault {
         RecordFault::Present => StatusCode::BadEntryExists,

@@ -8,7 +8,10 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use opcua::crypto::{PrivateKey, random};
-use trust::{Authority, Certificate, Crl, Issue, Request, Revoked, Serial, Unfit};
+use trust::{
+    Certificate, CertificateAuthority, CertificateSigningRequest, Crl, Issue, Revoked, Serial,
+    Unfit,
+};
 use x509_cert::der::pem::{self, LineEnding};
 
 use crate::records::replace;
@@ -17,7 +20,7 @@ use crate::records::replace;
 #[derive(Debug)]
 pub(crate) struct AuthorityStore {
     folder: PathBuf,
-    authority: Authority,
+    authority: CertificateAuthority,
 }
 
 /// An issued certificate.
@@ -96,8 +99,8 @@ impl AuthorityStore {
             from: now.saturating_sub(CLOCKS_DIFFER),
             until: now + life,
         };
-        let authority =
-            Authority::make(&key, names, &issue).map_err(AuthorityStoreFault::Request)?;
+        let authority = CertificateAuthority::make(&key, names, &issue)
+            .map_err(AuthorityStoreFault::Request)?;
         if is_new {
             write_key(&path, &pem_of(&key)?).map_err(io_at(&path))?;
         }
@@ -128,7 +131,7 @@ impl AuthorityStore {
         let bytes = fs::read(&path).map_err(io_at(&path))?;
         let certificate = Certificate::read(&bytes).map_err(unfit(&path))?;
         let der = read_key(&key)?;
-        let authority = Authority::open(certificate, &der).map_err(unfit(&key))?;
+        let authority = CertificateAuthority::open(certificate, &der).map_err(unfit(&key))?;
         Ok(Self {
             folder: folder.to_owned(),
             authority,
@@ -147,7 +150,7 @@ impl AuthorityStore {
     /// Issues the requested certificate with this life.
     pub(crate) fn issue(
         &self,
-        request: &Request,
+        request: &CertificateSigningRequest,
         now: Duration,
         life: Duration,
     ) -> Result<Certificate, AuthorityStoreFault> {
@@ -454,7 +457,8 @@ mod tests {
         let store = AuthorityStore::open(&folder).unwrap();
         let key = new_key(2048).unwrap();
         let hosts = ["robot".to_owned()];
-        let request = Request::make(&key, "urn:robot", ("Robot", "Plant"), &hosts).unwrap();
+        let request =
+            CertificateSigningRequest::make(&key, "urn:robot", ("Robot", "Plant"), &hosts).unwrap();
         let [first, second] = [1, 2].map(|day| {
             store
                 .issue(&request, NOW + Duration::from_secs(day), YEAR)

@@ -11,11 +11,15 @@ use std::time::{Duration, SystemTime};
 
 use async_trait::async_trait;
 use futures_util::future::join_all;
-use knowledge::{Answer, ComponentFacts, Knowledge, Lasting, NodeName, Source, SourceKind};
+use knowledge::{
+    ComponentFacts, Knowledge, KnowledgeSource, NodeName, QuestionAnswer, SourceKind,
+    SourceLifetime,
+};
 use serde::Serialize;
 use skills::choosing::Attachment;
 use skills::{
-    ClientOptions, FoundSkill, Runs as RunsOfSkill, SkillClient, ToolState, TypeName, Value,
+    ClientOptions, FoundSkill, ParameterType, RunnableSkill as RunsOfSkill, SkillClient,
+    SkillValue, ToolState,
 };
 use tokio::sync::watch;
 use tokio::time::timeout;
@@ -25,17 +29,17 @@ use self::facts::skill_facts;
 use self::opened::OpenedSkills;
 use self::parameters::{connects, parameter, result, values};
 use crate::execute::{OpenFault, Opened, Plant};
-use crate::goal::{Action, Goal, Sequence};
+use crate::goal::{GoalAction, GoalConditions, Sequence};
 use crate::plan::Offer;
-use crate::process::{Given, Process};
+use crate::process::{GivenParameter, Process};
 use crate::read_process::Processes;
-use crate::record::{Run, Runs};
-use crate::sources::{Finding, Sources};
+use crate::record::{NewestRuns, ProcessRun};
+use crate::sources::{Finding, MesSources};
 
 /// The current state of the plant.
-pub(crate) struct Cell {
+pub(crate) struct PlantState {
     knowledge: Arc<Knowledge>,
-    sources: Arc<Sources>,
+    sources: Arc<MesSources>,
     /// The processes of the graph, with the change of the graph after which they were read.
     processes: Mutex<(Option<u64>, Arc<Processes>)>,
     client: ClientOptions,
@@ -43,7 +47,7 @@ pub(crate) struct Cell {
     prefer: Vec<String>,
     present: Mutex<Present>,
     changed: watch::Sender<u64>,
-    runs: Runs,
+    runs: NewestRuns,
     /// The runs that use components, by the IRIs of the components.
     leases: Mutex<BTreeMap<String, String>>,
     /// Held during the search for a sequence, which takes up to 100 MB of memory.
@@ -96,16 +100,16 @@ pub(crate) struct PlannedGoal {
 
 /// A server, as discovery found it.
 #[derive(Debug, Clone)]
-pub(crate) struct Seen {
+pub(crate) struct SeenServer {
     pub(crate) name: String,
     pub(crate) url: String,
     pub(crate) at_ms: u64,
 }
 
-impl Cell {
+impl PlantState {
     pub(crate) fn new(
         knowledge: Arc<Knowledge>,
-        sources: Arc<Sources>,
+        sources: Arc<MesSources>,
         client: ClientOptions,
         prefer: Vec<String>,
     ) -> Self {
@@ -117,7 +121,7 @@ impl Cell {
             client,
             present: Mutex::default(),
             changed: watch::channel(0).0,
-            runs: Runs::default(),
+            runs: NewestRuns::default(),
             leases: Mutex::default(),
             searching: Mutex::default(),
             next_run: AtomicU64::new(1),
@@ -130,7 +134,7 @@ impl Cell {
     }
 
     /// Returns the newest runs.
-    pub(crate) fn runs(&self) -> Vec<Run> {
+    pub(crate) fn runs(&self) -> Vec<ProcessRun> {
         self.runs.all()
     }
 
@@ -214,8 +218,8 @@ impl Cell {
     /// # Errors
     /// The reason why it cannot be reached; `None` if there is no such goal.
     pub(crate) fn goal(&self, iri: &str) -> Result<PlannedGoal, Option<String>> {
-        let goal = Goal::read(&self.knowledge, iri)?;
-        let all = Action::read(&self.knowledge).map_err(Some)?;
+        let goal = GoalConditions::read(&self.knowledge, iri)?;
+        let all = GoalAction::read(&self.knowledge).map_err(Some)?;
         let offers = self.offers();
         let (actions, without): (Vec<_>, Vec<_>) = all.into_iter().partition(|action| {
             let mut skills = offers.iter().filter(|offer| offer.is_skill);
@@ -241,7 +245,10 @@ impl Cell {
     /// Returns the goal whose IRI is the end of a path, and its plan as JSON.
     pub(crate) fn goal_page(&self, escaped: &str) -> Option<serde_json::Value> {
         let answer = self.knowledge.ask("goals", &[]).ok()?;
-        let mut goals = answer.rows.iter().map(|row| Answer::text(row, "goal"));
+        let mut goals = answer
+            .rows
+            .iter()
+            .map(|row| QuestionAnswer::text(row, "goal"));
         let iri = goals.find(|iri| *iri == escaped || mtp::escaped(iri) == escaped)?;
         let page = match self.goal(iri) {
             Ok(planned) => serde_json::json!({
@@ -253,14 +260,14 @@ impl Cell {
         Some(page)
     }
 
-    pub(crate) fn sources(&self) -> &Arc<Sources> {
+    pub(crate) fn sources(&self) -> &Arc<MesSources> {
         &self.sources
     }
 
     /// Adds a server to the graph after it has listed its skills.
     pub(crate) fn came(
         &self,
-        seen: &Seen,
+        seen: &SeenServer,
         application_uri: &str,
         found: Vec<FoundSkill>,
         listed_ms: u64,
@@ -327,7 +334,7 @@ impl Cell {
                 left_out, "ignored capabilities that are not IRIs"
             );
         }
-        let source = Source::new(SourceKind::Component, &facts.application_uri);
+        let source = KnowledgeSource::new(SourceKind::Component, &facts.application_uri);
         let taken = self.knowledge.replace(&source, &triples, at);
         if let Err(fault) = &taken {
             error!(
@@ -364,7 +371,7 @@ impl Cell {
                 .collect()
         };
         for component in removed {
-            let source = Source::new(SourceKind::Component, &component.application_uri);
+            let source = KnowledgeSource::new(SourceKind::Component, &component.application_uri);
             if let Err(fault) = self.knowledge.remove(&source) {
                 error!(
                     component = component.name,
@@ -443,7 +450,7 @@ impl Cell {
 }
 
 #[async_trait]
-impl Plant for Cell {
+impl Plant for PlantState {
     fn offers(&self) -> Vec<Offer> {
         match self.knowledge.ask("candidates", &[]) {
             Ok(answer) => {
@@ -517,7 +524,11 @@ impl Plant for Cell {
         }
     }
 
-    fn values(&self, skill: &str, given: &[Given]) -> Result<Vec<(String, Value)>, String> {
+    fn values(
+        &self,
+        skill: &str,
+        given: &[GivenParameter],
+    ) -> Result<Vec<(String, SkillValue)>, String> {
         values(&self.found(skill)?, given)
     }
 
@@ -609,9 +620,12 @@ impl Plant for Cell {
         true
     }
 
-    fn keep(&self, run: &Run) {
+    fn keep(&self, run: &ProcessRun) {
         for gone in self.runs.put(run) {
-            if let Err(fault) = self.knowledge.remove(&Source::new(SourceKind::Run, &gone)) {
+            if let Err(fault) = self
+                .knowledge
+                .remove(&KnowledgeSource::new(SourceKind::Run, &gone))
+            {
                 error!(
                     run = gone,
                     "cannot remove an old run from the graph: {fault}"
@@ -619,9 +633,9 @@ impl Plant for Cell {
             }
         }
         if let Err(fault) = self.knowledge.replace_with(
-            &Source::new(SourceKind::Run, &run.run),
+            &KnowledgeSource::new(SourceKind::Run, &run.run),
             &run.triples(),
-            (run.started_ms, Lasting::Yes),
+            (run.started_ms, SourceLifetime::Yes),
         ) {
             error!(run = run.run, "cannot store a run in the graph: {fault}");
         }
@@ -632,12 +646,12 @@ impl Plant for Cell {
     }
 }
 
-impl Cell {
+impl PlantState {
     /// Reads the state of the tool changer with a skill.
     async fn tool_state(&self, endpoint: &str, skill: &str) -> Option<ToolState> {
         let node = self.found(skill).ok()?.node;
         let client = SkillClient::connect(endpoint, &self.client).await.ok()?;
-        let found = client.skills_of(&TypeName::own("ToolSkillType")).await;
+        let found = client.skills_of(&ParameterType::own("ToolSkillType")).await;
         client.close().await;
         let mut found = found.ok()?.into_iter();
         found.find(|found| found.node == node)?.tool_state

@@ -13,16 +13,16 @@ use std::time::Duration;
 use async_trait::async_trait;
 use skills::choosing::Attachment;
 use skills::frame::Frame;
-use skills::{PickAndPlace, Runs, Teller, Value};
+use skills::{JobObserver, PickAndPlace, RunnableSkill, SkillValue};
 use tokio::sync::watch;
 use tracing::{info, warn};
 
 use crate::plan::{Facts, Fallen, Offer, Plan, Situation, plan};
-use crate::process::{Given, Job, Process, Role, Step};
-use crate::record::{How, Planned, Run};
+use crate::process::{GivenParameter, Process, ProcessStep, SkillRole, StepJob};
+use crate::record::{How, Planned, ProcessRun};
 
-use sequence::{Progress, StepEnd};
-use watched::Watched;
+use sequence::{RunProgress, StepEnd};
+use watched::RecordedSkill;
 
 /// The plant as the execution of a process needs it.
 #[async_trait]
@@ -38,7 +38,11 @@ pub(crate) trait Plant: Send + Sync {
     async fn open(&self, offers: &[Offer]) -> Result<Box<dyn Opened>, OpenFault>;
 
     /// Converts the parameters of a step to the parameters of a skill.
-    fn values(&self, skill: &str, given: &[Given]) -> Result<Vec<(String, Value)>, String>;
+    fn values(
+        &self,
+        skill: &str,
+        given: &[GivenParameter],
+    ) -> Result<Vec<(String, SkillValue)>, String>;
 
     /// Returns the unit of a result of a skill, if it has one.
     ///
@@ -75,7 +79,7 @@ pub(crate) trait Plant: Send + Sync {
     fn lease(&self, run: &str, components: &BTreeSet<String>) -> bool;
 
     /// Stores the state of a run.
-    fn keep(&self, run: &Run);
+    fn keep(&self, run: &ProcessRun);
 
     /// Returns the time in ms since 1970.
     fn now(&self) -> u64;
@@ -85,7 +89,7 @@ pub(crate) trait Plant: Send + Sync {
 #[async_trait]
 pub(crate) trait Opened: Send + Sync {
     /// Returns the skills in the order in which they were requested.
-    fn skills(&self) -> Vec<Arc<dyn Runs>>;
+    fn skills(&self) -> Vec<Arc<dyn RunnableSkill>>;
 
     /// Releases the leases of the components.
     async fn close(self: Box<Self>);
@@ -103,8 +107,8 @@ pub(crate) async fn execute(
     plant: &Arc<dyn Plant>,
     process: &Process,
     number: u64,
-    teller: &dyn Teller,
-) -> Run {
+    teller: &dyn JobObserver,
+) -> ProcessRun {
     let (_going, paused) = watch::channel(false);
     execute_pausable(plant, process, number, (teller, paused)).await
 }
@@ -114,9 +118,9 @@ pub(crate) async fn execute_pausable(
     plant: &Arc<dyn Plant>,
     process: &Process,
     number: u64,
-    (teller, paused): (&dyn Teller, watch::Receiver<bool>),
-) -> Run {
-    let run = Run::begins(process, plant.now(), number);
+    (teller, paused): (&dyn JobObserver, watch::Receiver<bool>),
+) -> ProcessRun {
+    let run = ProcessRun::begins(process, plant.now(), number);
     plant.keep(&run);
     info!(process = process.iri, run = run.run, "a process begins");
     let log = Arc::new(Log {
@@ -199,14 +203,14 @@ impl Whole {
 }
 
 /// Returns the outcome of a run that is not done.
-fn ended_badly(run: &Run) -> How {
+fn ended_badly(run: &ProcessRun) -> How {
     match run.is_unknown() {
         true => How::Unknown,
         false => How::Failed,
     }
 }
 
-fn tell(run: &Run) {
+fn tell(run: &ProcessRun) {
     let (plans, process) = (run.plans.len(), &run.process);
     match &run.reason {
         None => info!(process, run = run.run, plans, "a process is done"),
@@ -230,7 +234,7 @@ pub(crate) fn dry_run(plant: &dyn Plant, process: &Process) -> Plan {
 struct OfPlant<'a>(&'a dyn Plant);
 
 impl Facts for OfPlant<'_> {
-    fn takes(&self, offer: &Offer, step: &Step) -> Result<(), String> {
+    fn takes(&self, offer: &Offer, step: &ProcessStep) -> Result<(), String> {
         self.0.values(&offer.skill, &step.parameters).map(drop)
     }
 
@@ -259,7 +263,7 @@ struct Execution<'a> {
     plant: &'a dyn Plant,
     process: &'a Process,
     log: &'a Arc<Log>,
-    teller: &'a dyn Teller,
+    teller: &'a dyn JobObserver,
     /// Whether no step may begin.
     paused: watch::Receiver<bool>,
 }
@@ -278,7 +282,7 @@ enum Ended {
 /// The skills that a plan runs.
 struct Chosen {
     /// The offers by their roles, in the order of the steps that are not done.
-    open: Vec<(Role, Offer)>,
+    open: Vec<(SkillRole, Offer)>,
     /// The offers of compensations, by the numbers of the steps.
     undo: BTreeMap<usize, Offer>,
 }
@@ -286,7 +290,7 @@ struct Chosen {
 impl Execution<'_> {
     /// Runs the process. If it fails, its completed steps are compensated.
     async fn run(&self) -> Result<(), String> {
-        let mut progress = Progress::default();
+        let mut progress = RunProgress::default();
         let ended = self.forward(&mut progress).await;
         match ended {
             Ok(()) => Ok(()),
@@ -295,7 +299,7 @@ impl Execution<'_> {
     }
 
     /// Runs plans until all steps are done.
-    async fn forward(&self, progress: &mut Progress) -> Result<(), String> {
+    async fn forward(&self, progress: &mut RunProgress) -> Result<(), String> {
         let mut last = String::new();
         let mut number = 0_usize;
         let mut broken = 0_usize;
@@ -337,7 +341,7 @@ impl Execution<'_> {
 
     /// Waits for a complete plan of the steps that are not done, and returns it with the chosen
     /// offers. The run has the use of their components then.
-    async fn planned(&self, last: &str, progress: &Progress) -> Result<(Plan, Chosen), String> {
+    async fn planned(&self, last: &str, progress: &RunProgress) -> Result<(Plan, Chosen), String> {
         let run = self.log.run().run;
         let kept = compensate::kept(self.process, &progress.done);
         let passed: Vec<usize> = progress.passed.keys().copied().collect();
@@ -395,12 +399,12 @@ impl Execution<'_> {
     }
 
     /// Returns the chosen offers of a plan, without those of the steps that are over.
-    fn chosen(&self, plan: &Plan, offers: &[Offer], progress: &Progress) -> Chosen {
-        let of = |role: Role| {
+    fn chosen(&self, plan: &Plan, offers: &[Offer], progress: &RunProgress) -> Chosen {
+        let of = |role: SkillRole| {
             let skill = plan.chosen(role)?;
             offers.iter().find(|offer| offer.skill == skill).cloned()
         };
-        let mut open: Vec<(Role, Offer)> = Vec::new();
+        let mut open: Vec<(SkillRole, Offer)> = Vec::new();
         let left = self.process.steps.iter().enumerate();
         let left = left.filter(|(number, _)| !progress.is_over(*number));
         for role in left.flat_map(|(_, step)| &step.needs).map(|need| need.role) {
@@ -410,7 +414,7 @@ impl Execution<'_> {
         }
         let left = (0..self.process.steps.len()).filter(|number| !progress.is_over(*number));
         let undo = left.filter_map(|number| {
-            let role = Role::Alone(self.process.compensation_of(number));
+            let role = SkillRole::Alone(self.process.compensation_of(number));
             Some((number, of(role)?))
         });
         Chosen {
@@ -423,21 +427,21 @@ impl Execution<'_> {
     async fn open(
         &self,
         offers: &[Offer],
-    ) -> Result<(Box<dyn Opened>, Vec<Arc<dyn Runs>>), OpenFault> {
+    ) -> Result<(Box<dyn Opened>, Vec<Arc<dyn RunnableSkill>>), OpenFault> {
         let opened = self.plant.open(offers).await?;
         let watched = opened
             .skills()
             .into_iter()
             .zip(offers)
             .map(|(skill, offer)| {
-                let watched = Watched::new(skill, offer, self.log, self.process);
-                Arc::new(watched) as Arc<dyn Runs>
+                let watched = RecordedSkill::new(skill, offer, self.log, self.process);
+                Arc::new(watched) as Arc<dyn RunnableSkill>
             });
         let watched = watched.collect();
         Ok((opened, watched))
     }
 
-    async fn carry_out(&self, chosen: &Chosen, progress: &mut Progress) -> Ended {
+    async fn carry_out(&self, chosen: &Chosen, progress: &mut RunProgress) -> Ended {
         let offers: Vec<Offer> = chosen.open.iter().map(|(_, offer)| offer.clone()).collect();
         let (opened, skills) = match self.open(&offers).await {
             Ok(opened) => opened,
@@ -460,29 +464,33 @@ impl Execution<'_> {
             }
         };
         let ended = match &self.process.work {
-            Job::PickAndPlace(job) => {
+            StepJob::PickAndPlace(job) => {
                 let roles = chosen.open.iter().map(|(role, _)| *role);
                 let roles: Vec<_> = roles.zip(skills).collect();
                 self.pick_and_place(job, &roles).await
             }
-            Job::Sequence => self.sequence(chosen, &skills, progress).await,
+            StepJob::Sequence => self.sequence(chosen, &skills, progress).await,
         };
         close(opened).await;
         ended
     }
 
-    async fn pick_and_place(&self, job: &skills::Job, roles: &[(Role, Arc<dyn Runs>)]) -> Ended {
-        let of = |wanted: Role| {
+    async fn pick_and_place(
+        &self,
+        job: &skills::Job,
+        roles: &[(SkillRole, Arc<dyn RunnableSkill>)],
+    ) -> Ended {
+        let of = |wanted: SkillRole| {
             roles
                 .iter()
                 .find(|(role, _)| *role == wanted)
                 .map(|(_, skill)| Arc::clone(skill))
         };
         let (Some(ptp), Some(linear), Some(grasp), Some(release)) = (
-            of(Role::Ptp),
-            of(Role::Linear),
-            of(Role::Grasp),
-            of(Role::Release),
+            of(SkillRole::Ptp),
+            of(SkillRole::Linear),
+            of(SkillRole::Grasp),
+            of(SkillRole::Release),
         ) else {
             return Ended::Over(
                 "the process does not say who moves, grasps and releases".to_owned(),
@@ -527,7 +535,7 @@ async fn close(opened: Box<dyn Opened>) {
 
 /// Forwards the steps of the composite to the log and to the caller.
 #[async_trait]
-impl Teller for Execution<'_> {
+impl JobObserver for Execution<'_> {
     async fn step(&self, step: &'static str) {
         self.log.step(step);
         self.teller.step(step).await;
@@ -553,7 +561,7 @@ struct Log {
 }
 
 struct Kept {
-    run: Run,
+    run: ProcessRun,
     step: String,
     fallen: Vec<Fallen>,
 }
@@ -570,7 +578,7 @@ impl Log {
         self.plant.keep(&run);
     }
 
-    fn run(&self) -> Run {
+    fn run(&self) -> ProcessRun {
         self.kept
             .lock()
             .unwrap_or_else(PoisonError::into_inner)

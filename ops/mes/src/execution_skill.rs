@@ -5,24 +5,24 @@ use std::time::Duration;
 
 use async_trait::async_trait;
 use skills::{
-    COMPOSITE_HALT_TIMEOUT, Driver, DriverError, InvalidParameter, Parameters, Results, Teller,
-    Value, Work,
+    COMPOSITE_HALT_TIMEOUT, Driver, DriverError, InvalidParameter, JobObserver, Parameters,
+    RunResults, SkillValue, Work,
 };
 
-use crate::cell::Cell;
+use crate::cell::PlantState;
 use crate::execute::{Plant, dry_run, execute};
 use crate::record::How;
 
 /// Plans and runs the process of its parameter.
 pub(crate) struct ExecuteProcess {
-    pub(crate) cell: Arc<Cell>,
+    pub(crate) cell: Arc<PlantState>,
     /// The number of the last run, unless its end is known. A run that was given up has not
     /// returned its outcome. The skill needs a Reset after such a run.
     unknown: Mutex<Option<u64>>,
 }
 
 impl ExecuteProcess {
-    pub(crate) fn new(cell: Arc<Cell>) -> Self {
+    pub(crate) fn new(cell: Arc<PlantState>) -> Self {
         Self {
             cell,
             unknown: Mutex::default(),
@@ -65,7 +65,7 @@ impl Driver for ExecuteProcess {
         }
     }
 
-    async fn run(&self, work: Work) -> Result<Results, DriverError> {
+    async fn run(&self, work: Work) -> Result<RunResults, DriverError> {
         let iri = work
             .parameters()
             .text("ProcessIri")
@@ -76,7 +76,7 @@ impl Driver for ExecuteProcess {
         let report = |report: &serde_json::Value| {
             Ok(vec![(
                 "Report".to_owned(),
-                Value::String(report.to_string()),
+                SkillValue::String(report.to_string()),
             )])
         };
         if work.parameters().text("ExecutionMode") == Some("plan") {
@@ -116,7 +116,7 @@ impl Driver for ExecuteProcess {
 struct Telling<'a>(&'a Work);
 
 #[async_trait]
-impl Teller for Telling<'_> {
+impl JobObserver for Telling<'_> {
     async fn step(&self, step: &'static str) {
         if let Some((_, done)) = DONE.iter().find(|(known, _)| *known == step) {
             self.0.progress(*done);

@@ -6,17 +6,17 @@ use std::net::IpAddr;
 use std::sync::Arc;
 use std::time::Duration;
 
-use discovery::{Found, Known, Watcher};
+use discovery::{PresentServer, ServerChange, ServerWatcher};
 use knowledge::{ComponentFacts, NodeName};
 use skills::{FoundSkill, SkillClient, SkillFault, StationChanges};
 use tokio::task::{AbortHandle, JoinSet};
 use tracing::{debug, warn};
 
-use crate::cell::{Cell, Seen, now, since_1970};
+use crate::cell::{PlantState, SeenServer, now, since_1970};
 use crate::live;
 
 /// Follows discovery until it ends. With `only_loopback`, servers at other addresses are ignored.
-pub(crate) async fn follow(cell: Arc<Cell>, mut watcher: Watcher, only_loopback: bool) {
+pub(crate) async fn follow(cell: Arc<PlantState>, mut watcher: ServerWatcher, only_loopback: bool) {
     let mut looks = JoinSet::new();
     let mut looking: HashMap<String, AbortHandle> = HashMap::new();
     loop {
@@ -33,15 +33,15 @@ pub(crate) async fn follow(cell: Arc<Cell>, mut watcher: Watcher, only_loopback:
             earlier.abort();
         }
         match found {
-            Found::Gone { known, loss } => cell.went(&known.name, loss.label()),
-            Found::Restarted(known) => {
+            ServerChange::Gone { known, loss } => cell.went(&known.name, loss.label()),
+            ServerChange::Restarted(known) => {
                 cell.went(&known.name, "it started anew");
                 looking.insert(
                     known.name.clone(),
                     looks.spawn(look(Arc::clone(&cell), known, only_loopback)),
                 );
             }
-            Found::Seen(known) => {
+            ServerChange::Seen(known) => {
                 looking.insert(
                     known.name.clone(),
                     looks.spawn(look(Arc::clone(&cell), known, only_loopback)),
@@ -52,7 +52,7 @@ pub(crate) async fn follow(cell: Arc<Cell>, mut watcher: Watcher, only_loopback:
 }
 
 /// Queries the skills of a server, and publishes their states while it is connected.
-async fn look(cell: Arc<Cell>, known: Known, only_loopback: bool) {
+async fn look(cell: Arc<PlantState>, known: PresentServer, only_loopback: bool) {
     if only_loopback && !is_loopback(&known.url) {
         warn!(
             url = known.url,
@@ -60,7 +60,7 @@ async fn look(cell: Arc<Cell>, known: Known, only_loopback: bool) {
         );
         return;
     }
-    let seen = Seen {
+    let seen = SeenServer {
         name: known.name,
         url: known.url,
         at_ms: since_1970(known.since),
@@ -78,7 +78,7 @@ async fn look(cell: Arc<Cell>, known: Known, only_loopback: bool) {
     }
 }
 
-async fn once(cell: &Cell, seen: &Seen) -> Result<(), SkillFault> {
+async fn once(cell: &PlantState, seen: &SeenServer) -> Result<(), SkillFault> {
     let client = SkillClient::connect(&seen.url, cell.client()).await?;
     let read = async {
         let changes = client.station_changes().await?;
@@ -109,7 +109,7 @@ async fn once(cell: &Cell, seen: &Seen) -> Result<(), SkillFault> {
     let listed = now();
     for (of, found) in &components {
         let Some(first) = found.first() else { continue };
-        let seen = Seen {
+        let seen = SeenServer {
             url: first.endpoint(&seen.url),
             ..seen.clone()
         };
@@ -123,7 +123,7 @@ async fn once(cell: &Cell, seen: &Seen) -> Result<(), SkillFault> {
 /// Publishes the states of the skills of a server until its connection is lost, or its components
 /// change.
 async fn show_states(
-    cell: &Cell,
+    cell: &PlantState,
     client: &SkillClient,
     (uri, found): (&str, &[FoundSkill]),
     changes: Option<StationChanges>,

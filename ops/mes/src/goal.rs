@@ -7,15 +7,15 @@
 use std::collections::{BTreeMap, BTreeSet, HashMap, VecDeque};
 use std::time::Duration;
 
-use knowledge::{Answer, Knowledge};
+use knowledge::{Knowledge, QuestionAnswer};
 use serde::Serialize;
 
-use crate::process::{By, Given, Job, Need, Process, Role, Step};
+use crate::process::{By, GivenParameter, Need, Process, ProcessStep, SkillRole, StepJob};
 use crate::read_process::{MOST_STEPS, USUALLY_WAIT, USUALLY_WITHIN, parameters_of, seconds};
 
 /// An action.
 #[derive(Debug, Clone, Default, PartialEq)]
-pub(crate) struct Action {
+pub(crate) struct GoalAction {
     pub(crate) iri: String,
     pub(crate) name: String,
     /// The class of the capability that does it.
@@ -27,12 +27,12 @@ pub(crate) struct Action {
     pub(crate) adds: BTreeSet<String>,
     /// Facts that do not hold after it, unless it adds them.
     pub(crate) removes: BTreeSet<String>,
-    pub(crate) parameters: Vec<Given>,
+    pub(crate) parameters: Vec<GivenParameter>,
 }
 
 /// A goal.
 #[derive(Debug, Clone, Default, PartialEq)]
-pub(crate) struct Goal {
+pub(crate) struct GoalConditions {
     pub(crate) iri: String,
     pub(crate) name: String,
     /// Facts that hold at the start.
@@ -52,14 +52,14 @@ pub(crate) struct Proved {
     pub(crate) name: String,
     pub(crate) capability: String,
     /// The conditions before the step, with the reasons why they hold.
-    pub(crate) because: Vec<Condition>,
+    pub(crate) because: Vec<GoalCondition>,
     pub(crate) adds: BTreeSet<String>,
     pub(crate) removes: BTreeSet<String>,
 }
 
 /// A condition that holds before a step, or at the end.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
-pub(crate) struct Condition {
+pub(crate) struct GoalCondition {
     pub(crate) fact: String,
     /// Whether the fact holds, or does not hold.
     pub(crate) holds: bool,
@@ -72,10 +72,10 @@ pub(crate) struct Condition {
 pub(crate) struct Sequence {
     pub(crate) steps: Vec<Proved>,
     /// The conditions of the goal.
-    pub(crate) reached: Vec<Condition>,
+    pub(crate) reached: Vec<GoalCondition>,
 }
 
-impl Goal {
+impl GoalConditions {
     /// Reads a goal of the graph.
     ///
     /// # Errors
@@ -83,11 +83,12 @@ impl Goal {
     pub(crate) fn read(knowledge: &Knowledge, iri: &str) -> Result<Self, Option<String>> {
         let answer = knowledge.ask("goals", &[]);
         let answer = answer.map_err(|fault| Some(fault.to_string()))?;
-        let of_goal = |row: &&BTreeMap<String, serde_json::Value>| Answer::text(row, "goal") == iri;
+        let of_goal =
+            |row: &&BTreeMap<String, serde_json::Value>| QuestionAnswer::text(row, "goal") == iri;
         let row = answer.rows.iter().find(of_goal).ok_or(None)?;
-        let facts = |column| Answer::texts(row, column).into_iter().collect();
+        let facts = |column| QuestionAnswer::texts(row, column).into_iter().collect();
         let time = |column| seconds(row.get(column).filter(|value| !value.is_null()), column);
-        let name = Answer::text(row, "name");
+        let name = QuestionAnswer::text(row, "name");
         let goal = Self {
             iri: iri.to_owned(),
             name: if name.is_empty() { iri } else { name }.to_owned(),
@@ -107,7 +108,7 @@ impl Goal {
     ///
     /// # Errors
     /// The reason why there is none.
-    pub(crate) fn search(&self, actions: &[Action]) -> Result<Sequence, String> {
+    pub(crate) fn search(&self, actions: &[GoalAction]) -> Result<Sequence, String> {
         let mut facts = Facts::default();
         let goal = Bits {
             yes: facts.set(&self.wants)?,
@@ -142,7 +143,7 @@ impl Goal {
     }
 
     /// Returns the reason why no sequence of actions reaches the goal.
-    fn unreachable(&self, actions: &[Action]) -> String {
+    fn unreachable(&self, actions: &[GoalAction]) -> String {
         let nobody = self.wants.iter().find(|fact| {
             let is_added = actions.iter().any(|action| action.adds.contains(*fact));
             !self.given.contains(*fact) && !is_added
@@ -157,14 +158,14 @@ impl Goal {
     }
 
     /// Adds the proof to a sequence.
-    fn proved(&self, actions: &[Action], order: &[usize]) -> Sequence {
+    fn proved(&self, actions: &[GoalAction], order: &[usize]) -> Sequence {
         // The step that last changed a fact, from 1.
         let mut since: BTreeMap<&str, usize> = BTreeMap::new();
         let conditions =
             |since: &BTreeMap<&str, usize>, yes: &BTreeSet<String>, no: &BTreeSet<String>| {
                 let all = yes.iter().map(|fact| (fact, true));
                 let all = all.chain(no.iter().map(|fact| (fact, false)));
-                let one = |(fact, holds): (&String, bool)| Condition {
+                let one = |(fact, holds): (&String, bool)| GoalCondition {
                     fact: fact.clone(),
                     holds,
                     since: since.get(fact.as_str()).copied().unwrap_or_default(),
@@ -204,13 +205,13 @@ impl Goal {
     }
 
     /// Returns the process of a sequence.
-    pub(crate) fn process(&self, sequence: &Sequence, actions: &[Action]) -> Process {
+    pub(crate) fn process(&self, sequence: &Sequence, actions: &[GoalAction]) -> Process {
         let step = |(number, proved): (usize, &Proved)| {
             let action = actions.iter().find(|action| action.iri == proved.action);
-            Step {
+            ProcessStep {
                 name: proved.name.clone(),
                 needs: vec![Need {
-                    role: Role::Alone(number),
+                    role: SkillRole::Alone(number),
                     capability: Some(proved.capability.clone()),
                     skill_type: None,
                 }],
@@ -218,13 +219,13 @@ impl Goal {
                     .map(|action| action.parameters.clone())
                     .unwrap_or_default(),
                 by: By::Any,
-                ..Step::default()
+                ..ProcessStep::default()
             }
         };
         Process {
             iri: self.iri.clone(),
             name: self.name.clone(),
-            work: Job::Sequence,
+            work: StepJob::Sequence,
             steps: sequence.steps.iter().enumerate().map(step).collect(),
             loops: Vec::new(),
             within: self.within.unwrap_or(USUALLY_WITHIN),
@@ -233,7 +234,7 @@ impl Goal {
     }
 }
 
-impl Action {
+impl GoalAction {
     /// Reads the actions of the graph.
     ///
     /// # Errors
@@ -246,8 +247,8 @@ impl Action {
         let (actions, parameters) = (ask("actions")?, ask("action-parameters")?);
         let mut all: Vec<Self> = Vec::new();
         for row in &actions.rows {
-            let text = |column| Answer::text(row, column).to_owned();
-            let facts = |column| Answer::texts(row, column).into_iter().collect();
+            let text = |column| QuestionAnswer::text(row, column).to_owned();
+            let facts = |column| QuestionAnswer::texts(row, column).into_iter().collect();
             let (iri, name) = (text("action"), text("name"));
             let wrong = |why: String| format!("the action {iri} {why}");
             if all.iter().any(|known| known.iri == iri) {

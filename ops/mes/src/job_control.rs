@@ -5,12 +5,12 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use plant_opcua::job_control::{
-    JobOrder, JobOrderAndState, JobResponse, NAMESPACE, NODESET, OptionalArray, Parameter, State,
-    Types,
+    JobOrder, JobOrderAndState, JobResponse, JobTypes, NAMESPACE, NODESET, OptionalArray,
+    Parameter, State,
 };
 use plant_opcua::server::{
-    IdRange, Instance, InstanceError, InstanceSpec, MethodRequest, Refusal, Server, ServerBuilder,
-    method,
+    IdRange, Instance, InstanceError, InstanceSpec, MethodRefusal, MethodRequest, OpcUaServer,
+    ServerBuilder, method,
 };
 use plant_opcua::types::{
     DataValue, DateTime, ExtensionObject, LocalizedText, NodeId, QualifiedName, RelativePath,
@@ -20,15 +20,15 @@ use serde_json::Value as Json;
 use tokio::runtime::Handle;
 use tracing::{info, warn};
 
-use crate::job_orders::{Command, JobRuns, MOST_ORDERS, Order, Orders, Status};
-use crate::jobs::Jobs;
+use crate::job_orders::{CommandStatus, JobCommand, JobRuns, KeptJobOrder, MOST_ORDERS, Orders};
+use crate::jobs::ProcessJobs;
 
 /// The objects of Job Control.
 #[derive(Clone)]
 pub(crate) struct JobControl(Arc<Inner>);
 
 struct Inner {
-    jobs: Arc<Jobs>,
+    jobs: Arc<ProcessJobs>,
     orders: Mutex<Orders>,
     runtime: Handle,
 }
@@ -42,13 +42,13 @@ impl std::fmt::Debug for JobControl {
 /// A place where the job orders are shown.
 #[derive(Clone)]
 struct Shown {
-    server: Server,
+    server: OpcUaServer,
     list: Option<NodeId>,
 }
 
 impl JobControl {
     /// Creates the objects for the jobs and the job orders of the MES.
-    pub(crate) fn new(jobs: Arc<Jobs>, orders: Orders, runtime: Handle) -> Self {
+    pub(crate) fn new(jobs: Arc<ProcessJobs>, orders: Orders, runtime: Handle) -> Self {
         Self(Arc::new(Inner {
             jobs,
             orders: Mutex::new(orders),
@@ -70,13 +70,13 @@ impl JobControl {
         &self,
         (name, request): (&str, &MethodRequest),
         shown: &Shown,
-    ) -> Result<Vec<Variant>, Refusal> {
+    ) -> Result<Vec<Variant>, MethodRefusal> {
         let order = match request.arguments.first() {
             Some(Variant::ExtensionObject(object)) => object.inner_as::<JobOrder>().cloned(),
             _ => None,
         };
         let order = order.ok_or_else(|| {
-            Refusal::Arguments(vec![StatusCode::BadInvalidArgument, StatusCode::Good])
+            MethodRefusal::Arguments(vec![StatusCode::BadInvalidArgument, StatusCode::Good])
         })?;
         let (runs, id) = (self.jobs(), order.id.clone());
         let status = {
@@ -86,8 +86,8 @@ impl JobControl {
                 "Store" => orders.store(order, runs),
                 _ => {
                     let stored = orders.store(order, runs);
-                    if stored == Status::Good {
-                        orders.command(id.as_ref(), Command::Start, runs)
+                    if stored == CommandStatus::Good {
+                        orders.command(id.as_ref(), JobCommand::Start, runs)
                     } else {
                         stored
                     }
@@ -102,10 +102,10 @@ impl JobControl {
     /// Executes a method with the ID of a job order.
     fn with_id(
         &self,
-        command: Command,
+        command: JobCommand,
         request: &MethodRequest,
         shown: &Shown,
-    ) -> Result<Vec<Variant>, Refusal> {
+    ) -> Result<Vec<Variant>, MethodRefusal> {
         let id = text(request)?;
         let status = self.orders().command(&id, command, self.jobs());
         info!(order = id, ?status, "{command:?} of a job order");
@@ -114,19 +114,19 @@ impl JobControl {
     }
 
     /// Returns the response of a job order by its ID.
-    fn response_by_id(&self, request: &MethodRequest) -> Result<Vec<Variant>, Refusal> {
+    fn response_by_id(&self, request: &MethodRequest) -> Result<Vec<Variant>, MethodRefusal> {
         let id = text(request)?;
         let orders = self.orders();
         let (response, status) = match orders.order(&id) {
-            Some(order) => (response(order), Status::Good),
-            None => (JobResponse::default(), Status::UnknownOrder),
+            Some(order) => (response(order), CommandStatus::Good),
+            None => (JobResponse::default(), CommandStatus::UnknownOrder),
         };
         let response = ExtensionObject::from_message(response);
         Ok(vec![Variant::from(response), Variant::from(status.bits())])
     }
 
     /// Returns the responses of the job orders in a state.
-    fn responses_by_state(&self, request: &MethodRequest) -> Result<Vec<Variant>, Refusal> {
+    fn responses_by_state(&self, request: &MethodRequest) -> Result<Vec<Variant>, MethodRefusal> {
         let wanted = match request.arguments.first() {
             Some(Variant::Array(states)) => states.values.first(),
             _ => None,
@@ -138,7 +138,7 @@ impl JobControl {
         let Some(wanted) = wanted else {
             return Ok(vec![
                 Variant::from(Vec::<ExtensionObject>::new()),
-                Variant::from(Status::InvalidRequest.bits()),
+                Variant::from(CommandStatus::InvalidRequest.bits()),
             ]);
         };
         let orders = self.orders();
@@ -149,7 +149,7 @@ impl JobControl {
             .collect();
         Ok(vec![
             Variant::from(responses),
-            Variant::from(Status::Good.bits()),
+            Variant::from(CommandStatus::Good.bits()),
         ])
     }
 
@@ -158,7 +158,7 @@ impl JobControl {
         let Some(list) = &shown.list else { return };
         // Locked until the list is shown, so that no older list replaces it.
         let orders = self.orders();
-        let one = |order: &Order| {
+        let one = |order: &KeptJobOrder| {
             ExtensionObject::from_message(JobOrderAndState {
                 order: order.order.clone(),
                 states: Some(vec![state(order)]),
@@ -188,12 +188,12 @@ impl skills::server::Extension for JobControl {
     fn prepare(&self, builder: ServerBuilder) -> ServerBuilder {
         builder
             .nodeset_str(NAMESPACE, NODESET)
-            .types(Arc::new(Types))
+            .types(Arc::new(JobTypes))
     }
 
     fn serve(
         &self,
-        server: &Server,
+        server: &OpcUaServer,
         component: &NodeId,
         ids: &mut IdRange,
     ) -> Result<(), InstanceError> {
@@ -251,10 +251,10 @@ impl skills::server::Extension for JobControl {
 }
 
 fn on_call(
-    server: &Server,
+    server: &OpcUaServer,
     object: &Instance,
     name: &str,
-    call: impl Fn(&MethodRequest) -> Result<Vec<Variant>, Refusal> + Send + Sync + 'static,
+    call: impl Fn(&MethodRequest) -> Result<Vec<Variant>, MethodRefusal> + Send + Sync + 'static,
 ) {
     match object.node(name) {
         Some(node) => server.on_call(&object.node_id, node, method(move |request| call(&request))),
@@ -263,14 +263,14 @@ fn on_call(
 }
 
 /// Returns the text of the first argument.
-fn text(request: &MethodRequest) -> Result<String, Refusal> {
+fn text(request: &MethodRequest) -> Result<String, MethodRefusal> {
     match request.arguments.first() {
         Some(Variant::String(text)) => Ok(text.as_ref().to_owned()),
         _ => Err(StatusCode::BadInvalidArgument.into()),
     }
 }
 
-fn state(order: &Order) -> State {
+fn state(order: &KeptJobOrder) -> State {
     State {
         path: RelativePath::default(),
         text: LocalizedText::new("en", order.state.name()),
@@ -278,7 +278,7 @@ fn state(order: &Order) -> State {
     }
 }
 
-fn response(order: &Order) -> JobResponse {
+fn response(order: &KeptJobOrder) -> JobResponse {
     let progress = order.progress.as_ref();
     let time = |ms: u64| {
         DateTime::from(
@@ -322,15 +322,15 @@ fn parameter(name: &str, value: &Json) -> Parameter {
     }
 }
 
-const COMMANDS: [(&str, Command); 8] = [
-    ("Start", Command::Start),
-    ("RevokeStart", Command::RevokeStart),
-    ("Pause", Command::Pause),
-    ("Resume", Command::Resume),
-    ("Stop", Command::Stop),
-    ("Abort", Command::Abort),
-    ("Cancel", Command::Cancel),
-    ("Clear", Command::Clear),
+const COMMANDS: [(&str, JobCommand); 8] = [
+    ("Start", JobCommand::Start),
+    ("RevokeStart", JobCommand::RevokeStart),
+    ("Pause", JobCommand::Pause),
+    ("Resume", JobCommand::Resume),
+    ("Stop", JobCommand::Stop),
+    ("Abort", JobCommand::Abort),
+    ("Cancel", JobCommand::Cancel),
+    ("Clear", JobCommand::Clear),
 ];
 const POLL: Duration = Duration::from_millis(200);
 /// Ticks of 100 ns from 1601 to 1970.

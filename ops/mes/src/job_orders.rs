@@ -48,7 +48,7 @@ impl OrderState {
 
 /// The status that a command returns.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Status {
+pub(crate) enum CommandStatus {
     Good,
     UnknownOrder,
     /// The command does not fit the state.
@@ -58,7 +58,7 @@ pub(crate) enum Status {
     InvalidRequest,
 }
 
-impl Status {
+impl CommandStatus {
     /// Returns the bit field of OPC 10031-4.
     pub(crate) const fn bits(self) -> u64 {
         match self {
@@ -117,7 +117,7 @@ pub(crate) enum JobOutcome {
 
 /// A job order.
 #[derive(Debug, Clone, PartialEq)]
-pub(crate) struct Order {
+pub(crate) struct KeptJobOrder {
     pub(crate) order: JobOrder,
     pub(crate) state: OrderState,
     pub(crate) progress: Option<JobProgress>,
@@ -129,13 +129,13 @@ pub(crate) struct Order {
     wanted: Option<OrderState>,
 }
 
-impl Order {
+impl KeptJobOrder {
     fn id(&self) -> &str {
         self.order.id.as_ref()
     }
 }
 
-impl Order {
+impl KeptJobOrder {
     /// Restores a job order of an earlier run of the program. Nothing is started again: an order
     /// that was allowed to start may have been started, so its outcome is unknown.
     pub(crate) fn restored(
@@ -170,13 +170,13 @@ impl Order {
 /// The job orders of the MES.
 #[derive(Debug, Default)]
 pub(crate) struct Orders {
-    all: Vec<Order>,
+    all: Vec<KeptJobOrder>,
     file: Option<OrderFile>,
 }
 
 /// A command for a job order.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Command {
+pub(crate) enum JobCommand {
     Start,
     RevokeStart,
     Pause,
@@ -189,14 +189,14 @@ pub(crate) enum Command {
 
 impl Orders {
     /// Creates the job orders of a file, which stores each change.
-    pub(crate) fn of_file((file, all): (OrderFile, Vec<Order>)) -> Self {
+    pub(crate) fn of_file((file, all): (OrderFile, Vec<KeptJobOrder>)) -> Self {
         Self {
             all,
             file: Some(file),
         }
     }
 
-    pub(crate) fn all(&self) -> &[Order] {
+    pub(crate) fn all(&self) -> &[KeptJobOrder] {
         &self.all
     }
 
@@ -213,20 +213,20 @@ impl Orders {
     }
 
     /// Returns the job order with an ID.
-    pub(crate) fn order(&self, id: &str) -> Option<&Order> {
+    pub(crate) fn order(&self, id: &str) -> Option<&KeptJobOrder> {
         self.all.iter().find(|order| order.id() == id)
     }
 
     /// Stores a job order.
-    pub(crate) fn store(&mut self, order: JobOrder, runs: &dyn JobRuns) -> Status {
+    pub(crate) fn store(&mut self, order: JobOrder, runs: &dyn JobRuns) -> CommandStatus {
         let process = match process_of(&order, runs) {
             Ok(process) => process,
             Err(status) => return status,
         };
         if self.order(order.id.as_ref()).is_some() || self.all.len() >= MOST_ORDERS {
-            return Status::UnableToAccept;
+            return CommandStatus::UnableToAccept;
         }
-        self.all.push(Order {
+        self.all.push(KeptJobOrder {
             order,
             state: OrderState::NotAllowedToStart,
             progress: None,
@@ -236,20 +236,20 @@ impl Orders {
             wanted: None,
         });
         if self.keep() {
-            return Status::Good;
+            return CommandStatus::Good;
         }
         self.all.pop();
-        Status::UnableToAccept
+        CommandStatus::UnableToAccept
     }
 
     /// Replaces a job order that has not been started.
-    pub(crate) fn update(&mut self, order: JobOrder, runs: &dyn JobRuns) -> Status {
+    pub(crate) fn update(&mut self, order: JobOrder, runs: &dyn JobRuns) -> CommandStatus {
         let mut all = self.all.iter_mut();
         let Some(known) = all.find(|known| known.order.id == order.id) else {
-            return Status::UnknownOrder;
+            return CommandStatus::UnknownOrder;
         };
         if known.job.is_some() || known.state.number() > OrderState::AllowedToStart.number() {
-            return Status::InvalidState;
+            return CommandStatus::InvalidState;
         }
         match process_of(&order, runs) {
             Ok(process) => {
@@ -262,40 +262,45 @@ impl Orders {
     }
 
     /// Executes a command.
-    pub(crate) fn command(&mut self, id: &str, command: Command, runs: &dyn JobRuns) -> Status {
+    pub(crate) fn command(
+        &mut self,
+        id: &str,
+        command: JobCommand,
+        runs: &dyn JobRuns,
+    ) -> CommandStatus {
         use OrderState::{
             Aborted, AllowedToStart, Ended, Interrupted, NotAllowedToStart, Paused, Running,
         };
         let Some(place) = self.all.iter().position(|order| order.id() == id) else {
-            return Status::UnknownOrder;
+            return CommandStatus::UnknownOrder;
         };
         let Some(order) = self.all.get_mut(place) else {
-            return Status::UnknownOrder;
+            return CommandStatus::UnknownOrder;
         };
         let before = order.clone();
         match (command, order.state) {
             // It is stored before anything starts: after a restart it may have been started.
-            (Command::Start, NotAllowedToStart) => {
+            (JobCommand::Start, NotAllowedToStart) => {
                 order.state = AllowedToStart;
                 let kept = self.kept_or(before);
-                if kept != Status::Good {
+                if kept != CommandStatus::Good {
                     return kept;
                 }
             }
-            (Command::RevokeStart, AllowedToStart) => order.state = NotAllowedToStart,
-            (Command::Cancel, NotAllowedToStart | AllowedToStart)
-            | (Command::Clear, Ended | Aborted) => drop(self.all.remove(place)),
-            (Command::Abort, NotAllowedToStart | AllowedToStart) => order.state = Aborted,
-            (Command::Stop | Command::Abort, Running | Paused) => {
+            (JobCommand::RevokeStart, AllowedToStart) => order.state = NotAllowedToStart,
+            (JobCommand::Cancel, NotAllowedToStart | AllowedToStart)
+            | (JobCommand::Clear, Ended | Aborted) => drop(self.all.remove(place)),
+            (JobCommand::Abort, NotAllowedToStart | AllowedToStart) => order.state = Aborted,
+            (JobCommand::Stop | JobCommand::Abort, Running | Paused) => {
                 let progress = order.job.and_then(|job| runs.progress(job));
                 let is_running = |of: &JobProgress| of.outcome == JobOutcome::Running;
                 // A stop gives back the components of a run with an unknown outcome, which the
                 // client has not seen yet.
                 if !progress.as_ref().is_some_and(is_running) {
                     self.poll(runs);
-                    return Status::InvalidState;
+                    return CommandStatus::InvalidState;
                 }
-                let end = if command == Command::Stop {
+                let end = if command == JobCommand::Stop {
                     Ended
                 } else {
                     Aborted
@@ -304,40 +309,40 @@ impl Orders {
                 order.job.into_iter().for_each(|job| runs.stop(job));
             }
             // Someone has looked at the machines.
-            (Command::Stop | Command::Abort, Interrupted) => {
+            (JobCommand::Stop | JobCommand::Abort, Interrupted) => {
                 order.job.take().into_iter().for_each(|job| runs.stop(job));
-                order.state = if command == Command::Stop {
+                order.state = if command == JobCommand::Stop {
                     Ended
                 } else {
                     Aborted
                 };
             }
-            (Command::Pause, Running) | (Command::Resume, Running | Paused) => {
-                let is_paused = command == Command::Pause;
+            (JobCommand::Pause, Running) | (JobCommand::Resume, Running | Paused) => {
+                let is_paused = command == JobCommand::Pause;
                 // A composite cannot be paused between its steps.
                 if !order.job.is_some_and(|job| runs.pause(job, is_paused)) {
-                    return Status::UnableToAccept;
+                    return CommandStatus::UnableToAccept;
                 }
             }
-            (Command::Resume, Interrupted) => return Status::UnableToAccept,
-            _ => return Status::InvalidState,
+            (JobCommand::Resume, Interrupted) => return CommandStatus::UnableToAccept,
+            _ => return CommandStatus::InvalidState,
         }
         if !self.poll(runs) {
             self.keep();
         }
-        Status::Good
+        CommandStatus::Good
     }
 
     /// Stores a changed order, or restores it as it was before.
-    fn kept_or(&mut self, before: Order) -> Status {
+    fn kept_or(&mut self, before: KeptJobOrder) -> CommandStatus {
         if self.keep() {
-            return Status::Good;
+            return CommandStatus::Good;
         }
         let mut all = self.all.iter_mut();
         if let Some(known) = all.find(|known| known.order.id == before.order.id) {
             *known = before;
         }
-        Status::UnableToAccept
+        CommandStatus::UnableToAccept
     }
 
     /// Starts the job orders that are allowed to start, follows the runs, and stores changes.
@@ -396,10 +401,10 @@ impl Orders {
 }
 
 /// Returns the process of a job order.
-fn process_of(order: &JobOrder, runs: &dyn JobRuns) -> Result<String, Status> {
+fn process_of(order: &JobOrder, runs: &dyn JobRuns) -> Result<String, CommandStatus> {
     let id = order.id.as_ref();
     if id.is_empty() || id.len() > LONGEST_ID {
-        return Err(Status::InvalidRequest);
+        return Err(CommandStatus::InvalidRequest);
     }
     // Nothing that a client requires is left out without a word.
     let is_empty = |count: Option<usize>| count.unwrap_or_default() == 0;
@@ -411,7 +416,7 @@ fn process_of(order: &JobOrder, runs: &dyn JobRuns) -> Result<String, Status> {
         order.material.as_ref().map(|array| array.0.len()),
     ];
     if !counts.into_iter().all(is_empty) || order.start.is_some() {
-        return Err(Status::UnableToAccept);
+        return Err(CommandStatus::UnableToAccept);
     }
     let masters = order.work_masters.iter().flat_map(|array| &array.0);
     let mut known = masters.filter(|master| {
@@ -419,7 +424,7 @@ fn process_of(order: &JobOrder, runs: &dyn JobRuns) -> Result<String, Status> {
         parameters == 0 && runs.is_process(master.id.as_ref())
     });
     let process = known.next().map(|master| master.id.as_ref().to_owned());
-    process.ok_or(Status::UnableToAccept)
+    process.ok_or(CommandStatus::UnableToAccept)
 }
 
 /// Maximum number of job orders.
@@ -500,40 +505,55 @@ mod tests {
     fn commands_follow_the_states() {
         let runs = Fakes::default();
         let mut orders = Orders::default();
-        assert_eq!(orders.store(job_order("one", "urn:p"), &runs), Status::Good);
         assert_eq!(
             orders.store(job_order("one", "urn:p"), &runs),
-            Status::UnableToAccept
+            CommandStatus::Good
+        );
+        assert_eq!(
+            orders.store(job_order("one", "urn:p"), &runs),
+            CommandStatus::UnableToAccept
         );
         assert_eq!(
             orders.store(job_order("two", "urn:q"), &runs),
-            Status::UnableToAccept
+            CommandStatus::UnableToAccept
         );
         assert_eq!(
             orders.store(job_order("", "urn:p"), &runs),
-            Status::InvalidRequest
+            CommandStatus::InvalidRequest
         );
         assert_eq!(
-            orders.command("two", Command::Start, &runs),
-            Status::UnknownOrder
+            orders.command("two", JobCommand::Start, &runs),
+            CommandStatus::UnknownOrder
         );
         for command in [
-            Command::Stop,
-            Command::Clear,
-            Command::RevokeStart,
-            Command::Pause,
+            JobCommand::Stop,
+            JobCommand::Clear,
+            JobCommand::RevokeStart,
+            JobCommand::Pause,
         ] {
-            assert_eq!(orders.command("one", command, &runs), Status::InvalidState);
+            assert_eq!(
+                orders.command("one", command, &runs),
+                CommandStatus::InvalidState
+            );
         }
-        assert_eq!(orders.command("one", Command::Start, &runs), Status::Good);
+        assert_eq!(
+            orders.command("one", JobCommand::Start, &runs),
+            CommandStatus::Good
+        );
         assert_eq!(state(&orders), OrderState::Running);
-        for command in [Command::Start, Command::Cancel, Command::Clear] {
-            assert_eq!(orders.command("one", command, &runs), Status::InvalidState);
+        for command in [JobCommand::Start, JobCommand::Cancel, JobCommand::Clear] {
+            assert_eq!(
+                orders.command("one", command, &runs),
+                CommandStatus::InvalidState
+            );
         }
         *runs.outcome.lock().unwrap() = Some(JobOutcome::Done);
         assert!(orders.poll(&runs));
         assert_eq!(state(&orders), OrderState::Ended);
-        assert_eq!(orders.command("one", Command::Clear, &runs), Status::Good);
+        assert_eq!(
+            orders.command("one", JobCommand::Clear, &runs),
+            CommandStatus::Good
+        );
         assert!(orders.all().is_empty());
         assert_eq!(
             *runs.calls.lock().unwrap(),
@@ -548,20 +568,29 @@ mod tests {
         let mut orders = Orders::default();
         orders.store(job_order("one", "urn:p"), &runs);
         assert_eq!(
-            orders.command("one", Command::Resume, &runs),
-            Status::InvalidState
+            orders.command("one", JobCommand::Resume, &runs),
+            CommandStatus::InvalidState
         );
-        orders.command("one", Command::Start, &runs);
-        assert_eq!(orders.command("one", Command::Pause, &runs), Status::Good);
+        orders.command("one", JobCommand::Start, &runs);
+        assert_eq!(
+            orders.command("one", JobCommand::Pause, &runs),
+            CommandStatus::Good
+        );
         assert_eq!(state(&orders).number(), 4);
         assert_eq!(
-            orders.command("one", Command::Pause, &runs),
-            Status::InvalidState
+            orders.command("one", JobCommand::Pause, &runs),
+            CommandStatus::InvalidState
         );
-        assert_eq!(orders.command("one", Command::Resume, &runs), Status::Good);
+        assert_eq!(
+            orders.command("one", JobCommand::Resume, &runs),
+            CommandStatus::Good
+        );
         assert_eq!(state(&orders), OrderState::Running);
-        orders.command("one", Command::Pause, &runs);
-        assert_eq!(orders.command("one", Command::Stop, &runs), Status::Good);
+        orders.command("one", JobCommand::Pause, &runs);
+        assert_eq!(
+            orders.command("one", JobCommand::Stop, &runs),
+            CommandStatus::Good
+        );
         *runs.outcome.lock().unwrap() = Some(JobOutcome::Failed);
         orders.poll(&runs);
         assert_eq!(state(&orders), OrderState::Ended);
@@ -577,15 +606,18 @@ mod tests {
         let runs = Fakes::default();
         let mut orders = open();
         for id in ["one", "stored", "done", "waits", "gone"] {
-            assert_eq!(orders.store(job_order(id, "urn:p"), &runs), Status::Good);
+            assert_eq!(
+                orders.store(job_order(id, "urn:p"), &runs),
+                CommandStatus::Good
+            );
         }
-        orders.command("done", Command::Start, &runs);
+        orders.command("done", JobCommand::Start, &runs);
         *runs.outcome.lock().unwrap() = Some(JobOutcome::Done);
         orders.poll(&runs);
-        orders.command("one", Command::Start, &runs);
+        orders.command("one", JobCommand::Start, &runs);
         *runs.is_busy.lock().unwrap() = true;
-        orders.command("waits", Command::Start, &runs);
-        orders.command("gone", Command::Cancel, &runs);
+        orders.command("waits", JobCommand::Start, &runs);
+        orders.command("gone", JobCommand::Cancel, &runs);
         drop(orders);
         *runs.is_busy.lock().unwrap() = false;
         runs.calls.lock().unwrap().clear();
@@ -603,10 +635,13 @@ mod tests {
         let done = orders.order("done").unwrap();
         assert!(done.progress.is_some() && done.order == job_order("done", "urn:p"));
         assert_eq!(
-            orders.command("one", Command::Resume, &runs),
-            Status::UnableToAccept
+            orders.command("one", JobCommand::Resume, &runs),
+            CommandStatus::UnableToAccept
         );
-        assert_eq!(orders.command("one", Command::Abort, &runs), Status::Good);
+        assert_eq!(
+            orders.command("one", JobCommand::Abort, &runs),
+            CommandStatus::Good
+        );
         assert!(runs.calls.lock().unwrap().is_empty(), "nothing was started");
         drop(orders);
         assert_eq!(open().order("one").unwrap().state, OrderState::Aborted);
@@ -619,11 +654,14 @@ mod tests {
         *runs.is_busy.lock().unwrap() = true;
         let mut orders = Orders::default();
         orders.store(job_order("one", "urn:p"), &runs);
-        assert_eq!(orders.command("one", Command::Start, &runs), Status::Good);
+        assert_eq!(
+            orders.command("one", JobCommand::Start, &runs),
+            CommandStatus::Good
+        );
         assert_eq!(state(&orders), OrderState::AllowedToStart);
         assert_eq!(
-            orders.command("one", Command::RevokeStart, &runs),
-            Status::Good
+            orders.command("one", JobCommand::RevokeStart, &runs),
+            CommandStatus::Good
         );
         *runs.is_busy.lock().unwrap() = false;
         orders.poll(&runs);
@@ -634,23 +672,23 @@ mod tests {
     #[test]
     fn a_stop_ends_the_order_only_when_the_end_is_confirmed() {
         for (command, end) in [
-            (Command::Stop, OrderState::Ended),
-            (Command::Abort, OrderState::Aborted),
+            (JobCommand::Stop, OrderState::Ended),
+            (JobCommand::Abort, OrderState::Aborted),
         ] {
             let runs = Fakes::default();
             let mut orders = Orders::default();
             orders.store(job_order("one", "urn:p"), &runs);
-            orders.command("one", Command::Start, &runs);
-            assert_eq!(orders.command("one", command, &runs), Status::Good);
+            orders.command("one", JobCommand::Start, &runs);
+            assert_eq!(orders.command("one", command, &runs), CommandStatus::Good);
             assert_eq!(state(&orders), OrderState::Running, "it still runs");
             *runs.outcome.lock().unwrap() = Some(JobOutcome::Unknown);
             orders.poll(&runs);
             assert_eq!(state(&orders), OrderState::Interrupted);
             assert_eq!(
-                orders.command("one", Command::Resume, &runs),
-                Status::UnableToAccept
+                orders.command("one", JobCommand::Resume, &runs),
+                CommandStatus::UnableToAccept
             );
-            assert_eq!(orders.command("one", command, &runs), Status::Good);
+            assert_eq!(orders.command("one", command, &runs), CommandStatus::Good);
             assert_eq!(state(&orders), end);
             assert_eq!(
                 *runs.calls.lock().unwrap(),
@@ -669,11 +707,11 @@ mod tests {
             let runs = Fakes::default();
             let mut orders = Orders::default();
             orders.store(job_order("one", "urn:p"), &runs);
-            orders.command("one", Command::Start, &runs);
+            orders.command("one", JobCommand::Start, &runs);
             *runs.outcome.lock().unwrap() = Some(outcome);
             assert_eq!(
-                orders.command("one", Command::Stop, &runs),
-                Status::InvalidState
+                orders.command("one", JobCommand::Stop, &runs),
+                CommandStatus::InvalidState
             );
             assert_eq!(state(&orders), shown);
             assert_eq!(*runs.calls.lock().unwrap(), ["start urn:p"]);
@@ -689,11 +727,11 @@ mod tests {
             parameters: Some(OptionalArray(vec![parameter])),
             ..job_order("one", "urn:p")
         };
-        assert_eq!(orders.store(with, &runs), Status::UnableToAccept);
+        assert_eq!(orders.store(with, &runs), CommandStatus::UnableToAccept);
         let empty = JobOrder {
             parameters: Some(OptionalArray(Vec::new())),
             ..job_order("one", "urn:p")
         };
-        assert_eq!(orders.store(empty, &runs), Status::Good);
+        assert_eq!(orders.store(empty, &runs), CommandStatus::Good);
     }
 }

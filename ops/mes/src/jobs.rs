@@ -5,19 +5,19 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use async_trait::async_trait;
 use serde::Serialize;
-use skills::Teller;
+use skills::JobObserver;
 use tokio::runtime::Handle;
 use tokio::sync::watch;
 
-use crate::cell::{Cell, now};
+use crate::cell::{PlantState, now};
 use crate::execute::{Plant, execute_pausable};
 use crate::job_orders::{JobOutcome, JobProgress, JobRuns};
-use crate::process::Job as Work;
-use crate::record::{How, Run};
+use crate::process::StepJob as Work;
+use crate::record::{How, ProcessRun};
 
 /// The jobs.
-pub(crate) struct Jobs {
-    cell: Arc<Cell>,
+pub(crate) struct ProcessJobs {
+    cell: Arc<PlantState>,
     runtime: Handle,
     all: Arc<Mutex<BTreeMap<u64, Job>>>,
 }
@@ -49,9 +49,9 @@ struct Job {
     pause: watch::Sender<bool>,
 }
 
-impl Jobs {
+impl ProcessJobs {
     /// Creates the jobs of a plant, which run in this runtime.
-    pub(crate) fn new(cell: Arc<Cell>, runtime: Handle) -> Self {
+    pub(crate) fn new(cell: Arc<PlantState>, runtime: Handle) -> Self {
         Self {
             cell,
             runtime,
@@ -60,7 +60,7 @@ impl Jobs {
     }
 }
 
-impl knowledge::Jobs for Jobs {
+impl knowledge::JobRunner for ProcessJobs {
     fn start(&self, process: &str) -> Result<Option<u64>, String> {
         let process = self.cell.process(process)?;
         let number = self.cell.next_run();
@@ -141,18 +141,18 @@ impl knowledge::Jobs for Jobs {
     }
 }
 
-impl JobRuns for Jobs {
+impl JobRuns for ProcessJobs {
     fn is_process(&self, process: &str) -> bool {
         let known = self.cell.processes();
         known.all.iter().any(|known| known.iri == process)
     }
 
     fn start(&self, process: &str) -> Result<Option<u64>, String> {
-        knowledge::Jobs::start(self, process)
+        knowledge::JobRunner::start(self, process)
     }
 
     fn stop(&self, job: u64) {
-        knowledge::Jobs::stop(self, job);
+        knowledge::JobRunner::stop(self, job);
     }
 
     fn pause(&self, job: u64, is_paused: bool) -> bool {
@@ -204,7 +204,7 @@ impl Job {
     }
 }
 
-fn ended(all: &Mutex<BTreeMap<u64, Job>>, number: u64, run: Run, holds: Vec<String>) {
+fn ended(all: &Mutex<BTreeMap<u64, Job>>, number: u64, run: ProcessRun, holds: Vec<String>) {
     if let Some(job) = locked(all).get_mut(&number) {
         job.paused = false;
         job.outcome = run.outcome;
@@ -228,7 +228,7 @@ struct Telling {
 }
 
 #[async_trait]
-impl Teller for Telling {
+impl JobObserver for Telling {
     async fn step(&self, step: &'static str) {
         if let Some(job) = locked(&self.all).get_mut(&self.number) {
             job.step = Some(step.to_owned());

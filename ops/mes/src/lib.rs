@@ -46,29 +46,29 @@ use std::time::Duration;
 use bridge_node::{
     Arguments, Context, Failure, FailureKind, KeyService, Made, Owned, Program, WithoutMapping,
 };
-use knowledge::{Endpoint, Knowledge, Limits, May, SourceFiles, Writes};
+use knowledge::{HttpEndpoint, Knowledge, May, QueryLimits, SourceFiles, Writes};
 use mappings::{Mapping, SpaceId};
 use plant_opcua::enrolment::GdsArguments;
-use plant_opcua::users::{self, Access, Role};
+use plant_opcua::users::{self, UserAccess, UserRole};
 use skills::yaml::Place;
 use skills::{
-    ClientOptions, Component, Driver, DriverSetup, Lds, LocalRun, Owner, Runs as _, Security,
-    Skill, SkillSetup, TypeName, Value,
+    ClientOptions, Component, ComponentSecurity, Driver, DriverSetup, Lds, LocalRun, ParameterType,
+    RunnableSkill as _, Skill, SkillOwner, SkillSetup, SkillValue,
 };
 use tokio::runtime::Handle;
 use tokio::signal::unix::{SignalKind, signal};
 use tracing::{error, info, warn};
-use ua_component::{ComponentPort, Options, made};
+use ua_component::{ComponentOptions, ComponentPort, made};
 
-use crate::cell::Cell;
+use crate::cell::PlantState;
 use crate::execution_skill::ExecuteProcess;
 use crate::job_control::JobControl;
 use crate::job_orders::Orders;
-use crate::jobs::Jobs;
+use crate::jobs::ProcessJobs;
 use crate::locate_skill::LocateObject;
 use crate::order_file::OrderFile;
 use crate::settings::{Connect, Settings};
-use crate::sources::Sources;
+use crate::sources::MesSources;
 
 /// The semantic MES: knows the components of the plant, answers questions about them, and runs processes with them.
 #[derive(Debug, clap::Parser)]
@@ -119,16 +119,16 @@ struct UaMes {
     #[arg(skip)]
     ready: OnceLock<Ready>,
     #[arg(skip)]
-    serving: OnceLock<Endpoint>,
+    serving: OnceLock<HttpEndpoint>,
 }
 
 /// The objects created from the YAML.
 struct Ready {
     settings: Settings,
     component: Component,
-    cell: Arc<Cell>,
+    cell: Arc<PlantState>,
     knowledge: Arc<Knowledge>,
-    options: Options,
+    options: ComponentOptions,
 }
 
 impl std::fmt::Debug for Ready {
@@ -171,7 +171,7 @@ impl UaMes {
         }
         let settings = self.settings()?;
         let knowledge = Arc::new(self.knowledge(&settings)?);
-        let sources = Arc::new(Sources::new(Arc::clone(&knowledge)));
+        let sources = Arc::new(MesSources::new(Arc::clone(&knowledge)));
         sources.read(&settings);
         let options = self.options(&settings);
         let client = ClientOptions {
@@ -184,7 +184,12 @@ impl UaMes {
             ..ClientOptions::default()
         };
         let prefer = settings.prefer.clone();
-        let cell = Arc::new(Cell::new(Arc::clone(&knowledge), sources, client, prefer));
+        let cell = Arc::new(PlantState::new(
+            Arc::clone(&knowledge),
+            sources,
+            client,
+            prefer,
+        ));
         if let Some(iri) = self.run.as_deref().filter(|iri| cell.process(iri).is_err()) {
             return Err(Failure::new(
                 FailureKind::Usage,
@@ -230,10 +235,10 @@ impl UaMes {
     }
 
     /// Returns the handlers of changes over HTTP.
-    fn writes(&self, ready: &Ready, jobs: Arc<Jobs>) -> Result<Writes, Failure> {
+    fn writes(&self, ready: &Ready, jobs: Arc<ProcessJobs>) -> Result<Writes, Failure> {
         let settings = &ready.settings;
         let folder = self.pki_root(settings).join(users::FOLDER);
-        let access = Access::new(Some(folder), settings.sparql.ip().is_loopback());
+        let access = UserAccess::new(Some(folder), settings.sparql.ip().is_loopback());
         let access = access.map_err(|fault| {
             Failure::new(
                 FailureKind::Configuration,
@@ -243,8 +248,8 @@ impl UaMes {
         let access = Arc::new(access);
         Ok(Writes {
             now: cell::now,
-            may: has(&access, Role::Engineer),
-            may_run: has(&access, Role::Operator),
+            may: has(&access, UserRole::Engineer),
+            may_run: has(&access, UserRole::Operator),
             files: Arc::clone(ready.cell.sources()) as Arc<dyn SourceFiles>,
             jobs,
         })
@@ -318,11 +323,13 @@ impl UaMes {
         self.pki.clone().unwrap_or_else(usual)
     }
 
-    fn options(&self, settings: &Settings) -> Options {
-        let is_secured =
-            self.gds.gds.is_some() || settings.security.contains(&Security::Basic256Sha256);
+    fn options(&self, settings: &Settings) -> ComponentOptions {
+        let is_secured = self.gds.gds.is_some()
+            || settings
+                .security
+                .contains(&ComponentSecurity::Basic256Sha256);
         let usual = || self.pki_root(settings);
-        Options {
+        ComponentOptions {
             pki: self.pki.clone().or_else(|| is_secured.then(usual)),
             trust_any_client: self.trust_any_client_certificate,
             mdns: Some(self.interface()),
@@ -335,22 +342,22 @@ impl UaMes {
         }
     }
 
-    fn interface(&self) -> discovery::Interface {
+    fn interface(&self) -> discovery::MdnsInterface {
         let interface = match self.arguments.0.flags.interface.as_deref() {
-            None => discovery::Interface::LOOPBACK,
-            Some(interface) => discovery::Interface::parse(interface),
+            None => discovery::MdnsInterface::LOOPBACK,
+            Some(interface) => discovery::MdnsInterface::parse(interface),
         };
         interface.with_networks(self.networks.iter().copied())
     }
 
     /// Serves queries, and follows the components of the plant.
-    async fn serve(&self, ready: &Ready, jobs: Arc<Jobs>) -> Result<(), Failure> {
+    async fn serve(&self, ready: &Ready, jobs: Arc<ProcessJobs>) -> Result<(), Failure> {
         let page = page(&ready.cell);
         let address = ready.settings.sparql;
-        let endpoint = Endpoint::bind_with(
+        let endpoint = HttpEndpoint::bind_with(
             address,
             Arc::clone(&ready.knowledge),
-            Limits::default(),
+            QueryLimits::default(),
             page,
             Some(self.writes(ready, jobs)?),
         )
@@ -371,7 +378,7 @@ impl UaMes {
         drop(tokio::spawn(self.reload(ready)?));
         let interface = self.interface();
         let only_loopback = self.arguments.0.flags.interface.is_none()
-            || interface == discovery::Interface::LOOPBACK;
+            || interface == discovery::MdnsInterface::LOOPBACK;
         let watcher = discovery::watch(discovery::WatchSettings {
             mdns: Some(interface),
             ..discovery::WatchSettings::default()
@@ -442,11 +449,13 @@ impl Program for UaMes {
     /// Returns a key service with the identity and the certificate store of the MES server.
     fn key_service(&self, _mapping: &Mapping) -> Option<Arc<dyn KeyService>> {
         let settings = &self.ready().ok()?.settings;
-        Some(Arc::new(plant_keys::Service::new(plant_keys::Identity {
-            application_uri: settings.application_uri.clone(),
-            application_name: settings.name.clone(),
-            pki: self.pki_root(settings),
-        })))
+        Some(Arc::new(plant_keys::KeyFetcher::new(
+            plant_keys::KeyClientIdentity {
+                application_uri: settings.application_uri.clone(),
+                application_name: settings.name.clone(),
+                pki: self.pki_root(settings),
+            },
+        )))
     }
 
     fn owned(mapping: &Mapping) -> Owned {
@@ -459,7 +468,7 @@ impl Program for UaMes {
 
     async fn start(&self, _context: Context) -> Result<ComponentPort, Failure> {
         let ready = self.ready()?;
-        let jobs = Arc::new(Jobs::new(Arc::clone(&ready.cell), Handle::current()));
+        let jobs = Arc::new(ProcessJobs::new(Arc::clone(&ready.cell), Handle::current()));
         self.serve(ready, Arc::clone(&jobs)).await?;
         let folder = self.store.as_ref().or(ready.settings.store.as_ref());
         let orders = match folder {
@@ -473,7 +482,7 @@ impl Program for UaMes {
         let control = JobControl::new(jobs, orders, Handle::current());
         let gds = self.gds.invitation();
         let gds = gds.map_err(|fault| Failure::new(FailureKind::Usage, fault.to_string()))?;
-        let options = Options {
+        let options = ComponentOptions {
             extension: Some(Arc::new(control)),
             gds,
             ..ready.options.clone()
@@ -487,7 +496,7 @@ impl Program for UaMes {
 }
 
 /// Returns the check that a user has a role. Without any user, programs of this host have it.
-fn has(access: &Arc<Access>, role: Role) -> May {
+fn has(access: &Arc<UserAccess>, role: UserRole) -> May {
     let access = Arc::clone(access);
     Arc::new(move |user| {
         let access = Arc::clone(&access);
@@ -496,9 +505,9 @@ fn has(access: &Arc<Access>, role: Role) -> May {
             match user {
                 Some((name, password)) => {
                     let roles = access.roles_by_password(&name, &password, "SPARQL").await;
-                    roles.contains(role) || roles.contains(Role::Engineer)
+                    roles.contains(role) || roles.contains(UserRole::Engineer)
                 }
-                None => access.roles_of_anonymous().contains(Role::Operator),
+                None => access.roles_of_anonymous().contains(UserRole::Operator),
             }
         })
     })
@@ -508,7 +517,7 @@ fn has(access: &Arc<Access>, role: Role) -> May {
 fn component(settings: &Settings, driver: ExecuteProcess, locator: LocateObject) -> Component {
     let skill = |name: &str, driver: Arc<dyn Driver>| SkillSetup {
         name: name.to_owned(),
-        skill_type: TypeName::own(&format!("{name}SkillType")),
+        skill_type: ParameterType::own(&format!("{name}SkillType")),
         driver: DriverSetup::Given(driver),
         capabilities: Vec::new(),
         timeout: None,
@@ -555,7 +564,7 @@ fn read_settings(file: &Path) -> Result<Settings, String> {
 
 /// Returns the pages `/status`, `/plan/IRI` and `/goal/IRI`. `/plan/` shows the plan that would be
 /// run, with its reasons; `/goal/` the sequence that reaches a goal, with its proof.
-fn page(cell: &Arc<Cell>) -> knowledge::Page {
+fn page(cell: &Arc<PlantState>) -> knowledge::ExtraPages {
     let cell = Arc::clone(cell);
     Arc::new(move |path| {
         if path == "/status" {
@@ -581,9 +590,9 @@ fn page(cell: &Arc<Cell>) -> knowledge::Page {
 async fn run_process(skill: Skill, iri: String) {
     let run = LocalRun {
         skill,
-        by: Owner::Local("the command line"),
+        by: SkillOwner::Local("the command line"),
     };
-    let parameters = vec![("ProcessIri".to_owned(), Value::String(iri.clone()))];
+    let parameters = vec![("ProcessIri".to_owned(), SkillValue::String(iri.clone()))];
     // The run itself logs its end.
     if let Err(fault) = run.run(parameters, RUN).await {
         error!(process = iri, "cannot run the process: {fault}");

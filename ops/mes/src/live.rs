@@ -4,10 +4,13 @@ use std::collections::{BTreeMap, HashMap};
 use std::sync::Arc;
 use std::time::Duration;
 
-use knowledge::{Answer, Knowledge, Lasting, NodeName, Source, SourceKind, vocabulary as v};
+use knowledge::{
+    Knowledge, KnowledgeSource, NodeName, QuestionAnswer, SourceKind, SourceLifetime,
+    vocabulary as v,
+};
 use mtp::state::{Command, State as ServiceState};
 use mtp::{Object, Triple};
-use plant_opcua::client::{Client, ClientConfig, Notice, Watch};
+use plant_opcua::client::{ClientConfig, MonitoredWatch, Notice, OpcUaClient};
 use plant_opcua::types::{NodeId, Variant};
 use skills::{ClientOptions, FoundSkill, SkillClient, from_variant};
 use tokio::task::{Id, JoinSet};
@@ -24,13 +27,13 @@ pub(crate) async fn skills(
     (name, found): (&str, &[FoundSkill]),
     iri: impl Fn(&FoundSkill) -> Option<String>,
 ) {
-    let source = Source::new(SourceKind::State, name);
+    let source = KnowledgeSource::new(SourceKind::State, name);
     let _forgotten = Forgotten {
         knowledge,
         source: &source,
     };
     let mut states = client.states(found);
-    let mut known: BTreeMap<String, program::State> = BTreeMap::new();
+    let mut known: BTreeMap<String, program::ProgramMachineState> = BTreeMap::new();
     loop {
         let next = tokio::select! {
             next = states.next() => next,
@@ -55,7 +58,7 @@ pub(crate) async fn skills(
 /// Removes the states of a component or a module when their task ends, also when it is aborted.
 struct Forgotten<'k> {
     knowledge: &'k Knowledge,
-    source: &'k Source,
+    source: &'k KnowledgeSource,
 }
 
 impl Drop for Forgotten<'_> {
@@ -82,8 +85,8 @@ fn of_state(skill: &str, state: &str, (name, value): (&str, i64)) -> Vec<Triple>
     ]
 }
 
-fn publish(knowledge: &Knowledge, source: &Source, triples: &[Triple]) {
-    if let Err(fault) = knowledge.replace_with(source, triples, (now(), Lasting::No)) {
+fn publish(knowledge: &Knowledge, source: &KnowledgeSource, triples: &[Triple]) {
+    if let Err(fault) = knowledge.replace_with(source, triples, (now(), SourceLifetime::No)) {
         error!(source = source.name, "cannot publish the states: {fault}");
     }
 }
@@ -150,7 +153,7 @@ pub(crate) async fn module(
             };
             let connection = Connection {
                 knowledge: Arc::clone(&knowledge),
-                source: Source::new(SourceKind::State, &name),
+                source: KnowledgeSource::new(SourceKind::State, &name),
                 module: module.name.clone(),
                 endpoint: endpoint.clone(),
                 pause: pauses.get(&endpoint).copied().unwrap_or(AGAIN),
@@ -199,7 +202,7 @@ fn by_endpoint(
 /// A connection to a server of a module.
 struct Connection {
     knowledge: Arc<Knowledge>,
-    source: Source,
+    source: KnowledgeSource,
     module: String,
     endpoint: String,
     /// Pause before the next connection.
@@ -221,7 +224,7 @@ impl Connection {
             timeout: options.within,
             ..ClientConfig::new(&options.application_uri, &options.application_name)
         };
-        let client = Client::open(config, &self.endpoint);
+        let client = OpcUaClient::open(config, &self.endpoint);
         let lasted = match client.up(CONNECTS).await {
             Ok(()) => {
                 let began = Instant::now();
@@ -237,7 +240,7 @@ impl Connection {
     }
 
     /// Publishes the states of services until the connection is lost.
-    async fn connected(&self, client: &Client, services: &mut BTreeMap<String, Watched>) {
+    async fn connected(&self, client: &OpcUaClient, services: &mut BTreeMap<String, Watched>) {
         let _forgotten = Forgotten {
             knowledge: &self.knowledge,
             source: &self.source,
@@ -272,7 +275,7 @@ fn services(knowledge: &Knowledge, module: &str) -> BTreeMap<String, Watched> {
     let mut services: BTreeMap<String, Watched> = BTreeMap::new();
     let start = format!("{module}/service/");
     for row in ask("state-of") {
-        let skill = Answer::text(&row, "skill");
+        let skill = QuestionAnswer::text(&row, "skill");
         let Some((service, _)) = skill.split_once("/procedure/") else {
             continue;
         };
@@ -281,16 +284,16 @@ fn services(knowledge: &Knowledge, module: &str) -> BTreeMap<String, Watched> {
         }
         let watched = services.entry(service.to_owned()).or_default();
         watched.skills.push(skill.to_owned());
-        Answer::text(&row, "endpoint").clone_into(&mut watched.endpoint);
-        watched.state = node_name(Answer::text(&row, "node"));
+        QuestionAnswer::text(&row, "endpoint").clone_into(&mut watched.endpoint);
+        watched.state = node_name(QuestionAnswer::text(&row, "node"));
     }
     for row in ask("access-of") {
-        let of = Answer::text(&row, "of");
+        let of = QuestionAnswer::text(&row, "of");
         if let Some(service) = of.strip_suffix("/node/CommandEnabled")
             && let Some(watched) = services.get_mut(service)
         {
-            Answer::text(&row, "endpoint").clone_into(&mut watched.commands_endpoint);
-            watched.commands = node_name(Answer::text(&row, "node"));
+            QuestionAnswer::text(&row, "endpoint").clone_into(&mut watched.commands_endpoint);
+            watched.commands = node_name(QuestionAnswer::text(&row, "node"));
         }
     }
     services
@@ -310,9 +313,9 @@ fn node_name(id: &str) -> Option<NodeName> {
 
 /// Returns the nodes of services to watch; for each, the service and whether the node is its state.
 fn watches(
-    client: &Client,
+    client: &OpcUaClient,
     services: &BTreeMap<String, Watched>,
-) -> (Vec<Watch>, Vec<(String, bool)>) {
+) -> (Vec<MonitoredWatch>, Vec<(String, bool)>) {
     let mut watches = Vec::new();
     let mut of = Vec::new();
     for (iri, service) in services {
@@ -323,7 +326,7 @@ fn watches(
                 info!(service = iri, namespace, "the server has no such namespace");
                 continue;
             };
-            watches.push(Watch::Value(id));
+            watches.push(MonitoredWatch::Value(id));
             of.push((iri.clone(), is_state));
         }
     }
@@ -333,8 +336,8 @@ fn watches(
 /// Publishes the states of services until the connection is lost.
 async fn watch(
     knowledge: &Knowledge,
-    client: &Client,
-    source: &Source,
+    client: &OpcUaClient,
+    source: &KnowledgeSource,
     services: &mut BTreeMap<String, Watched>,
 ) {
     let (watches, of) = watches(client, services);
@@ -424,7 +427,7 @@ fn word(value: &Variant) -> Option<u32> {
     u32::try_from(number).ok()
 }
 
-fn node_id(client: &Client, node: &NodeName) -> Option<NodeId> {
+fn node_id(client: &OpcUaClient, node: &NodeName) -> Option<NodeId> {
     let index = match node.namespace.parse() {
         Ok(index) => index,
         Err(_) => client.namespace(&node.namespace)?,
@@ -449,7 +452,7 @@ const QUEUE: usize = 1024;
 
 #[cfg(test)]
 mod tests {
-    use plant_opcua::server::{Server, ServerBuilder, ServerConfig, VariableSpec};
+    use plant_opcua::server::{OpcUaServer, ServerBuilder, ServerConfig, VariableSpec};
     use plant_opcua::types::{
         DataTypeId, DataValue, LocalizedText, ObjectId, QualifiedName, ReferenceTypeId,
         VariableTypeId,
@@ -484,7 +487,7 @@ mod tests {
         let module = mtp::Module::from_bytes(manifest.as_bytes()).unwrap();
         let triples = module.triples("urn:m", &BTreeMap::new());
         let knowledge = Knowledge::new().unwrap();
-        let source = Source::new(SourceKind::Mtp, "stage");
+        let source = KnowledgeSource::new(SourceKind::Mtp, "stage");
         knowledge.replace(&source, &triples, 1).unwrap();
         services(&knowledge, "urn:m")
     }
@@ -517,7 +520,7 @@ mod tests {
     }
 
     /// Starts a server that shows the state of a service.
-    fn serves(service: &str, state: ServiceState) -> Server {
+    fn serves(service: &str, state: ServiceState) -> OpcUaServer {
         const NAMESPACE: &str = "urn:ua-bridge:test:stage";
         let uri = format!("urn:test:{service}");
         let config = ServerConfig::new(&uri, service, "opc.tcp://127.0.0.1:0".parse().unwrap());
@@ -554,7 +557,7 @@ mod tests {
         let manifest = mtp::Module::from_bytes(manifest.as_bytes()).unwrap();
         let triples = manifest.triples("urn:m", &BTreeMap::new());
         let knowledge = Arc::new(Knowledge::new().unwrap());
-        let source = Source::new(SourceKind::Mtp, "stage");
+        let source = KnowledgeSource::new(SourceKind::Mtp, "stage");
         knowledge.replace(&source, &triples, 1).unwrap();
         let watched = WatchedModule {
             name: "stage".to_owned(),
@@ -564,8 +567,13 @@ mod tests {
         let states = || {
             let rows = knowledge.ask("state-of", &[]).unwrap().rows;
             let known = rows.iter().map(|row| {
-                let (service, _) = Answer::text(row, "skill_name").split_once('/').unwrap();
-                (service.to_owned(), Answer::text(row, "state").to_owned())
+                let (service, _) = QuestionAnswer::text(row, "skill_name")
+                    .split_once('/')
+                    .unwrap();
+                (
+                    service.to_owned(),
+                    QuestionAnswer::text(row, "state").to_owned(),
+                )
             });
             let known: BTreeMap<_, _> = known.filter(|(_, state)| !state.is_empty()).collect();
             known

@@ -4,9 +4,9 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use async_trait::async_trait;
-use knowledge::{Answer, Knowledge};
+use knowledge::{Knowledge, QuestionAnswer};
 use serde_json::Value as Json;
-use skills::{Driver, DriverError, Results, Value, Work};
+use skills::{Driver, DriverError, RunResults, SkillValue, Work};
 
 /// Looks up the object of its parameter in the graph.
 pub(crate) struct LocateObject {
@@ -15,7 +15,7 @@ pub(crate) struct LocateObject {
 
 #[async_trait]
 impl Driver for LocateObject {
-    async fn run(&self, work: Work) -> Result<Results, DriverError> {
+    async fn run(&self, work: Work) -> Result<RunResults, DriverError> {
         let id = work.parameters().text("ObjectId").unwrap_or_default();
         let answer = self.knowledge.ask("objects", &[]);
         let answer = answer.map_err(DriverError::device)?;
@@ -35,10 +35,14 @@ enum UnlocatedObject {
 }
 
 /// Returns the results for an object, which is identified by its `ua:objectId` or by its IRI.
-fn located(answer: &Answer, id: &str) -> Result<Results, UnlocatedObject> {
+fn located(answer: &QuestionAnswer, id: &str) -> Result<RunResults, UnlocatedObject> {
     let owned = || id.to_owned();
     let is_it = |row: &&BTreeMap<String, Json>| {
-        [Answer::text(row, "id"), Answer::text(row, "object")].contains(&id)
+        [
+            QuestionAnswer::text(row, "id"),
+            QuestionAnswer::text(row, "object"),
+        ]
+        .contains(&id)
     };
     let mut rows = answer.rows.iter().filter(is_it);
     let row = rows
@@ -59,10 +63,13 @@ fn located(answer: &Answer, id: &str) -> Result<Results, UnlocatedObject> {
     };
     let mass = numbers("mass", 1)?.first().copied().unwrap_or_default();
     Ok(vec![
-        ("Pose".to_owned(), Value::from(numbers("pose", 6)?)),
-        ("Box".to_owned(), Value::from(numbers("box", 3)?)),
-        ("Cylinder".to_owned(), Value::from(numbers("cylinder", 2)?)),
-        ("Mass".to_owned(), Value::from(mass)),
+        ("Pose".to_owned(), SkillValue::from(numbers("pose", 6)?)),
+        ("Box".to_owned(), SkillValue::from(numbers("box", 3)?)),
+        (
+            "Cylinder".to_owned(),
+            SkillValue::from(numbers("cylinder", 2)?),
+        ),
+        ("Mass".to_owned(), SkillValue::from(mass)),
     ])
 }
 
@@ -82,7 +89,7 @@ pub(crate) fn numbers_of(text: &str, count: usize) -> Option<Vec<f64>> {
 
 #[cfg(test)]
 mod tests {
-    use knowledge::{Source, SourceKind};
+    use knowledge::{KnowledgeSource, SourceKind};
 
     use super::*;
 
@@ -97,11 +104,11 @@ mod tests {
     #[test]
     fn an_object_is_found_by_its_id_or_iri_and_others_are_refused_with_the_reason() {
         let knowledge = Knowledge::new().unwrap();
-        let source = Source::new(SourceKind::File, "objects.ttl");
+        let source = KnowledgeSource::new(SourceKind::File, "objects.ttl");
         knowledge.replace_turtle(&source, OBJECTS, 1).unwrap();
         let answer = knowledge.ask("objects", &[]).unwrap();
         let find = |id: &str| located(&answer, id);
-        let value = |results: &Results, name: &str| {
+        let value = |results: &RunResults, name: &str| {
             let mut all = results.iter();
             all.find(|(known, _)| known == name).unwrap().1.as_f64s()
         };
@@ -109,7 +116,7 @@ mod tests {
         let pose = vec![0.4, 0.2, 0.1, 0.0, 0.0, 1.5];
         assert_eq!(value(&found, "Pose"), Some(pose));
         assert_eq!(value(&found, "Box"), Some(vec![0.04, 0.06, 0.05]));
-        assert_eq!(found[3], ("Mass".to_owned(), Value::from(0.2)));
+        assert_eq!(found[3], ("Mass".to_owned(), SkillValue::from(0.2)));
         let bolt = find("urn:test:bolt").unwrap();
         assert_eq!(value(&bolt, "Cylinder"), Some(vec![0.01, 0.04]));
         assert_eq!(value(&bolt, "Box"), Some(vec![0.0; 3]));

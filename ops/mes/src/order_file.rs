@@ -8,7 +8,7 @@ use plant_opcua::job_control::JobOrder;
 use serde::{Deserialize, Serialize};
 use tracing::warn;
 
-use crate::job_orders::{JobProgress, MOST_ORDERS, Order, OrderState};
+use crate::job_orders::{JobProgress, KeptJobOrder, MOST_ORDERS, OrderState};
 
 /// An open file of job orders.
 #[derive(Debug)]
@@ -34,7 +34,7 @@ impl OrderFile {
     ///
     /// # Errors
     /// Fails if the disk cannot be read or written.
-    pub(crate) fn open(folder: &Path) -> io::Result<(Self, Vec<Order>)> {
+    pub(crate) fn open(folder: &Path) -> io::Result<(Self, Vec<KeptJobOrder>)> {
         let file = Self {
             folder: folder.to_owned(),
         };
@@ -60,7 +60,7 @@ impl OrderFile {
     ///
     /// # Errors
     /// Fails if the disk is full or broken; then the file is as before.
-    pub(crate) fn write(&self, orders: &[Order]) -> io::Result<()> {
+    pub(crate) fn write(&self, orders: &[KeptJobOrder]) -> io::Result<()> {
         let stored = orders.iter().map(|order| Stored {
             id: order.order.id.as_ref().to_owned(),
             process: order.process.clone(),
@@ -79,7 +79,7 @@ impl OrderFile {
     }
 }
 
-fn restored(bytes: &[u8]) -> Result<Vec<Order>, String> {
+fn restored(bytes: &[u8]) -> Result<Vec<KeptJobOrder>, String> {
     let stored: Vec<Stored> = serde_json::from_slice(bytes).map_err(|error| error.to_string())?;
     if stored.len() > MOST_ORDERS {
         return Err(format!("it has more than {MOST_ORDERS} orders"));
@@ -87,7 +87,7 @@ fn restored(bytes: &[u8]) -> Result<Vec<Order>, String> {
     let orders = stored.into_iter().map(|stored| {
         let order = JobOrder::from_bytes(&stored.order);
         let order = order.map_err(|why| format!("{}: {why}", stored.id))?;
-        Ok(Order::restored(
+        Ok(KeptJobOrder::restored(
             (order, stored.process),
             stored.state,
             (stored.progress, stored.reason),

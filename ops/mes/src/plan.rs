@@ -6,12 +6,12 @@ mod judging;
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, BTreeSet};
 
-use knowledge::Answer;
+use knowledge::QuestionAnswer;
 use serde::Serialize;
-use skills::TypeName;
-use skills::choosing::{self, Attachment, Rank, choose};
+use skills::ParameterType;
+use skills::choosing::{self, Attachment, CandidateRank, choose};
 
-use crate::process::{By, Group, Job, Need, Process, Role, Step};
+use crate::process::{By, Group, Need, Process, ProcessStep, SkillRole, StepJob};
 
 use judging::Judging;
 
@@ -72,9 +72,9 @@ pub(crate) struct PlannedNeed {
     pub(crate) skill_type: Option<String>,
     /// The IRI of the chosen skill.
     pub(crate) chosen: Option<String>,
-    pub(crate) candidates: Vec<Candidate>,
+    pub(crate) candidates: Vec<PlanCandidate>,
     #[serde(skip)]
-    role_is: Role,
+    role_is: SkillRole,
     /// Whether the component of a completed step has to do it.
     #[serde(skip)]
     is_bound: bool,
@@ -91,7 +91,7 @@ impl PlannedNeed {
             capability: need.capability.clone(),
             skill_type: need.skill_type.as_ref().map(ToString::to_string),
             chosen: Some(offer.skill.clone()),
-            candidates: vec![Candidate {
+            candidates: vec![PlanCandidate {
                 skill: offer.skill.clone(),
                 name: offer.name.clone(),
                 component: offer.component.clone(),
@@ -108,7 +108,7 @@ impl PlannedNeed {
 
 /// A skill that was considered.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
-pub(crate) struct Candidate {
+pub(crate) struct PlanCandidate {
     pub(crate) skill: String,
     pub(crate) name: String,
     pub(crate) component: String,
@@ -120,18 +120,18 @@ pub(crate) struct Candidate {
 impl Offer {
     /// Reads the result of the query `candidates`. `since` returns the time at which a component
     /// entered the graph, by its IRI.
-    pub(crate) fn all(answer: &Answer, since: &dyn Fn(&str) -> u64) -> Vec<Self> {
+    pub(crate) fn all(answer: &QuestionAnswer, since: &dyn Fn(&str) -> u64) -> Vec<Self> {
         let offer = |row| {
-            let text = |column| Answer::text(row, column).to_owned();
+            let text = |column| QuestionAnswer::text(row, column).to_owned();
             let component = text("component");
             Self {
-                is_skill: Answer::text(row, "kind") == "skill",
+                is_skill: QuestionAnswer::text(row, "kind") == "skill",
                 skill: text("skill"),
                 component_name: text("component_name"),
                 name: text("name"),
-                types: Answer::texts(row, "types"),
-                capabilities: Answer::texts(row, "capabilities"),
-                closure: Answer::texts(row, "closure"),
+                types: QuestionAnswer::texts(row, "types"),
+                capabilities: QuestionAnswer::texts(row, "capabilities"),
+                closure: QuestionAnswer::texts(row, "closure"),
                 endpoint: text("endpoint"),
                 node: text("node"),
                 since_ms: since(&component),
@@ -145,7 +145,7 @@ impl Offer {
 /// A step that is done, or its compensation, with the skill that was chosen for it. A later plan
 /// keeps the choice.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) struct Kept {
+pub(crate) struct KeptStep {
     /// The number of the role.
     pub(crate) number: usize,
     pub(crate) offer: Offer,
@@ -157,7 +157,7 @@ pub(crate) struct Situation<'a> {
     /// Failed skills and lost components.
     pub(crate) fallen: &'a [Fallen],
     /// The steps that are done.
-    pub(crate) kept: &'a [Kept],
+    pub(crate) kept: &'a [KeptStep],
     /// The numbers of the steps that were passed without being done.
     pub(crate) passed: &'a [usize],
     /// The components that other runs use, with these runs.
@@ -166,10 +166,10 @@ pub(crate) struct Situation<'a> {
 
 impl Situation<'_> {
     /// Returns whether a role belongs to a step that was passed, or to its compensation.
-    fn is_passed(&self, process: &Process, role: Role) -> bool {
+    fn is_passed(&self, process: &Process, role: SkillRole) -> bool {
         self.passed.iter().any(|number| {
             [*number, process.compensation_of(*number)]
-                .map(Role::Alone)
+                .map(SkillRole::Alone)
                 .contains(&role)
         })
     }
@@ -178,7 +178,7 @@ impl Situation<'_> {
 /// The facts about skills that a plan needs. Each check returns the reason why it fails.
 pub(crate) trait Facts {
     /// Checks that an offer takes the parameters of a step.
-    fn takes(&self, offer: &Offer, step: &Step) -> Result<(), String>;
+    fn takes(&self, offer: &Offer, step: &ProcessStep) -> Result<(), String>;
 
     /// Checks that an offer has the result of a name.
     fn gives(&self, offer: &Offer, result: &str) -> Result<(), String>;
@@ -203,10 +203,10 @@ pub(crate) trait Facts {
 }
 
 /// Returns the rank of an offer for needs.
-fn rank(needs: &[&Need], offer: &Offer, facts: &dyn Facts) -> Rank {
-    Rank {
+fn rank(needs: &[&Need], offer: &Offer, facts: &dyn Facts) -> CandidateRank {
+    CandidateRank {
         attachment: facts.attachment(offer),
-        preference: Rank::preference(facts.prefer(), &offer.component),
+        preference: CandidateRank::preference(facts.prefer(), &offer.component),
         inexact: usize::from(!is_exact(needs, offer)),
         since_ms: offer.since_ms,
         name: offer.component.clone(),
@@ -220,14 +220,14 @@ pub(crate) fn plan(
     situation: Situation<'_>,
     facts: &dyn Facts,
 ) -> Plan {
-    let mut roles: BTreeMap<Role, Vec<&Need>> = BTreeMap::new();
+    let mut roles: BTreeMap<SkillRole, Vec<&Need>> = BTreeMap::new();
     let needs = process.numbered().flat_map(|(_, step)| &step.needs);
     for need in needs.filter(|need| !situation.is_passed(process, need.role)) {
         roles.entry(need.role).or_default().push(need);
     }
     let mut judging = Judging::new(process, situation, facts);
     judging.require_tools(offers);
-    let mut fitting: BTreeMap<Role, Vec<&Offer>> = roles
+    let mut fitting: BTreeMap<SkillRole, Vec<&Offer>> = roles
         .iter()
         .map(|(role, needs)| {
             if let Some(kept) = judging.kept(*role) {
@@ -277,17 +277,17 @@ pub(crate) fn plan(
 /// it, unless the process says otherwise.
 fn bind(
     process: &Process,
-    roles: &BTreeMap<Role, Vec<&Need>>,
-    fitting: &BTreeMap<Role, Vec<&Offer>>,
-) -> BTreeMap<Role, Group> {
-    let mut groups: BTreeMap<Role, Group> =
+    roles: &BTreeMap<SkillRole, Vec<&Need>>,
+    fitting: &BTreeMap<SkillRole, Vec<&Offer>>,
+) -> BTreeMap<SkillRole, Group> {
+    let mut groups: BTreeMap<SkillRole, Group> =
         roles.keys().map(|role| (*role, role.group())).collect();
-    if process.work != Job::Sequence {
+    if process.work != StepJob::Sequence {
         return groups;
     }
     let mut join = |number: usize, with: usize| {
-        let of = |role: Role| groups.get(&role).copied();
-        let (one, other) = (of(Role::Alone(number)), of(Role::Alone(with)));
+        let of = |role: SkillRole| groups.get(&role).copied();
+        let (one, other) = (of(SkillRole::Alone(number)), of(SkillRole::Alone(with)));
         if let (Some(one), Some(other)) = (one, other) {
             for group in groups.values_mut().filter(|group| **group == one) {
                 *group = other;
@@ -295,12 +295,12 @@ fn bind(
         }
     };
     let fits = |number: usize| {
-        let fitting = fitting.get(&Role::Alone(number));
+        let fitting = fitting.get(&SkillRole::Alone(number));
         fitting.into_iter().flatten().copied()
     };
     let is_of = |number: usize, of: &str| {
-        let of = TypeName::own(of);
-        let needs = roles.get(&Role::Alone(number)).into_iter().flatten();
+        let of = ParameterType::own(of);
+        let needs = roles.get(&SkillRole::Alone(number)).into_iter().flatten();
         let is_named = needs
             .clone()
             .any(|need| need.skill_type.as_ref() == Some(&of));
@@ -336,7 +336,7 @@ fn bind(
 
 impl Plan {
     /// Creates the plan of compensations, whose skills were chosen with their steps.
-    pub(crate) fn of<'a>(chosen: impl Iterator<Item = (&'a Step, &'a Offer)>) -> Self {
+    pub(crate) fn of<'a>(chosen: impl Iterator<Item = (&'a ProcessStep, &'a Offer)>) -> Self {
         let why = "it was chosen with the step that it undoes";
         let steps = chosen.map(|(step, offer)| PlannedStep {
             step: step.name.clone(),
@@ -394,14 +394,14 @@ impl Plan {
     }
 
     /// Returns the IRI of the skill for a role.
-    pub(crate) fn chosen(&self, role: Role) -> Option<&str> {
+    pub(crate) fn chosen(&self, role: SkillRole) -> Option<&str> {
         self.needs()
             .find(|(_, need)| need.role_is == role)
             .and_then(|(_, need)| need.chosen.as_deref())
     }
 
     /// Takes back the choice for a role.
-    fn refuse(&mut self, role: Role, why: &str) {
+    fn refuse(&mut self, role: SkillRole, why: &str) {
         let needs = self.steps.iter_mut().flat_map(|step| &mut step.needs);
         for need in needs.filter(|need| need.role_is == role) {
             need.chosen = None;
@@ -423,18 +423,18 @@ impl Plan {
 /// The component that fills the roles of a group.
 struct Team<'a> {
     /// The skills by role; empty if no component can fill all roles.
-    chosen: BTreeMap<Role, &'a Offer>,
+    chosen: BTreeMap<SkillRole, &'a Offer>,
     /// The missing roles of each component that cannot fill all.
-    lacks: BTreeMap<&'a str, Vec<Role>>,
+    lacks: BTreeMap<&'a str, Vec<SkillRole>>,
 }
 
 impl<'a> Team<'a> {
     fn of(
-        roles: &[(Role, Vec<&Need>)],
-        fitting: &BTreeMap<Role, Vec<&'a Offer>>,
+        roles: &[(SkillRole, Vec<&Need>)],
+        fitting: &BTreeMap<SkillRole, Vec<&'a Offer>>,
         facts: &dyn Facts,
     ) -> Self {
-        let of_role = |role: &Role| fitting.get(role).into_iter().flatten().copied();
+        let of_role = |role: &SkillRole| fitting.get(role).into_iter().flatten().copied();
         let components: BTreeSet<&str> = roles
             .iter()
             .flat_map(|(role, _)| of_role(role))
@@ -444,14 +444,14 @@ impl<'a> Team<'a> {
         let mut teams = Vec::new();
         for component in components {
             let mut chosen = BTreeMap::new();
-            let mut whole = Rank::default();
+            let mut whole = CandidateRank::default();
             for (role, needs) in roles {
                 let of_component = of_role(role).filter(|offer| offer.component == component);
                 let best = of_component
                     .min_by_key(|offer| (Reverse(is_exact(needs, offer)), offer.skill.as_str()));
                 if let Some(best) = best {
                     let rank = rank(needs, best, facts);
-                    whole = Rank {
+                    whole = CandidateRank {
                         inexact: whole.inexact + rank.inexact,
                         ..rank
                     };
@@ -459,7 +459,7 @@ impl<'a> Team<'a> {
                 }
             }
             if chosen.len() == roles.len() {
-                teams.push(choosing::Candidate {
+                teams.push(choosing::SkillCandidate {
                     of: chosen,
                     name: component.to_owned(),
                     fits: Ok(()),

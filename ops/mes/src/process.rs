@@ -5,16 +5,16 @@ use std::time::Duration;
 
 use knowledge::{is_iri, vocabulary as v};
 use mtp::{Object, Triple, escaped};
-use skills::TypeName;
+use skills::ParameterType;
 
 /// A process that the MES can run, identified by its IRI.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Process {
     pub(crate) iri: String,
     pub(crate) name: String,
-    pub(crate) work: Job,
+    pub(crate) work: StepJob,
     /// The steps in order.
-    pub(crate) steps: Vec<Step>,
+    pub(crate) steps: Vec<ProcessStep>,
     /// The parts of a sequence that are repeated.
     pub(crate) loops: Vec<Loop>,
     /// Time limit of each run of a skill.
@@ -25,7 +25,7 @@ pub(crate) struct Process {
 
 /// The way in which the steps are done.
 #[derive(Debug, Clone, PartialEq)]
-pub(crate) enum Job {
+pub(crate) enum StepJob {
     /// All steps together, by the composite that moves an object to another pose.
     PickAndPlace(skills::Job),
     /// A sequence of skills: each step is a skill.
@@ -34,11 +34,11 @@ pub(crate) enum Job {
 
 /// A step.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
-pub(crate) struct Step {
+pub(crate) struct ProcessStep {
     pub(crate) name: String,
     pub(crate) needs: Vec<Need>,
     /// The parameters of its skill, in a sequence.
-    pub(crate) parameters: Vec<Given>,
+    pub(crate) parameters: Vec<GivenParameter>,
     pub(crate) by: By,
     /// The step that undoes this one after a later step has failed, in a sequence.
     pub(crate) compensation: Option<Box<Self>>,
@@ -47,7 +47,7 @@ pub(crate) struct Step {
     pub(crate) after: Option<Vec<usize>>,
     /// The step is skipped unless all conditions of one of these alternatives hold. Without
     /// alternatives it is not skipped.
-    pub(crate) when: Vec<Vec<Condition>>,
+    pub(crate) when: Vec<Vec<StepCondition>>,
     /// Time limit of the skill, if it differs from that of the process.
     pub(crate) within: Option<Duration>,
 }
@@ -59,7 +59,7 @@ pub(crate) struct Loop {
     /// The numbers of its steps.
     pub(crate) steps: BTreeSet<usize>,
     /// Another round begins if all conditions of one of these alternatives hold.
-    pub(crate) again: Vec<Vec<Condition>>,
+    pub(crate) again: Vec<Vec<StepCondition>>,
     /// The run fails when another round is due after this number of rounds.
     pub(crate) rounds: u32,
 }
@@ -80,7 +80,7 @@ impl Loop {
 
 /// A condition about an earlier step.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) struct Condition {
+pub(crate) struct StepCondition {
     /// The number of the step, from 0.
     pub(crate) step: usize,
     pub(crate) test: Test,
@@ -179,7 +179,7 @@ impl BadEnd {
     }
 }
 
-impl Step {
+impl ProcessStep {
     /// Returns the numbers of the steps that end before this step begins. `number` is that of this
     /// step: it waits for the steps of its order, its conditions and the results that it takes.
     pub(crate) fn waits_for(&self, number: usize) -> Vec<usize> {
@@ -199,7 +199,7 @@ impl Step {
 
 /// A parameter as the process gives it.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) struct Given {
+pub(crate) struct GivenParameter {
     pub(crate) name: String,
     pub(crate) value: serde_json::Value,
     /// The unit of the value; that of the skill if missing.
@@ -233,16 +233,16 @@ pub(crate) enum By {
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct Need {
     /// The role of the skill. In all steps of a composite, each role has the same skill.
-    pub(crate) role: Role,
+    pub(crate) role: SkillRole,
     /// The class of the capability that the skill has to realise.
     pub(crate) capability: Option<String>,
     /// The required type; subtypes match too.
-    pub(crate) skill_type: Option<TypeName>,
+    pub(crate) skill_type: Option<ParameterType>,
 }
 
 /// The role of a skill.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
-pub(crate) enum Role {
+pub(crate) enum SkillRole {
     /// Moves fast, along a path that the robot chooses.
     Ptp,
     /// Moves along a straight line.
@@ -255,7 +255,7 @@ pub(crate) enum Role {
     Alone(usize),
 }
 
-impl Role {
+impl SkillRole {
     /// The roles of the composite.
     pub(crate) const OF_COMPOSITE: [Self; 4] =
         [Self::Ptp, Self::Linear, Self::Grasp, Self::Release];
@@ -272,7 +272,7 @@ impl Role {
     }
 
     /// Returns the default skill type of the role.
-    pub(crate) fn skill_type(self) -> Option<TypeName> {
+    pub(crate) fn skill_type(self) -> Option<ParameterType> {
         let name = match self {
             Self::Ptp => "PtpMoveSkillType",
             Self::Linear => "LinearMoveSkillType",
@@ -280,7 +280,7 @@ impl Role {
             Self::Release => "ReleaseSkillType",
             Self::Alone(_) => return None,
         };
-        Some(TypeName::own(name))
+        Some(ParameterType::own(name))
     }
 
     /// Returns the group. The same component fills all roles of a group: one robot moves, one tool
@@ -304,7 +304,7 @@ pub(crate) enum Group {
 
 impl Process {
     /// Returns the steps, and then their compensations, with the numbers of their roles.
-    pub(crate) fn numbered(&self) -> impl Iterator<Item = (usize, &Step)> {
+    pub(crate) fn numbered(&self) -> impl Iterator<Item = (usize, &ProcessStep)> {
         let steps = self.steps.iter().enumerate();
         let compensations = steps.filter_map(|(number, step)| {
             let compensation = step.compensation.as_deref()?;
@@ -328,7 +328,7 @@ impl Process {
     }
 
     /// Returns the step or the compensation with the number of its role.
-    pub(crate) fn step(&self, number: usize) -> Option<&Step> {
+    pub(crate) fn step(&self, number: usize) -> Option<&ProcessStep> {
         match number.checked_sub(self.steps.len()) {
             None => self.steps.get(number),
             Some(of) => self.steps.get(of)?.compensation.as_deref(),
@@ -336,7 +336,10 @@ impl Process {
     }
 
     /// Returns the triples of the process. `type_iri` returns the IRI of a type, if it is known.
-    pub(crate) fn triples(&self, type_iri: &dyn Fn(&TypeName) -> Option<String>) -> Vec<Triple> {
+    pub(crate) fn triples(
+        &self,
+        type_iri: &dyn Fn(&ParameterType) -> Option<String>,
+    ) -> Vec<Triple> {
         let mut all = Vec::new();
         let mut say = |subject: &str, predicate: &str, object: Object| {
             all.push(Triple {
@@ -351,7 +354,7 @@ impl Process {
         for (time, predicate) in [(self.within, v::WITHIN), (self.wait, v::WAIT)] {
             say(&self.iri, predicate, Object::Number(time.as_secs_f64()));
         }
-        if let Job::PickAndPlace(job) = &self.work {
+        if let StepJob::PickAndPlace(job) = &self.work {
             for (position, predicate) in [(job.pick, v::PICK), (job.place, v::PLACE)] {
                 let numbers: Vec<_> = position.iter().map(ToString::to_string).collect();
                 say(&self.iri, predicate, Object::Text(numbers.join(" ")));
@@ -415,7 +418,7 @@ impl Process {
 
 /// Adds the alternatives of a step or of a loop to the graph.
 fn of_conditions(
-    when: &[Vec<Condition>],
+    when: &[Vec<StepCondition>],
     part_iri: &str,
     iris: &[String],
     say: &mut dyn FnMut(&str, &str, Object),
@@ -460,11 +463,11 @@ fn of_conditions(
 
 /// States a step, or the compensation of a step.
 fn of_step(
-    step: &Step,
+    step: &ProcessStep,
     step_iri: &str,
     iris: &[String],
     say: &mut dyn FnMut(&str, &str, Object),
-    type_iri: &dyn Fn(&TypeName) -> Option<String>,
+    type_iri: &dyn Fn(&ParameterType) -> Option<String>,
 ) {
     let iri = |iri: &str| Object::Iri(iri.to_owned());
     for (given, number) in step.parameters.iter().zip(1..) {

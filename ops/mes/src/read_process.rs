@@ -5,13 +5,14 @@ mod loops;
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 
-use knowledge::{Answer, Knowledge};
+use knowledge::{Knowledge, QuestionAnswer};
 use serde_json::Value;
-use skills::TypeName;
+use skills::ParameterType;
 
 use crate::locate_skill::numbers_of;
 use crate::process::{
-    BadEnd, By, Compare, Condition, Given, Job, Loop, Need, Process, ResultOf, Role, Step, Test,
+    BadEnd, By, Compare, GivenParameter, Loop, Need, Process, ProcessStep, ResultOf, SkillRole,
+    StepCondition, StepJob, Test,
 };
 
 /// The processes of the graph: each can run, or has a reason why it cannot.
@@ -35,7 +36,7 @@ impl Processes {
         let (conditions, loops) = (ask("process-conditions")?, ask("process-loops")?);
         let mut by_process: BTreeMap<&str, Vec<&Row>> = BTreeMap::new();
         for row in &steps.rows {
-            let process = Answer::text(row, "process");
+            let process = QuestionAnswer::text(row, "process");
             by_process.entry(process).or_default().push(row);
         }
         let mut processes = Self::default();
@@ -71,10 +72,10 @@ fn process(iri: &str, rows: &[&Row], facts: Facts<'_>) -> Result<Process, String
     let mut undone: BTreeMap<&str, Vec<&Row>> = BTreeMap::new();
     for row in rows
         .iter()
-        .filter(|row| !Answer::text(row, "part").is_empty())
+        .filter(|row| !QuestionAnswer::text(row, "part").is_empty())
     {
-        let part = Answer::text(row, "part");
-        match Answer::text(row, "compensates") {
+        let part = QuestionAnswer::text(row, "part");
+        match QuestionAnswer::text(row, "compensates") {
             "" => by_part.entry(part).or_default().push(row),
             of => undone.entry(of).or_default().push(row),
         }
@@ -90,7 +91,7 @@ fn process(iri: &str, rows: &[&Row], facts: Facts<'_>) -> Result<Process, String
     let order: Vec<&str> = ordered.iter().map(|(_, part, _)| *part).collect();
     let mut steps = Vec::new();
     for (number, (_, part, rows)) in ordered.iter().enumerate() {
-        let role = job.is_none().then_some(Role::Alone(number));
+        let role = job.is_none().then_some(SkillRole::Alone(number));
         let read = step(part, rows, role, (&order, number), parameters);
         let mut read = read.map_err(|why| format!("the step {part} {why}"))?;
         let ordered = order_of(&mut read, rows, iri, (&order, number))
@@ -104,7 +105,7 @@ fn process(iri: &str, rows: &[&Row], facts: Facts<'_>) -> Result<Process, String
             ));
         }
         if let Some(rows) = undone.get(part) {
-            let role = Role::Alone(order.len().saturating_add(number));
+            let role = SkillRole::Alone(order.len().saturating_add(number));
             let undone = compensation(&read.name, rows, role, (&order, number), parameters);
             let undone = undone.map_err(|why| format!("the compensation of {part} {why}"))?;
             if job.is_some() {
@@ -123,7 +124,7 @@ fn process(iri: &str, rows: &[&Row], facts: Facts<'_>) -> Result<Process, String
     Ok(Process {
         iri: iri.to_owned(),
         name: name.unwrap_or(iri).to_owned(),
-        work: job.map_or(Job::Sequence, Job::PickAndPlace),
+        work: job.map_or(StepJob::Sequence, StepJob::PickAndPlace),
         steps,
         loops,
         within,
@@ -132,15 +133,15 @@ fn process(iri: &str, rows: &[&Row], facts: Facts<'_>) -> Result<Process, String
 }
 
 /// Checks that a pick-and-place process has all roles, and no loop.
-fn is_composite(steps: &[Step], loops: &[Loop]) -> Result<(), String> {
+fn is_composite(steps: &[ProcessStep], loops: &[Loop]) -> Result<(), String> {
     if !loops.is_empty() {
         return Err("it has a ua:hasLoop, and a pick-and-place process has none".to_owned());
     }
-    let has = |role: &Role| {
+    let has = |role: &SkillRole| {
         let mut needs = steps.iter().flat_map(|step| &step.needs);
         needs.any(|need| need.role == *role)
     };
-    match Role::OF_COMPOSITE.iter().find(|role| !has(role)) {
+    match SkillRole::OF_COMPOSITE.iter().find(|role| !has(role)) {
         None => Ok(()),
         Some(role) => Err(format!(
             "no step has a need with the ua:role `{}`",
@@ -175,13 +176,13 @@ fn in_order<'a>(by_part: BTreeMap<&'a str, Vec<&'a Row>>) -> Result<Vec<Position
 
 /// Reads the order and the time limit of a step.
 fn order_of(
-    step: &mut Step,
+    step: &mut ProcessStep,
     rows: &[&Row],
     process: &str,
     (order, number): (&[&str], usize),
 ) -> Result<(), String> {
     step.within = seconds(one(rows, "limit")?, "ua:within")?;
-    let named = rows.iter().map(|row| Answer::text(row, "after"));
+    let named = rows.iter().map(|row| QuestionAnswer::text(row, "after"));
     let named: BTreeSet<&str> = named.filter(|after| !after.is_empty()).collect();
     if named.is_empty() {
         return Ok(());
@@ -207,17 +208,20 @@ fn conditions_of(
     part: &str,
     place: (&[&str], usize),
     rows: &[Row],
-) -> Result<Vec<Vec<Condition>>, String> {
+) -> Result<Vec<Vec<StepCondition>>, String> {
     let mut alternatives: BTreeMap<&str, Vec<&Row>> = BTreeMap::new();
-    for row in rows.iter().filter(|row| Answer::text(row, "part") == part) {
-        let of = Answer::text(row, "alternative");
+    for row in rows
+        .iter()
+        .filter(|row| QuestionAnswer::text(row, "part") == part)
+    {
+        let of = QuestionAnswer::text(row, "alternative");
         alternatives.entry(of).or_default().push(row);
     }
     let mut all = Vec::new();
     for (iri, rows) in alternatives {
-        let mut conditions: Vec<(i64, Condition)> = Vec::new();
+        let mut conditions: Vec<(i64, StepCondition)> = Vec::new();
         for row in rows {
-            if Answer::text(row, "condition").is_empty() {
+            if QuestionAnswer::text(row, "condition").is_empty() {
                 return Err(format!("has the ua:when {iri} without a ua:condition"));
             }
             let position = row.get("position").and_then(Value::as_i64);
@@ -233,12 +237,12 @@ fn conditions_of(
     Ok(all)
 }
 
-fn condition(row: &Row, place: (&[&str], usize)) -> Result<Condition, String> {
+fn condition(row: &Row, place: (&[&str], usize)) -> Result<StepCondition, String> {
     let is_there = |column: &str| row.get(column).filter(|value| !value.is_null());
-    let step = earlier(Answer::text(row, "of"), place)?;
+    let step = earlier(QuestionAnswer::text(row, "of"), place)?;
     let test = match (is_there("result"), is_there("ends_as")) {
         (Some(name), None) => {
-            let sign = Answer::text(row, "compare");
+            let sign = QuestionAnswer::text(row, "compare");
             let compare = Compare::ALL.iter().find(|(_, known)| *known == sign);
             let compare = compare.ok_or_else(|| {
                 format!("has the ua:compare `{sign}`; use ==, !=, <, <=, > or >=")
@@ -266,7 +270,7 @@ fn condition(row: &Row, place: (&[&str], usize)) -> Result<Condition, String> {
         }
         _ => return Err("has neither a ua:result nor a ua:endsAs, or both".to_owned()),
     };
-    Ok(Condition {
+    Ok(StepCondition {
         step,
         test,
         is_negated: is_there("negated").and_then(Value::as_bool) == Some(true),
@@ -317,10 +321,10 @@ fn shape(rows: &[&Row]) -> Result<Option<skills::PartShape>, String> {
 fn step(
     part: &str,
     rows: &[&Row],
-    role: Option<Role>,
+    role: Option<SkillRole>,
     (order, number): (&[&str], usize),
     parameters: &[Row],
-) -> Result<Step, String> {
+) -> Result<ProcessStep, String> {
     let name = one(rows, "step")?.and_then(Value::as_str).unwrap_or(part);
     let with = one(rows, "with")?.and_then(Value::as_str);
     let is_attached = one(rows, "attached")?.and_then(Value::as_bool) == Some(true);
@@ -339,9 +343,9 @@ fn step(
     let mut by_need: BTreeMap<&str, Vec<&Row>> = BTreeMap::new();
     for row in rows
         .iter()
-        .filter(|row| !Answer::text(row, "need").is_empty())
+        .filter(|row| !QuestionAnswer::text(row, "need").is_empty())
     {
-        let need = Answer::text(row, "need");
+        let need = QuestionAnswer::text(row, "need");
         by_need.entry(need).or_default().push(row);
     }
     if by_need.is_empty() {
@@ -353,12 +357,12 @@ fn step(
     let needs = by_need.values().map(|rows| need(rows, role));
     let needs = needs.collect::<Result<_, _>>()?;
     let given = parameters_of(part, (order, number), parameters)?;
-    Ok(Step {
+    Ok(ProcessStep {
         name: name.to_owned(),
         needs,
         parameters: given,
         by,
-        ..Step::default()
+        ..ProcessStep::default()
     })
 }
 
@@ -367,11 +371,11 @@ fn step(
 fn compensation(
     of: &str,
     rows: &[&Row],
-    role: Role,
+    role: SkillRole,
     (order, number): (&[&str], usize),
     parameters: &[Row],
-) -> Result<Step, String> {
-    let mut parts = rows.iter().map(|row| Answer::text(row, "part"));
+) -> Result<ProcessStep, String> {
+    let mut parts = rows.iter().map(|row| QuestionAnswer::text(row, "part"));
     let part = parts.next().unwrap_or_default();
     if parts.any(|other| other != part) {
         return Err("is given twice".to_owned());
@@ -391,11 +395,11 @@ fn compensation(
     Ok(read)
 }
 
-fn need(rows: &[&Row], role: Option<Role>) -> Result<Need, String> {
+fn need(rows: &[&Row], role: Option<SkillRole>) -> Result<Need, String> {
     let role = match (role, one(rows, "role")?.and_then(Value::as_str)) {
         (Some(role), _) => role,
         (None, named) => {
-            let known = Role::OF_COMPOSITE.into_iter();
+            let known = SkillRole::OF_COMPOSITE.into_iter();
             let mut known = known.filter(|role| Some(role.name()) == named);
             let names = "ptp, linear, grasp or release";
             known
@@ -410,7 +414,7 @@ fn need(rows: &[&Row], role: Option<Role>) -> Result<Need, String> {
             let name = one(rows, "type_name")?.and_then(Value::as_str);
             let namespace = one(rows, "type_namespace")?.and_then(Value::as_str);
             match (name, namespace) {
-                (Some(name), Some(namespace)) => Some(TypeName {
+                (Some(name), Some(namespace)) => Some(ParameterType {
                     namespace: namespace.to_owned(),
                     name: name.to_owned(),
                 }),
@@ -437,11 +441,11 @@ pub(crate) fn parameters_of(
     part: &str,
     (order, number): (&[&str], usize),
     parameters: &[Row],
-) -> Result<Vec<Given>, String> {
-    let mut given: Vec<Given> = Vec::new();
+) -> Result<Vec<GivenParameter>, String> {
+    let mut given: Vec<GivenParameter> = Vec::new();
     for row in parameters
         .iter()
-        .filter(|row| Answer::text(row, "part") == part)
+        .filter(|row| QuestionAnswer::text(row, "part") == part)
     {
         let parameter = given_by(row, (order, number))?;
         if given.iter().any(|known| known.name == parameter.name) {
@@ -453,14 +457,14 @@ pub(crate) fn parameters_of(
 }
 
 /// Reads a parameter of the step with a number.
-fn given_by(row: &Row, (order, number): (&[&str], usize)) -> Result<Given, String> {
-    let name = Answer::text(row, "name");
+fn given_by(row: &Row, (order, number): (&[&str], usize)) -> Result<GivenParameter, String> {
+    let name = QuestionAnswer::text(row, "name");
     if name.is_empty() {
         return Err("has a parameter without cask:hasVariableName".to_owned());
     }
     let is_there = |column: &str| row.get(column).filter(|value| !value.is_null());
     let unit = is_there("unit").and_then(Value::as_str).map(str::to_owned);
-    let mut given = Given {
+    let mut given = GivenParameter {
         name: name.to_owned(),
         value: Value::Null,
         unit,
@@ -530,14 +534,14 @@ const LONGEST: f64 = 7.0 * 86_400.0;
 mod tests {
     use std::path::Path;
 
-    use knowledge::{Source, SourceKind};
+    use knowledge::{KnowledgeSource, SourceKind};
 
     use super::*;
     use crate::settings::Settings;
 
     fn read(turtle: &str) -> Processes {
         let knowledge = Knowledge::new().unwrap();
-        let source = Source::new(SourceKind::File, "processes.ttl");
+        let source = KnowledgeSource::new(SourceKind::File, "processes.ttl");
         knowledge.replace_turtle(&source, turtle, 1).unwrap();
         Processes::read(&knowledge).unwrap()
     }
@@ -565,7 +569,7 @@ mod tests {
         assert_eq!(names, ["grip", "let go"]);
         assert_eq!(process.within, Duration::from_secs(20));
         assert_eq!(process.steps[1].by, By::SameAs(0));
-        let force = Given {
+        let force = GivenParameter {
             name: "Force".into(),
             value: serde_json::json!(12.5),
             unit: Some("N".into()),
@@ -621,7 +625,7 @@ mod tests {
             .unwrap_or_else(|findings| panic!("{}", findings.render("mes.yaml", &text)));
         let knowledge = Knowledge::new().unwrap();
         for process in &settings.processes {
-            let source = Source::new(SourceKind::Process, &process.iri);
+            let source = KnowledgeSource::new(SourceKind::Process, &process.iri);
             let triples = process.triples(&|_| None);
             knowledge.replace(&source, &triples, 1).unwrap();
         }

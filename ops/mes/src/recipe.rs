@@ -17,27 +17,27 @@ use knowledge::is_iri;
 use mtp::escaped;
 use roxmltree::{Document, Node, ParsingOptions};
 use serde::Deserialize;
-use skills::TypeName;
+use skills::ParameterType;
 
-use crate::process::{Need, Process, Role};
+use crate::process::{Need, Process, SkillRole};
 
 /// The processes of a file.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Recipe {
     pub(crate) processes: Vec<Process>,
     /// Elements that are left out, each with its line.
-    pub(crate) notes: Vec<Finding>,
+    pub(crate) notes: Vec<RecipeFinding>,
 }
 
 /// An element that is left out, or that no process can have.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) struct Finding {
+pub(crate) struct RecipeFinding {
     /// The line of the element, from 1.
     pub(crate) line: usize,
     pub(crate) what: String,
 }
 
-impl fmt::Display for Finding {
+impl fmt::Display for RecipeFinding {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "line {}: {}", self.line, self.what)
     }
@@ -82,8 +82,8 @@ pub(crate) fn in_source(contents: &[u8]) -> Result<Option<(Cow<'_, str>, Names)>
 ///
 /// # Errors
 /// All elements that no process can have; then the file has no process.
-pub(crate) fn read(text: &str, names: &Names) -> Result<Recipe, Vec<Finding>> {
-    let whole = |line, what: String| vec![Finding { line, what }];
+pub(crate) fn read(text: &str, names: &Names) -> Result<Recipe, Vec<RecipeFinding>> {
+    let whole = |line, what: String| vec![RecipeFinding { line, what }];
     if text.len() > MAX_FILE {
         let what = format!("the file has more than {MAX_FILE} bytes");
         return Err(whole(1, what));
@@ -124,7 +124,7 @@ pub(crate) fn read(text: &str, names: &Names) -> Result<Recipe, Vec<Finding>> {
         reading.error(root, "the file has no recipe and no process".to_owned());
     }
     let dropped = reading.dropped;
-    let more = (dropped > 0).then(|| Finding {
+    let more = (dropped > 0).then(|| RecipeFinding {
         line: 1,
         what: format!("{dropped} more findings are not shown"),
     });
@@ -147,8 +147,8 @@ fn line_of_fault(fault: &roxmltree::Error) -> usize {
 struct Reading<'d> {
     document: &'d Document<'d>,
     names: &'d Names,
-    errors: Vec<Finding>,
-    notes: Vec<Finding>,
+    errors: Vec<RecipeFinding>,
+    notes: Vec<RecipeFinding>,
     /// Number of findings beyond the limit.
     dropped: usize,
 }
@@ -165,7 +165,7 @@ impl<'d> Reading<'d> {
             return;
         }
         let line = self.line(at);
-        self.errors.push(Finding { line, what });
+        self.errors.push(RecipeFinding { line, what });
     }
 
     /// Reports an element that is left out.
@@ -175,7 +175,7 @@ impl<'d> Reading<'d> {
             return;
         }
         let line = self.line(at.range().start);
-        self.notes.push(Finding { line, what });
+        self.notes.push(RecipeFinding { line, what });
     }
 
     /// Reports the children of an element whose names are not among these.
@@ -212,9 +212,9 @@ impl<'d> Reading<'d> {
     /// for, or is. The number of its role is set with the order of the steps.
     fn need(&self, name: &str) -> Option<Need> {
         let wanted = self.named(name).trim();
-        let role = Role::Alone(0);
+        let role = SkillRole::Alone(0);
         if wanted.starts_with("nsu=") {
-            let skill_type: TypeName = wanted.parse().ok()?;
+            let skill_type: ParameterType = wanted.parse().ok()?;
             return Some(Need {
                 role,
                 capability: None,

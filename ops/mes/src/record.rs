@@ -7,7 +7,7 @@ use knowledge::vocabulary as v;
 use mtp::{Object, Triple, escaped};
 use serde::Serialize;
 use serde_json::{Map, Value as Json};
-use skills::Value;
+use skills::SkillValue;
 
 use crate::plan::{Fallen, Plan};
 use crate::process::{Process, literal, step_iri};
@@ -29,7 +29,7 @@ pub(crate) enum How {
 
 /// A run of a process. Times are in ms since 1970.
 #[derive(Debug, Clone, PartialEq, Serialize)]
-pub(crate) struct Run {
+pub(crate) struct ProcessRun {
     /// The IRI of the run.
     pub(crate) run: String,
     pub(crate) process: String,
@@ -50,7 +50,7 @@ pub(crate) struct Planned {
     pub(crate) ended_ms: Option<u64>,
     #[serde(flatten)]
     pub(crate) plan: Plan,
-    pub(crate) ran: Vec<Ran>,
+    pub(crate) ran: Vec<SkillRun>,
     pub(crate) outcome: How,
     pub(crate) reason: Option<String>,
     /// After a fault, whether the robot has retreated.
@@ -61,7 +61,7 @@ pub(crate) struct Planned {
 
 /// A run of a skill.
 #[derive(Debug, Clone, PartialEq, Serialize)]
-pub(crate) struct Ran {
+pub(crate) struct SkillRun {
     /// The step of the composite, or the name of the step.
     pub(crate) step: String,
     /// The step of the process.
@@ -69,9 +69,9 @@ pub(crate) struct Ran {
     pub(crate) skill: String,
     pub(crate) component: String,
     /// The parameters that it was given.
-    pub(crate) parameters: Values,
+    pub(crate) parameters: RecordValues,
     /// The results that it returned.
-    pub(crate) results: Values,
+    pub(crate) results: RecordValues,
     pub(crate) started_ms: u64,
     /// `None` while it is running, and if its end is unknown.
     pub(crate) ended_ms: Option<u64>,
@@ -80,11 +80,11 @@ pub(crate) struct Ran {
 }
 
 /// Named values of a record.
-pub(crate) type Values = Map<String, Json>;
+pub(crate) type RecordValues = Map<String, Json>;
 
 /// Returns the values for a record. A value of more than 4 KiB is replaced by its size.
-pub(crate) fn recorded(values: &[(String, Value)]) -> Values {
-    let one = |(name, value): &(String, Value)| {
+pub(crate) fn recorded(values: &[(String, SkillValue)]) -> RecordValues {
+    let one = |(name, value): &(String, SkillValue)| {
         let json = value.to_json();
         let length = json.to_string().len();
         let json = match length > MOST_VALUE {
@@ -98,11 +98,11 @@ pub(crate) fn recorded(values: &[(String, Value)]) -> Values {
 
 /// The newest runs, in order; old runs are removed.
 #[derive(Debug, Default)]
-pub(crate) struct Runs(Mutex<VecDeque<Run>>);
+pub(crate) struct NewestRuns(Mutex<VecDeque<ProcessRun>>);
 
-impl Runs {
+impl NewestRuns {
     /// Adds or updates a run. Returns the runs that were removed to make space.
-    pub(crate) fn put(&self, run: &Run) -> Vec<String> {
+    pub(crate) fn put(&self, run: &ProcessRun) -> Vec<String> {
         let mut all = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         match all.iter_mut().find(|known| known.run == run.run) {
             Some(known) => *known = run.clone(),
@@ -116,7 +116,7 @@ impl Runs {
     }
 
     /// Returns all runs.
-    pub(crate) fn all(&self) -> Vec<Run> {
+    pub(crate) fn all(&self) -> Vec<ProcessRun> {
         self.0
             .lock()
             .unwrap_or_else(PoisonError::into_inner)
@@ -126,7 +126,7 @@ impl Runs {
     }
 }
 
-impl Run {
+impl ProcessRun {
     /// Creates a run. `number` distinguishes runs that start in the same millisecond.
     pub(crate) fn begins(process: &Process, at: u64, number: u64) -> Self {
         Self {
@@ -219,7 +219,7 @@ impl Run {
     }
 }
 
-impl Ran {
+impl SkillRun {
     pub(crate) fn is_running(&self) -> bool {
         self.outcome == How::Running
     }
@@ -262,7 +262,8 @@ impl Planned {
 
     /// Records the loss of a component: its running skills end as lost.
     pub(crate) fn lost(&mut self, at: u64, fallen: &Fallen) {
-        let of_component = |ran: &&mut Ran| ran.is_running() && ran.component == fallen.component;
+        let of_component =
+            |ran: &&mut SkillRun| ran.is_running() && ran.component == fallen.component;
         for ran in self.ran.iter_mut().filter(of_component) {
             ran.ended_ms = Some(at);
             ran.outcome = How::Lost;
@@ -283,7 +284,7 @@ impl Graph {
     }
 
     /// States the provenance (PROV-O) of a skill run: its component, step, parameters and results.
-    fn provenance(&mut self, part: &str, ran: &Ran, step: &str) {
+    fn provenance(&mut self, part: &str, ran: &SkillRun, step: &str) {
         self.say(part, v::RDF_TYPE, iri(v::PROV_ACTIVITY));
         self.say(part, v::PROV_WAS_ASSOCIATED_WITH, iri(&ran.component));
         self.say(&ran.component, v::RDF_TYPE, iri(v::PROV_AGENT));

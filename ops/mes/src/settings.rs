@@ -9,10 +9,12 @@ use std::path::{Path, PathBuf};
 
 use knowledge::is_iri;
 use plant_opcua::client::ClientUser;
-use skills::yaml::{Code, Findings, Kind, Node, Reader, parse};
-use skills::{Lds, Security, TypeName};
+use skills::yaml::{DocumentKind, DocumentNode, Findings, YamlFindingCode, YamlReader, parse};
+use skills::{ComponentSecurity, Lds, ParameterType};
 
-use crate::process::{By, Given, Job, Need, Process, ResultOf, Role, Step};
+use crate::process::{
+    By, GivenParameter, Need, Process, ProcessStep, ResultOf, SkillRole, StepJob,
+};
 use crate::read_process::{MOST_STEPS, USUALLY_WAIT, USUALLY_WITHIN};
 
 pub(crate) use files::{Connect, Manifest, RecipeSource, RmlSource, Source};
@@ -26,7 +28,7 @@ pub(crate) struct Settings {
     /// The number of the component in the space.
     pub(crate) namespace: u16,
     pub(crate) endpoint: String,
-    pub(crate) security: Vec<Security>,
+    pub(crate) security: Vec<ComponentSecurity>,
     pub(crate) lds: Lds,
     pub(crate) open: bool,
     /// The user as which the MES uses components; `None` for anonymous.
@@ -56,7 +58,7 @@ impl Settings {
         let mut findings = Findings::default();
         let read = match parse(text) {
             Ok(root) => Reading {
-                reader: Reader::new(&mut findings),
+                reader: YamlReader::new(&mut findings),
                 folder,
             }
             .settings(&root),
@@ -95,12 +97,12 @@ const KEYS: [&str; 18] = [
 ];
 
 struct Reading<'a> {
-    reader: Reader<'a>,
+    reader: YamlReader<'a>,
     folder: &'a Path,
 }
 
 impl Reading<'_> {
-    fn settings(&mut self, root: &Node) -> Option<Settings> {
+    fn settings(&mut self, root: &DocumentNode) -> Option<Settings> {
         let [
             name,
             uri,
@@ -128,14 +130,14 @@ impl Reading<'_> {
         let uri = self
             .reader
             .needed(uri, "application_uri", root.place)
-            .and_then(|node| self.iri(node, Code::Uri));
+            .and_then(|node| self.iri(node, YamlFindingCode::Uri));
         let namespace = self
             .reader
             .needed(namespace, "namespace", root.place)
             .and_then(|node| self.namespace(node));
         let usual = || Some(DEFAULT_ENDPOINT.to_owned());
         let endpoint = endpoint.map_or_else(usual, |node| self.endpoint(node));
-        let usual = || Some(vec![Security::None]);
+        let usual = || Some(vec![ComponentSecurity::None]);
         let security = security.map_or_else(usual, |node| self.security(node));
         let lds = lds.map_or(Some(Lds::Local), |node| self.lds(node));
         let open = open.map_or(Some(false), |node| self.reader.boolean(node));
@@ -181,7 +183,7 @@ impl Reading<'_> {
         })
     }
 
-    fn lds(&mut self, node: &Node) -> Option<Lds> {
+    fn lds(&mut self, node: &DocumentNode) -> Option<Lds> {
         match Lds::written(self.reader.text(node, "an endpoint, `embed` or `none`")?) {
             lds @ (Lds::Nowhere | Lds::Local | Lds::Embed(None)) => Some(lds),
             Lds::Embed(Some(url)) => self
@@ -193,19 +195,19 @@ impl Reading<'_> {
 
     fn each<T>(
         &mut self,
-        node: &Node,
-        mut read: impl FnMut(&mut Self, &Node) -> Option<T>,
+        node: &DocumentNode,
+        mut read: impl FnMut(&mut Self, &DocumentNode) -> Option<T>,
     ) -> Vec<T> {
         let nodes = self.reader.list(node);
         nodes.iter().filter_map(|node| read(self, node)).collect()
     }
 
-    fn once<'n>(&mut self, root: &Node, names: impl Iterator<Item = &'n str>, what: &str) {
+    fn once<'n>(&mut self, root: &DocumentNode, names: impl Iterator<Item = &'n str>, what: &str) {
         let mut seen: Vec<&str> = Vec::new();
         for name in names {
             if seen.contains(&name) {
                 self.reader.findings().error(
-                    Code::DuplicateKey,
+                    YamlFindingCode::DuplicateKey,
                     root.place,
                     format!("there are two of the {what} `{name}`"),
                 );
@@ -214,11 +216,11 @@ impl Reading<'_> {
         }
     }
 
-    fn preferred(&mut self, node: &Node) -> Option<String> {
-        self.iri(node, Code::Uri)
+    fn preferred(&mut self, node: &DocumentNode) -> Option<String> {
+        self.iri(node, YamlFindingCode::Uri)
     }
 
-    fn process(&mut self, node: &Node) -> Option<Process> {
+    fn process(&mut self, node: &DocumentNode) -> Option<Process> {
         let keys = [
             "process",
             "name",
@@ -231,7 +233,7 @@ impl Reading<'_> {
         let iri = self
             .reader
             .needed(iri, "process", node.place)
-            .and_then(|node| self.iri(node, Code::Uri));
+            .and_then(|node| self.iri(node, YamlFindingCode::Uri));
         let name = match name {
             Some(node) => self.reader.text(node, "a name").map(str::to_owned),
             None => iri.clone(),
@@ -245,7 +247,7 @@ impl Reading<'_> {
         if steps.is_some() && (nodes.is_empty() || nodes.len() > MOST_STEPS) {
             self.reader.refuse::<()>(
                 node,
-                Code::WrongValue,
+                YamlFindingCode::WrongValue,
                 format!(
                     "a process has from 1 to {MOST_STEPS} steps, and this one {}",
                     nodes.len()
@@ -253,7 +255,7 @@ impl Reading<'_> {
             );
         }
         let is_composite = composite.is_some();
-        let mut steps: Vec<Step> = Vec::new();
+        let mut steps: Vec<ProcessStep> = Vec::new();
         let count = nodes.len().min(MOST_STEPS);
         for (number, node) in nodes.iter().take(MOST_STEPS).enumerate() {
             let kind = is_composite.then_some(()).ok_or((number, count));
@@ -262,24 +264,24 @@ impl Reading<'_> {
         }
         let work = match composite {
             Some(composite) => {
-                let roles: Vec<Role> = steps
+                let roles: Vec<SkillRole> = steps
                     .iter()
                     .flat_map(|step| &step.needs)
                     .map(|need| need.role)
                     .collect();
-                for role in Role::OF_COMPOSITE
+                for role in SkillRole::OF_COMPOSITE
                     .iter()
                     .filter(|role| !roles.contains(role))
                 {
                     self.reader.refuse::<()>(
                         composite,
-                        Code::MissingKey,
+                        YamlFindingCode::MissingKey,
                         format!("no step says who is to be `{}`", role.name()),
                     );
                 }
-                self.job(composite).map(Job::PickAndPlace)
+                self.job(composite).map(StepJob::PickAndPlace)
             }
-            None => Some(Job::Sequence),
+            None => Some(StepJob::Sequence),
         };
         Some(Process {
             iri: iri?,
@@ -296,10 +298,10 @@ impl Reading<'_> {
     /// number is that of all steps.
     fn step(
         &mut self,
-        node: &Node,
+        node: &DocumentNode,
         kind: Result<(), (usize, usize)>,
-        earlier: &[Step],
-    ) -> Option<Step> {
+        earlier: &[ProcessStep],
+    ) -> Option<ProcessStep> {
         let keys = [
             "step",
             "needs",
@@ -316,9 +318,9 @@ impl Reading<'_> {
             .needed(name, "step", node.place)
             .and_then(|node| self.reader.text(node, "a name"));
         let needs = self.reader.needed(needs, "needs", node.place)?;
-        let roles: Vec<Role> = match kind {
-            Ok(()) => Role::OF_COMPOSITE.to_vec(),
-            Err((number, _)) => vec![Role::Alone(number)],
+        let roles: Vec<SkillRole> = match kind {
+            Ok(()) => SkillRole::OF_COMPOSITE.to_vec(),
+            Err((number, _)) => vec![SkillRole::Alone(number)],
         };
         let read = self.needs(needs, &roles)?;
         let given = match parameters {
@@ -343,12 +345,12 @@ impl Reading<'_> {
             }
             None => By::Any,
         };
-        let mut step = Step {
+        let mut step = ProcessStep {
             name: name?.to_owned(),
             needs: read,
             parameters: given,
             by,
-            ..Step::default()
+            ..ProcessStep::default()
         };
         for key in flow.into_iter().flatten() {
             self.only_alone(key, kind.is_err(), "does all its steps in one order")?;
@@ -369,11 +371,11 @@ impl Reading<'_> {
     /// Reads the compensation of the last of these steps.
     fn compensation(
         &mut self,
-        node: &Node,
+        node: &DocumentNode,
         number: usize,
         count: usize,
-        known: &[Step],
-    ) -> Option<Step> {
+        known: &[ProcessStep],
+    ) -> Option<ProcessStep> {
         let keys = ["step", "needs", "parameters", "by"];
         let [name, needs, parameters, by] = self.reader.map(node, keys)?;
         let of = known.last().map_or("", |step| step.name.as_str());
@@ -382,7 +384,7 @@ impl Reading<'_> {
             None => format!("compensation of {of}"),
         };
         let needs = self.reader.needed(needs, "needs", node.place)?;
-        let role = Role::Alone(count.saturating_add(number));
+        let role = SkillRole::Alone(count.saturating_add(number));
         let needs = self.needs(needs, &[role])?;
         let parameters = match parameters {
             Some(parameters) => self.parameters(parameters, known)?,
@@ -392,33 +394,37 @@ impl Reading<'_> {
             Some(by) => match self.by(by, known)? {
                 By::AttachedTool => {
                     let why = "a compensation is done by the component of a step, as {component_of: STEP}";
-                    return self.reader.refuse(by, Code::WrongValue, why.to_owned());
+                    return self
+                        .reader
+                        .refuse(by, YamlFindingCode::WrongValue, why.to_owned());
                 }
                 by @ (By::Any | By::SameAs(_)) => by,
             },
             None => By::SameAs(number),
         };
-        Some(Step {
+        Some(ProcessStep {
             name,
             needs,
             parameters,
             by,
-            ..Step::default()
+            ..ProcessStep::default()
         })
     }
 
     /// Refuses a key of a step that only steps of a sequence have.
-    fn only_alone(&mut self, node: &Node, is_alone: bool, why: &str) -> Option<()> {
+    fn only_alone(&mut self, node: &DocumentNode, is_alone: bool, why: &str) -> Option<()> {
         match is_alone {
             true => Some(()),
-            false => self
-                .reader
-                .refuse(node, Code::UnknownKey, format!("`pick_and_place` {why}")),
+            false => self.reader.refuse(
+                node,
+                YamlFindingCode::UnknownKey,
+                format!("`pick_and_place` {why}"),
+            ),
         }
     }
 
-    fn needs(&mut self, needs: &Node, roles: &[Role]) -> Option<Vec<Need>> {
-        let Kind::Map(pairs) = &needs.kind else {
+    fn needs(&mut self, needs: &DocumentNode, roles: &[SkillRole]) -> Option<Vec<Need>> {
+        let DocumentKind::Map(pairs) = &needs.kind else {
             self.reader.wrong(needs, "a map from what a skill is for to the capability it needs, as `grasp: urn:example:capability:grasp`");
             return None;
         };
@@ -431,7 +437,7 @@ impl Reading<'_> {
                 let known: Vec<_> = roles.iter().map(|role| role.name()).collect();
                 self.reader.refuse::<()>(
                     key,
-                    Code::UnknownKey,
+                    YamlFindingCode::UnknownKey,
                     format!("`{text}` is not known here; known are {}", known.join(", ")),
                 );
                 continue;
@@ -439,15 +445,22 @@ impl Reading<'_> {
             read.extend(self.need(need, *role));
         }
         if read.is_empty() {
-            self.reader
-                .refuse::<()>(needs, Code::MissingKey, "a step needs a skill".to_owned());
+            self.reader.refuse::<()>(
+                needs,
+                YamlFindingCode::MissingKey,
+                "a step needs a skill".to_owned(),
+            );
         }
         Some(read)
     }
 
     /// Reads the parameters of a step, which follows these steps.
-    fn parameters(&mut self, node: &Node, earlier: &[Step]) -> Option<Vec<Given>> {
-        let Kind::Map(pairs) = &node.kind else {
+    fn parameters(
+        &mut self,
+        node: &DocumentNode,
+        earlier: &[ProcessStep],
+    ) -> Option<Vec<GivenParameter>> {
+        let DocumentKind::Map(pairs) = &node.kind else {
             self.reader
                 .wrong(node, "a map from names of parameters to values");
             return None;
@@ -462,14 +475,19 @@ impl Reading<'_> {
     }
 
     /// Reads a parameter: its value, a map of `value` and `unit`, or the result of a step.
-    fn given(&mut self, name: &str, node: &Node, earlier: &[Step]) -> Option<Given> {
-        let mut given = Given {
+    fn given(
+        &mut self,
+        name: &str,
+        node: &DocumentNode,
+        earlier: &[ProcessStep],
+    ) -> Option<GivenParameter> {
+        let mut given = GivenParameter {
             name: name.to_owned(),
             value: serde_json::Value::Null,
             unit: None,
             result: None,
         };
-        if !matches!(&node.kind, Kind::Map(_)) {
+        if !matches!(&node.kind, DocumentKind::Map(_)) {
             given.value = json(node);
             return Some(given);
         }
@@ -483,7 +501,9 @@ impl Reading<'_> {
         }
         if let Some(other) = value.or(unit) {
             let why = "a result has the value and the unit of its skill";
-            return self.reader.refuse(other, Code::WrongValue, why.to_owned());
+            return self
+                .reader
+                .refuse(other, YamlFindingCode::WrongValue, why.to_owned());
         }
         let of = self.reader.needed(of, "of", node.place)?;
         let step = self.earlier(of, earlier)?;
@@ -499,7 +519,7 @@ impl Reading<'_> {
     }
 
     /// Reads the name of an earlier step. Returns its number.
-    fn earlier(&mut self, node: &Node, earlier: &[Step]) -> Option<usize> {
+    fn earlier(&mut self, node: &DocumentNode, earlier: &[ProcessStep]) -> Option<usize> {
         let name = self.reader.text(node, "the name of a step")?;
         let number = earlier.iter().position(|step| step.name == name);
         number.or_else(|| {
@@ -509,46 +529,50 @@ impl Reading<'_> {
                 shortened(name),
                 known.join(", ")
             );
-            self.reader.refuse(node, Code::WrongValue, why)
+            self.reader.refuse(node, YamlFindingCode::WrongValue, why)
         })
     }
 
     /// Reads the component that has to do a step.
-    fn by(&mut self, node: &Node, earlier: &[Step]) -> Option<By> {
-        if matches!(&node.kind, Kind::Scalar(text) if text == "attached-tool") {
+    fn by(&mut self, node: &DocumentNode, earlier: &[ProcessStep]) -> Option<By> {
+        if matches!(&node.kind, DocumentKind::Scalar(text) if text == "attached-tool") {
             return Some(By::AttachedTool);
         }
         let expected = "expected `attached-tool`, or the component of an earlier step, as {component_of: STEP}";
-        if !matches!(node.kind, Kind::Map(_)) {
+        if !matches!(node.kind, DocumentKind::Map(_)) {
             return self
                 .reader
-                .refuse(node, Code::WrongValue, expected.to_owned());
+                .refuse(node, YamlFindingCode::WrongValue, expected.to_owned());
         }
         let [of] = self.reader.map(node, ["component_of"])?;
         let of = self.reader.needed(of, "component_of", node.place)?;
         self.earlier(of, earlier).map(By::SameAs)
     }
 
-    fn need(&mut self, node: &Node, role: Role) -> Option<Need> {
-        if matches!(node.kind, Kind::Scalar(_)) {
+    fn need(&mut self, node: &DocumentNode, role: SkillRole) -> Option<Need> {
+        if matches!(node.kind, DocumentKind::Scalar(_)) {
             return Some(Need {
                 role,
-                capability: Some(self.iri(node, Code::Capability)?),
+                capability: Some(self.iri(node, YamlFindingCode::Capability)?),
                 skill_type: role.skill_type(),
             });
         }
         let [capability, of] = self.reader.map(node, ["capability", "type"])?;
         let capability = match capability {
-            Some(node) => Some(self.iri(node, Code::Capability)?),
+            Some(node) => Some(self.iri(node, YamlFindingCode::Capability)?),
             None => None,
         };
         let skill_type = match of {
             Some(node) => {
                 let text = self.reader.text(node, "a skill type")?;
-                match text.parse::<TypeName>() {
+                match text.parse::<ParameterType>() {
                     Ok(name) => Some(name),
                     Err(error) => {
-                        return self.reader.refuse(node, Code::SkillType, error.to_string());
+                        return self.reader.refuse(
+                            node,
+                            YamlFindingCode::SkillType,
+                            error.to_string(),
+                        );
                     }
                 }
             }
@@ -557,7 +581,7 @@ impl Reading<'_> {
         if capability.is_none() && skill_type.is_none() {
             return self.reader.refuse(
                 node,
-                Code::MissingKey,
+                YamlFindingCode::MissingKey,
                 "say a `capability`, a `type` or both".to_owned(),
             );
         }
@@ -568,7 +592,7 @@ impl Reading<'_> {
         })
     }
 
-    fn name(&mut self, node: &Node) -> Option<String> {
+    fn name(&mut self, node: &DocumentNode) -> Option<String> {
         let text = self.reader.text(node, "a name")?;
         let fits = (1..=64).contains(&text.len())
             && text
@@ -579,13 +603,13 @@ impl Reading<'_> {
         } else {
             self.reader.refuse(
                 node,
-                Code::Name,
+                YamlFindingCode::Name,
                 format!("`{}` is no name", shortened(text)),
             )
         }
     }
 
-    fn iri(&mut self, node: &Node, code: Code) -> Option<String> {
+    fn iri(&mut self, node: &DocumentNode, code: YamlFindingCode) -> Option<String> {
         let text = self.reader.text(node, "an IRI")?;
         if is_iri(text) && text.len() <= 256 {
             Some(text.to_owned())
@@ -601,13 +625,13 @@ impl Reading<'_> {
         }
     }
 
-    fn namespace(&mut self, node: &Node) -> Option<u16> {
+    fn namespace(&mut self, node: &DocumentNode) -> Option<u16> {
         let text = self.reader.text(node, "a number")?;
         let number = text.parse().ok().filter(|number| *number > 0);
         number.or_else(|| {
             self.reader.refuse(
                 node,
-                Code::Namespace,
+                YamlFindingCode::Namespace,
                 format!(
                     "expected a number from 1 to 65535, found `{}`",
                     shortened(text)
@@ -616,30 +640,30 @@ impl Reading<'_> {
         })
     }
 
-    fn endpoint(&mut self, node: &Node) -> Option<String> {
+    fn endpoint(&mut self, node: &DocumentNode) -> Option<String> {
         let text = self.reader.text(node, "an endpoint")?;
         self.checked_endpoint(text, node)
     }
 
-    fn checked_endpoint(&mut self, text: &str, node: &Node) -> Option<String> {
+    fn checked_endpoint(&mut self, text: &str, node: &DocumentNode) -> Option<String> {
         match text.parse::<plant_opcua::server::EndpointUrl>() {
             Ok(_) => Some(text.to_owned()),
             Err(error) => self.reader.refuse(
                 node,
-                Code::Endpoint,
+                YamlFindingCode::Endpoint,
                 format!("`{}` is no endpoint: {error}", shortened(text)),
             ),
         }
     }
 
-    fn security(&mut self, node: &Node) -> Option<Vec<Security>> {
+    fn security(&mut self, node: &DocumentNode) -> Option<Vec<ComponentSecurity>> {
         let read = self.each(node, |reading, node| {
             match reading.reader.text(node, "None or Basic256Sha256")? {
-                "None" => Some(Security::None),
-                "Basic256Sha256" => Some(Security::Basic256Sha256),
+                "None" => Some(ComponentSecurity::None),
+                "Basic256Sha256" => Some(ComponentSecurity::Basic256Sha256),
                 other => reading.reader.refuse(
                     node,
-                    Code::WrongValue,
+                    YamlFindingCode::WrongValue,
                     format!(
                         "expected None or Basic256Sha256, found `{}`",
                         shortened(other)
@@ -650,7 +674,7 @@ impl Reading<'_> {
         Some(read).filter(|read| !read.is_empty())
     }
 
-    fn address(&mut self, node: &Node) -> Option<SocketAddr> {
+    fn address(&mut self, node: &DocumentNode) -> Option<SocketAddr> {
         let text = self.reader.text(node, "an address with a port")?;
         let address = text
             .parse::<SocketAddr>()
@@ -659,7 +683,7 @@ impl Reading<'_> {
         address.or_else(|| {
             self.reader.refuse(
                 node,
-                Code::WrongValue,
+                YamlFindingCode::WrongValue,
                 format!(
                     "expected an address of loopback, as 127.0.0.1:8087, found `{}`",
                     shortened(text)
@@ -670,11 +694,11 @@ impl Reading<'_> {
 }
 
 /// Converts a value to JSON: a number or Boolean if the text is a valid number or Boolean.
-fn json(node: &Node) -> serde_json::Value {
+fn json(node: &DocumentNode) -> serde_json::Value {
     match &node.kind {
-        Kind::Scalar(text) => plain(text),
-        Kind::List(nodes) => nodes.iter().map(json).collect(),
-        Kind::Map(_) | Kind::Null => serde_json::Value::Null,
+        DocumentKind::Scalar(text) => plain(text),
+        DocumentKind::List(nodes) => nodes.iter().map(json).collect(),
+        DocumentKind::Map(_) | DocumentKind::Null => serde_json::Value::Null,
     }
 }
 

@@ -6,10 +6,11 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use knowledge::{
-    Knowledge, Lasting, Source, SourceCheck, SourceFiles, SourceFinding, SourceKind, nodeset,
+    Knowledge, KnowledgeSource, SourceCheck, SourceFiles, SourceFinding, SourceKind,
+    SourceLifetime, nodeset,
 };
 use mtp::{Module, Triple, escaped};
-use rml::{Folder, Mapping};
+use rml::{Folder, RmlMapping};
 use serde::Serialize;
 use tracing::{info, warn};
 
@@ -19,7 +20,7 @@ use crate::recipe::{self, Recipe};
 use crate::settings::{self, Manifest, RmlSource, Settings};
 
 /// The sources, and the findings about them.
-pub(crate) struct Sources {
+pub(crate) struct MesSources {
     knowledge: Arc<Knowledge>,
     state: Mutex<State>,
 }
@@ -27,9 +28,9 @@ pub(crate) struct Sources {
 #[derive(Debug, Default)]
 struct State {
     /// The sources of the YAML.
-    of_yaml: BTreeSet<Source>,
+    of_yaml: BTreeSet<KnowledgeSource>,
     /// The findings by the source.
-    findings: BTreeMap<Source, Vec<Finding>>,
+    findings: BTreeMap<KnowledgeSource, Vec<Finding>>,
 }
 
 /// A fault of a source.
@@ -45,7 +46,7 @@ pub(crate) struct Finding {
     pub(crate) refused: bool,
 }
 
-impl Sources {
+impl MesSources {
     pub(crate) fn new(knowledge: Arc<Knowledge>) -> Self {
         Self {
             knowledge,
@@ -57,29 +58,29 @@ impl Sources {
     pub(crate) fn read(&self, settings: &Settings) {
         let mut named = BTreeSet::new();
         let ours = skills::model::nodeset();
-        let source = Source::new(SourceKind::NodeSet, skills::model::NAMESPACE);
+        let source = KnowledgeSource::new(SourceKind::NodeSet, skills::model::NAMESPACE);
         named.insert(source.clone());
         self.try_one(source, |source| {
             let all = node_set(&ours)?;
-            self.put(source, &all.triples, Lasting::No)
+            self.put(source, &all.triples, SourceLifetime::No)
         });
-        let units = Source::new(SourceKind::File, "units of measurement");
+        let units = KnowledgeSource::new(SourceKind::File, "units of measurement");
         named.insert(units.clone());
         self.try_one(units, |source| {
-            self.put(source, &knowledge::units::triples(), Lasting::No)
+            self.put(source, &knowledge::units::triples(), SourceLifetime::No)
         });
         for file in &settings.nodesets {
             // The graph of a NodeSet is named by its namespace, which only the file has.
             let read = bytes(file).and_then(|bytes| node_set(&decoded(&bytes)?));
             let name = read.as_ref().map_or(&file.name, |read| &read.namespace);
-            let source = Source::new(SourceKind::NodeSet, name);
+            let source = KnowledgeSource::new(SourceKind::NodeSet, name);
             named.insert(source.clone());
             self.try_one(source, |source| {
-                self.put(source, &read?.triples, Lasting::No)
+                self.put(source, &read?.triples, SourceLifetime::No)
             });
         }
         for file in &settings.knowledge {
-            let source = Source::new(SourceKind::File, &file.name);
+            let source = KnowledgeSource::new(SourceKind::File, &file.name);
             named.insert(source.clone());
             self.try_one(source, |source| {
                 let text = utf8(&bytes(file)?)?;
@@ -88,32 +89,37 @@ impl Sources {
             });
         }
         for manifest in &settings.manifests {
-            let source = Source::new(SourceKind::Mtp, &manifest.source.name);
+            let source = KnowledgeSource::new(SourceKind::Mtp, &manifest.source.name);
             named.insert(source.clone());
             self.try_one(source, |source| {
-                self.module(source, &bytes(&manifest.source)?, manifest, Lasting::No)
+                self.module(
+                    source,
+                    &bytes(&manifest.source)?,
+                    manifest,
+                    SourceLifetime::No,
+                )
             });
         }
         for rml in &settings.rml {
-            let source = Source::new(SourceKind::File, &rml.mapping.name);
+            let source = KnowledgeSource::new(SourceKind::File, &rml.mapping.name);
             named.insert(source.clone());
             self.try_one(source, |source| self.mapped(source, rml));
         }
         for process in &settings.processes {
-            let source = Source::new(SourceKind::Process, &process.iri);
+            let source = KnowledgeSource::new(SourceKind::Process, &process.iri);
             named.insert(source.clone());
             self.try_one(source, |source| self.process(source, process));
         }
         for recipe in &settings.recipes {
-            let source = Source::new(SourceKind::Process, &recipe.source.name);
+            let source = KnowledgeSource::new(SourceKind::Process, &recipe.source.name);
             named.insert(source.clone());
             self.try_one(source, |source| {
                 let bytes = bytes(&recipe.source)?;
                 let read = recipe::read(&decoded(&bytes)?, &recipe.names);
-                self.recipe(source, read, Lasting::No)
+                self.recipe(source, read, SourceLifetime::No)
             });
         }
-        let gone: Vec<Source> = {
+        let gone: Vec<KnowledgeSource> = {
             let mut state = self.state();
             let before = std::mem::replace(&mut state.of_yaml, named);
             before.difference(&state.of_yaml).cloned().collect()
@@ -140,7 +146,7 @@ impl Sources {
 
     /// Adds a finding about the YAML itself, which replaces an earlier one.
     pub(crate) fn yaml(&self, name: &str, what: Option<String>) {
-        let source = Source::new(SourceKind::File, name);
+        let source = KnowledgeSource::new(SourceKind::File, name);
         let found = what.map(|what| finding(&source, what, true));
         self.state()
             .findings
@@ -148,7 +154,11 @@ impl Sources {
     }
 
     /// Reads a source. Its faults become findings.
-    fn try_one(&self, source: Source, read: impl FnOnce(&Source) -> Result<(), String>) {
+    fn try_one(
+        &self,
+        source: KnowledgeSource,
+        read: impl FnOnce(&KnowledgeSource) -> Result<(), String>,
+    ) {
         self.state().findings.remove(&source);
         if let Err(what) = read(&source) {
             warn!(kind = %source.kind, source = source.name, "cannot read a source: {what}");
@@ -159,15 +169,15 @@ impl Sources {
 
     fn module(
         &self,
-        source: &Source,
+        source: &KnowledgeSource,
         bytes: &[u8],
         manifest: &Manifest,
-        lasting: Lasting,
+        lasting: SourceLifetime,
     ) -> Result<(), String> {
         let folder = manifest.source.path.parent();
         let mut beside = |name: &str| {
             // A manifest that was sent has no folder.
-            let path = folder.filter(|_| lasting == Lasting::No)?.join(name);
+            let path = folder.filter(|_| lasting == SourceLifetime::No)?.join(name);
             bridge_node::read_bounded(&path, LARGEST).ok()
         };
         let module = Module::from_files(bytes, &mut beside).map_err(|fault| fault.to_string())?;
@@ -187,7 +197,7 @@ impl Sources {
     }
 
     /// Records a finding in a file that was read.
-    fn found(&self, source: &Source, what: String, is_note: bool) {
+    fn found(&self, source: &KnowledgeSource, what: String, is_note: bool) {
         match is_note {
             true => info!(source = source.name, "{what}"),
             false => warn!(source = source.name, "{what}"),
@@ -196,18 +206,18 @@ impl Sources {
     }
 
     /// Adds a finding to those of its source.
-    fn keep(&self, source: &Source, found: Finding) {
+    fn keep(&self, source: &KnowledgeSource, found: Finding) {
         let mut state = self.state();
         let findings = state.findings.entry(source.clone()).or_default();
         findings.push(found);
     }
 
     /// Runs an RML mapping.
-    fn mapped(&self, source: &Source, rml: &RmlSource) -> Result<(), String> {
+    fn mapped(&self, source: &KnowledgeSource, rml: &RmlSource) -> Result<(), String> {
         let path = &rml.mapping.path;
         let at = |what: &dyn std::fmt::Display| format!("{}: {what}", path.display());
         let text = utf8(&bytes(&rml.mapping)?)?;
-        let mapping = Mapping::read(&text).map_err(|fault| at(&fault))?;
+        let mapping = RmlMapping::read(&text).map_err(|fault| at(&fault))?;
         let mut folder = Folder::of(path);
         if let Some(file) = &rml.file {
             let files: Vec<&str> = mapping.files().into_iter().collect();
@@ -241,10 +251,10 @@ impl Sources {
         Ok(())
     }
 
-    fn process(&self, source: &Source, process: &Process) -> Result<(), String> {
+    fn process(&self, source: &KnowledgeSource, process: &Process) -> Result<(), String> {
         let type_iri =
-            |name: &skills::TypeName| self.knowledge.type_of(&name.namespace, &name.name);
-        self.put(source, &process.triples(&type_iri), Lasting::No)
+            |name: &skills::ParameterType| self.knowledge.type_of(&name.namespace, &name.name);
+        self.put(source, &process.triples(&type_iri), SourceLifetime::No)
     }
 
     /// Adds the processes of a recipe, with its findings.
@@ -253,9 +263,9 @@ impl Sources {
     /// The first finding, if the recipe has no process; the others are recorded.
     fn recipe(
         &self,
-        source: &Source,
-        read: Result<Recipe, Vec<recipe::Finding>>,
-        lasting: Lasting,
+        source: &KnowledgeSource,
+        read: Result<Recipe, Vec<recipe::RecipeFinding>>,
+        lasting: SourceLifetime,
     ) -> Result<(), String> {
         let recipe = match read {
             Ok(recipe) => recipe,
@@ -270,7 +280,7 @@ impl Sources {
             }
         };
         let type_iri =
-            |name: &skills::TypeName| self.knowledge.type_of(&name.namespace, &name.name);
+            |name: &skills::ParameterType| self.knowledge.type_of(&name.namespace, &name.name);
         let triples = recipe.processes.iter();
         let triples: Vec<Triple> = triples
             .flat_map(|process| process.triples(&type_iri))
@@ -291,7 +301,12 @@ impl Sources {
         Ok(())
     }
 
-    fn put(&self, source: &Source, triples: &[Triple], lasting: Lasting) -> Result<(), String> {
+    fn put(
+        &self,
+        source: &KnowledgeSource,
+        triples: &[Triple],
+        lasting: SourceLifetime,
+    ) -> Result<(), String> {
         self.knowledge
             .replace_with(source, triples, (now(), lasting))
             .map_err(|fault| fault.to_string())
@@ -301,14 +316,14 @@ impl Sources {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    fn is_known(&self, source: &Source) -> bool {
+    fn is_known(&self, source: &KnowledgeSource) -> bool {
         let sources = self.knowledge.sources();
         let mut sources = sources.iter();
         sources.any(|known| known.kind == source.kind && known.name == source.name)
     }
 
     /// Refuses to change a source of the YAML, which would come back at the next start.
-    fn of_yaml(&self, source: &Source) -> Result<(), String> {
+    fn of_yaml(&self, source: &KnowledgeSource) -> Result<(), String> {
         if self.state().of_yaml.contains(source) {
             return Err(format!(
                 "the {} `{}` is named in the YAML of the MES; change the file there and send SIGHUP",
@@ -319,12 +334,12 @@ impl Sources {
     }
 }
 
-impl SourceFiles for Sources {
+impl SourceFiles for MesSources {
     fn put(&self, kind: SourceKind, name: &str, contents: &[u8]) -> Result<bool, String> {
-        let mut source = Source::new(kind, name);
+        let mut source = KnowledgeSource::new(kind, name);
         let read = if kind == SourceKind::NodeSet {
             let read = node_set(&decoded(contents)?)?;
-            source = Source::new(kind, &read.namespace);
+            source = KnowledgeSource::new(kind, &read.namespace);
             Some(read)
         } else {
             None
@@ -344,11 +359,11 @@ impl SourceFiles for Sources {
                         let errors: Vec<_> = errors.iter().map(ToString::to_string).collect();
                         errors.join("; ")
                     })?;
-                    self.recipe(&source, Ok(read), Lasting::Yes)?;
+                    self.recipe(&source, Ok(read), SourceLifetime::Yes)?;
                 }
             }
             (SourceKind::NodeSet, Some(read)) => {
-                Self::put(self, &source, &read.triples, Lasting::Yes)?;
+                Self::put(self, &source, &read.triples, SourceLifetime::Yes)?;
             }
             (SourceKind::Mtp, _) => {
                 let manifest = Manifest {
@@ -360,7 +375,7 @@ impl SourceFiles for Sources {
                     capabilities: BTreeMap::new(),
                     connect: settings::Connect::No,
                 };
-                self.module(&source, contents, &manifest, Lasting::Yes)?;
+                self.module(&source, contents, &manifest, SourceLifetime::Yes)?;
             }
             (SourceKind::File | SourceKind::Process, _) => {
                 let taken = self.knowledge.take_turtle(&source, &utf8(contents)?, now());
@@ -373,7 +388,7 @@ impl SourceFiles for Sources {
     }
 
     fn check(&self, kind: SourceKind, name: &str, contents: &[u8]) -> SourceCheck {
-        let mut source = Source::new(kind, name);
+        let mut source = KnowledgeSource::new(kind, name);
         let read = examined(&mut source, contents).and_then(|notes| {
             self.of_yaml(&source).map_err(|why| vec![why])?;
             Ok(notes)
@@ -396,7 +411,7 @@ impl SourceFiles for Sources {
     }
 
     fn remove(&self, kind: SourceKind, name: &str) -> Result<bool, String> {
-        let source = Source::new(kind, name);
+        let source = KnowledgeSource::new(kind, name);
         self.of_yaml(&source)?;
         let removed = self.knowledge.remove(&source);
         let removed = removed.map_err(|fault| fault.to_string())?;
@@ -420,7 +435,7 @@ impl SourceFiles for Sources {
 ///
 /// # Errors
 /// The faults because of which it cannot be added.
-fn examined(source: &mut Source, contents: &[u8]) -> Result<Vec<String>, Vec<String>> {
+fn examined(source: &mut KnowledgeSource, contents: &[u8]) -> Result<Vec<String>, Vec<String>> {
     let one = |what: String| vec![what];
     match source.kind {
         SourceKind::NodeSet => {
@@ -441,7 +456,7 @@ fn examined(source: &mut Source, contents: &[u8]) -> Result<Vec<String>, Vec<Str
                 None
             };
             if let Some((text, names)) = recipe {
-                let all = |found: Vec<recipe::Finding>| -> Vec<String> {
+                let all = |found: Vec<recipe::RecipeFinding>| -> Vec<String> {
                     found.iter().map(ToString::to_string).collect()
                 };
                 return recipe::read(&text, &names)
@@ -461,7 +476,7 @@ fn examined(source: &mut Source, contents: &[u8]) -> Result<Vec<String>, Vec<Str
     }
 }
 
-fn node_set(text: &str) -> Result<nodeset::NodeSet, String> {
+fn node_set(text: &str) -> Result<nodeset::NodeSetContents, String> {
     nodeset::read(text).map_err(|fault| fault.to_string())
 }
 
@@ -485,7 +500,7 @@ fn utf8(bytes: &[u8]) -> Result<String, String> {
 }
 
 /// Creates a finding. Its line is the number behind the first `line` of the text.
-fn finding(source: &Source, what: String, refused: bool) -> Finding {
+fn finding(source: &KnowledgeSource, what: String, refused: bool) -> Finding {
     let line = what.split_once("line ").and_then(|(_, rest)| {
         let end = rest.find(|c: char| !c.is_ascii_digit());
         rest.get(..end.unwrap_or(rest.len()))?.parse().ok()
@@ -516,7 +531,7 @@ mod tests {
             Settings::from_yaml(&text, &folder).unwrap()
         };
         let knowledge = Arc::new(Knowledge::new().unwrap());
-        let sources = Sources::new(Arc::clone(&knowledge));
+        let sources = MesSources::new(Arc::clone(&knowledge));
         let statements = |name: &str| {
             let all = knowledge.sources();
             let found = all.iter().find(|source| source.name == name);
@@ -549,7 +564,7 @@ mod tests {
     #[test]
     fn a_check_has_the_lines_of_the_findings_and_changes_nothing() {
         let knowledge = Arc::new(Knowledge::new().unwrap());
-        let sources = Sources::new(Arc::clone(&knowledge));
+        let sources = MesSources::new(Arc::clone(&knowledge));
         let before = *knowledge.changes().borrow();
         let check = |kind, contents: &[u8]| sources.check(kind, "a", contents);
         let good = check(SourceKind::File, b"<urn:a> <urn:p> 1 .");

@@ -19,7 +19,7 @@ pub(crate) enum Level {
 
 /// A server in the status.
 #[derive(Debug, Clone, Default, Serialize)]
-pub(crate) struct Peer {
+pub(crate) struct StatusPeer {
     /// The displayed name, unique on its level.
     pub(crate) name: String,
     pub(crate) uri: String,
@@ -43,7 +43,7 @@ pub(crate) struct Peer {
     pub(crate) place: Option<String>,
 }
 
-impl Peer {
+impl StatusPeer {
     /// Returns whether there is a connection to it.
     fn is_there(&self) -> bool {
         self.state == CONNECTED || self.state == BUSY
@@ -56,7 +56,7 @@ struct State {
     own: Option<Gated>,
     place: Option<String>,
     discovery_above: Option<String>,
-    peers: BTreeMap<(Level, String), Peer>,
+    peers: BTreeMap<(Level, String), StatusPeer>,
 }
 
 /// The shared state of both levels.
@@ -119,7 +119,7 @@ impl Board {
     }
 
     /// Updates the entry of a server, if it exists.
-    pub(crate) fn note(&self, level: Level, url: &str, how: impl FnOnce(&mut Peer)) {
+    pub(crate) fn note(&self, level: Level, url: &str, how: impl FnOnce(&mut StatusPeer)) {
         self.change(|state| {
             if let Some(peer) = state.peers.get_mut(&(level, url.to_owned())) {
                 how(peer);

@@ -7,34 +7,34 @@ use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, PoisonError, Weak};
 use std::time::Duration;
 
-use plant_opcua::client::{Client, ClientError};
-use plant_opcua::server::Caller;
+use plant_opcua::client::{ClientError, OpcUaClient};
+use plant_opcua::server::SessionCaller;
 use plant_opcua::types::{DateTime, StatusCode};
-use plant_opcua::users::{Access, Role, Roles};
+use plant_opcua::users::{Roles, UserAccess, UserRole};
 use tokio::time::Instant;
 
 use crate::board::{Board, Level};
 
 /// Checks callers on a level.
 #[derive(Clone)]
-pub(crate) struct Admission {
-    pub(crate) users: Arc<Access>,
+pub(crate) struct CallerCheck {
+    pub(crate) users: Arc<UserAccess>,
     pub(crate) board: Arc<Board>,
     /// The level of the callers.
     pub(crate) level: Level,
 }
 
-impl Admission {
+impl CallerCheck {
     /// Checks that the calls of a caller are forwarded. The caller must be a server of its level
     /// with a verified certificate, or a user with the role operator or engineer.
     ///
     /// # Errors
     /// BadUserAccessDenied for other callers.
-    pub(crate) fn check(&self, caller: &Caller) -> Result<(), StatusCode> {
+    pub(crate) fn check(&self, caller: &SessionCaller) -> Result<(), StatusCode> {
         let is_peer = caller.proven
             && caller.encrypted
             && self.board.knows(self.level, &caller.application_uri);
-        let calls = Roles::of(&[Role::Operator, Role::Engineer]);
+        let calls = Roles::of(&[UserRole::Operator, UserRole::Engineer]);
         match is_peer || self.users.roles_of(caller).meets(calls) {
             true => Ok(()),
             false => Err(StatusCode::BadUserAccessDenied),
@@ -45,14 +45,14 @@ impl Admission {
 /// The sessions at a server.
 pub(crate) struct Callers {
     /// The session of the station itself.
-    client: Client,
+    client: OpcUaClient,
     /// The run of the server for which the shown NodeIds are valid, by its start time.
     run: Mutex<Option<DateTime>>,
-    sessions: Mutex<BTreeMap<u32, Client>>,
+    sessions: Mutex<BTreeMap<u32, OpcUaClient>>,
 }
 
 impl Callers {
-    pub(crate) fn new(client: Client) -> Self {
+    pub(crate) fn new(client: OpcUaClient) -> Self {
         Self {
             client,
             run: Mutex::default(),
@@ -72,7 +72,7 @@ impl Callers {
     ///
     /// # Errors
     /// There is no such connection.
-    pub(crate) async fn client_of(&self, session: u32) -> Result<Client, ClientError> {
+    pub(crate) async fn client_of(&self, session: u32) -> Result<OpcUaClient, ClientError> {
         let client = {
             let mut sessions = self.lock();
             let own = sessions.entry(session);
@@ -103,7 +103,7 @@ impl Callers {
         let _closed = self.lock().remove(&session);
     }
 
-    fn lock(&self) -> std::sync::MutexGuard<'_, BTreeMap<u32, Client>> {
+    fn lock(&self) -> std::sync::MutexGuard<'_, BTreeMap<u32, OpcUaClient>> {
         self.sessions.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
@@ -140,14 +140,14 @@ mod tests {
     fn calls_of_servers_of_the_level_and_of_operators_are_passed_on_and_of_nobody_else() {
         let (board, _added) = Board::new();
         let board = Arc::new(board);
-        let observer = Roles::of(&[Role::Observer]);
-        let admission = |anonymous| Admission {
-            users: Arc::new(Access::of_store(None, anonymous).unwrap()),
+        let observer = Roles::of(&[UserRole::Observer]);
+        let admission = |anonymous| CallerCheck {
+            users: Arc::new(UserAccess::of_store(None, anonymous).unwrap()),
             board: Arc::clone(&board),
             level: Level::Above,
         };
         let strict = admission(observer);
-        let caller = |proven: bool| Caller {
+        let caller = |proven: bool| SessionCaller {
             session: 1,
             user: "anonymous".to_owned(),
             application_uri: "urn:b".to_owned(),
@@ -171,7 +171,7 @@ mod tests {
         board.note(Level::Above, "u", |peer| peer.secured = true);
         assert_eq!(strict.check(&caller(true)), Ok(()));
         assert_eq!(strict.check(&caller(false)), denied, "anybody says so");
-        let operator = Roles::of(&[Role::Operator]);
+        let operator = Roles::of(&[UserRole::Operator]);
         assert_eq!(admission(operator).check(&caller(false)), Ok(()));
     }
 }

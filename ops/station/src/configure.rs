@@ -6,7 +6,7 @@ use plant_opcua::types::{Argument, DataTypeId, NodeId, Variant};
 
 /// The arguments of the method.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) struct Told {
+pub(crate) struct ConfigureArguments {
     /// The place of the component in the plant.
     pub(crate) place: String,
     /// The ApplicationUri of the supervisor.
@@ -15,7 +15,7 @@ pub(crate) struct Told {
     pub(crate) discovery_url: String,
 }
 
-impl Told {
+impl ConfigureArguments {
     pub(crate) fn arguments(&self) -> Vec<Variant> {
         let Self {
             place,

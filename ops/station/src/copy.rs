@@ -12,8 +12,8 @@ use plant_opcua::types::{
 use tracing::debug;
 
 use crate::callers::Callers;
-use crate::face::{Calling, Face, Passing, Writing, id};
-use crate::mirror::{Found, Kind, Mirror, Name, TypeRef, variable_type};
+use crate::face::{Calling, Face, ForwardedWrites, Passing, id};
+use crate::mirror::{MirroredKind, MirroredNode, MirroredServer, Name, TypeRef, variable_type};
 
 /// The nodes of a server on a face.
 pub(crate) struct ServerCopy {
@@ -23,7 +23,7 @@ pub(crate) struct ServerCopy {
     application_uri: String,
     callers: Arc<Callers>,
     /// The nodes by their paths, each with its children behind it.
-    nodes: BTreeMap<String, Found>,
+    nodes: BTreeMap<String, MirroredNode>,
     translation: Arc<Translation>,
     /// The source timestamps of the values that were marked as last values, by their variables.
     doubted: Mutex<HashMap<NodeId, Option<DateTime>>>,
@@ -90,7 +90,7 @@ impl ServerCopy {
     /// The folder does not exist.
     pub(crate) fn show(
         &mut self,
-        mirror: &Mirror,
+        mirror: &MirroredServer,
     ) -> Result<(Vec<CopiedVariable>, bool), InstanceError> {
         let root = self.path();
         let is_new = self.face.server.browse_name(&id(&root)).is_none();
@@ -134,17 +134,17 @@ impl ServerCopy {
         Ok((added, changed))
     }
 
-    fn path_of(&self, found: &Found) -> String {
+    fn path_of(&self, found: &MirroredNode) -> String {
         let path = found.path.join("/");
         let end = match found.kind {
-            Kind::Method { .. } => "()",
-            Kind::Object { .. } | Kind::Variable { .. } => "",
+            MirroredKind::Method { .. } => "()",
+            MirroredKind::Object { .. } | MirroredKind::Variable { .. } => "",
         };
         format!("{}/{path}{end}", self.path())
     }
 
     /// Removes the nodes that the server has no more or that differ. Returns whether there are any.
-    fn remove_outdated(&mut self, wanted: &BTreeMap<String, Found>) -> bool {
+    fn remove_outdated(&mut self, wanted: &BTreeMap<String, MirroredNode>) -> bool {
         let outdated: Vec<String> = self
             .nodes
             .iter()
@@ -164,7 +164,7 @@ impl ServerCopy {
 
     /// Adds the types of the server to the face. Returns their NodeIds by the NodeIds at the
     /// server.
-    fn types(&self, mirror: &Mirror) -> HashMap<NodeId, NodeId> {
+    fn types(&self, mirror: &MirroredServer) -> HashMap<NodeId, NodeId> {
         let mut known = HashMap::new();
         for (at_server, of) in &mirror.types {
             let node_id = id(&of.key.on_face());
@@ -198,7 +198,7 @@ impl ServerCopy {
     fn add(
         &self,
         path: &str,
-        found: &Found,
+        found: &MirroredNode,
         types: &HashMap<NodeId, NodeId>,
     ) -> Result<Option<CopiedVariable>, InstanceError> {
         let parent = match found.path.split_last() {
@@ -210,7 +210,7 @@ impl ServerCopy {
             browse_name.unwrap_or_else(|| QualifiedName::new(0, found.name.name.as_str()));
         let display_name = LocalizedText::new("", &found.name.name);
         match &found.kind {
-            Kind::Object { of, events } => {
+            MirroredKind::Object { of, events } => {
                 let of = type_node(of);
                 // A type that could not be added.
                 let is_known = of.namespace == 0 || types.values().any(|known| *known == of);
@@ -229,7 +229,7 @@ impl ServerCopy {
                 })?;
                 Ok(None)
             }
-            Kind::Variable {
+            MirroredKind::Variable {
                 data_type,
                 value_rank,
                 writable,
@@ -248,7 +248,7 @@ impl ServerCopy {
                 };
                 self.add_variable(&variable, &found.id).map(Some)
             }
-            Kind::Method {
+            MirroredKind::Method {
                 object,
                 takes,
                 gives,
@@ -279,7 +279,7 @@ impl ServerCopy {
     ) -> Result<CopiedVariable, InstanceError> {
         self.face.server.add_variable(variable)?;
         if variable.writable {
-            let handler = Writing {
+            let handler = ForwardedWrites {
                 passing: self.passing(),
                 node: at_server.clone(),
             };
@@ -303,7 +303,8 @@ impl ServerCopy {
     /// Returns all variables.
     pub(crate) fn variables(&self) -> Vec<CopiedVariable> {
         let nodes = self.nodes.iter();
-        let variables = nodes.filter(|(_, found)| matches!(found.kind, Kind::Variable { .. }));
+        let variables =
+            nodes.filter(|(_, found)| matches!(found.kind, MirroredKind::Variable { .. }));
         let copied = variables.map(|(path, found)| CopiedVariable {
             at_server: found.id.clone(),
             shown: id(path),
@@ -379,7 +380,7 @@ fn type_node(of: &TypeRef) -> NodeId {
 }
 
 impl Translation {
-    fn names(&self, copy: &ServerCopy, mirror: &Mirror, types: HashMap<NodeId, NodeId>) {
+    fn names(&self, copy: &ServerCopy, mirror: &MirroredServer, types: HashMap<NodeId, NodeId>) {
         let namespaces = mirror.namespaces.iter().enumerate();
         let namespaces = namespaces.map(|(at, uri)| match at {
             0 => Some(0),

@@ -7,15 +7,17 @@ use std::process::ExitCode;
 use std::time::Duration;
 
 use discovery::lds::LdsSettings;
-use discovery::{DEFAULT_LDS, Interface, ListingArguments};
+use discovery::{DEFAULT_LDS, ListingArguments, MdnsInterface};
 use plant_opcua::client::HostNames;
 use plant_opcua::enrolment::GdsArguments;
 use plant_opcua::limits::LimitArguments;
 use plant_opcua::pki::default_named;
 use plant_opcua::server::EndpointUrl;
-use plant_opcua::users::{Role, Roles};
-use registry::hierarchy::{Choice, Place};
-use service::{Failure, FailureKind, LogArguments, LogFormat, Service, run_service, serve_pages};
+use plant_opcua::users::{Roles, UserRole};
+use registry::hierarchy::{PlantLocation, ServerChoice};
+use service::{
+    Failure, FailureKind, LogArguments, LogFormat, ServiceProgram, run_service, serve_pages,
+};
 
 use crate::{StationSettings, Upper};
 
@@ -34,7 +36,7 @@ struct UaStation {
     name: String,
     /// The location of the level in the plant, such as plant/cell-1; the level above may change it
     #[arg(long, value_name = "PLACE", env = "UA_PLACE")]
-    place: Option<Place>,
+    place: Option<PlantLocation>,
     /// The endpoint URL for servers and clients of the level below
     #[arg(long, value_name = "URL", env = "UA_LDS_ENDPOINT", default_value = DEFAULT_LDS)]
     endpoint: String,
@@ -71,7 +73,7 @@ struct UaStation {
         default_value = "any",
         env = "UA_UPPER_LDS"
     )]
-    upper_lds: Choice,
+    upper_lds: ServerChoice,
     /// Also serve and use unsecured channels. Without --pki all channels are unsecured, and servers
     /// of other hosts need this option to register
     #[arg(long)]
@@ -116,7 +118,7 @@ pub fn run(arguments: Vec<OsString>) -> ExitCode {
     run_service::<UaStation>(arguments)
 }
 
-impl Service for UaStation {
+impl ServiceProgram for UaStation {
     const QUIET: &'static str = "opcua_server=warn,opcua_server::session::controller=off,opcua_client=off,\
         opcua_core=off,opcua_crypto=off,opcua_nodes=warn,opcua_types=off,mdns_sd=off";
 
@@ -126,7 +128,7 @@ impl Service for UaStation {
 
     async fn serve(self, stop: impl Future<Output = ()> + Send + 'static) -> Result<(), Failure> {
         let pages = serve_pages(self.metrics).await?;
-        let interface = self.interface.as_deref().map(Interface::parse);
+        let interface = self.interface.as_deref().map(MdnsInterface::parse);
         let gds = self.gds.invitation();
         let gds = gds.map_err(|fault| Failure::new(FailureKind::Usage, fault.to_string()))?;
         // A certificate of the plant needs a store.
@@ -136,7 +138,7 @@ impl Service for UaStation {
         };
         let lds = LdsSettings {
             interface: interface
-                .unwrap_or(Interface::LOOPBACK)
+                .unwrap_or(MdnsInterface::LOOPBACK)
                 .with_networks(self.networks.iter().copied()),
             allow_unsecured: self.allow_unsecured,
             register_every: Duration::from_secs(self.register_period.into()),
@@ -146,15 +148,15 @@ impl Service for UaStation {
             ..LdsSettings::at(self.endpoint)
         };
         let upper = self.upper_interface.as_deref().map(|interface| Upper {
-            interface: Interface::parse(interface).with_networks(self.networks.iter().copied()),
+            interface: MdnsInterface::parse(interface).with_networks(self.networks.iter().copied()),
             endpoint: self.upper_endpoint,
             discovery: self.upper_lds,
         });
         let is_open = self.allow_unsecured || lds.pki.is_none();
         let usual = if is_open {
-            Roles::of(&[Role::Observer, Role::Operator])
+            Roles::of(&[UserRole::Observer, UserRole::Operator])
         } else {
-            Roles::of(&[Role::Observer])
+            Roles::of(&[UserRole::Observer])
         };
         let settings = StationSettings {
             anonymous: self.anonymous.unwrap_or(usual),

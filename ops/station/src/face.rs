@@ -6,12 +6,12 @@ use std::time::Duration;
 
 use async_trait::async_trait;
 use plant_opcua::changes::{Became, ModelChange};
-use plant_opcua::client::{CallOptions, Client, ClientError};
+use plant_opcua::client::{CallOptions, ClientError, OpcUaClient};
 use plant_opcua::limits::ClientLimits;
 use plant_opcua::server::{
-    Caller, EndpointUrl, InstanceError, MethodHandler, MethodRequest, ObjectSpec, Presence,
-    Refusal, Security, Server, ServerBuilder, ServerConfig, ServerError, VariableSpec,
-    WriteHandler, WriteRequest,
+    EndpointUrl, InstanceError, MethodHandler, MethodRefusal, MethodRequest, ObjectSpec,
+    OpcUaServer, ServerBuilder, ServerConfig, ServerError, ServerSecurity, SessionCaller,
+    SessionPresence, VariableSpec, WriteHandler, WriteRequest,
 };
 use plant_opcua::types::{
     DataTypeId, DataValue, LocalizedText, NodeId, ObjectId, ObjectTypeId, QualifiedName,
@@ -19,15 +19,15 @@ use plant_opcua::types::{
 };
 use tracing::warn;
 
-use crate::callers::{Admission, AllCallers, Callers};
+use crate::callers::{AllCallers, CallerCheck, Callers};
 
 /// A face of a station: its server on a level.
 #[derive(Clone)]
 pub(crate) struct Face {
-    pub(crate) server: Server,
+    pub(crate) server: OpcUaServer,
     /// The folder of the servers that are shown.
     folder: &'static str,
-    admission: Admission,
+    admission: CallerCheck,
     callers: AllCallers,
 }
 
@@ -41,7 +41,7 @@ pub(crate) struct FaceSettings {
     pub(crate) allow_unsecured: bool,
     pub(crate) trust_any: bool,
     /// Checks callers.
-    pub(crate) admission: Admission,
+    pub(crate) admission: CallerCheck,
     pub(crate) clients: ClientLimits,
 }
 
@@ -59,9 +59,9 @@ impl Face {
             clients,
         } = settings;
         let security = match (&pki, allow_unsecured) {
-            (None, _) => vec![Security::None],
-            (Some(_), true) => vec![Security::None, Security::Basic256Sha256],
-            (Some(_), false) => vec![Security::Basic256Sha256],
+            (None, _) => vec![ServerSecurity::None],
+            (Some(_), true) => vec![ServerSecurity::None, ServerSecurity::Basic256Sha256],
+            (Some(_), false) => vec![ServerSecurity::Basic256Sha256],
         };
         let config = ServerConfig {
             security,
@@ -105,7 +105,7 @@ impl Face {
         self.folder
     }
 
-    pub(crate) fn admission(&self) -> &Admission {
+    pub(crate) fn admission(&self) -> &CallerCheck {
         &self.admission
     }
 
@@ -167,7 +167,7 @@ pub(crate) fn id(path: &str) -> NodeId {
 
 /// Forwards requests in the session that their caller has at the server.
 pub(crate) struct Passing {
-    pub(crate) admission: Admission,
+    pub(crate) admission: CallerCheck,
     pub(crate) callers: Arc<Callers>,
 }
 
@@ -175,10 +175,10 @@ impl Passing {
     /// Returns the session of a caller at the server.
     async fn session(
         &self,
-        caller: &Caller,
-        presence: &Presence,
+        caller: &SessionCaller,
+        presence: &SessionPresence,
         what: &str,
-    ) -> Result<Client, StatusCode> {
+    ) -> Result<OpcUaClient, StatusCode> {
         self.admission.check(caller).inspect_err(|_| {
             warn!(
                 application = ?caller.application_uri, user = ?caller.user, what,
@@ -209,11 +209,11 @@ impl MethodHandler for Calling {
         LONGEST_CALL
     }
 
-    async fn call(&self, request: MethodRequest) -> Result<Vec<Variant>, Refusal> {
+    async fn call(&self, request: MethodRequest) -> Result<Vec<Variant>, MethodRefusal> {
         let session = self
             .passing
             .session(&request.caller, &request.presence, &request.name);
-        let client = session.await.map_err(Refusal::Status)?;
+        let client = session.await.map_err(MethodRefusal::Status)?;
         let options = CallOptions {
             // The forwarded call times out first, so that the caller receives its status.
             within: LONGEST_CALL * 9 / 10,
@@ -222,20 +222,20 @@ impl MethodHandler for Calling {
         let target = (&self.object, &self.method);
         let called = client.call_result(target, request.arguments, options);
         match called.await {
-            Ok(result) => Err(Refusal::PassedOn(Box::new(result))),
-            Err(error) => Err(Refusal::Status(status(error))),
+            Ok(result) => Err(MethodRefusal::PassedOn(Box::new(result))),
+            Err(error) => Err(MethodRefusal::Status(status(error))),
         }
     }
 }
 
 /// Forwards writes of a variable.
-pub(crate) struct Writing {
+pub(crate) struct ForwardedWrites {
     pub(crate) passing: Passing,
     pub(crate) node: NodeId,
 }
 
 #[async_trait]
-impl WriteHandler for Writing {
+impl WriteHandler for ForwardedWrites {
     async fn write(&self, request: WriteRequest) -> Result<(), StatusCode> {
         let what = request.node.to_string();
         let session = self

@@ -4,8 +4,10 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use plant_opcua::client::{Client, Notice, Sampled, Select, Subscription, Watch};
-use plant_opcua::server::{ForwardedEvent, Server};
+use plant_opcua::client::{
+    ClientSubscription, MonitoredWatch, Notice, OpcUaClient, Sampled, Select,
+};
+use plant_opcua::server::{ForwardedEvent, OpcUaServer};
 use plant_opcua::types::{
     ByteString, DataValue, DateTime, LocalizedText, NodeId, ObjectId, ObjectTypeId, QualifiedName,
     UAString, Variant,
@@ -16,8 +18,8 @@ use crate::copy::{CopiedVariable, Translation};
 
 /// The target of the values and events of a server.
 #[derive(Clone)]
-pub(crate) struct Target {
-    pub(crate) face: Server,
+pub(crate) struct FeedTarget {
+    pub(crate) face: OpcUaServer,
     pub(crate) translation: Arc<Translation>,
     /// The node of the server itself, the source of events whose own source is not shown.
     pub(crate) root: NodeId,
@@ -28,14 +30,14 @@ pub(crate) struct Target {
 /// Repeats the values of variables until the client is closed. `lost` receives the number of
 /// notifications that were lost; the current values are then requested again.
 pub(crate) async fn values(
-    client: Client,
+    client: OpcUaClient,
     variables: Vec<CopiedVariable>,
-    target: Target,
+    target: FeedTarget,
     lost: impl Fn(u64) + Send,
 ) {
     loop {
         let watches = variables.iter().map(|variable| {
-            Watch::Sampled(Sampled {
+            MonitoredWatch::Sampled(Sampled {
                 node: variable.at_server.clone(),
                 interval: SAMPLING,
                 queue: QUEUE,
@@ -63,7 +65,7 @@ pub(crate) async fn values(
     }
 }
 
-fn repeat(variables: &[CopiedVariable], target: &Target, notice: Notice) {
+fn repeat(variables: &[CopiedVariable], target: &FeedTarget, notice: Notice) {
     let (watch, value) = match notice {
         Notice::Value { watch, value } => (watch, value),
         Notice::Refused { watch, status } => {
@@ -77,7 +79,7 @@ fn repeat(variables: &[CopiedVariable], target: &Target, notice: Notice) {
     }
 }
 
-impl Target {
+impl FeedTarget {
     /// Shows a value of the server.
     fn show(&self, variable: &CopiedVariable, mut value: DataValue) {
         value.value = value.value.map(|value| self.translation.value(value));
@@ -90,7 +92,7 @@ impl Target {
     }
 
     /// Reads the values of variables once, so that clients that are told of them find their values.
-    pub(crate) async fn read(&self, client: &Client, variables: &[CopiedVariable]) {
+    pub(crate) async fn read(&self, client: &OpcUaClient, variables: &[CopiedVariable]) {
         let nodes: Vec<NodeId> = variables.iter().map(|one| one.at_server.clone()).collect();
         match client.read(&nodes).await {
             Ok(values) => {
@@ -107,18 +109,18 @@ impl Target {
 /// Repeats the events of a server until the client is closed. `declared` are the fields of its own
 /// event types. `lost` receives the number of events that were lost.
 pub(crate) async fn events(
-    client: Client,
+    client: OpcUaClient,
     declared: Vec<Select>,
-    target: Target,
+    target: FeedTarget,
     lost: impl Fn(u64) + Send,
 ) {
     let select: Vec<Select> = usual_fields().chain(declared).collect();
-    let watch = Watch::Events {
+    let watch = MonitoredWatch::Events {
         node: ObjectId::Server.into(),
         select: select.clone(),
         of_type: None,
     };
-    let mut events: Subscription = client.subscribe(vec![watch], PUBLISHING, MOST_NOTICES);
+    let mut events: ClientSubscription = client.subscribe(vec![watch], PUBLISHING, MOST_NOTICES);
     let mut dropped = 0;
     while let Some(notice) = events.next().await {
         if events.dropped() > dropped {
@@ -141,10 +143,10 @@ pub(crate) async fn events(
 
 /// Returns the event for the face. `None` for events that concern the other server only.
 async fn event(
-    client: &Client,
+    client: &OpcUaClient,
     select: &[Select],
     fields: Vec<Variant>,
-    target: &Target,
+    target: &FeedTarget,
 ) -> Option<ForwardedEvent> {
     let translation = &target.translation;
     let mut event = ForwardedEvent {
@@ -188,7 +190,11 @@ async fn event(
 
 /// Returns the type of an event on the face: the type itself or the nearest supertype that is
 /// shown. `None` for model changes and audit events, which concern the other server only.
-async fn shown_type(client: &Client, of: &NodeId, translation: &Translation) -> Option<NodeId> {
+async fn shown_type(
+    client: &OpcUaClient,
+    of: &NodeId,
+    translation: &Translation,
+) -> Option<NodeId> {
     let above = client.supertypes(of).await.unwrap_or_default();
     let own = [
         ObjectTypeId::BaseModelChangeEventType,

@@ -3,17 +3,17 @@
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Duration;
 
-use plant_opcua::client::{Client, ClientError, Link};
+use plant_opcua::client::{ClientError, Link, OpcUaClient};
 use tokio::sync::{AcquireError, Semaphore, SemaphorePermit, watch};
 use tokio::time::{Instant, sleep};
 
-use crate::mirror::{self, Mirror};
+use crate::mirror::{self, MirroredServer};
 
 /// Limits the searches of all servers of a level: few run at the same time, and the more servers
 /// there are, the less often each is searched. A server that reports its model changes is searched
 /// at once after each.
 #[derive(Debug)]
-pub(crate) struct Looks {
+pub(crate) struct StationSearches {
     slots: Semaphore,
     /// Slots of the searches that have waited for `patience`.
     late: Semaphore,
@@ -21,7 +21,7 @@ pub(crate) struct Looks {
     servers: AtomicUsize,
 }
 
-impl Default for Looks {
+impl Default for StationSearches {
     fn default() -> Self {
         Self {
             slots: Semaphore::new(AT_ONCE),
@@ -32,7 +32,7 @@ impl Default for Looks {
     }
 }
 
-impl Looks {
+impl StationSearches {
     /// Adds a server, which is searched until the returned value is dropped.
     pub(crate) fn enter(&self) -> SearchedServer<'_> {
         self.servers.fetch_add(1, Ordering::Relaxed);
@@ -60,7 +60,7 @@ impl Looks {
 /// A server that is searched.
 #[derive(Debug)]
 pub(crate) struct SearchedServer<'l> {
-    looks: &'l Looks,
+    looks: &'l StationSearches,
     /// Duration of the last search.
     took: Duration,
 }
@@ -73,9 +73,9 @@ impl SearchedServer<'_> {
     /// No response.
     pub(crate) async fn look(
         &mut self,
-        client: &Client,
+        client: &OpcUaClient,
         link: &mut watch::Receiver<Link>,
-    ) -> Option<Result<Mirror, ClientError>> {
+    ) -> Option<Result<MirroredServer, ClientError>> {
         tokio::select! {
             biased;
             changed = link.changed() => {
@@ -131,9 +131,9 @@ mod tests {
 
     #[tokio::test]
     async fn searches_that_have_waited_long_are_few_at_the_same_time_too() {
-        let looks = Looks {
+        let looks = StationSearches {
             patience: Duration::ZERO,
-            ..Looks::default()
+            ..StationSearches::default()
         };
         let mut slots = Vec::new();
         for _ in 0..AT_ONCE + LATE_AT_ONCE {
@@ -148,7 +148,7 @@ mod tests {
 
     #[test]
     fn many_servers_are_searched_as_often_together_as_a_few() {
-        let looks = Looks::default();
+        let looks = StationSearches::default();
         let mut first = looks.enter();
         assert_eq!(first.pause(), AGAIN);
         let others: Vec<_> = (1..100).map(|_| looks.enter()).collect();

@@ -4,16 +4,16 @@ use std::time::Duration;
 
 use async_trait::async_trait;
 use discovery::Marks;
-use plant_opcua::client::{Client, ClientConfig};
+use plant_opcua::client::{ClientConfig, OpcUaClient};
 use plant_opcua::types::{AttributeId, NodeId};
 
 /// Searches with a client session.
-pub(crate) struct Sessions(pub(crate) ClientConfig);
+pub(crate) struct SearchSession(pub(crate) ClientConfig);
 
 #[async_trait]
-impl Marks for Sessions {
+impl Marks for SearchSession {
     async fn has(&self, url: &str, node: &str) -> bool {
-        let client = Client::open(self.0.clone(), url);
+        let client = OpcUaClient::open(self.0.clone(), url);
         let has = match client.up(LIMIT).await {
             Ok(()) => has(&client, node).await,
             Err(_) => false,
@@ -23,7 +23,7 @@ impl Marks for Sessions {
     }
 }
 
-async fn has(client: &Client, text: &str) -> bool {
+async fn has(client: &OpcUaClient, text: &str) -> bool {
     let Some(node) = node(client, text) else {
         return false;
     };
@@ -35,7 +35,7 @@ async fn has(client: &Client, text: &str) -> bool {
 }
 
 /// Parses a NodeId, with the URI or the index of its namespace.
-fn node(client: &Client, text: &str) -> Option<NodeId> {
+fn node(client: &OpcUaClient, text: &str) -> Option<NodeId> {
     let Some(rest) = text.strip_prefix("nsu=") else {
         return text.parse().ok();
     };

@@ -3,7 +3,7 @@
 
 use std::collections::HashSet;
 
-use plant_opcua::client::{Browse, Client, ClientError, Select};
+use plant_opcua::client::{Browse, ClientError, OpcUaClient, Select};
 use plant_opcua::server::arguments_in;
 use plant_opcua::types::{
     Argument, AttributeId, DataTypeId, DataValue, NodeClass, NodeClassMask, NodeId, ObjectId,
@@ -16,9 +16,9 @@ use crate::configure::is_configure;
 
 /// The nodes of a server.
 #[derive(Debug, Clone, Default, PartialEq)]
-pub(crate) struct Mirror {
+pub(crate) struct MirroredServer {
     /// The nodes that can be shown elsewhere, parents before their children.
-    pub(crate) nodes: Vec<Found>,
+    pub(crate) nodes: Vec<MirroredNode>,
     /// The types of the server, supertypes before their subtypes, by their NodeIds.
     pub(crate) types: Vec<(NodeId, NamedType)>,
     /// The fields that its own types of transition events declare.
@@ -37,7 +37,7 @@ pub(crate) struct Mirror {
 
 /// A node of a server.
 #[derive(Debug, Clone, PartialEq)]
-pub(crate) struct Found {
+pub(crate) struct MirroredNode {
     /// The BrowseNames of the nodes below Objects, the name of the node last.
     pub(crate) path: Vec<String>,
     /// Its BrowseName.
@@ -46,7 +46,7 @@ pub(crate) struct Found {
     pub(crate) reference: ReferenceTypeId,
     /// Its NodeId at the server.
     pub(crate) id: NodeId,
-    pub(crate) kind: Kind,
+    pub(crate) kind: MirroredKind,
 }
 
 /// A BrowseName with the URI of its namespace; the core namespace has none.
@@ -58,7 +58,7 @@ pub(crate) struct Name {
 
 /// The kind of a node.
 #[derive(Debug, Clone, PartialEq)]
-pub(crate) enum Kind {
+pub(crate) enum MirroredKind {
     Object {
         /// Its type.
         of: TypeRef,
@@ -125,29 +125,29 @@ impl TypeKey {
     }
 }
 
-impl Mirror {
+impl MirroredServer {
     /// Returns the number of methods.
     pub(crate) fn methods(&self) -> usize {
-        self.count(|kind| matches!(kind, Kind::Method { .. }))
+        self.count(|kind| matches!(kind, MirroredKind::Method { .. }))
     }
 
     /// Returns the number of variables.
     pub(crate) fn variables(&self) -> usize {
-        self.count(|kind| matches!(kind, Kind::Variable { .. }))
+        self.count(|kind| matches!(kind, MirroredKind::Variable { .. }))
     }
 
     /// Keeps this number of nodes, and counts the others as not shown. Parents come before their
     /// children.
     pub(crate) fn keep(&mut self, most: usize) {
         let kept_back = self.nodes.get(most..).unwrap_or_default();
-        let is_method = |node: &&Found| matches!(node.kind, Kind::Method { .. });
+        let is_method = |node: &&MirroredNode| matches!(node.kind, MirroredKind::Method { .. });
         let methods = kept_back.iter().filter(is_method).count();
         self.methods_kept_back += methods;
         self.variables_kept_back += kept_back.len() - methods;
         self.nodes.truncate(most);
     }
 
-    fn count(&self, is: impl Fn(&Kind) -> bool) -> usize {
+    fn count(&self, is: impl Fn(&MirroredKind) -> bool) -> usize {
         self.nodes.iter().filter(|node| is(&node.kind)).count()
     }
 }
@@ -156,12 +156,12 @@ impl Mirror {
 ///
 /// # Errors
 /// No response.
-pub(crate) async fn look(client: &Client) -> Result<Mirror, ClientError> {
+pub(crate) async fn look(client: &OpcUaClient) -> Result<MirroredServer, ClientError> {
     let mut survey = Survey {
         client,
-        mirror: Mirror {
+        mirror: MirroredServer {
             namespaces: namespaces(client).await?,
-            ..Mirror::default()
+            ..MirroredServer::default()
         },
         seen: HashSet::new(),
         object_types: Vec::new(),
@@ -192,8 +192,8 @@ struct Child {
 
 /// A search through the address space of a server, level by level.
 struct Survey<'c> {
-    client: &'c Client,
-    mirror: Mirror,
+    client: &'c OpcUaClient,
+    mirror: MirroredServer,
     seen: HashSet<NodeId>,
     /// The types of the objects that were found, each once.
     object_types: Vec<NodeId>,
@@ -283,7 +283,7 @@ impl Survey<'_> {
                 path: child.path.clone(),
             });
             // The name of the type is added when all types are known.
-            let kind = Kind::Object {
+            let kind = MirroredKind::Object {
                 of: TypeRef::Core(of),
                 events,
             };
@@ -332,7 +332,7 @@ impl Survey<'_> {
                 id: child.id().clone(),
                 path: child.path.clone(),
             });
-            let kind = Kind::Variable {
+            let kind = MirroredKind::Variable {
                 value_rank: match rank {
                     Some(Variant::Int32(rank)) => rank,
                     _ => SCALAR,
@@ -376,7 +376,7 @@ impl Survey<'_> {
                 self.mirror.configure.get_or_insert(own);
                 continue;
             }
-            let kind = Kind::Method {
+            let kind = MirroredKind::Method {
                 object: child.object.clone(),
                 takes,
                 gives,
@@ -386,9 +386,9 @@ impl Survey<'_> {
         Ok(())
     }
 
-    fn put(&mut self, child: Child, kind: Kind) {
+    fn put(&mut self, child: Child, kind: MirroredKind) {
         let name = self.name_of(&child.reference.browse_name);
-        self.mirror.nodes.push(Found {
+        self.mirror.nodes.push(MirroredNode {
             name,
             reference: reference(&child.reference.reference_type_id, &kind),
             id: child.reference.node_id.node_id,
@@ -435,7 +435,7 @@ impl Survey<'_> {
         }
         let types = &self.mirror.types;
         for node in &mut self.mirror.nodes {
-            if let Kind::Object { of, .. } = &mut node.kind
+            if let MirroredKind::Object { of, .. } = &mut node.kind
                 && let TypeRef::Core(id) = of
                 && id.namespace != 0
             {
@@ -499,7 +499,7 @@ fn reference_to(types: &[(NodeId, NamedType)], id: &NodeId) -> Option<TypeRef> {
 }
 
 /// Returns the reference type of the core namespace for a node on another server.
-fn reference(id: &NodeId, kind: &Kind) -> ReferenceTypeId {
+fn reference(id: &NodeId, kind: &MirroredKind) -> ReferenceTypeId {
     let kept = [
         ReferenceTypeId::HasComponent,
         ReferenceTypeId::HasProperty,
@@ -508,14 +508,16 @@ fn reference(id: &NodeId, kind: &Kind) -> ReferenceTypeId {
         ReferenceTypeId::Organizes,
     ];
     let usual = match kind {
-        Kind::Object { .. } => ReferenceTypeId::Organizes,
-        Kind::Variable { .. } | Kind::Method { .. } => ReferenceTypeId::HasComponent,
+        MirroredKind::Object { .. } => ReferenceTypeId::Organizes,
+        MirroredKind::Variable { .. } | MirroredKind::Method { .. } => {
+            ReferenceTypeId::HasComponent
+        }
     };
     kept.into_iter().find(|one| id == one).unwrap_or(usual)
 }
 
 /// Returns the NamespaceArray of the server. It may be longer than at the start of the connection.
-async fn namespaces(client: &Client) -> Result<Vec<String>, ClientError> {
+async fn namespaces(client: &OpcUaClient) -> Result<Vec<String>, ClientError> {
     let node: NodeId = VariableId::Server_NamespaceArray.into();
     let value = client.read(&[node]).await?.pop();
     let Some(Variant::Array(array)) = value.and_then(|value| value.value) else {
@@ -532,7 +534,7 @@ async fn namespaces(client: &Client) -> Result<Vec<String>, ClientError> {
 
 /// Returns the input and output arguments of a method; `None` if it cannot be forwarded.
 async fn signature(
-    client: &Client,
+    client: &OpcUaClient,
     values: [Option<Option<DataValue>>; 2],
 ) -> Result<Option<[Vec<Argument>; 2]>, ClientError> {
     let mut both = [Vec::new(), Vec::new()];
@@ -564,7 +566,7 @@ async fn signature(
 
 /// Returns the DataType of the core namespace for values on this server. `None` for custom
 /// structures, whose identifiers differ between servers.
-async fn passed(client: &Client, data_type: &NodeId) -> Result<Option<NodeId>, ClientError> {
+async fn passed(client: &OpcUaClient, data_type: &NodeId) -> Result<Option<NodeId>, ClientError> {
     if data_type.namespace == 0 {
         return Ok(Some(data_type.clone()));
     }
@@ -617,7 +619,7 @@ mod tests {
 
     #[test]
     fn nodes_that_are_not_kept_are_counted_by_their_kind() {
-        let found = |kind: Kind| Found {
+        let found = |kind: MirroredKind| MirroredNode {
             path: vec!["a".to_owned()],
             name: Name {
                 uri: None,
@@ -627,19 +629,19 @@ mod tests {
             id: NodeId::new(1, 1_u32),
             kind,
         };
-        let object = || Kind::Object {
+        let object = || MirroredKind::Object {
             of: TypeRef::Core(ObjectTypeId::BaseObjectType.into()),
             events: false,
         };
-        let method = || Kind::Method {
+        let method = || MirroredKind::Method {
             object: NodeId::new(1, 1_u32),
             takes: Vec::new(),
             gives: Vec::new(),
         };
         let nodes = [object(), object(), method(), method(), object()].map(found);
-        let mut mirror = Mirror {
+        let mut mirror = MirroredServer {
             nodes: nodes.into(),
-            ..Mirror::default()
+            ..MirroredServer::default()
         };
         mirror.keep(9);
         assert_eq!((mirror.nodes.len(), mirror.methods_kept_back), (5, 0));

@@ -6,20 +6,22 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 
-use discovery::lds::{self, Around, Gated, LdsSettings, LdsStatus, OnLevel};
+use discovery::lds::{self, Gated, LdsEmbedding, LdsSettings, LdsStatus, OnLevel};
 use discovery::{
-    AnnounceSettings, Announced, Found, Interface, MdnsFault, Server, WatchSettings, Watcher,
-    announce, find_lds, watch as watch_level,
+    AnnounceSettings, MdnsFault, MdnsInterface, ServerAnnouncement, ServerChange,
+    ServerDescription, ServerWatcher, WatchSettings, announce, find_lds, watch as watch_level,
 };
 use plant_opcua::client::{ClientConfig, HostNames, SecurityChoice};
 use plant_opcua::enrolment::{Applicant, Enrolment, Invitation};
 use plant_opcua::limits::ClientLimits;
 use plant_opcua::pki::Pki;
-use plant_opcua::server::{EndpointUrl, MethodRequest, MethodSpec, Refusal, ServerError, method};
+use plant_opcua::server::{
+    EndpointUrl, MethodRefusal, MethodRequest, MethodSpec, ServerError, method,
+};
 use plant_opcua::supervision::{CONFIGURE, Supervision, configure_takes};
 use plant_opcua::types::{ObjectId, QualifiedName, StatusCode};
-use plant_opcua::users::{Access, Roles};
-use registry::hierarchy::{Change, Choice, Place, Roster};
+use plant_opcua::users::{Roles, UserAccess};
+use registry::hierarchy::{PlantLocation, Roster, RosterChange, ServerChoice};
 use service::{Failure, FailureKind, Requests};
 use tokio::sync::{mpsc, watch};
 use tokio::task::AbortHandle;
@@ -27,11 +29,11 @@ use tracing::{info, warn};
 
 use crate::board::{Board, Level};
 use crate::budget::NodeBudget;
-use crate::callers::Admission;
-use crate::configure::Told;
+use crate::callers::CallerCheck;
+use crate::configure::ConfigureArguments;
 use crate::face::{Face, FaceSettings, id};
-use crate::looks::Looks;
-use crate::marks::Sessions;
+use crate::looks::StationSearches;
+use crate::marks::SearchSession;
 use crate::tend::Tending;
 
 /// The settings of a station.
@@ -40,7 +42,7 @@ pub struct StationSettings {
     /// Its name on the level above.
     pub name: String,
     /// The place of the level, used until a supervisor above sets it.
-    pub place: Option<Place>,
+    pub place: Option<PlantLocation>,
     /// The discovery server of the level below.
     pub lds: LdsSettings,
     /// The endpoint of the face below; `None` for a free port of the interface below.
@@ -61,11 +63,11 @@ pub struct StationSettings {
 #[derive(Debug, Clone)]
 pub struct Upper {
     /// The network interface.
-    pub interface: Interface,
+    pub interface: MdnsInterface,
     /// The endpoint of the face above; `None` for a free port of the interface.
     pub endpoint: Option<EndpointUrl>,
     /// The discovery server at which the station registers.
-    pub discovery: Choice,
+    pub discovery: ServerChoice,
 }
 
 /// Runs a station until `stop` completes.
@@ -85,9 +87,9 @@ pub async fn run(
     let pki = certificates(&settings, &uri)?;
     let (board, added) = Board::new();
     let board = Arc::new(board);
-    let users = Access::of_store(pki.as_deref(), settings.anonymous);
+    let users = UserAccess::of_store(pki.as_deref(), settings.anonymous);
     let users = users.map_err(|error| Failure::new(FailureKind::Io, error.to_string()))?;
-    board.place(settings.place.as_ref().map(Place::to_string));
+    board.place(settings.place.as_ref().map(PlantLocation::to_string));
     let (place, places) = watch::channel(settings.place.clone());
     let client = client(&settings, &uri, pki.clone());
     let common = Common {
@@ -115,12 +117,12 @@ pub async fn run(
         own_uri: uri.clone(),
         registered: watch::Sender::default(),
         nodes: NodeBudget::default(),
-        looks: Looks::default(),
+        looks: StationSearches::default(),
     };
     levels.below = Some(Abort(
         tokio::spawn(tend_below(events, tending)).abort_handle(),
     ));
-    let around = Around {
+    let around = LdsEmbedding {
         events: tell,
         added,
     };
@@ -151,7 +153,7 @@ struct Common<'a> {
     uri: &'a str,
     pki: Option<PathBuf>,
     board: Arc<Board>,
-    users: Arc<Access>,
+    users: Arc<UserAccess>,
     client: ClientConfig,
 }
 
@@ -160,7 +162,7 @@ impl Common<'_> {
     fn open(
         &self,
         upper: &Upper,
-        place: &watch::Sender<Option<Place>>,
+        place: &watch::Sender<Option<PlantLocation>>,
         levels: &mut Levels,
     ) -> Result<Faces, Failure> {
         let Self {
@@ -193,7 +195,7 @@ impl Common<'_> {
             own_uri: (*uri).to_owned(),
             registered: watch::Sender::default(),
             nodes: NodeBudget::default(),
-            looks: Looks::default(),
+            looks: StationSearches::default(),
         };
         levels.above = Some(follow(upper, tending)?);
         levels.announced = tell(settings, upper, uri, (&above, &below))?;
@@ -203,8 +205,8 @@ impl Common<'_> {
     }
 
     /// Returns the certificate store of a face, and the check of its callers.
-    fn callers(&self, level: Level) -> (Option<PathBuf>, Admission) {
-        let admission = Admission {
+    fn callers(&self, level: Level) -> (Option<PathBuf>, CallerCheck) {
+        let admission = CallerCheck {
             users: Arc::clone(&self.users),
             board: Arc::clone(&self.board),
             level,
@@ -245,7 +247,7 @@ struct Levels {
     enrolled: Option<Abort>,
     above: Option<Abort>,
     below: Option<Abort>,
-    announced: Vec<Announced>,
+    announced: Vec<ServerAnnouncement>,
     /// Dropping the sender ends the registration. The task ends when the server is unregistered.
     registered: Option<(mpsc::Sender<()>, tokio::task::JoinHandle<()>)>,
 }
@@ -312,7 +314,7 @@ fn enrol(settings: &StationSettings, uri: &str, faces: Option<&Faces>) -> Option
 fn open_below(
     settings: &StationSettings,
     uri: &str,
-    (pki, admission): (Option<PathBuf>, Admission),
+    (pki, admission): (Option<PathBuf>, CallerCheck),
 ) -> Result<Face, Failure> {
     let endpoint = endpoint(
         settings.devices_endpoint.as_ref(),
@@ -336,7 +338,7 @@ fn open_above(
     settings: &StationSettings,
     upper: &Upper,
     uri: &str,
-    (pki, admission): (Option<PathBuf>, Admission),
+    (pki, admission): (Option<PathBuf>, CallerCheck),
 ) -> Result<Face, Failure> {
     let endpoint = endpoint(
         upper.endpoint.as_ref(),
@@ -363,7 +365,7 @@ fn unavailable(error: &ServerError) -> Failure {
 /// Returns the given endpoint, or a free port of the first address of an interface.
 fn endpoint(
     given: Option<&EndpointUrl>,
-    interface: &Interface,
+    interface: &MdnsInterface,
     option: &str,
 ) -> Result<EndpointUrl, Failure> {
     if let Some(given) = given {
@@ -385,13 +387,13 @@ fn endpoint(
 fn configurable(
     face: &Face,
     name: &str,
-    (board, place): (&Arc<Board>, watch::Sender<Option<Place>>),
-    (supervision, users): (Supervision, Arc<Access>),
+    (board, place): (&Arc<Board>, watch::Sender<Option<PlantLocation>>),
+    (supervision, users): (Supervision, Arc<UserAccess>),
 ) -> Result<(), Failure> {
     let failed = |error: plant_opcua::server::InstanceError| {
         Failure::new(FailureKind::Unavailable, error.to_string())
     };
-    let told = place.borrow().as_ref().map(Place::to_string);
+    let told = place.borrow().as_ref().map(PlantLocation::to_string);
     let told = told.unwrap_or_default();
     face.object(STATION, &ObjectId::ObjectsFolder.into(), name)
         .map_err(failed)?;
@@ -408,9 +410,9 @@ fn configurable(
                     "refused Configure: the station is not registered with this client"
                 );
             })?;
-        let invalid = Refusal::Status(StatusCode::BadInvalidArgument);
-        let told = Told::read(&request.arguments).ok_or_else(|| invalid.clone())?;
-        let new: Place = told.place.parse().map_err(|_| invalid)?;
+        let invalid = MethodRefusal::Status(StatusCode::BadInvalidArgument);
+        let told = ConfigureArguments::read(&request.arguments).ok_or_else(|| invalid.clone())?;
+        let new: PlantLocation = told.place.parse().map_err(|_| invalid)?;
         info!(place = %new, supervisor = told.supervisor_uri, "configured by the supervisor");
         server.show(&shown, told.place.as_str())?;
         server.show(&by, told.supervisor_uri.as_str())?;
@@ -436,7 +438,7 @@ fn tell(
     upper: &Upper,
     uri: &str,
     (above, below): (&Face, &Face),
-) -> Result<Vec<Announced>, Failure> {
+) -> Result<Vec<ServerAnnouncement>, Failure> {
     let faces = [(above, &upper.interface), (below, &settings.lds.interface)];
     let told = faces.map(|(face, interface)| {
         let how = AnnounceSettings {
@@ -449,8 +451,8 @@ fn tell(
     told.into_iter().collect::<Result<_, _>>().map_err(no_mdns)
 }
 
-fn server(name: &str, uri: &str, face: &Face) -> Server {
-    Server {
+fn server(name: &str, uri: &str, face: &Face) -> ServerDescription {
+    ServerDescription {
         application_uri: uri.to_owned(),
         product_uri: "urn:ua-bridge:plant".to_owned(),
         name: name.to_owned(),
@@ -472,7 +474,7 @@ fn register(
     client: &ClientConfig,
     (board, supervision): (Arc<Board>, Supervision),
 ) -> Result<(mpsc::Sender<()>, tokio::task::JoinHandle<()>), Failure> {
-    let marks = Arc::new(Sessions(client.clone()));
+    let marks = Arc::new(SearchSession(client.clone()));
     let chosen = find_lds(upper.discovery.clone(), &upper.interface, Some(marks));
     let mut chosen = chosen.map_err(no_mdns)?;
     let server = server(&settings.name, face.server.application_uri(), face);
@@ -522,13 +524,13 @@ fn follow(upper: &Upper, tending: Tending) -> Result<Abort, Failure> {
     ))
 }
 
-async fn tend_above(mut watcher: Watcher, tending: Tending) {
+async fn tend_above(mut watcher: ServerWatcher, tending: Tending) {
     let mut tended = Tended::new(tending);
     while let Some(found) = watcher.next().await {
         match found {
-            Found::Seen(known) if !known.is_lds() => tended.told(&known.name, &known.url),
-            Found::Seen(_) | Found::Restarted(_) => {}
-            Found::Gone { known, .. } => tended.left(&known.name),
+            ServerChange::Seen(known) if !known.is_lds() => tended.told(&known.name, &known.url),
+            ServerChange::Seen(_) | ServerChange::Restarted(_) => {}
+            ServerChange::Gone { known, .. } => tended.left(&known.name),
         }
     }
 }
@@ -604,14 +606,14 @@ impl Tended {
         self.take(changes);
     }
 
-    fn take(&mut self, changes: Vec<Change>) {
+    fn take(&mut self, changes: Vec<RosterChange>) {
         for change in changes {
             match change {
-                Change::Joined(url) => {
+                RosterChange::Joined(url) => {
                     let task = tokio::spawn(Arc::clone(&self.tending).tend(url.clone()));
                     self.tasks.insert(url, Abort(task.abort_handle()));
                 }
-                Change::Left(url) => {
+                RosterChange::Left(url) => {
                     self.tasks.remove(&url);
                     self.tending.leave(&url);
                 }

@@ -5,13 +5,14 @@ use std::collections::BTreeSet;
 use std::sync::Arc;
 use std::time::Duration;
 
-use discovery::client::{Application, find_servers};
+use discovery::client::{FoundServer, find_servers};
 use plant_opcua::changes::Became;
 use plant_opcua::client::{
-    CallError, Client, ClientConfig, ClientError, Link, Notice, Select, Subscription, Watch,
+    CallError, ClientConfig, ClientError, ClientSubscription, Link, MonitoredWatch, Notice,
+    OpcUaClient, Select,
 };
 use plant_opcua::types::{DateTime, ObjectId, ObjectTypeId, StatusCode};
-use registry::hierarchy::Place;
+use registry::hierarchy::PlantLocation;
 use tokio::sync::watch;
 use tokio::task::JoinHandle;
 use tokio::time::sleep;
@@ -20,12 +21,12 @@ use tracing::{info, warn};
 use crate::board::{BUSY, Board, CONNECTED, Level};
 use crate::budget::NodeBudget;
 use crate::callers::Callers;
-use crate::configure::Told;
+use crate::configure::ConfigureArguments;
 use crate::copy::{CopiedVariable, ServerCopy};
 use crate::face::Face;
-use crate::feed::{self, Target};
-use crate::looks::Looks;
-use crate::mirror::Mirror;
+use crate::feed::{self, FeedTarget};
+use crate::looks::StationSearches;
+use crate::mirror::MirroredServer;
 
 /// Data that the supervisors of all servers of a level share.
 pub(crate) struct Tending {
@@ -35,7 +36,7 @@ pub(crate) struct Tending {
     pub(crate) face: Option<Face>,
     pub(crate) client: ClientConfig,
     /// The place of the station, for servers that are configured with their place.
-    pub(crate) place: Option<watch::Receiver<Option<Place>>>,
+    pub(crate) place: Option<watch::Receiver<Option<PlantLocation>>>,
     /// The discovery server of this level.
     pub(crate) discovery_url: String,
     /// The ApplicationUri of the station: its own servers are not supervised.
@@ -45,7 +46,7 @@ pub(crate) struct Tending {
     /// The nodes that the face shows of all servers.
     pub(crate) nodes: NodeBudget,
     /// The searches for the nodes of all servers.
-    pub(crate) looks: Looks,
+    pub(crate) looks: StationSearches,
 }
 
 impl Tending {
@@ -60,7 +61,7 @@ impl Tending {
             peer.uri.clone_from(&application.application_uri);
             peer.state = "waiting";
         });
-        let client = Client::open(self.client.clone(), &url);
+        let client = OpcUaClient::open(self.client.clone(), &url);
         let callers = Arc::new(Callers::new(client.clone()));
         if let Some(face) = &self.face {
             face.follow(&callers);
@@ -131,7 +132,7 @@ impl Tending {
 
     /// Identifies the application at a URL; `None` for discovery servers and for the station
     /// itself.
-    async fn ask(&self, url: &str) -> Option<Application> {
+    async fn ask(&self, url: &str) -> Option<FoundServer> {
         let mut wait = FIRST_WAIT;
         loop {
             if let Ok(found) = find_servers(url, ASK_LIMIT).await {
@@ -141,7 +142,7 @@ impl Tending {
                         .next()
                         .map(str::to_owned)
                 };
-                let here = |one: &&Application| {
+                let here = |one: &&FoundServer| {
                     let mut urls = one.discovery_urls.iter();
                     urls.any(|its| port(its) == port(url))
                 };
@@ -159,7 +160,7 @@ impl Tending {
         &self,
         of: &Connected<'_>,
         copy: &mut Option<ServerCopy>,
-        place: &mut Option<watch::Receiver<Option<Place>>>,
+        place: &mut Option<watch::Receiver<Option<PlantLocation>>>,
         link: &mut watch::Receiver<Link>,
     ) {
         let mut known = None;
@@ -197,7 +198,7 @@ impl Tending {
             let is_told = match (&*place, &known) {
                 (
                     Some(place),
-                    Some(Mirror {
+                    Some(MirroredServer {
                         configure: Some(_), ..
                     }),
                 ) => {
@@ -230,7 +231,7 @@ impl Tending {
     }
 
     /// Keeps the nodes of a server that the face can show beside those of the other servers.
-    fn within_budget(&self, url: &str, mut mirror: Mirror) -> Mirror {
+    fn within_budget(&self, url: &str, mut mirror: MirroredServer) -> MirroredServer {
         let wanted = mirror.nodes.len();
         let granted = self.nodes.grant(url, wanted);
         mirror.keep(granted);
@@ -241,7 +242,7 @@ impl Tending {
     async fn show(
         &self,
         (of, run): (&Connected<'_>, Option<DateTime>),
-        looked: &Mirror,
+        looked: &MirroredServer,
         copy: Option<&mut ServerCopy>,
         feeds: &mut Feeds,
     ) {
@@ -252,7 +253,7 @@ impl Tending {
             Some((Ok((added, changed)), copy)) => {
                 // A busy server may respond again with other nodes.
                 copy.trust_again();
-                let target = Target {
+                let target = FeedTarget {
                     face: copy.face().server.clone(),
                     translation: copy.translation(),
                     root: copy.root(),
@@ -294,8 +295,8 @@ impl Tending {
     fn feed(
         &self,
         of: &Connected<'_>,
-        looked: &Mirror,
-        (copy, added, target): (&ServerCopy, Vec<CopiedVariable>, Target),
+        looked: &MirroredServer,
+        (copy, added, target): (&ServerCopy, Vec<CopiedVariable>, FeedTarget),
         feeds: &mut Feeds,
     ) {
         let lost = || {
@@ -349,8 +350,8 @@ impl Tending {
     async fn keep_told(
         &self,
         of: &Connected<'_>,
-        mirror: &Mirror,
-        place: &mut watch::Receiver<Option<Place>>,
+        mirror: &MirroredServer,
+        place: &mut watch::Receiver<Option<PlantLocation>>,
     ) {
         let mut registered = self.registered.subscribe();
         let is_gone = {
@@ -376,7 +377,12 @@ impl Tending {
     }
 
     /// Calls `Configure` of the server. Returns whether there is nothing left to do.
-    async fn configure(&self, of: &Connected<'_>, mirror: &Mirror, station: &Place) -> bool {
+    async fn configure(
+        &self,
+        of: &Connected<'_>,
+        mirror: &MirroredServer,
+        station: &PlantLocation,
+    ) -> bool {
         let Some((object, method)) = &mirror.configure else {
             return true;
         };
@@ -387,7 +393,7 @@ impl Tending {
                 return true;
             }
         };
-        let told = Told {
+        let told = ConfigureArguments {
             place: place.clone(),
             supervisor_uri: self.own_uri.clone(),
             discovery_url: self.discovery_url.clone(),
@@ -430,8 +436,8 @@ impl Tending {
 }
 
 /// Returns a subscription to model changes of a server.
-fn model_changes() -> Watch {
-    Watch::Events {
+fn model_changes() -> MonitoredWatch {
+    MonitoredWatch::Events {
         node: ObjectId::Server.into(),
         select: vec![Select::new(ObjectTypeId::BaseEventType, "EventType")],
         of_type: Some(ObjectTypeId::BaseModelChangeEventType.into()),
@@ -439,7 +445,7 @@ fn model_changes() -> Watch {
 }
 
 /// Completes when the server reports a model change.
-async fn changed(changes: &mut Subscription) {
+async fn changed(changes: &mut ClientSubscription) {
     loop {
         match changes.next().await {
             Some(Notice::Event { .. }) => return,
@@ -451,13 +457,13 @@ async fn changed(changes: &mut Subscription) {
 
 /// A connection to the server with the registered identity.
 struct Connected<'a> {
-    client: &'a Client,
+    client: &'a OpcUaClient,
     callers: &'a Arc<Callers>,
     secured: bool,
     url: &'a str,
     name: &'a str,
     /// The place of the station with which the server was last configured.
-    told: tokio::sync::Mutex<Option<Place>>,
+    told: tokio::sync::Mutex<Option<PlantLocation>>,
 }
 
 /// The tasks that repeat the values and events of a server for the lifetime of a connection.

@@ -3,12 +3,14 @@
 use std::net::SocketAddr;
 
 use mappings::{SpaceId, TopicId};
-use uadp::discovery::{Announced, Announcement, DataSetMetaDataType, EUInformation, Settings as _};
+use uadp::discovery::{
+    AnnouncedContent, Announcement, DataSetMetaDataType, EUInformation, SettingsStructure as _,
+};
 use uadp::{NetworkMessage, NetworkMessageType, PublisherId, Scalar, Variant};
 
 /// The announced description of a value.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub(crate) struct Description {
+pub(crate) struct AnnouncedValue {
     /// The display name; may be empty.
     pub(crate) name: String,
     /// The ROS type, if the fields form a message.
@@ -27,7 +29,7 @@ pub(crate) struct Description {
 pub(crate) fn read(
     message: &NetworkMessage<'_>,
     from: SocketAddr,
-) -> Option<(TopicId, Description)> {
+) -> Option<(TopicId, AnnouncedValue)> {
     if message.message_type() != NetworkMessageType::Announcement
         || message.is_sealed()
         || message.is_chunk()
@@ -38,7 +40,7 @@ pub(crate) fn read(
         return None;
     };
     let announcement = Announcement::decode(message).ok()?;
-    let Announced::DataSetMetaData {
+    let AnnouncedContent::DataSetMetaData {
         writer_id,
         meta_data,
         status,
@@ -54,11 +56,15 @@ pub(crate) fn read(
     Some((topic, description(meta_data, name, from)))
 }
 
-fn description(meta_data: &DataSetMetaDataType<'_>, name: &str, from: SocketAddr) -> Description {
+fn description(
+    meta_data: &DataSetMetaDataType<'_>,
+    name: &str,
+    from: SocketAddr,
+) -> AnnouncedValue {
     let text = meta_data.description.text.unwrap_or_default();
     let (type_name, about) = text.split_once("; ").unwrap_or((text, ""));
     let names = meta_data.fields.iter().take(MOST_FIELDS);
-    Description {
+    AnnouncedValue {
         name: bounded(name),
         type_name: bounded(type_name),
         about: bounded(about),

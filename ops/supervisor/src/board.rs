@@ -12,16 +12,16 @@ use bytes::Bytes;
 use mappings::{Mapping, NodeIdText, SpaceId, TopicId, Variable};
 use uadp::Timestamp;
 
-use crate::announced::Description;
-use crate::mes::Mes;
+use crate::announced::AnnouncedValue;
+use crate::mes::MesClient;
 use crate::operations::ConditionState;
-use crate::program::Program;
-use crate::timeline::{Call, Timeline};
+use crate::program::ProgramStatus;
+use crate::timeline::{CallMessage, Timeline};
 use crate::value;
 
 /// The time of an event on both clocks.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) struct At {
+pub(crate) struct EventTime {
     /// The time since the start of the page.
     pub(crate) since: Duration,
     /// The time of the day.
@@ -30,7 +30,7 @@ pub(crate) struct At {
 
 /// A received value.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Sample<'a> {
+pub(crate) struct BoardSample<'a> {
     pub(crate) topic: TopicId,
     /// The block of fields.
     pub(crate) block: &'a Bytes,
@@ -42,11 +42,11 @@ pub(crate) struct Sample<'a> {
 
 /// All that the page knows of the cell.
 #[derive(Debug, Default)]
-pub(crate) struct Board {
-    pub(crate) topics: BTreeMap<TopicId, Entry>,
+pub(crate) struct CellBoard {
+    pub(crate) topics: BTreeMap<TopicId, TopicEntry>,
     /// The calls that can be requested, and whether this program executes them itself.
     pub(crate) calls: BTreeMap<TopicId, (Arc<CallDescription>, bool)>,
-    pub(crate) programs: Vec<Program>,
+    pub(crate) programs: Vec<ProgramStatus>,
     /// The events of values and calls.
     pub(crate) timeline: Timeline,
     /// The conditions of the program, if it has any; read while a browser shows them.
@@ -63,8 +63,8 @@ pub(crate) struct Board {
 
 /// A topic with its last value.
 #[derive(Debug)]
-pub(crate) struct Entry {
-    pub(crate) description: Description,
+pub(crate) struct TopicEntry {
+    pub(crate) description: AnnouncedValue,
     /// The ROS topics by the mapping: the space and the name.
     pub(crate) ros: Vec<(SpaceId, String)>,
     /// The unit by the mapping.
@@ -82,7 +82,7 @@ pub(crate) struct Entry {
     pub(crate) rate: Rate,
     pub(crate) spark: VecDeque<f32>,
     sparked: Duration,
-    pub(crate) delays: Delays,
+    pub(crate) delays: DelayClasses,
     /// The samples dropped by all programs, by reason.
     pub(crate) dropped: BTreeMap<String, u64>,
     /// The name in lower case, for filters.
@@ -99,7 +99,7 @@ pub(crate) struct Rate {
 
 /// The delays from the producer's bridge to this program, in classes of powers of two.
 #[derive(Debug, Default)]
-pub(crate) struct Delays {
+pub(crate) struct DelayClasses {
     /// Class `n` counts delays of 2^n to 2^(n+1) microseconds; class 0 also shorter delays.
     pub(crate) classes: [u32; DELAY_CLASSES],
     /// Delays below zero, which result from clocks that differ.
@@ -111,19 +111,19 @@ pub(crate) struct Delays {
 #[derive(Debug, Default)]
 struct Watched {
     until: Duration,
-    samples: VecDeque<Kept>,
+    samples: VecDeque<KeptSample>,
 }
 
 /// A kept sample.
 #[derive(Debug, Clone)]
-pub(crate) struct Kept {
+pub(crate) struct KeptSample {
     pub(crate) at: Timestamp,
     pub(crate) delay_us: Option<f64>,
     pub(crate) status: u16,
     pub(crate) line: String,
 }
 
-impl Board {
+impl CellBoard {
     /// Takes the names and bindings of a mapping.
     pub(crate) fn map(&mut self, mapping: &Arc<Mapping>) {
         self.mapping = Some(Arc::clone(mapping));
@@ -139,8 +139,8 @@ impl Board {
     }
 
     /// Takes a value.
-    pub(crate) fn take(&mut self, sample: Sample<'_>, at: At) {
-        let Sample {
+    pub(crate) fn take(&mut self, sample: BoardSample<'_>, at: EventTime) {
+        let BoardSample {
             topic,
             block,
             source,
@@ -165,7 +165,7 @@ impl Board {
             }
             let names = self.topics.get(&topic);
             let names = names.map_or(&[][..], |entry| &entry.description.fields);
-            watched.samples.push_back(Kept {
+            watched.samples.push_back(KeptSample {
                 at: source.unwrap_or(at.utc),
                 delay_us: delay,
                 status,
@@ -176,7 +176,7 @@ impl Board {
 
     /// Takes a description that was received in clear. In a secured namespace it is ignored,
     /// because any host can send it.
-    pub(crate) fn announce(&mut self, topic: TopicId, description: Description) {
+    pub(crate) fn announce(&mut self, topic: TopicId, description: AnnouncedValue) {
         let (_, namespace, _) = topic.triple();
         let mapping = self.mapping.as_deref();
         if mapping.is_none_or(|mapping| mapping.group_of(namespace).is_none()) {
@@ -185,7 +185,7 @@ impl Board {
     }
 
     /// Takes the description of a topic.
-    pub(crate) fn describe(&mut self, topic: TopicId, description: Description) {
+    pub(crate) fn describe(&mut self, topic: TopicId, description: AnnouncedValue) {
         let Some(entry) = self.entry(topic) else {
             return;
         };
@@ -206,7 +206,7 @@ impl Board {
     }
 
     /// Takes a request or response that was received in clear.
-    pub(crate) fn called(&mut self, call: Call, at: At) {
+    pub(crate) fn called(&mut self, call: CallMessage, at: EventTime) {
         self.timeline.call(call, at);
     }
 
@@ -235,14 +235,15 @@ impl Board {
     }
 
     /// Returns the MES, if its status was read.
-    pub(crate) fn mes(&self) -> Option<Mes> {
-        let is_mes = |program: &&Program| program.status.as_ref().is_ok_and(Mes::is_status);
+    pub(crate) fn mes(&self) -> Option<MesClient> {
+        let is_mes =
+            |program: &&ProgramStatus| program.status.as_ref().is_ok_and(MesClient::is_status);
         let program = self.programs.iter().find(is_mes)?;
-        program.source.parse().ok().map(Mes::new)
+        program.source.parse().ok().map(MesClient::new)
     }
 
     /// Takes the status of all programs.
-    pub(crate) fn set_programs(&mut self, programs: Vec<Program>) {
+    pub(crate) fn set_programs(&mut self, programs: Vec<ProgramStatus>) {
         for (topic, entry) in &mut self.topics {
             let name = topic.to_string();
             let mut dropped = BTreeMap::new();
@@ -275,7 +276,7 @@ impl Board {
     }
 
     /// Keeps the samples of a topic for some seconds, and returns the kept samples, newest first.
-    pub(crate) fn watch(&mut self, topic: TopicId, now: Duration) -> Vec<Kept> {
+    pub(crate) fn watch(&mut self, topic: TopicId, now: Duration) -> Vec<KeptSample> {
         self.watched.retain(|_, watched| watched.until > now);
         let has_room = self.watched.len() < MOST_WATCHED || self.watched.contains_key(&topic);
         if !has_room {
@@ -290,7 +291,7 @@ impl Board {
     pub(crate) fn nameless(&mut self) -> Vec<TopicId> {
         let mut asked = Vec::new();
         for (topic, entry) in &self.topics {
-            let is_nameless = entry.description == Description::default();
+            let is_nameless = entry.description == AnnouncedValue::default();
             if entry.count == 0 || !is_nameless {
                 continue;
             }
@@ -306,23 +307,23 @@ impl Board {
         asked
     }
 
-    fn entry(&mut self, topic: TopicId) -> Option<&mut Entry> {
+    fn entry(&mut self, topic: TopicId) -> Option<&mut TopicEntry> {
         if !self.topics.contains_key(&topic) {
             if self.topics.len() >= MOST_TOPICS {
                 return None;
             }
             self.topics
-                .insert(topic, Entry::new(topic, self.mapping.as_deref()));
+                .insert(topic, TopicEntry::new(topic, self.mapping.as_deref()));
             self.is_ordered = false;
         }
         self.topics.get_mut(&topic)
     }
 }
 
-impl Entry {
+impl TopicEntry {
     fn new(topic: TopicId, mapping: Option<&Mapping>) -> Self {
         let mut entry = Self {
-            description: Description::default(),
+            description: AnnouncedValue::default(),
             ros: Vec::new(),
             unit: None,
             writable: None,
@@ -336,7 +337,7 @@ impl Entry {
             rate: Rate::default(),
             spark: VecDeque::new(),
             sparked: Duration::ZERO,
-            delays: Delays::default(),
+            delays: DelayClasses::default(),
             dropped: BTreeMap::new(),
             folded: String::new(),
         };
@@ -401,7 +402,7 @@ impl Entry {
     }
 
     /// Takes a value. Returns its delay in microseconds.
-    fn update(&mut self, sample: Sample<'_>, at: At) -> Option<f64> {
+    fn update(&mut self, sample: BoardSample<'_>, at: EventTime) -> Option<f64> {
         let delay = sample
             .source
             .map(|source| at.utc.unix_nanos() - source.unix_nanos());
@@ -464,7 +465,7 @@ impl Rate {
     }
 }
 
-impl Delays {
+impl DelayClasses {
     /// Counts a delay. Returns it in microseconds, unless it is negative.
     fn record(&mut self, nanos: i128) -> Option<f64> {
         let Ok(nanos) = u64::try_from(nanos) else {
@@ -541,9 +542,9 @@ const PROBED_TOGETHER: usize = 64;
 pub(crate) mod tests {
     use super::*;
 
-    pub(crate) fn at(millis: u64) -> At {
+    pub(crate) fn at(millis: u64) -> EventTime {
         let nanos = 1_700_000_000_000_000_000 + i128::from(millis) * 1_000_000;
-        At {
+        EventTime {
             since: Duration::from_millis(millis),
             utc: Timestamp::from_unix_nanos(nanos),
         }
@@ -554,11 +555,11 @@ pub(crate) mod tests {
     }
 
     /// Takes a Double that was sent 2 ms before.
-    pub(crate) fn take(board: &mut Board, of: TopicId, number: f64, millis: u64) {
+    pub(crate) fn take(board: &mut CellBoard, of: TopicId, number: f64, millis: u64) {
         let mut block = vec![1, 0, 11];
         block.extend(number.to_le_bytes());
         let sent = Timestamp::from_unix_nanos(at(millis).utc.unix_nanos() - 2_000_000);
-        let sample = Sample {
+        let sample = BoardSample {
             topic: of,
             block: &block.into(),
             source: Some(sent),
@@ -569,7 +570,7 @@ pub(crate) mod tests {
 
     #[test]
     fn the_rate_is_the_mean_of_full_seconds() {
-        let mut board = Board::default();
+        let mut board = CellBoard::default();
         let one = topic("ua_1_2_10");
         for millis in (0..6000).step_by(100) {
             take(&mut board, one, 1.0, millis);
@@ -583,10 +584,10 @@ pub(crate) mod tests {
 
     #[test]
     fn delays_are_counted_in_classes_and_negative_delays_apart() {
-        let mut board = Board::default();
+        let mut board = CellBoard::default();
         let one = topic("ua_1_2_10");
         take(&mut board, one, 1.0, 10);
-        let early = Sample {
+        let early = BoardSample {
             topic: one,
             block: &Bytes::from_static(&[0, 0]),
             source: Some(at(5000).utc),
@@ -602,11 +603,11 @@ pub(crate) mod tests {
 
     #[test]
     fn the_number_of_topics_is_bounded_and_the_rest_is_counted() {
-        let mut board = Board::default();
+        let mut board = CellBoard::default();
         for id in 1..=u16::MAX {
             let of = TopicId::new(2, 5, id).unwrap();
             board.take(
-                Sample {
+                BoardSample {
                     topic: of,
                     block: &Bytes::new(),
                     source: None,
@@ -621,7 +622,7 @@ pub(crate) mod tests {
 
     #[test]
     fn samples_are_kept_while_a_browser_shows_the_topic() {
-        let mut board = Board::default();
+        let mut board = CellBoard::default();
         let one = topic("ua_1_2_10");
         take(&mut board, one, 1.0, 0);
         assert!(board.watch(one, at(0).since).is_empty());
@@ -637,14 +638,14 @@ pub(crate) mod tests {
 
     #[test]
     fn topics_are_in_the_order_of_their_names() {
-        let mut board = Board::default();
+        let mut board = CellBoard::default();
         let (a, b) = (topic("ua_1_2_10"), topic("ua_1_2_11"));
         take(&mut board, a, 1.0, 0);
         take(&mut board, b, 1.0, 0);
         assert_eq!(board.ordered(), [a, b]);
-        let named = Description {
+        let named = AnnouncedValue {
             name: "zone".to_owned(),
-            ..Description::default()
+            ..AnnouncedValue::default()
         };
         board.describe(a, named);
         assert_eq!(board.ordered(), [b, a]);
@@ -653,10 +654,10 @@ pub(crate) mod tests {
 
     #[test]
     fn drops_of_all_programs_are_added_up() {
-        let mut board = Board::default();
+        let mut board = CellBoard::default();
         let one = topic("ua_1_2_10");
         take(&mut board, one, 1.0, 0);
-        let program = |count: u64| Program {
+        let program = |count: u64| ProgramStatus {
             source: String::new(),
             status: Ok(serde_json::json!({
                 "topics": { "ua_1_2_10": { "dropped": { "full": count } } }

@@ -1,7 +1,7 @@
 //! Requests of calls and values of topics, from the text of a form.
 
 use bridge_node::{CallDescription, CallField};
-use messages::Rank;
+use messages::ArrayRank;
 use serde_json::{Map, Value};
 use uadp::BuiltinType;
 
@@ -78,7 +78,7 @@ pub(crate) fn value(field: &CallField, given: &Value) -> Result<Vec<u8>, FormFau
 }
 
 fn variant(field: &CallField, value: &Value, block: &mut Vec<u8>) -> Result<(), EntryFault> {
-    let Rank::Array { fixed } = field.rank else {
+    let ArrayRank::Array { fixed } = field.rank else {
         block.push(field.builtin.id());
         return scalar(field.builtin, &text(value), block);
     };
@@ -239,7 +239,7 @@ mod tests {
         let force = vec![CallField::scalar("Force", BuiltinType::Double)];
         assert!(encoded(force, &json!({ "Force": "inf" })).is_err());
         let fixed = CallField {
-            rank: Rank::Array { fixed: Some(6) },
+            rank: ArrayRank::Array { fixed: Some(6) },
             ..CallField::array("Joints", BuiltinType::Double)
         };
         for text in ["1,,3", "0,5; 1,5"] {

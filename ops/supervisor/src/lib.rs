@@ -39,4 +39,4 @@ pub use operations::{
 pub use page::{Page, Recorded};
 pub use program::is_intended_drop;
 pub use proxy::{ProxyUrl, ProxyUrlError};
-pub use tls::Pair;
+pub use tls::CertificateFiles;

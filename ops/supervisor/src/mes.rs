@@ -23,16 +23,16 @@ use crate::table;
 
 /// The program `ua-mes` at its address for queries.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) struct Mes(StatusUrl);
+pub(crate) struct MesClient(StatusUrl);
 
 /// The requests that are passed on at the same time; each has its result or file in memory.
 #[derive(Debug)]
-pub(crate) struct Places {
+pub(crate) struct RequestSlots {
     pub(crate) queries: Semaphore,
     pub(crate) files: Arc<Semaphore>,
 }
 
-impl Default for Places {
+impl Default for RequestSlots {
     fn default() -> Self {
         Self {
             queries: Semaphore::new(4),
@@ -53,7 +53,7 @@ pub(crate) struct SourceFile {
 
 /// The name and password of a user of `ua-mes`.
 #[derive(Clone)]
-pub(crate) struct Credentials {
+pub(crate) struct MesCredentials {
     pub(crate) user: String,
     pub(crate) password: String,
 }
@@ -92,7 +92,7 @@ struct Refusal {
     message: String,
 }
 
-impl Mes {
+impl MesClient {
     pub(crate) const fn new(at: StatusUrl) -> Self {
         Self(at)
     }
@@ -145,7 +145,7 @@ impl Mes {
     pub(crate) async fn check(
         &self,
         file: &SourceFile,
-        by: Option<&Credentials>,
+        by: Option<&MesCredentials>,
     ) -> Result<Value, MesFault> {
         let request = upload((Method::POST, "check"), file, by)?;
         json(&self.send(request, UPLOAD_LIMIT).await?)
@@ -155,7 +155,7 @@ impl Mes {
     pub(crate) async fn load(
         &self,
         file: &SourceFile,
-        by: Option<&Credentials>,
+        by: Option<&MesCredentials>,
     ) -> Result<(), MesFault> {
         let request = upload((Method::PUT, "sources"), file, by)?;
         self.send(request, UPLOAD_LIMIT).await.map(drop)
@@ -211,13 +211,13 @@ fn get(path: &str) -> Result<Request<Bytes>, MesFault> {
 fn upload(
     (method, verb): (Method, &str),
     file: &SourceFile,
-    by: Option<&Credentials>,
+    by: Option<&MesCredentials>,
 ) -> Result<Request<Bytes>, MesFault> {
     let mut request = Request::new(file.contents.clone());
     *request.method_mut() = method;
     let path = format!("/{verb}/{}/{}", file.kind, escaped(&file.name));
     *request.uri_mut() = path.parse()?;
-    if let Some(Credentials { user, password }) = by {
+    if let Some(MesCredentials { user, password }) = by {
         let basic = format!("Basic {}", STANDARD.encode(format!("{user}:{password}")));
         let mut basic = HeaderValue::from_str(&basic)?;
         basic.set_sensitive(true);
@@ -289,7 +289,7 @@ mod tests {
             name: "a module/1.aml".to_owned(),
             contents: Bytes::from_static(b"x"),
         };
-        let by = Credentials {
+        let by = MesCredentials {
             user: "anna".to_owned(),
             password: "secret: 1".to_owned(),
         };

@@ -5,26 +5,26 @@ use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError, Weak};
 use std::time::{Duration, Instant};
 
-use bridge_node::{CallDescription, Delivery, Observer, PortEvent, Statuses, now};
+use bridge_node::{CallDescription, LocalDelivery, Observer, PortEvent, Statuses, now};
 use bytes::Bytes;
 use mappings::{Mapping, SpaceId, TopicId};
 use serde_json::Value;
 use tokio::time::{MissedTickBehavior, interval};
 use tracing::warn;
-use uadp::discovery::{List, Probe};
+use uadp::discovery::{Probe, WireArray};
 use uadp::{NetworkMessage, PublisherId, SecurityHeader, Timestamp};
 
-use crate::announced::{self, Description};
-use crate::board::{At, Board, Sample};
+use crate::announced::{self, AnnouncedValue};
+use crate::board::{BoardSample, CellBoard, EventTime};
 use crate::fetch::StatusUrl;
-use crate::mes::{Mes, Places};
+use crate::mes::{MesClient, RequestSlots};
 use crate::operations::Operations;
-use crate::program::Program;
+use crate::program::ProgramStatus;
 use crate::proxy::ProxyUrl;
-use crate::session::Sessions;
+use crate::session::BrowserSessions;
 use crate::stream::Worker;
 use crate::timeline;
-use crate::tls::Resolver;
+use crate::tls::CertificateResolver;
 use crate::view::Viewer;
 
 /// The page of a program.
@@ -34,13 +34,13 @@ pub struct Page {
     /// The reverse proxy through which browsers reach the page, if there is one.
     pub(crate) proxy: Option<ProxyUrl>,
     /// The certificate of the page for browsers of other hosts, if it is served by TLS.
-    pub(crate) tls: OnceLock<Arc<Resolver>>,
+    pub(crate) tls: OnceLock<Arc<CertificateResolver>>,
     /// The users and the commands of the program, if it has any.
     pub(crate) operations: OnceLock<Arc<dyn Operations>>,
-    pub(crate) sessions: Mutex<Sessions>,
+    pub(crate) sessions: Mutex<BrowserSessions>,
     /// The requests to the MES at the same time.
-    pub(crate) places: Places,
-    board: Mutex<Board>,
+    pub(crate) places: RequestSlots,
+    board: Mutex<CellBoard>,
     /// Whether the page shows a recording instead of the group.
     shows_recording: AtomicBool,
     started: Instant,
@@ -76,7 +76,7 @@ impl Page {
             tls: OnceLock::new(),
             operations: OnceLock::new(),
             sessions: Mutex::default(),
-            places: Places::default(),
+            places: RequestSlots::default(),
             board: Mutex::default(),
             shows_recording: AtomicBool::new(false),
             started: now().monotonic,
@@ -100,7 +100,7 @@ impl Page {
 
     /// Takes a value of the recording that was received `since` its first datagram.
     pub fn recorded_value(&self, value: &Recorded<'_>, at: (Duration, Timestamp)) {
-        let sample = Sample {
+        let sample = BoardSample {
             topic: value.topic,
             block: &Bytes::copy_from_slice(value.block),
             source: value.source,
@@ -110,7 +110,7 @@ impl Page {
     }
 
     /// Reads the announcement and the calls of a datagram.
-    fn read(&self, datagram: &[u8], from: SocketAddr, at: At) {
+    fn read(&self, datagram: &[u8], from: SocketAddr, at: EventTime) {
         let Ok(message) = NetworkMessage::decode(datagram) else {
             return;
         };
@@ -153,24 +153,24 @@ impl Page {
         self.worker.get_or_init(start).as_ref()
     }
 
-    pub(crate) fn sessions(&self) -> MutexGuard<'_, Sessions> {
+    pub(crate) fn sessions(&self) -> MutexGuard<'_, BrowserSessions> {
         self.sessions.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    pub(crate) fn board(&self) -> MutexGuard<'_, Board> {
+    pub(crate) fn board(&self) -> MutexGuard<'_, CellBoard> {
         self.board.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    pub(crate) fn at(&self) -> At {
+    pub(crate) fn at(&self) -> EventTime {
         let now = now();
-        At {
+        EventTime {
             since: now.monotonic.saturating_duration_since(self.started),
             utc: now.utc,
         }
     }
 
     /// Returns the MES among the programs whose status is read.
-    pub(crate) async fn mes(&self) -> Option<Mes> {
+    pub(crate) async fn mes(&self) -> Option<MesClient> {
         let known = self.board().mes();
         if known.is_some() {
             return known;
@@ -179,9 +179,9 @@ impl Page {
             if url
                 .fetch()
                 .await
-                .is_ok_and(|status| Mes::is_status(&status))
+                .is_ok_and(|status| MesClient::is_status(&status))
             {
-                return Some(Mes::new(url.clone()));
+                return Some(MesClient::new(url.clone()));
             }
         }
         None
@@ -246,12 +246,12 @@ impl Observer for Page {
         }
     }
 
-    fn received(&self, sample: &Delivery) {
+    fn received(&self, sample: &LocalDelivery) {
         if !self.is_live() {
             return;
         }
         let at = self.at();
-        let sample = Sample {
+        let sample = BoardSample {
             topic: sample.topic,
             block: &sample.payload,
             source: sample.source,
@@ -283,7 +283,7 @@ impl Observer for Page {
             } => (*topic, payload, *taken, *status),
             PortEvent::Described { topic, description } => {
                 let type_name = description.message_type.as_ref();
-                let shown = Description {
+                let shown = AnnouncedValue {
                     name: description.name.clone(),
                     type_name: type_name.map_or_else(String::new, ToString::to_string),
                     about: description.about.clone(),
@@ -305,7 +305,7 @@ impl Observer for Page {
             _ => return,
         };
         let at = self.at();
-        let sample = Sample {
+        let sample = BoardSample {
             topic,
             block,
             source: Some(source),
@@ -355,8 +355,8 @@ pub struct Recorded<'a> {
     pub status: u16,
 }
 
-fn recorded_at((since, utc): (Duration, Timestamp)) -> At {
-    At { since, utc }
+fn recorded_at((since, utc): (Duration, Timestamp)) -> EventTime {
+    EventTime { since, utc }
 }
 
 /// Returns a probe for the descriptions of topics of a space.
@@ -364,16 +364,16 @@ fn probe<'t>(space: SpaceId, topics: impl Iterator<Item = &'t TopicId>) -> Optio
     let ids: Vec<u16> = topics.map(|topic| topic.identifier.get()).collect();
     let mut datagram = Vec::new();
     let publisher = Some(PublisherId::UInt16(space.into()));
-    let probe = Probe::DataSetMetaData(List::new(&ids));
+    let probe = Probe::DataSetMetaData(WireArray::new(&ids));
     let encoded = probe.encode(publisher, SecurityHeader::NONE, &mut datagram);
     encoded.ok().map(|_| datagram)
 }
 
 /// Returns the status of each run loop of this program.
-fn own(statuses: Vec<String>) -> Vec<Program> {
+fn own(statuses: Vec<String>) -> Vec<ProgramStatus> {
     let statuses = statuses.into_iter();
     statuses
-        .map(|text| Program {
+        .map(|text| ProgramStatus {
             source: "this program".to_owned(),
             status: serde_json::from_str(&text).map_err(|error| error.to_string()),
         })
@@ -381,14 +381,14 @@ fn own(statuses: Vec<String>) -> Vec<Program> {
 }
 
 /// Returns the status of another program; a program with several spaces has several.
-fn other(url: &StatusUrl, status: Result<Value, String>) -> Vec<Program> {
+fn other(url: &StatusUrl, status: Result<Value, String>) -> Vec<ProgramStatus> {
     let source = url.to_string();
     let each = match status {
         Ok(Value::Array(all)) => all.into_iter().map(Ok).collect(),
         other => vec![other],
     };
     each.into_iter()
-        .map(|status| Program {
+        .map(|status| ProgramStatus {
             source: source.clone(),
             status,
         })

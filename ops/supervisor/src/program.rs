@@ -8,7 +8,7 @@ use crate::value::cut;
 
 /// The status of a program, as read from its `/status`.
 #[derive(Debug, Clone, PartialEq)]
-pub(crate) struct Program {
+pub(crate) struct ProgramStatus {
     /// The location of the status: `this program`, or a URL.
     pub(crate) source: String,
     /// The status; otherwise the reason why it cannot be read.
@@ -23,7 +23,7 @@ pub(crate) struct TopicCounts {
     pub(crate) dropped: BTreeMap<String, u64>,
 }
 
-impl Program {
+impl ProgramStatus {
     /// Returns the name of the program.
     pub(crate) fn name(&self) -> &str {
         let status = self.status.as_ref().ok();
@@ -204,8 +204,8 @@ const LONGEST_REASON: usize = 400;
 mod tests {
     use super::*;
 
-    fn program(status: Value) -> Program {
-        Program {
+    fn program(status: Value) -> ProgramStatus {
+        ProgramStatus {
             source: "this program".to_owned(),
             status: Ok(status),
         }
@@ -241,7 +241,7 @@ mod tests {
         );
         let waiting = program(json!({ "not_ready": [], "waiting_for": ["space 2: no publisher"] }));
         assert_eq!(waiting.row()["state"], "waiting");
-        let gone = Program {
+        let gone = ProgramStatus {
             source: "http://127.0.0.1:9101".to_owned(),
             status: Err("connection refused".to_owned()),
         };

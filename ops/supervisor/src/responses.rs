@@ -17,9 +17,9 @@ pub(crate) fn set_cookie(response: &mut Response<PageBody>, cookie: &str) {
 
 /// The status and the reason of a refused request.
 #[derive(Debug)]
-pub(crate) struct Refusal(pub(crate) StatusCode, pub(crate) String);
+pub(crate) struct RefusedRequest(pub(crate) StatusCode, pub(crate) String);
 
-impl Refusal {
+impl RefusedRequest {
     pub(crate) fn new(status: StatusCode, why: impl Into<String>) -> Self {
         Self(status, why.into())
     }

@@ -7,15 +7,15 @@ use std::time::Duration;
 
 /// The sessions of browsers.
 #[derive(Debug, Default)]
-pub(crate) struct Sessions {
-    open: HashMap<String, Session>,
+pub(crate) struct BrowserSessions {
+    open: HashMap<String, BrowserSession>,
     /// The failed attempts of the last minute, oldest first.
     failed: VecDeque<(Duration, String)>,
 }
 
 /// The session of a user.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) struct Session {
+pub(crate) struct BrowserSession {
     pub(crate) user: String,
     /// The token that each changing request repeats in a header.
     pub(crate) csrf: String,
@@ -28,7 +28,7 @@ pub(crate) struct Session {
 #[error("too many attempts have failed: try again in {} s", LOCKED_FOR.as_secs())]
 pub(crate) struct Locked;
 
-impl Sessions {
+impl BrowserSessions {
     /// Checks whether a user may attempt to sign in.
     ///
     /// # Errors
@@ -70,7 +70,7 @@ impl Sessions {
         user: &str,
         [token, csrf]: [String; 2],
         now: Duration,
-    ) -> Session {
+    ) -> BrowserSession {
         self.expire(now);
         if self.open.len() >= MOST_SESSIONS {
             let oldest = self.open.iter().min_by_key(|(_, session)| session.used);
@@ -78,7 +78,7 @@ impl Sessions {
                 self.open.remove(&token);
             }
         }
-        let session = Session {
+        let session = BrowserSession {
             user: user.to_owned(),
             csrf,
             used: now,
@@ -89,7 +89,7 @@ impl Sessions {
     }
 
     /// Returns the session of a token.
-    pub(crate) fn find(&mut self, token: &str, now: Duration) -> Option<Session> {
+    pub(crate) fn find(&mut self, token: &str, now: Duration) -> Option<BrowserSession> {
         self.expire(now);
         let session = self.open.get_mut(token)?;
         session.used = now;
@@ -115,7 +115,7 @@ impl Sessions {
 
 /// The browser of an event stream.
 #[derive(Debug)]
-pub(crate) struct Reader {
+pub(crate) struct EventStreamBrowser {
     pub(crate) token: String,
     /// Whether only a signed-in user may read.
     pub(crate) must_sign_in: bool,
@@ -154,7 +154,7 @@ mod tests {
 
     #[test]
     fn a_session_is_found_by_its_token_until_it_is_closed_or_old() {
-        let mut sessions = Sessions::default();
+        let mut sessions = BrowserSessions::default();
         sessions.open("anna", tokens(1), at(0));
         assert_eq!(sessions.find("token1", at(1)).unwrap().user, "anna");
         assert_eq!(sessions.find("token2", at(1)), None);
@@ -166,7 +166,7 @@ mod tests {
 
     #[test]
     fn the_number_of_sessions_is_bounded() {
-        let mut sessions = Sessions::default();
+        let mut sessions = BrowserSessions::default();
         for number in 0..=MOST_SESSIONS {
             let now = at(u64::try_from(number).unwrap());
             sessions.open("anna", tokens(number), now);
@@ -177,7 +177,7 @@ mod tests {
 
     #[test]
     fn a_user_is_locked_after_failures_and_others_are_not() {
-        let mut sessions = Sessions::default();
+        let mut sessions = BrowserSessions::default();
         for _ in 0..MOST_FAILED_OF_USER {
             assert_eq!(sessions.may_try("anna", at(0)), Ok(()));
             sessions.fail("anna", at(0));

@@ -25,17 +25,17 @@ use uri_text::{is_loopback_host, without_port};
 use crate::encode;
 use crate::operations::{ConditionChange, OperationFault, Operations};
 use crate::page::Page;
-use crate::responses::{FILES, Refusal, json_page, refused, set_cookie, with_headers};
-use crate::session::{Reader, Session, cookie};
+use crate::responses::{FILES, RefusedRequest, json_page, refused, set_cookie, with_headers};
+use crate::session::{BrowserSession, EventStreamBrowser, cookie};
 use crate::stream::Events;
 use crate::value;
-use crate::view::View;
+use crate::view::BrowserView;
 
 /// The origin of a request: its Host, and its session.
 struct Browser {
     host: String,
     via: Via,
-    session: Option<Session>,
+    session: Option<BrowserSession>,
     token: String,
 }
 
@@ -97,7 +97,7 @@ impl Site for Page {
         Box::pin(async move {
             match self.respond(request, &visit).await {
                 Ok(response) => response,
-                Err(Refusal(status, why)) => refused(status, &why),
+                Err(RefusedRequest(status, why)) => refused(status, &why),
             }
         })
     }
@@ -134,7 +134,7 @@ impl Page {
         self: Arc<Self>,
         request: Request<impl RequestBody>,
         visit: &Visit,
-    ) -> Result<Response<PageBody>, Refusal> {
+    ) -> Result<Response<PageBody>, RefusedRequest> {
         let (host, via) = self.host(request.headers(), visit)?;
         let path = request.uri().path().to_owned();
         if request.method() == Method::POST {
@@ -163,13 +163,13 @@ impl Page {
             "/events" => {
                 check_reader(&browser)?;
                 let query = request.uri().query().unwrap_or_default();
-                let view = View::parse(query).map_err(bad_request)?;
+                let view = BrowserView::parse(query).map_err(bad_request)?;
                 let worker = self.worker().ok_or_else(|| {
                     let why = "the system refuses another thread";
-                    Refusal::new(StatusCode::SERVICE_UNAVAILABLE, why)
+                    RefusedRequest::new(StatusCode::SERVICE_UNAVAILABLE, why)
                 })?;
                 visit.keep_open();
-                let reader = Reader {
+                let reader = EventStreamBrowser {
                     token: browser.token,
                     must_sign_in: via.is_remote(),
                 };
@@ -183,7 +183,7 @@ impl Page {
                 visit.keep_open();
                 knowledge::read(&self, request.uri()).await
             }
-            _ => Err(Refusal::new(
+            _ => Err(RefusedRequest::new(
                 StatusCode::NOT_FOUND,
                 "there is no such page; the start is /",
             )),
@@ -197,10 +197,10 @@ impl Page {
         request: Request<impl RequestBody>,
         browser: Browser,
         visit: &Visit,
-    ) -> Result<Response<PageBody>, Refusal> {
+    ) -> Result<Response<PageBody>, RefusedRequest> {
         let operations = self.operations.get().cloned().ok_or_else(|| {
             let why = format!("{} has no users: the page is read-only", self.program);
-            Refusal::new(StatusCode::FORBIDDEN, why)
+            RefusedRequest::new(StatusCode::FORBIDDEN, why)
         })?;
         let token = request.headers().get("x-csrf-token");
         let token = token
@@ -216,10 +216,10 @@ impl Page {
         let session = browser
             .session
             .as_ref()
-            .ok_or_else(|| Refusal::new(StatusCode::UNAUTHORIZED, "sign in first"))?;
+            .ok_or_else(|| RefusedRequest::new(StatusCode::UNAUTHORIZED, "sign in first"))?;
         let is_own: bool = session.csrf.as_bytes().ct_eq(token.as_bytes()).into();
         if !is_own {
-            return Err(Refusal::new(
+            return Err(RefusedRequest::new(
                 StatusCode::FORBIDDEN,
                 "the request does not come from the page: load it again",
             ));
@@ -245,7 +245,7 @@ impl Page {
             knowledge::CHECK | knowledge::LOAD => {
                 knowledge::upload(&self, operations.as_ref(), session, request).await
             }
-            _ => Err(Refusal::new(
+            _ => Err(RefusedRequest::new(
                 StatusCode::NOT_FOUND,
                 "there is no such request",
             )),
@@ -257,24 +257,25 @@ impl Page {
         operations: &Arc<dyn Operations>,
         browser: &Browser,
         SignIn { user, password }: SignIn,
-    ) -> Result<Response<PageBody>, Refusal> {
+    ) -> Result<Response<PageBody>, RefusedRequest> {
         let now = self.at().since;
         let may_try = self.sessions().may_try(&user, now);
-        may_try
-            .map_err(|locked| Refusal::new(StatusCode::TOO_MANY_REQUESTS, locked.to_string()))?;
+        may_try.map_err(|locked| {
+            RefusedRequest::new(StatusCode::TOO_MANY_REQUESTS, locked.to_string())
+        })?;
         // Counted before the check, so that attempts at the same time are limited too.
         self.sessions().fail(&user, now);
         let shown = value::cut(&user, 64);
         if !operations.sign_in(user.clone(), password).await {
             warn!(user = shown, "refused to sign in on the page");
-            return Err(Refusal::new(
+            return Err(RefusedRequest::new(
                 StatusCode::FORBIDDEN,
                 "no such user, or another password",
             ));
         }
         let fault = |error| {
             warn!("cannot read {RANDOM}: {error}");
-            Refusal::new(StatusCode::INTERNAL_SERVER_ERROR, "no random token")
+            RefusedRequest::new(StatusCode::INTERNAL_SERVER_ERROR, "no random token")
         };
         let (token, csrf) = (random().map_err(fault)?, random().map_err(fault)?);
         let session = {
@@ -292,21 +293,21 @@ impl Page {
     async fn call(
         &self,
         operations: &Arc<dyn Operations>,
-        session: &Session,
+        session: &BrowserSession,
         Call { topic, fields }: Call,
-    ) -> Result<Response<PageBody>, Refusal> {
+    ) -> Result<Response<PageBody>, RefusedRequest> {
         let topic = parse_topic(&topic)?;
         let known = self.board().calls.get(&topic).cloned();
         let (call, is_own) = known.ok_or_else(|| {
             let why = format!("the call {topic} has no executor");
-            Refusal::new(StatusCode::NOT_FOUND, why)
+            RefusedRequest::new(StatusCode::NOT_FOUND, why)
         })?;
         if is_own {
             let why = format!(
                 "{} executes {topic} itself: call it by OPC UA",
                 self.program
             );
-            return Err(Refusal::new(StatusCode::CONFLICT, why));
+            return Err(RefusedRequest::new(StatusCode::CONFLICT, why));
         }
         let request = encode::request(&call, &fields).map_err(bad_request)?;
         let user = session.user.clone();
@@ -324,12 +325,12 @@ impl Page {
     async fn write(
         &self,
         operations: &Arc<dyn Operations>,
-        session: &Session,
+        session: &BrowserSession,
         Write {
             topic,
             value: given,
         }: Write,
-    ) -> Result<Response<PageBody>, Refusal> {
+    ) -> Result<Response<PageBody>, RefusedRequest> {
         let topic = parse_topic(&topic)?;
         let writable = {
             let board = self.board();
@@ -338,7 +339,7 @@ impl Page {
         };
         let writable = writable.ok_or_else(|| {
             let why = format!("{topic} is not written on the page: use an OPC UA client");
-            Refusal::new(StatusCode::CONFLICT, why)
+            RefusedRequest::new(StatusCode::CONFLICT, why)
         })?;
         let (node, field) = &*writable;
         let block = encode::value(field, &given).map_err(bad_request)?;
@@ -353,7 +354,7 @@ impl Page {
     }
 
     /// Returns the session for the browser.
-    fn told(&self, session: Option<&Session>, via: Via) -> Value {
+    fn told(&self, session: Option<&BrowserSession>, via: Via) -> Value {
         let operations = self.operations.get();
         let may_sign_in = operations.is_some_and(|operations| operations.has_users());
         let user = session.and_then(|session| {
@@ -380,21 +381,21 @@ impl Page {
     /// Checks that a request was meant for the page, because a page of another site can reach it by
     /// a name that resolves to its address; without TLS, it comes from this host. Returns the Host
     /// and the way.
-    fn host(&self, headers: &HeaderMap, visit: &Visit) -> Result<(String, Via), Refusal> {
+    fn host(&self, headers: &HeaderMap, visit: &Visit) -> Result<(String, Via), RefusedRequest> {
         let host = headers.get(HOST).and_then(|host| host.to_str().ok());
         let host = host.unwrap_or_default();
         if visit.is_secure {
             return if self.is_own_name(without_port(host)) {
                 Ok((host.to_owned(), Via::Tls))
             } else {
-                Err(Refusal::new(
+                Err(RefusedRequest::new(
                     StatusCode::MISDIRECTED_REQUEST,
                     "the page is served by the names in the certificate of the program",
                 ))
             };
         }
         if !visit.peer.ip().to_canonical().is_loopback() {
-            return Err(Refusal::new(
+            return Err(RefusedRequest::new(
                 StatusCode::FORBIDDEN,
                 "the page is for browsers on this host: use --page-tls, an SSH tunnel, or a reverse proxy with --page-proxy",
             ));
@@ -402,7 +403,7 @@ impl Page {
         // A proxy connects from loopback on behalf of other hosts.
         let is_forwarded = FORWARDED.iter().any(|name| headers.contains_key(*name));
         if is_forwarded && self.proxy.is_none() {
-            return Err(Refusal::new(
+            return Err(RefusedRequest::new(
                 StatusCode::FORBIDDEN,
                 "the request comes through a proxy: name it with --page-proxy, so that users sign in",
             ));
@@ -415,7 +416,7 @@ impl Page {
             };
             return Ok((host.to_owned(), via));
         }
-        Err(Refusal::new(
+        Err(RefusedRequest::new(
             StatusCode::MISDIRECTED_REQUEST,
             "the page is served on loopback, by 127.0.0.1, [::1] or localhost",
         ))
@@ -459,7 +460,7 @@ impl Page {
     }
 
     /// Returns whether the browser of a session may still read.
-    pub(crate) fn may_read(&self, reader: &Reader) -> bool {
+    pub(crate) fn may_read(&self, reader: &EventStreamBrowser) -> bool {
         if !reader.must_sign_in {
             return true;
         }
@@ -473,11 +474,14 @@ impl Page {
 
 /// Checks that a browser may read: on loopback without a proxy every browser may. Otherwise the
 /// request may come from any host, so each user signs in.
-fn check_reader(browser: &Browser) -> Result<(), Refusal> {
+fn check_reader(browser: &Browser) -> Result<(), RefusedRequest> {
     if !browser.via.is_remote() || browser.session.is_some() {
         Ok(())
     } else {
-        Err(Refusal::new(StatusCode::UNAUTHORIZED, "sign in first"))
+        Err(RefusedRequest::new(
+            StatusCode::UNAUTHORIZED,
+            "sign in first",
+        ))
     }
 }
 
@@ -502,9 +506,9 @@ impl Browser {
 /// Acknowledges or confirms a condition.
 fn change_condition(
     operations: &dyn Operations,
-    session: &Session,
+    session: &BrowserSession,
     change: &ConditionChange,
-) -> Result<Response<PageBody>, Refusal> {
+) -> Result<Response<PageBody>, RefusedRequest> {
     let user = &session.user;
     let condition = value::cut(&change.condition, 200);
     let comment = value::cut(&change.comment, 200);
@@ -519,13 +523,13 @@ fn change_condition(
     Ok(json_page(&json!({ "outcome": outcome })))
 }
 
-fn parse_topic(text: &str) -> Result<TopicId, Refusal> {
+fn parse_topic(text: &str) -> Result<TopicId, RefusedRequest> {
     text.parse()
         .map_err(|_| bad_request("a topic is wanted, as ua_0_7_105"))
 }
 
-fn bad_request(why: impl std::fmt::Display) -> Refusal {
-    Refusal(StatusCode::BAD_REQUEST, why.to_string())
+fn bad_request(why: impl std::fmt::Display) -> RefusedRequest {
+    RefusedRequest(StatusCode::BAD_REQUEST, why.to_string())
 }
 
 /// Returns the outcome of a command for the log.
@@ -539,24 +543,24 @@ fn outcome(fault: Option<&OperationFault>) -> &'static str {
     }
 }
 
-fn refusal(fault: OperationFault, user: &str) -> Refusal {
+fn refusal(fault: OperationFault, user: &str) -> RefusedRequest {
     match fault {
         OperationFault::Denied => {
             let why = format!("{user} has no role that permits it");
-            Refusal(StatusCode::FORBIDDEN, why)
+            RefusedRequest(StatusCode::FORBIDDEN, why)
         }
-        OperationFault::Refused(why) => Refusal(StatusCode::CONFLICT, why),
-        OperationFault::Failed(why) => Refusal(StatusCode::BAD_GATEWAY, why),
+        OperationFault::Refused(why) => RefusedRequest(StatusCode::CONFLICT, why),
+        OperationFault::Failed(why) => RefusedRequest(StatusCode::BAD_GATEWAY, why),
         OperationFault::Unknown(why) => {
             let why = format!("the outcome is unknown, it may have been executed: {why}");
-            Refusal(StatusCode::GATEWAY_TIMEOUT, why)
+            RefusedRequest(StatusCode::GATEWAY_TIMEOUT, why)
         }
     }
 }
 
 /// Refuses requests that the page of another site has sent. `own` is the origin of the page.
 /// `media` is the media type that only scripts of the page itself send.
-fn check_origin(headers: &HeaderMap, own: &str, media: &str) -> Result<(), Refusal> {
+fn check_origin(headers: &HeaderMap, own: &str, media: &str) -> Result<(), RefusedRequest> {
     let text = |name| {
         headers
             .get(name)
@@ -568,43 +572,43 @@ fn check_origin(headers: &HeaderMap, own: &str, media: &str) -> Result<(), Refus
     let is_media = text(CONTENT_TYPE).is_some_and(|sent| sent.starts_with(media));
     if !is_own || !is_media {
         let why = format!("only the page itself may send this, as {media}");
-        return Err(Refusal::new(StatusCode::FORBIDDEN, why));
+        return Err(RefusedRequest::new(StatusCode::FORBIDDEN, why));
     }
     Ok(())
 }
 
 /// Checks that no page of another site has sent a request. Programs other than browsers do not name
 /// a site.
-fn check_site(headers: &HeaderMap) -> Result<(), Refusal> {
+fn check_site(headers: &HeaderMap) -> Result<(), RefusedRequest> {
     let site = headers.get("sec-fetch-site");
     if site.is_some_and(|site| site != "same-origin") {
         let why = "only the page itself may send this";
-        return Err(Refusal::new(StatusCode::FORBIDDEN, why));
+        return Err(RefusedRequest::new(StatusCode::FORBIDDEN, why));
     }
     Ok(())
 }
 
 async fn body<T: for<'d> Deserialize<'d>>(
     request: Request<impl RequestBody>,
-) -> Result<T, Refusal> {
+) -> Result<T, RefusedRequest> {
     let bytes = bytes(request, (LARGEST_BODY, BODY_TIME)).await?;
     serde_json::from_slice(&bytes)
-        .map_err(|error| Refusal::new(StatusCode::BAD_REQUEST, error.to_string()))
+        .map_err(|error| RefusedRequest::new(StatusCode::BAD_REQUEST, error.to_string()))
 }
 
 /// Returns the body of a request, if it has at most `most` bytes and arrives in time.
 async fn bytes(
     request: Request<impl RequestBody>,
     (most, limit): (usize, Duration),
-) -> Result<Bytes, Refusal> {
+) -> Result<Bytes, RefusedRequest> {
     let limited = Limited::new(request.into_body(), most);
     match tokio::time::timeout(limit, limited.collect()).await {
         Ok(Ok(body)) => Ok(body.to_bytes()),
-        Ok(Err(error)) => Err(Refusal::new(
+        Ok(Err(error)) => Err(RefusedRequest::new(
             StatusCode::PAYLOAD_TOO_LARGE,
             error.to_string(),
         )),
-        Err(_) => Err(Refusal::new(
+        Err(_) => Err(RefusedRequest::new(
             StatusCode::REQUEST_TIMEOUT,
             "the request has not arrived",
         )),

@@ -4,14 +4,14 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use bridge_node::{CallDescription, CallField, CallRole};
 use mappings::TopicId;
-use messages::Rank;
+use messages::ArrayRank;
 use serde_json::{Map, Value, json};
 
-use crate::board::{Board, Entry};
+use crate::board::{CellBoard, TopicEntry};
 use crate::value;
 
 /// Returns the tiles of all skills.
-pub(crate) fn all(board: &Board) -> Vec<Value> {
+pub(crate) fn all(board: &CellBoard) -> Vec<Value> {
     let calls: Calls<'_> = board
         .calls
         .iter()
@@ -37,7 +37,7 @@ pub(crate) fn all(board: &Board) -> Vec<Value> {
 }
 
 /// Returns the calls that are neither methods of skills nor parts of actions, by name.
-pub(crate) fn calls(board: &Board) -> Vec<Value> {
+pub(crate) fn calls(board: &CellBoard) -> Vec<Value> {
     let states = board.topics.values();
     let skills: BTreeSet<&str> = states
         .filter_map(|entry| entry.description.name.strip_suffix(STATE))
@@ -73,8 +73,8 @@ pub(crate) fn calls(board: &Board) -> Vec<Value> {
 type Calls<'b> = BTreeMap<(u16, u16, &'b str), (TopicId, &'b CallDescription)>;
 
 fn tile(
-    (board, all): (&Board, &Calls<'_>),
-    (topic, entry): (TopicId, &Entry),
+    (board, all): (&CellBoard, &Calls<'_>),
+    (topic, entry): (TopicId, &TopicEntry),
     (component, skill): (&str, &str),
 ) -> Value {
     let state = shown(entry);
@@ -108,7 +108,7 @@ fn tile(
     })
 }
 
-fn shown(entry: &Entry) -> Map<String, Value> {
+fn shown(entry: &TopicEntry) -> Map<String, Value> {
     let fields = value::fields(&entry.block, &entry.description.fields);
     fields.unwrap_or_default().into_iter().collect()
 }
@@ -141,13 +141,13 @@ pub(crate) fn form(call: &CallDescription) -> Vec<Value> {
 /// Returns a field for a form.
 pub(crate) fn field(field: &CallField) -> Value {
     let fixed = match field.rank {
-        Rank::Scalar => None,
-        Rank::Array { fixed } => fixed,
+        ArrayRank::Scalar => None,
+        ArrayRank::Array { fixed } => fixed,
     };
     json!({
         "name": field.name,
         "type": field.builtin.name(),
-        "array": !matches!(field.rank, Rank::Scalar),
+        "array": !matches!(field.rank, ArrayRank::Scalar),
         "length": fixed,
         "optional": field.optional,
     })
@@ -176,8 +176,8 @@ mod tests {
     use uadp::BuiltinType;
 
     use super::*;
-    use crate::announced::Description;
-    use crate::board::Sample;
+    use crate::announced::AnnouncedValue;
+    use crate::board::BoardSample;
     use crate::board::tests::{at, topic};
 
     fn text(block: &mut Vec<u8>, text: &str) {
@@ -186,23 +186,23 @@ mod tests {
         block.extend(text.as_bytes());
     }
 
-    fn with_state() -> Board {
-        let mut board = Board::default();
+    fn with_state() -> CellBoard {
+        let mut board = CellBoard::default();
         let state = topic("ua_0_7_101");
         board.describe(
             state,
-            Description {
+            AnnouncedValue {
                 name: "gripper.Grasp.State".to_owned(),
                 type_name: "ua_msgs/SkillState".to_owned(),
                 about: "GraspSkillType nsu=urn:x".to_owned(),
                 fields: ["state", "step"].map(str::to_owned).to_vec(),
-                ..Description::default()
+                ..AnnouncedValue::default()
             },
         );
         let mut block = vec![2, 0];
         text(&mut block, "Running");
         text(&mut block, "Closing");
-        let sample = Sample {
+        let sample = BoardSample {
             topic: state,
             block: &block.into(),
             source: None,

@@ -13,8 +13,8 @@ use tokio::sync::{mpsc, oneshot};
 use tokio::time::{MissedTickBehavior, interval};
 
 use crate::page::Page;
-use crate::session::Reader;
-use crate::view::{View, Viewer};
+use crate::session::EventStreamBrowser;
+use crate::view::{BrowserView, Viewer};
 
 /// The thread that makes events and reads the status of programs, so that browsers delay
 /// samples only while an event is made. It ends when this value is dropped.
@@ -59,7 +59,12 @@ pub(crate) struct Events(mpsc::Receiver<Bytes>);
 
 impl Events {
     /// Starts the stream of a view.
-    pub(crate) fn start(worker: &Worker, page: Arc<Page>, view: View, reader: Reader) -> Self {
+    pub(crate) fn start(
+        worker: &Worker,
+        page: Arc<Page>,
+        view: BrowserView,
+        reader: EventStreamBrowser,
+    ) -> Self {
         let (events, taken) = mpsc::channel(1);
         worker.spawn(make(page, view, reader, events));
         Self(taken)
@@ -67,7 +72,12 @@ impl Events {
 }
 
 /// Makes events until the browser has left, or its session has ended.
-async fn make(page: Arc<Page>, view: View, reader: Reader, events: mpsc::Sender<Bytes>) {
+async fn make(
+    page: Arc<Page>,
+    view: BrowserView,
+    reader: EventStreamBrowser,
+    events: mpsc::Sender<Bytes>,
+) {
     let mut ticks = interval(view.period());
     ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
     let mut viewer = Viewer::new(view);

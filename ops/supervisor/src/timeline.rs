@@ -10,7 +10,7 @@ use serde_json::{Value, json};
 use uadp::action::{ActionDialect, ActionKind, ActionState};
 use uadp::{Fields, NetworkMessage, PublisherId, Scalar, Timestamp, Variant};
 
-use crate::board::{At, Entry, quality};
+use crate::board::{EventTime, TopicEntry, quality};
 use crate::value;
 
 /// The last events, oldest first.
@@ -25,7 +25,7 @@ pub(crate) struct Timeline {
     /// The topics with events.
     named: BTreeSet<TopicId>,
     /// The last requests and responses, because they are repeated.
-    calls: VecDeque<Call>,
+    calls: VecDeque<CallMessage>,
     /// The second of the last requests and responses, and their number.
     called: (u64, u32),
     /// The time of the day at the start of the page, in milliseconds since 1970.
@@ -79,7 +79,7 @@ impl Kind {
 
 /// A request or response of a call.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) struct Call {
+pub(crate) struct CallMessage {
     pub(crate) topic: TopicId,
     is_request: bool,
     id: u16,
@@ -94,7 +94,7 @@ impl Timeline {
 
     /// Takes a value whose bytes have changed. Numbers with fractions and messages of several
     /// fields change continuously and are no events.
-    pub(crate) fn value(&mut self, topic: TopicId, entry: &Entry, at: At) {
+    pub(crate) fn value(&mut self, topic: TopicId, entry: &TopicEntry, at: EventTime) {
         let Some((kind, text)) = text_of(entry) else {
             return;
         };
@@ -145,7 +145,7 @@ impl Timeline {
     }
 
     /// Takes a request or response. Repetitions are no events.
-    pub(crate) fn call(&mut self, call: Call, at: At) {
+    pub(crate) fn call(&mut self, call: CallMessage, at: EventTime) {
         if self.calls.contains(&call) {
             return;
         }
@@ -179,7 +179,7 @@ impl Timeline {
         self.push(event, None, at);
     }
 
-    fn push(&mut self, mut event: Event, source: Option<Timestamp>, at: At) {
+    fn push(&mut self, mut event: Event, source: Option<Timestamp>, at: EventTime) {
         let arrived = at.utc.unix_nanos();
         let taken = source.map_or(arrived, Timestamp::unix_nanos);
         self.number += 1;
@@ -251,7 +251,7 @@ fn participant(name: &str, space: SpaceId) -> (String, String) {
 }
 
 /// Returns the kind and the text of a discrete value.
-fn text_of(entry: &Entry) -> Option<(Kind, String)> {
+fn text_of(entry: &TopicEntry) -> Option<(Kind, String)> {
     let names = &entry.description.fields;
     let has_state = names.iter().any(|name| name == "state");
     if has_state && entry.description.name.ends_with(STATE) {
@@ -299,7 +299,7 @@ fn of_state(state: &str) -> &'static str {
 }
 
 /// Reads the requests and responses of a datagram in clear.
-pub(crate) fn calls(message: &NetworkMessage<'_>) -> Vec<Call> {
+pub(crate) fn calls(message: &NetworkMessage<'_>) -> Vec<CallMessage> {
     if !message.is_action() || message.is_sealed() || message.is_chunk() {
         return Vec::new();
     }
@@ -312,7 +312,7 @@ pub(crate) fn calls(message: &NetworkMessage<'_>) -> Vec<Call> {
         let PublisherId::UInt16(space) = action.publisher_id else {
             return None;
         };
-        Some(Call {
+        Some(CallMessage {
             topic: TopicId::new(space, action.writer_group_id?, action.writer_id)?,
             is_request,
             id: action.request_id,
@@ -339,23 +339,23 @@ mod tests {
     use bytes::Bytes;
 
     use super::*;
-    use crate::announced::Description;
+    use crate::announced::AnnouncedValue;
     use crate::board::tests::{at, topic};
-    use crate::board::{Board, Sample};
+    use crate::board::{BoardSample, CellBoard};
 
-    fn named(board: &mut Board, of: &str, name: &str, fields: &[&str]) {
-        let description = Description {
+    fn named(board: &mut CellBoard, of: &str, name: &str, fields: &[&str]) {
+        let description = AnnouncedValue {
             name: name.to_owned(),
             fields: fields.iter().map(|name| (*name).to_owned()).collect(),
-            ..Description::default()
+            ..AnnouncedValue::default()
         };
         board.describe(topic(of), description);
     }
 
     /// Takes a block that was sent 3 ms before.
-    fn take(board: &mut Board, of: &str, block: &[u8], millis: u64) {
+    fn take(board: &mut CellBoard, of: &str, block: &[u8], millis: u64) {
         let sent = Timestamp::from_unix_nanos(at(millis).utc.unix_nanos() - 3_000_000);
-        let sample = Sample {
+        let sample = BoardSample {
             topic: topic(of),
             block: &Bytes::copy_from_slice(block),
             source: Some(sent),
@@ -368,7 +368,7 @@ mod tests {
         [1, 0, 1, value.into()]
     }
 
-    fn texts(board: &Board) -> Vec<String> {
+    fn texts(board: &CellBoard) -> Vec<String> {
         let shown = board.timeline.after(0, at(0).since);
         let names = board.event_names();
         let events = shown["events"].as_array().unwrap().iter();
@@ -382,7 +382,7 @@ mod tests {
 
     #[test]
     fn changes_of_discrete_values_are_events_of_their_participant() {
-        let mut board = Board::default();
+        let mut board = CellBoard::default();
         named(&mut board, "ua_1_2_10", "Conveyor.Running", &["data"]);
         for (millis, value) in [(0, true), (100, true), (2000, false), (3000, false)] {
             take(&mut board, "ua_1_2_10", &boolean(value), millis);
@@ -404,7 +404,7 @@ mod tests {
 
     #[test]
     fn a_skill_has_an_event_for_each_state_but_not_for_its_progress() {
-        let mut board = Board::default();
+        let mut board = CellBoard::default();
         named(
             &mut board,
             "ua_2_2_11",
@@ -430,7 +430,7 @@ mod tests {
 
     #[test]
     fn the_events_of_a_topic_are_limited_and_the_rest_is_counted() {
-        let mut board = Board::default();
+        let mut board = CellBoard::default();
         for number in 0..200_u8 {
             take(&mut board, "ua_1_2_10", &[1, 0, 3, number], 1000);
         }
@@ -446,7 +446,7 @@ mod tests {
 
     #[test]
     fn a_value_beyond_the_limit_is_shown_with_its_repetition() {
-        let mut board = Board::default();
+        let mut board = CellBoard::default();
         for number in 0..7_u8 {
             take(&mut board, "ua_1_2_10", &[1, 0, 3, number], 1000);
         }
@@ -466,7 +466,7 @@ mod tests {
     fn requests_of_all_calls_are_limited_and_the_rest_is_counted() {
         let mut timeline = Timeline::default();
         for id in 0..200 {
-            let call = Call {
+            let call = CallMessage {
                 topic: topic("ua_1_2_61"),
                 is_request: true,
                 id,
@@ -481,7 +481,7 @@ mod tests {
     #[test]
     fn a_repeated_request_is_one_event() {
         let mut timeline = Timeline::default();
-        let call = |is_request: bool, id: u16| Call {
+        let call = |is_request: bool, id: u16| CallMessage {
             topic: topic("ua_1_2_61"),
             is_request,
             id,

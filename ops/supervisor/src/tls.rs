@@ -22,7 +22,7 @@ use crate::page::Page;
 
 /// The files of a certificate and its private key.
 #[derive(Debug, Clone)]
-pub struct Pair {
+pub struct CertificateFiles {
     /// The certificate, in DER.
     pub certificate: PathBuf,
     /// The private key, in PEM.
@@ -52,9 +52,9 @@ impl Page {
     pub async fn serve_tls(
         self: Arc<Self>,
         address: SocketAddr,
-        pair: Pair,
+        pair: CertificateFiles,
     ) -> Result<(), Failure> {
-        let resolver = Resolver::open(pair)
+        let resolver = CertificateResolver::open(pair)
             .map_err(|error| Failure::new(FailureKind::Configuration, error.to_string()))?;
         let resolver = Arc::new(resolver);
         let _first = self.tls.set(Arc::clone(&resolver));
@@ -86,8 +86,8 @@ impl Page {
 
 /// The certificate of the page. A renewed certificate is read at the next connection.
 #[derive(Debug)]
-pub(crate) struct Resolver {
-    pair: Pair,
+pub(crate) struct CertificateResolver {
+    pair: CertificateFiles,
     current: Mutex<Current>,
 }
 
@@ -100,8 +100,8 @@ struct Current {
     refused: Option<[Option<SystemTime>; 2]>,
 }
 
-impl Resolver {
-    fn open(pair: Pair) -> Result<Self, PairError> {
+impl CertificateResolver {
+    fn open(pair: CertificateFiles) -> Result<Self, PairError> {
         let modified = pair.modified();
         let key = pair.read()?;
         Ok(Self {
@@ -153,13 +153,13 @@ impl Resolver {
     }
 }
 
-impl ResolvesServerCert for Resolver {
+impl ResolvesServerCert for CertificateResolver {
     fn resolve(&self, _hello: ClientHello<'_>) -> Option<Arc<CertifiedKey>> {
         Some(self.key())
     }
 }
 
-impl Pair {
+impl CertificateFiles {
     fn modified(&self) -> [Option<SystemTime>; 2] {
         [&self.certificate, &self.key].map(|path| {
             let modified = std::fs::metadata(path).and_then(|data| data.modified());

@@ -1,7 +1,7 @@
 //! Values of the space as text and numbers for the page.
 
 use serde_json::{Value, json};
-use uadp::{Array, DecodeError, ExtensionBody, Fields, Identifier, NodeId, Scalar, Variant};
+use uadp::{Array, DecodeError, ExtensionBody, Fields, NodeId, NodeIdValue, Scalar, Variant};
 
 /// Returns the fields of a block in order with their `names`; a field without a name is `field_1`
 /// and so on.
@@ -176,10 +176,10 @@ fn text(value: Option<&str>) -> Value {
 fn node_id(id: &NodeId<'_>) -> String {
     let namespace = id.namespace;
     match &id.identifier {
-        Identifier::Numeric(number) => format!("ns={namespace};i={number}"),
-        Identifier::String(text) => format!("ns={namespace};s={}", text.unwrap_or_default()),
-        Identifier::Guid(guid) => format!("ns={namespace};g={guid}"),
-        Identifier::Opaque(_) => format!("ns={namespace};b=…"),
+        NodeIdValue::Numeric(number) => format!("ns={namespace};i={number}"),
+        NodeIdValue::String(text) => format!("ns={namespace};s={}", text.unwrap_or_default()),
+        NodeIdValue::Guid(guid) => format!("ns={namespace};g={guid}"),
+        NodeIdValue::Opaque(_) => format!("ns={namespace};b=…"),
     }
 }
 

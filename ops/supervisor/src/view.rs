@@ -6,8 +6,8 @@ use std::time::Duration;
 use mappings::{SpaceId, TopicId};
 use serde_json::{Map, Value, json};
 
-use crate::board::{Board, Entry, quality};
-use crate::mes::Mes;
+use crate::board::{CellBoard, TopicEntry, quality};
+use crate::mes::MesClient;
 use crate::operations;
 use crate::skill;
 use crate::value;
@@ -28,7 +28,7 @@ pub(crate) enum ViewFault {
 
 /// The view that a browser shows.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) enum View {
+pub(crate) enum BrowserView {
     /// The programs.
     Programs,
     /// A window of the list of values.
@@ -63,7 +63,7 @@ pub(crate) struct Window {
 /// event is made of the state at the time at which the browser takes it.
 #[derive(Debug)]
 pub(crate) struct Viewer {
-    view: View,
+    view: BrowserView,
     /// The sent version of each visible row.
     sent: HashMap<TopicId, u64>,
     order: Vec<TopicId>,
@@ -74,7 +74,7 @@ pub(crate) struct Viewer {
     event: u64,
 }
 
-impl View {
+impl BrowserView {
     /// Parses the query of the event stream, as `view=values&from=0&count=40`.
     ///
     /// # Errors
@@ -129,7 +129,7 @@ impl View {
 }
 
 impl Viewer {
-    pub(crate) fn new(view: View) -> Self {
+    pub(crate) fn new(view: BrowserView) -> Self {
         Self {
             view,
             sent: HashMap::new(),
@@ -143,33 +143,33 @@ impl Viewer {
 
     /// Returns whether the browser shows the conditions.
     pub(crate) fn shows_conditions(&self) -> bool {
-        self.view == View::Alarms
+        self.view == BrowserView::Alarms
     }
 
     /// Returns the next event of the stream; `None` if nothing visible has changed.
-    pub(crate) fn next(&mut self, board: &mut Board, now: Duration) -> Option<String> {
+    pub(crate) fn next(&mut self, board: &mut CellBoard, now: Duration) -> Option<String> {
         let data = match &self.view {
-            View::Values(window) => {
+            BrowserView::Values(window) => {
                 let window = window.clone();
                 self.values(&window, board, now)
             }
-            View::Programs => self.changed(programs(board)),
-            View::Topic(topic) => {
+            BrowserView::Programs => self.changed(programs(board)),
+            BrowserView::Topic(topic) => {
                 let shown = topic_view(board, *topic, now);
                 self.changed(shown)
             }
-            View::Map => self.changed(map(board, now)),
-            View::Skills => {
+            BrowserView::Map => self.changed(map(board, now)),
+            BrowserView::Skills => {
                 let shown = json!({ "skills": skill::all(board), "calls": skill::calls(board) });
                 self.changed(shown)
             }
-            View::Processes => self.changed(processes(board)),
-            View::Knowledge => {
+            BrowserView::Processes => self.changed(processes(board)),
+            BrowserView::Knowledge => {
                 // The state is known when the programs were read for the first time.
                 let is_known = !board.programs.is_empty();
                 self.changed(json!({ "mes": is_known.then(|| board.mes().is_some()) }))
             }
-            View::Events => {
+            BrowserView::Events => {
                 let names = board.event_names();
                 let text = names.to_string();
                 let is_renamed = text != self.last;
@@ -184,7 +184,7 @@ impl Viewer {
                     shown.to_string()
                 })
             }
-            View::Alarms => self.changed(operations::alarms(board.conditions.as_deref())),
+            BrowserView::Alarms => self.changed(operations::alarms(board.conditions.as_deref())),
         };
         match data {
             Some(data) => {
@@ -211,7 +211,7 @@ impl Viewer {
         Some(text)
     }
 
-    fn values(&mut self, window: &Window, board: &mut Board, now: Duration) -> Option<String> {
+    fn values(&mut self, window: &Window, board: &mut CellBoard, now: Duration) -> Option<String> {
         board.ordered();
         let all: Vec<TopicId> = board.ordered().to_vec();
         let matching = all.into_iter().filter(|topic| {
@@ -259,7 +259,7 @@ impl Viewer {
 }
 
 /// Returns a row of the list of values.
-fn row(topic: TopicId, entry: &mut Entry, now: Duration) -> Value {
+fn row(topic: TopicId, entry: &mut TopicEntry, now: Duration) -> Value {
     let hz = entry.rate.hz(now);
     let (severity, text) = quality(entry.status, entry.is_silent);
     let has_value = entry.count > 0;
@@ -288,7 +288,7 @@ fn row(topic: TopicId, entry: &mut Entry, now: Duration) -> Value {
     })
 }
 
-fn ros(entry: &Entry) -> Vec<String> {
+fn ros(entry: &TopicEntry) -> Vec<String> {
     let all = entry.ros.iter();
     all.map(|(space, name)| format!("{} {name}", world(*space)))
         .collect()
@@ -304,7 +304,7 @@ pub(crate) fn world(space: SpaceId) -> String {
     }
 }
 
-fn programs(board: &Board) -> Value {
+fn programs(board: &CellBoard) -> Value {
     let rows: Vec<Value> = board.programs.iter().map(|program| program.row()).collect();
     let known: Vec<&str> = board
         .programs
@@ -329,7 +329,7 @@ fn programs(board: &Board) -> Value {
     json!({ "programs": rows, "heard": heard, "topics": board.topics.len(), "calls": board.calls.len() })
 }
 
-fn topic_view(board: &mut Board, topic: TopicId, now: Duration) -> Value {
+fn topic_view(board: &mut CellBoard, topic: TopicId, now: Duration) -> Value {
     let samples: Vec<Value> = board
         .watch(topic, now)
         .iter()
@@ -396,7 +396,7 @@ fn topic_view(board: &mut Board, topic: TopicId, now: Duration) -> Value {
 }
 
 /// Returns the reasons why a value is missing, most likely first; empty if it is received.
-fn why(board: &Board, topic: TopicId) -> Vec<String> {
+fn why(board: &CellBoard, topic: TopicId) -> Vec<String> {
     let entry = board.topics.get(&topic);
     let is_received = entry
         .is_some_and(|entry| entry.count > 0 && quality(entry.status, entry.is_silent).0 == "good");
@@ -412,7 +412,7 @@ fn why(board: &Board, topic: TopicId) -> Vec<String> {
                 }
             }
         }
-        let serves = |program: &&crate::program::Program| {
+        let serves = |program: &&crate::program::ProgramStatus| {
             program.space() == Some(u64::from(topic.space.get()))
         };
         let mut serving = board.programs.iter().filter(serves).peekable();
@@ -452,7 +452,7 @@ fn why(board: &Board, topic: TopicId) -> Vec<String> {
 }
 
 /// Returns the map of the cell: the rates from each world to the space and back.
-fn map(board: &mut Board, now: Duration) -> Value {
+fn map(board: &mut CellBoard, now: Duration) -> Value {
     let mut worlds: Map<String, Value> = Map::new();
     let mut spaces: Vec<SpaceId> = board.topics.keys().map(|topic| topic.space).collect();
     let served = board.programs.iter().filter_map(|program| {
@@ -479,7 +479,7 @@ fn map(board: &mut Board, now: Duration) -> Value {
             // Events may never have been sent.
             silent += usize::from(entry.count > 0 && entry.is_silent);
         }
-        let programs: Vec<&crate::program::Program> = board
+        let programs: Vec<&crate::program::ProgramStatus> = board
             .programs
             .iter()
             .filter(|program| program.space() == Some(u64::from(space.get())))
@@ -513,10 +513,10 @@ fn map(board: &mut Board, now: Duration) -> Value {
 }
 
 /// Returns the processes and runs of the MES.
-fn processes(board: &Board) -> Value {
+fn processes(board: &CellBoard) -> Value {
     let mes = board.programs.iter().find_map(|program| {
         let status = program.status.as_ref().ok()?;
-        Mes::is_status(status).then_some(status)
+        MesClient::is_status(status).then_some(status)
     });
     match mes {
         None => json!({ "mes": false }),

@@ -8,7 +8,7 @@ use opcua::sync::Mutex;
 use opcua::types::{MethodId, NodeId, StatusCode};
 use plant_opcua::certificates::application_uri;
 use plant_opcua::configuration::Configuration;
-use plant_opcua::users::{Anonymous, Permissions, Role, Roles, Rules};
+use plant_opcua::users::{AnonymousRights, NodePermissions, PermissionRules, Roles, UserRole};
 use tracing::warn;
 
 use crate::address;
@@ -67,15 +67,15 @@ fn is_genuine(context: &RequestContext) -> bool {
 const MOST_REMEMBERED: usize = 10_000;
 
 /// Returns the access rules of a mapping for the nodes of its layout.
-pub(crate) fn rules(mapping: &Mapping, layout: &Layout) -> Rules {
+pub(crate) fn rules(mapping: &Mapping, layout: &Layout) -> PermissionRules {
     let mut nodes = HashMap::new();
     for topic in &layout.topics {
         let said = mapping.variable(topic.topic).map(|one| &one.permissions);
         let Some(said) = said.filter(|said| **said != Said::default()) else {
             continue;
         };
-        let usual = Permissions::default();
-        let permissions = Permissions {
+        let usual = NodePermissions::default();
+        let permissions = NodePermissions {
             read: said.read.as_deref().map_or(usual.read, roles),
             write: said.write.as_deref().map_or(usual.write, roles),
             ..usual
@@ -86,9 +86,9 @@ pub(crate) fn rules(mapping: &Mapping, layout: &Layout) -> Rules {
         let Some(callers) = &call.callers else {
             continue;
         };
-        let permissions = Permissions {
+        let permissions = NodePermissions {
             call: roles(callers),
-            ..Permissions::default()
+            ..NodePermissions::default()
         };
         // The parts of an action are Methods too. The first part has the node of the mapping or a
         // node of its own.
@@ -98,16 +98,16 @@ pub(crate) fn rules(mapping: &Mapping, layout: &Layout) -> Rules {
         }
     }
     // Methods of the core namespace are open to every client by default.
-    let switches = SWITCHES.map(|method| (method.into(), Permissions::default()));
+    let switches = SWITCHES.map(|method| (method.into(), NodePermissions::default()));
     nodes.extend(switches);
     nodes.extend(alarms::permissions());
-    let certificates = Permissions {
+    let certificates = NodePermissions {
         call: roles(&[mappings::Role::SecurityAdmin]),
-        ..Permissions::default()
+        ..NodePermissions::default()
     };
     nodes.extend(Configuration::nodes().map(|method| (method, certificates)));
     let keys: NodeId = MethodId::PublishSubscribe_GetSecurityKeys.into();
-    Rules {
+    PermissionRules {
         anonymous: anonymous(mapping.server().anonymous),
         nodes,
         encrypted: Configuration::nodes().chain([keys]).collect(),
@@ -121,20 +121,20 @@ const SWITCHES: [MethodId; 3] = [
     MethodId::PublishSubscribe_Diagnostics_Reset,
 ];
 
-fn anonymous(said: mappings::Anonymous) -> Anonymous {
+fn anonymous(said: mappings::Anonymous) -> AnonymousRights {
     match said {
-        mappings::Anonymous::Usual => Anonymous::Usual,
-        mappings::Anonymous::Refused => Anonymous::Refused,
-        mappings::Anonymous::Has(has) => Anonymous::Has(roles(&[has])),
+        mappings::Anonymous::Usual => AnonymousRights::Usual,
+        mappings::Anonymous::Refused => AnonymousRights::Refused,
+        mappings::Anonymous::Has(has) => AnonymousRights::Has(roles(&[has])),
     }
 }
 
 fn roles(said: &[mappings::Role]) -> Roles {
     let roles = said.iter().map(|role| match role {
-        mappings::Role::Observer => Role::Observer,
-        mappings::Role::Operator => Role::Operator,
-        mappings::Role::Engineer => Role::Engineer,
-        mappings::Role::SecurityAdmin => Role::SecurityAdmin,
+        mappings::Role::Observer => UserRole::Observer,
+        mappings::Role::Operator => UserRole::Operator,
+        mappings::Role::Engineer => UserRole::Engineer,
+        mappings::Role::SecurityAdmin => UserRole::SecurityAdmin,
     });
     roles.collect()
 }

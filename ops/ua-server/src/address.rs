@@ -8,7 +8,7 @@ use opcua::nodes::{NodeType, ObjectBuilder, VariableBuilder};
 use opcua::server::address_space::{AccessLevel, AddressSpace};
 use opcua::types::{LocalizedText, NodeId, ObjectId, QualifiedName, VariableTypeId};
 
-use crate::layout::{Layout, Shape, TopicNode};
+use crate::layout::{Layout, TopicNode, VariableShape};
 use crate::properties;
 
 /// Adds a variable without a value under `folder` for each node of a topic.
@@ -17,9 +17,12 @@ pub(crate) fn add_topic(address_space: &mut AddressSpace, topic: &TopicNode, fol
     let (own_name, _) = topic.parts();
     let name = |node: &NodeId, text: &str| QualifiedName::new(node.namespace, text);
     let (type_, rank) = if topic.compound {
-        (Shape(None).data_type(), 1)
+        (VariableShape(None).data_type(), 1)
     } else {
-        let open = (Shape(None).data_type(), Shape(None).value_rank());
+        let open = (
+            VariableShape(None).data_type(),
+            VariableShape(None).value_rank(),
+        );
         let only = topic.fields.first();
         only.map_or(open, |field| (field.data_type(), field.shape.value_rank()))
     };
@@ -65,7 +68,7 @@ pub(crate) fn add_topic(address_space: &mut AddressSpace, topic: &TopicNode, fol
 }
 
 /// Changes the DataType and the ValueRank of a variable.
-pub(crate) fn retype(address_space: &mut AddressSpace, node: &NodeId, shape: Shape) {
+pub(crate) fn retype(address_space: &mut AddressSpace, node: &NodeId, shape: VariableShape) {
     if let Some(NodeType::Variable(variable)) = address_space.find_mut(node) {
         variable.set_data_type(shape.data_type());
         variable.set_value_rank(shape.value_rank());

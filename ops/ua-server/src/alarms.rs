@@ -45,20 +45,20 @@ use tracing::info;
 use uadp::Scalar;
 
 pub(crate) use self::acknowledging::description as description_of_acknowledging;
-use self::condition::{Condition, Effect, Levels, Report, Stamp};
-use self::diagnostics::Diagnostics;
-use self::event::{ConditionEvent, Identity, Kind};
+use self::condition::{AlarmCondition, EventStamp, Levels, ReportEffect, SourceReport};
+use self::diagnostics::StatusLevels;
+use self::event::{ConditionEvent, ConditionIdentity, ConditionType};
 pub(crate) use self::methods::permissions;
 pub(crate) use self::past::MOST_RETURNED as MOST_EVENTS_RETURNED;
 use self::past::PastEvents;
 use self::publishers::Publishers;
-use self::report::Reports;
-use self::trigger::{Reading, Trigger};
+use self::report::ConditionReports;
+use self::trigger::{AlarmCause, AlarmInput};
 use crate::address;
 use crate::history::StoredConditions;
 use crate::layout::node_id;
 use crate::nodes::SpaceManager;
-use crate::values::Shown;
+use crate::values::ShownValue;
 
 /// The conditions of the server.
 #[derive(Default)]
@@ -89,8 +89,8 @@ struct Inner {
     /// The times at which the delays of conditions are over.
     delays: HashMap<NodeId, Instant>,
     publishers: Publishers,
-    diagnostics: Diagnostics,
-    reports: Reports,
+    diagnostics: StatusLevels,
+    reports: ConditionReports,
 }
 
 /// The conditions of a variable.
@@ -104,10 +104,10 @@ enum Source {
 
 /// A condition with its source.
 struct Entry {
-    identity: Arc<Identity>,
-    condition: Condition,
+    identity: Arc<ConditionIdentity>,
+    condition: AlarmCondition,
     /// The alarm of the mapping and its trigger; `None` for other sources.
-    alarm: Option<(Box<Alarm>, Trigger)>,
+    alarm: Option<(Box<Alarm>, AlarmCause)>,
     /// Texts of single values.
     texts: BTreeMap<i64, String>,
     /// True if every client may read the value, which then is in the message.
@@ -115,9 +115,9 @@ struct Entry {
 }
 
 impl Entry {
-    fn new(identity: Identity, severity: u16) -> Self {
+    fn new(identity: ConditionIdentity, severity: u16) -> Self {
         Self {
-            condition: Condition::new(identity.confirms, severity, stamp()),
+            condition: AlarmCondition::new(identity.confirms, severity, stamp()),
             identity: Arc::new(identity),
             alarm: None,
             texts: BTreeMap::new(),
@@ -135,12 +135,12 @@ impl Entry {
             }
         };
         let kind = match &alarm.trigger {
-            AlarmTrigger::Limits(limits) if limits.exclusive => Kind::ExclusiveLevel,
-            AlarmTrigger::Limits(_) => Kind::NonExclusiveLevel,
-            AlarmTrigger::Normal(_) => Kind::OffNormal,
-            AlarmTrigger::When(_) | AlarmTrigger::Diagnostics => Kind::Discrete,
+            AlarmTrigger::Limits(limits) if limits.exclusive => ConditionType::ExclusiveLevel,
+            AlarmTrigger::Limits(_) => ConditionType::NonExclusiveLevel,
+            AlarmTrigger::Normal(_) => ConditionType::OffNormal,
+            AlarmTrigger::When(_) | AlarmTrigger::Diagnostics => ConditionType::Discrete,
         };
-        let identity = Identity {
+        let identity = ConditionIdentity {
             node: condition_node(variable.topic),
             kind,
             input: source.clone(),
@@ -152,7 +152,7 @@ impl Entry {
             confirms: alarm.confirm,
             delay: alarm.delay,
         };
-        let trigger = Trigger::new(alarm.trigger.clone(), alarm.delay);
+        let trigger = AlarmCause::new(alarm.trigger.clone(), alarm.delay);
         Self {
             alarm: Some((Box::new(alarm.clone()), trigger)),
             texts: variable.meaning.texts.clone(),
@@ -161,7 +161,12 @@ impl Entry {
     }
 
     /// Returns the report of the levels of a value.
-    fn report(&self, levels: Levels, reading: Option<&Reading>, quality: StatusCode) -> Report {
+    fn report(
+        &self,
+        levels: Levels,
+        reading: Option<&AlarmInput>,
+        quality: StatusCode,
+    ) -> SourceReport {
         let state = self.condition.state();
         let severity = self.alarm.as_ref().map_or(500, |(alarm, _)| alarm.severity);
         let message = if levels == state.levels && !state.message.is_empty() {
@@ -169,7 +174,7 @@ impl Entry {
         } else {
             self.message(levels, reading)
         };
-        Report {
+        SourceReport {
             levels,
             severity: severity_of(levels, severity),
             message,
@@ -177,7 +182,7 @@ impl Entry {
         }
     }
 
-    fn message(&self, levels: Levels, reading: Option<&Reading>) -> String {
+    fn message(&self, levels: Levels, reading: Option<&AlarmInput>) -> String {
         let name = &self.identity.source_name;
         let own = self
             .alarm
@@ -188,11 +193,11 @@ impl Entry {
         }
         let shown = reading.filter(|_| self.is_public).map(|reading| {
             let text = match reading {
-                Reading::Value(mappings::AlarmValue::Integer(number)) => {
+                AlarmInput::Value(mappings::AlarmValue::Integer(number)) => {
                     let number = i64::try_from(*number).ok();
                     number.and_then(|number| self.texts.get(&number))
                 }
-                Reading::Value(_) | Reading::Number(_) => None,
+                AlarmInput::Value(_) | AlarmInput::Number(_) => None,
             };
             match text {
                 Some(text) => format!(" is {reading} ({text})"),
@@ -202,7 +207,7 @@ impl Entry {
         let shown = shown.unwrap_or_default();
         match (levels.is_active(), self.identity.kind) {
             (false, _) => format!("{name}{shown}: normal"),
-            (true, Kind::ExclusiveLevel | Kind::NonExclusiveLevel) => {
+            (true, ConditionType::ExclusiveLevel | ConditionType::NonExclusiveLevel) => {
                 format!("{name}{shown}: {}", levels.name())
             }
             (true, _) => format!("{name}{shown}: alarm"),
@@ -228,8 +233,8 @@ impl Place {
     }
 
     /// Shows the state of a condition to clients.
-    fn show(&self, entry: &Entry, effect: Effect) {
-        if effect == Effect::Nothing {
+    fn show(&self, entry: &Entry, effect: ReportEffect) {
+        if effect == ReportEffect::Nothing {
             return;
         }
         let stored = self.stored.lock();
@@ -241,7 +246,7 @@ impl Place {
         }
         drop(stored);
         let event = ConditionEvent::new(&entry.identity, entry.condition.state());
-        if effect == Effect::Reported {
+        if effect == ReportEffect::Reported {
             self.past.lock().keep(event.clone());
             self.raise(&event);
         }
@@ -270,13 +275,19 @@ fn data_value(value: opcua::types::Variant, event: &ConditionEvent) -> DataValue
 
 impl Inner {
     /// Applies a value of a variable with an alarm.
-    fn value(&mut self, node: &NodeId, shown: &Shown, now: Instant, place: &Place) -> Effect {
+    fn value(
+        &mut self,
+        node: &NodeId,
+        shown: &ShownValue,
+        now: Instant,
+        place: &Place,
+    ) -> ReportEffect {
         let Some(entry) = self.conditions.get_mut(node) else {
-            return Effect::Nothing;
+            return ReportEffect::Nothing;
         };
         let (reading, quality) = reading(shown);
         let Some((_, trigger)) = &mut entry.alarm else {
-            return Effect::Nothing;
+            return ReportEffect::Nothing;
         };
         let levels = match reading.as_ref().filter(|_| !quality.is_bad()) {
             Some(reading) => trigger.read(reading, now),
@@ -322,7 +333,7 @@ impl Inner {
 }
 
 /// Returns the value of a variable and its status.
-fn reading(shown: &Shown) -> (Option<Reading>, StatusCode) {
+fn reading(shown: &ShownValue) -> (Option<AlarmInput>, StatusCode) {
     let status = shown.stamp.status;
     let Some(mut fields) = shown.fields() else {
         return (None, status);
@@ -332,7 +343,7 @@ fn reading(shown: &Shown) -> (Option<Reading>, StatusCode) {
         Some(Ok(uadp::Variant::Scalar(Scalar::StatusCode(said)))) => {
             (None, StatusCode::from(said.0))
         }
-        Some(Ok(value)) => (Reading::of(&value), status),
+        Some(Ok(value)) => (AlarmInput::of(&value), status),
         Some(Err(_)) | None => (None, status),
     }
 }
@@ -459,7 +470,7 @@ impl Alarms {
     }
 
     /// Applies the current value of a topic.
-    pub(crate) fn look(&self, topic: TopicId, current: impl FnOnce() -> Shown) {
+    pub(crate) fn look(&self, topic: TopicId, current: impl FnOnce() -> ShownValue) {
         if !self.any.load(Ordering::Relaxed) {
             return;
         }
@@ -475,7 +486,7 @@ impl Alarms {
         match source {
             Source::Value(node) => {
                 let had = inner.due();
-                if inner.value(&node, &shown, now, place) == Effect::Reported {
+                if inner.value(&node, &shown, now, place) == ReportEffect::Reported {
                     inner.reports.changed(now);
                 }
                 let due = inner.due();
@@ -556,7 +567,7 @@ impl Alarms {
             return;
         }
         let now = now().monotonic;
-        let seen = publishers::Seen::of(router, timeout);
+        let seen = publishers::PublisherStates::of(router, timeout);
         for (node, report) in inner.publishers.look(&seen, now) {
             if let Some(entry) = inner.conditions.get_mut(&node) {
                 let effect = entry.condition.report(report, stamp());
@@ -573,7 +584,7 @@ impl Alarms {
         &self,
         node: &NodeId,
         user: &str,
-        act: impl FnOnce(&mut Condition, Stamp) -> Result<(), StatusCode>,
+        act: impl FnOnce(&mut AlarmCondition, EventStamp) -> Result<(), StatusCode>,
     ) -> Result<(), StatusCode> {
         let place = self.place.get().ok_or(StatusCode::BadShutdown)?;
         let mut inner = self.inner.lock();
@@ -583,7 +594,7 @@ impl Alarms {
             .ok_or(StatusCode::BadNodeIdUnknown)?;
         act(&mut entry.condition, stamp())?;
         info!(condition = %node, user, "a user changed a condition");
-        place.show(entry, Effect::Reported);
+        place.show(entry, ReportEffect::Reported);
         let is_earlier = inner.reports.changed(now().monotonic);
         drop(inner);
         if is_earlier {
@@ -669,8 +680,8 @@ fn condition_node(topic: TopicId) -> NodeId {
 }
 
 /// Returns the current time and a new event id.
-fn stamp() -> Stamp {
-    Stamp {
+fn stamp() -> EventStamp {
+    EventStamp {
         time: DateTime::now(),
         id: opcua::crypto::random::byte_string(16),
     }

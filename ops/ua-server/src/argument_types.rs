@@ -3,12 +3,12 @@
 
 use bridge_node::{CallDescription, CallField};
 use mappings::TopicId;
-use messages::Rank;
+use messages::ArrayRank;
 use opcua::server::address_space::AddressSpace;
 use opcua::types::{Argument, LocalizedText, NodeId};
 use tracing::warn;
 
-use crate::layout::Shape;
+use crate::layout::VariableShape;
 use crate::structures::Structure;
 
 /// The DataTypes of arguments, beside the DataTypes of variables.
@@ -71,7 +71,7 @@ impl ArgumentTypes {
         let all = structures(topic, field);
         match all.first() {
             Some(first) if all.iter().all(|one| self.knows(one)) => first.data_type(),
-            Some(_) | None => Shape::of(field).data_type(),
+            Some(_) | None => VariableShape::of(field).data_type(),
         }
     }
 
@@ -80,10 +80,10 @@ impl ArgumentTypes {
         let argument = |field: &CallField| Argument {
             name: field.name.as_str().into(),
             data_type: self.data_type(topic, field),
-            value_rank: Shape::of(field).value_rank(),
+            value_rank: VariableShape::of(field).value_rank(),
             array_dimensions: match field.rank {
-                Rank::Scalar => None,
-                Rank::Array { fixed } => Some(vec![fixed.unwrap_or(0)]),
+                ArrayRank::Scalar => None,
+                ArrayRank::Array { fixed } => Some(vec![fixed.unwrap_or(0)]),
             },
             description: LocalizedText::null(),
         };

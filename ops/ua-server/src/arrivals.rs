@@ -6,7 +6,7 @@
 use std::collections::HashMap;
 use std::time::Duration;
 
-use bridge_node::Arrival;
+use bridge_node::ConfirmedArrival;
 use mappings::{Mapping, TopicId};
 use opcua::sync::{Mutex, RwLock};
 use opcua::types::StatusCode;
@@ -17,12 +17,12 @@ use tracing::warn;
 #[derive(Default)]
 pub(crate) struct Arrivals {
     within: RwLock<HashMap<TopicId, Duration>>,
-    waiting: Mutex<HashMap<TopicId, Vec<Awaited>>>,
+    waiting: Mutex<HashMap<TopicId, Vec<PendingWrite>>>,
 }
 
 /// A pending write.
 #[derive(Debug)]
-pub(crate) struct Awaited {
+pub(crate) struct PendingWrite {
     /// The written field of the topic, or `None` for all fields.
     field: Option<usize>,
     answer: oneshot::Sender<StatusCode>,
@@ -69,10 +69,10 @@ impl Arrivals {
         &self,
         topic: TopicId,
         field: Option<usize>,
-    ) -> Option<(Awaited, Awaiting)> {
+    ) -> Option<(PendingWrite, Awaiting)> {
         let within = self.within.read().get(&topic).copied()?;
         let (told, answer) = oneshot::channel();
-        let awaited = Awaited {
+        let awaited = PendingWrite {
             field,
             answer: told,
         };
@@ -81,7 +81,7 @@ impl Arrivals {
 
     /// Records that a write is sent. Earlier writes are answered as superseded, except writes of
     /// other fields, because the new write contains their values.
-    pub(crate) fn sent(&self, topic: TopicId, write: Option<Awaited>) {
+    pub(crate) fn sent(&self, topic: TopicId, write: Option<PendingWrite>) {
         let mut waiting = self.waiting.lock();
         let field = write.as_ref().and_then(|write| write.field);
         let writes = waiting.entry(topic).or_default();
@@ -99,14 +99,14 @@ impl Arrivals {
     }
 
     /// Answers the writes that wait for the newest value of a topic.
-    pub(crate) fn settled(&self, topic: TopicId, arrival: &Arrival) {
+    pub(crate) fn settled(&self, topic: TopicId, arrival: &ConfirmedArrival) {
         let Some(writes) = self.waiting.lock().remove(&topic) else {
             return;
         };
         let status = match arrival {
-            Arrival::Confirmed => StatusCode::Good,
-            Arrival::NotSent => StatusCode::BadCommunicationError,
-            Arrival::Unknown(spaces) => {
+            ConfirmedArrival::Confirmed => StatusCode::Good,
+            ConfirmedArrival::NotSent => StatusCode::BadCommunicationError,
+            ConfirmedArrival::Unknown(spaces) => {
                 let spaces: Vec<String> = spaces.iter().map(ToString::to_string).collect();
                 warn!(
                     %topic,
@@ -173,14 +173,17 @@ variables:
     #[tokio::test]
     async fn a_write_is_answered_by_what_became_of_its_value() {
         let arrivals = arrivals();
-        let unknown = Arrival::Unknown(vec![SpaceId::ROS1]);
+        let unknown = ConfirmedArrival::Unknown(vec![SpaceId::ROS1]);
         for (arrival, wanted) in [
-            (Arrival::Confirmed, Ok(())),
+            (ConfirmedArrival::Confirmed, Ok(())),
             (unknown, Err(StatusCode::BadTimeout)),
-            (Arrival::NotSent, Err(StatusCode::BadCommunicationError)),
+            (
+                ConfirmedArrival::NotSent,
+                Err(StatusCode::BadCommunicationError),
+            ),
         ] {
             let awaiting = write(&arrivals, None);
-            arrivals.settled(topic(31), &Arrival::Confirmed);
+            arrivals.settled(topic(31), &ConfirmedArrival::Confirmed);
             arrivals.settled(topic(30), &arrival);
             assert_eq!(awaiting.arrived().await, wanted);
             assert!(arrivals.waiting.lock().is_empty());
@@ -198,7 +201,7 @@ variables:
             let arrivals = arrivals();
             let before = write(&arrivals, first);
             let after = write(&arrivals, second);
-            arrivals.settled(topic(30), &Arrival::Confirmed);
+            arrivals.settled(topic(30), &ConfirmedArrival::Confirmed);
             assert_eq!(before.arrived().await, wanted);
             assert_eq!(after.arrived().await, Ok(()));
         }

@@ -5,7 +5,7 @@ use std::collections::HashMap;
 use std::sync::Arc;
 use std::time::Duration;
 
-use bridge_node::{Answered, AskError, CallDescription};
+use bridge_node::{AskError, CallDescription, CallResponse};
 use bytes::Bytes;
 use futures_util::future::BoxFuture;
 use mappings::TopicId;
@@ -14,7 +14,7 @@ use opcua::types::{NodeId, StatusCode, Variant};
 use tokio::sync::{Notify, mpsc, oneshot};
 use uadp::Fields;
 
-use crate::layout::Shape;
+use crate::layout::VariableShape;
 use crate::value;
 
 /// The Methods by their nodes.
@@ -30,30 +30,30 @@ pub(crate) struct Callable {
 /// The sender of client requests to [`Methods`](crate::methods::Methods).
 #[derive(Debug, Clone)]
 pub(crate) struct Questions {
-    sender: mpsc::Sender<Question>,
+    sender: mpsc::Sender<ClientQuestion>,
     given_up: Arc<Notify>,
 }
 
 /// The receiver of [`Questions`].
 #[derive(Debug)]
-pub(crate) struct Heard {
-    pub(crate) questions: mpsc::Receiver<Question>,
+pub(crate) struct QuestionReceiver {
+    pub(crate) questions: mpsc::Receiver<ClientQuestion>,
     /// Notified when clients have abandoned requests that were handed on.
     pub(crate) given_up: Arc<Notify>,
 }
 
 /// A request of a client.
 #[derive(Debug)]
-pub(crate) struct Question {
+pub(crate) struct ClientQuestion {
     pub(crate) topic: TopicId,
     pub(crate) block: Bytes,
-    pub(crate) answer: oneshot::Sender<Answered<Bytes>>,
+    pub(crate) answer: oneshot::Sender<CallResponse<Bytes>>,
 }
 
 /// A pending answer for a client. [`Methods`](crate::methods::Methods) is notified when the client
 /// abandons it.
 struct Waiting {
-    answered: oneshot::Receiver<Answered<Bytes>>,
+    answered: oneshot::Receiver<CallResponse<Bytes>>,
     given_up: Arc<Notify>,
     over: bool,
 }
@@ -81,11 +81,12 @@ pub(crate) struct Drive {
 }
 
 /// The implementation of a method of a Program.
-pub(crate) type CarryOut =
-    Arc<dyn Fn(Vec<Variant>) -> BoxFuture<'static, Result<Vec<Variant>, Refused>> + Send + Sync>;
+pub(crate) type CarryOut = Arc<
+    dyn Fn(Vec<Variant>) -> BoxFuture<'static, Result<Vec<Variant>, CallFailure>> + Send + Sync,
+>;
 
 /// The reason why a call of a client failed.
-pub(crate) enum Refused {
+pub(crate) enum CallFailure {
     /// Some arguments have the wrong type; contains a status for each argument.
     Arguments(Vec<StatusCode>),
     /// The request was not sent.
@@ -96,10 +97,10 @@ pub(crate) enum Refused {
 
 impl Questions {
     /// Creates both ends of the queue.
-    pub(crate) fn channel() -> (Self, Heard) {
+    pub(crate) fn channel() -> (Self, QuestionReceiver) {
         let (sender, questions) = mpsc::channel(MOST_QUESTIONS);
         let given_up = Arc::<Notify>::default();
-        let heard = Heard {
+        let heard = QuestionReceiver {
             questions,
             given_up: Arc::clone(&given_up),
         };
@@ -110,7 +111,7 @@ impl Questions {
 impl Waiting {
     /// Waits for the answer. The request is abandoned when the session of the client is closed. The
     /// session is polled, because the library continues the requests of a lost connection.
-    async fn answer(mut self, gone: impl Fn() -> bool) -> Result<Answered<Bytes>, StatusCode> {
+    async fn answer(mut self, gone: impl Fn() -> bool) -> Result<CallResponse<Bytes>, StatusCode> {
         let answer = loop {
             match tokio::time::timeout(LOOK_AT_CLIENT, &mut self.answered).await {
                 Ok(answer) => break answer.map_err(|_| StatusCode::BadShutdown),
@@ -146,14 +147,14 @@ impl Callable {
         arguments: &[Variant],
         questions: &Questions,
         gone: impl Fn() -> bool,
-    ) -> Result<Vec<Variant>, Refused> {
+    ) -> Result<Vec<Variant>, CallFailure> {
         let response = self.ask(self.block(arguments)?, questions, gone).await?;
         let fields = Fields::parse(&response);
-        let fields = fields.map_err(|_| Refused::Status(StatusCode::BadDecodingError))?;
+        let fields = fields.map_err(|_| CallFailure::Status(StatusCode::BadDecodingError))?;
         let outputs = fields.map(|field| field.map(|field| value::from_field(&field)));
         outputs
             .collect::<Result<_, _>>()
-            .map_err(|_| Refused::Status(StatusCode::BadDecodingError))
+            .map_err(|_| CallFailure::Status(StatusCode::BadDecodingError))
     }
 
     /// Sends a request with this block of fields and returns the block of the response. See
@@ -163,9 +164,9 @@ impl Callable {
         block: Bytes,
         questions: &Questions,
         gone: impl Fn() -> bool,
-    ) -> Result<Bytes, Refused> {
+    ) -> Result<Bytes, CallFailure> {
         let (answer, answered) = oneshot::channel();
-        let question = Question {
+        let question = ClientQuestion {
             topic: self.topic,
             block,
             answer,
@@ -178,29 +179,29 @@ impl Callable {
         questions
             .sender
             .try_send(question)
-            .map_err(|_| Refused::Status(StatusCode::BadTooManyOperations))?;
-        let answer = waiting.answer(gone).await.map_err(Refused::Status)?;
-        answer.map_err(Refused::Asked)
+            .map_err(|_| CallFailure::Status(StatusCode::BadTooManyOperations))?;
+        let answer = waiting.answer(gone).await.map_err(CallFailure::Status)?;
+        answer.map_err(CallFailure::Asked)
     }
 
     /// Encodes the request. All arguments may be omitted together if each of them has a default.
-    fn block(&self, arguments: &[Variant]) -> Result<Bytes, Refused> {
+    fn block(&self, arguments: &[Variant]) -> Result<Bytes, CallFailure> {
         let request = &self.description.request;
         let left_out = arguments.is_empty() && self.description.may_be_empty();
         if arguments.len() < request.len() && !left_out {
-            return Err(Refused::Status(StatusCode::BadArgumentsMissing));
+            return Err(CallFailure::Status(StatusCode::BadArgumentsMissing));
         }
-        let block = value::fields_block(arguments).map_err(Refused::Status)?;
+        let block = value::fields_block(arguments).map_err(CallFailure::Status)?;
         let fields = Fields::parse(&block);
-        let fields = fields.map_err(|_| Refused::Status(StatusCode::BadInvalidArgument))?;
+        let fields = fields.map_err(|_| CallFailure::Status(StatusCode::BadInvalidArgument))?;
         let statuses = fields.zip(request).map(|(value, field)| match value {
-            Ok(value) if Shape::of(field).fits(&value) => StatusCode::Good,
+            Ok(value) if VariableShape::of(field).fits(&value) => StatusCode::Good,
             Ok(_) => StatusCode::BadTypeMismatch,
             Err(_) => StatusCode::BadInvalidArgument,
         });
         let statuses: Vec<StatusCode> = statuses.collect();
         if statuses.iter().any(|status| status.is_bad()) {
-            return Err(Refused::Arguments(statuses));
+            return Err(CallFailure::Arguments(statuses));
         }
         Ok(Bytes::from(block))
     }

@@ -2,13 +2,13 @@
 
 use opcua::server::node_manager::{MethodCall, RequestContext, WriteNode};
 use opcua::types::{AttributeId, NodeId, NumericRange, StatusCode, Variant};
-use plant_opcua::audit::{Action, Audit};
+use plant_opcua::audit::{Audit, AuditedAction};
 use plant_opcua::users::Login;
 
 use crate::nodes::SpaceManager;
 
 /// The state of a node before a write.
-pub(crate) struct Before {
+pub(crate) struct PreviousState {
     node: NodeId,
     /// True if every client may read the node. Audit events are visible to all clients.
     is_public: bool,
@@ -17,13 +17,13 @@ pub(crate) struct Before {
 
 /// Returns the values of the nodes before they are written. The values of nodes with restricted
 /// read access, and large values, are omitted.
-pub(crate) fn before(space: &SpaceManager, writes: &[&mut WriteNode]) -> Vec<Before> {
+pub(crate) fn before(space: &SpaceManager, writes: &[&mut WriteNode]) -> Vec<PreviousState> {
     let before = writes.iter().map(|write| {
         let node = write.value().node_id.clone();
         let is_public = space.inner().is_public(&node);
         let shown = || space.inner().shown_at(&node).filter(is_small);
         let old = is_public.then(shown).flatten();
-        Before {
+        PreviousState {
             node,
             is_public,
             old: old.unwrap_or_default(),
@@ -35,11 +35,11 @@ pub(crate) fn before(space: &SpaceManager, writes: &[&mut WriteNode]) -> Vec<Bef
 /// Reports writes and their results to the audit.
 pub(crate) fn wrote(
     context: &RequestContext,
-    before: Vec<Before>,
+    before: Vec<PreviousState>,
     (writes, done): (&[&mut WriteNode], Result<(), StatusCode>),
 ) {
     for (before, write) in before.into_iter().zip(writes) {
-        let Before {
+        let PreviousState {
             node,
             is_public,
             old,
@@ -53,7 +53,7 @@ pub(crate) fn wrote(
             .value
             .as_ref()
             .filter(|new| is_public && is_small(new));
-        let action = Action::Wrote {
+        let action = AuditedAction::Wrote {
             new: new.cloned().unwrap_or_default(),
             range: range_text(&value.index_range),
             node,
@@ -73,7 +73,7 @@ pub(crate) fn called(
     (calls, done): (&[&mut MethodCall], Result<(), StatusCode>),
 ) {
     for call in calls {
-        let action = Action::Called {
+        let action = AuditedAction::Called {
             object: call.object_id().clone(),
             method: call.method_id().clone(),
         };
@@ -83,7 +83,7 @@ pub(crate) fn called(
 
 /// Returns the audit event of a login, successful or refused.
 pub(crate) fn came_in(login: &Login, server: &str) -> Audit {
-    let action = Action::CameIn {
+    let action = AuditedAction::CameIn {
         by: login.by,
         endpoint: login.endpoint.clone(),
     };
@@ -112,7 +112,7 @@ fn range_text(range: &NumericRange) -> String {
     range.to_string()
 }
 
-fn tell(context: &RequestContext, action: Action, status: StatusCode) {
+fn tell(context: &RequestContext, action: AuditedAction, status: StatusCode) {
     Audit::of(context, action, status).tell(&context.subscriptions);
 }
 

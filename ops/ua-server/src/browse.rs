@@ -22,7 +22,7 @@ use opcua::types::{
     StatusCode, TimestampsToReturn,
 };
 use plant_opcua::server::{NodeFacts, Supplement};
-use plant_opcua::users::Access;
+use plant_opcua::users::UserAccess;
 
 use crate::auditing;
 use crate::nodes::{SpaceManager, SpaceNodes};
@@ -42,7 +42,7 @@ impl Ordered {
     /// Builds the node manager of `nodes` and wraps it.
     pub(crate) fn around<N>(
         nodes: N,
-        access: &Arc<Access>,
+        access: &Arc<UserAccess>,
     ) -> impl FnOnce(ServerContext) -> Self + use<N>
     where
         N: InMemoryNodeManagerImplBuilder<Impl = SpaceNodes> + 'static,

@@ -37,7 +37,7 @@ impl Answers {
 
 /// The monitored items and the memory of their large values.
 #[derive(Debug, Default)]
-pub(crate) struct Watched {
+pub(crate) struct MonitoredMemory {
     items: HashMap<MonitoredItemHandle, Item>,
     bytes: usize,
 }
@@ -59,7 +59,7 @@ impl Item {
     }
 }
 
-impl Watched {
+impl MonitoredMemory {
     /// Adds a monitored item. Items beyond the limit are not notified if only the status changes,
     /// and get no large values.
     pub(crate) fn insert(&mut self, handle: MonitoredItemHandle, unfiltered: bool, queue: usize) {
@@ -162,7 +162,7 @@ mod tests {
 
     #[test]
     fn watchers_of_large_values_get_them_while_there_is_room_for_all_their_copies() {
-        let mut watched = Watched::default();
+        let mut watched = MonitoredMemory::default();
         for id in 0..5 {
             watched.insert(item(id), true, 1);
         }
@@ -182,7 +182,7 @@ mod tests {
 
     #[test]
     fn a_large_value_counts_until_all_its_copies_have_given_way() {
-        let mut watched = Watched::default();
+        let mut watched = MonitoredMemory::default();
         watched.insert(item(1), true, 1);
         assert!(watched.take(item(1), 100 * MIB));
         for _ in 0..4 {

@@ -48,7 +48,7 @@ mod tests {
     use mappings::TopicId;
     use uadp::BuiltinType;
 
-    use crate::layout::Shape;
+    use crate::layout::VariableShape;
 
     use super::*;
 
@@ -57,7 +57,7 @@ mod tests {
             TopicId::new(1, 2, id).unwrap(),
             NodeId::new(2, u32::from(id)),
             format!("t{id}"),
-            vec![(String::new(), Shape(Some((shape, false))))],
+            vec![(String::new(), VariableShape(Some((shape, false))))],
         )
     }
 

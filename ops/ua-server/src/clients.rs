@@ -4,13 +4,13 @@ use std::collections::{HashMap, HashSet};
 use std::path::Path;
 use std::time::Duration;
 
-use mappings::{Access, ExecutedBy, Mapping, SecurityPolicy, Server};
-use plant_opcua::client::{Client, ClientConfig, ClientUser, HostNames, Link, SecurityChoice};
+use mappings::{Access, ExecutedBy, Mapping, Server, ServerSecurityPolicy};
+use plant_opcua::client::{ClientConfig, ClientUser, HostNames, Link, OpcUaClient, SecurityChoice};
 
 /// The clients of other servers.
 pub(crate) struct Clients {
     config: ClientConfig,
-    open: HashMap<Access, Client>,
+    open: HashMap<Access, OpcUaClient>,
 }
 
 impl Clients {
@@ -34,17 +34,21 @@ impl Clients {
 
     /// Returns the client of a server. The client connects at once, and reconnects until it is
     /// dropped.
-    pub(crate) fn of(&mut self, access: &Access) -> Client {
+    pub(crate) fn of(&mut self, access: &Access) -> OpcUaClient {
         if let Some(open) = self.open.get(access) {
             return open.clone();
         }
         let config = ClientConfig {
             security: match access.security {
                 None => SecurityChoice::Best,
-                Some(SecurityPolicy::None) => SecurityChoice::None,
-                Some(SecurityPolicy::Basic256Sha256) => SecurityChoice::Basic256Sha256,
-                Some(SecurityPolicy::Aes128Sha256RsaOaep) => SecurityChoice::Aes128Sha256RsaOaep,
-                Some(SecurityPolicy::Aes256Sha256RsaPss) => SecurityChoice::Aes256Sha256RsaPss,
+                Some(ServerSecurityPolicy::None) => SecurityChoice::None,
+                Some(ServerSecurityPolicy::Basic256Sha256) => SecurityChoice::Basic256Sha256,
+                Some(ServerSecurityPolicy::Aes128Sha256RsaOaep) => {
+                    SecurityChoice::Aes128Sha256RsaOaep
+                }
+                Some(ServerSecurityPolicy::Aes256Sha256RsaPss) => {
+                    SecurityChoice::Aes256Sha256RsaPss
+                }
             },
             user: access.user.as_ref().map(|user| ClientUser {
                 name: user.name.clone(),
@@ -52,7 +56,7 @@ impl Clients {
             }),
             ..self.config.clone()
         };
-        let client = Client::open(config, &access.endpoint.to_string());
+        let client = OpcUaClient::open(config, &access.endpoint.to_string());
         self.open.insert(access.clone(), client.clone());
         client
     }
@@ -66,7 +70,7 @@ impl Clients {
     /// Returns how often the certificate of a server was refused.
     pub(crate) fn refused(&self, access: &Access) -> u64 {
         let open = self.open.get(access);
-        open.map_or(0, Client::certificates_refused)
+        open.map_or(0, OpcUaClient::certificates_refused)
     }
 
     /// Closes the sessions that neither the mapping nor `found` uses.

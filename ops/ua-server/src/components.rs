@@ -6,7 +6,7 @@ use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
 use bridge_node::{PortEvent, now};
-use discovery::{Found, Interface, Known, Watcher};
+use discovery::{MdnsInterface, PresentServer, ServerChange, ServerWatcher};
 use mappings::TopicId;
 use opcua::nodes::{ObjectBuilder, VariableBuilder};
 use opcua::server::SubscriptionCache;
@@ -19,31 +19,31 @@ use tracing::info;
 
 use crate::address;
 use crate::nodes::SpaceManager;
-use crate::presence::Presence;
+use crate::presence::ValuePresence;
 
 /// The next event of [`Components`].
-pub(crate) enum Happened {
+pub(crate) enum ComponentEvent {
     /// An event of a server that is to be reported.
     Told(PortEvent),
     /// A discovered server, which is already shown.
-    Heard(Found),
+    Heard(ServerChange),
 }
 
 /// Shows the servers that a watcher reports. Lost servers stay visible for some time.
 pub(crate) struct Components {
-    watcher: Watcher,
+    watcher: ServerWatcher,
     manager: Arc<SpaceManager>,
     subscriptions: Arc<SubscriptionCache>,
     /// ApplicationUri of this server, which is not shown.
     own_uri: String,
     /// Names of the lost servers, longest lost first.
     gone: VecDeque<String>,
-    presence: Presence,
+    presence: ValuePresence,
 }
 
 impl Components {
     pub(crate) fn new(
-        (watcher, heard_on): (Watcher, &Interface),
+        (watcher, heard_on): (ServerWatcher, &MdnsInterface),
         (manager, subscriptions): (Arc<SpaceManager>, Arc<SubscriptionCache>),
         own_uri: String,
     ) -> Self {
@@ -59,32 +59,32 @@ impl Components {
             subscriptions,
             own_uri,
             gone: VecDeque::new(),
-            presence: Presence::new(heard_on.to_string()),
+            presence: ValuePresence::new(heard_on.to_string()),
         }
     }
 
     /// Waits for the next event and shows it. Cancel-safe.
-    pub(crate) async fn next(&mut self) -> Happened {
+    pub(crate) async fn next(&mut self) -> ComponentEvent {
         if let Some(event) = self.presence.event() {
-            return Happened::Told(event);
+            return ComponentEvent::Told(event);
         }
         match self.watcher.next().await {
             Some(found) => {
                 self.show(&found);
-                Happened::Heard(found)
+                ComponentEvent::Heard(found)
             }
             None => std::future::pending().await,
         }
     }
 
-    fn show(&mut self, found: &Found) {
+    fn show(&mut self, found: &ServerChange) {
         let known = found.known();
         if known.is_lds() || known.application_uri.as_ref() == Some(&self.own_uri) {
             return;
         }
         let name = &known.name;
         log(found);
-        let online = !matches!(found, Found::Gone { .. });
+        let online = !matches!(found, ServerChange::Gone { .. });
         if online {
             self.gone.retain(|gone| gone != name)
         } else {
@@ -115,15 +115,15 @@ impl Components {
     }
 }
 
-fn log(found: &Found) {
+fn log(found: &ServerChange) {
     match found {
-        Found::Seen(known) | Found::Restarted(known) => info!(
+        ServerChange::Seen(known) | ServerChange::Restarted(known) => info!(
             name = ?known.name,
             url = known.url,
             uri = known.application_uri,
             "discovered a server"
         ),
-        Found::Gone { known, loss } => info!(
+        ServerChange::Gone { known, loss } => info!(
             name = ?known.name,
             url = known.url,
             loss = loss.label(),
@@ -135,7 +135,7 @@ fn log(found: &Found) {
 type Property = (&'static str, DataTypeId, i32, Variant);
 
 fn values(
-    known: &Known,
+    known: &PresentServer,
     (online, since): (bool, SystemTime),
     (topic, level): (Option<TopicId>, &str),
 ) -> [Property; 9] {

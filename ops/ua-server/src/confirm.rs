@@ -8,14 +8,14 @@ use std::collections::{BTreeSet, HashMap};
 use std::sync::Arc;
 use std::time::Duration;
 
-use mappings::{Answer, Mapping, TopicId};
+use mappings::{ConfirmingValues, Mapping, TopicId};
 use opcua::sync::{Mutex, RwLock};
 use opcua::types::{StatusCode, Variant};
 use tokio::sync::{Notify, oneshot};
 
 use crate::arrivals::Arrivals;
 use crate::value;
-use crate::values::Shown;
+use crate::values::ShownValue;
 
 /// The rules of the mapping, and the pending writes.
 #[derive(Default)]
@@ -33,7 +33,7 @@ pub(crate) struct Confirms {
 pub(crate) struct Rule {
     by: TopicId,
     within: Duration,
-    answer: Answer,
+    answer: ConfirmingValues,
     /// Serializes the writes of the topic.
     turn: tokio::sync::Mutex<()>,
 }
@@ -148,7 +148,7 @@ impl Confirms {
     }
 
     /// Checks if a received value answers a pending write.
-    pub(crate) fn heard(&self, topic: TopicId, shown: &Shown) {
+    pub(crate) fn heard(&self, topic: TopicId, shown: &ShownValue) {
         let mut waiting = self.waiting.lock();
         let Some(writes) = waiting.writes.get_mut(&topic) else {
             return;
@@ -202,13 +202,13 @@ impl Rule {
 
     fn is_answer(&self, written: &[Variant], answer: &[Variant]) -> bool {
         match &self.answer {
-            Answer::Any => true,
-            Answer::Same => {
+            ConfirmingValues::Any => true,
+            ConfirmingValues::Same => {
                 let pairs = written.iter().zip(answer);
                 written.len() == answer.len()
                     && pairs.into_iter().all(|(one, other)| are_equal(one, other))
             }
-            Answer::Equals(text) => match answer {
+            ConfirmingValues::Equals(text) => match answer {
                 [only] => is_text(only, text),
                 _ => false,
             },
@@ -285,7 +285,7 @@ mod tests {
         TopicId::new(1, 2, identifier).unwrap()
     }
 
-    fn rule(answer: Answer) -> Arc<Rule> {
+    fn rule(answer: ConfirmingValues) -> Arc<Rule> {
         Arc::new(Rule::new(&mappings::Confirm {
             by: topic(31),
             within: WITHIN,
@@ -293,14 +293,17 @@ mod tests {
         }))
     }
 
-    fn shown(value: Variant, status: StatusCode) -> Shown {
-        let mut shown = Shown::nothing(status);
+    fn shown(value: Variant, status: StatusCode) -> ShownValue {
+        let mut shown = ShownValue::nothing(status);
         shown.block = Some(Bytes::from(value::fields_block(&[value]).unwrap()));
         shown
     }
 
     /// Writes 2.5 with these answers and returns the result.
-    async fn written(answer: Answer, answers: &[Shown]) -> (Result<u8, StatusCode>, Confirms) {
+    async fn written(
+        answer: ConfirmingValues,
+        answers: &[ShownValue],
+    ) -> (Result<u8, StatusCode>, Confirms) {
         let confirms = Confirms::default();
         let rule = rule(answer);
         let done = confirms.write(topic(30), &rule, |register| {
@@ -317,8 +320,8 @@ mod tests {
     #[tokio::test]
     async fn the_answer_that_counts_confirms_and_no_other_does() {
         let good = |value: Variant| shown(value, StatusCode::Good);
-        let same = || Answer::Same;
-        let equals = |text: &str| Answer::Equals(text.to_owned());
+        let same = || ConfirmingValues::Same;
+        let equals = |text: &str| ConfirmingValues::Equals(text.to_owned());
         for (answer, came, wanted) in [
             (same(), vec![good(2.5.into())], true),
             (same(), vec![good(2.5_f32.into())], true),
@@ -326,7 +329,7 @@ mod tests {
             (same(), vec![good(1.0.into())], false),
             (same(), vec![shown(2.5.into(), StatusCode::Bad)], false),
             (same(), vec![], false),
-            (Answer::Any, vec![good(9_i32.into())], true),
+            (ConfirmingValues::Any, vec![good(9_i32.into())], true),
             (equals("true"), vec![good(true.into())], true),
             (equals("true"), vec![good(false.into())], false),
             (equals("3"), vec![good(3_i32.into())], true),
@@ -344,7 +347,7 @@ mod tests {
     #[tokio::test]
     async fn what_could_not_be_sent_is_not_taken_back() {
         let confirms = Confirms::default();
-        let rule = rule(Answer::Any);
+        let rule = rule(ConfirmingValues::Any);
         let refused = confirms.write(topic(30), &rule, |_| {
             Err::<(), _>(StatusCode::BadTypeMismatch)
         });
@@ -355,7 +358,7 @@ mod tests {
     #[tokio::test]
     async fn of_two_writes_at_once_the_second_waits_for_its_turn_and_then_for_its_own_answer() {
         let confirms = Confirms::default();
-        let rule = rule(Answer::Same);
+        let rule = rule(ConfirmingValues::Same);
         let write = |value: f64| {
             confirms.write(topic(30), &rule, move |register| {
                 register(&[Variant::from(value)]);

@@ -4,7 +4,7 @@ use std::net::{SocketAddr, TcpListener};
 use std::sync::Arc;
 
 use bridge_node::{Failure, FailureKind};
-use mappings::{SecurityPolicy, Server, ServerLimits};
+use mappings::{Server, ServerLimits, ServerSecurityPolicy};
 use opcua::server::{Limits, ServerBuilder, ServerConfig, ServerHandle};
 use plant_opcua::configuration::Configuration;
 use plant_opcua::door::{Door, UnknownClients};
@@ -13,7 +13,7 @@ use plant_opcua::enrolment::{Applicant, Enrolment, Invitation};
 use plant_opcua::limits::{self, ClientLimits};
 use plant_opcua::patches;
 use plant_opcua::pki::{OWN_CERTIFICATE, OWN_KEY, Pki};
-use plant_opcua::server::Security;
+use plant_opcua::server::ServerSecurity;
 use serde_json::{Value, json};
 use tokio::runtime::Runtime;
 use tracing::warn;
@@ -26,13 +26,13 @@ pub(crate) fn is_local(described: &Server, address: SocketAddr) -> bool {
 }
 
 /// Returns the security policies that the server offers at `address`, as the mapping defines them.
-pub(crate) fn security(described: &Server, address: SocketAddr) -> Vec<Security> {
+pub(crate) fn security(described: &Server, address: SocketAddr) -> Vec<ServerSecurity> {
     let policies = described.policies(is_local(described, address));
     let security = policies.into_iter().map(|policy| match policy {
-        SecurityPolicy::None => Security::None,
-        SecurityPolicy::Basic256Sha256 => Security::Basic256Sha256,
-        SecurityPolicy::Aes128Sha256RsaOaep => Security::Aes128Sha256RsaOaep,
-        SecurityPolicy::Aes256Sha256RsaPss => Security::Aes256Sha256RsaPss,
+        ServerSecurityPolicy::None => ServerSecurity::None,
+        ServerSecurityPolicy::Basic256Sha256 => ServerSecurity::Basic256Sha256,
+        ServerSecurityPolicy::Aes128Sha256RsaOaep => ServerSecurity::Aes128Sha256RsaOaep,
+        ServerSecurityPolicy::Aes256Sha256RsaPss => ServerSecurity::Aes256Sha256RsaPss,
     });
     security.collect()
 }
@@ -42,7 +42,7 @@ pub(crate) fn security(described: &Server, address: SocketAddr) -> Vec<Security>
 pub(crate) fn server(
     described: &Server,
     (url, port): (&EndpointUrl, u16),
-    security: &[Security],
+    security: &[ServerSecurity],
 ) -> ServerBuilder {
     let host = url.advertised_host();
     let mut builder = ServerBuilder::new()
@@ -146,7 +146,7 @@ fn taken_by(runtime: &Runtime, listener: TcpListener) -> std::io::Result<tokio::
     tokio::net::TcpListener::from_std(listener)
 }
 
-pub(crate) type Standing = Option<(Door, TcpListener)>;
+pub(crate) type EndpointStanding = Option<(Door, TcpListener)>;
 
 /// Returns the door in front of the server with the public listener, if the certificate store needs
 /// a door; the server's own listener; and the builder with the certificate store to use.
@@ -155,7 +155,7 @@ pub(crate) fn door(
     trust_any: bool,
     clients: ClientLimits,
     (listener, builder): (TcpListener, ServerBuilder),
-) -> Result<(Standing, TcpListener, ServerBuilder), Failure> {
+) -> Result<(EndpointStanding, TcpListener, ServerBuilder), Failure> {
     let builder = builder.trust_client_certs(trust_any);
     let wanted = if trust_any {
         warn!("this server trusts and stores every client certificate: use this for tests only");
@@ -173,7 +173,7 @@ pub(crate) fn door(
 }
 
 /// Starts to accept clients through the door.
-pub(crate) fn stand(runtime: &Runtime, door: Standing) -> Result<(), Failure> {
+pub(crate) fn stand(runtime: &Runtime, door: EndpointStanding) -> Result<(), Failure> {
     if let Some((door, listener)) = door {
         let listener = taken_by(runtime, listener).map_err(io_fault)?;
         drop(runtime.spawn(door.stand(listener)));

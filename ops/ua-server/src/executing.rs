@@ -11,10 +11,10 @@ use std::collections::{HashMap, VecDeque};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use bridge_node::{Executed, Execution, ExecutionId, Offered, PortEvent, Refusal, now};
+use bridge_node::{Executed, Execution, ExecutionId, OfferedCall, PortEvent, Refusal, now};
 use mappings::{Access, ExecutedBy, Mapping, MethodTarget, TopicId};
 use opcua::types::{StatusCode, Variant};
-use plant_opcua::client::{CallError, CallOptions, Client, ClientError};
+use plant_opcua::client::{CallError, CallOptions, ClientError, OpcUaClient};
 use tokio::sync::{mpsc, watch as cell};
 use tokio::task::{AbortHandle, JoinSet};
 use tracing::info;
@@ -23,34 +23,34 @@ use uadp::Fields;
 pub(crate) use self::signature::node as local_node;
 
 use self::signature::Signature;
-use self::watch::{Found, News};
+use self::watch::{CallableMethod, News};
 use crate::alarms::{Alarms, description_of_acknowledging};
 use crate::clients::Clients;
-use crate::layout::Shape;
+use crate::layout::VariableShape;
 use crate::value;
 
 /// The Methods of other servers that the mapping names.
-pub(crate) struct Executing {
+pub(crate) struct ForeignMethods {
     /// The servers by their access data.
     servers: HashMap<Access, Server>,
-    wanted: HashMap<TopicId, Arc<Wanted>>,
+    wanted: HashMap<TopicId, Arc<MappedMethod>>,
     timeouts: HashMap<TopicId, Duration>,
     /// The Methods that are offered.
-    found: HashMap<TopicId, Arc<Found>>,
+    found: HashMap<TopicId, Arc<CallableMethod>>,
     heard: mpsc::Receiver<News>,
     tell: mpsc::Sender<News>,
     /// Events that are not reported yet: refused executions and withdrawn calls.
     events: VecDeque<PortEvent>,
     running: JoinSet<Executed>,
     /// The calls that acknowledge alarms, as they are offered.
-    acknowledging: HashMap<TopicId, Offered>,
+    acknowledging: HashMap<TopicId, OfferedCall>,
     alarms: Arc<Alarms>,
     executions: HashMap<tokio::task::Id, (ExecutionId, TopicId)>,
 }
 
 /// A Method as the mapping defines it.
 #[derive(Debug, PartialEq, Eq)]
-pub(crate) struct Wanted {
+pub(crate) struct MappedMethod {
     topic: TopicId,
     name: String,
     about: String,
@@ -60,7 +60,7 @@ pub(crate) struct Wanted {
 
 /// A server with Methods.
 struct Server {
-    wanted: cell::Sender<Vec<Arc<Wanted>>>,
+    wanted: cell::Sender<Vec<Arc<MappedMethod>>>,
     watching: AbortHandle,
 }
 
@@ -70,7 +70,7 @@ impl Drop for Server {
     }
 }
 
-impl Executing {
+impl ForeignMethods {
     /// Starts to look for the Methods of `mapping`, and offers the calls that acknowledge `alarms`.
     pub(crate) fn new(mapping: &Mapping, clients: &mut Clients, alarms: Arc<Alarms>) -> Self {
         let (tell, heard) = mpsc::channel(MOST_NEWS);
@@ -95,12 +95,12 @@ impl Executing {
     pub(crate) fn reload(&mut self, mapping: &Mapping, clients: &mut Clients) {
         let mut before = std::mem::take(&mut self.wanted);
         self.timeouts.clear();
-        let mut servers: HashMap<Access, Vec<Arc<Wanted>>> = HashMap::new();
+        let mut servers: HashMap<Access, Vec<Arc<MappedMethod>>> = HashMap::new();
         for call in mapping.calls() {
             let ExecutedBy::OpcUa(target) = &call.executed else {
                 continue;
             };
-            let wanted = Wanted {
+            let wanted = MappedMethod {
                 topic: call.topic,
                 name: call.name.clone(),
                 about: call.about.clone(),
@@ -115,7 +115,7 @@ impl Executing {
             self.timeouts.insert(call.topic, call.timeout);
         }
         self.offer_acknowledging(mapping);
-        let is_wanted = |found: &Found| {
+        let is_wanted = |found: &CallableMethod| {
             let wanted = self.wanted.get(&found.wanted.topic);
             wanted.is_some_and(|wanted| Arc::ptr_eq(wanted, &found.wanted))
         };
@@ -142,7 +142,7 @@ impl Executing {
         let offered = calls.map(|call| {
             let description = description_of_acknowledging(call);
             let open = call.open;
-            (call.topic, Offered { description, open })
+            (call.topic, OfferedCall { description, open })
         });
         let mut before = std::mem::replace(&mut self.acknowledging, offered.collect());
         for (topic, offered) in &self.acknowledging {
@@ -156,7 +156,12 @@ impl Executing {
             .extend(gone.map(|topic| PortEvent::Withdrawn { topic }));
     }
 
-    fn watch(&self, client: Client, access: &Access, wanted: Vec<Arc<Wanted>>) -> Server {
+    fn watch(
+        &self,
+        client: OpcUaClient,
+        access: &Access,
+        wanted: Vec<Arc<MappedMethod>>,
+    ) -> Server {
         let (wanted, receiver) = cell::channel(wanted);
         let watching = watch::run(
             client,
@@ -203,7 +208,7 @@ impl Executing {
                 let open = found.wanted.open;
                 info!(%topic, name = found.wanted.name, url = %found.wanted.target.access.endpoint, "a Method can be called");
                 self.found.insert(topic, Arc::new(found));
-                let offered = Offered { description, open };
+                let offered = OfferedCall { description, open };
                 self.events.push_back(PortEvent::Offer { topic, offered });
             }
             News::Lost(topic) => {
@@ -279,7 +284,7 @@ fn arguments(request: &[u8], signature: &Signature) -> Result<Vec<Variant>, Refu
     }
     let arguments = fields.zip(&signature.takes).map(|(field, wanted)| {
         let field = field.map_err(wrong)?;
-        let fits = Shape::of(wanted).fits(&field);
+        let fits = VariableShape::of(wanted).fits(&field);
         fits.then(|| value::from_field(&field))
             .ok_or(Refusal::InvalidArgument)
     });
@@ -287,7 +292,7 @@ fn arguments(request: &[u8], signature: &Signature) -> Result<Vec<Variant>, Refu
 }
 
 async fn call(
-    found: Arc<Found>,
+    found: Arc<CallableMethod>,
     arguments: Vec<Variant>,
     (within, start_by): (Duration, Instant),
 ) -> Executed {
@@ -295,7 +300,7 @@ async fn call(
         // The program was stopped, and another redundant server may have taken over.
         return Executed::Refused(Refusal::NotExecutable);
     }
-    let Found {
+    let CallableMethod {
         wanted,
         client,
         connects,
@@ -323,7 +328,7 @@ fn answered(outputs: &[Variant], signature: &Signature) -> Executed {
             .gives
             .iter()
             .zip(outputs)
-            .all(|(wanted, output)| Shape::of(wanted).accepts(output));
+            .all(|(wanted, output)| VariableShape::of(wanted).accepts(output));
     let block = value::fields_block(outputs);
     match block {
         Ok(block) if fits => Executed::Answered(block),

@@ -9,13 +9,13 @@ mod places;
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 
-use discovery::{Found, Interface, client};
+use discovery::{MdnsInterface, ServerChange, client};
 use mappings::{Access, Endpoint, FindSkills, Mapping};
 use tokio::task::JoinSet;
 use tokio::time::{Interval, MissedTickBehavior, interval};
 use tracing::{info, warn};
 
-use self::places::{Places, Room};
+use self::places::{FreeNumbers, ServerNumbers};
 use crate::endpoint::PRODUCT_URI;
 
 /// A server with a number in the space.
@@ -28,9 +28,9 @@ pub(crate) struct Placed {
 }
 
 /// The discovered servers.
-pub(crate) struct Finding {
+pub(crate) struct DiscoveredServers {
     wanted: Option<FindSkills>,
-    room: Room,
+    room: FreeNumbers,
     /// Endpoints of `servers` in the mapping, which get no second number.
     named: Vec<Endpoint>,
     own_uri: String,
@@ -40,12 +40,12 @@ pub(crate) struct Finding {
     /// Discovery servers to read lists from, by their sources.
     lists: BTreeMap<Source, String>,
     /// Allowed locations of servers that an announced discovery server lists.
-    near: Option<Interface>,
+    near: Option<MdnsInterface>,
     asking: JoinSet<Answer>,
     look: Interval,
     /// True if servers that no longer answer are to be queried again.
     is_time: bool,
-    places: Places,
+    places: ServerNumbers,
     placed: Vec<Placed>,
     /// Servers without a free number, each logged once.
     crowded: BTreeSet<String>,
@@ -98,15 +98,15 @@ enum Answer {
     Lists(String, Vec<(String, String)>),
 }
 
-impl Finding {
+impl DiscoveredServers {
     /// Creates the state from the mapping, with the discovery server of the command line.
-    pub(crate) fn new(mapping: &Mapping, lds: Option<&str>, near: Option<Interface>) -> Self {
+    pub(crate) fn new(mapping: &Mapping, lds: Option<&str>, near: Option<MdnsInterface>) -> Self {
         let mut look = interval(LOOK_AGAIN);
         look.set_missed_tick_behavior(MissedTickBehavior::Delay);
         let lds = lds.filter(|lds| Endpoint::parse(lds).is_some());
         let mut finding = Self {
             wanted: None,
-            room: Room::default(),
+            room: FreeNumbers::default(),
             named: Vec::new(),
             own_uri: String::new(),
             heard: BTreeMap::new(),
@@ -119,7 +119,7 @@ impl Finding {
             asking: JoinSet::new(),
             look,
             is_time: false,
-            places: Places::default(),
+            places: ServerNumbers::default(),
             placed: Vec::new(),
             crowded: BTreeSet::new(),
             is_full: false,
@@ -144,7 +144,7 @@ impl Finding {
             let mut of = namespaces.iter();
             of.any(|namespaces| namespaces.contains(namespace))
         });
-        self.room = Room {
+        self.room = FreeNumbers {
             kept: kept
                 .map(|(namespace, uri)| (*namespace, uri.clone()))
                 .collect(),
@@ -156,13 +156,13 @@ impl Finding {
     }
 
     /// Handles a change of a server in the network.
-    pub(crate) fn heard(&mut self, found: &Found) {
+    pub(crate) fn heard(&mut self, found: &ServerChange) {
         let known = found.known();
         let source = Source::Network(known.name.clone());
         let (is_there, is_new) = match found {
-            Found::Seen(_) => (true, false),
-            Found::Restarted(_) => (true, true),
-            Found::Gone { .. } => (false, false),
+            ServerChange::Seen(_) => (true, false),
+            ServerChange::Restarted(_) => (true, true),
+            ServerChange::Gone { .. } => (false, false),
         };
         self.lists.remove(&source);
         self.speaking.remove(&known.name);
@@ -431,7 +431,7 @@ async fn described(url: String) -> Answer {
 
 /// Reads the list of a discovery server; without an answer the list is empty. Every host can
 /// announce a discovery server, so only listed servers that `near` accepts are used.
-async fn listed(lds: String, near: Option<Interface>) -> Answer {
+async fn listed(lds: String, near: Option<MdnsInterface>) -> Answer {
     let listed = client::find_servers(&lds, ANSWERS_WITHIN).await;
     let listed = listed.unwrap_or_default().into_iter().take(MOST_HEARD);
     let servers = listed
@@ -472,7 +472,7 @@ const MOST_LISTS: usize = 8;
 mod tests {
     use std::time::SystemTime;
 
-    use discovery::{Known, Loss};
+    use discovery::{PresentServer, ServerLoss};
 
     use super::*;
 
@@ -482,13 +482,13 @@ server: {find_skills: {uris: ['urn:v:*'], first: 40, most: 4, security: None}}
 servers: [{name: press, endpoint: 'opc.tcp://127.0.0.1:5000'}]
 ";
 
-    fn finding() -> Finding {
+    fn finding() -> DiscoveredServers {
         let checked = Mapping::from_yaml(MAPPING, "m.yaml");
-        Finding::new(&checked.mapping.unwrap(), None, None)
+        DiscoveredServers::new(&checked.mapping.unwrap(), None, None)
     }
 
-    fn seen(name: &str, port: u16, number: u16) -> Found {
-        Found::Seen(Known {
+    fn seen(name: &str, port: u16, number: u16) -> ServerChange {
+        ServerChange::Seen(PresentServer {
             name: name.to_owned(),
             url: format!("opc.tcp://127.0.0.1:{port}/"),
             capabilities: Vec::new(),
@@ -499,7 +499,7 @@ servers: [{name: press, endpoint: 'opc.tcp://127.0.0.1:5000'}]
         })
     }
 
-    fn says(finding: &mut Finding, port: u16, uri: &str, product: &str) {
+    fn says(finding: &mut DiscoveredServers, port: u16, uri: &str, product: &str) {
         let says = Says {
             application_uri: uri.to_owned(),
             product_uri: product.to_owned(),
@@ -508,7 +508,7 @@ servers: [{name: press, endpoint: 'opc.tcp://127.0.0.1:5000'}]
         finding.take(Answer::Is(url, Some(says)));
     }
 
-    fn placed(finding: &mut Finding, is_up: bool) -> Vec<(String, u16)> {
+    fn placed(finding: &mut DiscoveredServers, is_up: bool) -> Vec<(String, u16)> {
         let placed = finding.look(|_| is_up).iter();
         placed
             .map(|one| (one.access.endpoint.to_string(), one.namespace))
@@ -526,9 +526,9 @@ servers: [{name: press, endpoint: 'opc.tcp://127.0.0.1:5000'}]
         says(&mut finding, 5001, "urn:v:oven", "");
         let oven = vec![("opc.tcp://127.0.0.1:5001".to_owned(), 41)];
         assert_eq!(placed(&mut finding, false), oven);
-        let gone = Found::Gone {
+        let gone = ServerChange::Gone {
             known: seen("oven", 5001, 0).known().clone(),
-            loss: Loss::Goodbye,
+            loss: ServerLoss::Goodbye,
         };
         finding.heard(&gone);
         assert_eq!(placed(&mut finding, true), oven, "it still answers");

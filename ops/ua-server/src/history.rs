@@ -17,14 +17,14 @@ use opcua::types::{
     TimestampsToReturn, VariableId, Variant, VariantScalarTypeId, VariantTypeId,
 };
 
-use self::aggregate::{Aggregate, Outcome, Quality, Rules, Sample};
+use self::aggregate::{Aggregate, AggregateRules, IntervalOutcome, PastValue, Quality};
 pub(crate) use self::past::Past;
-pub(crate) use self::store::{Store, Stored, StoredConditions};
+pub(crate) use self::store::{HistoryFile, StoredConditions, StoredValue};
 use crate::alarms::MOST_EVENTS_RETURNED;
 use crate::budget::{LARGEST, SMALL};
 use crate::layout::TopicNode;
 use crate::value;
-use crate::values::{Shown, View};
+use crate::values::{NodeView, ShownValue};
 
 /// The past values of a node, in the order of their times.
 pub(crate) struct Series {
@@ -38,12 +38,12 @@ struct One {
     time: i64,
     /// Unique number of the value.
     number: u64,
-    shown: Shown,
+    shown: ShownValue,
 }
 
 /// A value of a response.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Step {
+pub(crate) enum HistoryValue {
     Value(usize),
     /// There is no value before or after that time.
     NoBound(i64),
@@ -61,7 +61,7 @@ enum Left {
 }
 
 /// Accounts for the bytes of the values of a response.
-pub(crate) struct Room<'a> {
+pub(crate) struct ResponseBudget<'a> {
     used: usize,
     /// Returns true if there is memory for a large value beside all other responses.
     large: &'a (dyn Fn(usize) -> bool + Send + Sync),
@@ -76,7 +76,7 @@ enum Fit {
     Refused(StatusCode),
 }
 
-impl<'a> Room<'a> {
+impl<'a> ResponseBudget<'a> {
     pub(crate) const fn new(large: &'a (dyn Fn(usize) -> bool + Send + Sync)) -> Self {
         Self { used: 0, large }
     }
@@ -100,7 +100,7 @@ impl Series {
     /// Creates the series of a node from the kept values of its topic.
     pub(crate) fn new(
         (topic, field): (Arc<TopicNode>, Option<usize>),
-        kept: Vec<(u64, Shown)>,
+        kept: Vec<(u64, ShownValue)>,
     ) -> Self {
         let mut shown: Vec<One> = kept
             .into_iter()
@@ -119,7 +119,7 @@ impl Series {
         }
     }
 
-    fn view(&self, at: usize) -> Option<View<'_>> {
+    fn view(&self, at: usize) -> Option<NodeView<'_>> {
         let one = self.shown.get(at)?;
         Some(one.shown.view(&self.topic, self.field))
     }
@@ -129,7 +129,7 @@ impl Series {
         &self,
         details: &ReadRawModifiedDetails,
         node: &mut HistoryNode,
-        (wanted, room): (TimestampsToReturn, &mut Room<'_>),
+        (wanted, room): (TimestampsToReturn, &mut ResponseBudget<'_>),
     ) {
         let steps = match self.begun(details, node) {
             Ok(steps) => steps,
@@ -149,8 +149,8 @@ impl Series {
             .iter()
             .skip(values.len())
             .filter_map(|step| match step {
-                Step::Value(at) => self.shown.get(*at).map(|one| Left::Value(one.number)),
-                Step::NoBound(time) => Some(Left::NoBound(*time)),
+                HistoryValue::Value(at) => self.shown.get(*at).map(|one| Left::Value(one.number)),
+                HistoryValue::NoBound(time) => Some(Left::NoBound(*time)),
             })
             .collect();
         node.set_status(if steps.is_empty() {
@@ -172,7 +172,7 @@ impl Series {
         &self,
         details: &ReadRawModifiedDetails,
         node: &HistoryNode,
-    ) -> Result<Vec<Step>, StatusCode> {
+    ) -> Result<Vec<HistoryValue>, StatusCode> {
         if details.is_read_modified {
             return Err(StatusCode::BadHistoryOperationUnsupported);
         }
@@ -189,8 +189,8 @@ impl Series {
         let numbers = self.shown.iter().enumerate();
         let places: HashMap<u64, usize> = numbers.map(|(at, one)| (one.number, at)).collect();
         let steps = rest.0.iter().filter_map(|left| match left {
-            Left::Value(number) => places.get(number).map(|at| Step::Value(*at)),
-            Left::NoBound(time) => Some(Step::NoBound(*time)),
+            Left::Value(number) => places.get(number).map(|at| HistoryValue::Value(*at)),
+            Left::NoBound(time) => Some(HistoryValue::NoBound(*time)),
         });
         Ok(steps.collect())
     }
@@ -198,15 +198,15 @@ impl Series {
     /// Returns the values of the first steps, as many as fit into a response.
     fn values(
         &self,
-        steps: &[Step],
+        steps: &[HistoryValue],
         (most, range): (usize, &NumericRange),
-        (wanted, room): (TimestampsToReturn, &mut Room<'_>),
+        (wanted, room): (TimestampsToReturn, &mut ResponseBudget<'_>),
     ) -> Vec<DataValue> {
         let mut values = Vec::new();
         for step in steps.iter().take(most) {
             let value = match step {
-                Step::NoBound(time) => no_value(StatusCode::BadBoundNotFound, *time),
-                Step::Value(at) => {
+                HistoryValue::NoBound(time) => no_value(StatusCode::BadBoundNotFound, *time),
+                HistoryValue::Value(at) => {
                     let Some(view) = self.view(*at) else {
                         break;
                     };
@@ -228,7 +228,7 @@ impl Series {
         &self,
         (details, kind): (&ReadProcessedDetails, &NodeId),
         node: &mut HistoryNode,
-        (wanted, room): (TimestampsToReturn, &mut Room<'_>),
+        (wanted, room): (TimestampsToReturn, &mut ResponseBudget<'_>),
     ) {
         let values = self.intervals(details, kind, room);
         answer(node, values, wanted);
@@ -238,7 +238,7 @@ impl Series {
         &self,
         details: &ReadProcessedDetails,
         kind: &NodeId,
-        room: &mut Room<'_>,
+        room: &mut ResponseBudget<'_>,
     ) -> Result<Vec<DataValue>, StatusCode> {
         let aggregate = aggregate_of(kind).ok_or(StatusCode::BadAggregateNotSupported)?;
         let (start, end) = (given(details.start_time), given(details.end_time));
@@ -282,7 +282,7 @@ impl Series {
         &self,
         details: &ReadAtTimeDetails,
         node: &mut HistoryNode,
-        (wanted, room): (TimestampsToReturn, &mut Room<'_>),
+        (wanted, room): (TimestampsToReturn, &mut ResponseBudget<'_>),
     ) {
         let times = details.req_times.as_deref().unwrap_or_default();
         if times.is_empty() || times.len() > MOST_VALUES {
@@ -292,17 +292,17 @@ impl Series {
         let samples = self.samples();
         let values = times.iter().map(|time| {
             let time = time.ticks();
-            let outcome = aggregate::at(&samples, time, Rules::default());
+            let outcome = aggregate::at(&samples, time, AggregateRules::default());
             self.outcome(outcome, time, room)
         });
         answer(node, values.collect(), wanted);
     }
 
-    fn samples(&self) -> Vec<Sample> {
+    fn samples(&self) -> Vec<PastValue> {
         let samples = self.shown.iter().map(|one| {
             let view = one.shown.view(&self.topic, self.field);
             let status = view.stamp().status;
-            Sample {
+            PastValue {
                 time: one.time,
                 value: decoded(&view).and_then(|value| number(&value)),
                 quality: if status.is_good() {
@@ -323,9 +323,9 @@ impl Series {
     /// Returns `BadResponseTooLarge` if the response has no space for the value.
     fn outcome(
         &self,
-        outcome: Outcome,
+        outcome: IntervalOutcome,
         time: i64,
-        room: &mut Room<'_>,
+        room: &mut ResponseBudget<'_>,
     ) -> Result<DataValue, StatusCode> {
         let mut sample = |at: usize| {
             let Some(view) = self.view(at) else {
@@ -338,26 +338,30 @@ impl Series {
             }
         };
         let value = match outcome {
-            Outcome::Raw(at) => sample(at)?,
-            Outcome::Picked(at, quality) => made(sample(at)?.value, (quality, CALCULATED), time),
-            Outcome::Actual(at, quality) => {
+            IntervalOutcome::Raw(at) => sample(at)?,
+            IntervalOutcome::Picked(at, quality) => {
+                made(sample(at)?.value, (quality, CALCULATED), time)
+            }
+            IntervalOutcome::Actual(at, quality) => {
                 let time = self.shown.get(at).map_or(time, |one| one.time);
                 made(sample(at)?.value, (quality, RAW), time)
             }
-            Outcome::Status(at) => {
+            IntervalOutcome::Status(at) => {
                 let status = self.view(at).map(|view| view.stamp().status);
                 let value = status.map(Variant::StatusCode);
                 made(value, (Quality::Good, CALCULATED), time)
             }
-            Outcome::Held(at) => made(sample(at)?.value, (Quality::Good, INTERPOLATED), time),
-            Outcome::Calculated(value, quality) => {
+            IntervalOutcome::Held(at) => {
+                made(sample(at)?.value, (Quality::Good, INTERPOLATED), time)
+            }
+            IntervalOutcome::Calculated(value, quality) => {
                 made(Some(Variant::Double(value)), (quality, CALCULATED), time)
             }
-            Outcome::Count(count, quality) => {
+            IntervalOutcome::Count(count, quality) => {
                 let count = i32::try_from(count).unwrap_or(i32::MAX);
                 made(Some(Variant::Int32(count)), (quality, CALCULATED), time)
             }
-            Outcome::Interpolated(value, quality) => {
+            IntervalOutcome::Interpolated(value, quality) => {
                 let views = (0..self.shown.len()).filter_map(|at| self.view(at));
                 let alike = views
                     .filter_map(|view| decoded(&view))
@@ -365,8 +369,8 @@ impl Series {
                 let value = like(value, alike.as_ref());
                 made(Some(value), (quality, INTERPOLATED), time)
             }
-            Outcome::NoData => no_value(StatusCode::BadNoData, time),
-            Outcome::Bad => no_value(StatusCode::Bad, time),
+            IntervalOutcome::NoData => no_value(StatusCode::BadNoData, time),
+            IntervalOutcome::Bad => no_value(StatusCode::Bad, time),
         };
         match room.take(BESIDE) {
             Fit::Fits => Ok(value),
@@ -416,7 +420,7 @@ fn partial(status: StatusCode) -> StatusCode {
 }
 
 /// Decodes a value if it is small enough to be a number.
-fn decoded(view: &View<'_>) -> Option<Variant> {
+fn decoded(view: &NodeView<'_>) -> Option<Variant> {
     let small = view.weight() <= SMALL;
     small.then(|| view.data_value(&NumericRange::None).value)?
 }
@@ -426,15 +430,15 @@ fn decoded(view: &View<'_>) -> Option<Variant> {
 /// # Errors
 /// Returns `BadAggregateInvalidInputs` for percentages that contradict each other (OPC 10000-13,
 /// 4.2.1.2).
-fn rules(asked: &AggregateConfiguration) -> Result<Rules, StatusCode> {
+fn rules(asked: &AggregateConfiguration) -> Result<AggregateRules, StatusCode> {
     if asked.use_server_capabilities_defaults {
-        return Ok(Rules::default());
+        return Ok(AggregateRules::default());
     }
     let (bad, good) = (asked.percent_data_bad, asked.percent_data_good);
     if bad > 100 || good > 100 || u16::from(bad) + u16::from(good) < 100 {
         return Err(StatusCode::BadAggregateInvalidInputs);
     }
-    Ok(Rules {
+    Ok(AggregateRules {
         uncertain_is_bad: asked.treat_uncertain_as_bad,
         percent_bad: bad,
         percent_good: good,
@@ -448,7 +452,7 @@ pub(crate) fn steps(
     times: &[i64],
     (start, end): (Option<i64>, Option<i64>),
     (count, bounds): (u32, bool),
-) -> Result<Vec<Step>, StatusCode> {
+) -> Result<Vec<HistoryValue>, StatusCode> {
     let (start, end) = match (start, end) {
         (Some(start), Some(end)) => (start, Some(end)),
         (Some(start), None) if count > 0 => (start, None),
@@ -471,35 +475,39 @@ pub(crate) fn steps(
         steps.push(
             first
                 .checked_sub(1)
-                .map_or(Step::NoBound(start), Step::Value),
+                .map_or(HistoryValue::NoBound(start), HistoryValue::Value),
         );
     }
-    steps.extend((first..last).map(Step::Value));
+    steps.extend((first..last).map(HistoryValue::Value));
     if let Some(end) = end.filter(|end| bounds && *end != start) {
-        let behind = (last < times.len()).then_some(Step::Value(last));
-        steps.push(behind.unwrap_or(Step::NoBound(end)));
+        let behind = (last < times.len()).then_some(HistoryValue::Value(last));
+        steps.push(behind.unwrap_or(HistoryValue::NoBound(end)));
     }
     Ok(steps)
 }
 
 /// Returns the values from `start` backward to the earlier `end`.
-fn backwards(times: &[i64], (start, end): (i64, Option<i64>), bounds: bool) -> Vec<Step> {
+fn backwards(times: &[i64], (start, end): (i64, Option<i64>), bounds: bool) -> Vec<HistoryValue> {
     let behind = times.partition_point(|time| *time <= start);
     let first = end.map_or(0, |end| times.partition_point(|time| *time <= end));
     let mut steps = Vec::new();
     if bounds && behind.checked_sub(1).and_then(|last| times.get(last)) != Some(&start) {
-        let after = (behind < times.len()).then_some(Step::Value(behind));
-        steps.push(after.unwrap_or(Step::NoBound(start)));
+        let after = (behind < times.len()).then_some(HistoryValue::Value(behind));
+        steps.push(after.unwrap_or(HistoryValue::NoBound(start)));
     }
-    steps.extend((first..behind).rev().map(Step::Value));
+    steps.extend((first..behind).rev().map(HistoryValue::Value));
     if let Some(end) = end.filter(|_| bounds) {
-        steps.push(first.checked_sub(1).map_or(Step::NoBound(end), Step::Value));
+        steps.push(
+            first
+                .checked_sub(1)
+                .map_or(HistoryValue::NoBound(end), HistoryValue::Value),
+        );
     }
     steps
 }
 
 /// Returns the time of a value: its source timestamp, or else its time of arrival.
-fn time(shown: &Shown) -> i64 {
+fn time(shown: &ShownValue) -> i64 {
     let source = shown.stamp.source;
     let time = source.map_or_else(
         || shown.stamp.server,

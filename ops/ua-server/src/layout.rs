@@ -4,12 +4,12 @@ use std::collections::{BTreeMap, HashSet};
 
 use bridge_node::CallField;
 use mappings::{History, Mapping, Meaning, NodeIdText, SpaceId, TopicId, Variable};
-use messages::{Leaf, Rank};
+use messages::{ArrayRank, Leaf};
 use opcua::types::{ByteString, DataTypeId, Identifier, NodeId, Variant, VariantTypeId};
 use uadp::BuiltinType;
 
 use crate::address::unmapped_node;
-use crate::structures::{Structure, Structures, Types};
+use crate::structures::{MappedTypes, Structure, VariableStructures};
 
 /// The nodes of the mapped topics and their namespaces.
 #[derive(Debug)]
@@ -50,7 +50,7 @@ pub(crate) struct TopicNode {
 pub(crate) struct FieldNode {
     pub(crate) node: NodeId,
     pub(crate) name: String,
-    pub(crate) shape: Shape,
+    pub(crate) shape: VariableShape,
     /// The DataType of the structure, or of the structures in its array, if it is known.
     pub(crate) structure: Option<NodeId>,
 }
@@ -58,7 +58,7 @@ pub(crate) struct FieldNode {
 /// The builtin type of a variable's values and if they are arrays; `None` if the mapping leaves the
 /// type open.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) struct Shape(pub(crate) Option<(BuiltinType, bool)>);
+pub(crate) struct VariableShape(pub(crate) Option<(BuiltinType, bool)>);
 
 /// The reason why a mapping cannot be served.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -95,8 +95,8 @@ impl Layout {
     ///
     /// # Errors
     /// Returns the errors of [`new`](Self::new).
-    pub(crate) fn of(mapping: &Mapping, types: &mut Types) -> Result<Self, LayoutError> {
-        let mut structures = Structures::default();
+    pub(crate) fn of(mapping: &Mapping, types: &mut MappedTypes) -> Result<Self, LayoutError> {
+        let mut structures = VariableStructures::default();
         let topics = mapping.variables().iter();
         let history = mapping.server().history;
         let topics =
@@ -121,14 +121,14 @@ impl Layout {
     pub(crate) fn within(
         running: &[String],
         mapping: &Mapping,
-        types: &mut Types,
+        types: &mut MappedTypes,
     ) -> Result<(Self, Vec<String>), LayoutError> {
         let others = mapping
             .namespaces()
             .iter()
             .filter(|(index, uri)| running.get(usize::from(**index)) != Some(*uri));
         let others: Vec<u16> = others.map(|(index, _)| *index).collect();
-        let mut structures = Structures::default();
+        let mut structures = VariableStructures::default();
         let topics = mapping.variables().iter();
         let history = mapping.server().history;
         let topics =
@@ -257,17 +257,20 @@ impl TopicNode {
     fn of(
         variable: &Variable,
         history: History,
-        (types, structures): (&mut Types, &mut Structures),
+        (types, structures): (&mut MappedTypes, &mut VariableStructures),
     ) -> Self {
         let leaves = variable.fields.iter().map(|leaf| {
             let array = match leaf.rank {
-                Rank::Scalar => false,
-                Rank::Array { .. } => true,
+                ArrayRank::Scalar => false,
+                ArrayRank::Array { .. } => true,
             };
-            (leaf.path.clone(), Shape(Some((leaf.builtin, array))))
+            (
+                leaf.path.clone(),
+                VariableShape(Some((leaf.builtin, array))),
+            )
         });
         let fields = match variable.value_type {
-            Some(shape) => vec![(variable.name.clone(), Shape(Some(shape)))],
+            Some(shape) => vec![(variable.name.clone(), VariableShape(Some(shape)))],
             None => leaves.collect(),
         };
         let node = Self::new(
@@ -304,7 +307,7 @@ impl TopicNode {
         topic: TopicId,
         node: NodeId,
         name: String,
-        fields: Vec<(String, Shape)>,
+        fields: Vec<(String, VariableShape)>,
     ) -> Self {
         let compound = fields.len() > 1;
         let fields = if compound {
@@ -318,7 +321,9 @@ impl TopicNode {
                 })
                 .collect()
         } else {
-            let shape = fields.first().map_or(Shape(None), |(_, shape)| *shape);
+            let shape = fields
+                .first()
+                .map_or(VariableShape(None), |(_, shape)| *shape);
             vec![FieldNode {
                 node: node.clone(),
                 name: name.clone(),
@@ -409,12 +414,12 @@ impl FieldNode {
     }
 }
 
-impl Shape {
+impl VariableShape {
     /// Returns the shape of a field of a call.
     pub(crate) fn of(field: &CallField) -> Self {
         Self(Some((
             field.builtin,
-            matches!(field.rank, Rank::Array { .. }),
+            matches!(field.rank, ArrayRank::Array { .. }),
         )))
     }
 
@@ -502,7 +507,10 @@ mod tests {
             TopicId::new(space, namespace, identifier).unwrap(),
             NodeId::new(namespace, u32::from(identifier)),
             "x".to_owned(),
-            vec![("data".to_owned(), Shape(Some((BuiltinType::Double, false))))],
+            vec![(
+                "data".to_owned(),
+                VariableShape(Some((BuiltinType::Double, false))),
+            )],
         )
     }
 
@@ -575,7 +583,7 @@ mod tests {
             ("pose.x", BuiltinType::Double),
             ("name", BuiltinType::String),
         ]
-        .map(|(path, builtin)| (path.to_owned(), Shape(Some((builtin, false)))));
+        .map(|(path, builtin)| (path.to_owned(), VariableShape(Some((builtin, false)))));
         let topic = TopicNode::new(
             TopicId::new(1, 5, 10).unwrap(),
             NodeId::new(5, 10),
@@ -588,8 +596,8 @@ mod tests {
 
     #[test]
     fn a_shape_accepts_its_own_type_and_rank_only() {
-        let scalar = Shape(Some((BuiltinType::Int32, false)));
-        let array = Shape(Some((BuiltinType::Int32, true)));
+        let scalar = VariableShape(Some((BuiltinType::Int32, false)));
+        let array = VariableShape(Some((BuiltinType::Int32, true)));
         assert!(scalar.accepts(&Variant::from(1i32)));
         assert!(!scalar.accepts(&Variant::from(true)));
         assert!(!scalar.accepts(&Variant::from(vec![1i32])));
@@ -608,6 +616,6 @@ mod tests {
         assert!(array.accepts(&empty(Some(Vec::new()))));
         assert!(!array.accepts(&empty(Some(vec![0, 3]))));
         assert!(!scalar.accepts(&empty(None)));
-        assert!(Shape(None).accepts(&Variant::from("anything")));
+        assert!(VariableShape(None).accepts(&Variant::from("anything")));
     }
 }

@@ -75,19 +75,19 @@ use std::sync::{Arc, OnceLock};
 
 use bridge_node::{
     Arguments, Context, Failure, FailureKind, KeyService, NodeSetReader, Observer, Owned, Program,
-    Rank, SharedProgram, Site,
+    RedundancyRank, SharedProgram, Site,
 };
 use discovery::scan::Range;
-use discovery::{AnnounceSettings, Interface};
+use discovery::{AnnounceSettings, MdnsInterface};
 use mappings::{FindSkills, Mapping, SpaceId};
 use plant_opcua::endpoint::EndpointUrl;
 use plant_opcua::enrolment::GdsArguments;
 use plant_opcua::pki::{self, Pki};
-use supervisor::{Page, Pair, ProxyUrl, StatusUrl};
+use supervisor::{CertificateFiles, Page, ProxyUrl, StatusUrl};
 
 use crate::port::{ServerPort, Setup};
 use crate::sks::{ServerKeys, Sks};
-use crate::structures::Types;
+use crate::structures::MappedTypes;
 
 /// The OPC UA server of the cell: every value of the space as a variable, and a way in for those of origin 0.
 #[derive(Debug, clap::Parser)]
@@ -118,7 +118,7 @@ struct UaServer {
     /// Run as one of up to three redundant servers, whose ApplicationUris are in `server.redundant`
     /// of the mapping: all show the values, and a single one sends the values of clients and calls
     #[arg(long, value_name = "1|2|3", env = "UA_RANK", value_parser = bridge_node::rank)]
-    rank: Option<Rank>,
+    rank: Option<RedundancyRank>,
     /// Show the program with this address of --metrics on the page, as http://127.0.0.1:9101. May
     /// be repeated
     #[arg(long, value_name = "URL")]
@@ -176,7 +176,7 @@ impl UaServer {
 
     /// Returns the ApplicationUri of the server.
     fn uri(&self, mapping: &Mapping) -> String {
-        let rank = self.rank.map(Rank::get);
+        let rank = self.rank.map(RedundancyRank::get);
         let ranked = rank.and_then(|rank| mapping.for_rank(rank));
         ranked
             .as_ref()
@@ -203,7 +203,7 @@ impl UaServer {
             ));
         }
         let root = self.pki_root();
-        let pair = Pair {
+        let pair = CertificateFiles {
             certificate: root.join(pki::OWN_CERTIFICATE),
             key: root.join(pki::OWN_KEY),
         };
@@ -221,11 +221,11 @@ impl UaServer {
             .flags
             .interface
             .as_deref()
-            .map(Interface::parse);
+            .map(MdnsInterface::parse);
         let settings = AnnounceSettings {
             mdns: self
                 .announce
-                .then(|| interface.unwrap_or(Interface::LOOPBACK))
+                .then(|| interface.unwrap_or(MdnsInterface::LOOPBACK))
                 .map(|interface| interface.with_networks(networks)),
             // The directory of --pki exists by then.
             pki: Some(self.pki_root()),
@@ -277,12 +277,12 @@ impl Program for UaServer {
 
     const SHOWS_VALUES_AT_STANDBY: bool = true;
 
-    fn rank(&self) -> Option<Rank> {
+    fn rank(&self) -> Option<RedundancyRank> {
         self.rank
     }
 
     fn spaces(&self, mapping: &Mapping) -> Result<Vec<SpaceId>, Failure> {
-        if let Some(rank) = self.rank.map(Rank::get)
+        if let Some(rank) = self.rank.map(RedundancyRank::get)
             && mapping.for_rank(rank).is_none()
         {
             let message = format!(
@@ -297,7 +297,7 @@ impl Program for UaServer {
     fn key_service(&self, mapping: &Mapping) -> Option<Arc<dyn KeyService>> {
         Some(Arc::new(ServerKeys {
             own: self.sks(),
-            others: plant_keys::Service::new(plant_keys::Identity {
+            others: plant_keys::KeyFetcher::new(plant_keys::KeyClientIdentity {
                 application_uri: self.uri(mapping),
                 application_name: Self::NAME.to_owned(),
                 pki: self.pki_root(),
@@ -328,7 +328,7 @@ impl Program for UaServer {
             pki,
             sks: self.sks(),
             trust_any_client: self.trust_any_client_certificate,
-            types: Types::new(&context.types),
+            types: MappedTypes::new(&context.types),
             mapped_url: self.endpoint.is_none(),
             gds,
             rank: self.rank,

@@ -8,7 +8,7 @@ use std::path::Path;
 use std::sync::Arc;
 use std::time::Duration;
 
-use bridge_node::{Answered, AskId, CallDescription};
+use bridge_node::{AskId, CallDescription, CallResponse};
 use bytes::Bytes;
 use mappings::{Mapping, TopicId};
 use opcua::nodes::{MethodBuilder, ObjectBuilder};
@@ -20,7 +20,7 @@ use tracing::{info, warn};
 
 use crate::address;
 use crate::argument_types::ArgumentTypes;
-use crate::asking::{Callable, Heard, Question};
+use crate::asking::{Callable, ClientQuestion, QuestionReceiver};
 use crate::nodes::SpaceManager;
 use crate::programs::Programs;
 use crate::structures::Structure;
@@ -29,7 +29,7 @@ use crate::structures::Structure;
 pub(crate) struct Methods {
     manager: Arc<SpaceManager>,
     mapping: Arc<Mapping>,
-    heard: Heard,
+    heard: QuestionReceiver,
     shown: HashMap<TopicId, NodeId>,
     /// Calls without a Method, because another node has their NodeId.
     refused: HashMap<TopicId, Arc<CallDescription>>,
@@ -40,7 +40,7 @@ pub(crate) struct Methods {
     types: ArgumentTypes,
     /// Actions, as Programs beside their Methods.
     programs: Programs,
-    asked: HashMap<AskId, oneshot::Sender<Answered<Bytes>>>,
+    asked: HashMap<AskId, oneshot::Sender<CallResponse<Bytes>>>,
     /// Requests that clients have abandoned, to be reported.
     given_up: VecDeque<AskId>,
     next: u64,
@@ -68,7 +68,7 @@ impl Methods {
     pub(crate) fn new(
         (manager, subscriptions): (Arc<SpaceManager>, Arc<SubscriptionCache>),
         mapping: &Arc<Mapping>,
-        (heard, structures): (Heard, &[Structure]),
+        (heard, structures): (QuestionReceiver, &[Structure]),
         root: &Path,
     ) -> Self {
         let mut types = ArgumentTypes::default();
@@ -283,8 +283,8 @@ impl Methods {
         }
     }
 
-    fn ask(&mut self, question: Question) -> Wish {
-        let Question {
+    fn ask(&mut self, question: ClientQuestion) -> Wish {
+        let ClientQuestion {
             topic,
             block,
             answer,
@@ -304,7 +304,7 @@ impl Methods {
         }
     }
 
-    pub(crate) fn answered(&mut self, ask: AskId, answer: Answered<Bytes>) {
+    pub(crate) fn answered(&mut self, ask: AskId, answer: CallResponse<Bytes>) {
         if let Some(asked) = self.asked.remove(&ask) {
             // The client may be lost.
             drop(asked.send(answer));

@@ -28,29 +28,29 @@ use opcua::types::{
     ReadEventDetails, ReadProcessedDetails, ReadRawModifiedDetails, StatusCode, TimestampsToReturn,
     Variant,
 };
-use plant_opcua::nodeset::NodeSets;
-use plant_opcua::server::{Caller, EventHistory as _};
-use plant_opcua::users::{Access, Right};
+use plant_opcua::nodeset::ImportedNodeSets;
+use plant_opcua::server::{EventHistory as _, SessionCaller};
+use plant_opcua::users::{Right, UserAccess};
 use tokio::sync::{Semaphore, mpsc};
 
 use self::called::{Callables, set_result};
 use self::live::LiveValues;
 use self::write::WritePath;
-pub(crate) use self::write::{ClientWrite, Writer};
+pub(crate) use self::write::{ClientWrite, WriteClient};
 use crate::access::Genuine;
 use crate::address;
 use crate::alarms::Alarms;
-use crate::asking::{Questions, Refused};
+use crate::asking::{CallFailure, Questions};
 use crate::confirm::Confirms;
 use crate::folders;
-use crate::history::{Room, Series};
+use crate::history::{ResponseBudget, Series};
 use crate::identity;
 use crate::layout::{Layout, TopicNode};
 use crate::nodesets::Loaded;
 use crate::properties;
-use crate::pubsub::PubSub;
+use crate::pubsub::PubSubNodes;
 use crate::redundant::ServerRole;
-use crate::values::{self, Shown};
+use crate::values::{self, ShownValue};
 
 /// The node manager in the server.
 pub(crate) type SpaceManager = InMemoryNodeManager<SpaceNodes>;
@@ -65,8 +65,8 @@ pub(crate) struct SpaceNodes {
     writes: WritePath,
     genuine: Genuine,
     created: mpsc::Sender<(NodeId, MonitoredItemHandle)>,
-    access: Arc<Access>,
-    pubsub: Arc<PubSub>,
+    access: Arc<UserAccess>,
+    pubsub: Arc<PubSubNodes>,
     alarms: Arc<Alarms>,
     nodesets: Loaded,
     callables: Callables,
@@ -88,9 +88,9 @@ pub(crate) struct Exits {
     /// Calls of clients. If the channel is full, the client gets an error.
     pub(crate) questions: Questions,
     /// Permissions of users.
-    pub(crate) access: Arc<Access>,
+    pub(crate) access: Arc<UserAccess>,
     /// The PubSub configuration; clients can disable parts of it.
-    pub(crate) pubsub: Arc<PubSub>,
+    pub(crate) pubsub: Arc<PubSubNodes>,
     /// The confirmations of writes.
     pub(crate) confirms: Arc<Confirms>,
     /// Whether a redundant server sends the values that clients write.
@@ -102,7 +102,7 @@ pub(crate) struct Exits {
 impl SpaceNodes {
     /// Registers the namespaces and adds the nodes of `layout` to `address_space`.
     pub(crate) fn build(
-        (layout, sets): (&Layout, &NodeSets),
+        (layout, sets): (&Layout, &ImportedNodeSets),
         exits: Exits,
         context: &ServerContext,
         address_space: &mut AddressSpace,
@@ -174,7 +174,7 @@ impl SpaceNodes {
     }
 
     /// Returns the PubSub configuration.
-    pub(crate) fn pubsub(&self) -> &PubSub {
+    pub(crate) fn pubsub(&self) -> &PubSubNodes {
         &self.pubsub
     }
 
@@ -221,8 +221,9 @@ impl SpaceNodes {
         folders::tidy(&mut address_space, gone);
         let mut notifier = subscriptions.data_notifier();
         for node in gone.iter().flat_map(TopicNode::nodes) {
-            let nothing =
-                |status| values::data_value(Some(Variant::Empty), Shown::nothing(status).stamp);
+            let nothing = |status| {
+                values::data_value(Some(Variant::Empty), ShownValue::nothing(status).stamp)
+            };
             let value = match (places.get(node), left.remove(node)) {
                 (Some(_), _) => nothing(StatusCode::BadWaitingForInitialData),
                 (None, Some(shown)) => shown,
@@ -300,7 +301,7 @@ impl SpaceNodes {
     pub(crate) async fn write_one(
         &self,
         address_space: &RwLock<AddressSpace>,
-        writer: &Writer,
+        writer: &WriteClient,
         write: &ParsedWriteValue,
     ) -> Result<StatusCode, StatusCode> {
         let is_value = write.attribute_id == AttributeId::Value;
@@ -335,7 +336,7 @@ impl SpaceNodes {
         if !may {
             return StatusCode::BadUserAccessDenied;
         }
-        let called = self.pubsub.call(method, &Caller::of(context).user);
+        let called = self.pubsub.call(method, &SessionCaller::of(context).user);
         called.unwrap_or_else(|| {
             if self.nodesets.has(method) {
                 StatusCode::BadNotExecutable
@@ -357,7 +358,7 @@ impl SpaceNodes {
         context: &RequestContext,
         nodes: &mut [&mut &mut HistoryNode],
         wanted: TimestampsToReturn,
-        answer: impl Fn(&Series, &mut HistoryNode, &mut Room<'_>),
+        answer: impl Fn(&Series, &mut HistoryNode, &mut ResponseBudget<'_>),
     ) -> Result<(), StatusCode> {
         self.genuine.check(context)?;
         if matches!(
@@ -367,7 +368,7 @@ impl SpaceNodes {
             return Err(StatusCode::BadTimestampsToReturnInvalid);
         }
         let large = |weight| self.live.items().take(weight);
-        let mut room = Room::new(&large);
+        let mut room = ResponseBudget::new(&large);
         for node in nodes {
             match self.series(node.node_id()) {
                 Some(series) => answer(&series, node, &mut room),
@@ -565,7 +566,7 @@ impl InMemoryNodeManagerImpl for SpaceNodes {
         nodes_to_write: &mut [&mut WriteNode],
     ) -> Result<(), StatusCode> {
         self.genuine.check(context)?;
-        let writer = &Writer::of(context);
+        let writer = &WriteClient::of(context);
         let writes = nodes_to_write.iter_mut().map(|write| async {
             let result = self.write_one(address_space, writer, write.value()).await;
             let (Ok(status) | Err(status)) = result;
@@ -654,7 +655,7 @@ impl InMemoryNodeManagerImpl for SpaceNodes {
             let called =
                 called.unwrap_or_else(|| match self.call_pubsub(context, method.method_id()) {
                     StatusCode::Good => Ok(Vec::new()),
-                    refused => Err(Refused::Status(refused)),
+                    refused => Err(CallFailure::Status(refused)),
                 });
             set_result(method, called);
         });

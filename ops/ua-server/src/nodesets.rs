@@ -14,7 +14,7 @@ use opcua::types::{
     BrowseDirection, DataValue, NamespaceMap, NodeId, ObjectId, QualifiedName, ReferenceTypeId,
     StatusCode, Variant,
 };
-use plant_opcua::nodeset::NodeSets;
+use plant_opcua::nodeset::ImportedNodeSets;
 use tracing::{info, warn};
 
 use crate::layout::{TopicNode, component};
@@ -25,8 +25,8 @@ use crate::properties::{self, Property};
 /// # Errors
 /// Returns the first fatal error of the files. The check of the mapping has reported all errors,
 /// unless a file changed in the meantime.
-pub(crate) fn read(mapping: &Mapping) -> Result<NodeSets, Failure> {
-    let (sets, faults) = NodeSets::read(&mapping.server().nodesets);
+pub(crate) fn read(mapping: &Mapping) -> Result<ImportedNodeSets, Failure> {
+    let (sets, faults) = ImportedNodeSets::read(&mapping.server().nodesets);
     let mut faults = faults.into_iter();
     match faults.find(|fault| fault.error.is_fatal()) {
         Some(fault) => Err(Failure::new(
@@ -38,7 +38,7 @@ pub(crate) fn read(mapping: &Mapping) -> Result<NodeSets, Failure> {
 }
 
 /// Appends the namespaces of NodeSets that the server does not have yet.
-pub(crate) fn add_namespaces(sets: &NodeSets, namespaces: &mut Vec<String>) {
+pub(crate) fn add_namespaces(sets: &ImportedNodeSets, namespaces: &mut Vec<String>) {
     for uri in sets.provides() {
         if !namespaces.iter().any(|known| known == uri) {
             namespaces.push(uri.to_owned());
@@ -47,13 +47,13 @@ pub(crate) fn add_namespaces(sets: &NodeSets, namespaces: &mut Vec<String>) {
 }
 
 /// The NodeSet files of a running server. Other files take effect at the next start.
-pub(crate) struct Running {
+pub(crate) struct RunningNodeSets {
     files: Vec<PathBuf>,
     fingerprint: u64,
 }
 
-impl Running {
-    pub(crate) fn new(mapping: &Mapping, sets: &NodeSets) -> Self {
+impl RunningNodeSets {
+    pub(crate) fn new(mapping: &Mapping, sets: &ImportedNodeSets) -> Self {
         Self {
             files: mapping.server().nodesets.clone(),
             fingerprint: sets.fingerprint(),
@@ -96,7 +96,7 @@ struct Before {
 impl Loaded {
     /// Adds the nodes of NodeSets. Nodes that are not live are neither writable nor callable.
     pub(crate) fn put_in(
-        sets: &NodeSets,
+        sets: &ImportedNodeSets,
         address_space: &mut AddressSpace,
         namespaces: &mut NamespaceMap,
     ) -> Self {

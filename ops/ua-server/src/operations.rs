@@ -10,20 +10,20 @@ use opcua::server::SubscriptionCache;
 use opcua::server::authenticator::UserToken;
 use opcua::server::node_manager::ParsedWriteValue;
 use opcua::types::{AttributeId, DataValue, NumericRange, StatusCode, Variant};
-use plant_opcua::users::{Access, Right, Role, Roles};
+use plant_opcua::users::{Right, Roles, UserAccess, UserRole};
 use supervisor::{ConditionChange, ConditionState, OperationFault, Operations};
 use uadp::Fields;
 
 use crate::alarms::Alarms;
-use crate::asking::Refused;
+use crate::asking::CallFailure;
 use crate::commanders::Commander;
 use crate::layout::node_id;
-use crate::nodes::{SpaceManager, Writer};
+use crate::nodes::{SpaceManager, WriteClient};
 use crate::value::from_field;
 
 /// The server as operators use it on the page.
 pub(crate) struct PageOperations {
-    access: Arc<Access>,
+    access: Arc<UserAccess>,
     manager: Arc<SpaceManager>,
     subscriptions: Arc<SubscriptionCache>,
     alarms: Arc<Alarms>,
@@ -33,7 +33,7 @@ pub(crate) struct PageOperations {
 
 impl PageOperations {
     pub(crate) fn new(
-        access: Arc<Access>,
+        access: Arc<UserAccess>,
         (manager, subscriptions): (Arc<SpaceManager>, Arc<SubscriptionCache>),
         (alarms, server): (Arc<Alarms>, &str),
     ) -> Self {
@@ -64,14 +64,14 @@ impl Operations for PageOperations {
     }
 
     fn may_operate(&self, user: &str) -> bool {
-        let runs = Roles::of(&[Role::Operator, Role::Engineer]);
+        let runs = Roles::of(&[UserRole::Operator, UserRole::Engineer]);
         self.access
             .roles_of_user(user)
             .is_some_and(|roles| roles.meets(runs))
     }
 
     fn may_load(&self, user: &str) -> bool {
-        let loads = Roles::of(&[Role::Engineer]);
+        let loads = Roles::of(&[UserRole::Engineer]);
         self.access
             .roles_of_user(user)
             .is_some_and(|roles| roles.meets(loads))
@@ -113,7 +113,7 @@ impl Operations for PageOperations {
         block: Bytes,
     ) -> BoxFuture<Result<(), OperationFault>> {
         let manager = Arc::clone(&self.manager);
-        let writer = Writer {
+        let writer = WriteClient {
             subscriptions: Arc::clone(&self.subscriptions),
             token: UserToken(user),
             commander: Box::new(Commander::lasting),
@@ -196,14 +196,16 @@ fn write_fault(status: StatusCode) -> OperationFault {
     OperationFault::Refused(text)
 }
 
-fn fault(refused: Refused) -> OperationFault {
+fn fault(refused: CallFailure) -> OperationFault {
     match refused {
-        Refused::Arguments(_) => OperationFault::Refused("arguments of the wrong type".to_owned()),
-        Refused::Status(status @ StatusCode::BadShutdown) => {
+        CallFailure::Arguments(_) => {
+            OperationFault::Refused("arguments of the wrong type".to_owned())
+        }
+        CallFailure::Status(status @ StatusCode::BadShutdown) => {
             OperationFault::Unknown(status.to_string())
         }
-        Refused::Status(status) => OperationFault::Refused(status.to_string()),
-        Refused::Asked(error) => match error.kind {
+        CallFailure::Status(status) => OperationFault::Refused(status.to_string()),
+        CallFailure::Asked(error) => match error.kind {
             AskErrorKind::Refused => OperationFault::Refused(error.text),
             AskErrorKind::Failed => OperationFault::Failed(error.text),
             AskErrorKind::Unknown => OperationFault::Unknown(error.text),

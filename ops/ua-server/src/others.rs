@@ -5,7 +5,7 @@ use std::path::Path;
 use std::sync::Arc;
 
 use bridge_node::LinkState;
-use discovery::{AnnounceSettings, Found};
+use discovery::{AnnounceSettings, ServerChange};
 use mappings::{Mapping, TopicId};
 use plant_opcua::client::Link;
 use tracing::warn;
@@ -13,16 +13,16 @@ use ua_component::{Foreign, ForeignSkills};
 
 use crate::alarms::Alarms;
 use crate::clients::Clients;
-use crate::executing::Executing;
-use crate::finding::{Finding, Placed};
-use crate::sources::Sources;
+use crate::executing::ForeignMethods;
+use crate::finding::{DiscoveredServers, Placed};
+use crate::sources::MappedServers;
 
 /// The other servers.
 pub(crate) struct Others {
-    pub(crate) executing: Executing,
-    pub(crate) sources: Sources,
+    pub(crate) executing: ForeignMethods,
+    pub(crate) sources: MappedServers,
     pub(crate) skills: ForeignSkills,
-    pub(crate) finding: Finding,
+    pub(crate) finding: DiscoveredServers,
     placed: Vec<Placed>,
     clients: Clients,
     mapping: Arc<Mapping>,
@@ -39,10 +39,10 @@ impl Others {
         let mut clients = Clients::new(mapping.server(), pki);
         let lds = told.and_then(|told| told.lds.as_deref());
         let mut others = Self {
-            executing: Executing::new(mapping, &mut clients, Arc::clone(alarms)),
-            sources: Sources::new(mapping, &mut clients),
+            executing: ForeignMethods::new(mapping, &mut clients, Arc::clone(alarms)),
+            sources: MappedServers::new(mapping, &mut clients),
             skills: ForeignSkills::default(),
-            finding: Finding::new(mapping, lds, told.and_then(|told| told.mdns.clone())),
+            finding: DiscoveredServers::new(mapping, lds, told.and_then(|told| told.mdns.clone())),
             placed: Vec::new(),
             clients,
             mapping: Arc::clone(mapping),
@@ -68,7 +68,7 @@ impl Others {
     }
 
     /// Handles a change of a server in the network.
-    pub(crate) fn heard(&mut self, found: &Found) {
+    pub(crate) fn heard(&mut self, found: &ServerChange) {
         self.finding.heard(found);
         self.found();
     }

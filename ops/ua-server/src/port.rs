@@ -14,9 +14,9 @@ use std::collections::VecDeque;
 use std::sync::Arc;
 
 use bridge_node::{
-    Answered, Application, Arrival, AskId, CallDescription, Delivery, Described, Execution,
-    ExecutionId, Failure, FailureKind, LinkState, Port, PortEvent, Rank, Reason, Router, TypePaths,
-    Verdict,
+    Application, AskId, CallDescription, CallResponse, ConfirmedArrival, Execution, ExecutionId,
+    Failure, FailureKind, LinkState, LocalDelivery, Port, PortEvent, Reason, RedundancyRank,
+    Router, TopicMetaData, TypePaths, Verdict,
 };
 use bytes::Bytes;
 use discovery::AnnounceSettings;
@@ -34,17 +34,17 @@ use self::start::NodesBuilder;
 use self::writes::ClientWrites;
 use crate::access;
 use crate::browse::Ordered;
-use crate::components::{Components, Happened};
+use crate::components::{ComponentEvent, Components};
 use crate::endpoint;
 use crate::methods::{Methods, Wish};
 use crate::nodes::ClientWrite;
 use crate::operations::PageOperations;
 use crate::others::Others;
-use crate::pubsub::PubSub;
+use crate::pubsub::PubSubNodes;
 use crate::redundant::{ServerRole, ServerSet, ranked};
 use crate::sks::Sks;
 use crate::sources::Sourced;
-use crate::structures::Types;
+use crate::structures::MappedTypes;
 
 /// The arguments of [`ServerPort::start`] in addition to the mapping.
 pub(crate) struct Setup {
@@ -53,11 +53,11 @@ pub(crate) struct Setup {
     /// The key service of the groups for which this server creates the keys.
     pub(crate) sks: Arc<Sks>,
     pub(crate) trust_any_client: bool,
-    pub(crate) types: Types,
+    pub(crate) types: MappedTypes,
     /// True if the endpoint comes from the mapping, false if it comes from the command line.
     pub(crate) mapped_url: bool,
     /// The rank of the server among redundant servers.
-    pub(crate) rank: Option<Rank>,
+    pub(crate) rank: Option<RedundancyRank>,
     /// Settings for announcing the server.
     pub(crate) announce: Option<AnnounceSettings>,
     /// The Global Discovery Server that renews the certificate.
@@ -104,7 +104,7 @@ impl ServerPort {
         let port = address.port();
         let access = start::users(&setup.pki, endpoint::is_local(described, address))?;
         access.set_rules(access::rules(mapping, &layout));
-        let pubsub = Arc::new(PubSub::new());
+        let pubsub = Arc::new(PubSubNodes::new());
         let (exits, (writes, created_items, asked)) =
             start::exits(mapping, &access, (&pubsub, &role));
         let (confirms, alarms) = (Arc::clone(&exits.confirms), Arc::clone(&exits.alarms));
@@ -280,8 +280,8 @@ impl Port for ServerPort {
                 event = self.others.skills.next() => return event,
                 sourced = self.others.sources.next() => return self.sourced(sourced),
                 happened = next(&mut self.components) => match happened {
-                    Happened::Told(event) => return event,
-                    Happened::Heard(found) => self.others.heard(&found),
+                    ComponentEvent::Told(event) => return event,
+                    ComponentEvent::Heard(found) => self.others.heard(&found),
                 },
                 () = self.others.finding.changed() => self.others.found(),
                 step = self.shown.wait() => match step {
@@ -295,7 +295,7 @@ impl Port for ServerPort {
         }
     }
 
-    fn publish(&mut self, sample: Delivery) -> Result<(), &'static str> {
+    fn publish(&mut self, sample: LocalDelivery) -> Result<(), &'static str> {
         if !self.shown.admit(&sample)? {
             return Ok(());
         }
@@ -313,7 +313,7 @@ impl Port for ServerPort {
         &mut self,
         _topic: TopicId,
         _shape: &[(BuiltinType, bool)],
-        _described: Option<&Described>,
+        _described: Option<&TopicMetaData>,
     ) {
         // Values of every type have a node.
     }
@@ -330,7 +330,7 @@ impl Port for ServerPort {
         self.writes.drained(is_muted, router);
     }
 
-    fn settled(&mut self, topic: TopicId, arrival: &Arrival) {
+    fn settled(&mut self, topic: TopicId, arrival: &ConfirmedArrival) {
         self.shown.show_arrival(topic, arrival);
         self.writes.settled(topic, arrival);
     }
@@ -367,7 +367,7 @@ impl Port for ServerPort {
         self.methods.gone(topic);
     }
 
-    fn answered(&mut self, ask: AskId, _topic: TopicId, answer: Answered<Bytes>) {
+    fn answered(&mut self, ask: AskId, _topic: TopicId, answer: CallResponse<Bytes>) {
         self.methods.answered(ask, answer);
     }
 
@@ -445,7 +445,7 @@ impl Port for ServerPort {
 }
 
 /// Waits for the next event of the servers in the network.
-async fn next(components: &mut Option<Components>) -> Happened {
+async fn next(components: &mut Option<Components>) -> ComponentEvent {
     match components {
         Some(components) => components.next().await,
         None => std::future::pending().await,

@@ -10,9 +10,9 @@ use std::time::{SystemTime, UNIX_EPOCH};
 use bridge_core::ValueDescription;
 use bridge_node::{PortEvent, now};
 use bytes::Bytes;
-use discovery::Known;
+use discovery::PresentServer;
 use mappings::{Overflow, TopicId};
-use messages::{Leaf, Rank, TypeName};
+use messages::{ArrayRank, Leaf, TypeName};
 use opcua::types::{UAString, Variant};
 use tracing::warn;
 use uadp::BuiltinType;
@@ -30,7 +30,7 @@ struct Told {
 
 /// The values, and the events to be reported.
 #[derive(Debug)]
-pub(crate) struct Presence {
+pub(crate) struct ValuePresence {
     /// The network on which the servers are discovered.
     level: String,
     /// The published servers by their identities.
@@ -42,7 +42,7 @@ pub(crate) struct Presence {
     told_full: bool,
 }
 
-impl Presence {
+impl ValuePresence {
     /// Creates an empty state for servers discovered on that network.
     pub(crate) const fn new(level: String) -> Self {
         Self {
@@ -63,7 +63,7 @@ impl Presence {
     /// space.
     pub(crate) fn show(
         &mut self,
-        known: &Known,
+        known: &PresentServer,
         (online, since): (bool, SystemTime),
     ) -> Option<TopicId> {
         let who = who(known);
@@ -144,7 +144,7 @@ impl Presence {
     /// Returns the identifier of a server. `before` is kept if the server goes offline. Otherwise
     /// the identifier is the server's number if no other online server has it, or else an own
     /// identifier that stays assigned.
-    fn identifier(&mut self, known: &Known, before: Option<u16>) -> Option<u16> {
+    fn identifier(&mut self, known: &PresentServer, before: Option<u16>) -> Option<u16> {
         if before.is_some() {
             return before;
         }
@@ -172,27 +172,27 @@ impl Presence {
 }
 
 /// Returns the identity of a server.
-fn who(known: &Known) -> &str {
+fn who(known: &PresentServer) -> &str {
     known.application_uri.as_deref().unwrap_or(&known.name)
 }
 
 fn description(uri: Option<&str>) -> ValueDescription {
-    let leaf = |(name, builtin, rank): (&str, BuiltinType, Rank)| Leaf {
+    let leaf = |(name, builtin, rank): (&str, BuiltinType, ArrayRank)| Leaf {
         path: name.to_owned(),
         builtin,
         rank,
     };
-    let many = Rank::Array { fixed: None };
+    let many = ArrayRank::Array { fixed: None };
     let fields = [
-        ("online", BuiltinType::Boolean, Rank::Scalar),
-        ("since", BuiltinType::Double, Rank::Scalar),
-        ("started", BuiltinType::Double, Rank::Scalar),
-        ("number", BuiltinType::UInt16, Rank::Scalar),
-        ("name", BuiltinType::String, Rank::Scalar),
-        ("uri", BuiltinType::String, Rank::Scalar),
+        ("online", BuiltinType::Boolean, ArrayRank::Scalar),
+        ("since", BuiltinType::Double, ArrayRank::Scalar),
+        ("started", BuiltinType::Double, ArrayRank::Scalar),
+        ("number", BuiltinType::UInt16, ArrayRank::Scalar),
+        ("name", BuiltinType::String, ArrayRank::Scalar),
+        ("uri", BuiltinType::String, ArrayRank::Scalar),
         ("urls", BuiltinType::String, many),
         ("capabilities", BuiltinType::String, many),
-        ("level", BuiltinType::String, Rank::Scalar),
+        ("level", BuiltinType::String, ArrayRank::Scalar),
     ];
     ValueDescription {
         name: format!("Components.{}", uri.unwrap_or_default()),
@@ -203,7 +203,7 @@ fn description(uri: Option<&str>) -> ValueDescription {
     }
 }
 
-fn fields(known: &Known, (online, since): (bool, SystemTime), level: &str) -> [Variant; 9] {
+fn fields(known: &PresentServer, (online, since): (bool, SystemTime), level: &str) -> [Variant; 9] {
     let text = |text: &str| Variant::from(text);
     let texts = |all: &[String]| {
         let all: Vec<UAString> = all.iter().map(|one| one.as_str().into()).collect();
@@ -240,8 +240,8 @@ mod tests {
 
     use super::*;
 
-    fn known(name: &str, number: u16) -> Known {
-        Known {
+    fn known(name: &str, number: u16) -> PresentServer {
+        PresentServer {
             name: name.to_owned(),
             url: "opc.tcp://127.0.0.1:4841/".to_owned(),
             capabilities: vec!["DA".to_owned()],
@@ -252,14 +252,14 @@ mod tests {
         }
     }
 
-    fn shown(presence: &mut Presence, known: &Known) -> u16 {
+    fn shown(presence: &mut ValuePresence, known: &PresentServer) -> u16 {
         let topic = presence.show(known, (true, UNIX_EPOCH)).unwrap();
         topic.triple().2
     }
 
     #[test]
     fn a_component_has_its_number_and_others_keep_what_they_are_given() {
-        let mut presence = Presence::new("lo".to_owned());
+        let mut presence = ValuePresence::new("lo".to_owned());
         assert_eq!(shown(&mut presence, &known("gripper", 7)), 7);
         assert_eq!(shown(&mut presence, &known("plc", 0)), FIRST_GIVEN);
         assert_eq!(shown(&mut presence, &known("thief", 7)), FIRST_GIVEN + 1);
@@ -272,9 +272,9 @@ mod tests {
 
     #[test]
     fn a_component_that_is_started_anew_at_another_port_is_the_same() {
-        let mut presence = Presence::new("lo".to_owned());
+        let mut presence = ValuePresence::new("lo".to_owned());
         let first = known("gripper", 7);
-        let again = Known {
+        let again = PresentServer {
             name: "gripper at another port".to_owned(),
             ..first.clone()
         };
@@ -291,7 +291,7 @@ mod tests {
 
     #[test]
     fn what_has_not_been_reported_gives_way_to_what_is_true_now() {
-        let mut presence = Presence::new("lo".to_owned());
+        let mut presence = ValuePresence::new("lo".to_owned());
         let gripper = known("gripper", 7);
         for online in [true, false, true] {
             presence.show(&gripper, (online, UNIX_EPOCH)).unwrap();

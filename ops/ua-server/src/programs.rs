@@ -20,7 +20,7 @@ use opcua::server::SubscriptionCache;
 use opcua::types::NodeId;
 use tracing::{info, warn};
 
-use self::nodes::Nodes;
+use self::nodes::ProgramNodes;
 use self::run::Run;
 use self::unknown::UnknownOutcomes;
 use crate::address;
@@ -122,7 +122,7 @@ impl Programs {
         };
         let places = (Arc::clone(&self.manager), Arc::clone(&self.subscriptions));
         let described = (&**description, &**result.description());
-        let (nodes, around) = Nodes::insert(places, (goal, &name), described, types);
+        let (nodes, around) = ProgramNodes::insert(places, (goal, &name), described, types);
         let node = nodes.program();
         let feedback = beside(goal, family.feedback);
         let methods = nodes.methods();

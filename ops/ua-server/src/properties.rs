@@ -151,14 +151,17 @@ mod tests {
     use uadp::BuiltinType;
 
     use super::*;
-    use crate::layout::Shape;
+    use crate::layout::VariableShape;
 
     fn topic(number: i64, text: &str) -> TopicNode {
         let mut topic = TopicNode::new(
             TopicId::new(1, 2, 10).unwrap(),
             NodeId::new(2, 10),
             "x".to_owned(),
-            vec![("data".to_owned(), Shape(Some((BuiltinType::Int32, false))))],
+            vec![(
+                "data".to_owned(),
+                VariableShape(Some((BuiltinType::Int32, false))),
+            )],
         );
         topic.meaning.texts = BTreeMap::from([(number, text.to_owned())]);
         topic

@@ -27,21 +27,21 @@ use opcua::types::{
     VariableId, Variant,
 };
 use plant_opcua::file::Handles;
-use plant_opcua::server::{CoreMethod, MethodHandler, Refusal, method};
+use plant_opcua::server::{CoreMethod, MethodHandler, MethodRefusal, method};
 use tokio::sync::Notify;
 use tracing::info;
 
-use self::counts::{Counts, Diagnostics, LiveCounts, Totals};
+use self::counts::{Counts, LiveCounts, PubSubCounters, Totals};
 use self::file::Content;
-use self::insert::Wanted;
+use self::insert::NodesToAdd;
 pub(crate) use self::readers::Readers;
-pub(crate) use self::states::State;
-use self::states::{Change, States};
+pub(crate) use self::states::PubSubNodeState;
+use self::states::{StateChange, States};
 use crate::layout::Layout;
 use crate::nodes::SpaceManager;
 
 /// The configuration in the address spaces.
-pub(crate) struct PubSub {
+pub(crate) struct PubSubNodes {
     inner: Mutex<Inner>,
     /// True while the nodes of readers do not exist, because no client has looked at them.
     has_no_readers: AtomicBool,
@@ -50,7 +50,7 @@ pub(crate) struct PubSub {
     /// Notified when a client has enabled or disabled a component.
     called: Notify,
     /// Set when the nodes exist.
-    places: OnceLock<Places>,
+    places: OnceLock<PubSubManagers>,
     /// The open handles of the configuration file. No other lock is held when this lock is taken.
     file: Mutex<Handles>,
 }
@@ -66,7 +66,7 @@ pub(crate) fn capabilities() -> Vec<(VariableId, Variant)> {
 
 /// The node managers of the nodes, and their subscriptions.
 #[derive(Clone)]
-pub(crate) struct Places {
+pub(crate) struct PubSubManagers {
     /// The node manager of the object PublishSubscribe itself.
     pub(crate) core: Option<Arc<CoreNodeManager>>,
     pub(crate) space: Arc<SpaceManager>,
@@ -81,7 +81,7 @@ struct Inner {
     methods: HashMap<NodeId, (usize, Ask)>,
     /// The nodes of all components.
     made: Vec<NodeId>,
-    /// Topics that were switched on or off and not yet returned by [`PubSub::switched`].
+    /// Topics that were switched on or off and not yet returned by [`PubSubNodes::switched`].
     switched: HashMap<TopicId, bool>,
     /// The configuration as a file.
     content: Content,
@@ -103,7 +103,7 @@ struct Part {
     kind: Kind,
     parent: Option<usize>,
     state: NodeId,
-    diagnostics: Option<Diagnostics>,
+    diagnostics: Option<PubSubCounters>,
     /// The numbers of writers and readers below a component; `None` for components that do not show
     /// them.
     live: Option<LiveCounts>,
@@ -129,7 +129,7 @@ enum Ask {
     Reset,
 }
 
-impl PubSub {
+impl PubSubNodes {
     pub(crate) fn new() -> Self {
         Self {
             inner: Mutex::default(),
@@ -149,7 +149,7 @@ impl PubSub {
             let whole = Arc::clone(self);
             let handler: Arc<dyn MethodHandler> = method(move |request| {
                 let done = whole.ask((0, ask), &request.caller.user);
-                done.map(|()| Vec::new()).map_err(Refusal::Status)
+                done.map(|()| Vec::new()).map_err(MethodRefusal::Status)
             });
             handler
         };
@@ -176,7 +176,7 @@ impl PubSub {
 
     /// Sets the node managers, adds the missing methods of PublishSubscribe, and makes the methods
     /// for writing the file not executable.
-    pub(crate) fn stand(&self, places: Places) {
+    pub(crate) fn stand(&self, places: PubSubManagers) {
         if let Some(core) = &places.core {
             let mut address_space = core.address_space().write();
             for (method, name) in WHOLE {
@@ -206,9 +206,9 @@ impl PubSub {
             let switched = std::mem::take(&mut inner.switched);
             let is_unseen = self.has_no_readers.load(Ordering::Relaxed);
             let wanted = if is_unseen {
-                Wanted::WithoutReaders
+                NodesToAdd::WithoutReaders
             } else {
-                Wanted::All
+                NodesToAdd::All
             };
             *inner = insert::all(mapping, layout, &mut address_space, wanted);
             inner.unseen = is_unseen.then(|| (Arc::clone(mapping), Arc::clone(layout)));
@@ -246,14 +246,14 @@ impl PubSub {
         };
         {
             let mut address_space = places.space.address_space().write();
-            let readers = insert::all(&mapping, &layout, &mut address_space, Wanted::Readers);
+            let readers = insert::all(&mapping, &layout, &mut address_space, NodesToAdd::Readers);
             inner.made.extend(readers.made);
         }
         let diagnostics = inner
             .parts
             .iter()
             .filter_map(|part| part.diagnostics.as_ref());
-        let shown = diagnostics.flat_map(Diagnostics::shown).collect();
+        let shown = diagnostics.flat_map(PubSubCounters::shown).collect();
         self.write(shown);
         self.show_states(&inner);
         self.has_no_readers.store(false, Ordering::Relaxed);
@@ -373,7 +373,7 @@ impl PubSub {
             }
         }
         drop(off);
-        let shown = changes.iter().filter_map(|Change { at, is, .. }| {
+        let shown = changes.iter().filter_map(|StateChange { at, is, .. }| {
             let part = inner.parts.get(*at)?;
             Some((part.state.clone(), Variant::Int32(*is as i32)))
         });
@@ -396,7 +396,7 @@ impl PubSub {
         let mut below: Vec<(Totals, bool)> = vec![(Totals::default(), false); inner.parts.len()];
         let mut changes = Vec::new();
         for at in (0..inner.parts.len()).rev() {
-            let operational = u16::from(inner.states.of(at) == State::Operational);
+            let operational = u16::from(inner.states.of(at) == PubSubNodeState::Operational);
             let (mut numbers, errors) = below.get(at).copied().unwrap_or_default();
             let Some(part) = inner.parts.get_mut(at) else {
                 continue;
@@ -439,8 +439,8 @@ impl PubSub {
 }
 
 /// Returns true if messages are sent or received in that state.
-const fn is_on(state: State) -> bool {
-    !matches!(state, State::Disabled | State::Paused)
+const fn is_on(state: PubSubNodeState) -> bool {
+    !matches!(state, PubSubNodeState::Disabled | PubSubNodeState::Paused)
 }
 
 fn write(

@@ -10,8 +10,8 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use bridge_core::{Redundancy, Role};
-use bridge_node::Rank;
+use bridge_core::{Redundancy, RedundancyRole};
+use bridge_node::RedundancyRank;
 use mappings::{Endpoint, Mapping, Server};
 use opcua::server::address_space::AddressSpace;
 use opcua::sync::Mutex;
@@ -45,7 +45,7 @@ pub(crate) struct ServerRole {
 
 impl ServerRole {
     /// Creates the role of a server that starts: it is a standby if it is one of several servers.
-    pub(crate) fn new(rank: Option<Rank>) -> Self {
+    pub(crate) fn new(rank: Option<RedundancyRank>) -> Self {
         Self {
             is_standby: Arc::new(AtomicBool::new(rank.is_some())),
         }
@@ -62,7 +62,7 @@ impl ServerRole {
 }
 
 /// Returns the mapping for the server of a rank: with the ApplicationUri of the rank.
-pub(crate) fn ranked(mapping: &Arc<Mapping>, rank: Option<Rank>) -> Arc<Mapping> {
+pub(crate) fn ranked(mapping: &Arc<Mapping>, rank: Option<RedundancyRank>) -> Arc<Mapping> {
     let ranked = rank.and_then(|rank| mapping.for_rank(rank.get()));
     ranked.map_or_else(|| Arc::clone(mapping), Arc::new)
 }
@@ -71,7 +71,7 @@ pub(crate) fn ranked(mapping: &Arc<Mapping>, rank: Option<Rank>) -> Arc<Mapping>
 #[derive(Clone)]
 pub(crate) struct ServerSet {
     /// The rank of this server; `None` without redundancy.
-    rank: Option<Rank>,
+    rank: Option<RedundancyRank>,
     members: Arc<Mutex<Members>>,
 }
 
@@ -82,7 +82,7 @@ struct Members {
 }
 
 impl Members {
-    fn set(&mut self, rank: Rank, (level, state): (u8, ServerState)) {
+    fn set(&mut self, rank: RedundancyRank, (level, state): (u8, ServerState)) {
         let at = usize::from(rank.get()).checked_sub(1);
         let Some(server) = at.and_then(|at| self.servers.get_mut(at)) else {
             return;
@@ -95,7 +95,7 @@ impl Members {
 
 impl ServerSet {
     /// Creates the set of a server that starts. It knows no other server.
-    pub(crate) fn new(server: &Server, rank: Option<Rank>) -> Self {
+    pub(crate) fn new(server: &Server, rank: Option<RedundancyRank>) -> Self {
         let uris = rank.map_or(&[][..], |_| &server.redundant);
         let servers = uris.iter().map(|uri| RedundantServerDataType {
             server_id: uri.as_str().into(),
@@ -129,7 +129,7 @@ impl ServerSet {
     /// Sets the other servers by their heartbeats.
     pub(crate) fn follow(&self, redundancy: &Redundancy, now: Instant) {
         let mut members = self.members.lock();
-        let ranks = (1..=Rank::MOST).filter_map(Rank::new);
+        let ranks = (1..=RedundancyRank::MOST).filter_map(RedundancyRank::new);
         for rank in ranks.filter(|rank| Some(*rank) != self.rank) {
             // A restarted server is a second peer for some time.
             let peers = redundancy.peers(now);
@@ -138,8 +138,8 @@ impl ServerSet {
             let seen = peer.map(|peer| {
                 // A server of an earlier version does not send its level.
                 let by_role = match peer.role() {
-                    Role::Active => u8::MAX,
-                    Role::Starting | Role::Standby => BEST_DEGRADED,
+                    RedundancyRole::Active => u8::MAX,
+                    RedundancyRole::Starting | RedundancyRole::Standby => BEST_DEGRADED,
                 };
                 let level = peer.service_level().unwrap_or(by_role);
                 (level, ServerState::Running)
@@ -205,14 +205,14 @@ pub(crate) fn values(server: &Server, set: &ServerSet) -> Vec<(VariableId, CoreV
 
 /// The state of a server that its ServiceLevel shows.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) struct Condition {
+pub(crate) struct ServerCondition {
     pub(crate) is_standby: bool,
     /// Topics with values of other programs, and how many of them are silent.
     pub(crate) topics: usize,
     pub(crate) silent: usize,
 }
 
-impl Condition {
+impl ServerCondition {
     /// Returns the ServiceLevel (OPC 10000-4, 6.6.2.4.2): 1 without data; 2 to 199 if a part is not
     /// available, as writing at a standby; 200 to 255 otherwise, lower with each silent publisher.
     pub(crate) fn service_level(self) -> u8 {
@@ -248,7 +248,7 @@ const RANGE: usize = 55;
 mod tests {
     use super::*;
 
-    const ACTIVE: Condition = Condition {
+    const ACTIVE: ServerCondition = ServerCondition {
         is_standby: false,
         topics: 10,
         silent: 0,
@@ -256,29 +256,29 @@ mod tests {
 
     #[test]
     fn the_active_server_is_healthy_and_the_standby_is_degraded() {
-        let level = |condition: Condition| condition.service_level();
-        let standby = Condition {
+        let level = |condition: ServerCondition| condition.service_level();
+        let standby = ServerCondition {
             is_standby: true,
             ..ACTIVE
         };
         assert_eq!((level(ACTIVE), level(standby)), (255, 199));
         for silent in 0..10 {
-            let active = Condition { silent, ..ACTIVE };
-            let standby = Condition { silent, ..standby };
+            let active = ServerCondition { silent, ..ACTIVE };
+            let standby = ServerCondition { silent, ..standby };
             assert!((200..=255).contains(&level(active)), "{silent}");
             assert!((2..=199).contains(&level(standby)), "{silent}");
         }
-        let half = Condition {
+        let half = ServerCondition {
             silent: 5,
             ..ACTIVE
         };
         assert!(level(half) < level(ACTIVE));
-        let lost = Condition {
+        let lost = ServerCondition {
             silent: 10,
             ..ACTIVE
         };
         assert_eq!(level(lost), NO_DATA);
-        let empty = Condition {
+        let empty = ServerCondition {
             topics: 0,
             ..ACTIVE
         };
@@ -288,7 +288,7 @@ mod tests {
     #[test]
     fn a_server_starts_as_standby_only_in_a_redundant_set() {
         assert!(!ServerRole::new(None).is_standby());
-        let role = ServerRole::new(Rank::new(1));
+        let role = ServerRole::new(RedundancyRank::new(1));
         assert!(role.is_standby());
         role.set_active(true);
         assert!(!role.is_standby());
@@ -299,7 +299,7 @@ mod tests {
         let text = "spaces: [{id: 1}]\nserver: {redundant: [\"urn:cell:a\", \"urn:cell:b\"]}\n";
         let mapping = Mapping::from_yaml(text, "cell.yaml").mapping.unwrap();
         let now = bridge_node::now();
-        let rank = |number| Rank::new(number).unwrap();
+        let rank = |number| RedundancyRank::new(number).unwrap();
         let set = ServerSet::new(mapping.server(), Some(rank(2)));
         let shown = || {
             let servers = set.members.lock().servers.clone();
@@ -337,7 +337,7 @@ mod tests {
         let mapping = Mapping::from_yaml(text, "cell.yaml").mapping.unwrap();
         let mapping = Arc::new(mapping);
         let uri = |rank| {
-            ranked(&mapping, Rank::new(rank))
+            ranked(&mapping, RedundancyRank::new(rank))
                 .server()
                 .application_uri
                 .clone()
@@ -345,6 +345,6 @@ mod tests {
         assert_eq!((&uri(1)[..], &uri(2)[..]), ("urn:cell:a", "urn:cell:b"));
         assert_eq!(ranked(&mapping, None), mapping);
         assert!(!is_member(mapping.server()));
-        assert!(is_member(ranked(&mapping, Rank::new(1)).server()));
+        assert!(is_member(ranked(&mapping, RedundancyRank::new(1)).server()));
     }
 }

@@ -14,11 +14,13 @@ use std::time::Duration;
 
 use bridge_core::{Now, policy_of};
 use bridge_node::{Failure, FailureKind, Fetched, Fetching, KeyRequest, KeyService, now};
-use mappings::{KeySource, Mapping, SecurityGroup, Served};
+use mappings::{KeySource, Mapping, SecurityGroup, ServedKeys};
 use opcua::crypto::random;
 use opcua::sync::Mutex;
 use opcua::types::{ByteString, MethodId, NodeId, ObjectId, StatusCode, UAString, Variant};
-use plant_opcua::server::{Caller, CoreMethod, MethodHandler, MethodRequest, Refusal, method};
+use plant_opcua::server::{
+    CoreMethod, MethodHandler, MethodRefusal, MethodRequest, SessionCaller, method,
+};
 use tracing::{info, warn};
 use uadp::SecurityPolicy;
 
@@ -74,7 +76,7 @@ impl Sks {
         let unusable = |error: String| Failure::new(FailureKind::Io, error);
         let server = mapping.server();
         let groups = mapping.security().iter().filter(|_| server.creates_keys());
-        let wanted: Vec<(&SecurityGroup, &Served)> = groups.filter_map(served).collect();
+        let wanted: Vec<(&SecurityGroup, &ServedKeys)> = groups.filter_map(served).collect();
         let mut state = self.state.lock();
         let state = &mut *state;
         let now = now();
@@ -131,7 +133,7 @@ impl Sks {
     }
 
     /// Executes GetSecurityKeys (OPC 10000-14, 8.3.2).
-    fn get_security_keys(&self, request: &MethodRequest) -> Result<Vec<Variant>, Refusal> {
+    fn get_security_keys(&self, request: &MethodRequest) -> Result<Vec<Variant>, MethodRefusal> {
         let [
             Variant::String(group),
             Variant::UInt32(starting),
@@ -174,7 +176,7 @@ impl Sks {
 
     fn hand_out(
         &self,
-        caller: &Caller,
+        caller: &SessionCaller,
         group: &str,
         wanted: (u32, u32),
     ) -> Result<(SecurityPolicy, Handed), StatusCode> {
@@ -271,7 +273,7 @@ impl State {
 impl Group {
     /// Returns true if a client gets the keys. The ApplicationUri of its certificate decides, not
     /// its user.
-    fn has(&self, caller: &Caller) -> bool {
+    fn has(&self, caller: &SessionCaller) -> bool {
         caller.proven && self.members.contains(&caller.application_uri)
     }
 }
@@ -297,7 +299,7 @@ impl Members {
 #[derive(Debug)]
 pub(crate) struct ServerKeys {
     pub(crate) own: Arc<Sks>,
-    pub(crate) others: plant_keys::Service,
+    pub(crate) others: plant_keys::KeyFetcher,
 }
 
 impl KeyService for ServerKeys {
@@ -310,7 +312,7 @@ impl KeyService for ServerKeys {
 }
 
 /// Returns a group with keys that this server creates.
-fn served(group: &SecurityGroup) -> Option<(&SecurityGroup, &Served)> {
+fn served(group: &SecurityGroup) -> Option<(&SecurityGroup, &ServedKeys)> {
     match group.keys.as_ref()? {
         KeySource::Own(served) => Some((group, served)),
         KeySource::File(_) | KeySource::Credential(_) | KeySource::Sks(_) => None,

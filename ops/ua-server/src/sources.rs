@@ -20,8 +20,8 @@ use tokio::sync::{mpsc, oneshot, watch};
 use tokio::task::AbortHandle;
 use uadp::{Fields, Timestamp};
 
-use self::outbox::Outbox;
-use self::state::State;
+use self::outbox::ServerOutbox;
+use self::state::ServerState;
 use crate::clients::Clients;
 use crate::value;
 
@@ -35,14 +35,14 @@ pub(crate) struct Sourced {
 }
 
 /// The servers of the mapping.
-pub(crate) struct Sources {
+pub(crate) struct MappedServers {
     servers: HashMap<String, Running>,
     /// Names of the servers in the order of the mapping.
     order: Vec<String>,
     /// The topics that are read from servers.
     reads: HashMap<TopicId, Arc<Read>>,
     /// The topics that are written to servers.
-    writes: HashMap<TopicId, Arc<Outbox>>,
+    writes: HashMap<TopicId, Arc<ServerOutbox>>,
     heard: mpsc::Receiver<News>,
     tell: mpsc::Sender<News>,
 }
@@ -75,8 +75,8 @@ struct Plan {
 struct Running {
     access: Access,
     plan: watch::Sender<Arc<Plan>>,
-    outbox: Arc<Outbox>,
-    state: Arc<State>,
+    outbox: Arc<ServerOutbox>,
+    state: Arc<ServerState>,
     tasks: [AbortHandle; 2],
 }
 
@@ -94,7 +94,7 @@ struct News {
     value: DataValue,
 }
 
-impl Sources {
+impl MappedServers {
     /// Starts the tasks of the servers of `mapping`.
     pub(crate) fn new(mapping: &Mapping, clients: &mut Clients) -> Self {
         let (tell, heard) = mpsc::channel(MOST_NEWS);
@@ -209,8 +209,8 @@ impl Sources {
 
     fn run(&self, name: &str, access: &Access, plan: Arc<Plan>, clients: &mut Clients) -> Running {
         let client = clients.of(access);
-        let state = Arc::new(State::new(name, access));
-        let outbox = Arc::new(Outbox::new(Arc::clone(&state)));
+        let state = Arc::new(ServerState::new(name, access));
+        let outbox = Arc::new(ServerOutbox::new(Arc::clone(&state)));
         let (sender, receiver) = watch::channel(plan);
         let reading = reading::run(
             client.clone(),

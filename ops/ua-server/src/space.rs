@@ -13,14 +13,14 @@ use uadp::{Fields, Scalar, Timestamp};
 
 use crate::address;
 use crate::changes;
-use crate::layout::{Layout, Shape, TopicNode};
+use crate::layout::{Layout, TopicNode, VariableShape};
 use crate::nodes::SpaceManager;
 use crate::structures::Structure;
-use crate::values::{self, Shown, Stamp};
+use crate::values::{self, SampleStamp, ShownValue};
 use crate::wear::{Looks, Wear, Worn};
 
 /// Writes values of the space to the address space.
-pub(crate) struct Space {
+pub(crate) struct SpaceWriter {
     manager: Arc<SpaceManager>,
     subscriptions: Arc<SubscriptionCache>,
     topics: HashMap<TopicId, Known>,
@@ -47,7 +47,7 @@ struct Known {
     wear: Wear,
 }
 
-impl Space {
+impl SpaceWriter {
     pub(crate) fn new(
         layout: &Layout,
         manager: Arc<SpaceManager>,
@@ -195,7 +195,7 @@ impl Space {
             Ok(()) => (Some(block), None),
             Err((refused, why)) => (None, Some((refused, why))),
         };
-        let stamp = Stamp {
+        let stamp = SampleStamp {
             status: why.map_or(status, |(refused, _)| refused),
             source,
             server: DateTime::now(),
@@ -211,7 +211,7 @@ impl Space {
         self.looks.plan(topic, &mut known.wear, now);
         known.status = stamp.status;
         self.returned.retain(|returned| *returned != topic);
-        let shown = Shown {
+        let shown = ShownValue {
             block: shown,
             stamp,
         };
@@ -437,7 +437,7 @@ impl Known {
         let malformed = |_| (StatusCode::BadDecodingError, "malformed fields");
         let fields = Fields::parse(block).map_err(malformed)?;
         let open = !self.mapped
-            || matches!(self.node.fields.as_slice(), [field] if field.shape == Shape(None));
+            || matches!(self.node.fields.as_slice(), [field] if field.shape == VariableShape(None));
         if !open && fields.len() != self.node.fields.len() {
             return Err((StatusCode::BadTypeMismatch, "other fields than mapped"));
         }
@@ -476,12 +476,12 @@ fn publisher(topic: TopicId) -> (SpaceId, Option<u16>) {
 }
 
 /// Returns the shape of a single field. Several fields have no shape.
-fn shape_of(block: &[u8]) -> Shape {
+fn shape_of(block: &[u8]) -> VariableShape {
     let only = match Fields::parse(block) {
         Ok(mut fields) if fields.len() == 1 => fields.next(),
         Ok(_) | Err(_) => None,
     };
-    Shape(match only {
+    VariableShape(match only {
         Some(Ok(uadp::Variant::Scalar(scalar))) => Some((scalar.builtin_type(), false)),
         Some(Ok(uadp::Variant::Array(array))) => Some((array.element(), true)),
         Some(Ok(uadp::Variant::Matrix(_) | uadp::Variant::Null) | Err(_)) | None => None,
@@ -507,7 +507,7 @@ mod tests {
             ("name", (BuiltinType::String, false)),
             ("positions", (BuiltinType::Double, true)),
         ]
-        .map(|(path, shape)| (path.to_owned(), Shape(Some(shape))));
+        .map(|(path, shape)| (path.to_owned(), VariableShape(Some(shape))));
         let topic = TopicId::new(1, 2, 10).unwrap();
         let node = TopicNode::new(topic, NodeId::new(2, 10), "x".to_owned(), shapes.to_vec());
         let block = value::fields_block(fields).unwrap();

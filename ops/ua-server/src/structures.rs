@@ -7,9 +7,9 @@
 
 use std::sync::Arc;
 
-use bridge_node::{CallField, CallStructure, Definitions, Environment, TypePaths};
+use bridge_node::{CallField, CallStructure, Definitions, RosEnvironment, TypePaths};
 use mappings::{Binding, SpaceId, Variable};
-use messages::{Dialect, MemberKind, MessageType, Rank};
+use messages::{ArrayRank, Dialect, MemberKind, MessageType};
 use opcua::nodes::{DataTypeBuilder, ObjectBuilder, ReferenceDirection};
 use opcua::server::address_space::AddressSpace;
 use opcua::types::{
@@ -20,14 +20,14 @@ use tracing::warn;
 use uadp::BuiltinType;
 
 /// The definitions of the message types of the mapping, for ROS 1 and ROS 2.
-pub(crate) struct Types {
+pub(crate) struct MappedTypes {
     ros1: Definitions,
     ros2: Definitions,
 }
 
-impl Types {
+impl MappedTypes {
     pub(crate) fn new(types: &Arc<TypePaths>) -> Self {
-        let of = |dialect| Definitions::new(dialect, Arc::clone(types), Environment::from_env());
+        let of = |dialect| Definitions::new(dialect, Arc::clone(types), RosEnvironment::from_env());
         Self {
             ros1: of(Dialect::Ros1),
             ros2: of(Dialect::Ros2),
@@ -69,7 +69,7 @@ pub(crate) struct Structure {
 struct Member {
     name: String,
     kind: Kind,
-    rank: Rank,
+    rank: ArrayRank,
 }
 
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -81,9 +81,9 @@ enum Kind {
 
 /// The structures of all variables, each once.
 #[derive(Debug, Default)]
-pub(crate) struct Structures(Vec<Structure>);
+pub(crate) struct VariableStructures(Vec<Structure>);
 
-impl Structures {
+impl VariableStructures {
     /// Adds the message at a path of a message type, with its nested messages, and returns its
     /// DataType. Returns `None` if there is no message at the path, or if another definition has
     /// its name in this namespace.
@@ -120,7 +120,7 @@ impl Structures {
 }
 
 impl Structure {
-    fn new(of: &messages::Structure<'_>, namespace: u16) -> Self {
+    fn new(of: &messages::MessageStructure<'_>, namespace: u16) -> Self {
         let member = |field: &messages::StructureMember<'_>| Member {
             name: field.name.to_owned(),
             kind: match field.kind {
@@ -196,12 +196,12 @@ impl Structure {
                 Kind::Structure(name) => data_type(self.namespace, name),
             },
             value_rank: match member.rank {
-                Rank::Scalar => -1,
-                Rank::Array { .. } => 1,
+                ArrayRank::Scalar => -1,
+                ArrayRank::Array { .. } => 1,
             },
             array_dimensions: match member.rank {
-                Rank::Scalar => None,
-                Rank::Array { fixed } => Some(vec![fixed.unwrap_or(0)]),
+                ArrayRank::Scalar => None,
+                ArrayRank::Array { fixed } => Some(vec![fixed.unwrap_or(0)]),
             },
             max_string_length: 0,
             is_optional: false,
@@ -256,14 +256,14 @@ const DEFAULT_BINARY: &str = "Default Binary";
 
 #[cfg(test)]
 mod tests {
-    use messages::Registry;
+    use messages::TypeRegistry;
 
     use super::*;
 
     #[test]
     fn an_array_of_messages_has_a_data_type_for_each_message_in_it_once() {
-        let registry = Registry::bundle(Dialect::Ros2);
-        let mut structures = Structures::default();
+        let registry = TypeRegistry::bundle(Dialect::Ros2);
+        let mut structures = VariableStructures::default();
         let array = registry
             .get(&"geometry_msgs/PoseArray".parse().unwrap())
             .unwrap();

@@ -205,10 +205,10 @@ fn extension_object(object: uadp::ExtensionObject<'_>) -> ExtensionObject {
 
 fn node_id(node: uadp::NodeId<'_>) -> NodeId {
     let identifier = match node.identifier {
-        uadp::Identifier::Numeric(number) => Identifier::Numeric(number),
-        uadp::Identifier::String(text) => Identifier::String(string(text)),
-        uadp::Identifier::Guid(value) => Identifier::Guid(guid(value)),
-        uadp::Identifier::Opaque(bytes) => Identifier::ByteString(byte_string(bytes)),
+        uadp::NodeIdValue::Numeric(number) => Identifier::Numeric(number),
+        uadp::NodeIdValue::String(text) => Identifier::String(string(text)),
+        uadp::NodeIdValue::Guid(value) => Identifier::Guid(guid(value)),
+        uadp::NodeIdValue::Opaque(bytes) => Identifier::ByteString(byte_string(bytes)),
     };
     NodeId {
         namespace: node.namespace,
@@ -315,7 +315,7 @@ mod tests {
                 Scalar::ExpandedNodeId(uadp::ExpandedNodeId {
                     node_id: uadp::NodeId {
                         namespace: 0,
-                        identifier: uadp::Identifier::Guid(uadp::Guid(guid_bytes)),
+                        identifier: uadp::NodeIdValue::Guid(uadp::Guid(guid_bytes)),
                     },
                     namespace_uri: Some("urn:x"),
                     server_index: 2,
@@ -453,12 +453,12 @@ mod tests {
 
     #[test]
     fn the_zero_of_every_shape_fits_the_shape_and_goes_out() {
-        use crate::layout::Shape;
+        use crate::layout::VariableShape;
         for builtin in BuiltinType::ALL.into_iter().take(22) {
             for array in [false, true] {
                 let value = zero(Some((builtin, array)));
                 assert!(
-                    Shape(Some((builtin, array))).accepts(&value),
+                    VariableShape(Some((builtin, array))).accepts(&value),
                     "{builtin} {array}"
                 );
                 assert!(fields_block(&[value]).is_ok(), "{builtin} {array}");

@@ -17,30 +17,30 @@ use crate::value;
 
 /// The current values of the topics, with a common memory limit.
 #[derive(Debug)]
-pub(crate) struct Values {
-    topics: HashMap<TopicId, Shown>,
+pub(crate) struct CurrentValues {
+    topics: HashMap<TopicId, ShownValue>,
     bytes: usize,
     most: usize,
 }
 
 /// The current value of the nodes of a topic.
 #[derive(Debug, Clone)]
-pub(crate) struct Shown {
+pub(crate) struct ShownValue {
     /// FieldCount and a Variant for each field, all of them readable; `None` without a usable
     /// value.
     pub(crate) block: Option<Bytes>,
-    pub(crate) stamp: Stamp,
+    pub(crate) stamp: SampleStamp,
 }
 
 /// The properties that all values of a sample share.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Stamp {
+pub(crate) struct SampleStamp {
     pub(crate) status: StatusCode,
     pub(crate) source: Option<Timestamp>,
     pub(crate) server: DateTime,
 }
 
-impl Values {
+impl CurrentValues {
     /// Creates an empty store with a limit of `most` bytes.
     pub(crate) fn new(most: usize) -> Self {
         Self {
@@ -50,7 +50,7 @@ impl Values {
         }
     }
 
-    pub(crate) fn get(&self, topic: TopicId) -> Option<&Shown> {
+    pub(crate) fn get(&self, topic: TopicId) -> Option<&ShownValue> {
         self.topics.get(&topic)
     }
 
@@ -59,8 +59,8 @@ impl Values {
     pub(crate) fn put(
         &mut self,
         topic: TopicId,
-        mut shown: Shown,
-    ) -> (Option<Shown>, Result<(), StatusCode>) {
+        mut shown: ShownValue,
+    ) -> (Option<ShownValue>, Result<(), StatusCode>) {
         let before = self.remove(topic);
         let size = shown.size();
         let room = self.most.saturating_sub(self.bytes);
@@ -76,19 +76,19 @@ impl Values {
         (before, kept)
     }
 
-    pub(crate) fn remove(&mut self, topic: TopicId) -> Option<Shown> {
+    pub(crate) fn remove(&mut self, topic: TopicId) -> Option<ShownValue> {
         let shown = self.topics.remove(&topic)?;
         self.bytes -= shown.size();
         Some(shown)
     }
 }
 
-impl Shown {
+impl ShownValue {
     /// Returns a missing value with this status.
     pub(crate) fn nothing(status: StatusCode) -> Self {
         Self {
             block: None,
-            stamp: Stamp {
+            stamp: SampleStamp {
                 status,
                 source: None,
                 server: DateTime::now(),
@@ -106,12 +106,14 @@ impl Shown {
     }
 
     /// Returns the value of the topic's own node, or of the field with this index.
-    pub(crate) fn view(&self, topic: &TopicNode, field: Option<usize>) -> View<'_> {
+    pub(crate) fn view(&self, topic: &TopicNode, field: Option<usize>) -> NodeView<'_> {
         let Some(fields) = self.fields() else {
-            return View::One(uadp::Variant::Null, self.stamp);
+            return NodeView::One(uadp::Variant::Null, self.stamp);
         };
         let place = match field {
-            None if topic.compound || fields.len() != 1 => return View::All(fields, self.stamp),
+            None if topic.compound || fields.len() != 1 => {
+                return NodeView::All(fields, self.stamp);
+            }
             None => 0,
             Some(place) => place,
         };
@@ -120,7 +122,7 @@ impl Shown {
     }
 
     /// Returns the value of each of the topic's nodes, in the order of [`TopicNode::places`].
-    pub(crate) fn views<'a>(&'a self, topic: &'a TopicNode) -> impl Iterator<Item = View<'a>> {
+    pub(crate) fn views<'a>(&'a self, topic: &'a TopicNode) -> impl Iterator<Item = NodeView<'a>> {
         let mut fields = self.fields();
         let components = topic.places().filter_map(|(_, field)| field);
         let components = components.map(move |place| {
@@ -132,7 +134,12 @@ impl Shown {
     }
 
     /// Returns the value of the field with this index.
-    fn one<'a>(&'a self, topic: &TopicNode, place: usize, value: uadp::Variant<'a>) -> View<'a> {
+    fn one<'a>(
+        &'a self,
+        topic: &TopicNode,
+        place: usize,
+        value: uadp::Variant<'a>,
+    ) -> NodeView<'a> {
         // A StatusCode in place of a value of another type is the reason why there is no value (OPC
         // 10000-14, 7.2.4.5.5).
         if let uadp::Variant::Scalar(Scalar::StatusCode(status)) = value
@@ -140,13 +147,13 @@ impl Shown {
             && !field.shape.fits(&value)
         {
             let status = StatusCode::from(status.0);
-            let stamp = Stamp {
+            let stamp = SampleStamp {
                 status,
                 ..self.stamp
             };
-            return View::One(uadp::Variant::Null, stamp);
+            return NodeView::One(uadp::Variant::Null, stamp);
         }
-        View::One(value, self.stamp)
+        NodeView::One(value, self.stamp)
     }
 
     /// Returns the fields, if there are values.
@@ -157,25 +164,25 @@ impl Shown {
 
 /// The encoded value of a node.
 #[derive(Debug, Clone)]
-pub(crate) enum View<'a> {
-    One(uadp::Variant<'a>, Stamp),
+pub(crate) enum NodeView<'a> {
+    One(uadp::Variant<'a>, SampleStamp),
     /// All fields, which are shown as a Variant array.
-    All(Fields<'a>, Stamp),
+    All(Fields<'a>, SampleStamp),
 }
 
-impl<'a> View<'a> {
-    pub(crate) const fn stamp(&self) -> Stamp {
+impl<'a> NodeView<'a> {
+    pub(crate) const fn stamp(&self) -> SampleStamp {
         match self {
             Self::One(_, stamp) | Self::All(_, stamp) => *stamp,
         }
     }
 
     /// Returns true if both values are equal. Their statuses are not compared.
-    pub(crate) fn has_value_of(&self, other: &View<'_>) -> bool {
+    pub(crate) fn has_value_of(&self, other: &NodeView<'_>) -> bool {
         match (self, other) {
-            (Self::One(value, _), View::One(other, _)) => value == other,
-            (Self::All(fields, _), View::All(others, _)) => fields.bytes() == others.bytes(),
-            (Self::One(..), View::All(..)) | (Self::All(..), View::One(..)) => false,
+            (Self::One(value, _), NodeView::One(other, _)) => value == other,
+            (Self::All(fields, _), NodeView::All(others, _)) => fields.bytes() == others.bytes(),
+            (Self::One(..), NodeView::All(..)) | (Self::All(..), NodeView::One(..)) => false,
         }
     }
 
@@ -228,7 +235,7 @@ impl<'a> View<'a> {
         }
         match value.range_of_owned(range) {
             Ok(value) => data_value(Some(value), stamp),
-            Err(status) => data_value(None, Stamp { status, ..stamp }),
+            Err(status) => data_value(None, SampleStamp { status, ..stamp }),
         }
     }
 
@@ -241,12 +248,12 @@ impl<'a> View<'a> {
     /// Returns a DataValue without the value and with the reason.
     pub(crate) fn refused(&self, status: StatusCode) -> DataValue {
         let stamp = self.stamp();
-        data_value(Some(Variant::Empty), Stamp { status, ..stamp })
+        data_value(Some(Variant::Empty), SampleStamp { status, ..stamp })
     }
 }
 
 /// Returns a value of a sample as a DataValue.
-pub(crate) fn data_value(value: Option<Variant>, stamp: Stamp) -> DataValue {
+pub(crate) fn data_value(value: Option<Variant>, stamp: SampleStamp) -> DataValue {
     DataValue {
         value,
         status: Some(stamp.status),
@@ -369,7 +376,7 @@ mod tests {
     use opcua::types::NodeId;
 
     use super::*;
-    use crate::layout::Shape;
+    use crate::layout::VariableShape;
 
     fn id(identifier: u16) -> TopicId {
         TopicId::new(1, 2, identifier).unwrap()
@@ -377,7 +384,7 @@ mod tests {
 
     /// Returns a topic with that number of SByte arrays.
     fn topic(fields: usize) -> TopicNode {
-        let shape = Shape(Some((BuiltinType::SByte, true)));
+        let shape = VariableShape(Some((BuiltinType::SByte, true)));
         let fields = (0..fields).map(|at| (format!("f{at}"), shape)).collect();
         TopicNode::new(id(10), NodeId::new(2, 10), "x".to_owned(), fields)
     }
@@ -386,10 +393,10 @@ mod tests {
         Variant::from(values.to_vec())
     }
 
-    fn shown(fields: &[Variant]) -> Shown {
-        Shown {
+    fn shown(fields: &[Variant]) -> ShownValue {
+        ShownValue {
             block: Some(Bytes::from(value::fields_block(fields).unwrap())),
-            stamp: Stamp {
+            stamp: SampleStamp {
                 status: StatusCode::Good,
                 source: None,
                 server: DateTime::now(),
@@ -397,7 +404,7 @@ mod tests {
         }
     }
 
-    fn read(shown: &Shown, topic: &TopicNode, field: Option<usize>, range: &str) -> DataValue {
+    fn read(shown: &ShownValue, topic: &TopicNode, field: Option<usize>, range: &str) -> DataValue {
         let range: NumericRange = range.parse().unwrap();
         let (view, range) = shown.view(topic, field).narrowed(&range);
         view.data_value(&range)
@@ -405,10 +412,10 @@ mod tests {
 
     #[test]
     fn no_more_is_kept_than_there_is_room_for_and_what_gives_way_makes_room() {
-        let mut values = Values::new(100);
-        let sized = |size| Shown {
+        let mut values = CurrentValues::new(100);
+        let sized = |size| ShownValue {
             block: Some(Bytes::from(vec![0; size])),
-            ..Shown::nothing(StatusCode::Good)
+            ..ShownValue::nothing(StatusCode::Good)
         };
         assert_eq!(values.put(id(1), sized(60)).1, Ok(()));
         let (before, kept) = values.put(id(2), sized(41));
@@ -510,7 +517,7 @@ mod tests {
             read(&shown, &topic, Some(1), "").status,
             Some(StatusCode::Good)
         );
-        let nothing = Shown::nothing(StatusCode::BadTypeMismatch);
+        let nothing = ShownValue::nothing(StatusCode::BadTypeMismatch);
         let found = read(&nothing, &topic, None, "");
         assert_eq!(found.value, Some(Variant::Empty));
         assert_eq!(found.status, Some(StatusCode::BadTypeMismatch));

@@ -15,7 +15,7 @@ use clap::error::ErrorKind;
 use plant_opcua::certificates::{self, Standing, StoreFault, Stored};
 use plant_opcua::known;
 use plant_opcua::pki::{self, Pki, PkiError};
-use plant_opcua::users::{self, Credential, Roles, User, UserFault, Users};
+use plant_opcua::users::{self, Credential, Roles, StoredUser, UserFault, Users};
 
 /// Certificates and users of the OPC UA server of the cell.
 #[derive(Debug, clap::Parser)]
@@ -283,7 +283,7 @@ fn user(verb: UserVerb) -> Result<(), VerbFault> {
                 Some(file) => Users::keep_certificate(&folder, &file)?,
                 None => users::hashed(password(&name)?.as_bytes())?,
             };
-            let user = User {
+            let user = StoredUser {
                 roles: role,
                 credential,
             };
@@ -298,7 +298,7 @@ fn user(verb: UserVerb) -> Result<(), VerbFault> {
                 return Err(UserFault::Unknown(name).into());
             };
             let credential = users::hashed(password(&name)?.as_bytes())?;
-            let user = User {
+            let user = StoredUser {
                 credential,
                 ..known
             };

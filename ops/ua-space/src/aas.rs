@@ -9,24 +9,24 @@ use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::{self, Write as _};
 
-use mtp::{Family, Link, Module};
+use mtp::{Family, Module, VariableLink};
 use serde_json::{Value, json};
 
 use crate::arguments::AasArguments;
-use crate::exit::Failure;
+use crate::exit::CommandFailure;
 use crate::input;
 use crate::live::harmless;
 use crate::mtp_files::read;
 use crate::report::warn;
 use crate::source::plain_name;
 
-use elements::{Names, reference};
+use elements::{ShortNames, reference};
 
 /// Runs `ua-space aas`.
-pub(crate) fn aas(arguments: &AasArguments) -> Result<(), Failure> {
+pub(crate) fn aas(arguments: &AasArguments) -> Result<(), CommandFailure> {
     if arguments.aasx.is_some() && arguments.file == "-" {
         let why = "--aasx needs the manifest as a file, whose name the package has";
-        return Err(Failure::Usage(why.to_owned()));
+        return Err(CommandFailure::Usage(why.to_owned()));
     }
     let module = read(&arguments.file)?;
     let mut facts = of_module(&module);
@@ -38,7 +38,7 @@ pub(crate) fn aas(arguments: &AasArguments) -> Result<(), Failure> {
                 .iter()
                 .map(|field| field.name)
                 .collect();
-            return Err(Failure::Usage(format!(
+            return Err(CommandFailure::Usage(format!(
                 "--nameplate {given}: expected NAME=VALUE; the names are {}",
                 names.join(", ")
             )));
@@ -58,12 +58,12 @@ pub(crate) fn aas(arguments: &AasArguments) -> Result<(), Failure> {
         )));
     }
     let text = serde_json::to_string_pretty(&environment)
-        .map_err(|error| Failure::Data(format!("cannot write JSON: {error}")))?;
+        .map_err(|error| CommandFailure::Data(format!("cannot write JSON: {error}")))?;
     let Some(path) = &arguments.aasx else {
         writeln!(io::stdout().lock(), "{text}")?;
         return Ok(());
     };
-    let manifest = package::Manifest {
+    let manifest = package::PackagedManifest {
         path: &submodels::package_path(&file),
         content_type: submodels::content_type(&file),
         contents: &input::read(&arguments.file)?,
@@ -73,7 +73,7 @@ pub(crate) fn aas(arguments: &AasArguments) -> Result<(), Failure> {
         to.write_all(&bytes)?;
         to.sync_all()
     });
-    written.map_err(|error| Failure::Io(format!("cannot write {}: {error}", path.display())))
+    written.map_err(|error| CommandFailure::Io(format!("cannot write {}: {error}", path.display())))
 }
 
 /// Returns the environment of a module with these facts of its nameplate, and the mandatory fields
@@ -105,7 +105,7 @@ fn environment(
         "assetAdministrationShells": [{
             "modelType": "AssetAdministrationShell",
             "id": format!("{id}/aas"),
-            "idShort": Names::default().of(&module.name),
+            "idShort": ShortNames::default().of(&module.name),
             "assetInformation": { "assetKind": "Instance", "globalAssetId": id },
             "submodels": references,
         }],
@@ -120,7 +120,7 @@ fn of_module(module: &Module) -> BTreeMap<&'static str, String> {
     let information = information.filter(|one| one.family == Family::Information);
     let mut facts = BTreeMap::new();
     for variable in information.flat_map(|one| &one.variables) {
-        let Link::Constant(value) = &variable.link else {
+        let VariableLink::Constant(value) = &variable.link else {
             continue;
         };
         let field = submodels::NAMEPLATE
@@ -221,7 +221,7 @@ mod tests {
 
     #[test]
     fn short_names_are_valid_and_distinct() {
-        let mut names = Names::default();
+        let mut names = ShortNames::default();
         let made: Vec<String> = ["a b", "a.b", "1", "", "ä", "Fill"]
             .map(|name| names.of(name))
             .into();

@@ -7,11 +7,11 @@ use std::io::{self, Write as _};
 use mappings::{Broker, CarrierMedium, ForwardedName, Mapping, SpaceId, TopicForm};
 
 use crate::arguments::Acl;
-use crate::exit::Failure;
+use crate::exit::CommandFailure;
 use crate::live::broker_mapping;
 
 /// Prints the `acl_file` of mosquitto, or the permissions of NATS.
-pub(crate) fn acl(arguments: &Acl) -> Result<(), Failure> {
+pub(crate) fn acl(arguments: &Acl) -> Result<(), CommandFailure> {
     let mapping = broker_mapping(&arguments.mapping)?;
     let users = users(&mapping)?;
     let rules = if arguments.nats {
@@ -56,11 +56,11 @@ impl BrokerUser {
 }
 
 /// Returns a user of each space, a user that forwards, and a user that inspects.
-fn users(mapping: &Mapping) -> Result<Vec<BrokerUser>, Failure> {
+fn users(mapping: &Mapping) -> Result<Vec<BrokerUser>, CommandFailure> {
     let Some(broker) = mapping.pubsub().broker.as_deref() else {
         let why =
             "the mapping names no broker; for example pubsub: {address: mqtt://broker.local:1883}";
-        return Err(Failure::Usage(why.to_owned()));
+        return Err(CommandFailure::Usage(why.to_owned()));
     };
     let prefix = &broker.prefix;
     let declared = mapping.spaces().iter().map(|space| space.id);

@@ -6,21 +6,21 @@ use uadp::action::{
 };
 use uadp::{DataSetHeader, Extras, NetworkHeader, NetworkMessage};
 
-use crate::fault::{Fault, MessagePlace, Place, Stop, in_field, offset};
+use crate::fault::{DecodeFault, FaultLocation, MessagePlace, PartialRead, in_field, offset};
 use crate::values::{WrongValue, show_variant, variant_bytes};
 use crate::{decode, encode, hex, shape};
 
 /// The decoded part of an Action message, up to the first fault.
 #[derive(Default)]
-pub(crate) struct Shown {
-    pub(crate) header: Option<shape::ActionHeader>,
-    pub(crate) messages: Vec<shape::DataSetMessage>,
-    pub(crate) fault: Option<Fault>,
+pub(crate) struct DecodedAction {
+    pub(crate) header: Option<shape::ActionHeaderJson>,
+    pub(crate) messages: Vec<shape::DataSetMessageJson>,
+    pub(crate) fault: Option<DecodeFault>,
 }
 
 /// Reads an Action message in the dialect of the standard. If that fails and the dialect of
 /// UA-.NETStandard succeeds, returns the reading of UA-.NETStandard.
-pub(crate) fn read(message: &NetworkMessage<'_>) -> Shown {
+pub(crate) fn read(message: &NetworkMessage<'_>) -> DecodedAction {
     let standard = read_as(message, ActionDialect::Standard);
     if standard.fault.is_none() {
         return standard;
@@ -34,8 +34,8 @@ pub(crate) fn read(message: &NetworkMessage<'_>) -> Shown {
 
 /// Appends the NetworkMessage with this ActionHeader, up to the end of its payload.
 pub(crate) fn write(
-    json: &shape::Datagram,
-    header: &shape::ActionHeader,
+    json: &shape::DatagramJson,
+    header: &shape::ActionHeaderJson,
     (network, extras): (&NetworkHeader<'_>, &Extras<'_>),
     out: &mut Vec<u8>,
 ) -> Result<(), WrongValue> {
@@ -49,15 +49,15 @@ pub(crate) fn write(
         .map(encode::publisher_id)
         .transpose();
     let dialect = match header.dialect {
-        shape::ActionDialect::Standard => ActionDialect::Standard,
-        shape::ActionDialect::UaNetStandard => ONE_SHOT,
+        shape::ActionDialectJson::Standard => ActionDialect::Standard,
+        shape::ActionDialectJson::UaNetStandard => ONE_SHOT,
     };
     let start = ActionStart {
         network: *network,
         action: ActionHeader {
             kind: match header.kind {
-                shape::ActionKind::Request => ActionKind::Request,
-                shape::ActionKind::Response => ActionKind::Response,
+                shape::ActionKindJson::Request => ActionKind::Request,
+                shape::ActionKindJson::Response => ActionKind::Response,
             },
             response_address: header.response_address.as_deref(),
             correlation_data: correlation_data.as_deref(),
@@ -83,7 +83,7 @@ pub(crate) fn write(
 
 /// Appends the headers of a sealed Action message and returns the offset of its payload.
 pub(crate) fn headers(
-    json: &shape::Datagram,
+    json: &shape::DatagramJson,
     (network, extras): (&NetworkHeader<'_>, &Extras<'_>),
     out: &mut Vec<u8>,
 ) -> Result<usize, WrongValue> {
@@ -97,8 +97,8 @@ pub(crate) fn headers(
     Ok(ActionEncoder::new(out, &start, ids)?.payload_offset())
 }
 
-fn read_as(message: &NetworkMessage<'_>, dialect: ActionDialect) -> Shown {
-    let mut shown = Shown::default();
+fn read_as(message: &NetworkMessage<'_>, dialect: ActionDialect) -> DecodedAction {
+    let mut shown = DecodedAction::default();
     let actions = match message.actions(dialect) {
         Ok(actions) => actions,
         Err(error) => {
@@ -110,7 +110,7 @@ fn read_as(message: &NetworkMessage<'_>, dialect: ActionDialect) -> Shown {
     for (action, writer_id) in actions.zip(message.writer_ids().into_iter().flatten()) {
         let (part, stop) = match action {
             Ok(action) => show_message(&action),
-            Err(error) => (shape::DataSetMessage::default(), Some((None, error))),
+            Err(error) => (shape::DataSetMessageJson::default(), Some((None, error))),
         };
         shown.messages.push(part);
         if let Some(stop) = stop {
@@ -125,15 +125,15 @@ fn read_as(message: &NetworkMessage<'_>, dialect: ActionDialect) -> Shown {
     shown
 }
 
-fn show_header(header: &ActionHeader<'_>, dialect: ActionDialect) -> shape::ActionHeader {
-    shape::ActionHeader {
+fn show_header(header: &ActionHeader<'_>, dialect: ActionDialect) -> shape::ActionHeaderJson {
+    shape::ActionHeaderJson {
         kind: match header.kind {
-            ActionKind::Request => shape::ActionKind::Request,
-            ActionKind::Response => shape::ActionKind::Response,
+            ActionKind::Request => shape::ActionKindJson::Request,
+            ActionKind::Response => shape::ActionKindJson::Response,
         },
         dialect: match dialect {
-            ActionDialect::Standard => shape::ActionDialect::Standard,
-            ActionDialect::UaNetStandard(_) => shape::ActionDialect::UaNetStandard,
+            ActionDialect::Standard => shape::ActionDialectJson::Standard,
+            ActionDialect::UaNetStandard(_) => shape::ActionDialectJson::UaNetStandard,
         },
         response_address: header.response_address.map(str::to_owned),
         correlation_data_hex: header.correlation_data.map(hex::text),
@@ -142,12 +142,12 @@ fn show_header(header: &ActionHeader<'_>, dialect: ActionDialect) -> shape::Acti
     }
 }
 
-fn show_message(action: &ActionMessage<'_>) -> (shape::DataSetMessage, Option<Stop>) {
+fn show_message(action: &ActionMessage<'_>) -> (shape::DataSetMessageJson, Option<PartialRead>) {
     let header = action.header();
-    let mut shown = shape::DataSetMessage {
+    let mut shown = shape::DataSetMessageJson {
         kind: match action.action.kind {
-            ActionKind::Request => shape::MessageKind::ActionRequest,
-            ActionKind::Response => shape::MessageKind::ActionResponse,
+            ActionKind::Request => shape::MessageKindJson::ActionRequest,
+            ActionKind::Response => shape::MessageKindJson::ActionResponse,
         },
         sequence_number: header.sequence_number,
         timestamp: header.timestamp.map(decode::show_timestamp),
@@ -155,20 +155,20 @@ fn show_message(action: &ActionMessage<'_>) -> (shape::DataSetMessage, Option<St
         status16: header.status,
         major_version: header.major_version,
         minor_version: header.minor_version,
-        action: Some(shape::Action {
+        action: Some(shape::ActionJson {
             target_id: action.target_id,
             request_id: action.request_id,
             state: match action.state {
-                ActionState::Idle => shape::ActionState::Idle,
-                ActionState::Executing => shape::ActionState::Executing,
-                ActionState::Done => shape::ActionState::Done,
+                ActionState::Idle => shape::ActionStateJson::Idle,
+                ActionState::Executing => shape::ActionStateJson::Executing,
+                ActionState::Done => shape::ActionStateJson::Done,
             },
             field_count: None,
         }),
-        ..shape::DataSetMessage::default()
+        ..shape::DataSetMessageJson::default()
     };
     if let ActionFields::RawData { count, payload } = action.fields {
-        shown.field_encoding = shape::FieldEncoding::RawData;
+        shown.field_encoding = shape::FieldEncodingJson::RawData;
         shown.raw_data_hex = Some(hex::text(payload));
         if let Some(call) = &mut shown.action {
             call.field_count = count;
@@ -179,18 +179,21 @@ fn show_message(action: &ActionMessage<'_>) -> (shape::DataSetMessage, Option<St
     (shown, stop)
 }
 
-fn show_fields(action: &ActionMessage<'_>, shown: &mut Vec<shape::Field>) -> Result<(), Stop> {
+fn show_fields(
+    action: &ActionMessage<'_>,
+    shown: &mut Vec<shape::FieldJson>,
+) -> Result<(), PartialRead> {
     let fields = action.fields.variants().map_err(|error| (None, error))?;
     for (field, at) in fields.zip(0..) {
         let value = field.and_then(|field| show_variant(&field));
         let value = value.map_err(|error| in_field(at, error))?;
-        shown.push(shape::Field { index: None, value });
+        shown.push(shape::FieldJson { index: None, value });
     }
     Ok(())
 }
 
 /// Returns the field and the error at which reading stops.
-fn stop_of(message: &NetworkMessage<'_>, dialect: ActionDialect) -> Option<Stop> {
+fn stop_of(message: &NetworkMessage<'_>, dialect: ActionDialect) -> Option<PartialRead> {
     let actions = match message.actions(dialect) {
         Ok(actions) => actions,
         Err(error) => return Some((None, error)),
@@ -211,8 +214,8 @@ fn fault(
     message: &NetworkMessage<'_>,
     dialect: ActionDialect,
     writer_id: Option<u16>,
-    stop: Stop,
-) -> Fault {
+    stop: PartialRead,
+) -> DecodeFault {
     let (field, error) = stop;
     let start = message.payload_offset();
     let headers = message.datagram().get(..start).unwrap_or_default();
@@ -228,10 +231,10 @@ fn fault(
             stop_of(&NetworkMessage::decode(&datagram).ok()?, dialect)
         })
     };
-    Fault {
+    DecodeFault {
         place: match writer_id {
-            Some(_) => Place::Message(MessagePlace { writer_id, field }),
-            None => Place::Payload,
+            Some(_) => FaultLocation::Message(MessagePlace { writer_id, field }),
+            None => FaultLocation::Payload,
         },
         error,
         offset: start + in_payload,
@@ -239,7 +242,7 @@ fn fault(
 }
 
 fn write_message(
-    json: &shape::DataSetMessage,
+    json: &shape::DataSetMessageJson,
     encoder: &mut ActionEncoder<'_>,
 ) -> Result<(), WrongValue> {
     if let Some(why) = &json.malformed {
@@ -251,13 +254,13 @@ fn write_message(
         target_id: action.target_id,
         request_id: action.request_id,
         state: match action.state {
-            shape::ActionState::Idle => ActionState::Idle,
-            shape::ActionState::Executing => ActionState::Executing,
-            shape::ActionState::Done => ActionState::Done,
+            shape::ActionStateJson::Idle => ActionState::Idle,
+            shape::ActionStateJson::Executing => ActionState::Executing,
+            shape::ActionStateJson::Done => ActionState::Done,
         },
     };
     let header: DataSetHeader = encode::data_set_header(json)?;
-    if json.field_encoding == shape::FieldEncoding::RawData {
+    if json.field_encoding == shape::FieldEncodingJson::RawData {
         let payload = hex::parse(json.raw_data_hex.as_deref().unwrap_or_default());
         let payload =
             payload.map_err(|error| WrongValue::new(error.to_string()).at(".rawDataHex"))?;

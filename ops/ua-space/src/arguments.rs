@@ -9,14 +9,15 @@ mod recording;
 mod tap;
 mod write;
 
-pub(crate) use cell::{Doctor, DriverTemplate, New, StatusArguments, Template};
-pub(crate) use discover::{Discover, Look};
+pub(crate) use cell::{CellTemplate, Doctor, DriverTemplate, NewCellArguments, StatusArguments};
+pub(crate) use discover::{Discover, DiscoverArguments};
 pub(crate) use live::{
-    Ask, Call, Echo, Group, Hz, Info, InfoSkill, List, ListSkills, MesAt, PlanArguments, Skills,
-    SkillsVerb, Source, SourceAt, SourceVerb, Target, Top, Trace, Types, WatchSkills,
+    AskArguments, CallArguments, EchoArguments, GroupArguments, Hz, InfoArguments, InfoSkill,
+    ListArguments, ListSkills, MesAt, NamedTarget, PlanArguments, Skills, SkillsVerb,
+    SourceArguments, SourceAt, SourceVerb, Top, Trace, TypesArguments, WatchSkills,
 };
-pub(crate) use recording::{Record, Replay, Viewers};
-pub(crate) use tap::Tap;
+pub(crate) use recording::{RecordArguments, ReplayArguments, Viewers};
+pub(crate) use tap::TapArguments;
 pub(crate) use write::Write;
 
 pub(crate) use job::{GoalArguments, JobArguments, JobVerb, ProcessArguments, ProcessVerb};
@@ -36,7 +37,7 @@ use crate::page::PageArguments;
 /// converts datagrams of OPC UA PubSub to JSON and back.
 #[derive(Debug, Parser)]
 #[command(name = "ua-space", version = build_info::version())]
-pub(crate) struct Arguments {
+pub(crate) struct ToolArguments {
     #[command(subcommand)]
     pub(crate) verb: Verb,
 }
@@ -52,7 +53,7 @@ pub(crate) enum Verb {
     /// Exit codes: 0 all can run (with --for: there), with or without warnings, 64 usage, 69 a part
     /// of the environment is not available, 74 a file cannot be read or the output cannot be
     /// written, 78 a mapping cannot run.
-    Check(Check),
+    Check(CheckArguments),
     /// Propose a mapping of running robots and servers
     ///
     /// Inspects SysML models, ROS graphs, running OPC UA servers and NodeSets, or all discovered
@@ -129,19 +130,19 @@ pub(crate) enum Verb {
     ///
     /// Exit codes: 0 done, 64 usage, 69 an interface or group is not available, 74 the output
     /// cannot be written.
-    List(List),
+    List(ListArguments),
     /// Show all details of a topic or call
     ///
     /// Exit codes: 0 done, 64 usage, 69 nothing was received, or an interface or group is not
     /// available, 74 the output cannot be written.
-    Info(Info),
+    Info(InfoArguments),
     /// Show the values of a topic
     ///
     /// Shows each field by its announced name, as YAML, or with --json as a JSON object per value.
     ///
     /// Exit codes: 0 done, 64 usage, 65 no received value can be read, 69 nothing was received, or
     /// an interface or group is not available, 74 the output cannot be written.
-    Echo(Echo),
+    Echo(EchoArguments),
     /// Measure the rate of a topic
     ///
     /// Exit codes: 0 done, 64 usage, 69 nothing was received, or an interface or group is not
@@ -167,7 +168,7 @@ pub(crate) enum Verb {
     ///
     /// Exit codes: 0 done, 64 usage, 69 no such type, or an interface or group is not available,
     /// 74 the output cannot be written.
-    Types(Types),
+    Types(TypesArguments),
     /// Show all programs of the cell: whether they are ready, and what they wait for
     ///
     /// Finds the programs of this host and asks those with --metrics for their status; programs of
@@ -189,7 +190,7 @@ pub(crate) enum Verb {
     /// Write a commented starting file: a component, a MES, a mapping or a model
     ///
     /// Exit codes: 0 done, 64 usage, 74 the file exists or cannot be written.
-    New(New),
+    New(NewCellArguments),
     /// List the skills of all components with their states; show, start or watch skills
     ///
     /// Exit codes: 0 done, and the run succeeded, 1 refused, or the run did not succeed, 64 usage,
@@ -204,7 +205,7 @@ pub(crate) enum Verb {
     /// Exit codes: 0 answered, and the run succeeded, 1 refused, or the run did not succeed, 64
     /// usage, or a parameter is missing or wrong, 69 the call has no executor, or its outcome is
     /// unknown, 74 the output cannot be written, 130 interrupted.
-    Call(Call),
+    Call(CallArguments),
     /// Show each sample of a topic at the programs, and why it crosses or not
     ///
     /// Asks the programs of this host with --metrics, or those of --metrics, for the steps of each
@@ -213,7 +214,7 @@ pub(crate) enum Verb {
     ///
     /// Exit codes: 0 done, 64 usage, 69 no program with --metrics, or none knows the name, 74 the
     /// output cannot be written.
-    Tap(Tap),
+    Tap(TapArguments),
     /// Write a value of the OPC UA side (origin 0), as an OPC UA client does
     ///
     /// Beside a ua-server that has the value, it is written at this server, with the permissions of
@@ -243,7 +244,7 @@ pub(crate) enum Verb {
     ///
     /// Exit codes: 0 done, 64 usage, 69 an interface or group is not available, 74 the file exists
     /// or cannot be written; what was written before is whole.
-    Record(Record),
+    Record(RecordArguments),
     /// Send a recording into a group again, with its intervals
     ///
     /// Values and their descriptions are sent as recorded; their times are moved to the present.
@@ -254,7 +255,7 @@ pub(crate) enum Verb {
     /// Exit codes: 0 done, 1 live programs of the same spaces were found, 64 usage, 65 the file is
     /// malformed or has nothing to send, 69 an interface or group is not available, 74 the file
     /// cannot be read, 130 interrupted.
-    Replay(Replay),
+    Replay(ReplayArguments),
     /// Show the values of a running space in viewers of robot data, as Lichtblick or Foxglove
     ///
     /// Serves the Foxglove WebSocket protocol at ws://127.0.0.1:8765 (`foxglove.sdk.v1` and
@@ -276,7 +277,7 @@ pub(crate) enum Verb {
     ///
     /// Exit codes: 0 done, 64 usage, or an unknown question, 65 the query is wrong, 69 no answer in
     /// time, 74 a file cannot be read or the output cannot be written.
-    Ask(Ask),
+    Ask(AskArguments),
     /// Show which components would run a process, with the reasons
     ///
     /// Lists each skill that the MES considered for each need of the process, and why it was chosen
@@ -294,7 +295,7 @@ pub(crate) enum Verb {
     /// Exit codes: 0 done, 64 usage, or an unknown source, 65 the source is wrong, 69 no answer in
     /// time, or the user may not change sources, 74 a file cannot be read or the output cannot be
     /// written.
-    Source(Source),
+    Source(SourceArguments),
     /// Import processes from recipes of other programs: BatchML and BPMN
     ///
     /// Exit codes: 0 done, with or without notes, 64 usage, 65 the recipe is wrong, or no process
@@ -372,12 +373,12 @@ pub(crate) enum Verb {
 pub(crate) struct Completion {
     /// Which shell
     #[arg(value_name = "SHELL", value_enum)]
-    pub(crate) shell: Shell,
+    pub(crate) shell: CompletionShell,
 }
 
 /// A shell that completes words.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-pub(crate) enum Shell {
+pub(crate) enum CompletionShell {
     /// GNU Bash
     Bash,
     /// Zsh
@@ -428,7 +429,7 @@ pub(crate) struct Complete {
 }
 
 #[derive(Debug, Args)]
-pub(crate) struct Check {
+pub(crate) struct CheckArguments {
     /// The mappings, or - for stdin
     #[arg(value_name = "FILE", required = true)]
     pub(crate) files: Vec<String>,
@@ -451,7 +452,7 @@ pub(crate) struct Check {
         value_delimiter = ',',
         default_missing_value = "ros1,ros2,opcua"
     )]
-    pub(crate) environment: Vec<Part>,
+    pub(crate) environment: Vec<EnvironmentPart>,
     /// Longest time to listen in a DDS domain, in seconds
     #[arg(long, value_name = "SECONDS", default_value_t = 5, value_parser = clap::value_parser!(u16).range(1..=600))]
     pub(crate) wait: u16,
@@ -466,7 +467,7 @@ fn space(text: &str) -> Result<SpaceId, &'static str> {
 
 /// Whom of its environment to ask.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-pub(crate) enum Part {
+pub(crate) enum EnvironmentPart {
     /// The ROS 1 master
     Ros1,
     /// The DDS domains
@@ -497,7 +498,7 @@ pub(crate) struct Init {
     #[arg(long)]
     pub(crate) discover: bool,
     #[command(flatten)]
-    pub(crate) look: Look,
+    pub(crate) look: DiscoverArguments,
     /// The output file; without it stdout
     #[arg(short, long, value_name = "FILE")]
     pub(crate) output: Option<String>,
@@ -585,7 +586,7 @@ pub(crate) struct Decode {
     #[arg(long)]
     pub(crate) array: bool,
     #[command(flatten)]
-    pub(crate) known: Known,
+    pub(crate) known: DecoderArguments,
 }
 
 #[derive(Debug, Args)]
@@ -597,12 +598,12 @@ pub(crate) struct Encode {
     #[arg(long)]
     pub(crate) raw: bool,
     #[command(flatten)]
-    pub(crate) known: Known,
+    pub(crate) known: DecoderArguments,
 }
 
 /// What a reader has to know besides the datagram.
 #[derive(Debug, Args)]
-pub(crate) struct Known {
+pub(crate) struct DecoderArguments {
     /// Keys of secured messages: a JSON object or an array of objects with policy, securityTokenId,
     /// signingKey, encryptingKey and keyNonce, and optionally publisherId and writerGroupId
     #[arg(long, value_name = "FILE")]
@@ -633,6 +634,6 @@ mod tests {
 
     #[test]
     fn the_command_line_is_well_formed() {
-        Arguments::command().debug_assert();
+        ToolArguments::command().debug_assert();
     }
 }

@@ -7,15 +7,15 @@ use serde::Deserialize;
 use serde_json::{Map, Value};
 use uri_text::escaped;
 
-use crate::arguments::Ask;
-use crate::exit::Failure;
-use crate::http::{Answer, Server};
-use crate::live::{Table, harmless, is_coloured};
+use crate::arguments::AskArguments;
+use crate::exit::CommandFailure;
+use crate::http::{HttpResponse, HttpServer};
+use crate::live::{TextTable, harmless, is_coloured};
 use crate::survey::look;
 
 /// Runs `ua-space ask`.
-pub(crate) fn ask(arguments: &Ask) -> Result<(), Failure> {
-    let server = Server::parse(&arguments.mes.url)?;
+pub(crate) fn ask(arguments: &AskArguments) -> Result<(), CommandFailure> {
+    let server = HttpServer::parse(&arguments.mes.url)?;
     let query = arguments.sparql.as_deref().map(read).transpose()?;
     look(async {
         let answer = match (query, &arguments.question) {
@@ -34,7 +34,7 @@ pub(crate) fn ask(arguments: &Ask) -> Result<(), Failure> {
     })
 }
 
-fn read(file: &str) -> Result<String, Failure> {
+fn read(file: &str) -> Result<String, CommandFailure> {
     let mut text = String::new();
     let read = match file {
         "-" => io::stdin()
@@ -43,7 +43,7 @@ fn read(file: &str) -> Result<String, Failure> {
             .read_to_string(&mut text),
         path => File::open(path).and_then(|file| file.take(MOST_QUERY).read_to_string(&mut text)),
     };
-    read.map_err(|error| Failure::reading(crate::input::name(file), &error))?;
+    read.map_err(|error| CommandFailure::reading(crate::input::name(file), &error))?;
     Ok(text)
 }
 
@@ -93,7 +93,11 @@ struct Bindings {
 
 /// Returns the request path of a question with its parameters. Values without a name take the
 /// parameter names of the question in order.
-async fn path(server: &Server, question: &str, words: &[String]) -> Result<String, Failure> {
+async fn path(
+    server: &HttpServer,
+    question: &str,
+    words: &[String],
+) -> Result<String, CommandFailure> {
     let is_named = |word: &String| {
         let name = word.split_once('=').map(|(name, _)| name);
         let plain = |c: char| c.is_ascii_alphanumeric() || matches!(c, '-' | '_');
@@ -103,8 +107,8 @@ async fn path(server: &Server, question: &str, words: &[String]) -> Result<Strin
     if !words.iter().all(is_named) {
         let all = questions(server).await?;
         let known = all.questions.into_iter().find(|it| it.name == question);
-        let known =
-            known.ok_or_else(|| Failure::Usage(format!("there is no question {question}")))?;
+        let known = known
+            .ok_or_else(|| CommandFailure::Usage(format!("there is no question {question}")))?;
         places = known.parameters;
     }
     let mut places = places.into_iter();
@@ -115,7 +119,9 @@ async fn path(server: &Server, question: &str, words: &[String]) -> Result<Strin
             Some(_) | None => {
                 let name = places.next();
                 let name = name.ok_or_else(|| {
-                    Failure::Usage(format!("{question} does not take so many values: {word}"))
+                    CommandFailure::Usage(format!(
+                        "{question} does not take so many values: {word}"
+                    ))
                 })?;
                 format!("{}={}", escaped(&name), escaped(word))
             }
@@ -130,18 +136,18 @@ async fn path(server: &Server, question: &str, words: &[String]) -> Result<Strin
     Ok(format!("/ask/{}{query}", escaped(question)))
 }
 
-async fn questions(server: &Server) -> Result<Questions, Failure> {
+async fn questions(server: &HttpServer) -> Result<Questions, CommandFailure> {
     let answer = server.get("/ask").await?;
     parsed(&answer.body)
 }
 
-pub(crate) fn parsed<'a, T: Deserialize<'a>>(body: &'a str) -> Result<T, Failure> {
+pub(crate) fn parsed<'a, T: Deserialize<'a>>(body: &'a str) -> Result<T, CommandFailure> {
     serde_json::from_str(body)
-        .map_err(|error| Failure::Data(format!("the answer was not understood: {error}")))
+        .map_err(|error| CommandFailure::Data(format!("the answer was not understood: {error}")))
 }
 
 /// Returns the reason of a response with an error status.
-pub(crate) fn refusal(answer: &Answer) -> Failure {
+pub(crate) fn refusal(answer: &HttpResponse) -> CommandFailure {
     #[derive(Deserialize)]
     struct Told {
         error: String,
@@ -153,13 +159,13 @@ pub(crate) fn refusal(answer: &Answer) -> Failure {
         None => format!("HTTP status {}", answer.status),
     };
     match answer.status {
-        404 => Failure::Usage(why),
-        400 | 406 | 413 | 415 => Failure::Data(why),
-        _ => Failure::Unavailable(why),
+        404 => CommandFailure::Usage(why),
+        400 | 406 | 413 | 415 => CommandFailure::Data(why),
+        _ => CommandFailure::Unavailable(why),
     }
 }
 
-fn show(answer: &Answer, arguments: &Ask) -> Result<(), Failure> {
+fn show(answer: &HttpResponse, arguments: &AskArguments) -> Result<(), CommandFailure> {
     let mut out = io::stdout().lock();
     let is_json = answer.content_type.contains("json");
     if arguments.json || !is_json {
@@ -189,7 +195,7 @@ fn show(answer: &Answer, arguments: &Ask) -> Result<(), Failure> {
         }
         (None, None) => {
             let all: Questions = parsed(&answer.body)?;
-            let mut table = Table::new(["QUESTION", "TAKES", "ABOUT"].map(str::to_owned));
+            let mut table = TextTable::new(["QUESTION", "TAKES", "ABOUT"].map(str::to_owned));
             for question in all.questions {
                 table.row([
                     question.name,
@@ -204,8 +210,8 @@ fn show(answer: &Answer, arguments: &Ask) -> Result<(), Failure> {
     Ok(())
 }
 
-fn of_rows(columns: &[String], rows: &[Map<String, Value>]) -> Table {
-    let mut table = Table::new(columns.iter().map(|name| name.to_uppercase()));
+fn of_rows(columns: &[String], rows: &[Map<String, Value>]) -> TextTable {
+    let mut table = TextTable::new(columns.iter().map(|name| name.to_uppercase()));
     for row in rows {
         table.row(
             columns

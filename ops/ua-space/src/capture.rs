@@ -3,13 +3,13 @@
 
 mod write;
 
-pub(crate) use write::{Link, PcapNg};
+pub(crate) use write::{LinkLayer, PcapNg};
 
 use std::io::{self, Read};
 
 /// Reads the packets of a capture.
 #[derive(Debug)]
-pub(crate) struct Capture<R> {
+pub(crate) struct CaptureReader<R> {
     reader: R,
     format: Format,
     /// Number of bytes read so far.
@@ -75,7 +75,7 @@ pub(crate) fn is_capture(start: [u8; 4]) -> bool {
     pcap || start == SECTION_HEADER
 }
 
-impl<R: Read> Capture<R> {
+impl<R: Read> CaptureReader<R> {
     /// Reads the header of a file that starts with `magic`; `reader` returns the bytes after
     /// `magic`.
     pub(crate) fn new(magic: [u8; 4], reader: R) -> Result<Self, CaptureError> {
@@ -430,10 +430,10 @@ const MAX_INTERFACES: usize = 4096;
 mod tests {
     use super::*;
 
-    fn open(bytes: &[u8]) -> Result<Capture<&[u8]>, CaptureError> {
+    fn open(bytes: &[u8]) -> Result<CaptureReader<&[u8]>, CaptureError> {
         let (magic, rest) = bytes.split_first_chunk().unwrap();
         assert!(is_capture(*magic));
-        Capture::new(*magic, rest)
+        CaptureReader::new(*magic, rest)
     }
 
     /// Returns a pcap file with one packet, written by a machine of either byte order.

@@ -9,12 +9,12 @@ mod tap;
 
 pub(crate) use doctor::doctor;
 pub(crate) use overview::status;
-pub(crate) use pages::{HopPage, Page, TopicPage, of_url as page_of_url};
+pub(crate) use pages::{HopPage, StatusPage, TopicPage, of_url as page_of_url};
 pub(crate) use processes::own_drops;
 pub(crate) use tap::tap;
 
 /// Returns the status pages of the programs on this host.
-pub(crate) async fn pages_of_this_host() -> Vec<Page> {
+pub(crate) async fn pages_of_this_host() -> Vec<StatusPage> {
     let (processes, _) = processes::read(std::path::Path::new("/"));
     pages::of_processes(&processes).await
 }

@@ -5,19 +5,19 @@ use std::io::{self, BufWriter, Write as _};
 use std::path::PathBuf;
 
 use mappings::{
-    Checked, Diagnostic, Environment, Mapping, NodeSets, Readers, SpaceId, Surroundings, TypeFiles,
-    TypeOrigin, TypeUse,
+    Checked, Diagnostic, Environment, FileReaders, Mapping, NodeSets, OpenTypeFiles, SpaceId,
+    Surroundings, TypeOrigin, TypeUse,
 };
 use messages::Dialect;
 use serde::Serialize;
 use type_files::Disk;
 
-use crate::arguments::Check;
-use crate::environment::{Asked, Seen};
-use crate::exit::Failure;
+use crate::arguments::CheckArguments;
+use crate::environment::{EnvironmentQuery, QueriedEnvironment};
+use crate::exit::CommandFailure;
 use crate::report::warn;
 
-pub(crate) fn check(arguments: &Check) -> Result<(), Failure> {
+pub(crate) fn check(arguments: &CheckArguments) -> Result<(), CommandFailure> {
     let mut out = BufWriter::new(io::stdout().lock());
     let (mut all_can_run, mut all_there) = (true, true);
     for file in &arguments.files {
@@ -33,7 +33,7 @@ pub(crate) fn check(arguments: &Check) -> Result<(), Failure> {
         if !arguments.environment.is_empty()
             && let Some(mapping) = &checked.mapping
         {
-            let found = Seen::look(mapping, arguments)?;
+            let found = QueriedEnvironment::look(mapping, arguments)?;
             let around = Around {
                 environment: Some(&found.environment),
             };
@@ -43,7 +43,7 @@ pub(crate) fn check(arguments: &Check) -> Result<(), Failure> {
         }
         let asked = seen.as_ref().map(|seen| seen.asked.as_slice());
         if arguments.json {
-            let told = Told::of(name, &checked, asked, &arguments.spaces);
+            let told = CheckJson::of(name, &checked, asked, &arguments.spaces);
             writeln!(out, "{}", crate::live::json(&told)?)?;
         } else {
             out.write_all(checked.render_all().as_bytes())?;
@@ -58,15 +58,15 @@ pub(crate) fn check(arguments: &Check) -> Result<(), Failure> {
     }
     out.flush()?;
     if !all_can_run {
-        Err(Failure::Configuration)
+        Err(CommandFailure::Configuration)
     } else if all_there {
         Ok(())
     } else {
-        Err(Failure::NotThere)
+        Err(CommandFailure::NotThere)
     }
 }
 
-fn read(file: &str) -> Result<String, Failure> {
+fn read(file: &str) -> Result<String, CommandFailure> {
     let read = match file {
         "-" => type_files::read_text(io::stdin().lock()),
         // The file may be a pipe that the user fills.
@@ -74,7 +74,7 @@ fn read(file: &str) -> Result<String, Failure> {
             .map_err(|error| error.to_string())
             .and_then(type_files::read_text),
     };
-    read.map_err(|why| Failure::Io(format!("cannot read {file}: {why}")))
+    read.map_err(|why| CommandFailure::Io(format!("cannot read {file}: {why}")))
 }
 
 /// The files and variables around a mapping, with the environment if it was queried.
@@ -96,11 +96,11 @@ impl Surroundings for Around<'_> {
         Disk.variable(name)
     }
 
-    fn readers(&self, file: &str) -> Option<Readers> {
+    fn readers(&self, file: &str) -> Option<FileReaders> {
         Disk.readers(file)
     }
 
-    fn types(&self, paths: &[PathBuf]) -> Box<dyn TypeFiles> {
+    fn types(&self, paths: &[PathBuf]) -> Box<dyn OpenTypeFiles> {
         Disk.types(paths)
     }
 
@@ -151,7 +151,7 @@ fn sum(name: &str, checked: &Checked, spaces: &[SpaceId]) -> String {
 
 #[derive(Serialize)]
 #[serde(rename_all = "camelCase")]
-struct Told<'a> {
+struct CheckJson<'a> {
     file: &'a str,
     can_run: bool,
     /// The spaces given with `--for`.
@@ -161,7 +161,7 @@ struct Told<'a> {
     /// The message, service and action types that the mapping uses.
     types: Vec<Type<'a>>,
     #[serde(skip_serializing_if = "Option::is_none")]
-    environment: Option<&'a [Asked]>,
+    environment: Option<&'a [EnvironmentQuery]>,
 }
 
 #[derive(Serialize)]
@@ -209,11 +209,11 @@ struct Finding<'a> {
     needed_by: Vec<u8>,
 }
 
-impl<'a> Told<'a> {
+impl<'a> CheckJson<'a> {
     fn of(
         file: &'a str,
         checked: &'a Checked,
-        environment: Option<&'a [Asked]>,
+        environment: Option<&'a [EnvironmentQuery]>,
         spaces: &[SpaceId],
     ) -> Self {
         Self {

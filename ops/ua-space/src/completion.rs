@@ -4,16 +4,16 @@ use std::io::{self, Write as _};
 
 use clap::{Arg, Command, CommandFactory as _, Parser};
 
-use crate::arguments::{Arguments, Group, Shell};
-use crate::exit::Failure;
+use crate::arguments::{CompletionShell, GroupArguments, ToolArguments};
+use crate::exit::CommandFailure;
 use crate::live::{HeardNames, heard_names};
 
 /// Runs `ua-space completion`.
-pub(crate) fn script(shell: Shell) -> Result<(), Failure> {
+pub(crate) fn script(shell: CompletionShell) -> Result<(), CommandFailure> {
     let text = match shell {
-        Shell::Bash => BASH,
-        Shell::Zsh => ZSH,
-        Shell::Fish => FISH,
+        CompletionShell::Bash => BASH,
+        CompletionShell::Zsh => ZSH,
+        CompletionShell::Fish => FISH,
     };
     io::stdout().lock().write_all(text.as_bytes())?;
     Ok(())
@@ -21,12 +21,12 @@ pub(crate) fn script(shell: Shell) -> Result<(), Failure> {
 
 /// Runs `ua-space complete`: prints the candidates, a word per line. Failures give no candidates,
 /// because a shell cannot use an error message.
-pub(crate) fn complete(words: &[String]) -> Result<(), Failure> {
+pub(crate) fn complete(words: &[String]) -> Result<(), CommandFailure> {
     let (typed, before) = match words.split_last() {
         Some((typed, before)) => (typed.as_str(), before),
         None => ("", &[][..]),
     };
-    let place = Place::of(before);
+    let place = WordPosition::of(before);
     let mut found = place.words(typed);
     if let Some(kind) = place.names().filter(|_| !typed.starts_with('-')) {
         let heard = heard_names(&group(before)).unwrap_or_default();
@@ -43,7 +43,7 @@ pub(crate) fn complete(words: &[String]) -> Result<(), Failure> {
 }
 
 /// The position of the completed word in the command line.
-struct Place {
+struct WordPosition {
     command: Command,
     /// The option with the completed value.
     option: Option<Arg>,
@@ -61,10 +61,10 @@ enum Names {
     Topics,
 }
 
-impl Place {
+impl WordPosition {
     fn of(before: &[String]) -> Self {
         let mut place = Self {
-            command: Arguments::command(),
+            command: ToolArguments::command(),
             option: None,
             position: 0,
         };
@@ -181,7 +181,7 @@ impl Names {
 }
 
 /// Returns the location of the space from the words typed so far and the environment.
-fn group(before: &[String]) -> Group {
+fn group(before: &[String]) -> GroupArguments {
     let mut words = vec!["ua-space".to_owned()];
     let mut rest = before.iter();
     while let Some(word) = rest.next() {
@@ -194,13 +194,13 @@ fn group(before: &[String]) -> Group {
     }
     let read = OnlyGroup::try_parse_from(words);
     let or_usual = read.or_else(|_| OnlyGroup::try_parse_from(["ua-space"]));
-    or_usual.map_or_else(|_| Group::default(), |only| only.group)
+    or_usual.map_or_else(|_| GroupArguments::default(), |only| only.group)
 }
 
 #[derive(Debug, Parser)]
 struct OnlyGroup {
     #[command(flatten)]
-    group: Group,
+    group: GroupArguments,
 }
 
 const BASH: &str = r#"_ua_space() {
@@ -232,9 +232,9 @@ const FISH: &str = r#"complete -c ua-space -a '(ua-space complete -- (commandlin
 mod tests {
     use super::*;
 
-    fn place(line: &[&str]) -> Place {
+    fn place(line: &[&str]) -> WordPosition {
         let words: Vec<String> = line.iter().map(|word| (*word).to_owned()).collect();
-        Place::of(&words)
+        WordPosition::of(&words)
     }
 
     #[test]

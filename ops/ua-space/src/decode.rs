@@ -5,21 +5,22 @@ use std::time::Duration;
 use serde_json::json;
 use uadp::discovery::{Announcement, Probe};
 use uadp::{
-    ChunkRefusal, DateTime, DecodeError, Extras, Keys, NetworkMessage, NetworkMessageEncoder,
+    ChunkRefusal, DateTime, DecodeError, Extras, NetworkMessage, NetworkMessageEncoder,
     NetworkMessageType, PublisherId, Reassembled, Reassembler, ReassemblyLimits, SecurityHeader,
+    TokenKeys,
 };
 
 use crate::arguments::RawReading;
-use crate::fault::{Fault, Place, offset};
+use crate::fault::{DecodeFault, FaultLocation, offset};
 use crate::keys::{self, KeyFile};
-use crate::metadata::{MetaDataFile, Writer};
-use crate::raw_data::Layout;
+use crate::metadata::{MetaDataFile, WriterKey};
+use crate::raw_data::RawDataLayout;
 use crate::values::show_variant;
 use crate::{actions, discovery, hex, iso_time, messages, shape};
 
 /// The keys and metadata that decoding needs besides the datagrams.
 #[derive(Debug)]
-pub(crate) struct Context {
+pub(crate) struct DecodeContext {
     pub(crate) keys: Option<KeyFile>,
     pub(crate) metadata: MetaDataFile,
     pub(crate) raw_reading: RawReading,
@@ -27,7 +28,7 @@ pub(crate) struct Context {
 
 /// Reassembles chunks in the order of a file.
 #[derive(Debug)]
-pub(crate) struct Chunks {
+pub(crate) struct ChunkReassembler {
     reassembler: Reassembler,
     now: Duration,
     start: Option<i128>,
@@ -35,9 +36,9 @@ pub(crate) struct Chunks {
 
 /// The decoded contents of a datagram.
 #[derive(Debug, Default)]
-pub(crate) struct Reading {
-    pub(crate) shape: shape::Datagram,
-    pub(crate) faults: Vec<Fault>,
+pub(crate) struct DecodedDatagram {
+    pub(crate) shape: shape::DatagramJson,
+    pub(crate) faults: Vec<DecodeFault>,
     /// The reason why the message was not decrypted although keys were given.
     pub(crate) refused: Option<String>,
     /// The message that this chunk completes.
@@ -48,13 +49,17 @@ pub(crate) struct Reading {
     pub(crate) bytes: Vec<u8>,
 }
 
-impl Context {
+impl DecodeContext {
     /// Reads a datagram to its end, or to the first fault of each of its parts. With `chunks`, the
     /// reading of a chunk that completes a message includes that message.
-    pub(crate) fn read(&self, datagram: &[u8], chunks: Option<&mut Chunks>) -> Reading {
-        let mut reading = Reading {
+    pub(crate) fn read(
+        &self,
+        datagram: &[u8],
+        chunks: Option<&mut ChunkReassembler>,
+    ) -> DecodedDatagram {
+        let mut reading = DecodedDatagram {
             bytes: datagram.to_vec(),
-            ..Reading::default()
+            ..DecodedDatagram::default()
         };
         let message = match NetworkMessage::decode(datagram) {
             Ok(message) => message,
@@ -75,8 +80,8 @@ impl Context {
         &self,
         sealed: &NetworkMessage<'_>,
         keys: &KeyFile,
-        reading: &mut Reading,
-        chunks: Option<&mut Chunks>,
+        reading: &mut DecodedDatagram,
+        chunks: Option<&mut ChunkReassembler>,
     ) {
         let found = match keys.find(sealed) {
             Ok(found) => found,
@@ -87,10 +92,10 @@ impl Context {
             }
         };
         // If several key sets share the signing key, the right set decrypts to a readable message.
-        let reads = |keys: &&Keys| {
-            let mut tried = Reading {
+        let reads = |keys: &&TokenKeys| {
+            let mut tried = DecodedDatagram {
                 bytes: sealed.datagram().to_vec(),
-                ..Reading::default()
+                ..DecodedDatagram::default()
             };
             self.show_opened(sealed, keys, &mut tried, None);
             tried.faults.is_empty()
@@ -107,9 +112,9 @@ impl Context {
     fn show_opened(
         &self,
         sealed: &NetworkMessage<'_>,
-        keys: &Keys,
-        reading: &mut Reading,
-        chunks: Option<&mut Chunks>,
+        keys: &TokenKeys,
+        reading: &mut DecodedDatagram,
+        chunks: Option<&mut ChunkReassembler>,
     ) {
         let mut scratch = Vec::new();
         match keys::open(keys, sealed, &mut scratch) {
@@ -126,8 +131,8 @@ impl Context {
     fn show(
         &self,
         message: &NetworkMessage<'_>,
-        reading: &mut Reading,
-        chunks: Option<&mut Chunks>,
+        reading: &mut DecodedDatagram,
+        chunks: Option<&mut ChunkReassembler>,
     ) {
         reading.headers(message);
         if message.is_sealed() {
@@ -154,16 +159,16 @@ impl Context {
                 }
             }
         }
-        reading.shape.malformed = reading.faults.first().map(Fault::to_string);
+        reading.shape.malformed = reading.faults.first().map(DecodeFault::to_string);
     }
 
-    fn messages(&self, message: &NetworkMessage<'_>, reading: &mut Reading) {
+    fn messages(&self, message: &NetworkMessage<'_>, reading: &mut DecodedDatagram) {
         let (parts, stop) = messages::split(message);
         self.parts(&parts, reading);
         reading.faults.extend(stop);
     }
 
-    fn parts(&self, parts: &[messages::Part<'_>], reading: &mut Reading) {
+    fn parts(&self, parts: &[messages::PayloadMessage<'_>], reading: &mut DecodedDatagram) {
         let mut shown = Vec::new();
         for part in parts {
             let layout = self.layout(&reading.shape, part.writer_id);
@@ -177,8 +182,8 @@ impl Context {
     fn put_together(
         &self,
         message: &NetworkMessage<'_>,
-        reading: &mut Reading,
-        chunks: &mut Chunks,
+        reading: &mut DecodedDatagram,
+        chunks: &mut ChunkReassembler,
     ) {
         match chunks.reassembler.receive(message, chunks.now) {
             Ok(Some(whole)) => reading.whole = Some(Box::new(self.read_whole(message, &whole))),
@@ -190,15 +195,15 @@ impl Context {
 
     /// Reads the reassembled bytes of chunks: one DataSetMessage, or the body of a discovery
     /// message after its headers.
-    fn read_whole(&self, last: &NetworkMessage<'_>, whole: &Reassembled<'_>) -> Reading {
-        let mut reading = Reading {
+    fn read_whole(&self, last: &NetworkMessage<'_>, whole: &Reassembled<'_>) -> DecodedDatagram {
+        let mut reading = DecodedDatagram {
             bytes: whole.bytes.to_vec(),
-            ..Reading::default()
+            ..DecodedDatagram::default()
         };
         reading.headers(last);
         match whole.message_type {
             NetworkMessageType::DataSet => {
-                let part = messages::Part {
+                let part = messages::PayloadMessage {
                     writer_id: whole.writer_id,
                     offset: 0,
                     bytes: whole.bytes,
@@ -220,28 +225,28 @@ impl Context {
             "messageSequenceNumber": whole.message_sequence_number,
             "totalSize": whole.bytes.len(),
         }));
-        reading.shape.malformed = reading.faults.first().map(Fault::to_string);
+        reading.shape.malformed = reading.faults.first().map(DecodeFault::to_string);
         reading
     }
 
     /// Returns the layout of the RawData of a DataSetWriter, if metadata for it is available.
     pub(crate) fn layout(
         &self,
-        datagram: &shape::Datagram,
+        datagram: &shape::DatagramJson,
         data_set_writer_id: Option<u16>,
-    ) -> Option<Layout<'_>> {
+    ) -> Option<RawDataLayout<'_>> {
         let group = datagram.group_header.as_ref();
-        let metadata = self.metadata.find(Writer {
+        let metadata = self.metadata.find(WriterKey {
             publisher_id: datagram.publisher_id.as_ref(),
             writer_group_id: group.and_then(|group| group.writer_group_id),
             data_set_writer_id,
         })?;
         // Invalid layouts were rejected when the metadata file was read.
-        Layout::new(metadata, self.raw_reading).ok()
+        RawDataLayout::new(metadata, self.raw_reading).ok()
     }
 }
 
-impl Chunks {
+impl ChunkReassembler {
     /// Creates the reassembly buffer. Chunks belong together if they are at most a minute apart,
     /// because the recorded sender may have been slow.
     pub(crate) fn new() -> Self {
@@ -272,7 +277,7 @@ impl Chunks {
     }
 }
 
-impl Reading {
+impl DecodedDatagram {
     /// Returns false for datagrams that other protocols may send by chance: datagrams with a fault,
     /// without PublisherId and GroupHeader, or sealed in a way that no SecurityPolicy defines.
     pub(crate) fn is_plausible(&self) -> bool {
@@ -287,8 +292,8 @@ impl Reading {
 
     fn unreadable(&mut self, datagram: &[u8], error: DecodeError) {
         let stop = |bytes: &[u8]| Some((None, NetworkMessage::decode(bytes).err()?));
-        let fault = Fault {
-            place: Place::Headers,
+        let fault = DecodeFault {
+            place: FaultLocation::Headers,
             error,
             offset: offset(datagram, (None, error), stop),
         };
@@ -302,14 +307,14 @@ impl Reading {
         shape.uadp_version = Some(1);
         shape.network_message_type = match message.message_type() {
             NetworkMessageType::DataSet => None,
-            NetworkMessageType::Probe => Some(shape::NetworkMessageType::DiscoveryProbe),
+            NetworkMessageType::Probe => Some(shape::NetworkMessageTypeJson::DiscoveryProbe),
             NetworkMessageType::Announcement => {
-                Some(shape::NetworkMessageType::DiscoveryAnnouncement)
+                Some(shape::NetworkMessageTypeJson::DiscoveryAnnouncement)
             }
         };
         shape.publisher_id = header.publisher_id.map(Into::into);
         shape.data_set_class_id = header.data_set_class_id.map(|id| id.to_string());
-        shape.group_header = header.group.map(|group| shape::GroupHeader {
+        shape.group_header = header.group.map(|group| shape::GroupHeaderJson {
             writer_group_id: group.writer_group_id,
             group_version: group.group_version,
             network_message_number: group.network_message_number,
@@ -343,7 +348,7 @@ impl Reading {
     fn chunk(&mut self, message: &NetworkMessage<'_>) {
         match message.chunk() {
             Ok(chunk) => {
-                self.shape.chunk = Some(shape::Chunk {
+                self.shape.chunk = Some(shape::ChunkJson {
                     message_sequence_number: chunk.message_sequence_number,
                     chunk_offset: chunk.offset,
                     total_size: chunk.total_size,
@@ -358,8 +363,8 @@ impl Reading {
                     // The ChunkOffset, which follows the MessageSequenceNumber.
                     2
                 };
-                self.faults.push(Fault {
-                    place: Place::Chunk,
+                self.faults.push(DecodeFault {
+                    place: FaultLocation::Chunk,
                     error,
                     offset: message.payload_offset() + in_payload,
                 });
@@ -368,7 +373,7 @@ impl Reading {
     }
 }
 
-impl Reading {
+impl DecodedDatagram {
     /// Reads a body that starts `start` bytes after the first byte.
     fn discovery(&mut self, message_type: NetworkMessageType, body: &[u8], start: usize) {
         let read: fn(&[u8]) -> Result<(), DecodeError>;
@@ -385,8 +390,8 @@ impl Reading {
         };
         if let Err(error) = shown {
             let stop = |bytes: &[u8]| Some((None, read(bytes).err()?));
-            self.faults.push(Fault {
-                place: Place::Discovery,
+            self.faults.push(DecodeFault {
+                place: FaultLocation::Discovery,
                 error,
                 offset: start + offset(body, (None, error), stop),
             });
@@ -394,7 +399,7 @@ impl Reading {
     }
 }
 
-fn promoted_fault(message: &NetworkMessage<'_>, field: usize, error: DecodeError) -> Fault {
+fn promoted_fault(message: &NetworkMessage<'_>, field: usize, error: DecodeError) -> DecodeFault {
     let fields = promoted_range(message).unwrap_or_default();
     let bytes = message.datagram().get(fields.clone()).unwrap_or_default();
     let stop = (Some(field), error);
@@ -412,8 +417,8 @@ fn promoted_fault(message: &NetworkMessage<'_>, field: usize, error: DecodeError
         }
         None
     };
-    Fault {
-        place: Place::PromotedField(field),
+    DecodeFault {
+        place: FaultLocation::PromotedField(field),
         error,
         offset: fields.start + offset(bytes, stop, read),
     }
@@ -443,7 +448,7 @@ fn promoted_range(message: &NetworkMessage<'_>) -> Option<std::ops::Range<usize>
     Some(start..message.payload_offset() - security)
 }
 
-impl From<PublisherId<'_>> for shape::PublisherId {
+impl From<PublisherId<'_>> for shape::PublisherIdJson {
     fn from(id: PublisherId<'_>) -> Self {
         let (id_type, value) = match id {
             PublisherId::Byte(id) => (shape::PublisherIdType::Byte, id.into()),
@@ -456,8 +461,8 @@ impl From<PublisherId<'_>> for shape::PublisherId {
     }
 }
 
-pub(crate) fn show_timestamp(time: DateTime) -> shape::Timestamp {
-    shape::Timestamp {
+pub(crate) fn show_timestamp(time: DateTime) -> shape::TimestampJson {
+    shape::TimestampJson {
         ticks100ns: Some(time.0),
         iso: Some(iso_time::of_date_time(time)),
     }
@@ -466,8 +471,8 @@ pub(crate) fn show_timestamp(time: DateTime) -> shape::Timestamp {
 fn show_security(
     security: &SecurityHeader<'_>,
     message: &NetworkMessage<'_>,
-) -> shape::SecurityHeader {
-    shape::SecurityHeader {
+) -> shape::SecurityHeaderJson {
+    shape::SecurityHeaderJson {
         signed: security.signed,
         encrypted: security.encrypted,
         footer_enabled: security.footer_size.is_some(),

@@ -6,18 +6,18 @@ mod entry;
 use std::io::{self, Write as _};
 
 use crate::arguments::Discover;
-use crate::exit::Failure;
-use crate::live::{Table, is_coloured};
+use crate::exit::CommandFailure;
+use crate::live::{TextTable, is_coloured};
 use crate::survey::look;
 
 pub(crate) use around::{around, around_and};
-pub(crate) use entry::{Entry, Kind, Shown};
+pub(crate) use entry::{DiscoveredEntry, DiscoveredKind, EntryJson};
 
-pub(crate) fn discover(arguments: &Discover) -> Result<(), Failure> {
+pub(crate) fn discover(arguments: &Discover) -> Result<(), CommandFailure> {
     let found = look(around(&arguments.look))?;
     let mut out = io::stdout().lock();
     if arguments.json {
-        let shown: Vec<_> = found.entries.iter().map(Entry::shown).collect();
+        let shown: Vec<_> = found.entries.iter().map(DiscoveredEntry::shown).collect();
         writeln!(out, "{}", crate::live::json(&shown)?)?;
         return Ok(out.flush()?);
     }
@@ -42,8 +42,8 @@ const HEAD: [&str; 7] = [
     "URI",
 ];
 
-fn table(entries: &[Entry]) -> Table {
-    let mut table = Table::new(HEAD.map(str::to_owned)).yielding([6, 5, 4, 3, 2]);
+fn table(entries: &[DiscoveredEntry]) -> TextTable {
+    let mut table = TextTable::new(HEAD.map(str::to_owned)).yielding([6, 5, 4, 3, 2]);
     let dash = |text: String| {
         if text.is_empty() {
             "-".to_owned()

@@ -1,6 +1,6 @@
 //! Discovery messages as JSON: their type and identifiers as values, their structures as bytes.
 
-use uadp::discovery::{Announced, Announcement, List, Probe};
+use uadp::discovery::{AnnouncedContent, Announcement, Probe, WireArray};
 use uadp::{DecodeError, StatusCode};
 
 use crate::shape::{self, FieldMetaData};
@@ -8,10 +8,10 @@ use crate::values::WrongValue;
 use crate::{hex, node_ids};
 
 /// Shows the body of a probe, after its headers.
-pub(crate) fn show_probe(body: &[u8]) -> Result<shape::Probe, DecodeError> {
-    let mut shown = shape::Probe {
+pub(crate) fn show_probe(body: &[u8]) -> Result<shape::ProbeJson, DecodeError> {
+    let mut shown = shape::ProbeJson {
         probe_type: PUBLISHER_INFORMATION,
-        ..shape::Probe::default()
+        ..shape::ProbeJson::default()
     };
     let information_type = match Probe::decode_body(body)? {
         Probe::PublisherEndpoints => 1,
@@ -52,21 +52,21 @@ pub(crate) fn show_probe(body: &[u8]) -> Result<shape::Probe, DecodeError> {
 }
 
 /// Returns the body of a probe, after its headers.
-pub(crate) fn probe_body(json: &shape::Probe) -> Result<Vec<u8>, WrongValue> {
+pub(crate) fn probe_body(json: &shape::ProbeJson) -> Result<Vec<u8>, WrongValue> {
     let ids = json.data_set_writer_ids.as_deref().unwrap_or_default();
     let uris = json.transport_profile_uris.as_deref().unwrap_or_default();
     let uris: Vec<_> = uris.iter().map(Option::as_deref).collect();
     let include_data_set_writers = json.include_data_set_writers.unwrap_or_default();
     let probe = match (json.probe_type, json.information_type) {
         (PUBLISHER_INFORMATION, Some(1)) => Probe::PublisherEndpoints,
-        (PUBLISHER_INFORMATION, Some(2)) => Probe::DataSetMetaData(List::new(ids)),
-        (PUBLISHER_INFORMATION, Some(3)) => Probe::DataSetWriterConfiguration(List::new(ids)),
+        (PUBLISHER_INFORMATION, Some(2)) => Probe::DataSetMetaData(WireArray::new(ids)),
+        (PUBLISHER_INFORMATION, Some(3)) => Probe::DataSetWriterConfiguration(WireArray::new(ids)),
         (PUBLISHER_INFORMATION, Some(4)) => Probe::WriterGroupConfiguration {
             writer_group_id: json.writer_group_id.unwrap_or_default(),
             include_data_set_writers,
         },
         (PUBLISHER_INFORMATION, Some(5)) => Probe::PubSubConnections {
-            transport_profile_uris: List::new(&uris),
+            transport_profile_uris: WireArray::new(&uris),
             include_writer_groups: json.include_writer_groups.unwrap_or_default(),
             include_data_set_writers,
         },
@@ -83,19 +83,19 @@ pub(crate) fn probe_body(json: &shape::Probe) -> Result<Vec<u8>, WrongValue> {
 }
 
 /// Shows the body of an announcement, after its headers.
-pub(crate) fn show_announcement(body: &[u8]) -> Result<shape::Announcement, DecodeError> {
+pub(crate) fn show_announcement(body: &[u8]) -> Result<shape::AnnouncementJson, DecodeError> {
     let Announcement {
         sequence_number,
         announced,
     } = Announcement::decode_body(body)?;
-    let mut shown = shape::Announcement {
+    let mut shown = shape::AnnouncementJson {
         announcement_type: announced.announcement_type(),
         sequence_number,
-        ..shape::Announcement::default()
+        ..shape::AnnouncementJson::default()
     };
     // The numbers of bytes before and after the structure.
     let (head, tail) = match announced {
-        Announced::PublisherEndpoints { endpoints, status } => {
+        AnnouncedContent::PublisherEndpoints { endpoints, status } => {
             shown.endpoints = Some(endpoints.len());
             let urls = endpoints
                 .iter()
@@ -104,7 +104,7 @@ pub(crate) fn show_announcement(body: &[u8]) -> Result<shape::Announcement, Deco
             shown.status_code = Some(status.0);
             (LENGTH, STATUS)
         }
-        Announced::DataSetMetaData {
+        AnnouncedContent::DataSetMetaData {
             writer_id,
             meta_data,
             status,
@@ -115,7 +115,7 @@ pub(crate) fn show_announcement(body: &[u8]) -> Result<shape::Announcement, Deco
             shown.status_code = Some(status.0);
             (WRITER_ID, STATUS)
         }
-        Announced::DataSetWriterConfiguration {
+        AnnouncedContent::DataSetWriterConfiguration {
             writer_ids,
             statuses,
             ..
@@ -127,18 +127,18 @@ pub(crate) fn show_announcement(body: &[u8]) -> Result<shape::Announcement, Deco
                 LENGTH + statuses.len() * STATUS,
             )
         }
-        Announced::PubSubConnections(connections) => {
+        AnnouncedContent::PubSubConnections(connections) => {
             shown.connections = Some(connections.len());
             (LENGTH, 0)
         }
-        Announced::PubSubConnection { status, .. } => {
+        AnnouncedContent::PubSubConnection { status, .. } => {
             shown.status_code = Some(status.0);
             (0, STATUS)
         }
-        Announced::ApplicationDescription { .. }
-        | Announced::ApplicationStatus { .. }
-        | Announced::ActionResponder(_)
-        | Announced::ActionMetaData(_) => (0, 0),
+        AnnouncedContent::ApplicationDescription { .. }
+        | AnnouncedContent::ApplicationStatus { .. }
+        | AnnouncedContent::ActionResponder(_)
+        | AnnouncedContent::ActionMetaData(_) => (0, 0),
     };
     let structure = body
         .get(ANNOUNCEMENT_HEAD + head..body.len() - tail)
@@ -148,7 +148,7 @@ pub(crate) fn show_announcement(body: &[u8]) -> Result<shape::Announcement, Deco
 }
 
 /// Returns the body of an announcement, after its headers.
-pub(crate) fn announcement_body(json: &shape::Announcement) -> Result<Vec<u8>, WrongValue> {
+pub(crate) fn announcement_body(json: &shape::AnnouncementJson) -> Result<Vec<u8>, WrongValue> {
     let structure = json.body_hex.as_deref().unwrap_or_default();
     let structure =
         hex::parse(structure).map_err(|error| WrongValue::new(error.to_string()).at(".bodyHex"))?;

@@ -14,21 +14,24 @@ use std::str::FromStr;
 
 use uadp::discovery::{Announcement, Probe};
 use uadp::{
-    ChunkBudget, ChunkError, Chunks, DataSetHeader, DataValue, DateTime, Encoded, Extras,
-    FieldEncoder, GroupHeader, Guid, NetworkHeader, NetworkMessageEncoder, NetworkMessageType,
-    PublisherId, Seal, SecurityHeader, SecurityMode, Variant, Whole,
+    ChunkBudget, ChunkEncoder, ChunkError, DataSetHeader, DataValue, DateTime, Extras,
+    FieldEncoder, GroupHeader, Guid, Nested, NetworkHeader, NetworkMessageEncoder,
+    NetworkMessageType, PublisherId, Seal, SecurityHeader, SecurityMode, Variant, Whole,
 };
 
 use crate::arguments::RawReading;
-use crate::decode::Context;
-use crate::raw_data::Layout;
+use crate::decode::DecodeContext;
+use crate::raw_data::RawDataLayout;
 use crate::values::{WrongValue, data_value_bytes, variant_bytes};
 use crate::{actions, discovery, hex, iso_time, node_ids, shape};
 
 type Written = Result<(), WrongValue>;
 
 /// Returns the bytes of a datagram.
-pub(crate) fn write(json: &shape::Datagram, context: &Context) -> Result<Vec<u8>, WrongValue> {
+pub(crate) fn write(
+    json: &shape::DatagramJson,
+    context: &DecodeContext,
+) -> Result<Vec<u8>, WrongValue> {
     if let Some(why) = &json.malformed {
         return Err(WrongValue::new(format!("is malformed ({why})")).at("the datagram"));
     }
@@ -59,7 +62,7 @@ pub(crate) fn write(json: &shape::Datagram, context: &Context) -> Result<Vec<u8>
     }
     let promoted: Vec<_> = buffers
         .iter()
-        .map(|bytes| Encoded::<Variant<'_>>::new(bytes)?.get())
+        .map(|bytes| Nested::<Variant<'_>>::new(bytes)?.get())
         .collect::<Result<_, _>>()?;
     let security = json
         .security_header
@@ -78,11 +81,11 @@ pub(crate) fn write(json: &shape::Datagram, context: &Context) -> Result<Vec<u8>
 
 /// A datagram in progress, with its headers parsed.
 struct Writing<'a> {
-    json: &'a shape::Datagram,
+    json: &'a shape::DatagramJson,
     header: NetworkHeader<'a>,
     promoted_fields: Option<&'a [Variant<'a>]>,
     security: Option<&'a Security>,
-    context: &'a Context,
+    context: &'a DecodeContext,
 }
 
 /// A SecurityHeader with its hexadecimal texts parsed.
@@ -127,7 +130,7 @@ impl Writing<'_> {
 
     /// Writes a chunk: encodes its data as a complete message, then replaces the offset and total
     /// size.
-    fn chunk(&self, chunk: &shape::Chunk, out: &mut Vec<u8>) -> Written {
+    fn chunk(&self, chunk: &shape::ChunkJson, out: &mut Vec<u8>) -> Written {
         let data = bytes(&chunk.chunk_data_hex).map_err(|wrong| wrong.at("chunk.chunkDataHex"))?;
         let payload_at = self.chunk_headers(chunk.message_sequence_number, &data, out)?;
         // The ChunkOffset and TotalSize follow the MessageSequenceNumber.
@@ -153,9 +156,9 @@ impl Writing<'_> {
         };
         let whole = Whole {
             message_type: match self.json.network_message_type {
-                None | Some(shape::NetworkMessageType::DataSet) => NetworkMessageType::DataSet,
-                Some(shape::NetworkMessageType::DiscoveryProbe) => NetworkMessageType::Probe,
-                Some(shape::NetworkMessageType::DiscoveryAnnouncement) => {
+                None | Some(shape::NetworkMessageTypeJson::DataSet) => NetworkMessageType::DataSet,
+                Some(shape::NetworkMessageTypeJson::DiscoveryProbe) => NetworkMessageType::Probe,
+                Some(shape::NetworkMessageTypeJson::DiscoveryAnnouncement) => {
                     NetworkMessageType::Announcement
                 }
             },
@@ -169,7 +172,7 @@ impl Writing<'_> {
         };
         let wrong = |error: ChunkError| WrongValue::new(error.to_string()).at("chunk");
         let extras = self.extras();
-        let mut chunks = Chunks::new(&self.header, &extras, whole, budget).map_err(wrong)?;
+        let mut chunks = ChunkEncoder::new(&self.header, &extras, whole, budget).map_err(wrong)?;
         match chunks.append(out, &extras) {
             Some(placed) => Ok(placed.map_err(wrong)?.payload_at),
             None => Ok(out.len()),
@@ -185,12 +188,13 @@ impl Writing<'_> {
         const FIND_APPLICATIONS: &[u8] = &[2];
         const NO_CONNECTIONS: &[u8] = &[4, 0, 0, 0, 0, 0, 0];
         let body = match self.json.network_message_type {
-            Some(shape::NetworkMessageType::DiscoveryAnnouncement) => {
+            Some(shape::NetworkMessageTypeJson::DiscoveryAnnouncement) => {
                 self.announcement(NO_CONNECTIONS, out)?;
                 NO_CONNECTIONS
             }
             Some(
-                shape::NetworkMessageType::DiscoveryProbe | shape::NetworkMessageType::DataSet,
+                shape::NetworkMessageTypeJson::DiscoveryProbe
+                | shape::NetworkMessageTypeJson::DataSet,
             )
             | None => {
                 self.probe(FIND_APPLICATIONS, out)?;
@@ -329,7 +333,7 @@ impl Writing<'_> {
 }
 
 impl Security {
-    fn read(json: &shape::SecurityHeader) -> Result<Self, WrongValue> {
+    fn read(json: &shape::SecurityHeaderJson) -> Result<Self, WrongValue> {
         let part = |text: &str, key: &str| {
             bytes(text).map_err(|wrong| wrong.at(&format!("securityHeader.{key}")))
         };
@@ -377,25 +381,25 @@ impl Security {
 
 /// Returns the bytes of a single DataSetMessage.
 pub(crate) fn message_bytes(
-    json: &shape::DataSetMessage,
-    layout: Option<&Layout<'_>>,
+    json: &shape::DataSetMessageJson,
+    layout: Option<&RawDataLayout<'_>>,
 ) -> Result<Vec<u8>, WrongValue> {
     let mut out = Vec::new();
     let mut encoder = NetworkMessageEncoder::new(&mut out, &NetworkHeader::default(), None)?;
     let headers = encoder.payload_offset();
-    let reading = layout.map_or(RawReading::Standard, Layout::reading);
+    let reading = layout.map_or(RawReading::Standard, RawDataLayout::reading);
     write_message(json, layout, reading, &mut encoder)?;
     encoder.finish()?;
     Ok(out.split_off(headers))
 }
 
 fn write_message(
-    json: &shape::DataSetMessage,
-    known: Option<&Layout<'_>>,
+    json: &shape::DataSetMessageJson,
+    known: Option<&RawDataLayout<'_>>,
     reading: RawReading,
     encoder: &mut NetworkMessageEncoder<'_>,
 ) -> Written {
-    use shape::{FieldEncoding, MessageKind};
+    use shape::{FieldEncodingJson, MessageKindJson};
 
     if let Some(why) = &json.malformed {
         return Err(WrongValue::new(format!("is malformed ({why})")));
@@ -412,41 +416,41 @@ fn write_message(
     }
     let header = data_set_header(json)?;
     match (json.kind, json.field_encoding) {
-        (MessageKind::KeepAlive, _) => Ok(encoder.keep_alive(&header)?),
-        (MessageKind::KeyFrame, FieldEncoding::Variant) => {
+        (MessageKindJson::KeepAlive, _) => Ok(encoder.keep_alive(&header)?),
+        (MessageKindJson::KeyFrame, FieldEncodingJson::Variant) => {
             write_variants(json, encoder.key_frame(&header)?)
         }
-        (MessageKind::Event, FieldEncoding::Variant) => {
+        (MessageKindJson::Event, FieldEncodingJson::Variant) => {
             write_variants(json, encoder.event(&header)?)
         }
-        (MessageKind::DeltaFrame, FieldEncoding::Variant) => {
+        (MessageKindJson::DeltaFrame, FieldEncodingJson::Variant) => {
             let mut frame = encoder.delta_frame(&header)?;
             each_field(json, |field| {
                 let bytes = variant_bytes(&field.value)?;
-                let value = Encoded::<Variant<'_>>::new(&bytes)?.get()?;
+                let value = Nested::<Variant<'_>>::new(&bytes)?.get()?;
                 Ok(frame.field(index(field)?)?.variant(&value)?)
             })?;
             Ok(frame.finish()?)
         }
-        (MessageKind::KeyFrame, FieldEncoding::DataValue) => {
+        (MessageKindJson::KeyFrame, FieldEncodingJson::DataValue) => {
             let mut frame = encoder.data_values(&header)?;
             each_field(json, |field| {
                 let bytes = data_value_bytes(&field.value)?;
-                let value = Encoded::<DataValue<'_>>::new(&bytes)?.get()?;
+                let value = Nested::<DataValue<'_>>::new(&bytes)?.get()?;
                 Ok(frame.value(&value)?)
             })?;
             Ok(frame.finish()?)
         }
-        (MessageKind::DeltaFrame, FieldEncoding::DataValue) => {
+        (MessageKindJson::DeltaFrame, FieldEncodingJson::DataValue) => {
             let mut frame = encoder.delta_data_values(&header)?;
             each_field(json, |field| {
                 let bytes = data_value_bytes(&field.value)?;
-                let value = Encoded::<DataValue<'_>>::new(&bytes)?.get()?;
+                let value = Nested::<DataValue<'_>>::new(&bytes)?.get()?;
                 Ok(frame.changed(index(field)?, &value)?)
             })?;
             Ok(frame.finish()?)
         }
-        (MessageKind::KeyFrame, FieldEncoding::RawData) => {
+        (MessageKindJson::KeyFrame, FieldEncodingJson::RawData) => {
             let payload = raw_data(json, known, reading)?;
             Ok(encoder.raw_key_frame(&header, |out| {
                 out.extend(payload);
@@ -460,7 +464,7 @@ fn write_message(
 }
 
 /// Writes the fields of a key frame or event.
-fn write_variants(json: &shape::DataSetMessage, mut frame: FieldEncoder<'_>) -> Written {
+fn write_variants(json: &shape::DataSetMessageJson, mut frame: FieldEncoder<'_>) -> Written {
     each_field(json, |field| {
         if field.index.is_some() {
             return Err(WrongValue::new(
@@ -468,7 +472,7 @@ fn write_variants(json: &shape::DataSetMessage, mut frame: FieldEncoder<'_>) -> 
             ));
         }
         let bytes = variant_bytes(&field.value)?;
-        Ok(frame.variant(&Encoded::<Variant<'_>>::new(&bytes)?.get()?)?)
+        Ok(frame.variant(&Nested::<Variant<'_>>::new(&bytes)?.get()?)?)
     })?;
     Ok(frame.finish()?)
 }
@@ -476,15 +480,15 @@ fn write_variants(json: &shape::DataSetMessage, mut frame: FieldEncoder<'_>) -> 
 /// Returns RawData, encoded by the layout in the message or the given layout, or from its
 /// hexadecimal text.
 fn raw_data(
-    json: &shape::DataSetMessage,
-    known: Option<&Layout<'_>>,
+    json: &shape::DataSetMessageJson,
+    known: Option<&RawDataLayout<'_>>,
     reading: RawReading,
 ) -> Result<Vec<u8>, WrongValue> {
     if let Some(text) = &json.raw_data_hex {
         return bytes(text).map_err(|wrong| wrong.at(".rawDataHex"));
     }
     match (&json.meta_data, known) {
-        (Some(metadata), _) => Layout::new(metadata, reading)?.write(&json.fields),
+        (Some(metadata), _) => RawDataLayout::new(metadata, reading)?.write(&json.fields),
         (None, Some(known)) => known.write(&json.fields),
         (None, None) if json.fields.is_empty() => Ok(Vec::new()),
         (None, None) => Err(WrongValue::new(
@@ -494,8 +498,8 @@ fn raw_data(
 }
 
 fn each_field(
-    json: &shape::DataSetMessage,
-    mut write: impl FnMut(&shape::Field) -> Written,
+    json: &shape::DataSetMessageJson,
+    mut write: impl FnMut(&shape::FieldJson) -> Written,
 ) -> Written {
     for (field, at) in json.fields.iter().zip(0..) {
         write(field).map_err(|wrong| wrong.at(&format!(".fields[{at}]")))?;
@@ -503,12 +507,14 @@ fn each_field(
     Ok(())
 }
 
-fn index(field: &shape::Field) -> Result<u16, WrongValue> {
+fn index(field: &shape::FieldJson) -> Result<u16, WrongValue> {
     let missing = || WrongValue::new("a field of a delta frame wants its index");
     field.index.ok_or_else(missing)
 }
 
-pub(crate) fn data_set_header(json: &shape::DataSetMessage) -> Result<DataSetHeader, WrongValue> {
+pub(crate) fn data_set_header(
+    json: &shape::DataSetMessageJson,
+) -> Result<DataSetHeader, WrongValue> {
     Ok(DataSetHeader {
         valid: json.valid,
         sequence_number: json.sequence_number,
@@ -520,10 +526,10 @@ pub(crate) fn data_set_header(json: &shape::DataSetMessage) -> Result<DataSetHea
     })
 }
 
-pub(crate) fn publisher_id(json: &shape::PublisherId) -> Result<PublisherId<'_>, WrongValue> {
+pub(crate) fn publisher_id(json: &shape::PublisherIdJson) -> Result<PublisherId<'_>, WrongValue> {
     use shape::PublisherIdType;
 
-    fn number<T: FromStr>(json: &shape::PublisherId) -> Result<T, WrongValue> {
+    fn number<T: FromStr>(json: &shape::PublisherIdJson) -> Result<T, WrongValue> {
         let text = json.value.as_str().map(str::to_owned);
         let text = text.or_else(|| json.value.as_number().map(ToString::to_string));
         let number = text.and_then(|text| text.parse().ok());
@@ -546,7 +552,7 @@ fn class_id(text: &str) -> Result<Guid, WrongValue> {
     node_ids::parse_guid(text).ok_or_else(wrong)
 }
 
-fn timestamp(json: Option<&shape::Timestamp>) -> Result<Option<DateTime>, WrongValue> {
+fn timestamp(json: Option<&shape::TimestampJson>) -> Result<Option<DateTime>, WrongValue> {
     let Some(json) = json else {
         return Ok(None);
     };

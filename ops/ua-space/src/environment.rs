@@ -8,21 +8,21 @@ use mappings::{
 };
 use serde::Serialize;
 
-use crate::arguments::{Check, Part};
-use crate::exit::Failure;
+use crate::arguments::{CheckArguments, EnvironmentPart};
+use crate::exit::CommandFailure;
 use crate::survey::{self, look};
 
 /// The queried environment, with the parts that were not available.
 #[derive(Default)]
-pub(crate) struct Seen {
+pub(crate) struct QueriedEnvironment {
     pub(crate) environment: Environment,
-    pub(crate) asked: Vec<Asked>,
+    pub(crate) asked: Vec<EnvironmentQuery>,
 }
 
 /// A queried part of the environment.
 #[derive(Debug, Serialize)]
 #[serde(rename_all = "camelCase")]
-pub(crate) struct Asked {
+pub(crate) struct EnvironmentQuery {
     /// The name of the part, as `ROS 1 master http://localhost:11311`.
     pub(crate) whom: String,
     pub(crate) there: bool,
@@ -30,25 +30,28 @@ pub(crate) struct Asked {
     pub(crate) why: Option<String>,
 }
 
-impl Seen {
+impl QueriedEnvironment {
     /// Queries the graphs of the spaces and the servers of the mapping, as selected by
     /// `--environment`.
     ///
     /// # Errors
     /// The arguments or the configuration of the environment are wrong. An unavailable part is not
     /// an error.
-    pub(crate) fn look(mapping: &Mapping, arguments: &Check) -> Result<Self, Failure> {
+    pub(crate) fn look(
+        mapping: &Mapping,
+        arguments: &CheckArguments,
+    ) -> Result<Self, CommandFailure> {
         let mut seen = Self::default();
         let wished = |part| arguments.environment.contains(&part);
         for space in mapping.spaces() {
-            if space.id == SpaceId::ROS1 && wished(Part::Ros1) {
+            if space.id == SpaceId::ROS1 && wished(EnvironmentPart::Ros1) {
                 let uri = survey::ros1::master_uri();
                 let live = look(survey::ros1::survey(&uri));
                 if let Some(live) = seen.asked(format!("ROS 1 master {uri}"), live)? {
                     seen.environment.spaces.insert(space.id, live);
                 }
             }
-            if let Some(domain) = space.domain.filter(|_| wished(Part::Ros2)) {
+            if let Some(domain) = space.domain.filter(|_| wished(EnvironmentPart::Ros2)) {
                 let wait = Duration::from_secs(arguments.wait.into());
                 let live = look(survey::ros2::survey(domain, wait));
                 if let Some(live) = seen.asked(format!("DDS domain {domain}"), live)? {
@@ -56,7 +59,7 @@ impl Seen {
                 }
             }
         }
-        if wished(Part::Opcua) {
+        if wished(EnvironmentPart::Opcua) {
             let url = mapping.server().first_endpoint().to_string();
             let server = look(survey::opcua::check(&url, mapping));
             seen.environment.server = seen.asked(format!("OPC UA server {url}"), server)?;
@@ -67,7 +70,7 @@ impl Seen {
     }
 
     /// Queries each server that has Methods of the mapping.
-    fn methods(&mut self, mapping: &Mapping) -> Result<(), Failure> {
+    fn methods(&mut self, mapping: &Mapping) -> Result<(), CommandFailure> {
         let mut by_server: BTreeMap<String, (&Access, Vec<&MethodTarget>)> = BTreeMap::new();
         for call in mapping.executed_in(SpaceId::UA) {
             if let ExecutedBy::OpcUa(target) = &call.executed {
@@ -89,7 +92,7 @@ impl Seen {
     }
 
     /// Queries each server that is a source or target of variables.
-    fn remote(&mut self, mapping: &Mapping) -> Result<(), Failure> {
+    fn remote(&mut self, mapping: &Mapping) -> Result<(), CommandFailure> {
         for server in mapping.servers() {
             let mut nodes: Vec<&ExpandedNodeIdText> = Vec::new();
             for variable in mapping.variables() {
@@ -113,13 +116,17 @@ impl Seen {
         Ok(())
     }
 
-    fn asked<T>(&mut self, whom: String, answer: Result<T, Failure>) -> Result<Option<T>, Failure> {
+    fn asked<T>(
+        &mut self,
+        whom: String,
+        answer: Result<T, CommandFailure>,
+    ) -> Result<Option<T>, CommandFailure> {
         let (there, why) = match answer {
             Ok(found) => (Some(found), None),
-            Err(Failure::Unavailable(why)) => (None, Some(why)),
+            Err(CommandFailure::Unavailable(why)) => (None, Some(why)),
             Err(other) => return Err(other),
         };
-        self.asked.push(Asked {
+        self.asked.push(EnvironmentQuery {
             whom,
             there: there.is_some(),
             why,

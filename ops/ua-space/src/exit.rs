@@ -5,7 +5,7 @@ use std::process::ExitCode;
 
 /// The reason why a command failed.
 #[derive(Debug, thiserror::Error)]
-pub(crate) enum Failure {
+pub(crate) enum CommandFailure {
     /// A malformed datagram, JSON file, key file or metadata file.
     #[error("{0}")]
     Data(String),
@@ -41,14 +41,14 @@ pub(crate) enum Failure {
     Closed,
 }
 
-impl Failure {
+impl CommandFailure {
     pub(crate) fn reading(file: &str, error: &io::Error) -> Self {
         Self::Io(format!("cannot read {file}: {error}"))
     }
 }
 
 /// Maps errors of the output.
-impl From<io::Error> for Failure {
+impl From<io::Error> for CommandFailure {
     fn from(error: io::Error) -> Self {
         if error.kind() == io::ErrorKind::BrokenPipe {
             return Self::Closed;
@@ -58,17 +58,17 @@ impl From<io::Error> for Failure {
 }
 
 /// Returns the exit code, as in `sysexits.h`.
-impl From<&Failure> for ExitCode {
-    fn from(failure: &Failure) -> Self {
+impl From<&CommandFailure> for ExitCode {
+    fn from(failure: &CommandFailure) -> Self {
         match failure {
-            Failure::Data(_) | Failure::Told => Self::from(65),
-            Failure::Configuration | Failure::Unconfigured(_) => Self::from(78),
-            Failure::Usage(_) => Self::from(USAGE),
-            Failure::Unavailable(_) | Failure::NotThere => Self::from(69),
-            Failure::Io(_) => Self::from(74),
-            Failure::Failed(_) => Self::FAILURE,
-            Failure::Interrupted => Self::from(130),
-            Failure::Closed => Self::SUCCESS,
+            CommandFailure::Data(_) | CommandFailure::Told => Self::from(65),
+            CommandFailure::Configuration | CommandFailure::Unconfigured(_) => Self::from(78),
+            CommandFailure::Usage(_) => Self::from(USAGE),
+            CommandFailure::Unavailable(_) | CommandFailure::NotThere => Self::from(69),
+            CommandFailure::Io(_) => Self::from(74),
+            CommandFailure::Failed(_) => Self::FAILURE,
+            CommandFailure::Interrupted => Self::from(130),
+            CommandFailure::Closed => Self::SUCCESS,
         }
     }
 }

@@ -6,9 +6,9 @@ use std::io::{self, BufWriter, Write as _};
 use mappings::Code;
 
 use crate::arguments::Explain;
-use crate::exit::Failure;
+use crate::exit::CommandFailure;
 
-pub(crate) fn explain(arguments: &Explain) -> Result<(), Failure> {
+pub(crate) fn explain(arguments: &Explain) -> Result<(), CommandFailure> {
     let mut out = BufWriter::new(io::stdout().lock());
     match arguments.code {
         None => {
@@ -29,7 +29,7 @@ pub(crate) fn explain(arguments: &Explain) -> Result<(), Failure> {
     Ok(out.flush()?)
 }
 
-pub(crate) fn schema() -> Result<(), Failure> {
+pub(crate) fn schema() -> Result<(), CommandFailure> {
     let mut out = io::stdout().lock();
     out.write_all(mappings::schema().as_bytes())?;
     Ok(out.flush()?)

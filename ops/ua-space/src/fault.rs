@@ -10,8 +10,8 @@ use uadp::DecodeError;
 
 /// The first fault of a part of a datagram.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) struct Fault {
-    pub(crate) place: Place,
+pub(crate) struct DecodeFault {
+    pub(crate) place: FaultLocation,
     pub(crate) error: DecodeError,
     /// The number of bytes before the fault.
     pub(crate) offset: usize,
@@ -19,7 +19,7 @@ pub(crate) struct Fault {
 
 /// The part of the datagram with the fault.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Place {
+pub(crate) enum FaultLocation {
     Headers,
     PromotedField(usize),
     Chunk,
@@ -37,12 +37,16 @@ pub(crate) struct MessagePlace {
 }
 
 /// The number of parts read before the error, and the error.
-pub(crate) type Stop = (Option<usize>, DecodeError);
+pub(crate) type PartialRead = (Option<usize>, DecodeError);
 
 /// Returns the offset of the fault in `bytes`. `read` returns the stop of similar bytes.
 ///
 /// Calls `read` at most about 40 times.
-pub(crate) fn offset(bytes: &[u8], stop: Stop, read: impl Fn(&[u8]) -> Option<Stop>) -> usize {
+pub(crate) fn offset(
+    bytes: &[u8],
+    stop: PartialRead,
+    read: impl Fn(&[u8]) -> Option<PartialRead>,
+) -> usize {
     let (_, error) = stop;
     let shorter = |end: usize| read(bytes.get(..end)?);
     if let DecodeError::Truncated { found, .. } = error
@@ -72,7 +76,7 @@ pub(crate) fn offset(bytes: &[u8], stop: Stop, read: impl Fn(&[u8]) -> Option<St
 
 /// Returns the end of the field at fault: the first position after which the bytes make no
 /// difference. The length stays the same, because counts are compared with it.
-fn end(bytes: &[u8], stop: Stop, read: &impl Fn(&[u8]) -> Option<Stop>) -> usize {
+fn end(bytes: &[u8], stop: PartialRead, read: &impl Fn(&[u8]) -> Option<PartialRead>) -> usize {
     let mut other = bytes.to_vec();
     let (mut before, mut end) = (0, bytes.len());
     while end - before > 1 {
@@ -103,26 +107,26 @@ fn width(error: DecodeError) -> usize {
 }
 
 /// Returns the stop of an error after `field` fields. Trailing bytes belong to no field.
-pub(crate) const fn in_field(field: usize, error: DecodeError) -> Stop {
+pub(crate) const fn in_field(field: usize, error: DecodeError) -> PartialRead {
     if let DecodeError::TrailingBytes(_) = error {
         return (None, error);
     }
     (Some(field), error)
 }
 
-impl fmt::Display for Fault {
+impl fmt::Display for DecodeFault {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "offset {}, ", self.offset)?;
         let mut field = None;
         match self.place {
-            Place::Headers | Place::Payload => {}
-            Place::PromotedField(index) => {
+            FaultLocation::Headers | FaultLocation::Payload => {}
+            FaultLocation::PromotedField(index) => {
                 write!(f, "in the PromotedFields, ")?;
                 field = Some(index);
             }
-            Place::Chunk => write!(f, "in the chunk, ")?,
-            Place::Discovery => write!(f, "in the discovery message, ")?,
-            Place::Message(message) => {
+            FaultLocation::Chunk => write!(f, "in the chunk, ")?,
+            FaultLocation::Discovery => write!(f, "in the discovery message, ")?,
+            FaultLocation::Message(message) => {
                 match message.writer_id {
                     Some(id) => write!(f, "in DataSetMessage of DataSetWriterId {id}, ")?,
                     None => write!(f, "in DataSetMessage, ")?,
@@ -179,7 +183,7 @@ mod tests {
     use super::*;
 
     /// Reads a UInt32, a String and a Boolean array.
-    fn read(bytes: &[u8]) -> Option<Stop> {
+    fn read(bytes: &[u8]) -> Option<PartialRead> {
         let mut reader = StructureReader::new(bytes);
         let types = [BuiltinType::UInt32, BuiltinType::String];
         for (builtin, at) in types.into_iter().zip(0..) {

@@ -7,19 +7,19 @@ use uri_text::escaped;
 
 use crate::arguments::GoalArguments;
 use crate::ask::refusal;
-use crate::exit::Failure;
-use crate::http::Server;
-use crate::live::{Table, harmless, is_coloured};
+use crate::exit::CommandFailure;
+use crate::http::HttpServer;
+use crate::live::{TextTable, harmless, is_coloured};
 use crate::survey::look;
 
 /// Runs `ua-space goal`.
-pub(crate) fn goal(arguments: &GoalArguments) -> Result<(), Failure> {
-    let server = Server::parse(&arguments.at.mes.url)?;
+pub(crate) fn goal(arguments: &GoalArguments) -> Result<(), CommandFailure> {
+    let server = HttpServer::parse(&arguments.at.mes.url)?;
     look(async {
         let path = format!("/goal/{}", escaped(&arguments.goal));
         let answer = server.get(&path).await?;
         if answer.status == 404 {
-            return Err(Failure::Usage(format!(
+            return Err(CommandFailure::Usage(format!(
                 "{}: there is no such goal; `ua-space ask goals` lists them",
                 harmless(&arguments.goal)
             )));
@@ -28,14 +28,14 @@ pub(crate) fn goal(arguments: &GoalArguments) -> Result<(), Failure> {
             return Err(refusal(&answer));
         }
         let planned: Planned = serde_json::from_str(&answer.body)
-            .map_err(|error| Failure::Data(format!("cannot read the response: {error}")))?;
+            .map_err(|error| CommandFailure::Data(format!("cannot read the response: {error}")))?;
         let mut out = io::stdout().lock();
         if arguments.json {
             let text = mappings::harmless_json(answer.body.trim_end());
             writeln!(out, "{text}")?;
         } else if planned.reachable {
             let columns = ["STEP", "ACTION", "CAPABILITY", "BECAUSE", "EFFECT"];
-            let mut table = Table::new(columns.map(str::to_owned));
+            let mut table = TextTable::new(columns.map(str::to_owned));
             for row in planned.rows() {
                 table.row(row);
             }
@@ -44,7 +44,7 @@ pub(crate) fn goal(arguments: &GoalArguments) -> Result<(), Failure> {
         if planned.reachable {
             Ok(())
         } else {
-            Err(Failure::Failed(format!(
+            Err(CommandFailure::Failed(format!(
                 "the goal cannot be reached: {}",
                 harmless(planned.reason.as_deref().unwrap_or_default())
             )))

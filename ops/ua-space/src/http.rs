@@ -10,17 +10,17 @@ use http_client::{Connection, HttpError, Method, Request};
 use tokio::net::TcpStream;
 use tokio::time::timeout;
 
-use crate::exit::Failure;
+use crate::exit::CommandFailure;
 
 /// An HTTP response.
-pub(crate) struct Answer {
+pub(crate) struct HttpResponse {
     pub(crate) status: u16,
     pub(crate) content_type: String,
     pub(crate) body: String,
 }
 
 /// A request that changes something.
-pub(crate) struct Change {
+pub(crate) struct ChangeRequest {
     pub(crate) method: &'static str,
     pub(crate) content_type: &'static str,
     pub(crate) body: Vec<u8>,
@@ -30,19 +30,19 @@ pub(crate) struct Change {
 
 /// An HTTP server: `http://host:port`, or `host:port` alone.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) struct Server {
+pub(crate) struct HttpServer {
     /// `host:port`.
     authority: String,
     /// The prefix of every path, without a slash at its end.
     prefix: String,
 }
 
-impl Server {
+impl HttpServer {
     /// Parses the URL of a server.
     ///
     /// # Errors
-    /// [`Failure::Usage`] if the URL is malformed.
-    pub(crate) fn parse(url: &str) -> Result<Self, Failure> {
+    /// [`CommandFailure::Usage`] if the URL is malformed.
+    pub(crate) fn parse(url: &str) -> Result<Self, CommandFailure> {
         let rest = url.strip_prefix("http://").unwrap_or(url);
         let (authority, path) = rest.split_once('/').unwrap_or((rest, ""));
         let (host, port) = match authority.rsplit_once(':') {
@@ -55,7 +55,7 @@ impl Server {
                 authority: format!("{host}:{port}"),
                 prefix: path.trim_end_matches('/').to_owned(),
             }),
-            Some(_) | None => Err(Failure::Usage(format!(
+            Some(_) | None => Err(CommandFailure::Usage(format!(
                 "{url}: for example http://127.0.0.1:8087"
             ))),
         }
@@ -69,8 +69,8 @@ impl Server {
     /// Requests a path, which begins with a slash.
     ///
     /// # Errors
-    /// [`Failure::Unavailable`] if the server does not respond in time.
-    pub(crate) async fn get(&self, path: &str) -> Result<Answer, Failure> {
+    /// [`CommandFailure::Unavailable`] if the server does not respond in time.
+    pub(crate) async fn get(&self, path: &str) -> Result<HttpResponse, CommandFailure> {
         self.request(Method::GET, path, (JSON, "", Bytes::new()))
             .await
     }
@@ -79,7 +79,7 @@ impl Server {
     ///
     /// # Errors
     /// See [`get`](Self::get).
-    pub(crate) async fn get_turtle(&self, path: &str) -> Result<Answer, Failure> {
+    pub(crate) async fn get_turtle(&self, path: &str) -> Result<HttpResponse, CommandFailure> {
         self.request(Method::GET, path, ("text/turtle", "", Bytes::new()))
             .await
     }
@@ -88,7 +88,11 @@ impl Server {
     ///
     /// # Errors
     /// See [`get`](Self::get).
-    pub(crate) async fn query(&self, path: &str, query: String) -> Result<Answer, Failure> {
+    pub(crate) async fn query(
+        &self,
+        path: &str,
+        query: String,
+    ) -> Result<HttpResponse, CommandFailure> {
         let content = (RESULTS, "application/sparql-query", query.into());
         self.request(Method::POST, path, content).await
     }
@@ -97,9 +101,13 @@ impl Server {
     ///
     /// # Errors
     /// See [`get`](Self::get).
-    pub(crate) async fn change(&self, path: &str, change: Change) -> Result<Answer, Failure> {
+    pub(crate) async fn change(
+        &self,
+        path: &str,
+        change: ChangeRequest,
+    ) -> Result<HttpResponse, CommandFailure> {
         let method = Method::from_bytes(change.method.as_bytes())
-            .map_err(|error| Failure::Usage(error.to_string()))?;
+            .map_err(|error| CommandFailure::Usage(error.to_string()))?;
         let content = (JSON, change.content_type, change.body.into());
         let user = change.user.map(|(name, password)| {
             let encoded = STANDARD.encode(format!("{name}:{password}"));
@@ -114,7 +122,7 @@ impl Server {
         method: Method,
         path: &str,
         content: (&str, &str, Bytes),
-    ) -> Result<Answer, Failure> {
+    ) -> Result<HttpResponse, CommandFailure> {
         self.request_as(method, path, content, (None, LIMIT)).await
     }
 
@@ -124,12 +132,12 @@ impl Server {
         path: &str,
         content: (&str, &str, Bytes),
         (user, limit): (Option<String>, Duration),
-    ) -> Result<Answer, Failure> {
+    ) -> Result<HttpResponse, CommandFailure> {
         let asked = timeout(limit, self.asked(method, path, content, user)).await;
         let answer = asked.unwrap_or_else(|_| Err(format!("no answer within {limit:?}")));
         answer.map_err(|why| {
             let help = "is it running, and is this its address?";
-            Failure::Unavailable(format!(
+            CommandFailure::Unavailable(format!(
                 "http://{}: {why}\n  = help: {help}",
                 self.authority
             ))
@@ -142,7 +150,7 @@ impl Server {
         path: &str,
         (accept, content_type, body): (&str, &str, Bytes),
         user: Option<String>,
-    ) -> Result<Answer, String> {
+    ) -> Result<HttpResponse, String> {
         let stream = TcpStream::connect(&self.authority)
             .await
             .map_err(|error| format!("cannot connect to {} ({error})", self.authority))?;
@@ -172,7 +180,7 @@ impl Server {
             Err(wrong) if is_protobuf => String::from_utf8_lossy(wrong.as_bytes()).into_owned(),
             Err(_) => return Err("an answer that is no text".to_owned()),
         };
-        Ok(Answer {
+        Ok(HttpResponse {
             status,
             content_type,
             body,
@@ -204,7 +212,8 @@ mod tests {
 
     #[test]
     fn a_server_is_an_url_or_an_address() {
-        let of = |url: &str| Server::parse(url).map(|it| (it.authority.clone(), it.prefix_path()));
+        let of =
+            |url: &str| HttpServer::parse(url).map(|it| (it.authority.clone(), it.prefix_path()));
         for url in [
             "http://127.0.0.1:9100",
             "127.0.0.1:9100",

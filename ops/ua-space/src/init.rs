@@ -21,15 +21,15 @@ use serde::Serialize;
 use type_files::Disk;
 
 use crate::arguments::Init;
-use crate::discover::{self, Kind};
-use crate::exit::Failure;
+use crate::discover::{self, DiscoveredKind};
+use crate::exit::CommandFailure;
 use crate::report;
-use crate::survey::model::Model;
-use crate::survey::{self, Graph, Nodes, look};
-use known::Known;
-use plan::{Plan, Wishes};
+use crate::survey::model::NodeModel;
+use crate::survey::{self, SurveyedGraph, SurveyedNodes, look};
+use known::OldMapping;
+use plan::{Proposal, Wishes};
 
-pub(crate) fn init(arguments: &Init) -> Result<(), Failure> {
+pub(crate) fn init(arguments: &Init) -> Result<(), CommandFailure> {
     let asked = [
         arguments.ros1.is_none(),
         arguments.ros2.is_empty(),
@@ -39,7 +39,7 @@ pub(crate) fn init(arguments: &Init) -> Result<(), Failure> {
         !arguments.discover,
     ];
     if asked.iter().all(|nothing| *nothing) {
-        return Err(Failure::Usage(
+        return Err(CommandFailure::Usage(
             "nothing to look at: give one or several of --ros1, --ros2, --nodeset FILE, --model FILE, \
              --opcua URL, --discover"
                 .to_owned(),
@@ -50,15 +50,15 @@ pub(crate) fn init(arguments: &Init) -> Result<(), Failure> {
         None => None,
     };
     let mut known = match &existing {
-        Some((mapping, text)) => Known::of(mapping.clone(), text),
-        None => Known::default(),
+        Some((mapping, text)) => OldMapping::of(mapping.clone(), text),
+        None => OldMapping::default(),
     };
-    let found = Found::look(arguments, &known.mapping)?;
+    let found = InspectedSources::look(arguments, &known.mapping)?;
     let wishes = Wishes {
         namespace: &arguments.namespace,
         transforms: arguments.tf,
     };
-    let mut plan = Plan::new(
+    let mut plan = Proposal::new(
         &found.models,
         &found.graphs,
         &found.nodes,
@@ -79,16 +79,16 @@ pub(crate) fn init(arguments: &Init) -> Result<(), Failure> {
 }
 
 /// The inspected sources.
-struct Found {
-    models: Vec<Model>,
-    graphs: Vec<Graph>,
-    nodes: Vec<Nodes>,
+struct InspectedSources {
+    models: Vec<NodeModel>,
+    graphs: Vec<SurveyedGraph>,
+    nodes: Vec<SurveyedNodes>,
     /// The names of the sources for the head of the file, in order.
     places: Vec<String>,
 }
 
-impl Found {
-    fn look(arguments: &Init, known: &Mapping) -> Result<Self, Failure> {
+impl InspectedSources {
+    fn look(arguments: &Init, known: &Mapping) -> Result<Self, CommandFailure> {
         let mut found = Self {
             models: Vec::new(),
             graphs: Vec::new(),
@@ -104,7 +104,7 @@ impl Found {
             let uri = uri.clone().unwrap_or_else(survey::ros1::master_uri);
             let live = look(survey::ros1::survey(&uri))?;
             found.places.push(format!("ROS 1 master {uri}"));
-            found.graphs.push(Graph {
+            found.graphs.push(SurveyedGraph {
                 space: SpaceId::ROS1,
                 domain: None,
                 live,
@@ -130,12 +130,12 @@ impl Found {
 
     /// Adds the discovered sources that were not named in the arguments. Sources that cannot be
     /// inspected are named in the head of the file.
-    fn discover(&mut self, arguments: &Init, known: &Mapping) -> Result<(), Failure> {
+    fn discover(&mut self, arguments: &Init, known: &Mapping) -> Result<(), CommandFailure> {
         if arguments.ros1.is_none() {
             let uri = survey::ros1::master_uri();
             if let Ok(live) = look(survey::ros1::survey(&uri)) {
                 self.places.push(format!("ROS 1 master {uri}"));
-                self.graphs.push(Graph {
+                self.graphs.push(SurveyedGraph {
                     space: SpaceId::ROS1,
                     domain: None,
                     live,
@@ -154,7 +154,7 @@ impl Found {
         }
         for entry in look(discover::around(&arguments.look))?.entries {
             // Components and bridges take part in the space without a mapping.
-            let is_source = matches!(entry.kind, Kind::Server | Kind::Cell);
+            let is_source = matches!(entry.kind, DiscoveredKind::Server | DiscoveredKind::Cell);
             let Some(url) = entry.urls.first().filter(|_| is_source) else {
                 continue;
             };
@@ -178,21 +178,21 @@ impl Found {
 
     fn domain(&mut self, domain: u16, space: SpaceId, live: LiveSpace) {
         self.places.push(format!("DDS domain {domain}"));
-        self.graphs.push(Graph {
+        self.graphs.push(SurveyedGraph {
             space,
             domain: Some(domain),
             live,
         });
     }
 
-    fn add(&mut self, nodes: Nodes) {
+    fn add(&mut self, nodes: SurveyedNodes) {
         self.places.push(nodes.place.clone());
         self.nodes.push(nodes);
     }
 }
 
 /// Returns the requested domains in ascending order, without duplicates.
-fn domains(asked: &[Option<u16>]) -> Result<Vec<u16>, Failure> {
+fn domains(asked: &[Option<u16>]) -> Result<Vec<u16>, CommandFailure> {
     let mut domains = Vec::new();
     for asked in asked {
         let variable = std::env::var("ROS_DOMAIN_ID").ok();
@@ -204,7 +204,7 @@ fn domains(asked: &[Option<u16>]) -> Result<Vec<u16>, Failure> {
                 .ok()
                 .filter(|domain| *domain <= 232)
                 .ok_or_else(|| {
-                    Failure::Usage(format!("ROS_DOMAIN_ID is `{text}`: it is 0 to 232"))
+                    CommandFailure::Usage(format!("ROS_DOMAIN_ID is `{text}`: it is 0 to 232"))
                 })?,
         };
         if !domains.contains(&domain) {
@@ -217,7 +217,11 @@ fn domains(asked: &[Option<u16>]) -> Result<Vec<u16>, Failure> {
 
 /// Returns the space of a domain: its space in the mapping, the space with its number, or a free
 /// space for domains 0 and 1.
-fn space_of(domain: u16, known: &Mapping, graphs: &[Graph]) -> Result<SpaceId, Failure> {
+fn space_of(
+    domain: u16,
+    known: &Mapping,
+    graphs: &[SurveyedGraph],
+) -> Result<SpaceId, CommandFailure> {
     let taken = |space: &SpaceId| graphs.iter().any(|graph| graph.space == *space);
     if let Some(space) = known.space_of_domain(domain).filter(|space| !taken(space)) {
         return Ok(space);
@@ -227,23 +231,24 @@ fn space_of(domain: u16, known: &Mapping, graphs: &[Graph]) -> Result<SpaceId, F
         .chain(2..FIRST_FREE)
         .filter_map(SpaceId::new);
     spaces.find(free).ok_or_else(|| {
-        Failure::Unconfigured("no ROS 2 space is left for another domain".to_owned())
+        CommandFailure::Unconfigured("no ROS 2 space is left for another domain".to_owned())
     })
 }
 
 /// Reads the mapping in the file; `None` if the file does not exist.
-fn existing(file: &str) -> Result<Option<(Mapping, String)>, Failure> {
+fn existing(file: &str) -> Result<Option<(Mapping, String)>, CommandFailure> {
     let bytes = match bytes_of(file) {
         Ok(bytes) => bytes,
         Err(error) if error.kind() == ErrorKind::NotFound => return Ok(None),
-        Err(error) => return Err(Failure::reading(file, &error)),
+        Err(error) => return Err(CommandFailure::reading(file, &error)),
     };
-    let text = String::from_utf8(bytes)
-        .map_err(|_| Failure::Io(format!("{file} is there and is no text; it stays as it is")))?;
+    let text = String::from_utf8(bytes).map_err(|_| {
+        CommandFailure::Io(format!("{file} is there and is no text; it stays as it is"))
+    })?;
     let mut checked = Mapping::from_text(&text, file, &Disk);
     match checked.mapping.take() {
         Some(mapping) => Ok(Some((mapping, text))),
-        None => Err(Failure::Unconfigured(format!(
+        None => Err(CommandFailure::Unconfigured(format!(
             "{}\n{file} is there and cannot run, so nothing is added to it; it stays as it is",
             checked.render_all().trim_end()
         ))),
@@ -257,7 +262,7 @@ fn bytes_of(file: &str) -> io::Result<Vec<u8>> {
 }
 
 /// Returns a new document.
-fn written(file: &str, places: &[String], plan: &mut Plan) -> Result<String, Failure> {
+fn written(file: &str, places: &[String], plan: &mut Proposal) -> Result<String, CommandFailure> {
     settled(file, plan, |plan| {
         let mut lines = render::head(places);
         let spaces = "The ROS sides. 1 is ROS 1, others are DDS domains; 0, the OPC UA side, is always there.";
@@ -323,7 +328,11 @@ fn section(lines: &mut Vec<String>, title: &str, key: &str, block: Vec<String>) 
 }
 
 /// Returns the document with the new entries added.
-fn added(file: &str, (text, before): (&str, &Mapping), plan: &mut Plan) -> Result<String, Failure> {
+fn added(
+    file: &str,
+    (text, before): (&str, &Mapping),
+    plan: &mut Proposal,
+) -> Result<String, CommandFailure> {
     let merged = settled(file, plan, |plan| {
         let mut merged = text.to_owned();
         let indent = |key: &str| merge::indent(text, key);
@@ -374,8 +383,8 @@ fn added(file: &str, (text, before): (&str, &Mapping), plan: &mut Plan) -> Resul
     if kept { Ok(merged) } else { Err(unmergeable()) }
 }
 
-fn unmergeable() -> Failure {
-    Failure::Unconfigured(
+fn unmergeable() -> CommandFailure {
+    CommandFailure::Unconfigured(
         "nothing can be put into the file as it is written: have each of `spaces`, `namespaces`, `servers`, `variables` and `calls` \
          on lines of their own below the key, not in brackets or braces; it stays as it is"
             .to_owned(),
@@ -392,7 +401,7 @@ struct Rendered {
 
 impl Rendered {
     /// Comments out the entry with the finding. Returns true if an active entry was found.
-    fn mark(&self, finding: &Diagnostic, plan: &mut Plan) -> bool {
+    fn mark(&self, finding: &Diagnostic, plan: &mut Proposal) -> bool {
         let line = finding.at.line.saturating_sub(1);
         let within = |(start, entries): &(usize, Vec<Range<usize>>)| {
             let at = line.checked_sub(*start)?;
@@ -432,9 +441,9 @@ fn why(finding: &Diagnostic, origin: SpaceId) -> String {
 /// Renders until no entry has a finding. Entries with a finding become comments with its text.
 fn settled(
     file: &str,
-    plan: &mut Plan,
-    render: impl Fn(&Plan) -> Option<Rendered>,
-) -> Result<String, Failure> {
+    plan: &mut Proposal,
+    render: impl Fn(&Proposal) -> Option<Rendered>,
+) -> Result<String, CommandFailure> {
     loop {
         let rendered = render(plan).ok_or_else(unmergeable)?;
         let Checked {
@@ -455,7 +464,7 @@ fn settled(
         }
         // For example, the document is too large.
         return match (mapping, findings.first()) {
-            (None, Some(first)) => Err(Failure::Unconfigured(format!(
+            (None, Some(first)) => Err(CommandFailure::Unconfigured(format!(
                 "what would be written could not run: {}",
                 first.message
             ))),
@@ -464,7 +473,12 @@ fn settled(
     }
 }
 
-fn put(arguments: &Init, before: Option<&str>, text: &str, plan: &Plan) -> Result<(), Failure> {
+fn put(
+    arguments: &Init,
+    before: Option<&str>,
+    text: &str,
+    plan: &Proposal,
+) -> Result<(), CommandFailure> {
     let Some(file) = &arguments.output else {
         let mut out = io::stdout().lock();
         out.write_all(text.as_bytes())?;
@@ -477,7 +491,7 @@ fn put(arguments: &Init, before: Option<&str>, text: &str, plan: &Plan) -> Resul
         Some(before) if before == text => {}
         Some(before) if arguments.merge => replace(file, before, text)?,
         Some(_) => {
-            return Err(Failure::Io(format!(
+            return Err(CommandFailure::Io(format!(
                 "{file} is there and stays as it is: {} would be new in it. Say --merge to add them, or choose another \
                  file",
                 sum.counts()
@@ -501,10 +515,10 @@ fn put(arguments: &Init, before: Option<&str>, text: &str, plan: &Plan) -> Resul
 
 /// Replaces the text of the file atomically and keeps its permissions. Fails if the file was
 /// changed during the survey.
-fn replace(file: &str, before: &str, text: &str) -> Result<(), Failure> {
-    let now = bytes_of(file).map_err(|error| Failure::reading(file, &error))?;
+fn replace(file: &str, before: &str, text: &str) -> Result<(), CommandFailure> {
+    let now = bytes_of(file).map_err(|error| CommandFailure::reading(file, &error))?;
     if now != before.as_bytes() {
-        return Err(Failure::Io(format!(
+        return Err(CommandFailure::Io(format!(
             "{file} was changed while this looked around; it stays as it is now: say the same again"
         )));
     }
@@ -549,8 +563,8 @@ fn beside(target: &Path) -> PathBuf {
     target.with_file_name(name)
 }
 
-fn cannot_write(file: &str, error: &io::Error) -> Failure {
-    Failure::Io(format!("cannot write {file}: {error}"))
+fn cannot_write(file: &str, error: &io::Error) -> CommandFailure {
+    CommandFailure::Io(format!("cannot write {file}: {error}"))
 }
 
 /// The summary of the written mapping.
@@ -567,7 +581,7 @@ struct Sum<'a> {
 }
 
 impl<'a> Sum<'a> {
-    fn of(file: &'a str, plan: &Plan, changed: bool) -> Self {
+    fn of(file: &'a str, plan: &Proposal, changed: bool) -> Self {
         let active = || plan.entries.iter().filter(|entry| entry.faulty.is_none());
         let calls = plan.calls.iter().filter(|call| call.faulty.is_none());
         let calls = calls.count();

@@ -3,25 +3,25 @@
 use std::fs::File;
 use std::io::{self, BufReader, Read};
 
-use crate::capture::{Capture, CaptureError, is_capture};
-use crate::exit::Failure;
+use crate::capture::{CaptureError, CaptureReader, is_capture};
+use crate::exit::CommandFailure;
 use crate::hex;
 use crate::recorded::is_mcap;
 
 /// A file with its detected format.
-pub(crate) enum Input {
+pub(crate) enum InputFile {
     /// One datagram, as hexadecimal text or as bytes.
     Datagram(Vec<u8>),
     /// One datagram per line, each with its line number.
     Lines(Vec<(usize, Vec<u8>)>),
-    Capture(Capture<Box<dyn Read>>),
+    Capture(CaptureReader<Box<dyn Read>>),
     /// An MCAP file, after its first four bytes.
     Mcap(Box<dyn Read>),
 }
 
 /// Opens a file, `-` for stdin. With `lines`, every line of hexadecimal text is a datagram.
-pub(crate) fn open(file: &str, lines: bool) -> Result<Input, Failure> {
-    let reading = |error: io::Error| Failure::reading(name(file), &error);
+pub(crate) fn open(file: &str, lines: bool) -> Result<InputFile, CommandFailure> {
+    let reading = |error: io::Error| CommandFailure::reading(name(file), &error);
     let mut reader: Box<dyn Read> = match file {
         "-" => Box::new(io::stdin().lock()),
         path => Box::new(BufReader::new(File::open(path).map_err(reading)?)),
@@ -33,26 +33,26 @@ pub(crate) fn open(file: &str, lines: bool) -> Result<Input, Failure> {
         .read_to_end(&mut start)
         .map_err(reading)?;
     if start.first_chunk().copied().is_some_and(is_mcap) {
-        return Ok(Input::Mcap(reader));
+        return Ok(InputFile::Mcap(reader));
     }
     if let Some(magic) = start
         .first_chunk()
         .copied()
         .filter(|magic| is_capture(*magic))
     {
-        let capture = Capture::new(magic, reader).map_err(|error| failure(file, error))?;
-        return Ok(Input::Capture(capture));
+        let capture = CaptureReader::new(magic, reader).map_err(|error| failure(file, error))?;
+        return Ok(InputFile::Capture(capture));
     }
     let mut bytes = start;
     reader
         .take(MAX_BYTES)
         .read_to_end(&mut bytes)
         .map_err(reading)?;
-    let wrong = |what: String| Failure::Data(format!("{}: {what}", name(file)));
+    let wrong = |what: String| CommandFailure::Data(format!("{}: {what}", name(file)));
     match text(&bytes) {
         _ if bytes.iter().all(u8::is_ascii_whitespace) => Err(wrong("empty".to_owned())),
         None if lines => Err(wrong("no text, so --lines has no lines".to_owned())),
-        None => Ok(Input::Datagram(bytes)),
+        None => Ok(InputFile::Datagram(bytes)),
         Some(text) if text.trim_start().starts_with(['{', '[']) => {
             let hint = "this is JSON; `ua-space encode` makes datagrams of it";
             Err(wrong(hint.to_owned()))
@@ -60,20 +60,20 @@ pub(crate) fn open(file: &str, lines: bool) -> Result<Input, Failure> {
         Some(text) if lines => read_lines(text).map_err(|error| wrong(error.to_string())),
         Some(text) => match hex::parse(text) {
             Ok(bytes) if bytes.is_empty() => Err(wrong("no hexadecimal digits".to_owned())),
-            Ok(bytes) => Ok(Input::Datagram(bytes)),
+            Ok(bytes) => Ok(InputFile::Datagram(bytes)),
             Err(error) => Err(wrong(error.to_string())),
         },
     }
 }
 
 /// Reads a whole file, `-` for stdin. The rest of a very large file is left out.
-pub(crate) fn read(file: &str) -> Result<Vec<u8>, Failure> {
+pub(crate) fn read(file: &str) -> Result<Vec<u8>, CommandFailure> {
     let mut bytes = Vec::new();
     let read = match file {
         "-" => io::stdin().lock().take(LARGEST).read_to_end(&mut bytes),
         path => File::open(path).and_then(|file| file.take(LARGEST).read_to_end(&mut bytes)),
     };
-    read.map_err(|error| Failure::reading(name(file), &error))?;
+    read.map_err(|error| CommandFailure::reading(name(file), &error))?;
     Ok(bytes)
 }
 
@@ -86,11 +86,11 @@ pub(crate) fn name(file: &str) -> &str {
 }
 
 /// Returns the failure for an error of a capture.
-pub(crate) fn failure(file: &str, error: CaptureError) -> Failure {
+pub(crate) fn failure(file: &str, error: CaptureError) -> CommandFailure {
     match error {
-        CaptureError::Io(error) => Failure::reading(name(file), &error),
+        CaptureError::Io(error) => CommandFailure::reading(name(file), &error),
         error @ (CaptureError::CutOff(_) | CaptureError::Broken { .. }) => {
-            Failure::Data(format!("{}: {error}", name(file)))
+            CommandFailure::Data(format!("{}: {error}", name(file)))
         }
     }
 }
@@ -106,7 +106,7 @@ fn text(bytes: &[u8]) -> Option<&str> {
     }
 }
 
-fn read_lines(text: &str) -> Result<Input, hex::HexError> {
+fn read_lines(text: &str) -> Result<InputFile, hex::HexError> {
     let mut datagrams = Vec::new();
     for (line, number) in text.lines().zip(1..) {
         let mut datagram = Vec::new();
@@ -115,7 +115,7 @@ fn read_lines(text: &str) -> Result<Input, hex::HexError> {
             datagrams.push((number, datagram));
         }
     }
-    Ok(Input::Lines(datagrams))
+    Ok(InputFile::Lines(datagrams))
 }
 
 /// Maximum size of a datagram file with its comments, in bytes.

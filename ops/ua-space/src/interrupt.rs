@@ -2,23 +2,24 @@
 
 use tokio::signal::unix::{Signal, SignalKind, signal};
 
-use crate::exit::Failure;
+use crate::exit::CommandFailure;
 
 /// SIGINT and SIGTERM, which do not end the process while this value exists.
 #[derive(Debug)]
-pub(crate) struct Interrupt {
+pub(crate) struct SignalGuard {
     interrupt: Signal,
     terminate: Signal,
 }
 
-impl Interrupt {
+impl SignalGuard {
     /// Catches the signals from here on.
     ///
     /// # Errors
-    /// [`Failure::Io`] if the signals cannot be caught.
-    pub(crate) fn catch() -> Result<Self, Failure> {
+    /// [`CommandFailure::Io`] if the signals cannot be caught.
+    pub(crate) fn catch() -> Result<Self, CommandFailure> {
         let on = |kind| {
-            signal(kind).map_err(|error| Failure::Io(format!("cannot catch signals: {error}")))
+            signal(kind)
+                .map_err(|error| CommandFailure::Io(format!("cannot catch signals: {error}")))
         };
         Ok(Self {
             interrupt: on(SignalKind::interrupt())?,

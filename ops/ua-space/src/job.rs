@@ -7,15 +7,15 @@ use serde::Deserialize;
 
 use crate::arguments::{JobArguments, JobVerb, SourceAt};
 use crate::ask::refusal;
-use crate::exit::Failure;
-use crate::http::Server;
-use crate::live::{Table, harmless, is_coloured};
+use crate::exit::CommandFailure;
+use crate::http::HttpServer;
+use crate::live::{TextTable, harmless, is_coloured};
 use crate::report::say;
 use crate::source::change;
 use crate::survey::look;
 
 /// Runs `ua-space job`.
-pub(crate) fn job(arguments: &JobArguments) -> Result<(), Failure> {
+pub(crate) fn job(arguments: &JobArguments) -> Result<(), CommandFailure> {
     match &arguments.verb {
         JobVerb::Start { process, wait, at } => {
             let body = serde_json::json!({ "process": process }).to_string();
@@ -91,22 +91,22 @@ impl Job {
     }
 
     /// Returns how `--wait` ends, if the job has ended.
-    fn end(&self) -> Option<Result<(), Failure>> {
+    fn end(&self) -> Option<Result<(), CommandFailure>> {
         match self.outcome.as_str() {
             "running" => None,
             "done" => Some(Ok(())),
-            "unknown" => Some(Err(Failure::Unavailable(harmless(&self.line())))),
-            _ => Some(Err(Failure::Failed(harmless(&self.line())))),
+            "unknown" => Some(Err(CommandFailure::Unavailable(harmless(&self.line())))),
+            _ => Some(Err(CommandFailure::Failed(harmless(&self.line())))),
         }
     }
 }
 
-fn read<'a, T: Deserialize<'a>>(body: &'a str) -> Result<T, Failure> {
+fn read<'a, T: Deserialize<'a>>(body: &'a str) -> Result<T, CommandFailure> {
     serde_json::from_str(body)
-        .map_err(|error| Failure::Data(format!("cannot read the response: {error}")))
+        .map_err(|error| CommandFailure::Data(format!("cannot read the response: {error}")))
 }
 
-async fn jobs(server: &Server) -> Result<(String, Vec<Job>), Failure> {
+async fn jobs(server: &HttpServer) -> Result<(String, Vec<Job>), CommandFailure> {
     let answer = server.get("/jobs").await?;
     if answer.status != 200 {
         return Err(refusal(&answer));
@@ -116,14 +116,15 @@ async fn jobs(server: &Server) -> Result<(String, Vec<Job>), Failure> {
 }
 
 /// Prints the changes of a job until it ends.
-fn follow(number: u64, at: &SourceAt) -> Result<(), Failure> {
-    let server = Server::parse(&at.mes.url)?;
+fn follow(number: u64, at: &SourceAt) -> Result<(), CommandFailure> {
+    let server = HttpServer::parse(&at.mes.url)?;
     look(async {
         let mut last = None;
         loop {
             let (_, jobs) = jobs(&server).await?;
             let job = jobs.into_iter().find(|job| job.job == number);
-            let job = job.ok_or_else(|| Failure::Unavailable(format!("job {number} is gone")))?;
+            let job =
+                job.ok_or_else(|| CommandFailure::Unavailable(format!("job {number} is gone")))?;
             if let Some(end) = job.end() {
                 if end.is_ok() {
                     say(&job.line())?;
@@ -139,8 +140,8 @@ fn follow(number: u64, at: &SourceAt) -> Result<(), Failure> {
     })
 }
 
-fn list(json: bool, at: &SourceAt) -> Result<(), Failure> {
-    let server = Server::parse(&at.mes.url)?;
+fn list(json: bool, at: &SourceAt) -> Result<(), CommandFailure> {
+    let server = HttpServer::parse(&at.mes.url)?;
     look(async {
         let (body, jobs) = jobs(&server).await?;
         let mut out = io::stdout().lock();
@@ -149,7 +150,7 @@ fn list(json: bool, at: &SourceAt) -> Result<(), Failure> {
             return Ok(());
         }
         let columns = ["JOB", "PROCESS", "OUTCOME", "STEP", "REMARK"];
-        let mut table = Table::new(columns.map(str::to_owned));
+        let mut table = TextTable::new(columns.map(str::to_owned));
         for job in &jobs {
             table.row([
                 job.job.to_string(),
@@ -190,13 +191,16 @@ mod tests {
         assert!(matches!(job("done", None).end(), Some(Ok(()))));
         assert!(matches!(
             job("failed", None).end(),
-            Some(Err(Failure::Failed(_)))
+            Some(Err(CommandFailure::Failed(_)))
         ));
         let mut unknown = job("unknown", None);
         unknown.reason = Some("no answer".to_owned());
         unknown.holds = vec!["urn:gripper".to_owned()];
         let expected = "job 7: unknown: no answer; no other job may use urn:gripper before `ua-space job stop 7`";
         assert_eq!(unknown.line(), expected);
-        assert!(matches!(unknown.end(), Some(Err(Failure::Unavailable(_)))));
+        assert!(matches!(
+            unknown.end(),
+            Some(Err(CommandFailure::Unavailable(_)))
+        ));
     }
 }

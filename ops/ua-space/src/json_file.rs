@@ -5,14 +5,15 @@ use std::path::Path;
 use serde::de::DeserializeOwned;
 use serde_json::Deserializer;
 
-use crate::exit::Failure;
+use crate::exit::CommandFailure;
 
 /// Returns the text of a file.
-pub(crate) fn read(path: &Path) -> Result<String, Failure> {
+pub(crate) fn read(path: &Path) -> Result<String, CommandFailure> {
     let name = path.display().to_string();
     let bytes = type_files::read_bounded(path, LARGEST)
-        .map_err(|why| Failure::Io(format!("cannot read {name}: {why}")))?;
-    String::from_utf8(bytes).map_err(|_| Failure::Data(format!("{name}: not UTF-8, so no JSON")))
+        .map_err(|why| CommandFailure::Io(format!("cannot read {name}: {why}")))?;
+    String::from_utf8(bytes)
+        .map_err(|_| CommandFailure::Data(format!("{name}: not UTF-8, so no JSON")))
 }
 
 /// Maximum size of a file or input, in bytes.
@@ -27,7 +28,7 @@ pub(crate) fn one_or_many<T: DeserializeOwned>(text: &str) -> Result<Vec<T>, ser
 }
 
 /// Returns the failure for invalid JSON, without the list of expected keys.
-pub(crate) fn explain(name: &str, error: &serde_json::Error) -> Failure {
+pub(crate) fn explain(name: &str, error: &serde_json::Error) -> CommandFailure {
     let text = error.to_string();
     let (what, place) = match text.rsplit_once(" at line ") {
         Some((what, place)) => (what, format!(" at line {place}")),
@@ -37,7 +38,7 @@ pub(crate) fn explain(name: &str, error: &serde_json::Error) -> Failure {
         Some((what, _)) if what.starts_with("unknown field") => what,
         _ => what,
     };
-    Failure::Data(format!("{name}: {what}{place}"))
+    CommandFailure::Data(format!("{name}: {what}{place}"))
 }
 
 #[cfg(test)]
@@ -60,12 +61,12 @@ mod tests {
             explain("a.json", &error).to_string(),
             "a.json: invalid type: string \"x\", expected u8 at line 2 column 3"
         );
-        let error = one_or_many::<shape::PublisherId>("{\"typ\": 1}").unwrap_err();
+        let error = one_or_many::<shape::PublisherIdJson>("{\"typ\": 1}").unwrap_err();
         assert_eq!(
             explain("a.json", &error).to_string(),
             "a.json: unknown field `typ`, expected `type` or `value` at line 1 column 6"
         );
-        let error = one_or_many::<shape::Datagram>("\n{\"publisher\": 1}").unwrap_err();
+        let error = one_or_many::<shape::DatagramJson>("\n{\"publisher\": 1}").unwrap_err();
         assert_eq!(
             explain("a.json", &error).to_string(),
             "a.json: unknown field `publisher` at line 2 column 12"

@@ -6,10 +6,10 @@ use std::time::Duration;
 
 use serde::Deserialize;
 use serde::de::IgnoredAny;
-use uadp::{Keys, NetworkMessage, Opener, SecurityError, SecurityMode, SecurityPolicy};
+use uadp::{NetworkMessage, Opener, SecurityError, SecurityMode, SecurityPolicy, TokenKeys};
 
-use crate::exit::Failure;
-use crate::shape::PublisherId;
+use crate::exit::CommandFailure;
+use crate::shape::PublisherIdJson;
 use crate::{hex, json_file, selector};
 
 /// The keys of a file.
@@ -22,7 +22,7 @@ pub(crate) struct KeyFile {
 #[derive(Debug)]
 struct Entry {
     written: Written,
-    keys: Keys,
+    keys: TokenKeys,
 }
 
 /// The parts of a key of a SecurityGroup; texts are hexadecimal.
@@ -36,7 +36,7 @@ struct Written {
     encrypting_key: String,
     key_nonce: String,
     /// Limits the key to this publisher and WriterGroup.
-    publisher_id: Option<selector::Publisher>,
+    publisher_id: Option<selector::PublisherSelector>,
     writer_group_id: Option<u16>,
     /// Keys of test vectors that are ignored: values that the messages contain, and expected
     /// results.
@@ -56,7 +56,7 @@ struct Written {
 
 impl KeyFile {
     /// Reads the keys; warns if other users can read the file.
-    pub(crate) fn read(path: &Path, warn: impl FnOnce(&str)) -> Result<Self, Failure> {
+    pub(crate) fn read(path: &Path, warn: impl FnOnce(&str)) -> Result<Self, CommandFailure> {
         let name = path.display().to_string();
         let text = json_file::read(path)?;
         if let Some(mode) = others_may_read(path) {
@@ -69,7 +69,8 @@ impl KeyFile {
         let mut entries = Vec::new();
         for (written, at) in written.into_iter().zip(0..) {
             let keys = written.keys();
-            let keys = keys.map_err(|error| Failure::Data(format!("{name}: key {at}: {error}")))?;
+            let keys =
+                keys.map_err(|error| CommandFailure::Data(format!("{name}: key {at}: {error}")))?;
             entries.push(Entry { written, keys });
         }
         Ok(Self { name, entries })
@@ -78,7 +79,7 @@ impl KeyFile {
     /// Returns all keys that match the signature of a sealed message, at least one.
     ///
     /// Each message is verified independently, so a message that was sent twice is shown twice.
-    pub(crate) fn find(&self, message: &NetworkMessage<'_>) -> Result<Vec<&Keys>, String> {
+    pub(crate) fn find(&self, message: &NetworkMessage<'_>) -> Result<Vec<&TokenKeys>, String> {
         let token_id = message.security().map_or(0, |security| security.token_id);
         let mut found = Vec::new();
         let mut why = None;
@@ -108,15 +109,15 @@ impl KeyFile {
     pub(crate) fn of(
         &self,
         token_id: u32,
-        publisher_id: Option<&PublisherId>,
+        publisher_id: Option<&PublisherIdJson>,
         writer_group_id: Option<u16>,
-    ) -> Option<&Keys> {
+    ) -> Option<&TokenKeys> {
         let wanted = |entry: &&Entry| entry.is_of(token_id, publisher_id, writer_group_id);
         self.entries.iter().find(wanted).map(|entry| &entry.keys)
     }
 
     /// Returns the first key, with its SecurityTokenId.
-    pub(crate) fn first(&self) -> Option<(u32, &Keys)> {
+    pub(crate) fn first(&self) -> Option<(u32, &TokenKeys)> {
         let first = self.entries.first()?;
         Some((first.written.security_token_id, &first.keys))
     }
@@ -127,17 +128,17 @@ impl KeyFile {
 }
 
 /// Fills `bytes` with random bytes.
-pub(crate) fn random(bytes: &mut [u8]) -> Result<(), Failure> {
+pub(crate) fn random(bytes: &mut [u8]) -> Result<(), CommandFailure> {
     std::fs::File::open(RANDOM)
         .and_then(|mut random| random.read_exact(bytes))
-        .map_err(|error| Failure::reading(RANDOM, &error))
+        .map_err(|error| CommandFailure::reading(RANDOM, &error))
 }
 
 const RANDOM: &str = "/dev/urandom";
 
 /// Verifies a message and decrypts it into `scratch` if it is encrypted.
 pub(crate) fn open<'a>(
-    keys: &Keys,
+    keys: &TokenKeys,
     message: &NetworkMessage<'a>,
     scratch: &'a mut Vec<u8>,
 ) -> Result<NetworkMessage<'a>, SecurityError> {
@@ -152,7 +153,7 @@ pub(crate) fn open<'a>(
 impl Entry {
     fn fits(&self, message: &NetworkMessage<'_>) -> bool {
         let header = message.header();
-        let publisher_id = header.publisher_id.map(PublisherId::from);
+        let publisher_id = header.publisher_id.map(PublisherIdJson::from);
         self.is_of(
             message.security().map_or(0, |security| security.token_id),
             publisher_id.as_ref(),
@@ -163,7 +164,7 @@ impl Entry {
     fn is_of(
         &self,
         token_id: u32,
-        publisher_id: Option<&PublisherId>,
+        publisher_id: Option<&PublisherIdJson>,
         writer_group_id: Option<u16>,
     ) -> bool {
         let written = &self.written;
@@ -174,7 +175,7 @@ impl Entry {
 }
 
 impl Written {
-    fn keys(&self) -> Result<Keys, String> {
+    fn keys(&self) -> Result<TokenKeys, String> {
         let policy = SecurityPolicy::from_uri(&self.policy)
             .ok_or_else(|| format!("`{}` is no SecurityPolicy of PubSub", self.policy))?;
         let mut key_data = Vec::new();
@@ -187,7 +188,7 @@ impl Written {
             let bytes = hex::parse(part).map_err(|error| format!("{key}: {error}"))?;
             key_data.extend(bytes);
         }
-        Keys::from_bytes(policy, &key_data).map_err(|error| error.to_string())
+        TokenKeys::from_bytes(policy, &key_data).map_err(|error| error.to_string())
     }
 }
 

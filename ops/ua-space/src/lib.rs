@@ -60,8 +60,8 @@ use std::process::ExitCode;
 use clap::Parser as _;
 use clap::error::ErrorKind;
 
-use arguments::{Arguments, Verb};
-use exit::Failure;
+use arguments::{ToolArguments, Verb};
+use exit::CommandFailure;
 
 /// Reads a SysML model: XMI, or the textual notation of SysML v2. Returns the number of its values
 /// and calls. For tests with changed files.
@@ -78,7 +78,7 @@ pub fn read_model(content: &str) -> Result<usize, Vec<usize>> {
 #[must_use]
 pub fn run(arguments: Vec<OsString>) -> ExitCode {
     let given = arguments.clone();
-    let arguments = match Arguments::try_parse_from(arguments) {
+    let arguments = match ToolArguments::try_parse_from(arguments) {
         Ok(arguments) => arguments,
         Err(usage) => {
             // A closed stdout or stderr cannot be reported.
@@ -145,12 +145,12 @@ pub fn run(arguments: Vec<OsString>) -> ExitCode {
     match ended {
         Ok(()) => ExitCode::SUCCESS,
         Err(failure) => {
-            if let Failure::Data(what)
-            | Failure::Io(what)
-            | Failure::Usage(what)
-            | Failure::Unavailable(what)
-            | Failure::Failed(what)
-            | Failure::Unconfigured(what) = &failure
+            if let CommandFailure::Data(what)
+            | CommandFailure::Io(what)
+            | CommandFailure::Usage(what)
+            | CommandFailure::Unavailable(what)
+            | CommandFailure::Failed(what)
+            | CommandFailure::Unconfigured(what) = &failure
             {
                 report::warn(what);
             }

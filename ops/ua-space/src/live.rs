@@ -32,7 +32,7 @@ mod trace;
 mod write;
 
 pub(crate) use all::list;
-pub(crate) use application::Application;
+pub(crate) use application::AnnouncedProgram;
 pub(crate) use bandwidth::bandwidth;
 pub(crate) use call::call;
 pub(crate) use carrier::broker_mapping;
@@ -42,10 +42,10 @@ pub(crate) use names::fitting;
 pub(crate) use record::record;
 pub(crate) use replay::replay;
 pub(crate) use robot::ModelSource;
-pub(crate) use seen::{Timing, TopicSeen, listened};
+pub(crate) use seen::{SenderTiming, TopicSeen, listened};
 pub(crate) use serve::serve;
 pub(crate) use skills::{HeardNames, heard_names, skills, types};
-pub(crate) use text::{Table, harmless, help_within_width, is_coloured, wrapped};
+pub(crate) use text::{TextTable, harmless, help_within_width, is_coloured, wrapped};
 pub(crate) use top::{Sort, top};
 pub(crate) use trace::trace;
 pub(crate) use write::write;
@@ -56,15 +56,15 @@ use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use mappings::{SpaceId, TopicId};
 use tokio::time::Instant;
-use transport::{BUFFER, Carrier, Outgoing, Received};
+use transport::{BUFFER, Carrier, OutgoingMessage, Received};
 use uadp::{NetworkHeader, NetworkMessage, Timestamp};
 
-use crate::arguments::Group;
-use crate::exit::Failure;
-use crate::interrupt::Interrupt;
+use crate::arguments::GroupArguments;
+use crate::exit::CommandFailure;
+use crate::interrupt::SignalGuard;
 use crate::report::warn;
 use crate::survey::look;
-use book::{Book, News};
+use book::{Book, DatagramContent};
 use prober::Prober;
 use sealing::Sealing;
 
@@ -78,7 +78,7 @@ pub(crate) struct Live {
     pub(crate) book: Book,
     prober: Prober,
     wants_calls: bool,
-    interrupt: Interrupt,
+    interrupt: SignalGuard,
     buffer: Vec<u8>,
     /// The keys of a secured group.
     sealing: Option<Sealing>,
@@ -87,7 +87,7 @@ pub(crate) struct Live {
 
 /// The reason why listening ended.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Ended {
+pub(crate) enum ListenEnd {
     /// The time is over.
     Time,
     /// The closure requested the end.
@@ -116,9 +116,9 @@ pub(crate) enum Go {
 
 /// Joins the group and runs `looking` to its end.
 pub(crate) fn in_group<T>(
-    group: &Group,
-    looking: impl AsyncFnOnce(Live) -> Result<T, Failure>,
-) -> Result<T, Failure> {
+    group: &GroupArguments,
+    looking: impl AsyncFnOnce(Live) -> Result<T, CommandFailure>,
+) -> Result<T, CommandFailure> {
     look(async {
         let live = Live::join(group)?;
         looking(live).await
@@ -128,9 +128,9 @@ pub(crate) fn in_group<T>(
 /// Joins the group and runs `looking` to its end. Own datagrams are received too: the kernel counts
 /// each datagram that it filters like one that is lost because the socket is full.
 fn in_group_with_own<T>(
-    group: &Group,
-    looking: impl AsyncFnOnce(Live) -> Result<T, Failure>,
-) -> Result<T, Failure> {
+    group: &GroupArguments,
+    looking: impl AsyncFnOnce(Live) -> Result<T, CommandFailure>,
+) -> Result<T, CommandFailure> {
     look(async {
         let live = Live::with(group, carrier::open_with_own(group)?)?;
         looking(live).await
@@ -143,11 +143,14 @@ pub(crate) struct InGroup {
     /// The number of topics of each sender: its ROS space and address.
     pub(crate) senders: BTreeMap<(u16, String), usize>,
     /// The announced applications, by space and address.
-    pub(crate) applications: BTreeMap<(u16, String), Application>,
+    pub(crate) applications: BTreeMap<(u16, String), AnnouncedProgram>,
 }
 
 /// Returns the senders and applications of the group, which are probed and received for `seconds`.
-pub(crate) async fn in_the_group(group: &Group, seconds: f64) -> Result<(InGroup, ()), Failure> {
+pub(crate) async fn in_the_group(
+    group: &GroupArguments,
+    seconds: f64,
+) -> Result<(InGroup, ()), CommandFailure> {
     let mut live = Live::join(group)?;
     live.want_all();
     let end = until(live.now(), Some(seconds));
@@ -156,15 +159,15 @@ pub(crate) async fn in_the_group(group: &Group, seconds: f64) -> Result<(InGroup
 }
 
 impl Live {
-    fn join(group: &Group) -> Result<Self, Failure> {
+    fn join(group: &GroupArguments) -> Result<Self, CommandFailure> {
         Self::with(group, carrier::open(group)?)
     }
 
     /// Creates the connection from a carrier and the address of its group for output.
     fn with(
-        group: &Group,
+        group: &GroupArguments,
         (carrier, shown_group): (Box<dyn Carrier>, String),
-    ) -> Result<Self, Failure> {
+    ) -> Result<Self, CommandFailure> {
         Ok(Self {
             carrier,
             start: Instant::now(),
@@ -172,7 +175,7 @@ impl Live {
             book: Book::new(),
             prober: Prober::default(),
             wants_calls: false,
-            interrupt: Interrupt::catch()?,
+            interrupt: SignalGuard::catch()?,
             buffer: vec![0; BUFFER],
             sealing: match &group.keys {
                 Some(path) => Some(Sealing::read(path, group.sign)?),
@@ -259,9 +262,9 @@ impl Live {
         let sent = match sealed.transpose() {
             Ok(sealed) => {
                 let datagram = sealed.as_deref().unwrap_or(datagram);
-                let message = Outgoing {
+                let message = OutgoingMessage {
                     within: self.carrier.within(),
-                    ..Outgoing::new(datagram)
+                    ..OutgoingMessage::new(datagram)
                 };
                 self.carrier
                     .try_send(&message)
@@ -279,8 +282,8 @@ impl Live {
     pub(crate) async fn listen(
         &mut self,
         until: Duration,
-        each: &mut dyn FnMut(News<'_>, Duration) -> Go,
-    ) -> Result<Ended, Failure> {
+        each: &mut dyn FnMut(DatagramContent<'_>, Duration) -> Go,
+    ) -> Result<ListenEnd, CommandFailure> {
         let mut asked = Duration::ZERO;
         loop {
             let now = self.now();
@@ -290,8 +293,8 @@ impl Live {
             }
             if now >= until {
                 return match self.carrier.lost() {
-                    Some(why) => Err(Failure::Unavailable(why)),
-                    None => Ok(Ended::Time),
+                    Some(why) => Err(CommandFailure::Unavailable(why)),
+                    None => Ok(ListenEnd::Time),
                 };
             }
             if let Some(ended) = self.step(until.min(now + LOOK), each).await? {
@@ -304,10 +307,10 @@ impl Live {
     async fn step(
         &mut self,
         until: Duration,
-        each: &mut dyn FnMut(News<'_>, Duration) -> Go,
-    ) -> Result<Option<Ended>, Failure> {
+        each: &mut dyn FnMut(DatagramContent<'_>, Duration) -> Go,
+    ) -> Result<Option<ListenEnd>, CommandFailure> {
         match self.receive(until).await? {
-            Incoming::Interrupted => Ok(Some(Ended::Interrupted)),
+            Incoming::Interrupted => Ok(Some(ListenEnd::Interrupted)),
             Incoming::Nothing => Ok(None),
             Incoming::Message(received @ Received { length, from, .. }) => {
                 let arrived = self.arrived(&received);
@@ -319,7 +322,7 @@ impl Live {
     }
 
     /// Receives one datagram into the buffer, or waits until the given time.
-    async fn receive(&mut self, until: Duration) -> Result<Incoming, Failure> {
+    async fn receive(&mut self, until: Duration) -> Result<Incoming, CommandFailure> {
         let until = self.start + until;
         tokio::select! {
             biased;
@@ -327,7 +330,7 @@ impl Live {
             () = tokio::time::sleep_until(until) => Ok(Incoming::Nothing),
             received = self.carrier.recv(&mut self.buffer) => received
                 .map(Incoming::Message)
-                .map_err(|error| Failure::Io(format!("cannot hear the group: {error}"))),
+                .map_err(|error| CommandFailure::Io(format!("cannot hear the group: {error}"))),
         }
     }
 
@@ -402,15 +405,15 @@ impl Live {
     }
 }
 
-/// Handles a datagram. Returns [`Ended::Enough`] if `each` ends the listening.
+/// Handles a datagram. Returns [`ListenEnd::Enough`] if `each` ends the listening.
 fn take(
     (book, sealing): (&mut Book, Option<&mut Sealing>),
     (datagram, from): (&[u8], SocketAddr),
     now: Duration,
-    each: &mut dyn FnMut(News<'_>, Duration) -> Go,
-) -> Option<Ended> {
+    each: &mut dyn FnMut(DatagramContent<'_>, Duration) -> Go,
+) -> Option<ListenEnd> {
     let mut go = Go::On;
-    let mut each = |news: News<'_>| {
+    let mut each = |news: DatagramContent<'_>| {
         if go == Go::On {
             go = each(news, now);
         }
@@ -425,7 +428,7 @@ fn take(
         None => message,
     };
     book.handle((&message, from), now, &mut each);
-    (go == Go::Enough).then_some(Ended::Enough)
+    (go == Go::Enough).then_some(ListenEnd::Enough)
 }
 
 #[expect(clippy::disallowed_methods, reason = "the one read of this clock")]

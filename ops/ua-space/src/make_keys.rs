@@ -9,12 +9,12 @@ use serde_json::{Value, json};
 use uadp::SecurityPolicy;
 
 use crate::arguments::{KeyPolicy, MakeKeys};
-use crate::exit::Failure;
+use crate::exit::CommandFailure;
 use crate::keys::{self, KeyFile};
 use crate::report::warn;
 use crate::{hex, json_file};
 
-pub(crate) fn make_keys(arguments: &MakeKeys) -> Result<(), Failure> {
+pub(crate) fn make_keys(arguments: &MakeKeys) -> Result<(), CommandFailure> {
     let file = &arguments.file;
     let name = file.display();
     let told = if arguments.next {
@@ -26,7 +26,9 @@ pub(crate) fn make_keys(arguments: &MakeKeys) -> Result<(), Failure> {
         let policy = all.last().and_then(|key| key.get("policy")?.as_str());
         let policy = policy.and_then(SecurityPolicy::from_uri);
         let (Some(last), Some(policy)) = (last, policy) else {
-            return Err(Failure::Data(format!("{name}: there is no key in it")));
+            return Err(CommandFailure::Data(format!(
+                "{name}: there is no key in it"
+            )));
         };
         let token = last.checked_add(1).unwrap_or(1);
         all.push(made(token, policy)?);
@@ -38,7 +40,7 @@ pub(crate) fn make_keys(arguments: &MakeKeys) -> Result<(), Failure> {
         let mut all = listed(file)?;
         if all.len() < 2 {
             let why = format!("{name}: there is no other key in it; --next makes one");
-            return Err(Failure::Data(why));
+            return Err(CommandFailure::Data(why));
         }
         let gone = all.remove(0);
         replace(file, &all)?;
@@ -58,7 +60,7 @@ pub(crate) fn make_keys(arguments: &MakeKeys) -> Result<(), Failure> {
 }
 
 /// Returns the keys of a file as JSON.
-fn listed(file: &Path) -> Result<Vec<Value>, Failure> {
+fn listed(file: &Path) -> Result<Vec<Value>, CommandFailure> {
     // Invalid keys are reported as by the programs that read the file.
     KeyFile::read(file, warn)?;
     let name = file.display().to_string();
@@ -66,7 +68,7 @@ fn listed(file: &Path) -> Result<Vec<Value>, Failure> {
     json_file::one_or_many(&text).map_err(|error| json_file::explain(&name, &error))
 }
 
-fn made(token: u32, policy: SecurityPolicy) -> Result<Value, Failure> {
+fn made(token: u32, policy: SecurityPolicy) -> Result<Value, CommandFailure> {
     let part = |len: usize| {
         let mut bytes = vec![0; len];
         keys::random(&mut bytes).map(|()| hex::text(&bytes))
@@ -83,13 +85,13 @@ fn made(token: u32, policy: SecurityPolicy) -> Result<Value, Failure> {
 }
 
 /// Writes a new file that only its owner can access.
-fn write(file: &Path, keys: &[Value]) -> Result<(), Failure> {
+fn write(file: &Path, keys: &[Value]) -> Result<(), CommandFailure> {
     let mut made = create(file)?;
     put(&mut made, keys).map_err(|error| writing(file, &error))
 }
 
 /// Replaces an existing file atomically.
-fn replace(file: &Path, keys: &[Value]) -> Result<(), Failure> {
+fn replace(file: &Path, keys: &[Value]) -> Result<(), CommandFailure> {
     let mut beside = file.as_os_str().to_owned();
     beside.push(".new");
     let beside = PathBuf::from(beside);
@@ -101,7 +103,7 @@ fn replace(file: &Path, keys: &[Value]) -> Result<(), Failure> {
     })
 }
 
-fn create(file: &Path) -> Result<File, Failure> {
+fn create(file: &Path) -> Result<File, CommandFailure> {
     let made = OpenOptions::new()
         .write(true)
         .create_new(true)
@@ -117,8 +119,8 @@ fn put(file: &mut File, keys: &[Value]) -> std::io::Result<()> {
     file.sync_all()
 }
 
-fn writing(file: &Path, error: &std::io::Error) -> Failure {
-    Failure::Io(format!("cannot write {}: {error}", file.display()))
+fn writing(file: &Path, error: &std::io::Error) -> CommandFailure {
+    CommandFailure::Io(format!("cannot write {}: {error}", file.display()))
 }
 
 /// Bytes of the SigningKey and of the KeyNonce (OPC 10000-14, 7.2.4.4.3.1).

@@ -2,13 +2,13 @@
 
 use uadp::{DataSetMessage, DecodeError, FieldEncoding, MessageKind, NetworkMessage};
 
-use crate::fault::{Fault, MessagePlace, Place, Stop, in_field, offset};
-use crate::raw_data::Layout;
+use crate::fault::{DecodeFault, FaultLocation, MessagePlace, PartialRead, in_field, offset};
+use crate::raw_data::RawDataLayout;
 use crate::values::{show_data_value, show_variant};
 use crate::{decode, encode, hex, shape};
 
 /// A DataSetMessage of a payload.
-pub(crate) struct Part<'a> {
+pub(crate) struct PayloadMessage<'a> {
     pub(crate) writer_id: Option<u16>,
     /// Offset of the message in the datagram.
     pub(crate) offset: usize,
@@ -16,20 +16,22 @@ pub(crate) struct Part<'a> {
 }
 
 /// Splits a payload into its DataSetMessages, up to the first fault of their Sizes.
-pub(crate) fn split<'a>(message: &NetworkMessage<'a>) -> (Vec<Part<'a>>, Option<Fault>) {
+pub(crate) fn split<'a>(
+    message: &NetworkMessage<'a>,
+) -> (Vec<PayloadMessage<'a>>, Option<DecodeFault>) {
     let payload = message.payload();
     let start = message.payload_offset();
     let ids: Vec<_> = message.writer_ids().into_iter().flatten().collect();
     if ids.len() < 2 {
-        let part = Part {
+        let part = PayloadMessage {
             writer_id: ids.first().copied(),
             offset: start,
             bytes: payload,
         };
         return (vec![part], None);
     }
-    let fault = |error, in_payload| Fault {
-        place: Place::Payload,
+    let fault = |error, in_payload| DecodeFault {
+        place: FaultLocation::Payload,
         error,
         offset: start + in_payload,
     };
@@ -51,7 +53,7 @@ pub(crate) fn split<'a>(message: &NetworkMessage<'a>) -> (Vec<Part<'a>>, Option<
             let error = cut("DataSetMessage", size, rest.len());
             return (parts, Some(fault(error, at)));
         };
-        parts.push(Part {
+        parts.push(PayloadMessage {
             writer_id: Some(id),
             offset: start + at,
             bytes,
@@ -70,10 +72,10 @@ pub(crate) fn split<'a>(message: &NetworkMessage<'a>) -> (Vec<Part<'a>>, Option<
 
 /// Reads a DataSetMessage; RawData is read with the layout. The fields before a fault are included.
 pub(crate) fn read(
-    part: &Part<'_>,
-    layout: Option<&Layout<'_>>,
-) -> (shape::DataSetMessage, Option<Fault>) {
-    let mut shown = shape::DataSetMessage::default();
+    part: &PayloadMessage<'_>,
+    layout: Option<&RawDataLayout<'_>>,
+) -> (shape::DataSetMessageJson, Option<DecodeFault>) {
+    let mut shown = shape::DataSetMessageJson::default();
     let bytes = part.bytes;
     let stop = match DataSetMessage::decode(part.writer_id, bytes) {
         Ok(message) => {
@@ -98,37 +100,37 @@ pub(crate) fn read(
             field,
         };
         let in_message = offset(bytes, stop, |bytes| stop_of(bytes, layout));
-        Fault {
-            place: Place::Message(place),
+        DecodeFault {
+            place: FaultLocation::Message(place),
             error,
             offset: part.offset + in_message,
         }
     });
-    shown.malformed = fault.as_ref().map(Fault::to_string);
+    shown.malformed = fault.as_ref().map(DecodeFault::to_string);
     (shown, fault)
 }
 
 /// Returns the field and error at which reading a DataSetMessage stops.
-fn stop_of(bytes: &[u8], layout: Option<&Layout<'_>>) -> Option<Stop> {
+fn stop_of(bytes: &[u8], layout: Option<&RawDataLayout<'_>>) -> Option<PartialRead> {
     match DataSetMessage::decode(None, bytes) {
         Ok(message) => read_fields(&message, layout, |_| {}).err(),
         Err(error) => Some((None, error)),
     }
 }
 
-fn show_header(message: &DataSetMessage<'_>, shown: &mut shape::DataSetMessage) {
+fn show_header(message: &DataSetMessage<'_>, shown: &mut shape::DataSetMessageJson) {
     let header = message.header();
     shown.valid = header.valid;
     shown.kind = match message.kind {
-        MessageKind::KeyFrame => shape::MessageKind::KeyFrame,
-        MessageKind::DeltaFrame => shape::MessageKind::DeltaFrame,
-        MessageKind::Event => shape::MessageKind::Event,
-        MessageKind::KeepAlive => shape::MessageKind::KeepAlive,
+        MessageKind::KeyFrame => shape::MessageKindJson::KeyFrame,
+        MessageKind::DeltaFrame => shape::MessageKindJson::DeltaFrame,
+        MessageKind::Event => shape::MessageKindJson::Event,
+        MessageKind::KeepAlive => shape::MessageKindJson::KeepAlive,
     };
     shown.field_encoding = match message.encoding() {
-        FieldEncoding::Variant => shape::FieldEncoding::Variant,
-        FieldEncoding::RawData => shape::FieldEncoding::RawData,
-        FieldEncoding::DataValue => shape::FieldEncoding::DataValue,
+        FieldEncoding::Variant => shape::FieldEncodingJson::Variant,
+        FieldEncoding::RawData => shape::FieldEncodingJson::RawData,
+        FieldEncoding::DataValue => shape::FieldEncodingJson::DataValue,
     };
     shown.sequence_number = header.sequence_number;
     shown.timestamp = header.timestamp.map(decode::show_timestamp);
@@ -141,9 +143,9 @@ fn show_header(message: &DataSetMessage<'_>, shown: &mut shape::DataSetMessage) 
 /// Adds the metadata, or the bytes of RawData fields that cannot be shown otherwise.
 fn show_rest(
     message: &DataSetMessage<'_>,
-    layout: Option<&Layout<'_>>,
+    layout: Option<&RawDataLayout<'_>>,
     stopped: bool,
-    shown: &mut shape::DataSetMessage,
+    shown: &mut shape::DataSetMessageJson,
 ) {
     let is_raw = is_raw(message);
     if is_raw && let Some(layout) = layout {
@@ -158,17 +160,17 @@ fn show_rest(
 /// Shows a message with a cleared valid bit. Its contents have no meaning, so they are shown as
 /// fields only if encoding them gives the same bytes.
 fn show_invalid(
-    shown: shape::DataSetMessage,
+    shown: shape::DataSetMessageJson,
     bytes: &[u8],
-    layout: Option<&Layout<'_>>,
-) -> shape::DataSetMessage {
+    layout: Option<&RawDataLayout<'_>>,
+) -> shape::DataSetMessageJson {
     if encode::message_bytes(&shown, layout).is_ok_and(|again| again == bytes) {
         return shown;
     }
-    shape::DataSetMessage {
+    shape::DataSetMessageJson {
         valid: false,
         message_hex: Some(hex::text(bytes)),
-        ..shape::DataSetMessage::default()
+        ..shape::DataSetMessageJson::default()
     }
 }
 
@@ -179,9 +181,9 @@ fn is_raw(message: &DataSetMessage<'_>) -> bool {
 /// Passes the fields to `each`.
 fn read_fields(
     message: &DataSetMessage<'_>,
-    layout: Option<&Layout<'_>>,
-    mut each: impl FnMut(shape::Field),
-) -> Result<(), Stop> {
+    layout: Option<&RawDataLayout<'_>>,
+    mut each: impl FnMut(shape::FieldJson),
+) -> Result<(), PartialRead> {
     if is_raw(message) {
         return match layout {
             Some(layout) => layout.read(message.payload(), each),
@@ -197,7 +199,7 @@ fn read_fields(
                 (false, Some(variant)) => show_variant(variant)?,
                 _ => show_data_value(&field.value)?,
             };
-            Ok(shape::Field {
+            Ok(shape::FieldJson {
                 index: is_delta.then_some(field.index),
                 value,
             })
@@ -211,7 +213,7 @@ fn read_fields(
 fn configured_size(
     message: &DataSetMessage<'_>,
     bytes: &[u8],
-    layout: Option<&Layout<'_>>,
+    layout: Option<&RawDataLayout<'_>>,
     fields: usize,
 ) -> Option<u16> {
     let field_count = match message.kind {

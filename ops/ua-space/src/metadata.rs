@@ -6,9 +6,9 @@ use serde::Deserialize;
 use serde_json::{Map, Value};
 
 use crate::arguments::RawReading;
-use crate::exit::Failure;
-use crate::raw_data::Layout;
-use crate::shape::{FieldMetaData, PublisherId};
+use crate::exit::CommandFailure;
+use crate::raw_data::RawDataLayout;
+use crate::shape::{FieldMetaData, PublisherIdJson};
 use crate::{json_file, selector};
 
 /// The metadata of a file. The first entry that matches a message is used.
@@ -20,7 +20,7 @@ pub(crate) struct MetaDataFile {
 #[derive(Debug, Deserialize)]
 #[serde(rename_all = "camelCase", deny_unknown_fields)]
 struct Entry {
-    publisher_id: Option<selector::Publisher>,
+    publisher_id: Option<selector::PublisherSelector>,
     writer_group_id: Option<u16>,
     data_set_writer_id: Option<u16>,
     meta_data: Vec<FieldMetaData>,
@@ -28,15 +28,15 @@ struct Entry {
 
 /// The writer of a DataSetMessage.
 #[derive(Debug, Clone, Copy, Default)]
-pub(crate) struct Writer<'a> {
-    pub(crate) publisher_id: Option<&'a PublisherId>,
+pub(crate) struct WriterKey<'a> {
+    pub(crate) publisher_id: Option<&'a PublisherIdJson>,
     pub(crate) writer_group_id: Option<u16>,
     pub(crate) data_set_writer_id: Option<u16>,
 }
 
 impl MetaDataFile {
     /// Reads entries, or a list of fields that applies to all messages.
-    pub(crate) fn read(path: &Path, reading: RawReading) -> Result<Self, Failure> {
+    pub(crate) fn read(path: &Path, reading: RawReading) -> Result<Self, CommandFailure> {
         let text = json_file::read(path)?;
         let read = if is_list_of_fields(&text) {
             serde_json::from_str(&text).map(|meta_data| {
@@ -53,14 +53,14 @@ impl MetaDataFile {
         let name = path.display().to_string();
         let entries = read.map_err(|error| json_file::explain(&name, &error))?;
         for (entry, at) in entries.iter().zip(0..) {
-            Layout::new(&entry.meta_data, reading)
-                .map_err(|wrong| Failure::Data(format!("{name}: entry {at}{wrong}")))?;
+            RawDataLayout::new(&entry.meta_data, reading)
+                .map_err(|wrong| CommandFailure::Data(format!("{name}: entry {at}{wrong}")))?;
         }
         Ok(Self { entries })
     }
 
     /// Returns the fields of a message, if an entry matches.
-    pub(crate) fn find(&self, writer: Writer<'_>) -> Option<&[FieldMetaData]> {
+    pub(crate) fn find(&self, writer: WriterKey<'_>) -> Option<&[FieldMetaData]> {
         let fits = |entry: &&Entry| {
             selector::publisher_fits(entry.publisher_id.as_ref(), writer.publisher_id)
                 && selector::number_fits(entry.writer_group_id, writer.writer_group_id)

@@ -5,16 +5,16 @@ use std::collections::BTreeSet;
 use std::io::{self, Write as _};
 
 use ::mtp::pea::{Pea, PeaValue};
-use ::mtp::{Alarm, Module, Node};
+use ::mtp::{Module, ModuleAlarm, OpcUaNode};
 
 use crate::arguments::MtpAlarms;
-use crate::exit::Failure;
+use crate::exit::CommandFailure;
 use crate::live::{harmless, json};
 
 /// Prints the part of a mapping with the alarms of a manifest.
-pub(crate) fn alarms(arguments: &MtpAlarms) -> Result<(), Failure> {
+pub(crate) fn alarms(arguments: &MtpAlarms) -> Result<(), CommandFailure> {
     let module = crate::mtp_files::read(&arguments.file)?;
-    let part = Part::of(&module, arguments)?;
+    let part = AlarmMapping::of(&module, arguments)?;
     let mut out = io::stdout().lock();
     out.write_all(part.yaml(&module)?.as_bytes())?;
     out.flush()?;
@@ -23,7 +23,7 @@ pub(crate) fn alarms(arguments: &MtpAlarms) -> Result<(), Failure> {
 
 /// The servers and variables of a mapping.
 #[derive(Debug, Default)]
-struct Part {
+struct AlarmMapping {
     /// Names and endpoints.
     servers: Vec<(String, String)>,
     variables: Vec<Row>,
@@ -44,8 +44,8 @@ struct Row {
     message: String,
 }
 
-impl Part {
-    fn of(module: &Module, arguments: &MtpAlarms) -> Result<Self, Failure> {
+impl AlarmMapping {
+    fn of(module: &Module, arguments: &MtpAlarms) -> Result<Self, CommandFailure> {
         let pea = Pea::new(module);
         let mut part = Self::default();
         let mut names = BTreeSet::new();
@@ -79,7 +79,7 @@ impl Part {
         let room = usize::from(u16::MAX - arguments.first) + 1;
         if module.alarms.len() > room {
             let why = format!("{} alarms do not fit behind --first", module.alarms.len());
-            return Err(Failure::Data(why));
+            return Err(CommandFailure::Data(why));
         }
         Ok(part)
     }
@@ -88,13 +88,13 @@ impl Part {
     fn server(
         &mut self,
         module: &Module,
-        node: &Node,
+        node: &OpcUaNode,
         arguments: &MtpAlarms,
-    ) -> Result<String, Failure> {
+    ) -> Result<String, CommandFailure> {
         let endpoint = arguments.endpoint.as_ref().unwrap_or(&node.endpoint);
         if endpoint.is_empty() {
             let why = "the manifest names no endpoint: give one (--endpoint)".to_owned();
-            return Err(Failure::Data(why));
+            return Err(CommandFailure::Data(why));
         }
         if let Some((name, _)) = self.servers.iter().find(|(_, known)| known == endpoint) {
             return Ok(name.clone());
@@ -108,7 +108,7 @@ impl Part {
     }
 
     /// Returns the text. Texts of the manifest are quoted as in JSON, which YAML reads too.
-    fn yaml(&self, module: &Module) -> Result<String, Failure> {
+    fn yaml(&self, module: &Module) -> Result<String, CommandFailure> {
         let mut text = format!(
             "# Alarms of the process module {}: a part of the mapping of ua-server.\n",
             harmless(&module.name)
@@ -154,7 +154,7 @@ type TriggerValue = (&'static str, String);
 ///
 /// # Errors
 /// Returns the reason why no condition can be made.
-fn trigger<'a>(alarm: &'a Alarm, pea: &Pea) -> Result<(&'a Node, TriggerValue), String> {
+fn trigger<'a>(alarm: &'a ModuleAlarm, pea: &Pea) -> Result<(&'a OpcUaNode, TriggerValue), String> {
     let node = alarm.trigger.as_ref();
     let node = node.ok_or("its Trigger names no node of the manifest")?;
     let text = alarm.trigger_value.trim();
@@ -236,7 +236,7 @@ mod tests {
     #[test]
     fn an_alarm_of_a_manifest_is_a_variable_that_a_mapping_accepts() {
         let module = with_trigger(|value| matches!(value, PeaValue::Word(_)), "16");
-        let part = Part::of(&module, &arguments()).unwrap();
+        let part = AlarmMapping::of(&module, &arguments()).unwrap();
         let row = &part.variables[0];
         assert_eq!(
             (&*row.node, row.data_type, &*row.when, row.severity),
@@ -254,7 +254,7 @@ mod tests {
     #[test]
     fn an_alarm_of_an_analog_value_is_left_out_with_the_reason() {
         let module = column();
-        let part = Part::of(&module, &arguments()).unwrap();
+        let part = AlarmMapping::of(&module, &arguments()).unwrap();
         assert_eq!(part.variables, []);
         let why = &part.left_out[0];
         assert!(
@@ -267,7 +267,7 @@ mod tests {
                 .contains("# left out: LevelHigh")
         );
         let module = with_trigger(|value| matches!(value, PeaValue::Boolean(_)), "maybe");
-        let part = Part::of(&module, &arguments()).unwrap();
+        let part = AlarmMapping::of(&module, &arguments()).unwrap();
         assert_eq!(part.left_out.len(), 1, "{part:?}");
     }
 }

@@ -4,14 +4,14 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::io::{self, Write as _};
 
 use ::mtp::connect::{FittingOutput, InputProposal, NameMatch, proposals};
-use ::mtp::{Module, Output};
+use ::mtp::{Module, ModuleOutput};
 
 use crate::arguments::MtpConnect;
-use crate::exit::Failure;
+use crate::exit::CommandFailure;
 use crate::live::{harmless, json};
 
 /// Prints the part of a mapping that connects the modules of manifests.
-pub(crate) fn connect(arguments: &MtpConnect) -> Result<(), Failure> {
+pub(crate) fn connect(arguments: &MtpConnect) -> Result<(), CommandFailure> {
     let modules: Vec<Module> = arguments
         .files
         .iter()
@@ -70,7 +70,7 @@ fn is_plain(c: char) -> bool {
 /// The servers of the mapping: their names by the module and the endpoint of a node.
 type Servers = BTreeMap<(usize, String), String>;
 
-fn yaml(named: &Named, arguments: &MtpConnect) -> Result<String, Failure> {
+fn yaml(named: &Named, arguments: &MtpConnect) -> Result<String, CommandFailure> {
     let all = proposals(&named.modules);
     let mut servers = Servers::new();
     let mut variables = String::new();
@@ -84,7 +84,7 @@ fn yaml(named: &Named, arguments: &MtpConnect) -> Result<String, Failure> {
             continue;
         };
         let id = ids.next().ok_or_else(|| {
-            Failure::Data(format!("{} inputs do not fit behind --first", all.len()))
+            CommandFailure::Data(format!("{} inputs do not fit behind --first", all.len()))
         })?;
         let output = format!("{}.{}", named.name(best.module), best.output.name);
         let mut name = format!("{output} to {input}");
@@ -141,10 +141,10 @@ fn yaml(named: &Named, arguments: &MtpConnect) -> Result<String, Failure> {
 fn of_server(
     (servers, named): (&mut Servers, &Named),
     (module, endpoint): (usize, &str),
-) -> Result<String, Failure> {
+) -> Result<String, CommandFailure> {
     let name = named.name(module);
     if endpoint.is_empty() {
-        return Err(Failure::Data(format!(
+        return Err(CommandFailure::Data(format!(
             "the manifest of {name} names no endpoint: give one (--endpoint {name}=URL)"
         )));
     }
@@ -187,7 +187,7 @@ fn note(notes: &mut String, input: &str, one: &InputProposal<'_>, named: &Named)
         "# {input} ({}): {why}\n",
         harmless(&one.node.id())
     ));
-    let shown = |module: usize, output: &Output| {
+    let shown = |module: usize, output: &ModuleOutput| {
         format!("{}.{}", named.name(module), harmless(&output.name))
     };
     for fits in one.fitting.iter().take(MOST_NOTES) {
@@ -275,7 +275,7 @@ mod tests {
     fn an_input_without_an_output_has_the_reasons() {
         let mut other = column();
         for value in &mut other.process_values {
-            value.kind = ::mtp::ValueKind::Binary;
+            value.kind = ::mtp::ParameterKind::Binary;
         }
         for service in &mut other.services {
             for procedure in &mut service.procedures {

@@ -5,16 +5,16 @@ use std::fs;
 use std::io::{self, Read as _, Write as _};
 use std::path::Path;
 
-use mtp::{Family, Finding, Module, Object, Triple};
+use mtp::{Family, Module, MtpFinding, Object, Triple};
 use serde::Serialize;
 
 use crate::arguments::{MtpArguments, MtpRdf, MtpSkills, MtpVerb};
-use crate::exit::Failure;
+use crate::exit::CommandFailure;
 use crate::input;
-use crate::live::{Table, harmless, is_coloured, json};
+use crate::live::{TextTable, harmless, is_coloured, json};
 
 /// Runs `ua-space mtp`.
-pub(crate) fn mtp(arguments: &MtpArguments) -> Result<(), Failure> {
+pub(crate) fn mtp(arguments: &MtpArguments) -> Result<(), CommandFailure> {
     match &arguments.verb {
         MtpVerb::Check(arguments) => check(&arguments.files, arguments.json),
         MtpVerb::Rdf(arguments) => rdf(arguments),
@@ -26,7 +26,7 @@ pub(crate) fn mtp(arguments: &MtpArguments) -> Result<(), Failure> {
 }
 
 /// Reads a manifest, with the documents beside it that it refers to.
-pub(crate) fn read(file: &str) -> Result<Module, Failure> {
+pub(crate) fn read(file: &str) -> Result<Module, CommandFailure> {
     let bytes = input::read(file)?;
     let beside = Path::new(file).parent().unwrap_or_else(|| Path::new(""));
     let mut fetch = |name: &str| {
@@ -36,7 +36,7 @@ pub(crate) fn read(file: &str) -> Result<Module, Failure> {
         Some(bytes)
     };
     Module::from_files(&bytes, &mut fetch)
-        .map_err(|error| Failure::Data(format!("{}: {error}", input::name(file))))
+        .map_err(|error| CommandFailure::Data(format!("{}: {error}", input::name(file))))
 }
 
 /// The contents of a manifest, by their numbers.
@@ -103,7 +103,7 @@ impl<'m> Checked<'m> {
 }
 
 impl<'m> FindingRow<'m> {
-    fn of(finding: &'m Finding) -> Self {
+    fn of(finding: &'m MtpFinding) -> Self {
         Self {
             line: finding.line,
             severity: severity(finding),
@@ -113,7 +113,7 @@ impl<'m> FindingRow<'m> {
     }
 }
 
-fn severity(finding: &Finding) -> &'static str {
+fn severity(finding: &MtpFinding) -> &'static str {
     if finding.is_note { "note" } else { "error" }
 }
 
@@ -124,7 +124,7 @@ fn edition(module: &Module) -> &'static str {
     }
 }
 
-fn check(files: &[String], is_json: bool) -> Result<(), Failure> {
+fn check(files: &[String], is_json: bool) -> Result<(), CommandFailure> {
     let mut out = io::stdout().lock();
     let mut faults = Vec::new();
     for file in files {
@@ -167,7 +167,7 @@ fn check(files: &[String], is_json: bool) -> Result<(), Failure> {
     }
     match faults.is_empty() {
         true => Ok(()),
-        false => Err(Failure::Data(faults.join("\n"))),
+        false => Err(CommandFailure::Data(faults.join("\n"))),
     }
 }
 
@@ -189,7 +189,7 @@ struct Term<'t> {
     datatype: Option<&'t str>,
 }
 
-fn rdf(arguments: &MtpRdf) -> Result<(), Failure> {
+fn rdf(arguments: &MtpRdf) -> Result<(), CommandFailure> {
     let module = read(&arguments.file)?;
     let name = match Path::new(&arguments.file).file_stem() {
         Some(stem) if arguments.file != "-" => stem.to_string_lossy().into_owned(),
@@ -266,7 +266,7 @@ struct VariableRow {
     access: Option<&'static str>,
 }
 
-fn skills(arguments: &MtpSkills) -> Result<(), Failure> {
+fn skills(arguments: &MtpSkills) -> Result<(), CommandFailure> {
     let module = read(&arguments.file)?;
     let rows: Vec<SkillRow> = module
         .services
@@ -282,7 +282,7 @@ fn skills(arguments: &MtpSkills) -> Result<(), Failure> {
         return Ok(());
     }
     let columns = ["SKILL", "NUMBER", "ENDS", "PARAMETERS", "OUTPUTS"];
-    let mut table = Table::new(columns.map(str::to_owned));
+    let mut table = TextTable::new(columns.map(str::to_owned));
     for row in rows {
         let all = |rows: &[VariableRow]| {
             let shown: Vec<String> = rows.iter().map(VariableRow::shown).collect();
@@ -324,8 +324,8 @@ impl VariableRow {
     }
 }
 
-fn skill_row(module: &Module, service: &mtp::Service, procedure: &mtp::Procedure) -> SkillRow {
-    let node = |role| service.control.node(role).map(mtp::Node::id);
+fn skill_row(module: &Module, service: &mtp::MtpService, procedure: &mtp::Procedure) -> SkillRow {
+    let node = |role| service.control.node(role).map(mtp::OpcUaNode::id);
     let parameters = procedure.parameters.iter().chain(&service.parameters);
     let parameters = parameters.map(|parameter| VariableRow {
         name: parameter.name.clone(),
@@ -337,7 +337,7 @@ fn skill_row(module: &Module, service: &mtp::Service, procedure: &mtp::Procedure
         min: constant(parameter.min.as_ref()),
         max: constant(parameter.max.as_ref()),
         unit: unit(parameter.unit.as_ref()),
-        node: parameter.write.as_ref().map(mtp::Node::id),
+        node: parameter.write.as_ref().map(mtp::OpcUaNode::id),
         access: parameter.write.as_ref().map(|node| node.access.name()),
     });
     let outputs = procedure.outputs.iter().chain(&service.outputs);
@@ -352,7 +352,7 @@ fn skill_row(module: &Module, service: &mtp::Service, procedure: &mtp::Procedure
         min: constant(output.min.as_ref()),
         max: constant(output.max.as_ref()),
         unit: unit(output.unit.as_ref()),
-        node: output.node.as_ref().map(mtp::Node::id),
+        node: output.node.as_ref().map(mtp::OpcUaNode::id),
         access: output.node.as_ref().map(|node| node.access.name()),
     });
     let equipment = service.equipment.iter().chain(&procedure.equipment);
@@ -368,19 +368,19 @@ fn skill_row(module: &Module, service: &mtp::Service, procedure: &mtp::Procedure
         number: procedure.number,
         is_default: procedure.is_default,
         is_self_completing: procedure.is_self_completing,
-        state_node: node(mtp::Role::State),
-        command_node: node(mtp::Role::Command),
+        state_node: node(mtp::ControlRole::State),
+        command_node: node(mtp::ControlRole::Command),
         parameters: parameters.collect(),
         outputs: outputs.collect(),
         required_equipment: equipment.collect(),
     }
 }
 
-fn constant(bound: Option<&mtp::Bound>) -> Option<f64> {
-    bound.and_then(mtp::Bound::constant)
+fn constant(bound: Option<&mtp::ValueBound>) -> Option<f64> {
+    bound.and_then(mtp::ValueBound::constant)
 }
 
-fn unit(bound: Option<&mtp::Bound>) -> Option<String> {
+fn unit(bound: Option<&mtp::ValueBound>) -> Option<String> {
     let code = constant(bound)?;
     let symbol = mtp::unit_symbol(code);
     Some(symbol.map_or_else(|| format!("unit {code}"), str::to_owned))

@@ -9,39 +9,42 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Duration;
 
-use devices::module::{ProcessModule, Settings, Timing};
-use program::Method;
+use devices::module::{HandshakeTiming, ModuleSettings, ProcessModule};
+use program::ProgramMethod;
 use serde::Serialize;
 use serde_json::Value as Json;
-use skills::{Builtin, Code, Observer, Outcome, Owner, Parameter, Shown, Skill, Told, Value};
+use skills::{
+    Builtin, RefusalCode, RunOutcome, Skill, SkillEvent, SkillObserver, SkillOwner, SkillParameter,
+    SkillSnapshot, SkillValue,
+};
 use tokio::sync::mpsc;
 
 use crate::arguments::MtpRun;
-use crate::exit::Failure;
-use crate::interrupt::Interrupt;
+use crate::exit::CommandFailure;
+use crate::interrupt::SignalGuard;
 use crate::live::{harmless, json};
 use crate::report::say;
 use crate::survey::look;
 
 /// Runs `ua-space mtp run`.
-pub(crate) fn run(arguments: &MtpRun) -> Result<(), Failure> {
+pub(crate) fn run(arguments: &MtpRun) -> Result<(), CommandFailure> {
     let module = crate::mtp_files::read(&arguments.file)?;
-    let device = ProcessModule::new(Settings {
+    let device = ProcessModule::new(ModuleSettings {
         module,
         endpoint: arguments.endpoint.clone(),
         capabilities: BTreeMap::new(),
         configuration: arguments.configuration,
-        timing: Timing::default(),
+        timing: HandshakeTiming::default(),
     });
     look(async {
-        let interrupt = Interrupt::catch()?;
+        let interrupt = SignalGuard::catch()?;
         let (steps, mut told) = Steps::new();
         let skill = device.start(
             &arguments.service,
             arguments.procedure.as_deref(),
             vec![Box::new(steps)],
         );
-        let skill = skill.map_err(|fault| Failure::Usage(fault.0))?;
+        let skill = skill.map_err(|fault| CommandFailure::Usage(fault.0))?;
         let parameters = parameters(&skill.facts().parameters, &arguments.parameters)?;
         let outcome = follow(arguments, &skill, parameters, (&mut told, interrupt)).await?;
         skill.close().await;
@@ -53,20 +56,22 @@ pub(crate) fn run(arguments: &MtpRun) -> Result<(), Failure> {
 async fn follow(
     arguments: &MtpRun,
     skill: &Skill,
-    parameters: Vec<(String, Value)>,
-    (told, mut interrupt): (&mut Waiting, Interrupt),
-) -> Result<Result<(), Failure>, Failure> {
+    parameters: Vec<(String, SkillValue)>,
+    (told, mut interrupt): (&mut Waiting, SignalGuard),
+) -> Result<Result<(), CommandFailure>, CommandFailure> {
     let within = arguments.run_timeout;
     let within = within.and_then(|within| Duration::try_from_secs_f64(within).ok());
     let started = skill.execute(BY, parameters, within).await;
     let run = started.map_err(|refusal| {
         let is_of_parameters = matches!(
             refusal.code,
-            Code::InvalidArgument | Code::ArgumentsMissing | Code::TypeMismatch
+            RefusalCode::InvalidArgument
+                | RefusalCode::ArgumentsMissing
+                | RefusalCode::TypeMismatch
         );
         match is_of_parameters {
-            true => Failure::Usage(refusal.text + &takes(&skill.facts().parameters)),
-            false => Failure::Failed(refusal.text),
+            true => CommandFailure::Usage(refusal.text + &takes(&skill.facts().parameters)),
+            false => CommandFailure::Failed(refusal.text),
         }
     })?;
     let mut watch = skill.watch();
@@ -74,7 +79,7 @@ async fn follow(
     // An output that is closed does not end the command before the procedure.
     let mut printed = Ok(());
     let outcome = loop {
-        let is_over = |shown: &Arc<Shown>| {
+        let is_over = |shown: &Arc<SkillSnapshot>| {
             let outcome = shown.outcome.as_ref();
             outcome.is_some_and(|outcome| outcome.run == run)
         };
@@ -84,14 +89,14 @@ async fn follow(
                 printed = printed.and_then(|()| print(arguments.json, &step));
             }
             ended = watch.wait_for(is_over) => {
-                let shown = ended.map_err(|_| Failure::Failed("the skill ended".to_owned()))?;
+                let shown = ended.map_err(|_| CommandFailure::Failed("the skill ended".to_owned()))?;
                 break shown.outcome.clone();
             }
             () = interrupt.received() => {
                 is_interrupted = true;
                 let skill = skill.clone();
                 // A refused Halt finds the run at its end.
-                drop(tokio::spawn(async move { skill.call(BY, Method::Halt).await }));
+                drop(tokio::spawn(async move { skill.call(BY, ProgramMethod::Halt).await }));
                 let text = "stopping; the command ends when the end of the procedure is known";
                 printed = printed.and_then(|()| say(text));
             }
@@ -105,27 +110,32 @@ async fn follow(
     if lost > 0 {
         say(&format!("{lost} steps are not shown"))?;
     }
-    let outcome = outcome.ok_or_else(|| Failure::Failed("the run left no outcome".to_owned()))?;
-    print(arguments.json, &Line::End(End::of(&outcome)))?;
+    let outcome =
+        outcome.ok_or_else(|| CommandFailure::Failed("the run left no outcome".to_owned()))?;
+    print(arguments.json, &RunLine::End(End::of(&outcome)))?;
     let message = harmless(&outcome.message);
     Ok(match (outcome.succeeded, outcome.unknown) {
         (true, _) => Ok(()),
-        (false, true) => Err(Failure::Unavailable(format!(
+        (false, true) => Err(CommandFailure::Unavailable(format!(
             "the end is unknown, and the module may still work: {message}"
         ))),
         (false, false) if is_interrupted => {
             say(&message)?;
-            Err(Failure::Interrupted)
+            Err(CommandFailure::Interrupted)
         }
-        (false, false) => Err(Failure::Failed(message)),
+        (false, false) => Err(CommandFailure::Failed(message)),
     })
 }
 
 /// Reads the parameters by their declarations.
-fn parameters(declared: &[Parameter], words: &[String]) -> Result<Vec<(String, Value)>, Failure> {
-    let mut given: Vec<(String, Value)> = Vec::new();
+fn parameters(
+    declared: &[SkillParameter],
+    words: &[String],
+) -> Result<Vec<(String, SkillValue)>, CommandFailure> {
+    let mut given: Vec<(String, SkillValue)> = Vec::new();
     for word in words {
-        let wrong = |why: &str| Failure::Usage(format!("`{word}`: {why}{}", takes(declared)));
+        let wrong =
+            |why: &str| CommandFailure::Usage(format!("`{word}`: {why}{}", takes(declared)));
         let (name, text) = word
             .split_once('=')
             .ok_or_else(|| wrong("a parameter is NAME=VALUE"))?;
@@ -150,7 +160,7 @@ fn parameters(declared: &[Parameter], words: &[String]) -> Result<Vec<(String, V
 }
 
 /// Returns the declarations for a message.
-fn takes(declared: &[Parameter]) -> String {
+fn takes(declared: &[SkillParameter]) -> String {
     let each = declared.iter().map(|parameter| {
         let unit = parameter.unit.as_deref().unwrap_or_default();
         let range = parameter
@@ -171,7 +181,7 @@ fn takes(declared: &[Parameter]) -> String {
 /// A line of the output.
 #[derive(Debug, Serialize)]
 #[serde(rename_all = "lowercase")]
-enum Line {
+enum RunLine {
     /// A step of the handshake, or a state of the service.
     Step(String),
     End(End),
@@ -187,7 +197,7 @@ struct End {
 }
 
 impl End {
-    fn of(outcome: &Outcome) -> Self {
+    fn of(outcome: &RunOutcome) -> Self {
         let results = outcome.results.iter();
         Self {
             succeeded: outcome.succeeded,
@@ -200,12 +210,12 @@ impl End {
     }
 }
 
-fn print(is_json: bool, line: &Line) -> Result<(), Failure> {
+fn print(is_json: bool, line: &RunLine) -> Result<(), CommandFailure> {
     let mut out = io::stdout().lock();
     match (is_json, line) {
         (true, line) => writeln!(out, "{}", json(line)?)?,
-        (false, Line::Step(step)) => writeln!(out, "{}", harmless(step))?,
-        (false, Line::End(end)) => {
+        (false, RunLine::Step(step)) => writeln!(out, "{}", harmless(step))?,
+        (false, RunLine::End(end)) => {
             for (name, value) in &end.results {
                 writeln!(out, "{}: {value}", harmless(name))?;
             }
@@ -217,13 +227,13 @@ fn print(is_json: bool, line: &Line) -> Result<(), Failure> {
 
 /// Passes the steps of the run on.
 struct Steps {
-    steps: mpsc::Sender<Line>,
+    steps: mpsc::Sender<RunLine>,
     lost: Arc<AtomicUsize>,
 }
 
 /// The steps that are to be printed.
 struct Waiting {
-    steps: mpsc::Receiver<Line>,
+    steps: mpsc::Receiver<RunLine>,
     /// Number of steps that did not fit.
     lost: Arc<AtomicUsize>,
 }
@@ -240,16 +250,16 @@ impl Steps {
     }
 }
 
-impl Observer for Steps {
-    fn told(&self, what: Told<'_>, shown: &Shown) {
+impl SkillObserver for Steps {
+    fn told(&self, what: SkillEvent<'_>, shown: &SkillSnapshot) {
         let line = match what {
-            Told::Step => Line::Step(shown.step.clone()),
-            Told::Pending(why) => Line::Step(why.to_owned()),
-            Told::Parameters(_)
-            | Told::Transition(_)
-            | Told::Progress
-            | Told::Outcome(_)
-            | Told::Called => return,
+            SkillEvent::Step => RunLine::Step(shown.step.clone()),
+            SkillEvent::Pending(why) => RunLine::Step(why.to_owned()),
+            SkillEvent::Parameters(_)
+            | SkillEvent::Transition(_)
+            | SkillEvent::Progress
+            | SkillEvent::Outcome(_)
+            | SkillEvent::Called => return,
         };
         if self.steps.try_send(line).is_err() {
             self.lost.fetch_add(1, Ordering::Relaxed);
@@ -257,20 +267,20 @@ impl Observer for Steps {
     }
 }
 
-const BY: Owner = Owner::Local("ua-space mtp run");
+const BY: SkillOwner = SkillOwner::Local("ua-space mtp run");
 /// Maximum number of steps that wait for the output.
 const MOST_STEPS: usize = 1024;
 
 #[cfg(test)]
 mod tests {
-    use skills::Shape;
+    use skills::ValueShape;
 
     use super::*;
 
-    fn declared() -> Vec<Parameter> {
-        let of = |name: &str, builtin, range| Parameter {
+    fn declared() -> Vec<SkillParameter> {
+        let of = |name: &str, builtin, range| SkillParameter {
             name: name.to_owned(),
-            shape: Shape::scalar(builtin),
+            shape: ValueShape::scalar(builtin),
             length: None,
             default: None,
             unit: Some("l".to_owned()),
@@ -283,7 +293,7 @@ mod tests {
         ]
     }
 
-    fn read(words: &[&str]) -> Result<Vec<(String, Value)>, String> {
+    fn read(words: &[&str]) -> Result<Vec<(String, SkillValue)>, String> {
         let words: Vec<String> = words.iter().map(|word| (*word).to_owned()).collect();
         parameters(&declared(), &words).map_err(|failure| failure.to_string())
     }
@@ -291,8 +301,8 @@ mod tests {
     #[test]
     fn parameters_have_the_types_of_the_manifest() {
         let expected = vec![
-            ("Volume".to_owned(), Value::Double(2.0)),
-            ("Label".to_owned(), Value::String("7".to_owned())),
+            ("Volume".to_owned(), SkillValue::Double(2.0)),
+            ("Label".to_owned(), SkillValue::String("7".to_owned())),
         ];
         assert_eq!(read(&["Volume=2", "Label=7"]), Ok(expected));
         for (word, why) in [

@@ -3,15 +3,15 @@
 use std::fs::OpenOptions;
 use std::io::{self, Write as _};
 
-use crate::arguments::{DriverTemplate, New, Template};
-use crate::exit::Failure;
+use crate::arguments::{CellTemplate, DriverTemplate, NewCellArguments};
+use crate::exit::CommandFailure;
 use crate::report::warn;
 
 /// Runs `ua-space new`. An existing file stays unchanged.
-pub(crate) fn new(arguments: &New) -> Result<(), Failure> {
+pub(crate) fn new(arguments: &NewCellArguments) -> Result<(), CommandFailure> {
     let (template, driver) = (arguments.template, arguments.driver);
-    if template != Template::Component && driver != DriverTemplate::Simulated {
-        return Err(Failure::Usage(
+    if template != CellTemplate::Component && driver != DriverTemplate::Simulated {
+        return Err(CommandFailure::Usage(
             "only a component has a driver: ua-space new component --driver ...".to_owned(),
         ));
     }
@@ -24,19 +24,19 @@ pub(crate) fn new(arguments: &New) -> Result<(), Failure> {
     let file = open.write(true).create_new(true).open(path);
     let name = path.display();
     let mut file = file.map_err(|error| match error.kind() == io::ErrorKind::AlreadyExists {
-        true => Failure::Io(format!(
+        true => CommandFailure::Io(format!(
             "{name} exists already\n  = help: name another file with --output"
         )),
-        false => Failure::Io(format!("cannot write {name}: {error}")),
+        false => CommandFailure::Io(format!("cannot write {name}: {error}")),
     })?;
     file.write_all(text.as_bytes())
-        .map_err(|error| Failure::Io(format!("cannot write {name}: {error}")))?;
+        .map_err(|error| CommandFailure::Io(format!("cannot write {name}: {error}")))?;
     let next = match arguments.template {
-        Template::Component => format!("ua-component --check {name}"),
-        Template::Mes => format!("ua-mes --check {name}"),
-        Template::Mapping => format!("ua-space check {name}"),
-        Template::Sysml => format!("ua-space init --model {name}"),
-        Template::Profile => {
+        CellTemplate::Component => format!("ua-component --check {name}"),
+        CellTemplate::Mes => format!("ua-mes --check {name}"),
+        CellTemplate::Mapping => format!("ua-space check {name}"),
+        CellTemplate::Sysml => format!("ua-space init --model {name}"),
+        CellTemplate::Profile => {
             "apply it to a model in Papyrus, and then ua-space init --model MODEL.uml".to_owned()
         }
     };
@@ -44,19 +44,19 @@ pub(crate) fn new(arguments: &New) -> Result<(), Failure> {
     Ok(())
 }
 
-const fn text(template: Template, driver: DriverTemplate) -> &'static str {
+const fn text(template: CellTemplate, driver: DriverTemplate) -> &'static str {
     match (template, driver) {
-        (Template::Component, DriverTemplate::Simulated) => include_str!("new/component.yaml"),
-        (Template::Component, DriverTemplate::Ros) => include_str!("new/component-ros.yaml"),
-        (Template::Component, DriverTemplate::Exec) => include_str!("new/component-exec.yaml"),
-        (Template::Component, DriverTemplate::Http) => include_str!("new/component-http.yaml"),
-        (Template::Component, DriverTemplate::Moveit) => {
+        (CellTemplate::Component, DriverTemplate::Simulated) => include_str!("new/component.yaml"),
+        (CellTemplate::Component, DriverTemplate::Ros) => include_str!("new/component-ros.yaml"),
+        (CellTemplate::Component, DriverTemplate::Exec) => include_str!("new/component-exec.yaml"),
+        (CellTemplate::Component, DriverTemplate::Http) => include_str!("new/component-http.yaml"),
+        (CellTemplate::Component, DriverTemplate::Moveit) => {
             include_str!("new/component-moveit.yaml")
         }
-        (Template::Mes, _) => include_str!("new/mes.yaml"),
-        (Template::Mapping, _) => include_str!("new/mapping.yaml"),
-        (Template::Sysml, _) => include_str!("new/ua-bridge.sysml"),
-        (Template::Profile, _) => include_str!("new/ua-bridge.profile.uml"),
+        (CellTemplate::Mes, _) => include_str!("new/mes.yaml"),
+        (CellTemplate::Mapping, _) => include_str!("new/mapping.yaml"),
+        (CellTemplate::Sysml, _) => include_str!("new/ua-bridge.sysml"),
+        (CellTemplate::Profile, _) => include_str!("new/ua-bridge.profile.uml"),
     }
 }
 
@@ -69,7 +69,7 @@ mod tests {
     #[test]
     fn the_starting_mapping_runs_without_findings() {
         let checked = mappings::Mapping::from_yaml(
-            text(Template::Mapping, DriverTemplate::Simulated),
+            text(CellTemplate::Mapping, DriverTemplate::Simulated),
             "mapping.yaml",
         );
         assert!(checked.mapping.is_some(), "{:?}", checked.findings);
@@ -79,8 +79,8 @@ mod tests {
     #[test]
     fn starting_files_explain_each_key() {
         let component = DriverTemplate::value_variants().iter();
-        let component = component.map(|driver| (Template::Component, *driver));
-        let others = [Template::Mes, Template::Mapping];
+        let component = component.map(|driver| (CellTemplate::Component, *driver));
+        let others = [CellTemplate::Mes, CellTemplate::Mapping];
         let others = others.map(|template| (template, DriverTemplate::Simulated));
         for (template, driver) in component.chain(others) {
             let lines: Vec<&str> = text(template, driver).lines().collect();

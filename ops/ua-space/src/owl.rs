@@ -5,17 +5,17 @@ use std::io::{self, Write as _};
 use knowledge::owl::Ontology;
 
 use crate::arguments::Owl;
-use crate::exit::Failure;
+use crate::exit::CommandFailure;
 use crate::input::{name, read};
 use crate::live::harmless;
 use crate::report;
 
 /// Runs `ua-space owl`.
-pub(crate) fn owl(arguments: &Owl) -> Result<(), Failure> {
+pub(crate) fn owl(arguments: &Owl) -> Result<(), CommandFailure> {
     let mut all = Vec::new();
     for file in &arguments.files {
         let wrong = |what: &dyn std::fmt::Display| {
-            Failure::Data(harmless(&format!("{}: {what}", name(file))))
+            CommandFailure::Data(harmless(&format!("{}: {what}", name(file))))
         };
         let bytes = read(file)?;
         let text = xml_text::decode(&bytes).map_err(|fault| wrong(&fault))?;

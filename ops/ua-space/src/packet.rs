@@ -6,7 +6,7 @@ use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr, SocketAddrV4};
 
 /// A UDP datagram.
 #[derive(Debug, PartialEq, Eq)]
-pub(crate) struct Udp<'a> {
+pub(crate) struct UdpPacket<'a> {
     pub(crate) source: SocketAddr,
     pub(crate) destination: SocketAddr,
     pub(crate) payload: Cow<'a, [u8]>,
@@ -16,8 +16,8 @@ pub(crate) struct Udp<'a> {
 
 /// The contents of a packet.
 #[derive(Debug, PartialEq, Eq)]
-pub(crate) enum Found<'a> {
-    Udp(Udp<'a>),
+pub(crate) enum PacketContent<'a> {
+    Udp(UdpPacket<'a>),
     /// A fragment of a datagram that is not complete yet.
     Fragment,
     /// Another protocol, or a packet with truncated headers.
@@ -27,7 +27,11 @@ pub(crate) enum Found<'a> {
 }
 
 /// Extracts the UDP datagram of a packet.
-pub(crate) fn udp<'a>(link_type: u16, data: &'a [u8], fragments: &mut Fragments) -> Found<'a> {
+pub(crate) fn udp<'a>(
+    link_type: u16,
+    data: &'a [u8],
+    fragments: &mut Fragments,
+) -> PacketContent<'a> {
     if link_type == EXPORTED {
         return exported(data);
     }
@@ -39,55 +43,57 @@ pub(crate) fn udp<'a>(link_type: u16, data: &'a [u8], fragments: &mut Fragments)
         NULL | LOOP => data.get(4..),
         LINUX_SLL => data.get(16..),
         LINUX_SLL2 => data.get(20..),
-        _ => return Found::UnknownLink,
+        _ => return PacketContent::UnknownLink,
     };
     let Some(ip) = packet.and_then(Ip::read) else {
-        return Found::Other;
+        return PacketContent::Other;
     };
     if ip.protocol != UDP {
-        return Found::Other;
+        return PacketContent::Other;
     }
     let addresses = (ip.source, ip.destination);
     match ip.fragment {
         None => read_udp(addresses, ip.payload, ip.missing)
-            .map_or(Found::Other, |(header, payload)| {
-                Found::Udp(header.with(Cow::Borrowed(payload)))
+            .map_or(PacketContent::Other, |(header, payload)| {
+                PacketContent::Udp(header.with(Cow::Borrowed(payload)))
             }),
         // A fragment that was not captured completely leaves a gap that never closes.
         Some(fragment) => {
             match fragments.add((addresses, fragment.identification), &fragment, ip.payload) {
-                None => Found::Fragment,
-                Some(whole) => read_udp(addresses, &whole, 0)
-                    .map_or(Found::Other, |(header, payload)| {
-                        Found::Udp(header.with(Cow::Owned(payload.to_vec())))
-                    }),
+                None => PacketContent::Fragment,
+                Some(whole) => read_udp(addresses, &whole, 0).map_or(
+                    PacketContent::Other,
+                    |(header, payload)| {
+                        PacketContent::Udp(header.with(Cow::Owned(payload.to_vec())))
+                    },
+                ),
             }
         }
     }
 }
 
 /// Returns the NetworkMessage of an exported PDU, which has no addresses.
-fn exported(mut data: &[u8]) -> Found<'_> {
+fn exported(mut data: &[u8]) -> PacketContent<'_> {
     let nowhere = SocketAddr::from((Ipv4Addr::UNSPECIFIED, 0));
     let mut is_uadp = false;
     while let Some((&[a, b, c, d], rest)) = data.split_first_chunk() {
         let length = usize::from(u16::from_be_bytes([c, d]));
         match u16::from_be_bytes([a, b]) {
             END_OF_TAGS if is_uadp => {
-                return Found::Udp(Udp {
+                return PacketContent::Udp(UdpPacket {
                     source: nowhere,
                     destination: nowhere,
                     payload: Cow::Borrowed(rest),
                     missing: 0,
                 });
             }
-            END_OF_TAGS => return Found::Other,
+            END_OF_TAGS => return PacketContent::Other,
             DISSECTOR => is_uadp = rest.get(..length).is_some_and(|name| name == UADP),
             _ => {}
         }
         data = rest.get(length..).unwrap_or_default();
     }
-    Found::Other
+    PacketContent::Other
 }
 
 /// Returns the tags before the NetworkMessage in an exported PDU.
@@ -362,8 +368,8 @@ struct UdpHeader {
 }
 
 impl UdpHeader {
-    fn with(self, payload: Cow<'_, [u8]>) -> Udp<'_> {
-        Udp {
+    fn with(self, payload: Cow<'_, [u8]>) -> UdpPacket<'_> {
+        UdpPacket {
             source: self.source,
             destination: self.destination,
             payload,
@@ -465,8 +471,8 @@ mod tests {
         packet
     }
 
-    fn wanted<'a>(addresses: (&str, &str), payload: &'a [u8], missing: usize) -> Found<'a> {
-        Found::Udp(Udp {
+    fn wanted<'a>(addresses: (&str, &str), payload: &'a [u8], missing: usize) -> PacketContent<'a> {
+        PacketContent::Udp(UdpPacket {
             source: addresses.0.parse().unwrap(),
             destination: addresses.1.parse().unwrap(),
             payload: Cow::Borrowed(payload),
@@ -494,7 +500,7 @@ mod tests {
             assert_eq!(found, wanted(V4, b"payload", 0), "LINKTYPE {link_type}");
         }
         let found = udp(147, &ip, &mut Fragments::default());
-        assert_eq!(found, Found::UnknownLink);
+        assert_eq!(found, PacketContent::UnknownLink);
     }
 
     #[test]
@@ -528,11 +534,14 @@ mod tests {
         let packet = v4(0, 1, &udp_bytes(b"payload"));
         for end in 0..32 {
             let found = udp(RAW, &packet[..end], &mut Fragments::default());
-            assert_eq!(found, Found::Other, "{end} bytes");
+            assert_eq!(found, PacketContent::Other, "{end} bytes");
         }
         let mut tcp = packet;
         tcp[9] = 6;
-        assert_eq!(udp(RAW, &tcp, &mut Fragments::default()), Found::Other);
+        assert_eq!(
+            udp(RAW, &tcp, &mut Fragments::default()),
+            PacketContent::Other
+        );
     }
 
     #[test]
@@ -547,10 +556,13 @@ mod tests {
         for order in [[0, 1, 2], [2, 1, 0], [1, 2, 0]] {
             let mut fragments = Fragments::default();
             for index in &order[..2] {
-                assert_eq!(udp(RAW, &pieces[*index], &mut fragments), Found::Fragment);
+                assert_eq!(
+                    udp(RAW, &pieces[*index], &mut fragments),
+                    PacketContent::Fragment
+                );
                 // A fragment of another datagram is not mixed in.
                 let other = v4(0x2000 | 6, 8, &[0xEE; 48]);
-                assert_eq!(udp(RAW, &other, &mut fragments), Found::Fragment);
+                assert_eq!(udp(RAW, &other, &mut fragments), PacketContent::Fragment);
             }
             let found = udp(RAW, &pieces[order[2]], &mut fragments);
             assert_eq!(found, wanted(V4, &payload, 0));
@@ -563,7 +575,7 @@ mod tests {
         };
         let mut fragments = Fragments::default();
         let first = piece(1, &bytes[..64]);
-        assert_eq!(udp(RAW, &first, &mut fragments), Found::Fragment);
+        assert_eq!(udp(RAW, &first, &mut fragments), PacketContent::Fragment);
         let last = piece(64, &bytes[64..]);
         let found = udp(RAW, &last, &mut fragments);
         assert_eq!(found, wanted(V6, &payload, 0));
@@ -576,14 +588,14 @@ mod tests {
             for high in 0..4 {
                 let mut piece = v4(0x2000, number, &[0; 1400]);
                 piece[4] = high;
-                assert_eq!(udp(RAW, &piece, &mut fragments), Found::Fragment);
+                assert_eq!(udp(RAW, &piece, &mut fragments), PacketContent::Fragment);
             }
         }
         assert_eq!(fragments.open.len(), MAX_OPEN);
         assert_eq!(fragments.incomplete(), 1024);
         for _ in 0..10_000 {
             let piece = v4(0x2000, 7, &[0; 1400]);
-            assert_eq!(udp(RAW, &piece, &mut fragments), Found::Fragment);
+            assert_eq!(udp(RAW, &piece, &mut fragments), PacketContent::Fragment);
         }
         assert!(fragments.held <= MAX_HELD);
     }

@@ -8,8 +8,8 @@ use std::process::ExitCode;
 use std::sync::{Arc, OnceLock};
 
 use bridge_node::{
-    Arguments, Context, Delivery, Described, Failure, Observer, Owned, Port, PortEvent, Program,
-    Site, TypePaths,
+    Arguments, Context, Failure, LocalDelivery, Observer, Owned, Port, PortEvent, Program, Site,
+    TopicMetaData, TypePaths,
 };
 use mappings::{Mapping, SpaceId, TopicId};
 use supervisor::{Page, StatusUrl};
@@ -104,7 +104,7 @@ impl Port for NoSide {
         std::future::pending().await
     }
 
-    fn publish(&mut self, _sample: Delivery) -> Result<(), &'static str> {
+    fn publish(&mut self, _sample: LocalDelivery) -> Result<(), &'static str> {
         // The observer of the run loop has taken the value.
         Ok(())
     }
@@ -113,7 +113,7 @@ impl Port for NoSide {
         &mut self,
         _topic: TopicId,
         _shape: &[(BuiltinType, bool)],
-        _described: Option<&Described>,
+        _described: Option<&TopicMetaData>,
     ) {
         // Values of every type are shown.
     }

@@ -6,9 +6,9 @@ use std::time::Duration;
 
 use ::mtp::pea::{Pea, PeaFaults, PeaRefusal, PeaValue};
 use ::mtp::state::State;
-use ::mtp::{Identifier, Module, Node};
+use ::mtp::{Module, NodeIdentifier, OpcUaNode};
 use plant_opcua::server::{
-    EndpointUrl, ObjectSpec, Server, ServerBuilder, ServerConfig, VariableSpec, WriteRequest,
+    EndpointUrl, ObjectSpec, OpcUaServer, ServerBuilder, ServerConfig, VariableSpec, WriteRequest,
     write as write_handler,
 };
 use plant_opcua::types::{
@@ -18,22 +18,22 @@ use plant_opcua::types::{
 use tokio::time::{Instant, MissedTickBehavior};
 
 use crate::arguments::PeaArguments;
-use crate::exit::Failure;
-use crate::interrupt::Interrupt;
+use crate::exit::CommandFailure;
+use crate::interrupt::SignalGuard;
 use crate::report::say;
 use crate::survey::look;
 
 /// Runs `ua-space pea` until SIGINT or SIGTERM.
-pub(crate) fn pea(arguments: &PeaArguments) -> Result<(), Failure> {
+pub(crate) fn pea(arguments: &PeaArguments) -> Result<(), CommandFailure> {
     let module = crate::mtp_files::read(&arguments.file)?;
     let endpoint: EndpointUrl = arguments
         .listen
         .parse()
-        .map_err(|error| Failure::Usage(format!("{}: {error}", arguments.listen)))?;
+        .map_err(|error| CommandFailure::Usage(format!("{}: {error}", arguments.listen)))?;
     let stuck_in = match &arguments.stuck_in {
         Some(name) => Some(State::of_name(name).ok_or_else(|| {
             let known: Vec<&str> = State::ALL.iter().map(|state| state.name()).collect();
-            Failure::Usage(format!(
+            CommandFailure::Usage(format!(
                 "`{name}` is no state; there are {}",
                 known.join(", ")
             ))
@@ -51,7 +51,7 @@ pub(crate) fn pea(arguments: &PeaArguments) -> Result<(), Failure> {
             stuck_in,
         });
     look(async {
-        let mut interrupt = Interrupt::catch()?;
+        let mut interrupt = SignalGuard::catch()?;
         let server = serve(&module, pea, endpoint)?;
         say(&format!("{} is at {}", module.name, server.url()))?;
         interrupt.received().await;
@@ -80,7 +80,7 @@ impl Simulated {
     }
 }
 
-fn serve(module: &Module, pea: Pea, endpoint: EndpointUrl) -> Result<Server, Failure> {
+fn serve(module: &Module, pea: Pea, endpoint: EndpointUrl) -> Result<OpcUaServer, CommandFailure> {
     let uri = format!("urn:ua-bridge:pea:{}", ::mtp::escaped(&module.name));
     let config = ServerConfig::new(&uri, &module.name, endpoint);
     let mut builder = ServerBuilder::new(config);
@@ -89,9 +89,9 @@ fn serve(module: &Module, pea: Pea, endpoint: EndpointUrl) -> Result<Server, Fai
     }
     let server = builder
         .build()
-        .map_err(|error| Failure::Unavailable(error.to_string()))?;
+        .map_err(|error| CommandFailure::Unavailable(error.to_string()))?;
     let wrong =
-        |error: &dyn std::fmt::Display| Failure::Data(format!("the address space: {error}"));
+        |error: &dyn std::fmt::Display| CommandFailure::Data(format!("the address space: {error}"));
     let folder = NodeId::new(1, "Module");
     server
         .add_object(&ObjectSpec {
@@ -150,7 +150,7 @@ fn serve(module: &Module, pea: Pea, endpoint: EndpointUrl) -> Result<Server, Fai
 }
 
 /// Returns the namespaces to register. Indexes in place of URIs are filled up with names.
-fn namespaces(module: &Module) -> Result<Vec<String>, Failure> {
+fn namespaces(module: &Module) -> Result<Vec<String>, CommandFailure> {
     let mut uris: Vec<String> = Vec::new();
     let mut highest: u16 = 0;
     for item in &module.items {
@@ -158,7 +158,7 @@ fn namespaces(module: &Module) -> Result<Vec<String>, Failure> {
         match namespace.parse::<u16>() {
             Ok(index) if index > MOST_NAMESPACES => {
                 let why = format!("{}: the namespace index {index} is too large", item.name);
-                return Err(Failure::Data(why));
+                return Err(CommandFailure::Data(why));
             }
             Ok(index) => highest = highest.max(index),
             Err(_) if !uris.contains(namespace) => uris.push(namespace.clone()),
@@ -174,14 +174,14 @@ fn namespaces(module: &Module) -> Result<Vec<String>, Failure> {
     Ok(uris)
 }
 
-fn node_id(server: &Server, node: &Node) -> Option<NodeId> {
+fn node_id(server: &OpcUaServer, node: &OpcUaNode) -> Option<NodeId> {
     let index = match node.namespace.parse() {
         Ok(index) => index,
         Err(_) => server.namespace(&node.namespace)?,
     };
     Some(match &node.identifier {
-        Identifier::Numeric(number) => NodeId::new(index, *number),
-        Identifier::Text(text) => NodeId::new(index, text.as_str()),
+        NodeIdentifier::Numeric(number) => NodeId::new(index, *number),
+        NodeIdentifier::Text(text) => NodeId::new(index, text.as_str()),
     })
 }
 
@@ -210,7 +210,7 @@ fn written(
 }
 
 /// Advances the module, and publishes changed values.
-async fn run(server: Server, simulated: Arc<Mutex<Simulated>>, ids: BTreeMap<String, NodeId>) {
+async fn run(server: OpcUaServer, simulated: Arc<Mutex<Simulated>>, ids: BTreeMap<String, NodeId>) {
     let mut tick = tokio::time::interval(TICK);
     tick.set_missed_tick_behavior(MissedTickBehavior::Delay);
     loop {

@@ -7,14 +7,14 @@ use uri_text::escaped;
 
 use crate::arguments::PlanArguments;
 use crate::ask::{parsed, refusal};
-use crate::exit::Failure;
-use crate::http::Server;
-use crate::live::{Table, harmless, is_coloured};
+use crate::exit::CommandFailure;
+use crate::http::HttpServer;
+use crate::live::{TextTable, harmless, is_coloured};
 use crate::survey::look;
 
 /// Runs `ua-space plan`.
-pub(crate) fn plan(arguments: &PlanArguments) -> Result<(), Failure> {
-    let server = Server::parse(&arguments.mes.url)?;
+pub(crate) fn plan(arguments: &PlanArguments) -> Result<(), CommandFailure> {
+    let server = HttpServer::parse(&arguments.mes.url)?;
     look(async {
         let status = get(&server, "/status").await?;
         let known: Status = parsed(&status)?;
@@ -27,7 +27,7 @@ pub(crate) fn plan(arguments: &PlanArguments) -> Result<(), Failure> {
     })
 }
 
-async fn get(server: &Server, path: &str) -> Result<String, Failure> {
+async fn get(server: &HttpServer, path: &str) -> Result<String, CommandFailure> {
     let answer = server.get(path).await?;
     match answer.status {
         200 => Ok(answer.body),
@@ -39,12 +39,12 @@ async fn get(server: &Server, path: &str) -> Result<String, Failure> {
 #[derive(Debug, Deserialize)]
 struct Status {
     #[serde(default)]
-    processes: Vec<Known>,
+    processes: Vec<KnownProcess>,
 }
 
 /// A process that the MES knows.
 #[derive(Debug, Deserialize)]
-struct Known {
+struct KnownProcess {
     process: String,
     #[serde(default)]
     name: String,
@@ -93,16 +93,16 @@ struct Candidate {
 }
 
 /// Returns the IRI of a process that is given by its IRI, its name or the end of its IRI.
-fn find<'a>(known: &'a [Known], wanted: &str) -> Result<&'a str, Failure> {
+fn find<'a>(known: &'a [KnownProcess], wanted: &str) -> Result<&'a str, CommandFailure> {
     let exact = known.iter().find(|one| one.process == wanted);
     if let Some(one) = exact {
         return Ok(&one.process);
     }
-    let is_meant = |one: &&Known| one.name == wanted || short(&one.process) == wanted;
+    let is_meant = |one: &&KnownProcess| one.name == wanted || short(&one.process) == wanted;
     let mut meant = known.iter().filter(is_meant);
     match (meant.next(), meant.next()) {
         (Some(one), None) => Ok(&one.process),
-        (Some(one), Some(other)) => Err(Failure::Usage(format!(
+        (Some(one), Some(other)) => Err(CommandFailure::Usage(format!(
             "{wanted} is {} and {}: give the IRI",
             harmless(&one.process),
             harmless(&other.process)
@@ -114,14 +114,14 @@ fn find<'a>(known: &'a [Known], wanted: &str) -> Result<&'a str, Failure> {
                 None => "`ua-space plan` lists the processes".to_owned(),
             };
             let wanted = harmless(wanted);
-            Err(Failure::Usage(format!(
+            Err(CommandFailure::Usage(format!(
                 "the MES knows no process {wanted}\n  = help: {help}"
             )))
         }
     }
 }
 
-fn list(known: &[Known], status: &str, is_json: bool) -> Result<(), Failure> {
+fn list(known: &[KnownProcess], status: &str, is_json: bool) -> Result<(), CommandFailure> {
     let mut out = io::stdout().lock();
     if is_json {
         let status: serde_json::Value = parsed(status)?;
@@ -129,7 +129,7 @@ fn list(known: &[Known], status: &str, is_json: bool) -> Result<(), Failure> {
         writeln!(out, "{}", mappings::harmless_json(&processes.to_string()))?;
         return Ok(());
     }
-    let mut table = Table::new(["PROCESS", "NAME", "STEPS"].map(str::to_owned)).yielding([2]);
+    let mut table = TextTable::new(["PROCESS", "NAME", "STEPS"].map(str::to_owned)).yielding([2]);
     for one in known {
         let steps = one.steps.join(", ");
         table.row([one.process.clone(), one.name.clone(), steps]);
@@ -138,14 +138,14 @@ fn list(known: &[Known], status: &str, is_json: bool) -> Result<(), Failure> {
     Ok(())
 }
 
-fn show(body: &str, is_json: bool) -> Result<(), Failure> {
+fn show(body: &str, is_json: bool) -> Result<(), CommandFailure> {
     let planned: Planned = parsed(body)?;
     let mut out = io::stdout().lock();
     if is_json {
         writeln!(out, "{}", mappings::harmless_json(body.trim_end()))?;
     } else {
         let columns = ["STEP", "NEEDS", "COMPONENT", "SKILL", "CHOSEN", "REASON"];
-        let mut table = Table::new(columns.map(str::to_owned)).yielding([5, 1]);
+        let mut table = TextTable::new(columns.map(str::to_owned)).yielding([5, 1]);
         for row in rows(&planned) {
             table.row(row);
         }
@@ -154,7 +154,7 @@ fn show(body: &str, is_json: bool) -> Result<(), Failure> {
     if planned.complete {
         Ok(())
     } else {
-        Err(Failure::Failed(format!(
+        Err(CommandFailure::Failed(format!(
             "{} cannot run: {}",
             harmless(&planned.process),
             harmless(&plain(&planned.missing))
@@ -251,7 +251,7 @@ mod tests {
 
     #[test]
     fn a_process_is_found_by_its_iri_its_name_and_the_end_of_its_iri() {
-        let known = |process: &str, name: &str| Known {
+        let known = |process: &str, name: &str| KnownProcess {
             process: process.to_owned(),
             name: name.to_owned(),
             steps: Vec::new(),

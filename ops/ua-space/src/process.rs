@@ -6,14 +6,14 @@ use serde_json::json;
 use uri_text::escaped;
 
 use crate::arguments::{ProcessArguments, ProcessVerb};
-use crate::exit::Failure;
+use crate::exit::CommandFailure;
 use crate::input::read;
 use crate::live::harmless;
 use crate::report::{say, warn};
 use crate::source::{CREATED, change, findings, plain_name};
 
 /// Runs `ua-space process`.
-pub(crate) fn process(arguments: &ProcessArguments) -> Result<(), Failure> {
+pub(crate) fn process(arguments: &ProcessArguments) -> Result<(), CommandFailure> {
     let ProcessVerb::Import {
         file,
         names,
@@ -21,8 +21,8 @@ pub(crate) fn process(arguments: &ProcessArguments) -> Result<(), Failure> {
         at,
     } = &arguments.verb;
     let contents = read(file)?;
-    let recipe =
-        xml_text::decode(&contents).map_err(|fault| Failure::Data(format!("{file}: {fault}")))?;
+    let recipe = xml_text::decode(&contents)
+        .map_err(|fault| CommandFailure::Data(format!("{file}: {fault}")))?;
     let name = match source {
         Some(name) => name.clone(),
         None => plain_name(file)?,
@@ -41,7 +41,7 @@ pub(crate) fn process(arguments: &ProcessArguments) -> Result<(), Failure> {
 }
 
 /// Reads names with the names that they stand for.
-fn named(names: &[String]) -> Result<BTreeMap<&str, &str>, Failure> {
+fn named(names: &[String]) -> Result<BTreeMap<&str, &str>, CommandFailure> {
     let mut all = BTreeMap::new();
     for name in names {
         // The type of a skill begins with nsu=. An IRI contains no =, and a name of a recipe may.
@@ -49,7 +49,7 @@ fn named(names: &[String]) -> Result<BTreeMap<&str, &str>, Failure> {
         let split = at.and_then(|at| Some((name.get(..at)?, name.get(at + 1..)?)));
         let split = split.filter(|(name, of)| !name.is_empty() && !of.is_empty());
         let (name, stands_for) = split.ok_or_else(|| {
-            Failure::Usage(format!("--name {name}: expected NAME=NAME, as Sekunde=s"))
+            CommandFailure::Usage(format!("--name {name}: expected NAME=NAME, as Sekunde=s"))
         })?;
         all.insert(name, stands_for);
     }

@@ -3,25 +3,25 @@
 use std::sync::LazyLock;
 
 use uadp::{
-    BuiltinType, DecodeError, Encoded, NodeId, RawDialect, RawField, RawLayout, RawStructure,
+    BuiltinType, DecodeError, Nested, NodeId, RawDialect, RawField, RawLayout, RawStructure,
     RawStructureType, RawValue, Variant,
 };
 
 use crate::arguments::RawReading;
-use crate::fault::{Stop, in_field};
+use crate::fault::{PartialRead, in_field};
 use crate::node_ids::OwnedNodeId;
-use crate::shape::{Field, FieldMetaData};
-use crate::values::{FieldValue, WrongValue, show_scalar, show_variant, variant_bytes};
+use crate::shape::{FieldJson, FieldMetaData};
+use crate::values::{JsonFieldValue, WrongValue, show_scalar, show_variant, variant_bytes};
 
 /// The fields of a DataSet, with the properties that RawData uses.
 #[derive(Debug)]
-pub(crate) struct Layout<'a> {
+pub(crate) struct RawDataLayout<'a> {
     metadata: &'a [FieldMetaData],
     fields: Vec<RawField<'a>>,
     reading: RawReading,
 }
 
-impl<'a> Layout<'a> {
+impl<'a> RawDataLayout<'a> {
     /// Creates the layout. Fails if RawData cannot have these fields.
     pub(crate) fn new(
         metadata: &'a [FieldMetaData],
@@ -58,19 +58,23 @@ impl<'a> Layout<'a> {
     }
 
     /// Passes the fields of a payload to `each`; an error has the number of fields before it.
-    pub(crate) fn read(&self, payload: &[u8], mut each: impl FnMut(Field)) -> Result<(), Stop> {
+    pub(crate) fn read(
+        &self,
+        payload: &[u8],
+        mut each: impl FnMut(FieldJson),
+    ) -> Result<(), PartialRead> {
         let layout = RawLayout::new(&self.fields)
             .map_err(|_| (None, DecodeError::Misread("not what its metadata says")))?;
         for (value, at) in layout.read(payload, self.dialect()).zip(0..) {
             let value = value.and_then(|value| show_raw(&value));
             let value = value.map_err(|error| in_field(at, error))?;
-            each(Field { index: None, value });
+            each(FieldJson { index: None, value });
         }
         Ok(())
     }
 
     /// Returns the payload of these fields.
-    pub(crate) fn write(&self, fields: &[Field]) -> Result<Vec<u8>, WrongValue> {
+    pub(crate) fn write(&self, fields: &[FieldJson]) -> Result<Vec<u8>, WrongValue> {
         let mut buffers = Vec::new();
         for (field, at) in fields.iter().zip(0..) {
             let bytes = variant_bytes(&field.value);
@@ -78,7 +82,7 @@ impl<'a> Layout<'a> {
         }
         let mut values = Vec::new();
         for bytes in &buffers {
-            values.push(Encoded::<Variant<'_>>::new(bytes)?.get()?);
+            values.push(Nested::<Variant<'_>>::new(bytes)?.get()?);
         }
         let layout =
             RawLayout::new(&self.fields).map_err(|error| WrongValue::new(error.to_string()))?;
@@ -115,18 +119,18 @@ fn raw_field(metadata: &FieldMetaData) -> Result<RawField<'_>, WrongValue> {
     })
 }
 
-fn show_raw(value: &RawValue<'_>) -> Result<FieldValue, DecodeError> {
+fn show_raw(value: &RawValue<'_>) -> Result<JsonFieldValue, DecodeError> {
     let array = match value {
         RawValue::Variant(variant) => return show_variant(variant),
         RawValue::Array(array) => array,
     };
     let dimensions: Vec<_> = array.dimensions().collect();
-    Ok(FieldValue {
+    Ok(JsonFieldValue {
         ua_type: Some(array.element().id()),
         value: Some(array.iter().map(show_scalar).collect::<Result<_, _>>()?),
         null_array: array.is_null(),
         dimensions: (!dimensions.is_empty()).then_some(dimensions),
-        ..FieldValue::default()
+        ..JsonFieldValue::default()
     })
 }
 

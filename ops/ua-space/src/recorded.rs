@@ -9,29 +9,29 @@ use std::io::Read;
 use std::net::SocketAddr;
 use std::path::Path;
 
-use crate::capture::Capture;
-use crate::exit::Failure;
-use crate::input::{self, Input};
-use crate::packet::{self, Found, Fragments};
+use crate::capture::CaptureReader;
+use crate::exit::CommandFailure;
+use crate::input::{self, InputFile};
+use crate::packet::{self, Fragments, PacketContent};
 
 pub(crate) use self::mcap::is_mcap;
-pub(crate) use self::values::Unusable;
-use self::values::Values;
+use self::values::RecordedValues;
+pub(crate) use self::values::UnusableValue;
 
 /// Reads the NetworkMessages of a recording.
-pub(crate) struct Recorded {
+pub(crate) struct RecordingReader {
     name: String,
     source: Source,
 }
 
 enum Source {
     Packets(Packets),
-    Values(Box<Values<Box<dyn Read>>>),
+    Values(Box<RecordedValues<Box<dyn Read>>>),
 }
 
 /// The packets of a capture.
 struct Packets {
-    capture: Capture<Box<dyn Read>>,
+    capture: CaptureReader<Box<dyn Read>>,
     fragments: Fragments,
     /// The time of the last message.
     time: i128,
@@ -39,32 +39,33 @@ struct Packets {
 
 /// A recorded datagram.
 #[derive(Debug)]
-pub(crate) struct Datagram {
+pub(crate) struct RecordedDatagram {
     /// Nanoseconds since 1970.
     pub(crate) time: i128,
     pub(crate) from: SocketAddr,
     pub(crate) bytes: Vec<u8>,
 }
 
-impl Recorded {
+impl RecordingReader {
     /// Opens a capture, or an MCAP file of `ua-space record`.
     ///
     /// # Errors
-    /// A [`Failure`] if the file cannot be read or is no recording.
-    pub(crate) fn open(file: &Path) -> Result<Self, Failure> {
+    /// A [`CommandFailure`] if the file cannot be read or is no recording.
+    pub(crate) fn open(file: &Path) -> Result<Self, CommandFailure> {
         let name = file.display().to_string();
         let source = match input::open(&name, false)? {
-            Input::Capture(capture) => Source::Packets(Packets {
+            InputFile::Capture(capture) => Source::Packets(Packets {
                 capture,
                 fragments: Fragments::default(),
                 time: 0,
             }),
-            Input::Mcap(reader) => {
-                let values = Values::new(reader).map_err(|error| input::failure(&name, error))?;
+            InputFile::Mcap(reader) => {
+                let values =
+                    RecordedValues::new(reader).map_err(|error| input::failure(&name, error))?;
                 Source::Values(Box::new(values))
             }
-            Input::Datagram(_) | Input::Lines(_) => {
-                return Err(Failure::Data(format!(
+            InputFile::Datagram(_) | InputFile::Lines(_) => {
+                return Err(CommandFailure::Data(format!(
                     "{name} is no pcapng, pcap or MCAP file; `ua-space record` makes one"
                 )));
             }
@@ -74,7 +75,7 @@ impl Recorded {
 
     /// Returns the next datagram: a UDP datagram that was captured as a whole, or a value of an
     /// MCAP file.
-    pub(crate) fn next(&mut self) -> Result<Option<Datagram>, Failure> {
+    pub(crate) fn next(&mut self) -> Result<Option<RecordedDatagram>, CommandFailure> {
         let next = match &mut self.source {
             Source::Packets(packets) => packets.next(),
             Source::Values(values) => values.next(),
@@ -88,7 +89,7 @@ impl Recorded {
     }
 
     /// Returns the numbers of values so far that cannot be sent again, by reason.
-    pub(crate) fn unusable(&self) -> BTreeMap<Unusable, u64> {
+    pub(crate) fn unusable(&self) -> BTreeMap<UnusableValue, u64> {
         match &self.source {
             Source::Packets(_) => BTreeMap::new(),
             Source::Values(values) => values.unusable().clone(),
@@ -97,14 +98,14 @@ impl Recorded {
 }
 
 impl Packets {
-    fn next(&mut self) -> Result<Option<Datagram>, crate::capture::CaptureError> {
+    fn next(&mut self) -> Result<Option<RecordedDatagram>, crate::capture::CaptureError> {
         while let Some(packet) = self.capture.next_packet()? {
             self.time = packet.time.unwrap_or(self.time);
             let found = packet::udp(packet.link_type, &packet.data, &mut self.fragments);
-            if let Found::Udp(udp) = found
+            if let PacketContent::Udp(udp) = found
                 && udp.missing == 0
             {
-                return Ok(Some(Datagram {
+                return Ok(Some(RecordedDatagram {
                     time: self.time,
                     from: udp.source,
                     bytes: udp.payload.into_owned(),

@@ -2,12 +2,12 @@
 
 use std::io::{self, BufWriter, StdoutLock, Write as _};
 
-use crate::decode::Reading;
-use crate::exit::Failure;
+use crate::decode::DecodedDatagram;
+use crate::exit::CommandFailure;
 use crate::{hex, layout};
 
 /// The output and its style.
-pub(crate) struct Report {
+pub(crate) struct StyledOutput {
     out: BufWriter<StdoutLock<'static>>,
     style: Style,
     shown: usize,
@@ -24,7 +24,7 @@ pub(crate) enum Style {
     Array,
 }
 
-impl Report {
+impl StyledOutput {
     pub(crate) fn new(style: Style) -> Self {
         Self {
             out: BufWriter::new(io::stdout().lock()),
@@ -35,7 +35,11 @@ impl Report {
     }
 
     /// Shows a datagram and reports its faults; `name` identifies the datagram.
-    pub(crate) fn show(&mut self, name: &str, reading: &Reading) -> Result<(), Failure> {
+    pub(crate) fn show(
+        &mut self,
+        name: &str,
+        reading: &DecodedDatagram,
+    ) -> Result<(), CommandFailure> {
         if !reading.faults.is_empty() || reading.refused.is_some() {
             self.faulty += 1;
         }
@@ -72,7 +76,7 @@ impl Report {
     }
 
     /// Ends the output; fails if a datagram was malformed.
-    pub(crate) fn finish(mut self) -> Result<(), Failure> {
+    pub(crate) fn finish(mut self) -> Result<(), CommandFailure> {
         if self.style == Style::Array {
             let end = if self.shown == 0 { "[]\n" } else { "\n]\n" };
             self.out.write_all(end.as_bytes())?;
@@ -80,13 +84,13 @@ impl Report {
         self.out.flush()?;
         match self.faulty {
             0 => Ok(()),
-            _ => Err(Failure::Told),
+            _ => Err(CommandFailure::Told),
         }
     }
 }
 
 /// Writes a line to stdout.
-pub(crate) fn say(text: &str) -> Result<(), Failure> {
+pub(crate) fn say(text: &str) -> Result<(), CommandFailure> {
     let mut out = io::stdout().lock();
     writeln!(out, "{}", crate::live::harmless(text))?;
     out.flush()?;

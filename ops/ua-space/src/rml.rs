@@ -3,16 +3,16 @@
 use std::io;
 use std::path::Path;
 
-use rml::{Folder, Mapping, MappingFault, Output};
+use rml::{Folder, MappingFault, RmlMapping, RunOutput};
 
 use crate::arguments::{RdfFormat, Rml};
-use crate::exit::Failure;
+use crate::exit::CommandFailure;
 use crate::input::read;
 use crate::live::harmless;
 use crate::report;
 
 /// Runs `ua-space rml`.
-pub(crate) fn rml(arguments: &Rml) -> Result<(), Failure> {
+pub(crate) fn rml(arguments: &Rml) -> Result<(), CommandFailure> {
     let (mapping, mut folder) = open(&arguments.mapping)?;
     for given in &arguments.files {
         // A path may contain `=`, so that the whole counts as a path unless the name is known.
@@ -33,7 +33,7 @@ pub(crate) fn rml(arguments: &Rml) -> Result<(), Failure> {
 }
 
 /// Returns the statements of a mapping as Turtle, with `contents` as its only file.
-pub(crate) fn turtle(path: &str, contents: Vec<u8>) -> Result<Vec<u8>, Failure> {
+pub(crate) fn turtle(path: &str, contents: Vec<u8>) -> Result<Vec<u8>, CommandFailure> {
     let (mapping, folder) = open(path)?;
     let name = only_file(&mapping, path)?.to_owned();
     let output = run(path, &mapping, folder.with(&name, contents))?;
@@ -43,17 +43,17 @@ pub(crate) fn turtle(path: &str, contents: Vec<u8>) -> Result<Vec<u8>, Failure> 
     Ok(output.turtle()?)
 }
 
-fn open(path: &str) -> Result<(Mapping, Folder), Failure> {
+fn open(path: &str) -> Result<(RmlMapping, Folder), CommandFailure> {
     let text = String::from_utf8(read(path)?)
-        .map_err(|_| Failure::Data(format!("{path}: it is not UTF-8; save it as UTF-8")))?;
-    let mapping = Mapping::read(&text).map_err(|fault| failure(path, &fault))?;
+        .map_err(|_| CommandFailure::Data(format!("{path}: it is not UTF-8; save it as UTF-8")))?;
+    let mapping = RmlMapping::read(&text).map_err(|fault| failure(path, &fault))?;
     for found in mapping.findings() {
         report::warn(&harmless(&format!("{path}: {found}")));
     }
     Ok((mapping, Folder::of(Path::new(path))))
 }
 
-fn run(path: &str, mapping: &Mapping, mut folder: Folder) -> Result<Output, Failure> {
+fn run(path: &str, mapping: &RmlMapping, mut folder: Folder) -> Result<RunOutput, CommandFailure> {
     let output = mapping.run(&mut folder);
     let output = output.map_err(|fault| failure(path, &fault))?;
     for found in &output.findings {
@@ -62,16 +62,16 @@ fn run(path: &str, mapping: &Mapping, mut folder: Folder) -> Result<Output, Fail
     Ok(output)
 }
 
-fn failure(path: &str, fault: &MappingFault) -> Failure {
-    Failure::Data(harmless(&format!("{path}: {fault}")))
+fn failure(path: &str, fault: &MappingFault) -> CommandFailure {
+    CommandFailure::Data(harmless(&format!("{path}: {fault}")))
 }
 
 /// Returns the only file that a mapping names.
-fn only_file<'m>(mapping: &'m Mapping, path: &str) -> Result<&'m str, Failure> {
+fn only_file<'m>(mapping: &'m RmlMapping, path: &str) -> Result<&'m str, CommandFailure> {
     let files: Vec<&str> = mapping.files().into_iter().collect();
     match files.as_slice() {
         [only] => Ok(only),
-        several => Err(Failure::Usage(format!(
+        several => Err(CommandFailure::Usage(format!(
             "{path} reads several files ({}); give them to `ua-space rml` as NAME=FILE",
             several.join(", ")
         ))),

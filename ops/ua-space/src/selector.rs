@@ -8,13 +8,13 @@ use crate::shape;
 /// A PublisherId: with its type, or a number or text alone, which matches any type.
 #[derive(Debug, Deserialize)]
 #[serde(untagged)]
-pub(crate) enum Publisher {
-    Typed(shape::PublisherId),
+pub(crate) enum PublisherSelector {
+    Typed(shape::PublisherIdJson),
     Any(Value),
 }
 
-impl Publisher {
-    fn is(&self, id: &shape::PublisherId) -> bool {
+impl PublisherSelector {
+    fn is(&self, id: &shape::PublisherIdJson) -> bool {
         match self {
             Self::Typed(wanted) => {
                 wanted.id_type == id.id_type && text(&wanted.value) == text(&id.value)
@@ -25,7 +25,10 @@ impl Publisher {
 }
 
 /// Returns true if the ids are equal or `wanted` is `None`.
-pub(crate) fn publisher_fits(wanted: Option<&Publisher>, id: Option<&shape::PublisherId>) -> bool {
+pub(crate) fn publisher_fits(
+    wanted: Option<&PublisherSelector>,
+    id: Option<&shape::PublisherIdJson>,
+) -> bool {
     match (wanted, id) {
         (None, _) => true,
         (Some(wanted), Some(id)) => wanted.is(id),

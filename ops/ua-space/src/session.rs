@@ -4,35 +4,35 @@ use std::borrow::Cow;
 use std::io::{self, Read, Write as _};
 use std::path::Path;
 
-use crate::arguments::{Decode, Encode, Known};
-use crate::capture::Capture;
-use crate::decode::{Chunks, Context, Reading};
+use crate::arguments::{Decode, DecoderArguments, Encode};
+use crate::capture::CaptureReader;
+use crate::decode::{ChunkReassembler, DecodeContext, DecodedDatagram};
 use crate::encode;
-use crate::exit::Failure;
-use crate::input::{self, Input};
+use crate::exit::CommandFailure;
+use crate::input::{self, InputFile};
 use crate::keys::KeyFile;
 use crate::metadata::MetaDataFile;
-use crate::packet::{self, Found, Fragments, Udp};
-use crate::report::{Report, Style, warn};
+use crate::packet::{self, Fragments, PacketContent, UdpPacket};
+use crate::report::{Style, StyledOutput, warn};
 use crate::{hex, iso_time, json_file, shape};
 
 /// Runs `ua-space decode`.
-pub(crate) fn decode(arguments: &Decode) -> Result<(), Failure> {
+pub(crate) fn decode(arguments: &Decode) -> Result<(), CommandFailure> {
     let name = input::name(&arguments.file);
     let context = context(&arguments.known)?;
     let input = input::open(&arguments.file, arguments.lines)?;
     let style = match &input {
-        Input::Mcap(_) => return Err(no_datagrams(name)),
+        InputFile::Mcap(_) => return Err(no_datagrams(name)),
         _ if arguments.array => Style::Array,
-        Input::Datagram(_) => Style::Single,
-        Input::Lines(_) | Input::Capture(_) => Style::Lines,
+        InputFile::Datagram(_) => Style::Single,
+        InputFile::Lines(_) | InputFile::Capture(_) => Style::Lines,
     };
     let mut session = Session {
         name,
         port: arguments.port,
         context,
-        chunks: Chunks::new(),
-        report: Report::new(style),
+        chunks: ChunkReassembler::new(),
+        report: StyledOutput::new(style),
         counters: Counters::default(),
     };
     let ended = session.run(input);
@@ -42,25 +42,25 @@ pub(crate) fn decode(arguments: &Decode) -> Result<(), Failure> {
 }
 
 /// Returns the failure for a file with values only.
-fn no_datagrams(name: &str) -> Failure {
-    Failure::Data(format!(
+fn no_datagrams(name: &str) -> CommandFailure {
+    CommandFailure::Data(format!(
         "{name} is an MCAP file, which has values and no datagrams\n  = help: `ua-space replay --dry-run {name}` shows its topics; `ua-space record` writes datagrams as .pcapng"
     ))
 }
 
 /// Runs `ua-space encode`.
-pub(crate) fn encode(arguments: &Encode) -> Result<(), Failure> {
+pub(crate) fn encode(arguments: &Encode) -> Result<(), CommandFailure> {
     let name = input::name(&arguments.file);
     let context = context(&arguments.known)?;
     let text = match arguments.file.as_str() {
         "-" => io::read_to_string(io::stdin().lock().take(json_file::LARGEST))
-            .map_err(|error| Failure::reading(name, &error))?,
+            .map_err(|error| CommandFailure::reading(name, &error))?,
         path => json_file::read(Path::new(path))?,
     };
-    let datagrams: Vec<shape::Datagram> =
+    let datagrams: Vec<shape::DatagramJson> =
         json_file::one_or_many(&text).map_err(|error| json_file::explain(name, &error))?;
     if datagrams.is_empty() {
-        return Err(Failure::Data(format!("{name}: holds no datagram")));
+        return Err(CommandFailure::Data(format!("{name}: holds no datagram")));
     }
     let many = datagrams.len() > 1;
     let mut out = io::stdout().lock();
@@ -71,7 +71,7 @@ pub(crate) fn encode(arguments: &Encode) -> Result<(), Failure> {
             } else {
                 String::new()
             };
-            Failure::Data(format!("{name}:{number} {wrong}"))
+            CommandFailure::Data(format!("{name}:{number} {wrong}"))
         })?;
         if arguments.raw {
             out.write_all(&bytes)?
@@ -83,11 +83,11 @@ pub(crate) fn encode(arguments: &Encode) -> Result<(), Failure> {
     Ok(())
 }
 
-fn context(known: &Known) -> Result<Context, Failure> {
+fn context(known: &DecoderArguments) -> Result<DecodeContext, CommandFailure> {
     let keys = known.keys.as_deref().map(|path| KeyFile::read(path, warn));
     let metadata = known.metadata.as_deref();
     let metadata = metadata.map(|path| MetaDataFile::read(path, known.raw_reading));
-    Ok(Context {
+    Ok(DecodeContext {
         keys: keys.transpose()?,
         metadata: metadata.transpose()?.unwrap_or_default(),
         raw_reading: known.raw_reading,
@@ -98,9 +98,9 @@ fn context(known: &Known) -> Result<Context, Failure> {
 struct Session<'a> {
     name: &'a str,
     port: Option<u16>,
-    context: Context,
-    chunks: Chunks,
-    report: Report,
+    context: DecodeContext,
+    chunks: ChunkReassembler,
+    report: StyledOutput,
     counters: Counters,
 }
 
@@ -121,25 +121,25 @@ struct Counters {
 }
 
 impl Session<'_> {
-    fn run(&mut self, input: Input) -> Result<(), Failure> {
+    fn run(&mut self, input: InputFile) -> Result<(), CommandFailure> {
         match input {
-            Input::Datagram(datagram) => {
+            InputFile::Datagram(datagram) => {
                 let reading = self.context.read(&datagram, None);
                 self.show(self.name, &reading)
             }
-            Input::Lines(datagrams) => {
+            InputFile::Lines(datagrams) => {
                 for (line, datagram) in datagrams {
                     let reading = self.context.read(&datagram, Some(&mut self.chunks));
                     self.show(&format!("{}: line {line}", self.name), &reading)?;
                 }
                 Ok(())
             }
-            Input::Capture(capture) => self.capture(capture),
-            Input::Mcap(_) => Err(no_datagrams(self.name)),
+            InputFile::Capture(capture) => self.capture(capture),
+            InputFile::Mcap(_) => Err(no_datagrams(self.name)),
         }
     }
 
-    fn show(&mut self, name: &str, reading: &Reading) -> Result<(), Failure> {
+    fn show(&mut self, name: &str, reading: &DecodedDatagram) -> Result<(), CommandFailure> {
         if reading.shape.sealed.is_some() && reading.refused.is_none() {
             self.counters.sealed += 1;
         }
@@ -150,7 +150,7 @@ impl Session<'_> {
         }
     }
 
-    fn capture(&mut self, mut capture: Capture<impl Read>) -> Result<(), Failure> {
+    fn capture(&mut self, mut capture: CaptureReader<impl Read>) -> Result<(), CommandFailure> {
         let mut fragments = Fragments::default();
         loop {
             let packet = capture.next_packet();
@@ -160,20 +160,20 @@ impl Session<'_> {
             };
             self.counters.packets += 1;
             match packet::udp(packet.link_type, &packet.data, &mut fragments) {
-                Found::Udp(udp) => {
+                PacketContent::Udp(udp) => {
                     self.counters.udp += 1;
                     self.datagram(packet.time, udp)?;
                 }
-                Found::UnknownLink => {
+                PacketContent::UnknownLink => {
                     self.counters.unknown_links += 1;
                     self.counters.unknown_link = packet.link_type;
                 }
-                Found::Fragment | Found::Other => {}
+                PacketContent::Fragment | PacketContent::Other => {}
             }
         }
     }
 
-    fn datagram(&mut self, time: Option<i128>, udp: Udp<'_>) -> Result<(), Failure> {
+    fn datagram(&mut self, time: Option<i128>, udp: UdpPacket<'_>) -> Result<(), CommandFailure> {
         let is_of = |port| [udp.source.port(), udp.destination.port()].contains(&port);
         if self.port.is_some_and(|port| !is_of(port)) {
             return Ok(());

@@ -1,7 +1,7 @@
 //! The JSON of a datagram, key by key. Absent or null keys are not on the wire. There are no keys
 //! for flags, because the flags follow from the present keys.
 
-use json_values::FieldValue;
+use json_values::JsonFieldValue;
 use serde::de::IgnoredAny;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
@@ -9,7 +9,7 @@ use serde_json::Value;
 /// A NetworkMessage (OPC 10000-14, 7.2.4.4.2).
 #[derive(Debug, Default, Serialize, Deserialize)]
 #[serde(rename_all = "camelCase", deny_unknown_fields, default)]
-pub(crate) struct Datagram {
+pub(crate) struct DatagramJson {
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) time: Option<String>,
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -28,36 +28,36 @@ pub(crate) struct Datagram {
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) uadp_version: Option<u8>,
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub(crate) network_message_type: Option<NetworkMessageType>,
+    pub(crate) network_message_type: Option<NetworkMessageTypeJson>,
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub(crate) publisher_id: Option<PublisherId>,
+    pub(crate) publisher_id: Option<PublisherIdJson>,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) data_set_class_id: Option<String>,
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub(crate) group_header: Option<GroupHeader>,
+    pub(crate) group_header: Option<GroupHeaderJson>,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) data_set_writer_ids: Option<Vec<u16>>,
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub(crate) timestamp: Option<Timestamp>,
+    pub(crate) timestamp: Option<TimestampJson>,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) pico_seconds: Option<u16>,
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub(crate) promoted_fields: Option<Vec<FieldValue>>,
+    pub(crate) promoted_fields: Option<Vec<JsonFieldValue>>,
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub(crate) security_header: Option<SecurityHeader>,
+    pub(crate) security_header: Option<SecurityHeaderJson>,
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub(crate) action_header: Option<ActionHeader>,
+    pub(crate) action_header: Option<ActionHeaderJson>,
     /// The bytes after the headers, while they are encrypted or their signature is not verified.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) sealed: Option<Sealed>,
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub(crate) chunk: Option<Chunk>,
+    pub(crate) chunk: Option<ChunkJson>,
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub(crate) probe: Option<Probe>,
+    pub(crate) probe: Option<ProbeJson>,
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub(crate) announcement: Option<Announcement>,
+    pub(crate) announcement: Option<AnnouncementJson>,
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub(crate) data_set_messages: Option<Vec<DataSetMessage>>,
+    pub(crate) data_set_messages: Option<Vec<DataSetMessageJson>>,
     /// The origin of the datagram in files of test vectors; these keys are not written.
     #[serde(skip_serializing)]
     pub(crate) name: IgnoredAny,
@@ -85,7 +85,7 @@ pub(crate) struct Datagram {
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "camelCase")]
-pub(crate) enum NetworkMessageType {
+pub(crate) enum NetworkMessageTypeJson {
     DataSet,
     DiscoveryProbe,
     DiscoveryAnnouncement,
@@ -95,7 +95,7 @@ pub(crate) enum NetworkMessageType {
 /// all digits of a 64-bit number.
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(crate) struct PublisherId {
+pub(crate) struct PublisherIdJson {
     #[serde(rename = "type")]
     pub(crate) id_type: PublisherIdType,
     pub(crate) value: Value,
@@ -112,7 +112,7 @@ pub(crate) enum PublisherIdType {
 
 #[derive(Debug, Default, Serialize, Deserialize)]
 #[serde(rename_all = "camelCase", deny_unknown_fields, default)]
-pub(crate) struct GroupHeader {
+pub(crate) struct GroupHeaderJson {
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) writer_group_id: Option<u16>,
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -126,7 +126,7 @@ pub(crate) struct GroupHeader {
 /// A DateTime of a header. If both keys are present, the ticks are used.
 #[derive(Debug, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
-pub(crate) struct Timestamp {
+pub(crate) struct TimestampJson {
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) ticks100ns: Option<i64>,
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -136,7 +136,7 @@ pub(crate) struct Timestamp {
 /// The SecurityHeader (OPC 10000-14, 7.2.4.4.3) and the SecurityFooter.
 #[derive(Debug, Default, Serialize, Deserialize)]
 #[serde(rename_all = "camelCase", deny_unknown_fields, default)]
-pub(crate) struct SecurityHeader {
+pub(crate) struct SecurityHeaderJson {
     pub(crate) signed: bool,
     pub(crate) encrypted: bool,
     pub(crate) footer_enabled: bool,
@@ -167,18 +167,18 @@ pub(crate) struct Sealed {
 /// The header of all requests or responses of a NetworkMessage (OPC 10000-14, 7.2.4.4.2).
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(rename_all = "camelCase", deny_unknown_fields)]
-pub(crate) struct ActionHeader {
+pub(crate) struct ActionHeaderJson {
     #[serde(rename = "type")]
-    pub(crate) kind: ActionKind,
+    pub(crate) kind: ActionKindJson,
     /// The layout of the requests or responses.
-    #[serde(default, skip_serializing_if = "ActionDialect::is_standard")]
-    pub(crate) dialect: ActionDialect,
+    #[serde(default, skip_serializing_if = "ActionDialectJson::is_standard")]
+    pub(crate) dialect: ActionDialectJson,
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub(crate) response_address: Option<String>,
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub(crate) correlation_data_hex: Option<String>,
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub(crate) requestor_id: Option<PublisherId>,
+    pub(crate) requestor_id: Option<PublisherIdJson>,
     /// In milliseconds.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub(crate) timeout_hint: Option<f64>,
@@ -186,7 +186,7 @@ pub(crate) struct ActionHeader {
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "camelCase")]
-pub(crate) enum ActionKind {
+pub(crate) enum ActionKindJson {
     Request,
     Response,
 }
@@ -194,13 +194,13 @@ pub(crate) enum ActionKind {
 /// The layout of the standard, or the layout of UA-.NETStandard without DataSetMessage headers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "camelCase")]
-pub(crate) enum ActionDialect {
+pub(crate) enum ActionDialectJson {
     #[default]
     Standard,
     UaNetStandard,
 }
 
-impl ActionDialect {
+impl ActionDialectJson {
     #[expect(
         clippy::trivially_copy_pass_by_ref,
         reason = "what serde calls is given a reference"
@@ -213,10 +213,10 @@ impl ActionDialect {
 /// The header of a request or response (OPC 10000-14, 7.2.4.5.9 and 7.2.4.5.10).
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(rename_all = "camelCase", deny_unknown_fields)]
-pub(crate) struct Action {
+pub(crate) struct ActionJson {
     pub(crate) target_id: u16,
     pub(crate) request_id: u16,
-    pub(crate) state: ActionState,
+    pub(crate) state: ActionStateJson,
     /// Number of fields, for RawData.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub(crate) field_count: Option<u16>,
@@ -224,7 +224,7 @@ pub(crate) struct Action {
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "camelCase")]
-pub(crate) enum ActionState {
+pub(crate) enum ActionStateJson {
     Idle,
     Executing,
     Done,
@@ -233,7 +233,7 @@ pub(crate) enum ActionState {
 /// A chunk of a message (OPC 10000-14, 7.2.4.4.4).
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(rename_all = "camelCase", deny_unknown_fields)]
-pub(crate) struct Chunk {
+pub(crate) struct ChunkJson {
     pub(crate) message_sequence_number: u16,
     pub(crate) chunk_offset: u32,
     pub(crate) total_size: u32,
@@ -243,7 +243,7 @@ pub(crate) struct Chunk {
 /// A discovery probe (OPC 10000-14, 7.2.4.6.12).
 #[derive(Debug, Default, Serialize, Deserialize)]
 #[serde(rename_all = "camelCase", deny_unknown_fields, default)]
-pub(crate) struct Probe {
+pub(crate) struct ProbeJson {
     pub(crate) probe_type: u8,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) information_type: Option<u8>,
@@ -262,7 +262,7 @@ pub(crate) struct Probe {
 /// A discovery announcement (OPC 10000-14, 7.2.4.6.3).
 #[derive(Debug, Default, Serialize, Deserialize)]
 #[serde(rename_all = "camelCase", deny_unknown_fields, default)]
-pub(crate) struct Announcement {
+pub(crate) struct AnnouncementJson {
     #[serde(rename = "type")]
     pub(crate) announcement_type: u8,
     pub(crate) sequence_number: u16,
@@ -298,18 +298,18 @@ pub(crate) struct Announcement {
 /// A DataSetMessage (OPC 10000-14, 7.2.4.5.4).
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(rename_all = "camelCase", deny_unknown_fields, default)]
-pub(crate) struct DataSetMessage {
+pub(crate) struct DataSetMessageJson {
     /// The fault at which reading stopped; the fields before it are included.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) malformed: Option<String>,
     pub(crate) valid: bool,
     #[serde(rename = "type")]
-    pub(crate) kind: MessageKind,
-    pub(crate) field_encoding: FieldEncoding,
+    pub(crate) kind: MessageKindJson,
+    pub(crate) field_encoding: FieldEncodingJson,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) sequence_number: Option<u16>,
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub(crate) timestamp: Option<Timestamp>,
+    pub(crate) timestamp: Option<TimestampJson>,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) pico_seconds: Option<u16>,
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -320,7 +320,7 @@ pub(crate) struct DataSetMessage {
     pub(crate) minor_version: Option<u32>,
     /// The header of a request or response.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub(crate) action: Option<Action>,
+    pub(crate) action: Option<ActionJson>,
     /// Size in bytes to which the message is padded with zeros.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) configured_size: Option<u16>,
@@ -332,16 +332,16 @@ pub(crate) struct DataSetMessage {
     pub(crate) raw_data_hex: Option<String>,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) meta_data: Option<Vec<FieldMetaData>>,
-    pub(crate) fields: Vec<Field>,
+    pub(crate) fields: Vec<FieldJson>,
 }
 
-impl Default for DataSetMessage {
+impl Default for DataSetMessageJson {
     fn default() -> Self {
         Self {
             malformed: None,
             valid: true,
-            kind: MessageKind::KeyFrame,
-            field_encoding: FieldEncoding::Variant,
+            kind: MessageKindJson::KeyFrame,
+            field_encoding: FieldEncodingJson::Variant,
             sequence_number: None,
             timestamp: None,
             pico_seconds: None,
@@ -360,7 +360,7 @@ impl Default for DataSetMessage {
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "camelCase")]
-pub(crate) enum MessageKind {
+pub(crate) enum MessageKindJson {
     KeyFrame,
     DeltaFrame,
     Event,
@@ -370,7 +370,7 @@ pub(crate) enum MessageKind {
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-pub(crate) enum FieldEncoding {
+pub(crate) enum FieldEncodingJson {
     Variant,
     RawData,
     DataValue,
@@ -402,9 +402,9 @@ const fn scalar_rank() -> i32 {
 
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(crate) struct Field {
+pub(crate) struct FieldJson {
     /// The index of a field in a delta frame.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub(crate) index: Option<u16>,
-    pub(crate) value: FieldValue,
+    pub(crate) value: JsonFieldValue,
 }

@@ -6,17 +6,17 @@ use std::path::Path;
 use serde::Deserialize;
 use uri_text::escaped;
 
-use crate::arguments::{MesAt, Source, SourceAt, SourceVerb};
+use crate::arguments::{MesAt, SourceArguments, SourceAt, SourceVerb};
 use crate::ask::refusal;
-use crate::exit::Failure;
-use crate::http::{Answer, Change, Server};
+use crate::exit::CommandFailure;
+use crate::http::{ChangeRequest, HttpResponse, HttpServer};
 use crate::input::read;
-use crate::live::{Table, harmless, is_coloured};
+use crate::live::{TextTable, harmless, is_coloured};
 use crate::report::say;
 use crate::survey::look;
 
 /// Runs `ua-space source`.
-pub(crate) fn source(arguments: &Source) -> Result<(), Failure> {
+pub(crate) fn source(arguments: &SourceArguments) -> Result<(), CommandFailure> {
     match &arguments.verb {
         SourceVerb::List { json, at } => list(*json, at),
         SourceVerb::Add {
@@ -64,12 +64,12 @@ pub(crate) fn source(arguments: &Source) -> Result<(), Failure> {
 
 #[derive(Debug, Deserialize)]
 struct Sources {
-    sources: Vec<Known>,
+    sources: Vec<ListedSource>,
     findings: Vec<Finding>,
 }
 
 #[derive(Debug, Deserialize)]
-struct Known {
+struct ListedSource {
     kind: String,
     name: String,
     statements: u64,
@@ -83,8 +83,8 @@ struct Finding {
     what: String,
 }
 
-fn list(json: bool, at: &SourceAt) -> Result<(), Failure> {
-    let server = Server::parse(&at.mes.url)?;
+fn list(json: bool, at: &SourceAt) -> Result<(), CommandFailure> {
+    let server = HttpServer::parse(&at.mes.url)?;
     look(async {
         let answer = server.get("/sources").await?;
         if answer.status != 200 {
@@ -97,9 +97,9 @@ fn list(json: bool, at: &SourceAt) -> Result<(), Failure> {
             return Ok(());
         }
         let all: Sources = serde_json::from_str(&answer.body)
-            .map_err(|error| Failure::Data(format!("cannot read the response: {error}")))?;
+            .map_err(|error| CommandFailure::Data(format!("cannot read the response: {error}")))?;
         let columns = ["KIND", "SOURCE", "STATEMENTS", "STORED", "FINDING"];
-        let mut table = Table::new(columns.map(str::to_owned));
+        let mut table = TextTable::new(columns.map(str::to_owned));
         for known in &all.sources {
             let stored = if known.lasting { "yes" } else { "no" };
             let of_known = all.findings.iter();
@@ -149,8 +149,8 @@ struct Violation {
     severity: Option<String>,
 }
 
-fn check(turtle: bool, json: bool, at: &SourceAt) -> Result<(), Failure> {
-    let server = Server::parse(&at.mes.url)?;
+fn check(turtle: bool, json: bool, at: &SourceAt) -> Result<(), CommandFailure> {
+    let server = HttpServer::parse(&at.mes.url)?;
     look(async {
         let answer = if turtle {
             server.get_turtle("/report").await?
@@ -168,13 +168,13 @@ fn check(turtle: bool, json: bool, at: &SourceAt) -> Result<(), Failure> {
             return told(!answer.body.contains("sh:conforms false"));
         }
         let report: Report = serde_json::from_str(&answer.body)
-            .map_err(|error| Failure::Data(format!("cannot read the response: {error}")))?;
+            .map_err(|error| CommandFailure::Data(format!("cannot read the response: {error}")))?;
         if json {
             let text = mappings::harmless_json(answer.body.trim_end());
             writeln!(out, "{text}")?;
         } else if !report.results.is_empty() {
             let columns = ["SEVERITY", "NODE", "PATH", "VALUE", "MESSAGE"];
-            let mut table = Table::new(columns.map(str::to_owned));
+            let mut table = TextTable::new(columns.map(str::to_owned));
             for found in &report.results {
                 let dash = || "-".to_owned();
                 table.row([
@@ -206,8 +206,12 @@ fn conclusion(unchecked: &[String]) -> &'static str {
 }
 
 /// Returns the end of a check, whose violations were printed.
-fn told(conforms: bool) -> Result<(), Failure> {
-    if conforms { Ok(()) } else { Err(Failure::Told) }
+fn told(conforms: bool) -> Result<(), CommandFailure> {
+    if conforms {
+        Ok(())
+    } else {
+        Err(CommandFailure::Told)
+    }
 }
 
 /// Sends a change. Returns the response, which is no refusal.
@@ -216,17 +220,17 @@ pub(crate) fn change(
     path: &str,
     (content_type, body): (&'static str, Vec<u8>),
     at: &SourceAt,
-) -> Result<Answer, Failure> {
-    let server = Server::parse(&at.mes.url)?;
+) -> Result<HttpResponse, CommandFailure> {
+    let server = HttpServer::parse(&at.mes.url)?;
     let user = match (&at.user, &at.password) {
         (Some(user), Some(password)) => Some((user.clone(), password.clone())),
         (None, None) => None,
         _ => {
             let why = "give --user and the variable UA_PASSWORD together";
-            return Err(Failure::Usage(why.to_owned()));
+            return Err(CommandFailure::Usage(why.to_owned()));
         }
     };
-    let change = Change {
+    let change = ChangeRequest {
         method,
         content_type,
         body,
@@ -242,34 +246,34 @@ pub(crate) fn change(
 }
 
 /// Returns the kind of a source by the name and the contents of its file.
-fn kind_of(file: &str, contents: &[u8]) -> Result<&'static str, Failure> {
+fn kind_of(file: &str, contents: &[u8]) -> Result<&'static str, CommandFailure> {
     supervisor::source_kind(file, contents).ok_or_else(|| {
-        Failure::Usage(format!(
+        CommandFailure::Usage(format!(
             "{file}: give its --kind: file (Turtle), nodeset, mtp or process (Turtle, or a recipe)"
         ))
     })
 }
 
 /// Returns the findings about a source.
-pub(crate) fn findings(mes: &MesAt, kind: &str, name: &str) -> Result<Vec<String>, Failure> {
-    let server = Server::parse(&mes.url)?;
+pub(crate) fn findings(mes: &MesAt, kind: &str, name: &str) -> Result<Vec<String>, CommandFailure> {
+    let server = HttpServer::parse(&mes.url)?;
     look(async {
         let answer = server.get("/sources").await?;
         if answer.status != 200 {
             return Err(refusal(&answer));
         }
         let all: Sources = serde_json::from_str(&answer.body)
-            .map_err(|error| Failure::Data(format!("cannot read the response: {error}")))?;
+            .map_err(|error| CommandFailure::Data(format!("cannot read the response: {error}")))?;
         let findings = all.findings.into_iter();
         let of_source = findings.filter(|found| found.kind == kind && found.source == name);
         Ok(of_source.map(|found| found.what).collect())
     })
 }
 
-pub(crate) fn plain_name(file: &str) -> Result<String, Failure> {
+pub(crate) fn plain_name(file: &str) -> Result<String, CommandFailure> {
     let name = Path::new(file).file_name().and_then(|name| name.to_str());
     name.map(str::to_owned)
-        .ok_or_else(|| Failure::Usage(format!("{file}: give the source a name with --as")))
+        .ok_or_else(|| CommandFailure::Usage(format!("{file}: give the source a name with --as")))
 }
 
 pub(crate) const CREATED: u16 = 201;
@@ -284,6 +288,6 @@ mod tests {
         let unchecked = ["<urn:s>: sh:not is not supported here".to_owned()];
         assert!(conclusion(&unchecked).contains("were not checked"));
         assert!(told(true).is_ok());
-        assert!(matches!(told(false), Err(Failure::Told)));
+        assert!(matches!(told(false), Err(CommandFailure::Told)));
     }
 }

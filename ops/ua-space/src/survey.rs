@@ -15,11 +15,11 @@ use std::fmt::Display;
 use mappings::{LiveSpace, NodeIdText, SpaceId};
 use uadp::BuiltinType;
 
-use crate::exit::Failure;
+use crate::exit::CommandFailure;
 
 /// An inspected ROS graph.
 #[derive(Clone, Debug)]
-pub(crate) struct Graph {
+pub(crate) struct SurveyedGraph {
     pub(crate) space: SpaceId,
     /// The DDS domain of a ROS 2 space.
     pub(crate) domain: Option<u16>,
@@ -28,7 +28,7 @@ pub(crate) struct Graph {
 
 /// Nodes of a running server, or of a NodeSet.
 #[derive(Clone, Debug, Default)]
-pub(crate) struct Nodes {
+pub(crate) struct SurveyedNodes {
     /// The name of the source, for people.
     pub(crate) place: String,
     /// The server, if the nodes are from a running server.
@@ -86,11 +86,13 @@ pub(crate) struct UaSource {
 }
 
 /// Runs a survey on a runtime of its own.
-pub(crate) fn look<T>(looking: impl Future<Output = Result<T, Failure>>) -> Result<T, Failure> {
+pub(crate) fn look<T>(
+    looking: impl Future<Output = Result<T, CommandFailure>>,
+) -> Result<T, CommandFailure> {
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_all()
         .build()
-        .map_err(|error| Failure::Io(format!("cannot start: {error}")))?;
+        .map_err(|error| CommandFailure::Io(format!("cannot start: {error}")))?;
     let found = runtime.block_on(looking);
     // A name resolution may never end, so the runtime does not wait for it.
     runtime.shutdown_background();
@@ -98,8 +100,8 @@ pub(crate) fn look<T>(looking: impl Future<Output = Result<T, Failure>>) -> Resu
 }
 
 /// Returns the failure for an unavailable source, with a hint.
-fn away(what: impl Display, help: &str) -> Failure {
-    Failure::Unavailable(format!("{what}\n  = help: {help}"))
+fn away(what: impl Display, help: &str) -> CommandFailure {
+    CommandFailure::Unavailable(format!("{what}\n  = help: {help}"))
 }
 
 /// Maximum number of inspected topics of a graph and variables of a server.

@@ -6,23 +6,24 @@ use std::time::Duration;
 use async_trait::async_trait;
 use skills::frame::Frame;
 use skills::{
-    Authority, Device, Driver, Facts, GripPoint, GripType, Job, LocalRun, Outcome, Owner,
-    PartShape, PeerAccess, PickAndPlace, Runs, Skill, SkillFault, TypeName, Value, model,
+    Authority, Device, Driver, GripPoint, GripType, Job, LocalRun, ParameterType, PartShape,
+    PeerAccess, PickAndPlace, RunOutcome, RunnableSkill, Skill, SkillDescription, SkillFault,
+    SkillOwner, SkillValue, model,
 };
 
-use crate::modbus::server::{Faults, Serving};
+use crate::modbus::server::{LineFaults, ServedDevice};
 use crate::{robotiq, schmalz, ur};
 
 /// A grasp or release skill that records where the flange is when it runs.
 struct Recording {
     inner: LocalRun,
     grip: Option<GripPoint>,
-    robot: ur::simulator::Simulator,
+    robot: ur::simulator::UrSimulator,
     flanges: Arc<Mutex<Vec<[f64; 6]>>>,
 }
 
 #[async_trait]
-impl Runs for Recording {
+impl RunnableSkill for Recording {
     fn name(&self) -> String {
         self.inner.name()
     }
@@ -33,9 +34,9 @@ impl Runs for Recording {
 
     async fn run(
         &self,
-        parameters: Vec<(String, Value)>,
+        parameters: Vec<(String, SkillValue)>,
         within: Duration,
-    ) -> Result<Outcome, SkillFault> {
+    ) -> Result<RunOutcome, SkillFault> {
         let flange = ur::of_robot(self.robot.pose());
         self.flanges.lock().unwrap().push(flange);
         self.inner.run(parameters, within).await
@@ -49,11 +50,11 @@ impl Runs for Recording {
 fn run_of(name: &str, device: &dyn Device, authority: &Authority) -> LocalRun {
     let of = model::find(name).unwrap();
     let driver: Arc<dyn Driver> = device
-        .driver(&[TypeName::own(name)], &PeerAccess::default())
+        .driver(&[ParameterType::own(name)], &PeerAccess::default())
         .unwrap();
-    let facts = Facts {
+    let facts = SkillDescription {
         name: name.to_owned(),
-        types: vec![TypeName::own(name)],
+        types: vec![ParameterType::own(name)],
         parameters: of.parameters(),
         results: of.results(),
         capabilities: Vec::new(),
@@ -62,7 +63,7 @@ fn run_of(name: &str, device: &dyn Device, authority: &Authority) -> LocalRun {
     };
     LocalRun {
         skill: Skill::spawn(facts, driver, authority.clone(), Vec::new()),
-        by: Owner::Local("the test"),
+        by: SkillOwner::Local("the test"),
     }
 }
 
@@ -101,8 +102,8 @@ impl Gripper {
 
 /// The simulated robot and its device.
 struct Arm {
-    simulator: ur::simulator::Simulator,
-    device: ur::Robot,
+    simulator: ur::simulator::UrSimulator,
+    device: ur::UrRobot,
 }
 
 impl Arm {
@@ -151,53 +152,65 @@ impl Arm {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn grippers_of_two_lengths_touch_the_part_at_the_same_point() {
-    let settings = ur::simulator::Settings {
+    let settings = ur::simulator::UrSimulatorSettings {
         time_scale: 50.0,
-        ..ur::simulator::Settings::default()
+        ..ur::simulator::UrSimulatorSettings::default()
     };
-    let robot = ur::simulator::Simulator::new(settings);
-    let served = ur::simulator::Serving::start(&robot, "127.0.0.1:0", "127.0.0.1:0")
+    let robot = ur::simulator::UrSimulator::new(settings);
+    let served = ur::simulator::ServedRobot::start(&robot, "127.0.0.1:0", "127.0.0.1:0")
         .await
         .unwrap();
     let arm = Arm {
         simulator: robot,
-        device: ur::Robot::new(ur::Settings {
+        device: ur::UrRobot::new(ur::UrSettings {
             rtde: served.rtde().to_string(),
             secondary: served.secondary().to_string(),
             reach: ur::REACH,
         }),
     };
-    let fingers = robotiq::simulator::Simulator::new(robotiq::simulator::Settings {
+    let fingers = robotiq::simulator::RobotiqSimulator::new(robotiq::simulator::RobotiqSettings {
         object: Some(0.04),
         time_scale: 20.0,
     });
     let line = "tcp://127.0.0.1:0".parse().unwrap();
-    let modbus = Serving::start(&line, robotiq::UNIT, Arc::new(fingers), Faults::default())
-        .await
-        .unwrap();
-    let cup = schmalz::simulator::Simulator::new(schmalz::simulator::Settings {
+    let modbus = ServedDevice::start(
+        &line,
+        robotiq::UNIT,
+        Arc::new(fingers),
+        LineFaults::default(),
+    )
+    .await
+    .unwrap();
+    let cup = schmalz::simulator::SchmalzSimulator::new(schmalz::simulator::SchmalzSettings {
         time_scale: 20.0,
-        ..schmalz::simulator::Settings::default()
+        ..schmalz::simulator::SchmalzSettings::default()
     });
-    let master = schmalz::simulator::Serving::start(&cup, "127.0.0.1:0")
+    let master = schmalz::simulator::ServedMaster::start(&cup, "127.0.0.1:0")
         .await
         .unwrap();
     let address = master.address().to_string();
-    let timing = schmalz::Timing::default();
+    let timing = schmalz::SchmalzTiming::default();
     let grippers = [
         Gripper {
             name: "Robotiq 2F-85",
             length: 0.2028,
             grip_type: GripType::Parallel,
             above: 0.0,
-            device: Box::new(robotiq::Gripper::new(modbus.line().clone(), robotiq::UNIT)),
+            device: Box::new(robotiq::RobotiqGripper::new(
+                modbus.line().clone(),
+                robotiq::UNIT,
+            )),
         },
         Gripper {
             name: "Schmalz ECBPi",
             length: 0.1868,
             grip_type: GripType::Vacuum,
             above: 0.025,
-            device: Box::new(schmalz::Gripper::new(&address, "master1port1", timing)),
+            device: Box::new(schmalz::SchmalzGripper::new(
+                &address,
+                "master1port1",
+                timing,
+            )),
         },
     ];
     println!("| gripper | length | plate | place | error at pick | error at place |");

@@ -11,24 +11,24 @@ use serde_json::Value;
 use tokio::time::{Instant, timeout_at};
 
 use crate::modbus::connected;
-use crate::tls::Tls;
+use crate::tls::DeviceTls;
 
 /// The server of a device.
 #[derive(Debug, Clone)]
-pub(crate) struct Host {
+pub(crate) struct DeviceHost {
     /// Host and port.
     address: String,
     /// `None` for plain HTTP.
-    tls: Option<Tls>,
+    tls: Option<DeviceTls>,
 }
 
-impl PartialEq for Host {
+impl PartialEq for DeviceHost {
     fn eq(&self, other: &Self) -> bool {
         self.address == other.address && self.tls.is_some() == other.tls.is_some()
     }
 }
 
-impl fmt::Display for Host {
+impl fmt::Display for DeviceHost {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let scheme = if self.tls.is_some() { "https" } else { "http" };
         write!(f, "{scheme}://{}", self.address)
@@ -37,7 +37,7 @@ impl fmt::Display for Host {
 
 /// A request.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Asked<'a> {
+pub(crate) struct DeviceRequest<'a> {
     pub(crate) method: &'a str,
     /// The path with its query.
     pub(crate) path: &'a str,
@@ -48,7 +48,7 @@ pub(crate) struct Asked<'a> {
 
 /// A request without a usable response.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-pub(crate) enum Fault {
+pub(crate) enum HttpFault {
     /// The request was not sent: there is no connection, or Halt came before.
     #[error("{0}")]
     Unreachable(String),
@@ -65,14 +65,14 @@ pub(crate) enum Fault {
     },
 }
 
-impl Host {
+impl DeviceHost {
     /// Creates a server without TLS, by its host and port.
     pub(crate) const fn plain(address: String) -> Self {
         Self { address, tls: None }
     }
 
     /// Creates a server with TLS.
-    pub(crate) const fn secured(address: String, tls: Tls) -> Self {
+    pub(crate) const fn secured(address: String, tls: DeviceTls) -> Self {
         Self {
             address,
             tls: Some(tls),
@@ -82,8 +82,8 @@ impl Host {
     /// Sends a request and returns its response; null for a response without a body.
     ///
     /// # Errors
-    /// A [`Fault`], which says whether the request may have been executed.
-    pub(crate) async fn ask(&self, asked: Asked<'_>) -> Result<Value, Fault> {
+    /// A [`HttpFault`], which says whether the request may have been executed.
+    pub(crate) async fn ask(&self, asked: DeviceRequest<'_>) -> Result<Value, HttpFault> {
         self.ask_unless(asked, || false).await
     }
 
@@ -91,19 +91,19 @@ impl Host {
     /// been made.
     ///
     /// # Errors
-    /// As [`ask`](Self::ask); [`Fault::Unreachable`] for a withdrawn request.
+    /// As [`ask`](Self::ask); [`HttpFault::Unreachable`] for a withdrawn request.
     pub(crate) async fn ask_unless(
         &self,
-        asked: Asked<'_>,
+        asked: DeviceRequest<'_>,
         withdrawn: impl Fn() -> bool + Send,
-    ) -> Result<Value, Fault> {
+    ) -> Result<Value, HttpFault> {
         let until = Instant::now() + asked.within;
         let late = || {
             let within = asked.within.as_millis();
             format!("no answer from {self} within {within} ms")
         };
         let unreachable = |error: &dyn fmt::Display| {
-            Fault::Unreachable(format!("{self} cannot be reached: {error}"))
+            HttpFault::Unreachable(format!("{self} cannot be reached: {error}"))
         };
         let connecting = async {
             let stream = connected(&self.address)
@@ -120,7 +120,7 @@ impl Host {
         };
         let connection = timeout_at(until, connecting)
             .await
-            .map_err(|_| Fault::Unreachable(late()))??;
+            .map_err(|_| HttpFault::Unreachable(late()))??;
         let body = asked.body.map(Value::to_string).unwrap_or_default();
         let request = Request::builder()
             .method(asked.method)
@@ -129,19 +129,19 @@ impl Host {
             .header(CONTENT_TYPE, "application/json")
             .body(Bytes::from(body))
             .map_err(|error| {
-                Fault::Unreachable(format!("{} cannot be asked for: {error}", asked.path))
+                HttpFault::Unreachable(format!("{} cannot be asked for: {error}", asked.path))
             })?;
         if withdrawn() {
             let why = "Halt came before the request was sent".to_owned();
-            return Err(Fault::Unreachable(why));
+            return Err(HttpFault::Unreachable(why));
         }
         let answer = timeout_at(until, connection.send(request, LONGEST))
             .await
-            .map_err(|_| Fault::Lost(late()))?;
+            .map_err(|_| HttpFault::Lost(late()))?;
         self.read(&answer.map_err(|error| self.damaged(&error))?)
     }
 
-    fn read(&self, answer: &Response<Bytes>) -> Result<Value, Fault> {
+    fn read(&self, answer: &Response<Bytes>) -> Result<Value, HttpFault> {
         let (status, bytes) = (answer.status(), answer.body());
         let json = serde_json::from_slice::<Value>(bytes);
         if !status.is_success() {
@@ -150,7 +150,7 @@ impl Host {
                 Some(message.chars().take(120).collect::<String>())
             });
             let message = message.unwrap_or_default();
-            return Err(Fault::Refused {
+            return Err(HttpFault::Refused {
                 status: status.as_u16(),
                 why: format!("{self} refuses with {status}: {message}"),
             });
@@ -161,8 +161,8 @@ impl Host {
         json.map_err(|error| self.damaged(&error))
     }
 
-    fn damaged(&self, error: &dyn fmt::Display) -> Fault {
-        Fault::Lost(format!("the answer of {self} is damaged: {error}"))
+    fn damaged(&self, error: &dyn fmt::Display) -> HttpFault {
+        HttpFault::Lost(format!("the answer of {self} is damaged: {error}"))
     }
 }
 

@@ -12,15 +12,15 @@ use std::time::Duration;
 
 use async_trait::async_trait;
 use serde_json::Value as Json;
-use skills::yaml::{Code, Kind, Node, Reader};
+use skills::yaml::{DocumentKind, DocumentNode, YamlFindingCode, YamlReader};
 use skills::{
-    Builtin, Driver, DriverError, InvalidParameter, Measured, Parameters, Results, Sensor,
-    SensorRead, Shape, Value, Work,
+    Builtin, Driver, DriverError, InvalidParameter, Measured, Parameters, RunResults, SensorRead,
+    SkillValue, ValueSensor, ValueShape, Work,
 };
 use tokio::time::{Instant, sleep, sleep_until};
 
 use self::template::{Template, plain};
-use crate::http::Fault;
+use crate::http::HttpFault;
 use crate::sensors::ticks;
 
 /// A value at a JSON pointer (RFC 6901) and the values that it is compared with.
@@ -116,14 +116,14 @@ enum Ended {
 #[derive(Debug, thiserror::Error)]
 enum HttpSkillError {
     #[error(transparent)]
-    Http(#[from] Fault),
+    Http(#[from] HttpFault),
     /// The device reports a failure with this reason.
     #[error("{0}")]
     Reported(String),
     #[error("the work has not ended within {limit:?} after Halt")]
     NotHalted { limit: Duration },
     #[error("the state is unknown: {fault}")]
-    Silent { fault: Fault },
+    Silent { fault: HttpFault },
     #[error("{name}: the response has no {pointer}")]
     NoResult { name: String, pointer: String },
     #[error("{name}: {pointer} has a wrong type")]
@@ -149,7 +149,7 @@ enum StopRequest {
     #[error("the `stop` request is done")]
     Done,
     #[error("the `stop` request has failed: {0}")]
-    Failed(Fault),
+    Failed(HttpFault),
 }
 
 #[async_trait]
@@ -168,7 +168,7 @@ impl Driver for HttpSkill {
         Ok(())
     }
 
-    async fn run(&self, work: Work) -> Result<Results, DriverError> {
+    async fn run(&self, work: Work) -> Result<RunResults, DriverError> {
         work.step("Start").await;
         let unknown = match self.work(&work).await {
             // The state of the machine is unknown without its results.
@@ -212,9 +212,9 @@ impl HttpSkill {
         };
         let answer = match started {
             Ok(answer) => answer,
-            Err(fault @ Fault::Unreachable(_)) => return Ended::Failed(fault.into()),
+            Err(fault @ HttpFault::Unreachable(_)) => return Ended::Failed(fault.into()),
             // The status of a request that was not accepted.
-            Err(fault @ Fault::Refused { status, .. }) if (400..500).contains(&status) => {
+            Err(fault @ HttpFault::Refused { status, .. }) if (400..500).contains(&status) => {
                 return Ended::Failed(fault.into());
             }
             Err(fault) => return Ended::Unknown(fault.into()),
@@ -271,7 +271,7 @@ impl HttpSkill {
     }
 
     /// Asks the device to stop on Halt.
-    async fn halt(&self, work: &Work) -> Result<(), Fault> {
+    async fn halt(&self, work: &Work) -> Result<(), HttpFault> {
         work.pending("the device is asked to stop").await;
         let Some(stopped) = self.stop(work.parameters()).await else {
             let why = "the YAML has no `stop` request: the work goes on";
@@ -282,12 +282,12 @@ impl HttpSkill {
     }
 
     /// Sends the `stop` request; `None` if there is none.
-    async fn stop(&self, parameters: &Parameters) -> Option<Result<(), Fault>> {
+    async fn stop(&self, parameters: &Parameters) -> Option<Result<(), HttpFault>> {
         let stop = self.stop.as_ref()?;
         Some(stop.send(parameters, self.within).await.map(drop))
     }
 
-    fn outcome(&self, answer: &Json) -> Result<Results, HttpSkillError> {
+    fn outcome(&self, answer: &Json) -> Result<RunResults, HttpSkillError> {
         let results = self.results.iter().map(|(name, pointer)| {
             let found = answer.pointer(pointer);
             let of = || (name.clone(), pointer.clone());
@@ -295,7 +295,7 @@ impl HttpSkill {
                 let (name, pointer) = of();
                 HttpSkillError::NoResult { name, pointer }
             })?;
-            let value = Value::of_json(found);
+            let value = SkillValue::of_json(found);
             let value = value.ok_or_else(|| {
                 let (name, pointer) = of();
                 HttpSkillError::ResultType { name, pointer }
@@ -322,7 +322,7 @@ struct HttpValue {
 }
 
 #[async_trait]
-impl Sensor for HttpValue {
+impl ValueSensor for HttpValue {
     async fn measure(&self, period: Duration, out: &Measured) -> String {
         let mut ticks = ticks(period);
         loop {
@@ -352,7 +352,7 @@ impl Sensor for HttpValue {
 }
 
 /// Reads the value of the key `http` of a driver.
-pub(crate) fn read(node: &Node, reader: &mut Reader<'_>) -> Option<Arc<dyn Driver>> {
+pub(crate) fn read(node: &DocumentNode, reader: &mut YamlReader<'_>) -> Option<Arc<dyn Driver>> {
     let keys = ["start", "poll", "results", "stop", "within", "halt_timeout"];
     let [start, poll, results, stop, within, halt_timeout] = reader.map(node, keys)?;
     let start = reader
@@ -374,7 +374,7 @@ pub(crate) fn read(node: &Node, reader: &mut Reader<'_>) -> Option<Arc<dyn Drive
 }
 
 /// Reads the source `http` of a value.
-pub(crate) fn read_value(node: &Node, reader: &mut Reader<'_>) -> Option<SensorRead> {
+pub(crate) fn read_value(node: &DocumentNode, reader: &mut YamlReader<'_>) -> Option<SensorRead> {
     let [url, pointer, within] = reader.map(node, ["url", "pointer", "within"])?;
     let request = reader
         .needed(url, "url", node.place)
@@ -391,7 +391,7 @@ pub(crate) fn read_value(node: &Node, reader: &mut Reader<'_>) -> Option<SensorR
     };
     Some(SensorRead {
         sensor: Arc::new(sensor),
-        shape: Shape::scalar(Builtin::Double),
+        shape: ValueShape::scalar(Builtin::Double),
     })
 }
 
@@ -402,7 +402,7 @@ fn whole<T>(read: Option<Option<T>>) -> Option<Option<T>> {
     }
 }
 
-fn read_poll(node: &Node, reader: &mut Reader<'_>) -> Option<Poll> {
+fn read_poll(node: &DocumentNode, reader: &mut YamlReader<'_>) -> Option<Poll> {
     let keys = [
         "method", "url", "every", "done", "failed", "progress", "step", "reason",
     ];
@@ -439,14 +439,14 @@ fn read_poll(node: &Node, reader: &mut Reader<'_>) -> Option<Poll> {
 }
 
 /// Reads `{/state: done}` or `{/state: [error, aborted]}`.
-fn read_condition(node: &Node, reader: &mut Reader<'_>) -> Option<Condition> {
-    let Kind::Map(pairs) = &node.kind else {
+fn read_condition(node: &DocumentNode, reader: &mut YamlReader<'_>) -> Option<Condition> {
+    let DocumentKind::Map(pairs) = &node.kind else {
         reader.wrong(node, "a map from a JSON pointer to values: {/state: done}");
         return None;
     };
     let [(pointer, values)] = pairs.as_slice() else {
         let message = "a condition has one JSON pointer: {/state: done}".to_owned();
-        return reader.refuse(node, Code::WrongValue, message);
+        return reader.refuse(node, YamlFindingCode::WrongValue, message);
     };
     let pointer = read_pointer(pointer, reader)?;
     let values: Vec<String> = reader
@@ -457,8 +457,11 @@ fn read_condition(node: &Node, reader: &mut Reader<'_>) -> Option<Condition> {
     Some(Condition { pointer, values })
 }
 
-fn read_results(node: &Node, reader: &mut Reader<'_>) -> Option<BTreeMap<String, String>> {
-    let Kind::Map(pairs) = &node.kind else {
+fn read_results(
+    node: &DocumentNode,
+    reader: &mut YamlReader<'_>,
+) -> Option<BTreeMap<String, String>> {
+    let DocumentKind::Map(pairs) = &node.kind else {
         reader.wrong(
             node,
             "a map from results to JSON pointers: {Gripped: /gripped}",
@@ -474,13 +477,13 @@ fn read_results(node: &Node, reader: &mut Reader<'_>) -> Option<BTreeMap<String,
     Some(results)
 }
 
-fn read_pointer(node: &Node, reader: &mut Reader<'_>) -> Option<String> {
+fn read_pointer(node: &DocumentNode, reader: &mut YamlReader<'_>) -> Option<String> {
     let text = reader.text(node, "a JSON pointer, as /state")?;
     if text.is_empty() || text.starts_with('/') {
         return Some(text.to_owned());
     }
     let message = format!("expected a JSON pointer, as /state, found `{text}`");
-    reader.refuse(node, Code::WrongValue, message)
+    reader.refuse(node, YamlFindingCode::WrongValue, message)
 }
 
 /// Default time limit of a response.

@@ -19,23 +19,23 @@ use std::time::Duration;
 use async_trait::async_trait;
 use skills::{
     Builtin, COMPOSITE_HALT_TIMEOUT, Chosen, Device, DeviceValue, Driver, DriverError, DriverFault,
-    InvalidParameter, Measured, Needs, Parameters, Partner, PartnerError, PeerAccess, Results,
-    Runs, SkillFault, ToolState, TypeName, Value, Work,
+    InvalidParameter, Measured, Needs, ParameterType, Parameters, Partner, PartnerError,
+    PeerAccess, RunResults, RunnableSkill, SkillFault, SkillValue, ToolState, Work,
 };
 use tokio::sync::watch;
 use tokio::time::{Instant, sleep, timeout};
 
 use self::error::KelvinError;
 use self::look::Look;
-use self::mover::Connected;
-pub use self::volts::{Detector, InvalidVoltage, LEVELS, Reading, volts};
-use crate::line::Line;
+use self::mover::ConnectedMover;
+pub use self::volts::{ChangerReading, InvalidVoltage, LEVELS, VoltageDetector, volts};
+use crate::line::ModbusLine;
 use crate::modbus::Modbus;
 use crate::sensors::{ticks, value};
 
 /// The installation of the changer.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Settings {
+pub struct KelvinSettings {
     /// The analog converter.
     pub converter: Converter,
     /// The tools and the positions of their docks.
@@ -57,7 +57,7 @@ pub const READY_WITHIN: Duration = Duration::from_secs(60);
 #[derive(Debug, Clone, PartialEq)]
 pub struct Converter {
     /// The line to the converter.
-    pub at: Line,
+    pub at: ModbusLine,
     /// Unit of the converter.
     pub unit: u8,
     /// The input register.
@@ -90,9 +90,9 @@ pub enum Mover {
     /// Skills of the same program.
     Skills {
         /// PtpMoveSkillType
-        ptp: Arc<dyn Runs>,
+        ptp: Arc<dyn RunnableSkill>,
         /// LinearMoveSkillType
-        linear: Arc<dyn Runs>,
+        linear: Arc<dyn RunnableSkill>,
     },
 }
 
@@ -108,8 +108,8 @@ impl fmt::Debug for Mover {
 
 /// A changer.
 #[derive(Debug, Clone)]
-pub struct Changer {
-    settings: Arc<Settings>,
+pub struct KelvinChanger {
+    settings: Arc<KelvinSettings>,
     converter: Arc<Modbus>,
     mover: Mover,
     peers: PeerAccess,
@@ -119,10 +119,10 @@ pub struct Changer {
     docks: Arc<Mutex<BTreeMap<u8, [f64; 6]>>>,
 }
 
-impl Changer {
+impl KelvinChanger {
     /// Creates a changer.
     #[must_use]
-    pub fn new(settings: Settings, mover: Mover) -> Self {
+    pub fn new(settings: KelvinSettings, mover: Mover) -> Self {
         let Converter { at, unit, .. } = &settings.converter;
         Self {
             converter: Modbus::shared(at, *unit),
@@ -139,16 +139,16 @@ impl Changer {
     }
 
     /// Shows a reading to clients; `None` if there is none.
-    fn show(&self, reading: Option<Reading>) {
+    fn show(&self, reading: Option<ChangerReading>) {
         let current = match reading {
-            Some(Reading::Ready | Reading::NoTool) => Some(String::new()),
-            Some(Reading::Tool(number)) => {
+            Some(ChangerReading::Ready | ChangerReading::NoTool) => Some(String::new()),
+            Some(ChangerReading::Tool(number)) => {
                 let mut tools = self.settings.tools.iter();
                 let known = tools.find(|tool| tool.number == number);
                 known.map(|tool| tool.uri.clone())
             }
             // The ring is between open and locked, or the converter does not answer.
-            Some(Reading::Intermediate) | None => None,
+            Some(ChangerReading::Intermediate) | None => None,
         };
         self.change(|state| state.current = current);
     }
@@ -174,7 +174,7 @@ impl Changer {
 }
 
 /// Returns the state before the first measurement.
-fn shown_at_first(settings: &Settings, mover: &Mover) -> ToolState {
+fn shown_at_first(settings: &KelvinSettings, mover: &Mover) -> ToolState {
     let mover = match mover {
         Mover::Component(Some(Partner::At(endpoint))) => endpoint.clone(),
         Mover::Component(Some(Partner::Called(_)) | None) | Mover::Skills { .. } => String::new(),
@@ -187,21 +187,24 @@ fn shown_at_first(settings: &Settings, mover: &Mover) -> ToolState {
 }
 
 #[async_trait]
-impl Device for Changer {
+impl Device for KelvinChanger {
     fn driver(
         &self,
-        types: &[TypeName],
+        types: &[ParameterType],
         peers: &PeerAccess,
     ) -> Result<Arc<dyn Driver>, DriverFault> {
-        let is = |name: &str| types.contains(&TypeName::own(name));
+        let is = |name: &str| types.contains(&ParameterType::own(name));
         let what = if is("ChangeToolSkillType") {
-            What::Change
+            ChangerAction::Change
         } else if is("AttachToolSkillType") {
-            What::Attach
+            ChangerAction::Attach
         } else if is("DetachToolSkillType") {
-            What::Detach
+            ChangerAction::Detach
         } else {
-            let own = types.first().map(TypeName::to_string).unwrap_or_default();
+            let own = types
+                .first()
+                .map(ParameterType::to_string)
+                .unwrap_or_default();
             return Err(DriverFault(format!(
                 "`kelvin_tool_changer` does the work of ChangeToolSkillType, AttachToolSkillType, DetachToolSkillType and what is \
                  below them, and this is {own}"
@@ -237,9 +240,9 @@ impl Device for Changer {
             };
             out.put("Voltage", Ok(volts.into()));
             let number = match look.reading(volts) {
-                Ok(Reading::Ready | Reading::NoTool) => Ok(Value::Byte(0)),
-                Ok(Reading::Tool(number)) => Ok(Value::Byte(number)),
-                Ok(between @ Reading::Intermediate) => Err(between.to_string()),
+                Ok(ChangerReading::Ready | ChangerReading::NoTool) => Ok(SkillValue::Byte(0)),
+                Ok(ChangerReading::Tool(number)) => Ok(SkillValue::Byte(number)),
+                Ok(between @ ChangerReading::Intermediate) => Err(between.to_string()),
                 Err(why) => Err(why.to_string()),
             };
             out.put("ToolNumber", number);
@@ -265,7 +268,7 @@ impl Device for Changer {
     }
 }
 
-impl Changer {
+impl KelvinChanger {
     /// Looks for the robot until it is found, without waiting for it.
     async fn find_robot(&self, peers: &PeerAccess) {
         let Mover::Component(partner) = &self.mover else {
@@ -285,7 +288,7 @@ impl Changer {
 
 /// The action of a skill.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum What {
+enum ChangerAction {
     Attach,
     Detach,
     Change,
@@ -293,8 +296,8 @@ enum What {
 
 #[derive(Debug)]
 struct Change {
-    changer: Changer,
-    what: What,
+    changer: KelvinChanger,
+    what: ChangerAction,
 }
 
 /// A move of the flange: its name, whether it is linear, and its target.
@@ -341,8 +344,8 @@ impl Driver for Change {
 
     fn check(&self, parameters: &Parameters) -> Result<(), InvalidParameter> {
         match self.what {
-            What::Detach => Ok(()),
-            What::Attach | What::Change => self.wanted(parameters).map(drop),
+            ChangerAction::Detach => Ok(()),
+            ChangerAction::Attach | ChangerAction::Change => self.wanted(parameters).map(drop),
         }
     }
 
@@ -355,23 +358,23 @@ impl Driver for Change {
         }
     }
 
-    async fn run(&self, work: Work) -> Result<Results, DriverError> {
+    async fn run(&self, work: Work) -> Result<RunResults, DriverError> {
         let mut look = self.changer.look();
         let now = look.steady().await?;
         self.changer.show(Some(now));
         let wanted = match self.what {
-            What::Detach => None,
-            What::Attach | What::Change => {
+            ChangerAction::Detach => None,
+            ChangerAction::Attach | ChangerAction::Change => {
                 Some(self.at(self.wanted(work.parameters())?, Some(work.parameters())))
             }
         };
         let wanted = wanted.as_ref();
         let attached = match now {
-            Reading::Intermediate => {
+            ChangerReading::Intermediate => {
                 return Err(KelvinError::Between { now }.into());
             }
-            Reading::Ready | Reading::NoTool => None,
-            Reading::Tool(number) => Some(number),
+            ChangerReading::Ready | ChangerReading::NoTool => None,
+            ChangerReading::Tool(number) => Some(number),
         };
         if attached == wanted.map(|tool| tool.number) {
             if let Some(tool) = wanted {
@@ -380,11 +383,11 @@ impl Driver for Change {
             return Ok(attached_tool(wanted));
         }
         let put = match (attached, self.what) {
-            (Some(number), What::Attach) => {
+            (Some(number), ChangerAction::Attach) => {
                 return Err(KelvinError::Occupied { number }.into());
             }
-            (Some(number), What::Change) => Some(self.at(self.tool(number)?, None)),
-            (Some(number), What::Detach) => {
+            (Some(number), ChangerAction::Change) => Some(self.at(self.tool(number)?, None)),
+            (Some(number), ChangerAction::Detach) => {
                 Some(self.at(self.tool(number)?, Some(work.parameters())))
             }
             (None, _) => None,
@@ -392,7 +395,7 @@ impl Driver for Change {
         let put = put.as_ref();
         let changer = &self.changer;
         let found = |endpoint: &str| changer.change(|state| endpoint.clone_into(&mut state.mover));
-        let mover = Connected::open(&changer.mover, &changer.peers, found, &work).await?;
+        let mover = ConnectedMover::open(&changer.mover, &changer.peers, found, &work).await?;
         let moved = self.moved(&mover, &mut look, (put, wanted), &work).await;
         mover.close().await;
         match moved {
@@ -497,7 +500,7 @@ impl Change {
         let began = Instant::now();
         let limit = self.changer.settings.ready_within;
         let mut why = "it is not found".to_owned();
-        let any = TypeName::own("SkillType");
+        let any = ParameterType::own("SkillType");
         let ready = async {
             loop {
                 let found = detector
@@ -558,7 +561,7 @@ impl Change {
 
     async fn moved(
         &self,
-        mover: &Connected,
+        mover: &ConnectedMover,
         look: &mut Look,
         (put, take): (Option<&Tool>, Option<&Tool>),
         work: &Work,
@@ -568,16 +571,16 @@ impl Change {
             self.power_off(tool, work).await?;
             mover.go(&tool.put(), within, work).await?;
             work.step("WaitForRelease").await;
-            look.until(Reading::NoTool, work).await?;
+            look.until(ChangerReading::NoTool, work).await?;
             self.changer.remember(tool);
-            self.changer.show(Some(Reading::NoTool));
+            self.changer.show(Some(ChangerReading::NoTool));
         }
         if let Some(tool) = take {
             mover.go(&tool.take(), within, work).await?;
             work.step("WaitForTool").await;
-            look.until(Reading::Tool(tool.number), work).await?;
+            look.until(ChangerReading::Tool(tool.number), work).await?;
             self.changer.remember(tool);
-            self.changer.show(Some(Reading::Tool(tool.number)));
+            self.changer.show(Some(ChangerReading::Tool(tool.number)));
             let approach = ("Approach", true, tool.beside((FRONT, APPROACH), LOCKED));
             mover.go(&[approach], within, work).await?;
         }
@@ -585,7 +588,7 @@ impl Change {
     }
 }
 
-fn attached_tool(tool: Option<&Tool>) -> Results {
+fn attached_tool(tool: Option<&Tool>) -> RunResults {
     let uri = tool.map(|tool| tool.uri.as_str()).unwrap_or_default();
     vec![("Tool".to_owned(), uri.into())]
 }

@@ -4,10 +4,10 @@ use std::path::Path;
 use std::sync::Arc;
 use std::time::Duration;
 
-use skills::yaml::{Code, Node, Reader};
+use skills::yaml::{DocumentNode, YamlFindingCode, YamlReader};
 use skills::{Device, DeviceKinds, Driver, SensorRead};
 
-use crate::line::Line;
+use crate::line::ModbusLine;
 use crate::{http_skill, kelvin, module, robotiq, schmalz, sensors, ur};
 
 /// The devices of this crate.
@@ -15,7 +15,12 @@ use crate::{http_skill, kelvin, module, robotiq, schmalz, sensors, ur};
 pub struct Kinds;
 
 impl DeviceKinds for Kinds {
-    fn read(&self, node: &Node, folder: &Path, reader: &mut Reader<'_>) -> Option<Arc<dyn Device>> {
+    fn read(
+        &self,
+        node: &DocumentNode,
+        folder: &Path,
+        reader: &mut YamlReader<'_>,
+    ) -> Option<Arc<dyn Device>> {
         match reader.map(node, NAMES)? {
             [Some(node), None, None, None, None] => read_robotiq(node, reader),
             [None, Some(node), None, None, None] => read_schmalz(node, reader),
@@ -24,16 +29,21 @@ impl DeviceKinds for Kinds {
             [None, None, None, None, Some(node)] => module::read(node, folder, reader),
             _ => {
                 let message = format!("a device is exactly one of {}", NAMES.join(", "));
-                reader.refuse(node, Code::Driver, message)
+                reader.refuse(node, YamlFindingCode::Driver, message)
             }
         }
     }
 
-    fn http(&self, node: &Node, reader: &mut Reader<'_>) -> Option<Arc<dyn Driver>> {
+    fn http(&self, node: &DocumentNode, reader: &mut YamlReader<'_>) -> Option<Arc<dyn Driver>> {
         http_skill::read(node, reader)
     }
 
-    fn sensor(&self, kind: &str, node: &Node, reader: &mut Reader<'_>) -> Option<SensorRead> {
+    fn sensor(
+        &self,
+        kind: &str,
+        node: &DocumentNode,
+        reader: &mut YamlReader<'_>,
+    ) -> Option<SensorRead> {
         sensors::read(kind, node, reader)
     }
 }
@@ -46,16 +56,16 @@ const NAMES: [&str; 5] = [
     "mtp",
 ];
 
-fn read_robotiq(node: &Node, reader: &mut Reader<'_>) -> Option<Arc<dyn Device>> {
+fn read_robotiq(node: &DocumentNode, reader: &mut YamlReader<'_>) -> Option<Arc<dyn Device>> {
     let [at, unit] = reader.map(node, ["at", "unit"])?;
     let at = reader
         .needed(at, "at", node.place)
         .and_then(|node| read_line(node, reader));
     let unit = unit.map_or(Some(robotiq::UNIT), |node| read_unit(node, reader));
-    Some(Arc::new(robotiq::Gripper::new(at?, unit?)))
+    Some(Arc::new(robotiq::RobotiqGripper::new(at?, unit?)))
 }
 
-fn read_schmalz(node: &Node, reader: &mut Reader<'_>) -> Option<Arc<dyn Device>> {
+fn read_schmalz(node: &DocumentNode, reader: &mut YamlReader<'_>) -> Option<Arc<dyn Device>> {
     let [master, alias, grasp, release] =
         reader.map(node, ["master", "alias", "grasp_within", "release_within"])?;
     let master = reader
@@ -65,16 +75,21 @@ fn read_schmalz(node: &Node, reader: &mut Reader<'_>) -> Option<Arc<dyn Device>>
         Some(node) => read_alias(node, reader),
         None => Some("master1port1"),
     };
-    let usual = schmalz::Timing::default();
-    let timing = schmalz::Timing {
+    let usual = schmalz::SchmalzTiming::default();
+    let timing = schmalz::SchmalzTiming {
         grasp: grasp.map_or(Some(usual.grasp), |node| reader.duration(node))?,
         release: release.map_or(Some(usual.release), |node| reader.duration(node))?,
     };
-    Some(Arc::new(schmalz::Gripper::new(master?, alias?, timing)))
+    Some(Arc::new(schmalz::SchmalzGripper::new(
+        master?, alias?, timing,
+    )))
 }
 
 /// Reads the name of a device as it is used in a path.
-pub(crate) fn read_alias<'n>(node: &'n Node, reader: &mut Reader<'_>) -> Option<&'n str> {
+pub(crate) fn read_alias<'n>(
+    node: &'n DocumentNode,
+    reader: &mut YamlReader<'_>,
+) -> Option<&'n str> {
     let text = reader.text(node, "the alias of a device")?;
     let fits = !text.is_empty()
         && text.len() <= 64
@@ -85,23 +100,26 @@ pub(crate) fn read_alias<'n>(node: &'n Node, reader: &mut Reader<'_>) -> Option<
         return Some(text);
     }
     let message = "the alias of a device has letters, digits, -, _ and . only".to_owned();
-    reader.refuse(node, Code::WrongValue, message)
+    reader.refuse(node, YamlFindingCode::WrongValue, message)
 }
 
 /// Reads `host:port`.
-pub(crate) fn read_address<'n>(node: &'n Node, reader: &mut Reader<'_>) -> Option<&'n str> {
+pub(crate) fn read_address<'n>(
+    node: &'n DocumentNode,
+    reader: &mut YamlReader<'_>,
+) -> Option<&'n str> {
     let text = reader.text(node, "host:port")?;
-    if format!("tcp://{text}").parse::<Line>().is_ok() {
+    if format!("tcp://{text}").parse::<ModbusLine>().is_ok() {
         return Some(text);
     }
     reader.refuse(
         node,
-        Code::WrongValue,
+        YamlFindingCode::WrongValue,
         format!("expected host:port, found `{text}`"),
     )
 }
 
-fn read_changer(node: &Node, reader: &mut Reader<'_>) -> Option<Arc<dyn Device>> {
+fn read_changer(node: &DocumentNode, reader: &mut YamlReader<'_>) -> Option<Arc<dyn Device>> {
     let keys = [
         "converter",
         "unit",
@@ -140,7 +158,7 @@ fn read_changer(node: &Node, reader: &mut Reader<'_>) -> Option<Arc<dyn Device>>
     let tools = reader
         .needed(tools, "tools", node.place)
         .map(|node| read_tools(node, reader));
-    let settings = kelvin::Settings {
+    let settings = kelvin::KelvinSettings {
         converter: kelvin::Converter {
             at: at?,
             unit: unit?,
@@ -158,19 +176,19 @@ fn read_changer(node: &Node, reader: &mut Reader<'_>) -> Option<Arc<dyn Device>>
         None => None,
     };
     let mover = kelvin::Mover::Component(robot);
-    Some(Arc::new(kelvin::Changer::new(settings, mover)))
+    Some(Arc::new(kelvin::KelvinChanger::new(settings, mover)))
 }
 
-pub(crate) fn read_register(node: &Node, reader: &mut Reader<'_>) -> Option<u16> {
+pub(crate) fn read_register(node: &DocumentNode, reader: &mut YamlReader<'_>) -> Option<u16> {
     let text = reader.text(node, "the number of a register")?;
     let register = text.parse().ok();
     register.or_else(|| {
         let message = format!("expected a number from 0 to 65535, found `{text}`");
-        reader.refuse(node, Code::WrongValue, message)
+        reader.refuse(node, YamlFindingCode::WrongValue, message)
     })
 }
 
-fn read_tools(node: &Node, reader: &mut Reader<'_>) -> Vec<kelvin::Tool> {
+fn read_tools(node: &DocumentNode, reader: &mut YamlReader<'_>) -> Vec<kelvin::Tool> {
     let mut tools: Vec<kelvin::Tool> = Vec::new();
     for node in reader.list(node) {
         let Some(tool) = read_tool(node, reader) else {
@@ -183,14 +201,14 @@ fn read_tools(node: &Node, reader: &mut Reader<'_>) -> Vec<kelvin::Tool> {
             let message = "a tool of that number or URI is there already";
             reader
                 .findings()
-                .error(Code::WrongValue, node.place, message);
+                .error(YamlFindingCode::WrongValue, node.place, message);
         }
         tools.push(tool);
     }
     tools
 }
 
-fn read_tool(node: &Node, reader: &mut Reader<'_>) -> Option<kelvin::Tool> {
+fn read_tool(node: &DocumentNode, reader: &mut YamlReader<'_>) -> Option<kelvin::Tool> {
     let [number, uri, dock] = reader.map(node, ["number", "uri", "dock"])?;
     let number = reader.needed(number, "number", node.place);
     let number = number.and_then(|node| {
@@ -198,7 +216,7 @@ fn read_tool(node: &Node, reader: &mut Reader<'_>) -> Option<kelvin::Tool> {
         let number = text.parse().ok().filter(|number| (1..=10).contains(number));
         number.or_else(|| {
             let message = format!("expected a number from 1 to 10, found `{text}`");
-            reader.refuse(node, Code::WrongValue, message)
+            reader.refuse(node, YamlFindingCode::WrongValue, message)
         })
     });
     let uri = reader.needed(uri, "uri", node.place);
@@ -212,7 +230,7 @@ fn read_tool(node: &Node, reader: &mut Reader<'_>) -> Option<kelvin::Tool> {
     let six = numbers.try_into().ok();
     let six = six.or_else(|| {
         let message = "a dock is six numbers: x, y, z in m and rotations about x, y, z in rad";
-        reader.refuse(dock, Code::WrongValue, message.to_owned())
+        reader.refuse(dock, YamlFindingCode::WrongValue, message.to_owned())
     });
     Some(kelvin::Tool {
         number: number?,
@@ -221,7 +239,7 @@ fn read_tool(node: &Node, reader: &mut Reader<'_>) -> Option<kelvin::Tool> {
     })
 }
 
-fn read_robot(node: &Node, reader: &mut Reader<'_>) -> Option<Arc<dyn Device>> {
+fn read_robot(node: &DocumentNode, reader: &mut YamlReader<'_>) -> Option<Arc<dyn Device>> {
     let [host, rtde, secondary, reach] =
         reader.map(node, ["host", "rtde_port", "secondary_port", "reach"])?;
     let host = reader.needed(host, "host", node.place);
@@ -231,45 +249,45 @@ fn read_robot(node: &Node, reader: &mut Reader<'_>) -> Option<Arc<dyn Device>> {
             return Some(text);
         }
         let message = format!("expected a host name or address, found `{text}`");
-        reader.refuse(node, Code::WrongValue, message)
+        reader.refuse(node, YamlFindingCode::WrongValue, message)
     });
-    let mut port = |node: Option<&Node>, usual: u16| match node {
+    let mut port = |node: Option<&DocumentNode>, usual: u16| match node {
         Some(node) => read_port(node, reader),
         None => Some(usual),
     };
     let (rtde, secondary) = (port(rtde, ur::wire::PORT), port(secondary, ur::SECONDARY));
     let reach = reach.map_or(Some(ur::REACH), |node| reader.number(node, (0.1, 5.0)));
     let host = host?;
-    Some(Arc::new(ur::Robot::new(ur::Settings {
+    Some(Arc::new(ur::UrRobot::new(ur::UrSettings {
         rtde: format!("{host}:{}", rtde?),
         secondary: format!("{host}:{}", secondary?),
         reach: reach?,
     })))
 }
 
-fn read_port(node: &Node, reader: &mut Reader<'_>) -> Option<u16> {
+fn read_port(node: &DocumentNode, reader: &mut YamlReader<'_>) -> Option<u16> {
     let text = reader.text(node, "a port")?;
     let port = text.parse().ok().filter(|port| *port > 0);
     port.or_else(|| {
         let message = format!("expected a port from 1 to 65535, found `{text}`");
-        reader.refuse(node, Code::WrongValue, message)
+        reader.refuse(node, YamlFindingCode::WrongValue, message)
     })
 }
 
-pub(crate) fn read_line(node: &Node, reader: &mut Reader<'_>) -> Option<Line> {
+pub(crate) fn read_line(node: &DocumentNode, reader: &mut YamlReader<'_>) -> Option<ModbusLine> {
     let text = reader.text(node, "where the device is")?;
     match text.parse() {
         Ok(line) => Some(line),
-        Err(error) => reader.refuse(node, Code::WrongValue, format!("{error}")),
+        Err(error) => reader.refuse(node, YamlFindingCode::WrongValue, format!("{error}")),
     }
 }
 
-pub(crate) fn read_unit(node: &Node, reader: &mut Reader<'_>) -> Option<u8> {
+pub(crate) fn read_unit(node: &DocumentNode, reader: &mut YamlReader<'_>) -> Option<u8> {
     let text = reader.text(node, "the number of a unit")?;
     let unit = text.parse().ok().filter(|unit| (1..=247).contains(unit));
     unit.or_else(|| {
         let message = format!("expected a number from 1 to 247, found `{text}`");
-        reader.refuse(node, Code::WrongValue, message)
+        reader.refuse(node, YamlFindingCode::WrongValue, message)
     })
 }
 

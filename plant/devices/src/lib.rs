@@ -4,9 +4,9 @@
 //! answer. A submodule contains a simulator of the same protocol, so that other projects can test
 //! their software with it (`ua-component simulate`).
 //!
-//! Reading order: [`line`](Line) (the address of a device), `modbus` (the client), [`robotiq`],
-//! [`schmalz`], [`ur`], [`kelvin`] (which moves a robot), [`module`] (services of process modules),
-//! `sensors` (values without skills).
+//! Reading order: [`line`](ModbusLine) (the address of a device), `modbus` (the client),
+//! [`robotiq`], [`schmalz`], [`ur`], [`kelvin`] (which moves a robot), [`module`] (services of
+//! process modules), `sensors` (values without skills).
 
 #[cfg(test)]
 mod contact_tests;
@@ -25,6 +25,6 @@ mod tty;
 pub mod ur;
 
 pub use kinds::Kinds;
-pub use line::{Line, NoLine};
-pub use modbus::Fault as ModbusFault;
-pub use modbus::server::{Faults, Registers, Serving, Table};
+pub use line::{ModbusLine, NoLine};
+pub use modbus::ModbusFault;
+pub use modbus::server::{LineFaults, RegisterTable, Registers, ServedDevice};

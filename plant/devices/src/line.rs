@@ -10,7 +10,7 @@ use std::str::FromStr;
 /// by converters and robots for a serial line) or `serial:path[@baud]` (RTU, 8 bits, no parity, 115
 /// 200 baud by default).
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Line {
+pub enum ModbusLine {
     /// Modbus TCP at a host and port.
     Tcp(String),
     /// RTU frames over TCP.
@@ -29,7 +29,7 @@ pub enum Line {
 #[error("expected tcp://host:port, rtu+tcp://host:port or serial:path[@baud], found `{0}`")]
 pub struct NoLine(pub String);
 
-impl FromStr for Line {
+impl FromStr for ModbusLine {
     type Err = NoLine;
 
     fn from_str(text: &str) -> Result<Self, NoLine> {
@@ -58,7 +58,7 @@ impl FromStr for Line {
     }
 }
 
-impl fmt::Display for Line {
+impl fmt::Display for ModbusLine {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Tcp(address) => write!(f, "tcp://{address}"),
@@ -81,9 +81,9 @@ mod tests {
             "rtu+tcp://[::1]:54321",
             "serial:/dev/ttyUSB0@9600",
         ] {
-            assert_eq!(text.parse::<Line>().unwrap().to_string(), text);
+            assert_eq!(text.parse::<ModbusLine>().unwrap().to_string(), text);
         }
-        let usual = "serial:/dev/pts/3".parse::<Line>().unwrap();
+        let usual = "serial:/dev/pts/3".parse::<ModbusLine>().unwrap();
         assert_eq!(usual.to_string(), "serial:/dev/pts/3@115200");
         for wrong in [
             "",
@@ -94,7 +94,7 @@ mod tests {
             "serial:/x@fast",
             "tcp://a/b:1",
         ] {
-            assert_eq!(wrong.parse::<Line>(), Err(NoLine(wrong.to_owned())));
+            assert_eq!(wrong.parse::<ModbusLine>(), Err(NoLine(wrong.to_owned())));
         }
     }
 }

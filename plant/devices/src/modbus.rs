@@ -14,7 +14,7 @@ use tokio::time::timeout;
 use tokio_modbus::client::{Client as _, Context, rtu, tcp};
 use tokio_modbus::{Request, Response, Slave};
 
-use crate::line::Line;
+use crate::line::ModbusLine;
 use crate::tty::Tty;
 
 /// Time limit of an answer. Halt leaves a driver a second, enough for two requests.
@@ -26,14 +26,14 @@ static SHARED: StdMutex<Vec<Weak<Modbus>>> = StdMutex::new(Vec::new());
 /// A device behind a line. The connection is opened on request, and opened again after each
 /// fault: a late answer is never used for another request.
 pub(crate) struct Modbus {
-    line: Line,
+    line: ModbusLine,
     unit: u8,
     context: Mutex<Option<Context>>,
 }
 
 /// Error of a request.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-pub enum Fault {
+pub enum ModbusFault {
     /// There is no connection.
     #[error("{line} cannot be reached: {why}")]
     Unreachable {
@@ -78,14 +78,14 @@ impl fmt::Debug for Modbus {
     }
 }
 
-impl From<Fault> for String {
-    fn from(fault: Fault) -> Self {
+impl From<ModbusFault> for String {
+    fn from(fault: ModbusFault) -> Self {
         fault.to_string()
     }
 }
 
 impl Modbus {
-    pub(crate) fn new(line: Line, unit: u8) -> Self {
+    pub(crate) fn new(line: ModbusLine, unit: u8) -> Self {
         Self {
             line,
             unit,
@@ -95,7 +95,7 @@ impl Modbus {
 
     /// Returns the connection to a unit, which all users of this unit in the program share: many
     /// devices serve a single connection.
-    pub(crate) fn shared(line: &Line, unit: u8) -> Arc<Self> {
+    pub(crate) fn shared(line: &ModbusLine, unit: u8) -> Arc<Self> {
         let mut shared = SHARED.lock().unwrap_or_else(PoisonError::into_inner);
         shared.retain(|known| known.strong_count() > 0);
         let mut known = shared.iter().filter_map(Weak::upgrade);
@@ -108,7 +108,7 @@ impl Modbus {
     }
 
     /// Reads holding registers (function 3).
-    pub(crate) async fn holding(&self, address: u16, count: u16) -> Result<Vec<u16>, Fault> {
+    pub(crate) async fn holding(&self, address: u16, count: u16) -> Result<Vec<u16>, ModbusFault> {
         let answer = self
             .ask(Request::ReadHoldingRegisters(address, count))
             .await?;
@@ -121,7 +121,7 @@ impl Modbus {
     }
 
     /// Reads input registers (function 4).
-    pub(crate) async fn input(&self, address: u16, count: u16) -> Result<Vec<u16>, Fault> {
+    pub(crate) async fn input(&self, address: u16, count: u16) -> Result<Vec<u16>, ModbusFault> {
         let answer = self
             .ask(Request::ReadInputRegisters(address, count))
             .await?;
@@ -134,14 +134,14 @@ impl Modbus {
     }
 
     /// Writes holding registers (function 16).
-    pub(crate) async fn write(&self, address: u16, words: &[u16]) -> Result<(), Fault> {
+    pub(crate) async fn write(&self, address: u16, words: &[u16]) -> Result<(), ModbusFault> {
         let request = Request::WriteMultipleRegisters(address, Cow::Owned(words.to_vec()));
         self.ask(request).await.map(drop)
     }
 
     /// Sends a request. If it fails on an existing connection, which may be stale, the request is
     /// repeated once on a new connection.
-    async fn ask(&self, request: Request<'static>) -> Result<Response, Fault> {
+    async fn ask(&self, request: Request<'static>) -> Result<Response, ModbusFault> {
         let mut kept = self.context.lock().await;
         // A dropped future leaves no connection behind that could still receive its answer.
         if let Some(context) = kept.take()
@@ -162,18 +162,18 @@ impl Modbus {
         &self,
         mut context: Context,
         request: Request<'static>,
-    ) -> Result<(Context, Result<Response, Fault>), Fault> {
+    ) -> Result<(Context, Result<Response, ModbusFault>), ModbusFault> {
         let (line, unit) = (self.line.to_string(), self.unit);
         match timeout(ANSWER, context.call(request)).await {
-            Err(_) => Err(Fault::Silent { line, unit }),
+            Err(_) => Err(ModbusFault::Silent { line, unit }),
             Ok(Err(tokio_modbus::Error::Transport(error))) if is_broken(&error) => {
                 let why = error.to_string();
-                Err(Fault::Unreachable { line, why })
+                Err(ModbusFault::Unreachable { line, why })
             }
             Ok(Err(error)) => Err(self.damaged(&error.to_string())),
             Ok(Ok(Err(exception))) => {
                 let exception = exception.to_string();
-                let refused = Fault::Refused {
+                let refused = ModbusFault::Refused {
                     line,
                     unit,
                     exception,
@@ -184,30 +184,30 @@ impl Modbus {
         }
     }
 
-    async fn connect(&self) -> Result<Context, Fault> {
+    async fn connect(&self) -> Result<Context, ModbusFault> {
         let (line, unit) = (self.line.to_string(), Slave(self.unit));
-        let unreachable = |error: io::Error| Fault::Unreachable {
+        let unreachable = |error: io::Error| ModbusFault::Unreachable {
             line: line.clone(),
             why: error.to_string(),
         };
         match &self.line {
-            Line::Serial { path, baud } => {
+            ModbusLine::Serial { path, baud } => {
                 let tty = Tty::open(path, *baud).map_err(unreachable)?;
                 Ok(rtu::attach_slave(tty, unit))
             }
-            Line::Tcp(address) => {
+            ModbusLine::Tcp(address) => {
                 let stream = connected(address).await.map_err(unreachable)?;
                 Ok(tcp::attach_slave(stream, unit))
             }
-            Line::RtuOverTcp(address) => {
+            ModbusLine::RtuOverTcp(address) => {
                 let stream = connected(address).await.map_err(unreachable)?;
                 Ok(rtu::attach_slave(stream, unit))
             }
         }
     }
 
-    fn damaged(&self, why: &str) -> Fault {
-        Fault::Damaged {
+    fn damaged(&self, why: &str) -> ModbusFault {
+        ModbusFault::Damaged {
             line: self.line.to_string(),
             unit: self.unit,
             why: why.chars().take(200).collect(),

@@ -17,22 +17,22 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use mtp::{Module, Parameter, Procedure, Service};
-use skills::yaml::{Code, Kind, Node, Place, Reader};
+use mtp::{Module, MtpService, Procedure, ServiceParameter};
+use skills::yaml::{DocumentKind, DocumentNode, Place, YamlFindingCode, YamlReader};
 use skills::{
-    Authority, Device, Driver, DriverFault, DriverSetup, Facts, Observer, PeerAccess, Shape, Skill,
-    SkillSetup, TypeName, Value,
+    Authority, Device, Driver, DriverFault, DriverSetup, ParameterType, PeerAccess, Skill,
+    SkillDescription, SkillObserver, SkillSetup, SkillValue, ValueShape,
 };
 use tokio::sync::Mutex;
 
-pub use error::NodeError;
-pub use handshake::{ModuleNodes, Timing};
+pub use error::ModuleNodeError;
+pub use handshake::{HandshakeTiming, ModuleNodes};
 use nodes::UaNodes;
-use procedure::Run;
+use procedure::ProcedureRun;
 
 /// Settings of a module.
 #[derive(Debug, Clone)]
-pub struct Settings {
+pub struct ModuleSettings {
     /// The module of the manifest.
     pub module: Module,
     /// The endpoint of its server, if it differs from the manifest.
@@ -42,12 +42,12 @@ pub struct Settings {
     /// Whether parameters of the configuration are parameters of the skills.
     pub configuration: bool,
     /// The time limits.
-    pub timing: Timing,
+    pub timing: HandshakeTiming,
 }
 
 /// A process module.
 pub struct ProcessModule {
-    settings: Settings,
+    settings: ModuleSettings,
     skills: Vec<ModuleSkill>,
     nodes: Arc<dyn ModuleNodes>,
 }
@@ -57,7 +57,7 @@ pub struct ProcessModule {
 struct ModuleSkill {
     /// The name of the skill: `Service-Procedure`.
     name: String,
-    service: Arc<Service>,
+    service: Arc<MtpService>,
     procedure: Arc<Procedure>,
     /// Held during a run, since a service runs one procedure at a time.
     busy: Arc<Mutex<()>>,
@@ -75,14 +75,14 @@ impl std::fmt::Debug for ProcessModule {
 impl ProcessModule {
     /// Creates the device of a module, reached over OPC UA.
     #[must_use]
-    pub fn new(settings: Settings) -> Self {
+    pub fn new(settings: ModuleSettings) -> Self {
         let endpoint = settings.endpoint.clone();
         Self::over(settings, Arc::new(UaNodes::new(endpoint)))
     }
 
     /// Creates the device of a module whose nodes are reached by `nodes`.
     #[must_use]
-    pub fn over(settings: Settings, nodes: Arc<dyn ModuleNodes>) -> Self {
+    pub fn over(settings: ModuleSettings, nodes: Arc<dyn ModuleNodes>) -> Self {
         let mut skills: Vec<ModuleSkill> = Vec::new();
         for service in &settings.module.services {
             let busy = Arc::new(Mutex::new(()));
@@ -124,7 +124,7 @@ impl ProcessModule {
         &self,
         service: &str,
         procedure: Option<&str>,
-        observers: Vec<Box<dyn Observer>>,
+        observers: Vec<Box<dyn SkillObserver>>,
     ) -> Result<Skill, DriverFault> {
         let names = |all: &mut dyn Iterator<Item = &str>| all.collect::<Vec<_>>().join(", ");
         let of = |skill: &&ModuleSkill| skill.service.name == service;
@@ -155,32 +155,32 @@ impl ProcessModule {
     fn spawn(
         &self,
         skill: &ModuleSkill,
-        observers: Vec<Box<dyn Observer>>,
+        observers: Vec<Box<dyn SkillObserver>>,
     ) -> Result<Skill, DriverFault> {
-        let types = vec![self.type_of(skill), TypeName::own("SkillType")];
+        let types = vec![self.type_of(skill), ParameterType::own("SkillType")];
         let driver = self.driver(&types, &PeerAccess::default())?;
         let mut parameters: Vec<_> = self
             .parameters(skill)
-            .map(|parameter| skills::Parameter {
+            .map(|parameter| skills::SkillParameter {
                 unit: types::unit(parameter.unit.as_ref()).map(str::to_owned),
                 range: types::range(parameter),
                 ..plain(&parameter.name, types::builtin(parameter.kind))
             })
             .collect();
         if procedure::has_run_time(&skill.procedure, self.parameters(skill)) {
-            parameters.push(skills::Parameter {
-                default: Some(Value::Double(0.0)),
+            parameters.push(skills::SkillParameter {
+                default: Some(SkillValue::Double(0.0)),
                 unit: Some("s".to_owned()),
                 ..plain(procedure::RUN_TIME, skills::Builtin::Double)
             });
         }
         let outputs = procedure::outputs(&skill.service, &skill.procedure);
-        let facts = Facts {
+        let facts = SkillDescription {
             name: skill.name.clone(),
             types,
             parameters,
             results: outputs
-                .map(|output| skills::Parameter {
+                .map(|output| skills::SkillParameter {
                     unit: types::unit(output.unit.as_ref()).map(str::to_owned),
                     ..plain(&output.name, types::builtin(output.kind))
                 })
@@ -200,15 +200,15 @@ impl ProcessModule {
         )
     }
 
-    fn type_of(&self, skill: &ModuleSkill) -> TypeName {
-        TypeName {
+    fn type_of(&self, skill: &ModuleSkill) -> ParameterType {
+        ParameterType {
             namespace: self.namespace(),
             name: format!("{}SkillType", skill.name),
         }
     }
 
     /// Returns the parameters that a run of a procedure writes.
-    fn parameters<'s>(&self, skill: &'s ModuleSkill) -> impl Iterator<Item = &'s Parameter> {
+    fn parameters<'s>(&self, skill: &'s ModuleSkill) -> impl Iterator<Item = &'s ServiceParameter> {
         let configuration = self.settings.configuration;
         let of_service = skill.service.parameters.iter();
         let of_service = of_service.filter(move |_| configuration);
@@ -225,13 +225,16 @@ impl ProcessModule {
 impl Device for ProcessModule {
     fn driver(
         &self,
-        types: &[TypeName],
+        types: &[ParameterType],
         peers: &PeerAccess,
     ) -> Result<Arc<dyn Driver>, DriverFault> {
         self.nodes.identify(&peers.options);
         let of = |skill: &&ModuleSkill| types.contains(&self.type_of(skill));
         let Some(skill) = self.skills.iter().find(of) else {
-            let own = types.first().map(TypeName::to_string).unwrap_or_default();
+            let own = types
+                .first()
+                .map(ParameterType::to_string)
+                .unwrap_or_default();
             let known: Vec<String> = self
                 .skills
                 .iter()
@@ -242,15 +245,23 @@ impl Device for ProcessModule {
                 known.join(", ")
             )));
         };
-        if skill.service.control.node(mtp::Role::Command).is_none()
-            || skill.service.control.node(mtp::Role::State).is_none()
+        if skill
+            .service
+            .control
+            .node(mtp::ControlRole::Command)
+            .is_none()
+            || skill
+                .service
+                .control
+                .node(mtp::ControlRole::State)
+                .is_none()
         {
             return Err(DriverFault(format!(
                 "the service {} has no node for commands or for its state",
                 skill.service.name
             )));
         }
-        Ok(Arc::new(Run {
+        Ok(Arc::new(ProcedureRun {
             service: Arc::clone(&skill.service),
             procedure: Arc::clone(&skill.procedure),
             parameters: self.parameters(skill).cloned().collect(),
@@ -298,10 +309,10 @@ impl Device for ProcessModule {
     }
 }
 
-fn plain(name: &str, builtin: skills::Builtin) -> skills::Parameter {
-    skills::Parameter {
+fn plain(name: &str, builtin: skills::Builtin) -> skills::SkillParameter {
+    skills::SkillParameter {
         name: name.to_owned(),
-        shape: Shape::scalar(builtin),
+        shape: ValueShape::scalar(builtin),
         length: None,
         default: None,
         unit: None,
@@ -323,7 +334,11 @@ fn plain_name(name: &str) -> String {
 }
 
 /// Reads the value of `mtp`.
-pub(crate) fn read(node: &Node, folder: &Path, reader: &mut Reader<'_>) -> Option<Arc<dyn Device>> {
+pub(crate) fn read(
+    node: &DocumentNode,
+    folder: &Path,
+    reader: &mut YamlReader<'_>,
+) -> Option<Arc<dyn Device>> {
     let keys = [
         "manifest",
         "endpoint",
@@ -352,15 +367,15 @@ pub(crate) fn read(node: &Node, folder: &Path, reader: &mut Reader<'_>) -> Optio
         |node| read_capabilities(node, reader),
     );
     let configuration = configuration.map_or(Some(false), |node| reader.boolean(node));
-    let usual = Timing::default();
+    let usual = HandshakeTiming::default();
     let within = within.map_or(Some(usual.handshake), |node| reader.duration(node));
     let stop = stop.map_or(Some(usual.stop), |node| reader.duration(node));
-    Some(Arc::new(ProcessModule::new(Settings {
+    Some(Arc::new(ProcessModule::new(ModuleSettings {
         module: module?,
         endpoint,
         capabilities: capabilities?,
         configuration: configuration?,
-        timing: Timing {
+        timing: HandshakeTiming {
             handshake: within?,
             stop: stop?,
             ..usual
@@ -368,7 +383,11 @@ pub(crate) fn read(node: &Node, folder: &Path, reader: &mut Reader<'_>) -> Optio
     })))
 }
 
-fn read_manifest(node: &Node, folder: &Path, reader: &mut Reader<'_>) -> Option<Module> {
+fn read_manifest(
+    node: &DocumentNode,
+    folder: &Path,
+    reader: &mut YamlReader<'_>,
+) -> Option<Module> {
     let path: PathBuf = folder.join(reader.text(node, "the path of a manifest")?);
     let bounded = |path: &Path| -> std::io::Result<Vec<u8>> {
         match std::fs::metadata(path)?.len() {
@@ -383,34 +402,38 @@ fn read_manifest(node: &Node, folder: &Path, reader: &mut Reader<'_>) -> Option<
         Ok(bytes) => bytes,
         Err(error) => {
             let message = format!("cannot read {shown}: {error}");
-            return reader.refuse(node, Code::WrongValue, message);
+            return reader.refuse(node, YamlFindingCode::WrongValue, message);
         }
     };
     let beside = path.parent().unwrap_or_else(|| Path::new(""));
     match Module::from_files(&bytes, &mut |name| bounded(&beside.join(name)).ok()) {
         Ok(module) if module.services.iter().all(|one| one.procedures.is_empty()) => {
             let message = format!("{shown} has no services with procedures");
-            reader.refuse(node, Code::WrongValue, message)
+            reader.refuse(node, YamlFindingCode::WrongValue, message)
         }
         Ok(module) => Some(module),
-        Err(error) => reader.refuse(node, Code::WrongValue, format!("{shown}: {error}")),
+        Err(error) => reader.refuse(
+            node,
+            YamlFindingCode::WrongValue,
+            format!("{shown}: {error}"),
+        ),
     }
 }
 
-fn read_endpoint(node: &Node, reader: &mut Reader<'_>) -> Option<String> {
+fn read_endpoint(node: &DocumentNode, reader: &mut YamlReader<'_>) -> Option<String> {
     let text = reader.text(node, "an endpoint")?;
     if text.starts_with("opc.tcp://") {
         return Some(text.to_owned());
     }
     let message = format!("expected opc.tcp://<host>:<port>, found `{text}`");
-    reader.refuse(node, Code::Endpoint, message)
+    reader.refuse(node, YamlFindingCode::Endpoint, message)
 }
 
 fn read_capabilities(
-    node: &Node,
-    reader: &mut Reader<'_>,
+    node: &DocumentNode,
+    reader: &mut YamlReader<'_>,
 ) -> Option<BTreeMap<String, Vec<String>>> {
-    let Kind::Map(pairs) = &node.kind else {
+    let DocumentKind::Map(pairs) = &node.kind else {
         reader.wrong(
             node,
             "a map from the name of a service to IRIs of capabilities",
@@ -425,7 +448,7 @@ fn read_capabilities(
             let text = reader.text(class, "the IRI of a capability")?;
             if !text.contains(':') || text.contains(char::is_whitespace) {
                 let message = format!("`{text}` is no IRI");
-                return reader.refuse(class, Code::Capability, message);
+                return reader.refuse(class, YamlFindingCode::Capability, message);
             }
             iris.push(text.to_owned());
         }
@@ -435,10 +458,11 @@ fn read_capabilities(
 }
 
 /// Returns whether a value was read as it was written; a Float of a module has fewer digits.
-fn is_equal(written: &Value, read: &Value) -> bool {
+fn is_equal(written: &SkillValue, read: &SkillValue) -> bool {
     match (written.as_f64(), read.as_f64()) {
         (Some(a), Some(b)) => {
-            let is_float = |value: &Value| matches!(value, Value::Float(_) | Value::Double(_));
+            let is_float =
+                |value: &SkillValue| matches!(value, SkillValue::Float(_) | SkillValue::Double(_));
             let most = match is_float(written) || is_float(read) {
                 true => a.abs().max(b.abs()) * 1e-6,
                 false => 0.0,

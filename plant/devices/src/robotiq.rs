@@ -11,12 +11,12 @@ use std::time::Duration;
 use async_trait::async_trait;
 use skills::{
     Builtin, Device, DeviceValue, Driver, DriverError, DriverFault, InvalidParameter, Measured,
-    Parameters, PeerAccess, Results, TypeName, Value, Work,
+    ParameterType, Parameters, PeerAccess, RunResults, SkillValue, Work,
 };
 use tokio::time::{Instant, sleep};
 
-use crate::line::Line;
-use crate::modbus::{Fault, Modbus};
+use crate::line::ModbusLine;
+use crate::modbus::{Modbus, ModbusFault};
 use crate::sensors::{ticks, value};
 
 /// Address of the command registers: action, reserved; reserved, position; speed, force.
@@ -30,14 +30,14 @@ pub const STROKE: f64 = 0.085;
 
 /// A gripper.
 #[derive(Debug, Clone)]
-pub struct Gripper {
+pub struct RobotiqGripper {
     modbus: Arc<Modbus>,
 }
 
-impl Gripper {
+impl RobotiqGripper {
     /// Creates a gripper with a unit number behind a line.
     #[must_use]
-    pub fn new(line: Line, unit: u8) -> Self {
+    pub fn new(line: ModbusLine, unit: u8) -> Self {
         Self {
             modbus: Modbus::shared(&line, unit),
         }
@@ -45,25 +45,28 @@ impl Gripper {
 }
 
 #[async_trait]
-impl Device for Gripper {
+impl Device for RobotiqGripper {
     fn driver(
         &self,
-        types: &[TypeName],
+        types: &[ParameterType],
         _peers: &PeerAccess,
     ) -> Result<Arc<dyn Driver>, DriverFault> {
-        let is = |name: &str| types.contains(&TypeName::own(name));
+        let is = |name: &str| types.contains(&ParameterType::own(name));
         let modbus = Arc::clone(&self.modbus);
         let of = |what| -> Arc<dyn Driver> { Arc::new(Motion { modbus, what }) };
         if is("GraspSkillType") {
-            return Ok(of(What::Close));
+            return Ok(of(FingerTarget::Close));
         }
         if is("ReleaseSkillType") {
-            return Ok(of(What::Open));
+            return Ok(of(FingerTarget::Open));
         }
         if is("MoveGripperSkillType") {
-            return Ok(of(What::Width));
+            return Ok(of(FingerTarget::Width));
         }
-        let own = types.first().map(TypeName::to_string).unwrap_or_default();
+        let own = types
+            .first()
+            .map(ParameterType::to_string)
+            .unwrap_or_default();
         Err(DriverFault(format!(
             "`robotiq_2f85` does the work of GraspSkillType, ReleaseSkillType, MoveGripperSkillType and what is below them, and this is {own}"
         )))
@@ -91,7 +94,7 @@ impl Device for Gripper {
             out.put("ObjectDetected", Ok(matches!(status.object, 1 | 2).into()));
             out.put("Width", Ok(width(status.position).into()));
             out.put("Current", Ok((f64::from(status.current) * AMPERE).into()));
-            out.put("Fault", Ok(Value::Byte(status.fault)));
+            out.put("Fault", Ok(SkillValue::Byte(status.fault)));
         }
     }
 }
@@ -186,7 +189,7 @@ impl Status {
 #[derive(Debug, thiserror::Error)]
 enum RobotiqError {
     #[error(transparent)]
-    Modbus(#[from] Fault),
+    Modbus(#[from] ModbusFault),
     #[error("the gripper answers without its status")]
     NoStatus,
     #[error("nothing is between the fingers")]
@@ -219,12 +222,12 @@ impl From<RobotiqError> for DriverError {
 #[derive(Debug)]
 struct Motion {
     modbus: Arc<Modbus>,
-    what: What,
+    what: FingerTarget,
 }
 
 /// Target of the fingers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum What {
+enum FingerTarget {
     Close,
     Open,
     /// The distance of the parameter Width.
@@ -247,7 +250,7 @@ impl Driver for Motion {
 
     fn check(&self, parameters: &Parameters) -> Result<(), InvalidParameter> {
         match parameters.number("Width") {
-            Some(width) if self.what == What::Width && width > STROKE => {
+            Some(width) if self.what == FingerTarget::Width && width > STROKE => {
                 Err(InvalidParameter::OutOfRange {
                     name: "Width".to_owned(),
                     given: format!("{width} m"),
@@ -258,12 +261,12 @@ impl Driver for Motion {
         }
     }
 
-    async fn run(&self, work: Work) -> Result<Results, DriverError> {
+    async fn run(&self, work: Work) -> Result<RunResults, DriverError> {
         self.activate(&work).await?;
         let (step, position) = match self.what {
-            What::Close => ("Close", 255),
-            What::Open => ("Open", 0),
-            What::Width => ("Move", position(work.parameters())),
+            FingerTarget::Close => ("Close", 255),
+            FingerTarget::Open => ("Open", 0),
+            FingerTarget::Width => ("Move", position(work.parameters())),
         };
         work.step(step).await;
         let goal = Goal {
@@ -273,14 +276,14 @@ impl Driver for Motion {
         };
         let ended = self.go(goal, &work).await?;
         match (self.what, ended.object) {
-            (What::Close, 2) => Ok(vec![("Gripped".to_owned(), true.into())]),
-            (What::Close, _) => Err(RobotiqError::NothingGrasped.into()),
-            (What::Open, 1) => {
+            (FingerTarget::Close, 2) => Ok(vec![("Gripped".to_owned(), true.into())]),
+            (FingerTarget::Close, _) => Err(RobotiqError::NothingGrasped.into()),
+            (FingerTarget::Open, 1) => {
                 let position = ended.position;
                 Err(RobotiqError::Blocked { position }.into())
             }
-            (What::Open, _) => Ok(Vec::new()),
-            (What::Width, object) => Ok(vec![
+            (FingerTarget::Open, _) => Ok(Vec::new()),
+            (FingerTarget::Width, object) => Ok(vec![
                 ("Width".to_owned(), width(ended.position).into()),
                 ("Gripped".to_owned(), (object != 3).into()),
             ]),
@@ -294,7 +297,7 @@ impl Motion {
         Status::of(&words).ok_or(RobotiqError::NoStatus)
     }
 
-    async fn act(&self, action: u8, goal: Goal) -> Result<(), Fault> {
+    async fn act(&self, action: u8, goal: Goal) -> Result<(), ModbusFault> {
         let words = [
             u16::from_be_bytes([action, 0]),
             u16::from_be_bytes([0, goal.position]),

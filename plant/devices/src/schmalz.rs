@@ -14,31 +14,31 @@ use std::time::Duration;
 use async_trait::async_trait;
 use serde_json::{Value, json};
 use skills::{
-    Builtin, Device, DeviceValue, Driver, DriverError, DriverFault, Measured, PeerAccess, Results,
-    TypeName, Work,
+    Builtin, Device, DeviceValue, Driver, DriverError, DriverFault, Measured, ParameterType,
+    PeerAccess, RunResults, Work,
 };
 use tokio::time::{Instant, sleep};
 
-use crate::http::{Asked, Fault, Host};
+use crate::http::{DeviceHost, DeviceRequest, HttpFault};
 use crate::sensors::{ticks, value};
 
 /// A gripper.
 #[derive(Debug, Clone)]
-pub struct Gripper {
-    port: Arc<Port>,
-    timing: Timing,
+pub struct SchmalzGripper {
+    port: Arc<IoLinkPort>,
+    timing: SchmalzTiming,
 }
 
 /// Time limits of the gripper.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Timing {
+pub struct SchmalzTiming {
     /// Time limit for holding a part.
     pub grasp: Duration,
     /// Time limit for releasing a part.
     pub release: Duration,
 }
 
-impl Default for Timing {
+impl Default for SchmalzTiming {
     fn default() -> Self {
         Self {
             grasp: Duration::from_secs(8),
@@ -47,25 +47,25 @@ impl Default for Timing {
     }
 }
 
-impl Gripper {
+impl SchmalzGripper {
     /// Creates the device of an alias, such as `master1port1`, at the master at `host:port`.
     #[must_use]
-    pub fn new(master: &str, alias: &str, timing: Timing) -> Self {
+    pub fn new(master: &str, alias: &str, timing: SchmalzTiming) -> Self {
         Self {
-            port: Arc::new(Port::new(master, alias)),
+            port: Arc::new(IoLinkPort::new(master, alias)),
             timing,
         }
     }
 }
 
 #[async_trait]
-impl Device for Gripper {
+impl Device for SchmalzGripper {
     fn driver(
         &self,
-        types: &[TypeName],
+        types: &[ParameterType],
         _peers: &PeerAccess,
     ) -> Result<Arc<dyn Driver>, DriverFault> {
-        let is = |name: &str| types.contains(&TypeName::own(name));
+        let is = |name: &str| types.contains(&ParameterType::own(name));
         let motion = |holds| -> Arc<dyn Driver> {
             Arc::new(Motion {
                 port: Arc::clone(&self.port),
@@ -79,7 +79,10 @@ impl Device for Gripper {
         if is("ReleaseSkillType") {
             return Ok(motion(false));
         }
-        let own = types.first().map(TypeName::to_string).unwrap_or_default();
+        let own = types
+            .first()
+            .map(ParameterType::to_string)
+            .unwrap_or_default();
         Err(DriverFault(format!(
             "`schmalz_ecbpi` does the work of GraspSkillType, ReleaseSkillType and what is below them, and this is {own}"
         )))
@@ -100,8 +103,8 @@ impl Device for Gripper {
             out.put("PartPresent", Ok(status.part_present.into()));
             out.put("InControlRange", Ok(status.in_control_range.into()));
             out.put("PartDetached", Ok(status.part_detached.into()));
-            out.put("Vacuum", Ok(skills::Value::UInt16(status.vacuum)));
-            out.put("Health", Ok(skills::Value::Byte(status.health)));
+            out.put("Vacuum", Ok(skills::SkillValue::UInt16(status.vacuum)));
+            out.put("Health", Ok(skills::SkillValue::Byte(status.health)));
         }
     }
 }
@@ -139,7 +142,7 @@ const VALUES: [DeviceValue; 5] = [
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum SchmalzError {
     #[error(transparent)]
-    Http(#[from] Fault),
+    Http(#[from] HttpFault),
     #[error("the answer of {master} is damaged: {why}")]
     Damaged { master: String, why: &'static str },
     #[error("{master} says that the data of {alias} are not valid")]
@@ -170,8 +173,8 @@ impl From<SchmalzError> for DriverError {
 
 /// A port of a master.
 #[derive(Debug)]
-pub(crate) struct Port {
-    master: Host,
+pub(crate) struct IoLinkPort {
+    master: DeviceHost,
     alias: String,
 }
 
@@ -187,7 +190,7 @@ struct Status {
     vacuum: u16,
 }
 
-impl fmt::Display for Port {
+impl fmt::Display for IoLinkPort {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "{} at {}", self.alias, self.master)
     }
@@ -208,11 +211,11 @@ impl Status {
     }
 }
 
-impl Port {
+impl IoLinkPort {
     /// Creates the port of an alias at the master at `host:port`.
     pub(crate) fn new(master: &str, alias: &str) -> Self {
         Self {
-            master: Host::plain(master.to_owned()),
+            master: DeviceHost::plain(master.to_owned()),
             alias: alias.to_owned(),
         }
     }
@@ -251,14 +254,19 @@ impl Port {
         bytes.ok_or_else(|| self.damaged("the process data are not bytes"))
     }
 
-    async fn set(&self, out: u8) -> Result<(), Fault> {
+    async fn set(&self, out: u8) -> Result<(), HttpFault> {
         let path = format!("{}/{}/processdata/value", DEVICES, self.alias);
         let data = json!({"ioLink": {"valid": true, "value": [out, 0]}});
         self.ask("POST", &path, Some(&data)).await.map(drop)
     }
 
-    async fn ask(&self, method: &str, path: &str, body: Option<&Value>) -> Result<Value, Fault> {
-        let asked = Asked {
+    async fn ask(
+        &self,
+        method: &str,
+        path: &str,
+        body: Option<&Value>,
+    ) -> Result<Value, HttpFault> {
+        let asked = DeviceRequest {
             method,
             path,
             body,
@@ -278,14 +286,14 @@ impl Port {
 /// Grasping or releasing a part.
 #[derive(Debug)]
 struct Motion {
-    port: Arc<Port>,
-    timing: Timing,
+    port: Arc<IoLinkPort>,
+    timing: SchmalzTiming,
     holds: bool,
 }
 
 #[async_trait]
 impl Driver for Motion {
-    async fn run(&self, work: Work) -> Result<Results, DriverError> {
+    async fn run(&self, work: Work) -> Result<RunResults, DriverError> {
         let (step, out) = if self.holds {
             ("Suck", VACUUM)
         } else {

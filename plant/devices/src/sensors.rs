@@ -5,15 +5,15 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use async_trait::async_trait;
-use skills::yaml::{Code, Node, Reader};
-use skills::{Builtin, DeviceValue, Measured, Sensor, SensorRead, Shape, Value};
+use skills::yaml::{DocumentNode, YamlFindingCode, YamlReader};
+use skills::{Builtin, DeviceValue, Measured, SensorRead, SkillValue, ValueSensor, ValueShape};
 use tokio::time::{Interval, MissedTickBehavior, interval};
 
 use crate::http_skill;
 use crate::kinds::{read_address, read_alias, read_line, read_register, read_unit};
-use crate::line::Line;
+use crate::line::ModbusLine;
 use crate::modbus::Modbus;
-use crate::schmalz::Port;
+use crate::schmalz::IoLinkPort;
 
 /// Returns the description of a scalar value without a unit and a range.
 pub(crate) const fn value(
@@ -23,7 +23,7 @@ pub(crate) const fn value(
 ) -> DeviceValue {
     DeviceValue {
         name,
-        shape: Shape::scalar(builtin),
+        shape: ValueShape::scalar(builtin),
         unit: None,
         range: None,
         about,
@@ -48,7 +48,7 @@ struct Register {
 }
 
 #[async_trait]
-impl Sensor for Register {
+impl ValueSensor for Register {
     async fn measure(&self, period: Duration, out: &Measured) -> String {
         let mut ticks = ticks(period);
         let count = self.number.format.words();
@@ -78,14 +78,14 @@ impl Sensor for Register {
 /// A part of the process data of an IO-Link device.
 #[derive(Debug)]
 struct ProcessData {
-    port: Port,
+    port: IoLinkPort,
     /// The number of the first byte.
     byte: usize,
     number: Number,
 }
 
 #[async_trait]
-impl Sensor for ProcessData {
+impl ValueSensor for ProcessData {
     async fn measure(&self, period: Duration, out: &Measured) -> String {
         let mut ticks = ticks(period);
         loop {
@@ -154,8 +154,8 @@ impl Format {
 }
 
 impl Number {
-    fn shape(self) -> Shape {
-        Shape::scalar(match (self.bit, self.scaled) {
+    fn shape(self) -> ValueShape {
+        ValueShape::scalar(match (self.bit, self.scaled) {
             (Some(_), _) => Builtin::Boolean,
             (None, Some(_)) => Builtin::Double,
             (None, None) => self.format.row().0,
@@ -163,7 +163,7 @@ impl Number {
     }
 
     /// Returns the value at the front of some bytes.
-    fn of(self, bytes: &[u8]) -> Result<Value, String> {
+    fn of(self, bytes: &[u8]) -> Result<SkillValue, String> {
         let (_, count) = self.format.row();
         let short = || {
             format!(
@@ -181,13 +181,13 @@ impl Number {
         let [.., high, low] = whole.to_be_bytes();
         let word = u16::from_be_bytes([high, low]);
         let value = match self.format {
-            Format::UInt8 => Value::Byte(low),
-            Format::Int8 => Value::SByte(low.cast_signed()),
-            Format::UInt16 => Value::UInt16(word),
-            Format::Int16 => Value::Int16(word.cast_signed()),
-            Format::UInt32 => Value::UInt32(whole),
-            Format::Int32 => Value::Int32(whole.cast_signed()),
-            Format::Float32 => Value::Float(f32::from_bits(whole)),
+            Format::UInt8 => SkillValue::Byte(low),
+            Format::Int8 => SkillValue::SByte(low.cast_signed()),
+            Format::UInt16 => SkillValue::UInt16(word),
+            Format::Int16 => SkillValue::Int16(word.cast_signed()),
+            Format::UInt32 => SkillValue::UInt32(whole),
+            Format::Int32 => SkillValue::Int32(whole.cast_signed()),
+            Format::Float32 => SkillValue::Float(f32::from_bits(whole)),
         };
         match self.scaled {
             None => Ok(value),
@@ -200,19 +200,23 @@ impl Number {
 }
 
 /// Reads the source `modbus`, `io_link` or `http` of a value.
-pub(crate) fn read(kind: &str, node: &Node, reader: &mut Reader<'_>) -> Option<SensorRead> {
+pub(crate) fn read(
+    kind: &str,
+    node: &DocumentNode,
+    reader: &mut YamlReader<'_>,
+) -> Option<SensorRead> {
     match kind {
         "modbus" => read_modbus(node, reader),
         "io_link" => read_io_link(node, reader),
         "http" => http_skill::read_value(node, reader),
         _ => {
             let message = format!("this program knows no `{kind}`");
-            reader.refuse(node, Code::Source, message)
+            reader.refuse(node, YamlFindingCode::Source, message)
         }
     }
 }
 
-fn read_modbus(node: &Node, reader: &mut Reader<'_>) -> Option<SensorRead> {
+fn read_modbus(node: &DocumentNode, reader: &mut YamlReader<'_>) -> Option<SensorRead> {
     let keys = [
         "at",
         "unit",
@@ -225,7 +229,7 @@ fn read_modbus(node: &Node, reader: &mut Reader<'_>) -> Option<SensorRead> {
         "low_word_first",
     ];
     let [at, unit, holding, input, number @ ..] = reader.map(node, keys)?;
-    let line: Option<Line> = reader
+    let line: Option<ModbusLine> = reader
         .needed(at, "at", node.place)
         .and_then(|node| read_line(node, reader));
     let unit = unit.map_or(Some(1), |node| read_unit(node, reader));
@@ -234,13 +238,16 @@ fn read_modbus(node: &Node, reader: &mut Reader<'_>) -> Option<SensorRead> {
         (None, Some(node)) => (false, read_register(node, reader)),
         (None, None) | (Some(_), Some(_)) => {
             let message = "a register is either `holding` or `input`, with its number from 0";
-            (false, reader.refuse(node, Code::Source, message.to_owned()))
+            (
+                false,
+                reader.refuse(node, YamlFindingCode::Source, message.to_owned()),
+            )
         }
     };
     let number = read_number(number, Format::UInt16, reader);
     if number.is_some_and(|number| number.format.row().1 < 2) {
         let message = "a register has 16 bits: uint16, int16, uint32, int32 or float32";
-        return reader.refuse(node, Code::Source, message.to_owned());
+        return reader.refuse(node, YamlFindingCode::Source, message.to_owned());
     }
     let number = number?;
     let sensor = Register {
@@ -255,7 +262,7 @@ fn read_modbus(node: &Node, reader: &mut Reader<'_>) -> Option<SensorRead> {
     })
 }
 
-fn read_io_link(node: &Node, reader: &mut Reader<'_>) -> Option<SensorRead> {
+fn read_io_link(node: &DocumentNode, reader: &mut YamlReader<'_>) -> Option<SensorRead> {
     let keys = ["master", "alias", "byte", "as", "bit", "scale", "offset"];
     let [master, alias, byte, format, bit, scale, offset] = reader.map(node, keys)?;
     let master = reader
@@ -272,13 +279,13 @@ fn read_io_link(node: &Node, reader: &mut Reader<'_>) -> Option<SensorRead> {
             let byte: Option<usize> = text.parse().ok().filter(|byte| *byte < LONGEST_DATA);
             byte.or_else(|| {
                 let message = format!("expected a number from 0 to 31, found `{text}`");
-                reader.refuse(node, Code::WrongValue, message)
+                reader.refuse(node, YamlFindingCode::WrongValue, message)
             })
         }
     };
     let number = read_number([format, bit, scale, offset, None], Format::UInt8, reader)?;
     let sensor = ProcessData {
-        port: Port::new(master?, alias?),
+        port: IoLinkPort::new(master?, alias?),
         byte: byte?,
         number,
     };
@@ -289,9 +296,9 @@ fn read_io_link(node: &Node, reader: &mut Reader<'_>) -> Option<SensorRead> {
 }
 
 fn read_number(
-    [format, bit, scale, offset, swapped]: [Option<&Node>; 5],
+    [format, bit, scale, offset, swapped]: [Option<&DocumentNode>; 5],
     usual: Format,
-    reader: &mut Reader<'_>,
+    reader: &mut YamlReader<'_>,
 ) -> Option<Number> {
     let format = match format {
         None => usual,
@@ -305,12 +312,12 @@ fn read_number(
             let bit: Option<u8> = text.parse().ok().filter(|bit| usize::from(*bit) < bits);
             let Some(bit) = bit else {
                 let message = format!("expected the number of a bit below {bits}, found `{text}`");
-                return reader.refuse(node, Code::WrongValue, message);
+                return reader.refuse(node, YamlFindingCode::WrongValue, message);
             };
             Some(bit)
         }
     };
-    let mut number = |node: Option<&Node>, usual| match node {
+    let mut number = |node: Option<&DocumentNode>, usual| match node {
         Some(node) => reader.number(node, (-1e12, 1e12)),
         None => Some(usual),
     };
@@ -330,13 +337,13 @@ fn read_number(
     })
 }
 
-fn read_format(node: &Node, reader: &mut Reader<'_>) -> Option<Format> {
+fn read_format(node: &DocumentNode, reader: &mut YamlReader<'_>) -> Option<Format> {
     let text = reader.text(node, "the format of a number")?;
     let known = Format::ALL.iter().find(|(_, name, ..)| *name == text);
     known.map(|(format, ..)| *format).or_else(|| {
         let names: Vec<&str> = Format::ALL.iter().map(|(_, name, ..)| *name).collect();
         let message = format!("expected one of {}, found `{text}`", names.join(", "));
-        reader.refuse(node, Code::WrongValue, message)
+        reader.refuse(node, YamlFindingCode::WrongValue, message)
     })
 }
 

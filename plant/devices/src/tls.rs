@@ -14,12 +14,12 @@ use tokio_rustls::client::TlsStream;
 
 /// The verification of the certificate of a device.
 #[derive(Clone)]
-pub(crate) struct Tls {
+pub(crate) struct DeviceTls {
     config: Arc<ClientConfig>,
     host: ServerName<'static>,
 }
 
-impl fmt::Debug for Tls {
+impl fmt::Debug for DeviceTls {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.debug_struct("Tls")
             .field("host", &self.host)
@@ -27,7 +27,7 @@ impl fmt::Debug for Tls {
     }
 }
 
-impl Tls {
+impl DeviceTls {
     /// Creates the verification for a host, with the trusted authorities.
     ///
     /// # Errors

@@ -21,7 +21,7 @@ use std::time::Duration;
 use async_trait::async_trait;
 use skills::{
     Builtin, Device, DeviceValue, Driver, DriverError, DriverFault, InvalidParameter, Measured,
-    Parameters, PeerAccess, Results, Shape, TypeName, Work,
+    ParameterType, Parameters, PeerAccess, RunResults, ValueShape, Work,
 };
 use tokio::io::AsyncWriteExt as _;
 use tokio::net::TcpStream;
@@ -29,12 +29,12 @@ use tokio::time::{Instant, sleep, timeout, timeout_at};
 
 use self::error::{StopProgram, StoppedRobot, UrError};
 pub use self::follower::Follower;
-use self::force::Guard;
+use self::force::ForceGuard;
 pub use self::pose::{of_robot, to_robot};
 use self::rtde::Rtde;
 pub use self::rtde::RtdeError;
-use self::state::{INPUTS, OUTPUTS, PAUSED, STOPPED, State, UnfitRobot};
-use self::wire::Value;
+use self::state::{INPUTS, OUTPUTS, PAUSED, STOPPED, UnfitRobot, UrState};
+use self::wire::RecipeValue;
 use crate::modbus::connected;
 use crate::sensors::value;
 
@@ -45,7 +45,7 @@ pub const REACH: f64 = 0.85;
 
 /// Address and reach of a robot.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Settings {
+pub struct UrSettings {
     /// Host and port of RTDE.
     pub rtde: String,
     /// Host and port of the secondary interface.
@@ -54,7 +54,7 @@ pub struct Settings {
     pub reach: f64,
 }
 
-impl Settings {
+impl UrSettings {
     /// Returns the settings of a host with the default ports.
     #[must_use]
     pub fn of_host(host: &str) -> Self {
@@ -68,14 +68,14 @@ impl Settings {
 
 /// A robot.
 #[derive(Debug, Clone)]
-pub struct Robot {
-    settings: Arc<Settings>,
+pub struct UrRobot {
+    settings: Arc<UrSettings>,
 }
 
-impl Robot {
+impl UrRobot {
     /// Creates a robot.
     #[must_use]
-    pub fn new(settings: Settings) -> Self {
+    pub fn new(settings: UrSettings) -> Self {
         Self {
             settings: Arc::new(settings),
         }
@@ -83,13 +83,13 @@ impl Robot {
 }
 
 #[async_trait]
-impl Device for Robot {
+impl Device for UrRobot {
     fn driver(
         &self,
-        types: &[TypeName],
+        types: &[ParameterType],
         _peers: &PeerAccess,
     ) -> Result<Arc<dyn Driver>, DriverFault> {
-        let is = |name: &str| types.contains(&TypeName::own(name));
+        let is = |name: &str| types.contains(&ParameterType::own(name));
         let settings = Arc::clone(&self.settings);
         // ForceMoveSkillType is a subtype of LinearMoveSkillType.
         let kinds = [
@@ -101,7 +101,10 @@ impl Device for Robot {
         if let Some((_, kind)) = kinds.into_iter().find(|(name, _)| is(name)) {
             return Ok(Arc::new(Motion { settings, kind }));
         }
-        let own = types.first().map(TypeName::to_string).unwrap_or_default();
+        let own = types
+            .first()
+            .map(ParameterType::to_string)
+            .unwrap_or_default();
         Err(DriverFault(format!(
             "`universal_robot` does the work of PtpMoveSkillType, LinearMoveSkillType, ForceMoveSkillType, JointPtpMoveSkillType and what is below them, and this is {own}"
         )))
@@ -133,19 +136,19 @@ impl Device for Robot {
 }
 
 /// Returns a value of the robot for clients.
-fn shown(name: &str, value: Value) -> Result<skills::Value, String> {
+fn shown(name: &str, value: RecipeValue) -> Result<skills::SkillValue, String> {
     Ok(match value {
-        Value::Vector(pose) if name == "TcpPose" => of_robot(pose).into(),
-        Value::Vector(six) => six.into(),
-        Value::I32(number) => number.into(),
-        Value::F64(number) if name == "SpeedScaling" => (number * 100.0).into(),
-        Value::F64(number) => number.into(),
-        other @ (Value::Bool(_)
-        | Value::U8(_)
-        | Value::U32(_)
-        | Value::U64(_)
-        | Value::Triple(_)
-        | Value::Whole(_)) => return Err(format!("the robot sends {name} as {other:?}")),
+        RecipeValue::Vector(pose) if name == "TcpPose" => of_robot(pose).into(),
+        RecipeValue::Vector(six) => six.into(),
+        RecipeValue::I32(number) => number.into(),
+        RecipeValue::F64(number) if name == "SpeedScaling" => (number * 100.0).into(),
+        RecipeValue::F64(number) => number.into(),
+        other @ (RecipeValue::Bool(_)
+        | RecipeValue::U8(_)
+        | RecipeValue::U32(_)
+        | RecipeValue::U64(_)
+        | RecipeValue::Triple(_)
+        | RecipeValue::Whole(_)) => return Err(format!("the robot sends {name} as {other:?}")),
     })
 }
 
@@ -196,7 +199,7 @@ const VALUES: [DeviceValue; 7] = [
 
 const fn six(name: &'static str, unit: Option<&'static str>, about: &'static str) -> DeviceValue {
     DeviceValue {
-        shape: Shape::array(Builtin::Double),
+        shape: ValueShape::array(Builtin::Double),
         unit,
         ..value(name, Builtin::Double, about)
     }
@@ -205,7 +208,7 @@ const fn six(name: &'static str, unit: Option<&'static str>, about: &'static str
 /// A move.
 #[derive(Debug)]
 struct Motion {
-    settings: Arc<Settings>,
+    settings: Arc<UrSettings>,
     kind: Kind,
 }
 
@@ -242,7 +245,7 @@ impl Driver for Motion {
             });
         }
         if self.kind == Kind::Guarded {
-            Guard::of(parameters)?;
+            ForceGuard::of(parameters)?;
         }
         match parameters.text("ToolFrame") {
             None | Some("flange") => Ok(()),
@@ -254,9 +257,9 @@ impl Driver for Motion {
         }
     }
 
-    async fn run(&self, work: Work) -> Result<Results, DriverError> {
+    async fn run(&self, work: Work) -> Result<RunResults, DriverError> {
         let (mut guard, hertz) = match self.kind {
-            Kind::Guarded => (Some(Guard::of(work.parameters())?), GUARDED),
+            Kind::Guarded => (Some(ForceGuard::of(work.parameters())?), GUARDED),
             Kind::Ptp | Kind::Linear | Kind::Joints => (None, HERTZ),
         };
         let mut session = Session::open(&self.settings, hertz).await?;
@@ -407,14 +410,14 @@ struct Session {
 }
 
 impl Session {
-    async fn open(settings: &Settings, hertz: f64) -> Result<Self, UrError> {
+    async fn open(settings: &UrSettings, hertz: f64) -> Result<Self, UrError> {
         let rtde = Rtde::open(&settings.rtde, hertz, &OUTPUTS, &INPUTS).await?;
         Ok(Self { rtde })
     }
 
-    async fn state(&mut self) -> Result<State, UrError> {
+    async fn state(&mut self) -> Result<UrState, UrError> {
         let values = self.rtde.next().await?;
-        State::of(&values).ok_or(UrError::OtherTypes)
+        UrState::of(&values).ok_or(UrError::OtherTypes)
     }
 
     /// Sets the speed slider.
@@ -426,7 +429,7 @@ impl Session {
         (motion, work): (&Motion, &Work),
         fraction: f64,
     ) -> Result<(), UrError> {
-        let values = [Value::U32(1), Value::F64(fraction)];
+        let values = [RecipeValue::U32(1), RecipeValue::F64(fraction)];
         match self.rtde.tell(&values).await {
             Ok(()) => Ok(()),
             Err(why) => Err(motion.lost(work, why).await),
@@ -439,8 +442,8 @@ impl Session {
         &mut self,
         (motion, work): (&Motion, &Work),
         sent: &mut Sent,
-        guard: &mut Option<Guard>,
-    ) -> Result<State, UrError> {
+        guard: &mut Option<ForceGuard>,
+    ) -> Result<UrState, UrError> {
         let token = sent.token;
         let asked = Instant::now();
         let mut standing = None;
@@ -505,7 +508,7 @@ impl Session {
         &mut self,
         (motion, work): (&Motion, &Work),
         sent: &mut Sent,
-        (at, why): (&State, UnfitRobot),
+        (at, why): (&UrState, UnfitRobot),
     ) -> Result<UrError, UrError> {
         if at.started != sent.token {
             return self.withdraw((motion, work), sent, why.into()).await;
@@ -563,7 +566,7 @@ impl Session {
         (motion, work): (&Motion, &Work),
         slider: Option<f64>,
         force: &str,
-    ) -> Result<State, UrError> {
+    ) -> Result<UrState, UrError> {
         let braked = self.brake((motion, work), slider).await;
         work.note(force).await;
         braked.map_err(|why| UrError::Contact {
@@ -594,7 +597,7 @@ impl Session {
         &mut self,
         (motion, work): (&Motion, &Work),
         slider: Option<f64>,
-    ) -> Result<State, UrError> {
+    ) -> Result<UrState, UrError> {
         let _program = match motion.send(motion.stop_program()).await {
             Ok(program) => program,
             Err(why) => return Err(unknown(work, why, StopProgram::NotSent).await),
@@ -613,7 +616,7 @@ impl Session {
     ///
     /// # Errors
     /// The robot may move: the outcome is unknown.
-    async fn stand(&mut self, work: &Work) -> Result<State, UrError> {
+    async fn stand(&mut self, work: &Work) -> Result<UrState, UrError> {
         let asked = Instant::now();
         loop {
             // The connection is not used after a dropped future.

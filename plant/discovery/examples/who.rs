@@ -6,21 +6,22 @@ use std::process::ExitCode;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use discovery::{
-    AnnounceSettings, Announced, Found, Interface, Server, WatchSettings, announce, be_there, watch,
+    AnnounceSettings, MdnsInterface, ServerAnnouncement, ServerChange, ServerDescription,
+    WatchSettings, announce, be_there, watch,
 };
 use serde_json::{Value, json};
-use service::{Failure, FailureKind, LogFormat, Service, run_service};
+use service::{Failure, FailureKind, LogFormat, ServiceProgram, run_service};
 use tokio::net::TcpListener;
 
 /// Tells of a server that is not one, or watches who is there.
 #[derive(Debug, clap::Parser)]
-struct Who {
+struct WhoArguments {
     #[command(subcommand)]
-    what: What,
+    what: WhoVerb,
 }
 
 #[derive(Debug, clap::Subcommand)]
-enum What {
+enum WhoVerb {
     /// Be there: listen, announce by mDNS, register
     Announce(Presence),
     /// Print who comes and goes
@@ -80,11 +81,11 @@ impl Presence {
     }
 
     /// Starts to listen and to announce. Returns the announcement and the port.
-    async fn begin(self) -> Result<(Announced, u16), Failure> {
+    async fn begin(self) -> Result<(ServerAnnouncement, u16), Failure> {
         let address = SocketAddr::from((self.address, self.port));
         let listener = TcpListener::bind(address).await.map_err(unavailable)?;
         let at = listener.local_addr().map_err(unavailable)?;
-        let server = Server {
+        let server = ServerDescription {
             application_uri: self.uri.unwrap_or_else(|| format!("urn:who:{}", self.name)),
             product_uri: String::new(),
             name: self.name,
@@ -95,7 +96,7 @@ impl Presence {
         let settings = AnnounceSettings {
             register_every: Duration::from_secs(self.register_period),
             pki: self.pki,
-            mdns: (!self.no_mdns).then(|| Interface::parse(&self.address.to_string())),
+            mdns: (!self.no_mdns).then(|| MdnsInterface::parse(&self.address.to_string())),
             ..AnnounceSettings::registering(self.lds.as_deref())
         };
         let told = announce(server.clone(), settings).map_err(unavailable)?;
@@ -105,17 +106,17 @@ impl Presence {
 }
 
 fn main() -> ExitCode {
-    run_service::<Who>(std::env::args_os())
+    run_service::<WhoArguments>(std::env::args_os())
 }
 
-impl Service for Who {
+impl ServiceProgram for WhoArguments {
     fn log(&self) -> LogFormat {
         LogFormat::Text
     }
 
     async fn serve(self, stop: impl Future<Output = ()> + Send + 'static) -> Result<(), Failure> {
         match self.what {
-            What::Announce(presence) => {
+            WhoVerb::Announce(presence) => {
                 let mut told = Vec::new();
                 let mut port = 0;
                 for presence in presence.all() {
@@ -130,9 +131,9 @@ impl Service for Who {
                 }
                 Ok(())
             }
-            What::Watch { interface } => {
+            WhoVerb::Watch { interface } => {
                 let settings = WatchSettings {
-                    mdns: Some(Interface::parse(&interface)),
+                    mdns: Some(MdnsInterface::parse(&interface)),
                     ..WatchSettings::default()
                 };
                 let mut watcher = watch(settings).map_err(unavailable)?;
@@ -153,11 +154,11 @@ fn unavailable(error: impl std::fmt::Display) -> Failure {
     Failure::new(FailureKind::Unavailable, error.to_string())
 }
 
-fn line(found: &Found) -> Value {
+fn line(found: &ServerChange) -> Value {
     let (what, loss) = match found {
-        Found::Seen(_) => ("seen", None),
-        Found::Restarted(_) => ("restarted", None),
-        Found::Gone { loss, .. } => ("gone", Some(loss.label())),
+        ServerChange::Seen(_) => ("seen", None),
+        ServerChange::Restarted(_) => ("restarted", None),
+        ServerChange::Gone { loss, .. } => ("gone", Some(loss.label())),
     };
     let known = found.known();
     json!({

@@ -6,8 +6,8 @@ use std::time::Duration;
 use tokio::net::{TcpStream, UdpSocket, lookup_host};
 use tokio::time::timeout;
 
-use crate::announce::Server;
-use mdns::Interface;
+use crate::announce::ServerDescription;
+use mdns::MdnsInterface;
 use mdns::Url;
 use mdns::is_own;
 
@@ -15,7 +15,11 @@ use mdns::is_own;
 /// addresses has the name of its host, which few networks resolve. Such a server registers with the
 /// address of the interface towards the discovery server. A URL with an address or another name is
 /// not changed.
-pub(crate) async fn reachable(server: Server, lds: &str, interface: Option<&Interface>) -> Server {
+pub(crate) async fn reachable(
+    server: ServerDescription,
+    lds: &str,
+    interface: Option<&MdnsInterface>,
+) -> ServerDescription {
     let Some(place) = Url::parse(&server.url) else {
         return server;
     };
@@ -30,13 +34,13 @@ pub(crate) async fn reachable(server: Server, lds: &str, interface: Option<&Inte
         return server;
     };
     let url = Url::of(address, place.port, &place.path).to_string();
-    Server { url, ..server }
+    ServerDescription { url, ..server }
 }
 
-async fn address(place: &Url, lds: &str, interface: Option<&Interface>) -> Option<IpAddr> {
+async fn address(place: &Url, lds: &str, interface: Option<&MdnsInterface>) -> Option<IpAddr> {
     let towards = towards(lds).await?;
     let address = if towards.is_loopback() {
-        let addresses = interface.map(Interface::addresses).unwrap_or_default();
+        let addresses = interface.map(MdnsInterface::addresses).unwrap_or_default();
         let mut others = addresses.into_iter().filter(|one| !one.is_loopback());
         match others.next() {
             Some(address) => IpAddr::V4(address),
@@ -85,7 +89,7 @@ mod tests {
     async fn a_server_on_all_addresses_is_registered_with_the_one_towards_the_discovery_server() {
         let listener = TcpListener::bind("0.0.0.0:0").await.unwrap();
         let port = listener.local_addr().unwrap().port();
-        let server = |host: &str| Server {
+        let server = |host: &str| ServerDescription {
             application_uri: "urn:here".to_owned(),
             product_uri: String::new(),
             name: "here".to_owned(),

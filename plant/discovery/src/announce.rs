@@ -7,8 +7,8 @@ use std::time::{Duration, SystemTime};
 
 use plant_opcua::enrolment::Applicant;
 use plant_opcua::supervision::{Registrar, Supervision};
-use registry::hierarchy::Choice;
-use registry::{Announcement, instance_name};
+use registry::hierarchy::ServerChoice;
+use registry::{AnnouncedServer, instance_name};
 use tokio::sync::{mpsc, watch};
 use tokio::task::JoinHandle;
 use tokio::time::{Instant, sleep_until, timeout};
@@ -16,17 +16,17 @@ use tracing::{debug, info, warn};
 
 use crate::address::reachable;
 use crate::chosen::find_lds;
-use crate::client::{self, AskFault};
+use crate::client::{self, DiscoveryQueryFault};
 use crate::clock;
 use crate::embedded::{Embedded, Embedding, lost};
-use mdns::Interface;
+use mdns::MdnsInterface;
 use mdns::Url;
 use mdns::host_name;
-use mdns::{Aside, Heard, Mdns, MdnsFault, Ours, same_place};
+use mdns::{Aside, Mdns, MdnsEvent, MdnsFault, OwnAnnouncement, same_place};
 
 /// The description of a server for announcement and registration.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Server {
+pub struct ServerDescription {
     /// The ApplicationUri.
     pub application_uri: String,
     /// The ProductUri; may be empty.
@@ -42,7 +42,7 @@ pub struct Server {
     pub number: Option<NonZeroU16>,
 }
 
-impl Server {
+impl ServerDescription {
     /// Returns the applicant for a Global Discovery Server, with these DiscoveryUrls in addition to
     /// the URL of the server.
     #[must_use]
@@ -67,14 +67,15 @@ impl Server {
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct AnnounceSettings {
     /// The Local Discovery Server to register with; `None` for no registration. Either its URL, or
-    /// a [`Choice`] among the discovery servers on mDNS: `any`, `uri=urn:cell:*`, `name=cell-lds`.
+    /// a [`ServerChoice`] among the discovery servers on mDNS: `any`, `uri=urn:cell:*`,
+    /// `name=cell-lds`.
     pub lds: Option<String>,
     /// Whether the program embeds the discovery server while no other program provides it. Only
     /// valid with a URL of this host.
     pub embed: bool,
     /// The interface for mDNS; `None` for no mDNS announcement by the program. The Local Discovery
     /// Server is then asked to announce the server.
-    pub mdns: Option<Interface>,
+    pub mdns: Option<MdnsInterface>,
     /// The interval of registrations; at most ten seconds without mDNS.
     pub register_every: Duration,
     /// The certificate store of the server, which contains its certificate and key. The server
@@ -91,7 +92,7 @@ impl Default for AnnounceSettings {
         Self {
             lds: Some(crate::DEFAULT_LDS.to_owned()),
             embed: false,
-            mdns: Some(Interface::LOOPBACK),
+            mdns: Some(MdnsInterface::LOOPBACK),
             register_every: Duration::from_secs(60),
             pki: None,
             supervision: Supervision::default(),
@@ -133,17 +134,17 @@ pub struct AnnounceState {
 
 /// Announces a server until this value is dropped.
 #[derive(Debug)]
-pub struct Announced {
-    server: watch::Sender<Server>,
+pub struct ServerAnnouncement {
+    server: watch::Sender<ServerDescription>,
     state: watch::Receiver<AnnounceState>,
     /// Dropping the sender stops the announcement.
     stop: mpsc::Sender<()>,
     task: JoinHandle<()>,
 }
 
-impl Announced {
+impl ServerAnnouncement {
     /// Replaces the description of the server, and publishes changes.
-    pub fn update(&self, server: Server) {
+    pub fn update(&self, server: ServerDescription) {
         self.server.send_if_modified(|known| {
             let changed = *known != server;
             *known = server;
@@ -172,7 +173,10 @@ impl Announced {
 ///
 /// # Errors
 /// Returns an error if the mDNS daemon cannot be started.
-pub fn announce(server: Server, settings: AnnounceSettings) -> Result<Announced, MdnsFault> {
+pub fn announce(
+    server: ServerDescription,
+    settings: AnnounceSettings,
+) -> Result<ServerAnnouncement, MdnsFault> {
     let mdns = settings.mdns.as_ref().map(Mdns::open).transpose()?;
     let register_every = match mdns {
         Some(_) => settings.register_every,
@@ -204,7 +208,7 @@ pub fn announce(server: Server, settings: AnnounceSettings) -> Result<Announced,
         look_wait: FIRST_WAIT,
     };
     let task = tokio::spawn(telling.run(stopped));
-    Ok(Announced {
+    Ok(ServerAnnouncement {
         server: sender,
         state,
         stop,
@@ -212,14 +216,14 @@ pub fn announce(server: Server, settings: AnnounceSettings) -> Result<Announced,
     })
 }
 
-/// The discovery server found by mDNS, if it is selected by a [`Choice`].
+/// The discovery server found by mDNS, if it is selected by a [`ServerChoice`].
 type Looked = Option<watch::Receiver<Option<String>>>;
 
 /// Starts to look for the discovery server if it is not given by a URL.
 fn found(settings: AnnounceSettings) -> Result<(AnnounceSettings, Looked), MdnsFault> {
-    let choice = settings.lds.as_deref().map(str::parse::<Choice>);
+    let choice = settings.lds.as_deref().map(str::parse::<ServerChoice>);
     match (choice, &settings.mdns) {
-        (Some(Ok(choice)), Some(interface)) if !matches!(choice, Choice::At(_)) => {
+        (Some(Ok(choice)), Some(interface)) if !matches!(choice, ServerChoice::At(_)) => {
             let found = find_lds(choice, interface, None)?;
             let settings = AnnounceSettings {
                 lds: None,
@@ -237,7 +241,7 @@ struct Telling {
     mdns: Option<Mdns>,
     /// The discovery server found by mDNS, if it is selected by a choice.
     found: Looked,
-    server: watch::Receiver<Server>,
+    server: watch::Receiver<ServerDescription>,
     state: watch::Sender<AnnounceState>,
     start_time: i64,
     /// The mDNS instance name.
@@ -258,7 +262,7 @@ struct Telling {
     look_wait: Duration,
 }
 
-type Registering = Pin<Box<dyn Future<Output = Result<Done, AskFault>> + Send>>;
+type Registering = Pin<Box<dyn Future<Output = Result<Done, DiscoveryQueryFault>> + Send>>;
 
 /// The outcome of a registration.
 enum Done {
@@ -354,8 +358,8 @@ impl Telling {
         if let Some(before) = self.instance.take_if(|before| *before != instance) {
             drop(mdns.take_back(&before));
         }
-        mdns.put(Ours {
-            announcement: Announcement {
+        mdns.put(OwnAnnouncement {
+            announcement: AnnouncedServer {
                 instance: instance.clone(),
                 url: server.url,
                 capabilities: server.capabilities,
@@ -372,14 +376,14 @@ impl Telling {
         self.instance = Some(instance);
     }
 
-    fn hear(&mut self, heard: Heard) {
+    fn hear(&mut self, heard: MdnsEvent) {
         match heard {
-            Heard::Renamed { to, .. } => {
+            MdnsEvent::Renamed { to, .. } => {
                 self.state
                     .send_modify(|state| state.mdns_name = Some(to.clone()));
                 self.instance = Some(to);
             }
-            Heard::Announced {
+            MdnsEvent::Announced {
                 announcement,
                 aside: Aside { start_time, .. },
             } => {
@@ -393,7 +397,7 @@ impl Telling {
                     }
                 }
             }
-            Heard::Withdrawn { .. } => {}
+            MdnsEvent::Withdrawn { .. } => {}
         }
     }
 
@@ -459,13 +463,13 @@ impl Telling {
             if embed && same_port(&lds, &server.url) {
                 let message =
                     format!("the server itself listens at {lds}; give it another endpoint");
-                return Err(AskFault::Embed(message));
+                return Err(DiscoveryQueryFault::Embed(message));
             }
             let server = reachable(server, &lds, interface.as_ref()).await;
             let how = (mdns_name.as_deref(), pki.as_deref());
             match client::register(&lds, &server, how, is_online).await {
                 Ok(registrar) => Ok(Done::Registered(registrar)),
-                Err(AskFault::Connect(absent)) if embed && is_online => {
+                Err(DiscoveryQueryFault::Connect(absent)) if embed && is_online => {
                     embedding.start(absent).await.map(Done::Embedded)
                 }
                 Err(fault) => Err(fault),
@@ -477,13 +481,13 @@ impl Telling {
         let interface = self.settings.mdns.clone();
         Embedding {
             lds,
-            interface: interface.unwrap_or(Interface::LOOPBACK),
+            interface: interface.unwrap_or(MdnsInterface::LOOPBACK),
             pki: self.settings.pki.clone(),
             name: self.server.borrow().name.clone(),
         }
     }
 
-    fn registered(&mut self, result: Result<Done, AskFault>) {
+    fn registered(&mut self, result: Result<Done, DiscoveryQueryFault>) {
         let lds = self.settings.lds.as_deref().unwrap_or_default();
         match result {
             Ok(Done::Embedded(here)) => {
@@ -526,7 +530,9 @@ impl Telling {
                     if state.fault.as_ref() != Some(&fault) {
                         if matches!(
                             error,
-                            AskFault::Refused(_) | AskFault::Certificate(_) | AskFault::Embed(_)
+                            DiscoveryQueryFault::Refused(_)
+                                | DiscoveryQueryFault::Certificate(_)
+                                | DiscoveryQueryFault::Embed(_)
                         ) {
                             warn!(lds, "cannot register at the discovery server: {fault}");
                         } else {
@@ -565,7 +571,7 @@ fn spread(wait: Duration, url: &str) -> Duration {
 }
 
 /// Returns the mDNS instance name of a server.
-fn name(server: &Server) -> String {
+fn name(server: &ServerDescription) -> String {
     let place = Url::parse(&server.url);
     instance_name(
         &server.name,

@@ -5,14 +5,14 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use async_trait::async_trait;
-use registry::hierarchy::{Candidate, Choice, Chosen};
+use registry::hierarchy::{ChosenServer, ServerCandidate, ServerChoice};
 use tokio::sync::watch;
 use tokio::time::{MissedTickBehavior, interval};
 use tracing::{info, warn};
 
-use crate::watch::{Found, Known, WatchSettings, Watcher};
-use mdns::Interface;
+use crate::watch::{PresentServer, ServerChange, ServerWatcher, WatchSettings};
 use mdns::MdnsFault;
+use mdns::MdnsInterface;
 
 /// Looks for marker nodes in the address space of a discovery server, which requires a session.
 #[async_trait]
@@ -28,11 +28,11 @@ pub trait Marks: Send + Sync + 'static {
 /// # Errors
 /// Returns an error if the mDNS daemon cannot be started.
 pub fn find_lds(
-    choice: Choice,
-    interface: &Interface,
+    choice: ServerChoice,
+    interface: &MdnsInterface,
     marks: Option<Arc<dyn Marks>>,
 ) -> Result<watch::Receiver<Option<String>>, MdnsFault> {
-    if let Choice::At(url) = choice {
+    if let ServerChoice::At(url) = choice {
         // The URL is fixed; without a sender the value does not change.
         return Ok(watch::channel(Some(url)).1);
     }
@@ -45,21 +45,21 @@ pub fn find_lds(
         choice,
         marks,
         there: BTreeMap::new(),
-        told: Chosen::Nobody,
+        told: ChosenServer::Nobody,
     };
     tokio::spawn(finding.run(watcher, tell));
     Ok(chosen)
 }
 
 struct Finding {
-    choice: Choice,
+    choice: ServerChoice,
     marks: Option<Arc<dyn Marks>>,
-    there: BTreeMap<String, Candidate>,
-    told: Chosen,
+    there: BTreeMap<String, ServerCandidate>,
+    told: ChosenServer,
 }
 
 impl Finding {
-    async fn run(mut self, mut watcher: Watcher, tell: watch::Sender<Option<String>>) {
+    async fn run(mut self, mut watcher: ServerWatcher, tell: watch::Sender<Option<String>>) {
         let mut again = interval(LOOK_AGAIN);
         again.set_missed_tick_behavior(MissedTickBehavior::Delay);
         loop {
@@ -81,20 +81,22 @@ impl Finding {
         }
     }
 
-    async fn take(&mut self, found: &Found) {
+    async fn take(&mut self, found: &ServerChange) {
         match found {
-            Found::Seen(known) | Found::Restarted(known) if known.is_lds() => {
+            ServerChange::Seen(known) | ServerChange::Restarted(known) if known.is_lds() => {
                 let candidate = self.candidate(known).await;
                 self.there.insert(known.name.clone(), candidate);
             }
-            Found::Seen(known) | Found::Restarted(known) | Found::Gone { known, .. } => {
+            ServerChange::Seen(known)
+            | ServerChange::Restarted(known)
+            | ServerChange::Gone { known, .. } => {
                 self.there.remove(&known.name);
             }
         }
     }
 
-    async fn candidate(&self, known: &Known) -> Candidate {
-        Candidate {
+    async fn candidate(&self, known: &PresentServer) -> ServerCandidate {
+        ServerCandidate {
             name: known.name.clone(),
             url: known.url.clone(),
             application_uri: known.application_uri.clone(),
@@ -120,20 +122,24 @@ impl Finding {
 
     async fn is_marked(&self, url: &str) -> bool {
         match (&self.choice, &self.marks) {
-            (Choice::Marker(node), Some(marks)) => marks.has(url, node).await,
+            (ServerChoice::Marker(node), Some(marks)) => marks.has(url, node).await,
             (
-                Choice::Marker(_) | Choice::Any | Choice::At(_) | Choice::Uri(_) | Choice::Name(_),
+                ServerChoice::Marker(_)
+                | ServerChoice::Any
+                | ServerChoice::At(_)
+                | ServerChoice::Uri(_)
+                | ServerChoice::Name(_),
                 _,
             ) => false,
         }
     }
 
-    fn tell(&self, chosen: &Chosen) {
+    fn tell(&self, chosen: &ChosenServer) {
         let choice = &self.choice;
         let message = match chosen {
-            Chosen::Nobody => "no discovery server found".to_owned(),
-            Chosen::At(url) => format!("found the discovery server at {url}"),
-            Chosen::Several(names) => {
+            ChosenServer::Nobody => "no discovery server found".to_owned(),
+            ChosenServer::At(url) => format!("found the discovery server at {url}"),
+            ChosenServer::Several(names) => {
                 let names = names.join(", ");
                 warn!(
                     %choice,
@@ -146,15 +152,15 @@ impl Finding {
     }
 
     fn choose(&mut self) -> Option<String> {
-        let candidates: Vec<Candidate> = self.there.values().cloned().collect();
+        let candidates: Vec<ServerCandidate> = self.there.values().cloned().collect();
         let chosen = self.choice.among(&candidates);
         if chosen != self.told {
             self.tell(&chosen);
             self.told = chosen.clone();
         }
         match chosen {
-            Chosen::At(url) => Some(url),
-            Chosen::Nobody | Chosen::Several(_) => None,
+            ChosenServer::At(url) => Some(url),
+            ChosenServer::Nobody | ChosenServer::Several(_) => None,
         }
     }
 }

@@ -27,7 +27,7 @@ use tokio::time::timeout;
 
 use plant_opcua::supervision::Registrar;
 
-use crate::announce::Server;
+use crate::announce::ServerDescription;
 use crate::security::ChannelSecurity;
 use crate::wire::{Conversation, FrameKind, MOST_CHUNK, MOST_CHUNKS, MOST_HEARD, WireFault};
 use mdns::Url;
@@ -35,7 +35,7 @@ use mdns::Url;
 /// An error of a query.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
-pub enum AskFault {
+pub enum DiscoveryQueryFault {
     /// The URL is not an OPC UA URL over TCP.
     #[error("{0} is not a URL such as opc.tcp://host:port")]
     Url(String),
@@ -59,7 +59,7 @@ pub enum AskFault {
     Embed(String),
 }
 
-impl From<WireFault> for AskFault {
+impl From<WireFault> for DiscoveryQueryFault {
     fn from(fault: WireFault) -> Self {
         match fault {
             WireFault::Io(error) => Self::Connect(error),
@@ -71,7 +71,7 @@ impl From<WireFault> for AskFault {
 
 /// A server in the result of FindServers.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Application {
+pub struct FoundServer {
     /// The ApplicationUri.
     pub application_uri: String,
     /// The application name.
@@ -84,9 +84,9 @@ pub struct Application {
 
 /// The self-description of a server.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Described {
+pub struct SelfDescription {
     /// The application.
-    pub application: Application,
+    pub application: FoundServer,
     /// The ProductUri, which identifies the product.
     pub product_uri: String,
     /// The security of its endpoints without duplicates: `None`, or policy and mode, for example
@@ -110,8 +110,11 @@ pub struct OnNetwork {
 /// Returns the servers registered at a server, including the server itself: FindServers.
 ///
 /// # Errors
-/// Returns [`AskFault`], after `limit` at the latest.
-pub async fn find_servers(url: &str, limit: Duration) -> Result<Vec<Application>, AskFault> {
+/// Returns [`DiscoveryQueryFault`], after `limit` at the latest.
+pub async fn find_servers(
+    url: &str,
+    limit: Duration,
+) -> Result<Vec<FoundServer>, DiscoveryQueryFault> {
     let request = FindServersRequest {
         request_header: header(),
         endpoint_url: url.into(),
@@ -131,8 +134,8 @@ pub async fn find_servers(url: &str, limit: Duration) -> Result<Vec<Application>
 /// Returns the self-description of the server at `url`: GetEndpoints (OPC 10000-4, 5.5.4).
 ///
 /// # Errors
-/// Returns [`AskFault`], after `limit` at the latest.
-pub async fn describe(url: &str, limit: Duration) -> Result<Described, AskFault> {
+/// Returns [`DiscoveryQueryFault`], after `limit` at the latest.
+pub async fn describe(url: &str, limit: Duration) -> Result<SelfDescription, DiscoveryQueryFault> {
     let request = GetEndpointsRequest {
         request_header: header(),
         endpoint_url: url.into(),
@@ -143,7 +146,9 @@ pub async fn describe(url: &str, limit: Duration) -> Result<Described, AskFault>
         other => return Err(unexpected(&other)),
     };
     let Some(server) = endpoints.first().map(|endpoint| &endpoint.server) else {
-        return Err(AskFault::Protocol("it has no endpoints".to_owned()));
+        return Err(DiscoveryQueryFault::Protocol(
+            "it has no endpoints".to_owned(),
+        ));
     };
     let mut security = Vec::new();
     for endpoint in endpoints.iter().take(MOST_ENDPOINTS) {
@@ -159,7 +164,7 @@ pub async fn describe(url: &str, limit: Duration) -> Result<Described, AskFault>
             security.push(way);
         }
     }
-    Ok(Described {
+    Ok(SelfDescription {
         product_uri: text(&server.product_uri),
         application: application(server),
         security,
@@ -169,11 +174,11 @@ pub async fn describe(url: &str, limit: Duration) -> Result<Described, AskFault>
 /// Returns the servers that are announced on the network: FindServersOnNetwork.
 ///
 /// # Errors
-/// Returns [`AskFault`], after `limit` at the latest.
+/// Returns [`DiscoveryQueryFault`], after `limit` at the latest.
 pub async fn find_servers_on_network(
     url: &str,
     limit: Duration,
-) -> Result<Vec<OnNetwork>, AskFault> {
+) -> Result<Vec<OnNetwork>, DiscoveryQueryFault> {
     let request = FindServersOnNetworkRequest {
         request_header: header(),
         ..FindServersOnNetworkRequest::default()
@@ -198,15 +203,16 @@ pub async fn find_servers_on_network(
 /// its ServerStatus (OPC 10000-5, 12.10). Reads it in a temporary anonymous session.
 ///
 /// # Errors
-/// Returns [`AskFault`], after `limit` at the latest; a server without anonymous sessions refuses.
-pub(crate) async fn start_time(url: &str, limit: Duration) -> Result<i64, AskFault> {
+/// Returns [`DiscoveryQueryFault`], after `limit` at the latest; a server without anonymous
+/// sessions refuses.
+pub(crate) async fn start_time(url: &str, limit: Duration) -> Result<i64, DiscoveryQueryFault> {
     match timeout(limit, Box::pin(read_start_time(url))).await {
         Ok(read) => read,
-        Err(_) => Err(AskFault::Late(limit)),
+        Err(_) => Err(DiscoveryQueryFault::Late(limit)),
     }
 }
 
-async fn read_start_time(url: &str) -> Result<i64, AskFault> {
+async fn read_start_time(url: &str) -> Result<i64, DiscoveryQueryFault> {
     let mut conversation = opened(url, None).await?;
     let request = CreateSessionRequest {
         request_header: header(),
@@ -240,7 +246,9 @@ async fn read_start_time(url: &str) -> Result<i64, AskFault> {
         .map(|token| token.policy_id.clone());
     let read = match anonymous {
         Some(policy) => read_in_session(&mut conversation, &request_header, policy).await,
-        None => Err(AskFault::Refused(StatusCode::BadIdentityTokenRejected)),
+        None => Err(DiscoveryQueryFault::Refused(
+            StatusCode::BadIdentityTokenRejected,
+        )),
     };
     let close = CloseSessionRequest {
         request_header,
@@ -255,7 +263,7 @@ async fn read_in_session(
     conversation: &mut Conversation<TcpStream>,
     request_header: &RequestHeader,
     policy_id: UAString,
-) -> Result<i64, AskFault> {
+) -> Result<i64, DiscoveryQueryFault> {
     let request = ActivateSessionRequest {
         request_header: request_header.clone(),
         user_identity_token: ExtensionObject::from_message(AnonymousIdentityToken { policy_id }),
@@ -278,7 +286,7 @@ async fn read_in_session(
     };
     match results.first().and_then(|result| result.value.as_ref()) {
         Some(Variant::DateTime(at)) => Ok(at.ticks()),
-        _ => Err(AskFault::Protocol(
+        _ => Err(DiscoveryQueryFault::Protocol(
             "it does not say when it started".to_owned(),
         )),
     }
@@ -297,8 +305,8 @@ struct Way {
 /// Selects the best secured channel between a server and the application of a certificate store.
 /// Returns `None` if the server offers no secured channel. Also returns `None` for an untrusted
 /// server on this host: an attacker on this host has the same power without a forged server.
-async fn way(url: &str, pki: &Path) -> Result<Option<Way>, AskFault> {
-    let security = ChannelSecurity::existing(pki).map_err(AskFault::Certificate)?;
+async fn way(url: &str, pki: &Path) -> Result<Option<Way>, DiscoveryQueryFault> {
+    let security = ChannelSecurity::existing(pki).map_err(DiscoveryQueryFault::Certificate)?;
     let request = GetEndpointsRequest {
         request_header: header(),
         endpoint_url: url.into(),
@@ -341,7 +349,7 @@ async fn way(url: &str, pki: &Path) -> Result<Option<Way>, AskFault> {
     if is_here && !refused.may_be_told {
         Ok(None)
     } else {
-        Err(AskFault::Certificate(refused.to_string()))
+        Err(DiscoveryQueryFault::Certificate(refused.to_string()))
     }
 }
 
@@ -351,10 +359,10 @@ async fn way(url: &str, pki: &Path) -> Result<Option<Way>, AskFault> {
 /// identity is known.
 pub(crate) async fn register(
     lds: &str,
-    server: &Server,
+    server: &ServerDescription,
     (mdns_name, pki): (Option<&str>, Option<&Path>),
     is_online: bool,
-) -> Result<Option<Registrar>, AskFault> {
+) -> Result<Option<Registrar>, DiscoveryQueryFault> {
     let way = match pki {
         Some(pki) => way(lds, pki).await?,
         None => None,
@@ -397,7 +405,7 @@ pub(crate) async fn register(
     };
     let registering = async {
         match ask(lds, way, request.into(), REGISTER_LIMIT).await {
-            Err(AskFault::Refused(status)) if unknown.contains(&status) => {
+            Err(DiscoveryQueryFault::Refused(status)) if unknown.contains(&status) => {
                 let request = RegisterServerRequest {
                     request_header: header(),
                     server: registered,
@@ -429,10 +437,10 @@ async fn ask(
     way: Option<&Way>,
     request: RequestMessage,
     limit: Duration,
-) -> Result<ResponseMessage, AskFault> {
+) -> Result<ResponseMessage, DiscoveryQueryFault> {
     match timeout(limit, Box::pin(converse(url, way, request))).await {
         Ok(answer) => answer,
-        Err(_) => Err(AskFault::Late(limit)),
+        Err(_) => Err(DiscoveryQueryFault::Late(limit)),
     }
 }
 
@@ -440,7 +448,7 @@ async fn converse(
     url: &str,
     way: Option<&Way>,
     request: RequestMessage,
-) -> Result<ResponseMessage, AskFault> {
+) -> Result<ResponseMessage, DiscoveryQueryFault> {
     let mut conversation = opened(url, way).await?;
     let answered = answer(&mut conversation, 2, &request).await?;
     // A failure to close the channel does not affect the result.
@@ -452,8 +460,11 @@ async fn converse(
 }
 
 /// Connects and opens a new channel.
-async fn opened(url: &str, way: Option<&Way>) -> Result<Conversation<TcpStream>, AskFault> {
-    let place = Url::parse(url).ok_or_else(|| AskFault::Url(url.to_owned()))?;
+async fn opened(
+    url: &str,
+    way: Option<&Way>,
+) -> Result<Conversation<TcpStream>, DiscoveryQueryFault> {
+    let place = Url::parse(url).ok_or_else(|| DiscoveryQueryFault::Url(url.to_owned()))?;
     let stream = TcpStream::connect((place.host.as_str(), place.port)).await?;
     stream.set_nodelay(true)?;
     let mut conversation = Conversation::new(stream, Role::Client);
@@ -474,8 +485,8 @@ async fn opened(url: &str, way: Option<&Way>) -> Result<Conversation<TcpStream>,
 async fn open(
     conversation: &mut Conversation<TcpStream>,
     way: Option<&Way>,
-) -> Result<(), AskFault> {
-    let bad = |error: opcua::types::Error| AskFault::Protocol(error.to_string());
+) -> Result<(), DiscoveryQueryFault> {
+    let bad = |error: opcua::types::Error| DiscoveryQueryFault::Protocol(error.to_string());
     let channel = &mut conversation.channel;
     if let Some(way) = way {
         channel.set_security_policy(SecurityPolicy::Basic256Sha256);
@@ -513,7 +524,7 @@ async fn answer(
     conversation: &mut Conversation<TcpStream>,
     request_id: u32,
     request: &RequestMessage,
-) -> Result<ResponseMessage, AskFault> {
+) -> Result<ResponseMessage, DiscoveryQueryFault> {
     answer_from(conversation, None, request_id, request).await
 }
 
@@ -524,7 +535,7 @@ async fn answer_from(
     way: Option<&Way>,
     request_id: u32,
     request: &RequestMessage,
-) -> Result<ResponseMessage, AskFault> {
+) -> Result<ResponseMessage, DiscoveryQueryFault> {
     conversation.send(request_id, request).await?;
     let whose = |header: &AsymmetricSecurityHeader| match way {
         Some(way) if header.sender_certificate != way.server => {
@@ -535,14 +546,14 @@ async fn answer_from(
     let received = conversation.receive::<ResponseMessage>(whose).await?;
     let status = received.message.response_header().service_result;
     match received.message {
-        ResponseMessage::ServiceFault(_) => Err(AskFault::Refused(status)),
-        _ if status.is_bad() => Err(AskFault::Refused(status)),
+        ResponseMessage::ServiceFault(_) => Err(DiscoveryQueryFault::Refused(status)),
+        _ if status.is_bad() => Err(DiscoveryQueryFault::Refused(status)),
         message => Ok(message),
     }
 }
 
-fn application(told: &ApplicationDescription) -> Application {
-    Application {
+fn application(told: &ApplicationDescription) -> FoundServer {
+    FoundServer {
         application_uri: text(&told.application_uri),
         name: text(&told.application_name.text),
         is_discovery_server: told.application_type == ApplicationType::DiscoveryServer,
@@ -557,8 +568,8 @@ fn header() -> RequestHeader {
     }
 }
 
-fn unexpected(answer: &ResponseMessage) -> AskFault {
-    AskFault::Protocol(format!(
+fn unexpected(answer: &ResponseMessage) -> DiscoveryQueryFault {
+    DiscoveryQueryFault::Protocol(format!(
         "{} is not a response to this request",
         answer.type_name()
     ))

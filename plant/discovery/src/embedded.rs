@@ -8,20 +8,20 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use opcua::types::StatusCode;
-use registry::{ApplicationType, Asked, Channel, MdnsConfiguration};
+use registry::{ApplicationType, Channel, MdnsConfiguration, RegistrationRequest};
 use tokio::sync::{mpsc, oneshot};
 use tokio::task::JoinHandle;
 use tokio::time::{Instant, sleep, sleep_until, timeout};
 use tracing::{debug, info};
 
-use crate::announce::Server;
-use crate::client::AskFault;
+use crate::announce::ServerDescription;
+use crate::client::DiscoveryQueryFault;
 use crate::connection::RegistryRequest;
-use crate::lds::{EmbeddedIn, Lds, LdsSettings};
+use crate::lds::{DiscoveryServer, EmbeddedIn, LdsSettings};
 use crate::line::{OpenChannel, Reached};
 use crate::listen::listen;
 use crate::services::{RegistryAnswer, RegistryQuery};
-use mdns::Interface;
+use mdns::MdnsInterface;
 use mdns::Url;
 
 /// The settings of an embedded discovery server.
@@ -30,7 +30,7 @@ pub(crate) struct Embedding {
     /// The URL of the discovery server.
     pub(crate) lds: String,
     /// The interface for mDNS.
-    pub(crate) interface: Interface,
+    pub(crate) interface: MdnsInterface,
     /// The certificate store of the program. The discovery server has a separate store below it.
     pub(crate) pki: Option<PathBuf>,
     /// The name of the program.
@@ -59,24 +59,32 @@ impl Embedding {
 
     /// Starts the discovery server. `absent` is the error of the connection attempt to another
     /// discovery server.
-    pub(crate) async fn start(self, absent: std::io::Error) -> Result<Embedded, AskFault> {
+    pub(crate) async fn start(
+        self,
+        absent: std::io::Error,
+    ) -> Result<Embedded, DiscoveryQueryFault> {
         let at = self.lds.clone();
         let settings = self.settings();
         // The certificate is created before clients can connect.
         let prepared = settings.prepare().await;
-        prepared.map_err(|fault| AskFault::Embed(fault.to_string()))?;
+        prepared.map_err(|fault| DiscoveryQueryFault::Embed(fault.to_string()))?;
         let listening = match listen(&at).await {
             Ok(listening) => listening,
             // Another program was faster; the next registration goes to its discovery server.
-            Err(fault) if fault.is_taken() => return Err(AskFault::Connect(absent)),
-            Err(fault) => return Err(AskFault::Embed(format!("cannot listen at {at}: {fault}"))),
+            Err(fault) if fault.is_taken() => return Err(DiscoveryQueryFault::Connect(absent)),
+            Err(fault) => {
+                return Err(DiscoveryQueryFault::Embed(format!(
+                    "cannot listen at {at}: {fault}"
+                )));
+            }
         };
         info!(
             lds = at,
             "no discovery server runs: this program is the discovery server now"
         );
-        let started = Lds::start(&settings, listening).await;
-        let (mut lds, questions) = started.map_err(|fault| AskFault::Embed(fault.to_string()))?;
+        let started = DiscoveryServer::start(&settings, listening).await;
+        let (mut lds, questions) =
+            started.map_err(|fault| DiscoveryQueryFault::Embed(fault.to_string()))?;
         let ask = lds.asking();
         let (stop, stopped) = oneshot::channel::<()>();
         let task = tokio::spawn(async move {
@@ -131,11 +139,11 @@ impl EmbeddedAsking {
     /// announces the server.
     pub(crate) fn register(
         &self,
-        server: &Server,
+        server: &ServerDescription,
         mdns_name: Option<String>,
         is_online: bool,
-    ) -> impl Future<Output = Result<(), AskFault>> + Send + use<> {
-        let asked = Asked {
+    ) -> impl Future<Output = Result<(), DiscoveryQueryFault>> + Send + use<> {
+        let asked = RegistrationRequest {
             server_uri: server.application_uri.clone(),
             product_uri: server.product_uri.clone(),
             names: vec![("en".to_owned(), server.name.clone())],
@@ -167,13 +175,13 @@ impl EmbeddedAsking {
                 answer.await.ok()
             };
             match timeout(ANSWER_LIMIT, asking).await {
-                Err(_) => Err(AskFault::Late(ANSWER_LIMIT)),
+                Err(_) => Err(DiscoveryQueryFault::Late(ANSWER_LIMIT)),
                 Ok(Some(RegistryAnswer::Registered)) => Ok(()),
                 Ok(Some(RegistryAnswer::Refused(status))) => {
-                    Err(AskFault::Refused(StatusCode::from(status)))
+                    Err(DiscoveryQueryFault::Refused(StatusCode::from(status)))
                 }
                 Ok(None | Some(RegistryAnswer::Servers(_) | RegistryAnswer::OnNetwork { .. })) => {
-                    Err(AskFault::Embed("it has ended".to_owned()))
+                    Err(DiscoveryQueryFault::Embed("it has ended".to_owned()))
                 }
             }
         }

@@ -6,7 +6,7 @@ use std::time::Instant;
 
 use mdns_sd::ServiceInfo;
 use opcua::types::{ApplicationType, ByteString};
-use registry::{Announcement, Registry, Settings};
+use registry::{AnnouncedServer, RegistrySettings, ServerRegistry};
 use tokio::sync::mpsc;
 
 use crate::connection::{RegistryRequest, ServerShared, serve};
@@ -28,7 +28,7 @@ pub async fn answered(said: &[u8]) -> (Vec<u8>, usize) {
     };
     let (ask, mut questions) = mpsc::channel::<RegistryRequest>(1);
     let answers = tokio::spawn(async move {
-        let mut registry = Registry::new(Settings::default());
+        let mut registry = ServerRegistry::new(RegistrySettings::default());
         let at = clock::now();
         while let Some((question, channel, reply)) = questions.recv().await {
             let answer = answer(&mut registry, question, &channel, at);
@@ -46,7 +46,7 @@ pub async fn answered(said: &[u8]) -> (Vec<u8>, usize) {
 }
 
 fn answer(
-    registry: &mut Registry,
+    registry: &mut ServerRegistry,
     question: RegistryQuery,
     channel: &registry::Channel,
     at: Instant,
@@ -88,7 +88,12 @@ pub fn goodbyes(packet: &[u8]) -> Vec<String> {
 /// Decodes the announcement of a server from its instance name, its port, and the texts of its TXT
 /// record.
 #[must_use]
-pub fn heard(instance: &str, port: u16, path: &[u8], capabilities: &[u8]) -> Option<Announcement> {
+pub fn heard(
+    instance: &str,
+    port: u16,
+    path: &[u8],
+    capabilities: &[u8],
+) -> Option<AnnouncedServer> {
     let texts = [("path", path), ("caps", capabilities)];
     let texts = texts.map(|(key, text)| (key, String::from_utf8_lossy(text).into_owned()));
     let address = IpAddr::V4(Ipv4Addr::new(10, 0, 0, 7));

@@ -6,18 +6,21 @@ use std::num::NonZeroU16;
 use std::time::{Duration, Instant};
 
 use log_limit::LogLimit;
-use registry::{Announcement, Event, Loss, Outcome, RecordSource, Registry, Settings};
+use registry::{
+    AnnouncedServer, ProbeOutcome, RecordSource, RegistryEvent, RegistrySettings, ServerLoss,
+    ServerRegistry,
+};
 use tokio::time::sleep_until;
 use tracing::info;
 
 use crate::clock::now;
 use crate::liveness::{EndpointReport, Liveness, Try};
-use mdns::{Aside, Heard, Mdns, Ours, same_place};
+use mdns::{Aside, Mdns, MdnsEvent, OwnAnnouncement, same_place};
 
 /// See the module documentation. Call [`step`](Self::step) repeatedly, and take all
 /// [`event`](Self::event)s after each step.
 pub(crate) struct Keeper {
-    pub(crate) registry: Registry,
+    pub(crate) registry: ServerRegistry,
     pub(crate) mdns: Option<Mdns>,
     liveness: Liveness,
     /// The next time to remove entries of servers that are no longer watched.
@@ -52,14 +55,14 @@ struct Started {
 
 /// The event that ended a step.
 enum Happened {
-    Heard(Heard),
+    Heard(MdnsEvent),
     Told(EndpointReport),
     Due,
 }
 
 #[derive(Debug)]
 struct Asleep {
-    announcement: Announcement,
+    announcement: AnnouncedServer,
     try_at: Instant,
     /// The time to the next probe, which doubles with each probe.
     pause: Duration,
@@ -69,9 +72,9 @@ struct Asleep {
 
 impl Keeper {
     /// Creates a keeper. `own` is the URL of the program itself.
-    pub(crate) fn new(settings: Settings, mdns: Option<Mdns>, own: Option<String>) -> Self {
+    pub(crate) fn new(settings: RegistrySettings, mdns: Option<Mdns>, own: Option<String>) -> Self {
         Self {
-            registry: Registry::new(settings),
+            registry: ServerRegistry::new(settings),
             mdns,
             liveness: Liveness::new(),
             tidy_at: now(),
@@ -140,11 +143,11 @@ impl Keeper {
     }
 
     /// Returns the next event, oldest first. Events for mDNS are processed here.
-    pub(crate) fn event(&mut self) -> Option<Event> {
+    pub(crate) fn event(&mut self) -> Option<RegistryEvent> {
         loop {
             let event = self.registry.poll_event()?;
             match (&event, &mut self.mdns) {
-                (Event::Announce(announcement), Some(mdns)) => mdns.put(Ours {
+                (RegistryEvent::Announce(announcement), Some(mdns)) => mdns.put(OwnAnnouncement {
                     announcement: announcement.clone(),
                     aside: Aside {
                         // An announced start time implies that the server answers during calls.
@@ -156,12 +159,14 @@ impl Keeper {
                         number: self.numbers.get(&announcement.url).copied(),
                     },
                 }),
-                (Event::Withdraw { instance }, Some(mdns)) => drop(mdns.take_back(instance)),
-                (Event::Announce(_) | Event::Withdraw { .. }, None) => {}
+                (RegistryEvent::Withdraw { instance }, Some(mdns)) => {
+                    drop(mdns.take_back(instance))
+                }
+                (RegistryEvent::Announce(_) | RegistryEvent::Withdraw { .. }, None) => {}
                 (
-                    Event::Vanished {
+                    RegistryEvent::Vanished {
                         record,
-                        loss: Loss::Unreachable | Loss::Hanging,
+                        loss: ServerLoss::Unreachable | ServerLoss::Hanging,
                     },
                     _,
                 ) if record.source == RecordSource::Multicast => {
@@ -194,10 +199,10 @@ impl Keeper {
         std::mem::take(&mut self.new_starts)
     }
 
-    fn hear(&mut self, heard: Heard) {
+    fn hear(&mut self, heard: MdnsEvent) {
         let at = now();
         match heard {
-            Heard::Announced {
+            MdnsEvent::Announced {
                 announcement,
                 aside: Aside { start_time, number },
             } => {
@@ -228,15 +233,15 @@ impl Keeper {
                     self.registry.announced_start(&instance, start_time);
                 }
             }
-            Heard::Withdrawn { instance } => {
+            MdnsEvent::Withdrawn { instance } => {
                 self.asleep.remove(&instance);
                 self.registry.withdrawn(&instance);
             }
-            Heard::Renamed { from, to } => self.registry.renamed(&from, &to, at),
+            MdnsEvent::Renamed { from, to } => self.registry.renamed(&from, &to, at),
         }
     }
 
-    fn sleeps(&mut self, announcement: Announcement) {
+    fn sleeps(&mut self, announcement: AnnouncedServer) {
         if self.asleep.len() < self.most {
             let at = now();
             let had_answered = self.answered.contains_key(&announcement.url);
@@ -286,7 +291,7 @@ impl Keeper {
                 },
             };
             if self.own.as_ref().is_some_and(|own| same_place(own, &url)) {
-                let alive = Outcome::Alive { start_time: None };
+                let alive = ProbeOutcome::Alive { start_time: None };
                 self.registry.probed(&url, alive, at);
                 continue;
             }
@@ -295,9 +300,9 @@ impl Keeper {
         }
     }
 
-    fn probed(&mut self, url: &str, outcome: Outcome) {
+    fn probed(&mut self, url: &str, outcome: ProbeOutcome) {
         let at = now();
-        if outcome == Outcome::Untried
+        if outcome == ProbeOutcome::Untried
             && let Some(suppressed) = self.untried_log.admit(url, at)
         {
             info!(
@@ -306,7 +311,7 @@ impl Keeper {
                 "cannot probe a server: its host name does not resolve on this host, or its URL is not opc.tcp; it stays listed"
             );
         }
-        if let Outcome::Alive { start_time } = outcome {
+        if let ProbeOutcome::Alive { start_time } = outcome {
             keep(&mut self.answered, self.most, url, at);
             if let Some(at) = start_time {
                 let started = Started { at, tells: false };

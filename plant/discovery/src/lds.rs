@@ -13,7 +13,10 @@ use log_limit::LogLimit;
 use opcua::types::ApplicationType;
 use plant_opcua::enrolment::{Applicant, DirectoryClient, Enrolment, Invitation};
 use plant_opcua::own;
-use registry::{Announcement, Asked, Event, Loss, NetworkRecord, Settings, instance_name};
+use registry::{
+    AnnouncedServer, NetworkRecord, RegistrationRequest, RegistryEvent, RegistrySettings,
+    ServerLoss, instance_name,
+};
 use service::{Failure, FailureKind, Requests};
 use tokio::net::TcpListener;
 use tokio::sync::{mpsc, watch};
@@ -31,10 +34,10 @@ use crate::listen::{cut, listen};
 use crate::listing::{ListingTask, ServerQuery};
 use crate::security::{ChannelSecurity, TOLD_EVERY};
 use crate::services::{OwnDescription, RegistryAnswer, RegistryQuery, semaphore};
-use mdns::Interface;
+use mdns::MdnsInterface;
 use mdns::Url;
 use mdns::host_name;
-use mdns::{Aside, Mdns, Ours};
+use mdns::{Aside, Mdns, OwnAnnouncement};
 
 /// The settings of a discovery server.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -44,7 +47,7 @@ pub struct LdsSettings {
     /// The endpoint URL, for example `opc.tcp://127.0.0.1:4840`.
     pub endpoint: String,
     /// The interface for mDNS.
-    pub interface: Interface,
+    pub interface: MdnsInterface,
     /// Whether servers of other hosts may register over an unsecured channel.
     pub allow_unsecured: bool,
     /// Whether servers of this host must register over a secured channel too.
@@ -80,7 +83,7 @@ impl LdsSettings {
         Self {
             application_uri: None,
             endpoint: endpoint.into(),
-            interface: Interface::LOOPBACK,
+            interface: MdnsInterface::LOOPBACK,
             allow_unsecured: false,
             secured_only: false,
             register_every: REGISTER_EVERY,
@@ -186,7 +189,7 @@ pub struct Added {
 
 /// The connection between an embedding program and its discovery server.
 #[derive(Debug)]
-pub struct Around {
+pub struct LdsEmbedding {
     /// Receives changes of the servers. Events that do not fit into the channel are dropped, and
     /// counted as `level_missed_total`: the discovery server never waits.
     pub events: mpsc::Sender<OnLevel>,
@@ -236,7 +239,7 @@ pub async fn run(
 /// Returns an error if the endpoint or the interface cannot be used.
 pub async fn run_around(
     settings: LdsSettings,
-    around: Option<Around>,
+    around: Option<LdsEmbedding>,
     mut pages: Requests<LdsStatus>,
     stop: impl Future<Output = ()>,
 ) -> Result<(), Failure> {
@@ -244,7 +247,7 @@ pub async fn run_around(
         Ok(listening) => listening,
         Err(fault) => return Err(fault.told(&settings.endpoint).await),
     };
-    let (mut lds, questions) = Lds::start(&settings, listening).await?;
+    let (mut lds, questions) = DiscoveryServer::start(&settings, listening).await?;
     lds.around = around;
     service::service_manager::ready();
     lds.run(questions, &mut pages, stop).await;
@@ -252,17 +255,17 @@ pub async fn run_around(
 }
 
 /// A discovery server, which serves its clients during [`run`](Self::run).
-pub(crate) struct Lds {
+pub(crate) struct DiscoveryServer {
     keeper: Keeper,
     shared: Arc<ServerShared>,
-    interface: Interface,
+    interface: MdnsInterface,
     /// Its own mDNS instance name.
     instance: String,
     started: SystemTime,
     since: BTreeMap<String, SystemTime>,
     losses: VecDeque<LossStatus>,
     lost: u64,
-    around: Option<Around>,
+    around: Option<LdsEmbedding>,
     missed: u64,
     register_every: Duration,
     /// Limits the log messages for refused registrations, by URI and reason.
@@ -275,7 +278,7 @@ pub(crate) struct Lds {
     listing: Option<ListingTask>,
 }
 
-impl Lds {
+impl DiscoveryServer {
     /// Starts a discovery server with the result of [`listen`].
     pub(crate) async fn start(
         settings: &LdsSettings,
@@ -328,10 +331,10 @@ impl Lds {
         }
         let listing = settings.listing_task(&shared.own);
         info!(url, interface = %settings.interface, "the discovery server is listening");
-        let registry = Settings {
+        let registry = RegistrySettings {
             allow_unsecured: settings.allow_unsecured,
             forget_after: settings.register_every * 2,
-            ..Settings::default()
+            ..RegistrySettings::default()
         };
         let mut lds = Self {
             keeper: Keeper::new(registry, Some(mdns), Some(url)),
@@ -357,8 +360,8 @@ impl Lds {
     /// Announces the discovery server by mDNS.
     fn announce(&mut self) {
         if let Some(mdns) = &mut self.keeper.mdns {
-            mdns.put(Ours {
-                announcement: Announcement {
+            mdns.put(OwnAnnouncement {
+                announcement: AnnouncedServer {
                     instance: self.instance.clone(),
                     url: self.shared.own.url.clone(),
                     capabilities: vec!["LDS".to_owned()],
@@ -458,9 +461,9 @@ impl Lds {
         clippy::wildcard_enum_match_arm,
         reason = "everything is announced by then"
     )]
-    fn take(&mut self, event: Event) {
+    fn take(&mut self, event: RegistryEvent) {
         match event {
-            Event::Registered {
+            RegistryEvent::Registered {
                 server_uri,
                 discovery_urls,
             } => {
@@ -476,14 +479,14 @@ impl Lds {
                 }
                 self.since.entry(server_uri).or_insert_with(clock::wall);
             }
-            Event::Seen(record) => self.seen(record),
-            Event::Restarted { url } => {
+            RegistryEvent::Seen(record) => self.seen(record),
+            RegistryEvent::Restarted { url } => {
                 info!(url, "restarted");
                 self.tell(OnLevel::Restarted { url });
             }
-            Event::Gone { server_uri, loss } => self.lose(server_uri, String::new(), loss),
-            Event::Vanished { record, loss } => {
-                let Announcement { instance, url, .. } = record.announcement;
+            RegistryEvent::Gone { server_uri, loss } => self.lose(server_uri, String::new(), loss),
+            RegistryEvent::Vanished { record, loss } => {
+                let AnnouncedServer { instance, url, .. } = record.announcement;
                 self.lose(instance, url, loss);
             }
             _ => {}
@@ -491,7 +494,7 @@ impl Lds {
     }
 
     fn seen(&mut self, record: NetworkRecord) {
-        let Announcement { instance, url, .. } = record.announcement;
+        let AnnouncedServer { instance, url, .. } = record.announcement;
         let now = clock::wall();
         let started = self.keeper.started(&url).map(clock::of_ticks);
         let after = started.and_then(|at| now.duration_since(at).ok());
@@ -508,7 +511,7 @@ impl Lds {
         self.since.entry(instance).or_insert(now);
     }
 
-    fn lose(&mut self, name: String, url: String, loss: Loss) {
+    fn lose(&mut self, name: String, url: String, loss: ServerLoss) {
         let silent = self.keeper.silent_for(&url);
         let silent_ms = silent.map(|silent| u64::try_from(silent.as_millis()).unwrap_or(u64::MAX));
         info!(?name, url, loss = loss.label(), silent_ms, "gone");
@@ -649,7 +652,7 @@ impl Lds {
 
 /// Returns the host of the own URL. A server on the wildcard address uses the address of the
 /// interface.
-fn own_host(host: &str, interface: &Interface) -> String {
+fn own_host(host: &str, interface: &MdnsInterface) -> String {
     let address: Option<IpAddr> = host.parse().ok();
     let is_wildcard = address.is_some_and(|address| address.is_unspecified());
     match (is_wildcard, interface.addresses().first()) {
@@ -659,7 +662,7 @@ fn own_host(host: &str, interface: &Interface) -> String {
 }
 
 /// Waits until a Global Discovery Server lists other servers, and returns its servers.
-async fn listed(listing: &mut Option<ListingTask>) -> Vec<Announcement> {
+async fn listed(listing: &mut Option<ListingTask>) -> Vec<AnnouncedServer> {
     match listing {
         Some(listing) => listing.step().await,
         None => std::future::pending().await,
@@ -667,20 +670,24 @@ async fn listed(listing: &mut Option<ListingTask>) -> Vec<Announcement> {
 }
 
 /// Returns the servers of other levels with these URIs, or all, in the form of registrations.
-fn gated(around: &Around, uris: &[&str]) -> Vec<Asked> {
+fn gated(around: &LdsEmbedding, uris: &[&str]) -> Vec<RegistrationRequest> {
     let added = around.added.borrow();
     let wanted = |one: &&Gated| uris.is_empty() || uris.contains(&&*one.application_uri);
-    let gated = added.gated.iter().filter(wanted).map(|one| Asked {
-        server_uri: one.application_uri.clone(),
-        product_uri: String::new(),
-        names: vec![(String::new(), one.name.clone())],
-        application_type: registry::ApplicationType::Server,
-        gateway_server_uri: one.gateway_uri.clone(),
-        discovery_urls: vec![one.url.clone()],
-        semaphore_file_path: String::new(),
-        is_online: true,
-        mdns: None,
-    });
+    let gated = added
+        .gated
+        .iter()
+        .filter(wanted)
+        .map(|one| RegistrationRequest {
+            server_uri: one.application_uri.clone(),
+            product_uri: String::new(),
+            names: vec![(String::new(), one.name.clone())],
+            application_type: registry::ApplicationType::Server,
+            gateway_server_uri: one.gateway_uri.clone(),
+            discovery_urls: vec![one.url.clone()],
+            semaphore_file_path: String::new(),
+            is_online: true,
+            mdns: None,
+        });
     gated.collect()
 }
 

@@ -34,14 +34,16 @@ pub mod ua_lds;
 mod watch;
 mod wire;
 
-pub use announce::{AnnounceSettings, AnnounceState, Announced, Server, announce};
+pub use announce::{
+    AnnounceSettings, AnnounceState, ServerAnnouncement, ServerDescription, announce,
+};
 pub use chosen::{Marks, find_lds};
 pub use listing::{ListingArguments, ServerQuery};
-pub use mdns::{Interface, MdnsFault, host_name};
+pub use mdns::{MdnsFault, MdnsInterface, host_name};
 pub use presence::be_there;
 /// The detected cause of the loss of a server.
-pub use registry::Loss;
-pub use watch::{Found, Known, WatchSettings, Watcher, watch};
+pub use registry::ServerLoss;
+pub use watch::{PresentServer, ServerChange, ServerWatcher, WatchSettings, watch};
 
 /// The URL of the Local Discovery Server of a host (OPC 10000-12, 4.2.2).
 pub const DEFAULT_LDS: &str = "opc.tcp://127.0.0.1:4840";

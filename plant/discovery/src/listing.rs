@@ -6,7 +6,7 @@ use std::time::{Duration, SystemTime};
 
 use opcua::types::ServerOnNetwork;
 use plant_opcua::enrolment::{DirectoryClient, Invitation};
-use registry::{Announcement, ListedServer, Listing, ListingSettings};
+use registry::{AnnouncedServer, ListedServer, Listing, ListingSettings};
 use serde::Serialize;
 use tokio::task::JoinSet;
 use tokio::time::sleep_until;
@@ -95,7 +95,7 @@ impl ListingTask {
     }
 
     /// Waits until the list changes, and returns its servers. Cancel safe.
-    pub(crate) async fn step(&mut self) -> Vec<Announcement> {
+    pub(crate) async fn step(&mut self) -> Vec<AnnouncedServer> {
         loop {
             let expires = self.listing.expires();
             let due = self.running.is_empty().then(|| self.listing.due());
@@ -138,7 +138,7 @@ impl ListingTask {
     fn finished(
         &mut self,
         asked: Result<Vec<ServerOnNetwork>, String>,
-    ) -> Option<Vec<Announcement>> {
+    ) -> Option<Vec<AnnouncedServer>> {
         let before = self.listing.fault().map(str::to_owned);
         let gds = &self.client.gds.url;
         match asked {

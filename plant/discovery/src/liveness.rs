@@ -6,7 +6,7 @@
 use std::collections::BTreeMap;
 use std::time::Duration;
 
-use registry::Outcome;
+use registry::ProbeOutcome;
 use tokio::sync::mpsc;
 use tokio::time::{sleep, timeout};
 
@@ -18,7 +18,7 @@ use mdns::Url;
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) enum EndpointReport {
     /// The outcome of a probe.
-    Tried { url: String, outcome: Outcome },
+    Tried { url: String, outcome: ProbeOutcome },
     /// The connection to the endpoint was lost.
     Broken { url: String },
 }
@@ -173,12 +173,12 @@ impl Endpoint {
 
     /// Probes the endpoint within a second: on the line, and if the answer is delayed, also on
     /// another connection.
-    async fn attempt(&mut self, attempt: Try) -> Outcome {
+    async fn attempt(&mut self, attempt: Try) -> ProbeOutcome {
         let Some(place) = self.place.clone() else {
             // The endpoint has another transport, for example HTTPS.
-            return Outcome::Untried;
+            return ProbeOutcome::Untried;
         };
-        let alive = Outcome::Alive { start_time: None };
+        let alive = ProbeOutcome::Alive { start_time: None };
         let line = self.line.take().filter(OpenChannel::is_good);
         let asking = ask(line);
         tokio::pin!(asking);
@@ -210,13 +210,13 @@ impl Endpoint {
                 } else {
                     None
                 };
-                Outcome::Alive { start_time }
+                ProbeOutcome::Alive { start_time }
             }
             Reached::Answers => alive,
-            Reached::Accepts => Outcome::Hanging,
-            Reached::Refused => Outcome::Refused,
-            Reached::Nobody => Outcome::Silent,
-            Reached::Untried => Outcome::Untried,
+            Reached::Accepts => ProbeOutcome::Hanging,
+            Reached::Refused => ProbeOutcome::Refused,
+            Reached::Nobody => ProbeOutcome::Silent,
+            Reached::Untried => ProbeOutcome::Untried,
         }
     }
 }
@@ -248,10 +248,10 @@ mod tests {
     use tokio::net::TcpListener;
 
     use super::*;
-    use crate::announce::Server;
+    use crate::announce::ServerDescription;
     use crate::presence::be_there;
 
-    async fn tried(liveness: &mut Liveness, url: &str) -> Outcome {
+    async fn tried(liveness: &mut Liveness, url: &str) -> ProbeOutcome {
         liveness.attempt(url, Try { ask_start: false });
         match liveness.next().await {
             EndpointReport::Tried { outcome, .. } => outcome,
@@ -264,14 +264,18 @@ mod tests {
         let mut liveness = Liveness::new();
         let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
         let url = format!("opc.tcp://{}", listener.local_addr().unwrap());
-        assert_eq!(tried(&mut liveness, &url).await, Outcome::Hanging);
+        assert_eq!(tried(&mut liveness, &url).await, ProbeOutcome::Hanging);
         drop(listener);
-        assert_eq!(tried(&mut liveness, &url).await, Outcome::Refused);
+        assert_eq!(tried(&mut liveness, &url).await, ProbeOutcome::Refused);
         for url in [
             "https://127.0.0.1:1/",
             "opc.tcp://no-such-host.invalid:4840",
         ] {
-            assert_eq!(tried(&mut liveness, url).await, Outcome::Untried, "{url}");
+            assert_eq!(
+                tried(&mut liveness, url).await,
+                ProbeOutcome::Untried,
+                "{url}"
+            );
         }
         assert_eq!(liveness.endpoints.len(), 3);
         liveness.keep(|known| known == url);
@@ -285,7 +289,7 @@ mod tests {
         let mut liveness = Liveness::new();
         let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
         let url = format!("opc.tcp://{}", listener.local_addr().unwrap());
-        let server = Server {
+        let server = ServerDescription {
             application_uri: "urn:here".to_owned(),
             product_uri: String::new(),
             name: "here".to_owned(),
@@ -306,7 +310,7 @@ mod tests {
         runtime.spawn(async move {
             be_there(TcpListener::from_std(listener).unwrap(), &server).await;
         });
-        let alive = Outcome::Alive { start_time: None };
+        let alive = ProbeOutcome::Alive { start_time: None };
         for _ in 0..3 {
             assert_eq!(tried(&mut liveness, &url).await, alive);
         }
@@ -314,7 +318,7 @@ mod tests {
         let told = timeout(Duration::from_secs(5), liveness.next()).await;
         assert_eq!(told, Ok(EndpointReport::Broken { url: url.clone() }));
         // The sockets of the runtime may close one after another.
-        let gone = async { while tried(&mut liveness, &url).await != Outcome::Refused {} };
+        let gone = async { while tried(&mut liveness, &url).await != ProbeOutcome::Refused {} };
         timeout(Duration::from_secs(5), gone).await.unwrap();
     }
 
@@ -328,7 +332,7 @@ mod tests {
                 drop(stream);
             }
         });
-        let alive = Outcome::Alive { start_time: None };
+        let alive = ProbeOutcome::Alive { start_time: None };
         assert_eq!(tried(&mut liveness, &url).await, alive);
     }
 }

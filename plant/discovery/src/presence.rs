@@ -6,14 +6,14 @@ use opcua::types::{ApplicationType, ByteString};
 use tokio::net::TcpListener;
 use tokio::sync::mpsc;
 
-use crate::announce::Server;
+use crate::announce::ServerDescription;
 use crate::connection::{RegistryRequest, ServerShared};
 use crate::endpoint;
 use crate::services::{OwnDescription, RegistryAnswer, RegistryQuery};
 
 /// Answers FindServers and GetEndpoints on a listener, over unsecured channels. Sessions and all
 /// other services are not supported. Ends when the future is dropped.
-pub async fn be_there(listener: TcpListener, server: &Server) {
+pub async fn be_there(listener: TcpListener, server: &ServerDescription) {
     let own = OwnDescription {
         application_uri: server.application_uri.clone(),
         name: server.name.clone(),

@@ -14,11 +14,11 @@ use tokio::net::TcpStream;
 use tokio::task::JoinSet;
 use tokio::time::{MissedTickBehavior, interval, timeout};
 
-use crate::client::{Described, describe};
+use crate::client::{SelfDescription, describe};
 
 /// The limits of a scan.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Pace {
+pub struct ScanLimits {
     /// Maximum number of new connections per second, at least 1.
     pub per_second: u32,
     /// Maximum number of concurrent connections, at least 1.
@@ -29,7 +29,7 @@ pub struct Pace {
     pub answer: Duration,
 }
 
-impl Default for Pace {
+impl Default for ScanLimits {
     fn default() -> Self {
         Self {
             per_second: 200,
@@ -48,12 +48,12 @@ pub struct Scanned {
     /// The other URLs of the same server.
     pub also_at: Vec<String>,
     /// The self-description of the server.
-    pub described: Described,
+    pub described: SelfDescription,
 }
 
 /// The result of a scan.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
-pub struct Outcome {
+pub struct ScanOutcome {
     /// The servers, one per ApplicationUri, ordered by address.
     pub servers: Vec<Scanned>,
     /// Addresses whose listener is not an OPC UA server, with the reason, ordered by address.
@@ -63,7 +63,7 @@ pub struct Outcome {
 }
 
 /// Scans these ports of all addresses.
-pub async fn scan(ranges: &[Range], ports: &[u16], pace: Pace) -> Outcome {
+pub async fn scan(ranges: &[Range], ports: &[u16], pace: ScanLimits) -> ScanOutcome {
     let all = ranges.iter().flat_map(|range| range.addresses());
     let mut places = all.flat_map(|ip| ports.iter().map(move |port| SocketAddr::from((ip, *port))));
     let gap = Duration::from_secs(1) / pace.per_second.max(1);
@@ -95,10 +95,10 @@ pub async fn scan(ranges: &[Range], ports: &[u16], pace: Pace) -> Outcome {
 }
 
 /// The self-description of a server, or the reason why a listener did not answer.
-type Tried = Result<Described, String>;
+type Tried = Result<SelfDescription, String>;
 
 /// Scans an address; `None` without a listener.
-async fn try_one(place: SocketAddr, pace: Pace) -> Option<Tried> {
+async fn try_one(place: SocketAddr, pace: ScanLimits) -> Option<Tried> {
     let connected = timeout(pace.connect, TcpStream::connect(place)).await;
     drop(connected.ok()?.ok()?);
     let url = Url::of(place.ip(), place.port(), "").to_string();
@@ -107,8 +107,8 @@ async fn try_one(place: SocketAddr, pace: Pace) -> Option<Tried> {
 }
 
 /// Merges the results by ApplicationUri.
-fn merged(told: BTreeMap<SocketAddr, Tried>) -> Outcome {
-    let mut outcome = Outcome::default();
+fn merged(told: BTreeMap<SocketAddr, Tried>) -> ScanOutcome {
+    let mut outcome = ScanOutcome::default();
     for (place, tried) in told {
         let described = match tried {
             Ok(described) => described,
@@ -136,7 +136,7 @@ fn merged(told: BTreeMap<SocketAddr, Tried>) -> Outcome {
 
 /// Returns the URL of a scanned address, with the path that the server reports for this port.
 /// Reported host names cannot always be resolved.
-fn reached(ip: IpAddr, port: u16, described: &Described) -> String {
+fn reached(ip: IpAddr, port: u16, described: &SelfDescription) -> String {
     let told = described.application.discovery_urls.iter();
     let mut told = told.filter_map(|url| Url::parse(url));
     let path = told.find(|url| url.port == port).map(|url| url.path);
@@ -146,11 +146,11 @@ fn reached(ip: IpAddr, port: u16, described: &Described) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::client::Application;
+    use crate::client::FoundServer;
 
     fn described(uri: &str, url: &str) -> Tried {
-        Ok(Described {
-            application: Application {
+        Ok(SelfDescription {
+            application: FoundServer {
                 application_uri: uri.to_owned(),
                 name: "plc".to_owned(),
                 is_discovery_server: false,

@@ -8,11 +8,11 @@ use log_limit::LogLimit;
 use opcua::crypto::{CertificateStore, PrivateKey, X509};
 use opcua::sync::Mutex;
 use opcua::types::StatusCode;
-use plant_opcua::judge::{Judge, Refused};
+use plant_opcua::judge::{CertificateJudge, RefusedCertificate};
 use plant_opcua::pki::Pki;
 use service::{Failure, FailureKind};
 use tracing::warn;
-use trust::Names;
+use trust::RequiredNames;
 use x509_cert::Certificate;
 use x509_cert::der::Decode as _;
 use x509_cert::ext::pkix::SubjectAltName;
@@ -25,7 +25,7 @@ use crate::clock;
 pub(crate) struct ChannelSecurity {
     pub(crate) certificate: X509,
     pub(crate) key: PrivateKey,
-    judge: Judge,
+    judge: CertificateJudge,
     /// Limits the log messages for refused certificates, by certificate and reason.
     refused: Mutex<LogLimit>,
 }
@@ -56,7 +56,7 @@ impl ChannelSecurity {
             certificate: CertificateStore::read_cert(&certificate)
                 .map_err(|error| failed(&error))?,
             key: CertificateStore::read_pkey(&key).map_err(|error| failed(&error))?,
-            judge: Judge::of(root, trust_any),
+            judge: CertificateJudge::of(root, trust_any),
             refused: Mutex::new(LogLimit::every(TOLD_EVERY)),
         })
     }
@@ -68,7 +68,7 @@ impl ChannelSecurity {
         Ok(Self {
             certificate: CertificateStore::read_cert(&certificate).map_err(failed)?,
             key: CertificateStore::read_pkey(&key).map_err(failed)?,
-            judge: Judge::of(root, false),
+            judge: CertificateJudge::of(root, false),
             refused: Mutex::new(LogLimit::every(TOLD_EVERY)),
         })
     }
@@ -76,7 +76,7 @@ impl ChannelSecurity {
     /// Uses the store at another root to decide on trust.
     pub(crate) fn judging_by(self, root: Option<PathBuf>, trust_any: bool) -> Self {
         Self {
-            judge: root.map_or(self.judge, |root| Judge::of(&root, trust_any)),
+            judge: root.map_or(self.judge, |root| CertificateJudge::of(&root, trust_any)),
             ..self
         }
     }
@@ -84,8 +84,12 @@ impl ChannelSecurity {
     /// Judges the certificate of a server with this ApplicationUri. An undecided certificate is
     /// stored in `rejected`. The host name is not checked, because the registration contains no
     /// secret.
-    pub(crate) fn trusts(&self, der: &[u8], application_uri: &str) -> Result<(), Refused> {
-        let names = Names {
+    pub(crate) fn trusts(
+        &self,
+        der: &[u8],
+        application_uri: &str,
+    ) -> Result<(), RefusedCertificate> {
+        let names = RequiredNames {
             host: None,
             application_uri: Some(application_uri),
         };
@@ -94,7 +98,7 @@ impl ChannelSecurity {
 
     /// Checks that a channel may be opened, or stay open, with this certificate.
     pub(crate) fn admit(&self, der: &[u8]) -> Result<(), StatusCode> {
-        let Err(refused) = self.judge.take(der, Names::default()) else {
+        let Err(refused) = self.judge.take(der, RequiredNames::default()) else {
             return Ok(());
         };
         let told = refused.to_string();

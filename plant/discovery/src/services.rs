@@ -16,7 +16,7 @@ use opcua::types::{
     RegisterServer2Response, RegisterServerResponse, RegisteredServer, ResponseHeader,
     ServerOnNetwork, ServiceFault, StatusCode, UAString,
 };
-use registry::{Asked, MdnsConfiguration, NetworkRecord};
+use registry::{MdnsConfiguration, NetworkRecord, RegistrationRequest};
 
 use crate::clock;
 
@@ -32,7 +32,7 @@ pub(crate) enum RegistryQuery {
         capabilities: Vec<String>,
     },
     Register {
-        asked: Box<Asked>,
+        asked: Box<RegistrationRequest>,
         semaphore_is_there: Option<bool>,
     },
 }
@@ -40,7 +40,7 @@ pub(crate) enum RegistryQuery {
 /// The answer of the registry.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) enum RegistryAnswer {
-    Servers(Vec<Asked>),
+    Servers(Vec<RegistrationRequest>),
     OnNetwork {
         records: Vec<NetworkRecord>,
         reset: SystemTime,
@@ -135,7 +135,7 @@ pub(crate) fn question(request: &RequestMessage) -> Option<RegistryQuery> {
 
 fn register(server: &RegisteredServer, mdns: Option<MdnsConfiguration>) -> RegistryQuery {
     let names = server.server_names.iter().flatten();
-    let asked = Asked {
+    let asked = RegistrationRequest {
         server_uri: text(&server.server_uri),
         product_uri: text(&server.product_uri),
         names: names
@@ -225,7 +225,10 @@ pub(crate) fn fault(request: &RequestMessage, status: StatusCode) -> ResponseMes
     ServiceFault::new(request.request_header(), status).into()
 }
 
-fn description(server: &Asked, request: &FindServersRequest) -> ApplicationDescription {
+fn description(
+    server: &RegistrationRequest,
+    request: &FindServersRequest,
+) -> ApplicationDescription {
     let wanted = request.locale_ids.as_deref().unwrap_or_default();
     let in_locale = wanted.iter().find_map(|locale| {
         let mut names = server.names.iter();

@@ -8,12 +8,14 @@ use std::time::Duration;
 
 use plant_opcua::enrolment::GdsArguments;
 use plant_opcua::pki::default_named;
-use service::{Failure, FailureKind, LogArguments, LogFormat, Service, run_service, serve_pages};
+use service::{
+    Failure, FailureKind, LogArguments, LogFormat, ServiceProgram, run_service, serve_pages,
+};
 
 use crate::lds::{self, LdsSettings};
 use crate::listing::ListingArguments;
 use crate::scan::Range;
-use crate::{DEFAULT_LDS, Interface};
+use crate::{DEFAULT_LDS, MdnsInterface};
 
 /// A Local Discovery Server with multicast extension: lists the OPC UA servers of the network.
 ///
@@ -75,7 +77,7 @@ pub fn run(arguments: Vec<OsString>) -> ExitCode {
     run_service::<UaLds>(arguments)
 }
 
-impl Service for UaLds {
+impl ServiceProgram for UaLds {
     // The libraries log faults of clients at level error.
     const QUIET: &'static str = "opcua_core=off,opcua_crypto=off,opcua_types=off,mdns_sd=off";
 
@@ -85,14 +87,14 @@ impl Service for UaLds {
 
     async fn serve(self, stop: impl Future<Output = ()> + Send + 'static) -> Result<(), Failure> {
         let pages = serve_pages(self.metrics).await?;
-        let interface = self.interface.as_deref().map(Interface::parse);
+        let interface = self.interface.as_deref().map(MdnsInterface::parse);
         let gds = self.gds.invitation();
         let gds = gds.map_err(|fault| Failure::new(FailureKind::Usage, fault.to_string()))?;
         // A certificate of the plant requires a store.
         let usual = || gds.as_ref().map(|_| default_named("pki-ua-lds"));
         let settings = LdsSettings {
             interface: interface
-                .unwrap_or(Interface::LOOPBACK)
+                .unwrap_or(MdnsInterface::LOOPBACK)
                 .with_networks(self.networks),
             allow_unsecured: self.allow_unsecured,
             secured_only: self.secured_only,

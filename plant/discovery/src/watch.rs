@@ -4,14 +4,14 @@ use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::num::NonZeroU16;
 use std::time::{Duration, SystemTime};
 
-use registry::{Announcement, Event, Loss, Settings};
+use registry::{AnnouncedServer, RegistryEvent, RegistrySettings, ServerLoss};
 use tokio::sync::mpsc;
 use tokio::task::JoinSet;
 
 use crate::client;
 use crate::clock;
 use crate::keeper::Keeper;
-use mdns::Interface;
+use mdns::MdnsInterface;
 use mdns::Url;
 use mdns::{Mdns, MdnsFault, same_place};
 
@@ -19,7 +19,7 @@ use mdns::{Mdns, MdnsFault, same_place};
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct WatchSettings {
     /// The interface for mDNS; `None` for no mDNS.
-    pub mdns: Option<Interface>,
+    pub mdns: Option<MdnsInterface>,
     /// The interval of probes of each endpoint.
     pub probe_every: Duration,
     /// The time without any answer after which a server is lost.
@@ -28,9 +28,9 @@ pub struct WatchSettings {
 
 impl Default for WatchSettings {
     fn default() -> Self {
-        let settings = Settings::default();
+        let settings = RegistrySettings::default();
         Self {
-            mdns: Some(Interface::LOOPBACK),
+            mdns: Some(MdnsInterface::LOOPBACK),
             probe_every: settings.probe_every,
             lost_after: settings.lost_after,
         }
@@ -39,7 +39,7 @@ impl Default for WatchSettings {
 
 /// A server that is present.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Known {
+pub struct PresentServer {
     /// The mDNS instance name, which is unique while the server is present.
     pub name: String,
     /// The URL.
@@ -57,7 +57,7 @@ pub struct Known {
     pub number: Option<NonZeroU16>,
 }
 
-impl Known {
+impl PresentServer {
     /// Returns whether the server is a Local Discovery Server, which has no functions of its own.
     #[must_use]
     pub fn is_lds(&self) -> bool {
@@ -69,24 +69,24 @@ impl Known {
 
 /// A change of a server.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Found {
+pub enum ServerChange {
     /// The server appeared, or its description changed.
-    Seen(Known),
+    Seen(PresentServer),
     /// The program restarted: cached data of the server is invalid.
-    Restarted(Known),
+    Restarted(PresentServer),
     /// The server was lost.
     Gone {
         /// The last description of the server.
-        known: Known,
+        known: PresentServer,
         /// The detected cause of the loss.
-        loss: Loss,
+        loss: ServerLoss,
     },
 }
 
-impl Found {
+impl ServerChange {
     /// Returns the server.
     #[must_use]
-    pub fn known(&self) -> &Known {
+    pub fn known(&self) -> &PresentServer {
         match self {
             Self::Seen(known) | Self::Restarted(known) | Self::Gone { known, .. } => known,
         }
@@ -95,12 +95,12 @@ impl Found {
 
 /// Receives changes of servers until this value is dropped.
 #[derive(Debug)]
-pub struct Watcher(mpsc::Receiver<Found>);
+pub struct ServerWatcher(mpsc::Receiver<ServerChange>);
 
-impl Watcher {
+impl ServerWatcher {
     /// Waits for the next change. `None` only when the runtime ends. A slow reader receives only
     /// the last of several changes of a server, and misses no server.
-    pub async fn next(&mut self) -> Option<Found> {
+    pub async fn next(&mut self) -> Option<ServerChange> {
         self.0.recv().await
     }
 }
@@ -109,12 +109,12 @@ impl Watcher {
 ///
 /// # Errors
 /// Returns an error if the mDNS daemon cannot be started.
-pub fn watch(settings: WatchSettings) -> Result<Watcher, MdnsFault> {
+pub fn watch(settings: WatchSettings) -> Result<ServerWatcher, MdnsFault> {
     let mdns = settings.mdns.as_ref().map(Mdns::open).transpose()?;
-    let registry = Settings {
+    let registry = RegistrySettings {
         probe_every: settings.probe_every,
         lost_after: settings.lost_after,
-        ..Settings::default()
+        ..RegistrySettings::default()
     };
     let (tell, found) = mpsc::channel(16);
     let watching = Watching {
@@ -125,7 +125,7 @@ pub fn watch(settings: WatchSettings) -> Result<Watcher, MdnsFault> {
         ask_later: BTreeSet::new(),
     };
     tokio::spawn(watching.run(tell));
-    Ok(Watcher(found))
+    Ok(ServerWatcher(found))
 }
 
 struct Watching {
@@ -141,7 +141,7 @@ struct Watching {
 }
 
 impl Watching {
-    async fn run(mut self, tell: mpsc::Sender<Found>) {
+    async fn run(mut self, tell: mpsc::Sender<ServerChange>) {
         loop {
             tokio::select! {
                 permit = tell.reserve(), if !self.servers.outbox.is_empty() => {
@@ -203,9 +203,9 @@ impl Watching {
     }
 
     #[expect(clippy::wildcard_enum_match_arm, reason = "nobody registers here")]
-    fn take(&mut self, event: Event) {
+    fn take(&mut self, event: RegistryEvent) {
         match event {
-            Event::Seen(record) => {
+            RegistryEvent::Seen(record) => {
                 let url = record.announcement.url.clone();
                 if let Some(ask) = self.servers.seen(record.announcement, clock::wall()) {
                     self.ask(ask);
@@ -215,10 +215,10 @@ impl Watching {
                     self.servers.started(&url, clock::of_ticks(started));
                 }
             }
-            Event::Vanished { record, loss } => {
+            RegistryEvent::Vanished { record, loss } => {
                 self.servers.vanished(&record.announcement.instance, loss);
             }
-            Event::Restarted { url } => {
+            RegistryEvent::Restarted { url } => {
                 let started = self.keeper.started(&url).map(clock::of_ticks);
                 self.servers.restarted(&url, started);
             }
@@ -233,7 +233,7 @@ async fn application_uri(url: String) -> (String, Option<String>) {
         .await
         .unwrap_or_default();
     let port = Url::parse(&url).map(|url| url.port);
-    let of_port = |application: &&client::Application| {
+    let of_port = |application: &&client::FoundServer| {
         let ports = application
             .discovery_urls
             .iter()
@@ -256,12 +256,12 @@ struct Servers {
     known: BTreeMap<String, Server>,
     /// The names of the servers that are present for the reader.
     told: BTreeSet<String>,
-    outbox: VecDeque<Found>,
+    outbox: VecDeque<ServerChange>,
 }
 
 #[derive(Debug)]
 struct Server {
-    known: Known,
+    known: PresentServer,
     /// The mDNS instances of the server: a discovery server may announce it too.
     instances: BTreeSet<String>,
     /// Whether the query for the ApplicationUri has completed.
@@ -270,8 +270,8 @@ struct Server {
 
 impl Servers {
     /// Adds or changes a record. Returns the URL to query for the ApplicationUri.
-    fn seen(&mut self, announcement: Announcement, since: SystemTime) -> Option<String> {
-        let Announcement {
+    fn seen(&mut self, announcement: AnnouncedServer, since: SystemTime) -> Option<String> {
+        let AnnouncedServer {
             instance,
             url,
             capabilities,
@@ -281,7 +281,7 @@ impl Servers {
                 server.known.capabilities = capabilities;
                 let known = server.known.clone();
                 if server.asked {
-                    self.push(Found::Seen(known));
+                    self.push(ServerChange::Seen(known));
                 }
                 return None;
             }
@@ -307,7 +307,7 @@ impl Servers {
         } else {
             instance.clone()
         };
-        let known = Known {
+        let known = PresentServer {
             name: name.clone(),
             url: url.clone(),
             capabilities,
@@ -337,12 +337,12 @@ impl Servers {
         }
         let (after, asked) = (server.known.clone(), server.asked);
         self.known.insert(after.name.clone(), server);
-        self.push(Found::Gone {
+        self.push(ServerChange::Gone {
             known: before,
-            loss: Loss::Goodbye,
+            loss: ServerLoss::Goodbye,
         });
         if asked {
-            self.push(Found::Seen(after));
+            self.push(ServerChange::Seen(after));
         }
     }
 
@@ -352,11 +352,11 @@ impl Servers {
             server.known.application_uri = application_uri;
             server.asked = true;
             let known = server.known.clone();
-            self.push(Found::Seen(known));
+            self.push(ServerChange::Seen(known));
         }
     }
 
-    fn vanished(&mut self, instance: &str, loss: Loss) {
+    fn vanished(&mut self, instance: &str, loss: ServerLoss) {
         let Some((name, server)) = self.of_instance(instance) else {
             return;
         };
@@ -365,7 +365,7 @@ impl Servers {
             && let Some(server) = self.known.remove(&name)
         {
             let known = server.known;
-            self.push(Found::Gone { known, loss });
+            self.push(ServerChange::Gone { known, loss });
         }
     }
 
@@ -376,7 +376,7 @@ impl Servers {
             && server.asked
         {
             let known = server.known.clone();
-            self.push(Found::Seen(known));
+            self.push(ServerChange::Seen(known));
         }
     }
 
@@ -387,7 +387,7 @@ impl Servers {
             && server.asked
         {
             let known = server.known.clone();
-            self.push(Found::Seen(known));
+            self.push(ServerChange::Seen(known));
         }
     }
 
@@ -396,7 +396,7 @@ impl Servers {
             server.known.started = at.or(server.known.started);
             let known = server.known.clone();
             if server.asked {
-                self.push(Found::Restarted(known));
+                self.push(ServerChange::Restarted(known));
             }
         }
     }
@@ -414,33 +414,37 @@ impl Servers {
     }
 
     /// Queues a change for the reader, and replaces pending changes of the same server.
-    fn push(&mut self, found: Found) {
+    fn push(&mut self, found: ServerChange) {
         let name = found.known().name.clone();
-        let of_it = |waiting: &Found| waiting.known().name == name;
+        let of_it = |waiting: &ServerChange| waiting.known().name == name;
         let went = self
             .outbox
             .iter()
-            .find(|waiting| of_it(waiting) && matches!(waiting, Found::Gone { .. }));
+            .find(|waiting| of_it(waiting) && matches!(waiting, ServerChange::Gone { .. }));
         let went = went.cloned();
         self.outbox.retain(|waiting| !of_it(waiting));
         let told = self.told.contains(&name);
         match found {
-            Found::Gone { .. } if told => self.outbox.push_back(found),
+            ServerChange::Gone { .. } if told => self.outbox.push_back(found),
             // The server appeared and was lost before the reader received it.
-            Found::Gone { .. } => {}
-            Found::Seen(known) | Found::Restarted(known) if !told || went.is_some() => {
+            ServerChange::Gone { .. } => {}
+            ServerChange::Seen(known) | ServerChange::Restarted(known)
+                if !told || went.is_some() =>
+            {
                 self.outbox.extend(went);
-                self.outbox.push_back(Found::Seen(known));
+                self.outbox.push_back(ServerChange::Seen(known));
             }
-            Found::Seen(_) | Found::Restarted(_) => self.outbox.push_back(found),
+            ServerChange::Seen(_) | ServerChange::Restarted(_) => self.outbox.push_back(found),
         }
     }
 
-    fn next(&mut self) -> Option<Found> {
+    fn next(&mut self) -> Option<ServerChange> {
         let found = self.outbox.pop_front()?;
         match &found {
-            Found::Gone { known, .. } => self.told.remove(&known.name),
-            Found::Seen(known) | Found::Restarted(known) => self.told.insert(known.name.clone()),
+            ServerChange::Gone { known, .. } => self.told.remove(&known.name),
+            ServerChange::Seen(known) | ServerChange::Restarted(known) => {
+                self.told.insert(known.name.clone())
+            }
         };
         Some(found)
     }
@@ -450,8 +454,8 @@ impl Servers {
 mod tests {
     use super::*;
 
-    fn robot(instance: &str, port: u16) -> Announcement {
-        Announcement {
+    fn robot(instance: &str, port: u16) -> AnnouncedServer {
+        AnnouncedServer {
             instance: instance.to_owned(),
             url: format!("opc.tcp://127.0.0.1:{port}/"),
             capabilities: Vec::new(),
@@ -462,9 +466,9 @@ mod tests {
         let next = std::iter::from_fn(|| servers.next());
         next.map(|found| {
             let what = match &found {
-                Found::Seen(_) => "seen",
-                Found::Restarted(_) => "restarted",
-                Found::Gone { .. } => "gone",
+                ServerChange::Seen(_) => "seen",
+                ServerChange::Restarted(_) => "restarted",
+                ServerChange::Gone { .. } => "gone",
             };
             format!("{what} {}", found.known().name)
         })
@@ -472,7 +476,7 @@ mod tests {
     }
 
     /// Adds a server that has reported its ApplicationUri.
-    fn seen(servers: &mut Servers, announcement: Announcement) {
+    fn seen(servers: &mut Servers, announcement: AnnouncedServer) {
         let url = announcement.url.clone();
         if servers.seen(announcement, SystemTime::UNIX_EPOCH).is_some() {
             servers.answered(&url, Some("urn:robot".to_owned()));
@@ -485,9 +489,9 @@ mod tests {
         seen(&mut servers, robot("arm", 1));
         seen(&mut servers, robot("arm of the discovery server", 1));
         assert_eq!(told(&mut servers), ["seen arm"]);
-        servers.vanished("arm", Loss::Goodbye);
+        servers.vanished("arm", ServerLoss::Goodbye);
         assert!(told(&mut servers).is_empty());
-        servers.vanished("arm of the discovery server", Loss::Goodbye);
+        servers.vanished("arm of the discovery server", ServerLoss::Goodbye);
         assert_eq!(told(&mut servers), ["gone arm"]);
     }
 
@@ -495,12 +499,12 @@ mod tests {
     fn a_slow_reader_is_told_what_it_came_to() {
         let mut servers = Servers::default();
         seen(&mut servers, robot("brief", 2));
-        servers.vanished("brief", Loss::Unreachable);
+        servers.vanished("brief", ServerLoss::Unreachable);
         assert!(told(&mut servers).is_empty(), "it came and went meanwhile");
         seen(&mut servers, robot("arm", 1));
         assert_eq!(told(&mut servers), ["seen arm"]);
         servers.restarted("opc.tcp://127.0.0.1:1/", None);
-        servers.vanished("arm", Loss::Unreachable);
+        servers.vanished("arm", ServerLoss::Unreachable);
         seen(&mut servers, robot("arm", 1));
         servers.restarted("opc.tcp://127.0.0.1:1/", None);
         assert_eq!(
@@ -519,8 +523,8 @@ mod tests {
         assert_eq!(told(&mut servers), ["seen arm"]);
         seen(&mut servers, robot("arm", 1));
         assert_eq!(told(&mut servers), ["seen arm (2)", "gone arm", "seen arm"]);
-        servers.vanished("arm", Loss::Goodbye);
-        servers.vanished("arm (2)", Loss::Goodbye);
+        servers.vanished("arm", ServerLoss::Goodbye);
+        servers.vanished("arm (2)", ServerLoss::Goodbye);
         assert_eq!(told(&mut servers), ["gone arm", "gone arm (2)"]);
     }
 
@@ -529,7 +533,7 @@ mod tests {
         let mut servers = Servers::default();
         seen(&mut servers, robot("arm", 2));
         seen(&mut servers, robot("arm (2)", 2));
-        servers.vanished("arm", Loss::Goodbye);
+        servers.vanished("arm", ServerLoss::Goodbye);
         assert_eq!(told(&mut servers), ["seen arm"]);
         seen(&mut servers, robot("arm", 1));
         assert_eq!(told(&mut servers), ["seen arm (2)", "gone arm", "seen arm"]);

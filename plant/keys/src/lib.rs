@@ -11,7 +11,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use bridge_node::{Fetched, Fetching, KeyRequest, KeyService};
-use plant_opcua::client::{CallError, CallOptions, Client, ClientConfig, SecurityChoice};
+use plant_opcua::client::{CallError, CallOptions, ClientConfig, OpcUaClient, SecurityChoice};
 use plant_opcua::pki;
 use plant_opcua::types::{MethodId, NodeId, ObjectId, StatusCode, Variant};
 use tokio::sync::{mpsc, oneshot};
@@ -37,7 +37,7 @@ impl KeyArguments {
             root.with_file_name(format!("pki-{program}"))
         };
         let host = gethostname::gethostname().to_string_lossy().into_owned();
-        Arc::new(Service::new(Identity {
+        Arc::new(KeyFetcher::new(KeyClientIdentity {
             application_uri: format!("urn:{host}:ua-bridge:{program}"),
             application_name: program.to_owned(),
             pki: self.pki.clone().unwrap_or_else(usual),
@@ -47,7 +47,7 @@ impl KeyArguments {
 
 /// The identity of the program in its requests for keys.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Identity {
+pub struct KeyClientIdentity {
     /// The ApplicationUri, which is also in the certificate.
     pub application_uri: String,
     /// The ApplicationName.
@@ -57,8 +57,8 @@ pub struct Identity {
 }
 
 /// Fetches keys, one request after the other.
-pub struct Service {
-    identity: Identity,
+pub struct KeyFetcher {
+    identity: KeyClientIdentity,
     /// The sender to the fetching thread, once the thread is running.
     asked: Mutex<Option<mpsc::Sender<Asked>>>,
 }
@@ -68,10 +68,10 @@ struct Asked {
     answer: oneshot::Sender<Result<Fetched, String>>,
 }
 
-impl Service {
+impl KeyFetcher {
     /// Creates a service that requests keys as `identity`.
     #[must_use]
-    pub const fn new(identity: Identity) -> Self {
+    pub const fn new(identity: KeyClientIdentity) -> Self {
         Self {
             identity,
             asked: Mutex::new(None),
@@ -95,7 +95,7 @@ impl Service {
     }
 }
 
-impl fmt::Debug for Service {
+impl fmt::Debug for KeyFetcher {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.debug_struct("Service")
             .field("identity", &self.identity)
@@ -103,7 +103,7 @@ impl fmt::Debug for Service {
     }
 }
 
-impl KeyService for Service {
+impl KeyService for KeyFetcher {
     fn fetch<'a>(&'a self, request: &'a KeyRequest) -> Fetching<'a> {
         Box::pin(async move {
             let thread = self.thread()?;
@@ -118,7 +118,7 @@ impl KeyService for Service {
 }
 
 /// Fetches keys until all senders are dropped.
-fn serve(identity: &Identity, mut requests: mpsc::Receiver<Asked>) {
+fn serve(identity: &KeyClientIdentity, mut requests: mpsc::Receiver<Asked>) {
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_all()
         .build();
@@ -141,14 +141,14 @@ fn serve(identity: &Identity, mut requests: mpsc::Receiver<Asked>) {
 }
 
 /// Fetches keys in a session that is opened for the request and closed again.
-async fn fetch(identity: &Identity, request: &KeyRequest) -> Result<Fetched, String> {
+async fn fetch(identity: &KeyClientIdentity, request: &KeyRequest) -> Result<Fetched, String> {
     let config = ClientConfig {
         pki: Some(identity.pki.clone()),
         security: SecurityChoice::Basic256Sha256,
         timeout: WITHIN,
         ..ClientConfig::new(&identity.application_uri, &identity.application_name)
     };
-    let client = Client::open(config, &request.endpoint);
+    let client = OpcUaClient::open(config, &request.endpoint);
     let asked = async {
         client
             .up(LONGEST_CONNECT)

@@ -13,28 +13,28 @@ use oxigraph::sparql::results::QueryResultsFormat;
 use serde::Deserialize;
 use tokio::time::Instant;
 
-use crate::http::{Refusal, Site, content, json_page};
+use crate::http::{HttpRefusal, ServedSite, content, json_page};
 use crate::lanes::Lane;
-use crate::query::{Asked, Dataset, Formats, QueryFault, Results};
-use crate::shapes::{Check, Report, Shapes, Violation};
+use crate::query::{BoundedResults, Dataset, Formats, QueryFault, QueryOrQuestion};
+use crate::shapes::{Check, ShapeReport, Shapes, Violation};
 use crate::store::{Knowledge, KnowledgeFault};
 
-impl Site {
+impl ServedSite {
     /// Checks the knowledge against the shapes. The report is Turtle, or JSON if that is accepted.
     pub(crate) async fn report(
         &self,
         is_json: bool,
         peer: IpAddr,
-    ) -> Result<Response<Full<Bytes>>, Refusal> {
+    ) -> Result<Response<Full<Bytes>>, HttpRefusal> {
         let failed =
-            |what: String| Refusal::new(StatusCode::INTERNAL_SERVER_ERROR, "failed", &what);
+            |what: String| HttpRefusal::new(StatusCode::INTERNAL_SERVER_ERROR, "failed", &what);
         let knowledge = Arc::clone(self.queries.knowledge());
         let reading = tokio::task::spawn_blocking(move || compiled(&knowledge));
         let read = reading.await.map_err(|error| failed(error.to_string()))?;
         let (shapes, checks, unchecked) = read.map_err(|fault| failed(fault.to_string()))?;
-        let mut report = Report {
+        let mut report = ShapeReport {
             unchecked,
-            ..Report::default()
+            ..ShapeReport::default()
         };
         let end = Instant::now() + TIME;
         let mut size = 0;
@@ -43,7 +43,7 @@ impl Site {
                 report.not_checked(&check, "the time or the size of the report is over");
                 continue;
             }
-            let asked = Asked::Sparql(
+            let asked = QueryOrQuestion::Sparql(
                 check.query.clone(),
                 Dataset::default(),
                 Formats {
@@ -53,7 +53,7 @@ impl Site {
             );
             let running = self.queries.run(asked, Lane::Open(peer));
             match tokio::time::timeout_at(end, running).await {
-                Ok(Ok(Results::Written(_, rows))) => {
+                Ok(Ok(BoundedResults::Written(_, rows))) => {
                     size += rows.len();
                     let each = size_of_each(&check);
                     let reading = tokio::task::spawn_blocking(move || violations_in(&check, &rows));
@@ -85,7 +85,7 @@ fn compiled(knowledge: &Knowledge) -> Result<Compiled, KnowledgeFault> {
 }
 
 /// Writes a report, which takes long for many violations.
-fn page(report: &Report, shapes: &Shapes, is_json: bool) -> io::Result<Response<Full<Bytes>>> {
+fn page(report: &ShapeReport, shapes: &Shapes, is_json: bool) -> io::Result<Response<Full<Bytes>>> {
     if is_json {
         Ok(json_page(&report.json()))
     } else {
@@ -99,7 +99,7 @@ fn size_of_each(check: &Check) -> usize {
     check.shape.to_string().len() + check.message.len() + path
 }
 
-impl Report {
+impl ShapeReport {
     fn not_checked(&mut self, check: &Check, why: &str) {
         let Check {
             shape, component, ..

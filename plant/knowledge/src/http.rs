@@ -26,22 +26,24 @@ use tracing::debug;
 use uri_text::{is_loopback_host, unescaped};
 
 use crate::lanes::Lane;
-use crate::query::{Asked, Dataset, Formats, Limits, Queries, QueryFault, Results};
-use crate::question::{QUESTIONS, Question, QuestionFault};
+use crate::query::{
+    BoundedResults, Dataset, Formats, Queries, QueryFault, QueryLimits, QueryOrQuestion,
+};
+use crate::question::{NamedQuestion, QUESTIONS, QuestionFault};
 use crate::store::Knowledge;
 use crate::writes::{UPDATE, Writes, failed, media, updated};
 
 /// Additional pages by their path: JSON, or `None` for an unknown page.
-pub type Page = Arc<dyn Fn(&str) -> Option<String> + Send + Sync>;
+pub type ExtraPages = Arc<dyn Fn(&str) -> Option<String> + Send + Sync>;
 
 /// A listener that serves requests until it is dropped.
 #[derive(Debug)]
-pub struct Endpoint {
+pub struct HttpEndpoint {
     address: SocketAddr,
     task: JoinHandle<()>,
 }
 
-impl Endpoint {
+impl HttpEndpoint {
     /// Listens at a loopback address for queries; port 0 selects a free port.
     ///
     /// # Errors
@@ -49,8 +51,8 @@ impl Endpoint {
     pub async fn bind(
         address: SocketAddr,
         knowledge: Arc<Knowledge>,
-        limits: Limits,
-        page: Page,
+        limits: QueryLimits,
+        page: ExtraPages,
     ) -> io::Result<Self> {
         Self::bind_with(address, knowledge, limits, page, None).await
     }
@@ -62,8 +64,8 @@ impl Endpoint {
     pub async fn bind_with(
         address: SocketAddr,
         knowledge: Arc<Knowledge>,
-        limits: Limits,
-        page: Page,
+        limits: QueryLimits,
+        page: ExtraPages,
         writes: Option<Writes>,
     ) -> io::Result<Self> {
         if !address.ip().is_loopback() {
@@ -75,7 +77,7 @@ impl Endpoint {
         }
         let listener = TcpListener::bind(address).await?;
         let address = listener.local_addr()?;
-        let site = Site {
+        let site = ServedSite {
             queries: Queries::new(knowledge, limits),
             page,
             writes,
@@ -93,20 +95,20 @@ impl Endpoint {
     }
 }
 
-impl Drop for Endpoint {
+impl Drop for HttpEndpoint {
     fn drop(&mut self) {
         self.task.abort();
     }
 }
 
 #[derive(Clone)]
-pub(crate) struct Site {
+pub(crate) struct ServedSite {
     pub(crate) queries: Queries,
-    page: Page,
+    page: ExtraPages,
     pub(crate) writes: Option<Writes>,
 }
 
-async fn accept(listener: TcpListener, site: Site) {
+async fn accept(listener: TcpListener, site: ServedSite) {
     let places = Arc::new(Semaphore::new(MAX_CONNECTIONS));
     loop {
         // Beyond the limit a connection waits in the listener's queue.
@@ -134,14 +136,14 @@ async fn accept(listener: TcpListener, site: Site) {
     }
 }
 
-async fn serve(stream: TcpStream, peer: IpAddr, site: Site) {
+async fn serve(stream: TcpStream, peer: IpAddr, site: ServedSite) {
     let service = service_fn(|request| {
         let site = site.clone();
         async move {
             Ok::<_, Infallible>(
                 site.answer(request, peer)
                     .await
-                    .unwrap_or_else(Refusal::response),
+                    .unwrap_or_else(HttpRefusal::response),
             )
         }
     });
@@ -155,12 +157,12 @@ async fn serve(stream: TcpStream, peer: IpAddr, site: Site) {
     }
 }
 
-impl Site {
+impl ServedSite {
     async fn answer(
         &self,
         request: Request<Incoming>,
         peer: IpAddr,
-    ) -> Result<Response<Full<Bytes>>, Refusal> {
+    ) -> Result<Response<Full<Bytes>>, HttpRefusal> {
         is_local(&request)?;
         let path = request.uri().path().to_owned();
         match path.as_str() {
@@ -177,7 +179,7 @@ impl Site {
             _ => {}
         }
         if request.method() != Method::GET {
-            return Err(Refusal::method("GET"));
+            return Err(HttpRefusal::method("GET"));
         }
         let pairs = form(request.uri().query().unwrap_or_default())?;
         match path.as_str() {
@@ -195,7 +197,7 @@ impl Site {
                 Some(name) => self.question(name, pairs, accepted(&request)).await,
                 None => match self.made_page(path).await? {
                     Some(page) => Ok(content(JSON, page.into_bytes())),
-                    None => Err(Refusal::unknown(
+                    None => Err(HttpRefusal::unknown(
                         "there are /sparql, /update, /store, /sources, /check, /jobs, /ask, /ask/NAME, /graphs, /data, /report and /status here"
                             .to_owned(),
                     )),
@@ -205,14 +207,14 @@ impl Site {
     }
 
     /// Returns an additional page. All but the status may plan a process, which takes long.
-    async fn made_page(&self, path: &str) -> Result<Option<String>, Refusal> {
+    async fn made_page(&self, path: &str) -> Result<Option<String>, HttpRefusal> {
         let place = if path == STATUS {
             None
         } else {
             let place = self.queries.place(Lane::Plan).await;
             Some(place.map_err(|_busy| {
                 let why = "other plans are being made; ask again";
-                Refusal::new(StatusCode::SERVICE_UNAVAILABLE, "busy", why)
+                HttpRefusal::new(StatusCode::SERVICE_UNAVAILABLE, "busy", why)
             })?)
         };
         let (page, path) = (Arc::clone(&self.page), path.to_owned());
@@ -228,7 +230,7 @@ impl Site {
         &self,
         request: Request<Incoming>,
         peer: IpAddr,
-    ) -> Result<Response<Full<Bytes>>, Refusal> {
+    ) -> Result<Response<Full<Bytes>>, HttpRefusal> {
         if request.method() == Method::POST && media(&request) == UPDATE {
             return self.update(request).await;
         }
@@ -247,7 +249,7 @@ impl Site {
                 }
                 _ => {
                     let message = "a query is POSTed as application/sparql-query, or as query= in application/x-www-form-urlencoded";
-                    return Err(Refusal::new(
+                    return Err(HttpRefusal::new(
                         StatusCode::UNSUPPORTED_MEDIA_TYPE,
                         "media_type",
                         message,
@@ -255,14 +257,14 @@ impl Site {
                 }
             }
         } else if request.method() != Method::GET {
-            return Err(Refusal::method("GET, POST"));
+            return Err(HttpRefusal::method("GET, POST"));
         }
         let mut query = None;
         let mut dataset = Dataset::default();
         for (key, value) in pairs {
             match key.as_str() {
                 "query" if query.is_some() => {
-                    return Err(Refusal::malformed(
+                    return Err(HttpRefusal::malformed(
                         "there are two queries, and one is answered",
                     ));
                 }
@@ -274,12 +276,15 @@ impl Site {
             }
         }
         if dataset.default.len() + dataset.named.len() > MAX_GRAPHS {
-            return Err(Refusal::malformed("there are too many graphs"));
+            return Err(HttpRefusal::malformed("there are too many graphs"));
         }
         let query =
-            query.ok_or_else(|| Refusal::malformed("there is no query: give it as query="))?;
-        self.found(Asked::Sparql(query, dataset, formats), Lane::Open(peer))
-            .await
+            query.ok_or_else(|| HttpRefusal::malformed("there is no query: give it as query="))?;
+        self.found(
+            QueryOrQuestion::Sparql(query, dataset, formats),
+            Lane::Open(peer),
+        )
+        .await
     }
 
     async fn question(
@@ -287,14 +292,14 @@ impl Site {
         name: &str,
         pairs: Vec<(String, String)>,
         accepted: Vec<String>,
-    ) -> Result<Response<Full<Bytes>>, Refusal> {
+    ) -> Result<Response<Full<Bytes>>, HttpRefusal> {
         if let Some(name) = name.strip_suffix(".rq") {
             return Ok(content(
                 "application/sparql-query",
-                Question::of(name)?.sparql.as_bytes().to_vec(),
+                NamedQuestion::of(name)?.sparql.as_bytes().to_vec(),
             ));
         }
-        let question = Question::of(name)?;
+        let question = NamedQuestion::of(name)?;
         let sparql = question.with(&pairs)?;
         let formats = Formats::of(&accepted);
         // The first accepted of the two formats.
@@ -303,26 +308,26 @@ impl Site {
             .find(|media| QueryResultsFormat::from_media_type(media).is_some());
         let is_standard = wanted.is_some_and(|media| media != JSON);
         let asked = if is_standard {
-            Asked::Sparql(sparql, Dataset::default(), formats)
+            QueryOrQuestion::Sparql(sparql, Dataset::default(), formats)
         } else {
-            Asked::Question(question, sparql)
+            QueryOrQuestion::Question(question, sparql)
         };
         self.found(asked, Lane::Named).await
     }
 
     pub(crate) async fn found(
         &self,
-        asked: Asked,
+        asked: QueryOrQuestion,
         lane: Lane,
-    ) -> Result<Response<Full<Bytes>>, Refusal> {
+    ) -> Result<Response<Full<Bytes>>, HttpRefusal> {
         match self.queries.run(asked, lane).await? {
-            Results::Written(media, bytes) => Ok(content(media, bytes)),
-            Results::Answer(answer) => Ok(json_page(&json!(answer))),
-            Results::Updated(done) => Ok(updated(done.changed)),
+            BoundedResults::Written(media, bytes) => Ok(content(media, bytes)),
+            BoundedResults::Answer(answer) => Ok(json_page(&json!(answer))),
+            BoundedResults::Updated(done) => Ok(updated(done.changed)),
         }
     }
 
-    fn data(&self, pairs: &[(String, String)]) -> Result<Response<Full<Bytes>>, Refusal> {
+    fn data(&self, pairs: &[(String, String)]) -> Result<Response<Full<Bytes>>, HttpRefusal> {
         let graph = pairs
             .iter()
             .find(|(key, _)| key == "graph")
@@ -330,10 +335,10 @@ impl Site {
         let mut quads = Vec::new();
         match self.queries.knowledge().write_quads(graph, &mut quads) {
             Ok(Some(())) => Ok(content("application/n-quads", quads)),
-            Ok(None) => Err(Refusal::unknown(
+            Ok(None) => Err(HttpRefusal::unknown(
                 "there is no such graph; /graphs has those there are".to_owned(),
             )),
-            Err(error) => Err(Refusal::new(
+            Err(error) => Err(HttpRefusal::new(
                 StatusCode::INTERNAL_SERVER_ERROR,
                 "failed",
                 &error.to_string(),
@@ -365,14 +370,14 @@ impl Formats {
 
 /// Reason for refusing a request.
 #[derive(Debug)]
-pub(crate) struct Refusal {
+pub(crate) struct HttpRefusal {
     status: StatusCode,
     code: &'static str,
     message: String,
     allow: Option<&'static str>,
 }
 
-impl Refusal {
+impl HttpRefusal {
     pub(crate) fn new(status: StatusCode, code: &'static str, message: &str) -> Self {
         Self {
             status,
@@ -422,7 +427,7 @@ impl Refusal {
     }
 }
 
-impl From<QueryFault> for Refusal {
+impl From<QueryFault> for HttpRefusal {
     fn from(fault: QueryFault) -> Self {
         let (status, code) = match &fault {
             QueryFault::Malformed(_) | QueryFault::Graph(_) => {
@@ -446,7 +451,7 @@ impl From<QueryFault> for Refusal {
     }
 }
 
-impl From<QuestionFault> for Refusal {
+impl From<QuestionFault> for HttpRefusal {
     fn from(fault: QuestionFault) -> Self {
         match &fault {
             QuestionFault::Unknown { .. } => Self::unknown(fault.to_string()),
@@ -464,14 +469,14 @@ impl From<QuestionFault> for Refusal {
 
 /// Refuses all names except loopback names: a page of another site in a user's browser can reach
 /// loopback by a name that resolves to it.
-fn is_local(request: &Request<Incoming>) -> Result<(), Refusal> {
+fn is_local(request: &Request<Incoming>) -> Result<(), HttpRefusal> {
     let Some(host) = request.headers().get(HOST) else {
         return Ok(());
     };
     if is_loopback_host(host.to_str().unwrap_or_default()) {
         Ok(())
     } else {
-        Err(Refusal::new(
+        Err(HttpRefusal::new(
             StatusCode::MISDIRECTED_REQUEST,
             "host",
             "questions are answered on loopback, by 127.0.0.1, [::1] or localhost",
@@ -500,10 +505,10 @@ pub(crate) fn accepted(request: &Request<Incoming>) -> Vec<String> {
         .collect()
 }
 
-async fn body(request: Request<Incoming>, most: usize) -> Result<String, Refusal> {
+async fn body(request: Request<Incoming>, most: usize) -> Result<String, HttpRefusal> {
     let body = tokio::time::timeout(BODY_TIME, Limited::new(request.into_body(), most).collect());
     let body = body.await.map_err(|_late| {
-        Refusal::new(
+        HttpRefusal::new(
             StatusCode::REQUEST_TIMEOUT,
             "slow",
             "the request took too long to come",
@@ -514,23 +519,24 @@ async fn body(request: Request<Incoming>, most: usize) -> Result<String, Refusal
         Err(error) if error.is::<LengthLimitError>() => {
             return Err(QueryFault::TooLong { most }.into());
         }
-        Err(_) => return Err(Refusal::malformed("the request broke off")),
+        Err(_) => return Err(HttpRefusal::malformed("the request broke off")),
     };
-    String::from_utf8(bytes.into()).map_err(|_| Refusal::malformed("the request is not in UTF-8"))
+    String::from_utf8(bytes.into())
+        .map_err(|_| HttpRefusal::malformed("the request is not in UTF-8"))
 }
 
 /// Returns the pairs of a form or of the query of a URL.
-pub(crate) fn form(text: &str) -> Result<Vec<(String, String)>, Refusal> {
+pub(crate) fn form(text: &str) -> Result<Vec<(String, String)>, HttpRefusal> {
     let pairs: Vec<&str> = text.split('&').filter(|pair| !pair.is_empty()).collect();
     if pairs.len() > MAX_PAIRS {
-        return Err(Refusal::malformed("there are too many parameters"));
+        return Err(HttpRefusal::malformed("there are too many parameters"));
     }
     let pair = |pair: &&str| {
         let (key, value) = pair.split_once('=').unwrap_or((pair, ""));
         Some((unescaped(key)?, unescaped(value)?))
     };
     let pairs: Option<Vec<_>> = pairs.iter().map(pair).collect();
-    pairs.ok_or_else(|| Refusal::malformed("a parameter is not escaped as %XX of UTF-8"))
+    pairs.ok_or_else(|| HttpRefusal::malformed("a parameter is not escaped as %XX of UTF-8"))
 }
 
 /// Returns all questions with their parameters.

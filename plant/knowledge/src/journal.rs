@@ -15,27 +15,27 @@ use mtp::escaped;
 use oxigraph::io::{RdfFormat, RdfParser};
 use oxigraph::model::{Literal, Term, Triple};
 
-use crate::source::{Source, SourceKind};
+use crate::source::{KnowledgeSource, SourceKind};
 use crate::vocabulary;
-use crate::writing::Change;
+use crate::writing::GraphChange;
 
 /// An entry of the journal.
 #[derive(Debug, Clone, Copy)]
 pub(crate) enum Record<'a> {
     /// A source with all its statements.
     Put {
-        source: &'a Source,
+        source: &'a KnowledgeSource,
         at: u64,
         triples: &'a HashSet<Triple>,
     },
     /// A change of a source.
     Change {
-        source: &'a Source,
+        source: &'a KnowledgeSource,
         at: u64,
-        change: &'a Change,
+        change: &'a GraphChange,
     },
     /// The removal of a source.
-    Remove { source: &'a Source },
+    Remove { source: &'a KnowledgeSource },
 }
 
 /// A restored source.
@@ -49,7 +49,7 @@ pub(crate) struct Restored {
 /// The contents of a journal.
 #[derive(Debug, Default)]
 pub(crate) struct Contents {
-    pub(crate) graphs: BTreeMap<Source, Restored>,
+    pub(crate) graphs: BTreeMap<KnowledgeSource, Restored>,
     /// Number of bytes that could not be read.
     pub(crate) damaged: u64,
     /// Whether some records are outdated by later ones.
@@ -164,7 +164,7 @@ impl Journal {
     }
 
     /// Writes a new file without outdated records, and replaces the old one.
-    fn write_anew(&mut self, graphs: &BTreeMap<Source, Restored>) -> io::Result<()> {
+    fn write_anew(&mut self, graphs: &BTreeMap<KnowledgeSource, Restored>) -> io::Result<()> {
         let new = self.folder.join(NEW);
         let mut file = OpenOptions::new()
             .create(true)
@@ -237,7 +237,7 @@ impl Record<'_> {
 /// Ends the runs that were interrupted by the end of the program, and removes the oldest runs.
 fn settle(contents: &mut Contents) {
     let graphs = &mut contents.graphs;
-    let mut runs: Vec<(u64, Source)> = Vec::new();
+    let mut runs: Vec<(u64, KnowledgeSource)> = Vec::new();
     for (source, graph) in graphs.iter_mut() {
         if source.kind != SourceKind::Run {
             continue;
@@ -322,7 +322,7 @@ fn take(contents: &mut Contents, mut entry: &[u8]) -> Option<()> {
         let (statements, rest) = rest.split_at_checked(size.parse().ok()?)?;
         entry = rest;
         let kind: SourceKind = kind.parse().ok()?;
-        let source = Source::new(kind, &uri_text::unescaped(name)?);
+        let source = KnowledgeSource::new(kind, &uri_text::unescaped(name)?);
         let (at, removed): (u64, usize) = (at.parse().ok()?, removed.parse().ok()?);
         let triples = RdfParser::from_format(RdfFormat::NTriples).for_slice(statements);
         let mut triples = triples.map(|quad| quad.map(Triple::from).ok());
@@ -366,7 +366,7 @@ const SLACK: u64 = 64 << 20;
 mod tests {
     use super::*;
     use crate::source::UNNAMED;
-    use crate::store::{Knowledge, Lasting};
+    use crate::store::{Knowledge, SourceLifetime};
     use crate::test_folder;
 
     fn triple(subject: usize) -> Triple {
@@ -379,13 +379,13 @@ mod tests {
         )
     }
 
-    fn graph() -> Source {
-        Source::new(SourceKind::Graph, UNNAMED)
+    fn graph() -> KnowledgeSource {
+        KnowledgeSource::new(SourceKind::Graph, UNNAMED)
     }
 
     fn add(knowledge: &Knowledge, subject: usize) {
         let mut writing = knowledge.write().unwrap();
-        let change = Change {
+        let change = GraphChange {
             added: vec![triple(subject)],
             removed: Vec::new(),
         };
@@ -401,7 +401,9 @@ mod tests {
             add(&knowledge, 0);
             let mut writing = knowledge.write().unwrap();
             for (added, removed) in [(vec![triple(1)], vec![]), (vec![], vec![triple(1)])] {
-                writing.change(&graph(), Change { added, removed }).unwrap();
+                writing
+                    .change(&graph(), GraphChange { added, removed })
+                    .unwrap();
             }
             writing.commit(8).unwrap();
         }
@@ -456,7 +458,7 @@ mod tests {
         let folder = test_folder("journal-canonical");
         {
             let (knowledge, _) = Knowledge::open(&folder).unwrap();
-            let source = Source::new(SourceKind::Graph, "urn:g");
+            let source = KnowledgeSource::new(SourceKind::Graph, "urn:g");
             let put = |turtle| knowledge.take_turtle(&source, turtle, 1).unwrap();
             put("<urn:a> <urn:p> 02 , 2 , 3 .");
             let token = oxigraph::sparql::CancellationToken::new();
@@ -524,20 +526,21 @@ mod tests {
                 object: mtp::Object::Text(object.into()),
             }]
         };
-        let run = Source::new(SourceKind::Run, "a run: 100 % \u{fc}");
-        let gone = Source::new(SourceKind::Graph, "urn:gone");
+        let run = KnowledgeSource::new(SourceKind::Run, "a run: 100 % \u{fc}");
+        let gone = KnowledgeSource::new(SourceKind::Graph, "urn:gone");
         {
             let (knowledge, _) = Knowledge::open(&folder).unwrap();
             let lasting = |source, object| {
                 let statements = statement(object);
-                let replaced = knowledge.replace_with(source, &statements, (5, Lasting::Yes));
+                let replaced =
+                    knowledge.replace_with(source, &statements, (5, SourceLifetime::Yes));
                 replaced.unwrap();
             };
             lasting(&run, "done");
             lasting(&run, "running");
             lasting(&gone, "x");
             assert!(knowledge.remove(&gone).unwrap());
-            let component = Source::new(SourceKind::Component, "urn:component");
+            let component = KnowledgeSource::new(SourceKind::Component, "urn:component");
             knowledge.replace(&component, &statement("y"), 6).unwrap();
             assert!(Knowledge::open(&folder).is_err(), "the folder is in use");
         }

@@ -165,8 +165,8 @@ impl Lanes {
     }
 
     /// Returns a handle for the observer of a query.
-    pub(crate) fn watch(self: &Arc<Self>, seat: &Seat) -> Watch {
-        Watch {
+    pub(crate) fn watch(self: &Arc<Self>, seat: &Seat) -> QueryObserver {
+        QueryObserver {
             lanes: Arc::clone(self),
             number: seat.number,
         }
@@ -192,12 +192,12 @@ impl Drop for Seat {
 
 /// The observer of a running query.
 #[derive(Debug)]
-pub(crate) struct Watch {
+pub(crate) struct QueryObserver {
     lanes: Arc<Lanes>,
     number: u64,
 }
 
-impl Watch {
+impl QueryObserver {
     /// Moves a query that runs for `since` to a long place when its time in the quick place is
     /// over, which is earlier while other queries wait.
     ///
@@ -316,7 +316,7 @@ mod tests {
     const ONE: Lane = Lane::Open(IpAddr::V4(Ipv4Addr::LOCALHOST));
     const OTHER: Lane = Lane::Open(IpAddr::V4(Ipv4Addr::new(127, 0, 0, 2)));
 
-    async fn enter(lanes: &Arc<Lanes>, lane: Lane, text: &str) -> (Seat, Watch) {
+    async fn enter(lanes: &Arc<Lanes>, lane: Lane, text: &str) -> (Seat, QueryObserver) {
         let seat = lanes.enter(lane, text, Some(100)).await.unwrap();
         let watch = lanes.watch(&seat);
         (seat, watch)

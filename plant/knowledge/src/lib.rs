@@ -1,10 +1,10 @@
 //! The knowledge of the plant as RDF, and queries on it.
 //!
-//! [`Knowledge`] is a store in memory with a named graph per [`Source`]: a discovered component
-//! ([`ComponentFacts`]), a manifest of an MTP, a NodeSet ([`nodeset`]), a file of Turtle, a run of
-//! a process. Each graph is replaced as a whole when its source changes, and removed with its
-//! source. Queries are SPARQL ([`QUESTIONS`] are named queries); [`Endpoint`] serves them over
-//! HTTP, with limits of time, memory and size.
+//! [`Knowledge`] is a store in memory with a named graph per [`KnowledgeSource`]: a discovered
+//! component ([`ComponentFacts`]), a manifest of an MTP, a NodeSet ([`nodeset`]), a file of Turtle,
+//! a run of a process. Each graph is replaced as a whole when its source changes, and removed with
+//! its source. Queries are SPARQL ([`QUESTIONS`] are named queries); [`HttpEndpoint`] serves them
+//! over HTTP, with limits of time, memory and size.
 //!
 //! Users write graphs of their own by SPARQL 1.1 Update and the Graph Store Protocol. Lasting
 //! sources are stored in a journal.
@@ -40,13 +40,13 @@ mod writing;
 pub use component::{
     ComponentFacts, NodeName, OPC_UA, ParameterFacts, SkillFacts, TypeFacts, is_iri,
 };
-pub use http::{Endpoint, Page};
+pub use http::{ExtraPages, HttpEndpoint};
 pub use mtp::vocabulary;
-pub use query::Limits;
-pub use question::{Answer, QUESTIONS, Question, QuestionFault};
-pub use source::{Source, SourceKind};
-pub use store::{Knowledge, KnowledgeFault, Lasting, SourceStatus};
-pub use writes::{Jobs, May, SourceCheck, SourceFiles, SourceFinding, Writes};
+pub use query::QueryLimits;
+pub use question::{NamedQuestion, QUESTIONS, QuestionAnswer, QuestionFault};
+pub use source::{KnowledgeSource, SourceKind};
+pub use store::{Knowledge, KnowledgeFault, SourceLifetime, SourceStatus};
+pub use writes::{JobRunner, May, SourceCheck, SourceFiles, SourceFinding, Writes};
 
 /// Returns an empty folder for a test.
 #[cfg(test)]

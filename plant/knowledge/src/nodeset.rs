@@ -19,7 +19,7 @@ use crate::vocabulary as v;
 
 /// The contents of a NodeSet.
 #[derive(Debug, Clone, PartialEq)]
-pub struct NodeSet {
+pub struct NodeSetContents {
     /// The URI of its model, which is that of its namespace.
     pub namespace: String,
     /// The version of its model; empty if unknown.
@@ -31,7 +31,7 @@ pub struct NodeSet {
 /// Error of reading a NodeSet.
 #[derive(Debug, Clone, PartialEq, Eq, Error)]
 #[non_exhaustive]
-pub enum NodeSetFault {
+pub enum NodeSetReadFault {
     /// The file exceeds the limit.
     #[error("the file has {length} bytes, more than the {most} that are read")]
     TooLarge {
@@ -56,10 +56,10 @@ pub enum NodeSetFault {
 /// Reads the text of a NodeSet2 file.
 ///
 /// # Errors
-/// [`NodeSetFault`].
-pub fn read(xml: &str) -> Result<NodeSet, NodeSetFault> {
+/// [`NodeSetReadFault`].
+pub fn read(xml: &str) -> Result<NodeSetContents, NodeSetReadFault> {
     if xml.len() > MAX_FILE {
-        return Err(NodeSetFault::TooLarge {
+        return Err(NodeSetReadFault::TooLarge {
             length: xml.len(),
             most: MAX_FILE,
         });
@@ -70,7 +70,7 @@ pub fn read(xml: &str) -> Result<NodeSet, NodeSetFault> {
     let mut reading = Reading::default();
     loop {
         let event = reader.read_event();
-        let fault = |what: String| NodeSetFault::Xml {
+        let fault = |what: String| NodeSetReadFault::Xml {
             line: line(xml, reader.buffer_position()),
             what,
         };
@@ -102,7 +102,7 @@ pub fn read(xml: &str) -> Result<NodeSet, NodeSetFault> {
             Event::Empty(_) | Event::Comment(_) | Event::Decl(_) | Event::PI(_) => {}
         }
     }
-    reading.finish().ok_or(NodeSetFault::NoModel)
+    reading.finish().ok_or(NodeSetReadFault::NoModel)
 }
 
 #[derive(Debug, Default)]
@@ -238,7 +238,7 @@ impl Reading {
         }
     }
 
-    fn finish(self) -> Option<NodeSet> {
+    fn finish(self) -> Option<NodeSetContents> {
         let (namespace, version) = self.model.clone().filter(|(uri, _)| !uri.is_empty())?;
         let mut graph = Graph {
             reading: &self,
@@ -252,7 +252,7 @@ impl Reading {
         }
         graph.nodes();
         let triples = graph.all;
-        Some(NodeSet {
+        Some(NodeSetContents {
             namespace,
             version,
             triples,

@@ -16,7 +16,7 @@ use oxigraph::model::{Literal, NamedNode, Term, Triple};
 use roxmltree::{Document, Node, ParsingOptions};
 
 use crate::component::{NodeName, OPC_UA};
-use crate::nodeset::{MAX_FILE, MAX_NODES, NodeSetFault};
+use crate::nodeset::{MAX_FILE, MAX_NODES, NodeSetReadFault};
 use crate::vocabulary as v;
 
 /// A NodeSet as an ontology.
@@ -34,10 +34,10 @@ impl Ontology {
     /// Reads the text of a NodeSet2 file.
     ///
     /// # Errors
-    /// [`NodeSetFault`].
-    pub fn read(xml: &str) -> Result<Self, NodeSetFault> {
+    /// [`NodeSetReadFault`].
+    pub fn read(xml: &str) -> Result<Self, NodeSetReadFault> {
         if xml.len() > MAX_FILE {
-            return Err(NodeSetFault::TooLarge {
+            return Err(NodeSetReadFault::TooLarge {
                 length: xml.len(),
                 most: MAX_FILE,
             });
@@ -47,7 +47,7 @@ impl Ontology {
             ..ParsingOptions::default()
         };
         let document =
-            Document::parse_with_options(xml, options).map_err(|fault| NodeSetFault::Xml {
+            Document::parse_with_options(xml, options).map_err(|fault| NodeSetReadFault::Xml {
                 line: usize::try_from(fault.pos().row).unwrap_or_default(),
                 what: fault.to_string(),
             })?;
@@ -56,7 +56,7 @@ impl Ontology {
         let models: Vec<Node<'_, '_>> = models.collect();
         let model = models.first().and_then(|model| model.attribute("ModelUri"));
         let (true, Some(namespace)) = (root.tag_name().name() == "UANodeSet", model) else {
-            return Err(NodeSetFault::NoModel);
+            return Err(NodeSetReadFault::NoModel);
         };
         let mut reading = Reading {
             namespaces: texts(root, "NamespaceUris", "Uri"),
@@ -79,7 +79,7 @@ impl Ontology {
         for (number, node) in nodes.enumerate() {
             if number >= MAX_NODES {
                 let line = node.document().text_pos_at(node.range().start).row;
-                return Err(NodeSetFault::Xml {
+                return Err(NodeSetReadFault::Xml {
                     line: usize::try_from(line).unwrap_or_default(),
                     what: format!("there are more than {MAX_NODES} nodes"),
                 });

@@ -22,13 +22,13 @@ use tokio::time::Instant;
 
 use crate::bounds;
 use crate::lanes::{Lane, Lanes, Seat};
-use crate::question::{Answer, MOST_ROWS, Question};
+use crate::question::{MOST_ROWS, NamedQuestion, QuestionAnswer};
 use crate::store::{Knowledge, KnowledgeFault};
 use crate::update::{self, Updated};
 
 /// Limits of a query.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Limits {
+pub struct QueryLimits {
     /// Time limit.
     pub time: Duration,
     /// Maximum number of concurrent queries that take longer than a moment. A client can have half
@@ -44,7 +44,7 @@ pub struct Limits {
     pub memory: u64,
 }
 
-impl Default for Limits {
+impl Default for QueryLimits {
     fn default() -> Self {
         Self {
             time: Duration::from_secs(10),
@@ -78,11 +78,11 @@ pub(crate) struct Formats {
 
 /// Result of a query.
 #[derive(Debug, Clone, PartialEq)]
-pub(crate) enum Results {
+pub(crate) enum BoundedResults {
     /// Encoded result of SELECT, ASK, CONSTRUCT or DESCRIBE, with its media type.
     Written(&'static str, Vec<u8>),
     /// Result of a named question.
-    Answer(Answer),
+    Answer(QuestionAnswer),
     /// Result of an update.
     Updated(Updated),
 }
@@ -163,11 +163,11 @@ pub(crate) enum QueryFault {
 
 /// A query or question.
 #[derive(Debug, Clone)]
-pub(crate) enum Asked {
+pub(crate) enum QueryOrQuestion {
     /// A query of a client.
     Sparql(String, Dataset, Formats),
     /// A question with its parameters filled in, for an answer in plain JSON.
-    Question(Question, String),
+    Question(NamedQuestion, String),
     /// An update at a time in milliseconds since 1970.
     Update(String, u64),
 }
@@ -192,12 +192,12 @@ impl From<KnowledgeFault> for QueryFault {
 #[derive(Debug, Clone)]
 pub(crate) struct Queries {
     knowledge: Arc<Knowledge>,
-    limits: Limits,
+    limits: QueryLimits,
     lanes: Arc<Lanes>,
 }
 
 impl Queries {
-    pub(crate) fn new(knowledge: Arc<Knowledge>, limits: Limits) -> Self {
+    pub(crate) fn new(knowledge: Arc<Knowledge>, limits: QueryLimits) -> Self {
         Self {
             knowledge,
             limits,
@@ -205,7 +205,7 @@ impl Queries {
         }
     }
 
-    pub(crate) fn limits(&self) -> Limits {
+    pub(crate) fn limits(&self) -> QueryLimits {
         self.limits
     }
 
@@ -222,20 +222,24 @@ impl Queries {
     }
 
     /// Runs a query. Dropping the future stops the query.
-    pub(crate) async fn run(&self, asked: Asked, lane: Lane) -> Result<Results, QueryFault> {
+    pub(crate) async fn run(
+        &self,
+        asked: QueryOrQuestion,
+        lane: Lane,
+    ) -> Result<BoundedResults, QueryFault> {
         let limits = self.limits;
         let text = match &asked {
-            Asked::Sparql(query, ..) if query.len() > limits.query => {
+            QueryOrQuestion::Sparql(query, ..) if query.len() > limits.query => {
                 return Err(QueryFault::TooLong { most: limits.query });
             }
-            Asked::Update(text, _) if text.len() > LARGEST_UPDATE => {
+            QueryOrQuestion::Update(text, _) if text.len() > LARGEST_UPDATE => {
                 return Err(QueryFault::TooLong {
                     most: LARGEST_UPDATE,
                 });
             }
-            Asked::Sparql(text, ..) | Asked::Question(_, text) | Asked::Update(text, _) => {
-                text.clone()
-            }
+            QueryOrQuestion::Sparql(text, ..)
+            | QueryOrQuestion::Question(_, text)
+            | QueryOrQuestion::Update(text, _) => text.clone(),
         };
         let seat = self.lanes.enter(lane, &text, resident()).await?;
         let watch = self.lanes.watch(&seat);
@@ -318,25 +322,25 @@ fn parsed(text: &str) -> Result<spargebra::Query, QueryFault> {
 
 struct Work {
     knowledge: Arc<Knowledge>,
-    asked: Asked,
-    limits: Limits,
+    asked: QueryOrQuestion,
+    limits: QueryLimits,
     token: CancellationToken,
 }
 
 impl Work {
-    fn run(self) -> Result<Results, QueryFault> {
+    fn run(self) -> Result<BoundedResults, QueryFault> {
         let evaluator = SparqlEvaluator::new().with_cancellation_token(self.token.clone());
         let (text, dataset) = match &self.asked {
-            Asked::Sparql(text, dataset, _) => (text, dataset.clone()),
-            Asked::Question(_, text) => (text, Dataset::default()),
-            Asked::Update(text, at) => {
+            QueryOrQuestion::Sparql(text, dataset, _) => (text, dataset.clone()),
+            QueryOrQuestion::Question(_, text) => (text, Dataset::default()),
+            QueryOrQuestion::Update(text, at) => {
                 let update = update::read(text)?;
                 return match self.knowledge.update(&update, &self.token, *at) {
                     Err(QueryFault::Failed(_)) if self.token.is_cancelled() => {
                         let limit = self.limits.time;
                         Err(QueryFault::Time { limit })
                     }
-                    updated => updated.map(Results::Updated),
+                    updated => updated.map(BoundedResults::Updated),
                 };
             }
         };
@@ -368,42 +372,44 @@ impl Work {
             .execute()
             .map_err(|error| self.fault(&error))?;
         match (results, &self.asked) {
-            (QueryResults::Solutions(solutions), Asked::Question(question, _)) => {
+            (QueryResults::Solutions(solutions), QueryOrQuestion::Question(question, _)) => {
                 let answer = question.answer(solutions);
                 let answer = answer.map_err(|error| self.fault(&error))?;
                 if answer.rows.len() < MOST_ROWS {
-                    Ok(Results::Answer(answer))
+                    Ok(BoundedResults::Answer(answer))
                 } else {
                     Err(self.too_much())
                 }
             }
-            (QueryResults::Solutions(solutions), Asked::Sparql(.., formats)) => self.solutions(
-                solutions,
-                formats
-                    .solutions
-                    .ok_or(QueryFault::NotAcceptable("SELECT"))?,
-            ),
-            (QueryResults::Boolean(value), Asked::Sparql(.., formats)) => {
+            (QueryResults::Solutions(solutions), QueryOrQuestion::Sparql(.., formats)) => self
+                .solutions(
+                    solutions,
+                    formats
+                        .solutions
+                        .ok_or(QueryFault::NotAcceptable("SELECT"))?,
+                ),
+            (QueryResults::Boolean(value), QueryOrQuestion::Sparql(.., formats)) => {
                 let format = formats.solutions.ok_or(QueryFault::NotAcceptable("ASK"))?;
                 let written = QueryResultsSerializer::from_format(format)
                     .serialize_boolean_to_writer(Vec::new(), value);
                 written
-                    .map(|bytes| Results::Written(format.media_type(), bytes))
+                    .map(|bytes| BoundedResults::Written(format.media_type(), bytes))
                     .map_err(|error| self.broken(&error))
             }
-            (QueryResults::Graph(triples), Asked::Sparql(.., formats)) => self.triples(
+            (QueryResults::Graph(triples), QueryOrQuestion::Sparql(.., formats)) => self.triples(
                 triples,
                 formats
                     .triples
                     .ok_or(QueryFault::NotAcceptable("CONSTRUCT"))?,
             ),
-            (_, Asked::Update(..)) => Err(QueryFault::ReadOnly),
-            (QueryResults::Boolean(_) | QueryResults::Graph(_), Asked::Question(question, _)) => {
-                Err(QueryFault::Failed(format!(
-                    "the question `{}` is no SELECT",
-                    question.name
-                )))
-            }
+            (_, QueryOrQuestion::Update(..)) => Err(QueryFault::ReadOnly),
+            (
+                QueryResults::Boolean(_) | QueryResults::Graph(_),
+                QueryOrQuestion::Question(question, _),
+            ) => Err(QueryFault::Failed(format!(
+                "the question `{}` is no SELECT",
+                question.name
+            ))),
         }
     }
 
@@ -411,7 +417,7 @@ impl Work {
         &self,
         solutions: QuerySolutionIter<'_>,
         format: QueryResultsFormat,
-    ) -> Result<Results, QueryFault> {
+    ) -> Result<BoundedResults, QueryFault> {
         let to = Bounded {
             bytes: Vec::new(),
             most: self.limits.bytes,
@@ -430,14 +436,14 @@ impl Work {
                 .map_err(|error| self.broken(&error))?;
         }
         let to = writer.finish().map_err(|error| self.broken(&error))?;
-        Ok(Results::Written(format.media_type(), to.bytes))
+        Ok(BoundedResults::Written(format.media_type(), to.bytes))
     }
 
     fn triples(
         &self,
         triples: QueryTripleIter<'_>,
         format: RdfFormat,
-    ) -> Result<Results, QueryFault> {
+    ) -> Result<BoundedResults, QueryFault> {
         let mut to = RdfSerializer::from_format(format).for_writer(Bounded {
             bytes: Vec::new(),
             most: self.limits.bytes,
@@ -451,7 +457,7 @@ impl Work {
                 .map_err(|error| self.broken(&error))?;
         }
         let to = to.finish().map_err(|error| self.broken(&error))?;
-        Ok(Results::Written(format.media_type(), to.bytes))
+        Ok(BoundedResults::Written(format.media_type(), to.bytes))
     }
 
     fn fault(&self, error: &QueryEvaluationError) -> QueryFault {
@@ -522,7 +528,7 @@ mod tests {
     use std::net::Ipv4Addr;
 
     use super::*;
-    use crate::source::{Source, SourceKind};
+    use crate::source::{KnowledgeSource, SourceKind};
 
     /// Queries that work on tuples without reading statements, or hold many tuples.
     const LONG: [&str; 9] = [
@@ -543,11 +549,11 @@ mod tests {
         let many: String = (0..3000)
             .map(|number| format!("<urn:s{number}> <urn:p> <urn:s{}> .\n", (number * 7) % 3000))
             .collect();
-        let source = Source::new(SourceKind::File, "many");
+        let source = KnowledgeSource::new(SourceKind::File, "many");
         knowledge.replace_turtle(&source, &many, 5).unwrap();
-        let limits = Limits {
+        let limits = QueryLimits {
             time: Duration::from_millis(1000),
-            ..Limits::default()
+            ..QueryLimits::default()
         };
         let queries = Queries::new(knowledge, limits);
         let formats = Formats {
@@ -555,7 +561,7 @@ mod tests {
             triples: None,
         };
         for text in LONG {
-            let asked = Asked::Sparql(text.to_owned(), Dataset::default(), formats);
+            let asked = QueryOrQuestion::Sparql(text.to_owned(), Dataset::default(), formats);
             let result = queries.run(asked, Lane::Open(Ipv4Addr::LOCALHOST.into()));
             let fault = result.await.unwrap_err();
             let is_stopped = matches!(

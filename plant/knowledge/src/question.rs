@@ -12,7 +12,7 @@ use crate::store::Knowledge;
 
 /// A question with a name.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Question {
+pub struct NamedQuestion {
     /// Its name.
     pub name: &'static str,
     /// Its SPARQL, a complete query for any SPARQL endpoint. Lines that begin with `#:` contain its
@@ -22,7 +22,7 @@ pub struct Question {
 
 /// The answer: rows in order, each with all columns.
 #[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct Answer {
+pub struct QuestionAnswer {
     /// The name of the question.
     pub question: String,
     /// The names of the columns in order.
@@ -74,138 +74,138 @@ pub enum QuestionFault {
 }
 
 /// All questions, by their names.
-pub const QUESTIONS: &[Question] = &[
-    Question {
+pub const QUESTIONS: &[NamedQuestion] = &[
+    NamedQuestion {
         name: "access-of",
         sparql: include_str!("../queries/access-of.rq"),
     },
-    Question {
+    NamedQuestion {
         name: "action-parameters",
         sparql: include_str!("../queries/action-parameters.rq"),
     },
-    Question {
+    NamedQuestion {
         name: "actions",
         sparql: include_str!("../queries/actions.rq"),
     },
-    Question {
+    NamedQuestion {
         name: "candidates",
         sparql: include_str!("../queries/candidates.rq"),
     },
-    Question {
+    NamedQuestion {
         name: "commands",
         sparql: include_str!("../queries/commands.rq"),
     },
-    Question {
+    NamedQuestion {
         name: "components",
         sparql: include_str!("../queries/components.rq"),
     },
-    Question {
+    NamedQuestion {
         name: "components-of",
         sparql: include_str!("../queries/components-of.rq"),
     },
-    Question {
+    NamedQuestion {
         name: "goals",
         sparql: include_str!("../queries/goals.rq"),
     },
-    Question {
+    NamedQuestion {
         name: "modules-with",
         sparql: include_str!("../queries/modules-with.rq"),
     },
-    Question {
+    NamedQuestion {
         name: "objects",
         sparql: include_str!("../queries/objects.rq"),
     },
-    Question {
+    NamedQuestion {
         name: "outputs-of",
         sparql: include_str!("../queries/outputs-of.rq"),
     },
-    Question {
+    NamedQuestion {
         name: "parameters",
         sparql: include_str!("../queries/parameters.rq"),
     },
-    Question {
+    NamedQuestion {
         name: "parameters-of",
         sparql: include_str!("../queries/parameters-of.rq"),
     },
-    Question {
+    NamedQuestion {
         name: "process-conditions",
         sparql: include_str!("../queries/process-conditions.rq"),
     },
-    Question {
+    NamedQuestion {
         name: "process-loops",
         sparql: include_str!("../queries/process-loops.rq"),
     },
-    Question {
+    NamedQuestion {
         name: "process-parameters",
         sparql: include_str!("../queries/process-parameters.rq"),
     },
-    Question {
+    NamedQuestion {
         name: "process-steps",
         sparql: include_str!("../queries/process-steps.rq"),
     },
-    Question {
+    NamedQuestion {
         name: "processes",
         sparql: include_str!("../queries/processes.rq"),
     },
-    Question {
+    NamedQuestion {
         name: "run-steps",
         sparql: include_str!("../queries/run-steps.rq"),
     },
-    Question {
+    NamedQuestion {
         name: "run-values",
         sparql: include_str!("../queries/run-values.rq"),
     },
-    Question {
+    NamedQuestion {
         name: "runs",
         sparql: include_str!("../queries/runs.rq"),
     },
-    Question {
+    NamedQuestion {
         name: "services-of",
         sparql: include_str!("../queries/services-of.rq"),
     },
-    Question {
+    NamedQuestion {
         name: "skills",
         sparql: include_str!("../queries/skills.rq"),
     },
-    Question {
+    NamedQuestion {
         name: "skills-for",
         sparql: include_str!("../queries/skills-for.rq"),
     },
-    Question {
+    NamedQuestion {
         name: "sources",
         sparql: include_str!("../queries/sources.rq"),
     },
-    Question {
+    NamedQuestion {
         name: "state-of",
         sparql: include_str!("../queries/state-of.rq"),
     },
-    Question {
+    NamedQuestion {
         name: "transitions-now",
         sparql: include_str!("../queries/transitions-now.rq"),
     },
-    Question {
+    NamedQuestion {
         name: "types",
         sparql: include_str!("../queries/types.rq"),
     },
-    Question {
+    NamedQuestion {
         name: "what-can-hold",
         sparql: include_str!("../queries/what-can-hold.rq"),
     },
-    Question {
+    NamedQuestion {
         name: "what-can-run",
         sparql: include_str!("../queries/what-can-run.rq"),
     },
-    Question {
+    NamedQuestion {
         name: "where-is",
         sparql: include_str!("../queries/where-is.rq"),
     },
-    Question {
+    NamedQuestion {
         name: "who-provides",
         sparql: include_str!("../queries/who-provides.rq"),
     },
 ];
 
-impl Question {
+impl NamedQuestion {
     /// Returns the question of a name.
     ///
     /// # Errors
@@ -295,7 +295,7 @@ impl Question {
     pub(crate) fn answer(
         self,
         solutions: QuerySolutionIter<'_>,
-    ) -> Result<Answer, QueryEvaluationError> {
+    ) -> Result<QuestionAnswer, QueryEvaluationError> {
         let columns: Vec<String> = solutions
             .variables()
             .iter()
@@ -327,7 +327,7 @@ impl Question {
                 .map(key)
                 .collect::<Vec<_>>()
         });
-        Ok(Answer {
+        Ok(QuestionAnswer {
             question: self.name.to_owned(),
             columns,
             rows,
@@ -345,8 +345,8 @@ impl Knowledge {
         &self,
         name: &str,
         parameters: &[(String, String)],
-    ) -> Result<Answer, QuestionFault> {
-        let question = Question::of(name)?;
+    ) -> Result<QuestionAnswer, QuestionFault> {
+        let question = NamedQuestion::of(name)?;
         let sparql = question.with(parameters)?;
         let fault = |why: String| QuestionFault::Sparql {
             question: question.name,
@@ -373,7 +373,7 @@ impl Knowledge {
     }
 }
 
-impl Answer {
+impl QuestionAnswer {
     /// Returns the text in a row; empty if missing.
     #[must_use]
     pub fn text<'a>(row: &'a BTreeMap<String, Value>, column: &str) -> &'a str {

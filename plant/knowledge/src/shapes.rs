@@ -14,7 +14,7 @@ use oxigraph::model::{GraphNameRef, NamedNodeRef, NamedOrBlankNode, Term, Triple
 use crate::store::{Knowledge, KnowledgeFault};
 
 pub(crate) use compile::Check;
-pub(crate) use report::{Report, Violation};
+pub(crate) use report::{ShapeReport, Violation};
 
 /// The statements of shapes.
 #[derive(Debug, Default)]

@@ -8,7 +8,7 @@ use serde::Serialize;
 
 /// A source of statements, which names its graph.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash)]
-pub struct Source {
+pub struct KnowledgeSource {
     /// Its kind.
     pub kind: SourceKind,
     /// Its name: an ApplicationUri, a namespace URI, or the name of a file.
@@ -39,7 +39,7 @@ pub enum SourceKind {
     Derived,
 }
 
-impl Source {
+impl KnowledgeSource {
     /// Creates a source of a kind with a name.
     #[must_use]
     pub fn new(kind: SourceKind, name: &str) -> Self {

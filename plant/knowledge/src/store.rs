@@ -17,10 +17,10 @@ use thiserror::Error;
 use tokio::sync::watch;
 
 use crate::journal::Journal;
-use crate::rules::apply::{Derived, Rules};
-use crate::source::{Source, SourceKind};
+use crate::rules::apply::{Derived, StoreRules};
+use crate::source::{KnowledgeSource, SourceKind};
 use crate::vocabulary;
-use crate::writing::{Change, Writing, derive};
+use crate::writing::{GraphChange, StoreChange, derive};
 
 /// Error of adding data to the store.
 #[derive(Debug, Error)]
@@ -73,21 +73,21 @@ pub enum KnowledgeFault {
 pub struct Knowledge {
     store: Store,
     /// Serializes the writers.
-    written: Mutex<Written>,
+    written: Mutex<WrittenSources>,
     changed: watch::Sender<u64>,
 }
 
 /// The sources of the statements, and the journal of the lasting sources.
 #[derive(Debug, Default)]
-pub(crate) struct Written {
-    pub(crate) sources: BTreeMap<Source, SourceStatus>,
+pub(crate) struct WrittenSources {
+    pub(crate) sources: BTreeMap<KnowledgeSource, SourceStatus>,
     pub(crate) journal: Option<Journal>,
-    pub(crate) rules: Rules,
+    pub(crate) rules: StoreRules,
 }
 
 /// Whether a source outlasts the program.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Lasting {
+pub enum SourceLifetime {
     /// It is read again from its origin when the program starts.
     No,
     /// It is stored, if the knowledge has a journal.
@@ -147,7 +147,7 @@ impl Knowledge {
             status.lasting = true;
         }
         written.journal = Some(journal);
-        knowledge.derive_anew(&mut written, Rules::Off)?;
+        knowledge.derive_anew(&mut written, StoreRules::Off)?;
         drop(written);
         Ok((knowledge, restored.damaged))
     }
@@ -160,9 +160,11 @@ impl Knowledge {
     pub fn set_rules(&self, are_on: bool) -> Result<(), KnowledgeFault> {
         let mut written = self.written();
         let rules = match (are_on, &written.rules) {
-            (true, Rules::Off) => Rules::Suspended,
-            (false, Rules::On(_) | Rules::Suspended) => Rules::Off,
-            (true, Rules::On(_) | Rules::Suspended) | (false, Rules::Off) => return Ok(()),
+            (true, StoreRules::Off) => StoreRules::Suspended,
+            (false, StoreRules::On(_) | StoreRules::Suspended) => StoreRules::Off,
+            (true, StoreRules::On(_) | StoreRules::Suspended) | (false, StoreRules::Off) => {
+                return Ok(());
+            }
         };
         self.derive_anew(&mut written, rules)?;
         drop(written);
@@ -176,7 +178,11 @@ impl Knowledge {
         self.written().rules.name()
     }
 
-    fn derive_anew(&self, written: &mut Written, rules: Rules) -> Result<(), KnowledgeFault> {
+    fn derive_anew(
+        &self,
+        written: &mut WrittenSources,
+        rules: StoreRules,
+    ) -> Result<(), KnowledgeFault> {
         let mut transaction = self.store.start_transaction()?;
         let derived = rules.anew(&transaction)?;
         derive(&mut transaction, &derived)?;
@@ -196,11 +202,11 @@ impl Knowledge {
     /// [`KnowledgeFault`]; then nothing has changed.
     pub fn replace(
         &self,
-        source: &Source,
+        source: &KnowledgeSource,
         statements: &[Statement],
         at: u64,
     ) -> Result<(), KnowledgeFault> {
-        self.replace_with(source, statements, (at, Lasting::No))
+        self.replace_with(source, statements, (at, SourceLifetime::No))
     }
 
     /// Replaces the statements of a source, and stores them if the source lasts.
@@ -209,9 +215,9 @@ impl Knowledge {
     /// [`KnowledgeFault`]; then nothing has changed.
     pub fn replace_with(
         &self,
-        source: &Source,
+        source: &KnowledgeSource,
         statements: &[Statement],
-        (at, lasting): (u64, Lasting),
+        (at, lasting): (u64, SourceLifetime),
     ) -> Result<(), KnowledgeFault> {
         let triples = statements.iter().map(triple);
         self.put(source, triples.collect::<Result<_, _>>()?, (at, lasting))
@@ -223,12 +229,12 @@ impl Knowledge {
     /// [`KnowledgeFault`]; then nothing has changed.
     pub fn replace_turtle(
         &self,
-        source: &Source,
+        source: &KnowledgeSource,
         turtle: &str,
         at: u64,
     ) -> Result<(), KnowledgeFault> {
         let triples = parsed(RdfFormat::Turtle, turtle.as_bytes())?;
-        self.put(source, triples, (at, Lasting::No))
+        self.put(source, triples, (at, SourceLifetime::No))
     }
 
     /// Adds the statements of a document to a source, or replaces those of the source, and stores
@@ -238,7 +244,7 @@ impl Knowledge {
     /// [`KnowledgeFault`]; then nothing has changed.
     pub(crate) fn take(
         &self,
-        source: &Source,
+        source: &KnowledgeSource,
         (format, document): (RdfFormat, &[u8]),
         adds: bool,
         at: u64,
@@ -246,7 +252,7 @@ impl Knowledge {
         let triples = parsed(format, document)?;
         let is_new = !self.written().sources.contains_key(source);
         if adds {
-            let change = Change {
+            let change = GraphChange {
                 removed: Vec::new(),
                 added: triples.into_iter().collect(),
             };
@@ -254,7 +260,7 @@ impl Knowledge {
             writing.change(source, change)?;
             writing.commit(at)?;
         } else {
-            self.put(source, triples, (at, Lasting::Yes))?;
+            self.put(source, triples, (at, SourceLifetime::Yes))?;
         }
         Ok(is_new)
     }
@@ -265,7 +271,7 @@ impl Knowledge {
     /// [`KnowledgeFault`]; then nothing has changed.
     pub fn take_turtle(
         &self,
-        source: &Source,
+        source: &KnowledgeSource,
         turtle: &str,
         at: u64,
     ) -> Result<(), KnowledgeFault> {
@@ -285,13 +291,13 @@ impl Knowledge {
     ///
     /// # Errors
     /// [`KnowledgeFault`]; then nothing has changed.
-    pub fn remove(&self, source: &Source) -> Result<bool, KnowledgeFault> {
+    pub fn remove(&self, source: &KnowledgeSource) -> Result<bool, KnowledgeFault> {
         let mut writing = self.write()?;
         if !writing.written.sources.contains_key(source) {
             return Ok(false);
         }
         let of_graph = writing.triples(source)?;
-        let change = Change {
+        let change = GraphChange {
             removed: of_graph.into_iter().collect(),
             added: Vec::new(),
         };
@@ -306,7 +312,7 @@ impl Knowledge {
         self.written().sources.values().cloned().collect()
     }
 
-    fn written(&self) -> MutexGuard<'_, Written> {
+    fn written(&self) -> MutexGuard<'_, WrittenSources> {
         self.written.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
@@ -314,11 +320,11 @@ impl Knowledge {
     ///
     /// # Errors
     /// [`KnowledgeFault::Store`].
-    pub(crate) fn write(&self) -> Result<Writing<'_>, KnowledgeFault> {
+    pub(crate) fn write(&self) -> Result<StoreChange<'_>, KnowledgeFault> {
         // The sources are locked first: a transaction waits for others without end.
         let written = self.written();
         let transaction = self.store.start_transaction()?;
-        Ok(Writing::new(written, transaction, &self.changed))
+        Ok(StoreChange::new(written, transaction, &self.changed))
     }
 
     /// Returns the IRI of a type by its namespace and BrowseName, if a source has it.
@@ -413,9 +419,9 @@ impl Knowledge {
 
     fn put(
         &self,
-        source: &Source,
+        source: &KnowledgeSource,
         triples: HashSet<Triple>,
-        (at, lasting): (u64, Lasting),
+        (at, lasting): (u64, SourceLifetime),
     ) -> Result<(), KnowledgeFault> {
         if triples.len() > MAX_STATEMENTS {
             return Err(KnowledgeFault::TooMany {
@@ -429,10 +435,10 @@ impl Knowledge {
     }
 }
 
-impl Written {
+impl WrittenSources {
     /// Updates the rules and the status of the derived statements.
     pub(crate) fn derived(&mut self, change: Derived) {
-        let derived = Source::new(SourceKind::Derived, "");
+        let derived = KnowledgeSource::new(SourceKind::Derived, "");
         let since_ms = self.sources.values().map(|source| source.since_ms).min();
         let known = self.sources.get(&derived);
         let known = known.map_or(0, |known| known.statements);
@@ -447,7 +453,7 @@ impl Written {
 }
 
 impl SourceStatus {
-    pub(crate) fn new(source: &Source, at: u64) -> Self {
+    pub(crate) fn new(source: &KnowledgeSource, at: u64) -> Self {
         Self {
             graph: source.graph(),
             kind: source.kind,
@@ -530,7 +536,7 @@ mod tests {
     #[test]
     fn literals_that_are_not_canonical_stay_when_their_source_is_replaced() {
         let knowledge = Knowledge::new().unwrap();
-        let source = Source::new(SourceKind::File, "times.ttl");
+        let source = KnowledgeSource::new(SourceKind::File, "times.ttl");
         let literals = [
             r#""2026-11-27T10:00:00.120Z"^^xsd:dateTime"#,
             r#""2026-11-27T10:00:01.000Z"^^xsd:dateTime"#,

@@ -18,9 +18,9 @@ use spargebra::{GraphUpdateOperation, Query, SparqlParser, Update};
 
 use crate::bounds;
 use crate::query::QueryFault;
-use crate::source::{Source, SourceKind, UNNAMED};
+use crate::source::{KnowledgeSource, SourceKind, UNNAMED};
 use crate::store::{Knowledge, KnowledgeFault};
-use crate::writing::{Change, Writing};
+use crate::writing::{GraphChange, StoreChange};
 
 /// Number of statements that an update changed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -54,11 +54,11 @@ pub(crate) fn read(text: &str) -> Result<Update, QueryFault> {
 ///
 /// # Errors
 /// [`KnowledgeFault::Protected`].
-pub(crate) fn writable(graph: &str) -> Result<Source, KnowledgeFault> {
+pub(crate) fn writable(graph: &str) -> Result<KnowledgeSource, KnowledgeFault> {
     if graph.starts_with(OURS) && graph != UNNAMED {
         return Err(KnowledgeFault::Protected(graph.chars().take(200).collect()));
     }
-    Ok(Source::new(SourceKind::Graph, graph))
+    Ok(KnowledgeSource::new(SourceKind::Graph, graph))
 }
 
 impl Knowledge {
@@ -87,7 +87,7 @@ impl Knowledge {
 }
 
 struct Running<'a> {
-    writing: Writing<'a>,
+    writing: StoreChange<'a>,
     token: &'a CancellationToken,
     changed: usize,
 }
@@ -176,8 +176,8 @@ impl Running<'_> {
     }
 
     fn clear(&self, changes: &mut Changes, graph: &GraphTarget) -> Result<(), QueryFault> {
-        let unnamed = || Source::new(SourceKind::Graph, UNNAMED);
-        let graphs: Vec<Source> = match graph {
+        let unnamed = || KnowledgeSource::new(SourceKind::Graph, UNNAMED);
+        let graphs: Vec<KnowledgeSource> = match graph {
             GraphTarget::NamedNode(graph) => vec![writable(graph.as_str())?],
             GraphTarget::DefaultGraph => vec![unnamed()],
             GraphTarget::NamedGraphs | GraphTarget::AllGraphs => {
@@ -200,10 +200,10 @@ impl Running<'_> {
 
 /// The changes of an operation by graph. Deletions are applied before insertions.
 #[derive(Debug, Default)]
-struct Changes(BTreeMap<String, Change>);
+struct Changes(BTreeMap<String, GraphChange>);
 
 impl Changes {
-    fn of(&mut self, graph: &GraphName) -> Result<&mut Change, QueryFault> {
+    fn of(&mut self, graph: &GraphName) -> Result<&mut GraphChange, QueryFault> {
         let graph = match graph {
             GraphName::NamedNode(graph) => graph.as_str(),
             GraphName::DefaultGraph => UNNAMED,

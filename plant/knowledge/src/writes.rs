@@ -17,9 +17,9 @@ use serde_json::json;
 use tokio::sync::Semaphore;
 use uri_text::{is_loopback_host, unescaped};
 
-use crate::http::{Refusal, Site, UPLOAD_TIME, accepted, content, form, json_page};
+use crate::http::{HttpRefusal, ServedSite, UPLOAD_TIME, accepted, content, form, json_page};
 use crate::lanes::Lane;
-use crate::query::{Asked, LARGEST_UPDATE, QueryFault};
+use crate::query::{LARGEST_UPDATE, QueryFault, QueryOrQuestion};
 use crate::source::{SourceKind, UNNAMED};
 use crate::store::KnowledgeFault;
 use crate::update::writable;
@@ -36,7 +36,7 @@ pub struct Writes {
     /// The sources that are files of their own formats.
     pub files: Arc<dyn SourceFiles>,
     /// The jobs: runs of processes.
-    pub jobs: Arc<dyn Jobs>,
+    pub jobs: Arc<dyn JobRunner>,
 }
 
 /// Decides whether a client may write.
@@ -88,7 +88,7 @@ pub struct SourceFinding {
 }
 
 /// Runs of processes that clients start and stop.
-pub trait Jobs: Send + Sync {
+pub trait JobRunner: Send + Sync {
     /// Starts a process. Returns the number of the job; `None` if too many jobs are running.
     ///
     /// # Errors
@@ -112,9 +112,9 @@ impl fmt::Debug for Writes {
 /// The media types of updates.
 pub(crate) const UPDATE: &str = "application/sparql-update";
 
-impl Site {
+impl ServedSite {
     /// Checks whether updates are served, and the client may write.
-    async fn may_write(&self, request: &Request<Incoming>) -> Result<&Writes, Refusal> {
+    async fn may_write(&self, request: &Request<Incoming>) -> Result<&Writes, HttpRefusal> {
         let writes = self.writes.as_ref().ok_or(QueryFault::ReadOnly)?;
         let why = "a change needs the name and password of a user with the role engineer";
         require(&writes.may, request, why).await?;
@@ -125,7 +125,7 @@ impl Site {
     pub(crate) async fn jobs(
         &self,
         request: Request<Incoming>,
-    ) -> Result<Response<Full<Bytes>>, Refusal> {
+    ) -> Result<Response<Full<Bytes>>, HttpRefusal> {
         let writes = self.writes.clone().ok_or(QueryFault::ReadOnly)?;
         let path = request.uri().path().to_owned();
         let number = path.strip_prefix("/jobs/").unwrap_or_default();
@@ -143,17 +143,17 @@ impl Site {
                     .as_ref()
                     .and_then(|asked| asked.get("process")?.as_str());
                 let process = process.ok_or_else(|| {
-                    Refusal::malformed("a job is JSON: {\"process\": \"IRI of the process\"}")
+                    HttpRefusal::malformed("a job is JSON: {\"process\": \"IRI of the process\"}")
                 })?;
                 let (jobs, process) = (Arc::clone(&writes.jobs), process.to_owned());
                 // The sequence of a goal is searched, which takes long.
                 let started = tokio::task::spawn_blocking(move || jobs.start(&process)).await;
                 let started = started
                     .map_err(|error| failed(&error))?
-                    .map_err(Refusal::unknown)?;
+                    .map_err(HttpRefusal::unknown)?;
                 let job = started.ok_or_else(|| {
                     let why = "too many jobs are running; start it when one of them has ended";
-                    Refusal::new(StatusCode::SERVICE_UNAVAILABLE, "busy", why)
+                    HttpRefusal::new(StatusCode::SERVICE_UNAVAILABLE, "busy", why)
                 })?;
                 let mut response = json_page(&json!({ "job": job }));
                 *response.status_mut() = StatusCode::CREATED;
@@ -164,10 +164,10 @@ impl Site {
                 if number.parse().is_ok_and(|number| writes.jobs.stop(number)) {
                     Ok(status(StatusCode::NO_CONTENT))
                 } else {
-                    Err(Refusal::unknown("there is no such job".to_owned()))
+                    Err(HttpRefusal::unknown("there is no such job".to_owned()))
                 }
             }
-            _ => Err(Refusal::method(
+            _ => Err(HttpRefusal::method(
                 "GET, POST at /jobs, DELETE at /jobs/NUMBER",
             )),
         }
@@ -177,9 +177,9 @@ impl Site {
     pub(crate) async fn update(
         &self,
         request: Request<Incoming>,
-    ) -> Result<Response<Full<Bytes>>, Refusal> {
+    ) -> Result<Response<Full<Bytes>>, HttpRefusal> {
         if request.method() != Method::POST {
-            return Err(Refusal::method("POST"));
+            return Err(HttpRefusal::method("POST"));
         }
         let writes = self.may_write(&request).await?;
         let at = (writes.now)();
@@ -188,31 +188,32 @@ impl Site {
             .upload(request, LARGEST_UPDATE.saturating_mul(3))
             .await?;
         let text = String::from_utf8(text)
-            .map_err(|_| Refusal::malformed("the update is not in UTF-8"))?;
+            .map_err(|_| HttpRefusal::malformed("the update is not in UTF-8"))?;
         let text = if media == UPDATE {
             text
         } else {
             let mut updates = form(&text)?.into_iter().filter(|(key, _)| key == "update");
             match (updates.next(), updates.next()) {
                 (Some((_, text)), None) => text,
-                _ => return Err(Refusal::malformed("give one update as update=")),
+                _ => return Err(HttpRefusal::malformed("give one update as update=")),
             }
         };
-        self.found(Asked::Update(text, at), Lane::Write).await
+        self.found(QueryOrQuestion::Update(text, at), Lane::Write)
+            .await
     }
 
     /// Reads and writes a graph by the Graph Store Protocol.
     pub(crate) async fn store(
         &self,
         request: Request<Incoming>,
-    ) -> Result<Response<Full<Bytes>>, Refusal> {
+    ) -> Result<Response<Full<Bytes>>, HttpRefusal> {
         let pairs = form(request.uri().query().unwrap_or_default())?;
         let graph = match pairs.as_slice() {
             [(key, _)] if key == "default" => UNNAMED.to_owned(),
             [(key, graph)] if key == "graph" => graph.clone(),
             _ => {
                 let why = "name one graph as ?graph=IRI, or ?default for the graph without a name";
-                return Err(Refusal::malformed(why));
+                return Err(HttpRefusal::malformed(why));
             }
         };
         if !crate::is_iri(&graph) {
@@ -232,7 +233,7 @@ impl Site {
                     tokio::task::spawn_blocking(move || knowledge.write_triples(&graph, format));
                 match written.await {
                     Ok(Ok(Some(bytes))) => Ok(content(format.media_type(), bytes)),
-                    Ok(Ok(None)) => Err(Refusal::unknown("there is no such graph".to_owned())),
+                    Ok(Ok(None)) => Err(HttpRefusal::unknown("there is no such graph".to_owned())),
                     Ok(Err(error)) => Err(failed(&error)),
                     Err(error) => Err(failed(&error)),
                 }
@@ -247,7 +248,7 @@ impl Site {
                 };
                 let format = format.ok_or_else(|| {
                     let why = "send text/turtle, application/n-triples or application/rdf+xml";
-                    Refusal::new(StatusCode::UNSUPPORTED_MEDIA_TYPE, "media_type", why)
+                    HttpRefusal::new(StatusCode::UNSUPPORTED_MEDIA_TYPE, "media_type", why)
                 })?;
                 let document = self.upload(request, LARGEST_FILE).await?;
                 let adds = method == Method::POST;
@@ -268,10 +269,10 @@ impl Site {
                 if knowledge.remove(&writable(&graph)?)? {
                     Ok(status(StatusCode::NO_CONTENT))
                 } else {
-                    Err(Refusal::unknown("there is no such graph".to_owned()))
+                    Err(HttpRefusal::unknown("there is no such graph".to_owned()))
                 }
             }
-            _ => Err(Refusal::method("GET, HEAD, PUT, POST, DELETE")),
+            _ => Err(HttpRefusal::method("GET, HEAD, PUT, POST, DELETE")),
         }
     }
 
@@ -279,7 +280,7 @@ impl Site {
     pub(crate) async fn sources(
         &self,
         request: Request<Incoming>,
-    ) -> Result<Response<Full<Bytes>>, Refusal> {
+    ) -> Result<Response<Full<Bytes>>, HttpRefusal> {
         let path = request.uri().path().to_owned();
         let files = self
             .writes
@@ -289,7 +290,7 @@ impl Site {
         let rest = path.strip_prefix("/sources").unwrap_or_default();
         if rest.is_empty() {
             if request.method() != Method::GET {
-                return Err(Refusal::method("GET"));
+                return Err(HttpRefusal::method("GET"));
             }
             return Ok(json_page(&files.list()));
         }
@@ -304,16 +305,16 @@ impl Site {
             Method::DELETE => {
                 let removed = tokio::task::spawn_blocking(move || files.remove(kind, &name)).await;
                 if let Ok(Ok(false)) = removed {
-                    return Err(Refusal::unknown("there is no such source".to_owned()));
+                    return Err(HttpRefusal::unknown("there is no such source".to_owned()));
                 }
                 removed.map(|removed| removed.map(|_| false))
             }
-            _ => return Err(Refusal::method("PUT, DELETE")),
+            _ => return Err(HttpRefusal::method("PUT, DELETE")),
         };
         match done {
             Ok(Ok(true)) => Ok(status(StatusCode::CREATED)),
             Ok(Ok(false)) => Ok(status(StatusCode::NO_CONTENT)),
-            Ok(Err(why)) => Err(Refusal::new(StatusCode::BAD_REQUEST, "source", &why)),
+            Ok(Err(why)) => Err(HttpRefusal::new(StatusCode::BAD_REQUEST, "source", &why)),
             Err(error) => Err(failed(&error)),
         }
     }
@@ -323,9 +324,9 @@ impl Site {
     pub(crate) async fn check(
         &self,
         request: Request<Incoming>,
-    ) -> Result<Response<Full<Bytes>>, Refusal> {
+    ) -> Result<Response<Full<Bytes>>, HttpRefusal> {
         if request.method() != Method::POST {
-            return Err(Refusal::method("POST"));
+            return Err(HttpRefusal::method("POST"));
         }
         let path = request.uri().path().to_owned();
         let (kind, name) = named(path.strip_prefix("/check").unwrap_or_default())?;
@@ -344,27 +345,31 @@ impl Site {
     }
 
     /// Reads the body of a change.
-    async fn upload(&self, request: Request<Incoming>, most: usize) -> Result<Vec<u8>, Refusal> {
+    async fn upload(
+        &self,
+        request: Request<Incoming>,
+        most: usize,
+    ) -> Result<Vec<u8>, HttpRefusal> {
         let place = UPLOADS.acquire().await;
         let _place = place.map_err(|error| failed(&error))?;
         let body = Limited::new(request.into_body(), most).collect();
         let body = tokio::time::timeout(UPLOAD_TIME, body).await;
         let body = body.map_err(|_late| {
             let why = "the request took too long to come";
-            Refusal::new(StatusCode::REQUEST_TIMEOUT, "slow", why)
+            HttpRefusal::new(StatusCode::REQUEST_TIMEOUT, "slow", why)
         })?;
         match body {
             Ok(body) => Ok(body.to_bytes().into()),
             Err(error) if error.is::<LengthLimitError>() => {
                 Err(QueryFault::TooLong { most }.into())
             }
-            Err(_) => Err(Refusal::malformed("the request broke off")),
+            Err(_) => Err(HttpRefusal::malformed("the request broke off")),
         }
     }
 }
 
 /// Returns the source in a path `/KIND/NAME`.
-fn named(path: &str) -> Result<(SourceKind, String), Refusal> {
+fn named(path: &str) -> Result<(SourceKind, String), HttpRefusal> {
     let named = path.trim_start_matches('/').split_once('/');
     let named = named.and_then(|(kind, name)| {
         let kind: SourceKind = kind.parse().ok()?;
@@ -377,13 +382,13 @@ fn named(path: &str) -> Result<(SourceKind, String), Refusal> {
     });
     named.ok_or_else(|| {
         let why = "a source is /sources/KIND/NAME; the kinds are nodeset, mtp, file and process";
-        Refusal::unknown(why.to_owned())
+        HttpRefusal::unknown(why.to_owned())
     })
 }
 
 /// Checks whether a client may do something: the request does not come from a page of another site
 /// in a browser, and the user has the role.
-async fn require(may: &May, request: &Request<Incoming>, why: &str) -> Result<(), Refusal> {
+async fn require(may: &May, request: &Request<Incoming>, why: &str) -> Result<(), HttpRefusal> {
     let origin = request.headers().get(ORIGIN);
     let is_own = origin.is_none_or(|origin| {
         let origin = origin.to_str().unwrap_or_default();
@@ -392,7 +397,7 @@ async fn require(may: &May, request: &Request<Incoming>, why: &str) -> Result<()
     });
     if !is_own {
         let why = "pages of other sites cannot change what is known";
-        return Err(Refusal::new(StatusCode::FORBIDDEN, "origin", why));
+        return Err(HttpRefusal::new(StatusCode::FORBIDDEN, "origin", why));
     }
     let user = request.headers().get(AUTHORIZATION).and_then(|value| {
         let encoded = value.to_str().ok()?.strip_prefix("Basic ")?;
@@ -403,11 +408,11 @@ async fn require(may: &May, request: &Request<Incoming>, why: &str) -> Result<()
     if may(user).await {
         Ok(())
     } else {
-        Err(Refusal::new(StatusCode::UNAUTHORIZED, "user", why))
+        Err(HttpRefusal::new(StatusCode::UNAUTHORIZED, "user", why))
     }
 }
 
-impl From<KnowledgeFault> for Refusal {
+impl From<KnowledgeFault> for HttpRefusal {
     fn from(fault: KnowledgeFault) -> Self {
         let (status, code) = match &fault {
             KnowledgeFault::Protected(_) | KnowledgeFault::Derived => {
@@ -444,9 +449,9 @@ fn status(status: StatusCode) -> Response<Full<Bytes>> {
     response
 }
 
-pub(crate) fn failed(error: &dyn fmt::Display) -> Refusal {
+pub(crate) fn failed(error: &dyn fmt::Display) -> HttpRefusal {
     let status = StatusCode::INTERNAL_SERVER_ERROR;
-    Refusal::new(status, "failed", &error.to_string())
+    HttpRefusal::new(status, "failed", &error.to_string())
 }
 
 /// Concurrent uploads, each of which is in memory as a whole.

@@ -10,21 +10,22 @@ use tokio::sync::watch;
 use crate::journal::Record;
 use crate::rules::apply::Derived;
 use crate::rules::{Extent, Schema};
-use crate::source::{DERIVED, Source, SourceKind};
+use crate::source::{DERIVED, KnowledgeSource, SourceKind};
 use crate::store::{
-    KnowledgeFault, Lasting, MAX_SOURCES, MAX_STATEMENTS, SourceStatus, Written, named,
+    KnowledgeFault, MAX_SOURCES, MAX_STATEMENTS, SourceLifetime, SourceStatus, WrittenSources,
+    named,
 };
 
 /// A change of a graph: the statements that it removes and adds.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub(crate) struct Change {
+pub(crate) struct GraphChange {
     pub(crate) removed: Vec<Triple>,
     pub(crate) added: Vec<Triple>,
 }
 
 /// A change of the store. It is undone when it is dropped before the commit.
-pub(crate) struct Writing<'a> {
-    pub(crate) written: MutexGuard<'a, Written>,
+pub(crate) struct StoreChange<'a> {
+    pub(crate) written: MutexGuard<'a, WrittenSources>,
     pub(crate) transaction: Transaction<'a>,
     changed: &'a watch::Sender<u64>,
     /// Whether the change is about the schema of the rules.
@@ -32,17 +33,17 @@ pub(crate) struct Writing<'a> {
     /// The changed statements, if the rules need them.
     touched: HashSet<Triple>,
     /// The changes for the journal.
-    changes: BTreeMap<Source, Change>,
+    changes: BTreeMap<KnowledgeSource, GraphChange>,
     /// Sources that are replaced as a whole, with all their statements.
-    whole: BTreeMap<Source, HashSet<Triple>>,
-    removed: BTreeSet<Source>,
-    pub(crate) lasting: Lasting,
+    whole: BTreeMap<KnowledgeSource, HashSet<Triple>>,
+    removed: BTreeSet<KnowledgeSource>,
+    pub(crate) lasting: SourceLifetime,
 }
 
-impl<'a> Writing<'a> {
+impl<'a> StoreChange<'a> {
     /// Begins a change of lasting sources.
     pub(crate) fn new(
-        written: MutexGuard<'a, Written>,
+        written: MutexGuard<'a, WrittenSources>,
         transaction: Transaction<'a>,
         changed: &'a watch::Sender<u64>,
     ) -> Self {
@@ -55,12 +56,12 @@ impl<'a> Writing<'a> {
             changes: BTreeMap::new(),
             whole: BTreeMap::new(),
             removed: BTreeSet::new(),
-            lasting: Lasting::Yes,
+            lasting: SourceLifetime::Yes,
         }
     }
 
     /// Removes the status of a source with the commit.
-    pub(crate) fn remove(&mut self, source: &Source) {
+    pub(crate) fn remove(&mut self, source: &KnowledgeSource) {
         self.removed.insert(source.clone());
     }
     /// Returns the transaction, for queries that see the changes.
@@ -69,12 +70,15 @@ impl<'a> Writing<'a> {
     }
 
     /// Returns the sources.
-    pub(crate) fn sources(&self) -> impl Iterator<Item = &Source> {
+    pub(crate) fn sources(&self) -> impl Iterator<Item = &KnowledgeSource> {
         self.written.sources.keys().chain(self.changes.keys())
     }
 
     /// Returns the statements of a source.
-    pub(crate) fn triples(&self, source: &Source) -> Result<HashSet<Triple>, KnowledgeFault> {
+    pub(crate) fn triples(
+        &self,
+        source: &KnowledgeSource,
+    ) -> Result<HashSet<Triple>, KnowledgeFault> {
         let graph = named(&source.graph())?;
         let quads =
             self.transaction
@@ -85,17 +89,17 @@ impl<'a> Writing<'a> {
 
     pub(crate) fn replace(
         &mut self,
-        source: &Source,
+        source: &KnowledgeSource,
         triples: HashSet<Triple>,
     ) -> Result<(), KnowledgeFault> {
         let graph = named(&source.graph())?;
         let (added, removed) = difference(&self.transaction, &graph, &triples)?;
-        self.change(source, Change { removed, added })?;
+        self.change(source, GraphChange { removed, added })?;
         self.changes.remove(source);
         // The journal has literals as the store has them, so that a later removal finds them.
         let whole = match self.lasting {
-            Lasting::Yes => self.triples(source)?,
-            Lasting::No => triples,
+            SourceLifetime::Yes => self.triples(source)?,
+            SourceLifetime::No => triples,
         };
         self.whole.insert(source.clone(), whole);
         Ok(())
@@ -105,8 +109,8 @@ impl<'a> Writing<'a> {
     /// are left as they are. Returns the number of changed statements.
     pub(crate) fn change(
         &mut self,
-        source: &Source,
-        change: Change,
+        source: &KnowledgeSource,
+        change: GraphChange,
     ) -> Result<usize, KnowledgeFault> {
         if source.kind == SourceKind::Derived {
             return Err(KnowledgeFault::Derived);
@@ -118,7 +122,7 @@ impl<'a> Writing<'a> {
             return Err(KnowledgeFault::TooManySources { most: MAX_SOURCES });
         }
         let graph = named(&source.graph())?;
-        let mut effective = Change::default();
+        let mut effective = GraphChange::default();
         for triple in &change.removed {
             if let Some(known) = stored(&self.transaction, &graph, triple)? {
                 self.transaction.remove(known.as_ref().in_graph(&graph));
@@ -156,7 +160,7 @@ impl<'a> Writing<'a> {
     /// # Errors
     /// [`KnowledgeFault`]; then nothing has changed.
     pub(crate) fn commit(mut self, at: u64) -> Result<(), KnowledgeFault> {
-        let mut statuses: Vec<(Source, SourceStatus)> = Vec::new();
+        let mut statuses: Vec<(KnowledgeSource, SourceStatus)> = Vec::new();
         for source in self.changes.keys().chain(self.whole.keys()) {
             if self.removed.contains(source) {
                 continue;
@@ -183,7 +187,7 @@ impl<'a> Writing<'a> {
                 continue;
             }
             let was_lasting = status.lasting;
-            status.lasting = self.lasting == Lasting::Yes && self.written.journal.is_some();
+            status.lasting = self.lasting == SourceLifetime::Yes && self.written.journal.is_some();
             if was_lasting && !status.lasting {
                 self.removed.insert(source.clone());
             }
@@ -204,7 +208,7 @@ impl<'a> Writing<'a> {
                 .iter()
                 .filter(|source| known.get(*source).is_some_and(|known| known.lasting));
             let mut records: Vec<_> = removed.map(|source| Record::Remove { source }).collect();
-            if self.lasting == Lasting::Yes {
+            if self.lasting == SourceLifetime::Yes {
                 let puts = self.whole.iter();
                 let puts = puts.filter(|(source, _)| !self.removed.contains(*source));
                 records.extend(puts.map(|(source, triples)| Record::Put {
@@ -233,7 +237,7 @@ impl<'a> Writing<'a> {
     }
 }
 
-impl Change {
+impl GraphChange {
     /// Adds a later change.
     fn then(&mut self, later: Self) {
         // The removal of an added statement undoes the addition.

@@ -10,21 +10,21 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Duration;
 
-use knowledge::{Endpoint, Knowledge, Limits, Source, SourceKind};
+use knowledge::{HttpEndpoint, Knowledge, KnowledgeSource, QueryLimits, SourceKind};
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::TcpStream;
 
 /// Returns a store in which no join of three patterns ends.
-async fn site(limits: Limits) -> (Endpoint, Arc<Knowledge>) {
+async fn site(limits: QueryLimits) -> (HttpEndpoint, Arc<Knowledge>) {
     let knowledge = Arc::new(Knowledge::new().unwrap());
     let many: String = (0..300)
         .map(|number| format!("<urn:s{number}> <urn:p> {number} .\n"))
         .collect();
     knowledge
-        .replace_turtle(&Source::new(SourceKind::File, "many"), &many, 5)
+        .replace_turtle(&KnowledgeSource::new(SourceKind::File, "many"), &many, 5)
         .unwrap();
     let page = Arc::new(|path: &str| (path == "/status").then(|| "{\"run\":null}".to_owned()));
-    let endpoint = Endpoint::bind(
+    let endpoint = HttpEndpoint::bind(
         "127.0.0.1:0".parse().unwrap(),
         Arc::clone(&knowledge),
         limits,
@@ -108,11 +108,11 @@ fn count(answer: &Answered) -> String {
 
 #[tokio::test]
 async fn a_query_that_never_ends_is_stopped_while_others_are_answered() {
-    let limits = Limits {
+    let limits = QueryLimits {
         time: Duration::from_millis(1500),
         parallel: 2,
         memory: u64::MAX,
-        ..Limits::default()
+        ..QueryLimits::default()
     };
     let (endpoint, _) = site(limits).await;
     let at = endpoint.address();
@@ -151,11 +151,11 @@ async fn free(at: SocketAddr) {
 
 #[tokio::test]
 async fn one_long_query_more_than_there_are_places_is_told_to_come_again() {
-    let limits = Limits {
+    let limits = QueryLimits {
         time: Duration::from_secs(20),
         parallel: 1,
         memory: u64::MAX,
-        ..Limits::default()
+        ..QueryLimits::default()
     };
     let (endpoint, _) = site(limits).await;
     let at = endpoint.address();
@@ -177,10 +177,10 @@ async fn one_long_query_more_than_there_are_places_is_told_to_come_again() {
 
 #[tokio::test]
 async fn named_questions_are_answered_beside_many_clients_with_long_queries() {
-    let limits = Limits {
+    let limits = QueryLimits {
         time: Duration::from_secs(2),
         memory: u64::MAX,
-        ..Limits::default()
+        ..QueryLimits::default()
     };
     let (endpoint, _) = site(limits).await;
     let at = endpoint.address();
@@ -218,7 +218,7 @@ async fn a_third_plan_is_told_to_come_again_while_the_status_is_answered() {
     });
     let knowledge = Arc::new(Knowledge::new().unwrap());
     let at = "127.0.0.1:0".parse().unwrap();
-    let endpoint = Endpoint::bind(at, knowledge, Limits::default(), page);
+    let endpoint = HttpEndpoint::bind(at, knowledge, QueryLimits::default(), page);
     let endpoint = endpoint.await.unwrap();
     let at = endpoint.address();
     let plan = || tokio::spawn(async move { get(at, "/plan/urn:p", "*/*").await.status });
@@ -244,7 +244,7 @@ async fn a_third_plan_is_told_to_come_again_while_the_status_is_answered() {
 
 #[tokio::test]
 async fn queries_come_by_get_by_post_and_as_a_form() {
-    let (endpoint, _) = site(Limits::default()).await;
+    let (endpoint, _) = site(QueryLimits::default()).await;
     let at = endpoint.address();
     let by_get = get(
         at,
@@ -294,11 +294,11 @@ async fn queries_come_by_get_by_post_and_as_a_form() {
 
 #[tokio::test]
 async fn the_default_graph_is_the_merge_and_each_graph_has_its_name() {
-    let (endpoint, knowledge) = site(Limits::default()).await;
+    let (endpoint, knowledge) = site(QueryLimits::default()).await;
     let at = endpoint.address();
     knowledge
         .replace_turtle(
-            &Source::new(SourceKind::File, "same"),
+            &KnowledgeSource::new(SourceKind::File, "same"),
             "<urn:s1> <urn:p> 1 .",
             5,
         )
@@ -328,7 +328,7 @@ async fn the_default_graph_is_the_merge_and_each_graph_has_its_name() {
 
 #[tokio::test]
 async fn nothing_changes_what_is_known_and_nobody_else_is_asked() {
-    let (endpoint, _) = site(Limits::default()).await;
+    let (endpoint, _) = site(QueryLimits::default()).await;
     let at = endpoint.address();
     for update in [
         "INSERT DATA { <urn:a> <urn:b> <urn:c> }",
@@ -368,9 +368,9 @@ async fn nothing_changes_what_is_known_and_nobody_else_is_asked() {
 
 #[tokio::test]
 async fn what_is_wrong_with_a_request_is_told() {
-    let limits = Limits {
+    let limits = QueryLimits {
         rows: 100,
-        ..Limits::default()
+        ..QueryLimits::default()
     };
     let (endpoint, _) = site(limits).await;
     let at = endpoint.address();
@@ -445,7 +445,7 @@ async fn what_is_wrong_with_a_request_is_told() {
 
 #[tokio::test]
 async fn named_questions_are_listed_shown_and_answered_in_two_forms() {
-    let (endpoint, _) = site(Limits::default()).await;
+    let (endpoint, _) = site(QueryLimits::default()).await;
     let at = endpoint.address();
     let listed = get(at, "/ask", "*/*").await.json();
     let names: Vec<_> = listed["questions"]
@@ -478,11 +478,11 @@ async fn named_questions_are_listed_shown_and_answered_in_two_forms() {
 /// program continues.
 #[tokio::test]
 async fn monstrous_queries_of_full_length_are_refused() {
-    let limits = Limits {
+    let limits = QueryLimits {
         time: Duration::from_secs(2),
         memory: 256 << 20,
         parallel: 16,
-        ..Limits::default()
+        ..QueryLimits::default()
     };
     let (endpoint, _) = site(limits).await;
     let at = endpoint.address();
@@ -552,10 +552,10 @@ async fn monstrous_queries_of_full_length_are_refused() {
 #[tokio::test]
 async fn it_listens_on_loopback_only() {
     let knowledge = Arc::new(Knowledge::new().unwrap());
-    let anywhere = Endpoint::bind(
+    let anywhere = HttpEndpoint::bind(
         "0.0.0.0:0".parse().unwrap(),
         knowledge,
-        Limits::default(),
+        QueryLimits::default(),
         Arc::new(|_: &str| None),
     )
     .await;

@@ -4,7 +4,7 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use knowledge::{Endpoint, Knowledge, Limits, Source, SourceKind};
+use knowledge::{HttpEndpoint, Knowledge, KnowledgeSource, QueryLimits, SourceKind};
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::TcpStream;
 
@@ -18,15 +18,15 @@ async fn a_query_that_takes_all_memory_is_stopped_and_the_next_one_answered() {
         .map(|number| format!("<urn:s{number}> <urn:p> {number} .\n"))
         .collect();
     knowledge
-        .replace_turtle(&Source::new(SourceKind::File, "many"), &many, 5)
+        .replace_turtle(&KnowledgeSource::new(SourceKind::File, "many"), &many, 5)
         .unwrap();
-    let limits = Limits {
+    let limits = QueryLimits {
         parallel: 1,
         memory: 64 << 20,
         time: Duration::from_secs(60),
-        ..Limits::default()
+        ..QueryLimits::default()
     };
-    let endpoint = Endpoint::bind(
+    let endpoint = HttpEndpoint::bind(
         "127.0.0.1:0".parse().unwrap(),
         knowledge,
         limits,

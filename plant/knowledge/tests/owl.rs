@@ -3,7 +3,7 @@
 use std::collections::BTreeSet;
 
 use knowledge::owl::Ontology;
-use knowledge::{Knowledge, Source, SourceKind};
+use knowledge::{Knowledge, KnowledgeSource, SourceKind};
 use test_data::{foreign, read_foreign};
 
 const UA: &str = "http://opcfoundation.org/UA/";
@@ -134,7 +134,7 @@ fn published_nodesets_have_all_nodes_references_fields_and_values() {
         let mut turtle = Vec::new();
         ontology.write_turtle(&mut turtle).unwrap();
         let knowledge = Knowledge::new().unwrap();
-        let source = Source::new(SourceKind::File, &name);
+        let source = KnowledgeSource::new(SourceKind::File, &name);
         let turtle = String::from_utf8(turtle).unwrap();
         knowledge.replace_turtle(&source, &turtle, 1).unwrap();
     }

@@ -4,7 +4,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use knowledge::{Knowledge, QUESTIONS, Source, SourceKind};
+use knowledge::{Knowledge, KnowledgeSource, QUESTIONS, SourceKind};
 
 const PREFIXES: &str = "@prefix rdf: <http://www.w3.org/1999/02/22-rdf-syntax-ns#> . \
     @prefix rdfs: <http://www.w3.org/2000/01/rdf-schema#> . \
@@ -181,7 +181,7 @@ fn derived_statements_follow_each_change_of_a_source() {
     let mut most = 0;
     for step in 0..400 {
         let name = next() % 4;
-        let source = Source::new(SourceKind::File, &format!("{name}.ttl"));
+        let source = KnowledgeSource::new(SourceKind::File, &format!("{name}.ttl"));
         if next().is_multiple_of(6) {
             sources.remove(&name);
             knowledge.remove(&source).unwrap();
@@ -223,7 +223,7 @@ fn derived_statements_follow_each_change_of_a_source() {
 #[test]
 fn the_rules_are_switched_while_the_program_runs() {
     let knowledge = Knowledge::new().unwrap();
-    let source = Source::new(SourceKind::File, "all.ttl");
+    let source = KnowledgeSource::new(SourceKind::File, "all.ttl");
     let turtle = format!("{PREFIXES}{} .", PARTS.join(" .\n"));
     knowledge.replace_turtle(&source, &turtle, 1).unwrap();
     let stated: Statements = PARTS.iter().map(|part| statement(part)).collect();
@@ -243,7 +243,7 @@ fn the_rules_are_switched_while_the_program_runs() {
 fn named_questions_have_the_same_answers_with_the_rules() {
     let knowledge = Knowledge::new().unwrap();
     let module = mtp::Module::read(&test_data::read_own("mtp/stage.aml")).unwrap();
-    let stage = Source::new(SourceKind::Mtp, "stage");
+    let stage = KnowledgeSource::new(SourceKind::Mtp, "stage");
     let triples = module.triples("urn:m", &BTreeMap::new());
     knowledge.replace(&stage, &triples, 1).unwrap();
     let more = format!(
@@ -263,7 +263,7 @@ fn named_questions_have_the_same_answers_with_the_rules() {
         :p1 rdfs:label \"hold\" ; ua:position 1 ; css:requiresCapability :n .
         :n a cask:RequiredCapability , :Hold ; ua:role \"tool\" ."
     );
-    let file = Source::new(SourceKind::File, "more.ttl");
+    let file = KnowledgeSource::new(SourceKind::File, "more.ttl");
     knowledge.replace_turtle(&file, &more, 1).unwrap();
     let ask = |name: &str| {
         let rows = knowledge.ask(name, &[]).unwrap().rows.into_iter();

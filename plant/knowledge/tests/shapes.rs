@@ -4,7 +4,7 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use knowledge::{Endpoint, Knowledge, Limits, Source, SourceKind};
+use knowledge::{HttpEndpoint, Knowledge, KnowledgeSource, QueryLimits, SourceKind};
 use serde_json::Value;
 
 use super::http::get;
@@ -12,12 +12,12 @@ use super::http::get;
 async fn report(files: &[(&str, &str)]) -> (Value, String) {
     let knowledge = Arc::new(Knowledge::new().unwrap());
     for (name, turtle) in files {
-        let source = Source::new(SourceKind::File, name);
+        let source = KnowledgeSource::new(SourceKind::File, name);
         knowledge.replace_turtle(&source, turtle, 1).unwrap();
     }
     let page = Arc::new(|_: &str| None);
     let address = "127.0.0.1:0".parse().unwrap();
-    let endpoint = Endpoint::bind(address, knowledge, Limits::default(), page);
+    let endpoint = HttpEndpoint::bind(address, knowledge, QueryLimits::default(), page);
     let endpoint = endpoint.await.unwrap();
     let json = get(endpoint.address(), "/report", "application/json").await;
     let turtle = get(endpoint.address(), "/report", "text/turtle").await;

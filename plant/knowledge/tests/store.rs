@@ -4,8 +4,8 @@
 use std::collections::BTreeMap;
 
 use knowledge::{
-    Answer, ComponentFacts, Knowledge, KnowledgeFault, NodeName, OPC_UA, ParameterFacts, QUESTIONS,
-    SkillFacts, Source, SourceKind, TypeFacts, nodeset,
+    ComponentFacts, Knowledge, KnowledgeFault, KnowledgeSource, NodeName, OPC_UA, ParameterFacts,
+    QUESTIONS, QuestionAnswer, SkillFacts, SourceKind, TypeFacts, nodeset,
 };
 use test_data::{read_foreign, read_own};
 
@@ -68,15 +68,15 @@ fn gripper(uri: &str, types: Vec<TypeFacts>, capability: &str) -> ComponentFacts
     }
 }
 
-fn put(knowledge: &Knowledge, facts: &ComponentFacts, at: u64) -> Source {
-    let source = Source::new(SourceKind::Component, &facts.application_uri);
+fn put(knowledge: &Knowledge, facts: &ComponentFacts, at: u64) -> KnowledgeSource {
+    let source = KnowledgeSource::new(SourceKind::Component, &facts.application_uri);
     let (triples, left_out) = facts.triples();
     assert_eq!(left_out, Vec::<String>::new());
     knowledge.replace(&source, &triples, at).unwrap();
     source
 }
 
-fn ask(knowledge: &Knowledge, question: &str, parameters: &[(&str, &str)]) -> Answer {
+fn ask(knowledge: &Knowledge, question: &str, parameters: &[(&str, &str)]) -> QuestionAnswer {
     let parameters: Vec<_> = parameters
         .iter()
         .map(|(key, value)| ((*key).to_owned(), (*value).to_owned()))
@@ -84,7 +84,7 @@ fn ask(knowledge: &Knowledge, question: &str, parameters: &[(&str, &str)]) -> An
     knowledge.ask(question, &parameters).unwrap()
 }
 
-fn column(answer: &Answer, column: &str) -> Vec<String> {
+fn column(answer: &QuestionAnswer, column: &str) -> Vec<String> {
     answer
         .rows
         .iter()
@@ -141,7 +141,7 @@ fn a_component_is_found_by_what_it_can_do_until_it_is_gone() {
 #[test]
 fn a_quantity_is_held_by_skills_whose_limits_contain_it_in_any_unit() {
     let knowledge = Knowledge::new().unwrap();
-    let units = Source::new(SourceKind::File, "units");
+    let units = KnowledgeSource::new(SourceKind::File, "units");
     knowledge
         .replace(&units, &knowledge::units::triples(), 1)
         .unwrap();
@@ -158,7 +158,10 @@ fn a_quantity_is_held_by_skills_whose_limits_contain_it_in_any_unit() {
         };
         let found = ask(&knowledge, "what-can-hold", &parameters);
         let limit = |row: &BTreeMap<String, serde_json::Value>| {
-            (Answer::text(row, "limit").to_owned(), row["value"].as_f64())
+            (
+                QuestionAnswer::text(row, "limit").to_owned(),
+                row["value"].as_f64(),
+            )
         };
         found.rows.iter().map(limit).collect::<Vec<_>>()
     };
@@ -175,7 +178,7 @@ fn a_quantity_is_held_by_skills_whose_limits_contain_it_in_any_unit() {
         assert_eq!(held(quantity, capability), [], "{quantity}");
     }
     // The data sheet of the component as Turtle.
-    let sheet = Source::new(SourceKind::File, "sheet.ttl");
+    let sheet = KnowledgeSource::new(SourceKind::File, "sheet.ttl");
     let turtle = r#"<urn:example:gripper> <urn:ua-bridge:plant#hasLimit> [
         <http://www.w3id.org/hsu-aut/cask#hasVariableName> "Payload" ;
         <urn:ua-bridge:plant#max> 5000 ; <urn:ua-bridge:plant#unit> "g" ] ."#;
@@ -306,7 +309,7 @@ fn a_capability_is_provided_by_who_has_a_subclass_of_it() {
             .rows
             .is_empty()
     );
-    let ontology = Source::new(SourceKind::File, "capabilities.ttl");
+    let ontology = KnowledgeSource::new(SourceKind::File, "capabilities.ttl");
     let turtle = format!(
         "@prefix rdfs: <http://www.w3.org/2000/01/rdf-schema#> . <{HOLD}> rdfs:subClassOf <urn:example:capability:hold> . <urn:example:capability:hold> rdfs:subClassOf <{GRASP}> ."
     );
@@ -398,7 +401,7 @@ fn what_cannot_be_taken_leaves_what_was() {
         5,
     );
     let before = knowledge.sources();
-    let source = Source::new(SourceKind::Component, "urn:example:gripper");
+    let source = KnowledgeSource::new(SourceKind::Component, "urn:example:gripper");
     let bad = mtp::Triple {
         subject: "no iri".into(),
         predicate: "urn:p".into(),
@@ -413,7 +416,7 @@ fn what_cannot_be_taken_leaves_what_was() {
         .replace_turtle(&source, "<urn:a> <urn:b> .", 6)
         .unwrap_err();
     assert!(matches!(fault, KnowledgeFault::Turtle(_)), "{fault}");
-    let derived = Source::new(SourceKind::Derived, "");
+    let derived = KnowledgeSource::new(SourceKind::Derived, "");
     assert!(matches!(
         knowledge.replace(&derived, &[], 6),
         Err(KnowledgeFault::Derived)
@@ -435,7 +438,7 @@ fn names_from_the_network_cannot_say_more_than_a_name() {
     assert_eq!(left_out, ["not an iri"]);
     knowledge
         .replace(
-            &Source::new(SourceKind::Component, &facts.application_uri),
+            &KnowledgeSource::new(SourceKind::Component, &facts.application_uri),
             &triples,
             5,
         )
@@ -472,7 +475,7 @@ fn a_manifest_stands_beside_skills_in_one_question() {
     for name in ["one", "two"] {
         let triples = module.triples(&format!("urn:ua-bridge:mtp:{name}"), &BTreeMap::new());
         knowledge
-            .replace(&Source::new(SourceKind::Mtp, name), &triples, 5)
+            .replace(&KnowledgeSource::new(SourceKind::Mtp, name), &triples, 5)
             .unwrap();
     }
     let found = ask(&knowledge, "what-can-run", &[]);
@@ -493,7 +496,7 @@ fn types_below_a_type_are_found_over_two_node_sets_in_any_order() {
     let knowledge = Knowledge::new().unwrap();
     for file in ["machines.xml", "devices.xml"] {
         let read = nodeset::read(&read_own(&format!("nodesets/{file}"))).unwrap();
-        let source = Source::new(SourceKind::NodeSet, &read.namespace);
+        let source = KnowledgeSource::new(SourceKind::NodeSet, &read.namespace);
         knowledge.replace(&source, &read.triples, 5).unwrap();
     }
     let below = |id: &str| {
@@ -518,7 +521,7 @@ fn a_node_set_tells_types_below_a_type_and_what_they_declare() {
         let read = nodeset::read(&text).unwrap();
         knowledge
             .replace(
-                &Source::new(SourceKind::NodeSet, &read.namespace),
+                &KnowledgeSource::new(SourceKind::NodeSet, &read.namespace),
                 &read.triples,
                 5,
             )
@@ -555,14 +558,14 @@ fn half_a_node_set_is_refused_with_its_line() {
         "<UANodeSet>\n<Models><Model ModelUri=\"urn:x\"/></Models>\n<UAObjectType NodeId=\"i=1\"";
     let fault = nodeset::read(text).unwrap_err();
     assert!(
-        matches!(fault, nodeset::NodeSetFault::Xml { line: 3, .. }),
+        matches!(fault, nodeset::NodeSetReadFault::Xml { line: 3, .. }),
         "{fault}"
     );
     let fault = nodeset::read("<UANodeSet>\n<Models>").unwrap_err();
     assert_eq!(fault.to_string(), "line 2: the file ends in the middle");
     assert_eq!(
         nodeset::read("<UANodeSet/>"),
-        Err(nodeset::NodeSetFault::NoModel)
+        Err(nodeset::NodeSetReadFault::NoModel)
     );
 }
 

@@ -1,8 +1,8 @@
 //! Checks the used terms against the ontologies.
 use std::collections::BTreeSet;
 
-use knowledge::vocabulary::{self, TermKind};
-use knowledge::{Knowledge, QUESTIONS, Source, SourceKind};
+use knowledge::vocabulary::{self, IriKind};
+use knowledge::{Knowledge, KnowledgeSource, QUESTIONS, SourceKind};
 use test_data::read_foreign;
 
 #[test]
@@ -13,7 +13,7 @@ fn every_foreign_term_is_in_its_ontology_as_what_it_is_used_as() {
             return;
         };
         knowledge
-            .replace_turtle(&Source::new(SourceKind::File, file), &turtle, 0)
+            .replace_turtle(&KnowledgeSource::new(SourceKind::File, file), &turtle, 0)
             .unwrap();
     }
     let mut quads = Vec::new();
@@ -22,9 +22,9 @@ fn every_foreign_term_is_in_its_ontology_as_what_it_is_used_as() {
     let mut missing = Vec::new();
     for term in vocabulary::foreign() {
         let kind = match term.kind {
-            TermKind::Class => "Class",
-            TermKind::ObjectProperty => "ObjectProperty",
-            TermKind::DataProperty => "DatatypeProperty",
+            IriKind::Class => "Class",
+            IriKind::ObjectProperty => "ObjectProperty",
+            IriKind::DataProperty => "DatatypeProperty",
         };
         let said = format!(
             "<{}> <{}> <http://www.w3.org/2002/07/owl#{kind}> ",

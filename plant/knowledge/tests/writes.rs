@@ -5,8 +5,8 @@ use std::net::SocketAddr;
 use std::sync::{Arc, Mutex};
 
 use knowledge::{
-    Endpoint, Jobs, Knowledge, Limits, Source, SourceCheck, SourceFiles, SourceFinding, SourceKind,
-    Writes,
+    HttpEndpoint, JobRunner, Knowledge, KnowledgeSource, QueryLimits, SourceCheck, SourceFiles,
+    SourceFinding, SourceKind, Writes,
 };
 
 use crate::http::{Answered, send};
@@ -54,7 +54,7 @@ impl SourceFiles for Files {
 #[derive(Default)]
 struct Started(Mutex<Vec<String>>);
 
-impl Jobs for Started {
+impl JobRunner for Started {
     fn start(&self, process: &str) -> Result<Option<u64>, String> {
         if process != "urn:p" {
             return Err(format!("`{process}` is no process here"));
@@ -76,10 +76,10 @@ impl Jobs for Started {
     }
 }
 
-async fn site(may: bool) -> (Endpoint, Arc<Knowledge>) {
+async fn site(may: bool) -> (HttpEndpoint, Arc<Knowledge>) {
     let knowledge = Arc::new(Knowledge::new().unwrap());
     let turtle = "<urn:c:below> <http://www.w3.org/2000/01/rdf-schema#subClassOf> <urn:c:above> .";
-    let source = Source::new(SourceKind::File, "classes");
+    let source = KnowledgeSource::new(SourceKind::File, "classes");
     knowledge.replace_turtle(&source, turtle, 5).unwrap();
     let writes = Writes {
         now: || 9,
@@ -94,10 +94,10 @@ async fn site(may: bool) -> (Endpoint, Arc<Knowledge>) {
         files: Arc::new(Files::default()),
         jobs: Arc::new(Started::default()),
     };
-    let endpoint = Endpoint::bind_with(
+    let endpoint = HttpEndpoint::bind_with(
         "127.0.0.1:0".parse().unwrap(),
         Arc::clone(&knowledge),
-        Limits::default(),
+        QueryLimits::default(),
         Arc::new(|_: &str| None),
         Some(writes),
     )

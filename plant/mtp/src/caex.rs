@@ -152,13 +152,13 @@ impl CaexElement {
 /// The open elements while the file is read.
 #[derive(Debug, Default)]
 struct Building {
-    open: Vec<Part>,
+    open: Vec<CaexPart>,
     elements: usize,
     root: Option<CaexElement>,
 }
 
 #[derive(Debug)]
-enum Part {
+enum CaexPart {
     Element(CaexElement),
     Attribute(Attribute),
     Value,
@@ -201,7 +201,7 @@ impl Building {
                 if path.is_empty() {
                     path = text("RefBaseClassPath")?;
                 }
-                Part::Element(CaexElement {
+                CaexPart::Element(CaexElement {
                     name: text("Name")?,
                     id: text("ID")?,
                     path,
@@ -210,10 +210,10 @@ impl Building {
                     ..CaexElement::default()
                 })
             }
-            "Attribute" if matches!(self.open.last(), Some(Part::Element(_))) => {
+            "Attribute" if matches!(self.open.last(), Some(CaexPart::Element(_))) => {
                 let data_type = text("AttributeDataType")?;
                 let link_type = text("RefAttributeType")?;
-                Part::Attribute(Attribute {
+                CaexPart::Attribute(Attribute {
                     name: text("Name")?,
                     value: String::new(),
                     id: text("ID")?,
@@ -221,8 +221,8 @@ impl Building {
                     data_type,
                 })
             }
-            "Value" if matches!(self.open.last(), Some(Part::Attribute(_))) => Part::Value,
-            _ => Part::Other,
+            "Value" if matches!(self.open.last(), Some(CaexPart::Attribute(_))) => CaexPart::Value,
+            _ => CaexPart::Other,
         };
         self.open.push(part);
         Ok(())
@@ -234,19 +234,19 @@ impl Building {
             return;
         };
         let parent = self.open.iter_mut().rev().find_map(|part| match part {
-            Part::Element(element) => Some(element),
-            Part::Attribute(_) | Part::Value | Part::Other => None,
+            CaexPart::Element(element) => Some(element),
+            CaexPart::Attribute(_) | CaexPart::Value | CaexPart::Other => None,
         });
         match (part, parent) {
-            (Part::Element(element), Some(parent)) => parent.children.push(element),
-            (Part::Element(element), None) => self.root = Some(element),
-            (Part::Attribute(attribute), Some(parent)) => parent.attributes.push(attribute),
-            (Part::Attribute(_), None) | (Part::Value | Part::Other, _) => {}
+            (CaexPart::Element(element), Some(parent)) => parent.children.push(element),
+            (CaexPart::Element(element), None) => self.root = Some(element),
+            (CaexPart::Attribute(attribute), Some(parent)) => parent.attributes.push(attribute),
+            (CaexPart::Attribute(_), None) | (CaexPart::Value | CaexPart::Other, _) => {}
         }
     }
 
     fn text(&mut self, text: &str) {
-        if let [.., Part::Attribute(attribute), Part::Value] = &mut *self.open {
+        if let [.., CaexPart::Attribute(attribute), CaexPart::Value] = &mut *self.open {
             attribute.value.push_str(text);
         }
     }

@@ -6,7 +6,7 @@
 
 use std::collections::BTreeSet;
 
-use crate::model::{Bound, Module, Node, Output, OutputRole, ValueKind};
+use crate::model::{Module, ModuleOutput, OpcUaNode, OutputRole, ParameterKind, ValueBound};
 use crate::rdf::unit_symbol;
 
 /// An input of a module, with the outputs of other modules that fit.
@@ -15,13 +15,13 @@ pub struct InputProposal<'m> {
     /// The place of its module.
     pub module: usize,
     /// The input.
-    pub input: &'m Output,
+    pub input: &'m ModuleOutput,
     /// The node that is written.
-    pub node: &'m Node,
+    pub node: &'m OpcUaNode,
     /// The outputs that fit, the best first.
     pub fitting: Vec<FittingOutput<'m>>,
     /// The outputs that do not fit, with the reason.
-    pub others: Vec<(usize, &'m Output, String)>,
+    pub others: Vec<(usize, &'m ModuleOutput, String)>,
 }
 
 /// An output of a module that fits to an input.
@@ -30,9 +30,9 @@ pub struct FittingOutput<'m> {
     /// The place of its module.
     pub module: usize,
     /// The output.
-    pub output: &'m Output,
+    pub output: &'m ModuleOutput,
     /// The node that is read.
-    pub node: &'m Node,
+    pub node: &'m OpcUaNode,
     /// The likeness of the names.
     pub names: NameMatch,
     /// Whether both state the same unit; otherwise one of them states none in the file.
@@ -126,7 +126,7 @@ pub fn proposals(modules: &[Module]) -> Vec<InputProposal<'_>> {
 
 /// Returns the values of a role that a module exchanges with others. A value that the module and
 /// its services name is the same data assembly.
-fn exchanged(module: &Module, role: OutputRole) -> impl Iterator<Item = &Output> {
+fn exchanged(module: &Module, role: OutputRole) -> impl Iterator<Item = &ModuleOutput> {
     let procedures = module.services.iter().flat_map(|one| &one.procedures);
     let of_services = module.services.iter().flat_map(|one| &one.outputs);
     let of_procedures = procedures.flat_map(|one| &one.outputs);
@@ -140,7 +140,7 @@ fn exchanged(module: &Module, role: OutputRole) -> impl Iterator<Item = &Output>
 }
 
 /// Returns the node of an input that other modules write.
-fn written<'m>(module: &'m Module, input: &'m Output) -> Option<&'m Node> {
+fn written<'m>(module: &'m Module, input: &'m ModuleOutput) -> Option<&'m OpcUaNode> {
     let mut assemblies = module.assemblies.iter();
     let assembly = assemblies.find(|one| one.id == input.assembly);
     let outside = assembly.and_then(|one| one.node(&["VExt"]));
@@ -153,14 +153,17 @@ fn written<'m>(module: &'m Module, input: &'m Output) -> Option<&'m Node> {
 ///
 /// # Errors
 /// The reason why the output does not fit.
-fn fitting<'m>(output: &'m Output, input: &Output) -> Result<(&'m Node, (bool, bool)), String> {
+fn fitting<'m>(
+    output: &'m ModuleOutput,
+    input: &ModuleOutput,
+) -> Result<(&'m OpcUaNode, (bool, bool)), String> {
     let node = output.node.as_ref().filter(|node| node.access.reads);
     let node = node.ok_or("it has no node that can be read")?;
     if output.kind != input.kind {
         let (is, other) = (kind(output.kind), kind(input.kind));
         return Err(format!("it is {is}, and the input is {other}"));
     }
-    let unit = |of: &Output| of.unit.as_ref().and_then(Bound::constant);
+    let unit = |of: &ModuleOutput| of.unit.as_ref().and_then(ValueBound::constant);
     let is_same_unit = match (unit(output), unit(input)) {
         (Some(one), Some(other)) if one != other => {
             let (one, other) = (unit_name(one), unit_name(other));
@@ -169,8 +172,8 @@ fn fitting<'m>(output: &'m Output, input: &Output) -> Result<(&'m Node, (bool, b
         (Some(_), Some(_)) => true,
         _ => false,
     };
-    let scale = |of: &Output| {
-        let number = |bound: &Option<Bound>| bound.as_ref().and_then(Bound::constant);
+    let scale = |of: &ModuleOutput| {
+        let number = |bound: &Option<ValueBound>| bound.as_ref().and_then(ValueBound::constant);
         Some((number(&of.min)?, number(&of.max)?))
     };
     let is_in_range = match (scale(output), scale(input)) {
@@ -186,12 +189,12 @@ fn fitting<'m>(output: &'m Output, input: &Output) -> Result<(&'m Node, (bool, b
     Ok((node, (is_same_unit, is_in_range)))
 }
 
-fn kind(kind: ValueKind) -> &'static str {
+fn kind(kind: ParameterKind) -> &'static str {
     match kind {
-        ValueKind::Analog => "analog",
-        ValueKind::Integer => "an integer",
-        ValueKind::Binary => "binary",
-        ValueKind::Text => "a text",
+        ParameterKind::Analog => "analog",
+        ParameterKind::Integer => "an integer",
+        ParameterKind::Binary => "binary",
+        ParameterKind::Text => "a text",
     }
 }
 
@@ -239,36 +242,36 @@ const SHORTEST_WORD: usize = 4;
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::model::{Access, Identifier};
+    use crate::model::{ItemAccess, NodeIdentifier};
 
-    fn node(item: &str, writes: bool) -> Node {
-        Node {
+    fn node(item: &str, writes: bool) -> OpcUaNode {
+        OpcUaNode {
             item: item.to_owned(),
             endpoint: "opc.tcp://127.0.0.1:4841".to_owned(),
             namespace: "urn:example".to_owned(),
-            identifier: Identifier::Text(item.to_owned()),
-            access: Access {
+            identifier: NodeIdentifier::Text(item.to_owned()),
+            access: ItemAccess {
                 reads: true,
                 writes,
             },
         }
     }
 
-    fn value(name: &str, role: OutputRole) -> Output {
-        Output {
+    fn value(name: &str, role: OutputRole) -> ModuleOutput {
+        ModuleOutput {
             id: name.to_owned(),
             name: name.to_owned(),
             role,
-            kind: ValueKind::Analog,
+            kind: ParameterKind::Analog,
             assembly: name.to_owned(),
-            min: Some(Bound::Constant(0.0)),
-            max: Some(Bound::Constant(100.0)),
-            unit: Some(Bound::Constant(1001.0)),
+            min: Some(ValueBound::Constant(0.0)),
+            max: Some(ValueBound::Constant(100.0)),
+            unit: Some(ValueBound::Constant(1001.0)),
             node: Some(node(name, role == OutputRole::ProcessValueIn)),
         }
     }
 
-    fn module(name: &str, process_values: Vec<Output>) -> Module {
+    fn module(name: &str, process_values: Vec<ModuleOutput>) -> Module {
         Module {
             name: name.to_owned(),
             version: String::new(),
@@ -284,11 +287,11 @@ mod tests {
         }
     }
 
-    fn output(name: &str) -> Output {
+    fn output(name: &str) -> ModuleOutput {
         value(name, OutputRole::ProcessValueOut)
     }
 
-    fn proposed(inputs: Output, outputs: Vec<Output>) -> Option<String> {
+    fn proposed(inputs: ModuleOutput, outputs: Vec<ModuleOutput>) -> Option<String> {
         let modules = [module("one", vec![inputs]), module("two", outputs)];
         let all = proposals(&modules);
         assert_eq!(all.len(), 1);
@@ -326,28 +329,28 @@ mod tests {
         let plain = output("Temperature");
         for (other, why) in [
             (
-                Output {
-                    kind: ValueKind::Binary,
+                ModuleOutput {
+                    kind: ParameterKind::Binary,
                     ..plain.clone()
                 },
                 "it is binary, and the input is analog",
             ),
             (
-                Output {
-                    unit: Some(Bound::Constant(1000.0)),
+                ModuleOutput {
+                    unit: Some(ValueBound::Constant(1000.0)),
                     ..plain.clone()
                 },
                 "its unit is K, and that of the input °C",
             ),
             (
-                Output {
-                    max: Some(Bound::Constant(150.0)),
+                ModuleOutput {
+                    max: Some(ValueBound::Constant(150.0)),
                     ..plain.clone()
                 },
                 "its scale from 0 to 150 exceeds that of the input, from 0 to 100",
             ),
             (
-                Output {
+                ModuleOutput {
                     node: None,
                     ..plain
                 },
@@ -363,8 +366,8 @@ mod tests {
             assert_eq!(all[0].others[0].2, why);
         }
         // A unit that is a node is not known: the names have to agree.
-        let unknown = Output {
-            unit: Some(Bound::Node(node("unit", false))),
+        let unknown = ModuleOutput {
+            unit: Some(ValueBound::Node(node("unit", false))),
             ..output("Level")
         };
         assert_eq!(proposed(input, vec![unknown]), None);
@@ -375,7 +378,7 @@ mod tests {
         let input = value("Temperature", OutputRole::ProcessValueIn);
         let own = [module("one", vec![input.clone(), output("Temperature")])];
         assert_eq!(proposals(&own)[0].fitting, []);
-        let read_only = Output {
+        let read_only = ModuleOutput {
             node: Some(node("Temperature", false)),
             ..input
         };

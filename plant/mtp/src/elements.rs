@@ -3,7 +3,10 @@
 use std::collections::BTreeMap;
 
 use crate::caex::CaexElement;
-use crate::model::{Alarm, DataAssembly, Family, Link, Node, Output, OutputRole, Variable};
+use crate::model::{
+    AssemblyVariable, DataAssembly, Family, ModuleAlarm, ModuleOutput, OpcUaNode, OutputRole,
+    VariableLink,
+};
 use crate::read::{ElementIndex, is_assembly, is_list, is_true};
 
 /// Returns the family of a data assembly by the whole path of its type.
@@ -61,15 +64,15 @@ impl<'a> ElementIndex<'a> {
                 continue;
             }
             let link = match self.node_of(value) {
-                Some(node) => Link::Node(node),
+                Some(node) => VariableLink::Node(node),
                 None if attribute.is_link => {
                     let about = format!("{}.{}", element.name, attribute.name);
                     self.find(element, &about, "it refers to an ID that no OPCUAItem has");
                     continue;
                 }
-                None => Link::Constant(value.to_owned()),
+                None => VariableLink::Constant(value.to_owned()),
             };
-            variables.push(Variable {
+            variables.push(AssemblyVariable {
                 name: attribute.name.clone(),
                 link,
             });
@@ -84,7 +87,7 @@ impl<'a> ElementIndex<'a> {
     }
 
     /// Reads the output values below a service or a procedure, or the values of a module.
-    pub(crate) fn outputs(&mut self, about: &str, of: &'a CaexElement) -> Vec<Output> {
+    pub(crate) fn outputs(&mut self, about: &str, of: &'a CaexElement) -> Vec<ModuleOutput> {
         let mut outputs = Vec::new();
         for child in &of.children {
             let Some(role) = role_of(child) else { continue };
@@ -103,9 +106,9 @@ impl<'a> ElementIndex<'a> {
         outputs
     }
 
-    fn output(&mut self, element: &'a CaexElement, role: OutputRole) -> Option<Output> {
+    fn output(&mut self, element: &'a CaexElement, role: OutputRole) -> Option<ModuleOutput> {
         let assembly = self.data_assembly(self.value_assembly(element)?);
-        Some(Output {
+        Some(ModuleOutput {
             id: element.id.clone(),
             name: element.name.clone(),
             role,
@@ -137,7 +140,7 @@ impl<'a> ElementIndex<'a> {
     }
 
     /// Reads the alarms of a module.
-    pub(crate) fn alarms(&mut self, root: &'a CaexElement) -> Vec<Alarm> {
+    pub(crate) fn alarms(&mut self, root: &'a CaexElement) -> Vec<ModuleAlarm> {
         let texts: BTreeMap<&str, &str> = root
             .all()
             .filter(|one| matches!(one.kind(), "AlarmMessage" | "AlarmText"))
@@ -162,7 +165,7 @@ impl<'a> ElementIndex<'a> {
             }
             let text = element.value(&["MessageRef"]);
             let text = text.and_then(|id| texts.get(id)).copied();
-            alarms.push(Alarm {
+            alarms.push(ModuleAlarm {
                 id: element.id.clone(),
                 name: element.name.clone(),
                 text: text.unwrap_or_default().to_owned(),
@@ -181,7 +184,7 @@ impl<'a> ElementIndex<'a> {
     }
 
     /// Returns the node of an attribute of a data assembly by the ID of the attribute.
-    fn variable_node(&self, id: &str) -> Option<Node> {
+    fn variable_node(&self, id: &str) -> Option<OpcUaNode> {
         self.node_of(self.attribute_value(id)?)
     }
 }

@@ -7,7 +7,7 @@
 //! monitoring. Files of 2018 to 2026 differ in names (`ServiceStrategy`, `ServiceProcedure`,
 //! `Service/Procedure`; `CommandEn`, `CommandEnable`, `ControlEnable`), in the version of CAEX
 //! (2.15, 3.0) and in references (by RefID or by ID). The model has a single name for each concept.
-//! An inconsistency in a file is a [`Finding`], and the rest of the file is used.
+//! An inconsistency in a file is a [`MtpFinding`], and the rest of the file is used.
 //!
 //! [`connect::proposals`] finds outputs of modules for the inputs of others.
 //!
@@ -30,9 +30,10 @@ pub mod vocabulary;
 
 pub use caex::ManifestError;
 pub use model::{
-    Access, Alarm, Bound, Control, DataAssembly, Edition, Family, Finding, Identifier, Item, Link,
-    Module, Node, OpcUaServer, Output, OutputRole, Parameter, Procedure, Role, Service, ValueKind,
-    Variable,
+    AssemblyVariable, Control, ControlRole, DataAssembly, Edition, Family, ItemAccess,
+    ManifestServer, Module, ModuleAlarm, ModuleOutput, MtpFinding, MtpService, NodeIdentifier,
+    NodeItem, OpcUaNode, OutputRole, ParameterKind, Procedure, ServiceParameter, ValueBound,
+    VariableLink,
 };
 pub use rdf::{Object, Triple, unit_symbol};
 pub use rdf_module::state_iri;

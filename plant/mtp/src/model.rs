@@ -14,19 +14,19 @@ pub struct Module {
     /// The endpoints of its OPC UA servers.
     pub endpoints: Vec<String>,
     /// Its OPC UA servers.
-    pub servers: Vec<OpcUaServer>,
+    pub servers: Vec<ManifestServer>,
     /// All nodes of its servers (OPCUAItems).
-    pub items: Vec<Item>,
+    pub items: Vec<NodeItem>,
     /// All data assemblies: sensors, actuators, parameters, services.
     pub assemblies: Vec<DataAssembly>,
     /// The values that the module exchanges with other modules.
-    pub process_values: Vec<Output>,
+    pub process_values: Vec<ModuleOutput>,
     /// Its alarms (MTP 2.0).
-    pub alarms: Vec<Alarm>,
+    pub alarms: Vec<ModuleAlarm>,
     /// Its services, in the order of the file.
-    pub services: Vec<Service>,
+    pub services: Vec<MtpService>,
     /// Inconsistencies in the file.
-    pub findings: Vec<Finding>,
+    pub findings: Vec<MtpFinding>,
 }
 
 /// The edition of the standard of a manifest.
@@ -40,7 +40,7 @@ pub enum Edition {
 
 /// An element that is not in the model.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Finding {
+pub struct MtpFinding {
     /// The element, such as `Dosing/volume_based`.
     pub about: String,
     /// Description of the inconsistency.
@@ -52,7 +52,7 @@ pub struct Finding {
     pub is_note: bool,
 }
 
-impl std::fmt::Display for Finding {
+impl std::fmt::Display for MtpFinding {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         write!(f, "line {}: {}: {}", self.line, self.about, self.what)
     }
@@ -60,7 +60,7 @@ impl std::fmt::Display for Finding {
 
 /// An OPC UA server of a module.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct OpcUaServer {
+pub struct ManifestServer {
     /// Unique in the file.
     pub id: String,
     /// Its name.
@@ -71,11 +71,11 @@ pub struct OpcUaServer {
 
 /// A node of a server, as the file names it.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Item {
+pub struct NodeItem {
     /// Its name in the file.
     pub name: String,
     /// The node, with its ID in the file.
-    pub node: Node,
+    pub node: OpcUaNode,
 }
 
 /// A data assembly: the variables of a sensor, an actuator, a parameter or a service.
@@ -90,7 +90,7 @@ pub struct DataAssembly {
     /// The family of its type.
     pub family: Family,
     /// Its variables in the order of the file.
-    pub variables: Vec<Variable>,
+    pub variables: Vec<AssemblyVariable>,
 }
 
 /// A family of data assemblies (VDI/VDE/NAMUR 2658-3).
@@ -116,25 +116,25 @@ pub enum Family {
 
 /// A variable of a data assembly.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Variable {
+pub struct AssemblyVariable {
     /// Its name, such as `V` or `VSclMax`.
     pub name: String,
     /// A node, or a value in the file.
-    pub link: Link,
+    pub link: VariableLink,
 }
 
 /// The value of a variable of a data assembly.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Link {
+pub enum VariableLink {
     /// A node.
-    Node(Node),
+    Node(OpcUaNode),
     /// A value in the file.
     Constant(String),
 }
 
 /// An output value of a procedure or a service, or a value that a module exchanges with others.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Output {
+pub struct ModuleOutput {
     /// Unique in the file.
     pub id: String,
     /// Its name.
@@ -142,17 +142,17 @@ pub struct Output {
     /// Its use.
     pub role: OutputRole,
     /// Its kind.
-    pub kind: ValueKind,
+    pub kind: ParameterKind,
     /// The data assembly with its variables.
     pub assembly: String,
     /// Minimum value of its scale.
-    pub min: Option<Bound>,
+    pub min: Option<ValueBound>,
     /// Maximum value of its scale.
-    pub max: Option<Bound>,
+    pub max: Option<ValueBound>,
     /// The number of its unit, or the node with that number.
-    pub unit: Option<Bound>,
+    pub unit: Option<ValueBound>,
     /// The node with the value.
-    pub node: Option<Node>,
+    pub node: Option<OpcUaNode>,
 }
 
 /// The use of an output.
@@ -168,7 +168,7 @@ pub enum OutputRole {
 
 /// An alarm of a module (MTP 2.0).
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Alarm {
+pub struct ModuleAlarm {
     /// Unique in the file.
     pub id: String,
     /// Its name.
@@ -180,14 +180,14 @@ pub struct Alarm {
     /// Whether an operator acknowledges it.
     pub is_acknowledged: bool,
     /// The node that triggers it.
-    pub trigger: Option<Node>,
+    pub trigger: Option<OpcUaNode>,
     /// The value of the node that triggers it; empty if the file has none.
     pub trigger_value: String,
 }
 
 /// A service, which runs one of its procedures at a time (VDI/VDE/NAMUR 2658-4).
 #[derive(Debug, Clone, PartialEq)]
-pub struct Service {
+pub struct MtpService {
     /// Unique in the file; two services may have the same name.
     pub id: String,
     /// Its name.
@@ -195,9 +195,9 @@ pub struct Service {
     /// Nodes for commands and monitoring.
     pub control: Control,
     /// Parameters of the service itself.
-    pub parameters: Vec<Parameter>,
+    pub parameters: Vec<ServiceParameter>,
     /// Output values of the service itself.
-    pub outputs: Vec<Output>,
+    pub outputs: Vec<ModuleOutput>,
     /// The IDs of the equipment that the service requires.
     pub equipment: Vec<String>,
     /// Its procedures.
@@ -218,16 +218,16 @@ pub struct Procedure {
     /// Whether it ends by itself, or needs the command to complete.
     pub is_self_completing: bool,
     /// Its parameters.
-    pub parameters: Vec<Parameter>,
+    pub parameters: Vec<ServiceParameter>,
     /// Its output values.
-    pub outputs: Vec<Output>,
+    pub outputs: Vec<ModuleOutput>,
     /// The IDs of the equipment that the procedure requires.
     pub equipment: Vec<String>,
 }
 
 /// An input value of a service or procedure.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Parameter {
+pub struct ServiceParameter {
     /// Unique in the file.
     pub id: String,
     /// Its name.
@@ -235,24 +235,24 @@ pub struct Parameter {
     /// Whether it belongs to the configuration of the service, in place of a recipe.
     pub is_configuration: bool,
     /// Its kind.
-    pub kind: ValueKind,
+    pub kind: ParameterKind,
     /// Minimum value.
-    pub min: Option<Bound>,
+    pub min: Option<ValueBound>,
     /// Maximum value.
-    pub max: Option<Bound>,
+    pub max: Option<ValueBound>,
     /// The number of its unit in VDI/VDE/NAMUR 2658-3, or the node with that number.
-    pub unit: Option<Bound>,
+    pub unit: Option<ValueBound>,
     /// The node for writing from outside (VExt).
-    pub write: Option<Node>,
+    pub write: Option<OpcUaNode>,
     /// The node for reading the effective value (VOut).
-    pub read: Option<Node>,
+    pub read: Option<OpcUaNode>,
     /// The nodes of the handshake (Apply, mode and source), by the names of the standard.
-    pub handshake: Vec<(String, Node)>,
+    pub handshake: Vec<(String, OpcUaNode)>,
 }
 
 /// The kind of a parameter.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub enum ValueKind {
+pub enum ParameterKind {
     /// AnaServParam: a REAL.
     Analog,
     /// DIntServParam, DigServParam: a DINT.
@@ -265,20 +265,20 @@ pub enum ValueKind {
 
 /// A number in the file, or a node with the number while the module runs.
 #[derive(Debug, Clone, PartialEq)]
-pub enum Bound {
+pub enum ValueBound {
     /// A number in the file.
     Constant(f64),
     /// A node.
-    Node(Node),
+    Node(OpcUaNode),
 }
 
 /// The nodes of a ServiceControl in the file.
 #[derive(Debug, Clone, PartialEq, Default)]
-pub struct Control(pub BTreeMap<Role, Node>);
+pub struct Control(pub BTreeMap<ControlRole, OpcUaNode>);
 
 /// The role of a node of a ServiceControl, with the names of other drafts in brackets.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
-pub enum Role {
+pub enum ControlRole {
     /// CommandExt (ControlExt): commands from outside.
     Command,
     /// CommandEn (CommandEnable, ControlEnable): the currently enabled commands.
@@ -331,7 +331,7 @@ pub enum Role {
 
 /// A node of an OPC UA server.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Node {
+pub struct OpcUaNode {
     /// The ID of its OPCUAItem in the file.
     pub item: String,
     /// The endpoint of its server.
@@ -339,14 +339,14 @@ pub struct Node {
     /// The URI of its namespace, or the namespace index that some files have in its place.
     pub namespace: String,
     /// Its identifier in the namespace.
-    pub identifier: Identifier,
+    pub identifier: NodeIdentifier,
     /// Access rights.
-    pub access: Access,
+    pub access: ItemAccess,
 }
 
 /// The identifier of a node.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Identifier {
+pub enum NodeIdentifier {
     /// A number.
     Numeric(u32),
     /// A text, including GUIDs and opaque identifiers as written in the file.
@@ -355,7 +355,7 @@ pub enum Identifier {
 
 /// OPCUAItem's Access: 1 reads, 2 writes, 3 both.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Access {
+pub struct ItemAccess {
     /// Whether the node can be read.
     pub reads: bool,
     /// Whether the node can be written.
@@ -365,46 +365,46 @@ pub struct Access {
 impl DataAssembly {
     /// Returns the variable of a name.
     #[must_use]
-    pub fn variable(&self, name: &str) -> Option<&Variable> {
+    pub fn variable(&self, name: &str) -> Option<&AssemblyVariable> {
         self.variables.iter().find(|one| one.name == name)
     }
 
     /// Returns the node of the first existing variable with one of these names.
     #[must_use]
-    pub fn node(&self, names: &[&str]) -> Option<&Node> {
+    pub fn node(&self, names: &[&str]) -> Option<&OpcUaNode> {
         let found = names.iter().find_map(|name| self.variable(name))?;
         match &found.link {
-            Link::Node(node) => Some(node),
-            Link::Constant(_) => None,
+            VariableLink::Node(node) => Some(node),
+            VariableLink::Constant(_) => None,
         }
     }
 
     /// Returns the bound in the first existing variable with one of these names.
-    pub(crate) fn bound(&self, names: &[&str]) -> Option<Bound> {
+    pub(crate) fn bound(&self, names: &[&str]) -> Option<ValueBound> {
         let found = names.iter().find_map(|name| self.variable(name))?;
         match &found.link {
-            Link::Node(node) => Some(Bound::Node(node.clone())),
-            Link::Constant(text) => Bound::of_text(text),
+            VariableLink::Node(node) => Some(ValueBound::Node(node.clone())),
+            VariableLink::Constant(text) => ValueBound::of_text(text),
         }
     }
 
     /// Returns the kind of its value; `None` for data assemblies without a single value.
     #[must_use]
-    pub fn value_kind(&self) -> Option<ValueKind> {
+    pub fn value_kind(&self) -> Option<ParameterKind> {
         let is = |part: &str| self.kind.contains(part);
         let is_active = matches!(self.family, Family::Actuator | Family::Service);
         match () {
             () if is_active => None,
-            () if is("DInt") || is("Dig") => Some(ValueKind::Integer),
-            () if is("Ana") => Some(ValueKind::Analog),
-            () if is("Bin") => Some(ValueKind::Binary),
-            () if is("Str") => Some(ValueKind::Text),
+            () if is("DInt") || is("Dig") => Some(ParameterKind::Integer),
+            () if is("Ana") => Some(ParameterKind::Analog),
+            () if is("Bin") => Some(ParameterKind::Binary),
+            () if is("Str") => Some(ParameterKind::Text),
             () => None,
         }
     }
 }
 
-impl Bound {
+impl ValueBound {
     /// Returns the finite number in a text.
     pub(crate) fn of_text(text: &str) -> Option<Self> {
         let number: f64 = text.parse().ok()?;
@@ -422,7 +422,7 @@ impl Bound {
 
     /// Returns the node with the number.
     #[must_use]
-    pub fn node(&self) -> Option<&Node> {
+    pub fn node(&self) -> Option<&OpcUaNode> {
         match self {
             Self::Constant(_) => None,
             Self::Node(node) => Some(node),
@@ -433,7 +433,7 @@ impl Bound {
 impl Control {
     /// Returns the node with a role.
     #[must_use]
-    pub fn node(&self, role: Role) -> Option<&Node> {
+    pub fn node(&self, role: ControlRole) -> Option<&OpcUaNode> {
         self.0.get(&role)
     }
 }

@@ -4,7 +4,9 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 
-use crate::model::{DataAssembly, Family, Link, Module, Node, Role, Service, ValueKind};
+use crate::model::{
+    ControlRole, DataAssembly, Family, Module, MtpService, OpcUaNode, ParameterKind, VariableLink,
+};
 use crate::state::{Command, State};
 
 /// The value of a node.
@@ -85,7 +87,7 @@ struct Modes {
 
 #[derive(Debug, Clone)]
 struct SimulatedService {
-    nodes: BTreeMap<Role, String>,
+    nodes: BTreeMap<ControlRole, String>,
     modes: Modes,
     parameters: Vec<SimulatedParameter>,
     /// The numbers of the procedures, and whether each completes by itself.
@@ -121,7 +123,7 @@ impl Pea {
         }
         for assembly in &module.assemblies {
             for variable in &assembly.variables {
-                if let Link::Node(node) = &variable.link {
+                if let VariableLink::Node(node) = &variable.link {
                     let value = initial(assembly, &variable.name);
                     pea.values.insert(node.item.clone(), value);
                 }
@@ -280,7 +282,7 @@ impl Pea {
         };
         let is_effective = service.is_automatic && service.is_external;
         match role {
-            Some(Role::Command) => {
+            Some(ControlRole::Command) => {
                 let state = service.state;
                 let command = Command::of_bit(word).filter(|_| is_effective);
                 if let Some(next) = command.and_then(|command| state.after(command)) {
@@ -291,7 +293,7 @@ impl Pea {
                 }
                 return;
             }
-            Some(Role::ProcedureWanted) => {
+            Some(ControlRole::ProcedureWanted) => {
                 let is_known = service.procedures.contains_key(&word);
                 if is_effective && is_known && !faults.ignores_procedure {
                     if let Some(service) = self.services.get_mut(at) {
@@ -301,7 +303,7 @@ impl Pea {
                 }
                 return;
             }
-            Some(Role::OperationMode) => {
+            Some(ControlRole::OperationMode) => {
                 let asks = |bit: u32| word & bit != 0;
                 let (automatic, external) = (asks(OP_MODE_AUTOMATIC), asks(OP_MODE_EXTERNAL));
                 self.switch(at, automatic, external);
@@ -395,21 +397,30 @@ impl Pea {
             mode |= OP_MODE_EXTERNAL_ACTIVE;
         }
         let shown = [
-            (Role::State, PeaValue::Word(state)),
-            (Role::CommandEnabled, PeaValue::Word(commands)),
-            (Role::ProcedureRequested, PeaValue::Word(service.requested)),
-            (Role::ProcedureCurrent, PeaValue::Word(service.current)),
-            (Role::OperationMode, PeaValue::Word(mode)),
+            (ControlRole::State, PeaValue::Word(state)),
+            (ControlRole::CommandEnabled, PeaValue::Word(commands)),
             (
-                Role::AutomaticActive,
+                ControlRole::ProcedureRequested,
+                PeaValue::Word(service.requested),
+            ),
+            (
+                ControlRole::ProcedureCurrent,
+                PeaValue::Word(service.current),
+            ),
+            (ControlRole::OperationMode, PeaValue::Word(mode)),
+            (
+                ControlRole::AutomaticActive,
                 PeaValue::Boolean(service.is_automatic),
             ),
             (
-                Role::OperatorActive,
+                ControlRole::OperatorActive,
                 PeaValue::Boolean(!service.is_automatic),
             ),
-            (Role::ExternalActive, PeaValue::Boolean(service.is_external)),
-            (Role::Quality, PeaValue::Byte(255)),
+            (
+                ControlRole::ExternalActive,
+                PeaValue::Boolean(service.is_external),
+            ),
+            (ControlRole::Quality, PeaValue::Byte(255)),
         ];
         let nodes = service.nodes.clone();
         for (role, value) in shown {
@@ -439,8 +450,8 @@ impl Modes {
 }
 
 impl SimulatedService {
-    fn new(service: &Service, module: &Module) -> Self {
-        let nodes: BTreeMap<Role, String> = service
+    fn new(service: &MtpService, module: &Module) -> Self {
+        let nodes: BTreeMap<ControlRole, String> = service
             .control
             .0
             .iter()
@@ -448,10 +459,10 @@ impl SimulatedService {
             .collect();
         let mut modes = Modes::default();
         for (role, name) in [
-            (Role::AutomaticByOperator, "StateAutOp"),
-            (Role::AutomaticByAutomation, "StateAutAut"),
-            (Role::ExternalByOperator, "SrcExtOp"),
-            (Role::ExternalByAutomation, "SrcExtAut"),
+            (ControlRole::AutomaticByOperator, "StateAutOp"),
+            (ControlRole::AutomaticByAutomation, "StateAutAut"),
+            (ControlRole::ExternalByOperator, "SrcExtOp"),
+            (ControlRole::ExternalByAutomation, "SrcExtAut"),
         ] {
             if let Some(item) = nodes.get(&role) {
                 modes.nodes.insert(name, item.clone());
@@ -500,13 +511,12 @@ impl SimulatedService {
 
 /// Returns the items that show the effective value of a parameter: VOut, VFbk and VRbk of its data
 /// assembly.
-fn outputs(module: &Module, read: Option<&Node>) -> Vec<String> {
+fn outputs(module: &Module, read: Option<&OpcUaNode>) -> Vec<String> {
     let Some(read) = read else { return Vec::new() };
     let is_of = |assembly: &&DataAssembly| {
-        assembly
-            .variables
-            .iter()
-            .any(|variable| matches!(&variable.link, Link::Node(node) if node.item == read.item))
+        assembly.variables.iter().any(
+            |variable| matches!(&variable.link, VariableLink::Node(node) if node.item == read.item),
+        )
     };
     let Some(assembly) = module.assemblies.iter().find(is_of) else {
         return vec![read.item.clone()];
@@ -558,18 +568,22 @@ fn initial(assembly: &DataAssembly, name: &str) -> PeaValue {
         () if is_text => PeaValue::Text(String::new()),
         () if name.ends_with("Unit") => PeaValue::Integer(0),
         () if is_value => match assembly.value_kind() {
-            Some(ValueKind::Analog) => PeaValue::Number(if name == "VMax" || name == "VSclMax" {
-                100.0
-            } else {
-                0.0
-            }),
-            Some(ValueKind::Integer) => PeaValue::Integer(if name == "VMax" || name == "VSclMax" {
-                100
-            } else {
-                0
-            }),
-            Some(ValueKind::Text) => PeaValue::Text(String::new()),
-            Some(ValueKind::Binary) | None => PeaValue::Boolean(false),
+            Some(ParameterKind::Analog) => {
+                PeaValue::Number(if name == "VMax" || name == "VSclMax" {
+                    100.0
+                } else {
+                    0.0
+                })
+            }
+            Some(ParameterKind::Integer) => {
+                PeaValue::Integer(if name == "VMax" || name == "VSclMax" {
+                    100
+                } else {
+                    0
+                })
+            }
+            Some(ParameterKind::Text) => PeaValue::Text(String::new()),
+            Some(ParameterKind::Binary) | None => PeaValue::Boolean(false),
         },
         () if NUMBERS.contains(&name) => PeaValue::Number(0.0),
         () => PeaValue::Boolean(name == "ApplyEn" || name.ends_with("ApplyEn")),

@@ -11,8 +11,8 @@ use std::fmt;
 use uri_text::escaped;
 
 use crate::model::{
-    Access, Bound, Edition, Identifier, Module, Node, Parameter, Procedure, Role, Service,
-    ValueKind,
+    ControlRole, Edition, ItemAccess, Module, MtpService, NodeIdentifier, OpcUaNode, ParameterKind,
+    Procedure, ServiceParameter, ValueBound,
 };
 use crate::state::Command;
 use crate::vocabulary as v;
@@ -120,7 +120,7 @@ impl Module {
     }
 }
 
-impl Node {
+impl OpcUaNode {
     /// Returns its NodeId in the notation of OPC 10000-6, 5.1.12, such as
     /// `nsu=urn:module;s=Dosing.StateCur`. It starts with `ns=` if the file has only an index.
     #[must_use]
@@ -135,7 +135,7 @@ impl Node {
     }
 }
 
-impl fmt::Display for Identifier {
+impl fmt::Display for NodeIdentifier {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Numeric(number) => write!(f, "i={number}"),
@@ -175,7 +175,7 @@ impl ModuleStatements<'_> {
         }
     }
 
-    fn service(&mut self, module: &str, service: &Service) {
+    fn service(&mut self, module: &str, service: &MtpService) {
         let iri = self.name(module, "service", &service.id, &service.name);
         self.link(module, v::OFFERS_SERVICE, &iri);
         self.link(module, v::PAPER_HAS_CAPABILITY, &iri);
@@ -230,8 +230,8 @@ impl ModuleStatements<'_> {
     }
 
     /// Adds the commands of a procedure: a number for each command, written to the same node.
-    fn commands(&mut self, service_iri: &str, service: &Service) -> Vec<(Command, String)> {
-        let Some(node) = service.control.node(Role::Command) else {
+    fn commands(&mut self, service_iri: &str, service: &MtpService) -> Vec<(Command, String)> {
+        let Some(node) = service.control.node(ControlRole::Command) else {
             return Vec::new();
         };
         let mut commands = Vec::new();
@@ -250,7 +250,7 @@ impl ModuleStatements<'_> {
     fn procedure(
         &mut self,
         (module, service_iri): (&str, &str),
-        service: &Service,
+        service: &MtpService,
         procedure: &Procedure,
     ) -> String {
         let iri = self.name(service_iri, "procedure", &procedure.id, &procedure.name);
@@ -275,7 +275,7 @@ impl ModuleStatements<'_> {
             v::IS_SELF_COMPLETING,
             Object::Boolean(procedure.is_self_completing),
         );
-        if let Some(command) = service.control.node(Role::Command) {
+        if let Some(command) = service.control.node(ControlRole::Command) {
             self.node(&iri, command);
         }
         let about = format!("{}/{}", service.name, procedure.name);
@@ -294,7 +294,7 @@ impl ModuleStatements<'_> {
         &mut self,
         (module, skill): (&str, &str),
         class: &str,
-        service: &Service,
+        service: &MtpService,
         procedure: &Procedure,
     ) {
         let about = format!("{}/{}", service.name, procedure.name);
@@ -320,7 +320,7 @@ impl ModuleStatements<'_> {
         format!("{}/element/{}", self.base, escaped(id))
     }
 
-    fn parameter(&mut self, of: &str, about: &str, parameter: &Parameter) -> String {
+    fn parameter(&mut self, of: &str, about: &str, parameter: &ServiceParameter) -> String {
         let iri = self.name(of, "parameter", &parameter.id, &parameter.name);
         self.is_a(&iri, &[v::INPUT_PARAMETER, v::PAPER_SKILL_PARAMETER]);
         self.text(&iri, v::RDFS_LABEL, &format!("{about}.{}", parameter.name));
@@ -350,24 +350,24 @@ impl ModuleStatements<'_> {
     }
 
     /// Adds the limits and the unit of a parameter or an output: numbers, or nodes.
-    pub(crate) fn scale(&mut self, of: &str, about: &str, scale: [&Option<Bound>; 3]) {
+    pub(crate) fn scale(&mut self, of: &str, about: &str, scale: [&Option<ValueBound>; 3]) {
         let [min, max, unit] = scale;
         for (bound, predicate, role) in [(min, v::MIN, "Min"), (max, v::MAX, "Max")] {
             match bound {
-                Some(Bound::Constant(number)) => {
+                Some(ValueBound::Constant(number)) => {
                     self.say(of, predicate, Object::Number(*number));
                     self.constant(of, role, Object::Number(*number));
                 }
-                Some(Bound::Node(node)) => self.part(of, about, role, node),
+                Some(ValueBound::Node(node)) => self.part(of, about, role, node),
                 None => {}
             }
         }
         match unit {
-            Some(Bound::Constant(code)) => {
+            Some(ValueBound::Constant(code)) => {
                 self.unit(of, *code);
                 self.constant(of, "Unit", Object::Number(*code));
             }
-            Some(Bound::Node(node)) => self.part(of, about, "Unit", node),
+            Some(ValueBound::Node(node)) => self.part(of, about, "Unit", node),
             None => {}
         }
     }
@@ -382,7 +382,7 @@ impl ModuleStatements<'_> {
     }
 
     /// Adds a node of a parameter or an output beside its value.
-    fn part(&mut self, of: &str, about: &str, role: &str, node: &Node) {
+    fn part(&mut self, of: &str, about: &str, role: &str, node: &OpcUaNode) {
         let iri = format!("{of}/node/{role}");
         self.link(of, v::HAS_NODE, &iri);
         self.is_a(&iri, &[v::NODE]);
@@ -404,7 +404,7 @@ impl ModuleStatements<'_> {
     }
 
     /// Adds the location of a node, and the access to it.
-    pub(crate) fn node(&mut self, of: &str, node: &Node) {
+    pub(crate) fn node(&mut self, of: &str, node: &OpcUaNode) {
         self.text(of, v::ACCESS, node.access.name());
         self.text(of, v::ENDPOINT, &node.endpoint);
         self.text(of, v::NODE_NAMESPACE, &node.namespace);
@@ -450,7 +450,7 @@ impl ModuleStatements<'_> {
     }
 }
 
-impl Access {
+impl ItemAccess {
     /// Returns its name: `read`, `write`, `read and write` or `none`.
     #[must_use]
     pub const fn name(self) -> &'static str {
@@ -474,7 +474,7 @@ fn known_unit(code: f64) -> Option<(u16, &'static str)> {
     known.find(|(known, _)| f64::from(*known) == code)
 }
 
-impl ValueKind {
+impl ParameterKind {
     /// Returns the OPC UA DataType of such values.
     #[must_use]
     pub fn data_type(self) -> &'static str {

@@ -1,7 +1,10 @@
 //! Statements about the servers, nodes, data assemblies, outputs and state machines of a module.
 
 use crate::escaped;
-use crate::model::{Alarm, DataAssembly, Family, Link, Module, Output, OutputRole, Role, Service};
+use crate::model::{
+    ControlRole, DataAssembly, Family, Module, ModuleAlarm, ModuleOutput, MtpService, OutputRole,
+    VariableLink,
+};
 use crate::rdf::{ModuleStatements, Object};
 use crate::state::{Command, State};
 use crate::vocabulary as v;
@@ -70,12 +73,12 @@ impl ModuleStatements<'_> {
         self.text(&iri, v::ELEMENT_KIND, &assembly.kind);
         for variable in &assembly.variables {
             match &variable.link {
-                Link::Node(node) => {
+                VariableLink::Node(node) => {
                     let item = item_iri(module, &node.item, "");
                     self.link(&iri, v::HAS_NODE, &item);
                     self.text(&item, v::ROLE, &variable.name);
                 }
-                Link::Constant(text) => {
+                VariableLink::Constant(text) => {
                     let constant = format!("{iri}/constant/{}", escaped(&variable.name));
                     self.link(&iri, v::HAS_PARAMETER, &constant);
                     self.text(&constant, v::ROLE, &variable.name);
@@ -108,7 +111,7 @@ impl ModuleStatements<'_> {
         &mut self,
         of: &str,
         about: &str,
-        outputs: &[Output],
+        outputs: &[ModuleOutput],
     ) -> Vec<(&'static str, String)> {
         let mut iris = Vec::new();
         for output in outputs {
@@ -126,7 +129,7 @@ impl ModuleStatements<'_> {
         iris
     }
 
-    fn output(&mut self, iri: &str, about: &str, output: &Output) {
+    fn output(&mut self, iri: &str, about: &str, output: &ModuleOutput) {
         let (class, kind) = match output.role {
             OutputRole::Report => (v::OUTPUT_PARAMETER, "report"),
             OutputRole::ProcessValueOut => (v::OUTPUT_PARAMETER, "process value"),
@@ -146,7 +149,7 @@ impl ModuleStatements<'_> {
         self.scale(iri, about, [&output.min, &output.max, &output.unit]);
     }
 
-    fn alarm(&mut self, module: &str, alarm: &Alarm) {
+    fn alarm(&mut self, module: &str, alarm: &ModuleAlarm) {
         let iri = self.name(module, "alarm", &alarm.id, &alarm.name);
         self.link(module, v::HAS_ALARM, &iri);
         self.is_a(&iri, &[v::ALARM]);
@@ -168,7 +171,7 @@ impl ModuleStatements<'_> {
     pub(crate) fn state_machine(
         &mut self,
         service_iri: &str,
-        service: &Service,
+        service: &MtpService,
         commands: &[(Command, String)],
     ) -> String {
         let machine = format!("{service_iri}/machine");
@@ -216,29 +219,29 @@ impl ModuleStatements<'_> {
     pub(crate) fn service_variables(
         &mut self,
         service_iri: &str,
-        service: &Service,
+        service: &MtpService,
     ) -> Vec<(&'static str, String)> {
         let all = [
             (
-                Role::ProcedureWanted,
+                ControlRole::ProcedureWanted,
                 "ProcedureExt",
                 [v::INPUT_PARAMETER, v::PAPER_SKILL_PARAMETER],
                 [v::HAS_INPUT_PARAMETER, v::PAPER_HAS_PARAMETER],
             ),
             (
-                Role::ProcedureCurrent,
+                ControlRole::ProcedureCurrent,
                 "ProcedureCur",
                 [v::OUTPUT_PARAMETER, v::PAPER_SKILL_OUTPUT],
                 [v::HAS_OUTPUT_PARAMETER, v::PAPER_HAS_OUTPUT],
             ),
             (
-                Role::ProcedureRequested,
+                ControlRole::ProcedureRequested,
                 "ProcedureReq",
                 [v::OUTPUT_PARAMETER, v::PAPER_SKILL_OUTPUT],
                 [v::HAS_OUTPUT_PARAMETER, v::PAPER_HAS_OUTPUT],
             ),
             (
-                Role::State,
+                ControlRole::State,
                 "StateCur",
                 [v::CURRENT_STATE_OUTPUT, v::PAPER_CURRENT_STATE_OUTPUT],
                 [v::HAS_CURRENT_STATE_OUTPUT, v::PAPER_HAS_OUTPUT],

@@ -6,8 +6,8 @@ use std::collections::{BTreeMap, HashMap};
 use crate::caex::{CaexElement, MAX_FILE, ManifestError};
 use crate::container;
 use crate::model::{
-    Access, Bound, Control, Edition, Finding, Identifier, Item, Module, Node, OpcUaServer,
-    Parameter, Procedure, Role, Service, ValueKind,
+    Control, ControlRole, Edition, ItemAccess, ManifestServer, Module, MtpFinding, MtpService,
+    NodeIdentifier, NodeItem, OpcUaNode, ParameterKind, Procedure, ServiceParameter, ValueBound,
 };
 
 impl Module {
@@ -65,7 +65,7 @@ impl Module {
         let mut module = Self::of(&root)?;
         module
             .findings
-            .extend(missing.into_iter().map(|(reference, line)| Finding {
+            .extend(missing.into_iter().map(|(reference, line)| MtpFinding {
                 about: reference,
                 what: "the manifest refers to this document, which is missing".to_owned(),
                 line,
@@ -159,7 +159,7 @@ fn is_process_values(element: &CaexElement) -> bool {
 /// Index of the elements that are referenced in a file.
 pub(crate) struct ElementIndex<'a> {
     /// OPCUAItems by their ID.
-    nodes: HashMap<&'a str, Node>,
+    nodes: HashMap<&'a str, OpcUaNode>,
     /// ServiceControls and data assemblies of parameters by their RefID, and by their ID for files
     /// with services that reference the ID.
     assemblies: HashMap<&'a str, &'a CaexElement>,
@@ -170,9 +170,9 @@ pub(crate) struct ElementIndex<'a> {
     /// The values of attributes by their ID.
     attributes: HashMap<&'a str, &'a str>,
     endpoints: Vec<String>,
-    servers: Vec<OpcUaServer>,
-    items: Vec<Item>,
-    findings: Vec<Finding>,
+    servers: Vec<ManifestServer>,
+    items: Vec<NodeItem>,
+    findings: Vec<MtpFinding>,
 }
 
 impl<'a> ElementIndex<'a> {
@@ -241,7 +241,7 @@ impl<'a> ElementIndex<'a> {
         if !self.endpoints.iter().any(|known| known == endpoint) {
             self.endpoints.push(endpoint.to_owned());
         }
-        self.servers.push(OpcUaServer {
+        self.servers.push(ManifestServer {
             id: server.id.clone(),
             name: server.name.clone(),
             endpoint: endpoint.to_owned(),
@@ -268,14 +268,14 @@ impl<'a> ElementIndex<'a> {
             .attributes
             .iter()
             .any(|attribute| attribute.name == "Identifier" && is_number(&attribute.data_type));
-        let node = Node {
+        let node = OpcUaNode {
             item: item.id.clone(),
             endpoint: server.value(&["Endpoint"]).unwrap_or_default().to_owned(),
             namespace: namespace.to_owned(),
-            identifier: Identifier::of(identifier, is_numeric),
-            access: Access::of(item.value(&["Access"])),
+            identifier: NodeIdentifier::of(identifier, is_numeric),
+            access: ItemAccess::of(item.value(&["Access"])),
         };
-        self.items.push(Item {
+        self.items.push(NodeItem {
             name: item.name.clone(),
             node: node.clone(),
         });
@@ -289,7 +289,7 @@ impl<'a> ElementIndex<'a> {
     }
 
     /// Returns the node of an OPCUAItem by its ID.
-    pub(crate) fn node_of(&self, id: &str) -> Option<Node> {
+    pub(crate) fn node_of(&self, id: &str) -> Option<OpcUaNode> {
         self.nodes.get(id).cloned()
     }
 
@@ -331,7 +331,7 @@ impl<'a> ElementIndex<'a> {
                 } else {
                     path
                 };
-                self.findings.push(Finding {
+                self.findings.push(MtpFinding {
                     about: about.to_owned(),
                     what: format!("not read ({count} in the file)"),
                     line,
@@ -341,7 +341,7 @@ impl<'a> ElementIndex<'a> {
         }
     }
 
-    fn service(&mut self, element: &'a CaexElement) -> Service {
+    fn service(&mut self, element: &'a CaexElement) -> MtpService {
         let control = match self.assembly(element) {
             Some(assembly) if assembly.kind() == "ServiceControl" => self.control(assembly),
             _ => {
@@ -374,7 +374,7 @@ impl<'a> ElementIndex<'a> {
             .collect();
         let outputs = self.outputs(&element.name, element);
         let equipment = self.equipment(&element.name, element);
-        Service {
+        MtpService {
             outputs,
             equipment,
             id: element.id.clone(),
@@ -424,7 +424,7 @@ impl<'a> ElementIndex<'a> {
         })
     }
 
-    fn parameter(&mut self, about: &str, element: &'a CaexElement) -> Option<Parameter> {
+    fn parameter(&mut self, about: &str, element: &'a CaexElement) -> Option<ServiceParameter> {
         let assembly = self.assembly(element);
         let Some((assembly, kind)) = assembly.and_then(|found| Some((found, kind_of(found)?)))
         else {
@@ -436,7 +436,7 @@ impl<'a> ElementIndex<'a> {
             );
             return None;
         };
-        Some(Parameter {
+        Some(ServiceParameter {
             id: element.id.clone(),
             name: element.name.clone(),
             is_configuration: element.kind() == "ConfigurationParameter",
@@ -465,21 +465,21 @@ impl<'a> ElementIndex<'a> {
         self.assemblies.get(element.value(&["RefID"])?).copied()
     }
 
-    fn node(&self, assembly: &CaexElement, names: &[&str]) -> Option<Node> {
+    fn node(&self, assembly: &CaexElement, names: &[&str]) -> Option<OpcUaNode> {
         self.nodes.get(assembly.value(names)?).cloned()
     }
 
-    fn bound(&self, assembly: &CaexElement, name: &str) -> Option<Bound> {
+    fn bound(&self, assembly: &CaexElement, name: &str) -> Option<ValueBound> {
         let value = assembly.value(&[name])?;
         match self.nodes.get(value) {
-            Some(node) => Some(Bound::Node(node.clone())),
-            None => Bound::of_text(value),
+            Some(node) => Some(ValueBound::Node(node.clone())),
+            None => ValueBound::of_text(value),
         }
     }
 
     /// Adds a finding about an element.
     pub(crate) fn find(&mut self, element: &CaexElement, about: &str, what: &str) {
-        let finding = Finding {
+        let finding = MtpFinding {
             about: about.to_owned(),
             what: what.to_owned(),
             line: element.line,
@@ -528,18 +528,18 @@ fn is_parameter(element: &CaexElement) -> bool {
     )
 }
 
-fn kind_of(assembly: &CaexElement) -> Option<ValueKind> {
+fn kind_of(assembly: &CaexElement) -> Option<ParameterKind> {
     match assembly.kind() {
-        "AnaServParam" => Some(ValueKind::Analog),
-        "DIntServParam" | "DigServParam" => Some(ValueKind::Integer),
-        "BinServParam" => Some(ValueKind::Binary),
-        "StringServParam" => Some(ValueKind::Text),
+        "AnaServParam" => Some(ParameterKind::Analog),
+        "DIntServParam" | "DigServParam" => Some(ParameterKind::Integer),
+        "BinServParam" => Some(ParameterKind::Binary),
+        "StringServParam" => Some(ParameterKind::Text),
         // A draft of 2018.
-        "ServAnaParam" | "StrategyAnaParam" => Some(ValueKind::Analog),
+        "ServAnaParam" | "StrategyAnaParam" => Some(ParameterKind::Analog),
         // Before parameters had kinds of their own, they were operations from outside.
-        "ExtAnaOp" | "ExtIntAnaOp" | "AdvAnaOp" => Some(ValueKind::Analog),
-        "ExtDigOp" | "ExtIntDigOp" | "AdvDigOp" => Some(ValueKind::Integer),
-        "ExtBinOp" | "ExtIntBinOp" | "AdvBinOp" => Some(ValueKind::Binary),
+        "ExtAnaOp" | "ExtIntAnaOp" | "AdvAnaOp" => Some(ParameterKind::Analog),
+        "ExtDigOp" | "ExtIntDigOp" | "AdvDigOp" => Some(ParameterKind::Integer),
+        "ExtBinOp" | "ExtIntBinOp" | "AdvBinOp" => Some(ParameterKind::Binary),
         _ => None,
     }
 }
@@ -555,7 +555,7 @@ fn is_number(data_type: &str) -> bool {
     )
 }
 
-impl Identifier {
+impl NodeIdentifier {
     fn of(text: &str, is_numeric: bool) -> Self {
         // Some files have the whole NodeId here.
         let part = text
@@ -573,7 +573,7 @@ impl Identifier {
     }
 }
 
-impl Access {
+impl ItemAccess {
     /// Converts the number in the file. Without a number all access is allowed here; the server
     /// decides.
     fn of(text: Option<&str>) -> Self {
@@ -586,34 +586,46 @@ impl Access {
 }
 
 /// The names of the nodes of a ServiceControl, newest first.
-const ROLES: &[(Role, &[&str])] = &[
-    (Role::Command, &["CommandExt", "ControlExt"]),
+const ROLES: &[(ControlRole, &[&str])] = &[
+    (ControlRole::Command, &["CommandExt", "ControlExt"]),
     (
-        Role::CommandEnabled,
+        ControlRole::CommandEnabled,
         &["CommandEn", "CommandEnable", "ControlEnable"],
     ),
-    (Role::State, &["StateCur", "CurrentState", "State"]),
-    (Role::ProcedureWanted, &["ProcedureExt", "StrategyExt"]),
-    (Role::ProcedureRequested, &["ProcedureReq"]),
-    (Role::ProcedureCurrent, &["ProcedureCur", "CurrentStrategy"]),
-    (Role::OperationMode, &["OpMode"]),
-    (Role::AutomaticActive, &["StateAutAct"]),
-    (Role::AutomaticByOperator, &["StateAutOp"]),
-    (Role::AutomaticByAutomation, &["StateAutAut"]),
-    (Role::OperatorActive, &["StateOpAct"]),
-    (Role::ExternalActive, &["SrcExtAct"]),
-    (Role::ExternalByOperator, &["SrcExtOp"]),
-    (Role::ExternalByAutomation, &["SrcExtAut"]),
-    (Role::Quality, &["WQC"]),
-    (Role::SourceChannel, &["SrcChannel"]),
-    (Role::ModeChannel, &["StateChannel"]),
-    (Role::ApplyEnabled, &["ProcParamApplyEn"]),
-    (Role::ApplyByExternal, &["ProcParamApplyExt"]),
-    (Role::ConfigurationApplyEnabled, &["ConfigParamApplyEn"]),
-    (Role::ConfigurationApplyByExternal, &["ConfigParamApplyExt"]),
-    (Role::Question, &["InteractQuestionID"]),
-    (Role::Answer, &["InteractAnswerID"]),
-    (Role::Text, &["PosTextID"]),
+    (ControlRole::State, &["StateCur", "CurrentState", "State"]),
+    (
+        ControlRole::ProcedureWanted,
+        &["ProcedureExt", "StrategyExt"],
+    ),
+    (ControlRole::ProcedureRequested, &["ProcedureReq"]),
+    (
+        ControlRole::ProcedureCurrent,
+        &["ProcedureCur", "CurrentStrategy"],
+    ),
+    (ControlRole::OperationMode, &["OpMode"]),
+    (ControlRole::AutomaticActive, &["StateAutAct"]),
+    (ControlRole::AutomaticByOperator, &["StateAutOp"]),
+    (ControlRole::AutomaticByAutomation, &["StateAutAut"]),
+    (ControlRole::OperatorActive, &["StateOpAct"]),
+    (ControlRole::ExternalActive, &["SrcExtAct"]),
+    (ControlRole::ExternalByOperator, &["SrcExtOp"]),
+    (ControlRole::ExternalByAutomation, &["SrcExtAut"]),
+    (ControlRole::Quality, &["WQC"]),
+    (ControlRole::SourceChannel, &["SrcChannel"]),
+    (ControlRole::ModeChannel, &["StateChannel"]),
+    (ControlRole::ApplyEnabled, &["ProcParamApplyEn"]),
+    (ControlRole::ApplyByExternal, &["ProcParamApplyExt"]),
+    (
+        ControlRole::ConfigurationApplyEnabled,
+        &["ConfigParamApplyEn"],
+    ),
+    (
+        ControlRole::ConfigurationApplyByExternal,
+        &["ConfigParamApplyExt"],
+    ),
+    (ControlRole::Question, &["InteractQuestionID"]),
+    (ControlRole::Answer, &["InteractAnswerID"]),
+    (ControlRole::Text, &["PosTextID"]),
 ];
 
 /// The variables of a parameter beside its values, as far as a client from outside uses them.

@@ -6,7 +6,7 @@
 
 /// The use of an IRI of the table.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub enum TermKind {
+pub enum IriKind {
     /// After `rdf:type`.
     Class,
     /// From an individual to another.
@@ -21,7 +21,7 @@ pub struct Term {
     /// The whole IRI.
     pub iri: &'static str,
     /// Its use.
-    pub kind: TermKind,
+    pub kind: IriKind,
 }
 
 macro_rules! terms {
@@ -30,7 +30,7 @@ macro_rules! terms {
             #[doc = concat!("`", $base, $local, "`")]
             pub const $name: &str = concat!($base, $local);
         )+
-        const $table: &[Term] = &[$(Term { iri: $name, kind: TermKind::$kind }),+];
+        const $table: &[Term] = &[$(Term { iri: $name, kind: IriKind::$kind }),+];
     };
 }
 

@@ -1,7 +1,10 @@
 //! Manifests of this project and of six manufacturers, and their inconsistencies.
 #![expect(clippy::unwrap_used, reason = "a test may")]
 
-use mtp::{Bound, Identifier, ManifestError, Module, Procedure, Role, Service, ValueKind};
+use mtp::{
+    ControlRole, ManifestError, Module, MtpService, NodeIdentifier, ParameterKind, Procedure,
+    ValueBound,
+};
 use test_data::{read_foreign, read_own};
 
 /// Returns the module of a manifest of this project.
@@ -14,7 +17,7 @@ fn manifest(file: &str) -> Option<String> {
     read_foreign(&format!("mtp/{file}"))
 }
 
-fn service<'a>(module: &'a Module, name: &str) -> &'a Service {
+fn service<'a>(module: &'a Module, name: &str) -> &'a MtpService {
     module
         .services
         .iter()
@@ -22,7 +25,7 @@ fn service<'a>(module: &'a Module, name: &str) -> &'a Service {
         .unwrap()
 }
 
-fn procedure<'a>(service: &'a Service, name: &str) -> &'a Procedure {
+fn procedure<'a>(service: &'a MtpService, name: &str) -> &'a Procedure {
     service
         .procedures
         .iter()
@@ -108,12 +111,12 @@ fn counts(module: &Module) -> (&str, usize, usize, usize) {
 /// Returns the number of services with nodes for commands and monitoring.
 fn commanded(module: &Module) -> usize {
     let roles = [
-        Role::Command,
-        Role::CommandEnabled,
-        Role::State,
-        Role::ProcedureWanted,
+        ControlRole::Command,
+        ControlRole::CommandEnabled,
+        ControlRole::State,
+        ControlRole::ProcedureWanted,
     ];
-    let is_whole = |service: &&Service| {
+    let is_whole = |service: &&MtpService| {
         roles
             .iter()
             .all(|role| service.control.node(*role).is_some())
@@ -162,17 +165,20 @@ fn each_service_of_eight_manifests_can_be_commanded_and_watched() {
 fn a_node_is_found_by_endpoint_namespace_and_identifier() {
     let module = own("stage.aml");
     assert_eq!(module.endpoints, ["opc.tcp://127.0.0.1:4840"]);
-    let state = service(&module, "Duet").control.node(Role::State).unwrap();
+    let state = service(&module, "Duet")
+        .control
+        .node(ControlRole::State)
+        .unwrap();
     assert_eq!(state.endpoint, "opc.tcp://127.0.0.1:4840");
     assert_eq!(state.namespace, "urn:ua-bridge:test:stage");
     assert!(
-        matches!(&state.identifier, Identifier::Text(text) if text.ends_with("StateCur")),
+        matches!(&state.identifier, NodeIdentifier::Text(text) if text.ends_with("StateCur")),
         "{state:?}"
     );
     assert!(state.access.reads && !state.access.writes);
     let command = service(&module, "Duet")
         .control
-        .node(Role::Command)
+        .node(ControlRole::Command)
         .unwrap();
     assert!(command.access.writes);
 }
@@ -207,12 +213,12 @@ fn parameters_of_a_strategy_are_those_it_requires() {
         "no strategy names it"
     );
     let volume = &procedure(stirring, "by_volume").parameters[0];
-    assert_eq!(volume.kind, ValueKind::Analog);
+    assert_eq!(volume.kind, ParameterKind::Analog);
     assert!(
         volume.write.as_ref().is_some_and(|node| node.access.writes),
         "{volume:?}"
     );
-    assert!(matches!(volume.max, Some(Bound::Node(_))));
+    assert!(matches!(volume.max, Some(ValueBound::Node(_))));
 }
 
 #[test]
@@ -226,12 +232,12 @@ fn limits_that_the_file_tells_are_numbers() {
         service.parameters.iter().chain(own)
     });
     let ramp: Vec<_> = parameters
-        .filter(|parameter| parameter.max == Some(Bound::Constant(180.0)))
+        .filter(|parameter| parameter.max == Some(ValueBound::Constant(180.0)))
         .collect();
     assert!(!ramp.is_empty());
     assert!(
         ramp.iter()
-            .all(|parameter| parameter.unit == Some(Bound::Constant(1054.0))),
+            .all(|parameter| parameter.unit == Some(ValueBound::Constant(1054.0))),
         "seconds"
     );
 }

@@ -180,20 +180,20 @@ fn a_service_is_a_capability_of_the_plant_where_that_is_told() {
 
 #[test]
 fn node_ids_are_written_so_that_they_can_be_read_back() {
-    let node = mtp::Node {
+    let node = mtp::OpcUaNode {
         item: "n".into(),
         endpoint: "opc.tcp://127.0.0.1".into(),
         namespace: "urn:a;b%".into(),
-        identifier: mtp::Identifier::Text("x;y".into()),
-        access: mtp::Access {
+        identifier: mtp::NodeIdentifier::Text("x;y".into()),
+        access: mtp::ItemAccess {
             reads: true,
             writes: true,
         },
     };
     assert_eq!(node.id(), "nsu=urn:a%3Bb%25;s=x;y");
-    let by_index = mtp::Node {
+    let by_index = mtp::OpcUaNode {
         namespace: "3".into(),
-        identifier: mtp::Identifier::Numeric(7),
+        identifier: mtp::NodeIdentifier::Numeric(7),
         ..node
     };
     assert_eq!(by_index.id(), "ns=3;i=7");

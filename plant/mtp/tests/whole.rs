@@ -4,7 +4,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use mtp::vocabulary as v;
-use mtp::{Bound, Edition, Family, Module, Object, OutputRole, Triple, ValueKind};
+use mtp::{Edition, Family, Module, Object, OutputRole, ParameterKind, Triple, ValueBound};
 use test_data::{read_foreign, read_own};
 
 /// The elements of a manifest, by their numbers.
@@ -170,28 +170,28 @@ fn has_every_row(file: &str, module: &Module, all: &[Triple]) {
         has_write,
         of_class(all, v::INPUT_PARAMETER).min(parameters.len()),
     );
-    let has = |bound: fn(&mtp::Parameter) -> &Option<Bound>| {
+    let has = |bound: fn(&mtp::ServiceParameter) -> &Option<ValueBound>| {
         parameters.iter().any(|one| bound(one).is_some())
     };
     is("VMin", has(|one| &one.min), of_parameters("/Min"));
     is("VMax", has(|one| &one.max), of_parameters("/Max"));
     is("VUnit", has(|one| &one.unit), of_parameters("/Unit"));
     let rows = [
-        ("ProcedureExt", mtp::Role::ProcedureWanted),
-        ("ProcedureCur", mtp::Role::ProcedureCurrent),
-        ("ProcedureReq", mtp::Role::ProcedureRequested),
-        ("StateCur", mtp::Role::State),
+        ("ProcedureExt", mtp::ControlRole::ProcedureWanted),
+        ("ProcedureCur", mtp::ControlRole::ProcedureCurrent),
+        ("ProcedureReq", mtp::ControlRole::ProcedureRequested),
+        ("StateCur", mtp::ControlRole::State),
     ];
     for (name, of) in rows {
         is(name, role(of), named(name));
     }
-    let has_command = role(mtp::Role::Command);
+    let has_command = role(mtp::ControlRole::Command);
     is(
         "CommandExt",
         has_command,
         of_class(all, v::PAPER_SKILL_COMMAND),
     );
-    let has_state = role(mtp::Role::State);
+    let has_state = role(mtp::ControlRole::State);
     is(
         "state",
         has_state,
@@ -210,7 +210,7 @@ fn a_module_of_mtp_2_is_read_whole() {
     assert_eq!(module.edition, Edition::V2);
     assert_eq!((&*module.name, &*module.version), ("Column", "2.1.0"));
     let faults: Vec<_> = module.findings.iter().filter(|one| !one.is_note).collect();
-    assert_eq!(faults, Vec::<&mtp::Finding>::new());
+    assert_eq!(faults, Vec::<&mtp::MtpFinding>::new());
     let notes: Vec<&str> = module.findings.iter().map(|one| &*one.about).collect();
     assert_eq!(
         notes,
@@ -231,19 +231,19 @@ fn a_module_of_mtp_2_is_read_whole() {
     };
     assert_eq!(heating.control.0.len(), 23);
     let ramp = &heating.procedures[0];
-    let kinds: Vec<ValueKind> = ramp.parameters.iter().map(|one| one.kind).collect();
+    let kinds: Vec<ParameterKind> = ramp.parameters.iter().map(|one| one.kind).collect();
     assert_eq!(
         kinds,
         [
-            ValueKind::Analog,
-            ValueKind::Integer,
-            ValueKind::Binary,
-            ValueKind::Text
+            ParameterKind::Analog,
+            ParameterKind::Integer,
+            ParameterKind::Binary,
+            ParameterKind::Text
         ]
     );
     let setpoint = &ramp.parameters[0];
-    assert_eq!(setpoint.min, Some(Bound::Constant(20.0)));
-    assert_eq!(setpoint.unit, Some(Bound::Constant(1001.0)));
+    assert_eq!(setpoint.min, Some(ValueBound::Constant(20.0)));
+    assert_eq!(setpoint.unit, Some(ValueBound::Constant(1001.0)));
     assert!(!setpoint.is_configuration && heating.parameters[0].is_configuration);
     let outputs: Vec<(&str, OutputRole)> = ramp
         .outputs

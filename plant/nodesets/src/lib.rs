@@ -5,13 +5,13 @@ use std::path::PathBuf;
 
 use mappings::{Identifier, NodeSetFault, NodeSetNode, NodeSetType};
 use opcua::types::{ByteString, Identifier as Known};
-use plant_opcua::nodeset::{NodeKind, NodeSets, ValueKind};
+use plant_opcua::nodeset::{ImportedNodeSets, NodeKind, ValueKind};
 use uadp::BuiltinType;
 
 /// Reads the files for a check.
 #[must_use]
 pub fn read(files: &[PathBuf]) -> Box<dyn mappings::NodeSets> {
-    let (sets, faults) = NodeSets::read(files);
+    let (sets, faults) = ImportedNodeSets::read(files);
     let faults = faults.into_iter().map(|fault| NodeSetFault {
         file: fault.file,
         is_fatal: fault.error.is_fatal(),
@@ -39,7 +39,7 @@ pub fn identifier(text: &Identifier) -> Known {
 }
 
 struct Read {
-    sets: NodeSets,
+    sets: ImportedNodeSets,
     faults: Vec<NodeSetFault>,
 }
 

@@ -17,7 +17,7 @@ use tracing::{debug, warn};
 #[derive(Debug, Clone)]
 pub struct Audit {
     /// The action.
-    pub action: Action,
+    pub action: AuditedAction,
     /// The status code of the result.
     pub status: StatusCode,
     /// The name of the user, or `anonymous`.
@@ -32,7 +32,7 @@ pub struct Audit {
 
 /// An action that is audited.
 #[derive(Debug, Clone)]
-pub enum Action {
+pub enum AuditedAction {
     /// A client activated a session or tried to.
     CameIn {
         /// The kind of user identity: `anonymous`, `password` or `certificate`.
@@ -75,7 +75,7 @@ pub enum Action {
     },
 }
 
-impl Action {
+impl AuditedAction {
     /// Returns the type of the event and its supertypes.
     fn types(&self) -> Vec<NodeId> {
         let types: &[ObjectTypeId] = match self {
@@ -128,7 +128,7 @@ impl Action {
     }
 }
 
-impl std::fmt::Display for Action {
+impl std::fmt::Display for AuditedAction {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         match self {
             Self::CameIn { by, endpoint } => write!(f, "comes in ({by}, {endpoint})"),
@@ -144,7 +144,7 @@ impl std::fmt::Display for Action {
 impl Audit {
     /// Creates the audit of an action by the session of a request.
     #[must_use]
-    pub fn of(context: &RequestContext, action: Action, status: StatusCode) -> Self {
+    pub fn of(context: &RequestContext, action: AuditedAction, status: StatusCode) -> Self {
         Self {
             action,
             status,
@@ -157,7 +157,12 @@ impl Audit {
 
     /// Creates the audit of an action without a session, such as the action of a user of the page.
     #[must_use]
-    pub fn without_session(action: Action, status: StatusCode, user: &str, server: &str) -> Self {
+    pub fn without_session(
+        action: AuditedAction,
+        status: StatusCode,
+        user: &str,
+        server: &str,
+    ) -> Self {
         Self {
             action,
             status,
@@ -196,7 +201,7 @@ impl Audit {
         let (user, action, status) = (&self.user, &self.action, self.status);
         // Refusals are few: each refused client waited for a second or presented a trusted
         // certificate.
-        let is_turned_away = !status.is_good() && matches!(action, Action::CameIn { .. });
+        let is_turned_away = !status.is_good() && matches!(action, AuditedAction::CameIn { .. });
         if is_turned_away {
             warn!(target: "audit", user, %status, "{action}: refused");
         } else {
@@ -246,18 +251,23 @@ impl Told {
             return common;
         }
         match (&audit.action, name) {
-            (Action::CameIn { .. }, "SessionId") => {
+            (AuditedAction::CameIn { .. }, "SessionId") => {
                 Some(audit.session.clone().unwrap_or_default().into())
             }
-            (Action::Wrote { .. }, "AttributeId") => Some(13_u32.into()),
-            (Action::Wrote { range, .. }, "IndexRange") => Some(range.as_str().into()),
-            (Action::Wrote { old, .. }, "OldValue") => Some(old.clone()),
-            (Action::Wrote { new, .. }, "NewValue") => Some(new.clone()),
-            (Action::Called { method, .. } | Action::Condition { method, .. }, "MethodId") => {
-                Some(method.clone().into())
+            (AuditedAction::Wrote { .. }, "AttributeId") => Some(13_u32.into()),
+            (AuditedAction::Wrote { range, .. }, "IndexRange") => Some(range.as_str().into()),
+            (AuditedAction::Wrote { old, .. }, "OldValue") => Some(old.clone()),
+            (AuditedAction::Wrote { new, .. }, "NewValue") => Some(new.clone()),
+            (
+                AuditedAction::Called { method, .. } | AuditedAction::Condition { method, .. },
+                "MethodId",
+            ) => Some(method.clone().into()),
+            (AuditedAction::Condition { event, .. }, "ConditionEventId") => {
+                event.clone().map(Into::into)
             }
-            (Action::Condition { event, .. }, "ConditionEventId") => event.clone().map(Into::into),
-            (Action::Condition { comment, .. }, "Comment") => comment.clone().map(Into::into),
+            (AuditedAction::Condition { comment, .. }, "Comment") => {
+                comment.clone().map(Into::into)
+            }
             _ => None,
         }
     }

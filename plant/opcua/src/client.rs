@@ -22,13 +22,13 @@ use opcua::types::{DateTime, NamespaceMap, StatusCode, TypeLoader};
 use tokio::sync::watch;
 use trust::Fingerprint;
 
-pub use self::parts::{OperationLimits, PartFault, Parts, Service};
+pub use self::parts::{LimitedService, OperationLimits, PartFault, PartedRequest};
 pub use self::services::{Browse, CallError, CallOptions, CallResult, MOST_REFERENCES};
-pub use self::subscription::{Notice, Sampled, Select, Subscription, Watch};
+pub use self::subscription::{ClientSubscription, MonitoredWatch, Notice, Sampled, Select};
 pub use self::types::MOST_TYPES;
 pub use crate::judge::HostNames;
 
-use self::supervisor::{Shared, failed};
+use self::supervisor::{ConnectionState, failed};
 
 /// The identity, the security and the timing of a client.
 #[derive(Debug, Clone)]
@@ -181,13 +181,13 @@ impl From<PartFault> for ClientError {
 /// A client of a server. Clones share the same connection, which is closed when the last clone is
 /// dropped.
 #[derive(Clone)]
-pub struct Client {
-    shared: Arc<Shared>,
+pub struct OpcUaClient {
+    shared: Arc<ConnectionState>,
     /// Closes the connection when the last clone is dropped.
     _open: Arc<Open>,
 }
 
-struct Open(Arc<Shared>);
+struct Open(Arc<ConnectionState>);
 
 impl Drop for Open {
     fn drop(&mut self) {
@@ -195,11 +195,11 @@ impl Drop for Open {
     }
 }
 
-impl Client {
+impl OpcUaClient {
     /// Starts a task that connects to the server at `url`.
     #[must_use]
     pub fn open(config: ClientConfig, url: &str) -> Self {
-        Self::start(Shared::new(config, url))
+        Self::start(ConnectionState::new(config, url))
     }
 
     /// Opens a second connection to the same server, with its own session. Both clients take into
@@ -216,7 +216,7 @@ impl Client {
         self.shared.calls.any()
     }
 
-    fn start(shared: Shared) -> Self {
+    fn start(shared: ConnectionState) -> Self {
         let shared = Arc::new(shared);
         drop(tokio::spawn(supervisor::run(Arc::clone(&shared))));
         Self {

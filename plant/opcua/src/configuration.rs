@@ -24,16 +24,16 @@ use opcua::types::{
 };
 use tokio::sync::Notify;
 use tracing::{info, warn};
-use trust::{Certificate, Request};
+use trust::{Certificate, CertificateSigningRequest};
 
 pub(crate) use self::store::StoreList;
 
 use crate::file::{FileMethod, LARGEST, LONGEST_UNUSED};
 use crate::known;
-use crate::own::{self, Cause};
+use crate::own::{self, CertificateCause};
 use crate::pair;
 use crate::pki::{OWN_CERTIFICATE, OWN_KEY};
-use crate::server::{CoreMethod, MethodHandler, MethodRequest, Refusal, method};
+use crate::server::{CoreMethod, MethodHandler, MethodRefusal, MethodRequest, method};
 use crate::trust_file::TrustFile;
 
 /// The ServerConfiguration object of a server with a certificate store.
@@ -68,7 +68,7 @@ impl std::fmt::Debug for State {
     }
 }
 
-type Answer = Result<Vec<Variant>, Refusal>;
+type Answer = Result<Vec<Variant>, MethodRefusal>;
 
 impl Configuration {
     /// Creates the object of the server `application_uri` with the store at `root`, which contains
@@ -277,7 +277,7 @@ impl Configuration {
         &self,
         certificate: &Certificate,
         given: Option<Vec<u8>>,
-    ) -> Result<Option<Vec<u8>>, Refusal> {
+    ) -> Result<Option<Vec<u8>>, MethodRefusal> {
         let next = self.state.lock().next_key.clone();
         let fits = |key: &Vec<u8>| certificate.is_of_private_key(key);
         if let Some(given) = given {
@@ -317,7 +317,7 @@ impl Configuration {
                 self.state.lock().waiting = Some((certificate, key));
                 return Err(StatusCode::BadResourceUnavailable.into());
             }
-            own::report(&self.root, &Cause::Administrator);
+            own::report(&self.root, &CertificateCause::Administrator);
             self.state.lock().next_key = None;
         }
         if is_new || self.wants_door() {
@@ -351,7 +351,7 @@ impl Configuration {
         vec![Variant::from(read)]
     }
 
-    fn unfit(&self, why: &str) -> Refusal {
+    fn unfit(&self, why: &str) -> MethodRefusal {
         warn!("rejected a new certificate of the server: {why}");
         StatusCode::BadInvalidArgument.into()
     }
@@ -397,7 +397,7 @@ impl MethodHandler for CreateSigningRequest {
         let named = |name: &str| part(subject.as_ref(), name);
         let name = named("CN").unwrap_or_else(|| own.name());
         let organization = named("O").unwrap_or_default();
-        let made = Request::make(
+        let made = CertificateSigningRequest::make(
             &key,
             &this.application_uri,
             (&name, &organization),

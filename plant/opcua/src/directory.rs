@@ -10,9 +10,9 @@ use opcua::types::{
     ServerOnNetwork, StaticTypeLoader, TrustListDataType, TypeLoaderInstance, UAString, UaNullable,
     Variant, XmlDecodable, XmlEncodable, XmlType, binary_decode_to_enc,
 };
-use trust::{Certificate, Crl, Request};
+use trust::{Certificate, CertificateSigningRequest, Crl};
 
-use crate::client::{Browse, CallError, Client, ClientError};
+use crate::client::{Browse, CallError, ClientError, OpcUaClient};
 use crate::file::LARGEST;
 
 /// The namespace of the Directory.
@@ -83,9 +83,9 @@ impl ExpandedMessageInfo for ApplicationRecord {
 }
 
 /// Decodes application records that clients send.
-pub struct Types;
+pub struct RecordTypes;
 
-impl StaticTypeLoader for Types {
+impl StaticTypeLoader for RecordTypes {
     fn instance() -> &'static TypeLoaderInstance {
         static TYPES: LazyLock<TypeLoaderInstance> = LazyLock::new(|| {
             let mut types = TypeLoaderInstance::new();
@@ -125,7 +125,7 @@ pub enum DirectoryError {
 /// The Directory of a connected server.
 #[derive(Clone)]
 pub struct Directory {
-    client: Client,
+    client: OpcUaClient,
     namespace: u16,
 }
 
@@ -134,8 +134,8 @@ impl Directory {
     ///
     /// # Errors
     /// Returns an error if the client is not connected or the server has no Directory.
-    pub fn of(client: &Client) -> Result<Self, DirectoryError> {
-        client.knows(Arc::new(Types))?;
+    pub fn of(client: &OpcUaClient) -> Result<Self, DirectoryError> {
+        client.knows(Arc::new(RecordTypes))?;
         let namespace = client.namespace(NAMESPACE);
         Ok(Self {
             client: client.clone(),
@@ -247,7 +247,7 @@ impl Directory {
     pub async fn requested(
         &self,
         application: &NodeId,
-        request: &Request,
+        request: &CertificateSigningRequest,
     ) -> Result<NodeId, DirectoryError> {
         let any = NodeId::null();
         let request = Variant::ByteString(ByteString::from(request.der().to_vec()));

@@ -28,12 +28,12 @@ use tokio::sync::watch;
 use tokio::task::JoinSet;
 use tokio::time::{Instant, timeout};
 use tracing::{debug, info, warn};
-use trust::{Certificate, Fault, Known};
+use trust::{Certificate, CertificateFault, TrustedCertificates};
 
 use self::connections::Connections;
 use crate::certificates;
-use crate::judge::{self, Shown};
-use crate::known::{self, Stamp};
+use crate::judge::{self, PresentedChain};
+use crate::known::{self, StoreStamp};
 use crate::limits::ClientLimits;
 use crate::pki::{OWN_CERTIFICATE, OWN_KEY};
 
@@ -96,9 +96,9 @@ struct Shared {
     unknown: UnknownClients,
     /// The address of the server behind the door.
     inner: SocketAddr,
-    known: RwLock<Arc<Known>>,
+    known: RwLock<Arc<TrustedCertificates>>,
     /// The state of the files of the store before they were read first.
-    first: Stamp,
+    first: StoreStamp,
     /// The number of connections per admitted certificate, by the path of its copy.
     admitted: Mutex<HashMap<PathBuf, usize>>,
     /// Counts the changes of the store.
@@ -237,7 +237,7 @@ impl Shared {
 
     /// Reads the store again if its files changed, and makes each connection judge its certificate
     /// again.
-    fn look(&self, stamp: &mut Stamp) {
+    fn look(&self, stamp: &mut StoreStamp) {
         let now = known::stamp(&self.root);
         if now == *stamp {
             return;
@@ -301,11 +301,14 @@ impl Shared {
         Ok(())
     }
 
-    fn judge(&self, (certificate, sent): &Shown) -> Result<(), Fault> {
+    fn judge(&self, (certificate, sent): &PresentedChain) -> Result<(), CertificateFault> {
         let known = Arc::clone(&self.known.read());
         let checked = trust::check(certificate, sent, &known, known::now());
         match (checked, self.unknown) {
-            (Err(Fault::Untrusted | Fault::Incomplete), UnknownClients::Admit) => {
+            (
+                Err(CertificateFault::Untrusted | CertificateFault::Incomplete),
+                UnknownClients::Admit,
+            ) => {
                 let mut known = known;
                 Arc::make_mut(&mut known).trusted.push(certificate.clone());
                 trust::check(certificate, sent, &known, known::now())
@@ -315,14 +318,17 @@ impl Shared {
     }
 
     /// Judges a certificate, and adds it to the trust store of the library if it is trusted.
-    fn admit(&self, shown: &Shown, peer: SocketAddr) -> Result<Admitted<'_>, StatusCode> {
+    fn admit(&self, shown: &PresentedChain, peer: SocketAddr) -> Result<Admitted<'_>, StatusCode> {
         let certificate = &shown.0;
         let Ok(of_library) = X509::from_der(certificate.der()) else {
             return Err(StatusCode::BadCertificateInvalid);
         };
         let file = CertificateStore::cert_file_name(&of_library);
         if let Err(fault) = self.judge(shown) {
-            let unknown = matches!(fault, Fault::Untrusted | Fault::Incomplete);
+            let unknown = matches!(
+                fault,
+                CertificateFault::Untrusted | CertificateFault::Incomplete
+            );
             if unknown {
                 // `Pki::report_rejected` logs the certificate together with the command that trusts
                 // it.
@@ -357,7 +363,13 @@ impl Shared {
         *count += 1;
         Ok(Admitted { shared: self, path })
     }
-    fn tell(&self, certificate: &Certificate, fault: Fault, peer: SocketAddr, what: &str) {
+    fn tell(
+        &self,
+        certificate: &Certificate,
+        fault: CertificateFault,
+        peer: SocketAddr,
+        what: &str,
+    ) {
         let help = judge::help(fault);
         let why = format!("{what}: {fault}; {help}");
         if let Some(suppressed) = self.another(certificate, &why) {
@@ -413,7 +425,7 @@ impl Drop for Admitted<'_> {
 }
 
 /// Returns the certificate in an OpenSecureChannel request; `None` for a channel without security.
-fn shown(open: &[u8]) -> Result<Option<Shown>, StatusCode> {
+fn shown(open: &[u8]) -> Result<Option<PresentedChain>, StatusCode> {
     // Message type, size and SecureChannelId (OPC 10000-6, 6.7.2).
     let Some(after) = open.get(12..).filter(|_| open.starts_with(b"OPN")) else {
         // The server answers a wrong message type with an error.

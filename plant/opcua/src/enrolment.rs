@@ -18,16 +18,16 @@ use std::time::Duration;
 use opcua::types::{ApplicationType, NodeId, ServerOnNetwork, StatusCode};
 use tokio::time::{Instant, sleep, timeout};
 use tracing::{debug, info, warn};
-use trust::{Certificate, Renewal, Request, Step};
+use trust::{Certificate, CertificateSigningRequest, Renewal, RenewalStep};
 
 pub use self::invitation::{GdsArguments, GdsOption, Invitation, InvitationFault, Token};
 
-use crate::client::{CallError, Client, ClientConfig, ClientError, Link, SecurityChoice};
+use crate::client::{CallError, ClientConfig, ClientError, Link, OpcUaClient, SecurityChoice};
 use crate::configuration::StoreList;
 use crate::directory::{ApplicationRecord, Directory, DirectoryError, TrustLists};
 use crate::endpoint::EndpointUrl;
 use crate::known;
-use crate::own::{self, Cause};
+use crate::own::{self, CertificateCause};
 use crate::pair;
 use crate::pki::OWN_KEY;
 
@@ -149,8 +149,8 @@ impl Enrolment {
                 continue;
             };
             let wants = match renewal.step(known::now()) {
-                Step::Ask | Step::Late => Some(certificate.clone()),
-                Step::Wait { .. } => None,
+                RenewalStep::Ask | RenewalStep::Late => Some(certificate.clone()),
+                RenewalStep::Wait { .. } => None,
             };
             let is_for_lists = !certificate.is_self_signed() && Instant::now() >= lists_at;
             if wants.is_some() || is_for_lists {
@@ -334,7 +334,11 @@ impl Enrolment {
     }
 
     /// Signs a request with the own private key, which takes some time.
-    async fn request(&self, old: &Certificate, token: Option<Token>) -> Result<Request, Why> {
+    async fn request(
+        &self,
+        old: &Certificate,
+        token: Option<Token>,
+    ) -> Result<CertificateSigningRequest, Why> {
         let key = own_key(&self.root)?;
         let (uri, hosts) = (
             self.applicant.application_uri.clone(),
@@ -343,7 +347,7 @@ impl Enrolment {
         let name: String = self.applicant.name.chars().take(LONGEST_NAME).collect();
         let signing = tokio::task::spawn_blocking(move || {
             let token = token.as_ref().map(Token::secret);
-            Request::make_with(&key, (&uri, &hosts), (&name, ""), token)
+            CertificateSigningRequest::make_with(&key, (&uri, &hosts), (&name, ""), token)
         });
         let signed = signing.await.map_err(|error| error.to_string())?;
         signed.map_err(|why| format!("cannot request a certificate: {why}"))
@@ -382,7 +386,7 @@ impl Enrolment {
         }
         if !matches!(
             Renewal::of(certificate).step(known::now()),
-            Step::Wait { .. }
+            RenewalStep::Wait { .. }
         ) {
             // Otherwise the program would restart endlessly.
             return Err("the issued certificate must be renewed at once".to_owned());
@@ -395,7 +399,7 @@ impl Enrolment {
         let store = StoreList::new(&self.root);
         store.judge_among(certificate, above).map_err(refused)?;
         store.keep_all(above).map_err(refused)?;
-        own::replace(&self.root, certificate, &Cause::Enrolment)
+        own::replace(&self.root, certificate, &CertificateCause::Enrolment)
             .map_err(|error| format!("cannot write the certificate: {error}"))?;
         info!(
             gds = self.gds.url,
@@ -441,7 +445,7 @@ impl DirectoryClient {
         &self,
         requests: impl AsyncFnOnce(Directory) -> Result<T, Why>,
     ) -> Result<T, Why> {
-        let client = Client::open(
+        let client = OpcUaClient::open(
             ClientConfig {
                 pki: Some(self.root.clone()),
                 pinned: self.gds.fingerprint,

@@ -10,7 +10,7 @@ use std::time::Duration;
 use opcua::types::{ByteString, StatusCode, Variant};
 use tokio::time::Instant;
 
-use crate::server::{MethodRequest, Presence, Refusal};
+use crate::server::{MethodRefusal, MethodRequest, SessionPresence};
 
 /// A method of a file object.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -42,7 +42,7 @@ pub struct Handles {
 
 struct Handle {
     session: u32,
-    presence: Presence,
+    presence: SessionPresence,
     content: Vec<u8>,
     position: usize,
     is_writing: bool,
@@ -51,7 +51,7 @@ struct Handle {
 }
 
 /// The result of a method of a file.
-pub type Answer = Result<Vec<Variant>, Refusal>;
+pub type FileAnswer = Result<Vec<Variant>, MethodRefusal>;
 
 impl Handles {
     /// Returns the number of open handles.
@@ -85,7 +85,12 @@ impl Handles {
     /// # Errors
     /// `BadInvalidState` if the file is open for writing, or, for a writer, if the file is open at
     /// all; `BadTooManyOperations` if there are too many handles.
-    pub fn add(&mut self, request: &MethodRequest, content: Vec<u8>, is_writing: bool) -> Answer {
+    pub fn add(
+        &mut self,
+        request: &MethodRequest,
+        content: Vec<u8>,
+        is_writing: bool,
+    ) -> FileAnswer {
         self.tidy();
         let is_read = self.all.values().all(|handle| !handle.is_writing);
         if !is_read || (is_writing && !self.all.is_empty()) {
@@ -114,7 +119,7 @@ impl Handles {
     ///
     /// # Errors
     /// Returns the refusal of the method; `BadInvalidArgument` for the other methods.
-    pub fn call(&mut self, method: FileMethod, request: &MethodRequest) -> Answer {
+    pub fn call(&mut self, method: FileMethod, request: &MethodRequest) -> FileAnswer {
         let session = request.caller.session;
         match (method, request.arguments.as_slice()) {
             (FileMethod::Read, [Variant::UInt32(handle), Variant::Int32(length)]) => {
@@ -156,7 +161,7 @@ impl Handles {
     /// # Errors
     /// `BadInvalidArgument` if the session has no handle with this number; `BadInvalidState` if the
     /// handle was opened for reading.
-    pub fn written(&mut self, session: u32, number: u32) -> Result<Vec<u8>, Refusal> {
+    pub fn written(&mut self, session: u32, number: u32) -> Result<Vec<u8>, MethodRefusal> {
         let handle = self.take(session, number)?;
         match handle.is_writing {
             true => Ok(handle.content),
@@ -164,7 +169,7 @@ impl Handles {
         }
     }
 
-    fn of(&mut self, session: u32, number: u32) -> Result<&mut Handle, Refusal> {
+    fn of(&mut self, session: u32, number: u32) -> Result<&mut Handle, MethodRefusal> {
         self.tidy();
         match self.all.get_mut(&number) {
             Some(handle) if handle.session == session => {
@@ -176,7 +181,7 @@ impl Handles {
         }
     }
 
-    fn take(&mut self, session: u32, number: u32) -> Result<Handle, Refusal> {
+    fn take(&mut self, session: u32, number: u32) -> Result<Handle, MethodRefusal> {
         self.of(session, number)?;
         let taken = self.all.remove(&number);
         taken.ok_or_else(|| StatusCode::BadInvalidArgument.into())
@@ -184,7 +189,7 @@ impl Handles {
 }
 
 impl Handle {
-    fn read(&mut self, length: i32) -> Answer {
+    fn read(&mut self, length: i32) -> FileAnswer {
         if self.is_writing {
             return Err(StatusCode::BadInvalidState.into());
         }
@@ -195,7 +200,7 @@ impl Handle {
         Ok(vec![Variant::ByteString(ByteString::from(read))])
     }
 
-    fn write(&mut self, data: &ByteString) -> Answer {
+    fn write(&mut self, data: &ByteString) -> FileAnswer {
         let data = data.value.as_deref().unwrap_or_default();
         if !self.is_writing {
             return Err(StatusCode::BadInvalidState.into());
@@ -235,7 +240,7 @@ pub(crate) mod tests {
     use opcua::types::NodeId;
 
     use super::*;
-    use crate::server::Caller;
+    use crate::server::SessionCaller;
 
     /// Returns a call of an active session.
     pub(crate) fn request(session: u32, arguments: &[Variant]) -> MethodRequest {
@@ -248,7 +253,7 @@ pub(crate) mod tests {
         lasts: impl Fn() -> bool + Send + Sync + 'static,
     ) -> MethodRequest {
         MethodRequest {
-            caller: Caller {
+            caller: SessionCaller {
                 session,
                 user: "anonymous".to_owned(),
                 application_uri: String::new(),
@@ -256,7 +261,7 @@ pub(crate) mod tests {
                 encrypted: true,
                 certificate: None,
             },
-            presence: Presence::while_(lasts),
+            presence: SessionPresence::while_(lasts),
             object: NodeId::null(),
             method: NodeId::null(),
             name: String::new(),
@@ -264,7 +269,7 @@ pub(crate) mod tests {
         }
     }
 
-    fn refused(status: StatusCode) -> Answer {
+    fn refused(status: StatusCode) -> FileAnswer {
         Err(status.into())
     }
 

@@ -348,9 +348,9 @@ impl<T: XmlEncodable> XmlEncodable for OptionalArray<T> {
 }
 
 /// Decodes the structures that clients send.
-pub struct Types;
+pub struct JobTypes;
 
-impl StaticTypeLoader for Types {
+impl StaticTypeLoader for JobTypes {
     fn instance() -> &'static TypeLoaderInstance {
         static TYPES: LazyLock<TypeLoaderInstance> = LazyLock::new(types);
         &TYPES

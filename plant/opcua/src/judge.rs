@@ -12,17 +12,17 @@ use std::sync::Arc;
 use opcua::sync::Mutex;
 use opcua::types::StatusCode;
 use tracing::{debug, warn};
-use trust::{Certificate, Fault, Fingerprint, Known, Names};
+use trust::{Certificate, CertificateFault, Fingerprint, RequiredNames, TrustedCertificates};
 
 use crate::certificates;
-use crate::known::{self, Stamp};
+use crate::known::{self, StoreStamp};
 
 /// A certificate, and the issuer certificates that the peer sent.
-pub type Shown = (Certificate, Vec<Certificate>);
+pub type PresentedChain = (Certificate, Vec<Certificate>);
 
 /// Judges certificates by the store at a root.
 #[derive(Debug)]
-pub struct Judge {
+pub struct CertificateJudge {
     root: PathBuf,
     trusts_all: bool,
     /// A certificate that is trusted in addition to the store.
@@ -33,7 +33,7 @@ pub struct Judge {
     /// The pairs of certificate and host for which a warning was logged.
     warned: Mutex<BTreeSet<(String, String)>>,
     /// The content that was read last, and the state of the files at that time.
-    read: Mutex<Option<(Stamp, Arc<Known>)>>,
+    read: Mutex<Option<(StoreStamp, Arc<TrustedCertificates>)>>,
 }
 
 /// The rule for a server if its certificate does not name its host. The rule applies to
@@ -51,7 +51,7 @@ pub enum HostNames {
 
 /// The refusal of a peer's certificate.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Refused {
+pub struct RefusedCertificate {
     /// The status code.
     pub status: StatusCode,
     /// Whether the peer may receive the status code (OPC 10000-4, 6.1.3).
@@ -62,7 +62,7 @@ pub struct Refused {
     pub why: String,
 }
 
-impl fmt::Display for Refused {
+impl fmt::Display for RefusedCertificate {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Self {
             status, name, why, ..
@@ -71,7 +71,7 @@ impl fmt::Display for Refused {
     }
 }
 
-impl Judge {
+impl CertificateJudge {
     /// Creates the judge of a store. With `trusts_all` every valid certificate is trusted, for
     /// tests and demonstrations.
     #[must_use]
@@ -117,7 +117,7 @@ impl Judge {
 
     /// Returns the current content of the store.
     #[must_use]
-    pub fn known(&self) -> Arc<Known> {
+    pub fn known(&self) -> Arc<TrustedCertificates> {
         // The stamp is taken before reading, so that changes during the reading are detected later.
         let stamp = known::stamp(&self.root);
         let mut read = self.read.lock();
@@ -136,8 +136,12 @@ impl Judge {
     ///
     /// # Errors
     /// Returns an error if the certificate is refused.
-    pub fn take(&self, der: &[u8], names: Names<'_>) -> Result<Shown, Refused> {
-        let shown = Certificate::read_chain(der).map_err(|unfit| Refused {
+    pub fn take(
+        &self,
+        der: &[u8],
+        names: RequiredNames<'_>,
+    ) -> Result<PresentedChain, RefusedCertificate> {
+        let shown = Certificate::read_chain(der).map_err(|unfit| RefusedCertificate {
             status: StatusCode::BadCertificateInvalid,
             may_be_told: false,
             name: String::new(),
@@ -146,7 +150,7 @@ impl Judge {
         self.judge(&shown, names)?;
         if !shown.1.is_empty() {
             // The library does not support certificate chains.
-            return Err(Refused {
+            return Err(RefusedCertificate {
                 status: StatusCode::BadCertificateInvalid,
                 may_be_told: true,
                 name: shown.0.name(),
@@ -161,7 +165,11 @@ impl Judge {
     ///
     /// # Errors
     /// Returns an error if the certificate is refused.
-    pub fn judge(&self, shown: &Shown, names: Names<'_>) -> Result<(), Refused> {
+    pub fn judge(
+        &self,
+        shown: &PresentedChain,
+        names: RequiredNames<'_>,
+    ) -> Result<(), RefusedCertificate> {
         let (certificate, sent) = shown;
         let mut known = self.known();
         let is_pinned = self.pinned == Some(certificate.fingerprint());
@@ -171,12 +179,12 @@ impl Judge {
         let now = known::now();
         let mut checked = trust::check_named(certificate, sent, &known, (names, now));
         let is_trusted_itself = known.trusted.contains(certificate);
-        if checked == Err(Fault::Host)
+        if checked == Err(CertificateFault::Host)
             && self.host_names == HostNames::Warn
             && is_trusted_itself
             && names.application_uri.is_some()
         {
-            let others = Names {
+            let others = RequiredNames {
                 host: None,
                 ..names
             };
@@ -185,10 +193,10 @@ impl Judge {
                 self.warn_of_host(certificate, names.host.unwrap_or_default());
             }
         }
-        if self.allows_outdated_lists && checked == Err(Fault::RevocationUnknown) {
+        if self.allows_outdated_lists && checked == Err(CertificateFault::RevocationUnknown) {
             checked = Ok(());
         }
-        checked.map_err(|fault| Refused {
+        checked.map_err(|fault| RefusedCertificate {
             status: StatusCode::from(fault.status()),
             may_be_told: fault.may_be_told(),
             name: certificate.name(),
@@ -211,7 +219,12 @@ impl Judge {
         }
     }
 
-    fn help(&self, certificate: &Certificate, fault: Fault, names: Names<'_>) -> String {
+    fn help(
+        &self,
+        certificate: &Certificate,
+        fault: CertificateFault,
+        names: RequiredNames<'_>,
+    ) -> String {
         let pki = &self.root;
         let issuer = certificate.issuer_name();
         let this_one = || {
@@ -226,58 +239,60 @@ impl Judge {
             format!("`ua-server trust {digits} --pki {pki:?}`")
         };
         match fault {
-            Fault::Untrusted => format!("to trust it: {}", this_one()),
-            Fault::Incomplete => format!(
+            CertificateFault::Untrusted => format!("to trust it: {}", this_one()),
+            CertificateFault::Incomplete => format!(
                 "to trust its issuer {issuer:?}: `ua-server trust AUTHORITY.der --pki {pki:?}`; to trust \
                  only this certificate: {}",
                 this_one()
             ),
-            Fault::RevocationUnknown => format!(
+            CertificateFault::RevocationUnknown => format!(
                 "add the revocation list of the authority {issuer:?}: `ua-server trust FILE.crl --pki {pki:?}`"
             ),
-            Fault::IssuerRevocationUnknown => format!(
+            CertificateFault::IssuerRevocationUnknown => format!(
                 "add the revocation list of the issuer of {issuer:?}: `ua-server trust FILE.crl --pki {pki:?}`"
             ),
-            Fault::Host => format!(
+            CertificateFault::Host => format!(
                 "its URL has the host {:?}, but its certificate has {:?}: use one of these hosts in the \
                  URL, or issue a certificate for the host",
                 names.host.unwrap_or_default(),
                 certificate.hosts()
             ),
-            Fault::Uri => format!(
+            CertificateFault::Uri => format!(
                 "it announces the ApplicationUri {:?}, but its certificate has {:?}",
                 names.application_uri.unwrap_or_default(),
                 certificate.application_uri().unwrap_or_default()
             ),
-            Fault::Invalid
-            | Fault::Policy
-            | Fault::Time
-            | Fault::IssuerTime
-            | Fault::Use
-            | Fault::IssuerUse
-            | Fault::Revoked
-            | Fault::IssuerRevoked => help(fault).to_owned(),
+            CertificateFault::Invalid
+            | CertificateFault::Policy
+            | CertificateFault::Time
+            | CertificateFault::IssuerTime
+            | CertificateFault::Use
+            | CertificateFault::IssuerUse
+            | CertificateFault::Revoked
+            | CertificateFault::IssuerRevoked => help(fault).to_owned(),
         }
     }
 }
 
 /// Returns the solution of a fault that the store cannot solve.
-pub(crate) const fn help(fault: Fault) -> &'static str {
+pub(crate) const fn help(fault: CertificateFault) -> &'static str {
     match fault {
-        Fault::Revoked | Fault::IssuerRevoked => "it needs another certificate",
-        Fault::RevocationUnknown | Fault::IssuerRevocationUnknown => {
+        CertificateFault::Revoked | CertificateFault::IssuerRevoked => {
+            "it needs another certificate"
+        }
+        CertificateFault::RevocationUnknown | CertificateFault::IssuerRevocationUnknown => {
             "add the revocation list of the authority: `ua-server trust FILE.crl`"
         }
-        Fault::Time => "renew the certificate, or set the clocks of both hosts",
-        Fault::IssuerTime => "the authority needs a new certificate",
-        Fault::Invalid
-        | Fault::Incomplete
-        | Fault::Policy
-        | Fault::Untrusted
-        | Fault::Host
-        | Fault::Uri
-        | Fault::Use
-        | Fault::IssuerUse => "it needs another certificate (OPC 10000-6, 6.2.2)",
+        CertificateFault::Time => "renew the certificate, or set the clocks of both hosts",
+        CertificateFault::IssuerTime => "the authority needs a new certificate",
+        CertificateFault::Invalid
+        | CertificateFault::Incomplete
+        | CertificateFault::Policy
+        | CertificateFault::Untrusted
+        | CertificateFault::Host
+        | CertificateFault::Uri
+        | CertificateFault::Use
+        | CertificateFault::IssuerUse => "it needs another certificate (OPC 10000-6, 6.2.2)",
     }
 }
 
@@ -299,11 +314,11 @@ mod tests {
         device.ensure_own("urn:device", "192.0.2.7").unwrap();
         let der = std::fs::read(device.root().join(OWN_CERTIFICATE)).unwrap();
         let client = Pki::open(root.join("client")).unwrap();
-        let names = |uri| Names {
+        let names = |uri| RequiredNames {
             host: Some("192.0.2.8"),
             application_uri: Some(uri),
         };
-        let judge = |host_names| Judge::of(client.root(), false).host_names(host_names);
+        let judge = |host_names| CertificateJudge::of(client.root(), false).host_names(host_names);
         let status = |host_names, uri| {
             let taken = judge(host_names).take(&der, names(uri));
             taken.map(drop).map_err(|refused| refused.status)

@@ -6,21 +6,21 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, SystemTime};
 
 use tracing::warn;
-use trust::{Certificate, Crl, Known};
+use trust::{Certificate, Crl, TrustedCertificates};
 
 use crate::certificates::StoreFault;
 
 /// Reads the content of a store. Files that are neither certificates nor revocation lists are
 /// skipped.
 #[must_use]
-pub fn read(root: &Path) -> Known {
+pub fn read(root: &Path) -> TrustedCertificates {
     let certificates = |folder: &str| -> Vec<Certificate> {
         let all = files(&root.join(folder)).into_iter();
         all.filter_map(|path| Certificate::read(&bytes(&path)?).ok())
             .collect()
     };
     let lists = files(&root.join(CRLS)).into_iter();
-    Known {
+    TrustedCertificates {
         trusted: certificates(TRUSTED),
         issuers: certificates(ISSUERS),
         crls: lists
@@ -38,12 +38,12 @@ pub fn trusts_authorities(root: &Path) -> bool {
 }
 
 /// The files of a store with their lengths and modification times.
-pub type Stamp = Vec<(PathBuf, u64, Option<SystemTime>)>;
+pub type StoreStamp = Vec<(PathBuf, u64, Option<SystemTime>)>;
 
 /// Returns the state of the files of a store without reading them. The value changes when a file
 /// changes.
 #[must_use]
-pub fn stamp(root: &Path) -> Stamp {
+pub fn stamp(root: &Path) -> StoreStamp {
     let mut all = Vec::new();
     for folder in [TRUSTED, ISSUERS, CRLS] {
         for path in files(&root.join(folder)) {

@@ -24,7 +24,7 @@ use opcua::xml::schema::ua_node_set::{AliasTable, NodeIdAlias, UANode, UANodeSet
 
 use crate::limits::MOST_NODESETS;
 
-pub use self::files::{FileFault, Imported, NodeSets, fingerprint};
+pub use self::files::{FileFault, Imported, ImportedNodeSets, fingerprint};
 pub use self::outline::{NodeKind, ValueKind, builtin};
 
 use self::document::{Parsed, Text};
@@ -132,14 +132,14 @@ pub enum NodeSetError {
 
 /// The source of a NodeSet.
 #[derive(Debug)]
-pub(crate) enum Source {
+pub(crate) enum NodeSetSource {
     Text { name: String, xml: String },
     Bytes { name: String, bytes: Vec<u8> },
     File(PathBuf),
 }
 
 /// A NodeSet that is ready for import.
-pub(crate) struct NodeSet {
+pub(crate) struct ImportedNodeSet {
     file: String,
     facts: Facts,
     /// The DataTypes and their encodings.
@@ -198,13 +198,13 @@ fn imported(set: UANodeSet) -> NodeSet2Import {
 ///
 /// # Errors
 /// Returns the first error of a source.
-pub(crate) fn load(sources: Vec<Source>) -> Result<Vec<NodeSet>, NodeSetError> {
-    let read = sources.into_iter().map(NodeSet::read);
+pub(crate) fn load(sources: Vec<NodeSetSource>) -> Result<Vec<ImportedNodeSet>, NodeSetError> {
+    let read = sources.into_iter().map(ImportedNodeSet::read);
     ordered(read.collect::<Result<_, _>>()?)
 }
 
-impl NodeSet {
-    fn read(source: Source) -> Result<Self, NodeSetError> {
+impl ImportedNodeSet {
+    fn read(source: NodeSetSource) -> Result<Self, NodeSetError> {
         let Parsed { file, text, set } = Parsed::read(source)?;
         let facts = Facts::of(&file, &text, &set)?;
         let (types, others) = parted(set);
@@ -343,7 +343,7 @@ impl Facts {
 
 /// The import of the library, without its output to stdout for each namespace.
 struct Counted<'a> {
-    set: &'a NodeSet,
+    set: &'a ImportedNodeSet,
     loaded: AtomicUsize,
 }
 
@@ -494,8 +494,8 @@ impl Check<'_> {
 }
 
 /// Orders the NodeSets so that each NodeSet follows its dependencies.
-fn ordered(sets: Vec<NodeSet>) -> Result<Vec<NodeSet>, NodeSetError> {
-    let mut owners: HashMap<&str, &NodeSet> = HashMap::new();
+fn ordered(sets: Vec<ImportedNodeSet>) -> Result<Vec<ImportedNodeSet>, NodeSetError> {
+    let mut owners: HashMap<&str, &ImportedNodeSet> = HashMap::new();
     for set in &sets {
         for uri in &set.facts.provides {
             if let Some(first) = owners.insert(uri, set) {
@@ -524,7 +524,7 @@ fn ordered(sets: Vec<NodeSet>) -> Result<Vec<NodeSet>, NodeSetError> {
     let mut there: BTreeSet<String> = BTreeSet::new();
     let mut ordered = Vec::new();
     while !waiting.is_empty() {
-        let ready = |set: &NodeSet| set.facts.needs.is_subset(&there);
+        let ready = |set: &ImportedNodeSet| set.facts.needs.is_subset(&there);
         let (next, rest): (Vec<_>, Vec<_>) = waiting.into_iter().partition(ready);
         if next.is_empty() {
             let files: Vec<&str> = rest.iter().map(|set| set.file.as_str()).collect();

@@ -24,7 +24,7 @@ use crate::pki::OWN_CERTIFICATE;
 
 /// The reason why an application has its present certificate.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Cause {
+pub enum CertificateCause {
     /// The application had no certificate.
     Missing,
     /// The key of the previous certificate was missing.
@@ -47,7 +47,7 @@ pub enum Cause {
     Administrator,
 }
 
-impl fmt::Display for Cause {
+impl fmt::Display for CertificateCause {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self {
             Self::Missing => "no certificate existed",
@@ -68,7 +68,7 @@ impl fmt::Display for Cause {
 
 /// The role of the application that owns a certificate.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Owner {
+pub(crate) enum CertificateOwner {
     /// A server, which does not share its store.
     Server,
     /// A client, which may share the store of a server with a different ApplicationUri.
@@ -79,18 +79,20 @@ pub(crate) enum Owner {
 /// authorities are kept, because a self-made certificate would not be trusted.
 pub(crate) fn outdated(
     certificate: &Certificate,
-    (application_uri, owner): (&str, Owner),
+    (application_uri, owner): (&str, CertificateOwner),
     now: Duration,
-) -> Option<Cause> {
+) -> Option<CertificateCause> {
     if !is_self_made(certificate) {
         return None;
     }
     let (from, until) = certificate.validity();
     let is_other = certificate.application_uri().as_deref() != Some(application_uri);
     match () {
-        () if until <= now && from < PLAUSIBLE => Some(Cause::EarlyClock),
-        () if until <= now => Some(Cause::Expired),
-        () if is_other && owner == Owner::Server => Some(Cause::ApplicationUri),
+        () if until <= now && from < PLAUSIBLE => Some(CertificateCause::EarlyClock),
+        () if until <= now => Some(CertificateCause::Expired),
+        () if is_other && owner == CertificateOwner::Server => {
+            Some(CertificateCause::ApplicationUri)
+        }
         () => None,
     }
 }
@@ -110,14 +112,14 @@ pub fn read(root: &Path) -> Option<Certificate> {
 ///
 /// # Errors
 /// Returns an error if the certificate cannot be written.
-pub fn replace(root: &Path, certificate: &Certificate, cause: &Cause) -> io::Result<()> {
+pub fn replace(root: &Path, certificate: &Certificate, cause: &CertificateCause) -> io::Result<()> {
     crate::pair::write(root, certificate.der(), None)?;
     report(root, cause);
     Ok(())
 }
 
 /// Logs a new certificate, and stores its cause for [`status`].
-pub(crate) fn report(root: &Path, cause: &Cause) {
+pub(crate) fn report(root: &Path, cause: &CertificateCause) {
     let Some(certificate) = read(root) else {
         return;
     };
@@ -159,7 +161,7 @@ fn maker(certificate: &Certificate) -> String {
     }
 }
 
-fn note(root: &Path, certificate: &Certificate, cause: &Cause) -> io::Result<()> {
+fn note(root: &Path, certificate: &Certificate, cause: &CertificateCause) -> io::Result<()> {
     let mut file = fs::File::create(root.join(NOTE))?;
     write!(file, "{}\n{cause}\n", certificate.fingerprint())
 }
@@ -255,17 +257,17 @@ mod tests {
         let certificate = made();
         let (from, until) = certificate.validity();
         let why = |uri, owner, now| outdated(&certificate, (uri, owner), now);
-        assert_eq!(why("urn:a", Owner::Server, from + DAY), None);
-        assert_eq!(why("urn:a", Owner::Server, until - DAY), None);
+        assert_eq!(why("urn:a", CertificateOwner::Server, from + DAY), None);
+        assert_eq!(why("urn:a", CertificateOwner::Server, until - DAY), None);
         assert_eq!(
-            why("urn:a", Owner::Server, until + DAY),
-            Some(Cause::Expired)
+            why("urn:a", CertificateOwner::Server, until + DAY),
+            Some(CertificateCause::Expired)
         );
         assert_eq!(
-            why("urn:b", Owner::Server, from + DAY),
-            Some(Cause::ApplicationUri)
+            why("urn:b", CertificateOwner::Server, from + DAY),
+            Some(CertificateCause::ApplicationUri)
         );
-        assert_eq!(why("urn:b", Owner::Client, from + DAY), None);
+        assert_eq!(why("urn:b", CertificateOwner::Client, from + DAY), None);
     }
 
     #[test]
@@ -275,7 +277,7 @@ mod tests {
         fs::create_dir_all(root.join("own")).unwrap();
         assert_eq!(status(&root), None);
         fs::write(root.join(OWN_CERTIFICATE), made().der()).unwrap();
-        report(&root, &Cause::Command);
+        report(&root, &CertificateCause::Command);
         let said = status(&root).unwrap();
         assert_eq!(said["application_uri"], "urn:a");
         assert_eq!(said["made_by"], "itself");

@@ -10,7 +10,7 @@ use tracing::warn;
 
 use crate::certificates::{self, REJECTED_KEPT, Standing};
 use crate::known;
-use crate::own::{self, Cause, Owner};
+use crate::own::{self, CertificateCause, CertificateOwner};
 use crate::pair::{self, PairFiles};
 
 /// An OPC UA certificate store with the directories `own`, `private`, `trusted` and `rejected`
@@ -106,7 +106,7 @@ impl Pki {
     /// Returns an error if files cannot be read or written, or if only half of a pair exists.
     pub fn ensure_own(&self, application_uri: &str, host: &str) -> Result<(), PkiError> {
         let hosts = [host.to_owned()];
-        self.ensure((application_uri, Owner::Client), &hosts, NAME)
+        self.ensure((application_uri, CertificateOwner::Client), &hosts, NAME)
     }
 
     /// Makes sure that a server with several hosts has a certificate, like
@@ -130,12 +130,12 @@ impl Pki {
         hosts: &[String],
         name: &str,
     ) -> Result<(), PkiError> {
-        self.ensure((application_uri, Owner::Server), hosts, name)
+        self.ensure((application_uri, CertificateOwner::Server), hosts, name)
     }
 
     fn ensure(
         &self,
-        application: (&str, Owner),
+        application: (&str, CertificateOwner),
         hosts: &[String],
         name: &str,
     ) -> Result<(), PkiError> {
@@ -158,7 +158,7 @@ impl Pki {
             }
             PairFiles::Certificate => self.replace_without_key(&data, certificate, key),
             PairFiles::Key => self.certify_key(&data, certificate, key),
-            PairFiles::Neither => self.make_own(&data, None, &Cause::Missing),
+            PairFiles::Neither => self.make_own(&data, None, &CertificateCause::Missing),
         }
     }
 
@@ -187,11 +187,11 @@ impl Pki {
         // A certificate contains the names of the computer itself anyway.
         hosts.retain(|host| *host != computer && host != "localhost");
         let data = own::described(&uri, &hosts, name, known::now());
-        self.make_anew(&data, &Cause::Command)
+        self.make_anew(&data, &CertificateCause::Command)
     }
 
     /// Makes a new certificate for the existing key.
-    fn make_anew(&self, data: &X509Data, cause: &Cause) -> Result<(), PkiError> {
+    fn make_anew(&self, data: &X509Data, cause: &CertificateCause) -> Result<(), PkiError> {
         let key = CertificateStore::read_pkey(&self.root.join(OWN_KEY));
         let key = key.map_err(PkiError::Unreadable)?;
         self.make_own(data, Some(key), cause)?;
@@ -221,7 +221,7 @@ impl Pki {
             source,
         })?;
         warn!(aside = %aside.display(), "the previous certificate has no key: moved it aside");
-        self.make_own(data, None, &Cause::KeyMissing)
+        self.make_own(data, None, &CertificateCause::KeyMissing)
     }
 
     /// Makes a certificate for a key without certificate.
@@ -237,7 +237,7 @@ impl Pki {
                 missing: certificate,
             });
         };
-        self.make_own(data, Some(known), &Cause::CertificateMissing)
+        self.make_own(data, Some(known), &CertificateCause::CertificateMissing)
     }
 
     /// Makes a new pair, or a certificate for an existing key.
@@ -245,7 +245,7 @@ impl Pki {
         &self,
         data: &X509Data,
         key: Option<PrivateKey>,
-        cause: &Cause,
+        cause: &CertificateCause,
     ) -> Result<(), PkiError> {
         let made = |error: &dyn std::fmt::Display| PkiError::Make(error.to_string());
         let (certificate, new_key) = match key {
@@ -619,7 +619,7 @@ mod tests {
         assert!(third.is_for_host("other"));
         assert_eq!(third.hosts().len(), second.hosts().len());
         let said = own::status(&root).unwrap();
-        assert_eq!(said["reason"], Cause::Command.to_string());
+        assert_eq!(said["reason"], CertificateCause::Command.to_string());
         fs::remove_dir_all(root).unwrap();
     }
 

@@ -36,8 +36,8 @@ use tokio::net::TcpListener;
 use tokio::task::JoinHandle;
 use tracing::{error, warn};
 
-pub use self::build::{Security, ServerBuilder, ServerConfig, ServerError};
-pub use self::calls::{MethodHandler, MethodRequest, Refusal, arguments_in, method};
+pub use self::build::{ServerBuilder, ServerConfig, ServerError, ServerSecurity};
+pub use self::calls::{MethodHandler, MethodRefusal, MethodRequest, arguments_in, method};
 pub use self::capabilities::{Facets, capabilities, profiles};
 pub use self::copies::{ForwardedEvent, TypeSpec};
 pub use self::events::{StateRef, TransitionEvent};
@@ -48,17 +48,17 @@ pub use self::methods::MethodSpec;
 pub use self::nodes::{WriteHandler, WriteRequest, write};
 pub use self::overlay::{CoreMethod, core_of, core_with};
 pub(crate) use self::sessions::ANONYMOUS;
-pub use self::sessions::{Caller, Presence};
+pub use self::sessions::{SessionCaller, SessionPresence};
 pub use self::supplement::{CoreValue, EventHistory, NodeFacts, Supplement};
-pub use self::view::Child;
+pub use self::view::ChildNode;
 pub use crate::endpoint::EndpointUrl;
 
-use self::calls::Calls;
-use self::nodes::{Nodes, Spaces};
+use self::calls::MethodCalls;
+use self::nodes::{AddressSpaces, ServerNodes};
 use crate::changes::{self, ModelChange};
 use crate::door::Door;
 use crate::pki::Pki;
-use crate::users::Access;
+use crate::users::UserAccess;
 
 /// The attributes of a variable, or of a variable declaration in a type.
 #[derive(Debug, Clone)]
@@ -75,15 +75,15 @@ pub struct VariableFacts {
 
 /// A server. Clones share the same server, which stops when the last clone is dropped.
 #[derive(Clone)]
-pub struct Server {
+pub struct OpcUaServer {
     inner: Arc<Inner>,
 }
 
 struct Inner {
     handle: ServerHandle,
-    manager: Arc<InMemoryNodeManager<Nodes>>,
-    spaces: Arc<Spaces>,
-    calls: Arc<Calls>,
+    manager: Arc<InMemoryNodeManager<ServerNodes>>,
+    spaces: Arc<AddressSpaces>,
+    calls: Arc<MethodCalls>,
     application_uri: String,
     url: String,
     port: u16,
@@ -101,7 +101,7 @@ struct Waiting {
     pki: Option<Pki>,
     /// The door and its public listener, if the server listens for the door only.
     door: Option<(Door, TcpListener)>,
-    users: Option<Arc<Access>>,
+    users: Option<Arc<UserAccess>>,
 }
 
 impl Drop for Inner {
@@ -114,7 +114,7 @@ impl Drop for Inner {
     }
 }
 
-impl Server {
+impl OpcUaServer {
     /// Starts serving clients. A second call has no effect.
     pub fn start(&self) {
         let Some(waiting) = self.inner.waiting.lock().take() else {
@@ -253,7 +253,7 @@ impl Server {
 
     /// Returns the direct children of a node, in arbitrary order.
     #[must_use]
-    pub fn children(&self, node: &NodeId) -> Vec<Child> {
+    pub fn children(&self, node: &NodeId) -> Vec<ChildNode> {
         self.inner.spaces.with(|view| view.children(node))
     }
 

@@ -6,8 +6,8 @@ use std::sync::Arc;
 use opcua::sync::RwLock;
 use opcua::types::{Argument, DataTypeId, LocalizedText, StatusCode};
 
-use crate::server::Caller;
-use crate::users::{Role, Roles};
+use crate::server::SessionCaller;
+use crate::users::{Roles, UserRole};
 
 /// The BrowseName of the method with which a supervisor configures a program, in any namespace.
 pub const CONFIGURE: &str = "Configure";
@@ -72,8 +72,8 @@ impl Supervision {
     ///
     /// # Errors
     /// BadUserAccessDenied unless the caller is the supervisor or has the role ConfigureAdmin.
-    pub fn admits(&self, caller: &Caller, roles: Roles) -> Result<(), StatusCode> {
-        if roles.contains(Role::ConfigureAdmin) {
+    pub fn admits(&self, caller: &SessionCaller, roles: Roles) -> Result<(), StatusCode> {
+        if roles.contains(UserRole::ConfigureAdmin) {
             return Ok(());
         }
         let supervisor = self.0.read();
@@ -94,8 +94,8 @@ impl Supervision {
 mod tests {
     use super::*;
 
-    fn caller(uri: &str, proven: bool, encrypted: bool) -> Caller {
-        Caller {
+    fn caller(uri: &str, proven: bool, encrypted: bool) -> SessionCaller {
+        SessionCaller {
             session: 1,
             user: "anonymous".to_owned(),
             application_uri: uri.to_owned(),
@@ -126,9 +126,9 @@ mod tests {
         );
         let another = caller("urn:cell-2", true, true);
         assert_eq!(supervision.admits(&another, none), denied);
-        let admin = Roles::of(&[Role::ConfigureAdmin]);
+        let admin = Roles::of(&[UserRole::ConfigureAdmin]);
         assert_eq!(supervision.admits(&another, admin), Ok(()));
-        let security = Roles::of(&[Role::SecurityAdmin, Role::Engineer]);
+        let security = Roles::of(&[UserRole::SecurityAdmin, UserRole::Engineer]);
         assert_eq!(supervision.admits(&another, security), denied);
     }
 
@@ -139,7 +139,7 @@ mod tests {
             application_uri: "urn:cell".to_owned(),
             proven: false,
         });
-        let admits = |caller: &Caller| supervision.admits(caller, Roles::NONE).is_ok();
+        let admits = |caller: &SessionCaller| supervision.admits(caller, Roles::NONE).is_ok();
         assert!(admits(&caller("urn:cell", false, false)));
         assert!(admits(&caller("urn:cell", true, true)));
         assert!(!admits(&caller("urn:other", false, false)));

@@ -12,7 +12,7 @@ use opcua::types::{
     Variant,
 };
 
-use crate::file::{Answer, FileMethod, Handles, READ, WRITE_ANEW};
+use crate::file::{FileAnswer, FileMethod, Handles, READ, WRITE_ANEW};
 use crate::server::MethodRequest;
 
 /// The parts of a trust list, as bits (TrustListMasks of OPC 10000-12, 7.8.2.8).
@@ -79,7 +79,7 @@ impl TrustFile {
     ///
     /// # Errors
     /// Returns the refusal of the method.
-    pub fn call(&self, method: FileMethod, request: &MethodRequest) -> Answer {
+    pub fn call(&self, method: FileMethod, request: &MethodRequest) -> FileAnswer {
         match (method, request.arguments.as_slice()) {
             (FileMethod::Open, [Variant::Byte(mode)]) => self.open(request, *mode),
             (FileMethod::OpenWithMasks, [Variant::UInt32(masks)]) => {
@@ -102,7 +102,7 @@ impl TrustFile {
         }
     }
 
-    fn open(&self, request: &MethodRequest, mode: u8) -> Answer {
+    fn open(&self, request: &MethodRequest, mode: u8) -> FileAnswer {
         match mode {
             READ => self.open_with(request, masks::ALL),
             WRITE_ANEW if self.is_writable => self.open.lock().add(request, Vec::new(), true),
@@ -113,7 +113,7 @@ impl TrustFile {
         }
     }
 
-    fn open_with(&self, request: &MethodRequest, masks: u32) -> Answer {
+    fn open_with(&self, request: &MethodRequest, masks: u32) -> FileAnswer {
         if masks & !masks::ALL != 0 {
             return Err(StatusCode::BadInvalidArgument.into());
         }
@@ -122,7 +122,7 @@ impl TrustFile {
         self.open.lock().add(request, content, false)
     }
 
-    fn update(&self, session: u32, number: u32) -> Answer {
+    fn update(&self, session: u32, number: u32) -> FileAnswer {
         let written = self.open.lock().written(session, number)?;
         let mut from = Cursor::new(&written);
         let list = TrustListDataType::decode(&mut from, &ContextOwned::default().context());
@@ -164,11 +164,16 @@ mod tests {
         TrustFile::new(List(Mutex::new(list)), is_writable)
     }
 
-    fn call(file: &TrustFile, session: u32, method: FileMethod, arguments: &[Variant]) -> Answer {
+    fn call(
+        file: &TrustFile,
+        session: u32,
+        method: FileMethod,
+        arguments: &[Variant],
+    ) -> FileAnswer {
         file.call(method, &request(session, arguments))
     }
 
-    fn handle(opened: Answer) -> Variant {
+    fn handle(opened: FileAnswer) -> Variant {
         opened.unwrap().remove(0)
     }
 

@@ -10,14 +10,16 @@ mod access;
 mod file;
 mod password;
 
-pub use self::access::{Access, Anonymous, Login, LoginFault, Permissions, Right, Rules};
+pub use self::access::{
+    AnonymousRights, Login, LoginFault, NodePermissions, PermissionRules, Right, UserAccess,
+};
 pub use self::file::{
-    Credential, FOLDER, LARGEST_PASSWORD, MOST_USERS, User, UserFault, Users, hashed,
+    Credential, FOLDER, LARGEST_PASSWORD, MOST_USERS, StoredUser, UserFault, Users, hashed,
 };
 
 /// A well-known role of OPC 10000-18, 4.2.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-pub enum Role {
+pub enum UserRole {
     /// May read.
     Observer,
     /// Operates the cell: may read, write and call.
@@ -30,7 +32,7 @@ pub enum Role {
     ConfigureAdmin,
 }
 
-impl Role {
+impl UserRole {
     /// Every role.
     pub const ALL: &'static [Self] = &[
         Self::Observer,
@@ -63,7 +65,7 @@ impl Role {
     }
 }
 
-impl std::str::FromStr for Role {
+impl std::str::FromStr for UserRole {
     type Err = UnknownRole;
 
     fn from_str(text: &str) -> Result<Self, UnknownRole> {
@@ -92,13 +94,13 @@ impl Roles {
 
     /// Returns the set of the given roles.
     #[must_use]
-    pub fn of(roles: &[Role]) -> Self {
+    pub fn of(roles: &[UserRole]) -> Self {
         roles.iter().copied().collect()
     }
 
     /// Returns whether the set contains a role.
     #[must_use]
-    pub const fn contains(self, role: Role) -> bool {
+    pub const fn contains(self, role: UserRole) -> bool {
         self.0 & role.bit() != 0
     }
 
@@ -109,14 +111,14 @@ impl Roles {
     }
 
     /// Returns the roles in their order.
-    pub fn iter(self) -> impl Iterator<Item = Role> {
-        let all = Role::ALL.iter().copied();
+    pub fn iter(self) -> impl Iterator<Item = UserRole> {
+        let all = UserRole::ALL.iter().copied();
         all.filter(move |role| self.contains(*role))
     }
 }
 
-impl FromIterator<Role> for Roles {
-    fn from_iter<T: IntoIterator<Item = Role>>(roles: T) -> Self {
+impl FromIterator<UserRole> for Roles {
+    fn from_iter<T: IntoIterator<Item = UserRole>>(roles: T) -> Self {
         Self(roles.into_iter().fold(0, |all, role| all | role.bit()))
     }
 }

@@ -15,13 +15,15 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use async_trait::async_trait;
-use cell::{Cell, PATIENCE, config, next, next_value, press};
+use cell::{OpcuaCell, PATIENCE, config, next, next_value, press};
 use opcua::types::{NodeId, ObjectId, QualifiedName, StatusCode, VariableId, Variant};
 use plant_opcua::client::{
-    CallOptions, Client, ClientConfig, ClientError, Link, Notice, SecurityChoice, Watch,
+    CallOptions, ClientConfig, ClientError, Link, MonitoredWatch, Notice, OpcUaClient,
+    SecurityChoice,
 };
 use plant_opcua::server::{
-    MethodHandler, MethodRequest, MethodSpec, Refusal, Security, Server, ServerConfig,
+    MethodHandler, MethodRefusal, MethodRequest, MethodSpec, OpcUaServer, ServerConfig,
+    ServerSecurity,
 };
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::{TcpListener, TcpStream};
@@ -35,7 +37,7 @@ fn quick() -> ClientConfig {
     config
 }
 
-async fn until(client: &Client, wanted: impl FnMut(&Link) -> bool) -> Link {
+async fn until(client: &OpcUaClient, wanted: impl FnMut(&Link) -> bool) -> Link {
     let mut link = client.link();
     let waited = tokio::time::timeout(PATIENCE, link.wait_for(wanted)).await;
     waited.expect("the link never gets there").unwrap().clone()
@@ -51,10 +53,10 @@ fn is_down(link: &Link) -> bool {
 
 #[tokio::test]
 async fn a_server_that_is_started_again_is_found_with_all_subscriptions() {
-    let first = Cell::new();
+    let first = OpcuaCell::new();
     let url = first.server.url().to_owned();
     press(&first.server, 100, &[]);
-    let client = Client::open(quick(), &url);
+    let client = OpcUaClient::open(quick(), &url);
     let link = until(&client, is_up).await;
     assert!(
         matches!(&link, Link::Up { restarted: false, connects: 1, secured: false, application_uri, .. }
@@ -68,8 +70,8 @@ async fn a_server_that_is_started_again_is_found_with_all_subscriptions() {
     let path = ["ParameterSet", "Force"].map(|name| QualifiedName::new(machines, name));
     let force = client.translate(&NodeId::new(1, 100), &path).await.unwrap();
     let watches = vec![
-        Watch::Value(force.clone()),
-        Watch::Value(NodeId::new(1, 77)),
+        MonitoredWatch::Value(force.clone()),
+        MonitoredWatch::Value(NodeId::new(1, 77)),
     ];
     let mut subscription = client.subscribe(watches, Duration::from_millis(10), 64);
     assert_eq!(next(&mut subscription).await, Notice::Subscribed);
@@ -93,7 +95,7 @@ async fn a_server_that_is_started_again_is_found_with_all_subscriptions() {
     let refused = client.read(std::slice::from_ref(&force)).await.unwrap_err();
     assert!(matches!(refused, ClientError::NotConnected(_)), "{refused}");
 
-    let again = Cell::at(&url);
+    let again = OpcuaCell::at(&url);
     press(&again.server, 100, &[]);
     again.server.show(&force, 1.5).unwrap();
     let link = until(&client, is_up).await;
@@ -125,7 +127,7 @@ async fn a_server_that_is_started_again_is_found_with_all_subscriptions() {
 
 #[tokio::test]
 async fn a_server_that_says_nothing_more_is_taken_for_down() {
-    let cell = Cell::new();
+    let cell = OpcuaCell::new();
     // A proxy between client and server stops forwarding, as if a cable were pulled.
     let line = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let url = format!("opc.tcp://{}", line.local_addr().unwrap());
@@ -149,7 +151,7 @@ async fn a_server_that_says_nothing_more_is_taken_for_down() {
     });
     let mut config = quick();
     config.timeout = Duration::from_millis(500);
-    let client = Client::open(config, &url);
+    let client = OpcUaClient::open(config, &url);
     until(&client, is_up).await;
     cut.send_replace(true);
     let Link::Down { reason, .. } = until(&client, is_down).await else {
@@ -163,11 +165,11 @@ async fn a_server_that_says_nothing_more_is_taken_for_down() {
 
 #[tokio::test]
 async fn a_queue_that_is_full_loses_notices_and_counts_them() {
-    let cell = Cell::new();
+    let cell = OpcuaCell::new();
     let press = press(&cell.server, 100, &[]);
     let client = cell.client().await;
     let force = press.node("ParameterSet/Force").unwrap().clone();
-    let watches = vec![Watch::Value(force.clone())];
+    let watches = vec![MonitoredWatch::Value(force.clone())];
     let mut full = client.subscribe(watches.clone(), Duration::from_millis(10), 2);
     let mut roomy = client.subscribe(watches, Duration::from_millis(10), 64);
     next_value(&mut roomy).await;
@@ -202,7 +204,7 @@ impl Drop for Waiting {
 
 #[async_trait]
 impl MethodHandler for Slow {
-    async fn call(&self, _request: MethodRequest) -> Result<Vec<Variant>, Refusal> {
+    async fn call(&self, _request: MethodRequest) -> Result<Vec<Variant>, MethodRefusal> {
         self.0.send_replace("waits");
         let _waiting = Waiting(self.0.clone());
         tokio::time::sleep(Duration::from_secs(1)).await;
@@ -222,7 +224,7 @@ async fn a_call_takes_no_effect_after_its_caller_has_given_up_where_timeout_hint
                 "opc.tcp://127.0.0.1:0".parse().unwrap(),
             )
         };
-        let cell = Cell::with(config);
+        let cell = OpcuaCell::with(config);
         let (last, mut happened) = watch::channel("nothing");
         press(&cell.server, 100, &[]);
         let (object, id) = (NodeId::new(1, 100), NodeId::new(1, 500));
@@ -257,16 +259,16 @@ fn scratch(name: &str) -> PathBuf {
     path
 }
 
-fn secured(name: &str, trust: bool) -> (Cell, PathBuf) {
+fn secured(name: &str, trust: bool) -> (OpcuaCell, PathBuf) {
     let pki = scratch(name);
     let url = "opc.tcp://127.0.0.1:0".parse().unwrap();
     let config = ServerConfig {
-        security: vec![Security::None, Security::Basic256Sha256],
+        security: vec![ServerSecurity::None, ServerSecurity::Basic256Sha256],
         pki: Some(pki.clone()),
         trust_unknown_clients: trust,
         ..ServerConfig::new("urn:test:cell", "Cell", url)
     };
-    (Cell::with(config), pki)
+    (OpcuaCell::with(config), pki)
 }
 
 #[tokio::test]
@@ -276,12 +278,12 @@ async fn a_client_with_certificates_has_the_best_security_there_is() {
     let mut config = config();
     config.pki = Some(client_pki.clone());
     config.backoff = (Duration::from_millis(20), Duration::from_millis(100));
-    let strict = Client::open(config.clone(), cell.server.url());
+    let strict = OpcUaClient::open(config.clone(), cell.server.url());
     let is_refused = |link: &Link| matches!(link, Link::Down { reason, .. } if !reason.is_empty());
     until(&strict, is_refused).await;
     strict.close().await;
     config.accept_untrusted = true;
-    let client = Client::open(config, cell.server.url());
+    let client = OpcUaClient::open(config, cell.server.url());
     until(&client, is_refused).await;
     // The server does not trust the client's certificate until an operator trusts it.
     for rejected in std::fs::read_dir(server_pki.join("rejected")).unwrap() {
@@ -304,7 +306,7 @@ async fn a_client_with_certificates_has_the_best_security_there_is() {
 
     let mut plain = cell::config();
     plain.security = SecurityChoice::None;
-    let client = Client::open(plain, cell.server.url());
+    let client = OpcUaClient::open(plain, cell.server.url());
     let link = until(&client, is_up).await;
     assert!(matches!(link, Link::Up { secured: false, .. }), "{link:?}");
     for path in [server_pki, client_pki] {
@@ -357,12 +359,12 @@ fn garbage(url: &str) -> Vec<Vec<u8>> {
 
 #[tokio::test]
 async fn a_peer_that_sends_garbage_disturbs_nobody() {
-    let cell = Cell::new();
+    let cell = OpcuaCell::new();
     let press = press(&cell.server, 100, &[]);
     let force = press.node("ParameterSet/Force").unwrap().clone();
-    let client = Client::open(quick(), cell.server.url());
+    let client = OpcUaClient::open(quick(), cell.server.url());
     client.up(PATIENCE).await.unwrap();
-    let watches = vec![Watch::Value(force.clone())];
+    let watches = vec![MonitoredWatch::Value(force.clone())];
     let mut subscription = client.subscribe(watches, Duration::from_millis(10), 256);
     assert_eq!(
         next_value(&mut subscription).await.1,
@@ -396,8 +398,8 @@ async fn a_peer_that_sends_garbage_disturbs_nobody() {
     still_serves(&cell.server).await;
 }
 
-async fn still_serves(server: &Server) {
-    let client = Client::open(quick(), server.url());
+async fn still_serves(server: &OpcUaServer) {
+    let client = OpcUaClient::open(quick(), server.url());
     client.up(PATIENCE).await.unwrap();
     let root: NodeId = ObjectId::ObjectsFolder.into();
     let below = client
@@ -429,7 +431,7 @@ async fn small_server() -> (String, opcua::server::ServerHandle) {
 #[tokio::test]
 async fn a_server_with_small_limits_is_asked_in_parts() {
     let (url, server) = small_server().await;
-    let client = Client::open(quick(), &url);
+    let client = OpcUaClient::open(quick(), &url);
     until(&client, is_up).await;
     let state: NodeId = VariableId::Server_ServerStatus_State.into();
     let values = client.read(&vec![state.clone(); 40]).await.unwrap();
@@ -452,7 +454,7 @@ async fn a_server_with_small_limits_is_asked_in_parts() {
         );
     }
 
-    let watches = vec![Watch::Value(state); 60];
+    let watches = vec![MonitoredWatch::Value(state); 60];
     let mut subscription = client.subscribe(watches, Duration::from_millis(10), 256);
     assert_eq!(next(&mut subscription).await, Notice::Subscribed);
     let mut seen = std::collections::BTreeSet::new();

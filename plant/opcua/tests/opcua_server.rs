@@ -6,21 +6,21 @@ mod cell;
 
 use std::time::Duration;
 
-use cell::{Cell, MACHINES, PATIENCE, VENDOR, next_event, next_value, press};
+use cell::{MACHINES, OpcuaCell, PATIENCE, VENDOR, next_event, next_value, press};
 use opcua::types::{
     AttributeId, DataValue, LocalizedText, MethodId, NodeId, ObjectId, ObjectTypeId, QualifiedName,
     ReferenceTypeId, StatusCode, Variant,
 };
-use plant_opcua::client::{Browse, CallError, Notice, Select, Watch};
+use plant_opcua::client::{Browse, CallError, MonitoredWatch, Notice, Select};
 use plant_opcua::nodeset::NodeSetError;
 use plant_opcua::server::{
-    InstanceError, InstanceSpec, MethodRequest, Refusal, Server, ServerBuilder, ServerConfig,
-    ServerError, StateRef, TransitionEvent, WriteRequest, method, write,
+    InstanceError, InstanceSpec, MethodRefusal, MethodRequest, OpcUaServer, ServerBuilder,
+    ServerConfig, ServerError, StateRef, TransitionEvent, WriteRequest, method, write,
 };
 
 #[tokio::test]
 async fn an_instance_has_what_its_types_make_mandatory() {
-    let cell = Cell::new();
+    let cell = OpcuaCell::new();
     let press = press(&cell.server, 100, &["Remark", "ProgramDiagnostic"]);
     let paths: Vec<&str> = press.nodes().map(|(path, _)| path).collect();
     for path in [
@@ -91,7 +91,7 @@ async fn an_instance_has_what_its_types_make_mandatory() {
 
 #[tokio::test]
 async fn types_and_nodes_that_cannot_be_are_refused_and_nothing_is_made() {
-    let cell = Cell::new();
+    let cell = OpcuaCell::new();
     let server = &cell.server;
     let machine = server.find_type(MACHINES, "MachineType").unwrap();
     let press_type = server.find_type(VENDOR, "PressType").unwrap();
@@ -148,7 +148,7 @@ async fn types_and_nodes_that_cannot_be_are_refused_and_nothing_is_made() {
 
 #[tokio::test]
 async fn a_method_is_reached_by_its_own_id_and_by_those_of_its_types() {
-    let cell = Cell::new();
+    let cell = OpcuaCell::new();
     let press = press(&cell.server, 100, &[]);
     let (tell, mut called) = tokio::sync::mpsc::channel(8);
     let start = press.node("Start").unwrap();
@@ -194,7 +194,7 @@ fn status(result: Result<Vec<Variant>, CallError>) -> StatusCode {
 
 #[tokio::test]
 async fn a_method_of_one_object_is_none_of_another() {
-    let cell = Cell::new();
+    let cell = OpcuaCell::new();
     let press = press(&cell.server, 100, &[]);
     let other = cell::press(&cell.server, 300, &[]);
     let start = press.node("Start").unwrap();
@@ -246,7 +246,7 @@ async fn a_method_of_one_object_is_none_of_another() {
 
 #[tokio::test]
 async fn arguments_that_do_not_fit_never_reach_the_handler() {
-    let cell = Cell::new();
+    let cell = OpcuaCell::new();
     let press = press(&cell.server, 100, &[]);
     let turn = press.node("Turn").unwrap();
     cell.server.on_call(
@@ -255,7 +255,7 @@ async fn arguments_that_do_not_fit_never_reach_the_handler() {
         method(|request: MethodRequest| {
             if matches!(request.arguments[0], Variant::Double(angle) if angle > 90.0) {
                 let each = vec![StatusCode::BadOutOfRange, StatusCode::Good];
-                return Err(Refusal::Arguments(each));
+                return Err(MethodRefusal::Arguments(each));
             }
             Ok(request.arguments)
         }),
@@ -308,7 +308,7 @@ async fn arguments_that_do_not_fit_never_reach_the_handler() {
 
 #[tokio::test]
 async fn a_write_is_shown_unless_its_handler_refuses() {
-    let cell = Cell::new();
+    let cell = OpcuaCell::new();
     let press = press(&cell.server, 100, &[]);
     let force = press.node("ParameterSet/Force").unwrap().clone();
     let depth = press.node("ParameterSet/Depth").unwrap().clone();
@@ -322,7 +322,7 @@ async fn a_write_is_shown_unless_its_handler_refuses() {
     );
     let client = cell.client().await;
     let mut watched = client.subscribe(
-        vec![Watch::Value(force.clone())],
+        vec![MonitoredWatch::Value(force.clone())],
         Duration::from_millis(10),
         16,
     );
@@ -370,7 +370,7 @@ async fn a_write_is_shown_unless_its_handler_refuses() {
     assert_eq!(refused, [StatusCode::BadNotWritable]);
 }
 
-fn transition(server: &Server, source: &NodeId) -> TransitionEvent {
+fn transition(server: &OpcUaServer, source: &NodeId) -> TransitionEvent {
     let state = |name: &str, id: ObjectId, number| StateRef {
         name: name.to_owned(),
         id: id.into(),
@@ -402,7 +402,7 @@ fn transition(server: &Server, source: &NodeId) -> TransitionEvent {
 
 #[tokio::test]
 async fn an_event_comes_on_its_source_and_on_the_server_with_the_fields_of_each_type() {
-    let cell = Cell::new();
+    let cell = OpcuaCell::new();
     let press = press(&cell.server, 100, &[]);
     let client = cell.client().await;
     let declared = cell
@@ -429,7 +429,7 @@ async fn an_event_comes_on_its_source_and_on_the_server_with_the_fields_of_each_
         run,
         Select::new(declared.clone(), "EventType"),
     ];
-    let events = |node: NodeId, of_type| Watch::Events {
+    let events = |node: NodeId, of_type| MonitoredWatch::Events {
         node,
         select: select.clone(),
         of_type,
@@ -473,7 +473,7 @@ async fn an_event_comes_on_its_source_and_on_the_server_with_the_fields_of_each_
 
 #[tokio::test]
 async fn an_object_with_events_says_so_and_is_found_from_the_server() {
-    let cell = Cell::new();
+    let cell = OpcuaCell::new();
     let press = press(&cell.server, 100, &[]);
     let client = cell.client().await;
     let read = client
@@ -505,7 +505,7 @@ async fn an_object_with_events_says_so_and_is_found_from_the_server() {
 
 #[tokio::test]
 async fn sessions_that_called_are_told_when_they_are_closed() {
-    let cell = Cell::new();
+    let cell = OpcuaCell::new();
     let press = press(&cell.server, 100, &[]);
     let start = press.node("Start").unwrap();
     let (tell, mut callers) = tokio::sync::mpsc::channel(8);
@@ -523,7 +523,9 @@ async fn sessions_that_called_are_told_when_they_are_closed() {
     let silent = cell.client().await;
     let caller = cell.client().await;
     // A subscription outlives its session, and must not keep the session alive.
-    let watches = vec![Watch::Value(press.node("CurrentState").unwrap().clone())];
+    let watches = vec![MonitoredWatch::Value(
+        press.node("CurrentState").unwrap().clone(),
+    )];
     let mut subscription = caller.subscribe(watches, Duration::from_millis(10), 4);
     assert_eq!(subscription.next().await, Some(Notice::Subscribed));
     caller.call(&press.node_id, start, vec![]).await.unwrap();
@@ -541,7 +543,7 @@ async fn sessions_that_called_are_told_when_they_are_closed() {
 
 #[tokio::test]
 async fn more_items_than_other_clients_can_bear_are_all_told() {
-    let cell = Cell::new();
+    let cell = OpcuaCell::new();
     let folder: NodeId = ObjectId::ObjectsFolder.into();
     let nodes: Vec<NodeId> = (0..3_000).map(|n| NodeId::new(1, 10_000 + n)).collect();
     for (n, node) in nodes.iter().enumerate() {
@@ -550,7 +552,7 @@ async fn more_items_than_other_clients_can_bear_are_all_told() {
             .unwrap();
     }
     let client = cell.client().await;
-    let watches = nodes.iter().cloned().map(Watch::Value).collect();
+    let watches = nodes.iter().cloned().map(MonitoredWatch::Value).collect();
     let mut subscription = client.subscribe(watches, Duration::from_millis(50), 10_000);
     for round in 0..2_u32 {
         let mut missing = nodes.len();
@@ -655,14 +657,18 @@ fn build_file(path: &str) -> String {
 
 #[tokio::test]
 async fn a_node_that_is_removed_is_gone_for_everybody() {
-    let cell = Cell::new();
+    let cell = OpcuaCell::new();
     let press = press(&cell.server, 100, &[]);
     let start = press.node("Start").unwrap();
     cell.server
         .on_call(&press.node_id, start, method(|_| Ok(vec![])));
     let client = cell.client().await;
     let force = press.node("ParameterSet/Force").unwrap().clone();
-    let mut watched = client.subscribe(vec![Watch::Value(force)], Duration::from_millis(10), 8);
+    let mut watched = client.subscribe(
+        vec![MonitoredWatch::Value(force)],
+        Duration::from_millis(10),
+        8,
+    );
     assert_eq!(
         next_value(&mut watched).await.1,
         Some(Variant::Double(12.5))

@@ -14,7 +14,7 @@ pub struct Lease<S> {
 /// Another client holds the lease; nothing has changed.
 #[derive(Debug, Clone, PartialEq, Eq, Error)]
 #[error("another client has the lease of this component")]
-pub struct Held<S> {
+pub struct LeaseHeld<S> {
     /// The holder.
     pub by: S,
 }
@@ -29,10 +29,10 @@ impl<S: Clone + PartialEq> Lease<S> {
     /// Acquires or renews the lease.
     ///
     /// # Errors
-    /// [`Held`] if another client holds the lease.
-    pub fn claim(&mut self, by: S) -> Result<(), Held<S>> {
+    /// [`LeaseHeld`] if another client holds the lease.
+    pub fn claim(&mut self, by: S) -> Result<(), LeaseHeld<S>> {
         match &self.holder {
-            Some(holder) if *holder != by => Err(Held { by: holder.clone() }),
+            Some(holder) if *holder != by => Err(LeaseHeld { by: holder.clone() }),
             _ => {
                 self.holder = Some(by);
                 Ok(())
@@ -65,7 +65,7 @@ mod tests {
     fn of_two_clients_that_race_one_wins_and_the_other_is_told_of_it() {
         let mut lease = Lease::free();
         assert_eq!(lease.claim("first"), Ok(()));
-        assert_eq!(lease.claim("second"), Err(Held { by: "first" }));
+        assert_eq!(lease.claim("second"), Err(LeaseHeld { by: "first" }));
         assert_eq!(lease.claim("first"), Ok(()), "it has it already");
         assert!(!lease.release(&"second"), "it is not theirs to give back");
         assert_eq!(lease.holder(), Some(&"first"));

@@ -1,10 +1,10 @@
 //! The state machine of an OPC UA Program (OPC 10000-10, 4.2) as a table.
 //!
-//! A [`Program`] is an instance of ProgramStateMachineType. It processes [`Method`]s and the
-//! [`Ending`] of a run, and returns the resulting [`Transition`], or the reason why there is no
-//! transition. It runs nothing, stores no parameters and does not depend on a server. Its owner
-//! stores the parameters, publishes the transition and then starts the work. The [`Lease`] controls
-//! which client may call.
+//! A [`ProgramInstance`] is an instance of ProgramStateMachineType. It processes [`ProgramMethod`]s
+//! and the [`Ending`] of a run, and returns the resulting [`Transition`], or the reason why there
+//! is no transition. It runs nothing, stores no parameters and does not depend on a server. Its
+//! owner stores the parameters, publishes the transition and then starts the work. The [`Lease`]
+//! controls which client may call.
 //!
 //! | state | Start | Suspend | Resume | Halt | Reset |
 //! |---|---|---|---|---|---|
@@ -19,8 +19,10 @@
 mod lease;
 mod table;
 
-pub use lease::{Held, Lease};
-pub use table::{Cause, Ending, Method, State, TRANSITIONS, Transition};
+pub use lease::{Lease, LeaseHeld};
+pub use table::{
+    Ending, ProgramMachineState, ProgramMethod, TRANSITIONS, Transition, TransitionCause,
+};
 
 use thiserror::Error;
 
@@ -63,14 +65,14 @@ pub enum Rest {
 /// A refused method call; nothing has changed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Error)]
 #[non_exhaustive]
-pub enum Refused {
+pub enum RefusedMethod {
     /// The table has no such transition. BadInvalidState (OPC 10000-10, 5.2.3.2).
     #[error("{method} is not possible in the state {state}")]
     State {
         /// The called method.
-        method: Method,
+        method: ProgramMethod,
         /// The current state, which does not change.
-        state: State,
+        state: ProgramMachineState,
     },
     /// The work of this type cannot be suspended. BadNotSupported.
     #[error("this program cannot be suspended")]
@@ -88,16 +90,16 @@ pub struct NotRunning {
 
 /// An instance of a program. Its initial state is Halted (OPC 10000-10).
 #[derive(Debug, Clone)]
-pub struct Program {
+pub struct ProgramInstance {
     nature: Nature,
-    state: State,
+    state: ProgramMachineState,
     last: Option<&'static Transition>,
     run: Option<RunId>,
     /// The number of the first run.
     first: u32,
 }
 
-impl Program {
+impl ProgramInstance {
     /// Creates a program. Its first run has the number 1.
     #[must_use]
     pub fn new(nature: Nature) -> Self {
@@ -110,7 +112,7 @@ impl Program {
     pub fn counting_from(nature: Nature, first: u32) -> Self {
         Self {
             nature,
-            state: State::Halted,
+            state: ProgramMachineState::Halted,
             last: None,
             run: None,
             first: first.max(1),
@@ -126,16 +128,16 @@ impl Program {
     /// Calls a method and returns the resulting transition.
     ///
     /// # Errors
-    /// [`Refused`]; nothing has changed.
-    pub fn call(&mut self, method: Method) -> Result<&'static Transition, Refused> {
-        if method == Method::Suspend && !self.nature.can_suspend {
-            return Err(Refused::CannotSuspend);
+    /// [`RefusedMethod`]; nothing has changed.
+    pub fn call(&mut self, method: ProgramMethod) -> Result<&'static Transition, RefusedMethod> {
+        if method == ProgramMethod::Suspend && !self.nature.can_suspend {
+            return Err(RefusedMethod::CannotSuspend);
         }
-        let transition = Transition::by_method(self.state, method).ok_or(Refused::State {
+        let transition = Transition::by_method(self.state, method).ok_or(RefusedMethod::State {
             method,
             state: self.state,
         })?;
-        if method == Method::Start {
+        if method == ProgramMethod::Start {
             self.run = Some(match self.run {
                 None => RunId(self.first),
                 Some(last) => last.next(),
@@ -161,7 +163,7 @@ impl Program {
 
     /// Returns the current state.
     #[must_use]
-    pub fn state(&self) -> State {
+    pub fn state(&self) -> ProgramMachineState {
         self.state
     }
 
@@ -180,8 +182,8 @@ impl Program {
     /// Returns whether a call is possible in the current state: the attribute Executable of the
     /// method's node.
     #[must_use]
-    pub fn is_executable(&self, method: Method) -> bool {
-        (method != Method::Suspend || self.nature.can_suspend)
+    pub fn is_executable(&self, method: ProgramMethod) -> bool {
+        (method != ProgramMethod::Suspend || self.nature.can_suspend)
             && Transition::by_method(self.state, method).is_some()
     }
 
@@ -201,13 +203,17 @@ mod tests {
         rests_in: Rest::Ready,
     };
 
-    fn program(state: State) -> (Program, Option<RunId>) {
-        let mut program = Program::new(SKILL);
-        let way: &[Method] = match state {
-            State::Halted => &[],
-            State::Ready => &[Method::Reset],
-            State::Running => &[Method::Reset, Method::Start],
-            State::Suspended => &[Method::Reset, Method::Start, Method::Suspend],
+    fn program(state: ProgramMachineState) -> (ProgramInstance, Option<RunId>) {
+        let mut program = ProgramInstance::new(SKILL);
+        let way: &[ProgramMethod] = match state {
+            ProgramMachineState::Halted => &[],
+            ProgramMachineState::Ready => &[ProgramMethod::Reset],
+            ProgramMachineState::Running => &[ProgramMethod::Reset, ProgramMethod::Start],
+            ProgramMachineState::Suspended => &[
+                ProgramMethod::Reset,
+                ProgramMethod::Start,
+                ProgramMethod::Suspend,
+            ],
         };
         for method in way {
             program.call(*method).unwrap();
@@ -220,8 +226,8 @@ mod tests {
     #[test]
     fn of_twenty_calls_eight_are_legal_and_the_others_change_nothing() {
         let mut legal = Vec::new();
-        for state in State::ALL {
-            for method in Method::ALL {
+        for state in ProgramMachineState::ALL {
+            for method in ProgramMethod::ALL {
                 let (mut program, _) = program(state);
                 let before = (program.state(), program.last_transition(), program.run());
                 assert_eq!(
@@ -234,7 +240,7 @@ mod tests {
                         legal.push((state, method, transition.to));
                     }
                     Err(refused) => {
-                        assert_eq!(refused, Refused::State { method, state });
+                        assert_eq!(refused, RefusedMethod::State { method, state });
                         let after = (program.state(), program.last_transition(), program.run());
                         assert_eq!(after, before, "{method} in {state}");
                     }
@@ -243,14 +249,46 @@ mod tests {
         }
         legal.sort();
         let mut expected = [
-            (State::Halted, Method::Reset, State::Ready),
-            (State::Ready, Method::Start, State::Running),
-            (State::Ready, Method::Halt, State::Halted),
-            (State::Running, Method::Suspend, State::Suspended),
-            (State::Running, Method::Halt, State::Halted),
-            (State::Suspended, Method::Resume, State::Running),
-            (State::Suspended, Method::Halt, State::Halted),
-            (State::Suspended, Method::Reset, State::Ready),
+            (
+                ProgramMachineState::Halted,
+                ProgramMethod::Reset,
+                ProgramMachineState::Ready,
+            ),
+            (
+                ProgramMachineState::Ready,
+                ProgramMethod::Start,
+                ProgramMachineState::Running,
+            ),
+            (
+                ProgramMachineState::Ready,
+                ProgramMethod::Halt,
+                ProgramMachineState::Halted,
+            ),
+            (
+                ProgramMachineState::Running,
+                ProgramMethod::Suspend,
+                ProgramMachineState::Suspended,
+            ),
+            (
+                ProgramMachineState::Running,
+                ProgramMethod::Halt,
+                ProgramMachineState::Halted,
+            ),
+            (
+                ProgramMachineState::Suspended,
+                ProgramMethod::Resume,
+                ProgramMachineState::Running,
+            ),
+            (
+                ProgramMachineState::Suspended,
+                ProgramMethod::Halt,
+                ProgramMachineState::Halted,
+            ),
+            (
+                ProgramMachineState::Suspended,
+                ProgramMethod::Reset,
+                ProgramMachineState::Ready,
+            ),
         ];
         expected.sort();
         assert_eq!(legal, expected);
@@ -259,33 +297,40 @@ mod tests {
     #[test]
     fn a_run_ends_where_its_type_says_and_fails_into_halted() {
         for (rests_in, rest, number) in [
-            (Rest::Ready, State::Ready, 4),
-            (Rest::Halted, State::Halted, 3),
+            (Rest::Ready, ProgramMachineState::Ready, 4),
+            (Rest::Halted, ProgramMachineState::Halted, 3),
         ] {
-            let mut program = Program::new(Nature { rests_in, ..SKILL });
-            program.call(Method::Reset).unwrap();
-            program.call(Method::Start).unwrap();
+            let mut program = ProgramInstance::new(Nature { rests_in, ..SKILL });
+            program.call(ProgramMethod::Reset).unwrap();
+            program.call(ProgramMethod::Start).unwrap();
             let run = program.run().unwrap();
             let end = program.ended(run, Ending::Success).unwrap();
             assert_eq!((end.number, program.state()), (number, rest));
         }
-        let (mut program, run) = program(State::Running);
+        let (mut program, run) = program(ProgramMachineState::Running);
         let end = program.ended(run.unwrap(), Ending::Failure).unwrap();
-        assert_eq!((end.number, program.state()), (3, State::Halted));
+        assert_eq!(
+            (end.number, program.state()),
+            (3, ProgramMachineState::Halted)
+        );
     }
 
     #[test]
     fn a_worker_that_ends_after_it_was_halted_does_not_end_the_next_run() {
-        let (mut program, first) = program(State::Running);
+        let (mut program, first) = program(ProgramMachineState::Running);
         let first = first.unwrap();
-        for method in [Method::Halt, Method::Reset, Method::Start] {
+        for method in [
+            ProgramMethod::Halt,
+            ProgramMethod::Reset,
+            ProgramMethod::Start,
+        ] {
             program.call(method).unwrap();
         }
         assert_eq!(
             program.ended(first, Ending::Success),
             Err(NotRunning { run: first })
         );
-        assert_eq!(program.state(), State::Running);
+        assert_eq!(program.state(), ProgramMachineState::Running);
         let second = program.run().unwrap();
         assert_ne!(second, first);
         assert!(program.ended(second, Ending::Success).is_ok());
@@ -298,10 +343,10 @@ mod tests {
     #[test]
     fn runs_are_counted_from_where_it_is_told_and_never_are_0() {
         for (first, numbers) in [(0, [1, 2]), (7, [7, 8]), (u32::MAX, [u32::MAX, 1])] {
-            let mut program = Program::counting_from(SKILL, first);
-            program.call(Method::Reset).unwrap();
+            let mut program = ProgramInstance::counting_from(SKILL, first);
+            program.call(ProgramMethod::Reset).unwrap();
             for number in numbers {
-                program.call(Method::Start).unwrap();
+                program.call(ProgramMethod::Start).unwrap();
                 let run = program.run().unwrap();
                 assert_eq!(run.number(), number);
                 program.ended(run, Ending::Success).unwrap();
@@ -311,23 +356,29 @@ mod tests {
 
     #[test]
     fn a_suspended_run_can_fail_but_does_no_work() {
-        let (mut program, run) = program(State::Suspended);
+        let (mut program, run) = program(ProgramMachineState::Suspended);
         let run = run.unwrap();
         assert!(program.ended(run, Ending::Success).is_err());
         let end = program.ended(run, Ending::Failure).unwrap();
-        assert_eq!((end.number, program.state()), (7, State::Halted));
+        assert_eq!(
+            (end.number, program.state()),
+            (7, ProgramMachineState::Halted)
+        );
     }
 
     #[test]
     fn what_cannot_stand_still_is_never_suspended() {
-        let mut program = Program::new(Nature {
+        let mut program = ProgramInstance::new(Nature {
             can_suspend: false,
             ..SKILL
         });
-        program.call(Method::Reset).unwrap();
-        program.call(Method::Start).unwrap();
-        assert!(!program.is_executable(Method::Suspend));
-        assert_eq!(program.call(Method::Suspend), Err(Refused::CannotSuspend));
-        assert!(program.is_executable(Method::Halt));
+        program.call(ProgramMethod::Reset).unwrap();
+        program.call(ProgramMethod::Start).unwrap();
+        assert!(!program.is_executable(ProgramMethod::Suspend));
+        assert_eq!(
+            program.call(ProgramMethod::Suspend),
+            Err(RefusedMethod::CannotSuspend)
+        );
+        assert!(program.is_executable(ProgramMethod::Halt));
     }
 }

@@ -6,7 +6,7 @@ use crate::Rest;
 
 /// A state of ProgramStateMachineType (OPC 10000-10, 5.2.3.1).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
-pub enum State {
+pub enum ProgramMachineState {
     /// Not started, or ended. A Reset leads to Ready.
     Halted,
     /// Can be started.
@@ -17,7 +17,7 @@ pub enum State {
     Suspended,
 }
 
-impl State {
+impl ProgramMachineState {
     /// All states.
     pub const ALL: [Self; 4] = [Self::Halted, Self::Ready, Self::Running, Self::Suspended];
 
@@ -55,7 +55,7 @@ impl State {
     }
 }
 
-impl fmt::Display for State {
+impl fmt::Display for ProgramMachineState {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(self.name())
     }
@@ -63,7 +63,7 @@ impl fmt::Display for State {
 
 /// A method of ProgramStateMachineType (OPC 10000-10, 5.2.3.2).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
-pub enum Method {
+pub enum ProgramMethod {
     /// Starts a run.
     Start,
     /// Suspends the work.
@@ -76,7 +76,7 @@ pub enum Method {
     Reset,
 }
 
-impl Method {
+impl ProgramMethod {
     /// All methods.
     pub const ALL: [Self; 5] = [
         Self::Start,
@@ -112,7 +112,7 @@ impl Method {
     }
 }
 
-impl fmt::Display for Method {
+impl fmt::Display for ProgramMethod {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(self.name())
     }
@@ -129,13 +129,13 @@ pub enum Ending {
 
 /// The cause of a transition.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub enum Cause {
+pub enum TransitionCause {
     /// Only a method call.
-    Method(Method),
+    Method(ProgramMethod),
     /// Only the end of the work.
     Work,
     /// A method call or the end of the work.
-    MethodOrWork(Method),
+    MethodOrWork(ProgramMethod),
 }
 
 /// A transition of ProgramStateMachineType, which has nine (OPC 10000-10, 5.2.3.1).
@@ -148,37 +148,51 @@ pub struct Transition {
     /// The numeric identifier of its node in namespace 0, which is the Id of LastTransition.
     pub node_id: u32,
     /// The source state.
-    pub from: State,
+    pub from: ProgramMachineState,
     /// The target state.
-    pub to: State,
+    pub to: ProgramMachineState,
     /// The cause.
-    pub cause: Cause,
+    pub cause: TransitionCause,
 }
 
 impl Transition {
-    pub(crate) fn by_method(from: State, method: Method) -> Option<&'static Self> {
+    pub(crate) fn by_method(
+        from: ProgramMachineState,
+        method: ProgramMethod,
+    ) -> Option<&'static Self> {
         TRANSITIONS.iter().find(|transition| {
             let caused = match transition.cause {
-                Cause::Method(cause) | Cause::MethodOrWork(cause) => cause == method,
-                Cause::Work => false,
+                TransitionCause::Method(cause) | TransitionCause::MethodOrWork(cause) => {
+                    cause == method
+                }
+                TransitionCause::Work => false,
             };
             caused && transition.from == from
         })
     }
 
-    pub(crate) fn by_ending(from: State, ending: Ending, rest: Rest) -> Option<&'static Self> {
+    pub(crate) fn by_ending(
+        from: ProgramMachineState,
+        ending: Ending,
+        rest: Rest,
+    ) -> Option<&'static Self> {
         let to = match (from, ending, rest) {
-            (State::Running, Ending::Success, Rest::Ready) => State::Ready,
-            (State::Running, Ending::Success, Rest::Halted)
-            | (State::Running | State::Suspended, Ending::Failure, _) => State::Halted,
-            (State::Suspended, Ending::Success, _) | (State::Halted | State::Ready, _, _) => {
+            (ProgramMachineState::Running, Ending::Success, Rest::Ready) => {
+                ProgramMachineState::Ready
+            }
+            (ProgramMachineState::Running, Ending::Success, Rest::Halted)
+            | (ProgramMachineState::Running | ProgramMachineState::Suspended, Ending::Failure, _) => {
+                ProgramMachineState::Halted
+            }
+            (ProgramMachineState::Suspended, Ending::Success, _)
+            | (ProgramMachineState::Halted | ProgramMachineState::Ready, _, _) => {
                 return None;
             }
         };
         TRANSITIONS.iter().find(|transition| {
             transition.from == from
                 && transition.to == to
-                && !matches!(transition.cause, Cause::Method(_))
+                && !matches!(transition.cause, TransitionCause::Method(_))
         })
     }
 }
@@ -189,73 +203,73 @@ pub static TRANSITIONS: [Transition; 9] = [
         number: 1,
         name: "HaltedToReady",
         node_id: 2408,
-        from: State::Halted,
-        to: State::Ready,
-        cause: Cause::Method(Method::Reset),
+        from: ProgramMachineState::Halted,
+        to: ProgramMachineState::Ready,
+        cause: TransitionCause::Method(ProgramMethod::Reset),
     },
     Transition {
         number: 2,
         name: "ReadyToRunning",
         node_id: 2410,
-        from: State::Ready,
-        to: State::Running,
-        cause: Cause::Method(Method::Start),
+        from: ProgramMachineState::Ready,
+        to: ProgramMachineState::Running,
+        cause: TransitionCause::Method(ProgramMethod::Start),
     },
     Transition {
         number: 3,
         name: "RunningToHalted",
         node_id: 2412,
-        from: State::Running,
-        to: State::Halted,
-        cause: Cause::MethodOrWork(Method::Halt),
+        from: ProgramMachineState::Running,
+        to: ProgramMachineState::Halted,
+        cause: TransitionCause::MethodOrWork(ProgramMethod::Halt),
     },
     Transition {
         number: 4,
         name: "RunningToReady",
         node_id: 2414,
-        from: State::Running,
-        to: State::Ready,
-        cause: Cause::Work,
+        from: ProgramMachineState::Running,
+        to: ProgramMachineState::Ready,
+        cause: TransitionCause::Work,
     },
     Transition {
         number: 5,
         name: "RunningToSuspended",
         node_id: 2416,
-        from: State::Running,
-        to: State::Suspended,
-        cause: Cause::Method(Method::Suspend),
+        from: ProgramMachineState::Running,
+        to: ProgramMachineState::Suspended,
+        cause: TransitionCause::Method(ProgramMethod::Suspend),
     },
     Transition {
         number: 6,
         name: "SuspendedToRunning",
         node_id: 2418,
-        from: State::Suspended,
-        to: State::Running,
-        cause: Cause::Method(Method::Resume),
+        from: ProgramMachineState::Suspended,
+        to: ProgramMachineState::Running,
+        cause: TransitionCause::Method(ProgramMethod::Resume),
     },
     Transition {
         number: 7,
         name: "SuspendedToHalted",
         node_id: 2420,
-        from: State::Suspended,
-        to: State::Halted,
-        cause: Cause::MethodOrWork(Method::Halt),
+        from: ProgramMachineState::Suspended,
+        to: ProgramMachineState::Halted,
+        cause: TransitionCause::MethodOrWork(ProgramMethod::Halt),
     },
     Transition {
         number: 8,
         name: "SuspendedToReady",
         node_id: 2422,
-        from: State::Suspended,
-        to: State::Ready,
-        cause: Cause::Method(Method::Reset),
+        from: ProgramMachineState::Suspended,
+        to: ProgramMachineState::Ready,
+        cause: TransitionCause::Method(ProgramMethod::Reset),
     },
     Transition {
         number: 9,
         name: "ReadyToHalted",
         node_id: 2424,
-        from: State::Ready,
-        to: State::Halted,
-        cause: Cause::Method(Method::Halt),
+        from: ProgramMachineState::Ready,
+        to: ProgramMachineState::Halted,
+        cause: TransitionCause::Method(ProgramMethod::Halt),
     },
 ];
 
@@ -274,8 +288,8 @@ mod tests {
             .iter()
             .map(|transition| transition.node_id)
             .collect();
-        ids.extend(State::ALL.map(State::node_id));
-        ids.extend(Method::ALL.map(Method::node_id));
+        ids.extend(ProgramMachineState::ALL.map(ProgramMachineState::node_id));
+        ids.extend(ProgramMethod::ALL.map(ProgramMethod::node_id));
         ids.sort_unstable();
         ids.dedup();
         assert_eq!(ids.len(), 9 + 4 + 5, "no identifier is given twice");

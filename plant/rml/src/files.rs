@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 /// Reason for which a file of a mapping cannot be read, with the remedy.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
-pub enum FileFault {
+pub enum MappingFileFault {
     /// The name is a URL.
     #[error("it is a URL, and nothing is fetched; save the file beside the mapping and name it")]
     Url,
@@ -49,8 +49,8 @@ pub trait Files {
     /// Returns the contents of a file.
     ///
     /// # Errors
-    /// [`FileFault`].
-    fn read(&mut self, name: &str) -> Result<Vec<u8>, FileFault>;
+    /// [`MappingFileFault`].
+    fn read(&mut self, name: &str) -> Result<Vec<u8>, MappingFileFault>;
 }
 
 /// The files of a folder, and contents that take the place of named files.
@@ -78,12 +78,12 @@ impl Folder {
         self
     }
 
-    fn path(&self, name: &str) -> Result<PathBuf, FileFault> {
+    fn path(&self, name: &str) -> Result<PathBuf, MappingFileFault> {
         if name.contains("://") {
-            return Err(FileFault::Url);
+            return Err(MappingFileFault::Url);
         }
         let resolved = |path: &Path| {
-            path.canonicalize().map_err(|error| FileFault::Open {
+            path.canonicalize().map_err(|error| MappingFileFault::Open {
                 path: path.to_owned(),
                 error,
             })
@@ -91,26 +91,26 @@ impl Folder {
         let root = resolved(&self.root)?;
         let found = resolved(&root.join(name))?;
         if !found.starts_with(&root) {
-            return Err(FileFault::Outside(root));
+            return Err(MappingFileFault::Outside(root));
         }
         Ok(found)
     }
 }
 
 impl Files for Folder {
-    fn read(&mut self, name: &str) -> Result<Vec<u8>, FileFault> {
+    fn read(&mut self, name: &str) -> Result<Vec<u8>, MappingFileFault> {
         if let Some(given) = self.given.get(name) {
             check_size(u64::try_from(given.len()).unwrap_or(u64::MAX))?;
             return Ok(given.clone());
         }
         let path = self.path(name)?;
-        let cannot = |error: io::Error| FileFault::Read {
+        let cannot = |error: io::Error| MappingFileFault::Read {
             path: path.clone(),
             error,
         };
         let metadata = path.metadata().map_err(cannot)?;
         if !metadata.is_file() {
-            return Err(FileFault::NoFile(path));
+            return Err(MappingFileFault::NoFile(path));
         }
         check_size(metadata.len())?;
         let mut bytes = Vec::new();
@@ -120,9 +120,9 @@ impl Files for Folder {
     }
 }
 
-fn check_size(bytes: u64) -> Result<(), FileFault> {
+fn check_size(bytes: u64) -> Result<(), MappingFileFault> {
     if bytes > MAX_FILE {
-        Err(FileFault::Size {
+        Err(MappingFileFault::Size {
             bytes,
             most: MAX_FILE,
         })

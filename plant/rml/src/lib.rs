@@ -1,8 +1,8 @@
 //! RML: XML files as RDF, by a mapping that users write.
 //!
 //! A mapping is Turtle in one of two vocabularies: `http://semweb.mmlab.be/ns/rml#` with R2RML, or
-//! `http://w3id.org/rml/`. [`Mapping`] reads it, and [`Mapping::run`] reads the files that it names
-//! through [`Files`] and returns the statements. [`Folder`] gives files of one folder only.
+//! `http://w3id.org/rml/`. [`RmlMapping`] reads it, and [`RmlMapping::run`] reads the files that it
+//! names through [`Files`] and returns the statements. [`Folder`] gives files of one folder only.
 //!
 //! Sizes, depths, and the work of a run are limited. The crate opens no connection.
 //!
@@ -16,6 +16,6 @@ mod run;
 mod write;
 mod xpath;
 
-pub use files::{FileFault, Files, Folder};
-pub use mapping::{Mapping, MappingFault};
-pub use run::Output;
+pub use files::{Files, Folder, MappingFileFault};
+pub use mapping::{MappingFault, RmlMapping};
+pub use run::RunOutput;

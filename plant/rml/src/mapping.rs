@@ -9,7 +9,7 @@ use crate::xpath::Expr;
 
 /// A mapping of XML files to RDF.
 #[derive(Debug, Clone)]
-pub struct Mapping {
+pub struct RmlMapping {
     pub(crate) sources: Vec<LogicalSource>,
     pub(crate) maps: Vec<TriplesMap>,
     pub(crate) base: String,
@@ -140,7 +140,7 @@ pub(crate) enum TermKind {
     Literal,
 }
 
-impl Mapping {
+impl RmlMapping {
     /// Returns the names of the files that the mapping reads.
     #[must_use]
     pub fn files(&self) -> BTreeSet<&str> {

@@ -13,9 +13,9 @@ use oxttl::TurtleParser;
 
 use self::fault::TriplesMapFault;
 use crate::mapping::{
-    LogicalSource, Mapping, MappingFault, ObjectMap, PredicateObject, TermKind, TriplesMap,
+    LogicalSource, MappingFault, ObjectMap, PredicateObject, RmlMapping, TermKind, TriplesMap,
 };
-use crate::xpath::{Namespaces, parse};
+use crate::xpath::{XpathNamespaces, parse};
 
 const R2RML: &str = "http://www.w3.org/ns/r2rml#";
 const OLD: &str = "http://semweb.mmlab.be/ns/rml#";
@@ -23,7 +23,7 @@ const FORMULATIONS: &str = "http://semweb.mmlab.be/ns/ql#";
 const NEW: &str = "http://w3id.org/rml/";
 const TYPE: &str = "http://www.w3.org/1999/02/22-rdf-syntax-ns#type";
 
-impl Mapping {
+impl RmlMapping {
     /// Reads a mapping.
     ///
     /// # Errors
@@ -457,7 +457,7 @@ impl<'a> Reading<'a> {
 /// The triples map that is read, and the namespaces of its expressions.
 struct Scope<'s> {
     map: &'s NamedOrBlankNode,
-    namespaces: &'s Namespaces,
+    namespaces: &'s XpathNamespaces,
 }
 
 /// A term map, or a constant in its place.

@@ -8,10 +8,10 @@ use std::rc::Rc;
 use oxrdf::{BlankNode, GraphName, Literal, NamedNode, NamedOrBlankNode, Quad, Term};
 use roxmltree::{Document, ParsingOptions};
 
-use self::sink::Sink;
+use self::sink::StatementSink;
 use crate::files::Files;
 use crate::mapping::{
-    Expression, JoinCondition, Mapping, MappingFault, ObjectMap, PredicateObject, TemplatePart,
+    Expression, JoinCondition, MappingFault, ObjectMap, PredicateObject, RmlMapping, TemplatePart,
     TermKind, TermMap, TermValue, TriplesMap,
 };
 use crate::read::{blank, is_default_graph, is_language};
@@ -19,7 +19,7 @@ use crate::xpath::{EvaluationFault, Evaluator, NodeRef, WorkBudget};
 
 /// The statements of a run.
 #[derive(Debug, Clone)]
-pub struct Output {
+pub struct RunOutput {
     /// The statements, each once, in the order of the triples maps and rows.
     pub quads: Vec<Quad>,
     /// Values that are no term, and other faults that cost single statements.
@@ -27,16 +27,20 @@ pub struct Output {
     pub(crate) prefixes: Vec<(String, String)>,
 }
 
-impl Mapping {
+impl RmlMapping {
     /// Runs the mapping.
     ///
     /// # Errors
     /// [`MappingFault`] if a file cannot be read, or a limit is exceeded.
-    pub fn run(&self, files: &mut dyn Files) -> Result<Output, MappingFault> {
+    pub fn run(&self, files: &mut dyn Files) -> Result<RunOutput, MappingFault> {
         self.run_within(files, WorkBudget::new(MAX_WORK))
     }
 
-    fn run_within(&self, files: &mut dyn Files, work: WorkBudget) -> Result<Output, MappingFault> {
+    fn run_within(
+        &self,
+        files: &mut dyn Files,
+        work: WorkBudget,
+    ) -> Result<RunOutput, MappingFault> {
         let texts = self.texts(files)?;
         let mut documents = Vec::new();
         for (file, text) in &texts {
@@ -57,7 +61,7 @@ impl Mapping {
             file_of_source: Vec::new(),
             rows: Vec::new(),
             work,
-            sink: Sink::default(),
+            sink: StatementSink::default(),
             blank_nodes: HashMap::new(),
             findings: BTreeMap::new(),
             subjects: HashMap::new(),
@@ -75,7 +79,7 @@ impl Mapping {
             })?;
         }
         let findings = run.findings.into_iter();
-        Ok(Output {
+        Ok(RunOutput {
             quads: run.sink.quads,
             findings: findings
                 .map(|(problem, times)| repeated(problem, times))
@@ -147,14 +151,14 @@ enum RunFault {
 }
 
 struct Run<'a> {
-    mapping: &'a Mapping,
+    mapping: &'a RmlMapping,
     /// One per file.
     evaluators: Vec<Evaluator<'a>>,
     file_of_source: Vec<usize>,
     /// The rows by source.
     rows: Vec<Rc<Vec<NodeRef>>>,
     work: WorkBudget,
-    sink: Sink,
+    sink: StatementSink,
     blank_nodes: HashMap<String, BlankNode>,
     findings: BTreeMap<String, usize>,
     /// The subjects of the rows of parents, by triples map.
@@ -658,12 +662,12 @@ const MAX_SHOWN: usize = 80;
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::files::FileFault;
+    use crate::files::MappingFileFault;
 
     struct Deep;
 
     impl Files for Deep {
-        fn read(&mut self, _: &str) -> Result<Vec<u8>, FileFault> {
+        fn read(&mut self, _: &str) -> Result<Vec<u8>, MappingFileFault> {
             let (open, close) = ("<a>".repeat(300), "</a>".repeat(300));
             Ok(format!("{open}{close}").into_bytes())
         }
@@ -681,7 +685,7 @@ mod tests {
     #[test]
     fn a_run_ends_at_the_limit_of_its_work() {
         let mapping = "@prefix r: <http://w3id.org/rml/> . <urn:m> r:logicalSource [ r:source \"a\"; r:referenceFormulation r:XPath; r:iterator \"//a\" ]; r:subject <urn:s>; r:predicateObjectMap [ r:predicate <urn:p>; r:objectMap [ r:reference \"//a[.//a//a]\" ] ] .";
-        let mapping = Mapping::read(mapping).unwrap();
+        let mapping = RmlMapping::read(mapping).unwrap();
         let run = mapping.run_within(&mut Deep, WorkBudget::new(200_000));
         let fault = run.unwrap_err().to_string();
         assert!(fault.contains("narrow its paths"), "{fault}");

@@ -4,9 +4,9 @@ use std::io;
 
 use oxttl::{NQuadsSerializer, TriGSerializer, TurtleSerializer};
 
-use crate::run::Output;
+use crate::run::RunOutput;
 
-impl Output {
+impl RunOutput {
     /// Writes TriG with the prefixes of the mapping. It is Turtle unless the mapping has graphs.
     ///
     /// # Errors

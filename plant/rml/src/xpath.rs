@@ -16,7 +16,7 @@ pub(crate) use evaluate::{EvaluationFault, Evaluator, NodeRef, WorkBudget};
 pub(crate) use parse::{XPathSyntaxFault, parse};
 
 /// The namespaces of prefixes in expressions. Without any, names match in all namespaces.
-pub(crate) type Namespaces = [(String, String)];
+pub(crate) type XpathNamespaces = [(String, String)];
 
 /// An expression.
 #[derive(Debug, Clone, PartialEq)]
@@ -112,7 +112,7 @@ pub(crate) struct Join {
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct XPathStep {
     pub(crate) axis: Axis,
-    pub(crate) test: Test,
+    pub(crate) test: StepTest,
     pub(crate) predicates: Vec<Expr>,
 }
 
@@ -144,7 +144,7 @@ impl Axis {
 
 /// The test of a step.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) enum Test {
+pub(crate) enum StepTest {
     /// Any node.
     Node,
     Text,

@@ -8,7 +8,7 @@ use std::path::Path;
 use oxrdf::Dataset;
 use oxrdf::dataset::CanonicalizationAlgorithm;
 use oxttl::NQuadsParser;
-use rml::{Folder, Mapping};
+use rml::{Folder, RmlMapping};
 use test_data::foreign;
 
 #[test]
@@ -49,7 +49,7 @@ fn passes(suite: &str, count: usize) {
 fn check(case: &Path) -> Result<(), String> {
     let path = case.join("mapping.ttl");
     let text = fs::read_to_string(&path).unwrap();
-    let result = Mapping::read(&text).and_then(|mapping| mapping.run(&mut Folder::of(&path)));
+    let result = RmlMapping::read(&text).and_then(|mapping| mapping.run(&mut Folder::of(&path)));
     let expected = ["output.nq", "default.nq"]
         .iter()
         .find_map(|name| fs::read_to_string(case.join(name)).ok());

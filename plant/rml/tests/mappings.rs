@@ -5,13 +5,13 @@ use std::collections::BTreeSet;
 use std::path::PathBuf;
 use std::{fs, process};
 
-use rml::{FileFault, Files, Folder, Mapping, MappingFault, Output};
+use rml::{Files, Folder, MappingFault, MappingFileFault, RmlMapping, RunOutput};
 
 /// One text for all files.
 struct Text(String);
 
 impl Files for Text {
-    fn read(&mut self, _: &str) -> Result<Vec<u8>, FileFault> {
+    fn read(&mut self, _: &str) -> Result<Vec<u8>, MappingFileFault> {
         Ok(self.0.clone().into_bytes())
     }
 }
@@ -27,8 +27,8 @@ fn mapping(iterator: &str, subject: &str, object: &str) -> String {
     )
 }
 
-fn run(mapping: &str, xml: &str) -> Result<Output, MappingFault> {
-    Mapping::read(mapping)?.run(&mut Text(xml.to_owned()))
+fn run(mapping: &str, xml: &str) -> Result<RunOutput, MappingFault> {
+    RmlMapping::read(mapping)?.run(&mut Text(xml.to_owned()))
 }
 
 /// Returns the values of `ex:p`, in order.
@@ -172,7 +172,7 @@ fn a_mapping_with_an_error_names_the_triples_map_and_the_remedy() {
             "cannot be a predicate",
         ),
     ] {
-        let fault = Mapping::read(&text).unwrap_err().to_string();
+        let fault = RmlMapping::read(&text).unwrap_err().to_string();
         assert!(fault.contains(part), "{fault:?} contains {part:?}");
     }
 }
@@ -217,7 +217,7 @@ fn terms_without_effect_are_findings() {
         "rr:subjectMap",
         "<http://w3id.org/rml/logicalTarget> <#T>; rr:subjectMap",
     );
-    let mapping = Mapping::read(&text).unwrap();
+    let mapping = RmlMapping::read(&text).unwrap();
     let findings: BTreeSet<&str> = mapping.findings().iter().map(String::as_str).collect();
     let found = |part: &str| findings.iter().any(|finding| finding.contains(part));
     assert!(found("`class` belongs to a subject map"), "{findings:?}");
@@ -241,7 +241,7 @@ fn a_run_ends_at_its_limits() {
         format!("a{}", "/a".repeat(5000)),
     ] {
         let text = mapping("/a", "x", &format!("rml:reference \"{nested}\""));
-        let fault = Mapping::read(&text).unwrap_err().to_string();
+        let fault = RmlMapping::read(&text).unwrap_err().to_string();
         assert!(fault.contains("more than"), "{fault}");
     }
 }
@@ -255,7 +255,7 @@ fn a_mapping_reads_files_of_its_folder_only() {
     let path = folder.0.join("maps/m.ttl");
     let read = |file: &str, folder: &mut Folder| {
         let text = mapping("/a", "x", "rml:reference \"@b\"").replace("a.xml", file);
-        Mapping::read(&text).unwrap().run(folder)
+        RmlMapping::read(&text).unwrap().run(folder)
     };
     let mut files = Folder::of(&path);
     assert_eq!(read("a.xml", &mut files).unwrap().quads.len(), 1);

@@ -7,19 +7,19 @@
 
 use std::{error::Error, sync::Arc, time::Duration};
 
-use program::{Method, State};
+use program::{ProgramMachineState, ProgramMethod};
 use skills::{
-    Authority, Driver, DriverError, Facts, Owner, Results, Shown, Skill, TypeName, Value, Work,
-    model,
+    Authority, Driver, DriverError, ParameterType, RunResults, Skill, SkillDescription, SkillOwner,
+    SkillSnapshot, SkillValue, Work, model,
 };
 
-const OPERATOR: Owner = Owner::Local("the example");
+const OPERATOR: SkillOwner = SkillOwner::Local("the example");
 
 struct Fingers;
 
 #[async_trait::async_trait]
 impl Driver for Fingers {
-    async fn run(&self, work: Work) -> Result<Results, DriverError> {
+    async fn run(&self, work: Work) -> Result<RunResults, DriverError> {
         let force = work.parameters().number("Force").unwrap_or_default();
         work.step(format!("closing with {force} N")).await;
         for tenth in 1..=10_u8 {
@@ -27,16 +27,16 @@ impl Driver for Fingers {
             work.spend(Duration::from_millis(200)).await?;
             work.progress(f32::from(tenth) / 10.0);
         }
-        Ok(vec![("Gripped".to_owned(), Value::from(true))])
+        Ok(vec![("Gripped".to_owned(), SkillValue::from(true))])
     }
 }
 
 #[tokio::main(flavor = "current_thread")]
 async fn main() -> Result<(), Box<dyn Error>> {
     let of = model::find("GraspSkillType").ok_or("the type is not in the model")?;
-    let facts = Facts {
+    let facts = SkillDescription {
         name: "Grasp".to_owned(),
-        types: of.chain().map(|of| TypeName::own(of.name)).collect(),
+        types: of.chain().map(|of| ParameterType::own(of.name)).collect(),
         parameters: of.parameters(),
         results: of.results(),
         capabilities: Vec::new(),
@@ -45,26 +45,31 @@ async fn main() -> Result<(), Box<dyn Error>> {
     };
     let skill = Skill::spawn(facts, Arc::new(Fingers), Authority::new(), Vec::new());
 
-    let force = vec![("Force".to_owned(), Value::from(20.0))];
+    let force = vec![("Force".to_owned(), SkillValue::from(20.0))];
     let run = skill.execute(OPERATOR, force.clone(), None).await?;
     show(&ended(&skill, run).await?);
 
     let run = skill.execute(OPERATOR, force, None).await?;
-    skill.call(OPERATOR, Method::Halt).await?;
+    skill.call(OPERATOR, ProgramMethod::Halt).await?;
     show(&ended(&skill, run).await?);
     skill.close().await;
     Ok(())
 }
 
 /// Waits for the end of a run.
-async fn ended(skill: &Skill, run: u32) -> Result<Shown, Box<dyn Error>> {
+async fn ended(skill: &Skill, run: u32) -> Result<SkillSnapshot, Box<dyn Error>> {
     let mut watch = skill.watch();
-    let shown = watch
-        .wait_for(|shown| shown.run == run && matches!(shown.state, State::Ready | State::Halted));
-    Ok(Shown::clone(&*shown.await?))
+    let shown = watch.wait_for(|shown| {
+        shown.run == run
+            && matches!(
+                shown.state,
+                ProgramMachineState::Ready | ProgramMachineState::Halted
+            )
+    });
+    Ok(SkillSnapshot::clone(&*shown.await?))
 }
 
-fn show(shown: &Shown) {
+fn show(shown: &SkillSnapshot) {
     if let Some(outcome) = &shown.outcome {
         println!(
             "run {}: {:?}: {}",

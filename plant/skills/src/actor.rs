@@ -10,60 +10,65 @@ use std::sync::{Arc, Mutex};
 use std::time::{Duration, SystemTime};
 
 use log_limit::LogLimit;
-use program::{Ending, Method, Nature, Program, RunId, State, Transition};
+use program::{
+    Ending, Nature, ProgramInstance, ProgramMachineState, ProgramMethod, RunId, Transition,
+};
 use tokio::sync::{mpsc, watch};
 use tokio::time::{Instant, sleep_until, timeout};
 use tracing::{debug, info, warn};
 
-use self::history::History;
-pub(crate) use self::order::{Call, Given, Order, Successor};
+use self::history::SkillHistory;
+pub(crate) use self::order::{Given, Order, SkillCallRequest, Successor};
 use self::refused::{not_now, refusal, still_at_work, unknown_outcome};
 use self::work::{
-    Halting, Happened, RunFailure, Running, Started, Stop, Then, happens, outcome_of,
+    Halting, RunFailure, Running, Started, Stop, Then, WorkEvent, happens, outcome_of,
 };
-use crate::authority::{Authority, Owner};
-use crate::driver::{Driver, Line, Results, Signal, Work};
+use crate::authority::{Authority, SkillOwner};
+use crate::driver::{Driver, Line, RunResults, Signal, Work};
 use crate::driver_error::DriverError;
 use crate::parameters::Parameters;
-use crate::refusal::{Code, Refusal};
-use crate::shown::{LastCall, Observer, Outcome, Shown, Told, Transitioned};
-use crate::skill::{Facts, Pending, lock};
+use crate::refusal::{RefusalCode, SkillRefusal};
+use crate::shown::{LastCall, RunOutcome, SkillEvent, SkillObserver, SkillSnapshot, Transitioned};
+use crate::skill::{PendingParameters, SkillDescription, lock};
 
 pub(crate) struct Actor {
-    facts: Arc<Facts>,
+    facts: Arc<SkillDescription>,
     driver: Arc<dyn Driver>,
     /// Time limit of a run.
     timeout: Option<Duration>,
     successor: Arc<Mutex<Option<Successor>>>,
     authority: Authority,
-    pending: Arc<Mutex<Pending>>,
-    history: History,
-    observers: Vec<Box<dyn Observer>>,
-    program: Program,
-    shown: watch::Sender<Arc<Shown>>,
-    now: Shown,
+    pending: Arc<Mutex<PendingParameters>>,
+    history: SkillHistory,
+    observers: Vec<Box<dyn SkillObserver>>,
+    program: ProgramInstance,
+    shown: watch::Sender<Arc<SkillSnapshot>>,
+    now: SkillSnapshot,
     work: Option<Running>,
     /// Rate limit of log messages about refused calls, so that a client that retries in a loop
     /// cannot flood the log.
     refusals: LogLimit,
 }
 
-type Store = (Arc<Mutex<Pending>>, Arc<Mutex<VecDeque<Arc<Outcome>>>>);
+type Store = (
+    Arc<Mutex<PendingParameters>>,
+    Arc<Mutex<VecDeque<Arc<RunOutcome>>>>,
+);
 
 impl Actor {
     pub(crate) fn new(
-        (facts, driver): (Arc<Facts>, Arc<dyn Driver>),
+        (facts, driver): (Arc<SkillDescription>, Arc<dyn Driver>),
         authority: Authority,
         (pending, outcomes): Store,
-        (observers, first_run): (Vec<Box<dyn Observer>>, u32),
+        (observers, first_run): (Vec<Box<dyn SkillObserver>>, u32),
         successor: Arc<Mutex<Option<Successor>>>,
-    ) -> (Self, watch::Receiver<Arc<Shown>>) {
+    ) -> (Self, watch::Receiver<Arc<SkillSnapshot>>) {
         let nature = Nature {
             can_suspend: driver.can_suspend(),
             rests_in: facts.rests_in,
         };
-        let program = Program::counting_from(nature, first_run);
-        let now = Shown::first(&program, clock());
+        let program = ProgramInstance::counting_from(nature, first_run);
+        let now = SkillSnapshot::first(&program, clock());
         let (shown, watched) = watch::channel(Arc::new(now.clone()));
         let actor = Self {
             timeout: facts.timeout,
@@ -72,7 +77,7 @@ impl Actor {
             successor,
             authority,
             pending,
-            history: History::new(outcomes),
+            history: SkillHistory::new(outcomes),
             observers,
             program,
             shown,
@@ -87,7 +92,7 @@ impl Actor {
         loop {
             let happened = tokio::select! {
                 order = orders.recv() => match order {
-                    Some(Order::Call(call)) => Happened::Call(call),
+                    Some(Order::Call(call)) => WorkEvent::Call(call),
                     Some(Order::Close(closed)) => {
                         self.close().await;
                         // The caller of the close may not wait for the reply.
@@ -99,11 +104,11 @@ impl Actor {
                 happened = happens(&mut self.work) => happened,
             };
             match happened {
-                Happened::Call(call) => self.obey(call).await,
-                Happened::Line(line) => self.line(line),
-                Happened::Progress(done) => self.progress(done),
-                Happened::Ended(result) => self.settle(result),
-                Happened::Late => self.late().await,
+                WorkEvent::Call(call) => self.obey(call).await,
+                WorkEvent::Line(line) => self.line(line),
+                WorkEvent::Progress(done) => self.progress(done),
+                WorkEvent::Ended(result) => self.settle(result),
+                WorkEvent::Late => self.late().await,
             }
         }
         // All handles are dropped: the machine is stopped.
@@ -111,7 +116,7 @@ impl Actor {
     }
 
     async fn close(&mut self) {
-        if !self.program.is_executable(Method::Halt) {
+        if !self.program.is_executable(ProgramMethod::Halt) {
             return;
         }
         if let Err(refusal) = self.halt("the end of the component").await {
@@ -124,9 +129,9 @@ impl Actor {
         let ended = timeout(PENDING_AT_END, async {
             while self.work.is_some() {
                 match happens(&mut self.work).await {
-                    Happened::Line(line) => self.line(line),
-                    Happened::Ended(result) => self.settle(result),
-                    Happened::Call(_) | Happened::Progress(_) | Happened::Late => {}
+                    WorkEvent::Line(line) => self.line(line),
+                    WorkEvent::Ended(result) => self.settle(result),
+                    WorkEvent::Call(_) | WorkEvent::Progress(_) | WorkEvent::Late => {}
                 }
             }
         });
@@ -143,8 +148,8 @@ impl Actor {
         }
     }
 
-    async fn obey(&mut self, call: Call) {
-        let Call {
+    async fn obey(&mut self, call: SkillCallRequest) {
+        let SkillCallRequest {
             by,
             method,
             given,
@@ -158,7 +163,7 @@ impl Actor {
             at: clock(),
             refused: answer.as_ref().err().cloned(),
         });
-        self.tell(Told::Called);
+        self.tell(SkillEvent::Called);
         if let Err(refusal) = &answer
             && let Some(suppressed) = self.refusals.admit("", Instant::now().into_std())
         {
@@ -171,13 +176,18 @@ impl Actor {
         let _told = reply.send(answer);
     }
 
-    async fn call(&mut self, by: &Owner, method: Method, given: Given) -> Result<u32, Refusal> {
+    async fn call(
+        &mut self,
+        by: &SkillOwner,
+        method: ProgramMethod,
+        given: Given,
+    ) -> Result<u32, SkillRefusal> {
         self.authority.claim(by)?;
         // The state is checked before the capability: a skill without Suspend refuses it with
         // BadNotSupported only while it is Running.
-        let is_running = self.program.state() == State::Running;
-        let is_its_capability = method == Method::Suspend && is_running;
-        let is_made_ready = given.readies && self.program.state() == State::Halted;
+        let is_running = self.program.state() == ProgramMachineState::Running;
+        let is_its_capability = method == ProgramMethod::Suspend && is_running;
+        let is_made_ready = given.readies && self.program.state() == ProgramMachineState::Halted;
         if is_made_ready && self.now.needs_reset {
             return Err(unknown_outcome(self.now.run));
         }
@@ -185,18 +195,18 @@ impl Actor {
             return Err(not_now(method, self.program.state()));
         }
         match method {
-            Method::Start => self.start(by, given).await?,
-            Method::Halt => self.halt(&by.to_string()).await?,
-            Method::Reset => self.reset(by).await?,
-            Method::Suspend => {
-                self.take(Method::Suspend, &format!("suspended by {by}"))?;
+            ProgramMethod::Start => self.start(by, given).await?,
+            ProgramMethod::Halt => self.halt(&by.to_string()).await?,
+            ProgramMethod::Reset => self.reset(by).await?,
+            ProgramMethod::Suspend => {
+                self.take(ProgramMethod::Suspend, &format!("suspended by {by}"))?;
                 self.signal(Signal::StandStill);
                 if let Some(work) = &mut self.work {
                     work.suspend();
                 }
             }
-            Method::Resume => {
-                self.take(Method::Resume, &format!("resumed by {by}"))?;
+            ProgramMethod::Resume => {
+                self.take(ProgramMethod::Resume, &format!("resumed by {by}"))?;
                 self.signal(Signal::Go);
                 if let Some(result) = self.work.as_mut().and_then(Running::resume) {
                     self.settle(result);
@@ -206,8 +216,8 @@ impl Actor {
         Ok(self.now.run)
     }
 
-    async fn start(&mut self, by: &Owner, given: Given) -> Result<(), Refusal> {
-        let is_halted = self.program.state() == State::Halted;
+    async fn start(&mut self, by: &SkillOwner, given: Given) -> Result<(), SkillRefusal> {
+        let is_halted = self.program.state() == ProgramMachineState::Halted;
         if let Some(work) = &self.work
             && !(is_halted && work.task.is_finished())
         {
@@ -222,7 +232,7 @@ impl Actor {
         let parameters = Parameters::complete(&self.facts.parameters, prepared)?;
         self.driver
             .check(&parameters)
-            .map_err(|why| Refusal::new(Code::InvalidArgument, why.to_string()))?;
+            .map_err(|why| SkillRefusal::new(RefusalCode::InvalidArgument, why.to_string()))?;
         self.authority.begin(&self.facts.name)?;
         let begun = self.begin(by, is_halted).await;
         let (transition, run) = begun.inspect_err(|_| self.authority.end(&self.facts.name))?;
@@ -233,7 +243,7 @@ impl Actor {
         self.now.run = run.number();
         self.now.progress = 0.0;
         self.now.step.clear();
-        self.tell(Told::Parameters(&parameters));
+        self.tell(SkillEvent::Parameters(&parameters));
         self.transition(
             transition,
             format!("run {} is started by {by}", run.number()),
@@ -258,20 +268,23 @@ impl Actor {
     /// Performs the transition to Running, from Halted by way of Ready.
     async fn begin(
         &mut self,
-        by: &Owner,
+        by: &SkillOwner,
         is_halted: bool,
-    ) -> Result<(&'static Transition, RunId), Refusal> {
+    ) -> Result<(&'static Transition, RunId), SkillRefusal> {
         if is_halted {
             self.reset(by).await?;
         }
-        let transition = self.program.call(Method::Start).map_err(refusal)?;
+        let transition = self.program.call(ProgramMethod::Start).map_err(refusal)?;
         let run = self.program.run();
-        let run = run.ok_or_else(|| not_now(Method::Start, self.program.state()))?;
+        let run = run.ok_or_else(|| not_now(ProgramMethod::Start, self.program.state()))?;
         Ok((transition, run))
     }
 
-    async fn halt(&mut self, by: &str) -> Result<(), Refusal> {
-        let goes_on = matches!(self.program.state(), State::Running | State::Suspended);
+    async fn halt(&mut self, by: &str) -> Result<(), SkillRefusal> {
+        let goes_on = matches!(
+            self.program.state(),
+            ProgramMachineState::Running | ProgramMachineState::Suspended
+        );
         let mut message = format!("halted by {by}");
         if goes_on {
             if let Some(over) = self.is_halting() {
@@ -286,23 +299,25 @@ impl Actor {
                     self.await_end(message, Then::Halt);
                     return Ok(());
                 }
-                Stop::Refused(why) => return Err(Refusal::new(Code::RequestNotAllowed, why)),
+                Stop::Refused(why) => {
+                    return Err(SkillRefusal::new(RefusalCode::RequestNotAllowed, why));
+                }
                 // The work finished before it could be stopped.
-                Stop::Done(result) if self.program.state() == State::Running => {
+                Stop::Done(result) if self.program.state() == ProgramMachineState::Running => {
                     self.settle(Ok(result))
                 }
                 Stop::Done(_) | Stop::Stopped => {}
                 Stop::BrokenOff(how) => message = format!("{message}; {how}"),
             }
-            if self.program.state() != State::Ready {
+            if self.program.state() != ProgramMachineState::Ready {
                 self.end_without_work(message.clone());
             }
         }
-        self.take(Method::Halt, &message)
+        self.take(ProgramMethod::Halt, &message)
     }
 
-    async fn reset(&mut self, by: &Owner) -> Result<(), Refusal> {
-        if self.program.state() == State::Suspended {
+    async fn reset(&mut self, by: &SkillOwner) -> Result<(), SkillRefusal> {
+        if self.program.state() == ProgramMachineState::Suspended {
             // Cancels the suspended work.
             let mut message = format!("reset by {by} while it was suspended");
             if let Stop::BrokenOff(how) = self.stop_work().await {
@@ -311,7 +326,7 @@ impl Actor {
             if self.work.is_none() {
                 self.end_without_work(message.clone());
                 if self.now.needs_reset {
-                    self.take(Method::Halt, &message)?;
+                    self.take(ProgramMethod::Halt, &message)?;
                     return Err(unknown_outcome(self.now.run));
                 }
             }
@@ -322,7 +337,7 @@ impl Actor {
             }
             self.work = None;
         }
-        self.take(Method::Reset, &format!("reset by {by}"))
+        self.take(ProgramMethod::Reset, &format!("reset by {by}"))
     }
 
     /// Handles a run that exceeded its time limit.
@@ -396,12 +411,12 @@ impl Actor {
             };
             let happened = tokio::select! {
                 biased;
-                Some(line) = work.reins.steps.recv() => Happened::Line(line),
-                ended = &mut work.task => Happened::Ended(outcome_of(ended, &mut work.unknown)),
+                Some(line) = work.reins.steps.recv() => WorkEvent::Line(line),
+                ended = &mut work.task => WorkEvent::Ended(outcome_of(ended, &mut work.unknown)),
                 () = sleep_until(until) => return Stop::Pending,
             };
             match happened {
-                Happened::Line(line) => {
+                WorkEvent::Line(line) => {
                     let refused = match &line {
                         Line::Refused(why) => Some(why.clone()),
                         Line::Step(_) | Line::Note(_) | Line::Pending(_) | Line::Unknown(_) => None,
@@ -411,7 +426,7 @@ impl Actor {
                         return Stop::Refused(why);
                     }
                 }
-                Happened::Ended(ended) => {
+                WorkEvent::Ended(ended) => {
                     self.end_stopped();
                     return match ended {
                         Ok(results) => Stop::Done(results),
@@ -419,7 +434,7 @@ impl Actor {
                         Err(why) => Stop::BrokenOff(why.to_string()),
                     };
                 }
-                Happened::Call(_) | Happened::Progress(_) | Happened::Late => {}
+                WorkEvent::Call(_) | WorkEvent::Progress(_) | WorkEvent::Late => {}
             }
         }
     }
@@ -465,7 +480,7 @@ impl Actor {
         warn!(skill = self.facts.name, run = self.now.run, "{message}");
         self.now.needs_reset = true;
         self.end_without_work(message.clone());
-        if let Err(refusal) = self.take(Method::Halt, &message) {
+        if let Err(refusal) = self.take(ProgramMethod::Halt, &message) {
             warn!(skill = self.facts.name, "{refusal}");
         }
     }
@@ -474,18 +489,18 @@ impl Actor {
     fn pends(&mut self, why: String) {
         self.now.step.clone_from(&why);
         self.now.pending = Some(why.clone());
-        self.tell(Told::Pending(&why));
+        self.tell(SkillEvent::Pending(&why));
     }
 
     /// Handles the end of the work of a run that was asked to stop.
-    fn settle_halted(&mut self, halting: Halting, result: Result<Results, RunFailure>) {
+    fn settle_halted(&mut self, halting: Halting, result: Result<RunResults, RunFailure>) {
         let Halting { message, then, .. } = halting;
         match (result, then) {
             (Ok(results), then) => {
                 self.finish(Ok(results));
                 if then == Then::Halt
-                    && self.program.state() == State::Ready
-                    && let Err(refusal) = self.take(Method::Halt, &message)
+                    && self.program.state() == ProgramMachineState::Ready
+                    && let Err(refusal) = self.take(ProgramMethod::Halt, &message)
                 {
                     warn!(skill = self.facts.name, "{refusal}");
                 }
@@ -496,7 +511,7 @@ impl Actor {
                 self.take_steps();
                 self.work = None;
                 self.end_without_work(message.clone());
-                if let Err(refusal) = self.take(Method::Halt, &message) {
+                if let Err(refusal) = self.take(ProgramMethod::Halt, &message) {
                     warn!(skill = self.facts.name, "{refusal}");
                 }
             }
@@ -504,7 +519,7 @@ impl Actor {
     }
 
     /// Handles the end of work that was not asked to stop.
-    fn settle(&mut self, result: Result<Results, RunFailure>) {
+    fn settle(&mut self, result: Result<RunResults, RunFailure>) {
         self.take_steps();
         let work = self.work.as_mut();
         if work.as_ref().is_some_and(|work| work.unknown.is_some()) {
@@ -514,18 +529,20 @@ impl Actor {
             return self.settle_halted(halting, result);
         }
         match (self.program.state(), &result) {
-            (State::Running, _) | (State::Suspended, Err(_)) => self.finish(result),
-            (State::Suspended, Ok(_)) => {
+            (ProgramMachineState::Running, _) | (ProgramMachineState::Suspended, Err(_)) => {
+                self.finish(result)
+            }
+            (ProgramMachineState::Suspended, Ok(_)) => {
                 if let Some(work) = &mut self.work {
                     work.ended = Some(result);
                 }
             }
             // The run was halted, but its task could not be aborted then.
-            (State::Halted | State::Ready, _) => self.work = None,
+            (ProgramMachineState::Halted | ProgramMachineState::Ready, _) => self.work = None,
         }
     }
 
-    fn finish(&mut self, result: Result<Results, RunFailure>) {
+    fn finish(&mut self, result: Result<RunResults, RunFailure>) {
         self.work = None;
         let Some(run) = self.program.run() else {
             return;
@@ -542,7 +559,7 @@ impl Actor {
         if result.is_ok() {
             self.now.progress = 1.0;
         }
-        let outcome = Outcome {
+        let outcome = RunOutcome {
             run: run.number(),
             succeeded: result.is_ok(),
             unknown: result.is_err() && self.now.needs_reset,
@@ -576,7 +593,7 @@ impl Actor {
         let Some(run) = self.program.run() else {
             return;
         };
-        let outcome = Outcome {
+        let outcome = RunOutcome {
             run: run.number(),
             succeeded: false,
             unknown: self.now.needs_reset,
@@ -587,13 +604,13 @@ impl Actor {
         self.keep(outcome);
     }
 
-    fn keep(&mut self, outcome: Outcome) {
+    fn keep(&mut self, outcome: RunOutcome) {
         let outcome = self.history.keep(outcome);
         self.now.outcome = Some(Arc::clone(&outcome));
-        self.tell(Told::Outcome(&outcome));
+        self.tell(SkillEvent::Outcome(&outcome));
     }
 
-    fn take(&mut self, method: Method, message: &str) -> Result<(), Refusal> {
+    fn take(&mut self, method: ProgramMethod, message: &str) -> Result<(), SkillRefusal> {
         let transition = self.program.call(method).map_err(refusal)?;
         self.transition(transition, message.to_owned());
         Ok(())
@@ -604,21 +621,28 @@ impl Actor {
         self.now.state = transition.to;
         self.now.last = Some(transition);
         self.now.since = at;
-        self.now.executable = Method::ALL.map(|method| self.program.is_executable(method));
-        if matches!(transition.to, State::Halted | State::Ready) {
+        self.now.executable = ProgramMethod::ALL.map(|method| self.program.is_executable(method));
+        if matches!(
+            transition.to,
+            ProgramMachineState::Halted | ProgramMachineState::Ready
+        ) {
             self.now.step.clear();
             self.now.pending = None;
         }
-        if transition.to == State::Ready {
+        if transition.to == ProgramMachineState::Ready {
             self.now.needs_reset = false;
         }
-        if matches!(transition.from, State::Running | State::Suspended)
-            && !matches!(transition.to, State::Running | State::Suspended)
-        {
+        if matches!(
+            transition.from,
+            ProgramMachineState::Running | ProgramMachineState::Suspended
+        ) && !matches!(
+            transition.to,
+            ProgramMachineState::Running | ProgramMachineState::Suspended
+        ) {
             self.authority.end(&self.facts.name);
         }
         debug!(skill = self.facts.name, "{}: {message}", transition.name);
-        self.tell(Told::Transition(&Transitioned {
+        self.tell(SkillEvent::Transition(&Transitioned {
             transition,
             run: self.now.run,
             message,
@@ -633,7 +657,7 @@ impl Actor {
         match line {
             Line::Step(step) => {
                 self.now.step = step;
-                self.tell(Told::Step);
+                self.tell(SkillEvent::Step);
             }
             Line::Note(_) => {}
             Line::Pending(why) => self.pends(why),
@@ -657,7 +681,7 @@ impl Actor {
 
     fn progress(&mut self, done: f32) {
         self.now.progress = done;
-        self.tell(Told::Progress);
+        self.tell(SkillEvent::Progress);
     }
 
     /// Processes steps that were reported before the work ended.
@@ -673,7 +697,7 @@ impl Actor {
         }
     }
 
-    fn tell(&self, what: Told<'_>) {
+    fn tell(&self, what: SkillEvent<'_>) {
         for observer in &self.observers {
             observer.told(what, &self.now);
         }

@@ -8,11 +8,11 @@ use program::Lease;
 use tokio::sync::watch;
 use tokio::time::Instant;
 
-use crate::refusal::{Code, Refusal};
+use crate::refusal::{RefusalCode, SkillRefusal};
 
 /// A client that writes parameters and calls methods.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
-pub enum Owner {
+pub enum SkillOwner {
     /// A session of the OPC UA server, by the server's number of the session. It holds the lease
     /// until it closes or is idle for the lease time.
     Session(u32),
@@ -22,7 +22,7 @@ pub enum Owner {
     Local(&'static str),
 }
 
-impl fmt::Display for Owner {
+impl fmt::Display for SkillOwner {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Session(number) => write!(f, "session {number}"),
@@ -36,12 +36,12 @@ impl fmt::Display for Owner {
 #[derive(Debug, Clone)]
 pub struct Authority {
     inner: Arc<Mutex<Inner>>,
-    holder: watch::Sender<Option<Owner>>,
+    holder: watch::Sender<Option<SkillOwner>>,
 }
 
 #[derive(Debug)]
 struct Inner {
-    lease: Lease<Owner>,
+    lease: Lease<SkillOwner>,
     /// The name of the running skill.
     running: Option<String>,
     /// Time of the holder's last action or of the end of the last run.
@@ -71,7 +71,7 @@ impl Authority {
     ///
     /// # Errors
     /// BadLocked if another owner holds the lease.
-    pub fn claim(&self, by: &Owner) -> Result<(), Refusal> {
+    pub fn claim(&self, by: &SkillOwner) -> Result<(), SkillRefusal> {
         let mut inner = self.lock();
         inner
             .lease
@@ -86,7 +86,7 @@ impl Authority {
     ///
     /// # Errors
     /// BadLocked if another owner holds the lease.
-    pub fn lock_for(&self, by: &Owner) -> Result<(), Refusal> {
+    pub fn lock_for(&self, by: &SkillOwner) -> Result<(), SkillRefusal> {
         self.claim(by)?;
         self.lock().locked = true;
         Ok(())
@@ -102,13 +102,13 @@ impl Authority {
 
     /// Releases the lease of a session that has been idle for `idle`, unless the lease is locked.
     /// Returns the previous holder.
-    pub fn release_idle(&self, idle: Duration, now: Instant) -> Option<Owner> {
+    pub fn release_idle(&self, idle: Duration, now: Instant) -> Option<SkillOwner> {
         let mut inner = self.lock();
         let since = now.saturating_duration_since(inner.used);
         let is_idle = inner.running.is_none() && !inner.locked && since >= idle;
         let holder = inner.lease.holder().filter(|holder| {
             // Other owners release the lease at the end of their run.
-            is_idle && matches!(holder, Owner::Session(_))
+            is_idle && matches!(holder, SkillOwner::Session(_))
         });
         let holder = holder.cloned()?;
         inner.lease.release(&holder);
@@ -120,7 +120,7 @@ impl Authority {
     ///
     /// # Errors
     /// BadLocked if another owner holds the lease.
-    pub fn allows(&self, by: &Owner) -> Result<(), Refusal> {
+    pub fn allows(&self, by: &SkillOwner) -> Result<(), SkillRefusal> {
         match self.lock().lease.holder() {
             Some(holder) if holder != by => Err(locked(holder)),
             Some(_) | None => Ok(()),
@@ -128,7 +128,7 @@ impl Authority {
     }
 
     /// Releases the lease, for example when a session closes. A run in progress continues.
-    pub fn release(&self, by: &Owner) {
+    pub fn release(&self, by: &SkillOwner) {
         let mut inner = self.lock();
         if inner.lease.release(by) {
             inner.locked = false;
@@ -145,7 +145,7 @@ impl Authority {
         let passing = inner
             .lease
             .holder()
-            .filter(|holder| !matches!(holder, Owner::Session(_)))
+            .filter(|holder| !matches!(holder, SkillOwner::Session(_)))
             .cloned();
         if let Some(holder) = passing {
             inner.lease.release(&holder);
@@ -155,7 +155,7 @@ impl Authority {
 
     /// Returns the holder of the lease and its changes.
     #[must_use]
-    pub fn holder(&self) -> watch::Receiver<Option<Owner>> {
+    pub fn holder(&self) -> watch::Receiver<Option<SkillOwner>> {
         self.holder.subscribe()
     }
 
@@ -163,11 +163,11 @@ impl Authority {
     ///
     /// # Errors
     /// BadInvalidState while another skill of the component runs.
-    pub(crate) fn begin(&self, skill: &str) -> Result<(), Refusal> {
+    pub(crate) fn begin(&self, skill: &str) -> Result<(), SkillRefusal> {
         let mut inner = self.lock();
         if let Some(running) = &inner.running {
             let text = format!("{running} of this component runs, and it does one thing at a time");
-            return Err(Refusal::new(Code::InvalidState, text));
+            return Err(SkillRefusal::new(RefusalCode::InvalidState, text));
         }
         inner.running = Some(skill.to_owned());
         Ok(())
@@ -213,9 +213,9 @@ impl Authority {
     }
 }
 
-fn locked(holder: &Owner) -> Refusal {
+fn locked(holder: &SkillOwner) -> SkillRefusal {
     let text = format!("{holder} has the lease of this component");
-    Refusal::new(Code::Locked, text)
+    SkillRefusal::new(RefusalCode::Locked, text)
 }
 
 impl Default for Authority {
@@ -229,8 +229,8 @@ mod tests {
     use super::*;
 
     const IDLE: Duration = Duration::from_secs(60);
-    const ME: Owner = Owner::Session(1);
-    const OTHER: Owner = Owner::Session(2);
+    const ME: SkillOwner = SkillOwner::Session(1);
+    const OTHER: SkillOwner = SkillOwner::Session(2);
 
     #[test]
     fn a_lease_that_is_not_used_is_free_after_a_while_and_not_before() {
@@ -241,7 +241,10 @@ mod tests {
         };
         authority.claim(&ME).unwrap();
         assert_eq!(after(59), None);
-        assert_eq!(authority.claim(&OTHER).unwrap_err().code, Code::Locked);
+        assert_eq!(
+            authority.claim(&OTHER).unwrap_err().code,
+            RefusalCode::Locked
+        );
         authority.begin("Grasp").unwrap();
         assert_eq!(after(600), None, "a run goes on");
         authority.end("Grasp");
@@ -253,7 +256,7 @@ mod tests {
         authority.release(&OTHER);
         authority.claim(&OTHER).unwrap();
         assert_eq!(after(61), Some(OTHER), "the lock has ended");
-        authority.claim(&Owner::Local("mes")).unwrap();
+        authority.claim(&SkillOwner::Local("mes")).unwrap();
         assert_eq!(after(600), None, "not a session's");
     }
     #[test]
@@ -267,6 +270,6 @@ mod tests {
         authority.end("Grasp");
         assert!(authority.reserve());
         let refused = authority.begin("Grasp").unwrap_err();
-        assert_eq!(refused.code, Code::InvalidState, "{refused}");
+        assert_eq!(refused.code, RefusalCode::InvalidState, "{refused}");
     }
 }

@@ -3,7 +3,7 @@
 
 /// A candidate for a part of the work.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Candidate<T> {
+pub struct SkillCandidate<T> {
     /// The component or skill.
     pub of: T,
     /// Its name in the reasons for the others.
@@ -11,13 +11,13 @@ pub struct Candidate<T> {
     /// Whether it can do the work, or the reason why it cannot.
     pub fits: Result<(), String>,
     /// Its rank among the candidates that fit.
-    pub rank: Rank,
+    pub rank: CandidateRank,
 }
 
 /// The rank of a candidate: of those that fit, the least is chosen. The fields are compared in
 /// their order.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Default)]
-pub struct Rank {
+pub struct CandidateRank {
     /// What it is attached to.
     pub attachment: Attachment,
     /// Its place in the list of preferred components; the length of the list if it is not there.
@@ -54,7 +54,7 @@ impl Attachment {
 
 /// A chosen candidate, and the reasons.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Choice<T> {
+pub struct SkillChoice<T> {
     /// The chosen candidate.
     pub chosen: T,
     /// The reason for the choice.
@@ -72,7 +72,7 @@ pub enum NoChoice<T> {
     Equal(Vec<T>),
 }
 
-impl Rank {
+impl CandidateRank {
     /// Returns the place of a component in the list of preferred components.
     #[must_use]
     pub fn preference(prefer: &[String], component: &str) -> usize {
@@ -115,7 +115,7 @@ impl Rank {
 ///
 /// # Errors
 /// No candidate fits, or the least rank is that of several.
-pub fn choose<T>(candidates: Vec<Candidate<T>>) -> Result<Choice<T>, NoChoice<T>> {
+pub fn choose<T>(candidates: Vec<SkillCandidate<T>>) -> Result<SkillChoice<T>, NoChoice<T>> {
     let mut fitting = Vec::new();
     let mut others = Vec::new();
     for candidate in candidates {
@@ -146,7 +146,7 @@ pub fn choose<T>(candidates: Vec<Candidate<T>>) -> Result<Choice<T>, NoChoice<T>
     };
     let passed = behind.into_iter();
     others.extend(passed.map(|(other, _, of)| (of, other.why_not((&name, &rank)))));
-    Ok(Choice {
+    Ok(SkillChoice {
         chosen,
         reason,
         others,
@@ -157,8 +157,8 @@ pub fn choose<T>(candidates: Vec<Candidate<T>>) -> Result<Choice<T>, NoChoice<T>
 mod tests {
     use super::*;
 
-    fn candidate(name: &'static str, rank: Rank) -> Candidate<&'static str> {
-        Candidate {
+    fn candidate(name: &'static str, rank: CandidateRank) -> SkillCandidate<&'static str> {
+        SkillCandidate {
             of: name,
             name: name.to_owned(),
             fits: Ok(()),
@@ -166,21 +166,21 @@ mod tests {
         }
     }
 
-    fn ranked(attachment: Attachment, preference: usize) -> Rank {
-        Rank {
+    fn ranked(attachment: Attachment, preference: usize) -> CandidateRank {
+        CandidateRank {
             attachment,
             preference,
-            ..Rank::default()
+            ..CandidateRank::default()
         }
     }
 
     #[test]
     fn what_is_attached_comes_before_the_rules_and_each_other_candidate_gets_a_reason() {
         let prefer = ["b".to_owned(), "a".to_owned()];
-        let rank = |attachment, name| ranked(attachment, Rank::preference(&prefer, name));
-        let far = Candidate {
+        let rank = |attachment, name| ranked(attachment, CandidateRank::preference(&prefer, name));
+        let far = SkillCandidate {
             fits: Err("it reaches 0.3 m".to_owned()),
-            ..candidate("far", Rank::default())
+            ..candidate("far", CandidateRank::default())
         };
         let all = vec![
             far.clone(),
@@ -217,11 +217,11 @@ mod tests {
 
     #[test]
     fn the_exact_the_older_and_the_first_are_better() {
-        let rank = |inexact, since_ms, name: &str| Rank {
+        let rank = |inexact, since_ms, name: &str| CandidateRank {
             inexact,
             since_ms,
             name: name.to_owned(),
-            ..Rank::default()
+            ..CandidateRank::default()
         };
         let best = rank(0, 5, "b");
         for (other, advantage) in [

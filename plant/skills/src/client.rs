@@ -37,7 +37,7 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use plant_opcua::client::{
-    CallError, Client, ClientConfig, ClientError, ClientUser, Link, SecurityChoice,
+    CallError, ClientConfig, ClientError, ClientUser, Link, OpcUaClient, SecurityChoice,
 };
 use plant_opcua::types::StatusCode;
 
@@ -45,7 +45,7 @@ pub use choice::{Chosen, Needs, ToolState};
 pub use detector::{Detected, Detector};
 pub use find::{FoundParameter, FoundSkill, FoundType};
 pub use handle::{RemoteState, SkillHandle};
-pub use mirror::{Mirror, Mirrors, Watchable};
+pub use mirror::{MirroredSkill, Mirrors, Watchable};
 pub use partner_error::{
     FailedLocator, LocatorError, NotLocated, PartnerError, Unchosen, UnfitGrasp,
 };
@@ -54,7 +54,7 @@ pub use remote::Remote;
 pub use states::SkillStates;
 pub use stations::StationChanges;
 
-use crate::parameters::TypeName;
+use crate::parameters::ParameterType;
 use crate::runs::SkillFault;
 
 /// Identity and settings of a client.
@@ -94,7 +94,7 @@ impl Default for ClientOptions {
 /// running skills, and close the connection that runs skills when it is done.
 #[derive(Clone)]
 pub struct SkillClient {
-    client: Client,
+    client: OpcUaClient,
     endpoint: String,
     /// The ApplicationUri of the component behind a station to which the client is restricted.
     behind: Option<String>,
@@ -119,7 +119,7 @@ impl SkillClient {
             Some((url, uri)) => (url, Some(uri.to_owned())),
             None => (endpoint, None),
         };
-        let client = Client::open(config, url);
+        let client = OpcUaClient::open(config, url);
         connected(&client, options).await?;
         Ok(Self {
             client,
@@ -131,7 +131,7 @@ impl SkillClient {
     /// Uses an existing client and shares its connection. Dropping the result keeps the connection
     /// open; [`close`](Self::close) closes it for all clones.
     #[must_use]
-    pub fn over(client: &Client, endpoint: &str) -> Self {
+    pub fn over(client: &OpcUaClient, endpoint: &str) -> Self {
         Self {
             client: client.clone(),
             endpoint: endpoint.to_owned(),
@@ -167,7 +167,7 @@ impl SkillClient {
     /// # Errors
     /// No response.
     pub async fn skills(&self) -> Result<Vec<FoundSkill>, SkillFault> {
-        self.skills_of(&TypeName::own(crate::model::SKILL_TYPE))
+        self.skills_of(&ParameterType::own(crate::model::SKILL_TYPE))
             .await
     }
 
@@ -194,7 +194,7 @@ impl SkillClient {
     ///
     /// # Errors
     /// No response.
-    pub async fn skills_of(&self, wanted: &TypeName) -> Result<Vec<FoundSkill>, SkillFault> {
+    pub async fn skills_of(&self, wanted: &ParameterType) -> Result<Vec<FoundSkill>, SkillFault> {
         let found = find::skills(&self.client, wanted).await?;
         Ok(self.of_component(found))
     }
@@ -233,7 +233,7 @@ impl SkillClient {
 
 /// Waits for the first connection. A refused certificate is reported at once, because it stays
 /// refused until an operator trusts it.
-async fn connected(client: &Client, options: &ClientOptions) -> Result<(), SkillFault> {
+async fn connected(client: &OpcUaClient, options: &ClientOptions) -> Result<(), SkillFault> {
     let mut link = client.link();
     let refused = async {
         while let Ok(()) = link.changed().await {

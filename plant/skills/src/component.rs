@@ -16,14 +16,14 @@ use std::time::Duration;
 
 use plant_opcua::client::ClientUser;
 use plant_opcua::limits::ClientLimits;
-use plant_opcua::users::{Role, Roles};
+use plant_opcua::users::{Roles, UserRole};
 
-pub use changes::{Change, ChangeKind, Takes};
+pub use changes::{ChangeKind, Takes, YamlChange};
 pub(crate) use device::DeviceSensor;
 pub use device::{Device, DeviceKinds, NoDevices, measure_device};
 pub use document::{read_partner, read_user};
 pub use drivers::{DriverFault, Drivers};
-pub use space::{Asked, Form, Part, Source, SpaceWork};
+pub use space::{Form, RequestKind, SpaceFieldSource, SpaceWork, ValuePart};
 
 pub use values::{ExecSource, MOST_VALUES, SensorRead, TopicSource, ValueSetup, ValueSource};
 pub use world::{World, WorldObject, read_numbers, read_shape};
@@ -31,8 +31,8 @@ pub use world::{World, WorldObject, read_numbers, read_shape};
 use crate::configuration::Configurable;
 use crate::driver::Driver;
 use crate::grip::GripPoint;
-use crate::parameters::TypeName;
-use crate::workspace::Workspace;
+use crate::parameters::ParameterType;
+use crate::workspace::RobotWorkspace;
 use crate::yaml::Place;
 
 /// A component, read from YAML or created by a program.
@@ -47,7 +47,7 @@ pub struct Component {
     /// The URL of the endpoint; port 0 selects a free port.
     pub endpoint: String,
     /// The security policies that clients can choose.
-    pub security: Vec<Security>,
+    pub security: Vec<ComponentSecurity>,
     /// NodeSet files with additional types.
     pub nodesets: Vec<PathBuf>,
     /// The discovery server at which the component registers.
@@ -71,7 +71,7 @@ pub struct Component {
     /// The objects of the cell by their ObjectIds, for composites.
     pub world: World,
     /// The positions that its moves reach; `None` for no limits.
-    pub workspace: Option<Arc<Workspace>>,
+    pub workspace: Option<Arc<RobotWorkspace>>,
     /// The values that it shows beside its skills.
     pub values: Vec<ValueSetup>,
     /// The fields of its configuration.
@@ -101,7 +101,7 @@ pub struct Robot {
 
 /// A security policy.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Security {
+pub enum ComponentSecurity {
     /// No signing and no encryption.
     None,
     /// Signing and encryption.
@@ -154,7 +154,7 @@ pub struct SkillSetup {
     /// The name of the skill in its component.
     pub name: String,
     /// The type of the skill.
-    pub skill_type: TypeName,
+    pub skill_type: ParameterType,
     /// The driver that does the work.
     pub driver: DriverSetup,
     /// The IRIs of the capabilities it provides.
@@ -280,7 +280,7 @@ impl Component {
 /// Returns the default roles of anonymous users: they may run skills while they hold the lease.
 #[must_use]
 pub fn anonymous_by_default() -> Roles {
-    Roles::of(&[Role::Observer, Role::Operator])
+    Roles::of(&[UserRole::Observer, UserRole::Operator])
 }
 
 /// Default idle time after which the lease of a session is released.

@@ -7,26 +7,26 @@ use std::time::Duration;
 use async_trait::async_trait;
 use tracing::{debug, warn};
 
-use crate::driver::{Driver, Results, Work};
+use crate::driver::{Driver, RunResults, Work};
 use crate::driver_error::{DriverError, InvalidParameter};
 use crate::frame::Frame;
 use crate::grip::{Hold, PartShape};
 use crate::parameters::Parameters;
 use crate::part::{PartEnd, run_part};
-use crate::runs::{COMPOSITE_HALT_TIMEOUT, Runs, SkillFault};
-use crate::value::Value;
+use crate::runs::{COMPOSITE_HALT_TIMEOUT, RunnableSkill, SkillFault};
+use crate::value::SkillValue;
 
 /// Skills of other components that together move an object from one pose to another.
 #[derive(Clone)]
 pub struct PickAndPlace {
     /// PtpMoveSkillType of the robot.
-    pub ptp: Arc<dyn Runs>,
+    pub ptp: Arc<dyn RunnableSkill>,
     /// LinearMoveSkillType of the same robot.
-    pub linear: Arc<dyn Runs>,
+    pub linear: Arc<dyn RunnableSkill>,
     /// GraspSkillType of the gripper.
-    pub grasp: Arc<dyn Runs>,
+    pub grasp: Arc<dyn RunnableSkill>,
     /// ReleaseSkillType of the same gripper.
-    pub release: Arc<dyn Runs>,
+    pub release: Arc<dyn RunnableSkill>,
     /// The tool plate of the gripper in the frame of the flange, for example behind a tool changer.
     pub plate: Frame,
     /// Time limit of each run.
@@ -66,7 +66,7 @@ pub struct Broken {
 
 /// Receives the steps of a job, and can stop it.
 #[async_trait]
-pub trait Teller: Send + Sync {
+pub trait JobObserver: Send + Sync {
     /// Reports the start of a step.
     async fn step(&self, step: &'static str);
 
@@ -92,7 +92,7 @@ pub trait Teller: Send + Sync {
 }
 
 #[async_trait]
-impl Teller for Work {
+impl JobObserver for Work {
     async fn step(&self, step: &'static str) {
         Self::step(self, step).await;
     }
@@ -115,19 +115,19 @@ impl Teller for Work {
 }
 
 #[async_trait]
-impl<F: Fn(&'static str) + Send + Sync> Teller for F {
+impl<F: Fn(&'static str) + Send + Sync> JobObserver for F {
     async fn step(&self, step: &'static str) {
         self(step);
     }
 }
 
 /// A retreat move: its name, the skill and the target pose.
-type Retreat<'s> = (&'static str, &'s Arc<dyn Runs>, [f64; 6]);
+type Retreat<'s> = (&'static str, &'s Arc<dyn RunnableSkill>, [f64; 6]);
 
 /// A step: its name, the skill, the target pose of a move, and the retreat from there.
 type Step<'s> = (
     &'static str,
-    &'s Arc<dyn Runs>,
+    &'s Arc<dyn RunnableSkill>,
     Option<[f64; 6]>,
     Retreat<'s>,
 );
@@ -159,7 +159,7 @@ impl PickAndPlace {
     ///
     /// # Errors
     /// [`Broken`].
-    pub async fn run(&self, job: &Job, teller: &dyn Teller) -> Result<(), Broken> {
+    pub async fn run(&self, job: &Job, teller: &dyn JobObserver) -> Result<(), Broken> {
         teller.step(INIT).await;
         let grip = self.grasp.grip_point();
         let hold = Hold::new(grip.as_ref(), &self.plate, job.shape.as_ref()).map_err(|why| {
@@ -231,9 +231,9 @@ impl PickAndPlace {
 
     async fn part(
         &self,
-        skill: &Arc<dyn Runs>,
+        skill: &Arc<dyn RunnableSkill>,
         target: Option<[f64; 6]>,
-        teller: &dyn Teller,
+        teller: &dyn JobObserver,
     ) -> Result<(), Fault> {
         let interrupted = async {
             tokio::select! {
@@ -259,7 +259,7 @@ impl PickAndPlace {
     async fn retreat(
         &self,
         (step, skill, to): Retreat<'_>,
-        teller: &dyn Teller,
+        teller: &dyn JobObserver,
     ) -> Result<(), String> {
         teller.step(step).await;
         let ran = run(&**skill, Some(to), self.within, teller, teller.stopped());
@@ -281,13 +281,13 @@ enum Ran<T> {
 }
 
 async fn run<T>(
-    skill: &dyn Runs,
+    skill: &dyn RunnableSkill,
     target: Option<[f64; 6]>,
     within: Duration,
-    teller: &dyn Teller,
+    teller: &dyn JobObserver,
     interrupted: impl Future<Output = T> + Send,
 ) -> Result<(), Ran<T>> {
-    let parameters = target.map(|target| ("TargetPosition".to_owned(), Value::from(target)));
+    let parameters = target.map(|target| ("TargetPosition".to_owned(), SkillValue::from(target)));
     let parameters = parameters.into_iter().collect();
     let name = skill.name();
     let ran = match run_part(skill, parameters, within, teller, interrupted).await {
@@ -318,7 +318,7 @@ const INIT: &str = "Init";
 /// Why a robot that was told to stop has not retreated.
 const HALTED: &str = "it was halted, and stands still";
 
-fn lost(skill: &dyn Runs, why: &str) -> String {
+fn lost(skill: &dyn RunnableSkill, why: &str) -> String {
     format!("{} is lost: {why}", skill.name())
 }
 
@@ -333,7 +333,7 @@ impl Driver for PickAndPlace {
         job(parameters).map(drop)
     }
 
-    async fn run(&self, work: Work) -> Result<Results, DriverError> {
+    async fn run(&self, work: Work) -> Result<RunResults, DriverError> {
         let job = job(work.parameters())?;
         Self::run(self, &job, &work).await?;
         Ok(Vec::new())
@@ -363,14 +363,14 @@ mod tests {
     use tokio::sync::watch;
 
     use super::*;
-    use crate::authority::{Authority, Owner};
+    use crate::authority::{Authority, SkillOwner};
     use crate::conformance;
     use crate::model;
-    use crate::parameters::TypeName;
+    use crate::parameters::ParameterType;
     use crate::runs::LocalRun;
-    use crate::shown::Outcome;
+    use crate::shown::RunOutcome;
     use crate::simulated::{Arm, ArmSettings, Gripper, GripperSettings, Path};
-    use crate::skill::{Facts, Skill, lock};
+    use crate::skill::{Skill, SkillDescription, lock};
 
     const PICK: [f64; 6] = [0.4, 0.2, 0.1, 0.0, 0.0, 0.0];
     const PLACE: [f64; 6] = [0.4, -0.2, 0.1, 0.0, 0.0, 0.0];
@@ -388,16 +388,16 @@ mod tests {
     }
 
     #[async_trait]
-    impl Runs for Losable {
+    impl RunnableSkill for Losable {
         fn name(&self) -> String {
             self.inner.name()
         }
 
         async fn run(
             &self,
-            parameters: Vec<(String, Value)>,
+            parameters: Vec<(String, SkillValue)>,
             within: Duration,
-        ) -> Result<Outcome, SkillFault> {
+        ) -> Result<RunOutcome, SkillFault> {
             if *self.gone.borrow() {
                 return Err(SkillFault::Lost("no answer".to_owned()));
             }
@@ -425,9 +425,9 @@ mod tests {
 
     fn skill(name: &str, driver: Arc<dyn Driver>, authority: &Authority) -> LocalRun {
         let of = model::find(name).unwrap();
-        let facts = Facts {
+        let facts = SkillDescription {
             name: name.trim_end_matches("SkillType").to_owned(),
-            types: vec![TypeName::own(name)],
+            types: vec![ParameterType::own(name)],
             parameters: of.parameters(),
             results: of.results(),
             capabilities: Vec::new(),
@@ -437,7 +437,7 @@ mod tests {
         let skill = Skill::spawn(facts, driver, authority.clone(), Vec::new());
         LocalRun {
             skill,
-            by: Owner::Local("composite"),
+            by: SkillOwner::Local("composite"),
         }
     }
 
@@ -555,7 +555,7 @@ mod tests {
     #[tokio::test]
     async fn as_a_driver_it_hears_halt_and_the_robot_stands_still() {
         let cell = cell(true);
-        let parameters: Vec<(String, Value)> = vec![
+        let parameters: Vec<(String, SkillValue)> = vec![
             ("PickPosition".to_owned(), PICK.into()),
             ("PlacePosition".to_owned(), PLACE.into()),
         ];

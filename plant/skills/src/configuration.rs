@@ -13,12 +13,12 @@ use async_trait::async_trait;
 use serde_json::Value as Json;
 use tokio::sync::watch;
 
-use crate::driver::{Driver, Results, Work};
+use crate::driver::{Driver, RunResults, Work};
 use crate::driver_error::{DriverError, InvalidParameter};
-use crate::parameters::{Parameter, Parameters, shortened};
-use crate::value::Value;
+use crate::parameters::{Parameters, SkillParameter, shortened};
+use crate::value::SkillValue;
 use crate::values::ValueFacts;
-use crate::yaml::{Code, Finding, Place, nearest};
+use crate::yaml::{Place, YamlFinding, YamlFindingCode, nearest};
 
 /// A field of the configuration.
 #[derive(Debug, Clone, PartialEq)]
@@ -26,9 +26,9 @@ pub struct Configurable {
     /// The description.
     pub facts: Arc<ValueFacts>,
     /// The value without a configuration.
-    pub default: Option<Value>,
+    pub default: Option<SkillValue>,
     /// The effect.
-    pub effect: Effect,
+    pub effect: FieldEffect,
     /// The skills on which it acts; empty for all skills.
     pub skills: Vec<String>,
     /// The location in the document.
@@ -37,7 +37,7 @@ pub struct Configurable {
 
 /// The effect of a field.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Effect {
+pub enum FieldEffect {
     /// The highest value of a parameter: higher values are lowered.
     Limits(String),
     /// The value of a parameter that is not given.
@@ -59,11 +59,11 @@ pub struct NotConfigured {
 }
 
 /// The values of the fields.
-type Values = BTreeMap<String, Value>;
+type Values = BTreeMap<String, SkillValue>;
 
 /// The configuration of a component. Clones share it.
 #[derive(Debug, Clone)]
-pub struct Configuration {
+pub struct ComponentConfiguration {
     fields: Arc<Vec<Configurable>>,
     values: watch::Sender<Arc<Values>>,
     store: Option<Arc<PathBuf>>,
@@ -71,13 +71,13 @@ pub struct Configuration {
     setting: Arc<Mutex<()>>,
 }
 
-impl Default for Configuration {
+impl Default for ComponentConfiguration {
     fn default() -> Self {
         Self::new(Vec::new(), None)
     }
 }
 
-impl Configuration {
+impl ComponentConfiguration {
     /// Creates the configuration with the values in `store`, a file that is written at each change.
     /// Stored values that do not fit any more are ignored, with a warning.
     #[must_use]
@@ -111,7 +111,7 @@ impl Configuration {
 
     /// Returns the value of a field: as configured, or its default.
     #[must_use]
-    pub fn value(&self, field: &Configurable) -> Option<Value> {
+    pub fn value(&self, field: &Configurable) -> Option<SkillValue> {
         field.value_in(&self.values.borrow())
     }
 
@@ -120,7 +120,7 @@ impl Configuration {
     ///
     /// # Errors
     /// The first wrong field, with the reason.
-    pub fn set(&self, given: Vec<(String, Value)>) -> Result<(), NotConfigured> {
+    pub fn set(&self, given: Vec<(String, SkillValue)>) -> Result<(), NotConfigured> {
         let _setting = self.setting.lock().unwrap_or_else(PoisonError::into_inner);
         let mut values = Values::clone(&self.values.borrow());
         let mut seen: Vec<String> = Vec::new();
@@ -176,7 +176,7 @@ impl Configuration {
     }
 
     /// Returns the fields that act on a skill, with their values at one time.
-    fn of_skill(&self, skill: &str) -> Vec<(&Configurable, Value)> {
+    fn of_skill(&self, skill: &str) -> Vec<(&Configurable, SkillValue)> {
         let values = Arc::clone(&self.values.borrow());
         let acting = self.fields.iter().filter(|field| field.acts_on(skill));
         acting
@@ -188,7 +188,7 @@ impl Configuration {
     pub(crate) fn period(&self, names: &[String]) -> Option<Duration> {
         let values = Arc::clone(&self.values.borrow());
         let periods = self.fields.iter().filter_map(|field| {
-            let Effect::Period(of) = &field.effect else {
+            let FieldEffect::Period(of) = &field.effect else {
                 return None;
             };
             let is_meant = of.as_ref().is_none_or(|name| names.contains(name));
@@ -215,18 +215,21 @@ impl Configuration {
 impl Configurable {
     /// Returns a finding if no skill has the parameter of the field. Each skill has its name and
     /// its parameters.
-    pub(crate) fn lacks_parameter(&self, skills: &[(&str, &[Parameter])]) -> Option<Finding> {
-        let (Effect::Limits(wanted) | Effect::Sets(wanted)) = &self.effect else {
+    pub(crate) fn lacks_parameter(
+        &self,
+        skills: &[(&str, &[SkillParameter])],
+    ) -> Option<YamlFinding> {
+        let (FieldEffect::Limits(wanted) | FieldEffect::Sets(wanted)) = &self.effect else {
             return None;
         };
         let acting = skills.iter().filter(|(skill, _)| self.acts_on(skill));
-        let parameters: Vec<&Parameter> = acting.flat_map(|(_, of)| of.iter()).collect();
+        let parameters: Vec<&SkillParameter> = acting.flat_map(|(_, of)| of.iter()).collect();
         if parameters.iter().any(|parameter| parameter.name == *wanted) {
             return None;
         }
         let names: Vec<&str> = parameters.iter().map(|of| of.name.as_str()).collect();
         let message = format!("no skill has a parameter `{}`", shortened(wanted));
-        let finding = Finding::error(Code::WrongValue, self.place, message);
+        let finding = YamlFinding::error(YamlFindingCode::WrongValue, self.place, message);
         Some(match nearest(wanted, names.iter().copied()) {
             Some(near) => finding.with_help(format!("did you mean `{near}`?")),
             None => finding,
@@ -234,13 +237,13 @@ impl Configurable {
     }
 
     /// Returns the value of the field among configured values, or its default.
-    fn value_in(&self, values: &Values) -> Option<Value> {
+    fn value_in(&self, values: &Values) -> Option<SkillValue> {
         let configured = values.get(&self.facts.name).cloned();
         configured.or_else(|| self.default.clone())
     }
 
     fn acts_on(&self, skill: &str) -> bool {
-        let acts = !matches!(self.effect, Effect::Period(_));
+        let acts = !matches!(self.effect, FieldEffect::Period(_));
         acts && (self.skills.is_empty() || self.skills.iter().any(|name| name == skill))
     }
 
@@ -248,7 +251,7 @@ impl Configurable {
     ///
     /// # Errors
     /// The reason why it does not fit.
-    pub fn take(&self, value: Value) -> Result<Value, String> {
+    pub fn take(&self, value: SkillValue) -> Result<SkillValue, String> {
         let ValueFacts {
             shape, range, unit, ..
         } = &*self.facts;
@@ -259,12 +262,12 @@ impl Configurable {
         if value.is_unreal() {
             return Err(format!("{value} is not a number"));
         }
-        if let Value::String(text) = &value
+        if let SkillValue::String(text) = &value
             && (text.len() > LONGEST_TEXT || text.contains(char::is_control))
         {
             return Err(format!("expected a line of at most {LONGEST_TEXT} bytes"));
         }
-        let elements = if let Value::Array(_, elements) = &value {
+        let elements = if let SkillValue::Array(_, elements) = &value {
             elements.as_slice()
         } else {
             std::slice::from_ref(&value)
@@ -275,7 +278,7 @@ impl Configurable {
         if let Some((low, high)) = range
             && let Some(outside) = elements
                 .iter()
-                .filter_map(Value::as_f64)
+                .filter_map(SkillValue::as_f64)
                 .find(|number| !(*low..=*high).contains(number))
         {
             let unit = unit.as_ref().map(|unit| format!(" {unit}"));
@@ -289,7 +292,7 @@ impl Configurable {
 /// A driver with the effects of the configuration.
 struct Configured {
     skill: String,
-    configuration: Configuration,
+    configuration: ComponentConfiguration,
     driver: Arc<dyn Driver>,
 }
 
@@ -314,12 +317,12 @@ impl Driver for Configured {
     /// Adds the configured parameters, and lowers those above their limits.
     fn prepared(
         &self,
-        declared: &[Parameter],
-        mut given: Vec<(String, Value)>,
-    ) -> Vec<(String, Value)> {
+        declared: &[SkillParameter],
+        mut given: Vec<(String, SkillValue)>,
+    ) -> Vec<(String, SkillValue)> {
         let acting = self.configuration.of_skill(&self.skill);
         for (field, value) in &acting {
-            if let Effect::Sets(parameter) = &field.effect
+            if let FieldEffect::Sets(parameter) = &field.effect
                 && declared.iter().any(|known| known.name == *parameter)
                 && !given.iter().any(|(name, _)| name == parameter)
             {
@@ -327,7 +330,7 @@ impl Driver for Configured {
             }
         }
         for (field, limit) in &acting {
-            let Effect::Limits(parameter) = &field.effect else {
+            let FieldEffect::Limits(parameter) = &field.effect else {
                 continue;
             };
             let Some(known) = declared.iter().find(|known| known.name == *parameter) else {
@@ -344,8 +347,8 @@ impl Driver for Configured {
         given
     }
 
-    async fn run(&self, work: Work) -> Result<Results, DriverError> {
-        let configured: Vec<(String, Value)> = self
+    async fn run(&self, work: Work) -> Result<RunResults, DriverError> {
+        let configured: Vec<(String, SkillValue)> = self
             .configuration
             .of_skill(&self.skill)
             .into_iter()
@@ -360,11 +363,11 @@ impl Driver for Configured {
 
 /// Lowers a number, and each number of an array, to a limit. A limit that the type cannot hold
 /// takes the place of the whole value, so that the Start is refused.
-fn lowered(value: Value, limit: &Value) -> Value {
+fn lowered(value: SkillValue, limit: &SkillValue) -> SkillValue {
     let Some(highest) = limit.as_f64() else {
         return value;
     };
-    if let Value::Array(builtin, elements) = value {
+    if let SkillValue::Array(builtin, elements) = value {
         let mut fits = true;
         let elements = elements.into_iter().map(|element| {
             let shape = element.shape();
@@ -372,9 +375,9 @@ fn lowered(value: Value, limit: &Value) -> Value {
             fits &= element.shape() == shape;
             element
         });
-        let elements: Vec<Value> = elements.collect();
+        let elements: Vec<SkillValue> = elements.collect();
         return match fits {
-            true => Value::Array(builtin, elements),
+            true => SkillValue::Array(builtin, elements),
             false => limit.clone(),
         };
     }
@@ -432,17 +435,19 @@ const LONGEST_FILE: u64 = 1 << 20;
 mod tests {
     use super::*;
     use crate::conformance;
-    use crate::value::{Builtin, Shape};
+    use crate::value::{Builtin, ValueShape};
 
-    fn field(name: &str, effect: Effect, range: Option<(f64, f64)>) -> Configurable {
+    fn field(name: &str, effect: FieldEffect, range: Option<(f64, f64)>) -> Configurable {
         let builtin = match effect {
-            Effect::Data => Builtin::String,
-            Effect::Limits(_) | Effect::Sets(_) | Effect::Period(_) => Builtin::Double,
+            FieldEffect::Data => Builtin::String,
+            FieldEffect::Limits(_) | FieldEffect::Sets(_) | FieldEffect::Period(_) => {
+                Builtin::Double
+            }
         };
         Configurable {
             facts: Arc::new(ValueFacts {
                 name: name.to_owned(),
-                shape: Shape::scalar(builtin),
+                shape: ValueShape::scalar(builtin),
                 unit: None,
                 range,
                 about: String::new(),
@@ -458,15 +463,15 @@ mod tests {
         vec![
             field(
                 "ForceLimit",
-                Effect::Limits("Force".to_owned()),
+                FieldEffect::Limits("Force".to_owned()),
                 Some((5.0, 50.0)),
             ),
-            field("UsualForce", Effect::Sets("Force".to_owned()), None),
-            field("Product", Effect::Data, None),
+            field("UsualForce", FieldEffect::Sets("Force".to_owned()), None),
+            field("Product", FieldEffect::Data, None),
         ]
     }
 
-    fn given(name: &str, value: impl Into<Value>) -> Vec<(String, Value)> {
+    fn given(name: &str, value: impl Into<SkillValue>) -> Vec<(String, SkillValue)> {
         vec![(name.to_owned(), value.into())]
     }
 
@@ -476,7 +481,7 @@ mod tests {
 
     #[async_trait]
     impl Driver for Recorder {
-        async fn run(&self, work: Work) -> Result<Results, DriverError> {
+        async fn run(&self, work: Work) -> Result<RunResults, DriverError> {
             let force = work.parameters().number("Force").unwrap();
             let configured = work.configuration().len();
             self.0.lock().unwrap().push((force, configured));
@@ -486,10 +491,10 @@ mod tests {
 
     #[tokio::test]
     async fn a_configuration_acts_on_the_next_run() {
-        let configuration = Configuration::new(fields(), None);
+        let configuration = ComponentConfiguration::new(fields(), None);
         let recorder = Arc::new(Recorder::default());
         let driver = configuration.applied("GraspSkillType", recorder.clone());
-        let run = async |force: Vec<(String, Value)>| {
+        let run = async |force: Vec<(String, SkillValue)>| {
             let run = conformance::run_once("GraspSkillType", driver.clone(), force);
             let outcome = run.await.unwrap();
             assert!(outcome.succeeded, "{}", outcome.message);
@@ -515,8 +520,10 @@ mod tests {
     #[test]
     fn fields_that_are_set_at_the_same_time_are_all_kept() {
         let names: Vec<String> = (0..8).map(|number| format!("Field{number}")).collect();
-        let fields = names.iter().map(|name| field(name, Effect::Data, None));
-        let configuration = Configuration::new(fields.collect(), None);
+        let fields = names
+            .iter()
+            .map(|name| field(name, FieldEffect::Data, None));
+        let configuration = ComponentConfiguration::new(fields.collect(), None);
         std::thread::scope(|scope| {
             for name in &names {
                 let configuration = configuration.clone();
@@ -528,20 +535,23 @@ mod tests {
 
     #[test]
     fn a_limit_that_the_type_cannot_hold_takes_the_place_of_the_value() {
-        let below = Value::from(-1.0);
-        let bytes = |byte: u8| Value::Array(Builtin::Byte, vec![Value::Byte(byte)]);
-        assert_eq!(lowered(Value::Byte(9), &4.5.into()), Value::Byte(4));
+        let below = SkillValue::from(-1.0);
+        let bytes = |byte: u8| SkillValue::Array(Builtin::Byte, vec![SkillValue::Byte(byte)]);
+        assert_eq!(
+            lowered(SkillValue::Byte(9), &4.5.into()),
+            SkillValue::Byte(4)
+        );
         assert_eq!(lowered(bytes(9), &4.5.into()), bytes(4));
-        assert_eq!(lowered(Value::Byte(9), &below), below);
+        assert_eq!(lowered(SkillValue::Byte(9), &below), below);
         assert_eq!(lowered(bytes(9), &below), below);
-        assert_eq!(Shape::scalar(Builtin::Byte).take(below.clone()), None);
-        assert_eq!(Shape::array(Builtin::Byte).take(below), None);
+        assert_eq!(ValueShape::scalar(Builtin::Byte).take(below.clone()), None);
+        assert_eq!(ValueShape::array(Builtin::Byte).take(below), None);
     }
 
     #[test]
     fn a_wrong_field_is_refused_with_its_reason_and_nothing_is_set() {
-        let configuration = Configuration::new(fields(), None);
-        let refused = |values: Vec<(String, Value)>| {
+        let configuration = ComponentConfiguration::new(fields(), None);
+        let refused = |values: Vec<(String, SkillValue)>| {
             let refused = configuration.set(values).unwrap_err();
             (refused.field, refused.reason)
         };
@@ -573,23 +583,23 @@ mod tests {
     fn a_configuration_is_there_again_after_a_restart_and_unfit_values_are_left_out() {
         let folder = std::env::temp_dir().join(format!("configuration-{}", std::process::id()));
         let path = folder.join("configuration.json");
-        let configuration = Configuration::new(fields(), Some(&path));
+        let configuration = ComponentConfiguration::new(fields(), Some(&path));
         let both = [given("Product", "A"), given("ForceLimit", 20.0)].concat();
         configuration.set(both).unwrap();
-        let again = Configuration::new(fields(), Some(&path));
+        let again = ComponentConfiguration::new(fields(), Some(&path));
         assert_eq!(*again.watch().borrow(), *configuration.watch().borrow());
         let mut narrower = fields();
         narrower.truncate(1);
         narrower[0] = field(
             "ForceLimit",
-            Effect::Limits("Force".to_owned()),
+            FieldEffect::Limits("Force".to_owned()),
             Some((0.0, 10.0)),
         );
-        let narrow = Configuration::new(narrower, Some(&path));
+        let narrow = ComponentConfiguration::new(narrower, Some(&path));
         assert!(narrow.watch().borrow().is_empty());
         std::fs::write(&path, "[").unwrap();
         assert!(
-            Configuration::new(fields(), Some(&path))
+            ComponentConfiguration::new(fields(), Some(&path))
                 .watch()
                 .borrow()
                 .is_empty()

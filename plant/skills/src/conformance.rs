@@ -3,17 +3,17 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use program::{Method, State};
+use program::{ProgramMachineState, ProgramMethod};
 
-use crate::authority::{Authority, Owner};
+use crate::authority::{Authority, SkillOwner};
 use crate::driver::Driver;
 use crate::model;
-use crate::parameters::TypeName;
-use crate::shown::{Outcome, Shown};
-use crate::skill::{Facts, Skill};
-use crate::value::Value;
+use crate::parameters::ParameterType;
+use crate::shown::{RunOutcome, SkillSnapshot};
+use crate::skill::{Skill, SkillDescription};
+use crate::value::SkillValue;
 
-const BY: Owner = Owner::Local("the conformance check");
+const BY: SkillOwner = SkillOwner::Local("the conformance check");
 const WAIT: Duration = Duration::from_secs(10);
 
 /// Tests a driver of a skill type of the table. With the `parameters`, which are requested before
@@ -25,7 +25,7 @@ const WAIT: Duration = Duration::from_secs(10);
 pub async fn check(
     skill_type: &str,
     driver: Arc<dyn Driver>,
-    mut parameters: impl FnMut() -> Vec<(String, Value)>,
+    mut parameters: impl FnMut() -> Vec<(String, SkillValue)>,
 ) -> Result<(), String> {
     let can_suspend = driver.can_suspend();
     let skill = skill(skill_type, driver)?;
@@ -52,7 +52,7 @@ pub async fn check(
 
     start(&skill, &parameters()).await?;
     let asked = tokio::time::Instant::now();
-    call(&skill, Method::Halt).await?;
+    call(&skill, ProgramMethod::Halt).await?;
     let outcome = skill
         .shown()
         .outcome
@@ -64,26 +64,28 @@ pub async fn check(
             asked.elapsed()
         ));
     }
-    if skill.shown().state != State::Halted {
+    if skill.shown().state != ProgramMachineState::Halted {
         return Err(format!("after Halt the skill is {}", skill.shown().state));
     }
 
     if can_suspend {
         start(&skill, &parameters()).await?;
-        call(&skill, Method::Suspend).await?;
+        call(&skill, ProgramMethod::Suspend).await?;
         // Twice the time in which work that is not suspended reports progress.
         tokio::time::sleep(Duration::from_millis(60)).await;
         let before = skill.shown().progress;
         tokio::time::sleep(Duration::from_millis(60)).await;
         let shown = skill.shown();
-        if shown.state != State::Suspended || (shown.progress - before).abs() > f32::EPSILON {
+        if shown.state != ProgramMachineState::Suspended
+            || (shown.progress - before).abs() > f32::EPSILON
+        {
             return Err(format!(
                 "the work went on while it was suspended: {before} to {}",
                 shown.progress
             ));
         }
-        call(&skill, Method::Resume).await?;
-        let shown = until(&skill, |shown| shown.state != State::Running).await?;
+        call(&skill, ProgramMethod::Resume).await?;
+        let shown = until(&skill, |shown| shown.state != ProgramMachineState::Running).await?;
         let succeeded = shown
             .outcome
             .as_ref()
@@ -92,8 +94,8 @@ pub async fn check(
             return Err("the run did not succeed after it was resumed".to_owned());
         }
         start(&skill, &parameters()).await?;
-        call(&skill, Method::Suspend).await?;
-        call(&skill, Method::Reset).await?;
+        call(&skill, ProgramMethod::Suspend).await?;
+        call(&skill, ProgramMethod::Reset).await?;
     }
     let outcome = run(&skill, &parameters()).await?;
     if !outcome.succeeded {
@@ -112,16 +114,16 @@ pub async fn check(
 pub async fn run_once(
     skill_type: &str,
     driver: Arc<dyn Driver>,
-    parameters: Vec<(String, Value)>,
-) -> Result<Outcome, String> {
+    parameters: Vec<(String, SkillValue)>,
+) -> Result<RunOutcome, String> {
     run(&skill(skill_type, driver)?, &parameters).await
 }
 
 fn skill(skill_type: &str, driver: Arc<dyn Driver>) -> Result<Skill, String> {
     let of = model::find(skill_type).ok_or_else(|| format!("there is no type {skill_type}"))?;
-    let facts = Facts {
+    let facts = SkillDescription {
         name: of.name.to_owned(),
-        types: of.chain().map(|of| TypeName::own(of.name)).collect(),
+        types: of.chain().map(|of| ParameterType::own(of.name)).collect(),
         parameters: of.parameters(),
         results: of.results(),
         capabilities: Vec::new(),
@@ -131,10 +133,13 @@ fn skill(skill_type: &str, driver: Arc<dyn Driver>) -> Result<Skill, String> {
     Ok(Skill::spawn(facts, driver, Authority::new(), Vec::new()))
 }
 
-async fn run(skill: &Skill, parameters: &[(String, Value)]) -> Result<Outcome, String> {
+async fn run(skill: &Skill, parameters: &[(String, SkillValue)]) -> Result<RunOutcome, String> {
     start(skill, parameters).await?;
     let shown = until(skill, |shown| {
-        matches!(shown.state, State::Ready | State::Halted)
+        matches!(
+            shown.state,
+            ProgramMachineState::Ready | ProgramMachineState::Halted
+        )
     })
     .await?;
     let outcome = shown
@@ -142,13 +147,13 @@ async fn run(skill: &Skill, parameters: &[(String, Value)]) -> Result<Outcome, S
         .as_ref()
         .filter(|outcome| outcome.run == shown.run);
     outcome
-        .map(|outcome| Outcome::clone(outcome))
+        .map(|outcome| RunOutcome::clone(outcome))
         .ok_or_else(|| "the run left no outcome".to_owned())
 }
 
-async fn start(skill: &Skill, parameters: &[(String, Value)]) -> Result<(), String> {
-    if skill.shown().state == State::Halted {
-        call(skill, Method::Reset).await?;
+async fn start(skill: &Skill, parameters: &[(String, SkillValue)]) -> Result<(), String> {
+    if skill.shown().state == ProgramMachineState::Halted {
+        call(skill, ProgramMethod::Reset).await?;
     }
     skill
         .start_with(BY, parameters.to_vec())
@@ -157,14 +162,17 @@ async fn start(skill: &Skill, parameters: &[(String, Value)]) -> Result<(), Stri
     Ok(())
 }
 
-async fn call(skill: &Skill, method: Method) -> Result<(), String> {
+async fn call(skill: &Skill, method: ProgramMethod) -> Result<(), String> {
     let taken = skill.call(BY, method).await;
     taken
         .map(drop)
         .map_err(|refusal| format!("{method} is refused: {refusal}"))
 }
 
-async fn until(skill: &Skill, is: impl FnMut(&Arc<Shown>) -> bool) -> Result<Arc<Shown>, String> {
+async fn until(
+    skill: &Skill,
+    is: impl FnMut(&Arc<SkillSnapshot>) -> bool,
+) -> Result<Arc<SkillSnapshot>, String> {
     let mut watch = skill.watch();
     match tokio::time::timeout(WAIT, watch.wait_for(is)).await {
         Ok(Ok(shown)) => Ok(Arc::clone(&shown)),

@@ -6,11 +6,11 @@ use async_trait::async_trait;
 use tokio::sync::{mpsc, watch};
 
 use crate::driver_error::{DriverError, InvalidParameter};
-use crate::parameters::{Parameter, Parameters};
-use crate::value::Value;
+use crate::parameters::{Parameters, SkillParameter};
+use crate::value::SkillValue;
 
 /// The results of a run, by their names in the skill type.
-pub type Results = Vec<(String, Value)>;
+pub type RunResults = Vec<(String, SkillValue)>;
 
 /// Does the work of one skill: a device, a simulation, or a composite of other skills.
 ///
@@ -43,9 +43,9 @@ pub trait Driver: Send + Sync + 'static {
     /// Changes the given parameters of a run before they are completed by defaults and checked.
     fn prepared(
         &self,
-        declared: &[Parameter],
-        given: Vec<(String, Value)>,
-    ) -> Vec<(String, Value)> {
+        declared: &[SkillParameter],
+        given: Vec<(String, SkillValue)>,
+    ) -> Vec<(String, SkillValue)> {
         let _all = declared;
         given
     }
@@ -63,7 +63,7 @@ pub trait Driver: Send + Sync + 'static {
     /// # Errors
     /// The reason why the work is not done. [`DriverError::Stopped`] is work that ended because of
     /// Halt, with nothing to add.
-    async fn run(&self, work: Work) -> Result<Results, DriverError>;
+    async fn run(&self, work: Work) -> Result<RunResults, DriverError>;
 }
 
 /// A run, as its driver sees it.
@@ -71,7 +71,7 @@ pub trait Driver: Send + Sync + 'static {
 pub struct Work {
     run: u32,
     parameters: Parameters,
-    configuration: Results,
+    configuration: RunResults,
     signal: watch::Receiver<Signal>,
     steps: mpsc::Sender<Line>,
     progress: watch::Sender<f32>,
@@ -146,11 +146,11 @@ impl Work {
 
     /// Returns the configured values of the component that act on the skill.
     #[must_use]
-    pub fn configuration(&self) -> &[(String, Value)] {
+    pub fn configuration(&self) -> &[(String, SkillValue)] {
         &self.configuration
     }
 
-    pub(crate) fn with_configuration(self, configuration: Vec<(String, Value)>) -> Self {
+    pub(crate) fn with_configuration(self, configuration: Vec<(String, SkillValue)>) -> Self {
         Self {
             configuration,
             ..self

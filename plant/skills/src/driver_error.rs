@@ -5,7 +5,7 @@ use std::error::Error;
 use crate::client::PartnerError;
 use crate::composite::Broken;
 use crate::driver::Stopped;
-use crate::value::Value;
+use crate::value::SkillValue;
 use crate::workspace::OutOfWorkspace;
 
 /// The reason why the work of a skill is not done.
@@ -95,7 +95,7 @@ pub enum InvalidParameter {
         /// The name of the parameter.
         name: String,
         /// The given value; `None` if it is missing.
-        given: Option<Value>,
+        given: Option<SkillValue>,
         /// The accepted values, as a predicate: `is one of a, b`.
         expected: String,
     },
@@ -130,7 +130,7 @@ mod tests {
     #[test]
     fn an_invalid_parameter_starts_with_its_name() {
         let missing = InvalidParameter::missing("Width", "number");
-        let given = Some(Value::from("odom"));
+        let given = Some(SkillValue::from("odom"));
         let unexpected = InvalidParameter::Unexpected {
             name: "Frame".to_owned(),
             given,

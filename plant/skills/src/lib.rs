@@ -31,35 +31,38 @@ mod variant;
 mod workspace;
 pub mod yaml;
 
-pub use authority::{Authority, Owner};
+pub use authority::{Authority, SkillOwner};
 pub use client::{
     Chosen, ClientOptions, Detected, Detector, FailedLocator, FoundParameter, FoundSkill,
-    FoundType, LocatorError, Mirror, Mirrors, Needs, NotLocated, PartnerError, PeerAccess,
+    FoundType, LocatorError, MirroredSkill, Mirrors, Needs, NotLocated, PartnerError, PeerAccess,
     RemoteState, SkillClient, SkillHandle, SkillStates, StationChanges, ToolState, Unchosen,
     UnfitGrasp, Watchable,
 };
 pub use component::{
-    Asked, Change, ChangeKind, Component, Device, DeviceKinds, DriverFault, DriverSetup, Drivers,
-    ExecSource, ExecWork, Form, LEASE, Lds, MOST_SKILLS, MOST_VALUES, NoDevices, Part, Partner,
-    Partners, Robot, Security, SensorRead, Simulation, SkillSetup, Source, SpaceWork, Takes,
-    TopicSource, ValueSetup, ValueSource, World, WorldObject, anonymous_by_default, measure_device,
-    read_numbers, read_partner, read_shape, read_user,
+    ChangeKind, Component, ComponentSecurity, Device, DeviceKinds, DriverFault, DriverSetup,
+    Drivers, ExecSource, ExecWork, Form, LEASE, Lds, MOST_SKILLS, MOST_VALUES, NoDevices, Partner,
+    Partners, RequestKind, Robot, SensorRead, Simulation, SkillSetup, SpaceFieldSource, SpaceWork,
+    Takes, TopicSource, ValuePart, ValueSetup, ValueSource, World, WorldObject, YamlChange,
+    anonymous_by_default, measure_device, read_numbers, read_partner, read_shape, read_user,
 };
-pub use composite::{Broken, Job, PickAndPlace, Teller};
-pub use configuration::{Configurable, Configuration, Effect, NotConfigured};
-pub use driver::{Driver, Results, Stopped, Work};
+pub use composite::{Broken, Job, JobObserver, PickAndPlace};
+pub use configuration::{ComponentConfiguration, Configurable, FieldEffect, NotConfigured};
+pub use driver::{Driver, RunResults, Stopped, Work};
 pub use driver_error::{DriverError, InvalidParameter};
 pub use grip::{GripError, GripPoint, GripType, NoShape, PartShape};
 pub use model::NAMESPACE;
-pub use parameters::{NoTypeName, Parameter, Parameters, TypeName};
+pub use parameters::{NoTypeName, ParameterType, Parameters, SkillParameter};
 pub use part::{PartEnd, run_part};
-pub use refusal::{Code, Refusal};
-pub use runs::{COMPOSITE_HALT_TIMEOUT, LocalRun, Runs, SkillFault};
-pub use shown::{Diagnostic, LastCall, Observer, Outcome, Shown, Told, Transitioned};
-pub use skill::{Facts, Skill};
-pub use value::{Builtin, Shape, Value};
+pub use refusal::{RefusalCode, SkillRefusal};
+pub use runs::{COMPOSITE_HALT_TIMEOUT, LocalRun, RunnableSkill, SkillFault};
+pub use shown::{
+    LastCall, ProgramDiagnostic, RunOutcome, SkillEvent, SkillObserver, SkillSnapshot, Transitioned,
+};
+pub use skill::{Skill, SkillDescription};
+pub use value::{Builtin, SkillValue, ValueShape};
 pub use values::{
-    DeviceValue, LiveValue, Measure, Measured, Reading, Sensor, Statistics, Tally, ValueFacts,
+    DeviceValue, LiveValue, Measure, Measured, NewestState, Statistics, Tally, ValueFacts,
+    ValueSensor,
 };
 pub use variant::{from_variant, to_variant};
-pub use workspace::{OutOfWorkspace, Workspace, Zone};
+pub use workspace::{OutOfWorkspace, RobotWorkspace, Zone};

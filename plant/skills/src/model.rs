@@ -7,11 +7,11 @@ mod types;
 mod units;
 
 pub use nodeset::{DomainNodeSet, domain_nodesets, nodeset};
-pub use table::{Preset, SkillType, Unit, Variable};
+pub use table::{Preset, SkillType, TableUnit, TableVariable};
 pub use types::TYPES;
 
-use crate::parameters::Parameter;
-use crate::value::{Builtin, Shape, Value};
+use crate::parameters::SkillParameter;
+use crate::value::{Builtin, SkillValue, ValueShape};
 
 /// The URI of the types' namespace.
 pub const NAMESPACE: &str = "urn:ua-bridge:skills";
@@ -72,33 +72,33 @@ impl SkillType {
 
     /// Returns the parameters, with the supertypes' parameters first.
     #[must_use]
-    pub fn parameters(&'static self) -> Vec<Parameter> {
+    pub fn parameters(&'static self) -> Vec<SkillParameter> {
         self.inherited(|of| of.parameters)
     }
 
     /// Returns the results, with the supertypes' results first.
     #[must_use]
-    pub fn results(&'static self) -> Vec<Parameter> {
+    pub fn results(&'static self) -> Vec<SkillParameter> {
         self.inherited(|of| of.results)
     }
 
     fn inherited(
         &'static self,
-        of: impl Fn(&'static Self) -> &'static [Variable],
-    ) -> Vec<Parameter> {
+        of: impl Fn(&'static Self) -> &'static [TableVariable],
+    ) -> Vec<SkillParameter> {
         let mut chain: Vec<&Self> = self.chain().collect();
         chain.reverse();
         chain
             .into_iter()
             .flat_map(of)
-            .map(Variable::parameter)
+            .map(TableVariable::parameter)
             .collect()
     }
 }
 
-impl Variable {
-    fn parameter(&self) -> Parameter {
-        Parameter {
+impl TableVariable {
+    fn parameter(&self) -> SkillParameter {
+        SkillParameter {
             name: self.name.to_owned(),
             shape: self.shape,
             length: self.length,
@@ -111,11 +111,11 @@ impl Variable {
 
     /// Returns the default value.
     #[must_use]
-    pub fn default_value(&self) -> Option<Value> {
+    pub fn default_value(&self) -> Option<SkillValue> {
         match self.preset {
             Preset::None => None,
             Preset::Number(number) => {
-                Shape::scalar(Builtin::Double)
+                ValueShape::scalar(Builtin::Double)
                     .take(number.into())
                     .and_then(|value| {
                         // All numbers of the table match their types.

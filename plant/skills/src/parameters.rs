@@ -4,22 +4,22 @@ use std::fmt;
 use std::str::FromStr;
 
 use crate::model;
-use crate::refusal::{Code, Refusal};
-use crate::value::{Shape, Value};
+use crate::refusal::{RefusalCode, SkillRefusal};
+use crate::value::{SkillValue, ValueShape};
 
 /// A type, identified by the URI of its namespace and its BrowseName.
 ///
 /// Its text is `nsu=<uri>;<BrowseName>`; a name without a URI is a type of
 /// [`NAMESPACE`](crate::NAMESPACE).
 #[derive(Debug, Clone, PartialEq, Eq, Hash, PartialOrd, Ord)]
-pub struct TypeName {
+pub struct ParameterType {
     /// The URI of the namespace.
     pub namespace: String,
     /// The BrowseName.
     pub name: String,
 }
 
-impl TypeName {
+impl ParameterType {
     /// Returns the name of a type of [`NAMESPACE`](crate::NAMESPACE).
     #[must_use]
     pub fn own(name: &str) -> Self {
@@ -30,7 +30,7 @@ impl TypeName {
     }
 }
 
-impl fmt::Display for TypeName {
+impl fmt::Display for ParameterType {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "nsu={};{}", self.namespace, self.name)
     }
@@ -41,7 +41,7 @@ impl fmt::Display for TypeName {
 #[error("expected a type as GraspSkillType or nsu=<namespace uri>;<BrowseName>, found `{0}`")]
 pub struct NoTypeName(pub String);
 
-impl FromStr for TypeName {
+impl FromStr for ParameterType {
     type Err = NoTypeName;
 
     fn from_str(text: &str) -> Result<Self, NoTypeName> {
@@ -69,15 +69,15 @@ const LONGEST_NAME: usize = 512;
 
 /// A parameter or result of a skill type.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Parameter {
+pub struct SkillParameter {
     /// The BrowseName.
     pub name: String,
     /// Type and rank.
-    pub shape: Shape,
+    pub shape: ValueShape,
     /// The number of elements of an array, if the type defines it.
     pub length: Option<u32>,
     /// The default value. A parameter without a default is mandatory.
-    pub default: Option<Value>,
+    pub default: Option<SkillValue>,
     /// The symbol of the unit, as `m/s`.
     pub unit: Option<String>,
     /// The lowest and the highest value of a number.
@@ -86,27 +86,32 @@ pub struct Parameter {
     pub about: String,
 }
 
-impl Parameter {
+impl SkillParameter {
     /// Converts a value to the type of the parameter and checks it.
     ///
     /// # Errors
     /// - BadTypeMismatch for a value of another type
     /// - BadInvalidArgument for a number that is NaN, infinite or out of range, or an array of
     ///   another length
-    pub fn take(&self, value: Value) -> Result<Value, Refusal> {
+    pub fn take(&self, value: SkillValue) -> Result<SkillValue, SkillRefusal> {
         let Self { name, shape, .. } = self;
         let given = value.shape();
         let Some(value) = shape.take(value) else {
-            return Err(Refusal::new(
-                Code::TypeMismatch,
+            return Err(SkillRefusal::new(
+                RefusalCode::TypeMismatch,
                 format!("{name} is {shape}, and {given} was given"),
             ));
         };
-        let wrong = |why: String| Err(Refusal::new(Code::InvalidArgument, format!("{name} {why}")));
+        let wrong = |why: String| {
+            Err(SkillRefusal::new(
+                RefusalCode::InvalidArgument,
+                format!("{name} {why}"),
+            ))
+        };
         if value.is_unreal() {
             return wrong(format!("has a value that is no number: {value}"));
         }
-        if let Value::Array(_, elements) = &value
+        if let SkillValue::Array(_, elements) = &value
             && let Some(length) = self.length
             && u32::try_from(elements.len()) != Ok(length)
         {
@@ -126,7 +131,7 @@ impl Parameter {
 
 /// The parameters of one run, complete and checked, in the order of the type.
 #[derive(Debug, Clone, PartialEq, Default)]
-pub struct Parameters(Vec<(String, Value)>);
+pub struct Parameters(Vec<(String, SkillValue)>);
 
 impl Parameters {
     /// Completes the given parameters with the defaults of the type.
@@ -134,9 +139,12 @@ impl Parameters {
     /// # Errors
     /// - BadArgumentsMissing with the names of the missing mandatory parameters
     /// - BadInvalidArgument for a name that the type does not have or that is given twice
-    /// - As [`Parameter::take`]
-    pub fn complete(declared: &[Parameter], given: Vec<(String, Value)>) -> Result<Self, Refusal> {
-        let mut values: Vec<Option<Value>> = vec![None; declared.len()];
+    /// - As [`SkillParameter::take`]
+    pub fn complete(
+        declared: &[SkillParameter],
+        given: Vec<(String, SkillValue)>,
+    ) -> Result<Self, SkillRefusal> {
+        let mut values: Vec<Option<SkillValue>> = vec![None; declared.len()];
         for (name, value) in given {
             let found = declared
                 .iter()
@@ -144,17 +152,17 @@ impl Parameters {
                 .find(|(parameter, _)| parameter.name == name);
             let Some((parameter, place)) = found else {
                 let text = format!("there is no parameter {}", shortened(&name));
-                return Err(Refusal::new(Code::InvalidArgument, text));
+                return Err(SkillRefusal::new(RefusalCode::InvalidArgument, text));
             };
             let value = parameter.take(value)?;
             if place.replace(value).is_some() {
-                return Err(Refusal::new(
-                    Code::InvalidArgument,
+                return Err(SkillRefusal::new(
+                    RefusalCode::InvalidArgument,
                     format!("{name} is given twice"),
                 ));
             }
         }
-        let complete: Vec<(&Parameter, Option<Value>)> = declared
+        let complete: Vec<(&SkillParameter, Option<SkillValue>)> = declared
             .iter()
             .zip(values)
             .map(|(parameter, value)| (parameter, value.or_else(|| parameter.default.clone())))
@@ -166,22 +174,22 @@ impl Parameters {
             .collect();
         if !missing.is_empty() {
             let text = format!("{} must be given", missing.join(", "));
-            return Err(Refusal::new(Code::ArgumentsMissing, text));
+            return Err(SkillRefusal::new(RefusalCode::ArgumentsMissing, text));
         }
-        let named = |(parameter, value): (&Parameter, Option<Value>)| {
+        let named = |(parameter, value): (&SkillParameter, Option<SkillValue>)| {
             Some((parameter.name.clone(), value?))
         };
         Ok(Self(complete.into_iter().filter_map(named).collect()))
     }
 
     /// Creates parameters from the values of another server, which has checked them.
-    pub(crate) const fn shown(of: Vec<(String, Value)>) -> Self {
+    pub(crate) const fn shown(of: Vec<(String, SkillValue)>) -> Self {
         Self(of)
     }
 
     /// Returns the value of a parameter.
     #[must_use]
-    pub fn get(&self, name: &str) -> Option<&Value> {
+    pub fn get(&self, name: &str) -> Option<&SkillValue> {
         self.0
             .iter()
             .find(|(known, _)| known == name)
@@ -214,7 +222,7 @@ impl Parameters {
 
     /// Returns all names and values, in the order of the type.
     #[must_use]
-    pub fn all(&self) -> &[(String, Value)] {
+    pub fn all(&self) -> &[(String, SkillValue)] {
         &self.0
     }
 }
@@ -231,11 +239,11 @@ pub(crate) fn shortened(name: &str) -> String {
 mod tests {
     use super::*;
 
-    fn move_parameters() -> Vec<Parameter> {
+    fn move_parameters() -> Vec<SkillParameter> {
         model::find("PtpMoveSkillType").unwrap().parameters()
     }
 
-    fn refusal(given: Vec<(&str, Value)>) -> (Code, String) {
+    fn refusal(given: Vec<(&str, SkillValue)>) -> (RefusalCode, String) {
         let given = given
             .into_iter()
             .map(|(name, value)| (name.to_owned(), value));
@@ -245,7 +253,7 @@ mod tests {
 
     #[test]
     fn what_is_not_given_has_its_default_or_is_missing_by_name() {
-        let target = ("TargetPosition".to_owned(), Value::from([0.1; 6]));
+        let target = ("TargetPosition".to_owned(), SkillValue::from([0.1; 6]));
         let parameters = Parameters::complete(&move_parameters(), vec![target]).unwrap();
         assert_eq!(parameters.number("MaxVelocity"), Some(0.2));
         assert_eq!(parameters.six("TargetPosition"), Some([0.1; 6]));
@@ -253,7 +261,7 @@ mod tests {
         assert_eq!(
             refusal(vec![]),
             (
-                Code::ArgumentsMissing,
+                RefusalCode::ArgumentsMissing,
                 "TargetPosition must be given".to_owned()
             )
         );
@@ -261,36 +269,36 @@ mod tests {
 
     #[test]
     fn a_wrong_parameter_is_refused_by_name_and_with_what_is_right() {
-        let target = || ("TargetPosition", Value::from([0.1; 6]));
+        let target = || ("TargetPosition", SkillValue::from([0.1; 6]));
         let cases = [
             (
-                vec![("TargetPosition", Value::from(vec![0.1; 5]))],
-                Code::InvalidArgument,
+                vec![("TargetPosition", SkillValue::from(vec![0.1; 5]))],
+                RefusalCode::InvalidArgument,
                 "TargetPosition has 6 values, and 5 were given",
             ),
             (
-                vec![("TargetPosition", Value::from(0.1))],
-                Code::TypeMismatch,
+                vec![("TargetPosition", SkillValue::from(0.1))],
+                RefusalCode::TypeMismatch,
                 "TargetPosition is Double[], and Double was given",
             ),
             (
-                vec![("TargetPosition", Value::from([f64::NAN; 6]))],
-                Code::InvalidArgument,
+                vec![("TargetPosition", SkillValue::from([f64::NAN; 6]))],
+                RefusalCode::InvalidArgument,
                 "TargetPosition has a value that is no number: [\"NaN\",\"NaN\",\"NaN\",\"NaN\",\"NaN\",\"NaN\"]",
             ),
             (
-                vec![target(), ("MaxVelocity", Value::from(-1.0))],
-                Code::InvalidArgument,
+                vec![target(), ("MaxVelocity", SkillValue::from(-1.0))],
+                RefusalCode::InvalidArgument,
                 "MaxVelocity is from 0.001 to 10, and -1 was given",
             ),
             (
-                vec![target(), ("Speed", Value::from(1.0))],
-                Code::InvalidArgument,
+                vec![target(), ("Speed", SkillValue::from(1.0))],
+                RefusalCode::InvalidArgument,
                 "there is no parameter Speed",
             ),
             (
                 vec![target(), target()],
-                Code::InvalidArgument,
+                RefusalCode::InvalidArgument,
                 "TargetPosition is given twice",
             ),
         ];
@@ -301,16 +309,16 @@ mod tests {
 
     #[test]
     fn a_type_is_named_with_or_without_its_namespace() {
-        let own: TypeName = "GraspSkillType".parse().unwrap();
+        let own: ParameterType = "GraspSkillType".parse().unwrap();
         assert_eq!(own.to_string(), "nsu=urn:ua-bridge:skills;GraspSkillType");
-        let vendor: TypeName = "nsu=urn:vendor;v2;VacuumGraspSkillType".parse().unwrap();
+        let vendor: ParameterType = "nsu=urn:vendor;v2;VacuumGraspSkillType".parse().unwrap();
         assert_eq!(
             (vendor.namespace.as_str(), vendor.name.as_str()),
             ("urn:vendor;v2", "VacuumGraspSkillType")
         );
         assert_eq!(vendor.to_string().parse(), Ok(vendor));
         for wrong in ["", "nsu=urn:vendor", "nsu=;x", "nsu=urn:vendor;", "a;b"] {
-            assert!(wrong.parse::<TypeName>().is_err(), "{wrong}");
+            assert!(wrong.parse::<ParameterType>().is_err(), "{wrong}");
         }
     }
 }

@@ -6,16 +6,16 @@ use std::time::Duration;
 
 use tokio::time::timeout;
 
-use crate::composite::Teller;
-use crate::runs::{Runs, SkillFault, goes_on};
-use crate::shown::Outcome;
-use crate::value::Value;
+use crate::composite::JobObserver;
+use crate::runs::{RunnableSkill, SkillFault, goes_on};
+use crate::shown::RunOutcome;
+use crate::value::SkillValue;
 
 /// The end of a part.
 #[derive(Debug)]
 pub enum PartEnd<T> {
     /// The run has ended by itself, or its component is lost.
-    Ended(Result<Outcome, SkillFault>),
+    Ended(Result<RunOutcome, SkillFault>),
     /// The run was halted because of `by`.
     Interrupted {
         /// The output of the future that interrupted the part.
@@ -29,10 +29,10 @@ pub enum PartEnd<T> {
 /// the function returns when the run has ended. Until then the teller shows that the cancellation
 /// is pending. If the end is unknown, the composite needs a Reset.
 pub async fn run_part<T>(
-    skill: &dyn Runs,
-    parameters: Vec<(String, Value)>,
+    skill: &dyn RunnableSkill,
+    parameters: Vec<(String, SkillValue)>,
     within: Duration,
-    teller: &dyn Teller,
+    teller: &dyn JobObserver,
     interrupted: impl Future<Output = T>,
 ) -> PartEnd<T> {
     let mut run = pin!(skill.run(parameters, within));
@@ -65,9 +65,9 @@ pub async fn run_part<T>(
 
 /// Halts a skill and waits for the end of its run.
 async fn halt(
-    skill: &dyn Runs,
-    mut run: Pin<&mut (impl Future<Output = Result<Outcome, SkillFault>> + ?Sized)>,
-    teller: &dyn Teller,
+    skill: &dyn RunnableSkill,
+    mut run: Pin<&mut (impl Future<Output = Result<RunOutcome, SkillFault>> + ?Sized)>,
+    teller: &dyn JobObserver,
 ) -> Result<(), SkillFault> {
     // A Halt can overtake the request that starts the run, so it is repeated.
     for _ in 0..HALTS {
@@ -87,7 +87,10 @@ async fn halt(
 }
 
 /// Turns an outcome that is unknown into an error: the machine may move.
-fn known(skill: &dyn Runs, ended: Result<Outcome, SkillFault>) -> Result<Outcome, SkillFault> {
+fn known(
+    skill: &dyn RunnableSkill,
+    ended: Result<RunOutcome, SkillFault>,
+) -> Result<RunOutcome, SkillFault> {
     ended.and_then(|outcome| match outcome.unknown {
         false => Ok(outcome),
         true => Err(SkillFault::NotHalted(format!(
@@ -100,7 +103,7 @@ fn known(skill: &dyn Runs, ended: Result<Outcome, SkillFault>) -> Result<Outcome
 }
 
 /// An error if the run may go on.
-fn confirmed(ended: Result<Outcome, SkillFault>) -> Result<(), SkillFault> {
+fn confirmed(ended: Result<RunOutcome, SkillFault>) -> Result<(), SkillFault> {
     match ended {
         Err(fault @ (SkillFault::Lost(_) | SkillFault::NotHalted(_))) => Err(fault),
         Ok(_)
@@ -121,18 +124,18 @@ mod tests {
     use std::sync::atomic::{AtomicU32, Ordering};
 
     use async_trait::async_trait;
-    use program::{Method, State};
+    use program::{ProgramMachineState, ProgramMethod};
     use tokio::sync::watch;
 
     use super::*;
-    use crate::authority::{Authority, Owner};
+    use crate::authority::{Authority, SkillOwner};
     use crate::composite::PickAndPlace;
     use crate::model;
-    use crate::parameters::TypeName;
-    use crate::shown::Shown;
-    use crate::skill::{Facts, Skill};
+    use crate::parameters::ParameterType;
+    use crate::shown::SkillSnapshot;
+    use crate::skill::{Skill, SkillDescription};
 
-    const BY: Owner = Owner::Local("the test");
+    const BY: SkillOwner = SkillOwner::Local("the test");
 
     /// The way of a run to its end.
     #[derive(Clone, Copy, PartialEq)]
@@ -166,23 +169,23 @@ mod tests {
     }
 
     #[async_trait]
-    impl Runs for Scripted {
+    impl RunnableSkill for Scripted {
         fn name(&self) -> String {
             "gripper.Grasp".to_owned()
         }
 
         async fn run(
             &self,
-            _parameters: Vec<(String, Value)>,
+            _parameters: Vec<(String, SkillValue)>,
             _within: Duration,
-        ) -> Result<Outcome, SkillFault> {
+        ) -> Result<RunOutcome, SkillFault> {
             let run = self.runs.fetch_add(1, Ordering::Relaxed) + 1;
             let mut may_end = self.may_end.subscribe();
             may_end.wait_for(|may_end| *may_end).await.unwrap();
             if self.way == Way::Refuses {
                 return Err(goes_on("gripper.Grasp"));
             }
-            Ok(Outcome {
+            Ok(RunOutcome {
                 run,
                 succeeded: self.way == Way::Done,
                 unknown: self.way == Way::Lost,
@@ -207,15 +210,15 @@ mod tests {
         let composite = PickAndPlace {
             ptp: Scripted::new(Way::Done),
             linear: Scripted::new(Way::Done),
-            grasp: Arc::clone(&grasp) as Arc<dyn Runs>,
+            grasp: Arc::clone(&grasp) as Arc<dyn RunnableSkill>,
             release: Scripted::new(Way::Done),
             plate: crate::frame::Frame::IDENTITY,
             within: Duration::from_secs(60),
         };
         let of = model::find("PickAndPlaceSkillType").unwrap();
-        let facts = Facts {
+        let facts = SkillDescription {
             name: "PickAndPlace".to_owned(),
-            types: vec![TypeName::own(of.name)],
+            types: vec![ParameterType::own(of.name)],
             parameters: of.parameters(),
             results: of.results(),
             capabilities: Vec::new(),
@@ -223,15 +226,18 @@ mod tests {
             rests_in: of.rests_in,
         };
         let skill = Skill::spawn(facts, Arc::new(composite), Authority::new(), Vec::new());
-        skill.call(BY, Method::Reset).await.unwrap();
-        let six = |name: &str| (name.to_owned(), Value::from([0.0; 6]));
+        skill.call(BY, ProgramMethod::Reset).await.unwrap();
+        let six = |name: &str| (name.to_owned(), SkillValue::from([0.0; 6]));
         let parameters = vec![six("PickPosition"), six("PlacePosition")];
         skill.start_with(BY, parameters).await.unwrap();
         until(&skill, |shown| shown.step == "Grasp").await;
         (skill, grasp)
     }
 
-    async fn until(skill: &Skill, is: impl FnMut(&Arc<Shown>) -> bool) -> Arc<Shown> {
+    async fn until(
+        skill: &Skill,
+        is: impl FnMut(&Arc<SkillSnapshot>) -> bool,
+    ) -> Arc<SkillSnapshot> {
         let mut watch = skill.watch();
         let shown = timeout(Duration::from_secs(60), watch.wait_for(is)).await;
         Arc::clone(&shown.unwrap().unwrap())
@@ -240,28 +246,28 @@ mod tests {
     #[tokio::test]
     async fn a_halted_composite_halts_the_running_grasp_and_is_halted_when_the_grasp_has_ended() {
         let (skill, grasp) = at_grasp(Way::Halts).await;
-        skill.call(BY, Method::Halt).await.unwrap();
-        assert_eq!(skill.shown().state, State::Running);
+        skill.call(BY, ProgramMethod::Halt).await.unwrap();
+        assert_eq!(skill.shown().state, ProgramMachineState::Running);
         assert_ne!(grasp.halts.load(Ordering::Relaxed), 0);
         grasp.may_end.send_replace(true);
-        let shown = until(&skill, |shown| shown.state == State::Halted).await;
+        let shown = until(&skill, |shown| shown.state == ProgramMachineState::Halted).await;
         assert!(!shown.needs_reset);
     }
 
     #[tokio::test]
     async fn a_composite_with_a_part_that_does_not_halt_says_so_and_needs_a_reset() {
         let (skill, grasp) = at_grasp(Way::Refuses).await;
-        skill.call(BY, Method::Halt).await.unwrap();
+        skill.call(BY, ProgramMethod::Halt).await.unwrap();
         let shown = skill.shown();
         let pending = shown.pending.clone().unwrap_or_default();
-        assert_eq!(shown.state, State::Running);
+        assert_eq!(shown.state, ProgramMachineState::Running);
         assert!(pending.contains("gripper.Grasp is not halted"), "{pending}");
         grasp.may_end.send_replace(true);
-        let shown = until(&skill, |shown| shown.state == State::Halted).await;
+        let shown = until(&skill, |shown| shown.state == ProgramMachineState::Halted).await;
         assert!(shown.needs_reset);
         let message = shown.outcome.as_ref().unwrap().message.clone();
         assert!(message.contains("whether it moves is unknown"), "{message}");
-        skill.call(BY, Method::Reset).await.unwrap();
+        skill.call(BY, ProgramMethod::Reset).await.unwrap();
         assert!(!skill.shown().needs_reset);
     }
 
@@ -270,10 +276,10 @@ mod tests {
         for is_halted in [true, false] {
             let (skill, grasp) = at_grasp(Way::Lost).await;
             if is_halted {
-                skill.call(BY, Method::Halt).await.unwrap();
+                skill.call(BY, ProgramMethod::Halt).await.unwrap();
             }
             grasp.may_end.send_replace(true);
-            let shown = until(&skill, |shown| shown.state == State::Halted).await;
+            let shown = until(&skill, |shown| shown.state == ProgramMachineState::Halted).await;
             assert!(shown.needs_reset);
             let outcome = shown.outcome.clone().unwrap();
             assert!(outcome.unknown);

@@ -4,7 +4,7 @@ use std::fmt;
 
 /// The kind of a refusal: a StatusCode of OPC 10000-4.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Code {
+pub enum RefusalCode {
     /// Another owner holds the lease of the component.
     Locked,
     /// The state machine does not have this transition in the current state.
@@ -27,7 +27,7 @@ pub enum Code {
     RequestNotAllowed,
 }
 
-impl Code {
+impl RefusalCode {
     /// Returns its name in OPC 10000-4.
     #[must_use]
     pub const fn name(self) -> &'static str {
@@ -65,15 +65,15 @@ impl Code {
 
 /// A refusal with its reason for people. Its text is `BadInvalidState: <reason>`.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-pub struct Refusal {
+pub struct SkillRefusal {
     /// The kind.
-    pub code: Code,
+    pub code: RefusalCode,
     /// The reason, in a sentence.
     pub text: String,
 }
 
-impl Refusal {
-    pub(crate) fn new(code: Code, text: impl Into<String>) -> Self {
+impl SkillRefusal {
+    pub(crate) fn new(code: RefusalCode, text: impl Into<String>) -> Self {
         Self {
             code,
             text: text.into(),
@@ -81,7 +81,7 @@ impl Refusal {
     }
 }
 
-impl fmt::Display for Refusal {
+impl fmt::Display for SkillRefusal {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "{}: {}", self.code.name(), self.text)
     }

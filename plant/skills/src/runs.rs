@@ -4,31 +4,31 @@ use std::future::pending;
 use std::time::Duration;
 
 use async_trait::async_trait;
-use program::{Method, State};
+use program::{ProgramMachineState, ProgramMethod};
 
-use crate::authority::Owner;
+use crate::authority::SkillOwner;
 use crate::grip::GripPoint;
-use crate::refusal::{Code, Refusal};
-use crate::shown::Outcome;
+use crate::refusal::{RefusalCode, SkillRefusal};
+use crate::shown::RunOutcome;
 use crate::skill::Skill;
-use crate::value::Value;
+use crate::value::SkillValue;
 
 /// A skill that can be run: a skill of another component or of this program.
 #[async_trait]
-pub trait Runs: Send + Sync {
+pub trait RunnableSkill: Send + Sync {
     /// Returns the name for messages, as `parallel-gripper.Grasp`.
     fn name(&self) -> String;
 
     /// Resets the skill if necessary, starts it and waits for the end of the run. The run is halted
-    /// when the time `within` has passed. A failed run has an [`Outcome`] too.
+    /// when the time `within` has passed. A failed run has an [`RunOutcome`] too.
     ///
     /// # Errors
     /// The reason why there is no outcome.
     async fn run(
         &self,
-        parameters: Vec<(String, Value)>,
+        parameters: Vec<(String, SkillValue)>,
         within: Duration,
-    ) -> Result<Outcome, SkillFault>;
+    ) -> Result<RunOutcome, SkillFault>;
 
     /// Halts the skill unless it is Halted, and waits until its run has ended. Work that is done
     /// elsewhere may take a while to end.
@@ -75,8 +75,8 @@ pub enum SkillFault {
     Unexpected(String),
 }
 
-impl From<Refusal> for SkillFault {
-    fn from(refusal: Refusal) -> Self {
+impl From<SkillRefusal> for SkillFault {
+    fn from(refusal: SkillRefusal) -> Self {
         Self::Refused {
             status: refusal.code.name().to_owned(),
             text: refusal.text,
@@ -90,41 +90,45 @@ pub struct LocalRun {
     /// The skill.
     pub skill: Skill,
     /// The owner of the lease.
-    pub by: Owner,
+    pub by: SkillOwner,
 }
 
 #[async_trait]
-impl Runs for LocalRun {
+impl RunnableSkill for LocalRun {
     fn name(&self) -> String {
         self.skill.facts().name.clone()
     }
 
     async fn run(
         &self,
-        parameters: Vec<(String, Value)>,
+        parameters: Vec<(String, SkillValue)>,
         within: Duration,
-    ) -> Result<Outcome, SkillFault> {
+    ) -> Result<RunOutcome, SkillFault> {
         let shown = self.skill.shown();
         if shown.needs_reset {
             return Err(SkillFault::Refused {
-                status: Code::InvalidState.name().to_owned(),
+                status: RefusalCode::InvalidState.name().to_owned(),
                 text: format!(
                     "the outcome of run {} is unknown; Reset makes the skill ready",
                     shown.run
                 ),
             });
         }
-        if shown.state == State::Halted {
-            let reset = self.skill.call(self.by.clone(), Method::Reset).await;
+        if shown.state == ProgramMachineState::Halted {
+            let reset = self.skill.call(self.by.clone(), ProgramMethod::Reset).await;
             // The Reset of a caller that gave up earlier may have taken effect first.
-            if self.skill.shown().state != State::Ready {
+            if self.skill.shown().state != ProgramMachineState::Ready {
                 reset?;
             }
         }
         let run = self.skill.start_with(self.by.clone(), parameters).await?;
         let mut watch = self.skill.watch();
         let ended = watch.wait_for(|shown| {
-            shown.run != run || matches!(shown.state, State::Ready | State::Halted)
+            shown.run != run
+                || matches!(
+                    shown.state,
+                    ProgramMachineState::Ready | ProgramMachineState::Halted
+                )
         });
         let ended = tokio::time::timeout(within, ended).await;
         match ended.map(|ended| ended.is_ok()) {
@@ -143,15 +147,22 @@ impl Runs for LocalRun {
         let outcome = self.skill.outcome(run);
         let outcome =
             outcome.ok_or_else(|| SkillFault::Unexpected(format!("run {run} left no outcome")))?;
-        Ok(Outcome::clone(&outcome))
+        Ok(RunOutcome::clone(&outcome))
     }
 
     async fn halt(&self) -> Result<(), SkillFault> {
-        if self.skill.shown().state != State::Halted {
-            self.skill.call(self.by.clone(), Method::Halt).await?;
+        if self.skill.shown().state != ProgramMachineState::Halted {
+            self.skill
+                .call(self.by.clone(), ProgramMethod::Halt)
+                .await?;
         }
         let mut watch = self.skill.watch();
-        let ended = watch.wait_for(|shown| matches!(shown.state, State::Ready | State::Halted));
+        let ended = watch.wait_for(|shown| {
+            matches!(
+                shown.state,
+                ProgramMachineState::Ready | ProgramMachineState::Halted
+            )
+        });
         match tokio::time::timeout(HALTS_WITHIN, ended).await {
             Ok(_ended_or_gone) => Ok(()),
             Err(_) => Err(goes_on(&self.name())),

@@ -35,12 +35,12 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use plant_opcua::server::{
-    EndpointUrl, IdRange, Instance, InstanceError, InstanceSpec, Security as Policy, Server,
-    ServerBuilder, ServerConfig, ServerError,
+    EndpointUrl, IdRange, Instance, InstanceError, InstanceSpec, OpcUaServer, ServerBuilder,
+    ServerConfig, ServerError, ServerSecurity as Policy,
 };
 use plant_opcua::supervision::Supervision;
 use plant_opcua::types::{NodeId, ObjectId, ObjectTypeId, QualifiedName};
-use plant_opcua::users::{Access, Anonymous, Roles, Rules};
+use plant_opcua::users::{AnonymousRights, PermissionRules, Roles, UserAccess};
 use tokio::sync::{mpsc, watch};
 use tokio::task::JoinSet;
 use tokio::time::{Instant, MissedTickBehavior};
@@ -49,22 +49,22 @@ use self::grip::Stated;
 use self::lock::Lock;
 use self::methods::status;
 pub use self::power::PowerOff;
-use self::show::{Nodes, Shower};
+use self::show::{Shower, SkillNodes};
 pub(crate) use self::types::OUTCOME;
 use self::values::Tallies;
 pub use self::values::status as value_status;
-use crate::authority::{Authority, Owner};
+use crate::authority::{Authority, SkillOwner};
 use crate::client::PeerAccess;
-use crate::component::{Component, DriverFault, Drivers, Security, SkillSetup};
-use crate::configuration::Configuration;
+use crate::component::{Component, ComponentSecurity, DriverFault, Drivers, SkillSetup};
+use crate::configuration::ComponentConfiguration;
 use crate::driver::Driver;
 use crate::model::{self, NAMESPACE};
-use crate::parameters::{Parameter, TypeName};
-use crate::shown::Observer;
-use crate::skill::{Facts, Skill};
+use crate::parameters::{ParameterType, SkillParameter};
+use crate::shown::SkillObserver;
+use crate::skill::{Skill, SkillDescription};
 use crate::values::LiveValue;
-use crate::workspace::Workspace;
-use crate::yaml::{Code, Finding, Findings};
+use crate::workspace::RobotWorkspace;
+use crate::yaml::{Findings, YamlFinding, YamlFindingCode};
 
 /// Settings of the server of a component, beside the component.
 #[derive(Debug, Clone, Default)]
@@ -100,7 +100,7 @@ pub trait Extension: std::fmt::Debug + Send + Sync {
     /// A node cannot be created.
     fn serve(
         &self,
-        server: &Server,
+        server: &OpcUaServer,
         component: &NodeId,
         ids: &mut IdRange,
     ) -> Result<(), InstanceError>;
@@ -128,12 +128,12 @@ impl From<InstanceError> for ServeFault {
 
 /// A served component, until [`stop`](Self::stop).
 pub struct ComponentServer {
-    server: Server,
+    server: OpcUaServer,
     authority: Authority,
     skills: Vec<Skill>,
     values: Vec<LiveValue>,
     drivers: Drivers,
-    configuration: Configuration,
+    configuration: ComponentConfiguration,
     tasks: JoinSet<()>,
 }
 
@@ -149,7 +149,7 @@ impl ComponentServer {
     pub fn build(
         component: &Component,
         settings: &ServeSettings,
-        mut observers: impl FnMut(u16, &Facts) -> Vec<Box<dyn Observer>>,
+        mut observers: impl FnMut(u16, &SkillDescription) -> Vec<Box<dyn SkillObserver>>,
     ) -> Result<Self, ServeFault> {
         let users = users_of(component, settings)?;
         let server = server_of(component, settings, &users)?;
@@ -170,14 +170,14 @@ impl ComponentServer {
             return Err(ServeFault::Findings(findings));
         };
         let store = settings.configuration.as_deref();
-        let configuration = Configuration::new(component.configurable.clone(), store);
+        let configuration = ComponentConfiguration::new(component.configurable.clone(), store);
         let shown = configuration::serve(&server, &root.node_id, &mut ids, (&configuration, by))?;
         let authority = Authority::new();
         let mut served = Vec::new();
         let mut used = Vec::new();
         for (number, made) in (1..).zip(made) {
             let (facts, driver, nodes) = (made.facts, made.driver, made.nodes);
-            let mut all: Vec<Box<dyn Observer>> =
+            let mut all: Vec<Box<dyn SkillObserver>> =
                 vec![Box::new(Shower::new(server.clone(), Arc::clone(&nodes)))];
             all.extend(tallies.observers(number, &facts.name));
             all.extend(observers(number, &facts));
@@ -304,14 +304,17 @@ impl ComponentServer {
 }
 
 /// Returns the users of the certificate store.
-fn users_of(component: &Component, settings: &ServeSettings) -> Result<Arc<Access>, ServeFault> {
+fn users_of(
+    component: &Component,
+    settings: &ServeSettings,
+) -> Result<Arc<UserAccess>, ServeFault> {
     let anonymous = component.anonymous.unwrap_or(Roles::NONE);
-    let users = Access::of_store(settings.pki.as_deref(), anonymous);
+    let users = UserAccess::of_store(settings.pki.as_deref(), anonymous);
     let users = users.map_err(|error| ServerError::Configuration(error.to_string()))?;
     if component.anonymous.is_none() {
-        users.set_rules(Rules {
-            anonymous: Anonymous::Refused,
-            ..Rules::default()
+        users.set_rules(PermissionRules {
+            anonymous: AnonymousRights::Refused,
+            ..PermissionRules::default()
         });
     }
     Ok(Arc::new(users))
@@ -320,15 +323,15 @@ fn users_of(component: &Component, settings: &ServeSettings) -> Result<Arc<Acces
 fn server_of(
     component: &Component,
     settings: &ServeSettings,
-    users: &Arc<Access>,
-) -> Result<Server, ServeFault> {
+    users: &Arc<UserAccess>,
+) -> Result<OpcUaServer, ServeFault> {
     let endpoint: EndpointUrl = component
         .endpoint
         .parse()
         .map_err(|error| ServeFault::Space(format!("{}: {error}", component.endpoint)))?;
     let policies = component.security.iter().map(|security| match security {
-        Security::None => Policy::None,
-        Security::Basic256Sha256 => Policy::Basic256Sha256,
+        ComponentSecurity::None => Policy::None,
+        ComponentSecurity::Basic256Sha256 => Policy::Basic256Sha256,
     });
     let config = ServerConfig {
         security: policies.collect(),
@@ -356,7 +359,11 @@ fn server_of(
 }
 
 /// Creates the object of the component, below Objects.
-fn root(server: &Server, component: &Component, ids: &mut IdRange) -> Result<Instance, ServeFault> {
+fn root(
+    server: &OpcUaServer,
+    component: &Component,
+    ids: &mut IdRange,
+) -> Result<Instance, ServeFault> {
     let space = |why: &dyn std::fmt::Display| ServeFault::Space(why.to_string());
     let controller = server
         .find_type(NAMESPACE, model::CONTROLLER_TYPE)
@@ -383,14 +390,14 @@ fn root(server: &Server, component: &Component, ids: &mut IdRange) -> Result<Ins
 }
 
 struct Made {
-    facts: Facts,
+    facts: SkillDescription,
     driver: Arc<dyn Driver>,
-    nodes: Arc<Nodes>,
+    nodes: Arc<SkillNodes>,
 }
 
 /// Creates the skills of a component. Returns them with the findings.
 fn make_all(
-    server: &Server,
+    server: &OpcUaServer,
     component: &Component,
     folder: &NodeId,
     drivers: &mut Drivers,
@@ -405,7 +412,7 @@ fn make_all(
             Err(finding) => findings.push(finding),
         }
     }
-    let parameters: Vec<(&str, &[Parameter])> = made
+    let parameters: Vec<(&str, &[SkillParameter])> = made
         .iter()
         .map(|made| (made.facts.name.as_str(), made.facts.parameters.as_slice()))
         .collect();
@@ -419,7 +426,7 @@ fn make_all(
 }
 
 /// Returns the remedy for a skill type that no NodeSet defines.
-fn help_for_type(skill_type: &TypeName) -> String {
+fn help_for_type(skill_type: &ParameterType) -> String {
     let own = skill_type.namespace == NAMESPACE;
     let names: Vec<&str> = model::TYPES.iter().map(|of| of.name).collect();
     let near = crate::yaml::nearest(&skill_type.name, names.iter().copied()).filter(|_| own);
@@ -432,38 +439,38 @@ fn help_for_type(skill_type: &TypeName) -> String {
 
 /// Creates the instance of a skill's type, and its description.
 fn make(
-    server: &Server,
-    (number, setup, workspace): (u32, &SkillSetup, Option<&Workspace>),
+    server: &OpcUaServer,
+    (number, setup, workspace): (u32, &SkillSetup, Option<&RobotWorkspace>),
     folder: &NodeId,
     drivers: &mut Drivers,
     free: &mut IdRange,
-) -> Result<Made, Finding> {
+) -> Result<Made, YamlFinding> {
     let SkillSetup {
         name,
         skill_type,
         place,
         ..
     } = setup;
-    let wrong = |code, message: String| Finding::error(code, *place, message);
+    let wrong = |code, message: String| YamlFinding::error(code, *place, message);
     let Some(type_id) = server.find_type(&skill_type.namespace, &skill_type.name) else {
         let message = format!("there is no type {skill_type}");
-        return Err(wrong(Code::SkillType, message).with_help(help_for_type(skill_type)));
+        return Err(wrong(YamlFindingCode::SkillType, message).with_help(help_for_type(skill_type)));
     };
     let types = types::chain(server, &type_id);
-    let root = TypeName::own(model::SKILL_TYPE);
+    let root = ParameterType::own(model::SKILL_TYPE);
     let Some(last) = types.iter().position(|of| *of == root) else {
         let message = format!("{skill_type} is no subtype of SkillType");
-        return Err(wrong(Code::SkillType, message));
+        return Err(wrong(YamlFindingCode::SkillType, message));
     };
-    let types: Vec<TypeName> = types.into_iter().take(last + 1).collect();
+    let types: Vec<ParameterType> = types.into_iter().take(last + 1).collect();
     let driver = drivers
         .make(&setup.driver, &types)
-        .map_err(|fault| wrong(Code::Driver, fault.to_string()))?;
+        .map_err(|fault| wrong(YamlFindingCode::Driver, fault.to_string()))?;
     let changes_tools =
-        drivers.has_tool_changer() && types.contains(&TypeName::own("ToolSkillType"));
+        drivers.has_tool_changer() && types.contains(&ParameterType::own("ToolSkillType"));
     let stated = Stated {
         grip: setup.grip_point.as_ref(),
-        workspace: workspace.filter(|_| types.contains(&TypeName::own("MotionSkillType"))),
+        workspace: workspace.filter(|_| types.contains(&ParameterType::own("MotionSkillType"))),
     };
     let first = number * IDS_PER_SKILL;
     let of_tools = changes_tools.then_some(tool::PROPERTIES).into_iter();
@@ -487,9 +494,9 @@ fn make(
     });
     let instance = made.map_err(|error| {
         let code = if matches!(error, InstanceError::Abstract(_)) {
-            Code::AbstractType
+            YamlFindingCode::AbstractType
         } else {
-            Code::SkillType
+            YamlFindingCode::SkillType
         };
         let finding = wrong(code, format!("{skill_type} has no instances: {error}"));
         finding.with_help("a subtype that is not abstract has skills")
@@ -497,9 +504,9 @@ fn make(
     if !stated.show(server, &instance) {
         let message =
             format!("`grip_point` is for skills of GraspSkillType, and this is {skill_type}");
-        return Err(wrong(Code::SkillType, message));
+        return Err(wrong(YamlFindingCode::SkillType, message));
     }
-    let facts = Facts {
+    let facts = SkillDescription {
         name: name.clone(),
         parameters: types::parameters(server, &instance, "ParameterSet", &types, |of| {
             of.parameters()
@@ -512,7 +519,7 @@ fn make(
         timeout: setup.timeout,
         rests_in: types::rests_in(server, &instance),
     };
-    let nodes = Nodes::new(server, instance, &facts);
+    let nodes = SkillNodes::new(server, instance, &facts);
     Ok(Made {
         facts,
         driver,
@@ -539,8 +546,8 @@ fn kept(path: &str) -> Option<u32> {
 
 /// Releases the leases of sessions.
 struct Leases {
-    server: Server,
-    served: Vec<(Skill, Arc<Nodes>)>,
+    server: OpcUaServer,
+    served: Vec<(Skill, Arc<SkillNodes>)>,
     authority: Authority,
 }
 
@@ -551,7 +558,7 @@ impl Leases {
         let (closed, mut told) = mpsc::channel(MOST_CLOSED);
         let authority = self.authority.clone();
         self.server.on_session_closed(move |session| {
-            authority.release(&Owner::Session(session));
+            authority.release(&SkillOwner::Session(session));
             // The queue is longer than the maximum number of sessions of the server.
             if let Err(error) = closed.try_send(session) {
                 tracing::warn!(session, "cannot process the end of a session: {error}");
@@ -562,7 +569,7 @@ impl Leases {
         loop {
             tokio::select! {
                 session = told.recv() => match session {
-                    Some(session) => self.forget(&Owner::Session(session)),
+                    Some(session) => self.forget(&SkillOwner::Session(session)),
                     None => return,
                 },
                 _ = look.tick() => if let Some(owner) = self.authority.release_idle(idle, Instant::now()) {
@@ -573,7 +580,7 @@ impl Leases {
         }
     }
 
-    fn forget(&self, owner: &Owner) {
+    fn forget(&self, owner: &SkillOwner) {
         for (skill, nodes) in &self.served {
             if skill.forget(owner) {
                 nodes.show_defaults(&self.server, skill.facts());
@@ -585,8 +592,8 @@ impl Leases {
 /// Keeps the state of the device up to date, and shows the state of a tool changer.
 fn tend(
     tasks: &mut JoinSet<()>,
-    server: &Server,
-    nodes: Vec<Arc<Nodes>>,
+    server: &OpcUaServer,
+    nodes: Vec<Arc<SkillNodes>>,
     (device, peers): (Arc<dyn crate::component::Device>, PeerAccess),
 ) {
     if let Some(state) = device.tool_changer() {
@@ -595,7 +602,11 @@ fn tend(
     tasks.spawn(async move { device.tend(&peers).await });
 }
 
-async fn show_holder(server: Server, node: NodeId, mut holder: watch::Receiver<Option<Owner>>) {
+async fn show_holder(
+    server: OpcUaServer,
+    node: NodeId,
+    mut holder: watch::Receiver<Option<SkillOwner>>,
+) {
     loop {
         let text = holder
             .borrow_and_update()

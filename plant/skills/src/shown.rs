@@ -3,18 +3,18 @@
 use std::sync::Arc;
 use std::time::SystemTime;
 
-use program::{Method, Program, State, Transition};
+use program::{ProgramInstance, ProgramMachineState, ProgramMethod, Transition};
 
-use crate::authority::Owner;
+use crate::authority::SkillOwner;
 use crate::parameters::Parameters;
-use crate::refusal::Refusal;
-use crate::value::Value;
+use crate::refusal::SkillRefusal;
+use crate::value::SkillValue;
 
 /// A snapshot of a skill. It outlives the client that started the run.
 #[derive(Debug, Clone)]
-pub struct Shown {
+pub struct SkillSnapshot {
     /// The state of the state machine.
-    pub state: State,
+    pub state: ProgramMachineState,
     /// The last transition; `None` before the first transition.
     pub last: Option<&'static Transition>,
     /// Time of the last transition; before the first, the creation time of the skill.
@@ -28,20 +28,20 @@ pub struct Shown {
     /// The parameters of the newest run.
     pub parameters: Arc<Parameters>,
     /// The outcome of the newest run that has ended.
-    pub outcome: Option<Arc<Outcome>>,
+    pub outcome: Option<Arc<RunOutcome>>,
     /// The last call and its caller.
-    pub diagnostic: Diagnostic,
+    pub diagnostic: ProgramDiagnostic,
     /// The reason why a run that is being cancelled has not ended.
     pub pending: Option<String>,
     /// Whether the outcome of the newest run is unknown: only a Reset makes the skill Ready.
     pub needs_reset: bool,
-    /// For each of [`Method::ALL`], whether a call is possible in this state.
+    /// For each of [`ProgramMethod::ALL`], whether a call is possible in this state.
     pub executable: [bool; 5],
 }
 
-impl Shown {
+impl SkillSnapshot {
     /// Returns the snapshot of a skill that was created at this time and has had no run.
-    pub(crate) fn first(program: &Program, created: SystemTime) -> Self {
+    pub(crate) fn first(program: &ProgramInstance, created: SystemTime) -> Self {
         Self {
             state: program.state(),
             last: None,
@@ -51,20 +51,20 @@ impl Shown {
             step: String::new(),
             parameters: Arc::default(),
             outcome: None,
-            diagnostic: Diagnostic {
+            diagnostic: ProgramDiagnostic {
                 created,
                 last_call: None,
             },
             pending: None,
             needs_reset: false,
-            executable: Method::ALL.map(|method| program.is_executable(method)),
+            executable: ProgramMethod::ALL.map(|method| program.is_executable(method)),
         }
     }
 }
 
 /// The end of a run.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Outcome {
+pub struct RunOutcome {
     /// The number of the run.
     pub run: u32,
     /// Whether the work was done.
@@ -74,7 +74,7 @@ pub struct Outcome {
     /// The reason of a failure, or a message.
     pub message: String,
     /// The results, in the order of the type; empty after a failure.
-    pub results: Vec<(String, Value)>,
+    pub results: Vec<(String, SkillValue)>,
     /// The steps and their parts in order, each with the seconds since the start of the run: `0.412
     /// MovePick`.
     pub trace: Vec<String>,
@@ -82,7 +82,7 @@ pub struct Outcome {
 
 /// The content of ProgramDiagnostic (OPC 10000-10, 5.2.9).
 #[derive(Debug, Clone)]
-pub struct Diagnostic {
+pub struct ProgramDiagnostic {
     /// The creation time of the skill.
     pub created: SystemTime,
     /// The last call, accepted or refused.
@@ -93,13 +93,13 @@ pub struct Diagnostic {
 #[derive(Debug, Clone)]
 pub struct LastCall {
     /// The method.
-    pub method: Method,
+    pub method: ProgramMethod,
     /// The caller.
-    pub by: Owner,
+    pub by: SkillOwner,
     /// The time of the call.
     pub at: SystemTime,
     /// The refusal, if the call was refused.
-    pub refused: Option<Refusal>,
+    pub refused: Option<SkillRefusal>,
 }
 
 /// A transition that has happened.
@@ -117,7 +117,7 @@ pub struct Transitioned {
 
 /// An event of a skill, in the order in which it happens.
 #[derive(Debug, Clone, Copy)]
-pub enum Told<'a> {
+pub enum SkillEvent<'a> {
     /// A run is about to start with these parameters; its transition follows, and then the work.
     Parameters(&'a Parameters),
     /// A transition: before the work of a run starts, or after the outcome of a run.
@@ -130,15 +130,15 @@ pub enum Told<'a> {
     /// The progress of the run has changed.
     Progress,
     /// The outcome of a run; its transition follows.
-    Outcome(&'a Outcome),
+    Outcome(&'a RunOutcome),
     /// A call was accepted or refused.
     Called,
 }
 
 /// Receives all events of a skill in order, from the task that owns the skill. It must not block.
-pub trait Observer: Send + Sync + 'static {
+pub trait SkillObserver: Send + Sync + 'static {
     /// Receives an event, after which the skill has the state `shown`.
-    fn told(&self, what: Told<'_>, shown: &Shown);
+    fn told(&self, what: SkillEvent<'_>, shown: &SkillSnapshot);
 
     /// Reports that the server of a mirrored skill is lost; no further events follow.
     fn lost(&self, why: &str) {

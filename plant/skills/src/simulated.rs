@@ -8,6 +8,6 @@ mod profile;
 
 pub use arm::{Arm, ArmSettings, Hole, Path};
 pub use base::Base;
-pub use changer::{Change, Changer};
+pub use changer::{Changer, ToolChange};
 pub use gripper::{Gripper, GripperSettings};
 pub use profile::Profile;

@@ -4,29 +4,29 @@ use std::collections::{BTreeMap, VecDeque};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
-use program::{Method, Rest, State};
+use program::{ProgramMachineState, ProgramMethod, Rest};
 use tokio::sync::{mpsc, oneshot, watch};
 use tracing::debug;
 
-use crate::actor::{Actor, Call, Given, Order, Successor};
-use crate::authority::{Authority, Owner};
-use crate::driver::{Driver, Results};
-use crate::parameters::{Parameter, Parameters, TypeName, shortened};
-use crate::refusal::{Code, Refusal};
-use crate::shown::{Observer, Outcome, Shown};
-use crate::value::Value;
+use crate::actor::{Actor, Given, Order, SkillCallRequest, Successor};
+use crate::authority::{Authority, SkillOwner};
+use crate::driver::{Driver, RunResults};
+use crate::parameters::{ParameterType, Parameters, SkillParameter, shortened};
+use crate::refusal::{RefusalCode, SkillRefusal};
+use crate::shown::{RunOutcome, SkillObserver, SkillSnapshot};
+use crate::value::SkillValue;
 
 /// The constant description of a skill.
 #[derive(Debug, Clone)]
-pub struct Facts {
+pub struct SkillDescription {
     /// The name of the skill in its component.
     pub name: String,
     /// Its type and all supertypes, nearest first.
-    pub types: Vec<TypeName>,
+    pub types: Vec<ParameterType>,
     /// The parameters of a run.
-    pub parameters: Vec<Parameter>,
+    pub parameters: Vec<SkillParameter>,
     /// The results of a run.
-    pub results: Vec<Parameter>,
+    pub results: Vec<SkillParameter>,
     /// The IRIs of the capabilities that it provides.
     pub capabilities: Vec<String>,
     /// Time limit of a run; `None` for no limit.
@@ -35,9 +35,9 @@ pub struct Facts {
     pub rests_in: Rest,
 }
 
-impl Facts {
+impl SkillDescription {
     /// Returns the results that the type declares, in the order of the type.
-    pub(crate) fn in_order(&self, results: Results) -> Results {
+    pub(crate) fn in_order(&self, results: RunResults) -> RunResults {
         let mut ordered = Vec::new();
         for declared in &self.results {
             let found = results.iter().find(|(name, _)| *name == declared.name);
@@ -55,26 +55,26 @@ impl Facts {
 /// dropped, and its run is stopped then.
 #[derive(Debug, Clone)]
 pub struct Skill {
-    facts: Arc<Facts>,
+    facts: Arc<SkillDescription>,
     authority: Authority,
-    pending: Arc<Mutex<Pending>>,
+    pending: Arc<Mutex<PendingParameters>>,
     orders: mpsc::Sender<Order>,
-    shown: watch::Receiver<Arc<Shown>>,
-    outcomes: Arc<Mutex<VecDeque<Arc<Outcome>>>>,
+    shown: watch::Receiver<Arc<SkillSnapshot>>,
+    outcomes: Arc<Mutex<VecDeque<Arc<RunOutcome>>>>,
     successor: Arc<Mutex<Option<Successor>>>,
 }
 
 /// The parameters that an owner has written for the next run. A write by another owner discards
 /// them.
 #[derive(Debug, Default)]
-pub(crate) struct Pending {
-    by: Option<Owner>,
-    values: BTreeMap<String, Value>,
+pub(crate) struct PendingParameters {
+    by: Option<SkillOwner>,
+    values: BTreeMap<String, SkillValue>,
 }
 
-impl Pending {
+impl PendingParameters {
     /// Returns the values of this owner; discards the values of another owner.
-    fn of(&mut self, by: &Owner) -> &mut BTreeMap<String, Value> {
+    fn of(&mut self, by: &SkillOwner) -> &mut BTreeMap<String, SkillValue> {
         if self.by.as_ref() != Some(by) {
             self.by = Some(by.clone());
             self.values.clear();
@@ -82,11 +82,11 @@ impl Pending {
         &mut self.values
     }
 
-    pub(crate) fn given(&mut self, by: &Owner) -> Vec<(String, Value)> {
+    pub(crate) fn given(&mut self, by: &SkillOwner) -> Vec<(String, SkillValue)> {
         self.of(by).clone().into_iter().collect()
     }
 
-    pub(crate) fn kept(&mut self, by: &Owner, values: &[(String, Value)]) {
+    pub(crate) fn kept(&mut self, by: &SkillOwner, values: &[(String, SkillValue)]) {
         *self.of(by) = values.iter().cloned().collect();
     }
 }
@@ -95,10 +95,10 @@ impl Skill {
     /// Starts a skill in the state Halted. Its first run has the number 1. Needs a tokio runtime.
     #[must_use]
     pub fn spawn(
-        facts: Facts,
+        facts: SkillDescription,
         driver: Arc<dyn Driver>,
         authority: Authority,
-        observers: Vec<Box<dyn Observer>>,
+        observers: Vec<Box<dyn SkillObserver>>,
     ) -> Self {
         Self::counting_from(1, facts, driver, authority, observers)
     }
@@ -108,13 +108,13 @@ impl Skill {
     #[must_use]
     pub fn counting_from(
         first_run: u32,
-        facts: Facts,
+        facts: SkillDescription,
         driver: Arc<dyn Driver>,
         authority: Authority,
-        observers: Vec<Box<dyn Observer>>,
+        observers: Vec<Box<dyn SkillObserver>>,
     ) -> Self {
         let facts = Arc::new(facts);
-        let pending = Arc::new(Mutex::new(Pending::default()));
+        let pending = Arc::new(Mutex::new(PendingParameters::default()));
         let outcomes = Arc::default();
         let successor = Arc::default();
         let (orders, waiting) = mpsc::channel(MOST_ORDERS);
@@ -145,26 +145,26 @@ impl Skill {
 
     /// Returns the description of the skill.
     #[must_use]
-    pub fn facts(&self) -> &Arc<Facts> {
+    pub fn facts(&self) -> &Arc<SkillDescription> {
         &self.facts
     }
 
     /// Returns the current state of the skill.
     #[must_use]
-    pub fn shown(&self) -> Arc<Shown> {
+    pub fn shown(&self) -> Arc<SkillSnapshot> {
         self.shown.borrow().clone()
     }
 
     /// Returns the state and its changes. Only the newest of rapid changes is delivered; an
-    /// [`Observer`] receives all.
+    /// [`SkillObserver`] receives all.
     #[must_use]
-    pub fn watch(&self) -> watch::Receiver<Arc<Shown>> {
+    pub fn watch(&self) -> watch::Receiver<Arc<SkillSnapshot>> {
         self.shown.clone()
     }
 
     /// Returns the outcome of a run, if it is one of the newest runs.
     #[must_use]
-    pub fn outcome(&self, run: u32) -> Option<Arc<Outcome>> {
+    pub fn outcome(&self, run: u32) -> Option<Arc<RunOutcome>> {
         lock(&self.outcomes)
             .iter()
             .find(|outcome| outcome.run == run)
@@ -177,19 +177,27 @@ impl Skill {
     /// - BadLocked
     /// - BadInvalidState during a run
     /// - BadInvalidArgument for a name that the type does not have
-    /// - As [`Parameter::take`]
-    pub fn write(&self, by: &Owner, name: &str, value: Value) -> Result<(), Refusal> {
+    /// - As [`SkillParameter::take`]
+    pub fn write(
+        &self,
+        by: &SkillOwner,
+        name: &str,
+        value: SkillValue,
+    ) -> Result<(), SkillRefusal> {
         self.authority.claim(by)?;
         let written = self.written(by, name, value);
         self.authority.settle();
         written
     }
 
-    fn written(&self, by: &Owner, name: &str, value: Value) -> Result<(), Refusal> {
+    fn written(&self, by: &SkillOwner, name: &str, value: SkillValue) -> Result<(), SkillRefusal> {
         let state = self.shown.borrow().state;
-        if matches!(state, State::Running | State::Suspended) {
+        if matches!(
+            state,
+            ProgramMachineState::Running | ProgramMachineState::Suspended
+        ) {
             let text = format!("parameters are kept while the skill is {state}");
-            return Err(Refusal::new(Code::InvalidState, text));
+            return Err(SkillRefusal::new(RefusalCode::InvalidState, text));
         }
         let parameter = self
             .facts
@@ -198,7 +206,7 @@ impl Skill {
             .find(|parameter| parameter.name == name);
         let Some(parameter) = parameter else {
             let text = format!("there is no parameter {}", shortened(name));
-            return Err(Refusal::new(Code::InvalidArgument, text));
+            return Err(SkillRefusal::new(RefusalCode::InvalidArgument, text));
         };
         let value = parameter.take(value)?;
         lock(&self.pending).of(by).insert(name.to_owned(), value);
@@ -207,11 +215,11 @@ impl Skill {
 
     /// Discards the parameters that an owner wrote, for example when its session has closed.
     /// Returns whether the owner had written any.
-    pub fn forget(&self, by: &Owner) -> bool {
+    pub fn forget(&self, by: &SkillOwner) -> bool {
         let mut pending = lock(&self.pending);
         let theirs = pending.by.as_ref() == Some(by);
         if theirs {
-            *pending = Pending::default();
+            *pending = PendingParameters::default();
         }
         theirs
     }
@@ -228,7 +236,7 @@ impl Skill {
     /// 4. BadArgumentsMissing, BadTypeMismatch or BadInvalidArgument (parameters)
     /// 5. BadInvalidState while another skill of the component runs, and BadTooManyOperations
     ///    (queue)
-    pub async fn call(&self, by: Owner, method: Method) -> Result<u32, Refusal> {
+    pub async fn call(&self, by: SkillOwner, method: ProgramMethod) -> Result<u32, SkillRefusal> {
         self.order(by, method, Given::default()).await
     }
 
@@ -238,14 +246,14 @@ impl Skill {
     /// As [`call`](Self::call).
     pub async fn start_with(
         &self,
-        by: Owner,
-        parameters: Vec<(String, Value)>,
-    ) -> Result<u32, Refusal> {
+        by: SkillOwner,
+        parameters: Vec<(String, SkillValue)>,
+    ) -> Result<u32, SkillRefusal> {
         let given = Given {
             parameters: Some(parameters),
             ..Given::default()
         };
-        self.order(by, Method::Start, given).await
+        self.order(by, ProgramMethod::Start, given).await
     }
 
     /// Starts a run with these parameters in one call; a Halted skill is reset first. The run fails
@@ -256,31 +264,31 @@ impl Skill {
     /// As [`call`](Self::call).
     pub async fn execute(
         &self,
-        by: Owner,
-        parameters: Vec<(String, Value)>,
+        by: SkillOwner,
+        parameters: Vec<(String, SkillValue)>,
         within: Option<Duration>,
-    ) -> Result<u32, Refusal> {
+    ) -> Result<u32, SkillRefusal> {
         let given = Given {
             parameters: Some(parameters),
             within,
             readies: true,
         };
-        self.order(by, Method::Start, given).await
+        self.order(by, ProgramMethod::Start, given).await
     }
 
     /// Returns the outcome of a run; `None` while it is in progress. Run 0 is the newest run.
     ///
     /// # Errors
     /// BadNotFound if the run does not exist or its outcome is no longer kept.
-    pub fn outcome_of(&self, run: u32) -> Result<Option<Arc<Outcome>>, Refusal> {
+    pub fn outcome_of(&self, run: u32) -> Result<Option<Arc<RunOutcome>>, SkillRefusal> {
         // The number is read before the outcome, so that a run that ends meanwhile is found.
         let newest = self.shown.borrow().run;
         let run = if run == 0 { newest } else { run };
         match self.outcome(run) {
             Some(outcome) => Ok(Some(outcome)),
             None if run == newest && run != 0 => Ok(None),
-            None => Err(Refusal::new(
-                Code::NotFound,
+            None => Err(SkillRefusal::new(
+                RefusalCode::NotFound,
                 format!("nothing is known of run {run}; the newest is {newest}"),
             )),
         }
@@ -296,7 +304,12 @@ impl Skill {
         }
     }
 
-    async fn order(&self, by: Owner, method: Method, given: Given) -> Result<u32, Refusal> {
+    async fn order(
+        &self,
+        by: SkillOwner,
+        method: ProgramMethod,
+        given: Given,
+    ) -> Result<u32, SkillRefusal> {
         let (reply, answer) = oneshot::channel();
         let room = match self.orders.try_reserve() {
             Ok(room) => room,
@@ -305,7 +318,7 @@ impl Skill {
             }
             Err(mpsc::error::TrySendError::Closed(())) => return Err(ends()),
         };
-        room.send(Order::Call(Call {
+        room.send(Order::Call(SkillCallRequest {
             by,
             method,
             given,
@@ -316,23 +329,23 @@ impl Skill {
 
     /// Returns the refusal of a call for which the queue has no space. Errors that do not depend on
     /// the queue come first.
-    fn no_room(&self, by: &Owner, given: Option<Vec<(String, Value)>>) -> Refusal {
+    fn no_room(&self, by: &SkillOwner, given: Option<Vec<(String, SkillValue)>>) -> SkillRefusal {
         if let Err(refusal) = self.authority.allows(by) {
             return refusal;
         }
         let wrong =
             given.and_then(|given| Parameters::complete(&self.facts.parameters, given).err());
         wrong.unwrap_or_else(|| {
-            Refusal::new(
-                Code::TooManyOperations,
+            SkillRefusal::new(
+                RefusalCode::TooManyOperations,
                 "too many calls of this skill wait already",
             )
         })
     }
 }
 
-fn ends() -> Refusal {
-    Refusal::new(Code::Shutdown, "the component ends")
+fn ends() -> SkillRefusal {
+    SkillRefusal::new(RefusalCode::Shutdown, "the component ends")
 }
 
 pub(crate) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {

@@ -69,14 +69,14 @@ impl Builtin {
 
 /// A builtin type and its rank: a scalar, or an array of one dimension.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub struct Shape {
+pub struct ValueShape {
     /// The type of the value or of each element.
     pub builtin: Builtin,
     /// Whether it is an array.
     pub array: bool,
 }
 
-impl Shape {
+impl ValueShape {
     /// Returns the shape of a scalar.
     #[must_use]
     pub const fn scalar(builtin: Builtin) -> Self {
@@ -99,7 +99,7 @@ impl Shape {
     ///
     /// # Errors
     /// The expected type, as text for people. Numbers are never rounded or truncated.
-    pub fn read_json(self, json: &Json) -> Result<Value, String> {
+    pub fn read_json(self, json: &Json) -> Result<SkillValue, String> {
         if !self.array {
             return scalar_of_json(self.builtin, json);
         }
@@ -109,7 +109,7 @@ impl Shape {
         let elements = elements
             .iter()
             .map(|element| scalar_of_json(self.builtin, element));
-        Ok(Value::Array(
+        Ok(SkillValue::Array(
             self.builtin,
             elements.collect::<Result<_, _>>()?,
         ))
@@ -118,26 +118,29 @@ impl Shape {
     /// Converts a value to this shape if that is possible without loss: the same type, or a number
     /// in a wider type.
     #[must_use]
-    pub fn take(self, value: Value) -> Option<Value> {
+    pub fn take(self, value: SkillValue) -> Option<SkillValue> {
         if value.shape() == self {
             return Some(value);
         }
-        if let Value::Array(_, elements) = value {
+        if let SkillValue::Array(_, elements) = value {
             let one = Self::scalar(self.builtin);
             let elements = elements.into_iter().map(|element| one.take(element));
             return match self.array {
-                true => Some(Value::Array(self.builtin, elements.collect::<Option<_>>()?)),
+                true => Some(SkillValue::Array(
+                    self.builtin,
+                    elements.collect::<Option<_>>()?,
+                )),
                 false => None,
             };
         }
-        if self.array || matches!(value, Value::String(_) | Value::Boolean(_)) {
+        if self.array || matches!(value, SkillValue::String(_) | SkillValue::Boolean(_)) {
             return None;
         }
         scalar_of_json(self.builtin, &value.to_json()).ok()
     }
 }
 
-impl fmt::Display for Shape {
+impl fmt::Display for ValueShape {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(self.builtin.name())?;
         f.write_str(if self.array { "[]" } else { "" })
@@ -146,7 +149,7 @@ impl fmt::Display for Shape {
 
 /// A value of a builtin type, or an array of such values.
 #[derive(Debug, Clone, PartialEq)]
-pub enum Value {
+pub enum SkillValue {
     /// true or false
     Boolean(bool),
     /// 8 bits with a sign
@@ -175,10 +178,10 @@ pub enum Value {
     Array(Builtin, Vec<Self>),
 }
 
-impl Value {
+impl SkillValue {
     /// Returns the type of the value.
     #[must_use]
-    pub fn shape(&self) -> Shape {
+    pub fn shape(&self) -> ValueShape {
         let builtin = match self {
             Self::Boolean(_) => Builtin::Boolean,
             Self::SByte(_) => Builtin::SByte,
@@ -192,9 +195,9 @@ impl Value {
             Self::Float(_) => Builtin::Float,
             Self::Double(_) => Builtin::Double,
             Self::String(_) => Builtin::String,
-            Self::Array(builtin, _) => return Shape::array(*builtin),
+            Self::Array(builtin, _) => return ValueShape::array(*builtin),
         };
-        Shape::scalar(builtin)
+        ValueShape::scalar(builtin)
     }
 
     /// Converts the value to JSON. Numbers that JSON does not have are the texts `NaN`, `Infinity`
@@ -291,7 +294,7 @@ impl Value {
 }
 
 /// Writes the value as JSON.
-impl fmt::Display for Value {
+impl fmt::Display for SkillValue {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "{}", self.to_json())
     }
@@ -299,7 +302,7 @@ impl fmt::Display for Value {
 
 macro_rules! from {
     ($($type:ty => $variant:ident),* $(,)?) => {$(
-        impl From<$type> for Value {
+        impl From<$type> for SkillValue {
             fn from(value: $type) -> Self {
                 Self::$variant(value.into())
             }
@@ -309,7 +312,7 @@ macro_rules! from {
 
 from! { bool => Boolean, i32 => Int32, u32 => UInt32, f32 => Float, f64 => Double, String => String, &str => String }
 
-impl From<Vec<f64>> for Value {
+impl From<Vec<f64>> for SkillValue {
     fn from(values: Vec<f64>) -> Self {
         Self::Array(
             Builtin::Double,
@@ -318,7 +321,7 @@ impl From<Vec<f64>> for Value {
     }
 }
 
-impl From<[f64; 6]> for Value {
+impl From<[f64; 6]> for SkillValue {
     fn from(values: [f64; 6]) -> Self {
         values.to_vec().into()
     }
@@ -333,22 +336,30 @@ fn real(value: f64) -> Json {
     }
 }
 
-fn scalar_of_json(builtin: Builtin, json: &Json) -> Result<Value, String> {
+fn scalar_of_json(builtin: Builtin, json: &Json) -> Result<SkillValue, String> {
     let whole = json.as_i64();
     let natural = json.as_u64();
     let value = match builtin {
-        Builtin::Boolean => json.as_bool().map(Value::Boolean),
-        Builtin::SByte => whole.and_then(|n| n.try_into().ok()).map(Value::SByte),
-        Builtin::Byte => natural.and_then(|n| n.try_into().ok()).map(Value::Byte),
-        Builtin::Int16 => whole.and_then(|n| n.try_into().ok()).map(Value::Int16),
-        Builtin::UInt16 => natural.and_then(|n| n.try_into().ok()).map(Value::UInt16),
-        Builtin::Int32 => whole.and_then(|n| n.try_into().ok()).map(Value::Int32),
-        Builtin::UInt32 => natural.and_then(|n| n.try_into().ok()).map(Value::UInt32),
-        Builtin::Int64 => whole.map(Value::Int64),
-        Builtin::UInt64 => natural.map(Value::UInt64),
-        Builtin::Float => real_of_json(json).and_then(narrow).map(Value::Float),
-        Builtin::Double => real_of_json(json).map(Value::Double),
-        Builtin::String => json.as_str().map(|text| Value::String(text.to_owned())),
+        Builtin::Boolean => json.as_bool().map(SkillValue::Boolean),
+        Builtin::SByte => whole.and_then(|n| n.try_into().ok()).map(SkillValue::SByte),
+        Builtin::Byte => natural
+            .and_then(|n| n.try_into().ok())
+            .map(SkillValue::Byte),
+        Builtin::Int16 => whole.and_then(|n| n.try_into().ok()).map(SkillValue::Int16),
+        Builtin::UInt16 => natural
+            .and_then(|n| n.try_into().ok())
+            .map(SkillValue::UInt16),
+        Builtin::Int32 => whole.and_then(|n| n.try_into().ok()).map(SkillValue::Int32),
+        Builtin::UInt32 => natural
+            .and_then(|n| n.try_into().ok())
+            .map(SkillValue::UInt32),
+        Builtin::Int64 => whole.map(SkillValue::Int64),
+        Builtin::UInt64 => natural.map(SkillValue::UInt64),
+        Builtin::Float => real_of_json(json).and_then(narrow).map(SkillValue::Float),
+        Builtin::Double => real_of_json(json).map(SkillValue::Double),
+        Builtin::String => json
+            .as_str()
+            .map(|text| SkillValue::String(text.to_owned())),
     };
     value.ok_or_else(|| format!("expected {}, found {}", builtin.name(), shown(json)))
 }
@@ -390,16 +401,16 @@ mod tests {
     #[test]
     fn a_value_is_the_same_after_its_way_through_json() {
         let values = [
-            Value::from(true),
-            Value::SByte(-7),
-            Value::UInt64(u64::MAX),
-            Value::Int64(i64::MIN),
-            Value::Float(0.1),
-            Value::from(1.5),
-            Value::from("ja \"so\""),
-            Value::from([0.1, 0.2, 0.3, 0.0, -1.5, 1e300]),
-            Value::Array(Builtin::String, Vec::new()),
-            Value::from(f64::INFINITY),
+            SkillValue::from(true),
+            SkillValue::SByte(-7),
+            SkillValue::UInt64(u64::MAX),
+            SkillValue::Int64(i64::MIN),
+            SkillValue::Float(0.1),
+            SkillValue::from(1.5),
+            SkillValue::from("ja \"so\""),
+            SkillValue::from([0.1, 0.2, 0.3, 0.0, -1.5, 1e300]),
+            SkillValue::Array(Builtin::String, Vec::new()),
+            SkillValue::from(f64::INFINITY),
         ];
         for value in values {
             assert_eq!(value.shape().read_json(&value.to_json()), Ok(value));
@@ -409,13 +420,13 @@ mod tests {
     #[test]
     fn numbers_that_do_not_fit_are_refused_and_never_cut() {
         let read = |builtin, text: &str| {
-            Shape::scalar(builtin).read_json(&serde_json::from_str(text).unwrap())
+            ValueShape::scalar(builtin).read_json(&serde_json::from_str(text).unwrap())
         };
         assert!(read(Builtin::Byte, "256").is_err());
         assert!(read(Builtin::UInt16, "-1").is_err());
         assert!(read(Builtin::Int32, "1.5").is_err());
         assert!(read(Builtin::Float, "1e300").is_err());
-        assert_eq!(read(Builtin::Double, "3"), Ok(Value::Double(3.0)));
+        assert_eq!(read(Builtin::Double, "3"), Ok(SkillValue::Double(3.0)));
         assert_eq!(
             read(Builtin::Boolean, "1"),
             Err("expected Boolean, found 1".to_owned())
@@ -424,13 +435,19 @@ mod tests {
 
     #[test]
     fn a_narrower_number_is_taken_where_a_wider_one_is_wanted() {
-        let double = Shape::scalar(Builtin::Double);
-        assert_eq!(double.take(Value::Float(0.5)), Some(Value::Double(0.5)));
-        assert_eq!(double.take(Value::from("0.5")), None);
-        assert_eq!(double.take(Value::from(vec![0.5])), None);
-        let doubles = Shape::array(Builtin::Double);
-        let floats = Value::Array(Builtin::Float, vec![Value::Float(0.5)]);
-        assert_eq!(doubles.take(floats), Some(Value::from(vec![0.5])));
-        assert_eq!(Shape::scalar(Builtin::Byte).take(Value::Int32(300)), None);
+        let double = ValueShape::scalar(Builtin::Double);
+        assert_eq!(
+            double.take(SkillValue::Float(0.5)),
+            Some(SkillValue::Double(0.5))
+        );
+        assert_eq!(double.take(SkillValue::from("0.5")), None);
+        assert_eq!(double.take(SkillValue::from(vec![0.5])), None);
+        let doubles = ValueShape::array(Builtin::Double);
+        let floats = SkillValue::Array(Builtin::Float, vec![SkillValue::Float(0.5)]);
+        assert_eq!(doubles.take(floats), Some(SkillValue::from(vec![0.5])));
+        assert_eq!(
+            ValueShape::scalar(Builtin::Byte).take(SkillValue::Int32(300)),
+            None
+        );
     }
 }

@@ -1,8 +1,8 @@
 //! Values of a component: variables that a sensor measures or that are computed from the runs of
 //! its skills.
 //!
-//! A [`Sensor`] measures until an error occurs; [`watch`] restarts it with growing pauses. The
-//! newest [`Reading`] of each value is kept: a number with the time of the measurement, or the
+//! A [`ValueSensor`] measures until an error occurs; [`watch`] restarts it with growing pauses. The
+//! newest [`NewestState`] of each value is kept: a number with the time of the measurement, or the
 //! reason why it is unknown.
 
 mod statistics;
@@ -18,7 +18,7 @@ use tokio::sync::watch;
 use tokio::time::{Instant, sleep};
 
 pub use self::statistics::{Measure, Statistics, Tally};
-use crate::value::{Shape, Value};
+use crate::value::{SkillValue, ValueShape};
 
 /// The constant description of a value.
 #[derive(Debug, Clone, PartialEq)]
@@ -26,7 +26,7 @@ pub struct ValueFacts {
     /// The name of the value in its component.
     pub name: String,
     /// Type and rank.
-    pub shape: Shape,
+    pub shape: ValueShape,
     /// The symbol of the unit, as `mbar`.
     pub unit: Option<String>,
     /// The lowest and the highest expected value of a number.
@@ -41,7 +41,7 @@ pub struct DeviceValue {
     /// The name.
     pub name: &'static str,
     /// Type and rank.
-    pub shape: Shape,
+    pub shape: ValueShape,
     /// The symbol of the unit.
     pub unit: Option<&'static str>,
     /// The lowest and the highest value.
@@ -52,7 +52,7 @@ pub struct DeviceValue {
 
 /// A source of values outside of the component.
 #[async_trait]
-pub trait Sensor: Debug + Send + Sync + 'static {
+pub trait ValueSensor: Debug + Send + Sync + 'static {
     /// Measures until an error occurs, about once in `period`. Each measurement is passed to `out`.
     /// Returns the reason why there are no further measurements, as text for people.
     async fn measure(&self, period: Duration, out: &Measured) -> String;
@@ -68,9 +68,9 @@ pub trait Sensor: Debug + Send + Sync + 'static {
 
 /// The newest state of a value.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Reading {
+pub struct NewestState {
     /// The value, or the reason why it is unknown.
-    pub value: Result<Value, String>,
+    pub value: Result<SkillValue, String>,
     /// Time of the measurement, or of the loss.
     pub at: SystemTime,
 }
@@ -79,7 +79,7 @@ pub struct Reading {
 #[derive(Debug, Clone)]
 pub struct LiveValue {
     facts: Arc<ValueFacts>,
-    reading: watch::Receiver<Reading>,
+    reading: watch::Receiver<NewestState>,
 }
 
 impl LiveValue {
@@ -91,13 +91,13 @@ impl LiveValue {
 
     /// Returns the newest reading.
     #[must_use]
-    pub fn reading(&self) -> Reading {
+    pub fn reading(&self) -> NewestState {
         self.reading.borrow().clone()
     }
 
     /// Returns the readings. Only the newest of rapid changes is delivered.
     #[must_use]
-    pub fn watch(&self) -> watch::Receiver<Reading> {
+    pub fn watch(&self) -> watch::Receiver<NewestState> {
         self.reading.clone()
     }
 }
@@ -115,13 +115,13 @@ struct Slot {
     /// The name of the value at its source.
     key: String,
     facts: Arc<ValueFacts>,
-    reading: watch::Sender<Reading>,
+    reading: watch::Sender<NewestState>,
 }
 
 impl Measured {
     /// Adds a value, which has the name `key` at the source.
     pub fn add(&mut self, key: &str, facts: &Arc<ValueFacts>) -> LiveValue {
-        let first = Reading {
+        let first = NewestState {
             value: Err(NOT_MEASURED.to_owned()),
             at: now(),
         };
@@ -151,7 +151,7 @@ impl Measured {
     }
 
     /// Takes a measured value, or the reason why it is unknown. Other names are ignored.
-    pub fn put(&self, key: &str, value: Result<Value, String>) {
+    pub fn put(&self, key: &str, value: Result<SkillValue, String>) {
         self.touch();
         for slot in self.slots.iter().filter(|slot| slot.key == key) {
             slot.put(value.clone());
@@ -179,7 +179,7 @@ impl Measured {
     }
 
     /// Takes the value of a source with a single value.
-    pub fn put_single(&self, value: Result<Value, String>) {
+    pub fn put_single(&self, value: Result<SkillValue, String>) {
         self.touch();
         for slot in &self.slots {
             slot.put(value.clone());
@@ -219,7 +219,7 @@ impl Slot {
         });
     }
 
-    fn put(&self, value: Result<Value, String>) {
+    fn put(&self, value: Result<SkillValue, String>) {
         let shape = self.facts.shape;
         let value = value.and_then(|value| {
             let found = value.shape();
@@ -230,7 +230,7 @@ impl Slot {
             // A lost value keeps the time of its loss.
             let is_new = reading.value != value || value.is_ok();
             if is_new {
-                *reading = Reading { value, at: now() };
+                *reading = NewestState { value, at: now() };
             }
             is_new
         });
@@ -240,7 +240,7 @@ impl Slot {
 /// Measures as long as the future is polled. A sensor that fails is started again after a pause,
 /// which grows while it fails. A changed period starts it again at once.
 pub(crate) async fn watch(
-    sensor: Arc<dyn Sensor>,
+    sensor: Arc<dyn ValueSensor>,
     mut periods: watch::Receiver<Duration>,
     out: Measured,
 ) {
@@ -315,7 +315,7 @@ mod tests {
     fn facts(name: &str, builtin: Builtin) -> Arc<ValueFacts> {
         Arc::new(ValueFacts {
             name: name.to_owned(),
-            shape: Shape::scalar(builtin),
+            shape: ValueShape::scalar(builtin),
             unit: None,
             range: None,
             about: String::new(),
@@ -330,7 +330,7 @@ mod tests {
     }
 
     #[async_trait]
-    impl Sensor for Counter {
+    impl ValueSensor for Counter {
         async fn measure(&self, _period: Duration, out: &Measured) -> String {
             loop {
                 self.permits.acquire().await.unwrap().forget();
@@ -353,7 +353,7 @@ mod tests {
     struct Silent;
 
     #[async_trait]
-    impl Sensor for Silent {
+    impl ValueSensor for Silent {
         async fn measure(&self, _period: Duration, _out: &Measured) -> String {
             std::future::pending().await
         }
@@ -390,10 +390,10 @@ mod tests {
             seen.push(watch_value.borrow_and_update().value.clone());
         }
         let expected = [
-            Ok(Value::UInt32(1)),
-            Ok(Value::UInt32(2)),
+            Ok(SkillValue::UInt32(1)),
+            Ok(SkillValue::UInt32(2)),
             Err("unplugged".to_owned()),
-            Ok(Value::UInt32(4)),
+            Ok(SkillValue::UInt32(4)),
         ];
         assert_eq!(seen, expected);
         task.abort();
@@ -421,8 +421,8 @@ mod tests {
     fn a_value_of_another_type_is_refused_and_a_wider_number_is_taken() {
         let mut out = Measured::default();
         let level = out.add("", &facts("Level", Builtin::Double));
-        out.put_single(Ok(Value::Float(0.5)));
-        assert_eq!(level.reading().value, Ok(Value::Double(0.5)));
+        out.put_single(Ok(SkillValue::Float(0.5)));
+        assert_eq!(level.reading().value, Ok(SkillValue::Double(0.5)));
         out.put_single(Ok("full".into()));
         let refused = "the source gives String, and the value is Double".to_owned();
         assert_eq!(level.reading().value, Err(refused));

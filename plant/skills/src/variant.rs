@@ -3,24 +3,24 @@
 use plant_opcua::types::{Array, NodeId, UAString, Variant, VariantScalarTypeId};
 
 use crate::client::packed::frame;
-use crate::value::{Builtin, Value};
+use crate::value::{Builtin, SkillValue};
 
 /// Converts a value to a Variant.
-pub fn to_variant(value: &Value) -> Variant {
+pub fn to_variant(value: &SkillValue) -> Variant {
     match value {
-        Value::Boolean(value) => Variant::Boolean(*value),
-        Value::SByte(value) => Variant::SByte(*value),
-        Value::Byte(value) => Variant::Byte(*value),
-        Value::Int16(value) => Variant::Int16(*value),
-        Value::UInt16(value) => Variant::UInt16(*value),
-        Value::Int32(value) => Variant::Int32(*value),
-        Value::UInt32(value) => Variant::UInt32(*value),
-        Value::Int64(value) => Variant::Int64(*value),
-        Value::UInt64(value) => Variant::UInt64(*value),
-        Value::Float(value) => Variant::Float(*value),
-        Value::Double(value) => Variant::Double(*value),
-        Value::String(value) => Variant::String(UAString::from(value.as_str())),
-        Value::Array(builtin, elements) => {
+        SkillValue::Boolean(value) => Variant::Boolean(*value),
+        SkillValue::SByte(value) => Variant::SByte(*value),
+        SkillValue::Byte(value) => Variant::Byte(*value),
+        SkillValue::Int16(value) => Variant::Int16(*value),
+        SkillValue::UInt16(value) => Variant::UInt16(*value),
+        SkillValue::Int32(value) => Variant::Int32(*value),
+        SkillValue::UInt32(value) => Variant::UInt32(*value),
+        SkillValue::Int64(value) => Variant::Int64(*value),
+        SkillValue::UInt64(value) => Variant::UInt64(*value),
+        SkillValue::Float(value) => Variant::Float(*value),
+        SkillValue::Double(value) => Variant::Double(*value),
+        SkillValue::String(value) => Variant::String(UAString::from(value.as_str())),
+        SkillValue::Array(builtin, elements) => {
             let values = elements.iter().map(to_variant).collect();
             Variant::Array(Box::new(Array {
                 value_type: scalar_type(*builtin),
@@ -32,7 +32,7 @@ pub fn to_variant(value: &Value) -> Variant {
 }
 
 /// Returns names and values as two arrays, as the arguments of methods have them.
-pub(crate) fn to_pairs(of: &[(String, Value)]) -> [Variant; 2] {
+pub(crate) fn to_pairs(of: &[(String, SkillValue)]) -> [Variant; 2] {
     let array = |value_type, values| {
         Variant::Array(Box::new(Array {
             value_type,
@@ -53,7 +53,7 @@ pub(crate) fn to_pairs(of: &[(String, Value)]) -> [Variant; 2] {
 }
 
 /// Reads pairs from two arrays; `None` if their lengths differ or a value is not supported.
-pub(crate) fn from_pairs(names: &Variant, values: &Variant) -> Option<Vec<(String, Value)>> {
+pub(crate) fn from_pairs(names: &Variant, values: &Variant) -> Option<Vec<(String, SkillValue)>> {
     let elements = |of: &Variant| {
         if let Variant::Array(array) = of {
             return Some(array.values.clone());
@@ -81,20 +81,20 @@ pub(crate) fn from_pairs(names: &Variant, values: &Variant) -> Option<Vec<(Strin
     clippy::wildcard_enum_match_arm,
     reason = "of the types of OPC UA those that a skill can be told in are named"
 )]
-pub fn from_variant(variant: &Variant) -> Option<Value> {
+pub fn from_variant(variant: &Variant) -> Option<SkillValue> {
     Some(match variant {
-        Variant::Boolean(value) => Value::Boolean(*value),
-        Variant::SByte(value) => Value::SByte(*value),
-        Variant::Byte(value) => Value::Byte(*value),
-        Variant::Int16(value) => Value::Int16(*value),
-        Variant::UInt16(value) => Value::UInt16(*value),
-        Variant::Int32(value) => Value::Int32(*value),
-        Variant::UInt32(value) => Value::UInt32(*value),
-        Variant::Int64(value) => Value::Int64(*value),
-        Variant::UInt64(value) => Value::UInt64(*value),
-        Variant::Float(value) => Value::Float(*value),
-        Variant::Double(value) => Value::Double(*value),
-        Variant::String(value) => Value::String(value.as_ref().to_owned()),
+        Variant::Boolean(value) => SkillValue::Boolean(*value),
+        Variant::SByte(value) => SkillValue::SByte(*value),
+        Variant::Byte(value) => SkillValue::Byte(*value),
+        Variant::Int16(value) => SkillValue::Int16(*value),
+        Variant::UInt16(value) => SkillValue::UInt16(*value),
+        Variant::Int32(value) => SkillValue::Int32(*value),
+        Variant::UInt32(value) => SkillValue::UInt32(*value),
+        Variant::Int64(value) => SkillValue::Int64(*value),
+        Variant::UInt64(value) => SkillValue::UInt64(*value),
+        Variant::Float(value) => SkillValue::Float(*value),
+        Variant::Double(value) => SkillValue::Double(*value),
+        Variant::String(value) => SkillValue::String(value.as_ref().to_owned()),
         Variant::Array(array) => {
             if array
                 .dimensions
@@ -107,10 +107,10 @@ pub fn from_variant(variant: &Variant) -> Option<Value> {
                 .iter()
                 .copied()
                 .find(|one| scalar_type(*one) == array.value_type)?;
-            let elements: Option<Vec<Value>> = array.values.iter().map(from_variant).collect();
+            let elements: Option<Vec<SkillValue>> = array.values.iter().map(from_variant).collect();
             let elements =
                 elements.filter(|all| all.iter().all(|one| one.shape().builtin == builtin))?;
-            Value::Array(builtin, elements)
+            SkillValue::Array(builtin, elements)
         }
         Variant::ExtensionObject(_) => return frame(variant),
         _ => return None,
@@ -151,11 +151,11 @@ mod tests {
     #[test]
     fn a_value_is_the_same_after_its_way_through_opc_ua() {
         for value in [
-            Value::from(true),
-            Value::UInt16(65_535),
-            Value::from("x"),
-            Value::from([0.5; 6]),
-            Value::Array(Builtin::String, Vec::new()),
+            SkillValue::from(true),
+            SkillValue::UInt16(65_535),
+            SkillValue::from("x"),
+            SkillValue::from([0.5; 6]),
+            SkillValue::Array(Builtin::String, Vec::new()),
         ] {
             assert_eq!(from_variant(&to_variant(&value)), Some(value));
         }
@@ -173,7 +173,7 @@ mod tests {
             },
         };
         let frame = Variant::from(ExtensionObject::from_message(frame));
-        let six = Value::from([0.1, 0.2, 0.3, 1.0, 2.0, 3.0]);
+        let six = SkillValue::from([0.1, 0.2, 0.3, 1.0, 2.0, 3.0]);
         assert_eq!(from_variant(&frame), Some(six));
         let range = Range {
             low: 0.0,
@@ -193,7 +193,7 @@ mod tests {
     #[test]
     fn pairs_are_the_same_after_their_way_and_others_are_none() {
         let all = vec![
-            ("Force".to_owned(), Value::from(0.5)),
+            ("Force".to_owned(), SkillValue::from(0.5)),
             ("Target".to_owned(), [0.5; 6].into()),
         ];
         let [names, values] = to_pairs(&all);

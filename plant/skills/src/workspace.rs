@@ -4,14 +4,14 @@ use std::sync::Arc;
 
 use async_trait::async_trait;
 
-use crate::driver::{Driver, Results, Work};
+use crate::driver::{Driver, RunResults, Work};
 use crate::driver_error::{DriverError, InvalidParameter};
-use crate::parameters::{Parameter, Parameters};
-use crate::value::Value;
+use crate::parameters::{Parameters, SkillParameter};
+use crate::value::SkillValue;
 
 /// The positions that a robot reaches.
 #[derive(Debug, Clone, PartialEq, Default)]
-pub struct Workspace {
+pub struct RobotWorkspace {
     /// The largest distance from the base, m; `None` for no limit.
     pub reach: Option<f64>,
     /// The zones of the robot; empty for no limit.
@@ -56,7 +56,7 @@ fn metres([x, y, z]: [f64; 3]) -> String {
     format!("{x:.3}, {y:.3}, {z:.3} m")
 }
 
-impl Workspace {
+impl RobotWorkspace {
     /// Checks that a position is within the reach and in a zone.
     ///
     /// # Errors
@@ -99,7 +99,7 @@ impl Workspace {
     /// [`InvalidParameter::OutOfWorkspace`].
     pub fn allows_target<'p>(
         &self,
-        mut parameters: impl Iterator<Item = &'p (String, Value)>,
+        mut parameters: impl Iterator<Item = &'p (String, SkillValue)>,
     ) -> Result<(), InvalidParameter> {
         let target = parameters.find(|(name, _)| name == TARGET);
         let target = target.and_then(|(_, value)| value.as_f64s());
@@ -151,7 +151,7 @@ impl Workspace {
 
 /// A driver of moves within a workspace.
 struct Bounded {
-    workspace: Arc<Workspace>,
+    workspace: Arc<RobotWorkspace>,
     driver: Arc<dyn Driver>,
 }
 
@@ -172,9 +172,9 @@ impl Driver for Bounded {
 
     fn prepared(
         &self,
-        declared: &[Parameter],
-        given: Vec<(String, Value)>,
-    ) -> Vec<(String, Value)> {
+        declared: &[SkillParameter],
+        given: Vec<(String, SkillValue)>,
+    ) -> Vec<(String, SkillValue)> {
         self.driver.prepared(declared, given)
     }
 
@@ -182,7 +182,7 @@ impl Driver for Bounded {
         self.driver.uses()
     }
 
-    async fn run(&self, work: Work) -> Result<Results, DriverError> {
+    async fn run(&self, work: Work) -> Result<RunResults, DriverError> {
         self.driver.run(work).await
     }
 }
@@ -201,7 +201,7 @@ mod tests {
             low,
             high,
         };
-        let workspace = Workspace {
+        let workspace = RobotWorkspace {
             reach: Some(1.0),
             zones: vec![
                 zone("table", [0.2, -0.5, 0.0], [0.8, 0.5, 0.4]),
@@ -209,7 +209,7 @@ mod tests {
             ],
         };
         let names = workspace.zones.iter().map(|zone| zone.name.clone());
-        let read = Workspace::of(Some(1.0), names.collect(), &workspace.bounds());
+        let read = RobotWorkspace::of(Some(1.0), names.collect(), &workspace.bounds());
         assert_eq!(read, workspace);
         for (position, expected) in [
             ([0.4, 0.2, 0.1], ""),
@@ -230,9 +230,9 @@ mod tests {
                 "{why}"
             );
         }
-        let target = [("TargetPosition".to_owned(), Value::from([2.0; 6]))];
+        let target = [("TargetPosition".to_owned(), SkillValue::from([2.0; 6]))];
         let why = workspace.allows_target(target.iter()).unwrap_err();
         assert!(why.to_string().starts_with("TargetPosition: "), "{why}");
-        assert_eq!(Workspace::default().allows([9.0, 0.0, 0.0]), Ok(()));
+        assert_eq!(RobotWorkspace::default().allows([9.0, 0.0, 0.0]), Ok(()));
     }
 }

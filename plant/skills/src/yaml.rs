@@ -1,7 +1,7 @@
 //! Reads YAML that people write. All errors are reported together, with their locations.
 //!
-//! [`parse`] builds a tree of nodes with locations. [`Reader`] reads values from it and adds errors
-//! to [`Findings`]. Anchors, aliases and tags are not supported.
+//! [`parse`] builds a tree of nodes with locations. [`YamlReader`] reads values from it and adds
+//! errors to [`Findings`]. Anchors, aliases and tags are not supported.
 
 mod findings;
 mod read;
@@ -9,6 +9,6 @@ mod tree;
 
 pub use documents::SourceSpan as Place;
 pub(crate) use documents::nearest;
-pub use findings::{Code, Finding, Findings};
-pub use read::Reader;
-pub use tree::{Kind, Node, parse};
+pub use findings::{Findings, YamlFinding, YamlFindingCode};
+pub use read::YamlReader;
+pub use tree::{DocumentKind, DocumentNode, parse};

@@ -5,7 +5,7 @@
 
 use std::{env, error::Error, fs};
 
-use messages::{Dialect, Registry};
+use messages::{Dialect, TypeRegistry};
 
 fn main() -> Result<(), Box<dyn Error>> {
     let mut arguments = env::args().skip(1);
@@ -16,7 +16,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         _ => return Err(usage.into()),
     };
     let name = arguments.next().ok_or(usage)?.parse()?;
-    let mut registry = Registry::bundle(dialect);
+    let mut registry = TypeRegistry::bundle(dialect);
     if let Some(file) = arguments.next() {
         registry.add(&name, &fs::read_to_string(file)?)?;
     }

@@ -3,8 +3,8 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use crate::definition::Definition;
-use crate::resolve::Resolver;
+use crate::definition::MessageDefinition;
+use crate::resolve::TypeResolver;
 use crate::service::{ServiceDefinition, derived};
 use crate::{DefinitionError, Dialect, MessageType, ServiceType, TypeName};
 
@@ -27,7 +27,7 @@ pub struct ActionCalls {
 impl ActionCalls {
     pub(crate) fn of(
         (dialect, name): (Dialect, &TypeName),
-        definitions: &BTreeMap<TypeName, Arc<Definition>>,
+        definitions: &BTreeMap<TypeName, Arc<MessageDefinition>>,
     ) -> Result<Self, DefinitionError> {
         let x = name.name();
         let time = match dialect {
@@ -38,15 +38,15 @@ impl ActionCalls {
             let service = ServiceDefinition::parse(dialect, name, text)?;
             let own = service.messages();
             let sets = [&own, definitions];
-            let mut resolver = Resolver::new(dialect, &sets);
+            let mut resolver = TypeResolver::new(dialect, &sets);
             service.resolve(name, &mut resolver).map(Arc::new)
         };
         let message = |suffix, text: &str| {
             let name = derived(name, suffix)?;
-            let definition = Arc::new(Definition::parse(dialect, &name, text)?);
+            let definition = Arc::new(MessageDefinition::parse(dialect, &name, text)?);
             let own = BTreeMap::from([(name.clone(), definition)]);
             let sets = [&own, definitions];
-            let mut resolver = Resolver::new(dialect, &sets);
+            let mut resolver = TypeResolver::new(dialect, &sets);
             resolver.message_type(&name, None).map(Arc::new)
         };
         let goal =
@@ -147,7 +147,7 @@ mod tests {
     use super::reason_of;
     use uadp::BuiltinType;
 
-    use crate::{ActionCalls, Dialect, MessageType, Registry};
+    use crate::{ActionCalls, Dialect, MessageType, TypeRegistry};
 
     const COUNT: &str = "int32 order\n---\nint32[] sequence\n---\nint32[] partial\nfloat64 share\n";
 
@@ -162,7 +162,7 @@ mod tests {
     fn an_action_of_either_ros_is_the_same_calls_and_values() {
         let name = "demo_msgs/Count".parse().unwrap();
         let [one, two] = [Dialect::Ros1, Dialect::Ros2].map(|dialect| {
-            let mut registry = Registry::bundle(dialect);
+            let mut registry = TypeRegistry::bundle(dialect);
             registry.add_action(&name, COUNT).unwrap();
             let calls = registry.action_calls(&name).unwrap();
             assert_eq!(*calls.goal().name(), name);
@@ -238,7 +238,7 @@ mod tests {
 
     #[test]
     fn an_action_that_is_not_known_is_named() {
-        let registry = Registry::bundle(Dialect::Ros2);
+        let registry = TypeRegistry::bundle(Dialect::Ros2);
         let name = "demo_msgs/Count".parse().unwrap();
         let why = registry.action_calls(&name).unwrap_err().to_string();
         assert!(why.contains("demo_msgs/CountGoal"), "{why}");

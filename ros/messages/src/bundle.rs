@@ -74,19 +74,19 @@ const PACKAGES: [(&str, &str); 26] = [
 
 /// The kind of a definition in the bundle.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Kind {
+pub(crate) enum BundledKind {
     Message,
     Service,
     Action,
 }
 
 /// Returns kind, name and text of each definition of the dialect.
-pub(crate) fn texts(dialect: Dialect) -> Vec<(Kind, TypeName, String)> {
+pub(crate) fn texts(dialect: Dialect) -> Vec<(BundledKind, TypeName, String)> {
     let other = match dialect {
         Dialect::Ros1 => "2",
         Dialect::Ros2 => "1",
     };
-    let mut found: Vec<(Kind, TypeName, String)> = Vec::new();
+    let mut found: Vec<(BundledKind, TypeName, String)> = Vec::new();
     for (package, text) in PACKAGES {
         let mut skip = true;
         for line in text.lines() {
@@ -107,11 +107,11 @@ pub(crate) fn texts(dialect: Dialect) -> Vec<(Kind, TypeName, String)> {
     found
 }
 
-fn heading(line: &str) -> Option<(Kind, &str)> {
+fn heading(line: &str) -> Option<(BundledKind, &str)> {
     [
-        ("message ", Kind::Message),
-        ("service ", Kind::Service),
-        ("action ", Kind::Action),
+        ("message ", BundledKind::Message),
+        ("service ", BundledKind::Service),
+        ("action ", BundledKind::Action),
     ]
     .into_iter()
     .find_map(|(word, kind)| Some((kind, line.strip_prefix(word)?)))

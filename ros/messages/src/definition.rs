@@ -12,8 +12,8 @@ use crate::{DefinitionError, Dialect, TypeName};
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Primitive {
     Number(Number),
-    Clock(Clock),
-    Text(Text),
+    Clock(ClockType),
+    Text(StringType),
 }
 
 /// A type with the same bytes, little endian, as its OPC UA value.
@@ -34,7 +34,7 @@ pub(crate) enum Number {
 
 /// Two words of 32 bits: seconds and nanoseconds.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Clock {
+pub(crate) enum ClockType {
     /// ROS 1 `time`: unsigned seconds.
     Time1,
     /// `builtin_interfaces/Time`: signed seconds.
@@ -47,7 +47,7 @@ pub(crate) enum Clock {
 
 /// `string`, or `wstring` if `wide`; the bound is in bytes or UTF-16 units.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) struct Text {
+pub(crate) struct StringType {
     pub(crate) wide: bool,
     pub(crate) bound: u32,
 }
@@ -66,7 +66,7 @@ pub(crate) enum Arity {
 }
 
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub(crate) struct Field {
+pub(crate) struct FieldDefinition {
     pub(crate) name: String,
     /// The type as written, which is input of the md5.
     pub(crate) written: String,
@@ -74,7 +74,7 @@ pub(crate) struct Field {
     pub(crate) arity: Arity,
 }
 
-impl Field {
+impl FieldDefinition {
     /// Returns the type in the notation of `.msg` files, with the package: `package/Name`.
     pub(crate) fn spelling(&self) -> String {
         let bounded = |word: &str, bound: u32| match bound {
@@ -115,17 +115,17 @@ pub struct Constant {
 }
 
 #[derive(Clone, Debug)]
-pub(crate) struct Definition {
+pub(crate) struct MessageDefinition {
     pub(crate) name: TypeName,
     pub(crate) text: String,
     pub(crate) constants: Vec<Constant>,
-    pub(crate) fields: Vec<Field>,
+    pub(crate) fields: Vec<FieldDefinition>,
 }
 
 /// A line of a definition in another language: the type in the notation of `.msg` files, and the
 /// value if it is a constant.
 #[derive(Clone, Debug)]
-pub(crate) struct Line {
+pub(crate) struct DefinitionLine {
     /// Line number in its text, from 1.
     pub(crate) number: usize,
     pub(crate) written: String,
@@ -133,7 +133,7 @@ pub(crate) struct Line {
     pub(crate) value: Option<String>,
 }
 
-impl Line {
+impl DefinitionLine {
     fn text(&self) -> String {
         match &self.value {
             None => format!("{} {}", self.written, self.name),
@@ -142,14 +142,14 @@ impl Line {
     }
 }
 
-impl Definition {
+impl MessageDefinition {
     /// Creates a definition from the constants and fields of a text in another language. The text
     /// of the definition is that of the equivalent `.msg` file.
     pub(crate) fn of_lines(
         dialect: Dialect,
         name: &TypeName,
-        constants: Vec<Line>,
-        fields: Vec<Line>,
+        constants: Vec<DefinitionLine>,
+        fields: Vec<DefinitionLine>,
     ) -> Result<Self, DefinitionError> {
         let mut named = BTreeSet::new();
         let mut made = Self {
@@ -159,7 +159,7 @@ impl Definition {
             fields: Vec::new(),
         };
         for line in constants.into_iter().chain(fields) {
-            let Line {
+            let DefinitionLine {
                 number,
                 written,
                 name: of,
@@ -294,7 +294,7 @@ impl Definition {
             return Err("the field is defined twice");
         }
         let (kind, arity) = parse_type(dialect, &self.name, written)?;
-        self.fields.push(Field {
+        self.fields.push(FieldDefinition {
             name: name.to_owned(),
             written: written.to_owned(),
             kind,
@@ -384,16 +384,16 @@ fn primitive(dialect: Dialect, base: &str, bound: Option<u32>) -> Option<Primiti
         "uint64" => Primitive::Number(Number::UInt64),
         "float32" => Primitive::Number(Number::Float32),
         "float64" => Primitive::Number(Number::Float64),
-        "string" => Primitive::Text(Text {
+        "string" => Primitive::Text(StringType {
             wide: false,
             bound: bound.unwrap_or(u32::MAX),
         }),
-        "wstring" if !ros1 => Primitive::Text(Text {
+        "wstring" if !ros1 => Primitive::Text(StringType {
             wide: true,
             bound: bound.unwrap_or(u32::MAX),
         }),
-        "time" if ros1 => Primitive::Clock(Clock::Time1),
-        "duration" if ros1 => Primitive::Clock(Clock::Duration1),
+        "time" if ros1 => Primitive::Clock(ClockType::Time1),
+        "duration" if ros1 => Primitive::Clock(ClockType::Duration1),
         _ => return None,
     })
 }
@@ -415,8 +415,8 @@ fn message_name(dialect: Dialect, of: &TypeName, base: &str) -> Result<TypeName,
 mod tests {
     use super::*;
 
-    fn parse(dialect: Dialect, text: &str) -> Result<Definition, DefinitionError> {
-        Definition::parse(dialect, &"pkg/T".parse().unwrap(), text)
+    fn parse(dialect: Dialect, text: &str) -> Result<MessageDefinition, DefinitionError> {
+        MessageDefinition::parse(dialect, &"pkg/T".parse().unwrap(), text)
     }
 
     fn fields(dialect: Dialect, text: &str) -> Vec<(String, FieldType, Arity)> {
@@ -451,7 +451,7 @@ mod tests {
                 ),
                 (
                     "t".to_owned(),
-                    FieldType::Primitive(Primitive::Clock(Clock::Time1)),
+                    FieldType::Primitive(Primitive::Clock(ClockType::Time1)),
                     Arity::One
                 ),
                 (
@@ -472,7 +472,7 @@ mod tests {
             [
                 (
                     "name".to_owned(),
-                    FieldType::Primitive(Primitive::Text(Text {
+                    FieldType::Primitive(Primitive::Text(StringType {
                         wide: false,
                         bound: 10
                     })),
@@ -485,7 +485,7 @@ mod tests {
                 ),
                 (
                     "wide".to_owned(),
-                    FieldType::Primitive(Primitive::Text(Text {
+                    FieldType::Primitive(Primitive::Text(StringType {
                         wide: true,
                         bound: 3
                     })),

@@ -4,13 +4,13 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use crate::definition::{Definition, Line};
-use crate::resolve::Resolver;
+use crate::definition::{DefinitionLine, MessageDefinition};
+use crate::resolve::TypeResolver;
 use crate::type_hash::{
     ARRAY, BOUNDED_SEQUENCE, BOUNDED_STRING, BOUNDED_WSTRING, BYTE, CHAR, NESTED, STRING,
     UNBOUNDED_SEQUENCE, WSTRING,
 };
-use crate::{DefinitionError, Dialect, MessageType, Registry, TypeHash, TypeName};
+use crate::{DefinitionError, Dialect, MessageType, TypeHash, TypeName, TypeRegistry};
 
 /// A type without the types it needs.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -63,7 +63,7 @@ impl DescribedType {
     }
 }
 
-impl Registry {
+impl TypeRegistry {
     /// Adds the type `name` from a description, with all types it needs. The type hash decides
     /// whether it is the announced type: the registry stores the definitions of new names only if
     /// the hash is `expected`. Types that are not needed are ignored.
@@ -103,7 +103,7 @@ impl Registry {
             });
         }
         let none = BTreeMap::new();
-        let message_type = Resolver::new(Dialect::Ros2, &[&described.definitions, &none])
+        let message_type = TypeResolver::new(Dialect::Ros2, &[&described.definitions, &none])
             .message_type(name, None)?;
         for (name, definition) in described.definitions {
             self.definitions.entry(name).or_insert(definition);
@@ -115,7 +115,7 @@ impl Registry {
     /// order of the names.
     ///
     /// # Errors
-    /// As [`Registry::get`].
+    /// As [`TypeRegistry::get`].
     pub fn describe(&self, name: &TypeName) -> Result<Vec<DescribedType>, DefinitionError> {
         crate::type_hash::describe(self, name)
     }
@@ -124,7 +124,7 @@ impl Registry {
     /// among the types it needs.
     ///
     /// # Errors
-    /// As [`Registry::service`].
+    /// As [`TypeRegistry::service`].
     pub fn describe_service(&self, name: &TypeName) -> Result<Vec<DescribedType>, DefinitionError> {
         crate::type_hash::describe_service(self, name)
     }
@@ -132,13 +132,16 @@ impl Registry {
     /// Returns the description of an added ROS 2 action: itself first, then the types it needs.
     ///
     /// # Errors
-    /// As [`Registry::get`], for its messages.
+    /// As [`TypeRegistry::get`], for its messages.
     pub fn describe_action(&self, name: &TypeName) -> Result<Vec<DescribedType>, DefinitionError> {
         crate::type_hash::describe_action(self, name)
     }
 }
 
-fn definition(of: &TypeName, described: &DescribedType) -> Result<Definition, DefinitionError> {
+fn definition(
+    of: &TypeName,
+    described: &DescribedType,
+) -> Result<MessageDefinition, DefinitionError> {
     let refused = |reason: &'static str, text: &str| DefinitionError::Syntax {
         name: of.clone(),
         line: 1,
@@ -159,7 +162,7 @@ fn definition(of: &TypeName, described: &DescribedType) -> Result<Definition, De
                 &field.name,
             ));
         };
-        lines.push(Line {
+        lines.push(DefinitionLine {
             number: number + 1,
             written,
             name: field.name.clone(),
@@ -171,7 +174,7 @@ fn definition(of: &TypeName, described: &DescribedType) -> Result<Definition, De
     {
         lines.clear();
     }
-    Definition::of_lines(Dialect::Ros2, &name, Vec::new(), lines)
+    MessageDefinition::of_lines(Dialect::Ros2, &name, Vec::new(), lines)
 }
 
 /// Returns the type in the notation of `.msg` files.
@@ -227,11 +230,11 @@ mod tests {
 
     #[test]
     fn every_message_of_the_bundle_is_described_such_that_its_hash_is_the_same() {
-        let registry = Registry::bundle(Dialect::Ros2);
+        let registry = TypeRegistry::bundle(Dialect::Ros2);
         for name in registry.names() {
             let hash = registry.type_hash(name).unwrap();
             let described = registry.describe(name).unwrap();
-            let mut empty = Registry::empty(Dialect::Ros2);
+            let mut empty = TypeRegistry::empty(Dialect::Ros2);
             let again = empty.add_described(name, &described, hash).unwrap();
             assert_eq!(
                 again.leaves(),
@@ -244,7 +247,7 @@ mod tests {
 
     #[test]
     fn a_description_of_another_hash_is_not_believed() {
-        let mut registry = Registry::bundle(Dialect::Ros2);
+        let mut registry = TypeRegistry::bundle(Dialect::Ros2);
         let name: TypeName = "robot_msgs/Arm".parse().unwrap();
         let bool_hash = registry
             .type_hash(&"std_msgs/Bool".parse().unwrap())
@@ -279,7 +282,7 @@ mod tests {
 
     #[test]
     fn nothing_is_kept_that_the_type_does_not_need_and_no_more_is_read_than_a_message_has() {
-        let registry = Registry::bundle(Dialect::Ros2);
+        let registry = TypeRegistry::bundle(Dialect::Ros2);
         let [twist, stray, other]: [TypeName; 3] =
             ["geometry_msgs/Twist", "robot_msgs/Stray", "std_msgs/Bool"]
                 .map(|name| name.parse().unwrap());
@@ -293,7 +296,7 @@ mod tests {
         });
         let needed = DescribedType::needed(&twist, &described);
         assert!(needed.into_iter().eq(&alone));
-        let mut empty = Registry::empty(Dialect::Ros2);
+        let mut empty = TypeRegistry::empty(Dialect::Ros2);
         empty.add_described(&twist, &described, hash).unwrap();
         for name in [&stray, &other] {
             assert!(empty.get(name).is_err(), "{name}");
@@ -308,14 +311,14 @@ mod tests {
         let many_types = vec![described.pop().unwrap(); MOST_TYPES];
         for too_many in [vec![many_fields], many_types] {
             let all = [alone.clone(), too_many].concat();
-            let refused = Registry::empty(Dialect::Ros2).add_described(&twist, &all, hash);
+            let refused = TypeRegistry::empty(Dialect::Ros2).add_described(&twist, &all, hash);
             assert!(matches!(refused, Err(DefinitionError::Syntax { .. })));
         }
     }
 
     #[test]
     fn a_hash_is_read_back_from_its_text() {
-        let registry = Registry::bundle(Dialect::Ros2);
+        let registry = TypeRegistry::bundle(Dialect::Ros2);
         let hash = registry
             .type_hash(&"std_msgs/Bool".parse().unwrap())
             .unwrap();

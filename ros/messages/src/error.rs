@@ -5,11 +5,11 @@ use crate::{TypeHash, TypeName};
 /// Error for a text that is not a message type name.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("`{text}` is not a message type name: expected `package/Name` or `package/msg/Name`")]
-pub struct NameError {
+pub struct TypeNameError {
     text: String,
 }
 
-impl NameError {
+impl TypeNameError {
     /// Creates the error. Only about the first 255 bytes of `text` are kept.
     pub(crate) fn new(text: &str) -> Self {
         Self {
@@ -21,7 +21,7 @@ impl NameError {
 /// Error while creating a message type from the available definitions.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum DefinitionError {
-    /// No definition of that name; [`Registry::suggest`](crate::Registry::suggest) returns a
+    /// No definition of that name; [`Registry::suggest`](crate::TypeRegistry::suggest) returns a
     /// similar name.
     #[error("no definition of `{name}`{}", needed_by.as_ref().map(|by| format!(", which `{by}` uses")).unwrap_or_default())]
     Unknown {
@@ -138,7 +138,7 @@ pub enum PlanError {
 
 /// Error in the bytes of a message.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
-pub enum Fault {
+pub enum MessageFault {
     /// The payload ends inside the field, or a length exceeds the payload.
     #[error("the message ends too early")]
     Truncated,
@@ -195,7 +195,7 @@ pub enum ValueFault {
     NoNumber,
 }
 
-/// Error of [`Plan::read`](crate::Plan::read).
+/// Error of [`Plan::read`](crate::MessagePlan::read).
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum ReadError<E> {
     /// The payload is not a message of the type.
@@ -206,7 +206,7 @@ pub enum ReadError<E> {
         /// Offset in the payload.
         at: usize,
         /// Description of the error.
-        fault: Fault,
+        fault: MessageFault,
     },
     /// The selected value of a field is not available.
     #[error("{}{fault}", in_field(field))]
@@ -226,7 +226,7 @@ pub enum ReadError<E> {
     },
 }
 
-/// Error of a [`Source`](crate::Source) without the requested value.
+/// Error of a [`Source`](crate::FieldSupplier) without the requested value.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum SourceError {
     /// No field is left.
@@ -294,7 +294,7 @@ pub enum WriteFault {
     Duration,
 }
 
-/// Error of [`Plan::write`](crate::Plan::write); nothing was appended.
+/// Error of [`Plan::write`](crate::MessagePlan::write); nothing was appended.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("{}{fault}", in_field(field))]
 pub struct WriteError {

@@ -2,7 +2,7 @@ use uadp::{BuiltinType, Scalar};
 
 use crate::{SourceError, TypeName};
 
-/// Receives the fields of a message, in the order of [`Plan::leaves`](crate::Plan::leaves).
+/// Receives the fields of a message, in the order of [`Plan::leaves`](crate::MessagePlan::leaves).
 ///
 /// A field is one of these sequences of calls:
 ///
@@ -11,7 +11,7 @@ use crate::{SourceError, TypeName};
 /// - `array` and then the announced number of calls of `element`
 /// - the begin and end of a structure
 /// - `structures` and then the announced number of structures
-pub trait Sink {
+pub trait FieldSink {
     /// Reason for which a value is refused.
     type Error;
 
@@ -52,7 +52,7 @@ pub trait Sink {
     ///
     /// The fields of the message follow inline, in order. The fields of a nested message are passed
     /// like the message's own fields, and nested arrays of messages as described in
-    /// [`Sink::array`].
+    /// [`FieldSink::array`].
     fn structures(&mut self, of: &TypeName, count: usize) -> Result<(), Self::Error>;
 
     /// Begins the next structure of an array, or a field that is a structure.
@@ -62,12 +62,12 @@ pub trait Sink {
     fn end_structure(&mut self) -> Result<(), Self::Error>;
 }
 
-/// Supplies the fields of a message, in the order of [`Plan::leaves`](crate::Plan::leaves): the
-/// mirror of [`Sink`].
+/// Supplies the fields of a message, in the order of [`Plan::leaves`](crate::MessagePlan::leaves):
+/// the mirror of [`FieldSink`].
 ///
 /// An implementation returns exactly the requested builtin type or an error; it may convert values.
 /// A null array or text counts as empty.
-pub trait Source<'a> {
+pub trait FieldSupplier<'a> {
     /// Returns the next field, or inside a structure the next value, as a scalar of `expected`.
     fn scalar(&mut self, expected: BuiltinType) -> Result<Scalar<'a>, SourceError>;
 
@@ -85,9 +85,10 @@ pub trait Source<'a> {
     /// little endian without gaps.
     fn packed_array(&mut self, expected: BuiltinType) -> Result<(usize, &'a [u8]), SourceError>;
 
-    /// Opens the next field as an array, to be read by [`Source::element`], and returns its length.
+    /// Opens the next field as an array, to be read by [`FieldSupplier::element`], and returns its
+    /// length.
     ///
-    /// ExtensionObject occurs only inside a structure: see [`Sink::array`].
+    /// ExtensionObject occurs only inside a structure: see [`FieldSink::array`].
     fn array(&mut self, expected: BuiltinType) -> Result<usize, SourceError>;
 
     /// Returns the next element of the array opened last.
@@ -112,11 +113,11 @@ pub trait Source<'a> {
     fn finish(&mut self) -> Result<(), SourceError>;
 }
 
-/// A [`Source`] without fields, for messages of constants alone.
+/// A [`FieldSupplier`] without fields, for messages of constants alone.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct NoFields;
 
-impl<'a> Source<'a> for NoFields {
+impl<'a> FieldSupplier<'a> for NoFields {
     fn scalar(&mut self, _expected: BuiltinType) -> Result<Scalar<'a>, SourceError> {
         Err(SourceError::Missing)
     }

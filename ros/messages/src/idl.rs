@@ -6,7 +6,7 @@
 
 use std::collections::HashMap;
 
-use crate::definition::{Definition, Line};
+use crate::definition::{DefinitionLine, MessageDefinition};
 use crate::{DefinitionError, Dialect, TextKind, TypeName};
 
 /// Parses the structs of one ROS type: one of a message, two of a service, or three of an action.
@@ -18,7 +18,7 @@ pub(crate) fn definitions<const N: usize>(
     name: &TypeName,
     text: &str,
     parts: [(&str, TypeName); N],
-) -> Result<[Definition; N], DefinitionError> {
+) -> Result<[MessageDefinition; N], DefinitionError> {
     let refused = |fault: Fault| DefinitionError::Syntax {
         name: name.clone(),
         line: fault.line,
@@ -54,7 +54,7 @@ pub(crate) fn definitions<const N: usize>(
         }
         let constants = parser.constants.remove(&format!("{path}_Constants"));
         let constants = constants.unwrap_or_default();
-        found.push(Definition::of_lines(
+        found.push(MessageDefinition::of_lines(
             Dialect::Ros2,
             &made,
             constants,
@@ -76,8 +76,8 @@ struct Parser<'t> {
     /// The enclosing modules.
     scope: Vec<&'t str>,
     typedefs: HashMap<String, Type>,
-    structs: HashMap<String, Vec<Line>>,
-    constants: HashMap<String, Vec<Line>>,
+    structs: HashMap<String, Vec<DefinitionLine>>,
+    constants: HashMap<String, Vec<DefinitionLine>>,
 }
 
 #[derive(Clone, Copy, Debug)]
@@ -178,13 +178,13 @@ impl<'t> Parser<'t> {
     }
 
     /// Parses `type name;` or `type one, two[3];`.
-    fn members(&mut self, fields: &mut Vec<Line>) -> Parsed<()> {
+    fn members(&mut self, fields: &mut Vec<DefinitionLine>) -> Parsed<()> {
         let kind = self.type_spec()?;
         loop {
             let token = self.peek().ok_or_else(|| self.ended())?;
             let name = self.word()?;
             let kind = self.declarator(&kind)?;
-            fields.push(Line {
+            fields.push(DefinitionLine {
                 number: token.line,
                 written: kind.written(),
                 name: name.to_owned(),
@@ -247,7 +247,7 @@ impl<'t> Parser<'t> {
                 (_, text) => value.push_str(text),
             }
         }
-        let line = Line {
+        let line = DefinitionLine {
             number: token.line,
             written: kind.written(),
             name: name.to_owned(),
@@ -537,7 +537,7 @@ const LONGEST: usize = 255;
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::Registry;
+    use crate::TypeRegistry;
 
     const LEG: &str = r#"
 // generated from rosidl_adapter/resource/msg.idl.em
@@ -579,8 +579,8 @@ module robot_msgs {
     const LEG_MSG: &str = "std_msgs/Header header\nfloat64[3] angles\ngeometry_msgs/Point[4] corners\nFoot[] feet\n\
         string<=8[<=3] names\nwstring<=4 short_name\nbyte raw\nint8 a\nint8[2] b\nuint64 count\n";
 
-    fn registry() -> Registry {
-        let mut registry = Registry::bundle(Dialect::Ros2);
+    fn registry() -> TypeRegistry {
+        let mut registry = TypeRegistry::bundle(Dialect::Ros2);
         registry
             .add(&"robot_msgs/Foot".parse().unwrap(), "bool down")
             .unwrap();
@@ -652,7 +652,7 @@ module robot_msgs {
             ),
         ] {
             let text = format!("module p {{ module msg {{\nstruct T {{\n{member} }};\n}}; }};");
-            let error = Registry::empty(Dialect::Ros2)
+            let error = TypeRegistry::empty(Dialect::Ros2)
                 .add_idl(TextKind::Message, &name, &text)
                 .unwrap_err();
             let DefinitionError::Syntax {
@@ -663,7 +663,7 @@ module robot_msgs {
             };
             assert_eq!((line, told), (3, reason), "{member}");
         }
-        let missing = Registry::empty(Dialect::Ros2)
+        let missing = TypeRegistry::empty(Dialect::Ros2)
             .add_idl(TextKind::Message, &name, "module p { module msg { }; };")
             .unwrap_err();
         assert!(missing.to_string().contains("p::msg::T"), "{missing}");
@@ -673,9 +673,9 @@ module robot_msgs {
     fn services_and_actions_are_structs_side_by_side() {
         let name: TypeName = "p/Turn".parse().unwrap();
         let service = "module p { module srv { struct Turn_Request { double angle; }; struct Turn_Response { boolean ok; }; }; };";
-        let mut idl = Registry::bundle(Dialect::Ros2);
+        let mut idl = TypeRegistry::bundle(Dialect::Ros2);
         idl.add_idl(TextKind::Service, &name, service).unwrap();
-        let mut srv = Registry::bundle(Dialect::Ros2);
+        let mut srv = TypeRegistry::bundle(Dialect::Ros2);
         srv.add_service(&name, "float64 angle\n---\nbool ok")
             .unwrap();
         assert_eq!(

@@ -1,21 +1,21 @@
 //! ROS message definitions at run time, and conversion of ROS messages to and from OPC UA fields.
 //!
-//! A [`Registry`] holds `.msg` texts of one [`Dialect`] and creates [`MessageType`]s from them: the
-//! flattened list of [`Leaf`]s, and for ROS 1 the md5 and the full definition text that a publisher
-//! announces. A [`Plan`] is compiled once per message type, [`Selection`] and [`Wire`]. It reads
-//! the bytes of a message into a [`Sink`], or takes the fields of a [`Source`] and writes the
-//! bytes. Neither direction builds a tree of values.
+//! A [`TypeRegistry`] holds `.msg` texts of one [`Dialect`] and creates [`MessageType`]s from them:
+//! the flattened list of [`Leaf`]s, and for ROS 1 the md5 and the full definition text that a
+//! publisher announces. A [`MessagePlan`] is compiled once per message type, [`Selection`] and
+//! [`Wire`]. It reads the bytes of a message into a [`FieldSink`], or takes the fields of a
+//! [`FieldSupplier`] and writes the bytes. Neither direction builds a tree of values.
 //!
 //! ```
-//! use messages::{Dialect, Plan, Registry, Selection, Wire};
+//! use messages::{Dialect, MessagePlan, TypeRegistry, Selection, Wire};
 //!
-//! let mut registry = Registry::bundle(Dialect::Ros1);
+//! let mut registry = TypeRegistry::bundle(Dialect::Ros1);
 //! registry.add(&"line/Cover".parse()?, "Header header\ngeometry_msgs/Point position\nuint8 colour")?;
 //! let cover = registry.get(&"line/Cover".parse()?)?;
 //! let paths: Vec<&str> = cover.leaves().iter().map(|leaf| leaf.path.as_str()).collect();
 //! assert_eq!(paths, ["header.stamp", "header.frame_id", "position.x", "position.y", "position.z", "colour"]);
-//! let plan = Plan::compile(&cover, &Selection::Field("position.x".to_owned()), Wire::Ros1)?;
-//! assert_eq!(plan.leaves().len(), 1);
+//! let plan = MessagePlan::compile(&cover, &Selection::Field("position.x".to_owned()),
+//! Wire::Ros1)?; assert_eq!(plan.leaves().len(), 1);
 //! # Ok::<(), Box<dyn std::error::Error>>(())
 //! ```
 //!
@@ -43,7 +43,7 @@
 //! | array of `uint8`, `char` or ROS 2 `byte` | ByteString, a scalar |
 //! | array of anything else that is not a message | array of the above |
 //! | message | its fields, named `outer.inner` |
-//! | array of messages | array of structures, one field; see [`Sink::structures`] |
+//! | array of messages | array of structures, one field; see [`FieldSink::structures`] |
 //!
 //! `seq` of a ROS 1 `std_msgs/Header` is not a field: it is skipped when read and 0 when written. A
 //! ROS 2 topic of the type `builtin_interfaces/Time` or `Duration` itself has a single field named
@@ -78,17 +78,19 @@ pub use convert::{date_time_to_time, duration_to_millis, millis_to_duration, tim
 pub use definition::Constant;
 pub use description::{DescribedField, DescribedType};
 pub use error::{
-    DefinitionError, Fault, NameError, PlanError, ReadError, SourceError, ValueFault, WriteError,
-    WriteFault,
+    DefinitionError, MessageFault, PlanError, ReadError, SourceError, TypeNameError, ValueFault,
+    WriteError, WriteFault,
 };
-pub use fields::{NoFields, Sink, Source};
+pub use fields::{FieldSink, FieldSupplier, NoFields};
 pub use library::{
     DefinitionText, DefinitionTexts, Language, Library, NoTexts, Noted, TextKind, check_text,
 };
-pub use message::{Leaf, MessageType, Rank, standard_type};
+pub use message::{ArrayRank, Leaf, MessageType, standard_type};
 pub use name::{Dialect, TypeName};
-pub use plan::{Conversion, Literal, Part, Plan, Selected, Selection, Wire, constant, is_lossless};
-pub use registry::{PeerDefinitions, Registry};
+pub use plan::{
+    ArrayPart, Conversion, Literal, MessagePlan, Selected, Selection, Wire, constant, is_lossless,
+};
+pub use registry::{PeerDefinitions, TypeRegistry};
 pub use service::{ActionMessages, ActionType, ServiceType};
-pub use structure::{MemberKind, Structure, StructureMember};
+pub use structure::{MemberKind, MessageStructure, StructureMember};
 pub use type_hash::{ActionTypeHashes, NoTypeHash, ServiceTypeHashes, TypeHash};

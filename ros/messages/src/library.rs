@@ -5,10 +5,10 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
 use std::sync::Arc;
 
-use crate::definition::Definition;
+use crate::definition::MessageDefinition;
 use crate::{
-    ActionCalls, ActionMessages, ActionType, DefinitionError, Dialect, MessageType, Registry,
-    ServiceType, TypeName,
+    ActionCalls, ActionMessages, ActionType, DefinitionError, Dialect, MessageType, ServiceType,
+    TypeName, TypeRegistry,
 };
 
 /// The kind of a definition text.
@@ -136,7 +136,7 @@ pub enum Noted {
 /// definitions of peers to the [`registry`](Self::registry_mut): a text found later replaces them.
 #[derive(Clone, Debug)]
 pub struct Library {
-    registry: Registry,
+    registry: TypeRegistry,
     asked: BTreeSet<(TextKind, TypeName)>,
     files: BTreeMap<(TextKind, TypeName), Arc<str>>,
     noted: Vec<Noted>,
@@ -145,7 +145,7 @@ pub struct Library {
 impl Library {
     /// Creates a library with the definitions of a registry as its built-in definitions.
     #[must_use]
-    pub const fn new(registry: Registry) -> Self {
+    pub const fn new(registry: TypeRegistry) -> Self {
         Self {
             registry,
             asked: BTreeSet::new(),
@@ -156,12 +156,12 @@ impl Library {
 
     /// Returns the current definitions.
     #[must_use]
-    pub const fn registry(&self) -> &Registry {
+    pub const fn registry(&self) -> &TypeRegistry {
         &self.registry
     }
 
     /// Returns the registry, for definitions from other sources than texts.
-    pub const fn registry_mut(&mut self) -> &mut Registry {
+    pub const fn registry_mut(&mut self) -> &mut TypeRegistry {
         &mut self.registry
     }
 
@@ -173,7 +173,7 @@ impl Library {
         if files.is_empty() {
             return;
         }
-        let built_in = Registry::bundle(self.dialect());
+        let built_in = TypeRegistry::bundle(self.dialect());
         for (kind, name) in files.into_keys() {
             match kind {
                 TextKind::Message => self.registry.restore(&name, &built_in),
@@ -313,7 +313,8 @@ impl Library {
     }
 
     fn needed(&self, kind: TextKind, name: &TypeName) -> Vec<TypeName> {
-        let of = |definition: &Arc<Definition>| definition.needs().cloned().collect::<Vec<_>>();
+        let of =
+            |definition: &Arc<MessageDefinition>| definition.needs().cloned().collect::<Vec<_>>();
         match kind {
             TextKind::Message => self.registry.definition(name).map(of).unwrap_or_default(),
             TextKind::Service => {
@@ -404,7 +405,7 @@ impl Library {
     }
 }
 
-impl Definition {
+impl MessageDefinition {
     /// Returns the messages among its fields.
     pub(crate) fn needs(&self) -> impl Iterator<Item = &TypeName> {
         self.fields.iter().filter_map(|field| match &field.kind {
@@ -436,7 +437,7 @@ pub fn check_text(
     name: &TypeName,
     text: &DefinitionText,
 ) -> Result<(), DefinitionError> {
-    let mut registry = Registry::empty(dialect);
+    let mut registry = TypeRegistry::empty(dialect);
     match (text.language, kind) {
         (Language::Idl, _) => registry.add_idl(kind, name, &text.text),
         (Language::Ros, TextKind::Message) => registry.add(name, &text.text),

@@ -3,7 +3,7 @@ use std::sync::Arc;
 use uadp::BuiltinType;
 
 use crate::definition::{Arity, Number, Primitive};
-use crate::resolve::{Shape, ShapeKind};
+use crate::resolve::{MessageShape, ShapeKind};
 use crate::{Constant, Dialect, TypeName};
 
 /// A message type with all nested types resolved.
@@ -14,7 +14,7 @@ pub struct MessageType {
     pub(crate) md5: String,
     pub(crate) definition: String,
     pub(crate) leaves: Vec<Leaf>,
-    pub(crate) shape: Arc<Shape>,
+    pub(crate) shape: Arc<MessageShape>,
 }
 
 /// A field of the flattened message.
@@ -25,7 +25,7 @@ pub struct Leaf {
     /// The builtin type of the value or of its elements; ExtensionObject for an array of messages.
     pub builtin: BuiltinType,
     /// Single value or array. An array of bytes is a ByteString and single.
-    pub rank: Rank,
+    pub rank: ArrayRank,
 }
 
 impl Leaf {
@@ -35,7 +35,7 @@ impl Leaf {
         Self {
             path: String::new(),
             builtin: BuiltinType::ByteString,
-            rank: Rank::Scalar,
+            rank: ArrayRank::Scalar,
         }
     }
 
@@ -49,7 +49,7 @@ impl Leaf {
 
 /// Whether a field is an array.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Rank {
+pub enum ArrayRank {
     /// A single value.
     Scalar,
     /// An array of one dimension.
@@ -137,7 +137,7 @@ impl MessageType {
 /// default type.
 ///
 /// DateTime is `std_msgs/Time`, which only ROS 1 has; ROS 2 has `builtin_interfaces/Time`, see
-/// [`Registry::standard_type`](crate::Registry::standard_type). Returns `None` for arrays and
+/// [`Registry::standard_type`](crate::TypeRegistry::standard_type). Returns `None` for arrays and
 /// ByteStrings: the `MultiArray` types of std_msgs have a layout beside their data, so they have
 /// more than one field. Also returns `None` for builtin types without a ROS type.
 pub fn standard_type(builtin: BuiltinType, array: bool) -> Option<TypeName> {

@@ -2,7 +2,7 @@ use std::fmt;
 use std::str::FromStr;
 use std::sync::Arc;
 
-use crate::NameError;
+use crate::TypeNameError;
 
 /// The rules of a definition text: `time`, `Header` and `byte` differ in meaning between the
 /// dialects.
@@ -29,10 +29,10 @@ const LONGEST: usize = 255;
 
 impl TypeName {
     /// Creates a name from `package` and `name`, both without slashes.
-    pub fn new(package: &str, name: &str) -> Result<Self, NameError> {
+    pub fn new(package: &str, name: &str) -> Result<Self, TypeNameError> {
         if package.len() + name.len() >= LONGEST || !is_identifier(package) || !is_identifier(name)
         {
-            return Err(NameError::new(&format!("{package}/{name}")));
+            return Err(TypeNameError::new(&format!("{package}/{name}")));
         }
         Ok(Self {
             text: format!("{package}/{name}").into(),
@@ -67,13 +67,13 @@ impl TypeName {
 
     /// Parses the result of [`TypeName::dds`]. Fails for names of services and actions, which are
     /// not message types.
-    pub fn from_dds(text: &str) -> Result<Self, NameError> {
+    pub fn from_dds(text: &str) -> Result<Self, TypeNameError> {
         let parts = text
             .split_once("::msg::dds_::")
             .and_then(|(package, name)| Some((package, name.strip_suffix('_')?)));
         match parts {
-            Some((package, name)) => Self::new(package, name).map_err(|_| NameError::new(text)),
-            None => Err(NameError::new(text)),
+            Some((package, name)) => Self::new(package, name).map_err(|_| TypeNameError::new(text)),
+            None => Err(TypeNameError::new(text)),
         }
     }
 
@@ -83,16 +83,16 @@ impl TypeName {
 }
 
 impl FromStr for TypeName {
-    type Err = NameError;
+    type Err = TypeNameError;
 
-    fn from_str(text: &str) -> Result<Self, NameError> {
+    fn from_str(text: &str) -> Result<Self, TypeNameError> {
         let mut parts = text.split('/');
         match (parts.next(), parts.next(), parts.next(), parts.next()) {
             (Some(package), Some(name), None, None)
             | (Some(package), Some("msg"), Some(name), None) => {
-                Self::new(package, name).map_err(|_| NameError::new(text))
+                Self::new(package, name).map_err(|_| TypeNameError::new(text))
             }
-            _ => Err(NameError::new(text)),
+            _ => Err(TypeNameError::new(text)),
         }
     }
 }
@@ -137,7 +137,7 @@ mod tests {
         ] {
             assert_eq!(
                 text.parse::<TypeName>(),
-                Err(NameError::new(text)),
+                Err(TypeNameError::new(text)),
                 "{text}"
             );
         }

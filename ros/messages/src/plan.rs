@@ -15,17 +15,18 @@ use std::sync::Arc;
 use uadp::{BuiltinType, Scalar};
 
 pub use conversion::{Conversion, is_lossless};
-use literal::{Given, Typed};
+use literal::{GivenConstant, Typed};
 pub use literal::{Literal, constant};
 pub use several::Selected;
 use several::Several;
-pub use shaped::Part;
+pub use shaped::ArrayPart;
 use shaped::Shaped;
 
 use crate::definition::{Arity, Number, Primitive};
-use crate::resolve::{Shape, ShapeKind};
+use crate::resolve::{MessageShape, ShapeKind};
 use crate::{
-    Dialect, Leaf, MessageType, PlanError, Rank, ReadError, Sink, Source, TypeName, WriteError,
+    ArrayRank, Dialect, FieldSink, FieldSupplier, Leaf, MessageType, PlanError, ReadError,
+    TypeName, WriteError,
 };
 
 /// The wire format of a message.
@@ -52,7 +53,7 @@ pub enum Selection {
         /// The path.
         field: String,
         /// The part of an array; `None` for the whole field.
-        part: Option<Part>,
+        part: Option<ArrayPart>,
         /// The conversion of each value.
         conversion: Conversion,
     },
@@ -78,7 +79,7 @@ pub enum Selection {
 ///
 /// Compile once, then share: a plan keeps no state between messages.
 #[derive(Clone, Debug)]
-pub struct Plan {
+pub struct MessagePlan {
     wire: Wire,
     body: Body,
     leaves: Vec<Leaf>,
@@ -99,10 +100,10 @@ enum Body {
     Bytes,
 }
 
-/// A step. The steps of a message in an array follow its [`What::Messages`].
+/// A step. The steps of a message in an array follow its [`PlanStep::Messages`].
 #[derive(Clone, Debug)]
 struct Op {
-    what: What,
+    what: PlanStep,
     /// Whether the value is transferred; otherwise it is skipped when read and zero when written.
     carry: bool,
     /// The written constant of a field that is not transferred.
@@ -112,7 +113,7 @@ struct Op {
 }
 
 #[derive(Clone, Debug)]
-enum What {
+enum PlanStep {
     One(Primitive),
     /// The given number of steps after this step are single numbers of that kind, and all are
     /// transferred: they may be moved at once.
@@ -148,7 +149,7 @@ enum Len {
     Counted { bound: u32 },
 }
 
-impl Plan {
+impl MessagePlan {
     /// Compiles a plan.
     ///
     /// # Errors
@@ -208,7 +209,7 @@ impl Plan {
                 let leaf = Leaf {
                     path: at.to_owned(),
                     builtin: BuiltinType::ExtensionObject,
-                    rank: Rank::Scalar,
+                    rank: ArrayRank::Scalar,
                 };
                 (Body::Structure(of.clone(), ops), vec![leaf])
             }
@@ -243,7 +244,11 @@ impl Plan {
     ///
     /// A length is used only after comparison with the remaining bytes. After an error the sink may
     /// have received some fields already.
-    pub fn read<S: Sink>(&self, payload: &[u8], sink: &mut S) -> Result<(), ReadError<S::Error>> {
+    pub fn read<S: FieldSink>(
+        &self,
+        payload: &[u8],
+        sink: &mut S,
+    ) -> Result<(), ReadError<S::Error>> {
         match &self.body {
             Body::Steps(ops) => read::read(self, ops, payload, sink),
             Body::Several(several) => several.read(payload, sink),
@@ -260,7 +265,7 @@ impl Plan {
 
     /// Takes the fields from `source` and appends the message to `out`; on error `out` is
     /// unchanged.
-    pub fn write<'a, S: Source<'a>>(
+    pub fn write<'a, S: FieldSupplier<'a>>(
         &self,
         source: &mut S,
         out: &mut Vec<u8>,
@@ -304,7 +309,7 @@ fn steps(
 /// Returns the steps of a message with transferred fields and constants.
 fn ops(
     message: &MessageType,
-    (carried, given): (Vec<Range<usize>>, BTreeMap<usize, Given<'_>>),
+    (carried, given): (Vec<Range<usize>>, BTreeMap<usize, GivenConstant<'_>>),
     wire: Wire,
 ) -> Result<Vec<Op>, PlanError> {
     let mut compiler = Compiler::new(wire, carried);
@@ -359,7 +364,7 @@ fn index(message: &MessageType, path: &str) -> Result<usize, PlanError> {
 fn given<'m>(
     message: &'m MessageType,
     (fields, rest): (&[Selected], &'m BTreeMap<String, Literal>),
-) -> Result<BTreeMap<usize, Given<'m>>, PlanError> {
+) -> Result<BTreeMap<usize, GivenConstant<'m>>, PlanError> {
     let each = rest.iter().map(|(path, literal)| {
         let at = index(message, path)?;
         let leaf = message.leaves().get(at);
@@ -374,10 +379,11 @@ fn given<'m>(
         }
         // An array of messages is empty even without a constant.
         let is_open = leaf.is_some_and(|leaf| {
-            leaf.builtin == BuiltinType::ExtensionObject && leaf.rank == Rank::Array { fixed: None }
+            leaf.builtin == BuiltinType::ExtensionObject
+                && leaf.rank == ArrayRank::Array { fixed: None }
         });
         let is_empty = matches!(literal, Literal::List(texts) if texts.is_empty());
-        Ok((!is_open || !is_empty).then(|| (at, Given::new(message, path, literal))))
+        Ok((!is_open || !is_empty).then(|| (at, GivenConstant::new(message, path, literal))))
     });
     each.filter_map(Result::transpose).collect()
 }
@@ -388,20 +394,21 @@ fn coalesced(mut ops: &[Op]) -> Vec<Op> {
     while let Some((op, after)) = ops.split_first() {
         ops = after;
         match &op.what {
-            What::Messages { steps, .. } => {
+            PlanStep::Messages { steps, .. } => {
                 let (body, after) = ops.split_at_checked(*steps).unwrap_or((ops, &[]));
                 ops = after;
                 let body = coalesced(body);
                 let mut head = op.clone();
-                if let What::Messages { steps, .. } = &mut head.what {
+                if let PlanStep::Messages { steps, .. } = &mut head.what {
                     *steps = body.len();
                 }
                 all.push(head);
                 all.extend(body);
             }
-            What::One(Primitive::Number(number)) if op.carry && *number != Number::Bool => {
+            PlanStep::One(Primitive::Number(number)) if op.carry && *number != Number::Bool => {
                 let more = ops.iter().take_while(|next| {
-                    let same = matches!(next.what, What::One(Primitive::Number(n)) if n == *number);
+                    let same =
+                        matches!(next.what, PlanStep::One(Primitive::Number(n)) if n == *number);
                     same && next.carry && next.constant.is_none()
                 });
                 let more = more.count().min(usize::from(u16::MAX - 1));
@@ -409,19 +416,19 @@ fn coalesced(mut ops: &[Op]) -> Vec<Op> {
                 ops = after;
                 if let Ok(count) = u16::try_from(more + 1) {
                     all.push(Op {
-                        what: What::Run(*number, count),
+                        what: PlanStep::Run(*number, count),
                         ..op.clone()
                     });
                 }
                 all.push(op.clone());
                 all.extend_from_slice(run);
             }
-            What::One(_)
-            | What::Run(..)
-            | What::Packed(..)
-            | What::Bytes(_)
-            | What::Many(..)
-            | What::Skip { .. } => all.push(op.clone()),
+            PlanStep::One(_)
+            | PlanStep::Run(..)
+            | PlanStep::Packed(..)
+            | PlanStep::Bytes(_)
+            | PlanStep::Many(..)
+            | PlanStep::Skip { .. } => all.push(op.clone()),
         }
     }
     all
@@ -431,7 +438,7 @@ struct Compiler<'m> {
     wire: Wire,
     /// Ranges of transferred fields.
     carried: Vec<Range<usize>>,
-    given: BTreeMap<usize, Given<'m>>,
+    given: BTreeMap<usize, GivenConstant<'m>>,
     leaf: usize,
     ops: Vec<Op>,
     /// Start of the steps of the innermost message in an array.
@@ -455,16 +462,16 @@ impl Compiler<'_> {
 
     /// Adds the steps of a message and returns its minimum length in bytes. `element`: whether the
     /// message is an element of an array.
-    fn message(&mut self, shape: &Shape, element: bool) -> usize {
+    fn message(&mut self, shape: &MessageShape, element: bool) -> usize {
         if shape.fields.is_empty() && self.wire == Wire::Cdr {
-            self.push(What::Skip { align: 1, bytes: 1 });
+            self.push(PlanStep::Skip { align: 1, bytes: 1 });
             return 1;
         }
         let mut least = 0;
         for field in &shape.fields {
             least += match &field.kind {
                 ShapeKind::Sequence => {
-                    self.push(What::Skip { align: 4, bytes: 4 });
+                    self.push(PlanStep::Skip { align: 4, bytes: 4 });
                     4
                 }
                 ShapeKind::Primitive(primitive) => {
@@ -485,9 +492,9 @@ impl Compiler<'_> {
         least
     }
 
-    fn messages(&mut self, inner: &Shape, len: Len) -> usize {
+    fn messages(&mut self, inner: &MessageShape, len: Len) -> usize {
         let head = self.ops.len();
-        self.push(What::Messages {
+        self.push(PlanStep::Messages {
             of: inner.name.clone(),
             len,
             steps: 0,
@@ -500,7 +507,7 @@ impl Compiler<'_> {
         self.body = outer.max(self.ops.len());
         let all = self.ops.len() - head - 1;
         if let Some(Op {
-            what: What::Messages { steps, least, .. },
+            what: PlanStep::Messages { steps, least, .. },
             ..
         }) = self.ops.get_mut(head)
         {
@@ -516,16 +523,16 @@ impl Compiler<'_> {
         let text = matches!(primitive, Primitive::Text(_));
         let size = primitive.size();
         let Some(len) = length(arity) else {
-            self.push(What::One(primitive));
+            self.push(PlanStep::One(primitive));
             if !text {
                 self.shorten(size);
             }
             return size;
         };
         self.push(match primitive {
-            Primitive::Number(Number::UInt8) => What::Bytes(len),
-            Primitive::Number(number) => What::Packed(number, len),
-            Primitive::Clock(_) | Primitive::Text(_) => What::Many(primitive, len),
+            Primitive::Number(Number::UInt8) => PlanStep::Bytes(len),
+            Primitive::Number(number) => PlanStep::Packed(number, len),
+            Primitive::Clock(_) | Primitive::Text(_) => PlanStep::Many(primitive, len),
         });
         match len {
             Len::Fixed(count) => {
@@ -539,9 +546,9 @@ impl Compiler<'_> {
         }
     }
 
-    fn push(&mut self, what: What) {
+    fn push(&mut self, what: PlanStep) {
         let carry = self.carried.iter().any(|range| range.contains(&self.leaf));
-        let skip = matches!(what, What::Skip { .. });
+        let skip = matches!(what, PlanStep::Skip { .. });
         let constant = match self.given.get(&self.leaf).filter(|_| !skip) {
             Some(given) => match given.typed(&what) {
                 Ok(typed) => Some(Box::new(typed)),
@@ -559,7 +566,7 @@ impl Compiler<'_> {
             leaf: self.leaf,
         });
         if let Some(Op {
-            what: What::Skip { bytes, .. },
+            what: PlanStep::Skip { bytes, .. },
             ..
         }) = self.ops.last()
         {
@@ -572,7 +579,7 @@ impl Compiler<'_> {
     fn shorten(&mut self, bytes: usize) {
         let skips = |op: &Op| {
             let passed = !op.carry && op.constant.is_none();
-            passed || matches!(op.what, What::Skip { .. })
+            passed || matches!(op.what, PlanStep::Skip { .. })
         };
         if self.wire != Wire::Ros1 || !self.ops.last().is_some_and(skips) {
             return;
@@ -581,7 +588,7 @@ impl Compiler<'_> {
         let mergeable = self.ops.len() > self.body;
         let joined = match self.ops.last_mut() {
             Some(Op {
-                what: What::Skip { bytes: before, .. },
+                what: PlanStep::Skip { bytes: before, .. },
                 ..
             }) if mergeable => {
                 *before += bytes;
@@ -590,7 +597,7 @@ impl Compiler<'_> {
             _ => false,
         };
         if let Some(mut op) = last.filter(|_| !joined) {
-            op.what = What::Skip { align: 1, bytes };
+            op.what = PlanStep::Skip { align: 1, bytes };
             self.ops.push(op);
         }
     }

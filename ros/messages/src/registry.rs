@@ -4,9 +4,9 @@ use std::sync::Arc;
 use uadp::BuiltinType;
 
 use crate::bundle;
-use crate::definition::Definition;
+use crate::definition::MessageDefinition;
 use crate::idl;
-use crate::resolve::{self, Resolver};
+use crate::resolve::{self, TypeResolver};
 use crate::service::{self, ServiceDefinition};
 use crate::{
     ActionCalls, ActionMessages, ActionType, DefinitionError, Dialect, MessageType, ServiceType,
@@ -17,13 +17,13 @@ use crate::{
 ///
 /// Definitions may be added in any order: the types that a type needs are resolved on request.
 #[derive(Clone, Debug)]
-pub struct Registry {
+pub struct TypeRegistry {
     dialect: Dialect,
-    pub(crate) definitions: BTreeMap<TypeName, Arc<Definition>>,
+    pub(crate) definitions: BTreeMap<TypeName, Arc<MessageDefinition>>,
     services: BTreeMap<TypeName, Arc<ServiceDefinition>>,
 }
 
-impl Registry {
+impl TypeRegistry {
     /// Creates a registry without definitions.
     pub fn empty(dialect: Dialect) -> Self {
         Self {
@@ -47,9 +47,9 @@ impl Registry {
         let mut registry = Self::empty(dialect);
         for (kind, name, text) in bundle::texts(dialect) {
             let added = match kind {
-                bundle::Kind::Message => registry.add(&name, &text),
-                bundle::Kind::Service => registry.add_service(&name, &text),
-                bundle::Kind::Action => registry.add_action(&name, &text),
+                bundle::BundledKind::Message => registry.add(&name, &text),
+                bundle::BundledKind::Service => registry.add_service(&name, &text),
+                bundle::BundledKind::Action => registry.add_action(&name, &text),
             };
             // A test checks each of them.
             debug_assert!(added.is_ok(), "every text of the bundle parses");
@@ -89,9 +89,9 @@ impl Registry {
     ///
     /// # Errors
     /// [`DefinitionError::Syntax`]. Needed types may be added later, so a missing type is an error
-    /// of [`Registry::get`] only.
+    /// of [`TypeRegistry::get`] only.
     pub fn add(&mut self, name: &TypeName, text: &str) -> Result<(), DefinitionError> {
-        let definition = Definition::parse(self.dialect, name, text)?;
+        let definition = MessageDefinition::parse(self.dialect, name, text)?;
         self.definitions.insert(name.clone(), Arc::new(definition));
         Ok(())
     }
@@ -126,10 +126,10 @@ impl Registry {
     ) -> Result<(Arc<MessageType>, PeerDefinitions), DefinitionError> {
         let mut peers = BTreeMap::new();
         for (name, text) in sections(name, text)? {
-            let definition = Arc::new(Definition::parse(self.dialect, &name, text)?);
+            let definition = Arc::new(MessageDefinition::parse(self.dialect, &name, text)?);
             peers.entry(name).or_insert(definition);
         }
-        let found = Resolver::new(self.dialect, &[&peers, &self.definitions])
+        let found = TypeResolver::new(self.dialect, &[&peers, &self.definitions])
             .message_type(name, Some(text))?;
         let mut needed = Vec::new();
         let mut wanted = vec![name.clone()];
@@ -165,12 +165,12 @@ impl Registry {
 
     /// Returns the type of that name with all types it needs.
     pub fn get(&self, name: &TypeName) -> Result<Arc<MessageType>, DefinitionError> {
-        Resolver::new(self.dialect, &[&self.definitions])
+        TypeResolver::new(self.dialect, &[&self.definitions])
             .message_type(name, None)
             .map(Arc::new)
     }
 
-    pub(crate) fn definition(&self, name: &TypeName) -> Option<&Arc<Definition>> {
+    pub(crate) fn definition(&self, name: &TypeName) -> Option<&Arc<MessageDefinition>> {
         self.definitions.get(name)
     }
 
@@ -180,7 +180,10 @@ impl Registry {
     }
 
     /// Returns request and response of a service.
-    pub(crate) fn service_definitions(&self, name: &TypeName) -> Option<[&Arc<Definition>; 2]> {
+    pub(crate) fn service_definitions(
+        &self,
+        name: &TypeName,
+    ) -> Option<[&Arc<MessageDefinition>; 2]> {
         self.services.get(name).map(|service| service.parts())
     }
 
@@ -194,7 +197,7 @@ impl Registry {
     ///
     /// # Errors
     /// [`DefinitionError::Syntax`]. Needed types may be added later, so a missing type is an error
-    /// of [`Registry::service`] only.
+    /// of [`TypeRegistry::service`] only.
     pub fn add_service(&mut self, name: &TypeName, text: &str) -> Result<(), DefinitionError> {
         let definition = ServiceDefinition::parse(self.dialect, name, text)?;
         self.services.insert(name.clone(), Arc::new(definition));
@@ -204,7 +207,7 @@ impl Registry {
     /// Returns the service of that name with all types it needs.
     ///
     /// # Errors
-    /// As [`Registry::get`]. [`DefinitionError::Unknown`] refers to the service itself if
+    /// As [`TypeRegistry::get`]. [`DefinitionError::Unknown`] refers to the service itself if
     /// `needed_by` is `None`, otherwise to a message.
     pub fn service(&self, name: &TypeName) -> Result<Arc<ServiceType>, DefinitionError> {
         let Some(definition) = self.services.get(name) else {
@@ -215,7 +218,7 @@ impl Registry {
         };
         let own = definition.messages();
         let sets = [&own, &self.definitions];
-        let mut resolver = Resolver::new(self.dialect, &sets);
+        let mut resolver = TypeResolver::new(self.dialect, &sets);
         definition.resolve(name, &mut resolver).map(Arc::new)
     }
 
@@ -274,7 +277,7 @@ impl Registry {
     /// package has a `.msg` file for each message beside the `.action` file.
     ///
     /// # Errors
-    /// As [`Registry::get`], for its messages.
+    /// As [`TypeRegistry::get`], for its messages.
     pub fn action(&self, name: &TypeName) -> Result<Arc<ActionType>, DefinitionError> {
         ActionType::of(name, |name| self.get(name)).map(Arc::new)
     }
@@ -282,7 +285,7 @@ impl Registry {
     /// Returns the added ROS 2 action of that name.
     ///
     /// # Errors
-    /// As [`Registry::get`], for its messages.
+    /// As [`TypeRegistry::get`], for its messages.
     pub fn action_messages(&self, name: &TypeName) -> Result<ActionMessages, DefinitionError> {
         ActionMessages::of(name, |name| self.get(name))
     }
@@ -290,12 +293,12 @@ impl Registry {
     /// Returns the action of that name, of ROS 1 or ROS 2, as calls and values of the space.
     ///
     /// # Errors
-    /// As [`Registry::get`], for its messages.
+    /// As [`TypeRegistry::get`], for its messages.
     pub fn action_calls(&self, name: &TypeName) -> Result<ActionCalls, DefinitionError> {
         ActionCalls::of((self.dialect, name), &self.definitions)
     }
 
-    /// Returns a similar name as [`Registry::suggest`] does, among the services.
+    /// Returns a similar name as [`TypeRegistry::suggest`] does, among the services.
     pub fn suggest_service(&self, name: &TypeName) -> Option<TypeName> {
         resolve::suggest(name, self.services.keys())
     }
@@ -321,7 +324,7 @@ impl Registry {
 /// The type definitions of a peer by name, the type itself first.
 #[derive(Clone, Debug)]
 pub struct PeerDefinitions {
-    needed: Vec<(TypeName, Arc<Definition>)>,
+    needed: Vec<(TypeName, Arc<MessageDefinition>)>,
 }
 
 impl PeerDefinitions {

@@ -7,8 +7,10 @@ use std::sync::Arc;
 use md5::{Digest, Md5};
 use uadp::BuiltinType;
 
-use crate::definition::{Arity, Clock, Constant, Definition, FieldType, Number, Primitive};
-use crate::{DefinitionError, Dialect, Leaf, MessageType, Rank, TypeName};
+use crate::definition::{
+    Arity, ClockType, Constant, FieldType, MessageDefinition, Number, Primitive,
+};
+use crate::{ArrayRank, DefinitionError, Dialect, Leaf, MessageType, TypeName};
 
 const DEEPEST: usize = 32;
 pub(crate) const MOST_FIELDS: usize = 4096;
@@ -16,7 +18,7 @@ const BIGGEST: usize = 64 << 20;
 
 /// A message with its nested messages, as the plan compiler traverses it.
 #[derive(Debug, PartialEq, Eq)]
-pub(crate) struct Shape {
+pub(crate) struct MessageShape {
     pub(crate) name: TypeName,
     pub(crate) fields: Vec<ShapeField>,
     pub(crate) constants: Vec<Constant>,
@@ -38,7 +40,7 @@ pub(crate) struct ShapeField {
 #[derive(Debug, PartialEq, Eq)]
 pub(crate) enum ShapeKind {
     Primitive(Primitive),
-    Message(Arc<Shape>),
+    Message(Arc<MessageShape>),
     /// `seq` of a ROS 1 Header.
     Sequence,
 }
@@ -89,7 +91,7 @@ impl Number {
     }
 }
 
-impl Clock {
+impl ClockType {
     pub(crate) const fn builtin(self) -> BuiltinType {
         match self {
             Self::Time1 | Self::Time2 => BuiltinType::DateTime,
@@ -99,17 +101,17 @@ impl Clock {
 }
 
 /// Looks up names in several sets of definitions; the first set with the name takes precedence.
-pub(crate) struct Resolver<'r> {
+pub(crate) struct TypeResolver<'r> {
     dialect: Dialect,
-    sets: &'r [&'r BTreeMap<TypeName, Arc<Definition>>],
-    shapes: BTreeMap<TypeName, Arc<Shape>>,
+    sets: &'r [&'r BTreeMap<TypeName, Arc<MessageDefinition>>],
+    shapes: BTreeMap<TypeName, Arc<MessageShape>>,
     md5s: BTreeMap<TypeName, String>,
 }
 
-impl<'r> Resolver<'r> {
+impl<'r> TypeResolver<'r> {
     pub(crate) fn new(
         dialect: Dialect,
-        sets: &'r [&'r BTreeMap<TypeName, Arc<Definition>>],
+        sets: &'r [&'r BTreeMap<TypeName, Arc<MessageDefinition>>],
     ) -> Self {
         Self {
             dialect,
@@ -132,7 +134,7 @@ impl<'r> Resolver<'r> {
                     kind: ShapeKind::Primitive(primitive),
                     arity: Arity::One,
                 };
-                Arc::new(Shape {
+                Arc::new(MessageShape {
                     name: name.clone(),
                     fields: vec![data],
                     constants: Vec::new(),
@@ -167,10 +169,10 @@ impl<'r> Resolver<'r> {
     fn time(&self, name: &TypeName) -> Option<Primitive> {
         match self.dialect {
             Dialect::Ros2 if name.is("builtin_interfaces", "Time") => {
-                Some(Primitive::Clock(Clock::Time2))
+                Some(Primitive::Clock(ClockType::Time2))
             }
             Dialect::Ros2 if name.is("builtin_interfaces", "Duration") => {
-                Some(Primitive::Clock(Clock::Duration2))
+                Some(Primitive::Clock(ClockType::Duration2))
             }
             Dialect::Ros1 | Dialect::Ros2 => None,
         }
@@ -180,7 +182,7 @@ impl<'r> Resolver<'r> {
         &self,
         name: &TypeName,
         needed_by: Option<&TypeName>,
-    ) -> Result<&'r Arc<Definition>, DefinitionError> {
+    ) -> Result<&'r Arc<MessageDefinition>, DefinitionError> {
         self.sets
             .iter()
             .find_map(|set| set.get(name))
@@ -195,7 +197,7 @@ impl<'r> Resolver<'r> {
         &mut self,
         name: &TypeName,
         above: &mut Vec<TypeName>,
-    ) -> Result<Arc<Shape>, DefinitionError> {
+    ) -> Result<Arc<MessageShape>, DefinitionError> {
         if above.contains(name) {
             return Err(DefinitionError::Cyclic { name: name.clone() });
         }
@@ -212,7 +214,7 @@ impl<'r> Resolver<'r> {
         }
         let definition = self.find(name, above.last())?;
         above.push(name.clone());
-        let mut shape = Shape {
+        let mut shape = MessageShape {
             name: name.clone(),
             fields: Vec::new(),
             constants: definition.constants.clone(),
@@ -242,7 +244,7 @@ impl<'r> Resolver<'r> {
         Ok(shape)
     }
 
-    fn is_sequence(&self, definition: &Definition, field: &str) -> bool {
+    fn is_sequence(&self, definition: &MessageDefinition, field: &str) -> bool {
         self.dialect == Dialect::Ros1 && definition.name.is("std_msgs", "Header") && field == "seq"
     }
 
@@ -347,7 +349,7 @@ pub(crate) fn hex(bytes: &[u8]) -> String {
     text
 }
 
-impl Shape {
+impl MessageShape {
     fn push(&mut self, field: ShapeField) -> Result<(), DefinitionError> {
         let (weight, element) = match &field.kind {
             ShapeKind::Primitive(primitive) => (1, primitive.size()),
@@ -380,7 +382,7 @@ impl Shape {
     }
 }
 
-pub(crate) fn flatten(shape: &Shape, prefix: &str, leaves: &mut Vec<Leaf>) {
+pub(crate) fn flatten(shape: &MessageShape, prefix: &str, leaves: &mut Vec<Leaf>) {
     for field in &shape.fields {
         let path = format!("{prefix}{}", field.name);
         match (&field.kind, field.arity) {
@@ -398,7 +400,7 @@ pub(crate) fn flatten(shape: &Shape, prefix: &str, leaves: &mut Vec<Leaf>) {
                 leaves.push(Leaf {
                     path,
                     builtin: BuiltinType::ByteString,
-                    rank: Rank::Scalar,
+                    rank: ArrayRank::Scalar,
                 });
             }
             (ShapeKind::Primitive(primitive), arity) => leaves.push(Leaf {
@@ -410,13 +412,13 @@ pub(crate) fn flatten(shape: &Shape, prefix: &str, leaves: &mut Vec<Leaf>) {
     }
 }
 
-fn rank(arity: Arity) -> Rank {
+fn rank(arity: Arity) -> ArrayRank {
     match arity {
-        Arity::One => Rank::Scalar,
-        Arity::Fixed(length) => Rank::Array {
+        Arity::One => ArrayRank::Scalar,
+        Arity::Fixed(length) => ArrayRank::Array {
             fixed: Some(length),
         },
-        Arity::Sequence { .. } => Rank::Array { fixed: None },
+        Arity::Sequence { .. } => ArrayRank::Array { fixed: None },
     }
 }
 

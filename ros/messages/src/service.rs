@@ -5,9 +5,9 @@ use std::sync::Arc;
 
 use md5::{Digest, Md5};
 
-use crate::definition::Definition;
+use crate::definition::MessageDefinition;
 use crate::idl;
-use crate::resolve::{self, Resolver};
+use crate::resolve::{self, TypeResolver};
 use crate::{DefinitionError, Dialect, MessageType, TextKind, TypeName};
 
 /// A service type with all types it needs resolved.
@@ -163,8 +163,8 @@ impl ActionMessages {
 /// The two messages of a `.srv` text.
 #[derive(Clone, Debug)]
 pub(crate) struct ServiceDefinition {
-    request: Arc<Definition>,
-    response: Arc<Definition>,
+    request: Arc<MessageDefinition>,
+    response: Arc<MessageDefinition>,
 }
 
 impl ServiceDefinition {
@@ -197,11 +197,11 @@ impl ServiceDefinition {
     }
 
     /// Returns request and response.
-    pub(crate) fn parts(&self) -> [&Arc<Definition>; 2] {
+    pub(crate) fn parts(&self) -> [&Arc<MessageDefinition>; 2] {
         [&self.request, &self.response]
     }
 
-    pub(crate) fn messages(&self) -> BTreeMap<TypeName, Arc<Definition>> {
+    pub(crate) fn messages(&self) -> BTreeMap<TypeName, Arc<MessageDefinition>> {
         [&self.request, &self.response]
             .into_iter()
             .map(|definition| (definition.name.clone(), Arc::clone(definition)))
@@ -211,7 +211,7 @@ impl ServiceDefinition {
     pub(crate) fn resolve(
         &self,
         name: &TypeName,
-        resolver: &mut Resolver<'_>,
+        resolver: &mut TypeResolver<'_>,
     ) -> Result<ServiceType, DefinitionError> {
         let request = resolver.message_type(&self.request.name, None)?;
         let response = resolver.message_type(&self.response.name, None)?;
@@ -238,7 +238,7 @@ pub(crate) fn action_parts(
     dialect: Dialect,
     name: &TypeName,
     text: &str,
-) -> Result<[Arc<Definition>; 3], DefinitionError> {
+) -> Result<[Arc<MessageDefinition>; 3], DefinitionError> {
     let [goal, result, feedback] = parts(name, text, ACTION_PARTS)?;
     Ok([
         goal.parse(dialect, &derived(name, "Goal")?)?,
@@ -256,7 +256,7 @@ pub(crate) fn action(
     dialect: Dialect,
     name: &TypeName,
     text: &str,
-) -> Result<Vec<(TypeName, Arc<Definition>)>, DefinitionError> {
+) -> Result<Vec<(TypeName, Arc<MessageDefinition>)>, DefinitionError> {
     let goal_result_feedback = action_parts(dialect, name, text)?;
     with_made(dialect, name, goal_result_feedback)
 }
@@ -265,7 +265,7 @@ pub(crate) fn action(
 pub(crate) fn idl_action(
     name: &TypeName,
     text: &str,
-) -> Result<Vec<(TypeName, Arc<Definition>)>, DefinitionError> {
+) -> Result<Vec<(TypeName, Arc<MessageDefinition>)>, DefinitionError> {
     let parts = [
         ("_Goal", derived(name, "Goal")?),
         ("_Result", derived(name, "Result")?),
@@ -279,8 +279,8 @@ pub(crate) fn idl_action(
 fn with_made(
     dialect: Dialect,
     name: &TypeName,
-    goal_result_feedback: [Arc<Definition>; 3],
-) -> Result<Vec<(TypeName, Arc<Definition>)>, DefinitionError> {
+    goal_result_feedback: [Arc<MessageDefinition>; 3],
+) -> Result<Vec<(TypeName, Arc<MessageDefinition>)>, DefinitionError> {
     let x = name.name();
     let made = match dialect {
         Dialect::Ros1 => wrappers(x),
@@ -288,7 +288,7 @@ fn with_made(
     };
     let mut found = goal_result_feedback.to_vec();
     for (suffix, text) in made {
-        let part = Part { before: 0, text };
+        let part = DefinitionPart { before: 0, text };
         found.push(part.parse(dialect, &derived(name, suffix)?)?);
     }
     let named = found
@@ -318,15 +318,19 @@ fn wrappers(x: &str) -> Vec<(&'static str, String)> {
 }
 
 /// A part of a text, and the number of lines before it.
-struct Part {
+struct DefinitionPart {
     before: usize,
     text: String,
 }
 
-impl Part {
+impl DefinitionPart {
     /// Parses the part. An error contains the line number in the whole text.
-    fn parse(&self, dialect: Dialect, name: &TypeName) -> Result<Arc<Definition>, DefinitionError> {
-        match Definition::parse(dialect, name, &self.text) {
+    fn parse(
+        &self,
+        dialect: Dialect,
+        name: &TypeName,
+    ) -> Result<Arc<MessageDefinition>, DefinitionError> {
+        match MessageDefinition::parse(dialect, name, &self.text) {
             Ok(definition) => Ok(Arc::new(definition)),
             Err(DefinitionError::Syntax {
                 name,
@@ -350,14 +354,14 @@ fn parts<const N: usize>(
     name: &TypeName,
     text: &str,
     reason: &'static str,
-) -> Result<[Part; N], DefinitionError> {
-    let mut found = vec![Part {
+) -> Result<[DefinitionPart; N], DefinitionError> {
+    let mut found = vec![DefinitionPart {
         before: 0,
         text: String::new(),
     }];
     for (number, line) in text.lines().enumerate() {
         if line.starts_with("---") {
-            found.push(Part {
+            found.push(DefinitionPart {
                 before: number + 1,
                 text: String::new(),
             });

@@ -3,19 +3,19 @@
 use uadp::BuiltinType;
 
 use crate::definition::{Arity, Number, Primitive};
-use crate::resolve::{Shape, ShapeKind, flatten};
-use crate::{Leaf, MessageType, Rank, TypeName};
+use crate::resolve::{MessageShape, ShapeKind, flatten};
+use crate::{ArrayRank, Leaf, MessageType, TypeName};
 
 /// A message type as a structure: its fields in the order of their encoding (OPC 10000-6, 5.2.6).
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Structure<'m> {
+pub struct MessageStructure<'m> {
     /// The message type.
     pub name: &'m TypeName,
     /// Its fields; a nested message is one field.
     pub fields: Vec<StructureMember<'m>>,
 }
 
-/// A field of a [`Structure`].
+/// A field of a [`MessageStructure`].
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct StructureMember<'m> {
     /// Its name in the message definition.
@@ -23,7 +23,7 @@ pub struct StructureMember<'m> {
     /// Type of the field or of its elements.
     pub kind: MemberKind<'m>,
     /// Single value or array.
-    pub rank: Rank,
+    pub rank: ArrayRank,
 }
 
 /// Type of a [`StructureMember`].
@@ -46,7 +46,7 @@ impl MessageType {
     /// Returns the message at a path, as in [`message_at`](Self::message_at), as a structure,
     /// followed by its nested structures, each once. Empty if the path has no message.
     #[must_use]
-    pub fn structures(&self, path: &str) -> Vec<Structure<'_>> {
+    pub fn structures(&self, path: &str) -> Vec<MessageStructure<'_>> {
         let mut found = Vec::new();
         if let Some(shape) = self.shape_at(path) {
             collect(shape, &mut found);
@@ -73,7 +73,7 @@ impl MessageType {
         Some((&shape.name, leaves))
     }
 
-    fn shape_at(&self, path: &str) -> Option<&Shape> {
+    fn shape_at(&self, path: &str) -> Option<&MessageShape> {
         let mut parts = path.split('.').filter(|part| !part.is_empty());
         parts.try_fold(self.shape.as_ref(), |shape, part| {
             let field = shape.fields.iter().find(|field| field.name == part)?;
@@ -86,11 +86,11 @@ impl MessageType {
 }
 
 /// Collects nested structures. The recursion is limited by the nesting limit of definitions.
-fn collect<'m>(shape: &'m Shape, found: &mut Vec<Structure<'m>>) {
+fn collect<'m>(shape: &'m MessageShape, found: &mut Vec<MessageStructure<'m>>) {
     if found.iter().any(|known| *known.name == shape.name) {
         return;
     }
-    found.push(Structure {
+    found.push(MessageStructure {
         name: &shape.name,
         fields: shape.fields.iter().filter_map(member).collect(),
     });
@@ -104,18 +104,19 @@ fn collect<'m>(shape: &'m Shape, found: &mut Vec<Structure<'m>>) {
 /// Returns the member of a field, or `None` for a field that is not transferred.
 fn member(field: &crate::resolve::ShapeField) -> Option<StructureMember<'_>> {
     let rank = match field.arity {
-        Arity::One => Rank::Scalar,
-        Arity::Fixed(length) => Rank::Array {
+        Arity::One => ArrayRank::Scalar,
+        Arity::Fixed(length) => ArrayRank::Array {
             fixed: Some(length),
         },
-        Arity::Sequence { .. } => Rank::Array { fixed: None },
+        Arity::Sequence { .. } => ArrayRank::Array { fixed: None },
     };
     let (kind, rank) = match &field.kind {
         ShapeKind::Sequence => return None,
         ShapeKind::Message(inner) => (MemberKind::Message(&inner.name), rank),
-        ShapeKind::Primitive(Primitive::Number(Number::UInt8)) if rank != Rank::Scalar => {
-            (MemberKind::Value(BuiltinType::ByteString), Rank::Scalar)
-        }
+        ShapeKind::Primitive(Primitive::Number(Number::UInt8)) if rank != ArrayRank::Scalar => (
+            MemberKind::Value(BuiltinType::ByteString),
+            ArrayRank::Scalar,
+        ),
         ShapeKind::Primitive(primitive) => (MemberKind::Value(primitive.builtin()), rank),
     };
     Some(StructureMember {
@@ -127,11 +128,11 @@ fn member(field: &crate::resolve::ShapeField) -> Option<StructureMember<'_>> {
 
 #[cfg(test)]
 mod tests {
-    use crate::{Dialect, Registry};
+    use crate::{Dialect, TypeRegistry};
 
     #[test]
     fn a_message_is_a_structure_of_its_fields_with_each_message_in_it_once() {
-        let registry = Registry::bundle(Dialect::Ros1);
+        let registry = TypeRegistry::bundle(Dialect::Ros1);
         let name = "nav_msgs/Path".parse().unwrap();
         let path = registry.get(&name).unwrap();
         let names = |at: &str| -> Vec<String> {

@@ -11,9 +11,11 @@ use std::sync::Arc;
 
 use sha2::{Digest, Sha256};
 
-use crate::definition::{Arity, Definition, Field, FieldType, Number, Primitive, Text};
+use crate::definition::{
+    Arity, FieldDefinition, FieldType, MessageDefinition, Number, Primitive, StringType,
+};
 use crate::resolve::hex;
-use crate::{DefinitionError, DescribedField, DescribedType, Dialect, Registry, TypeName};
+use crate::{DefinitionError, DescribedField, DescribedType, Dialect, TypeName, TypeRegistry};
 
 /// The hash of a ROS 2 type, as announced by nodes since Iron. Prints as `RIHS01_` and 64 hex
 /// digits.
@@ -57,7 +59,7 @@ pub struct NoTypeHash;
 
 /// Returns the description of a message and of the types it needs.
 pub(crate) fn describe(
-    registry: &Registry,
+    registry: &TypeRegistry,
     name: &TypeName,
 ) -> Result<Vec<DescribedType>, DefinitionError> {
     registry.get(name)?;
@@ -68,7 +70,7 @@ pub(crate) fn describe(
 
 /// Returns the description of a service and of the types it needs.
 pub(crate) fn describe_service(
-    registry: &Registry,
+    registry: &TypeRegistry,
     name: &TypeName,
 ) -> Result<Vec<DescribedType>, DefinitionError> {
     let (types, full) = Described::of_service(registry, name)?;
@@ -77,7 +79,7 @@ pub(crate) fn describe_service(
 
 /// Returns the description of an added ROS 2 action and of the types it needs.
 pub(crate) fn describe_action(
-    registry: &Registry,
+    registry: &TypeRegistry,
     name: &TypeName,
 ) -> Result<Vec<DescribedType>, DefinitionError> {
     let (types, full) = Described::of_added_action(registry, name)?;
@@ -122,12 +124,12 @@ pub struct ActionTypeHashes {
     pub feedback_message: TypeHash,
 }
 
-impl Registry {
+impl TypeRegistry {
     /// Returns the type hash of a message. Definitions are treated as ROS 2 definitions; the hash
     /// has no meaning for a registry of ROS 1.
     ///
     /// # Errors
-    /// As [`Registry::get`].
+    /// As [`TypeRegistry::get`].
     pub fn type_hash(&self, name: &TypeName) -> Result<TypeHash, DefinitionError> {
         // Checks for types that contain themselves, which the code below assumes to be absent.
         self.get(name)?;
@@ -139,7 +141,7 @@ impl Registry {
     /// Returns the type hashes of a service and of the messages that rosidl derives from it.
     ///
     /// # Errors
-    /// As [`Registry::service`].
+    /// As [`TypeRegistry::service`].
     pub fn service_type_hashes(
         &self,
         name: &TypeName,
@@ -152,7 +154,7 @@ impl Registry {
     /// messages and services that rosidl derives from it (design.ros2.org, "Actions").
     ///
     /// # Errors
-    /// As [`Registry::get`], and [`DefinitionError::Syntax`] for a text without exactly three
+    /// As [`TypeRegistry::get`], and [`DefinitionError::Syntax`] for a text without exactly three
     /// parts.
     pub fn action_type_hashes(
         &self,
@@ -168,7 +170,7 @@ impl Registry {
     /// [`action_type_hashes`](Self::action_type_hashes).
     ///
     /// # Errors
-    /// As [`Registry::get`], for its messages.
+    /// As [`TypeRegistry::get`], for its messages.
     pub fn added_action_type_hashes(
         &self,
         name: &TypeName,
@@ -180,7 +182,7 @@ impl Registry {
 
 /// Types by their ROS 2 names.
 struct Described<'r> {
-    registry: &'r Registry,
+    registry: &'r TypeRegistry,
     types: BTreeMap<String, Vec<FieldDescription>>,
 }
 
@@ -195,7 +197,7 @@ struct FieldDescription {
 }
 
 impl<'r> Described<'r> {
-    fn new(registry: &'r Registry) -> Self {
+    fn new(registry: &'r TypeRegistry) -> Self {
         Self {
             registry,
             types: BTreeMap::new(),
@@ -204,7 +206,7 @@ impl<'r> Described<'r> {
 
     /// Returns a service with all types it needs, and its ROS 2 name.
     fn of_service(
-        registry: &'r Registry,
+        registry: &'r TypeRegistry,
         name: &TypeName,
     ) -> Result<(Self, String), DefinitionError> {
         registry.service(name)?;
@@ -220,9 +222,9 @@ impl<'r> Described<'r> {
 
     /// Returns an action of these three parts with all types it needs, and its ROS 2 name.
     fn of_action(
-        registry: &'r Registry,
+        registry: &'r TypeRegistry,
         name: &TypeName,
-        parts: &[Arc<Definition>; 3],
+        parts: &[Arc<MessageDefinition>; 3],
     ) -> Result<(Self, String), DefinitionError> {
         let full = format!("{}/action/{}", name.package(), name.name());
         let mut types = Self::new(registry);
@@ -237,7 +239,7 @@ impl<'r> Described<'r> {
     }
 
     fn of_added_action(
-        registry: &'r Registry,
+        registry: &'r TypeRegistry,
         name: &TypeName,
     ) -> Result<(Self, String), DefinitionError> {
         let part = |suffix| {
@@ -280,7 +282,7 @@ impl<'r> Described<'r> {
     fn definition(
         &mut self,
         full: &str,
-        definition: &Arc<Definition>,
+        definition: &Arc<MessageDefinition>,
     ) -> Result<(), DefinitionError> {
         if self.types.contains_key(full) {
             return Ok(());
@@ -519,7 +521,7 @@ impl FieldDescription {
         }
     }
 
-    fn of(field: &Field, dialect: Dialect) -> Self {
+    fn of(field: &FieldDefinition, dialect: Dialect) -> Self {
         let mut found = match &field.kind {
             FieldType::Message(name) => Self::nested(&field.name, &name.ros2()),
             // The parser treats it as `uint8`, which has the same values and bytes.
@@ -549,7 +551,7 @@ impl FieldDescription {
         found
     }
 
-    fn text(name: &str, text: Text) -> Self {
+    fn text(name: &str, text: StringType) -> Self {
         let bounded = text.bound != u32::MAX;
         let type_id = match (text.wide, bounded) {
             (false, false) => STRING,

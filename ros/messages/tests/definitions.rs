@@ -3,8 +3,8 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use messages::{
-    DefinitionError, Dialect, Leaf, MessageType, NoFields, Plan, PlanError, Rank, Registry,
-    Selection, TypeName, Wire, standard_type,
+    ArrayRank, DefinitionError, Dialect, Leaf, MessagePlan, MessageType, NoFields, PlanError,
+    Selection, TypeName, TypeRegistry, Wire, standard_type,
 };
 use uadp::BuiltinType;
 
@@ -12,8 +12,8 @@ fn name(text: &str) -> TypeName {
     text.parse().unwrap()
 }
 
-fn registry(dialect: Dialect, definitions: &[(&str, &str)]) -> Registry {
-    let mut registry = Registry::bundle(dialect);
+fn registry(dialect: Dialect, definitions: &[(&str, &str)]) -> TypeRegistry {
+    let mut registry = TypeRegistry::bundle(dialect);
     for (name_text, text) in definitions {
         registry.add(&name(name_text), text).unwrap();
     }
@@ -31,7 +31,7 @@ fn a_pose_stamped_is_flattened_by_path_without_the_sequence_number() {
     let leaf = |path: &str, builtin| Leaf {
         path: path.to_owned(),
         builtin,
-        rank: Rank::Scalar,
+        rank: ArrayRank::Scalar,
     };
     let mut wanted = vec![
         leaf("header.stamp", BuiltinType::DateTime),
@@ -49,7 +49,7 @@ fn a_pose_stamped_is_flattened_by_path_without_the_sequence_number() {
         wanted.push(leaf(&format!("pose.{part}"), BuiltinType::Double));
     }
     for dialect in [Dialect::Ros1, Dialect::Ros2] {
-        let found = Registry::bundle(dialect)
+        let found = TypeRegistry::bundle(dialect)
             .get(&name("geometry_msgs/PoseStamped"))
             .unwrap();
         assert_eq!(found.leaves(), wanted, "{dialect:?}");
@@ -69,12 +69,15 @@ fn bytes_are_byte_strings_fixed_arrays_keep_their_length_and_messages_become_str
     assert_eq!(
         shapes,
         [
-            (BuiltinType::SByte, Rank::Array { fixed: None }),
-            (BuiltinType::ByteString, Rank::Scalar),
-            (BuiltinType::Byte, Rank::Scalar),
-            (BuiltinType::Float, Rank::Array { fixed: Some(3) }),
-            (BuiltinType::ExtensionObject, Rank::Array { fixed: Some(2) }),
-            (BuiltinType::Double, Rank::Array { fixed: None }),
+            (BuiltinType::SByte, ArrayRank::Array { fixed: None }),
+            (BuiltinType::ByteString, ArrayRank::Scalar),
+            (BuiltinType::Byte, ArrayRank::Scalar),
+            (BuiltinType::Float, ArrayRank::Array { fixed: Some(3) }),
+            (
+                BuiltinType::ExtensionObject,
+                ArrayRank::Array { fixed: Some(2) }
+            ),
+            (BuiltinType::Double, ArrayRank::Array { fixed: None }),
         ]
     );
     let ros2 = message(Dialect::Ros2, "byte[] bytes\nbyte one\nwstring wide");
@@ -130,7 +133,7 @@ fn a_missing_type_is_named_with_who_needs_it_and_what_may_be_meant() {
     reason = "what takes how long is the matter"
 )]
 fn a_name_nobody_knows_costs_no_more_than_one_that_is_known() {
-    let registry = Registry::bundle(Dialect::Ros2);
+    let registry = TypeRegistry::bundle(Dialect::Ros2);
     let time = |text: &str| {
         let name = name(text);
         let start = std::time::Instant::now();
@@ -166,7 +169,7 @@ fn types_that_contain_themselves_or_nest_without_end_are_refused() {
         DefinitionError::Cyclic { name: name("t/B") }
     );
 
-    let mut deep = Registry::empty(Dialect::Ros2);
+    let mut deep = TypeRegistry::empty(Dialect::Ros2);
     deep.add(&name("t/L1"), "int8 x").unwrap();
     for level in 2..=33 {
         deep.add(
@@ -203,7 +206,7 @@ fn a_time_defined_by_itself_is_still_a_time() {
 #[test]
 fn a_text_of_very_many_fields_is_refused_where_the_limit_is_passed() {
     let text: String = (0..5000).map(|field| format!("int8 f{field}\n")).collect();
-    let error = Registry::empty(Dialect::Ros1)
+    let error = TypeRegistry::empty(Dialect::Ros1)
         .add(&name("t/T"), &text)
         .unwrap_err();
     assert_eq!(
@@ -214,7 +217,7 @@ fn a_text_of_very_many_fields_is_refused_where_the_limit_is_passed() {
 
 #[test]
 fn types_that_multiply_are_refused_before_they_are_built() {
-    let mut registry = Registry::empty(Dialect::Ros2);
+    let mut registry = TypeRegistry::empty(Dialect::Ros2);
     registry.add(&name("t/L1"), "int8 x").unwrap();
     for level in 2..=20 {
         let text: String = (0..8)
@@ -244,7 +247,7 @@ const PEER: &str = "Header header\nmine/Thing[] things\n\n\
 
 #[test]
 fn a_connection_header_brings_its_own_definition() {
-    let mut registry = Registry::bundle(Dialect::Ros1);
+    let mut registry = TypeRegistry::bundle(Dialect::Ros1);
     let found = registry
         .add_ros1_definition(&name("mine/Things"), PEER)
         .unwrap();
@@ -262,7 +265,7 @@ fn a_connection_header_brings_its_own_definition() {
 
 #[test]
 fn of_a_connection_header_only_what_its_type_needs_is_kept_and_can_be_forgotten() {
-    let mut registry = Registry::bundle(Dialect::Ros1);
+    let mut registry = TypeRegistry::bundle(Dialect::Ros1);
     let before = registry.names().count();
     let rule = "=".repeat(80);
     let padded = format!("{PEER}{rule}\nMSG: mine/Unneeded\nint8 x\n");
@@ -282,7 +285,7 @@ fn of_a_connection_header_only_what_its_type_needs_is_kept_and_can_be_forgotten(
 
 #[test]
 fn a_peer_cannot_replace_a_definition() {
-    let mut registry = Registry::bundle(Dialect::Ros1);
+    let mut registry = TypeRegistry::bundle(Dialect::Ros1);
     let before = registry.get(&name("geometry_msgs/Point")).unwrap();
     let found = registry
         .add_ros1_definition(&name("geometry_msgs/Point"), "float32 x\n")
@@ -303,7 +306,7 @@ fn a_peer_cannot_replace_a_definition() {
 
 #[test]
 fn a_broken_connection_header_is_refused_and_leaves_nothing_behind() {
-    let mut registry = Registry::empty(Dialect::Ros1);
+    let mut registry = TypeRegistry::empty(Dialect::Ros1);
     let rule = "=".repeat(80);
     for text in [
         format!("int8 x\n{rule}\nno heading\nint8 y\n"),
@@ -328,15 +331,16 @@ fn a_broken_connection_header_is_refused_and_leaves_nothing_behind() {
 
 #[test]
 fn a_wrong_path_lists_the_paths_there_are() {
-    let found = Registry::bundle(Dialect::Ros1)
+    let found = TypeRegistry::bundle(Dialect::Ros1)
         .get(&name("geometry_msgs/Vector3"))
         .unwrap();
-    let error = Plan::compile(&found, &Selection::Field("X".to_owned()), Wire::Ros1).unwrap_err();
+    let error =
+        MessagePlan::compile(&found, &Selection::Field("X".to_owned()), Wire::Ros1).unwrap_err();
     assert_eq!(
         error.to_string(),
         "`geometry_msgs/Vector3` has no field `X`; it has x, y, z"
     );
-    let error = Plan::compile(&found, &Selection::Whole, Wire::Cdr).unwrap_err();
+    let error = MessagePlan::compile(&found, &Selection::Whole, Wire::Cdr).unwrap_err();
     assert_eq!(
         error,
         PlanError::Wire {
@@ -348,7 +352,7 @@ fn a_wrong_path_lists_the_paths_there_are() {
 #[test]
 fn every_standard_type_holds_its_builtin_type_alone() {
     for dialect in [Dialect::Ros1, Dialect::Ros2] {
-        let registry = Registry::bundle(dialect);
+        let registry = TypeRegistry::bundle(dialect);
         let mut found = 0;
         for builtin in (1..=25).filter_map(BuiltinType::from_id) {
             assert_eq!(standard_type(builtin, true), None);
@@ -361,7 +365,7 @@ fn every_standard_type_holds_its_builtin_type_alone() {
                 [Leaf {
                     path: "data".to_owned(),
                     builtin,
-                    rank: Rank::Scalar
+                    rank: ArrayRank::Scalar
                 }],
                 "{standard}"
             );
@@ -377,7 +381,7 @@ fn every_standard_type_holds_its_builtin_type_alone() {
 
 #[test]
 fn constants_are_told_with_their_values() {
-    let mut registry = Registry::empty(Dialect::Ros1);
+    let mut registry = TypeRegistry::empty(Dialect::Ros1);
     let text = "uint8 ADD=1 # one\nstring WORD= it's # all\nuint8 cmd";
     registry.add(&name("t/T"), text).unwrap();
     let found = registry.get(&name("t/T")).unwrap();
@@ -386,7 +390,7 @@ fn constants_are_told_with_their_values() {
     assert_eq!(found.constant("WORD").unwrap().value, "it's # all");
     assert_eq!(found.constants().len(), 2);
     assert!(found.constant("cmd").is_none());
-    let mut registry = Registry::empty(Dialect::Ros2);
+    let mut registry = TypeRegistry::empty(Dialect::Ros2);
     let text = "string A='x'\nstring B=\"y\"\nstring C=z";
     registry.add(&name("t/T"), text).unwrap();
     let found = registry.get(&name("t/T")).unwrap();
@@ -402,7 +406,7 @@ fn constants_are_told_with_their_values() {
 fn a_service_is_the_same_while_no_message_in_it_is_another() {
     for dialect in [Dialect::Ros1, Dialect::Ros2] {
         let service = |inner: &str| {
-            let mut registry = Registry::empty(dialect);
+            let mut registry = TypeRegistry::empty(dialect);
             registry.add(&name("t/Inner"), inner).unwrap();
             registry
                 .add_service(&name("t/S"), "t/Inner[] all\n---\nbool ok\n")
@@ -418,7 +422,7 @@ fn a_service_is_the_same_while_no_message_in_it_is_another() {
 
 #[test]
 fn a_service_is_two_messages_found_only_through_it() {
-    let mut registry = Registry::bundle(Dialect::Ros1);
+    let mut registry = TypeRegistry::bundle(Dialect::Ros1);
     let text = "uint8 ADD = 1\nuint8 cmd\n--- # the answer\nItem[] items\n";
     registry.add_service(&name("t/List"), text).unwrap();
     let error = registry.service(&name("t/List")).unwrap_err();
@@ -442,7 +446,7 @@ fn a_service_is_two_messages_found_only_through_it() {
 
 #[test]
 fn a_service_or_action_text_in_the_wrong_number_of_parts_is_refused() {
-    let mut registry = Registry::empty(Dialect::Ros1);
+    let mut registry = TypeRegistry::empty(Dialect::Ros1);
     for text in ["", "bool a\n", "---\n---\n"] {
         let error = registry.add_service(&name("t/S"), text).unwrap_err();
         assert!(error.to_string().contains("one line `---`"), "{error}");
@@ -465,7 +469,7 @@ fn a_service_or_action_text_in_the_wrong_number_of_parts_is_refused() {
 
 #[test]
 fn an_action_of_ros_2_has_its_status_before_its_result() {
-    let mut registry = Registry::bundle(Dialect::Ros2);
+    let mut registry = TypeRegistry::bundle(Dialect::Ros2);
     let fibonacci = name("demo_msgs/Fibonacci");
     let text = "int32 order\n---\nint32[] sequence\n---\nint32[] partial\n";
     registry.add_action(&fibonacci, text).unwrap();
@@ -479,13 +483,13 @@ fn an_action_of_ros_2_has_its_status_before_its_result() {
     let result = action.result_response();
     assert_eq!(paths(result), ["status", "result.sequence"]);
     let field = Selection::Field("result".to_owned());
-    let plan = Plan::compile(result, &field, Wire::Cdr).unwrap();
+    let plan = MessagePlan::compile(result, &field, Wire::Cdr).unwrap();
     assert_eq!(plan.leaves().len(), 1);
     let nothing = Selection::Template {
         fields: Vec::new(),
         rest: BTreeMap::new(),
     };
-    let plan = Plan::compile(result, &nothing, Wire::Cdr).unwrap();
+    let plan = MessagePlan::compile(result, &nothing, Wire::Cdr).unwrap();
     let mut empty = Vec::new();
     plan.write(&mut NoFields, &mut empty).unwrap();
     // The count of the sequence is aligned after the status.
@@ -505,8 +509,8 @@ fn the_package_people_build_has_the_skill_messages_that_are_built_in() {
     let folder = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../../ros/ua_msgs");
     let cmake = std::fs::read_to_string(folder.join("CMakeLists.txt")).unwrap();
     for dialect in [Dialect::Ros1, Dialect::Ros2] {
-        let built_in = Registry::bundle(dialect);
-        let mut files = Registry::empty(dialect);
+        let built_in = TypeRegistry::bundle(dialect);
+        let mut files = TypeRegistry::empty(dialect);
         for entry in std::fs::read_dir(folder.join("msg")).unwrap() {
             let path = entry.unwrap().path();
             let stem = path.file_stem().unwrap().to_str().unwrap().to_owned();

@@ -12,11 +12,11 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
 
 use inventor::{invent, unnamed};
-use messages::{Dialect, Plan, Registry, Selection, TypeName, Wire};
+use messages::{Dialect, MessagePlan, Selection, TypeName, TypeRegistry, Wire};
 use proptest::prelude::Rng as _;
 use proptest::test_runner::{RngAlgorithm, TestRng};
 use serde_json::json;
-use support::{Event, Player, Recorder, Value};
+use support::{EventPlayer, RecordedEvent, RecordedValue, Recorder};
 
 /// Every kind of field: alone, in arrays of each kind, and in messages in arrays. No type of the
 /// bundle has all of them.
@@ -118,20 +118,20 @@ impl Drop for Judge {
 }
 
 /// Packs events in the format of `packed` in `data/fields.py`.
-fn packed(events: &[Event]) -> Vec<u8> {
+fn packed(events: &[RecordedEvent]) -> Vec<u8> {
     let mut out = Vec::new();
     for event in events {
         let (letter, count): (u8, _) = match event {
-            Event::Scalar(Value::Bytes(bytes)) => (b'O', Some(bytes.len())),
-            Event::Scalar(Value::Text(text)) => (b'S', Some(text.len())),
-            Event::Element(Value::Text(text)) => (b'E', Some(text.len())),
-            Event::Scalar(_) => (b'S', None),
-            Event::Element(_) => (b'E', None),
-            Event::Packed(_, count, _) => (b'P', Some(*count)),
-            Event::Array(_, count) => (b'A', Some(*count)),
-            Event::Structures(_, count) => (b'T', Some(*count)),
-            Event::Begin(_) => (b'B', None),
-            Event::End => (b'N', None),
+            RecordedEvent::Scalar(RecordedValue::Bytes(bytes)) => (b'O', Some(bytes.len())),
+            RecordedEvent::Scalar(RecordedValue::Text(text)) => (b'S', Some(text.len())),
+            RecordedEvent::Element(RecordedValue::Text(text)) => (b'E', Some(text.len())),
+            RecordedEvent::Scalar(_) => (b'S', None),
+            RecordedEvent::Element(_) => (b'E', None),
+            RecordedEvent::Packed(_, count, _) => (b'P', Some(*count)),
+            RecordedEvent::Array(_, count) => (b'A', Some(*count)),
+            RecordedEvent::Structures(_, count) => (b'T', Some(*count)),
+            RecordedEvent::Begin(_) => (b'B', None),
+            RecordedEvent::End => (b'N', None),
         };
         out.push(letter);
         out.extend(count.into_iter().flat_map(|count| {
@@ -139,12 +139,17 @@ fn packed(events: &[Event]) -> Vec<u8> {
             count.to_le_bytes()
         }));
         match event {
-            Event::Scalar(value) | Event::Element(value) => out.extend_from_slice(match value {
-                Value::Fixed(_, bytes) | Value::Bytes(bytes) => bytes,
-                Value::Text(text) => text.as_bytes(),
-            }),
-            Event::Packed(_, _, bytes) => out.extend_from_slice(bytes),
-            Event::Array(..) | Event::Structures(..) | Event::Begin(_) | Event::End => {}
+            RecordedEvent::Scalar(value) | RecordedEvent::Element(value) => {
+                out.extend_from_slice(match value {
+                    RecordedValue::Fixed(_, bytes) | RecordedValue::Bytes(bytes) => bytes,
+                    RecordedValue::Text(text) => text.as_bytes(),
+                })
+            }
+            RecordedEvent::Packed(_, _, bytes) => out.extend_from_slice(bytes),
+            RecordedEvent::Array(..)
+            | RecordedEvent::Structures(..)
+            | RecordedEvent::Begin(_)
+            | RecordedEvent::End => {}
         }
     }
     out
@@ -162,7 +167,7 @@ fn padded(mut bytes: Vec<u8>, wire: Wire) -> Vec<u8> {
     bytes
 }
 
-fn read(plan: &Plan, bytes: &[u8], what: &str) -> Vec<Event> {
+fn read(plan: &MessagePlan, bytes: &[u8], what: &str) -> Vec<RecordedEvent> {
     let mut recorder = Recorder::default();
     plan.read(bytes, &mut recorder)
         .unwrap_or_else(|error| panic!("{what}: {error}: {bytes:02x?}"));
@@ -170,7 +175,11 @@ fn read(plan: &Plan, bytes: &[u8], what: &str) -> Vec<Event> {
 }
 
 /// Checks messages of the judge: this crate reads the same fields, and writes the same bytes.
-fn theirs_to_ours(judge: &mut Judge, (name, plan, wire): (&TypeName, &Plan, Wire), count: usize) {
+fn theirs_to_ours(
+    judge: &mut Judge,
+    (name, plan, wire): (&TypeName, &MessagePlan, Wire),
+    count: usize,
+) {
     for (at, (message, fields)) in judge.answers().into_iter().enumerate() {
         let what = format!("{name}, message {at} of {count}");
         let events = read(plan, &message, &what);
@@ -179,7 +188,7 @@ fn theirs_to_ours(judge: &mut Judge, (name, plan, wire): (&TypeName, &Plan, Wire
             "{what} is read otherwise: {message:02x?}\n{events:?}"
         );
         let mut again = Vec::new();
-        plan.write(&mut Player::new(&events), &mut again)
+        plan.write(&mut EventPlayer::new(&events), &mut again)
             .unwrap_or_else(|error| panic!("{what}: {error}"));
         assert!(
             again == padded(message.clone(), wire),
@@ -191,7 +200,7 @@ fn theirs_to_ours(judge: &mut Judge, (name, plan, wire): (&TypeName, &Plan, Wire
 /// Checks messages of this crate: the judge reads the same fields, and writes the same bytes.
 fn ours_to_theirs(
     judge: &mut Judge,
-    (name, plan, wire): (&TypeName, &Plan, Wire),
+    (name, plan, wire): (&TypeName, &MessagePlan, Wire),
     (count, rng): (usize, &mut TestRng),
 ) {
     let mut made = Vec::new();
@@ -231,7 +240,7 @@ fn all_types(judge: &mut Judge, dialect: Dialect, made: &[(&str, &str)], least: 
         Dialect::Ros1 => Wire::Ros1,
         Dialect::Ros2 => Wire::Cdr,
     };
-    let mut registry = Registry::bundle(dialect);
+    let mut registry = TypeRegistry::bundle(dialect);
     for (name, text) in made {
         registry.add(&name.parse().unwrap(), text).unwrap();
     }
@@ -272,7 +281,7 @@ fn all_types(judge: &mut Judge, dialect: Dialect, made: &[(&str, &str)], least: 
         if let Some(md5) = md5 {
             assert_eq!(message_type.md5(), md5, "{name}");
         }
-        let plan = Plan::compile(&message_type, &Selection::Whole, wire).unwrap();
+        let plan = MessagePlan::compile(&message_type, &Selection::Whole, wire).unwrap();
         for first in (0..count).step_by(BATCH) {
             let some = BATCH.min(count - first);
             let question =

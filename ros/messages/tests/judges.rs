@@ -8,10 +8,11 @@ use std::sync::Arc;
 
 use md5::{Digest, Md5};
 use messages::{
-    ActionType, DefinitionError, Dialect, MessageType, Plan, Registry, Selection, TypeName, Wire,
+    ActionType, DefinitionError, Dialect, MessagePlan, MessageType, Selection, TypeName,
+    TypeRegistry, Wire,
 };
 use serde_json::Value as Json;
-use support::{Player, Recorder};
+use support::{EventPlayer, Recorder};
 
 const MD5S: &str = include_str!("data/ros1_md5.txt");
 const SERVICES: &str = include_str!("data/ros1_services.txt");
@@ -51,7 +52,7 @@ fn strings(json: &Json) -> Vec<String> {
 
 #[test]
 fn the_md5_of_every_ros_1_type_of_the_bundle_is_the_one_others_compute() {
-    let registry = Registry::bundle(Dialect::Ros1);
+    let registry = TypeRegistry::bundle(Dialect::Ros1);
     let mut table: HashMap<String, String> = MD5S
         .lines()
         .map(|line| line.split_once(' ').unwrap())
@@ -101,7 +102,7 @@ fn parts(action: &ActionType) -> [&Arc<MessageType>; 7] {
 
 #[test]
 fn the_md5_of_every_service_of_the_bundle_is_the_one_genpy_computed() {
-    let registry = Registry::bundle(Dialect::Ros1);
+    let registry = TypeRegistry::bundle(Dialect::Ros1);
     let table = table(SERVICES);
     for known in registry.services() {
         let service = registry.service(known).unwrap();
@@ -126,7 +127,7 @@ fn an_action_is_the_seven_messages_genaction_makes() {
              geometry_msgs/TransformStamped transform\ntf2_msgs/TF2Error error\n---\n",
         ),
     ];
-    let mut registry = Registry::bundle(Dialect::Ros1);
+    let mut registry = TypeRegistry::bundle(Dialect::Ros1);
     for (action, text) in texts {
         registry.add_action(&name(action), text).unwrap();
         let action = registry.action(&name(action)).unwrap();
@@ -173,7 +174,7 @@ fn judged(robot: &Path) -> Option<usize> {
     };
     let told = String::from_utf8(told.stdout).unwrap();
     let table = table(&told);
-    let mut registry = Registry::bundle(Dialect::Ros1);
+    let mut registry = TypeRegistry::bundle(Dialect::Ros1);
     let (mut services, mut actions) = (Vec::new(), Vec::new());
     for path in files_below(robot) {
         let folder = path.parent().unwrap();
@@ -247,7 +248,7 @@ fn files_below(folder: &Path) -> Vec<PathBuf> {
 
 #[test]
 fn the_md5s_well_known_to_ros_1_users_are_right() {
-    let registry = Registry::bundle(Dialect::Ros1);
+    let registry = TypeRegistry::bundle(Dialect::Ros1);
     for (type_name, md5) in [
         ("std_msgs/String", "992ce8a1687cec8c8bd883ec73ca41d1"),
         ("geometry_msgs/Twist", "9f195f881246fdfa2798d1d3eebca84a"),
@@ -265,7 +266,7 @@ fn the_md5s_well_known_to_ros_1_users_are_right() {
 
 #[test]
 fn the_text_of_every_ros_1_type_means_the_same_to_the_crate_ros_message() {
-    let registry = Registry::bundle(Dialect::Ros1);
+    let registry = TypeRegistry::bundle(Dialect::Ros1);
     let path =
         |name: &TypeName| ros_message::MessagePath::new(name.package(), name.name()).unwrap();
     let types: Vec<Arc<MessageType>> = registry
@@ -288,7 +289,7 @@ fn the_text_of_every_ros_1_type_means_the_same_to_the_crate_ros_message() {
 
 #[test]
 fn the_fields_of_every_ros_2_type_of_the_bundle_are_those_of_rosbags() {
-    let mut others = Registry::empty(Dialect::Ros2);
+    let mut others = TypeRegistry::empty(Dialect::Ros2);
     for line in FIELDS.lines() {
         let mut words = line.split(' ');
         let type_name = name(words.next().unwrap());
@@ -298,7 +299,7 @@ fn the_fields_of_every_ros_2_type_of_the_bundle_are_those_of_rosbags() {
             .collect();
         others.add(&type_name, &fields.join("\n")).unwrap();
     }
-    let bundle = Registry::bundle(Dialect::Ros2);
+    let bundle = TypeRegistry::bundle(Dialect::Ros2);
     // rosbags has no actions.
     let of_actions = |name: &&TypeName| {
         ACTION_PACKAGES.contains(&name.package())
@@ -352,7 +353,7 @@ const ACTION_PACKAGES: [&str; 7] = [
 
 #[test]
 fn every_action_of_the_bundle_is_the_same_calls_and_values_in_both_ros() {
-    let registries = [Dialect::Ros1, Dialect::Ros2].map(Registry::bundle);
+    let registries = [Dialect::Ros1, Dialect::Ros2].map(TypeRegistry::bundle);
     let leaves = |message: &MessageType| {
         let leaves = message.leaves().iter();
         leaves
@@ -379,7 +380,7 @@ fn every_action_of_the_bundle_is_the_same_calls_and_values_in_both_ros() {
 
 #[test]
 fn a_full_definition_names_what_it_needs_in_the_order_of_genpy() {
-    let registry = Registry::bundle(Dialect::Ros1);
+    let registry = TypeRegistry::bundle(Dialect::Ros1);
     for sample in samples(GENPY) {
         let found = registry.get(&name(text(&sample["type"]))).unwrap();
         let needs: Vec<String> = found
@@ -389,7 +390,7 @@ fn a_full_definition_names_what_it_needs_in_the_order_of_genpy() {
             .map(str::to_owned)
             .collect();
         assert_eq!(needs, strings(&sample["needs"]), "{}", found.name());
-        let mut empty = Registry::empty(Dialect::Ros1);
+        let mut empty = TypeRegistry::empty(Dialect::Ros1);
         let again = empty
             .add_ros1_definition(found.name(), found.definition())
             .unwrap();
@@ -399,7 +400,7 @@ fn a_full_definition_names_what_it_needs_in_the_order_of_genpy() {
 }
 
 /// Reads `payload`, compares the fields, writes them and compares the bytes with `written`.
-fn judge(plan: &Plan, sample: &Json, payload: &[u8], written: &[u8]) {
+fn judge(plan: &MessagePlan, sample: &Json, payload: &[u8], written: &[u8]) {
     let what = text(&sample["type"]);
     let mut recorder = Recorder::default();
     plan.read(payload, &mut recorder)
@@ -407,7 +408,7 @@ fn judge(plan: &Plan, sample: &Json, payload: &[u8], written: &[u8]) {
     let events: Vec<String> = recorder.events.iter().map(ToString::to_string).collect();
     assert_eq!(events, strings(&sample["fields"]), "{what}");
     let mut out = vec![0xEE];
-    plan.write(&mut Player::new(&recorder.events), &mut out)
+    plan.write(&mut EventPlayer::new(&recorder.events), &mut out)
         .unwrap_or_else(|error| panic!("{what}: {error}"));
     let mut wanted = vec![0xEE];
     wanted.extend_from_slice(written);
@@ -421,14 +422,14 @@ fn padded(mut cdr: Vec<u8>) -> Vec<u8> {
 
 #[test]
 fn ros_1_messages_written_by_genpy_and_rosbags_are_read_and_written_alike() {
-    let registry = Registry::bundle(Dialect::Ros1);
+    let registry = TypeRegistry::bundle(Dialect::Ros1);
     let mut count = 0;
     for sample in samples(GENPY)
         .iter()
         .chain(&samples(ROSBAGS))
         .filter(|sample| sample["dialect"] == 1)
     {
-        let plan = Plan::compile(
+        let plan = MessagePlan::compile(
             &registry.get(&name(text(&sample["type"]))).unwrap(),
             &Selection::Whole,
             Wire::Ros1,
@@ -443,13 +444,13 @@ fn ros_1_messages_written_by_genpy_and_rosbags_are_read_and_written_alike() {
 
 #[test]
 fn cdr_of_both_byte_orders_written_by_rosbags_is_read_alike_and_written_little_endian() {
-    let registry = Registry::bundle(Dialect::Ros2);
+    let registry = TypeRegistry::bundle(Dialect::Ros2);
     let mut count = 0;
     for sample in samples(ROSBAGS)
         .iter()
         .filter(|sample| sample["dialect"] == 2)
     {
-        let plan = Plan::compile(
+        let plan = MessagePlan::compile(
             &registry.get(&name(text(&sample["type"]))).unwrap(),
             &Selection::Whole,
             Wire::Cdr,
@@ -467,11 +468,11 @@ fn cdr_of_both_byte_orders_written_by_rosbags_is_read_alike_and_written_little_e
 
 #[test]
 fn cdr_written_by_cyclone_dds_is_read_and_written_alike() {
-    let registry = Registry::bundle(Dialect::Ros2);
+    let registry = TypeRegistry::bundle(Dialect::Ros2);
     let samples = samples(CYCLONE);
     for sample in &samples {
         let found = registry.get(&name(text(&sample["type"]))).unwrap();
-        let plan = Plan::compile(&found, &Selection::Whole, Wire::Cdr).unwrap();
+        let plan = MessagePlan::compile(&found, &Selection::Whole, Wire::Cdr).unwrap();
         let payload = bytes(&sample["little"]);
         judge(&plan, sample, &payload, &padded(payload.clone()));
     }

@@ -3,19 +3,21 @@ use crate::inventor;
 use crate::support;
 
 use inventor::{invent, unnamed};
-use messages::{Dialect, Fault, Leaf, Plan, ReadError, Registry, Selection, Wire};
+use messages::{
+    Dialect, Leaf, MessageFault, MessagePlan, ReadError, Selection, TypeRegistry, Wire,
+};
 use proptest::prelude::*;
 use proptest::test_runner::TestRunner;
-use support::{Event, Player, Recorder, Value};
+use support::{EventPlayer, RecordedEvent, RecordedValue, Recorder};
 use uadp::BuiltinType;
 
-fn plans() -> Vec<(String, Wire, Plan)> {
+fn plans() -> Vec<(String, Wire, MessagePlan)> {
     let mut plans = Vec::new();
     for (dialect, wire) in [(Dialect::Ros1, Wire::Ros1), (Dialect::Ros2, Wire::Cdr)] {
-        let registry = Registry::bundle(dialect);
+        let registry = TypeRegistry::bundle(dialect);
         for name in registry.names() {
-            let plan =
-                Plan::compile(&registry.get(name).unwrap(), &Selection::Whole, wire).unwrap();
+            let plan = MessagePlan::compile(&registry.get(name).unwrap(), &Selection::Whole, wire)
+                .unwrap();
             plans.push((format!("{name} {wire:?}"), wire, plan));
         }
     }
@@ -36,7 +38,7 @@ fn random_values_of_every_type_of_the_bundle_return_from_either_wire() {
             plan.read(&bytes, &mut recorder)
                 .unwrap_or_else(|error| panic!("{what}: {error}"));
             let mut again = Vec::new();
-            plan.write(&mut Player::new(&recorder.events), &mut again)
+            plan.write(&mut EventPlayer::new(&recorder.events), &mut again)
                 .unwrap();
             assert_eq!(again, bytes, "{what}");
             assert_eq!(unnamed(recorder.events), made, "{what}");
@@ -61,7 +63,7 @@ fn a_message_cut_short_errs_unless_only_padding_was_cut() {
                     assert_eq!(unnamed(recorder.events), made, "{what}");
                 }
                 Err(ReadError::Malformed {
-                    fault: Fault::Truncated,
+                    fault: MessageFault::Truncated,
                     at,
                     ..
                 }) => assert!(at <= cut, "{what}"),
@@ -84,7 +86,7 @@ fn bytes_after_a_ros_1_message_err_and_after_cdr_do_not() {
                 let wanted = ReadError::Malformed {
                     field: String::new(),
                     at: bytes.len() - 5,
-                    fault: Fault::TrailingBytes(5),
+                    fault: MessageFault::TrailingBytes(5),
                 };
                 assert_eq!(done, Err(wanted), "{what}");
             }
@@ -97,10 +99,10 @@ fn bytes_after_a_ros_1_message_err_and_after_cdr_do_not() {
 fn a_field_alone_is_what_it_is_in_the_whole_and_the_rest_is_zero() {
     let mut runner = runner();
     for (dialect, wire) in [(Dialect::Ros1, Wire::Ros1), (Dialect::Ros2, Wire::Cdr)] {
-        let registry = Registry::bundle(dialect);
+        let registry = TypeRegistry::bundle(dialect);
         for name in registry.names() {
             let message = registry.get(name).unwrap();
-            let whole = Plan::compile(&message, &Selection::Whole, wire).unwrap();
+            let whole = MessagePlan::compile(&message, &Selection::Whole, wire).unwrap();
             let (_, bytes) = invent(&whole, &runner.new_rng());
             let mut all = Recorder::default();
             whole.read(&bytes, &mut all).unwrap();
@@ -115,7 +117,7 @@ fn a_field_alone_is_what_it_is_in_the_whole_and_the_rest_is_zero() {
             for paths in [each, outer] {
                 let pieces = paths.into_iter().flat_map(|path| {
                     let selection = Selection::Field(path.to_owned());
-                    let plan = Plan::compile(&message, &selection, wire).unwrap();
+                    let plan = MessagePlan::compile(&message, &selection, wire).unwrap();
                     alone(&plan, &whole, &bytes, &format!("{name} {path}"))
                 });
                 assert_eq!(pieces.collect::<Vec<_>>(), all.events, "{name}");
@@ -126,8 +128,8 @@ fn a_field_alone_is_what_it_is_in_the_whole_and_the_rest_is_zero() {
 
 /// Returns the fields that `plan` reads from a message, after they were written and read again on
 /// their own, with zeros around them.
-fn alone(plan: &Plan, whole: &Plan, bytes: &[u8], what: &str) -> Vec<Event> {
-    let read = |plan: &Plan, bytes: &[u8]| {
+fn alone(plan: &MessagePlan, whole: &MessagePlan, bytes: &[u8], what: &str) -> Vec<RecordedEvent> {
+    let read = |plan: &MessagePlan, bytes: &[u8]| {
         let mut recorder = Recorder::default();
         plan.read(bytes, &mut recorder)
             .unwrap_or_else(|error| panic!("{what}: {error}"));
@@ -135,7 +137,8 @@ fn alone(plan: &Plan, whole: &Plan, bytes: &[u8], what: &str) -> Vec<Event> {
     };
     let one = read(plan, bytes);
     let mut written = Vec::new();
-    plan.write(&mut Player::new(&one), &mut written).unwrap();
+    plan.write(&mut EventPlayer::new(&one), &mut written)
+        .unwrap();
     assert_eq!(read(plan, &written), one, "{what}");
     let rest = read(whole, &written);
     assert!(is_zero_but(&rest, &one), "{what}: {rest:?}");
@@ -143,17 +146,19 @@ fn alone(plan: &Plan, whole: &Plan, bytes: &[u8], what: &str) -> Vec<Event> {
 }
 
 /// Returns whether all of `events` outside of one run of `carried` are zeros.
-fn is_zero_but(events: &[Event], carried: &[Event]) -> bool {
+fn is_zero_but(events: &[RecordedEvent], carried: &[RecordedEvent]) -> bool {
     let epoch = 116_444_736_000_000_000i64.to_le_bytes();
-    let zero = |event: &Event| match event {
-        Event::Scalar(value) | Event::Element(value) => match value {
-            Value::Fixed(BuiltinType::DateTime, bytes) => *bytes == epoch,
-            Value::Fixed(_, bytes) | Value::Bytes(bytes) => bytes.iter().all(|byte| *byte == 0),
-            Value::Text(text) => text.is_empty(),
+    let zero = |event: &RecordedEvent| match event {
+        RecordedEvent::Scalar(value) | RecordedEvent::Element(value) => match value {
+            RecordedValue::Fixed(BuiltinType::DateTime, bytes) => *bytes == epoch,
+            RecordedValue::Fixed(_, bytes) | RecordedValue::Bytes(bytes) => {
+                bytes.iter().all(|byte| *byte == 0)
+            }
+            RecordedValue::Text(text) => text.is_empty(),
         },
-        Event::Packed(_, _, bytes) => bytes.iter().all(|byte| *byte == 0),
-        Event::Array(..) | Event::Begin(_) | Event::End => true,
-        Event::Structures(..) => true,
+        RecordedEvent::Packed(_, _, bytes) => bytes.iter().all(|byte| *byte == 0),
+        RecordedEvent::Array(..) | RecordedEvent::Begin(_) | RecordedEvent::End => true,
+        RecordedEvent::Structures(..) => true,
     };
     (0..=events.len() - carried.len()).any(|at| {
         let (before, rest) = events.split_at(at);
@@ -169,7 +174,7 @@ fn a_length_beyond_the_payload_is_refused_before_the_sink_hears_of_it() {
         (Dialect::Ros2, Wire::Cdr, &[0, 1, 0, 0][..]),
         (Dialect::Ros2, Wire::Cdr, &[0, 0, 0, 0][..]),
     ] {
-        let mut registry = Registry::bundle(dialect);
+        let mut registry = TypeRegistry::bundle(dialect);
         for kind in [
             "string",
             "uint8[]",
@@ -181,8 +186,8 @@ fn a_length_beyond_the_payload_is_refused_before_the_sink_hears_of_it() {
         ] {
             let name = "test_msgs/T".parse().unwrap();
             registry.add(&name, &format!("{kind} x")).unwrap();
-            let plan =
-                Plan::compile(&registry.get(&name).unwrap(), &Selection::Whole, wire).unwrap();
+            let plan = MessagePlan::compile(&registry.get(&name).unwrap(), &Selection::Whole, wire)
+                .unwrap();
             for count in [1u32, 0x7FFF_FFFF, 0x8000_0000, 0x8000_0080, u32::MAX] {
                 let mut payload = header.to_vec();
                 let big = header.get(1) == Some(&0);
@@ -195,7 +200,7 @@ fn a_length_beyond_the_payload_is_refused_before_the_sink_hears_of_it() {
                 let wanted = ReadError::Malformed {
                     field: "x".to_owned(),
                     at: payload.len(),
-                    fault: Fault::Truncated,
+                    fault: MessageFault::Truncated,
                 };
                 assert_eq!(
                     plan.read(&payload, &mut recorder),
@@ -220,7 +225,7 @@ proptest! {
             if plan.read(&payload, &mut recorder).is_ok() {
                 let mut out = Vec::new();
                 // A text with a NUL and an unnormalised time are read but not written.
-                drop(plan.write(&mut Player::new(&recorder.events), &mut out));
+                drop(plan.write(&mut EventPlayer::new(&recorder.events), &mut out));
             }
         }
     }

@@ -2,25 +2,25 @@
 use crate::support;
 
 use messages::{
-    Conversion, Dialect, Literal, MessageType, Part, Plan, PlanError, ReadError, Registry,
-    Selected, Selection, ValueFault, Wire, WriteFault,
+    ArrayPart, Conversion, Dialect, Literal, MessagePlan, MessageType, PlanError, ReadError,
+    Selected, Selection, TypeRegistry, ValueFault, Wire, WriteFault,
 };
 use proptest::prelude::*;
 use std::sync::Arc;
-use support::{Event, Player, Recorder, Value};
+use support::{EventPlayer, RecordedEvent, RecordedValue, Recorder};
 use uadp::{BuiltinType, Scalar};
 
 const WIRES: [(Dialect, Wire); 2] = [(Dialect::Ros1, Wire::Ros1), (Dialect::Ros2, Wire::Cdr)];
 
 fn message(dialect: Dialect, text: &str) -> Arc<MessageType> {
-    let mut registry = Registry::bundle(dialect);
+    let mut registry = TypeRegistry::bundle(dialect);
     let name = "test_msgs/T".parse().unwrap();
     registry.add(&name, text).unwrap();
     registry.get(&name).unwrap()
 }
 
 fn select(text: &str, conversion: Conversion) -> Selection {
-    let (field, part) = Part::split(text).unwrap();
+    let (field, part) = ArrayPart::split(text).unwrap();
     Selection::Value {
         field: field.to_owned(),
         part,
@@ -28,29 +28,29 @@ fn select(text: &str, conversion: Conversion) -> Selection {
     }
 }
 
-fn written(plan: &Plan, events: &[Event]) -> Vec<u8> {
+fn written(plan: &MessagePlan, events: &[RecordedEvent]) -> Vec<u8> {
     let mut out = Vec::new();
-    plan.write(&mut Player::new(events), &mut out).unwrap();
+    plan.write(&mut EventPlayer::new(events), &mut out).unwrap();
     out
 }
 
-fn read(plan: &Plan, payload: &[u8]) -> Result<Vec<String>, ReadError<()>> {
+fn read(plan: &MessagePlan, payload: &[u8]) -> Result<Vec<String>, ReadError<()>> {
     let mut recorder = Recorder::default();
     plan.read(payload, &mut recorder)?;
     Ok(recorder.events.iter().map(ToString::to_string).collect())
 }
 
-fn scalar(value: Scalar<'_>) -> Event {
-    Event::Scalar(Value::of(value))
+fn scalar(value: Scalar<'_>) -> RecordedEvent {
+    RecordedEvent::Scalar(RecordedValue::of(value))
 }
 
-fn text(text: &str) -> Event {
-    Event::Element(Value::Text(text.to_owned()))
+fn text(text: &str) -> RecordedEvent {
+    RecordedEvent::Element(RecordedValue::Text(text.to_owned()))
 }
 
-fn doubles(values: &[f64]) -> Event {
+fn doubles(values: &[f64]) -> RecordedEvent {
     let bytes = values.iter().flat_map(|value| value.to_le_bytes());
-    Event::Packed(BuiltinType::Double, values.len(), bytes.collect())
+    RecordedEvent::Packed(BuiltinType::Double, values.len(), bytes.collect())
 }
 
 /// Names before and after the values, as the order varies between messages.
@@ -62,19 +62,19 @@ fn joints(dialect: Dialect, wire: Wire) -> (Arc<MessageType>, Vec<u8>) {
         Dialect::Ros2 => JOINTS.replace("duration", "builtin_interfaces/Duration"),
     };
     let of = message(dialect, &text_of);
-    let whole = Plan::compile(&of, &Selection::Whole, wire).unwrap();
-    let late = |millis| Event::Element(Value::of(Scalar::Double(millis)));
+    let whole = MessagePlan::compile(&of, &Selection::Whole, wire).unwrap();
+    let late = |millis| RecordedEvent::Element(RecordedValue::of(Scalar::Double(millis)));
     let events = [
         doubles(&[7.0, 8.0]),
-        Event::Array(BuiltinType::String, 3),
+        RecordedEvent::Array(BuiltinType::String, 3),
         text("joint_1"),
         text("joint_2"),
         text("joint_3"),
         scalar(Scalar::Byte(9)),
         doubles(&[0.25, 0.5, 0.75]),
-        Event::Packed(BuiltinType::Boolean, 2, vec![0, 1]),
+        RecordedEvent::Packed(BuiltinType::Boolean, 2, vec![0, 1]),
         scalar(Scalar::ByteString(Some(&[1, 2, 3]))),
-        Event::Array(BuiltinType::Double, 2),
+        RecordedEvent::Array(BuiltinType::Double, 2),
         late(1500.0),
         late(2500.0),
     ];
@@ -124,14 +124,16 @@ fn a_part_of_an_array_is_an_element_the_one_of_a_name_or_a_slice() {
             ),
             ("late[1]", "scalar Double 2500.0", BuiltinType::Double),
         ] {
-            let plan = Plan::compile(&of, &select(part, Conversion::default()), wire).unwrap();
+            let plan =
+                MessagePlan::compile(&of, &select(part, Conversion::default()), wire).unwrap();
             assert_eq!(read(&plan, &bytes).unwrap(), [expected], "{part} {wire:?}");
             let [leaf] = plan.leaves() else {
                 unreachable!("{part} is one field")
             };
             assert_eq!((leaf.builtin, leaf.path.as_str()), (builtin, part));
         }
-        let names = Plan::compile(&of, &select("name[1:3]", Conversion::default()), wire).unwrap();
+        let names =
+            MessagePlan::compile(&of, &select("name[1:3]", Conversion::default()), wire).unwrap();
         assert_eq!(
             read(&names, &bytes).unwrap(),
             [
@@ -148,7 +150,8 @@ fn what_a_message_has_not_is_told_with_its_field() {
     for (dialect, wire) in WIRES {
         let (of, bytes) = joints(dialect, wire);
         let fault = |part: &str| {
-            let plan = Plan::compile(&of, &select(part, Conversion::default()), wire).unwrap();
+            let plan =
+                MessagePlan::compile(&of, &select(part, Conversion::default()), wire).unwrap();
             read(&plan, &bytes).unwrap_err().to_string()
         };
         assert_eq!(
@@ -164,7 +167,8 @@ fn what_a_message_has_not_is_told_with_its_field() {
             "field `position`: no element has the name `elbow`"
         );
         let cut = &bytes[..bytes.len() / 2];
-        let plan = Plan::compile(&of, &select("late[0]", Conversion::default()), wire).unwrap();
+        let plan =
+            MessagePlan::compile(&of, &select("late[0]", Conversion::default()), wire).unwrap();
         assert!(matches!(read(&plan, cut), Err(ReadError::Malformed { .. })));
     }
 }
@@ -183,7 +187,7 @@ fn a_part_that_is_none_of_its_type_is_refused_when_compiled() {
         "gone[0]",
         "fixed[gone=a]",
     ] {
-        let refused = Plan::compile(&of, &select(part, Conversion::default()), Wire::Ros1);
+        let refused = MessagePlan::compile(&of, &select(part, Conversion::default()), Wire::Ros1);
         let refused = refused.map(|plan| plan.leaves().to_vec());
         assert!(
             matches!(
@@ -206,16 +210,17 @@ fn a_part_that_is_none_of_its_type_is_refused_when_compiled() {
         "a[+1]",
         "a[4294967296]",
     ] {
-        assert_eq!(Part::split(text), None, "{text}");
+        assert_eq!(ArrayPart::split(text), None, "{text}");
     }
 }
 
 #[test]
 fn a_part_is_not_written() {
     let of = message(Dialect::Ros1, "float64[] x");
-    let plan = Plan::compile(&of, &select("x[0]", Conversion::default()), Wire::Ros1).unwrap();
+    let plan =
+        MessagePlan::compile(&of, &select("x[0]", Conversion::default()), Wire::Ros1).unwrap();
     let mut out = Vec::new();
-    let error = plan.write(&mut Player::new(&[doubles(&[1.0])]), &mut out);
+    let error = plan.write(&mut EventPlayer::new(&[doubles(&[1.0])]), &mut out);
     assert_eq!(error.unwrap_err().fault, WriteFault::Part);
     assert!(out.is_empty());
 }
@@ -227,13 +232,16 @@ fn a_converted_value_crosses_both_ways_and_what_does_not_fit_does_not() {
         let scaled = Conversion::default()
             .scaled(0.1, -5.0)
             .to(BuiltinType::Double);
-        let plan = Plan::compile(&of, &select("raw", scaled), wire).unwrap();
+        let plan = MessagePlan::compile(&of, &select("raw", scaled), wire).unwrap();
         let bytes = written(&plan, &[scalar(Scalar::Double(18.0))]);
-        let raw = Plan::compile(&of, &Selection::Field("raw".to_owned()), wire).unwrap();
+        let raw = MessagePlan::compile(&of, &Selection::Field("raw".to_owned()), wire).unwrap();
         assert_eq!(read(&raw, &bytes).unwrap(), ["scalar Int16 230"]);
         assert_eq!(read(&plan, &bytes).unwrap(), ["scalar Double 18.0"]);
         let mut out = vec![1];
-        let refused = plan.write(&mut Player::new(&[scalar(Scalar::Double(1e6))]), &mut out);
+        let refused = plan.write(
+            &mut EventPlayer::new(&[scalar(Scalar::Double(1e6))]),
+            &mut out,
+        );
         assert_eq!(
             refused.unwrap_err().to_string(),
             "field `raw`: 10000050 does not fit Int16"
@@ -241,21 +249,21 @@ fn a_converted_value_crosses_both_ways_and_what_does_not_fit_does_not() {
         assert_eq!(out, [1]);
 
         let inverted = select("open", Conversion::default().inverted());
-        let inverted = Plan::compile(&of, &inverted, wire).unwrap();
+        let inverted = MessagePlan::compile(&of, &inverted, wire).unwrap();
         let bytes = written(&inverted, &[scalar(Scalar::Boolean(false))]);
-        let open = Plan::compile(&of, &Selection::Field("open".to_owned()), wire).unwrap();
+        let open = MessagePlan::compile(&of, &Selection::Field("open".to_owned()), wire).unwrap();
         assert_eq!(read(&open, &bytes).unwrap(), ["scalar Boolean true"]);
         assert_eq!(read(&inverted, &bytes).unwrap(), ["scalar Boolean false"]);
 
-        let many = Plan::compile(&of, &select("many", scaled), wire).unwrap();
-        let element = |value| Event::Element(Value::of(Scalar::Double(value)));
+        let many = MessagePlan::compile(&of, &select("many", scaled), wire).unwrap();
+        let element = |value| RecordedEvent::Element(RecordedValue::of(Scalar::Double(value)));
         let events = [
-            Event::Array(BuiltinType::Double, 2),
+            RecordedEvent::Array(BuiltinType::Double, 2),
             element(-5.0),
             element(0.5),
         ];
         let bytes = written(&many, &events);
-        let whole = Plan::compile(&of, &Selection::Field("many".to_owned()), wire).unwrap();
+        let whole = MessagePlan::compile(&of, &Selection::Field("many".to_owned()), wire).unwrap();
         assert_eq!(read(&whole, &bytes).unwrap(), ["packed Int16 2 0 55"]);
         assert_eq!(
             read(&many, &bytes).unwrap(),
@@ -265,7 +273,7 @@ fn a_converted_value_crosses_both_ways_and_what_does_not_fit_does_not() {
                 "element Double 0.5"
             ]
         );
-        let slice = Plan::compile(&of, &select("many[1:]", scaled), wire).unwrap();
+        let slice = MessagePlan::compile(&of, &select("many[1:]", scaled), wire).unwrap();
         assert_eq!(
             read(&slice, &bytes).unwrap(),
             ["array Double 1", "element Double 0.5"]
@@ -277,7 +285,7 @@ fn a_converted_value_crosses_both_ways_and_what_does_not_fit_does_not() {
 fn a_value_out_of_range_is_named_with_its_field() {
     let of = message(Dialect::Ros1, "float64 x");
     let to = Conversion::default().to(BuiltinType::Byte);
-    let plan = Plan::compile(&of, &select("x", to), Wire::Ros1).unwrap();
+    let plan = MessagePlan::compile(&of, &select("x", to), Wire::Ros1).unwrap();
     let fault = ValueFault::OutOfRange {
         value: "300".to_owned(),
         to: BuiltinType::Byte,
@@ -287,7 +295,7 @@ fn a_value_out_of_range_is_named_with_its_field() {
         read(&plan, &300f64.to_le_bytes()),
         Err(ReadError::Value { field, fault })
     );
-    let plan = Plan::compile(&of, &select("x", to.clamped()), Wire::Ros1).unwrap();
+    let plan = MessagePlan::compile(&of, &select("x", to.clamped()), Wire::Ros1).unwrap();
     assert_eq!(
         read(&plan, &300f64.to_le_bytes()).unwrap(),
         ["scalar Byte 255"]
@@ -299,13 +307,13 @@ proptest! {
     fn an_element_is_what_stands_there_in_the_whole(values in proptest::collection::vec(any::<i32>(), 0..20), at in 0u32..24) {
         for (dialect, wire) in WIRES {
             let of = message(dialect, "bool odd\nint32[] x\nuint8 after");
-            let whole = Plan::compile(&of, &Selection::Field("x".to_owned()), wire).unwrap();
+            let whole = MessagePlan::compile(&of, &Selection::Field("x".to_owned()), wire).unwrap();
             let bytes = values.iter().flat_map(|value| value.to_le_bytes()).collect();
-            let bytes = written(&whole, &[Event::Packed(BuiltinType::Int32, values.len(), bytes)]);
-            let plan = Plan::compile(&of, &select(&format!("x[{at}]"), Conversion::default()), wire).unwrap();
+            let bytes = written(&whole, &[RecordedEvent::Packed(BuiltinType::Int32, values.len(), bytes)]);
+            let plan = MessagePlan::compile(&of, &select(&format!("x[{at}]"), Conversion::default()), wire).unwrap();
             let expected = values.get(at as usize).map(|value| vec![format!("scalar Int32 {value}")]);
             prop_assert_eq!(read(&plan, &bytes).ok(), expected);
-            let slice = Plan::compile(&of, &select(&format!("x[3:{}]", at + 4), Conversion::default()), wire).unwrap();
+            let slice = MessagePlan::compile(&of, &select(&format!("x[3:{}]", at + 4), Conversion::default()), wire).unwrap();
             let picked: Vec<String> = values.iter().skip(3).take(at as usize + 1).map(ToString::to_string).collect();
             let expected = [vec![format!("packed Int32 {}", picked.len())], picked].concat().join(" ");
             prop_assert_eq!(read(&slice, &bytes).unwrap(), [expected]);
@@ -314,7 +322,7 @@ proptest! {
 }
 
 fn selected(text: &str, conversion: Conversion) -> Selected {
-    let (field, part) = Part::split(text).unwrap();
+    let (field, part) = ArrayPart::split(text).unwrap();
     Selected {
         field: field.to_owned(),
         part,
@@ -332,7 +340,7 @@ fn several_fields_cross_in_the_order_given_with_their_parts_and_conversions() {
             selected("position[name=joint_3]", none.scaled(1000.0, 1.0)),
             selected("gap", none),
         ];
-        let plan = Plan::compile(&of, &Selection::Fields(fields), wire).unwrap();
+        let plan = MessagePlan::compile(&of, &Selection::Fields(fields), wire).unwrap();
         let paths: Vec<&str> = plan
             .leaves()
             .iter()
@@ -349,7 +357,7 @@ fn several_fields_cross_in_the_order_given_with_their_parts_and_conversions() {
                 "scalar Byte 9"
             ]
         );
-        let refused = plan.write(&mut Player::new(&[]), &mut Vec::new());
+        let refused = plan.write(&mut EventPlayer::new(&[]), &mut Vec::new());
         assert_eq!(refused.unwrap_err().fault, WriteFault::Part);
     }
 }
@@ -360,18 +368,19 @@ fn several_fields_are_written_between_zeros_and_each_is_converted_by_its_own() {
     for (dialect, wire) in WIRES {
         let of = message(dialect, text_of);
         let none = Conversion::default();
-        let plan = |fields: Vec<Selected>| Plan::compile(&of, &Selection::Fields(fields), wire);
+        let plan =
+            |fields: Vec<Selected>| MessagePlan::compile(&of, &Selection::Fields(fields), wire);
         let fields = vec![
             selected("b", none.scaled(10.0, 0.0)),
             selected("d", none),
             selected("e", none.to(BuiltinType::Double)),
         ];
-        let whole = Plan::compile(&of, &Selection::Whole, wire).unwrap();
+        let whole = MessagePlan::compile(&of, &Selection::Whole, wire).unwrap();
         let some = plan(fields).unwrap();
-        let real = |value| Event::Scalar(Value::of(Scalar::Double(value)));
-        let whole_number = |value| Event::Element(Value::of(Scalar::Int32(value)));
+        let real = |value| RecordedEvent::Scalar(RecordedValue::of(Scalar::Double(value)));
+        let whole_number = |value| RecordedEvent::Element(RecordedValue::of(Scalar::Int32(value)));
         let events = [
-            Event::Array(BuiltinType::Int32, 2),
+            RecordedEvent::Array(BuiltinType::Int32, 2),
             whole_number(20),
             whole_number(-30),
             real(1.0),
@@ -400,7 +409,7 @@ fn several_fields_are_written_between_zeros_and_each_is_converted_by_its_own() {
         );
 
         let turned = plan(vec![selected("d", none), selected("a", none)]).unwrap();
-        let refused = turned.write(&mut Player::new(&[]), &mut Vec::new());
+        let refused = turned.write(&mut EventPlayer::new(&[]), &mut Vec::new());
         assert_eq!(refused.unwrap_err().fault, WriteFault::Order);
         assert!(plan(vec![selected("x", none)]).is_err());
     }
@@ -428,7 +437,7 @@ fn values_of_a_template_are_converted_between_its_constants() {
             selected("speed", tenths),
             selected("levels", Conversion::default().scaled(2.0, 0.0)),
         ];
-        let plan = Plan::compile(&message, &template(fields.clone()), wire).unwrap();
+        let plan = MessagePlan::compile(&message, &template(fields.clone()), wire).unwrap();
         let outside: Vec<BuiltinType> = plan.leaves().iter().map(|leaf| leaf.builtin).collect();
         assert_eq!(
             outside,
@@ -441,11 +450,11 @@ fn values_of_a_template_are_converted_between_its_constants() {
         let events = [
             scalar(Scalar::Boolean(false)),
             scalar(Scalar::Double(-20.04)),
-            Event::Array(BuiltinType::Float, 1),
-            Event::Element(Value::of(Scalar::Float(3.0))),
+            RecordedEvent::Array(BuiltinType::Float, 1),
+            RecordedEvent::Element(RecordedValue::of(Scalar::Float(3.0))),
         ];
         let bytes = written(&plan, &events);
-        let whole = Plan::compile(&message, &Selection::Whole, wire).unwrap();
+        let whole = MessagePlan::compile(&message, &Selection::Whole, wire).unwrap();
         assert_eq!(
             read(&whole, &bytes).unwrap()[..4],
             [
@@ -461,20 +470,20 @@ fn values_of_a_template_are_converted_between_its_constants() {
             scalar(Scalar::Double(4000.0)),
         ];
         let error = plan
-            .write(&mut Player::new(&big), &mut Vec::new())
+            .write(&mut EventPlayer::new(&big), &mut Vec::new())
             .unwrap_err();
         assert_eq!(error.to_string(), "field `speed`: 40000 does not fit Int16");
         let twice = template(vec![selected("id", Conversion::default())]);
-        let error = Plan::compile(&message, &twice, wire).unwrap_err();
+        let error = MessagePlan::compile(&message, &twice, wire).unwrap_err();
         assert!(
             matches!(error, PlanError::ConstantOfField { .. }),
             "{error}"
         );
         let part = vec![selected("levels[0]", Conversion::default())];
-        let plan = Plan::compile(&message, &template(part), wire).unwrap();
+        let plan = MessagePlan::compile(&message, &template(part), wire).unwrap();
         let one = [scalar(Scalar::Float(1.0))];
         let error = plan
-            .write(&mut Player::new(&one), &mut Vec::new())
+            .write(&mut EventPlayer::new(&one), &mut Vec::new())
             .unwrap_err();
         assert_eq!(error.fault, WriteFault::Part);
     }
@@ -486,7 +495,7 @@ fn a_part_behind_the_end_of_an_array_of_bytes_of_one_length_is_refused() {
     let message = message(Dialect::Ros2, text);
     let compiled = |field: &str| {
         let selection = select(field, Conversion::default());
-        Plan::compile(&message, &selection, Wire::Cdr).map(|_| ())
+        MessagePlan::compile(&message, &selection, Wire::Cdr).map(|_| ())
     };
     for field in [
         "uuid[15]",
@@ -510,16 +519,16 @@ fn a_part_behind_the_end_of_an_array_of_bytes_of_one_length_is_refused() {
 fn a_message_is_one_structure_with_the_messages_in_it_inline() {
     for (dialect, wire) in WIRES {
         let name = "geometry_msgs/Polygon".parse().unwrap();
-        let of = Registry::bundle(dialect).get(&name).unwrap();
-        let plan = Plan::compile(&of, &Selection::Structure(None), wire).unwrap();
+        let of = TypeRegistry::bundle(dialect).get(&name).unwrap();
+        let plan = MessagePlan::compile(&of, &Selection::Structure(None), wire).unwrap();
         let point = |values: [f32; 3]| values.map(|value| scalar(Scalar::Float(value)));
         let mut events = vec![
-            Event::Begin("geometry_msgs/Polygon".to_owned()),
-            Event::Array(BuiltinType::ExtensionObject, 2),
+            RecordedEvent::Begin("geometry_msgs/Polygon".to_owned()),
+            RecordedEvent::Array(BuiltinType::ExtensionObject, 2),
         ];
         events.extend(point([1.0, 2.0, 3.0]));
         events.extend(point([4.0, 5.0, 6.0]));
-        events.push(Event::End);
+        events.push(RecordedEvent::End);
         let bytes = written(&plan, &events);
         let expected: Vec<String> = events.iter().map(ToString::to_string).collect();
         assert_eq!(read(&plan, &bytes).unwrap(), expected);
@@ -527,10 +536,10 @@ fn a_message_is_one_structure_with_the_messages_in_it_inline() {
         assert_eq!(leaf.builtin, BuiltinType::ExtensionObject);
     }
     let stamped = "geometry_msgs/PointStamped".parse().unwrap();
-    let of = Registry::bundle(Dialect::Ros2).get(&stamped).unwrap();
+    let of = TypeRegistry::bundle(Dialect::Ros2).get(&stamped).unwrap();
     let compile = |path: &str| {
         let selection = Selection::Structure(Some(path.to_owned()));
-        Plan::compile(&of, &selection, Wire::Cdr)
+        MessagePlan::compile(&of, &selection, Wire::Cdr)
     };
     assert_eq!(compile("point").unwrap().leaves()[0].path, "point");
     assert!(matches!(
@@ -556,24 +565,33 @@ fn a_field_of_one_message_of_an_array_is_found_by_place_and_by_name() {
     };
     for (dialect, wire) in WIRES {
         let of = message(dialect, text_of);
-        let whole = Plan::compile(&of, &Selection::Whole, wire).unwrap();
-        let string = |text: &str| Event::Scalar(Value::Text(text.to_owned()));
+        let whole = MessagePlan::compile(&of, &Selection::Whole, wire).unwrap();
+        let string = |text: &str| RecordedEvent::Scalar(RecordedValue::Text(text.to_owned()));
         let status = |name: &str, level| {
-            let begin = Event::Begin("diagnostic_msgs/DiagnosticStatus".to_owned());
-            let values = Event::Array(BuiltinType::ExtensionObject, 0);
+            let begin = RecordedEvent::Begin("diagnostic_msgs/DiagnosticStatus".to_owned());
+            let values = RecordedEvent::Array(BuiltinType::ExtensionObject, 0);
             let texts = [name, "said", "id"].map(string);
             let [name, said, id] = texts;
-            vec![begin, scalar(level), name, said, id, values, Event::End]
+            vec![
+                begin,
+                scalar(level),
+                name,
+                said,
+                id,
+                values,
+                RecordedEvent::End,
+            ]
         };
         let mut events = vec![
             scalar(Scalar::Int32(1)),
-            Event::Structures("diagnostic_msgs/DiagnosticStatus".to_owned(), 2),
+            RecordedEvent::Structures("diagnostic_msgs/DiagnosticStatus".to_owned(), 2),
         ];
         events.extend(status("imu", zero(dialect)));
         events.extend(status("lidar", level(dialect)));
         events.push(scalar(Scalar::Int32(2)));
         let bytes = written(&whole, &events);
-        let part = |text: &str| Plan::compile(&of, &select(text, Conversion::default()), wire);
+        let part =
+            |text: &str| MessagePlan::compile(&of, &select(text, Conversion::default()), wire);
         let expected = scalar(level(dialect)).to_string();
         for text in ["status[name=lidar].level", "status[1].level"] {
             let plan = part(text).unwrap();
@@ -601,10 +619,10 @@ fn a_field_of_one_message_of_an_array_is_found_by_place_and_by_name() {
             assert!(matches!(part(text), Err(PlanError::Shape { .. })), "{text}");
         }
         let scaled = select("status[1].level", Conversion::default().scaled(10.0, 0.0));
-        let scaled = Plan::compile(&of, &scaled, wire).unwrap();
+        let scaled = MessagePlan::compile(&of, &scaled, wire).unwrap();
         assert!(read(&scaled, &bytes).unwrap()[0].ends_with("20"));
     }
     for text in ["a[0:2].x", "a[0]x", "a[0].", "a[0].b[1]"] {
-        assert_eq!(Part::split(text), None, "{text}");
+        assert_eq!(ArrayPart::split(text), None, "{text}");
     }
 }

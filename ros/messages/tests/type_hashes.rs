@@ -2,7 +2,7 @@
 //! hashes of services and actions.
 use std::collections::BTreeSet;
 
-use messages::{Dialect, Registry, TextKind, TypeName};
+use messages::{Dialect, TextKind, TypeName, TypeRegistry};
 use uadp::BuiltinType;
 
 const HASHES: &str = include_str!("data/ros2_type_hashes.txt");
@@ -45,7 +45,7 @@ fn has_char(store: &[&str], type_name: &str) -> bool {
 
 #[test]
 fn every_message_of_humble_to_lyrical_has_the_hash_rosbags_computes() {
-    let mut registry = Registry::empty(Dialect::Ros2);
+    let mut registry = TypeRegistry::empty(Dialect::Ros2);
     let mut judged = 0;
     let mut with_char = BTreeSet::new();
     let mut all: Vec<&str> = Vec::new();
@@ -80,7 +80,7 @@ fn every_message_of_humble_to_lyrical_has_the_hash_rosbags_computes() {
 #[test]
 fn the_messages_of_the_bundle_have_the_hashes_of_jazzy() {
     let jazzy = HASHES.split("# Kilted").next().unwrap();
-    let registry = Registry::bundle(Dialect::Ros2);
+    let registry = TypeRegistry::bundle(Dialect::Ros2);
     let is_judged = |known: &&TypeName| {
         !WITH_CHAR.contains(&known.to_string().as_str())
             // rosbags has no actions.
@@ -103,8 +103,8 @@ fn the_messages_of_the_bundle_have_the_hashes_of_jazzy() {
 }
 
 /// Returns a registry with the services of published hashes.
-fn services() -> Registry {
-    let mut registry = Registry::bundle(Dialect::Ros2);
+fn services() -> TypeRegistry {
+    let mut registry = TypeRegistry::bundle(Dialect::Ros2);
     let texts = [
         ("std_srvs/Empty", "---\n"),
         (
@@ -229,7 +229,7 @@ fn the_messages_of_an_action_have_the_hashes_rosidl_generates() {
     // generated files.
     let text = "int32 order\n---\nint32[] sequence\n---\nint32[] sequence\n";
     let fibonacci = name("example_interfaces/Fibonacci");
-    let mut registry = Registry::bundle(Dialect::Ros2);
+    let mut registry = TypeRegistry::bundle(Dialect::Ros2);
     let ours = registry.action_type_hashes(&fibonacci, text).unwrap();
     registry.add_action(&fibonacci, text).unwrap();
     assert_eq!(
@@ -278,7 +278,7 @@ fn the_messages_of_an_action_have_the_hashes_rosidl_generates() {
 
 #[test]
 fn what_is_missing_or_contains_itself_is_an_error_as_elsewhere() {
-    let mut registry = Registry::empty(Dialect::Ros2);
+    let mut registry = TypeRegistry::empty(Dialect::Ros2);
     registry.add(&name("a/Ring"), "Ring[] rings").unwrap();
     assert!(registry.type_hash(&name("a/Ring")).is_err());
     assert!(registry.type_hash(&name("a/Unknown")).is_err());
@@ -299,13 +299,13 @@ fn a_char_of_idl_is_a_type_of_its_own_and_comes_back_from_its_description() {
         typedef char char__4[4];
         struct Key { char letter; char__4 word; octet octet; }; }; };";
     let key = name("robot_msgs/Key");
-    let mut registry = Registry::empty(Dialect::Ros2);
+    let mut registry = TypeRegistry::empty(Dialect::Ros2);
     registry.add_idl(TextKind::Message, &key, idl).unwrap();
     let hash = registry.type_hash(&key).unwrap();
     let expected = "0002d06732862500c8797638eea2b46640ccf5f690cd1aaaf3e25e97be1768a3";
     assert_eq!(hash.to_string(), format!("RIHS01_{expected}"));
     let told = registry.describe(&key).unwrap();
-    let mut other = Registry::empty(Dialect::Ros2);
+    let mut other = TypeRegistry::empty(Dialect::Ros2);
     other.add_described(&key, &told, hash).unwrap();
     assert_eq!(other.describe(&key).unwrap(), told);
     let values: Vec<_> = other
@@ -327,7 +327,7 @@ fn a_char_of_idl_is_a_type_of_its_own_and_comes_back_from_its_description() {
 
 #[test]
 fn a_char_is_hashed_as_the_uint8_it_is_to_rosidl() {
-    let mut registry = Registry::bundle(Dialect::Ros2);
+    let mut registry = TypeRegistry::bundle(Dialect::Ros2);
     let texts = [
         ("rmw_dds_common/Gid", "char[16] data"),
         (
@@ -359,7 +359,7 @@ fn a_char_is_hashed_as_the_uint8_it_is_to_rosidl() {
 
 #[test]
 fn an_idl_text_makes_the_type_that_rosbags_reads_in_it() {
-    let bundle = Registry::bundle(Dialect::Ros2);
+    let bundle = TypeRegistry::bundle(Dialect::Ros2);
     let samples: Vec<serde_json::Value> =
         serde_json::from_str(include_str!("data/rosbags_idl.json")).unwrap();
     assert_eq!(samples.len(), 16);

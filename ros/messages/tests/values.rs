@@ -5,18 +5,18 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use messages::{
-    Dialect, Fault, Leaf, Literal, MessageType, Plan, ReadError, Registry, Selected, Selection,
-    SourceError, TypeName, Wire, WriteError, WriteFault,
+    Dialect, Leaf, Literal, MessageFault, MessagePlan, MessageType, ReadError, Selected, Selection,
+    SourceError, TypeName, TypeRegistry, Wire, WriteError, WriteFault,
 };
-use support::{Event, Player, Recorder, Value};
+use support::{EventPlayer, RecordedEvent, RecordedValue, Recorder};
 use uadp::{BuiltinType, DateTime, Scalar};
 
 fn name(text: &str) -> TypeName {
     text.parse().unwrap()
 }
 
-fn registry(dialect: Dialect, definitions: &[(&str, &str)]) -> Registry {
-    let mut registry = Registry::bundle(dialect);
+fn registry(dialect: Dialect, definitions: &[(&str, &str)]) -> TypeRegistry {
+    let mut registry = TypeRegistry::bundle(dialect);
     for (name_text, text) in definitions {
         registry.add(&name(name_text), text).unwrap();
     }
@@ -29,29 +29,29 @@ fn message(dialect: Dialect, text: &str) -> Arc<MessageType> {
         .unwrap()
 }
 
-fn plan(dialect: Dialect, text: &str) -> Plan {
+fn plan(dialect: Dialect, text: &str) -> MessagePlan {
     let wire = if dialect == Dialect::Ros1 {
         Wire::Ros1
     } else {
         Wire::Cdr
     };
-    Plan::compile(&message(dialect, text), &Selection::Whole, wire).unwrap()
+    MessagePlan::compile(&message(dialect, text), &Selection::Whole, wire).unwrap()
 }
 
-fn read(plan: &Plan, payload: &[u8]) -> Result<Vec<String>, ReadError<()>> {
+fn read(plan: &MessagePlan, payload: &[u8]) -> Result<Vec<String>, ReadError<()>> {
     let mut recorder = Recorder::default();
     plan.read(payload, &mut recorder)?;
     Ok(recorder.events.iter().map(ToString::to_string).collect())
 }
 
-fn write(plan: &Plan, events: &[Event]) -> Result<Vec<u8>, WriteError> {
+fn write(plan: &MessagePlan, events: &[RecordedEvent]) -> Result<Vec<u8>, WriteError> {
     let mut out = Vec::new();
-    plan.write(&mut Player::new(events), &mut out)?;
+    plan.write(&mut EventPlayer::new(events), &mut out)?;
     Ok(out)
 }
 
-fn scalar(value: Scalar<'_>) -> Event {
-    Event::Scalar(Value::of(value))
+fn scalar(value: Scalar<'_>) -> RecordedEvent {
+    RecordedEvent::Scalar(RecordedValue::of(value))
 }
 
 #[test]
@@ -85,7 +85,7 @@ fn elements_without_bytes_are_believed_up_to_a_number_all_arrays_together() {
         let many = matches!(
             error,
             ReadError::Malformed {
-                fault: Fault::WithoutBytes(_),
+                fault: MessageFault::WithoutBytes(_),
                 ..
             }
         );
@@ -137,7 +137,11 @@ fn booleans_of_an_array_become_zero_or_one() {
     assert_eq!(
         write(
             &plan,
-            &[Event::Packed(BuiltinType::Boolean, 3, vec![0, 1, 9])]
+            &[RecordedEvent::Packed(
+                BuiltinType::Boolean,
+                3,
+                vec![0, 1, 9]
+            )]
         )
         .unwrap(),
         [0, 1, 1]
@@ -164,10 +168,10 @@ fn a_wide_string_is_utf_16_in_words_of_four_bytes() {
         ["scalar SByte 1", "scalar String é", "scalar SByte 2"]
     );
     let alone = [0, 1, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 0x3E, 0xD8, 0, 0, 2];
-    assert_eq!(fault(read(&plan, &alone)), Fault::Text);
+    assert_eq!(fault(read(&plan, &alone)), MessageFault::Text);
 }
 
-fn fault(result: Result<Vec<String>, ReadError<()>>) -> Fault {
+fn fault(result: Result<Vec<String>, ReadError<()>>) -> MessageFault {
     match result {
         Err(ReadError::Malformed { fault, .. }) => fault,
         other => unreachable!("{other:?}"),
@@ -178,16 +182,16 @@ fn fault(result: Result<Vec<String>, ReadError<()>>) -> Fault {
 fn texts_that_are_not_valid_are_refused() {
     assert_eq!(
         fault(read(&plan(Dialect::Ros1, "string s"), &[1, 0, 0, 0, 0xFF])),
-        Fault::Text
+        MessageFault::Text
     );
     let cdr = plan(Dialect::Ros2, "string<=2 s");
     assert_eq!(
         fault(read(&cdr, &[0, 1, 0, 0, 1, 0, 0, 0, b'a'])),
-        Fault::Terminator
+        MessageFault::Terminator
     );
     assert_eq!(
         fault(read(&cdr, &[0, 1, 0, 0, 4, 0, 0, 0, b'a', b'b', b'c', 0])),
-        Fault::Bound { bound: 2, found: 3 }
+        MessageFault::Bound { bound: 2, found: 3 }
     );
     assert_eq!(
         read(&cdr, &[0, 1, 0, 0, 3, 0, 0, 0, b'a', b'b', 0]).unwrap(),
@@ -200,7 +204,7 @@ fn texts_that_are_not_valid_are_refused() {
     let bounded = plan(Dialect::Ros2, "int8[<=1] few");
     assert_eq!(
         fault(read(&bounded, &[0, 1, 0, 0, 2, 0, 0, 0, 1, 1])),
-        Fault::Bound { bound: 1, found: 2 }
+        MessageFault::Bound { bound: 1, found: 2 }
     );
 }
 
@@ -211,11 +215,11 @@ fn a_cdr_of_another_representation_is_refused_by_its_number() {
         let error = ReadError::Malformed {
             field: String::new(),
             at: 0,
-            fault: Fault::Encapsulation(identifier),
+            fault: MessageFault::Encapsulation(identifier),
         };
         assert_eq!(read(&plan, &[0, low, 0, 0, 1]), Err(error));
     }
-    assert_eq!(fault(read(&plan, &[0, 1])), Fault::Truncated);
+    assert_eq!(fault(read(&plan, &[0, 1])), MessageFault::Truncated);
 }
 
 #[test]
@@ -311,7 +315,7 @@ fn values_that_do_not_fit_are_refused_and_nothing_is_appended() {
         (&text, scalar(Scalar::String(Some("a\0b"))), WriteFault::Nul),
         (
             &fixed,
-            Event::Packed(BuiltinType::Float, 2, vec![0; 8]),
+            RecordedEvent::Packed(BuiltinType::Float, 2, vec![0; 8]),
             WriteFault::Length {
                 expected: 3,
                 found: 2,
@@ -327,14 +331,14 @@ fn values_that_do_not_fit_are_refused_and_nothing_is_appended() {
         ),
         (
             &fixed,
-            Event::Packed(BuiltinType::Float, 3, vec![0; 8]),
+            RecordedEvent::Packed(BuiltinType::Float, 3, vec![0; 8]),
             WriteFault::Source(SourceError::Malformed("3 elements in 8 bytes".to_owned())),
         ),
     ];
     for (plan, event, fault) in cases {
         let mut out = vec![1, 2, 3];
         let field = plan.leaves().first().unwrap().path.clone();
-        let done = plan.write(&mut Player::new(&[event]), &mut out);
+        let done = plan.write(&mut EventPlayer::new(&[event]), &mut out);
         assert_eq!(done, Err(WriteError { field, fault }));
         assert_eq!(out, [1, 2, 3]);
     }
@@ -376,7 +380,7 @@ fn messages_within_elements_are_inline_and_their_arrays_counted() {
             ("t/T", "Row[] rows"),
         ],
     );
-    let plan = Plan::compile(
+    let plan = MessagePlan::compile(
         &registry.get(&name("t/T")).unwrap(),
         &Selection::Whole,
         Wire::Ros1,
@@ -399,11 +403,12 @@ fn messages_within_elements_are_inline_and_their_arrays_counted() {
 
 #[test]
 fn a_ros_2_time_as_a_topic_is_one_date_time() {
-    let registry = Registry::bundle(Dialect::Ros2);
+    let registry = TypeRegistry::bundle(Dialect::Ros2);
     let time = registry
         .standard_type(BuiltinType::DateTime, false)
         .unwrap();
-    let plan = Plan::compile(&registry.get(&time).unwrap(), &Selection::Whole, Wire::Cdr).unwrap();
+    let plan =
+        MessagePlan::compile(&registry.get(&time).unwrap(), &Selection::Whole, Wire::Cdr).unwrap();
     let payload = [0, 1, 0, 0, 0xFF, 0xFF, 0xFF, 0xFF, 0, 0, 0, 0];
     assert_eq!(
         read(&plan, &payload).unwrap(),
@@ -416,7 +421,7 @@ fn a_ros_2_time_as_a_topic_is_one_date_time() {
 fn a_message_may_cross_as_it_is() {
     for (dialect, wire) in [(Dialect::Ros1, Wire::Ros1), (Dialect::Ros2, Wire::Cdr)] {
         let message = message(dialect, "bool b\nstring s");
-        let plan = Plan::compile(&message, &Selection::Bytes, wire).unwrap();
+        let plan = MessagePlan::compile(&message, &Selection::Bytes, wire).unwrap();
         assert_eq!(plan.leaves(), [Leaf::bytes()]);
         // Not a message of the type: the bytes are not checked.
         let payload = [9, 8, 7];
@@ -482,16 +487,16 @@ fn a_template_is_its_constants_with_the_value_in_its_place() {
         bytes.extend([2, 0, 0, 0, 1, 0]);
         bytes
     };
-    let plan = Plan::compile(&message, &template(Some("run"), &rest), Wire::Ros1).unwrap();
+    let plan = MessagePlan::compile(&message, &template(Some("run"), &rest), Wire::Ros1).unwrap();
     assert_eq!(plan.leaves().len(), 1);
     let written = write(&plan, &[scalar(Scalar::Boolean(true))]).unwrap();
     assert_eq!(written, wanted(1));
     assert_eq!(read(&plan, &written).unwrap(), ["scalar Boolean true"]);
-    let constant = Plan::compile(&message, &template(None, &rest), Wire::Ros1).unwrap();
+    let constant = MessagePlan::compile(&message, &template(None, &rest), Wire::Ros1).unwrap();
     assert_eq!(constant.leaves(), []);
     assert_eq!(write(&constant, &[]).unwrap(), wanted(0));
     assert!(write(&constant, &[scalar(Scalar::Boolean(true))]).is_err());
-    let empty = Plan::compile(&message, &template(None, &[]), Wire::Ros1).unwrap();
+    let empty = MessagePlan::compile(&message, &template(None, &[]), Wire::Ros1).unwrap();
     assert!(write(&empty, &[]).unwrap().iter().all(|byte| *byte == 0));
 }
 
@@ -499,7 +504,7 @@ fn a_template_is_its_constants_with_the_value_in_its_place() {
 fn a_template_is_aligned_in_cdr() {
     let message = message(Dialect::Ros2, "uint8 a\nstring s\nfloat64 x\nint32[] n");
     let rest = [("s", one("b")), ("n", list(&["-1"]))];
-    let plan = Plan::compile(&message, &template(Some("x"), &rest), Wire::Cdr).unwrap();
+    let plan = MessagePlan::compile(&message, &template(Some("x"), &rest), Wire::Cdr).unwrap();
     let mut wanted = vec![
         0, 1, 0, 0, 0, 0, 0, 0, 2, 0, 0, 0, b'b', 0, 0, 0, 0, 0, 0, 0,
     ];
@@ -522,7 +527,7 @@ fn a_constant_that_does_not_fit_its_field_is_told_with_what_would() {
     );
     let message = ros1.get(&name("t/T")).unwrap();
     let [with, without] = [&[("many", list(&[]))][..], &[]].map(|rest| {
-        let plan = Plan::compile(&message, &template(None, rest), Wire::Ros1);
+        let plan = MessagePlan::compile(&message, &template(None, rest), Wire::Ros1);
         write(&plan.unwrap(), &[]).unwrap()
     });
     assert_eq!(with, without, "no messages are none");
@@ -577,7 +582,7 @@ fn a_constant_that_does_not_fit_its_field_is_told_with_what_would() {
         ),
     ] {
         let selection = template(Some("note"), &[(path, literal)]);
-        let error = Plan::compile(&message, &selection, Wire::Ros1).unwrap_err();
+        let error = MessagePlan::compile(&message, &selection, Wire::Ros1).unwrap_err();
         assert!(error.to_string().contains(told), "{error}");
     }
 }

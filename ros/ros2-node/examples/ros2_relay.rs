@@ -14,8 +14,8 @@ use std::process::ExitCode;
 use std::time::Duration;
 
 use ros2_node::domain::{Domain, DomainOptions};
-use ros2_node::graph::Endpoint;
-use ros2_node::inbox::{Inbox, Taken};
+use ros2_node::graph::RemoteEndpoint;
+use ros2_node::inbox::{Inbox, InboxTurn};
 use ros2_node::outlet::Outlet;
 use ros2_node::qos::{Offered, Requested};
 use tokio::time::Instant;
@@ -69,18 +69,18 @@ async fn relay(from: String, to: String, domain: u16) -> Result<(), Failure> {
         tokio::select! {
             biased;
             taken = inbox.recv() => match taken {
-                Taken::Sample { payload, .. } => {
+                InboxTurn::Sample { payload, .. } => {
                     if let Err(refusal) = outlet.offer(payload, None, Instant::now()) {
                         eprintln!("relay: {}", refusal.label());
                     }
                 }
-                Taken::Unreadable { why, .. } => eprintln!("relay: {why}"),
+                InboxTurn::Unreadable { why, .. } => eprintln!("relay: {why}"),
             },
             // More often only while samples wait for room.
             () = tokio::time::sleep(FLUSH), if outlet.is_waiting() => outlet.flush(Instant::now()).map_err(|r| r.label())?,
             _ = look.tick() => {
                 let graph = domain.graph();
-                let readers: Vec<Endpoint> = graph.readers(&to).to_vec();
+                let readers: Vec<RemoteEndpoint> = graph.readers(&to).to_vec();
                 outlet.set_readers(&readers, Instant::now()).map_err(|r| r.label())?;
             }
         }

@@ -24,7 +24,7 @@ mod types;
 mod wire;
 mod withdrawal;
 
-use messages::{ActionTypeHashes, Dialect, Registry, TypeName};
+use messages::{ActionTypeHashes, Dialect, TypeName, TypeRegistry};
 use rustdds::policy::{Durability, History, ResourceLimits};
 use rustdds::{QosPolicies, QosPolicyBuilder};
 
@@ -37,19 +37,19 @@ pub use self::server::{ActionServer, ServerEvent};
 pub use self::server_goals::{GoalError, ServerCounters};
 pub use self::server_handles::{CancelRequest, NewGoal, ServerGoal};
 pub use self::serving::ActionServerOptions;
-pub use self::types::{CancelAnswer, CancelCode, CancelWhat, GoalId, GoalInfo, Status};
+pub use self::types::{CancelAnswer, CancelCode, CancelWhat, GoalId, GoalInfo, GoalStatusCode};
 
 use crate::domain::Domain;
-use crate::service::{Service, ServiceTypes};
+use crate::service::{ServiceName, ServiceTypes};
 
 /// An action by name and type.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Action {
+pub struct ActionName {
     name: String,
     action_type: TypeName,
 }
 
-impl Action {
+impl ActionName {
     /// Returns the action with the ROS name, such as `/arm/move`, and the type of an `.action`
     /// file.
     #[must_use]
@@ -75,7 +75,7 @@ impl Action {
 
     /// Sets the type hashes of the types that all actions share, which are built in.
     fn announce_shared(&self, domain: &Domain) {
-        let bundle = Registry::bundle(Dialect::Ros2);
+        let bundle = TypeRegistry::bundle(Dialect::Ros2);
         let action_msgs = |name| TypeName::new("action_msgs", name);
         if let Ok(hashes) =
             action_msgs("CancelGoal").map(|cancel| bundle.service_type_hashes(&cancel))
@@ -90,15 +90,15 @@ impl Action {
         }
     }
 
-    fn send_goal(&self) -> Service {
+    fn send_goal(&self) -> ServiceName {
         self.service("send_goal", self.types("SendGoal"))
     }
 
-    fn get_result(&self) -> Service {
+    fn get_result(&self) -> ServiceName {
         self.service("get_result", self.types("GetResult"))
     }
 
-    fn cancel_goal(&self) -> Service {
+    fn cancel_goal(&self) -> ServiceName {
         let of = |half| format!("action_msgs::srv::dds_::CancelGoal_{half}_");
         let types = ServiceTypes {
             request: of("Request"),
@@ -107,8 +107,8 @@ impl Action {
         self.service("cancel_goal", types)
     }
 
-    fn service(&self, part: &str, types: ServiceTypes) -> Service {
-        Service {
+    fn service(&self, part: &str, types: ServiceTypes) -> ServiceName {
+        ServiceName {
             name: format!("{}/_action/{part}", self.name),
             types,
         }
@@ -173,7 +173,7 @@ mod tests {
 
     #[test]
     fn topics_and_types_have_the_names_of_ros() {
-        let action = Action::new("/arm/count", &"demo_msgs/Fibonacci".parse().unwrap());
+        let action = ActionName::new("/arm/count", &"demo_msgs/Fibonacci".parse().unwrap());
         let send = action.send_goal();
         assert_eq!(
             send.request_topic(),

@@ -10,11 +10,11 @@ use std::time::{SystemTime, UNIX_EPOCH};
 /// The clock provides stamps of messages. Simulated time can stop and jump, so timeouts never use
 /// it.
 #[derive(Debug, Clone, Default)]
-pub struct RosClock(Arc<Simulation>);
+pub struct Ros2Clock(Arc<Simulation>);
 
 /// A time in the format of `builtin_interfaces/Time`.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, PartialOrd, Ord)]
-pub struct RosTime {
+pub struct Ros2Time {
     /// Whole seconds since 1970, or since the start of the simulation.
     pub sec: i32,
     /// The remainder in nanoseconds, below 1 000 000 000.
@@ -29,7 +29,7 @@ struct Simulation {
     malformed: AtomicU64,
 }
 
-impl RosClock {
+impl Ros2Clock {
     pub(crate) fn new(use_sim_time: bool) -> Self {
         let clock = Self::default();
         clock.0.runs.store(use_sim_time, Ordering::Release);
@@ -38,12 +38,12 @@ impl RosClock {
 
     /// Returns the current time.
     #[must_use]
-    pub fn now(&self) -> RosTime {
+    pub fn now(&self) -> Ros2Time {
         if !self.is_simulated() {
-            return RosTime::from_unix_nanos(unix_nanos());
+            return Ros2Time::from_unix_nanos(unix_nanos());
         }
         let [a, b, c, d, e, f, g, h] = self.0.time.load(Ordering::Acquire).to_be_bytes();
-        RosTime {
+        Ros2Time {
             sec: i32::from_be_bytes([a, b, c, d]),
             nanosec: u32::from_be_bytes([e, f, g, h]),
         }
@@ -81,7 +81,7 @@ impl RosClock {
     }
 }
 
-impl RosTime {
+impl Ros2Time {
     /// Converts nanoseconds since 1970 to a time, clamped to its range.
     #[must_use]
     pub fn from_unix_nanos(nanos: i128) -> Self {
@@ -123,25 +123,25 @@ mod tests {
 
     #[test]
     fn simulated_time_is_zero_at_first_and_then_what_the_last_message_said() {
-        let clock = RosClock::new(true);
-        assert_eq!(clock.now(), RosTime::default());
+        let clock = Ros2Clock::new(true);
+        assert_eq!(clock.now(), Ros2Time::default());
         clock.hear(&[0, 1, 0, 0, 7, 0, 0, 0, 9, 0, 0, 0]);
-        assert_eq!(clock.now(), RosTime { sec: 7, nanosec: 9 });
+        assert_eq!(clock.now(), Ros2Time { sec: 7, nanosec: 9 });
         clock.hear(&[0, 0, 0, 0, 0, 0, 0, 3, 0, 0, 0, 1]);
-        assert_eq!(clock.now(), RosTime { sec: 3, nanosec: 1 });
+        assert_eq!(clock.now(), Ros2Time { sec: 3, nanosec: 1 });
     }
 
     #[test]
     fn a_message_that_says_no_time_is_counted_and_not_taken() {
-        let clock = RosClock::new(true);
+        let clock = Ros2Clock::new(true);
         clock.hear(&[0, 1, 0, 0, 7, 0, 0, 0]);
         clock.hear(&[0, 1, 0, 0, 7, 0, 0, 0, 0, 0, 0, 0xFF]);
-        assert_eq!((clock.now(), clock.malformed()), (RosTime::default(), 2));
+        assert_eq!((clock.now(), clock.malformed()), (Ros2Time::default(), 2));
     }
 
     #[test]
     fn without_simulation_it_is_the_wall_clock() {
-        let clock = RosClock::new(false);
+        let clock = Ros2Clock::new(false);
         clock.hear(&[0, 1, 0, 0, 7, 0, 0, 0, 9, 0, 0, 0]);
         assert!(clock.now().sec > 1_700_000_000);
     }

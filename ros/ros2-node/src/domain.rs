@@ -24,16 +24,16 @@ use tokio::time::Instant;
 use tracing::warn;
 
 pub use self::range::DiscoveryRange;
-use crate::clock::{self, RosClock};
+use crate::clock::{self, Ros2Clock};
 use crate::discovery_info::{self, NodeEntities};
 #[cfg(feature = "patched-dds")]
 use crate::driver;
 use crate::graph::{BRIDGE_TYPE, Graph, bridge_topic};
-use crate::node::{Channels, Node, NodeOptions, ParticipantPrefix, Services};
+use crate::node::{Channels, DomainNode, NodeOptions, NodeServices, ParticipantPrefix};
 use crate::qos::{Offered, Requested};
-use crate::raw::{Opaque, Payload, RawReader, RawWriter, Reader, Writer};
+use crate::raw::{Opaque, Payload, PayloadReader, PayloadWriter, RawReader, RawWriter};
 use crate::rosout::{self, Rosout};
-use crate::security::{Enclave, SecurityError};
+use crate::security::{DdsSecurityError, Enclave};
 use crate::service::peers::{changes_of, offered};
 
 /// The domain to join and its network settings.
@@ -95,7 +95,7 @@ pub enum DomainError {
     },
     /// The files of the enclave are invalid.
     #[error("cannot set up DDS Security: {0}")]
-    Security(#[from] SecurityError),
+    Security(#[from] DdsSecurityError),
     /// RustDDS cannot join with these files.
     #[error("cannot join domain {domain} with the enclave in {}: {why}", .folder.display())]
     Enclave {
@@ -126,7 +126,7 @@ pub enum DomainError {
 pub struct Domain {
     // Fields are dropped in this order: the node withdraws its name first, while the participant
     // can still announce it.
-    node: Node,
+    node: DomainNode,
     domain: u16,
     joined: Instant,
     /// The type hashes to announce, by DDS type name.
@@ -182,7 +182,7 @@ impl Domain {
                 .map_err(failed)?,
         };
         let domain = Self {
-            node: Node::start(options.node.clone(), channels)?,
+            node: DomainNode::start(options.node.clone(), channels)?,
             domain: options.domain,
             joined: Instant::now(),
             type_hashes: Mutex::default(),
@@ -207,7 +207,7 @@ impl Domain {
                 .build();
             self.open_reader(clock::TOPIC, clock::TYPE, &newest)
         });
-        self.node.serve(Services {
+        self.node.serve(NodeServices {
             rosout: self.open_writer(rosout::TOPIC, rosout::TYPE, &rosout::qos())?,
             clock: clock.transpose()?,
         });
@@ -317,7 +317,7 @@ impl Domain {
 
     /// Returns the clock of the node.
     #[must_use]
-    pub fn clock(&self) -> RosClock {
+    pub fn clock(&self) -> Ros2Clock {
         self.node.clock()
     }
 
@@ -355,7 +355,7 @@ impl Domain {
         topic: &str,
         type_name: &str,
         requested: Requested,
-    ) -> Result<Reader, DomainError> {
+    ) -> Result<PayloadReader, DomainError> {
         self.open_reader(topic, type_name, &requested.policies())
     }
 
@@ -369,7 +369,7 @@ impl Domain {
         topic: &str,
         type_name: &str,
         offered: Offered,
-    ) -> Result<Writer, DomainError> {
+    ) -> Result<PayloadWriter, DomainError> {
         self.open_writer(topic, type_name, &offered.policies())
     }
 
@@ -383,7 +383,7 @@ impl Domain {
         topic: &str,
         type_name: &str,
         qos: &QosPolicies,
-    ) -> Result<Reader, DomainError> {
+    ) -> Result<PayloadReader, DomainError> {
         let qos = self.with_type_hash(type_name, qos);
         create_topic(&self.participant, (topic, type_name), &qos)
             .and_then(|topic| -> Result<RawReader, CreateError> {
@@ -404,7 +404,7 @@ impl Domain {
         topic: &str,
         type_name: &str,
         qos: &QosPolicies,
-    ) -> Result<Writer, DomainError> {
+    ) -> Result<PayloadWriter, DomainError> {
         let qos = self.with_type_hash(type_name, qos);
         create_topic(&self.participant, (topic, type_name), &qos)
             .and_then(|topic| -> Result<RawWriter, CreateError> {

@@ -16,7 +16,7 @@ use crate::node::ParticipantPrefix;
 
 /// A writer or reader of another participant.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Endpoint {
+pub struct RemoteEndpoint {
     /// The GUID of the endpoint.
     pub guid: GUID,
     /// The DDS name of its type, such as `std_msgs::msg::dds_::String_`.
@@ -31,7 +31,7 @@ pub struct Endpoint {
     pub qos: Arc<QosPolicies>,
 }
 
-impl Endpoint {
+impl RemoteEndpoint {
     /// Returns a discovered writer and its DDS topic.
     pub(crate) fn of_writer(writer: DiscoveredWriterData) -> (String, Self) {
         let data = writer.publication_topic_data;
@@ -83,8 +83,8 @@ impl Endpoint {
 /// The endpoints of other participants on ROS topics (`rt/...`), by DDS topic name.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Graph {
-    writers: BTreeMap<String, Vec<Endpoint>>,
-    readers: BTreeMap<String, Vec<Endpoint>>,
+    writers: BTreeMap<String, Vec<RemoteEndpoint>>,
+    readers: BTreeMap<String, Vec<RemoteEndpoint>>,
     /// Participants with any endpoint.
     participants: BTreeSet<ParticipantPrefix>,
     /// The bridge's own endpoints that were received as announcements: RustDDS receives its own
@@ -101,10 +101,10 @@ impl Graph {
         let prefix = participant.guid().prefix;
         let mut own = BTreeSet::new();
         let writers = participant.discovered_writers();
-        let writers = writers.into_iter().map(Endpoint::of_writer);
+        let writers = writers.into_iter().map(RemoteEndpoint::of_writer);
         let readers = participant.discovered_readers();
-        let readers = readers.into_iter().map(Endpoint::of_reader);
-        let mut foreign = |(_, endpoint): &(String, Endpoint)| {
+        let readers = readers.into_iter().map(RemoteEndpoint::of_reader);
+        let mut foreign = |(_, endpoint): &(String, RemoteEndpoint)| {
             let foreign = endpoint.guid.prefix != prefix;
             if !foreign {
                 own.insert(endpoint.guid);
@@ -122,12 +122,12 @@ impl Graph {
     /// Sorts endpoints by topic. Leaves out topics outside of ROS, and writers of bridges: their
     /// values of the space would return to the space under another name, or loop forever.
     pub fn from_endpoints(
-        writers: impl IntoIterator<Item = (String, Endpoint)>,
-        readers: impl IntoIterator<Item = (String, Endpoint)>,
+        writers: impl IntoIterator<Item = (String, RemoteEndpoint)>,
+        readers: impl IntoIterator<Item = (String, RemoteEndpoint)>,
     ) -> Self {
         let mut participants = BTreeSet::new();
         let mut bridges = BTreeMap::new();
-        let mut note = |endpoint: &Endpoint| participants.extend(prefix(endpoint.guid));
+        let mut note = |endpoint: &RemoteEndpoint| participants.extend(prefix(endpoint.guid));
         let mut writers = by_topic(writers.into_iter().inspect(|(topic, writer)| {
             note(writer);
             bridges.extend(prefix(writer.guid).zip(bridge_of(topic, &writer.type_name)));
@@ -168,13 +168,13 @@ impl Graph {
 
     /// Returns the writers of a topic, in the order of their GUIDs.
     #[must_use]
-    pub fn writers(&self, topic: &str) -> &[Endpoint] {
+    pub fn writers(&self, topic: &str) -> &[RemoteEndpoint] {
         self.writers.get(topic).map_or(&[], Vec::as_slice)
     }
 
     /// Returns the readers of a topic, in the order of their GUIDs.
     #[must_use]
-    pub fn readers(&self, topic: &str) -> &[Endpoint] {
+    pub fn readers(&self, topic: &str) -> &[RemoteEndpoint] {
         self.readers.get(topic).map_or(&[], Vec::as_slice)
     }
 
@@ -247,9 +247,9 @@ fn prefix(guid: GUID) -> Option<ParticipantPrefix> {
 }
 
 fn by_topic(
-    endpoints: impl IntoIterator<Item = (String, Endpoint)>,
-) -> BTreeMap<String, Vec<Endpoint>> {
-    let mut topics: BTreeMap<String, Vec<Endpoint>> = BTreeMap::new();
+    endpoints: impl IntoIterator<Item = (String, RemoteEndpoint)>,
+) -> BTreeMap<String, Vec<RemoteEndpoint>> {
+    let mut topics: BTreeMap<String, Vec<RemoteEndpoint>> = BTreeMap::new();
     for (topic, endpoint) in endpoints {
         if ros_topic(&topic).is_some() {
             topics.entry(topic).or_default().push(endpoint);
@@ -284,8 +284,8 @@ pub const BRIDGE_TYPE: &str = "ua_bridge::Presence_";
 mod tests {
     use super::*;
 
-    fn writer(topic: &str, participant: u8) -> (String, Endpoint) {
-        let endpoint = Endpoint {
+    fn writer(topic: &str, participant: u8) -> (String, RemoteEndpoint) {
+        let endpoint = RemoteEndpoint {
             guid: GUID::from_bytes([participant; 16]),
             type_name: "std_msgs::msg::dds_::Bool_".into(),
             reliable: true,
@@ -296,7 +296,7 @@ mod tests {
         (topic.to_owned(), endpoint)
     }
 
-    fn marker(topic: &str, participant: u8) -> (String, Endpoint) {
+    fn marker(topic: &str, participant: u8) -> (String, RemoteEndpoint) {
         let (topic, mut endpoint) = writer(topic, participant);
         endpoint.type_name = BRIDGE_TYPE.into();
         (topic, endpoint)

@@ -15,7 +15,7 @@ use std::task::{Context, Poll, Wake, Waker};
 use futures_util::task::AtomicWaker;
 use rustdds::GUID;
 
-use crate::raw::{Payload, Reader};
+use crate::raw::{Payload, PayloadReader};
 
 /// Readers with a key chosen by the owner.
 #[derive(Debug)]
@@ -32,7 +32,7 @@ pub struct SlotId(u64);
 
 /// The result of a turn.
 #[derive(Debug)]
-pub enum Taken<K> {
+pub enum InboxTurn<K> {
     /// A sample that was not delivered before.
     Sample {
         /// The key of the reader.
@@ -66,7 +66,7 @@ impl<K: Clone> Inbox<K> {
     }
 
     /// Adds a reader; its existing samples are delivered.
-    pub fn insert(&mut self, key: K, reader: Reader) -> SlotId {
+    pub fn insert(&mut self, key: K, reader: PayloadReader) -> SlotId {
         let id = self.next_slot;
         self.next_slot += 1;
         let wakeup = Arc::new(Wakeup {
@@ -90,7 +90,7 @@ impl<K: Clone> Inbox<K> {
 
     /// Replaces the reader in a slot by another reader of the same topic and returns the former
     /// reader; samples that both received are delivered once.
-    pub fn replace(&mut self, id: SlotId, reader: Reader) -> Option<Reader> {
+    pub fn replace(&mut self, id: SlotId, reader: PayloadReader) -> Option<PayloadReader> {
         let slot = self.slots.get_mut(&id.0)?;
         slot.reader.set_waker(None);
         let before = std::mem::replace(&mut slot.reader, reader);
@@ -105,12 +105,12 @@ impl<K: Clone> Inbox<K> {
     }
 
     /// Removes a reader.
-    pub fn remove(&mut self, id: SlotId) -> Option<Reader> {
+    pub fn remove(&mut self, id: SlotId) -> Option<PayloadReader> {
         self.slots.remove(&id.0).map(|slot| slot.reader)
     }
 
     /// Returns the undelivered samples of the reader in a slot, at most its history.
-    pub fn drain(&mut self, id: SlotId) -> Vec<Taken<K>> {
+    pub fn drain(&mut self, id: SlotId) -> Vec<InboxTurn<K>> {
         let Some(slot) = self.slots.get_mut(&id.0) else {
             return Vec::new();
         };
@@ -138,12 +138,12 @@ impl<K: Clone> Inbox<K> {
 
     /// Returns the next sample of any reader. Cancel-safe: a sample is only taken in the poll that
     /// returns it.
-    pub async fn recv(&mut self) -> Taken<K> {
+    pub async fn recv(&mut self) -> InboxTurn<K> {
         poll_fn(|cx| self.poll_recv(cx)).await
     }
 
     /// Polls for the next sample as [`recv`](Self::recv) does, for a hand-written future.
-    pub fn poll_recv(&mut self, cx: &mut Context<'_>) -> Poll<Taken<K>> {
+    pub fn poll_recv(&mut self, cx: &mut Context<'_>) -> Poll<InboxTurn<K>> {
         self.ready.consumer.register(cx.waker());
         while let Some(id) = self.ready.pop() {
             let Some(slot) = self.slots.get_mut(&id) else {
@@ -167,7 +167,7 @@ impl<K: Clone> Default for Inbox<K> {
 
 struct Slot<K> {
     key: K,
-    reader: Reader,
+    reader: PayloadReader,
     /// The last delivered sequence number, by writer.
     delivered: BTreeMap<GUID, i64>,
     wakeup: Arc<Wakeup>,
@@ -185,7 +185,7 @@ impl<K: std::fmt::Debug> std::fmt::Debug for Slot<K> {
 
 impl<K: Clone> Slot<K> {
     /// Takes the next sample, or returns `None` with the waker armed.
-    fn take(&mut self) -> Option<Taken<K>> {
+    fn take(&mut self) -> Option<InboxTurn<K>> {
         let mut armed = false;
         loop {
             match self.reader.try_take_one() {
@@ -193,7 +193,7 @@ impl<K: Clone> Slot<K> {
                     let sequence = i64::from(change.sequence_number);
                     let writer = change.writer_guid();
                     if let Some(missing) = self.advance(writer, sequence) {
-                        return Some(Taken::Sample {
+                        return Some(InboxTurn::Sample {
                             key: self.key.clone(),
                             payload: change.into_value(),
                             writer,
@@ -209,7 +209,7 @@ impl<K: Clone> Slot<K> {
                     armed = true;
                 }
                 Err(error) => {
-                    return Some(Taken::Unreadable {
+                    return Some(InboxTurn::Unreadable {
                         key: self.key.clone(),
                         why: error.to_string(),
                     });

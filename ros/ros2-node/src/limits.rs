@@ -4,7 +4,7 @@
 //! complete if its burst overflows the receiver's socket buffer. The patches in `patches/` change
 //! that; `cargo xtask` builds with them.
 
-use crate::graph::Endpoint;
+use crate::graph::RemoteEndpoint;
 
 /// True with the patched RustDDS.
 pub const PATCHED: bool = cfg!(feature = "patched-dds");
@@ -25,10 +25,10 @@ pub const SECURITY: &str = if cfg!(feature = "security") {
 
 /// Returns the size in bytes of the largest serialized sample that all readers with the system's
 /// default socket buffers receive. A larger sample is not written, but refused
-/// ([`Refusal::TooLarge`](crate::outlet::Refusal::TooLarge)).
+/// ([`Refusal::TooLarge`](crate::outlet::OutletRefusal::TooLarge)).
 #[must_use]
-pub fn sample_size(readers: &[Endpoint]) -> usize {
-    if readers.iter().any(Endpoint::is_fast_dds) {
+pub fn sample_size(readers: &[RemoteEndpoint]) -> usize {
+    if readers.iter().any(RemoteEndpoint::is_fast_dds) {
         TO_FAST_DDS
     } else {
         TO_OTHERS

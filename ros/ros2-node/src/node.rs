@@ -17,12 +17,12 @@ use std::time::Duration;
 use rustdds::{GUID, RTPSEntity};
 use tokio::time::Instant;
 
-use crate::clock::RosClock;
+use crate::clock::Ros2Clock;
 use crate::discovery_info::{GidLength, GuidBytes, NodeEntities};
-use crate::raw::{RawReader, RawWriter, Reader, Writer};
+use crate::raw::{PayloadReader, PayloadWriter, RawReader, RawWriter};
 use crate::rosout::Rosout;
 
-use teller::Teller;
+use teller::NodeThread;
 
 /// The name and the options of a node.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -126,7 +126,7 @@ impl Drop for Entry {
 }
 
 /// The node. Its own thread announces it until it is dropped; then its name is withdrawn.
-pub(crate) struct Node {
+pub(crate) struct DomainNode {
     shared: Arc<Shared>,
     thread: Option<JoinHandle<()>>,
 }
@@ -139,17 +139,17 @@ pub(crate) struct Channels {
 }
 
 /// Endpoints of the node that its thread serves.
-pub(crate) struct Services {
-    pub(crate) rosout: Writer,
-    pub(crate) clock: Option<Reader>,
+pub(crate) struct NodeServices {
+    pub(crate) rosout: PayloadWriter,
+    pub(crate) clock: Option<PayloadReader>,
 }
 
 struct Shared {
     options: NodeOptions,
-    clock: RosClock,
+    clock: Ros2Clock,
     own: Mutex<Own>,
     others: Mutex<Others>,
-    services: Mutex<Option<(Services, Arc<Rosout>)>>,
+    services: Mutex<Option<(NodeServices, Arc<Rosout>)>>,
     stop: AtomicBool,
     thread: Mutex<Option<Thread>>,
 }
@@ -179,14 +179,14 @@ struct Others {
 /// The GUID prefix of all entities of a participant.
 pub type ParticipantPrefix = [u8; 12];
 
-impl Node {
+impl DomainNode {
     /// Starts the thread that announces the node.
     ///
     /// # Errors
     /// If the thread cannot be started.
     pub(crate) fn start(options: NodeOptions, channels: Channels) -> std::io::Result<Self> {
         let shared = Arc::new(Shared {
-            clock: RosClock::new(options.use_sim_time),
+            clock: Ros2Clock::new(options.use_sim_time),
             options,
             own: Mutex::new(Own {
                 changed: true,
@@ -197,7 +197,7 @@ impl Node {
             stop: AtomicBool::new(false),
             thread: Mutex::default(),
         });
-        let teller = Teller::new(Arc::clone(&shared), channels);
+        let teller = NodeThread::new(Arc::clone(&shared), channels);
         let thread = std::thread::Builder::new()
             .name("ros-node".to_owned())
             .spawn(move || teller.run())?;
@@ -209,7 +209,7 @@ impl Node {
     }
 
     /// Starts to publish the process's warnings and to read `/clock`.
-    pub(crate) fn serve(&self, services: Services) {
+    pub(crate) fn serve(&self, services: NodeServices) {
         let Some(thread) = lock(&self.shared.thread).clone() else {
             return;
         };
@@ -228,16 +228,16 @@ impl Node {
         services.as_ref().map(|(_, rosout)| Arc::clone(rosout))
     }
 
-    pub(crate) fn clock(&self) -> RosClock {
+    pub(crate) fn clock(&self) -> Ros2Clock {
         self.shared.clock.clone()
     }
 
-    pub(crate) fn list_reader(&self, endpoint: RawReader) -> Reader {
+    pub(crate) fn list_reader(&self, endpoint: RawReader) -> PayloadReader {
         let guid = endpoint.guid();
         self.list(endpoint, guid, Kind::Reader)
     }
 
-    pub(crate) fn list_writer(&self, endpoint: RawWriter) -> Writer {
+    pub(crate) fn list_writer(&self, endpoint: RawWriter) -> PayloadWriter {
         let guid = endpoint.guid();
         self.list(endpoint, guid, Kind::Writer)
     }
@@ -333,7 +333,7 @@ impl Node {
     }
 }
 
-impl Drop for Node {
+impl Drop for DomainNode {
     fn drop(&mut self) {
         self.shared.stop.store(true, Ordering::Release);
         self.shared.wake();

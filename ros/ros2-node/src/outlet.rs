@@ -21,15 +21,15 @@ use tokio::time::Instant;
 
 pub use self::former::Former;
 use self::settling::{PATIENCE, SETTLE, Settling};
-use self::waiting::{Sample, UnsentSamples};
-use crate::graph::Endpoint;
+use self::waiting::{UnsentSamples, WaitingSample};
+use crate::graph::RemoteEndpoint;
 use crate::limits;
 use crate::qos::Offered;
-use crate::raw::{Payload, Writer};
+use crate::raw::{Payload, PayloadWriter};
 
 /// The writing end of a topic.
 pub struct Outlet {
-    writer: Writer,
+    writer: PayloadWriter,
     offered: Offered,
     joined: Instant,
     audience: Audience,
@@ -40,7 +40,7 @@ pub struct Outlet {
     /// Bytes written after the last time that every reader had acknowledged everything.
     in_flight: usize,
     /// For a state topic, the value that its readers have: another writer has to start with it.
-    last: Option<Sample>,
+    last: Option<WaitingSample>,
     /// The time since when the writer's history holds a sample that no late reader may receive.
     /// Cleared once the present readers have the sample.
     to_forget: Option<Instant>,
@@ -55,7 +55,7 @@ enum Audience {
     /// later; volatile readers receive nothing that was written before. The history of the
     /// published RustDDS would keep all values without acknowledgement, so with it the state is
     /// held back until only transient-local readers have appeared.
-    Nobody { held: Option<Sample> },
+    Nobody { held: Option<WaitingSample> },
     /// At least one reader, which receives samples of up to this size.
     Present {
         /// Set until written samples reach the readers.
@@ -68,7 +68,7 @@ enum Audience {
 
 /// The progress of the samples that were offered.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Progress {
+pub enum OutletProgress {
     /// The topic has no reader.
     NoReader,
     /// Samples wait for readers or for room in the send window.
@@ -79,7 +79,7 @@ pub enum Progress {
 
 /// The reason for which a sample was not delivered.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Refusal {
+pub enum OutletRefusal {
     /// The send window and the queue are full: the oldest waiting sample was dropped for this
     /// sample.
     Overflow,
@@ -94,7 +94,7 @@ pub enum Refusal {
     Failed,
 }
 
-impl Refusal {
+impl OutletRefusal {
     /// Returns the label under which the refusal is counted.
     #[must_use]
     pub fn label(self) -> &'static str {
@@ -112,7 +112,7 @@ impl Outlet {
     /// Wraps a writer created with the policies of `offered` in a domain joined at `joined`
     /// ([`Domain::joined`](crate::domain::Domain::joined)).
     #[must_use]
-    pub fn new(writer: Writer, offered: Offered, joined: Instant) -> Self {
+    pub fn new(writer: PayloadWriter, offered: Offered, joined: Instant) -> Self {
         Self {
             writer,
             offered,
@@ -142,7 +142,7 @@ impl Outlet {
 
     /// Installs a new writer of the same topic and policies. Waiting samples are written once its
     /// readers know it.
-    pub fn replace_writer(&mut self, writer: Writer, now: Instant) {
+    pub fn replace_writer(&mut self, writer: PayloadWriter, now: Instant) {
         // Without the full wait for the reader that caused the replacement.
         let patience = if self.is_stuck(now) { SETTLE } else { PATIENCE };
         let before = std::mem::replace(&mut self.writer, writer);
@@ -233,16 +233,16 @@ impl Outlet {
     /// Writes a sample, or queues it. Never waits. On a state topic, late readers receive it too.
     ///
     /// # Errors
-    /// [`Refusal`]: one sample was lost, this sample or an older sample.
+    /// [`OutletRefusal`]: one sample was lost, this sample or an older sample.
     pub fn offer(
         &mut self,
         payload: Payload,
         source: Option<Timestamp>,
         now: Instant,
-    ) -> Result<(), Refusal> {
+    ) -> Result<(), OutletRefusal> {
         let lasting = self.offered == Offered::KeepLatest;
         self.offer_sample(
-            Sample {
+            WaitingSample {
                 payload,
                 source,
                 lasting,
@@ -255,16 +255,16 @@ impl Outlet {
     /// Offers an event as [`offer`](Self::offer) does: only the present readers receive it.
     ///
     /// # Errors
-    /// [`Refusal`]: one sample was lost, this sample or an older sample; [`Refusal::NoReader`]
-    /// without a present reader.
+    /// [`OutletRefusal`]: one sample was lost, this sample or an older sample;
+    /// [`OutletRefusal::NoReader`] without a present reader.
     pub fn offer_once(
         &mut self,
         payload: Payload,
         source: Option<Timestamp>,
         now: Instant,
-    ) -> Result<(), Refusal> {
+    ) -> Result<(), OutletRefusal> {
         self.offer_sample(
-            Sample {
+            WaitingSample {
                 payload,
                 source,
                 lasting: false,
@@ -273,7 +273,7 @@ impl Outlet {
             now,
         )?;
         match self.audience {
-            Audience::Nobody { .. } => Err(Refusal::NoReader),
+            Audience::Nobody { .. } => Err(OutletRefusal::NoReader),
             Audience::Present { .. } => Ok(()),
         }
     }
@@ -282,13 +282,13 @@ impl Outlet {
     /// readers, and is dropped after `within`.
     ///
     /// # Errors
-    /// [`Refusal`]: one sample was lost, this sample or an older sample.
+    /// [`OutletRefusal`]: one sample was lost, this sample or an older sample.
     pub fn offer_in_time(
         &mut self,
         payload: Payload,
         source: Option<Timestamp>,
         (now, within): (Instant, Duration),
-    ) -> Result<(), Refusal> {
+    ) -> Result<(), OutletRefusal> {
         if matches!(self.audience, Audience::Nobody { .. }) {
             self.notice_matches(now);
         }
@@ -296,7 +296,7 @@ impl Outlet {
             return Ok(());
         }
         self.offer_sample(
-            Sample {
+            WaitingSample {
                 payload,
                 source,
                 lasting: false,
@@ -308,15 +308,15 @@ impl Outlet {
 
     /// Returns the progress of the samples that were offered.
     #[must_use]
-    pub fn progress(&self) -> Progress {
+    pub fn progress(&self) -> OutletProgress {
         match self.audience {
-            Audience::Nobody { .. } => Progress::NoReader,
-            Audience::Present { .. } if self.waiting.is_empty() => Progress::Written,
-            Audience::Present { .. } => Progress::Waiting,
+            Audience::Nobody { .. } => OutletProgress::NoReader,
+            Audience::Present { .. } if self.waiting.is_empty() => OutletProgress::Written,
+            Audience::Present { .. } => OutletProgress::Waiting,
         }
     }
 
-    fn offer_sample(&mut self, sample: Sample, now: Instant) -> Result<(), Refusal> {
+    fn offer_sample(&mut self, sample: WaitingSample, now: Instant) -> Result<(), OutletRefusal> {
         if matches!(self.audience, Audience::Nobody { .. }) {
             self.notice_matches(now);
         }
@@ -326,7 +326,7 @@ impl Outlet {
             }
             Audience::Nobody { .. } => {}
             Audience::Present { sample_size, .. } if sample.payload.len() > *sample_size => {
-                return Err(Refusal::TooLarge(*sample_size));
+                return Err(OutletRefusal::TooLarge(*sample_size));
             }
             Audience::Present { .. } => {}
         }
@@ -351,17 +351,17 @@ impl Outlet {
     /// Sends the waiting samples as the send window allows.
     ///
     /// # Errors
-    /// [`Refusal::Failed`], with the sample lost, or [`Refusal::Late`] if a waiting sample has
-    /// expired.
-    pub fn flush(&mut self, now: Instant) -> Result<(), Refusal> {
+    /// [`OutletRefusal::Failed`], with the sample lost, or [`OutletRefusal::Late`] if a waiting
+    /// sample has expired.
+    pub fn flush(&mut self, now: Instant) -> Result<(), OutletRefusal> {
         self.flush_waiting(now)?;
         if self.waiting.take_late() {
-            return Err(Refusal::Late);
+            return Err(OutletRefusal::Late);
         }
         Ok(())
     }
 
-    fn flush_waiting(&mut self, now: Instant) -> Result<(), Refusal> {
+    fn flush_waiting(&mut self, now: Instant) -> Result<(), OutletRefusal> {
         self.look_back(now);
         self.waiting.drop_expired(now);
         if self.waiting.is_empty() || !self.is_settled(now) {
@@ -379,8 +379,12 @@ impl Outlet {
     /// Updates the readers of the topic, and sends the held value to the first readers.
     ///
     /// # Errors
-    /// [`Refusal`] of the held value.
-    pub fn set_readers(&mut self, readers: &[Endpoint], now: Instant) -> Result<(), Refusal> {
+    /// [`OutletRefusal`] of the held value.
+    pub fn set_readers(
+        &mut self,
+        readers: &[RemoteEndpoint],
+        now: Instant,
+    ) -> Result<(), OutletRefusal> {
         // Statuses are read so that their channel never fills up; the snapshot is newer.
         while self.writer.try_recv_status().is_some() {}
         self.former.retain(|former| !former.is_done(now));
@@ -402,7 +406,7 @@ impl Outlet {
 
     /// Stores a state for later readers, in place of the former state. An event is dropped, because
     /// no reader is present.
-    fn store(&mut self, sample: Sample, now: Instant) -> Result<(), Refusal> {
+    fn store(&mut self, sample: WaitingSample, now: Instant) -> Result<(), OutletRefusal> {
         self.forget_written();
         self.to_forget = None;
         self.last = None;
@@ -513,7 +517,7 @@ impl Outlet {
     }
 
     /// Records the readers; returns the value that was held while there was no reader.
-    fn greet(&mut self, now: Instant, number: usize, size: usize) -> Option<Sample> {
+    fn greet(&mut self, now: Instant, number: usize, size: usize) -> Option<WaitingSample> {
         match &mut self.audience {
             Audience::Present {
                 seen, sample_size, ..
@@ -536,22 +540,26 @@ impl Outlet {
         }
     }
 
-    fn queue(&mut self, sample: Sample, room: usize) -> Result<(), Refusal> {
+    fn queue(&mut self, sample: WaitingSample, room: usize) -> Result<(), OutletRefusal> {
         let overflow = self.waiting.len() >= room;
         if overflow {
             self.waiting.pop();
         }
         self.waiting.push(sample);
         if overflow {
-            Err(Refusal::Overflow)
+            Err(OutletRefusal::Overflow)
         } else {
             Ok(())
         }
     }
 
     /// Passes a sample to RustDDS; returns it if the send window is full.
-    fn write(&mut self, sample: Sample, now: Instant) -> Result<Option<Sample>, Refusal> {
-        let Sample {
+    fn write(
+        &mut self,
+        sample: WaitingSample,
+        now: Instant,
+    ) -> Result<Option<WaitingSample>, OutletRefusal> {
+        let WaitingSample {
             payload,
             source,
             lasting,
@@ -560,7 +568,7 @@ impl Outlet {
         let size = payload.len();
         if !self.has_room(size) {
             self.full_since.get_or_insert(now);
-            return Ok(Some(Sample {
+            return Ok(Some(WaitingSample {
                 payload,
                 source,
                 lasting,
@@ -568,7 +576,7 @@ impl Outlet {
             }));
         }
         let is_state = self.offered == Offered::KeepLatest;
-        let kept = (is_state && lasting).then(|| Sample {
+        let kept = (is_state && lasting).then(|| WaitingSample {
             payload: payload.clone(),
             source,
             lasting,
@@ -593,7 +601,7 @@ impl Outlet {
             }
             Err(WriteError::WouldBlock { data }) => {
                 self.full_since.get_or_insert(now);
-                Ok(Some(Sample {
+                Ok(Some(WaitingSample {
                     payload: data,
                     source,
                     lasting,
@@ -605,7 +613,7 @@ impl Outlet {
                 | WriteError::Poisoned { .. }
                 | WriteError::Io(_)
                 | WriteError::Internal { .. },
-            ) => Err(Refusal::Failed),
+            ) => Err(OutletRefusal::Failed),
         }
     }
 

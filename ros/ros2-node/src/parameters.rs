@@ -10,20 +10,20 @@ mod value;
 use std::sync::{Arc, Mutex, PoisonError};
 
 use bytes::Bytes;
-use messages::{Dialect, Registry, TypeName};
+use messages::{Dialect, TypeName, TypeRegistry};
 use rustdds::policy::{Durability, History};
 use rustdds::{QosPolicies, QosPolicyBuilder};
 use tracing::{info, warn};
 
-pub use self::store::Parameter;
+pub use self::store::DeclaredParameter;
 pub use self::value::ParameterValue;
 
-use self::store::{Question, Store};
+use self::store::{ParameterService, ParameterStore};
 use crate::cdr::Malformed;
 use crate::clock::unix_nanos;
 use crate::domain::{Domain, DomainError};
-use crate::raw::{Payload, Writer};
-use crate::service::{Service, ServiceCounters, ServiceOptions, ServicePeers, ServiceServer};
+use crate::raw::{Payload, PayloadWriter};
+use crate::service::{ServiceCounters, ServiceName, ServiceOptions, ServicePeers, ServiceServer};
 
 /// Serves the parameters of a node. Dropping it withdraws the services.
 #[derive(Debug)]
@@ -34,8 +34,8 @@ pub struct ParameterServer {
 
 struct Shared {
     node: String,
-    store: Mutex<Store>,
-    events: Mutex<Writer>,
+    store: Mutex<ParameterStore>,
+    events: Mutex<PayloadWriter>,
 }
 
 impl ParameterServer {
@@ -46,10 +46,10 @@ impl ParameterServer {
     pub fn open(
         domain: &Domain,
         peers: &ServicePeers,
-        parameters: Vec<Parameter>,
+        parameters: Vec<DeclaredParameter>,
     ) -> Result<Self, DomainError> {
         let node = domain.node_name();
-        let bundle = Registry::bundle(Dialect::Ros2);
+        let bundle = TypeRegistry::bundle(Dialect::Ros2);
         let event = TypeName::new("rcl_interfaces", "ParameterEvent");
         if let Some(hash) = event.ok().and_then(|name| bundle.type_hash(&name).ok()) {
             domain.learn_type_hash(EVENT_TYPE, hash.to_string());
@@ -57,16 +57,16 @@ impl ParameterServer {
         let events = domain.open_writer(EVENTS, EVENT_TYPE, &policies())?;
         let shared = Arc::new(Shared {
             node: node.clone(),
-            store: Mutex::new(Store::new(parameters)),
+            store: Mutex::new(ParameterStore::new(parameters)),
             events: Mutex::new(events),
         });
         let mut services = Vec::new();
-        for question in Question::ALL {
+        for question in ParameterService::ALL {
             let (name, service_type) = question.names();
             let Ok(service_type) = TypeName::new("rcl_interfaces", service_type) else {
                 continue;
             };
-            let service = Service::new(&format!("{node}/{name}"), &service_type);
+            let service = ServiceName::new(&format!("{node}/{name}"), &service_type);
             if let Ok(hashes) = bundle.service_type_hashes(&service_type) {
                 service.announce(domain, &hashes);
             }
@@ -102,14 +102,14 @@ impl ParameterServer {
 }
 
 impl Shared {
-    fn answer(&self, question: Question, request: &[u8]) -> Result<Bytes, Malformed> {
+    fn answer(&self, question: ParameterService, request: &[u8]) -> Result<Bytes, Malformed> {
         let (answer, changed) = self
             .store
             .lock()
             .unwrap_or_else(PoisonError::into_inner)
             .answer(question, request)?;
         if !changed.is_empty() {
-            for Parameter { name, value, .. } in &changed {
+            for DeclaredParameter { name, value, .. } in &changed {
                 info!(parameter = name, ?value, "parameter set");
             }
             let event = store::event(&self.node, unix_nanos(), &changed);

@@ -7,7 +7,7 @@ use messages::TypeName;
 use rustdds::policy::{Deadline, Durability, History, ResourceLimits};
 use rustdds::{Duration, QosPolicies, QosPolicyBuilder};
 
-use crate::graph::Endpoint;
+use crate::graph::RemoteEndpoint;
 
 /// The QoS that a reader requests, derived from the offers of its topic's writers.
 ///
@@ -31,7 +31,7 @@ impl Requested {
 
     /// Returns the most that all `writers` offer.
     #[must_use]
-    pub fn from_writers(writers: &[Endpoint]) -> Self {
+    pub fn from_writers(writers: &[RemoteEndpoint]) -> Self {
         Self {
             reliable: writers.iter().all(|writer| writer.reliable),
             transient_local: !writers.is_empty()
@@ -189,8 +189,8 @@ mod tests {
     use rustdds::GUID;
     use rustdds::policy::Reliability;
 
-    fn writer(reliable: bool, transient_local: bool) -> Endpoint {
-        Endpoint {
+    fn writer(reliable: bool, transient_local: bool) -> RemoteEndpoint {
+        RemoteEndpoint {
             guid: GUID::GUID_UNKNOWN,
             type_name: "std_msgs::msg::dds_::Bool_".into(),
             reliable,
@@ -200,7 +200,7 @@ mod tests {
         }
     }
 
-    fn asked(writers: &[Endpoint]) -> (bool, bool) {
+    fn asked(writers: &[RemoteEndpoint]) -> (bool, bool) {
         let qos = Requested::from_writers(writers).policies();
         (
             matches!(qos.reliability(), Some(Reliability::Reliable { .. })),

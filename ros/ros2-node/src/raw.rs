@@ -89,9 +89,9 @@ impl PayloadError {
 pub struct Opaque;
 
 /// A reader that returns [`Payload`]s, on the list of its node.
-pub type Reader = Listed<RawReader>;
+pub type PayloadReader = Listed<RawReader>;
 /// A writer of [`Payload`]s, on the list of its node.
-pub type Writer = Listed<RawWriter>;
+pub type PayloadWriter = Listed<RawWriter>;
 /// A reader that returns [`Payload`]s.
 pub type RawReader = no_key::SimpleDataReader<Payload, Opaque>;
 /// A writer of [`Payload`]s.

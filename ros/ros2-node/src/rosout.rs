@@ -10,26 +10,26 @@ use rustdds::policy::{Durability, History, Lifespan, ResourceLimits};
 use rustdds::{Duration, QosPolicies, QosPolicyBuilder};
 use tracing::Level;
 
-use crate::clock::{RosClock, RosTime};
+use crate::clock::{Ros2Clock, Ros2Time};
 use crate::discovery_info::Cdr;
 
 /// Collects warnings and errors of all threads, for the node's thread to publish.
 #[derive(Debug)]
 pub struct Rosout {
     waiting: Mutex<Waiting>,
-    clock: RosClock,
+    clock: Ros2Clock,
     publisher: Thread,
 }
 
 #[derive(Debug, Default)]
 struct Waiting {
-    records: VecDeque<(RosTime, LogRecord)>,
+    records: VecDeque<(Ros2Time, LogRecord)>,
     dropped: u64,
 }
 
 impl Rosout {
     /// Creates the queue. `publisher` is woken when a record is added.
-    pub(crate) fn new(clock: RosClock, publisher: Thread) -> Self {
+    pub(crate) fn new(clock: Ros2Clock, publisher: Thread) -> Self {
         Self {
             waiting: Mutex::default(),
             clock,
@@ -55,7 +55,7 @@ impl Rosout {
         false
     }
 
-    fn next(&self) -> Option<(RosTime, LogRecord)> {
+    fn next(&self) -> Option<(Ros2Time, LogRecord)> {
         let mut waiting = self.lock();
         let (stamp, mut record) = waiting.records.pop_front()?;
         let dropped = std::mem::take(&mut waiting.dropped);
@@ -86,7 +86,7 @@ impl LogSink for Rosout {
     }
 }
 
-fn encode(stamp: RosTime, record: &LogRecord, name: &str) -> Bytes {
+fn encode(stamp: Ros2Time, record: &LogRecord, name: &str) -> Bytes {
     let mut out = Cdr::new();
     out.0.put_i32_le(stamp.sec);
     out.u32(stamp.nanosec);
@@ -161,7 +161,7 @@ mod tests {
 
     #[test]
     fn a_warning_is_a_log_message_of_the_node() {
-        let stamp = RosTime { sec: 1, nanosec: 2 };
+        let stamp = Ros2Time { sec: 1, nanosec: 2 };
         let bytes = encode(stamp, &record("slow"), "bridge");
         let mut wanted = vec![0, 1, 0, 0, 1, 0, 0, 0, 2, 0, 0, 0, 30, 0, 0, 0];
         wanted.extend(b"\x07\0\0\0bridge\0\0\x05\0\0\0slow\0\0\0\0\x08\0\0\0port.rs\0");
@@ -171,7 +171,7 @@ mod tests {
 
     #[test]
     fn when_too_many_wait_the_oldest_give_way_and_the_next_says_how_many() {
-        let rosout = Rosout::new(RosClock::default(), std::thread::current());
+        let rosout = Rosout::new(Ros2Clock::default(), std::thread::current());
         for number in 0..MAX_WAITING + 3 {
             rosout.hear(record(&format!("number {number}")));
         }
@@ -195,7 +195,11 @@ mod tests {
 
     #[test]
     fn a_long_message_is_cut_between_letters() {
-        let bytes = encode(RosTime::default(), &record(&"ü".repeat(MAX_TEXT)), "bridge");
+        let bytes = encode(
+            Ros2Time::default(),
+            &record(&"ü".repeat(MAX_TEXT)),
+            "bridge",
+        );
         assert!(bytes.len() < MAX_TEXT + 200, "{}", bytes.len());
     }
 }

@@ -16,7 +16,7 @@ use thiserror::Error;
 
 /// The security that the environment requests.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub enum Security {
+pub enum RequestedSecurity {
     /// No security: every participant in the domain can read and write.
     #[default]
     Off,
@@ -38,7 +38,7 @@ pub struct Enclave {
 
 /// The reason for which the bridge cannot be secured as requested.
 #[derive(Debug, Error, PartialEq, Eq)]
-pub enum SecurityError {
+pub enum DdsSecurityError {
     /// A value that ROS does not define.
     #[error("{name} is `{value}`: it is {allowed}")]
     Value {
@@ -70,17 +70,17 @@ pub enum SecurityError {
     },
 }
 
-impl Security {
+impl RequestedSecurity {
     /// Reads `ROS_SECURITY_ENABLE`, `ROS_SECURITY_STRATEGY`, `ROS_SECURITY_KEYSTORE` and
     /// `ROS_SECURITY_ENCLAVE_OVERRIDE`, which takes precedence over `enclave`, the argument
     /// `--enclave` of ROS.
     ///
     /// # Errors
-    /// [`SecurityError`]; with `Enforce`, also for a fault that `Permissive` ignores.
+    /// [`DdsSecurityError`]; with `Enforce`, also for a fault that `Permissive` ignores.
     pub fn from_env(
         variable: impl Fn(&str) -> Option<String>,
         enclave: Option<&str>,
-    ) -> Result<Self, SecurityError> {
+    ) -> Result<Self, DdsSecurityError> {
         let set = |name| variable(name).filter(|value| !value.is_empty());
         if !one_of(set, "ROS_SECURITY_ENABLE", ["true", "false"])? {
             return Ok(Self::Off);
@@ -89,11 +89,11 @@ impl Security {
         let name = set("ROS_SECURITY_ENCLAVE_OVERRIDE");
         let name = name.as_deref().or(enclave).unwrap_or("/");
         if !is_enclave(name) {
-            return Err(SecurityError::Name(name.to_owned()));
+            return Err(DdsSecurityError::Name(name.to_owned()));
         }
         match Enclave::find(set("ROS_SECURITY_KEYSTORE").as_deref(), name) {
             Ok(enclave) => Ok(Self::On(enclave)),
-            Err(why) if enforced => Err(SecurityError::Enforced(why)),
+            Err(why) if enforced => Err(DdsSecurityError::Enforced(why)),
             Err(why) => Ok(Self::Refrained(why)),
         }
     }
@@ -123,12 +123,12 @@ fn one_of(
     set: impl Fn(&'static str) -> Option<String>,
     name: &'static str,
     [yes, no]: [&'static str; 2],
-) -> Result<bool, SecurityError> {
+) -> Result<bool, DdsSecurityError> {
     match set(name) {
         Some(value) if value == yes => Ok(true),
         None => Ok(false),
         Some(value) if value == no => Ok(false),
-        Some(value) => Err(SecurityError::Value {
+        Some(value) => Err(DdsSecurityError::Value {
             name,
             value,
             allowed: match yes {
@@ -197,9 +197,9 @@ impl Enclave {
     /// Returns advice about faults that do not prevent operation.
     ///
     /// # Errors
-    /// [`SecurityError::File`] for the first invalid file.
+    /// [`DdsSecurityError::File`] for the first invalid file.
     #[cfg(feature = "security")]
-    pub fn check(&self) -> Result<Vec<String>, SecurityError> {
+    pub fn check(&self) -> Result<Vec<String>, DdsSecurityError> {
         files::check(&self.folder)
     }
 
@@ -208,14 +208,14 @@ impl Enclave {
     /// # Errors
     /// Never fails.
     #[cfg(not(feature = "security"))]
-    pub const fn check(&self) -> Result<Vec<String>, SecurityError> {
+    pub const fn check(&self) -> Result<Vec<String>, DdsSecurityError> {
         Ok(Vec::new())
     }
 
     /// Returns an error about a file of the enclave.
     #[cfg(feature = "security")]
-    fn fault(folder: &Path, file: &str, why: impl std::fmt::Display) -> SecurityError {
-        SecurityError::File {
+    fn fault(folder: &Path, file: &str, why: impl std::fmt::Display) -> DdsSecurityError {
+        DdsSecurityError::File {
             path: folder.join(file),
             why: why.to_string(),
         }
@@ -239,12 +239,15 @@ const REVOKED: &str = "crl.pem";
 mod tests {
     use super::*;
 
-    fn read(variables: &[(&str, &str)], enclave: Option<&str>) -> Result<Security, SecurityError> {
+    fn read(
+        variables: &[(&str, &str)],
+        enclave: Option<&str>,
+    ) -> Result<RequestedSecurity, DdsSecurityError> {
         let find = |name: &str| {
             let found = variables.iter().find(|(set, _)| *set == name);
             found.map(|(_, value)| (*value).to_owned())
         };
-        Security::from_env(find, enclave)
+        RequestedSecurity::from_env(find, enclave)
     }
 
     const ON: (&str, &str) = ("ROS_SECURITY_ENABLE", "true");
@@ -252,14 +255,14 @@ mod tests {
 
     #[test]
     fn security_is_off_unless_it_is_asked_for() {
-        assert_eq!(read(&[], None), Ok(Security::Off));
+        assert_eq!(read(&[], None), Ok(RequestedSecurity::Off));
         assert_eq!(
             read(&[("ROS_SECURITY_ENABLE", ""), ENFORCE], None),
-            Ok(Security::Off)
+            Ok(RequestedSecurity::Off)
         );
         assert_eq!(
             read(&[("ROS_SECURITY_ENABLE", "false"), ENFORCE], None),
-            Ok(Security::Off)
+            Ok(RequestedSecurity::Off)
         );
     }
 
@@ -270,7 +273,7 @@ mod tests {
             &[ON, ("ROS_SECURITY_STRATEGY", "enforce")],
         ] {
             let error = read(wrong, None).unwrap_err();
-            assert!(matches!(error, SecurityError::Value { .. }), "{error}");
+            assert!(matches!(error, DdsSecurityError::Value { .. }), "{error}");
         }
     }
 
@@ -278,9 +281,9 @@ mod tests {
     fn without_files_enforce_refuses_and_permissive_refrains() {
         let nowhere = ("ROS_SECURITY_KEYSTORE", "/nowhere");
         let error = read(&[ON, ENFORCE, nowhere], Some("/bridge")).unwrap_err();
-        assert!(matches!(error, SecurityError::Enforced(_)), "{error}");
+        assert!(matches!(error, DdsSecurityError::Enforced(_)), "{error}");
         let refrained = read(&[ON, nowhere], Some("/bridge")).unwrap();
-        let Security::Refrained(why) = refrained else {
+        let RequestedSecurity::Refrained(why) = refrained else {
             panic!("{refrained:?}")
         };
         if cfg!(feature = "security") {
@@ -300,6 +303,6 @@ mod tests {
         }
         let escaping = ("ROS_SECURITY_ENCLAVE_OVERRIDE", "/..");
         let error = read(&[ON, escaping], Some("/bridge")).unwrap_err();
-        assert_eq!(error, SecurityError::Name("/..".into()));
+        assert_eq!(error, DdsSecurityError::Name("/..".into()));
     }
 }

@@ -29,11 +29,11 @@ pub use self::peers::{ServicePeers, Snapshot, action_type, service_type};
 pub use self::server::{ServiceCounters, ServiceOptions, ServiceRequest, ServiceServer};
 
 pub(crate) use self::audience::Audience;
-pub(crate) use self::mapping::Received;
+pub(crate) use self::mapping::ReceivedServiceSample;
 pub(crate) use self::opening::Opening;
-pub(crate) use self::server::{Answer, Never};
+pub(crate) use self::server::{HandlerResult, NoValue};
 use crate::domain::Domain;
-use crate::raw::Reader;
+use crate::raw::PayloadReader;
 
 /// The DDS types of a service's two topics.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -64,14 +64,14 @@ impl ServiceTypes {
 
 /// A service by name and type.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Service {
+pub struct ServiceName {
     /// The ROS name, such as `/arm/grip`.
     pub name: String,
     /// The DDS types of the service.
     pub types: ServiceTypes,
 }
 
-impl Service {
+impl ServiceName {
     /// Returns the service with the name and the type of a `.srv` file.
     #[must_use]
     pub fn new(name: &str, service_type: &TypeName) -> Self {
@@ -117,13 +117,13 @@ pub(crate) fn policies() -> QosPolicies {
 
 /// Receives the next sample, or `None` for an unreadable sample. Cancel-safe: a sample is taken
 /// only when it is returned.
-pub(crate) async fn next(reader: &Reader) -> Option<Received> {
+pub(crate) async fn next(reader: &PayloadReader) -> Option<ReceivedServiceSample> {
     poll_fn(|cx| {
         let mut armed = false;
         loop {
             match reader.try_take_one() {
                 Ok(Some(change)) => {
-                    return Poll::Ready(Some(Received {
+                    return Poll::Ready(Some(ReceivedServiceSample {
                         writer: change.writer_guid(),
                         sequence: i64::from(change.sequence_number),
                         related: change.related_sample_identity(),
@@ -161,7 +161,7 @@ mod tests {
 
     #[test]
     fn topics_and_types_have_the_names_of_ros() {
-        let service = Service::new("/arm/grip", &"std_srvs/SetBool".parse().unwrap());
+        let service = ServiceName::new("/arm/grip", &"std_srvs/SetBool".parse().unwrap());
         assert_eq!(service.request_topic(), "rq/arm/gripRequest");
         assert_eq!(service.reply_topic(), "rr/arm/gripReply");
         let types = service.types;

@@ -5,12 +5,12 @@ use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, PoisonError};
 
 use bytes::Bytes;
-use messages::{DescribedField, DescribedType, Dialect, Registry, TypeHash, TypeName};
+use messages::{DescribedField, DescribedType, Dialect, TypeHash, TypeName, TypeRegistry};
 
 use crate::cdr::{CdrReader, CdrWriter, Malformed};
 use crate::domain::{Domain, DomainError};
 use crate::service::{
-    Service, ServiceCounters, ServiceOptions, ServicePeers, ServiceRequest, ServiceServer,
+    ServiceCounters, ServiceName, ServiceOptions, ServicePeers, ServiceRequest, ServiceServer,
     ServiceTypes,
 };
 
@@ -93,9 +93,9 @@ impl TypeServer {
 
 /// Returns the service of a node.
 #[must_use]
-pub fn service(node: &str) -> Service {
+pub fn service(node: &str) -> ServiceName {
     let of = |half| format!("type_description_interfaces::srv::dds_::GetTypeDescription_{half}_");
-    Service {
+    ServiceName {
         name: format!("{node}/get_type_description"),
         types: ServiceTypes {
             request: of("Request"),
@@ -228,8 +228,8 @@ fn write_type(writer: &mut CdrWriter, described: &DescribedType) {
 
 /// Returns the definitions of the service in `.srv` and `.msg` files, for the hashes that its
 /// endpoints announce.
-pub(crate) fn definitions() -> Registry {
-    let mut registry = Registry::empty(Dialect::Ros2);
+pub(crate) fn definitions() -> TypeRegistry {
+    let mut registry = TypeRegistry::empty(Dialect::Ros2);
     for (name, text) in MESSAGES {
         if let Ok(name) = TypeName::new(PACKAGE, name) {
             // A test compares the hash of the complete definitions.
@@ -282,7 +282,7 @@ mod tests {
 
     /// Returns a node that has only this type of the bundle.
     fn known(name: &TypeName) -> (Known, TypeHash) {
-        let registry = Registry::bundle(Dialect::Ros2);
+        let registry = TypeRegistry::bundle(Dialect::Ros2);
         let hash = registry.type_hash(name).unwrap();
         let types = registry.describe(name).unwrap();
         let source = |described: &DescribedType| TypeSource {

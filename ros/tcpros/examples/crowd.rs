@@ -13,8 +13,8 @@ use std::time::{Duration, Instant};
 
 use bytes::Bytes;
 use tcpros::{
-    Inbox, InboxEvent, MasterState, Node, NodeOptions, Publisher, PublisherOptions,
-    SubscriberOptions, Subscription, TopicType, Wanted,
+    Inbox, InboxEvent, MasterState, Node, NodeOptions, Publisher, PublisherOptions, RequestedType,
+    SubscriberOptions, Subscription, TopicType,
 };
 use tokio::time::{sleep, timeout};
 
@@ -136,7 +136,7 @@ fn subscribe(
     names
         .iter()
         .enumerate()
-        .map(|(index, name)| node.subscribe(name, Wanted::default(), options, index, inbox))
+        .map(|(index, name)| node.subscribe(name, RequestedType::default(), options, index, inbox))
         .collect()
 }
 

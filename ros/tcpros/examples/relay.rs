@@ -9,8 +9,8 @@ use std::pin::pin;
 use std::sync::Arc;
 
 use tcpros::{
-    Inbox, InboxEvent, Node, NodeError, NodeOptions, Peer, Publisher, PublisherOptions,
-    SubscriberOptions, TopicType, Wanted,
+    ConnectionPeer, Inbox, InboxEvent, Node, NodeError, NodeOptions, Publisher, PublisherOptions,
+    RequestedType, SubscriberOptions, TopicType,
 };
 use tokio::signal::unix::{SignalKind, signal};
 
@@ -34,7 +34,7 @@ async fn relay() -> Result<(), Box<dyn Error + Send + Sync>> {
     let mut inbox = Inbox::new();
     let mut subscriptions = Vec::new();
     for [input, output] in pairs {
-        let (wanted, queue) = (Wanted::default(), SubscriberOptions::default());
+        let (wanted, queue) = (RequestedType::default(), SubscriberOptions::default());
         let output: Arc<str> = output.as_str().into();
         subscriptions.push(node.subscribe(input, wanted, queue, output, &inbox)?);
     }
@@ -89,7 +89,7 @@ fn stop(node: &Node) -> std::io::Result<impl Future<Output = ()> + use<>> {
     })
 }
 
-fn advertise(node: &Node, topic: &str, peer: &Peer) -> Result<Publisher, NodeError> {
+fn advertise(node: &Node, topic: &str, peer: &ConnectionPeer) -> Result<Publisher, NodeError> {
     let field = |text: Option<&str>| text.unwrap_or_default().to_owned();
     let topic_type = TopicType {
         name: field(peer.header.type_name()),

@@ -1,9 +1,9 @@
 //! actionlib: goals that take time, report progress and can be cancelled, over five topics.
 //!
 //! An action `name` has the topics `name/goal` and `name/cancel` towards its server, and
-//! `name/status`, `name/feedback` and `name/result` from its server. [`ActionClient`] sends goals,
-//! and a [`GoalHandle`] follows each goal. [`ActionServer`] receives goals as [`ServerGoal`]s;
-//! [`SimpleActionServer`] does so for one goal at a time.
+//! `name/status`, `name/feedback` and `name/result` from its server. [`ActionlibClient`] sends
+//! goals, and a [`ActionlibGoal`] follows each goal. [`ActionlibServer`] receives goals as
+//! [`ActionlibServerGoal`]s; [`SimpleActionServer`] does so for one goal at a time.
 //!
 //! Goals, results and feedback are opaque bytes to this module: the serialized `XGoal`, `XResult`
 //! and `XFeedback`. The module reads and writes only the wrappers `XActionGoal`, `XActionResult`
@@ -11,7 +11,7 @@
 //!
 //! - Goals are identified by their id alone, never by a clock of another machine. Time limits use
 //!   steady time.
-//! - A goal always ends: with its result, or as lost with the [`LostReason`]. After the loss of its
+//! - A goal always ends: with its result, or as lost with the [`GoalLoss`]. After the loss of its
 //!   server, a client continues by itself when a server is back.
 //! - Feedback waits in a bounded queue that drops and counts the oldest messages. Results are never
 //!   dropped there.
@@ -34,12 +34,19 @@ mod simple;
 mod types;
 mod wire;
 
-pub use client::{ActionClient, ActionClientOptions, CancelSent, GoalHandle, IdInUse, NoServer};
-pub use client_goals::{ClientCounters, CommState, Feedback, GoalEvent, GoalResult, LostReason};
-pub use server::{ActionServer, ActionServerOptions, ServerEvent, ServerGoal};
-pub use server_goals::{GoalError, ServerCounters};
+pub use client::{
+    ActionlibClient, ActionlibClientOptions, ActionlibGoal, CancelSent, GoalIdInUse,
+    NoActionlibServer,
+};
+pub use client_goals::{
+    ActionlibClientCounters, ActionlibGoalEvent, CommState, Feedback, GoalLoss, GoalResult,
+};
+pub use server::{
+    ActionlibServer, ActionlibServerEvent, ActionlibServerGoal, ActionlibServerOptions,
+};
+pub use server_goals::{ActionlibGoalError, ActionlibServerCounters};
 pub use simple::SimpleActionServer;
 pub use types::{
-    ActionError, ActionType, ClientType, GoalId, GoalStatus, Status, goal_id_type,
-    goal_status_array_type,
+    ActionlibError, ActionlibGoalId, ActionlibStatus, ActionlibTypes, ClientType, GoalStatus,
+    goal_id_type, goal_status_array_type,
 };

@@ -11,14 +11,14 @@ use tokio::net::TcpListener;
 use tokio::sync::Notify;
 use tokio::task::JoinSet;
 
-use self::parameters::{Tree, Update, parts};
+use self::parameters::{ParameterTree, Update, parts};
 use crate::clock;
 use crate::crowd::Shares;
 use crate::header::clipped;
-use crate::names::{self, NameError};
+use crate::names::{self, ResourceNameError};
 use crate::outbox::lock;
-use crate::rpc::{self, Endpoint, RpcError};
-use crate::xmlrpc::{Call, Fault, Response, Value};
+use crate::rpc::{self, RpcEndpoint, RpcError};
+use crate::xmlrpc::{MethodCall, MethodResponse, XmlRpcFault, XmlRpcValue};
 
 /// A running master: registrations of topics and services, and the parameter tree. It stops on
 /// drop.
@@ -86,11 +86,11 @@ struct Registry {
     types: BTreeMap<String, String>,
     /// URIs of the slave APIs by node name.
     nodes: BTreeMap<String, String>,
-    parameters: Tree,
+    parameters: ParameterTree,
     /// Topics with a change that their subscribers have not been notified of.
     dirty: BTreeSet<String>,
     /// Pending parameter updates by slave API, with only the latest update per key.
-    updates: BTreeMap<String, Vec<(String, Value)>>,
+    updates: BTreeMap<String, Vec<(String, XmlRpcValue)>>,
     /// Slave APIs and names of nodes that have lost their name to another node and have not been
     /// notified.
     displaced: BTreeSet<(String, String)>,
@@ -100,7 +100,7 @@ struct Registry {
 type Registrations = BTreeMap<String, Vec<(String, String)>>;
 
 impl Shared {
-    fn answer(&self, call: &Call) -> Response {
+    fn answer(&self, call: &MethodCall) -> MethodResponse {
         let texts: Vec<&str> = call
             .params
             .iter()
@@ -154,7 +154,7 @@ impl Registry {
         registry
     }
 
-    fn registration(&mut self, method: &str, texts: &[&str]) -> Response {
+    fn registration(&mut self, method: &str, texts: &[&str]) -> MethodResponse {
         Ok(match (method, texts) {
             ("registerPublisher", [caller, topic, type_name, api]) => {
                 self.know(caller, api);
@@ -212,7 +212,12 @@ impl Registry {
         })
     }
 
-    fn parameter(&mut self, method: &str, texts: &[&str], value: Option<&Value>) -> Response {
+    fn parameter(
+        &mut self,
+        method: &str,
+        texts: &[&str],
+        value: Option<&XmlRpcValue>,
+    ) -> MethodResponse {
         let tree = &mut self.parameters;
         Ok(match (method, texts) {
             ("setParam", [caller, name, _]) => {
@@ -229,9 +234,9 @@ impl Registry {
                 let value = tree.get(&name);
                 value.map_or_else(|| not_set(&name), done)
             }
-            ("hasParam", [caller, name]) => {
-                done(Value::Bool(tree.get(&full_name(name, caller)?).is_some()))
-            }
+            ("hasParam", [caller, name]) => done(XmlRpcValue::Bool(
+                tree.get(&full_name(name, caller)?).is_some(),
+            )),
             ("deleteParam", [caller, name]) => {
                 let name = full_name(name, caller)?;
                 match tree.delete(&name) {
@@ -259,7 +264,7 @@ impl Registry {
                 done(1)
             }
             ("getParamNames", _) => {
-                let names = tree.names().into_iter().map(Value::from);
+                let names = tree.names().into_iter().map(XmlRpcValue::from);
                 done(names.collect::<Vec<_>>())
             }
             (
@@ -303,7 +308,7 @@ impl Registry {
     }
 
     /// Returns the pending calls by slave API, in order.
-    fn news(&mut self) -> BTreeMap<String, Vec<(&'static str, Vec<Value>)>> {
+    fn news(&mut self) -> BTreeMap<String, Vec<(&'static str, Vec<XmlRpcValue>)>> {
         let mut news: BTreeMap<String, Vec<_>> = BTreeMap::new();
         for topic in std::mem::take(&mut self.dirty) {
             let publishers = apis(&self.publishers, &topic);
@@ -314,7 +319,7 @@ impl Registry {
             }
         }
         for (api, updates) in std::mem::take(&mut self.updates) {
-            let update = |(key, value): (String, Value)| {
+            let update = |(key, value): (String, XmlRpcValue)| {
                 ("paramUpdate", vec![MASTER.into(), key.into(), value])
             };
             let calls = news.entry(api).or_default();
@@ -338,22 +343,22 @@ impl Registry {
         }
     }
 
-    fn system_state(&self) -> Value {
+    fn system_state(&self) -> XmlRpcValue {
         let topics = |registrations: &Registrations| {
             let entry = |(topic, nodes): (&String, &Vec<(String, String)>)| {
                 let names = nodes.iter().map(|(node, _)| node.as_str().into()).collect();
-                Value::Array(vec![topic.as_str().into(), Value::Array(names)])
+                XmlRpcValue::Array(vec![topic.as_str().into(), XmlRpcValue::Array(names)])
             };
-            Value::Array(registrations.iter().map(entry).collect())
+            XmlRpcValue::Array(registrations.iter().map(entry).collect())
         };
         let service = |(name, (node, _)): (&String, &(String, String))| {
-            Value::Array(vec![
+            XmlRpcValue::Array(vec![
                 name.as_str().into(),
-                Value::Array(vec![node.as_str().into()]),
+                XmlRpcValue::Array(vec![node.as_str().into()]),
             ])
         };
-        let services = Value::Array(self.services.iter().map(service).collect());
-        Value::Array(vec![
+        let services = XmlRpcValue::Array(self.services.iter().map(service).collect());
+        XmlRpcValue::Array(vec![
             topics(&self.publishers),
             topics(&self.subscribers),
             services,
@@ -362,7 +367,7 @@ impl Registry {
 
     /// Returns the types of the published topics below a namespace; an empty namespace selects all
     /// topics.
-    fn published_topics(&self, subgraph: &str) -> Value {
+    fn published_topics(&self, subgraph: &str) -> XmlRpcValue {
         let namespace = match subgraph.trim_end_matches('/') {
             "" => String::new(),
             name => format!("{name}/"),
@@ -372,12 +377,12 @@ impl Registry {
         })
     }
 
-    fn topic_types(&self, wanted: impl Fn(&str) -> bool) -> Value {
+    fn topic_types(&self, wanted: impl Fn(&str) -> bool) -> XmlRpcValue {
         let pair = |(topic, name): (&String, &String)| {
-            Value::Array(vec![topic.as_str().into(), name.as_str().into()])
+            XmlRpcValue::Array(vec![topic.as_str().into(), name.as_str().into()])
         };
         let types = self.types.iter().filter(|(topic, _)| wanted(topic));
-        Value::Array(types.map(pair).collect())
+        XmlRpcValue::Array(types.map(pair).collect())
     }
 }
 
@@ -388,7 +393,7 @@ async fn notify(shared: Arc<Shared>) {
         shared.changed.notified().await;
         let mut calls = JoinSet::new();
         for (api, news) in lock(&shared.registry).news() {
-            if let Some(endpoint) = Endpoint::parse(&api) {
+            if let Some(endpoint) = RpcEndpoint::parse(&api) {
                 calls.spawn(async move {
                     for (method, params) in news {
                         rpc::call(&endpoint, method, params, NOTIFY_LIMIT).await?;
@@ -425,37 +430,37 @@ fn remove(registrations: &mut Registrations, topic: &str, caller: &str, api: &st
     i32::try_from(removed).unwrap_or(i32::MAX)
 }
 
-fn apis(registrations: &Registrations, topic: &str) -> Value {
+fn apis(registrations: &Registrations, topic: &str) -> XmlRpcValue {
     let nodes = registrations.get(topic).into_iter().flatten();
-    Value::Array(nodes.map(|(_, api)| api.as_str().into()).collect())
+    XmlRpcValue::Array(nodes.map(|(_, api)| api.as_str().into()).collect())
 }
 
-fn found(value: Option<&str>, what: &str) -> Value {
+fn found(value: Option<&str>, what: &str) -> XmlRpcValue {
     value.map_or_else(|| triple(-1, &format!("unknown {what}"), 0), done)
 }
 
-fn done(result: impl Into<Value>) -> Value {
+fn done(result: impl Into<XmlRpcValue>) -> XmlRpcValue {
     triple(1, "", result)
 }
 
-fn triple(code: i32, message: &str, result: impl Into<Value>) -> Value {
-    Value::Array(vec![code.into(), message.into(), result.into()])
+fn triple(code: i32, message: &str, result: impl Into<XmlRpcValue>) -> XmlRpcValue {
+    XmlRpcValue::Array(vec![code.into(), message.into(), result.into()])
 }
 
-fn not_set(name: &str) -> Value {
+fn not_set(name: &str) -> XmlRpcValue {
     triple(-1, &format!("Parameter [{name}] is not set"), 0)
 }
 
 /// Resolves the name of a parameter relative to the caller and returns its canonical form. Fails
 /// for a name of more than [`MAX_PARTS`] parts.
-fn full_name(name: &str, caller: &str) -> Result<String, Fault> {
+fn full_name(name: &str, caller: &str) -> Result<String, XmlRpcFault> {
     let full = names::of_caller(name, caller)
-        .map_err(|error: NameError| fault(clipped(&error.to_string()).to_owned()))?;
+        .map_err(|error: ResourceNameError| fault(clipped(&error.to_string()).to_owned()))?;
     not_too_deep(&full)?;
     Ok(full)
 }
 
-fn not_too_deep(name: &str) -> Result<(), Fault> {
+fn not_too_deep(name: &str) -> Result<(), XmlRpcFault> {
     if parts(name).nth(MAX_PARTS).is_some() {
         let name = clipped(name);
         return Err(fault(format!(
@@ -465,8 +470,8 @@ fn not_too_deep(name: &str) -> Result<(), Fault> {
     Ok(())
 }
 
-const fn fault(message: String) -> Fault {
-    Fault { code: -1, message }
+const fn fault(message: String) -> XmlRpcFault {
+    XmlRpcFault { code: -1, message }
 }
 
 /// Maximum number of parts in the name of a parameter. The tree is traversed by recursion, and its
@@ -488,16 +493,17 @@ mod tests {
         }
     }
 
-    fn ask(shared: &Shared, method: &str, texts: &[&str]) -> Response {
-        shared.answer(&Call {
+    fn ask(shared: &Shared, method: &str, texts: &[&str]) -> MethodResponse {
+        shared.answer(&MethodCall {
             method: method.to_owned(),
-            params: texts.iter().map(|text| Value::from(*text)).collect(),
+            params: texts.iter().map(|text| XmlRpcValue::from(*text)).collect(),
         })
     }
 
-    fn types(topics: &[(&str, &str)]) -> Value {
-        let pair =
-            |(topic, name): &(&str, &str)| Value::Array(vec![(*topic).into(), (*name).into()]);
+    fn types(topics: &[(&str, &str)]) -> XmlRpcValue {
+        let pair = |(topic, name): &(&str, &str)| {
+            XmlRpcValue::Array(vec![(*topic).into(), (*name).into()])
+        };
         done(topics.iter().map(pair).collect::<Vec<_>>())
     }
 

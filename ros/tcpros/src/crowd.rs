@@ -13,12 +13,12 @@ use tokio::task::AbortHandle;
 
 /// Connection limits of a listener.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) struct Places {
+pub(crate) struct ConnectionLimits {
     pub(crate) total: usize,
     pub(crate) per_address: usize,
 }
 
-impl Places {
+impl ConnectionLimits {
     const fn shared(total: usize) -> Self {
         Self {
             total,
@@ -32,11 +32,11 @@ impl Places {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Shares {
     /// Subscribers and clients of services.
-    pub(crate) subscribers: Places,
+    pub(crate) subscribers: ConnectionLimits,
     /// Callers of the slave API.
-    pub(crate) callers: Places,
+    pub(crate) callers: ConnectionLimits,
     /// Callers of a master in this process, all of which may be on one host.
-    pub(crate) nodes: Places,
+    pub(crate) nodes: ConnectionLimits,
     /// Publishers that are connected or being connected.
     pub(crate) publishers: usize,
     /// Publishers of a topic that are connected or being connected.
@@ -59,9 +59,9 @@ impl Shares {
         let publishers = at_most(eighth.saturating_mul(3), 8192);
         let nodes = at_most(eighth.saturating_mul(4), 4096);
         Self {
-            subscribers: Places::shared(at_most(eighth.saturating_mul(3), 4096)),
-            callers: Places::shared(at_most(eighth, 1024)),
-            nodes: Places {
+            subscribers: ConnectionLimits::shared(at_most(eighth.saturating_mul(3), 4096)),
+            callers: ConnectionLimits::shared(at_most(eighth, 1024)),
+            nodes: ConnectionLimits {
                 total: nodes,
                 per_address: nodes,
             },
@@ -85,7 +85,7 @@ const fn at_most(number: usize, most: usize) -> usize {
 /// The connections of a listener in the order of arrival.
 #[derive(Debug)]
 pub(crate) struct Crowd {
-    places: Places,
+    places: ConnectionLimits,
     open: Vec<Guest>,
 }
 
@@ -113,7 +113,7 @@ impl Settled {
 
 /// Outcome of a new connection.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Admission {
+pub(crate) enum ConnectionAdmission {
     /// The connection is admitted.
     Free,
     /// The connection is admitted; the oldest unsettled connection, which was from this address,
@@ -124,7 +124,7 @@ pub(crate) enum Admission {
 }
 
 impl Crowd {
-    pub(crate) const fn new(places: Places) -> Self {
+    pub(crate) const fn new(places: ConnectionLimits) -> Self {
         Self {
             places,
             open: Vec::new(),
@@ -136,17 +136,17 @@ impl Crowd {
         &mut self,
         address: IpAddr,
         begin: impl FnOnce(Settled) -> AbortHandle,
-    ) -> Admission {
+    ) -> ConnectionAdmission {
         self.open.retain(|guest| !guest.task.is_finished());
         let from_there = self.open.iter().filter(|g| g.address == address).count();
         let has_share = from_there >= self.places.per_address;
-        let mut admission = Admission::Free;
+        let mut admission = ConnectionAdmission::Free;
         if has_share || self.open.len() >= self.places.total {
             let gives_way = |guest: &Guest| {
                 !guest.settled.is_settled() && (!has_share || guest.address == address)
             };
             let Some(at) = self.open.iter().position(gives_way) else {
-                return Admission::Full(if has_share {
+                return ConnectionAdmission::Full(if has_share {
                     self.places.per_address
                 } else {
                     self.places.total
@@ -154,7 +154,7 @@ impl Crowd {
             };
             let guest = self.open.remove(at);
             guest.task.abort();
-            admission = Admission::InPlaceOf(guest.address);
+            admission = ConnectionAdmission::InPlaceOf(guest.address);
         }
         let settled = Settled::default();
         let task = begin(settled.clone());
@@ -198,7 +198,7 @@ mod tests {
     #[tokio::test]
     async fn the_oldest_that_says_nothing_gives_way_and_others_stay() {
         let mut tasks: JoinSet<()> = JoinSet::new();
-        let mut crowd = Crowd::new(Places {
+        let mut crowd = Crowd::new(ConnectionLimits {
             total: 4,
             per_address: 2,
         });
@@ -213,26 +213,26 @@ mod tests {
             });
             (admission, place)
         };
-        assert_eq!(come(A, true).0, Admission::Free);
-        assert_eq!(come(B, false).0, Admission::Free);
+        assert_eq!(come(A, true).0, ConnectionAdmission::Free);
+        assert_eq!(come(B, false).0, ConnectionAdmission::Free);
         let (_, silent) = come(A, false);
         // The address has used its share: its own idle connection is closed, not that of another
         // address.
         let (admission, second) = come(A, false);
-        assert_eq!(admission, Admission::InPlaceOf(A));
+        assert_eq!(admission, ConnectionAdmission::InPlaceOf(A));
         drop(silent);
         second.unwrap().settle();
-        assert_eq!(come(A, false).0, Admission::Full(2));
-        assert_eq!(come(B, true).0, Admission::Free);
+        assert_eq!(come(A, false).0, ConnectionAdmission::Full(2));
+        assert_eq!(come(B, true).0, ConnectionAdmission::Free);
         // All connections are in use: the remaining idle connection is closed.
         let c = IpAddr::V4(std::net::Ipv4Addr::new(10, 0, 0, 3));
-        assert_eq!(come(c, true).0, Admission::InPlaceOf(B));
-        assert_eq!(come(c, false).0, Admission::Full(4));
+        assert_eq!(come(c, true).0, ConnectionAdmission::InPlaceOf(B));
+        assert_eq!(come(c, false).0, ConnectionAdmission::Full(4));
     }
 
     #[tokio::test]
     async fn a_connection_that_has_ended_leaves_its_place() {
-        let mut crowd = Crowd::new(Places {
+        let mut crowd = Crowd::new(ConnectionLimits {
             total: 1,
             per_address: 1,
         });
@@ -243,9 +243,9 @@ mod tests {
                 tasks.spawn(async {})
             })
         };
-        assert_eq!(come(&mut tasks), Admission::Free);
-        assert_eq!(come(&mut tasks), Admission::Full(1));
+        assert_eq!(come(&mut tasks), ConnectionAdmission::Free);
+        assert_eq!(come(&mut tasks), ConnectionAdmission::Full(1));
         tasks.join_next().await.unwrap().unwrap();
-        assert_eq!(come(&mut tasks), Admission::Free);
+        assert_eq!(come(&mut tasks), ConnectionAdmission::Free);
     }
 }

@@ -13,11 +13,11 @@ use crate::outbox::{Limit, lock};
 
 /// A message received from a publisher.
 #[derive(Clone, Debug)]
-pub struct Message {
+pub struct InboxMessage {
     /// The serialized message, without its length.
     pub bytes: Bytes,
     /// The publisher.
-    pub peer: Arc<Peer>,
+    pub peer: Arc<ConnectionPeer>,
     /// Time at which the last byte of the message was read. Messages from the same read differ by a
     /// nanosecond, so that the time also identifies a message.
     pub received: SystemTime,
@@ -25,7 +25,7 @@ pub struct Message {
 
 /// The node at the other end of a connection: a publisher, or a client of a service.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Peer {
+pub struct ConnectionPeer {
     /// Resolved name of the node.
     pub caller_id: String,
     /// Connection header of the node, which describes the node and the topic or service.
@@ -36,7 +36,7 @@ pub struct Peer {
 #[derive(Clone, Debug)]
 pub enum InboxEvent {
     /// A message, in the order of its publisher.
-    Message(Message),
+    Message(InboxMessage),
     /// A connection to a publisher was made or ended.
     Peer {
         /// True if the connection was made.
@@ -44,7 +44,7 @@ pub enum InboxEvent {
         /// Number of publishers that this subscription is connected to.
         publishers: usize,
         /// The publisher.
-        peer: Arc<Peer>,
+        peer: Arc<ConnectionPeer>,
     },
     /// Number of messages lost since the last event because the consumer did not keep up. The
     /// oldest messages are dropped.
@@ -123,8 +123,8 @@ impl<K: Clone + Send + 'static> Default for Inbox<K> {
 /// Receiver for the messages of a subscription's connections.
 pub(crate) trait Deliver: Send + Sync {
     /// Queues a message and returns the number of older messages that were dropped.
-    fn message(&self, message: Message) -> u64;
-    fn peer(&self, connected: bool, publishers: usize, peer: Arc<Peer>);
+    fn message(&self, message: InboxMessage) -> u64;
+    fn peer(&self, connected: bool, publishers: usize, peer: Arc<ConnectionPeer>);
     /// Removes the subscription and its queue.
     fn close(&self);
 }
@@ -136,11 +136,11 @@ pub(crate) struct Entrance<K> {
 }
 
 impl<K: Clone + Send + 'static> Deliver for Entrance<K> {
-    fn message(&self, message: Message) -> u64 {
+    fn message(&self, message: InboxMessage) -> u64 {
         self.put(|slot| slot.message(message))
     }
 
-    fn peer(&self, connected: bool, publishers: usize, peer: Arc<Peer>) {
+    fn peer(&self, connected: bool, publishers: usize, peer: Arc<ConnectionPeer>) {
         self.put(|slot| {
             slot.peer(InboxEvent::Peer {
                 connected,
@@ -241,7 +241,7 @@ impl<K> Slot<K> {
         }
     }
 
-    fn message(&mut self, message: Message) -> u64 {
+    fn message(&mut self, message: InboxMessage) -> u64 {
         let mut dropped = 0;
         while self.messages > 0
             && (self.messages >= self.limit.messages.max(1)
@@ -306,12 +306,12 @@ const MAX_PEERS: usize = 16;
 mod tests {
     use super::*;
 
-    fn message(content: &[u8]) -> Message {
-        let peer = Arc::new(Peer {
+    fn message(content: &[u8]) -> InboxMessage {
+        let peer = Arc::new(ConnectionPeer {
             caller_id: "/p".to_owned(),
             header: ConnectionHeader::default(),
         });
-        Message {
+        InboxMessage {
             bytes: Bytes::copy_from_slice(content),
             peer,
             received: SystemTime::UNIX_EPOCH,

@@ -50,20 +50,20 @@ mod xmlrpc;
 
 pub use crate::core::Core;
 pub use crate::header::{ConnectionHeader, HeaderError};
-pub use crate::inbox::{Inbox, InboxEvent, Message, Peer};
-pub use crate::master::{Graph, MasterError};
-pub use crate::names::NameError;
+pub use crate::inbox::{ConnectionPeer, Inbox, InboxEvent, InboxMessage};
+pub use crate::master::{MasterError, MasterGraph};
+pub use crate::names::ResourceNameError;
 pub use crate::node::{GraphReader, MasterState, Node, NodeError};
 pub use crate::options::{ArgumentError, NodeOptions};
-pub use crate::parameters::{ParamError, ParamSubscription, ParamValue, Parameters};
+pub use crate::parameters::{NodeParameters, ParamError, ParamSubscription, ParamValue};
 pub use crate::publisher::{
     Latched, MAX_LATCHED, Published, Publisher, PublisherOptions, TopicType,
 };
 pub use crate::rpc::RpcError;
 pub use crate::service::{
     CallPhase, ServiceClient, ServiceClientOptions, ServiceError, ServiceOptions, ServiceRequest,
-    ServiceServer, ServiceType,
+    ServiceServer, ServiceTypeSum,
 };
-pub use crate::subscription::{SubscriberOptions, Subscription, Wanted};
-pub use crate::time::{RosClock, RosTime};
-pub use crate::xmlrpc::{Fault, XmlError};
+pub use crate::subscription::{RequestedType, SubscriberOptions, Subscription};
+pub use crate::time::{Ros1Clock, Ros1Time};
+pub use crate::xmlrpc::{XmlError, XmlRpcFault};

@@ -19,12 +19,12 @@ use crate::crowd::Shares;
 use crate::events;
 use crate::frame::{FrameTooLong, Frames};
 use crate::header::{ConnectionHeader, HeaderError, clipped};
-use crate::inbox::{Message, Peer};
+use crate::inbox::{ConnectionPeer, InboxMessage};
 use crate::master::{Master, MasterError, unwrap_triple};
 use crate::outbox::lock;
-use crate::rpc::{self, Endpoint, RpcError};
-use crate::subscription::{Feed, LinkState};
-use crate::xmlrpc::Value;
+use crate::rpc::{self, RpcEndpoint, RpcError};
+use crate::subscription::{TopicFeed, TopicLink};
+use crate::xmlrpc::XmlRpcValue;
 
 /// State shared by all links of a node.
 #[derive(Debug)]
@@ -88,10 +88,10 @@ impl LinkContext {
 /// Keeps a subscription connected to a publisher until the master no longer lists the publisher.
 /// Runs as a task of its own.
 pub(crate) async fn run(
-    feed: Arc<Feed>,
+    feed: Arc<TopicFeed>,
     context: Arc<LinkContext>,
     uri: String,
-    state: Arc<LinkState>,
+    state: Arc<TopicLink>,
 ) {
     let mut wait = FIRST_WAIT;
     let mut failures = 0u32;
@@ -137,10 +137,10 @@ pub(crate) async fn run(
 }
 
 async fn connect(
-    feed: &Feed,
+    feed: &TopicFeed,
     context: &LinkContext,
     uri: &str,
-) -> Result<(TcpStream, Arc<Peer>), LinkError> {
+) -> Result<(TcpStream, Arc<ConnectionPeer>), LinkError> {
     let (host, port) = request_topic(feed, context, uri).await?;
     let connecting = timeout(
         CONNECT_LIMIT,
@@ -156,7 +156,7 @@ async fn connect(
         .map_err(|_| LinkError::NoHeader(HANDSHAKE_LIMIT))??;
     Ok((
         stream,
-        Arc::new(Peer {
+        Arc::new(ConnectionPeer {
             caller_id: header.caller_id().to_owned(),
             header,
         }),
@@ -164,14 +164,14 @@ async fn connect(
 }
 
 async fn request_topic(
-    feed: &Feed,
+    feed: &TopicFeed,
     context: &LinkContext,
     uri: &str,
 ) -> Result<(String, u16), LinkError> {
-    let endpoint = Endpoint::parse(uri)
+    let endpoint = RpcEndpoint::parse(uri)
         .ok_or(RpcError::Uri)?
         .ipv6_first(context.master.prefers_ipv6());
-    let protocols = vec![Value::Array(vec!["TCPROS".into()])];
+    let protocols = vec![XmlRpcValue::Array(vec!["TCPROS".into()])];
     let params = vec![
         context.caller_id.as_str().into(),
         feed.topic.as_str().into(),
@@ -180,7 +180,9 @@ async fn request_topic(
     let reply = rpc::call(&endpoint, "requestTopic", params, REQUEST_LIMIT).await?;
     let chosen = unwrap_triple(reply, "requestTopic")?;
     match chosen.as_array() {
-        Some([protocol, Value::String(host), port, ..]) if protocol.as_str() == Some("TCPROS") => {
+        Some([protocol, XmlRpcValue::String(host), port, ..])
+            if protocol.as_str() == Some("TCPROS") =>
+        {
             let port = port.as_int().and_then(|port| u16::try_from(port).ok());
             Ok((
                 host.clone(),
@@ -193,7 +195,7 @@ async fn request_topic(
 
 async fn shake_hands(
     stream: &mut TcpStream,
-    feed: &Feed,
+    feed: &TopicFeed,
     context: &LinkContext,
 ) -> Result<ConnectionHeader, LinkError> {
     let wanted = &feed.wanted;
@@ -231,10 +233,10 @@ async fn shake_hands(
 /// end.
 async fn follow(
     mut stream: TcpStream,
-    peer: Arc<Peer>,
-    feed: &Feed,
+    peer: Arc<ConnectionPeer>,
+    feed: &TopicFeed,
     context: &LinkContext,
-    state: &LinkState,
+    state: &TopicLink,
 ) -> LinkError {
     events::publisher_joined(&feed.topic, &peer.caller_id);
     *lock(&state.transport) = transport_info(&stream);
@@ -260,7 +262,7 @@ async fn follow(
                 Ok(Some(bytes)) => {
                     state.messages.fetch_add(1, Ordering::Relaxed);
                     ahead += 1 + bytes.len() / 4096;
-                    feed.deliver(Message {
+                    feed.deliver(InboxMessage {
                         bytes,
                         peer: Arc::clone(&peer),
                         received,

@@ -8,12 +8,12 @@ use std::time::Duration;
 use bytes::Bytes;
 use thiserror::Error;
 
-use crate::rpc::{self, Endpoint, RpcError};
-use crate::xmlrpc::Value;
+use crate::rpc::{self, RpcEndpoint, RpcError};
+use crate::xmlrpc::XmlRpcValue;
 
 /// The publishers, subscribers and services that are registered with the master.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub struct Graph {
+pub struct MasterGraph {
     /// Names of the publishing nodes by topic.
     pub publishers: BTreeMap<String, Vec<String>>,
     /// Names of the subscribing nodes by topic.
@@ -25,7 +25,7 @@ pub struct Graph {
     pub types: BTreeMap<String, String>,
 }
 
-impl Graph {
+impl MasterGraph {
     /// Reads the graph from the master at `uri` (`http://host:port`) without registering a node.
     /// Takes at most two calls of 3 s each.
     ///
@@ -53,7 +53,7 @@ impl Graph {
 /// A master, called with the name of a node.
 #[derive(Clone, Debug)]
 pub(crate) struct Master {
-    endpoint: Endpoint,
+    endpoint: RpcEndpoint,
     uri: String,
     caller_id: String,
     caller_uri: String,
@@ -62,12 +62,12 @@ pub(crate) struct Master {
 }
 
 /// A call: the method, and its parameters without the caller id.
-pub(crate) type Request = (&'static str, Vec<Value>);
+pub(crate) type MasterRequest = (&'static str, Vec<XmlRpcValue>);
 
 impl Master {
     /// Returns a client of the master at a URI, for a caller that is not a node of its graph.
     pub(crate) fn at(uri: &str, caller_id: &str) -> Result<Self, MasterError> {
-        let endpoint = Endpoint::parse(uri).ok_or(RpcError::Uri)?;
+        let endpoint = RpcEndpoint::parse(uri).ok_or(RpcError::Uri)?;
         Ok(Self::new(
             endpoint,
             uri.to_owned(),
@@ -77,7 +77,7 @@ impl Master {
     }
 
     pub(crate) fn new(
-        endpoint: Endpoint,
+        endpoint: RpcEndpoint,
         uri: String,
         caller_id: String,
         caller_uri: String,
@@ -125,7 +125,7 @@ impl Master {
         }
     }
 
-    pub(crate) fn register_publisher(&self, topic: &str, type_name: &str) -> Request {
+    pub(crate) fn register_publisher(&self, topic: &str, type_name: &str) -> MasterRequest {
         let uri = self.caller_uri.as_str();
         (
             "registerPublisher",
@@ -134,7 +134,7 @@ impl Master {
     }
 
     /// Returns the registration of a subscriber; its result is decoded by [`publishers`].
-    pub(crate) fn register_subscriber(&self, topic: &str, type_name: &str) -> Request {
+    pub(crate) fn register_subscriber(&self, topic: &str, type_name: &str) -> MasterRequest {
         let uri = self.caller_uri.as_str();
         (
             "registerSubscriber",
@@ -142,7 +142,7 @@ impl Master {
         )
     }
 
-    pub(crate) fn register_service(&self, service: &str, service_uri: &str) -> Request {
+    pub(crate) fn register_service(&self, service: &str, service_uri: &str) -> MasterRequest {
         let uri = self.caller_uri.as_str();
         (
             "registerService",
@@ -150,17 +150,17 @@ impl Master {
         )
     }
 
-    pub(crate) fn unregister_publisher(&self, topic: &str) -> Request {
+    pub(crate) fn unregister_publisher(&self, topic: &str) -> MasterRequest {
         let uri = self.caller_uri.as_str();
         ("unregisterPublisher", vec![topic.into(), uri.into()])
     }
 
-    pub(crate) fn unregister_subscriber(&self, topic: &str) -> Request {
+    pub(crate) fn unregister_subscriber(&self, topic: &str) -> MasterRequest {
         let uri = self.caller_uri.as_str();
         ("unregisterSubscriber", vec![topic.into(), uri.into()])
     }
 
-    pub(crate) fn unregister_service(service: &str, service_uri: &str) -> Request {
+    pub(crate) fn unregister_service(service: &str, service_uri: &str) -> MasterRequest {
         (
             "unregisterService",
             vec![service.into(), service_uri.into()],
@@ -175,7 +175,7 @@ impl Master {
         self.lookup("lookupService", service).await
     }
 
-    pub(crate) async fn graph(&self) -> Result<Graph, MasterError> {
+    pub(crate) async fn graph(&self) -> Result<MasterGraph, MasterError> {
         let (state, types) = match self.call_all(graph_requests()).await {
             Ok(replies) => return graph_of(replies),
             // Each half of a very large graph may be small enough for a reply.
@@ -192,8 +192,8 @@ impl Master {
     /// decoded again: the graph of a plant has thousands of names and rarely changes.
     pub(crate) async fn graph_since(
         &self,
-        before: &mut Option<(Bytes, Arc<Graph>)>,
-    ) -> Result<Arc<Graph>, MasterError> {
+        before: &mut Option<(Bytes, Arc<MasterGraph>)>,
+    ) -> Result<Arc<MasterGraph>, MasterError> {
         let known = before.take();
         if !self.one_by_one.load(Ordering::Relaxed) {
             let requests = graph_requests();
@@ -220,7 +220,7 @@ impl Master {
     }
 
     /// Reads the graph without the types.
-    pub(crate) async fn registrations(&self) -> Result<Graph, MasterError> {
+    pub(crate) async fn registrations(&self) -> Result<MasterGraph, MasterError> {
         registrations(&self.call(STATE, vec![]).await?)
     }
 
@@ -245,8 +245,8 @@ impl Master {
     /// Fails if the master cannot be reached; some of the calls may have been made then.
     pub(crate) async fn call_all(
         &self,
-        requests: Vec<Request>,
-    ) -> Result<Vec<Result<Value, MasterError>>, MasterError> {
+        requests: Vec<MasterRequest>,
+    ) -> Result<Vec<Result<XmlRpcValue, MasterError>>, MasterError> {
         if requests.len() > 1 && !self.one_by_one.load(Ordering::Relaxed) {
             match self.multicall(&requests).await {
                 Err(MasterError::Rpc(RpcError::Fault(_)) | MasterError::Shape(_)) => {
@@ -267,22 +267,22 @@ impl Master {
 
     async fn multicall(
         &self,
-        requests: &[Request],
-    ) -> Result<Vec<Result<Value, MasterError>>, MasterError> {
+        requests: &[MasterRequest],
+    ) -> Result<Vec<Result<XmlRpcValue, MasterError>>, MasterError> {
         read_all(&self.fetch_all(requests).await?, requests)
     }
 
     /// Makes the calls of a multicall, and returns the document of the reply for [`read_all`].
-    async fn fetch_all(&self, requests: &[Request]) -> Result<Bytes, MasterError> {
+    async fn fetch_all(&self, requests: &[MasterRequest]) -> Result<Bytes, MasterError> {
         let calls = requests.iter().map(|(method, params)| {
             let own = std::iter::once(self.caller_id.as_str().into());
             let params = own.chain(params.iter().cloned()).collect();
-            Value::Struct(vec![
+            XmlRpcValue::Struct(vec![
                 ("methodName".to_owned(), (*method).into()),
-                ("params".to_owned(), Value::Array(params)),
+                ("params".to_owned(), XmlRpcValue::Array(params)),
             ])
         });
-        let params = vec![Value::Array(calls.collect())];
+        let params = vec![XmlRpcValue::Array(calls.collect())];
         Ok(rpc::fetch(&self.endpoint, MULTICALL, params, CALL_LIMIT).await?)
     }
 
@@ -291,8 +291,8 @@ impl Master {
     pub(crate) async fn call(
         &self,
         method: &'static str,
-        mut params: Vec<Value>,
-    ) -> Result<Value, MasterError> {
+        mut params: Vec<XmlRpcValue>,
+    ) -> Result<XmlRpcValue, MasterError> {
         params.insert(0, self.caller_id.as_str().into());
         let reply = rpc::call(&self.endpoint, method, params, CALL_LIMIT).await?;
         unwrap_triple(reply, method)
@@ -302,9 +302,9 @@ impl Master {
 /// Reads the reply to a multicall, with a result for each of the requests.
 fn read_all(
     document: &[u8],
-    requests: &[Request],
-) -> Result<Vec<Result<Value, MasterError>>, MasterError> {
-    let Value::Array(replies) = rpc::read(document)? else {
+    requests: &[MasterRequest],
+) -> Result<Vec<Result<XmlRpcValue, MasterError>>, MasterError> {
+    let XmlRpcValue::Array(replies) = rpc::read(document)? else {
         return Err(MasterError::Shape(MULTICALL));
     };
     if replies.len() != requests.len() {
@@ -315,29 +315,29 @@ fn read_all(
 }
 
 /// Returns the calls that read the graph.
-fn graph_requests() -> Vec<Request> {
+fn graph_requests() -> Vec<MasterRequest> {
     vec![(STATE, vec![]), (TYPES, vec![])]
 }
 
 /// Decodes the replies to [`graph_requests`].
-fn graph_of(replies: Vec<Result<Value, MasterError>>) -> Result<Graph, MasterError> {
+fn graph_of(replies: Vec<Result<XmlRpcValue, MasterError>>) -> Result<MasterGraph, MasterError> {
     let mut replies = replies.into_iter();
     let mut next = |method| replies.next().ok_or(MasterError::Shape(method))?;
     let (state, types) = (next(STATE)?, next(TYPES)?);
-    let text = |value: &Value| value.as_str().map(str::to_owned);
-    Ok(Graph {
+    let text = |value: &XmlRpcValue| value.as_str().map(str::to_owned);
+    Ok(MasterGraph {
         types: pairs(&types, text).ok_or(MasterError::Shape(TYPES))?,
         ..registrations(&state)?
     })
 }
 
 /// Decodes the reply to `getSystemState`: the graph without the types.
-fn registrations(state: &Value) -> Result<Graph, MasterError> {
+fn registrations(state: &XmlRpcValue) -> Result<MasterGraph, MasterError> {
     let [publishers, subscribers, services, ..] = state.as_array().unwrap_or_default() else {
         return Err(MasterError::Shape(STATE));
     };
     let by_topic = |value| pairs(value, strings).ok_or(MasterError::Shape(STATE));
-    Ok(Graph {
+    Ok(MasterGraph {
         publishers: by_topic(publishers)?,
         subscribers: by_topic(subscribers)?,
         services: by_topic(services)?,
@@ -346,25 +346,28 @@ fn registrations(state: &Value) -> Result<Graph, MasterError> {
 }
 
 /// Unwraps a reply of a multicall: its result in an array of its own, or a struct with a fault.
-fn unwrap_one((reply, method): (Value, &'static str)) -> Result<Value, MasterError> {
-    let Value::Array(result) = reply else {
+fn unwrap_one((reply, method): (XmlRpcValue, &'static str)) -> Result<XmlRpcValue, MasterError> {
+    let XmlRpcValue::Array(result) = reply else {
         return Err(MasterError::Shape(method));
     };
-    let [result] = <[Value; 1]>::try_from(result).map_err(|_| MasterError::Shape(method))?;
+    let [result] = <[XmlRpcValue; 1]>::try_from(result).map_err(|_| MasterError::Shape(method))?;
     unwrap_triple(result, method)
 }
 
 /// Decodes the URIs of a topic's publishers from the reply to `registerSubscriber`.
-pub(crate) fn publishers(result: &Value) -> Result<Vec<String>, MasterError> {
+pub(crate) fn publishers(result: &XmlRpcValue) -> Result<Vec<String>, MasterError> {
     strings(result).ok_or(MasterError::Shape("registerSubscriber"))
 }
 
 /// Unwraps the reply of every ROS API: status code, status message, result.
-pub(crate) fn unwrap_triple(reply: Value, method: &'static str) -> Result<Value, MasterError> {
-    let Value::Array(items) = reply else {
+pub(crate) fn unwrap_triple(
+    reply: XmlRpcValue,
+    method: &'static str,
+) -> Result<XmlRpcValue, MasterError> {
+    let XmlRpcValue::Array(items) = reply else {
         return Err(MasterError::Shape(method));
     };
-    let Ok([code, message, result]) = <[Value; 3]>::try_from(items) else {
+    let Ok([code, message, result]) = <[XmlRpcValue; 3]>::try_from(items) else {
         return Err(MasterError::Shape(method));
     };
     match code.as_int() {
@@ -397,7 +400,7 @@ pub enum MasterError {
     Shape(&'static str),
 }
 
-pub(crate) fn strings(value: &Value) -> Option<Vec<String>> {
+pub(crate) fn strings(value: &XmlRpcValue) -> Option<Vec<String>> {
     value
         .as_array()?
         .iter()
@@ -405,8 +408,11 @@ pub(crate) fn strings(value: &Value) -> Option<Vec<String>> {
         .collect()
 }
 
-fn pairs<T>(value: &Value, second: impl Fn(&Value) -> Option<T>) -> Option<BTreeMap<String, T>> {
-    let pair = |item: &Value| match item.as_array()? {
+fn pairs<T>(
+    value: &XmlRpcValue,
+    second: impl Fn(&XmlRpcValue) -> Option<T>,
+) -> Option<BTreeMap<String, T>> {
+    let pair = |item: &XmlRpcValue| match item.as_array()? {
         [topic, rest] => Some((topic.as_str()?.to_owned(), second(rest)?)),
         _ => None,
     };
@@ -426,11 +432,11 @@ mod tests {
     use tokio::task::JoinSet;
 
     use super::*;
-    use crate::xmlrpc::{Call, Fault, Response};
+    use crate::xmlrpc::{MethodCall, MethodResponse, XmlRpcFault};
 
     /// Returns a master that replies with `answer`, and the list of the called methods.
     async fn master(
-        answer: fn(&Call) -> Response,
+        answer: fn(&MethodCall) -> MethodResponse,
     ) -> (Master, Arc<Mutex<Vec<String>>>, JoinSet<()>) {
         let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
         let uri = format!("http://{}/", listener.local_addr().unwrap());
@@ -442,16 +448,16 @@ mod tests {
             noted.lock().unwrap().push(call.method.clone());
             answer(&call)
         }));
-        let endpoint = Endpoint::parse(&uri).unwrap();
+        let endpoint = RpcEndpoint::parse(&uri).unwrap();
         let node = ("/node".to_owned(), "http://node:1/".to_owned());
         (Master::new(endpoint, uri, node.0, node.1), asked, tasks)
     }
 
-    fn accepted() -> Value {
-        Value::Array(vec![Value::Int(1), "".into(), Value::Int(0)])
+    fn accepted() -> XmlRpcValue {
+        XmlRpcValue::Array(vec![XmlRpcValue::Int(1), "".into(), XmlRpcValue::Int(0)])
     }
 
-    fn requests(master: &Master) -> Vec<Request> {
+    fn requests(master: &Master) -> Vec<MasterRequest> {
         vec![
             master.register_publisher("/a", "std_msgs/Bool"),
             master.register_publisher("/b", "std_msgs/Bool"),
@@ -467,15 +473,16 @@ mod tests {
                 0 | 1 => "/a",
                 _ => "/b",
             };
-            let pair = Value::Array(vec![topic.into(), Value::Array(vec!["/node".into()])]);
-            let published = Value::Array(vec![pair]);
-            let none = || Value::Array(Vec::new());
+            let pair =
+                XmlRpcValue::Array(vec![topic.into(), XmlRpcValue::Array(vec!["/node".into()])]);
+            let published = XmlRpcValue::Array(vec![pair]);
+            let none = || XmlRpcValue::Array(Vec::new());
             let answer = |result| {
-                let triple = Value::Array(vec![Value::Int(1), "".into(), result]);
-                Value::Array(vec![triple])
+                let triple = XmlRpcValue::Array(vec![XmlRpcValue::Int(1), "".into(), result]);
+                XmlRpcValue::Array(vec![triple])
             };
-            let state = Value::Array(vec![published, none(), none()]);
-            Ok(Value::Array(vec![answer(state), answer(none())]))
+            let state = XmlRpcValue::Array(vec![published, none(), none()]);
+            Ok(XmlRpcValue::Array(vec![answer(state), answer(none())]))
         })
         .await;
         let mut before = None;
@@ -491,14 +498,14 @@ mod tests {
     #[tokio::test]
     async fn several_calls_are_one_request_and_a_refused_one_leaves_the_others() {
         let (master, asked, _tasks) = master(|call| {
-            let Some(Value::Array(calls)) = call.params.first() else {
-                return Ok(Value::Nil);
+            let Some(XmlRpcValue::Array(calls)) = call.params.first() else {
+                return Ok(XmlRpcValue::Nil);
             };
-            let own = Value::Struct(vec![
+            let own = XmlRpcValue::Struct(vec![
                 ("methodName".to_owned(), "registerPublisher".into()),
                 (
                     "params".to_owned(),
-                    Value::Array(vec![
+                    XmlRpcValue::Array(vec![
                         "/node".into(),
                         "/b".into(),
                         "std_msgs/Bool".into(),
@@ -507,9 +514,10 @@ mod tests {
                 ),
             ]);
             assert_eq!(calls.get(1), Some(&own));
-            let refused = Value::Array(vec![Value::Int(-1), "no".into(), Value::Int(0)]);
-            let answers = [accepted(), refused].map(|answer| Value::Array(vec![answer]));
-            Ok(Value::Array(answers.to_vec()))
+            let refused =
+                XmlRpcValue::Array(vec![XmlRpcValue::Int(-1), "no".into(), XmlRpcValue::Int(0)]);
+            let answers = [accepted(), refused].map(|answer| XmlRpcValue::Array(vec![answer]));
+            Ok(XmlRpcValue::Array(answers.to_vec()))
         })
         .await;
         let results = master.call_all(requests(&master)).await.unwrap();
@@ -523,12 +531,12 @@ mod tests {
     #[tokio::test]
     async fn the_graph_is_read_with_one_request() {
         let (master, asked, _tasks) = master(|_| {
-            let list = |items: Vec<Value>| Value::Array(items);
+            let list = |items: Vec<XmlRpcValue>| XmlRpcValue::Array(items);
             let entry = list(vec!["/a".into(), list(vec!["/node".into()])]);
             let state = list(vec![list(vec![entry]), list(vec![]), list(vec![])]);
             let types = list(vec![list(vec!["/a".into(), "std_msgs/Bool".into()])]);
             let answers = [state, types]
-                .map(|result| list(vec![list(vec![Value::Int(1), "".into(), result])]));
+                .map(|result| list(vec![list(vec![XmlRpcValue::Int(1), "".into(), result])]));
             Ok(list(answers.to_vec()))
         })
         .await;
@@ -542,7 +550,7 @@ mod tests {
     async fn a_master_that_takes_no_several_calls_is_called_one_by_one_from_then_on() {
         let (master, asked, _tasks) = master(|call| {
             if call.method == "system.multicall" {
-                return Err(Fault {
+                return Err(XmlRpcFault {
                     code: 1,
                     message: "no such method".to_owned(),
                 });

@@ -4,22 +4,22 @@ use thiserror::Error;
 
 /// Resolves names as one node sees them.
 #[derive(Clone, Debug)]
-pub(crate) struct Names {
+pub(crate) struct NameResolver {
     node: String,
     namespace: String,
     remappings: Vec<(String, String)>,
 }
 
-impl Names {
+impl NameResolver {
     /// Fails if the node's own name or namespace or a remapping is not a graph name.
     pub(crate) fn new(
         name: &str,
         namespace: &str,
         remappings: &[(String, String)],
-    ) -> Result<Self, NameError> {
+    ) -> Result<Self, ResourceNameError> {
         let base = name.strip_prefix('/').unwrap_or(name);
         if base.contains('/') {
-            return Err(NameError::NodeName(name.to_owned()));
+            return Err(ResourceNameError::NodeName(name.to_owned()));
         }
         let namespace = match namespace.trim_matches('/') {
             "" => "/".to_owned(),
@@ -35,7 +35,7 @@ impl Names {
         let resolved = remappings
             .iter()
             .map(|(from, to)| Ok((names.expand(from)?, names.expand(to)?)));
-        names.remappings = resolved.collect::<Result<_, NameError>>()?;
+        names.remappings = resolved.collect::<Result<_, ResourceNameError>>()?;
         Ok(names)
     }
 
@@ -45,7 +45,7 @@ impl Names {
     }
 
     /// Returns the resolved name of a topic, with remappings applied.
-    pub(crate) fn resolve(&self, name: &str) -> Result<String, NameError> {
+    pub(crate) fn resolve(&self, name: &str) -> Result<String, ResourceNameError> {
         let name = self.expand(name)?;
         let remapped = self.remappings.iter().find(|(from, _)| *from == name);
         Ok(remapped.map_or(name, |(_, to)| to.clone()))
@@ -53,7 +53,7 @@ impl Names {
 
     /// Returns a name for the upward search of the master. The name is unchanged, except that a
     /// private or remapped name is resolved.
-    pub(crate) fn searched(&self, name: &str) -> Result<String, NameError> {
+    pub(crate) fn searched(&self, name: &str) -> Result<String, ResourceNameError> {
         let resolved = self.resolve(name)?;
         if name.starts_with(['~', '/']) || resolved != self.expand(name)? {
             Ok(resolved)
@@ -62,18 +62,18 @@ impl Names {
         }
     }
 
-    fn expand(&self, name: &str) -> Result<String, NameError> {
+    fn expand(&self, name: &str) -> Result<String, ResourceNameError> {
         check(name)?;
         canonical(&full(name, &self.node, &self.namespace))
-            .ok_or_else(|| NameError::Invalid(name.to_owned()))
+            .ok_or_else(|| ResourceNameError::Invalid(name.to_owned()))
     }
 }
 
 /// Resolves a parameter name relative to the calling node, `/` included. A master uses this
 /// function, because it knows no remappings and accepts more characters than graph names have.
-pub(crate) fn of_caller(name: &str, caller: &str) -> Result<String, NameError> {
+pub(crate) fn of_caller(name: &str, caller: &str) -> Result<String, ResourceNameError> {
     if name.is_empty() {
-        return Err(NameError::Invalid(name.to_owned()));
+        return Err(ResourceNameError::Invalid(name.to_owned()));
     }
     let namespace = caller
         .rsplit_once('/')
@@ -105,7 +105,7 @@ fn canonical(full: &str) -> Option<String> {
 /// Error for an invalid graph resource name.
 #[derive(Clone, Debug, PartialEq, Eq, Error)]
 #[non_exhaustive]
-pub enum NameError {
+pub enum ResourceNameError {
     /// Not a letter, `/` or `~` followed by letters, digits, `_` and `/`.
     #[error(
         "`{0}` is not a ROS name: use letters, digits, `_` and `/`, beginning with a letter, `/` or `~`"
@@ -125,7 +125,7 @@ fn join(namespace: &str, name: &str) -> String {
 }
 
 /// Checks that a name is a valid ROS name (`wiki.ros.org/Names`).
-pub(crate) fn check(name: &str) -> Result<(), NameError> {
+pub(crate) fn check(name: &str) -> Result<(), ResourceNameError> {
     let mut bytes = name.bytes();
     let head = bytes
         .next()
@@ -133,7 +133,7 @@ pub(crate) fn check(name: &str) -> Result<(), NameError> {
     if head && bytes.all(|b| b.is_ascii_alphanumeric() || b == b'_' || b == b'/') {
         Ok(())
     } else {
-        Err(NameError::Invalid(name.to_owned()))
+        Err(ResourceNameError::Invalid(name.to_owned()))
     }
 }
 
@@ -141,12 +141,12 @@ pub(crate) fn check(name: &str) -> Result<(), NameError> {
 mod tests {
     use super::*;
 
-    fn names(remappings: &[(&str, &str)]) -> Names {
+    fn names(remappings: &[(&str, &str)]) -> NameResolver {
         let owned: Vec<_> = remappings
             .iter()
             .map(|(a, b)| ((*a).to_owned(), (*b).to_owned()))
             .collect();
-        Names::new("cell", "line1/", &owned).unwrap()
+        NameResolver::new("cell", "line1/", &owned).unwrap()
     }
 
     #[test]
@@ -157,9 +157,12 @@ mod tests {
         assert_eq!(names.resolve("/chatter").unwrap(), "/chatter");
         assert_eq!(names.resolve("~chatter").unwrap(), "/line1/cell/chatter");
         assert_eq!(names.resolve("a//b/").unwrap(), "/line1/a/b");
-        assert_eq!(Names::new("cell", "", &[]).unwrap().node(), "/cell");
+        assert_eq!(NameResolver::new("cell", "", &[]).unwrap().node(), "/cell");
         assert_eq!(
-            Names::new("/cell", "/", &[]).unwrap().resolve("a").unwrap(),
+            NameResolver::new("/cell", "/", &[])
+                .unwrap()
+                .resolve("a")
+                .unwrap(),
             "/a"
         );
     }
@@ -197,8 +200,8 @@ mod tests {
             assert!(names.resolve(bad).is_err(), "{bad}");
         }
         assert_eq!(
-            Names::new("a/b", "", &[]).unwrap_err(),
-            NameError::NodeName("a/b".to_owned())
+            NameResolver::new("a/b", "", &[]).unwrap_err(),
+            ResourceNameError::NodeName("a/b".to_owned())
         );
     }
 }

@@ -24,18 +24,18 @@ use crate::crowd::Shares;
 use crate::events;
 use crate::inbox::Inbox;
 use crate::link::LinkContext;
-use crate::master::{Graph, Master, MasterError};
-use crate::names::{NameError, Names};
+use crate::master::{Master, MasterError, MasterGraph};
+use crate::names::{NameResolver, ResourceNameError};
 use crate::options::NodeOptions;
 use crate::outbox::{Limit, lock};
-use crate::parameters::{ParamValue, Parameters, Params};
-use crate::publisher::{Hub, Publisher, PublisherOptions, TopicType};
+use crate::parameters::{NodeParameters, ParamValue, Params};
+use crate::publisher::{PublishedTopic, Publisher, PublisherOptions, TopicType};
 use crate::service::{
-    Served, ServiceClient, ServiceClientOptions, ServiceOptions, ServiceRequest, ServiceServer,
-    ServiceType,
+    OfferedService, ServiceClient, ServiceClientOptions, ServiceOptions, ServiceRequest,
+    ServiceServer, ServiceTypeSum,
 };
-use crate::subscription::{Feed, SubscriberOptions, Subscription, Wanted};
-use crate::time::{CLOCK_MD5, CLOCK_TYPE, RosClock, RosTime};
+use crate::subscription::{RequestedType, SubscriberOptions, Subscription, TopicFeed};
+use crate::time::{CLOCK_MD5, CLOCK_TYPE, Ros1Clock, Ros1Time};
 use crate::{registrar, rpc, slave, topic_server};
 
 /// A ROS 1 node. Dropping it ends its connections; only [`Node::shutdown`] also unregisters it at
@@ -86,7 +86,7 @@ impl Node {
             master,
             links: Arc::new(context),
             params,
-            clock: RosClock::default(),
+            clock: Ros1Clock::default(),
             clock_feed: Mutex::default(),
             registry: Mutex::default(),
             changed: Notify::new(),
@@ -123,25 +123,25 @@ impl Node {
     }
 
     /// Resolves the name of a topic or service: applies the namespace, `~` and remappings.
-    pub fn resolve(&self, topic: &str) -> Result<String, NameError> {
+    pub fn resolve(&self, topic: &str) -> Result<String, ResourceNameError> {
         self.inner.names.resolve(topic)
     }
 
     /// Returns the time of [`Node::clock`] for the stamps of messages.
-    pub fn now(&self) -> RosTime {
+    pub fn now(&self) -> Ros1Time {
         self.inner.clock.now()
     }
 
     /// Returns the clock that follows `/use_sim_time` and `/clock`. Before
     /// [`MasterState::Registered`] it is the wall clock, from then on the clock that the master's
     /// parameter selects.
-    pub fn clock(&self) -> RosClock {
+    pub fn clock(&self) -> Ros1Clock {
         self.inner.clock.clone()
     }
 
     /// Returns the parameters of the node's master.
-    pub fn parameters(&self) -> Parameters {
-        Parameters::new(Arc::clone(&self.inner))
+    pub fn parameters(&self) -> NodeParameters {
+        NodeParameters::new(Arc::clone(&self.inner))
     }
 
     /// Returns the state of the connection to the master and its changes.
@@ -189,7 +189,7 @@ impl Node {
         }
         let generation = registry.next_generation();
         let draining = self.inner.draining.clone();
-        let hub = Arc::new(Hub::new(
+        let hub = Arc::new(PublishedTopic::new(
             topic.clone(),
             topic_type,
             options,
@@ -211,7 +211,7 @@ impl Node {
     pub fn subscribe<K: Clone + Send + 'static>(
         &self,
         topic: &str,
-        wanted: Wanted,
+        wanted: RequestedType,
         options: SubscriberOptions,
         key: K,
         inbox: &Inbox<K>,
@@ -222,7 +222,7 @@ impl Node {
             bytes: options.queue_bytes,
         };
         let entrance = Box::new(inbox.open(key, limit));
-        let feed = Arc::new(Feed::new(topic, wanted, entrance));
+        let feed = Arc::new(TopicFeed::new(topic, wanted, entrance));
         // A node that can still be called is open.
         let _open = self.inner.follow(&feed);
         Ok(Subscription::new(feed, Arc::clone(&self.inner)))
@@ -238,7 +238,7 @@ impl Node {
     pub fn advertise_service<H, F>(
         &self,
         service: &str,
-        service_type: ServiceType,
+        service_type: ServiceTypeSum,
         options: ServiceOptions,
         handler: H,
     ) -> Result<ServiceServer, NodeError>
@@ -257,7 +257,7 @@ impl Node {
         if registry.services.contains_key(&service) {
             return Err(NodeError::AlreadyOffered(service));
         }
-        let served = Arc::new(Served::new(
+        let served = Arc::new(OfferedService::new(
             service.clone(),
             service_type,
             options,
@@ -284,7 +284,7 @@ impl Node {
     }
 
     /// Reads the publishers, subscribers and services from the master.
-    pub async fn graph(&self) -> Result<Graph, MasterError> {
+    pub async fn graph(&self) -> Result<MasterGraph, MasterError> {
         self.inner.master.graph().await
     }
 
@@ -334,7 +334,7 @@ pub enum MasterState {
 /// State shared by the handles and tasks of the node.
 #[derive(Debug)]
 pub(crate) struct Inner {
-    names: Names,
+    names: NameResolver,
     pub(crate) uri: String,
     /// Address of the node's services, which is registered with the master.
     pub(crate) service_uri: String,
@@ -343,9 +343,9 @@ pub(crate) struct Inner {
     pub(crate) master: Master,
     links: Arc<LinkContext>,
     pub(crate) params: Params,
-    clock: RosClock,
+    clock: Ros1Clock,
     /// The subscription to `/clock` while time is simulated.
-    clock_feed: Mutex<Option<Arc<Feed>>>,
+    clock_feed: Mutex<Option<Arc<TopicFeed>>>,
     registry: Mutex<Registry>,
     /// Notifies that the registry differs from the state of the master.
     pub(crate) changed: Notify,
@@ -372,11 +372,11 @@ impl Inner {
         self.next_id.fetch_add(1, Ordering::Relaxed)
     }
 
-    pub(crate) fn publication(&self, topic: &str) -> Option<Arc<Hub>> {
+    pub(crate) fn publication(&self, topic: &str) -> Option<Arc<PublishedTopic>> {
         lock(&self.registry).publications.get(topic).cloned()
     }
 
-    pub(crate) fn publications(&self) -> Vec<Arc<Hub>> {
+    pub(crate) fn publications(&self) -> Vec<Arc<PublishedTopic>> {
         lock(&self.registry)
             .publications
             .values()
@@ -384,7 +384,7 @@ impl Inner {
             .collect()
     }
 
-    pub(crate) fn feeds(&self) -> Vec<Arc<Feed>> {
+    pub(crate) fn feeds(&self) -> Vec<Arc<TopicFeed>> {
         let registry = lock(&self.registry);
         registry
             .subscriptions
@@ -394,7 +394,7 @@ impl Inner {
     }
 
     /// Returns the full name of a parameter; `/` is the root of the tree.
-    pub(crate) fn parameter_name(&self, name: &str) -> Result<String, NameError> {
+    pub(crate) fn parameter_name(&self, name: &str) -> Result<String, ResourceNameError> {
         if name == "/" {
             Ok(name.to_owned())
         } else {
@@ -404,7 +404,7 @@ impl Inner {
 
     /// Returns the name of a parameter for the upward search of the master. A remapped name is
     /// absolute.
-    pub(crate) fn searched_name(&self, name: &str) -> Result<String, NameError> {
+    pub(crate) fn searched_name(&self, name: &str) -> Result<String, ResourceNameError> {
         self.names.searched(name)
     }
 
@@ -426,11 +426,11 @@ impl Inner {
             self.withdraw_subscription(&feed);
         }
         if simulated && let Ok(topic) = self.names.resolve("/clock") {
-            let wanted = Wanted {
+            let wanted = RequestedType {
                 type_name: Some(CLOCK_TYPE.to_owned()),
                 md5sum: Some(CLOCK_MD5.to_owned()),
             };
-            let feed = Arc::new(Feed::new(topic, wanted, Box::new(self.clock.clone())));
+            let feed = Arc::new(TopicFeed::new(topic, wanted, Box::new(self.clock.clone())));
             if self.follow(&feed) {
                 *current = Some(feed);
             }
@@ -439,7 +439,7 @@ impl Inner {
 
     /// Registers a subscription and links it to the known publishers. Returns false if the node is
     /// closed; then the feed is closed as well.
-    fn follow(&self, feed: &Arc<Feed>) -> bool {
+    fn follow(&self, feed: &Arc<TopicFeed>) -> bool {
         let mut registry = lock(&self.registry);
         if registry.closed {
             drop(registry);
@@ -463,7 +463,7 @@ impl Inner {
         true
     }
 
-    pub(crate) fn withdraw_publication(&self, hub: &Arc<Hub>) {
+    pub(crate) fn withdraw_publication(&self, hub: &Arc<PublishedTopic>) {
         let mut registry = lock(&self.registry);
         if registry
             .publications
@@ -476,15 +476,15 @@ impl Inner {
         self.changed.notify_one();
     }
 
-    pub(crate) fn service(&self, name: &str) -> Option<Arc<Served>> {
+    pub(crate) fn service(&self, name: &str) -> Option<Arc<OfferedService>> {
         lock(&self.registry).services.get(name).cloned()
     }
 
-    pub(crate) fn services(&self) -> Vec<Arc<Served>> {
+    pub(crate) fn services(&self) -> Vec<Arc<OfferedService>> {
         lock(&self.registry).services.values().cloned().collect()
     }
 
-    pub(crate) fn withdraw_service(&self, served: &Arc<Served>) {
+    pub(crate) fn withdraw_service(&self, served: &Arc<OfferedService>) {
         let mut registry = lock(&self.registry);
         let known = registry.services.get(&served.service);
         if known.is_some_and(|known| Arc::ptr_eq(known, served)) {
@@ -494,7 +494,7 @@ impl Inner {
         self.changed.notify_one();
     }
 
-    pub(crate) fn withdraw_subscription(&self, feed: &Arc<Feed>) {
+    pub(crate) fn withdraw_subscription(&self, feed: &Arc<TopicFeed>) {
         let mut registry = lock(&self.registry);
         if let Some(entry) = registry.subscriptions.get_mut(&feed.topic) {
             entry.feeds.retain(|known| !Arc::ptr_eq(known, feed));
@@ -579,7 +579,7 @@ impl Inner {
 
     /// Links a feed to publishers other than this node itself. Called with the registry locked;
     /// this lock is taken before the lock of a feed's links.
-    fn connect(&self, feed: &Arc<Feed>, publishers: &[String]) {
+    fn connect(&self, feed: &Arc<TopicFeed>, publishers: &[String]) {
         let own = self.uri.trim_end_matches('/');
         let others: Vec<String> = publishers
             .iter()
@@ -660,7 +660,7 @@ impl Inner {
 }
 
 /// Returns the initial parameters by their full names. The last value of a name is used.
-fn params(names: &Names, given: Vec<(String, ParamValue)>) -> Result<Params, NodeError> {
+fn params(names: &NameResolver, given: Vec<(String, ParamValue)>) -> Result<Params, NodeError> {
     let mut last: Vec<(String, ParamValue)> = Vec::new();
     for (name, value) in given {
         let full = names.resolve(&format!("~{name}"))?;

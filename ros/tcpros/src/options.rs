@@ -4,9 +4,9 @@ use std::net::{IpAddr, Ipv4Addr, Ipv6Addr};
 
 use thiserror::Error;
 
-use crate::names::{self, NameError, Names};
+use crate::names::{self, NameResolver, ResourceNameError};
 use crate::parameters::{self, ParamError, ParamValue};
-use crate::rpc::Endpoint;
+use crate::rpc::RpcEndpoint;
 
 /// The settings of a node before its start.
 #[derive(Clone, Debug, PartialEq)]
@@ -102,7 +102,7 @@ impl NodeOptions {
     fn assign(&mut self, from: &str, to: &str) -> Result<(), ParamError> {
         if let Some(parameter) = from.strip_prefix('_') {
             if parameter.is_empty() {
-                return Err(NameError::Invalid(from.to_owned()).into());
+                return Err(ResourceNameError::Invalid(from.to_owned()).into());
             }
             names::check(&format!("~{parameter}"))?;
             let value = parameters::argument_value(to)?;
@@ -122,12 +122,12 @@ impl NodeOptions {
         self.bind = bind_for(hostname, self.ipv6);
     }
 
-    pub(crate) fn names(&self) -> Result<Names, NameError> {
-        Names::new(&self.name, &self.namespace, &self.remappings)
+    pub(crate) fn names(&self) -> Result<NameResolver, ResourceNameError> {
+        NameResolver::new(&self.name, &self.namespace, &self.remappings)
     }
 
-    pub(crate) fn master(&self) -> Option<Endpoint> {
-        Endpoint::parse(&self.master_uri).map(|endpoint| endpoint.ipv6_first(self.ipv6))
+    pub(crate) fn master(&self) -> Option<RpcEndpoint> {
+        RpcEndpoint::parse(&self.master_uri).map(|endpoint| endpoint.ipv6_first(self.ipv6))
     }
 }
 

@@ -9,7 +9,7 @@ use tokio::sync::Notify;
 /// Messages waiting for a subscriber. When the queue is full the oldest messages are dropped. The
 /// newest message is always kept, so a message larger than the byte limit waits alone.
 #[derive(Debug)]
-pub(crate) struct Outbox {
+pub(crate) struct SubscriberQueue {
     limit: Limit,
     state: Mutex<State>,
     changed: Notify,
@@ -31,7 +31,7 @@ struct State {
     closed: bool,
 }
 
-impl Outbox {
+impl SubscriberQueue {
     pub(crate) fn new(limit: Limit) -> Self {
         Self {
             limit,
@@ -125,8 +125,8 @@ pub(crate) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 mod tests {
     use super::*;
 
-    fn outbox(messages: usize, bytes: usize) -> Outbox {
-        Outbox::new(Limit { messages, bytes })
+    fn outbox(messages: usize, bytes: usize) -> SubscriberQueue {
+        SubscriberQueue::new(Limit { messages, bytes })
     }
 
     #[tokio::test]

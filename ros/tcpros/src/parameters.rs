@@ -15,12 +15,12 @@ use thiserror::Error;
 use tokio::sync::watch;
 
 use crate::master::{Master, MasterError};
-use crate::names::NameError;
+use crate::names::ResourceNameError;
 use crate::node::Inner;
-use crate::xmlrpc::Value;
+use crate::xmlrpc::XmlRpcValue;
 
 pub(crate) use self::argument::value as argument_value;
-pub(crate) use self::follow::{Heard, Params, settle};
+pub(crate) use self::follow::{ParameterState, Params, settle};
 pub use self::value::ParamValue;
 
 /// The parameters of a node's master, with names as the node sees them: `~` and remappings apply,
@@ -30,11 +30,11 @@ pub use self::value::ParamValue;
 /// Every call is a request to the master and takes a few seconds at most; all calls fail without
 /// a master.
 #[derive(Clone)]
-pub struct Parameters {
+pub struct NodeParameters {
     node: Arc<Inner>,
 }
 
-impl Parameters {
+impl NodeParameters {
     pub(crate) const fn new(node: Arc<Inner>) -> Self {
         Self { node }
     }
@@ -130,7 +130,7 @@ impl Parameters {
     }
 }
 
-impl fmt::Debug for Parameters {
+impl fmt::Debug for NodeParameters {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let master = self.node.master.uri();
         f.debug_struct("Parameters")
@@ -143,7 +143,7 @@ impl fmt::Debug for Parameters {
 /// arrive faster than they are read are merged. Dropping it unsubscribes.
 pub struct ParamSubscription {
     name: String,
-    heard: watch::Receiver<Heard>,
+    heard: watch::Receiver<ParameterState>,
     node: Arc<Inner>,
 }
 
@@ -157,8 +157,8 @@ impl ParamSubscription {
     /// read yet.
     pub fn current(&self) -> Option<ParamValue> {
         match &*self.heard.borrow() {
-            Heard::Value(value) => value.clone(),
-            Heard::Nothing => None,
+            ParameterState::Value(value) => value.clone(),
+            ParameterState::Nothing => None,
         }
     }
 
@@ -169,7 +169,7 @@ impl ParamSubscription {
         loop {
             let changed = self.heard.changed().await;
             changed.map_err(|_| ParamError::NodeEnded)?;
-            if let Heard::Value(value) = &*self.heard.borrow_and_update() {
+            if let ParameterState::Value(value) = &*self.heard.borrow_and_update() {
                 return Ok(value.clone());
             }
         }
@@ -198,7 +198,7 @@ impl Drop for ParamSubscription {
 pub enum ParamError {
     /// The name is not a valid ROS name.
     #[error(transparent)]
-    Name(#[from] NameError),
+    Name(#[from] ResourceNameError),
     /// An integer that XML-RPC cannot represent. Nothing was sent.
     #[error(
         "{0} does not fit into the 32 bits of a ROS integer: give it as a number with a point, or in quotes as text"
@@ -232,6 +232,6 @@ async fn exists(node: &Inner, name: &str) -> Result<bool, MasterError> {
     Ok(flag != 0)
 }
 
-fn known(method: &'static str, value: Value) -> Result<ParamValue, MasterError> {
+fn known(method: &'static str, value: XmlRpcValue) -> Result<ParamValue, MasterError> {
     ParamValue::from_wire(value).ok_or(MasterError::Shape(method))
 }

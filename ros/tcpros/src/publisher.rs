@@ -10,7 +10,7 @@ use tokio::sync::watch;
 use crate::events;
 use crate::header::{ConnectionHeader, clipped};
 use crate::node::Inner;
-use crate::outbox::{Limit, Outbox, lock};
+use crate::outbox::{Limit, SubscriberQueue, lock};
 
 /// The type of a topic, as publishers and subscribers compare it.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -81,12 +81,12 @@ impl Latched {
 /// second.
 #[derive(Debug)]
 pub struct Publisher {
-    hub: Arc<Hub>,
+    hub: Arc<PublishedTopic>,
     node: Arc<Inner>,
 }
 
 impl Publisher {
-    pub(crate) const fn new(hub: Arc<Hub>, node: Arc<Inner>) -> Self {
+    pub(crate) const fn new(hub: Arc<PublishedTopic>, node: Arc<Inner>) -> Self {
         Self { hub, node }
     }
 
@@ -180,7 +180,7 @@ impl Drop for Publisher {
 
 /// A published topic, shared by the publisher and the tasks that serve its subscribers.
 #[derive(Debug)]
-pub(crate) struct Hub {
+pub(crate) struct PublishedTopic {
     pub(crate) topic: String,
     pub(crate) topic_type: TopicType,
     /// Distinguishes this registration from earlier registrations of the same topic.
@@ -221,12 +221,12 @@ pub(crate) struct Subscriber {
     joined: u64,
     /// The keys of the messages that were latched at the time of joining.
     found: Vec<u64>,
-    pub(crate) outbox: Outbox,
+    pub(crate) outbox: SubscriberQueue,
     pub(crate) bytes: AtomicU64,
     pub(crate) messages: AtomicU64,
 }
 
-impl Hub {
+impl PublishedTopic {
     pub(crate) fn new(
         topic: String,
         topic_type: TopicType,
@@ -309,7 +309,7 @@ impl Hub {
             transport,
             joined: state.count,
             found: state.latched.iter().map(|(key, _)| *key).collect(),
-            outbox: Outbox::new(limit),
+            outbox: SubscriberQueue::new(limit),
             bytes: AtomicU64::new(0),
             messages: AtomicU64::new(0),
         });
@@ -455,7 +455,7 @@ impl HubState {
 /// The membership of a subscriber in a topic, which ends on drop.
 #[derive(Debug)]
 pub(crate) struct Joined {
-    pub(crate) hub: Arc<Hub>,
+    pub(crate) hub: Arc<PublishedTopic>,
     pub(crate) subscriber: Arc<Subscriber>,
 }
 
@@ -478,11 +478,11 @@ pub const MAX_LATCHED: usize = 64;
 mod tests {
     use super::*;
 
-    fn hub(latch: bool) -> Arc<Hub> {
+    fn hub(latch: bool) -> Arc<PublishedTopic> {
         hub_of(latch, 2)
     }
 
-    fn hub_of(latch: bool, queue_messages: usize) -> Arc<Hub> {
+    fn hub_of(latch: bool, queue_messages: usize) -> Arc<PublishedTopic> {
         let topic_type = TopicType {
             name: "std_msgs/String".to_owned(),
             md5sum: "992ce8a1687cec8c8bd883ec73ca41d1".to_owned(),
@@ -493,7 +493,7 @@ mod tests {
             queue_messages,
             ..PublisherOptions::default()
         };
-        Arc::new(Hub::new(
+        Arc::new(PublishedTopic::new(
             "/chatter".to_owned(),
             topic_type,
             options,

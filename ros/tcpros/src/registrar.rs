@@ -14,10 +14,10 @@ use tokio::time::{Instant, timeout};
 
 use crate::clock;
 use crate::events;
-use crate::master::{self, Master, MasterError, Request};
+use crate::master::{self, Master, MasterError, MasterRequest};
 use crate::node::{Inner, MasterState, Registration, ResourceKind};
 use crate::parameters;
-use crate::xmlrpc::Value;
+use crate::xmlrpc::XmlRpcValue;
 
 /// Runs until the node is closed and everything is unregistered at the master.
 pub(crate) async fn run(node: Arc<Inner>) {
@@ -69,7 +69,7 @@ pub(crate) async fn run(node: Arc<Inner>) {
 struct Registrar {
     node: Arc<Inner>,
     /// The registrations sent to the master, with or without a reply.
-    told: HashMap<(String, ResourceKind), Told>,
+    told: HashMap<(String, ResourceKind), ReportedState>,
     pid: Option<i32>,
     /// `None` before the first attempt.
     found: Option<bool>,
@@ -83,7 +83,7 @@ struct Registrar {
 }
 
 #[derive(Clone, Copy)]
-struct Told {
+struct ReportedState {
     generation: u64,
     confirmed: bool,
 }
@@ -284,7 +284,7 @@ impl Registrar {
             if current.is_some_and(|told| told.confirmed) {
                 continue;
             }
-            let told = Told {
+            let told = ReportedState {
                 generation: registration.generation,
                 confirmed: false,
             };
@@ -363,7 +363,7 @@ fn batches(jobs: Vec<Job>) -> Vec<Vec<Job>> {
 async fn perform(node: Arc<Inner>, jobs: Vec<Job>) -> Result<Vec<Outcome>, MasterError> {
     // Lists of publishers that arrive before the reply of the master are newer than the reply.
     let seen: Vec<u64> = jobs.iter().map(|job| job.updates(&node)).collect();
-    let requests: Vec<Request> = jobs.iter().flat_map(|job| job.requests(&node)).collect();
+    let requests: Vec<MasterRequest> = jobs.iter().flat_map(|job| job.requests(&node)).collect();
     let mut results = Vec::with_capacity(requests.len());
     if jobs.iter().any(Job::replaces) {
         for request in requests {
@@ -399,7 +399,7 @@ async fn perform(node: Arc<Inner>, jobs: Vec<Job>) -> Result<Vec<Outcome>, Maste
 fn registered(
     node: &Inner,
     registration: &Registration,
-    result: &Value,
+    result: &XmlRpcValue,
     seen: u64,
 ) -> Result<(), MasterError> {
     if registration.kind == ResourceKind::Subscribed {
@@ -411,7 +411,7 @@ fn registered(
 
 impl Job {
     /// Returns the calls to the master, in order.
-    fn requests(&self, node: &Inner) -> Vec<Request> {
+    fn requests(&self, node: &Inner) -> Vec<MasterRequest> {
         let master = &node.master;
         match self {
             Self::Register {
@@ -460,7 +460,7 @@ impl Job {
     }
 }
 
-fn unregister(node: &Inner, name: &str, kind: ResourceKind) -> Request {
+fn unregister(node: &Inner, name: &str, kind: ResourceKind) -> MasterRequest {
     match kind {
         ResourceKind::Published => node.master.unregister_publisher(name),
         ResourceKind::Subscribed => node.master.unregister_subscriber(name),

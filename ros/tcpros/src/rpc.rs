@@ -16,20 +16,22 @@ use tokio::net::{TcpListener, TcpStream};
 use tokio::task::JoinSet;
 use tokio::time::timeout;
 
-use crate::crowd::{Admission, Crowd, Places};
+use crate::crowd::{ConnectionAdmission, ConnectionLimits, Crowd};
 use crate::events;
-use crate::xmlrpc::{Call, Fault, Response, Value, XmlError, encode_response, parse_response};
+use crate::xmlrpc::{
+    MethodCall, MethodResponse, XmlError, XmlRpcFault, XmlRpcValue, encode_response, parse_response,
+};
 
 /// Address of an XML-RPC server.
 #[derive(Clone, Debug, PartialEq, Eq, Hash)]
-pub(crate) struct Endpoint {
+pub(crate) struct RpcEndpoint {
     host: String,
     port: u16,
     path: String,
     ipv6_first: bool,
 }
 
-impl Endpoint {
+impl RpcEndpoint {
     /// Parses `http://host:port[/path]`.
     pub(crate) fn parse(uri: &str) -> Option<Self> {
         let (host, port, path) = parts(uri, "http://")?;
@@ -79,22 +81,22 @@ pub(crate) fn parts<'a>(uri: &'a str, scheme: &str) -> Option<(&'a str, u16, &'a
 
 /// Calls a method and waits for its result at most `limit`.
 pub(crate) async fn call(
-    endpoint: &Endpoint,
+    endpoint: &RpcEndpoint,
     method: &str,
-    params: Vec<Value>,
+    params: Vec<XmlRpcValue>,
     limit: Duration,
-) -> Result<Value, RpcError> {
+) -> Result<XmlRpcValue, RpcError> {
     read(&fetch(endpoint, method, params, limit).await?)
 }
 
 /// Calls a method as [`call`] does, and returns the document of its result for [`read`].
 pub(crate) async fn fetch(
-    endpoint: &Endpoint,
+    endpoint: &RpcEndpoint,
     method: &str,
-    params: Vec<Value>,
+    params: Vec<XmlRpcValue>,
     limit: Duration,
 ) -> Result<Bytes, RpcError> {
-    let body = Call {
+    let body = MethodCall {
         method: method.to_owned(),
         params,
     }
@@ -106,11 +108,11 @@ pub(crate) async fn fetch(
 }
 
 /// Reads the result of a call.
-pub(crate) fn read(document: &[u8]) -> Result<Value, RpcError> {
+pub(crate) fn read(document: &[u8]) -> Result<XmlRpcValue, RpcError> {
     Ok(parse_response(document)??)
 }
 
-async fn exchange(endpoint: &Endpoint, body: String) -> Result<Bytes, RpcError> {
+async fn exchange(endpoint: &RpcEndpoint, body: String) -> Result<Bytes, RpcError> {
     let stream = connect(&endpoint.host, endpoint.port, endpoint.ipv6_first)
         .await
         .map_err(RpcError::Connect)?;
@@ -164,9 +166,9 @@ pub(crate) async fn connect(host: &str, port: u16, ipv6_first: bool) -> std::io:
 ///
 /// A call takes milliseconds, so a new connection is always admitted. Beyond the limit the oldest
 /// connection is closed; its caller makes a new connection for its next call.
-pub(crate) async fn serve<H>(listener: TcpListener, places: Places, handler: H)
+pub(crate) async fn serve<H>(listener: TcpListener, places: ConnectionLimits, handler: H)
 where
-    H: Fn(Call) -> Response + Send + Sync + 'static,
+    H: Fn(MethodCall) -> MethodResponse + Send + Sync + 'static,
 {
     let handler = Arc::new(handler);
     let mut crowd = Crowd::new(places);
@@ -190,16 +192,16 @@ where
             connections.spawn(answer_connection(stream, handler))
         });
         match admission {
-            Admission::Free => {}
-            Admission::InPlaceOf(address) => refusals.gave_way(address),
-            Admission::Full(limit) => refusals.too_many(limit),
+            ConnectionAdmission::Free => {}
+            ConnectionAdmission::InPlaceOf(address) => refusals.gave_way(address),
+            ConnectionAdmission::Full(limit) => refusals.too_many(limit),
         }
     }
 }
 
 async fn answer_connection<H>(stream: TcpStream, handler: Arc<H>)
 where
-    H: Fn(Call) -> Response + Send + Sync + 'static,
+    H: Fn(MethodCall) -> MethodResponse + Send + Sync + 'static,
 {
     if let Err(error) = stream.set_nodelay(true) {
         tracing::debug!(%error, "an XML-RPC client disconnected at once");
@@ -223,7 +225,7 @@ async fn answer<H>(
     handler: Arc<H>,
 ) -> Result<hyper::Response<Full<Bytes>>, std::convert::Infallible>
 where
-    H: Fn(Call) -> Response + Send + Sync + 'static,
+    H: Fn(MethodCall) -> MethodResponse + Send + Sync + 'static,
 {
     if request.method() != Method::POST {
         return Ok(plain(StatusCode::METHOD_NOT_ALLOWED));
@@ -240,9 +242,9 @@ where
         Ok(Err(_)) => return Ok(plain(StatusCode::BAD_REQUEST)),
         Err(_) => return Ok(plain(StatusCode::REQUEST_TIMEOUT)),
     };
-    let response = match Call::parse(&document) {
+    let response = match MethodCall::parse(&document) {
         Ok(call) => handler(call),
-        Err(error) => Err(Fault {
+        Err(error) => Err(XmlRpcFault {
             code: -1,
             message: format!("malformed call: {error}"),
         }),
@@ -287,7 +289,7 @@ pub enum RpcError {
     Xml(#[from] XmlError),
     /// The method failed at the peer.
     #[error(transparent)]
-    Fault(#[from] Fault),
+    Fault(#[from] XmlRpcFault),
 }
 
 const XML: &str = "text/xml";
@@ -306,18 +308,18 @@ mod tests {
         let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
         let port = listener.local_addr().unwrap().port();
         let mut tasks = JoinSet::new();
-        let places = Places {
+        let places = ConnectionLimits {
             total: 4,
             per_address: 2,
         };
         tasks.spawn(serve(listener, places, |call| {
-            Ok(Value::Array(call.params))
+            Ok(XmlRpcValue::Array(call.params))
         }));
         (port, tasks)
     }
 
-    fn endpoint(port: u16) -> Endpoint {
-        Endpoint::parse(&format!("http://127.0.0.1:{port}/")).unwrap()
+    fn endpoint(port: u16) -> RpcEndpoint {
+        RpcEndpoint::parse(&format!("http://127.0.0.1:{port}/")).unwrap()
     }
 
     async fn raw(port: u16, request: &str) -> String {
@@ -334,12 +336,12 @@ mod tests {
 
     #[test]
     fn an_endpoint_is_host_and_port() {
-        let parsed = Endpoint::parse("http://robot.local:4711/RPC2").unwrap();
+        let parsed = RpcEndpoint::parse("http://robot.local:4711/RPC2").unwrap();
         assert_eq!(
             (parsed.host.as_str(), parsed.port, parsed.path.as_str()),
             ("robot.local", 4711, "/RPC2")
         );
-        assert_eq!(Endpoint::parse("http://[::1]:1").unwrap().host, "::1");
+        assert_eq!(RpcEndpoint::parse("http://[::1]:1").unwrap().host, "::1");
         for bad in [
             "robot:1",
             "http://robot",
@@ -348,24 +350,24 @@ mod tests {
             "http://a:70000",
             "http://a b:1",
         ] {
-            assert_eq!(Endpoint::parse(bad), None, "{bad}");
+            assert_eq!(RpcEndpoint::parse(bad), None, "{bad}");
         }
     }
 
     #[tokio::test]
     async fn a_call_comes_back() {
         let (port, _tasks) = echo_server().await;
-        let params = vec![Value::Int(1), "<&>".into()];
+        let params = vec![XmlRpcValue::Int(1), "<&>".into()];
         let result = call(&endpoint(port), "echo", params.clone(), READ_LIMIT)
             .await
             .unwrap();
-        assert_eq!(result, Value::Array(params));
+        assert_eq!(result, XmlRpcValue::Array(params));
     }
 
     #[tokio::test]
     async fn a_caller_of_http_1_0_is_answered_and_the_connection_closed() {
         let (port, _tasks) = echo_server().await;
-        let body = Call {
+        let body = MethodCall {
             method: "m".to_owned(),
             params: vec![],
         }
@@ -428,8 +430,11 @@ mod tests {
             silent.push(stream);
         }
         let limit = Duration::from_secs(2);
-        let result = call(&endpoint(port), "echo", vec![Value::Int(1)], limit).await;
-        assert_eq!(result.unwrap(), Value::Array(vec![Value::Int(1)]));
+        let result = call(&endpoint(port), "echo", vec![XmlRpcValue::Int(1)], limit).await;
+        assert_eq!(
+            result.unwrap(),
+            XmlRpcValue::Array(vec![XmlRpcValue::Int(1)])
+        );
     }
 
     #[tokio::test]

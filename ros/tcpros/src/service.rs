@@ -8,12 +8,12 @@ mod client;
 mod server;
 
 pub use self::client::{CallPhase, ServiceClient, ServiceClientOptions, ServiceError};
-pub(crate) use self::server::{Admitted, ClientFault, Served, nonexistent};
+pub(crate) use self::server::{ClientFault, ClientHandshake, OfferedService, nonexistent};
 pub use self::server::{ServiceOptions, ServiceRequest, ServiceServer};
 
 /// The type of a service, as its clients compare it and `rosservice` shows it.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct ServiceType {
+pub struct ServiceTypeSum {
     /// Name, such as `std_srvs/SetBool`.
     pub name: String,
     /// Checksum of the definition, request and response together, 32 hexadecimal digits.

@@ -9,10 +9,10 @@ use crate::header::clipped;
 use crate::master::strings;
 use crate::node::Inner;
 use crate::outbox::lock;
-use crate::xmlrpc::{Call, Fault, Response, Value};
+use crate::xmlrpc::{MethodCall, MethodResponse, XmlRpcFault, XmlRpcValue};
 
 /// Answers a call.
-pub(crate) fn answer(node: &Inner, call: Call) -> Response {
+pub(crate) fn answer(node: &Inner, call: MethodCall) -> MethodResponse {
     let params = call.params.as_slice();
     match call.method.as_str() {
         "getPid" => Ok(done(i32::try_from(std::process::id()).unwrap_or(0))),
@@ -25,15 +25,15 @@ pub(crate) fn answer(node: &Inner, call: Call) -> Response {
         "requestTopic" => Ok(request_topic(node, params)),
         "paramUpdate" => Ok(param_update(node, params)),
         "shutdown" => Ok(shutdown(node, params)),
-        other => Err(Fault {
+        other => Err(XmlRpcFault {
             code: -1,
             message: format!("no such method: {other}"),
         }),
     }
 }
 
-fn publisher_update(node: &Inner, params: &[Value]) -> Value {
-    let [_, Value::String(topic), publishers] = params else {
+fn publisher_update(node: &Inner, params: &[XmlRpcValue]) -> XmlRpcValue {
+    let [_, XmlRpcValue::String(topic), publishers] = params else {
         return refused("publisherUpdate takes (caller_id, topic, publishers)");
     };
     let Some(publishers) = strings(publishers) else {
@@ -43,8 +43,8 @@ fn publisher_update(node: &Inner, params: &[Value]) -> Value {
     done(0)
 }
 
-fn param_update(node: &Inner, params: &[Value]) -> Value {
-    let [_, Value::String(key), _] = params else {
+fn param_update(node: &Inner, params: &[XmlRpcValue]) -> XmlRpcValue {
+    let [_, XmlRpcValue::String(key), _] = params else {
         return refused("paramUpdate takes (caller_id, key, value)");
     };
     // The key of a namespace ends in a slash, and the key of the root is only a slash.
@@ -53,18 +53,23 @@ fn param_update(node: &Inner, params: &[Value]) -> Value {
     done(0)
 }
 
-fn request_topic(node: &Inner, params: &[Value]) -> Value {
-    let [caller, Value::String(topic), Value::Array(protocols)] = params else {
+fn request_topic(node: &Inner, params: &[XmlRpcValue]) -> XmlRpcValue {
+    let [
+        caller,
+        XmlRpcValue::String(topic),
+        XmlRpcValue::Array(protocols),
+    ] = params
+    else {
         return refused("requestTopic takes (caller_id, topic, protocols)");
     };
     let Some(hub) = node.publication(topic) else {
         return triple(-1, &format!("not a publisher of [{topic}]"), Vec::new());
     };
-    let tcpros = |protocol: &Value| {
+    let tcpros = |protocol: &XmlRpcValue| {
         protocol
             .as_array()
-            .and_then(<[Value]>::first)
-            .and_then(Value::as_str)
+            .and_then(<[XmlRpcValue]>::first)
+            .and_then(XmlRpcValue::as_str)
             == Some("TCPROS")
     };
     if !protocols.iter().any(tcpros) {
@@ -76,8 +81,8 @@ fn request_topic(node: &Inner, params: &[Value]) -> Value {
     triple(1, &format!("ready on {}:{port}", node.hostname), chosen)
 }
 
-fn shutdown(node: &Inner, params: &[Value]) -> Value {
-    let reason = clipped(params.get(1).and_then(Value::as_str).unwrap_or(""));
+fn shutdown(node: &Inner, params: &[XmlRpcValue]) -> XmlRpcValue {
+    let reason = clipped(params.get(1).and_then(XmlRpcValue::as_str).unwrap_or(""));
     if reason.contains(NAME_TAKEN) {
         node.name_is_contested();
     } else {
@@ -87,26 +92,26 @@ fn shutdown(node: &Inner, params: &[Value]) -> Value {
     done(0)
 }
 
-fn publications(node: &Inner) -> Value {
-    let pair = |hub: &std::sync::Arc<crate::publisher::Hub>| {
-        Value::Array(vec![
+fn publications(node: &Inner) -> XmlRpcValue {
+    let pair = |hub: &std::sync::Arc<crate::publisher::PublishedTopic>| {
+        XmlRpcValue::Array(vec![
             hub.topic.as_str().into(),
             hub.topic_type.name.as_str().into(),
         ])
     };
-    Value::Array(node.publications().iter().map(pair).collect())
+    XmlRpcValue::Array(node.publications().iter().map(pair).collect())
 }
 
-fn subscriptions(node: &Inner) -> Value {
-    let pair = |feed: &std::sync::Arc<crate::subscription::Feed>| {
+fn subscriptions(node: &Inner) -> XmlRpcValue {
+    let pair = |feed: &std::sync::Arc<crate::subscription::TopicFeed>| {
         let wanted = feed.wanted.type_name.as_deref().unwrap_or("*");
-        Value::Array(vec![feed.topic.as_str().into(), wanted.into()])
+        XmlRpcValue::Array(vec![feed.topic.as_str().into(), wanted.into()])
     };
-    Value::Array(node.feeds().iter().map(pair).collect())
+    XmlRpcValue::Array(node.feeds().iter().map(pair).collect())
 }
 
 /// Returns `[publishStats, subscribeStats, serviceStats]`.
-fn bus_stats(node: &Inner) -> Value {
+fn bus_stats(node: &Inner) -> XmlRpcValue {
     let mut published = Vec::new();
     for hub in node.publications() {
         let (mut total, mut connections) = (0u64, Vec::new());
@@ -114,27 +119,28 @@ fn bus_stats(node: &Inner) -> Value {
             let bytes = subscriber.bytes.load(Ordering::Relaxed);
             let messages = subscriber.messages.load(Ordering::Relaxed);
             total = total.saturating_add(bytes);
-            connections.push(Value::Array(vec![
+            connections.push(XmlRpcValue::Array(vec![
                 subscriber.id.into(),
                 count(bytes),
                 count(messages),
-                Value::Bool(true),
+                XmlRpcValue::Bool(true),
             ]));
         }
         published.push(vec![hub.topic.as_str().into(), count(total), connections.into()].into());
     }
     let mut subscribed = Vec::new();
     for feed in node.feeds() {
-        let connection = |(_, link): (String, std::sync::Arc<crate::subscription::LinkState>)| {
+        let connection = |(_, link): (String, std::sync::Arc<crate::subscription::TopicLink>)| {
             let bytes = count(link.bytes.load(Ordering::Relaxed));
-            Value::Array(vec![
+            XmlRpcValue::Array(vec![
                 link.id.into(),
                 bytes,
                 count(feed.dropped()),
-                Value::Bool(true),
+                XmlRpcValue::Bool(true),
             ])
         };
-        let connections: Vec<Value> = feed.connections().into_iter().map(connection).collect();
+        let connections: Vec<XmlRpcValue> =
+            feed.connections().into_iter().map(connection).collect();
         subscribed.push(vec![feed.topic.as_str().into(), connections.into()].into());
     }
     // Requests, bytes received and bytes sent over all services: the slave API has no finer
@@ -147,62 +153,62 @@ fn bus_stats(node: &Inner) -> Value {
         sent = sent.saturating_add(counters.sent.load(Ordering::Relaxed));
     }
     let services = vec![count(calls), count(received), count(sent)];
-    Value::Array(vec![
-        Value::Array(published),
-        Value::Array(subscribed),
-        Value::Array(services),
+    XmlRpcValue::Array(vec![
+        XmlRpcValue::Array(published),
+        XmlRpcValue::Array(subscribed),
+        XmlRpcValue::Array(services),
     ])
 }
 
 /// Returns `[connectionId, destinationId, direction, transport, topic, connected, connectionInfo]`
 /// per connection. The destination is the name of a subscriber or the URI of a publisher, as in
 /// rospy and roscpp.
-fn bus_info(node: &Inner) -> Value {
+fn bus_info(node: &Inner) -> XmlRpcValue {
     let mut entries = Vec::new();
     for hub in node.publications() {
         for subscriber in hub.connected() {
-            entries.push(Value::Array(vec![
+            entries.push(XmlRpcValue::Array(vec![
                 subscriber.id.into(),
                 subscriber.caller_id.as_str().into(),
                 "o".into(),
                 "TCPROS".into(),
                 hub.topic.as_str().into(),
-                Value::Bool(true),
+                XmlRpcValue::Bool(true),
                 subscriber.transport.as_str().into(),
             ]));
         }
     }
     for feed in node.feeds() {
         for (uri, link) in feed.connections() {
-            entries.push(Value::Array(vec![
+            entries.push(XmlRpcValue::Array(vec![
                 link.id.into(),
                 uri.into(),
                 "i".into(),
                 "TCPROS".into(),
                 feed.topic.as_str().into(),
-                Value::Bool(true),
+                XmlRpcValue::Bool(true),
                 lock(&link.transport).as_str().into(),
             ]));
         }
     }
-    Value::Array(entries)
+    XmlRpcValue::Array(entries)
 }
 
 /// Returns a count as an XML-RPC integer of 32 bits; larger counts are limited.
-fn count(number: u64) -> Value {
-    Value::Int(i32::try_from(number).unwrap_or(i32::MAX))
+fn count(number: u64) -> XmlRpcValue {
+    XmlRpcValue::Int(i32::try_from(number).unwrap_or(i32::MAX))
 }
 
-fn done(result: impl Into<Value>) -> Value {
+fn done(result: impl Into<XmlRpcValue>) -> XmlRpcValue {
     triple(1, "", result)
 }
 
-fn refused(message: &str) -> Value {
+fn refused(message: &str) -> XmlRpcValue {
     triple(-1, message, 0)
 }
 
-fn triple(code: i32, message: &str, result: impl Into<Value>) -> Value {
-    Value::Array(vec![code.into(), message.into(), result.into()])
+fn triple(code: i32, message: &str, result: impl Into<XmlRpcValue>) -> XmlRpcValue {
+    XmlRpcValue::Array(vec![code.into(), message.into(), result.into()])
 }
 
 /// Text with which the master displaces the previous owner of a name

@@ -12,14 +12,14 @@ use tokio::task::AbortHandle;
 
 use crate::clock;
 use crate::events;
-use crate::inbox::{Deliver, Message, Peer};
+use crate::inbox::{ConnectionPeer, Deliver, InboxMessage};
 use crate::link::{self, LinkContext};
 use crate::node::Inner;
 use crate::outbox::lock;
 
 /// The type that a subscriber requests from publishers. `None` accepts any type.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub struct Wanted {
+pub struct RequestedType {
     /// Name, such as `std_msgs/String`.
     pub type_name: Option<String>,
     /// Checksum of the definition.
@@ -49,12 +49,12 @@ impl Default for SubscriberOptions {
 /// Receives a topic into an inbox. Dropping it unsubscribes and discards the queued messages.
 #[derive(Debug)]
 pub struct Subscription {
-    feed: Arc<Feed>,
+    feed: Arc<TopicFeed>,
     node: Arc<Inner>,
 }
 
 impl Subscription {
-    pub(crate) const fn new(feed: Arc<Feed>, node: Arc<Inner>) -> Self {
+    pub(crate) const fn new(feed: Arc<TopicFeed>, node: Arc<Inner>) -> Self {
         Self { feed, node }
     }
 
@@ -88,9 +88,9 @@ impl Drop for Subscription {
 }
 
 /// A subscribed topic, shared by the subscription and its links.
-pub(crate) struct Feed {
+pub(crate) struct TopicFeed {
     pub(crate) topic: String,
-    pub(crate) wanted: Wanted,
+    pub(crate) wanted: RequestedType,
     pub(crate) refused_frames: AtomicU64,
     entrance: Box<dyn Deliver>,
     links: Mutex<Links>,
@@ -111,13 +111,13 @@ struct Link {
     /// while it is connected. After a restart the master does not know the nodes that never
     /// register again, although they continue to publish.
     named: bool,
-    state: Arc<LinkState>,
+    state: Arc<TopicLink>,
     task: AbortHandle,
 }
 
 /// State and counters of a link.
 #[derive(Debug)]
-pub(crate) struct LinkState {
+pub(crate) struct TopicLink {
     pub(crate) id: i32,
     pub(crate) bytes: AtomicU64,
     pub(crate) messages: AtomicU64,
@@ -128,7 +128,7 @@ pub(crate) struct LinkState {
     pub(crate) named_again: Notify,
 }
 
-impl LinkState {
+impl TopicLink {
     fn new(id: i32) -> Self {
         Self {
             id,
@@ -141,8 +141,8 @@ impl LinkState {
     }
 }
 
-impl Feed {
-    pub(crate) fn new(topic: String, wanted: Wanted, entrance: Box<dyn Deliver>) -> Self {
+impl TopicFeed {
+    pub(crate) fn new(topic: String, wanted: RequestedType, entrance: Box<dyn Deliver>) -> Self {
         Self {
             topic,
             wanted,
@@ -190,7 +190,7 @@ impl Feed {
                 left_out = true;
                 continue;
             }
-            let state = Arc::new(LinkState::new(next_id()));
+            let state = Arc::new(TopicLink::new(next_id()));
             let task = tokio::spawn(link::run(
                 Arc::clone(self),
                 Arc::clone(context),
@@ -212,7 +212,7 @@ impl Feed {
 
     /// Returns whether a link that has lost its connection should reconnect. A link that is not
     /// wanted is removed.
-    pub(crate) fn still_wanted(&self, uri: &str, state: &Arc<LinkState>) -> bool {
+    pub(crate) fn still_wanted(&self, uri: &str, state: &Arc<TopicLink>) -> bool {
         let mut links = lock(&self.links);
         // A later link to the same publisher is not affected by this call.
         let own = links
@@ -229,18 +229,22 @@ impl Feed {
     }
 
     /// Counts and reports a connection until the guard is dropped.
-    pub(crate) fn connected<'a>(&'a self, peer: Arc<Peer>, state: &'a LinkState) -> Connected<'a> {
+    pub(crate) fn connected<'a>(
+        &'a self,
+        peer: Arc<ConnectionPeer>,
+        state: &'a TopicLink,
+    ) -> PublisherConnection<'a> {
         state.connected.store(true, Ordering::Release);
         let publishers = self.publishers.fetch_add(1, Ordering::AcqRel) + 1;
         self.entrance.peer(true, publishers, Arc::clone(&peer));
-        Connected {
+        PublisherConnection {
             feed: self,
             peer,
             state,
         }
     }
 
-    pub(crate) fn deliver(&self, message: Message) {
+    pub(crate) fn deliver(&self, message: InboxMessage) {
         let dropped = self.entrance.message(message);
         if dropped > 0 {
             self.dropped.fetch_add(dropped, Ordering::Relaxed);
@@ -263,7 +267,7 @@ impl Feed {
     }
 
     /// Returns the connected links with the URIs of their publishers.
-    pub(crate) fn connections(&self) -> Vec<(String, Arc<LinkState>)> {
+    pub(crate) fn connections(&self) -> Vec<(String, Arc<TopicLink>)> {
         let links = lock(&self.links);
         let connected = links
             .by_uri
@@ -275,7 +279,7 @@ impl Feed {
     }
 }
 
-impl fmt::Debug for Feed {
+impl fmt::Debug for TopicFeed {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.debug_struct("Feed")
             .field("topic", &self.topic)
@@ -285,13 +289,13 @@ impl fmt::Debug for Feed {
 }
 
 /// A connection to a publisher.
-pub(crate) struct Connected<'a> {
-    feed: &'a Feed,
-    peer: Arc<Peer>,
-    state: &'a LinkState,
+pub(crate) struct PublisherConnection<'a> {
+    feed: &'a TopicFeed,
+    peer: Arc<ConnectionPeer>,
+    state: &'a TopicLink,
 }
 
-impl Drop for Connected<'_> {
+impl Drop for PublisherConnection<'_> {
     fn drop(&mut self) {
         self.state.connected.store(false, Ordering::Release);
         let publishers = self.feed.publishers.fetch_sub(1, Ordering::AcqRel) - 1;

@@ -5,19 +5,19 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use crate::clock;
-use crate::inbox::{Deliver, Message, Peer};
+use crate::inbox::{ConnectionPeer, Deliver, InboxMessage};
 
 /// A point in time, as the `time` of a message: since the Unix epoch, or since the start of a
 /// simulation.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
-pub struct RosTime {
+pub struct Ros1Time {
     /// Whole seconds.
     pub secs: u32,
     /// The rest in nanoseconds, below 1 000 000 000.
     pub nsecs: u32,
 }
 
-impl RosTime {
+impl Ros1Time {
     /// Converts a wall clock time. A time outside the 136 years of ROS time becomes the nearer
     /// limit.
     pub fn from_system(time: SystemTime) -> Self {
@@ -42,7 +42,7 @@ impl RosTime {
 /// its publisher, so time limits, the supervision of the master and reconnecting never use it. A
 /// `/clock` that this very node publishes is not received, as no node receives its own messages.
 #[derive(Clone, Debug, Default)]
-pub struct RosClock {
+pub struct Ros1Clock {
     simulation: Arc<Simulation>,
 }
 
@@ -54,15 +54,15 @@ struct Simulation {
     malformed: AtomicU64,
 }
 
-impl RosClock {
+impl Ros1Clock {
     /// Returns the current time. Simulated time is the last received time, and zero before the
     /// first.
-    pub fn now(&self) -> RosTime {
+    pub fn now(&self) -> Ros1Time {
         if !self.is_simulated() {
-            return RosTime::from_system(clock::utc());
+            return Ros1Time::from_system(clock::utc());
         }
         let [a, b, c, d, e, f, g, h] = self.simulation.time.load(Ordering::Acquire).to_be_bytes();
-        RosTime {
+        Ros1Time {
             secs: u32::from_be_bytes([a, b, c, d]),
             nsecs: u32::from_be_bytes([e, f, g, h]),
         }
@@ -106,13 +106,13 @@ impl RosClock {
 
 /// The messages of `/clock` are passed directly to the clock: nothing is queued, and only the
 /// newest message matters.
-impl Deliver for RosClock {
-    fn message(&self, message: Message) -> u64 {
+impl Deliver for Ros1Clock {
+    fn message(&self, message: InboxMessage) -> u64 {
         self.set(&message.bytes);
         0
     }
 
-    fn peer(&self, _connected: bool, _publishers: usize, _peer: Arc<Peer>) {}
+    fn peer(&self, _connected: bool, _publishers: usize, _peer: Arc<ConnectionPeer>) {}
 
     fn close(&self) {}
 }
@@ -127,13 +127,13 @@ mod tests {
 
     #[test]
     fn a_simulated_clock_begins_at_zero_and_goes_where_it_is_told() {
-        let clock = RosClock::default();
+        let clock = Ros1Clock::default();
         assert!(clock.now().secs > 1_700_000_000);
         assert!(clock.simulate(true) && !clock.simulate(true));
-        assert_eq!(clock.now(), RosTime::default());
+        assert_eq!(clock.now(), Ros1Time::default());
         for (secs, nsecs) in [(7_u32, 999_999_999_u32), (3, 0)] {
             clock.set(&[secs.to_le_bytes(), nsecs.to_le_bytes()].concat());
-            assert_eq!(clock.now(), RosTime { secs, nsecs });
+            assert_eq!(clock.now(), Ros1Time { secs, nsecs });
         }
         assert!(clock.simulate(false));
         assert!(clock.now().secs > 1_700_000_000);
@@ -141,21 +141,21 @@ mod tests {
 
     #[test]
     fn a_clock_message_that_says_no_time_is_counted_and_not_taken() {
-        let clock = RosClock::default();
+        let clock = Ros1Clock::default();
         assert!(clock.simulate(true));
         clock.set(&[1, 0, 0, 0, 0, 0, 0]);
         clock.set(&[[1, 0, 0, 0], 1_000_000_000_u32.to_le_bytes()].concat());
-        assert_eq!((clock.now(), clock.malformed()), (RosTime::default(), 2));
+        assert_eq!((clock.now(), clock.malformed()), (Ros1Time::default(), 2));
     }
 
     #[test]
     fn the_wall_clock_reads_as_seconds_and_nanoseconds() {
         let at = UNIX_EPOCH + Duration::new(1_700_000_000, 5);
-        let read = RosTime::from_system(at);
+        let read = Ros1Time::from_system(at);
         assert_eq!((read.secs, read.nsecs), (1_700_000_000, 5));
         assert_eq!(
-            RosTime::from_system(UNIX_EPOCH - Duration::from_secs(1)),
-            RosTime::default()
+            Ros1Time::from_system(UNIX_EPOCH - Duration::from_secs(1)),
+            Ros1Time::default()
         );
     }
 }

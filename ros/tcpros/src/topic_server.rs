@@ -18,7 +18,7 @@ use tokio::net::{TcpListener, TcpStream};
 use tokio::task::JoinSet;
 use tokio::time::{sleep, timeout};
 
-use crate::crowd::{Admission, Crowd, Places, Settled};
+use crate::crowd::{ConnectionAdmission, ConnectionLimits, Crowd, Settled};
 use crate::events::{self, Refusals};
 use crate::header::{ConnectionHeader, HeaderError, clipped};
 use crate::link::{prepare, transport_info};
@@ -28,7 +28,7 @@ use crate::service::{self, ClientFault};
 
 /// Serves the subscribers and clients of a node until it is dropped. Beyond the limit, connections
 /// without a completed handshake are closed first; otherwise the new connection is refused.
-pub(crate) async fn serve(listener: TcpListener, places: Places, node: Arc<Inner>) {
+pub(crate) async fn serve(listener: TcpListener, places: ConnectionLimits, node: Arc<Inner>) {
     let mut crowd = Crowd::new(places);
     let mut connections: JoinSet<Result<(), (SocketAddr, Refused)>> = JoinSet::new();
     let mut refusals = Refusals::new("TCPROS");
@@ -57,9 +57,9 @@ pub(crate) async fn serve(listener: TcpListener, places: Places, node: Arc<Inner
             })
         });
         match admission {
-            Admission::Free => {}
-            Admission::InPlaceOf(address) => refusals.gave_way(address),
-            Admission::Full(limit) => refusals.too_many(limit),
+            ConnectionAdmission::Free => {}
+            ConnectionAdmission::InPlaceOf(address) => refusals.gave_way(address),
+            ConnectionAdmission::Full(limit) => refusals.too_many(limit),
         }
     }
 }
@@ -72,10 +72,10 @@ async fn serve_one(mut stream: TcpStream, node: &Inner, settled: &Settled) -> Re
     settled.settle();
     let joined = match admitted {
         Admitted::Subscriber(joined) => joined,
-        Admitted::Service(service::Admitted::Client(session)) => {
+        Admitted::Service(service::ClientHandshake::Client(session)) => {
             return Ok(session.serve(&mut stream).await?);
         }
-        Admitted::Service(service::Admitted::Probe) => return Ok(()),
+        Admitted::Service(service::ClientHandshake::Probe) => return Ok(()),
     };
     let subscriber = &joined.subscriber;
     let ended = write_messages(&mut stream, subscriber).await;
@@ -87,7 +87,7 @@ async fn serve_one(mut stream: TcpStream, node: &Inner, settled: &Settled) -> Re
 /// Role of an admitted peer.
 enum Admitted {
     Subscriber(Joined),
-    Service(service::Admitted),
+    Service(service::ClientHandshake),
 }
 
 async fn shake_hands(stream: &mut TcpStream, node: &Inner) -> Result<Admitted, Refused> {
@@ -140,7 +140,7 @@ fn admit(
     Ok((reply, Admitted::Subscriber(joined)))
 }
 
-async fn write_messages(stream: &mut TcpStream, subscriber: &Subscriber) -> Ended {
+async fn write_messages(stream: &mut TcpStream, subscriber: &Subscriber) -> ConnectionEnd {
     let outbox = &subscriber.outbox;
     let (mut reader, mut writer) = stream.split();
     let mut waiting = Vec::new();
@@ -159,7 +159,7 @@ async fn write_messages(stream: &mut TcpStream, subscriber: &Subscriber) -> Ende
             ended = until_closed(&mut reader) => return ended,
         };
         if !more {
-            return Ended::Withdrawn;
+            return ConnectionEnd::Withdrawn;
         }
         let bytes: usize = waiting.iter().map(|message| message.len() + 4).sum();
         let messages = waiting.len();
@@ -183,7 +183,7 @@ async fn write_all(
     messages: &mut Vec<Bytes>,
     batch: &mut BytesMut,
     mut overdue: Pin<&mut impl Future<Output = ()>>,
-) -> Result<(), Ended> {
+) -> Result<(), ConnectionEnd> {
     for message in messages.drain(..) {
         batch.put_slice(&length(&message));
         if message.len() <= COPIED {
@@ -202,18 +202,18 @@ pub(crate) async fn write(
     head: Bytes,
     body: Bytes,
     mut overdue: Pin<&mut impl Future<Output = ()>>,
-) -> Result<(), Ended> {
+) -> Result<(), ConnectionEnd> {
     let mut data = head.chain(body);
     while data.has_remaining() {
         tokio::select! {
             biased;
             written = writer.write_buf(&mut data) => match written {
-                Ok(0) => return Err(Ended::Closed),
+                Ok(0) => return Err(ConnectionEnd::Closed),
                 Ok(_) => {}
-                Err(error) => return Err(Ended::Failed(error)),
+                Err(error) => return Err(ConnectionEnd::Failed(error)),
             },
-            () = sleep(STALL_LIMIT) => return Err(Ended::Stalled),
-            () = overdue.as_mut() => return Err(Ended::Withdrawn),
+            () = sleep(STALL_LIMIT) => return Err(ConnectionEnd::Stalled),
+            () = overdue.as_mut() => return Err(ConnectionEnd::Withdrawn),
         }
     }
     Ok(())
@@ -221,13 +221,13 @@ pub(crate) async fn write(
 
 /// Reads until the subscriber disconnects. A subscriber sends nothing after its header, so reading
 /// only detects the end.
-pub(crate) async fn until_closed(reader: &mut ReadHalf<'_>) -> Ended {
+pub(crate) async fn until_closed(reader: &mut ReadHalf<'_>) -> ConnectionEnd {
     let mut nothing = [0; 256];
     loop {
         match reader.read(&mut nothing).await {
-            Ok(0) => return Ended::Closed,
+            Ok(0) => return ConnectionEnd::Closed,
             Ok(_) => {}
-            Err(error) => return Ended::Failed(error),
+            Err(error) => return ConnectionEnd::Failed(error),
         }
     }
 }
@@ -256,7 +256,7 @@ enum Refused {
 
 /// Reason for the end of a connection.
 #[derive(Debug, Error)]
-pub(crate) enum Ended {
+pub(crate) enum ConnectionEnd {
     #[error("it closed the connection")]
     Closed,
     #[error("the topic or service was withdrawn")]
@@ -283,7 +283,7 @@ mod tests {
     use std::task::{Context, Poll};
 
     use super::*;
-    use crate::outbox::{Limit, Outbox};
+    use crate::outbox::{Limit, SubscriberQueue};
 
     /// A writer that accepts all data and records the address and length of the pieces of each
     /// write.
@@ -328,8 +328,8 @@ mod tests {
         }
     }
 
-    fn outbox() -> Outbox {
-        Outbox::new(Limit {
+    fn outbox() -> SubscriberQueue {
+        SubscriberQueue::new(Limit {
             messages: 1000,
             bytes: 1 << 20,
         })

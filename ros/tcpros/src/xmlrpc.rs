@@ -10,12 +10,12 @@ mod writer;
 
 use thiserror::Error;
 
-use self::reader::Reader;
+use self::reader::XmlReader;
 use self::writer::{escape, write_value};
 
 /// An XML-RPC value.
 #[derive(Clone, Debug, PartialEq)]
-pub(crate) enum Value {
+pub(crate) enum XmlRpcValue {
     /// `<i4>` and `<int>`; also `<i8>` where the number fits.
     Int(i32),
     /// `<boolean>`, `0` or `1` on the wire.
@@ -36,7 +36,7 @@ pub(crate) enum Value {
     Nil,
 }
 
-impl Value {
+impl XmlRpcValue {
     /// Returns the text of a string value.
     pub(crate) fn as_str(&self) -> Option<&str> {
         if let Self::String(text) = self {
@@ -72,25 +72,25 @@ impl Value {
     }
 }
 
-impl From<&str> for Value {
+impl From<&str> for XmlRpcValue {
     fn from(text: &str) -> Self {
         Self::String(text.to_owned())
     }
 }
 
-impl From<String> for Value {
+impl From<String> for XmlRpcValue {
     fn from(text: String) -> Self {
         Self::String(text)
     }
 }
 
-impl From<i32> for Value {
+impl From<i32> for XmlRpcValue {
     fn from(number: i32) -> Self {
         Self::Int(number)
     }
 }
 
-impl From<Vec<Self>> for Value {
+impl From<Vec<Self>> for XmlRpcValue {
     fn from(items: Vec<Self>) -> Self {
         Self::Array(items)
     }
@@ -98,17 +98,17 @@ impl From<Vec<Self>> for Value {
 
 /// A method call.
 #[derive(Clone, Debug, PartialEq)]
-pub(crate) struct Call {
+pub(crate) struct MethodCall {
     /// Name of the method.
     pub(crate) method: String,
     /// Arguments in order.
-    pub(crate) params: Vec<Value>,
+    pub(crate) params: Vec<XmlRpcValue>,
 }
 
-impl Call {
+impl MethodCall {
     /// Reads a `<methodCall>` document.
     pub(crate) fn parse(document: &[u8]) -> Result<Self, XmlError> {
-        let mut reader = Reader::new(document)?;
+        let mut reader = XmlReader::new(document)?;
         reader.open("methodCall")?;
         reader.open("methodName")?;
         let method = reader.text()?.trim().to_owned();
@@ -137,7 +137,7 @@ impl Call {
 /// A `<fault>` response.
 #[derive(Clone, Debug, PartialEq, Eq, Error)]
 #[error("fault {code}: {message}")]
-pub struct Fault {
+pub struct XmlRpcFault {
     /// `faultCode`.
     pub code: i32,
     /// `faultString`.
@@ -145,11 +145,11 @@ pub struct Fault {
 }
 
 /// The result of a method call.
-pub(crate) type Response = Result<Value, Fault>;
+pub(crate) type MethodResponse = Result<XmlRpcValue, XmlRpcFault>;
 
 /// Reads a `<methodResponse>` document.
-pub(crate) fn parse_response(document: &[u8]) -> Result<Response, XmlError> {
-    let mut reader = Reader::new(document)?;
+pub(crate) fn parse_response(document: &[u8]) -> Result<MethodResponse, XmlError> {
+    let mut reader = XmlReader::new(document)?;
     reader.open("methodResponse")?;
     let response = if reader.at_open("fault")? {
         reader.open("fault")?;
@@ -164,7 +164,7 @@ pub(crate) fn parse_response(document: &[u8]) -> Result<Response, XmlError> {
                 at: reader.position(),
             });
         }
-        Ok(params.pop().unwrap_or(Value::Nil))
+        Ok(params.pop().unwrap_or(XmlRpcValue::Nil))
     };
     reader.close("methodResponse")?;
     reader.end()?;
@@ -172,7 +172,7 @@ pub(crate) fn parse_response(document: &[u8]) -> Result<Response, XmlError> {
 }
 
 /// Returns a response as a document.
-pub(crate) fn encode_response(response: &Response) -> String {
+pub(crate) fn encode_response(response: &MethodResponse) -> String {
     let mut out = String::from("<?xml version=\"1.0\"?>\n<methodResponse>");
     match response {
         Ok(value) => {
@@ -183,13 +183,13 @@ pub(crate) fn encode_response(response: &Response) -> String {
         Err(fault) => {
             out.push_str("<fault>");
             let members = vec![
-                ("faultCode".to_owned(), Value::Int(fault.code)),
+                ("faultCode".to_owned(), XmlRpcValue::Int(fault.code)),
                 (
                     "faultString".to_owned(),
-                    Value::String(fault.message.clone()),
+                    XmlRpcValue::String(fault.message.clone()),
                 ),
             ];
-            write_value(&Value::Struct(members), &mut out);
+            write_value(&XmlRpcValue::Struct(members), &mut out);
             out.push_str("</fault>");
         }
     }
@@ -228,12 +228,12 @@ pub enum XmlError {
     TooDeep,
 }
 
-fn fault_of(value: &Value) -> Fault {
-    let mut fault = Fault {
+fn fault_of(value: &XmlRpcValue) -> XmlRpcFault {
+    let mut fault = XmlRpcFault {
         code: 0,
         message: String::new(),
     };
-    if let Value::Struct(members) = value {
+    if let XmlRpcValue::Struct(members) = value {
         for (name, member) in members {
             match name.as_str() {
                 "faultCode" => fault.code = member.as_int().unwrap_or(0),
@@ -253,7 +253,7 @@ mod tests {
 
     use super::*;
 
-    fn value_of(inner: &str) -> Result<Value, XmlError> {
+    fn value_of(inner: &str) -> Result<XmlRpcValue, XmlError> {
         let document = format!(
             "<?xml version='1.0'?><methodResponse><params><param>{inner}</param></params></methodResponse>"
         );
@@ -265,14 +265,14 @@ mod tests {
         let document = b"<?xml version=\"1.0\"?>\r\n<methodCall><methodName>requestTopic</methodName>\r\n\
             <params><param><value>/relay</value></param><param><value>/a&amp;b</value></param><param><value><array><data>\
             <value><array><data><value>TCPROS</value></data></array></value></data></array></value></param></params></methodCall>\r\n";
-        let call = Call::parse(document).unwrap();
+        let call = MethodCall::parse(document).unwrap();
         assert_eq!(call.method, "requestTopic");
         assert_eq!(
             call.params,
             [
                 "/relay".into(),
                 "/a&b".into(),
-                Value::Array(vec![Value::Array(vec!["TCPROS".into()])])
+                XmlRpcValue::Array(vec![XmlRpcValue::Array(vec!["TCPROS".into()])])
             ]
         );
     }
@@ -281,18 +281,21 @@ mod tests {
     fn every_type_reads_from_its_tag() {
         assert_eq!(
             value_of("<value><int> -7 </int></value>"),
-            Ok(Value::Int(-7))
+            Ok(XmlRpcValue::Int(-7))
         );
-        assert_eq!(value_of("<value><i4>+7</i4></value>"), Ok(Value::Int(7)));
+        assert_eq!(
+            value_of("<value><i4>+7</i4></value>"),
+            Ok(XmlRpcValue::Int(7))
+        );
         assert_eq!(
             value_of("<value><boolean>1</boolean></value>"),
-            Ok(Value::Bool(true))
+            Ok(XmlRpcValue::Bool(true))
         );
         assert_eq!(
             value_of("<value><double>-1.5e3</double></value>"),
-            Ok(Value::Double(-1500.0))
+            Ok(XmlRpcValue::Double(-1500.0))
         );
-        assert_eq!(value_of("<value><nil/></value>"), Ok(Value::Nil));
+        assert_eq!(value_of("<value><nil/></value>"), Ok(XmlRpcValue::Nil));
         assert_eq!(value_of("<value/>"), Ok("".into()));
         assert_eq!(value_of("<value></value>"), Ok("".into()));
         assert_eq!(value_of("<value> a </value>"), Ok(" a ".into()));
@@ -303,17 +306,17 @@ mod tests {
         );
         assert_eq!(
             value_of("<value><base64>AP8Q\n/w==</base64></value>"),
-            Ok(Value::Binary(vec![0, 255, 16, 255]))
+            Ok(XmlRpcValue::Binary(vec![0, 255, 16, 255]))
         );
         assert_eq!(
             value_of("<value><array><data/></array></value>"),
-            Ok(Value::Array(vec![]))
+            Ok(XmlRpcValue::Array(vec![]))
         );
         assert_eq!(
             value_of(
                 "<value><struct><member><name>a</name><value>b</value></member></struct></value>"
             ),
-            Ok(Value::Struct(vec![("a".to_owned(), "b".into())]))
+            Ok(XmlRpcValue::Struct(vec![("a".to_owned(), "b".into())]))
         );
     }
 
@@ -367,10 +370,10 @@ mod tests {
             }
         ));
         assert_eq!(
-            Call::parse(b"<methodCall><methodName>x"),
+            MethodCall::parse(b"<methodCall><methodName>x"),
             Err(XmlError::Truncated("a text"))
         );
-        assert_eq!(Call::parse(b"\xff"), Err(XmlError::NotUtf8));
+        assert_eq!(MethodCall::parse(b"\xff"), Err(XmlError::NotUtf8));
         let deep = format!(
             "{}{}",
             "<value><array><data>".repeat(40),
@@ -381,7 +384,7 @@ mod tests {
 
     #[test]
     fn a_fault_comes_out_as_a_fault() {
-        let fault = Fault {
+        let fault = XmlRpcFault {
             code: -1,
             message: "no <such> method".to_owned(),
         };
@@ -389,19 +392,19 @@ mod tests {
         assert_eq!(parse_response(document.as_bytes()), Ok(Err(fault)));
     }
 
-    fn any_value() -> impl Strategy<Value = Value> {
+    fn any_value() -> impl Strategy<Value = XmlRpcValue> {
         let leaf = prop_oneof![
-            any::<i32>().prop_map(Value::Int),
-            any::<bool>().prop_map(Value::Bool),
-            (-1e300..1e300).prop_map(Value::Double),
-            "[^\\x00-\\x08\\x0b\\x0c\\x0e-\\x1f\u{fffe}\u{ffff}]*".prop_map(Value::String),
-            prop::collection::vec(any::<u8>(), 0..40).prop_map(Value::Binary),
-            Just(Value::Nil),
+            any::<i32>().prop_map(XmlRpcValue::Int),
+            any::<bool>().prop_map(XmlRpcValue::Bool),
+            (-1e300..1e300).prop_map(XmlRpcValue::Double),
+            "[^\\x00-\\x08\\x0b\\x0c\\x0e-\\x1f\u{fffe}\u{ffff}]*".prop_map(XmlRpcValue::String),
+            prop::collection::vec(any::<u8>(), 0..40).prop_map(XmlRpcValue::Binary),
+            Just(XmlRpcValue::Nil),
         ];
         leaf.prop_recursive(4, 32, 4, |inner| {
             prop_oneof![
-                prop::collection::vec(inner.clone(), 0..4).prop_map(Value::Array),
-                prop::collection::vec(("[a-z<&>]{0,6}", inner), 0..4).prop_map(Value::Struct),
+                prop::collection::vec(inner.clone(), 0..4).prop_map(XmlRpcValue::Array),
+                prop::collection::vec(("[a-z<&>]{0,6}", inner), 0..4).prop_map(XmlRpcValue::Struct),
             ]
         })
     }
@@ -409,27 +412,27 @@ mod tests {
     proptest! {
         #[test]
         fn a_written_call_reads_back_equal(method in "[a-zA-Z]{1,12}", params in prop::collection::vec(any_value(), 0..4)) {
-            let call = Call { method, params };
-            prop_assert_eq!(Call::parse(call.encode().as_bytes()), Ok(call));
+            let call = MethodCall { method, params };
+            prop_assert_eq!(MethodCall::parse(call.encode().as_bytes()), Ok(call));
         }
 
         #[test]
         fn a_prefix_of_a_call_is_an_error(params in prop::collection::vec(any_value(), 0..3), cut in any::<prop::sample::Index>()) {
-            let document = Call { method: "m".to_owned(), params }.encode();
+            let document = MethodCall { method: "m".to_owned(), params }.encode();
             let document = document.trim_end().as_bytes();
-            prop_assert!(Call::parse(&document[..cut.index(document.len())]).is_err());
+            prop_assert!(MethodCall::parse(&document[..cut.index(document.len())]).is_err());
         }
 
         #[test]
         fn random_bytes_never_panic(bytes in prop::collection::vec(any::<u8>(), 0..300)) {
-            prop_assert!(Call::parse(&bytes).is_err());
+            prop_assert!(MethodCall::parse(&bytes).is_err());
         }
 
         #[test]
         fn random_tags_never_panic(text in "(<(/)?(methodCall|methodName|params|param|value|array|data|struct|member|name|i4|base64)(/)?>|[a&;#<>!\\[\\]-]){0,60}") {
             // The call may be well formed by chance; reading has to end in a value or an error.
-            if let Ok(call) = Call::parse(text.as_bytes()) {
-                prop_assert_eq!(Call::parse(call.encode().as_bytes()), Ok(call));
+            if let Ok(call) = MethodCall::parse(text.as_bytes()) {
+                prop_assert_eq!(MethodCall::parse(call.encode().as_bytes()), Ok(call));
             }
         }
     }

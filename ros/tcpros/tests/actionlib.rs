@@ -9,13 +9,14 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use tcpros::actionlib::{
-    ActionClient, ActionClientOptions, ActionError, ActionServer, ActionServerOptions, ActionType,
-    ClientType, CommState, GoalError, GoalEvent, GoalHandle, LostReason, ServerEvent, ServerGoal,
-    SimpleActionServer, Status, goal_id_type, goal_status_array_type,
+    ActionlibClient, ActionlibClientOptions, ActionlibError, ActionlibGoal, ActionlibGoalError,
+    ActionlibGoalEvent, ActionlibServer, ActionlibServerEvent, ActionlibServerGoal,
+    ActionlibServerOptions, ActionlibStatus, ActionlibTypes, ClientType, CommState, GoalLoss,
+    SimpleActionServer, goal_id_type, goal_status_array_type,
 };
 use tcpros::{
-    Core, Inbox, InboxEvent, Node, NodeOptions, Publisher, PublisherOptions, RosTime,
-    SubscriberOptions, TopicType, Wanted,
+    Core, Inbox, InboxEvent, Node, NodeOptions, Publisher, PublisherOptions, RequestedType,
+    Ros1Time, SubscriberOptions, TopicType,
 };
 use tokio::time::timeout;
 
@@ -41,21 +42,21 @@ fn topic_type(name: &str, digit: char) -> TopicType {
     }
 }
 
-fn action() -> ActionType {
-    ActionType {
+fn action() -> ActionlibTypes {
+    ActionlibTypes {
         goal: topic_type("CountActionGoal", '1'),
         result: topic_type("CountActionResult", '2'),
         feedback: topic_type("CountActionFeedback", '3'),
     }
 }
 
-fn serve(node: &Node) -> ActionServer {
-    let options = ActionServerOptions::new(Bytes::from_static(b"empty"));
-    ActionServer::new(node, "count", action(), options).unwrap()
+fn serve(node: &Node) -> ActionlibServer {
+    let options = ActionlibServerOptions::new(Bytes::from_static(b"empty"));
+    ActionlibServer::new(node, "count", action(), options).unwrap()
 }
 
-fn client(node: &Node, options: ActionClientOptions) -> ActionClient {
-    ActionClient::new(node, "count", action(), options).unwrap()
+fn client(node: &Node, options: ActionlibClientOptions) -> ActionlibClient {
+    ActionlibClient::new(node, "count", action(), options).unwrap()
 }
 
 async fn within<T>(what: &str, future: impl Future<Output = T>) -> T {
@@ -65,29 +66,29 @@ async fn within<T>(what: &str, future: impl Future<Output = T>) -> T {
     }
 }
 
-async fn ready(client: &ActionClient) {
+async fn ready(client: &ActionlibClient) {
     client.wait_for_server(DEADLINE).await.unwrap();
 }
 
-async fn goal(server: &mut ActionServer) -> ServerGoal {
+async fn goal(server: &mut ActionlibServer) -> ActionlibServerGoal {
     match within("a goal", server.recv()).await {
-        ServerEvent::Goal(goal) => goal,
-        ServerEvent::Cancel(id) => panic!("a request to cancel {id:?} instead of a goal"),
+        ActionlibServerEvent::Goal(goal) => goal,
+        ActionlibServerEvent::Cancel(id) => panic!("a request to cancel {id:?} instead of a goal"),
     }
 }
 
-async fn cancelled(server: &mut ActionServer) -> String {
+async fn cancelled(server: &mut ActionlibServer) -> String {
     match within("a request to cancel", server.recv()).await {
-        ServerEvent::Cancel(id) => id.id,
-        ServerEvent::Goal(goal) => panic!("{goal:?} instead of a request to cancel"),
+        ActionlibServerEvent::Cancel(id) => id.id,
+        ActionlibServerEvent::Goal(goal) => panic!("{goal:?} instead of a request to cancel"),
     }
 }
 
-async fn state(handle: &mut GoalHandle, wanted: CommState) {
+async fn state(handle: &mut ActionlibGoal, wanted: CommState) {
     within(&format!("{wanted:?}"), async {
         loop {
             match handle.recv().await {
-                Some(GoalEvent::State(state)) if state == wanted => return,
+                Some(ActionlibGoalEvent::State(state)) if state == wanted => return,
                 Some(_) => {}
                 None => panic!("the goal ended before it was {wanted:?}"),
             }
@@ -96,12 +97,12 @@ async fn state(handle: &mut GoalHandle, wanted: CommState) {
     .await;
 }
 
-async fn ended(handle: &mut GoalHandle) -> (Status, String, Bytes) {
+async fn ended(handle: &mut ActionlibGoal) -> (ActionlibStatus, String, Bytes) {
     let result = within("the result", handle.outcome()).await.unwrap();
     (result.status, result.text, result.body)
 }
 
-async fn lost(handle: &mut GoalHandle) -> LostReason {
+async fn lost(handle: &mut ActionlibGoal) -> GoalLoss {
     match within("the loss", handle.outcome()).await {
         Err(reason) => reason,
         Ok(result) => panic!("{result:?} instead of a loss"),
@@ -112,7 +113,10 @@ async fn lost(handle: &mut GoalHandle) -> LostReason {
 async fn a_goal_is_accepted_reports_progress_and_succeeds() {
     let core = core();
     let (robot, cell) = (node("robot", &core), node("cell", &core));
-    let (mut server, client) = (serve(&robot), client(&cell, ActionClientOptions::default()));
+    let (mut server, client) = (
+        serve(&robot),
+        client(&cell, ActionlibClientOptions::default()),
+    );
     assert_eq!(client.wait_for_server(DEADLINE).await.unwrap(), "/robot");
     let mut handle = client.send_goal(b"to ten");
     assert!(handle.goal_id().id.starts_with("/cell-"));
@@ -124,7 +128,8 @@ async fn a_goal_is_accepted_reports_progress_and_succeeds() {
     state(&mut handle, CommState::Active).await;
     assert_eq!(handle.status().text, "counting");
     goal.feedback(b"five").unwrap();
-    let Some(GoalEvent::Feedback(feedback)) = within("feedback", handle.recv()).await else {
+    let Some(ActionlibGoalEvent::Feedback(feedback)) = within("feedback", handle.recv()).await
+    else {
         panic!("no feedback");
     };
     assert_eq!(feedback.body, b"five".as_slice());
@@ -136,11 +141,11 @@ async fn a_goal_is_accepted_reports_progress_and_succeeds() {
     let (status, text, body) = ended(&mut handle).await;
     assert_eq!(
         (status, &*text, &*body),
-        (Status::Succeeded, "done", b"ten".as_slice())
+        (ActionlibStatus::Succeeded, "done", b"ten".as_slice())
     );
     assert_eq!(
         (handle.state(), handle.status().status),
-        (CommState::Done, Status::Succeeded)
+        (CommState::Done, ActionlibStatus::Succeeded)
     );
     assert!(handle.recv().await.is_none());
     let refused = goal.feedback(b"late").unwrap_err();
@@ -153,12 +158,16 @@ async fn a_client_that_knows_only_the_goals_type_is_told_the_others() {
     let (robot, cell) = (node("robot", &core), node("cell", &core));
     let mut server = serve(&robot);
     let open = ClientType::of_goal(action().goal);
-    let client = ActionClient::new(&cell, "count", open, ActionClientOptions::default()).unwrap();
+    let client =
+        ActionlibClient::new(&cell, "count", open, ActionlibClientOptions::default()).unwrap();
     ready(&client).await;
     let mut handle = client.send_goal(b"");
     goal(&mut server).await.reject("busy").unwrap();
     let result = within("the result", handle.outcome()).await.unwrap();
-    assert_eq!((result.status, &*result.text), (Status::Rejected, "busy"));
+    assert_eq!(
+        (result.status, &*result.text),
+        (ActionlibStatus::Rejected, "busy")
+    );
     assert_eq!(result.body, b"empty".as_slice());
     assert_eq!(result.peer.header.md5sum(), Some("2".repeat(32).as_str()));
 }
@@ -170,7 +179,7 @@ async fn two_clients_get_their_own_results_and_no_other() {
     let mut server = serve(&robot);
     let clients = cells
         .each_ref()
-        .map(|cell| client(cell, ActionClientOptions::default()));
+        .map(|cell| client(cell, ActionlibClientOptions::default()));
     for client in &clients {
         ready(client).await;
     }
@@ -194,7 +203,10 @@ async fn two_clients_get_their_own_results_and_no_other() {
 async fn a_request_to_cancel_reaches_the_goal_and_its_end_is_the_servers_decision() {
     let core = core();
     let (robot, cell) = (node("robot", &core), node("cell", &core));
-    let (mut server, client) = (serve(&robot), client(&cell, ActionClientOptions::default()));
+    let (mut server, client) = (
+        serve(&robot),
+        client(&cell, ActionlibClientOptions::default()),
+    );
     ready(&client).await;
     let mut handles = [client.send_goal(b"1"), client.send_goal(b"2")];
     let goals = [goal(&mut server).await, goal(&mut server).await];
@@ -207,20 +219,26 @@ async fn a_request_to_cancel_reaches_the_goal_and_its_end_is_the_servers_decisio
     assert!(!handles[0].cancel(), "the server knows already");
     goals[0].cancelled(Some(b"half"), "stopped").unwrap();
     let (status, _, body) = ended(&mut handles[0]).await;
-    assert_eq!((status, &*body), (Status::Preempted, b"half".as_slice()));
+    assert_eq!(
+        (status, &*body),
+        (ActionlibStatus::Preempted, b"half".as_slice())
+    );
     assert_eq!(client.cancel_all(), 1);
     assert_eq!(cancelled(&mut server).await, handles[1].goal_id().id);
-    assert_eq!(goals[1].status(), Status::Recalling);
+    assert_eq!(goals[1].status(), ActionlibStatus::Recalling);
     goals[1].accept("too late to recall").unwrap();
     goals[1].succeed(b"", "was done anyway").unwrap();
-    assert_eq!(ended(&mut handles[1]).await.0, Status::Succeeded);
+    assert_eq!(ended(&mut handles[1]).await.0, ActionlibStatus::Succeeded);
 }
 
 #[tokio::test]
 async fn goals_up_to_a_time_are_cancelled_those_to_come_included() {
     let core = core();
     let (robot, cell) = (node("robot", &core), node("cell", &core));
-    let (mut server, client) = (serve(&robot), client(&cell, ActionClientOptions::default()));
+    let (mut server, client) = (
+        serve(&robot),
+        client(&cell, ActionlibClientOptions::default()),
+    );
     ready(&client).await;
     let mut first = client.send_goal(b"1");
     let held = goal(&mut server).await;
@@ -229,10 +247,13 @@ async fn goals_up_to_a_time_are_cancelled_those_to_come_included() {
     assert_eq!(client.cancel_before(far), 1);
     assert_eq!(cancelled(&mut server).await, first.goal_id().id);
     held.cancelled(None, "").unwrap();
-    assert_eq!(ended(&mut first).await.0, Status::Recalled);
+    assert_eq!(ended(&mut first).await.0, ActionlibStatus::Recalled);
     let mut second = client.send_goal(b"2");
     let (status, _, body) = ended(&mut second).await;
-    assert_eq!((status, &*body), (Status::Recalled, b"empty".as_slice()));
+    assert_eq!(
+        (status, &*body),
+        (ActionlibStatus::Recalled, b"empty".as_slice())
+    );
     assert!(server.try_recv().is_none());
 }
 
@@ -240,7 +261,10 @@ async fn goals_up_to_a_time_are_cancelled_those_to_come_included() {
 async fn a_goal_with_an_id_of_the_caller_is_stamped_by_its_server() {
     let core = core();
     let (robot, cell) = (node("robot", &core), node("cell", &core));
-    let (mut server, client) = (serve(&robot), client(&cell, ActionClientOptions::default()));
+    let (mut server, client) = (
+        serve(&robot),
+        client(&cell, ActionlibClientOptions::default()),
+    );
     ready(&client).await;
     let mut ahead = client.send_goal(b"1").goal_id().stamp;
     let first = goal(&mut server).await;
@@ -254,32 +278,38 @@ async fn a_goal_with_an_id_of_the_caller_is_stamped_by_its_server() {
     let held = goal(&mut server).await;
     assert_eq!(held.goal_id().id, "mine");
     let stamp = held.goal_id().stamp;
-    assert!(RosTime::default() < stamp && stamp < ahead, "{stamp:?}");
+    assert!(Ros1Time::default() < stamp && stamp < ahead, "{stamp:?}");
 }
 
 #[tokio::test]
 async fn a_goal_that_the_server_drops_is_aborted_and_so_are_all_when_it_stops() {
     let core = core();
     let (robot, cell) = (node("robot", &core), node("cell", &core));
-    let (mut server, client) = (serve(&robot), client(&cell, ActionClientOptions::default()));
+    let (mut server, client) = (
+        serve(&robot),
+        client(&cell, ActionlibClientOptions::default()),
+    );
     ready(&client).await;
     let mut handle = client.send_goal(b"1");
     drop(goal(&mut server).await);
     let (status, text, body) = ended(&mut handle).await;
-    assert_eq!((status, &*body), (Status::Aborted, b"empty".as_slice()));
+    assert_eq!(
+        (status, &*body),
+        (ActionlibStatus::Aborted, b"empty".as_slice())
+    );
     assert!(text.contains("abandoned the goal"), "{text}");
     let mut handle = client.send_goal(b"2");
     let held = goal(&mut server).await;
     drop(server);
-    assert_eq!(ended(&mut handle).await.0, Status::Aborted);
-    assert_eq!(held.accept(""), Err(GoalError::Closed));
+    assert_eq!(ended(&mut handle).await.0, ActionlibStatus::Aborted);
+    assert_eq!(held.accept(""), Err(ActionlibGoalError::Closed));
 }
 
 #[tokio::test]
 async fn a_goal_for_no_server_is_lost_at_once_and_the_reason_names_the_topic() {
     let core = core();
     let cell = node("cell", &core);
-    let client = client(&cell, ActionClientOptions::default());
+    let client = client(&cell, ActionlibClientOptions::default());
     let missing = client
         .wait_for_server(Duration::from_millis(50))
         .await
@@ -301,7 +331,7 @@ async fn a_goal_for_no_server_is_lost_at_once_and_the_reason_names_the_topic() {
 async fn a_server_that_goes_loses_its_goals_and_the_next_one_is_found() {
     let core = core();
     let cell = node("cell", &core);
-    let client = client(&cell, ActionClientOptions::default());
+    let client = client(&cell, ActionlibClientOptions::default());
     let robot = node("robot", &core);
     let mut server = serve(&robot);
     ready(&client).await;
@@ -314,7 +344,7 @@ async fn a_server_that_goes_loses_its_goals_and_the_next_one_is_found() {
     drop(robot);
     let reason = lost(&mut handle).await;
     let server = "/robot".to_owned();
-    assert_eq!(reason, LostReason::Disconnected { server });
+    assert_eq!(reason, GoalLoss::Disconnected { server });
     let robot = node("robot", &core);
     let mut server = serve(&robot);
     ready(&client).await;
@@ -329,12 +359,15 @@ async fn a_server_that_goes_loses_its_goals_and_the_next_one_is_found() {
 async fn closing_a_client_ends_its_goals() {
     let core = core();
     let (robot, cell) = (node("robot", &core), node("cell", &core));
-    let (mut server, client) = (serve(&robot), client(&cell, ActionClientOptions::default()));
+    let (mut server, client) = (
+        serve(&robot),
+        client(&cell, ActionlibClientOptions::default()),
+    );
     ready(&client).await;
     let mut handle = client.send_goal(b"1");
     let _held = goal(&mut server).await;
     drop(client);
-    assert_eq!(lost(&mut handle).await, LostReason::ClientClosed);
+    assert_eq!(lost(&mut handle).await, GoalLoss::ClientClosed);
 }
 
 /// A hand-made server: publishes the topics of an action, and receives goals and cancel requests.
@@ -355,7 +388,7 @@ impl ByHand {
         let goals = Inbox::new();
         let subscribe = |topic| {
             let options = SubscriberOptions::default();
-            node.subscribe(topic, Wanted::default(), options, (), &goals)
+            node.subscribe(topic, RequestedType::default(), options, (), &goals)
                 .unwrap()
         };
         Self {
@@ -396,17 +429,17 @@ fn status(id: &str, code: u8) -> Vec<u8> {
     out
 }
 
-fn impatient() -> ActionClientOptions {
-    ActionClientOptions {
+fn impatient() -> ActionlibClientOptions {
+    ActionlibClientOptions {
         acknowledge_timeout: Duration::from_millis(200),
         silence_timeout: Duration::from_millis(400),
         result_timeout: Duration::from_millis(200),
-        ..ActionClientOptions::default()
+        ..ActionlibClientOptions::default()
     }
 }
 
 /// Returns a hand-made server that a client has found, and a goal sent to it.
-async fn sent_by_hand(robot: &Node, client: &ActionClient) -> (ByHand, GoalHandle) {
+async fn sent_by_hand(robot: &Node, client: &ActionlibClient) -> (ByHand, ActionlibGoal) {
     let mut server = ByHand::server(robot);
     within("the server", async {
         while client.server().is_err() {
@@ -428,7 +461,7 @@ async fn every_way_of_a_server_to_fall_silent_ends_the_goal_with_its_reason() {
     let (server, mut handle) = sent_by_hand(&robot, &client).await;
     assert!(matches!(
         lost(&mut handle).await,
-        LostReason::NotAcknowledged(_)
+        GoalLoss::NotAcknowledged(_)
     ));
     for (code, end) in [(1, "no status"), (3, "no result")] {
         let mut handle = client.send_goal(b"");
@@ -441,7 +474,7 @@ async fn every_way_of_a_server_to_fall_silent_ends_the_goal_with_its_reason() {
     server.list(&[]);
     assert!(matches!(
         lost(&mut handle).await,
-        LostReason::Forgotten { .. }
+        GoalLoss::Forgotten { .. }
     ));
 }
 
@@ -449,7 +482,7 @@ async fn every_way_of_a_server_to_fall_silent_ends_the_goal_with_its_reason() {
 async fn messages_that_do_not_read_are_counted_and_the_goal_goes_on() {
     let core = core();
     let (robot, cell) = (node("robot", &core), node("cell", &core));
-    let client = client(&cell, ActionClientOptions::default());
+    let client = client(&cell, ActionlibClientOptions::default());
     let (server, mut handle) = sent_by_hand(&robot, &client).await;
     ByHand::send(&server.status, vec![0xff; 20]);
     ByHand::send(&server.feedback, vec![1, 2, 3]);
@@ -493,7 +526,7 @@ async fn a_goal_with_no_id_gets_one_and_bad_goals_are_counted() {
     let goal = goal(&mut server).await;
     assert_eq!(goal.body(), b"body".as_slice());
     assert!(goal.goal_id().id.starts_with("/robot-"), "{goal:?}");
-    assert!(goal.goal_id().stamp > RosTime::default());
+    assert!(goal.goal_id().stamp > Ros1Time::default());
     within("two counts", async {
         while server.counters().malformed < 2 {
             tokio::time::sleep(Duration::from_millis(5)).await;
@@ -507,7 +540,7 @@ async fn a_simple_server_gives_way_to_the_newest_goal() {
     let core = core();
     let (robot, cell) = (node("robot", &core), node("cell", &core));
     let mut simple = SimpleActionServer::new(serve(&robot));
-    let client = client(&cell, ActionClientOptions::default());
+    let client = client(&cell, ActionlibClientOptions::default());
     ready(&client).await;
     let mut first = client.send_goal(b"1");
     let current = within("the first goal", simple.next()).await;
@@ -515,14 +548,14 @@ async fn a_simple_server_gives_way_to_the_newest_goal() {
     within("a newer goal", simple.preempted(&current)).await;
     state(&mut third, CommState::Pending).await;
     current.cancelled(None, "").unwrap();
-    assert_eq!(ended(&mut first).await.0, Status::Preempted);
+    assert_eq!(ended(&mut first).await.0, ActionlibStatus::Preempted);
     let current = within("the newest goal", simple.next()).await;
     assert_eq!(current.body(), b"3".as_slice());
-    assert_eq!(ended(&mut second).await.0, Status::Recalled);
+    assert_eq!(ended(&mut second).await.0, ActionlibStatus::Recalled);
     assert!(third.cancel());
     within("the request", simple.preempted(&current)).await;
     current.cancelled(None, "").unwrap();
-    assert_eq!(ended(&mut third).await.0, Status::Preempted);
+    assert_eq!(ended(&mut third).await.0, ActionlibStatus::Preempted);
 }
 
 #[tokio::test]
@@ -530,11 +563,11 @@ async fn the_type_of_a_bare_goal_is_refused_and_so_is_a_second_client_of_one_nod
     let core = core();
     let cell = node("cell", &core);
     let bare = ClientType::of_goal(topic_type("CountGoal", '1'));
-    let options = ActionClientOptions::default();
-    let refused = ActionClient::new(&cell, "count", bare, options).unwrap_err();
-    assert!(matches!(refused, ActionError::NotAWrapper { .. }));
+    let options = ActionlibClientOptions::default();
+    let refused = ActionlibClient::new(&cell, "count", bare, options).unwrap_err();
+    assert!(matches!(refused, ActionlibError::NotAWrapper { .. }));
     let _first = client(&cell, options);
-    let second = ActionClient::new(&cell, "count", action(), options).unwrap_err();
+    let second = ActionlibClient::new(&cell, "count", action(), options).unwrap_err();
     assert!(
         second
             .to_string()

@@ -9,7 +9,7 @@ use std::time::Duration;
 use bytes::Bytes;
 use tcpros::{
     Core, Inbox, InboxEvent, MasterState, Node, NodeOptions, ParamError, ParamSubscription,
-    ParamValue, Publisher, PublisherOptions, RosTime, SubscriberOptions, TopicType, Wanted,
+    ParamValue, Publisher, PublisherOptions, RequestedType, Ros1Time, SubscriberOptions, TopicType,
 };
 use tokio::time::timeout;
 
@@ -369,12 +369,12 @@ async fn the_clock_follows_use_sim_time_and_the_topic_clock() {
         .await
         .unwrap();
     eventually("simulated time", || clock.is_simulated()).await;
-    assert_eq!(ours.now(), RosTime::default());
+    assert_eq!(ours.now(), Ros1Time::default());
     let publisher = clock_publisher(&simulator);
     tick(&publisher, 100);
     eventually("the time", || {
         clock.now()
-            == RosTime {
+            == Ros1Time {
                 secs: 100,
                 nsecs: 5,
             }
@@ -434,7 +434,7 @@ async fn watching_the_master_and_reconnecting_go_on_while_simulated_time_stands_
     let inbox: Inbox<()> = Inbox::new();
     let options = SubscriberOptions::default();
     let heard = ours
-        .subscribe("/t", Wanted::default(), options, (), &inbox)
+        .subscribe("/t", RequestedType::default(), options, (), &inbox)
         .unwrap();
     let publisher = simulator
         .advertise("/t", string(), Default::default())
@@ -465,7 +465,7 @@ async fn watching_the_master_and_reconnecting_go_on_while_simulated_time_stands_
         }
     })
     .await;
-    assert_eq!(before, RosTime { secs: 2, nsecs: 5 });
+    assert_eq!(before, Ros1Time { secs: 2, nsecs: 5 });
     // The new master has no simulated time.
     eventually("the wall clock", || !ours.clock().is_simulated()).await;
     drop(publisher);
@@ -530,7 +530,7 @@ async fn nodes_that_are_known_by_an_ipv6_address_talk_over_it() {
     let mut inbox: Inbox<()> = Inbox::new();
     let options = SubscriberOptions::default();
     let _heard = listener
-        .subscribe("/t", Wanted::default(), options, (), &inbox)
+        .subscribe("/t", RequestedType::default(), options, (), &inbox)
         .unwrap();
     eventually("the link", || publisher.subscribers() == 1).await;
     assert_eq!(publisher.publish(Bytes::from_static(b"six")).sent_to, 1);

@@ -15,9 +15,9 @@ use std::time::Duration;
 use bytes::Bytes;
 use socket2::SockRef;
 use tcpros::{
-    CallPhase, ConnectionHeader, Core, Graph, MasterState, Node, NodeError, NodeOptions,
+    CallPhase, ConnectionHeader, Core, MasterGraph, MasterState, Node, NodeError, NodeOptions,
     ServiceClient, ServiceClientOptions, ServiceError, ServiceOptions, ServiceRequest,
-    ServiceServer, ServiceType,
+    ServiceServer, ServiceTypeSum,
 };
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpStream};
@@ -39,8 +39,8 @@ fn node(name: &str, core: &Core) -> Node {
     Node::start(options).unwrap()
 }
 
-fn set_bool() -> ServiceType {
-    ServiceType {
+fn set_bool() -> ServiceTypeSum {
+    ServiceTypeSum {
         name: "std_srvs/SetBool".to_owned(),
         md5sum: MD5.to_owned(),
         request_type: "std_srvs/SetBoolRequest".to_owned(),
@@ -98,7 +98,7 @@ async fn eventually(what: &str, mut condition: impl FnMut() -> bool) {
 }
 
 /// Waits until the master's graph is as wanted.
-async fn graph(node: &Node, what: &str, mut as_wanted: impl FnMut(&Graph) -> bool) {
+async fn graph(node: &Node, what: &str, mut as_wanted: impl FnMut(&MasterGraph) -> bool) {
     within(what, async {
         while !node.graph().await.is_ok_and(|graph| as_wanted(&graph)) {
             tokio::time::sleep(Duration::from_millis(5)).await;
@@ -905,8 +905,9 @@ async fn of_two_nodes_with_one_service_the_last_serves_and_the_first_may_leave()
     let early = offer(&first, "/grip");
     offered(&second, "/grip").await;
     let late = offer(&second, "/grip");
-    let by =
-        |node: &'static str| move |g: &Graph| g.services.get("/grip").is_some_and(|n| n == &[node]);
+    let by = |node: &'static str| {
+        move |g: &MasterGraph| g.services.get("/grip").is_some_and(|n| n == &[node])
+    };
     graph(&first, "the takeover", by("/second")).await;
     let client = client(&first, "/grip");
     assert_eq!(ask(&client, "on").await.unwrap(), "on");
@@ -928,7 +929,7 @@ async fn a_service_is_offered_once_and_with_a_whole_type() {
     assert!(
         matches!(advertise("grip", set_bool()), Err(NodeError::AlreadyOffered(s)) if s == "/grip")
     );
-    let any = ServiceType {
+    let any = ServiceTypeSum {
         md5sum: "*".to_owned(),
         ..set_bool()
     };

@@ -6,7 +6,7 @@ use std::path::{Component, Path, PathBuf};
 
 use messages::{Dialect, TextKind, TypeName};
 
-use crate::package::{MANIFEST, Package};
+use crate::package::{MANIFEST, PackageFolder};
 
 /// Files, or their contents, by their definitions; the first file of a name counts.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -77,7 +77,7 @@ pub(crate) struct DefinitionFile {
 
 impl DefinitionFile {
     /// Classifies a file. Returns `None` if its extension is not that of a definition.
-    fn of_path(path: PathBuf, package: &Package, folder: Option<TextKind>) -> Option<Self> {
+    fn of_path(path: PathBuf, package: &PackageFolder, folder: Option<TextKind>) -> Option<Self> {
         let ending = path.extension()?.to_str()?;
         let own = TextKind::ALL.into_iter().find(|kind| kind.word() == ending);
         let (kind, only) = match own {
@@ -103,7 +103,7 @@ impl DefinitionFile {
 }
 
 /// A directory walk with a limited number of folders.
-pub(crate) struct Walk<'s> {
+pub(crate) struct FolderWalk<'s> {
     folders: usize,
     files: usize,
     /// Folders that cannot be listed, with the reason.
@@ -112,7 +112,7 @@ pub(crate) struct Walk<'s> {
     see: &'s mut dyn FnMut(&Path),
 }
 
-impl<'s> Walk<'s> {
+impl<'s> FolderWalk<'s> {
     pub(crate) fn new(see: &'s mut dyn FnMut(&Path)) -> Self {
         Self {
             folders: MOST_FOLDERS,
@@ -131,9 +131,9 @@ impl<'s> Walk<'s> {
         std::mem::take(&mut self.unlisted)
     }
 
-    fn package(&mut self, folder: &Path) -> Package {
+    fn package(&mut self, folder: &Path) -> PackageFolder {
         self.see(&folder.join(MANIFEST));
-        Package::of(folder)
+        PackageFolder::of(folder)
     }
 
     /// Returns the definitions at or below a path: of packages, and of files beside a `package.xml`
@@ -257,7 +257,7 @@ impl<'s> Walk<'s> {
 
     fn folder_of(
         &mut self,
-        package: &Package,
+        package: &PackageFolder,
         (folder, kind): (&Path, Option<TextKind>),
         found: &mut Vec<DefinitionFile>,
     ) {
@@ -268,7 +268,7 @@ impl<'s> Walk<'s> {
 
     fn files_of(
         &mut self,
-        package: &Package,
+        package: &PackageFolder,
         entries: &[PathBuf],
         kind: Option<TextKind>,
         found: &mut Vec<DefinitionFile>,

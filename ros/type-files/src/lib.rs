@@ -15,32 +15,32 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 pub use documents::read_bounded;
-use mappings::{PathFault, Readers, Surroundings};
+use mappings::{FileReaders, PathFault, Surroundings};
 use messages::{DefinitionText, DefinitionTexts, Dialect, Language, TextKind, TypeName};
 use tracing::warn;
 
-use self::index::{Index, Walk};
+use self::index::{FolderWalk, Index};
 pub use self::paths::TypePaths;
 
 /// Definitions in files, for a program.
 #[derive(Debug, Clone)]
 pub struct TypeFiles {
     own: Arc<TypePaths>,
-    environment: Environment,
+    environment: RosEnvironment,
     /// The files of the installations, after the first lookup.
     installed: [Option<Index<PathBuf>>; 2],
 }
 
 /// The ROS installations in the environment of the program.
 #[derive(Debug, Clone, Default)]
-pub struct Environment {
+pub struct RosEnvironment {
     /// Folders with packages at any depth, as in `ROS_PACKAGE_PATH`.
     pub ros1: Vec<PathBuf>,
     /// Folders with `share/<package>`, as in `AMENT_PREFIX_PATH`.
     pub ros2: Vec<PathBuf>,
 }
 
-impl Environment {
+impl RosEnvironment {
     /// Reads the environment variables.
     #[must_use]
     pub fn from_env() -> Self {
@@ -70,7 +70,7 @@ impl Environment {
             return Some(folder);
         }
         let mut unseen = |_: &Path| {};
-        let mut walk = Walk::new(&mut unseen);
+        let mut walk = FolderWalk::new(&mut unseen);
         let mut roots = self.ros1.iter();
         roots.find_map(|root| walk.package_named(name, root, DEEPEST))
     }
@@ -97,30 +97,30 @@ impl Surroundings for Disk {
         std::env::var(name).ok()
     }
 
-    fn readers(&self, file: &str) -> Option<Readers> {
+    fn readers(&self, file: &str) -> Option<FileReaders> {
         readers(Path::new(file))
     }
 
-    fn types(&self, paths: &[PathBuf]) -> Box<dyn mappings::TypeFiles> {
+    fn types(&self, paths: &[PathBuf]) -> Box<dyn mappings::OpenTypeFiles> {
         let own = TypePaths::read(paths, &mut |_| {});
-        Box::new(TypeFiles::new(Arc::new(own), Environment::from_env()))
+        Box::new(TypeFiles::new(Arc::new(own), RosEnvironment::from_env()))
     }
 }
 
 /// Returns the readers according to the mode of the file.
 #[cfg(unix)]
-fn readers(file: &Path) -> Option<Readers> {
+fn readers(file: &Path) -> Option<FileReaders> {
     use std::os::unix::fs::PermissionsExt as _;
     let mode = file.metadata().ok()?.permissions().mode();
     match (mode & 0o040, mode & 0o004) {
         (0, 0) => None,
-        (_, 0) => Some(Readers::Group),
-        (_, _) => Some(Readers::Everybody),
+        (_, 0) => Some(FileReaders::Group),
+        (_, _) => Some(FileReaders::Everybody),
     }
 }
 
 #[cfg(not(unix))]
-const fn readers(_: &Path) -> Option<Readers> {
+const fn readers(_: &Path) -> Option<FileReaders> {
     None
 }
 
@@ -165,7 +165,7 @@ fn utf8(bytes: Vec<u8>) -> Result<String, String> {
 impl TypeFiles {
     /// Creates the definitions from the files of `own`, and from the installations.
     #[must_use]
-    pub const fn new(own: Arc<TypePaths>, environment: Environment) -> Self {
+    pub const fn new(own: Arc<TypePaths>, environment: RosEnvironment) -> Self {
         Self {
             own,
             environment,
@@ -190,13 +190,13 @@ impl TypeFiles {
         match dialect {
             Dialect::Ros1 => ros1.get_or_insert_with(|| {
                 let mut unseen = |_: &Path| {};
-                let mut walk = Walk::new(&mut unseen);
+                let mut walk = FolderWalk::new(&mut unseen);
                 let roots = environment.ros1.iter();
                 Index::of(dialect, roots.flat_map(|root| walk.packages(root, DEEPEST)))
             }),
             Dialect::Ros2 => ros2.get_or_insert_with(|| {
                 let mut unseen = |_: &Path| {};
-                let mut walk = Walk::new(&mut unseen);
+                let mut walk = FolderWalk::new(&mut unseen);
                 let roots = environment.ros2.iter();
                 Index::of(
                     dialect,
@@ -245,7 +245,7 @@ impl DefinitionTexts for TypeFiles {
     }
 }
 
-impl mappings::TypeFiles for TypeFiles {
+impl mappings::OpenTypeFiles for TypeFiles {
     fn faults(&mut self) -> Vec<PathFault> {
         self.own.faults()
     }

@@ -7,13 +7,13 @@ use messages::Dialect;
 
 /// A folder with definitions.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) struct Package {
+pub(crate) struct PackageFolder {
     pub(crate) name: String,
     /// The ROS version of the package, if `package.xml` names it.
     pub(crate) dialect: Option<Dialect>,
 }
 
-impl Package {
+impl PackageFolder {
     /// Reads the `package.xml` of a folder; without it, the package has the name of the folder.
     pub(crate) fn of(folder: &Path) -> Self {
         let named = folder.file_name().map(|name| name.to_string_lossy());

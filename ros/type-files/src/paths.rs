@@ -7,11 +7,11 @@ use std::sync::Arc;
 
 use mappings::{PathFault, PathFaultKind};
 use messages::{
-    DefinitionError, DefinitionText, DefinitionTexts, Dialect, Library, Registry, TextKind,
-    TypeName, check_text,
+    DefinitionError, DefinitionText, DefinitionTexts, Dialect, Library, TextKind, TypeName,
+    TypeRegistry, check_text,
 };
 
-use crate::index::{DefinitionFile, Index, Walk};
+use crate::index::{DefinitionFile, FolderWalk, Index};
 use crate::{definition, read};
 
 /// The definition files of a mapping's `type_paths`, as they were when they were read.
@@ -54,7 +54,7 @@ impl TypePaths {
             paths: paths.to_vec(),
             ..Self::default()
         };
-        let mut walk = Walk::new(see);
+        let mut walk = FolderWalk::new(see);
         for (number, path) in paths.iter().enumerate() {
             read.take(number, path, &mut walk);
         }
@@ -117,11 +117,11 @@ impl TypePaths {
         };
         self.kept
             .push(format!("{file}: a type that `{name}` uses is not defined"));
-        let mut asked = Asked {
+        let mut asked = FoundTypeNames {
             of: before,
             found: Vec::new(),
         };
-        let mut library = Library::new(Registry::bundle(dialect));
+        let mut library = Library::new(TypeRegistry::bundle(dialect));
         // The result does not matter, only the requested names.
         let _known = match kind {
             TextKind::Message => library.message(name, &mut asked).is_ok(),
@@ -211,7 +211,7 @@ impl TypePaths {
         any
     }
 
-    fn take(&mut self, number: usize, path: &Path, walk: &mut Walk<'_>) {
+    fn take(&mut self, number: usize, path: &Path, walk: &mut FolderWalk<'_>) {
         let found = walk.all(path);
         let (own, below): (Vec<_>, Vec<_>) = walk
             .take_unlisted()
@@ -284,12 +284,12 @@ impl TypePaths {
 }
 
 /// Records the requested names that are found.
-struct Asked<'t> {
+struct FoundTypeNames<'t> {
     of: &'t TypePaths,
     found: Vec<(TextKind, TypeName)>,
 }
 
-impl DefinitionTexts for Asked<'_> {
+impl DefinitionTexts for FoundTypeNames<'_> {
     fn find(
         &mut self,
         dialect: Dialect,

@@ -1,7 +1,7 @@
 use std::collections::BTreeMap;
 
-use mappings::{PathFaultKind, TypeFiles as _};
-use messages::{Library, Registry};
+use mappings::{OpenTypeFiles as _, PathFaultKind};
+use messages::{Library, TypeRegistry};
 
 use super::*;
 
@@ -30,7 +30,7 @@ impl Drop for Folder {
     }
 }
 
-fn open(paths: &[PathBuf], environment: Environment) -> TypeFiles {
+fn open(paths: &[PathBuf], environment: RosEnvironment) -> TypeFiles {
     TypeFiles::new(Arc::new(TypePaths::read(paths, &mut |_| {})), environment)
 }
 
@@ -63,13 +63,13 @@ fn a_path_wins_over_the_installation_and_both_over_what_is_built_in() {
             ),
         ],
     );
-    let environment = Environment {
+    let environment = RosEnvironment {
         ros1: vec![folder.path("ws")],
         ros2: vec![],
     };
     let mut files = open(&[folder.path("types")], environment);
     assert!(files.faults().is_empty());
-    let mut library = Library::new(Registry::bundle(Dialect::Ros1));
+    let mut library = Library::new(TypeRegistry::bundle(Dialect::Ros1));
     let service = library
         .service(&name("robot_msgs/Move"), &mut files)
         .unwrap();
@@ -122,12 +122,12 @@ fn an_installation_of_ros_2_is_read_below_share_and_prefers_the_msg_to_the_idl_m
             ("install/lib/nav/msg/Other.msg", "bool x\n"),
         ],
     );
-    let environment = Environment {
+    let environment = RosEnvironment {
         ros1: vec![],
         ros2: vec![folder.path("install")],
     };
     let mut files = open(&[], environment);
-    let mut library = Library::new(Registry::bundle(Dialect::Ros2));
+    let mut library = Library::new(TypeRegistry::bundle(Dialect::Ros2));
     let hip = library.message(&name("nav/Hip"), &mut files).unwrap();
     assert_eq!(hip.leaves()[0].path, "leg.knee");
     assert!(
@@ -169,7 +169,7 @@ fn what_one_ros_is_to_ignore_is_only_looked_into_for_the_other() {
             ("d/folder/inner_msgs/msg/Arm.msg", "bool x\n"),
         ],
     );
-    let environment = Environment {
+    let environment = RosEnvironment {
         ros1: vec![folder.0.clone()],
         ros2: vec![],
     };
@@ -183,7 +183,7 @@ fn what_one_ros_is_to_ignore_is_only_looked_into_for_the_other() {
         ["ament_msgs/Arm", "colcon_msgs/Arm", "robot_msgs/Arm"],
         "the last by its package.xml, and none within it"
     );
-    let mut files = open(std::slice::from_ref(&folder.0), Environment::default());
+    let mut files = open(std::slice::from_ref(&folder.0), RosEnvironment::default());
     assert_eq!(
         names(&mut files, Dialect::Ros2),
         ["inner_msgs/Arm", "old_msgs/Arm"]
@@ -210,7 +210,7 @@ fn a_file_that_does_not_parse_is_told_with_its_line_and_the_others_count() {
     );
     let paths = ["types", "empty", "nowhere", "types/robot_msgs/msg/Good.msg"]
         .map(|path| folder.path(path));
-    let mut files = open(&paths, Environment::default());
+    let mut files = open(&paths, RosEnvironment::default());
     let faults = files.faults();
     let told: Vec<(usize, String)> = faults
         .into_iter()
@@ -229,7 +229,7 @@ fn a_file_that_does_not_parse_is_told_with_its_line_and_the_others_count() {
     ]
     .map(|(path, why)| (path, why.to_owned()));
     assert_eq!(told, expected);
-    let mut library = Library::new(Registry::bundle(Dialect::Ros1));
+    let mut library = Library::new(TypeRegistry::bundle(Dialect::Ros1));
     assert!(
         library
             .message(&name("robot_msgs/Good"), &mut files)
@@ -251,7 +251,7 @@ fn a_single_file_is_of_the_package_around_its_folder() {
     let folder = Folder::new("single", &[("robot_msgs/msg/Arm.msg", "bool x\n")]);
     let mut files = open(
         &[folder.path("robot_msgs/msg/Arm.msg")],
-        Environment::default(),
+        RosEnvironment::default(),
     );
     for dialect in [Dialect::Ros1, Dialect::Ros2] {
         assert!(file(&mut files, dialect, TextKind::Message, "robot_msgs/Arm").is_some());
@@ -290,9 +290,9 @@ const ROBOT: [(&str, &str); 8] = [
 
 /// Returns name and md5 of each service of the folders, and of each message of each action.
 fn md5s(paths: &[PathBuf]) -> BTreeMap<String, String> {
-    let mut files = open(paths, Environment::default());
+    let mut files = open(paths, RosEnvironment::default());
     assert_eq!(files.faults(), []);
-    let mut library = Library::new(Registry::bundle(Dialect::Ros1));
+    let mut library = Library::new(TypeRegistry::bundle(Dialect::Ros1));
     let mut found = BTreeMap::new();
     for service in [
         "robot_msgs/Move",
@@ -374,9 +374,9 @@ fn who_may_read_a_file_is_told_by_its_mode() {
     for (mode, readers) in [
         (0o600, None),
         (0o622, None),
-        (0o640, Some(Readers::Group)),
-        (0o604, Some(Readers::Everybody)),
-        (0o644, Some(Readers::Everybody)),
+        (0o640, Some(FileReaders::Group)),
+        (0o604, Some(FileReaders::Everybody)),
+        (0o644, Some(FileReaders::Everybody)),
     ] {
         std::fs::set_permissions(&path, std::fs::Permissions::from_mode(mode)).unwrap();
         let told = Disk.readers(path.to_str().unwrap());
@@ -546,11 +546,11 @@ fn packages_are_found_by_the_name_in_their_manifest_and_names_are_no_paths() {
             ("prefix/share/base_description/package.xml", ""),
         ],
     );
-    let environment = Environment {
+    let environment = RosEnvironment {
         ros1: vec![folder.path("ws/src")],
         ros2: vec![folder.path("prefix")],
     };
-    assert!(!environment.is_empty() && Environment::default().is_empty());
+    assert!(!environment.is_empty() && RosEnvironment::default().is_empty());
     let found = |name: &str| environment.package(name);
     let arm = folder.path("ws/src/repo/arm");
     assert_eq!(found("arm_description"), Some(arm));

@@ -3,8 +3,8 @@
 
 use mappings::SpaceId;
 use uadp::discovery::{
-    Announced, Announcement, ApplicationDescription, ApplicationType, EndpointDescription, List,
-    MessageSecurityMode,
+    AnnouncedContent, Announcement, ApplicationDescription, ApplicationType, EndpointDescription,
+    MessageSecurityMode, WireArray,
 };
 use uadp::{EncodeError, LocalizedText, PublisherId, SecurityHeader, StatusCode};
 
@@ -22,12 +22,12 @@ pub struct Application {
     /// The ServerCapability identifiers (OPC 10000-12, Annex D).
     pub capabilities: Vec<String>,
     /// The Endpoints of its server.
-    pub endpoints: Vec<Endpoint>,
+    pub endpoints: Vec<ApplicationEndpoint>,
 }
 
 /// An Endpoint of the server of an [`Application`].
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Endpoint {
+pub struct ApplicationEndpoint {
     /// The EndpointUrl.
     pub url: String,
     /// The SecurityPolicyUri.
@@ -46,7 +46,7 @@ impl Application {
         ways: impl IntoIterator<Item = (&'a str, Option<bool>)>,
     ) -> Self {
         for (policy_uri, encrypts) in ways {
-            let each = self.urls.iter().map(|url| Endpoint {
+            let each = self.urls.iter().map(|url| ApplicationEndpoint {
                 url: url.clone(),
                 policy_uri: policy_uri.to_owned(),
                 mode: match encrypts {
@@ -64,9 +64,9 @@ impl Application {
     /// control characters, or if the ApplicationUri is empty.
     pub(crate) fn read(
         description: &ApplicationDescription<'_>,
-        capabilities: List<'_, Option<&str>>,
+        capabilities: WireArray<'_, Option<&str>>,
     ) -> Option<Self> {
-        let texts = |list: List<'_, Option<&str>>| -> Option<Vec<String>> {
+        let texts = |list: WireArray<'_, Option<&str>>| -> Option<Vec<String>> {
             let some = list.iter().take(MOST_TEXTS).flatten();
             some.map(|text| kept(Some(text))).collect()
         };
@@ -92,9 +92,9 @@ impl Application {
         let capabilities = some(&self.capabilities);
         let announcement = Announcement {
             sequence_number,
-            announced: Announced::ApplicationDescription {
+            announced: AnnouncedContent::ApplicationDescription {
                 description: self.description(&urls),
-                capabilities: List::new(&capabilities),
+                capabilities: WireArray::new(&capabilities),
             },
         };
         let publisher = PublisherId::UInt16(space.into());
@@ -120,8 +120,8 @@ impl Application {
         let endpoints: Vec<EndpointDescription<'_>> = endpoints.collect();
         let announcement = Announcement {
             sequence_number,
-            announced: Announced::PublisherEndpoints {
-                endpoints: List::new(&endpoints),
+            announced: AnnouncedContent::PublisherEndpoints {
+                endpoints: WireArray::new(&endpoints),
                 status: if endpoints.is_empty() {
                     BAD_NOT_SUPPORTED
                 } else {
@@ -146,7 +146,7 @@ impl Application {
             } else {
                 ApplicationType::SERVER
             },
-            discovery_urls: List::new(urls),
+            discovery_urls: WireArray::new(urls),
             ..ApplicationDescription::default()
         }
     }

@@ -8,7 +8,7 @@ use uadp::{
 };
 
 use crate::counters::Reason;
-use crate::place::Place;
+use crate::place::SequencePosition;
 
 /// The last key frame of a writer with the changes of the following delta frames.
 ///
@@ -17,7 +17,7 @@ use crate::place::Place;
 /// contains it. Without sequence numbers a loss is not detected, and its effect lasts until the
 /// next key frame.
 #[derive(Debug)]
-pub(crate) struct Base {
+pub(crate) struct KeyFrame {
     /// A DataSetMessage in the form that [`DataSetMessage::decode`] reads.
     message: Vec<u8>,
     from: SocketAddr,
@@ -31,16 +31,16 @@ pub(crate) struct Base {
 
 /// The result of a delta frame.
 #[derive(Debug, PartialEq, Eq)]
-pub(crate) struct Merged {
+pub(crate) struct MergedDelta {
     /// The number of fields of the DataSet.
     pub(crate) count: usize,
     /// The indexes of the fields in the delta frame.
     pub(crate) said: Vec<u16>,
 }
 
-impl Base {
+impl KeyFrame {
     /// Creates the state from a key frame of Variants or DataValues.
-    pub(crate) fn new(message: &DataSetMessage<'_>, place: &Place) -> Self {
+    pub(crate) fn new(message: &DataSetMessage<'_>, place: &SequencePosition) -> Self {
         let mut base = Self {
             message: Vec::new(),
             from: place.from,
@@ -54,7 +54,7 @@ impl Base {
     }
 
     /// Replaces the state by another key frame.
-    pub(crate) fn renew(&mut self, message: &DataSetMessage<'_>, place: &Place) {
+    pub(crate) fn renew(&mut self, message: &DataSetMessage<'_>, place: &SequencePosition) {
         let header = message.header();
         self.message.clear();
         self.message.push(flags(message.encoding()));
@@ -75,7 +75,7 @@ impl Base {
     }
 
     /// Records a repetition of the key frame.
-    pub(crate) const fn repeated(&mut self, place: &Place) {
+    pub(crate) const fn repeated(&mut self, place: &SequencePosition) {
         self.sequence = place.sequence;
     }
 
@@ -98,9 +98,9 @@ impl Base {
     pub(crate) fn merge(
         &mut self,
         delta: &DataSetMessage<'_>,
-        place: &Place,
+        place: &SequencePosition,
         out: &mut Vec<u8>,
-    ) -> Result<Merged, (Reason, String)> {
+    ) -> Result<MergedDelta, (Reason, String)> {
         let follows = match (self.sequence, place.sequence) {
             (Some(last), Some(next)) => next == last.wrapping_add(1),
             (None, None) => true,
@@ -114,7 +114,7 @@ impl Base {
             self.in_doubt.clear();
             self.in_doubt.resize(count, true);
         }
-        let Ok(Merged { said, .. }) = &merged else {
+        let Ok(MergedDelta { said, .. }) = &merged else {
             return merged;
         };
         for index in said {
@@ -149,7 +149,7 @@ fn merged(
     base: &[u8],
     delta: &DataSetMessage<'_>,
     out: &mut Vec<u8>,
-) -> Result<Merged, (Reason, String)> {
+) -> Result<MergedDelta, (Reason, String)> {
     let malformed = |error: DecodeError| (Reason::Malformed, error.to_string());
     let whole = DataSetMessage::decode(None, base).map_err(malformed)?;
     let fields = whole.values().map_err(malformed)?;
@@ -171,7 +171,7 @@ fn merged(
     }
     let count = fields.len();
     write(whole.encoding(), &fields, out).map_err(|error| (Reason::TooBig, error.to_string()))?;
-    Ok(Merged { count, said })
+    Ok(MergedDelta { count, said })
 }
 
 /// Returns whether an entry contains no change. open62541 ends its delta frames with entries for

@@ -4,13 +4,13 @@ use uadp::{
     DataSetHeader, EncodeError, FieldEncoder, NetworkHeader, NetworkMessage, NetworkMessageEncoder,
 };
 
-use crate::counters::{Cause, Reason};
+use crate::counters::{DropCause, Reason};
 use crate::fields;
 
 /// Returns the block of the fields that `write` writes.
 pub(crate) fn block(
-    write: impl FnOnce(&mut FieldEncoder<'_>) -> Result<(), (Cause, String)>,
-) -> Result<Vec<u8>, (Cause, String)> {
+    write: impl FnOnce(&mut FieldEncoder<'_>) -> Result<(), (DropCause, String)>,
+) -> Result<Vec<u8>, (DropCause, String)> {
     let mut scratch = Vec::new();
     let mut message = NetworkMessageEncoder::new(&mut scratch, &NetworkHeader::default(), None)
         .map_err(too_big)?;
@@ -30,7 +30,7 @@ pub(crate) fn block(
     Ok(fields.map_or_else(|| NO_FIELDS.to_vec(), |fields| fields.bytes().to_vec()))
 }
 
-pub(crate) fn too_big(error: EncodeError) -> (Cause, String) {
+pub(crate) fn too_big(error: EncodeError) -> (DropCause, String) {
     (Reason::TooBig.into(), error.to_string())
 }
 

@@ -3,13 +3,13 @@
 use std::sync::Arc;
 
 use mappings::FieldMap;
-use messages::{MessageType, Plan, Selection};
+use messages::{MessagePlan, MessageType, Selection};
 use uadp::Fields;
 
-use crate::call::{CallDescription, CallField, CallRole, CallTypeError, Origin};
+use crate::call::{CallDescription, CallField, CallRole, CallTypeError, FieldOrigin};
 use crate::call_plan;
-use crate::counters::Cause;
-use crate::description::Described;
+use crate::counters::DropCause;
+use crate::description::TopicMetaData;
 use crate::fields;
 
 /// Converts the fields of a value of another space to a message, in any order of the fields.
@@ -20,7 +20,7 @@ pub(crate) struct ByName {
     map: FieldMap,
     /// The description from the writer, and the indexes of the used fields in the order of the
     /// message.
-    arranged: Option<(Arc<Described>, Vec<Origin>)>,
+    arranged: Option<(Arc<TopicMetaData>, Vec<FieldOrigin>)>,
 }
 
 impl ByName {
@@ -40,7 +40,7 @@ impl ByName {
     /// Returns the reason if the fields do not fit the message.
     pub(crate) fn arrange(
         &mut self,
-        described: Arc<Described>,
+        described: Arc<TopicMetaData>,
     ) -> Result<Option<(Arc<MessageType>, Selection)>, CallTypeError> {
         if let Some((known, _)) = &self.arranged
             && *known == described
@@ -55,10 +55,10 @@ impl ByName {
     /// Appends the message of the fields.
     pub(crate) fn write(
         &self,
-        plan: &Plan,
+        plan: &MessagePlan,
         fields: &[u8],
         out: &mut Vec<u8>,
-    ) -> Result<(), (Cause, String)> {
+    ) -> Result<(), (DropCause, String)> {
         let order = self.arranged.as_ref();
         let order = order.map_or(&[][..], |(_, order)| order);
         let fields = call_plan::arrange(fields, order)?;
@@ -72,9 +72,9 @@ impl ByName {
 
 /// Returns the selection of fields in the message, and the index of the source field for each.
 fn order(
-    described: &Described,
+    described: &TopicMetaData,
     (message_type, map): (&MessageType, &FieldMap),
-) -> Result<(Selection, Vec<Origin>), CallTypeError> {
+) -> Result<(Selection, Vec<FieldOrigin>), CallTypeError> {
     let fields = described.fields.iter().map(CallField::of).collect();
     let call = CallDescription {
         name: String::new(),
@@ -84,5 +84,8 @@ fn order(
         response: fields,
     };
     let (selection, order) = call.response_order(message_type, map)?;
-    Ok((selection, order.into_iter().map(Origin::Leaf).collect()))
+    Ok((
+        selection,
+        order.into_iter().map(FieldOrigin::Leaf).collect(),
+    ))
 }

@@ -7,7 +7,9 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use mappings::{Assigned, FieldMap, Overflow, SpaceId, TopicId};
-use messages::{Leaf, MessageType, PlanError, Rank, Selected, Selection, ServiceType, TypeName};
+use messages::{
+    ArrayRank, Leaf, MessageType, PlanError, Selected, Selection, ServiceType, TypeName,
+};
 use uadp::action::{ExecutionId, Refusal};
 use uadp::{BuiltinType, StatusCode};
 
@@ -88,7 +90,7 @@ pub struct CallField {
     /// The builtin type of the field or of its elements.
     pub builtin: BuiltinType,
     /// Whether the field is an array.
-    pub rank: Rank,
+    pub rank: ArrayRank,
     /// For a field of a request: whether it has a default value, which is used if the request has
     /// no fields.
     pub optional: bool,
@@ -131,7 +133,7 @@ pub struct AskId(pub u64);
 
 /// The outcome of a request: the response in the local encoding, or the reason why there is no
 /// response.
-pub type Answered<R = Vec<u8>> = Result<R, AskError>;
+pub type CallResponse<R = Vec<u8>> = Result<R, AskError>;
 
 /// The reason why a request has no response.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -158,7 +160,7 @@ pub enum AskErrorKind {
 
 /// A request of another program for the local side to execute.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Execution<R = Vec<u8>> {
+pub struct CallExecution<R = Vec<u8>> {
     /// The unique identifier of the execution.
     pub id: ExecutionId,
     /// The topic of the call.
@@ -190,7 +192,7 @@ pub enum Executed {
 
 /// A call that the local side executes.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Offered {
+pub struct OfferedCall {
     /// The arguments and results of the call.
     pub description: CallDescription,
     /// Whether requests from other hosts are executed. If false, only requests from a loopback
@@ -227,7 +229,7 @@ pub struct CallMap {
 
 /// The source of a field of a request.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) enum Origin {
+pub(crate) enum FieldOrigin {
     /// The field at this index of the ROS message.
     Leaf(usize),
     /// A constant, as block with a single field.
@@ -301,7 +303,7 @@ impl CallField {
         Self {
             name: name.to_owned(),
             builtin,
-            rank: Rank::Scalar,
+            rank: ArrayRank::Scalar,
             optional: false,
             structure: None,
             note: None,
@@ -312,7 +314,7 @@ impl CallField {
     #[must_use]
     pub fn array(name: &str, builtin: BuiltinType) -> Self {
         Self {
-            rank: Rank::Array { fixed: None },
+            rank: ArrayRank::Array { fixed: None },
             ..Self::scalar(name, builtin)
         }
     }
@@ -423,16 +425,16 @@ impl CallDescription {
         &self,
         message: &MessageType,
         map: &FieldMap,
-    ) -> Result<Option<Vec<Origin>>, CallTypeError> {
+    ) -> Result<Option<Vec<FieldOrigin>>, CallTypeError> {
         let leaves = message.leaves();
         if leaves.is_empty() && map.is_empty() && self.may_be_empty() {
             return Ok(None);
         }
-        let origin = |field: &CallField| -> Result<Origin, CallTypeError> {
+        let origin = |field: &CallField| -> Result<FieldOrigin, CallTypeError> {
             let path = match map.source(&field.name) {
                 Some(Assigned::Constant(literal)) => {
                     let block = constant::block(field, (field.builtin, field.rank), &literal)?;
-                    return Ok(Origin::Constant(block));
+                    return Ok(FieldOrigin::Constant(block));
                 }
                 Some(Assigned::Field(path)) => path,
                 None => field.name.clone(),
@@ -442,7 +444,7 @@ impl CallDescription {
                     && takes(field.rank, leaf.rank)
                     && field.builtin == leaf.builtin
             };
-            let found = leaves.iter().position(find).map(Origin::Leaf);
+            let found = leaves.iter().position(find).map(FieldOrigin::Leaf);
             let is_same_name = path == field.name;
             // An optional field without a source is sent as null, so that its default value is
             // used.
@@ -452,7 +454,7 @@ impl CallDescription {
                     && !leaves
                         .iter()
                         .any(|leaf| path.eq_ignore_ascii_case(&leaf.path));
-                is_left_out.then(|| Origin::Constant(constant::NULL.to_vec()))
+                is_left_out.then(|| FieldOrigin::Constant(constant::NULL.to_vec()))
             });
             found.ok_or_else(|| {
                 let (field, lacked_by) = (field.to_string(), message.name().clone());
@@ -468,11 +470,11 @@ impl CallDescription {
             })
         };
         let order = self.request.iter().map(origin);
-        let order: Vec<Origin> = order.collect::<Result<_, _>>()?;
+        let order: Vec<FieldOrigin> = order.collect::<Result<_, _>>()?;
         let missing = leaves
             .iter()
             .enumerate()
-            .find(|(at, _)| !order.contains(&Origin::Leaf(*at)));
+            .find(|(at, _)| !order.contains(&FieldOrigin::Leaf(*at)));
         match missing {
             Some((_, leaf)) if map.is_empty() => Err(CallTypeError::NotRequested {
                 message: message.name().clone(),
@@ -556,18 +558,19 @@ pub(crate) fn join_name(topic: TopicId, name: &str) -> String {
 }
 
 /// Returns whether values of rank `given` can be assigned to a field of rank `wanted`.
-fn takes(wanted: Rank, given: Rank) -> bool {
+fn takes(wanted: ArrayRank, given: ArrayRank) -> bool {
     match (wanted, given) {
-        (Rank::Scalar, Rank::Scalar) => true,
-        (Rank::Array { fixed: None }, Rank::Array { .. }) => true,
-        (Rank::Array { fixed }, Rank::Array { fixed: given }) => fixed == given,
-        (Rank::Scalar, Rank::Array { .. }) | (Rank::Array { .. }, Rank::Scalar) => false,
+        (ArrayRank::Scalar, ArrayRank::Scalar) => true,
+        (ArrayRank::Array { fixed: None }, ArrayRank::Array { .. }) => true,
+        (ArrayRank::Array { fixed }, ArrayRank::Array { fixed: given }) => fixed == given,
+        (ArrayRank::Scalar, ArrayRank::Array { .. })
+        | (ArrayRank::Array { .. }, ArrayRank::Scalar) => false,
     }
 }
 
-fn kind(builtin: BuiltinType, rank: Rank) -> String {
+fn kind(builtin: BuiltinType, rank: ArrayRank) -> String {
     match rank {
-        Rank::Scalar => format!("{builtin}"),
-        Rank::Array { .. } => format!("{builtin}[]"),
+        ArrayRank::Scalar => format!("{builtin}"),
+        ArrayRank::Array { .. } => format!("{builtin}[]"),
     }
 }

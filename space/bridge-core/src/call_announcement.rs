@@ -9,14 +9,14 @@ use std::hash::{DefaultHasher, Hash, Hasher};
 use std::sync::Arc;
 
 use mappings::{TopicId, Unit};
-use messages::{MessageType, Rank};
+use messages::{ArrayRank, MessageType};
 use uadp::discovery::{
-    ActionMetaData, ActionTargetDataType, Announced, Announcement, ConfigurationVersion,
-    DataSetMetaDataType, DataTypeSchemaHeader, EUInformation, FieldMetaData, KeyValuePair, List,
-    Range, Settings as _, StructureDescription, StructureType,
+    ActionMetaData, ActionTargetDataType, AnnouncedContent, Announcement, ConfigurationVersion,
+    DataSetMetaDataType, DataTypeSchemaHeader, EUInformation, FieldMetaData, KeyValuePair, Range,
+    SettingsStructure as _, StructureDescription, StructureType, WireArray,
 };
 use uadp::{
-    Array, BuiltinType, EncodeError, Identifier, NodeId, PublisherId, QualifiedName, Scalar,
+    Array, BuiltinType, EncodeError, NodeId, NodeIdValue, PublisherId, QualifiedName, Scalar,
     SecurityHeader, Timestamp, Variant,
 };
 
@@ -28,11 +28,11 @@ use crate::description::{
     text, value_rank, version_time, with_structures,
 };
 use crate::learned::Weight;
-use crate::redundancy::Rank as BridgeRank;
+use crate::redundancy::RedundancyRank as BridgeRank;
 
 /// The ROS messages of the fields of a call.
 #[derive(Clone, Copy)]
-pub(crate) struct Types<'m> {
+pub(crate) struct CallTypes<'m> {
     pub(crate) request: &'m MessageType,
     pub(crate) response: &'m MessageType,
 }
@@ -41,7 +41,7 @@ pub(crate) struct Types<'m> {
 /// index, and the ActionTargetId.
 pub(crate) type Said<'s> = (
     &'s CallDescription,
-    Option<Types<'s>>,
+    Option<CallTypes<'s>>,
     &'s BTreeMap<u16, String>,
     u16,
 );
@@ -137,12 +137,12 @@ fn encode(
         response.with(topic, namespaces, |response| {
             let announcement = Announcement {
                 sequence_number: 0,
-                announced: Announced::ActionMetaData(ActionMetaData {
+                announced: AnnouncedContent::ActionMetaData(ActionMetaData {
                     writer_id,
-                    action_targets: List::new(&target),
+                    action_targets: WireArray::new(&target),
                     request: *request,
                     response: *response,
-                    action_methods: List::null(),
+                    action_methods: WireArray::null(),
                 }),
             };
             let mut datagram = Vec::new();
@@ -488,8 +488,8 @@ fn read_structure(
     let fields = definition.fields.iter().map(|field| {
         let name = field.name.filter(|name| name.len() <= MAX_NAME)?;
         let rank = match field.value_rank {
-            -1 => Rank::Scalar,
-            1 => Rank::Array {
+            -1 => ArrayRank::Scalar,
+            1 => ArrayRank::Array {
                 fixed: field.array_dimensions.get(0).filter(|length| *length > 0),
             },
             _ => return None,
@@ -503,7 +503,7 @@ fn read_structure(
                 None,
                 NodeId {
                     namespace: 0,
-                    identifier: Identifier::Numeric(number),
+                    identifier: NodeIdValue::Numeric(number),
                 },
             ) => {
                 let builtin = u8::try_from(number).ok().and_then(BuiltinType::from_id)?;

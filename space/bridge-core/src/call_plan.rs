@@ -2,24 +2,24 @@
 
 use std::sync::Arc;
 
-use messages::{MessageType, Plan, Selection, ServiceType, Wire};
+use messages::{MessagePlan, MessageType, Selection, ServiceType, Wire};
 use uadp::{Fields, Variant};
 
 use crate::block::{NO_FIELDS, block, too_big};
-use crate::call::{CallDescription, CallMap, CallTypeError, Origin};
-use crate::counters::{Cause, Reason};
-use crate::fields::{self, Payload};
+use crate::call::{CallDescription, CallMap, CallTypeError, FieldOrigin};
+use crate::counters::{DropCause, Reason};
+use crate::fields::{self, LocalPayload};
 use crate::plans::Plans;
 
 /// Converts between the bytes of a service type and the fields of a call of another program.
 #[derive(Debug)]
 pub(crate) struct CallPlan {
-    request: Arc<Plan>,
-    response: Arc<Plan>,
+    request: Arc<MessagePlan>,
+    response: Arc<MessagePlan>,
     /// The source of each field of the request; `None` for a request without fields.
-    request_order: Option<Vec<Origin>>,
+    request_order: Option<Vec<FieldOrigin>>,
     /// The index in the response for each field of the ROS message.
-    response_order: Vec<Origin>,
+    response_order: Vec<FieldOrigin>,
 }
 
 impl CallPlan {
@@ -39,7 +39,7 @@ impl CallPlan {
             request: plan(service.request(), &Selection::Whole)?,
             response: plan(service.response(), &made)?,
             request_order,
-            response_order: order.into_iter().map(Origin::Leaf).collect(),
+            response_order: order.into_iter().map(FieldOrigin::Leaf).collect(),
         })
     }
 
@@ -48,8 +48,8 @@ impl CallPlan {
         &self,
         message: &[u8],
         namespace: u16,
-    ) -> Result<Vec<u8>, (Cause, String)> {
-        let payload = Payload::Ros(&self.request, message);
+    ) -> Result<Vec<u8>, (DropCause, String)> {
+        let payload = LocalPayload::Ros(&self.request, message);
         let read = block(|frame| fields::read(&payload, namespace, frame))?;
         match &self.request_order {
             None => Ok(NO_FIELDS.to_vec()),
@@ -59,7 +59,11 @@ impl CallPlan {
     }
 
     /// Appends the ROS bytes of a response.
-    pub(crate) fn response(&self, fields: &[u8], out: &mut Vec<u8>) -> Result<(), (Cause, String)> {
+    pub(crate) fn response(
+        &self,
+        fields: &[u8],
+        out: &mut Vec<u8>,
+    ) -> Result<(), (DropCause, String)> {
         let count = Fields::parse(fields).map_err(fields::undecodable)?.len();
         let order = &self.response_order;
         let arranged = if is_identity(order) && count == order.len() {
@@ -73,7 +77,10 @@ impl CallPlan {
 }
 
 /// Returns a block with the fields of the given origins in their order.
-pub(crate) fn arrange(fields: &[u8], order: &[Origin]) -> Result<Vec<u8>, (Cause, String)> {
+pub(crate) fn arrange(
+    fields: &[u8],
+    order: &[FieldOrigin],
+) -> Result<Vec<u8>, (DropCause, String)> {
     let fields = Fields::parse(fields).map_err(fields::undecodable)?;
     let all: Vec<Variant<'_>> = fields
         .collect::<Result<_, _>>()
@@ -81,8 +88,8 @@ pub(crate) fn arrange(fields: &[u8], order: &[Origin]) -> Result<Vec<u8>, (Cause
     block(|frame| {
         for origin in order {
             let place = match origin {
-                Origin::Leaf(place) => *place,
-                Origin::Constant(block) => {
+                FieldOrigin::Leaf(place) => *place,
+                FieldOrigin::Constant(block) => {
                     for field in Fields::parse(block).map_err(fields::undecodable)? {
                         let field = field.map_err(fields::undecodable)?;
                         frame.variant(&field).map_err(too_big)?;
@@ -105,8 +112,8 @@ pub(crate) fn arrange(fields: &[u8], order: &[Origin]) -> Result<Vec<u8>, (Cause
 /// executes.
 #[derive(Debug)]
 pub(crate) struct ExecutedPlan {
-    request: Arc<Plan>,
-    response: Arc<Plan>,
+    request: Arc<MessagePlan>,
+    response: Arc<MessagePlan>,
 }
 
 impl ExecutedPlan {
@@ -126,7 +133,11 @@ impl ExecutedPlan {
     }
 
     /// Appends the ROS bytes of a request.
-    pub(crate) fn request(&self, fields: &[u8], out: &mut Vec<u8>) -> Result<(), (Cause, String)> {
+    pub(crate) fn request(
+        &self,
+        fields: &[u8],
+        out: &mut Vec<u8>,
+    ) -> Result<(), (DropCause, String)> {
         let fields = Fields::parse(fields).map_err(fields::undecodable)?;
         fields::write(&self.request, fields, out)
     }
@@ -136,13 +147,13 @@ impl ExecutedPlan {
         &self,
         message: &[u8],
         namespace: u16,
-    ) -> Result<Vec<u8>, (Cause, String)> {
-        let payload = Payload::Ros(&self.response, message);
+    ) -> Result<Vec<u8>, (DropCause, String)> {
+        let payload = LocalPayload::Ros(&self.response, message);
         block(|frame| fields::read(&payload, namespace, frame))
     }
 }
 
-fn is_identity(order: &[Origin]) -> bool {
+fn is_identity(order: &[FieldOrigin]) -> bool {
     let mut origins = order.iter().enumerate();
-    origins.all(|(at, origin)| *origin == Origin::Leaf(at))
+    origins.all(|(at, origin)| *origin == FieldOrigin::Leaf(at))
 }

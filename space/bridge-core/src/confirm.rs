@@ -21,7 +21,7 @@ use uadp::{
 
 /// The outcome of an event that bridges confirm.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Arrival {
+pub enum ConfirmedArrival {
     /// Each space in the mapping of the event has confirmed it.
     Confirmed,
     /// These spaces have not confirmed the event in time. Its arrival there is unknown.
@@ -51,7 +51,7 @@ pub(crate) struct Confirming {
 
 /// An event of the own space that is not confirmed yet.
 #[derive(Debug)]
-pub(crate) struct Awaited {
+pub(crate) struct AwaitedEvent {
     mark: Mark,
     /// The time at which the event is given up.
     pub(crate) until: Instant,
@@ -123,8 +123,8 @@ impl Confirming {
         self.within
     }
 
-    pub(crate) fn await_event(&self, mark: Mark, now: Instant) -> Awaited {
-        Awaited {
+    pub(crate) fn await_event(&self, mark: Mark, now: Instant) -> AwaitedEvent {
+        AwaitedEvent {
             mark,
             until: now + self.within,
             spaces: self.spaces.clone(),
@@ -132,7 +132,7 @@ impl Confirming {
     }
 }
 
-impl Awaited {
+impl AwaitedEvent {
     /// Returns whether the space has not confirmed the event yet.
     pub(crate) fn is_awaited(&self, mark: Mark, space: SpaceId) -> bool {
         self.mark == mark && self.spaces.contains(&space)

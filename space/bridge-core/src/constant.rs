@@ -2,11 +2,11 @@
 
 use std::fmt::Display;
 
-use messages::{Literal, Rank, constant};
+use messages::{ArrayRank, Literal, constant};
 use uadp::{BuiltinType, FieldEncoder, Scalar};
 
 use crate::block;
-use crate::counters::Cause;
+use crate::counters::DropCause;
 
 /// The block with a single null field, for a field without a value.
 pub(crate) const NULL: [u8; 3] = [1, 0, 0];
@@ -59,31 +59,31 @@ pub enum ConstantFault {
 /// Returns the reason if the value does not fit the type of the field.
 pub(crate) fn block(
     field: &impl Display,
-    (builtin, rank): (BuiltinType, Rank),
+    (builtin, rank): (BuiltinType, ArrayRank),
     literal: &Literal,
 ) -> Result<Vec<u8>, ConstantFault> {
     let name = || field.to_string();
     let texts = match (literal, rank, builtin) {
-        (Literal::One(text), Rank::Scalar, _) => std::slice::from_ref(text),
-        (Literal::List(texts), Rank::Scalar, BuiltinType::ByteString) => {
+        (Literal::One(text), ArrayRank::Scalar, _) => std::slice::from_ref(text),
+        (Literal::List(texts), ArrayRank::Scalar, BuiltinType::ByteString) => {
             let numbers = texts.iter().map(|text| text.parse::<u8>());
             let bytes: Vec<u8> = numbers
                 .collect::<Result<_, _>>()
                 .map_err(|_| ConstantFault::NotBytes { field: name() })?;
             return encode(|frame| frame.scalar(Scalar::ByteString(Some(&bytes))));
         }
-        (Literal::List(texts), Rank::Array { fixed }, _)
+        (Literal::List(texts), ArrayRank::Array { fixed }, _)
             if fixed.is_none_or(|fixed| usize::try_from(fixed) == Ok(texts.len())) =>
         {
             texts
         }
-        (Literal::List(_), Rank::Array { .. }, _) => {
+        (Literal::List(_), ArrayRank::Array { .. }, _) => {
             return Err(ConstantFault::Length { field: name() });
         }
-        (Literal::List(_), Rank::Scalar, _) => {
+        (Literal::List(_), ArrayRank::Scalar, _) => {
             return Err(ConstantFault::List { field: name() });
         }
-        (Literal::One(_), Rank::Array { .. }, _) => {
+        (Literal::One(_), ArrayRank::Array { .. }, _) => {
             return Err(ConstantFault::Single { field: name() });
         }
     };
@@ -95,8 +95,8 @@ pub(crate) fn block(
     });
     let values: Vec<Scalar<'_>> = values.collect::<Result<_, _>>()?;
     encode(|frame| match rank {
-        Rank::Scalar => values.iter().try_for_each(|value| frame.scalar(*value)),
-        Rank::Array { .. } => {
+        ArrayRank::Scalar => values.iter().try_for_each(|value| frame.scalar(*value)),
+        ArrayRank::Array { .. } => {
             frame.array(builtin, values.len())?;
             values.iter().try_for_each(|value| frame.element(*value))
         }
@@ -107,7 +107,7 @@ fn encode(
     write: impl FnOnce(&mut FieldEncoder<'_>) -> Result<(), uadp::EncodeError>,
 ) -> Result<Vec<u8>, ConstantFault> {
     let written = block::block(|frame| write(frame).map_err(block::too_big));
-    written.map_err(|(_, why): (Cause, String)| ConstantFault::Encoding(why))
+    written.map_err(|(_, why): (DropCause, String)| ConstantFault::Encoding(why))
 }
 
 #[cfg(test)]
@@ -118,7 +118,7 @@ mod tests {
 
     #[test]
     fn a_constant_is_a_field_of_the_type_of_its_call() {
-        let speed = (BuiltinType::Int32, Rank::Scalar);
+        let speed = (BuiltinType::Int32, ArrayRank::Scalar);
         let bytes = block(&"`speed`", speed, &Literal::One("100".to_owned())).unwrap();
         let mut fields = Fields::parse(&bytes).unwrap();
         let field = fields.next().unwrap().unwrap();
@@ -128,7 +128,7 @@ mod tests {
         let why = why.to_string();
         assert!(why.contains("`fast`") && why.contains("`speed`"), "{why}");
         block(&"`speed`", speed, &Literal::List(vec!["1".to_owned()])).unwrap_err();
-        let list = (BuiltinType::Double, Rank::Array { fixed: None });
+        let list = (BuiltinType::Double, ArrayRank::Array { fixed: None });
         let literal = Literal::List(vec!["0.5".to_owned(), "1".to_owned()]);
         let bytes = block(&"`joints`", list, &literal).unwrap();
         let Variant::Array(array) = Fields::parse(&bytes).unwrap().next().unwrap().unwrap() else {

@@ -320,24 +320,24 @@ pub struct Counters {
     /// Values that came later than the deadline after the value before.
     pub deadline_missed: u64,
     /// The drops by cause, sorted. A list, because most topics have few causes.
-    dropped: Vec<(Cause, u64)>,
+    dropped: Vec<(DropCause, u64)>,
 }
 
 /// The cause of a drop: the counted reason, and a case that the log distinguishes. Frequent drops
 /// of one case do not hide rare drops of another case.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-pub(crate) struct Cause {
+pub(crate) struct DropCause {
     pub(crate) reason: Reason,
     pub(crate) case: &'static str,
 }
 
-impl From<Reason> for Cause {
+impl From<Reason> for DropCause {
     fn from(reason: Reason) -> Self {
         Self { reason, case: "" }
     }
 }
 
-impl From<(Reason, &'static str)> for Cause {
+impl From<(Reason, &'static str)> for DropCause {
     fn from((reason, case): (Reason, &'static str)) -> Self {
         Self { reason, case }
     }
@@ -365,7 +365,7 @@ impl Counters {
     }
 
     /// Adds `count` drops and returns the total for the cause.
-    pub(crate) fn add(&mut self, cause: impl Into<Cause>, count: u64) -> u64 {
+    pub(crate) fn add(&mut self, cause: impl Into<DropCause>, count: u64) -> u64 {
         let cause = cause.into();
         let place = self.dropped.binary_search_by_key(&cause, |(each, _)| *each);
         if let Err(before) = place
@@ -404,7 +404,7 @@ impl Counters {
         self.keep_alives += keep_alives;
         self.sender_changed += sender_changed;
         self.deadline_missed += deadline_missed;
-        for (Cause { reason, .. }, count) in dropped {
+        for (DropCause { reason, .. }, count) in dropped {
             // A separate case, so that the inherited total does not delay the log entries of other
             // cases.
             self.add((*reason, "of a topic before"), *count);

@@ -17,10 +17,11 @@ use std::collections::hash_map::DefaultHasher;
 use std::hash::{Hash, Hasher};
 
 use mappings::{Binding, Meaning, SpaceId, TopicId, Unit, Variable};
-use messages::{Leaf, MessageType, Rank, Selected, Selection, TypeName};
+use messages::{ArrayRank, Leaf, MessageType, Selected, Selection, TypeName};
 use uadp::discovery::{
-    Announced, Announcement, ConfigurationVersion, DataSetMetaDataType, EUInformation,
-    EnumValueType, FieldMetaData, KeyValuePair, List, Range, Settings, enum_strings, strings,
+    AnnouncedContent, Announcement, ConfigurationVersion, DataSetMetaDataType, EUInformation,
+    EnumValueType, FieldMetaData, KeyValuePair, Range, SettingsStructure, WireArray, enum_strings,
+    strings,
 };
 use uadp::{
     BuiltinType, EncodeError, Guid, LocalizedText, PublisherId, QualifiedName, Scalar,
@@ -33,7 +34,7 @@ use crate::learned::Weight;
 
 /// The DataSetMetaData of a topic from a writer of another space.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Described {
+pub struct TopicMetaData {
     /// The ROS type of the message that the fields form.
     pub message_type: TypeName,
     /// Whether a single ByteString contains the whole message.
@@ -46,7 +47,7 @@ pub struct Described {
     pub fields: Vec<Leaf>,
 }
 
-impl Described {
+impl TopicMetaData {
     /// Returns the selection of the fields in a local type of the same name; `None` if the type has
     /// other fields.
     #[must_use]
@@ -55,7 +56,7 @@ impl Described {
             return Some(Selection::Bytes);
         }
         if let [one] = &self.fields[..]
-            && (one.builtin, one.rank) == (BuiltinType::ExtensionObject, Rank::Scalar)
+            && (one.builtin, one.rank) == (BuiltinType::ExtensionObject, ArrayRank::Scalar)
         {
             return Some(Selection::Structure(None));
         }
@@ -78,7 +79,7 @@ impl Described {
     /// Returns whether values of these types match the description. The flag is true for arrays.
     pub(crate) fn fits(&self, shape: &[(BuiltinType, bool)]) -> bool {
         let fields = self.fields.iter().map(|field| {
-            let array = matches!(field.rank, Rank::Array { .. });
+            let array = matches!(field.rank, ArrayRank::Array { .. });
             (field.builtin, array)
         });
         fields.eq(shape.iter().copied())
@@ -147,7 +148,7 @@ pub(crate) enum DescriptionFault {
     Full,
 }
 
-impl Weight for Described {
+impl Weight for TopicMetaData {
     fn weight(&self) -> usize {
         let names: usize = self.fields.iter().map(|field| field.path.len()).sum();
         let texts = self.name.len() + self.about.len();
@@ -174,10 +175,10 @@ fn read_field(field: &FieldMetaData<'_>) -> Result<Leaf, DescriptionFault> {
 ///
 /// # Errors
 /// The field has or may have several dimensions.
-pub(crate) fn read_rank(field: &FieldMetaData<'_>) -> Result<Rank, DescriptionFault> {
+pub(crate) fn read_rank(field: &FieldMetaData<'_>) -> Result<ArrayRank, DescriptionFault> {
     match field.value_rank {
-        -1 => Ok(Rank::Scalar),
-        1 => Ok(Rank::Array {
+        -1 => Ok(ArrayRank::Scalar),
+        1 => Ok(ArrayRank::Array {
             fixed: field.array_dimensions.get(0).filter(|length| *length > 0),
         }),
         other => Err(DescriptionFault::ValueRank(other)),
@@ -191,7 +192,7 @@ fn is_same(a: &Leaf, b: &Leaf) -> bool {
 
 /// The announcement of a topic of the own space.
 #[derive(Debug)]
-pub(crate) struct Description {
+pub(crate) struct OwnAnnouncements {
     /// The complete announcement with the SequenceNumber 0.
     datagram: Vec<u8>,
     /// The offset of the body in the announcement.
@@ -203,7 +204,7 @@ pub(crate) struct Description {
 
 /// A topic and the sources of its metadata.
 #[derive(Clone, Copy)]
-pub(crate) struct Source<'s> {
+pub(crate) struct MetaDataSource<'s> {
     pub(crate) topic: TopicId,
     /// The message of the fields, and the selection of fields. `None` if no message is converted;
     /// the mapping alone then describes the fields.
@@ -218,7 +219,7 @@ pub(crate) struct Source<'s> {
     pub(crate) namespaces: &'s BTreeMap<u16, String>,
 }
 
-impl Description {
+impl OwnAnnouncements {
     /// Creates the description of a topic. The version is the version of `before` if the content is
     /// the same, and newer otherwise.
     ///
@@ -226,7 +227,7 @@ impl Description {
     /// Returns an [`EncodeError`] for a name that is too long, and for more than
     /// [`MAX_ANNOUNCEMENT`] bytes in total.
     pub(crate) fn new(
-        source: Source<'_>,
+        source: MetaDataSource<'_>,
         before: Option<&Self>,
         utc: Timestamp,
     ) -> Result<Self, EncodeError> {
@@ -278,7 +279,7 @@ impl Description {
     }
 }
 
-impl Source<'_> {
+impl MetaDataSource<'_> {
     /// Returns the announcement and the offset of its body.
     fn encode(&self, version: ConfigurationVersion) -> Result<(Vec<u8>, usize), EncodeError> {
         let (_, namespace, _) = self.topic.triple();
@@ -305,7 +306,7 @@ impl Source<'_> {
         let plain = DataSetMetaDataType {
             name: Some(&name),
             description: text(&description),
-            fields: List::new(&fields),
+            fields: WireArray::new(&fields),
             configuration_version: version,
             ..DataSetMetaDataType::default()
         };
@@ -327,7 +328,7 @@ impl Source<'_> {
         let (space, _, writer_id) = self.topic.triple();
         let announcement = Announcement {
             sequence_number: 0,
-            announced: Announced::DataSetMetaData {
+            announced: AnnouncedContent::DataSetMetaData {
                 writer_id,
                 meta_data: *meta_data,
                 status: StatusCode::GOOD,
@@ -478,9 +479,9 @@ pub(crate) fn mapped_leaves(variable: &Variable) -> Vec<Leaf> {
     }
     let rank = |array| {
         if array {
-            Rank::Array { fixed: None }
+            ArrayRank::Array { fixed: None }
         } else {
-            Rank::Scalar
+            ArrayRank::Scalar
         }
     };
     match variable.value_type {

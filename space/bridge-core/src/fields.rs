@@ -6,31 +6,32 @@
 //! with the name of the ROS type in the namespace of the topic.
 
 use messages::{
-    Fault, Plan, ReadError, Sink, Source, SourceError, TypeName, ValueFault, WriteError, WriteFault,
+    FieldSink, FieldSupplier, MessageFault, MessagePlan, ReadError, SourceError, TypeName,
+    ValueFault, WriteError, WriteFault,
 };
 use uadp::{
     Array, BuiltinType, DecodeError, Elements, EncodeError, ExtensionBody, FieldEncoder, Fields,
     NodeId, Scalar, StructureReader, Variant,
 };
 
-use crate::counters::{Cause, Reason};
+use crate::counters::{DropCause, Reason};
 
 /// A payload of the local side with its format.
-pub(crate) enum Payload<'a> {
+pub(crate) enum LocalPayload<'a> {
     /// A block of fields to copy.
     Block(&'a [u8]),
     /// A ROS message with its plan.
-    Ros(&'a Plan, &'a [u8]),
+    Ros(&'a MessagePlan, &'a [u8]),
 }
 
 /// Writes the fields of a local payload into a key frame.
 pub(crate) fn read(
-    payload: &Payload<'_>,
+    payload: &LocalPayload<'_>,
     namespace: u16,
     frame: &mut FieldEncoder<'_>,
-) -> Result<(), (Cause, String)> {
+) -> Result<(), (DropCause, String)> {
     match payload {
-        Payload::Block(block) => {
+        LocalPayload::Block(block) => {
             // Checked before sending, because subscribers cannot read a datagram with an invalid
             // block.
             Fields::parse(block)
@@ -40,7 +41,7 @@ pub(crate) fn read(
                 .fields_block(block)
                 .map_err(|error| (Reason::TooBig.into(), error.to_string()))
         }
-        Payload::Ros(plan, bytes) => {
+        LocalPayload::Ros(plan, bytes) => {
             encode_fields(plan, bytes, namespace, frame).map_err(|error| match &error {
                 ReadError::Malformed { fault, .. } => {
                     ((Reason::Malformed, case(*fault)).into(), error.to_string())
@@ -62,7 +63,7 @@ pub(crate) fn read(
 /// The message does not match the type of the plan, or is too long for UADP. Discard the frame in
 /// this case.
 pub fn encode_fields(
-    plan: &Plan,
+    plan: &MessagePlan,
     message: &[u8],
     namespace: u16,
     frame: &mut FieldEncoder<'_>,
@@ -74,16 +75,20 @@ pub fn encode_fields(
 ///
 /// # Errors
 /// The fields do not match the plan; `out` is then unchanged.
-pub fn decode_fields(plan: &Plan, fields: Fields<'_>, out: &mut Vec<u8>) -> Result<(), WriteError> {
+pub fn decode_fields(
+    plan: &MessagePlan,
+    fields: Fields<'_>,
+    out: &mut Vec<u8>,
+) -> Result<(), WriteError> {
     plan.write(&mut FieldSource::new(fields), out)
 }
 
 /// Appends the ROS message of the fields.
 pub(crate) fn write(
-    plan: &Plan,
+    plan: &MessagePlan,
     fields: Fields<'_>,
     out: &mut Vec<u8>,
-) -> Result<(), (Cause, String)> {
+) -> Result<(), (DropCause, String)> {
     decode_fields(plan, fields, out).map_err(|error| {
         let cause = (Reason::Mismatch, write_case(&error.fault)).into();
         (cause, error.to_string())
@@ -91,26 +96,26 @@ pub(crate) fn write(
 }
 
 /// Appends the unchanged fields after a check that they can be read.
-pub(crate) fn copy(fields: &Fields<'_>, out: &mut Vec<u8>) -> Result<(), (Cause, String)> {
+pub(crate) fn copy(fields: &Fields<'_>, out: &mut Vec<u8>) -> Result<(), (DropCause, String)> {
     let block = fields.checked_bytes().map_err(undecodable)?;
     out.extend_from_slice(block);
     Ok(())
 }
 
-pub(crate) fn undecodable(error: DecodeError) -> (Cause, String) {
+pub(crate) fn undecodable(error: DecodeError) -> (DropCause, String) {
     let cause = (Reason::Malformed, error.subject()).into();
     (cause, error.to_string())
 }
 
-const fn case(fault: Fault) -> &'static str {
+const fn case(fault: MessageFault) -> &'static str {
     match fault {
-        Fault::Truncated => "truncated",
-        Fault::Text => "text",
-        Fault::Terminator => "terminator",
-        Fault::Bound { .. } => "bound",
-        Fault::TrailingBytes(_) => "trailing bytes",
-        Fault::Encapsulation(_) => "encapsulation",
-        Fault::WithoutBytes(_) => "without bytes",
+        MessageFault::Truncated => "truncated",
+        MessageFault::Text => "text",
+        MessageFault::Terminator => "terminator",
+        MessageFault::Bound { .. } => "bound",
+        MessageFault::TrailingBytes(_) => "trailing bytes",
+        MessageFault::Encapsulation(_) => "encapsulation",
+        MessageFault::WithoutBytes(_) => "without bytes",
     }
 }
 
@@ -157,7 +162,7 @@ struct FrameSink<'f, 'm> {
     namespace: u16,
 }
 
-impl Sink for FrameSink<'_, '_> {
+impl FieldSink for FrameSink<'_, '_> {
     type Error = EncodeError;
 
     fn scalar(&mut self, value: Scalar<'_>) -> Result<(), EncodeError> {
@@ -269,7 +274,7 @@ impl<'a> FieldSource<'a> {
     }
 }
 
-impl<'a> Source<'a> for FieldSource<'a> {
+impl<'a> FieldSupplier<'a> for FieldSource<'a> {
     fn scalar(&mut self, expected: BuiltinType) -> Result<Scalar<'a>, SourceError> {
         if let Some(structure) = &mut self.structure {
             return structure.scalar(expected).map_err(malformed);

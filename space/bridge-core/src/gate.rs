@@ -5,7 +5,7 @@ use std::time::Instant;
 use mappings::Publish;
 use uadp::{Array, BuiltinType, DecodeError, Fields, Scalar, Variant};
 
-use crate::message::Encoded;
+use crate::message::EncodedSample;
 use crate::output::PublisherKey;
 use crate::writer::MAX_KEPT;
 
@@ -26,7 +26,7 @@ pub(crate) struct Gate {
 }
 
 /// A sample and its publisher, if the publisher latches.
-pub(crate) type Waiting = (Encoded, Option<PublisherKey>);
+pub(crate) type Waiting = (EncodedSample, Option<PublisherKey>);
 
 /// The decision for a sample.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -59,7 +59,7 @@ impl Gate {
     /// sample of each publisher.
     pub(crate) fn judge(
         &mut self,
-        sample: &Encoded,
+        sample: &EncodedSample,
         latched_by: Option<PublisherKey>,
         now: Instant,
     ) -> (Passage, Option<Waiting>) {

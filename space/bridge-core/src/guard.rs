@@ -9,8 +9,8 @@ use std::time::{Duration, Instant};
 
 use mappings::{GroupMode, GroupPolicy, Replay, SecurityGroup};
 use uadp::{
-    CountedBy, KeyError, Keys, NetworkMessage, NetworkMessageType, Opener, OpenerOptions, Seal,
-    SealError, Sealer, SecurityError, SecurityMode, SecurityPolicy,
+    CountedBy, KeyError, NetworkMessage, NetworkMessageType, Opener, OpenerOptions, Seal,
+    SealError, Sealer, SecurityError, SecurityMode, SecurityPolicy, TokenKeys,
 };
 
 use crate::counters::Reason;
@@ -36,7 +36,7 @@ pub struct KeyDelivery {
     /// The SecurityTokenId of the first key, which is the current key.
     pub first_token_id: u32,
     /// The current key and the future keys, in their order.
-    pub keys: Vec<Keys>,
+    pub keys: Vec<TokenKeys>,
     /// The time until the second key becomes current. `None` if the first key is used until new
     /// keys are set.
     pub time_to_next: Option<Duration>,

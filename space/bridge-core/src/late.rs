@@ -7,7 +7,7 @@ use uadp::Timestamp;
 
 use crate::confirm::Confirming;
 use crate::counters::Reason;
-use crate::place::Place;
+use crate::place::SequencePosition;
 use crate::settings::Relay;
 
 /// The case and details of a late message.
@@ -22,7 +22,7 @@ impl Relay {
     /// Returns the reason why a DataSetMessage is late. Commands have their own limit.
     pub(crate) fn judge_value(
         self,
-        place: &Place,
+        place: &SequencePosition,
         (confirming, lasting): (Option<&Confirming>, Lasting),
         now: Timestamp,
     ) -> Option<Late> {

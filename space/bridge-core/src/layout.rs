@@ -4,7 +4,7 @@
 use std::net::{Ipv4Addr, SocketAddr};
 
 use mappings::Variable;
-use messages::Rank;
+use messages::ArrayRank;
 use uadp::discovery::{DataSetMetaDataType, VersionMatch};
 use uadp::{BuiltinType, ConfigurationVersion, DataSetHeader, RawField};
 
@@ -13,7 +13,7 @@ use crate::learned::Weight;
 
 /// The fields of a DataSet, as announced by its writer or as defined in the mapping.
 #[derive(Debug, PartialEq, Eq)]
-pub(crate) struct Layout {
+pub(crate) struct DataSetLayout {
     from: SocketAddr,
     version: ConfigurationVersion,
     fields: Vec<Field>,
@@ -28,7 +28,7 @@ struct Field {
     max_string_length: u32,
 }
 
-impl Layout {
+impl DataSetLayout {
     /// Reads the announcement of the sender at the address `from`.
     ///
     /// # Errors
@@ -70,8 +70,8 @@ impl Layout {
     pub(crate) fn mapped(variable: &Variable) -> Self {
         let fields = variable.fields.iter().map(|leaf| {
             let (value_rank, array_dimensions) = match leaf.rank {
-                Rank::Scalar => (-1, Vec::new()),
-                Rank::Array { fixed } => (1, fixed.into_iter().collect()),
+                ArrayRank::Scalar => (-1, Vec::new()),
+                ArrayRank::Array { fixed } => (1, fixed.into_iter().collect()),
             };
             let declared = variable.value_type.map(|(builtin, _)| builtin);
             Field {
@@ -119,7 +119,7 @@ impl Layout {
     }
 }
 
-impl Weight for Layout {
+impl Weight for DataSetLayout {
     fn weight(&self) -> usize {
         let inner = self
             .fields

@@ -10,16 +10,16 @@ use mappings::TopicId;
 /// bounded in number and bytes, and announcements expire if they are not repeated.
 #[derive(Debug)]
 pub(crate) struct Learned<T> {
-    known: HashMap<TopicId, Known<T>>,
+    known: HashMap<TopicId, LearnedTopic<T>>,
     weight: usize,
     /// The last time an announcement of this rank found no room. Announcements of this rank or
     /// lower are rejected without another search for a short time after it.
-    full: Option<(Instant, Rank)>,
+    full: Option<(Instant, TopicPrecedence)>,
 }
 
 /// The precedence of topics. Later variants take precedence over earlier variants.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-pub(crate) enum Rank {
+pub(crate) enum TopicPrecedence {
     /// The values of the topic are not received, or not received any more.
     Stray,
     /// The values of the topic are received.
@@ -29,7 +29,7 @@ pub(crate) enum Rank {
 }
 
 #[derive(Debug)]
-struct Known<T> {
+struct LearnedTopic<T> {
     described: Arc<T>,
     until: Instant,
 }
@@ -52,7 +52,7 @@ impl<T> Default for Learned<T> {
 
 /// The effect of an announcement.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum News {
+pub(crate) enum AnnouncementEffect {
     /// The announcement equals the stored announcement.
     Same,
     /// The announcement is new or differs.
@@ -70,37 +70,37 @@ impl<T: Weight + PartialEq> Learned<T> {
         topic: TopicId,
         described: T,
         (now, period): (Instant, Duration),
-        rank: impl Fn(TopicId) -> Rank,
-    ) -> News {
+        rank: impl Fn(TopicId) -> TopicPrecedence,
+    ) -> AnnouncementEffect {
         let until = now + period.saturating_mul(MISSED).max(LEAST);
         if let Some(known) = self.known.get_mut(&topic)
             && *known.described == described
         {
             known.until = until;
-            return News::Same;
+            return AnnouncementEffect::Same;
         }
         let weight = described.weight();
         self.forget(topic);
         if !self.has_room(weight) {
             let own = rank(topic);
             if matches!(self.full, Some((at, of)) if own <= of && now < at + LOOK_AGAIN) {
-                return News::Full;
+                return AnnouncementEffect::Full;
             }
             self.retain(|_, known| known.until > now);
-            for lower in [Rank::Stray, Rank::Heard] {
+            for lower in [TopicPrecedence::Stray, TopicPrecedence::Heard] {
                 if lower < own && !self.has_room(weight) {
                     self.retain(|topic, _| rank(topic) > lower);
                 }
             }
             if !self.has_room(weight) {
                 self.full = Some((now, own));
-                return News::Full;
+                return AnnouncementEffect::Full;
             }
         }
         self.weight += weight;
         let described = Arc::new(described);
-        self.known.insert(topic, Known { described, until });
-        News::Other
+        self.known.insert(topic, LearnedTopic { described, until });
+        AnnouncementEffect::Other
     }
 
     /// Returns the description of a topic, unless it has expired.
@@ -124,7 +124,7 @@ impl<T: Weight + PartialEq> Learned<T> {
         self.known.len() < MAX_TOPICS && self.weight.saturating_add(weight) <= MAX_WEIGHT
     }
 
-    fn retain(&mut self, is_kept: impl Fn(TopicId, &Known<T>) -> bool) {
+    fn retain(&mut self, is_kept: impl Fn(TopicId, &LearnedTopic<T>) -> bool) {
         let weight = &mut self.weight;
         self.known.retain(|topic, known| {
             let keep = is_kept(*topic, known);
@@ -150,12 +150,12 @@ const LEAST: Duration = Duration::from_secs(300);
 
 #[cfg(test)]
 mod tests {
-    use crate::description::Described;
+    use crate::description::TopicMetaData;
 
     use super::*;
 
-    fn described(name: &str) -> Described {
-        Described {
+    fn described(name: &str) -> TopicMetaData {
+        TopicMetaData {
             message_type: name.parse().unwrap(),
             bytes: true,
             name: String::new(),
@@ -180,15 +180,15 @@ mod tests {
         let mut learn = |number: usize, at: Instant| {
             let what = described("std_msgs/Bool");
             learned.learn(topic(number), what, (at, Duration::from_secs(30)), |_| {
-                Rank::Heard
+                TopicPrecedence::Heard
             })
         };
         for number in 0..MAX_TOPICS {
-            assert_eq!(learn(number, start), News::Other);
+            assert_eq!(learn(number, start), AnnouncementEffect::Other);
         }
-        assert_eq!(learn(MAX_TOPICS, start), News::Full);
-        assert_eq!(learn(0, start + LEAST / 2), News::Same);
-        assert_eq!(learn(MAX_TOPICS, start + LEAST), News::Other);
+        assert_eq!(learn(MAX_TOPICS, start), AnnouncementEffect::Full);
+        assert_eq!(learn(0, start + LEAST / 2), AnnouncementEffect::Same);
+        assert_eq!(learn(MAX_TOPICS, start + LEAST), AnnouncementEffect::Other);
         assert!(learned.get(topic(0), start + LEAST).is_some(), "repeated");
         assert!(learned.get(topic(1), start + LEAST).is_none());
         let weight: usize = learned
@@ -210,9 +210,9 @@ mod tests {
         let mut learn = |number: usize, seconds: u64, heard: &[usize], mapped: &[usize]| {
             let of = |numbers: &[usize], it| numbers.iter().any(|number| topic(*number) == it);
             let rank = |it| match (of(mapped, it), of(heard, it)) {
-                (true, _) => Rank::Mapped,
-                (false, true) => Rank::Heard,
-                (false, false) => Rank::Stray,
+                (true, _) => TopicPrecedence::Mapped,
+                (false, true) => TopicPrecedence::Heard,
+                (false, false) => TopicPrecedence::Stray,
             };
             let what = described("std_msgs/Bool");
             let at = start + Duration::from_secs(seconds);
@@ -221,21 +221,34 @@ mod tests {
         };
         let all: Vec<usize> = (0..MAX_TOPICS).collect();
         for number in &all {
-            assert_eq!(learn(*number, 0, &all, &[]), (News::Other, number + 1));
+            assert_eq!(
+                learn(*number, 0, &all, &[]),
+                (AnnouncementEffect::Other, number + 1)
+            );
         }
         let stranger = MAX_TOPICS;
-        assert_eq!(learn(stranger, 0, &all, &[]), (News::Full, MAX_TOPICS));
+        assert_eq!(
+            learn(stranger, 0, &all, &[]),
+            (AnnouncementEffect::Full, MAX_TOPICS)
+        );
         let mapped = MAX_TOPICS + 1;
         assert_eq!(
             learn(mapped, 0, &all, &[mapped]),
-            (News::Other, 1),
+            (AnnouncementEffect::Other, 1),
             "of a higher rank it is looked for room at once"
         );
         for number in &all[1..] {
-            assert_eq!(learn(*number, 1, &[], &[mapped]).0, News::Other);
+            assert_eq!(
+                learn(*number, 1, &[], &[mapped]).0,
+                AnnouncementEffect::Other
+            );
         }
         let heard = learn(stranger, 2, &[0, stranger], &[mapped]);
-        assert_eq!(heard, (News::Other, 2), "those that fell silent give way");
-        assert_eq!(learn(mapped, 2, &[], &[mapped]).0, News::Same);
+        assert_eq!(
+            heard,
+            (AnnouncementEffect::Other, 2),
+            "those that fell silent give way"
+        );
+        assert_eq!(learn(mapped, 2, &[], &[mapped]).0, AnnouncementEffect::Same);
     }
 }

@@ -55,30 +55,30 @@ mod topics;
 mod transcoder;
 mod writer;
 
-pub use application::{Application, Endpoint};
+pub use application::{Application, ApplicationEndpoint};
 pub use call::{
-    ActionFamily, Answered, AskError, AskErrorKind, AskId, CallCounters, CallDescription,
-    CallField, CallMap, CallRole, CallStructure, CallTypeError, Executed, Execution, FieldNote,
-    Offered, OfferedType, ValueDescription, ValueNote, split_name,
+    ActionFamily, AskError, AskErrorKind, AskId, CallCounters, CallDescription, CallExecution,
+    CallField, CallMap, CallResponse, CallRole, CallStructure, CallTypeError, Executed, FieldNote,
+    OfferedCall, OfferedType, ValueDescription, ValueNote, split_name,
 };
-pub use confirm::{Arrival, Handover};
+pub use confirm::{ConfirmedArrival, Handover};
 pub use constant::ConstantFault;
 pub use counters::{Counters, Reason, Verdict};
-pub use description::{Described, ROS_TOPICS};
+pub use description::{ROS_TOPICS, TopicMetaData};
 pub use fields::{decode_fields, encode_fields};
 pub use guard::{GroupState, Guard, KeyDelivery, Unopened, policy_of};
 pub use hops::{Delays, Hop, Hops};
 pub use interest::Interest;
 pub use late::is_aged;
-pub use loop_rule::{Owned, Side, What, may_cross};
-pub use output::{Delivery, Heard, Kept, Notice, Output, PublisherKey, Unsent};
+pub use loop_rule::{Crosses, Owned, Side, may_cross};
+pub use output::{Delivery, DropNotice, LocalMessage, Output, PublisherKey, Unsent, ValueRelation};
 pub use redundancy::{
-    Heartbeat, LocalSide, MuteCause, Rank, Redundancy, RedundancyCounts, RedundantPeer, Role,
-    RoleChange, SwitchRefusal, Takeover, TakeoverCause,
+    Heartbeat, LocalSide, MuteCause, Redundancy, RedundancyCounts, RedundancyRank, RedundancyRole,
+    RedundantPeer, RoleChange, SwitchRefusal, Takeover, TakeoverCause,
 };
 pub use room::Room;
 pub use router::{MutedSamples, Router};
-pub use settings::{Forwarding, Link, Local, Now, Relay, Settings};
+pub use settings::{Forwarding, LinkCapacity, Local, Now, Relay, RouterSettings};
 pub use tap::{Crossing, Tapped};
 pub use uadp::action::{ExecutionId, Refusal};
 pub use uadp::discovery::MessageSecurityMode;

@@ -16,7 +16,7 @@ pub enum Side {
 
 /// The kind of a message.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub enum What {
+pub enum Crosses {
     /// A value, or metadata of a value or call. It comes from the space in its name.
     Value,
     /// A request. It goes to the space in its name.
@@ -64,10 +64,10 @@ impl Owned {
 /// needed. Calls: a request crosses only towards its executor, a response only away from it. A
 /// request therefore crosses UA once and is executed in one place.
 #[must_use]
-pub const fn may_cross(home: bool, heard_on: Side, what: What) -> bool {
+pub const fn may_cross(home: bool, heard_on: Side, what: Crosses) -> bool {
     match (what, heard_on) {
-        (What::Value | What::Response, Side::Local) | (What::Request, Side::Ua) => home,
-        (What::Value | What::Response, Side::Ua) | (What::Request, Side::Local) => !home,
+        (Crosses::Value | Crosses::Response, Side::Local) | (Crosses::Request, Side::Ua) => home,
+        (Crosses::Value | Crosses::Response, Side::Ua) | (Crosses::Request, Side::Local) => !home,
     }
 }
 
@@ -77,10 +77,10 @@ mod tests {
 
     #[test]
     fn only_own_values_leave_and_only_foreign_ones_enter() {
-        assert!(may_cross(true, Side::Local, What::Value));
-        assert!(!may_cross(false, Side::Local, What::Value));
-        assert!(!may_cross(true, Side::Ua, What::Value));
-        assert!(may_cross(false, Side::Ua, What::Value));
+        assert!(may_cross(true, Side::Local, Crosses::Value));
+        assert!(!may_cross(false, Side::Local, Crosses::Value));
+        assert!(!may_cross(true, Side::Ua, Crosses::Value));
+        assert!(may_cross(false, Side::Ua, Crosses::Value));
     }
 
     #[test]
@@ -94,8 +94,8 @@ mod tests {
             ]
             .map(|(home, heard_on)| may_cross(home, heard_on, what))
         };
-        assert_eq!(crossing(What::Request), [false, true, true, false]);
-        assert_eq!(crossing(What::Response), [true, false, false, true]);
+        assert_eq!(crossing(Crosses::Request), [false, true, true, false]);
+        assert_eq!(crossing(Crosses::Response), [true, false, false, true]);
     }
 
     #[test]

@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 
 use mappings::{LossAction, Mapping, ServiceRole, TopicId, Trigger};
 use messages::{
-    Literal, MessageType, NoFields, Plan, PlanError, Selected, Selection, Wire, WriteError,
+    Literal, MessagePlan, MessageType, NoFields, PlanError, Selected, Selection, Wire, WriteError,
 };
 use uadp::{BuiltinType, DateTime, DecodeError, Fields, Timestamp};
 
@@ -13,7 +13,7 @@ use crate::fields;
 
 /// The reaction to the loss of the commander of a topic, and whether it is due.
 #[derive(Debug)]
-pub(crate) struct Loss {
+pub(crate) struct LossReaction {
     reaction: Reaction,
     /// The time for which a value is valid without renewal.
     hold: Option<Duration>,
@@ -25,7 +25,7 @@ pub(crate) struct Loss {
 #[derive(Debug, Clone)]
 pub(crate) enum Reaction {
     /// Publishes this message of the topic.
-    Publish(Stop),
+    Publish(ConstantMessage),
     /// Delivers the value of another topic that calls its service.
     Call(TopicId),
 }
@@ -46,20 +46,20 @@ pub(crate) enum ReactionFault {
 
 /// A message of constants.
 #[derive(Debug, Clone)]
-pub(crate) struct Stop {
-    plan: Arc<Plan>,
+pub(crate) struct ConstantMessage {
+    plan: Arc<MessagePlan>,
     /// Whether the stamp of its header is the time of the loss.
     is_stamped: bool,
 }
 
-impl Stop {
+impl ConstantMessage {
     fn new(
         message_type: &Arc<MessageType>,
         template: Selection,
         wire: Wire,
     ) -> Result<Self, PlanError> {
         let Selection::Template { mut fields, rest } = template else {
-            let plan = Arc::new(Plan::compile(message_type, &template, wire)?);
+            let plan = Arc::new(MessagePlan::compile(message_type, &template, wire)?);
             let is_stamped = false;
             return Ok(Self { plan, is_stamped });
         };
@@ -72,7 +72,7 @@ impl Stop {
             fields.push(Selected::whole(STAMP));
         }
         let template = Selection::Template { fields, rest };
-        let plan = Arc::new(Plan::compile(message_type, &template, wire)?);
+        let plan = Arc::new(MessagePlan::compile(message_type, &template, wire)?);
         Ok(Self { plan, is_stamped })
     }
 
@@ -94,7 +94,7 @@ impl Stop {
     }
 }
 
-impl Loss {
+impl LossReaction {
     /// Returns the reaction from the mapping in the local type of the topic; `None` if the mapping
     /// has no reaction.
     ///
@@ -116,7 +116,7 @@ impl Loss {
                 let Some(template) = action.template(selection) else {
                     return Ok(None);
                 };
-                Reaction::Publish(Stop::new(message_type, template, wire)?)
+                Reaction::Publish(ConstantMessage::new(message_type, template, wire)?)
             }
         };
         Ok(Some(Self {
@@ -159,7 +159,7 @@ pub(crate) fn trigger(
     topic: TopicId,
     message_type: &Arc<MessageType>,
     wire: Wire,
-) -> Result<Option<Stop>, PlanError> {
+) -> Result<Option<ConstantMessage>, PlanError> {
     let role = mapping
         .variable(topic)
         .and_then(|variable| variable.service.as_ref())
@@ -179,7 +179,7 @@ pub(crate) fn trigger(
         Trigger::Any => std::collections::BTreeMap::new(),
     };
     let fields = Vec::new();
-    Stop::new(message_type, Selection::Template { fields, rest }, wire).map(Some)
+    ConstantMessage::new(message_type, Selection::Template { fields, rest }, wire).map(Some)
 }
 
 /// The header stamp of messages that start with a header.

@@ -6,20 +6,20 @@ use std::time::Duration;
 use uadp::{DateTime, DecodeError, NetworkMessage, Timestamp};
 
 use crate::confirm::Mark;
-use crate::pace::Pace;
+use crate::pace::ChunkPace;
 
 /// The message of a sample.
 #[derive(Debug)]
-pub(crate) enum Message {
+pub(crate) enum SampleMessage {
     /// A single NetworkMessage.
-    Datagram(Encoded),
+    Datagram(EncodedSample),
     /// A message larger than a datagram. Its chunks are read from this shared buffer.
-    Large(Arc<Encoded>),
+    Large(Arc<EncodedSample>),
 }
 
 /// A NetworkMessage with a single DataSetMessage, and the offsets of its variable numbers.
 #[derive(Debug, Clone, Default)]
-pub(crate) struct Encoded {
+pub(crate) struct EncodedSample {
     pub(crate) bytes: Vec<u8>,
     /// The offset of the NetworkMessage Timestamp, which is followed by PicoSeconds.
     pub(crate) timestamp_at: usize,
@@ -29,7 +29,7 @@ pub(crate) struct Encoded {
     pub(crate) sequence_at: usize,
 }
 
-impl Message {
+impl SampleMessage {
     /// Returns a copy to keep. A large message shares its buffer.
     pub(crate) fn share(&self) -> Self {
         match self {
@@ -38,7 +38,7 @@ impl Message {
         }
     }
 
-    pub(crate) fn encoded(&self) -> &Encoded {
+    pub(crate) fn encoded(&self) -> &EncodedSample {
         match self {
             Self::Datagram(encoded) => encoded,
             Self::Large(encoded) => encoded,
@@ -50,13 +50,13 @@ impl Message {
         match self {
             Self::Datagram(_) => Duration::ZERO,
             Self::Large(encoded) => {
-                Pace::time_of(u64::try_from(encoded.bytes.len()).unwrap_or(u64::MAX))
+                ChunkPace::time_of(u64::try_from(encoded.bytes.len()).unwrap_or(u64::MAX))
             }
         }
     }
 }
 
-impl Encoded {
+impl EncodedSample {
     /// Sets the NetworkMessage Timestamp and PicoSeconds.
     pub(crate) fn stamp(&mut self, at: Timestamp) {
         patch(&mut self.bytes, self.timestamp_at, &at.time.0.to_le_bytes());

@@ -3,24 +3,24 @@
 
 use mappings::{SpaceId, TopicId};
 use uadp::{
-    ChunkBudget, ChunkError, Chunks, DataSetHeader, EncodeError, Extras, GroupHeader,
+    ChunkBudget, ChunkEncoder, ChunkError, DataSetHeader, EncodeError, Extras, GroupHeader,
     NetworkHeader, NetworkMessageEncoder, NetworkMessageType, PublisherId, SecurityHeader,
     Timestamp, Whole,
 };
 
-use crate::counters::{Cause, Reason};
+use crate::counters::{DropCause, Reason};
 use crate::fields;
-use crate::message::Encoded;
+use crate::message::EncodedSample;
 
 /// Writes the NetworkMessage of a sample. The time of sending is patched in when the message is
 /// polled.
 pub(crate) fn encode(
-    encoded: &mut Encoded,
+    encoded: &mut EncodedSample,
     topic: TopicId,
     header: &DataSetHeader,
     utc: Timestamp,
-    sample: &fields::Payload<'_>,
-) -> Result<(), (Cause, String)> {
+    sample: &fields::LocalPayload<'_>,
+) -> Result<(), (DropCause, String)> {
     let too_big = |error: EncodeError| (Reason::TooBig.into(), error.to_string());
     let (space, namespace, identifier) = topic.triple();
     let network = network_header(space, namespace, utc);
@@ -43,7 +43,7 @@ pub(crate) fn encode(
 pub(crate) fn join<'a>(
     bytes: &mut Vec<u8>,
     utc: Timestamp,
-    messages: impl Iterator<Item = (TopicId, &'a Encoded)> + Clone,
+    messages: impl Iterator<Item = (TopicId, &'a EncodedSample)> + Clone,
 ) -> Result<(), EncodeError> {
     let triples = messages.clone().map(|(topic, _)| topic.triple());
     let (space, namespace, _) = triples.clone().next().unwrap_or_default();
@@ -66,7 +66,7 @@ pub(crate) struct MessageTooBig {
 
 /// Checks that a DataSetMessage has at most `max_message` bytes. It is called for DataSetMessages
 /// that are too big for a datagram.
-pub(crate) fn check_size(encoded: &Encoded, max_message: u32) -> Result<(), MessageTooBig> {
+pub(crate) fn check_size(encoded: &EncodedSample, max_message: u32) -> Result<(), MessageTooBig> {
     let size = encoded.data_set_message().len();
     if u32::try_from(size).is_ok_and(|size| size <= max_message) {
         return Ok(());
@@ -79,7 +79,7 @@ pub(crate) fn check_size(encoded: &Encoded, max_message: u32) -> Result<(), Mess
 pub(crate) fn chunk(
     bytes: &mut Vec<u8>,
     topic: TopicId,
-    (sample, offset): (&Encoded, usize),
+    (sample, offset): (&EncodedSample, usize),
     max_datagram: u16,
     utc: Timestamp,
 ) -> Result<usize, ChunkError> {
@@ -96,7 +96,7 @@ pub(crate) fn chunk(
     };
     let header = network_header(space, namespace, utc);
     let extras = Extras::default();
-    let mut chunks = Chunks::new(&header, &extras, whole, budget)?.resumed_at(offset);
+    let mut chunks = ChunkEncoder::new(&header, &extras, whole, budget)?.resumed_at(offset);
     chunks.append(bytes, &extras).transpose()?;
     Ok(chunks.offset())
 }
@@ -128,7 +128,7 @@ pub(crate) fn announcement_chunks(
         security: Some(SecurityHeader::NONE),
         ..Extras::default()
     };
-    let mut chunks = Chunks::new(&header, &extras, whole, budget)?;
+    let mut chunks = ChunkEncoder::new(&header, &extras, whole, budget)?;
     let mut datagrams = Vec::new();
     loop {
         let mut bytes = Vec::new();
@@ -148,7 +148,7 @@ pub(crate) fn keep_alive(
     topic: TopicId,
     expected_sequence: u16,
     utc: Timestamp,
-) -> Option<Encoded> {
+) -> Option<EncodedSample> {
     let (space, namespace, identifier) = topic.triple();
     let network = network_header(space, namespace, utc);
     let mut message = NetworkMessageEncoder::new(&mut bytes, &network, Some(&[identifier])).ok()?;
@@ -160,7 +160,7 @@ pub(crate) fn keep_alive(
     };
     message.keep_alive(&header).ok()?;
     message.finish().ok()?;
-    Some(Encoded {
+    Some(EncodedSample {
         bytes,
         timestamp_at,
         payload_at,

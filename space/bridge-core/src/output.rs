@@ -7,10 +7,10 @@ use mappings::TopicId;
 use uadp::action::ExecutionId;
 use uadp::{BuiltinType, Timestamp};
 
-use crate::call::{Answered, AskId, CallDescription, Execution};
-use crate::confirm::Arrival;
+use crate::call::{AskId, CallDescription, CallExecution, CallResponse};
+use crate::confirm::ConfirmedArrival;
 use crate::counters::Reason;
-use crate::description::Described;
+use crate::description::TopicMetaData;
 use crate::redundancy::RoleChange;
 
 /// An action that the Router requests from its caller.
@@ -52,7 +52,7 @@ pub enum Output {
         /// scalar [`BuiltinType::Variant`].
         shape: Vec<(BuiltinType, bool)>,
         /// The announced description, if the values match it.
-        described: Option<Arc<Described>>,
+        described: Option<Arc<TopicMetaData>>,
     },
     /// A topic of another space has had no good value for `receive_timeout`, or has a good value
     /// again. Good are samples that the local side accepted
@@ -96,7 +96,7 @@ pub enum Output {
         /// The topic of the call.
         topic: TopicId,
         /// The response, or the reason why there is no response.
-        answer: Answered,
+        answer: CallResponse,
     },
     /// A call of another program can be requested, or its description has changed.
     CallKnown {
@@ -112,7 +112,7 @@ pub enum Output {
     },
     /// A request for the local side to execute. End each execution with
     /// [`Router::executed`](crate::Router::executed).
-    Execute(Execution),
+    Execute(CallExecution),
     /// The requestor does not need the execution any more. Cancel it if possible, and end it in any
     /// case.
     Abandoned {
@@ -127,7 +127,7 @@ pub enum Output {
         /// The topic of the event.
         topic: TopicId,
         /// The outcome.
-        arrival: Arrival,
+        arrival: ConfirmedArrival,
     },
     /// A value that the local side accepted needs a confirmation. Report its handover with
     /// [`Router::handed`](crate::Router::handed).
@@ -154,7 +154,7 @@ pub enum Output {
         group: String,
     },
     /// An event to log.
-    Notice(Notice),
+    Notice(DropNotice),
 }
 
 impl Output {
@@ -211,7 +211,7 @@ pub struct PublisherKey(pub u32);
 
 /// A message received on the local side.
 #[derive(Debug, Clone, Copy)]
-pub struct Heard<'a> {
+pub struct LocalMessage<'a> {
     /// The topic of the value.
     pub topic: TopicId,
     /// The message in the local encoding.
@@ -226,7 +226,7 @@ pub struct Heard<'a> {
 
 /// The relation of a value to the other values of its topic.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Kept {
+pub enum ValueRelation {
     /// The value replaces all previous values, as for a state.
     Alone,
     /// The value exists beside others, as for several latched publishers, until it is
@@ -256,7 +256,7 @@ pub struct Delivery {
     /// topic.
     pub instance: Option<Timestamp>,
     /// The relation to the other values of the topic.
-    pub kept: Kept,
+    pub kept: ValueRelation,
     /// Whether late joiners receive the value: true for a state, false for an event.
     pub lasting: bool,
 }
@@ -264,7 +264,7 @@ pub struct Delivery {
 /// A drop to log. Repetitions for the same cause are reported at the 1st, 10th, 100th ...
 /// occurrence.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Notice {
+pub struct DropNotice {
     /// The topic, if the drop concerns a topic.
     pub topic: Option<TopicId>,
     /// The sender, if the dropped value was received in a datagram.

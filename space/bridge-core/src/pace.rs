@@ -2,14 +2,14 @@
 
 use std::time::{Duration, Instant};
 
-use crate::settings::Link;
+use crate::settings::LinkCapacity;
 
 /// Spreads the chunks of large messages over time, so that they overrun neither a link nor the
 /// socket buffer of a receiver. Messages in a single datagram are not limited.
 ///
-/// It is a token bucket: the average rate and the size of a burst follow from the [`Link`].
+/// It is a token bucket: the average rate and the size of a burst follow from the [`LinkCapacity`].
 #[derive(Debug)]
-pub(crate) struct Pace {
+pub(crate) struct ChunkPace {
     /// Bytes per second.
     rate: u64,
     /// Bytes of a burst.
@@ -18,7 +18,7 @@ pub(crate) struct Pace {
     done: Option<Instant>,
 }
 
-impl Default for Pace {
+impl Default for ChunkPace {
     fn default() -> Self {
         Self {
             rate: Self::RATE,
@@ -28,7 +28,7 @@ impl Default for Pace {
     }
 }
 
-impl Pace {
+impl ChunkPace {
     /// Bytes per second on a link of unknown speed: below the capacity of a gigabit link.
     const RATE: u64 = 100_000_000;
     /// Bytes of a burst on a link: the amount that accumulates while a timer is some milliseconds
@@ -42,12 +42,12 @@ impl Pace {
     const SHARE: u64 = 4;
 
     /// Adopts the rate and the burst of a link.
-    pub(crate) fn follow(&mut self, link: Link) {
+    pub(crate) fn follow(&mut self, link: LinkCapacity) {
         (self.rate, self.burst) = match link {
-            Link::Unknown => (Self::RATE, Self::BURST),
+            LinkCapacity::Unknown => (Self::RATE, Self::BURST),
             // A fifth of the link is left to other datagrams and to headers.
-            Link::Wire { speed } => ((speed / 5 * 4).clamp(1, Self::RATE), Self::BURST),
-            Link::Host { receive_buffer } => (
+            LinkCapacity::Wire { speed } => ((speed / 5 * 4).clamp(1, Self::RATE), Self::BURST),
+            LinkCapacity::Host { receive_buffer } => (
                 receive_buffer.saturating_mul(Self::PAUSES).max(Self::RATE),
                 (receive_buffer / Self::SHARE).max(Self::BURST),
             ),
@@ -95,14 +95,14 @@ mod tests {
         Instant::now()
     }
 
-    fn pace(link: Link) -> Pace {
-        let mut pace = Pace::default();
+    fn pace(link: LinkCapacity) -> ChunkPace {
+        let mut pace = ChunkPace::default();
         pace.follow(link);
         pace
     }
 
     /// Sends chunks while the pace is open, and returns the number of bytes.
-    fn fill(pace: &mut Pace, now: Instant) -> usize {
+    fn fill(pace: &mut ChunkPace, now: Instant) -> usize {
         let mut sent = 0;
         while pace.is_open(now) {
             pace.spend(CHUNK, now);
@@ -113,7 +113,7 @@ mod tests {
 
     /// Sends `bytes` bytes with a timer that is `late`, and returns the time taken and the largest
     /// burst.
-    fn send(pace: &mut Pace, bytes: usize, late: Duration) -> (Duration, usize) {
+    fn send(pace: &mut ChunkPace, bytes: usize, late: Duration) -> (Duration, usize) {
         let start = start();
         let mut largest = fill(pace, start);
         let (mut now, mut sent) = (start, largest);
@@ -130,7 +130,7 @@ mod tests {
 
     #[test]
     fn a_burst_goes_at_once_and_the_rest_at_the_rate_however_late_the_timer_rings() {
-        let (took, largest) = send(&mut pace(Link::Unknown), 10_000_000, LATE);
+        let (took, largest) = send(&mut pace(LinkCapacity::Unknown), 10_000_000, LATE);
         assert!(
             (262_144..262_144 + CHUNK + 1).contains(&largest),
             "{largest}"
@@ -144,7 +144,7 @@ mod tests {
     #[test]
     fn on_this_host_a_receiver_may_pause_for_16_ms_and_a_burst_takes_a_quarter_of_its_buffer() {
         let receive_buffer = 4 << 20;
-        let mut pace = pace(Link::Host { receive_buffer });
+        let mut pace = pace(LinkCapacity::Host { receive_buffer });
         let (took, largest) = send(&mut pace, 5_000_000, LATE);
         assert!(
             (1 << 20..(1 << 20) + CHUNK + 1).contains(&largest),
@@ -160,10 +160,10 @@ mod tests {
     #[test]
     fn a_small_receive_buffer_and_a_fast_link_keep_the_rate_of_an_unknown_link() {
         for link in [
-            Link::Host {
+            LinkCapacity::Host {
                 receive_buffer: 106_496,
             },
-            Link::Wire {
+            LinkCapacity::Wire {
                 speed: 1_250_000_000,
             },
         ] {
@@ -177,12 +177,16 @@ mod tests {
 
     #[test]
     fn a_slow_link_gets_four_fifths_of_its_speed_and_no_division_fails_without_speed() {
-        let (took, _) = send(&mut pace(Link::Wire { speed: 12_500_000 }), 1_000_000, LATE);
+        let (took, _) = send(
+            &mut pace(LinkCapacity::Wire { speed: 12_500_000 }),
+            1_000_000,
+            LATE,
+        );
         assert!(
             (Duration::from_millis(67)..Duration::from_millis(77)).contains(&took),
             "{took:?}"
         );
-        let mut stopped = pace(Link::Wire { speed: 0 });
+        let mut stopped = pace(LinkCapacity::Wire { speed: 0 });
         assert!(fill(&mut stopped, start()) > 0);
     }
 }

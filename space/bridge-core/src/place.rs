@@ -7,7 +7,7 @@ use uadp::Timestamp;
 
 /// The position of a DataSetMessage in the sequence of its writer, from its headers.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Place {
+pub(crate) struct SequencePosition {
     pub(crate) sequence: Option<u16>,
     pub(crate) stamp: Option<Timestamp>,
     /// Whether the stamp has PicoSeconds. All bridges send them, and two samples of one writer then
@@ -24,7 +24,7 @@ pub(crate) struct Place {
     pub(crate) by_clients: bool,
 }
 
-impl Place {
+impl SequencePosition {
     /// Returns the stamp if it distinguishes the sample from all other samples of the writer.
     pub(crate) fn instance(&self) -> Option<Timestamp> {
         self.stamp.filter(|_| self.fine)

@@ -3,22 +3,22 @@
 use std::collections::HashMap;
 use std::sync::{Arc, Weak};
 
-use messages::{MessageType, Plan, PlanError, Selection, TypeName, Wire};
+use messages::{MessagePlan, MessageType, PlanError, Selection, TypeName, Wire};
 
 /// The plans in use. They are shared, because thousands of topics may have the same type.
 #[derive(Debug, Default)]
 pub(crate) struct Plans {
-    known: HashMap<(TypeName, Selection), Known>,
+    known: HashMap<(TypeName, Selection), CachedPlan>,
     /// The number of plans at which unused plans are removed.
     limit: usize,
 }
 
 #[derive(Debug)]
-struct Known {
+struct CachedPlan {
     /// The type from which the plan was compiled. A changed definition is a different
     /// `MessageType`.
     message_type: Weak<MessageType>,
-    plan: Weak<Plan>,
+    plan: Weak<MessagePlan>,
 }
 
 impl Plans {
@@ -32,7 +32,7 @@ impl Plans {
         message_type: &Arc<MessageType>,
         selection: &Selection,
         wire: Wire,
-    ) -> Result<Arc<Plan>, PlanError> {
+    ) -> Result<Arc<MessagePlan>, PlanError> {
         let key = (message_type.name().clone(), selection.clone());
         let known = self.known.get(&key);
         if let Some(known) = known
@@ -41,12 +41,12 @@ impl Plans {
         {
             return Ok(plan);
         }
-        let plan = Arc::new(Plan::compile(message_type, selection, wire)?);
+        let plan = Arc::new(MessagePlan::compile(message_type, selection, wire)?);
         if self.known.len() >= self.limit {
             self.known.retain(|_, known| known.plan.strong_count() > 0);
             self.limit = MIN_LIMIT.max(2 * self.known.len());
         }
-        let known = Known {
+        let known = CachedPlan {
             message_type: Arc::downgrade(message_type),
             plan: Arc::downgrade(&plan),
         };
@@ -59,7 +59,7 @@ const MIN_LIMIT: usize = 16;
 
 #[cfg(test)]
 mod tests {
-    use messages::{Dialect, Registry};
+    use messages::{Dialect, TypeRegistry};
 
     use super::*;
 
@@ -67,7 +67,7 @@ mod tests {
     fn topics_of_one_type_share_their_plan() {
         let read = || {
             let name: TypeName = "std_msgs/Header".parse().unwrap();
-            Registry::bundle(Dialect::Ros2).get(&name).unwrap()
+            TypeRegistry::bundle(Dialect::Ros2).get(&name).unwrap()
         };
         let known = read();
         let mut plans = Plans::default();

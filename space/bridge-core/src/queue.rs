@@ -7,13 +7,13 @@ use mappings::Overflow;
 /// The samples of a topic that wait to be polled, bounded in number and in bytes. A full queue
 /// drops its oldest samples, never the newest, and never blocks a producer.
 #[derive(Debug)]
-pub(crate) struct Queue<T> {
+pub(crate) struct SampleQueue<T> {
     items: VecDeque<(T, usize)>,
     depth: usize,
     bytes: usize,
 }
 
-impl<T> Queue<T> {
+impl<T> SampleQueue<T> {
     pub(crate) fn new(overflow: Overflow) -> Self {
         let depth = match overflow {
             Overflow::KeepLatest => 1,
@@ -77,7 +77,7 @@ mod tests {
 
     #[test]
     fn the_latest_samples_stay_in_order() {
-        let mut queue = Queue::new(Overflow::DropOldest(NonZeroU16::new(2).unwrap()));
+        let mut queue = SampleQueue::new(Overflow::DropOldest(NonZeroU16::new(2).unwrap()));
         let dropped: Vec<_> = (1..=4).flat_map(|sample| queue.push(sample, 1)).collect();
         assert_eq!(dropped, [1, 2]);
         assert_eq!(
@@ -88,14 +88,14 @@ mod tests {
 
     #[test]
     fn keep_latest_keeps_one() {
-        let mut queue = Queue::new(Overflow::KeepLatest);
+        let mut queue = SampleQueue::new(Overflow::KeepLatest);
         assert_eq!((queue.push(1, 1), queue.push(2, 1)), (vec![], vec![1]));
         assert_eq!((queue.pop(), queue.pop()), (Some(2), None));
     }
 
     #[test]
     fn large_samples_give_way_before_their_number_is_reached() {
-        let mut queue = Queue::new(Overflow::DropOldest(NonZeroU16::new(100).unwrap()));
+        let mut queue = SampleQueue::new(Overflow::DropOldest(NonZeroU16::new(100).unwrap()));
         let half = MAX_BYTES / 2;
         assert_eq!(queue.push(1, half), [0; 0]);
         assert_eq!(queue.push(2, half), [0; 0]);

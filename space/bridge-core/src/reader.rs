@@ -7,17 +7,17 @@ use std::time::{Duration, Instant};
 use mappings::Lasting;
 use uadp::{BuiltinType, DataSetMessage, SequenceOrder, Timestamp};
 
-use crate::base::Base;
+use crate::base::KeyFrame;
 use crate::confirm::Receipt;
 use crate::counters::Reason;
-use crate::output::Kept;
-use crate::place::Place;
+use crate::output::ValueRelation;
+use crate::place::SequencePosition;
 use crate::settings::Local;
 use crate::writer::MAX_KEPT;
 
 /// The state of a received topic.
 #[derive(Debug)]
-pub(crate) struct Reader {
+pub(crate) struct ReceivedTopicState {
     /// The sequence number of the newest accepted DataSetMessage.
     sequence: Option<u16>,
     /// The Timestamp of the last sample that was not a repetition.
@@ -37,7 +37,7 @@ pub(crate) struct Reader {
     silent: bool,
     /// The delivered samples in their order, if their stamps are precise enough to distinguish
     /// them; at most [`MAX_KNOWN`].
-    known: VecDeque<Known>,
+    known: VecDeque<DeliveredSample>,
     /// The last time at which the writer repeated a value other than the newest. `Some` while the
     /// writer repeats several values, as for several latched publishers.
     several: Option<Instant>,
@@ -54,11 +54,11 @@ pub(crate) struct Reader {
     /// A stored value that turned out not to be a state.
     withdrawn: Option<Timestamp>,
     /// A sample that waits for its local type.
-    pub(crate) held: Option<Box<Held>>,
+    pub(crate) held: Option<Box<HeldSample>>,
     /// The newest event, if this space confirms it.
     pub(crate) receipt: Option<Receipt>,
     /// The state to which delta frames apply.
-    pub(crate) base: Option<Box<Base>>,
+    pub(crate) base: Option<Box<KeyFrame>>,
     /// Whether the writer has sent a delta frame.
     pub(crate) deltas: bool,
     /// Whether the local side lacks the value, because it was not delivered or not accepted.
@@ -74,23 +74,23 @@ pub(crate) struct Reader {
     /// The time of the last accepted change of the announced type, and the number of changes.
     renamed: Option<(Instant, u32)>,
     /// The pending notifications of the port about the topic.
-    pub(crate) news: News,
+    pub(crate) news: PendingNotifications,
 }
 
 /// The pending notifications of the port about a topic, in this order.
 #[derive(Debug, Default)]
-pub(crate) struct News {
+pub(crate) struct PendingNotifications {
     /// Whether the topic is in the Router's list of topics with news.
     pub(crate) queued: bool,
     /// Whether the silence of the writer has changed.
     pub(crate) silence: bool,
     /// The pending request for a local type.
-    pub(crate) ask: Option<Ask>,
+    pub(crate) ask: Option<LocalTypeRequest>,
 }
 
 /// The condition for a request to the port for the local type of a topic.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Ask {
+pub(crate) enum LocalTypeRequest {
     /// Only if the writer announces its type, because a local type exists.
     IfDescribed,
     /// Always, because no local type exists.
@@ -99,7 +99,7 @@ pub(crate) enum Ask {
 
 /// A sample that was delivered, or that was not delivered because its writer had stored it.
 #[derive(Debug)]
-struct Known {
+struct DeliveredSample {
     stamp: Timestamp,
     heard: Instant,
     repeated: bool,
@@ -146,18 +146,18 @@ impl Handling {
 
 /// The relation of an accepted message to the other messages of its writer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) struct Admitted {
+pub(crate) struct AcceptedMessage {
     /// The number of messages that are missing before it.
     pub(crate) missing: u16,
     /// The relation to the topic's other values.
-    pub(crate) kept: Kept,
+    pub(crate) kept: ValueRelation,
     /// Whether late joiners receive the value.
     pub(crate) lasting: bool,
 }
 
 /// A sample received before its local type was known. Only the newest sample is held.
 #[derive(Debug)]
-pub(crate) struct Held {
+pub(crate) struct HeldSample {
     pub(crate) fields: Vec<u8>,
     pub(crate) source: Option<Timestamp>,
     pub(crate) instance: Option<Timestamp>,
@@ -167,7 +167,7 @@ pub(crate) struct Held {
     pub(crate) until: Instant,
 }
 
-impl Held {
+impl HeldSample {
     /// Returns whether the sample counts towards the limit for large samples.
     pub(crate) const fn is_large(&self) -> bool {
         self.fields.len() > MAX_SMALL
@@ -179,7 +179,7 @@ impl Held {
     }
 }
 
-impl Reader {
+impl ReceivedTopicState {
     pub(crate) const fn new(from: Option<SocketAddr>, now: Instant) -> Self {
         Self {
             sequence: None,
@@ -207,7 +207,7 @@ impl Reader {
             shape: None,
             major_version: None,
             renamed: None,
-            news: News {
+            news: PendingNotifications {
                 queued: false,
                 silence: false,
                 ask: None,
@@ -356,11 +356,11 @@ impl Reader {
     /// event.
     pub(crate) fn admit(
         &mut self,
-        place: Place,
+        place: SequencePosition,
         message: Option<&DataSetMessage<'_>>,
         handling: Handling,
         now: Instant,
-    ) -> Result<Admitted, Reason> {
+    ) -> Result<AcceptedMessage, Reason> {
         let moved = self.from.is_some_and(|from| from != place.from);
         let again = place.stamp.is_some() && place.stamp == self.stamp;
         let restarted = moved
@@ -412,12 +412,12 @@ impl Reader {
         let kept = match stamp {
             // The sample is newer than all previous samples, as nearly every sample is.
             Some(stamp) if self.several.is_none() && self.stamp.is_none_or(|last| stamp > last) => {
-                Kept::Alone
+                ValueRelation::Alone
             }
             Some(stamp) => self.recognise((stamp, &place), handling, now)?,
-            None => Kept::Alone,
+            None => ValueRelation::Alone,
         };
-        if kept != Kept::Again {
+        if kept != ValueRelation::Again {
             self.stamp = place.stamp.or(self.stamp);
         }
         let lasting = match handling {
@@ -434,7 +434,7 @@ impl Reader {
             }
             return Err(Reason::Repeat);
         }
-        Ok(Admitted {
+        Ok(AcceptedMessage {
             missing,
             kept,
             lasting,
@@ -443,7 +443,7 @@ impl Reader {
 
     /// Handles a repetition of the newest message under its own number. Writers repeat events in
     /// case they are lost, and stored values for readers that show them.
-    fn again(&mut self, place: &Place) -> Reason {
+    fn again(&mut self, place: &SequencePosition) -> Reason {
         let (Some(stamp), Some(last)) = (place.instance(), self.stamp) else {
             return Reason::Duplicate;
         };
@@ -459,7 +459,7 @@ impl Reader {
     /// Returns whether a sample was delivered, by its stamp or its sequence number. After the end
     /// of a writer this distinguishes a datagram delayed by the network from the first datagram of
     /// a restarted writer. A stored value of a restarted writer is not an event.
-    fn came_before(&self, place: &Place, handling: Handling) -> bool {
+    fn came_before(&self, place: &SequencePosition, handling: Handling) -> bool {
         let is_known = |stamp| self.known.iter().any(|known| known.stamp == stamp);
         let stored = place.is_stored() && handling != Handling::Event;
         match place.instance() {
@@ -471,7 +471,7 @@ impl Reader {
     /// Returns whether a sample without a precise stamp is one of the last samples that a broker
     /// delivered. After a lost connection to the broker, a writer sends the states again that were
     /// not confirmed.
-    fn is_resent(&self, place: &Place, handling: Handling) -> bool {
+    fn is_resent(&self, place: &SequencePosition, handling: Handling) -> bool {
         let (Some(last), Some(sequence)) = (self.sequence, place.sequence) else {
             return false;
         };
@@ -505,7 +505,7 @@ impl Reader {
 
     /// Returns whether a sample that follows the last sample was taken before it, because the clock
     /// was set back.
-    fn is_set_back(&self, place: Place) -> bool {
+    fn is_set_back(&self, place: SequencePosition) -> bool {
         let older = matches!((place.stamp, self.stamp), (Some(new), Some(last)) if new < last);
         let known = || {
             self.known
@@ -518,10 +518,10 @@ impl Reader {
     /// Determines the relation of a sample that may be a repetition.
     fn recognise(
         &mut self,
-        (stamp, place): (Timestamp, &Place),
+        (stamp, place): (Timestamp, &SequencePosition),
         handling: Handling,
         now: Instant,
-    ) -> Result<Kept, Reason> {
+    ) -> Result<ValueRelation, Reason> {
         let newest = self.stamp == Some(stamp);
         let older = self.stamp.is_some_and(|last| stamp < last);
         let known = self.known.iter_mut().find(|known| known.stamp == stamp);
@@ -531,9 +531,9 @@ impl Reader {
         }
         let Some(known) = known else {
             return Ok(if self.several.is_some() {
-                Kept::Beside
+                ValueRelation::Beside
             } else {
-                Kept::Alone
+                ValueRelation::Alone
             });
         };
         known.heard = now;
@@ -547,13 +547,13 @@ impl Reader {
             (Handling::Event, _) | (_, Handed::No) => {
                 self.known.retain(|known| known.stamp != stamp);
                 Ok(match self.several {
-                    Some(_) => Kept::Beside,
-                    None => Kept::Alone,
+                    Some(_) => ValueRelation::Beside,
+                    None => ValueRelation::Alone,
                 })
             }
-            (Handling::AsSource, Handed::Once) => Ok(Kept::Again),
+            (Handling::AsSource, Handed::Once) => Ok(ValueRelation::Again),
             (_, Handed::Once | Handed::Lasting) if known.live => Err(Reason::Repeat),
-            (_, Handed::Once | Handed::Lasting) => Ok(Kept::Again),
+            (_, Handed::Once | Handed::Lasting) => Ok(ValueRelation::Again),
         }
     }
 
@@ -563,7 +563,7 @@ impl Reader {
     pub(crate) fn delivered(
         &mut self,
         instance: Option<Timestamp>,
-        (kept, lasting): (Kept, bool),
+        (kept, lasting): (ValueRelation, bool),
         now: Instant,
     ) -> Option<Timestamp> {
         self.owed = false;
@@ -582,19 +582,19 @@ impl Reader {
     fn note(
         &mut self,
         stamp: Timestamp,
-        (kept, handed): (Kept, Handed),
+        (kept, handed): (ValueRelation, Handed),
         now: Instant,
     ) -> Option<Timestamp> {
         let mut repeated = false;
         match kept {
-            Kept::Again => {
+            ValueRelation::Again => {
                 if let Some(known) = self.known.iter_mut().find(|known| known.stamp == stamp) {
                     known.live = true;
                     known.handed = handed;
                 }
                 return None;
             }
-            Kept::Alone => {
+            ValueRelation::Alone => {
                 // A topic with a single value has no other current value than the last.
                 if let Some(last) = self.known.back_mut() {
                     last.live = false;
@@ -602,10 +602,10 @@ impl Reader {
             }
             // A newer sample was received before, so this is a repetition of a sample that was
             // missed.
-            Kept::Beside => repeated = self.known.iter().any(|known| known.stamp > stamp),
+            ValueRelation::Beside => repeated = self.known.iter().any(|known| known.stamp > stamp),
         }
         let evicted = (self.known.len() >= MAX_KNOWN).then(|| self.evict());
-        self.known.push_back(Known {
+        self.known.push_back(DeliveredSample {
             stamp,
             heard: now,
             repeated,
@@ -627,7 +627,7 @@ impl Reader {
     }
 
     /// Removes the oldest sample; with several values preferably a sample that was never repeated.
-    fn evict(&mut self) -> Option<Known> {
+    fn evict(&mut self) -> Option<DeliveredSample> {
         let seldom = match self.several {
             Some(_) => self.known.iter().position(|known| !known.repeated),
             None => None,

@@ -23,7 +23,9 @@ use std::time::{Duration, Instant};
 pub(crate) use self::address::SenderAddress;
 pub(crate) use self::clocks::{SenderClocks, SentAt};
 pub use self::heartbeat::Heartbeat;
-pub use self::role::{LocalSide, MuteCause, Rank, Role, RoleChange, SwitchRefusal, TakeoverCause};
+pub use self::role::{
+    LocalSide, MuteCause, RedundancyRank, RedundancyRole, RoleChange, SwitchRefusal, TakeoverCause,
+};
 use crate::settings::Now;
 
 /// Another bridge of the space.
@@ -37,13 +39,13 @@ pub struct RedundantPeer {
 impl RedundantPeer {
     /// Returns the rank.
     #[must_use]
-    pub const fn rank(&self) -> Rank {
+    pub const fn rank(&self) -> RedundancyRank {
         self.heartbeat.rank
     }
 
     /// Returns the role.
     #[must_use]
-    pub const fn role(&self) -> Role {
+    pub const fn role(&self) -> RedundancyRole {
         self.heartbeat.role
     }
 
@@ -109,9 +111,9 @@ pub struct Takeover {
 /// The state of a redundant bridge.
 #[derive(Debug)]
 pub struct Redundancy {
-    rank: Rank,
+    rank: RedundancyRank,
     instance: u32,
-    role: Role,
+    role: RedundancyRole,
     epoch: u32,
     side: LocalSide,
     /// The ServiceLevel of this OPC UA server.
@@ -147,11 +149,11 @@ pub struct Redundancy {
 impl Redundancy {
     /// Creates the state of a bridge that starts. `instance` distinguishes the bridges of a space.
     #[must_use]
-    pub fn new(rank: Rank, instance: u32, now: Now) -> Self {
+    pub fn new(rank: RedundancyRank, instance: u32, now: Now) -> Self {
         Self {
             rank,
             instance,
-            role: Role::Starting,
+            role: RedundancyRole::Starting,
             epoch: 0,
             side: LocalSide::Reached,
             service_level: None,
@@ -174,13 +176,13 @@ impl Redundancy {
 
     /// Returns the rank of this bridge.
     #[must_use]
-    pub const fn rank(&self) -> Rank {
+    pub const fn rank(&self) -> RedundancyRank {
         self.rank
     }
 
     /// Returns the role of this bridge.
     #[must_use]
-    pub const fn role(&self) -> Role {
+    pub const fn role(&self) -> RedundancyRole {
         self.role
     }
 
@@ -218,13 +220,13 @@ impl Redundancy {
     /// Returns whether nothing may be sent to the group.
     #[must_use]
     pub fn mutes_group(&self) -> bool {
-        self.role != Role::Active || self.is_cut
+        self.role != RedundancyRole::Active || self.is_cut
     }
 
     /// Returns whether nothing may be published on the local side.
     #[must_use]
     pub fn mutes_local(&self) -> bool {
-        self.role != Role::Active
+        self.role != RedundancyRole::Active
     }
 
     /// Returns whether the group is out of reach while this bridge is active.
@@ -243,22 +245,22 @@ impl Redundancy {
         let followed = |peer: &RedundantPeer| {
             peer.from() == from && Some(peer.heartbeat.instance) == self.followed
         };
-        self.role != Role::Active && self.peers.iter().any(followed)
+        self.role != RedundancyRole::Active && self.peers.iter().any(followed)
     }
 
     /// Returns the time of the next [`poll`](Self::poll).
     #[must_use]
     pub fn due(&self) -> Instant {
         match self.role {
-            Role::Active => self.next,
-            Role::Starting | Role::Standby => self.next.min(self.deadline),
+            RedundancyRole::Active => self.next,
+            RedundancyRole::Starting | RedundancyRole::Standby => self.next.min(self.deadline),
         }
     }
 
     /// Returns whether this bridge takes over at the next [`poll`](Self::poll).
     #[must_use]
     pub fn takes_over(&self, now: Instant) -> bool {
-        self.role != Role::Active && now >= self.deadline
+        self.role != RedundancyRole::Active && now >= self.deadline
     }
 
     /// Defers the takeover, because messages that have arrived are not handled yet: a heartbeat of
@@ -288,7 +290,7 @@ impl Redundancy {
     /// run, or with a clock that jumped, is muted.
     pub fn check(&mut self, now: Now) -> Option<RoleChange> {
         let seen = std::mem::replace(&mut self.seen, now);
-        if self.role != Role::Active {
+        if self.role != RedundancyRole::Active {
             let stopped = now.monotonic.saturating_duration_since(seen.monotonic);
             if stopped > TOLERATED {
                 self.deadline = (self.deadline + stopped).max(now.monotonic + QUIET);
@@ -322,12 +324,14 @@ impl Redundancy {
     /// Report the heartbeat with [`sent`](Self::sent) or [`not_sent`](Self::not_sent).
     pub fn poll(&mut self, now: Now) -> (Option<Heartbeat>, Option<RoleChange>) {
         let change = match self.role {
-            Role::Starting | Role::Standby if now.monotonic >= self.deadline => {
+            RedundancyRole::Starting | RedundancyRole::Standby
+                if now.monotonic >= self.deadline =>
+            {
                 self.next = now.monotonic;
                 Some(self.take_over(now))
             }
-            Role::Active if now.monotonic >= self.next => self.look_at_sides(now),
-            Role::Starting | Role::Standby | Role::Active => None,
+            RedundancyRole::Active if now.monotonic >= self.next => self.look_at_sides(now),
+            RedundancyRole::Starting | RedundancyRole::Standby | RedundancyRole::Active => None,
         };
         if now.monotonic < self.next {
             return (None, None);
@@ -353,12 +357,12 @@ impl Redundancy {
 
     /// Records that a heartbeat was sent.
     pub fn sent(&mut self, now: Now) -> Option<RoleChange> {
-        if self.role == Role::Active && self.is_cut {
+        if self.role == RedundancyRole::Active && self.is_cut {
             // Another bridge may have taken over in the meantime.
             return Some(self.mute(MuteCause::Reconnected, PATIENCE + STALLED, now));
         }
         self.leased = now.monotonic;
-        if self.role == Role::Active {
+        if self.role == RedundancyRole::Active {
             self.active_at = Some(now.monotonic);
         }
         None
@@ -368,7 +372,7 @@ impl Redundancy {
     /// over. The active bridge stays responsible for its local side.
     pub fn not_sent(&mut self, now: Now) -> Option<RoleChange> {
         self.deadline = now.monotonic + PATIENCE + STALLED;
-        let is_new = self.role == Role::Active && !self.is_cut;
+        let is_new = self.role == RedundancyRole::Active && !self.is_cut;
         self.is_cut |= is_new;
         is_new.then_some(RoleChange::CutOff)
     }
@@ -376,7 +380,7 @@ impl Redundancy {
     /// Records that there were no keys for a heartbeat.
     pub fn not_sealed(&mut self, now: Now) -> Option<RoleChange> {
         self.deadline = now.monotonic + self.rank.listening();
-        let was_active = self.role == Role::Active;
+        let was_active = self.role == RedundancyRole::Active;
         was_active.then(|| self.mute(MuteCause::NoKeys, self.rank.listening(), now))
     }
 
@@ -410,7 +414,7 @@ impl Redundancy {
             return self.hear_active(heartbeat, from, (before, now));
         }
         if heartbeat.is_released
-            && self.role != Role::Active
+            && self.role != RedundancyRole::Active
             && self.followed == Some(heartbeat.instance)
         {
             // The former active bridge sends nothing any more; its last values may be under way.
@@ -428,7 +432,7 @@ impl Redundancy {
         from: SocketAddr,
         (before, now): (Option<Heartbeat>, Now),
     ) -> Option<RoleChange> {
-        if self.role == Role::Active {
+        if self.role == RedundancyRole::Active {
             if heartbeat.precedence() > self.heartbeat().precedence() {
                 self.counts.rivals += 1;
                 let muted = self.mute(MuteCause::Outranked, PATIENCE, now);
@@ -450,7 +454,8 @@ impl Redundancy {
             // A bridge that was active before; it mutes itself.
             return None;
         }
-        let is_new = self.role == Role::Starting || self.followed != Some(heartbeat.instance);
+        let is_new =
+            self.role == RedundancyRole::Starting || self.followed != Some(heartbeat.instance);
         self.follow(heartbeat, now);
         is_new.then_some(RoleChange::Follows {
             rank: heartbeat.rank,
@@ -459,7 +464,7 @@ impl Redundancy {
     }
 
     fn follow(&mut self, heartbeat: Heartbeat, now: Now) {
-        self.role = Role::Standby;
+        self.role = RedundancyRole::Standby;
         self.epoch = heartbeat.epoch;
         self.followed = Some(heartbeat.instance);
         self.active_at = Some(now.monotonic);
@@ -472,7 +477,9 @@ impl Redundancy {
     /// Returns the time by which this bridge takes over later than the standbys of lower ranks.
     fn turn(&self, now: Instant) -> Duration {
         let before = self.peers.iter().filter(|peer| {
-            peer.role() == Role::Standby && peer.is_present(now) && peer.rank() < self.rank
+            peer.role() == RedundancyRole::Standby
+                && peer.is_present(now)
+                && peer.rank() < self.rank
         });
         LATER * u32::try_from(before.count()).unwrap_or(u32::MAX)
     }
@@ -482,7 +489,7 @@ impl Redundancy {
     /// # Errors
     /// This bridge is not active, or there is no standby.
     pub fn switch_over(&mut self, now: Now) -> Result<RoleChange, SwitchRefusal> {
-        if self.role != Role::Active {
+        if self.role != RedundancyRole::Active {
             return Err(SwitchRefusal::NotActive);
         }
         if !self.has_standby(false, now.monotonic) {
@@ -501,7 +508,9 @@ impl Redundancy {
     /// Returns whether a standby was received within the time of a takeover.
     fn has_standby(&self, fit: bool, now: Instant) -> bool {
         self.peers.iter().any(|peer| {
-            peer.role() == Role::Standby && peer.is_present(now) && (peer.is_fit() || !fit)
+            peer.role() == RedundancyRole::Standby
+                && peer.is_present(now)
+                && (peer.is_fit() || !fit)
         })
     }
 
@@ -522,7 +531,7 @@ impl Redundancy {
 
     fn take_over(&mut self, now: Now) -> RoleChange {
         let known = self.peers.iter().map(RedundantPeer::epoch).max();
-        self.role = Role::Active;
+        self.role = RedundancyRole::Active;
         self.epoch = known.unwrap_or(0).max(self.epoch).saturating_add(1);
         self.followed = None;
         self.deferred = None;
@@ -547,7 +556,7 @@ impl Redundancy {
     }
 
     fn mute(&mut self, cause: MuteCause, patience: Duration, now: Now) -> RoleChange {
-        self.role = Role::Standby;
+        self.role = RedundancyRole::Standby;
         self.is_cut = false;
         self.followed = None;
         self.deadline = now.monotonic + patience;

@@ -42,20 +42,20 @@ use mappings::{Mapping, TopicId};
 use messages::{MessageType, PlanError, Selection};
 use uadp::Timestamp;
 
-use self::about::About;
-use self::announcements::Announcements;
-use self::calls::Calls;
+use self::about::DropSite;
+use self::announcements::PlannedAnnouncements;
+use self::calls::RouterCalls;
 use self::reassembly::Reassembly;
 pub use self::redundant::MutedSamples;
-use self::security::Security;
+use self::security::MessageSecurity;
 use self::senders::RedundantSenders;
-use self::values::Values;
+use self::values::TopicQueues;
 use crate::confirm::Handover;
 use crate::counters::{Counters, Reason, Verdict};
 use crate::hops::{Hop, Hops};
-use crate::output::{GOOD, Heard, PublisherKey};
+use crate::output::{GOOD, LocalMessage, PublisherKey};
 use crate::part::OtherParts;
-use crate::settings::{Local, Now, Settings};
+use crate::settings::{Local, Now, RouterSettings};
 use crate::tap::{Crossing, Tapped};
 
 /// Decides which messages cross between a space and UADP. The crate documentation describes its
@@ -118,17 +118,17 @@ use crate::tap::{Crossing, Tapped};
 #[derive(Debug)]
 pub struct Router {
     /// Topics with their queues, turns and timers, and outputs about them.
-    values: Values,
+    values: TopicQueues,
     /// Received chunks of large messages.
     reassembly: Reassembly,
     /// Planned announcements and pending probes.
-    announcements: Announcements,
+    announcements: PlannedAnnouncements,
     /// Requested and executed calls; `None` before the first use.
-    calls: Option<Box<Calls>>,
+    calls: Option<Box<RouterCalls>>,
     /// Random bytes that distinguish own requests from requests of other programs.
     instance: [u8; 16],
     /// Secured groups.
-    security: Security,
+    security: MessageSecurity,
     /// The redundant bridges of other spaces.
     redundant_senders: RedundantSenders,
     /// The bridges of other spaces that carry a part of their space.
@@ -141,14 +141,14 @@ impl Router {
     /// Creates a Router for a space. `mapping` defines the queue of each topic and the period of
     /// repetitions.
     #[must_use]
-    pub fn new(settings: Settings, mapping: Arc<Mapping>) -> Self {
-        let security = Security::new(mapping.security());
+    pub fn new(settings: RouterSettings, mapping: Arc<Mapping>) -> Self {
+        let security = MessageSecurity::new(mapping.security());
         let overhead = security.overhead();
         let own = settings.own;
         Self {
-            values: Values::new(settings, mapping, overhead),
+            values: TopicQueues::new(settings, mapping, overhead),
             reassembly: Reassembly::default(),
-            announcements: Announcements::new(own),
+            announcements: PlannedAnnouncements::new(own),
             calls: None,
             instance: [0; 16],
             security,
@@ -181,14 +181,14 @@ impl Router {
     }
 
     /// Handles a sample received on the local side.
-    pub fn handle_local(&mut self, heard: Heard<'_>, now: Now) -> Verdict {
+    pub fn handle_local(&mut self, heard: LocalMessage<'_>, now: Now) -> Verdict {
         self.handle_local_as(heard, GOOD, now)
     }
 
     /// Handles a sample as [`handle_local`](Self::handle_local) does, with the quality of the
     /// sample: the upper 16 bits of a StatusCode, which are sent as the Status of the
     /// DataSetMessage (OPC 10000-14, 7.2.4.5.4).
-    pub fn handle_local_as(&mut self, heard: Heard<'_>, status: u16, now: Now) -> Verdict {
+    pub fn handle_local_as(&mut self, heard: LocalMessage<'_>, status: u16, now: Now) -> Verdict {
         let topic = heard.topic;
         let verdict = self.values.take_local(heard, status, now);
         self.inquire(now);
@@ -296,16 +296,18 @@ impl Router {
             self.values.forget(at, instance);
         }
         self.handed(topic, instance, Handover::Nobody);
-        self.values
-            .count(About::topic(topic), (Reason::NotPublished, why), 1, || {
-                why.to_owned()
-            });
+        self.values.count(
+            DropSite::topic(topic),
+            (Reason::NotPublished, why),
+            1,
+            || why.to_owned(),
+        );
     }
 
     /// Records that a service did not accept a value of the topic, or did not respond.
     pub fn call_failed(&mut self, topic: TopicId, detail: &str) {
         self.values
-            .count(About::topic(topic), Reason::CallFailed, 1, || {
+            .count(DropSite::topic(topic), Reason::CallFailed, 1, || {
                 detail.to_owned()
             });
     }
@@ -313,8 +315,12 @@ impl Router {
     /// Records a publisher or subscriber of the topic with QoS policies that are incompatible with
     /// the local side.
     pub fn unmatched(&mut self, topic: TopicId) {
-        self.values
-            .count(About::topic(topic), Reason::IncompatibleQos, 1, String::new);
+        self.values.count(
+            DropSite::topic(topic),
+            Reason::IncompatibleQos,
+            1,
+            String::new,
+        );
     }
 
     /// Counts samples that were lost before they reached the Router, such as in a queue of the port
@@ -326,14 +332,14 @@ impl Router {
         (reason, why): (Reason, &'static str),
     ) {
         self.values
-            .count_only(About { topic, from: None }, (reason, why), count, || {
+            .count_only(DropSite { topic, from: None }, (reason, why), count, || {
                 why.to_owned()
             });
     }
 
     /// Counts drops of a port that belong to no topic.
     pub fn dropped(&mut self, reason: Reason, count: u64, why: &'static str) {
-        let about = About {
+        let about = DropSite {
             topic: None,
             from: None,
         };

@@ -8,7 +8,7 @@ use uadp::Timestamp;
 
 /// The space and local side of a Router.
 #[derive(Debug, Clone)]
-pub struct Settings {
+pub struct RouterSettings {
     /// The space that the Router serves.
     pub own: SpaceId,
     /// The payload format of the local side.
@@ -42,7 +42,7 @@ pub enum Forwarding {
 
 /// The capacity of the network for the chunks of large messages.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Link {
+pub enum LinkCapacity {
     /// The speed is unknown, as of a wireless link or behind a broker.
     Unknown,
     /// A network interface of this speed.

@@ -4,7 +4,7 @@ use mappings::Variable;
 
 /// The fields of foreign messages that a topic uses.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub(crate) enum Takes {
+pub(crate) enum UsedFields {
     /// All fields.
     #[default]
     All,
@@ -14,7 +14,7 @@ pub(crate) enum Takes {
     Named,
 }
 
-impl Takes {
+impl UsedFields {
     pub(crate) fn of(variable: Option<&Variable>) -> Self {
         match variable {
             Some(variable) if variable.ua_field.is_some() => Self::Named,

@@ -5,11 +5,11 @@ use std::net::SocketAddr;
 
 use mappings::TopicId;
 
-use crate::counters::{Cause, Reason};
+use crate::counters::{DropCause, Reason};
 
 /// The tapped topics and the events that were not taken yet.
 #[derive(Debug, Default)]
-pub(crate) struct Tap {
+pub(crate) struct TappedTopics {
     topics: Vec<TopicId>,
     events: VecDeque<Tapped>,
     /// The number of events for which there was no room.
@@ -72,7 +72,7 @@ pub enum Crossing {
     },
 }
 
-impl Tap {
+impl TappedTopics {
     /// Sets the tapped topics. Without topics, nothing is recorded.
     pub(crate) fn set(&mut self, topics: &[TopicId]) {
         if self.topics == topics {
@@ -117,7 +117,7 @@ impl Tap {
     pub(crate) fn note_drop(
         &mut self,
         (topic, from): (TopicId, Option<SocketAddr>),
-        Cause { reason, case }: Cause,
+        DropCause { reason, case }: DropCause,
         (count, detail): (u64, &str),
     ) {
         self.note(topic, || Crossing::Dropped {

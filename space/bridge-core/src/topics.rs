@@ -6,14 +6,14 @@ use std::time::Duration;
 use mappings::TopicId;
 
 use crate::counters::Counters;
-use crate::reader::Reader;
-use crate::topic::{Role, Topic};
-use crate::writer::Writer;
+use crate::reader::ReceivedTopicState;
+use crate::topic::{Topic, TopicSide};
+use crate::writer::SentTopicState;
 
 /// The topics of a Router. A topic is looked up once for each sample; its [`Handle`] then leads to
 /// the entry without another search.
 #[derive(Debug, Default)]
-pub(crate) struct Topics {
+pub(crate) struct TopicTable {
     index: HashMap<TopicId, usize>,
     slots: Vec<Option<Slot>>,
     /// The slots without a topic.
@@ -41,7 +41,7 @@ impl Handle {
     }
 }
 
-impl Topics {
+impl TopicTable {
     /// Looks a topic up.
     pub(crate) fn find(&self, topic: TopicId) -> Option<Handle> {
         let slot = *self.index.get(&topic)?;
@@ -86,19 +86,19 @@ impl Topics {
 
     /// Returns the reader of a topic of another space.
     #[inline]
-    pub(crate) fn reader(&mut self, at: Handle) -> Option<&mut Reader> {
+    pub(crate) fn reader(&mut self, at: Handle) -> Option<&mut ReceivedTopicState> {
         match &mut self.at_mut(at)?.role {
-            Role::Theirs(reader) => Some(reader),
-            Role::Ours(_) => None,
+            TopicSide::Theirs(reader) => Some(reader),
+            TopicSide::Ours(_) => None,
         }
     }
 
     /// Returns the writer of a topic of the own space.
     #[inline]
-    pub(crate) fn writer(&mut self, at: Handle) -> Option<&mut Writer> {
+    pub(crate) fn writer(&mut self, at: Handle) -> Option<&mut SentTopicState> {
         match &mut self.at_mut(at)?.role {
-            Role::Ours(writer) => Some(writer),
-            Role::Theirs(_) => None,
+            TopicSide::Ours(writer) => Some(writer),
+            TopicSide::Theirs(_) => None,
         }
     }
 
@@ -113,12 +113,12 @@ impl Topics {
     }
 
     /// Looks a topic of another space up, and returns its reader.
-    pub(crate) fn reader_of(&mut self, topic: TopicId) -> Option<&mut Reader> {
+    pub(crate) fn reader_of(&mut self, topic: TopicId) -> Option<&mut ReceivedTopicState> {
         self.reader(self.find(topic)?)
     }
 
     /// Looks a topic of the own space up, and returns its writer.
-    pub(crate) fn writer_of(&mut self, topic: TopicId) -> Option<&mut Writer> {
+    pub(crate) fn writer_of(&mut self, topic: TopicId) -> Option<&mut SentTopicState> {
         self.writer(self.find(topic)?)
     }
 
@@ -186,9 +186,9 @@ mod tests {
         reason = "a test needs some instant to count from"
     )]
     fn topic() -> Topic {
-        let writer = Writer::new(std::time::Instant::now());
+        let writer = SentTopicState::new(std::time::Instant::now());
         let rules = <(Overflow, Lasting)>::default();
-        Topic::new(Role::Ours(Box::new(writer)), rules)
+        Topic::new(TopicSide::Ours(Box::new(writer)), rules)
     }
 
     fn id(text: &str) -> TopicId {
@@ -197,7 +197,7 @@ mod tests {
 
     #[test]
     fn a_handle_ends_with_its_topic_even_if_another_topic_takes_the_slot() {
-        let mut topics = Topics::default();
+        let mut topics = TopicTable::default();
         let (first, second) = (id("ua_1_1_1"), id("ua_1_1_2"));
         let at = topics.insert(first, topic());
         assert_eq!(topics.find(first), Some(at));
@@ -213,9 +213,9 @@ mod tests {
 
     #[test]
     fn many_topics_are_spread_over_the_period_and_few_are_not() {
-        let mut topics = Topics::default();
+        let mut topics = TopicTable::default();
         let period = Duration::from_secs(1);
-        let add = |topics: &mut Topics, id: u16| {
+        let add = |topics: &mut TopicTable, id: u16| {
             let topic = TopicId::new(1, 5, id).unwrap();
             topics.insert(topic, self::topic())
         };
@@ -238,7 +238,7 @@ mod tests {
 
     #[test]
     fn the_counters_of_a_removed_topic_are_kept_in_total() {
-        let mut topics = Topics::default();
+        let mut topics = TopicTable::default();
         let first = id("ua_1_1_1");
         topics.insert(first, topic());
         topics.counters(Some(first)).add(Reason::Overflow, 2);

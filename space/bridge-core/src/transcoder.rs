@@ -3,20 +3,21 @@
 use std::sync::Arc;
 
 use messages::{
-    DefinitionError, Dialect, MessageType, Plan, PlanError, Registry, Selection, TypeName, Wire,
+    DefinitionError, Dialect, MessagePlan, MessageType, PlanError, Selection, TypeName,
+    TypeRegistry, Wire,
 };
 use uadp::{
     DataSetHeader, Fields, NetworkHeader, NetworkMessage, NetworkMessageEncoder, Scalar, Variant,
 };
 
-use crate::counters::{Cause, Reason};
-use crate::fields::{self, Payload};
+use crate::counters::{DropCause, Reason};
+use crate::fields::{self, LocalPayload};
 
 /// Converts the bytes of a message of the other ROS version into the local type of the same name.
 #[derive(Debug)]
 pub(crate) struct Transcoder {
-    from: Plan,
-    to: Plan,
+    from: MessagePlan,
+    to: MessagePlan,
     namespace: u16,
 }
 
@@ -60,7 +61,7 @@ impl Transcoder {
             name: name.clone(),
             cause: Box::new(cause),
         };
-        let foreign = Registry::bundle(origin)
+        let foreign = TypeRegistry::bundle(origin)
             .get(name)
             .map_err(|error| why(error.into()))?;
         let differs = foreign.leaves().len() != local.leaves().len()
@@ -72,7 +73,8 @@ impl Transcoder {
             return Err(why(TranscodeCause::Differs { there, name }));
         }
         let plan = |message: &Arc<MessageType>, wire| {
-            Plan::compile(message, &Selection::Whole, wire).map_err(|error| why(error.into()))
+            MessagePlan::compile(message, &Selection::Whole, wire)
+                .map_err(|error| why(error.into()))
         };
         Ok(Self {
             from: plan(&foreign, wire(origin))?,
@@ -87,7 +89,7 @@ impl Transcoder {
         mut fields: Fields<'_>,
         scratch: &mut Vec<u8>,
         out: &mut Vec<u8>,
-    ) -> Result<(), (Cause, String)> {
+    ) -> Result<(), (DropCause, String)> {
         let (Some(Ok(Variant::Scalar(Scalar::ByteString(bytes)))), None) =
             (fields.next(), fields.next())
         else {
@@ -100,7 +102,7 @@ impl Transcoder {
         let mut frame = message
             .key_frame(&DataSetHeader::default())
             .map_err(too_big)?;
-        let payload = Payload::Ros(&self.from, bytes.unwrap_or_default());
+        let payload = LocalPayload::Ros(&self.from, bytes.unwrap_or_default());
         fields::read(&payload, self.namespace, &mut frame)?;
         frame.finish().map_err(too_big)?;
         message.finish().map_err(too_big)?;

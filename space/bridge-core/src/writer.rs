@@ -6,13 +6,13 @@ use std::time::{Duration, Instant};
 use mappings::SpaceId;
 use uadp::Timestamp;
 
-use crate::confirm::{Arrival, Awaited, Confirming, Mark};
-use crate::message::{Encoded, Message};
+use crate::confirm::{AwaitedEvent, ConfirmedArrival, Confirming, Mark};
+use crate::message::{EncodedSample, SampleMessage};
 use crate::output::PublisherKey;
 
 /// The state of a sent topic.
 #[derive(Debug)]
-pub(crate) struct Writer {
+pub(crate) struct SentTopicState {
     /// The sequence number of the next DataSetMessage.
     sequence: u16,
     /// The time at which the last sample was taken, as in its message.
@@ -27,7 +27,7 @@ pub(crate) struct Writer {
     live: bool,
     /// The samples to repeat in the order in which they were taken: the last sample, or the last
     /// sample of each latched publisher. Empty for topics of events, and before the first sample.
-    kept: Vec<Kept>,
+    kept: Vec<LastSample>,
     /// The index of the next sample in the current round of repetitions; past the end if the round
     /// is complete.
     next: usize,
@@ -38,7 +38,7 @@ pub(crate) struct Writer {
     /// The newest event, while it is repeated in case it is lost.
     again: Option<Again>,
     /// The outcome of the newest event, if other spaces confirm it.
-    arrival: Option<Arrival>,
+    arrival: Option<ConfirmedArrival>,
     /// Whether the outcome was not reported yet.
     is_news: bool,
 }
@@ -48,11 +48,11 @@ pub(crate) struct Writer {
 #[derive(Debug)]
 struct Again {
     /// The message, unless it is also kept as the last value.
-    message: Option<Encoded>,
+    message: Option<EncodedSample>,
     /// The message, if it is large.
-    large: Option<Arc<Encoded>>,
+    large: Option<Arc<EncodedSample>>,
     /// The missing confirmations.
-    awaited: Option<Awaited>,
+    awaited: Option<AwaitedEvent>,
     /// The time at which it was first sent.
     since: Instant,
     /// The number of repetitions.
@@ -63,12 +63,12 @@ struct Again {
 
 /// The last sample of a latched publisher, or of all publishers that do not latch.
 #[derive(Debug)]
-struct Kept {
+struct LastSample {
     publisher: Option<PublisherKey>,
     /// Whether it is repeated as a state, under a new sequence number. The last event is repeated
     /// under its own number for readers that show it; readers that already have it drop it.
     is_state: bool,
-    message: Message,
+    message: SampleMessage,
     /// Whether its stamp is the stamp of another bridge, which sends this topic while this bridge
     /// is muted.
     is_adopted: bool,
@@ -81,7 +81,7 @@ pub(crate) enum Idle {
     KeepAlive,
 }
 
-impl Writer {
+impl SentTopicState {
     pub(crate) const fn new(now: Instant) -> Self {
         Self {
             sequence: 0,
@@ -137,7 +137,7 @@ impl Writer {
     /// recognise its repetitions. Returns whether there is such a sample.
     pub(crate) fn adopt(&mut self, fields: &[u8], stamp: Timestamp) -> bool {
         for kept in &mut self.kept {
-            if let Message::Datagram(encoded) = &mut kept.message
+            if let SampleMessage::Datagram(encoded) = &mut kept.message
                 && encoded.fields().is_ok_and(|own| own == fields)
             {
                 encoded.take_at(stamp);
@@ -152,7 +152,7 @@ impl Writer {
     /// value since.
     pub(crate) fn disown(&mut self, utc: Timestamp) {
         let [
-            Kept {
+            LastSample {
                 is_adopted: true, ..
             },
         ] = self.kept.as_slice()
@@ -161,7 +161,7 @@ impl Writer {
         };
         let stamp = self.stamp(utc);
         if let Some(kept) = self.kept.first_mut()
-            && let Message::Datagram(encoded) = &mut kept.message
+            && let SampleMessage::Datagram(encoded) = &mut kept.message
         {
             encoded.take_at(stamp);
             kept.is_adopted = false;
@@ -205,7 +205,7 @@ impl Writer {
     pub(crate) fn keep(
         &mut self,
         (publisher, is_state): (Option<PublisherKey>, bool),
-        message: &Message,
+        message: &SampleMessage,
     ) -> bool {
         let found = self
             .kept
@@ -217,7 +217,7 @@ impl Writer {
                 kept.is_state = is_state;
                 kept.is_adopted = false;
                 match (&mut kept.message, message) {
-                    (Message::Datagram(last), Message::Datagram(new)) => {
+                    (SampleMessage::Datagram(last), SampleMessage::Datagram(new)) => {
                         last.bytes.clone_from(&new.bytes);
                         last.timestamp_at = new.timestamp_at;
                         last.payload_at = new.payload_at;
@@ -236,7 +236,7 @@ impl Writer {
                     self.kept.remove(0);
                     self.leave_round(0);
                 }
-                self.kept.push(Kept {
+                self.kept.push(LastSample {
                     publisher,
                     is_state,
                     message: message.share(),
@@ -302,7 +302,7 @@ impl Writer {
 
     /// Returns the next sample of the round of repetitions; `None` if a repetition of the newest
     /// event is due.
-    pub(crate) fn next_repeated(&self) -> Option<&Message> {
+    pub(crate) fn next_repeated(&self) -> Option<&SampleMessage> {
         if self.is_again_due() {
             // A repeated event is sent alone, because it is short and must not wait.
             return None;
@@ -313,7 +313,7 @@ impl Writer {
     /// Returns the newest event if its repetition is due, else the next sample of the round: a
     /// state with a new sequence number, an event with its own. `buffer` returns a buffer for the
     /// datagram.
-    pub(crate) fn repeat(&mut self, buffer: impl FnOnce() -> Vec<u8>) -> Option<Message> {
+    pub(crate) fn repeat(&mut self, buffer: impl FnOnce() -> Vec<u8>) -> Option<SampleMessage> {
         if self.is_again_due() {
             return self.event_again(buffer);
         }
@@ -324,13 +324,13 @@ impl Writer {
             self.next += 1;
             // A message that is still being sent needs no repetition.
             let Some(sequence) = (match &mut kept.message {
-                Message::Large(last) => Arc::get_mut(last).map(|last| {
+                SampleMessage::Large(last) => Arc::get_mut(last).map(|last| {
                     if kept.is_state {
                         last.number(next);
                     }
                     last.sequence()
                 }),
-                Message::Datagram(last) => Some(last.sequence()),
+                SampleMessage::Datagram(last) => Some(last.sequence()),
             }) else {
                 continue;
             };
@@ -343,43 +343,43 @@ impl Writer {
             self.sequence = next.wrapping_add(1);
         }
         Some(match &kept.message {
-            Message::Datagram(last) => {
+            SampleMessage::Datagram(last) => {
                 let mut bytes = buffer();
                 bytes.clone_from(&last.bytes);
-                let mut again = Encoded { bytes, ..*last };
+                let mut again = EncodedSample { bytes, ..*last };
                 if kept.is_state {
                     again.number(next);
                 }
-                Message::Datagram(again)
+                SampleMessage::Datagram(again)
             }
-            large @ Message::Large(_) => large.share(),
+            large @ SampleMessage::Large(_) => large.share(),
         })
     }
 
     /// Returns the newest event for repetition.
-    fn event_again(&mut self, buffer: impl FnOnce() -> Vec<u8>) -> Option<Message> {
+    fn event_again(&mut self, buffer: impl FnOnce() -> Vec<u8>) -> Option<SampleMessage> {
         let again = self.again.as_mut()?;
         again.is_due = false;
         if let Some(large) = &again.large {
             let kept = self.kept.iter().filter(
-                |kept| matches!(&kept.message, Message::Large(kept) if Arc::ptr_eq(kept, large)),
+                |kept| matches!(&kept.message, SampleMessage::Large(kept) if Arc::ptr_eq(kept, large)),
             );
             // A message that is still being sent needs no repetition.
             let is_sent = Arc::strong_count(large) == 1 + kept.count();
-            return is_sent.then(|| Message::Large(Arc::clone(large)));
+            return is_sent.then(|| SampleMessage::Large(Arc::clone(large)));
         }
         let mut kept = self.kept.iter();
         let message = match &again.message {
             Some(message) => Some(message),
             None => kept.find_map(|kept| match &kept.message {
-                Message::Datagram(message) if kept.publisher.is_none() => Some(message),
-                Message::Datagram(_) | Message::Large(_) => None,
+                SampleMessage::Datagram(message) if kept.publisher.is_none() => Some(message),
+                SampleMessage::Datagram(_) | SampleMessage::Large(_) => None,
             }),
         };
         let message = message.map(|message| {
             let mut bytes = buffer();
             bytes.clone_from(&message.bytes);
-            Message::Datagram(Encoded { bytes, ..*message })
+            SampleMessage::Datagram(EncodedSample { bytes, ..*message })
         });
         if again.awaited.is_none() && again.times >= AGAIN.len() {
             self.again = None;
@@ -396,7 +396,7 @@ impl Writer {
     /// replaces the previous event, which is not repeated any more.
     pub(crate) fn send_again(
         &mut self,
-        message: &Message,
+        message: &SampleMessage,
         (is_state, is_kept): (bool, bool),
         confirmed: Option<&Confirming>,
         now: Instant,
@@ -406,8 +406,8 @@ impl Writer {
         let mark = message.encoded().mark();
         let awaited = confirmed.and_then(|confirmed| Some(confirmed.await_event(mark?, now)));
         let large = match message {
-            Message::Large(large) => Some(Arc::clone(large)),
-            Message::Datagram(_) => None,
+            SampleMessage::Large(large) => Some(Arc::clone(large)),
+            SampleMessage::Datagram(_) => None,
         };
         if is_state || (large.is_some() && awaited.is_none()) {
             self.again = None;
@@ -423,7 +423,7 @@ impl Writer {
         });
         (again.since, again.times, again.is_due) = (now, 0, false);
         (again.large, again.awaited) = (large, awaited);
-        let Message::Datagram(message) = message else {
+        let SampleMessage::Datagram(message) = message else {
             again.message = None;
             return;
         };
@@ -489,7 +489,7 @@ impl Writer {
     fn end_again(&mut self) {
         let awaited = self.again.take().and_then(|again| again.awaited);
         if let Some(awaited) = awaited {
-            self.arrival = Some(Arrival::Unknown(awaited.spaces));
+            self.arrival = Some(ConfirmedArrival::Unknown(awaited.spaces));
             self.is_news = true;
         }
     }
@@ -526,12 +526,12 @@ impl Writer {
         if is_over {
             self.again = None;
         }
-        self.arrival = Some(Arrival::Confirmed);
+        self.arrival = Some(ConfirmedArrival::Confirmed);
         self.is_news = true;
     }
 
     /// Returns the outcome of the newest event, if others confirm it and it is known.
-    pub(crate) const fn arrival(&self) -> Option<&Arrival> {
+    pub(crate) const fn arrival(&self) -> Option<&ConfirmedArrival> {
         self.arrival.as_ref()
     }
 

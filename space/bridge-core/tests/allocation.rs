@@ -4,15 +4,15 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use allocation_counter::measure;
-use bridge_core::{Local, Now, Output, Router, Settings, decode_fields, encode_fields};
+use bridge_core::{Local, Now, Output, Router, RouterSettings, decode_fields, encode_fields};
 use mappings::{Mapping, SpaceId};
-use messages::{Dialect, NoFields, Plan, Registry, Selection, Wire};
+use messages::{Dialect, MessagePlan, NoFields, Selection, TypeRegistry, Wire};
 use uadp::{
     DataSetHeader, Fields, GroupHeader, NetworkHeader, NetworkMessage, NetworkMessageEncoder,
     PublisherId, Scalar, Timestamp,
 };
 
-fn encode(plan: &Plan, message: &[u8], datagram: &mut Vec<u8>) {
+fn encode(plan: &MessagePlan, message: &[u8], datagram: &mut Vec<u8>) {
     datagram.clear();
     let network = NetworkHeader::default();
     let mut encoder = NetworkMessageEncoder::new(datagram, &network, Some(&[1])).unwrap();
@@ -40,16 +40,16 @@ fn messages_move_both_ways_without_an_allocation() {
             "sensor_msgs/LaserScan",
             "sensor_msgs/PointCloud2",
         ] {
-            let message = Registry::bundle(dialect)
+            let message = TypeRegistry::bundle(dialect)
                 .get(&name.parse().unwrap())
                 .unwrap();
-            let plan = Plan::compile(&message, &Selection::Whole, wire).unwrap();
+            let plan = MessagePlan::compile(&message, &Selection::Whole, wire).unwrap();
             let nothing = Selection::Template {
                 fields: Vec::new(),
                 rest: [].into(),
             };
             let mut bytes = Vec::new();
-            Plan::compile(&message, &nothing, wire)
+            MessagePlan::compile(&message, &nothing, wire)
                 .unwrap()
                 .write(&mut NoFields, &mut bytes)
                 .unwrap();
@@ -70,7 +70,7 @@ fn messages_move_both_ways_without_an_allocation() {
 #[test]
 #[expect(clippy::disallowed_methods, reason = "some instant to count from")]
 fn a_key_frame_of_another_space_is_handed_on_without_an_allocation() {
-    let settings = Settings {
+    let settings = RouterSettings {
         own: SpaceId::new(1).unwrap(),
         local: Local::Ros1,
         source: None,
@@ -80,7 +80,7 @@ fn a_key_frame_of_another_space_is_handed_on_without_an_allocation() {
         monotonic: Instant::now(),
         utc: Timestamp::from_unix_nanos(1_700_000_000_000_000_000),
     };
-    let message = Registry::bundle(Dialect::Ros1)
+    let message = TypeRegistry::bundle(Dialect::Ros1)
         .get(&"geometry_msgs/Twist".parse().unwrap())
         .unwrap();
     let topic = "ua_2_5_10".parse().unwrap();

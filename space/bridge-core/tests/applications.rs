@@ -6,15 +6,15 @@ use crate::cell;
 use std::net::SocketAddr;
 use std::time::Duration;
 
-use bridge_core::{Application, Endpoint, Local, MessageSecurityMode, Reason};
-use cell::{Cell, Program, component};
-use uadp::discovery::{Announced, Announcement, ApplicationDescription, List, Probe};
+use bridge_core::{Application, ApplicationEndpoint, Local, MessageSecurityMode, Reason};
+use cell::{SimulatedCell, SimulatedProgram, component};
+use uadp::discovery::{AnnouncedContent, Announcement, ApplicationDescription, Probe, WireArray};
 use uadp::{NetworkMessage, NetworkMessageType, PublisherId, SecurityHeader, StatusCode};
 
 const SECOND: Duration = Duration::from_secs(1);
 
 fn application(name: &str, url: Option<&str>) -> Application {
-    let endpoint = |url: &str| Endpoint {
+    let endpoint = |url: &str| ApplicationEndpoint {
         url: url.to_owned(),
         policy_uri: "http://opcfoundation.org/UA/SecurityPolicy#None".to_owned(),
         mode: MessageSecurityMode::NONE,
@@ -30,8 +30,8 @@ fn application(name: &str, url: Option<&str>) -> Application {
 }
 
 /// Creates a bridge and a component in the same group, which announce their applications.
-fn cell() -> Cell {
-    let mut cell = Cell::new(vec![Program::new(1, Local::Ros1), component(7)]);
+fn cell() -> SimulatedCell {
+    let mut cell = SimulatedCell::new(vec![SimulatedProgram::new(1, Local::Ros1), component(7)]);
     let now = cell.now();
     let [bridge, gripper] = &mut cell.programs[..] else {
         panic!("two programs")
@@ -67,7 +67,7 @@ fn who_begins_learns_who_is_there_and_is_told_of_once() {
 }
 
 /// Returns the announcements of a program.
-fn announced(cell: &mut Cell, at: usize) -> Vec<Vec<u8>> {
+fn announced(cell: &mut SimulatedCell, at: usize) -> Vec<Vec<u8>> {
     let mut all = cell.datagrams_of(at);
     all.retain(|datagram| {
         let message = NetworkMessage::decode(datagram).unwrap();
@@ -77,7 +77,7 @@ fn announced(cell: &mut Cell, at: usize) -> Vec<Vec<u8>> {
 }
 
 /// Sends a datagram from another host to all programs.
-fn say(cell: &mut Cell, port: u16, datagram: &[u8]) {
+fn say(cell: &mut SimulatedCell, port: u16, datagram: &[u8]) {
     let from = SocketAddr::from(([10, 0, 0, 9], port));
     for at in 0..cell.programs.len() {
         cell.hear(at, datagram, from);
@@ -110,7 +110,7 @@ fn endpoints_are_told_by_servers_and_others_say_that_they_have_none() {
         let told = all.iter().rev().find_map(|datagram| {
             let message = NetworkMessage::decode(datagram).unwrap();
             match Announcement::decode(&message).unwrap().announced {
-                Announced::PublisherEndpoints { endpoints, status } => {
+                AnnouncedContent::PublisherEndpoints { endpoints, status } => {
                     Some((endpoints.len(), status))
                 }
                 _ => None,
@@ -128,9 +128,9 @@ fn told(uri: &str) -> Vec<u8> {
     };
     let announcement = Announcement {
         sequence_number: 0,
-        announced: Announced::ApplicationDescription {
+        announced: AnnouncedContent::ApplicationDescription {
             description,
-            capabilities: List::null(),
+            capabilities: WireArray::null(),
         },
     };
     let mut datagram = Vec::new();

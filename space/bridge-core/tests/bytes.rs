@@ -5,9 +5,9 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Instant;
 
-use bridge_core::{Heard, Local, Now, Output, Reason, Router, Settings, Verdict};
+use bridge_core::{Local, LocalMessage, Now, Output, Reason, Router, RouterSettings, Verdict};
 use mappings::{Mapping, SpaceId, TopicId};
-use messages::{Dialect, MessageType, Registry, Selection};
+use messages::{Dialect, MessageType, Selection, TypeRegistry};
 use uadp::Timestamp;
 
 #[expect(clippy::disallowed_methods, reason = "some instant to count from")]
@@ -19,25 +19,25 @@ fn now() -> Now {
 }
 
 /// Creates a bridge: ROS 1 for space 1, ROS 2 for other spaces.
-fn bridge(space: u16) -> (Router, Registry) {
+fn bridge(space: u16) -> (Router, TypeRegistry) {
     let (local, dialect) = match space {
         1 => (Local::Ros1, Dialect::Ros1),
         _ => (Local::Cdr, Dialect::Ros2),
     };
-    let settings = Settings {
+    let settings = RouterSettings {
         own: SpaceId::new(space).unwrap(),
         local,
         source: None,
     };
     let router = Router::new(settings, Arc::new(Mapping::default()));
-    (router, Registry::bundle(dialect))
+    (router, TypeRegistry::bundle(dialect))
 }
 
 /// Returns the message that a bridge of space `to` publishes when a bridge of space `from` receives
 /// `message`. Both bind the topic `as: bytes`.
 fn cross(
     (from, to): (u16, u16),
-    types: impl Fn(&mut Registry) -> Arc<MessageType>,
+    types: impl Fn(&mut TypeRegistry) -> Arc<MessageType>,
     message: &[u8],
 ) -> Result<Vec<u8>, (Reason, String)> {
     let topic: TopicId = format!("ua_{from}_5_10").parse().unwrap();
@@ -50,7 +50,7 @@ fn cross(
             .unwrap();
         router
     });
-    let heard = Heard {
+    let heard = LocalMessage {
         topic,
         payload: message,
         received: now.utc,
@@ -70,7 +70,7 @@ fn cross(
     output.unwrap()
 }
 
-fn of(name: &'static str) -> impl Fn(&mut Registry) -> Arc<MessageType> {
+fn of(name: &'static str) -> impl Fn(&mut TypeRegistry) -> Arc<MessageType> {
     move |registry| registry.get(&name.parse().unwrap()).unwrap()
 }
 
@@ -112,7 +112,7 @@ fn bytes_that_are_no_such_message_are_counted_as_malformed() {
 
 #[test]
 fn a_type_the_other_ros_is_not_known_to_have_is_a_mismatch_that_names_both_sides() {
-    let own = |registry: &mut Registry| {
+    let own = |registry: &mut TypeRegistry| {
         let name = "my_robot_msgs/Part".parse().unwrap();
         registry.add(&name, "int32 number\n").unwrap();
         registry.get(&name).unwrap()

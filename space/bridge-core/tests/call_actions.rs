@@ -5,19 +5,19 @@ use std::num::NonZeroU16;
 use std::sync::Arc;
 
 use bridge_core::{
-    ActionFamily, AskId, CallMap, CallRole, Executed, Heard, Local, OfferedType, Output, Reason,
-    ValueNote,
+    ActionFamily, AskId, CallMap, CallRole, Executed, Local, LocalMessage, OfferedType, Output,
+    Reason, ValueNote,
 };
-use cell::{Cell, Program, ms, topic};
+use cell::{SimulatedCell, SimulatedProgram, ms, topic};
 use mappings::{Assigned, Assignment, FieldMap, Overflow, TopicId};
-use messages::{ActionCalls, Dialect, Literal, Registry};
+use messages::{ActionCalls, Dialect, Literal, TypeRegistry};
 
 const ASKING: usize = 0;
 const EXECUTING: usize = 1;
 const GOAL: u16 = 70;
 
 fn actions(dialect: Dialect, name: &str, text: &str) -> ActionCalls {
-    let mut registry = Registry::bundle(dialect);
+    let mut registry = TypeRegistry::bundle(dialect);
     let name = name.parse().unwrap();
     registry.add_action(&name, text).unwrap();
     registry.action_calls(&name).unwrap()
@@ -52,10 +52,10 @@ fn field(path: &str) -> Assigned {
 }
 
 /// Creates a ROS 2 bridge that executes an action of the type, and a ROS 1 bridge.
-fn executed(calls: &ActionCalls) -> Cell {
-    let mut cell = Cell::new(vec![
-        Program::new(1, Local::Ros1),
-        Program::new(2, Local::Cdr),
+fn executed(calls: &ActionCalls) -> SimulatedCell {
+    let mut cell = SimulatedCell::new(vec![
+        SimulatedProgram::new(1, Local::Ros1),
+        SimulatedProgram::new(2, Local::Cdr),
     ]);
     let now = cell.now();
     let router = &mut cell.programs[EXECUTING].router;
@@ -81,9 +81,9 @@ fn executed(calls: &ActionCalls) -> Cell {
     cell
 }
 
-fn say(cell: &mut Cell, payload: &[u8]) {
+fn say(cell: &mut SimulatedCell, payload: &[u8]) {
     let now = cell.now();
-    let heard = Heard {
+    let heard = LocalMessage {
         topic: of(GOAL + 3),
         payload,
         received: now.utc,
@@ -92,7 +92,7 @@ fn say(cell: &mut Cell, payload: &[u8]) {
     let _verdict = cell.programs[EXECUTING].router.handle_local(heard, now);
 }
 
-fn deliveries(cell: &mut Cell) -> Vec<Vec<u8>> {
+fn deliveries(cell: &mut SimulatedCell) -> Vec<Vec<u8>> {
     let outputs = cell.outputs(ASKING).into_iter();
     let payloads = outputs.filter_map(|output| match output {
         Output::Delivery(delivery) => Some(delivery.payload),
@@ -166,7 +166,7 @@ fn the_first_feedback_is_told_where_the_action_was_known_before_it_was_offered()
     let mut cell = executed(&actions(Dialect::Ros2, "demo_msgs/Count", COUNT));
     // A program that starts later has not received the first announcements.
     cell.kill(ASKING);
-    cell.start(ASKING, Program::new(1, Local::Ros1));
+    cell.start(ASKING, SimulatedProgram::new(1, Local::Ros1));
     let now = cell.now();
     cell.programs[ASKING].router.call_the_roll(now);
     cell.run(ms(2_000));

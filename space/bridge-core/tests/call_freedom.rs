@@ -12,12 +12,12 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use bridge_core::{
-    AskErrorKind, AskId, CallDescription, CallField, CallRole, Executed, Local, Offered,
+    AskErrorKind, AskId, CallDescription, CallField, CallRole, Executed, Local, OfferedCall,
     OfferedType, Reason,
 };
-use cell::{Cell, Program, block, is_action, ms, topic};
+use cell::{SimulatedCell, SimulatedProgram, block, is_action, ms, topic};
 use mappings::TopicId;
-use messages::{Dialect, Registry, ServiceType};
+use messages::{Dialect, ServiceType, TypeRegistry};
 use proptest::prelude::*;
 use uadp::{BuiltinType, Scalar, Variant};
 
@@ -55,7 +55,7 @@ fn weather() -> impl Strategy<Value = Weather> {
 }
 
 impl Weather {
-    fn fill(self, cell: &mut Cell) {
+    fn fill(self, cell: &mut SimulatedCell) {
         let Self {
             lost,
             doubled,
@@ -99,7 +99,7 @@ fn number(local: Local, number: u32) -> Vec<u8> {
 
 fn service(dialect: Dialect) -> Arc<ServiceType> {
     let name = "t/Echo".parse().unwrap();
-    let mut registry = Registry::empty(dialect);
+    let mut registry = TypeRegistry::empty(dialect);
     registry
         .add_service(&name, "uint32 number\n---\nuint32 number\n")
         .unwrap();
@@ -108,14 +108,14 @@ fn service(dialect: Dialect) -> Arc<ServiceType> {
 
 /// Offers the call of a program, and binds the calls of the other programs with the type of its
 /// local side.
-fn join(cell: &mut Cell, (at, local): (usize, Local), own: TopicId, others: &[TopicId]) {
+fn join(cell: &mut SimulatedCell, (at, local): (usize, Local), own: TopicId, others: &[TopicId]) {
     let dialect = match local {
         Local::Fields => {
             let description = description();
             return cell.offer(
                 at,
                 own,
-                Offered {
+                OfferedCall {
                     description,
                     open: false,
                 },
@@ -141,7 +141,7 @@ fn join(cell: &mut Cell, (at, local): (usize, Local), own: TopicId, others: &[To
     cell.drain(at);
 }
 
-fn actions(cell: &mut Cell) -> usize {
+fn actions(cell: &mut SimulatedCell) -> usize {
     let all = 0..cell.programs.len();
     all.map(|at| {
         let sent = cell.datagrams_of(at);
@@ -164,8 +164,8 @@ proptest! {
         let death = death.map(|(who, when, again)| (who.index(spaces.len()), when, again));
         let dies = |at: usize| death.is_some_and(|(who, ..)| who == at);
         let spaces: Vec<u16> = spaces.into_iter().collect();
-        let programs = spaces.iter().zip(sides).map(|(space, local)| Program::new(*space, local));
-        let mut cell = Cell::new(programs.collect());
+        let programs = spaces.iter().zip(sides).map(|(space, local)| SimulatedProgram::new(*space, local));
+        let mut cell = SimulatedCell::new(programs.collect());
         let call = |at: usize| topic(spaces[at], 5, 61);
         let all: Vec<TopicId> = (0..spaces.len()).map(call).collect();
         for (at, (own, local)) in all.iter().zip(sides).enumerate() {
@@ -193,7 +193,7 @@ proptest! {
                 Some((who, when, _)) if turn == when => cell.kill(who),
                 Some((who, when, true)) if turn == when + 5 => {
                     let port = 30_000 + u16::try_from(who).unwrap();
-                    cell.start(who, Program::new(spaces[who], sides[who]).at_port(port));
+                    cell.start(who, SimulatedProgram::new(spaces[who], sides[who]).at_port(port));
                     join(&mut cell, (who, sides[who]), all[who], &all);
                     lives[who] += 1;
                 }

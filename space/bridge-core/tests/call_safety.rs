@@ -7,10 +7,10 @@ use std::rc::Rc;
 use std::time::Duration;
 
 use bridge_core::{
-    AskErrorKind, AskId, CallDescription, CallField, CallRole, Executed, Local, Offered, Output,
-    Reason,
+    AskErrorKind, AskId, CallDescription, CallField, CallRole, Executed, Local, OfferedCall,
+    Output, Reason,
 };
-use cell::{Cell, Program, component, ms, topic};
+use cell::{SimulatedCell, SimulatedProgram, component, ms, topic};
 use mappings::TopicId;
 use uadp::action::{
     ActionAddress, ActionDialect, ActionFields, ActionHeader, ActionKind, ActionState, ActionToSend,
@@ -27,8 +27,8 @@ fn start() -> TopicId {
     topic(0, 7, 105)
 }
 
-fn offered(open: bool) -> Offered {
-    Offered {
+fn offered(open: bool) -> OfferedCall {
+    OfferedCall {
         description: CallDescription {
             name: "gripper.Load".to_owned(),
             about: String::new(),
@@ -42,8 +42,8 @@ fn offered(open: bool) -> Offered {
 
 /// Creates a bridge of space 1 and a component with the namespace 7. The bridge knows the call of
 /// the component.
-fn plugged_in() -> Cell {
-    let mut cell = Cell::new(vec![Program::new(1, Local::Fields), component(7)]);
+fn plugged_in() -> SimulatedCell {
+    let mut cell = SimulatedCell::new(vec![SimulatedProgram::new(1, Local::Fields), component(7)]);
     cell.offer(GRIPPER, start(), offered(true));
     cell.run(ms(200));
     assert_eq!(cell.known(BRIDGE), [start()]);
@@ -172,7 +172,7 @@ fn the_chunks_of_a_repetition_fill_in_those_that_were_lost() {
 }
 
 /// Returns the time of sending and the TimeoutHint of the requests that a program sent.
-fn times_of_requests(cell: &mut Cell, at: usize) -> Vec<(Option<i128>, Duration)> {
+fn times_of_requests(cell: &mut SimulatedCell, at: usize) -> Vec<(Option<i128>, Duration)> {
     let mut times = Vec::new();
     for datagram in cell.datagrams_of(at) {
         let message = NetworkMessage::decode(&datagram).unwrap();
@@ -231,7 +231,9 @@ fn the_chunks_of_a_request_and_of_its_repetitions_have_no_time() {
 #[test]
 fn chunks_of_calls_go_out_at_the_pace_of_chunks() {
     let mut cell = plugged_in();
-    let sent = |cell: &mut Cell| -> usize { cell.datagrams_of(BRIDGE).iter().map(Vec::len).sum() };
+    let sent = |cell: &mut SimulatedCell| -> usize {
+        cell.datagrams_of(BRIDGE).iter().map(Vec::len).sum()
+    };
     let before = sent(&mut cell);
     cell.ask(BRIDGE, AskId(1), (start(), &large(2_500_000)), ms(10_000));
     let burst = sent(&mut cell) - before;
@@ -369,21 +371,21 @@ fn who_missed_that_a_program_was_started_anew_asks_what_it_is_when_that_shows() 
 }
 
 /// Sends `count` requests of a stranger with distinct ids.
-fn flood(cell: &mut Cell, count: u16, from: SocketAddr) {
+fn flood(cell: &mut SimulatedCell, count: u16, from: SocketAddr) {
     for id in 0..count {
         cell.hear(GRIPPER, &request(None, id), from);
     }
 }
 
 /// Returns the number of requests and responses that a program has sent.
-fn actions_of(cell: &mut Cell, at: usize) -> usize {
+fn actions_of(cell: &mut SimulatedCell, at: usize) -> usize {
     let sent = cell.datagrams_of(at);
     sent.iter().filter(|bytes| cell::is_action(bytes)).count()
 }
 
 #[test]
 fn refused_requests_of_a_stranger_are_answered_once_each_and_no_more_than_there_is_room_for() {
-    let mut cell = Cell::new(vec![Program::new(1, Local::Fields), component(7)]);
+    let mut cell = SimulatedCell::new(vec![SimulatedProgram::new(1, Local::Fields), component(7)]);
     cell.offer(GRIPPER, start(), offered(false));
     cell.run(ms(200));
     let stranger = SocketAddr::from(([192, 0, 2, 9], 5_000));
@@ -425,7 +427,8 @@ fn a_stranger_that_fills_the_room_of_an_open_call_does_not_stop_the_calls_of_oth
 #[test]
 fn no_room_is_taken_for_the_chunks_of_a_stranger_where_no_call_is_open() {
     for open in [false, true] {
-        let mut cell = Cell::new(vec![Program::new(1, Local::Fields), component(7)]);
+        let mut cell =
+            SimulatedCell::new(vec![SimulatedProgram::new(1, Local::Fields), component(7)]);
         cell.offer(GRIPPER, start(), offered(open));
         cell.run(ms(200));
         cell.programs[BRIDGE].address = SocketAddr::from(([192, 0, 2, 9], 5_000));
@@ -441,7 +444,8 @@ fn no_room_is_taken_for_the_chunks_of_a_stranger_where_no_call_is_open() {
 #[test]
 fn a_stranger_that_sends_half_a_request_takes_room_only_where_a_call_is_open() {
     for open in [false, true] {
-        let mut cell = Cell::new(vec![Program::new(1, Local::Fields), component(7)]);
+        let mut cell =
+            SimulatedCell::new(vec![SimulatedProgram::new(1, Local::Fields), component(7)]);
         cell.offer(GRIPPER, start(), offered(open));
         cell.run(ms(200));
         cell.programs[BRIDGE].address = SocketAddr::from(([192, 0, 2, 9], 5_000));

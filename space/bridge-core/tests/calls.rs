@@ -5,12 +5,12 @@ use crate::cell;
 use std::sync::Arc;
 
 use bridge_core::{
-    AskErrorKind, AskId, CallDescription, CallField, CallMap, CallRole, Executed, Local, Offered,
-    OfferedType, Output, Owned, Reason, ValueDescription,
+    AskErrorKind, AskId, CallDescription, CallField, CallMap, CallRole, Executed, Local,
+    OfferedCall, OfferedType, Output, Owned, Reason, ValueDescription,
 };
-use cell::{Cell, Program, component, ms, topic};
+use cell::{SimulatedCell, SimulatedProgram, component, ms, topic};
 use mappings::{Assigned, Assignment, FieldMap, Mapping, Overflow, TopicId};
-use messages::{Dialect, Leaf, Literal, Rank, Registry, ServiceType};
+use messages::{ArrayRank, Dialect, Leaf, Literal, ServiceType, TypeRegistry};
 use uadp::{BuiltinType, Fields, Scalar, StatusCode, Variant};
 
 const BRIDGE: usize = 0;
@@ -22,7 +22,7 @@ fn start() -> TopicId {
 
 fn service(dialect: Dialect, name: &str) -> Arc<ServiceType> {
     let name = name.parse().unwrap();
-    Registry::bundle(dialect).service(&name).unwrap()
+    TypeRegistry::bundle(dialect).service(&name).unwrap()
 }
 
 /// Returns the Start call of a skill with default values for all parameters.
@@ -40,8 +40,8 @@ fn grasp() -> CallDescription {
     }
 }
 
-fn offered(description: CallDescription) -> Offered {
-    Offered {
+fn offered(description: CallDescription) -> OfferedCall {
+    OfferedCall {
         description,
         open: false,
     }
@@ -49,8 +49,8 @@ fn offered(description: CallDescription) -> Offered {
 
 /// Creates a bridge of space 1 and a component with the namespace 7. The bridge knows the call of
 /// the component.
-fn plugged_in(local: Local) -> Cell {
-    let mut cell = Cell::new(vec![Program::new(1, local), component(7)]);
+fn plugged_in(local: Local) -> SimulatedCell {
+    let mut cell = SimulatedCell::new(vec![SimulatedProgram::new(1, local), component(7)]);
     cell.offer(GRIPPER, start(), offered(grasp()));
     cell.run(ms(200));
     assert_eq!(cell.known(BRIDGE), [start()]);
@@ -276,10 +276,11 @@ fn bad_outcomes_are_told_as_what_they_are() {
 #[test]
 fn requests_from_other_hosts_are_executed_only_where_that_is_allowed() {
     for open in [false, true] {
-        let mut cell = Cell::new(vec![Program::new(1, Local::Fields), component(7)]);
+        let mut cell =
+            SimulatedCell::new(vec![SimulatedProgram::new(1, Local::Fields), component(7)]);
         cell.programs[BRIDGE].address = "192.168.1.9:5000".parse().unwrap();
         let description = grasp();
-        cell.offer(GRIPPER, start(), Offered { description, open });
+        cell.offer(GRIPPER, start(), OfferedCall { description, open });
         cell.run(ms(200));
         cell.ask(BRIDGE, AskId(1), (start(), &[0, 0]), ms(3_000));
         cell.run(ms(50));
@@ -296,10 +297,10 @@ fn requests_from_other_hosts_are_executed_only_where_that_is_allowed() {
 
 #[test]
 fn a_forged_answer_is_not_believed_whether_from_a_third_space_or_a_third_address() {
-    let mut cell = Cell::new(vec![
-        Program::new(1, Local::Fields),
+    let mut cell = SimulatedCell::new(vec![
+        SimulatedProgram::new(1, Local::Fields),
         component(7),
-        Program::new(3, Local::Fields),
+        SimulatedProgram::new(3, Local::Fields),
     ]);
     cell.offer(GRIPPER, start(), offered(grasp()));
     cell.run(ms(200));
@@ -364,8 +365,8 @@ fn no_more_requests_are_open_than_there_is_room_for() {
 
 #[test]
 fn calls_of_several_components_with_equal_identifiers_are_told_apart() {
-    let mut cell = Cell::new(vec![
-        Program::new(1, Local::Fields),
+    let mut cell = SimulatedCell::new(vec![
+        SimulatedProgram::new(1, Local::Fields),
         component(7),
         component(8),
     ]);
@@ -497,29 +498,29 @@ fn a_program_that_speaks_seldom_is_missed_whenever_it_dies() {
 
 #[test]
 fn who_comes_late_learns_the_calls_that_are_there_by_asking() {
-    let mut cell = Cell::new(vec![component(7)]);
+    let mut cell = SimulatedCell::new(vec![component(7)]);
     cell.describe(0, topic(0, 7, 101), state());
     cell.offer(0, start(), offered(grasp()));
     cell.say(0, topic(0, 7, 101), "Ready");
     cell.run(ms(5_000));
-    cell.programs.push(Program::new(2, Local::Fields));
+    cell.programs.push(SimulatedProgram::new(2, Local::Fields));
     // The next key frame is received within a second, and the response to the probe within another
     // second.
     cell.run(ms(2_000));
     assert_eq!(cell.known(1), [start()]);
 
     // Or after a request for the call.
-    let mut cell = Cell::new(vec![component(7)]);
+    let mut cell = SimulatedCell::new(vec![component(7)]);
     cell.offer(0, start(), offered(grasp()));
     cell.run(ms(5_000));
-    cell.programs.push(Program::new(2, Local::Fields));
+    cell.programs.push(SimulatedProgram::new(2, Local::Fields));
     let now = cell.now();
     cell.programs[1].router.want_call(start(), now);
     cell.run(ms(1_000));
     assert_eq!(cell.known(1), [start()]);
 
     // Or after the probe of a starting program.
-    cell.programs.push(Program::new(3, Local::Cdr));
+    cell.programs.push(SimulatedProgram::new(3, Local::Cdr));
     let now = cell.now();
     cell.programs[2].router.call_the_roll(now);
     cell.run(ms(3_000));
@@ -534,7 +535,7 @@ fn state() -> ValueDescription {
         fields: vec![Leaf {
             path: "data".to_owned(),
             builtin: BuiltinType::String,
-            rank: Rank::Scalar,
+            rank: ArrayRank::Scalar,
         }],
         overflow: Overflow::KeepLatest,
     }
@@ -542,7 +543,7 @@ fn state() -> ValueDescription {
 
 #[test]
 fn a_value_that_the_program_describes_itself_crosses_under_the_ros_type_it_says() {
-    let mut cell = Cell::new(vec![Program::new(1, Local::Ros1), component(7)]);
+    let mut cell = SimulatedCell::new(vec![SimulatedProgram::new(1, Local::Ros1), component(7)]);
     let value = topic(0, 7, 101);
     cell.describe(GRIPPER, value, state());
     cell.say(GRIPPER, value, "Ready");
@@ -560,7 +561,7 @@ fn a_value_that_the_program_describes_itself_crosses_under_the_ros_type_it_says(
 
 #[test]
 fn a_namespace_that_somebody_else_writes_is_left_alone_until_it_is_free() {
-    let mut cell = Cell::new(vec![Program::new(1, Local::Fields), component(7)]);
+    let mut cell = SimulatedCell::new(vec![SimulatedProgram::new(1, Local::Fields), component(7)]);
     let value = topic(0, 7, 101);
     cell.describe(GRIPPER, value, state());
     cell.offer(GRIPPER, start(), offered(grasp()));
@@ -597,7 +598,7 @@ fn a_namespace_that_somebody_else_writes_is_left_alone_until_it_is_free() {
 
 #[test]
 fn a_free_namespace_is_used_after_a_moment_and_nothing_is_lost_meanwhile() {
-    let mut cell = Cell::new(vec![Program::new(1, Local::Fields), component(7)]);
+    let mut cell = SimulatedCell::new(vec![SimulatedProgram::new(1, Local::Fields), component(7)]);
     let value = topic(0, 7, 102);
     let now = cell.now();
     cell.programs[GRIPPER].router.claim(now);
@@ -617,7 +618,7 @@ fn a_free_namespace_is_used_after_a_moment_and_nothing_is_lost_meanwhile() {
 
 #[test]
 fn a_state_replaced_before_its_namespace_is_known_to_be_free_is_no_overflow() {
-    let mut cell = Cell::new(vec![Program::new(1, Local::Fields), component(7)]);
+    let mut cell = SimulatedCell::new(vec![SimulatedProgram::new(1, Local::Fields), component(7)]);
     let value = topic(0, 7, 101);
     let now = cell.now();
     cell.programs[GRIPPER].router.claim(now);
@@ -633,8 +634,8 @@ fn a_state_replaced_before_its_namespace_is_known_to_be_free_is_no_overflow() {
 
 #[test]
 fn a_server_shows_the_values_of_components_beside_its_own() {
-    let mut cell = Cell::new(vec![
-        Program::new(0, Local::Fields).owning(&[2]),
+    let mut cell = SimulatedCell::new(vec![
+        SimulatedProgram::new(0, Local::Fields).owning(&[2]),
         component(7),
     ]);
     let (theirs, ours) = (topic(0, 7, 101), topic(0, 2, 10));
@@ -692,9 +693,9 @@ fn a_request_and_a_response_of_a_megabyte_cross_in_chunks() {
 
 #[test]
 fn a_service_of_ros_2_is_asked_for_from_ros_1_under_another_type_as_a_map_says() {
-    let mut cell = Cell::new(vec![
-        Program::new(1, Local::Ros1),
-        Program::new(2, Local::Cdr),
+    let mut cell = SimulatedCell::new(vec![
+        SimulatedProgram::new(1, Local::Ros1),
+        SimulatedProgram::new(2, Local::Cdr),
     ]);
     let call = topic(2, 5, 61);
     let set_bool = OfferedType {
@@ -744,10 +745,10 @@ fn a_service_of_ros_2_is_asked_for_from_ros_1_under_another_type_as_a_map_says()
 
 #[test]
 fn who_asks_with_the_ids_of_another_gets_the_own_answer_and_what_comes_too_late_nobody() {
-    let mut cell = Cell::new(vec![
-        Program::new(1, Local::Fields),
+    let mut cell = SimulatedCell::new(vec![
+        SimulatedProgram::new(1, Local::Fields),
         component(7),
-        Program::new(3, Local::Fields),
+        SimulatedProgram::new(3, Local::Fields),
     ]);
     let asking = [0, 2];
     for at in asking {

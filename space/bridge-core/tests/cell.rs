@@ -7,8 +7,8 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use bridge_core::{
-    Answered, AskId, CallCounters, Executed, Execution, ExecutionId, Heard, Local, Now, Offered,
-    Output, Owned, Reason, Router, Settings, ValueDescription,
+    AskId, CallCounters, CallExecution, CallResponse, Executed, ExecutionId, Local, LocalMessage,
+    Now, OfferedCall, Output, Owned, Reason, Router, RouterSettings, ValueDescription,
 };
 use mappings::{Mapping, SpaceId, TopicId};
 use uadp::{
@@ -17,19 +17,19 @@ use uadp::{
 };
 
 /// Returns the number of copies of a datagram that are delivered; 1 by default.
-pub(crate) type Network = Box<dyn FnMut(&[u8]) -> usize>;
+pub(crate) type NetworkCopies = Box<dyn FnMut(&[u8]) -> usize>;
 /// Returns the transmission delay of a datagram.
 pub(crate) type Delay = Box<dyn FnMut() -> Duration>;
 
-pub(crate) struct Cell {
-    pub(crate) programs: Vec<Program>,
+pub(crate) struct SimulatedCell {
+    pub(crate) programs: Vec<SimulatedProgram>,
     /// The datagrams in transmission with their senders.
     under_way: VecDeque<(SocketAddr, Vec<u8>)>,
     /// The delayed datagrams by their arrival time and their sending order.
     late: BTreeMap<(Duration, u64), (SocketAddr, Vec<u8>)>,
     sent: u64,
     /// The number of copies of each datagram.
-    pub(crate) copies: Network,
+    pub(crate) copies: NetworkCopies,
     /// The delay of each copy; zero by default.
     pub(crate) delay: Delay,
     /// Whether every second datagram is taken from the end.
@@ -39,7 +39,7 @@ pub(crate) struct Cell {
     passed: Duration,
 }
 
-pub(crate) struct Program {
+pub(crate) struct SimulatedProgram {
     pub(crate) router: Router,
     pub(crate) address: SocketAddr,
     outputs: Vec<Output>,
@@ -50,14 +50,14 @@ pub(crate) struct Program {
     socket: Vec<(SocketAddr, Vec<u8>)>,
 }
 
-impl Program {
+impl SimulatedProgram {
     pub(crate) fn new(space: u16, local: Local) -> Self {
         let address = SocketAddr::from(([127, 0, 0, 1], 10_000 + space));
         Self::at(space, local, address)
     }
 
     fn at(space: u16, local: Local, address: SocketAddr) -> Self {
-        let settings = Settings {
+        let settings = RouterSettings {
             own: SpaceId::new(space).unwrap(),
             local,
             source: Some(address),
@@ -110,13 +110,13 @@ fn instance(address: SocketAddr) -> [u8; 16] {
 }
 
 /// Creates a program that writes a single namespace of space 0.
-pub(crate) fn component(namespace: u16) -> Program {
+pub(crate) fn component(namespace: u16) -> SimulatedProgram {
     let address = SocketAddr::from(([127, 0, 0, 1], 20_000 + namespace));
-    Program::at(0, Local::Fields, address).owning(&[namespace])
+    SimulatedProgram::at(0, Local::Fields, address).owning(&[namespace])
 }
 
-impl Cell {
-    pub(crate) fn new(programs: Vec<Program>) -> Self {
+impl SimulatedCell {
+    pub(crate) fn new(programs: Vec<SimulatedProgram>) -> Self {
         Self {
             programs,
             under_way: VecDeque::new(),
@@ -257,11 +257,11 @@ impl Cell {
         }
     }
 
-    pub(crate) fn start(&mut self, at: usize, program: Program) {
+    pub(crate) fn start(&mut self, at: usize, program: SimulatedProgram) {
         self.programs[at] = program;
     }
 
-    pub(crate) fn offer(&mut self, at: usize, topic: TopicId, offered: Offered) {
+    pub(crate) fn offer(&mut self, at: usize, topic: TopicId, offered: OfferedCall) {
         let now = self.now();
         self.programs[at].router.offer(topic, offered, now);
     }
@@ -275,7 +275,7 @@ impl Cell {
     pub(crate) fn say(&mut self, at: usize, topic: TopicId, text: &str) {
         let now = self.now();
         let payload = block(&[Variant::Scalar(Scalar::String(Some(text)))]);
-        let heard = Heard {
+        let heard = LocalMessage {
             topic,
             payload: &payload,
             received: now.utc,
@@ -315,14 +315,14 @@ impl Cell {
         std::mem::take(&mut self.programs[at].outputs)
     }
 
-    pub(crate) fn answers(&mut self, at: usize) -> Vec<(AskId, Answered)> {
+    pub(crate) fn answers(&mut self, at: usize) -> Vec<(AskId, CallResponse)> {
         self.take(at, |output| match output {
             Output::Answer { ask, answer, .. } => Some((*ask, answer.clone())),
             _ => None,
         })
     }
 
-    pub(crate) fn executions(&mut self, at: usize) -> Vec<Execution> {
+    pub(crate) fn executions(&mut self, at: usize) -> Vec<CallExecution> {
         self.take(at, |output| match output {
             Output::Execute(execution) => Some(execution.clone()),
             _ => None,

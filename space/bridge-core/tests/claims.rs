@@ -4,12 +4,12 @@ use crate::cell;
 use std::cell::Cell as Flag;
 use std::rc::Rc;
 
-use bridge_core::{CallDescription, CallField, CallRole, Offered};
-use cell::{Cell, component, ms, topic};
+use bridge_core::{CallDescription, CallField, CallRole, OfferedCall};
+use cell::{SimulatedCell, component, ms, topic};
 use uadp::BuiltinType;
 
-fn offer(cell: &mut Cell, at: usize) {
-    let offered = Offered {
+fn offer(cell: &mut SimulatedCell, at: usize) {
+    let offered = OfferedCall {
         description: CallDescription {
             name: "gripper.Grasp.Start".to_owned(),
             about: String::new(),
@@ -23,14 +23,14 @@ fn offer(cell: &mut Cell, at: usize) {
 }
 
 /// Starts a program that offers a call, and claims its namespace.
-fn start(cell: &mut Cell, at: usize) {
+fn start(cell: &mut SimulatedCell, at: usize) {
     let now = cell.now();
     cell.programs[at].router.claim(now);
     offer(cell, at);
 }
 
 /// Returns a network whose datagrams are lost while the flag is set.
-fn lossy(cell: &mut Cell) -> Rc<Flag<bool>> {
+fn lossy(cell: &mut SimulatedCell) -> Rc<Flag<bool>> {
     let is_lost = Rc::new(Flag::new(false));
     let flag = Rc::clone(&is_lost);
     cell.copies = Box::new(move |_| usize::from(!flag.get()));
@@ -40,7 +40,7 @@ fn lossy(cell: &mut Cell) -> Rc<Flag<bool>> {
 #[test]
 fn a_writer_is_found_although_the_first_probes_and_responses_are_lost() {
     for lost_for in [50, 150, 250, 700] {
-        let mut cell = Cell::new(vec![component(7)]);
+        let mut cell = SimulatedCell::new(vec![component(7)]);
         let is_lost = lossy(&mut cell);
         start(&mut cell, 0);
         cell.run(ms(5_000));
@@ -58,7 +58,7 @@ fn a_writer_is_found_although_the_first_probes_and_responses_are_lost() {
 
 #[test]
 fn of_two_programs_that_start_at_the_same_moment_one_stays() {
-    let mut cell = Cell::new(vec![component(7), component(7).at_port(7_777)]);
+    let mut cell = SimulatedCell::new(vec![component(7), component(7).at_port(7_777)]);
     let is_lost = lossy(&mut cell);
     is_lost.set(true);
     for at in [0, 1] {

@@ -5,11 +5,11 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use bridge_core::{
-    Application, Arrival, Delivery, Handover, Heard, Local, Now, Output, Reason, Relay, Router,
-    Settings,
+    Application, ConfirmedArrival, Delivery, Handover, Local, LocalMessage, Now, Output, Reason,
+    Relay, Router, RouterSettings,
 };
 use mappings::{Mapping, SpaceId, TopicId};
-use messages::{Dialect, Registry, Selection};
+use messages::{Dialect, Selection, TypeRegistry};
 use uadp::{BuiltinType, Timestamp};
 
 const STEP: Duration = Duration::from_millis(10);
@@ -65,7 +65,7 @@ struct Program {
     got: Vec<u32>,
     /// The handover that the local side reports for them.
     handover: Handover,
-    arrivals: Vec<(TopicId, Arrival)>,
+    arrivals: Vec<(TopicId, ConfirmedArrival)>,
 }
 
 impl Program {
@@ -75,7 +75,7 @@ impl Program {
             1 => (Local::Ros1, Dialect::Ros1),
             _ => (Local::Cdr, Dialect::Ros2),
         };
-        let settings = Settings {
+        let settings = RouterSettings {
             own: SpaceId::new(own).unwrap(),
             local,
             source: Some(address(port)),
@@ -87,7 +87,7 @@ impl Program {
                 14 => "std_msgs/String",
                 _ => "std_msgs/UInt32",
             };
-            let message = Registry::bundle(dialect).get(&type_name.parse().unwrap());
+            let message = TypeRegistry::bundle(dialect).get(&type_name.parse().unwrap());
             router
                 .bind(of, &message.unwrap(), &Selection::Whole, now)
                 .unwrap();
@@ -110,7 +110,7 @@ impl Program {
     }
 
     fn write(&mut self, of: TopicId, payload: &[u8], now: Now) {
-        let heard = Heard {
+        let heard = LocalMessage {
             topic: of,
             payload,
             received: now.utc,
@@ -206,7 +206,7 @@ impl Cell {
         self.programs[0].write(of, &field(value), now);
     }
 
-    fn arrivals(&mut self) -> Vec<Arrival> {
+    fn arrivals(&mut self) -> Vec<ConfirmedArrival> {
         let told = std::mem::take(&mut self.programs[0].arrivals);
         told.into_iter().map(|(_, arrival)| arrival).collect()
     }
@@ -216,8 +216,8 @@ fn topic(text: &str) -> TopicId {
     text.parse().unwrap()
 }
 
-fn unknown(space: u16) -> Arrival {
-    Arrival::Unknown(vec![SpaceId::new(space).unwrap()])
+fn unknown(space: u16) -> ConfirmedArrival {
+    ConfirmedArrival::Unknown(vec![SpaceId::new(space).unwrap()])
 }
 
 /// Returns a function that loses a fifth of the datagrams, the same in each run.
@@ -243,7 +243,7 @@ fn of_1000_stops_that_bridges_confirm_none_is_lost_and_none_comes_twice_though_a
     let all: Vec<u32> = (0..1000).collect();
     assert_eq!(cell.programs[1].got, all);
     assert_eq!(cell.programs[2].got, all);
-    assert_eq!(cell.arrivals(), vec![Arrival::Confirmed; 1000]);
+    assert_eq!(cell.arrivals(), vec![ConfirmedArrival::Confirmed; 1000]);
 }
 
 #[test]
@@ -273,7 +273,7 @@ fn a_value_that_nobody_has_is_handed_over_as_soon_as_somebody_is_there_in_time()
     cell.programs[1].handover = Handover::Done;
     cell.run(Duration::from_secs(1));
     assert_eq!(cell.programs[1].got, [7], "once");
-    assert_eq!(cell.arrivals(), [Arrival::Confirmed]);
+    assert_eq!(cell.arrivals(), [ConfirmedArrival::Confirmed]);
 }
 
 #[test]
@@ -315,7 +315,7 @@ fn a_value_whose_subscriber_gets_it_late_is_confirmed_then() {
     assert!(cell.arrivals().is_empty());
     cell.programs[1].handover = Handover::Done;
     cell.run(Duration::from_millis(100));
-    assert_eq!(cell.arrivals(), [Arrival::Confirmed]);
+    assert_eq!(cell.arrivals(), [ConfirmedArrival::Confirmed]);
     assert_eq!(cell.programs[1].got, [7]);
 }
 
@@ -330,18 +330,18 @@ fn a_newer_write_goes_out_at_once_and_ends_the_repetition_of_the_one_before() {
     cell.write(of, 2);
     cell.run(Duration::from_secs(2));
     assert_eq!(cell.programs[1].got, [2]);
-    assert_eq!(cell.arrivals(), [Arrival::Confirmed]);
+    assert_eq!(cell.arrivals(), [ConfirmedArrival::Confirmed]);
     // The same holds for a newer event that waits for its publication time.
     let of = topic("ua_0_2_13");
     let mut cell = Cell::new(of, &[1]);
     cell.write(of, 1);
     cell.run(Duration::from_millis(300));
-    assert_eq!(cell.arrivals(), [Arrival::Confirmed]);
+    assert_eq!(cell.arrivals(), [ConfirmedArrival::Confirmed]);
     cell.write(of, 2);
     cell.run(Duration::from_millis(300));
     assert!(cell.arrivals().is_empty());
     cell.run(Duration::from_secs(1));
-    assert_eq!(cell.arrivals(), [Arrival::Confirmed]);
+    assert_eq!(cell.arrivals(), [ConfirmedArrival::Confirmed]);
     assert_eq!(cell.programs[1].got, [1, 2]);
 }
 
@@ -413,7 +413,10 @@ fn a_bridge_that_was_started_anew_confirms_from_another_address() {
     cell.run(Duration::from_millis(500));
     cell.write(of, 2);
     cell.run(Duration::from_secs(2));
-    assert_eq!(cell.arrivals(), [Arrival::Confirmed, Arrival::Confirmed]);
+    assert_eq!(
+        cell.arrivals(),
+        [ConfirmedArrival::Confirmed, ConfirmedArrival::Confirmed]
+    );
     assert_eq!(cell.programs[1].got, [2]);
 }
 
@@ -447,7 +450,7 @@ fn a_large_event_is_confirmed_and_sent_again_whole() {
     cell.loses = Box::new(|_, _| false);
     cell.run(Duration::from_secs(1));
     assert_eq!(cell.programs[1].got.len(), 1);
-    assert_eq!(cell.arrivals(), [Arrival::Confirmed]);
+    assert_eq!(cell.arrivals(), [ConfirmedArrival::Confirmed]);
 }
 
 #[test]

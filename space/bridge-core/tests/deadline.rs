@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use crate::cell::{Cell, component, ms, topic};
+use crate::cell::{SimulatedCell, component, ms, topic};
 use mappings::Mapping;
 
 const LEVEL: &str = "
@@ -18,7 +18,7 @@ variables:
 ";
 
 /// Returns the number of missed deadlines at a program.
-fn missed(cell: &Cell, at: usize) -> u64 {
+fn missed(cell: &SimulatedCell, at: usize) -> u64 {
     let mut topics = cell.programs[at].router.topics();
     let found = topics.find(|(of, _)| *of == topic(0, 7, 10));
     found.map_or(0, |(_, counters)| counters.deadline_missed)
@@ -26,7 +26,7 @@ fn missed(cell: &Cell, at: usize) -> u64 {
 
 #[test]
 fn a_value_later_than_the_deadline_is_counted_at_both_ends_and_repetitions_are_not() {
-    let mut cell = Cell::new(vec![component(7), component(8)]);
+    let mut cell = SimulatedCell::new(vec![component(7), component(8)]);
     let mapping = Mapping::from_yaml(LEVEL, "cell.yaml").mapping.unwrap();
     let mapping = Arc::new(mapping);
     let now = cell.now();

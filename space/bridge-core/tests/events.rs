@@ -6,10 +6,11 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use bridge_core::{
-    Delivery, Heard, Kept, Local, Now, Output, PublisherKey, Reason, Router, Settings,
+    Delivery, Local, LocalMessage, Now, Output, PublisherKey, Reason, Router, RouterSettings,
+    ValueRelation,
 };
 use mappings::{Mapping, ServiceRole, SpaceId, TopicId};
-use messages::{Dialect, Registry, Selection};
+use messages::{Dialect, Selection, TypeRegistry};
 use uadp::{
     BuiltinType, DataSetHeader, DateTime, GroupHeader, NetworkHeader, NetworkMessageEncoder,
     PublisherId, Scalar, Timestamp, Variant,
@@ -43,7 +44,7 @@ fn later(now: Now, time: Duration) -> Now {
 }
 
 fn router(own: u16, local: Local) -> Router {
-    let settings = Settings {
+    let settings = RouterSettings {
         own: SpaceId::new(own).unwrap(),
         local,
         source: Some(address(10_000 + own)),
@@ -58,7 +59,7 @@ fn bridge(own: u16, of: TopicId, now: Now) -> Router {
         _ => (Local::Cdr, Dialect::Ros2),
     };
     let mut router = router(own, local);
-    let number = Registry::bundle(dialect).get(&"std_msgs/UInt32".parse().unwrap());
+    let number = TypeRegistry::bundle(dialect).get(&"std_msgs/UInt32".parse().unwrap());
     router
         .bind(of, &number.unwrap(), &Selection::Whole, now)
         .unwrap();
@@ -74,7 +75,7 @@ fn field(value: u32) -> Vec<u8> {
 }
 
 fn say(router: &mut Router, of: TopicId, payload: &[u8], latched: bool, now: Now) {
-    let heard = Heard {
+    let heard = LocalMessage {
         topic: of,
         payload,
         received: now.utc,
@@ -369,9 +370,12 @@ fn a_latched_value_reaches_a_bridge_that_starts_late_and_is_stored_there() {
     }
     // Once for the present subscribers, and once to be stored.
     let kinds: Vec<_> = came.iter().map(|one| (one.kept, one.lasting)).collect();
-    assert_eq!(kinds, [(Kept::Alone, false), (Kept::Again, true)]);
+    assert_eq!(
+        kinds,
+        [(ValueRelation::Alone, false), (ValueRelation::Again, true)]
+    );
     let kinds: Vec<_> = stored.iter().map(|one| (one.kept, one.lasting)).collect();
-    assert_eq!(kinds, [(Kept::Alone, true)]);
+    assert_eq!(kinds, [(ValueRelation::Alone, true)]);
     // The next value is known to be a state at once.
     say(&mut robot, of, &6_u32.to_le_bytes(), true, now);
     let next = taken(&mut present, &sent(&mut robot, now), 1, now);
@@ -394,8 +398,8 @@ fn a_state_whose_producer_timed_out_comes_again_for_late_subscribers_when_it_is_
         now = later(now, SECOND / 10);
     }
     let kinds: Vec<_> = came.iter().map(|one| (one.kept, one.lasting)).collect();
-    let stored = (Kept::Again, true);
-    assert_eq!(kinds, [(Kept::Alone, false), stored, stored]);
+    let stored = (ValueRelation::Again, true);
+    assert_eq!(kinds, [(ValueRelation::Alone, false), stored, stored]);
 }
 
 #[test]
@@ -492,7 +496,7 @@ variables:
 /// Creates a bridge of space 1 with the mapping, which binds the topic to the type.
 fn commanded(of: TopicId, type_name: &str, selection: &Selection, now: Now) -> Router {
     let checked = Mapping::from_yaml(COMMANDS, "cell.yaml");
-    let settings = Settings {
+    let settings = RouterSettings {
         own: SpaceId::ROS1,
         local: Local::Ros1,
         source: Some(address(10_001)),
@@ -502,7 +506,7 @@ fn commanded(of: TopicId, type_name: &str, selection: &Selection, now: Now) -> R
         (of, type_name, selection),
         (topic("ua_0_2_13"), "std_msgs/Bool", &Selection::Whole),
     ] {
-        let message = Registry::bundle(Dialect::Ros1).get(&type_name.parse().unwrap());
+        let message = TypeRegistry::bundle(Dialect::Ros1).get(&type_name.parse().unwrap());
         router
             .bind(topic, &message.unwrap(), selection, now)
             .unwrap();
@@ -635,7 +639,8 @@ fn a_service_is_called_once_more_when_the_commander_of_a_value_that_calls_it_is_
         panic!("{service:?}")
     };
     let mut robot = commanded(topic("ua_0_2_13"), "std_msgs/Bool", &Selection::Whole, now);
-    let set_bool = Registry::bundle(Dialect::Ros1).service(&"std_srvs/SetBool".parse().unwrap());
+    let set_bool =
+        TypeRegistry::bundle(Dialect::Ros1).service(&"std_srvs/SetBool".parse().unwrap());
     let set_bool = set_bool.unwrap();
     robot.bind(of, set_bool.request(), request, now).unwrap();
     let mut server = router(0, Local::Fields);
@@ -658,7 +663,7 @@ fn a_service_is_called_once_more_when_the_commander_of_a_value_that_calls_it_is_
 /// ROS 1, and the characters.
 fn heard_before_its_type(of: TopicId, size: usize, now: Now) -> (Router, Vec<u8>) {
     let mut producer = router(1, Local::Ros1);
-    let text = Registry::bundle(Dialect::Ros1).get(&"std_msgs/String".parse().unwrap());
+    let text = TypeRegistry::bundle(Dialect::Ros1).get(&"std_msgs/String".parse().unwrap());
     producer
         .bind(of, &text.unwrap(), &Selection::Whole, now)
         .unwrap();
@@ -678,7 +683,7 @@ fn heard_before_its_type(of: TopicId, size: usize, now: Now) -> (Router, Vec<u8>
 
 /// Returns the deliveries that the bridge publishes after the topic was bound to std_msgs/String.
 fn typed(router: &mut Router, of: TopicId, now: Now) -> Vec<Delivery> {
-    let text = Registry::bundle(Dialect::Ros2).get(&"std_msgs/String".parse().unwrap());
+    let text = TypeRegistry::bundle(Dialect::Ros2).get(&"std_msgs/String".parse().unwrap());
     router
         .bind(of, &text.unwrap(), &Selection::Whole, now)
         .unwrap();

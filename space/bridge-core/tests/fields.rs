@@ -2,14 +2,14 @@
 use crate::inventor;
 
 use bridge_core::{decode_fields, encode_fields};
-use messages::{Dialect, Plan, Rank, Registry, Selection, Wire};
+use messages::{ArrayRank, Dialect, MessagePlan, Selection, TypeRegistry, Wire};
 use proptest::test_runner::TestRunner;
 use uadp::{
     BuiltinType, DataSetHeader, Fields, NetworkHeader, NetworkMessage, NetworkMessageEncoder,
     Variant,
 };
 
-fn encode(plan: &Plan, message: &[u8]) -> Vec<u8> {
+fn encode(plan: &MessagePlan, message: &[u8]) -> Vec<u8> {
     let mut datagram = Vec::new();
     let network = NetworkHeader::default();
     let mut encoder = NetworkMessageEncoder::new(&mut datagram, &network, Some(&[1])).unwrap();
@@ -35,14 +35,16 @@ fn random_messages_of_every_type_cross_and_return() {
     let mut runner = TestRunner::deterministic();
     let mut types = 0;
     for (dialect, wire) in [(Dialect::Ros1, Wire::Ros1), (Dialect::Ros2, Wire::Cdr)] {
-        let registry = Registry::bundle(dialect);
+        let registry = TypeRegistry::bundle(dialect);
         for name in registry.names() {
             let message = registry.get(name).unwrap();
-            let plan = Plan::compile(&message, &Selection::Whole, wire).unwrap();
-            let shapes = plan
-                .leaves()
-                .iter()
-                .map(|leaf| (Some(leaf.builtin), matches!(leaf.rank, Rank::Array { .. })));
+            let plan = MessagePlan::compile(&message, &Selection::Whole, wire).unwrap();
+            let shapes = plan.leaves().iter().map(|leaf| {
+                (
+                    Some(leaf.builtin),
+                    matches!(leaf.rank, ArrayRank::Array { .. }),
+                )
+            });
             let shapes: Vec<_> = shapes.collect();
             for _ in 0..10 {
                 let (_, bytes) = inventor::invent(&plan, &runner.new_rng());
@@ -83,15 +85,15 @@ const WITH_EMPTY_ELEMENTS: [(&str, &str); 4] = [
 fn arrays_of_messages_without_fields_cross_with_their_lengths() {
     let mut runner = TestRunner::deterministic();
     for (dialect, wire) in [(Dialect::Ros1, Wire::Ros1), (Dialect::Ros2, Wire::Cdr)] {
-        let mut registry = Registry::empty(dialect);
+        let mut registry = TypeRegistry::empty(dialect);
         for (name, text) in WITH_EMPTY_ELEMENTS {
             registry.add(&name.parse().unwrap(), text).unwrap();
         }
         for (name, _) in WITH_EMPTY_ELEMENTS {
             let message = registry.get(&name.parse().unwrap()).unwrap();
-            let whole = Plan::compile(&message, &Selection::Whole, wire).unwrap();
+            let whole = MessagePlan::compile(&message, &Selection::Whole, wire).unwrap();
             for selection in [Selection::Whole, Selection::Structure(None)] {
-                let plan = Plan::compile(&message, &selection, wire).unwrap();
+                let plan = MessagePlan::compile(&message, &selection, wire).unwrap();
                 for _ in 0..20 {
                     let (_, bytes) = inventor::invent(&whole, &runner.new_rng());
                     let datagram = encode(&plan, &bytes);
@@ -107,14 +109,14 @@ fn arrays_of_messages_without_fields_cross_with_their_lengths() {
 
 #[test]
 fn what_one_datagram_claims_of_messages_without_fields_is_bounded() {
-    let mut registry = Registry::empty(Dialect::Ros2);
+    let mut registry = TypeRegistry::empty(Dialect::Ros2);
     for (name, text) in WITH_EMPTY_ELEMENTS {
         registry.add(&name.parse().unwrap(), text).unwrap();
     }
     let message = registry
         .get(&"nothing_msgs/Arrays".parse().unwrap())
         .unwrap();
-    let plan = Plan::compile(&message, &Selection::Structure(None), Wire::Cdr).unwrap();
+    let plan = MessagePlan::compile(&message, &Selection::Structure(None), Wire::Cdr).unwrap();
     let claim = |many: u32| {
         let mut datagram = Vec::new();
         let network = NetworkHeader::default();
@@ -141,10 +143,10 @@ fn what_one_datagram_claims_of_messages_without_fields_is_bounded() {
 
 #[test]
 fn a_field_of_another_type_among_numbers_is_named() {
-    let message = Registry::bundle(Dialect::Ros1)
+    let message = TypeRegistry::bundle(Dialect::Ros1)
         .get(&"geometry_msgs/Vector3".parse().unwrap())
         .unwrap();
-    let plan = Plan::compile(&message, &Selection::Whole, Wire::Ros1).unwrap();
+    let plan = MessagePlan::compile(&message, &Selection::Whole, Wire::Ros1).unwrap();
     let mut datagram = Vec::new();
     let network = NetworkHeader::default();
     let mut encoder = NetworkMessageEncoder::new(&mut datagram, &network, Some(&[1])).unwrap();

@@ -6,10 +6,12 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use bridge_core::{Delivery, Kept, Local, Now, Output, Reason, Router, Settings};
+use bridge_core::{Delivery, Local, Now, Output, Reason, Router, RouterSettings, ValueRelation};
 use mappings::{Mapping, SpaceId, TopicId};
-use messages::{Dialect, Registry, Selection};
-use uadp::discovery::{Announced, Announcement, DataSetMetaDataType, FieldMetaData, List};
+use messages::{Dialect, Selection, TypeRegistry};
+use uadp::discovery::{
+    AnnouncedContent, Announcement, DataSetMetaDataType, FieldMetaData, WireArray,
+};
 use uadp::{
     BuiltinType, ConfigurationVersion, DataSetHeader, DataSetMessage, DataValue, DateTime, Fields,
     GroupHeader, NetworkHeader, NetworkMessage, NetworkMessageEncoder, PublisherId, Scalar,
@@ -39,7 +41,7 @@ impl Bench {
 
     #[expect(clippy::disallowed_methods, reason = "some instant to count from")]
     fn new(own: u16, local: Local, mapping: Mapping) -> Self {
-        let settings = Settings {
+        let settings = RouterSettings {
             own: SpaceId::new(own).unwrap(),
             local,
             source: None,
@@ -107,13 +109,13 @@ impl Bench {
             .collect();
         let meta_data = DataSetMetaDataType {
             name: Some(topic),
-            fields: List::new(&fields),
+            fields: WireArray::new(&fields),
             configuration_version: ConfigurationVersion { major, minor: 0 },
             ..DataSetMetaDataType::default()
         };
         let announcement = Announcement {
             sequence_number: 0,
-            announced: Announced::DataSetMetaData {
+            announced: AnnouncedContent::DataSetMetaData {
                 writer_id,
                 meta_data,
                 status: StatusCode::GOOD,
@@ -489,7 +491,10 @@ fn events_are_samples_each_and_never_repetitions() {
     for sequence in 1..4 {
         let heard = bench.hear(&event(sequence));
         assert_eq!(all_told(&heard), ["Boolean(true)"]);
-        assert_eq!((heard[0].kept, heard[0].instance), (Kept::Alone, None));
+        assert_eq!(
+            (heard[0].kept, heard[0].instance),
+            (ValueRelation::Alone, None)
+        );
     }
     assert_eq!(bench.hear(&event(3)).len(), 0, "the same datagram");
     assert_eq!(bench.dropped(Reason::Duplicate), 1);
@@ -503,7 +508,7 @@ fn of_several_fields_a_ros_topic_gets_the_one_the_mapping_names() {
     let mapping = Mapping::from_yaml(text, "test.yaml").mapping.unwrap();
     let mut bench = Bench::new(1, Local::Ros1, mapping);
     let topic = "ua_2_5_10".parse().unwrap();
-    let registry = Registry::bundle(Dialect::Ros1);
+    let registry = TypeRegistry::bundle(Dialect::Ros1);
     let message_type = registry.get(&"std_msgs/UInt32".parse().unwrap()).unwrap();
     bench
         .router

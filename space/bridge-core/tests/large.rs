@@ -6,10 +6,11 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use bridge_core::{
-    Delivery, Heard, Local, Notice, Now, Output, PublisherKey, Reason, Router, Settings, Verdict,
+    Delivery, DropNotice, Local, LocalMessage, Now, Output, PublisherKey, Reason, Router,
+    RouterSettings, Verdict,
 };
 use mappings::{Mapping, SpaceId, TopicId};
-use messages::{Dialect, Registry, Selection};
+use messages::{Dialect, Selection, TypeRegistry};
 use proptest::prelude::*;
 use uadp::Timestamp;
 
@@ -31,7 +32,7 @@ impl Pair {
     fn new(yaml: &str) -> Self {
         let mapping = Arc::new(Mapping::from_yaml(yaml, "test.yaml").mapping.unwrap());
         let router = |own, local| {
-            let settings = Settings {
+            let settings = RouterSettings {
                 own: SpaceId::new(own).unwrap(),
                 local,
                 source: None,
@@ -61,7 +62,7 @@ impl Pair {
     }
 
     fn say(&mut self, name: &str, message: &[u8]) -> Verdict {
-        let heard = Heard {
+        let heard = LocalMessage {
             topic: topic(name),
             payload: message,
             received: self.now.utc,
@@ -108,7 +109,7 @@ impl Pair {
             .collect()
     }
 
-    fn notices(&mut self) -> Vec<Notice> {
+    fn notices(&mut self) -> Vec<DropNotice> {
         std::iter::from_fn(|| self.reader.poll_output(self.now))
             .filter_map(|output| match output {
                 Output::Notice(notice) => Some(notice),
@@ -128,7 +129,7 @@ fn topic(name: &str) -> TopicId {
 }
 
 fn bind(router: &mut Router, name: &str, now: Now) {
-    let registry = Registry::bundle(Dialect::Ros1);
+    let registry = TypeRegistry::bundle(Dialect::Ros1);
     let message_type = registry.get(&"std_msgs/String".parse().unwrap()).unwrap();
     router
         .bind(topic(name), &message_type, &Selection::Whole, now)
@@ -260,7 +261,7 @@ fn a_lost_chunk_costs_its_message_which_is_counted_and_named() {
 fn a_value_whose_chunk_was_lost_comes_with_its_repetition() {
     let mut pair = Pair::new(SMALL_DATAGRAMS);
     let image = text(4_000, 0);
-    let state = Heard {
+    let state = LocalMessage {
         topic: topic(CAMERA),
         payload: &image,
         received: pair.now.utc,

@@ -1,10 +1,12 @@
 //! Programs that use few namespaces of a cell with many programs.
 use crate::cell;
 
-use bridge_core::{CallDescription, CallField, CallRole, Local, Offered, Reason, ValueDescription};
-use cell::{Cell, Program, component, ms, topic};
+use bridge_core::{
+    CallDescription, CallField, CallRole, Local, OfferedCall, Reason, ValueDescription,
+};
+use cell::{SimulatedCell, SimulatedProgram, component, ms, topic};
 use mappings::{Overflow, TopicId};
-use messages::{Leaf, Rank};
+use messages::{ArrayRank, Leaf};
 use uadp::{BuiltinType, NetworkMessage, NetworkMessageType};
 
 /// Returns the value and the call of the component with this namespace.
@@ -20,14 +22,14 @@ fn state() -> ValueDescription {
         fields: vec![Leaf {
             path: "data".to_owned(),
             builtin: BuiltinType::String,
-            rank: Rank::Scalar,
+            rank: ArrayRank::Scalar,
         }],
         overflow: Overflow::KeepLatest,
     }
 }
 
-fn start() -> Offered {
-    Offered {
+fn start() -> OfferedCall {
+    OfferedCall {
         description: CallDescription {
             name: "gripper.Grasp.Start".to_owned(),
             about: String::new(),
@@ -40,7 +42,7 @@ fn start() -> Offered {
 }
 
 /// Describes and sends the value of a component, and offers its call.
-fn serve(cell: &mut Cell, at: usize, namespace: u16) {
+fn serve(cell: &mut SimulatedCell, at: usize, namespace: u16) {
     let (value, call) = of(namespace);
     cell.describe(at, value, state());
     cell.offer(at, call, start());
@@ -48,7 +50,7 @@ fn serve(cell: &mut Cell, at: usize, namespace: u16) {
 }
 
 /// Returns the number of announcements that a program has sent.
-fn announced(cell: &mut Cell, at: usize) -> usize {
+fn announced(cell: &mut SimulatedCell, at: usize) -> usize {
     let sent = cell.datagrams_of(at);
     let types = sent
         .iter()
@@ -60,7 +62,7 @@ fn announced(cell: &mut Cell, at: usize) -> usize {
 
 #[test]
 fn a_limited_program_uses_its_namespaces_and_stores_nothing_of_others() {
-    let mut cell = Cell::new(vec![component(5), component(7), component(9)]);
+    let mut cell = SimulatedCell::new(vec![component(5), component(7), component(9)]);
     cell.programs[0].router.limit_to([of(7).0]);
     serve(&mut cell, 1, 7);
     serve(&mut cell, 2, 9);
@@ -79,7 +81,7 @@ fn a_limited_program_uses_its_namespaces_and_stores_nothing_of_others() {
 
 #[test]
 fn a_call_that_a_limited_program_wants_later_is_found() {
-    let mut cell = Cell::new(vec![component(5), component(7)]);
+    let mut cell = SimulatedCell::new(vec![component(5), component(7)]);
     cell.programs[0].router.limit_to([]);
     serve(&mut cell, 1, 7);
     cell.run(ms(3_000));
@@ -92,10 +94,10 @@ fn a_call_that_a_limited_program_wants_later_is_found() {
 
 #[test]
 fn a_newcomer_does_not_make_the_others_announce_their_calls() {
-    let mut cell = Cell::new(vec![
+    let mut cell = SimulatedCell::new(vec![
         component(7),
         component(9),
-        Program::new(0, Local::Fields).owning(&[2]),
+        SimulatedProgram::new(0, Local::Fields).owning(&[2]),
     ]);
     serve(&mut cell, 0, 7);
     serve(&mut cell, 1, 9);
@@ -119,7 +121,7 @@ fn a_newcomer_does_not_make_the_others_announce_their_calls() {
 
 #[test]
 fn a_namespace_with_calls_and_no_values_is_found_taken() {
-    let mut cell = Cell::new(vec![component(7), component(9)]);
+    let mut cell = SimulatedCell::new(vec![component(7), component(9)]);
     cell.offer(0, of(7).1, start());
     cell.run(ms(5_000));
     cell.programs.push(component(7).at_port(7_777));

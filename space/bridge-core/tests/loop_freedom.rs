@@ -6,11 +6,11 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use bridge_core::{Heard, KeyDelivery, Local, Now, Output, Router, Settings};
+use bridge_core::{KeyDelivery, Local, LocalMessage, Now, Output, Router, RouterSettings};
 use mappings::{GroupMode, Mapping, SpaceId, TopicId};
-use messages::{Dialect, Registry, Selection};
+use messages::{Dialect, Selection, TypeRegistry};
 use proptest::prelude::*;
-use uadp::{Keys, SecurityPolicy, Timestamp};
+use uadp::{SecurityPolicy, Timestamp, TokenKeys};
 
 /// A simulated cell: a bridge per space, a group that delivers every datagram to all bridges
 /// including its sender, and local graphs that echo every publication to the bridge itself.
@@ -49,12 +49,12 @@ impl Cell {
         };
         let mapping = Mapping::from_yaml(&yaml, "cell.yaml").mapping.unwrap();
         let mapping = Arc::new(mapping);
-        let keys = Keys::from_bytes(SecurityPolicy::PubSubAes256Ctr, &[7; 68]).unwrap();
+        let keys = TokenKeys::from_bytes(SecurityPolicy::PubSubAes256Ctr, &[7; 68]).unwrap();
         let started = Instant::now();
         let bridges = spaces
             .iter()
             .map(|own| {
-                let settings = Settings {
+                let settings = RouterSettings {
                     own: *own,
                     local: Local::Ros1,
                     source: Some(address(*own)),
@@ -119,7 +119,7 @@ impl Cell {
                     let bridge = self.bridges.get_mut(&space).unwrap();
                     bind(bridge, topic, now);
                     let _verdict = bridge.handle_local(
-                        Heard {
+                        LocalMessage {
                             topic,
                             payload: &payload,
                             received: now.utc,
@@ -173,7 +173,7 @@ impl Cell {
 }
 
 fn bind(bridge: &mut Router, topic: TopicId, now: Now) {
-    let registry = Registry::bundle(Dialect::Ros1);
+    let registry = TypeRegistry::bundle(Dialect::Ros1);
     let string = registry.get(&"std_msgs/String".parse().unwrap()).unwrap();
     bridge.bind(topic, &string, &Selection::Whole, now).unwrap();
 }

@@ -5,9 +5,9 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use allocation_counter::measure;
-use bridge_core::{Heard, Local, Now, Output, Router, Settings};
+use bridge_core::{Local, LocalMessage, Now, Output, Router, RouterSettings};
 use mappings::{Mapping, SpaceId, TopicId};
-use messages::{Dialect, Registry, Selection};
+use messages::{Dialect, Selection, TypeRegistry};
 use uadp::Timestamp;
 
 const TOPICS: u16 = 10_000;
@@ -20,7 +20,7 @@ struct Many {
 impl Many {
     #[expect(clippy::disallowed_methods, reason = "some instant to count from")]
     fn new() -> Self {
-        let settings = Settings {
+        let settings = RouterSettings {
             own: SpaceId::new(1).unwrap(),
             local: Local::Ros1,
             source: None,
@@ -40,14 +40,14 @@ impl Many {
 
     /// Binds all topics, and gives each a value.
     fn start(&mut self) {
-        let message = Registry::bundle(Dialect::Ros1)
+        let message = TypeRegistry::bundle(Dialect::Ros1)
             .get(&"geometry_msgs/Twist".parse().unwrap())
             .unwrap();
         for topic in Self::topics() {
             self.router
                 .bind(topic, &message, &Selection::Whole, self.now)
                 .unwrap();
-            let heard = Heard {
+            let heard = LocalMessage {
                 topic,
                 payload: &[0; 48],
                 received: self.now.utc,

@@ -4,17 +4,19 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use bridge_core::{Described, Heard, Local, Now, Output, Reason, Router, Settings};
+use bridge_core::{
+    Local, LocalMessage, Now, Output, Reason, Router, RouterSettings, TopicMetaData,
+};
 use mappings::{Mapping, SpaceId, TopicId};
-use messages::{Dialect, Registry, Selection, TypeName};
-use uadp::discovery::{Announced, Announcement, DataSetMetaDataType, List, Probe};
+use messages::{Dialect, Selection, TypeName, TypeRegistry};
+use uadp::discovery::{AnnouncedContent, Announcement, DataSetMetaDataType, Probe, WireArray};
 use uadp::{BuiltinType, NetworkMessage, PublisherId, SecurityHeader, StatusCode, Timestamp};
 
 /// A bridge without a ROS graph: the Router of a space.
 struct Bridge {
     router: Router,
     address: SocketAddr,
-    registry: Registry,
+    registry: TypeRegistry,
 }
 
 impl Bridge {
@@ -29,7 +31,7 @@ impl Bridge {
             1 => Dialect::Ros1,
             _ => Dialect::Ros2,
         };
-        let settings = Settings {
+        let settings = RouterSettings {
             own: SpaceId::new(space).unwrap(),
             local: match (space, dialect) {
                 (0, _) => Local::Fields,
@@ -41,7 +43,7 @@ impl Bridge {
         Self {
             router: Router::new(settings, Arc::new(mapping)),
             address,
-            registry: Registry::bundle(dialect),
+            registry: TypeRegistry::bundle(dialect),
         }
     }
 
@@ -54,7 +56,7 @@ impl Bridge {
     }
 
     fn say(&mut self, topic: &str, payload: &[u8], now: Now) {
-        let heard = Heard {
+        let heard = LocalMessage {
             topic: topic.parse().unwrap(),
             payload,
             received: now.utc,
@@ -97,7 +99,7 @@ impl Bridge {
     }
 
     /// Returns the requests to the port for local types.
-    fn told(&mut self, now: Now) -> Vec<(TopicId, Option<Described>)> {
+    fn told(&mut self, now: Now) -> Vec<(TopicId, Option<TopicMetaData>)> {
         let told = self.outputs(now).into_iter();
         told.filter_map(|output| match output {
             Output::Unbound {
@@ -137,7 +139,7 @@ fn each_meta_data(datagrams: &[Vec<u8>], mut with: impl FnMut(u16, &DataSetMetaD
     for datagram in datagrams {
         let message = NetworkMessage::decode(datagram).unwrap();
         if let Ok(announcement) = Announcement::decode(&message)
-            && let Announced::DataSetMetaData {
+            && let AnnouncedContent::DataSetMetaData {
                 writer_id,
                 meta_data,
                 ..
@@ -198,7 +200,7 @@ fn it_is_announced_again_now_and_then_and_when_somebody_asks() {
     assert_eq!(announced(&bridge.sent_within(SECOND * 29, &mut now)), 1);
     assert_eq!(announced(&bridge.sent_within(SECOND * 2, &mut now)), 1);
     let mut probe = Vec::new();
-    Probe::DataSetMetaData(List::new(&[10, 11]))
+    Probe::DataSetMetaData(WireArray::new(&[10, 11]))
         .encode(
             Some(PublisherId::UInt16(1)),
             SecurityHeader::NONE,
@@ -213,7 +215,7 @@ fn it_is_announced_again_now_and_then_and_when_somebody_asks() {
         let message = NetworkMessage::decode(answer).unwrap();
         if let Ok(Announcement {
             announced:
-                Announced::DataSetMetaData {
+                AnnouncedContent::DataSetMetaData {
                     writer_id, status, ..
                 },
             ..
@@ -256,7 +258,7 @@ fn a_value_is_known_by_what_its_writer_says_and_the_port_is_told_at_once() {
     };
     assert_eq!(*topic, "ua_1_5_10".parse().unwrap());
     assert_eq!(described.message_type, name("geometry_msgs/Twist"));
-    let local = Registry::bundle(Dialect::Ros2);
+    let local = TypeRegistry::bundle(Dialect::Ros2);
     let twist = local.get(&described.message_type).unwrap();
     assert_eq!(described.selection(&twist), Some(Selection::Whole));
     let accel = local.get(&name("geometry_msgs/Vector3")).unwrap();
@@ -292,7 +294,7 @@ fn nobody_but_the_writer_says_that_there_is_no_such_writer() {
     let mut denial = Vec::new();
     let announcement = Announcement {
         sequence_number: 0,
-        announced: Announced::DataSetMetaData {
+        announced: AnnouncedContent::DataSetMetaData {
             writer_id: 10,
             meta_data: DataSetMetaDataType::default(),
             status: StatusCode(0x803E_0000),
@@ -343,7 +345,7 @@ fn cost_of_a_long_probe(missing: u16) -> Duration {
     let ids: Vec<u16> = (1..=32_000).rev().collect();
     let mut probe = Vec::new();
     let publisher = Some(PublisherId::UInt16(1));
-    Probe::DataSetMetaData(List::new(&ids))
+    Probe::DataSetMetaData(WireArray::new(&ids))
         .encode(publisher, SecurityHeader::NONE, &mut probe)
         .unwrap();
     let other = Bridge::new(3, "");

@@ -2,8 +2,10 @@
 //! an overlap is refused with both names.
 use crate::cell;
 
-use bridge_core::{AskErrorKind, AskId, CallDescription, CallRole, Local, Offered, Output, Reason};
-use cell::{Cell, Program, component, ms, topic};
+use bridge_core::{
+    AskErrorKind, AskId, CallDescription, CallRole, Local, OfferedCall, Output, Reason,
+};
+use cell::{SimulatedCell, SimulatedProgram, component, ms, topic};
 
 /// The bridges of space 2.
 const A: usize = 0;
@@ -14,8 +16,8 @@ const READER: usize = 2;
 const COMMANDER_5: usize = 3;
 const COMMANDER_6: usize = 4;
 
-fn bridge(port: u16, cell: &mut Cell, namespaces: &[u16]) -> Program {
-    let mut program = Program::new(2, Local::Fields).at_port(port);
+fn bridge(port: u16, cell: &mut SimulatedCell, namespaces: &[u16]) -> SimulatedProgram {
+    let mut program = SimulatedProgram::new(2, Local::Fields).at_port(port);
     let now = cell.now();
     let part = namespaces.iter().copied().collect();
     let name = format!("bridge on port {port}");
@@ -23,22 +25,22 @@ fn bridge(port: u16, cell: &mut Cell, namespaces: &[u16]) -> Program {
     program
 }
 
-fn plant(a: &[u16], b: &[u16]) -> Cell {
-    let mut cell = Cell::new(Vec::new());
+fn plant(a: &[u16], b: &[u16]) -> SimulatedCell {
+    let mut cell = SimulatedCell::new(Vec::new());
     let a = bridge(10_002, &mut cell, a);
     cell.programs.push(a);
     cell.run(ms(20));
     let b = bridge(10_012, &mut cell, b);
     cell.programs.push(b);
-    cell.programs.push(Program::new(1, Local::Fields));
+    cell.programs.push(SimulatedProgram::new(1, Local::Fields));
     cell.programs.push(component(5));
     cell.programs.push(component(6));
     cell.run(ms(1_000));
     cell
 }
 
-fn offered() -> Offered {
-    Offered {
+fn offered() -> OfferedCall {
+    OfferedCall {
         description: CallDescription {
             name: "Weld".to_owned(),
             about: String::new(),
@@ -51,7 +53,7 @@ fn offered() -> Offered {
 }
 
 /// Returns the overlaps that a program reported: the namespace and the name of the other program.
-fn overlaps(cell: &mut Cell, at: usize) -> Vec<(u16, String)> {
+fn overlaps(cell: &mut SimulatedCell, at: usize) -> Vec<(u16, String)> {
     let outputs = cell.outputs(at);
     let taken = outputs.into_iter().filter_map(|output| match output {
         Output::Taken {
@@ -97,10 +99,10 @@ fn each_value_and_command_crosses_the_bridge_of_its_namespace() {
 
 #[test]
 fn a_sample_of_the_start_waits_until_the_namespace_is_known_to_be_free() {
-    let mut cell = Cell::new(Vec::new());
+    let mut cell = SimulatedCell::new(Vec::new());
     let bridge = bridge(10_002, &mut cell, &[5]);
     cell.programs.push(bridge);
-    cell.programs.push(Program::new(1, Local::Fields));
+    cell.programs.push(SimulatedProgram::new(1, Local::Fields));
     let (at, reader, latched) = (0, 1, topic(2, 5, 10));
     cell.say(at, latched, "latched");
     cell.run(ms(200));
@@ -175,7 +177,7 @@ fn a_request_in_a_namespace_of_another_bridge_is_not_sent_and_its_outcome_is_unk
 #[test]
 fn a_bridge_of_a_whole_space_names_the_bridge_of_a_part() {
     let mut cell = plant(&[5], &[6]);
-    let whole = Program::new(2, Local::Fields).at_port(10_022);
+    let whole = SimulatedProgram::new(2, Local::Fields).at_port(10_022);
     cell.programs.push(whole);
     cell.run(ms(2_000));
     let notices = cell.outputs(5);

@@ -2,9 +2,11 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use bridge_core::{Heard, Local, Now, Output, PublisherKey, Reason, Router, Settings, Verdict};
+use bridge_core::{
+    Local, LocalMessage, Now, Output, PublisherKey, Reason, Router, RouterSettings, Verdict,
+};
 use mappings::{Mapping, SpaceId, TopicId};
-use messages::{Dialect, Registry, Selection};
+use messages::{Dialect, Selection, TypeRegistry};
 use uadp::{NetworkMessage, Scalar, Timestamp, Variant};
 
 /// A bridge with a single variable of type Double and the given publishing rules.
@@ -24,7 +26,7 @@ impl Bench {
         );
         let checked = Mapping::from_yaml(&text, "cell.yaml");
         assert!(checked.findings.is_empty(), "{}", checked.render(&text));
-        let settings = Settings {
+        let settings = RouterSettings {
             own: SpaceId::new(1).unwrap(),
             local: Local::Ros1,
             source: None,
@@ -35,7 +37,7 @@ impl Bench {
         };
         let mut router = Router::new(settings, Arc::new(checked.mapping.unwrap()));
         let topic = "ua_1_2_10".parse().unwrap();
-        let double = Registry::bundle(Dialect::Ros1)
+        let double = TypeRegistry::bundle(Dialect::Ros1)
             .get(&"std_msgs/Float64".parse().unwrap())
             .unwrap();
         router.bind(topic, &double, &Selection::Whole, now).unwrap();
@@ -51,7 +53,7 @@ impl Bench {
     }
 
     fn say_by(&mut self, latched_by: Option<PublisherKey>, value: f64) -> Verdict {
-        let heard = Heard {
+        let heard = LocalMessage {
             topic: self.topic,
             payload: &value.to_le_bytes(),
             received: self.now.utc,

@@ -7,11 +7,12 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use bridge_core::{
-    Heard, Kept, KeyDelivery, Local, Now, Output, Rank, Reason, Role, Router, Settings,
+    KeyDelivery, Local, LocalMessage, Now, Output, Reason, RedundancyRank, RedundancyRole, Router,
+    RouterSettings, ValueRelation,
 };
 use mappings::{Mapping, SpaceId, TopicId};
-use messages::{Dialect, Registry, Selection};
-use uadp::{BuiltinType, Keys, NetworkMessage, SecurityPolicy, Timestamp};
+use messages::{Dialect, Selection, TypeRegistry};
+use uadp::{BuiltinType, NetworkMessage, SecurityPolicy, Timestamp, TokenKeys};
 
 const A: usize = 0;
 const B: usize = 1;
@@ -68,7 +69,7 @@ struct Published {
     by: usize,
     topic: TopicId,
     value: u32,
-    kept: Kept,
+    kept: ValueRelation,
 }
 
 struct Program {
@@ -101,7 +102,7 @@ fn program(space: u16, port: u16, mapping: &Arc<Mapping>, now: Now) -> Program {
         1 => Local::Ros1,
         _ => Local::Cdr,
     };
-    let settings = Settings {
+    let settings = RouterSettings {
         own: SpaceId::new(space).unwrap(),
         local,
         source: Some(address),
@@ -116,7 +117,7 @@ fn program(space: u16, port: u16, mapping: &Arc<Mapping>, now: Now) -> Program {
         _ => Dialect::Ros2,
     };
     if space != 0 {
-        let number = Registry::bundle(dialect).get(&"std_msgs/UInt32".parse().unwrap());
+        let number = TypeRegistry::bundle(dialect).get(&"std_msgs/UInt32".parse().unwrap());
         let number = number.unwrap();
         let only = [DRIVE].into_iter().filter(|_| space == 2);
         for of in [MEASURED, STATE, TARGET, COMMAND].into_iter().chain(only) {
@@ -162,7 +163,7 @@ impl World {
             program(0, 10_000, &mapping, now),
         ];
         for (at, rank) in [(A, 1), (B, 2)] {
-            let rank = Rank::new(rank).unwrap();
+            let rank = RedundancyRank::new(rank).unwrap();
             world.programs[at].router.set_redundancy(rank, now);
         }
         world.programs[B].skew = 3_000_000;
@@ -226,7 +227,7 @@ impl World {
             self.drain(at);
         }
         while let Some((topic, payload)) = self.programs[at].local.pop_front() {
-            let heard = Heard {
+            let heard = LocalMessage {
                 topic,
                 payload: &payload,
                 received: now.utc,
@@ -288,14 +289,14 @@ impl World {
         }
     }
 
-    fn role(&self, of: usize) -> Role {
+    fn role(&self, of: usize) -> RedundancyRole {
         self.programs[of].router.redundancy().unwrap().role()
     }
 
     /// Returns the first datagram of a command, which no program has received yet.
     fn command(&mut self, value: u32) -> Vec<u8> {
         let now = self.now(COMMANDER);
-        let heard = Heard {
+        let heard = LocalMessage {
             topic: topic(COMMAND),
             payload: &field(value),
             received: now.utc,
@@ -316,7 +317,7 @@ impl World {
     fn active(&self) -> usize {
         let runs = !self.programs[A].is_dead && self.programs[A].stopped <= self.passed;
         match self.role(A) {
-            Role::Active if runs || self.role(B) != Role::Active => A,
+            RedundancyRole::Active if runs || self.role(B) != RedundancyRole::Active => A,
             _ => B,
         }
     }
@@ -324,10 +325,9 @@ impl World {
     /// Returns the values that were published for a topic, for present subscribers.
     fn values(&self, of: &str) -> Vec<u32> {
         let of = topic(of);
-        let new = self
-            .published
-            .iter()
-            .filter(|one| one.by != COMMANDER && one.topic == of && one.kept != Kept::Again);
+        let new = self.published.iter().filter(|one| {
+            one.by != COMMANDER && one.topic == of && one.kept != ValueRelation::Again
+        });
         new.map(|one| one.value).collect()
     }
 
@@ -435,7 +435,7 @@ fn a_standby_sends_only_heartbeats_and_probes_and_continues_the_numbers() {
     }
     assert_eq!(
         (world.role(A), world.role(B)),
-        (Role::Active, Role::Standby)
+        (RedundancyRole::Active, RedundancyRole::Standby)
     );
     assert_eq!(world.programs[B].sent, 0);
     let muted = world.programs[B].router.muted_samples().unwrap();
@@ -445,7 +445,7 @@ fn a_standby_sends_only_heartbeats_and_probes_and_continues_the_numbers() {
         world.say(MEASURED, value);
         world.run(1);
     }
-    assert_eq!(world.role(B), Role::Active);
+    assert_eq!(world.role(B), RedundancyRole::Active);
     let measured = world.values(MEASURED);
     assert_rising(&measured, "values");
     assert_eq!(measured.last(), Some(&999));
@@ -469,7 +469,7 @@ fn a_state_is_repeated_by_the_new_bridge_and_delivered_once() {
     assert_eq!(world.values(STATE), [7]);
     world.programs[A].is_dead = true;
     world.run(4_000);
-    assert_eq!(world.role(B), Role::Active);
+    assert_eq!(world.role(B), RedundancyRole::Active);
     // The new bridge repeats it under the stamp of the former one.
     assert_eq!(world.values(STATE), [7]);
     assert!(world.programs[B].sent > 0);
@@ -479,8 +479,8 @@ fn a_state_is_repeated_by_the_new_bridge_and_delivered_once() {
         .published
         .iter()
         .filter(|one| one.by == B && one.topic == target);
-    let kept: Vec<(u32, Kept)> = of_b.map(|one| (one.value, one.kept)).collect();
-    assert_eq!(kept, [(70, Kept::Again)]);
+    let kept: Vec<(u32, ValueRelation)> = of_b.map(|one| (one.value, one.kept)).collect();
+    assert_eq!(kept, [(70, ValueRelation::Again)]);
 }
 
 #[test]
@@ -489,29 +489,32 @@ fn a_bridge_that_is_active_again_has_the_states_for_late_joiners() {
     world.run(700);
     world.say(TARGET, 70);
     world.run(2_500);
-    let of_a = |world: &World| -> Vec<(u32, Kept)> {
+    let of_a = |world: &World| -> Vec<(u32, ValueRelation)> {
         let published = world.published.iter();
         let published = published.filter(|one| one.by == A && one.topic == topic(TARGET));
         published.map(|one| (one.value, one.kept)).collect()
     };
-    assert_eq!(of_a(&world), [(70, Kept::Alone)]);
+    assert_eq!(of_a(&world), [(70, ValueRelation::Alone)]);
     // The other bridge takes over, and ends later.
     world.programs[A].stopped = world.passed + 500;
     world.run(3_000);
     assert_eq!(
         (world.role(A), world.role(B)),
-        (Role::Standby, Role::Active)
+        (RedundancyRole::Standby, RedundancyRole::Active)
     );
     world.programs[B].is_dead = true;
     world.run(3_000);
-    assert_eq!(world.role(A), Role::Active);
-    assert_eq!(of_a(&world), [(70, Kept::Alone), (70, Kept::Again)]);
+    assert_eq!(world.role(A), RedundancyRole::Active);
+    assert_eq!(
+        of_a(&world),
+        [(70, ValueRelation::Alone), (70, ValueRelation::Again)]
+    );
     // No other bridge takes over.
     world.programs[A].stopped = world.passed + 500;
     world.run(3_000);
-    assert_eq!(world.role(A), Role::Active);
+    assert_eq!(world.role(A), RedundancyRole::Active);
     assert_eq!(of_a(&world).len(), 3);
-    assert_eq!(of_a(&world).last(), Some(&(70, Kept::Again)));
+    assert_eq!(of_a(&world).last(), Some(&(70, ValueRelation::Again)));
 }
 
 /// Two redundant servers, whose clients write [`STATE`].
@@ -542,13 +545,13 @@ fn a_server_that_is_active_again_repeats_no_value_that_its_clients_wrote_before(
     world.run(3_000);
     assert_eq!(
         (world.role(A), world.role(B)),
-        (Role::Standby, Role::Active)
+        (RedundancyRole::Standby, RedundancyRole::Active)
     );
     write(&mut world, B, 9);
     world.run(2_500);
     world.programs[B].is_dead = true;
     world.run(3_000);
-    assert_eq!(world.role(A), Role::Active);
+    assert_eq!(world.role(A), RedundancyRole::Active);
     assert_eq!(world.values(STATE), [5, 9]);
 }
 
@@ -564,7 +567,7 @@ fn a_robot_stops_when_the_active_server_ends_with_the_session_of_its_commander()
     world.run(2_500);
     world.programs[A].is_dead = true;
     world.run(5_000);
-    assert_eq!(world.role(B), Role::Active);
+    assert_eq!(world.role(B), RedundancyRole::Active);
     assert_eq!(world.values(STATE), [5, 0]);
 }
 
@@ -602,7 +605,7 @@ fn a_command_that_may_have_been_delivered_is_not_delivered_by_the_new_bridge() {
         world.programs[A].is_dead = true;
         world.programs[COMMANDER].stopped = world.passed + pause;
         world.run(1_000);
-        assert_eq!(world.role(B), Role::Active);
+        assert_eq!(world.role(B), RedundancyRole::Active);
         let of_robots: Vec<u32> = (world.published.iter())
             .filter(|one| one.topic == topic(COMMAND) && one.by != READER)
             .map(|one| one.value)
@@ -653,7 +656,7 @@ fn a_command_that_the_network_holds_back_for_a_bridge_is_delivered_once() {
         world.programs[A].is_dead = true;
         world.programs[COMMANDER].is_dead = true;
         world.run(held);
-        assert_eq!(world.role(B), Role::Active);
+        assert_eq!(world.role(B), RedundancyRole::Active);
         let passed = world.passed;
         world.programs[B].socket.push((passed + 1, from, first));
         world.run(50);
@@ -671,7 +674,7 @@ fn a_commander_that_starts_after_a_takeover_is_heard_after_a_second() {
         world.run(700);
         world.programs[A].is_dead = true;
         world.run(pause);
-        assert_eq!(world.role(B), Role::Active);
+        assert_eq!(world.role(B), RedundancyRole::Active);
         world.programs[COMMANDER].is_dead = false;
         world.say(COMMAND, 5);
         world.run(100);
@@ -695,7 +698,7 @@ fn a_command_that_is_received_in_the_pass_of_the_takeover_is_not_delivered() {
         world.programs[COMMANDER].is_dead = true;
         let bytes = world.command(2);
         world.run(delay);
-        if world.role(B) == Role::Active {
+        if world.role(B) == RedundancyRole::Active {
             assert!(delay > 80, "the takeover was in an earlier pass");
             break;
         }
@@ -752,7 +755,7 @@ fn a_late_message_of_the_former_bridge_is_dropped_by_readers_of_heartbeats() {
     // A message that is under way while the bridge is stopped.
     let now = world.now(A);
     world.programs[A].stopped = world.passed + 1_000;
-    let heard = Heard {
+    let heard = LocalMessage {
         topic: topic(MEASURED),
         payload: &[0, 1, 0, 0, 101, 0, 0, 0],
         received: now.utc,
@@ -801,7 +804,7 @@ fn a_heartbeat_in_the_name_of_a_bridge_from_another_address_changes_no_role() {
     }
     assert_eq!(
         (world.role(A), world.role(B)),
-        (Role::Active, Role::Standby)
+        (RedundancyRole::Active, RedundancyRole::Standby)
     );
     for at in [B, READER] {
         assert_eq!(world.dropped(at, Reason::Forged), 20, "at {at}");
@@ -816,7 +819,7 @@ fn a_heartbeat_in_the_name_of_a_bridge_from_another_address_changes_no_role() {
     world.run(1_000);
     assert_eq!(
         (world.role(A), world.role(B)),
-        (Role::Active, Role::Standby)
+        (RedundancyRole::Active, RedundancyRole::Standby)
     );
     assert_eq!(takeovers(&world).takeovers, 0);
 }
@@ -848,7 +851,7 @@ fn a_planned_switch_and_the_end_of_a_program_lose_less_than_a_loss() {
 const SECURED: &str = "security: [{group: cell, keys: {file: k}}]\n";
 
 fn keys(byte: u8) -> KeyDelivery {
-    let key = Keys::from_bytes(SecurityPolicy::PubSubAes256Ctr, &[byte; 68]).unwrap();
+    let key = TokenKeys::from_bytes(SecurityPolicy::PubSubAes256Ctr, &[byte; 68]).unwrap();
     KeyDelivery {
         first_token_id: 1,
         keys: vec![key],
@@ -870,7 +873,7 @@ fn in_a_secured_group_a_bridge_without_keys_never_becomes_active() {
     world.run(2_000);
     assert_eq!(
         (world.role(A), world.role(B)),
-        (Role::Starting, Role::Active)
+        (RedundancyRole::Starting, RedundancyRole::Active)
     );
     for value in 1..=100 {
         world.say(MEASURED, value);
@@ -885,14 +888,14 @@ fn in_a_secured_group_a_bridge_without_keys_never_becomes_active() {
     world.run(500);
     assert_eq!(
         (world.role(A), world.role(B)),
-        (Role::Standby, Role::Active)
+        (RedundancyRole::Standby, RedundancyRole::Active)
     );
     world.programs[B].is_dead = true;
     for value in 101..=500 {
         world.say(MEASURED, value);
         world.run(1);
     }
-    assert_eq!(world.role(A), Role::Active);
+    assert_eq!(world.role(A), RedundancyRole::Active);
     let measured = world.values(MEASURED);
     assert_rising(&measured, "values");
     assert_eq!(measured.last(), Some(&499));
@@ -911,7 +914,7 @@ fn in_a_secured_group_a_heartbeat_in_clear_changes_no_role() {
         program.router.set_keys("cell", &keys(1), now).unwrap();
     }
     world.run(700);
-    assert_eq!(world.role(A), Role::Active);
+    assert_eq!(world.role(A), RedundancyRole::Active);
     // The heartbeat of an active bridge in a group without security.
     let mut other = World::new(CELL, 8);
     other.programs[A].is_dead = true;
@@ -937,6 +940,6 @@ fn in_a_secured_group_a_heartbeat_in_clear_changes_no_role() {
     }
     assert_eq!(
         (world.role(A), world.role(B)),
-        (Role::Active, Role::Standby)
+        (RedundancyRole::Active, RedundancyRole::Standby)
     );
 }

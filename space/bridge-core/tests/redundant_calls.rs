@@ -9,12 +9,12 @@ use std::time::Duration;
 
 use bridge_core::{
     AskErrorKind, AskId, CallDescription, CallField, CallRole, Executed, KeyDelivery, Local,
-    Offered, Rank, Reason, Role,
+    OfferedCall, Reason, RedundancyRank, RedundancyRole,
 };
-use cell::{Cell, Program, component, ms, topic};
+use cell::{SimulatedCell, SimulatedProgram, component, ms, topic};
 use mappings::{Mapping, TopicId};
 use uadp::action::{ActionDialect, ActionKind};
-use uadp::{BuiltinType, Keys, NetworkMessage, Scalar, SecurityPolicy, Variant};
+use uadp::{BuiltinType, NetworkMessage, Scalar, SecurityPolicy, TokenKeys, Variant};
 
 /// The redundant bridges of space 2.
 const A: usize = 0;
@@ -34,8 +34,8 @@ fn grip() -> TopicId {
     topic(0, 7, 105)
 }
 
-fn offered() -> Offered {
-    Offered {
+fn offered() -> OfferedCall {
+    OfferedCall {
         description: CallDescription {
             name: "Weld".to_owned(),
             about: String::new(),
@@ -56,7 +56,7 @@ fn done() -> Executed {
 }
 
 fn keys() -> KeyDelivery {
-    let key = Keys::from_bytes(SecurityPolicy::PubSubAes256Ctr, &[9; 68]).unwrap();
+    let key = TokenKeys::from_bytes(SecurityPolicy::PubSubAes256Ctr, &[9; 68]).unwrap();
     KeyDelivery {
         first_token_id: 1,
         keys: vec![key],
@@ -68,16 +68,23 @@ fn keys() -> KeyDelivery {
 const PLAIN: &str = "spaces: [{id: 1}, {id: 2}]\nnamespaces: {5: urn:x, 7: urn:y}\n";
 const SECURED: &str = "security: [{group: cell, keys: {file: k}}]\n";
 
-fn redundant(port: u16, rank: u8, mapping: &Arc<Mapping>, cell: &mut Cell) -> Program {
-    let mut program = Program::new(2, Local::Fields).at_port(port).mapped(mapping);
+fn redundant(
+    port: u16,
+    rank: u8,
+    mapping: &Arc<Mapping>,
+    cell: &mut SimulatedCell,
+) -> SimulatedProgram {
+    let mut program = SimulatedProgram::new(2, Local::Fields)
+        .at_port(port)
+        .mapped(mapping);
     let now = cell.now();
-    let rank = Rank::new(rank).unwrap();
+    let rank = RedundancyRank::new(rank).unwrap();
     program.router.set_redundancy(rank, now);
     program
 }
 
 /// Creates the bridges, of which A is active, and the component. All know the calls of each other.
-fn plant(is_secured: bool) -> Cell {
+fn plant(is_secured: bool) -> SimulatedCell {
     let text = if is_secured {
         format!("{PLAIN}{SECURED}")
     } else {
@@ -85,12 +92,12 @@ fn plant(is_secured: bool) -> Cell {
     };
     let mapping = Mapping::from_yaml(&text, "cell.yaml").mapping.unwrap();
     let mapping = Arc::new(mapping);
-    let mut cell = Cell::new(Vec::new());
+    let mut cell = SimulatedCell::new(Vec::new());
     let bridges = [(10_002, 1), (10_012, 2)];
     let bridges = bridges.map(|(port, rank)| redundant(port, rank, &mapping, &mut cell));
     cell.programs.extend(bridges);
     cell.programs
-        .push(Program::new(1, Local::Fields).mapped(&mapping));
+        .push(SimulatedProgram::new(1, Local::Fields).mapped(&mapping));
     cell.programs.push(component(7).mapped(&mapping));
     if is_secured {
         let now = cell.now();
@@ -103,12 +110,15 @@ fn plant(is_secured: bool) -> Cell {
     }
     cell.offer(GRIPPER, grip(), offered());
     cell.run(ms(1_500));
-    assert_eq!(roles(&cell), [Role::Active, Role::Standby]);
+    assert_eq!(
+        roles(&cell),
+        [RedundancyRole::Active, RedundancyRole::Standby]
+    );
     assert_eq!(cell.known(CALLER), [grip(), weld()]);
     cell
 }
 
-fn roles(cell: &Cell) -> [Role; 2] {
+fn roles(cell: &SimulatedCell) -> [RedundancyRole; 2] {
     [A, B].map(|at| cell.programs[at].router.redundancy().unwrap().role())
 }
 
@@ -127,7 +137,7 @@ fn is_response(bytes: &[u8]) -> bool {
 }
 
 /// Lets the network lose the responses as long as the returned flag is set.
-fn losing_responses(cell: &mut Cell) -> Rc<Shared<bool>> {
+fn losing_responses(cell: &mut SimulatedCell) -> Rc<Shared<bool>> {
     let loses = Rc::new(Shared::new(true));
     let flag = Rc::clone(&loses);
     cell.copies = Box::new(move |bytes| {
@@ -150,7 +160,7 @@ fn a_request_that_the_former_active_bridge_executed_is_unknown_and_not_executed_
     cell.kill(A);
     loses.set(false);
     cell.run(ms(5_000));
-    assert_eq!(roles(&cell)[B], Role::Active);
+    assert_eq!(roles(&cell)[B], RedundancyRole::Active);
     assert_eq!(cell.executions(B), [], "no second execution");
     let answers = cell.answers(CALLER);
     let [(AskId(1), Err(error))] = &answers[..] else {
@@ -176,7 +186,7 @@ fn in_a_secured_group_the_new_active_bridge_answers_and_executes_at_once() {
     // The request reaches no active bridge, and the standby answers it after the takeover.
     cell.ask(CALLER, AskId(2), (weld(), &seam(2)), ms(3_000));
     cell.run(ms(450));
-    assert_eq!(roles(&cell)[B], Role::Active);
+    assert_eq!(roles(&cell)[B], RedundancyRole::Active);
     let answers = cell.answers(CALLER);
     let [(AskId(2), Err(error))] = &answers[..] else {
         panic!("{answers:?}");
@@ -228,7 +238,7 @@ fn a_bridge_that_was_stopped_starts_nothing() {
 }
 
 /// Returns the datagram of a request, which does not reach the bridges.
-fn request(cell: &mut Cell) -> Vec<u8> {
+fn request(cell: &mut SimulatedCell) -> Vec<u8> {
     let now = cell.now();
     let router = &mut cell.programs[CALLER].router;
     router.ask(AskId(1), (weld(), &seam(1)), ms(3_000), now);
@@ -325,7 +335,10 @@ fn a_confirmed_request_is_answered_after_a_planned_switch_and_others_are_unknown
     loses.set(false);
     cell.executed(GRIPPER, executions[0].id, done());
     cell.run(ms(300));
-    assert_eq!(roles(&cell), [Role::Standby, Role::Active]);
+    assert_eq!(
+        roles(&cell),
+        [RedundancyRole::Standby, RedundancyRole::Active]
+    );
     assert!(matches!(cell.answers(A)[..], [(AskId(1), Ok(_))]));
     assert_eq!(cell.executions(GRIPPER), []);
 }
@@ -354,7 +367,7 @@ fn each_term_of_each_bridge_has_an_action_target_id_of_its_own() {
     let mut cell = plant(true);
     let mut executed = 0;
     for turn in 0..4 {
-        let active = usize::from(roles(&cell)[B] == Role::Active);
+        let active = usize::from(roles(&cell)[B] == RedundancyRole::Active);
         let ask = AskId(turn);
         cell.ask(CALLER, ask, (weld(), &seam(1)), ms(3_000));
         cell.run(ms(20));

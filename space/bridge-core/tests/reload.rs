@@ -3,10 +3,10 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use bridge_core::{Heard, Local, Now, Output, Reason, Router, Settings};
+use bridge_core::{Local, LocalMessage, Now, Output, Reason, Router, RouterSettings};
 use mappings::{Mapping, SpaceId, TopicId};
-use messages::{Dialect, Registry, Selection};
-use uadp::discovery::{Announced, Announcement};
+use messages::{Dialect, Selection, TypeRegistry};
+use uadp::discovery::{AnnouncedContent, Announcement};
 use uadp::{NetworkMessage, Scalar, Timestamp, Variant};
 
 struct Bench {
@@ -31,7 +31,7 @@ fn topic(id: u16) -> TopicId {
 impl Bench {
     #[expect(clippy::disallowed_methods, reason = "some instant to count from")]
     fn new(mapping: Arc<Mapping>) -> Self {
-        let settings = Settings {
+        let settings = RouterSettings {
             own: SpaceId::ROS1,
             local: Local::Ros1,
             source: None,
@@ -49,7 +49,7 @@ impl Bench {
     }
 
     fn bind(&mut self, id: u16) {
-        let registry = Registry::bundle(Dialect::Ros1);
+        let registry = TypeRegistry::bundle(Dialect::Ros1);
         let uint = registry.get(&"std_msgs/UInt32".parse().unwrap()).unwrap();
         let bound = self
             .router
@@ -65,7 +65,7 @@ impl Bench {
     }
 
     fn say(&mut self, id: u16, value: u32) {
-        let heard = Heard {
+        let heard = LocalMessage {
             topic: topic(id),
             payload: &value.to_le_bytes(),
             received: self.now.utc,
@@ -85,7 +85,8 @@ impl Bench {
                 };
                 let message = NetworkMessage::decode(&bytes).unwrap();
                 let announcement = Announcement::decode(&message).unwrap();
-                if let Announced::DataSetMetaData { writer_id, .. } = announcement.announced {
+                if let AnnouncedContent::DataSetMetaData { writer_id, .. } = announcement.announced
+                {
                     announced.push(writer_id);
                 }
             }

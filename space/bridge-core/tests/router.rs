@@ -6,12 +6,12 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use bridge_core::{
-    Crossing, Delivery, Heard, Hop, Local, Notice, Now, Output, PublisherKey, Reason, Router,
-    Settings, Verdict,
+    Crossing, Delivery, DropNotice, Hop, Local, LocalMessage, Now, Output, PublisherKey, Reason,
+    Router, RouterSettings, Verdict,
 };
 use mappings::{Mapping, SpaceId, TopicId};
-use messages::{Dialect, Registry, Selection};
-use uadp::discovery::{List, Probe};
+use messages::{Dialect, Selection, TypeRegistry};
+use uadp::discovery::{Probe, WireArray};
 use uadp::{
     BuiltinType, DataSetHeader, Extras, Fields, GroupHeader, MessageKind, NetworkHeader,
     NetworkMessage, NetworkMessageEncoder, PublisherId, Scalar, SecurityHeader, Timestamp, Variant,
@@ -31,7 +31,7 @@ impl Bench {
     #[expect(clippy::disallowed_methods, reason = "some instant to count from")]
     fn with(own: u16, local: Local, mapping: Mapping) -> Self {
         let own = SpaceId::new(own).unwrap();
-        let settings = Settings {
+        let settings = RouterSettings {
             own,
             local,
             source: Some(OUR_ADDRESS),
@@ -86,7 +86,7 @@ impl Bench {
             .collect()
     }
 
-    fn notices(&mut self) -> Vec<Notice> {
+    fn notices(&mut self) -> Vec<DropNotice> {
         let outputs = self.outputs().into_iter();
         outputs
             .filter_map(|output| match output {
@@ -106,7 +106,7 @@ impl Bench {
     }
 
     fn bind(&mut self, topic: TopicId, type_name: &str) {
-        let registry = Registry::bundle(Dialect::Ros1);
+        let registry = TypeRegistry::bundle(Dialect::Ros1);
         let message_type = registry.get(&type_name.parse().unwrap()).unwrap();
         self.router
             .bind(topic, &message_type, &Selection::Whole, self.now)
@@ -182,8 +182,8 @@ impl Frame {
     }
 }
 
-const fn heard(topic: TopicId, payload: &[u8], received: Timestamp) -> Heard<'_> {
-    Heard {
+const fn heard(topic: TopicId, payload: &[u8], received: Timestamp) -> LocalMessage<'_> {
+    LocalMessage {
         topic,
         payload,
         received,
@@ -453,7 +453,7 @@ fn what_the_codec_reads_and_the_space_does_not_carry_is_counted_as_unsupported()
     let security_flags = NetworkMessage::decode(&signed).unwrap().payload_offset() - 6;
     signed[security_flags] |= 1;
     let probes = [
-        Probe::DataSetWriterConfiguration(List::new(&[10])),
+        Probe::DataSetWriterConfiguration(WireArray::new(&[10])),
         Probe::WriterGroupConfiguration {
             writer_group_id: 1,
             include_data_set_writers: true,
@@ -526,7 +526,7 @@ fn a_state_is_repeated_with_its_time_and_its_readers_deliver_it_once() {
     // The metadata is announced in the meantime.
     sender.wait(SECOND);
     sender.router.handle_timeout(sender.now);
-    let state = Heard {
+    let state = LocalMessage {
         latched_by: Some(PublisherKey(1)),
         ..heard(topic("ua_1_5_10"), &[7, 0, 0, 0], sender.now.utc)
     };

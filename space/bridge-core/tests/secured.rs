@@ -5,13 +5,13 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use bridge_core::{
-    AskId, CallDescription, CallField, CallRole, Executed, Guard, KeyDelivery, Local, Offered,
+    AskId, CallDescription, CallField, CallRole, Executed, Guard, KeyDelivery, Local, OfferedCall,
     Reason, ValueDescription,
 };
-use cell::{Cell, Program, component, ms, topic};
+use cell::{SimulatedCell, SimulatedProgram, component, ms, topic};
 use mappings::{Mapping, TopicId};
 use proptest::prelude::*;
-use uadp::{BuiltinType, Keys, NetworkMessage, Scalar, SecurityPolicy, Variant};
+use uadp::{BuiltinType, NetworkMessage, Scalar, SecurityPolicy, TokenKeys, Variant};
 
 const WRITER: usize = 0;
 const READER: usize = 1;
@@ -24,8 +24,8 @@ const SIGNED: &str = "security: [{group: cell, mode: sign, keys: {file: k}}]";
 const MIXED: &str =
     "security: [{group: cell, keys: {file: k}}, {group: all, mode: none, namespaces: [9]}]";
 
-fn key(byte: u8) -> Keys {
-    Keys::from_bytes(SecurityPolicy::PubSubAes256Ctr, &[byte; 68]).unwrap()
+fn key(byte: u8) -> TokenKeys {
+    TokenKeys::from_bytes(SecurityPolicy::PubSubAes256Ctr, &[byte; 68]).unwrap()
 }
 
 fn delivery(first_token_id: u32, keys: &[u8]) -> KeyDelivery {
@@ -38,7 +38,7 @@ fn delivery(first_token_id: u32, keys: &[u8]) -> KeyDelivery {
 }
 
 /// Applies the mapping to a program.
-fn follows(cell: &mut Cell, at: usize, yaml: &str) {
+fn follows(cell: &mut SimulatedCell, at: usize, yaml: &str) {
     let mapping = Mapping::from_yaml(yaml, "cell.yaml").mapping.unwrap();
     let now = cell.now();
     cell.programs[at]
@@ -46,7 +46,7 @@ fn follows(cell: &mut Cell, at: usize, yaml: &str) {
         .replace_mapping(Arc::new(mapping), now);
 }
 
-fn give(cell: &mut Cell, at: usize, delivery: &KeyDelivery) {
+fn give(cell: &mut SimulatedCell, at: usize, delivery: &KeyDelivery) {
     let now = cell.now();
     cell.programs[at]
         .router
@@ -56,8 +56,8 @@ fn give(cell: &mut Cell, at: usize, delivery: &KeyDelivery) {
 
 /// Creates components of the namespaces 7, 8 and 9 with fields as payload. The first two have the
 /// key.
-fn secured(yaml: &str) -> Cell {
-    let mut cell = Cell::new(vec![component(7), component(8), component(9)]);
+fn secured(yaml: &str) -> SimulatedCell {
+    let mut cell = SimulatedCell::new(vec![component(7), component(8), component(9)]);
     for at in [WRITER, READER] {
         follows(&mut cell, at, yaml);
         give(&mut cell, at, &delivery(1, &[1]));
@@ -70,7 +70,7 @@ fn said() -> TopicId {
 }
 
 /// Returns the newest value that a program received.
-fn last(cell: &mut Cell, at: usize, topic: TopicId) -> Option<String> {
+fn last(cell: &mut SimulatedCell, at: usize, topic: TopicId) -> Option<String> {
     cell.texts(at, topic).pop()
 }
 
@@ -216,11 +216,11 @@ fn programs_whose_times_differ_a_little_use_each_key_for_its_lifetime_and_no_sho
         lifetime: ms(100),
         ..delivery(first, keys)
     };
-    let token = |cell: &Cell, at: usize| {
+    let token = |cell: &SimulatedCell, at: usize| {
         let state = cell.programs[at].router.groups().next().unwrap();
         (state.token_id.unwrap(), state.overdue)
     };
-    let says = |cell: &mut Cell, for_ms: u64| {
+    let says = |cell: &mut SimulatedCell, for_ms: u64| {
         for _ in 0..for_ms / 10 {
             cell.say(WRITER, said(), "on");
             cell.say(READER, topic(0, 8, 10), "too");
@@ -288,7 +288,7 @@ fn start() -> TopicId {
     topic(0, 7, 105)
 }
 
-fn offer(cell: &mut Cell) {
+fn offer(cell: &mut SimulatedCell) {
     let description = CallDescription {
         name: "gripper.Grasp.Start".to_owned(),
         about: String::new(),
@@ -296,7 +296,7 @@ fn offer(cell: &mut Cell) {
         request: vec![CallField::scalar("Text", BuiltinType::String)],
         response: vec![CallField::scalar("Text", BuiltinType::String)],
     };
-    let offered = Offered {
+    let offered = OfferedCall {
         description,
         open: false,
     };
@@ -305,7 +305,7 @@ fn offer(cell: &mut Cell) {
 }
 
 /// Sends a request of a program and returns the response, if it is received.
-fn ask(cell: &mut Cell, at: usize, text: &str) -> Option<Vec<u8>> {
+fn ask(cell: &mut SimulatedCell, at: usize, text: &str) -> Option<Vec<u8>> {
     let request = cell::block(&[Variant::Scalar(Scalar::String(Some(text)))]);
     cell.ask(at, AskId(1), (start(), &request), ms(2_000));
     cell.run(ms(500));
@@ -338,7 +338,7 @@ fn a_call_is_executed_for_who_has_the_key_wherever_it_is_and_for_nobody_else() {
 
 #[test]
 fn without_a_secured_group_a_call_of_another_host_stays_refused() {
-    let mut cell = Cell::new(vec![component(7), component(8), component(9)]);
+    let mut cell = SimulatedCell::new(vec![component(7), component(8), component(9)]);
     cell.programs[READER].address = "192.0.2.7:4000".parse().unwrap();
     offer(&mut cell);
     assert_eq!(ask(&mut cell, READER, "short"), None);
@@ -397,7 +397,7 @@ proptest! {
 
 #[test]
 fn bridges_of_both_ros_are_as_closed() {
-    let mut cell = Cell::new(vec![component(7), Program::new(1, Local::Ros1)]);
+    let mut cell = SimulatedCell::new(vec![component(7), SimulatedProgram::new(1, Local::Ros1)]);
     for at in [WRITER, READER] {
         follows(&mut cell, at, ENCRYPTED);
         give(&mut cell, at, &delivery(1, &[1]));

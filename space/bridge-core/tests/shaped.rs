@@ -3,9 +3,9 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Instant;
 
-use bridge_core::{Heard, Local, Now, Output, Reason, Router, Settings, Verdict};
+use bridge_core::{Local, LocalMessage, Now, Output, Reason, Router, RouterSettings, Verdict};
 use mappings::{Mapping, ServiceRole, SpaceId, TopicId};
-use messages::{Dialect, NoFields, Plan, Registry, Selected, Selection, Wire};
+use messages::{Dialect, MessagePlan, NoFields, Selected, Selection, TypeRegistry, Wire};
 use uadp::Timestamp;
 
 const CELL: &str = r#"
@@ -42,7 +42,7 @@ fn mapping(text: &str) -> Arc<Mapping> {
 }
 
 fn router(space: u16, mapping: &Arc<Mapping>) -> Router {
-    let settings = Settings {
+    let settings = RouterSettings {
         own: SpaceId::new(space).unwrap(),
         local: match space {
             1 => Local::Ros1,
@@ -53,8 +53,8 @@ fn router(space: u16, mapping: &Arc<Mapping>) -> Router {
     Router::new(settings, Arc::clone(mapping))
 }
 
-fn registry(space: u16) -> Registry {
-    Registry::bundle(match space {
+fn registry(space: u16) -> TypeRegistry {
+    TypeRegistry::bundle(match space {
         1 => Dialect::Ros1,
         _ => Dialect::Ros2,
     })
@@ -96,7 +96,7 @@ fn carried(
     now: Now,
 ) -> Result<Vec<u8>, String> {
     let topic: TopicId = topic.parse().unwrap();
-    let heard = Heard {
+    let heard = LocalMessage {
         topic,
         payload,
         received: now.utc,
@@ -279,7 +279,7 @@ variables:
 
 #[test]
 fn a_message_of_zeros_is_what_the_test_takes_it_for() {
-    let registry = Registry::bundle(Dialect::Ros1);
+    let registry = TypeRegistry::bundle(Dialect::Ros1);
     let message = registry
         .get(&"sensor_msgs/JointState".parse().unwrap())
         .unwrap();
@@ -287,7 +287,7 @@ fn a_message_of_zeros_is_what_the_test_takes_it_for() {
         fields: Vec::new(),
         rest: [].into(),
     };
-    let plan = Plan::compile(&message, &nothing, Wire::Ros1).unwrap();
+    let plan = MessagePlan::compile(&message, &nothing, Wire::Ros1).unwrap();
     let mut out = Vec::new();
     plan.write(&mut NoFields, &mut out).unwrap();
     assert_eq!(out, joint_state(&[], &[]));

@@ -3,10 +3,11 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use bridge_core::{
-    Delivery, Heard, Local, Now, Output, PublisherKey, Reason, Router, Settings, Verdict,
+    Delivery, Local, LocalMessage, Now, Output, PublisherKey, Reason, Router, RouterSettings,
+    Verdict,
 };
 use mappings::{Mapping, SpaceId, TopicId};
-use messages::{Dialect, Registry, Selection};
+use messages::{Dialect, Selection, TypeRegistry};
 use proptest::prelude::*;
 use uadp::{NetworkMessage, Scalar, Timestamp, Variant};
 
@@ -57,7 +58,7 @@ impl Bench {
         }
         let checked = Mapping::from_yaml(&text, "cell.yaml");
         assert!(checked.findings.is_empty(), "{}", checked.render(&text));
-        let settings = Settings {
+        let settings = RouterSettings {
             own: SpaceId::new(space).unwrap(),
             local: Local::Ros1,
             source: None,
@@ -80,7 +81,7 @@ impl Bench {
     }
 
     fn bind(&mut self, topic: TopicId) {
-        let string = Registry::bundle(Dialect::Ros1)
+        let string = TypeRegistry::bundle(Dialect::Ros1)
             .get(&"std_msgs/String".parse().unwrap())
             .unwrap();
         self.router
@@ -103,7 +104,7 @@ impl Bench {
     fn say_by(&mut self, latched_by: Option<PublisherKey>, topic: TopicId, text: &str) -> Verdict {
         let mut payload = u32::try_from(text.len()).unwrap().to_le_bytes().to_vec();
         payload.extend(text.as_bytes());
-        let heard = Heard {
+        let heard = LocalMessage {
             topic,
             payload: &payload,
             received: self.now.utc,

@@ -5,10 +5,11 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use bridge_core::{
-    Delivery, Heard, Kept, Local, Notice, Now, Output, Reason, Router, Settings, Verdict,
+    Delivery, DropNotice, Local, LocalMessage, Now, Output, Reason, Router, RouterSettings,
+    ValueRelation, Verdict,
 };
 use mappings::{Mapping, SpaceId, TopicId};
-use messages::{Dialect, Registry, Selection};
+use messages::{Dialect, Selection, TypeRegistry};
 use uadp::{
     DataSetHeader, GroupHeader, NetworkHeader, NetworkMessageEncoder, PublisherId, Scalar,
     Timestamp,
@@ -25,7 +26,7 @@ impl Bridge {
     #[expect(clippy::disallowed_methods, reason = "some instant to count from")]
     fn new(local: Local) -> Self {
         let mapping = Mapping::from_yaml(CELL, "cell.yaml").mapping.unwrap();
-        let settings = Settings {
+        let settings = RouterSettings {
             own: SpaceId::new(1).unwrap(),
             local,
             source: None,
@@ -48,7 +49,7 @@ impl Bridge {
     }
 
     fn bind(&mut self, topic: TopicId) {
-        let registry = Registry::bundle(Dialect::Ros1);
+        let registry = TypeRegistry::bundle(Dialect::Ros1);
         let message_type = registry.get(&"std_msgs/UInt32".parse().unwrap()).unwrap();
         self.router
             .bind(topic, &message_type, &Selection::Whole, self.now)
@@ -69,7 +70,7 @@ impl Bridge {
             .collect()
     }
 
-    fn notices(&mut self) -> Vec<Notice> {
+    fn notices(&mut self) -> Vec<DropNotice> {
         let outputs = self.outputs().into_iter();
         outputs
             .filter_map(|output| match output {
@@ -96,7 +97,7 @@ impl Bridge {
             Local::Fields => &[1, 0, 7, 7, 0, 0, 0],
             Local::Ros1 | Local::Cdr => &[7, 0, 0, 0],
         };
-        let heard = Heard {
+        let heard = LocalMessage {
             topic,
             payload,
             received: self.now.utc,
@@ -338,7 +339,7 @@ fn a_value_taken_by_a_clock_that_was_set_back_takes_the_place_of_the_one_before(
         let datagram = frame(robot, header, Some(sent));
         bridge.router.handle_datagram(&datagram, WRITER, bridge.now);
         let delivered = bridge.deliveries();
-        let kept: Vec<Kept> = delivered.iter().map(|delivery| delivery.kept).collect();
-        assert_eq!(kept, [Kept::Alone], "at {at} s");
+        let kept: Vec<ValueRelation> = delivered.iter().map(|delivery| delivery.kept).collect();
+        assert_eq!(kept, [ValueRelation::Alone], "at {at} s");
     }
 }

@@ -27,8 +27,9 @@ use mappings::{CallKind, Mapping, TopicId};
 use tokio::sync::mpsc;
 
 pub use self::graph::{
-    ActionClient, ActionGraph, ActionServer, CancelAnswer, CancelRequest, CancelWhat, GoalEvent,
-    GoalId, NO_GOAL, NewGoal, SentGoal, ServedGoal, ServerEvent, Waits,
+    ActionGraph, GraphActionClient, GraphActionServer, GraphCancelRequest, GraphCancelResponse,
+    GraphCancelSelection, GraphGoalEvent, GraphGoalId, GraphNewGoal, GraphServerEvent, NO_GOAL,
+    SentGoal, ServedGoal, Waits,
 };
 
 pub use self::own::{OwnAction, OwnActions};
@@ -36,21 +37,21 @@ pub use self::own::{OwnAction, OwnActions};
 use self::executors::Executors;
 use self::facades::Facades;
 use crate::policy::Policy;
-use crate::port::{Delivery, Execution};
+use crate::port::{Execution, LocalDelivery};
 use crate::present::{self, Present};
 use crate::{Asker, PortEvent};
 
 /// The actions of one bridge: actions of its graph that are executed for other spaces, and actions
 /// of other spaces that are offered in its graph.
 #[derive(Debug)]
-pub struct Actions {
+pub struct BridgeActions {
     executors: Executors,
     facades: Facades,
     reports: mpsc::Receiver<PortEvent>,
     report: mpsc::Sender<PortEvent>,
 }
 
-impl Default for Actions {
+impl Default for BridgeActions {
     fn default() -> Self {
         let (report, reports) = mpsc::channel(MOST_REPORTS);
         Self {
@@ -63,7 +64,7 @@ impl Default for Actions {
 }
 
 /// Actions of the graph, executed for other spaces.
-impl Actions {
+impl BridgeActions {
     /// Returns whether the name of an action makes it a call of the own space, so that its type has
     /// to be found out.
     #[must_use]
@@ -117,7 +118,7 @@ impl Actions {
 }
 
 /// Actions of other spaces, offered in the graph.
-impl Actions {
+impl BridgeActions {
     /// Adds or updates a call of another space.
     pub fn known(&mut self, topic: TopicId, described: &Arc<CallDescription>) {
         self.facades.known(topic, described);
@@ -156,8 +157,8 @@ impl Actions {
     }
 
     /// Offers at most `most` waiting actions that `may` be offered under their names in this space.
-    /// `asker` returns the [`Asker`] of a call ([`Calls::asker`](crate::Calls::asker)). Reports the
-    /// types of their calls and values.
+    /// `asker` returns the [`Asker`] of a call ([`Calls::asker`](crate::SpaceCalls::asker)).
+    /// Reports the types of their calls and values.
     pub fn offer_waiting<G: ActionGraph>(
         &mut self,
         with: (&mut G, &mut Policy),
@@ -186,13 +187,13 @@ impl Actions {
     ///
     /// # Errors
     /// A short reason under which the value is counted as dropped.
-    pub fn publish(&mut self, value: &Delivery) -> Result<(), &'static str> {
+    pub fn publish(&mut self, value: &LocalDelivery) -> Result<(), &'static str> {
         self.facades.publish(value)
     }
 }
 
 /// Both directions.
-impl Actions {
+impl BridgeActions {
     /// Checks all actions again, because definitions or the mapping may have changed.
     pub fn look_again<G: ActionGraph>(
         &mut self,

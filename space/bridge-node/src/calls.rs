@@ -3,7 +3,7 @@
 //!
 //! The module [`policy`](crate::policy) chooses the type, and the graph offers the service.
 //! Requests go to the Router as [`PortEvent::Ask`], and the responses come back through
-//! [`answered`](Calls::answered).
+//! [`answered`](SpaceCalls::answered).
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::Arc;
@@ -11,10 +11,12 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::task::{Context, Poll};
 use std::time::{Duration, Instant};
 
-use bridge_core::{Answered, AskErrorKind, AskId, CallDescription, CallMap, CallRole};
+use bridge_core::{AskErrorKind, AskId, CallDescription, CallMap, CallResponse, CallRole};
 use bytes::Bytes;
 use mappings::{CallKind, TopicId};
-use messages::{Literal, MessageType, NoFields, Plan, Selection, ServiceType, TypeName, Wire};
+use messages::{
+    Literal, MessagePlan, MessageType, NoFields, Selection, ServiceType, TypeName, Wire,
+};
 use tokio::sync::{mpsc, oneshot};
 use tracing::{debug, info};
 
@@ -43,7 +45,7 @@ pub trait CallGraph: ServiceGraph {
 
 /// The calls of other spaces that a port knows, and the open requests of its graph.
 #[derive(Debug)]
-pub struct Calls<S> {
+pub struct SpaceCalls<S> {
     known: BTreeMap<TopicId, Known<S>>,
     /// Services of lost calls, with the time of the loss: callers that wait for a response still
     /// receive the failure.
@@ -238,7 +240,7 @@ impl Asker {
     }
 }
 
-impl<S: Send> Default for Calls<S> {
+impl<S: Send> Default for SpaceCalls<S> {
     fn default() -> Self {
         let (say, said) = mpsc::channel(MOST_ASKED);
         Self {
@@ -253,7 +255,7 @@ impl<S: Send> Default for Calls<S> {
     }
 }
 
-impl<S: Send> Calls<S> {
+impl<S: Send> SpaceCalls<S> {
     /// Adds or updates a call of another space. It is offered by
     /// [`offer_waiting`](Self::offer_waiting).
     pub fn known(&mut self, topic: TopicId, described: Arc<CallDescription>) {
@@ -560,7 +562,7 @@ impl<S: Send> Calls<S> {
     }
 
     /// Passes a response to its caller.
-    pub fn answered(&mut self, ask: AskId, answer: Answered<Bytes>) {
+    pub fn answered(&mut self, ask: AskId, answer: CallResponse<Bytes>) {
         let Some(asked) = self.asked.remove(&ask) else {
             return;
         };
@@ -607,7 +609,7 @@ fn no(response: &Arc<MessageType>, why: &str) -> Option<Bytes> {
             ("message".to_owned(), one(why)),
         ]),
     };
-    let plan = Plan::compile(response, &template, Wire::Cdr).ok()?;
+    let plan = MessagePlan::compile(response, &template, Wire::Cdr).ok()?;
     let mut bytes = Vec::new();
     plan.write(&mut NoFields, &mut bytes).ok()?;
     Some(bytes.into())

@@ -7,8 +7,8 @@ use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 
 use std::sync::Arc;
 
-use bridge_core::{Link, Relay};
-use broker::{Identity, Mqtt};
+use bridge_core::{LinkCapacity, Relay};
+use broker::{BrokerIdentity, Mqtt};
 use mappings::{
     Broker, BrokerAddress, CarrierMedium, ConfiguredCarrier, EthernetGroup, Mapping, PubSub,
     SpaceId, UdpGroup,
@@ -17,11 +17,11 @@ use service::{Failure, FailureKind};
 use tokio::sync::watch;
 use transport::{
     Capacity, Carrier, CarrierRules, Carriers, Ethernet, EthernetError, EthernetOptions, Judgement,
-    MessagePath, Options, ProcessHub, Senders, Udp, VlanTag,
+    MessagePath, ProcessHub, Senders, Udp, UdpOptions, VlanTag,
 };
 
 use crate::arguments::Arguments;
-use crate::mapping_file::Running;
+use crate::mapping_file::RunningMapping;
 pub(crate) use drops::rules;
 use routes::LiveRoutes;
 
@@ -33,10 +33,10 @@ pub(crate) const NO_SOURCE: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LO
 pub(crate) fn open(
     (program, own): (&str, SpaceId),
     (arguments, mapping): (&Arguments, &Arc<Mapping>),
-    changes: &watch::Receiver<Running>,
+    changes: &watch::Receiver<RunningMapping>,
     (several, hub): (bool, Option<&ProcessHub>),
-) -> Result<(Box<dyn Carrier>, Option<Options>), Failure> {
-    let identity = Identity {
+) -> Result<(Box<dyn Carrier>, Option<UdpOptions>), Failure> {
+    let identity = BrokerIdentity {
         program: program.to_owned(),
         publisher: (!arguments.flags.dry_run).then(|| own.into()),
     };
@@ -59,12 +59,12 @@ pub(crate) fn open(
 }
 
 /// Carriers, and the options of their first socket if one of them uses UDP.
-type WithOptions<T> = (T, Option<Options>);
+type WithOptions<T> = (T, Option<UdpOptions>);
 
 /// Opens the carriers of a list. Returns the options of the first socket too, if UDP is among them.
 fn open_all(
     listed: &[ConfiguredCarrier],
-    identity: &Identity,
+    identity: &BrokerIdentity,
     arguments: &Arguments,
     (several, hub): (bool, Option<&ProcessHub>),
 ) -> Result<WithOptions<Vec<Box<dyn Carrier>>>, Failure> {
@@ -91,13 +91,13 @@ fn open_all(
     Ok((carriers, first))
 }
 
-fn open_broker(broker: &Broker, identity: &Identity) -> Result<Box<dyn Carrier>, Failure> {
+fn open_broker(broker: &Broker, identity: &BrokerIdentity) -> Result<Box<dyn Carrier>, Failure> {
     let mqtt = Mqtt::open(broker, identity)
         .map_err(|error| Failure::new(FailureKind::Configuration, format!("MQTT: {error}")))?;
     Ok(Box::new(mqtt))
 }
 
-fn open_udp(options: &Options, hub: Option<&ProcessHub>) -> Result<Box<dyn Carrier>, Failure> {
+fn open_udp(options: &UdpOptions, hub: Option<&ProcessHub>) -> Result<Box<dyn Carrier>, Failure> {
     let udp = Udp::open(options)
         .map_err(|error| Failure::new(FailureKind::Unavailable, error.to_string()))?;
     Ok(match hub {
@@ -178,7 +178,7 @@ fn broker_of(url: Option<&str>, pubsub: &PubSub) -> Result<Option<Broker>, Failu
 }
 
 /// Returns the socket options for the group.
-fn options(arguments: &Arguments, mapping: &Mapping, several: bool) -> Result<Options, Failure> {
+fn options(arguments: &Arguments, mapping: &Mapping, several: bool) -> Result<UdpOptions, Failure> {
     let pubsub = mapping.pubsub();
     let address: SocketAddr = match &arguments.flags.address {
         Some(url) => PubSub::parse_address(url).ok_or_else(|| {
@@ -204,7 +204,11 @@ fn options(arguments: &Arguments, mapping: &Mapping, several: bool) -> Result<Op
 }
 
 /// Returns the socket options for a group. The interface of the command line takes precedence.
-fn udp_options(arguments: &Arguments, group: &UdpGroup, several: bool) -> Result<Options, Failure> {
+fn udp_options(
+    arguments: &Arguments,
+    group: &UdpGroup,
+    several: bool,
+) -> Result<UdpOptions, Failure> {
     let UdpGroup {
         address,
         interface,
@@ -212,11 +216,11 @@ fn udp_options(arguments: &Arguments, group: &UdpGroup, several: bool) -> Result
         peers,
     } = group;
     let flag = arguments.flags.interface.clone();
-    let options = Options {
+    let options = UdpOptions {
         interface: flag.or_else(|| interface.clone()),
         ttl: u32::from(*ttl),
         peers: peers.clone(),
-        ..Options::new(*address)
+        ..UdpOptions::new(*address)
     };
     if several && !address.ip().is_multicast() {
         let message = format!(
@@ -243,10 +247,10 @@ pub(crate) fn limit(carrier: &dyn Carrier) -> Option<u16> {
 }
 
 /// Returns the capacity of the network of the carrier.
-pub(crate) fn link(carrier: &dyn Carrier) -> Link {
+pub(crate) fn link(carrier: &dyn Carrier) -> LinkCapacity {
     match carrier.capacity() {
-        Capacity::Wire(speed) => Link::Wire { speed },
-        Capacity::Host(receive_buffer) => Link::Host { receive_buffer },
-        Capacity::Unknown => Link::Unknown,
+        Capacity::Wire(speed) => LinkCapacity::Wire { speed },
+        Capacity::Host(receive_buffer) => LinkCapacity::Host { receive_buffer },
+        Capacity::Unknown => LinkCapacity::Unknown,
     }
 }

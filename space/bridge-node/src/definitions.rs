@@ -6,10 +6,10 @@ use std::sync::Arc;
 
 use messages::{
     ActionCalls, ActionMessages, ActionType, DefinitionError, Dialect, Library, MessageType, Noted,
-    Registry, ServiceType, TextKind, TypeName,
+    ServiceType, TextKind, TypeName, TypeRegistry,
 };
 use tracing::{info, warn};
-use type_files::{Environment, TypeFiles, TypePaths};
+use type_files::{RosEnvironment, TypeFiles, TypePaths};
 
 /// Finds types by name. A definition stays cached until all definitions are read again.
 #[derive(Debug)]
@@ -26,9 +26,9 @@ impl Definitions {
     /// Creates the definitions of one ROS from the built-in definitions, the `type_paths` of the
     /// mapping, and the installed ROS distributions.
     #[must_use]
-    pub fn new(dialect: Dialect, types: Arc<TypePaths>, environment: Environment) -> Self {
+    pub fn new(dialect: Dialect, types: Arc<TypePaths>, environment: RosEnvironment) -> Self {
         Self {
-            library: Library::new(Registry::bundle(dialect)),
+            library: Library::new(TypeRegistry::bundle(dialect)),
             files: TypeFiles::new(types, environment),
             peers: BTreeMap::new(),
             suggestions: MOST_SUGGESTIONS,
@@ -47,12 +47,12 @@ impl Definitions {
 
     /// Returns the registry of the known definitions.
     #[must_use]
-    pub const fn registry(&self) -> &Registry {
+    pub const fn registry(&self) -> &TypeRegistry {
         self.library.registry()
     }
 
     /// Returns the registry for definitions that do not come from files.
-    pub const fn registry_mut(&mut self) -> &mut Registry {
+    pub const fn registry_mut(&mut self) -> &mut TypeRegistry {
         self.library.registry_mut()
     }
 
@@ -224,7 +224,7 @@ mod tests {
     #[test]
     fn what_may_be_meant_is_told_of_the_first_unknown_names() {
         let types = Arc::default();
-        let mut known = Definitions::new(Dialect::Ros2, types, Environment::default());
+        let mut known = Definitions::new(Dialect::Ros2, types, RosEnvironment::default());
         let name: TypeName = "geometry_msgs/Twists".parse().unwrap();
         let error = known.find(&name).unwrap_err();
         let mut explained = || known.explain(TextKind::Message, &error);
@@ -246,7 +246,7 @@ mod tests {
         std::fs::write(folder.join("robot_msgs/package.xml"), manifest).unwrap();
         std::fs::write(action.join("Turn.action"), "float64 a\n---\n---\n").unwrap();
         let types = TypePaths::read(std::slice::from_ref(&folder), &mut |_| {});
-        let mut known = Definitions::new(Dialect::Ros2, Arc::new(types), Environment::default());
+        let mut known = Definitions::new(Dialect::Ros2, Arc::new(types), RosEnvironment::default());
         let mut told = |name: &str| {
             let name: TypeName = name.parse().unwrap();
             let error = known.find_action_calls(&name).unwrap_err();

@@ -22,7 +22,7 @@ use crate::clock::now;
 use crate::policy::Policy;
 use crate::port::Execution;
 use crate::present::{self, Present};
-use crate::services::{CallFault, Ran, ServiceCall};
+use crate::services::{CallFault, MayHaveRun, ServiceCall};
 use crate::{GraphError, PortEvent, ServiceGraph};
 
 /// A ROS graph with services that can be executed for other spaces.
@@ -44,7 +44,7 @@ pub trait ExecutorGraph: ServiceGraph {
 
 /// The services of a graph that are executed for the space.
 #[derive(Debug)]
-pub struct Executing<C> {
+pub struct ExecutedServices<C> {
     served: HashMap<TopicId, Served<C>>,
     /// Services that cannot be served with their present settings.
     refused: HashMap<TopicId, Wanted>,
@@ -82,7 +82,7 @@ struct Done {
     result: Result<Bytes, CallFault>,
 }
 
-impl<C> Default for Executing<C> {
+impl<C> Default for ExecutedServices<C> {
     fn default() -> Self {
         let (report, done) = mpsc::channel(MOST_RUNNING);
         Self {
@@ -96,7 +96,7 @@ impl<C> Default for Executing<C> {
     }
 }
 
-impl<C: ServiceCall + Sync> Executing<C> {
+impl<C: ServiceCall + Sync> ExecutedServices<C> {
     /// Returns whether the name of a service makes it a call of the own space, so that its type has
     /// to be found out.
     #[must_use]
@@ -248,9 +248,9 @@ impl<C: ServiceCall + Sync> Executing<C> {
             Ok(response) => (Executed::Answered(response.into()), None),
             Err(CallFault { text, ran, .. }) => {
                 let outcome = match ran {
-                    Ran::No => Executed::Refused(Refusal::NotExecutable),
-                    Ran::Perhaps => Executed::Lost,
-                    Ran::Yes => Executed::Failed(BAD_UNEXPECTED_ERROR),
+                    MayHaveRun::No => Executed::Refused(Refusal::NotExecutable),
+                    MayHaveRun::Perhaps => Executed::Lost,
+                    MayHaveRun::Yes => Executed::Failed(BAD_UNEXPECTED_ERROR),
                 };
                 let detail = text;
                 (outcome, Some(PortEvent::CallFailed { topic, detail }))
@@ -276,7 +276,7 @@ async fn run<C: ServiceCall + Sync>(
         Err(CallFault {
             text: TOO_LATE.to_owned(),
             may_pass: true,
-            ran: Ran::No,
+            ran: MayHaveRun::No,
         })
     };
     drop(place);

@@ -8,7 +8,7 @@ use service::{Ask, Failure, FailureKind, Pages, Site, service_manager};
 use tokio::sync::watch;
 use transport::ProcessHub;
 
-use crate::status::Status;
+use crate::status::StatusSnapshot;
 use crate::tap::Taps;
 
 /// The parts of a process that its programs share: the pages, the tapped topics, and the messages
@@ -17,7 +17,7 @@ use crate::tap::Taps;
 pub(crate) struct ProcessHost {
     hub: ProcessHub,
     taps: Arc<Taps>,
-    pages: Arc<Pages<Status>>,
+    pages: Arc<Pages<StatusSnapshot>>,
     /// The programs of the process; `None` for a program alone.
     programs: Option<Arc<watch::Sender<ProgramStates>>>,
 }
@@ -93,7 +93,7 @@ impl ProcessHost {
         &self.taps
     }
 
-    pub(crate) fn pages(&self) -> &Pages<Status> {
+    pub(crate) fn pages(&self) -> &Pages<StatusSnapshot> {
         &self.pages
     }
 
@@ -118,7 +118,7 @@ impl ProcessHost {
     pub(crate) async fn starting(
         &self,
         program: &'static str,
-        (asks, site): (&[Ask<Status>], Option<&Arc<dyn Site>>),
+        (asks, site): (&[Ask<StatusSnapshot>], Option<&Arc<dyn Site>>),
         address: Option<SocketAddr>,
     ) -> Result<(), Failure> {
         if self.programs.is_none() {
@@ -135,7 +135,7 @@ impl ProcessHost {
     pub(crate) fn started(
         &self,
         program: &'static str,
-        (asks, site): (Vec<Ask<Status>>, Option<Arc<dyn Site>>),
+        (asks, site): (Vec<Ask<StatusSnapshot>>, Option<Arc<dyn Site>>),
     ) {
         if self.programs.is_none() {
             return service_manager::ready();

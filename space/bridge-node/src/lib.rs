@@ -33,28 +33,28 @@ mod stamp;
 mod status;
 mod tap;
 
-pub use actions::{ActionGraph, Actions};
+pub use actions::{ActionGraph, BridgeActions};
 pub use arguments::{Arguments, Flags, WithoutMapping};
 pub use awaited::{AwaitedPeers, near};
 pub use bridge_core::{
-    ActionFamily, Answered, Application, Arrival, AskError, AskErrorKind, AskId, CallDescription,
-    CallField, CallMap, CallRole, CallStructure, Counters, Described, Executed, ExecutionId,
-    Handover, Kept, Offered, OfferedType, Owned, PublisherKey, Rank, Reason, Refusal, Room, Router,
-    Unsent, ValueDescription, ValueNote, Verdict,
+    ActionFamily, Application, AskError, AskErrorKind, AskId, CallDescription, CallField, CallMap,
+    CallResponse, CallRole, CallStructure, ConfirmedArrival, Counters, Executed, ExecutionId,
+    Handover, OfferedCall, OfferedType, Owned, PublisherKey, Reason, RedundancyRank, Refusal, Room,
+    Router, TopicMetaData, Unsent, ValueDescription, ValueNote, ValueRelation, Verdict,
 };
 pub use busy_poll::BusyPoll;
-pub use calls::{Asker, CallGraph, Calls};
+pub use calls::{Asker, CallGraph, SpaceCalls};
 pub use carrier::carrier_rules;
 pub use cell::{ProgramSet, SharedProgram, check_mapping, run_together};
 pub use clock::{now, timestamp};
 pub use definitions::Definitions;
-pub use executing::{Executing, ExecutorGraph};
+pub use executing::{ExecutedServices, ExecutorGraph};
 pub use graph_error::GraphError;
 pub use keys::{Fetched, Fetching, KeyRequest, KeyService};
 pub use mapping_file::{ConfigurationFile, NodeSetReader};
 pub use mappings::harmless_json;
 pub use observer::Observer;
-pub use port::{Delivery, Execution, LinkState, Port, PortEvent};
+pub use port::{Execution, LinkState, LocalDelivery, Port, PortEvent};
 pub use present::Present;
 pub use program::{Carried, Context, Made, Program, run};
 pub use redundancy::{RedundancyArguments, rank};
@@ -65,6 +65,8 @@ pub use service::{
     BoxFuture, Failure, FailureKind, PageBody, Secure, Site, Statuses, Stream, Visit, full,
     serve_secure,
 };
-pub use services::{CallFault, Outcome, Ran, ServiceCall, ServiceGraph, Services};
+pub use services::{
+    BridgeServiceCalls, CallFault, MayHaveRun, ServiceCall, ServiceGraph, ServiceOutcome,
+};
 pub use stamp::wants_stamp;
-pub use type_files::{Environment, TypePaths, read_bounded, read_text_file};
+pub use type_files::{RosEnvironment, TypePaths, read_bounded, read_text_file};

@@ -12,7 +12,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use mappings::{
-    Checked, Code, Diagnostic, Mapping, NodeSets, Readers, Severity, SpaceId, Surroundings,
+    Checked, Code, Diagnostic, FileReaders, Mapping, NodeSets, Severity, SpaceId, Surroundings,
     TypeOrigin, TypeUse,
 };
 use messages::{Dialect, TextKind, TypeName};
@@ -22,10 +22,10 @@ use sha2::{Digest, Sha256};
 use tokio::signal::unix::Signal;
 use tokio::sync::watch;
 use tracing::{error, info, warn};
-use type_files::{Environment, TypeFiles, TypePaths};
+use type_files::{RosEnvironment, TypeFiles, TypePaths};
 
 pub use self::configuration::ConfigurationFile;
-use self::look::{Before, Look, Seen, see};
+use self::look::{Before, PollParameters, SeenFiles, see};
 use crate::clock::now;
 
 /// Reads NodeSet2 files for the check of a mapping.
@@ -33,7 +33,7 @@ pub type NodeSetReader = fn(&[PathBuf]) -> Box<dyn NodeSets>;
 
 /// The running mapping with its definitions and status.
 #[derive(Debug, Clone)]
-pub(crate) struct Running {
+pub(crate) struct RunningMapping {
     pub(crate) mapping: Arc<Mapping>,
     /// The definitions of its `type_paths`.
     pub(crate) types: Arc<TypePaths>,
@@ -93,7 +93,7 @@ struct Reading {
     known: Known,
     /// Number of definitions that differ from the running definitions.
     differing: usize,
-    files: Seen,
+    files: SeenFiles,
 }
 
 type Known = BTreeSet<(Dialect, TextKind, TypeName)>;
@@ -177,7 +177,7 @@ fn key(used: &TypeUse) -> (Dialect, TextKind, TypeName) {
 struct Disk<'r> {
     /// The running definitions, for definitions that cannot be read.
     running: &'r TypePaths,
-    seen: RefCell<Seen>,
+    seen: RefCell<SeenFiles>,
     /// The definitions of the `type_paths`, once they were read.
     types: RefCell<Option<Arc<TypePaths>>>,
     /// The reader of NodeSets, and the fingerprint of the NodeSets read.
@@ -209,11 +209,11 @@ impl Surroundings for Disk<'_> {
         type_files::Disk.variable(name)
     }
 
-    fn readers(&self, file: &str) -> Option<Readers> {
+    fn readers(&self, file: &str) -> Option<FileReaders> {
         type_files::Disk.readers(file)
     }
 
-    fn types(&self, paths: &[PathBuf]) -> Box<dyn mappings::TypeFiles> {
+    fn types(&self, paths: &[PathBuf]) -> Box<dyn mappings::OpenTypeFiles> {
         let read = || {
             let mut seen = self.seen.borrow_mut();
             let mut own = TypePaths::read(paths, &mut |path| see(&mut seen.types, path));
@@ -221,7 +221,7 @@ impl Surroundings for Disk<'_> {
             Arc::new(own)
         };
         let own = Arc::clone(self.types.borrow_mut().get_or_insert_with(read));
-        Box::new(TypeFiles::new(own, Environment::from_env()))
+        Box::new(TypeFiles::new(own, RosEnvironment::from_env()))
     }
 
     fn nodesets(&self, files: &[PathBuf]) -> Option<Box<dyn NodeSets>> {
@@ -245,7 +245,7 @@ pub(crate) struct MappingFile {
     /// The reader of the NodeSets that the mapping names.
     nodesets: Option<NodeSetReader>,
     /// The files as they were when they were last read.
-    files: Arc<Seen>,
+    files: Arc<SeenFiles>,
     /// Hash of the last reading, adopted or refused.
     hash: String,
     /// Fingerprint of the last reading, adopted or refused.
@@ -258,13 +258,13 @@ pub(crate) struct MappingFile {
     gone: bool,
     /// The spaces that the program serves. Errors that concern only other spaces do not stop it.
     spaces: Vec<SpaceId>,
-    running: Running,
+    running: RunningMapping,
 }
 
 impl MappingFile {
     /// Returns a mapping without a file, which never changes.
     pub(crate) fn none(mapping: Mapping) -> Self {
-        let running = Running {
+        let running = RunningMapping {
             mapping: Arc::new(mapping),
             types: Arc::default(),
             about: Arc::default(),
@@ -339,7 +339,7 @@ impl MappingFile {
                     told: BTreeSet::new(),
                     gone: false,
                     spaces: own,
-                    running: Running {
+                    running: RunningMapping {
                         mapping: Arc::new(mapping),
                         types: reading.types,
                         about: Arc::new(about),
@@ -357,7 +357,7 @@ impl MappingFile {
     }
 
     /// Returns the running mapping.
-    pub(crate) const fn running(&self) -> &Running {
+    pub(crate) const fn running(&self) -> &RunningMapping {
         &self.running
     }
 
@@ -368,7 +368,7 @@ impl MappingFile {
     /// does not, such as a remounted folder of a container and files on a network. It costs a
     /// handful of system calls, and it is needed anyway to wait until a file is written completely.
     /// There may be thousands of definitions, so each poll checks a bounded number of them in turn.
-    pub(crate) async fn follow(self, hangup: Signal, shells: watch::Sender<Running>) {
+    pub(crate) async fn follow(self, hangup: Signal, shells: watch::Sender<RunningMapping>) {
         match self.configuration.clone() {
             Some(configuration) => {
                 self.follow_configuration(configuration, hangup, shells)
@@ -378,7 +378,7 @@ impl MappingFile {
         }
     }
 
-    async fn follow_mapping(mut self, mut hangup: Signal, shells: watch::Sender<Running>) {
+    async fn follow_mapping(mut self, mut hangup: Signal, shells: watch::Sender<RunningMapping>) {
         let mut pause = Duration::ZERO;
         let mut before = Before::default();
         let mut turn = 0_usize;
@@ -395,7 +395,7 @@ impl MappingFile {
                 }
                 continue;
             };
-            let look = Look {
+            let look = PollParameters {
                 file,
                 nodesets: self.nodesets,
                 files: Arc::clone(&self.files),

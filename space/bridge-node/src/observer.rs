@@ -6,7 +6,7 @@ use std::sync::Arc;
 use bridge_core::CallDescription;
 use mappings::{Mapping, TopicId};
 
-use crate::port::{Delivery, PortEvent};
+use crate::port::{LocalDelivery, PortEvent};
 
 /// Observes the values, descriptions and calls of a run loop. No method may wait, because the run
 /// loop calls it for each sample.
@@ -18,7 +18,7 @@ pub trait Observer: Send + Sync + 'static {
     fn datagram(&self, datagram: &[u8], from: SocketAddr);
 
     /// Notes a value of another program before it is delivered.
-    fn received(&self, sample: &Delivery);
+    fn received(&self, sample: &LocalDelivery);
 
     /// Notes an event of the local side before it is handled.
     fn event(&self, event: &PortEvent);

@@ -15,15 +15,15 @@ use std::collections::VecDeque;
 use std::sync::Arc;
 use std::time::Instant;
 
-use bridge_core::{Described, Room};
+use bridge_core::{Room, TopicMetaData};
 use mappings::{Mapping, SpaceId, TopicId};
 use messages::{MessageType, Selection, TypeName};
 
 pub use self::calls::{action_type, call_type};
-pub use self::choice::{Choice, Step, Word};
-pub use self::found::Found;
+pub use self::choice::{Choice, PortStep, Word};
+pub use self::found::TopicMeaning;
 pub use self::reload::{Destination, Read, still_made, taken_up};
-pub use self::told::Told;
+pub use self::told::LoggedMessages;
 use crate::PortEvent;
 
 /// The knowledge of a port about its own space, apart from the content of its graph.
@@ -32,7 +32,7 @@ pub struct Policy {
     own: SpaceId,
     mapping: Arc<Mapping>,
     /// Messages that are logged once.
-    pub told: Told,
+    pub told: LoggedMessages,
     /// The places for strays: values that neither the mapping nor a subscriber asks for.
     room: Room,
 }
@@ -53,7 +53,7 @@ impl Policy {
         Self {
             own,
             mapping,
-            told: Told::default(),
+            told: LoggedMessages::default(),
             room: Room::new(MAX_TOPICS),
         }
     }
@@ -108,7 +108,7 @@ impl Policy {
     pub fn learned(
         &mut self,
         topic: TopicId,
-        described: &Described,
+        described: &TopicMetaData,
         message_type: &MessageType,
     ) -> Option<(TypeName, Selection)> {
         let name = &described.message_type;

@@ -6,9 +6,9 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use bridge_core::{
-    Answered, Application, Arrival, AskId, CallDescription, CallMap, Described, Executed,
-    ExecutionId, Handover, Kept, Offered, OfferedType, PublisherKey, Reason, Router,
-    ValueDescription, ValueNote, Verdict,
+    Application, AskId, CallDescription, CallMap, CallResponse, ConfirmedArrival, Executed,
+    ExecutionId, Handover, OfferedCall, OfferedType, PublisherKey, Reason, Router, TopicMetaData,
+    ValueDescription, ValueNote, ValueRelation, Verdict,
 };
 use bytes::Bytes;
 use mappings::{Mapping, TopicId};
@@ -37,7 +37,7 @@ pub trait Port: Send + 'static {
     ///
     /// # Errors
     /// A short reason under which the sample is counted as dropped.
-    fn publish(&mut self, sample: Delivery) -> Result<(), &'static str>;
+    fn publish(&mut self, sample: LocalDelivery) -> Result<(), &'static str>;
 
     /// Returns the handover of the last [published](Self::publish) value of a topic that is
     /// confirmed.
@@ -67,7 +67,7 @@ pub trait Port: Send + 'static {
     }
 
     /// Receives the outcome of the newest value of a topic of this side that bridges confirm.
-    fn settled(&mut self, topic: TopicId, arrival: &Arrival) {
+    fn settled(&mut self, topic: TopicId, arrival: &ConfirmedArrival) {
         let _nobody_waits = (topic, arrival);
     }
 
@@ -79,7 +79,7 @@ pub trait Port: Send + 'static {
         &mut self,
         topic: TopicId,
         shape: &[(BuiltinType, bool)],
-        described: Option<&Described>,
+        described: Option<&TopicMetaData>,
     );
 
     /// Notes that a topic of another space had no good value for its receive timeout, or has one
@@ -88,8 +88,8 @@ pub trait Port: Send + 'static {
     fn silent(&mut self, topic: TopicId, silent: bool);
 
     /// Notes that one of the concurrent values of a topic is not available to late joiners any
-    /// more: the value delivered with this [`instance`](Delivery::instance). No effect for a side
-    /// that keeps only the last value.
+    /// more: the value delivered with this [`instance`](LocalDelivery::instance). No effect for a
+    /// side that keeps only the last value.
     fn retired(&mut self, topic: TopicId, instance: Timestamp) {
         let _one_value = (topic, instance);
     }
@@ -118,7 +118,7 @@ pub trait Port: Send + 'static {
     }
 
     /// Receives the outcome of a request that was reported as [`PortEvent::Ask`].
-    fn answered(&mut self, ask: AskId, topic: TopicId, answer: Answered<Bytes>) {
+    fn answered(&mut self, ask: AskId, topic: TopicId, answer: CallResponse<Bytes>) {
         let _never_asked = (ask, topic, answer);
     }
 
@@ -246,11 +246,11 @@ pub struct LinkState {
 }
 
 /// A request for the local side to execute.
-pub type Execution = bridge_core::Execution<Bytes>;
+pub type Execution = bridge_core::CallExecution<Bytes>;
 
 /// A value of another space on its way to the local side.
 #[derive(Debug, Clone)]
-pub struct Delivery {
+pub struct LocalDelivery {
     /// The value's topic.
     pub topic: TopicId,
     /// The payload in the port's encoding.
@@ -264,7 +264,7 @@ pub struct Delivery {
     /// The DataSetMessage Timestamp, if it identifies this value among the values of the topic.
     pub instance: Option<Timestamp>,
     /// The relation of the value to the other values of its topic.
-    pub kept: Kept,
+    pub kept: ValueRelation,
     /// Whether late subscribers receive it: it is a state, not an event.
     pub lasting: bool,
 }
@@ -420,7 +420,7 @@ pub enum PortEvent {
         /// The call's topic, in a namespace that the program owns.
         topic: TopicId,
         /// The description of the call.
-        offered: Offered,
+        offered: OfferedCall,
     },
     /// Offers a call, as `Offer` does, for a ROS service: requests and responses are ROS messages.
     OfferTyped {

@@ -14,7 +14,7 @@ pub type Present = BTreeMap<String, Option<TypeName>>;
 
 /// A present service or action that is to be executed for other spaces.
 #[derive(Debug)]
-pub(crate) struct Found<'p> {
+pub(crate) struct PresentExecutor<'p> {
     pub(crate) topic: TopicId,
     /// Its name in the graph.
     pub(crate) target: &'p str,
@@ -23,7 +23,7 @@ pub(crate) struct Found<'p> {
     pub(crate) call: Option<&'p Call>,
 }
 
-impl Found<'_> {
+impl PresentExecutor<'_> {
     /// Returns its display name, its description, and whether it is open to other hosts.
     pub(crate) fn said(&self) -> (String, String, bool) {
         let said = |call: &Call| (call.name.clone(), call.about.clone(), call.open);
@@ -54,13 +54,13 @@ pub(crate) fn found<'p>(
     policy: &'p Policy,
     present: &'p Present,
     kind: CallKind,
-) -> impl Iterator<Item = Found<'p>> {
+) -> impl Iterator<Item = PresentExecutor<'p>> {
     let mapping = policy.mapping();
     let calls = mapping.executed_in(policy.own());
     let taken: BTreeSet<TopicId> = calls.flat_map(Call::topics).collect();
     let by_name = present.iter().filter_map(move |(target, type_name)| {
         let topic = named(policy, target).filter(|topic| !taken.contains(topic))?;
-        Some(Found {
+        Some(PresentExecutor {
             topic,
             target,
             type_name: type_name.as_ref()?,
@@ -70,7 +70,7 @@ pub(crate) fn found<'p>(
     let by_mapping = targets(mapping, policy.own(), kind).filter_map(|(call, target)| {
         let there = present.get(&target.name)?;
         let fits = there.as_ref().is_none_or(|is| *is == target.type_name);
-        fits.then_some(Found {
+        fits.then_some(PresentExecutor {
             topic: call.topic,
             target: &target.name,
             type_name: &target.type_name,

@@ -9,7 +9,7 @@ use std::process::ExitCode;
 use std::sync::Arc;
 use std::time::Duration;
 
-use bridge_core::{Application, Local, Owned, Rank, Router, Settings};
+use bridge_core::{Application, Local, Owned, RedundancyRank, Router, RouterSettings};
 use clap::Parser;
 use mappings::{Mapping, SecurityGroup, SpaceId};
 use service::{
@@ -19,7 +19,7 @@ use tokio::signal::unix::SignalKind;
 use tokio::sync::watch;
 use tokio::task::{JoinError, JoinSet};
 use tracing::{Instrument, Span, error, info, info_span};
-use transport::{Carrier, Held};
+use transport::{Carrier, HeldInterfaces};
 use type_files::TypePaths;
 
 use crate::arguments::Arguments;
@@ -29,13 +29,13 @@ use crate::carrier;
 use crate::clock::now;
 use crate::host::ProcessHost;
 use crate::keys::{KeyRing, KeyService};
-use crate::mapping_file::{ConfigurationFile, MappingFile, NodeSetReader, Running};
+use crate::mapping_file::{ConfigurationFile, MappingFile, NodeSetReader, RunningMapping};
 use crate::observer::Observer;
 use crate::port::Port;
 use crate::redundancy;
-use crate::run::{Fixed, Outbox, Shell, Turn};
+use crate::run::{DatagramOutbox, Fixed, Shell, Turn};
 use crate::signals;
-use crate::status::Status;
+use crate::status::StatusSnapshot;
 
 /// The parts of a program, for [`run`].
 pub trait Program: Parser {
@@ -94,7 +94,7 @@ pub trait Program: Parser {
 
     /// Returns the rank of the program among the redundant programs of its spaces; `None` without
     /// redundancy.
-    fn rank(&self) -> Option<Rank> {
+    fn rank(&self) -> Option<RedundancyRank> {
         None
     }
 
@@ -321,12 +321,12 @@ pub(crate) async fn carry<P: Program>(
 /// Prepares the run loop of a space.
 async fn prepare<P: Program>(
     program: &P,
-    (changes, switches): (&watch::Receiver<Running>, &watch::Receiver<u64>),
+    (changes, switches): (&watch::Receiver<RunningMapping>, &watch::Receiver<u64>),
     (own, several): (SpaceId, bool),
-    (requests, host): (Requests<Status>, &ProcessHost),
+    (requests, host): (Requests<StatusSnapshot>, &ProcessHost),
 ) -> Result<Shell<P::Port>, Failure> {
     let arguments = program.arguments();
-    let Running {
+    let RunningMapping {
         mapping,
         types,
         about,
@@ -335,7 +335,7 @@ async fn prepare<P: Program>(
     let hub = host.hub(several);
     let name = (P::NAME, own);
     let (carrier, group) = carrier::open(name, (arguments, &mapping), changes, (several, hub))?;
-    let settings = Settings {
+    let settings = RouterSettings {
         own,
         local: P::LOCAL,
         source: Some(carrier.source().unwrap_or(carrier::NO_SOURCE)),
@@ -372,11 +372,11 @@ async fn prepare<P: Program>(
         library: P::library(),
         own,
         router,
-        held: port.addresses().and_then(Held::start),
+        held: port.addresses().and_then(HeldInterfaces::start),
         port,
         carrier,
         interest: None,
-        outbox: Outbox::default(),
+        outbox: DatagramOutbox::default(),
         owned: P::owned,
         claims: P::CLAIMS,
         requests,
@@ -415,7 +415,7 @@ fn look_around(router: &mut Router, port: &impl Port) {
 /// Returns the Router of a space, which has no keys yet.
 fn router_of<P: Program>(
     program: &P,
-    settings: Settings,
+    settings: RouterSettings,
     mapping: &Arc<Mapping>,
     carrier: &dyn Carrier,
 ) -> Result<Router, Failure> {
@@ -448,7 +448,7 @@ fn log_start<P: Program>(arguments: &Arguments, own: SpaceId, hash: &str) {
 }
 
 /// Sets the instance of a program, and its rank among the redundant bridges of its space.
-fn identify(router: &mut Router, rank: Option<Rank>) -> Result<(), Failure> {
+fn identify(router: &mut Router, rank: Option<RedundancyRank>) -> Result<(), Failure> {
     router.set_instance(instance()?);
     if let Some(rank) = rank {
         router.set_redundancy(rank, now());

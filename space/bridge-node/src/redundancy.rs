@@ -2,7 +2,7 @@
 
 use std::collections::BTreeSet;
 
-use bridge_core::Rank;
+use bridge_core::RedundancyRank;
 use mappings::{Mapping, SpaceId};
 use service::{Failure, FailureKind};
 
@@ -15,7 +15,7 @@ pub struct RedundancyArguments {
     /// Run as one of up to three redundant bridges of the space, of which a single one is active:
     /// 1 for the first host, 2 for the second. All of them have the same mapping and the same group
     #[arg(long, value_name = "1|2|3", env = "UA_RANK", value_parser = rank)]
-    pub rank: Option<Rank>,
+    pub rank: Option<RedundancyRank>,
     /// Carry only these namespaces in both directions, such as 2,5, because other bridges of the
     /// space carry the others
     #[arg(
@@ -52,10 +52,10 @@ impl RedundancyArguments {
 ///
 /// # Errors
 /// The text is no rank.
-pub fn rank(text: &str) -> Result<Rank, String> {
+pub fn rank(text: &str) -> Result<RedundancyRank, String> {
     let number = text.trim().parse().ok();
-    let rank = number.and_then(Rank::new);
-    rank.ok_or_else(|| format!("a rank is 1 to {}", Rank::MOST))
+    let rank = number.and_then(RedundancyRank::new);
+    rank.ok_or_else(|| format!("a rank is 1 to {}", RedundancyRank::MOST))
 }
 
 /// Checks that a redundant bridge can carry the mapping.

@@ -6,18 +6,18 @@ use std::task::{Context, Poll};
 use std::time::Instant;
 
 use bridge_core::{
-    Answered, AskId, CallDescription, Executed, ExecutionId, Handover, Kept, Reason,
+    AskId, CallDescription, CallResponse, Executed, ExecutionId, Handover, Reason, ValueRelation,
 };
 use bytes::Bytes;
 use mappings::{Mapping, SpaceId, TopicId};
 
-use crate::actions::{ActionGraph, Actions};
-use crate::calls::{CallGraph, Calls};
+use crate::actions::{ActionGraph, BridgeActions};
+use crate::calls::{CallGraph, SpaceCalls};
 use crate::clock::now;
-use crate::executing::{Executing, ExecutorGraph};
+use crate::executing::{ExecutedServices, ExecutorGraph};
 use crate::policy::{Policy, is_bad};
-use crate::port::{Delivery, Execution, PortEvent};
-use crate::services::{ServiceCall, ServiceGraph, Services};
+use crate::port::{Execution, LocalDelivery, PortEvent};
+use crate::services::{BridgeServiceCalls, ServiceCall, ServiceGraph};
 
 /// The services and actions of a ROS port in both directions: calls of other spaces that are
 /// offered to the local side, and calls of the local side that are executed for other spaces. `S`
@@ -25,13 +25,13 @@ use crate::services::{ServiceCall, ServiceGraph, Services};
 #[derive(Debug)]
 pub struct RosRequests<S, E> {
     /// Services that are called for values.
-    services: Services,
+    services: BridgeServiceCalls,
     /// Calls of other spaces, offered as services.
-    calls: Calls<S>,
+    calls: SpaceCalls<S>,
     /// Services of the local side, executed for other spaces.
-    executing: Executing<E>,
+    executing: ExecutedServices<E>,
     /// Actions in both directions.
-    actions: Actions,
+    actions: BridgeActions,
 }
 
 impl<S: Send, E: ServiceCall + Sync> RosRequests<S, E> {
@@ -41,12 +41,12 @@ impl<S: Send, E: ServiceCall + Sync> RosRequests<S, E> {
         own: SpaceId,
         mapping: &Mapping,
     ) -> (Self, Vec<PortEvent>) {
-        let (services, bound) = Services::start(graph, own, mapping);
+        let (services, bound) = BridgeServiceCalls::start(graph, own, mapping);
         let requests = Self {
             services,
-            calls: Calls::default(),
-            executing: Executing::default(),
-            actions: Actions::default(),
+            calls: SpaceCalls::default(),
+            executing: ExecutedServices::default(),
+            actions: BridgeActions::default(),
         };
         (requests, bound)
     }
@@ -80,7 +80,7 @@ impl<S: Send, E: ServiceCall + Sync> RosRequests<S, E> {
     pub fn publish(
         &mut self,
         policy: &Policy,
-        sample: &Delivery,
+        sample: &LocalDelivery,
         events: &mut VecDeque<PortEvent>,
     ) -> Option<Result<(), &'static str>> {
         let topic = sample.topic;
@@ -91,7 +91,7 @@ impl<S: Send, E: ServiceCall + Sync> RosRequests<S, E> {
             return None;
         }
         // A repeated value is for late joiners, and a service is not a late joiner.
-        if sample.kept == Kept::Again {
+        if sample.kept == ValueRelation::Again {
             return Some(Ok(()));
         }
         if is_bad(sample.status) {
@@ -142,7 +142,7 @@ impl<S: Send, E: ServiceCall + Sync> RosRequests<S, E> {
     }
 
     /// Answers a request of the local side.
-    pub fn answered(&mut self, ask: AskId, answer: Answered<Bytes>) {
+    pub fn answered(&mut self, ask: AskId, answer: CallResponse<Bytes>) {
         self.calls.answered(ask, answer);
     }
 
@@ -220,28 +220,28 @@ impl<S: Send, E: ServiceCall + Sync> RosRequests<S, E> {
 
     /// Returns the calls of other spaces.
     #[must_use]
-    pub const fn calls(&self) -> &Calls<S> {
+    pub const fn calls(&self) -> &SpaceCalls<S> {
         &self.calls
     }
 
     /// Returns the calls of other spaces, to offer them as services.
-    pub const fn calls_mut(&mut self) -> &mut Calls<S> {
+    pub const fn calls_mut(&mut self) -> &mut SpaceCalls<S> {
         &mut self.calls
     }
 
     /// Returns the services of the local side, to compare them with the graph.
-    pub const fn executing_mut(&mut self) -> &mut Executing<E> {
+    pub const fn executing_mut(&mut self) -> &mut ExecutedServices<E> {
         &mut self.executing
     }
 
     /// Returns the actions of both directions.
     #[must_use]
-    pub const fn actions(&self) -> &Actions {
+    pub const fn actions(&self) -> &BridgeActions {
         &self.actions
     }
 
     /// Returns the actions of both directions, to compare them with the graph.
-    pub const fn actions_mut(&mut self) -> &mut Actions {
+    pub const fn actions_mut(&mut self) -> &mut BridgeActions {
         &mut self.actions
     }
 }

@@ -17,14 +17,16 @@ use std::sync::Arc;
 use std::task::Poll;
 use std::time::{Duration, Instant};
 
-use bridge_core::{Handover, Heard, Interest, Notice, Output, Owned, Reason, Router};
+use bridge_core::{DropNotice, Handover, Interest, LocalMessage, Output, Owned, Reason, Router};
 use bytes::Bytes;
 use mappings::{Mapping, SpaceId, TopicId};
-use service::{Failure, FailureKind, Requests, Told as _};
+use service::{Failure, FailureKind, PageState as _, Requests};
 use tokio::sync::watch;
 use tokio::time::{Instant as TokioInstant, Sleep};
 use tracing::{debug, info, warn};
-use transport::{BUFFER, Carrier, Finding, Held, Outgoing, Received, SendError};
+use transport::{
+    BUFFER, Carrier, HeldInterfaces, InterfaceFinding, OutgoingMessage, Received, SendError,
+};
 use uadp::Timestamp;
 
 use crate::awaited::PeerWatch;
@@ -32,15 +34,15 @@ use crate::busy_poll::BusyPoll;
 use crate::carrier::NO_SOURCE;
 use crate::clock::{now, timestamp};
 use crate::keys::{self, KeyRing, NewKeys};
-use crate::mapping_file::Running;
+use crate::mapping_file::RunningMapping;
 use crate::observer::Observer;
 use crate::policy::NO_SUBSCRIBER;
-use crate::port::{Delivery, Port, PortEvent};
-use crate::status::{Interfaces, Readiness, RedundancyStatus, Status};
+use crate::port::{LocalDelivery, Port, PortEvent};
+use crate::status::{Interfaces, Readiness, RedundancyStatus, StatusSnapshot};
 use crate::tap::Taps;
 
 pub(crate) use fixed::Fixed;
-pub(crate) use outbox::Outbox;
+pub(crate) use outbox::DatagramOutbox;
 use outbox::Parcel;
 pub(crate) use turn::Turn;
 
@@ -58,17 +60,17 @@ pub(crate) struct Shell<P> {
     /// The messages that the carrier does not drop; `None` for all of them.
     pub(crate) interest: Option<Interest>,
     /// The datagrams to send together.
-    pub(crate) outbox: Outbox,
+    pub(crate) outbox: DatagramOutbox,
     /// The network interfaces that the port cannot change while it runs.
-    pub(crate) held: Option<Held>,
+    pub(crate) held: Option<HeldInterfaces>,
     /// Returns the namespaces that only this program writes, by the mapping.
     pub(crate) owned: fn(&Mapping) -> Owned,
     /// Whether it listens for other writers in these namespaces before it sends.
     pub(crate) claims: bool,
-    pub(crate) requests: Requests<Status>,
+    pub(crate) requests: Requests<StatusSnapshot>,
     /// The tapped topics.
     pub(crate) taps: Arc<Taps>,
-    pub(crate) changes: watch::Receiver<Running>,
+    pub(crate) changes: watch::Receiver<RunningMapping>,
     /// The requests of the operator to hand over to a standby.
     pub(crate) switches: watch::Receiver<u64>,
     pub(crate) keys: KeyRing,
@@ -260,7 +262,7 @@ impl<P: Port> Shell<P> {
         Ok(more)
     }
 
-    fn status(&self) -> Status {
+    fn status(&self) -> StatusSnapshot {
         let about = Arc::clone(&self.changes.borrow().about);
         let interfaces = Interfaces {
             pubsub: u8::from(self.carrier.lost().is_none()),
@@ -269,8 +271,12 @@ impl<P: Port> Shell<P> {
                 .as_ref()
                 .map(|held| u8::from(held.lost().is_none())),
         };
-        let side_lost = self.held.as_ref().and_then(Held::lost).map(side_lost);
-        Status::of(
+        let side_lost = self
+            .held
+            .as_ref()
+            .and_then(HeldInterfaces::lost)
+            .map(side_lost);
+        StatusSnapshot::of(
             (self.program, self.own),
             &self.router,
             (&about, &self.restart),
@@ -308,19 +314,19 @@ impl<P: Port> Shell<P> {
     /// Checks the network interfaces of the local side; fails if the local side cannot follow a
     /// change.
     fn look_at_held(&mut self) -> Result<(), Failure> {
-        let findings = self.held.as_mut().map(Held::look);
+        let findings = self.held.as_mut().map(HeldInterfaces::look);
         for finding in findings.into_iter().flatten() {
             let told = match finding {
-                Finding::Lost(why) => side_lost(why),
-                Finding::Late(interface) => format!(
+                InterfaceFinding::Lost(why) => side_lost(why),
+                InterfaceFinding::Late(interface) => format!(
                     "the network interface {interface} appeared after the start: the ROS side does not use \
                      it until this program is restarted"
                 ),
-                Finding::Back(interface) => {
+                InterfaceFinding::Back(interface) => {
                     info!(%interface, "the network interface of the ROS side is up again");
                     continue;
                 }
-                Finding::Void(why) => {
+                InterfaceFinding::Void(why) => {
                     let message = format!(
                         "{why}, and the ROS side cannot switch to it: stopping; the service manager should \
                          restart this program"
@@ -335,7 +341,7 @@ impl<P: Port> Shell<P> {
 
     /// Adopts the mapping if it has changed.
     fn reload(&mut self) {
-        let Running { mapping, types, .. } = self.changes.borrow_and_update().clone();
+        let RunningMapping { mapping, types, .. } = self.changes.borrow_and_update().clone();
         if Arc::ptr_eq(&mapping, &self.fixed.taken) {
             return;
         }
@@ -399,7 +405,7 @@ impl<P: Port> Shell<P> {
                 received,
                 latched_by,
             } => {
-                let heard = Heard {
+                let heard = LocalMessage {
                     topic,
                     payload: &payload,
                     received,
@@ -417,7 +423,7 @@ impl<P: Port> Shell<P> {
                 taken,
                 status,
             } => {
-                let heard = Heard {
+                let heard = LocalMessage {
                     topic,
                     payload: &payload,
                     received: taken,
@@ -500,7 +506,7 @@ impl<P: Port> Shell<P> {
                     self.post(parcel);
                 }
                 Output::Discovery { bytes } => {
-                    match self.send(&Outgoing::new(&bytes)) {
+                    match self.send(&OutgoingMessage::new(&bytes)) {
                         // The network does not return own datagrams.
                         Ok(()) => {
                             let from = self.carrier.source().unwrap_or(NO_SOURCE);
@@ -588,13 +594,13 @@ impl<P: Port> Shell<P> {
             let Some(probe) = observer.probe() else {
                 return;
             };
-            if let Err(error) = self.send(&Outgoing::new(&probe)) {
+            if let Err(error) = self.send(&OutgoingMessage::new(&probe)) {
                 debug!(%error, "cannot send a probe");
             }
         }
     }
 
-    fn send(&mut self, message: &Outgoing<'_>) -> Result<(), SendError> {
+    fn send(&mut self, message: &OutgoingMessage<'_>) -> Result<(), SendError> {
         if self.dry_run {
             return Ok(());
         }
@@ -625,7 +631,7 @@ impl<P: Port> Shell<P> {
             self.router.recycle(payload);
             return;
         }
-        let sample = Delivery {
+        let sample = LocalDelivery {
             topic,
             payload: Bytes::from(payload),
             source,
@@ -676,8 +682,8 @@ fn not_sent(error: SendError) -> Reason {
     }
 }
 
-fn tell(notice: &Notice, name: Option<&str>) {
-    let Notice {
+fn tell(notice: &DropNotice, name: Option<&str>) {
+    let DropNotice {
         topic,
         from,
         reason,

@@ -15,15 +15,17 @@ use std::time::Duration;
 use bridge_core::Handover;
 use bytes::Bytes;
 use mappings::{Mapping, Overflow, ServiceRole, SpaceId, TopicId, Trigger, Variable};
-use messages::{Literal, MessageType, NoFields, Plan, Selection, ServiceType, TypeName, Wire};
+use messages::{
+    Literal, MessagePlan, MessageType, NoFields, Selection, ServiceType, TypeName, Wire,
+};
 use tokio::sync::mpsc;
 use tokio::task::{AbortHandle, JoinSet};
 use tracing::warn;
 use uadp::{BuiltinType, Timestamp};
 
-pub use self::caller::{CallFault, Outcome, Ran, ServiceCall};
+pub use self::caller::{CallFault, MayHaveRun, ServiceCall, ServiceOutcome};
 
-use self::caller::{Caller, Source};
+use self::caller::{CallCause, ServiceCallTask};
 use self::pending::Pending;
 use crate::{GraphError, PortEvent};
 
@@ -66,14 +68,14 @@ pub trait ServiceGraph {
 
 /// The service calls of a bridge.
 #[derive(Debug)]
-pub struct Services {
+pub struct BridgeServiceCalls {
     callers: HashMap<TopicId, Callee>,
     /// The values that are made of the responses.
-    takers: HashMap<Source, Vec<TopicId>>,
+    takers: HashMap<CallCause, Vec<TopicId>>,
     /// Sources with an answering service: for a poll, the last call was answered.
-    answering: HashSet<Source>,
-    outcomes: mpsc::Receiver<Outcome>,
-    report: mpsc::Sender<Outcome>,
+    answering: HashSet<CallCause>,
+    outcomes: mpsc::Receiver<ServiceOutcome>,
+    report: mpsc::Sender<ServiceOutcome>,
     polls: Vec<Polled>,
     /// The number of the next poll.
     next_poll: usize,
@@ -133,7 +135,7 @@ impl Polled {
     }
 }
 
-impl Services {
+impl BridgeServiceCalls {
     /// Starts the service calls of the mapping. Reports the types of the values. A binding that
     /// cannot be served is logged.
     pub fn start(
@@ -260,8 +262,8 @@ impl Services {
                 if let Some(callee) = self.callers.remove(&topic) {
                     callee.task.abort();
                 }
-                self.takers.remove(&Source::Value(topic));
-                self.answering.remove(&Source::Value(topic));
+                self.takers.remove(&CallCause::Value(topic));
+                self.answering.remove(&CallCause::Value(topic));
             }
             ServiceRole::Answer { .. } | ServiceRole::Poll { .. } => {
                 self.takers.retain(|_, takers| {
@@ -271,10 +273,10 @@ impl Services {
                 let takers = &self.takers;
                 for poll in self
                     .polls
-                    .extract_if(.., |poll| !takers.contains_key(&Source::Poll(poll.of)))
+                    .extract_if(.., |poll| !takers.contains_key(&CallCause::Poll(poll.of)))
                 {
                     poll.task.abort();
-                    self.answering.remove(&Source::Poll(poll.of));
+                    self.answering.remove(&CallCause::Poll(poll.of));
                 }
             }
         }
@@ -333,7 +335,7 @@ impl Services {
             service_type: Arc::clone(&service_type),
             timeout: *timeout,
         };
-        let of = Source::Value(variable.topic);
+        let of = CallCause::Value(variable.topic);
         let caller = self.caller(graph, &target, of)?;
         let pending = Arc::new(Pending::new(variable.overflow));
         let insist = variable.overflow == Overflow::KeepLatest;
@@ -362,7 +364,7 @@ impl Services {
             return Err(GraphError::CallsNothing { of });
         };
         let service_type = graph.service_type(service_type)?;
-        let takers = self.takers.entry(Source::Value(of)).or_default();
+        let takers = self.takers.entry(CallCause::Value(of)).or_default();
         takers.push(variable.topic);
         Ok(bound(variable.topic, &service_type, selection))
     }
@@ -387,7 +389,7 @@ impl Services {
         let service_type = graph.service_type(name)?;
         let known = self.polls.iter().find(|known| known.serves(role));
         let number = known.map_or(self.next_poll, |known| known.of);
-        let of = Source::Poll(number);
+        let of = CallCause::Poll(number);
         if known.is_none() {
             let request = constant::<G>(service_type.request(), request)?;
             let target = Target {
@@ -412,10 +414,10 @@ impl Services {
         &self,
         graph: &mut G,
         target: &Target<'_>,
-        of: Source,
-    ) -> Result<Caller<G::Client>, GraphError> {
+        of: CallCause,
+    ) -> Result<ServiceCallTask<G::Client>, GraphError> {
         let client = graph.client(target.service, &target.service_type, target.timeout)?;
-        Ok(Caller::new(client, of, self.report.clone()))
+        Ok(ServiceCallTask::new(client, of, self.report.clone()))
     }
 
     /// Returns whether the values of a topic are for a service.
@@ -448,7 +450,7 @@ impl Services {
     }
 
     /// Returns the outcome of the next call. Cancel-safe.
-    pub async fn recv(&mut self) -> Outcome {
+    pub async fn recv(&mut self) -> ServiceOutcome {
         match self.outcomes.recv().await {
             Some(outcome) => outcome,
             // Never `None`, because `self` holds a sender.
@@ -457,7 +459,7 @@ impl Services {
     }
 
     /// Polls for the outcome of [`recv`](Self::recv), for ports that poll.
-    pub fn poll_recv(&mut self, cx: &mut Context<'_>) -> Poll<Outcome> {
+    pub fn poll_recv(&mut self, cx: &mut Context<'_>) -> Poll<ServiceOutcome> {
         match self.outcomes.poll_recv(cx) {
             Poll::Ready(Some(outcome)) => Poll::Ready(outcome),
             // Never `None`, because `self` holds a sender.
@@ -467,8 +469,8 @@ impl Services {
 
     /// Returns the events that the outcome of a call causes for the values made of it.
     #[must_use]
-    pub fn ended(&mut self, outcome: Outcome, received: Timestamp) -> Vec<PortEvent> {
-        let Outcome { of, result } = outcome;
+    pub fn ended(&mut self, outcome: ServiceOutcome, received: Timestamp) -> Vec<PortEvent> {
+        let ServiceOutcome { of, result } = outcome;
         let takers = self.takers.get(&of).map_or(&[][..], Vec::as_slice);
         let mut events = Vec::new();
         let mut live = |live: bool| {
@@ -496,8 +498,8 @@ impl Services {
                 };
                 match of {
                     // The last response of the service stays valid.
-                    Source::Value(topic) => events.push(failed(&topic)),
-                    Source::Poll(_) => {
+                    CallCause::Value(topic) => events.push(failed(&topic)),
+                    CallCause::Poll(_) => {
                         if self.answering.remove(&of) {
                             live(false);
                         }
@@ -564,7 +566,7 @@ fn constant<G: ServiceGraph>(
     message_type: &Arc<MessageType>,
     template: &Selection,
 ) -> Result<Bytes, GraphError> {
-    let plan = Plan::compile(message_type, template, G::WIRE)?;
+    let plan = MessagePlan::compile(message_type, template, G::WIRE)?;
     let mut bytes = Vec::new();
     plan.write(&mut NoFields, &mut bytes)?;
     Ok(bytes.into())

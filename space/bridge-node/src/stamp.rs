@@ -32,12 +32,12 @@ const STAMP: &str = "header.stamp";
 #[cfg(test)]
 mod tests {
     use super::*;
-    use messages::{Dialect, Registry};
+    use messages::{Dialect, TypeRegistry};
 
     #[test]
     fn a_stamp_is_wanted_where_only_a_part_without_it_is_given() {
         let name = "geometry_msgs/TwistStamped".parse().unwrap();
-        let stamped = Registry::bundle(Dialect::Ros2).get(&name).unwrap();
+        let stamped = TypeRegistry::bundle(Dialect::Ros2).get(&name).unwrap();
         let field = |path: &str| wants_stamp(&stamped, Some(&Selection::Field(path.to_owned())));
         assert!(field("twist") && field("twist.linear.x") && field("header.frame_id"));
         let converted = Selection::Value {
@@ -49,7 +49,7 @@ mod tests {
         assert!(!field("header.stamp") && !field("header"));
         assert!(!wants_stamp(&stamped, Some(&Selection::Whole)) && !wants_stamp(&stamped, None));
         let name = "geometry_msgs/Twist".parse().unwrap();
-        let plain = Registry::bundle(Dialect::Ros2).get(&name).unwrap();
+        let plain = TypeRegistry::bundle(Dialect::Ros2).get(&name).unwrap();
         assert!(!wants_stamp(
             &plain,
             Some(&Selection::Field("linear".to_owned()))

@@ -10,7 +10,7 @@ use std::time::Duration;
 use bridge_core::{CallCounters, Counters, Delays, Hop, Reason, Router};
 use mappings::{SpaceId, Variable};
 use serde::Serialize;
-use service::Told;
+use service::PageState;
 use uadp::Timestamp;
 
 use self::carriers::CarrierStatus;
@@ -20,7 +20,7 @@ use crate::port::LinkState;
 
 /// A snapshot of a program's counters and delays.
 #[derive(Debug, Clone, Serialize)]
-pub(crate) struct Status {
+pub(crate) struct StatusSnapshot {
     program: &'static str,
     /// The version, with the commit of a packaged build.
     version: &'static str,
@@ -172,7 +172,7 @@ struct HopStatus {
     max_us: f64,
 }
 
-impl Status {
+impl StatusSnapshot {
     pub(crate) fn of(
         (program, space): (&'static str, SpaceId),
         router: &Router,
@@ -328,7 +328,7 @@ fn applications(router: &Router) -> Vec<ApplicationStatus> {
     shown.collect()
 }
 
-impl Told for Status {
+impl PageState for StatusSnapshot {
     fn not_ready(&self) -> Vec<String> {
         let (program, space) = (self.program, self.space);
         let reasons = self.readiness.not_ready.iter();

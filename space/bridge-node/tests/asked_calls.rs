@@ -14,18 +14,18 @@ use std::time::{Duration, Instant};
 use bridge_node::policy::Policy;
 use bridge_node::{
     AskError, AskErrorKind, AskId, Asker, CallDescription, CallFault, CallField, CallGraph,
-    CallRole, Calls, GraphError, PortEvent, ServiceCall, ServiceGraph, now,
+    CallRole, GraphError, PortEvent, ServiceCall, ServiceGraph, SpaceCalls, now,
 };
 use bytes::Bytes;
 use mappings::{SpaceId, TopicId};
-use messages::{Dialect, MessageType, Registry, ServiceType, TypeName, Wire};
+use messages::{Dialect, MessageType, ServiceType, TypeName, TypeRegistry, Wire};
 use uadp::{BuiltinType, StatusCode};
 
 type Offered = Arc<Mutex<BTreeMap<String, Asker>>>;
 
 /// A graph with services that the test calls.
 struct Fake {
-    registry: Registry,
+    registry: TypeRegistry,
     offered: Offered,
 }
 
@@ -87,18 +87,18 @@ impl CallGraph for Fake {
 struct Bench {
     graph: Fake,
     policy: Policy,
-    calls: Calls<Server>,
+    calls: SpaceCalls<Server>,
 }
 
 impl Bench {
     fn new() -> Self {
         Self {
             graph: Fake {
-                registry: Registry::bundle(Dialect::Ros2),
+                registry: TypeRegistry::bundle(Dialect::Ros2),
                 offered: Offered::default(),
             },
             policy: Policy::new(SpaceId::ROS1, Arc::default()),
-            calls: Calls::default(),
+            calls: SpaceCalls::default(),
         }
     }
 

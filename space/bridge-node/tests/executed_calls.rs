@@ -8,12 +8,12 @@ use std::time::{Duration, Instant};
 
 use bridge_node::policy::Policy;
 use bridge_node::{
-    CallFault, Executed, Executing, Execution, ExecutionId, ExecutorGraph, GraphError, PortEvent,
-    Present, Ran, Refusal, ServiceCall, ServiceGraph, now,
+    CallFault, Executed, ExecutedServices, Execution, ExecutionId, ExecutorGraph, GraphError,
+    MayHaveRun, PortEvent, Present, Refusal, ServiceCall, ServiceGraph, now,
 };
 use bytes::Bytes;
 use mappings::{Call, CallKind, CallTarget, ExecutedBy, Mapping, NodeIdText, SpaceId, TopicId};
-use messages::{Dialect, MessageType, Registry, ServiceType, TypeName, Wire};
+use messages::{Dialect, MessageType, ServiceType, TypeName, TypeRegistry, Wire};
 use tokio::sync::Semaphore;
 use uadp::BuiltinType;
 
@@ -22,7 +22,7 @@ type Answers = Arc<Mutex<VecDeque<Result<Bytes, CallFault>>>>;
 
 /// A graph whose services respond once the test permits it.
 struct Fake {
-    registry: Registry,
+    registry: TypeRegistry,
     may: Arc<Semaphore>,
     answers: Answers,
 }
@@ -76,14 +76,14 @@ impl ExecutorGraph for Fake {
 struct Bench {
     graph: Fake,
     policy: Policy,
-    executing: Executing<Client>,
+    executing: ExecutedServices<Client>,
 }
 
 impl Bench {
     fn new(calls: Vec<Call>) -> Self {
         Self {
             graph: Fake {
-                registry: Registry::bundle(Dialect::Ros2),
+                registry: TypeRegistry::bundle(Dialect::Ros2),
                 may: Arc::new(Semaphore::new(0)),
                 answers: Answers::default(),
             },
@@ -91,7 +91,7 @@ impl Bench {
                 SpaceId::ROS1,
                 Arc::new(Mapping::default().with_calls(calls)),
             ),
-            executing: Executing::default(),
+            executing: ExecutedServices::default(),
         }
     }
 
@@ -227,7 +227,7 @@ async fn one_request_more_than_a_service_may_have_at_a_time_is_refused_and_there
 async fn what_came_of_an_execution_says_whether_the_service_ran() {
     let mut bench = Bench::new(Vec::new());
     bench.look(&[("/ua_1_2_61", SET_BOOL)]);
-    let outcomes = [Ran::No, Ran::Perhaps, Ran::Yes];
+    let outcomes = [MayHaveRun::No, MayHaveRun::Perhaps, MayHaveRun::Yes];
     for (id, ran) in (0..).zip(outcomes) {
         let text = "the valve is stuck".to_owned();
         let fault = CallFault {
@@ -250,9 +250,9 @@ async fn what_came_of_an_execution_says_whether_the_service_ran() {
         };
         assert!(detail.contains("stuck"), "{detail}");
         let fits = match ran {
-            Ran::No => matches!(outcome, Executed::Refused(Refusal::NotExecutable)),
-            Ran::Perhaps => matches!(outcome, Executed::Lost),
-            Ran::Yes => matches!(outcome, Executed::Failed(_)),
+            MayHaveRun::No => matches!(outcome, Executed::Refused(Refusal::NotExecutable)),
+            MayHaveRun::Perhaps => matches!(outcome, Executed::Lost),
+            MayHaveRun::Yes => matches!(outcome, Executed::Failed(_)),
         };
         assert!(fits, "{ran:?}: {outcome:?}");
         bench.look(&[("/ua_1_2_61", SET_BOOL)]);

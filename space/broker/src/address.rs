@@ -2,7 +2,7 @@
 
 use mappings::TopicId;
 use uadp::action::{ActionDialect, ActionKind};
-use uadp::discovery::{Announced, Announcement, ConnectionState, CyclicStatus};
+use uadp::discovery::{AnnouncedContent, Announcement, ConnectionState, CyclicStatus};
 use uadp::{NetworkMessage, NetworkMessageType, PublisherId};
 
 use crate::topics::{Address, TopicMessageType};
@@ -92,15 +92,15 @@ pub(crate) fn status(
         return None;
     }
     match Announcement::decode(message).ok()?.announced {
-        Announced::ApplicationStatus { state, cyclic } => Some((state, cyclic)),
-        Announced::PublisherEndpoints { .. }
-        | Announced::DataSetMetaData { .. }
-        | Announced::DataSetWriterConfiguration { .. }
-        | Announced::PubSubConnections(_)
-        | Announced::PubSubConnection { .. }
-        | Announced::ApplicationDescription { .. }
-        | Announced::ActionResponder(_)
-        | Announced::ActionMetaData(_) => None,
+        AnnouncedContent::ApplicationStatus { state, cyclic } => Some((state, cyclic)),
+        AnnouncedContent::PublisherEndpoints { .. }
+        | AnnouncedContent::DataSetMetaData { .. }
+        | AnnouncedContent::DataSetWriterConfiguration { .. }
+        | AnnouncedContent::PubSubConnections(_)
+        | AnnouncedContent::PubSubConnection { .. }
+        | AnnouncedContent::ApplicationDescription { .. }
+        | AnnouncedContent::ActionResponder(_)
+        | AnnouncedContent::ActionMetaData(_) => None,
     }
 }
 
@@ -162,7 +162,7 @@ fn announcement(message: &NetworkMessage<'_>, publisher: u16) -> Addressed {
         })
     };
     match announcement.announced {
-        Announced::DataSetMetaData {
+        AnnouncedContent::DataSetMetaData {
             meta_data, status, ..
         } => match status.0 & BAD {
             0 => of_topic(TopicMessageType::MetaData, meta_data.name).unwrap_or(hidden),
@@ -171,17 +171,17 @@ fn announcement(message: &NetworkMessage<'_>, publisher: u16) -> Addressed {
                 ..hidden
             },
         },
-        Announced::ActionMetaData(action) => {
+        AnnouncedContent::ActionMetaData(action) => {
             of_topic(TopicMessageType::ActionMetaData, action.request.name).unwrap_or(hidden)
         }
-        Announced::ApplicationDescription { .. } => plain(TopicMessageType::Application),
-        Announced::PublisherEndpoints { .. } => plain(TopicMessageType::Endpoints),
-        Announced::ApplicationStatus { .. } => plain(TopicMessageType::Status),
-        Announced::PubSubConnections(_) | Announced::PubSubConnection { .. } => {
+        AnnouncedContent::ApplicationDescription { .. } => plain(TopicMessageType::Application),
+        AnnouncedContent::PublisherEndpoints { .. } => plain(TopicMessageType::Endpoints),
+        AnnouncedContent::ApplicationStatus { .. } => plain(TopicMessageType::Status),
+        AnnouncedContent::PubSubConnections(_) | AnnouncedContent::PubSubConnection { .. } => {
             plain(TopicMessageType::Connection)
         }
-        Announced::ActionResponder(_) => plain(TopicMessageType::ActionResponder),
-        Announced::DataSetWriterConfiguration { .. } => hidden,
+        AnnouncedContent::ActionResponder(_) => plain(TopicMessageType::ActionResponder),
+        AnnouncedContent::DataSetWriterConfiguration { .. } => hidden,
     }
 }
 
@@ -248,7 +248,7 @@ mod tests {
         ] {
             let announcement = Announcement {
                 sequence_number: 1,
-                announced: Announced::DataSetMetaData {
+                announced: AnnouncedContent::DataSetMetaData {
                     writer_id: 10,
                     meta_data: DataSetMetaDataType {
                         name: Some("ua_1_2_10 battery"),

@@ -11,7 +11,7 @@ use std::time::{Duration, SystemTime, UNIX_EPOCH};
 use mappings::{Broker, MqttVersion, TopicId};
 use tokio::sync::mpsc;
 use tokio::time::{Sleep, sleep};
-use transport::{Carrier, CarrierChange, Outgoing, Received, SendError, Senders};
+use transport::{Carrier, CarrierChange, OutgoingMessage, Received, SendError, Senders};
 use uadp::discovery::ConnectionState;
 use uadp::{NetworkMessage, Timestamp};
 
@@ -22,8 +22,8 @@ use crate::json::Json;
 use crate::packets::ReceivedPublish;
 use crate::producers::Producers;
 use crate::queue::QueuedPublish;
-use crate::reports::Reports;
-use crate::settings::{BrokerSettings, Identity, OpenError};
+use crate::reports::BrokerReports;
+use crate::settings::{BrokerIdentity, BrokerSettings, OpenError};
 use crate::topics::{self, Address, JSON, TopicMessageType, UADP};
 
 /// A connection with an MQTT broker that carries the NetworkMessages of a program.
@@ -35,7 +35,7 @@ pub struct Mqtt {
     ready: VecDeque<(Vec<u8>, SocketAddr)>,
     producers: Producers,
     echo: Echo,
-    reports: Reports,
+    reports: BrokerReports,
     json: Json,
     /// Numbers of dropped messages by reason.
     dropped: BTreeMap<&'static str, u64>,
@@ -61,10 +61,10 @@ impl Mqtt {
     ///
     /// # Errors
     /// An [`OpenError`] if a file with certificates or the log-in cannot be used.
-    pub fn open(broker: &Broker, identity: &Identity) -> Result<Self, OpenError> {
+    pub fn open(broker: &Broker, identity: &BrokerIdentity) -> Result<Self, OpenError> {
         let settings = Arc::new(BrokerSettings::read(broker, identity)?);
         let shared = Arc::new(ConnectionShared::default());
-        let reports = Reports::new(settings.will.is_some());
+        let reports = BrokerReports::new(settings.will.is_some());
         let (out, received) = mpsc::channel(MAX_RECEIVED);
         // The task ends when the carrier is closed or dropped.
         drop(tokio::spawn(run(
@@ -448,7 +448,7 @@ impl Mqtt {
 }
 
 impl Carrier for Mqtt {
-    fn try_send(&mut self, message: &Outgoing<'_>) -> Result<(), SendError> {
+    fn try_send(&mut self, message: &OutgoingMessage<'_>) -> Result<(), SendError> {
         let network = NetworkMessage::decode(message.bytes).map_err(|_| SendError::Refused)?;
         let Addressed { address, withdrawn } =
             address::of(&network, self.settings.publisher).ok_or(SendError::Refused)?;

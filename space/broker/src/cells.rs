@@ -13,7 +13,7 @@ use crate::carrier::utc;
 use crate::connection::{BrokerLink, ConnectionShared, run};
 use crate::packets::ReceivedPublish;
 use crate::producers::time_left;
-use crate::settings::{BrokerSettings, Identity, OpenError};
+use crate::settings::{BrokerIdentity, BrokerSettings, OpenError};
 use crate::topics::{self, TopicFilter};
 
 /// Receives the status of each publisher of several cells.
@@ -45,7 +45,7 @@ impl CellWatch {
     /// # Errors
     /// An [`OpenError`] if a file with certificates or the log-in cannot be used.
     pub fn open(broker: &Broker, prefixes: &str) -> Result<Self, OpenError> {
-        let identity = Identity {
+        let identity = BrokerIdentity {
             program: "ua-space".to_owned(),
             publisher: None,
         };
@@ -120,14 +120,14 @@ const MAX_RECEIVED: usize = 4096;
 
 #[cfg(test)]
 mod tests {
-    use crate::reports::Reports;
+    use crate::reports::BrokerReports;
 
     use super::*;
 
     fn message(topic: &str) -> ReceivedPublish {
         ReceivedPublish {
             topic: topic.to_owned(),
-            payload: Reports::default().failed(1).unwrap(),
+            payload: BrokerReports::default().failed(1).unwrap(),
             retained: true,
         }
     }

@@ -37,4 +37,4 @@ pub use carrier::Mqtt;
 pub use cells::{CellStatus, CellWatch};
 pub use connection::STALL;
 pub use scope::{MessageRole, MessageScope, scope};
-pub use settings::{Identity, OpenError};
+pub use settings::{BrokerIdentity, OpenError};

@@ -4,8 +4,8 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::time::{Duration, Instant};
 
 use uadp::discovery::{
-    Announced, Announcement, ConnectionState, CyclicStatus, DataSetWriterDataType, List,
-    PubSubConnectionDataType, PubSubGroupDataType, WriterGroupDataType,
+    AnnouncedContent, Announcement, ConnectionState, CyclicStatus, DataSetWriterDataType,
+    PubSubConnectionDataType, PubSubGroupDataType, WireArray, WriterGroupDataType,
 };
 use uadp::{DateTime, PublisherId, Scalar, SecurityHeader, Timestamp, Variant};
 
@@ -13,7 +13,7 @@ use crate::topics::Address;
 
 /// The own status, and topics to clear.
 #[derive(Debug, Default)]
-pub(crate) struct Reports {
+pub(crate) struct BrokerReports {
     next_status: Option<Instant>,
     /// Whether the broker reports the end of the program, so that the status is not cyclic.
     has_will: bool,
@@ -27,7 +27,7 @@ pub(crate) struct Reports {
     connection_due: Option<Instant>,
 }
 
-impl Reports {
+impl BrokerReports {
     pub(crate) fn new(has_will: bool) -> Self {
         Self {
             has_will,
@@ -116,7 +116,7 @@ impl Reports {
                     ..PubSubGroupDataType::default()
                 },
                 writer_group_id: *id,
-                data_set_writers: List::new(writers),
+                data_set_writers: WireArray::new(writers),
                 ..WriterGroupDataType::default()
             })
             .collect();
@@ -126,13 +126,13 @@ impl Reports {
             enabled: true,
             publisher_id: Variant::Scalar(Scalar::UInt16(publisher)),
             transport_profile_uri: Some(PROFILE),
-            writer_groups: List::new(&groups),
+            writer_groups: WireArray::new(&groups),
             ..PubSubConnectionDataType::default()
         }];
         self.sequence = self.sequence.wrapping_add(1);
         let announcement = Announcement {
             sequence_number: self.sequence,
-            announced: Announced::PubSubConnections(List::new(&connections)),
+            announced: AnnouncedContent::PubSubConnections(WireArray::new(&connections)),
         };
         let mut bytes = Vec::new();
         announcement
@@ -159,7 +159,7 @@ impl Reports {
         self.sequence = self.sequence.wrapping_add(1);
         let announcement = Announcement {
             sequence_number: self.sequence,
-            announced: Announced::ApplicationStatus { state, cyclic },
+            announced: AnnouncedContent::ApplicationStatus { state, cyclic },
         };
         let mut bytes = Vec::new();
         let publisher = PublisherId::UInt16(publisher);
@@ -215,7 +215,7 @@ mod tests {
     fn a_program_with_a_will_has_no_cyclic_status() {
         let (now, utc) = (Instant::now(), Timestamp::from_unix_nanos(0));
         for has_will in [false, true] {
-            let mut reports = Reports::new(has_will);
+            let mut reports = BrokerReports::new(has_will);
             let bytes = reports.status(1, (now, utc)).unwrap();
             let status = NetworkMessage::decode(&bytes).unwrap();
             let (state, cyclic) = crate::address::status(&status).unwrap();
@@ -230,7 +230,7 @@ mod tests {
     #[test]
     #[expect(clippy::disallowed_methods, reason = "some instant to count from")]
     fn the_connection_names_groups_and_writers_by_their_decimal_ids() {
-        let mut reports = Reports::default();
+        let mut reports = BrokerReports::default();
         let now = Instant::now();
         assert_eq!(reports.connection(1, now), None);
         for writer in [11, 10, 11] {
@@ -245,7 +245,7 @@ mod tests {
         assert_eq!(reports.connection(1, now), None);
         let bytes = reports.connection(1, now + SETTLE).unwrap();
         let message = NetworkMessage::decode(&bytes).unwrap();
-        let Announced::PubSubConnections(connections) =
+        let AnnouncedContent::PubSubConnections(connections) =
             Announcement::decode(&message).unwrap().announced
         else {
             panic!("another announcement");

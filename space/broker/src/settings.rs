@@ -12,12 +12,12 @@ use rustls::pki_types::pem::PemObject;
 use rustls::pki_types::{CertificateDer, InvalidDnsNameError, PrivateKeyDer, ServerName};
 use rustls::{ClientConfig, RootCertStore, crypto};
 
-use crate::reports::Reports;
+use crate::reports::BrokerReports;
 use crate::topics::{self, Address, TopicFilter, TopicMessageType, UADP};
 
 /// The program that uses a broker.
 #[derive(Debug, Clone)]
-pub struct Identity {
+pub struct BrokerIdentity {
     /// Name of the program, for its ClientId.
     pub program: String,
     /// PublisherId of own messages, whose status is reported. `None` for a program that only
@@ -84,7 +84,7 @@ pub(crate) struct Tls {
 }
 
 impl BrokerSettings {
-    pub(crate) fn read(broker: &Broker, identity: &Identity) -> Result<Self, OpenError> {
+    pub(crate) fn read(broker: &Broker, identity: &BrokerIdentity) -> Result<Self, OpenError> {
         let credentials = broker.credentials.as_deref().map(credentials).transpose()?;
         let tls = broker.address.tls.then(|| tls(broker)).transpose()?;
         Ok(Self {
@@ -101,7 +101,7 @@ impl BrokerSettings {
 
 /// Returns the will of a program that alone uses its PublisherId. The programs of space 0 share
 /// theirs.
-fn will(broker: &Broker, identity: &Identity) -> Option<Will> {
+fn will(broker: &Broker, identity: &BrokerIdentity) -> Option<Will> {
     let publisher = identity.publisher.filter(|of| broker.will && *of != 0)?;
     let address = Address {
         kind: TopicMessageType::Status,
@@ -111,14 +111,14 @@ fn will(broker: &Broker, identity: &Identity) -> Option<Will> {
     };
     Some(Will {
         topic: topics::name(broker, UADP, address),
-        payload: Reports::default().failed(publisher)?,
+        payload: BrokerReports::default().failed(publisher)?,
     })
 }
 
 /// Returns a ClientId that no other client has. The broker disconnects the older of two clients
 /// with the same ClientId, so the default of the standard, the PublisherId, cannot be used: several
 /// programs share it.
-fn client_id(broker: &Broker, identity: &Identity) -> String {
+fn client_id(broker: &Broker, identity: &BrokerIdentity) -> String {
     let first = broker.client_id.as_deref().unwrap_or("ua-bridge");
     let host = fs::read_to_string("/proc/sys/kernel/hostname").unwrap_or_default();
     let host: String = host

@@ -7,7 +7,7 @@ use serde_json::Value;
 /// UaType is a DataValue without value.
 #[derive(Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "PascalCase", deny_unknown_fields, default)]
-pub struct FieldValue {
+pub struct JsonFieldValue {
     /// Number of the builtin type.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub ua_type: Option<u8>,
@@ -22,7 +22,7 @@ pub struct FieldValue {
     pub null_array: bool,
     /// The status of a DataValue.
     #[serde(alias = "StatusCode", skip_serializing_if = "Option::is_none")]
-    pub status: Option<Status>,
+    pub status: Option<JsonStatus>,
     /// The time at which the source had the value.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub source_timestamp: Option<String>,
@@ -40,7 +40,7 @@ pub struct FieldValue {
 /// A StatusCode.
 #[derive(Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "PascalCase", deny_unknown_fields)]
-pub struct Status {
+pub struct JsonStatus {
     /// The number of the code.
     pub code: u32,
     /// The name of the code, for people.

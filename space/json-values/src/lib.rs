@@ -9,8 +9,8 @@ pub mod status;
 mod structures;
 mod values;
 
-pub use field_value::{FieldValue, Status};
-pub use structures::Structure;
+pub use field_value::{JsonFieldValue, JsonStatus};
+pub use structures::JsonStructure;
 pub use values::{
     WrongValue, data_value_bytes, show_data_value, show_scalar, show_variant, variant_bytes,
     write_scalar,

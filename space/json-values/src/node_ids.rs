@@ -3,7 +3,7 @@
 
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD as BASE64;
-use uadp::{ExpandedNodeId, Guid, Identifier, NodeId};
+use uadp::{ExpandedNodeId, Guid, NodeId, NodeIdValue};
 
 /// A NodeId that owns its text.
 #[derive(Debug, Default)]
@@ -81,10 +81,10 @@ impl OwnedNodeId {
     #[must_use]
     pub fn expanded(&self) -> ExpandedNodeId<'_> {
         let identifier = match &self.identifier {
-            OwnedIdentifier::Numeric(identifier) => Identifier::Numeric(*identifier),
-            OwnedIdentifier::String(identifier) => Identifier::String(identifier.as_deref()),
-            OwnedIdentifier::Guid(identifier) => Identifier::Guid(*identifier),
-            OwnedIdentifier::Opaque(identifier) => Identifier::Opaque(identifier.as_deref()),
+            OwnedIdentifier::Numeric(identifier) => NodeIdValue::Numeric(*identifier),
+            OwnedIdentifier::String(identifier) => NodeIdValue::String(identifier.as_deref()),
+            OwnedIdentifier::Guid(identifier) => NodeIdValue::Guid(*identifier),
+            OwnedIdentifier::Opaque(identifier) => NodeIdValue::Opaque(identifier.as_deref()),
         };
         ExpandedNodeId {
             node_id: NodeId {
@@ -101,12 +101,12 @@ impl OwnedNodeId {
 #[must_use]
 pub fn text(node_id: NodeId<'_>) -> String {
     let identifier = match node_id.identifier {
-        Identifier::Numeric(identifier) => format!("i={identifier}"),
-        Identifier::String(Some(identifier)) => format!("s={identifier}"),
-        Identifier::String(None) => NULL_STRING.to_owned(),
-        Identifier::Guid(identifier) => format!("g={}", identifier.to_string().to_lowercase()),
-        Identifier::Opaque(Some(identifier)) => format!("b={}", BASE64.encode(identifier)),
-        Identifier::Opaque(None) => NULL_OPAQUE.to_owned(),
+        NodeIdValue::Numeric(identifier) => format!("i={identifier}"),
+        NodeIdValue::String(Some(identifier)) => format!("s={identifier}"),
+        NodeIdValue::String(None) => NULL_STRING.to_owned(),
+        NodeIdValue::Guid(identifier) => format!("g={}", identifier.to_string().to_lowercase()),
+        NodeIdValue::Opaque(Some(identifier)) => format!("b={}", BASE64.encode(identifier)),
+        NodeIdValue::Opaque(None) => NULL_OPAQUE.to_owned(),
     };
     match node_id.namespace {
         0 => identifier,

@@ -8,21 +8,21 @@ use crate::values::{WrongValue, show_scalar, write_scalar};
 
 /// The type of a structure and its fields, in order.
 #[derive(Debug)]
-pub struct Structure {
+pub struct JsonStructure {
     /// NodeId of the type in namespace 0.
     pub data_type: u32,
     /// NodeId of its binary encoding in namespace 0.
     pub encoding: u32,
-    fields: &'static [(&'static str, Part)],
+    fields: &'static [(&'static str, StructurePartType)],
 }
 
 #[derive(Debug)]
-enum Part {
+enum StructurePartType {
     Value(BuiltinType),
     Inline(&'static [(&'static str, Self)]),
 }
 
-impl Structure {
+impl JsonStructure {
     /// Returns the structure with this NodeId of its binary encoding.
     #[must_use]
     pub fn by_encoding(encoding: u32) -> Option<&'static Self> {
@@ -60,14 +60,14 @@ impl Structure {
 }
 
 fn show_fields(
-    fields: &[(&str, Part)],
+    fields: &[(&str, StructurePartType)],
     reader: &mut StructureReader<'_>,
 ) -> Option<Map<String, Value>> {
     let mut shown = Map::new();
     for (name, part) in fields {
         let value = match part {
-            Part::Value(builtin) => show_scalar(reader.scalar(*builtin).ok()?).ok()?,
-            Part::Inline(fields) => show_fields(fields, reader)?.into(),
+            StructurePartType::Value(builtin) => show_scalar(reader.scalar(*builtin).ok()?).ok()?,
+            StructurePartType::Inline(fields) => show_fields(fields, reader)?.into(),
         };
         shown.insert((*name).to_owned(), value);
     }
@@ -75,7 +75,7 @@ fn show_fields(
 }
 
 fn write_fields(
-    fields: &[(&str, Part)],
+    fields: &[(&str, StructurePartType)],
     besides: &[&str],
     json: &Map<String, Value>,
     out: &mut Vec<u8>,
@@ -90,8 +90,8 @@ fn write_fields(
         let missing = || WrongValue::new(format!("the structure lacks the field `{name}`"));
         let value = json.get(*name).ok_or_else(missing)?;
         let written = match part {
-            Part::Value(builtin) => write_scalar(*builtin, value, out),
-            Part::Inline(fields) => match value.as_object() {
+            StructurePartType::Value(builtin) => write_scalar(*builtin, value, out),
+            StructurePartType::Inline(fields) => match value.as_object() {
                 Some(json) => write_fields(fields, &[], json, out),
                 None => Err(WrongValue::expected("an object", value)),
             },
@@ -102,51 +102,60 @@ fn write_fields(
 }
 
 /// Numbers of OPC 10000-6, Annex A (NodeIds).
-const KNOWN: [Structure; 3] = [
-    Structure {
+const KNOWN: [JsonStructure; 3] = [
+    JsonStructure {
         data_type: 884,
         encoding: 886,
         fields: RANGE,
     },
-    Structure {
+    JsonStructure {
         data_type: 887,
         encoding: 889,
         fields: EU_INFORMATION,
     },
-    Structure {
+    JsonStructure {
         data_type: 18814,
         encoding: 18823,
         fields: THREE_D_FRAME,
     },
 ];
 
-const RANGE: &[(&str, Part)] = &[
-    ("Low", Part::Value(BuiltinType::Double)),
-    ("High", Part::Value(BuiltinType::Double)),
+const RANGE: &[(&str, StructurePartType)] = &[
+    ("Low", StructurePartType::Value(BuiltinType::Double)),
+    ("High", StructurePartType::Value(BuiltinType::Double)),
 ];
 
-const EU_INFORMATION: &[(&str, Part)] = &[
-    ("NamespaceUri", Part::Value(BuiltinType::String)),
-    ("UnitId", Part::Value(BuiltinType::Int32)),
-    ("DisplayName", Part::Value(BuiltinType::LocalizedText)),
-    ("Description", Part::Value(BuiltinType::LocalizedText)),
+const EU_INFORMATION: &[(&str, StructurePartType)] = &[
+    (
+        "NamespaceUri",
+        StructurePartType::Value(BuiltinType::String),
+    ),
+    ("UnitId", StructurePartType::Value(BuiltinType::Int32)),
+    (
+        "DisplayName",
+        StructurePartType::Value(BuiltinType::LocalizedText),
+    ),
+    (
+        "Description",
+        StructurePartType::Value(BuiltinType::LocalizedText),
+    ),
 ];
 
-const THREE_D_FRAME: &[(&str, Part)] = &[
+const THREE_D_FRAME: &[(&str, StructurePartType)] = &[
     (
         "CartesianCoordinates",
-        Part::Inline(&[
-            ("X", Part::Value(BuiltinType::Double)),
-            ("Y", Part::Value(BuiltinType::Double)),
-            ("Z", Part::Value(BuiltinType::Double)),
+        StructurePartType::Inline(&[
+            ("X", StructurePartType::Value(BuiltinType::Double)),
+            ("Y", StructurePartType::Value(BuiltinType::Double)),
+            ("Z", StructurePartType::Value(BuiltinType::Double)),
         ]),
     ),
     (
         "Orientation",
-        Part::Inline(&[
-            ("A", Part::Value(BuiltinType::Double)),
-            ("B", Part::Value(BuiltinType::Double)),
-            ("C", Part::Value(BuiltinType::Double)),
+        StructurePartType::Inline(&[
+            ("A", StructurePartType::Value(BuiltinType::Double)),
+            ("B", StructurePartType::Value(BuiltinType::Double)),
+            ("C", StructurePartType::Value(BuiltinType::Double)),
         ]),
     ),
 ];

@@ -14,7 +14,7 @@ use nix::sys::socket::{
 use nix::sys::time::TimeSpec;
 use rustix::net::{MMsgHdr, SendAncillaryBuffer, SendFlags, SocketAddrAny, sendmmsg};
 
-use crate::carrier::{BUFFER, Outgoing, Received};
+use crate::carrier::{BUFFER, OutgoingMessage, Received};
 
 /// The maximum number of datagrams of a system call.
 pub(crate) const AT_ONCE: usize = 32;
@@ -143,7 +143,7 @@ fn stamp(message: &RecvMsg<'_, '_, SockaddrIn>) -> Option<SystemTime> {
 pub(crate) fn send(
     socket: impl AsFd,
     target: SocketAddr,
-    messages: &[Outgoing<'_>],
+    messages: &[OutgoingMessage<'_>],
 ) -> io::Result<usize> {
     let target = SocketAddrAny::from(target);
     let slices = messages.iter().map(|message| [IoSlice::new(message.bytes)]);
@@ -158,7 +158,7 @@ pub(crate) fn send(
 pub(crate) fn send_behind(
     socket: impl AsFd,
     header: &[u8],
-    messages: &[Outgoing<'_>],
+    messages: &[OutgoingMessage<'_>],
 ) -> io::Result<usize> {
     let slices = messages
         .iter()

@@ -10,7 +10,7 @@ use std::time::{Duration, SystemTime};
 
 use crate::key_rule::KeyRule;
 use crate::udp::{SendError, Udp};
-use crate::watch::Change;
+use crate::watch::InterfaceChange;
 
 /// Sends and receives the NetworkMessages of a PubSub connection.
 ///
@@ -22,11 +22,11 @@ pub trait Carrier: fmt::Debug + Send {
     ///
     /// # Errors
     /// A [`SendError`]; later messages may be sent nevertheless.
-    fn try_send(&mut self, message: &Outgoing<'_>) -> Result<(), SendError>;
+    fn try_send(&mut self, message: &OutgoingMessage<'_>) -> Result<(), SendError>;
 
     /// Sends messages in their order without waiting, with as few system calls as possible. Returns
     /// the errors of the messages that were not sent, by their index.
-    fn try_send_all(&mut self, messages: &[Outgoing<'_>]) -> BTreeMap<usize, SendError> {
+    fn try_send_all(&mut self, messages: &[OutgoingMessage<'_>]) -> BTreeMap<usize, SendError> {
         let sent = messages.iter().map(|message| self.try_send(message));
         let errors = sent
             .enumerate()
@@ -77,8 +77,8 @@ pub trait Carrier: fmt::Debug + Send {
     }
 
     /// Returns the properties of the network by which the last message was received.
-    fn arrival(&self) -> Arrival {
-        Arrival {
+    fn arrival(&self) -> NetworkArrival {
+        NetworkArrival {
             senders: self.senders(),
             within: self.within(),
             is_forwarded: false,
@@ -150,7 +150,7 @@ impl dyn Carrier + '_ {
 
 /// A message to send.
 #[derive(Debug, Clone, Copy)]
-pub struct Outgoing<'a> {
+pub struct OutgoingMessage<'a> {
     /// The NetworkMessage.
     pub bytes: &'a [u8],
     /// Whether a newer message of the same topic replaces the message while it waits.
@@ -161,7 +161,7 @@ pub struct Outgoing<'a> {
     pub within: Option<Duration>,
 }
 
-impl<'a> Outgoing<'a> {
+impl<'a> OutgoingMessage<'a> {
     /// Returns a message that is neither replaced nor expires.
     #[must_use]
     pub const fn new(bytes: &'a [u8]) -> Self {
@@ -198,7 +198,7 @@ pub enum Senders {
 
 /// The properties of the network by which a message was received.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Arrival {
+pub struct NetworkArrival {
     /// How far the network tells senders apart.
     pub senders: Senders,
     /// The time after which the message counts as late; `None` if the network does not store
@@ -270,11 +270,11 @@ pub enum CarrierChange {
 }
 
 impl Carrier for Udp {
-    fn try_send(&mut self, message: &Outgoing<'_>) -> Result<(), SendError> {
+    fn try_send(&mut self, message: &OutgoingMessage<'_>) -> Result<(), SendError> {
         Self::try_send(self, message.bytes)
     }
 
-    fn try_send_all(&mut self, messages: &[Outgoing<'_>]) -> BTreeMap<usize, SendError> {
+    fn try_send_all(&mut self, messages: &[OutgoingMessage<'_>]) -> BTreeMap<usize, SendError> {
         Self::try_send_all(self, messages)
     }
 
@@ -292,8 +292,8 @@ impl Carrier for Udp {
 
     fn follow(&mut self) -> Option<CarrierChange> {
         Some(match Self::follow(self)? {
-            Change::Lost(why) => CarrierChange::Lost(why),
-            Change::Back(interface) => CarrierChange::Back(interface.to_string()),
+            InterfaceChange::Lost(why) => CarrierChange::Lost(why),
+            InterfaceChange::Back(interface) => CarrierChange::Back(interface.to_string()),
         })
     }
 

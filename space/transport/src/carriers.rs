@@ -7,7 +7,8 @@ use std::task::{Context, Poll};
 use std::time::Duration;
 
 use crate::carrier::{
-    Arrival, Capacity, Carrier, CarrierChange, CarrierState, Outgoing, Received, Senders, Traffic,
+    Capacity, Carrier, CarrierChange, CarrierState, NetworkArrival, OutgoingMessage, Received,
+    Senders, Traffic,
 };
 use crate::udp::SendError;
 
@@ -152,7 +153,7 @@ impl Carriers {
     /// Returns whether a carrier has taken the message.
     fn forward(&mut self, bytes: &[u8], forward: &ForwardTo) -> bool {
         let mut is_taken = false;
-        let message = Outgoing {
+        let message = OutgoingMessage {
             bytes,
             replaceable: forward.replaceable,
             command: forward.command,
@@ -222,14 +223,14 @@ enum Taken {
 }
 
 impl Carrier for Carriers {
-    fn try_send(&mut self, message: &Outgoing<'_>) -> Result<(), SendError> {
+    fn try_send(&mut self, message: &OutgoingMessage<'_>) -> Result<(), SendError> {
         let mut errors = self.try_send_all(&[*message]);
         errors.remove(&0).map_or(Ok(()), Err)
     }
 
     /// Sends messages on each carrier. A message is not sent if no carrier takes it; the failures
     /// of single carriers are counted.
-    fn try_send_all(&mut self, messages: &[Outgoing<'_>]) -> BTreeMap<usize, SendError> {
+    fn try_send_all(&mut self, messages: &[OutgoingMessage<'_>]) -> BTreeMap<usize, SendError> {
         for message in messages {
             self.rules.sent(message.bytes);
         }
@@ -328,10 +329,10 @@ impl Carrier for Carriers {
         slowest.unwrap_or(Capacity::Unknown)
     }
 
-    fn arrival(&self) -> Arrival {
+    fn arrival(&self) -> NetworkArrival {
         let (is_forwarded, not_forwarded) = (self.is_forwarded, self.not_forwarded);
         let member = self.members.get(self.last).map(|member| &member.carrier);
-        Arrival {
+        NetworkArrival {
             senders: member.map_or_else(|| self.senders(), |carrier| carrier.senders()),
             within: member.and_then(|carrier| carrier.within()),
             is_forwarded,
@@ -422,7 +423,7 @@ mod tests {
     struct End(Arc<Mutex<Wire>>);
 
     impl Carrier for End {
-        fn try_send(&mut self, message: &Outgoing<'_>) -> Result<(), SendError> {
+        fn try_send(&mut self, message: &OutgoingMessage<'_>) -> Result<(), SendError> {
             let mut wire = self.0.lock().unwrap();
             if wire.is_lost {
                 return Err(SendError::Unreachable);
@@ -517,7 +518,7 @@ mod tests {
     fn own_messages_are_sent_on_all_carriers_and_a_lost_carrier_stops_no_other() {
         let (mut carriers, a, b) = pair();
         b.0.lock().unwrap().is_lost = true;
-        assert_eq!(carriers.try_send(&Outgoing::new(&[5])), Ok(()));
+        assert_eq!(carriers.try_send(&OutgoingMessage::new(&[5])), Ok(()));
         assert_eq!(a.0.lock().unwrap().outgoing, [[5]]);
         assert_eq!(carriers.lost(), None);
         let states = carriers.states();
@@ -526,7 +527,7 @@ mod tests {
 
         a.0.lock().unwrap().is_lost = true;
         assert_eq!(
-            carriers.try_send(&Outgoing::new(&[6])),
+            carriers.try_send(&OutgoingMessage::new(&[6])),
             Err(SendError::Unreachable)
         );
         assert!(carriers.lost().is_some());

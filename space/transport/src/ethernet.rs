@@ -18,11 +18,11 @@ use tokio::io::unix::AsyncFd;
 use tracing::{debug, info};
 
 use crate::batch::{self, Batch};
-use crate::carrier::{Capacity, Carrier, CarrierChange, Outgoing, Received, Senders};
+use crate::carrier::{Capacity, Carrier, CarrierChange, OutgoingMessage, Received, Senders};
 use crate::interface::{InterfaceError, speed};
 use crate::udp::{SEND_BUFFER, SendError, send_error};
 pub use frame::VlanTag;
-use frame::{ETHERTYPE, Frame, FrameFault, FrameHeader};
+use frame::{ETHERTYPE, EthernetFrame, FrameFault, FrameHeader};
 use port::EthernetPort;
 
 /// A socket that receives and sends Ethernet frames of a PubSub connection.
@@ -180,8 +180,8 @@ impl Ethernet {
     fn take(&mut self, buffer: &mut Vec<u8>) -> Option<Received> {
         while let Some(received) = self.batch.take(buffer) {
             let bytes = buffer.get(..received.length).unwrap_or_default();
-            match Frame::decode(bytes, [self.options.address, self.port.address]) {
-                Ok(Frame { source, message }) => {
+            match EthernetFrame::decode(bytes, [self.options.address, self.port.address]) {
+                Ok(EthernetFrame { source, message }) => {
                     let length = message.len();
                     let start = received.length.saturating_sub(length);
                     buffer.copy_within(start..received.length, 0);
@@ -237,12 +237,12 @@ impl Ethernet {
 }
 
 impl Carrier for Ethernet {
-    fn try_send(&mut self, message: &Outgoing<'_>) -> Result<(), SendError> {
+    fn try_send(&mut self, message: &OutgoingMessage<'_>) -> Result<(), SendError> {
         let mut errors = self.try_send_all(&[*message]);
         errors.remove(&0).map_or(Ok(()), Err)
     }
 
-    fn try_send_all(&mut self, messages: &[Outgoing<'_>]) -> BTreeMap<usize, SendError> {
+    fn try_send_all(&mut self, messages: &[OutgoingMessage<'_>]) -> BTreeMap<usize, SendError> {
         let mut errors = BTreeMap::new();
         if self.lost.is_some() {
             errors.extend((0..messages.len()).map(|index| (index, SendError::Unreachable)));

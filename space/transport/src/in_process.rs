@@ -14,10 +14,10 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::task::{Context, Poll, Waker};
 use std::time::Duration;
 
-use crate::carrier::{Capacity, Carrier, CarrierChange, Outgoing, Received, Senders};
+use crate::carrier::{Capacity, Carrier, CarrierChange, OutgoingMessage, Received, Senders};
 use crate::ethernet::{Ethernet, EthernetOptions};
 use crate::key_rule::KeyRule;
-use crate::udp::{Options, SendError, Udp};
+use crate::udp::{SendError, Udp, UdpOptions};
 
 /// The carriers of one process that exchange messages without the network.
 #[derive(Debug, Clone, Default)]
@@ -103,7 +103,7 @@ impl ProcessHub {
     /// Connects a socket with the other sockets of the hub that use the same group and interface.
     /// A unicast socket stays as it is, because no other program of the process receives at it.
     #[must_use]
-    pub fn connect(&self, udp: Udp, options: &Options) -> Box<dyn Carrier> {
+    pub fn connect(&self, udp: Udp, options: &UdpOptions) -> Box<dyn Carrier> {
         if !options.address.ip().is_multicast() || !options.peers.is_empty() || options.own {
             return Box::new(udp);
         }
@@ -221,7 +221,7 @@ impl<N: HubNetwork> InProcess<N> {
     }
 
     /// Passes a sent message to the other members.
-    fn pass(&self, message: &Outgoing<'_>) {
+    fn pass(&self, message: &OutgoingMessage<'_>) {
         for other in &self.others {
             other.put(message.bytes, self.source);
         }
@@ -241,14 +241,14 @@ impl<N: HubNetwork> Drop for InProcess<N> {
 impl<N: HubNetwork> Carrier for InProcess<N> {
     /// A message that the network refuses reaches no member either: the caller reports it as not
     /// sent.
-    fn try_send(&mut self, message: &Outgoing<'_>) -> Result<(), SendError> {
+    fn try_send(&mut self, message: &OutgoingMessage<'_>) -> Result<(), SendError> {
         self.follow_members();
         self.network.try_send(message)?;
         self.pass(message);
         Ok(())
     }
 
-    fn try_send_all(&mut self, messages: &[Outgoing<'_>]) -> BTreeMap<usize, SendError> {
+    fn try_send_all(&mut self, messages: &[OutgoingMessage<'_>]) -> BTreeMap<usize, SendError> {
         self.follow_members();
         let errors = self.network.try_send_all(messages);
         for (index, message) in messages.iter().enumerate() {

@@ -18,13 +18,13 @@ mod udp;
 mod watch;
 
 pub use carrier::{
-    Arrival, BUFFER, Capacity, Carrier, CarrierChange, CarrierState, Outgoing, Received, Senders,
-    Traffic,
+    BUFFER, Capacity, Carrier, CarrierChange, CarrierState, NetworkArrival, OutgoingMessage,
+    Received, Senders, Traffic,
 };
 pub use carriers::{CarrierRules, Carriers, ForwardTo, Judgement, MessagePath};
 pub use ethernet::{Ethernet, EthernetError, EthernetOptions, VlanTag};
 pub use in_process::ProcessHub;
 pub use interface::{Interface, InterfaceError, interfaces};
 pub use key_rule::{ByteTest, KeyRule};
-pub use udp::{OpenError, Options, SendError, Udp};
-pub use watch::{Change, Finding, Held, LOOK};
+pub use udp::{SendError, Udp, UdpOpenError, UdpOptions};
+pub use watch::{HeldInterfaces, InterfaceChange, InterfaceFinding, LOOK};

@@ -15,11 +15,11 @@ use tokio::net::UdpSocket;
 use tracing::{debug, info};
 
 use crate::batch::{self, Batch};
-use crate::carrier::{Capacity, Outgoing, Received};
+use crate::carrier::{Capacity, OutgoingMessage, Received};
 use crate::filter::{OwnFilter, ProcessSenders};
 use crate::interface::{Interface, InterfaceError, interfaces};
 use crate::key_rule::KeyRule;
-use crate::watch::{Change, Wanted, Watch};
+use crate::watch::{InterfaceChange, InterfaceSelection, InterfaceWatch};
 
 /// A UDP socket that receives and sends the datagrams of a PubSub connection.
 #[derive(Debug)]
@@ -32,9 +32,9 @@ pub struct Udp {
     sender: std::net::UdpSocket,
     targets: Vec<SocketAddr>,
     local: SocketAddr,
-    options: Options,
+    options: UdpOptions,
     /// Interface of the sockets; `None` if the interface does not have to be watched.
-    watch: Option<Watch>,
+    watch: Option<InterfaceWatch>,
     /// Received datagrams that were not yet taken.
     batch: Batch,
     /// Drops own datagrams; `None` if own datagrams are received.
@@ -45,7 +45,7 @@ pub struct Udp {
 
 /// Addresses and options of a [`Udp`].
 #[derive(Debug, Clone)]
-pub struct Options {
+pub struct UdpOptions {
     /// A multicast group with its port, or a unicast address. A unicast address of this host is
     /// bound for receiving. For an address of another host, datagrams are sent to it and received
     /// on the same port of this host.
@@ -70,7 +70,7 @@ pub struct Options {
 /// Reason why a socket could not be opened.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
-pub enum OpenError {
+pub enum UdpOpenError {
     /// The requested interface does not exist.
     #[error(transparent)]
     Interface(#[from] InterfaceError),
@@ -129,7 +129,7 @@ pub enum SendError {
     Refused,
 }
 
-impl Options {
+impl UdpOptions {
     /// Returns the default options for `address`: TTL 1, multicast loopback without own datagrams,
     /// 4 MiB receive buffer, no peers.
     #[must_use]
@@ -152,11 +152,11 @@ impl Udp {
     /// Must be called within a tokio runtime.
     ///
     /// # Errors
-    /// [`OpenError`] with the interface, port or group that caused it.
-    pub fn open(options: &Options) -> Result<Self, OpenError> {
+    /// [`UdpOpenError`] with the interface, port or group that caused it.
+    pub fn open(options: &UdpOptions) -> Result<Self, UdpOpenError> {
         let address = options.address;
         let IpAddr::V4(ip) = address.ip() else {
-            return Err(OpenError::Ipv6(address));
+            return Err(UdpOpenError::Ipv6(address));
         };
         let interface = options
             .interface
@@ -194,7 +194,7 @@ impl Udp {
             targets,
             local,
             options: options.clone(),
-            watch: options.wanted().and_then(Watch::start),
+            watch: options.wanted().and_then(InterfaceWatch::start),
             batch: Batch::default(),
             own_filter,
             companions: Vec::new(),
@@ -205,7 +205,7 @@ impl Udp {
     /// has another address, or is available again. Call it every [`LOOK`](crate::LOOK). The
     /// [`source`](Self::source) may change, and received datagrams that were not yet taken are
     /// lost.
-    pub fn follow(&mut self) -> Option<Change> {
+    pub fn follow(&mut self) -> Option<InterfaceChange> {
         // If the system cannot list its interfaces, their state is unknown.
         let present = interfaces().ok()?;
         let (options, receiver) = (&self.options, &self.receiver);
@@ -304,7 +304,7 @@ impl Udp {
     /// Returns the capacity of the network interface that the sockets use.
     #[must_use]
     pub fn capacity(&self) -> Capacity {
-        let held = self.watch.as_ref().map(Watch::interface);
+        let held = self.watch.as_ref().map(InterfaceWatch::interface);
         let loopback = held.is_some_and(|interface| interface.address.is_loopback())
             || self.targets.iter().all(|target| target.ip().is_loopback());
         if loopback {
@@ -390,7 +390,10 @@ impl Udp {
 
     /// Sends messages as [`try_send`](Self::try_send), several in one system call. Returns the
     /// first [`SendError`] of each message that was not sent to all targets, by its index.
-    pub(crate) fn try_send_all(&self, messages: &[Outgoing<'_>]) -> BTreeMap<usize, SendError> {
+    pub(crate) fn try_send_all(
+        &self,
+        messages: &[OutgoingMessage<'_>],
+    ) -> BTreeMap<usize, SendError> {
         let mut errors = BTreeMap::new();
         for target in &self.targets {
             let mut sent = 0;
@@ -415,13 +418,15 @@ impl Udp {
     }
 }
 
-impl Options {
+impl UdpOptions {
     /// Returns the interface to watch. Without a group and an interface name, the sockets are not
     /// bound to an interface.
-    fn wanted(&self) -> Option<Wanted> {
+    fn wanted(&self) -> Option<InterfaceSelection> {
         match &self.interface {
-            Some(wanted) => Some(Wanted::Named(wanted.clone())),
-            None if self.address.ip().is_multicast() => Some(Wanted::Towards(self.address)),
+            Some(wanted) => Some(InterfaceSelection::Named(wanted.clone())),
+            None if self.address.ip().is_multicast() => {
+                Some(InterfaceSelection::Towards(self.address))
+            }
             None => None,
         }
     }
@@ -432,13 +437,13 @@ type Sender = (std::net::UdpSocket, SocketAddr);
 /// Returns new sockets for a changed interface. A receiver that is bound to a present address is
 /// kept, because its port cannot be bound twice.
 fn anew(
-    options: &Options,
+    options: &UdpOptions,
     receiver: &UdpSocket,
     interface: &Interface,
-) -> Result<(Option<UdpSocket>, Sender), OpenError> {
+) -> Result<(Option<UdpSocket>, Sender), UdpOpenError> {
     let address = options.address;
     let IpAddr::V4(ip) = address.ip() else {
-        return Err(OpenError::Ipv6(address));
+        return Err(UdpOpenError::Ipv6(address));
     };
     // Without an interface name, the system selects the interface for each datagram.
     let interface = options.interface.is_some().then_some(interface);
@@ -452,7 +457,7 @@ fn anew(
         let present = interfaces().map_err(InterfaceError::List)?;
         let is_here = ip.is_loopback() || present.iter().any(|interface| interface.address == ip);
         if bound_to_own && !is_here {
-            return Err(OpenError::Gone(address));
+            return Err(UdpOpenError::Gone(address));
         }
         None
     } else {
@@ -485,13 +490,13 @@ const EMSGSIZE: i32 = 90;
 const ENOBUFS: i32 = 105;
 
 fn receiver(
-    options: &Options,
+    options: &UdpOptions,
     ip: Ipv4Addr,
     interface: Option<&Interface>,
-) -> Result<UdpSocket, OpenError> {
+) -> Result<UdpSocket, UdpOpenError> {
     let address = options.address;
     let at = |what| {
-        move |source| OpenError::Socket {
+        move |source| UdpOpenError::Socket {
             what,
             address,
             source,
@@ -528,9 +533,9 @@ fn receiver(
     });
     bound.map_err(|source| {
         if source.kind() == io::ErrorKind::AddrInUse {
-            OpenError::PortTaken(address)
+            UdpOpenError::PortTaken(address)
         } else {
-            OpenError::Socket {
+            UdpOpenError::Socket {
                 what: "bind",
                 address,
                 source,
@@ -551,11 +556,15 @@ fn receiver(
     UdpSocket::from_std(socket.into()).map_err(at("register the socket"))
 }
 
-fn join(socket: &Socket, group: Ipv4Addr, interface: Option<&Interface>) -> Result<(), OpenError> {
+fn join(
+    socket: &Socket,
+    group: Ipv4Addr,
+    interface: Option<&Interface>,
+) -> Result<(), UdpOpenError> {
     let on = interface.map_or(Ipv4Addr::UNSPECIFIED, |interface| interface.address);
     socket
         .join_multicast_v4(&group, &on)
-        .map_err(|source| OpenError::Join {
+        .map_err(|source| UdpOpenError::Join {
             group,
             interface: interface
                 .map_or_else(|| "the default interface".to_owned(), ToString::to_string),
@@ -572,7 +581,7 @@ fn join(socket: &Socket, group: Ipv4Addr, interface: Option<&Interface>) -> Resu
                 Err(error)
             }
         })
-        .map_err(|source| OpenError::Join {
+        .map_err(|source| UdpOpenError::Join {
             group,
             interface: on.to_string(),
             source,
@@ -580,10 +589,10 @@ fn join(socket: &Socket, group: Ipv4Addr, interface: Option<&Interface>) -> Resu
 }
 
 /// Returns the sending socket and its local address.
-fn sender(options: &Options, interface: Option<&Interface>) -> Result<Sender, OpenError> {
+fn sender(options: &UdpOptions, interface: Option<&Interface>) -> Result<Sender, UdpOpenError> {
     let address = options.address;
     let at = |what| {
-        move |source| OpenError::Socket {
+        move |source| UdpOpenError::Socket {
             what,
             address,
             source,

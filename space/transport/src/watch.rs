@@ -16,7 +16,7 @@ pub const LOOK: Duration = Duration::from_secs(1);
 
 /// Change of an interface between two polls.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Change {
+pub enum InterfaceChange {
     /// The interface cannot be used, for this reason.
     Lost(String),
     /// The interface can be used again, or was replaced.
@@ -25,7 +25,7 @@ pub enum Change {
 
 /// Selection of the interface of the sockets.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) enum Wanted {
+pub(crate) enum InterfaceSelection {
     /// The interface with this name or address.
     Named(String),
     /// The interface that the system uses for this multicast group.
@@ -34,17 +34,17 @@ pub(crate) enum Wanted {
 
 /// The interface of our sockets.
 #[derive(Debug)]
-pub(crate) struct Watch {
-    wanted: Wanted,
+pub(crate) struct InterfaceWatch {
+    wanted: InterfaceSelection,
     /// The interface at the time when the sockets were created.
     held: Interface,
     /// Reason why the interface cannot be used at present.
     lost: Option<String>,
 }
 
-impl Watch {
+impl InterfaceWatch {
     /// Starts to watch the present interface; `None` if there is no interface to watch.
-    pub(crate) fn start(wanted: Wanted) -> Option<Self> {
+    pub(crate) fn start(wanted: InterfaceSelection) -> Option<Self> {
         let held = wanted.find(&interfaces().ok()?, None).ok()?;
         Some(Self {
             wanted,
@@ -68,7 +68,7 @@ impl Watch {
         &mut self,
         present: &[Interface],
         take: impl FnOnce(&Interface) -> Result<(), String>,
-    ) -> Option<Change> {
+    ) -> Option<InterfaceChange> {
         let found = self.wanted.find(present, Some(&self.held));
         let taken = found.and_then(|found| {
             if !found.up {
@@ -85,17 +85,17 @@ impl Watch {
             Ok(Some(found)) => {
                 self.lost = None;
                 self.held = found.clone();
-                Some(Change::Back(found))
+                Some(InterfaceChange::Back(found))
             }
             Err(why) => {
                 let told = self.lost.replace(why.clone()).is_some();
-                (!told).then_some(Change::Lost(why))
+                (!told).then_some(InterfaceChange::Lost(why))
             }
         }
     }
 }
 
-impl Wanted {
+impl InterfaceSelection {
     fn find(&self, present: &[Interface], held: Option<&Interface>) -> Result<Interface, String> {
         let (wanted, missing) = match self {
             Self::Named(wanted) => (
@@ -135,7 +135,7 @@ fn source_towards(group: SocketAddr) -> io::Result<Ipv4Addr> {
 
 /// Interfaces whose addresses a library uses permanently: it cannot change them while it runs.
 #[derive(Debug)]
-pub struct Held {
+pub struct HeldInterfaces {
     held: Vec<Holding>,
     /// True if the library uses all interfaces.
     all: bool,
@@ -147,7 +147,7 @@ pub struct Held {
 struct Holding {
     interface: Interface,
     state: State,
-    /// State at the last call of [`Held::look`].
+    /// State at the last call of [`HeldInterfaces::look`].
     reported: State,
     /// True if the interface was removed at that call or since.
     was_gone: bool,
@@ -162,7 +162,7 @@ enum State {
 
 /// Result of a check of held interfaces.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Finding {
+pub enum InterfaceFinding {
     /// An interface cannot be used at present, for this reason.
     Lost(String),
     /// An unchanged interface can be used again.
@@ -174,7 +174,7 @@ pub enum Finding {
     Void(String),
 }
 
-impl Held {
+impl HeldInterfaces {
     /// Starts to watch the interfaces with the given addresses, or all interfaces except loopback
     /// if the list is empty. Loopback is not watched: returns `None` if no other interface has a
     /// given address.
@@ -212,7 +212,7 @@ impl Held {
     }
 
     /// Checks the interfaces, and returns the changes since the last call.
-    pub fn look(&mut self) -> Vec<Finding> {
+    pub fn look(&mut self) -> Vec<InterfaceFinding> {
         interfaces().map_or_else(|_not_now| Vec::new(), |present| self.see(&present))
     }
 
@@ -245,7 +245,7 @@ impl Held {
         }
     }
 
-    fn see(&mut self, present: &[Interface]) -> Vec<Finding> {
+    fn see(&mut self, present: &[Interface]) -> Vec<InterfaceFinding> {
         self.update(present);
         let is_there = |holding: &Holding| holding.reported == State::There;
         let was_there = self.held.iter().any(is_there);
@@ -257,16 +257,16 @@ impl Held {
             match (before, state) {
                 // The kernel removed its state together with the interface.
                 (_, State::There | State::Down) if was_gone => {
-                    findings.push(Finding::Void(format!(
+                    findings.push(InterfaceFinding::Void(format!(
                         "the network interface {} was created again",
                         holding.interface
                     )));
                 }
                 (State::Down, State::There) => {
-                    findings.push(Finding::Back(holding.interface.clone()));
+                    findings.push(InterfaceFinding::Back(holding.interface.clone()));
                 }
                 (State::There, State::Down | State::Gone) => {
-                    findings.push(Finding::Lost(holding.why()));
+                    findings.push(InterfaceFinding::Lost(holding.why()));
                 }
                 _ => {}
             }
@@ -278,7 +278,7 @@ impl Held {
     /// Returns present interfaces that replace a held interface or are new. `was_there` is whether
     /// a held interface was up at the check before: links that are down at one check only may be up
     /// again soon, so no new interface replaces them yet.
-    fn changed(&mut self, present: &[Interface], was_there: bool) -> Vec<Finding> {
+    fn changed(&mut self, present: &[Interface], was_there: bool) -> Vec<InterfaceFinding> {
         let mut findings = Vec::new();
         let usable = |one: &&Interface| one.up && !one.address.is_loopback();
         let is_there = self.held.iter().any(|held| held.state == State::There);
@@ -289,21 +289,23 @@ impl Held {
             }
             let mut of_name = self.held.iter().filter(|h| h.interface.name == one.name);
             if let Some(gone) = of_name.find(|h| h.state == State::Gone) {
-                findings.push(Finding::Void(if gone.interface.address == one.address {
-                    format!("the network interface {one} was created again")
-                } else {
-                    format!(
-                        "the network interface {} has another address, {}",
-                        gone.interface, one.address
-                    )
-                }));
+                findings.push(InterfaceFinding::Void(
+                    if gone.interface.address == one.address {
+                        format!("the network interface {one} was created again")
+                    } else {
+                        format!(
+                            "the network interface {} has another address, {}",
+                            gone.interface, one.address
+                        )
+                    },
+                ));
             } else if self.all && !was_there && !is_there {
-                findings.push(Finding::Void(format!(
+                findings.push(InterfaceFinding::Void(format!(
                     "the network interface {one} appeared"
                 )));
             } else if self.all && !self.late.contains(&one.name) && self.late.len() < MAX_LATE {
                 self.late.push(one.name.clone());
-                findings.push(Finding::Late(one.clone()));
+                findings.push(InterfaceFinding::Late(one.clone()));
             }
         }
         findings
@@ -350,16 +352,16 @@ mod tests {
         }
     }
 
-    fn named(name: &str) -> Watch {
-        Watch {
-            wanted: Wanted::Named(name.to_owned()),
+    fn named(name: &str) -> InterfaceWatch {
+        InterfaceWatch {
+            wanted: InterfaceSelection::Named(name.to_owned()),
             held: wire(3, 1),
             lost: None,
         }
     }
 
     /// Performs a check. Returns the change, and true if the sockets were recreated.
-    fn look(watch: &mut Watch, present: &[Interface]) -> (Option<Change>, bool) {
+    fn look(watch: &mut InterfaceWatch, present: &[Interface]) -> (Option<InterfaceChange>, bool) {
         let mut made = false;
         let change = watch.see(present, |_| {
             made = true;
@@ -380,7 +382,7 @@ mod tests {
     fn an_interface_that_was_made_anew_or_has_another_address_is_taken_up() {
         for anew in [wire(4, 1), wire(3, 2), wire(4, 2)] {
             let mut watch = named("wire0");
-            let back = (Some(Change::Back(anew.clone())), true);
+            let back = (Some(InterfaceChange::Back(anew.clone())), true);
             assert_eq!(look(&mut watch, std::slice::from_ref(&anew)), back);
             assert_eq!(look(&mut watch, &[anew]), (None, false));
         }
@@ -391,10 +393,10 @@ mod tests {
         for without in [vec![], vec![down(wire(3, 1))]] {
             let mut watch = named("wire0");
             let (change, made) = look(&mut watch, &without);
-            assert!(matches!(&change, Some(Change::Lost(why)) if why.contains("wire0")));
+            assert!(matches!(&change, Some(InterfaceChange::Lost(why)) if why.contains("wire0")));
             assert!(!made && watch.lost().is_some());
             assert_eq!(look(&mut watch, &without), (None, false));
-            let back = (Some(Change::Back(wire(3, 1))), true);
+            let back = (Some(InterfaceChange::Back(wire(3, 1))), true);
             assert_eq!(look(&mut watch, &[wire(3, 1)]), back);
             assert!(watch.lost().is_none());
         }
@@ -405,9 +407,9 @@ mod tests {
         let mut watch = named("10.77.0.1");
         assert!(matches!(
             look(&mut watch, &[wire(4, 2)]).0,
-            Some(Change::Lost(_))
+            Some(InterfaceChange::Lost(_))
         ));
-        let back = (Some(Change::Back(wire(5, 1))), true);
+        let back = (Some(InterfaceChange::Back(wire(5, 1))), true);
         assert_eq!(look(&mut watch, &[wire(4, 2), wire(5, 1)]), back);
     }
 
@@ -416,9 +418,9 @@ mod tests {
         let mut watch = named("wire0");
         let refuse = |_: &Interface| Err("no".to_owned());
         let refused = watch.see(&[wire(4, 1)], refuse);
-        assert_eq!(refused, Some(Change::Lost("no".to_owned())));
+        assert_eq!(refused, Some(InterfaceChange::Lost("no".to_owned())));
         assert_eq!(watch.see(&[wire(4, 1)], refuse), None);
-        let back = (Some(Change::Back(wire(4, 1))), true);
+        let back = (Some(InterfaceChange::Back(wire(4, 1))), true);
         assert_eq!(look(&mut watch, &[wire(4, 1)]), back);
     }
 
@@ -427,38 +429,47 @@ mod tests {
         for anew in [wire(4, 1), wire(3, 2), wire(4, 2)] {
             // The interface changes between two checks, or is absent during a check.
             for looks in [&[][..], &[&[][..]]] {
-                let mut held = Held::of(vec![wire(3, 1)], false);
+                let mut held = HeldInterfaces::of(vec![wire(3, 1)], false);
                 for present in looks {
-                    assert!(matches!(held.see(present)[..], [Finding::Lost(_)]));
+                    assert!(matches!(held.see(present)[..], [InterfaceFinding::Lost(_)]));
                     assert!(held.lost().unwrap().contains("wire0 (10.77.0.1)"));
                     assert_eq!(held.see(present), []);
                 }
                 let last = held.see(std::slice::from_ref(&anew)).pop();
-                assert!(matches!(last, Some(Finding::Void(_))), "{last:?}");
+                assert!(matches!(last, Some(InterfaceFinding::Void(_))), "{last:?}");
             }
         }
-        let mut held = Held::of(vec![wire(3, 1)], false);
+        let mut held = HeldInterfaces::of(vec![wire(3, 1)], false);
         held.see(&[]);
-        assert!(matches!(held.see(&[wire(3, 1)])[..], [Finding::Void(_)]));
+        assert!(matches!(
+            held.see(&[wire(3, 1)])[..],
+            [InterfaceFinding::Void(_)]
+        ));
     }
 
     #[test]
     fn what_a_library_holds_stays_good_while_a_link_is_down() {
-        let mut held = Held::of(vec![wire(3, 1)], false);
+        let mut held = HeldInterfaces::of(vec![wire(3, 1)], false);
         assert!(matches!(
             held.see(&[down(wire(3, 1))])[..],
-            [Finding::Lost(_)]
+            [InterfaceFinding::Lost(_)]
         ));
         assert!(held.lost().is_some());
-        assert_eq!(held.see(&[wire(3, 1)]), [Finding::Back(wire(3, 1))]);
+        assert_eq!(
+            held.see(&[wire(3, 1)]),
+            [InterfaceFinding::Back(wire(3, 1))]
+        );
         assert_eq!(held.lost(), None);
     }
 
     #[test]
     fn a_link_that_is_down_for_a_moment_does_not_make_what_a_library_holds_void() {
-        let mut held = Held::of(vec![wire(3, 1)], true);
+        let mut held = HeldInterfaces::of(vec![wire(3, 1)], true);
         let flap = [down(wire(3, 1)), other()];
-        assert_eq!(held.see(&[wire(3, 1), other()]), [Finding::Late(other())]);
+        assert_eq!(
+            held.see(&[wire(3, 1), other()]),
+            [InterfaceFinding::Late(other())]
+        );
         // Between two checks, only the fitness follows the link.
         held.update(&flap);
         assert!(held.lost().is_some());
@@ -467,42 +478,54 @@ mod tests {
         assert_eq!(held.see(&[wire(3, 1), other()]), []);
         // At a check, the loss is reported first. It is void if the link stays down.
         held.update(&flap);
-        assert!(matches!(held.see(&flap)[..], [Finding::Lost(_)]));
+        assert!(matches!(held.see(&flap)[..], [InterfaceFinding::Lost(_)]));
         held.update(&flap);
-        assert!(matches!(held.see(&flap)[..], [Finding::Void(_)]));
+        assert!(matches!(held.see(&flap)[..], [InterfaceFinding::Void(_)]));
     }
 
     #[test]
     fn an_interface_that_was_removed_between_two_checks_is_void_at_the_next() {
-        let mut held = Held::of(vec![wire(3, 1)], false);
+        let mut held = HeldInterfaces::of(vec![wire(3, 1)], false);
         held.update(&[]);
         held.update(&[wire(3, 1)]);
         assert_eq!(held.lost(), None);
-        assert!(matches!(held.see(&[wire(3, 1)])[..], [Finding::Void(_)]));
+        assert!(matches!(
+            held.see(&[wire(3, 1)])[..],
+            [InterfaceFinding::Void(_)]
+        ));
         assert_eq!(held.see(&[wire(3, 1)]), []);
         held.update(&[]);
-        assert!(matches!(held.see(&[])[..], [Finding::Lost(_)]));
-        assert!(matches!(held.see(&[wire(3, 1)])[..], [Finding::Void(_)]));
+        assert!(matches!(held.see(&[])[..], [InterfaceFinding::Lost(_)]));
+        assert!(matches!(
+            held.see(&[wire(3, 1)])[..],
+            [InterfaceFinding::Void(_)]
+        ));
     }
 
     #[test]
     fn an_interface_that_comes_late_is_told_of_where_all_are_wanted() {
         let other = other();
         let both = [wire(3, 1), other.clone()];
-        let mut one = Held::of(vec![wire(3, 1)], false);
+        let mut one = HeldInterfaces::of(vec![wire(3, 1)], false);
         assert_eq!(one.see(&both), []);
-        let mut all = Held::of(vec![wire(3, 1)], true);
-        assert_eq!(all.see(&both), [Finding::Late(other.clone())]);
+        let mut all = HeldInterfaces::of(vec![wire(3, 1)], true);
+        assert_eq!(all.see(&both), [InterfaceFinding::Late(other.clone())]);
         assert_eq!(all.see(&both), []);
         // The loss of one of several interfaces does not prevent communication.
-        let mut two = Held::of(both.to_vec(), true);
-        assert!(matches!(two.see(&both[..1])[..], [Finding::Lost(_)]));
+        let mut two = HeldInterfaces::of(both.to_vec(), true);
+        assert!(matches!(
+            two.see(&both[..1])[..],
+            [InterfaceFinding::Lost(_)]
+        ));
         assert_eq!(two.lost(), None);
         // Without interfaces, or with an interface that is down (as for containers), no
         // communication was possible.
         for nothing in [vec![], vec![down(other)]] {
-            let mut none = Held::of(nothing, true);
-            assert!(matches!(none.see(&both[..1])[..], [.., Finding::Void(_)]));
+            let mut none = HeldInterfaces::of(nothing, true);
+            assert!(matches!(
+                none.see(&both[..1])[..],
+                [.., InterfaceFinding::Void(_)]
+            ));
         }
     }
 }

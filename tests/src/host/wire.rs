@@ -25,7 +25,7 @@ use nix::{
 
 /// The effect of a wire on frames, in each direction.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct Wire {
+pub struct WireEffect {
     /// The share of lost frames, 0 to 1.
     pub loss: f64,
     /// The delay of a frame.
@@ -34,7 +34,7 @@ pub struct Wire {
 
 /// Orders to a wire that carries frames.
 #[derive(Debug, Default)]
-pub(super) struct Orders {
+pub(super) struct WireOrders {
     pub(super) end: AtomicBool,
     pub(super) cut: AtomicBool,
 }
@@ -44,9 +44,9 @@ const LOOK_UP: Duration = Duration::from_millis(50);
 /// Buffer size of a packet socket, for bursts.
 const ROOM: usize = 64 << 20;
 
-impl Wire {
+impl WireEffect {
     /// Carries frames between two interfaces of this thread's network until the orders end it.
-    pub(super) fn carry(self, ends: [&str; 2], orders: &Orders) {
+    pub(super) fn carry(self, ends: [&str; 2], orders: &WireOrders) {
         let sockets = ends.map(packet_socket);
         let mut directions = [
             Direction::new(self, 0x2545_f491),
@@ -76,13 +76,13 @@ impl Wire {
 }
 
 struct Direction {
-    wire: Wire,
+    wire: WireEffect,
     random: u64,
     under_way: VecDeque<(Instant, Vec<u8>)>,
 }
 
 impl Direction {
-    fn new(wire: Wire, seed: u64) -> Self {
+    fn new(wire: WireEffect, seed: u64) -> Self {
         Self {
             wire,
             random: seed,
@@ -212,7 +212,7 @@ mod tests {
 
     #[test]
     fn a_lossy_wire_loses_about_its_share_and_the_same_frames_each_time() {
-        let wire = Wire {
+        let wire = WireEffect {
             loss: 0.05,
             delay: Duration::ZERO,
         };

@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use system_tests::{Cell, Child, Distribution, Peer, Started, eventually, program};
+use system_tests::{Cell, Child, Distribution, Peer, StartedChild, eventually, program};
 
 /// The time that rospy and rclpy need to start on a busy machine.
 const SOON: Duration = Duration::from_secs(60);
@@ -34,7 +34,7 @@ impl Command {
     }
 
     /// Returns the program in its environment and in the folder with the files.
-    fn started(&self, cell: &Cell) -> Started {
+    fn started(&self, cell: &Cell) -> StartedChild {
         let (name, args) = self.words.split_first().unwrap();
         let ros1 = self.place.starts_with("ROS 1");
         let python = match &self.place[..] {
@@ -46,7 +46,7 @@ impl Command {
             "python3" => python,
             name => program(name),
         };
-        let started = Started::new(&self.words.join(" "), &program)
+        let started = StartedChild::new(&self.words.join(" "), &program)
             .args(args)
             .in_folder(cell.folder())
             .env("HOME", cell.folder())

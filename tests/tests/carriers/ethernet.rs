@@ -5,7 +5,7 @@ use std::os::fd::AsRawFd as _;
 use nix::ifaddrs::getifaddrs;
 use serde_json::Value;
 use socket2::{Domain, Socket, Type};
-use system_tests::{Started, Wire, program};
+use system_tests::{StartedChild, WireEffect, program};
 use transport::{Ethernet, EthernetOptions, VlanTag};
 
 use super::*;
@@ -243,14 +243,14 @@ fn a_text_of_many_frames_crosses_between_hosts_by_ethernet_alone() {
     let Some(cell) = Cell::with(&[Peer::Ros1, Peer::Python]) else {
         return;
     };
-    let host = cell.host(Wire {
+    let host = cell.host(WireEffect {
         loss: 0.0,
         delay: Duration::from_millis(1),
     });
     let _master = cell.roscore();
     let text = format!("pubsub: {{eth: {{interface: {WIRE}}}}}\nspaces: [{{id: 1}}, {{id: 2}}]\n");
     let mapping = cell.file("ethernet.yaml", &text).display().to_string();
-    let bridge = |name: &str| Started::new(name, &program(name)).args([&mapping[..]]);
+    let bridge = |name: &str| StartedChild::new(name, &program(name)).args([&mapping[..]]);
     let _ros1 = cell.with_ros1(bridge("bridge-ros1")).start();
     let _ros2 = bridge("bridge-ros2")
         .args(["--domain", "2"])

@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use serde_json::{Value, json};
-use system_tests::{Cell, Child, Peer, Started, eventually, group_member, metrics, program};
+use system_tests::{Cell, Child, Peer, StartedChild, eventually, group_member, metrics, program};
 
 use super::{LDS, MDNS, SOON, STATUS, list, now, on_network, registered, told, who};
 
@@ -105,7 +105,7 @@ fn a_clock_that_jumps_loses_nobody_restarts_nobody_and_ends_no_subscription() {
         return;
     };
     let clock = cell.wall_clock();
-    let lds = Started::new("ua-lds", &program("ua-lds"))
+    let lds = StartedChild::new("ua-lds", &program("ua-lds"))
         .args(["--metrics", STATUS])
         .by(&clock)
         .start();
@@ -115,7 +115,7 @@ fn a_clock_that_jumps_loses_nobody_restarts_nobody_and_ends_no_subscription() {
         "gripper.yaml",
         &text.replace("urn:example:gripper", GRIPPER_URI),
     );
-    let gripper = Started::new("ua-component", &program("ua-component"))
+    let gripper = StartedChild::new("ua-component", &program("ua-component"))
         .args([&yaml])
         .args(["--interface", "lo", "--endpoint", ENDPOINT])
         .by(&clock)

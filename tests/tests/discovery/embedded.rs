@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use nix::sys::signal::Signal;
 use serde_json::{Value, json};
-use system_tests::{Cell, Child, Peer, Started, eventually, program};
+use system_tests::{Cell, Child, Peer, StartedChild, eventually, program};
 
 use super::{Greeter, LDS, SOON, lds, list, told, who};
 
@@ -16,7 +16,7 @@ const TAKES_OVER: &str = "no discovery server runs: this program is the discover
 
 fn component(yaml: &str) -> Child {
     let example = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../examples/plant");
-    Started::new(yaml, &program("ua-component"))
+    StartedChild::new(yaml, &program("ua-component"))
         .args([example.join(yaml)])
         .args(["--interface", "lo", "--lds", "embed"])
         .start()
@@ -136,7 +136,7 @@ fn nobody_embeds_a_discovery_server_beside_one_and_it_says_who_does() {
     let lines = listed(&cell, "both are listed", SOON, &[GRIPPER, ROBOT]);
     assert!(embeds(&gripper) != embeds(&robot), "{gripper} {robot}");
     let name = called(&lines);
-    let mut late = Started::new("ua-lds", &program("ua-lds")).start();
+    let mut late = StartedChild::new("ua-lds", &program("ua-lds")).start();
     let why = late.wait_for_line("cannot listen at", SOON);
     assert!(why.contains(&name) && why.contains("--endpoint"), "{why}");
     assert_eq!(late.wait_for_end(SOON).code(), Some(69));

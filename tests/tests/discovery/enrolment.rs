@@ -7,7 +7,7 @@ use std::process::Command;
 use std::time::Duration;
 
 use serde_json::{Value, json};
-use system_tests::{Cell, Child, Peer, Started, eventually, metrics, program};
+use system_tests::{Cell, Child, Peer, StartedChild, eventually, metrics, program};
 
 use super::{LDS, STATUS, registered};
 
@@ -30,7 +30,7 @@ impl Site {
         let pki = cell.folder().join("gds").to_str().unwrap().to_owned();
         let of_store = ["--pki", &pki];
         run(&[&["ca", "init", "--name", "Cell authority"], &of_store[..]].concat());
-        let gds = Started::new("ua-gds", &program("ua-gds"))
+        let gds = StartedChild::new("ua-gds", &program("ua-gds"))
             .args(["--endpoint", GDS])
             .args(of_store)
             .start();
@@ -86,7 +86,7 @@ fn component(site: &Site, invitation: &str) -> Child {
     assert_ne!(text, secured);
     let file = site.cell.file("parallel-gripper.yaml", &secured);
     let invitation = site.cell.file("invitation", invitation);
-    Started::new("ua-component", &program("ua-component"))
+    StartedChild::new("ua-component", &program("ua-component"))
         .args([&file])
         .args(["--lds", "opc.tcp://127.0.0.1:4850", "--interface", "lo"])
         .args(["--metrics", COMPONENT_STATUS])
@@ -99,7 +99,7 @@ fn component(site: &Site, invitation: &str) -> Child {
 fn station(site: &Site) -> Child {
     let invitation = site.invitation("nobody");
     let (pinned, _token) = invitation.split_once(",token=").unwrap();
-    Started::new("ua-station", &program("ua-station"))
+    StartedChild::new("ua-station", &program("ua-station"))
         .args(["--name", "station-a", "--interface", "lo"])
         .args(["--endpoint", "opc.tcp://127.0.0.1:4850"])
         .args(["--upper-interface", "lo", "--upper-lds", LDS])
@@ -115,7 +115,7 @@ fn programs_that_are_invited_trust_one_another_and_others_wait_for_an_administra
         return;
     };
     let site = Site::start(cell);
-    let lds = Started::new("ua-lds", &program("ua-lds"))
+    let lds = StartedChild::new("ua-lds", &program("ua-lds"))
         .args(["--metrics", STATUS, "--secured-only"])
         .args(["--pki", &site.store("lds-pki")])
         .env("UA_GDS", site.invitation("UA bridge discovery server"))

@@ -7,7 +7,7 @@ use std::process::{Command, Output};
 use std::time::Duration;
 
 use serde_json::{Value, json};
-use system_tests::{Cell, Child, Peer, Started, eventually, program};
+use system_tests::{Cell, Child, Peer, StartedChild, eventually, program};
 
 use super::SOON;
 
@@ -44,7 +44,7 @@ fn site() -> Option<Site> {
             .unwrap();
         assert!(made.status.success(), "{made:?}");
     }
-    let gds = Started::new("ua-gds", &program("ua-gds"))
+    let gds = StartedChild::new("ua-gds", &program("ua-gds"))
         .args(["--endpoint", GDS, "--pki", pki])
         .start();
     eventually("the server answers clients", SOON, || {

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use nix::sys::signal::Signal;
 use serde_json::{Value, json};
 use system_tests::{
-    Capture, Cell, Child, Peer, Segment, Site, Started, eventually, metrics, program,
+    CaptureFile, Cell, Child, Peer, PlantSite, Segment, StartedChild, eventually, metrics, program,
 };
 
 use super::{MDNS, SOON, STATUS, list};
@@ -21,10 +21,10 @@ struct Plant {
     /// Keeps the network alive.
     _bus: Segment,
     /// For each workstation: the network, the station's host, and the hosts of its devices.
-    stations: [(Segment, Site, [Site; 2]); 2],
-    cell: Site,
+    stations: [(Segment, PlantSite, [PlantSite; 2]); 2],
+    cell: PlantSite,
     /// Sockets that receive all mDNS traffic on the bus and in each workstation.
-    ears: [(Site, UdpSocket); 3],
+    ears: [(PlantSite, UdpSocket); 3],
 }
 
 fn plant(cell: &Cell) -> Plant {
@@ -78,7 +78,7 @@ fn top(plant: &Plant) -> Child {
         "--interface",
         "bus0",
     ];
-    Started::new("cell", &program("ua-station"))
+    StartedChild::new("cell", &program("ua-station"))
         .args(args)
         .args([
             "--endpoint",
@@ -94,7 +94,7 @@ fn top(plant: &Plant) -> Child {
 fn station(plant: &Plant, at: usize, more: &[&str]) -> Child {
     let name = ["station-a", "station-b"][at];
     let endpoint = format!("opc.tcp://{}.1:4840", INSIDE[at]);
-    Started::new(name, &program("ua-station"))
+    StartedChild::new(name, &program("ua-station"))
         .args([
             "--name",
             name,
@@ -115,7 +115,7 @@ fn gripper(plant: &Plant, at: usize) -> Child {
     let example = std::path::Path::new(env!("CARGO_MANIFEST_DIR"))
         .join("../examples/plant/parallel-gripper.yaml");
     let endpoint = format!("opc.tcp://{}.21:0", INSIDE[at]);
-    Started::new("ua-component", &program("ua-component"))
+    StartedChild::new("ua-component", &program("ua-component"))
         .args([&example])
         .args([
             "--endpoint",
@@ -141,27 +141,27 @@ fn device(cell: &Cell, plant: &Plant, at: usize) -> Child {
 }
 
 /// Returns the status of a station.
-fn status(site: &Site) -> Option<Value> {
+fn status(site: &PlantSite) -> Option<Value> {
     site.within(|| metrics(STATUS))
 }
 
-fn below(site: &Site, name: &str) -> Option<Value> {
+fn below(site: &PlantSite, name: &str) -> Option<Value> {
     shown(site, "below", name)
 }
 
-fn shown(site: &Site, level: &str, name: &str) -> Option<Value> {
+fn shown(site: &PlantSite, level: &str, name: &str) -> Option<Value> {
     let status = status(site)?;
     let peers = status["level"][level].as_array()?;
     let of = |one: &&Value| one["server"]["name"] == name;
     peers.iter().find(of).map(|one| one["server"].clone())
 }
 
-fn place(site: &Site, name: &str) -> Option<String> {
+fn place(site: &PlantSite, name: &str) -> Option<String> {
     below(site, name)?["place"].as_str().map(str::to_owned)
 }
 
 /// Calls a method with asyncua from a site, and returns the answer.
-fn call(cell: &Cell, site: &Site, url: &str, path: &str, value: &str) -> Value {
+fn call(cell: &Cell, site: &PlantSite, url: &str, path: &str, value: &str) -> Value {
     let args = [url, path, "--value", value];
     let mut asked = cell
         .asyncua_started("opcua_call.py", &args)
@@ -172,14 +172,14 @@ fn call(cell: &Cell, site: &Site, url: &str, path: &str, value: &str) -> Value {
 }
 
 /// Returns the addresses in the mDNS records that an ear received.
-fn told(cell: &Cell, (_, ear): &(Site, UdpSocket)) -> BTreeSet<String> {
+fn told(cell: &Cell, (_, ear): &(PlantSite, UdpSocket)) -> BTreeSet<String> {
     let mut packets = Vec::new();
     let mut buffer = [0; 9000];
     while let Ok(length) = ear.recv(&mut buffer) {
         packets.push(buffer[..length].to_vec());
     }
     assert!(!packets.is_empty());
-    let lines = cell.fields(&Capture::of(packets).to_port(MDNS.port()), &["dns.a"]);
+    let lines = cell.fields(&CaptureFile::of(packets).to_port(MDNS.port()), &["dns.a"]);
     let addresses = lines.iter().flat_map(|line| line.split(','));
     addresses
         .filter(|address| !address.is_empty())
@@ -233,7 +233,7 @@ fn a_device_calls_a_device_of_another_workstation_and_no_level_sees_another() {
     are_configured(&plant, &mut adders);
     let [a, b] = [0, 1].map(|at| &plant.stations[at].1);
     eventually("each sees the other's devices", SOON, || {
-        let seen = |site: &Site, other| shown(site, "above", other)?["methods"].as_u64();
+        let seen = |site: &PlantSite, other| shown(site, "above", other)?["methods"].as_u64();
         let [on_a, on_b] = [seen(a, "station-b")?, seen(b, "station-a")?];
         (on_a > 10 && on_b > 10).then_some(())
     });
@@ -306,7 +306,7 @@ fn a_device_calls_a_device_of_another_workstation_and_no_level_sees_another() {
 const UPPER: &str = "opc.tcp://10.80.0.11:4870";
 
 /// Starts an asyncua client that calls a method and keeps its session until it is ordered to leave.
-fn holding(cell: &Cell, site: &Site, path: &str, value: &str) -> Child {
+fn holding(cell: &Cell, site: &PlantSite, path: &str, value: &str) -> Child {
     let args = [UPPER, path, "--value", value, "--hold", "--patience", "20"];
     let client = cell.asyncua_started("opcua_call.py", &args);
     client.at(site).told().start()
@@ -319,7 +319,7 @@ fn answer(client: &mut Child) -> Value {
 }
 
 /// Returns whether the discovery server of a level lists the server with this URI.
-fn listed(site: &Site, uri: &str) -> bool {
+fn listed(site: &PlantSite, uri: &str) -> bool {
     let status = status(site);
     let servers = status
         .as_ref()
@@ -478,7 +478,7 @@ fn operator(cell: &Cell, store: &str) {
 const PASSWORD: &str = "correct horse battery";
 
 /// Starts a `ua-component` gripper with secured channels only and a separate store.
-fn secured_gripper(cell: &Cell, site: &Site) -> Child {
+fn secured_gripper(cell: &Cell, site: &PlantSite) -> Child {
     let example = std::path::Path::new(env!("CARGO_MANIFEST_DIR"))
         .join("../examples/plant/parallel-gripper.yaml");
     let text = std::fs::read_to_string(example).unwrap();
@@ -486,7 +486,7 @@ fn secured_gripper(cell: &Cell, site: &Site) -> Child {
     let text = text.replace("security: [None]", "security: [Basic256Sha256]");
     let file = cell.file("parallel-gripper.yaml", &text);
     let endpoint = format!("opc.tcp://{}.21:0", INSIDE[0]);
-    Started::new("ua-component", &program("ua-component"))
+    StartedChild::new("ua-component", &program("ua-component"))
         .args([&file])
         .args(["--endpoint", &endpoint, "--lds", "any"])
         .args(["--interface", "dev0", "--pki"])
@@ -498,9 +498,9 @@ fn secured_gripper(cell: &Cell, site: &Site) -> Child {
 /// A workstation with secured channels only, and hosts above and below it.
 struct Guarded {
     _networks: [Segment; 2],
-    station: Site,
-    above: Site,
-    devices: [Site; 2],
+    station: PlantSite,
+    above: PlantSite,
+    devices: [PlantSite; 2],
     supervisor: Child,
     /// The folder with the key pairs of devices; most are issued by a trusted authority.
     pairs: String,
@@ -524,7 +524,7 @@ fn guarded(cell: &Cell) -> Guarded {
     }
     let lds = format!("opc.tcp://{}.1:4840", INSIDE[0]);
     let top = format!("opc.tcp://{BUS}.11:4870");
-    let supervisor = Started::new("station-a", &program("ua-station"))
+    let supervisor = StartedChild::new("station-a", &program("ua-station"))
         .args(["--name", "station-a", "--place", "plant/cell-1"])
         .args(["--endpoint", &lds, "--interface", "lower0"])
         .args(["--upper-interface", "upper0", "--upper-endpoint", &top])

@@ -5,8 +5,8 @@ use std::process::Command;
 use std::time::Duration;
 
 use nix::sys::signal::Signal;
-use skills::{ClientOptions, Runs as _, SkillClient, TypeName};
-use system_tests::{Cell, HERE, Peer, Started, THERE, eventually, metrics, program};
+use skills::{ClientOptions, ParameterType, RunnableSkill as _, SkillClient};
+use system_tests::{Cell, HERE, Peer, StartedChild, THERE, eventually, metrics, program};
 
 use super::{LDS, SOON, STATUS, list, on_network};
 
@@ -43,7 +43,9 @@ fn run_through_station() -> bool {
             let Ok(client) = SkillClient::connect(STATION, &ClientOptions::default()).await else {
                 continue;
             };
-            let found = client.skills_of(&TypeName::own("ReleaseSkillType")).await;
+            let found = client
+                .skills_of(&ParameterType::own("ReleaseSkillType"))
+                .await;
             if let Some(found) = found.unwrap_or_default().pop() {
                 assert_eq!(found.component, "far");
                 let outcome = client.handle(&found).run(Vec::new(), SOON).await.unwrap();
@@ -66,19 +68,19 @@ fn a_component_beyond_multicast_is_listed_and_run_while_the_gds_lists_it() {
     let (pki, url) = (store("gds"), format!("opc.tcp://{HERE}:4841"));
     administrator(&["ca", "init", "--name", "Cell authority"], &pki);
     let invited = |name: &str| administrator(&["invite", name, "--endpoint", &url], &pki);
-    let gds = Started::new("ua-gds", &program("ua-gds"))
+    let gds = StartedChild::new("ua-gds", &program("ua-gds"))
         .args(["--endpoint", &url, "--pki", &pki])
         .start();
     // The discovery servers know the certificate of the GDS, and have none of the plant.
     let invitation = invited("nobody");
     let (pinned, _token) = invitation.split_once(",token=").unwrap();
     let asks = ["--gds", pinned, "--gds-period", "1", "--interface", "lo"];
-    let _lds = Started::new("ua-lds", &program("ua-lds"))
+    let _lds = StartedChild::new("ua-lds", &program("ua-lds"))
         .args(asks)
         .args(["--gds-servers", "%", "--metrics", STATUS])
         .args(["--pki", &store("lds-pki")])
         .start();
-    let _station = Started::new("ua-station", &program("ua-station"))
+    let _station = StartedChild::new("ua-station", &program("ua-station"))
         .args([
             "--name",
             "station",
@@ -91,7 +93,7 @@ fn a_component_beyond_multicast_is_listed_and_run_while_the_gds_lists_it() {
         .args(["--gds-servers", "f%", "--pki", &store("station-pki")])
         .start();
     // mDNS of the component ends at its own host.
-    let _far = Started::new("ua-component", &program("ua-component"))
+    let _far = StartedChild::new("ua-component", &program("ua-component"))
         .args([cell.file("far.yaml", COMPONENT)])
         .args(["--endpoint", &format!("opc.tcp://{THERE}:4850")])
         .args(["--lds", "none", "--interface", "lo"])

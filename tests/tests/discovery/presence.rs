@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use nix::sys::signal::Signal;
 use serde_json::{Value, json};
-use system_tests::{Cell, Child, Distribution, Peer, Started, program};
+use system_tests::{Cell, Child, Distribution, Peer, StartedChild, program};
 
 use super::{SOON, now};
 
@@ -17,7 +17,7 @@ const ENDPOINT: &str = "opc.tcp://127.0.0.1:4841/";
 const TOPIC: &str = "ua_0_1_7";
 
 fn gripper(cell: &Cell) -> Child {
-    Started::new("ua-component", &program("ua-component"))
+    StartedChild::new("ua-component", &program("ua-component"))
         .args([GRIPPER, "--interface", "lo", "--lds", "none"])
         .args(["--pki".into(), cell.folder().join("gripper-pki")])
         .start()

@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use serde_json::{Value, json};
 use system_tests::{
-    Capture, Cell, Child, Peer, Started, UadpSocket, eventually, group_member, program,
+    CaptureFile, Cell, Child, Peer, StartedChild, UadpSocket, eventually, group_member, program,
 };
 
 use super::{MDNS, SOON};
@@ -20,7 +20,7 @@ const TWIST: &str = "geometry_msgs/Twist";
 const OTHER_GROUP: &str = "239.192.0.41:4840";
 
 fn list(words: &[&str]) -> Vec<String> {
-    let mut child = Started::new("ua-space", &program("ua-space"))
+    let mut child = StartedChild::new("ua-space", &program("ua-space"))
         .args(["list", "--seconds", "1.5", "--interface", "lo"])
         .args(words)
         .start();
@@ -70,7 +70,7 @@ fn the_whole_space_is_listed_without_configuration_and_tshark_reads_what_was_sai
     let _core = cell.roscore();
     let mut bridge = cell.bridge_ros1(&[]);
     let _server = cell.ua_server(&["--endpoint", ENDPOINT, "--announce"]);
-    let _gripper = Started::new("ua-component", &program("ua-component"))
+    let _gripper = StartedChild::new("ua-component", &program("ua-component"))
         .args([GRIPPER, "--interface", "lo", "--lds", "none"])
         .args(["--pki".into(), cell.folder().join("gripper-pki")])
         .start();
@@ -116,7 +116,7 @@ fn the_whole_space_is_listed_without_configuration_and_tshark_reads_what_was_sai
     assert!(only[0].starts_with("TOPIC") && !only.iter().any(|line| line.starts_with("KIND")));
 
     let said = group.receive_for(Duration::from_millis(200));
-    let words = cell.columns(&Capture::of(said), &[]);
+    let words = cell.columns(&CaptureFile::of(said), &[]);
     for part in [
         "FindApplications",
         "Application information: Application description",
@@ -163,7 +163,7 @@ fn packets_until(cell: &Cell, socket: &UdpSocket, is_it: impl Fn(&str) -> bool) 
         if packets.is_empty() {
             return None;
         }
-        let lines = cell.fields(&Capture::of(packets).to_port(MDNS.port()), &fields);
+        let lines = cell.fields(&CaptureFile::of(packets).to_port(MDNS.port()), &fields);
         seen.extend(lines);
         if !seen.iter().any(|line| is_it(line)) {
             eprintln!("{seen:#?}");

@@ -6,9 +6,11 @@ use std::time::Duration;
 
 use nix::sys::signal::Signal;
 use serde_json::{Value, json};
-use skills::{ClientOptions, Detector, FoundSkill, Runs as _, SkillClient, SkillFault, TypeName};
+use skills::{
+    ClientOptions, Detector, FoundSkill, ParameterType, RunnableSkill as _, SkillClient, SkillFault,
+};
 use system_tests::{
-    Cell, Child, Peer, Segment, Site, Started, eventually, http_get, metrics, program,
+    Cell, Child, Peer, PlantSite, Segment, StartedChild, eventually, http_get, metrics, program,
 };
 
 use super::{SOON, STATUS};
@@ -22,9 +24,9 @@ const GRIPPER: &str = "urn:ua-bridge:system-tests:gripper";
 struct Tower {
     /// Keep the networks alive.
     _levels: [Segment; 3],
-    stations: [Site; 2],
-    devices: [Site; 2],
-    client: Site,
+    stations: [PlantSite; 2],
+    devices: [PlantSite; 2],
+    client: PlantSite,
 }
 
 fn tower(cell: &Cell) -> Tower {
@@ -52,7 +54,7 @@ fn tower(cell: &Cell) -> Tower {
 
 fn station(tower: &Tower, at: usize) -> Child {
     let name = ["station-low", "station-high"][at];
-    Started::new(name, &program("ua-station"))
+    StartedChild::new(name, &program("ua-station"))
         .args(["--name", name, "--interface", "lower0"])
         .args(["--endpoint", &format!("opc.tcp://{}.1:4840", LEVELS[at])])
         .args(["--upper-interface", "upper0"])
@@ -88,9 +90,9 @@ fn gripper(cell: &Cell) -> PathBuf {
     cell.file("gripper.yaml", &yaml)
 }
 
-fn component(file: &Path, site: &Site, last: u8) -> Child {
+fn component(file: &Path, site: &PlantSite, last: u8) -> Child {
     let endpoint = format!("opc.tcp://{}.{last}:4850", LEVELS[0]);
-    Started::new("ua-component", &program("ua-component"))
+    StartedChild::new("ua-component", &program("ua-component"))
         .args([file])
         .args([
             "--endpoint",
@@ -117,7 +119,7 @@ fn on_top<T: Send>(tower: &Tower, what: impl AsyncFnOnce() -> T + Send) -> T {
 async fn found(client: &SkillClient, of: &str) -> FoundSkill {
     let limit = tokio::time::Instant::now() + SOON;
     loop {
-        let mut found = client.skills_of(&TypeName::own(of)).await.unwrap();
+        let mut found = client.skills_of(&ParameterType::own(of)).await.unwrap();
         if let Some(found) = found.pop() {
             return found;
         }
@@ -136,7 +138,7 @@ async fn connected() -> SkillClient {
     }
 }
 
-fn to(x: f64) -> Vec<(String, skills::Value)> {
+fn to(x: f64) -> Vec<(String, skills::SkillValue)> {
     vec![(
         "TargetPosition".to_owned(),
         [x, 0.2, 0.3, 0.0, 0.0, 0.0].into(),
@@ -144,7 +146,7 @@ fn to(x: f64) -> Vec<(String, skills::Value)> {
 }
 
 /// A move that takes a minute.
-fn slowly(x: f64) -> Vec<(String, skills::Value)> {
+fn slowly(x: f64) -> Vec<(String, skills::SkillValue)> {
     let slow = [("MaxVelocity".to_owned(), 0.01.into())];
     to(x).into_iter().chain(slow).collect()
 }
@@ -285,11 +287,13 @@ fn a_detector_follows_components_that_come_and_go_behind_two_stations() {
         let found = until(&detector, &[GRIPPER, ROBOT]).await;
         // Each component behind the station has an endpoint of its own.
         assert_eq!(found[0].1, format!("{}#{GRIPPER}", upper(1)));
-        let of = detector.of_type(&TypeName::own("GraspSkillType"));
+        let of = detector.of_type(&ParameterType::own("GraspSkillType"));
         let (client, handle) = detector.open(&of[0]).await.unwrap();
         let outcome = handle.run(Vec::new(), SOON).await.unwrap();
         assert!(outcome.succeeded, "{outcome:?}");
-        let moves = client.skills_of(&TypeName::own("MotionSkillType")).await;
+        let moves = client
+            .skills_of(&ParameterType::own("MotionSkillType"))
+            .await;
         assert_eq!(moves.unwrap(), [], "another component of the station");
         client.close().await;
         gripper.signal(Signal::SIGKILL);
@@ -314,8 +318,8 @@ fn a_composite_uses_a_robot_of_another_workstation_and_is_run_from_the_cell() {
         inside.plug(&device, "dev0", &format!("{}.21", below[at]));
         (inside, site, device)
     });
-    let started = |name: &str, args: &[&str], site: &Site| {
-        Started::new(name, &program("ua-station"))
+    let started = |name: &str, args: &[&str], site: &PlantSite| {
+        StartedChild::new(name, &program("ua-station"))
             .args(["--name", name, "--allow-unsecured", "--metrics", STATUS])
             .args(args)
             .at(site)
@@ -348,7 +352,7 @@ fn a_composite_uses_a_robot_of_another_workstation_and_is_run_from_the_cell() {
     });
     let serve = |name: &str, at: usize, port: u16, yaml: &str| {
         let endpoint = format!("opc.tcp://{}.21:{port}", below[at]);
-        Started::new(name, &program("ua-component"))
+        StartedChild::new(name, &program("ua-component"))
             .args([cell.file(&format!("{name}.yaml"), yaml)])
             .args([
                 "--endpoint",
@@ -395,7 +399,7 @@ fn a_composite_uses_a_robot_of_another_workstation_and_is_run_from_the_cell() {
             let place = found(&client, "PickAndPlaceSkillType").await;
             assert_eq!(place.component, "handling");
             let handle = client.handle(&place);
-            let six = |y: f64| skills::Value::from([0.4, y, 0.1, 0.0, 0.0, 0.0]);
+            let six = |y: f64| skills::SkillValue::from([0.4, y, 0.1, 0.0, 0.0, 0.0]);
             let given = vec![
                 ("PickPosition".to_owned(), six(0.2)),
                 ("PlacePosition".to_owned(), six(-0.2)),
@@ -445,7 +449,7 @@ processes:
 ",
         top = LEVELS[2]
     );
-    let _mes = Started::new("ua-mes", &program("ua-mes"))
+    let _mes = StartedChild::new("ua-mes", &program("ua-mes"))
         .args([cell.file("mes.yaml", &yaml)])
         .args(["--interface", "top0", "--lds", "none", "--run", PROCESS])
         .at(&tower.client)

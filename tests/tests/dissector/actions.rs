@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use system_tests::{Capture, Cell, Peer};
+use system_tests::{CaptureFile, Cell, Peer};
 use uadp::action::ActionDialect;
 use uadp::{NetworkMessage, PublisherId, SecurityHeader, discovery};
 
@@ -44,7 +44,7 @@ fn a_request_and_its_response_are_shown_field_by_field() {
         "idle",
         "signed_header",
     ];
-    let shown = cell.dissect(&Capture::of(names.map(vector)), &[]);
+    let shown = cell.dissect(&CaptureFile::of(names.map(vector)), &[]);
     for (shown, name) in shown.iter().zip(names) {
         assert!(!shown.has("uadp.dissector_bug"), "{name}");
         assert!(
@@ -106,7 +106,7 @@ fn one_shot_actions_are_shown_on_demand() {
     let Some(cell) = Cell::with(&[Peer::Tshark]) else {
         return;
     };
-    let capture = Capture::of([vector("netstandard_request")]);
+    let capture = CaptureFile::of([vector("netstandard_request")]);
     let shown = cell.dissect(&capture, &["-o", "uadp.one_shot_actions:TRUE"]);
     assert!(
         !shown[0].has("uadp.malformed"),
@@ -143,7 +143,7 @@ fn what_our_reader_refuses_of_an_action_is_malformed() {
             }
         }
     }
-    let shown = cell.dissect(&Capture::of(datagrams.clone()), &[]);
+    let shown = cell.dissect(&CaptureFile::of(datagrams.clone()), &[]);
     let mut counts = [0, 0];
     for (datagram, shown) in datagrams.iter().zip(&shown) {
         assert!(!shown.has("uadp.dissector_bug"), "{datagram:02x?}");
@@ -206,14 +206,14 @@ fn an_announced_action_is_shown_with_its_targets_and_metadata() {
     };
     let action = discovery::ActionMetaData {
         writer_id: 61,
-        action_targets: discovery::List::new(&targets),
+        action_targets: discovery::WireArray::new(&targets),
         request: meta_data,
         response: meta_data,
         ..discovery::ActionMetaData::default()
     };
     let announcement = discovery::Announcement {
         sequence_number: 3,
-        announced: discovery::Announced::ActionMetaData(action),
+        announced: discovery::AnnouncedContent::ActionMetaData(action),
     };
     let mut datagram = Vec::new();
     announcement

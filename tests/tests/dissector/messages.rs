@@ -1,17 +1,17 @@
 //! Messages written by this project's own encoder.
 
-use system_tests::{Capture, Cell, Dissected, Peer, hex};
+use system_tests::{CaptureFile, Cell, Dissected, Peer, hex};
 use uadp::{
-    Array, BuiltinType, DataSetHeader, DataValue, DateTime, DiagnosticInfo, Encoded,
-    ExpandedNodeId, ExtensionBody, ExtensionObject, Extras, FieldEncoder, GroupHeader, Guid,
-    LocalizedText, Matrix, NetworkHeader, NetworkMessageEncoder, NodeId, PublisherId,
-    QualifiedName, Scalar, StatusCode, Variant,
+    Array, BuiltinType, DataSetHeader, DataValue, DateTime, DiagnosticInfo, ExpandedNodeId,
+    ExtensionBody, ExtensionObject, Extras, FieldEncoder, GroupHeader, Guid, LocalizedText, Matrix,
+    Nested, NetworkHeader, NetworkMessageEncoder, NodeId, PublisherId, QualifiedName, Scalar,
+    StatusCode, Variant,
 };
 
 use crate::dissector::{
     dissected,
     time::ticks,
-    vectors::{Vector, unhex},
+    vectors::{DissectorVector, unhex},
 };
 
 const NOON: DateTime = DateTime(134_234_948_967_890_123);
@@ -168,7 +168,7 @@ fn all_types_of_publisher_ids_are_shown_and_only_numbers_name_a_topic() {
         encoder.finish().unwrap();
         datagram
     });
-    let capture = Capture::of(datagrams);
+    let capture = CaptureFile::of(datagrams);
     let shown = cell.dissect(&capture, &[]);
     let numbers = ["2", "65535", "70000", "18446744073709551615"];
     for (shown, id) in shown.iter().zip(numbers) {
@@ -212,7 +212,7 @@ fn the_info_column_tells_kinds_sequence_numbers_and_fields() {
     encoder.keep_alive(&numbered(9)).unwrap();
     encoder.finish().unwrap();
 
-    let capture = Capture::of([two_fields, delta, event, several]);
+    let capture = CaptureFile::of([two_fields, delta, event, several]);
     assert_eq!(
         cell.columns(&capture, &[]),
         [
@@ -353,11 +353,11 @@ fn values_in_values_are_shown_below_them() {
     };
     let (mut variant, mut value, mut diagnostic) = (Vec::new(), Vec::new(), Vec::new());
     let datagram = key_frame(|fields| {
-        let encoded = Encoded::data_value(&data_value, &mut value).unwrap();
+        let encoded = Nested::data_value(&data_value, &mut value).unwrap();
         fields.scalar(Scalar::DataValue(encoded)).unwrap();
-        let encoded = Encoded::diagnostic_info(&diagnostic_info, &mut diagnostic).unwrap();
+        let encoded = Nested::diagnostic_info(&diagnostic_info, &mut diagnostic).unwrap();
         fields.scalar(Scalar::DiagnosticInfo(encoded)).unwrap();
-        let encoded = Encoded::variant(&inner, &mut variant).unwrap();
+        let encoded = Nested::variant(&inner, &mut variant).unwrap();
         let nested = Array::new(BuiltinType::Variant, 1, encoded.bytes()).unwrap();
         fields.variant(&nested.into()).unwrap();
     });
@@ -480,7 +480,7 @@ fn padding_and_raw_data_are_bytes() {
         fields.scalar(Scalar::Int32(7)).unwrap();
         fields.finish().unwrap();
     });
-    let shown = cell.dissect(&Capture::of([padded, raw, too_long]), &[]);
+    let shown = cell.dissect(&CaptureFile::of([padded, raw, too_long]), &[]);
     assert_shown(
         &shown[0],
         &[("field.int32", "7"), ("dataset.padding", "00:00:00:00")],
@@ -501,9 +501,9 @@ fn a_signed_payload_is_read_and_an_encrypted_one_is_not() {
     let Some(cell) = Cell::with(&[Peer::Tshark]) else {
         return;
     };
-    let signed = Vector::load("wire_sign_aes128").datagram;
-    let encrypted = Vector::load("wire_encrypt_aes128_r0").datagram;
-    let capture = Capture::of([signed.clone(), encrypted]);
+    let signed = DissectorVector::load("wire_sign_aes128").datagram;
+    let encrypted = DissectorVector::load("wire_encrypt_aes128_r0").datagram;
+    let capture = CaptureFile::of([signed.clone(), encrypted]);
     let shown = cell.dissect(&capture, &[]);
     assert_shown(
         &shown[0],
@@ -532,8 +532,8 @@ fn chunks_in_any_order_become_one_message() {
     let Some(cell) = Cell::with(&[Peer::Tshark]) else {
         return;
     };
-    let chunk = |number| Vector::load(&format!("composite_chunk_{number}")).datagram;
-    let capture = Capture::of([chunk(1), chunk(2), chunk(1), chunk(0)]);
+    let chunk = |number| DissectorVector::load(&format!("composite_chunk_{number}")).datagram;
+    let capture = CaptureFile::of([chunk(1), chunk(2), chunk(1), chunk(0)]);
     let expected: Vec<u8> = (0_u16..600).map(|i| (i * 3).to_le_bytes()[0]).collect();
     // In the first pass of tshark, and in the second pass over the same packets.
     for passes in [&[][..], &["-2"]] {
@@ -567,8 +567,8 @@ fn chunks_are_left_alone_when_told_so_or_when_one_is_missing() {
     let Some(cell) = Cell::with(&[Peer::Tshark]) else {
         return;
     };
-    let chunk = |number| Vector::load(&format!("composite_chunk_{number}")).datagram;
-    let all = Capture::of([chunk(0), chunk(1), chunk(2)]);
+    let chunk = |number| DissectorVector::load(&format!("composite_chunk_{number}")).datagram;
+    let all = CaptureFile::of([chunk(0), chunk(1), chunk(2)]);
     let shown = cell.dissect(&all, &["-o", "uadp.reassemble:FALSE"]);
     assert!(shown.iter().all(|shown| !shown.has("uadp.dataset")));
     let shown = cell.dissect(&all, &["-o", "uadp.max_total:609"]);
@@ -577,7 +577,7 @@ fn chunks_are_left_alone_when_told_so_or_when_one_is_missing() {
             .iter()
             .all(|shown| shown.has("uadp.chunk.not_reassembled"))
     );
-    let shown = cell.dissect(&Capture::of([chunk(0), chunk(2)]), &[]);
+    let shown = cell.dissect(&CaptureFile::of([chunk(0), chunk(2)]), &[]);
     assert!(shown.iter().all(|shown| !shown.has("uadp.dataset")));
 }
 
@@ -586,7 +586,7 @@ fn an_announcement_names_its_fields_chunked_or_not() {
     let Some(cell) = Cell::with(&[Peer::Tshark]) else {
         return;
     };
-    let whole = Vector::load("composite_announce_metadata").datagram;
+    let whole = DissectorVector::load("composite_announce_metadata").datagram;
     let (head, body) = whole.split_at(11);
     let chunks = body.chunks(100).enumerate().map(|(number, piece)| {
         let mut datagram = head.to_vec();
@@ -598,7 +598,10 @@ fn an_announcement_names_its_fields_chunked_or_not() {
         datagram.extend(piece);
         datagram
     });
-    let shown = cell.dissect(&Capture::of([whole.clone()].into_iter().chain(chunks)), &[]);
+    let shown = cell.dissect(
+        &CaptureFile::of([whole.clone()].into_iter().chain(chunks)),
+        &[],
+    );
     for shown in [shown.first().unwrap(), shown.last().unwrap()] {
         assert_shown(
             shown,
@@ -671,7 +674,7 @@ fn other_ports_are_taken_when_told_or_when_nothing_but_uadp_fits() {
     let good = key_frame(|fields| fields.scalar(Scalar::Int32(7)).unwrap());
     let mut trailing = good.clone();
     trailing.push(1);
-    let capture = Capture::of([good, trailing, vec![0xF1; 40]]).to_port(4999);
+    let capture = CaptureFile::of([good, trailing, vec![0xF1; 40]]).to_port(4999);
     let taken = |args: &[&str]| -> Vec<bool> {
         let shown = cell.dissect(&capture, args);
         shown.iter().map(|shown| shown.has("uadp.flags")).collect()
@@ -688,7 +691,7 @@ fn values_are_found_by_filters() {
         return;
     };
     let value = |value: f64| key_frame(|fields| fields.scalar(Scalar::Double(value)).unwrap());
-    let capture = Capture::of([value(0.5), value(2.5), value(-1.0)]);
+    let capture = CaptureFile::of([value(0.5), value(2.5), value(-1.0)]);
     for (filter, hits) in [
         ("uadp.field.double > 0.6", 1),
         ("uadp.topic == \"ua_2_5_10\" && uadp.publisher_id == 2", 3),

@@ -1,16 +1,16 @@
 //! Messages secured and split by this project's own writers.
 
-use system_tests::{Capture, Cell, Peer, hex};
+use system_tests::{CaptureFile, Cell, Peer, hex};
 use uadp::{
-    ChunkBudget, Chunks, Extras, Keys, NetworkMessage, NetworkMessageEncoder, NetworkMessageType,
-    Scalar, Sealer, SecurityMode, SecurityPolicy, Whole,
+    ChunkBudget, ChunkEncoder, Extras, NetworkMessage, NetworkMessageEncoder, NetworkMessageType,
+    Scalar, Sealer, SecurityMode, SecurityPolicy, TokenKeys, Whole,
 };
 
 use crate::dissector::messages::{assert_shown, header, key_frame, numbered};
 
 fn sealer(mode: SecurityMode) -> Sealer {
     let policy = SecurityPolicy::PubSubAes256Ctr;
-    let keys = Keys::from_bytes(policy, &[7; 68]).unwrap();
+    let keys = TokenKeys::from_bytes(policy, &[7; 68]).unwrap();
     let mut sealer = Sealer::new(mode);
     sealer.update_keys(3, [keys]).unwrap();
     sealer
@@ -42,7 +42,7 @@ fn the_headers_of_what_we_seal_are_shown_and_the_payload_if_it_is_only_signed() 
     let mut encrypting = sealer(SecurityMode::SignAndEncrypt);
     let encrypted = [sealed(&mut encrypting), sealed(&mut encrypting)];
     let [first, second] = encrypted;
-    let shown = cell.dissect(&Capture::of([signed.clone(), first, second]), &[]);
+    let shown = cell.dissect(&CaptureFile::of([signed.clone(), first, second]), &[]);
     let headers = [
         ("topic", "ua_2_5_10"),
         ("security.token_id", "3"),
@@ -90,13 +90,13 @@ fn the_chunks_we_send_become_the_message_they_were() {
     };
     let network = header(2, 5);
     let extras = Extras::default();
-    let mut chunks = Chunks::new(&network, &extras, whole, ChunkBudget::IPV4).unwrap();
+    let mut chunks = ChunkEncoder::new(&network, &extras, whole, ChunkBudget::IPV4).unwrap();
     let (mut buffer, mut datagrams) = (Vec::new(), Vec::new());
     while let Some(chunk) = chunks.append(&mut buffer, &extras) {
         datagrams.push(buffer.split_off(chunk.unwrap().start));
     }
     assert_eq!(datagrams.len(), 3);
-    let shown = cell.dissect(&Capture::of(datagrams), &[]);
+    let shown = cell.dissect(&CaptureFile::of(datagrams), &[]);
     assert_eq!(shown[1].all("uadp.chunk.offset").len(), 1);
     assert_shown(
         &shown[2],

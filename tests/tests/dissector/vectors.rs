@@ -9,13 +9,13 @@ use uadp::{BuiltinType, NetworkMessage};
 use crate::dissector::time::ticks;
 
 /// A datagram with its description, both from `uadp/tests/vectors`.
-pub(crate) struct Vector {
+pub(crate) struct DissectorVector {
     pub(crate) name: String,
     pub(crate) datagram: Vec<u8>,
     pub(crate) json: Value,
 }
 
-impl Vector {
+impl DissectorVector {
     pub(crate) fn load(name: &str) -> Self {
         let digits = read(&format!("{name}.hex"));
         Self {
@@ -211,7 +211,7 @@ impl Check<'_> {
         self.same(field, &shown.all(field), &expected);
     }
 
-    fn encrypted(&mut self, vector: &Vector, shown: &Dissected) {
+    fn encrypted(&mut self, vector: &DissectorVector, shown: &Dissected) {
         let at = |key: &str| -> usize {
             let security = &vector.json["security"];
             security[key].as_u64().unwrap().try_into().unwrap()
@@ -294,7 +294,7 @@ impl Check<'_> {
         }
     }
 
-    fn messages(&mut self, vector: &Vector, shown: &Dissected) {
+    fn messages(&mut self, vector: &DissectorVector, shown: &Dissected) {
         let expected = vector.json["dataSetMessages"].as_array();
         let expected: Vec<&Value> = expected.into_iter().flatten().collect();
         // A reassembled message is described by its chunks and has no description itself.

@@ -1,13 +1,13 @@
 //! Invalid datagrams: the reported error and its byte, and that no datagram makes the dissector
 //! fail.
 
-use system_tests::{Capture, Cell, Dissected, Peer};
+use system_tests::{CaptureFile, Cell, Dissected, Peer};
 use uadp::{DecodeError, MessageKind, NetworkMessage, NetworkMessageType, Scalar};
 
 use crate::dissector::{
     dissected,
     messages::key_frame,
-    vectors::{Vector, unhex},
+    vectors::{DissectorVector, unhex},
 };
 
 /// PublisherId UInt16 2, WriterGroupId 5, DataSetWriterId 10: 10 bytes.
@@ -156,7 +156,7 @@ fn what_is_wrong_is_said_at_its_byte() {
     let Some(cell) = Cell::with(&[Peer::Tshark]) else {
         return;
     };
-    let capture = Capture::of(WRONG.iter().map(|(digits, ..)| datagram(digits)));
+    let capture = CaptureFile::of(WRONG.iter().map(|(digits, ..)| datagram(digits)));
     for (shown, (digits, at, why)) in cell.dissect(&capture, &[]).iter().zip(WRONG) {
         let said = shown.expert_infos();
         let expected = format!("At byte {at}: {why}");
@@ -195,12 +195,12 @@ fn a_datagram_cut_by_who_captured_it_is_not_called_malformed() {
         "wire_sign_aes128",
         "composite_announce_metadata",
     ];
-    let vectors = vectors.map(|name| Vector::load(name).datagram);
+    let vectors = vectors.map(|name| DissectorVector::load(name).datagram);
     let cut = [whole]
         .into_iter()
         .chain(vectors)
         .flat_map(|datagram| (1..datagram.len()).map(move |kept| (datagram.clone(), kept)));
-    for shown in cell.dissect(&Capture::cut(cut), &[]) {
+    for shown in cell.dissect(&CaptureFile::cut(cut), &[]) {
         assert!(shown.has("uadp.cut_by_capture"), "{shown:?}");
         assert!(!shown.has("uadp.malformed"), "{shown:?}");
         assert!(!shown.has("uadp.dissector_bug"), "{shown:?}");
@@ -226,7 +226,7 @@ fn values_nested_too_deep_and_too_many_to_show_do_no_harm() {
         bytes.push(last);
         bytes
     };
-    let capture = Capture::of([
+    let capture = CaptureFile::of([
         nested(100),
         nested(101),
         nested(5000),
@@ -321,7 +321,7 @@ fn damaged_datagrams_are_called_malformed_when_our_reader_refuses_them() {
         return;
     };
     let mut noise = Noise(0x9E37_79B9_7F4A_7C15);
-    let datagrams: Vec<Vec<u8>> = Vector::all()
+    let datagrams: Vec<Vec<u8>> = DissectorVector::all()
         .iter()
         .flat_map(|vector| {
             (0..30)
@@ -329,7 +329,7 @@ fn damaged_datagrams_are_called_malformed_when_our_reader_refuses_them() {
                 .collect::<Vec<_>>()
         })
         .collect();
-    let shown = cell.dissect(&Capture::of(datagrams.clone()), &[]);
+    let shown = cell.dissect(&CaptureFile::of(datagrams.clone()), &[]);
     let mut counts = [0, 0];
     let mut differences = Vec::new();
     for (datagram, shown) in datagrams.iter().zip(&shown) {

@@ -1,7 +1,7 @@
 //! The exchange of an arm: the same process, with another YAML file of the arm.
 
 use serde_json::{Value, json};
-use system_tests::{Cell, Child, Started, eventually, program};
+use system_tests::{Cell, Child, StartedChild, eventually, program};
 
 use super::{EXAMPLES, PROCESS, SOON, list, run, start};
 use crate::niryo;
@@ -33,7 +33,7 @@ fn ran_on(cell: &Cell, arm: &str) -> (Vec<Value>, Vec<(String, String)>) {
 }
 
 fn simulated_ur() -> Child {
-    let simulator = Started::new("universal-robot", &program("ua-component"))
+    let simulator = StartedChild::new("universal-robot", &program("ua-component"))
         .args(["simulate", "universal-robot", "--speed", "20"])
         .start();
     eventually("the simulator serves", SOON, || {

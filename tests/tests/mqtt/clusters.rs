@@ -7,7 +7,7 @@ use nix::sys::signal::Signal;
 use serde_json::Value;
 use system_tests::{
     BROKER, Bridged, Cell, Child, METRICS_ROS1, METRICS_ROS2, NatsCluster, Peer, SERVER_ENDPOINT,
-    Started, eventually, http_answer, metrics,
+    StartedChild, eventually, http_answer, metrics,
 };
 
 use super::commanded::{COMMAND, Commanded};
@@ -245,7 +245,7 @@ fn generated_permissions_of_nats_keep_a_space_from_sending_in_the_name_of_anothe
     let _cluster = cell.nats(&rules, &users);
     // A message may cross to another node.
     let at = |node: u16| ["-p".to_owned(), NatsCluster::port(node).to_string()];
-    let mut seen = Started::new("mosquitto_sub", "/usr/bin/mosquitto_sub".as_ref())
+    let mut seen = StartedChild::new("mosquitto_sub", "/usr/bin/mosquitto_sub".as_ref())
         .args([
             "-h",
             "127.0.0.1",

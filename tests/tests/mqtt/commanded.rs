@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use serde_json::Value;
 use system_tests::{
-    Cell, Child, METRICS_ROS1, SERVER_ENDPOINT, Started, eventually, holds_for, metrics,
+    Cell, Child, METRICS_ROS1, SERVER_ENDPOINT, StartedChild, eventually, holds_for, metrics,
 };
 
 use super::SOON;
@@ -78,7 +78,7 @@ impl<'c> Commanded<'c> {
 
     /// Checks that a command that the broker delivers after its time is dropped and counted.
     pub(super) fn copy_is_dropped(&mut self) {
-        let mut copy = Started::new("mosquitto_sub", Path::new("/usr/bin/mosquitto_sub"))
+        let mut copy = StartedChild::new("mosquitto_sub", Path::new("/usr/bin/mosquitto_sub"))
             .args([
                 "-h",
                 "127.0.0.1",

@@ -2,7 +2,7 @@
 
 use serde_json::Value;
 use std::path::Path;
-use system_tests::{Cell, Child, MASTER, Peer, Started, program};
+use system_tests::{Cell, Child, MASTER, Peer, StartedChild, program};
 
 use crate::ros1::support::SOON;
 
@@ -10,7 +10,7 @@ use crate::ros1::support::SOON;
 const FILES: &str = "--nofile=8192";
 
 fn crowd(cell: &Cell, args: &[&str]) -> Child {
-    Started::new("crowd", Path::new("/usr/bin/prlimit"))
+    StartedChild::new("crowd", Path::new("/usr/bin/prlimit"))
         .args([FILES.into(), program("examples/crowd")])
         .args(args)
         .env("ROS_MASTER_URI", format!("http://{MASTER}"))

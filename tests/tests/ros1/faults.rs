@@ -18,7 +18,7 @@ use system_tests::{
 };
 use tcpros::ConnectionHeader;
 
-use crate::ros1::support::{Ours, SOON, string, string_type};
+use crate::ros1::support::{Ros1Node, SOON, string, string_type};
 
 const ROS1: &[Peer] = &[Peer::Ros1];
 /// Time that the master or a peer may need on a busy machine in addition to the time a rule allows.
@@ -64,7 +64,7 @@ fn a_stalled_subscriber_costs_nobody_else_a_message() {
         return;
     };
     let _master = cell.roscore();
-    let ours = Ours::start("ours");
+    let ours = Ros1Node::start("ours");
     let big = ours.advertise("/big", string_type(), false);
     let mut healthy = cell.rospy("ros1_tally.py", &["/big"]);
     let port = eventually("the topic is served", SOON, || {
@@ -100,7 +100,7 @@ fn peers_that_break_the_handshake_cost_only_themselves() {
         return;
     };
     let _master = cell.roscore();
-    let ours = Ours::start("ours");
+    let ours = Ros1Node::start("ours");
     let chatter = ours.advertise("/chatter", string_type(), false);
     let port = eventually("the topic is served", SOON, || {
         cell.tcpros_port("/ours", "/chatter")
@@ -291,7 +291,7 @@ fn a_publisher_that_lies_or_breaks_off_is_asked_again() {
         return;
     };
     let _master = cell.roscore();
-    let ours = Ours::start("ours");
+    let ours = Ros1Node::start("ours");
     let mut heard = ours.subscribe("/t");
     let _by_hand = ByHand::start(vec![Lie::Huge, Lie::Half, Lie::HalfHeader]);
     let message = heard.next("the truth after three lies");
@@ -381,7 +381,7 @@ fn twenty_restarts_of_the_master_cost_no_message() {
         return;
     };
     let mut master = cell.roscore();
-    let ours = Ours::start("ours");
+    let ours = Ros1Node::start("ours");
     let out = Arc::new(ours.advertise("/out", string_type(), false));
     let heard = ours.subscribe("/in");
     let mut tallied = cell.rospy("ros1_tally.py", &["/out", "std_msgs/String"]);
@@ -463,7 +463,7 @@ fn a_master_that_answers_nonsense_is_waited_for() {
         b"HTTP/1.1 200 OK\r\nContent-Length: 99999999\r\n\r\n<methodResponse>",
         b"HTTP/1.1 200 OK\r\n\r\n<methodResponse><params><param><value><i4>1</i4></value></param></params></methodResponse>",
     ];
-    let ours = Ours::start("ours");
+    let ours = Ros1Node::start("ours");
     let _out = ours.advertise("/out", string_type(), false);
     let stop = Arc::new(AtomicBool::new(false));
     let listener = TcpListener::bind(MASTER).unwrap();
@@ -570,7 +570,7 @@ fn a_bridge_whose_name_is_taken_ends_and_says_so() {
     let _sends = rospy_pub(&cell, "value", ["0", "0"]);
     let mut bridge = cell.bridge_ros1(&["__name:=cell", "__ns:=/line"]);
     crosses(&group, "value");
-    let thief = Ours::start_in("/line", "cell");
+    let thief = Ros1Node::start_in("/line", "cell");
     let _out = thief.advertise("/anything", string_type(), false);
     let status = bridge.wait_for_end(SOON);
     assert!(!status.success());

@@ -5,20 +5,20 @@ use std::time::Duration;
 use bytes::Bytes;
 use system_tests::{MASTER, eventually};
 use tcpros::{
-    Inbox, InboxEvent, MasterState, Message, Node, NodeOptions, Publisher, PublisherOptions,
-    SubscriberOptions, Subscription, TopicType, Wanted,
+    Inbox, InboxEvent, InboxMessage, MasterState, Node, NodeOptions, Publisher, PublisherOptions,
+    RequestedType, SubscriberOptions, Subscription, TopicType,
 };
 use tokio::runtime::{Builder, Runtime};
 
 pub(crate) const SOON: Duration = Duration::from_secs(30);
 
 /// A node and the runtime it runs on.
-pub(crate) struct Ours {
+pub(crate) struct Ros1Node {
     pub(crate) runtime: Runtime,
     pub(crate) node: Option<Node>,
 }
 
-impl Ours {
+impl Ros1Node {
     pub(crate) fn start(name: &str) -> Self {
         Self::start_in("/", name)
     }
@@ -60,7 +60,7 @@ impl Ours {
         self.node().advertise(topic, kind, options).unwrap()
     }
 
-    pub(crate) fn subscribe(&self, topic: &str) -> Heard {
+    pub(crate) fn subscribe(&self, topic: &str) -> SubscribedTopic {
         let _inside = self.runtime.enter();
         let inbox = Inbox::new();
         let options = SubscriberOptions {
@@ -69,9 +69,9 @@ impl Ours {
         };
         let subscription = self
             .node()
-            .subscribe(topic, Wanted::default(), options, (), &inbox)
+            .subscribe(topic, RequestedType::default(), options, (), &inbox)
             .unwrap();
-        Heard {
+        SubscribedTopic {
             inbox,
             subscription,
         }
@@ -87,14 +87,14 @@ impl Ours {
 }
 
 /// A subscription and its received messages.
-pub(crate) struct Heard {
+pub(crate) struct SubscribedTopic {
     inbox: Inbox<()>,
     pub(crate) subscription: Subscription,
 }
 
-impl Heard {
+impl SubscribedTopic {
     /// Returns the next waiting message.
-    pub(crate) fn try_next(&mut self) -> Option<Message> {
+    pub(crate) fn try_next(&mut self) -> Option<InboxMessage> {
         loop {
             match self.inbox.try_recv()?.1 {
                 InboxEvent::Message(message) => return Some(message),
@@ -104,7 +104,7 @@ impl Heard {
         }
     }
 
-    pub(crate) fn next(&mut self, what: &str) -> Message {
+    pub(crate) fn next(&mut self, what: &str) -> InboxMessage {
         eventually(what, SOON, || self.try_next())
     }
 }

@@ -10,7 +10,7 @@ use system_tests::{Cell, Child, Peer, eventually};
 use tcpros::Publisher;
 use tokio::task::JoinHandle;
 
-use crate::ros1::support::{Ours, SOON, string, string_type, twist, twist_type};
+use crate::ros1::support::{Ros1Node, SOON, string, string_type, twist, twist_type};
 
 const PERIOD: Duration = Duration::from_millis(20);
 /// Messages per topic in a bag.
@@ -18,7 +18,7 @@ const RECORDED: u8 = 10;
 const TRIPS: u32 = 50;
 
 /// Publishes a `Twist` fifty times a second, with an increasing forward speed.
-fn driving(ours: &Ours, publisher: &Arc<Publisher>) -> JoinHandle<()> {
+fn driving(ours: &Ros1Node, publisher: &Arc<Publisher>) -> JoinHandle<()> {
     let publisher = Arc::clone(publisher);
     ours.runtime.spawn(async move {
         let mut ticks = tokio::time::interval(PERIOD);
@@ -50,7 +50,7 @@ fn the_tools_of_ros_see_and_hear_a_node() {
         return;
     };
     let _master = cell.roscore();
-    let ours = Ours::start("ours");
+    let ours = Ros1Node::start("ours");
     let chatter = ours.advertise("/chatter", string_type(), true);
     let cmd = Arc::new(ours.advertise("/cmd", twist_type(), false));
     let mut heard = ours.subscribe("/in");
@@ -126,7 +126,7 @@ fn a_bag_has_all_a_topic_says_and_plays_it_back() {
         return;
     };
     let _master = cell.roscore();
-    let ours = Ours::start("ours");
+    let ours = Ros1Node::start("ours");
     let chatter = ours.advertise("/chatter", string_type(), true);
     let cmd = ours.advertise("/cmd", twist_type(), false);
     let mut heard = ours.subscribe("/cmd");
@@ -201,7 +201,7 @@ fn roscpp_relays_and_throttles_stand_on_either_side() {
         return;
     };
     let _master = cell.roscore();
-    let ours = Ours::start("ours");
+    let ours = Ros1Node::start("ours");
     let cmd = Arc::new(ours.advertise("/cmd", twist_type(), false));
     let (mut relayed, mut slowed) = (ours.subscribe("/relayed"), ours.subscribe("/slowed"));
     let _relay = cell.topic_tools_relay("/cmd", "/relayed");
@@ -248,7 +248,7 @@ fn rosrust_hears_a_node_and_is_heard() {
         return;
     };
     let _master = cell.roscore();
-    let ours = Ours::start("ours");
+    let ours = Ros1Node::start("ours");
     let chatter = ours.advertise("/chatter", string_type(), false);
     let mut heard = ours.subscribe("/from_rosrust");
     let _sends = cell.rosrust(&["pub", "/from_rosrust", "hello"]);

@@ -1,10 +1,10 @@
 //! Actions with a peer on Fast DDS.
 
-use ros2_node::action::{CancelCode, Outcome, Status};
+use ros2_node::action::{CancelCode, GoalStatusCode, Outcome};
 use serde_json::{Value, json};
 use system_tests::{Cell, Peer};
 
-use crate::ros2_actions::fibonacci::{ACTION, Ours, goal, until};
+use crate::ros2_actions::fibonacci::{ACTION, ActionParticipant, goal, until};
 use crate::ros2_actions::served::{options, serve};
 use crate::ros2_actions::{client, done, feedback, outcome, story};
 
@@ -13,7 +13,7 @@ async fn a_server_of_fast_dds_ends_our_goals_in_every_way() {
     let Some(cell) = Cell::with(&[Peer::FastDds]) else {
         return;
     };
-    let ours = Ours::join();
+    let ours = ActionParticipant::join();
     let client = client(&ours);
     let _server = cell.fastdds(&["action-serve", ACTION]);
     let mut reached = client.send_goal(&goal(5));
@@ -22,17 +22,20 @@ async fn a_server_of_fast_dds_ends_our_goals_in_every_way() {
     assert!(told.iter().any(|one| one == "[1, 1, 2]"), "{told:?}");
     assert_eq!(
         done(&mut reached).await,
-        (Status::Succeeded, vec![1, 1, 2, 3, 5])
+        (GoalStatusCode::Succeeded, vec![1, 1, 2, 3, 5])
     );
     let mut aborted = client.send_goal(&goal(-2));
-    assert_eq!(done(&mut aborted).await, (Status::Aborted, vec![]));
+    assert_eq!(done(&mut aborted).await, (GoalStatusCode::Aborted, vec![]));
     let mut rejected = client.send_goal(&goal(-1));
     assert_eq!(outcome(&mut rejected).await, Outcome::Rejected);
     let mut stopped = client.send_goal(&goal(100));
     feedback(&mut stopped, 3).await;
     let answer = stopped.cancel().await.unwrap();
     assert_eq!((answer.code, answer.goals.len()), (CancelCode::None, 1));
-    assert_eq!(done(&mut stopped).await, (Status::Canceled, vec![1, 1, 2]));
+    assert_eq!(
+        done(&mut stopped).await,
+        (GoalStatusCode::Canceled, vec![1, 1, 2])
+    );
     let again = stopped.cancel().await.unwrap();
     assert_eq!(again.code, CancelCode::Terminated);
     assert_eq!(client.counters().malformed, 0);
@@ -43,7 +46,7 @@ async fn a_client_of_fast_dds_sees_its_goals_end_in_every_way() {
     let Some(cell) = Cell::with(&[Peer::FastDds]) else {
         return;
     };
-    let ours = Ours::join();
+    let ours = ActionParticipant::join();
     let serving = serve(&ours, options());
     let orders = ["5", "-2", "-1", "100", "0"].map(|order| ["--order", order]);
     let client = cell.fastdds(&[&["action-call", ACTION], orders.as_flattened()].concat());

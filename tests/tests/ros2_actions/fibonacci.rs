@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use bytes::Bytes;
-use ros2_node::action::Action;
+use ros2_node::action::ActionName;
 use ros2_node::domain::{Domain, DomainOptions};
 use ros2_node::service::ServicePeers;
 
@@ -12,12 +12,12 @@ pub(crate) const SOON: Duration = Duration::from_secs(20);
 pub(crate) const ACTION: &str = "/count";
 
 /// A participant of this workspace on the cell's loopback.
-pub(crate) struct Ours {
+pub(crate) struct ActionParticipant {
     pub(crate) peers: ServicePeers,
     pub(crate) domain: Domain,
 }
 
-impl Ours {
+impl ActionParticipant {
     pub(crate) fn join() -> Self {
         let domain = Domain::join(&DomainOptions {
             domain: 2,
@@ -34,8 +34,8 @@ impl Ours {
     }
 }
 
-pub(crate) fn action() -> Action {
-    Action::new(ACTION, &"demo_msgs/Fibonacci".parse().unwrap())
+pub(crate) fn action() -> ActionName {
+    ActionName::new(ACTION, &"demo_msgs/Fibonacci".parse().unwrap())
 }
 
 pub(crate) const DEFINITION: &str = "int32 order\n---\nint32[] sequence\n---\nint32[] sequence\n";

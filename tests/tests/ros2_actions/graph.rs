@@ -2,12 +2,12 @@
 
 use std::collections::BTreeSet;
 
-use messages::{ActionTypeHashes, Dialect, Registry, TypeHash};
+use messages::{ActionTypeHashes, Dialect, TypeHash, TypeRegistry};
 use ros2_node::domain::can_announce_type_hashes;
 use serde_json::Value;
 use system_tests::{Cell, Child, Peer};
 
-use crate::ros2_actions::fibonacci::{self, DEFINITION, Ours, until};
+use crate::ros2_actions::fibonacci::{self, ActionParticipant, DEFINITION, until};
 use crate::ros2_actions::served::{options, serve};
 
 /// Returns the graph as last printed by a peer.
@@ -25,10 +25,10 @@ fn endpoint(graph: &Value, kind: &str, topic: &str) -> Option<(String, Value)> {
 }
 
 /// Kind, topic, type and hash of an endpoint.
-type Wanted = (&'static str, String, String, TypeHash);
+type WantedEndpoint = (&'static str, String, String, TypeHash);
 
 /// Returns the endpoints of the server.
-fn wanted(registry: &Registry, hashes: &ActionTypeHashes) -> Vec<Wanted> {
+fn wanted(registry: &TypeRegistry, hashes: &ActionTypeHashes) -> Vec<WantedEndpoint> {
     let shared = |name: &str| name.parse().unwrap();
     let cancel = registry.service_type_hashes(&shared("action_msgs/CancelGoal"));
     let list = registry.type_hash(&shared("action_msgs/GoalStatusArray"));
@@ -86,8 +86,8 @@ async fn an_action_is_on_the_list_of_its_node_with_the_types_and_hashes_of_ros()
         return;
     };
     let peer = cell.cyclone("ros2_graph.py", &["--domain", "2", "--gid", "16"]);
-    let ours = Ours::join();
-    let mut registry = Registry::bundle(Dialect::Ros2);
+    let ours = ActionParticipant::join();
+    let mut registry = TypeRegistry::bundle(Dialect::Ros2);
     let fibonacci = "demo_msgs/Fibonacci".parse().unwrap();
     registry.add_action(&fibonacci, DEFINITION).unwrap();
     let hashes = registry.action_type_hashes(&fibonacci, DEFINITION).unwrap();

@@ -3,20 +3,25 @@
 use std::time::Duration;
 
 use bytes::Bytes;
-use ros2_node::action::{CancelCode, GoalEvent, Status};
+use ros2_node::action::{CancelCode, GoalEvent, GoalStatusCode};
 use ros2_node::qos::Offered;
-use ros2_node::service::{Service, ServiceOptions, ServiceServer, ServiceTypes};
+use ros2_node::service::{ServiceName, ServiceOptions, ServiceServer, ServiceTypes};
 use system_tests::Cell;
 use tokio::time::timeout;
 
 use super::{client, done};
-use crate::ros2_actions::fibonacci::{ACTION, Ours, SOON, goal, until};
+use crate::ros2_actions::fibonacci::{ACTION, ActionParticipant, SOON, goal, until};
 
 /// Creates a part of an action server that gives every request the same answer, or none if `answer`
 /// is `None`.
-fn part(ours: &Ours, name: &str, types: [&str; 2], answer: Option<&'static [u8]>) -> ServiceServer {
+fn part(
+    ours: &ActionParticipant,
+    name: &str,
+    types: [&str; 2],
+    answer: Option<&'static [u8]>,
+) -> ServiceServer {
     let [request, response] = types.map(|one| format!("{one}_"));
-    let service = Service {
+    let service = ServiceName {
         name: format!("{ACTION}/_action/{name}"),
         types: ServiceTypes { request, response },
     };
@@ -60,7 +65,11 @@ async fn who_accepted_a_goal_is_asked_for_its_result_though_another_is_known_soo
     let Some(_cell) = Cell::with(&[]) else {
         return;
     };
-    let (ours, dead, new) = (Ours::join(), Ours::join(), Ours::join());
+    let (ours, dead, new) = (
+        ActionParticipant::join(),
+        ActionParticipant::join(),
+        ActionParticipant::join(),
+    );
     // Like a killed server with a lease that has not ended.
     let silent = [
         part(&dead, "get_result", GET_RESULT, None),
@@ -93,5 +102,8 @@ async fn who_accepted_a_goal_is_asked_for_its_result_though_another_is_known_soo
     let answer = running.cancel().await.unwrap();
     assert_eq!(answer.code, CancelCode::Terminated);
     let _results = part(&new, "get_result", GET_RESULT, Some(RESULT));
-    assert_eq!(done(&mut running).await, (Status::Succeeded, vec![5]));
+    assert_eq!(
+        done(&mut running).await,
+        (GoalStatusCode::Succeeded, vec![5])
+    );
 }

@@ -4,19 +4,19 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::time::Duration;
 
-use messages::{Dialect, Registry, TypeName};
+use messages::{Dialect, TypeName, TypeRegistry};
 use nix::sys::signal::Signal;
 use ros2_node::action::{
-    Action, ActionClient, ActionServerOptions, CancelCode, CancelWhat, GoalId, LostReason, Outcome,
-    Status,
+    ActionClient, ActionName, ActionServerOptions, CancelCode, CancelWhat, GoalId, GoalStatusCode,
+    LostReason, Outcome,
 };
 use ros2_node::domain::can_announce_type_hashes;
 use ros2_node::service::ServiceError;
 use serde_json::{Value, json};
-use system_tests::{Cell, Child, Distribution, Peer, Started};
+use system_tests::{Cell, Child, Distribution, Peer, StartedChild};
 use tokio::time::timeout;
 
-use crate::ros2_actions::fibonacci::{ACTION, DEFINITION, Ours, SOON, goal, until};
+use crate::ros2_actions::fibonacci::{ACTION, ActionParticipant, DEFINITION, SOON, goal, until};
 use crate::ros2_actions::served::{of, options, said, serve_as};
 use crate::ros2_actions::{client_of, done, feedback, outcome, story};
 
@@ -29,20 +29,26 @@ fn type_name(name: &str) -> TypeName {
 }
 
 /// Returns the action with the type hashes that the domain announces.
-fn fibonacci(ours: &Ours) -> Action {
+fn fibonacci(ours: &ActionParticipant) -> ActionName {
     announced(
         ours,
         ACTION,
         "Fibonacci",
         DEFINITION,
-        Registry::bundle(Dialect::Ros2),
+        TypeRegistry::bundle(Dialect::Ros2),
     )
 }
 
-fn announced(ours: &Ours, name: &str, kind: &str, text: &str, mut registry: Registry) -> Action {
+fn announced(
+    ours: &ActionParticipant,
+    name: &str,
+    kind: &str,
+    text: &str,
+    mut registry: TypeRegistry,
+) -> ActionName {
     let kind = type_name(kind);
     registry.add_action(&kind, text).unwrap();
-    let action = Action::new(name, &kind);
+    let action = ActionName::new(name, &kind);
     action.announce(
         &ours.domain,
         &registry.action_type_hashes(&kind, text).unwrap(),
@@ -51,10 +57,10 @@ fn announced(ours: &Ours, name: &str, kind: &str, text: &str, mut registry: Regi
 }
 
 /// Returns an action defined in files of the distribution.
-fn nested(ours: &Ours, distribution: Distribution) -> Action {
+fn nested(ours: &ActionParticipant, distribution: Distribution) -> ActionName {
     let package = distribution.share("test_msgs");
     let read = |path: &str| fs::read_to_string(package.join(path)).unwrap();
-    let mut registry = Registry::bundle(Dialect::Ros2);
+    let mut registry = TypeRegistry::bundle(Dialect::Ros2);
     for name in ["Builtins", "BasicTypes"] {
         registry
             .add(&type_name(name), &read(&format!("msg/{name}.msg")))
@@ -64,11 +70,11 @@ fn nested(ours: &Ours, distribution: Distribution) -> Action {
     announced(ours, NESTED, "NestedMessage", &text, registry)
 }
 
-fn client(ours: &Ours) -> ActionClient {
+fn client(ours: &ActionParticipant) -> ActionClient {
     client_of(ours, &fibonacci(ours))
 }
 
-fn started(cell: &Cell, distribution: Distribution, args: &[&str]) -> Started {
+fn started(cell: &Cell, distribution: Distribution, args: &[&str]) -> StartedChild {
     cell.rclpy_started(distribution, SCRIPT, args).told()
 }
 
@@ -150,7 +156,7 @@ async fn a_server_of_rclpy_ends_our_goals_in_every_way(distribution: Distributio
     let Some(cell) = Cell::with(&[Peer::Ros2]) else {
         return;
     };
-    let ours = Ours::join();
+    let ours = ActionParticipant::join();
     let client = client(&ours);
     // Sent before a server exists: the client waits for the server.
     let mut early = client.send_goal(&goal(5));
@@ -162,7 +168,7 @@ async fn a_server_of_rclpy_ends_our_goals_in_every_way(distribution: Distributio
     );
     assert_eq!(
         done(&mut early).await,
-        (Status::Succeeded, vec![1, 1, 2, 3, 5])
+        (GoalStatusCode::Succeeded, vec![1, 1, 2, 3, 5])
     );
     // Feedback is volatile, and the server may have started before it knew our reader.
     let known = async {
@@ -184,7 +190,7 @@ async fn a_server_of_rclpy_ends_our_goals_in_every_way(distribution: Distributio
         ]
     );
     let mut aborted = client.send_goal(&goal(-2));
-    assert_eq!(done(&mut aborted).await, (Status::Aborted, vec![]));
+    assert_eq!(done(&mut aborted).await, (GoalStatusCode::Aborted, vec![]));
     let mut rejected = client.send_goal(&goal(-1));
     assert_eq!(outcome(&mut rejected).await, Outcome::Rejected);
     end_cancelled(&client).await;
@@ -201,7 +207,7 @@ async fn a_server_of_rclpy_ends_our_goals_in_every_way(distribution: Distributio
         (refused.code, refused.goals.len()),
         (CancelCode::Rejected, 0)
     );
-    assert_eq!(obstinate.status(), Status::Executing);
+    assert_eq!(obstinate.status(), GoalStatusCode::Executing);
     assert_eq!(
         (
             client.counters().malformed,
@@ -228,9 +234,9 @@ async fn a_server_of_rclpy_ends_our_goals_in_every_way(distribution: Distributio
 /// Checks that the server decides how a cancelled goal ends.
 async fn end_cancelled(client: &ActionClient) {
     for (order, end) in [
-        (100, Status::Canceled),
-        (110, Status::Succeeded),
-        (112, Status::Aborted),
+        (100, GoalStatusCode::Canceled),
+        (110, GoalStatusCode::Succeeded),
+        (112, GoalStatusCode::Aborted),
     ] {
         let mut stopped = client.send_goal(&goal(order));
         feedback(&mut stopped, 3).await;
@@ -252,7 +258,7 @@ async fn end_at_once(client: &ActionClient) {
         .collect();
     for (count, goal) in many.iter_mut().enumerate() {
         let (status, numbers) = done(goal).await;
-        assert_eq!((status, numbers.len()), (Status::Succeeded, count));
+        assert_eq!((status, numbers.len()), (GoalStatusCode::Succeeded, count));
     }
     let mut all = [100, 102].map(|order| client.send_goal(&goal(order)));
     for goal in &mut all {
@@ -265,7 +271,7 @@ async fn end_at_once(client: &ActionClient) {
         (CancelCode::None, all.iter().map(|goal| goal.id()).collect())
     );
     for goal in &mut all {
-        assert_eq!(done(goal).await.0, Status::Canceled);
+        assert_eq!(done(goal).await.0, GoalStatusCode::Canceled);
     }
 }
 
@@ -304,7 +310,7 @@ async fn a_goal_whose_server_is_killed_is_lost_and_the_next_one_is_served_again(
     let Some(cell) = Cell::with(&[Peer::Ros2]) else {
         return;
     };
-    let ours = Ours::join();
+    let ours = ActionParticipant::join();
     let client = client(&ours);
     let killed = mortal(&cell, distribution);
     let mut running = client.send_goal(&goal(100));
@@ -323,7 +329,10 @@ async fn a_goal_whose_server_is_killed_is_lost_and_the_next_one_is_served_again(
             }
         }
     };
-    assert_eq!(timeout(SOON, next).await.unwrap(), Status::Succeeded);
+    assert_eq!(
+        timeout(SOON, next).await.unwrap(),
+        GoalStatusCode::Succeeded
+    );
     let lost = outcome(&mut running).await;
     let Outcome::Lost(reason @ LostReason::ServerLost(_)) = &lost else {
         panic!("{lost:?}");
@@ -347,7 +356,7 @@ async fn a_client_of_rclpy_sees_its_goals_end_in_every_way(distribution: Distrib
     let Some(cell) = Cell::with(&[Peer::Ros2]) else {
         return;
     };
-    let ours = Ours::join();
+    let ours = ActionParticipant::join();
     let nested = client_of(&ours, &nested(&ours, distribution));
     let serving = serve_as(&ours, &fibonacci(&ours), options());
     let mut client = caller(&cell, distribution, &["--results", "--nested", NESTED]);
@@ -459,7 +468,7 @@ async fn a_server_that_comes_back_serves_a_client_that_stayed(distribution: Dist
         result_timeout: Some(Duration::from_secs(1)),
         ..options()
     };
-    let ours = Ours::join();
+    let ours = ActionParticipant::join();
     let serving = serve_as(&ours, &fibonacci(&ours), brief.clone());
     let mut client = caller(&cell, distribution, &[]);
     client.tell("watch");
@@ -471,12 +480,12 @@ async fn a_server_that_comes_back_serves_a_client_that_stayed(distribution: Dist
     serving.end().await;
     let answer = asked(&mut client, "gone", "gone").await;
     assert_eq!(answer, json!({"gone": true}));
-    let Ours { peers, domain } = ours;
+    let ActionParticipant { peers, domain } = ours;
     drop(peers);
     assert!(domain.leave(()).await);
     let alone = json!({"participants": 1});
     comes_to(&mut client, "participants", "participants", &alone).await;
-    let again = Ours::join();
+    let again = ActionParticipant::join();
     let _serving = serve_as(&again, &fibonacci(&again), brief);
     let answer = asked(&mut client, "back", "back").await;
     assert_eq!(answer, json!({"back": true}));

@@ -1,17 +1,17 @@
 //! Actions with DDS Security on both sides.
 
-use ros2_node::action::{CancelCode, Outcome, Status};
+use ros2_node::action::{CancelCode, GoalStatusCode, Outcome};
 use ros2_node::domain::{Domain, DomainOptions};
 use ros2_node::security::Enclave;
 use ros2_node::service::ServicePeers;
 use serde_json::json;
 use system_tests::{Cell, Keystore, Peer};
 
-use crate::ros2_actions::fibonacci::{ACTION, Ours, goal, until};
+use crate::ros2_actions::fibonacci::{ACTION, ActionParticipant, goal, until};
 use crate::ros2_actions::served::{options, serve};
 use crate::ros2_actions::{client, done, feedback, outcome, story};
 
-fn join(keystore: &Keystore) -> Ours {
+fn join(keystore: &Keystore) -> ActionParticipant {
     let domain = Domain::join(&DomainOptions {
         domain: 2,
         networks: vec![std::net::Ipv4Addr::LOCALHOST.into()],
@@ -23,7 +23,7 @@ fn join(keystore: &Keystore) -> Ours {
         }),
     })
     .unwrap();
-    Ours {
+    ActionParticipant {
         peers: ServicePeers::new(&domain),
         domain,
     }
@@ -44,7 +44,7 @@ async fn a_secured_server_ends_our_goals_in_every_way() {
     let told = story(&mut reached).await;
     assert_eq!(told[0], "accepted");
     assert!(told.iter().any(|one| one == "[1, 1, 2]"), "{told:?}");
-    let fifth = (Status::Succeeded, vec![1, 1, 2, 3, 5]);
+    let fifth = (GoalStatusCode::Succeeded, vec![1, 1, 2, 3, 5]);
     assert_eq!(done(&mut reached).await, fifth);
     let mut rejected = client.send_goal(&goal(-1));
     assert_eq!(outcome(&mut rejected).await, Outcome::Rejected);
@@ -52,7 +52,10 @@ async fn a_secured_server_ends_our_goals_in_every_way() {
     feedback(&mut stopped, 3).await;
     let answer = stopped.cancel().await.unwrap();
     assert_eq!((answer.code, answer.goals.len()), (CancelCode::None, 1));
-    assert_eq!(done(&mut stopped).await, (Status::Canceled, vec![1, 1, 2]));
+    assert_eq!(
+        done(&mut stopped).await,
+        (GoalStatusCode::Canceled, vec![1, 1, 2])
+    );
     assert_eq!(client.counters().malformed, 0);
 }
 
@@ -101,7 +104,7 @@ async fn secured_ends_of_cyclone_serve_our_goals_and_send_theirs() {
     let mut reached = client.send_goal(&goal(5));
     let told = story(&mut reached).await;
     assert_eq!(told[0], "accepted");
-    let fifth = (Status::Succeeded, vec![1, 1, 2, 3, 5]);
+    let fifth = (GoalStatusCode::Succeeded, vec![1, 1, 2, 3, 5]);
     assert_eq!(done(&mut reached).await, fifth);
     let mut rejected = client.send_goal(&goal(-1));
     assert_eq!(outcome(&mut rejected).await, Outcome::Rejected);

@@ -7,7 +7,7 @@ use std::time::Duration;
 use bytes::Bytes;
 use nix::sys::signal::Signal;
 use ros2_node::action::{
-    Action, ActionServer, ActionServerOptions, GoalError, NewGoal, ServerCounters, ServerEvent,
+    ActionName, ActionServer, ActionServerOptions, GoalError, NewGoal, ServerCounters, ServerEvent,
     ServerGoal,
 };
 use serde_json::{Value, json};
@@ -15,22 +15,24 @@ use system_tests::{Cell, Child, Peer};
 use tokio::sync::{Semaphore, watch};
 use tokio::task::JoinHandle;
 
-use crate::ros2_actions::fibonacci::{self, ACTION, Ours, SOON, feedback, result, until};
+use crate::ros2_actions::fibonacci::{
+    self, ACTION, ActionParticipant, SOON, feedback, result, until,
+};
 
 /// A running server, until dropped.
-pub(crate) struct Serving {
+pub(crate) struct RunningActionServer {
     counters: watch::Receiver<ServerCounters>,
     ends: Arc<Semaphore>,
     task: JoinHandle<()>,
 }
 
-impl Drop for Serving {
+impl Drop for RunningActionServer {
     fn drop(&mut self) {
         self.task.abort();
     }
 }
 
-impl Serving {
+impl RunningActionServer {
     /// Ends the server, and returns when all of its entities are removed.
     pub(crate) async fn end(mut self) {
         self.task.abort();
@@ -52,13 +54,17 @@ pub(crate) fn options() -> ActionServerOptions {
 }
 
 /// Serves goals as the peers do. A goal with an order of 50 to 99 runs like a goal with an order
-/// that is lower by 50, but waits for [`Serving::end_a_goal`] before it ends.
-pub(crate) fn serve(ours: &Ours, options: ActionServerOptions) -> Serving {
+/// that is lower by 50, but waits for [`RunningActionServer::end_a_goal`] before it ends.
+pub(crate) fn serve(ours: &ActionParticipant, options: ActionServerOptions) -> RunningActionServer {
     serve_as(ours, &fibonacci::action(), options)
 }
 
 /// Serves an action with the messages of Fibonacci and any name and type.
-pub(crate) fn serve_as(ours: &Ours, action: &Action, options: ActionServerOptions) -> Serving {
+pub(crate) fn serve_as(
+    ours: &ActionParticipant,
+    action: &ActionName,
+    options: ActionServerOptions,
+) -> RunningActionServer {
     let mut server = ActionServer::open(&ours.domain, &ours.peers, action, options).unwrap();
     let (counters, heard) = watch::channel(server.counters());
     let ends = Arc::new(Semaphore::new(0));
@@ -82,7 +88,7 @@ pub(crate) fn serve_as(ours: &Ours, action: &Action, options: ActionServerOption
             }
         }
     });
-    Serving {
+    RunningActionServer {
         counters: heard,
         ends,
         task,
@@ -171,7 +177,7 @@ async fn a_client_of_cyclone_sees_its_goals_end_in_every_way() {
     let Some(cell) = Cell::with(&[Peer::Python]) else {
         return;
     };
-    let ours = Ours::join();
+    let ours = ActionParticipant::join();
     let serving = serve(&ours, options());
     let mut client = cyclone(&cell, &["--results"]);
     client.tell("send 5");
@@ -226,7 +232,7 @@ async fn a_burst_of_feedback_is_heard_whole_by_each_new_client() {
     let Some(cell) = Cell::with(&[Peer::Python]) else {
         return;
     };
-    let ours = Ours::join();
+    let ours = ActionParticipant::join();
     let _serving = serve(&ours, options());
     let mut clients = Vec::new();
     for _ in 0..6 {
@@ -244,7 +250,7 @@ async fn a_client_of_cyclone_cancels_until_a_time_and_all() {
     let Some(cell) = Cell::with(&[Peer::Python]) else {
         return;
     };
-    let ours = Ours::join();
+    let ours = ActionParticipant::join();
     let _serving = serve(&ours, options());
     let mut client = cyclone(&cell, &["--results"]);
     for (number, order) in [100, 101, 102, 104].into_iter().enumerate() {
@@ -292,7 +298,7 @@ async fn a_result_and_a_status_are_kept_for_who_comes_late() {
     let Some(cell) = Cell::with(&[Peer::Python]) else {
         return;
     };
-    let ours = Ours::join();
+    let ours = ActionParticipant::join();
     let _serving = serve(&ours, kept_for(None));
     let mut client = cyclone(&cell, &[]);
     client.tell("result_unknown");
@@ -311,7 +317,7 @@ async fn a_result_is_forgotten_after_its_time() {
     let Some(cell) = Cell::with(&[Peer::Python]) else {
         return;
     };
-    let ours = Ours::join();
+    let ours = ActionParticipant::join();
     let _serving = serve(&ours, kept_for(Some(Duration::from_secs(1))));
     let mut client = cyclone(&cell, &[]);
     let watch = watches(&cell);
@@ -328,7 +334,7 @@ async fn results_that_are_waited_for_do_not_hold_up_other_goals() {
     let Some(cell) = Cell::with(&[Peer::Python]) else {
         return;
     };
-    let ours = Ours::join();
+    let ours = ActionParticipant::join();
     let serving = serve(&ours, options());
     let mut waits = cyclone(&cell, &["--results"]);
     for _ in 0..100 {
@@ -366,7 +372,7 @@ async fn of_more_goals_than_allowed_the_next_is_rejected_until_one_ends() {
     let Some(cell) = Cell::with(&[Peer::Python]) else {
         return;
     };
-    let ours = Ours::join();
+    let ours = ActionParticipant::join();
     let options = ActionServerOptions {
         max_goals: 2,
         ..options()
@@ -393,7 +399,7 @@ async fn garbage_is_counted_and_goals_go_on() {
     let Some(cell) = Cell::with(&[Peer::Python]) else {
         return;
     };
-    let ours = Ours::join();
+    let ours = ActionParticipant::join();
     let serving = serve(&ours, options());
     let _garbage = cell.cyclone("ros2_action.py", &["garbage", ACTION, "--domain", "2"]);
     until("three for each service are malformed", || {
@@ -410,7 +416,7 @@ async fn a_goal_whose_worker_gives_it_up_is_aborted_and_one_nobody_decides_about
     let Some(cell) = Cell::with(&[Peer::Python]) else {
         return;
     };
-    let ours = Ours::join();
+    let ours = ActionParticipant::join();
     let action = fibonacci::action();
     let mut server = ActionServer::open(&ours.domain, &ours.peers, &action, options()).unwrap();
     let mut client = cyclone(&cell, &["--results"]);
@@ -434,13 +440,13 @@ async fn a_server_that_comes_back_serves_a_client_that_stayed_and_knows_no_old_g
     let Some(cell) = Cell::with(&[Peer::Python]) else {
         return;
     };
-    let ours = Ours::join();
+    let ours = ActionParticipant::join();
     let serving = serve(&ours, options());
     let mut client = cyclone(&cell, &["--results"]);
     client.tell("send 100");
     said(&client, &json!({"feedback": 0, "sequence": [1, 1, 2]})).await;
     drop((serving, ours));
-    let again = Ours::join();
+    let again = ActionParticipant::join();
     let _serving = serve(&again, options());
     // The client does not wait for the server, so requests sent before mutual discovery are lost.
     let asked = async {

@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use nix::sys::signal::Signal;
 use ros2_node::domain::Domain;
 use ros2_node::graph::Graph;
-use ros2_node::inbox::{Inbox, Taken};
+use ros2_node::inbox::{Inbox, InboxTurn};
 use ros2_node::limits::PATCHED;
 use ros2_node::outlet::Outlet;
 use ros2_node::qos::{Offered, Requested};
@@ -50,10 +50,10 @@ fn inbox(domain: &Domain, requested: Requested) -> Inbox<()> {
 /// Returns the next sample, and the number of samples lost before it.
 async fn sample(inbox: &mut Inbox<()>) -> (Vec<u8>, u64) {
     match tokio::time::timeout(SOON, inbox.recv()).await.unwrap() {
-        Taken::Sample {
+        InboxTurn::Sample {
             payload, missing, ..
         } => (payload.into_bytes().to_vec(), missing),
-        Taken::Unreadable { why, .. } => panic!("{why}"),
+        InboxTurn::Unreadable { why, .. } => panic!("{why}"),
     }
 }
 

@@ -3,8 +3,8 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use bridge_node::{Delivery, Kept, Port, PortEvent, Reason, TypePaths};
-use bridge_ros2::{PortOptions, Ros2Port};
+use bridge_node::{LocalDelivery, Port, PortEvent, Reason, TypePaths, ValueRelation};
+use bridge_ros2::{Ros2Port, Ros2PortOptions};
 use mappings::{Mapping, SpaceId, TopicId};
 use nix::sys::signal::Signal;
 use ros2_node::limits::PATCHED;
@@ -21,7 +21,7 @@ pub(crate) fn port() -> Ros2Port {
 }
 
 pub(crate) fn port_of(mapping: Arc<Mapping>) -> Ros2Port {
-    Ros2Port::start(PortOptions {
+    Ros2Port::start(Ros2PortOptions {
         domain: options(),
         own: SpaceId::new(DOMAIN).unwrap(),
         types: types(&mapping),
@@ -102,14 +102,14 @@ fn last_is(reader: &Child, text: &str) -> bool {
     heard(reader).last().is_some_and(|last| last == text)
 }
 
-fn delivery(topic: TopicId, text: &str) -> Delivery {
-    Delivery {
+fn delivery(topic: TopicId, text: &str) -> LocalDelivery {
+    LocalDelivery {
         topic,
         payload: string(text).into(),
         source: None,
         status: 0,
         instance: None,
-        kept: Kept::Alone,
+        kept: ValueRelation::Alone,
         lasting: true,
     }
 }
@@ -333,10 +333,10 @@ async fn a_bad_value_is_not_published() {
     let topic = topic("ua_1_2_3");
     port.wanted(topic, &[(BuiltinType::String, false)], None);
     assert_eq!(bound(&mut port, topic).await, "std_msgs/String");
-    let bad = Delivery {
+    let bad = LocalDelivery {
         status: 0x8032,
         instance: None,
-        kept: Kept::Alone,
+        kept: ValueRelation::Alone,
         ..delivery(topic, "stale")
     };
     assert_eq!(port.publish(bad), Err("bad status"));

@@ -2,9 +2,9 @@
 
 use std::time::Duration;
 
-use bridge_node::{Delivery, Kept, Port, PortEvent};
+use bridge_node::{LocalDelivery, Port, PortEvent, ValueRelation};
 use mappings::Mapping;
-use messages::{Dialect, Registry};
+use messages::{Dialect, TypeRegistry};
 use ros2_node::domain::{Domain, DomainOptions, can_announce_type_hashes};
 use ros2_node::qos::{Offered, Requested};
 use ros2_node::raw::Payload;
@@ -20,7 +20,7 @@ const UNKNOWN: &str = "type_description_interfaces/FieldType";
 /// Returns the hash of another type with the same name that has only its first two fields.
 fn short() -> String {
     let name = UNKNOWN.parse().unwrap();
-    let mut registry = Registry::empty(Dialect::Ros2);
+    let mut registry = TypeRegistry::empty(Dialect::Ros2);
     registry
         .add(&name, "uint8 type_id\nuint64 capacity\n")
         .unwrap();
@@ -292,13 +292,13 @@ async fn a_value_is_written_to_a_subscriber_whose_type_only_its_node_knows() {
     payload.extend_from_slice(&8_u64.to_le_bytes());
     payload.extend_from_slice(&9_u64.to_le_bytes());
     payload.extend_from_slice(b"\x04\0\0\0ten\0");
-    let delivery = Delivery {
+    let delivery = LocalDelivery {
         topic: of,
         payload: payload.into(),
         source: None,
         status: 0,
         instance: None,
-        kept: Kept::Alone,
+        kept: ValueRelation::Alone,
         lasting: true,
     };
     port.publish(delivery).unwrap();
@@ -467,7 +467,9 @@ async fn of_subscribers_of_two_definitions_the_one_that_is_not_written_is_told()
 
     let ours = other("ours");
     let name = "std_msgs/String".parse().unwrap();
-    let hash = Registry::bundle(Dialect::Ros2).type_hash(&name).unwrap();
+    let hash = TypeRegistry::bundle(Dialect::Ros2)
+        .type_hash(&name)
+        .unwrap();
     ours.learn_type_hash(STRING, hash.to_string());
     let _ours = ours.reader("rt/ua_1_2_3", STRING, volatile).unwrap();
     // Discovered after the reader.

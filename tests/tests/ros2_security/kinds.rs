@@ -2,13 +2,15 @@
 
 use std::time::Duration;
 
-use system_tests::{Cell, Child, Governance, Keystore, Peer, Triple, UaSide, Wiretap, eventually};
+use system_tests::{
+    Cell, Child, Governance, Keystore, Peer, TopicTriple, UaSide, Wiretap, eventually,
+};
 use uadp::Scalar;
 
 use crate::ros2_security::{BACK, SOON, STRING, Secured, THERE, answering, is_in, reaches, sends};
 
 /// A vendor, and the value that its peer writes.
-const MAKERS: [(Secured, Triple, &str); 2] = [
+const MAKERS: [(Secured, TopicTriple, &str); 2] = [
     (Cell::secured_cyclone, (2, 2, 20), "/ua_2_2_20"),
     (Cell::secured_fastdds, (2, 2, 21), "/ua_2_2_21"),
 ];

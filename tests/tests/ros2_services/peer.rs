@@ -12,12 +12,12 @@ pub(crate) const SOON: Duration = Duration::from_secs(20);
 pub(crate) const DONE: &[u8] = b"\0\x01\0\0\x01\0\0\0\x05\0\0\0done\0\0\0\0";
 
 /// A participant of this workspace on the cell's loopback.
-pub(crate) struct Ours {
+pub(crate) struct ServiceParticipant {
     pub(crate) peers: ServicePeers,
     pub(crate) domain: Domain,
 }
 
-impl Ours {
+impl ServiceParticipant {
     pub(crate) fn join() -> Self {
         let domain = Domain::join(&DomainOptions {
             domain: 2,

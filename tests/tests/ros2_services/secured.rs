@@ -5,7 +5,7 @@ use ros2_node::security::Enclave;
 use ros2_node::service::{ServiceOptions, ServicePeers};
 use system_tests::{Cell, Keystore, Peer};
 
-use crate::ros2_services::peer::{Ours, SET_BOOL, until};
+use crate::ros2_services::peer::{SET_BOOL, ServiceParticipant, until};
 use crate::ros2_services::{GRIP, server};
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 1)]
@@ -25,7 +25,7 @@ async fn calls_of_secured_clients_of_both_makers_are_answered_by_our_server() {
         node: "services".into(),
     })
     .unwrap();
-    let ours = Ours {
+    let ours = ServiceParticipant {
         peers: ServicePeers::new(&domain),
         domain,
     };

@@ -27,12 +27,12 @@ variables:
   - {node: ns=2;i=31, name: limit, type: Double, origin: 0, permissions: {write: engineer}}
 ";
 
-pub(super) struct Site {
+pub(super) struct AccessSite {
     pub(super) cell: Cell,
     pub(super) server: Child,
 }
 
-impl Site {
+impl AccessSite {
     pub(super) fn with(mapping: &str, args: &[&str]) -> Option<Self> {
         Some(Self::of(Cell::with(&[Peer::Python])?, mapping, args))
     }
@@ -122,7 +122,7 @@ const NEVER: &str = "BadWaitingForInitialData";
 
 #[test]
 fn each_policy_takes_each_kind_of_user_and_each_may_do_what_its_role_may() {
-    let Some(site) = Site::with(MAPPING, &["--trust-any-client-certificate"]) else {
+    let Some(site) = AccessSite::with(MAPPING, &["--trust-any-client-certificate"]) else {
         return;
     };
     // Without users, every client on this host has the rights of an operator.
@@ -184,7 +184,7 @@ fn node_opcua_comes_in_by_each_policy_and_kind_of_user() {
     let Some(cell) = Cell::with(&[Peer::Python, Peer::NodeOpcua]) else {
         return;
     };
-    let site = Site::of(cell, MAPPING, &["--trust-any-client-certificate"]);
+    let site = AccessSite::of(cell, MAPPING, &["--trust-any-client-certificate"]);
     site.told(&["user", "add", "anna", "--role", "operator"], PASSWORD);
     let certificate = site.pair("user");
     let engineer = ["user", "add", "plc", "--role", "engineer", "--certificate"];
@@ -220,7 +220,7 @@ fn node_opcua_comes_in_by_each_policy_and_kind_of_user() {
 
 #[test]
 fn who_came_in_wrote_and_was_refused_is_audited() {
-    let Some(site) = Site::with(MAPPING, &["--trust-any-client-certificate"]) else {
+    let Some(site) = AccessSite::with(MAPPING, &["--trust-any-client-certificate"]) else {
         return;
     };
     site.told(&["user", "add", "anna", "--role", "operator"], PASSWORD);
@@ -269,7 +269,7 @@ fn who_came_in_wrote_and_was_refused_is_audited() {
 fn more_sessions_than_there_may_be_are_refused_and_those_of_killed_clients_make_room() {
     let mapping =
         format!("{MAPPING}server:\n  limits: {{sessions: 100, sessions_per_address: 100}}\n");
-    let Some(site) = Site::with(&mapping, &[]) else {
+    let Some(site) = AccessSite::with(&mapping, &[]) else {
         return;
     };
     let crowd = |count: &str, more: &[&str]| {
@@ -291,7 +291,7 @@ fn more_sessions_than_there_may_be_are_refused_and_those_of_killed_clients_make_
 
 #[test]
 fn a_client_is_let_in_by_the_command_that_the_log_names_and_refused_by_another() {
-    let Some(mut site) = Site::with(MAPPING, &[]) else {
+    let Some(mut site) = AccessSite::with(MAPPING, &[]) else {
         return;
     };
     let way = "Basic256Sha256/SignAndEncrypt";
@@ -333,7 +333,7 @@ fn a_client_is_let_in_by_the_command_that_the_log_names_and_refused_by_another()
 
 #[test]
 fn a_certificate_that_is_over_or_of_another_application_is_refused_with_its_status() {
-    let Some(site) = Site::with(MAPPING, &[]) else {
+    let Some(site) = AccessSite::with(MAPPING, &[]) else {
         return;
     };
     for name in ["client", "expired"] {
@@ -352,7 +352,7 @@ fn a_certificate_that_is_over_or_of_another_application_is_refused_with_its_stat
 
 #[test]
 fn a_value_outside_its_range_does_not_go_out() {
-    let Some(site) = Site::with(MAPPING, &[]) else {
+    let Some(site) = AccessSite::with(MAPPING, &[]) else {
         return;
     };
     let write = |value: &str| {
@@ -370,7 +370,7 @@ fn a_value_outside_its_range_does_not_go_out() {
 
 #[test]
 fn permissions_and_users_are_others_without_a_restart() {
-    let Some(site) = Site::with(MAPPING, &["--trust-any-client-certificate"]) else {
+    let Some(site) = AccessSite::with(MAPPING, &["--trust-any-client-certificate"]) else {
         return;
     };
     let way = "Basic256Sha256/SignAndEncrypt";
@@ -464,7 +464,7 @@ calls:
     permissions: {call: engineer}
     ros: {service: /grip, type: std_srvs/Trigger}
 ";
-    let Some(site) = Site::with(mapping, &["--trust-any-client-certificate"]) else {
+    let Some(site) = AccessSite::with(mapping, &["--trust-any-client-certificate"]) else {
         return;
     };
     let executor = Executor::start((1, 2, 61), "Grip", Executes::AtOnce, 1);

@@ -6,7 +6,7 @@ use std::fs;
 use system_tests::{Cell, Peer, SERVER_ENDPOINT, eventually};
 
 use super::SOON;
-use super::access::{Site, path, verb};
+use super::access::{AccessSite, path, verb};
 
 const SETPOINT: &str = "ns=2;i=30";
 const WAY: &str = "Basic256Sha256/SignAndEncrypt";
@@ -19,7 +19,7 @@ variables:
 
 /// Starts a server that trusts an authority, with certificates of that and other authorities in the
 /// folder of the clients.
-fn site() -> Option<Site> {
+fn site() -> Option<AccessSite> {
     let cell = Cell::with(&[Peer::Python])?;
     let pairs = cell.folder().join("pairs");
     let made = cell.asyncua_once("opcua_access.py", &["issued", path(&pairs)]);
@@ -33,7 +33,7 @@ fn site() -> Option<Site> {
     );
     let file = cell.file("access.yaml", MAPPING);
     let server = cell.ua_server(&[path(&file)]);
-    let site = Site { cell, server };
+    let site = AccessSite { cell, server };
     eventually("the server answers clients", SOON, || {
         site.cell
             .asyncua_try("opcua_read.py", &[SERVER_ENDPOINT, "ns=0;i=2258"])
@@ -41,12 +41,12 @@ fn site() -> Option<Site> {
     Some(site)
 }
 
-fn takes(site: &Site, file: &str) {
+fn takes(site: &AccessSite, file: &str) {
     let file = site.cell.folder().join("pairs").join(file);
     site.told(&["trust", path(&file)], "");
 }
 
-fn outcome(site: &Site, client: &str) -> String {
+fn outcome(site: &AccessSite, client: &str) -> String {
     let tried = site
         .tries(SETPOINT, WAY, "anonymous", &["--client", client])
         .remove(0);
@@ -54,7 +54,7 @@ fn outcome(site: &Site, client: &str) -> String {
 }
 
 /// Waits until a client has this outcome; the server checks its store once a second.
-fn becomes(site: &Site, client: &str, wanted: &str) {
+fn becomes(site: &AccessSite, client: &str, wanted: &str) {
     eventually(&format!("{client}: {wanted}"), SOON, || {
         (outcome(site, client) == wanted).then_some(())
     });

@@ -5,7 +5,7 @@ use serde_json::json;
 use system_tests::{SERVER_ENDPOINT, eventually};
 
 use super::SOON;
-use super::access::{PASSWORD, Site, path};
+use super::access::{AccessSite, PASSWORD, path};
 
 const MAPPING: &str = "
 namespaces:
@@ -17,7 +17,7 @@ const SETPOINT: &str = "ns=2;i=30";
 
 #[test]
 fn an_administrator_gives_the_server_another_certificate_and_says_whom_it_trusts() {
-    let Some(site) = Site::with(MAPPING, &[]) else {
+    let Some(site) = AccessSite::with(MAPPING, &[]) else {
         return;
     };
     let client = site.pair("client");

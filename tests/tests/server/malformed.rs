@@ -94,7 +94,7 @@ pub(super) struct Stranger {
 }
 
 /// A channel that the server has opened.
-pub(super) struct Channel {
+pub(super) struct OpenedChannel {
     id: [u8; 4],
     token: [u8; 4],
     sequence: u32,
@@ -187,13 +187,13 @@ impl Stranger {
     }
 
     /// Opens a channel, after a HELLO.
-    fn open_channel(&self, stream: &mut TcpStream) -> io::Result<Channel> {
+    fn open_channel(&self, stream: &mut TcpStream) -> io::Result<OpenedChannel> {
         stream.write_all(&self.open)?;
-        Ok(Channel::opened(&answer(stream)?))
+        Ok(OpenedChannel::opened(&answer(stream)?))
     }
 
     /// Connects, and opens a channel without security.
-    pub(super) fn connected(&self) -> io::Result<(TcpStream, Channel)> {
+    pub(super) fn connected(&self) -> io::Result<(TcpStream, OpenedChannel)> {
         let mut stream = TcpStream::connect(SERVER_ENDPOINT.trim_start_matches("opc.tcp://"))?;
         stream.set_read_timeout(Some(SOON))?;
         stream.set_write_timeout(Some(SOON))?;
@@ -207,7 +207,7 @@ impl Stranger {
     pub(super) fn create_session(
         &self,
         stream: &mut TcpStream,
-        channel: &mut Channel,
+        channel: &mut OpenedChannel,
     ) -> io::Result<()> {
         let create = channel.addressed(&self.create);
         stream.write_all(&create)?;
@@ -219,7 +219,7 @@ impl Stranger {
     pub(super) fn activate_session(
         &self,
         stream: &mut TcpStream,
-        channel: &mut Channel,
+        channel: &mut OpenedChannel,
     ) -> io::Result<Vec<u8>> {
         let activate = channel.addressed(&self.activate);
         stream.write_all(&activate)?;
@@ -291,7 +291,7 @@ impl Stranger {
     }
 
     /// Splits a message into two chunks or more. The last chunk may be missing or aborted.
-    fn split(&mut self, frame: &[u8], channel: &mut Channel) -> Vec<u8> {
+    fn split(&mut self, frame: &[u8], channel: &mut OpenedChannel) -> Vec<u8> {
         let Some((header, body)) = frame.split_at_checked(BODY) else {
             return frame.to_vec();
         };
@@ -328,7 +328,7 @@ impl Stranger {
     }
 }
 
-impl Channel {
+impl OpenedChannel {
     /// Returns the channel of an answer to an OpenSecureChannel request (OPC 10000-6, 6.7.2; OPC
     /// 10000-4, 5.6.2).
     fn opened(answer: &[u8]) -> Self {

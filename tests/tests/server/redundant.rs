@@ -1,6 +1,6 @@
 //! Two redundant servers, as asyncua sees them.
 
-use system_tests::{METRICS_SERVER, Started, metrics, program};
+use system_tests::{METRICS_SERVER, StartedChild, metrics, program};
 
 use super::*;
 
@@ -25,7 +25,7 @@ const SETPOINT: &str = "ns=2;i=30";
 
 fn start(cell: &Cell, at: usize, mapping: &str) -> Child {
     let rank = ["1", "2"][at];
-    Started::new("ua-server", &program("ua-server"))
+    StartedChild::new("ua-server", &program("ua-server"))
         .args([mapping, "--rank", rank])
         .args(["--pki".into(), cell.folder().join(format!("pki{rank}"))])
         .args(["--interface", "lo", "--metrics", METRICS[at]])

@@ -5,7 +5,7 @@ use std::io::Write as _;
 use std::process::{Command, Stdio};
 
 use serde_json::json;
-use system_tests::{Cell, Peer, Started, program};
+use system_tests::{Cell, Peer, StartedChild, program};
 
 use super::{ENDPOINT, SOON, component_started};
 
@@ -70,11 +70,11 @@ fn an_administrator_configures_a_component_and_a_restart_keeps_it() {
     let _arm = start();
     let again = configure("{}", &chief);
     assert_eq!(again["shown"], shown, "{again}");
-    let mut run = Started::new("ua-space", &program("ua-space"))
+    let mut run = StartedChild::new("ua-space", &program("ua-space"))
         .args(["call", "arm.Grasp.Reset", "--interface", "lo"])
         .start();
     assert!(run.wait_for_end(SOON).success(), "{run}");
-    let mut run = Started::new("ua-space", &program("ua-space"))
+    let mut run = StartedChild::new("ua-space", &program("ua-space"))
         .args(["call", "arm.Grasp", "Force=45", "--interface", "lo"])
         .start();
     assert!(run.wait_for_end(SOON).success(), "{run}");

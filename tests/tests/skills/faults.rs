@@ -3,7 +3,7 @@
 use std::time::{Duration, Instant};
 
 use serde_json::{Value, json};
-use system_tests::{Cell, Child, Peer, Started, eventually, program};
+use system_tests::{Cell, Child, Peer, StartedChild, eventually, program};
 
 use super::{COMPONENT, ENDPOINT, SOON, component, line_of};
 
@@ -71,7 +71,7 @@ const GRIPPER: &str = "opc.tcp://127.0.0.1:10254";
 
 fn part(cell: &Cell, name: &str, endpoint: &str, yaml: &str) -> Child {
     let file = cell.file(&format!("{name}.yaml"), yaml);
-    let child = Started::new(name, &program("ua-component"))
+    let child = StartedChild::new(name, &program("ua-component"))
         .args([file])
         .args(["--endpoint", endpoint, "--lds", "none", "--interface", "lo"])
         .start();
@@ -82,7 +82,7 @@ fn part(cell: &Cell, name: &str, endpoint: &str, yaml: &str) -> Child {
 }
 
 fn ua_space(words: &[&str]) -> Child {
-    Started::new("ua-space", &program("ua-space"))
+    StartedChild::new("ua-space", &program("ua-space"))
         .args(words)
         .args(["--interface", "lo"])
         .start()

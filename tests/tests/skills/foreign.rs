@@ -8,7 +8,7 @@ use std::time::Duration;
 use nix::sys::signal::Signal;
 use serde_json::{Value, json};
 use system_tests::{
-    Cell, Child, Distribution, METRICS_SERVER, Peer, Started, eventually, metrics, program,
+    Cell, Child, Distribution, METRICS_SERVER, Peer, StartedChild, eventually, metrics, program,
 };
 
 /// The time that asyncua needs to start on a busy machine.
@@ -26,7 +26,7 @@ fn machine(cell: &Cell, more: &[&str]) -> Child {
 }
 
 fn ua_space(words: &[&str]) -> (i32, Vec<String>) {
-    let mut child = Started::new("ua-space", &program("ua-space"))
+    let mut child = StartedChild::new("ua-space", &program("ua-space"))
         .args(words)
         .args(["--interface", "lo"])
         .start();
@@ -148,7 +148,7 @@ fn a_machine_that_knows_programs_only_is_in_the_space_as_a_component_is() {
         (&json!("Ready"), &json!(33.5))
     );
     // A run that ends at once is still reported as a run.
-    let echo = Started::new("ua-space", &program("ua-space"))
+    let echo = StartedChild::new("ua-space", &program("ua-space"))
         .args(["echo", "ua_0_12_202", "--json", "--interface", "lo"])
         .start();
     eventually("both transitions of a run are told", SOON, || {
@@ -206,7 +206,7 @@ fn goals_for_a_machine_run_it_are_cancelled_and_end_when_it_is_gone() {
     let mut first = machine(&cell, &["--seconds", "100"]);
     listed(4);
     let goal = |words: &[&str]| {
-        Started::new("ua-space", &program("ua-space"))
+        StartedChild::new("ua-space", &program("ua-space"))
             .args(["call", "press.Stamp.Goal", "--json", "--interface", "lo"])
             .args(words)
             .start()
@@ -314,7 +314,7 @@ fn discovery_server(cell: &Cell) -> Child {
 
 fn discovery_server_with(cell: &Cell, more: &[&str]) -> Child {
     let args = ["--interface", "lo", "--endpoint", LDS];
-    let child = Started::new("ua-lds", &program("ua-lds"))
+    let child = StartedChild::new("ua-lds", &program("ua-lds"))
         .args(args)
         .args(more)
         .start();

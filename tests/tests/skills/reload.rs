@@ -5,7 +5,7 @@ use std::path::Path;
 
 use nix::sys::signal::Signal;
 use serde_json::{Value, json};
-use system_tests::{Cell, Child, Peer, Started, eventually, metrics, program};
+use system_tests::{Cell, Child, Peer, StartedChild, eventually, metrics, program};
 
 use super::{COMPONENT, ENDPOINT, SOON, component};
 
@@ -33,7 +33,7 @@ fn reloaded(bench: &Child, (adopted, refused): (u64, u64)) -> Value {
 
 /// Calls a method of a skill, or runs the skill to its end.
 fn call(name: &str) {
-    let mut called = Started::new("ua-space", &program("ua-space"))
+    let mut called = StartedChild::new("ua-space", &program("ua-space"))
         .args(["call", name, "--interface", "lo"])
         .start();
     assert!(called.wait_for_end(SOON).success(), "{called}");

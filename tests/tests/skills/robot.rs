@@ -1,7 +1,7 @@
 //! A robot for clients of OPC 40010-1, which know no skills.
 
 use serde_json::{Value, json};
-use system_tests::{Cell, Peer, Started, eventually, program};
+use system_tests::{Cell, Peer, StartedChild, eventually, program};
 
 use super::{ENDPOINT, SOON, component};
 
@@ -85,7 +85,7 @@ fn a_client_that_knows_robots_sees_the_axes_the_speed_and_the_safety_state_of_a_
     let [Some(robotics), Some(di)] = files.map(|file| test_data::foreign(&file)) else {
         return;
     };
-    let _simulator = Started::new("universal-robot", &program("ua-component"))
+    let _simulator = StartedChild::new("universal-robot", &program("ua-component"))
         .args(["simulate", "universal-robot"])
         .start();
     eventually("the simulator serves", SOON, || {

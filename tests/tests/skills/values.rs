@@ -2,7 +2,7 @@
 //! units, and why they are unknown while the device is lost.
 
 use serde_json::{Value, json};
-use system_tests::{Cell, Child, Peer, Started, eventually, program};
+use system_tests::{Cell, Child, Peer, StartedChild, eventually, program};
 
 use super::{ENDPOINT, SOON, component};
 
@@ -21,7 +21,7 @@ skills:
 ";
 
 fn gripper() -> Child {
-    Started::new("ua-component", &program("ua-component"))
+    StartedChild::new("ua-component", &program("ua-component"))
         .args(["simulate", "schmalz-ecbpi", "--listen", MASTER])
         .start()
 }
@@ -51,7 +51,7 @@ fn values_reach_opc_ua_and_the_space_and_are_bad_while_the_device_is_lost() {
     });
     assert_eq!(values, expected);
     let follow = |name: &str| {
-        Started::new("ua-space", &program("ua-space"))
+        StartedChild::new("ua-space", &program("ua-space"))
             .args(["echo", name, "--json", "--interface", "lo"])
             .start()
     };
@@ -60,7 +60,7 @@ fn values_reach_opc_ua_and_the_space_and_are_bad_while_the_device_is_lost() {
     eventually("no part is there", SOON, || {
         (newest(&client, "Part")? == (json!(false), good.clone())).then_some(())
     });
-    let mut start = Started::new("ua-space", &program("ua-space"))
+    let mut start = StartedChild::new("ua-space", &program("ua-space"))
         .args(["skills", "start", "cup.Grasp", "--interface", "lo"])
         .start();
     assert!(start.wait_for_end(SOON).success(), "{start}");

@@ -3,21 +3,21 @@
 
 use std::time::Duration;
 
-use discovery::{Interface, WatchSettings};
-use skills::{ClientOptions, Detector, SkillClient, SkillHandle, TypeName};
-use system_tests::{Cell, HERE, Started, THERE, WIRE, Wire, program};
+use discovery::{MdnsInterface, WatchSettings};
+use skills::{ClientOptions, Detector, ParameterType, SkillClient, SkillHandle};
+use system_tests::{Cell, HERE, StartedChild, THERE, WIRE, WireEffect, program};
 use tokio::time::{Instant, sleep};
 
 use super::SOON;
 
 /// A component for the other end of a cable or wire.
-fn far(cell: &Cell) -> Started {
+fn far(cell: &Cell) -> StartedChild {
     let yaml = "{component: far, application_uri: 'urn:ua-bridge:system-tests:far', namespace: 9,
         security: [None], skills: [
           {name: Grasp, type: GraspSkillType, driver: {simulated: {duration: 5 s}}},
           {name: Release, type: ReleaseSkillType, driver: {simulated: {duration: 50 ms}}}]}";
     let endpoint = format!("opc.tcp://{THERE}:4850");
-    Started::new("ua-component", &program("ua-component"))
+    StartedChild::new("ua-component", &program("ua-component"))
         .args([cell.file("far.yaml", yaml)])
         .args([
             "--endpoint",
@@ -46,7 +46,7 @@ async fn connected(within: Duration) -> SkillClient {
 }
 
 async fn one(client: &SkillClient, of: &str) -> SkillHandle {
-    let found = client.skills_of(&TypeName::own(of)).await.unwrap();
+    let found = client.skills_of(&ParameterType::own(of)).await.unwrap();
     client.handle(&found[0])
 }
 
@@ -84,7 +84,7 @@ fn a_run_goes_on_while_the_link_is_gone_and_its_outcome_is_read_afterwards() {
 #[test]
 fn runs_over_a_lossy_and_slow_link_happen_once_each_and_their_outcomes_are_known() {
     let Some(cell) = Cell::with(&[]) else { return };
-    let host = cell.host(Wire {
+    let host = cell.host(WireEffect {
         loss: 0.05,
         delay: Duration::from_millis(50),
     });
@@ -95,7 +95,9 @@ fn runs_over_a_lossy_and_slow_link_happen_once_each_and_their_outcomes_are_known
         let release = one(&client, "ReleaseSkillType").await;
         let mut before = None;
         for _ in 0..20 {
-            let outcome = skills::Runs::run(&release, Vec::new(), SOON).await.unwrap();
+            let outcome = skills::RunnableSkill::run(&release, Vec::new(), SOON)
+                .await
+                .unwrap();
             assert!(outcome.succeeded, "{outcome:?}");
             assert!(
                 before.is_none_or(|before| outcome.run == before + 1),
@@ -110,13 +112,13 @@ fn runs_over_a_lossy_and_slow_link_happen_once_each_and_their_outcomes_are_known
 #[test]
 fn a_component_and_its_skills_are_found_over_a_lossy_and_slow_link() {
     let Some(cell) = Cell::with(&[]) else { return };
-    let host = cell.host(Wire {
+    let host = cell.host(WireEffect {
         loss: 0.05,
         delay: Duration::from_millis(50),
     });
     on_this_host(async || {
         let settings = WatchSettings {
-            mdns: Some(Interface::parse(WIRE)),
+            mdns: Some(MdnsInterface::parse(WIRE)),
             ..WatchSettings::default()
         };
         let mut watcher = discovery::watch(settings).unwrap();
@@ -129,17 +131,17 @@ fn a_component_and_its_skills_are_found_over_a_lossy_and_slow_link() {
         let mut announced = None;
         let mut changes = detector.changes();
         while detector
-            .of_type(&TypeName::own("GraspSkillType"))
+            .of_type(&ParameterType::own("GraspSkillType"))
             .is_empty()
         {
             tokio::select! {
                 found = watcher.next() => match found.unwrap() {
-                    discovery::Found::Seen(known) => {
+                    discovery::ServerChange::Seen(known) => {
                         announced.get_or_insert_with(|| began.elapsed());
                         detector.seen(&known.name, &known.url);
                     }
-                    discovery::Found::Restarted(_) => {}
-                    discovery::Found::Gone { known, loss } => panic!("{known:?}: {loss:?}"),
+                    discovery::ServerChange::Restarted(_) => {}
+                    discovery::ServerChange::Gone { known, loss } => panic!("{known:?}: {loss:?}"),
                 },
                 changed = changes.changed() => changed.unwrap(),
                 () = sleep(FOUND_WITHIN) => {}

@@ -1,8 +1,8 @@
 //! Conversions between our codec and the types of the foreign crate, for writing and reading.
 
 use uadp::{
-    Array, BuiltinType, DataSetHeader, DateTime, DecodeError, DeltaEncoder, EncodeError, Encoded,
-    Extras, FieldEncoder, FieldEncoding, MessageKind, NetworkHeader, NetworkMessageEncoder, Scalar,
+    Array, BuiltinType, DataSetHeader, DateTime, DecodeError, DeltaEncoder, EncodeError, Extras,
+    FieldEncoder, FieldEncoding, MessageKind, Nested, NetworkHeader, NetworkMessageEncoder, Scalar,
     StatusCode,
 };
 use zerodds_opcua_gateway::data_value as foreign;
@@ -134,7 +134,7 @@ impl<'a> Value<'a> {
         for value in &foreign.value {
             let scalar = uadp::Variant::Scalar(our_scalar(value));
             // The bytes after the encoding byte.
-            elements.extend_from_slice(&Encoded::variant(&scalar, &mut one).unwrap().bytes()[1..]);
+            elements.extend_from_slice(&Nested::variant(&scalar, &mut one).unwrap().bytes()[1..]);
         }
         let dimensions = foreign.array_dimensions.iter();
         Self {
@@ -201,10 +201,10 @@ fn our_node_id(id: &NodeId) -> uadp::NodeId<'_> {
     uadp::NodeId {
         namespace: id.namespace_index,
         identifier: match &id.identifier_type {
-            NodeIdentifier::Numeric(id) => uadp::Identifier::Numeric(*id),
-            NodeIdentifier::String(id) => uadp::Identifier::String(Some(id)),
-            NodeIdentifier::Guid(id) => uadp::Identifier::Guid(our_guid(id)),
-            NodeIdentifier::Opaque(id) => uadp::Identifier::Opaque(Some(id)),
+            NodeIdentifier::Numeric(id) => uadp::NodeIdValue::Numeric(*id),
+            NodeIdentifier::String(id) => uadp::NodeIdValue::String(Some(id)),
+            NodeIdentifier::Guid(id) => uadp::NodeIdValue::Guid(our_guid(id)),
+            NodeIdentifier::Opaque(id) => uadp::NodeIdValue::Opaque(Some(id)),
         },
     }
 }
@@ -400,10 +400,12 @@ fn their_node_id(id: uadp::NodeId<'_>) -> NodeId {
     NodeId {
         namespace_index: id.namespace,
         identifier_type: match id.identifier {
-            uadp::Identifier::Numeric(id) => NodeIdentifier::Numeric(id),
-            uadp::Identifier::String(id) => NodeIdentifier::String(owned(id)),
-            uadp::Identifier::Guid(id) => NodeIdentifier::Guid(their_guid(id)),
-            uadp::Identifier::Opaque(id) => NodeIdentifier::Opaque(id.unwrap_or_default().to_vec()),
+            uadp::NodeIdValue::Numeric(id) => NodeIdentifier::Numeric(id),
+            uadp::NodeIdValue::String(id) => NodeIdentifier::String(owned(id)),
+            uadp::NodeIdValue::Guid(id) => NodeIdentifier::Guid(their_guid(id)),
+            uadp::NodeIdValue::Opaque(id) => {
+                NodeIdentifier::Opaque(id.unwrap_or_default().to_vec())
+            }
         },
     }
 }

@@ -8,7 +8,7 @@ use std::hint::black_box;
 use std::process::ExitCode;
 use std::time::{Duration, Instant};
 
-use ours::{Config, Payload};
+use ours::{Config, EncodedContent};
 
 /// Number of rounds. The fastest round counts, because slower rounds were disturbed.
 const ROUNDS: u32 = 15;
@@ -58,7 +58,7 @@ fn usage() -> ExitCode {
 
 fn cases() -> Vec<Case> {
     let mut cases = Vec::new();
-    for payload in Payload::ALL {
+    for payload in EncodedContent::ALL {
         let name = payload.name();
         let mut datagram = Vec::with_capacity(2048);
         let config = Config::new();
@@ -82,7 +82,7 @@ fn cases() -> Vec<Case> {
 /// Cases that are timed only, not counted.
 fn their_cases() -> Vec<Case> {
     let mut cases = Vec::new();
-    for payload in Payload::ALL {
+    for payload in EncodedContent::ALL {
         let message = theirs::message(payload);
         let mut datagram = Vec::new();
         ours::encode(payload, 1, &Config::new(), &mut datagram);

@@ -9,7 +9,7 @@ use uadp::{
 
 /// Content of a message.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Payload {
+pub(crate) enum EncodedContent {
     /// A single Double.
     Double,
     /// 20 Int32.
@@ -18,7 +18,7 @@ pub(crate) enum Payload {
     Bytes,
 }
 
-impl Payload {
+impl EncodedContent {
     pub(crate) const ALL: [Self; 3] = [Self::Double, Self::Ints, Self::Bytes];
 
     pub(crate) const fn name(self) -> &'static str {
@@ -64,7 +64,12 @@ impl Config {
 
 /// Encodes message number `number` to the start of the buffer.
 #[inline(never)]
-pub(crate) fn encode(payload: Payload, number: u16, config: &Config, datagram: &mut Vec<u8>) {
+pub(crate) fn encode(
+    payload: EncodedContent,
+    number: u16,
+    config: &Config,
+    datagram: &mut Vec<u8>,
+) {
     datagram.clear();
     let ids = [config.writer_id];
     let mut message = NetworkMessageEncoder::new(datagram, &config.header, Some(&ids)).unwrap();
@@ -74,15 +79,15 @@ pub(crate) fn encode(payload: Payload, number: u16, config: &Config, datagram: &
     };
     let mut fields = message.key_frame(&data_set_header).unwrap();
     match payload {
-        Payload::Double => fields.scalar(Scalar::Double(f64::from(number))).unwrap(),
-        Payload::Ints => {
+        EncodedContent::Double => fields.scalar(Scalar::Double(f64::from(number))).unwrap(),
+        EncodedContent::Ints => {
             for index in 0..20 {
                 fields
                     .scalar(Scalar::Int32(index + i32::from(number)))
                     .unwrap();
             }
         }
-        Payload::Bytes => fields.scalar(Scalar::ByteString(Some(&BLOB))).unwrap(),
+        EncodedContent::Bytes => fields.scalar(Scalar::ByteString(Some(&BLOB))).unwrap(),
     }
     fields.finish().unwrap();
     message.finish().unwrap();

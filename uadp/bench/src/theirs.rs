@@ -7,16 +7,16 @@ use zerodds_opcua_gateway::data_value::{Variant, VariantValue};
 use zerodds_opcua_pubsub::uadp::{DataSetMessage, GroupHeader, NetworkMessage, PublisherId};
 use zerodds_opcua_pubsub::{UaEncode, UaWriter, from_binary};
 
-use crate::ours::{BLOB, Payload};
+use crate::ours::{BLOB, EncodedContent};
 
 /// Returns a message to encode; its creation is not measured.
-pub(crate) fn message(payload: Payload) -> NetworkMessage {
+pub(crate) fn message(payload: EncodedContent) -> NetworkMessage {
     let fields = match payload {
-        Payload::Double => vec![Variant::scalar(VariantValue::Double(2.5))],
-        Payload::Ints => (0..20)
+        EncodedContent::Double => vec![Variant::scalar(VariantValue::Double(2.5))],
+        EncodedContent::Ints => (0..20)
             .map(|n| Variant::scalar(VariantValue::Int32(n)))
             .collect(),
-        Payload::Bytes => vec![Variant::scalar(VariantValue::ByteString(BLOB.to_vec()))],
+        EncodedContent::Bytes => vec![Variant::scalar(VariantValue::ByteString(BLOB.to_vec()))],
     };
     NetworkMessage {
         publisher_id: Some(PublisherId::UInt16(2)),

@@ -201,7 +201,7 @@ impl<'b> ActionEncoder<'b> {
         header: &DataSetHeader,
         call: ActionCall,
         encoding: ActionEncoding,
-    ) -> Result<encoder::Offsets, EncodeError> {
+    ) -> Result<encoder::HeaderOffsets, EncodeError> {
         self.message.begin_message()?;
         let buf = &mut *self.message.buf;
         let offsets = match self.dialect {
@@ -226,7 +226,7 @@ impl<'b> ActionEncoder<'b> {
                         "DataSetMessage header fields where the dialect has none",
                     ));
                 }
-                encoder::Offsets::default()
+                encoder::HeaderOffsets::default()
             }
         };
         buf.extend_from_slice(&call.target_id.to_le_bytes());

@@ -3,7 +3,7 @@
 use alloc::vec::Vec;
 use core::time::Duration;
 
-use crate::reader::Reader;
+use crate::reader::ByteReader;
 use crate::writer::{self, flag};
 use crate::{DecodeError, EncodeError, PublisherId, Scalar, Variant};
 
@@ -62,7 +62,7 @@ impl<'a> ActionHeader<'a> {
         Some(Duration::try_from_secs_f64(seconds).unwrap_or(Duration::MAX))
     }
 
-    pub(crate) fn read(reader: &mut Reader<'a>) -> Result<Self, DecodeError> {
+    pub(crate) fn read(reader: &mut ByteReader<'a>) -> Result<Self, DecodeError> {
         let flags = reader.u8("ActionFlags")?;
         if flags & RESERVED != 0 {
             return Err(DecodeError::Reserved {
@@ -137,7 +137,7 @@ impl<'a> ActionHeader<'a> {
 }
 
 /// Reads a Variant of a type that a PublisherId can have (OPC 10000-14, 6.2.7.1).
-fn read_requestor_id<'a>(reader: &mut Reader<'a>) -> Result<PublisherId<'a>, DecodeError> {
+fn read_requestor_id<'a>(reader: &mut ByteReader<'a>) -> Result<PublisherId<'a>, DecodeError> {
     let reserved = DecodeError::Reserved {
         field: "RequestorId",
         value: reader.rest().first().copied().unwrap_or_default().into(),

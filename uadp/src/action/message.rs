@@ -2,7 +2,7 @@
 
 use super::{ActionCall, ActionHeader, ActionKind};
 use crate::data_set_message::{self as message, Head};
-use crate::reader::Reader;
+use crate::reader::ByteReader;
 use crate::{DataSetHeader, DecodeError, Fields, NetworkHeader, PublisherId};
 
 /// Layout of Actions on the wire. Requestor and Responder have to use the same dialect.
@@ -73,7 +73,7 @@ pub struct Actions<'a> {
     writer_ids: &'a [[u8; 2]],
     /// `None` for a single message, which spans the whole payload.
     sizes: Option<&'a [[u8; 2]]>,
-    payload: Reader<'a>,
+    payload: ByteReader<'a>,
 }
 
 /// A request or response, with the headers of its NetworkMessage (OPC 10000-14, 7.2.4.5.9 and
@@ -119,7 +119,7 @@ impl ActionState {
         }
     }
 
-    fn read(reader: &mut Reader<'_>) -> Result<Self, DecodeError> {
+    fn read(reader: &mut ByteReader<'_>) -> Result<Self, DecodeError> {
         match reader.u8("ActionState")? {
             IDLE => Ok(Self::Idle),
             EXECUTING => Ok(Self::Executing),
@@ -160,7 +160,7 @@ impl<'a> ActionFields<'a> {
     fn read(
         encoding: ActionEncoding,
         counted: bool,
-        reader: &mut Reader<'a>,
+        reader: &mut ByteReader<'a>,
     ) -> Result<Self, DecodeError> {
         match encoding {
             ActionEncoding::Variant => {
@@ -185,7 +185,7 @@ impl<'a> Actions<'a> {
     pub(crate) fn read(
         header: &NetworkHeader<'a>,
         writer_ids: Option<&'a [[u8; 2]]>,
-        mut payload: Reader<'a>,
+        mut payload: ByteReader<'a>,
         dialect: ActionDialect,
     ) -> Result<Self, DecodeError> {
         // An Action is addressed by PublisherId and DataSetWriterId (OPC 10000-14, 7.2.4.5.9).
@@ -251,11 +251,11 @@ impl<'a> Iterator for Actions<'a> {
         match bytes {
             Ok(bytes) => {
                 self.writer_ids = writer_ids;
-                Some(self.of.read(writer_id, Reader::new(bytes)))
+                Some(self.of.read(writer_id, ByteReader::new(bytes)))
             }
             Err(error) => {
                 self.writer_ids = &[];
-                self.payload = Reader::new(&[]);
+                self.payload = ByteReader::new(&[]);
                 Some(Err(error))
             }
         }
@@ -289,7 +289,7 @@ impl<'a> Of<'a> {
     fn read(
         &self,
         writer_id: u16,
-        mut reader: Reader<'a>,
+        mut reader: ByteReader<'a>,
     ) -> Result<ActionMessage<'a>, DecodeError> {
         let (head, encoding) = match self.dialect {
             ActionDialect::Standard => {
@@ -314,7 +314,7 @@ impl<'a> Of<'a> {
 
     fn read_head(
         &self,
-        reader: &mut Reader<'a>,
+        reader: &mut ByteReader<'a>,
     ) -> Result<(Head<'a>, ActionEncoding), DecodeError> {
         let flags1 = reader.u8("DataSetFlags1")?;
         if flags1 & message::VALID == 0 {

@@ -5,7 +5,7 @@ use crate::StatusCode;
 
 /// Outcome of a call, as far as the Requestor knows it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Outcome<'a> {
+pub enum ActionOutcome<'a> {
     /// The call was executed.
     Answered {
         /// Good, or the error of the execution.
@@ -101,7 +101,7 @@ impl Unknown {
     }
 }
 
-impl<'a> Outcome<'a> {
+impl<'a> ActionOutcome<'a> {
     /// Returns the outcome in a response with ActionState Done. A missing status is Good.
     ///
     /// If a Responder executes an Action and responds with the status of a refusal and without

@@ -8,7 +8,7 @@ use super::sending::KeptFields;
 use super::timers::Timers;
 use super::{
     ActionAddress, ActionDialect, ActionEncoding, ActionFields, ActionHeader, ActionKind,
-    ActionMessage, ActionState, ActionToSend, Outcome, Unknown,
+    ActionMessage, ActionOutcome, ActionState, ActionToSend, Unknown,
 };
 use crate::{DecodeError, Fields, OwnedPublisherId};
 
@@ -20,7 +20,7 @@ use crate::{DecodeError, Fields, OwnedPublisherId};
 /// forgotten the request must not execute it again. The Requestor acknowledges a response with
 /// ActionState Idle until the Responder is idle too, at most
 /// [`idle_repeats`](RequestorSettings::idle_repeats) times. Every call ends, at its deadline at the
-/// latest, with one [`Outcome`]: from [`handle_response`](Self::handle_response), or from
+/// latest, with one [`ActionOutcome`]: from [`handle_response`](Self::handle_response), or from
 /// [`poll_given_up`](Self::poll_given_up) if it is unknown. The Requestor then asks the Responder
 /// to forget the call.
 ///
@@ -126,11 +126,11 @@ pub struct CallId(u64);
 
 /// Meaning of a response.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Heard<'a> {
+pub enum ResponseMeaning<'a> {
     /// The Responder has received the request and is executing it.
     Executing(CallId),
     /// The call is finished.
-    Done(CallId, Outcome<'a>),
+    Done(CallId, ActionOutcome<'a>),
     /// The Responder has forgotten a finished call.
     Closed(CallId),
 }
@@ -372,12 +372,12 @@ impl Requestor {
         &mut self,
         response: &ActionMessage<'a>,
         now: Duration,
-    ) -> Result<Heard<'a>, ResponseDrop> {
+    ) -> Result<ResponseMeaning<'a>, ResponseDrop> {
         self.handle_timeout(now);
         let heard = self.hear(response, now);
         match heard {
-            Ok(Heard::Done(..)) => self.counters.answered += 1,
-            Ok(Heard::Executing(_) | Heard::Closed(_)) => {}
+            Ok(ResponseMeaning::Done(..)) => self.counters.answered += 1,
+            Ok(ResponseMeaning::Executing(_) | ResponseMeaning::Closed(_)) => {}
             Err(_) => self.counters.dropped += 1,
         }
         heard
@@ -499,7 +499,7 @@ impl Requestor {
         &mut self,
         response: &ActionMessage<'a>,
         now: Duration,
-    ) -> Result<Heard<'a>, ResponseDrop> {
+    ) -> Result<ResponseMeaning<'a>, ResponseDrop> {
         let id = self.id_of(response)?;
         let receive_timeout = self.settings.receive_timeout;
         let call = self.calls.get_mut(&id).ok_or(ResponseDrop::NoCall)?;
@@ -512,16 +512,16 @@ impl Requestor {
                 call.next_send = None;
                 let next = call.next_wake();
                 self.timers.move_to(id, &mut call.wake, next);
-                Ok(Heard::Executing(CallId(id)))
+                Ok(ResponseMeaning::Executing(CallId(id)))
             }
             (Phase::Asking { .. }, ActionState::Done) => {
                 self.close(id, false, now);
-                let outcome = Outcome::of(response.header().status, response.fields);
-                Ok(Heard::Done(CallId(id), outcome))
+                let outcome = ActionOutcome::of(response.header().status, response.fields);
+                Ok(ResponseMeaning::Done(CallId(id), outcome))
             }
             (Phase::Closing { .. }, ActionState::Idle) => {
                 self.forget(id);
-                Ok(Heard::Closed(CallId(id)))
+                Ok(ResponseMeaning::Closed(CallId(id)))
             }
             (Phase::Closing { given_up, .. }, ActionState::Done) => Err(if *given_up {
                 ResponseDrop::Late

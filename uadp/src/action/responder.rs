@@ -12,16 +12,16 @@ use core::time::Duration;
 use super::sending::KeptFields;
 use super::timers::Timers;
 use super::{
-    ActionDialect, ActionFields, ActionHeader, ActionKind, ActionMessage, ActionState,
-    ActionToSend, Outcome, Refusal,
+    ActionDialect, ActionFields, ActionHeader, ActionKind, ActionMessage, ActionOutcome,
+    ActionState, ActionToSend, Refusal,
 };
 use crate::hashing::DefaultHasher;
 use crate::{OwnedPublisherId, StatusCode};
-use entry::{Entry, Key, Phase};
+use entry::{ActionRequestKey, Phase, RequestEntry};
 use over::Over;
-use refused::{Answer, Refused};
+use refused::{RefusalResponse, RefusedRequests};
 pub use settings::{
-    ExecutionId, FinishRefusal, RequestDrop, RequestOrigin, Requested, ResponderCounters,
+    ExecutionId, FinishRefusal, RequestDrop, RequestOrigin, RequiredAction, ResponderCounters,
     ResponderSettings,
 };
 
@@ -62,10 +62,9 @@ pub use settings::{
 /// ```
 /// use std::time::Duration;
 /// use uadp::action::{
-///     ActionAddress, ActionDialect, ActionFields, ActionRequest, Heard, Outcome, Requested, Requestor,
-///     RequestorSettings, Responder, ResponderSettings,
-/// };
-/// use uadp::{Extras, NetworkHeader, NetworkMessage, OwnedPublisherId, StatusCode};
+///     ActionAddress, ActionDialect, ActionFields, ActionRequest, ResponseMeaning, ActionOutcome,
+///     RequiredAction, Requestor, RequestorSettings, Responder, ResponderSettings, }; use
+///     uadp::{Extras, NetworkHeader, NetworkMessage, OwnedPublisherId, StatusCode};
 ///
 /// const STANDARD: ActionDialect = ActionDialect::Standard;
 /// let mut requestor = Requestor::new(OwnedPublisherId::UInt16(1), [7; 16], RequestorSettings::default());
@@ -91,11 +90,9 @@ pub use settings::{
 ///
 /// let received = NetworkMessage::decode(&datagram)?;
 /// let request = received.actions(STANDARD)?.next().unwrap()?;
-/// let Requested::Execute(execution) = responder.handle_request(&request, "the group", now)? else {
-///     panic!("a new request");
-/// };
-/// let answer = Outcome::Answered { status: StatusCode::GOOD, fields: ActionFields::NONE };
-/// responder.finish(execution, answer, now)?;
+/// let RequiredAction::Execute(execution) = responder.handle_request(&request, "the group", now)?
+/// else { panic!("a new request"); }; let answer = ActionOutcome::Answered { status:
+/// StatusCode::GOOD, fields: ActionFields::NONE }; responder.finish(execution, answer, now)?;
 ///
 /// datagram.clear();
 /// let (to, response) = responder.poll_transmit(now).unwrap();
@@ -104,15 +101,15 @@ pub use settings::{
 ///
 /// let received = NetworkMessage::decode(&datagram)?;
 /// let response = received.actions(STANDARD)?.next().unwrap()?;
-/// assert_eq!(requestor.handle_response(&response, now)?, Heard::Done(call, answer));
+/// assert_eq!(requestor.handle_response(&response, now)?, ResponseMeaning::Done(call, answer));
 /// # Ok::<(), Box<dyn std::error::Error>>(())
 /// ```
 #[derive(Debug)]
 pub struct Responder<P> {
     settings: ResponderSettings,
     next: u64,
-    entries: BTreeMap<u64, Entry<P>>,
-    ids: BTreeMap<Key, u64>,
+    entries: BTreeMap<u64, RequestEntry<P>>,
+    ids: BTreeMap<ActionRequestKey, u64>,
     timers: Timers,
     /// Space used by each sender of each group.
     usage: BTreeMap<RequestOrigin<P>, Usage>,
@@ -121,9 +118,9 @@ pub struct Responder<P> {
     /// Finished requests of which only a hash is kept.
     over: Over<P>,
     /// Requests that were refused before space was allocated.
-    refused: Refused<P>,
+    refused: RefusedRequests<P>,
     /// The response to a refused request that is being sent.
-    answer: Option<Answer<P>>,
+    answer: Option<RefusalResponse<P>>,
     /// Executions past their deadline that were not yet polled.
     overdue: BTreeSet<u64>,
     counters: ResponderCounters,
@@ -152,7 +149,7 @@ impl<P: Ord + Clone> Responder<P> {
             usage: BTreeMap::new(),
             totals: BTreeMap::new(),
             over: Over::new(),
-            refused: Refused::new(),
+            refused: RefusedRequests::new(),
             answer: None,
             overdue: BTreeSet::new(),
             counters: ResponderCounters::default(),
@@ -169,7 +166,7 @@ impl<P: Ord + Clone> Responder<P> {
         request: &ActionMessage<'_>,
         reply_to: P,
         now: Duration,
-    ) -> Result<Requested, RequestDrop> {
+    ) -> Result<RequiredAction, RequestDrop> {
         let origin = RequestOrigin {
             group: 0,
             sender: reply_to,
@@ -189,15 +186,17 @@ impl<P: Ord + Clone> Responder<P> {
         request: &ActionMessage<'_>,
         (origin, verdict): (RequestOrigin<P>, Result<(), Refusal>),
         now: Duration,
-    ) -> Result<Requested, RequestDrop> {
+    ) -> Result<RequiredAction, RequestDrop> {
         self.handle_timeout(now);
         let requested = self.hear(request, (origin, verdict), now);
         match requested {
-            Ok(Requested::Execute(_)) => self.counters.executed += 1,
-            Ok(Requested::Refused(..) | Requested::Declined(_)) => self.counters.refused += 1,
-            Ok(Requested::Repeated(_)) => self.counters.repeated += 1,
-            Ok(Requested::Abandoned(_)) => self.counters.abandoned += 1,
-            Ok(Requested::Closed(_)) => self.counters.closed += 1,
+            Ok(RequiredAction::Execute(_)) => self.counters.executed += 1,
+            Ok(RequiredAction::Refused(..) | RequiredAction::Declined(_)) => {
+                self.counters.refused += 1
+            }
+            Ok(RequiredAction::Repeated(_)) => self.counters.repeated += 1,
+            Ok(RequiredAction::Abandoned(_)) => self.counters.abandoned += 1,
+            Ok(RequiredAction::Closed(_)) => self.counters.closed += 1,
             Err(_) => self.counters.dropped += 1,
         }
         requested
@@ -210,7 +209,7 @@ impl<P: Ord + Clone> Responder<P> {
     pub fn finish(
         &mut self,
         execution: ExecutionId,
-        outcome: Outcome<'_>,
+        outcome: ActionOutcome<'_>,
         now: Duration,
     ) -> Result<(), FinishRefusal> {
         self.handle_timeout(now);
@@ -237,7 +236,7 @@ impl<P: Ord + Clone> Responder<P> {
             told = Err(FinishRefusal::NoStatus);
         }
         // A Requestor without a response repeats its request, and each repetition gets a response.
-        let is_repeated = entry_said || !matches!(outcome, Outcome::Refused(_));
+        let is_repeated = entry_said || !matches!(outcome, ActionOutcome::Refused(_));
         let repeats = if is_repeated {
             self.settings.done_repeats
         } else {
@@ -257,7 +256,7 @@ impl<P: Ord + Clone> Responder<P> {
         refusal: Refusal,
         now: Duration,
     ) -> Result<(), FinishRefusal> {
-        self.finish(execution, Outcome::Refused(refusal), now)
+        self.finish(execution, ActionOutcome::Refused(refusal), now)
     }
 
     /// Removes expired requests, and records executions that are past their deadline.
@@ -365,7 +364,7 @@ impl<P: Ord + Clone> Responder<P> {
         request: &ActionMessage<'_>,
         (origin, verdict): (RequestOrigin<P>, Result<(), Refusal>),
         now: Duration,
-    ) -> Result<Requested, RequestDrop> {
+    ) -> Result<RequiredAction, RequestDrop> {
         if request.action.kind == ActionKind::Response {
             return Err(RequestDrop::Response);
         }
@@ -373,7 +372,7 @@ impl<P: Ord + Clone> Responder<P> {
         if correlation_data.len() > self.settings.max_correlation_data {
             return Err(RequestDrop::CorrelationData(correlation_data.len()));
         }
-        let key = Key::of(request);
+        let key = ActionRequestKey::of(request);
         let known = self.ids.get(&key).copied();
         match (request.state, known) {
             (ActionState::Done, _) => Err(RequestDrop::State),
@@ -401,10 +400,10 @@ impl<P: Ord + Clone> Responder<P> {
     /// Admits a new request.
     fn admit(
         &mut self,
-        key: Key,
+        key: ActionRequestKey,
         (request, origin): (&ActionMessage<'_>, RequestOrigin<P>),
         now: Duration,
-    ) -> Result<Requested, RequestDrop> {
+    ) -> Result<RequiredAction, RequestDrop> {
         let cost = key.cost();
         self.make_room(&origin, cost)?;
         let is_busy = self.is_busy(&origin);
@@ -415,11 +414,13 @@ impl<P: Ord + Clone> Responder<P> {
         let (phase, requested) = match request.state {
             // An Idle request ends a request that is lost or still under way, which is then never
             // executed.
-            ActionState::Idle | ActionState::Done => (Phase::Closed, Requested::Closed(execution)),
+            ActionState::Idle | ActionState::Done => {
+                (Phase::Closed, RequiredAction::Closed(execution))
+            }
             ActionState::Executing if is_busy => {
                 let busy = Refusal::Busy;
                 let phase = Phase::done(busy.status_code(), ActionFields::NONE, ONCE);
-                (phase, Requested::Refused(execution, busy))
+                (phase, RequiredAction::Refused(execution, busy))
             }
             ActionState::Executing => {
                 let hint = request.action.timeout();
@@ -429,13 +430,13 @@ impl<P: Ord + Clone> Responder<P> {
                     abandoned: false,
                     overdue: false,
                 };
-                (phase, Requested::Execute(execution))
+                (phase, RequiredAction::Execute(execution))
             }
         };
         let executing = usize::from(matches!(phase, Phase::Executing { .. }));
         let is_closed = matches!(phase, Phase::Closed);
         let interval = self.interval();
-        let mut entry = Entry {
+        let mut entry = RequestEntry {
             key: key.clone(),
             address: request.into(),
             dialect: request.dialect,
@@ -508,7 +509,7 @@ impl<P: Ord + Clone> Responder<P> {
         id: u64,
         request: &ActionMessage<'_>,
         now: Duration,
-    ) -> Result<Requested, RequestDrop> {
+    ) -> Result<RequiredAction, RequestDrop> {
         let interval = self.interval();
         let entry = self.entries.get_mut(&id).ok_or(RequestDrop::Full)?;
         let arguments = fingerprint(request);
@@ -524,7 +525,7 @@ impl<P: Ord + Clone> Responder<P> {
             Phase::Closed => {}
         }
         self.schedule(id);
-        Ok(Requested::Repeated(ExecutionId(id)))
+        Ok(RequiredAction::Repeated(ExecutionId(id)))
     }
 
     /// Handles an Idle request: the Requestor has the response, or does not want it.
@@ -533,7 +534,7 @@ impl<P: Ord + Clone> Responder<P> {
         id: u64,
         request: &ActionMessage<'_>,
         now: Duration,
-    ) -> Result<Requested, RequestDrop> {
+    ) -> Result<RequiredAction, RequestDrop> {
         let interval = self.interval();
         let entry = self.entries.get_mut(&id).ok_or(RequestDrop::Full)?;
         if !entry.address.is_of(request) || entry.dialect != request.dialect {
@@ -546,9 +547,9 @@ impl<P: Ord + Clone> Responder<P> {
                 let first = !core::mem::replace(abandoned, true);
                 entry.answer(now, interval);
                 if first {
-                    Requested::Abandoned(execution)
+                    RequiredAction::Abandoned(execution)
                 } else {
-                    Requested::Repeated(execution)
+                    RequiredAction::Repeated(execution)
                 }
             }
             Phase::Done { .. } => {
@@ -557,11 +558,11 @@ impl<P: Ord + Clone> Responder<P> {
                 entry.next_send = None;
                 entry.answer(now, interval);
                 self.closed(id);
-                Requested::Closed(execution)
+                RequiredAction::Closed(execution)
             }
             Phase::Closed => {
                 entry.answer(now, interval);
-                Requested::Repeated(execution)
+                RequiredAction::Repeated(execution)
             }
         };
         self.schedule(id);

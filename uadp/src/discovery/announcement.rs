@@ -2,12 +2,12 @@
 
 use super::configuration::{PubSubConnectionDataType, WriterGroupDataType};
 use super::endpoint::{ApplicationDescription, EndpointDescription};
-use super::list::List;
+use super::list::WireArray;
 use super::meta_data::DataSetMetaDataType;
-use super::wire::{Structure, enumeration, structure};
+use super::wire::{WireStructure, enumeration, structure};
 use super::{read_payload, write_headers};
 use crate::data_set_message::check_padding;
-use crate::reader::Reader;
+use crate::reader::ByteReader;
 use crate::{
     DateTime, DecodeError, EncodeError, LocalizedText, NetworkMessage, NetworkMessageType, NodeId,
     PublisherId, SecurityHeader, StatusCode,
@@ -23,16 +23,16 @@ pub struct Announcement<'a> {
     /// MessageSequenceNumber of the chunks of the announcement.
     pub sequence_number: u16,
     /// Content of the announcement.
-    pub announced: Announced<'a>,
+    pub announced: AnnouncedContent<'a>,
 }
 
 /// Content of an [`Announcement`].
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Announced<'a> {
+pub enum AnnouncedContent<'a> {
     /// The Endpoints of the Server associated with the Publisher (OPC 10000-14, 7.2.4.6.6).
     PublisherEndpoints {
         /// The Endpoints.
-        endpoints: List<'a, EndpointDescription<'a>>,
+        endpoints: WireArray<'a, EndpointDescription<'a>>,
         /// Bad if the Publisher has no information.
         status: StatusCode,
     },
@@ -51,14 +51,14 @@ pub enum Announced<'a> {
     /// separate announcement.
     DataSetWriterConfiguration {
         /// Ids of the announced DataSetWriters.
-        writer_ids: List<'a, u16>,
+        writer_ids: WireArray<'a, u16>,
         /// The group, with the announced DataSetWriters only.
         writer_group: WriterGroupDataType<'a>,
         /// A status for each DataSetWriterId, in the same order.
-        statuses: List<'a, StatusCode>,
+        statuses: WireArray<'a, StatusCode>,
     },
     /// The PubSubConnections (OPC 10000-14, 7.2.4.6.8).
-    PubSubConnections(List<'a, PubSubConnectionDataType<'a>>),
+    PubSubConnections(WireArray<'a, PubSubConnectionDataType<'a>>),
     /// A PubSubConnection with a status. The standard defines an array without status instead, but
     /// other stacks send this form with the same AnnouncementType. It is decoded, but should not be
     /// sent.
@@ -74,7 +74,7 @@ pub enum Announced<'a> {
         /// The application.
         description: ApplicationDescription<'a>,
         /// Capability identifiers of OPC 10000-12, Annex D.
-        capabilities: List<'a, Option<&'a str>>,
+        capabilities: WireArray<'a, Option<&'a str>>,
     },
     /// The state of the Publisher (OPC 10000-14, 7.2.4.6.7).
     ApplicationStatus {
@@ -84,7 +84,7 @@ pub enum Announced<'a> {
         cyclic: Option<CyclicStatus>,
     },
     /// The connections with Action Responders (OPC 10000-14, 7.2.4.6.10).
-    ActionResponder(List<'a, PubSubConnectionDataType<'a>>),
+    ActionResponder(WireArray<'a, PubSubConnectionDataType<'a>>),
     /// Arguments and results of an Action (OPC 10000-14, 7.2.4.6.11).
     ActionMetaData(ActionMetaData<'a>),
 }
@@ -103,13 +103,13 @@ structure! {
         /// DataSetWriter of the Action.
         writer_id: u16 = "DataSetWriterId",
         /// Targets of the Action.
-        action_targets: List<'a, ActionTargetDataType<'a>> = "ActionTargets",
+        action_targets: WireArray<'a, ActionTargetDataType<'a>> = "ActionTargets",
         /// Content of requests; its name is the name of the Action.
         request: DataSetMetaDataType<'a> = "Request",
         /// Content of responses, with the name and ConfigurationVersion of the request.
         response: DataSetMetaDataType<'a> = "Response",
         /// The Methods of the targets, in the order of the targets, or empty.
-        action_methods: List<'a, ActionMethodDataType<'a>> = "ActionMethods",
+        action_methods: WireArray<'a, ActionMethodDataType<'a>> = "ActionMethods",
     }
 
     /// A target of an Action (OPC 10000-14, 6.2.3.10.3).
@@ -168,10 +168,10 @@ impl<'a> Announcement<'a> {
     /// [`DecodeError::Reserved`] with the type of an unknown announcement. Otherwise fails if a
     /// field is truncated or malformed, or if bytes other than padding follow the last field.
     pub fn decode_body(body: &'a [u8]) -> Result<Self, DecodeError> {
-        let mut reader = Reader::new(body);
+        let mut reader = ByteReader::new(body);
         let announcement_type = reader.u8("AnnouncementType")?;
         let sequence_number = reader.u16("SequenceNumber")?;
-        let announced = Announced::read(announcement_type, &mut reader)?;
+        let announced = AnnouncedContent::read(announcement_type, &mut reader)?;
         check_padding(reader.rest())?;
         Ok(Self {
             sequence_number,
@@ -211,7 +211,7 @@ impl<'a> Announcement<'a> {
     }
 }
 
-impl<'a> Announced<'a> {
+impl<'a> AnnouncedContent<'a> {
     /// Returns the AnnouncementType, 1 to 7 (OPC 10000-14, 7.2.4.6.3).
     #[must_use]
     pub const fn announcement_type(&self) -> u8 {
@@ -228,21 +228,21 @@ impl<'a> Announced<'a> {
         }
     }
 
-    fn read(announcement_type: u8, reader: &mut Reader<'a>) -> Result<Self, DecodeError> {
+    fn read(announcement_type: u8, reader: &mut ByteReader<'a>) -> Result<Self, DecodeError> {
         Ok(match announcement_type {
             PUBLISHER_ENDPOINTS => Self::PublisherEndpoints {
-                endpoints: List::read(reader, ENDPOINTS)?,
-                status: Structure::read(reader, STATUS_CODE)?,
+                endpoints: WireArray::read(reader, ENDPOINTS)?,
+                status: WireStructure::read(reader, STATUS_CODE)?,
             },
             DATA_SET_META_DATA => Self::DataSetMetaData {
                 writer_id: reader.u16("DataSetWriterId")?,
-                meta_data: Structure::read(reader, "MetaData")?,
-                status: Structure::read(reader, STATUS_CODE)?,
+                meta_data: WireStructure::read(reader, "MetaData")?,
+                status: WireStructure::read(reader, STATUS_CODE)?,
             },
             DATA_SET_WRITER_CONFIGURATION => Self::read_writer_configuration(reader)?,
             PUB_SUB_CONNECTIONS => Self::read_connections(reader)?,
             APPLICATION_INFORMATION => Self::read_application_information(reader)?,
-            ACTION_RESPONDER => Self::ActionResponder(List::read(reader, "ActionResponder")?),
+            ACTION_RESPONDER => Self::ActionResponder(WireArray::read(reader, "ActionResponder")?),
             ACTION_META_DATA => Self::read_action_meta_data(reader)?,
             unknown => {
                 return Err(DecodeError::Reserved {
@@ -253,10 +253,10 @@ impl<'a> Announced<'a> {
         })
     }
 
-    fn read_writer_configuration(reader: &mut Reader<'a>) -> Result<Self, DecodeError> {
-        let writer_ids: List<'a, u16> = List::read(reader, WRITER_IDS)?;
-        let writer_group = Structure::read(reader, "DataSetWriterConfig")?;
-        let statuses: List<'a, StatusCode> = List::read(reader, STATUS_CODES)?;
+    fn read_writer_configuration(reader: &mut ByteReader<'a>) -> Result<Self, DecodeError> {
+        let writer_ids: WireArray<'a, u16> = WireArray::read(reader, WRITER_IDS)?;
+        let writer_group = WireStructure::read(reader, "DataSetWriterConfig")?;
+        let statuses: WireArray<'a, StatusCode> = WireArray::read(reader, STATUS_CODES)?;
         if statuses.len() != writer_ids.len() {
             return Err(DecodeError::Reserved {
                 field: "number of statusCodes",
@@ -272,9 +272,9 @@ impl<'a> Announced<'a> {
 
     /// Reads the array of the standard, or else the single connection of other stacks. If both
     /// fail, the error is the error of the array.
-    fn read_connections(reader: &mut Reader<'a>) -> Result<Self, DecodeError> {
+    fn read_connections(reader: &mut ByteReader<'a>) -> Result<Self, DecodeError> {
         let mut other = *reader;
-        let connections = List::read(reader, CONNECTIONS).map(Self::PubSubConnections);
+        let connections = WireArray::read(reader, CONNECTIONS).map(Self::PubSubConnections);
         if connections.is_ok() && reader.remaining() == 0 {
             return connections;
         }
@@ -287,15 +287,15 @@ impl<'a> Announced<'a> {
         }
     }
 
-    fn read_single_connection(reader: &mut Reader<'a>) -> Result<Self, DecodeError> {
+    fn read_single_connection(reader: &mut ByteReader<'a>) -> Result<Self, DecodeError> {
         Ok(Self::PubSubConnection {
-            connection: Structure::read(reader, CONNECTIONS)?,
-            status: Structure::read(reader, STATUS_CODE)?,
+            connection: WireStructure::read(reader, CONNECTIONS)?,
+            status: WireStructure::read(reader, STATUS_CODE)?,
         })
     }
 
-    fn read_action_meta_data(reader: &mut Reader<'a>) -> Result<Self, DecodeError> {
-        let action: ActionMetaData<'a> = Structure::read(reader, "ActionMetaData")?;
+    fn read_action_meta_data(reader: &mut ByteReader<'a>) -> Result<Self, DecodeError> {
+        let action: ActionMetaData<'a> = WireStructure::read(reader, "ActionMetaData")?;
         if action.has_its_methods() {
             Ok(Self::ActionMetaData(action))
         } else {
@@ -306,18 +306,18 @@ impl<'a> Announced<'a> {
         }
     }
 
-    fn read_application_information(reader: &mut Reader<'a>) -> Result<Self, DecodeError> {
+    fn read_application_information(reader: &mut ByteReader<'a>) -> Result<Self, DecodeError> {
         Ok(match reader.u16("ApplicationInformationType")? {
             APPLICATION_DESCRIPTION => Self::ApplicationDescription {
-                description: Structure::read(reader, "ApplicationDescription")?,
-                capabilities: List::read(reader, CAPABILITIES)?,
+                description: WireStructure::read(reader, "ApplicationDescription")?,
+                capabilities: WireArray::read(reader, CAPABILITIES)?,
             },
             APPLICATION_STATUS => {
                 let is_cyclic = bool::read(reader, "IsCyclic")?;
                 Self::ApplicationStatus {
-                    state: Structure::read(reader, "Status")?,
+                    state: WireStructure::read(reader, "Status")?,
                     cyclic: if is_cyclic {
-                        Some(Structure::read(reader, "CyclicStatus")?)
+                        Some(WireStructure::read(reader, "CyclicStatus")?)
                     } else {
                         None
                     },

@@ -16,16 +16,16 @@ use super::probe::Probe;
 /// [`AnnounceLimits::unknown`] unknown subjects.
 /// ```
 /// use std::time::Duration;
-/// use uadp::discovery::{AnnounceLimits, Announcer, List, Probe, Subject};
+/// use uadp::discovery::{AnnounceLimits, Announcer, WireArray, Probe, AnnouncedSubject};
 ///
 /// let ms = Duration::from_millis;
 /// let mut announcer = Announcer::new([(5, 10), (5, 11)], AnnounceLimits::default());
-/// announcer.handle_probe(&Probe::DataSetWriterConfiguration(List::new(&[11])), ms(0));
-/// announcer.handle_probe(&Probe::DataSetWriterConfiguration(List::new(&[10, 11])), ms(20));
+/// announcer.handle_probe(&Probe::DataSetWriterConfiguration(WireArray::new(&[11])), ms(0));
+/// announcer.handle_probe(&Probe::DataSetWriterConfiguration(WireArray::new(&[10, 11])), ms(20));
 ///
 /// assert_eq!(announcer.poll_timeout(), Some(ms(50)));
 /// let due = announcer.poll(ms(50)).unwrap();
-/// assert_eq!(due.subject, Subject::DataSetWriterConfiguration(11));
+/// assert_eq!(due.subject, AnnouncedSubject::DataSetWriterConfiguration(11));
 /// assert_eq!(due.writer_ids, [10, 11]);
 /// assert_eq!(due.sequence_number, 0);
 /// assert_eq!(announcer.poll(ms(50)), None);
@@ -39,11 +39,11 @@ pub struct Announcer {
     /// DataSetWriters of Actions.
     actions: BTreeSet<u16>,
     /// Planned subjects, and recently announced subjects.
-    entries: BTreeMap<Subject, Entry>,
+    entries: BTreeMap<AnnouncedSubject, Entry>,
     /// The planned subjects by time, known subjects first.
-    planned: BTreeSet<(Duration, bool, Subject)>,
+    planned: BTreeSet<(Duration, bool, AnnouncedSubject)>,
     /// The other subjects by the earliest time of their next announcement.
-    announced: BTreeSet<(Duration, Subject)>,
+    announced: BTreeSet<(Duration, AnnouncedSubject)>,
     /// Number of entries for unknown subjects.
     unknown: usize,
     /// Times of the last announcements, at most as many as the rate allows in 500 ms.
@@ -69,23 +69,24 @@ pub struct AnnounceLimits {
 
 /// Subject of an announcement.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
-pub enum Subject {
-    /// The application, as [`Announced::ApplicationDescription`](super::Announced).
+pub enum AnnouncedSubject {
+    /// The application, as [`Announced::ApplicationDescription`](super::AnnouncedContent).
     ApplicationInformation,
-    /// The Endpoints, as [`Announced::PublisherEndpoints`](super::Announced).
+    /// The Endpoints, as [`Announced::PublisherEndpoints`](super::AnnouncedContent).
     PublisherEndpoints,
-    /// The connections, as [`Announced::PubSubConnections`](super::Announced).
+    /// The connections, as [`Announced::PubSubConnections`](super::AnnouncedContent).
     PubSubConnections,
-    /// A WriterGroup, as [`Announced::DataSetWriterConfiguration`](super::Announced).
+    /// A WriterGroup, as [`Announced::DataSetWriterConfiguration`](super::AnnouncedContent).
     WriterGroupConfiguration(u16),
-    /// A DataSetWriter, as [`Announced::DataSetWriterConfiguration`](super::Announced).
+    /// A DataSetWriter, as [`Announced::DataSetWriterConfiguration`](super::AnnouncedContent).
     DataSetWriterConfiguration(u16),
     /// The content of the DataSet of a DataSetWriter, as
-    /// [`Announced::DataSetMetaData`](super::Announced).
+    /// [`Announced::DataSetMetaData`](super::AnnouncedContent).
     DataSetMetaData(u16),
-    /// The connections with Action Responders, as [`Announced::ActionResponder`](super::Announced).
+    /// The connections with Action Responders, as
+    /// [`Announced::ActionResponder`](super::AnnouncedContent).
     ActionResponder,
-    /// The Action of a DataSetWriter, as [`Announced::ActionMetaData`](super::Announced).
+    /// The Action of a DataSetWriter, as [`Announced::ActionMetaData`](super::AnnouncedContent).
     ActionMetaData(u16),
 }
 
@@ -103,7 +104,7 @@ pub struct Included {
 pub struct DueAnnouncement {
     /// Subject of the announcement. An unknown DataSetWriter or WriterGroup is announced with a bad
     /// status.
-    pub subject: Subject,
+    pub subject: AnnouncedSubject,
     /// Content of the announcement: the union of all its probes.
     pub included: Included,
     /// For the configuration of DataSetWriters: their ids in ascending order, all of the same
@@ -207,21 +208,21 @@ impl Announcer {
     pub fn handle_probe(&mut self, probe: &Probe<'_>, now: Duration) {
         self.forget(now);
         match *probe {
-            Probe::FindApplications => self.ask(Subject::ApplicationInformation, now),
-            Probe::PublisherEndpoints => self.ask(Subject::PublisherEndpoints, now),
+            Probe::FindApplications => self.ask(AnnouncedSubject::ApplicationInformation, now),
+            Probe::PublisherEndpoints => self.ask(AnnouncedSubject::PublisherEndpoints, now),
             Probe::DataSetMetaData(writer_ids) => {
                 for id in writer_ids {
                     let subject = if self.actions.contains(&id) {
-                        Subject::ActionMetaData(id)
+                        AnnouncedSubject::ActionMetaData(id)
                     } else {
-                        Subject::DataSetMetaData(id)
+                        AnnouncedSubject::DataSetMetaData(id)
                     };
                     self.ask(subject, now);
                 }
             }
             Probe::DataSetWriterConfiguration(writer_ids) => {
                 for id in writer_ids {
-                    self.ask(Subject::DataSetWriterConfiguration(id), now);
+                    self.ask(AnnouncedSubject::DataSetWriterConfiguration(id), now);
                 }
             }
             Probe::WriterGroupConfiguration {
@@ -233,7 +234,7 @@ impl Announcer {
                     data_set_writers: include_data_set_writers,
                 };
                 let planned = self.plan(
-                    Subject::WriterGroupConfiguration(writer_group_id),
+                    AnnouncedSubject::WriterGroupConfiguration(writer_group_id),
                     included,
                     now,
                 );
@@ -248,10 +249,10 @@ impl Announcer {
                     writer_groups: include_writer_groups,
                     data_set_writers: include_writer_groups && include_data_set_writers,
                 };
-                let planned = self.plan(Subject::PubSubConnections, included, now);
+                let planned = self.plan(AnnouncedSubject::PubSubConnections, included, now);
                 self.count(planned);
                 if !self.actions.is_empty() {
-                    let planned = self.plan(Subject::ActionResponder, included, now);
+                    let planned = self.plan(AnnouncedSubject::ActionResponder, included, now);
                     self.count(planned);
                 }
             }
@@ -264,7 +265,7 @@ impl Announcer {
     /// [`AnnounceRefusal`] if the announcement is not sent, or was planned already.
     pub fn announce(
         &mut self,
-        subject: Subject,
+        subject: AnnouncedSubject,
         included: Included,
         now: Duration,
     ) -> Result<(), AnnounceRefusal> {
@@ -281,18 +282,18 @@ impl Announcer {
         }
         self.count_sent(now);
         let writer_ids = match subject {
-            Subject::DataSetWriterConfiguration(id) => self.writers_with(id, now),
-            Subject::ApplicationInformation
-            | Subject::PublisherEndpoints
-            | Subject::PubSubConnections
-            | Subject::WriterGroupConfiguration(_)
-            | Subject::DataSetMetaData(_)
-            | Subject::ActionResponder
-            | Subject::ActionMetaData(_) => Vec::new(),
+            AnnouncedSubject::DataSetWriterConfiguration(id) => self.writers_with(id, now),
+            AnnouncedSubject::ApplicationInformation
+            | AnnouncedSubject::PublisherEndpoints
+            | AnnouncedSubject::PubSubConnections
+            | AnnouncedSubject::WriterGroupConfiguration(_)
+            | AnnouncedSubject::DataSetMetaData(_)
+            | AnnouncedSubject::ActionResponder
+            | AnnouncedSubject::ActionMetaData(_) => Vec::new(),
         };
         let included = self.finish(subject, now);
         for id in &writer_ids {
-            self.finish(Subject::DataSetWriterConfiguration(*id), now);
+            self.finish(AnnouncedSubject::DataSetWriterConfiguration(*id), now);
         }
         let sequence_number = self.sequence_number;
         self.sequence_number = sequence_number.wrapping_add(1);
@@ -317,7 +318,7 @@ impl Announcer {
         &self.counters
     }
 
-    fn ask(&mut self, subject: Subject, now: Duration) {
+    fn ask(&mut self, subject: AnnouncedSubject, now: Duration) {
         let planned = self.plan(subject, Included::default(), now);
         self.count(planned);
     }
@@ -333,7 +334,7 @@ impl Announcer {
 
     fn plan(
         &mut self,
-        subject: Subject,
+        subject: AnnouncedSubject,
         included: Included,
         now: Duration,
     ) -> Result<(), AnnounceRefusal> {
@@ -367,23 +368,22 @@ impl Announcer {
         Ok(())
     }
 
-    fn has(&self, subject: Subject) -> bool {
+    fn has(&self, subject: AnnouncedSubject) -> bool {
         match subject {
-            Subject::ApplicationInformation
-            | Subject::PublisherEndpoints
-            | Subject::PubSubConnections => true,
-            Subject::WriterGroupConfiguration(group) => self.groups.contains(&group),
-            Subject::DataSetWriterConfiguration(writer) | Subject::DataSetMetaData(writer) => {
-                self.writers.contains_key(&writer)
-            }
-            Subject::ActionResponder => !self.actions.is_empty(),
-            Subject::ActionMetaData(writer) => self.actions.contains(&writer),
+            AnnouncedSubject::ApplicationInformation
+            | AnnouncedSubject::PublisherEndpoints
+            | AnnouncedSubject::PubSubConnections => true,
+            AnnouncedSubject::WriterGroupConfiguration(group) => self.groups.contains(&group),
+            AnnouncedSubject::DataSetWriterConfiguration(writer)
+            | AnnouncedSubject::DataSetMetaData(writer) => self.writers.contains_key(&writer),
+            AnnouncedSubject::ActionResponder => !self.actions.is_empty(),
+            AnnouncedSubject::ActionMetaData(writer) => self.actions.contains(&writer),
         }
     }
 
     /// Returns the subject that is due first. At the same time, known subjects come before unknown
     /// subjects.
-    fn next(&self) -> Option<(Duration, Subject)> {
+    fn next(&self) -> Option<(Duration, AnnouncedSubject)> {
         let (due, _, subject) = self.planned.first()?;
         Some((*due, *subject))
     }
@@ -392,20 +392,20 @@ impl Announcer {
     /// WriterGroup, and not announced within the last 500 ms.
     fn writers_with(&self, id: u16, now: Duration) -> Vec<u16> {
         let group = self.writers.get(&id);
-        let all =
-            Subject::DataSetWriterConfiguration(0)..=Subject::DataSetWriterConfiguration(u16::MAX);
+        let all = AnnouncedSubject::DataSetWriterConfiguration(0)
+            ..=AnnouncedSubject::DataSetWriterConfiguration(u16::MAX);
         self.entries
             .range(all)
             .filter(|(_, entry)| entry.due.is_some() && entry.earliest <= now)
             .filter_map(|(subject, _)| match subject {
-                Subject::DataSetWriterConfiguration(id) => Some(*id),
-                Subject::ApplicationInformation
-                | Subject::PublisherEndpoints
-                | Subject::PubSubConnections
-                | Subject::WriterGroupConfiguration(_)
-                | Subject::DataSetMetaData(_)
-                | Subject::ActionResponder
-                | Subject::ActionMetaData(_) => None,
+                AnnouncedSubject::DataSetWriterConfiguration(id) => Some(*id),
+                AnnouncedSubject::ApplicationInformation
+                | AnnouncedSubject::PublisherEndpoints
+                | AnnouncedSubject::PubSubConnections
+                | AnnouncedSubject::WriterGroupConfiguration(_)
+                | AnnouncedSubject::DataSetMetaData(_)
+                | AnnouncedSubject::ActionResponder
+                | AnnouncedSubject::ActionMetaData(_) => None,
             })
             .filter(|id| self.writers.get(id) == group)
             .collect()
@@ -434,7 +434,7 @@ impl Announcer {
     }
 
     /// Marks the subject as announced, and returns the content to include.
-    fn finish(&mut self, subject: Subject, now: Duration) -> Included {
+    fn finish(&mut self, subject: AnnouncedSubject, now: Duration) -> Included {
         let Some(entry) = self.entries.get_mut(&subject) else {
             return Included::default();
         };

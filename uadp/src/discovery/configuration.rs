@@ -1,7 +1,7 @@
 //! Configuration of a Publisher: connections, groups and writers.
 
 use super::endpoint::{EndpointDescription, MessageSecurityMode};
-use super::list::List;
+use super::list::WireArray;
 use super::meta_data::DataSetMetaDataType;
 use super::wire::structure;
 use crate::{ExtensionObject, QualifiedName, Variant};
@@ -28,14 +28,14 @@ structure! {
         /// Destination, such as a [`NetworkAddressUrlDataType`](super::NetworkAddressUrlDataType).
         address: ExtensionObject<'a> = "Address",
         /// Not in discovery messages (OPC 10000-14, 7.2.4.6.8).
-        connection_properties: List<'a, KeyValuePair<'a>> = "ConnectionProperties",
+        connection_properties: WireArray<'a, KeyValuePair<'a>> = "ConnectionProperties",
         /// Transport settings, such as a
         /// [`DatagramConnectionTransport2DataType`](super::DatagramConnectionTransport2DataType).
         transport_settings: ExtensionObject<'a> = "TransportSettings",
         /// WriterGroups, if requested by the probe.
-        writer_groups: List<'a, WriterGroupDataType<'a>> = "WriterGroups",
+        writer_groups: WireArray<'a, WriterGroupDataType<'a>> = "WriterGroups",
         /// Empty in discovery messages (OPC 10000-14, 7.2.4.6.8).
-        reader_groups: List<'a, ReaderGroupDataType<'a>> = "ReaderGroups",
+        reader_groups: WireArray<'a, ReaderGroupDataType<'a>> = "ReaderGroups",
     }
 
     /// Common settings of writer and reader groups (OPC 10000-14, 6.2.5.7).
@@ -49,12 +49,12 @@ structure! {
         /// SecurityGroup that provides the keys.
         security_group_id: Option<&'a str> = "SecurityGroupId",
         /// Endpoints of the Security Key Services.
-        security_key_services: List<'a, EndpointDescription<'a>> = "SecurityKeyServices",
+        security_key_services: WireArray<'a, EndpointDescription<'a>> = "SecurityKeyServices",
         /// Maximum bytes of a NetworkMessage, above which messages are sent in chunks; 0 for no
         /// limit.
         max_network_message_size: u32 = "MaxNetworkMessageSize",
         /// Not in discovery messages (OPC 10000-14, 7.2.4.6.9).
-        group_properties: List<'a, KeyValuePair<'a>> = "GroupProperties",
+        group_properties: WireArray<'a, KeyValuePair<'a>> = "GroupProperties",
     }
 
     /// A WriterGroup (OPC 10000-14, 6.2.6.7.1).
@@ -70,7 +70,7 @@ structure! {
         /// Priority among the groups of the Publisher; a higher value is processed first.
         priority: u8 = "Priority",
         /// Languages of LocalizedTexts, in order of preference.
-        locale_ids: List<'a, Option<&'a str>> = "LocaleIds",
+        locale_ids: WireArray<'a, Option<&'a str>> = "LocaleIds",
         /// The header layout of OPC 10000-14, Annex A.
         header_layout_uri: Option<&'a str> = "HeaderLayoutUri",
         /// Transport settings, such as a
@@ -80,7 +80,7 @@ structure! {
         /// [`UadpWriterGroupMessageDataType`](super::UadpWriterGroupMessageDataType).
         message_settings: ExtensionObject<'a> = "MessageSettings",
         /// The DataSetWriters; announcements contain the requested DataSetWriters only.
-        data_set_writers: List<'a, DataSetWriterDataType<'a>> = "DataSetWriters",
+        data_set_writers: WireArray<'a, DataSetWriterDataType<'a>> = "DataSetWriters",
     }
 
     /// A DataSetWriter (OPC 10000-14, 6.2.4.5.1).
@@ -99,7 +99,7 @@ structure! {
         /// The PublishedDataSet; null for a heartbeat.
         data_set_name: Option<&'a str> = "DataSetName",
         /// Not in discovery messages (OPC 10000-14, 7.2.4.6.9).
-        data_set_writer_properties: List<'a, KeyValuePair<'a>> = "DataSetWriterProperties",
+        data_set_writer_properties: WireArray<'a, KeyValuePair<'a>> = "DataSetWriterProperties",
         /// Transport settings; null with datagrams.
         transport_settings: ExtensionObject<'a> = "TransportSettings",
         /// Settings of the message mapping, such as a
@@ -116,7 +116,7 @@ structure! {
         /// Settings of the message mapping.
         message_settings: ExtensionObject<'a> = "MessageSettings",
         /// The DataSetReaders.
-        data_set_readers: List<'a, DataSetReaderDataType<'a>> = "DataSetReaders",
+        data_set_readers: WireArray<'a, DataSetReaderDataType<'a>> = "DataSetReaders",
     }
 
     /// A DataSetReader (OPC 10000-14, 6.2.9.13.1).
@@ -146,9 +146,9 @@ structure! {
         /// As in [`PubSubGroupDataType`].
         security_group_id: Option<&'a str> = "SecurityGroupId",
         /// As in [`PubSubGroupDataType`].
-        security_key_services: List<'a, EndpointDescription<'a>> = "SecurityKeyServices",
+        security_key_services: WireArray<'a, EndpointDescription<'a>> = "SecurityKeyServices",
         /// Properties of the configuration.
-        data_set_reader_properties: List<'a, KeyValuePair<'a>> = "DataSetReaderProperties",
+        data_set_reader_properties: WireArray<'a, KeyValuePair<'a>> = "DataSetReaderProperties",
         /// Transport settings.
         transport_settings: ExtensionObject<'a> = "TransportSettings",
         /// Settings of the message mapping.

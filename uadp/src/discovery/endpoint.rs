@@ -1,6 +1,6 @@
 //! The Servers associated with a Publisher, and their Endpoints.
 
-use super::list::List;
+use super::list::WireArray;
 use super::wire::{enumeration, structure};
 use crate::LocalizedText;
 
@@ -18,7 +18,7 @@ structure! {
         /// Algorithms of the security policy.
         security_policy_uri: Option<&'a str> = "SecurityPolicyUri",
         /// Supported user identity tokens.
-        user_identity_tokens: List<'a, UserTokenPolicy<'a>> = "UserIdentityTokens",
+        user_identity_tokens: WireArray<'a, UserTokenPolicy<'a>> = "UserIdentityTokens",
         /// The protocol stack.
         transport_profile_uri: Option<&'a str> = "TransportProfileUri",
         /// Security level among the Endpoints of the Server; a higher level is more secure, 0 is
@@ -41,7 +41,7 @@ structure! {
         /// Discovery profile that the URLs support.
         discovery_profile_uri: Option<&'a str> = "DiscoveryProfileUri",
         /// Addresses of the discovery Endpoints.
-        discovery_urls: List<'a, Option<&'a str>> = "DiscoveryUrls",
+        discovery_urls: WireArray<'a, Option<&'a str>> = "DiscoveryUrls",
     }
 
     /// A user identity token that an Endpoint accepts (OPC 10000-4, 7.41).

@@ -4,8 +4,8 @@ use alloc::vec::Vec;
 use core::fmt;
 use core::marker::PhantomData;
 
-use super::wire::Structure;
-use crate::reader::Reader;
+use super::wire::WireStructure;
+use crate::reader::ByteReader;
 use crate::{DecodeError, EncodeError, writer};
 
 /// An array of a message (OPC 10000-6, 5.2.5), which may be null.
@@ -13,7 +13,7 @@ use crate::{DecodeError, EncodeError, writer};
 /// A decoded array consists of the checked bytes of its elements: it allocates nothing, and each
 /// iteration decodes the elements again. An array to encode borrows a slice. Equality compares the
 /// elements; the null array equals only the null array.
-pub struct List<'a, T> {
+pub struct WireArray<'a, T> {
     elements: Elements<'a, T>,
 }
 
@@ -27,7 +27,7 @@ enum Elements<'a, T> {
     Slice(&'a [T]),
 }
 
-/// Iterator over the elements of a [`List`].
+/// Iterator over the elements of a [`WireArray`].
 pub struct ListIter<'a, T> {
     step: Step<'a, T>,
 }
@@ -35,13 +35,13 @@ pub struct ListIter<'a, T> {
 enum Step<'a, T> {
     Wire {
         left: usize,
-        reader: Reader<'a>,
+        reader: ByteReader<'a>,
         element: PhantomData<fn() -> T>,
     },
     Slice(core::slice::Iter<'a, T>),
 }
 
-impl<'a, T> List<'a, T> {
+impl<'a, T> WireArray<'a, T> {
     /// Creates the null array, which differs from the empty array.
     #[must_use]
     pub const fn null() -> Self {
@@ -88,7 +88,7 @@ impl<'a, T> List<'a, T> {
                 Elements::Null => Step::Slice([].iter()),
                 Elements::Wire { count, bytes, .. } => Step::Wire {
                     left: count,
-                    reader: Reader::new(bytes),
+                    reader: ByteReader::new(bytes),
                     element: PhantomData,
                 },
                 Elements::Slice(elements) => Step::Slice(elements.iter()),
@@ -101,7 +101,7 @@ impl<'a, T> List<'a, T> {
     private_bounds,
     reason = "the builtin types and structures of this crate are all elements there are"
 )]
-impl<'a, T: Structure<'a>> List<'a, T> {
+impl<'a, T: WireStructure<'a>> WireArray<'a, T> {
     /// Returns the element at an index. In a decoded array, all elements before the index are
     /// decoded too.
     #[must_use]
@@ -114,11 +114,11 @@ impl<'a, T: Structure<'a>> List<'a, T> {
     }
 }
 
-impl<'a, T: Structure<'a>> Structure<'a> for List<'a, T> {
+impl<'a, T: WireStructure<'a>> WireStructure<'a> for WireArray<'a, T> {
     const NULL: Self = Self::null();
     const MIN_SIZE: usize = 4;
 
-    fn read(reader: &mut Reader<'a>, what: &'static str) -> Result<Self, DecodeError> {
+    fn read(reader: &mut ByteReader<'a>, what: &'static str) -> Result<Self, DecodeError> {
         let Some(count) = reader.length(what)? else {
             return Ok(Self::null());
         };
@@ -160,13 +160,13 @@ impl<'a, T: Structure<'a>> Structure<'a> for List<'a, T> {
     }
 }
 
-impl<T> Clone for List<'_, T> {
+impl<T> Clone for WireArray<'_, T> {
     fn clone(&self) -> Self {
         *self
     }
 }
 
-impl<T> Copy for List<'_, T> {}
+impl<T> Copy for WireArray<'_, T> {}
 
 impl<T> Clone for Elements<'_, T> {
     fn clone(&self) -> Self {
@@ -177,25 +177,25 @@ impl<T> Clone for Elements<'_, T> {
 impl<T> Copy for Elements<'_, T> {}
 
 /// The null array.
-impl<T> Default for List<'_, T> {
+impl<T> Default for WireArray<'_, T> {
     fn default() -> Self {
         Self::null()
     }
 }
 
-impl<'a, T> From<&'a [T]> for List<'a, T> {
+impl<'a, T> From<&'a [T]> for WireArray<'a, T> {
     fn from(elements: &'a [T]) -> Self {
         Self::new(elements)
     }
 }
 
-impl<'a, T, const N: usize> From<&'a [T; N]> for List<'a, T> {
+impl<'a, T, const N: usize> From<&'a [T; N]> for WireArray<'a, T> {
     fn from(elements: &'a [T; N]) -> Self {
         Self::new(elements)
     }
 }
 
-impl<'a, T: Structure<'a> + PartialEq> PartialEq for List<'a, T> {
+impl<'a, T: WireStructure<'a> + PartialEq> PartialEq for WireArray<'a, T> {
     fn eq(&self, other: &Self) -> bool {
         self.is_null() == other.is_null()
             && self.len() == other.len()
@@ -203,7 +203,7 @@ impl<'a, T: Structure<'a> + PartialEq> PartialEq for List<'a, T> {
     }
 }
 
-impl<'a, T: Structure<'a> + fmt::Debug> fmt::Debug for List<'a, T> {
+impl<'a, T: WireStructure<'a> + fmt::Debug> fmt::Debug for WireArray<'a, T> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self.elements {
             Elements::Null => f.write_str("null"),
@@ -212,7 +212,7 @@ impl<'a, T: Structure<'a> + fmt::Debug> fmt::Debug for List<'a, T> {
     }
 }
 
-impl<'a, T: Structure<'a>> IntoIterator for List<'a, T> {
+impl<'a, T: WireStructure<'a>> IntoIterator for WireArray<'a, T> {
     type Item = T;
     type IntoIter = ListIter<'a, T>;
 
@@ -221,7 +221,7 @@ impl<'a, T: Structure<'a>> IntoIterator for List<'a, T> {
     }
 }
 
-impl<'a, T: Structure<'a>> IntoIterator for &List<'a, T> {
+impl<'a, T: WireStructure<'a>> IntoIterator for &WireArray<'a, T> {
     type Item = T;
     type IntoIter = ListIter<'a, T>;
 
@@ -230,7 +230,7 @@ impl<'a, T: Structure<'a>> IntoIterator for &List<'a, T> {
     }
 }
 
-impl<'a, T: Structure<'a>> Iterator for ListIter<'a, T> {
+impl<'a, T: WireStructure<'a>> Iterator for ListIter<'a, T> {
     type Item = T;
 
     fn next(&mut self) -> Option<T> {
@@ -253,7 +253,7 @@ impl<'a, T: Structure<'a>> Iterator for ListIter<'a, T> {
     }
 }
 
-impl<'a, T: Structure<'a>> ExactSizeIterator for ListIter<'a, T> {}
+impl<'a, T: WireStructure<'a>> ExactSizeIterator for ListIter<'a, T> {}
 
 impl<T> Clone for ListIter<'_, T> {
     fn clone(&self) -> Self {

@@ -1,9 +1,9 @@
 //! DataSetMetaData: names and types of the fields of a DataSet.
 
 use super::configuration::KeyValuePair;
-use super::list::List;
-use super::wire::{Structure, enumeration, structure};
-use crate::reader::Reader;
+use super::list::WireArray;
+use super::wire::{WireStructure, enumeration, structure};
+use crate::reader::ByteReader;
 use crate::{
     BuiltinType, ConfigurationVersion, DataSetHeader, DecodeError, EncodeError, Guid,
     LocalizedText, NodeId, QualifiedName,
@@ -20,7 +20,7 @@ structure! {
         /// Description for people.
         description: LocalizedText<'a> = "Description",
         /// The fields, in the order of the DataSetMessages.
-        fields: List<'a, FieldMetaData<'a>> = "Fields",
+        fields: WireArray<'a, FieldMetaData<'a>> = "Fields",
         /// The DataSetClass; zero if there is no class.
         data_set_class_id: Guid = "DataSetClassId",
         /// Version for the check of DataSetMessages: see
@@ -45,25 +45,25 @@ structure! {
         /// (OPC 10000-3, 5.6.2).
         value_rank: i32 = "ValueRank",
         /// Maximum number of elements in each dimension, 0 for no limit; null for a scalar.
-        array_dimensions: List<'a, u32> = "ArrayDimensions",
+        array_dimensions: WireArray<'a, u32> = "ArrayDimensions",
         /// Maximum bytes of a String or ByteString, 0 for no limit.
         max_string_length: u32 = "MaxStringLength",
         /// Identity of the field, independent of its name and position.
         data_set_field_id: Guid = "DataSetFieldId",
         /// Further properties of the field, such as its engineering unit.
-        properties: List<'a, KeyValuePair<'a>> = "Properties",
+        properties: WireArray<'a, KeyValuePair<'a>> = "Properties",
     }
 
     /// Type definitions (OPC 10000-14, 6.2.3.2.2, and OPC 10000-5, 12.31).
     DataTypeSchemaHeader<'a> {
         /// Namespaces from index 1 on: see [`namespace_uri`](Self::namespace_uri).
-        namespaces: List<'a, Option<&'a str>> = "Namespaces",
+        namespaces: WireArray<'a, Option<&'a str>> = "Namespaces",
         /// Structures and unions, including nested types.
-        structure_data_types: List<'a, StructureDescription<'a>> = "StructureDataTypes",
+        structure_data_types: WireArray<'a, StructureDescription<'a>> = "StructureDataTypes",
         /// Enumerations and option sets.
-        enum_data_types: List<'a, EnumDescription<'a>> = "EnumDataTypes",
+        enum_data_types: WireArray<'a, EnumDescription<'a>> = "EnumDataTypes",
         /// Aliases of builtin types.
-        simple_data_types: List<'a, SimpleTypeDescription<'a>> = "SimpleDataTypes",
+        simple_data_types: WireArray<'a, SimpleTypeDescription<'a>> = "SimpleDataTypes",
     }
 
     /// A structure or union (OPC 10000-5, 12.33).
@@ -85,7 +85,7 @@ structure! {
         /// Layout of the fields.
         structure_type: StructureType = "StructureType",
         /// All fields in the order of the encoding, including the fields of the base type.
-        fields: List<'a, StructureField<'a>> = "Fields",
+        fields: WireArray<'a, StructureField<'a>> = "Fields",
     }
 
     /// A field of a structure or union (OPC 10000-3, 8.51).
@@ -99,7 +99,7 @@ structure! {
         /// -1 for a scalar, otherwise the number of dimensions.
         value_rank: i32 = "ValueRank",
         /// Maximum number of elements in each dimension, 0 for no limit; null for a scalar.
-        array_dimensions: List<'a, u32> = "ArrayDimensions",
+        array_dimensions: WireArray<'a, u32> = "ArrayDimensions",
         /// Maximum bytes of a String or ByteString, 0 for no limit.
         max_string_length: u32 = "MaxStringLength",
         /// The field can be omitted or can hold a subtype, depending on the structure type.
@@ -122,7 +122,7 @@ structure! {
     /// The values of an enumeration, or the bits of an option set (OPC 10000-3, 8.50).
     EnumDefinition<'a> {
         /// The values or bits.
-        fields: List<'a, EnumField<'a>> = "Fields",
+        fields: WireArray<'a, EnumField<'a>> = "Fields",
     }
 
     /// A value of an enumeration, or a bit of an option set (OPC 10000-3, 8.52).
@@ -258,11 +258,11 @@ impl<'a> EnumDefinition<'a> {
 }
 
 /// ConfigurationVersionDataType (OPC 10000-14, 6.2.3.2.6).
-impl<'a> Structure<'a> for ConfigurationVersion {
+impl<'a> WireStructure<'a> for ConfigurationVersion {
     const NULL: Self = Self { major: 0, minor: 0 };
     const MIN_SIZE: usize = 8;
 
-    fn read(reader: &mut Reader<'a>, _: &'static str) -> Result<Self, DecodeError> {
+    fn read(reader: &mut ByteReader<'a>, _: &'static str) -> Result<Self, DecodeError> {
         Ok(Self {
             major: reader.u32("MajorVersion")?,
             minor: reader.u32("MinorVersion")?,

@@ -1,10 +1,10 @@
 //! Discovery probes of a Subscriber.
 
-use super::list::List;
-use super::wire::Structure;
+use super::list::WireArray;
+use super::wire::WireStructure;
 use super::{read_payload, write_headers};
 use crate::data_set_message::check_padding;
-use crate::reader::Reader;
+use crate::reader::ByteReader;
 use crate::{
     DecodeError, EncodeError, NetworkMessage, NetworkMessageType, PublisherId, SecurityHeader,
 };
@@ -20,11 +20,11 @@ pub enum Probe<'a> {
     /// Requests the Endpoints of the Server associated with the Publisher.
     PublisherEndpoints,
     /// Requests the DataSetMetaData of these DataSetWriters.
-    DataSetMetaData(List<'a, u16>),
+    DataSetMetaData(WireArray<'a, u16>),
     /// Requests the configuration of these DataSetWriters and their WriterGroups.
-    DataSetWriterConfiguration(List<'a, u16>),
+    DataSetWriterConfiguration(WireArray<'a, u16>),
     /// Requests the configuration of a WriterGroup, which is announced as
-    /// [`Announced::DataSetWriterConfiguration`](super::Announced).
+    /// [`Announced::DataSetWriterConfiguration`](super::AnnouncedContent).
     WriterGroupConfiguration {
         /// Id of the WriterGroup.
         writer_group_id: u16,
@@ -34,7 +34,7 @@ pub enum Probe<'a> {
     /// Requests the PubSubConnections.
     PubSubConnections {
         /// Restricts the response to these transport profiles; null or empty for all.
-        transport_profile_uris: List<'a, Option<&'a str>>,
+        transport_profile_uris: WireArray<'a, Option<&'a str>>,
         /// Include their WriterGroups.
         include_writer_groups: bool,
         /// Include the DataSetWriters of the WriterGroups.
@@ -68,7 +68,7 @@ impl<'a> Probe<'a> {
     /// [`DecodeError::Reserved`] with the type of an unknown probe. Otherwise fails if a field is
     /// truncated or malformed, or if bytes other than padding follow the last field.
     pub fn decode_body(body: &'a [u8]) -> Result<Self, DecodeError> {
-        let mut reader = Reader::new(body);
+        let mut reader = ByteReader::new(body);
         let probe = match reader.u8("ProbeType")? {
             PUBLISHER_INFORMATION => Self::read_publisher_information(&mut reader)?,
             FIND_APPLICATIONS => Self::FindApplications,
@@ -83,20 +83,22 @@ impl<'a> Probe<'a> {
         Ok(probe)
     }
 
-    fn read_publisher_information(reader: &mut Reader<'a>) -> Result<Self, DecodeError> {
+    fn read_publisher_information(reader: &mut ByteReader<'a>) -> Result<Self, DecodeError> {
         Ok(match reader.u8("InformationType")? {
             PUBLISHER_ENDPOINTS => {
                 skip_no_writer_ids(reader)?;
                 Self::PublisherEndpoints
             }
-            DATA_SET_META_DATA => Self::DataSetMetaData(List::read(reader, WRITER_IDS)?),
-            DATA_SET_WRITER => Self::DataSetWriterConfiguration(List::read(reader, WRITER_IDS)?),
+            DATA_SET_META_DATA => Self::DataSetMetaData(WireArray::read(reader, WRITER_IDS)?),
+            DATA_SET_WRITER => {
+                Self::DataSetWriterConfiguration(WireArray::read(reader, WRITER_IDS)?)
+            }
             WRITER_GROUP => Self::WriterGroupConfiguration {
                 writer_group_id: reader.u16("WriterGroupId")?,
                 include_data_set_writers: bool::read(reader, "IncludeDataSetWriters")?,
             },
             PUB_SUB_CONNECTIONS => Self::PubSubConnections {
-                transport_profile_uris: List::read(reader, "TransportProfileUris")?,
+                transport_profile_uris: WireArray::read(reader, "TransportProfileUris")?,
                 include_writer_groups: bool::read(reader, "IncludeWriterGroups")?,
                 include_data_set_writers: bool::read(reader, "IncludeDataSetWriters")?,
             },
@@ -169,7 +171,7 @@ impl<'a> Probe<'a> {
 }
 
 /// Skips the null array of DataSetWriterIds that ends the Endpoints probe of version 1.04.
-fn skip_no_writer_ids(reader: &mut Reader<'_>) -> Result<(), DecodeError> {
+fn skip_no_writer_ids(reader: &mut ByteReader<'_>) -> Result<(), DecodeError> {
     if reader.remaining() == 0 {
         return Ok(());
     }

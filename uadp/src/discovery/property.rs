@@ -1,6 +1,6 @@
 //! Values of Properties that describe a number.
 
-use super::settings::Settings;
+use super::settings::SettingsStructure;
 use super::wire::structure;
 use crate::{Array, BuiltinType, DecodeError, EncodeError, LocalizedText, NodeId, Scalar, Variant};
 use alloc::vec::Vec;
@@ -37,17 +37,17 @@ structure! {
     }
 }
 
-impl<'a> Settings<'a> for EUInformation<'a> {
+impl<'a> SettingsStructure<'a> for EUInformation<'a> {
     const ENCODING_ID: NodeId<'static> = NodeId::numeric(0, 889);
     const NAME: &'static str = "EUInformation";
 }
 
-impl<'a> Settings<'a> for Range {
+impl<'a> SettingsStructure<'a> for Range {
     const ENCODING_ID: NodeId<'static> = NodeId::numeric(0, 886);
     const NAME: &'static str = "Range";
 }
 
-impl<'a> Settings<'a> for EnumValueType<'a> {
+impl<'a> SettingsStructure<'a> for EnumValueType<'a> {
     const ENCODING_ID: NodeId<'static> = NodeId::numeric(0, 8251);
     const NAME: &'static str = "EnumValueType";
 }

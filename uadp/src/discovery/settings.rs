@@ -1,7 +1,7 @@
 //! Structures in ExtensionObjects, which can also hold other structures.
 
-use super::list::List;
-use super::wire::{Structure, enumeration, read_all, structure};
+use super::list::WireArray;
+use super::wire::{WireStructure, enumeration, read_all, structure};
 use crate::{DecodeError, EncodeError, ExtensionBody, ExtensionObject, NodeId};
 use alloc::vec::Vec;
 
@@ -12,7 +12,7 @@ use alloc::vec::Vec;
     private_bounds,
     reason = "the settings of UADP and datagrams are all there are"
 )]
-pub trait Settings<'a>: Structure<'a> {
+pub trait SettingsStructure<'a>: WireStructure<'a> {
     /// NodeId of the binary encoding in the ExtensionObject.
     const ENCODING_ID: NodeId<'static>;
 
@@ -61,7 +61,7 @@ structure! {
         /// Sampling time within the publishing interval, in milliseconds; -1 if undefined.
         sampling_offset: f64 = "SamplingOffset",
         /// Sending time of each NetworkMessage within the publishing interval, in milliseconds.
-        publishing_offset: List<'a, f64> = "PublishingOffset",
+        publishing_offset: WireArray<'a, f64> = "PublishingOffset",
     }
 
     /// UADP DataSetMessage settings of a DataSetWriter (OPC 10000-14, 6.3.1.3.6).
@@ -102,7 +102,7 @@ structure! {
         /// Quality of service; null for best effort.
         qos_category: Option<&'a str> = "QosCategory",
         /// Parameters of the quality of service.
-        datagram_qos: List<'a, ExtensionObject<'a>> = "DatagramQos",
+        datagram_qos: WireArray<'a, ExtensionObject<'a>> = "DatagramQos",
     }
 
     /// Datagram settings of a WriterGroup (OPC 10000-14, 6.4.1.3.3).
@@ -125,7 +125,7 @@ structure! {
         /// Quality of service; null for the quality of service of the connection.
         qos_category: Option<&'a str> = "QosCategory",
         /// Parameters of the quality of service.
-        datagram_qos: List<'a, ExtensionObject<'a>> = "DatagramQos",
+        datagram_qos: WireArray<'a, ExtensionObject<'a>> = "DatagramQos",
         /// Announcement interval of the group, in seconds; 0 for announcements on request only.
         discovery_announce_rate: u32 = "DiscoveryAnnounceRate",
         /// Topic, for transports with topics.
@@ -147,7 +147,7 @@ enumeration! {
 
 macro_rules! settings {
     ($($name:ident $(<$lifetime:lifetime>)? = $encoding_id:literal;)+) => { $(
-        impl<'a> Settings<'a> for $name $(<$lifetime>)? {
+        impl<'a> SettingsStructure<'a> for $name $(<$lifetime>)? {
             const ENCODING_ID: NodeId<'static> = NodeId::numeric(0, $encoding_id);
             const NAME: &'static str = stringify!($name);
         }

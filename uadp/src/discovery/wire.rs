@@ -1,6 +1,6 @@
 //! Encoding of values at fixed positions, and of structures as lists of such values.
 
-use crate::reader::Reader;
+use crate::reader::ByteReader;
 use crate::writer;
 use crate::{
     DateTime, DecodeError, EncodeError, ExtensionBody, ExtensionObject, Guid, LocalizedText,
@@ -9,7 +9,7 @@ use crate::{
 use alloc::vec::Vec;
 
 /// A value with a fixed encoding: a builtin type, an array or a structure (OPC 10000-6, 5.2.6).
-pub(crate) trait Structure<'a>: Copy {
+pub(crate) trait WireStructure<'a>: Copy {
     /// The default value: null if the type has it, otherwise zero.
     const NULL: Self;
     /// Minimum encoded size in bytes. An array length is checked against it before the elements are
@@ -18,7 +18,7 @@ pub(crate) trait Structure<'a>: Copy {
 
     /// Decodes a value. `what` is the field name in errors; a structure uses the names of its
     /// fields.
-    fn read(reader: &mut Reader<'a>, what: &'static str) -> Result<Self, DecodeError>;
+    fn read(reader: &mut ByteReader<'a>, what: &'static str) -> Result<Self, DecodeError>;
 
     /// Appends the encoding; `what` as in [`read`](Self::read).
     fn write(&self, out: &mut Vec<u8>, what: &'static str) -> Result<(), EncodeError>;
@@ -27,12 +27,12 @@ pub(crate) trait Structure<'a>: Copy {
 /// Numbers, little-endian.
 macro_rules! number {
     ($($number:ty)+) => { $(
-        impl Structure<'_> for $number {
+        impl WireStructure<'_> for $number {
             const NULL: Self = 0 as Self;
             const MIN_SIZE: usize = size_of::<Self>();
 
             #[inline]
-            fn read(reader: &mut Reader<'_>, what: &'static str) -> Result<Self, DecodeError> {
+            fn read(reader: &mut ByteReader<'_>, what: &'static str) -> Result<Self, DecodeError> {
                 reader.array(what).map(Self::from_le_bytes)
             }
 
@@ -50,13 +50,13 @@ number! { u8 u16 u32 i32 i64 f64 }
 /// Types that wrap a value of another type.
 macro_rules! wrapped {
     ($($wrapper:ident($inner:ty))+) => { $(
-        impl Structure<'_> for $wrapper {
-            const NULL: Self = Self(<$inner as Structure<'_>>::NULL);
-            const MIN_SIZE: usize = <$inner as Structure<'_>>::MIN_SIZE;
+        impl WireStructure<'_> for $wrapper {
+            const NULL: Self = Self(<$inner as WireStructure<'_>>::NULL);
+            const MIN_SIZE: usize = <$inner as WireStructure<'_>>::MIN_SIZE;
 
             #[inline]
-            fn read(reader: &mut Reader<'_>, what: &'static str) -> Result<Self, DecodeError> {
-                Structure::read(reader, what).map(Self)
+            fn read(reader: &mut ByteReader<'_>, what: &'static str) -> Result<Self, DecodeError> {
+                WireStructure::read(reader, what).map(Self)
             }
 
             #[inline]
@@ -72,12 +72,12 @@ wrapped! { StatusCode(u32) DateTime(i64) }
 /// Builtin types with `read` and `write` functions.
 macro_rules! builtin {
     ($($builtin:ident: $null:expr, $min_size:literal;)+) => { $(
-        impl<'a> Structure<'a> for $builtin<'a> {
+        impl<'a> WireStructure<'a> for $builtin<'a> {
             const NULL: Self = $null;
             const MIN_SIZE: usize = $min_size;
 
             #[inline]
-            fn read(reader: &mut Reader<'a>, _: &'static str) -> Result<Self, DecodeError> {
+            fn read(reader: &mut ByteReader<'a>, _: &'static str) -> Result<Self, DecodeError> {
                 Self::read(reader)
             }
 
@@ -97,11 +97,11 @@ builtin! {
     ExtensionObject: Self { type_id: NodeId::NULL, body: ExtensionBody::None }, 3;
 }
 
-impl Structure<'_> for bool {
+impl WireStructure<'_> for bool {
     const NULL: Self = false;
     const MIN_SIZE: usize = 1;
 
-    fn read(reader: &mut Reader<'_>, what: &'static str) -> Result<Self, DecodeError> {
+    fn read(reader: &mut ByteReader<'_>, what: &'static str) -> Result<Self, DecodeError> {
         // Every value except 0 is true (OPC 10000-6, 5.2.2.1).
         reader.u8(what).map(|byte| byte != 0)
     }
@@ -112,11 +112,11 @@ impl Structure<'_> for bool {
     }
 }
 
-impl Structure<'_> for Guid {
+impl WireStructure<'_> for Guid {
     const NULL: Self = Self([0; 16]);
     const MIN_SIZE: usize = 16;
 
-    fn read(reader: &mut Reader<'_>, what: &'static str) -> Result<Self, DecodeError> {
+    fn read(reader: &mut ByteReader<'_>, what: &'static str) -> Result<Self, DecodeError> {
         reader.array(what).map(Self)
     }
 
@@ -126,11 +126,11 @@ impl Structure<'_> for Guid {
     }
 }
 
-impl<'a> Structure<'a> for Option<&'a str> {
+impl<'a> WireStructure<'a> for Option<&'a str> {
     const NULL: Self = None;
     const MIN_SIZE: usize = 4;
 
-    fn read(reader: &mut Reader<'a>, what: &'static str) -> Result<Self, DecodeError> {
+    fn read(reader: &mut ByteReader<'a>, what: &'static str) -> Result<Self, DecodeError> {
         reader.text(what)
     }
 
@@ -139,11 +139,11 @@ impl<'a> Structure<'a> for Option<&'a str> {
     }
 }
 
-impl<'a> Structure<'a> for Option<&'a [u8]> {
+impl<'a> WireStructure<'a> for Option<&'a [u8]> {
     const NULL: Self = None;
     const MIN_SIZE: usize = 4;
 
-    fn read(reader: &mut Reader<'a>, what: &'static str) -> Result<Self, DecodeError> {
+    fn read(reader: &mut ByteReader<'a>, what: &'static str) -> Result<Self, DecodeError> {
         reader.byte_string(what)
     }
 
@@ -153,11 +153,11 @@ impl<'a> Structure<'a> for Option<&'a [u8]> {
 }
 
 /// Decodes a value that spans all bytes.
-pub(crate) fn read_all<'a, T: Structure<'a>>(
+pub(crate) fn read_all<'a, T: WireStructure<'a>>(
     bytes: &'a [u8],
     what: &'static str,
 ) -> Result<T, DecodeError> {
-    let mut reader = Reader::new(bytes);
+    let mut reader = ByteReader::new(bytes);
     let value = T::read(&mut reader, what)?;
     match reader.remaining() {
         0 => Ok(value),
@@ -180,19 +180,19 @@ macro_rules! structure {
             $( $(#[$field_meta])* pub $field: $type, )+
         }
 
-        impl<'a> crate::discovery::wire::Structure<'a> for $name $(<$lifetime>)? {
+        impl<'a> crate::discovery::wire::WireStructure<'a> for $name $(<$lifetime>)? {
             const NULL: Self = Self {
-                $( $field: <$type as crate::discovery::wire::Structure<'a>>::NULL, )+
+                $( $field: <$type as crate::discovery::wire::WireStructure<'a>>::NULL, )+
             };
             const MIN_SIZE: usize =
-                0 $( + <$type as crate::discovery::wire::Structure<'a>>::MIN_SIZE )+;
+                0 $( + <$type as crate::discovery::wire::WireStructure<'a>>::MIN_SIZE )+;
 
             fn read(
-                reader: &mut crate::reader::Reader<'a>,
+                reader: &mut crate::reader::ByteReader<'a>,
                 _: &'static str,
             ) -> Result<Self, crate::DecodeError> {
                 Ok(Self {
-                    $( $field: crate::discovery::wire::Structure::read(
+                    $( $field: crate::discovery::wire::WireStructure::read(
                         reader,
                         concat!(stringify!($name), " ", $label),
                     )?, )+
@@ -204,7 +204,7 @@ macro_rules! structure {
                 out: &mut alloc::vec::Vec<u8>,
                 _: &'static str,
             ) -> Result<(), crate::EncodeError> {
-                $( crate::discovery::wire::Structure::write(
+                $( crate::discovery::wire::WireStructure::write(
                     &self.$field,
                     out,
                     concat!(stringify!($name), " ", $label),
@@ -216,7 +216,7 @@ macro_rules! structure {
         /// Every field is null, or zero if its type has no null.
         impl $(<$lifetime>)? Default for $name $(<$lifetime>)? {
             fn default() -> Self {
-                <Self as crate::discovery::wire::Structure<'_>>::NULL
+                <Self as crate::discovery::wire::WireStructure<'_>>::NULL
             }
         }
     )+ };
@@ -237,12 +237,12 @@ macro_rules! enumeration {
             $( $(#[$value_meta])* pub const $constant: Self = Self($value); )+
         }
 
-        impl crate::discovery::wire::Structure<'_> for $name {
+        impl crate::discovery::wire::WireStructure<'_> for $name {
             const NULL: Self = Self(0);
             const MIN_SIZE: usize = 4;
 
             fn read(
-                reader: &mut crate::reader::Reader<'_>,
+                reader: &mut crate::reader::ByteReader<'_>,
                 what: &'static str,
             ) -> Result<Self, crate::DecodeError> {
                 reader.i32(what).map(Self)

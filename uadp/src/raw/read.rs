@@ -3,7 +3,7 @@
 use super::layout::{Element, to_usize};
 use super::{Form, RawArray, RawDialect, RawField, RawLayout, RawStructure, RawStructureType};
 use super::{RawValue, SCALAR, WORD};
-use crate::reader::Reader;
+use crate::reader::ByteReader;
 use crate::{Array, DecodeError, ExtensionBody, ExtensionObject, Matrix, Scalar, Variant};
 
 /// Iterator over the fields of a RawData payload.
@@ -15,7 +15,7 @@ use crate::{Array, DecodeError, ExtensionBody, ExtensionObject, Matrix, Scalar, 
 pub struct RawFields<'a> {
     fields: core::slice::Iter<'a, RawField<'a>>,
     form: Form,
-    reader: Reader<'a>,
+    reader: ByteReader<'a>,
 }
 
 /// Iterator over the present fields of a structure, each with its index in
@@ -25,19 +25,19 @@ pub struct RawFields<'a> {
 /// [`DecodeError::TrailingBytes`].
 #[derive(Debug, Clone)]
 pub struct RawMembers<'a> {
-    walk: Walk<'a>,
+    walk: StructureWalk<'a>,
     done: bool,
 }
 
 /// Iteration over the fields of a structure.
 #[derive(Debug, Clone)]
-pub(super) struct Walk<'a> {
+pub(super) struct StructureWalk<'a> {
     structure: &'a RawStructure<'a>,
     form: Form,
     next: usize,
     /// EncodingMask, shifted to the next optional field; or SwitchField.
     head: u32,
-    reader: Reader<'a>,
+    reader: ByteReader<'a>,
 }
 
 /// A field of a structure during the iteration.
@@ -49,9 +49,9 @@ pub(super) struct Member<'a> {
 }
 
 /// Bytes to decode: a padded range, or all remaining bytes.
-struct Place<'a> {
+struct UnreadBytes<'a> {
     padded: bool,
-    reader: Reader<'a>,
+    reader: ByteReader<'a>,
 }
 
 /// Length or dimensions of an array.
@@ -81,7 +81,7 @@ impl<'a> RawLayout<'a> {
         RawFields {
             fields,
             form: Form::of(dialect),
-            reader: Reader::new(payload),
+            reader: ByteReader::new(payload),
         }
     }
 }
@@ -91,7 +91,7 @@ impl<'a> Iterator for RawFields<'a> {
 
     fn next(&mut self) -> Option<Self::Item> {
         let Some(field) = self.fields.next() else {
-            let padding = core::mem::replace(&mut self.reader, Reader::new(&[])).rest();
+            let padding = core::mem::replace(&mut self.reader, ByteReader::new(&[])).rest();
             return if padding.iter().all(|byte| *byte == 0) {
                 None
             } else {
@@ -101,7 +101,7 @@ impl<'a> Iterator for RawFields<'a> {
         let value = read_field(field, self.form, &mut self.reader);
         if value.is_err() {
             self.fields = [].iter();
-            self.reader = Reader::new(&[]);
+            self.reader = ByteReader::new(&[]);
         }
         Some(value)
     }
@@ -122,7 +122,7 @@ impl<'a> RawStructure<'a> {
     where
         'a: 'p,
     {
-        let walk = Walk::new(self, Form::of(dialect).nested(), Reader::new(body))?;
+        let walk = StructureWalk::new(self, Form::of(dialect).nested(), ByteReader::new(body))?;
         Ok(RawMembers { walk, done: false })
     }
 }
@@ -156,11 +156,11 @@ impl<'a> Iterator for RawMembers<'a> {
 
 impl core::iter::FusedIterator for RawMembers<'_> {}
 
-impl<'a> Walk<'a> {
+impl<'a> StructureWalk<'a> {
     pub(super) fn new(
         structure: &'a RawStructure<'a>,
         form: Form,
-        mut reader: Reader<'a>,
+        mut reader: ByteReader<'a>,
     ) -> Result<Self, DecodeError> {
         let head = match structure.structure_type() {
             RawStructureType::Structure => 0,
@@ -237,7 +237,7 @@ impl<'a> Walk<'a> {
             return Ok(None);
         }
         let room = self.structure.union_room(self.form);
-        let mut place = Place::new(room, &mut self.reader, "Union")?;
+        let mut place = UnreadBytes::new(room, &mut self.reader, "Union")?;
         let member = match self.chosen() {
             Some((index, field)) => Some(Member {
                 index,
@@ -257,17 +257,17 @@ impl<'a> Walk<'a> {
     }
 }
 
-impl<'a> Place<'a> {
+impl<'a> UnreadBytes<'a> {
     /// Takes the next `room` bytes from `reader`; without `room`, copies `reader`.
     fn new(
         room: Option<usize>,
-        reader: &mut Reader<'a>,
+        reader: &mut ByteReader<'a>,
         what: &'static str,
     ) -> Result<Self, DecodeError> {
         Ok(match room {
             Some(room) => Self {
                 padded: true,
-                reader: Reader::new(reader.bytes(room, what)?),
+                reader: ByteReader::new(reader.bytes(room, what)?),
             },
             None => Self {
                 padded: false,
@@ -276,7 +276,7 @@ impl<'a> Place<'a> {
         })
     }
 
-    fn leave(self, reader: &mut Reader<'a>) -> Result<(), DecodeError> {
+    fn leave(self, reader: &mut ByteReader<'a>) -> Result<(), DecodeError> {
         if self.padded {
             return check_zero(self.reader.rest());
         }
@@ -288,7 +288,7 @@ impl<'a> Place<'a> {
 fn read_field<'a>(
     field: &'a RawField<'a>,
     form: Form,
-    reader: &mut Reader<'a>,
+    reader: &mut ByteReader<'a>,
 ) -> Result<RawValue<'a>, DecodeError> {
     match field.value_rank {
         SCALAR => read_element(field, form, reader).map(|value| Variant::Scalar(value).into()),
@@ -300,7 +300,7 @@ fn read_field<'a>(
 pub(super) fn read_element<'a>(
     field: &'a RawField<'a>,
     form: Form,
-    reader: &mut Reader<'a>,
+    reader: &mut ByteReader<'a>,
 ) -> Result<Scalar<'a>, DecodeError> {
     match field.element() {
         Some(Element::Fixed(_)) => Scalar::read(field.builtin, reader),
@@ -314,12 +314,12 @@ pub(super) fn read_element<'a>(
 fn read_text<'a>(
     field: &RawField<'_>,
     form: Form,
-    reader: &mut Reader<'a>,
+    reader: &mut ByteReader<'a>,
 ) -> Result<Scalar<'a>, DecodeError> {
     let name = field.builtin.name();
     let room = field.text_room(form);
     let size = room.map(|room| room.saturating_add(WORD));
-    let mut place = Place::new(size, reader, name)?;
+    let mut place = UnreadBytes::new(size, reader, name)?;
     let mut ahead = place.reader;
     if let (Some(length), Some(room)) = (ahead.length(name)?, room)
         && length > room
@@ -334,10 +334,10 @@ fn read_text<'a>(
 fn read_structure<'a>(
     structure: &'a RawStructure<'a>,
     form: Form,
-    reader: &mut Reader<'a>,
+    reader: &mut ByteReader<'a>,
 ) -> Result<Scalar<'a>, DecodeError> {
     let before = *reader;
-    let mut walk = Walk::new(structure, form, before)?;
+    let mut walk = StructureWalk::new(structure, form, before)?;
     while walk.step()?.is_some() {}
     *reader = walk.reader;
     Ok(Scalar::ExtensionObject(ExtensionObject {
@@ -349,13 +349,13 @@ fn read_structure<'a>(
 fn read_array<'a>(
     field: &'a RawField<'a>,
     form: Form,
-    reader: &mut Reader<'a>,
+    reader: &mut ByteReader<'a>,
 ) -> Result<RawValue<'a>, DecodeError> {
     let extent = match field.value_rank {
         1 => read_length(field, form, reader)?,
         _ => read_dimensions(field, form, reader)?,
     };
-    let mut place = Place::new(field.array_room(form), reader, "array")?;
+    let mut place = UnreadBytes::new(field.array_room(form), reader, "array")?;
     let value = read_elements(field, form, &extent, &mut place.reader)?;
     place.leave(reader)?;
     Ok(value)
@@ -364,7 +364,7 @@ fn read_array<'a>(
 fn read_length<'a>(
     field: &RawField<'_>,
     form: Form,
-    reader: &mut Reader<'a>,
+    reader: &mut ByteReader<'a>,
 ) -> Result<Extent<'a>, DecodeError> {
     const NAME: &str = "array length";
     let length = reader.length(NAME)?;
@@ -388,7 +388,7 @@ fn read_length<'a>(
 fn read_dimensions<'a>(
     field: &RawField<'_>,
     form: Form,
-    reader: &mut Reader<'a>,
+    reader: &mut ByteReader<'a>,
 ) -> Result<Extent<'a>, DecodeError> {
     let rank = field.rank();
     if form != Form::Open62541 {
@@ -435,7 +435,7 @@ fn read_elements<'a>(
     field: &'a RawField<'a>,
     form: Form,
     extent: &Extent<'a>,
-    reader: &mut Reader<'a>,
+    reader: &mut ByteReader<'a>,
 ) -> Result<RawValue<'a>, DecodeError> {
     let Extent {
         null,

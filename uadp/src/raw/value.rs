@@ -2,7 +2,7 @@
 
 use super::read::read_element;
 use super::{Form, RawField};
-use crate::reader::Reader;
+use crate::reader::ByteReader;
 use crate::{BuiltinType, Scalar, Variant};
 
 /// Value of a field.
@@ -40,7 +40,7 @@ pub struct RawElements<'a> {
     field: &'a RawField<'a>,
     form: Form,
     left: usize,
-    reader: Reader<'a>,
+    reader: ByteReader<'a>,
 }
 
 impl<'a> RawValue<'a> {
@@ -109,7 +109,7 @@ impl<'a> RawArray<'a> {
             field: self.field,
             form: self.form,
             left: self.len,
-            reader: Reader::new(self.bytes),
+            reader: ByteReader::new(self.bytes),
         }
     }
 }

@@ -1,10 +1,10 @@
 //! Encoding: checks types and lengths against the layout, and pads values.
 
 use super::layout::{Element, to_usize};
-use super::read::Walk;
+use super::read::StructureWalk;
 use super::{Form, RawArray, RawDialect, RawField, RawLayout, RawStructure, RawStructureType};
 use super::{RawValue, SCALAR};
-use crate::reader::Reader;
+use crate::reader::ByteReader;
 use crate::{
     Array, BuiltinType, DecodeError, ExtensionBody, ExtensionObject, Scalar, Variant, writer,
 };
@@ -306,8 +306,8 @@ fn write_structure(
     body: &[u8],
     buf: &mut Vec<u8>,
 ) -> Result<(), RawWriteFault> {
-    let mut walk =
-        Walk::new(structure, forms.from, Reader::new(body)).map_err(RawWriteFault::Body)?;
+    let mut walk = StructureWalk::new(structure, forms.from, ByteReader::new(body))
+        .map_err(RawWriteFault::Body)?;
     if structure.structure_type() != RawStructureType::Structure {
         buf.extend_from_slice(&walk.head().to_le_bytes());
     }

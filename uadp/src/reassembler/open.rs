@@ -6,14 +6,14 @@ use alloc::vec::Vec;
 use core::hash::Hasher;
 use core::time::Duration;
 
-use super::{GiveUp, GivenUp};
+use super::{GiveUp, IncompleteWhole};
 use crate::hashing::DefaultHasher;
 use crate::publisher_id::OwnedPublisherId;
 use crate::{Chunk, NetworkMessage, NetworkMessageType, PublisherId};
 
 /// Identity of a whole.
 #[derive(Debug)]
-pub(super) struct Key<S> {
+pub(super) struct WholeKey<S> {
     /// Sender of its chunks.
     pub(super) sender: S,
     publisher_id: Option<OwnedPublisherId>,
@@ -21,7 +21,7 @@ pub(super) struct Key<S> {
     message_sequence_number: u16,
 }
 
-/// A [`Key`] for lookups, which borrows the PublisherId.
+/// A [`WholeKey`] for lookups, which borrows the PublisherId.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct KeyRef<'a, S> {
     pub(super) sender: S,
@@ -41,8 +41,8 @@ struct Writer {
 
 /// A whole during reassembly.
 #[derive(Debug)]
-pub(super) struct Open<S> {
-    pub(super) key: Key<S>,
+pub(super) struct OpenWhole<S> {
+    pub(super) key: WholeKey<S>,
     pub(super) total_size: u32,
     /// Time of its first chunk.
     pub(super) since: Duration,
@@ -54,8 +54,8 @@ pub(super) struct Open<S> {
 
 /// A completed whole, with the digests of its chunks.
 #[derive(Debug)]
-pub(super) struct Done<S> {
-    pub(super) key: Key<S>,
+pub(super) struct CompletedWhole<S> {
+    pub(super) key: WholeKey<S>,
     /// Time of completion.
     pub(super) at: Duration,
     total_size: u32,
@@ -65,7 +65,7 @@ pub(super) struct Done<S> {
 
 /// Result of inserting a chunk.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Insertion {
+pub(super) enum ChunkInsertion {
     Taken,
     /// The same bytes are present.
     Duplicate,
@@ -94,17 +94,17 @@ impl<'a, S: Copy + Eq> KeyRef<'a, S> {
         }
     }
 
-    pub(super) fn is(&self, key: &Key<S>) -> bool {
+    pub(super) fn is(&self, key: &WholeKey<S>) -> bool {
         self.message_sequence_number == key.message_sequence_number && self.is_writer_of(key)
     }
 
-    pub(super) fn is_writer_of(&self, key: &Key<S>) -> bool {
+    pub(super) fn is_writer_of(&self, key: &WholeKey<S>) -> bool {
         let publisher_id = key.publisher_id.as_ref().map(OwnedPublisherId::as_id);
         self.writer == key.writer && self.publisher_id == publisher_id && self.sender == key.sender
     }
 
-    pub(super) fn to_key(self) -> Key<S> {
-        Key {
+    pub(super) fn to_key(self) -> WholeKey<S> {
+        WholeKey {
             sender: self.sender,
             publisher_id: self.publisher_id.map(Into::into),
             writer: self.writer,
@@ -113,7 +113,7 @@ impl<'a, S: Copy + Eq> KeyRef<'a, S> {
     }
 }
 
-impl<S> Key<S> {
+impl<S> WholeKey<S> {
     /// Returns the approximate bytes that the key uses.
     pub(super) fn cost(&self) -> usize {
         let text = match &self.publisher_id {
@@ -130,8 +130,8 @@ impl<S> Key<S> {
     }
 }
 
-impl<S> Open<S> {
-    pub(super) const fn new(key: Key<S>, total_size: u32, since: Duration) -> Self {
+impl<S> OpenWhole<S> {
+    pub(super) const fn new(key: WholeKey<S>, total_size: u32, since: Duration) -> Self {
         Self {
             key,
             total_size,
@@ -142,25 +142,25 @@ impl<S> Open<S> {
     }
 
     /// Adds the piece, unless it is present or the whole has `limit` pieces.
-    pub(super) fn insert(&mut self, chunk: &Chunk<'_>, limit: usize) -> Insertion {
+    pub(super) fn insert(&mut self, chunk: &Chunk<'_>, limit: usize) -> ChunkInsertion {
         match self.pieces.get(&chunk.offset) {
-            Some(piece) if **piece == *chunk.data => return Insertion::Duplicate,
-            Some(piece) if piece.len() == chunk.data.len() => return Insertion::Contradiction,
-            Some(_) => return Insertion::Overlap,
+            Some(piece) if **piece == *chunk.data => return ChunkInsertion::Duplicate,
+            Some(piece) if piece.len() == chunk.data.len() => return ChunkInsertion::Contradiction,
+            Some(_) => return ChunkInsertion::Overlap,
             None => {}
         }
         let Ok(len) = u32::try_from(chunk.data.len()) else {
-            return Insertion::Overlap;
+            return ChunkInsertion::Overlap;
         };
         if self.overlaps(chunk.offset, len) {
-            return Insertion::Overlap;
+            return ChunkInsertion::Overlap;
         }
         if self.pieces.len() >= limit {
-            return Insertion::TooMany;
+            return ChunkInsertion::TooMany;
         }
         self.pieces.insert(chunk.offset, chunk.data.into());
         self.received += len;
-        Insertion::Taken
+        ChunkInsertion::Taken
     }
 
     fn overlaps(&self, offset: u32, len: u32) -> bool {
@@ -185,7 +185,7 @@ impl<S> Open<S> {
     }
 
     /// Converts the whole to the entry that is remembered after completion.
-    pub(super) fn done(self, at: Duration) -> Done<S> {
+    pub(super) fn done(self, at: Duration) -> CompletedWhole<S> {
         let Self {
             key,
             total_size,
@@ -197,7 +197,7 @@ impl<S> Open<S> {
             .map(|(at, piece)| (*at, digest(piece)))
             .collect();
         drop(pieces);
-        Done {
+        CompletedWhole {
             key,
             at,
             total_size,
@@ -208,8 +208,8 @@ impl<S> Open<S> {
     }
 
     /// Converts the whole to the entry that reports it as given up.
-    pub(super) fn given_up(self, why: GiveUp) -> GivenUp<S> {
-        GivenUp {
+    pub(super) fn given_up(self, why: GiveUp) -> IncompleteWhole<S> {
+        IncompleteWhole {
             sender: self.key.sender,
             publisher_id: self.key.publisher_id,
             writer_group_id: self.key.writer.group_id,
@@ -227,9 +227,9 @@ impl<S> Open<S> {
     }
 }
 
-impl<S> Done<S> {
+impl<S> CompletedWhole<S> {
     /// Creates the entry of a whole with a single chunk.
-    pub(super) fn alone(key: Key<S>, chunk: &Chunk<'_>, at: Duration) -> Self {
+    pub(super) fn alone(key: WholeKey<S>, chunk: &Chunk<'_>, at: Duration) -> Self {
         Self {
             key,
             at,

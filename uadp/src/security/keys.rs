@@ -22,7 +22,7 @@ use super::{KEY_NONCE, KeyError, MESSAGE_NONCE, Nonce, SIGNATURE, SIGNING_KEY, S
 /// Comparison takes constant time. The key data is overwritten with zeros on drop; `Debug` shows
 /// the policy only.
 #[derive(Clone)]
-pub struct Keys(Box<Prepared>);
+pub struct TokenKeys(Box<Prepared>);
 
 #[derive(Clone)]
 struct Prepared {
@@ -39,7 +39,7 @@ enum Cipher {
     Aes256(Aes256Enc),
 }
 
-impl Keys {
+impl TokenKeys {
     /// Reads SigningKey (32 bytes), EncryptingKey (16 or 32) and KeyNonce (4) from a ByteString of
     /// GetSecurityKeys.
     ///
@@ -130,16 +130,16 @@ fn apply<C: BlockCipherEncrypt + BlockSizeUser<BlockSize = U16>>(
         .try_apply_keystream_partial(bytes.into())
 }
 
-impl PartialEq for Keys {
+impl PartialEq for TokenKeys {
     fn eq(&self, other: &Self) -> bool {
         // Each policy has a different length of key data, so the policies need no comparison.
         self.0.key_data.ct_eq(&other.0.key_data).into()
     }
 }
 
-impl Eq for Keys {}
+impl Eq for TokenKeys {}
 
-impl fmt::Debug for Keys {
+impl fmt::Debug for TokenKeys {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.debug_struct("Keys")
             .field("policy", &self.policy())
@@ -214,7 +214,7 @@ mod tests {
                 _ => SecurityPolicy::PubSubAes256Ctr,
             };
             let key_data = [vec![0; 32], bytes(key), bytes(key_nonce)].concat();
-            let keys = Keys::from_bytes(policy, &key_data).unwrap();
+            let keys = TokenKeys::from_bytes(policy, &key_data).unwrap();
             let nonce = Nonce::from_bytes(bytes(nonce).try_into().unwrap());
             let mut text = plain.to_vec();
             keys.apply_keystream(nonce, &mut text).unwrap();

@@ -4,8 +4,8 @@ use alloc::vec::Vec;
 use core::time::Duration;
 
 use super::replay::{Accepted, StreamId, Streams};
-use super::ring::KeyRing;
-use super::{KeyError, Keys, Nonce, SIGNATURE, SecurityError, SecurityMode};
+use super::ring::TokenKeyRing;
+use super::{KeyError, Nonce, SIGNATURE, SecurityError, SecurityMode, TokenKeys};
 use crate::{NetworkMessage, NetworkMessageType, SecurityHeader};
 
 /// Opens the secured messages of a SecurityGroup (OPC 10000-14, 7.2.4.4.3).
@@ -25,11 +25,11 @@ use crate::{NetworkMessage, NetworkMessageType, SecurityHeader};
 /// # Examples
 /// ```
 /// use std::time::Duration;
-/// use uadp::{Keys, NetworkMessage, Opener, SecurityMode, SecurityPolicy};
+/// use uadp::{TokenKeys, NetworkMessage, Opener, SecurityMode, SecurityPolicy};
 ///
 /// // SigningKey 01 02 .. 20, EncryptingKey a0 a1 .. af, KeyNonce 10 11 12 13
 /// let key_data: Vec<u8> = (1..=32).chain(0xA0..=0xAF).chain(0x10..=0x13).collect();
-/// let keys = Keys::from_bytes(SecurityPolicy::PubSubAes128Ctr, &key_data)?;
+/// let keys = TokenKeys::from_bytes(SecurityPolicy::PubSubAes128Ctr, &key_data)?;
 /// let mut opener = Opener::new(SecurityMode::SignAndEncrypt);
 /// opener.update_keys(1, [keys])?;
 ///
@@ -54,7 +54,7 @@ use crate::{NetworkMessage, NetworkMessageType, SecurityHeader};
 pub struct Opener {
     mode: SecurityMode,
     options: OpenerOptions,
-    ring: KeyRing<Streams>,
+    ring: TokenKeyRing<Streams>,
 }
 
 /// Limits and options of an [`Opener`].
@@ -77,8 +77,8 @@ pub struct OpenerOptions {
     /// Messages that share a sequence. Default [`CountedBy::Publisher`].
     pub counted_by: CountedBy,
     /// Accepts publishers with the constant sequence number 1, as in open62541 up to version 1.5.7.
-    /// Their messages are marked [`Opened::constant_sequence`] and can be replayed, except the last
-    /// message. Default `false`.
+    /// Their messages are marked [`OpenedMessage::constant_sequence`] and can be replayed, except
+    /// the last message. Default `false`.
     pub accept_constant_sequence: bool,
 }
 
@@ -104,7 +104,7 @@ pub enum CountedBy {
 /// An opened message, and events that it causes.
 #[derive(Debug, Clone)]
 #[non_exhaustive]
-pub struct Opened<'a> {
+pub struct OpenedMessage<'a> {
     /// The message with readable payload and footer.
     pub message: NetworkMessage<'a>,
     /// The message is the first with a future key, which is the current key from then on.
@@ -143,7 +143,7 @@ impl Opener {
         Self {
             mode,
             options,
-            ring: KeyRing::new(options.past_keys),
+            ring: TokenKeyRing::new(options.past_keys),
         }
     }
 
@@ -161,7 +161,7 @@ impl Opener {
     pub fn update_keys(
         &mut self,
         first_token_id: u32,
-        keys: impl IntoIterator<Item = Keys>,
+        keys: impl IntoIterator<Item = TokenKeys>,
     ) -> Result<(), KeyError> {
         self.ring.update(first_token_id, keys)
     }
@@ -188,7 +188,7 @@ impl Opener {
         message: &NetworkMessage<'a>,
         now: Duration,
         scratch: &'a mut Vec<u8>,
-    ) -> Result<Opened<'a>, SecurityError> {
+    ) -> Result<OpenedMessage<'a>, SecurityError> {
         let header = self.checked_header(message)?;
         let nonce = read_nonce(header.nonce)?;
         let parts = Parts::of(message, &header)?;
@@ -217,7 +217,7 @@ impl Opener {
         let (payload, footer) = body
             .split_at_checked(parts.footer_at)
             .unwrap_or((body, &[]));
-        Ok(Opened {
+        Ok(OpenedMessage {
             message: message.opened(payload, footer),
             key_changed: self.ring.advance(token_id),
             force_key_reset: header.force_key_reset,
@@ -306,7 +306,7 @@ fn stream_id<'a>(
 }
 
 fn decrypt<'a>(
-    keys: &Keys,
+    keys: &TokenKeys,
     nonce: Nonce,
     body: &[u8],
     scratch: &'a mut Vec<u8>,

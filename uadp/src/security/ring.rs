@@ -1,14 +1,14 @@
 //! The keys of a SecurityGroup in the order of their SecurityTokenIds: past, current and future
 //! keys.
 
-use super::{KeyError, Keys};
+use super::{KeyError, TokenKeys};
 use alloc::vec::Vec;
 
 /// Keys, each with a state that starts as its default and is removed with the key.
 #[derive(Debug)]
-pub(super) struct KeyRing<S> {
+pub(super) struct TokenKeyRing<S> {
     /// Oldest first.
-    entries: Vec<Entry<S>>,
+    entries: Vec<KeyEntry<S>>,
     /// SecurityTokenId of the current key, 0 without keys.
     current: u32,
     /// Maximum number of past keys.
@@ -18,16 +18,16 @@ pub(super) struct KeyRing<S> {
 }
 
 #[derive(Debug)]
-pub(super) struct Entry<S> {
+pub(super) struct KeyEntry<S> {
     pub(super) token_id: u32,
-    pub(super) keys: Keys,
+    pub(super) keys: TokenKeys,
     pub(super) state: S,
 }
 
 /// Maximum number of keys in an update.
 const MAX_KEYS: usize = 64;
 
-impl<S: Default> KeyRing<S> {
+impl<S: Default> TokenKeyRing<S> {
     pub(super) const fn new(max_past: usize) -> Self {
         Self {
             entries: Vec::new(),
@@ -46,7 +46,7 @@ impl<S: Default> KeyRing<S> {
     pub(super) fn update(
         &mut self,
         first: u32,
-        keys: impl IntoIterator<Item = Keys>,
+        keys: impl IntoIterator<Item = TokenKeys>,
     ) -> Result<(), KeyError> {
         if first == 0 {
             return Err(KeyError::TokenId);
@@ -54,7 +54,7 @@ impl<S: Default> KeyRing<S> {
         let mut token_id = first;
         let mut given = Vec::new();
         for keys in keys.into_iter().take(MAX_KEYS + 1) {
-            given.push(Entry {
+            given.push(KeyEntry {
                 token_id,
                 keys,
                 state: S::default(),
@@ -72,7 +72,7 @@ impl<S: Default> KeyRing<S> {
         Ok(())
     }
 
-    fn merge(&mut self, first: u32, given: Vec<Entry<S>>) {
+    fn merge(&mut self, first: u32, given: Vec<KeyEntry<S>>) {
         for entry in given {
             if !self.holds(&entry) && !self.is_retired(entry.token_id) {
                 self.entries.retain(|old| old.token_id != entry.token_id);
@@ -86,7 +86,7 @@ impl<S: Default> KeyRing<S> {
         self.drop_past();
     }
 
-    fn replace(&mut self, first: u32, given: Vec<Entry<S>>) {
+    fn replace(&mut self, first: u32, given: Vec<KeyEntry<S>>) {
         let newest = self.entries.last().map(|entry| entry.token_id);
         // Lower ids come from a restarted service, and may occur again.
         self.retired = newest.filter(|newest| is_newer(first, *newest));
@@ -117,20 +117,20 @@ impl<S: Default> KeyRing<S> {
     }
 }
 
-impl<S> KeyRing<S> {
-    pub(super) fn get_mut(&mut self, token_id: u32) -> Option<&mut Entry<S>> {
+impl<S> TokenKeyRing<S> {
+    pub(super) fn get_mut(&mut self, token_id: u32) -> Option<&mut KeyEntry<S>> {
         self.entries
             .iter_mut()
             .find(|entry| entry.token_id == token_id)
     }
 
-    pub(super) fn current(&self) -> Option<&Entry<S>> {
+    pub(super) fn current(&self) -> Option<&KeyEntry<S>> {
         self.entries
             .iter()
             .find(|entry| entry.token_id == self.current)
     }
 
-    pub(super) fn current_mut(&mut self) -> Option<&mut Entry<S>> {
+    pub(super) fn current_mut(&mut self) -> Option<&mut KeyEntry<S>> {
         self.get_mut(self.current)
     }
 
@@ -155,7 +155,7 @@ impl<S> KeyRing<S> {
         })
     }
 
-    fn holds(&self, other: &Entry<S>) -> bool {
+    fn holds(&self, other: &KeyEntry<S>) -> bool {
         self.entries
             .iter()
             .any(|entry| entry.token_id == other.token_id && entry.keys == other.keys)
@@ -197,15 +197,15 @@ mod tests {
     use super::*;
     use crate::SecurityPolicy;
 
-    fn key(byte: u8) -> Keys {
-        Keys::from_bytes(SecurityPolicy::PubSubAes128Ctr, &[byte; 52]).unwrap()
+    fn key(byte: u8) -> TokenKeys {
+        TokenKeys::from_bytes(SecurityPolicy::PubSubAes128Ctr, &[byte; 52]).unwrap()
     }
 
-    fn keys(bytes: impl IntoIterator<Item = u8>) -> Vec<Keys> {
+    fn keys(bytes: impl IntoIterator<Item = u8>) -> Vec<TokenKeys> {
         bytes.into_iter().map(key).collect()
     }
 
-    fn tokens(ring: &KeyRing<u8>) -> Vec<u32> {
+    fn tokens(ring: &TokenKeyRing<u8>) -> Vec<u32> {
         ring.entries.iter().map(|entry| entry.token_id).collect()
     }
 
@@ -225,7 +225,7 @@ mod tests {
 
     #[test]
     fn keys_are_merged_across_the_end_of_the_token_ids() {
-        let mut ring = KeyRing::<u8>::new(1);
+        let mut ring = TokenKeyRing::<u8>::new(1);
         ring.update(u32::MAX - 1, keys([1, 2, 3])).unwrap();
         assert_eq!(tokens(&ring), [u32::MAX - 1, u32::MAX, 1]);
         ring.update(1, keys([3, 4])).unwrap();
@@ -236,7 +236,7 @@ mod tests {
 
     #[test]
     fn a_key_given_again_keeps_its_state_and_another_of_its_token_id_does_not() {
-        let mut ring = KeyRing::<u8>::new(1);
+        let mut ring = TokenKeyRing::<u8>::new(1);
         ring.update(5, keys([1, 2])).unwrap();
         ring.get_mut(5).unwrap().state = 50;
         ring.get_mut(6).unwrap().state = 60;
@@ -247,7 +247,7 @@ mod tests {
 
     #[test]
     fn a_merge_neither_goes_back_nor_brings_back() {
-        let mut ring = KeyRing::<u8>::new(1);
+        let mut ring = TokenKeyRing::<u8>::new(1);
         ring.update(5, keys([5, 6, 7])).unwrap();
         assert!(ring.advance(7));
         assert_eq!(tokens(&ring), [6, 7]);
@@ -261,7 +261,7 @@ mod tests {
 
     #[test]
     fn older_keys_never_held_are_taken_as_far_as_past_ones_are_kept() {
-        let mut ring = KeyRing::<u8>::new(2);
+        let mut ring = TokenKeyRing::<u8>::new(2);
         ring.update(5, keys([5, 6])).unwrap();
         ring.update(2, keys([2, 3, 4, 5])).unwrap();
         assert_eq!(tokens(&ring), [3, 4, 5, 6]);
@@ -270,7 +270,7 @@ mod tests {
 
     #[test]
     fn keys_without_one_in_common_replace_all() {
-        let mut ring = KeyRing::<u8>::new(4);
+        let mut ring = TokenKeyRing::<u8>::new(4);
         ring.update(5, keys([5, 6])).unwrap();
         ring.update(9, keys([9, 10])).unwrap();
         assert_eq!(tokens(&ring), [9, 10]);
@@ -284,7 +284,7 @@ mod tests {
 
     #[test]
     fn no_keys_too_many_and_token_id_0_leave_the_ring_alone() {
-        let mut ring = KeyRing::<u8>::new(1);
+        let mut ring = TokenKeyRing::<u8>::new(1);
         ring.update(5, keys([5])).unwrap();
         assert_eq!(ring.update(0, keys([1])), Err(KeyError::TokenId));
         assert_eq!(ring.update(1, keys([])), Err(KeyError::Count(0)));

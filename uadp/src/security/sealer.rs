@@ -1,8 +1,8 @@
 //! The sending side: assigns a nonce to each message, encrypts and signs it.
 
-use super::ring::KeyRing;
-use super::{KeyError, Keys, MESSAGE_NONCE, Nonce, SealError, SecurityMode};
-use crate::reader::Reader;
+use super::ring::TokenKeyRing;
+use super::{KeyError, MESSAGE_NONCE, Nonce, SealError, SecurityMode, TokenKeys};
+use crate::reader::ByteReader;
 use crate::{EncodeError, NetworkMessage, SecurityHeader};
 use alloc::vec::Vec;
 
@@ -16,12 +16,11 @@ use alloc::vec::Vec;
 /// # Examples
 /// ```
 /// use uadp::{
-///     DataSetHeader, Extras, Keys, NetworkHeader, NetworkMessageEncoder, PublisherId, Scalar, Sealer, SecurityMode,
-///     SecurityPolicy,
-/// };
+///     DataSetHeader, Extras, TokenKeys, NetworkHeader, NetworkMessageEncoder, PublisherId, Scalar,
+///     Sealer, SecurityMode, SecurityPolicy, };
 ///
 /// let key_data: Vec<u8> = (1..=32).chain(0xA0..=0xAF).chain(0x10..=0x13).collect();
-/// let keys = Keys::from_bytes(SecurityPolicy::PubSubAes128Ctr, &key_data)?;
+/// let keys = TokenKeys::from_bytes(SecurityPolicy::PubSubAes128Ctr, &key_data)?;
 /// let mut sealer = Sealer::new(SecurityMode::SignAndEncrypt);
 /// sealer.update_keys(1, [keys])?;
 ///
@@ -40,7 +39,7 @@ use alloc::vec::Vec;
 #[derive(Debug)]
 pub struct Sealer {
     mode: SecurityMode,
-    ring: KeyRing<LastSequenceNumber>,
+    ring: TokenKeyRing<LastSequenceNumber>,
     /// SecurityTokenId until which messages request new keys.
     resets: Option<u32>,
 }
@@ -53,7 +52,7 @@ struct LastSequenceNumber(u32);
 #[derive(Debug)]
 #[must_use = "a seal not used leaves a gap in the sequence numbers"]
 pub struct Seal<'a> {
-    keys: &'a Keys,
+    keys: &'a TokenKeys,
     mode: SecurityMode,
     token_id: u32,
     nonce: [u8; MESSAGE_NONCE],
@@ -73,7 +72,7 @@ impl Sealer {
     pub const fn new(mode: SecurityMode) -> Self {
         Self {
             mode,
-            ring: KeyRing::new(0),
+            ring: TokenKeyRing::new(0),
             resets: None,
         }
     }
@@ -91,7 +90,7 @@ impl Sealer {
     pub fn update_keys(
         &mut self,
         current_token_id: u32,
-        keys: impl IntoIterator<Item = Keys>,
+        keys: impl IntoIterator<Item = TokenKeys>,
     ) -> Result<(), KeyError> {
         self.ring.update(current_token_id, keys)
     }
@@ -172,7 +171,7 @@ impl<'a> Seal<'a> {
     /// the same nonce and key reveal each other's payload, so use [`Sealer::seal`] for messages to
     /// send.
     pub const fn with_nonce(
-        keys: &'a Keys,
+        keys: &'a TokenKeys,
         token_id: u32,
         mode: SecurityMode,
         nonce: [u8; 8],
@@ -269,7 +268,7 @@ impl<'a> Seal<'a> {
         let Some(header) = at.and_then(|at| headers.get(at..)) else {
             return false;
         };
-        SecurityHeader::read(&mut Reader::new(header)) == Ok(self.header())
+        SecurityHeader::read(&mut ByteReader::new(header)) == Ok(self.header())
     }
 }
 

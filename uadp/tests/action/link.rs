@@ -5,8 +5,8 @@ use std::time::Duration;
 
 use proptest::prelude::*;
 use uadp::action::{
-    ActionFields, CallId, ExecutionId, FinishRefusal, Heard, Outcome, Refusal, Requested,
-    Requestor, RequestorSettings, Responder, ResponderSettings,
+    ActionFields, ActionOutcome, CallId, ExecutionId, FinishRefusal, Refusal, Requestor,
+    RequestorSettings, RequiredAction, Responder, ResponderSettings, ResponseMeaning,
 };
 use uadp::{OwnedPublisherId, StatusCode};
 
@@ -67,11 +67,11 @@ struct World {
     begun: usize,
     ids: BTreeMap<(usize, CallId), usize>,
     executed: Vec<u32>,
-    outcomes: Vec<Vec<Told>>,
+    outcomes: Vec<Vec<LinkEvent>>,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq)]
-enum Told {
+enum LinkEvent {
     Answered(StatusCode, i32),
     Failed(StatusCode),
     Refused(Refusal),
@@ -202,7 +202,7 @@ impl World {
             };
             (responder.handle_request(request, 0, now), call)
         });
-        let Ok(Requested::Execute(execution)) = requested else {
+        let Ok(RequiredAction::Execute(execution)) = requested else {
             return;
         };
         let call = call.unwrap();
@@ -229,11 +229,11 @@ impl World {
             self.working.pop_first();
             let result = block(-i32::try_from(call).unwrap());
             let outcome = match self.calls[call].work {
-                Work::Fail { .. } => Outcome::Answered {
+                Work::Fail { .. } => ActionOutcome::Answered {
                     status: BAD_DEVICE_FAILURE,
                     fields: ActionFields::NONE,
                 },
-                Work::Answer { .. } | Work::Refuse | Work::NeverEnds => Outcome::Answered {
+                Work::Answer { .. } | Work::Refuse | Work::NeverEnds => ActionOutcome::Answered {
                     status: StatusCode::GOOD,
                     fields: ActionFields::Variants(&result),
                 },
@@ -250,17 +250,21 @@ impl World {
         for (index, requestor) in self.requestors.iter_mut().enumerate() {
             let now = self.now;
             message(datagram, STANDARD, |response| {
-                if let Ok(Heard::Done(id, outcome)) = requestor.handle_response(response, now) {
+                if let Ok(ResponseMeaning::Done(id, outcome)) =
+                    requestor.handle_response(response, now)
+                {
                     let call = self.ids[&(index, id)];
                     let told = match outcome {
-                        Outcome::Answered { status, fields } if fields == ActionFields::NONE => {
-                            Told::Failed(status)
+                        ActionOutcome::Answered { status, fields }
+                            if fields == ActionFields::NONE =>
+                        {
+                            LinkEvent::Failed(status)
                         }
-                        Outcome::Answered { status, fields } => {
-                            Told::Answered(status, number(fields))
+                        ActionOutcome::Answered { status, fields } => {
+                            LinkEvent::Answered(status, number(fields))
                         }
-                        Outcome::Refused(refusal) => Told::Refused(refusal),
-                        Outcome::Unknown(_) => Told::Unknown,
+                        ActionOutcome::Refused(refusal) => LinkEvent::Refused(refusal),
+                        ActionOutcome::Unknown(_) => LinkEvent::Unknown,
                     };
                     self.outcomes[call].push(told);
                 }
@@ -272,7 +276,7 @@ impl World {
         for (index, requestor) in self.requestors.iter_mut().enumerate() {
             requestor.handle_timeout(self.now);
             while let Some((id, _)) = requestor.poll_given_up() {
-                self.outcomes[self.ids[&(index, id)]].push(Told::Unknown);
+                self.outcomes[self.ids[&(index, id)]].push(LinkEvent::Unknown);
             }
         }
     }
@@ -286,24 +290,24 @@ impl World {
             };
             let work = self.calls[call].work;
             match told {
-                Told::Answered(status, result) => {
+                LinkEvent::Answered(status, result) => {
                     assert!(matches!(work, Work::Answer { .. }), "{work:?}");
                     assert_eq!(status, StatusCode::GOOD);
                     assert_eq!(result, -i32::try_from(call).unwrap());
                     assert_eq!(executed, 1);
                 }
-                Told::Failed(status) => {
+                LinkEvent::Failed(status) => {
                     assert!(matches!(work, Work::Fail { .. }), "{work:?}");
                     assert_eq!((status, executed), (BAD_DEVICE_FAILURE, 1));
                 }
-                Told::Refused(Refusal::NotAllowed) => {
+                LinkEvent::Refused(Refusal::NotAllowed) => {
                     assert!(matches!(work, Work::Refuse), "{work:?}");
                     assert_eq!(executed, 0);
                 }
-                Told::Refused(refusal) => {
+                LinkEvent::Refused(refusal) => {
                     assert_eq!((refusal, executed), (Refusal::Busy, 0), "call {call}");
                 }
-                Told::Unknown => {}
+                LinkEvent::Unknown => {}
             }
         }
         for requestor in &self.requestors {
@@ -367,7 +371,7 @@ proptest! {
         let mut world = World::new(network, seed, calls);
         world.run();
         world.check();
-        let unknown = world.outcomes.iter().filter(|told| told.contains(&Told::Unknown));
+        let unknown = world.outcomes.iter().filter(|told| told.contains(&LinkEvent::Unknown));
         prop_assert_eq!(unknown.count(), 0);
     }
 }

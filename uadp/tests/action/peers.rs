@@ -3,8 +3,9 @@
 use std::time::Duration;
 
 use uadp::action::{
-    ActionAddress, ActionDialect, ActionFields, ActionMessage, ActionRequest, Heard, RequestDrop,
-    Requested, Requestor, RequestorSettings, Responder, ResponderSettings, ResponseDrop,
+    ActionAddress, ActionDialect, ActionFields, ActionMessage, ActionRequest, RequestDrop,
+    Requestor, RequestorSettings, RequiredAction, Responder, ResponderSettings, ResponseDrop,
+    ResponseMeaning,
 };
 use uadp::{Extras, NetworkHeader, NetworkMessage, OwnedPublisherId};
 
@@ -100,7 +101,7 @@ pub(super) fn ask(
     responder: &mut Responder<u16>,
     datagram: &[u8],
     now: Duration,
-) -> Result<Requested, RequestDrop> {
+) -> Result<RequiredAction, RequestDrop> {
     ask_from(responder, 0, datagram, now)
 }
 
@@ -110,7 +111,7 @@ pub(super) fn ask_from(
     sender: u16,
     datagram: &[u8],
     now: Duration,
-) -> Result<Requested, RequestDrop> {
+) -> Result<RequiredAction, RequestDrop> {
     message(datagram, STANDARD, |request| {
         responder.handle_request(request, sender, now)
     })
@@ -125,9 +126,9 @@ pub(super) fn answer(
     message(datagram, STANDARD, |response| {
         let heard = requestor.handle_response(response, now)?;
         Ok(match heard {
-            Heard::Executing(_) => "executing".to_owned(),
-            Heard::Closed(_) => "closed".to_owned(),
-            Heard::Done(_, outcome) => format!("{outcome:?}"),
+            ResponseMeaning::Executing(_) => "executing".to_owned(),
+            ResponseMeaning::Closed(_) => "closed".to_owned(),
+            ResponseMeaning::Done(_, outcome) => format!("{outcome:?}"),
         })
     })
 }

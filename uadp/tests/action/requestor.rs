@@ -2,8 +2,8 @@
 
 use uadp::OwnedPublisherId;
 use uadp::action::{
-    ActionDialect, ActionEncoding, ActionFields, ActionRequest, ActionState, CallRefusal, Outcome,
-    Refusal, Requestor, RequestorSettings, ResponseDrop, Unknown,
+    ActionDialect, ActionEncoding, ActionFields, ActionOutcome, ActionRequest, ActionState,
+    CallRefusal, Refusal, Requestor, RequestorSettings, ResponseDrop, Unknown,
 };
 
 use super::STANDARD;
@@ -59,13 +59,13 @@ fn an_answer_is_acknowledged_until_the_responder_is_idle() {
     let (mut requestor, mut responder) = (requestor(), responder());
     requestor.call(request(&block(1), at(5000)), at(0)).unwrap();
     let asked = requests(&mut requestor, at(0));
-    let uadp::action::Requested::Execute(execution) =
+    let uadp::action::RequiredAction::Execute(execution) =
         ask(&mut responder, &asked[0], at(1)).unwrap()
     else {
         unreachable!("a new request")
     };
     let result = block(42);
-    let outcome = Outcome::Answered {
+    let outcome = ActionOutcome::Answered {
         status: uadp::StatusCode::GOOD,
         fields: ActionFields::Variants(&result),
     };
@@ -176,7 +176,7 @@ fn what_is_answered_after_it_was_given_up_is_not_told() {
     requestor.call(request(&block(1), at(100)), at(0)).unwrap();
     let asked = requests(&mut requestor, at(0));
     let execution = ask(&mut responder, &asked[0], at(0)).unwrap();
-    let uadp::action::Requested::Execute(execution) = execution else {
+    let uadp::action::RequiredAction::Execute(execution) = execution else {
         unreachable!("a new request")
     };
     responder
@@ -317,26 +317,26 @@ fn request_ids_that_start_over_have_other_correlation_data() {
 fn every_refusal_and_unknown_outcome_survives_the_wire() {
     let none = ActionFields::NONE;
     for refusal in Refusal::ALL {
-        let (status, fields) = Outcome::Refused(refusal).to_response();
+        let (status, fields) = ActionOutcome::Refused(refusal).to_response();
         assert_eq!(fields, none);
-        let read = Outcome::of(Some(status.status()), fields);
-        assert_eq!(read, Outcome::Refused(refusal));
+        let read = ActionOutcome::of(Some(status.status()), fields);
+        assert_eq!(read, ActionOutcome::Refused(refusal));
     }
     for unknown in [Unknown::Deadline, Unknown::Lost] {
-        let (status, fields) = Outcome::Unknown(unknown).to_response();
-        let read = Outcome::of(Some(status.status()), fields);
-        assert_eq!(read, Outcome::Unknown(unknown));
+        let (status, fields) = ActionOutcome::Unknown(unknown).to_response();
+        let read = ActionOutcome::of(Some(status.status()), fields);
+        assert_eq!(read, ActionOutcome::Unknown(unknown));
     }
     let good = uadp::StatusCode::GOOD;
-    let answered = Outcome::Answered {
+    let answered = ActionOutcome::Answered {
         status: good,
         fields: none,
     };
-    assert_eq!(Outcome::of(None, none), answered);
+    assert_eq!(ActionOutcome::of(None, none), answered);
     let fields = block(1);
-    let executed = Outcome::of(Some(0x80AB), ActionFields::Variants(&fields));
+    let executed = ActionOutcome::of(Some(0x80AB), ActionFields::Variants(&fields));
     assert!(
-        matches!(executed, Outcome::Answered { .. }),
+        matches!(executed, ActionOutcome::Answered { .. }),
         "it has fields"
     );
 }

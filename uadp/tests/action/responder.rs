@@ -3,9 +3,9 @@
 use std::time::Duration;
 
 use uadp::action::{
-    ActionDialect, ActionEncoding, ActionFields, ActionRequest, ActionState, ExecutionId,
-    FinishRefusal, Outcome, Refusal, RequestDrop, RequestOrigin, Requested, Requestor,
-    RequestorSettings, Responder, ResponderSettings,
+    ActionDialect, ActionEncoding, ActionFields, ActionOutcome, ActionRequest, ActionState,
+    ExecutionId, FinishRefusal, Refusal, RequestDrop, RequestOrigin, Requestor, RequestorSettings,
+    RequiredAction, Responder, ResponderSettings,
 };
 use uadp::{OwnedPublisherId, StatusCode};
 
@@ -33,9 +33,9 @@ fn idle(asked: &[u8]) -> Vec<u8> {
     idle
 }
 
-fn execute(requested: Result<Requested, RequestDrop>) -> ExecutionId {
+fn execute(requested: Result<RequiredAction, RequestDrop>) -> ExecutionId {
     match requested {
-        Ok(Requested::Execute(execution)) => execution,
+        Ok(RequiredAction::Execute(execution)) => execution,
         other => unreachable!("{other:?}"),
     }
 }
@@ -48,8 +48,8 @@ fn due(responder: &mut Responder<u16>, now: u64) -> Vec<ActionState> {
         .collect()
 }
 
-fn answered(fields: &[u8]) -> Outcome<'_> {
-    Outcome::Answered {
+fn answered(fields: &[u8]) -> ActionOutcome<'_> {
+    ActionOutcome::Answered {
         status: StatusCode::GOOD,
         fields: ActionFields::Variants(fields),
     }
@@ -66,7 +66,7 @@ fn a_repetition_is_not_executed_but_answered_from_memory() {
     let execution = execute(ask(&mut responder, &asked, at(0)));
     assert_eq!(due(&mut responder, 0), [EXECUTING]);
     let again = ask(&mut responder, &asked, at(10));
-    assert_eq!(again, Ok(Requested::Repeated(execution)));
+    assert_eq!(again, Ok(RequiredAction::Repeated(execution)));
     assert_eq!(due(&mut responder, 10), [], "at most once an interval");
     assert_eq!(due(&mut responder, 100), [EXECUTING]);
 
@@ -101,13 +101,13 @@ fn an_answer_is_said_until_it_is_acknowledged() {
         assert_eq!(due(&mut responder, now), [DONE]);
     }
     let closed = ask(&mut responder, &idle(&asked), at(250));
-    assert_eq!(closed, Ok(Requested::Closed(execution)));
+    assert_eq!(closed, Ok(RequiredAction::Closed(execution)));
     assert_eq!(due(&mut responder, 250), [IDLE]);
     assert_eq!(due(&mut responder, 5000), []);
     let late = ask(&mut responder, &asked, at(5000));
     assert_eq!(
         late,
-        Ok(Requested::Repeated(execution)),
+        Ok(RequiredAction::Repeated(execution)),
         "not executed again"
     );
     assert_eq!(due(&mut responder, 5000), []);
@@ -170,7 +170,7 @@ fn an_execution_the_requestor_gives_up_is_told_and_its_end_is_not() {
     let execution = execute(ask(&mut responder, &asked, at(0)));
     assert_eq!(due(&mut responder, 0), [EXECUTING]);
     let abandoned = ask(&mut responder, &idle(&asked), at(150));
-    assert_eq!(abandoned, Ok(Requested::Abandoned(execution)));
+    assert_eq!(abandoned, Ok(RequiredAction::Abandoned(execution)));
     assert_eq!(
         due(&mut responder, 150),
         [EXECUTING],
@@ -181,7 +181,7 @@ fn an_execution_the_requestor_gives_up_is_told_and_its_end_is_not() {
     assert_eq!(ended, Err(FinishRefusal::Abandoned));
     assert_eq!(due(&mut responder, 1000), []);
     let again = ask(&mut responder, &asked, at(1001));
-    assert_eq!(again, Ok(Requested::Repeated(execution)));
+    assert_eq!(again, Ok(RequiredAction::Repeated(execution)));
 }
 
 #[test]
@@ -189,10 +189,10 @@ fn a_request_taken_back_before_it_came_is_not_executed() {
     let mut responder = responder();
     let asked = asked(1);
     let closed = ask(&mut responder, &idle(&asked), at(0));
-    assert!(matches!(closed, Ok(Requested::Closed(_))));
+    assert!(matches!(closed, Ok(RequiredAction::Closed(_))));
     assert_eq!(due(&mut responder, 0), [IDLE]);
     let late = ask(&mut responder, &asked, at(10));
-    assert!(matches!(late, Ok(Requested::Repeated(_))));
+    assert!(matches!(late, Ok(RequiredAction::Repeated(_))));
 }
 
 #[test]
@@ -209,7 +209,7 @@ fn a_refusal_is_remembered() {
     let status = message(&said, STANDARD, |response| response.header().status);
     assert_eq!(status, Some(0x801F), "Bad_UserAccessDenied");
     let again = ask(&mut responder, &asked, at(500));
-    assert_eq!(again, Ok(Requested::Repeated(execution)));
+    assert_eq!(again, Ok(RequiredAction::Repeated(execution)));
 }
 
 #[test]
@@ -304,7 +304,7 @@ fn requests_that_are_over_make_room_for_others_and_are_still_known() {
         let told = responder.finish(execution, answered(&block(1)), at(0));
         told.unwrap();
         let closed = ask(responder, &idle(asked), at(0));
-        assert_eq!(closed, Ok(Requested::Closed(execution)));
+        assert_eq!(closed, Ok(RequiredAction::Closed(execution)));
     };
     // Two complete requests and 8 hashes.
     for asked in &one[..10] {
@@ -319,7 +319,10 @@ fn requests_that_are_over_make_room_for_others_and_are_still_known() {
     for asked in one[..10].iter().chain(&two) {
         for late in [asked.clone(), idle(asked)] {
             let heard = ask(&mut responder, &late, at(9_000));
-            let known = matches!(heard, Ok(Requested::Repeated(_)) | Err(RequestDrop::Over));
+            let known = matches!(
+                heard,
+                Ok(RequiredAction::Repeated(_)) | Err(RequestDrop::Over)
+            );
             assert!(known, "{heard:?}");
         }
     }
@@ -390,12 +393,15 @@ fn requests_beyond_what_can_be_executed_are_refused_as_busy() {
     let asked = many(1, 3);
     let first = execute(ask(&mut responder, &asked[0], at(0)));
     let second = ask(&mut responder, &asked[1], at(0));
-    assert!(matches!(second, Ok(Requested::Refused(_, Refusal::Busy))));
+    assert!(matches!(
+        second,
+        Ok(RequiredAction::Refused(_, Refusal::Busy))
+    ));
     responder.finish(first, answered(&block(1)), at(0)).unwrap();
     execute(ask(&mut responder, &asked[2], at(0)));
     let again = ask(&mut responder, &asked[1], at(0));
     assert!(
-        matches!(again, Ok(Requested::Repeated(_))),
+        matches!(again, Ok(RequiredAction::Repeated(_))),
         "once refused, for good"
     );
 }
@@ -439,7 +445,7 @@ fn ask_judged(
     (group, sender): (usize, u16),
     datagram: &[u8],
     (verdict, now): (Result<(), Refusal>, u64),
-) -> Result<Requested, RequestDrop> {
+) -> Result<RequiredAction, RequestDrop> {
     let origin = RequestOrigin { group, sender };
     message(datagram, STANDARD, |request| {
         responder.handle_judged(request, (origin, verdict), at(now))
@@ -452,7 +458,7 @@ fn a_refused_request_is_answered_once_and_its_repetitions_a_few_times() {
     let asked = asked(1);
     let refused = Err(Refusal::NotAllowed);
     let declined = ask_judged(&mut responder, (0, 0), &asked, (refused, 0));
-    assert_eq!(declined, Ok(Requested::Declined(Refusal::NotAllowed)));
+    assert_eq!(declined, Ok(RequiredAction::Declined(Refusal::NotAllowed)));
     let said = responses(&mut responder, at(0));
     let status = message(&said[0], STANDARD, |response| response.header().status);
     assert_eq!((said.len(), status), (1, Some(0x801F)));
@@ -505,7 +511,10 @@ fn refused_requests_fill_the_room_of_their_sender_and_group_alone() {
     // Refusals use no space of requests, and each group has its own space.
     execute(ask_of((0, 3), 7, Ok(())));
     let busy = ask_of((0, 4), 8, Ok(()));
-    assert!(matches!(busy, Ok(Requested::Refused(_, Refusal::Busy))));
+    assert!(matches!(
+        busy,
+        Ok(RequiredAction::Refused(_, Refusal::Busy))
+    ));
     assert_eq!(ask_of((0, 5), 9, Ok(())), Err(RequestDrop::Full));
     execute(ask_of((1, 1), 10, Ok(())));
     ask_of((1, 1), 11, refused).unwrap();
@@ -576,6 +585,6 @@ fn a_one_shot_requestor_is_answered_once_and_never_without_its_status() {
     let again = message(&asked[1], dialect, |request| {
         responder.handle_request(request, 3, at(9000))
     });
-    assert_eq!(again, Ok(Requested::Repeated(bad)));
+    assert_eq!(again, Ok(RequiredAction::Repeated(bad)));
     assert!(responder.poll_transmit(at(9000)).is_none());
 }

@@ -4,17 +4,17 @@ use std::time::Duration;
 
 use uadp::action::{ActionCall, ActionEncoder, ActionHeader, ActionKind, ActionStart, ActionState};
 use uadp::{
-    ChunkBudget, Chunks, DataSetHeader, DecodeError, Extras, Keys, NetworkHeader, NetworkMessage,
+    ChunkBudget, ChunkEncoder, DataSetHeader, DecodeError, Extras, NetworkHeader, NetworkMessage,
     NetworkMessageType, Opener, PublisherId, Reassembler, Scalar, Sealer, SecurityError,
-    SecurityMode, SecurityPolicy, Whole,
+    SecurityMode, SecurityPolicy, TokenKeys, Whole,
 };
 
 use super::vectors::vector;
 use super::{STANDARD, read};
 
-fn keys() -> Keys {
+fn keys() -> TokenKeys {
     let key_data: Vec<u8> = (0..52).collect();
-    Keys::from_bytes(SecurityPolicy::PubSubAes128Ctr, &key_data).unwrap()
+    TokenKeys::from_bytes(SecurityPolicy::PubSubAes128Ctr, &key_data).unwrap()
 }
 
 /// Returns a request with a secret in its CorrelationData and another secret in its field.
@@ -109,7 +109,7 @@ fn a_whole_action_message_travels_in_chunks_but_not_a_part_of_one() {
         network_message: 40,
         trailer: 0,
     };
-    let mut chunks = Chunks::new(&header, &Extras::default(), whole, budget).unwrap();
+    let mut chunks = ChunkEncoder::new(&header, &Extras::default(), whole, budget).unwrap();
     let mut reassembler = Reassembler::default();
     let mut found = 0;
     let mut buffer = Vec::new();

@@ -4,9 +4,9 @@ use proptest::collection::vec;
 use proptest::option;
 use proptest::prelude::*;
 use uadp::{
-    Array, BuiltinType, DataSetHeader, DataValue, DateTime, DiagnosticInfo, Encoded,
-    ExpandedNodeId, ExtensionBody, ExtensionObject, Guid, Identifier, LocalizedText, Matrix,
-    NetworkHeader, NetworkMessageEncoder, NodeId, QualifiedName, Scalar, StatusCode, Variant,
+    Array, BuiltinType, DataSetHeader, DataValue, DateTime, DiagnosticInfo, ExpandedNodeId,
+    ExtensionBody, ExtensionObject, Guid, LocalizedText, Matrix, Nested, NetworkHeader,
+    NetworkMessageEncoder, NodeId, NodeIdValue, QualifiedName, Scalar, StatusCode, Variant,
 };
 
 /// Data that a [`Scalar`] of any type borrows from.
@@ -26,23 +26,23 @@ pub(crate) struct Seed {
 #[derive(Debug, Clone)]
 enum Inside {
     Nothing,
-    Variant(Box<Value>),
-    DataValue(Box<Sample>),
-    DiagnosticInfo(Box<Info>),
+    Variant(Box<ModelVariant>),
+    DataValue(Box<ModelDataValue>),
+    DiagnosticInfo(Box<ModelDiagnosticInfo>),
 }
 
 /// A Variant.
 #[derive(Debug, Clone)]
-pub(crate) enum Value {
+pub(crate) enum ModelVariant {
     Null,
     Scalar(Box<Seed>),
-    Array(Elements),
-    Matrix(Elements, Vec<[u8; 4]>),
+    Array(ModelElements),
+    Matrix(ModelElements, Vec<[u8; 4]>),
 }
 
 /// The elements of an array and their encoding.
 #[derive(Debug, Clone)]
-pub(crate) struct Elements {
+pub(crate) struct ModelElements {
     pub(crate) builtin: BuiltinType,
     /// `None` is the null array.
     pub(crate) seeds: Option<Vec<Seed>>,
@@ -51,14 +51,14 @@ pub(crate) struct Elements {
 
 /// A DataValue.
 #[derive(Debug, Clone)]
-pub(crate) struct Sample {
-    value: Option<Value>,
+pub(crate) struct ModelDataValue {
+    value: Option<ModelVariant>,
     rest: DataValue<'static>,
 }
 
 /// A DiagnosticInfo; `inner` includes its encoding.
 #[derive(Debug, Clone)]
-pub(crate) struct Info {
+pub(crate) struct ModelDiagnosticInfo {
     indexes: [Option<i32>; 4],
     text: Option<Option<String>>,
     status: Option<u32>,
@@ -71,15 +71,15 @@ impl Seed {
         let mut bytes = Vec::new();
         let builtin = match &inside {
             Inside::Variant(value) => {
-                Encoded::variant(&value.variant(), &mut bytes).unwrap();
+                Nested::variant(&value.variant(), &mut bytes).unwrap();
                 BuiltinType::Variant
             }
             Inside::DataValue(sample) => {
-                Encoded::data_value(&sample.data_value(), &mut bytes).unwrap();
+                Nested::data_value(&sample.data_value(), &mut bytes).unwrap();
                 BuiltinType::DataValue
             }
             Inside::DiagnosticInfo(info) => {
-                Encoded::diagnostic_info(&info.diagnostic_info(), &mut bytes).unwrap();
+                Nested::diagnostic_info(&info.diagnostic_info(), &mut bytes).unwrap();
                 BuiltinType::DiagnosticInfo
             }
             Inside::Nothing => unreachable!("no type holds nothing"),
@@ -104,12 +104,12 @@ impl Seed {
             _ => u16::from_le_bytes([a, b]),
         };
         let identifier = match self.choice >> 2 & 7 {
-            0 => Identifier::Numeric((self.number & 0xFF) as u32),
-            1 => Identifier::Numeric((self.number & 0xFFFF) as u32),
-            2 | 3 => Identifier::Numeric((self.number & 0xFFFF_FFFF) as u32),
-            4 => Identifier::Guid(Guid(self.wide)),
-            5 => Identifier::Opaque(self.bytes.as_deref()),
-            _ => Identifier::String(self.text.as_deref()),
+            0 => NodeIdValue::Numeric((self.number & 0xFF) as u32),
+            1 => NodeIdValue::Numeric((self.number & 0xFFFF) as u32),
+            2 | 3 => NodeIdValue::Numeric((self.number & 0xFFFF_FFFF) as u32),
+            4 => NodeIdValue::Guid(Guid(self.wide)),
+            5 => NodeIdValue::Opaque(self.bytes.as_deref()),
+            _ => NodeIdValue::String(self.text.as_deref()),
         };
         NodeId {
             namespace,
@@ -163,9 +163,9 @@ impl Seed {
                     (None, None) => ExtensionBody::None,
                 },
             }),
-            BuiltinType::DataValue => Scalar::DataValue(Encoded::new(inside).unwrap()),
-            BuiltinType::Variant => Scalar::Variant(Encoded::new(inside).unwrap()),
-            BuiltinType::DiagnosticInfo => Scalar::DiagnosticInfo(Encoded::new(inside).unwrap()),
+            BuiltinType::DataValue => Scalar::DataValue(Nested::new(inside).unwrap()),
+            BuiltinType::Variant => Scalar::Variant(Nested::new(inside).unwrap()),
+            BuiltinType::DiagnosticInfo => Scalar::DiagnosticInfo(Nested::new(inside).unwrap()),
         }
     }
 
@@ -187,7 +187,7 @@ impl Seed {
     }
 }
 
-impl Elements {
+impl ModelElements {
     fn new(builtin: BuiltinType, seeds: Option<Vec<Seed>>) -> Self {
         let mut out = Vec::new();
         let header = NetworkHeader::default();
@@ -228,7 +228,7 @@ impl Elements {
     }
 }
 
-impl Value {
+impl ModelVariant {
     pub(crate) fn variant(&self) -> Variant<'_> {
         match self {
             Self::Null => Variant::Null,
@@ -254,10 +254,10 @@ impl Value {
     }
 }
 
-impl Sample {
+impl ModelDataValue {
     pub(crate) fn data_value(&self) -> DataValue<'_> {
         DataValue {
-            value: self.value.as_ref().map(Value::variant),
+            value: self.value.as_ref().map(ModelVariant::variant),
             ..self.rest
         }
     }
@@ -276,7 +276,7 @@ impl Sample {
     }
 }
 
-impl Info {
+impl ModelDiagnosticInfo {
     fn diagnostic_info(&self) -> DiagnosticInfo<'_> {
         let [symbolic_id, namespace_uri, locale, localized_text] = self.indexes;
         let inner = self.inner.as_ref();
@@ -287,7 +287,7 @@ impl Info {
             localized_text,
             additional_info: self.text.as_ref().map(Option::as_deref),
             inner_status_code: self.status.map(StatusCode),
-            inner: inner.map(|(_, bytes)| Encoded::new(bytes).unwrap()),
+            inner: inner.map(|(_, bytes)| Nested::new(bytes).unwrap()),
         }
     }
 
@@ -302,49 +302,51 @@ impl Info {
 }
 
 /// Generates a Variant that contains several levels of values.
-pub(crate) fn value() -> impl Strategy<Value = Value> {
-    let leaf = plain(1..=22).prop_map(|seed| Value::Scalar(Box::new(seed)));
-    let leaf = prop_oneof![1 => Just(Value::Null), 6 => leaf];
+pub(crate) fn value() -> impl Strategy<Value = ModelVariant> {
+    let leaf = plain(1..=22).prop_map(|seed| ModelVariant::Scalar(Box::new(seed)));
+    let leaf = prop_oneof![1 => Just(ModelVariant::Null), 6 => leaf];
     leaf.prop_recursive(4, 12, 3, |inner| {
         let holder = inner.clone();
         let scalar = prop_oneof![Just(23), Just(25)].prop_flat_map(move |id| seed(id, &holder));
         prop_oneof![
-            2 => scalar.prop_map(|seed| Value::Scalar(Box::new(seed))),
-            2 => elements(inner.clone(), 0..4_usize).prop_map(Value::Array),
+            2 => scalar.prop_map(|seed| ModelVariant::Scalar(Box::new(seed))),
+            2 => elements(inner.clone(), 0..4_usize).prop_map(ModelVariant::Array),
             1 => matrix(inner),
         ]
     })
 }
 
 fn elements(
-    inner: BoxedStrategy<Value>,
+    inner: BoxedStrategy<ModelVariant>,
     count: impl Strategy<Value = usize>,
-) -> impl Strategy<Value = Elements> {
+) -> impl Strategy<Value = ModelElements> {
     // Half of the elements contain values.
     let id = prop_oneof![1..=22_u8, 23..=25_u8];
     (id, count).prop_flat_map(move |(id, count)| {
         let builtin = BuiltinType::from_id(id).unwrap();
         let seeds = option::weighted(0.9, vec(seed(id, &inner), count));
-        seeds.prop_map(move |seeds| Elements::new(builtin, seeds))
+        seeds.prop_map(move |seeds| ModelElements::new(builtin, seeds))
     })
 }
 
 /// Generates at least two non-empty dimensions, because any other matrix is encoded as an array.
-fn matrix(inner: BoxedStrategy<Value>) -> impl Strategy<Value = Value> {
+fn matrix(inner: BoxedStrategy<ModelVariant>) -> impl Strategy<Value = ModelVariant> {
     vec(1..3_u32, 2..4).prop_flat_map(move |sizes| {
         let count = sizes.iter().product::<u32>() as usize;
         let dimensions: Vec<_> = sizes.iter().map(|size| size.to_le_bytes()).collect();
         elements(inner.clone(), Just(count))
             .prop_filter("null has no elements", |elements| elements.seeds.is_some())
-            .prop_map(move |elements| Value::Matrix(elements, dimensions.clone()))
+            .prop_map(move |elements| ModelVariant::Matrix(elements, dimensions.clone()))
     })
 }
 
-pub(crate) fn sample(value: impl Strategy<Value = Value>) -> impl Strategy<Value = Sample> {
+pub(crate) fn sample(
+    value: impl Strategy<Value = ModelVariant>,
+) -> impl Strategy<Value = ModelDataValue> {
     let time = || (option::of(any::<i64>()), option::of(0..=9999_u16));
     let status = option::of(any::<u32>());
     (option::weighted(0.9, value), status, time(), time()).prop_map(
-        |(value, status, source, server)| Sample {
+        |(value, status, source, server)| ModelDataValue {
             value,
             rest: DataValue {
                 value: None,
@@ -358,22 +360,24 @@ pub(crate) fn sample(value: impl Strategy<Value = Value>) -> impl Strategy<Value
     )
 }
 
-fn info() -> impl Strategy<Value = Info> {
+fn info() -> impl Strategy<Value = ModelDiagnosticInfo> {
     let head = || {
         let indexes = proptest::array::uniform4(option::of(any::<i32>()));
         let text = option::of(option::of(".{0,3}"));
-        (indexes, text, option::of(any::<u32>())).prop_map(|(indexes, text, status)| Info {
-            indexes,
-            text,
-            status,
-            inner: None,
+        (indexes, text, option::of(any::<u32>())).prop_map(|(indexes, text, status)| {
+            ModelDiagnosticInfo {
+                indexes,
+                text,
+                status,
+                inner: None,
+            }
         })
     };
     head().prop_recursive(5, 5, 1, move |inner| {
         (head(), inner).prop_map(|(head, inner)| {
             let mut bytes = Vec::new();
-            Encoded::diagnostic_info(&inner.diagnostic_info(), &mut bytes).unwrap();
-            Info {
+            Nested::diagnostic_info(&inner.diagnostic_info(), &mut bytes).unwrap();
+            ModelDiagnosticInfo {
                 inner: Some((Box::new(inner), bytes)),
                 ..head
             }
@@ -382,7 +386,7 @@ fn info() -> impl Strategy<Value = Info> {
 }
 
 /// Generates a value of the type with an id. `inner` are its nested Variants.
-fn seed(id: u8, inner: &BoxedStrategy<Value>) -> BoxedStrategy<Seed> {
+fn seed(id: u8, inner: &BoxedStrategy<ModelVariant>) -> BoxedStrategy<Seed> {
     let inner = inner.clone();
     match BuiltinType::from_id(id).unwrap() {
         BuiltinType::Variant => inner

@@ -2,17 +2,17 @@
 //! with asyncua 2.1.0; the values below repeat the values of the script.
 
 use uadp::discovery::{
-    ActionMetaData, ActionMethodDataType, ActionTargetDataType, Announced, Announcement,
+    ActionMetaData, ActionMethodDataType, ActionTargetDataType, AnnouncedContent, Announcement,
     ApplicationDescription, ApplicationType, ConfigurationVersion, DataSetMetaDataType,
     DataSetOrderingType, DataSetWriterDataType, DatagramConnectionTransport2DataType,
     DatagramConnectionTransportDataType, DatagramWriterGroupTransport2DataType,
     DatagramWriterGroupTransportDataType, EndpointDescription, EnumField, FieldMetaData,
-    KeyValuePair, List, MessageSecurityMode, NetworkAddressUrlDataType, PubSubConnectionDataType,
-    Settings, StructureType, UadpDataSetWriterMessageDataType, UadpWriterGroupMessageDataType,
-    UserTokenPolicy, WriterGroupDataType,
+    KeyValuePair, MessageSecurityMode, NetworkAddressUrlDataType, PubSubConnectionDataType,
+    SettingsStructure, StructureType, UadpDataSetWriterMessageDataType,
+    UadpWriterGroupMessageDataType, UserTokenPolicy, WireArray, WriterGroupDataType,
 };
 use uadp::{
-    BuiltinType, Guid, Identifier, LocalizedText, NodeId, QualifiedName, Scalar, StatusCode,
+    BuiltinType, Guid, LocalizedText, NodeId, NodeIdValue, QualifiedName, Scalar, StatusCode,
     Variant,
 };
 
@@ -73,7 +73,7 @@ fn every_structure_is_written_back_byte_for_byte() {
 #[test]
 fn the_endpoint_is_read() {
     let bytes = &bodies()[0];
-    let Announced::PublisherEndpoints { endpoints, status } = announced(bytes) else {
+    let AnnouncedContent::PublisherEndpoints { endpoints, status } = announced(bytes) else {
         unreachable!()
     };
     assert_eq!(status, StatusCode::GOOD);
@@ -83,13 +83,13 @@ fn the_endpoint_is_read() {
     }];
     let urls = [Some("opc.tcp://cell1:4840/"), None];
     let endpoint = endpoint(&tokens, &urls);
-    assert_eq!(endpoints, List::new(&[endpoint]));
+    assert_eq!(endpoints, WireArray::new(&[endpoint]));
 }
 
 #[test]
 fn the_metadata_are_read_and_looked_up() {
     let bytes = &bodies()[1];
-    let Announced::DataSetMetaData { meta_data, .. } = announced(bytes) else {
+    let AnnouncedContent::DataSetMetaData { meta_data, .. } = announced(bytes) else {
         unreachable!()
     };
     check_meta_data(&meta_data);
@@ -98,7 +98,7 @@ fn the_metadata_are_read_and_looked_up() {
 #[test]
 fn the_writer_group_is_read_with_its_settings() {
     let bytes = &bodies()[2];
-    let Announced::DataSetWriterConfiguration {
+    let AnnouncedContent::DataSetWriterConfiguration {
         writer_group,
         writer_ids,
         ..
@@ -106,14 +106,14 @@ fn the_writer_group_is_read_with_its_settings() {
     else {
         unreachable!()
     };
-    assert_eq!(writer_ids, List::new(&[10]));
+    assert_eq!(writer_ids, WireArray::new(&[10]));
     check_writer_group(&writer_group);
 }
 
 #[test]
 fn the_connections_are_read_with_their_settings() {
     let bytes = &bodies()[3];
-    let Announced::PubSubConnections(connections) = announced(bytes) else {
+    let AnnouncedContent::PubSubConnections(connections) = announced(bytes) else {
         unreachable!()
     };
     assert_eq!(connections.len(), 2);
@@ -125,7 +125,7 @@ fn the_connections_are_read_with_their_settings() {
 #[test]
 fn the_action_is_read() {
     let bytes = &bodies()[5];
-    let Announced::ActionMetaData(action) = announced(bytes) else {
+    let AnnouncedContent::ActionMetaData(action) = announced(bytes) else {
         unreachable!()
     };
     let ActionMetaData {
@@ -143,17 +143,17 @@ fn the_action_is_read() {
         name: Some("target"),
         description: text("en", "it"),
     };
-    assert_eq!(action_targets, List::new(&[target]));
+    assert_eq!(action_targets, WireArray::new(&[target]));
     let method = ActionMethodDataType {
         object_id: NodeId::string(2, "Robot"),
         method_id: NodeId::numeric(2, 7001),
     };
-    assert_eq!(action_methods, List::new(&[method]));
+    assert_eq!(action_methods, WireArray::new(&[method]));
     check_meta_data(&request);
     assert_eq!(request, response);
 }
 
-fn announced(bytes: &[u8]) -> Announced<'_> {
+fn announced(bytes: &[u8]) -> AnnouncedContent<'_> {
     Announcement::decode_body(bytes).unwrap().announced
 }
 
@@ -177,12 +177,12 @@ fn endpoint<'a>(
             application_type: ApplicationType::CLIENT_AND_SERVER,
             gateway_server_uri: None,
             discovery_profile_uri: None,
-            discovery_urls: List::new(urls),
+            discovery_urls: WireArray::new(urls),
         },
         server_certificate: Some(&[0x30, 0x82, 0x01]),
         security_mode: MessageSecurityMode::SIGN_AND_ENCRYPT,
         security_policy_uri: Some("http://opcfoundation.org/UA/SecurityPolicy#Basic256Sha256"),
-        user_identity_tokens: List::new(tokens),
+        user_identity_tokens: WireArray::new(tokens),
         transport_profile_uri: Some(
             "http://opcfoundation.org/UA-Profile/Transport/uatcp-uasc-uabinary",
         ),
@@ -220,12 +220,12 @@ fn check_meta_data(meta_data: &DataSetMetaDataType<'_>) {
         built_in_type: 22,
         data_type: NodeId::numeric(1, 3001),
         value_rank: -1,
-        array_dimensions: List::new(&[]),
+        array_dimensions: WireArray::new(&[]),
         max_string_length: 0,
         data_set_field_id: field_id,
-        properties: List::new(&properties),
+        properties: WireArray::new(&properties),
     };
-    assert_eq!(meta_data.fields, List::new(&[pose]));
+    assert_eq!(meta_data.fields, WireArray::new(&[pose]));
     assert_eq!(pose.builtin_type(), Some(BuiltinType::ExtensionObject));
     assert_eq!(meta_data.field(0), Some(pose));
     assert_eq!(meta_data.field(1), None);
@@ -256,7 +256,7 @@ fn check_schema(meta_data: &DataSetMetaDataType<'_>) {
     let [position, frame] = [0, 1].map(|index| definition.fields.get(index).unwrap());
     assert_eq!(position.name, Some("position"));
     assert_eq!(position.description, text("en", "in metres"));
-    assert_eq!(position.array_dimensions, List::new(&[3]));
+    assert_eq!(position.array_dimensions, WireArray::new(&[3]));
     assert!(!position.is_optional);
     assert_eq!(frame.data_type, NodeId::string(1, "Frame"));
     assert_eq!(frame.max_string_length, 16);
@@ -276,7 +276,7 @@ fn check_enumeration(meta_data: &DataSetMetaDataType<'_>) {
     assert_eq!(mode.enum_definition.field(1), None);
 
     let frame = schema.simple_type(NodeId::string(1, "Frame")).unwrap();
-    assert_eq!(frame.base_data_type.identifier, Identifier::Numeric(12));
+    assert_eq!(frame.base_data_type.identifier, NodeIdValue::Numeric(12));
     assert_eq!(frame.built_in_type, BuiltinType::String.id());
 
     assert_eq!(schema.enumeration(NodeId::numeric(1, 3001)), None);
@@ -305,7 +305,7 @@ fn check_writer_group(writer_group: &WriterGroupDataType<'_>) {
     assert_eq!(writer_group.priority, 7);
     assert_eq!(
         writer_group.locale_ids,
-        List::new(&[Some("en"), Some("de")])
+        WireArray::new(&[Some("en"), Some("de")])
     );
     let transport =
         DatagramWriterGroupTransport2DataType::from_object(&writer_group.transport_settings);
@@ -319,7 +319,7 @@ fn check_writer_group(writer_group: &WriterGroupDataType<'_>) {
         data_set_ordering: DataSetOrderingType::ASCENDING_WRITER_ID,
         network_message_content_mask: 0x47,
         sampling_offset: -1.0,
-        publishing_offset: List::new(&[0.5, 1.5]),
+        publishing_offset: WireArray::new(&[0.5, 1.5]),
     };
     assert_eq!(
         UadpWriterGroupMessageDataType::from_object(&writer_group.message_settings),

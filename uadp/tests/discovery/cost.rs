@@ -2,7 +2,7 @@
 
 use allocation_counter::measure;
 use uadp::DecodeError;
-use uadp::discovery::{Announced, Announcement, DataSetMetaDataType, Probe};
+use uadp::discovery::{AnnouncedContent, Announcement, DataSetMetaDataType, Probe};
 
 use crate::discovery::asyncua::bodies;
 
@@ -78,22 +78,23 @@ fn hostile_lengths_anywhere_are_refused_or_harmless_and_allocate_nothing() {
 }
 
 /// Returns the number of fields of all DataSetMetaData.
-fn count_fields(announced: &Announced<'_>) -> usize {
+fn count_fields(announced: &AnnouncedContent<'_>) -> usize {
     let meta_data = |meta_data: &DataSetMetaDataType<'_>| meta_data.fields.iter().count();
     match announced {
-        Announced::DataSetMetaData { meta_data: it, .. } => meta_data(it),
-        Announced::ActionMetaData(action) => {
+        AnnouncedContent::DataSetMetaData { meta_data: it, .. } => meta_data(it),
+        AnnouncedContent::ActionMetaData(action) => {
             meta_data(&action.request) + meta_data(&action.response)
         }
-        Announced::PubSubConnections(connections) | Announced::ActionResponder(connections) => {
+        AnnouncedContent::PubSubConnections(connections)
+        | AnnouncedContent::ActionResponder(connections) => {
             let groups = connections.iter().flat_map(|it| it.reader_groups);
             let readers = groups.flat_map(|group| group.data_set_readers);
             readers.map(|it| meta_data(&it.data_set_meta_data)).sum()
         }
-        Announced::PublisherEndpoints { .. }
-        | Announced::DataSetWriterConfiguration { .. }
-        | Announced::PubSubConnection { .. }
-        | Announced::ApplicationDescription { .. }
-        | Announced::ApplicationStatus { .. } => 0,
+        AnnouncedContent::PublisherEndpoints { .. }
+        | AnnouncedContent::DataSetWriterConfiguration { .. }
+        | AnnouncedContent::PubSubConnection { .. }
+        | AnnouncedContent::ApplicationDescription { .. }
+        | AnnouncedContent::ApplicationStatus { .. } => 0,
     }
 }

@@ -1,8 +1,8 @@
 //! Each kind of probe and announcement, and other messages.
 
 use uadp::discovery::{
-    Announced, Announcement, ApplicationDescription, ConfigurationVersion, ConnectionState,
-    CyclicStatus, DataSetMetaDataType, List, Probe, PubSubConnectionDataType, VersionMatch,
+    AnnouncedContent, Announcement, ApplicationDescription, ConfigurationVersion, ConnectionState,
+    CyclicStatus, DataSetMetaDataType, Probe, PubSubConnectionDataType, VersionMatch, WireArray,
     WriterGroupDataType,
 };
 use uadp::{
@@ -17,11 +17,11 @@ fn probes_are_laid_out_as_in_the_tables() {
     for (probe, bytes) in [
         (Probe::PublisherEndpoints, &[1, 1][..]),
         (
-            Probe::DataSetMetaData(List::new(&[10])),
+            Probe::DataSetMetaData(WireArray::new(&[10])),
             &[1, 2, 1, 0, 0, 0, 10, 0],
         ),
         (
-            Probe::DataSetWriterConfiguration(List::new(&[])),
+            Probe::DataSetWriterConfiguration(WireArray::new(&[])),
             &[1, 3, 0, 0, 0, 0],
         ),
         (
@@ -33,7 +33,7 @@ fn probes_are_laid_out_as_in_the_tables() {
         ),
         (
             Probe::PubSubConnections {
-                transport_profile_uris: List::new(&[Some("u")]),
+                transport_profile_uris: WireArray::new(&[Some("u")]),
                 include_writer_groups: true,
                 include_data_set_writers: false,
             },
@@ -90,9 +90,9 @@ fn find_applications_asks_no_publisher_in_particular() {
 
 #[test]
 fn application_information_says_what_it_is_or_how_it_is() {
-    let description = Announced::ApplicationDescription {
+    let description = AnnouncedContent::ApplicationDescription {
         description: ApplicationDescription::default(),
-        capabilities: List::new(&[Some("NA")]),
+        capabilities: WireArray::new(&[Some("NA")]),
     };
     let bytes = announced(description);
     assert_eq!(bytes[..5], [5, 1, 0, 1, 0]);
@@ -101,12 +101,12 @@ fn application_information_says_what_it_is_or_how_it_is() {
         [1, 0, 0, 0, 2, 0, 0, 0, b'N', b'A']
     );
 
-    let on_change = Announced::ApplicationStatus {
+    let on_change = AnnouncedContent::ApplicationStatus {
         state: ConnectionState::ERROR,
         cyclic: None,
     };
     assert_eq!(announced(on_change), [5, 1, 0, 2, 0, 0, 3, 0, 0, 0]);
-    let cyclic = Announced::ApplicationStatus {
+    let cyclic = AnnouncedContent::ApplicationStatus {
         state: ConnectionState::OPERATIONAL,
         cyclic: Some(CyclicStatus {
             next_report_time: DateTime(2),
@@ -121,13 +121,15 @@ fn application_information_says_what_it_is_or_how_it_is() {
 #[test]
 fn connections_are_an_array_without_a_status() {
     let connections = [PubSubConnectionDataType::default(); 2];
-    let bytes = announced(Announced::PubSubConnections(List::new(&connections)));
+    let bytes = announced(AnnouncedContent::PubSubConnections(WireArray::new(
+        &connections,
+    )));
     assert_eq!(bytes[..7], [4, 1, 0, 2, 0, 0, 0]);
     let one = (bytes.len() - 7) / 2;
     assert_eq!(bytes[7..7 + one], bytes[7 + one..]);
 
     // The form of other stacks is recognized, and any other form is rejected.
-    let single = announced(Announced::PubSubConnection {
+    let single = announced(AnnouncedContent::PubSubConnection {
         connection: connections[0],
         status: StatusCode::GOOD,
     });
@@ -146,19 +148,19 @@ fn connections_are_an_array_without_a_status() {
 fn every_data_set_writer_has_a_status() {
     let uneven = Announcement {
         sequence_number: 0,
-        announced: Announced::DataSetWriterConfiguration {
-            writer_ids: List::new(&[1, 2]),
+        announced: AnnouncedContent::DataSetWriterConfiguration {
+            writer_ids: WireArray::new(&[1, 2]),
             writer_group: WriterGroupDataType::default(),
-            statuses: List::new(&[StatusCode::GOOD]),
+            statuses: WireArray::new(&[StatusCode::GOOD]),
         },
     };
     let refused = uneven.encode_body(&mut Vec::new());
     assert!(matches!(refused, Err(EncodeError::Misplaced(_))));
 
-    let mut bytes = announced(Announced::DataSetWriterConfiguration {
-        writer_ids: List::new(&[1]),
+    let mut bytes = announced(AnnouncedContent::DataSetWriterConfiguration {
+        writer_ids: WireArray::new(&[1]),
         writer_group: WriterGroupDataType::default(),
-        statuses: List::new(&[StatusCode::GOOD]),
+        statuses: WireArray::new(&[StatusCode::GOOD]),
     });
     bytes.truncate(bytes.len() - 8);
     bytes.extend([0; 4]);
@@ -172,7 +174,7 @@ fn every_data_set_writer_has_a_status() {
 #[test]
 fn null_and_empty_lists_stay_apart() {
     let with = |fields| {
-        announced(Announced::DataSetMetaData {
+        announced(AnnouncedContent::DataSetMetaData {
             writer_id: 1,
             meta_data: DataSetMetaDataType {
                 fields,
@@ -181,8 +183,8 @@ fn null_and_empty_lists_stay_apart() {
             status: StatusCode::GOOD,
         })
     };
-    assert_ne!(with(List::null()), with(List::new(&[])));
-    assert_ne!(List::<u16>::null(), List::new(&[]));
+    assert_ne!(with(WireArray::null()), with(WireArray::new(&[])));
+    assert_ne!(WireArray::<u16>::null(), WireArray::new(&[]));
 }
 
 #[test]
@@ -232,12 +234,12 @@ fn other_messages_are_not_taken_for_discovery() {
 fn an_announcement_in_chunks_is_read_from_the_whole_of_them() {
     let announcement = Announcement {
         sequence_number: 1,
-        announced: Announced::ApplicationDescription {
+        announced: AnnouncedContent::ApplicationDescription {
             description: ApplicationDescription {
                 application_uri: Some("urn:cell:robot"),
                 ..ApplicationDescription::default()
             },
-            capabilities: List::null(),
+            capabilities: WireArray::null(),
         },
     };
     let sent = body(&announcement);
@@ -291,7 +293,7 @@ fn metadata_fit_messages_of_their_major_version() {
 }
 
 /// Returns the body with SequenceNumber 1 after a round trip.
-fn announced(announced: Announced<'_>) -> Vec<u8> {
+fn announced(announced: AnnouncedContent<'_>) -> Vec<u8> {
     let announcement = Announcement {
         sequence_number: 1,
         announced,
@@ -336,7 +338,7 @@ fn an_action_is_announced_with_a_method_for_each_target_or_none() {
     for methods in [-1, 0, 2] {
         let bytes = action_meta_data(methods);
         let announcement = Announcement::decode_body(&bytes).unwrap();
-        let Announced::ActionMetaData(action) = announcement.announced else {
+        let AnnouncedContent::ActionMetaData(action) = announcement.announced else {
             unreachable!("{announcement:?}")
         };
         assert_eq!((action.writer_id, action.name()), (61, Some("home")));
@@ -358,14 +360,14 @@ fn an_action_is_announced_with_a_method_for_each_target_or_none() {
 
     let bytes = action_meta_data(2);
     let announcement = Announcement::decode_body(&bytes).unwrap();
-    let Announced::ActionMetaData(mut action) = announcement.announced else {
+    let AnnouncedContent::ActionMetaData(mut action) = announcement.announced else {
         unreachable!("{announcement:?}")
     };
     action.response.configuration_version.major += 1;
     assert_eq!(action.name(), None, "not of one Action");
-    action.action_targets = List::new(&[]);
+    action.action_targets = WireArray::new(&[]);
     let refused = Announcement {
-        announced: Announced::ActionMetaData(action),
+        announced: AnnouncedContent::ActionMetaData(action),
         ..announcement
     }
     .encode_body(&mut Vec::new());

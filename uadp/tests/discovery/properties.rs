@@ -5,13 +5,13 @@ use proptest::collection::vec;
 use proptest::option;
 use proptest::prelude::*;
 use uadp::discovery::{
-    ActionMetaData, ActionMethodDataType, ActionTargetDataType, Announced, Announcement,
+    ActionMetaData, ActionMethodDataType, ActionTargetDataType, AnnouncedContent, Announcement,
     ApplicationDescription, ApplicationType, ConfigurationVersion, ConnectionState, CyclicStatus,
     DataSetMetaDataType, DataSetReaderDataType, DataSetWriterDataType, DataTypeSchemaHeader,
     EndpointDescription, EnumDefinition, EnumDescription, EnumField, FieldMetaData, KeyValuePair,
-    List, MessageSecurityMode, Probe, PubSubConnectionDataType, PubSubGroupDataType,
-    ReaderGroupDataType, SimpleTypeDescription, StructureDefinition, StructureDescription,
-    StructureField, StructureType, UserTokenPolicy, UserTokenType, WriterGroupDataType,
+    MessageSecurityMode, Probe, PubSubConnectionDataType, PubSubGroupDataType, ReaderGroupDataType,
+    SimpleTypeDescription, StructureDefinition, StructureDescription, StructureField,
+    StructureType, UserTokenPolicy, UserTokenType, WireArray, WriterGroupDataType,
 };
 use uadp::{
     DateTime, ExtensionBody, ExtensionObject, Guid, LocalizedText, NetworkMessage, NodeId,
@@ -28,19 +28,20 @@ fn leak<T>(values: Vec<T>) -> &'static [T] {
 
 fn list<T: std::fmt::Debug + Clone + 'static>(
     element: impl Strategy<Value = T>,
-) -> impl Strategy<Value = List<'static, T>>
+) -> impl Strategy<Value = WireArray<'static, T>>
 where
-    List<'static, T>: std::fmt::Debug,
+    WireArray<'static, T>: std::fmt::Debug,
 {
-    option::weighted(0.8, vec(element, 0..3))
-        .prop_map(|elements| elements.map_or(List::null(), |elements| List::new(leak(elements))))
+    option::weighted(0.8, vec(element, 0..3)).prop_map(|elements| {
+        elements.map_or(WireArray::null(), |elements| WireArray::new(leak(elements)))
+    })
 }
 
 fn text() -> impl Strategy<Value = Option<&'static str>> {
     option::of(".{0,5}").prop_map(|text| text.map(|text| &*text.leak()))
 }
 
-fn texts() -> impl Strategy<Value = List<'static, Option<&'static str>>> {
+fn texts() -> impl Strategy<Value = WireArray<'static, Option<&'static str>>> {
     list(text())
 }
 
@@ -403,25 +404,26 @@ fn action() -> impl Strategy<Value = ActionMetaData<'static>> {
             let (targets, methods): (Vec<_>, Vec<_>) = targets.into_iter().unzip();
             ActionMetaData {
                 writer_id,
-                action_targets: List::new(leak(targets)),
+                action_targets: WireArray::new(leak(targets)),
                 request,
                 response,
                 action_methods: if with_methods {
-                    List::new(leak(methods))
+                    WireArray::new(leak(methods))
                 } else {
-                    List::null()
+                    WireArray::null()
                 },
             }
         })
 }
 
-fn announced() -> impl Strategy<Value = Announced<'static>> {
+fn announced() -> impl Strategy<Value = AnnouncedContent<'static>> {
     let status = || any::<u32>().prop_map(StatusCode);
     prop_oneof![
-        (list(endpoint()), status())
-            .prop_map(|(endpoints, status)| Announced::PublisherEndpoints { endpoints, status }),
+        (list(endpoint()), status()).prop_map(|(endpoints, status)| {
+            AnnouncedContent::PublisherEndpoints { endpoints, status }
+        }),
         (any::<u16>(), meta_data(), status()).prop_map(|(writer_id, meta_data, status)| {
-            Announced::DataSetMetaData {
+            AnnouncedContent::DataSetMetaData {
                 writer_id,
                 meta_data,
                 status,
@@ -429,21 +431,21 @@ fn announced() -> impl Strategy<Value = Announced<'static>> {
         }),
         (vec((any::<u16>(), status()), 0..3), writer_group()).prop_map(|(writers, group)| {
             let (ids, statuses): (Vec<_>, Vec<_>) = writers.into_iter().unzip();
-            Announced::DataSetWriterConfiguration {
-                writer_ids: List::new(leak(ids)),
+            AnnouncedContent::DataSetWriterConfiguration {
+                writer_ids: WireArray::new(leak(ids)),
                 writer_group: group,
-                statuses: List::new(leak(statuses)),
+                statuses: WireArray::new(leak(statuses)),
             }
         }),
-        list(connection()).prop_map(Announced::PubSubConnections),
+        list(connection()).prop_map(AnnouncedContent::PubSubConnections),
         (application(), texts()).prop_map(|(description, capabilities)| {
-            Announced::ApplicationDescription {
+            AnnouncedContent::ApplicationDescription {
                 description,
                 capabilities,
             }
         }),
         (any::<i32>(), option::of(any::<(i64, i64)>())).prop_map(|(state, times)| {
-            Announced::ApplicationStatus {
+            AnnouncedContent::ApplicationStatus {
                 state: ConnectionState(state),
                 cyclic: times.map(|(next, now)| CyclicStatus {
                     next_report_time: DateTime(next),
@@ -451,8 +453,8 @@ fn announced() -> impl Strategy<Value = Announced<'static>> {
                 }),
             }
         }),
-        list(connection()).prop_map(Announced::ActionResponder),
-        action().prop_map(Announced::ActionMetaData),
+        list(connection()).prop_map(AnnouncedContent::ActionResponder),
+        action().prop_map(AnnouncedContent::ActionMetaData),
     ]
 }
 

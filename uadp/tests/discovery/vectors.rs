@@ -4,11 +4,11 @@ use std::path::Path;
 
 use serde_json::{Value, json};
 use uadp::discovery::{
-    Announced, Announcement, ApplicationDescription, ApplicationType, ConfigurationVersion,
-    DataSetMetaDataType, DataSetWriterDataType, EndpointDescription, FieldMetaData, List,
+    AnnouncedContent, Announcement, ApplicationDescription, ApplicationType, ConfigurationVersion,
+    DataSetMetaDataType, DataSetWriterDataType, EndpointDescription, FieldMetaData,
     MessageSecurityMode, NetworkAddressUrlDataType, Probe, PubSubConnectionDataType,
-    PubSubGroupDataType, Settings, UadpDataSetWriterMessageDataType,
-    UadpWriterGroupMessageDataType, WriterGroupDataType,
+    PubSubGroupDataType, SettingsStructure, UadpDataSetWriterMessageDataType,
+    UadpWriterGroupMessageDataType, WireArray, WriterGroupDataType,
 };
 use uadp::{
     ExtensionObject, Guid, LocalizedText, NetworkMessage, NodeId, PublisherId, Scalar,
@@ -23,11 +23,11 @@ fn probes_are_read_as_described_and_written_back() {
         ("composite_probe_endpoints", Probe::PublisherEndpoints),
         (
             "composite_probe_metadata",
-            Probe::DataSetMetaData(List::new(&[1, 2])),
+            Probe::DataSetMetaData(WireArray::new(&[1, 2])),
         ),
         (
             "composite_probe_writerconfig",
-            Probe::DataSetWriterConfiguration(List::new(&[1, 2])),
+            Probe::DataSetWriterConfiguration(WireArray::new(&[1, 2])),
         ),
     ] {
         let bytes = vector(name);
@@ -77,17 +77,17 @@ fn announcements_are_read_as_described_and_written_back() {
         assert_eq!(json["type"], found.announced.announcement_type());
         assert_eq!(json["sequenceNumber"], found.sequence_number);
         match found.announced {
-            Announced::PublisherEndpoints { endpoints, status } => {
+            AnnouncedContent::PublisherEndpoints { endpoints, status } => {
                 assert_eq!(json["endpoints"], endpoints.len());
                 assert_eq!(json["statusCode"], status.0);
             }
-            Announced::DataSetMetaData {
+            AnnouncedContent::DataSetMetaData {
                 writer_id, status, ..
             } => {
                 assert_eq!(json["dataSetWriterId"], writer_id);
                 assert_eq!(json["statusCode"], status.0);
             }
-            Announced::DataSetWriterConfiguration {
+            AnnouncedContent::DataSetWriterConfiguration {
                 writer_ids,
                 statuses,
                 ..
@@ -99,12 +99,14 @@ fn announcements_are_read_as_described_and_written_back() {
                 let statuses: Value = statuses.iter().map(|status| status.0).collect();
                 assert_eq!(json["statusCodes"], statuses);
             }
-            Announced::PubSubConnection { status, .. } => assert_eq!(status, StatusCode::GOOD),
-            Announced::PubSubConnections(_)
-            | Announced::ApplicationDescription { .. }
-            | Announced::ApplicationStatus { .. }
-            | Announced::ActionResponder(_)
-            | Announced::ActionMetaData(_) => unreachable!("{found:?}"),
+            AnnouncedContent::PubSubConnection { status, .. } => {
+                assert_eq!(status, StatusCode::GOOD)
+            }
+            AnnouncedContent::PubSubConnections(_)
+            | AnnouncedContent::ApplicationDescription { .. }
+            | AnnouncedContent::ApplicationStatus { .. }
+            | AnnouncedContent::ActionResponder(_)
+            | AnnouncedContent::ActionMetaData(_) => unreachable!("{found:?}"),
         }
         assert_eq!(datagram(&found), bytes, "{name}");
     }
@@ -127,8 +129,8 @@ fn the_endpoint_of_the_vector_is_what_open62541_was_given() {
         security_policy_uri: Some("http://opcfoundation.org/UA/SecurityPolicy#None"),
         ..EndpointDescription::default()
     }];
-    let announced = Announced::PublisherEndpoints {
-        endpoints: List::new(&endpoints),
+    let announced = AnnouncedContent::PublisherEndpoints {
+        endpoints: WireArray::new(&endpoints),
         status: StatusCode::GOOD,
     };
     same("composite_announce_endpoints", announced);
@@ -154,7 +156,7 @@ fn the_metadata_of_the_vector_are_what_open62541_was_given() {
         built_in_type: 11,
         data_type: NodeId::numeric(0, 11),
         value_rank: 1,
-        array_dimensions: List::new(&[3]),
+        array_dimensions: WireArray::new(&[3]),
         ..FieldMetaData::default()
     };
     let text = FieldMetaData {
@@ -173,7 +175,7 @@ fn the_metadata_of_the_vector_are_what_open62541_was_given() {
     let fields = [battery, pose, text];
     let meta_data = DataSetMetaDataType {
         name: Some("robot_status"),
-        fields: List::new(&fields),
+        fields: WireArray::new(&fields),
         configuration_version: ConfigurationVersion {
             major: 700_000_000,
             minor: 700_000_001,
@@ -188,7 +190,7 @@ fn the_metadata_of_the_vector_are_what_open62541_was_given() {
             StatusCode(0x8035_0000),
         ),
     ] {
-        let announced = Announced::DataSetMetaData {
+        let announced = AnnouncedContent::DataSetMetaData {
             writer_id,
             meta_data,
             status,
@@ -234,13 +236,13 @@ fn the_configuration_of_the_vectors_is_what_open62541_was_given() {
         }
         .write_object(group_settings)
         .unwrap(),
-        data_set_writers: List::new(&writers),
+        data_set_writers: WireArray::new(&writers),
         ..WriterGroupDataType::default()
     }];
-    let announced = Announced::DataSetWriterConfiguration {
-        writer_ids: List::new(&[1]),
+    let announced = AnnouncedContent::DataSetWriterConfiguration {
+        writer_ids: WireArray::new(&[1]),
         writer_group: groups[0],
-        statuses: List::new(&[StatusCode::GOOD]),
+        statuses: WireArray::new(&[StatusCode::GOOD]),
     };
     same("composite_announce_writerconfig", announced);
 
@@ -257,10 +259,10 @@ fn the_configuration_of_the_vectors_is_what_open62541_was_given() {
         }
         .write_object(address)
         .unwrap(),
-        writer_groups: List::new(&groups),
+        writer_groups: WireArray::new(&groups),
         ..PubSubConnectionDataType::default()
     };
-    let announced = Announced::PubSubConnection {
+    let announced = AnnouncedContent::PubSubConnection {
         connection,
         status: StatusCode::GOOD,
     };
@@ -272,7 +274,7 @@ fn settings_are_decoded_on_demand_and_others_left_alone() {
     let bytes = vector("composite_announce_writerconfig");
     let message = NetworkMessage::decode(&bytes).unwrap();
     let announced = Announcement::decode(&message).unwrap().announced;
-    let Announced::DataSetWriterConfiguration { writer_group, .. } = announced else {
+    let AnnouncedContent::DataSetWriterConfiguration { writer_group, .. } = announced else {
         unreachable!("{announced:?}")
     };
     let settings = UadpWriterGroupMessageDataType::from_object(&writer_group.message_settings);
@@ -299,7 +301,7 @@ fn settings_are_decoded_on_demand_and_others_left_alone() {
 
 /// Checks that the vector decodes to the announcement, and that the announcement encodes to the
 /// vector.
-fn same(name: &str, announced: Announced<'_>) {
+fn same(name: &str, announced: AnnouncedContent<'_>) {
     let announcement = Announcement {
         sequence_number: 7,
         announced,

@@ -4,8 +4,8 @@ use std::path::Path;
 
 use serde_json::Value;
 use uadp::{
-    DataSetHeader, DecodeError, Extras, Keys, NetworkMessage, NetworkMessageEncoder, Opener, Seal,
-    SecurityError, SecurityMode, SecurityPolicy,
+    DataSetHeader, DecodeError, Extras, NetworkMessage, NetworkMessageEncoder, Opener, Seal,
+    SecurityError, SecurityMode, SecurityPolicy, TokenKeys,
 };
 
 use super::START;
@@ -46,10 +46,10 @@ impl Foreign {
         self.json["security"][what].as_str().unwrap()
     }
 
-    fn keys(&self) -> Keys {
+    fn keys(&self) -> TokenKeys {
         let policy = SecurityPolicy::from_uri(self.said("policy")).unwrap();
         let parts = ["signingKey", "encryptingKey", "keyNonce"].map(|part| bytes(self.said(part)));
-        Keys::from_bytes(policy, &parts.concat()).unwrap()
+        TokenKeys::from_bytes(policy, &parts.concat()).unwrap()
     }
 
     fn mode(&self) -> SecurityMode {

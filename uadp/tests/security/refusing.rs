@@ -1,9 +1,9 @@
 //! Messages that are rejected for their content.
 
 use uadp::{
-    DataSetHeader, Extras, KeyError, Keys, NetworkMessage, NetworkMessageEncoder, Opener,
-    PublisherId, Seal, SealError, Sealer, SecurityError, SecurityHeader, SecurityMode,
-    SecurityPolicy,
+    DataSetHeader, Extras, KeyError, NetworkMessage, NetworkMessageEncoder, Opener, PublisherId,
+    Seal, SealError, Sealer, SecurityError, SecurityHeader, SecurityMode, SecurityPolicy,
+    TokenKeys,
 };
 
 use super::{header, keys, nonce, open, opener, sealed, write};
@@ -139,7 +139,7 @@ fn key_data_has_the_length_of_its_policy() {
         assert_eq!(policy.key_data_length(), length);
         assert_eq!(SecurityPolicy::from_uri(policy.uri()), Some(policy));
         for found in 0..100 {
-            let keys = Keys::from_bytes(policy, &vec![1; found]);
+            let keys = TokenKeys::from_bytes(policy, &vec![1; found]);
             let expected = (found == length).then_some(policy).ok_or(KeyError::Length {
                 policy,
                 expected: length,
@@ -155,14 +155,14 @@ fn key_data_has_the_length_of_its_policy() {
 #[test]
 fn keys_are_equal_only_in_all_their_parts() {
     let policy = SecurityPolicy::PubSubAes128Ctr;
-    let same = Keys::from_bytes(policy, &[7; 52]).unwrap();
-    assert_eq!(same, Keys::from_bytes(policy, &[7; 52]).unwrap());
+    let same = TokenKeys::from_bytes(policy, &[7; 52]).unwrap();
+    assert_eq!(same, TokenKeys::from_bytes(policy, &[7; 52]).unwrap());
     for at in [0, 31, 32, 47, 48, 51] {
         let mut key_data = [7; 52];
         key_data[at] = 8;
-        assert_ne!(same, Keys::from_bytes(policy, &key_data).unwrap());
+        assert_ne!(same, TokenKeys::from_bytes(policy, &key_data).unwrap());
     }
-    let longer = Keys::from_bytes(SecurityPolicy::PubSubAes256Ctr, &[7; 68]).unwrap();
+    let longer = TokenKeys::from_bytes(SecurityPolicy::PubSubAes256Ctr, &[7; 68]).unwrap();
     assert_ne!(same, longer);
 }
 

@@ -3,9 +3,9 @@
 use proptest::collection::vec;
 use proptest::prelude::*;
 use uadp::{
-    BuiltinType, DataSetHeader, EncodeError, Extras, Keys, NetworkHeader, NetworkMessage,
+    BuiltinType, DataSetHeader, EncodeError, Extras, NetworkHeader, NetworkMessage,
     NetworkMessageEncoder, Opener, PublisherId, Seal, Sealer, SecurityHeader, SecurityMode,
-    SecurityPolicy, Variant,
+    SecurityPolicy, TokenKeys, Variant,
 };
 
 use super::{START, header, keys, nonce, sealed, write};
@@ -45,7 +45,7 @@ proptest! {
     ) {
         let policy = if aes128 { SecurityPolicy::PubSubAes128Ctr } else { SecurityPolicy::PubSubAes256Ctr };
         let mode = if encrypt { SecurityMode::SignAndEncrypt } else { SecurityMode::Sign };
-        let keys = Keys::from_bytes(policy, &key_data[..policy.key_data_length()]).unwrap();
+        let keys = TokenKeys::from_bytes(policy, &key_data[..policy.key_data_length()]).unwrap();
         let mut sealer = Sealer::new(mode);
         sealer.update_keys(3, [keys.clone()]).unwrap();
         let mut opener = Opener::new(mode);

@@ -3,8 +3,8 @@
 use serde_json::{Map, Value, json};
 use uadp::{
     Array, BuiltinType, DataSetMessage, DataValue, DecodeError, ExtensionBody, ExtensionObject,
-    FieldEncoding, GroupHeader, Identifier, MessageKind, NetworkMessage, NetworkMessageType,
-    NodeId, PublisherId, Scalar, Variant,
+    FieldEncoding, GroupHeader, MessageKind, NetworkMessage, NetworkMessageType, NodeId,
+    NodeIdValue, PublisherId, Scalar, Variant,
 };
 
 /// Describes the headers of a NetworkMessage and of its chunk.
@@ -214,10 +214,10 @@ fn describe_scalar(scalar: Scalar<'_>) -> Value {
 
 fn describe_node_id(node_id: NodeId<'_>) -> String {
     let identifier = match node_id.identifier {
-        Identifier::Numeric(id) => format!("i={id}"),
-        Identifier::String(id) => format!("s={}", id.unwrap()),
-        Identifier::Guid(id) => format!("g={}", id.to_string().to_lowercase()),
-        Identifier::Opaque(id) => format!("b={}", base64(id.unwrap())),
+        NodeIdValue::Numeric(id) => format!("i={id}"),
+        NodeIdValue::String(id) => format!("s={}", id.unwrap()),
+        NodeIdValue::Guid(id) => format!("g={}", id.to_string().to_lowercase()),
+        NodeIdValue::Opaque(id) => format!("b={}", base64(id.unwrap())),
     };
     match node_id.namespace {
         0 => identifier,

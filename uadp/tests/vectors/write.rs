@@ -1,7 +1,7 @@
 //! Three ways of encoding decoded fields, which have to result in the same bytes.
 
 use uadp::{
-    Array, BuiltinType, Encoded, ExtensionBody, ExtensionObject, FieldEncoder, Fields, Matrix,
+    Array, BuiltinType, ExtensionBody, ExtensionObject, FieldEncoder, Fields, Matrix, Nested,
     NodeId, Scalar, Variant,
 };
 
@@ -57,7 +57,7 @@ fn write_elements(encoder: &mut FieldEncoder<'_>, array: Array<'_>) {
             }) => write_structure(encoder, type_id, body),
             Scalar::Variant(value) => {
                 let mut buffer = Vec::new();
-                let value = Encoded::variant(&value.get().unwrap(), &mut buffer).unwrap();
+                let value = Nested::variant(&value.get().unwrap(), &mut buffer).unwrap();
                 encoder.element(Scalar::Variant(value)).unwrap();
             }
             other => encoder.element(other).unwrap(),

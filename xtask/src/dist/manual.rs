@@ -3,7 +3,7 @@
 use std::fmt::Write as _;
 
 use crate::{
-    help::{Help, Parts},
+    help::{Help, HelpParts},
     links,
 };
 
@@ -58,7 +58,7 @@ pub(crate) fn overview(version: &str, date: &str) -> String {
 }
 
 /// Returns the first sentence, without its full stop.
-fn summary<'a>(parts: &Parts<'a>) -> &'a str {
+fn summary<'a>(parts: &HelpParts<'a>) -> &'a str {
     let first = parts.about.first().copied().unwrap_or_default();
     let sentence = first.split(". ").next().unwrap_or(first);
     sentence.trim_end_matches('.')

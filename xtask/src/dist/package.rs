@@ -10,7 +10,7 @@ use std::{
 
 use anyhow::{Context as _, ensure};
 
-use super::{sysroot::Machine, tree::Tree, units};
+use super::{sysroot::Machine, tree::PackageFiles, units};
 use crate::{shell::run as must, workspace::Workspace};
 
 const SUMMARY: &str = "gateway between ROS 1, ROS 2 and OPC UA PubSub";
@@ -23,17 +23,17 @@ const DESCRIPTION: [&str; 2] = [
 pub(crate) const MAINTAINER: &str = "The authors of the UA bridge <maintainers@example.org>";
 
 /// A package to be written.
-pub(crate) struct Package<'a> {
+pub(crate) struct DebianPackage<'a> {
     pub(crate) workspace: &'a Workspace,
     pub(crate) machine: Machine,
     /// The version, such as `0.1.0+202601020304.1a2b3c4d5e6f`.
     pub(crate) version: String,
     /// The time of the commit in seconds.
     pub(crate) time: String,
-    pub(crate) tree: &'a Tree,
+    pub(crate) tree: &'a PackageFiles,
 }
 
-impl Package<'_> {
+impl DebianPackage<'_> {
     /// Writes the package of Debian and returns its path.
     ///
     /// # Errors

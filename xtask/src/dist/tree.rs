@@ -20,11 +20,11 @@ enum Entry {
 
 /// The files of a package by their paths below the root, such as `usr/bin/ua-bridge`.
 #[derive(Default)]
-pub(crate) struct Tree {
+pub(crate) struct PackageFiles {
     entries: BTreeMap<String, Entry>,
 }
 
-impl Tree {
+impl PackageFiles {
     /// Adds a file that all users can read.
     pub(crate) fn file(&mut self, path: impl Into<String>, contents: impl Into<Vec<u8>>) {
         self.with_mode(path, contents, 0o644);
@@ -146,7 +146,7 @@ mod tests {
     #[test]
     fn files_have_their_modes_and_links_their_targets() {
         let root = std::env::temp_dir().join(format!("xtask-tree-{}", std::process::id()));
-        let mut tree = Tree::default();
+        let mut tree = PackageFiles::default();
         tree.program("usr/bin/a", b"program".to_vec());
         tree.link("usr/bin/b", "a");
         tree.file("etc/a/a.conf", "x");

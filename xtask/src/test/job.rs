@@ -16,13 +16,13 @@ const LONGEST: Duration = Duration::from_secs(600);
 const LOOK_EVERY: Duration = Duration::from_millis(20);
 
 /// A process with one test or more.
-pub(super) struct Job {
+pub(super) struct TestJob {
     name: String,
     command: Command,
     has_peers: bool,
 }
 
-impl Job {
+impl TestJob {
     pub(super) fn new(name: String, command: Command) -> Self {
         Self {
             name,
@@ -38,7 +38,7 @@ impl Job {
     }
 
     /// Runs the job to its end, or to its time limit.
-    fn run(mut self) -> anyhow::Result<Done> {
+    fn run(mut self) -> anyhow::Result<EndedJob> {
         #[expect(
             clippy::disallowed_methods,
             reason = "how long a test takes is told, and it may not hang"
@@ -66,13 +66,13 @@ impl Job {
             (texts.map(Option::unwrap_or_default).concat(), status)
         });
         let ended = status.with_context(|| format!("{} cannot be waited for", self.name))?;
-        let mut counts = Counts::of(&printed);
+        let mut counts = ResultCounts::of(&printed);
         let passed = ended.is_some_and(|status| status.success());
         if !passed && counts.failed == 0 {
             // The program ended without a result, for example by a signal.
             counts.failed = 1;
         }
-        Ok(Done {
+        Ok(EndedJob {
             counts,
             passed,
             hung: ended.is_none(),
@@ -109,13 +109,13 @@ fn wait(child: &mut Child, start: Instant) -> std::io::Result<Option<ExitStatus>
 
 /// The counts in the results of test programs.
 #[derive(Debug, Default, Clone, Copy, PartialEq, Eq)]
-pub(super) struct Counts {
+pub(super) struct ResultCounts {
     pub(super) passed: u64,
     pub(super) failed: u64,
     pub(super) ignored: u64,
 }
 
-impl Counts {
+impl ResultCounts {
     fn of(printed: &str) -> Self {
         let mut counts = Self::default();
         let results = printed
@@ -138,16 +138,16 @@ impl Counts {
 }
 
 /// A job that ended.
-pub(super) struct Done {
-    job: Job,
-    pub(super) counts: Counts,
+pub(super) struct EndedJob {
+    job: TestJob,
+    pub(super) counts: ResultCounts,
     pub(super) passed: bool,
     hung: bool,
     pub(super) took: Duration,
     printed: String,
 }
 
-impl Done {
+impl EndedJob {
     pub(super) fn name(&self) -> &str {
         &self.job.name
     }
@@ -155,7 +155,7 @@ impl Done {
     fn print(&self) {
         let took = self.took.as_secs_f64();
         if self.passed {
-            if self.counts == Counts::default() {
+            if self.counts == ResultCounts::default() {
                 // A program without tests, or without tests that match the filters.
                 return;
             }
@@ -176,17 +176,17 @@ impl Done {
 }
 
 /// The number of concurrent jobs.
-pub(super) struct Lanes(pub(super) usize);
+pub(super) struct JobSlots(pub(super) usize);
 
-impl Lanes {
+impl JobSlots {
     /// Runs all jobs and prints each result as it ends, for failures with the whole output.
-    pub(super) fn run(self, jobs: Vec<Job>) -> anyhow::Result<Vec<Done>> {
+    pub(super) fn run(self, jobs: Vec<TestJob>) -> anyhow::Result<Vec<EndedJob>> {
         let waiting = Mutex::new(VecDeque::from(jobs));
         let next = || {
             let mut waiting = waiting.lock().unwrap_or_else(PoisonError::into_inner);
             waiting.pop_front()
         };
-        let lane = || -> anyhow::Result<Vec<Done>> {
+        let lane = || -> anyhow::Result<Vec<EndedJob>> {
             let mut all = Vec::new();
             while let Some(job) = next() {
                 let done = job.run()?;
@@ -211,21 +211,21 @@ impl Lanes {
 
 /// The results of all jobs.
 #[derive(Default)]
-pub(super) struct Report {
-    pub(super) done: Vec<Done>,
+pub(super) struct JobReport {
+    pub(super) done: Vec<EndedJob>,
     /// Tests that failed and then passed.
     pub(super) flaky: Vec<String>,
 }
 
-impl Report {
-    pub(super) fn take(&mut self, done: Vec<Done>) {
+impl JobReport {
+    pub(super) fn take(&mut self, done: Vec<EndedJob>) {
         self.done.extend(done);
     }
 
     /// Removes and returns the failed jobs that may be retried; returns no jobs if there are more
     /// than `most`.
-    pub(super) fn failed_with_peers(&mut self, most: usize) -> Vec<Job> {
-        let may = |done: &Done| !done.passed && done.job.has_peers;
+    pub(super) fn failed_with_peers(&mut self, most: usize) -> Vec<TestJob> {
+        let may = |done: &EndedJob| !done.passed && done.job.has_peers;
         if self.done.iter().filter(|done| may(done)).count() > most {
             return Vec::new();
         }
@@ -235,7 +235,7 @@ impl Report {
     }
 
     /// Adds the results of a retry.
-    pub(super) fn retry(&mut self, done: Vec<Done>) {
+    pub(super) fn retry(&mut self, done: Vec<EndedJob>) {
         let passed = done.iter().filter(|done| done.passed);
         self.flaky.extend(passed.map(|done| done.name().to_owned()));
         self.take(done);
@@ -246,10 +246,10 @@ impl Report {
 mod tests {
     use super::*;
 
-    fn shell(name: &str, script: &str) -> Job {
+    fn shell(name: &str, script: &str) -> TestJob {
         let mut command = Command::new("sh");
         command.args(["-c", script]);
-        Job::new(name.to_owned(), command)
+        TestJob::new(name.to_owned(), command)
     }
 
     const WELL: &str = "echo 'test result: ok. 7 passed; 0 failed; 1 ignored; 0 measured'";
@@ -257,18 +257,18 @@ mod tests {
 
     #[test]
     fn what_test_programs_say_in_the_end_is_counted() {
-        let done = Lanes(2)
+        let done = JobSlots(2)
             .run(vec![shell("a", WELL), shell("b", BADLY)])
             .unwrap();
         let mut counts: Vec<_> = done.iter().map(|done| (done.passed, done.counts)).collect();
         counts.sort_by_key(|(passed, _)| *passed);
         let (well, badly) = (
-            Counts {
+            ResultCounts {
                 passed: 7,
                 failed: 0,
                 ignored: 1,
             },
-            Counts {
+            ResultCounts {
                 passed: 3,
                 failed: 2,
                 ignored: 0,
@@ -279,7 +279,9 @@ mod tests {
 
     #[test]
     fn a_program_that_dies_without_a_word_has_failed() {
-        let done = Lanes(1).run(vec![shell("dies", "kill -KILL $$")]).unwrap();
+        let done = JobSlots(1)
+            .run(vec![shell("dies", "kill -KILL $$")])
+            .unwrap();
         assert_eq!(
             done.first().map(|done| (done.passed, done.counts.failed)),
             Some((false, 1))
@@ -288,9 +290,9 @@ mod tests {
 
     #[test]
     fn only_tests_with_peers_are_tried_again_and_are_flaky_then() {
-        let mut report = Report::default();
+        let mut report = JobReport::default();
         report.take(
-            Lanes(1)
+            JobSlots(1)
                 .run(vec![
                     shell("ours", BADLY),
                     shell("theirs", BADLY).with_peers(),
@@ -305,7 +307,7 @@ mod tests {
         let again = report.failed_with_peers(1);
         let names: Vec<_> = again.iter().map(|job| job.name.clone()).collect();
         assert_eq!(names, ["theirs"]);
-        report.retry(Lanes(1).run(vec![shell("theirs", WELL)]).unwrap());
+        report.retry(JobSlots(1).run(vec![shell("theirs", WELL)]).unwrap());
         assert_eq!(report.flaky, ["theirs"]);
         let failed: Vec<_> = report.done.iter().filter(|done| !done.passed).collect();
         assert_eq!(

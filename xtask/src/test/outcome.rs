@@ -2,14 +2,14 @@
 
 use std::{cmp::Reverse, fmt, time::Duration};
 
-use super::job::{Counts, Report};
-use crate::shell::Ended;
+use super::job::{JobReport, ResultCounts};
+use crate::shell::CommandOutcome;
 
 const SLOWEST: usize = 20;
 
 /// The counts, failures and slowest tests of a test run.
-pub(super) struct Outcome<'a> {
-    counts: Counts,
+pub(super) struct TestOutcome<'a> {
+    counts: ResultCounts,
     programs: usize,
     failed: Vec<&'a str>,
     flaky: &'a [String],
@@ -18,11 +18,11 @@ pub(super) struct Outcome<'a> {
     slowest: Vec<(&'a str, Duration)>,
 }
 
-impl<'a> Outcome<'a> {
+impl<'a> TestOutcome<'a> {
     /// Creates the summary. `skipped` has the reasons of skipped tests. More than `most_flaky`
     /// tests that passed only at the second attempt are a failure.
-    pub(super) fn new(report: &'a Report, skipped: Vec<&'a str>, most_flaky: usize) -> Self {
-        let mut counts = Counts::default();
+    pub(super) fn new(report: &'a JobReport, skipped: Vec<&'a str>, most_flaky: usize) -> Self {
+        let mut counts = ResultCounts::default();
         for done in &report.done {
             counts.passed += done.counts.passed;
             counts.failed += done.counts.failed;
@@ -51,15 +51,15 @@ impl<'a> Outcome<'a> {
         self.flaky.len() > self.most_flaky
     }
 
-    pub(super) fn ended(&self) -> Ended {
+    pub(super) fn ended(&self) -> CommandOutcome {
         match self.failed.is_empty() && !self.too_flaky() {
-            true => Ended::WELL,
-            false => Ended::BADLY,
+            true => CommandOutcome::WELL,
+            false => CommandOutcome::BADLY,
         }
     }
 }
 
-impl fmt::Display for Outcome<'_> {
+impl fmt::Display for TestOutcome<'_> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         writeln!(f, "\nthe slowest:")?;
         for (name, took) in &self.slowest {
@@ -80,7 +80,7 @@ impl fmt::Display for Outcome<'_> {
         for name in &self.failed {
             writeln!(f, "failed: {name}")?;
         }
-        let word = match self.ended() == Ended::WELL {
+        let word = match self.ended() == CommandOutcome::WELL {
             true => "ok",
             false => "FAILED",
         };
@@ -102,16 +102,19 @@ impl fmt::Display for Outcome<'_> {
 mod tests {
     use super::*;
 
-    fn ended(flaky: usize) -> Ended {
-        let report = Report {
+    fn ended(flaky: usize) -> CommandOutcome {
+        let report = JobReport {
             flaky: vec!["a test".to_owned(); flaky],
-            ..Report::default()
+            ..JobReport::default()
         };
-        Outcome::new(&report, Vec::new(), 2).ended()
+        TestOutcome::new(&report, Vec::new(), 2).ended()
     }
 
     #[test]
     fn two_flaky_tests_are_told_and_a_third_fails_the_run() {
-        assert_eq!((ended(2), ended(3)), (Ended::WELL, Ended::BADLY));
+        assert_eq!(
+            (ended(2), ended(3)),
+            (CommandOutcome::WELL, CommandOutcome::BADLY)
+        );
     }
 }

@@ -8,11 +8,11 @@ use std::{
 use anyhow::{Context as _, bail, ensure};
 use serde_json::Value;
 
-use crate::{namespace::Namespaces, shell::line};
+use crate::{namespace::NamespacePermission, shell::line};
 
 /// An executable with tests.
 #[derive(Debug, PartialEq, Eq)]
-pub(super) struct Program {
+pub(super) struct TestProgram {
     pub(super) package: String,
     /// The name of the target: `router` for `tests/router.rs`.
     pub(super) name: String,
@@ -25,7 +25,7 @@ pub(super) struct Program {
 ///
 /// # Errors
 /// Returns an error if cargo does not start or fails; the reason is on stderr.
-pub(super) fn build(mut cargo: Command) -> anyhow::Result<Vec<Program>> {
+pub(super) fn build(mut cargo: Command) -> anyhow::Result<Vec<TestProgram>> {
     let output = cargo
         .arg("--message-format=json-render-diagnostics")
         .stderr(Stdio::inherit())
@@ -36,11 +36,11 @@ pub(super) fn build(mut cargo: Command) -> anyhow::Result<Vec<Program>> {
     }
     String::from_utf8_lossy(&output.stdout)
         .lines()
-        .filter_map(|message| Program::of(message).transpose())
+        .filter_map(|message| TestProgram::of(message).transpose())
         .collect()
 }
 
-impl Program {
+impl TestProgram {
     /// Parses a message of cargo; `None` for messages about other things than test programs.
     fn of(message: &str) -> anyhow::Result<Option<Self>> {
         let message: Value = serde_json::from_str(message)
@@ -77,12 +77,12 @@ impl Program {
     }
 
     /// Returns a command that runs the program as `cargo test` does.
-    pub(super) fn command(&self, namespaces: Namespaces) -> Command {
+    pub(super) fn command(&self, namespaces: NamespacePermission) -> Command {
         self.at_home(namespaces.command(&self.executable))
     }
 
     /// Like `command`, in a network of its own.
-    pub(super) fn alone(&self, namespaces: Namespaces) -> Command {
+    pub(super) fn alone(&self, namespaces: NamespacePermission) -> Command {
         self.at_home(namespaces.alone(&self.executable))
     }
 
@@ -152,21 +152,21 @@ mod tests {
     #[test]
     fn a_program_with_tests_is_known_by_cargos_message() {
         let named = message("path+file:///w/tests#system-tests@0.1.0", true);
-        let program = Program::of(&named).unwrap().unwrap();
+        let program = TestProgram::of(&named).unwrap().unwrap();
         assert_eq!(
             (&*program.package, &*program.name),
             ("system-tests", "rate")
         );
         assert_eq!(program.label(), "system-tests rate");
         let unnamed = message("path+file:///w/tests#0.1.0", true);
-        assert_eq!(Program::of(&unnamed).unwrap().unwrap().package, "tests");
+        assert_eq!(TestProgram::of(&unnamed).unwrap().unwrap().package, "tests");
     }
 
     #[test]
     fn what_has_no_tests_is_no_test_program() {
         let program = message("path+file:///w/tests#system-tests@0.1.0", false);
-        assert_eq!(Program::of(&program).unwrap(), None);
+        assert_eq!(TestProgram::of(&program).unwrap(), None);
         let other = json!({"reason": "build-finished", "success": true}).to_string();
-        assert_eq!(Program::of(&other).unwrap(), None);
+        assert_eq!(TestProgram::of(&other).unwrap(), None);
     }
 }

@@ -84,9 +84,9 @@ async fn of_two_servers_with_one_name_one_is_called_otherwise() {
     // On a port of its own, so that no other program on this host takes part.
     let port = 20_000 + u16::try_from(std::process::id() % 20_000).unwrap();
     let open = |url: &str| {
-        let mut mdns = Mdns::open_at(&Interface::LOOPBACK, port).unwrap();
-        mdns.put(Ours {
-            announcement: Announcement {
+        let mut mdns = Mdns::open_at(&MdnsInterface::LOOPBACK, port).unwrap();
+        mdns.put(OwnAnnouncement {
+            announcement: AnnouncedServer {
                 instance: "arm".to_owned(),
                 url: url.to_owned(),
                 capabilities: Vec::new(),
@@ -105,7 +105,7 @@ async fn of_two_servers_with_one_name_one_is_called_otherwise() {
                 heard = one.next() => (heard, true),
                 heard = other.next() => (heard, false),
             };
-            if let Heard::Renamed { from, to } = heard {
+            if let MdnsEvent::Renamed { from, to } = heard {
                 return (from, to, first);
             }
         }

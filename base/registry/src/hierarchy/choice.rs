@@ -5,22 +5,22 @@ use std::str::FromStr;
 
 /// Selection of a discovery server.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Choice {
+pub enum ServerChoice {
     /// The only discovery server of the network.
     Any,
     /// The discovery server at this URL, announced or not.
     At(String),
     /// By its ApplicationUri.
-    Uri(Pattern),
+    Uri(NamePattern),
     /// By its mDNS instance name.
-    Name(Pattern),
+    Name(NamePattern),
     /// The discovery server whose address space has this node, such as `nsu=urn:cell;s=Marker`.
     Marker(String),
 }
 
 /// A text, or a prefix.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Pattern {
+pub struct NamePattern {
     text: String,
     is_prefix: bool,
 }
@@ -35,20 +35,20 @@ pub struct ChoiceFault(String);
 
 /// An available discovery server.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Candidate {
+pub struct ServerCandidate {
     /// Its mDNS instance name.
     pub name: String,
     /// Its URL.
     pub url: String,
     /// Its ApplicationUri; `None` if unknown.
     pub application_uri: Option<String>,
-    /// Whether it has the node of [`Choice::Marker`].
+    /// Whether it has the node of [`ServerChoice::Marker`].
     pub is_marked: bool,
 }
 
 /// Result of a choice.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Chosen {
+pub enum ChosenServer {
     /// No candidate matches.
     Nobody,
     /// URL of the selected discovery server.
@@ -57,32 +57,33 @@ pub enum Chosen {
     Several(Vec<String>),
 }
 
-impl Choice {
+impl ServerChoice {
     /// Selects a candidate. A discovery server with several addresses counts once, and is used at
     /// the first of its addresses.
     #[must_use]
-    pub fn among(&self, candidates: &[Candidate]) -> Chosen {
+    pub fn among(&self, candidates: &[ServerCandidate]) -> ChosenServer {
         if let Self::At(url) = self {
-            return Chosen::At(url.clone());
+            return ChosenServer::At(url.clone());
         }
-        let mut fit: Vec<&Candidate> = candidates.iter().filter(|one| self.fits(one)).collect();
+        let mut fit: Vec<&ServerCandidate> =
+            candidates.iter().filter(|one| self.fits(one)).collect();
         fit.sort_by(|a, b| a.url.cmp(&b.url));
         let Some(first) = fit.first() else {
-            return Chosen::Nobody;
+            return ChosenServer::Nobody;
         };
-        let same = |one: &&&Candidate| {
+        let same = |one: &&&ServerCandidate| {
             one.url == first.url
                 || (one.application_uri.is_some() && one.application_uri == first.application_uri)
         };
         if fit.iter().all(|one| same(&one)) {
-            return Chosen::At(first.url.clone());
+            return ChosenServer::At(first.url.clone());
         }
         let mut names: Vec<String> = fit.iter().map(|one| one.name.clone()).collect();
         names.sort();
-        Chosen::Several(names)
+        ChosenServer::Several(names)
     }
 
-    fn fits(&self, candidate: &Candidate) -> bool {
+    fn fits(&self, candidate: &ServerCandidate) -> bool {
         match self {
             Self::Any => true,
             Self::At(url) => candidate.url == *url,
@@ -96,7 +97,7 @@ impl Choice {
     }
 }
 
-impl Pattern {
+impl NamePattern {
     fn parse(text: &str) -> Option<Self> {
         let (text, is_prefix) = match text.strip_suffix('*') {
             Some(prefix) => (prefix, true),
@@ -117,7 +118,7 @@ impl Pattern {
     }
 }
 
-impl FromStr for Choice {
+impl FromStr for ServerChoice {
     type Err = ChoiceFault;
 
     fn from_str(text: &str) -> Result<Self, ChoiceFault> {
@@ -128,8 +129,8 @@ impl FromStr for Choice {
             _ if strange || text.len() > MOST_TEXT => None,
             _ if text == "any" => Some(Self::Any),
             _ if text.starts_with("opc.tcp://") => Some(Self::At(text.to_owned())),
-            Some(("uri", pattern)) => Pattern::parse(pattern).map(Self::Uri),
-            Some(("name", pattern)) => Pattern::parse(pattern).map(Self::Name),
+            Some(("uri", pattern)) => NamePattern::parse(pattern).map(Self::Uri),
+            Some(("name", pattern)) => NamePattern::parse(pattern).map(Self::Name),
             Some(("node", node)) if !node.is_empty() => Some(Self::Marker(node.to_owned())),
             Some(_) | None => None,
         };
@@ -137,7 +138,7 @@ impl FromStr for Choice {
     }
 }
 
-impl fmt::Display for Choice {
+impl fmt::Display for ServerChoice {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Any => f.write_str("any"),
@@ -149,7 +150,7 @@ impl fmt::Display for Choice {
     }
 }
 
-impl fmt::Display for Pattern {
+impl fmt::Display for NamePattern {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Self { text, is_prefix } = self;
         write!(f, "{text}{}", if *is_prefix { "*" } else { "" })
@@ -162,8 +163,8 @@ const MOST_TEXT: usize = 1024;
 mod tests {
     use super::*;
 
-    fn candidate(name: &str, url: &str, uri: Option<&str>) -> Candidate {
-        Candidate {
+    fn candidate(name: &str, url: &str, uri: Option<&str>) -> ServerCandidate {
+        ServerCandidate {
             name: name.to_owned(),
             url: url.to_owned(),
             application_uri: uri.map(str::to_owned),
@@ -171,8 +172,8 @@ mod tests {
         }
     }
 
-    fn chosen(choice: &str, candidates: &[Candidate]) -> Chosen {
-        choice.parse::<Choice>().unwrap().among(candidates)
+    fn chosen(choice: &str, candidates: &[ServerCandidate]) -> ChosenServer {
+        choice.parse::<ServerChoice>().unwrap().among(candidates)
     }
 
     #[test]
@@ -182,7 +183,7 @@ mod tests {
             candidate("marked", "opc.tcp://10.0.0.8:4840", Some("urn:station:a")),
             candidate("mute", "opc.tcp://10.0.0.7:4840", None),
         ];
-        let at = |url: &str| Chosen::At(format!("opc.tcp://10.0.0.{url}:4840"));
+        let at = |url: &str| ChosenServer::At(format!("opc.tcp://10.0.0.{url}:4840"));
         for (choice, wanted) in [
             ("uri=urn:cell:lds", at("9")),
             ("uri=urn:cell:*", at("9")),
@@ -190,18 +191,18 @@ mod tests {
             ("name=cell*", at("9")),
             ("node=nsu=urn:cell;s=Marker", at("8")),
             ("opc.tcp://10.0.0.7:4840", at("7")),
-            ("uri=urn:cell:ld", Chosen::Nobody),
+            ("uri=urn:cell:ld", ChosenServer::Nobody),
             (
                 "opc.tcp://10.0.0.1:1",
-                Chosen::At("opc.tcp://10.0.0.1:1".to_owned()),
+                ChosenServer::At("opc.tcp://10.0.0.1:1".to_owned()),
             ),
         ] {
             assert_eq!(chosen(choice, &all), wanted, "{choice}");
         }
         let names = ["cell-lds", "marked", "mute"].map(str::to_owned);
-        assert_eq!(chosen("any", &all), Chosen::Several(names.to_vec()));
+        assert_eq!(chosen("any", &all), ChosenServer::Several(names.to_vec()));
         assert_eq!(chosen("any", &all[..1]), at("9"));
-        assert_eq!(chosen("any", &[]), Chosen::Nobody);
+        assert_eq!(chosen("any", &[]), ChosenServer::Nobody);
     }
 
     #[test]
@@ -212,13 +213,13 @@ mod tests {
         ];
         assert_eq!(
             chosen("any", &both),
-            Chosen::At("opc.tcp://10.0.0.1:4840".to_owned())
+            ChosenServer::At("opc.tcp://10.0.0.1:4840".to_owned())
         );
-        let unknown = both.map(|one| Candidate {
+        let unknown = both.map(|one| ServerCandidate {
             application_uri: None,
             ..one
         });
-        assert!(matches!(chosen("any", &unknown), Chosen::Several(_)));
+        assert!(matches!(chosen("any", &unknown), ChosenServer::Several(_)));
     }
 
     #[test]
@@ -231,12 +232,12 @@ mod tests {
             "name=n*",
             "node=i=7",
         ] {
-            assert_eq!(text.parse::<Choice>().unwrap().to_string(), text);
+            assert_eq!(text.parse::<ServerChoice>().unwrap().to_string(), text);
         }
         for text in [
             "", "some", "uri=", "uri=*", "name=", "node=", "name=a b", "uri=a\n", "http://h",
         ] {
-            assert!(text.parse::<Choice>().is_err(), "{text:?}");
+            assert!(text.parse::<ServerChoice>().is_err(), "{text:?}");
         }
     }
 }

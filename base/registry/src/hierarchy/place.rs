@@ -6,7 +6,7 @@ use std::str::FromStr;
 
 /// A location: names without slashes. Neither the list nor a name is empty.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash)]
-pub struct Place(String);
+pub struct PlantLocation(String);
 
 /// Error for an invalid location.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -16,7 +16,7 @@ pub struct Place(String);
 )]
 pub struct PlaceFault(String);
 
-impl Place {
+impl PlantLocation {
     /// Returns the location of an object at this location. Slashes in its name are replaced, and
     /// control characters removed.
     ///
@@ -39,7 +39,7 @@ impl Place {
     }
 }
 
-impl FromStr for Place {
+impl FromStr for PlantLocation {
     type Err = PlaceFault;
 
     fn from_str(text: &str) -> Result<Self, PlaceFault> {
@@ -57,7 +57,7 @@ impl FromStr for Place {
     }
 }
 
-impl fmt::Display for Place {
+impl fmt::Display for PlantLocation {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(&self.0)
     }
@@ -72,7 +72,7 @@ mod tests {
 
     #[test]
     fn a_place_grows_downwards_and_has_an_end() {
-        let cell: Place = "plant/cell-1".parse().unwrap();
+        let cell: PlantLocation = "plant/cell-1".parse().unwrap();
         let gripper = cell.of(" left/gripper\n").unwrap();
         assert_eq!(gripper.to_string(), "plant/cell-1/left-gripper");
         assert_eq!(gripper.name(), "left-gripper");
@@ -80,7 +80,7 @@ mod tests {
         let deep = (0..14).try_fold(cell, |place, _| place.of("x"));
         assert!(deep.unwrap().of("x").is_err());
         for text in ["", "/", "a/", "/a", "a//b", "a/ b", "a\tb"] {
-            assert!(text.parse::<Place>().is_err(), "{text:?}");
+            assert!(text.parse::<PlantLocation>().is_err(), "{text:?}");
         }
     }
 }

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 
 /// Change of the roster.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Change {
+pub enum RosterChange {
     /// A server is available at this URL.
     Joined(String),
     /// The server at this URL is no longer available.
@@ -31,7 +31,7 @@ impl Roster {
 
     /// Sets the server of a source, such as an ApplicationUri or an mDNS name, in place of its
     /// previous server.
-    pub fn put(&mut self, source: &str, url: &str) -> Vec<Change> {
+    pub fn put(&mut self, source: &str, url: &str) -> Vec<RosterChange> {
         let url = url.trim_end_matches('/').to_owned();
         if self.told.get(source) == Some(&url) {
             return Vec::new();
@@ -39,7 +39,7 @@ impl Roster {
         let mut changes = self.remove(source);
         if self.told.len() < self.most {
             if !self.told.values().any(|known| *known == url) {
-                changes.push(Change::Joined(url.clone()));
+                changes.push(RosterChange::Joined(url.clone()));
             }
             self.told.insert(source.to_owned(), url);
         }
@@ -47,14 +47,14 @@ impl Roster {
     }
 
     /// Removes the server of a source.
-    pub fn remove(&mut self, source: &str) -> Vec<Change> {
+    pub fn remove(&mut self, source: &str) -> Vec<RosterChange> {
         let Some(url) = self.told.remove(source) else {
             return Vec::new();
         };
         if self.told.values().any(|known| *known == url) {
             Vec::new()
         } else {
-            vec![Change::Left(url)]
+            vec![RosterChange::Left(url)]
         }
     }
 }
@@ -66,8 +66,8 @@ mod tests {
     #[test]
     fn a_server_is_there_until_nobody_tells_of_it() {
         let mut roster = Roster::new(3);
-        let joined = |url: &str| vec![Change::Joined(url.to_owned())];
-        let left = |url: &str| vec![Change::Left(url.to_owned())];
+        let joined = |url: &str| vec![RosterChange::Joined(url.to_owned())];
+        let left = |url: &str| vec![RosterChange::Left(url.to_owned())];
         assert_eq!(
             roster.put("urn:arm", "opc.tcp://a:1/"),
             joined("opc.tcp://a:1")

@@ -4,15 +4,15 @@
 use std::collections::BTreeMap;
 use std::time::Instant;
 
-use super::{Event, Registry};
-use crate::asked::Asked;
-use crate::loss::Loss;
+use super::{RegistryEvent, ServerRegistry};
+use crate::asked::RegistrationRequest;
+use crate::loss::ServerLoss;
 use crate::name::{label, renamed};
-use crate::network::{Announcement, RecordSource, place};
+use crate::network::{AnnouncedServer, RecordSource, place};
 
-impl Registry {
+impl ServerRegistry {
     /// Handles an announcement by mDNS, new or repeated.
-    pub fn announced(&mut self, announcement: Announcement, now: Instant) {
+    pub fn announced(&mut self, announcement: AnnouncedServer, now: Instant) {
         let instance = &announcement.instance;
         if self.is_ours(instance) {
             // An announcement of this program itself.
@@ -35,7 +35,7 @@ impl Registry {
         }
         self.watch.add(&url, self.settings.probe_every, now);
         let record = self.network.get(&instance).cloned();
-        self.events.extend(record.map(Event::Seen));
+        self.events.extend(record.map(RegistryEvent::Seen));
         self.supersede_at(&place(&url));
     }
 
@@ -43,20 +43,20 @@ impl Registry {
     pub fn withdrawn(&mut self, instance: &str) {
         let known = self.network.get(instance);
         if known.is_some_and(|known| known.source == RecordSource::Multicast) {
-            self.vanish(instance, Loss::Goodbye);
+            self.vanish(instance, ServerLoss::Goodbye);
         }
     }
 
     /// Replaces the servers that a Global Discovery Server lists, at most one for each host and
     /// port. They are probed. FindServersOnNetwork has those that answer, unless a server of the
     /// same host and port is registered or announced by mDNS.
-    pub fn listed(&mut self, servers: Vec<Announcement>, now: Instant) {
+    pub fn listed(&mut self, servers: Vec<AnnouncedServer>, now: Instant) {
         let servers = servers.into_iter().map(|one| (place(&one.url), one));
-        let servers: BTreeMap<String, Announcement> = servers.collect();
+        let servers: BTreeMap<String, AnnouncedServer> = servers.collect();
         let before = std::mem::replace(&mut self.listed, servers);
         for (at, old) in before {
             if self.listed.get(&at) != Some(&old) {
-                self.hide_listed(|record_at, _| record_at == at, Loss::Unlisted);
+                self.hide_listed(|record_at, _| record_at == at, ServerLoss::Unlisted);
                 self.unwatch(&old.url);
             }
         }
@@ -95,22 +95,22 @@ impl Registry {
         let instance = listed.instance.clone();
         self.network.put(listed, RecordSource::Gds, now);
         let record = self.network.get(&instance).cloned();
-        self.events.extend(record.map(Event::Seen));
+        self.events.extend(record.map(RegistryEvent::Seen));
     }
 
     /// Hides the listed server of a host and port that another source reports.
     pub(super) fn supersede_at(&mut self, at: &str) {
-        self.hide_listed(|record_at, _| record_at == at, Loss::Superseded);
+        self.hide_listed(|record_at, _| record_at == at, ServerLoss::Superseded);
     }
 
     /// Hides the listed server with a name that a registered server gets.
     pub(super) fn supersede(&mut self, instance: &str) {
         let has_name = |_: &str, name: &str| name.eq_ignore_ascii_case(instance);
-        self.hide_listed(has_name, Loss::Superseded);
+        self.hide_listed(has_name, ServerLoss::Superseded);
     }
 
     /// Removes the records of listed servers, by host and port and instance name.
-    fn hide_listed(&mut self, which: impl Fn(&str, &str) -> bool, loss: Loss) {
+    fn hide_listed(&mut self, which: impl Fn(&str, &str) -> bool, loss: ServerLoss) {
         let shown = self.network.arrivals();
         let shown = shown.filter(|(record, known)| {
             record.source == RecordSource::Gds && which(&known.place, &record.announcement.instance)
@@ -151,7 +151,7 @@ impl Registry {
     /// Returns the announcement for a server: the requested name, with a number if another server
     /// has that name (RFC 6762, 9). Returns `None` if the server already announces itself with this
     /// name and URL.
-    pub(super) fn free(&self, asked: &Asked) -> Option<Announcement> {
+    pub(super) fn free(&self, asked: &RegistrationRequest) -> Option<AnnouncedServer> {
         let mut wish = asked.announcement()?;
         let others = |name: &str| {
             self.servers
@@ -177,15 +177,15 @@ impl Registry {
     }
 }
 
-impl Asked {
+impl RegistrationRequest {
     /// Returns the requested announcement, if any.
-    fn announcement(&self) -> Option<Announcement> {
+    fn announcement(&self) -> Option<AnnouncedServer> {
         let mdns = self.mdns.as_ref()?;
         let instance = label(&mdns.name);
         if instance.is_empty() {
             return None;
         }
-        Some(Announcement {
+        Some(AnnouncedServer {
             instance,
             url: self.discovery_urls.first()?.clone(),
             capabilities: mdns.capabilities.clone(),

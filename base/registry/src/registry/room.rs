@@ -3,18 +3,18 @@
 use std::collections::BTreeSet;
 use std::time::Instant;
 
-use super::Registry;
-use crate::asked::{Asked, RegisterFault};
-use crate::loss::Loss;
-use crate::network::{Announcement, host, place};
+use super::ServerRegistry;
+use crate::asked::{RegisterFault, RegistrationRequest};
+use crate::loss::ServerLoss;
+use crate::network::{AnnouncedServer, host, place};
 use crate::share::{AdmissionVerdict, Newcomer, ShareEntry, admit};
 
-impl Registry {
+impl ServerRegistry {
     /// Makes space for a server that is not registered. An unverified registration may be
     /// displaced.
     pub(super) fn make_room(
         &mut self,
-        asked: &Asked,
+        asked: &RegistrationRequest,
         sender: &str,
         certified: bool,
         now: Instant,
@@ -46,7 +46,7 @@ impl Registry {
             AdmissionVerdict::Room => Ok(()),
             AdmissionVerdict::InsteadOf(uri) => {
                 self.displaced += 1;
-                self.end(&uri, Loss::Displaced);
+                self.end(&uri, ServerLoss::Displaced);
                 Ok(())
             }
             AdmissionVerdict::Full => {
@@ -57,7 +57,7 @@ impl Registry {
     }
 
     /// Returns whether one of the endpoints of a server has answered.
-    fn is_live(&self, asked: &Asked) -> bool {
+    fn is_live(&self, asked: &RegistrationRequest) -> bool {
         let mut urls = asked.discovery_urls.iter();
         urls.any(|url| self.watch.has_answered(url))
     }
@@ -66,7 +66,7 @@ impl Registry {
     /// of registered servers stay.
     pub(super) fn make_room_on_network(
         &mut self,
-        announcement: &Announcement,
+        announcement: &AnnouncedServer,
         now: Instant,
     ) -> bool {
         let place = place(&announcement.url);
@@ -84,7 +84,7 @@ impl Registry {
             .network
             .arrivals()
             .map(|(record, arrival)| {
-                let Announcement { instance, url, .. } = &record.announcement;
+                let AnnouncedServer { instance, url, .. } = &record.announcement;
                 ShareEntry {
                     key: instance,
                     place: &arrival.place,
@@ -99,7 +99,7 @@ impl Registry {
             AdmissionVerdict::Room => true,
             AdmissionVerdict::InsteadOf(instance) => {
                 self.displaced += 1;
-                self.vanish(&instance, Loss::Displaced);
+                self.vanish(&instance, ServerLoss::Displaced);
                 true
             }
             AdmissionVerdict::Full => {
@@ -111,7 +111,7 @@ impl Registry {
 }
 
 /// Returns host and port of the first endpoint of a server.
-pub(super) fn place_of(asked: &Asked) -> String {
+pub(super) fn place_of(asked: &RegistrationRequest) -> String {
     let first = asked.discovery_urls.first();
     first.map(|url| place(url)).unwrap_or_default()
 }

@@ -7,7 +7,7 @@ use std::time::Duration;
 use serde_json::json;
 use tokio::sync::{mpsc, oneshot};
 
-use super::{Requests, Told};
+use super::{PageState, Requests};
 
 /// Requests the status of a run loop.
 pub type Ask<T> = mpsc::Sender<oneshot::Sender<T>>;
@@ -188,7 +188,7 @@ async fn answer<T>(ask: &Ask<T>) -> Option<T> {
     status.await.ok()
 }
 
-impl<T: Told> Told for ShownPart<T> {
+impl<T: PageState> PageState for ShownPart<T> {
     fn json(&self) -> String {
         match self {
             Self::Running(status) => status.json(),
@@ -233,7 +233,7 @@ mod tests {
 
     struct Fixed(&'static str);
 
-    impl Told for Fixed {
+    impl PageState for Fixed {
         fn json(&self) -> String {
             format!("{{\"program\":\"{}\"}}", self.0)
         }

@@ -8,16 +8,16 @@ use std::collections::HashSet;
 use std::ops::Bound;
 use std::time::Duration;
 
-use bridge_node::policy::{Found, MAX_TOPICS};
+use bridge_node::policy::{MAX_TOPICS, TopicMeaning};
 use mappings::TopicId;
 use messages::{Selection, TypeName};
 use tracing::warn;
 
 use super::super::side::Ros1Side;
-use super::{Refused, Sources};
-use crate::source::Source;
+use super::{Refused, SubscribedTopics};
+use crate::source::Ros1Source;
 
-impl Sources {
+impl SubscribedTopics {
     /// Subscribes to published topics with a name of this space or of a pattern, and removes topics
     /// that are not published. `written_topics` returns the topics to which values of other spaces
     /// are written.
@@ -47,19 +47,19 @@ impl Sources {
             }
             let typed = side.graph.types.get(ros_topic).and_then(|t| t.parse().ok());
             let made = match side.policy.found(ros_topic, typed.as_ref()) {
-                Found::Named(topic) => Ok((topic, None, Selection::Whole)),
+                TopicMeaning::Named(topic) => Ok((topic, None, Selection::Whole)),
                 // Other publishers of topics to which values of other spaces are written do not
                 // produce values of this space.
-                Found::Made(_) | Found::Fault(_)
+                TopicMeaning::Made(_) | TopicMeaning::Fault(_)
                     if written
                         .get_or_insert_with(|| written_topics(side))
                         .contains(ros_topic) =>
                 {
                     continue;
                 }
-                Found::Made(made) => Ok((made.topic, made.message_type, made.selection)),
-                Found::Fault(fault) => Err(fault.to_string()),
-                Found::Tied(_) | Found::Nothing => continue,
+                TopicMeaning::Made(made) => Ok((made.topic, made.message_type, made.selection)),
+                TopicMeaning::Fault(fault) => Err(fault.to_string()),
+                TopicMeaning::Tied(_) | TopicMeaning::Nothing => continue,
             };
             found.push((ros_topic.clone(), made));
         }
@@ -91,7 +91,7 @@ impl Sources {
 
     /// Subscribes to a topic without a subscription, if another node publishes it.
     fn resubscribe(&mut self, side: &mut Ros1Side, index: usize) {
-        let lost = |s: &&Source| s.subscription.is_none() && !s.values.is_empty();
+        let lost = |s: &&Ros1Source| s.subscription.is_none() && !s.values.is_empty();
         let Some(source) = self.list.get(index).filter(lost) else {
             return;
         };
@@ -136,7 +136,7 @@ impl Sources {
             self.vacate(side, silent);
             places.free += 1;
         }
-        let same = |source: &&Source| source.values.iter().any(|(other, _)| *other == topic);
+        let same = |source: &&Ros1Source| source.values.iter().any(|(other, _)| *other == topic);
         if let Some(other) = self.list.iter().find(same) {
             let other = other.ros_topic.clone();
             side.policy.tell_same(&ros_topic, topic, &other);
@@ -188,10 +188,10 @@ mod tests {
 
     use bridge_node::Port as _;
     use mappings::{Mapping, SpaceId};
-    use tcpros::{Graph, NodeOptions};
+    use tcpros::{MasterGraph, NodeOptions};
 
     use super::*;
-    use crate::port::{PortOptions, Ros1Port};
+    use crate::port::{Ros1Port, Ros1PortOptions};
 
     fn port(mapping: &str) -> Ros1Port {
         let mut node = NodeOptions::from_env("n");
@@ -203,7 +203,7 @@ mod tests {
         } else {
             Mapping::from_yaml(mapping, "cell.yaml").mapping.unwrap()
         };
-        Ros1Port::start(PortOptions {
+        Ros1Port::start(Ros1PortOptions {
             node,
             own: SpaceId::ROS1,
             mapping: Arc::new(mapping),
@@ -215,13 +215,13 @@ mod tests {
 
     /// Returns a graph with this number of published topics of namespace 1, and optionally one
     /// topic of namespace 9.
-    fn graph(made_up: usize, honest: bool) -> Option<Arc<Graph>> {
+    fn graph(made_up: usize, honest: bool) -> Option<Arc<MasterGraph>> {
         let made_up = (1..=made_up).map(|id| format!("/ua_1_1_{id}"));
         let topics = made_up.chain(honest.then(|| HONEST.to_owned()));
         let publishers = topics.map(|topic| (topic, vec!["/p".to_owned()]));
-        Some(Arc::new(Graph {
+        Some(Arc::new(MasterGraph {
             publishers: publishers.collect(),
-            ..Graph::default()
+            ..MasterGraph::default()
         }))
     }
 

@@ -1,15 +1,15 @@
 //! Switches the subscribed topics to another mapping.
 
 use bridge_node::PortEvent;
-use bridge_node::policy::{Found, Policy, Read, still_made, taken_up};
+use bridge_node::policy::{Policy, Read, TopicMeaning, still_made, taken_up};
 use mappings::TopicId;
 use messages::{Selection, TypeName};
 
 use super::super::side::Ros1Side;
-use super::Sources;
-use crate::source::Source;
+use super::SubscribedTopics;
+use crate::source::Ros1Source;
 
-impl Sources {
+impl SubscribedTopics {
     /// Removes the values that the new mapping does not make of their topics.
     pub(in crate::port) fn give_up(&mut self, side: &mut Ros1Side, read: &Read) {
         for source in &mut self.list {
@@ -93,14 +93,14 @@ impl Sources {
 
 /// Returns the value of a topic found in the graph, if the new mapping also makes a value of
 /// it.
-fn still_found(policy: &Policy, source: &Source) -> Option<(TopicId, Selection)> {
+fn still_found(policy: &Policy, source: &Ros1Source) -> Option<(TopicId, Selection)> {
     let typed = source.bound.as_ref().map(|bound| bound.name());
     let typed = source.expected.as_ref().or(typed);
     match policy.found(&source.ros_topic, typed) {
-        Found::Named(topic) => Some((topic, Selection::Whole)),
-        Found::Made(made) => {
+        TopicMeaning::Named(topic) => Some((topic, Selection::Whole)),
+        TopicMeaning::Made(made) => {
             (made.message_type == source.expected).then_some((made.topic, made.selection))
         }
-        Found::Tied(_) | Found::Fault(_) | Found::Nothing => None,
+        TopicMeaning::Tied(_) | TopicMeaning::Fault(_) | TopicMeaning::Nothing => None,
     }
 }

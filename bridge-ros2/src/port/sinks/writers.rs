@@ -9,16 +9,16 @@ use bridge_node::{PortEvent, Reason, now};
 use mappings::TopicId;
 use messages::Selection;
 use ros2_node::compatibility::Incompatibility;
-use ros2_node::graph::{Endpoint, Graph};
+use ros2_node::graph::{Graph, RemoteEndpoint};
 use ros2_node::outlet::Outlet;
 use tokio::time::Instant;
 use tracing::{info, warn};
 
 use super::super::side::{Ros2Side, lost};
-use super::{Sinks, cause, unwritten};
-use crate::sink::{Open, Sink, shortest_deadline};
+use super::{WrittenTopics, cause, unwritten};
+use crate::sink::{OpenWriter, Ros2Sink, shortest_deadline};
 
-impl Sinks {
+impl WrittenTopics {
     /// Opens the writer of a topic, or adapts it to the subscribers.
     pub(super) fn reconcile_sink(&mut self, side: &mut Ros2Side, topic: TopicId, now: Instant) {
         let at_home = side.is_at_home(topic.space);
@@ -95,9 +95,10 @@ impl Sinks {
         let readers = side.graph.readers(&sink.dds_topic);
         let of_another_type = readers.iter().find(|reader| reader.type_name != dds_type);
         let of_another_type = of_another_type.map(|reader| reader.type_name.clone());
-        let other =
-            |reader: &&Endpoint| reader.type_name == dds_type && !reader.is_of(&dds_type, ours);
-        let others: Vec<Endpoint> = readers.iter().filter(other).cloned().collect();
+        let other = |reader: &&RemoteEndpoint| {
+            reader.type_name == dds_type && !reader.is_of(&dds_type, ours)
+        };
+        let others: Vec<RemoteEndpoint> = readers.iter().filter(other).cloned().collect();
         let dds_topic = sink.dds_topic.clone();
         if let Some(other) = of_another_type {
             side.policy.told.once(&dds_topic, "subscriber of another type", || {
@@ -257,7 +258,7 @@ impl Sinks {
                 .extend(before.and_then(|open| unwritten(topic, open)));
             sink.choice.learn_from(&message_type);
             selection = sink.choice.selection(message_type.name());
-            sink.open = Some(Open {
+            sink.open = Some(OpenWriter {
                 definition,
                 outlet,
                 deadline,
@@ -278,7 +279,7 @@ impl Sinks {
         if self.topics.contains_key(&topic) {
             return true;
         }
-        let sink = Sink::new(side.policy.destination(topic));
+        let sink = Ros2Sink::new(side.policy.destination(topic));
         let subscribed = is_subscribed(&sink, &side.graph);
         let is_stray = side.policy.is_stray(topic, subscribed);
         if is_stray && !self.has_descriptors(side) {
@@ -345,7 +346,7 @@ impl Sinks {
 /// at which its publisher in the space fell silent.
 fn strays(
     policy: &Policy,
-    sinks: &HashMap<TopicId, Box<Sink>>,
+    sinks: &HashMap<TopicId, Box<Ros2Sink>>,
     graph: &Graph,
 ) -> Vec<(Option<StdInstant>, TopicId)> {
     let strays = sinks.iter();
@@ -357,7 +358,7 @@ fn strays(
     strays.collect()
 }
 
-fn is_subscribed(sink: &Sink, graph: &Graph) -> bool {
+fn is_subscribed(sink: &Ros2Sink, graph: &Graph) -> bool {
     !graph.readers(&sink.dds_topic).is_empty()
 }
 

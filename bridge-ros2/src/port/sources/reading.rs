@@ -9,7 +9,7 @@ use bridge_node::{PortEvent, Reason};
 use mappings::TopicId;
 use messages::Selection;
 use ros2_node::compatibility::Incompatibility;
-use ros2_node::graph::Endpoint;
+use ros2_node::graph::RemoteEndpoint;
 use ros2_node::inbox::SlotId;
 use ros2_node::qos::Requested;
 use rustdds::GUID;
@@ -17,11 +17,11 @@ use tokio::time::Instant;
 use tracing::{debug, info};
 
 use super::super::side::{Ros2Side, SETTLED, UNKNOWN_TYPE, lost};
-use super::Sources;
-use crate::definitions::Definition;
-use crate::source::{OTHER_DEFINITION, OTHER_TYPE, Reading};
+use super::ReadTopics;
+use crate::definitions::TypeDefinition;
+use crate::source::{OTHER_DEFINITION, OTHER_TYPE, ReaderState};
 
-impl Sources {
+impl ReadTopics {
     /// Finds topics without a binding (zero configuration and patterns): a topic named in our part
     /// of the space, or matched by a pattern, crosses once it has a publisher. `is_written`
     /// returns whether values of other spaces are written to a topic.
@@ -32,7 +32,7 @@ impl Sources {
         now: Instant,
     ) {
         let pending = self.list.iter();
-        let pending = pending.filter(|source| source.reading == Reading::Pending);
+        let pending = pending.filter(|source| source.reading == ReaderState::Pending);
         let free = side.descriptors.free().found;
         let mut free = free.saturating_sub(pending.count());
         let unknown = |topic: &&str| !self.by_name.contains_key(*topic);
@@ -92,7 +92,8 @@ impl Sources {
     ) -> usize {
         let mut made = 0_usize;
         for index in 0..self.list.len() {
-            let Some(Reading::Open { slot, requested }) = self.list.get(index).map(|s| s.reading)
+            let Some(ReaderState::Open { slot, requested }) =
+                self.list.get(index).map(|s| s.reading)
             else {
                 continue;
             };
@@ -141,7 +142,7 @@ impl Sources {
         };
         let returned = requested.is_transient_local() && !source.returned(writers).is_empty();
         match source.reading {
-            Reading::Pending => {
+            ReaderState::Pending => {
                 let name = source.message_type.clone();
                 let known = side.definitions.get(&name).is_ok();
                 // A reader that requests more than a writer offers makes the writer's node log a
@@ -156,12 +157,12 @@ impl Sources {
                     self.open_source(side, index, requested);
                 }
             }
-            Reading::Open {
+            ReaderState::Open {
                 requested: before, ..
             } if (before != requested && !ours.is_empty()) || returned => {
                 self.reopen_source(side, index, requested, now);
             }
-            Reading::Open { slot, .. } => self
+            ReaderState::Open { slot, .. } => self
                 .inbox
                 .retain_writers(slot, |writer| writers.iter().any(|w| w.guid == *writer)),
         }
@@ -193,7 +194,7 @@ impl Sources {
         let (name, current) = (source.message_type.clone(), source.announced);
         let dds_type = name.dds();
         let writers = side.graph.writers(&source.dds_topic);
-        let read_so = |writer: &Endpoint| writer.is_of(&dds_type, current);
+        let read_so = |writer: &RemoteEndpoint| writer.is_of(&dds_type, current);
         // Only while the source is read with the definition of the hash: a built-in definition
         // precedes a hash that no node describes.
         let known = source.definition.as_ref().map(|it| it.hash) == Some(current);
@@ -208,9 +209,9 @@ impl Sources {
         let Some(source) = self.list.get_mut(index) else {
             return false;
         };
-        let same = |(a, b): (&Definition, &Definition)| a.is_same(b);
+        let same = |(a, b): (&TypeDefinition, &TypeDefinition)| a.is_same(b);
         let read = source.definition.as_ref().zip(found.as_ref());
-        if let Reading::Open { slot, .. } = source.reading
+        if let ReaderState::Open { slot, .. } = source.reading
             && !read.is_none_or(same)
         {
             // The reader holds samples of the former definition; the new definition would misread
@@ -233,7 +234,7 @@ impl Sources {
         let Some(source) = self.list.get_mut(index) else {
             return;
         };
-        source.reading = Reading::Pending;
+        source.reading = ReaderState::Pending;
         source.live = false;
         // Samples of the former definition must not be repeated with the new definition.
         let unbound = source.values.iter();
@@ -271,7 +272,7 @@ impl Sources {
         };
         let slot = self.inbox.insert(index, reader);
         if let Some(source) = self.list.get_mut(index) {
-            source.reading = Reading::Open { slot, requested };
+            source.reading = ReaderState::Open { slot, requested };
             source.announced = source.announced.or(definition.hash);
             info!(topic, message_type = %name, definition = %definition.from, %requested, "subscribed");
             for (topic, selection) in &source.values {
@@ -299,7 +300,7 @@ impl Sources {
         let Some(source) = self.list.get(index) else {
             return;
         };
-        let Reading::Open { slot, .. } = source.reading else {
+        let ReaderState::Open { slot, .. } = source.reading else {
             return;
         };
         let (topic, dds_type) = (source.dds_topic.clone(), source.message_type.dds());
@@ -313,7 +314,7 @@ impl Sources {
             self.retired.push_back((now + RETIRE_AFTER, before));
         }
         if let Some(source) = self.list.get_mut(index) {
-            source.reading = Reading::Open { slot, requested };
+            source.reading = ReaderState::Open { slot, requested };
             if requested.is_transient_local() {
                 for writer in source.returned(side.graph.writers(&topic)) {
                     source.reread(writer);
@@ -332,7 +333,7 @@ impl Sources {
         let Some(source) = self.list.get_mut(index) else {
             return;
         };
-        if source.live == live || source.reading == Reading::Pending {
+        if source.live == live || source.reading == ReaderState::Pending {
             return;
         }
         source.live = live;
@@ -344,7 +345,7 @@ impl Sources {
         }
     }
 
-    fn tell_stranger(&mut self, side: &mut Ros2Side, index: usize, stranger: &Endpoint) {
+    fn tell_stranger(&mut self, side: &mut Ros2Side, index: usize, stranger: &RemoteEndpoint) {
         let Some(source) = self.list.get(index) else {
             return;
         };

@@ -2,16 +2,16 @@
 
 use std::sync::Arc;
 
-use bridge_node::policy::{Found, Read, still_made, taken_up};
+use bridge_node::policy::{Read, TopicMeaning, still_made, taken_up};
 use bridge_node::{PortEvent, now};
 use mappings::TopicId;
 use messages::{Selection, TypeName};
 
 use super::super::side::Ros2Side;
-use super::Sources;
-use crate::source::{Reading, Source};
+use super::ReadTopics;
+use crate::source::{ReaderState, Ros2Source};
 
-impl Sources {
+impl ReadTopics {
     /// Gives up the values that the new mapping does not make.
     pub(in crate::port) fn give_up(&mut self, side: &mut Ros2Side, read: &Read) {
         for index in 0..self.list.len() {
@@ -72,14 +72,14 @@ impl Sources {
 
     fn give_up_source(&mut self, index: usize) {
         if let Some(source) = self.list.get_mut(index) {
-            if let Reading::Open { slot, .. } = source.reading {
+            if let ReaderState::Open { slot, .. } = source.reading {
                 // The publishers of the topic see that the reader is disposed.
                 drop(self.inbox.remove(slot));
             }
             // The slot stays, because the inbox uses its index; the name is free for another
             // source.
             let (topic, message_type) = (source.dds_topic.clone(), source.message_type.clone());
-            **source = Source::new(topic.clone(), message_type);
+            **source = Ros2Source::new(topic.clone(), message_type);
             if self.by_name.get(&topic) == Some(&index) {
                 self.by_name.remove(&topic);
             }
@@ -134,7 +134,7 @@ impl Sources {
             .collect();
         source.values.extend(new.iter().cloned());
         // A source that is not read yet reports all its values when it is opened.
-        let Reading::Open { .. } = source.reading else {
+        let ReaderState::Open { .. } = source.reading else {
             return;
         };
         let Some(message_type) = source
@@ -160,8 +160,8 @@ fn found_value(
     message_type: &TypeName,
 ) -> Option<(TopicId, Selection)> {
     match side.found(dds_topic, &message_type.dds()) {
-        Found::Named(topic) => Some((topic, Selection::Whole)),
-        Found::Made(made) => Some((made.topic, made.selection)),
-        Found::Tied(_) | Found::Fault(_) | Found::Nothing => None,
+        TopicMeaning::Named(topic) => Some((topic, Selection::Whole)),
+        TopicMeaning::Made(made) => Some((made.topic, made.selection)),
+        TopicMeaning::Tied(_) | TopicMeaning::Fault(_) | TopicMeaning::Nothing => None,
     }
 }

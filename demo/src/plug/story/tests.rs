@@ -1,16 +1,16 @@
-use super::super::fact::{Plan, Ran};
+use super::super::fact::{ExecutedSkill, RunPlan};
 use super::*;
 
 /// Returns a story in this act.
-fn at(act: Act) -> Story {
-    let mut story = Story::new();
+fn at(act: Act) -> PlugStory {
+    let mut story = PlugStory::new();
     while story.act() != act {
         story.advance();
     }
     story
 }
 
-fn sees(story: &mut Story, facts: impl IntoIterator<Item = (i64, Fact)>) {
+fn sees(story: &mut PlugStory, facts: impl IntoIterator<Item = (i64, Fact)>) {
     for (at_ns, fact) in facts {
         story.observe(at_ns, &fact);
     }
@@ -25,53 +25,59 @@ fn state(ros: Ros, state: &str, run: u32) -> Fact {
     })
 }
 
-fn ran(steps: &[&str]) -> Plan {
-    let ran = steps.iter().map(|step| Ran {
+fn ran(steps: &[&str]) -> RunPlan {
+    let ran = steps.iter().map(|step| ExecutedSkill {
         step: (*step).to_owned(),
-        component: Part::Gripper.uri().to_owned(),
+        component: PlugComponent::Gripper.uri().to_owned(),
         outcome: "running".to_owned(),
-        ..Ran::default()
+        ..ExecutedSkill::default()
     });
-    Plan {
+    RunPlan {
         outcome: "running".to_owned(),
         ran: ran.collect(),
-        ..Plan::default()
+        ..RunPlan::default()
     }
 }
 
-fn run(outcome: &str, plans: Vec<Plan>) -> Run {
-    Run {
+fn run(outcome: &str, plans: Vec<RunPlan>) -> MesRun {
+    MesRun {
         outcome: outcome.to_owned(),
         plans,
-        ..Run::default()
+        ..MesRun::default()
     }
 }
 
 #[test]
 fn a_component_is_plugged_in_when_it_is_known_everywhere() {
     let mut story = at(Act::Robot);
-    for level in Level::ALL {
+    for level in VisibilityLevel::ALL {
         let lacks = story.missing().unwrap();
         assert!(
             lacks.contains(&format!("robot: not {}", level.label())),
             "{lacks:?}"
         );
-        story.observe(1, &Fact::Reached(Part::Robot, level));
+        story.observe(1, &Fact::Reached(PlugComponent::Robot, level));
         // Facts about another component do not count.
-        story.observe(1, &Fact::Reached(Part::Vacuum, level));
+        story.observe(1, &Fact::Reached(PlugComponent::Vacuum, level));
     }
     assert_eq!(story.missing(), Ok(Vec::new()));
-    assert_eq!(story.advance(), Order::Plug(Part::Gripper));
+    assert_eq!(story.advance(), ActStart::Plug(PlugComponent::Gripper));
     assert!(!story.missing().unwrap().is_empty());
 }
 
 #[test]
 fn the_earliest_moment_of_a_kind_counts_in_whatever_order_it_is_told() {
-    let mut story = Story::new();
+    let mut story = PlugStory::new();
     for at_ns in [30, 20, 40] {
-        story.observe(at_ns, &Fact::Reached(Part::Robot, Level::Registered));
+        story.observe(
+            at_ns,
+            &Fact::Reached(PlugComponent::Robot, VisibilityLevel::Registered),
+        );
     }
-    assert_eq!(story.reached[&(Part::Robot, Level::Registered)], 20);
+    assert_eq!(
+        story.reached[&(PlugComponent::Robot, VisibilityLevel::Registered)],
+        20
+    );
 }
 
 #[test]
@@ -165,7 +171,7 @@ fn the_gripper_is_killed_when_it_holds_the_part_and_not_before() {
     let holding = run("running", vec![ran(&["Grasp", "MovePickApproachAfter"])]);
     sees(&mut story, [(2, Fact::Run(1, holding))]);
     assert_eq!(story.missing(), Ok(Vec::new()));
-    assert_eq!(story.advance(), Order::Kill(Part::Gripper));
+    assert_eq!(story.advance(), ActStart::Kill(PlugComponent::Gripper));
 }
 
 #[test]
@@ -181,12 +187,12 @@ fn a_second_run_that_is_over_too_early_is_a_failure() {
 #[test]
 fn who_died_has_to_be_missing_everywhere_and_the_robot_away() {
     let mut story = at(Act::SecondRun);
-    let left = |level| Fact::Left(Part::Gripper, level);
+    let left = |level| Fact::Left(PlugComponent::Gripper, level);
     // No component is lost before the signal.
-    sees(&mut story, [(1, left(Level::Registered))]);
+    sees(&mut story, [(1, left(VisibilityLevel::Registered))]);
     assert!(story.left.is_empty());
     story.advance();
-    sees(&mut story, [(2, Fact::Killed(Part::Gripper))]);
+    sees(&mut story, [(2, Fact::Killed(PlugComponent::Gripper))]);
     sees(&mut story, LOST_FROM.map(|level| (5, left(level))));
     let mut plan = ran(&["MovePickApproachAfter"]);
     "failed".clone_into(&mut plan.outcome);
@@ -201,7 +207,10 @@ fn who_died_has_to_be_missing_everywhere_and_the_robot_away() {
     plan.retreated = Some(true);
     sees(&mut story, [(7, Fact::Run(1, run("running", vec![plan])))]);
     assert_eq!(story.missing(), Ok(Vec::new()));
-    assert_eq!(story.left[&(Part::Gripper, Level::InGraph)], 5);
+    assert_eq!(
+        story.left[&(PlugComponent::Gripper, VisibilityLevel::InGraph)],
+        5
+    );
 }
 
 #[test]
@@ -210,7 +219,7 @@ fn the_second_run_has_to_end_by_another_plan() {
         let mut story = at(Act::Vacuum);
         sees(
             &mut story,
-            Level::ALL.map(|level| (1, Fact::Reached(Part::Vacuum, level))),
+            VisibilityLevel::ALL.map(|level| (1, Fact::Reached(PlugComponent::Vacuum, level))),
         );
         let plans = vec![ran(&["MovePlace"]); plans];
         let ended = Fact::CallEnded {
@@ -233,7 +242,7 @@ fn the_question_has_to_list_skills_and_services() {
     let asked = |skills, services, incomplete: &[&str]| {
         let mut story = at(Act::Question);
         let incomplete = incomplete.iter().map(|one| (*one).to_owned()).collect();
-        let asked = Asked {
+        let asked = CanRunAnswer {
             skills,
             services,
             incomplete,

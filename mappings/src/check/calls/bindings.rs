@@ -9,29 +9,29 @@ use crate::call::{Assigned, Assignment, CallKind, CallTarget, FieldMap};
 use crate::check::bindings::ros_name;
 use crate::check::required;
 use crate::check::services;
-use crate::check::types::{Types, dialect};
+use crate::check::types::{MessageTypes, dialect};
 use crate::check::variables::space;
 use crate::code::Code;
 use crate::document::{CallBindingEntry, CallEntry, FieldMapEntry};
-use crate::findings::Findings;
-use crate::read::{Field, given, short};
+use crate::findings::MappingFindings;
+use crate::read::{OptionalKey, given, short};
 use crate::topic::SpaceId;
-use crate::tree::Place;
+use crate::tree::TextSpan;
 
 /// A service or action under `ros`, with the parts that are known.
-pub(super) struct Found {
+pub(super) struct FoundBinding {
     pub(super) space: SpaceId,
-    pub(super) place: Place,
+    pub(super) place: TextSpan,
     pub(super) kind: CallKind,
     pub(super) target: CallTarget,
     /// `None` if the type is not known.
-    pub(super) definition: Option<Definition>,
+    pub(super) definition: Option<CallDefinition>,
     pub(super) maps: Maps,
 }
 
 /// Definition of a service or action type.
 #[derive(Clone)]
-pub(super) enum Definition {
+pub(super) enum CallDefinition {
     Service(Arc<ServiceType>),
     Action(Arc<ActionCalls>),
 }
@@ -40,15 +40,15 @@ pub(super) enum Definition {
 #[derive(Default)]
 pub(super) struct Maps {
     /// Map of the request, or of the goal.
-    pub(super) request: Option<(FieldMap, Place)>,
+    pub(super) request: Option<(FieldMap, TextSpan)>,
     /// Map of the response, or of the result.
-    pub(super) response: Option<(FieldMap, Place)>,
-    pub(super) feedback: Option<(FieldMap, Place)>,
+    pub(super) response: Option<(FieldMap, TextSpan)>,
+    pub(super) feedback: Option<(FieldMap, TextSpan)>,
 }
 
 impl Maps {
     /// Returns the position of the first map.
-    pub(super) fn place(&self) -> Option<Place> {
+    pub(super) fn place(&self) -> Option<TextSpan> {
         let maps = [&self.request, &self.response, &self.feedback];
         maps.into_iter().flatten().map(|(_, place)| *place).next()
     }
@@ -57,9 +57,9 @@ impl Maps {
 /// Returns the kind of a call by its bindings; `None` if they are faulty, or of both kinds, which
 /// is noted.
 pub(super) fn kind_of(
-    found: Option<&[Found]>,
+    found: Option<&[FoundBinding]>,
     entry: &CallEntry,
-    findings: &mut Findings,
+    findings: &mut MappingFindings,
 ) -> Option<CallKind> {
     let found = found?;
     let kind = match (found.first(), &entry.opcua) {
@@ -85,11 +85,11 @@ impl Checker<'_> {
         &mut self,
         entry: &CallEntry,
         origin: Option<SpaceId>,
-        findings: &mut Findings,
-    ) -> Option<Vec<Found>> {
+        findings: &mut MappingFindings,
+    ) -> Option<Vec<FoundBinding>> {
         let entries = entry.ros.as_ref().and_then(|at| at.value.as_ref());
         let entries = entries.map_or(&[][..], |bindings| &bindings.0);
-        let mut all: Option<Vec<Found>> = Some(Vec::new());
+        let mut all: Option<Vec<FoundBinding>> = Some(Vec::new());
         for at in entries {
             let found = at.value.as_ref().and_then(|binding| {
                 let found = self.binding(binding, at.place, origin, findings)?;
@@ -121,10 +121,10 @@ impl Checker<'_> {
     fn binding(
         &mut self,
         entry: &CallBindingEntry,
-        place: Place,
+        place: TextSpan,
         origin: Option<SpaceId>,
-        findings: &mut Findings,
-    ) -> Option<Found> {
+        findings: &mut MappingFindings,
+    ) -> Option<FoundBinding> {
         let space = self.space_of(entry, place, origin, findings)?;
         let dialect = dialect(space);
         let kind = kind(entry, place, findings)?;
@@ -137,10 +137,10 @@ impl Checker<'_> {
         let definition = match kind {
             CallKind::Service => {
                 let known = services::built_in(&type_name, at_type, self.types, findings);
-                known.map(Definition::Service)
+                known.map(CallDefinition::Service)
             }
             CallKind::Action => {
-                action(&type_name, at_type, self.types, findings).map(Definition::Action)
+                action(&type_name, at_type, self.types, findings).map(CallDefinition::Action)
             }
         };
         findings.of_part(None);
@@ -165,7 +165,7 @@ impl Checker<'_> {
                 feedback: field_map(&entry.feedback, "feedback."),
             },
         };
-        Some(Found {
+        Some(FoundBinding {
             space,
             place,
             kind,
@@ -178,9 +178,9 @@ impl Checker<'_> {
     fn space_of(
         &self,
         entry: &CallBindingEntry,
-        place: Place,
+        place: TextSpan,
         origin: Option<SpaceId>,
-        findings: &mut Findings,
+        findings: &mut MappingFindings,
     ) -> Option<SpaceId> {
         let (id, at) = match &entry.space {
             Some(at) => {
@@ -202,8 +202,12 @@ impl Checker<'_> {
 
 /// Returns `None` if the binding is not exactly one of the kinds, or has keys of the other kind.
 /// Both are noted.
-fn kind(entry: &CallBindingEntry, owner: Place, findings: &mut Findings) -> Option<CallKind> {
-    let place = |at: &Field<FieldMapEntry>| at.as_ref().map(|at| at.place);
+fn kind(
+    entry: &CallBindingEntry,
+    owner: TextSpan,
+    findings: &mut MappingFindings,
+) -> Option<CallKind> {
+    let place = |at: &OptionalKey<FieldMapEntry>| at.as_ref().map(|at| at.place);
     let maps = [
         (CallKind::Service, "request", place(&entry.request)),
         (CallKind::Service, "response", place(&entry.response)),
@@ -251,8 +255,8 @@ fn name(
     entry: &CallBindingEntry,
     kind: CallKind,
     dialect: Dialect,
-    findings: &mut Findings,
-) -> Option<(String, Place)> {
+    findings: &mut MappingFindings,
+) -> Option<(String, TextSpan)> {
     let named = match kind {
         CallKind::Service => &entry.service,
         CallKind::Action => &entry.action,
@@ -267,9 +271,9 @@ fn name(
 fn type_name(
     text: &str,
     kind: CallKind,
-    place: Place,
-    findings: &mut Findings,
-) -> Option<(TypeName, Place)> {
+    place: TextSpan,
+    findings: &mut MappingFindings,
+) -> Option<(TypeName, TextSpan)> {
     let (name, example) = match kind {
         CallKind::Service => (services::type_name(text), "std_srvs/SetBool"),
         CallKind::Action => (
@@ -289,9 +293,9 @@ fn type_name(
 /// Returns `None` for an unknown action type, which is noted.
 fn action(
     name: &TypeName,
-    (dialect, place): (Dialect, Place),
-    types: &mut Types,
-    findings: &mut Findings,
+    (dialect, place): (Dialect, TextSpan),
+    types: &mut MessageTypes,
+    findings: &mut MappingFindings,
 ) -> Option<Arc<ActionCalls>> {
     let known = types.action((dialect, place), name, findings);
     if known.is_none() {
@@ -317,7 +321,7 @@ fn action(
 }
 
 /// Reads a field map. `within` is the message of the call that contains the fields.
-fn field_map(entry: &Field<FieldMapEntry>, within: &str) -> Option<(FieldMap, Place)> {
+fn field_map(entry: &OptionalKey<FieldMapEntry>, within: &str) -> Option<(FieldMap, TextSpan)> {
     let (entry, place) = given(entry)?;
     let assigned = entry.0.iter().map(|(target, _, value)| Assignment {
         target: format!("{within}{target}"),

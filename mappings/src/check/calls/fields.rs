@@ -3,20 +3,24 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use messages::{Leaf, Literal, MessageType, Plan, Rank, Selection};
+use messages::{ArrayRank, Leaf, Literal, MessagePlan, MessageType, Selection};
 use uadp::BuiltinType;
 
-use super::bindings::{Definition, Found};
+use super::bindings::{CallDefinition, FoundBinding};
 use crate::call::{Assigned, Assignment, CallKind, FieldMap};
 use crate::check::{services, types};
 use crate::code::Code;
-use crate::findings::Findings;
+use crate::findings::MappingFindings;
 use crate::read::short;
-use crate::tree::Place;
+use crate::tree::TextSpan;
 
 /// Notes each field without a source, in the request of the executor and in the response of the
 /// offered service. Notes faults of the maps as far as the types are known.
-pub(super) fn compare(executes: Option<&Found>, asks: &Found, findings: &mut Findings) {
+pub(super) fn compare(
+    executes: Option<&FoundBinding>,
+    asks: &FoundBinding,
+    findings: &mut MappingFindings,
+) {
     let there = executes.and_then(|one| one.definition.as_ref());
     let here = asks.definition.as_ref();
     let [request, response, feedback] = match asks.kind {
@@ -29,25 +33,25 @@ pub(super) fn compare(executes: Option<&Found>, asks: &Found, findings: &mut Fin
     };
     let maps = &asks.maps;
     let parts = [
-        Part {
+        MessagePair {
             key: request,
             map: maps.request.as_ref(),
-            target: executes.zip(there.map(Definition::request)),
-            source: Some((asks, here.map(Definition::request))),
+            target: executes.zip(there.map(CallDefinition::request)),
+            source: Some((asks, here.map(CallDefinition::request))),
             asked: true,
         },
-        Part {
+        MessagePair {
             key: response,
             map: maps.response.as_ref(),
-            target: Some(asks).zip(here.map(Definition::response)),
-            source: executes.map(|one| (one, there.map(Definition::response))),
+            target: Some(asks).zip(here.map(CallDefinition::response)),
+            source: executes.map(|one| (one, there.map(CallDefinition::response))),
             asked: false,
         },
-        Part {
+        MessagePair {
             key: feedback,
             map: maps.feedback.as_ref(),
-            target: Some(asks).zip(here.and_then(Definition::feedback)),
-            source: executes.map(|one| (one, there.and_then(Definition::feedback))),
+            target: Some(asks).zip(here.and_then(CallDefinition::feedback)),
+            source: executes.map(|one| (one, there.and_then(CallDefinition::feedback))),
             asked: false,
         },
     ];
@@ -63,7 +67,7 @@ pub(super) fn compare(executes: Option<&Found>, asks: &Found, findings: &mut Fin
     }
 }
 
-impl Definition {
+impl CallDefinition {
     /// Returns the request of a service, or of an action's goal.
     fn request(&self) -> &Arc<MessageType> {
         match self {
@@ -89,19 +93,19 @@ impl Definition {
 }
 
 /// Two messages: a target that is made of a source.
-struct Part<'p> {
+struct MessagePair<'p> {
     /// Key of the map in the document, and the prefix of an action's paths that the document leaves
     /// out.
     key: (&'static str, &'static str),
-    map: Option<&'p (FieldMap, Place)>,
+    map: Option<&'p (FieldMap, TextSpan)>,
     /// `None` if the type of the target is not known.
-    target: Option<(&'p Found, &'p Arc<MessageType>)>,
-    source: Option<(&'p Found, Option<&'p Arc<MessageType>>)>,
+    target: Option<(&'p FoundBinding, &'p Arc<MessageType>)>,
+    source: Option<(&'p FoundBinding, Option<&'p Arc<MessageType>>)>,
     /// The message goes from the caller to the executor.
     asked: bool,
 }
 
-impl Part<'_> {
+impl MessagePair<'_> {
     /// Returns the fault of this pair of messages, for users.
     fn fault(&self) -> Option<String> {
         let (target, message) = self.target?;
@@ -139,7 +143,7 @@ impl Part<'_> {
         &self,
         map: &FieldMap,
         leaf: &Leaf,
-        (of, message): (&Found, &Arc<MessageType>),
+        (of, message): (&FoundBinding, &Arc<MessageType>),
     ) -> Option<String> {
         let literal = match map.source(&leaf.path)? {
             Assigned::Constant(literal) => literal,
@@ -157,7 +161,7 @@ impl Part<'_> {
             rest: BTreeMap::from([(leaf.path.clone(), literal)]),
         };
         let wire = services::wire(types::dialect(of.space));
-        let fault = Plan::compile(message, &one, wire).err()?;
+        let fault = MessagePlan::compile(message, &one, wire).err()?;
         Some(fault.to_string())
     }
 
@@ -209,15 +213,15 @@ fn has_target(message: &MessageType, target: &str) -> bool {
 fn is_value(leaf: &Leaf, literal: &Literal) -> bool {
     let fits = |text: &String| messages::constant(leaf.builtin, text).is_some();
     match (literal, leaf.rank) {
-        (Literal::One(text), Rank::Scalar) => fits(text),
-        (Literal::List(texts), Rank::Scalar) => {
+        (Literal::One(text), ArrayRank::Scalar) => fits(text),
+        (Literal::List(texts), ArrayRank::Scalar) => {
             leaf.builtin == BuiltinType::ByteString
                 && texts.iter().all(|text| text.parse::<u8>().is_ok())
         }
-        (Literal::List(texts), Rank::Array { fixed }) => {
+        (Literal::List(texts), ArrayRank::Array { fixed }) => {
             fixed.is_none_or(|fixed| usize::try_from(fixed) == Ok(texts.len()))
                 && texts.iter().all(fits)
         }
-        (Literal::One(_), Rank::Array { .. }) => false,
+        (Literal::One(_), ArrayRank::Array { .. }) => false,
     }
 }

@@ -7,12 +7,12 @@ use crate::check::servers::{named, node};
 use crate::code::Code;
 use crate::document::{CallEntry, MethodEntry};
 use crate::endpoint::Endpoint;
-use crate::findings::Findings;
+use crate::findings::MappingFindings;
 use crate::node_id::NodeIdText;
-use crate::read::At;
+use crate::read::Located;
 use crate::remote::Access;
 use crate::topic::SpaceId;
-use crate::tree::Place;
+use crate::tree::TextSpan;
 
 /// A part of the entry is faulty, which is noted.
 pub(super) struct Faulty;
@@ -22,11 +22,11 @@ impl Checker<'_> {
     pub(super) fn method(
         &self,
         entry: &CallEntry,
-        node: Option<&(NodeIdText, Place)>,
-        origin: Option<(SpaceId, Place)>,
-        findings: &mut Findings,
+        node: Option<&(NodeIdText, TextSpan)>,
+        origin: Option<(SpaceId, TextSpan)>,
+        findings: &mut MappingFindings,
     ) -> Result<Option<MethodTarget>, Faulty> {
-        let Some(At { place, value }) = &entry.opcua else {
+        let Some(Located { place, value }) = &entry.opcua else {
             return Ok(None);
         };
         let target = value
@@ -60,8 +60,8 @@ impl Checker<'_> {
     fn target(
         &self,
         entry: &MethodEntry,
-        place: Place,
-        findings: &mut Findings,
+        place: TextSpan,
+        findings: &mut MappingFindings,
     ) -> Option<MethodTarget> {
         let reached = self.reached(entry, place, findings);
         let object = node(&entry.object, ("object", "`opcua`"), place, findings);
@@ -79,8 +79,8 @@ impl Checker<'_> {
     fn reached(
         &self,
         entry: &MethodEntry,
-        place: Place,
-        findings: &mut Findings,
+        place: TextSpan,
+        findings: &mut MappingFindings,
     ) -> Option<(Access, Option<String>)> {
         match (&entry.server, &entry.endpoint) {
             (Some(at), None) => {
@@ -107,7 +107,12 @@ impl Checker<'_> {
         }
     }
 
-    fn endpoint(&self, text: &str, place: Place, findings: &mut Findings) -> Option<Endpoint> {
+    fn endpoint(
+        &self,
+        text: &str,
+        place: TextSpan,
+        findings: &mut MappingFindings,
+    ) -> Option<Endpoint> {
         let endpoint = remote_endpoint(text, place, findings)?;
         if is_own(&endpoint, self.known.server) {
             let message = "the endpoint belongs to the server of the cell";

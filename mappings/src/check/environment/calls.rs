@@ -6,18 +6,18 @@ use crate::call::{Call, CallKind, CallTarget, ExecutedBy};
 use crate::code::Code;
 use crate::document::{CallBindingEntry, CallEntry};
 use crate::environment::{Environment, LiveSpace};
-use crate::findings::Findings;
+use crate::findings::MappingFindings;
 use crate::read::{given, short};
 use crate::topic::SpaceId;
-use crate::tree::Place;
+use crate::tree::TextSpan;
 use documents::nearest;
 
 pub(super) fn check(
     entry: &CallEntry,
     call: &Call,
     environment: &Environment,
-    place: Place,
-    findings: &mut Findings,
+    place: TextSpan,
+    findings: &mut MappingFindings,
 ) {
     let at = |space: SpaceId| name_place(entry, call, space).unwrap_or(place);
     match &call.executed {
@@ -82,8 +82,8 @@ fn executed(
     kind: CallKind,
     target: &CallTarget,
     there: &BTreeMap<&str, BTreeSet<String>>,
-    place: Place,
-    findings: &mut Findings,
+    place: TextSpan,
+    findings: &mut MappingFindings,
 ) {
     let (word, name) = (kind.word(), target.name.as_str());
     let Some(types) = there.get(name) else {
@@ -109,7 +109,7 @@ fn executed(
 }
 
 /// Returns the position of the name of the service or action of a space.
-fn name_place(entry: &CallEntry, call: &Call, space: SpaceId) -> Option<Place> {
+fn name_place(entry: &CallEntry, call: &Call, space: SpaceId) -> Option<TextSpan> {
     let (bindings, _) = given(&entry.ros)?;
     let of_space = |binding: &&CallBindingEntry| match given(&binding.space) {
         Some((number, _)) => *number == u16::from(space.get()),

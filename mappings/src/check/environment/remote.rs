@@ -3,10 +3,10 @@
 use crate::code::Code;
 use crate::document::VariableEntry;
 use crate::environment::{Environment, LiveRemote};
-use crate::findings::Findings;
+use crate::findings::MappingFindings;
 use crate::mapping::Variable;
 use crate::read::{given, short};
-use crate::tree::Place;
+use crate::tree::TextSpan;
 
 use super::types;
 
@@ -14,7 +14,7 @@ pub(super) fn check(
     entry: &VariableEntry,
     variable: &Variable,
     environment: &Environment,
-    findings: &mut Findings,
+    findings: &mut MappingFindings,
 ) {
     if let Some(from) = &variable.from
         && let Some(live) = environment.remote(&from.server, &from.node)
@@ -53,8 +53,8 @@ fn node(
     entry: &VariableEntry,
     variable: &Variable,
     (about, live): (&About<'_>, LiveRemote),
-    place: Option<Place>,
-    findings: &mut Findings,
+    place: Option<TextSpan>,
+    findings: &mut MappingFindings,
 ) {
     let Some(place) = place else {
         return;

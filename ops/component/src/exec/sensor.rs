@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use async_trait::async_trait;
 use serde_json::Value as Json;
-use skills::{Component, ExecSource, Measured, Sensor, ValueSource};
+use skills::{Component, ExecSource, Measured, ValueSensor, ValueSource};
 use tokio::io::BufReader;
 
 use super::{KilledGroup, group_of, log, next_line, start};
@@ -39,7 +39,7 @@ struct ProgramSensor {
 }
 
 #[async_trait]
-impl Sensor for ProgramSensor {
+impl ValueSensor for ProgramSensor {
     async fn measure(&self, _period: Duration, out: &Measured) -> String {
         let ExecSource {
             command, folder, ..
@@ -141,7 +141,10 @@ mod tests {
         (built.unwrap(), folder)
     }
 
-    async fn until(value: &LiveValue, wanted: impl Fn(&Result<skills::Value, String>) -> bool) {
+    async fn until(
+        value: &LiveValue,
+        wanted: impl Fn(&Result<skills::SkillValue, String>) -> bool,
+    ) {
         let mut readings = value.watch();
         let found = readings.wait_for(|reading| wanted(&reading.value));
         let found = tokio::time::timeout(Duration::from_secs(30), found).await;
@@ -150,7 +153,7 @@ mod tests {
         }
     }
 
-    fn is_lost(why: &'static str) -> impl Fn(&Result<skills::Value, String>) -> bool {
+    fn is_lost(why: &'static str) -> impl Fn(&Result<skills::SkillValue, String>) -> bool {
         move |value| value.as_ref().is_err_and(|found| found.contains(why))
     }
 
@@ -164,7 +167,7 @@ mod tests {
         };
         let process = |value: &LiveValue| value.reading().value.ok().and_then(|of| of.as_f64());
         until(count, |value| {
-            let count = value.as_ref().ok().and_then(skills::Value::as_f64);
+            let count = value.as_ref().ok().and_then(skills::SkillValue::as_f64);
             count.is_some() && count == process(heat)
         })
         .await;

@@ -52,11 +52,14 @@ read -r halt && kill $worker && echo '{"failed": "halted"}'
 async fn a_program_that_obeys_is_as_a_driver_should_be_and_gets_the_parameters() {
     let scripts = Scripts::new("obeys");
     let driver = scripts.driver(OBEYS);
-    let force = vec![("Force".to_owned(), Value::from(7.5))];
+    let force = vec![("Force".to_owned(), SkillValue::from(7.5))];
     let outcome = conformance::run_once("GraspSkillType", driver.clone(), force).await;
     let outcome = outcome.unwrap();
     assert!(outcome.succeeded, "{}", outcome.message);
-    assert_eq!(outcome.results, [("Gripped".to_owned(), Value::from(true))]);
+    assert_eq!(
+        outcome.results,
+        [("Gripped".to_owned(), SkillValue::from(true))]
+    );
     let traced = |what: &str| outcome.trace.iter().any(|line| line.ends_with(what));
     assert!(traced(" Close") && traced(" half"), "{:?}", outcome.trace);
     let start = std::fs::read_to_string(scripts.0.join("start")).unwrap();
@@ -110,14 +113,14 @@ async fn a_program_that_ends_or_talks_otherwise_leaves_an_unknown_machine_that_i
 
 #[tokio::test]
 async fn a_program_that_does_not_halt_is_killed_with_its_group_and_start_waits_for_a_reset() {
-    use skills::{Authority, Facts, Owner, Skill, TypeName, model};
+    use skills::{Authority, ParameterType, Skill, SkillDescription, SkillOwner, model};
 
     let scripts = Scripts::new("deaf");
     let script = "trap '' TERM\nsh -c 'echo $$ > child; exec sleep 600' &\necho '{\"step\": \"Deaf\"}'\nsleep 600\n";
     let of = model::find("GraspSkillType").unwrap();
-    let facts = Facts {
+    let facts = SkillDescription {
         name: "Grasp".to_owned(),
-        types: vec![TypeName::own(of.name)],
+        types: vec![ParameterType::own(of.name)],
         parameters: of.parameters(),
         results: of.results(),
         capabilities: Vec::new(),
@@ -125,9 +128,9 @@ async fn a_program_that_does_not_halt_is_killed_with_its_group_and_start_waits_f
         rests_in: of.rests_in,
     };
     let skill = Skill::spawn(facts, scripts.driver(script), Authority::new(), Vec::new());
-    let by = Owner::Local("the test");
+    let by = SkillOwner::Local("the test");
     skill
-        .call(by.clone(), program::Method::Reset)
+        .call(by.clone(), program::ProgramMethod::Reset)
         .await
         .unwrap();
     skill.start_with(by.clone(), Vec::new()).await.unwrap();
@@ -146,8 +149,11 @@ async fn a_program_that_does_not_halt_is_killed_with_its_group_and_start_waits_f
         }
     };
     let pid = timeout(soon, pid).await.unwrap();
-    skill.call(by.clone(), program::Method::Halt).await.unwrap();
-    let halted = watch.wait_for(|shown| shown.state == program::State::Halted);
+    skill
+        .call(by.clone(), program::ProgramMethod::Halt)
+        .await
+        .unwrap();
+    let halted = watch.wait_for(|shown| shown.state == program::ProgramMachineState::Halted);
     let shown = timeout(soon, halted).await.unwrap().unwrap().clone();
     let message = &shown.outcome.as_ref().unwrap().message;
     assert!(
@@ -170,8 +176,8 @@ async fn a_program_that_does_not_halt_is_killed_with_its_group_and_start_waits_f
 #[test]
 fn a_line_is_progress_or_the_end() {
     let results = vec![
-        ("Torque".to_owned(), Value::from(1.5)),
-        ("Values".to_owned(), Value::from(vec![1.0, 2.0])),
+        ("Torque".to_owned(), SkillValue::from(1.5)),
+        ("Values".to_owned(), SkillValue::from(vec![1.0, 2.0])),
     ];
     assert_eq!(
         reported(r#"{"result": {"Torque": 1.5, "Values": [1, 2]}}"#),
@@ -212,7 +218,7 @@ fn the_example_in_rust_speaks_the_lines_of_programs() {
         .iter()
         .map(|line| reported(&line.to_string()).unwrap())
         .collect();
-    let gripped = vec![("Gripped".to_owned(), Value::from(true))];
+    let gripped = vec![("Gripped".to_owned(), SkillValue::from(true))];
     assert_eq!(said.last(), Some(&Report::Ended(Ok(gripped))));
     assert_eq!(said.len(), 12);
     let said = lines_of_the_example("grasp", &[start], true);

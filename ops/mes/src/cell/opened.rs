@@ -3,19 +3,19 @@
 use std::sync::Arc;
 
 use async_trait::async_trait;
-use skills::{Runs, SkillClient};
+use skills::{RunnableSkill, SkillClient};
 
 use crate::execute::Opened;
 
 /// Skills over the connections to their components.
 pub(super) struct OpenedSkills {
     pub(super) clients: Vec<SkillClient>,
-    pub(super) skills: Vec<Arc<dyn Runs>>,
+    pub(super) skills: Vec<Arc<dyn RunnableSkill>>,
 }
 
 #[async_trait]
 impl Opened for OpenedSkills {
-    fn skills(&self) -> Vec<Arc<dyn Runs>> {
+    fn skills(&self) -> Vec<Arc<dyn RunnableSkill>> {
         self.skills.clone()
     }
 

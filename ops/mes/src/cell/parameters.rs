@@ -1,15 +1,18 @@
 //! The parameters and results of skills: names, types, units and limits.
 
 use knowledge::units;
-use skills::{Builtin, FoundParameter, FoundSkill, Value};
+use skills::{Builtin, FoundParameter, FoundSkill, SkillValue};
 
-use crate::process::Given;
+use crate::process::GivenParameter;
 
 /// Converts the parameters of a step to the parameters of a skill.
 ///
 /// # Errors
 /// The first parameter that is unknown, missing, of another type or unit, or out of its limits.
-pub(super) fn values(found: &FoundSkill, given: &[Given]) -> Result<Vec<(String, Value)>, String> {
+pub(super) fn values(
+    found: &FoundSkill,
+    given: &[GivenParameter],
+) -> Result<Vec<(String, SkillValue)>, String> {
     for known in &found.parameters {
         let is_given = given.iter().any(|given| given.name == known.name);
         if known.default.is_none() && !is_given {
@@ -19,7 +22,7 @@ pub(super) fn values(found: &FoundSkill, given: &[Given]) -> Result<Vec<(String,
             ));
         }
     }
-    let value = |given: &Given| {
+    let value = |given: &GivenParameter| {
         let parameter = parameter(found, &given.name)?;
         // The value is known when its step is done.
         if given.result.is_some() {
@@ -28,8 +31,8 @@ pub(super) fn values(found: &FoundSkill, given: &[Given]) -> Result<Vec<(String,
         let wrong = |why: String| format!("{}: {why}", given.name);
         let json = in_unit(given, parameter).map_err(wrong)?;
         let value = parameter.shape.read_json(&json).map_err(wrong)?;
-        let numbers = if let Value::Array(_, elements) = &value {
-            elements.iter().filter_map(Value::as_f64).collect()
+        let numbers = if let SkillValue::Array(_, elements) = &value {
+            elements.iter().filter_map(SkillValue::as_f64).collect()
         } else {
             Vec::from_iter(value.as_f64())
         };
@@ -44,7 +47,7 @@ pub(super) fn values(found: &FoundSkill, given: &[Given]) -> Result<Vec<(String,
         }
         Ok(Some((given.name.clone(), value)))
     };
-    let values: Vec<(String, Value)> = given
+    let values: Vec<(String, SkillValue)> = given
         .iter()
         .filter_map(|given| value(given).transpose())
         .collect::<Result<_, _>>()?;
@@ -125,7 +128,10 @@ fn kind(of: &FoundParameter) -> &'static str {
 }
 
 /// Returns the value of a parameter in the unit of the skill.
-fn in_unit(given: &Given, parameter: &FoundParameter) -> Result<serde_json::Value, String> {
+fn in_unit(
+    given: &GivenParameter,
+    parameter: &FoundParameter,
+) -> Result<serde_json::Value, String> {
     let Some(from) = given.unit.as_deref() else {
         return Ok(given.value.clone());
     };

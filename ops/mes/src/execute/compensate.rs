@@ -1,12 +1,12 @@
 //! Compensation: the completed steps of a run that failed are undone, the last one first.
 
-use skills::Value;
+use skills::SkillValue;
 use tracing::{info, warn};
 
 use super::{Execution, Plant, StepEnd, close};
-use crate::plan::{Kept, Offer, Plan};
-use crate::process::{Given, Process, Step};
-use crate::record::{How, Planned, Run};
+use crate::plan::{KeptStep, Offer, Plan};
+use crate::process::{GivenParameter, Process, ProcessStep};
+use crate::record::{How, Planned, ProcessRun};
 
 /// A completed step.
 #[derive(Debug, Clone)]
@@ -15,20 +15,20 @@ pub(super) struct Done {
     pub(super) offer: Offer,
     /// The skill of its compensation, if it has one.
     pub(super) undo: Option<Offer>,
-    pub(super) results: Vec<(String, Value)>,
+    pub(super) results: Vec<(String, SkillValue)>,
     /// It was done in an earlier round of a loop, and the present round does it again.
     pub(super) is_earlier: bool,
 }
 
 /// Returns the choices that later plans keep: those of completed steps and of their compensations.
 /// Steps that are done again are chosen again.
-pub(super) fn kept(process: &Process, done: &[Done]) -> Vec<Kept> {
+pub(super) fn kept(process: &Process, done: &[Done]) -> Vec<KeptStep> {
     let one = |done: &Done| {
-        let undo = done.undo.clone().map(|offer| Kept {
+        let undo = done.undo.clone().map(|offer| KeptStep {
             number: process.compensation_of(done.number),
             offer,
         });
-        let step = Kept {
+        let step = KeptStep {
             number: done.number,
             offer: done.offer.clone(),
         };
@@ -44,10 +44,10 @@ pub(super) fn kept(process: &Process, done: &[Done]) -> Vec<Kept> {
 /// The result that a step did not return.
 pub(super) fn resolved(
     plant: &dyn Plant,
-    step: &Step,
+    step: &ProcessStep,
     done: &[&Done],
-) -> Result<Vec<Given>, String> {
-    let one = |given: &Given| {
+) -> Result<Vec<GivenParameter>, String> {
+    let one = |given: &GivenParameter| {
         let Some(of) = &given.result else {
             return Ok(given.clone());
         };
@@ -59,7 +59,7 @@ pub(super) fn resolved(
             let skill = &from.offer.name;
             format!("{}: {skill} returned no result {}", given.name, of.name)
         })?;
-        Ok(Given {
+        Ok(GivenParameter {
             name: given.name.clone(),
             value: value.to_json(),
             unit: plant.result(&from.offer.skill, &of.name)?,
@@ -71,8 +71,8 @@ pub(super) fn resolved(
 
 /// A completed step to compensate.
 struct Undone<'a> {
-    step: &'a Step,
-    compensation: &'a Step,
+    step: &'a ProcessStep,
+    compensation: &'a ProcessStep,
     /// The skill that runs the compensation.
     offer: &'a Offer,
     /// The completed steps up to this one: the results that the compensation may take.
@@ -212,7 +212,7 @@ impl Execution<'_> {
 }
 
 /// Returns whether the end of a skill is not confirmed.
-fn is_open(run: &Run) -> bool {
+fn is_open(run: &ProcessRun) -> bool {
     let mut ran = run.plans.iter().flat_map(|plan| &plan.ran);
     ran.any(|ran| matches!(ran.outcome, How::Running | How::Unknown | How::Lost))
 }

@@ -6,16 +6,16 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
 use futures_util::stream::{FuturesUnordered, StreamExt as _};
-use skills::{PartEnd, Runs, SkillFault, Value, run_part};
+use skills::{PartEnd, RunnableSkill, SkillFault, SkillValue, run_part};
 use tracing::info;
 
 use super::compensate::{self, Done};
-use super::{Chosen, Ended, Execution, Fallen, Offer, Role, Step};
-use crate::process::{BadEnd, Condition, Loop, Process, Test};
+use super::{Chosen, Ended, Execution, Fallen, Offer, ProcessStep, SkillRole};
+use crate::process::{BadEnd, Loop, Process, StepCondition, Test};
 
 /// The steps of a run that are over.
 #[derive(Debug, Default)]
-pub(super) struct Progress {
+pub(super) struct RunProgress {
     /// In the order in which they ended.
     pub(super) done: Vec<Done>,
     /// The other steps, by their numbers.
@@ -37,7 +37,7 @@ pub(super) enum Passed {
     Ended(BadEnd),
 }
 
-impl Progress {
+impl RunProgress {
     pub(super) fn is_over(&self, number: usize) -> bool {
         self.passed.contains_key(&number) || self.current().any(|done| done.number == number)
     }
@@ -127,7 +127,7 @@ impl Progress {
     ///
     /// # Errors
     /// The condition that cannot be decided.
-    fn allows(&self, process: &Process, step: &Step) -> Result<bool, String> {
+    fn allows(&self, process: &Process, step: &ProcessStep) -> Result<bool, String> {
         match step.when.is_empty() {
             true => Ok(true),
             false => self.holds_one(process, &step.when),
@@ -135,7 +135,7 @@ impl Progress {
     }
 
     /// Returns whether all conditions of one of the alternatives hold.
-    fn holds_one(&self, process: &Process, all: &[Vec<Condition>]) -> Result<bool, String> {
+    fn holds_one(&self, process: &Process, all: &[Vec<StepCondition>]) -> Result<bool, String> {
         for alternative in all {
             let mut holds = true;
             // The conditions of an outer branch come first: an inner condition is not decidable
@@ -153,7 +153,7 @@ impl Progress {
         Ok(false)
     }
 
-    fn holds(&self, process: &Process, condition: &Condition) -> Result<bool, String> {
+    fn holds(&self, process: &Process, condition: &StepCondition) -> Result<bool, String> {
         let test = match &condition.test {
             Test::Ended(end) => self.passed.get(&condition.step) == Some(&Passed::Ended(*end)),
             Test::Result {
@@ -180,7 +180,7 @@ impl Progress {
 /// The end of a step.
 pub(super) enum StepEnd {
     /// With its results.
-    Done(Vec<(String, Value)>),
+    Done(Vec<(String, SkillValue)>),
     /// The caller stopped the run.
     Stopped(String),
     /// An earlier step did not return a result.
@@ -203,8 +203,8 @@ impl Execution<'_> {
     pub(super) async fn sequence(
         &self,
         chosen: &Chosen,
-        skills: &[Arc<dyn Runs>],
-        progress: &mut Progress,
+        skills: &[Arc<dyn RunnableSkill>],
+        progress: &mut RunProgress,
     ) -> Ended {
         let mut running = FuturesUnordered::new();
         let mut begun: BTreeMap<usize, &str> = BTreeMap::new();
@@ -284,7 +284,7 @@ impl Execution<'_> {
         &self,
         chosen: &Chosen,
         begun: &BTreeMap<usize, &str>,
-        progress: &mut Progress,
+        progress: &mut RunProgress,
     ) -> Result<Option<Ready>, Ended> {
         loop {
             if progress.next_round(self.process).map_err(Ended::Over)? {
@@ -306,7 +306,7 @@ impl Execution<'_> {
         &self,
         chosen: &Chosen,
         begun: &BTreeMap<usize, &str>,
-        progress: &mut Progress,
+        progress: &mut RunProgress,
     ) -> Result<Option<Ready>, String> {
         let busy: BTreeSet<&str> = begun.values().copied().collect();
         for (number, step) in self.process.steps.iter().enumerate() {
@@ -325,7 +325,7 @@ impl Execution<'_> {
                 continue;
             }
             let mut open = chosen.open.iter();
-            let place = open.position(|(role, _)| *role == Role::Alone(number));
+            let place = open.position(|(role, _)| *role == SkillRole::Alone(number));
             let place =
                 place.ok_or_else(|| "the plan has another step than the process".to_owned())?;
             let offer = chosen.open.get(place).map(|(_, offer)| offer);
@@ -341,7 +341,7 @@ impl Execution<'_> {
         &self,
         (number, offer): (usize, &Offer),
         end: StepEnd,
-        (chosen, progress): (&Chosen, &mut Progress),
+        (chosen, progress): (&Chosen, &mut RunProgress),
         ended: &mut Ended,
     ) {
         // The machine of a step whose end is unknown may move: no other step handles it.
@@ -386,10 +386,10 @@ impl Execution<'_> {
     /// Returns the parameters of a step, or the end of a step that cannot begin.
     pub(super) fn prepared(
         &self,
-        step: &Step,
+        step: &ProcessStep,
         offer: &Offer,
         done: &[&Done],
-    ) -> Result<Vec<(String, Value)>, StepEnd> {
+    ) -> Result<Vec<(String, SkillValue)>, StepEnd> {
         let given = compensate::resolved(self.plant, step, done)
             .map_err(|why| StepEnd::Unresolved(format!("{}: {why}", step.name)))?;
         self.plant.values(&offer.skill, &given).map_err(|why| {
@@ -406,9 +406,9 @@ impl Execution<'_> {
     /// Runs the skill of a step or of a compensation to its end.
     pub(super) async fn one(
         &self,
-        step: &Step,
-        (offer, skill): (&Offer, &dyn Runs),
-        values: Vec<(String, Value)>,
+        step: &ProcessStep,
+        (offer, skill): (&Offer, &dyn RunnableSkill),
+        values: Vec<(String, SkillValue)>,
     ) -> StepEnd {
         let before = self.log.ran(&offer.skill);
         // The skill records the step at its first poll, which follows without a pause.

@@ -3,11 +3,11 @@ mod loops;
 
 use std::sync::atomic::{AtomicU64, Ordering};
 
-use knowledge::{Knowledge, Source, SourceKind};
-use skills::{Outcome, SkillFault, TypeName};
+use knowledge::{Knowledge, KnowledgeSource, SourceKind};
+use skills::{ParameterType, RunOutcome, SkillFault};
 
 use super::*;
-use crate::process::{By, Given, Need, ResultOf, Step};
+use crate::process::{By, GivenParameter, Need, ProcessStep, ResultOf};
 
 /// A plant for tests. Its skills do nothing and record their runs.
 struct Fakes {
@@ -18,7 +18,7 @@ struct Fakes {
     dies_at: Mutex<Option<&'static str>>,
     fails_at: Option<&'static str>,
     /// A skill and how its run ends; `None` if it does not end.
-    ends: Option<(&'static str, Option<Result<Outcome, SkillFault>>)>,
+    ends: Option<(&'static str, Option<Result<RunOutcome, SkillFault>>)>,
     /// A skill that runs until it is halted, because the gripper is lost meanwhile.
     halted_at: Mutex<Option<&'static str>>,
     halts: watch::Sender<u32>,
@@ -26,7 +26,7 @@ struct Fakes {
     /// Skills named `Meet` wait for each other here.
     meets: Option<Arc<tokio::sync::Barrier>>,
     journal: Mutex<Vec<String>>,
-    kept: Mutex<Vec<Run>>,
+    kept: Mutex<Vec<ProcessRun>>,
     clock: AtomicU64,
     leases: Mutex<BTreeMap<String, String>>,
     /// Appears when a component is lost.
@@ -62,7 +62,7 @@ impl Plant for Arc<Fakes> {
             Arc::new(FakeSkill {
                 plant: Self::clone(self),
                 offer: offer.clone(),
-            }) as Arc<dyn Runs>
+            }) as Arc<dyn RunnableSkill>
         };
         Ok(Box::new(FakeOpened(
             offers.iter().map(skill).collect(),
@@ -70,13 +70,17 @@ impl Plant for Arc<Fakes> {
         )))
     }
 
-    fn values(&self, _skill: &str, given: &[Given]) -> Result<Vec<(String, Value)>, String> {
+    fn values(
+        &self,
+        _skill: &str,
+        given: &[GivenParameter],
+    ) -> Result<Vec<(String, SkillValue)>, String> {
         given
             .iter()
             .filter(|given| given.result.is_none())
             .map(|given| {
                 let number = given.value.as_f64().ok_or("no number")?;
-                Ok((given.name.clone(), Value::Double(number)))
+                Ok((given.name.clone(), SkillValue::Double(number)))
             })
             .collect()
     }
@@ -111,7 +115,7 @@ impl Plant for Arc<Fakes> {
         true
     }
 
-    fn keep(&self, run: &Run) {
+    fn keep(&self, run: &ProcessRun) {
         self.kept.lock().unwrap().push(run.clone());
     }
 
@@ -120,11 +124,11 @@ impl Plant for Arc<Fakes> {
     }
 }
 
-struct FakeOpened(Vec<Arc<dyn Runs>>, Arc<Fakes>);
+struct FakeOpened(Vec<Arc<dyn RunnableSkill>>, Arc<Fakes>);
 
 #[async_trait]
 impl Opened for FakeOpened {
-    fn skills(&self) -> Vec<Arc<dyn Runs>> {
+    fn skills(&self) -> Vec<Arc<dyn RunnableSkill>> {
         self.0.clone()
     }
 
@@ -135,12 +139,12 @@ impl Opened for FakeOpened {
 
 impl FakeSkill {
     /// Returns the results of a run: `Count` has its number.
-    fn results(&self, name: &str) -> Vec<(String, Value)> {
+    fn results(&self, name: &str) -> Vec<(String, SkillValue)> {
         let journal = self.plant.journal.lock().unwrap();
         let runs = journal.iter().filter(|told| **told == name).count();
-        let runs = Value::Double(f64::from(u32::try_from(runs).unwrap()));
+        let runs = SkillValue::Double(f64::from(u32::try_from(runs).unwrap()));
         match name.rsplit('.').next() {
-            Some("Grasp") => vec![("Width".to_owned(), Value::Double(0.03))],
+            Some("Grasp") => vec![("Width".to_owned(), SkillValue::Double(0.03))],
             Some("Count") => vec![("Runs".to_owned(), runs)],
             _ => vec![],
         }
@@ -148,16 +152,16 @@ impl FakeSkill {
 }
 
 #[async_trait]
-impl Runs for FakeSkill {
+impl RunnableSkill for FakeSkill {
     fn name(&self) -> String {
         format!("{}.{}", self.offer.component_name, self.offer.name)
     }
 
     async fn run(
         &self,
-        parameters: Vec<(String, Value)>,
+        parameters: Vec<(String, SkillValue)>,
         _within: Duration,
-    ) -> Result<Outcome, SkillFault> {
+    ) -> Result<RunOutcome, SkillFault> {
         let name = self.name();
         let told = if parameters.is_empty() {
             name.clone()
@@ -226,7 +230,7 @@ impl Runs for FakeSkill {
                 None => std::future::pending().await,
             };
         }
-        Ok(Outcome {
+        Ok(RunOutcome {
             run: 1,
             succeeded: true,
             unknown: false,
@@ -262,8 +266,8 @@ impl Runs for FakeSkill {
     }
 }
 
-fn failed(message: &str) -> Outcome {
-    Outcome {
+fn failed(message: &str) -> RunOutcome {
+    RunOutcome {
         run: 1,
         succeeded: false,
         unknown: false,
@@ -274,8 +278,8 @@ fn failed(message: &str) -> Outcome {
 }
 
 /// Returns an outcome whose end is unknown.
-fn unconfirmed(message: &str) -> Outcome {
-    Outcome {
+fn unconfirmed(message: &str) -> RunOutcome {
+    RunOutcome {
         unknown: true,
         ..failed(message)
     }
@@ -288,7 +292,7 @@ fn offer(component: &str, name: &str, of: &str) -> Offer {
         skill: format!("urn:example:{component}#{name}"),
         component_name: component.into(),
         name: name.into(),
-        types: vec![TypeName::own(of).to_string()],
+        types: vec![ParameterType::own(of).to_string()],
         capabilities: vec![],
         closure: vec![],
         endpoint: String::new(),
@@ -332,33 +336,36 @@ fn plant(offers: Vec<Offer>) -> Fakes {
 }
 
 fn process() -> Process {
-    let need = |role: Role| Need {
+    let need = |role: SkillRole| Need {
         role,
         capability: None,
         skill_type: role.skill_type(),
     };
-    let step = |name: &str, last| Step {
+    let step = |name: &str, last| ProcessStep {
         name: name.into(),
-        needs: [Role::Ptp, Role::Linear, last].map(need).into(),
-        ..Step::default()
+        needs: [SkillRole::Ptp, SkillRole::Linear, last].map(need).into(),
+        ..ProcessStep::default()
     };
     Process {
         iri: "urn:example:process:move-part".into(),
         name: "Move a part".into(),
-        work: Job::PickAndPlace(skills::Job {
+        work: StepJob::PickAndPlace(skills::Job {
             pick: [0.0; 6],
             place: [1.0; 6],
             approach: 0.05,
             shape: None,
         }),
-        steps: vec![step("pick", Role::Grasp), step("place", Role::Release)],
+        steps: vec![
+            step("pick", SkillRole::Grasp),
+            step("place", SkillRole::Release),
+        ],
         loops: vec![],
         within: Duration::from_secs(5),
         wait: Duration::from_millis(300),
     }
 }
 
-async fn executed(fakes: Fakes, process: &Process) -> (Run, Arc<Fakes>, Vec<&'static str>) {
+async fn executed(fakes: Fakes, process: &Process) -> (ProcessRun, Arc<Fakes>, Vec<&'static str>) {
     let fakes = Arc::new(fakes);
     let steps = Mutex::new(Vec::new());
     let plant: Arc<dyn Plant> = Arc::new(Arc::clone(&fakes));
@@ -525,7 +532,7 @@ async fn a_skill_that_fails_or_cannot_be_reached_is_not_tried_again() {
     let used: Vec<_> = run
         .plans
         .iter()
-        .map(|plan| plan.plan.chosen(Role::Grasp).unwrap())
+        .map(|plan| plan.plan.chosen(SkillRole::Grasp).unwrap())
         .collect();
     assert_eq!(
         used,
@@ -546,18 +553,18 @@ async fn a_skill_that_fails_or_cannot_be_reached_is_not_tried_again() {
 
 /// A process that grasps and releases.
 fn grasps() -> Process {
-    let alone = |step: usize, of: &str| Step {
+    let alone = |step: usize, of: &str| ProcessStep {
         name: format!("step {step}"),
         needs: vec![Need {
-            role: Role::Alone(step),
+            role: SkillRole::Alone(step),
             capability: None,
-            skill_type: Some(TypeName::own(of)),
+            skill_type: Some(ParameterType::own(of)),
         }],
-        ..Step::default()
+        ..ProcessStep::default()
     };
     Process {
         steps: vec![alone(0, "GraspSkillType"), alone(1, "ReleaseSkillType")],
-        work: Job::Sequence,
+        work: StepJob::Sequence,
         ..process()
     }
 }
@@ -609,7 +616,7 @@ async fn a_run_whose_end_is_unknown_has_no_end_and_is_repeated_by_nobody() {
             let done = plan.ran.iter().filter(|ran| ran.outcome == How::Done);
             assert_eq!(ended.count(), done.count());
             let knowledge = Knowledge::new().unwrap();
-            let source = Source::new(SourceKind::Run, &run.run);
+            let source = KnowledgeSource::new(SourceKind::Run, &run.run);
             knowledge.replace(&source, &triples, 1).unwrap();
             let steps = knowledge.ask("run-steps", &[]).unwrap().rows;
             let mut unknown = steps.iter().filter(|row| row["outcome"] == "unknown");
@@ -625,7 +632,7 @@ async fn a_run_whose_end_is_unknown_has_no_end_and_is_repeated_by_nobody() {
 struct Unknowns(Mutex<Vec<String>>);
 
 #[async_trait]
-impl Teller for Unknowns {
+impl JobObserver for Unknowns {
     async fn step(&self, _step: &'static str) {}
 
     async fn unknown(&self, why: &str) {
@@ -667,7 +674,7 @@ async fn a_skill_that_runs_when_its_process_is_given_up_has_an_unknown_end() {
 #[tokio::test]
 async fn a_sequence_gives_each_step_what_it_needs_and_never_does_one_twice() {
     let mut process = grasps();
-    process.steps[0].parameters.push(Given {
+    process.steps[0].parameters.push(GivenParameter {
         name: "Force".into(),
         value: 12.into(),
         unit: None,
@@ -694,7 +701,7 @@ async fn a_sequence_gives_each_step_what_it_needs_and_never_does_one_twice() {
 struct StopAt(&'static str, watch::Sender<bool>);
 
 #[async_trait]
-impl Teller for StopAt {
+impl JobObserver for StopAt {
     async fn step(&self, step: &'static str) {
         if step == self.0 {
             self.1.send_replace(true);
@@ -753,11 +760,15 @@ async fn what_became_of_a_run_can_be_asked_for() {
     let (run, ..) = executed(fakes, &process()).await;
     let knowledge = Knowledge::new().unwrap();
     knowledge
-        .replace(&Source::new(SourceKind::Run, &run.run), &run.triples(), 1)
+        .replace(
+            &KnowledgeSource::new(SourceKind::Run, &run.run),
+            &run.triples(),
+            1,
+        )
         .unwrap();
     knowledge
         .replace(
-            &Source::new(SourceKind::Process, "p"),
+            &KnowledgeSource::new(SourceKind::Process, "p"),
             &process().triples(&|_| None),
             1,
         )
@@ -799,22 +810,22 @@ async fn what_became_of_a_run_can_be_asked_for() {
 }
 
 /// A step of a sequence that a skill of a type does.
-fn alone(number: usize, name: &str, of: &str) -> Step {
-    Step {
+fn alone(number: usize, name: &str, of: &str) -> ProcessStep {
+    ProcessStep {
         name: name.into(),
         needs: vec![Need {
-            role: Role::Alone(number),
+            role: SkillRole::Alone(number),
             capability: None,
-            skill_type: Some(TypeName::own(of)),
+            skill_type: Some(ParameterType::own(of)),
         }],
-        ..Step::default()
+        ..ProcessStep::default()
     }
 }
 
 /// The compensation of a step, by the same component.
-fn undone_by(of: usize, of_all: usize, skill_type: &str) -> Option<Box<Step>> {
+fn undone_by(of: usize, of_all: usize, skill_type: &str) -> Option<Box<ProcessStep>> {
     let step = alone(of_all + of, &format!("compensation {of}"), skill_type);
-    Some(Box::new(Step {
+    Some(Box::new(ProcessStep {
         by: By::SameAs(of),
         ..step
     }))
@@ -866,7 +877,7 @@ async fn completed_steps_are_compensated_in_reverse_order() {
         panic!("{run:?}")
     };
     assert_eq!((plan.outcome, undo.outcome), (How::Failed, How::Done));
-    let of = |ran: &crate::record::Ran| (ran.step.clone(), ran.of.clone());
+    let of = |ran: &crate::record::SkillRun| (ran.step.clone(), ran.of.clone());
     let pair = |step: &str, of: &str| (step.to_owned(), of.to_owned());
     let expected = [
         pair("compensation 1", "move"),
@@ -876,7 +887,7 @@ async fn completed_steps_are_compensated_in_reverse_order() {
     assert!(undo.compensates && told.contains(&"Compensate"));
     assert!(fakes.leases.lock().unwrap().is_empty());
     let knowledge = Knowledge::new().unwrap();
-    let source = Source::new(SourceKind::Run, &run.run);
+    let source = KnowledgeSource::new(SourceKind::Run, &run.run);
     knowledge.replace(&source, &run.triples(), 1).unwrap();
     let rows = knowledge.ask("run-steps", &[]).unwrap().rows;
     let undone = rows.iter().filter(|row| row["compensates"] == true);
@@ -938,7 +949,7 @@ async fn nothing_is_compensated_while_a_skill_may_go_on_or_after_a_stop() {
         ..drills()
     };
     let mut slow = slow;
-    slow.steps[2].needs[0].skill_type = Some(TypeName::own("PtpMoveSkillType"));
+    slow.steps[2].needs[0].skill_type = Some(ParameterType::own("PtpMoveSkillType"));
     let fakes = Arc::new(Fakes {
         halted_at: Mutex::new(Some("robot.Ptp")),
         ..fakes
@@ -961,7 +972,7 @@ async fn nothing_is_compensated_while_a_skill_may_go_on_or_after_a_stop() {
 struct Third(StopAt, AtomicU64);
 
 #[async_trait]
-impl Teller for Third {
+impl JobObserver for Third {
     async fn step(&self, step: &'static str) {
         if step == "Step" && self.1.fetch_add(1, Ordering::Relaxed) == 2 {
             self.0.step("Third").await;
@@ -1007,7 +1018,7 @@ async fn a_failed_step_is_planned_anew_and_completed_steps_are_not_repeated() {
 #[tokio::test]
 async fn a_result_of_a_step_is_a_parameter_of_a_later_step() {
     let mut process = drills();
-    process.steps[2].parameters = vec![Given {
+    process.steps[2].parameters = vec![GivenParameter {
         name: "Depth".into(),
         value: serde_json::Value::Null,
         unit: None,

@@ -5,17 +5,17 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use async_trait::async_trait;
-use skills::{GripPoint, Outcome, Runs, SkillFault, Value};
+use skills::{GripPoint, RunOutcome, RunnableSkill, SkillFault, SkillValue};
 use tokio::time::Instant;
 
 use super::Log;
 use crate::plan::{Fallen, Offer};
-use crate::process::{Job, Process};
-use crate::record::{How, Ran, Values, recorded};
+use crate::process::{Process, StepJob};
+use crate::record::{How, RecordValues, SkillRun, recorded};
 
 /// A skill that records its runs in the log.
-pub(super) struct Watched {
-    inner: Arc<dyn Runs>,
+pub(super) struct RecordedSkill {
+    inner: Arc<dyn RunnableSkill>,
     offer: Offer,
     process: Process,
     log: Arc<Log>,
@@ -23,9 +23,9 @@ pub(super) struct Watched {
     is_halted: AtomicBool,
 }
 
-impl Watched {
+impl RecordedSkill {
     pub(super) fn new(
-        inner: Arc<dyn Runs>,
+        inner: Arc<dyn RunnableSkill>,
         offer: &Offer,
         log: &Arc<Log>,
         process: &Process,
@@ -39,7 +39,7 @@ impl Watched {
         }
     }
 
-    fn begins(&self, parameters: Values) {
+    fn begins(&self, parameters: RecordValues) {
         self.log.change(|kept, now| {
             let step = kept.step.clone();
             if let Some(plan) = kept.run.plan() {
@@ -47,13 +47,13 @@ impl Watched {
                     true => undone_step(&self.process, &step),
                     false => of_step(&self.process, &step),
                 };
-                plan.ran.push(Ran {
+                plan.ran.push(SkillRun {
                     step,
                     of,
                     skill: self.offer.skill.clone(),
                     component: self.offer.component.clone(),
                     parameters,
-                    results: Values::new(),
+                    results: RecordValues::new(),
                     started_ms: now,
                     ended_ms: None,
                     outcome: How::Running,
@@ -63,9 +63,9 @@ impl Watched {
         });
     }
 
-    fn ends(&self, outcome: How, reason: Option<String>, results: Values) {
+    fn ends(&self, outcome: How, reason: Option<String>, results: RecordValues) {
         self.log.change(|kept, now| {
-            let is_this = |ran: &&mut Ran| ran.is_running() && ran.skill == self.offer.skill;
+            let is_this = |ran: &&mut SkillRun| ran.is_running() && ran.skill == self.offer.skill;
             if let Some(ran) = kept
                 .run
                 .plan()
@@ -81,7 +81,7 @@ impl Watched {
 
     /// Records that the end of the run is unknown.
     fn unknown(&self, why: &str) {
-        self.ends(How::Unknown, Some(why.to_owned()), Values::new());
+        self.ends(How::Unknown, Some(why.to_owned()), RecordValues::new());
     }
 
     /// Records the loss of the component. The end of a run that was halted before is unknown: the
@@ -110,7 +110,7 @@ impl Watched {
 }
 
 #[async_trait]
-impl Runs for Watched {
+impl RunnableSkill for RecordedSkill {
     fn grip_point(&self) -> Option<GripPoint> {
         self.inner.grip_point()
     }
@@ -121,9 +121,9 @@ impl Runs for Watched {
 
     async fn run(
         &self,
-        parameters: Vec<(String, Value)>,
+        parameters: Vec<(String, SkillValue)>,
         within: Duration,
-    ) -> Result<Outcome, SkillFault> {
+    ) -> Result<RunOutcome, SkillFault> {
         self.is_halted.store(false, Ordering::Relaxed);
         self.begins(recorded(&parameters));
         let began = Instant::now();
@@ -134,11 +134,15 @@ impl Runs for Watched {
             }
             Ok(outcome) if outcome.unknown => self.unknown(&outcome.message),
             Ok(_) if self.is_halted.load(Ordering::Relaxed) => {
-                self.ends(How::Stopped, None, Values::new());
+                self.ends(How::Stopped, None, RecordValues::new());
             }
             Ok(outcome) => {
                 self.fell(false, &outcome.message);
-                self.ends(How::Failed, Some(outcome.message.clone()), Values::new());
+                self.ends(
+                    How::Failed,
+                    Some(outcome.message.clone()),
+                    RecordValues::new(),
+                );
             }
             Err(SkillFault::Lost(why)) => self.went(why),
             Err(fault) if may_go_on(fault, began.elapsed() >= within) => {
@@ -146,7 +150,7 @@ impl Runs for Watched {
             }
             Err(fault) => {
                 self.fell(false, &fault.to_string());
-                self.ends(How::Failed, Some(fault.to_string()), Values::new());
+                self.ends(How::Failed, Some(fault.to_string()), RecordValues::new());
             }
         }
         outcome
@@ -181,15 +185,15 @@ const fn may_go_on(fault: &SkillFault, is_late: bool) -> bool {
 fn of_step(process: &Process, step: &str) -> String {
     let is_picking = step.starts_with("MovePick") || matches!(step, "Init" | "Grasp");
     let of = match (&process.work, process.steps.as_slice()) {
-        (Job::PickAndPlace(_), [picks, .., places]) => {
+        (StepJob::PickAndPlace(_), [picks, .., places]) => {
             if is_picking {
                 Some(picks)
             } else {
                 Some(places)
             }
         }
-        (Job::PickAndPlace(_), [all]) => Some(all),
-        (Job::PickAndPlace(_), []) | (Job::Sequence, _) => None,
+        (StepJob::PickAndPlace(_), [all]) => Some(all),
+        (StepJob::PickAndPlace(_), []) | (StepJob::Sequence, _) => None,
     };
     of.map_or_else(|| step.to_owned(), |of| of.name.clone())
 }

@@ -1,4 +1,4 @@
-use knowledge::{Source, SourceKind};
+use knowledge::{KnowledgeSource, SourceKind};
 use serde::Deserialize;
 
 use super::*;
@@ -17,19 +17,19 @@ struct Problem {
 }
 
 impl Problem {
-    fn goal(&self) -> Goal {
-        Goal {
+    fn goal(&self) -> GoalConditions {
+        GoalConditions {
             iri: "urn:goal".into(),
             name: self.name.clone(),
             given: self.given.clone(),
             wants: self.wants.clone(),
             avoids: self.avoids.clone(),
-            ..Goal::default()
+            ..GoalConditions::default()
         }
     }
 
-    fn actions(&self) -> Vec<Action> {
-        let action = |(name, [requires, forbids, adds, removes]): &(String, [_; 4])| Action {
+    fn actions(&self) -> Vec<GoalAction> {
+        let action = |(name, [requires, forbids, adds, removes]): &(String, [_; 4])| GoalAction {
             iri: format!("urn:action:{name}"),
             name: name.clone(),
             capability: format!("urn:capability:{name}"),
@@ -44,7 +44,7 @@ impl Problem {
 }
 
 /// Checks each step of a sequence by its conditions, without the search.
-fn is_sound(goal: &Goal, actions: &[Action], sequence: &Sequence) {
+fn is_sound(goal: &GoalConditions, actions: &[GoalAction], sequence: &Sequence) {
     let mut holds = goal.given.clone();
     for step in &sequence.steps {
         let action = actions
@@ -91,17 +91,17 @@ fn twenty_problems_have_plans_as_long_as_those_of_another_planner() {
 #[test]
 fn a_sequence_has_at_most_as_many_steps_as_a_process() {
     let chain = |length: usize| {
-        let action = |number: usize| Action {
+        let action = |number: usize| GoalAction {
             iri: format!("urn:action:{number}"),
             requires: [format!("fact {number}")].into(),
             adds: [format!("fact {}", number + 1)].into(),
-            ..Action::default()
+            ..GoalAction::default()
         };
-        let actions: Vec<Action> = (0..length).map(action).collect();
-        let goal = Goal {
+        let actions: Vec<GoalAction> = (0..length).map(action).collect();
+        let goal = GoalConditions {
             given: ["fact 0".to_owned()].into(),
             wants: [format!("fact {length}")].into(),
-            ..Goal::default()
+            ..GoalConditions::default()
         };
         goal.search(&actions).map(|sequence| sequence.steps.len())
     };
@@ -124,10 +124,10 @@ const TURTLE: &str = r#"@prefix ua: <urn:ua-bridge:plant#> . @prefix rdfs: <http
 #[test]
 fn a_goal_of_the_graph_becomes_a_process_with_a_proof_of_each_step() {
     let knowledge = Knowledge::new().unwrap();
-    let source = Source::new(SourceKind::File, "goals.ttl");
+    let source = KnowledgeSource::new(SourceKind::File, "goals.ttl");
     knowledge.replace_turtle(&source, TURTLE, 1).unwrap();
-    let actions = Action::read(&knowledge).unwrap();
-    let goal = Goal::read(&knowledge, "urn:goal").unwrap();
+    let actions = GoalAction::read(&knowledge).unwrap();
+    let goal = GoalConditions::read(&knowledge, "urn:goal").unwrap();
     let sequence = goal.search(&actions).unwrap();
     is_sound(&goal, &actions, &sequence);
     let names: Vec<&str> = sequence
@@ -136,7 +136,7 @@ fn a_goal_of_the_graph_becomes_a_process_with_a_proof_of_each_step() {
         .map(|step| step.name.as_str())
         .collect();
     assert_eq!(names, ["grasp", "move to the bin", "urn:release"]);
-    let condition = |fact: &str, holds, since| Condition {
+    let condition = |fact: &str, holds, since| GoalCondition {
         fact: format!("urn:f:{fact}"),
         holds,
         since,
@@ -156,10 +156,10 @@ fn a_goal_of_the_graph_becomes_a_process_with_a_proof_of_each_step() {
     let need = &process.steps[2].needs[0];
     assert_eq!(
         (need.role, need.capability.as_deref()),
-        (Role::Alone(2), Some("urn:c:release"))
+        (SkillRole::Alone(2), Some("urn:c:release"))
     );
     // Without the capability to release there is no sequence.
-    let without: Vec<Action> = actions
+    let without: Vec<GoalAction> = actions
         .iter()
         .filter(|one| one.iri != "urn:release")
         .cloned()
@@ -168,12 +168,15 @@ fn a_goal_of_the_graph_becomes_a_process_with_a_proof_of_each_step() {
         goal.search(&without).unwrap_err(),
         "no available action adds urn:f:in-bin"
     );
-    let never = Goal::read(&knowledge, "urn:never").unwrap();
+    let never = GoalConditions::read(&knowledge, "urn:never").unwrap();
     assert_eq!(
         never.search(&actions).unwrap_err(),
         "no available action adds urn:f:painted"
     );
-    let empty = Goal::read(&knowledge, "urn:empty").unwrap_err();
+    let empty = GoalConditions::read(&knowledge, "urn:empty").unwrap_err();
     assert_eq!(empty.as_deref(), Some("it has no ua:wants or ua:avoids"));
-    assert_eq!(Goal::read(&knowledge, "urn:nothing").unwrap_err(), None);
+    assert_eq!(
+        GoalConditions::read(&knowledge, "urn:nothing").unwrap_err(),
+        None
+    );
 }

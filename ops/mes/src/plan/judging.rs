@@ -3,10 +3,10 @@
 use std::cmp::Reverse;
 use std::collections::BTreeMap;
 
-use skills::TypeName;
+use skills::ParameterType;
 
-use super::{Candidate, Facts, Offer, Plan, PlannedNeed, Situation, Team, rank};
-use crate::process::{By, Group, Job, Need, Process, Role, Step};
+use super::{Facts, Offer, Plan, PlanCandidate, PlannedNeed, Situation, Team, rank};
+use crate::process::{By, Group, Need, Process, ProcessStep, SkillRole, StepJob};
 
 #[derive(Debug, Clone, PartialEq, Eq)]
 enum NotFit {
@@ -20,9 +20,9 @@ pub(super) struct Judging<'a> {
     situation: Situation<'a>,
     facts: &'a dyn Facts,
     /// The tools that have to fill roles, with the steps that attach them.
-    tools: BTreeMap<Role, Option<Attached>>,
+    tools: BTreeMap<SkillRole, Option<Attached>>,
     /// The completed steps whose components have to fill roles.
-    bound: BTreeMap<Role, Bound<'a>>,
+    bound: BTreeMap<SkillRole, Bound<'a>>,
 }
 
 /// A completed step, and the component that did it.
@@ -78,28 +78,28 @@ impl<'a> Judging<'a> {
     }
 
     /// Returns whether a completed step does not exclude the offer for a role.
-    pub(super) fn is_allowed(&self, role: Role, offer: &Offer) -> bool {
+    pub(super) fn is_allowed(&self, role: SkillRole, offer: &Offer) -> bool {
         let bound = self.bound.get(&role);
         bound.is_none_or(|bound| bound.is_it(offer))
     }
 
     /// Returns the step of a sequence, or the compensation, that has a role.
-    fn step(&self, role: Role) -> Option<&'a Step> {
+    fn step(&self, role: SkillRole) -> Option<&'a ProcessStep> {
         match role {
-            Role::Alone(number) => self.process.step(number),
-            Role::Ptp | Role::Linear | Role::Grasp | Role::Release => None,
+            SkillRole::Alone(number) => self.process.step(number),
+            SkillRole::Ptp | SkillRole::Linear | SkillRole::Grasp | SkillRole::Release => None,
         }
     }
 
     /// Returns the offer that an earlier plan chose for a step that is done.
-    pub(super) fn kept(&self, role: Role) -> Option<&'a Offer> {
+    pub(super) fn kept(&self, role: SkillRole) -> Option<&'a Offer> {
         let mut kept = self.situation.kept.iter();
-        let of_role = kept.find(|kept| Role::Alone(kept.number) == role);
+        let of_role = kept.find(|kept| SkillRole::Alone(kept.number) == role);
         of_role.map(|kept| &kept.offer)
     }
 
     /// Binds the roles of each group with a completed step to its component.
-    pub(super) fn bind(&mut self, groups: &BTreeMap<Role, Group>) {
+    pub(super) fn bind(&mut self, groups: &BTreeMap<SkillRole, Group>) {
         for kept in self.situation.kept {
             let Some(step) = self.process.steps.get(kept.number) else {
                 continue;
@@ -108,7 +108,7 @@ impl<'a> Judging<'a> {
                 step: &step.name,
                 offer: &kept.offer,
             };
-            let group = groups.get(&Role::Alone(kept.number));
+            let group = groups.get(&SkillRole::Alone(kept.number));
             for (role, _) in groups.iter().filter(|(_, other)| Some(*other) == group) {
                 self.bound.entry(*role).or_insert(bound);
             }
@@ -121,13 +121,13 @@ impl<'a> Judging<'a> {
             let taken = step.parameters.iter();
             for (given, of) in taken.filter_map(|given| Some((given, given.result.as_ref()?))) {
                 let chosen =
-                    |plan: &Plan, number| plan.chosen(Role::Alone(number)).map(str::to_owned);
+                    |plan: &Plan, number| plan.chosen(SkillRole::Alone(number)).map(str::to_owned);
                 let (Some(from), Some(to)) = (chosen(plan, of.step), chosen(plan, number)) else {
                     continue;
                 };
                 let connects = self.facts.connects((&from, &of.name), (&to, &given.name));
                 if let Err(why) = connects {
-                    plan.refuse(Role::Alone(number), &format!("{}: {why}", given.name));
+                    plan.refuse(SkillRole::Alone(number), &format!("{}: {why}", given.name));
                 }
             }
         }
@@ -140,32 +140,32 @@ impl<'a> Judging<'a> {
     }
 
     /// Returns the results of a step that other steps take.
-    fn taken(&self, role: Role) -> impl Iterator<Item = &'a str> {
+    fn taken(&self, role: SkillRole) -> impl Iterator<Item = &'a str> {
         let given = self.process.numbered();
         let given = given.flat_map(|(_, step)| &step.parameters);
         let results = given.filter_map(|given| given.result.as_ref());
         results
-            .filter(move |of| Role::Alone(of.step) == role)
+            .filter(move |of| SkillRole::Alone(of.step) == role)
             .map(|of| of.name.as_str())
     }
 
     /// Returns the tools that have to fill roles: a tool that a step attaches does all later steps
     /// that it can do, until another tool is attached.
-    fn attached_tools(&self, offers: &[Offer]) -> BTreeMap<Role, Option<Attached>> {
+    fn attached_tools(&self, offers: &[Offer]) -> BTreeMap<SkillRole, Option<Attached>> {
         let mut tools = BTreeMap::new();
-        if self.process.work != Job::Sequence {
+        if self.process.work != StepJob::Sequence {
             return tools;
         }
         let mut attached: Option<Attached> = None;
         for (number, step) in self.process.steps.iter().enumerate() {
-            let role = Role::Alone(number);
+            let role = SkillRole::Alone(number);
             // A tool that has failed or is in use stays attached.
             let fits = |offer: &&Offer| {
                 let mut needs = step.needs.iter();
                 needs.all(|need| self.suits(need, offer).is_ok() && self.takes(need, offer).is_ok())
             };
             let is_tool = |of: &str| {
-                let of = TypeName::own(of).to_string();
+                let of = ParameterType::own(of).to_string();
                 let named = step
                     .needs
                     .iter()
@@ -223,7 +223,7 @@ impl<'a> Judging<'a> {
                 Err(NotFit::Unrelated) => String::new(),
                 Err(NotFit::Because(why)) => why,
             };
-            candidates.push(Candidate {
+            candidates.push(PlanCandidate {
                 skill: offer.skill.clone(),
                 name: offer.name.clone(),
                 component: offer.component.clone(),
@@ -291,7 +291,8 @@ impl<'a> Judging<'a> {
         if let Some(step) = self.step(need.role) {
             self.facts.takes(offer, step).map_err(NotFit::Because)?;
         }
-        if let (Job::PickAndPlace(job), Role::Ptp | Role::Linear) = (&self.process.work, need.role)
+        if let (StepJob::PickAndPlace(job), SkillRole::Ptp | SkillRole::Linear) =
+            (&self.process.work, need.role)
         {
             let positions = [job.pick, job.place].map(|[x, y, z, ..]| [x, y, z]);
             let reached = self.facts.reaches(offer, &positions);

@@ -1,15 +1,15 @@
 use std::time::Duration;
 
-use skills::TypeName;
+use skills::ParameterType;
 
 use super::*;
-use crate::process::{Given, Job, ResultOf, Step};
+use crate::process::{GivenParameter, ProcessStep, ResultOf, StepJob};
 
 const GRASP: &str = "urn:example:capability:grasp";
 const RELEASE: &str = "urn:example:capability:release";
 const MOVE: &str = "urn:example:capability:move";
 
-fn need(role: Role, capability: &str) -> Need {
+fn need(role: SkillRole, capability: &str) -> Need {
     Need {
         role,
         capability: Some(capability.into()),
@@ -24,7 +24,7 @@ struct Known {
 }
 
 impl Facts for Known {
-    fn takes(&self, offer: &Offer, step: &Step) -> Result<(), String> {
+    fn takes(&self, offer: &Offer, step: &ProcessStep) -> Result<(), String> {
         match self.refuses == (&*offer.component_name, &*step.name) {
             true => Err(format!("{} has no parameter Nonsense", offer.name)),
             false => Ok(()),
@@ -55,7 +55,7 @@ struct Preferring {
 }
 
 impl Facts for Preferring {
-    fn takes(&self, _: &Offer, _: &Step) -> Result<(), String> {
+    fn takes(&self, _: &Offer, _: &ProcessStep) -> Result<(), String> {
         Ok(())
     }
 
@@ -69,7 +69,7 @@ impl Facts for Preferring {
 
     fn reaches(&self, offer: &Offer, positions: &[[f64; 3]]) -> Result<(), String> {
         assert_eq!(positions, [[0.0; 3], [1.0; 3]]);
-        let workspace = skills::Workspace {
+        let workspace = skills::RobotWorkspace {
             reach: (offer.component_name == "short").then_some(0.5),
             zones: Vec::new(),
         };
@@ -110,26 +110,38 @@ fn reach_attached_tools_and_the_rules_of_the_user_decide_with_a_reason_for_each(
         super::plan(&process(), &offers, Situation::default(), &facts)
     };
     let plain = planned("", &[]);
-    assert_eq!(plain.chosen(Role::Ptp), Some("urn:example:a-short#Ptp"));
-    assert_eq!(plain.chosen(Role::Grasp), Some("urn:example:fingers#Grasp"));
     assert_eq!(
-        why(&plain, Role::Ptp, "short#Ptp"),
+        plain.chosen(SkillRole::Ptp),
+        Some("urn:example:a-short#Ptp")
+    );
+    assert_eq!(
+        plain.chosen(SkillRole::Grasp),
+        Some("urn:example:fingers#Grasp")
+    );
+    assert_eq!(
+        why(&plain, SkillRole::Ptp, "short#Ptp"),
         "1.000, 1.000, 1.000 m is 1.732 m from its base, and it reaches 0.5 m"
     );
     let ruled = planned("", &["short", "b-robot", "vacuum"]);
-    assert_eq!(ruled.chosen(Role::Ptp), Some("urn:example:b-robot#Ptp"));
-    assert_eq!(ruled.chosen(Role::Grasp), Some("urn:example:vacuum#Grasp"));
     assert_eq!(
-        why(&ruled, Role::Linear, "a-short#Lin"),
+        ruled.chosen(SkillRole::Ptp),
+        Some("urn:example:b-robot#Ptp")
+    );
+    assert_eq!(
+        ruled.chosen(SkillRole::Grasp),
+        Some("urn:example:vacuum#Grasp")
+    );
+    assert_eq!(
+        why(&ruled, SkillRole::Linear, "a-short#Lin"),
         "it would fit, but b-robot.Lin is preferred"
     );
     let attached = planned("fingers", &["vacuum"]);
     assert_eq!(
-        attached.chosen(Role::Grasp),
+        attached.chosen(SkillRole::Grasp),
         Some("urn:example:fingers#Grasp")
     );
     assert_eq!(
-        why(&attached, Role::Release, "vacuum#Release"),
+        why(&attached, SkillRole::Release, "vacuum#Release"),
         "it would fit, but fingers.Release is attached to a robot"
     );
 }
@@ -147,24 +159,24 @@ fn plan(process: &Process, offers: &[Offer], fallen: &[Fallen]) -> Plan {
 
 /// A process that picks a part and places it.
 fn process() -> Process {
-    let moves = || [need(Role::Ptp, MOVE), need(Role::Linear, MOVE)];
-    let step = |name: &str, last| Step {
+    let moves = || [need(SkillRole::Ptp, MOVE), need(SkillRole::Linear, MOVE)];
+    let step = |name: &str, last| ProcessStep {
         name: name.into(),
         needs: moves().into_iter().chain([last]).collect(),
-        ..Step::default()
+        ..ProcessStep::default()
     };
     Process {
         iri: "urn:example:process:move-part".into(),
         name: "Move a part".into(),
-        work: Job::PickAndPlace(skills::Job {
+        work: StepJob::PickAndPlace(skills::Job {
             pick: [0.0; 6],
             place: [1.0; 6],
             approach: 0.05,
             shape: None,
         }),
         steps: vec![
-            step("pick", need(Role::Grasp, GRASP)),
-            step("place", need(Role::Release, RELEASE)),
+            step("pick", need(SkillRole::Grasp, GRASP)),
+            step("place", need(SkillRole::Release, RELEASE)),
         ],
         loops: vec![],
         within: Duration::from_secs(30),
@@ -185,7 +197,7 @@ fn offer(component: &str, name: &str, types: &[&str], capabilities: &[&str]) -> 
                 if name.contains('=') {
                     (*name).to_owned()
                 } else {
-                    TypeName::own(name).to_string()
+                    ParameterType::own(name).to_string()
                 }
             })
             .collect(),
@@ -216,7 +228,7 @@ fn gripper(name: &str) -> Vec<Offer> {
     ]
 }
 
-fn why<'a>(plan: &'a Plan, role: Role, skill: &str) -> &'a str {
+fn why<'a>(plan: &'a Plan, role: SkillRole, skill: &str) -> &'a str {
     let (_, need) = plan.needs().find(|(_, need)| need.role_is == role).unwrap();
     let skill = format!("urn:example:{skill}");
     need.candidates
@@ -230,7 +242,7 @@ fn each_role_is_filled_by_capability_and_type() {
     let offers = [robot("robot"), gripper("gripper")].concat();
     let plan = plan(&process(), &offers, &[]);
     assert!(plan.is_complete(), "{}", plan.missing());
-    let chosen: Vec<_> = Role::OF_COMPOSITE
+    let chosen: Vec<_> = SkillRole::OF_COMPOSITE
         .iter()
         .map(|role| plan.chosen(*role).unwrap())
         .collect();
@@ -244,14 +256,14 @@ fn each_role_is_filled_by_capability_and_type() {
         ]
     );
     assert_eq!(
-        why(&plan, Role::Ptp, "robot#Lin"),
+        why(&plan, SkillRole::Ptp, "robot#Lin"),
         "its type is not nsu=urn:ua-bridge:skills;PtpMoveSkillType or below it"
     );
     assert_eq!(
-        why(&plan, Role::Grasp, "gripper#Grasp"),
+        why(&plan, SkillRole::Grasp, "gripper#Grasp"),
         "it realises urn:example:capability:grasp, its type is GraspSkillType or below it"
     );
-    assert_eq!(why(&plan, Role::Grasp, "robot#Ptp"), "not looked at");
+    assert_eq!(why(&plan, SkillRole::Grasp, "robot#Ptp"), "not looked at");
 }
 
 #[test]
@@ -262,9 +274,12 @@ fn a_type_never_seen_fits_by_its_supertype_and_a_capability_by_its_superclass() 
     vacuum[0].closure = vec!["urn:example:capability:suck".into(), GRASP.into()];
     let offers = [robot("robot"), vacuum].concat();
     let plan = plan(&process(), &offers, &[]);
-    assert_eq!(plan.chosen(Role::Grasp), Some("urn:example:vacuum#Grasp"));
+    assert_eq!(
+        plan.chosen(SkillRole::Grasp),
+        Some("urn:example:vacuum#Grasp")
+    );
     assert!(
-        why(&plan, Role::Grasp, "vacuum#Grasp")
+        why(&plan, SkillRole::Grasp, "vacuum#Grasp")
             .contains("urn:example:capability:suck, which is below urn:example:capability:grasp")
     );
 }
@@ -277,14 +292,17 @@ fn one_component_fills_all_roles_of_its_group() {
     let offers = [robot("robot"), grasps, releases, gripper("gripper")].concat();
     let both = plan(&process(), &offers, &[]);
     assert_eq!(
-        (both.chosen(Role::Grasp), both.chosen(Role::Release)),
+        (
+            both.chosen(SkillRole::Grasp),
+            both.chosen(SkillRole::Release)
+        ),
         (
             Some("urn:example:gripper#Grasp"),
             Some("urn:example:gripper#Release")
         )
     );
     assert_eq!(
-        why(&both, Role::Grasp, "a-grasps#Grasp"),
+        why(&both, SkillRole::Grasp, "a-grasps#Grasp"),
         "it would fit, but its component has nothing for release"
     );
     let without = plan(&process(), &offers[..4], &[]);
@@ -310,18 +328,21 @@ fn of_several_the_one_that_is_there_longest_is_taken_and_a_name_before_a_subclas
     ]
     .concat();
     let three = plan(&process(), &offers, &[]);
-    assert_eq!(three.chosen(Role::Grasp), Some("urn:example:gripper#Grasp"));
     assert_eq!(
-        why(&three, Role::Grasp, "a-young#Grasp"),
+        three.chosen(SkillRole::Grasp),
+        Some("urn:example:gripper#Grasp")
+    );
+    assert_eq!(
+        why(&three, SkillRole::Grasp, "a-young#Grasp"),
         "it would fit, but gripper.Grasp has been there for longer"
     );
     assert_eq!(
-        why(&three, Role::Grasp, "old#Grasp"),
+        why(&three, SkillRole::Grasp, "old#Grasp"),
         "it would fit, but gripper.Grasp is of just this capability"
     );
     let reversed: Vec<_> = offers.into_iter().rev().collect();
     assert_eq!(
-        plan(&process(), &reversed, &[]).chosen(Role::Grasp),
+        plan(&process(), &reversed, &[]).chosen(SkillRole::Grasp),
         Some("urn:example:gripper#Grasp"),
         "whatever the order"
     );
@@ -340,18 +361,18 @@ fn what_was_lost_is_not_chosen_until_it_comes_anew() {
     assert_eq!(
         (
             without.is_complete(),
-            without.chosen(Role::Grasp),
-            without.chosen(Role::Ptp)
+            without.chosen(SkillRole::Grasp),
+            without.chosen(SkillRole::Ptp)
         ),
         (false, None, Some("urn:example:robot#Ptp"))
     );
     assert_eq!(
-        why(&without, Role::Release, "gripper#Release"),
+        why(&without, SkillRole::Release, "gripper#Release"),
         "it was lost in plan 1"
     );
     let with_another = [offers.clone(), gripper("vacuum")].concat();
     assert_eq!(
-        plan(&process(), &with_another, &lost).chosen(Role::Grasp),
+        plan(&process(), &with_another, &lost).chosen(SkillRole::Grasp),
         Some("urn:example:vacuum#Grasp")
     );
     let mut anew = offers;
@@ -371,7 +392,7 @@ fn one_skill_that_failed_leaves_the_others_of_its_component() {
         why: "it failed".into(),
     }];
     assert_eq!(
-        plan(&process(), &offers, &failed).chosen(Role::Grasp),
+        plan(&process(), &offers, &failed).chosen(SkillRole::Grasp),
         Some("urn:example:gripper#Hold")
     );
 }
@@ -383,7 +404,7 @@ fn a_service_of_a_module_is_told_and_not_chosen() {
     let offers = [robot("robot"), vec![dose]].concat();
     let plan = plan(&process(), &offers, &[]);
     assert_eq!(
-        why(&plan, Role::Grasp, "dosing#Dose"),
+        why(&plan, SkillRole::Grasp, "dosing#Dose"),
         "it is a service in a manifest; `ua-component` with `device: {mtp: ..}` runs it as a skill"
     );
     assert!(!plan.is_complete());
@@ -397,24 +418,24 @@ fn nothing_there_is_told_as_that() {
 
 fn sequence(capabilities: &[&str]) -> Process {
     let steps = capabilities.iter().enumerate();
-    let alone = |(number, capability): (usize, &&str)| Step {
+    let alone = |(number, capability): (usize, &&str)| ProcessStep {
         name: format!("step {number}"),
         needs: vec![Need {
-            role: Role::Alone(number),
+            role: SkillRole::Alone(number),
             capability: Some((*capability).into()),
             skill_type: None,
         }],
-        ..Step::default()
+        ..ProcessStep::default()
     };
     Process {
         steps: steps.map(alone).collect(),
-        work: Job::Sequence,
+        work: StepJob::Sequence,
         ..process()
     }
 }
 
 fn chosen(plan: &Plan, steps: usize) -> Vec<&str> {
-    let chosen = |number| plan.chosen(Role::Alone(number)).unwrap_or("none");
+    let chosen = |number| plan.chosen(SkillRole::Alone(number)).unwrap_or("none");
     (0..steps)
         .map(|number| chosen(number).trim_start_matches("urn:example:"))
         .collect()
@@ -492,7 +513,7 @@ fn the_attached_tool_does_what_it_can() {
     ]
     .concat();
     let mut process = sequence(&["urn:change", GRASP, MOVE, RELEASE]);
-    process.steps[0].parameters = vec![Given {
+    process.steps[0].parameters = vec![GivenParameter {
         name: "ToolAppUri".into(),
         value: "urn:example:vacuum".into(),
         unit: None,
@@ -507,7 +528,7 @@ fn the_attached_tool_does_what_it_can() {
     ];
     assert_eq!(chosen(&attached, 4), expected);
     assert_eq!(
-        why(&attached, Role::Alone(1), "finger#Grasp"),
+        why(&attached, SkillRole::Alone(1), "finger#Grasp"),
         "it is not of the tool urn:example:vacuum, which the step `step 0` attaches"
     );
     // A tool that is not there is waited for, if the process says that it does the step.
@@ -520,7 +541,7 @@ fn the_attached_tool_does_what_it_can() {
         .iter_mut()
         .zip(0..)
         .for_each(|(step, number)| {
-            step.needs[0].role = Role::Alone(number);
+            step.needs[0].role = SkillRole::Alone(number);
         });
     let without = plan(&process, &offers, &[]);
     let expected = "no step before it attaches a tool";
@@ -547,8 +568,8 @@ fn a_skill_that_cannot_take_the_parameters_of_a_step_is_not_chosen() {
 }
 
 /// A parameter that is a result of a step.
-fn result_of(step: usize, name: &str, parameter: &str) -> Given {
-    Given {
+fn result_of(step: usize, name: &str, parameter: &str) -> GivenParameter {
+    GivenParameter {
         name: parameter.into(),
         value: serde_json::Value::Null,
         unit: None,
@@ -569,28 +590,31 @@ fn a_skill_without_the_result_that_a_later_step_takes_is_not_chosen() {
     let found = plan(&process, &offers, &[]);
     assert_eq!(chosen(&found, 2), ["gripper#Grasp", "gripper#Release"]);
     let expected = "Hold has no result GraspWidth";
-    assert_eq!(why(&found, Role::Alone(0), "a-plain#Grasp"), expected);
+    assert_eq!(why(&found, SkillRole::Alone(0), "a-plain#Grasp"), expected);
     // A result of another type is a reason too.
     process.steps[1].parameters[0].name = "Text".into();
     let found = plan(&process, &offers, &[]);
     assert!(!found.is_complete());
     let expected = "Text: GraspWidth is a number";
-    assert_eq!(why(&found, Role::Alone(1), "gripper#Release"), expected);
+    assert_eq!(
+        why(&found, SkillRole::Alone(1), "gripper#Release"),
+        expected
+    );
 }
 
 /// The compensation of the step with a number in a process of two steps.
-fn compensation(number: usize, capability: &str) -> Option<Box<Step>> {
-    let role = Role::Alone(2 + number);
+fn compensation(number: usize, capability: &str) -> Option<Box<ProcessStep>> {
+    let role = SkillRole::Alone(2 + number);
     let need = Need {
         role,
         capability: Some(capability.into()),
         skill_type: None,
     };
-    Some(Box::new(Step {
+    Some(Box::new(ProcessStep {
         name: format!("compensation of step {number}"),
         needs: vec![need],
         by: By::SameAs(number),
-        ..Step::default()
+        ..ProcessStep::default()
     }))
 }
 
@@ -610,14 +634,14 @@ fn a_component_that_cannot_undo_its_step_is_not_chosen() {
     );
     let expected =
         "it would fit, but its component has nothing for the step `compensation of step 0`";
-    assert_eq!(why(&with, Role::Alone(0), "a-grasps#Grasp"), expected);
+    assert_eq!(why(&with, SkillRole::Alone(0), "a-grasps#Grasp"), expected);
 }
 
 #[test]
 fn a_step_that_is_done_keeps_its_component_in_the_next_plan() {
     let offers = [gripper("a"), gripper("b"), robot("robot")].concat();
     let process = sequence(&[GRASP, MOVE, RELEASE]);
-    let kept = [Kept {
+    let kept = [KeptStep {
         number: 0,
         offer: offers[2].clone(),
     }];
@@ -631,7 +655,7 @@ fn a_step_that_is_done_keeps_its_component_in_the_next_plan() {
     let next = with(&offers);
     assert_eq!(chosen(&next, 3), ["b#Grasp", "robot#Lin", "b#Release"]);
     let expected = "b has done the step `step 0`, and has to do this one too";
-    assert_eq!(why(&next, Role::Alone(2), "a#Release"), expected);
+    assert_eq!(why(&next, SkillRole::Alone(2), "a#Release"), expected);
     // The component was lost meanwhile, and may not hold the part any more.
     let mut anew = offers.clone();
     anew[2].since_ms = 99;
@@ -640,7 +664,7 @@ fn a_step_that_is_done_keeps_its_component_in_the_next_plan() {
     assert_eq!(chosen(&next, 3), ["b#Grasp", "robot#Lin", "none"]);
     assert!(!next.is_complete() && next.is_hopeless());
     let expected = "its component was lost after it had done the step `step 0`";
-    assert_eq!(why(&next, Role::Alone(2), "b#Release"), expected);
+    assert_eq!(why(&next, SkillRole::Alone(2), "b#Release"), expected);
     // A missing robot may come.
     let next = with(&offers[..4]);
     assert!(!next.is_complete() && !next.is_hopeless());
@@ -660,10 +684,10 @@ fn a_component_that_another_run_uses_is_not_chosen_and_an_attached_tool_stays_at
     let found = with(&sequence(&[GRASP, RELEASE]));
     assert_eq!(chosen(&found, 2), ["b#Grasp", "b#Release"]);
     let expected = "it would fit, but the run urn:run:1 uses its component";
-    assert_eq!(why(&found, Role::Alone(0), "a#Grasp"), expected);
+    assert_eq!(why(&found, SkillRole::Alone(0), "a#Grasp"), expected);
     let mut process = sequence(&["urn:change", GRASP]);
-    process.steps[0].needs[0].skill_type = Some(TypeName::own("ChangeToolSkillType"));
-    process.steps[0].parameters = vec![Given {
+    process.steps[0].needs[0].skill_type = Some(ParameterType::own("ChangeToolSkillType"));
+    process.steps[0].parameters = vec![GivenParameter {
         name: "ToolAppUri".into(),
         value: "urn:example:a".into(),
         unit: None,

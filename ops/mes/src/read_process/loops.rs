@@ -2,11 +2,11 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use knowledge::Answer;
+use knowledge::QuestionAnswer;
 use serde_json::Value;
 
 use super::{Row, conditions_of, one};
-use crate::process::{Loop, Step};
+use crate::process::{Loop, ProcessStep};
 
 /// Reads the loops of a process. `order` has the IRIs of the steps.
 ///
@@ -14,14 +14,14 @@ use crate::process::{Loop, Step};
 /// The reason why the process cannot run.
 pub(super) fn loops_of(
     process: &str,
-    (order, steps): (&[&str], &[Step]),
+    (order, steps): (&[&str], &[ProcessStep]),
     (loops, conditions): (&[Row], &[Row]),
 ) -> Result<Vec<Loop>, String> {
     let mut by_loop: BTreeMap<&str, Vec<&Row>> = BTreeMap::new();
-    let of_process = |row: &&Row| Answer::text(row, "process") == process;
+    let of_process = |row: &&Row| QuestionAnswer::text(row, "process") == process;
     for row in loops.iter().filter(of_process) {
         by_loop
-            .entry(Answer::text(row, "loop"))
+            .entry(QuestionAnswer::text(row, "loop"))
             .or_default()
             .push(row);
     }
@@ -51,7 +51,7 @@ pub(super) fn loops_of(
 
 fn read(iri: &str, rows: &[&Row], order: &[&str], conditions: &[Row]) -> Result<Loop, String> {
     let mut steps = BTreeSet::new();
-    let named = rows.iter().map(|row| Answer::text(row, "step"));
+    let named = rows.iter().map(|row| QuestionAnswer::text(row, "step"));
     for step in named.filter(|step| !step.is_empty()) {
         let number = order.iter().position(|known| *known == step);
         steps.insert(number.ok_or_else(|| format!("repeats {step}, which is no step"))?);
@@ -84,7 +84,7 @@ fn rounds(value: &Value) -> Option<u32> {
 }
 
 /// Returns a step outside a loop for which the loop waits, and which waits for the loop.
-fn caught(one: &Loop, steps: &[Step]) -> Option<usize> {
+fn caught(one: &Loop, steps: &[ProcessStep]) -> Option<usize> {
     let mut behind: BTreeSet<usize> = BTreeSet::new();
     for (number, step) in steps.iter().enumerate() {
         let waits = step.waits_for(number);

@@ -12,10 +12,12 @@ use mtp::escaped;
 use roxmltree::Node;
 use serde_json::Value;
 
-use super::flow::{Edge, Flow, MOST_FLOW_NODES, NodeCondition, NodeKind, Sequence, too_large};
-use super::values::{self, Written};
+use super::flow::{
+    Edge, Flow, FlowNodeKind, MOST_FLOW_NODES, NodeCondition, RecipeSequence, too_large,
+};
+use super::values::{self, WrittenValue};
 use super::{Reading, child, children, text_of};
-use crate::process::{Given, Job, Need, Process, ResultOf, Role, Step};
+use crate::process::{GivenParameter, Need, Process, ProcessStep, ResultOf, SkillRole, StepJob};
 use crate::read_process::{USUALLY_WAIT, USUALLY_WITHIN};
 
 pub(super) const NAMESPACE: &str = "http://www.mesa.org/xml/B2MML";
@@ -37,7 +39,7 @@ struct RecipeParts<'d> {
 /// The first and the last node of a procedure logic.
 type Ends = (usize, usize);
 
-/// The nodes of a procedure logic, by `Step`, `Transition` or `Link` and the ID.
+/// The nodes of a procedure logic, by `ProcessStep`, `Transition` or `Link` and the ID.
 type Places<'d> = BTreeMap<(&'d str, &'d str), Ends>;
 
 impl<'d> Reading<'d> {
@@ -99,13 +101,15 @@ impl<'d> Reading<'d> {
             steps: BTreeMap::new(),
             results: Vec::new(),
         };
-        let start = parts.flow.node(recipe.range().start, id, NodeKind::Start);
+        let start = parts
+            .flow
+            .node(recipe.range().start, id, FlowNodeKind::Start);
         let (first, _) = self.logic(recipe, &mut parts, &mut vec![recipe])?;
         parts
             .flow
             .edge(start, first, recipe.range().start, Vec::new());
         let flow = self.resolved(parts);
-        let Sequence { steps, loops } = self.sequence(&flow)?;
+        let RecipeSequence { steps, loops } = self.sequence(&flow)?;
         let description = text_of(recipe, "Description");
         Some(Process {
             iri: self.iri(id, "recipe"),
@@ -115,7 +119,7 @@ impl<'d> Reading<'d> {
                 description
             }
             .to_owned(),
-            work: Job::Sequence,
+            work: StepJob::Sequence,
             steps,
             loops,
             within: USUALLY_WITHIN,
@@ -141,7 +145,8 @@ impl<'d> Reading<'d> {
                 );
                 continue;
             };
-            if let Some(NodeKind::Task(task)) = flow.nodes.get_mut(node).map(|node| &mut node.kind)
+            if let Some(FlowNodeKind::Task(task)) =
+                flow.nodes.get_mut(node).map(|node| &mut node.kind)
                 && let Some(given) = task.parameters.get_mut(parameter)
                 && let Some(result) = given.result.as_mut()
             {
@@ -166,8 +171,8 @@ impl<'d> Reading<'d> {
             return None;
         };
         self.only(logic, &["Link", "Step", "Transition"]);
-        let first = parts.flow.node(at, name, NodeKind::Merge);
-        let last = parts.flow.node(at, name, NodeKind::Merge);
+        let first = parts.flow.node(at, name, FlowNodeKind::Merge);
+        let last = parts.flow.node(at, name, FlowNodeKind::Merge);
         let (places, conditions) = self.places((parent, logic), parts, open)?;
         self.links(logic, &places, parts);
         let mut own: Vec<usize> = places
@@ -266,16 +271,16 @@ impl<'d> Reading<'d> {
             let id = text_of(transition, "ID");
             let node = parts
                 .flow
-                .node(transition.range().start, id, NodeKind::Join);
+                .node(transition.range().start, id, FlowNodeKind::Join);
             conditions.insert(node, transition);
             places.insert(("Transition", id), (node, node));
         }
         for link in children(logic, "Link") {
             let kind = match text_of(link, "LinkType") {
                 "ControlLink" | "ParallelDivergent" | "SerialDivergent" | "SerialConvergent" => {
-                    NodeKind::Merge
+                    FlowNodeKind::Merge
                 }
-                "ParallelConvergent" => NodeKind::Join,
+                "ParallelConvergent" => FlowNodeKind::Join,
                 other => {
                     let id = text_of(link, "ID");
                     let what = format!(
@@ -489,7 +494,7 @@ impl<'d> Reading<'d> {
         }
         match text_of(element, "RecipeElementType") {
             "Begin" | "End" => {
-                let node = parts.flow.node(at, id, NodeKind::Merge);
+                let node = parts.flow.node(at, id, FlowNodeKind::Merge);
                 return Some((node, node));
             }
             "Allocation" => {
@@ -497,7 +502,7 @@ impl<'d> Reading<'d> {
                     "the allocation `{of}` is left out: the plan chooses and reserves components"
                 );
                 self.note(element, what);
-                let node = parts.flow.node(at, id, NodeKind::Merge);
+                let node = parts.flow.node(at, id, FlowNodeKind::Merge);
                 return Some((node, node));
             }
             _ => {}
@@ -522,13 +527,13 @@ impl<'d> Reading<'d> {
         } else {
             description
         };
-        let task = Step {
+        let task = ProcessStep {
             name: name.to_owned(),
             needs: vec![need],
             parameters,
-            ..Step::default()
+            ..ProcessStep::default()
         };
-        let node = parts.flow.node(at, id, NodeKind::Task(Box::new(task)));
+        let node = parts.flow.node(at, id, FlowNodeKind::Task(Box::new(task)));
         let known = parts.steps.entry(id);
         known
             .and_modify(|known| *known = None)
@@ -563,7 +568,7 @@ impl<'d> Reading<'d> {
         {
             let equipment = escaped(self.named(equipment));
             return Some(Need {
-                role: Role::Alone(0),
+                role: SkillRole::Alone(0),
                 capability: None,
                 skill_type: format!(
                     "nsu=urn:ua-bridge:mtp:{equipment};{service}-{procedure}SkillType"
@@ -589,8 +594,8 @@ impl<'d> Reading<'d> {
         element: Node<'d, 'd>,
         node: usize,
         parts: &mut RecipeParts<'d>,
-    ) -> Vec<Given> {
-        let mut all: Vec<Given> = Vec::new();
+    ) -> Vec<GivenParameter> {
+        let mut all: Vec<GivenParameter> = Vec::new();
         for parameter in children(element, "Parameter") {
             let id = text_of(parameter, "ID");
             if text_of(parameter, "ParameterType") == "ProcessOutput" {
@@ -645,7 +650,7 @@ impl<'d> Reading<'d> {
         parameter: Node<'d, 'd>,
         name: &str,
         parts: &RecipeParts<'d>,
-    ) -> Option<(Given, Option<String>)> {
+    ) -> Option<(GivenParameter, Option<String>)> {
         let mut parameter = parameter;
         for _ in 0..MOST_LEVELS {
             let mut values = children(parameter, "Value");
@@ -689,7 +694,7 @@ impl<'d> Reading<'d> {
                         parameter = *other;
                         continue;
                     }
-                    if let Written::Result(step, result) = values::value(&format!("={text}")) {
+                    if let WrittenValue::Result(step, result) = values::value(&format!("={text}")) {
                         let mut given = values::given(name, Value::Null, None);
                         given.result = Some(ResultOf {
                             step: usize::MAX,
@@ -743,8 +748,10 @@ fn constant(texts: &[&str], kind: &str) -> Option<Value> {
             },
             "string" | "text" | "identifier" => Some(Value::String(text.to_owned())),
             "" | "other" => match values::value(text) {
-                Written::Value { value, unit: None } => Some(value),
-                Written::Value { .. } | Written::Result(..) => Some(Value::String(text.to_owned())),
+                WrittenValue::Value { value, unit: None } => Some(value),
+                WrittenValue::Value { .. } | WrittenValue::Result(..) => {
+                    Some(Value::String(text.to_owned()))
+                }
             },
             _ => {
                 let value: Value = serde_json::from_str(text).ok()?;

@@ -10,10 +10,10 @@ use std::time::Duration;
 
 use roxmltree::Node;
 
-use super::flow::{self, Flow, NodeCondition, NodeKind, Sequence};
-use super::values::{self, Written};
+use super::flow::{self, Flow, FlowNodeKind, NodeCondition, RecipeSequence};
+use super::values::{self, WrittenValue};
 use super::{Reading, child, children, text_of};
-use crate::process::{BadEnd, Given, Job, Process, ResultOf, Step, Test};
+use crate::process::{BadEnd, GivenParameter, Process, ProcessStep, ResultOf, StepJob, Test};
 use crate::read_process::{USUALLY_WAIT, USUALLY_WITHIN};
 
 pub(super) const NAMESPACE: &str = "http://www.omg.org/spec/BPMN/20100524/MODEL";
@@ -70,7 +70,7 @@ impl<'d> Reading<'d> {
                 );
                 continue;
             };
-            if let Some(NodeKind::Task(task)) =
+            if let Some(FlowNodeKind::Task(task)) =
                 parts.flow.nodes.get_mut(node).map(|node| &mut node.kind)
                 && let Some(result) = task
                     .parameters
@@ -83,11 +83,11 @@ impl<'d> Reading<'d> {
         if self.errors.len() > before {
             return None;
         }
-        let Sequence { steps, loops } = self.sequence(&parts.flow)?;
+        let RecipeSequence { steps, loops } = self.sequence(&parts.flow)?;
         Some(Process {
             iri: self.iri(id, "bpmn"),
             name: process.attribute("name").unwrap_or(id).to_owned(),
-            work: Job::Sequence,
+            work: StepJob::Sequence,
             steps,
             loops,
             within: USUALLY_WITHIN,
@@ -116,8 +116,8 @@ impl<'d> Reading<'d> {
                     );
                 }
                 match kind {
-                    "startEvent" => NodeKind::Start,
-                    _ => NodeKind::Merge,
+                    "startEvent" => FlowNodeKind::Start,
+                    _ => FlowNodeKind::Merge,
                 }
             }
             "serviceTask" => {
@@ -125,18 +125,18 @@ impl<'d> Reading<'d> {
                 let Some(task) = self.task(element, (id, name), node, parts) else {
                     return;
                 };
-                NodeKind::Task(Box::new(task))
+                FlowNodeKind::Task(Box::new(task))
             }
             "exclusiveGateway" => {
                 self.only(element, &common);
                 parts
                     .exclusive
                     .insert(id, element.attribute("default").unwrap_or_default());
-                NodeKind::Merge
+                FlowNodeKind::Merge
             }
             "parallelGateway" => {
                 self.only(element, &common);
-                NodeKind::Join
+                FlowNodeKind::Join
             }
             "sequenceFlow" | "boundaryEvent" => return,
             "documentation"
@@ -182,7 +182,7 @@ impl<'d> Reading<'d> {
         (id, name): (&'d str, &'d str),
         node: usize,
         parts: &mut Parts<'d>,
-    ) -> Option<Step> {
+    ) -> Option<ProcessStep> {
         self.only(
             task,
             &[
@@ -230,11 +230,11 @@ impl<'d> Reading<'d> {
         };
         let given = self.task_parameters((task, name), node, parts);
         self.left_out(task);
-        Some(Step {
+        Some(ProcessStep {
             name: name.to_owned(),
             needs: vec![need],
             parameters: given,
-            ..Step::default()
+            ..ProcessStep::default()
         })
     }
 
@@ -244,8 +244,8 @@ impl<'d> Reading<'d> {
         (task, name): (Node<'d, 'd>, &str),
         node: usize,
         parts: &mut Parts<'d>,
-    ) -> Vec<Given> {
-        let mut given: Vec<Given> = Vec::new();
+    ) -> Vec<GivenParameter> {
+        let mut given: Vec<GivenParameter> = Vec::new();
         for (key, text, at) in inputs(task) {
             let key = self.named(key).to_owned();
             if given.iter().any(|known| known.name == key) {
@@ -256,11 +256,11 @@ impl<'d> Reading<'d> {
                 continue;
             }
             match values::value(text) {
-                Written::Value { value, unit } => {
+                WrittenValue::Value { value, unit } => {
                     let unit = unit.map(|unit| self.named(&unit).to_owned());
                     given.push(values::given(&key, value, unit));
                 }
-                Written::Result(of, result) => {
+                WrittenValue::Result(of, result) => {
                     parts.results.push((node, given.len(), of, at));
                     let mut taken = values::given(&key, serde_json::Value::Null, None);
                     taken.result = Some(ResultOf {
@@ -336,7 +336,7 @@ impl<'d> Reading<'d> {
                     );
                     return;
                 };
-                if let Some(NodeKind::Task(step)) =
+                if let Some(FlowNodeKind::Task(step)) =
                     parts.flow.nodes.get_mut(node).map(|node| &mut node.kind)
                 {
                     step.within = Some(Duration::from_secs_f64(seconds));

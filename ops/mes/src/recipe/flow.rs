@@ -10,7 +10,7 @@ mod loops;
 use std::collections::{BTreeMap, BTreeSet};
 
 use super::Reading;
-use crate::process::{BadEnd, Condition, Loop, Role, Step, Test};
+use crate::process::{BadEnd, Loop, ProcessStep, SkillRole, StepCondition, Test};
 use crate::read_process::MOST_STEPS;
 use loops::FlowLoops;
 
@@ -28,15 +28,15 @@ pub(super) struct FlowNode {
     pub(super) at: usize,
     /// Its name for findings.
     pub(super) name: String,
-    pub(super) kind: NodeKind,
+    pub(super) kind: FlowNodeKind,
 }
 
 #[derive(Debug)]
-pub(super) enum NodeKind {
+pub(super) enum FlowNodeKind {
     /// The process begins here.
     Start,
     /// A step. The steps in its parameters are numbers of nodes.
-    Task(Box<Step>),
+    Task(Box<ProcessStep>),
     /// Goes on when one of the flows to it is done.
     Merge,
     /// Goes on when all flows to it are done.
@@ -54,15 +54,15 @@ pub(super) struct Edge {
 }
 
 /// A condition whose step is the number of a node.
-pub(super) type NodeCondition = Condition;
+pub(super) type NodeCondition = StepCondition;
 
 /// Alternatives, each of which is a list of conditions.
 type Guard = Vec<Vec<NodeCondition>>;
 
 /// The steps of a process in an order in which they can be done, and its loops.
 #[derive(Debug)]
-pub(super) struct Sequence {
-    pub(super) steps: Vec<Step>,
+pub(super) struct RecipeSequence {
+    pub(super) steps: Vec<ProcessStep>,
     pub(super) loops: Vec<Loop>,
 }
 
@@ -76,7 +76,7 @@ struct Paths {
 
 impl Flow {
     /// Adds a node. Returns its number.
-    pub(super) fn node(&mut self, at: usize, name: &str, kind: NodeKind) -> usize {
+    pub(super) fn node(&mut self, at: usize, name: &str, kind: FlowNodeKind) -> usize {
         self.nodes.push(FlowNode {
             at,
             name: name.to_owned(),
@@ -108,7 +108,7 @@ impl Flow {
 
     fn is_task(&self, node: usize) -> bool {
         let node = self.nodes.get(node);
-        node.is_some_and(|node| matches!(node.kind, NodeKind::Task(_)))
+        node.is_some_and(|node| matches!(node.kind, FlowNodeKind::Task(_)))
     }
 }
 
@@ -131,7 +131,7 @@ pub(super) fn ended_well(step: usize, handled: &[BadEnd]) -> Vec<NodeCondition> 
 
 impl Reading<'_> {
     /// Returns the steps of a flow in an order in which they can be done, and its loops.
-    pub(super) fn sequence(&mut self, flow: &Flow) -> Option<Sequence> {
+    pub(super) fn sequence(&mut self, flow: &Flow) -> Option<RecipeSequence> {
         let before = self.errors.len();
         if flow.nodes.len() > MOST_FLOW_NODES {
             let at = flow.nodes.first().map_or(0, |node| node.at);
@@ -177,7 +177,7 @@ impl Reading<'_> {
             .collect();
         let steps = self.steps(flow, &tasks, &paths, &numbers);
         let loops = self.loops((flow, &loops), &paths, &numbers);
-        (self.errors.len() == before).then_some(Sequence { steps, loops })
+        (self.errors.len() == before).then_some(RecipeSequence { steps, loops })
     }
 
     /// Returns the steps of tasks in their order, with the numbers of steps in the place of those
@@ -188,12 +188,12 @@ impl Reading<'_> {
         tasks: &[usize],
         paths: &Paths,
         numbers: &BTreeMap<usize, usize>,
-    ) -> Vec<Step> {
+    ) -> Vec<ProcessStep> {
         let mut steps = Vec::new();
         for (number, node) in tasks.iter().enumerate() {
             let Some(FlowNode {
                 at,
-                kind: NodeKind::Task(step),
+                kind: FlowNodeKind::Task(step),
                 ..
             }) = flow.nodes.get(*node)
             else {
@@ -202,7 +202,7 @@ impl Reading<'_> {
             let mut step = (**step).clone();
             let guard = paths.guards.get(*node).cloned().unwrap_or_default();
             for need in &mut step.needs {
-                need.role = Role::Alone(number);
+                need.role = SkillRole::Alone(number);
             }
             self.results(&mut step, (*at, &guard), flow, (&paths.guards, numbers));
             let is_always = guard.iter().any(Vec::is_empty);
@@ -295,7 +295,7 @@ impl Reading<'_> {
     /// Resolves the steps whose results are parameters: they are done whenever the step is reached.
     fn results(
         &mut self,
-        step: &mut Step,
+        step: &mut ProcessStep,
         (at, guard): (usize, &Guard),
         flow: &Flow,
         (guards, numbers): (&[Guard], &BTreeMap<usize, usize>),
@@ -342,7 +342,7 @@ impl Reading<'_> {
                 continue;
             }
             ready.insert(number);
-            if !matches!(node.kind, NodeKind::Start) {
+            if !matches!(node.kind, FlowNodeKind::Start) {
                 let what = format!("`{}` is not reached from the start", node.name);
                 self.error_at(node.at, what);
             }
@@ -378,7 +378,7 @@ impl Reading<'_> {
         paths: &Paths,
     ) -> Option<(Guard, BTreeSet<usize>)> {
         let here = flow.nodes.get(node)?;
-        if matches!(here.kind, NodeKind::Start) {
+        if matches!(here.kind, FlowNodeKind::Start) {
             return Some((vec![Vec::new()], BTreeSet::new()));
         }
         let mut waits = BTreeSet::new();
@@ -395,7 +395,7 @@ impl Reading<'_> {
             }
         }
         let guard = match here.kind {
-            NodeKind::Join => {
+            FlowNodeKind::Join => {
                 let (first, rest) = incoming.split_first()?;
                 if rest
                     .iter()
@@ -408,7 +408,7 @@ impl Reading<'_> {
                 }
                 first.clone()
             }
-            NodeKind::Merge | NodeKind::Task(_) | NodeKind::Start => {
+            FlowNodeKind::Merge | FlowNodeKind::Task(_) | FlowNodeKind::Start => {
                 for (number, one) in incoming.iter().enumerate() {
                     let mut later = incoming.iter().skip(number + 1);
                     if later.any(|other| !excludes(one, other)) {

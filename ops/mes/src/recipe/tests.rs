@@ -5,12 +5,12 @@ use std::time::Duration;
 use serde_json::json;
 
 use super::*;
-use crate::process::{BadEnd, Compare, Condition, Step, Test};
+use crate::process::{BadEnd, Compare, ProcessStep, StepCondition, Test};
 
 const BATCH: &str = include_str!("../../../../examples/plant/batch.xml");
 const BPMN: &str = include_str!("../../../../examples/plant/batch.bpmn");
 
-fn steps(text: &str) -> Vec<Step> {
+fn steps(text: &str) -> Vec<ProcessStep> {
     let recipe = read(text, &Names::new()).unwrap();
     let [process] = recipe.processes.as_slice() else {
         panic!("{recipe:?}")
@@ -18,7 +18,7 @@ fn steps(text: &str) -> Vec<Step> {
     process.steps.clone()
 }
 
-fn names(steps: &[Step]) -> Vec<&str> {
+fn names(steps: &[ProcessStep]) -> Vec<&str> {
     steps.iter().map(|step| step.name.as_str()).collect()
 }
 
@@ -44,7 +44,7 @@ fn a_master_recipe_is_a_process_with_the_order_of_its_procedure_logic() {
         .map(|(number, step)| step.waits_for(number))
         .collect();
     assert_eq!(waits, [vec![], vec![0], vec![], vec![1, 2]]);
-    let need = |step: &Step| step.needs.first().cloned().unwrap();
+    let need = |step: &ProcessStep| step.needs.first().cloned().unwrap();
     assert_eq!(need(&steps[0]).capability, None, "`Dosing:Fill` is no IRI");
     assert_eq!(
         need(&steps[0]).skill_type.unwrap().to_string(),
@@ -164,7 +164,7 @@ fn branches_of_a_recipe_have_the_conditions_of_their_transitions() {
     let named = ["a", "b", "c"].map(|name| (name.to_owned(), format!("urn:c:{name}")));
     let recipe = read(text, &Names::from(named.clone())).unwrap();
     let steps = &recipe.processes[0].steps;
-    let low = |is_negated| Condition {
+    let low = |is_negated| StepCondition {
         step: 0,
         test: Test::Result {
             name: "Level".to_owned(),
@@ -199,7 +199,7 @@ fn a_bpmn_process_has_parallel_branches_and_handlers_of_bad_ends() {
             "empty the mixer"
         ]
     );
-    let ended = |step, end, is_negated| Condition {
+    let ended = |step, end, is_negated| StepCondition {
         step,
         test: Test::Ended(end),
         is_negated,
@@ -212,7 +212,7 @@ fn a_bpmn_process_has_parallel_branches_and_handlers_of_bad_ends() {
     assert_eq!(waits[..2], *none, "both begin at once");
     assert_eq!(steps[2].when, [[ended(0, BadEnd::Failed, false)]]);
     // The branches meet again: the step behind them runs in every case.
-    assert_eq!(steps[3].when, Vec::<Vec<Condition>>::new());
+    assert_eq!(steps[3].when, Vec::<Vec<StepCondition>>::new());
     assert_eq!(steps[3].after.as_deref(), Some(&[0, 1, 2][..]));
     assert_eq!(steps[3].within, Some(Duration::from_secs(20)));
     assert_eq!(steps[4].when, [[ended(3, BadEnd::TimedOut, false)]]);
@@ -318,7 +318,7 @@ fn recipes_come_back_from_the_graph_as_they_were() {
     for text in [BATCH, BPMN] {
         let recipe = read(text, &Names::new()).unwrap();
         let knowledge = knowledge::Knowledge::new().unwrap();
-        let source = knowledge::Source::new(knowledge::SourceKind::Process, "a recipe");
+        let source = knowledge::KnowledgeSource::new(knowledge::SourceKind::Process, "a recipe");
         let triples = recipe.processes[0].triples(&|_| None);
         knowledge.replace(&source, &triples, 1).unwrap();
         let read = crate::read_process::Processes::read(&knowledge).unwrap();

@@ -3,11 +3,11 @@
 use serde_json::Value;
 
 use super::flow::NodeCondition;
-use crate::process::{Compare, Given, Test};
+use crate::process::{Compare, GivenParameter, Test};
 
 /// A value in a text, or a reference to a result of an earlier step.
 #[derive(Debug, Clone, PartialEq)]
-pub(super) enum Written {
+pub(super) enum WrittenValue {
     Value {
         value: Value,
         unit: Option<String>,
@@ -18,32 +18,32 @@ pub(super) enum Written {
 
 /// Reads a value as `5`, `2.5 l`, `true`, `[1, 2]` or a text, or a reference as `${step.Result}` or
 /// `=step.Result`.
-pub(super) fn value(text: &str) -> Written {
+pub(super) fn value(text: &str) -> WrittenValue {
     let text = text.trim();
     if let Some(expression) = expression(text) {
         if let Some((step, result)) = reference(expression) {
-            return Written::Result(step.to_owned(), result.to_owned());
+            return WrittenValue::Result(step.to_owned(), result.to_owned());
         }
         return plain(expression);
     }
     plain(text)
 }
 
-fn plain(text: &str) -> Written {
+fn plain(text: &str) -> WrittenValue {
     if let Ok(value) = serde_json::from_str(text) {
-        return Written::Value { value, unit: None };
+        return WrittenValue::Value { value, unit: None };
     }
     let with_unit = text
         .split_once(char::is_whitespace)
         .and_then(|(number, unit)| {
             let value: Value = serde_json::from_str(number).ok().filter(Value::is_number)?;
             let unit = unit.trim();
-            (!unit.is_empty() && !unit.contains(char::is_whitespace)).then(|| Written::Value {
+            (!unit.is_empty() && !unit.contains(char::is_whitespace)).then(|| WrittenValue::Value {
                 value,
                 unit: Some(unit.to_owned()),
             })
         });
-    with_unit.unwrap_or_else(|| Written::Value {
+    with_unit.unwrap_or_else(|| WrittenValue::Value {
         value: Value::String(text.to_owned()),
         unit: None,
     })
@@ -118,8 +118,8 @@ pub(super) fn condition(
 }
 
 /// Returns a parameter with a value.
-pub(super) fn given(name: &str, value: Value, unit: Option<String>) -> Given {
-    Given {
+pub(super) fn given(name: &str, value: Value, unit: Option<String>) -> GivenParameter {
+    GivenParameter {
         name: name.to_owned(),
         value,
         unit,

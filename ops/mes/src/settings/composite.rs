@@ -1,12 +1,12 @@
 //! The work of a process whose steps one composite does together.
 
-use skills::yaml::{Code, Node};
+use skills::yaml::{DocumentNode, YamlFindingCode};
 
 use super::Reading;
 use crate::read_process::USUALLY_APPROACH;
 
 impl Reading<'_> {
-    pub(super) fn job(&mut self, node: &Node) -> Option<skills::Job> {
+    pub(super) fn job(&mut self, node: &DocumentNode) -> Option<skills::Job> {
         let keys = ["pick", "place", "approach", "shape"];
         let [pick, place, approach, shape] = self.reader.map(node, keys)?;
         let pick = self
@@ -32,14 +32,14 @@ impl Reading<'_> {
         })
     }
 
-    fn position(&mut self, node: &Node) -> Option<[f64; 6]> {
+    fn position(&mut self, node: &DocumentNode) -> Option<[f64; 6]> {
         let numbers: Vec<f64> = self.each(node, |reading, node| {
             reading.reader.number(node, (-1000.0, 1000.0))
         });
         numbers.try_into().ok().or_else(|| {
             self.reader.refuse(
                 node,
-                Code::WrongValue,
+                YamlFindingCode::WrongValue,
                 "a position is six numbers: m, m, m, rad, rad, rad".to_owned(),
             )
         })

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 
-use skills::yaml::{Code, Kind, Node};
+use skills::yaml::{DocumentKind, DocumentNode, YamlFindingCode};
 
 use super::Reading;
 use crate::recipe::Names;
@@ -55,7 +55,7 @@ pub(crate) enum Connect {
 }
 
 impl Reading<'_> {
-    pub(super) fn files(&mut self, node: &Node) -> Vec<Source> {
+    pub(super) fn files(&mut self, node: &DocumentNode) -> Vec<Source> {
         self.each(node, |reading, node| {
             let name = reading.reader.text(node, "the path of a file")?;
             Some(reading.source(name, name))
@@ -70,15 +70,15 @@ impl Reading<'_> {
     }
 
     /// Checks that no two files of the graph have one name.
-    pub(super) fn files_once(&mut self, root: &Node, files: &[Source], rml: &[RmlSource]) {
+    pub(super) fn files_once(&mut self, root: &DocumentNode, files: &[Source], rml: &[RmlSource]) {
         let names = files.iter().map(|file| &*file.name);
         let names = names.chain(rml.iter().map(|rml| &*rml.mapping.name));
         self.once(root, names, "file");
     }
 
     /// Reads a mapping: its path, or a map.
-    pub(super) fn rml(&mut self, node: &Node) -> Option<RmlSource> {
-        if !matches!(node.kind, Kind::Map(_)) {
+    pub(super) fn rml(&mut self, node: &DocumentNode) -> Option<RmlSource> {
+        if !matches!(node.kind, DocumentKind::Map(_)) {
             let path = self.reader.text(node, "the path of a mapping, or a map")?;
             return Some(RmlSource {
                 mapping: self.source(path, path),
@@ -103,8 +103,8 @@ impl Reading<'_> {
     }
 
     /// Reads a recipe: its path, or a map.
-    pub(super) fn recipe(&mut self, node: &Node) -> Option<RecipeSource> {
-        if !matches!(node.kind, Kind::Map(_)) {
+    pub(super) fn recipe(&mut self, node: &DocumentNode) -> Option<RecipeSource> {
+        if !matches!(node.kind, DocumentKind::Map(_)) {
             let path = self.reader.text(node, "the path of a recipe, or a map")?;
             return Some(RecipeSource {
                 source: self.source(path, path),
@@ -116,7 +116,7 @@ impl Reading<'_> {
         let file = self.reader.text(file, "the path of a recipe")?;
         let mut given = Names::new();
         if let Some(node) = names {
-            let Kind::Map(pairs) = &node.kind else {
+            let DocumentKind::Map(pairs) = &node.kind else {
                 self.reader
                     .wrong(node, "a map from names of the recipe to names here");
                 return None;
@@ -138,7 +138,7 @@ impl Reading<'_> {
         })
     }
 
-    pub(super) fn manifest(&mut self, node: &Node) -> Option<Manifest> {
+    pub(super) fn manifest(&mut self, node: &DocumentNode) -> Option<Manifest> {
         let keys = ["name", "file", "iri", "capabilities", "connect"];
         let [name, file, iri, capabilities, connect] = self.reader.map(node, keys)?;
         let connect = match connect {
@@ -158,14 +158,14 @@ impl Reading<'_> {
             None => file.map(str::to_owned),
         };
         let iri = match iri {
-            Some(node) => self.iri(node, Code::Uri),
+            Some(node) => self.iri(node, YamlFindingCode::Uri),
             None => name
                 .as_deref()
                 .map(|name| format!("urn:ua-bridge:mtp:{}", mtp::escaped(name))),
         };
         let mut told = BTreeMap::new();
         if let Some(node) = capabilities {
-            let Kind::Map(pairs) = &node.kind else {
+            let DocumentKind::Map(pairs) = &node.kind else {
                 self.reader.wrong(
                     node,
                     "a map from the name of a service to IRIs of capabilities",
@@ -176,8 +176,9 @@ impl Reading<'_> {
                 let Some(service) = self.reader.text(service, "the name of a service") else {
                     continue;
                 };
-                let classes =
-                    self.each(classes, |reading, node| reading.iri(node, Code::Capability));
+                let classes = self.each(classes, |reading, node| {
+                    reading.iri(node, YamlFindingCode::Capability)
+                });
                 told.insert(service.to_owned(), classes);
             }
         }

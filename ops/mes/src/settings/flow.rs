@@ -1,22 +1,22 @@
 //! The order, the conditions and the time limit of a step of a sequence.
 
-use skills::yaml::{Code, Kind, Node};
+use skills::yaml::{DocumentKind, DocumentNode, YamlFindingCode};
 
 use super::{Reading, plain, shortened};
-use crate::process::{BadEnd, Compare, Condition, Step, Test};
+use crate::process::{BadEnd, Compare, ProcessStep, StepCondition, Test};
 
 impl Reading<'_> {
     /// Reads the keys `after`, `when` and `within` of a step, which follows these steps.
     pub(super) fn flow(
         &mut self,
-        step: &mut Step,
-        [after, when, within]: [Option<&Node>; 3],
-        earlier: &[Step],
+        step: &mut ProcessStep,
+        [after, when, within]: [Option<&DocumentNode>; 3],
+        earlier: &[ProcessStep],
     ) -> Option<()> {
         if let Some(node) = after {
             let mut numbers = match &node.kind {
-                Kind::Scalar(_) => vec![self.earlier(node, earlier)?],
-                Kind::List(_) | Kind::Map(_) | Kind::Null => {
+                DocumentKind::Scalar(_) => vec![self.earlier(node, earlier)?],
+                DocumentKind::List(_) | DocumentKind::Map(_) | DocumentKind::Null => {
                     let count = self.reader.list(node).len();
                     let read = self.each(node, |reading, node| reading.earlier(node, earlier));
                     (read.len() == count).then_some(read)?
@@ -28,8 +28,8 @@ impl Reading<'_> {
         }
         if let Some(node) = when {
             let conditions = match &node.kind {
-                Kind::Map(_) => vec![self.condition(node, earlier)?],
-                Kind::List(_) | Kind::Scalar(_) | Kind::Null => {
+                DocumentKind::Map(_) => vec![self.condition(node, earlier)?],
+                DocumentKind::List(_) | DocumentKind::Scalar(_) | DocumentKind::Null => {
                     let count = self.reader.list(node).len();
                     let read = self.each(node, |reading, node| reading.condition(node, earlier));
                     (read.len() == count).then_some(read)?
@@ -44,7 +44,7 @@ impl Reading<'_> {
     }
 
     /// Reads a condition: a result of an earlier step, or its end.
-    fn condition(&mut self, node: &Node, earlier: &[Step]) -> Option<Condition> {
+    fn condition(&mut self, node: &DocumentNode, earlier: &[ProcessStep]) -> Option<StepCondition> {
         let keys = ["of", "result", "is", "ended", "not"];
         let [of, result, is, ended, not] = self.reader.map(node, keys)?;
         let of = self.reader.needed(of, "of", node.place)?;
@@ -53,7 +53,9 @@ impl Reading<'_> {
             Some(end) => {
                 if let Some(other) = result.or(is) {
                     let why = "a condition is about a result or about an end";
-                    return self.reader.refuse(other, Code::WrongValue, why.to_owned());
+                    return self
+                        .reader
+                        .refuse(other, YamlFindingCode::WrongValue, why.to_owned());
                 }
                 Test::Ended(self.bad_end(end)?)
             }
@@ -82,14 +84,14 @@ impl Reading<'_> {
             Some(not) => self.reader.boolean(not)?,
             None => false,
         };
-        Some(Condition {
+        Some(StepCondition {
             step,
             test,
             is_negated,
         })
     }
 
-    fn bad_end(&mut self, node: &Node) -> Option<BadEnd> {
+    fn bad_end(&mut self, node: &DocumentNode) -> Option<BadEnd> {
         let text = self.reader.text(node, "failed or timed out")?;
         let all = [BadEnd::Failed, BadEnd::TimedOut];
         let found = all.into_iter().find(|end| end.name() == text);
@@ -98,7 +100,7 @@ impl Reading<'_> {
                 "expected `failed` or `timed out`, found `{}`",
                 shortened(text)
             );
-            self.reader.refuse(node, Code::WrongValue, why)
+            self.reader.refuse(node, YamlFindingCode::WrongValue, why)
         })
     }
 }

@@ -1,5 +1,5 @@
 use super::*;
-use crate::process::{BadEnd, Compare, Condition, Test};
+use crate::process::{BadEnd, Compare, StepCondition, Test};
 
 const EXAMPLE: &str = include_str!("../../../../examples/plant/mes.yaml");
 
@@ -20,13 +20,13 @@ fn the_example_is_read_as_it_stands() {
     let grasp = process.steps[0]
         .needs
         .iter()
-        .find(|need| need.role == Role::Grasp)
+        .find(|need| need.role == SkillRole::Grasp)
         .unwrap();
     assert_eq!(
         grasp.capability.as_deref(),
         Some("urn:example:capability:grasp")
     );
-    assert_eq!(grasp.skill_type, Some(TypeName::own("GraspSkillType")));
+    assert_eq!(grasp.skill_type, Some(ParameterType::own("GraspSkillType")));
     assert_eq!(
         settings.knowledge[0].path,
         Path::new("examples/plant/capabilities.ttl")
@@ -60,7 +60,7 @@ fn steps_that_are_done_by_themselves_have_parameters() {
     let [step] = settings.processes[0].steps.as_slice() else {
         panic!()
     };
-    let given = |name: &str, value, unit: Option<&str>| Given {
+    let given = |name: &str, value, unit: Option<&str>| GivenParameter {
         name: name.to_owned(),
         value,
         unit: unit.map(str::to_owned),
@@ -121,7 +121,7 @@ processes:
         [Err(0), Ok(vec![]), Ok(vec![0, 1]), Ok(vec![2]), Err(4)]
     );
     assert_eq!(steps[1].within, Some(std::time::Duration::from_secs(7)));
-    let condition = |step, test, is_negated| Condition {
+    let condition = |step, test, is_negated| StepCondition {
         step,
         test,
         is_negated,

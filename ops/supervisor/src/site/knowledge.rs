@@ -21,11 +21,11 @@ use tracing::{info, warn};
 
 use super::{RequestBody, bytes};
 use crate::fetch::FetchFault;
-use crate::mes::{Credentials, Mes, MesFault, SourceFile, source_kind};
+use crate::mes::{MesClient, MesCredentials, MesFault, SourceFile, source_kind};
 use crate::operations::Operations;
 use crate::page::Page;
-use crate::responses::{Refusal, json_page};
-use crate::session::Session;
+use crate::responses::{RefusedRequest, json_page};
+use crate::session::BrowserSession;
 use crate::table::MOST_ROWS;
 use crate::value::cut;
 use crate::view::pairs;
@@ -44,7 +44,7 @@ pub(super) const LOAD: &str = "/knowledge/load";
 /// The body of a query: SPARQL, or a named question with its parameters.
 #[derive(Deserialize)]
 #[serde(untagged)]
-pub(super) enum Query {
+pub(super) enum QueryBody {
     /// A query of SPARQL.
     Sparql { query: String },
     /// A named question.
@@ -61,7 +61,7 @@ pub(super) fn media(path: &str) -> Option<&'static str> {
 }
 
 /// Answers with the named questions, or with the plan of a process.
-pub(super) async fn read(page: &Page, uri: &Uri) -> Result<Response<PageBody>, Refusal> {
+pub(super) async fn read(page: &Page, uri: &Uri) -> Result<Response<PageBody>, RefusedRequest> {
     let _place = page
         .places
         .queries
@@ -76,14 +76,18 @@ pub(super) async fn read(page: &Page, uri: &Uri) -> Result<Response<PageBody>, R
         }
         return Ok(json_page(&shown));
     }
-    let process = parameter(uri, "process")
-        .ok_or_else(|| Refusal::new(StatusCode::BAD_REQUEST, "name the process as ?process=IRI"))?;
+    let process = parameter(uri, "process").ok_or_else(|| {
+        RefusedRequest::new(StatusCode::BAD_REQUEST, "name the process as ?process=IRI")
+    })?;
     let plan = mes.plan(&process).await.map_err(refusal)?;
     Ok(json_page(&plan))
 }
 
 /// Answers a query.
-pub(super) async fn query(page: &Page, query: Query) -> Result<Response<PageBody>, Refusal> {
+pub(super) async fn query(
+    page: &Page,
+    query: QueryBody,
+) -> Result<Response<PageBody>, RefusedRequest> {
     let _place = page
         .places
         .queries
@@ -91,8 +95,8 @@ pub(super) async fn query(page: &Page, query: Query) -> Result<Response<PageBody
         .map_err(|_| busy("queries"))?;
     let mes = mes(page).await?;
     let table = match query {
-        Query::Sparql { query } => mes.query(query).await,
-        Query::Named {
+        QueryBody::Sparql { query } => mes.query(query).await,
+        QueryBody::Named {
             question,
             parameters,
         } => mes.ask(&question, parameters.iter()).await,
@@ -105,9 +109,9 @@ pub(super) async fn query(page: &Page, query: Query) -> Result<Response<PageBody
 pub(super) async fn upload(
     page: &Arc<Page>,
     operations: &dyn Operations,
-    session: &Session,
+    session: &BrowserSession,
     request: Request<impl RequestBody>,
-) -> Result<Response<PageBody>, Refusal> {
+) -> Result<Response<PageBody>, RefusedRequest> {
     let user = session.user.as_str();
     require_role(operations, user)?;
     let loads = request.uri().path() == LOAD;
@@ -118,7 +122,7 @@ pub(super) async fn upload(
     let mes = mes(page).await?;
     if !uri_text::is_loopback_host(mes.authority()) {
         let why = "ua-mes is not on this host: load the file there with ua-space source add";
-        return Err(Refusal::new(StatusCode::CONFLICT, why));
+        return Err(RefusedRequest::new(StatusCode::CONFLICT, why));
     }
     let (page, user) = (Arc::clone(page), user.to_owned());
     let (answer, done) = oneshot::channel();
@@ -136,12 +140,12 @@ pub(super) async fn upload(
     }));
     let done = done.await.unwrap_or_else(|_| {
         let why = "the outcome is unknown: the page has failed";
-        Err(Refusal::new(StatusCode::GATEWAY_TIMEOUT, why))
+        Err(RefusedRequest::new(StatusCode::GATEWAY_TIMEOUT, why))
     });
     done.map(|answer| json_page(&answer))
 }
 
-fn require_role(operations: &dyn Operations, user: &str) -> Result<(), Refusal> {
+fn require_role(operations: &dyn Operations, user: &str) -> Result<(), RefusedRequest> {
     if operations.may_load(user) {
         return Ok(());
     }
@@ -150,7 +154,7 @@ fn require_role(operations: &dyn Operations, user: &str) -> Result<(), Refusal> 
         "refused to load a source on the page: no role engineer"
     );
     let why = format!("{user} has no role that permits it: sources need the role engineer");
-    Err(Refusal::new(StatusCode::FORBIDDEN, why))
+    Err(RefusedRequest::new(StatusCode::FORBIDDEN, why))
 }
 
 /// Logs the check or the load of a file.
@@ -163,23 +167,23 @@ fn report(user: &str, file: &SourceFile, outcome: &str) {
 }
 
 /// Returns the outcome of a file for the log.
-fn outcome(done: &Result<Value, Refusal>) -> &'static str {
+fn outcome(done: &Result<Value, RefusedRequest>) -> &'static str {
     match done {
         Ok(answer) if answer["needs_password"] == true => "no user of ua-mes",
         Ok(answer) if answer["loaded"] == true => "loaded",
         Ok(answer) if answer["accepted"] == true => "checked",
         Ok(_) => "not accepted",
-        Err(Refusal(StatusCode::GATEWAY_TIMEOUT, _)) => "unknown",
+        Err(RefusedRequest(StatusCode::GATEWAY_TIMEOUT, _)) => "unknown",
         Err(_) => "refused",
     }
 }
 
 /// Returns the file of a request, whose kind its name and its contents show.
-async fn source_file(request: Request<impl RequestBody>) -> Result<SourceFile, Refusal> {
+async fn source_file(request: Request<impl RequestBody>) -> Result<SourceFile, RefusedRequest> {
     let name = parameter(request.uri(), "name").unwrap_or_default();
     if name.is_empty() || name.len() > LONGEST_NAME {
         let why = "name the file as ?name=FILE, in at most 256 bytes";
-        return Err(Refusal::new(StatusCode::BAD_REQUEST, why));
+        return Err(RefusedRequest::new(StatusCode::BAD_REQUEST, why));
     }
     let contents = file(request).await?;
     // The search of a large file would keep the thread of the program.
@@ -191,7 +195,7 @@ async fn source_file(request: Request<impl RequestBody>) -> Result<SourceFile, R
              NodeSet, a manifest or a recipe",
             cut(&name, 100)
         );
-        Refusal::new(StatusCode::BAD_REQUEST, why)
+        RefusedRequest::new(StatusCode::BAD_REQUEST, why)
     })?;
     Ok(SourceFile {
         kind,
@@ -203,15 +207,16 @@ async fn source_file(request: Request<impl RequestBody>) -> Result<SourceFile, R
 /// Checks a file, and loads it if it was accepted and `loads` is still true.
 async fn checked(
     page: &Page,
-    mes: &Mes,
-    (file, by): (&SourceFile, Option<&Credentials>),
+    mes: &MesClient,
+    (file, by): (&SourceFile, Option<&MesCredentials>),
     loads: impl Fn() -> bool,
-) -> Result<Value, Refusal> {
+) -> Result<Value, RefusedRequest> {
     if let Some(by) = by {
         let now = page.at().since;
         let may_try = page.sessions().may_try(&by.user, now);
-        may_try
-            .map_err(|locked| Refusal::new(StatusCode::TOO_MANY_REQUESTS, locked.to_string()))?;
+        may_try.map_err(|locked| {
+            RefusedRequest::new(StatusCode::TOO_MANY_REQUESTS, locked.to_string())
+        })?;
         // Counted before the check, so that attempts at the same time are limited too.
         page.sessions().fail(&by.user, now);
     }
@@ -242,7 +247,7 @@ async fn checked(
 }
 
 /// Returns the user of `ua-mes`: the signed-in user, with the password that the request has for it.
-fn credentials(headers: &HeaderMap, user: &str) -> Result<Option<Credentials>, Refusal> {
+fn credentials(headers: &HeaderMap, user: &str) -> Result<Option<MesCredentials>, RefusedRequest> {
     let Some(given) = headers.get("x-mes-password") else {
         return Ok(None);
     };
@@ -250,16 +255,16 @@ fn credentials(headers: &HeaderMap, user: &str) -> Result<Option<Credentials>, R
     let password = decoded.and_then(|bytes| String::from_utf8(bytes).ok());
     let password = password.ok_or_else(|| {
         let why = "the password for ua-mes is not in base64 of UTF-8";
-        Refusal::new(StatusCode::BAD_REQUEST, why)
+        RefusedRequest::new(StatusCode::BAD_REQUEST, why)
     })?;
-    Ok(Some(Credentials {
+    Ok(Some(MesCredentials {
         user: user.to_owned(),
         password,
     }))
 }
 
 /// Returns the file in a request.
-async fn file(request: Request<impl RequestBody>) -> Result<Bytes, Refusal> {
+async fn file(request: Request<impl RequestBody>) -> Result<Bytes, RefusedRequest> {
     let length = request.headers().get(CONTENT_LENGTH);
     let length = length.and_then(|length| length.to_str().ok()?.parse::<usize>().ok());
     let too_large = || {
@@ -267,22 +272,22 @@ async fn file(request: Request<impl RequestBody>) -> Result<Bytes, Refusal> {
             "the file has more than {} MiB: load it with ua-space source add",
             LARGEST_FILE >> 20
         );
-        Refusal::new(StatusCode::PAYLOAD_TOO_LARGE, why)
+        RefusedRequest::new(StatusCode::PAYLOAD_TOO_LARGE, why)
     };
     if length.is_some_and(|length| length > LARGEST_FILE) {
         return Err(too_large());
     }
     let read = bytes(request, (LARGEST_FILE, FILE_TIME)).await;
-    read.map_err(|Refusal(status, why)| match status {
+    read.map_err(|RefusedRequest(status, why)| match status {
         StatusCode::PAYLOAD_TOO_LARGE => too_large(),
-        status => Refusal(status, why),
+        status => RefusedRequest(status, why),
     })
 }
 
-async fn mes(page: &Page) -> Result<Mes, Refusal> {
+async fn mes(page: &Page) -> Result<MesClient, RefusedRequest> {
     page.mes().await.ok_or_else(|| {
         let why = "no ua-mes is known: name the address of its --sparql with --status URL";
-        Refusal::new(StatusCode::NOT_FOUND, why)
+        RefusedRequest::new(StatusCode::NOT_FOUND, why)
     })
 }
 
@@ -292,12 +297,12 @@ fn parameter(uri: &Uri, name: &str) -> Option<String> {
     values.next().map(|(_, value)| value)
 }
 
-fn busy(of: &str) -> Refusal {
+fn busy(of: &str) -> RefusedRequest {
     let why = format!("other {of} are being answered: try again in a few seconds");
-    Refusal::new(StatusCode::SERVICE_UNAVAILABLE, why)
+    RefusedRequest::new(StatusCode::SERVICE_UNAVAILABLE, why)
 }
 
-fn refusal(fault: MesFault) -> Refusal {
+fn refusal(fault: MesFault) -> RefusedRequest {
     let status = match &fault {
         // The user is still signed in on the page.
         MesFault::Refused { status, .. } if *status == StatusCode::UNAUTHORIZED => {
@@ -309,18 +314,18 @@ fn refusal(fault: MesFault) -> Refusal {
             StatusCode::BAD_GATEWAY
         }
     };
-    Refusal(status, fault.to_string())
+    RefusedRequest(status, fault.to_string())
 }
 
 /// Returns the refusal of a change: without a response the change may have been made.
-fn unknown_or_refused(fault: MesFault) -> Refusal {
+fn unknown_or_refused(fault: MesFault) -> RefusedRequest {
     let was_sent = matches!(
         fault,
         MesFault::Fetch(FetchFault::Late(_) | FetchFault::Exchange(_)) | MesFault::TooLarge
     );
     if was_sent {
         let why = format!("the outcome is unknown, the file may have been loaded: {fault}");
-        return Refusal(StatusCode::GATEWAY_TIMEOUT, why);
+        return RefusedRequest(StatusCode::GATEWAY_TIMEOUT, why);
     }
     refusal(fault)
 }

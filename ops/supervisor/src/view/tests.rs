@@ -1,14 +1,14 @@
 use super::*;
 use crate::board::tests::{at, take, topic};
-use crate::program::Program;
+use crate::program::ProgramStatus;
 
 fn data(event: &str) -> Value {
     let data = event.strip_prefix("event: view\ndata: ").unwrap();
     serde_json::from_str(data.trim_end()).unwrap()
 }
 
-fn filled(count: u16) -> Board {
-    let mut board = Board::default();
+fn filled(count: u16) -> CellBoard {
+    let mut board = CellBoard::default();
     for id in 1..=count {
         take(&mut board, TopicId::new(1, 2, id).unwrap(), id.into(), 0);
     }
@@ -24,17 +24,17 @@ fn the_query_names_the_view() {
         only_bad: true,
     };
     let query = "view=values&from=20&count=40&filter=Arm+%41&only=bad";
-    assert_eq!(View::parse(query), Ok(View::Values(window)));
-    assert_eq!(View::parse("view=skills"), Ok(View::Skills));
+    assert_eq!(BrowserView::parse(query), Ok(BrowserView::Values(window)));
+    assert_eq!(BrowserView::parse("view=skills"), Ok(BrowserView::Skills));
     for wrong in ["", "view=all", "view=values&from=x", "view=topic&topic=x"] {
-        assert!(View::parse(wrong).is_err(), "{wrong}");
+        assert!(BrowserView::parse(wrong).is_err(), "{wrong}");
     }
 }
 
 #[test]
 fn only_visible_rows_are_sent_and_only_if_they_have_changed() {
     let mut board = filled(1000);
-    let view = View::parse("view=values&from=100&count=20").unwrap();
+    let view = BrowserView::parse("view=values&from=100&count=20").unwrap();
     let mut viewer = Viewer::new(view);
     let first = data(&viewer.next(&mut board, at(0).since).unwrap());
     assert_eq!(first["total"], 1000);
@@ -54,7 +54,7 @@ fn only_visible_rows_are_sent_and_only_if_they_have_changed() {
 #[test]
 fn a_browser_that_does_not_read_costs_nothing_and_then_gets_the_last_value() {
     let mut board = filled(1);
-    let mut viewer = Viewer::new(View::parse("view=values&count=10").unwrap());
+    let mut viewer = Viewer::new(BrowserView::parse("view=values&count=10").unwrap());
     viewer.next(&mut board, at(0).since).unwrap();
     for millis in 0..1000 {
         take(&mut board, topic("ua_1_2_1"), 0.5 + f64::from(millis), 1000);
@@ -66,8 +66,8 @@ fn a_browser_that_does_not_read_costs_nothing_and_then_gets_the_last_value() {
 
 #[test]
 fn a_quiet_view_is_kept_alive() {
-    let mut board = Board::default();
-    let mut viewer = Viewer::new(View::Map);
+    let mut board = CellBoard::default();
+    let mut viewer = Viewer::new(BrowserView::Map);
     assert!(viewer.next(&mut board, at(0).since).is_some());
     assert_eq!(viewer.next(&mut board, at(1000).since), None);
     let alive = viewer.next(&mut board, at(6000).since).unwrap();
@@ -76,8 +76,8 @@ fn a_quiet_view_is_kept_alive() {
 
 #[test]
 fn each_event_is_sent_once() {
-    let mut board = Board::default();
-    let mut viewer = Viewer::new(View::Events);
+    let mut board = CellBoard::default();
+    let mut viewer = Viewer::new(BrowserView::Events);
     let first = data(&viewer.next(&mut board, at(0).since).unwrap());
     assert_eq!(
         (&first["all"], &first["events"]),
@@ -85,7 +85,7 @@ fn each_event_is_sent_once() {
     );
     assert_eq!(viewer.next(&mut board, at(250).since), None);
     for number in 1..3_u8 {
-        let sample = crate::board::Sample {
+        let sample = crate::board::BoardSample {
             topic: topic("ua_1_2_1"),
             block: &vec![1, 0, 3, number].into(),
             source: None,
@@ -97,9 +97,9 @@ fn each_event_is_sent_once() {
         assert_eq!(next["events"][0]["text"], number.to_string());
     }
     assert_eq!(viewer.next(&mut board, at(750).since), None);
-    let named = crate::announced::Description {
+    let named = crate::announced::AnnouncedValue {
         name: "Storage.Covers".to_owned(),
-        ..crate::announced::Description::default()
+        ..crate::announced::AnnouncedValue::default()
     };
     board.describe(topic("ua_1_2_1"), named);
     let renamed = data(&viewer.next(&mut board, at(1000).since).unwrap());
@@ -111,7 +111,7 @@ fn each_event_is_sent_once() {
 fn bad_values_can_be_shown_alone() {
     let mut board = filled(3);
     board.set_silent(topic("ua_1_2_2"), true);
-    let mut viewer = Viewer::new(View::parse("view=values&only=bad").unwrap());
+    let mut viewer = Viewer::new(BrowserView::parse("view=values&only=bad").unwrap());
     let shown = data(&viewer.next(&mut board, at(0).since).unwrap());
     assert_eq!(shown["order"], json!(["ua_1_2_2"]));
     assert_eq!(shown["rows"]["ua_1_2_2"]["quality"], "no data");
@@ -119,8 +119,8 @@ fn bad_values_can_be_shown_alone() {
 
 #[test]
 fn a_missing_topic_has_reasons() {
-    let mut board = Board::default();
-    board.set_programs(vec![Program {
+    let mut board = CellBoard::default();
+    board.set_programs(vec![ProgramStatus {
         source: "this program".to_owned(),
         status: Ok(json!({
             "program": "bridge-ros1", "space": 1, "not_ready": ["no ROS master answers"],
@@ -146,7 +146,7 @@ fn the_map_shows_rates_and_programs_that_are_not_ready() {
     for millis in (1000..7000).step_by(100) {
         take(&mut board, topic("ua_1_2_1"), 1.0, millis);
     }
-    board.set_programs(vec![Program {
+    board.set_programs(vec![ProgramStatus {
         source: String::new(),
         status: Ok(json!({ "program": "bridge-ros1", "space": 1, "not_ready": ["x"] })),
     }]);
@@ -161,14 +161,14 @@ fn the_map_shows_rates_and_programs_that_are_not_ready() {
 
 #[test]
 fn the_knowledge_has_a_mes_once_its_status_was_read() {
-    let mut board = Board::default();
-    let mut viewer = Viewer::new(View::parse("view=knowledge").unwrap());
-    let mut shown = |board: &mut Board, millis| {
+    let mut board = CellBoard::default();
+    let mut viewer = Viewer::new(BrowserView::parse("view=knowledge").unwrap());
+    let mut shown = |board: &mut CellBoard, millis| {
         let event = viewer.next(board, at(millis).since);
         event.map(|event| data(&event)["mes"].clone())
     };
     assert_eq!(shown(&mut board, 0), Some(Value::Null), "not known yet");
-    let program = |status| Program {
+    let program = |status| ProgramStatus {
         source: "http://127.0.0.1:8087".to_owned(),
         status: Ok(status),
     };

@@ -8,7 +8,8 @@ use uadp::action::{
     ActionState,
 };
 use uadp::{
-    DataSetHeader, Extras, Keys, NetworkHeader, PublisherId, Sealer, SecurityMode, SecurityPolicy,
+    DataSetHeader, Extras, NetworkHeader, PublisherId, Sealer, SecurityMode, SecurityPolicy,
+    TokenKeys,
 };
 
 use crate::program::run_on;
@@ -114,7 +115,7 @@ fn what_is_wrong_with_an_action_is_told_with_its_place() {
 
 #[test]
 fn an_action_that_is_not_opened_is_written_again_as_it_was() {
-    let keys = Keys::from_bytes(SecurityPolicy::PubSubAes128Ctr, &[7; 52]).unwrap();
+    let keys = TokenKeys::from_bytes(SecurityPolicy::PubSubAes128Ctr, &[7; 52]).unwrap();
     let mut sealer = Sealer::new(SecurityMode::SignAndEncrypt);
     sealer.update_keys(3, [keys]).unwrap();
     let seal = sealer.seal([1, 2, 3, 4]).unwrap();

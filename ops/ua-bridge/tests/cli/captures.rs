@@ -4,8 +4,8 @@ use std::net::Ipv6Addr;
 
 use serde_json::{Value, json};
 
-use crate::program::{Ended, file, run, run_on};
-use crate::vectors::Vector;
+use crate::program::{ProgramEnd, file, run, run_on};
+use crate::vectors::DatagramVector;
 
 const ETHERNET: u16 = 1;
 const LINUX_SLL2: u16 = 276;
@@ -109,12 +109,12 @@ fn ethernet(packet: &[u8]) -> Vec<u8> {
 
 /// Returns a vector as a frame to port 4840.
 fn frame(name: &str) -> Vec<u8> {
-    ethernet(&ipv4(0, &udp(4840, &Vector::load(name).bytes())))
+    ethernet(&ipv4(0, &udp(4840, &DatagramVector::load(name).bytes())))
 }
 
 /// Returns the decoded output of a vector without a capture.
 fn shown(name: &str) -> Value {
-    let shown = run_on(&["decode", "-"], Vector::load(name).hex.as_bytes()).quiet();
+    let shown = run_on(&["decode", "-"], DatagramVector::load(name).hex.as_bytes()).quiet();
     serde_json::from_str(&shown).unwrap()
 }
 
@@ -129,7 +129,7 @@ fn alone(mut object: Value) -> Value {
     object
 }
 
-fn decode(name: &str, capture: &[u8], more: &[&str]) -> Ended {
+fn decode(name: &str, capture: &[u8], more: &[&str]) -> ProgramEnd {
     let file = file(name, capture);
     run(&[&["decode", &file][..], more].concat())
 }
@@ -158,7 +158,7 @@ fn every_datagram_of_a_pcap_is_a_line_with_time_and_addresses() {
 
 #[test]
 fn a_pcapng_may_mix_link_layers_and_address_families() {
-    let payload = |name: &str| Vector::load(name).bytes();
+    let payload = |name: &str| DatagramVector::load(name).bytes();
     let vlan = [
         &[0; 12][..],
         &[0x81, 0, 0, 5, 0x08, 0],
@@ -204,7 +204,7 @@ fn one_bad_datagram_does_not_stop_the_others_and_ends_with_65() {
     let said = "offset 1, PublisherId type: the reserved value 0x6";
     assert_eq!(
         alone(lines[1].clone()),
-        json!({ "malformed": said, "datagramHex": Vector::load(names[1]).hex })
+        json!({ "malformed": said, "datagramHex": DatagramVector::load(names[1]).hex })
     );
     let place = "packet 2, 10.0.0.1:40000 to 224.0.0.22:4840";
     assert!(
@@ -224,7 +224,7 @@ fn one_bad_datagram_does_not_stop_the_others_and_ends_with_65() {
 
 #[test]
 fn the_port_says_what_is_looked_at() {
-    let to = |port, name| ethernet(&ipv4(0, &udp(port, &Vector::load(name).bytes())));
+    let to = |port, name| ethernet(&ipv4(0, &udp(port, &DatagramVector::load(name).bytes())));
     // A name query, and a malformed datagram to an unusual port.
     let dns = [
         0x31, 0x01, 1, 0, 0, 1, 0, 0, 0, 0, 0, 0, 4, b'r', b'o', b's', b'1', 0, 0, 1, 0, 1,
@@ -263,7 +263,7 @@ fn the_port_says_what_is_looked_at() {
 
 #[test]
 fn fragments_are_put_together_and_missing_ones_told() {
-    let body = udp(4840, &Vector::load("bench_bytestring_1k").bytes());
+    let body = udp(4840, &DatagramVector::load("bench_bytestring_1k").bytes());
     let (first, rest) = body.split_at(800);
     let pieces = [ipv4(0x2000, first), ipv4(100, rest)];
     let ended = decode("pieces.pcap", &pcap(RAW, &pieces), &[]);
@@ -347,8 +347,8 @@ fn chunks_are_shown_and_put_together() {
 
 #[test]
 fn an_announcement_in_chunks_is_read_as_a_whole() {
-    let json = Vector::load("composite_announce_metadata").json;
-    let body = Vector::load("composite_announce_metadata").hex[22..].to_owned();
+    let json = DatagramVector::load("composite_announce_metadata").json;
+    let body = DatagramVector::load("composite_announce_metadata").hex[22..].to_owned();
     let (first, second) = body.split_at(200);
     let chunk = |offset: usize, data: &str| {
         json!({
@@ -429,7 +429,7 @@ fn secured_datagrams_of_a_capture_are_opened_each_with_its_keys() {
     let capture = pcap(ETHERNET, &names.map(frame));
     let keys: Vec<_> = names[..3]
         .iter()
-        .map(|name| Vector::load(name).json["security"].clone())
+        .map(|name| DatagramVector::load(name).json["security"].clone())
         .collect();
     let keys = file("capture.keys.json", json!(keys).to_string());
     let ended = decode("secured.pcap", &capture, &["--keys", &keys]);

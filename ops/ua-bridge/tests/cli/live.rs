@@ -7,22 +7,22 @@ use std::net::{TcpListener, UdpSocket};
 use std::process::{Command, Stdio};
 use std::time::Duration;
 
-use component::Component;
+use component::GroupComponent;
 use serde_json::{Value, json};
 
-use crate::program::{Ended, named, run, run_on};
+use crate::program::{ProgramEnd, named, run, run_on};
 
 fn object(text: &str) -> Value {
     serde_json::from_str(text).unwrap()
 }
 
-fn of(component: &Component, words: &[&str]) -> Ended {
+fn of(component: &GroupComponent, words: &[&str]) -> ProgramEnd {
     run(&component.words(words))
 }
 
 #[test]
 fn topics_and_calls_are_listed_with_what_they_are_whatever_else_is_in_the_group() {
-    let component = Component::start();
+    let component = GroupComponent::start();
     let group = component.address;
     let noise = std::thread::spawn(move || {
         let socket = UdpSocket::bind("127.0.0.1:0").unwrap();
@@ -77,7 +77,7 @@ fn topics_and_calls_are_listed_with_what_they_are_whatever_else_is_in_the_group(
 
 #[test]
 fn a_pipe_gets_a_table_without_colour() {
-    let component = Component::start();
+    let component = GroupComponent::start();
     let ended = of(&component, &["list", "--topics", "--seconds", "1.5"]).quiet();
     let mut lines = ended.lines();
     let head = lines.next().unwrap();
@@ -94,7 +94,7 @@ fn a_pipe_gets_a_table_without_colour() {
 
 #[test]
 fn a_value_is_echoed_field_by_field_under_its_names_and_counted() {
-    let component = Component::start();
+    let component = GroupComponent::start();
     let ended = of(&component, &["echo", "/ua_0_7_101", "-n", "2", "--json"]);
     let lines = ended.lines();
     assert_eq!((ended.code, lines.len()), (0, 2), "{ended:?}");
@@ -126,7 +126,7 @@ fn a_value_is_echoed_field_by_field_under_its_names_and_counted() {
 
 #[test]
 fn a_topic_is_known_by_its_name_to_every_verb() {
-    let component = Component::start();
+    let component = GroupComponent::start();
     for name in ["gripper.Grasp.State", "Grasp.State", "grasp.state"] {
         let ended = of(&component, &["echo", name, "-n", "1", "--json"]);
         let lines = ended.lines();
@@ -150,7 +150,7 @@ fn a_topic_is_known_by_its_name_to_every_verb() {
 
 #[test]
 fn an_unknown_name_is_reported_with_the_name_that_may_be_meant() {
-    let component = Component::start();
+    let component = GroupComponent::start();
     let words = ["echo", "gripper.Grasp.Stat", "--seconds", "4"];
     let ended = of(&component, &words);
     assert_eq!((ended.code, ended.stdout.as_str()), (69, ""));
@@ -165,7 +165,7 @@ fn an_unknown_name_is_reported_with_the_name_that_may_be_meant() {
 
 #[test]
 fn of_a_topic_nobody_sends_it_is_told_what_there_is() {
-    let component = Component::start();
+    let component = GroupComponent::start();
     let ended = of(&component, &["echo", "ua_0_7_99", "--seconds", "0.5"]);
     assert_eq!((ended.code, ended.stdout.as_str()), (69, ""));
     assert!(
@@ -185,7 +185,7 @@ fn of_a_topic_nobody_sends_it_is_told_what_there_is() {
 
 #[test]
 fn a_call_says_what_it_takes_and_gives() {
-    let component = Component::start();
+    let component = GroupComponent::start();
     let text = of(&component, &["info", "ua_0_7_105", "--seconds", "1"]).quiet();
     for line in [
         "name:        gripper.Grasp.Start",
@@ -198,7 +198,7 @@ fn a_call_says_what_it_takes_and_gives() {
 
 #[test]
 fn the_skills_are_listed_with_their_states_and_how_to_start_them() {
-    let component = Component::start();
+    let component = GroupComponent::start();
     let all = object(&of(&component, &["skills", "--json", "--seconds", "1.5"]).quiet());
     let skill = &all[0];
     assert_eq!(
@@ -229,7 +229,7 @@ fn the_skills_are_listed_with_their_states_and_how_to_start_them() {
 
 #[test]
 fn a_skill_is_started_by_its_name_and_followed_to_its_result() {
-    let component = Component::start();
+    let component = GroupComponent::start();
     let ended = of(&component, &["call", "gripper.Grasp", "Force=12.5"]);
     assert_eq!(
         (ended.code, ended.stderr.as_str()),
@@ -268,7 +268,7 @@ fn a_skill_is_started_by_its_name_and_followed_to_its_result() {
 
 #[test]
 fn answers_count_only_from_the_sender_that_announced_the_call() {
-    let component = Component::start_beside_a_forger();
+    let component = GroupComponent::start_beside_a_forger();
     let ended = of(&component, &["call", "gripper.Grasp", "Force=12.5"]);
     assert_eq!(ended.code, 0, "{ended:?}");
     assert!(ended.stdout.contains("\nrun: 1\n"), "{}", ended.stdout);
@@ -279,7 +279,7 @@ fn answers_count_only_from_the_sender_that_announced_the_call() {
 
 #[test]
 fn what_is_wrong_with_parameters_is_said_before_anything_moves() {
-    let component = Component::start();
+    let component = GroupComponent::start();
     let help = "this call takes Force: Double, [Name: String]";
     for (words, why) in [
         (&["call", "gripper.Grasp"][..], "Force is missing"),
@@ -323,7 +323,7 @@ fn what_is_wrong_with_parameters_is_said_before_anything_moves() {
 
 #[test]
 fn ctrl_c_halts_the_run_and_says_how_it_ended() {
-    let component = Component::start();
+    let component = GroupComponent::start();
     let mut child = named("ua-space")
         .args(component.words(&["call", "gripper.Grasp", "Force=0"]))
         .stdout(Stdio::piped())
@@ -363,7 +363,7 @@ fn ctrl_c_halts_the_run_and_says_how_it_ended() {
 
 #[test]
 fn a_run_is_followed_although_announcements_are_lost() {
-    let component = Component::start_losing(4);
+    let component = GroupComponent::start_losing(4);
     let mut child = named("ua-space")
         .args(component.words(&["call", "gripper.Grasp", "Force=0"]))
         .stdout(Stdio::piped())
@@ -385,7 +385,7 @@ fn a_run_is_followed_although_announcements_are_lost() {
 
 #[test]
 fn of_who_falls_silent_in_a_call_it_is_said_that_nobody_knows() {
-    let component = Component::start();
+    let component = GroupComponent::start();
     let words = component.words(&["call", "gripper.Grasp", "Force=0", "--json"]);
     let mut child = named("ua-space")
         .args(&words)
@@ -532,7 +532,7 @@ fn a_query_is_sent_as_it_is_and_what_is_wrong_with_it_is_told() {
 
 #[test]
 fn delays_are_told_by_program_and_by_topic() {
-    let component = Component::start();
+    let component = GroupComponent::start();
     let hops = r#"{"program":"bridge-ros1","space":1,"topics":{},
         "hops":{"out":{"count":7,"negative":0,"p50_us":12.5,"p99_us":1500,"max_us":2000000},
                 "in":{"count":0,"negative":0,"p50_us":0,"p99_us":0,"max_us":0}}}"#;

@@ -1,7 +1,7 @@
 //! Messages about datagrams that are malformed, truncated or secured with other keys.
 
 use crate::program::{file, run, run_on};
-use crate::vectors::{Vector, vectors};
+use crate::vectors::{DatagramVector, vectors};
 
 /// The vectors that violate the standard, and the message about each.
 #[test]
@@ -21,14 +21,14 @@ fn malformed_vectors_are_refused_at_the_right_byte() {
             "offset 6, in the discovery message, 9 bytes after the end of the message",
         ),
     ] {
-        let file = file(&format!("{name}.malformed"), Vector::load(name).hex);
+        let file = file(&format!("{name}.malformed"), DatagramVector::load(name).hex);
         let ended = run(&["decode", &file]);
         assert_eq!(ended.code, 65, "{name}");
         let first = ended.stderr.lines().next().unwrap();
         assert_eq!(first, format!("{file}: {said}"));
     }
     // The extra byte turns the Count into another DataSetWriterId, and the rest into a chunk.
-    let vector = Vector::load("asyncua_chunk");
+    let vector = DatagramVector::load("asyncua_chunk");
     assert!(vector.is_malformed());
     let shown = run_on(&["decode", "-"], vector.hex.as_bytes()).quiet();
     assert!(shown.contains("\"dataSetWriterIds\": [1281]"), "{shown}");
@@ -43,7 +43,7 @@ fn malformed_vectors_are_refused_at_the_right_byte() {
 
 #[test]
 fn the_bytes_around_a_fault_are_shown_with_a_caret_below_it() {
-    let vector = Vector::load("asyncua_pubid_uint64");
+    let vector = DatagramVector::load("asyncua_pubid_uint64");
     let ended = run_on(&["decode", "-"], vector.hex.as_bytes());
     assert_eq!(
         ended.stderr,
@@ -135,7 +135,7 @@ fn a_fault_in_a_field_is_named_with_writer_field_and_type() {
 #[test]
 fn one_malformed_message_among_several_does_not_hide_the_others() {
     // Three bytes of the Double of the second message are left.
-    let hex = Vector::load("wire_two_writers").hex;
+    let hex = DatagramVector::load("wire_two_writers").hex;
     let cut = hex
         .replacen("1c001c00", "1c001200", 1)
         .get(..hex.len() - 20)
@@ -164,7 +164,7 @@ fn one_malformed_message_among_several_does_not_hide_the_others() {
 
 #[test]
 fn sizes_that_reach_too_far_are_named() {
-    let hex = Vector::load("wire_two_writers").hex;
+    let hex = DatagramVector::load("wire_two_writers").hex;
     for (sizes, said) in [
         (
             "1c001d00",

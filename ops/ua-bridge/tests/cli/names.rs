@@ -2,7 +2,7 @@
 
 use std::process::Command;
 
-use crate::program::{Ended, named};
+use crate::program::{ProgramEnd, named};
 
 /// The name of each program, and the first argument of `ua-bridge` for the program.
 const NAMES: [(&str, &str); 10] = [
@@ -18,9 +18,9 @@ const NAMES: [(&str, &str); 10] = [
     ("ua-space", "space"),
 ];
 
-fn ended(mut command: Command, words: &[&str]) -> Ended {
+fn ended(mut command: Command, words: &[&str]) -> ProgramEnd {
     let output = command.args(words).output().unwrap();
-    Ended {
+    ProgramEnd {
         code: output.status.code().unwrap(),
         stdout: String::from_utf8(output.stdout).unwrap(),
         stderr: String::from_utf8(output.stderr).unwrap(),

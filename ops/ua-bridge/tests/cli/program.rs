@@ -10,7 +10,7 @@ use serde_json::Value;
 
 /// The exit code and output of the program.
 #[derive(Debug)]
-pub(crate) struct Ended {
+pub(crate) struct ProgramEnd {
     pub(crate) code: i32,
     pub(crate) stdout: String,
     pub(crate) stderr: String,
@@ -24,12 +24,12 @@ pub(crate) fn named(name: &str) -> Command {
 }
 
 /// Runs `ua-space` with empty stdin.
-pub(crate) fn run(words: &[&str]) -> Ended {
+pub(crate) fn run(words: &[&str]) -> ProgramEnd {
     run_on(words, b"")
 }
 
 /// Runs `ua-space` with `stdin`.
-pub(crate) fn run_on(words: &[&str], stdin: &[u8]) -> Ended {
+pub(crate) fn run_on(words: &[&str], stdin: &[u8]) -> ProgramEnd {
     let mut child = named("ua-space")
         .args(words)
         .stdin(Stdio::piped())
@@ -40,14 +40,14 @@ pub(crate) fn run_on(words: &[&str], stdin: &[u8]) -> Ended {
     // The program may end before it has read all input.
     let _written = child.stdin.take().unwrap().write_all(stdin);
     let output = child.wait_with_output().unwrap();
-    Ended {
+    ProgramEnd {
         code: output.status.code().unwrap(),
         stdout: String::from_utf8(output.stdout).unwrap(),
         stderr: String::from_utf8(output.stderr).unwrap(),
     }
 }
 
-impl Ended {
+impl ProgramEnd {
     /// Returns the output of a successful run with empty stderr.
     #[track_caller]
     pub(crate) fn quiet(self) -> String {

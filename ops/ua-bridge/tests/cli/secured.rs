@@ -3,11 +3,11 @@
 use serde_json::{Value, json};
 
 use crate::program::{file, run};
-use crate::vectors::Vector;
+use crate::vectors::DatagramVector;
 
 /// Writes the files of one secured vector, its datagram and its keys, and returns their paths.
 fn files(name: &str, keys: &Value) -> (String, String) {
-    let vector = Vector::load("wire_encrypt_aes128_r0");
+    let vector = DatagramVector::load("wire_encrypt_aes128_r0");
     (
         file(&format!("{name}.hex"), vector.hex),
         file(&format!("{name}.keys.json"), keys.to_string()),
@@ -15,7 +15,7 @@ fn files(name: &str, keys: &Value) -> (String, String) {
 }
 
 fn good_keys() -> Value {
-    Vector::load("wire_encrypt_aes128_r0").json["security"].clone()
+    DatagramVector::load("wire_encrypt_aes128_r0").json["security"].clone()
 }
 
 fn fields(shown: &str) -> Value {
@@ -181,7 +181,7 @@ fn keys_that_are_none_are_refused_with_the_reason() {
 
 #[test]
 fn a_secured_datagram_is_not_written_without_its_keys() {
-    let vector = Vector::load("wire_encrypt_aes128_r0");
+    let vector = DatagramVector::load("wire_encrypt_aes128_r0");
     let json = file("secured.json", vector.json.to_string());
     let ended = run(&["encode", &json]);
     assert_eq!(ended.code, 65);
@@ -195,7 +195,7 @@ fn a_secured_datagram_is_not_written_without_its_keys() {
 fn raw_data_is_read_in_the_way_that_is_asked_for() {
     // The length of an array of four Int32 is a UInt32 in the standard reading and an Int32 in the
     // open62541 reading; the bytes are equal.
-    let vector = Vector::load("raw_array_1d");
+    let vector = DatagramVector::load("raw_array_1d");
     let metadata = &vector.json["dataSetMessages"][0]["metaData"];
     let metadata = file("raw_array_1d.reading", metadata.to_string());
     let hex = file("raw_array_1d.hex", &vector.hex);
@@ -215,7 +215,7 @@ fn raw_data_is_read_in_the_way_that_is_asked_for() {
         );
     }
     // For a matrix the standard encodes the number of dimensions as well.
-    let vector = Vector::load("raw_matrix_2d");
+    let vector = DatagramVector::load("raw_matrix_2d");
     let metadata = &vector.json["dataSetMessages"][0]["metaData"];
     let metadata = file("raw_matrix_2d.reading", metadata.to_string());
     let hex = file("raw_matrix_2d.hex", &vector.hex);
@@ -242,7 +242,7 @@ fn raw_data_is_read_in_the_way_that_is_asked_for() {
 
 #[test]
 fn raw_data_without_metadata_is_shown_as_its_bytes() {
-    let vector = Vector::load("raw_double");
+    let vector = DatagramVector::load("raw_double");
     let hex = file("raw_double.plain", &vector.hex);
     let shown: Value = serde_json::from_str(&run(&["decode", &hex]).quiet()).unwrap();
     let message = &shown["dataSetMessages"][0];
@@ -252,7 +252,7 @@ fn raw_data_without_metadata_is_shown_as_its_bytes() {
 
 #[test]
 fn metadata_is_chosen_by_publisher_group_and_writer() {
-    let vector = Vector::load("raw_double");
+    let vector = DatagramVector::load("raw_double");
     let double = json!([{ "builtInType": 11 }]);
     let entries = json!([
         { "publisherId": 1, "metaData": [{ "builtInType": 8 }] },
@@ -272,7 +272,7 @@ fn metadata_is_chosen_by_publisher_group_and_writer() {
 
 #[test]
 fn what_an_announcement_says_of_the_fields_is_metadata() {
-    let vector = Vector::load("composite_announce_metadata");
+    let vector = DatagramVector::load("composite_announce_metadata");
     let announced = file("announced.hex", &vector.hex);
     let shown: Value = serde_json::from_str(&run(&["decode", &announced]).quiet()).unwrap();
     let fields = &shown["announcement"]["metaData"];
@@ -299,7 +299,10 @@ fn fields_of(shown: &str) -> Vec<Value> {
 
 #[test]
 fn metadata_that_raw_data_cannot_have_is_refused_when_it_is_read() {
-    let hex = file("refused_metadata.hex", Vector::load("raw_double").hex);
+    let hex = file(
+        "refused_metadata.hex",
+        DatagramVector::load("raw_double").hex,
+    );
     for (metadata, said) in [
         (
             json!([{ "builtInType": 22 }]),

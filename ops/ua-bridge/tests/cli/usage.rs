@@ -3,7 +3,7 @@
 use serde_json::{Value, json};
 
 use crate::program::{file, named, run, run_on};
-use crate::vectors::Vector;
+use crate::vectors::DatagramVector;
 
 #[test]
 fn help_and_version_are_told_and_other_words_refused() {
@@ -52,7 +52,7 @@ fn an_output_that_takes_nothing_is_told_with_74() {
         .write(true)
         .open("/dev/full")
         .unwrap();
-    let datagram = file("full.hex", Vector::load("pubid_byte").hex);
+    let datagram = file("full.hex", DatagramVector::load("pubid_byte").hex);
     let output = named("ua-space")
         .args(["decode", &datagram])
         .stdout(full)
@@ -65,7 +65,7 @@ fn an_output_that_takes_nothing_is_told_with_74() {
 
 #[test]
 fn a_datagram_is_read_as_hexadecimal_text_and_as_its_bytes() {
-    let vector = Vector::load("wire_tutorial_layout");
+    let vector = DatagramVector::load("wire_tutorial_layout");
     let wanted = run_on(&["decode", "-"], vector.hex.as_bytes()).quiet();
     let bytes = vector.bytes();
     let words: Vec<_> = bytes.iter().map(|byte| format!("0x{byte:02X}")).collect();
@@ -102,7 +102,7 @@ fn what_holds_no_datagram_is_refused() {
 #[test]
 fn several_datagrams_are_written_a_line_each_and_read_so() {
     let names = ["pubid_byte", "delta_variant", "composite_probe_endpoints"];
-    let vectors = names.map(Vector::load);
+    let vectors = names.map(DatagramVector::load);
     let wanted: String = vectors
         .iter()
         .map(|vector| format!("{}\n", vector.hex))
@@ -121,7 +121,7 @@ fn several_datagrams_are_written_a_line_each_and_read_so() {
     for json in [array, lines] {
         assert_eq!(run_on(&["encode", "-"], json.as_bytes()).quiet(), wanted);
         let raw = file("several.json", &json);
-        let bytes: Vec<_> = vectors.iter().flat_map(Vector::bytes).collect();
+        let bytes: Vec<_> = vectors.iter().flat_map(DatagramVector::bytes).collect();
         let output = named("ua-space")
             .args(["encode", "--raw", &raw])
             .output()

@@ -6,7 +6,7 @@ use std::path::PathBuf;
 use serde_json::{Map, Value};
 
 use crate::normal::normal;
-use crate::program::{Ended, file, run, run_on};
+use crate::program::{ProgramEnd, file, run, run_on};
 
 /// Vectors with JSON that does not encode to their datagram, each with the reason.
 const NOT_WRITTEN: &[(&str, &str)] = &[
@@ -175,14 +175,14 @@ fn symbols(json: &Value) -> Map<String, Value> {
 }
 
 /// A datagram and its content.
-pub(crate) struct Vector {
+pub(crate) struct DatagramVector {
     pub(crate) name: String,
     /// One line of hexadecimal digits without a line end.
     pub(crate) hex: String,
     pub(crate) json: Value,
 }
 
-impl Vector {
+impl DatagramVector {
     pub(crate) fn load(name: &str) -> Self {
         let text = |suffix| fs::read_to_string(folder().join(format!("{name}.{suffix}"))).unwrap();
         Self {
@@ -200,18 +200,18 @@ impl Vector {
     }
 
     /// Decodes the datagram with the keys and metadata of the vector.
-    fn decode(&self) -> Ended {
+    fn decode(&self) -> ProgramEnd {
         let hex = file(&format!("{}.hex", self.name), &self.hex);
         self.with_files("decode", &hex)
     }
 
     /// Encodes JSON with the keys and metadata of this vector.
-    fn encode(&self, json: &str) -> Ended {
+    fn encode(&self, json: &str) -> ProgramEnd {
         let json = file(&format!("{}.json", self.name), json);
         self.with_files("encode", &json)
     }
 
-    fn with_files(&self, verb: &str, input: &str) -> Ended {
+    fn with_files(&self, verb: &str, input: &str) -> ProgramEnd {
         let mut words = vec![verb, input, "--raw-reading", "open62541"];
         let keys = self
             .json
@@ -245,13 +245,13 @@ impl Vector {
     }
 }
 
-pub(crate) fn vectors() -> Vec<Vector> {
+pub(crate) fn vectors() -> Vec<DatagramVector> {
     let manifest = fs::read_to_string(folder().join("MANIFEST.json")).unwrap();
     let manifest: Vec<Value> = serde_json::from_str(&manifest).unwrap();
     assert_eq!(manifest.len(), 195);
     manifest
         .iter()
-        .map(|entry| Vector::load(entry["name"].as_str().unwrap()))
+        .map(|entry| DatagramVector::load(entry["name"].as_str().unwrap()))
         .collect()
 }
 

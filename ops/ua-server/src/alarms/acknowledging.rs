@@ -5,7 +5,7 @@ use mappings::Call;
 use opcua::types::{
     ByteString, LocalizedText, MethodId, NodeId, ObjectTypeId, StatusCode, Variant,
 };
-use plant_opcua::audit::{Action as Audited, Audit};
+use plant_opcua::audit::{Audit, AuditedAction as Audited};
 use uadp::{BuiltinType, Fields, Scalar};
 
 use super::condition::Action;

@@ -83,14 +83,14 @@ impl Levels {
 
 /// The time and the id of an event.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) struct Stamp {
+pub(crate) struct EventStamp {
     pub(crate) time: DateTime,
     pub(crate) id: ByteString,
 }
 
 /// The state of the source of a condition.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) struct Report {
+pub(crate) struct SourceReport {
     pub(crate) levels: Levels,
     pub(crate) severity: u16,
     pub(crate) message: String,
@@ -108,7 +108,7 @@ pub(crate) struct Action {
 
 /// The effect of a report.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Effect {
+pub(crate) enum ReportEffect {
     Nothing,
     /// The nodes change; there is no event, because clients do not track the condition.
     Shown,
@@ -133,7 +133,7 @@ impl TwoState {
 
 /// The state of a condition that events and nodes show.
 #[derive(Debug, Clone, PartialEq)]
-pub(crate) struct State {
+pub(crate) struct AlarmConditionState {
     pub(crate) enabled: TwoState,
     pub(crate) active: TwoState,
     pub(crate) levels: Levels,
@@ -145,10 +145,10 @@ pub(crate) struct State {
     pub(crate) comment: (LocalizedText, DateTime),
     pub(crate) user: String,
     pub(crate) message: String,
-    pub(crate) event: Stamp,
+    pub(crate) event: EventStamp,
 }
 
-impl State {
+impl AlarmConditionState {
     /// Returns true if clients have to track the condition (OPC 10000-9, 5.5.2).
     pub(crate) const fn retain(&self) -> bool {
         self.enabled.on && (self.active.on || !self.acked.on || !self.confirmed.on)
@@ -157,12 +157,12 @@ impl State {
 
 /// A condition that is enabled, acknowledged and confirmed by users.
 #[derive(Debug)]
-pub(crate) struct Condition {
-    state: State,
+pub(crate) struct AlarmCondition {
+    state: AlarmConditionState,
     /// True if acknowledged conditions have to be confirmed.
     confirms: bool,
     /// The last report while the condition is disabled.
-    missed: Option<Report>,
+    missed: Option<SourceReport>,
     /// The ids of the last events, oldest first.
     events: VecDeque<ByteString>,
     /// The ids of the events since the condition became unacknowledged.
@@ -171,16 +171,16 @@ pub(crate) struct Condition {
 
 /// The content of a condition that survives a restart.
 #[derive(Debug, Clone, PartialEq)]
-pub(crate) struct Parts {
-    pub(crate) state: State,
+pub(crate) struct StoredCondition {
+    pub(crate) state: AlarmConditionState,
     pub(crate) events: Vec<ByteString>,
     pub(crate) unacknowledged: Vec<ByteString>,
 }
 
-impl Condition {
+impl AlarmCondition {
     /// Returns the content that survives a restart.
-    pub(crate) fn parts(&self) -> Parts {
-        Parts {
+    pub(crate) fn parts(&self) -> StoredCondition {
+        StoredCondition {
             state: self.state.clone(),
             events: self.events.iter().cloned().collect(),
             unacknowledged: self.unacknowledged.iter().cloned().collect(),
@@ -188,7 +188,7 @@ impl Condition {
     }
 
     /// Replaces the state by the state before a restart.
-    pub(crate) fn restore(&mut self, parts: Parts) {
+    pub(crate) fn restore(&mut self, parts: StoredCondition) {
         let last = |ids: Vec<ByteString>| {
             let over = ids.len().saturating_sub(MOST_EVENTS);
             ids.into_iter().skip(over).collect()
@@ -199,11 +199,11 @@ impl Condition {
     }
 
     /// Creates a condition that is enabled, inactive and acknowledged.
-    pub(crate) fn new(confirms: bool, severity: u16, stamp: Stamp) -> Self {
+    pub(crate) fn new(confirms: bool, severity: u16, stamp: EventStamp) -> Self {
         let at = stamp.time;
         let state = |on| TwoState { on, at };
         Self {
-            state: State {
+            state: AlarmConditionState {
                 enabled: state(true),
                 active: state(false),
                 levels: Levels::NONE,
@@ -224,20 +224,20 @@ impl Condition {
         }
     }
 
-    pub(crate) const fn state(&self) -> &State {
+    pub(crate) const fn state(&self) -> &AlarmConditionState {
         &self.state
     }
 
     /// Applies the state of the source.
-    pub(crate) fn report(&mut self, report: Report, stamp: Stamp) -> Effect {
+    pub(crate) fn report(&mut self, report: SourceReport, stamp: EventStamp) -> ReportEffect {
         if !self.state.enabled.on {
             self.missed = Some(report);
-            return Effect::Nothing;
+            return ReportEffect::Nothing;
         }
         self.apply(report, stamp)
     }
 
-    fn apply(&mut self, report: Report, stamp: Stamp) -> Effect {
+    fn apply(&mut self, report: SourceReport, stamp: EventStamp) -> ReportEffect {
         let state = &mut self.state;
         let was_retained = state.retain();
         let is_same = state.levels == report.levels
@@ -245,7 +245,7 @@ impl Condition {
             && state.quality.0 == report.quality
             && state.message == report.message;
         if is_same {
-            return Effect::Nothing;
+            return ReportEffect::Nothing;
         }
         let at = stamp.time;
         if report.levels.is_worse_than(state.levels) {
@@ -265,14 +265,14 @@ impl Condition {
         }
         state.message = report.message;
         if !was_retained && !state.retain() {
-            return Effect::Shown;
+            return ReportEffect::Shown;
         }
         self.happened(stamp);
-        Effect::Reported
+        ReportEffect::Reported
     }
 
     /// Notes the event of a change.
-    fn happened(&mut self, stamp: Stamp) {
+    fn happened(&mut self, stamp: EventStamp) {
         remember(&mut self.events, &stamp.id);
         if !self.state.acked.on {
             remember(&mut self.unacknowledged, &stamp.id);
@@ -284,7 +284,7 @@ impl Condition {
     ///
     /// # Errors
     /// Returns `BadConditionAlreadyEnabled` for an enabled condition.
-    pub(crate) fn enable(&mut self, user: &str, stamp: Stamp) -> Result<(), StatusCode> {
+    pub(crate) fn enable(&mut self, user: &str, stamp: EventStamp) -> Result<(), StatusCode> {
         if self.state.enabled.on {
             return Err(StatusCode::BadConditionAlreadyEnabled);
         }
@@ -301,7 +301,7 @@ impl Condition {
     ///
     /// # Errors
     /// Returns `BadConditionAlreadyDisabled` for a disabled condition.
-    pub(crate) fn disable(&mut self, user: &str, stamp: Stamp) -> Result<(), StatusCode> {
+    pub(crate) fn disable(&mut self, user: &str, stamp: EventStamp) -> Result<(), StatusCode> {
         if !self.state.enabled.on {
             return Err(StatusCode::BadConditionAlreadyDisabled);
         }
@@ -320,7 +320,7 @@ impl Condition {
         &mut self,
         event: &ByteString,
         action: Action,
-        stamp: Stamp,
+        stamp: EventStamp,
     ) -> Result<(), StatusCode> {
         self.check(event)?;
         if self.state.acked.on {
@@ -347,7 +347,7 @@ impl Condition {
         &mut self,
         event: &ByteString,
         action: Action,
-        stamp: Stamp,
+        stamp: EventStamp,
     ) -> Result<(), StatusCode> {
         if !self.confirms {
             return Err(StatusCode::BadMethodInvalid);
@@ -369,7 +369,7 @@ impl Condition {
         &mut self,
         event: &ByteString,
         action: Action,
-        stamp: Stamp,
+        stamp: EventStamp,
     ) -> Result<(), StatusCode> {
         self.check(event)?;
         self.act(action, stamp);
@@ -391,7 +391,7 @@ impl Condition {
         Ok(())
     }
 
-    fn act(&mut self, action: Action, stamp: Stamp) {
+    fn act(&mut self, action: Action, stamp: EventStamp) {
         let Action { user, comment } = action;
         if !(comment.text.is_null() && comment.locale.is_null()) {
             self.state.comment = (comment, stamp.time);
@@ -419,8 +419,8 @@ mod tests {
     use super::*;
 
     /// Returns the stamp of the event with this number, at as many seconds.
-    fn stamp(number: u8) -> Stamp {
-        Stamp {
+    fn stamp(number: u8) -> EventStamp {
+        EventStamp {
             time: DateTime::from(i64::from(number) * 10_000_000),
             id: event(number),
         }
@@ -430,9 +430,9 @@ mod tests {
         ByteString::from(vec![number])
     }
 
-    fn at(levels: Levels) -> Report {
+    fn at(levels: Levels) -> SourceReport {
         let outer = levels.has(Levels::HIGH_HIGH) || levels.has(Levels::LOW_LOW);
-        Report {
+        SourceReport {
             levels,
             severity: if outer { 750 } else { 500 },
             message: levels.name().to_owned(),
@@ -447,18 +447,18 @@ mod tests {
         }
     }
 
-    fn condition(confirms: bool) -> Condition {
-        let mut condition = Condition::new(confirms, 500, stamp(0));
+    fn condition(confirms: bool) -> AlarmCondition {
+        let mut condition = AlarmCondition::new(confirms, 500, stamp(0));
         assert_eq!(
             condition.report(at(Levels::NONE), stamp(1)),
-            Effect::Shown,
+            ReportEffect::Shown,
             "a normal value is no event"
         );
         condition
     }
 
     /// Returns active, acknowledged, confirmed, retain.
-    fn states(condition: &Condition) -> [bool; 4] {
+    fn states(condition: &AlarmCondition) -> [bool; 4] {
         let state = condition.state();
         [
             state.active.on,
@@ -475,7 +475,7 @@ mod tests {
         assert_eq!(states(&condition), [false, true, true, false]);
         assert_eq!(
             condition.report(at(Levels::HIGH), stamp(2)),
-            Effect::Reported
+            ReportEffect::Reported
         );
         assert_eq!(states(&condition), [true, false, true, true]);
         condition
@@ -484,7 +484,7 @@ mod tests {
         assert_eq!(states(&condition), [true, true, false, true]);
         assert_eq!(
             condition.report(at(Levels::NONE), stamp(4)),
-            Effect::Reported
+            ReportEffect::Reported
         );
         assert_eq!(states(&condition), [false, true, false, true]);
         condition
@@ -509,7 +509,7 @@ mod tests {
             .unwrap();
         assert_eq!(
             condition.report(at(Levels::HIGH), stamp(5)),
-            Effect::Reported
+            ReportEffect::Reported
         );
         assert!(condition.state().acked.on, "a step back needs no attention");
         condition.report(at(Levels::LOW), stamp(6));
@@ -565,7 +565,7 @@ mod tests {
         let mut condition = condition(false);
         condition.disable("anna", stamp(2)).unwrap();
         let missed = condition.report(at(Levels::HIGH), stamp(3));
-        assert_eq!(missed, Effect::Nothing);
+        assert_eq!(missed, ReportEffect::Nothing);
         assert!(!condition.state().active.on);
         condition.enable("anna", stamp(4)).unwrap();
         assert_eq!(states(&condition), [true, false, true, true]);
@@ -600,12 +600,15 @@ mod tests {
         let mut condition = condition(false);
         let mut lost = at(Levels::NONE);
         lost.quality = StatusCode::BadNoCommunication;
-        assert_eq!(condition.report(lost, stamp(2)), Effect::Shown);
+        assert_eq!(condition.report(lost, stamp(2)), ReportEffect::Shown);
         condition.report(at(Levels::HIGH), stamp(3));
         let mut lost = at(Levels::HIGH);
         lost.quality = StatusCode::BadNoCommunication;
-        assert_eq!(condition.report(lost.clone(), stamp(4)), Effect::Reported);
-        assert_eq!(condition.report(lost, stamp(5)), Effect::Nothing);
+        assert_eq!(
+            condition.report(lost.clone(), stamp(4)),
+            ReportEffect::Reported
+        );
+        assert_eq!(condition.report(lost, stamp(5)), ReportEffect::Nothing);
         assert!(condition.state().active.on);
     }
 }

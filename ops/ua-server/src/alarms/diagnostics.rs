@@ -9,11 +9,11 @@ use opcua::types::{NodeId, StatusCode};
 use tracing::warn;
 use uadp::{ExtensionBody, Scalar};
 
-use super::condition::{Levels, Report};
-use super::event::{Identity, Kind};
+use super::condition::{Levels, SourceReport};
+use super::event::{ConditionIdentity, ConditionType};
 use super::{Entry, Inner, Place, stamp};
 use crate::layout::node_id;
-use crate::values::Shown;
+use crate::values::ShownValue;
 
 /// A variable with a DiagnosticArray.
 #[derive(Debug, Clone)]
@@ -42,13 +42,13 @@ impl Origin {
     }
 
     /// Returns true if a condition is of this variable.
-    pub(super) fn has(&self, identity: &Identity) -> bool {
-        identity.kind == Kind::SystemDiagnostic
+    pub(super) fn has(&self, identity: &ConditionIdentity) -> bool {
+        identity.kind == ConditionType::SystemDiagnostic
             && identity.source == self.node
             && identity.confirms == self.confirms
     }
 
-    fn identity(&self, status: &Status<'_>) -> Identity {
+    fn identity(&self, status: &Status<'_>) -> ConditionIdentity {
         let Status { name, hardware, .. } = status;
         let (source_name, shown) = match *hardware {
             "" => (*name, (*name).to_owned()),
@@ -56,9 +56,9 @@ impl Origin {
         };
         // The first slash ends the hardware id.
         let part = hardware.replace('%', "%25").replace('/', "%2F");
-        Identity {
+        ConditionIdentity {
             node: NodeId::new(1, format!("{}.alarm/{part}/{name}", self.topic)),
-            kind: Kind::SystemDiagnostic,
+            kind: ConditionType::SystemDiagnostic,
             source: self.node.clone(),
             source_name: source_name.to_owned(),
             name: shown,
@@ -73,13 +73,13 @@ impl Origin {
 
 /// The last level and message of each status.
 #[derive(Debug, Default)]
-pub(super) struct Diagnostics {
+pub(super) struct StatusLevels {
     last: HashMap<NodeId, (u8, String)>,
     /// Number of statuses without a condition.
     refused: u64,
 }
 
-impl Diagnostics {
+impl StatusLevels {
     /// Keeps the statuses of these conditions only.
     pub(super) fn retain(&mut self, is_kept: impl Fn(&NodeId) -> bool) {
         self.last.retain(|node, _| is_kept(node));
@@ -140,9 +140,9 @@ impl Inner {
     pub(super) fn diagnosed(
         &mut self,
         origin: &Origin,
-        shown: &Shown,
+        shown: &ShownValue,
         place: &Place,
-    ) -> (Vec<Arc<Identity>>, Vec<Arc<Identity>>) {
+    ) -> (Vec<Arc<ConditionIdentity>>, Vec<Arc<ConditionIdentity>>) {
         let (mut new, mut gone) = (Vec::new(), Vec::new());
         let quality = shown.stamp.status;
         let field = shown
@@ -180,7 +180,9 @@ impl Inner {
                     match self.oldest_done() {
                         Some(entry) => {
                             // A status of the same array may give way.
-                            new.retain(|one: &Arc<Identity>| one.node != entry.identity.node);
+                            new.retain(|one: &Arc<ConditionIdentity>| {
+                                one.node != entry.identity.node
+                            });
                             gone.push(entry.identity);
                         }
                         None => {
@@ -208,7 +210,7 @@ impl Inner {
                 // The values of a status change all the time.
                 (false, _) => entry.condition.state().message.clone(),
             };
-            let report = Report {
+            let report = SourceReport {
                 levels: status.levels(),
                 severity: status.severity(origin.severity),
                 message,
@@ -225,7 +227,7 @@ impl Inner {
         let all = self.conditions.values_mut();
         for entry in all.filter(|entry| origin.has(&entry.identity)) {
             let state = entry.condition.state();
-            let report = Report {
+            let report = SourceReport {
                 levels: state.levels,
                 severity: state.severity,
                 message: state.message.clone(),

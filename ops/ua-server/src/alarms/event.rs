@@ -10,11 +10,11 @@ use opcua::types::{
     QualifiedName, Variant,
 };
 
-use super::condition::{Levels, Stamp, State, TwoState};
+use super::condition::{AlarmConditionState, EventStamp, Levels, TwoState};
 
 /// The type of a condition.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Kind {
+pub(crate) enum ConditionType {
     ExclusiveLevel,
     NonExclusiveLevel,
     Discrete,
@@ -25,7 +25,7 @@ pub(crate) enum Kind {
     SystemDiagnostic,
 }
 
-impl Kind {
+impl ConditionType {
     /// Returns the type and its supertypes.
     pub(crate) const fn types(self) -> &'static [ObjectTypeId] {
         match self {
@@ -108,10 +108,10 @@ impl Kind {
 
 /// The constant properties of a condition.
 #[derive(Debug, Clone, PartialEq)]
-pub(crate) struct Identity {
+pub(crate) struct ConditionIdentity {
     /// The ConditionId, which is also the node of the condition.
     pub(crate) node: NodeId,
-    pub(crate) kind: Kind,
+    pub(crate) kind: ConditionType,
     /// The node that the condition is about.
     pub(crate) source: NodeId,
     pub(crate) source_name: String,
@@ -128,14 +128,17 @@ pub(crate) struct Identity {
     pub(crate) delay: Duration,
 }
 
-impl Identity {
+impl ConditionIdentity {
     fn class(&self) -> (ObjectTypeId, &'static str) {
         match self.kind {
-            Kind::SystemOffNormal => (ObjectTypeId::SystemConditionClassType, "System"),
-            Kind::SystemDiagnostic => (ObjectTypeId::MaintenanceConditionClassType, "Maintenance"),
-            Kind::ExclusiveLevel | Kind::NonExclusiveLevel | Kind::Discrete | Kind::OffNormal => {
-                (ObjectTypeId::ProcessConditionClassType, "Process")
+            ConditionType::SystemOffNormal => (ObjectTypeId::SystemConditionClassType, "System"),
+            ConditionType::SystemDiagnostic => {
+                (ObjectTypeId::MaintenanceConditionClassType, "Maintenance")
             }
+            ConditionType::ExclusiveLevel
+            | ConditionType::NonExclusiveLevel
+            | ConditionType::Discrete
+            | ConditionType::OffNormal => (ObjectTypeId::ProcessConditionClassType, "Process"),
         }
     }
 
@@ -157,13 +160,13 @@ const LEVELS: [(&str, Levels); 4] = [
 /// A condition in a state.
 #[derive(Debug, Clone)]
 pub(crate) struct ConditionEvent {
-    identity: Arc<Identity>,
-    state: State,
+    identity: Arc<ConditionIdentity>,
+    state: AlarmConditionState,
     event_type: NodeId,
 }
 
 impl ConditionEvent {
-    pub(crate) fn new(identity: &Arc<Identity>, state: &State) -> Self {
+    pub(crate) fn new(identity: &Arc<ConditionIdentity>, state: &AlarmConditionState) -> Self {
         Self {
             event_type: identity.kind.type_id(),
             identity: Arc::clone(identity),
@@ -225,15 +228,17 @@ impl ConditionEvent {
             return identity.limit(level).map(Variant::from);
         }
         match (identity.kind, name, below) {
-            (Kind::ExclusiveLevel, "LimitState", ["CurrentState"]) => Some(if state.active.on {
-                english(state.levels.name())
-            } else {
-                Variant::from(LocalizedText::null())
-            }),
-            (Kind::ExclusiveLevel, "LimitState", ["CurrentState", "Id"]) => {
+            (ConditionType::ExclusiveLevel, "LimitState", ["CurrentState"]) => {
+                Some(if state.active.on {
+                    english(state.levels.name())
+                } else {
+                    Variant::from(LocalizedText::null())
+                })
+            }
+            (ConditionType::ExclusiveLevel, "LimitState", ["CurrentState", "Id"]) => {
                 Some(limit_state(state.levels).into())
             }
-            (Kind::NonExclusiveLevel, name, below) => {
+            (ConditionType::NonExclusiveLevel, name, below) => {
                 let (level, flag) = LEVELS
                     .iter()
                     .find(|(level, _)| name.strip_suffix("State") == Some(level))?;
@@ -333,7 +338,7 @@ impl EventField for ConditionEvent {
 
 /// Returns an event about the conditions of the whole server: RefreshStartEventType,
 /// RefreshEndEventType or RefreshRequiredEventType (OPC 10000-9, 5.11).
-pub(crate) fn refresh(kind: ObjectTypeId, stamp: Stamp) -> RefreshEvent {
+pub(crate) fn refresh(kind: ObjectTypeId, stamp: EventStamp) -> RefreshEvent {
     let message = if kind == ObjectTypeId::RefreshStartEventType {
         "the conditions follow"
     } else if kind == ObjectTypeId::RefreshEndEventType {
@@ -388,11 +393,11 @@ impl EventField for RefreshEvent {
 mod tests {
     use opcua::types::{ByteString, StatusCode};
 
-    use super::super::condition::{Condition, Report};
+    use super::super::condition::{AlarmCondition, SourceReport};
     use super::*;
 
-    fn event(kind: Kind, levels: Levels) -> ConditionEvent {
-        let identity = Identity {
+    fn event(kind: ConditionType, levels: Levels) -> ConditionEvent {
+        let identity = ConditionIdentity {
             node: NodeId::new(1, "ua_1_2_10.alarm"),
             kind,
             source: NodeId::new(2, 10),
@@ -404,12 +409,12 @@ mod tests {
             confirms: false,
             delay: Duration::ZERO,
         };
-        let stamp = Stamp {
+        let stamp = EventStamp {
             time: DateTime::from(1_000),
             id: ByteString::from(vec![1]),
         };
-        let mut condition = Condition::new(false, 500, stamp.clone());
-        let report = Report {
+        let mut condition = AlarmCondition::new(false, 500, stamp.clone());
+        let report = SourceReport {
             levels,
             severity: 500,
             message: "hot".to_owned(),
@@ -426,7 +431,7 @@ mod tests {
 
     #[test]
     fn the_condition_id_is_the_node_id_of_the_event() {
-        let event = event(Kind::Discrete, Levels::ON);
+        let event = event(ConditionType::Discrete, Levels::ON);
         let of = |kind: ObjectTypeId, attribute| {
             event.get_field(&kind.into(), attribute, &NumericRange::None, &[])
         };
@@ -440,7 +445,7 @@ mod tests {
 
     #[test]
     fn a_field_is_selected_by_each_type_above_the_event_type() {
-        let event = event(Kind::ExclusiveLevel, Levels::HIGH_HIGH);
+        let event = event(ConditionType::ExclusiveLevel, Levels::HIGH_HIGH);
         let active = ["ActiveState", "Id"];
         for kind in [
             ObjectTypeId::BaseEventType,
@@ -466,7 +471,7 @@ mod tests {
     #[test]
     fn a_non_exclusive_alarm_has_a_state_for_each_of_its_limits() {
         let levels = Levels::HIGH.with(Levels::HIGH_HIGH);
-        let event = event(Kind::NonExclusiveLevel, levels);
+        let event = event(ConditionType::NonExclusiveLevel, levels);
         let id = |name| selected(&event, ObjectTypeId::BaseEventType, &[name, "Id"]);
         assert_eq!(id("HighState"), Variant::from(true));
         assert_eq!(id("HighHighState"), Variant::from(true));

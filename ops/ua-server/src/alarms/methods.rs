@@ -7,12 +7,12 @@ use opcua::server::node_manager::MethodCall;
 use opcua::types::{
     ByteString, LocalizedText, MethodId, NodeId, ObjectTypeId, StatusCode, Variant,
 };
-use plant_opcua::audit::Action as Audited;
-use plant_opcua::server::{CoreMethod, MethodHandler, MethodRequest, Refusal, method};
-use plant_opcua::users::Permissions;
+use plant_opcua::audit::AuditedAction as Audited;
+use plant_opcua::server::{CoreMethod, MethodHandler, MethodRefusal, MethodRequest, method};
+use plant_opcua::users::NodePermissions;
 
 use super::Alarms;
-use super::condition::{Action, Condition};
+use super::condition::{Action, AlarmCondition};
 
 impl Alarms {
     /// Returns the methods of all conditions.
@@ -21,7 +21,7 @@ impl Alarms {
             let alarms = Arc::clone(self);
             let handler: Arc<dyn MethodHandler> = method(move |request| {
                 let done = act(&alarms, &request);
-                done.map(|()| Vec::new()).map_err(Refusal::Status)
+                done.map(|()| Vec::new()).map_err(MethodRefusal::Status)
             });
             CoreMethod::of_type(id.into(), name, handler)
         };
@@ -62,19 +62,19 @@ impl Alarms {
 
     fn call_acknowledge(&self, request: &MethodRequest) -> Done {
         let (event, action) = action(request)?;
-        let act = |one: &mut Condition, stamp| one.acknowledge(&event, action, stamp);
+        let act = |one: &mut AlarmCondition, stamp| one.acknowledge(&event, action, stamp);
         self.act(&request.object, &request.caller.user, act)
     }
 
     fn call_confirm(&self, request: &MethodRequest) -> Done {
         let (event, action) = action(request)?;
-        let act = |one: &mut Condition, stamp| one.confirm(&event, action, stamp);
+        let act = |one: &mut AlarmCondition, stamp| one.confirm(&event, action, stamp);
         self.act(&request.object, &request.caller.user, act)
     }
 
     fn call_add_comment(&self, request: &MethodRequest) -> Done {
         let (event, action) = action(request)?;
-        let act = |one: &mut Condition, stamp| one.add_comment(&event, action, stamp);
+        let act = |one: &mut AlarmCondition, stamp| one.add_comment(&event, action, stamp);
         self.act(&request.object, &request.caller.user, act)
     }
 
@@ -102,7 +102,7 @@ type Done = Result<(), StatusCode>;
 type Act = fn(&Alarms, &MethodRequest) -> Done;
 
 /// Returns the methods that change conditions, for operators and engineers.
-pub(crate) fn permissions() -> impl Iterator<Item = (NodeId, Permissions)> {
+pub(crate) fn permissions() -> impl Iterator<Item = (NodeId, NodePermissions)> {
     let methods = [
         MethodId::AcknowledgeableConditionType_Acknowledge,
         MethodId::AcknowledgeableConditionType_Confirm,
@@ -112,7 +112,7 @@ pub(crate) fn permissions() -> impl Iterator<Item = (NodeId, Permissions)> {
     ];
     methods
         .into_iter()
-        .map(|method| (method.into(), Permissions::default()))
+        .map(|method| (method.into(), NodePermissions::default()))
 }
 
 fn number(request: &MethodRequest, at: usize) -> Result<u32, StatusCode> {

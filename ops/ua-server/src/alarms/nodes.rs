@@ -8,7 +8,7 @@ use opcua::types::{
     ReferenceTypeId, VariableTypeId,
 };
 
-use super::event::{Identity, Kind};
+use super::event::{ConditionIdentity, ConditionType};
 use crate::address::{self, alarms_folder};
 
 /// A variable of a condition: its path, its DataType and its type.
@@ -72,7 +72,7 @@ const EXCLUSIVE: &[Spec] = &[
     ("LimitState.CurrentState.Id", DataTypeId::NodeId, PROPERTY),
 ];
 
-/// The limits in the order of [`Identity::limits`].
+/// The limits in the order of [`ConditionIdentity::limits`].
 const LIMITS: [Spec; 4] = [
     ("LowLowLimit", DataTypeId::Double, PROPERTY),
     ("LowLimit", DataTypeId::Double, PROPERTY),
@@ -101,7 +101,7 @@ const LIMIT_STATES: [[Spec; 2]; 4] = [
 ];
 
 /// Returns the variables of a condition. The parent of a variable comes before it.
-fn specs(identity: &Identity) -> Vec<Spec> {
+fn specs(identity: &ConditionIdentity) -> Vec<Spec> {
     let mut specs = ALARM.to_vec();
     if identity.confirms {
         specs.extend(CONFIRMED);
@@ -117,11 +117,11 @@ fn specs(identity: &Identity) -> Vec<Spec> {
             continue;
         }
         specs.extend(LIMITS.get(at));
-        if identity.kind == Kind::NonExclusiveLevel {
+        if identity.kind == ConditionType::NonExclusiveLevel {
             specs.extend(LIMIT_STATES.get(at).into_iter().flatten());
         }
     }
-    if identity.kind == Kind::ExclusiveLevel {
+    if identity.kind == ConditionType::ExclusiveLevel {
         specs.extend(EXCLUSIVE);
     }
     specs
@@ -146,7 +146,9 @@ pub(super) fn split(node: &NodeId) -> Option<(NodeId, Vec<&str>)> {
 }
 
 /// Returns the variables of a condition with their paths.
-pub(super) fn variables(identity: &Identity) -> impl Iterator<Item = (NodeId, &'static str)> {
+pub(super) fn variables(
+    identity: &ConditionIdentity,
+) -> impl Iterator<Item = (NodeId, &'static str)> {
     let specs = specs(identity).into_iter();
     specs.map(|(path, ..)| (below(&identity.node, path), path))
 }
@@ -174,7 +176,7 @@ pub(super) fn add_folder(address_space: &mut AddressSpace) {
 }
 
 /// Adds a condition.
-pub(super) fn insert(address_space: &mut AddressSpace, identity: &Identity) {
+pub(super) fn insert(address_space: &mut AddressSpace, identity: &ConditionIdentity) {
     remove(address_space, identity);
     let node = &identity.node;
     ObjectBuilder::new(
@@ -185,7 +187,7 @@ pub(super) fn insert(address_space: &mut AddressSpace, identity: &Identity) {
     .has_type_definition(identity.kind.type_id())
     .component_of(alarms_folder())
     .insert(address_space);
-    if identity.kind == Kind::ExclusiveLevel {
+    if identity.kind == ConditionType::ExclusiveLevel {
         ObjectBuilder::new(&below(node, "LimitState"), "LimitState", "LimitState")
             .has_type_definition(ObjectTypeId::ExclusiveLimitStateMachineType)
             .component_of(node.clone())
@@ -222,7 +224,7 @@ pub(super) fn insert(address_space: &mut AddressSpace, identity: &Identity) {
 }
 
 /// Removes a condition.
-pub(super) fn remove(address_space: &mut AddressSpace, identity: &Identity) {
+pub(super) fn remove(address_space: &mut AddressSpace, identity: &ConditionIdentity) {
     let node = &identity.node;
     if !address_space.node_exists(node) {
         return;

@@ -3,15 +3,15 @@
 use opcua::server::SubscriptionCache;
 use opcua::server::authenticator::UserToken;
 use opcua::types::{ByteString, LocalizedText, MethodId, NodeId, ObjectTypeId, StatusCode};
-use plant_opcua::audit::{Action as Audited, Audit};
-use plant_opcua::users::{Access, Right};
+use plant_opcua::audit::{Audit, AuditedAction as Audited};
+use plant_opcua::users::{Right, UserAccess};
 use supervisor::{ConditionAction, ConditionChange, ConditionState, MOST_CONDITIONS};
 use uadp::Timestamp;
 
-use super::condition::{Action, Condition};
-use super::event::Identity;
+use super::condition::{Action, AlarmCondition};
+use super::event::ConditionIdentity;
 use super::methods::LONGEST_COMMENT;
-use super::{Alarms, Stamp};
+use super::{Alarms, EventStamp};
 use crate::value;
 
 impl Alarms {
@@ -41,7 +41,7 @@ impl Alarms {
         &self,
         change: &ConditionChange,
         (user, server): (&str, &str),
-        (access, subscriptions): (&Access, &SubscriptionCache),
+        (access, subscriptions): (&UserAccess, &SubscriptionCache),
     ) -> Result<(), StatusCode> {
         let (method, kind, source) = match change.action {
             ConditionAction::Acknowledge => (
@@ -76,7 +76,7 @@ impl Alarms {
                     user: user.to_owned(),
                     comment: comment.clone(),
                 };
-                let act = |one: &mut Condition, stamp: Stamp| match change.action {
+                let act = |one: &mut AlarmCondition, stamp: EventStamp| match change.action {
                     ConditionAction::Acknowledge => one.acknowledge(&event, action, stamp),
                     ConditionAction::Confirm => one.confirm(&event, action, stamp),
                 };
@@ -105,7 +105,7 @@ fn ids(change: &ConditionChange) -> Result<(NodeId, ByteString), StatusCode> {
     Ok((condition, ByteString::from(event)))
 }
 
-fn state(identity: &Identity, condition: &Condition) -> ConditionState {
+fn state(identity: &ConditionIdentity, condition: &AlarmCondition) -> ConditionState {
     let state = condition.state();
     let time = Timestamp {
         time: value::ticks(state.event.time),
@@ -156,8 +156,8 @@ mod tests {
 
     use opcua::types::DateTime;
 
-    use super::super::condition::{Levels, Report};
-    use super::super::event::Kind;
+    use super::super::condition::{Levels, SourceReport};
+    use super::super::event::ConditionType;
     use super::*;
 
     #[test]
@@ -170,21 +170,21 @@ mod tests {
 
     #[test]
     fn a_condition_is_shown_with_the_id_that_acknowledges_it() {
-        let stamp = |number: u8| Stamp {
+        let stamp = |number: u8| EventStamp {
             time: DateTime::now(),
             id: ByteString::from(vec![number; 16]),
         };
-        let mut condition = Condition::new(true, 500, stamp(1));
-        let report = Report {
+        let mut condition = AlarmCondition::new(true, 500, stamp(1));
+        let report = SourceReport {
             levels: Levels::HIGH,
             severity: 700,
             message: "Speed is 7: High".to_owned(),
             quality: StatusCode::Good,
         };
         let _effect = condition.report(report, stamp(2));
-        let identity = Identity {
+        let identity = ConditionIdentity {
             node: NodeId::new(1, "ua_0_2_30.alarm"),
-            kind: Kind::ExclusiveLevel,
+            kind: ConditionType::ExclusiveLevel,
             source: NodeId::new(2, 30),
             source_name: "Speed".to_owned(),
             name: "Speed".to_owned(),

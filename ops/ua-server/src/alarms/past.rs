@@ -10,7 +10,7 @@ use opcua::types::{
 };
 
 use super::event::ConditionEvent;
-use crate::history::{Step, given, steps};
+use crate::history::{HistoryValue, given, steps};
 
 /// The last events of all conditions, oldest first.
 #[derive(Default)]
@@ -119,7 +119,9 @@ impl PastEvents {
         };
         let steps = steps(&times, span, (count, false))?;
         let numbers = steps.into_iter().filter_map(|step| {
-            let Step::Value(at) = step else { return None };
+            let HistoryValue::Value(at) = step else {
+                return None;
+            };
             all.get(at).map(|(_, number)| *number)
         });
         Ok(numbers.collect())

@@ -9,8 +9,8 @@ use bridge_node::{Reason, Router};
 use mappings::{Mapping, SpaceId};
 use opcua::types::{NodeId, ObjectId, StatusCode};
 
-use super::condition::{Levels, Report};
-use super::event::{Identity, Kind};
+use super::condition::{Levels, SourceReport};
+use super::event::{ConditionIdentity, ConditionType};
 use super::{Entry, space_name};
 use crate::address;
 
@@ -25,7 +25,7 @@ pub(super) fn spaces(mapping: &Mapping) -> BTreeSet<SpaceId> {
 
 /// The state of the publishers.
 #[derive(Debug, Default)]
-pub(super) struct Seen {
+pub(super) struct PublisherStates {
     /// The time of the last message of each space.
     heard: BTreeMap<SpaceId, Instant>,
     /// Number of dropped values of each space, and of values that were lost on their way.
@@ -35,7 +35,7 @@ pub(super) struct Seen {
     timeout: Duration,
 }
 
-impl Seen {
+impl PublisherStates {
     pub(super) fn of(router: &Router, timeout: Duration) -> Self {
         let mut seen = Self {
             timeout,
@@ -116,7 +116,11 @@ impl Publishers {
     }
 
     /// Returns the reports of all conditions.
-    pub(super) fn look(&mut self, seen: &Seen, now: Instant) -> Vec<(NodeId, Report)> {
+    pub(super) fn look(
+        &mut self,
+        seen: &PublisherStates,
+        now: Instant,
+    ) -> Vec<(NodeId, SourceReport)> {
         let mut reports = Vec::new();
         for (space, rising) in &mut self.spaces {
             let name = space_name(*space);
@@ -163,14 +167,14 @@ fn node(space: Option<SpaceId>, fault: &str) -> NodeId {
     }
 }
 
-fn identity(space: Option<SpaceId>, fault: &str) -> Identity {
+fn identity(space: Option<SpaceId>, fault: &str) -> ConditionIdentity {
     let (source, source_name) = match space {
         Some(space) => (address::origin_folder(space), space_name(space)),
         None => (ObjectId::Server.into(), "Server".to_owned()),
     };
-    Identity {
+    ConditionIdentity {
         node: node(space, fault),
-        kind: Kind::SystemOffNormal,
+        kind: ConditionType::SystemOffNormal,
         source,
         name: match fault {
             "lost" => format!("{source_name}: publisher lost"),
@@ -186,8 +190,8 @@ fn identity(space: Option<SpaceId>, fault: &str) -> Identity {
     }
 }
 
-fn report(fault: Option<String>) -> Report {
-    Report {
+fn report(fault: Option<String>) -> SourceReport {
+    SourceReport {
         levels: if fault.is_some() {
             Levels::ON
         } else {
@@ -208,7 +212,7 @@ const CALM: Duration = Duration::from_secs(10);
 mod tests {
     use super::*;
 
-    fn active(reports: &[(NodeId, Report)], node: &NodeId) -> bool {
+    fn active(reports: &[(NodeId, SourceReport)], node: &NodeId) -> bool {
         let found = reports.iter().find(|(each, _)| each == node);
         found.unwrap().1.levels.is_active()
     }
@@ -220,11 +224,11 @@ mod tests {
         assert_eq!(publishers.follow(BTreeSet::from([space])).len(), 3);
         let begin = bridge_node::now().monotonic;
         let at = |seconds| begin + Duration::from_secs(seconds);
-        let mut seen = Seen {
+        let mut seen = PublisherStates {
             timeout: Duration::from_secs(3),
             dropped: BTreeMap::from([(space, 7)]),
             early: 2,
-            ..Seen::default()
+            ..PublisherStates::default()
         };
         let (lost, drops) = (node(Some(space), "lost"), node(Some(space), "drops"));
         let clock = node(None, "clock");

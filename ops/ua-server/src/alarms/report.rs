@@ -8,8 +8,8 @@ use mappings::{Mapping, TopicId};
 use opcua::types::StatusCode;
 use uadp::Timestamp;
 
-use super::condition::State;
-use super::event::{Identity, Kind};
+use super::condition::AlarmConditionState;
+use super::event::{ConditionIdentity, ConditionType};
 use super::page;
 
 /// A variable with the conditions of the server.
@@ -22,13 +22,13 @@ struct Target {
 
 /// The variables with the conditions of the server, and the time of their next value.
 #[derive(Debug, Default)]
-pub(super) struct Reports {
+pub(super) struct ConditionReports {
     targets: Vec<Target>,
     last: Option<Instant>,
     due: Option<Instant>,
 }
 
-impl Reports {
+impl ConditionReports {
     /// Switches to the variables of a mapping.
     pub(super) fn follow(&mut self, mapping: &Mapping, now: Instant) {
         let variables = mapping.variables().iter();
@@ -62,7 +62,7 @@ impl Reports {
     /// Returns the values if they are due.
     pub(super) fn take<'a>(
         &mut self,
-        conditions: impl Iterator<Item = (&'a Identity, &'a State)>,
+        conditions: impl Iterator<Item = (&'a ConditionIdentity, &'a AlarmConditionState)>,
         (now, time): (Instant, Timestamp),
     ) -> Vec<(TopicId, Bytes)> {
         if self.due.is_none_or(|due| due > now) {
@@ -70,15 +70,16 @@ impl Reports {
         }
         self.last = Some(now);
         self.due = now.checked_add(PERIOD);
-        let mut conditions: Vec<(&Identity, &State)> = conditions
+        let mut conditions: Vec<(&ConditionIdentity, &AlarmConditionState)> = conditions
             .filter(|(identity, state)| {
                 // A robot reports its own diagnostics.
-                identity.kind != Kind::SystemDiagnostic && state.enabled.on
+                identity.kind != ConditionType::SystemDiagnostic && state.enabled.on
             })
             .collect();
         // The most important conditions, if there are too many.
         conditions.sort_by(|(one, state), (other, of_other)| {
-            let key = |state: &State| (!state.retain(), std::cmp::Reverse(state.severity));
+            let key =
+                |state: &AlarmConditionState| (!state.retain(), std::cmp::Reverse(state.severity));
             let order = key(state).cmp(&key(of_other));
             order.then_with(|| one.name.cmp(&other.name))
         });
@@ -91,7 +92,11 @@ impl Reports {
 
 impl Target {
     /// Encodes the fields of the message as a key frame carries them.
-    fn block(&self, conditions: &[(&Identity, &State)], time: Timestamp) -> Bytes {
+    fn block(
+        &self,
+        conditions: &[(&ConditionIdentity, &AlarmConditionState)],
+        time: Timestamp,
+    ) -> Bytes {
         let mut block = Vec::new();
         let count = u16::try_from(self.paths.len()).unwrap_or(u16::MAX);
         block.extend(count.to_le_bytes());
@@ -120,7 +125,7 @@ impl Target {
 }
 
 /// Returns the level of a condition: stale while its value is bad.
-fn level(state: &State) -> u8 {
+fn level(state: &AlarmConditionState) -> u8 {
     if state.quality.0.is_bad() && state.quality.0 != StatusCode::BadWaitingForInitialData {
         return 3;
     }
@@ -131,7 +136,12 @@ fn level(state: &State) -> u8 {
     }
 }
 
-fn put_status(block: &mut Vec<u8>, topic: TopicId, identity: &Identity, state: &State) {
+fn put_status(
+    block: &mut Vec<u8>,
+    topic: TopicId,
+    identity: &ConditionIdentity,
+    state: &AlarmConditionState,
+) {
     // The TypeId is the name of the message in the namespace of the topic.
     block.push(STRING_NODE_ID);
     block.extend(topic.namespace.get().to_le_bytes());
@@ -191,12 +201,12 @@ mod tests {
     use opcua::types::{ByteString, DateTime, NodeId};
     use uadp::{ExtensionBody, Fields, Scalar};
 
-    use super::super::condition::{Condition, Levels, Report, Stamp};
+    use super::super::condition::{AlarmCondition, EventStamp, Levels, SourceReport};
     use super::super::diagnostics;
     use super::*;
 
-    fn identity(name: &str, kind: Kind) -> Identity {
-        Identity {
+    fn identity(name: &str, kind: ConditionType) -> ConditionIdentity {
+        ConditionIdentity {
             node: NodeId::new(1, "ua_0_2_30.alarm"),
             kind,
             source: NodeId::new(2, 30),
@@ -210,13 +220,13 @@ mod tests {
         }
     }
 
-    fn condition(levels: Levels, severity: u16) -> Condition {
-        let stamp = Stamp {
+    fn condition(levels: Levels, severity: u16) -> AlarmCondition {
+        let stamp = EventStamp {
             time: DateTime::from(1_000),
             id: ByteString::from(vec![1]),
         };
-        let mut condition = Condition::new(false, 500, stamp.clone());
-        let report = Report {
+        let mut condition = AlarmCondition::new(false, 500, stamp.clone());
+        let report = SourceReport {
             levels,
             severity,
             message: "beyond".to_owned(),
@@ -226,9 +236,9 @@ mod tests {
         condition
     }
 
-    fn reports(now: Instant) -> Reports {
+    fn reports(now: Instant) -> ConditionReports {
         let paths = ["header.stamp", "header.frame_id", "status"];
-        Reports {
+        ConditionReports {
             targets: vec![Target {
                 topic: TopicId::new(0, 2, 90).unwrap(),
                 paths: paths.map(str::to_owned).to_vec(),
@@ -247,10 +257,10 @@ mod tests {
         );
         let warm = condition(Levels::HIGH, 500);
         let all = [
-            (identity("fine", Kind::OffNormal), &fine),
-            (identity("hot", Kind::ExclusiveLevel), &hot),
-            (identity("motor", Kind::SystemDiagnostic), &hot),
-            (identity("warm", Kind::ExclusiveLevel), &warm),
+            (identity("fine", ConditionType::OffNormal), &fine),
+            (identity("hot", ConditionType::ExclusiveLevel), &hot),
+            (identity("motor", ConditionType::SystemDiagnostic), &hot),
+            (identity("warm", ConditionType::ExclusiveLevel), &warm),
         ];
         let conditions = all.iter().map(|(identity, one)| (identity, one.state()));
         let mut reports = reports(now.monotonic);
@@ -283,7 +293,7 @@ mod tests {
         let now = bridge_node::now();
         let at = |milliseconds| now.monotonic + Duration::from_millis(milliseconds);
         let mut reports = reports(at(0));
-        let take = |reports: &mut Reports, milliseconds| {
+        let take = |reports: &mut ConditionReports, milliseconds| {
             let none = std::iter::empty();
             reports.take(none, (at(milliseconds), now.utc)).len()
         };

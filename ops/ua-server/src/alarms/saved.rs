@@ -4,7 +4,9 @@
 use opcua::types::{ByteString, DateTime, LocalizedText, NodeId, StatusCode, UAString};
 use serde::{Deserialize, Serialize};
 
-use super::condition::{Condition, Levels, Parts, Stamp, State, TwoState};
+use super::condition::{
+    AlarmCondition, AlarmConditionState, EventStamp, Levels, StoredCondition, TwoState,
+};
 use super::{Entry, Place};
 
 /// The stored form of a condition. Times are ticks of 100 ns.
@@ -74,8 +76,8 @@ impl Place {
 }
 
 /// Encodes a condition of an alarm.
-pub(super) fn encoded(condition: &Condition, alarm: &str) -> Vec<u8> {
-    let Parts {
+pub(super) fn encoded(condition: &AlarmCondition, alarm: &str) -> Vec<u8> {
+    let StoredCondition {
         state,
         events,
         unacknowledged,
@@ -110,7 +112,7 @@ pub(super) fn encoded(condition: &Condition, alarm: &str) -> Vec<u8> {
 
 /// Decodes a condition of an alarm. Returns `None` for the condition of another alarm, and for
 /// bytes that are no condition.
-fn decoded(bytes: &[u8], alarm: &str) -> Option<Parts> {
+fn decoded(bytes: &[u8], alarm: &str) -> Option<StoredCondition> {
     let saved: Saved = serde_json::from_slice(bytes).ok()?;
     if saved.alarm != alarm {
         return None;
@@ -123,8 +125,8 @@ fn decoded(bytes: &[u8], alarm: &str) -> Option<Parts> {
     let ids = |ids: Vec<Vec<u8>>| ids.into_iter().map(ByteString::from).collect();
     let (locale, comment, commented) = saved.comment;
     let (id, time) = saved.event;
-    Some(Parts {
-        state: State {
+    Some(StoredCondition {
+        state: AlarmConditionState {
             enabled: two(saved.enabled),
             active: two(saved.active),
             levels: Levels::from_bits(saved.levels),
@@ -145,7 +147,7 @@ fn decoded(bytes: &[u8], alarm: &str) -> Option<Parts> {
             ),
             user: saved.user,
             message: saved.message,
-            event: Stamp {
+            event: EventStamp {
                 time: DateTime::from(time),
                 id: ByteString::from(id),
             },
@@ -161,11 +163,11 @@ fn bytes(id: &ByteString) -> Vec<u8> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::condition::{Action, Report};
+    use super::super::condition::{Action, SourceReport};
     use super::*;
 
-    fn stamp(number: u8) -> Stamp {
-        Stamp {
+    fn stamp(number: u8) -> EventStamp {
+        EventStamp {
             time: DateTime::from(i64::from(number)),
             id: ByteString::from(vec![number]),
         }
@@ -173,8 +175,8 @@ mod tests {
 
     #[test]
     fn a_condition_goes_on_as_it_was_stored() {
-        let mut condition = Condition::new(true, 500, stamp(1));
-        let report = Report {
+        let mut condition = AlarmCondition::new(true, 500, stamp(1));
+        let report = SourceReport {
             levels: Levels::HIGH,
             severity: 700,
             message: "hot".to_owned(),
@@ -188,7 +190,7 @@ mod tests {
         let id = stamp(2).id;
         condition.acknowledge(&id, action, stamp(3)).unwrap();
         let stored = encoded(&condition, "the alarm");
-        let mut restored = Condition::new(true, 500, stamp(9));
+        let mut restored = AlarmCondition::new(true, 500, stamp(9));
         restored.restore(decoded(&stored, "the alarm").unwrap());
         assert_eq!(restored.state(), condition.state());
         // The last event can still be confirmed.
@@ -202,7 +204,7 @@ mod tests {
 
     #[test]
     fn conditions_of_other_alarms_and_damaged_bytes_are_left_out() {
-        let stored = encoded(&Condition::new(false, 500, stamp(1)), "high: 70");
+        let stored = encoded(&AlarmCondition::new(false, 500, stamp(1)), "high: 70");
         assert!(decoded(&stored, "high: 80").is_none());
         assert!(decoded(&stored[1..], "high: 70").is_none());
     }

@@ -10,12 +10,12 @@ use super::condition::Levels;
 
 /// A value as alarms compare it.
 #[derive(Debug, Clone, PartialEq)]
-pub(crate) enum Reading {
+pub(crate) enum AlarmInput {
     Number(f64),
     Value(AlarmValue),
 }
 
-impl Reading {
+impl AlarmInput {
     /// Returns the value of a field. Returns `None` for values that have no alarms.
     pub(crate) fn of(value: &uadp::Variant<'_>) -> Option<Self> {
         let uadp::Variant::Scalar(scalar) = value else {
@@ -52,7 +52,7 @@ impl Reading {
     }
 }
 
-impl std::fmt::Display for Reading {
+impl std::fmt::Display for AlarmInput {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         match self {
             Self::Number(number) => write!(f, "{number}"),
@@ -82,15 +82,15 @@ fn integer(scalar: &Scalar<'_>) -> Option<i128> {
 
 /// The trigger of an alarm, with its current levels.
 #[derive(Debug)]
-pub(crate) struct Trigger {
+pub(crate) struct AlarmCause {
     rule: AlarmTrigger,
     delay: Duration,
     levels: Levels,
     /// Levels that become current at this time, and the value that caused them.
-    pending: Option<(Instant, Levels, Reading)>,
+    pending: Option<(Instant, Levels, AlarmInput)>,
 }
 
-impl Trigger {
+impl AlarmCause {
     pub(crate) const fn new(rule: AlarmTrigger, delay: Duration) -> Self {
         Self {
             rule,
@@ -111,7 +111,7 @@ impl Trigger {
     }
 
     /// Returns the levels of a value. A value that cannot be compared changes nothing.
-    pub(crate) fn read(&mut self, reading: &Reading, now: Instant) -> Levels {
+    pub(crate) fn read(&mut self, reading: &AlarmInput, now: Instant) -> Levels {
         let Some(found) = evaluate(&self.rule, reading, self.levels) else {
             return self.levels;
         };
@@ -134,7 +134,7 @@ impl Trigger {
     }
 
     /// Returns the levels whose delay is over, and the value that caused them.
-    pub(crate) fn elapsed(&mut self, now: Instant) -> Option<(Levels, Reading)> {
+    pub(crate) fn elapsed(&mut self, now: Instant) -> Option<(Levels, AlarmInput)> {
         let (_, levels, reading) = self.pending.take_if(|(due, ..)| *due <= now)?;
         self.levels = levels;
         Some((levels, reading))
@@ -142,13 +142,13 @@ impl Trigger {
 }
 
 /// Returns `None` for a value that the rule cannot compare.
-fn evaluate(rule: &AlarmTrigger, reading: &Reading, before: Levels) -> Option<Levels> {
+fn evaluate(rule: &AlarmTrigger, reading: &AlarmInput, before: Levels) -> Option<Levels> {
     let on = |on: bool| Some(if on { Levels::ON } else { Levels::NONE });
     match (rule, reading) {
         (AlarmTrigger::Limits(limits), reading) => Some(beyond(limits, reading.number()?, before)),
-        (AlarmTrigger::Normal(normal), Reading::Value(value)) => on(value != normal),
-        (AlarmTrigger::When(values), Reading::Value(value)) => on(values.contains(value)),
-        (AlarmTrigger::Normal(_) | AlarmTrigger::When(_), Reading::Number(_))
+        (AlarmTrigger::Normal(normal), AlarmInput::Value(value)) => on(value != normal),
+        (AlarmTrigger::When(values), AlarmInput::Value(value)) => on(values.contains(value)),
+        (AlarmTrigger::Normal(_) | AlarmTrigger::When(_), AlarmInput::Number(_))
         | (AlarmTrigger::Diagnostics, _) => None,
     }
 }
@@ -193,17 +193,17 @@ mod tests {
         bridge_node::now().monotonic
     }
 
-    fn levels(trigger: &mut Trigger, values: &[f64]) -> Vec<&'static str> {
+    fn levels(trigger: &mut AlarmCause, values: &[f64]) -> Vec<&'static str> {
         let now = begin();
         let all = values
             .iter()
-            .map(|value| trigger.read(&Reading::Number(*value), now).name());
+            .map(|value| trigger.read(&AlarmInput::Number(*value), now).name());
         all.collect()
     }
 
     #[test]
     fn an_exclusive_alarm_is_at_the_outermost_limit() {
-        let mut trigger = Trigger::new(limits(true, 0.0), Duration::ZERO);
+        let mut trigger = AlarmCause::new(limits(true, 0.0), Duration::ZERO);
         assert_eq!(
             levels(&mut trigger, &[70.0, 70.1, 90.1, 90.0, 50.0, -1.0, -11.0]),
             [
@@ -215,14 +215,14 @@ mod tests {
 
     #[test]
     fn a_non_exclusive_alarm_is_at_each_limit() {
-        let mut trigger = Trigger::new(limits(false, 0.0), Duration::ZERO);
+        let mut trigger = AlarmCause::new(limits(false, 0.0), Duration::ZERO);
         levels(&mut trigger, &[91.0]);
         assert_eq!(trigger.levels, Levels::HIGH.with(Levels::HIGH_HIGH));
     }
 
     #[test]
     fn a_limit_is_left_when_the_value_has_returned_by_the_deadband() {
-        let mut trigger = Trigger::new(limits(true, 2.0), Duration::ZERO);
+        let mut trigger = AlarmCause::new(limits(true, 2.0), Duration::ZERO);
         assert_eq!(
             levels(
                 &mut trigger,
@@ -237,10 +237,10 @@ mod tests {
 
     #[test]
     fn an_alarm_with_a_delay_is_active_when_the_value_stays_beyond_the_limit() {
-        let mut trigger = Trigger::new(limits(true, 0.0), Duration::from_secs(2));
+        let mut trigger = AlarmCause::new(limits(true, 0.0), Duration::from_secs(2));
         let begin = begin();
         let at = |seconds| begin + Duration::from_secs(seconds);
-        let number = Reading::Number;
+        let number = AlarmInput::Number;
         assert_eq!(trigger.read(&number(71.0), at(0)), Levels::NONE);
         assert_eq!(trigger.due(), Some(at(2)));
         assert_eq!(trigger.read(&number(50.0), at(1)), Levels::NONE);
@@ -255,19 +255,22 @@ mod tests {
 
     #[test]
     fn values_that_cannot_be_compared_change_nothing() {
-        let mut trigger = Trigger::new(limits(true, 0.0), Duration::ZERO);
+        let mut trigger = AlarmCause::new(limits(true, 0.0), Duration::ZERO);
         levels(&mut trigger, &[71.0]);
         let now = begin();
-        assert_eq!(trigger.read(&Reading::Number(f64::NAN), now), Levels::HIGH);
-        let text = Reading::Value(AlarmValue::Text("71".to_owned()));
+        assert_eq!(
+            trigger.read(&AlarmInput::Number(f64::NAN), now),
+            Levels::HIGH
+        );
+        let text = AlarmInput::Value(AlarmValue::Text("71".to_owned()));
         assert_eq!(trigger.read(&text, now), Levels::HIGH);
     }
 
     #[test]
     fn booleans_integers_and_texts_are_compared_as_they_are() {
         let now = begin();
-        let reading = |scalar| Reading::of(&uadp::Variant::Scalar(scalar)).unwrap();
-        let mut normal = Trigger::new(
+        let reading = |scalar| AlarmInput::of(&uadp::Variant::Scalar(scalar)).unwrap();
+        let mut normal = AlarmCause::new(
             AlarmTrigger::Normal(AlarmValue::Boolean(false)),
             Duration::ZERO,
         );
@@ -281,12 +284,12 @@ mod tests {
                 .is_active()
         );
         let values = vec![AlarmValue::Integer(2), AlarmValue::Integer(-3)];
-        let mut when = Trigger::new(AlarmTrigger::When(values), Duration::ZERO);
+        let mut when = AlarmCause::new(AlarmTrigger::When(values), Duration::ZERO);
         assert!(when.read(&reading(Scalar::Int64(-3)), now).is_active());
         assert!(!when.read(&reading(Scalar::Byte(3)), now).is_active());
         assert_eq!(when.read(&reading(Scalar::Byte(2)), now), Levels::ON);
         let values = vec![AlarmValue::Text("fault".to_owned())];
-        let mut text = Trigger::new(AlarmTrigger::When(values), Duration::ZERO);
+        let mut text = AlarmCause::new(AlarmTrigger::When(values), Duration::ZERO);
         assert!(
             text.read(&reading(Scalar::String(Some("fault"))), now)
                 .is_active()

@@ -2,15 +2,15 @@
 
 use bridge_node::{CallDescription, CallField, CallRole};
 use mappings::{ExpandedNodeIdText, MethodTarget, NamespaceText, NodeIdText};
-use messages::Rank;
+use messages::ArrayRank;
 use opcua::types::{
     Argument, AttributeId, DataTypeId, DataValue, Identifier, NodeId, ReferenceTypeId, Variant,
 };
-use plant_opcua::client::{Browse, Client, ClientError};
+use plant_opcua::client::{Browse, ClientError, OpcUaClient};
 use plant_opcua::server::arguments_in;
 use uadp::BuiltinType;
 
-use super::Wanted;
+use super::MappedMethod;
 use crate::layout;
 
 /// The nodes of a Method, and its input and output arguments.
@@ -24,7 +24,7 @@ pub(super) struct Signature {
 
 impl Signature {
     /// Returns the description of the call that is announced in the space.
-    pub(super) fn description(&self, wanted: &Wanted) -> CallDescription {
+    pub(super) fn description(&self, wanted: &MappedMethod) -> CallDescription {
         CallDescription {
             name: wanted.name.clone(),
             about: wanted.about.clone(),
@@ -39,7 +39,7 @@ impl Signature {
 ///
 /// # Errors
 /// Returns the reason why the Method cannot be called, as text for the operator.
-pub(super) async fn read(client: &Client, target: &MethodTarget) -> Result<Signature, String> {
+pub(super) async fn read(client: &OpcUaClient, target: &MethodTarget) -> Result<Signature, String> {
     let object = node(client, &target.object)?;
     let method = node(client, &target.method)?;
     let what = [
@@ -89,7 +89,7 @@ pub(super) async fn read(client: &Client, target: &MethodTarget) -> Result<Signa
 ///
 /// # Errors
 /// Returns the reason why there is no such NodeId, as text for the operator.
-pub(crate) fn node(client: &Client, text: &ExpandedNodeIdText) -> Result<NodeId, String> {
+pub(crate) fn node(client: &OpcUaClient, text: &ExpandedNodeIdText) -> Result<NodeId, String> {
     let namespace = match &text.namespace {
         NamespaceText::Index(index) => *index,
         NamespaceText::Uri(uri) => client
@@ -115,7 +115,7 @@ fn told(error: ClientError) -> String {
 }
 
 async fn fields(
-    client: &Client,
+    client: &OpcUaClient,
     which: &str,
     arguments: Vec<Argument>,
 ) -> Result<Vec<CallField>, String> {
@@ -129,8 +129,8 @@ async fn fields(
         let builtin = builtin
             .ok_or_else(|| wrong(&format!("is of {}, which no call has", argument.data_type)))?;
         let rank = match argument.value_rank {
-            -1 => Rank::Scalar,
-            1 => Rank::Array { fixed: None },
+            -1 => ArrayRank::Scalar,
+            1 => ArrayRank::Array { fixed: None },
             other => return Err(wrong(&format!("has ValueRank {other}, which no call has"))),
         };
         let name = argument.name.as_ref();
@@ -158,7 +158,10 @@ async fn fields(
 /// Returns the builtin type of the values of a DataType, or `None` if a call cannot carry them.
 /// Structures and NodeIds depend on the namespaces of that server, and values of an abstract type
 /// may have any type.
-async fn builtin(client: &Client, data_type: &NodeId) -> Result<Option<BuiltinType>, ClientError> {
+async fn builtin(
+    client: &OpcUaClient,
+    data_type: &NodeId,
+) -> Result<Option<BuiltinType>, ClientError> {
     if let Some(known) = standard(data_type) {
         return Ok(known);
     }

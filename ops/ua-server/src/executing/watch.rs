@@ -5,17 +5,17 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use mappings::TopicId;
-use plant_opcua::client::{Client, Link};
+use plant_opcua::client::{Link, OpcUaClient};
 use tokio::sync::{mpsc, watch};
 use tracing::warn;
 
-use super::Wanted;
+use super::MappedMethod;
 use super::signature::{self, Signature};
 
 /// A Method that can be called.
-pub(crate) struct Found {
-    pub(super) wanted: Arc<Wanted>,
-    pub(super) client: Client,
+pub(crate) struct CallableMethod {
+    pub(super) wanted: Arc<MappedMethod>,
+    pub(super) client: OpcUaClient,
     /// Number of the connection for which the NodeIds are valid.
     pub(super) connects: u64,
     pub(super) signature: Signature,
@@ -24,16 +24,16 @@ pub(crate) struct Found {
 /// A change of a Method.
 pub(super) enum News {
     /// The Method can be called, or it has changed.
-    Found(Found),
+    Found(CallableMethod),
     /// The Method cannot be called.
     Lost(TopicId),
 }
 
 /// Checks the server at each change of the connection or of the wanted Methods, and periodically.
 pub(super) async fn run(
-    client: Client,
+    client: OpcUaClient,
     url: String,
-    mut wanted: watch::Receiver<Vec<Arc<Wanted>>>,
+    mut wanted: watch::Receiver<Vec<Arc<MappedMethod>>>,
     tell: mpsc::Sender<News>,
 ) {
     let mut link = client.link();
@@ -70,11 +70,11 @@ pub(super) async fn run(
 }
 
 struct Watcher {
-    client: Client,
+    client: OpcUaClient,
     url: String,
     tell: mpsc::Sender<News>,
     /// The last reported state of each Method, with its connection.
-    known: HashMap<TopicId, (Arc<Wanted>, u64, Signature)>,
+    known: HashMap<TopicId, (Arc<MappedMethod>, u64, Signature)>,
     /// The last logged error of each Method.
     troubles: HashMap<TopicId, String>,
     /// True if the loss of the server was logged.
@@ -84,7 +84,7 @@ struct Watcher {
 type Told = Result<(), mpsc::error::SendError<News>>;
 
 impl Watcher {
-    async fn look(&mut self, all: &[Arc<Wanted>], connects: u64) -> Told {
+    async fn look(&mut self, all: &[Arc<MappedMethod>], connects: u64) -> Told {
         self.away = false;
         self.known
             .retain(|topic, _| all.iter().any(|wanted| wanted.topic == *topic));
@@ -97,7 +97,12 @@ impl Watcher {
         Ok(())
     }
 
-    async fn find(&mut self, wanted: &Arc<Wanted>, connects: u64, signature: Signature) -> Told {
+    async fn find(
+        &mut self,
+        wanted: &Arc<MappedMethod>,
+        connects: u64,
+        signature: Signature,
+    ) -> Told {
         let topic = wanted.topic;
         self.troubles.remove(&topic);
         let known = self.known.get(&topic);
@@ -109,7 +114,7 @@ impl Watcher {
         }
         let entry = (Arc::clone(wanted), connects, signature.clone());
         self.known.insert(topic, entry);
-        let found = Found {
+        let found = CallableMethod {
             wanted: Arc::clone(wanted),
             client: self.client.clone(),
             connects,
@@ -119,7 +124,7 @@ impl Watcher {
     }
 
     /// Reports all Methods as lost. The loss is logged once until the server is connected again.
-    async fn lose(&mut self, all: &[Arc<Wanted>], reason: &str) -> Told {
+    async fn lose(&mut self, all: &[Arc<MappedMethod>], reason: &str) -> Told {
         self.troubles.clear();
         if !std::mem::replace(&mut self.away, true) {
             let methods = all.len();

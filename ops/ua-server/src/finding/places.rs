@@ -5,7 +5,7 @@ use std::ops::RangeInclusive;
 
 /// The namespace number and the name of a server.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(super) struct Place {
+pub(super) struct ServerNumber {
     pub(super) namespace: u16,
     pub(super) name: String,
 }
@@ -13,13 +13,13 @@ pub(super) struct Place {
 /// The assigned numbers, by ApplicationUri. An offline server keeps its number as long as other
 /// numbers are free.
 #[derive(Debug, Default)]
-pub(super) struct Places {
-    given: BTreeMap<String, Place>,
+pub(super) struct ServerNumbers {
+    given: BTreeMap<String, ServerNumber>,
 }
 
 /// The available numbers and the names in use.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub(super) struct Room {
+pub(super) struct FreeNumbers {
     /// The range of namespace numbers, or `None` if no servers are to be found.
     pub(super) namespaces: Option<RangeInclusive<u16>>,
     /// Namespace numbers that are reserved, with their ApplicationUris.
@@ -28,7 +28,7 @@ pub(super) struct Room {
     pub(super) named: BTreeSet<String>,
 }
 
-impl Places {
+impl ServerNumbers {
     /// Returns the number and the name of a server. The number is reserved for the server, or is
     /// its previous number. A new server gets the number that follows from its ApplicationUri, so
     /// that it is the same after a restart, or else the next free number. `there` are the
@@ -36,15 +36,15 @@ impl Places {
     pub(super) fn give(
         &mut self,
         application_uri: &str,
-        room: &Room,
+        room: &FreeNumbers,
         there: &BTreeSet<String>,
-    ) -> Option<Place> {
+    ) -> Option<ServerNumber> {
         let range = room.namespaces.clone()?;
         let mut kept = room.kept.iter();
         let own = kept
             .find(|(namespace, uri)| *uri == application_uri && range.contains(namespace))
             .map(|(namespace, _)| *namespace);
-        let stays = |place: &Place| {
+        let stays = |place: &ServerNumber| {
             let fits = match own {
                 Some(own) => place.namespace == own,
                 None => {
@@ -64,7 +64,7 @@ impl Places {
         // The previous owner is offline, or has a reserved number.
         self.given.retain(|_, place| place.namespace != namespace);
         let name = self.name(application_uri, namespace, &room.named);
-        let place = Place { namespace, name };
+        let place = ServerNumber { namespace, name };
         self.given.insert(application_uri.to_owned(), place.clone());
         Some(place)
     }
@@ -72,7 +72,7 @@ impl Places {
     fn free(
         &self,
         application_uri: &str,
-        (range, room): (&RangeInclusive<u16>, &Room),
+        (range, room): (&RangeInclusive<u16>, &FreeNumbers),
         there: &BTreeSet<String>,
     ) -> Option<u16> {
         let open = range.clone().filter(|one| !room.kept.contains_key(one));
@@ -122,8 +122,8 @@ const MOST_NAME: usize = 48;
 mod tests {
     use super::*;
 
-    fn room(range: RangeInclusive<u16>, kept: &[(u16, &str)]) -> Room {
-        Room {
+    fn room(range: RangeInclusive<u16>, kept: &[(u16, &str)]) -> FreeNumbers {
+        FreeNumbers {
             namespaces: Some(range),
             kept: kept
                 .iter()
@@ -142,7 +142,7 @@ mod tests {
         let room = room(40..=47, &[(44, "urn:v:oven"), (90, "urn:v:belt")]);
         let all = there(&["urn:v:oven", "urn:v:belt", "urn:v:saw"]);
         let given = |order: &[&str]| {
-            let mut places = Places::default();
+            let mut places = ServerNumbers::default();
             let mut given: Vec<(String, u16)> = order
                 .iter()
                 .map(|uri| {
@@ -164,7 +164,7 @@ mod tests {
     #[test]
     fn whoever_is_away_gives_way_and_who_is_there_does_not() {
         let room = room(40..=41, &[]);
-        let mut places = Places::default();
+        let mut places = ServerNumbers::default();
         let all = there(&["urn:a", "urn:b", "urn:c"]);
         let a = places.give("urn:a", &room, &all).unwrap();
         let b = places.give("urn:b", &room, &all).unwrap();
@@ -178,7 +178,7 @@ mod tests {
     #[test]
     fn names_are_the_last_part_and_none_is_that_of_another() {
         let room = room(40..=47, &[]);
-        let mut places = Places::default();
+        let mut places = ServerNumbers::default();
         let mut name = |uri: &str| {
             let place = places.give(uri, &room, &BTreeSet::new()).unwrap();
             (place.name, place.namespace)

@@ -2,7 +2,7 @@
 
 /// A past value as a number, with its quality.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Sample {
+pub(super) struct PastValue {
     pub(super) time: i64,
     /// The number, or `None` if the value is not a number.
     pub(super) value: Option<f64>,
@@ -51,7 +51,7 @@ pub(super) enum Aggregate {
 
 /// The outcome of an interval.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) enum Outcome {
+pub(super) enum IntervalOutcome {
     /// The value of that sample, unchanged.
     Raw(usize),
     /// The value of that sample, at the time of the interval.
@@ -76,13 +76,13 @@ pub(super) enum Outcome {
 
 /// The rules for the quality of an aggregate (AggregateConfiguration, OPC 10000-13, 4.2.1.2).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct Rules {
+pub(super) struct AggregateRules {
     pub(super) uncertain_is_bad: bool,
     pub(super) percent_bad: u8,
     pub(super) percent_good: u8,
 }
 
-impl Default for Rules {
+impl Default for AggregateRules {
     fn default() -> Self {
         Self {
             uncertain_is_bad: true,
@@ -96,10 +96,10 @@ impl Default for Rules {
 /// `samples` ascend in time.
 pub(super) fn of(
     aggregate: Aggregate,
-    samples: &[Sample],
+    samples: &[PastValue],
     (start, end): (i64, i64),
-    rules: Rules,
-) -> Outcome {
+    rules: AggregateRules,
+) -> IntervalOutcome {
     if aggregate == Aggregate::Interpolative {
         return at(samples, start, rules);
     }
@@ -120,36 +120,38 @@ pub(super) fn of(
     };
     let (first, last) = (place(from), place(to));
     let within = samples.get(first..last).unwrap_or_default();
-    let within: Vec<(usize, &Sample)> = (first..).zip(within).collect();
+    let within: Vec<(usize, &PastValue)> = (first..).zip(within).collect();
     match aggregate {
         Aggregate::TimeAverage => average_over_time(samples, (from, to), rules).0,
         Aggregate::Total => {
             let (average, seconds) = average_over_time(samples, (from, to), rules);
-            if let Outcome::Calculated(value, quality) = average {
-                return Outcome::Calculated(value * seconds, quality);
+            if let IntervalOutcome::Calculated(value, quality) = average {
+                return IntervalOutcome::Calculated(value * seconds, quality);
             }
             average
         }
         Aggregate::DurationGood => {
             let good = time_good(samples, (from, to));
-            Outcome::Calculated(good / TICKS_PER_MILLISECOND, Quality::Good)
+            IntervalOutcome::Calculated(good / TICKS_PER_MILLISECOND, Quality::Good)
         }
         Aggregate::PercentGood => {
             let good = time_good(samples, (from, to));
             let whole = length((from, to)).max(1.0);
-            Outcome::Calculated(good * 100.0 / whole, Quality::Good)
+            IntervalOutcome::Calculated(good * 100.0 / whole, Quality::Good)
         }
         Aggregate::WorstQuality => {
             let worst = within.iter().rev();
             let worst = worst.max_by_key(|(_, sample)| sample.quality.rank());
-            worst.map_or(Outcome::NoData, |(at, _)| Outcome::Status(*at))
+            worst.map_or(IntervalOutcome::NoData, |(at, _)| {
+                IntervalOutcome::Status(*at)
+            })
         }
         Aggregate::Start => within
             .first()
-            .map_or(Outcome::NoData, |(at, _)| Outcome::Raw(*at)),
+            .map_or(IntervalOutcome::NoData, |(at, _)| IntervalOutcome::Raw(*at)),
         Aggregate::End => within
             .last()
-            .map_or(Outcome::NoData, |(at, _)| Outcome::Raw(*at)),
+            .map_or(IntervalOutcome::NoData, |(at, _)| IntervalOutcome::Raw(*at)),
         Aggregate::Interpolative
         | Aggregate::Average
         | Aggregate::Minimum
@@ -165,11 +167,11 @@ pub(super) fn of(
 /// Returns an aggregate of the values within an interval.
 fn of_values(
     aggregate: Aggregate,
-    (samples, within): (&[Sample], &[(usize, &Sample)]),
+    (samples, within): (&[PastValue], &[(usize, &PastValue)]),
     start: i64,
-    rules: Rules,
-) -> Outcome {
-    let usable = |sample: &Sample| rules.takes(sample.quality);
+    rules: AggregateRules,
+) -> IntervalOutcome {
+    let usable = |sample: &PastValue| rules.takes(sample.quality);
     let good: Vec<(usize, f64)> = within
         .iter()
         .filter(|(_, sample)| usable(sample))
@@ -179,16 +181,16 @@ fn of_values(
     if aggregate == Aggregate::Count {
         let count = within.iter().filter(|(_, sample)| usable(sample)).count();
         let count = u32::try_from(count).unwrap_or(u32::MAX);
-        return Outcome::Count(count, quality.unwrap_or(Quality::Good));
+        return IntervalOutcome::Count(count, quality.unwrap_or(Quality::Good));
     }
     let Some(quality) = quality else {
-        return Outcome::NoData;
+        return IntervalOutcome::NoData;
     };
     let (Some(first), Some(last)) = (good.first(), good.last()) else {
-        return Outcome::NoData;
+        return IntervalOutcome::NoData;
     };
     if quality == Quality::Bad {
-        return Outcome::Bad;
+        return IntervalOutcome::Bad;
     }
     let order = |pair: &&(usize, f64), other: &&(usize, f64)| pair.1.total_cmp(&other.1);
     // The first of equal samples is used.
@@ -199,7 +201,7 @@ fn of_values(
         Aggregate::Maximum => picked(samples, high.0, (start, quality)),
         Aggregate::MinimumActualTime => actual(low.0, quality),
         Aggregate::MaximumActualTime => actual(high.0, quality),
-        Aggregate::Range => Outcome::Calculated(high.1 - low.1, quality),
+        Aggregate::Range => IntervalOutcome::Calculated(high.1 - low.1, quality),
         Aggregate::Delta => {
             // Samples before the first and after the last number are bad.
             let ends = [within.first(), within.last()].map(|end| end.map(|(at, _)| *at));
@@ -208,7 +210,7 @@ fn of_values(
             } else {
                 Quality::Uncertain
             };
-            Outcome::Calculated(last.1 - first.1, quality)
+            IntervalOutcome::Calculated(last.1 - first.1, quality)
         }
         Aggregate::Average
         | Aggregate::Interpolative
@@ -222,7 +224,7 @@ fn of_values(
         | Aggregate::WorstQuality => {
             let sum: f64 = good.iter().map(|(_, value)| value).sum();
             let count = u32::try_from(good.len()).unwrap_or(u32::MAX);
-            Outcome::Calculated(sum / f64::from(count), quality)
+            IntervalOutcome::Calculated(sum / f64::from(count), quality)
         }
     }
 }
@@ -233,30 +235,34 @@ fn length((from, to): (i64, i64)) -> f64 {
 }
 
 /// Returns the outcome for a selected sample at its own time.
-fn actual(at: usize, quality: Quality) -> Outcome {
+fn actual(at: usize, quality: Quality) -> IntervalOutcome {
     match quality {
-        Quality::Good => Outcome::Raw(at),
-        Quality::Uncertain | Quality::Bad => Outcome::Actual(at, quality),
+        Quality::Good => IntervalOutcome::Raw(at),
+        Quality::Uncertain | Quality::Bad => IntervalOutcome::Actual(at, quality),
     }
 }
 
 /// Returns the average of the line through the samples (OPC 10000-13, 5.4.3.6), and the length of
 /// the interval in seconds. The time before the first sample has no data, and the value after the
 /// last sample is uncertain.
-fn average_over_time(samples: &[Sample], (from, to): (i64, i64), rules: Rules) -> (Outcome, f64) {
+fn average_over_time(
+    samples: &[PastValue],
+    (from, to): (i64, i64),
+    rules: AggregateRules,
+) -> (IntervalOutcome, f64) {
     let whole = length((from, to));
     let seconds = whole / TICKS_PER_MILLISECOND / 1e3;
     let value_at = |time| {
         let outcome = at(samples, time, rules);
-        if let Outcome::Interpolated(value, _) = outcome {
+        if let IntervalOutcome::Interpolated(value, _) = outcome {
             return Some(value);
         }
-        let Outcome::Raw(at) = outcome else {
+        let IntervalOutcome::Raw(at) = outcome else {
             return None;
         };
         samples.get(at).and_then(|sample| sample.value)
     };
-    let usable = |sample: &&Sample| rules.takes(sample.quality) && sample.value.is_some();
+    let usable = |sample: &&PastValue| rules.takes(sample.quality) && sample.value.is_some();
     let inside = |(after, before): (i64, i64)| {
         let first = samples.partition_point(|one| one.time <= after);
         let last = samples.partition_point(|one| one.time < before);
@@ -284,21 +290,21 @@ fn average_over_time(samples: &[Sample], (from, to): (i64, i64), rules: Rules) -
     }
     let known = whole - bad;
     if known <= 0.0 {
-        return (Outcome::NoData, seconds);
+        return (IntervalOutcome::NoData, seconds);
     }
     let quality = if bad > 0.0 && bad * 100.0 >= whole * f64::from(rules.percent_bad) {
-        return (Outcome::Bad, seconds);
+        return (IntervalOutcome::Bad, seconds);
     } else if good * 100.0 >= whole * f64::from(rules.percent_good) {
         Quality::Good
     } else {
         Quality::Uncertain
     };
-    (Outcome::Calculated(area / known, quality), seconds)
+    (IntervalOutcome::Calculated(area / known, quality), seconds)
 }
 
 /// Returns the time with good values, in ticks. Each value counts until the next value (OPC
 /// 10000-13, 5.4.3.22). The start of the interval has a good value between two good samples only.
-fn time_good(samples: &[Sample], (from, to): (i64, i64)) -> f64 {
+fn time_good(samples: &[PastValue], (from, to): (i64, i64)) -> f64 {
     let mut good = 0.0;
     let first = samples.partition_point(|one| one.time <= from);
     let end = samples.partition_point(|one| one.time < to);
@@ -306,7 +312,8 @@ fn time_good(samples: &[Sample], (from, to): (i64, i64)) -> f64 {
         .get(first.saturating_sub(1)..end)
         .unwrap_or_default();
     let nexts = samples.iter().skip(1).map(|next| next.time);
-    let is_good = |sample: Option<&Sample>| sample.is_none_or(|one| one.quality == Quality::Good);
+    let is_good =
+        |sample: Option<&PastValue>| sample.is_none_or(|one| one.quality == Quality::Good);
     for (place, (sample, next)) in samples.iter().zip(nexts.chain([i64::MAX])).enumerate() {
         let (begin, end) = (sample.time.max(from), next.min(to));
         let follower = samples.get(place + 1).filter(|_| sample.time < from);
@@ -322,34 +329,36 @@ const TICKS_PER_MILLISECOND: f64 = 1e4;
 
 /// Returns the outcome for a selected sample: the raw value if the sample is good and at the start
 /// of the interval.
-fn picked(samples: &[Sample], at: usize, (start, quality): (i64, Quality)) -> Outcome {
+fn picked(samples: &[PastValue], at: usize, (start, quality): (i64, Quality)) -> IntervalOutcome {
     match samples.get(at) {
-        Some(sample) if sample.time == start && quality == Quality::Good => Outcome::Raw(at),
-        Some(_) | None => Outcome::Picked(at, quality),
+        Some(sample) if sample.time == start && quality == Quality::Good => {
+            IntervalOutcome::Raw(at)
+        }
+        Some(_) | None => IntervalOutcome::Picked(at, quality),
     }
 }
 
 /// Returns the value at a time (OPC 10000-13, 5.4.3.4): the sample at that time, or the
 /// interpolation between its neighbours. After the last sample its value is held. Values that are
 /// not numbers are held too.
-pub(super) fn at(samples: &[Sample], time: i64, rules: Rules) -> Outcome {
-    let usable = |sample: &Sample| rules.takes(sample.quality);
+pub(super) fn at(samples: &[PastValue], time: i64, rules: AggregateRules) -> IntervalOutcome {
+    let usable = |sample: &PastValue| rules.takes(sample.quality);
     let behind = samples.partition_point(|sample| sample.time <= time);
     let (before, after) = samples.split_at(behind.min(samples.len()));
     let then = before.iter().enumerate().rev();
     let mut then = then.take_while(|(_, sample)| sample.time == time);
     if let Some((exact, _)) = then.find(|(_, sample)| usable(sample)) {
-        return Outcome::Raw(exact);
+        return IntervalOutcome::Raw(exact);
     }
     let Some(last) = before.iter().rposition(usable) else {
-        return Outcome::NoData;
+        return IntervalOutcome::NoData;
     };
     let first = after.iter().find(|sample| usable(sample));
     let Some(low) = before.get(last) else {
-        return Outcome::NoData;
+        return IntervalOutcome::NoData;
     };
     let Some(from) = low.value else {
-        return Outcome::Held(last);
+        return IntervalOutcome::Held(last);
     };
     // Bad samples in between, and uncertain samples at the ends, make the value uncertain.
     let skipped = before.len() - 1 != last || after.first() != first;
@@ -359,7 +368,7 @@ pub(super) fn at(samples: &[Sample], time: i64, rules: Rules) -> Outcome {
         .flatten()
         .any(|end| end.quality != Quality::Good);
     match first {
-        Some(Sample {
+        Some(PastValue {
             time: next,
             value: Some(to),
             ..
@@ -371,10 +380,10 @@ pub(super) fn at(samples: &[Sample], time: i64, rules: Rules) -> Outcome {
             } else {
                 Quality::Good
             };
-            Outcome::Interpolated(from + (to - from) * part, quality)
+            IntervalOutcome::Interpolated(from + (to - from) * part, quality)
         }
-        Some(_) => Outcome::Held(last),
-        None => Outcome::Interpolated(from, Quality::Uncertain),
+        Some(_) => IntervalOutcome::Held(last),
+        None => IntervalOutcome::Interpolated(from, Quality::Uncertain),
     }
 }
 
@@ -389,7 +398,7 @@ impl Quality {
     }
 }
 
-impl Rules {
+impl AggregateRules {
     const fn takes(self, quality: Quality) -> bool {
         match quality {
             Quality::Good => true,
@@ -432,15 +441,15 @@ mod examples;
 mod tests {
     use super::*;
 
-    fn sample(time: i64, value: f64) -> Sample {
-        Sample {
+    fn sample(time: i64, value: f64) -> PastValue {
+        PastValue {
             time,
             value: Some(value),
             quality: Quality::Good,
         }
     }
 
-    fn samples() -> Vec<Sample> {
+    fn samples() -> Vec<PastValue> {
         vec![
             sample(10, 1.0),
             sample(20, 5.0),
@@ -449,52 +458,62 @@ mod tests {
         ]
     }
 
-    fn of_all(aggregate: Aggregate, samples: &[Sample], interval: (i64, i64)) -> Outcome {
-        of(aggregate, samples, interval, Rules::default())
+    fn of_all(
+        aggregate: Aggregate,
+        samples: &[PastValue],
+        interval: (i64, i64),
+    ) -> IntervalOutcome {
+        of(aggregate, samples, interval, AggregateRules::default())
     }
 
     #[test]
     fn an_interval_has_its_start_and_not_its_end() {
         let all = samples();
         let average = of_all(Aggregate::Average, &all, (10, 30));
-        assert_eq!(average, Outcome::Calculated(3.0, Quality::Good));
+        assert_eq!(average, IntervalOutcome::Calculated(3.0, Quality::Good));
         let back = of_all(Aggregate::Average, &all, (40, 20));
-        assert_eq!(back, Outcome::Calculated(6.0, Quality::Good));
+        assert_eq!(back, IntervalOutcome::Calculated(6.0, Quality::Good));
         assert_eq!(
             of_all(Aggregate::Count, &all, (10, 40)),
-            Outcome::Count(3, Quality::Good)
+            IntervalOutcome::Count(3, Quality::Good)
         );
         assert_eq!(
             of_all(Aggregate::Count, &all, (50, 60)),
-            Outcome::Count(0, Quality::Good)
+            IntervalOutcome::Count(0, Quality::Good)
         );
-        assert_eq!(of_all(Aggregate::Average, &all, (50, 60)), Outcome::NoData);
+        assert_eq!(
+            of_all(Aggregate::Average, &all, (50, 60)),
+            IntervalOutcome::NoData
+        );
     }
 
     #[test]
     fn the_least_and_the_greatest_are_samples_and_raw_where_they_stand_at_the_start() {
         let all = samples();
-        assert_eq!(of_all(Aggregate::Minimum, &all, (10, 40)), Outcome::Raw(0));
+        assert_eq!(
+            of_all(Aggregate::Minimum, &all, (10, 40)),
+            IntervalOutcome::Raw(0)
+        );
         assert_eq!(
             of_all(Aggregate::Maximum, &all, (10, 40)),
-            Outcome::Picked(1, Quality::Good)
+            IntervalOutcome::Picked(1, Quality::Good)
         );
     }
 
     #[test]
     fn between_samples_the_value_lies_on_the_line_and_behind_the_last_it_is_held() {
         let all = samples();
-        let rules = Rules::default();
+        let rules = AggregateRules::default();
         assert_eq!(
             at(&all, 15, rules),
-            Outcome::Interpolated(3.0, Quality::Good)
+            IntervalOutcome::Interpolated(3.0, Quality::Good)
         );
-        assert_eq!(at(&all, 20, rules), Outcome::Raw(1));
+        assert_eq!(at(&all, 20, rules), IntervalOutcome::Raw(1));
         assert_eq!(
             at(&all, 50, rules),
-            Outcome::Interpolated(9.0, Quality::Uncertain)
+            IntervalOutcome::Interpolated(9.0, Quality::Uncertain)
         );
-        assert_eq!(at(&all, 5, rules), Outcome::NoData);
+        assert_eq!(at(&all, 5, rules), IntervalOutcome::NoData);
     }
 
     #[test]
@@ -502,50 +521,65 @@ mod tests {
         let mut all = samples();
         all[1].quality = Quality::Bad;
         let average = of_all(Aggregate::Average, &all, (10, 50));
-        assert_eq!(average, Outcome::Calculated(13.0 / 3.0, Quality::Uncertain));
         assert_eq!(
-            at(&all, 15, Rules::default()),
-            Outcome::Interpolated(1.5, Quality::Uncertain)
+            average,
+            IntervalOutcome::Calculated(13.0 / 3.0, Quality::Uncertain)
         );
-        assert_eq!(of_all(Aggregate::Average, &all, (20, 30)), Outcome::NoData);
+        assert_eq!(
+            at(&all, 15, AggregateRules::default()),
+            IntervalOutcome::Interpolated(1.5, Quality::Uncertain)
+        );
+        assert_eq!(
+            of_all(Aggregate::Average, &all, (20, 30)),
+            IntervalOutcome::NoData
+        );
         all[1].quality = Quality::Uncertain;
-        let lenient = Rules {
+        let lenient = AggregateRules {
             uncertain_is_bad: false,
-            ..Rules::default()
+            ..AggregateRules::default()
         };
         assert_eq!(
             of(Aggregate::Average, &all, (20, 30), lenient),
-            Outcome::Calculated(5.0, Quality::Good)
+            IntervalOutcome::Calculated(5.0, Quality::Good)
         );
     }
 
     #[test]
     fn the_first_and_the_last_sample_and_their_difference() {
         let mut all = samples();
-        assert_eq!(of_all(Aggregate::Start, &all, (15, 45)), Outcome::Raw(1));
-        assert_eq!(of_all(Aggregate::End, &all, (15, 40)), Outcome::Raw(2));
-        assert_eq!(of_all(Aggregate::Start, &all, (50, 60)), Outcome::NoData);
+        assert_eq!(
+            of_all(Aggregate::Start, &all, (15, 45)),
+            IntervalOutcome::Raw(1)
+        );
+        assert_eq!(
+            of_all(Aggregate::End, &all, (15, 40)),
+            IntervalOutcome::Raw(2)
+        );
+        assert_eq!(
+            of_all(Aggregate::Start, &all, (50, 60)),
+            IntervalOutcome::NoData
+        );
         assert_eq!(
             of_all(Aggregate::Delta, &all, (10, 50)),
-            Outcome::Calculated(8.0, Quality::Good)
+            IntervalOutcome::Calculated(8.0, Quality::Good)
         );
         all[3].quality = Quality::Bad;
         assert_eq!(
             of_all(Aggregate::Delta, &all, (10, 50)),
-            Outcome::Calculated(2.0, Quality::Uncertain),
+            IntervalOutcome::Calculated(2.0, Quality::Uncertain),
             "without the last sample"
         );
         assert_eq!(
             of_all(Aggregate::Range, &all, (10, 40)),
-            Outcome::Calculated(4.0, Quality::Good)
+            IntervalOutcome::Calculated(4.0, Quality::Good)
         );
         assert_eq!(
             of_all(Aggregate::WorstQuality, &all, (10, 50)),
-            Outcome::Status(3)
+            IntervalOutcome::Status(3)
         );
         assert_eq!(
             of_all(Aggregate::WorstQuality, &all, (10, 40)),
-            Outcome::Status(0)
+            IntervalOutcome::Status(0)
         );
     }
 
@@ -554,12 +588,12 @@ mod tests {
         let mut all = samples();
         assert_eq!(
             of_all(Aggregate::MaximumActualTime, &all, (10, 40)),
-            Outcome::Raw(1)
+            IntervalOutcome::Raw(1)
         );
         all[0].quality = Quality::Bad;
         assert_eq!(
             of_all(Aggregate::MinimumActualTime, &all, (10, 40)),
-            Outcome::Actual(2, Quality::Uncertain)
+            IntervalOutcome::Actual(2, Quality::Uncertain)
         );
     }
 
@@ -568,46 +602,52 @@ mod tests {
         let all = samples();
         // The line from 1 to 5, to 3 and to 9: areas of 30, 40 and 60.
         let whole = of_all(Aggregate::TimeAverage, &all, (10, 40));
-        assert_eq!(whole, Outcome::Calculated(130.0 / 30.0, Quality::Good));
+        assert_eq!(
+            whole,
+            IntervalOutcome::Calculated(130.0 / 30.0, Quality::Good)
+        );
         let half = of_all(Aggregate::TimeAverage, &all, (15, 20));
-        assert_eq!(half, Outcome::Calculated(4.0, Quality::Good));
+        assert_eq!(half, IntervalOutcome::Calculated(4.0, Quality::Good));
         let held = of_all(Aggregate::TimeAverage, &all, (40, 50));
-        assert_eq!(held, Outcome::Calculated(9.0, Quality::Uncertain));
+        assert_eq!(held, IntervalOutcome::Calculated(9.0, Quality::Uncertain));
         let before = of_all(Aggregate::TimeAverage, &all, (0, 5));
-        assert_eq!(before, Outcome::NoData);
+        assert_eq!(before, IntervalOutcome::NoData);
         // Half of this interval is before the first sample.
         let partly = of_all(Aggregate::TimeAverage, &all, (5, 15));
-        assert_eq!(partly, Outcome::Calculated(2.0, Quality::Uncertain));
-        let seconds: Vec<Sample> = [0, 1].map(|at| sample(at * 10_000_000, 3.0)).to_vec();
+        assert_eq!(partly, IntervalOutcome::Calculated(2.0, Quality::Uncertain));
+        let seconds: Vec<PastValue> = [0, 1].map(|at| sample(at * 10_000_000, 3.0)).to_vec();
         let total = of_all(Aggregate::Total, &seconds, (0, 10_000_000));
-        assert_eq!(total, Outcome::Calculated(3.0, Quality::Good));
+        assert_eq!(total, IntervalOutcome::Calculated(3.0, Quality::Good));
     }
 
     #[test]
     fn a_value_is_good_until_the_next_value() {
-        let mut all: Vec<Sample> = (0..4).map(|at| sample(at * 10_000, 1.0)).collect();
+        let mut all: Vec<PastValue> = (0..4).map(|at| sample(at * 10_000, 1.0)).collect();
         all[1].quality = Quality::Bad;
         all[2].quality = Quality::Uncertain;
         let interval = (-10_000, 40_000);
         assert_eq!(
             of_all(Aggregate::DurationGood, &all, interval),
-            Outcome::Calculated(2.0, Quality::Good),
+            IntervalOutcome::Calculated(2.0, Quality::Good),
             "in milliseconds"
         );
         assert_eq!(
             of_all(Aggregate::PercentGood, &all, interval),
-            Outcome::Calculated(40.0, Quality::Good)
+            IntervalOutcome::Calculated(40.0, Quality::Good)
         );
     }
 
     #[test]
     fn texts_are_held() {
-        let text = Sample {
+        let text = PastValue {
             time: 10,
             value: None,
             quality: Quality::Good,
         };
-        let all = [text, Sample { time: 20, ..text }];
-        assert_eq!(at(&all, 15, Rules::default()), Outcome::Held(0));
+        let all = [text, PastValue { time: 20, ..text }];
+        assert_eq!(
+            at(&all, 15, AggregateRules::default()),
+            IntervalOutcome::Held(0)
+        );
     }
 }

@@ -6,9 +6,9 @@ use mappings::TopicId;
 use opcua::types::StatusCode;
 use uadp::Timestamp;
 
-use super::store::{Store, Stored};
+use super::store::{HistoryFile, StoredValue};
 use crate::layout::TopicNode;
-use crate::values::Shown;
+use crate::values::ShownValue;
 
 /// Past values, oldest first in each topic.
 #[derive(Debug)]
@@ -24,12 +24,12 @@ pub(crate) struct Past {
     next: u64,
     topics: HashMap<TopicId, Kept>,
     /// The file of the values.
-    store: Option<Store>,
+    store: Option<HistoryFile>,
 }
 
 #[derive(Debug, Default)]
 struct Kept {
-    values: VecDeque<(u64, Shown)>,
+    values: VecDeque<(u64, ShownValue)>,
     bytes: usize,
 }
 
@@ -50,7 +50,7 @@ impl Past {
     /// Adds the values of a file, and stores all further values in the file. Each topic gets the
     /// mark `BadDataLost` for the time without the server (OPC 10000-11, 6.7), unless its last
     /// value is such a mark: repeated restarts do not displace the values.
-    pub(crate) fn keep_in(&mut self, store: Store, stored: Vec<Stored>) {
+    pub(crate) fn keep_in(&mut self, store: HistoryFile, stored: Vec<StoredValue>) {
         let last = stored.iter().map(|(_, _, shown)| shown.stamp.server).max();
         let next = stored
             .iter()
@@ -63,7 +63,7 @@ impl Past {
         }
         self.enforce();
         let Some(last) = last else { return };
-        let mut lost = Shown::nothing(StatusCode::BadDataLost);
+        let mut lost = ShownValue::nothing(StatusCode::BadDataLost);
         lost.stamp.server = last;
         lost.stamp.source = Some(Timestamp {
             time: uadp::DateTime(last.ticks()),
@@ -94,7 +94,7 @@ impl Past {
         drop(self.store.take());
     }
 
-    fn insert(&mut self, topic: TopicId, number: u64, shown: Shown) {
+    fn insert(&mut self, topic: TopicId, number: u64, shown: ShownValue) {
         let size = size(&shown);
         let kept = self.topics.entry(topic).or_default();
         kept.values.push_back((number, shown));
@@ -126,7 +126,7 @@ impl Past {
 
     /// Stores the current value of a topic. If the store is full, topics that occupy three quarters
     /// of their share or more drop the older half of their values.
-    pub(crate) fn keep(&mut self, topic: TopicId, shown: &Shown) {
+    pub(crate) fn keep(&mut self, topic: TopicId, shown: &ShownValue) {
         let size = size(shown);
         let most = self.own.get(&topic).copied().unwrap_or(self.most_values);
         if most == 0 || size > self.most_bytes {
@@ -160,7 +160,7 @@ impl Past {
     }
 
     /// Returns the values of a topic in the order of their arrival, each with its unique number.
-    pub(crate) fn of(&self, topic: TopicId) -> Vec<(u64, Shown)> {
+    pub(crate) fn of(&self, topic: TopicId) -> Vec<(u64, ShownValue)> {
         let kept = self.topics.get(&topic);
         kept.map_or_else(Vec::new, |kept| kept.values.iter().cloned().collect())
     }
@@ -178,7 +178,11 @@ impl Past {
 
 impl Kept {
     /// Drops the oldest values, in the file too, and returns the number of freed bytes.
-    fn drop_oldest(&mut self, count: usize, (topic, store): (TopicId, Option<&Store>)) -> usize {
+    fn drop_oldest(
+        &mut self,
+        count: usize,
+        (topic, store): (TopicId, Option<&HistoryFile>),
+    ) -> usize {
         let gone = self.values.drain(..count.min(self.values.len()));
         let mut behind = None;
         let mut freed = 0;
@@ -195,12 +199,12 @@ impl Kept {
 }
 
 /// Returns the memory size of a value.
-fn size(shown: &Shown) -> usize {
+fn size(shown: &ShownValue) -> usize {
     shown.block.as_ref().map_or(0, bytes::Bytes::len) + BESIDE
 }
 
 /// Size of the stamps, spare capacity for further entries, and the allocation of the bytes.
-const BESIDE: usize = 2 * size_of::<(u64, Shown)>() + 48;
+const BESIDE: usize = 2 * size_of::<(u64, ShownValue)>() + 48;
 
 #[cfg(test)]
 mod tests {
@@ -209,10 +213,10 @@ mod tests {
 
     use super::*;
 
-    fn value(size: usize, mark: u8) -> Shown {
-        Shown {
+    fn value(size: usize, mark: u8) -> ShownValue {
+        ShownValue {
             block: Some(Bytes::from(vec![mark; size])),
-            ..Shown::nothing(StatusCode::Good)
+            ..ShownValue::nothing(StatusCode::Good)
         }
     }
 
@@ -268,7 +272,7 @@ mod tests {
         let topic = TopicId::new(1, 2, 3).unwrap();
         let name = format!("ua-past-{}", std::process::id());
         let file = std::env::temp_dir().join(name);
-        let opened = || Store::open(&file, std::iter::empty()).unwrap();
+        let opened = || HistoryFile::open(&file, std::iter::empty()).unwrap();
         let stored = (4..8).map(|number| (topic, number, value(4, 1)));
         let mut past = Past::new(3, 1 << 20);
         past.keep_in(opened().0, stored.collect());
@@ -281,7 +285,7 @@ mod tests {
         // The file is free again.
         drop(opened());
         // A second restart without a new value adds no second mark.
-        let lost = Shown::nothing(StatusCode::BadDataLost);
+        let lost = ShownValue::nothing(StatusCode::BadDataLost);
         let mut past = Past::new(9, 1 << 20);
         past.keep_in(opened().0, vec![(topic, 0, value(4, 1)), (topic, 1, lost)]);
         assert_eq!(past.of(topic).len(), 2);

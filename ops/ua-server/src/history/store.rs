@@ -19,10 +19,10 @@ use tracing::{info, warn};
 use uadp::Timestamp;
 
 use crate::layout::TopicNode;
-use crate::values::{Shown, Stamp};
+use crate::values::{SampleStamp, ShownValue};
 
 /// A value in the file: its topic, its number and its content.
-pub(crate) type Stored = (TopicId, u64, Shown);
+pub(crate) type StoredValue = (TopicId, u64, ShownValue);
 
 /// The file of the history is unusable.
 #[derive(Debug, thiserror::Error)]
@@ -31,14 +31,14 @@ pub(crate) type Stored = (TopicId, u64, Shown);
      give another file, or move this one away to start with an empty history",
     path.display()
 )]
-pub(crate) struct StoreFault {
+pub(crate) struct HistoryFileFault {
     path: PathBuf,
     why: String,
 }
 
 /// Writes the changes of the history to a file.
 #[derive(Debug)]
-pub(crate) struct Store {
+pub(crate) struct HistoryFile {
     shared: Arc<Shared>,
     /// The conditions of the file until they are taken.
     conditions: HashMap<String, Vec<u8>>,
@@ -54,7 +54,7 @@ struct Shared {
 /// The changes that are not in the file.
 #[derive(Debug, Default)]
 struct Pending {
-    values: Vec<Stored>,
+    values: Vec<StoredValue>,
     bytes: usize,
     /// The number of the oldest value of each topic that has dropped values.
     floors: HashMap<TopicId, u64>,
@@ -67,7 +67,7 @@ struct Pending {
     is_over: bool,
 }
 
-impl Store {
+impl HistoryFile {
     /// Opens the file or creates it. Also returns its values of `topics`, by topic and in the order
     /// of their arrival. Values of other topics, and of topics that had other types, are removed.
     ///
@@ -76,8 +76,8 @@ impl Store {
     pub(crate) fn open<'t>(
         path: &Path,
         topics: impl Iterator<Item = &'t TopicNode>,
-    ) -> Result<(Self, Vec<Stored>), StoreFault> {
-        let fault = |why: String| StoreFault {
+    ) -> Result<(Self, Vec<StoredValue>), HistoryFileFault> {
+        let fault = |why: String| HistoryFileFault {
             path: path.to_owned(),
             why,
         };
@@ -121,7 +121,7 @@ impl Store {
     }
 
     /// Adds a value.
-    pub(crate) fn keep(&self, topic: TopicId, number: u64, shown: &Shown) {
+    pub(crate) fn keep(&self, topic: TopicId, number: u64, shown: &ShownValue) {
         let size = size(shown);
         let mut pending = self.shared.lock();
         if pending.bytes + size > MOST_PENDING {
@@ -201,7 +201,7 @@ impl Pending {
 }
 
 /// Writes the remaining changes.
-impl Drop for Store {
+impl Drop for HistoryFile {
     fn drop(&mut self) {
         self.shared.lock().is_over = true;
         self.shared.changed.notify_one();
@@ -332,7 +332,7 @@ fn write(database: &Database, changes: &Pending) -> Result<(), redb::Error> {
 }
 
 /// The values and the conditions of a file.
-type Loaded = (Vec<Stored>, HashMap<String, Vec<u8>>);
+type Loaded = (Vec<StoredValue>, HashMap<String, Vec<u8>>);
 
 /// Reads the values of topics with these shapes, and removes all others. Also reads the conditions.
 fn load(database: &Database, shapes: &HashMap<u64, String>) -> Result<Loaded, redb::Error> {
@@ -405,7 +405,7 @@ fn shape(topic: &TopicNode) -> String {
 
 /// Encodes a value: the version, the status, the server timestamp, the source timestamp, and the
 /// fields.
-fn encoded(shown: &Shown) -> Vec<u8> {
+fn encoded(shown: &ShownValue) -> Vec<u8> {
     let stamp = &shown.stamp;
     let mut bytes = vec![VERSION];
     bytes.extend(stamp.status.bits().to_le_bytes());
@@ -423,7 +423,7 @@ fn encoded(shown: &Shown) -> Vec<u8> {
 }
 
 /// Decodes a value; `None` if it is not valid.
-fn decoded(bytes: &[u8]) -> Option<Shown> {
+fn decoded(bytes: &[u8]) -> Option<ShownValue> {
     let mut rest = bytes;
     if take::<1>(&mut rest)? != [VERSION] {
         return None;
@@ -438,9 +438,9 @@ fn decoded(bytes: &[u8]) -> Option<Shown> {
             picoseconds: u16::from_le_bytes(take(&mut rest)?),
         }),
     };
-    let shown = Shown {
+    let shown = ShownValue {
         block: (flags & 2 != 0).then(|| Bytes::copy_from_slice(rest)),
-        stamp: Stamp {
+        stamp: SampleStamp {
             status,
             source,
             server,
@@ -462,8 +462,8 @@ fn take<const N: usize>(bytes: &mut &[u8]) -> Option<[u8; N]> {
 }
 
 /// Returns the size of a value that waits to be written, in bytes.
-fn size(shown: &Shown) -> usize {
-    shown.block.as_ref().map_or(0, Bytes::len) + size_of::<Stored>()
+fn size(shown: &ShownValue) -> usize {
+    shown.block.as_ref().map_or(0, Bytes::len) + size_of::<StoredValue>()
 }
 
 /// The values by topic and number.
@@ -483,7 +483,7 @@ const CACHE: usize = 8 << 20;
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::layout::{FieldNode, Shape};
+    use crate::layout::{FieldNode, VariableShape};
     use uadp::BuiltinType;
 
     struct Scratch(PathBuf);
@@ -496,8 +496,8 @@ mod tests {
             Self(folder)
         }
 
-        fn open(&self, topics: &[TopicNode]) -> (Store, Vec<Stored>) {
-            Store::open(&self.0.join("below/history"), topics.iter()).unwrap()
+        fn open(&self, topics: &[TopicNode]) -> (HistoryFile, Vec<StoredValue>) {
+            HistoryFile::open(&self.0.join("below/history"), topics.iter()).unwrap()
         }
     }
 
@@ -517,7 +517,7 @@ mod tests {
             fields: vec![FieldNode {
                 node,
                 name: "value".to_owned(),
-                shape: Shape(Some((builtin, false))),
+                shape: VariableShape(Some((builtin, false))),
                 structure: None,
             }],
             compound: false,
@@ -529,12 +529,12 @@ mod tests {
     }
 
     /// A value with one field, a Double.
-    fn value(number: f64) -> Shown {
+    fn value(number: f64) -> ShownValue {
         let mut block = vec![1, 0, 11];
         block.extend(number.to_le_bytes());
-        Shown {
+        ShownValue {
             block: Some(Bytes::from(block)),
-            stamp: Stamp {
+            stamp: SampleStamp {
                 status: StatusCode::Good,
                 source: Some(Timestamp {
                     time: uadp::DateTime(7),
@@ -545,7 +545,7 @@ mod tests {
         }
     }
 
-    fn numbers(stored: &[Stored], topic: TopicId) -> Vec<u64> {
+    fn numbers(stored: &[StoredValue], topic: TopicId) -> Vec<u64> {
         let of_topic = stored.iter().filter(|(other, ..)| *other == topic);
         of_topic.map(|(_, number, _)| *number).collect()
     }
@@ -560,7 +560,7 @@ mod tests {
         for number in 0..5 {
             store.keep(one, number, &value(1.5));
         }
-        store.keep(other, 5, &Shown::nothing(StatusCode::BadNoData));
+        store.keep(other, 5, &ShownValue::nothing(StatusCode::BadNoData));
         store.remove_before(one, 3);
         drop(store);
         let (store, stored) = scratch.open(&topics);
@@ -571,7 +571,7 @@ mod tests {
         assert_eq!(first.stamp.source, value(1.5).stamp.source);
         assert_eq!(first.stamp.server, DateTime::from(8));
         // Another program cannot open it at the same time.
-        let second = Store::open(&scratch.0.join("below/history"), topics.iter());
+        let second = HistoryFile::open(&scratch.0.join("below/history"), topics.iter());
         assert!(
             second
                 .unwrap_err()
@@ -639,7 +639,7 @@ mod tests {
         fs::create_dir_all(&scratch.0).unwrap();
         let path = scratch.0.join("notes.txt");
         fs::write(&path, "a text".repeat(1_000)).unwrap();
-        let refused = Store::open(&path, std::iter::empty());
+        let refused = HistoryFile::open(&path, std::iter::empty());
         assert!(refused.is_err());
         assert_eq!(fs::read(&path).unwrap().len(), 6_000);
     }
@@ -651,7 +651,7 @@ mod tests {
         for end in 0..good.len() {
             assert!(decoded(&good[..end]).is_none(), "{end}");
         }
-        let nothing = encoded(&Shown::nothing(StatusCode::BadNoData));
+        let nothing = encoded(&ShownValue::nothing(StatusCode::BadNoData));
         assert!(decoded(&nothing).is_some());
         assert!(decoded(&[nothing, vec![0]].concat()).is_none());
     }

@@ -4,12 +4,12 @@ use super::*;
 
 const TIMES: [i64; 4] = [10, 20, 30, 40];
 
-fn read(start: Option<i64>, end: Option<i64>, count: u32, bounds: bool) -> Vec<Step> {
+fn read(start: Option<i64>, end: Option<i64>, count: u32, bounds: bool) -> Vec<HistoryValue> {
     steps(&TIMES, (start, end), (count, bounds)).unwrap()
 }
 
-fn values(list: &[usize]) -> Vec<Step> {
-    list.iter().map(|at| Step::Value(*at)).collect()
+fn values(list: &[usize]) -> Vec<HistoryValue> {
+    list.iter().map(|at| HistoryValue::Value(*at)).collect()
 }
 
 #[test]
@@ -30,9 +30,9 @@ fn bounds_are_the_values_at_the_ends_or_beyond_them() {
     assert_eq!(
         read(Some(5), Some(50), 0, true),
         [
-            &[Step::NoBound(5)][..],
+            &[HistoryValue::NoBound(5)][..],
             &values(&[0, 1, 2, 3]),
-            &[Step::NoBound(50)]
+            &[HistoryValue::NoBound(50)]
         ]
         .concat()
     );

@@ -4,7 +4,7 @@ use opcua::server::node_manager::{MethodCall, RequestContext};
 use opcua::types::{NodeId, StatusCode, Variant};
 use tracing::info;
 
-use crate::asking::{Drive, Drives, Questions, Refused, Table};
+use crate::asking::{CallFailure, Drive, Drives, Questions, Table};
 
 /// The Methods and Programs that clients can call.
 pub(crate) struct Callables {
@@ -43,7 +43,7 @@ impl Callables {
         context: &RequestContext,
         (method, arguments): (&NodeId, &[Variant]),
         gone: impl Fn() -> bool,
-    ) -> Option<Result<Vec<Variant>, Refused>> {
+    ) -> Option<Result<Vec<Variant>, CallFailure>> {
         // The Method may have been removed after the check of the server.
         let callable = self.methods.lock().get(method).cloned();
         if let Some(callable) = callable {
@@ -60,33 +60,33 @@ async fn drive(
     context: &RequestContext,
     asked: Drive,
     arguments: &[Variant],
-) -> Result<Vec<Variant>, Refused> {
+) -> Result<Vec<Variant>, CallFailure> {
     // Clients with permission to send goals may call the method.
     let may = context
         .authenticator
         .is_user_executable(&context.token, &asked.goal);
     if !may {
-        return Err(Refused::Status(StatusCode::BadUserAccessDenied));
+        return Err(CallFailure::Status(StatusCode::BadUserAccessDenied));
     }
     let ended = tokio::spawn((asked.carry_out)(arguments.to_vec())).await;
-    ended.unwrap_or(Err(Refused::Status(StatusCode::BadInternalError)))
+    ended.unwrap_or(Err(CallFailure::Status(StatusCode::BadInternalError)))
 }
 
 /// Sets the outputs of a call, or the status with which it failed.
-pub(super) fn set_result(method: &mut MethodCall, called: Result<Vec<Variant>, Refused>) {
+pub(super) fn set_result(method: &mut MethodCall, called: Result<Vec<Variant>, CallFailure>) {
     match called {
         Ok(outputs) => {
             method.set_outputs(outputs);
             method.set_status(StatusCode::Good);
         }
-        Err(Refused::Arguments(statuses)) => {
+        Err(CallFailure::Arguments(statuses)) => {
             method.set_argument_error(statuses);
             method.set_status(StatusCode::BadInvalidArgument);
         }
-        Err(Refused::Asked(error)) => {
+        Err(CallFailure::Asked(error)) => {
             info!(method = %method.method_id(), "cannot execute a call of a Method: {error}");
             method.set_status(StatusCode::from(error.status.0));
         }
-        Err(Refused::Status(status)) => method.set_status(status),
+        Err(CallFailure::Status(status)) => method.set_status(status),
     }
 }

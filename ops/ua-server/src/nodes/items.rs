@@ -9,13 +9,13 @@ use opcua::sync::Mutex;
 use opcua::types::{AttributeId, DataValue, NodeId, NumericRange, StatusCode};
 use tracing::warn;
 
-use crate::budget::{Answers, LARGEST, SMALL, Watched};
-use crate::values::View;
+use crate::budget::{Answers, LARGEST, MonitoredMemory, SMALL};
+use crate::values::NodeView;
 
 /// The monitored items, and the memory of values for clients.
 #[derive(Debug, Default)]
 pub(super) struct ClientValues {
-    watched: Mutex<Watched>,
+    watched: Mutex<MonitoredMemory>,
     answers: Mutex<Answers>,
     /// Number of values that were refused to clients because of their size.
     refused: AtomicU64,
@@ -49,7 +49,7 @@ impl ClientValues {
     }
 
     /// Returns a range of a value for a response, or the reason why it is refused.
-    pub(super) fn answer(&self, view: View<'_>, range: &NumericRange) -> DataValue {
+    pub(super) fn answer(&self, view: NodeView<'_>, range: &NumericRange) -> DataValue {
         let (view, range) = view.narrowed(range);
         let weight = view.weight();
         let refused = match weight {
@@ -72,8 +72,8 @@ impl ClientValues {
         &self,
         subscriptions: &SubscriptionCache,
         node: &NodeId,
-        view: &View<'_>,
-        before: &View<'_>,
+        view: &NodeView<'_>,
+        before: &NodeView<'_>,
     ) {
         let mut notifier = subscriptions.data_notifier();
         let Some(mut items) = notifier.notify_for(node, AttributeId::Value) else {
@@ -113,7 +113,7 @@ impl ClientValues {
     pub(super) fn for_item(
         &self,
         handle: MonitoredItemHandle,
-        view: &View<'_>,
+        view: &NodeView<'_>,
         decoded: &mut Option<DataValue>,
     ) -> (DataValue, bool) {
         let weight = view.weight();
@@ -137,7 +137,7 @@ impl ClientValues {
 
     /// Returns the DataValue of a refused value. The refusal is logged at the 1st, 10th, 100th ...
     /// time.
-    fn refuse(&self, view: &View<'_>, weight: usize, status: StatusCode) -> DataValue {
+    fn refuse(&self, view: &NodeView<'_>, weight: usize, status: StatusCode) -> DataValue {
         let total = self.refused.fetch_add(1, Ordering::Relaxed) + 1;
         if 10_u64.pow(total.ilog10()) == total {
             warn!(

@@ -11,13 +11,13 @@ use super::items::ClientValues;
 use crate::alarms::Alarms;
 use crate::budget::SMALL;
 use crate::confirm::Confirms;
-use crate::history::{Past, Series, Store, Stored};
+use crate::history::{HistoryFile, Past, Series, StoredValue};
 use crate::layout::TopicNode;
-use crate::values::{Shown, Values};
+use crate::values::{CurrentValues, ShownValue};
 
 /// The values of the topics.
 pub(crate) struct LiveValues {
-    values: RwLock<Values>,
+    values: RwLock<CurrentValues>,
     past: RwLock<Past>,
     items: ClientValues,
     /// The confirmations of writes.
@@ -30,7 +30,7 @@ impl LiveValues {
     /// Creates the values of topics that all wait for their first value.
     pub(super) fn new(confirms: Arc<Confirms>, alarms: Arc<Alarms>) -> Self {
         Self {
-            values: RwLock::new(Values::new(MOST_HELD)),
+            values: RwLock::new(CurrentValues::new(MOST_HELD)),
             past: RwLock::new(Past::new(0, 0)),
             items: ClientValues::default(),
             confirms,
@@ -68,7 +68,7 @@ impl LiveValues {
     }
 
     /// Adds the past values of a file, and stores all further values there.
-    pub(crate) fn keep_past_in(&self, (store, stored): (Store, Vec<Stored>)) {
+    pub(crate) fn keep_past_in(&self, (store, stored): (HistoryFile, Vec<StoredValue>)) {
         self.past.write().keep_in(store, stored);
     }
 
@@ -78,9 +78,9 @@ impl LiveValues {
     }
 
     /// Returns the current value of a topic.
-    pub(crate) fn shown(&self, topic: TopicId) -> Shown {
+    pub(crate) fn shown(&self, topic: TopicId) -> ShownValue {
         let shown = self.values.read().get(topic).cloned();
-        shown.unwrap_or_else(Shown::waiting)
+        shown.unwrap_or_else(ShownValue::waiting)
     }
 
     /// Shows a new value of a topic, notifies the monitored items of its nodes, and adds the value
@@ -93,7 +93,7 @@ impl LiveValues {
         &self,
         subscriptions: &SubscriptionCache,
         topic: &TopicNode,
-        shown: Shown,
+        shown: ShownValue,
     ) -> Result<(), StatusCode> {
         self.put(subscriptions, topic, (shown, true))
     }
@@ -103,7 +103,7 @@ impl LiveValues {
         &self,
         subscriptions: &SubscriptionCache,
         topic: &TopicNode,
-        shown: Shown,
+        shown: ShownValue,
     ) {
         // The value is stored already, so the memory limit does not apply.
         let _kept = self.put(subscriptions, topic, (shown, false));
@@ -113,7 +113,7 @@ impl LiveValues {
         &self,
         subscriptions: &SubscriptionCache,
         topic: &TopicNode,
-        (shown, is_new): (Shown, bool),
+        (shown, is_new): (ShownValue, bool),
     ) -> Result<(), StatusCode> {
         // The lock is held until all items are notified, so that notifications keep their order.
         let mut values = self.values.write();
@@ -125,7 +125,7 @@ impl LiveValues {
             self.past.write().keep(topic.topic, shown);
             self.confirms.heard(topic.topic, shown);
         }
-        let before = before.unwrap_or_else(Shown::waiting);
+        let before = before.unwrap_or_else(ShownValue::waiting);
         let views = before.views(topic).zip(shown.views(topic));
         for (node, (before, view)) in topic.nodes().zip(views) {
             self.items.notify(subscriptions, node, &view, &before);

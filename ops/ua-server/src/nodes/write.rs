@@ -15,17 +15,17 @@ use uadp::Timestamp;
 
 use super::Exits;
 use super::live::LiveValues;
-use crate::arrivals::Awaited;
+use crate::arrivals::PendingWrite;
 use crate::budget::LARGEST;
 use crate::commanders::Commander;
 use crate::confirm::Confirms;
 use crate::layout::{FieldNode, TopicNode};
 use crate::leaving::{Departing, Departure, LONGEST_WAY_OUT, NOT_ACTIVE, departure};
 use crate::properties;
-use crate::pubsub::PubSub;
+use crate::pubsub::PubSubNodes;
 use crate::redundant::ServerRole;
 use crate::value;
-use crate::values::{Shown, Stamp};
+use crate::values::{SampleStamp, ShownValue};
 
 /// Sends and shows the values that clients write.
 pub(crate) struct WritePath {
@@ -38,7 +38,7 @@ pub(crate) struct WritePath {
     writes: mpsc::Sender<ClientWrite>,
     /// Limits the total size of the values in the channel, in KiB.
     room: Arc<Semaphore>,
-    pubsub: Arc<PubSub>,
+    pubsub: Arc<PubSubNodes>,
     confirms: Arc<Confirms>,
     role: ServerRole,
 }
@@ -60,18 +60,18 @@ pub(crate) struct ClientWrite {
     /// server.
     pub(crate) answer: oneshot::Sender<StatusCode>,
     /// Receives the confirmation of the bridges.
-    pub(crate) awaited: Option<Awaited>,
+    pub(crate) awaited: Option<PendingWrite>,
 }
 
 /// The client of a write.
-pub(crate) struct Writer {
+pub(crate) struct WriteClient {
     pub(crate) subscriptions: Arc<SubscriptionCache>,
     pub(crate) token: UserToken,
     /// Returns the session that commands a topic by a write.
     pub(crate) commander: Box<dyn Fn() -> Commander + Send + Sync>,
 }
 
-impl Writer {
+impl WriteClient {
     pub(super) fn of(context: &RequestContext) -> Self {
         Self {
             subscriptions: Arc::clone(&context.subscriptions),
@@ -89,7 +89,7 @@ struct OnItsWay {
 
 /// A callback for the fields of a write before it is sent, and the confirmation that the write
 /// waits for.
-type Registration<'r> = (&'r dyn Fn(&[Variant]), Option<Awaited>);
+type Registration<'r> = (&'r dyn Fn(&[Variant]), Option<PendingWrite>);
 
 impl WritePath {
     pub(super) fn new(live: Arc<LiveValues>, exits: &Exits) -> Self {
@@ -147,7 +147,7 @@ impl WritePath {
     /// Writes a value to a topic or to one of its fields. The client may write it.
     pub(super) async fn write(
         &self,
-        writer: &Writer,
+        writer: &WriteClient,
         (topic, field): (&TopicNode, Option<usize>),
         write: &ParsedWriteValue,
     ) -> Result<StatusCode, StatusCode> {
@@ -198,9 +198,9 @@ impl WritePath {
     /// Sends a value and shows it. Returns the server timestamp of the shown value.
     fn write_and_show(
         &self,
-        writer: &Writer,
+        writer: &WriteClient,
         place: (&TopicNode, Option<usize>),
-        (write, awaited): (&ParsedWriteValue, Option<Awaited>),
+        (write, awaited): (&ParsedWriteValue, Option<PendingWrite>),
     ) -> Result<(OnItsWay, DateTime), StatusCode> {
         // No other write may come between sending and showing, because a write of a single field
         // keeps the current values of the other fields.
@@ -215,11 +215,11 @@ impl WritePath {
     /// the result of sending.
     fn send_written(
         &self,
-        writer: &Writer,
+        writer: &WriteClient,
         place: (&TopicNode, Option<usize>),
         write: &ParsedWriteValue,
         register: &dyn Fn(&[Variant]),
-    ) -> Result<Shown, StatusCode> {
+    ) -> Result<ShownValue, StatusCode> {
         let _alone = self.writing.lock();
         let (sent, _on_its_way) = self.send_alone(writer, place, write, (register, None))?;
         Ok(sent)
@@ -229,11 +229,11 @@ impl WritePath {
     /// to show afterwards, and the pending results of sending. The caller holds the write lock.
     fn send_alone(
         &self,
-        writer: &Writer,
+        writer: &WriteClient,
         (topic, at): (&TopicNode, Option<usize>),
         write: &ParsedWriteValue,
         (register, awaited): Registration<'_>,
-    ) -> Result<(Shown, OnItsWay), StatusCode> {
+    ) -> Result<(ShownValue, OnItsWay), StatusCode> {
         if self.pubsub.is_off(topic.topic) || self.role.is_standby() {
             // The writer of the topic is disabled, or another server is active: the value would
             // not be sent.
@@ -263,13 +263,13 @@ impl WritePath {
         let source = source_of(&write.value);
         let value = (block.clone(), source);
         let on_its_way = self.send((topic, at), value, ((writer.commander)(), awaited))?;
-        let stamp = Stamp {
+        let stamp = SampleStamp {
             status: StatusCode::Good,
             source: Some(source),
             server: DateTime::now(),
         };
         let block = Some(block);
-        Ok((Shown { block, stamp }, on_its_way))
+        Ok((ShownValue { block, stamp }, on_its_way))
     }
 
     /// Passes a written value to the run loop.
@@ -277,7 +277,7 @@ impl WritePath {
         &self,
         (topic, field): (&TopicNode, Option<usize>),
         (block, source): (Bytes, Timestamp),
-        (commander, awaited): (Commander, Option<Awaited>),
+        (commander, awaited): (Commander, Option<PendingWrite>),
     ) -> Result<OnItsWay, StatusCode> {
         if block.len() > self.largest.load(Ordering::Relaxed) {
             return Err(StatusCode::BadRequestTooLarge);
@@ -331,7 +331,7 @@ fn source_of(value: &DataValue) -> Timestamp {
 
 /// Returns all fields of a topic after a write to the topic or to one of its fields.
 fn new_fields(
-    shown: &Shown,
+    shown: &ShownValue,
     topic: &TopicNode,
     field: Option<&FieldNode>,
     (value, range): (&Variant, &NumericRange),

@@ -3,15 +3,15 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use bridge_node::{Failure, Rank, Router};
-use discovery::Announced;
+use bridge_node::{Failure, RedundancyRank, Router};
+use discovery::ServerAnnouncement;
 use mappings::{Mapping, Server};
 use opcua::server::{ServerHandle, SubscriptionCache};
 use opcua::types::{AttributeId, DataValue, NodeId, VariableId};
 use plant_opcua::configuration::Configuration;
 use plant_opcua::own;
 use plant_opcua::pki::Pki;
-use plant_opcua::users::Access;
+use plant_opcua::users::UserAccess;
 use tokio::runtime::Runtime;
 use tokio::task::JoinHandle;
 use tokio::time::{Interval, MissedTickBehavior};
@@ -20,7 +20,7 @@ use tracing::warn;
 use crate::access;
 use crate::layout::Layout;
 use crate::nodesets;
-use crate::redundant::{Condition, ServerRole, ServerSet};
+use crate::redundant::{ServerCondition, ServerRole, ServerSet};
 use crate::sks::Sks;
 
 /// The running server.
@@ -32,13 +32,13 @@ pub(super) struct RunningServer {
     serving: Option<JoinHandle<Result<(), String>>>,
     described: DescribedServer,
     rights: Rights,
-    rank: Option<Rank>,
+    rank: Option<RedundancyRank>,
     role: ServerRole,
     set: ServerSet,
     /// The interval of checking refused certificates and the users.
     look: Interval,
     /// Announces the server. Taken at shutdown.
-    told: Option<Announced>,
+    told: Option<ServerAnnouncement>,
 }
 
 /// The server as the mapping describes it at the start.
@@ -46,14 +46,14 @@ pub(super) struct DescribedServer {
     pub(super) server: Server,
     /// True if the endpoint comes from the mapping, false if it comes from the command line.
     pub(super) mapped_url: bool,
-    pub(super) nodesets: nodesets::Running,
+    pub(super) nodesets: nodesets::RunningNodeSets,
 }
 
 /// The certificates and keys of the server, and the rights of its users.
 pub(super) struct Rights {
     pub(super) pki: Pki,
     pub(super) sks: Arc<Sks>,
-    pub(super) access: Arc<Access>,
+    pub(super) access: Arc<UserAccess>,
     /// The certificates of the server, which clients can manage.
     pub(super) certificates: Arc<Configuration>,
 }
@@ -63,8 +63,8 @@ impl RunningServer {
         handle: ServerHandle,
         (runtime, serving): (Runtime, JoinHandle<Result<(), String>>),
         (described, rights): (DescribedServer, Rights),
-        (rank, role, set): (Option<Rank>, ServerRole, ServerSet),
-        told: Option<Announced>,
+        (rank, role, set): (Option<RedundancyRank>, ServerRole, ServerSet),
+        told: Option<ServerAnnouncement>,
     ) -> Self {
         let mut look = tokio::time::interval(LOOK_AT_REJECTED);
         look.set_missed_tick_behavior(MissedTickBehavior::Delay);
@@ -93,12 +93,12 @@ impl RunningServer {
     }
 
     /// Returns the users and their rights.
-    pub(super) const fn access(&self) -> &Arc<Access> {
+    pub(super) const fn access(&self) -> &Arc<UserAccess> {
         &self.rights.access
     }
 
     /// Returns the rank among redundant servers.
-    pub(super) const fn rank(&self) -> Option<Rank> {
+    pub(super) const fn rank(&self) -> Option<RedundancyRank> {
         self.rank
     }
 
@@ -117,7 +117,7 @@ impl RunningServer {
         if self.rank.is_none() {
             return;
         }
-        let condition = Condition {
+        let condition = ServerCondition {
             is_standby: self.role.is_standby(),
             topics,
             silent,

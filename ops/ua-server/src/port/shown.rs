@@ -4,7 +4,9 @@ use std::collections::VecDeque;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use bridge_node::{Arrival, Delivery, Kept, PortEvent, Reason, Router, TypePaths};
+use bridge_node::{
+    ConfirmedArrival, LocalDelivery, PortEvent, Reason, Router, TypePaths, ValueRelation,
+};
 use bytes::Bytes;
 use mappings::{Mapping, SpaceId, TopicId};
 use opcua::server::SubscriptionCache;
@@ -13,19 +15,19 @@ use opcua::types::StatusCode;
 use crate::alarms::Alarms;
 use crate::layout::{Layout, LayoutError};
 use crate::nodes::SpaceManager;
-use crate::pubsub::{PubSub, Readers, State};
+use crate::pubsub::{PubSubNodeState, PubSubNodes, Readers};
 use crate::sources::{self, Sourced};
-use crate::space::Space;
-use crate::structures::{Structure, Types};
+use crate::space::SpaceWriter;
+use crate::structures::{MappedTypes, Structure};
 
 /// The values of the space, with the states of their readers and conditions.
 pub(super) struct ShownValues {
-    space: Space,
+    space: SpaceWriter,
     /// The namespaces at the start of the server.
     namespaces: Vec<String>,
-    types: Types,
+    types: MappedTypes,
     /// The PubSub configuration, and the state of its readers.
-    pubsub: Arc<PubSub>,
+    pubsub: Arc<PubSubNodes>,
     readers: Readers,
     /// The conditions of values, robots and publishers.
     alarms: Arc<Alarms>,
@@ -59,11 +61,11 @@ impl ShownValues {
     pub(super) fn new(
         (mapping, layout): (&Mapping, &Layout),
         (manager, subscriptions): (Arc<SpaceManager>, Arc<SubscriptionCache>),
-        (pubsub, alarms): (Arc<PubSub>, Arc<Alarms>),
-        types: Types,
+        (pubsub, alarms): (Arc<PubSubNodes>, Arc<Alarms>),
+        types: MappedTypes,
     ) -> Self {
         Self {
-            space: Space::new(layout, manager, subscriptions).with_ages(mapping),
+            space: SpaceWriter::new(layout, manager, subscriptions).with_ages(mapping),
             namespaces: layout.namespaces.clone(),
             types,
             pubsub,
@@ -119,7 +121,7 @@ impl ShownValues {
                 writers.push((topic, on));
             } else {
                 // Values of a disabled reader are not updated.
-                let silent = !on || self.readers.of(topic) == State::Error;
+                let silent = !on || self.readers.of(topic) == PubSubNodeState::Error;
                 self.space.set_silent(topic, silent);
             }
         }
@@ -130,7 +132,7 @@ impl ShownValues {
     ///
     /// # Errors
     /// The reason for which it is dropped.
-    pub(super) fn admit(&mut self, sample: &Delivery) -> Result<bool, &'static str> {
+    pub(super) fn admit(&mut self, sample: &LocalDelivery) -> Result<bool, &'static str> {
         if self.space.is_mapped(sample.topic) {
             self.readers.heard(sample.topic);
         }
@@ -141,9 +143,9 @@ impl ShownValues {
         // A variable shows a single value, the last. If several values are kept for late joiners,
         // an older value may arrive after the last value.
         let is_old = match sample.kept {
-            Kept::Again => true,
-            Kept::Beside => sample.source < self.space.shown(sample.topic),
-            Kept::Alone => false,
+            ValueRelation::Again => true,
+            ValueRelation::Beside => sample.source < self.space.shown(sample.topic),
+            ValueRelation::Alone => false,
         };
         Ok(!is_old)
     }
@@ -152,7 +154,7 @@ impl ShownValues {
     ///
     /// # Errors
     /// The reason for which the value is not shown.
-    pub(super) fn show(&mut self, sample: Delivery) -> Result<(), &'static str> {
+    pub(super) fn show(&mut self, sample: LocalDelivery) -> Result<(), &'static str> {
         let quality = (sample.source, sample.status);
         let shown = self.space.update(sample.topic, sample.payload, quality);
         self.unbound.extend(self.space.take_gave_way());
@@ -160,8 +162,8 @@ impl ShownValues {
     }
 
     /// Shows whether a value that a client wrote has arrived.
-    pub(super) fn show_arrival(&self, topic: TopicId, arrival: &Arrival) {
-        let has_arrived = matches!(arrival, Arrival::Confirmed);
+    pub(super) fn show_arrival(&self, topic: TopicId, arrival: &ConfirmedArrival) {
+        let has_arrived = matches!(arrival, ConfirmedArrival::Confirmed);
         self.space.show_arrival(topic, has_arrived);
     }
 

@@ -4,7 +4,7 @@ use std::net::{SocketAddr, TcpListener};
 use std::sync::Arc;
 
 use bridge_node::{Application, Failure, FailureKind};
-use discovery::{AnnounceSettings, Announced, MdnsFault, WatchSettings, announce, watch};
+use discovery::{AnnounceSettings, MdnsFault, ServerAnnouncement, WatchSettings, announce, watch};
 use mappings::{Anonymous, Mapping, Role, Server};
 use opcua::nodes::NodeType;
 use opcua::server::address_space::{AddressSpace, EventNotifier};
@@ -14,38 +14,39 @@ use opcua::server::{MonitoredItemHandle, ServerHandle, SubscriptionCache};
 use opcua::types::{NodeId, NumericRange, ObjectId, VariableId};
 use plant_opcua::configuration::Configuration;
 use plant_opcua::endpoint::EndpointUrl;
-use plant_opcua::nodeset::NodeSets;
+use plant_opcua::nodeset::ImportedNodeSets;
 use plant_opcua::pki::Pki;
 use plant_opcua::server::{
-    CoreValue, EventHistory, Facets, Security, Supplement, capabilities, core_of, core_with, roles,
+    CoreValue, EventHistory, Facets, ServerSecurity, Supplement, capabilities, core_of, core_with,
+    roles,
 };
-use plant_opcua::users::{self, Access, UserFault};
+use plant_opcua::users::{self, UserAccess, UserFault};
 use tokio::runtime::Runtime;
 use tokio::sync::{Semaphore, mpsc};
 use tracing::{info, warn};
 
 use super::shown::largest_write;
 use crate::alarms::Alarms;
-use crate::asking::{Heard, Questions};
+use crate::asking::{QuestionReceiver, Questions};
 use crate::auditing;
 use crate::browse::Ordered;
 use crate::components::Components;
 use crate::endpoint;
-use crate::history::{self, Store, Stored};
+use crate::history::{self, HistoryFile, StoredValue};
 use crate::layout::{Layout, LayoutError};
 use crate::methods::Methods;
 use crate::nodes::{ClientWrite, Exits, SpaceManager, SpaceNodes, look_again};
 use crate::nodesets;
-use crate::pubsub::{Places, PubSub};
+use crate::pubsub::{PubSubManagers, PubSubNodes};
 use crate::redundant::{self, ServerRole, ServerSet};
 use crate::sks::Sks;
-use crate::structures::Types;
+use crate::structures::MappedTypes;
 
 /// Creates the Methods for the calls of other spaces.
 pub(super) fn shown_calls(
     nodes: &(Arc<SpaceManager>, Arc<SubscriptionCache>),
     mapping: &Arc<Mapping>,
-    (asked, layout): (Heard, &Layout),
+    (asked, layout): (QuestionReceiver, &Layout),
     pki: &Pki,
 ) -> Methods {
     let asked = (asked, &layout.structures[..]);
@@ -53,27 +54,27 @@ pub(super) fn shown_calls(
 }
 
 /// Reads the users of the server.
-pub(super) fn users(pki: &Pki, is_local: bool) -> Result<Arc<Access>, Failure> {
+pub(super) fn users(pki: &Pki, is_local: bool) -> Result<Arc<UserAccess>, Failure> {
     let folder = pki.root().join(users::FOLDER);
-    let access = Access::new(Some(folder), is_local);
+    let access = UserAccess::new(Some(folder), is_local);
     let faulty = |error: UserFault| Failure::new(FailureKind::Configuration, error.to_string());
     access.map(Arc::new).map_err(faulty)
 }
 
 /// NodeSets to be loaded, and the record of their files.
-pub(super) type Loading = (NodeSets, nodesets::Running);
+pub(super) type Loading = (ImportedNodeSets, nodesets::RunningNodeSets);
 
 /// Returns the nodes of the mapping and the NodeSets.
 pub(super) fn laid_out(
     mapping: &Mapping,
-    types: &mut Types,
+    types: &mut MappedTypes,
 ) -> Result<(Arc<Layout>, Loading), Failure> {
     let configuration =
         |error: LayoutError| Failure::new(FailureKind::Configuration, error.to_string());
     let mut layout = Layout::of(mapping, types).map_err(configuration)?;
     let sets = nodesets::read(mapping)?;
     nodesets::add_namespaces(&sets, &mut layout.namespaces);
-    let running = nodesets::Running::new(mapping, &sets);
+    let running = nodesets::RunningNodeSets::new(mapping, &sets);
     Ok((Arc::new(layout), (sets, running)))
 }
 
@@ -82,7 +83,7 @@ pub(super) fn listen(
     pki: &Pki,
     url: &EndpointUrl,
     described: &Server,
-) -> Result<(TcpListener, (SocketAddr, Vec<Security>)), Failure> {
+) -> Result<(TcpListener, (SocketAddr, Vec<ServerSecurity>)), Failure> {
     let io = |error: String| Failure::new(FailureKind::Io, error);
     pki.ensure_own_at(&described.application_uri, &url.hosts())
         .map_err(|error| io(error.to_string()))?;
@@ -100,8 +101,8 @@ pub(super) fn listen(
 
 /// Warns about the access that a server grants to other hosts. Requests that the server sends to
 /// other programs come from its own address.
-fn tell_open(url: &EndpointUrl, described: &Server, security: &[Security]) {
-    if security.contains(&Security::None) {
+fn tell_open(url: &EndpointUrl, described: &Server, security: &[ServerSecurity]) {
+    if security.contains(&ServerSecurity::None) {
         warn!(
             "messages of {url} can be read and changed on the network: remove None from server.security"
         );
@@ -117,7 +118,7 @@ fn tell_open(url: &EndpointUrl, described: &Server, security: &[Security]) {
 }
 
 /// Reports logins to the audit.
-pub(super) fn audit(access: &Access, handle: &ServerHandle) {
+pub(super) fn audit(access: &UserAccess, handle: &ServerHandle) {
     let subscriptions = Arc::clone(handle.subscriptions());
     let server = handle.info().application_uri.as_ref().to_owned();
     access.on_login(move |login| auditing::came_in(login, &server).tell(&subscriptions));
@@ -125,10 +126,10 @@ pub(super) fn audit(access: &Access, handle: &ServerHandle) {
 
 /// Builds the core namespace with its methods and values.
 pub(super) fn core(
-    (sks, pubsub, alarms): (&Arc<Sks>, &Arc<PubSub>, &Arc<Alarms>),
+    (sks, pubsub, alarms): (&Arc<Sks>, &Arc<PubSubNodes>, &Arc<Alarms>),
     (configuration, is_announced): (&Arc<Configuration>, bool),
     (described, facets, set): (&Server, Facets, &ServerSet),
-    access: &Arc<Access>,
+    access: &Arc<UserAccess>,
 ) -> impl NodeManagerBuilder + use<> {
     let methods = [
         sks.methods(),
@@ -183,7 +184,7 @@ pub(super) fn show_limits(
     mapping: &Arc<Mapping>,
     layout: &Arc<Layout>,
     (handle, manager): (&ServerHandle, &Arc<SpaceManager>),
-    ((pubsub, alarms), history): ((&PubSub, &Alarms), Option<OpenedHistory>),
+    ((pubsub, alarms), history): ((&PubSubNodes, &Alarms), Option<OpenedHistory>),
 ) {
     limit(manager.inner(), mapping);
     let conditions = history.map(|(mut store, values)| {
@@ -198,12 +199,14 @@ pub(super) fn show_limits(
 }
 
 /// The file of the history, and its values.
-pub(super) type OpenedHistory = (Store, Vec<Stored>);
+pub(super) type OpenedHistory = (HistoryFile, Vec<StoredValue>);
 
 /// Returns the facets of the profile that a server with these policies and topics has.
-pub(super) fn facets(security: &[Security], layout: &Layout) -> Facets {
+pub(super) fn facets(security: &[ServerSecurity], layout: &Layout) -> Facets {
     Facets {
-        is_secured: security.iter().any(|policy| *policy != Security::None),
+        is_secured: security
+            .iter()
+            .any(|policy| *policy != ServerSecurity::None),
         has_history: layout.topics.iter().any(|topic| topic.historizing),
         has_alarms: true,
     }
@@ -215,13 +218,13 @@ pub(super) fn history(
     layout: &Layout,
 ) -> Result<Option<OpenedHistory>, Failure> {
     let file = described.history_file.as_ref();
-    let opened = file.map(|file| Store::open(file, layout.topics.iter()));
+    let opened = file.map(|file| HistoryFile::open(file, layout.topics.iter()));
     let opened = opened.transpose();
     opened.map_err(|fault| Failure::new(FailureKind::Io, fault.to_string()))
 }
 
-fn places(handle: &ServerHandle, manager: &Arc<SpaceManager>) -> Places {
-    Places {
+fn places(handle: &ServerHandle, manager: &Arc<SpaceManager>) -> PubSubManagers {
+    PubSubManagers {
         core: core_of(handle),
         space: Arc::clone(manager),
         subscriptions: Arc::clone(handle.subscriptions()),
@@ -254,8 +257,8 @@ fn limit(nodes: &SpaceNodes, mapping: &Mapping) {
 /// Creates the channels of the node manager, with their receivers.
 pub(super) fn exits(
     mapping: &Mapping,
-    access: &Arc<Access>,
-    (pubsub, role): (&Arc<PubSub>, &ServerRole),
+    access: &Arc<UserAccess>,
+    (pubsub, role): (&Arc<PubSubNodes>, &ServerRole),
 ) -> (Exits, Entries) {
     let (writes, written) = mpsc::channel(MOST_WRITES);
     let (created, created_items) = mpsc::channel(MOST_CREATED);
@@ -279,15 +282,15 @@ pub(super) fn exits(
 pub(super) type Entries = (
     mpsc::Receiver<ClientWrite>,
     mpsc::Receiver<(NodeId, MonitoredItemHandle)>,
-    Heard,
+    QuestionReceiver,
 );
 
 /// Announces the server if the settings request it, and watches other servers if mDNS is enabled.
 pub(super) fn tell(
-    server: discovery::Server,
+    server: discovery::ServerDescription,
     settings: Option<AnnounceSettings>,
     nodes: (Arc<SpaceManager>, Arc<SubscriptionCache>),
-) -> Result<(Option<Announced>, Option<Components>), Failure> {
+) -> Result<(Option<ServerAnnouncement>, Option<Components>), Failure> {
     let unavailable = |error: MdnsFault| Failure::new(FailureKind::Unavailable, error.to_string());
     let Some(settings) = settings else {
         return Ok((None, None));
@@ -312,11 +315,11 @@ pub(super) fn tell(
 pub(super) fn told_of(
     described: &Server,
     url: String,
-    security: &[Security],
-) -> (discovery::Server, Application) {
+    security: &[ServerSecurity],
+) -> (discovery::ServerDescription, Application) {
     let redundancy = redundant::is_member(described).then_some("NTRS");
     let capabilities = ["DA", "HD"].into_iter().chain(redundancy);
-    let server = discovery::Server {
+    let server = discovery::ServerDescription {
         application_uri: described.application_uri.clone(),
         product_uri: endpoint::PRODUCT_URI.to_owned(),
         name: "ua-server".to_owned(),
@@ -329,7 +332,7 @@ pub(super) fn told_of(
 }
 
 /// Returns the description of the server for the group.
-fn application(server: &discovery::Server, security: &[Security]) -> Application {
+fn application(server: &discovery::ServerDescription, security: &[ServerSecurity]) -> Application {
     let ways = security.iter().flat_map(|security| security.ways());
     Application {
         uri: server.application_uri.clone(),
@@ -345,7 +348,7 @@ fn application(server: &discovery::Server, security: &[Security]) -> Application
 /// Builds the node manager of the space.
 pub(super) struct NodesBuilder {
     pub(super) layout: Arc<Layout>,
-    pub(super) sets: NodeSets,
+    pub(super) sets: ImportedNodeSets,
     pub(super) exits: Exits,
 }
 

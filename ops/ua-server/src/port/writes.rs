@@ -3,11 +3,11 @@
 use std::collections::VecDeque;
 use std::sync::Arc;
 
-use bridge_node::{Arrival, PortEvent, Reason, Router, Verdict};
+use bridge_node::{ConfirmedArrival, PortEvent, Reason, Router, Verdict};
 use mappings::{Mapping, SpaceId, TopicId};
 use tokio::sync::mpsc;
 
-use crate::arrivals::Awaited;
+use crate::arrivals::PendingWrite;
 use crate::commanders::{Commander, Commanders};
 use crate::confirm::Confirms;
 use crate::layout::Layout;
@@ -93,7 +93,7 @@ impl ClientWrites {
         &mut self,
         (topic, commander): (TopicId, Commander),
         departure: Departure,
-        awaited: Option<Awaited>,
+        awaited: Option<PendingWrite>,
     ) {
         self.commanders.wrote(topic, commander);
         self.leaving.add(departure);
@@ -102,7 +102,7 @@ impl ClientWrites {
     }
 
     /// Records the outcome of a write.
-    pub(super) fn settled(&self, topic: TopicId, arrival: &Arrival) {
+    pub(super) fn settled(&self, topic: TopicId, arrival: &ConfirmedArrival) {
         self.confirms.arrivals.settled(topic, arrival);
     }
 

@@ -13,7 +13,7 @@ use opcua::types::{
     Variant,
 };
 use plant_opcua::server::{StateRef, TransitionEvent};
-use program::{Method, State, Transition};
+use program::{ProgramMachineState, ProgramMethod, Transition};
 
 use super::run::{NEVER_RAN, SUCCEEDED, whole};
 use crate::address;
@@ -21,7 +21,7 @@ use crate::argument_types::ArgumentTypes;
 use crate::nodes::SpaceManager;
 
 /// The nodes of a Program.
-pub(super) struct Nodes {
+pub(super) struct ProgramNodes {
     manager: Arc<SpaceManager>,
     subscriptions: Arc<SubscriptionCache>,
     topic: TopicId,
@@ -33,14 +33,14 @@ pub(super) struct Nodes {
 }
 
 /// The outcome of a goal.
-pub(super) struct Outcome {
+pub(super) struct GoalOutcome {
     /// Status of `action_msgs/GoalStatus`, or 0 if it is unknown.
     pub(super) status: i64,
     message: String,
     fields: Vec<Variant>,
 }
 
-impl Outcome {
+impl GoalOutcome {
     /// Decodes an answer: status, message, and the fields of the result.
     pub(super) fn of(answer: Vec<Variant>) -> Self {
         let mut fields = answer.into_iter();
@@ -87,7 +87,7 @@ impl Outcome {
     }
 }
 
-impl Nodes {
+impl ProgramNodes {
     /// Adds the Program of an action and its parent objects. Also returns the parent objects,
     /// outermost first.
     pub(super) fn insert(
@@ -113,9 +113,9 @@ impl Nodes {
             value_rank: -1,
             ..Argument::default()
         };
-        tree.method(Method::Start, (&takes, &[gives]));
-        tree.method(Method::Halt, (&[], &[]));
-        tree.method(Method::Reset, (&[], &[]));
+        tree.method(ProgramMethod::Start, (&takes, &[gives]));
+        tree.method(ProgramMethod::Halt, (&[], &[]));
+        tree.method(ProgramMethod::Reset, (&[], &[]));
         let shown = result.response.get(2..).unwrap_or_default();
         let results = tree.results(shown, types);
         let made = tree.made;
@@ -135,7 +135,7 @@ impl Nodes {
         self.node("")
     }
 
-    pub(super) fn methods(&self) -> [(NodeId, Method); 3] {
+    pub(super) fn methods(&self) -> [(NodeId, ProgramMethod); 3] {
         METHODS.map(|method| (self.node(method.name()), method))
     }
 
@@ -162,7 +162,7 @@ impl Nodes {
     }
 
     /// Shows the initial state.
-    pub(super) fn show_first(&self, now: State) {
+    pub(super) fn show_first(&self, now: ProgramMachineState) {
         self.show(state(now).to_vec());
     }
 
@@ -176,7 +176,7 @@ impl Nodes {
     }
 
     /// Returns the end of a goal as text for the operator, with the reason in its result.
-    pub(super) fn said(&self, outcome: &Outcome) -> String {
+    pub(super) fn said(&self, outcome: &GoalOutcome) -> String {
         let said = outcome.said();
         if !outcome.message.is_empty() || outcome.status == SUCCEEDED {
             return said;
@@ -195,7 +195,7 @@ impl Nodes {
         }
     }
 
-    pub(super) fn show_outcome(&self, outcome: &Outcome) {
+    pub(super) fn show_outcome(&self, outcome: &GoalOutcome) {
         let status = i32::try_from(outcome.status).unwrap_or_default();
         self.show(vec![
             ("FinalResultData.Status", Variant::Int32(status)),
@@ -210,7 +210,7 @@ impl Nodes {
 
     /// Shows why a goal that is being cancelled has not ended or is not cancelled, and raises an
     /// event without a transition.
-    pub(super) fn show_pending(&self, why: &str, now: State) {
+    pub(super) fn show_pending(&self, why: &str, now: ProgramMachineState) {
         self.show(vec![("FinalResultData.Message", Variant::from(why))]);
         let state = StateRef {
             name: now.name().to_owned(),
@@ -252,7 +252,8 @@ impl Nodes {
             id: NodeId::new(0, node_id),
             number,
         };
-        let of_state = |state: State| of(state.name(), state.node_id(), state.number());
+        let of_state =
+            |state: ProgramMachineState| of(state.name(), state.node_id(), state.number());
         let event = TransitionEvent {
             source: self.program(),
             source_name: self.name.clone(),
@@ -262,8 +263,10 @@ impl Nodes {
                 message => message.to_owned(),
             },
             severity: match transition.to {
-                State::Halted => FAILED,
-                State::Ready | State::Running | State::Suspended => USUAL,
+                ProgramMachineState::Halted => FAILED,
+                ProgramMachineState::Ready
+                | ProgramMachineState::Running
+                | ProgramMachineState::Suspended => USUAL,
             },
             from_state: of_state(transition.from),
             to_state: of_state(transition.to),
@@ -435,7 +438,7 @@ impl Tree<'_> {
         self.made.push(node);
     }
 
-    fn method(&mut self, method: Method, (takes, gives): (&[Argument], &[Argument])) {
+    fn method(&mut self, method: ProgramMethod, (takes, gives): (&[Argument], &[Argument])) {
         let name = method.name();
         let node = self.made(name);
         let mut builder = MethodBuilder::new(&node, core(name), LocalizedText::from(name))
@@ -462,7 +465,7 @@ impl Tree<'_> {
     }
 }
 
-fn state(state: State) -> [(&'static str, Variant); 3] {
+fn state(state: ProgramMachineState) -> [(&'static str, Variant); 3] {
     [
         (
             "CurrentState",
@@ -506,7 +509,11 @@ const OWN_RESULTS: [(&str, DataTypeId); 3] = [
     ("Status", DataTypeId::Int32),
     ("Message", DataTypeId::String),
 ];
-const METHODS: [Method; 3] = [Method::Start, Method::Halt, Method::Reset];
+const METHODS: [ProgramMethod; 3] = [
+    ProgramMethod::Start,
+    ProgramMethod::Halt,
+    ProgramMethod::Reset,
+];
 const PROPERTY: (VariableTypeId, ReferenceTypeId) =
     (VariableTypeId::PropertyType, ReferenceTypeId::HasProperty);
 const VALUE: (VariableTypeId, ReferenceTypeId) = (

@@ -7,21 +7,21 @@ use bridge_node::AskErrorKind;
 use mappings::TopicId;
 use opcua::sync::Mutex;
 use opcua::types::{ByteString, DateTime, NodeId, StatusCode, Variant};
-use program::{Ending, Method, Nature, Program, Rest, RunId, State};
+use program::{Ending, Nature, ProgramInstance, ProgramMachineState, ProgramMethod, Rest, RunId};
 use tokio::sync::watch;
 use tokio::time::{Instant, sleep, timeout};
 use tracing::{info, warn};
 use uadp::Fields;
 
-use super::nodes::{Nodes, Outcome};
+use super::nodes::{GoalOutcome, ProgramNodes};
 use super::unknown::UnknownOutcomes;
-use crate::asking::{Callable, Drive, Questions, Refused};
+use crate::asking::{CallFailure, Callable, Drive, Questions};
 use crate::value;
 
 /// A Program. Its methods are executed one at a time.
 pub(crate) struct Run {
     name: String,
-    nodes: Nodes,
+    nodes: ProgramNodes,
     send: Callable,
     cancel: Callable,
     result: Callable,
@@ -31,11 +31,11 @@ pub(crate) struct Run {
     unknown: Arc<UnknownOutcomes>,
     inner: Mutex<Inner>,
     /// The state, for tasks that wait for a change. Never closed.
-    state: watch::Sender<State>,
+    state: watch::Sender<ProgramMachineState>,
 }
 
 struct Inner {
-    program: Program,
+    program: ProgramInstance,
     /// The current goal, which is executed or being sent.
     goal: Option<ByteString>,
     /// The goal is being sent: only Halt may be called.
@@ -70,23 +70,23 @@ impl Run {
     /// Creates a Program in Ready, or in Halted after a goal with an unknown outcome.
     pub(super) fn new(
         (name, goal): (String, TopicId),
-        nodes: Nodes,
+        nodes: ProgramNodes,
         [send, cancel, result]: [Callable; 3],
         unknown: &Arc<UnknownOutcomes>,
     ) -> Arc<Self> {
         let needs_reset = unknown.has(goal);
-        let mut program = Program::new(Nature {
+        let mut program = ProgramInstance::new(Nature {
             can_suspend: false,
             rests_in: Rest::Ready,
         });
         if !needs_reset {
             // An announced action is ready.
-            let _ready = program.call(Method::Reset);
+            let _ready = program.call(ProgramMethod::Reset);
         }
         let (state, _) = watch::channel(program.state());
         nodes.show_first(program.state());
         if needs_reset {
-            nodes.show_outcome(&Outcome::lost(BEFORE_RESTART.to_owned()));
+            nodes.show_outcome(&GoalOutcome::lost(BEFORE_RESTART.to_owned()));
         }
         Arc::new(Self {
             name,
@@ -110,7 +110,7 @@ impl Run {
     /// Returns a method of the Program, for clients that may call the Method at `goal`.
     pub(super) fn drive(
         self: &Arc<Self>,
-        method: Method,
+        method: ProgramMethod,
         questions: &Questions,
         goal: NodeId,
     ) -> Drive {
@@ -126,19 +126,19 @@ impl Run {
 
     async fn call(
         self: Arc<Self>,
-        method: Method,
+        method: ProgramMethod,
         arguments: Vec<Variant>,
         questions: Questions,
-    ) -> Result<Vec<Variant>, Refused> {
+    ) -> Result<Vec<Variant>, CallFailure> {
         match method {
-            Method::Start => self.start(arguments, questions).await,
-            Method::Halt => self.halt(&questions).await,
-            Method::Reset => self.reset(),
-            Method::Suspend | Method::Resume => Err(NOT_NOW_AND_NEVER),
+            ProgramMethod::Start => self.start(arguments, questions).await,
+            ProgramMethod::Halt => self.halt(&questions).await,
+            ProgramMethod::Reset => self.reset(),
+            ProgramMethod::Suspend | ProgramMethod::Resume => Err(NOT_NOW_AND_NEVER),
         }
     }
 
-    pub(super) const fn nodes(&self) -> &Nodes {
+    pub(super) const fn nodes(&self) -> &ProgramNodes {
         &self.nodes
     }
 
@@ -147,17 +147,17 @@ impl Run {
         self: Arc<Self>,
         arguments: Vec<Variant>,
         questions: Questions,
-    ) -> Result<Vec<Variant>, Refused> {
+    ) -> Result<Vec<Variant>, CallFailure> {
         // The first argument is the goal id, which is generated here.
         let most = self.send.description().request.len().saturating_sub(1);
         if arguments.len() > most {
-            return Err(Refused::Status(StatusCode::BadTooManyArguments));
+            return Err(CallFailure::Status(StatusCode::BadTooManyArguments));
         }
         let id = opcua::crypto::random::byte_string(16);
         {
             let mut inner = self.inner.lock();
-            if inner.left || inner.starting || !inner.program.is_executable(Method::Start) {
-                return Err(Refused::Status(StatusCode::BadInvalidState));
+            if inner.left || inner.starting || !inner.program.is_executable(ProgramMethod::Start) {
+                return Err(CallFailure::Status(StatusCode::BadInvalidState));
             }
             inner.starting = true;
             // Feedback may arrive before the answer.
@@ -171,7 +171,7 @@ impl Run {
             inner.left || inner.halting.is_some()
         };
         let accepted = if is_withdrawn {
-            let refused = Refused::Status(StatusCode::BadRequestCancelledByRequest);
+            let refused = CallFailure::Status(StatusCode::BadRequestCancelledByRequest);
             Err((refused, Some("halted before the goal was sent".to_owned())))
         } else {
             let mut goal = vec![Variant::from(id.clone())];
@@ -184,11 +184,11 @@ impl Run {
         let mut inner = self.inner.lock();
         inner.starting = false;
         if inner.left {
-            return Err(Refused::Status(StatusCode::BadNoCommunication));
+            return Err(CallFailure::Status(StatusCode::BadNoCommunication));
         }
         // If the Program runs already, it was halted in the meantime, and the outcome of the goal
         // is awaited.
-        let runs = inner.program.state() == State::Running;
+        let runs = inner.program.state() == ProgramMachineState::Running;
         match accepted {
             Ok(()) if runs => {}
             Ok(()) => self.runs(&mut inner, &id, ("the goal is accepted", &questions))?,
@@ -203,7 +203,7 @@ impl Run {
                 return Err(refused);
             }
             Err((refused, why)) => {
-                let outcome = Outcome::never_ran(why.unwrap_or_default());
+                let outcome = GoalOutcome::never_ran(why.unwrap_or_default());
                 match inner.program.run().filter(|_| runs) {
                     Some(run) => {
                         drop(inner);
@@ -228,9 +228,9 @@ impl Run {
         inner: &mut Inner,
         id: &ByteString,
         (why, questions): (&str, &Questions),
-    ) -> Result<(), Refused> {
-        let started = inner.program.call(Method::Start);
-        let transition = started.map_err(|_| Refused::Status(StatusCode::BadInvalidState))?;
+    ) -> Result<(), CallFailure> {
+        let started = inner.program.call(ProgramMethod::Start);
+        let transition = started.map_err(|_| CallFailure::Status(StatusCode::BadInvalidState))?;
         inner.halting = None;
         self.nodes.show_goal(id);
         self.nodes.show_transition(transition, why);
@@ -257,16 +257,16 @@ impl Run {
 
     /// Checks if a goal is accepted. The error has the reason of a rejection as text for the
     /// operator.
-    fn is_accepted(&self, answer: &[Variant]) -> Result<(), (Refused, Option<String>)> {
+    fn is_accepted(&self, answer: &[Variant]) -> Result<(), (CallFailure, Option<String>)> {
         match answer {
             [Variant::Boolean(true), ..] => Ok(()),
             [Variant::Boolean(false), rest @ ..] => {
                 let why = rest.last().map(ToString::to_string).unwrap_or_default();
                 info!(program = self.name, "a goal is rejected: {why}");
-                let refused = Refused::Status(StatusCode::BadRequestNotAllowed);
+                let refused = CallFailure::Status(StatusCode::BadRequestNotAllowed);
                 Err((refused, Some(why)))
             }
-            _ => Err((Refused::Status(StatusCode::BadDecodingError), None)),
+            _ => Err((CallFailure::Status(StatusCode::BadDecodingError), None)),
         }
     }
 
@@ -277,21 +277,21 @@ impl Run {
             let asked = [Variant::from(id.clone())];
             match self.result.call(&asked, &questions, || false).await {
                 Ok(answer) => {
-                    let outcome = Outcome::of(answer);
+                    let outcome = GoalOutcome::of(answer);
                     if outcome.status != UNKNOWN || !self.is_lost(&outcome.said()) {
                         return self.ended(run, outcome);
                     }
                 }
-                Err(Refused::Asked(error)) if error.kind == AskErrorKind::Failed => {
-                    return self.ended(run, Outcome::lost(error.text));
+                Err(CallFailure::Asked(error)) if error.kind == AskErrorKind::Failed => {
+                    return self.ended(run, GoalOutcome::lost(error.text));
                 }
-                Err(Refused::Arguments(_)) => {
+                Err(CallFailure::Arguments(_)) => {
                     let why = "the result cannot be asked for".to_owned();
-                    return self.ended(run, Outcome::lost(why));
+                    return self.ended(run, GoalOutcome::lost(why));
                 }
                 // The goal continues, or the action server is unreachable for the moment. If it is
                 // lost permanently, the action is removed.
-                Err(Refused::Status(_) | Refused::Asked(_)) => {}
+                Err(CallFailure::Status(_) | CallFailure::Asked(_)) => {}
             }
             if self.is_over(run) {
                 return;
@@ -303,7 +303,8 @@ impl Run {
 
     fn is_over(&self, run: RunId) -> bool {
         let inner = self.inner.lock();
-        let runs = inner.program.state() == State::Running && inner.program.run() == Some(run);
+        let runs = inner.program.state() == ProgramMachineState::Running
+            && inner.program.run() == Some(run);
         inner.left || !runs
     }
 
@@ -350,7 +351,7 @@ impl Run {
         self.nodes.show_pending(why, inner.program.state());
     }
 
-    fn ended(&self, run: RunId, outcome: Outcome) {
+    fn ended(&self, run: RunId, outcome: GoalOutcome) {
         let mut inner = self.inner.lock();
         if inner.left {
             return;
@@ -360,7 +361,7 @@ impl Run {
         let ended = match outcome.status {
             _ if inner.program.run() != Some(run) => return,
             SUCCEEDED => inner.program.ended(run, Ending::Success).ok(),
-            _ if halted => inner.program.call(Method::Halt).ok(),
+            _ if halted => inner.program.call(ProgramMethod::Halt).ok(),
             _ => inner.program.ended(run, Ending::Failure).ok(),
         };
         inner.goal = None;
@@ -379,16 +380,16 @@ impl Run {
     /// Cancels the goal. Returns when the cancellation has been sent, after a short wait for the
     /// end of the goal. A second Halt after [`HALT_TIMEOUT`], or when the action server has lost
     /// the goal, ends the run with an unknown outcome. A Program that is Ready becomes Halted.
-    async fn halt(self: &Arc<Self>, questions: &Questions) -> Result<Vec<Variant>, Refused> {
+    async fn halt(self: &Arc<Self>, questions: &Questions) -> Result<Vec<Variant>, CallFailure> {
         let (id, is_first) = {
             let mut inner = self.inner.lock();
-            if inner.left || !(inner.starting || inner.program.is_executable(Method::Halt)) {
-                return Err(Refused::Status(StatusCode::BadInvalidState));
+            if inner.left || !(inner.starting || inner.program.is_executable(ProgramMethod::Halt)) {
+                return Err(CallFailure::Status(StatusCode::BadInvalidState));
             }
             let Some(id) = inner.goal.clone() else {
-                return self.called(&mut inner, Method::Halt);
+                return self.called(&mut inner, ProgramMethod::Halt);
             };
-            if inner.program.state() != State::Running {
+            if inner.program.state() != ProgramMachineState::Running {
                 let why = "halted before the action server has decided about the goal";
                 self.runs(&mut inner, &id, (why, questions))?;
             }
@@ -404,7 +405,7 @@ impl Run {
         let answer = self.ask_to_cancel(&id, questions).await;
         if let Ok(REJECTED) = answer {
             self.refused(&mut self.inner.lock());
-            return Err(Refused::Status(StatusCode::BadRequestNotAllowed));
+            return Err(CallFailure::Status(StatusCode::BadRequestNotAllowed));
         }
         if is_first && !matches!(answer, Ok(AGREED)) {
             let again = Arc::clone(self).cancel_until_ended(id, questions.clone());
@@ -412,7 +413,10 @@ impl Run {
         }
         answer?;
         let mut state = self.state.subscribe();
-        let ends = timeout(AT_ONCE, state.wait_for(|now| *now != State::Running));
+        let ends = timeout(
+            AT_ONCE,
+            state.wait_for(|now| *now != ProgramMachineState::Running),
+        );
         if ends.await.is_err() {
             let mut inner = self.inner.lock();
             if inner
@@ -427,38 +431,47 @@ impl Run {
     }
 
     /// Ends a run although its goal continues or may continue elsewhere.
-    fn give_up(&self, inner: &mut Inner) -> Result<Vec<Variant>, Refused> {
+    fn give_up(&self, inner: &mut Inner) -> Result<Vec<Variant>, CallFailure> {
         let halting = inner.halting.take();
         let why = halting.map(|halting| halting.why).unwrap_or_default();
         let message = format!("the outcome is unknown, the goal may go on: {why}");
         warn!(program = self.name, "{message}");
         inner.goal = None;
         self.unknown.insert(self.goal);
-        self.nodes.show_outcome(&Outcome::lost(message));
-        self.called(inner, Method::Halt)
+        self.nodes.show_outcome(&GoalOutcome::lost(message));
+        self.called(inner, ProgramMethod::Halt)
     }
 
     /// Sends a cancel request and returns the `return_code` of `action_msgs/CancelGoal`.
-    async fn ask_to_cancel(&self, id: &ByteString, questions: &Questions) -> Result<i64, Refused> {
+    async fn ask_to_cancel(
+        &self,
+        id: &ByteString,
+        questions: &Questions,
+    ) -> Result<i64, CallFailure> {
         let asked = [Variant::from(id.clone()), Variant::from(DateTime::null())];
         let answer = self.cancel.call(&asked, questions, || false).await?;
         let code = answer.first().and_then(whole);
-        code.ok_or(Refused::Status(StatusCode::BadDecodingError))
+        code.ok_or(CallFailure::Status(StatusCode::BadDecodingError))
     }
 
-    fn reset(&self) -> Result<Vec<Variant>, Refused> {
+    fn reset(&self) -> Result<Vec<Variant>, CallFailure> {
         let mut inner = self.inner.lock();
         if inner.left || inner.starting {
-            return Err(Refused::Status(StatusCode::BadInvalidState));
+            return Err(CallFailure::Status(StatusCode::BadInvalidState));
         }
-        let reset = self.called(&mut inner, Method::Reset)?;
+        let reset = self.called(&mut inner, ProgramMethod::Reset)?;
         self.unknown.remove(self.goal);
         Ok(reset)
     }
 
-    fn called(&self, inner: &mut Inner, method: Method) -> Result<Vec<Variant>, Refused> {
+    fn called(
+        &self,
+        inner: &mut Inner,
+        method: ProgramMethod,
+    ) -> Result<Vec<Variant>, CallFailure> {
         let transition = inner.program.call(method);
-        let transition = transition.map_err(|_| Refused::Status(StatusCode::BadInvalidState))?;
+        let transition =
+            transition.map_err(|_| CallFailure::Status(StatusCode::BadInvalidState))?;
         self.nodes.show_transition(transition, "");
         self.state.send_replace(inner.program.state());
         Ok(Vec::new())
@@ -477,11 +490,11 @@ impl Run {
         let run = inner.program.run();
         let ended = run.and_then(|run| inner.program.ended(run, Ending::Failure).ok());
         if let Some(transition) = ended {
-            let outcome = Outcome::lost(why.to_owned());
+            let outcome = GoalOutcome::lost(why.to_owned());
             self.nodes.show_outcome(&outcome);
             self.nodes.show_transition(transition, why);
         }
-        self.state.send_replace(State::Halted);
+        self.state.send_replace(ProgramMachineState::Halted);
     }
 
     /// Shows feedback of the current goal.
@@ -503,18 +516,18 @@ impl Run {
 }
 
 /// Returns true if the goal may be executed nevertheless.
-fn is_unknown(refused: &Refused) -> bool {
-    matches!(refused, Refused::Asked(error) if error.kind == AskErrorKind::Unknown)
+fn is_unknown(refused: &CallFailure) -> bool {
+    matches!(refused, CallFailure::Asked(error) if error.kind == AskErrorKind::Unknown)
 }
 
 /// Converts argument errors to the arguments of Start, which exclude the goal id.
-fn in_terms_of_start(refused: Refused) -> Refused {
+fn in_terms_of_start(refused: CallFailure) -> CallFailure {
     match refused {
-        Refused::Arguments(mut statuses) => {
+        CallFailure::Arguments(mut statuses) => {
             statuses.drain(..statuses.len().min(1));
-            Refused::Arguments(statuses)
+            CallFailure::Arguments(statuses)
         }
-        Refused::Status(_) | Refused::Asked(_) => refused,
+        CallFailure::Status(_) | CallFailure::Asked(_) => refused,
     }
 }
 
@@ -533,7 +546,7 @@ pub(super) fn whole(value: &Variant) -> Option<i64> {
     }
 }
 
-const NOT_NOW_AND_NEVER: Refused = Refused::Status(StatusCode::BadNotSupported);
+const NOT_NOW_AND_NEVER: CallFailure = CallFailure::Status(StatusCode::BadNotSupported);
 const PENDING: &str = "cancellation pending: the goal has not ended";
 pub(super) const GONE: &str =
     "the executor of the action is lost: the outcome is unknown, the goal may go on";

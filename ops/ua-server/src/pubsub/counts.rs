@@ -6,7 +6,7 @@ use opcua::types::{
     DataTypeId, NodeId, ObjectTypeId, ReferenceTypeId, VariableId, VariableTypeId, Variant,
 };
 
-use super::states::{Cause, Change, State};
+use super::states::{PubSubNodeState, StateCause, StateChange};
 use super::tree::{At, BASIC, Tree};
 
 /// The counters of a topic, or of all topics of a group.
@@ -131,7 +131,7 @@ impl Counter {
 }
 
 /// The counters of a component in the address space.
-pub(super) struct Diagnostics {
+pub(super) struct PubSubCounters {
     counters: Vec<Shown>,
     information: NodeId,
     error: NodeId,
@@ -151,7 +151,7 @@ struct Shown {
     shown: u32,
 }
 
-impl Diagnostics {
+impl PubSubCounters {
     /// Adds the counters below a component. Also returns the method that resets them, and the
     /// object of the live values.
     pub(super) fn insert(
@@ -210,16 +210,29 @@ impl Diagnostics {
     }
 
     /// Counts a change of the component's state.
-    pub(super) fn note(&mut self, change: &Change) {
+    pub(super) fn note(&mut self, change: &StateChange) {
         let [error, by_method, by_parent, from_error, paused, disabled] = &mut self.states;
         let which = match (change.is, change.cause) {
-            (State::Error, _) => error,
-            (State::Operational | State::PreOperational, Cause::Method) => by_method,
-            (State::Operational | State::PreOperational, Cause::Parent) => by_parent,
-            (State::Operational, Cause::Itself) if change.was == State::Error => from_error,
-            (State::Operational | State::PreOperational, Cause::Itself) => return,
-            (State::Paused, _) => paused,
-            (State::Disabled, _) => disabled,
+            (PubSubNodeState::Error, _) => error,
+            (
+                PubSubNodeState::Operational | PubSubNodeState::PreOperational,
+                StateCause::Method,
+            ) => by_method,
+            (
+                PubSubNodeState::Operational | PubSubNodeState::PreOperational,
+                StateCause::Parent,
+            ) => by_parent,
+            (PubSubNodeState::Operational, StateCause::Itself)
+                if change.was == PubSubNodeState::Error =>
+            {
+                from_error
+            }
+            (
+                PubSubNodeState::Operational | PubSubNodeState::PreOperational,
+                StateCause::Itself,
+            ) => return,
+            (PubSubNodeState::Paused, _) => paused,
+            (PubSubNodeState::Disabled, _) => disabled,
         };
         *which = which.saturating_add(1);
     }

@@ -17,11 +17,11 @@ use opcua::types::{
     UadpDataSetWriterMessageDataType, UadpNetworkMessageContentMask,
     UadpWriterGroupMessageDataType, VariableId, Variant, WriterGroupDataType,
 };
-use plant_opcua::file::{Answer, FileMethod, READ};
+use plant_opcua::file::{FileAnswer, FileMethod, READ};
 use plant_opcua::server::{CoreMethod, MethodRequest, method};
 
 use super::insert::{self, DATA_SET_MESSAGE, NETWORK_MESSAGE};
-use super::{Kind, PubSub};
+use super::{Kind, PubSubNodes};
 use crate::layout::{Layout, TopicNode};
 
 /// The content of the file while all components are enabled.
@@ -224,7 +224,7 @@ fn reader(mapping: &Mapping, topic: &TopicNode) -> DataSetReaderDataType {
     }
 }
 
-impl PubSub {
+impl PubSubNodes {
     /// Returns the methods of the file.
     pub(super) fn file_methods(self: &Arc<Self>) -> Vec<CoreMethod> {
         let methods = METHODS.iter().map(|(own, of_type, name, what)| {
@@ -237,7 +237,7 @@ impl PubSub {
         methods.collect()
     }
 
-    fn in_file(&self, what: Option<FileMethod>, request: &MethodRequest) -> Answer {
+    fn in_file(&self, what: Option<FileMethod>, request: &MethodRequest) -> FileAnswer {
         let mut handles = self.file.lock();
         let before = handles.len();
         let answer = match (what, request.arguments.as_slice()) {

@@ -13,16 +13,16 @@ use opcua::types::{
 };
 use tracing::warn;
 
-use super::counts::{Counter, Counts, Diagnostics, LiveCounts};
+use super::counts::{Counter, Counts, LiveCounts, PubSubCounters};
 use super::file::{self, Content};
-use super::states::State;
+use super::states::PubSubNodeState;
 use super::tree::{At, Tree};
 use super::{Ask, Inner, Kind, Part};
 use crate::layout::{Layout, TopicNode};
 
 /// The nodes to add.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Wanted {
+pub(super) enum NodesToAdd {
     /// All nodes except the nodes of readers.
     WithoutReaders,
     /// The nodes of readers only.
@@ -36,9 +36,9 @@ pub(super) fn all(
     mapping: &Mapping,
     layout: &Layout,
     address_space: &mut AddressSpace,
-    wanted: Wanted,
+    wanted: NodesToAdd,
 ) -> Inner {
-    let has_others = wanted != Wanted::Readers;
+    let has_others = wanted != NodesToAdd::Readers;
     let mut insert = Insert {
         mapping,
         inner: Inner::default(),
@@ -68,7 +68,7 @@ pub(super) fn all(
         if space == SpaceId::UA {
             insert.writer(topic, (group, &above), detailed);
         } else {
-            insert.tree.is_dry = wanted == Wanted::WithoutReaders;
+            insert.tree.is_dry = wanted == NodesToAdd::WithoutReaders;
             insert.reader(topic, (group, &above), detailed);
             insert.tree.is_dry = !has_others;
         }
@@ -90,12 +90,12 @@ struct Insert<'a> {
 impl Insert<'_> {
     /// Adds the object PublishSubscribe; its node exists already.
     fn whole(&mut self) -> usize {
-        let at = self.inner.states.add(None, State::Operational);
+        let at = self.inner.states.add(None, PubSubNodeState::Operational);
         self.inner.parts.push(Part {
             kind: Kind::Whole,
             parent: None,
             state: VariableId::PublishSubscribe_Status_State.into(),
-            diagnostics: Some(Diagnostics::of_the_whole()),
+            diagnostics: Some(PubSubCounters::of_the_whole()),
             live: Some(LiveCounts::of_the_whole()),
             counts: Counts::default(),
         });
@@ -114,7 +114,7 @@ impl Insert<'_> {
     fn part(
         &mut self,
         kind: Kind,
-        (parent, own): (usize, State),
+        (parent, own): (usize, PubSubNodeState),
         object: &At,
         counters: Option<(ObjectTypeId, &[Counter])>,
     ) -> (usize, Option<At>) {
@@ -130,7 +130,8 @@ impl Insert<'_> {
         ];
         let mut live = None;
         let diagnostics = counters.map(|(kind, counters)| {
-            let (made, reset, values) = Diagnostics::insert(&mut self.tree, object, kind, counters);
+            let (made, reset, values) =
+                PubSubCounters::insert(&mut self.tree, object, kind, counters);
             methods.push((reset, Ask::Reset));
             live = Some(values);
             made
@@ -175,7 +176,7 @@ impl Insert<'_> {
         let counters = (ObjectTypeId::PubSubDiagnosticsConnectionType, &[][..]);
         let (at, live) = self.part(
             Kind::Connection,
-            (whole, State::Operational),
+            (whole, PubSubNodeState::Operational),
             &object,
             Some(counters),
         );
@@ -232,7 +233,7 @@ impl Insert<'_> {
         }
         let (at, live) = self.part(
             kind,
-            (above, State::Operational),
+            (above, PubSubNodeState::Operational),
             &object,
             Some((type_.1, counted)),
         );
@@ -319,7 +320,7 @@ impl Insert<'_> {
         );
         self.part(
             Kind::Writer(topic.topic),
-            (above, State::Operational),
+            (above, PubSubNodeState::Operational),
             &object,
             detailed.then_some(counters),
         );
@@ -366,7 +367,7 @@ impl Insert<'_> {
         );
         self.part(
             Kind::Reader(topic.topic),
-            (above, State::PreOperational),
+            (above, PubSubNodeState::PreOperational),
             &object,
             detailed.then_some(counters),
         );

@@ -4,12 +4,12 @@ use std::collections::HashMap;
 
 use mappings::TopicId;
 
-use super::states::State;
+use super::states::PubSubNodeState;
 
 /// The state of the reader of each topic, after its last message.
 #[derive(Debug, Default)]
 pub(crate) struct Readers {
-    states: HashMap<TopicId, State>,
+    states: HashMap<TopicId, PubSubNodeState>,
     /// Numbers of messages that arrived while their reader was disabled.
     ignored: HashMap<TopicId, u64>,
 }
@@ -17,7 +17,7 @@ pub(crate) struct Readers {
 impl Readers {
     /// Records that a value of a topic arrived.
     pub(crate) fn heard(&mut self, topic: TopicId) {
-        self.states.insert(topic, State::Operational);
+        self.states.insert(topic, PubSubNodeState::Operational);
     }
 
     /// Records that a message was dropped because its reader is disabled.
@@ -28,9 +28,9 @@ impl Readers {
     /// Records that the writer of a topic is silent or active again.
     pub(crate) fn silent(&mut self, topic: TopicId, silent: bool) {
         let state = if silent {
-            State::Error
+            PubSubNodeState::Error
         } else {
-            State::Operational
+            PubSubNodeState::Operational
         };
         self.states.insert(topic, state);
     }
@@ -44,15 +44,17 @@ impl Readers {
     }
 
     /// Returns the state of the reader of a topic, which is PreOperational until the first value.
-    pub(crate) fn of(&self, topic: TopicId) -> State {
+    pub(crate) fn of(&self, topic: TopicId) -> PubSubNodeState {
         let state = self.states.get(&topic).copied();
-        state.unwrap_or(State::PreOperational)
+        state.unwrap_or(PubSubNodeState::PreOperational)
     }
 
     /// Returns the number of topics with a received value, and how many of them are silent.
     pub(crate) fn silence(&self) -> (usize, usize) {
         let states = self.states.values();
-        let silent = states.filter(|state| **state == State::Error).count();
+        let silent = states
+            .filter(|state| **state == PubSubNodeState::Error)
+            .count();
         (self.states.len(), silent)
     }
 

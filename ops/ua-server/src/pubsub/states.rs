@@ -3,7 +3,7 @@
 
 /// PubSubState (OPC 10000-14, 6.2.1) by its number.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum State {
+pub(crate) enum PubSubNodeState {
     /// A client has disabled the component.
     Disabled = 0,
     /// The parent is not operational.
@@ -18,7 +18,7 @@ pub(crate) enum State {
 
 /// The cause of a state change.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Cause {
+pub(crate) enum StateCause {
     /// A client called Enable or Disable of the component.
     Method,
     /// The state of the parent changed.
@@ -29,12 +29,12 @@ pub(crate) enum Cause {
 
 /// A changed state.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) struct Change {
+pub(crate) struct StateChange {
     /// The number of the component.
     pub(crate) at: usize,
-    pub(crate) was: State,
-    pub(crate) is: State,
-    pub(crate) cause: Cause,
+    pub(crate) was: PubSubNodeState,
+    pub(crate) is: PubSubNodeState,
+    pub(crate) cause: StateCause,
 }
 
 #[derive(Debug)]
@@ -45,8 +45,8 @@ struct Component {
     called: bool,
     /// The component's own condition, which is its state while it is enabled and its parent is
     /// operational.
-    own: State,
-    state: State,
+    own: PubSubNodeState,
+    state: PubSubNodeState,
 }
 
 /// All components. A parent has a lower number than its children.
@@ -57,7 +57,7 @@ pub(crate) struct States {
 
 impl States {
     /// Adds a component below `parent` and returns its number.
-    pub(crate) fn add(&mut self, parent: Option<usize>, own: State) -> usize {
+    pub(crate) fn add(&mut self, parent: Option<usize>, own: PubSubNodeState) -> usize {
         let component = Component {
             parent,
             enabled: true,
@@ -70,13 +70,13 @@ impl States {
     }
 
     /// Returns the state of a component.
-    pub(crate) fn of(&self, at: usize) -> State {
+    pub(crate) fn of(&self, at: usize) -> PubSubNodeState {
         let component = self.all.get(at);
-        component.map_or(State::Disabled, |component| component.state)
+        component.map_or(PubSubNodeState::Disabled, |component| component.state)
     }
 
     /// Sets the own condition of a component.
-    pub(crate) fn set_own(&mut self, at: usize, own: State) {
+    pub(crate) fn set_own(&mut self, at: usize, own: PubSubNodeState) {
         if let Some(component) = self.all.get_mut(at) {
             component.own = own;
         }
@@ -100,7 +100,7 @@ impl States {
     }
 
     /// Computes all states and returns the changes.
-    pub(crate) fn settle(&mut self) -> Vec<Change> {
+    pub(crate) fn settle(&mut self) -> Vec<StateChange> {
         let mut changes = Vec::new();
         for at in 0..self.all.len() {
             let Some(component) = self.all.get(at) else {
@@ -108,9 +108,13 @@ impl States {
             };
             let above = component.parent.map(|parent| self.of(parent));
             let is = match above {
-                _ if !component.enabled => State::Disabled,
-                Some(State::Disabled | State::Paused | State::Error) => State::Paused,
-                Some(State::Operational | State::PreOperational) | None => component.own,
+                _ if !component.enabled => PubSubNodeState::Disabled,
+                Some(
+                    PubSubNodeState::Disabled | PubSubNodeState::Paused | PubSubNodeState::Error,
+                ) => PubSubNodeState::Paused,
+                Some(PubSubNodeState::Operational | PubSubNodeState::PreOperational) | None => {
+                    component.own
+                }
             };
             let was = component.state;
             let called = component.called;
@@ -120,11 +124,13 @@ impl States {
             }
             if was != is {
                 let cause = match (called, was, is) {
-                    (true, _, _) => Cause::Method,
-                    (false, State::Paused, _) | (false, _, State::Paused) => Cause::Parent,
-                    (false, _, _) => Cause::Itself,
+                    (true, _, _) => StateCause::Method,
+                    (false, PubSubNodeState::Paused, _) | (false, _, PubSubNodeState::Paused) => {
+                        StateCause::Parent
+                    }
+                    (false, _, _) => StateCause::Itself,
                 };
-                changes.push(Change { at, was, is, cause });
+                changes.push(StateChange { at, was, is, cause });
             }
         }
         changes
@@ -138,9 +144,9 @@ mod tests {
     #[test]
     fn what_is_below_one_that_is_disabled_is_paused_and_goes_on_with_it() {
         let mut states = States::default();
-        let connection = states.add(None, State::Operational);
-        let group = states.add(Some(connection), State::Operational);
-        let writer = states.add(Some(group), State::Operational);
+        let connection = states.add(None, PubSubNodeState::Operational);
+        let group = states.add(Some(connection), PubSubNodeState::Operational);
+        let writer = states.add(Some(group), PubSubNodeState::Operational);
         assert_eq!(states.settle(), []);
         assert!(states.enable(connection, false));
         assert!(!states.enable(connection, false), "it is already");
@@ -152,33 +158,33 @@ mod tests {
         assert_eq!(
             seen,
             [
-                (connection, State::Disabled, Cause::Method),
-                (group, State::Paused, Cause::Parent),
-                (writer, State::Paused, Cause::Parent),
+                (connection, PubSubNodeState::Disabled, StateCause::Method),
+                (group, PubSubNodeState::Paused, StateCause::Parent),
+                (writer, PubSubNodeState::Paused, StateCause::Parent),
             ]
         );
         states.enable(connection, true);
         states.settle();
-        assert_eq!(states.of(writer), State::Operational);
+        assert_eq!(states.of(writer), PubSubNodeState::Operational);
     }
 
     #[test]
     fn one_that_is_disabled_stays_so_whatever_is_above_it() {
         let mut states = States::default();
-        let group = states.add(None, State::Operational);
-        let reader = states.add(Some(group), State::PreOperational);
+        let group = states.add(None, PubSubNodeState::Operational);
+        let reader = states.add(Some(group), PubSubNodeState::PreOperational);
         states.enable(reader, false);
         states.enable(group, false);
         states.settle();
         states.enable(group, true);
         states.settle();
-        assert_eq!(states.of(reader), State::Disabled);
-        states.set_own(reader, State::Error);
+        assert_eq!(states.of(reader), PubSubNodeState::Disabled);
+        states.set_own(reader, PubSubNodeState::Error);
         assert_eq!(states.settle(), [], "what it meets with is no matter");
         states.enable(reader, true);
         let changes = states.settle();
-        assert_eq!(changes[0].is, State::Error);
-        states.set_own(reader, State::Operational);
-        assert_eq!(states.settle()[0].cause, Cause::Itself);
+        assert_eq!(changes[0].is, PubSubNodeState::Error);
+        states.set_own(reader, PubSubNodeState::Operational);
+        assert_eq!(states.settle()[0].cause, StateCause::Itself);
     }
 }

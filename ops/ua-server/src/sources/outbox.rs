@@ -9,17 +9,17 @@ use opcua::sync::Mutex;
 use opcua::types::StatusCode;
 use tokio::sync::{Notify, oneshot};
 
-use super::state::{State, Way};
+use super::state::{ServerState, Way};
 use super::{Plan, Write};
 
 /// Values to be written to a server, as fields. Only the newest value of a state waits, also while
 /// the server is offline; it is written again after a reconnect. Events are written while the
 /// server is connected, and dropped otherwise.
-pub(super) struct Outbox {
+pub(super) struct ServerOutbox {
     waiting: Mutex<Waiting>,
     /// Notified when a value waits.
     pub(super) filled: Notify,
-    pub(super) state: Arc<State>,
+    pub(super) state: Arc<ServerState>,
 }
 
 #[derive(Default)]
@@ -32,13 +32,13 @@ struct Waiting {
 
 /// A waiting value, as fields.
 #[derive(Debug)]
-pub(super) struct Value {
+pub(super) struct WaitingValue {
     pub(super) block: Bytes,
     /// Receives the result if a client waits for it.
     answer: Option<oneshot::Sender<StatusCode>>,
 }
 
-impl Value {
+impl WaitingValue {
     /// Answers the client that wrote the value.
     fn answer(&mut self, status: StatusCode) {
         if let Some(answer) = self.answer.take() {
@@ -51,13 +51,13 @@ impl Value {
 /// The queue of a variable.
 struct Lane {
     write: Arc<Write>,
-    values: VecDeque<Value>,
+    values: VecDeque<WaitingValue>,
     /// The last value of a state.
     last: Option<Bytes>,
 }
 
-impl Outbox {
-    pub(super) fn new(state: Arc<State>) -> Self {
+impl ServerOutbox {
+    pub(super) fn new(state: Arc<ServerState>) -> Self {
         Self {
             waiting: Mutex::default(),
             filled: Notify::new(),
@@ -102,7 +102,7 @@ impl Outbox {
             return;
         };
         let block = Bytes::copy_from_slice(block);
-        let mut value = Value { block, answer };
+        let mut value = WaitingValue { block, answer };
         let mut dropped = 0;
         match lane.write.overflow {
             Overflow::KeepLatest => {
@@ -175,7 +175,7 @@ impl Outbox {
         for (topic, lane) in topics {
             if lane.values.is_empty() {
                 let last = lane.last.clone();
-                lane.values.extend(last.map(|block| Value {
+                lane.values.extend(last.map(|block| WaitingValue {
                     block,
                     answer: None,
                 }));
@@ -211,7 +211,7 @@ impl Outbox {
     }
 
     /// Returns the next values to be written, at most one of each variable.
-    pub(super) fn take(&self, most: usize) -> Vec<(Arc<Write>, Value)> {
+    pub(super) fn take(&self, most: usize) -> Vec<(Arc<Write>, WaitingValue)> {
         let mut waiting = self.waiting.lock();
         let mut taken = Vec::new();
         for _ in 0..waiting.turns.len().min(most) {
@@ -234,7 +234,7 @@ impl Outbox {
 
     /// Handles a value that may not have reached the server. A state is written again unless there
     /// is a newer value; an event is dropped.
-    pub(super) fn untold(&self, write: &Write, mut value: Value) {
+    pub(super) fn untold(&self, write: &Write, mut value: WaitingValue) {
         if write.overflow == Overflow::KeepLatest {
             value.answer(StatusCode::GoodCompletesAsynchronously);
         } else {
@@ -244,7 +244,7 @@ impl Outbox {
     }
 
     /// Handles a value that the server rejected.
-    pub(super) fn refused(&self, write: &Write, mut value: Value, why: (StatusCode, &str)) {
+    pub(super) fn refused(&self, write: &Write, mut value: WaitingValue, why: (StatusCode, &str)) {
         let (status, why) = why;
         value.answer(status);
         self.state.not_written(1);
@@ -252,7 +252,7 @@ impl Outbox {
     }
 
     /// Handles a value that the server accepted.
-    pub(super) fn written(&self, write: &Write, mut value: Value, status: StatusCode) {
+    pub(super) fn written(&self, write: &Write, mut value: WaitingValue, status: StatusCode) {
         value.answer(status);
         self.state.written(1);
         self.state.sound(&write.name, Way::To);
@@ -275,9 +275,9 @@ mod tests {
 
     use super::*;
 
-    fn outbox(overflow: Overflow) -> (Outbox, TopicId) {
+    fn outbox(overflow: Overflow) -> (ServerOutbox, TopicId) {
         let access = Access::anonymous(Endpoint::default());
-        let outbox = Outbox::new(Arc::new(State::new("plc", &access)));
+        let outbox = ServerOutbox::new(Arc::new(ServerState::new("plc", &access)));
         let topic = TopicId::new(1, 2, 10).unwrap();
         outbox.plan(&Plan {
             reads: Vec::new(),
@@ -294,7 +294,7 @@ mod tests {
         (outbox, topic)
     }
 
-    fn taken(outbox: &Outbox) -> Vec<Bytes> {
+    fn taken(outbox: &ServerOutbox) -> Vec<Bytes> {
         let all = std::iter::from_fn(|| outbox.take(10).pop());
         all.map(|(_, value)| value.block).collect()
     }
@@ -357,13 +357,13 @@ mod tests {
     fn each_write_of_a_client_has_its_own_result() {
         let (state, topic) = outbox(Overflow::KeepLatest);
         let (event, event_topic) = outbox(Overflow::DropOldest(NonZeroU16::new(1).unwrap()));
-        let write = |outbox: &Outbox, topic, block: &[u8]| {
+        let write = |outbox: &ServerOutbox, topic, block: &[u8]| {
             let (answer, answered) = oneshot::channel();
             outbox.write(topic, block, answer);
             answered
         };
         let answer = |mut answered: oneshot::Receiver<StatusCode>| answered.try_recv().ok();
-        let only = |outbox: &Outbox| outbox.take(1).pop().unwrap();
+        let only = |outbox: &ServerOutbox| outbox.take(1).pop().unwrap();
 
         // The server is offline.
         let waits = answer(write(&state, topic, b"1"));

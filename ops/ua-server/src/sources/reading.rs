@@ -10,20 +10,20 @@ use std::time::Duration;
 
 use mappings::TopicId;
 use opcua::types::{DataValue, DateTime, StatusCode, Variant};
-use plant_opcua::client::{Client, Link, Notice, Sampled, Subscription, Watch};
+use plant_opcua::client::{ClientSubscription, Link, MonitoredWatch, Notice, OpcUaClient, Sampled};
 use plant_opcua::limits::SHORTEST_PUBLISHING;
 use tokio::sync::{mpsc, watch};
 use tokio::time::{Instant, MissedTickBehavior};
 
-use super::state::{State, Way};
+use super::state::{ServerState, Way};
 use super::{News, Plan, Read};
 use crate::executing::local_node;
 
 /// Reads the nodes for as long as the server is in use.
 pub(super) async fn run(
-    client: Client,
+    client: OpcUaClient,
     mut plan: watch::Receiver<Arc<Plan>>,
-    state: Arc<State>,
+    state: Arc<ServerState>,
     tell: mpsc::Sender<News>,
 ) {
     let mut link = client.link();
@@ -66,8 +66,8 @@ pub(super) async fn run(
 }
 
 struct Reader {
-    client: Client,
-    state: Arc<State>,
+    client: OpcUaClient,
+    state: Arc<ServerState>,
     tell: mpsc::Sender<News>,
     wanted: Vec<Arc<Read>>,
     batches: Vec<Batch>,
@@ -81,7 +81,7 @@ struct Reader {
 
 /// A subscription.
 struct Batch {
-    subscription: Subscription,
+    subscription: ClientSubscription,
     reads: Vec<Arc<Read>>,
 }
 
@@ -166,7 +166,7 @@ impl Reader {
         for read in reads {
             match local_node(&self.client, &read.source.node) {
                 Ok(node) => {
-                    watches.push(Watch::Sampled(Sampled {
+                    watches.push(MonitoredWatch::Sampled(Sampled {
                         node,
                         interval: read.source.sampling,
                         queue: read.source.queue.get().into(),

@@ -11,7 +11,7 @@ use tracing::{info, warn};
 use super::Plan;
 
 /// The state of a server, shared by its two tasks.
-pub(super) struct State {
+pub(super) struct ServerState {
     told: Mutex<LinkState>,
 }
 
@@ -31,7 +31,7 @@ impl Way {
     }
 }
 
-impl State {
+impl ServerState {
     pub(super) fn new(name: &str, access: &Access) -> Self {
         Self {
             told: Mutex::new(LinkState {

@@ -4,16 +4,20 @@ use std::sync::Arc;
 
 use mappings::ExpandedNodeIdText;
 use opcua::types::{NodeId, StatusCode, Variant};
-use plant_opcua::client::{Client, ClientError, Link};
+use plant_opcua::client::{ClientError, Link, OpcUaClient};
 use plant_opcua::limits::MOST_PER_REQUEST;
 use tokio::sync::watch;
 
-use super::outbox::{Outbox, Value};
+use super::outbox::{ServerOutbox, WaitingValue};
 use super::{Plan, Write, one_value};
 use crate::executing::local_node;
 
 /// Writes for as long as the server is in use.
-pub(super) async fn run(client: Client, mut plan: watch::Receiver<Arc<Plan>>, outbox: Arc<Outbox>) {
+pub(super) async fn run(
+    client: OpcUaClient,
+    mut plan: watch::Receiver<Arc<Plan>>,
+    outbox: Arc<ServerOutbox>,
+) {
     let mut link = client.link();
     outbox.plan(&plan.borrow_and_update().clone());
     let mut at = None;
@@ -46,13 +50,13 @@ pub(super) async fn run(client: Client, mut plan: watch::Receiver<Arc<Plan>>, ou
 }
 
 /// Writes all waiting values that the server accepts.
-async fn write(client: &Client, outbox: &Outbox) {
+async fn write(client: &OpcUaClient, outbox: &ServerOutbox) {
     loop {
         let batch = outbox.take(MOST_PER_REQUEST);
         if batch.is_empty() {
             return;
         }
-        let mut writes: Vec<(Arc<Write>, Value)> = Vec::new();
+        let mut writes: Vec<(Arc<Write>, WaitingValue)> = Vec::new();
         let mut values: Vec<(NodeId, Variant)> = Vec::new();
         for (write, waits) in batch {
             match (node(client, &write.target.node), one_value(&waits.block)) {
@@ -97,7 +101,7 @@ async fn write(client: &Client, outbox: &Outbox) {
     }
 }
 
-fn node(client: &Client, text: &ExpandedNodeIdText) -> Result<NodeId, String> {
+fn node(client: &OpcUaClient, text: &ExpandedNodeIdText) -> Result<NodeId, String> {
     local_node(client, text)
 }
 

@@ -6,9 +6,9 @@ use serde_json::{Value, json};
 
 /// The short names of elements with one parent, which are distinct.
 #[derive(Debug, Default)]
-pub(super) struct Names(BTreeSet<String>);
+pub(super) struct ShortNames(BTreeSet<String>);
 
-impl Names {
+impl ShortNames {
     /// Returns a short name for an element: letters, digits and underscores.
     pub(super) fn of(&mut self, name: &str) -> String {
         let plain: String = name

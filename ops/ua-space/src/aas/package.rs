@@ -6,7 +6,7 @@ use std::io::{self, Write as _};
 use rawzip::{CompressionMethod, ZipArchiveWriter};
 
 /// The manifest in the package.
-pub(super) struct Manifest<'m> {
+pub(super) struct PackagedManifest<'m> {
     /// Its part name, as the shell refers to it: `/aasx/files/dosing.aml`.
     pub(super) path: &'m str,
     pub(super) content_type: &'m str,
@@ -14,8 +14,8 @@ pub(super) struct Manifest<'m> {
 }
 
 /// Returns the package of an environment in JSON.
-pub(super) fn package(environment: &str, manifest: &Manifest<'_>) -> io::Result<Vec<u8>> {
-    let Manifest {
+pub(super) fn package(environment: &str, manifest: &PackagedManifest<'_>) -> io::Result<Vec<u8>> {
+    let PackagedManifest {
         path,
         content_type,
         contents,
@@ -80,7 +80,7 @@ mod tests {
 
     #[test]
     fn a_package_leads_from_its_root_to_the_shell_and_the_manifest() {
-        let manifest = Manifest {
+        let manifest = PackagedManifest {
             path: "/aasx/files/a%20b.aml",
             content_type: "text/xml",
             contents: b"<CAEXFile/>",

@@ -2,13 +2,13 @@
 
 use std::collections::BTreeMap;
 
-use mtp::{Bound, Module, Node, Parameter, ValueKind, unit_symbol};
+use mtp::{Module, OpcUaNode, ParameterKind, ServiceParameter, ValueBound, unit_symbol};
 use serde_json::{Value, json};
 
-use super::elements::{Names, collection, meaning, property, submodel, text};
+use super::elements::{ShortNames, collection, meaning, property, submodel, text};
 
 /// A field of the nameplate.
-pub(super) struct Field {
+pub(super) struct NameplateField {
     /// Its name in the submodel and in `--nameplate`.
     pub(super) name: &'static str,
     semantic_id: &'static str,
@@ -33,8 +33,8 @@ const fn field(
     kind: FieldKind,
     is_mandatory: bool,
     information: Option<&'static str>,
-) -> Field {
-    Field {
+) -> NameplateField {
+    NameplateField {
         name,
         semantic_id,
         kind,
@@ -44,15 +44,15 @@ const fn field(
     }
 }
 
-const fn address(name: &'static str, semantic_id: &'static str) -> Field {
-    Field {
+const fn address(name: &'static str, semantic_id: &'static str) -> NameplateField {
+    NameplateField {
         is_address: true,
         ..field(name, semantic_id, FieldKind::Text, true, None)
     }
 }
 
 /// The fields of the digital nameplate 2.0 (IDTA 02006-2-0).
-pub(super) const NAMEPLATE: [Field; 14] = [
+pub(super) const NAMEPLATE: [NameplateField; 14] = [
     field(
         "URIOfTheProduct",
         "0173-1#02-AAY811#001",
@@ -143,7 +143,7 @@ pub(super) fn nameplate(
     if !missing.is_empty() {
         return Err(missing);
     }
-    let element = |field: &Field| {
+    let element = |field: &NameplateField| {
         let value = facts.get(field.name)?;
         let element = match field.kind {
             FieldKind::Property => property(field.name, "string", value),
@@ -151,7 +151,7 @@ pub(super) fn nameplate(
         };
         Some(meaning(element, field.semantic_id))
     };
-    let (of_address, own): (Vec<&Field>, Vec<&Field>) =
+    let (of_address, own): (Vec<&NameplateField>, Vec<&NameplateField>) =
         NAMEPLATE.iter().partition(|field| field.is_address);
     let contact = collection(
         "ContactInformation",
@@ -166,12 +166,12 @@ pub(super) fn nameplate(
 /// Returns the capabilities that the module offers: a container for each procedure, with its
 /// parameters and its service.
 pub(super) fn capabilities(asset: &str, module: &Module) -> Value {
-    let mut names = Names::default();
+    let mut names = ShortNames::default();
     let mut containers = Vec::new();
     for service in &module.services {
         for procedure in &service.procedures {
             let name = names.of(&format!("{}_{}", service.name, procedure.name));
-            let mut properties = Names::default();
+            let mut properties = ShortNames::default();
             let parameters = service.parameters.iter().chain(&procedure.parameters);
             let parameters: Vec<Value> = parameters
                 .map(|parameter| of_parameter(parameter, &mut properties))
@@ -217,26 +217,29 @@ pub(super) fn capabilities(asset: &str, module: &Module) -> Value {
 }
 
 fn names_of(name: &str) -> String {
-    Names::default().of(name)
+    ShortNames::default().of(name)
 }
 
 /// Returns a parameter: a range if the file has its limits, else a property without a value.
-fn of_parameter(parameter: &Parameter, names: &mut Names) -> Value {
+fn of_parameter(parameter: &ServiceParameter, names: &mut ShortNames) -> Value {
     let id_short = names.of(&parameter.name);
     let kind = match parameter.kind {
-        ValueKind::Analog => "double",
-        ValueKind::Integer => "int",
-        ValueKind::Binary => "boolean",
-        ValueKind::Text => "string",
+        ParameterKind::Analog => "double",
+        ParameterKind::Integer => "int",
+        ParameterKind::Binary => "boolean",
+        ParameterKind::Text => "string",
     };
-    let number = |bound: &Option<Bound>| {
+    let number = |bound: &Option<ValueBound>| {
         let number = bound.as_ref()?.constant()?;
         let is_whole = kind == "int" && number.fract() != 0.0;
         (!is_whole).then(|| number.to_string())
     };
     let mut element = json!({ "idShort": id_short, "valueType": format!("xs:{kind}") });
     let limits = (number(&parameter.min), number(&parameter.max));
-    let is_number = matches!(parameter.kind, ValueKind::Analog | ValueKind::Integer);
+    let is_number = matches!(
+        parameter.kind,
+        ParameterKind::Analog | ParameterKind::Integer
+    );
     if let Some(element) = element.as_object_mut() {
         let has_limits = is_number && (limits.0.is_some() || limits.1.is_some());
         let model = if has_limits { "Range" } else { "Property" };
@@ -246,7 +249,7 @@ fn of_parameter(parameter: &Parameter, names: &mut Names) -> Value {
                 element.insert(key.to_owned(), limit.into());
             }
         }
-        let unit = parameter.unit.as_ref().and_then(Bound::constant);
+        let unit = parameter.unit.as_ref().and_then(ValueBound::constant);
         if let Some(unit) = unit.and_then(unit_symbol) {
             let qualifier = json!([{ "type": "Unit", "valueType": "xs:string", "value": unit }]);
             element.insert("qualifiers".to_owned(), qualifier);
@@ -257,10 +260,10 @@ fn of_parameter(parameter: &Parameter, names: &mut Names) -> Value {
 
 /// Returns the interfaces of the module: an OPC UA server with its nodes as properties.
 pub(super) fn interfaces(asset: &str, module: &Module) -> Value {
-    let mut names = Names::default();
+    let mut names = ShortNames::default();
     let mut interfaces = Vec::new();
     for server in &module.servers {
-        let mut items = Names::default();
+        let mut items = ShortNames::default();
         let of_server = module.items.iter();
         let of_server = of_server.filter(|item| item.node.endpoint == server.endpoint);
         let properties: Vec<Value> = of_server
@@ -316,7 +319,7 @@ const fn bool_of(value: bool) -> &'static str {
 }
 
 /// Returns the address of a node: the endpoint of its server with its NodeId.
-fn href(node: &Node) -> String {
+fn href(node: &OpcUaNode) -> String {
     format!("{}/?id={}", node.endpoint, node.id())
 }
 

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use clap::{Args, ValueEnum};
 
-use super::live::{Group, seconds};
+use super::live::{GroupArguments, seconds};
 
 #[derive(Debug, Args)]
 pub(crate) struct StatusArguments {
@@ -18,7 +18,7 @@ pub(crate) struct StatusArguments {
     #[arg(long)]
     pub(crate) json: bool,
     #[command(flatten)]
-    pub(crate) group: Group,
+    pub(crate) group: GroupArguments,
 }
 
 #[derive(Debug, Args)]
@@ -41,14 +41,14 @@ pub(crate) struct Doctor {
     #[arg(long)]
     pub(crate) json: bool,
     #[command(flatten)]
-    pub(crate) group: Group,
+    pub(crate) group: GroupArguments,
 }
 
 #[derive(Debug, Args)]
-pub(crate) struct New {
+pub(crate) struct NewCellArguments {
     /// The kind of the file
     #[arg(value_name = "KIND", value_enum)]
-    pub(crate) template: Template,
+    pub(crate) template: CellTemplate,
     /// How the skills of a component do their work
     #[arg(long, value_name = "DRIVER", value_enum, default_value_t = DriverTemplate::Simulated)]
     pub(crate) driver: DriverTemplate,
@@ -74,7 +74,7 @@ pub(crate) enum DriverTemplate {
 
 /// The kind of a starting file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-pub(crate) enum Template {
+pub(crate) enum CellTemplate {
     /// A component with two skills, for ua-component
     Component,
     /// A MES with a process, for ua-mes

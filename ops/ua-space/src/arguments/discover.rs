@@ -3,13 +3,13 @@
 use clap::Args;
 use discovery::scan::Range;
 
-use super::Group;
+use super::GroupArguments;
 use super::live::seconds;
 
 #[derive(Debug, Args)]
 pub(crate) struct Discover {
     #[command(flatten)]
-    pub(crate) look: Look,
+    pub(crate) look: DiscoverArguments,
     /// Print a JSON array
     #[arg(long)]
     pub(crate) json: bool,
@@ -17,7 +17,7 @@ pub(crate) struct Discover {
 
 /// How to look around.
 #[derive(Debug, Default, Args)]
-pub(crate) struct Look {
+pub(crate) struct DiscoverArguments {
     /// Time to listen
     #[arg(long, value_name = "SECONDS", default_value = "3", value_parser = seconds)]
     pub(crate) seconds: f64,
@@ -37,5 +37,5 @@ pub(crate) struct Look {
     #[arg(long, value_name = "N", default_value_t = 200, requires = "scan", value_parser = clap::value_parser!(u32).range(1..=1000))]
     pub(crate) rate: u32,
     #[command(flatten)]
-    pub(crate) group: Group,
+    pub(crate) group: GroupArguments,
 }

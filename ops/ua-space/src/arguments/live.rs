@@ -11,7 +11,7 @@ use crate::live::Sort;
 
 /// Where the space is.
 #[derive(Debug, Clone, Default, Args)]
-pub(crate) struct Group {
+pub(crate) struct GroupArguments {
     /// The network interface of the PubSub group, by name or address
     #[arg(long, value_name = "NAME|ADDRESS", env = "UA_INTERFACE")]
     pub(crate) interface: Option<String>,
@@ -37,7 +37,7 @@ pub(crate) struct Group {
 }
 
 #[derive(Debug, Args)]
-pub(crate) struct List {
+pub(crate) struct ListArguments {
     /// Only topics of this origin: 0 the OPC UA side, 1 ROS 1, 2 to 232 a ROS 2 space
     #[arg(long, value_name = "SPACE", value_parser = super::space)]
     pub(crate) space: Option<SpaceId>,
@@ -51,14 +51,14 @@ pub(crate) struct List {
     #[arg(long)]
     pub(crate) json: bool,
     #[command(flatten)]
-    pub(crate) group: Group,
+    pub(crate) group: GroupArguments,
 }
 
 #[derive(Debug, Args)]
-pub(crate) struct Info {
+pub(crate) struct InfoArguments {
     /// The topic, as ua_1_2_10, or its name, as JointStates or /joint_states
     #[arg(value_name = "TOPIC|NAME")]
-    pub(crate) target: Target,
+    pub(crate) target: NamedTarget,
     /// Time to listen
     #[arg(long, value_name = "SECONDS", default_value = "3", value_parser = seconds)]
     pub(crate) seconds: f64,
@@ -66,14 +66,14 @@ pub(crate) struct Info {
     #[arg(long)]
     pub(crate) json: bool,
     #[command(flatten)]
-    pub(crate) group: Group,
+    pub(crate) group: GroupArguments,
 }
 
 #[derive(Debug, Args)]
-pub(crate) struct Echo {
+pub(crate) struct EchoArguments {
     /// The topic, as ua_1_2_10, or its name, as JointStates or /joint_states
     #[arg(value_name = "TOPIC|NAME")]
-    pub(crate) target: Target,
+    pub(crate) target: NamedTarget,
     /// End after this number of values
     #[arg(short = 'n', long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
     pub(crate) count: Option<u64>,
@@ -84,14 +84,14 @@ pub(crate) struct Echo {
     #[arg(long)]
     pub(crate) json: bool,
     #[command(flatten)]
-    pub(crate) group: Group,
+    pub(crate) group: GroupArguments,
 }
 
 #[derive(Debug, Args)]
 pub(crate) struct Hz {
     /// The topic, as ua_1_2_10, or its name, as JointStates or /joint_states
     #[arg(value_name = "TOPIC|NAME")]
-    pub(crate) target: Target,
+    pub(crate) target: NamedTarget,
     /// Largest number of values in a measurement
     #[arg(long, value_name = "N", default_value_t = 10_000, value_parser = window)]
     pub(crate) window: usize,
@@ -102,7 +102,7 @@ pub(crate) struct Hz {
     #[arg(long)]
     pub(crate) json: bool,
     #[command(flatten)]
-    pub(crate) group: Group,
+    pub(crate) group: GroupArguments,
 }
 
 #[derive(Debug, Args)]
@@ -117,11 +117,11 @@ pub(crate) struct Top {
     #[arg(long, value_name = "SECONDS", value_parser = seconds)]
     pub(crate) seconds: Option<f64>,
     #[command(flatten)]
-    pub(crate) group: Group,
+    pub(crate) group: GroupArguments,
 }
 
 #[derive(Debug, Args)]
-pub(crate) struct Types {
+pub(crate) struct TypesArguments {
     /// Only this type, as GraspSkillType or Grasp
     #[arg(value_name = "TYPE")]
     pub(crate) name: Option<String>,
@@ -132,7 +132,7 @@ pub(crate) struct Types {
     #[arg(long)]
     pub(crate) json: bool,
     #[command(flatten)]
-    pub(crate) group: Group,
+    pub(crate) group: GroupArguments,
 }
 
 #[derive(Debug, Args)]
@@ -151,7 +151,7 @@ pub(crate) enum SkillsVerb {
     /// Show a skill: its parameters, its state, the end of its last run
     Info(InfoSkill),
     /// Start a skill, after a Reset if it is Halted, and follow it to its end; Ctrl-C halts it
-    Start(Call),
+    Start(CallArguments),
     /// Watch transitions, progress and results of skills
     Watch(WatchSkills),
 }
@@ -168,7 +168,7 @@ pub(crate) struct InfoSkill {
     #[arg(long)]
     pub(crate) json: bool,
     #[command(flatten)]
-    pub(crate) group: Group,
+    pub(crate) group: GroupArguments,
 }
 
 #[derive(Debug, Args)]
@@ -183,7 +183,7 @@ pub(crate) struct WatchSkills {
     #[arg(long)]
     pub(crate) json: bool,
     #[command(flatten)]
-    pub(crate) group: Group,
+    pub(crate) group: GroupArguments,
 }
 
 #[derive(Debug, Args)]
@@ -199,14 +199,14 @@ pub(crate) struct ListSkills {
     #[arg(long)]
     pub(crate) json: bool,
     #[command(flatten)]
-    pub(crate) group: Group,
+    pub(crate) group: GroupArguments,
 }
 
 #[derive(Debug, Args)]
-pub(crate) struct Call {
+pub(crate) struct CallArguments {
     /// A topic as ua_0_7_105, or a name as gripper.Grasp.Halt; gripper.Grasp is gripper.Grasp.Start
     #[arg(value_name = "TOPIC|NAME")]
-    pub(crate) target: Target,
+    pub(crate) target: NamedTarget,
     /// Parameters, as Force=12.5 TargetPosition=0.4,0,0.2,0,0,0; a goal also as YAML, '{order: 5}'
     #[arg(value_name = "NAME=VALUE")]
     pub(crate) parameters: Vec<String>,
@@ -228,7 +228,7 @@ pub(crate) struct Call {
     #[arg(long)]
     pub(crate) json: bool,
     #[command(flatten)]
-    pub(crate) group: Group,
+    pub(crate) group: GroupArguments,
 }
 
 #[derive(Debug, Args)]
@@ -242,7 +242,7 @@ pub(crate) struct Trace {
     pub(crate) seconds: Option<f64>,
     /// Show the delays of each sample of this topic: ua_1_2_10, or its name
     #[arg(long, value_name = "TOPIC|NAME", conflicts_with = "metrics")]
-    pub(crate) follow: Option<Target>,
+    pub(crate) follow: Option<NamedTarget>,
     /// Write the samples as a trace of Perfetto: a track for each hop of a topic, and a flow for
     /// each sample
     #[arg(long, value_name = "FILE")]
@@ -267,11 +267,11 @@ pub(crate) struct Trace {
     #[arg(long)]
     pub(crate) json: bool,
     #[command(flatten)]
-    pub(crate) group: Group,
+    pub(crate) group: GroupArguments,
 }
 
 #[derive(Debug, Args)]
-pub(crate) struct Ask {
+pub(crate) struct AskArguments {
     /// The question, as what-can-run. Without it all questions are listed
     #[arg(value_name = "QUESTION", conflicts_with = "sparql")]
     pub(crate) question: Option<String>,
@@ -301,7 +301,7 @@ pub(crate) struct PlanArguments {
 }
 
 #[derive(Debug, Args)]
-pub(crate) struct Source {
+pub(crate) struct SourceArguments {
     #[command(subcommand)]
     pub(crate) verb: SourceVerb,
 }
@@ -397,12 +397,12 @@ pub(crate) struct SourceAt {
 
 /// A topic or call, by its identifiers or by a name.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) enum Target {
+pub(crate) enum NamedTarget {
     Topic(TopicId),
     Name(String),
 }
 
-impl FromStr for Target {
+impl FromStr for NamedTarget {
     type Err = &'static str;
 
     fn from_str(text: &str) -> Result<Self, Self::Err> {
@@ -417,7 +417,7 @@ impl FromStr for Target {
     }
 }
 
-impl fmt::Display for Target {
+impl fmt::Display for NamedTarget {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Topic(topic) => topic.fmt(f),

@@ -6,7 +6,7 @@ use std::path::PathBuf;
 use clap::Args;
 use mappings::SpaceId;
 
-use super::live::{Group, seconds};
+use super::live::{GroupArguments, seconds};
 use crate::live::ModelSource;
 
 /// The models of robots that viewers show.
@@ -21,7 +21,7 @@ pub(crate) struct Models {
 }
 
 #[derive(Debug, Args)]
-pub(crate) struct Record {
+pub(crate) struct RecordArguments {
     /// The new file: cell.pcapng for all messages, or cell.mcap for values
     #[arg(value_name = "FILE")]
     pub(crate) file: PathBuf,
@@ -40,11 +40,11 @@ pub(crate) struct Record {
     #[command(flatten)]
     pub(crate) models: Models,
     #[command(flatten)]
-    pub(crate) group: Group,
+    pub(crate) group: GroupArguments,
 }
 
 #[derive(Debug, Args)]
-pub(crate) struct Replay {
+pub(crate) struct ReplayArguments {
     /// A recording of `ua-space record`, .pcapng or .mcap, or another capture of pcap or pcapng
     #[arg(value_name = "FILE")]
     pub(crate) file: PathBuf,
@@ -67,7 +67,7 @@ pub(crate) struct Replay {
     #[arg(long)]
     pub(crate) json: bool,
     #[command(flatten)]
-    pub(crate) group: Group,
+    pub(crate) group: GroupArguments,
 }
 
 #[derive(Debug, Args)]
@@ -88,7 +88,7 @@ pub(crate) struct Viewers {
     #[arg(long, value_name = "SECONDS", value_parser = seconds)]
     pub(crate) seconds: Option<f64>,
     #[command(flatten)]
-    pub(crate) group: Group,
+    pub(crate) group: GroupArguments,
 }
 
 fn speed(text: &str) -> Result<f64, &'static str> {

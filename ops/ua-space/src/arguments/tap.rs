@@ -2,13 +2,13 @@
 
 use clap::Args;
 
-use super::live::{Target, seconds};
+use super::live::{NamedTarget, seconds};
 
 #[derive(Debug, Args)]
-pub(crate) struct Tap {
+pub(crate) struct TapArguments {
     /// The topic, as ua_1_2_10, or its name, as JointStates or /joint_states
     #[arg(value_name = "TOPIC|NAME")]
-    pub(crate) target: Target,
+    pub(crate) target: NamedTarget,
     /// Ask the program with this address of --metrics. May be repeated. Without it: all programs of
     /// this host with --metrics
     #[arg(long, value_name = "URL")]

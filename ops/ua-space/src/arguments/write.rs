@@ -4,13 +4,13 @@ use std::path::PathBuf;
 
 use clap::Args;
 
-use super::live::{Group, Target, seconds};
+use super::live::{GroupArguments, NamedTarget, seconds};
 
 #[derive(Debug, Args)]
 pub(crate) struct Write {
     /// The topic, as ua_0_2_30, or its name, as Line.Speed or /cmd_vel
     #[arg(value_name = "TOPIC|NAME")]
-    pub(crate) target: Target,
+    pub(crate) target: NamedTarget,
     /// The value, as 0.5, true, text or [1, 2]. Parts of a message as linear.x=0.5, or as YAML or
     /// JSON, '{linear: {x: 0.5}}'. Parts that are left out are zero, and a stamp is the present
     /// time
@@ -53,7 +53,7 @@ pub(crate) struct Write {
     #[arg(long)]
     pub(crate) json: bool,
     #[command(flatten)]
-    pub(crate) group: Group,
+    pub(crate) group: GroupArguments,
 }
 
 fn rate(text: &str) -> Result<f64, &'static str> {

@@ -11,14 +11,14 @@ use crate::packet;
 /// Encodes the blocks of a file. The file is whole after each block.
 #[derive(Debug)]
 pub(crate) struct PcapNg {
-    link: Link,
+    link: LinkLayer,
     /// The Identification of the next IP packet.
     identification: u16,
 }
 
 /// The form of the packets.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Link {
+pub(crate) enum LinkLayer {
     /// IPv4 packets with the UDP datagrams that were sent to an address.
     Udp(SocketAddrV4),
     /// NetworkMessages that a broker delivered, as exported PDUs.
@@ -28,7 +28,7 @@ pub(crate) enum Link {
 impl PcapNg {
     /// Appends the first blocks of a file. `interface` is the name of the network interface or
     /// broker.
-    pub(crate) fn begin(link: Link, interface: &str, out: &mut Vec<u8>) -> Self {
+    pub(crate) fn begin(link: LinkLayer, interface: &str, out: &mut Vec<u8>) -> Self {
         let program = concat!("ua-space ", env!("CARGO_PKG_VERSION"));
         block(header_type(), out, |out| {
             out.extend(reversed(BYTE_ORDER));
@@ -40,8 +40,8 @@ impl PcapNg {
             option(END_OF_OPTIONS, &[], out);
         });
         let link_type = match link {
-            Link::Udp(_) => packet::RAW,
-            Link::Exported => packet::EXPORTED,
+            LinkLayer::Udp(_) => packet::RAW,
+            LinkLayer::Exported => packet::EXPORTED,
         };
         block(INTERFACE_DESCRIPTION, out, |out| {
             out.extend(link_type.to_le_bytes());
@@ -67,11 +67,11 @@ impl PcapNg {
         out: &mut Vec<u8>,
     ) {
         let head = match self.link {
-            Link::Udp(to) => {
+            LinkLayer::Udp(to) => {
                 self.identification = self.identification.wrapping_add(1);
                 packet::ipv4_head((from, to), self.identification, message.len())
             }
-            Link::Exported => packet::exported_head(),
+            LinkLayer::Exported => packet::exported_head(),
         };
         let length = u32::try_from(head.len() + message.len()).unwrap_or(u32::MAX);
         block(ENHANCED_PACKET, out, |out| {
@@ -145,15 +145,15 @@ const NANOSECONDS: u8 = 9;
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::capture::{Capture, is_capture};
-    use crate::packet::{Found, Fragments, udp};
+    use crate::capture::{CaptureReader, is_capture};
+    use crate::packet::{Fragments, PacketContent, udp};
 
     const TIME: i128 = 1_779_021_296_789_012_345;
 
     #[test]
     fn a_written_file_is_read_with_its_times_and_addresses() {
         let (from, to) = ("10.0.0.1:5000", "239.192.0.40:4840");
-        let link = Link::Udp(to.parse().unwrap());
+        let link = LinkLayer::Udp(to.parse().unwrap());
         let mut file = Vec::new();
         let mut writer = PcapNg::begin(link, "eth0", &mut file);
         let messages = [&b"one"[..], &[7; 60_000], b""];
@@ -163,12 +163,13 @@ mod tests {
         PcapNg::end(TIME, 3, 1, &mut file);
         let (magic, rest) = file.split_first_chunk().unwrap();
         assert!(is_capture(*magic));
-        let mut capture = Capture::new(*magic, rest).unwrap();
+        let mut capture = CaptureReader::new(*magic, rest).unwrap();
         for (message, time) in messages.iter().zip(TIME..) {
             let packet = capture.next_packet().unwrap().unwrap();
             assert_eq!(packet.time, Some(time));
             let mut fragments = Fragments::default();
-            let Found::Udp(found) = udp(packet.link_type, &packet.data, &mut fragments) else {
+            let PacketContent::Udp(found) = udp(packet.link_type, &packet.data, &mut fragments)
+            else {
                 panic!("no datagram");
             };
             assert_eq!((found.payload.as_ref(), found.missing), (*message, 0));
@@ -181,14 +182,17 @@ mod tests {
     #[test]
     fn messages_of_a_broker_are_exported_for_the_dissector() {
         let mut file = Vec::new();
-        let mut writer = PcapNg::begin(Link::Exported, "mqtt://broker", &mut file);
+        let mut writer = PcapNg::begin(LinkLayer::Exported, "mqtt://broker", &mut file);
         let from = "127.0.0.1:1883".parse().unwrap();
         writer.packet(TIME, from, b"message", &mut file);
         let (magic, rest) = file.split_first_chunk().unwrap();
-        let packet = Capture::new(*magic, rest).unwrap().next_packet().unwrap();
+        let packet = CaptureReader::new(*magic, rest)
+            .unwrap()
+            .next_packet()
+            .unwrap();
         let packet = packet.unwrap();
         assert!(packet.data.windows(4).any(|window| window == b"uadp"));
         let found = udp(packet.link_type, &packet.data, &mut Fragments::default());
-        assert!(matches!(found, Found::Udp(found) if found.payload.as_ref() == b"message"));
+        assert!(matches!(found, PacketContent::Udp(found) if found.payload.as_ref() == b"message"));
     }
 }

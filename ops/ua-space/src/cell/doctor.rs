@@ -17,20 +17,20 @@ use std::path::Path;
 use serde::Serialize;
 
 use crate::arguments::Doctor;
-use crate::exit::Failure;
+use crate::exit::CommandFailure;
 use crate::live::{harmless, is_coloured, json, wrapped};
 use crate::report::warn;
 use crate::survey::look;
-use facts::Facts;
-use findings::{Finding, Fix, Severity};
+use facts::CellFacts;
+use findings::{DoctorFinding, DoctorSeverity, Fix};
 
 /// Runs `ua-space doctor`.
-pub(crate) fn doctor(arguments: &Doctor) -> Result<(), Failure> {
+pub(crate) fn doctor(arguments: &Doctor) -> Result<(), CommandFailure> {
     let facts = look(async { Ok(Box::pin(facts::gather(arguments)).await) })?;
     let findings = findings::of(&facts);
     let mut out = io::stdout().lock();
     if arguments.json {
-        let shown = Shown {
+        let shown = DiagnosisJson {
             findings: &findings,
             facts: &facts,
         };
@@ -45,7 +45,9 @@ pub(crate) fn doctor(arguments: &Doctor) -> Result<(), Failure> {
         open.write(true).create(true).truncate(true).mode(0o600);
         open.open(path)
             .and_then(|mut file| file.write_all(&packed))
-            .map_err(|error| Failure::Io(format!("cannot write {}: {error}", path.display())))?;
+            .map_err(|error| {
+                CommandFailure::Io(format!("cannot write {}: {error}", path.display()))
+            })?;
         if !arguments.json {
             writeln!(out, "the report is in {}", path.display())?;
         }
@@ -60,9 +62,9 @@ pub(crate) fn doctor(arguments: &Doctor) -> Result<(), Failure> {
             .filter(|one| one.severity == severity)
             .count()
     };
-    match (count(Severity::Error), count(Severity::Warning)) {
+    match (count(DoctorSeverity::Error), count(DoctorSeverity::Warning)) {
         (0, 0) => Ok(()),
-        (errors, warnings) => Err(Failure::Failed(format!(
+        (errors, warnings) => Err(CommandFailure::Failed(format!(
             "found {errors} {} and {warnings} {}",
             plural(errors, "error"),
             plural(warnings, "warning")
@@ -71,9 +73,9 @@ pub(crate) fn doctor(arguments: &Doctor) -> Result<(), Failure> {
 }
 
 #[derive(Serialize)]
-struct Shown<'a> {
-    findings: &'a [Finding],
-    facts: &'a Facts,
+struct DiagnosisJson<'a> {
+    findings: &'a [DoctorFinding],
+    facts: &'a CellFacts,
 }
 
 fn plural(count: usize, word: &str) -> String {
@@ -83,13 +85,17 @@ fn plural(count: usize, word: &str) -> String {
     }
 }
 
-fn tell(facts: &Facts, findings: &[Finding], out: &mut impl io::Write) -> Result<(), Failure> {
+fn tell(
+    facts: &CellFacts,
+    findings: &[DoctorFinding],
+    out: &mut impl io::Write,
+) -> Result<(), CommandFailure> {
     let is_coloured = is_coloured();
     for one in findings {
         let (word, colour) = match one.severity {
-            Severity::Error => ("error", "31"),
-            Severity::Warning => ("warning", "33"),
-            Severity::Note => ("note", "36"),
+            DoctorSeverity::Error => ("error", "31"),
+            DoctorSeverity::Warning => ("warning", "33"),
+            DoctorSeverity::Note => ("note", "36"),
         };
         let head = format!("{word} {}: ", one.code);
         let text = wrapped(&head, &harmless(&one.what));
@@ -123,7 +129,7 @@ fn tell(facts: &Facts, findings: &[Finding], out: &mut impl io::Write) -> Result
 }
 
 /// Writes the settings of the safe repairs, which last until the host restarts.
-fn repair(findings: &[Finding], root: &Path) {
+fn repair(findings: &[DoctorFinding], root: &Path) {
     for fix in findings.iter().filter_map(|one| one.fix.as_ref()) {
         let Fix { path, value } = fix;
         let target = root.join(path.trim_start_matches('/'));
@@ -157,9 +163,9 @@ mod tests {
         fs::create_dir_all(&folder).unwrap();
         let path = "/proc/sys/net/ipv4/ipfrag_high_thresh";
         fs::write(folder.join("ipfrag_high_thresh"), "1\n").unwrap();
-        let finding = |fix| Finding {
+        let finding = |fix| DoctorFinding {
             code: "D052",
-            severity: Severity::Warning,
+            severity: DoctorSeverity::Warning,
             what: String::new(),
             why: String::new(),
             remedy: String::new(),

@@ -8,16 +8,18 @@ use std::path::Path;
 
 use serde::Serialize;
 
-use super::pages::{self, Page, RedundancyPage, RedundantPeerPage};
-use super::processes::{self, Process};
-use crate::arguments::{Group, StatusArguments};
-use crate::exit::Failure;
-use crate::live::{Application, Table, harmless, in_the_group, is_coloured, json, wrapped};
+use super::pages::{self, RedundancyPage, RedundantPeerPage, StatusPage};
+use super::processes::{self, LocalProcess};
+use crate::arguments::{GroupArguments, StatusArguments};
+use crate::exit::CommandFailure;
+use crate::live::{
+    AnnouncedProgram, TextTable, harmless, in_the_group, is_coloured, json, wrapped,
+};
 use crate::report::warn;
 use crate::survey::look;
 
 /// Runs `ua-space status`.
-pub(crate) fn status(arguments: &StatusArguments) -> Result<(), Failure> {
+pub(crate) fn status(arguments: &StatusArguments) -> Result<(), CommandFailure> {
     let found = look(find(&arguments.urls, &arguments.group, arguments.seconds))?;
     let programs = programs(&found);
     let mut out = io::stdout().lock();
@@ -25,7 +27,7 @@ pub(crate) fn status(arguments: &StatusArguments) -> Result<(), Failure> {
         writeln!(
             out,
             "{}",
-            json(&Shown {
+            json(&ProgramJson {
                 programs: &programs
             })?
         )?;
@@ -41,25 +43,31 @@ pub(crate) fn status(arguments: &StatusArguments) -> Result<(), Failure> {
         .filter(|one| one.state == State::NotReady)
         .count();
     match (programs.len(), unready) {
-        (0, _) => Err(Failure::Unavailable(NOBODY.to_owned())),
+        (0, _) => Err(CommandFailure::Unavailable(NOBODY.to_owned())),
         (_, 0) => Ok(()),
-        (all, 1) => Err(Failure::Failed(format!("1 of {all} programs is not ready"))),
-        (all, some) => Err(Failure::Failed(format!(
+        (all, 1) => Err(CommandFailure::Failed(format!(
+            "1 of {all} programs is not ready"
+        ))),
+        (all, some) => Err(CommandFailure::Failed(format!(
             "{some} of {all} programs are not ready"
         ))),
     }
 }
 
 /// The programs on this host, at the given URLs and in the group.
-pub(super) struct Cell {
-    pub(super) processes: Vec<Process>,
-    pub(super) pages: Vec<Page>,
+pub(super) struct CellOverview {
+    pub(super) processes: Vec<LocalProcess>,
+    pub(super) pages: Vec<StatusPage>,
     /// Announced applications: space, sender and description.
-    pub(super) applications: Vec<(u16, SocketAddr, Application)>,
+    pub(super) applications: Vec<(u16, SocketAddr, AnnouncedProgram)>,
     pub(super) own_addresses: BTreeSet<IpAddr>,
 }
 
-async fn find(urls: &[String], group: &Group, seconds: f64) -> Result<Cell, Failure> {
+async fn find(
+    urls: &[String],
+    group: &GroupArguments,
+    seconds: f64,
+) -> Result<CellOverview, CommandFailure> {
     let (processes, _) = processes::read(Path::new("/"));
     let (pages, heard) = tokio::join!(all_pages(&processes, urls), in_the_group(group, seconds));
     let applications = match heard {
@@ -69,7 +77,7 @@ async fn find(urls: &[String], group: &Group, seconds: f64) -> Result<Cell, Fail
             Vec::new()
         }
     };
-    Ok(Cell {
+    Ok(CellOverview {
         processes,
         pages,
         applications,
@@ -79,27 +87,27 @@ async fn find(urls: &[String], group: &Group, seconds: f64) -> Result<Cell, Fail
 
 /// Returns the pages of the processes of this host and of the URLs. A URL without an answer is
 /// reported.
-pub(super) async fn all_pages(processes: &[Process], urls: &[String]) -> Vec<Page> {
+pub(super) async fn all_pages(processes: &[LocalProcess], urls: &[String]) -> Vec<StatusPage> {
     let mut pages = pages::of_processes(processes).await;
     for url in urls {
         match pages::of_url(url).await {
             Ok(found) => {
-                let is_new = |one: &Page| {
+                let is_new = |one: &StatusPage| {
                     !pages.iter().any(|known| {
                         known.url.trim_start_matches("http://")
                             == one.url.trim_start_matches("http://")
                     })
                 };
-                let new: Vec<Page> = found.into_iter().filter(is_new).collect();
+                let new: Vec<StatusPage> = found.into_iter().filter(is_new).collect();
                 pages.extend(new);
             }
             Err(failure) => {
                 warn(&failure.to_string());
-                pages.push(Page {
+                pages.push(StatusPage {
                     program: "?".to_owned(),
                     not_ready: vec![format!("no status at {url}")],
                     url: url.clone(),
-                    ..Page::default()
+                    ..StatusPage::default()
                 });
             }
         }
@@ -108,8 +116,8 @@ pub(super) async fn all_pages(processes: &[Process], urls: &[String]) -> Vec<Pag
 }
 
 pub(super) fn applications(
-    heard: impl IntoIterator<Item = ((u16, String), Application)>,
-) -> Vec<(u16, SocketAddr, Application)> {
+    heard: impl IntoIterator<Item = ((u16, String), AnnouncedProgram)>,
+) -> Vec<(u16, SocketAddr, AnnouncedProgram)> {
     let all = heard.into_iter();
     all.filter_map(|((space, from), one)| Some((space, from.parse().ok()?, one)))
         .collect()
@@ -157,11 +165,11 @@ struct Program {
 }
 
 #[derive(Serialize)]
-struct Shown<'a> {
+struct ProgramJson<'a> {
     programs: &'a [Program],
 }
 
-fn programs(cell: &Cell) -> Vec<Program> {
+fn programs(cell: &CellOverview) -> Vec<Program> {
     let mut all: Vec<Program> = cell.pages.iter().map(of_page).collect();
     let mut local = BTreeSet::new();
     for process in &cell.processes {
@@ -194,7 +202,7 @@ fn programs(cell: &Cell) -> Vec<Program> {
     all
 }
 
-fn of_page(page: &Page) -> Program {
+fn of_page(page: &StatusPage) -> Program {
     let has_mapping = !page.mapping.hash.is_empty();
     let mut not_ready = page.not_ready.clone();
     // A mapping that cannot run is no reason for /readyz, because the previous mapping runs.
@@ -223,7 +231,7 @@ fn of_page(page: &Page) -> Program {
     }
 }
 
-fn of_process(process: &Process, space: Option<u16>) -> Program {
+fn of_process(process: &LocalProcess, space: Option<u16>) -> Program {
     Program {
         program: process.program.clone(),
         space,
@@ -240,7 +248,7 @@ fn of_process(process: &Process, space: Option<u16>) -> Program {
     }
 }
 
-fn of_application((space, from): (u16, SocketAddr), application: &Application) -> Program {
+fn of_application((space, from): (u16, SocketAddr), application: &AnnouncedProgram) -> Program {
     let name = match application.name.as_str() {
         "" => &application.uri,
         name => name,
@@ -348,8 +356,8 @@ const HEAD: [&str; 7] = [
     "PROGRAM", "SPACE", "STATE", "VERSION", "UPTIME", "MAPPING", "WHERE",
 ];
 
-fn table(programs: &[Program]) -> Table {
-    let mut table = Table::new(HEAD.map(str::to_owned)).yielding([6, 0]);
+fn table(programs: &[Program]) -> TextTable {
+    let mut table = TextTable::new(HEAD.map(str::to_owned)).yielding([6, 0]);
     for one in programs {
         let dash = || "-".to_owned();
         let hash = one.mapping_hash.as_deref();
@@ -386,8 +394,8 @@ mod tests {
     use super::*;
     use crate::cell::pages::TakeoverPage;
 
-    fn application(name: &str) -> Application {
-        Application {
+    fn application(name: &str) -> AnnouncedProgram {
+        AnnouncedProgram {
             uri: format!("urn:{name}"),
             product_uri: String::new(),
             name: name.to_owned(),
@@ -399,21 +407,21 @@ mod tests {
     #[test]
     fn a_program_is_listed_once_whatever_is_known_of_it() {
         let here: IpAddr = "10.0.0.1".parse().unwrap();
-        let process = |pid, program: &str, port| Process {
+        let process = |pid, program: &str, port| LocalProcess {
             pid,
             program: program.to_owned(),
             udp: vec![SocketAddr::new(here, port)],
-            ..Process::default()
+            ..LocalProcess::default()
         };
-        let page = Page {
+        let page = StatusPage {
             program: "bridge-ros1".to_owned(),
             space: 1,
             not_ready: vec!["no ROS master".to_owned()],
             pid: Some(7),
-            ..Page::default()
+            ..StatusPage::default()
         };
         let at = |ip: &str, port: u16| SocketAddr::new(ip.parse().unwrap(), port);
-        let cell = Cell {
+        let cell = CellOverview {
             processes: vec![
                 process(7, "bridge-ros1", 1000),
                 process(8, "bridge-ros2", 2000),
@@ -451,7 +459,7 @@ mod tests {
             address: format!("10.0.0.{rank}:4000"),
             age_ms,
         };
-        let page = Page {
+        let page = StatusPage {
             program: "bridge-ros1".to_owned(),
             space: 1,
             redundancy: Some(RedundancyPage {
@@ -465,7 +473,7 @@ mod tests {
                 peers: vec![peer(2, "standby", 12), peer(3, "standby", 4_000)],
                 ..RedundancyPage::default()
             }),
-            ..Page::default()
+            ..StatusPage::default()
         };
         let shown = of_page(&page);
         assert_eq!(shown.state_text(), "ready, active");

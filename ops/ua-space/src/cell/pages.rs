@@ -9,14 +9,14 @@ use serde_json::Value;
 use tokio::task::JoinSet;
 use tokio::time::timeout;
 
-use super::processes::Process;
-use crate::exit::Failure;
-use crate::http::Server;
+use super::processes::LocalProcess;
+use crate::exit::CommandFailure;
+use crate::http::HttpServer;
 
 /// The status of a program in a space, as far as it is needed here.
 #[derive(Debug, Clone, Default, PartialEq, Deserialize, Serialize)]
 #[serde(default)]
-pub(crate) struct Page {
+pub(crate) struct StatusPage {
     pub(crate) program: String,
     pub(crate) version: Option<String>,
     pub(crate) uptime_s: Option<u64>,
@@ -134,7 +134,7 @@ pub(crate) struct HopPage {
     pub(crate) negative: u64,
 }
 
-impl Page {
+impl StatusPage {
     /// Returns the program and its space for output.
     pub(crate) fn label(&self) -> String {
         format!("{} (space {})", self.program, self.space)
@@ -142,7 +142,7 @@ impl Page {
 }
 
 /// Reads the body of a `/status`: an object, or an array with an object for each space.
-pub(crate) fn parse(body: &str) -> Option<Vec<Page>> {
+pub(crate) fn parse(body: &str) -> Option<Vec<StatusPage>> {
     let value: Value = serde_json::from_str(body).ok()?;
     let all = if value.is_array() {
         serde_json::from_value(value).ok()?
@@ -150,7 +150,7 @@ pub(crate) fn parse(body: &str) -> Option<Vec<Page>> {
         vec![value]
     };
     let pages = all.into_iter().map(|one| serde_json::from_value(one).ok());
-    let pages: Vec<Page> = pages.collect::<Option<_>>()?;
+    let pages: Vec<StatusPage> = pages.collect::<Option<_>>()?;
     pages
         .iter()
         .all(|page| !page.program.is_empty())
@@ -158,13 +158,13 @@ pub(crate) fn parse(body: &str) -> Option<Vec<Page>> {
 }
 
 /// Returns the pages of programs on this host, at the addresses where they listen.
-pub(crate) async fn of_processes(processes: &[Process]) -> Vec<Page> {
+pub(crate) async fn of_processes(processes: &[LocalProcess]) -> Vec<StatusPage> {
     let mut asking = JoinSet::new();
     for process in processes {
         for address in process.listening.iter().take(MOST_PORTS) {
             let (pid, at) = (process.pid, reachable(*address));
             asking.spawn(async move {
-                let server = Server::parse(&format!("http://{at}")).ok()?;
+                let server = HttpServer::parse(&format!("http://{at}")).ok()?;
                 let answer = timeout(LIMIT, server.get("/status")).await.ok()?.ok()?;
                 let mut pages = parse(&answer.body).filter(|_| answer.status == 200)?;
                 for page in &mut pages {
@@ -176,7 +176,7 @@ pub(crate) async fn of_processes(processes: &[Process]) -> Vec<Page> {
         }
     }
     let all = asking.join_all().await;
-    let mut pages: Vec<Page> = all.into_iter().flatten().flatten().collect();
+    let mut pages: Vec<StatusPage> = all.into_iter().flatten().flatten().collect();
     pages.sort_by(|a, b| (&a.program, a.space, &a.url).cmp(&(&b.program, b.space, &b.url)));
     pages
 }
@@ -185,11 +185,11 @@ pub(crate) async fn of_processes(processes: &[Process]) -> Vec<Page> {
 ///
 /// # Errors
 /// The program does not answer, or its answer is no status.
-pub(crate) async fn of_url(url: &str) -> Result<Vec<Page>, Failure> {
-    let answer = Server::parse(url)?.get("/status").await?;
+pub(crate) async fn of_url(url: &str) -> Result<Vec<StatusPage>, CommandFailure> {
+    let answer = HttpServer::parse(url)?.get("/status").await?;
     let mut pages = parse(&answer.body)
         .filter(|_| answer.status == 200)
-        .ok_or_else(|| Failure::Data(format!("{url}/status is no status of a program")))?;
+        .ok_or_else(|| CommandFailure::Data(format!("{url}/status is no status of a program")))?;
     for page in &mut pages {
         url.clone_into(&mut page.url);
     }

@@ -9,7 +9,7 @@ use serde::Serialize;
 
 /// A running program of this project in the network namespace of the caller.
 #[derive(Debug, Clone, Default, PartialEq, Serialize)]
-pub(crate) struct Process {
+pub(crate) struct LocalProcess {
     pub(crate) pid: u32,
     /// The name of the program, as `bridge-ros1`.
     pub(crate) program: String,
@@ -36,7 +36,7 @@ pub(crate) struct UdpSocket {
 }
 
 /// Reads the programs and the UDP sockets below a root: `/proc` is `<root>/proc`.
-pub(crate) fn read(root: &Path) -> (Vec<Process>, Vec<UdpSocket>) {
+pub(crate) fn read(root: &Path) -> (Vec<LocalProcess>, Vec<UdpSocket>) {
     let proc = root.join("proc");
     let mut udp = sockets(&proc, "udp");
     udp.extend(sockets(&proc, "udp6"));
@@ -65,7 +65,7 @@ pub(crate) fn read(root: &Path) -> (Vec<Process>, Vec<UdpSocket>) {
             .cloned()
             .collect();
         let limits = fs::read_to_string(folder.join("limits")).unwrap_or_default();
-        programs.push(Process {
+        programs.push(LocalProcess {
             pid,
             program,
             listening: of(&listening),

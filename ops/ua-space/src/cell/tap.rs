@@ -10,23 +10,23 @@ use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use tokio::time::{Instant, MissedTickBehavior, interval};
 
-use super::pages::{self, Page};
+use super::pages::{self, StatusPage};
 use super::pages_of_this_host;
-use crate::arguments::{Tap, Target};
-use crate::exit::Failure;
-use crate::http::Server;
-use crate::interrupt::Interrupt;
+use crate::arguments::{NamedTarget, TapArguments};
+use crate::exit::CommandFailure;
+use crate::http::HttpServer;
+use crate::interrupt::SignalGuard;
 use crate::iso_time;
 use crate::live::{fitting, harmless, json};
 use crate::report::warn;
 use crate::survey::look;
 
 /// Runs `ua-space tap`.
-pub(crate) fn tap(arguments: &Tap) -> Result<(), Failure> {
+pub(crate) fn tap(arguments: &TapArguments) -> Result<(), CommandFailure> {
     look(run(arguments))
 }
 
-async fn run(arguments: &Tap) -> Result<(), Failure> {
+async fn run(arguments: &TapArguments) -> Result<(), CommandFailure> {
     let pages = pages(arguments).await?;
     let topic = topic(&arguments.target, &pages)?;
     let mut programs: Vec<Program> = Vec::new();
@@ -36,21 +36,21 @@ async fn run(arguments: &Tap) -> Result<(), Failure> {
             None => programs.push(Program {
                 name: page.program.clone(),
                 url: page.url.clone(),
-                server: Server::parse(&page.url)?,
+                server: HttpServer::parse(&page.url)?,
                 from: 0,
                 lost: 0,
                 fault: None,
             }),
         }
     }
-    let mut interrupt = Interrupt::catch()?;
+    let mut interrupt = SignalGuard::catch()?;
     let limit = arguments.seconds.map(Duration::try_from_secs_f64);
     let end = limit
         .and_then(Result::ok)
         .map(|limit| Instant::now() + limit);
     let mut ticks = interval(PERIOD);
     ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
-    let mut told = Told::new(arguments, topic);
+    let mut told = PrintedEvents::new(arguments, topic);
     loop {
         let asked = async {
             ticks.tick().await;
@@ -70,7 +70,7 @@ async fn run(arguments: &Tap) -> Result<(), Failure> {
         if programs.iter().all(|program| program.fault.is_some()) {
             let faults = programs.iter().filter_map(|program| program.fault.clone());
             let faults: Vec<String> = faults.collect();
-            return Err(Failure::Unavailable(faults.join("\n")));
+            return Err(CommandFailure::Unavailable(faults.join("\n")));
         }
         let is_enough = told.tell(events)?;
         if is_enough || end.is_some_and(|end| Instant::now() >= end) {
@@ -89,7 +89,7 @@ async fn run(arguments: &Tap) -> Result<(), Failure> {
 }
 
 /// Returns the status pages of the programs to ask.
-async fn pages(arguments: &Tap) -> Result<Vec<Page>, Failure> {
+async fn pages(arguments: &TapArguments) -> Result<Vec<StatusPage>, CommandFailure> {
     let mut found = Vec::new();
     if arguments.metrics.is_empty() {
         found = pages_of_this_host().await;
@@ -100,7 +100,7 @@ async fn pages(arguments: &Tap) -> Result<Vec<Page>, Failure> {
         found.extend(pages::of_url(url).await?);
     }
     if found.is_empty() {
-        Err(Failure::Unavailable(
+        Err(CommandFailure::Unavailable(
             "no program of this host has --metrics\n  = help: start the bridge with `--metrics \
              127.0.0.1:9101`, or name its address here with --metrics"
                 .to_owned(),
@@ -111,10 +111,10 @@ async fn pages(arguments: &Tap) -> Result<Vec<Page>, Failure> {
 }
 
 /// Returns the topic of the target, by the names that the programs know.
-fn topic(target: &Target, pages: &[Page]) -> Result<TopicId, Failure> {
+fn topic(target: &NamedTarget, pages: &[StatusPage]) -> Result<TopicId, CommandFailure> {
     let name = match target {
-        Target::Topic(topic) => return Ok(*topic),
-        Target::Name(name) => name,
+        NamedTarget::Topic(topic) => return Ok(*topic),
+        NamedTarget::Name(name) => name,
     };
     let known: Vec<(&str, Vec<&str>)> = pages
         .iter()
@@ -127,7 +127,7 @@ fn topic(target: &Target, pages: &[Page]) -> Result<TopicId, Failure> {
     match found.as_slice() {
         [only] => only
             .parse()
-            .map_err(|_| Failure::Data(format!("{only} is not a topic"))),
+            .map_err(|_| CommandFailure::Data(format!("{only} is not a topic"))),
         [] => {
             let names = known.iter().flat_map(|(_, names)| names.iter().copied());
             let help = match mappings::nearest(name, names) {
@@ -136,11 +136,11 @@ fn topic(target: &Target, pages: &[Page]) -> Result<TopicId, Failure> {
                     "`ua-space status` shows the programs, `ua-space list` the names".to_owned()
                 }
             };
-            Err(Failure::Unavailable(format!(
+            Err(CommandFailure::Unavailable(format!(
                 "no program knows a topic named {shown}\n  = help: {help}"
             )))
         }
-        several => Err(Failure::Usage(format!(
+        several => Err(CommandFailure::Usage(format!(
             "{shown} is the name of {}: give the topic",
             several.join(", ")
         ))),
@@ -151,7 +151,7 @@ fn topic(target: &Target, pages: &[Page]) -> Result<TopicId, Failure> {
 struct Program {
     name: String,
     url: String,
-    server: Server,
+    server: HttpServer,
     /// The number of the next event.
     from: u64,
     lost: u64,
@@ -214,8 +214,8 @@ impl Program {
 }
 
 /// The printed events.
-struct Told<'a> {
-    arguments: &'a Tap,
+struct PrintedEvents<'a> {
+    arguments: &'a TapArguments,
     topic: TopicId,
     lines: u64,
     /// The number of samples for each program and step.
@@ -223,15 +223,15 @@ struct Told<'a> {
 }
 
 #[derive(Serialize)]
-struct Shown<'a> {
+struct SampleJson<'a> {
     topic: String,
     program: &'a str,
     #[serde(flatten)]
     event: &'a Event,
 }
 
-impl<'a> Told<'a> {
-    fn new(arguments: &'a Tap, topic: TopicId) -> Self {
+impl<'a> PrintedEvents<'a> {
+    fn new(arguments: &'a TapArguments, topic: TopicId) -> Self {
         Self {
             arguments,
             topic,
@@ -241,7 +241,7 @@ impl<'a> Told<'a> {
     }
 
     /// Prints events. Returns true if enough lines are printed.
-    fn tell(&mut self, events: Vec<(String, Event)>) -> Result<bool, Failure> {
+    fn tell(&mut self, events: Vec<(String, Event)>) -> Result<bool, CommandFailure> {
         let mut out = io::stdout().lock();
         for (program, event) in events {
             if self.arguments.drops && event.step != DROPPED {
@@ -249,7 +249,7 @@ impl<'a> Told<'a> {
             }
             let program = harmless(&program);
             if self.arguments.json {
-                let shown = Shown {
+                let shown = SampleJson {
                     topic: self.topic.to_string(),
                     program: &program,
                     event: &event,
@@ -275,7 +275,7 @@ impl<'a> Told<'a> {
     }
 
     /// Prints the sums.
-    fn sum(&self) -> Result<(), Failure> {
+    fn sum(&self) -> Result<(), CommandFailure> {
         if self.arguments.json {
             return Ok(());
         }

@@ -4,29 +4,29 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 
-use discovery::client::{Application, describe, find_servers, find_servers_on_network};
-use discovery::scan::{Outcome, Pace, scan};
-use discovery::{DEFAULT_LDS, Found, Interface, Known, WatchSettings, watch};
+use discovery::client::{FoundServer, describe, find_servers, find_servers_on_network};
+use discovery::scan::{ScanLimits, ScanOutcome, scan};
+use discovery::{DEFAULT_LDS, MdnsInterface, PresentServer, ServerChange, WatchSettings, watch};
 use mdns::{HeardBridge, heard_bridges};
 use tokio::signal::ctrl_c;
 use tokio::task::JoinSet;
 use tokio::time::timeout;
 
-use super::entry::{By, Entry, Kind, merged};
-use crate::arguments::Look;
-use crate::exit::Failure;
+use super::entry::{DiscoveredEntry, DiscoveredKind, DiscoveryMethod, merged};
+use crate::arguments::DiscoverArguments;
+use crate::exit::CommandFailure;
 use crate::live::{self, InGroup};
 use crate::report::warn;
 
 /// The result of a discovery.
-pub(crate) struct Around {
-    pub(crate) entries: Vec<Entry>,
+pub(crate) struct DiscoveryResult {
+    pub(crate) entries: Vec<DiscoveredEntry>,
     /// The number of scanned addresses, if there was a scan.
     pub(crate) tried: Option<u32>,
 }
 
-/// Discovers programs and servers. Ctrl-C ends it with [`Failure::Interrupted`].
-pub(crate) async fn around(look: &Look) -> Result<Around, Failure> {
+/// Discovers programs and servers. Ctrl-C ends it with [`CommandFailure::Interrupted`].
+pub(crate) async fn around(look: &DiscoverArguments) -> Result<DiscoveryResult, CommandFailure> {
     let hearing = live::in_the_group(&look.group, look.seconds);
     let (found, heard) = around_and(look, hearing).await?;
     if let Err(failure) = heard {
@@ -37,23 +37,23 @@ pub(crate) async fn around(look: &Look) -> Result<Around, Failure> {
 
 /// Discovers programs and servers together with a given listener in the group.
 pub(crate) async fn around_and<T>(
-    look: &Look,
-    hearing: impl Future<Output = Result<(InGroup, T), Failure>>,
-) -> Result<(Around, Result<T, Failure>), Failure> {
+    look: &DiscoverArguments,
+    hearing: impl Future<Output = Result<(InGroup, T), CommandFailure>>,
+) -> Result<(DiscoveryResult, Result<T, CommandFailure>), CommandFailure> {
     tokio::select! {
         found = Box::pin(gathered(look, hearing)) => Ok(found),
-        _ = ctrl_c() => Err(Failure::Interrupted),
+        _ = ctrl_c() => Err(CommandFailure::Interrupted),
     }
 }
 
 async fn gathered<T>(
-    look: &Look,
-    hearing: impl Future<Output = Result<(InGroup, T), Failure>>,
-) -> (Around, Result<T, Failure>) {
+    look: &DiscoverArguments,
+    hearing: impl Future<Output = Result<(InGroup, T), CommandFailure>>,
+) -> (DiscoveryResult, Result<T, CommandFailure>) {
     let limit = Duration::from_secs_f64(look.seconds);
-    let pace = Pace {
+    let pace = ScanLimits {
         per_second: look.rate,
-        ..Pace::default()
+        ..ScanLimits::default()
     };
     let scanning = async {
         match look.scan.as_slice() {
@@ -63,7 +63,7 @@ async fn gathered<T>(
     };
     let (heard, bridges, in_group, scanned) =
         tokio::join!(heard(look, limit), told(look, limit), hearing, scanning);
-    let mut found: Vec<Entry> = Vec::new();
+    let mut found: Vec<DiscoveredEntry> = Vec::new();
     let mut asked: BTreeSet<String> = look.lds.iter().cloned().collect();
     asked.insert(DEFAULT_LDS.to_owned());
     for known in &heard {
@@ -73,12 +73,12 @@ async fn gathered<T>(
     }
     let tried = scanned.as_ref().map(|scanned| scanned.tried);
     for entry in scanned.into_iter().flat_map(of_scan) {
-        if entry.kind == Kind::Lds {
+        if entry.kind == DiscoveredKind::Lds {
             asked.extend(entry.urls.first().cloned());
         }
         found.push(entry);
     }
-    let mut places: Vec<Place> = heard.into_iter().map(Place::of_mdns).collect();
+    let mut places: Vec<ServerLocation> = heard.into_iter().map(ServerLocation::of_mdns).collect();
     places.extend(listed(look, asked).await);
     found.extend(reached(places).await);
     found.extend(bridges.into_iter().map(of_bridge));
@@ -87,23 +87,23 @@ async fn gathered<T>(
         found.extend(in_group.senders.into_iter().map(bridge));
         rest
     });
-    let around = Around {
+    let around = DiscoveryResult {
         entries: merged(found),
         tried,
     };
     (around, heard)
 }
 
-fn interfaces(look: &Look) -> impl Iterator<Item = Interface> + use<> {
+fn interfaces(look: &DiscoverArguments) -> impl Iterator<Item = MdnsInterface> + use<> {
     let interfaces = match &look.group.interface {
-        Some(interface) => vec![Interface::parse(interface)],
-        None => Interface::all(),
+        Some(interface) => vec![MdnsInterface::parse(interface)],
+        None => MdnsInterface::all(),
     };
     interfaces.into_iter().take(MOST_INTERFACES)
 }
 
 /// Returns the bridges announced on the network.
-async fn told(look: &Look, limit: Duration) -> Vec<HeardBridge> {
+async fn told(look: &DiscoverArguments, limit: Duration) -> Vec<HeardBridge> {
     let mut hearing = JoinSet::new();
     for interface in interfaces(look) {
         hearing.spawn(async move { heard_bridges(&interface, limit).await });
@@ -114,7 +114,7 @@ async fn told(look: &Look, limit: Duration) -> Vec<HeardBridge> {
 }
 
 /// Returns the servers announced on the network.
-async fn heard(look: &Look, limit: Duration) -> Vec<Known> {
+async fn heard(look: &DiscoverArguments, limit: Duration) -> Vec<PresentServer> {
     let mut hearing = JoinSet::new();
     for interface in interfaces(look) {
         let settings = WatchSettings {
@@ -129,10 +129,10 @@ async fn heard(look: &Look, limit: Duration) -> Vec<Known> {
                         while let Some(found) = watcher.next().await {
                             let name = found.known().name.clone();
                             match found {
-                                Found::Seen(one) | Found::Restarted(one) => {
+                                ServerChange::Seen(one) | ServerChange::Restarted(one) => {
                                     known.insert(name, one);
                                 }
-                                Found::Gone { .. } => {
+                                ServerChange::Gone { .. } => {
                                     known.remove(&name);
                                 }
                             }
@@ -140,7 +140,7 @@ async fn heard(look: &Look, limit: Duration) -> Vec<Known> {
                     };
                     // The search ends at the limit.
                     let _over = timeout(limit, all).await;
-                    known.into_values().collect::<Vec<Known>>()
+                    known.into_values().collect::<Vec<PresentServer>>()
                 });
             }
             Err(fault) => warn(&format!("mDNS is not heard on {interface}: {fault}")),
@@ -150,8 +150,8 @@ async fn heard(look: &Look, limit: Duration) -> Vec<Known> {
 }
 
 /// The announced or listed location of a server.
-struct Place {
-    by: By,
+struct ServerLocation {
+    by: DiscoveryMethod,
     url: String,
     name: String,
     capabilities: Vec<String>,
@@ -162,10 +162,10 @@ struct Place {
     host: Option<String>,
 }
 
-impl Place {
-    fn of_mdns(known: Known) -> Self {
+impl ServerLocation {
+    fn of_mdns(known: PresentServer) -> Self {
         Self {
-            by: By::Mdns,
+            by: DiscoveryMethod::Mdns,
             is_lds: known.is_lds(),
             url: known.url,
             name: known.name,
@@ -175,10 +175,10 @@ impl Place {
         }
     }
 
-    fn of_lds(lds: &str, application: Application) -> Option<Self> {
+    fn of_lds(lds: &str, application: FoundServer) -> Option<Self> {
         let mut urls = application.discovery_urls.into_iter();
         Some(Self {
-            by: By::Lds,
+            by: DiscoveryMethod::Lds,
             url: urls.find(|url| url.starts_with("opc.tcp://"))?,
             name: application.name,
             capabilities: Vec::new(),
@@ -189,7 +189,7 @@ impl Place {
     }
 
     /// Requests the description of the server.
-    async fn reached(self) -> Entry {
+    async fn reached(self) -> DiscoveredEntry {
         let first = describe(&self.url, ANSWER).await;
         // The host name in the URL may not resolve on this host.
         let elsewhere = self.host.as_deref().and_then(|host| moved(&self.url, host));
@@ -200,13 +200,13 @@ impl Place {
             },
             (first, _) => (self.url, first),
         };
-        let mut entry = Entry::new(Kind::Server, self.by, url);
+        let mut entry = DiscoveredEntry::new(DiscoveredKind::Server, self.by, url);
         entry.name = self.name;
         entry.uri = self.uri;
         entry.capabilities.extend(self.capabilities);
         match described {
             Ok(told) => {
-                entry.kind = Kind::of_product(&told.product_uri);
+                entry.kind = DiscoveredKind::of_product(&told.product_uri);
                 entry.security = told.security;
                 let application = told.application;
                 if !application.application_uri.is_empty() {
@@ -216,20 +216,20 @@ impl Place {
                     entry.name = application.name;
                 }
                 if application.is_discovery_server {
-                    entry.kind = Kind::Lds;
+                    entry.kind = DiscoveredKind::Lds;
                 }
             }
             Err(fault) => entry.fault = Some(fault.to_string()),
         }
         if self.is_lds {
-            entry.kind = Kind::Lds;
+            entry.kind = DiscoveredKind::Lds;
         }
         entry
     }
 }
 
 /// Returns the servers that the discovery servers list.
-async fn listed(look: &Look, asked: BTreeSet<String>) -> Vec<Place> {
+async fn listed(look: &DiscoverArguments, asked: BTreeSet<String>) -> Vec<ServerLocation> {
     let mut asking = JoinSet::new();
     for url in asked.into_iter().take(MOST_LDS) {
         asking.spawn(async move {
@@ -243,7 +243,10 @@ async fn listed(look: &Look, asked: BTreeSet<String>) -> Vec<Place> {
     let mut places = Vec::new();
     for (url, registered, announced) in asking.join_all().await {
         match registered {
-            Ok(all) => places.extend(all.into_iter().filter_map(|one| Place::of_lds(&url, one))),
+            Ok(all) => places.extend(
+                all.into_iter()
+                    .filter_map(|one| ServerLocation::of_lds(&url, one)),
+            ),
             Err(fault) if look.lds.contains(&url) => {
                 warn(&format!("the discovery server {url} is not there: {fault}"));
             }
@@ -251,8 +254,8 @@ async fn listed(look: &Look, asked: BTreeSet<String>) -> Vec<Place> {
         }
         // A server that is not a discovery server has no such list.
         for one in announced.into_iter().flatten() {
-            places.push(Place {
-                by: By::Lds,
+            places.push(ServerLocation {
+                by: DiscoveryMethod::Lds,
                 is_lds: one.capabilities.iter().any(|code| code == "LDS"),
                 url: one.url,
                 name: one.name,
@@ -265,7 +268,7 @@ async fn listed(look: &Look, asked: BTreeSet<String>) -> Vec<Place> {
     places
 }
 
-async fn reached(places: Vec<Place>) -> Vec<Entry> {
+async fn reached(places: Vec<ServerLocation>) -> Vec<DiscoveredEntry> {
     let mut waiting = places.into_iter().take(MOST_PLACES);
     let mut asking = JoinSet::new();
     let mut found = Vec::new();
@@ -283,15 +286,15 @@ async fn reached(places: Vec<Place>) -> Vec<Entry> {
     }
 }
 
-fn of_scan(scanned: Outcome) -> Vec<Entry> {
+fn of_scan(scanned: ScanOutcome) -> Vec<DiscoveredEntry> {
     let servers = scanned.servers.into_iter().map(|one| {
         let told = one.described;
         let kind = if told.application.is_discovery_server {
-            Kind::Lds
+            DiscoveredKind::Lds
         } else {
-            Kind::of_product(&told.product_uri)
+            DiscoveredKind::of_product(&told.product_uri)
         };
-        let mut entry = Entry::new(kind, By::Scan, one.url);
+        let mut entry = DiscoveredEntry::new(kind, DiscoveryMethod::Scan, one.url);
         entry.urls.extend(one.also_at);
         entry.name = told.application.name;
         entry.uri = told.application.application_uri;
@@ -299,15 +302,19 @@ fn of_scan(scanned: Outcome) -> Vec<Entry> {
         entry
     });
     let others = scanned.others.into_iter().map(|(place, why)| {
-        let mut entry = Entry::new(Kind::Other, By::Scan, format!("opc.tcp://{place}"));
+        let mut entry = DiscoveredEntry::new(
+            DiscoveredKind::Other,
+            DiscoveryMethod::Scan,
+            format!("opc.tcp://{place}"),
+        );
         entry.fault = Some(why);
         entry
     });
     servers.chain(others).collect()
 }
 
-fn bridge(((space, from), topics): ((u16, String), usize)) -> Entry {
-    let mut entry = Entry::new(Kind::Bridge, By::Group, from);
+fn bridge(((space, from), topics): ((u16, String), usize)) -> DiscoveredEntry {
+    let mut entry = DiscoveredEntry::new(DiscoveredKind::Bridge, DiscoveryMethod::Group, from);
     entry.name = match space {
         1 => "space 1 (ROS 1)".to_owned(),
         space => format!("space {space} (ROS 2)"),
@@ -317,9 +324,13 @@ fn bridge(((space, from), topics): ((u16, String), usize)) -> Entry {
     entry
 }
 
-fn of_bridge(heard: HeardBridge) -> Entry {
+fn of_bridge(heard: HeardBridge) -> DiscoveredEntry {
     let HeardBridge { name, bridge, .. } = heard;
-    let mut entry = Entry::new(Kind::Bridge, By::Mdns, heard.host.to_string());
+    let mut entry = DiscoveredEntry::new(
+        DiscoveredKind::Bridge,
+        DiscoveryMethod::Mdns,
+        heard.host.to_string(),
+    );
     entry.name = name;
     entry.uri = bridge.uri;
     entry.space = Some(bridge.space);
@@ -329,13 +340,15 @@ fn of_bridge(heard: HeardBridge) -> Entry {
 
 /// Returns the entry of an application announced in the group. An application without URLs is not a
 /// server.
-fn application(((space, from), told): (&(u16, String), &live::Application)) -> Entry {
+fn application(
+    ((space, from), told): (&(u16, String), &live::AnnouncedProgram),
+) -> DiscoveredEntry {
     let kind = if told.urls.is_empty() {
-        Kind::Bridge
+        DiscoveredKind::Bridge
     } else {
-        Kind::of_product(&told.product_uri)
+        DiscoveredKind::of_product(&told.product_uri)
     };
-    let mut entry = Entry::new(kind, By::Group, from.clone());
+    let mut entry = DiscoveredEntry::new(kind, DiscoveryMethod::Group, from.clone());
     if !told.urls.is_empty() {
         entry.urls.clone_from(&told.urls);
     }

@@ -6,7 +6,7 @@ use serde::Serialize;
 
 /// The kind of a discovered program.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-pub(crate) enum Kind {
+pub(crate) enum DiscoveredKind {
     /// A discovery server.
     Lds,
     /// The server of a cell, `ua-server`.
@@ -21,7 +21,7 @@ pub(crate) enum Kind {
     Other,
 }
 
-impl Kind {
+impl DiscoveredKind {
     pub(crate) const fn word(self) -> &'static str {
         match self {
             Self::Lds => "discovery server",
@@ -45,14 +45,14 @@ impl Kind {
 
 /// The way in which an entry was found.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-pub(crate) enum By {
+pub(crate) enum DiscoveryMethod {
     Mdns,
     Lds,
     Scan,
     Group,
 }
 
-impl By {
+impl DiscoveryMethod {
     const fn word(self) -> &'static str {
         match self {
             Self::Mdns => "mdns",
@@ -65,8 +65,8 @@ impl By {
 
 /// A discovered program or server.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) struct Entry {
-    pub(crate) kind: Kind,
+pub(crate) struct DiscoveredEntry {
+    pub(crate) kind: DiscoveredKind,
     pub(crate) name: String,
     /// The ApplicationUri; empty if it is unknown.
     pub(crate) uri: String,
@@ -75,7 +75,7 @@ pub(crate) struct Entry {
     pub(crate) capabilities: BTreeSet<String>,
     /// The SecurityModes and SecurityPolicies of its endpoints.
     pub(crate) security: Vec<String>,
-    pub(crate) found_by: BTreeSet<By>,
+    pub(crate) found_by: BTreeSet<DiscoveryMethod>,
     /// The reason why the server was not reached or its response was not understood.
     pub(crate) fault: Option<String>,
     /// The space of the values that the program carries or publishes, if known.
@@ -89,7 +89,7 @@ pub(crate) struct Entry {
 /// An entry as JSON.
 #[derive(Serialize)]
 #[serde(rename_all = "camelCase")]
-pub(crate) struct Shown<'e> {
+pub(crate) struct EntryJson<'e> {
     pub(crate) kind: &'static str,
     name: &'e str,
     uri: &'e str,
@@ -107,8 +107,8 @@ pub(crate) struct Shown<'e> {
     group: Option<&'e str>,
 }
 
-impl Entry {
-    pub(super) fn new(kind: Kind, by: By, url: String) -> Self {
+impl DiscoveredEntry {
+    pub(super) fn new(kind: DiscoveredKind, by: DiscoveryMethod, url: String) -> Self {
         Self {
             kind,
             name: String::new(),
@@ -124,8 +124,8 @@ impl Entry {
         }
     }
 
-    pub(crate) fn shown(&self) -> Shown<'_> {
-        Shown {
+    pub(crate) fn shown(&self) -> EntryJson<'_> {
+        EntryJson {
             kind: self.kind.word(),
             name: &self.name,
             uri: &self.uri,
@@ -144,7 +144,9 @@ impl Entry {
     /// URL is equal where an ApplicationUri is unknown. Bridges of different spaces are different
     /// programs.
     fn is(&self, other: &Self) -> bool {
-        if (self.kind, other.kind) == (Kind::Bridge, Kind::Bridge) && self.space != other.space {
+        if (self.kind, other.kind) == (DiscoveredKind::Bridge, DiscoveredKind::Bridge)
+            && self.space != other.space
+        {
             return false;
         }
         if self.uri.is_empty() || other.uri.is_empty() {
@@ -169,7 +171,7 @@ impl Entry {
             }
         }
         first.kind = match (first.kind, second.kind) {
-            (Kind::Server, kind) | (kind, Kind::Server) => kind,
+            (DiscoveredKind::Server, kind) | (kind, DiscoveredKind::Server) => kind,
             (kind, _) => kind,
         };
         if first.name.is_empty() {
@@ -191,15 +193,15 @@ impl Entry {
 }
 
 /// Merges entries of the same program and sorts them by kind and name.
-pub(super) fn merged(found: impl IntoIterator<Item = Entry>) -> Vec<Entry> {
-    let mut entries: Vec<Entry> = Vec::new();
+pub(super) fn merged(found: impl IntoIterator<Item = DiscoveredEntry>) -> Vec<DiscoveredEntry> {
+    let mut entries: Vec<DiscoveredEntry> = Vec::new();
     for one in found {
         match entries.iter_mut().find(|entry| entry.is(&one)) {
             Some(entry) => entry.join(one),
             None => entries.push(one),
         }
     }
-    let order = |entry: &Entry| (entry.kind, entry.name.clone(), entry.urls.clone());
+    let order = |entry: &DiscoveredEntry| (entry.kind, entry.name.clone(), entry.urls.clone());
     entries.sort_by_cached_key(order);
     entries
 }
@@ -208,30 +210,37 @@ pub(super) fn merged(found: impl IntoIterator<Item = Entry>) -> Vec<Entry> {
 mod tests {
     use super::*;
 
-    fn entry(by: By, uri: &str, url: &str) -> Entry {
-        Entry {
+    fn entry(by: DiscoveryMethod, uri: &str, url: &str) -> DiscoveredEntry {
+        DiscoveredEntry {
             uri: uri.to_owned(),
-            ..Entry::new(Kind::Server, by, url.to_owned())
+            ..DiscoveredEntry::new(DiscoveredKind::Server, by, url.to_owned())
         }
     }
 
     #[test]
     fn a_server_that_is_found_three_ways_is_one() {
-        let mut away = entry(By::Lds, "", "opc.tcp://plc:4840");
+        let mut away = entry(DiscoveryMethod::Lds, "", "opc.tcp://plc:4840");
         away.fault = Some("no answer".to_owned());
-        let mut told = entry(By::Mdns, "urn:plc", "opc.tcp://plc:4840");
-        told.kind = Kind::Component;
+        let mut told = entry(DiscoveryMethod::Mdns, "urn:plc", "opc.tcp://plc:4840");
+        told.kind = DiscoveredKind::Component;
         told.capabilities.insert("DA".to_owned());
         let all = merged([
             away,
             told,
-            entry(By::Scan, "urn:plc", "opc.tcp://10.0.0.7:4840"),
-            entry(By::Scan, "urn:other", "opc.tcp://10.0.0.8:4840"),
+            entry(DiscoveryMethod::Scan, "urn:plc", "opc.tcp://10.0.0.7:4840"),
+            entry(
+                DiscoveryMethod::Scan,
+                "urn:other",
+                "opc.tcp://10.0.0.8:4840",
+            ),
         ]);
         let [plc, other] = all.as_slice() else {
             panic!("{all:?}")
         };
-        assert_eq!((plc.kind, plc.fault.as_deref()), (Kind::Component, None));
+        assert_eq!(
+            (plc.kind, plc.fault.as_deref()),
+            (DiscoveredKind::Component, None)
+        );
         assert_eq!(plc.urls, ["opc.tcp://plc:4840", "opc.tcp://10.0.0.7:4840"]);
         assert_eq!(plc.found_by.len(), 3);
         assert_eq!(other.uri, "urn:other");

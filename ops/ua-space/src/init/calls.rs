@@ -5,11 +5,11 @@ use std::ops::Range;
 
 use mappings::{CallKind, ExecutedBy, Mapping, NodeIdText, ServiceRole, SpaceId, TopicId};
 
-use super::known::Known;
+use super::known::OldMapping;
 use super::topics::camel;
 use super::yaml::{comment, scalar, wrapped};
-use crate::survey::model::{Model, ModelCall};
-use crate::survey::{Graph, Nodes, UaMethod};
+use crate::survey::model::{ModelCall, NodeModel};
+use crate::survey::{SurveyedGraph, SurveyedNodes, UaMethod};
 
 /// A proposed call.
 #[derive(Clone, Debug)]
@@ -17,7 +17,7 @@ pub(super) struct CallEntry {
     pub(super) node: NodeIdText,
     pub(super) name: String,
     pub(super) origin: SpaceId,
-    pub(super) what: Executor,
+    pub(super) what: CallExecutor,
     /// The reason why the entry is a comment.
     pub(super) faulty: Option<String>,
     /// True if the file already has the entry as a comment.
@@ -26,16 +26,16 @@ pub(super) struct CallEntry {
 
 /// The executor of a call.
 #[derive(Clone, Debug)]
-pub(super) enum Executor {
+pub(super) enum CallExecutor {
     /// A service or action of the origin, with its name and type.
     Ros(CallKind, String, String),
     /// A Method of a server.
-    Method { server: Whose, target: String },
+    Method { server: CallServer, target: String },
 }
 
 /// A server in a call.
 #[derive(Clone, Debug)]
-pub(super) enum Whose {
+pub(super) enum CallServer {
     /// The name of the server in `servers`.
     Named(String),
     /// The endpoint of the server.
@@ -43,25 +43,25 @@ pub(super) enum Whose {
 }
 
 /// A call without a node.
-pub(super) struct Candidate {
+pub(super) struct CallCandidate {
     pub(super) name: String,
     pub(super) origin: SpaceId,
-    pub(super) what: Executor,
+    pub(super) what: CallExecutor,
 }
 
-impl Candidate {
+impl CallCandidate {
     /// Returns the number of identifiers that the call uses.
     pub(super) const fn numbers(&self) -> u16 {
         match self.what {
-            Executor::Ros(CallKind::Action, ..) => 5,
-            Executor::Ros(CallKind::Service, ..) | Executor::Method { .. } => 1,
+            CallExecutor::Ros(CallKind::Action, ..) => 5,
+            CallExecutor::Ros(CallKind::Service, ..) | CallExecutor::Method { .. } => 1,
         }
     }
 
     /// Returns true if both are the same service or action.
     pub(super) fn is_same(&self, other: &Self) -> bool {
         match (&self.what, &other.what) {
-            (Executor::Ros(kind, name, _), Executor::Ros(other_kind, other_name, _)) => {
+            (CallExecutor::Ros(kind, name, _), CallExecutor::Ros(other_kind, other_name, _)) => {
                 self.origin == other.origin && kind == other_kind && name == other_name
             }
             _ => false,
@@ -73,26 +73,26 @@ impl Candidate {
 pub(super) type Untyped = BTreeMap<SpaceId, BTreeSet<String>>;
 
 /// Returns the calls of the models that are not in `known`, in order.
-pub(super) fn modelled(models: &[Model], known: &Known) -> Vec<Candidate> {
+pub(super) fn modelled(models: &[NodeModel], known: &OldMapping) -> Vec<CallCandidate> {
     let calls = models.iter().flat_map(|model| &model.calls);
     let new = calls.filter(|call| {
         let names = Names::of(&known.mapping, call.origin);
         !names.has(call.kind, &call.server) && !known.mentions(&call.server)
     });
-    let candidate = |call: &ModelCall| Candidate {
+    let candidate = |call: &ModelCall| CallCandidate {
         name: call.name.clone(),
         origin: call.origin,
-        what: Executor::Ros(call.kind, call.server.clone(), call.type_name.clone()),
+        what: CallExecutor::Ros(call.kind, call.server.clone(), call.type_name.clone()),
     };
     new.map(candidate).collect()
 }
 
 /// Returns the calls of `graphs` and `nodes` that are not in `known`, in order.
 pub(super) fn candidates(
-    graphs: &[Graph],
-    (nodes, servers): (&[Nodes], &[Option<String>]),
-    known: &Known,
-) -> (Vec<Candidate>, Untyped) {
+    graphs: &[SurveyedGraph],
+    (nodes, servers): (&[SurveyedNodes], &[Option<String>]),
+    known: &OldMapping,
+) -> (Vec<CallCandidate>, Untyped) {
     let (mut found, mut untyped) = (Vec::new(), Untyped::new());
     for graph in graphs {
         let names = Names::of(&known.mapping, graph.space);
@@ -125,8 +125,8 @@ pub(super) fn candidates(
             continue;
         };
         let at = match name {
-            Some(name) => Whose::Named(name.clone()),
-            None => Whose::At(server.endpoint.clone()),
+            Some(name) => CallServer::Named(name.clone()),
+            None => CallServer::At(server.endpoint.clone()),
         };
         let methods = nodes.methods.iter();
         found.extend(methods.filter_map(|one| method(one, (nodes, &at), known)));
@@ -134,16 +134,20 @@ pub(super) fn candidates(
     (found, untyped)
 }
 
-fn ros(kind: CallKind, origin: SpaceId, name: &str, type_name: &str) -> Candidate {
+fn ros(kind: CallKind, origin: SpaceId, name: &str, type_name: &str) -> CallCandidate {
     let parts = name.split('/').filter(|part| !part.is_empty()).map(camel);
-    Candidate {
+    CallCandidate {
         name: parts.collect::<Vec<_>>().join("."),
         origin,
-        what: Executor::Ros(kind, name.to_owned(), type_name.to_owned()),
+        what: CallExecutor::Ros(kind, name.to_owned(), type_name.to_owned()),
     }
 }
 
-fn method(one: &UaMethod, (server, at): (&Nodes, &Whose), known: &Known) -> Option<Candidate> {
+fn method(
+    one: &UaMethod,
+    (server, at): (&SurveyedNodes, &CallServer),
+    known: &OldMapping,
+) -> Option<CallCandidate> {
     let expanded = |node: &NodeIdText| {
         let uri = server.namespaces.get(usize::from(node.namespace))?;
         let namespace = match node.namespace {
@@ -167,10 +171,10 @@ fn method(one: &UaMethod, (server, at): (&Nodes, &Whose), known: &Known) -> Opti
         "" => one.name.clone(),
         within => format!("{within}.{}", one.name),
     };
-    (!has && !known.mentions_method(&target)).then(|| Candidate {
+    (!has && !known.mentions_method(&target)).then(|| CallCandidate {
         name,
         origin: SpaceId::UA,
-        what: Executor::Method {
+        what: CallExecutor::Method {
             server: at.clone(),
             target,
         },
@@ -268,7 +272,7 @@ fn entry(call: &CallEntry, indent: &str, lines: &mut Vec<String>) {
     say(format!("{mark}  name: {}", scalar(&call.name)));
     say(format!("{mark}  origin: {}", call.origin));
     say(match &call.what {
-        Executor::Ros(kind, name, type_name) => {
+        CallExecutor::Ros(kind, name, type_name) => {
             let word = kind.word();
             format!(
                 "{mark}  ros: {{{word}: {}, type: {}}}",
@@ -276,10 +280,10 @@ fn entry(call: &CallEntry, indent: &str, lines: &mut Vec<String>) {
                 scalar(type_name)
             )
         }
-        Executor::Method { server, target } => {
+        CallExecutor::Method { server, target } => {
             let server = match server {
-                Whose::Named(name) => format!("server: {}", scalar(name)),
-                Whose::At(endpoint) => format!("endpoint: {}", scalar(endpoint)),
+                CallServer::Named(name) => format!("server: {}", scalar(name)),
+                CallServer::At(endpoint) => format!("endpoint: {}", scalar(endpoint)),
             };
             format!("{mark}  opcua: {{{server}, {target}}}")
         }

@@ -7,14 +7,14 @@ use messages::TypeName;
 
 use super::calls::UNTYPED;
 use super::nodes::is_same;
-use super::topics::LeftOut;
+use super::topics::OmittedTopic;
 use super::yaml;
 use crate::survey::UaSource;
 
 /// A mapping with the names in its comments. Topics and nodes that a user left out on purpose are
 /// not proposed again.
 #[derive(Default)]
-pub(super) struct Known {
+pub(super) struct OldMapping {
     pub(super) mapping: Mapping,
     nodes: HashSet<NodeIdText>,
     names: HashSet<(u16, String)>,
@@ -43,19 +43,19 @@ pub(super) struct Known {
 
 /// The server of a node that is already in use by a variable.
 #[derive(Clone, Copy, PartialEq, Eq)]
-pub(super) enum Whose {
+pub(super) enum NodeServer {
     Same,
     Other,
 }
 
 /// The name of a server.
-pub(super) enum Named {
+pub(super) enum ServerName {
     /// A name in the mapping.
     Known(String),
     New(String),
 }
 
-impl Known {
+impl OldMapping {
     /// Collects the names of `mapping`, which was read from `text`.
     pub(super) fn of(mapping: Mapping, text: &str) -> Self {
         let mut known = Self::default();
@@ -173,7 +173,7 @@ impl Known {
 
     /// Returns the server of the variable with the node, compared with `server`; `None` if the node
     /// is not in use.
-    pub(super) fn has_node_of(&self, node: &NodeIdText, server: &str) -> Option<Whose> {
+    pub(super) fn has_node_of(&self, node: &NodeIdText, server: &str) -> Option<NodeServer> {
         if !self.has_node(node) {
             return None;
         }
@@ -182,18 +182,18 @@ impl Known {
         let from = same.and_then(|same| same.from.as_ref().map(|from| &from.server));
         let to = same.and_then(|same| same.to.as_ref().map(|to| &to.server));
         Some(match from.or(to) {
-            Some(other) if other != server => Whose::Other,
-            Some(_) | None => Whose::Same,
+            Some(other) if other != server => NodeServer::Other,
+            Some(_) | None => NodeServer::Same,
         })
     }
 
     /// Returns the name of the server at an endpoint, from the mapping or new.
-    pub(super) fn server(&mut self, endpoint: &str, wanted: &str) -> Named {
+    pub(super) fn server(&mut self, endpoint: &str, wanted: &str) -> ServerName {
         let servers = self.mapping.servers().iter();
         let mut there =
             servers.filter(|server| is_same(&server.access.endpoint.to_string(), endpoint));
         if let Some(there) = there.next() {
-            return Named::Known(there.name.clone());
+            return ServerName::Known(there.name.clone());
         }
         let mut plain: String = wanted
             .chars()
@@ -221,7 +221,7 @@ impl Known {
         let mut names = std::iter::once(plain.to_owned()).chain(numbered);
         let name = names.find(|name| !taken(name)).unwrap_or_default();
         self.servers.insert(name.clone());
-        Named::New(name)
+        ServerName::New(name)
     }
 
     /// Returns `wanted`, with a number appended if the name is in use.
@@ -316,7 +316,7 @@ fn begins_set_aside(comment: &str) -> bool {
         let number = code.strip_prefix('M');
         number.is_some_and(|number| number.len() == 3 && number.bytes().all(|b| b.is_ascii_digit()))
     });
-    has_code || comment.ends_with(LeftOut::Untyped.heading()) || comment.ends_with(UNTYPED)
+    has_code || comment.ends_with(OmittedTopic::Untyped.heading()) || comment.ends_with(UNTYPED)
 }
 
 /// Returns the node of another server named in a comment, in the notation of `render`.

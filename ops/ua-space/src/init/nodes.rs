@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, HashMap, HashSet};
 
 use mappings::NodeIdText;
 
-use crate::survey::{Nodes, UaSource};
+use crate::survey::{SurveyedNodes, UaSource};
 
 /// The namespace indexes of node ids.
 pub(super) struct Indexes {
@@ -30,11 +30,11 @@ impl Indexes {
     /// Assigns an index in the mapping to each namespace that has variables, preferably its index
     /// at the server. For NodeSet files and for servers other than the server of the cell the index
     /// is at least 2, because index 1 is the own namespace of each server.
-    pub(super) fn give(&mut self, source: &Nodes) -> HashMap<u16, u16> {
+    pub(super) fn give(&mut self, source: &SurveyedNodes) -> HashMap<u16, u16> {
         let variables = source.variables.iter();
         let used: HashSet<u16> = variables.map(|one| one.node.namespace).collect();
         let mut indexes = HashMap::new();
-        let mut free = Free::default();
+        let mut free = FreeIndexes::default();
         for (index, uri) in (0..=u16::MAX).zip(&source.namespaces).skip(1) {
             if !used.contains(&index) {
                 continue;
@@ -53,7 +53,12 @@ impl Indexes {
 
     /// Returns the index of the namespace: its index in the mapping, or a free index, preferably
     /// `wanted`. `None` if no index is free.
-    pub(super) fn index_of(&mut self, uri: &str, wanted: u16, free: &mut Free) -> Option<u16> {
+    pub(super) fn index_of(
+        &mut self,
+        uri: &str,
+        wanted: u16,
+        free: &mut FreeIndexes,
+    ) -> Option<u16> {
         if let Some(known) = self.by_uri.get(uri) {
             return Some(*known);
         }
@@ -67,18 +72,18 @@ impl Indexes {
 
 /// A search for free indexes. It continues from the wanted index upwards, then from 2. Indexes are
 /// never released, so earlier positions are not free.
-pub(super) struct Free {
+pub(super) struct FreeIndexes {
     above: u16,
     below: u16,
 }
 
-impl Default for Free {
+impl Default for FreeIndexes {
     fn default() -> Self {
         Self { above: 0, below: 2 }
     }
 }
 
-impl Free {
+impl FreeIndexes {
     fn next(&mut self, wanted: u16, all: &BTreeMap<u16, String>) -> Option<u16> {
         let free = |at: &u16| !all.contains_key(at);
         self.above = wanted.max(self.above);

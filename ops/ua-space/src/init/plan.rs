@@ -6,27 +6,27 @@ mod models;
 use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet};
 
 use mappings::{LiveTopic, NodeIdText, SpaceId};
-use messages::{Registry, TypeName};
+use messages::{TypeName, TypeRegistry};
 use uadp::BuiltinType;
 
-use super::calls::{self, CallEntry, Executor, Untyped};
-use super::known::{Known, Named, Whose};
+use super::calls::{self, CallEntry, CallExecutor, Untyped};
+use super::known::{NodeServer, OldMapping, ServerName};
 use super::nodes::{Indexes, is_at, is_same, source_of};
-use super::topics::{Form, LeftOut, camel, normal, registry};
-use crate::survey::model::Model;
-use crate::survey::{Graph, Nodes, UaServer, UaSource, UaVariable};
+use super::topics::{OmittedTopic, ValueForm, camel, normal, registry};
+use crate::survey::model::NodeModel;
+use crate::survey::{SurveyedGraph, SurveyedNodes, UaServer, UaSource, UaVariable};
 
 /// The contents of the mapping, in order.
 #[derive(Default)]
-pub(super) struct Plan {
+pub(super) struct Proposal {
     pub(super) spaces: Vec<(SpaceId, Option<u16>)>,
     pub(super) namespaces: BTreeMap<u16, String>,
     /// The endpoint of the server of the cell.
     pub(super) endpoint: Option<String>,
     /// Names and endpoints of existing servers.
     pub(super) servers: Vec<(String, String)>,
-    pub(super) entries: Vec<Entry>,
-    pub(super) left_out: BTreeMap<(SpaceId, LeftOut), BTreeSet<String>>,
+    pub(super) entries: Vec<ProposedVariable>,
+    pub(super) left_out: BTreeMap<(SpaceId, OmittedTopic), BTreeSet<String>>,
     /// Topics to which a variable of the file could be bound additionally.
     pub(super) proposals: Vec<String>,
     pub(super) calls: Vec<CallEntry>,
@@ -35,7 +35,7 @@ pub(super) struct Plan {
 
 /// A proposed variable.
 #[derive(Clone, Debug)]
-pub(super) struct Entry {
+pub(super) struct ProposedVariable {
     /// The heading under which the variables of a group are listed.
     pub(super) group: String,
     pub(super) node: NodeIdText,
@@ -43,7 +43,7 @@ pub(super) struct Entry {
     pub(super) name: String,
     pub(super) value: Option<(BuiltinType, bool)>,
     pub(super) origin: SpaceId,
-    pub(super) bindings: Vec<Bound>,
+    pub(super) bindings: Vec<BoundTopic>,
     /// The node of another server that is the source of the value, or its target if ROS produces
     /// the value.
     pub(super) source: Option<UaSource>,
@@ -58,11 +58,11 @@ pub(super) struct Entry {
 
 /// A topic to which the variable is bound.
 #[derive(Clone, Debug)]
-pub(super) struct Bound {
+pub(super) struct BoundTopic {
     pub(super) space: SpaceId,
     pub(super) topic: String,
     pub(super) kind: TypeName,
-    pub(super) form: Form,
+    pub(super) form: ValueForm,
 }
 
 /// The options from the command line.
@@ -72,15 +72,15 @@ pub(super) struct Wishes<'a> {
     pub(super) transforms: bool,
 }
 
-impl Plan {
+impl Proposal {
     /// Plans the values and calls of `models`, and the topics and nodes of `graphs` and `nodes`,
     /// that are not in `known`.
     pub(super) fn new(
-        models: &[Model],
-        graphs: &[Graph],
-        nodes: &[Nodes],
+        models: &[NodeModel],
+        graphs: &[SurveyedGraph],
+        nodes: &[SurveyedNodes],
         wishes: &Wishes<'_>,
-        known: &mut Known,
+        known: &mut OldMapping,
     ) -> Self {
         let mut planner = Planner {
             plan: Self::default(),
@@ -103,9 +103,9 @@ impl Plan {
 }
 
 struct Planner<'k> {
-    plan: Plan,
+    plan: Proposal,
     /// The registries of ROS 1 and of ROS 2.
-    registries: [Registry; 2],
+    registries: [TypeRegistry; 2],
     /// Nodes without a variable, in the namespaces of the mapping; `None` once the node has a
     /// variable.
     ua: Vec<Option<UaVariable>>,
@@ -115,11 +115,11 @@ struct Planner<'k> {
     modelled: HashSet<(SpaceId, String)>,
     /// Positions of the entries of models by their nodes.
     of_models: HashMap<NodeIdText, usize>,
-    known: &'k mut Known,
+    known: &'k mut OldMapping,
 }
 
 impl Planner<'_> {
-    fn spaces(&mut self, graphs: &[Graph]) {
+    fn spaces(&mut self, graphs: &[SurveyedGraph]) {
         for graph in graphs {
             if self.known.mapping.space(graph.space).is_none() {
                 self.plan.spaces.push((graph.space, graph.domain));
@@ -128,7 +128,7 @@ impl Planner<'_> {
     }
 
     /// Returns the names of the servers, `None` for NodeSet files and for the server of the cell.
-    fn servers(&mut self, sources: &[Nodes]) -> Vec<Option<String>> {
+    fn servers(&mut self, sources: &[SurveyedNodes]) -> Vec<Option<String>> {
         let mut names = Vec::with_capacity(sources.len());
         for source in sources {
             let name = match &source.server {
@@ -161,8 +161,8 @@ impl Planner<'_> {
             return name.clone();
         }
         match self.known.server(endpoint, &server.name) {
-            Named::Known(name) => name,
-            Named::New(name) => {
+            ServerName::Known(name) => name,
+            ServerName::New(name) => {
                 self.plan.servers.push((name.clone(), endpoint.clone()));
                 name
             }
@@ -170,7 +170,7 @@ impl Planner<'_> {
     }
 
     /// Collects the new nodes, in the namespaces of the mapping.
-    fn nodes(&mut self, sources: &[Nodes], servers: &[Option<String>], uri: &str) {
+    fn nodes(&mut self, sources: &[SurveyedNodes], servers: &[Option<String>], uri: &str) {
         let mut indexes = self.indexes();
         let mut taken = BTreeSet::new();
         let (mut ua, mut twins) = (Vec::new(), Vec::new());
@@ -208,17 +208,17 @@ impl Planner<'_> {
                     Some(from) if self.known.has_source(from) => continue,
                     // Two servers of the same model have nodes of the same names.
                     Some(from) => self.known.has_node_of(&node, &from.server),
-                    None => self.known.has_node(&node).then_some(Whose::Same),
+                    None => self.known.has_node(&node).then_some(NodeServer::Same),
                 };
                 let one = UaVariable {
                     source: from,
                     ..one.clone()
                 };
                 match known {
-                    Some(Whose::Same) => {}
+                    Some(NodeServer::Same) => {}
                     None if taken.insert(node.to_string()) => ua.push(UaVariable { node, ..one }),
-                    Some(Whose::Other) | None if one.source.is_some() => twins.push(one),
-                    Some(Whose::Other) | None => {}
+                    Some(NodeServer::Other) | None if one.source.is_some() => twins.push(one),
+                    Some(NodeServer::Other) | None => {}
                 }
             }
         }
@@ -255,7 +255,7 @@ impl Planner<'_> {
         }
     }
 
-    fn topics(&mut self, graphs: &[Graph], wishes: &Wishes<'_>) {
+    fn topics(&mut self, graphs: &[SurveyedGraph], wishes: &Wishes<'_>) {
         let mut names: BTreeMap<&str, Vec<(SpaceId, &LiveTopic)>> = BTreeMap::new();
         for graph in graphs {
             for (name, topic) in &graph.live.topics {
@@ -282,14 +282,14 @@ impl Planner<'_> {
         name: &str,
         ends: Vec<(SpaceId, &LiveTopic)>,
         transforms: bool,
-    ) -> Vec<(Bound, bool)> {
+    ) -> Vec<(BoundTopic, bool)> {
         let mut bound = Vec::new();
         for (space, topic) in ends {
             let kind = match topic.types.first() {
                 Some(kind) if topic.types.len() == 1 => kind.parse::<TypeName>().ok(),
                 Some(_) | None => None,
             };
-            if let Some(why) = LeftOut::of(name, kind.as_ref(), transforms) {
+            if let Some(why) = OmittedTopic::of(name, kind.as_ref(), transforms) {
                 self.leave_out(space, why, name);
                 continue;
             }
@@ -300,7 +300,7 @@ impl Planner<'_> {
                 if self.known.is_set_aside(name) {
                     continue;
                 }
-                self.leave_out(space, LeftOut::Untyped, name);
+                self.leave_out(space, OmittedTopic::Untyped, name);
                 continue;
             };
             if self.known.bound(space, name, Some(&kind)) {
@@ -313,8 +313,8 @@ impl Planner<'_> {
                 continue;
             }
             let [ros1, ros2] = &self.registries;
-            let form = Form::of(&kind, if space.is_ros2() { ros2 } else { ros1 });
-            let one = Bound {
+            let form = ValueForm::of(&kind, if space.is_ros2() { ros2 } else { ros1 });
+            let one = BoundTopic {
                 space,
                 topic: name.to_owned(),
                 kind,
@@ -325,7 +325,7 @@ impl Planner<'_> {
         bound
     }
 
-    fn leave_out(&mut self, space: SpaceId, why: LeftOut, name: &str) {
+    fn leave_out(&mut self, space: SpaceId, why: OmittedTopic, name: &str) {
         let topics = self.plan.left_out.entry((space, why)).or_default();
         topics.insert(name.to_owned());
     }
@@ -338,8 +338,8 @@ impl Planner<'_> {
             bindings,
         } = candidate;
         let value = match bindings.first().map(|one| &one.form) {
-            Some(Form::Field(_, value)) => *value,
-            Some(Form::Whole | Form::Bytes) | None => None,
+            Some(ValueForm::Field(_, value)) => *value,
+            Some(ValueForm::Whole | ValueForm::Bytes) | None => None,
         };
         let mut notes = Vec::new();
         let mut guessed = bindings.len() > 1;
@@ -387,7 +387,7 @@ impl Planner<'_> {
                 )
             }
         };
-        self.push(Entry {
+        self.push(ProposedVariable {
             group,
             node,
             alias: None,
@@ -439,7 +439,7 @@ impl Planner<'_> {
                         .to_owned(),
                 );
             }
-            let entry = Entry {
+            let entry = ProposedVariable {
                 group: one.within.clone(),
                 name: one.name,
                 node: one.node,
@@ -457,7 +457,7 @@ impl Planner<'_> {
         }
     }
 
-    fn push(&mut self, mut entry: Entry) {
+    fn push(&mut self, mut entry: ProposedVariable) {
         let namespace = match entry.node.namespace {
             0 => u16::MAX,
             index => index,
@@ -477,9 +477,9 @@ impl Planner<'_> {
 
     fn calls(
         &mut self,
-        models: &[Model],
-        graphs: &[Graph],
-        nodes: (&[Nodes], &[Option<String>]),
+        models: &[NodeModel],
+        graphs: &[SurveyedGraph],
+        nodes: (&[SurveyedNodes], &[Option<String>]),
         uri: &str,
     ) {
         let mut found = calls::modelled(models, self.known);
@@ -506,8 +506,8 @@ impl Planner<'_> {
                 identifier: mappings::Identifier::Numeric(number.into()),
             };
             let is_set_aside = match &one.what {
-                Executor::Ros(_, name, _) => self.known.is_set_aside(name),
-                Executor::Method { .. } => false,
+                CallExecutor::Ros(_, name, _) => self.known.is_set_aside(name),
+                CallExecutor::Method { .. } => false,
             };
             self.plan.calls.push(CallEntry {
                 is_set_aside,
@@ -529,16 +529,16 @@ struct Candidate {
     group: String,
     topic: String,
     origin: SpaceId,
-    bindings: Vec<Bound>,
+    bindings: Vec<BoundTopic>,
 }
 
 /// Returns the variables of a topic: one variable for all spaces if at most one space publishes the
 /// topic, otherwise one variable for each publishing space. Topics of another type become separate
 /// variables.
-fn candidates(name: &str, bound: Vec<(Bound, bool)>) -> Vec<Candidate> {
+fn candidates(name: &str, bound: Vec<(BoundTopic, bool)>) -> Vec<Candidate> {
     let group = name.trim_start_matches('/').split_once('/');
     let group = group.map_or("", |(first, _)| first);
-    let candidate = |origin: SpaceId, bindings: Vec<Bound>| Candidate {
+    let candidate = |origin: SpaceId, bindings: Vec<BoundTopic>| Candidate {
         group: group.to_owned(),
         topic: name.to_owned(),
         origin,
@@ -551,7 +551,7 @@ fn candidates(name: &str, bound: Vec<(Bound, bool)>) -> Vec<Candidate> {
         let own = bindings.filter(|one| producers.contains(&one.space));
         return own.map(|one| candidate(one.space, vec![one])).collect();
     }
-    let bindings: Vec<Bound> = bindings.collect();
+    let bindings: Vec<BoundTopic> = bindings.collect();
     let origin = producers.first().copied().unwrap_or(SpaceId::UA);
     let first = bindings
         .iter()
@@ -560,7 +560,7 @@ fn candidates(name: &str, bound: Vec<(Bound, bool)>) -> Vec<Candidate> {
     let Some(kind) = first.map(|one| one.kind.clone()) else {
         return Vec::new();
     };
-    let (tied, alone): (Vec<Bound>, Vec<Bound>) =
+    let (tied, alone): (Vec<BoundTopic>, Vec<BoundTopic>) =
         bindings.into_iter().partition(|one| one.kind == kind);
     let alone = alone
         .into_iter()

@@ -5,8 +5,8 @@ use std::ops::Range;
 
 use mappings::{Motion, SpaceId};
 
-use super::plan::{Bound, Entry, Plan};
-use super::topics::Form;
+use super::plan::{BoundTopic, Proposal, ProposedVariable};
+use super::topics::ValueForm;
 use super::yaml::{comment, scalar, wrapped};
 use crate::survey::UaSource;
 
@@ -36,7 +36,7 @@ pub(super) fn head(sources: &[String]) -> Vec<String> {
 }
 
 /// Returns the lines of the ROS spaces.
-pub(super) fn spaces(plan: &Plan, indent: &str) -> Vec<String> {
+pub(super) fn spaces(plan: &Proposal, indent: &str) -> Vec<String> {
     let space = |(id, domain): &(SpaceId, Option<u16>)| match domain {
         Some(domain) => format!("{indent}- {{id: {id}, domain: {domain}}}"),
         None => format!("{indent}- {{id: {id}}}"),
@@ -45,7 +45,7 @@ pub(super) fn spaces(plan: &Plan, indent: &str) -> Vec<String> {
 }
 
 /// Returns the lines of the network settings, with their default values.
-pub(super) fn network(plan: &Plan) -> Vec<String> {
+pub(super) fn network(plan: &Proposal) -> Vec<String> {
     let mut lines = [
         "",
         "# The network of the values. For several hosts name the interface that connects them.",
@@ -66,7 +66,7 @@ pub(super) fn network(plan: &Plan) -> Vec<String> {
 }
 
 /// Returns the lines of the existing servers.
-pub(super) fn servers(plan: &Plan, indent: &str) -> Vec<String> {
+pub(super) fn servers(plan: &Proposal, indent: &str) -> Vec<String> {
     let all = plan.servers.iter();
     all.map(|(name, endpoint)| {
         let endpoint = scalar(endpoint);
@@ -76,14 +76,14 @@ pub(super) fn servers(plan: &Plan, indent: &str) -> Vec<String> {
 }
 
 /// Returns the lines of the namespace indexes.
-pub(super) fn namespaces(plan: &Plan, indent: &str) -> Vec<String> {
+pub(super) fn namespaces(plan: &Proposal, indent: &str) -> Vec<String> {
     let all = plan.namespaces.iter();
     all.map(|(index, uri)| format!("{indent}{index}: {}", scalar(uri)))
         .collect()
 }
 
 /// Returns the variables, grouped under headings, and the topics left out.
-pub(super) fn variables(plan: &Plan, indent: &str) -> Variables {
+pub(super) fn variables(plan: &Proposal, indent: &str) -> Variables {
     let mut lines = Vec::new();
     let mut entries = Vec::new();
     let mut group: Option<&str> = None;
@@ -127,7 +127,7 @@ pub(super) fn variables(plan: &Plan, indent: &str) -> Variables {
     Variables { lines, entries }
 }
 
-fn entry(entry: &Entry, indent: &str, lines: &mut Vec<String>) {
+fn entry(entry: &ProposedVariable, indent: &str, lines: &mut Vec<String>) {
     let mark = if entry.faulty.is_some() { "# " } else { "" };
     let mut say = |text: String| lines.push(format!("{indent}{text}"));
     let faulty = entry.faulty.iter().flat_map(|why| why.lines());
@@ -181,8 +181,8 @@ fn entry(entry: &Entry, indent: &str, lines: &mut Vec<String>) {
     }
 }
 
-fn binding(bound: &Bound, origin: SpaceId, named: bool) -> String {
-    let Bound {
+fn binding(bound: &BoundTopic, origin: SpaceId, named: bool) -> String {
+    let BoundTopic {
         space,
         topic,
         kind,
@@ -194,9 +194,9 @@ fn binding(bound: &Bound, origin: SpaceId, named: bool) -> String {
         String::new()
     };
     let form = match form {
-        Form::Field(path, _) => format!(", field: {}", scalar(path)),
-        Form::Whole => String::new(),
-        Form::Bytes => ", as: bytes".to_owned(),
+        ValueForm::Field(path, _) => format!(", field: {}", scalar(path)),
+        ValueForm::Whole => String::new(),
+        ValueForm::Bytes => ", as: bytes".to_owned(),
     };
     format!("{{{space}topic: {}, type: {kind}{form}}}", scalar(topic))
 }

@@ -10,7 +10,7 @@ const WISHES: Wishes<'static> = Wishes {
 };
 
 /// Returns a graph; the topics are (name, type, published).
-fn graph(space: u16, topics: &[(&str, &str, bool)]) -> Graph {
+fn graph(space: u16, topics: &[(&str, &str, bool)]) -> SurveyedGraph {
     let topic = |(name, kind, published): &(&str, &str, bool)| {
         let live = LiveTopic {
             types: BTreeSet::from([(*kind).to_owned()]),
@@ -19,7 +19,7 @@ fn graph(space: u16, topics: &[(&str, &str, bool)]) -> Graph {
         };
         ((*name).to_owned(), live)
     };
-    Graph {
+    SurveyedGraph {
         space: SpaceId::new(space).unwrap(),
         domain: (space > 1).then_some(space),
         live: LiveSpace {
@@ -29,15 +29,15 @@ fn graph(space: u16, topics: &[(&str, &str, bool)]) -> Graph {
     }
 }
 
-fn fresh(graphs: &[Graph]) -> String {
-    let mut plan = Plan::new(&[], graphs, &[], &WISHES, &mut Known::default());
+fn fresh(graphs: &[SurveyedGraph]) -> String {
+    let mut plan = Proposal::new(&[], graphs, &[], &WISHES, &mut OldMapping::default());
     written("", &[], &mut plan).unwrap()
 }
 
-fn merged(text: &str, graphs: &[Graph]) -> String {
+fn merged(text: &str, graphs: &[SurveyedGraph]) -> String {
     let mapping = mapping(text);
-    let mut known = Known::of(mapping.clone(), text);
-    let mut plan = Plan::new(&[], graphs, &[], &WISHES, &mut known);
+    let mut known = OldMapping::of(mapping.clone(), text);
+    let mut plan = Proposal::new(&[], graphs, &[], &WISHES, &mut known);
     added("", (text, &mapping), &mut plan).unwrap()
 }
 
@@ -235,7 +235,7 @@ fn what_is_executed_anywhere_becomes_calls_once() {
     let feedback = "/nav/count/_action/feedback";
     let kind = "example_interfaces/Fibonacci_FeedbackMessage";
     let ros2 = graph(2, &[(feedback, kind, true)]);
-    let server = |url: &str| Nodes {
+    let server = |url: &str| SurveyedNodes {
         place: url.to_owned(),
         server: Some(survey::UaServer {
             endpoint: url.to_owned(),
@@ -255,7 +255,7 @@ fn what_is_executed_anywhere_becomes_calls_once() {
     };
     let graphs = [ros1, ros2];
     let servers = ["opc.tcp://127.0.0.1:4840", "opc.tcp://plc:4840"].map(server);
-    let mut plan = Plan::new(&[], &graphs, &servers, &WISHES, &mut Known::default());
+    let mut plan = Proposal::new(&[], &graphs, &servers, &WISHES, &mut OldMapping::default());
     let text = written("", &[], &mut plan).unwrap();
     let found = mapping(&text);
     let calls: Vec<(String, &str)> = found
@@ -288,8 +288,8 @@ fn what_is_executed_anywhere_becomes_calls_once() {
     }
     let sum = Sum::of("x", &plan, true).counts();
     assert!(sum.contains("5 calls, 1 other as comments"), "{sum}");
-    let mut known = Known::of(found.clone(), &text);
-    let mut plan = Plan::new(&[], &graphs, &servers, &WISHES, &mut known);
+    let mut known = OldMapping::of(found.clone(), &text);
+    let mut plan = Proposal::new(&[], &graphs, &servers, &WISHES, &mut known);
     assert_eq!(added("", (&text, &found), &mut plan).unwrap(), text);
 }
 
@@ -326,7 +326,7 @@ fn calls_that_stand_before_the_variables_keep_both_apart() {
 }
 
 /// Returns a server with a numeric node id, a string node id, and a node named like a topic.
-fn plc(url: &str, is_cell: bool) -> Nodes {
+fn plc(url: &str, is_cell: bool) -> SurveyedNodes {
     let variable = |node: &str, name: &str| survey::UaVariable {
         node: node.parse().unwrap(),
         name: name.to_owned(),
@@ -334,7 +334,7 @@ fn plc(url: &str, is_cell: bool) -> Nodes {
         source: None,
         value: Some((uadp::BuiltinType::Boolean, false)),
     };
-    Nodes {
+    SurveyedNodes {
         place: url.to_owned(),
         server: Some(survey::UaServer {
             endpoint: url.to_owned(),
@@ -353,15 +353,19 @@ fn plc(url: &str, is_cell: bool) -> Nodes {
     }
 }
 
-fn of_servers(servers: &[Nodes], graphs: &[Graph], known: &mut Known) -> Plan {
-    Plan::new(&[], graphs, servers, &WISHES, known)
+fn of_servers(
+    servers: &[SurveyedNodes],
+    graphs: &[SurveyedGraph],
+    known: &mut OldMapping,
+) -> Proposal {
+    Proposal::new(&[], graphs, servers, &WISHES, known)
 }
 
 #[test]
 fn a_server_of_another_is_a_source_and_not_the_cells_own() {
     let graphs = [graph(1, &[("/line/lamp", "std_msgs/Bool", true)])];
     let servers = [plc("opc.tcp://192.168.0.5:4840", false)];
-    let mut plan = of_servers(&servers, &graphs, &mut Known::default());
+    let mut plan = of_servers(&servers, &graphs, &mut OldMapping::default());
     let text = written("", &[], &mut plan).unwrap();
     let found = mapping(&text);
     assert!(!text.contains("\nserver:"), "{text}");
@@ -400,7 +404,7 @@ fn a_server_of_another_is_a_source_and_not_the_cells_own() {
             text_of("nsu=urn:plc;s=Line.Lamp")
         )
     );
-    let mut known = Known::of(found.clone(), &text);
+    let mut known = OldMapping::of(found.clone(), &text);
     let mut plan = of_servers(&servers, &graphs, &mut known);
     assert_eq!(added("", (&text, &found), &mut plan).unwrap(), text);
 }
@@ -415,19 +419,19 @@ fn servers_of_one_make_are_told_apart_also_when_one_is_added_later() {
         from.map(|from| (from.server, from.node.to_string()))
             .collect()
     };
-    let mut plan = of_servers(&all, &[], &mut Known::default());
+    let mut plan = of_servers(&all, &[], &mut OldMapping::default());
     let both = written("", &[], &mut plan).unwrap();
     assert_eq!(sources(&both).len(), 6, "{both}");
-    let mut plan = of_servers(&all[..1], &[], &mut Known::default());
+    let mut plan = of_servers(&all[..1], &[], &mut OldMapping::default());
     let first = written("", &[], &mut plan).unwrap();
     let found = mapping(&first);
-    let mut known = Known::of(found.clone(), &first);
+    let mut known = OldMapping::of(found.clone(), &first);
     let mut plan = of_servers(&all, &[], &mut known);
     let later = added("", (&first, &found), &mut plan).unwrap();
     assert_eq!(sources(&later), sources(&both), "{later}");
     // A third run adds nothing.
     let found = mapping(&later);
-    let mut known = Known::of(found.clone(), &later);
+    let mut known = OldMapping::of(found.clone(), &later);
     let mut plan = of_servers(&all, &[], &mut known);
     assert_eq!(added("", (&later, &found), &mut plan).unwrap(), later);
 }
@@ -435,7 +439,7 @@ fn servers_of_one_make_are_told_apart_also_when_one_is_added_later() {
 #[test]
 fn the_cells_own_server_stays_the_cells_own() {
     let servers = [plc("opc.tcp://192.168.0.5:4842", true)];
-    let mut plan = of_servers(&servers, &[], &mut Known::default());
+    let mut plan = of_servers(&servers, &[], &mut OldMapping::default());
     let text = written("", &[], &mut plan).unwrap();
     assert!(
         text.contains("server:\n  endpoint: opc.tcp://192.168.0.5:4842\n"),
@@ -457,7 +461,7 @@ fn a_command_of_motion_is_proposed_with_what_ends_it() {
             ("/speed", "geometry_msgs/Twist", true),
         ],
     );
-    let mut plan = Plan::new(&[], &[robot], &[], &WISHES, &mut Known::default());
+    let mut plan = Proposal::new(&[], &[robot], &[], &WISHES, &mut OldMapping::default());
     let text = written("", &[], &mut plan).unwrap();
     assert_eq!(text.matches("  on_loss: zero\n").count(), 1, "{text}");
     let of_arm = text.split("name: Arm").nth(1).unwrap();
@@ -467,15 +471,15 @@ fn a_command_of_motion_is_proposed_with_what_ends_it() {
     assert_eq!(codes, [Code::EndlessMotion], "{}", checked.render(&text));
 }
 
-fn of_model(text: &str, model: &Model, graphs: &[Graph]) -> String {
+fn of_model(text: &str, model: &NodeModel, graphs: &[SurveyedGraph]) -> String {
     let models = std::slice::from_ref(model);
     if text.is_empty() {
-        let mut plan = Plan::new(models, graphs, &[], &WISHES, &mut Known::default());
+        let mut plan = Proposal::new(models, graphs, &[], &WISHES, &mut OldMapping::default());
         return written("", &[], &mut plan).unwrap();
     }
     let mapping = mapping(text);
-    let mut known = Known::of(mapping.clone(), text);
-    let mut plan = Plan::new(models, graphs, &[], &WISHES, &mut known);
+    let mut known = OldMapping::of(mapping.clone(), text);
+    let mut plan = Proposal::new(models, graphs, &[], &WISHES, &mut known);
     added("", (text, &mapping), &mut plan).unwrap()
 }
 

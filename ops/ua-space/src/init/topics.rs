@@ -1,11 +1,11 @@
 //! Selects the topics of a graph to leave out, and the bindings of the others.
 
-use messages::{Dialect, Leaf, Rank, Registry, TypeName};
+use messages::{ArrayRank, Dialect, Leaf, TypeName, TypeRegistry};
 use uadp::BuiltinType;
 
 /// The reason why a topic is left out; its text is the heading of a list of topics.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub(super) enum LeftOut {
+pub(super) enum OmittedTopic {
     Log,
     Time,
     Transforms,
@@ -16,7 +16,7 @@ pub(super) enum LeftOut {
     Untyped,
 }
 
-impl LeftOut {
+impl OmittedTopic {
     pub(super) const fn heading(self) -> &'static str {
         match self {
             Self::Log => "log, parameters and life cycle of nodes",
@@ -78,7 +78,7 @@ fn is_of_action(topic: &str, kind: &str) -> bool {
 
 /// The part of a message that is the value.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub(super) enum Form {
+pub(super) enum ValueForm {
     /// The path of the only field, and its type; `None` if the type is unknown here.
     Field(String, Option<(BuiltinType, bool)>),
     /// All fields.
@@ -87,9 +87,9 @@ pub(super) enum Form {
     Bytes,
 }
 
-impl Form {
+impl ValueForm {
     /// Returns the form in which a message of this type is bound.
-    pub(super) fn of(kind: &TypeName, registry: &Registry) -> Self {
+    pub(super) fn of(kind: &TypeName, registry: &TypeRegistry) -> Self {
         if BULKY.contains(&kind.as_str()) {
             return Self::Bytes;
         }
@@ -104,12 +104,12 @@ impl Form {
 }
 
 fn value_type(leaf: &Leaf) -> (BuiltinType, bool) {
-    (leaf.builtin, matches!(leaf.rank, Rank::Array { .. }))
+    (leaf.builtin, matches!(leaf.rank, ArrayRank::Array { .. }))
 }
 
 /// Returns the built-in definitions for ROS 1 or ROS 2.
-pub(super) fn registry(ros2: bool) -> Registry {
-    Registry::bundle(if ros2 { Dialect::Ros2 } else { Dialect::Ros1 })
+pub(super) fn registry(ros2: bool) -> TypeRegistry {
+    TypeRegistry::bundle(if ros2 { Dialect::Ros2 } else { Dialect::Ros1 })
 }
 
 /// Types with messages that are not useful field by field.
@@ -148,35 +148,39 @@ pub(super) fn normal(name: &str) -> String {
 mod tests {
     use super::*;
 
-    fn left_out(topic: &str, kind: &str) -> Option<LeftOut> {
-        LeftOut::of(topic, Some(&kind.parse().unwrap()), false)
+    fn left_out(topic: &str, kind: &str) -> Option<OmittedTopic> {
+        OmittedTopic::of(topic, Some(&kind.parse().unwrap()), false)
     }
 
     #[test]
     fn what_ros_is_run_with_is_left_out() {
         for (topic, kind, expected) in [
-            ("/rosout", "rosgraph_msgs/Log", LeftOut::Log),
-            ("/move/goal", "a/MoveActionGoal", LeftOut::Action),
-            ("/move/cancel", "actionlib_msgs/GoalID", LeftOut::Action),
+            ("/rosout", "rosgraph_msgs/Log", OmittedTopic::Log),
+            ("/move/goal", "a/MoveActionGoal", OmittedTopic::Action),
+            (
+                "/move/cancel",
+                "actionlib_msgs/GoalID",
+                OmittedTopic::Action,
+            ),
             (
                 "/move/_action/feedback",
                 "a/Move_FeedbackMessage",
-                LeftOut::Action,
+                OmittedTopic::Action,
             ),
-            ("/tf", "tf2_msgs/TFMessage", LeftOut::Transforms),
-            ("/ua_2_5_10", "std_msgs/Bool", LeftOut::InSpace),
-            ("/arm/_internal", "std_msgs/Bool", LeftOut::Hidden),
+            ("/tf", "tf2_msgs/TFMessage", OmittedTopic::Transforms),
+            ("/ua_2_5_10", "std_msgs/Bool", OmittedTopic::InSpace),
+            ("/arm/_internal", "std_msgs/Bool", OmittedTopic::Hidden),
             (
                 "/cam/parameter_updates",
                 "dynamic_reconfigure/Config",
-                LeftOut::Configuration,
+                OmittedTopic::Configuration,
             ),
         ] {
             assert_eq!(left_out(topic, kind), Some(expected), "{topic}");
         }
         assert_eq!(left_out("/goal", "geometry_msgs/PoseStamped"), None);
         assert_eq!(left_out("/joint_states", "sensor_msgs/JointState"), None);
-        assert_eq!(LeftOut::of("/tf", None, true), None);
+        assert_eq!(OmittedTopic::of("/tf", None, true), None);
     }
 
     #[test]

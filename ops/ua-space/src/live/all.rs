@@ -6,16 +6,16 @@ use std::io::{self, Write as _};
 use mappings::SpaceId;
 use serde::Serialize;
 
-use super::list::{self, FIRST_ASKED, Line, json, lines, origin};
-use super::text::{Table, is_coloured};
+use super::list::{self, FIRST_ASKED, ListRow, json, lines, origin};
+use super::text::{TextTable, is_coloured};
 use super::{Go, InGroup, Live, until};
-use crate::arguments::{Group, List, Look};
-use crate::discover::{Entry, Kind, around_and};
-use crate::exit::Failure;
+use crate::arguments::{DiscoverArguments, GroupArguments, ListArguments};
+use crate::discover::{DiscoveredEntry, DiscoveredKind, around_and};
+use crate::exit::CommandFailure;
 use crate::survey::look;
 
 /// Runs `ua-space list`.
-pub(crate) fn list(arguments: &List) -> Result<(), Failure> {
+pub(crate) fn list(arguments: &ListArguments) -> Result<(), CommandFailure> {
     if let Some(cells) = arguments.group.cell.as_deref()
         && cells.contains('+')
     {
@@ -26,7 +26,7 @@ pub(crate) fn list(arguments: &List) -> Result<(), Failure> {
         let elsewhere = elsewhere(arguments, &programs);
         for address in elsewhere {
             // The group that a bridge announced.
-            let group = Group {
+            let group = GroupArguments {
                 address: Some(format!("opc.udp://{address}")),
                 ..arguments.group.clone()
             };
@@ -37,21 +37,26 @@ pub(crate) fn list(arguments: &List) -> Result<(), Failure> {
 }
 
 /// Returns the discovered programs, and the contents of the group.
-async fn found(arguments: &List) -> Result<(Vec<Entry>, Vec<Live>), Failure> {
+async fn found(
+    arguments: &ListArguments,
+) -> Result<(Vec<DiscoveredEntry>, Vec<Live>), CommandFailure> {
     let hearing = heard(arguments, &arguments.group);
     if arguments.topics {
         return Ok((Vec::new(), vec![hearing.await?.1]));
     }
-    let look = Look {
+    let look = DiscoverArguments {
         seconds: arguments.seconds,
         group: arguments.group.clone(),
-        ..Look::default()
+        ..DiscoverArguments::default()
     };
     let (around, live) = around_and(&look, hearing).await?;
     Ok((around.entries, vec![live?]))
 }
 
-async fn heard(arguments: &List, group: &Group) -> Result<(InGroup, Live), Failure> {
+async fn heard(
+    arguments: &ListArguments,
+    group: &GroupArguments,
+) -> Result<(InGroup, Live), CommandFailure> {
     let mut live = Live::join(group)?;
     let end = until(live.now(), Some(arguments.seconds));
     if !arguments.topics {
@@ -67,7 +72,7 @@ async fn heard(arguments: &List, group: &Group) -> Result<(InGroup, Live), Failu
 }
 
 /// Returns the other groups that bridges announce, unless a group was given.
-fn elsewhere(arguments: &List, programs: &[Entry]) -> Vec<String> {
+fn elsewhere(arguments: &ListArguments, programs: &[DiscoveredEntry]) -> Vec<String> {
     if arguments.group.address.is_some() || arguments.group.broker.is_some() {
         return Vec::new();
     }
@@ -96,9 +101,9 @@ struct Space<'p> {
 #[derive(Serialize)]
 struct All<'a> {
     spaces: Vec<Space<'a>>,
-    bridges: Vec<crate::discover::Shown<'a>>,
-    servers: Vec<crate::discover::Shown<'a>>,
-    components: Vec<crate::discover::Shown<'a>>,
+    bridges: Vec<crate::discover::EntryJson<'a>>,
+    servers: Vec<crate::discover::EntryJson<'a>>,
+    components: Vec<crate::discover::EntryJson<'a>>,
     topics: Vec<Placed<'a>>,
 }
 
@@ -106,36 +111,44 @@ struct All<'a> {
 #[derive(Serialize)]
 struct Placed<'a> {
     #[serde(flatten)]
-    shown: list::Shown<'a>,
+    shown: list::ListJson<'a>,
     group: String,
 }
 
-fn tell(arguments: &List, programs: &[Entry], groups: &[Live]) -> Result<(), Failure> {
+fn tell(
+    arguments: &ListArguments,
+    programs: &[DiscoveredEntry],
+    groups: &[Live],
+) -> Result<(), CommandFailure> {
     let is_wanted = |space: SpaceId| arguments.space.is_none_or(|wanted| wanted == space);
-    let mut found: Vec<(String, Line<'_>)> = Vec::new();
+    let mut found: Vec<(String, ListRow<'_>)> = Vec::new();
     for live in groups {
         let group = live.group().to_string();
         let lines = lines(&live.book, live.now()).into_iter();
         let wanted = lines.filter(|line| is_wanted(line.topic.space));
         found.extend(wanted.map(|line| (group.clone(), line)));
     }
-    let wanted = |one: &&Entry| {
+    let wanted = |one: &&DiscoveredEntry| {
         arguments
             .space
             .is_none_or(|wanted| one.space == Some(wanted.into()))
     };
-    let programs: Vec<&Entry> = programs.iter().filter(wanted).collect();
+    let programs: Vec<&DiscoveredEntry> = programs.iter().filter(wanted).collect();
     let spaces = spaces(&programs, &found);
     let mut out = io::stdout().lock();
     if arguments.json {
-        let of = |kinds: &[Kind]| {
+        let of = |kinds: &[DiscoveredKind]| {
             let those = programs.iter().filter(|one| kinds.contains(&one.kind));
             those.map(|one| one.shown()).collect()
         };
         let all = All {
-            bridges: of(&[Kind::Bridge]),
-            servers: of(&[Kind::Lds, Kind::Cell, Kind::Server]),
-            components: of(&[Kind::Component]),
+            bridges: of(&[DiscoveredKind::Bridge]),
+            servers: of(&[
+                DiscoveredKind::Lds,
+                DiscoveredKind::Cell,
+                DiscoveredKind::Server,
+            ]),
+            components: of(&[DiscoveredKind::Component]),
             spaces,
             topics: found
                 .iter()
@@ -161,10 +174,10 @@ fn tell(arguments: &List, programs: &[Entry], groups: &[Live]) -> Result<(), Fai
 }
 
 fn print(
-    arguments: &List,
-    (spaces, programs, found): (&[Space<'_>], &[&Entry], &[(String, Line<'_>)]),
+    arguments: &ListArguments,
+    (spaces, programs, found): (&[Space<'_>], &[&DiscoveredEntry], &[(String, ListRow<'_>)]),
     out: &mut impl io::Write,
-) -> Result<(), Failure> {
+) -> Result<(), CommandFailure> {
     let bold = is_coloured();
     if !arguments.topics {
         if !spaces.is_empty() {
@@ -177,13 +190,13 @@ fn print(
         }
     }
     if !found.is_empty() {
-        let lines: Vec<&Line<'_>> = found.iter().map(|(_, line)| line).collect();
+        let lines: Vec<&ListRow<'_>> = found.iter().map(|(_, line)| line).collect();
         list::table(&lines).write(out, bold)?;
     }
     Ok(())
 }
 
-fn spaces<'p>(programs: &[&'p Entry], found: &[(String, Line<'_>)]) -> Vec<Space<'p>> {
+fn spaces<'p>(programs: &[&'p DiscoveredEntry], found: &[(String, ListRow<'_>)]) -> Vec<Space<'p>> {
     let mut spaces: BTreeMap<u8, Space<'p>> = BTreeMap::new();
     let known = programs.iter().filter_map(|one| SpaceId::new(one.space?));
     let all = found.iter().map(|(_, line)| line.topic.space).chain(known);
@@ -213,9 +226,9 @@ fn spaces<'p>(programs: &[&'p Entry], found: &[(String, Line<'_>)]) -> Vec<Space
     spaces.into_values().collect()
 }
 
-fn table_of_spaces(spaces: &[Space<'_>]) -> Table {
+fn table_of_spaces(spaces: &[Space<'_>]) -> TextTable {
     let head = ["SPACE", "ORIGIN", "TOPICS", "CALLS", "PROGRAMS"];
-    let mut table = Table::new(head.map(str::to_owned));
+    let mut table = TextTable::new(head.map(str::to_owned));
     for space in spaces {
         table.row([
             space.space.to_string(),
@@ -228,7 +241,7 @@ fn table_of_spaces(spaces: &[Space<'_>]) -> Table {
     table
 }
 
-fn table_of_programs(programs: &[&Entry]) -> Table {
+fn table_of_programs(programs: &[&DiscoveredEntry]) -> TextTable {
     let head = [
         "KIND",
         "NAME",
@@ -238,7 +251,7 @@ fn table_of_programs(programs: &[&Entry]) -> Table {
         "CAPABILITIES",
         "URI",
     ];
-    let mut table = Table::new(head.map(str::to_owned)).yielding([6, 5, 4, 2]);
+    let mut table = TextTable::new(head.map(str::to_owned)).yielding([6, 5, 4, 2]);
     for one in programs {
         let shown = one.shown();
         let space = one.space.map(|space| space.to_string());

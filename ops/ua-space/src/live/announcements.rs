@@ -3,21 +3,24 @@
 use std::collections::BTreeMap;
 
 use mappings::TopicId;
-use uadp::discovery::{Announced, Announcement};
+use uadp::discovery::{AnnouncedContent, Announcement};
 use uadp::{PublisherId, SecurityHeader};
 
 /// The newest announcement of each topic. The size of all is limited.
 #[derive(Debug, Default)]
-pub(super) struct Announcements {
+pub(super) struct LatestAnnouncements {
     topics: BTreeMap<TopicId, Vec<u8>>,
     weight: usize,
 }
 
-impl Announcements {
+impl LatestAnnouncements {
     /// Keeps the announcement of a topic without its security. The descriptions of calls are left
     /// out.
     pub(super) fn keep(&mut self, topic: TopicId, announcement: &Announcement<'_>) {
-        if !matches!(announcement.announced, Announced::DataSetMetaData { .. }) {
+        if !matches!(
+            announcement.announced,
+            AnnouncedContent::DataSetMetaData { .. }
+        ) {
             return;
         }
         let publisher = PublisherId::UInt16(topic.space.into());

@@ -1,10 +1,10 @@
 //! The application descriptions that programs announce.
 
-use uadp::discovery::{ApplicationDescription, List};
+use uadp::discovery::{ApplicationDescription, WireArray};
 
 /// The announced description of a program.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) struct Application {
+pub(crate) struct AnnouncedProgram {
     pub(crate) uri: String,
     pub(crate) product_uri: String,
     pub(crate) name: String,
@@ -13,18 +13,18 @@ pub(crate) struct Application {
     pub(crate) capabilities: Vec<String>,
 }
 
-impl Application {
+impl AnnouncedProgram {
     /// Reads a description; `None` if texts are too long or too many, or the ApplicationUri is
     /// missing.
     pub(super) fn read(
         description: &ApplicationDescription<'_>,
-        capabilities: List<'_, Option<&str>>,
+        capabilities: WireArray<'_, Option<&str>>,
     ) -> Option<Self> {
         let text = |text: Option<&str>| {
             let text = text.unwrap_or_default();
             (text.len() <= LONGEST).then(|| text.to_owned())
         };
-        let texts = |list: List<'_, Option<&str>>| -> Option<Vec<String>> {
+        let texts = |list: WireArray<'_, Option<&str>>| -> Option<Vec<String>> {
             list.iter().take(MOST_TEXTS).map(text).collect()
         };
         let uri = text(description.application_uri)?;

@@ -7,20 +7,20 @@ use std::time::Duration;
 use serde::Serialize;
 use uadp::MessageKind;
 
-use super::book::{Kind, News};
+use super::book::{DatagramContent, NameKind};
 use super::list::{json, unheard};
 use super::names::unknown;
-use super::{Ended, Go, in_group, until};
+use super::{Go, ListenEnd, in_group, until};
 use crate::arguments::Hz;
-use crate::exit::Failure;
+use crate::exit::CommandFailure;
 use crate::report::warn;
 
 /// Runs `ua-space bw`.
-pub(crate) fn bandwidth(arguments: &Hz) -> Result<(), Failure> {
+pub(crate) fn bandwidth(arguments: &Hz) -> Result<(), CommandFailure> {
     in_group(&arguments.group, async |mut live| {
         let end = until(live.now(), arguments.seconds);
         let seconds = arguments.seconds.unwrap_or_default();
-        let target = (&arguments.target, Some(Kind::Value));
+        let target = (&arguments.target, Some(NameKind::Value));
         let found = live.resolve(target, end, &mut |_, _| Go::On).await?;
         let Some(topic) = found else {
             return Err(unknown(&live, &arguments.target, seconds));
@@ -28,8 +28,8 @@ pub(crate) fn bandwidth(arguments: &Hz) -> Result<(), Failure> {
         let mut sizes: VecDeque<(Duration, usize)> = VecDeque::new();
         loop {
             let next = until(live.now(), Some(REPORT)).min(end);
-            let mut each = |news: News<'_>, now| {
-                if let News::Sample(sample) = news
+            let mut each = |news: DatagramContent<'_>, now| {
+                if let DatagramContent::Sample(sample) = news
                     && sample.topic == topic
                     && sample.message.kind != MessageKind::KeepAlive
                 {
@@ -41,13 +41,13 @@ pub(crate) fn bandwidth(arguments: &Hz) -> Result<(), Failure> {
                 Go::On
             };
             let ended = live.listen(next, &mut each).await?;
-            let last = ended == Ended::Interrupted || live.now() >= end;
+            let last = ended == ListenEnd::Interrupted || live.now() >= end;
             if let Some(load) = Load::of(&sizes) {
                 load.print(arguments.json)?;
             } else if !arguments.json && !last {
                 warn("no two values yet");
             }
-            if last && sizes.is_empty() && ended == Ended::Time {
+            if last && sizes.is_empty() && ended == ListenEnd::Time {
                 return Err(unheard(&live, topic, seconds));
             }
             if last {
@@ -90,7 +90,7 @@ impl Load {
         })
     }
 
-    fn print(&self, as_json: bool) -> Result<(), Failure> {
+    fn print(&self, as_json: bool) -> Result<(), CommandFailure> {
         let mut out = io::stdout().lock();
         if as_json {
             writeln!(out, "{}", json(self)?)?;

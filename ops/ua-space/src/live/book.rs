@@ -7,22 +7,22 @@ use std::time::Duration;
 
 use mappings::TopicId;
 use uadp::action::{ActionDialect, ActionKind, ActionMessage};
-use uadp::discovery::{Announced, Announcement};
+use uadp::discovery::{AnnouncedContent, Announcement};
 use uadp::{
     DataSetMessage, DateTime, DecodeError, FieldEncoding, MessageKind, NetworkHeader,
     NetworkMessage, NetworkMessageType, PublisherId, Reassembler, ReassemblyLimits, StatusCode,
     Timestamp,
 };
 
-use super::application::Application;
-use super::described::{Described, topic_of};
+use super::application::AnnouncedProgram;
+use super::described::{AnnouncedDescription, topic_of};
 
 /// All received topics, descriptions and applications. Any host in the group can send made-up
 /// topics, senders and announcements, so the table is bounded and counts the entries that it drops.
 pub(crate) struct Book {
-    topics: BTreeMap<TopicId, Heard>,
+    topics: BTreeMap<TopicId, TopicValues>,
     announced: BTreeMap<Subject, Announcing>,
-    applications: BTreeMap<(u16, SocketAddr), Application>,
+    applications: BTreeMap<(u16, SocketAddr), AnnouncedProgram>,
     /// The approximate size of all descriptions, in bytes.
     weight: usize,
     reassembler: Reassembler<SocketAddr>,
@@ -30,23 +30,23 @@ pub(crate) struct Book {
 }
 
 /// The subject of an announcement, and its sender.
-type Subject = (TopicId, Kind, SocketAddr);
+type Subject = (TopicId, NameKind, SocketAddr);
 
 /// The kind of item that is announced under a name of the space.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-pub(crate) enum Kind {
+pub(crate) enum NameKind {
     Value,
     Call,
 }
 
 struct Announcing {
-    described: Arc<Described>,
+    described: Arc<AnnouncedDescription>,
     first: Duration,
 }
 
 /// A topic with received values.
 #[derive(Debug, Clone)]
-pub(crate) struct Heard {
+pub(crate) struct TopicValues {
     /// Number of messages with values.
     pub(crate) values: u64,
     /// Number of keep-alive messages.
@@ -94,34 +94,34 @@ impl Drop {
 }
 
 /// The contents of a datagram.
-pub(crate) enum News<'a> {
+pub(crate) enum DatagramContent<'a> {
     /// A value, or a keep-alive message.
-    Sample(Sample<'a>),
+    Sample(ReceivedSample<'a>),
     /// A response of an Action, and its sender.
     Response(ActionMessage<'a>, SocketAddr),
     /// The new or changed announcement of a topic or call, and its sender.
     Announced {
         topic: TopicId,
-        kind: Kind,
-        described: &'a Arc<Described>,
+        kind: NameKind,
+        described: &'a Arc<AnnouncedDescription>,
         from: SocketAddr,
         announcement: &'a Announcement<'a>,
     },
 }
 
 /// A DataSetMessage of a topic.
-pub(crate) struct Sample<'a> {
+pub(crate) struct ReceivedSample<'a> {
     pub(crate) topic: TopicId,
     /// The address of the sender.
     pub(crate) from: SocketAddr,
     /// The description announced by the sender.
-    pub(crate) described: Option<Arc<Described>>,
+    pub(crate) described: Option<Arc<AnnouncedDescription>>,
     /// The header of its NetworkMessage.
     pub(crate) network: NetworkHeader<'a>,
     pub(crate) message: DataSetMessage<'a>,
 }
 
-impl Sample<'_> {
+impl ReceivedSample<'_> {
     /// Returns the time at which its writer took the value, in nanoseconds since 1970.
     pub(crate) fn taken(&self) -> Option<i128> {
         let header = self.message.header();
@@ -168,7 +168,7 @@ impl Book {
         &mut self,
         (message, from): (&NetworkMessage<'_>, SocketAddr),
         now: Duration,
-        each: &mut dyn FnMut(News<'_>),
+        each: &mut dyn FnMut(DatagramContent<'_>),
     ) {
         if message.message_type() == NetworkMessageType::Probe {
             return;
@@ -193,18 +193,18 @@ impl Book {
     }
 
     /// Returns the topics with received values or keep-alive messages.
-    pub(crate) fn topics(&self) -> impl Iterator<Item = (TopicId, &Heard)> {
+    pub(crate) fn topics(&self) -> impl Iterator<Item = (TopicId, &TopicValues)> {
         self.topics.iter().map(|(topic, heard)| (*topic, heard))
     }
 
-    pub(crate) fn heard(&self, topic: TopicId) -> Option<&Heard> {
+    pub(crate) fn heard(&self, topic: TopicId) -> Option<&TopicValues> {
         self.topics.get(&topic)
     }
 
     /// Returns the description of a topic that was announced by the sender of its values.
-    pub(crate) fn described(&self, topic: TopicId) -> Option<&Arc<Described>> {
+    pub(crate) fn described(&self, topic: TopicId) -> Option<&Arc<AnnouncedDescription>> {
         let from = self.topics.get(&topic)?.from;
-        let found = self.announced.get(&(topic, Kind::Value, from))?;
+        let found = self.announced.get(&(topic, NameKind::Value, from))?;
         Some(&found.described)
     }
 
@@ -212,7 +212,7 @@ impl Book {
     /// announce a topic, returns the first announcement.
     pub(crate) fn announced(
         &self,
-    ) -> impl Iterator<Item = (TopicId, Kind, &Arc<Described>, SocketAddr)> {
+    ) -> impl Iterator<Item = (TopicId, NameKind, &Arc<AnnouncedDescription>, SocketAddr)> {
         self.announced_where(|_| true)
     }
 
@@ -220,7 +220,7 @@ impl Book {
     pub(crate) fn announced_where(
         &self,
         counts: impl Fn(SocketAddr) -> bool,
-    ) -> impl Iterator<Item = (TopicId, Kind, &Arc<Described>, SocketAddr)> {
+    ) -> impl Iterator<Item = (TopicId, NameKind, &Arc<AnnouncedDescription>, SocketAddr)> {
         let all = self.announced.iter();
         let mut all: Vec<_> = all.filter(|((_, _, from), _)| counts(*from)).collect();
         all.sort_by_key(|((topic, kind, from), found)| (*topic, *kind, found.first, *from));
@@ -232,26 +232,30 @@ impl Book {
     /// Returns all announcements with their senders, in the order of topics.
     pub(crate) fn all_announced(
         &self,
-    ) -> impl Iterator<Item = (TopicId, Kind, &Arc<Described>, SocketAddr)> {
+    ) -> impl Iterator<Item = (TopicId, NameKind, &Arc<AnnouncedDescription>, SocketAddr)> {
         let all = self.announced.iter();
         all.map(|((topic, kind, from), found)| (*topic, *kind, &found.described, *from))
     }
 
     /// Returns the announced calls.
-    pub(crate) fn calls(&self) -> impl Iterator<Item = (TopicId, &Arc<Described>)> {
-        let calls = self.announced().filter(|(_, kind, ..)| *kind == Kind::Call);
+    pub(crate) fn calls(&self) -> impl Iterator<Item = (TopicId, &Arc<AnnouncedDescription>)> {
+        let calls = self
+            .announced()
+            .filter(|(_, kind, ..)| *kind == NameKind::Call);
         calls.map(|(topic, _, described, _)| (topic, described))
     }
 
     /// Returns the number of addresses that announce a call.
     pub(crate) fn announcers(&self, topic: TopicId) -> usize {
         let all = self.announced.keys();
-        all.filter(|(of, kind, _)| (*of, *kind) == (topic, Kind::Call))
+        all.filter(|(of, kind, _)| (*of, *kind) == (topic, NameKind::Call))
             .count()
     }
 
     /// Returns the announced applications, by space and address.
-    pub(crate) fn applications(&self) -> impl Iterator<Item = (&(u16, SocketAddr), &Application)> {
+    pub(crate) fn applications(
+        &self,
+    ) -> impl Iterator<Item = (&(u16, SocketAddr), &AnnouncedProgram)> {
         self.applications.iter()
     }
 
@@ -278,7 +282,7 @@ impl Book {
         message: &NetworkMessage<'_>,
         of: (u16, SocketAddr),
         now: Duration,
-        each: &mut dyn FnMut(News<'_>),
+        each: &mut dyn FnMut(DatagramContent<'_>),
     ) {
         let network = message.header();
         let namespace = network.group.and_then(|group| group.writer_group_id);
@@ -304,13 +308,13 @@ impl Book {
         (network, message): (NetworkHeader<'_>, DataSetMessage<'_>),
         from @ ((_, sender), _): ((u16, SocketAddr), u16),
         now: Duration,
-        each: &mut dyn FnMut(News<'_>),
+        each: &mut dyn FnMut(DatagramContent<'_>),
     ) {
         let Some(writer_id) = message.writer_id else {
             return self.count(Drop::NotInSpace);
         };
         if let Some(topic) = self.hear(writer_id, from, now, Some(&message)) {
-            each(News::Sample(Sample {
+            each(DatagramContent::Sample(ReceivedSample {
                 topic,
                 from: sender,
                 described: self.described(topic).cloned(),
@@ -336,7 +340,7 @@ impl Book {
             self.count(Drop::Topics);
             return None;
         }
-        let heard = self.topics.entry(topic).or_insert(Heard {
+        let heard = self.topics.entry(topic).or_insert(TopicValues {
             values: 0,
             keep_alives: 0,
             first: now,
@@ -372,7 +376,7 @@ impl Book {
         message: &NetworkMessage<'_>,
         of: (u16, SocketAddr),
         now: Duration,
-        each: &mut dyn FnMut(News<'_>),
+        each: &mut dyn FnMut(DatagramContent<'_>),
     ) {
         // The reassembled message borrows from the reassembler.
         let mut reassembler = std::mem::take(&mut self.reassembler);
@@ -414,7 +418,7 @@ impl Book {
     fn actions(
         &mut self,
         (message, from): (&NetworkMessage<'_>, SocketAddr),
-        each: &mut dyn FnMut(News<'_>),
+        each: &mut dyn FnMut(DatagramContent<'_>),
     ) {
         let Ok(actions) = message.actions(ActionDialect::Standard) else {
             return self.count(Drop::Malformed);
@@ -424,7 +428,7 @@ impl Book {
         }
         for action in actions {
             match action {
-                Ok(action) => each(News::Response(action, from)),
+                Ok(action) => each(DatagramContent::Response(action, from)),
                 Err(_) => self.count(Drop::Malformed),
             }
         }
@@ -435,32 +439,35 @@ impl Book {
         announcement: &Announcement<'_>,
         (space, from): (u16, SocketAddr),
         now: Duration,
-        each: &mut dyn FnMut(News<'_>),
+        each: &mut dyn FnMut(DatagramContent<'_>),
     ) {
-        if let Announced::ApplicationDescription {
+        if let AnnouncedContent::ApplicationDescription {
             description,
             capabilities,
         } = &announcement.announced
         {
-            return self.meet(Application::read(description, *capabilities), (space, from));
+            return self.meet(
+                AnnouncedProgram::read(description, *capabilities),
+                (space, from),
+            );
         }
         #[expect(
             clippy::wildcard_enum_match_arm,
             reason = "all else is not about a topic"
         )]
         let (writer_id, name, kind, described) = match &announcement.announced {
-            Announced::DataSetMetaData {
+            AnnouncedContent::DataSetMetaData {
                 writer_id,
                 meta_data,
                 status,
             } => {
                 let is_there = status.0 & BAD == 0;
-                let described = is_there.then(|| Described::of_value(meta_data));
-                (*writer_id, meta_data.name, Kind::Value, described)
+                let described = is_there.then(|| AnnouncedDescription::of_value(meta_data));
+                (*writer_id, meta_data.name, NameKind::Value, described)
             }
-            Announced::ActionMetaData(of) => {
-                let described = Some(Described::of_call(of));
-                (of.writer_id, of.request.name, Kind::Call, described)
+            AnnouncedContent::ActionMetaData(of) => {
+                let described = Some(AnnouncedDescription::of_call(of));
+                (of.writer_id, of.request.name, NameKind::Call, described)
             }
             _ => return,
         };
@@ -471,7 +478,7 @@ impl Book {
         match (topic, described) {
             (Some(topic), Some(Ok(described))) => {
                 if let Some(described) = self.keep((topic, kind, from), described, now) {
-                    each(News::Announced {
+                    each(DatagramContent::Announced {
                         topic,
                         kind,
                         described: &described,
@@ -482,8 +489,8 @@ impl Book {
             }
             // The publisher does not have the item, or has removed it.
             (Some(topic), None) => {
-                self.forget((topic, Kind::Value, from));
-                self.forget((topic, Kind::Call, from));
+                self.forget((topic, NameKind::Value, from));
+                self.forget((topic, NameKind::Call, from));
             }
             (None, None) => {}
             (_, Some(Err(_))) | (None, Some(Ok(_))) => self.count(Drop::Useless),
@@ -491,7 +498,7 @@ impl Book {
     }
 
     /// Stores the description of an application, unless the table is full.
-    fn meet(&mut self, application: Option<Application>, who: (u16, SocketAddr)) {
+    fn meet(&mut self, application: Option<AnnouncedProgram>, who: (u16, SocketAddr)) {
         let is_known = self.applications.contains_key(&who);
         match application {
             None => self.count(Drop::Useless),
@@ -506,9 +513,9 @@ impl Book {
     fn keep(
         &mut self,
         subject: Subject,
-        described: Described,
+        described: AnnouncedDescription,
         now: Duration,
-    ) -> Option<Arc<Described>> {
+    ) -> Option<Arc<AnnouncedDescription>> {
         let before = self.announced.get(&subject);
         if before.is_some_and(|before| *before.described == described) {
             return None;

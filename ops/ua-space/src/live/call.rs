@@ -14,50 +14,51 @@ use std::time::Duration;
 use mappings::TopicId;
 use serde::Serialize;
 use uadp::action::{
-    ActionAddress, ActionDialect, ActionFields, ActionMessage, ActionRequest, CallId, Heard,
-    Outcome, Requestor, RequestorSettings,
+    ActionAddress, ActionDialect, ActionFields, ActionMessage, ActionOutcome, ActionRequest,
+    CallId, Requestor, RequestorSettings, ResponseMeaning,
 };
 use uadp::{Extras, OwnedPublisherId, StatusCode};
 
-use self::executor::Executor;
-use super::book::{Kind, News};
-use super::described::{self, Described};
+use self::executor::AnnouncedExecutor;
+use super::book::{DatagramContent, NameKind};
+use super::described::{self, AnnouncedDescription};
 use super::list::json;
-use super::plain::{self, Named};
-use super::run::{End, Places, Run, Step};
+use super::plain::{self, NamedValues};
+use super::run::{FollowedRun, RunEnd, RunEvent, RunTopics};
 use super::text::harmless;
-use super::{Ended, Go, Live, in_group, parameters, until};
-use crate::arguments::{Call, Target};
-use crate::exit::Failure;
+use super::{Go, ListenEnd, Live, in_group, parameters, until};
+use crate::arguments::{CallArguments, NamedTarget};
+use crate::exit::CommandFailure;
 use crate::report::warn;
 use crate::status;
 
 /// Runs `ua-space call`.
-pub(crate) fn call(arguments: &Call) -> Result<(), Failure> {
+pub(crate) fn call(arguments: &CallArguments) -> Result<(), CommandFailure> {
     ask_for(arguments, true)
 }
 
 /// Calls without printing the response.
-pub(super) fn call_quietly(arguments: &Call) -> Result<(), Failure> {
+pub(super) fn call_quietly(arguments: &CallArguments) -> Result<(), CommandFailure> {
     ask_for(arguments, false)
 }
 
-fn ask_for(arguments: &Call, is_told: bool) -> Result<(), Failure> {
+fn ask_for(arguments: &CallArguments, is_told: bool) -> Result<(), CommandFailure> {
     in_group(&arguments.group, async |live| {
         let mut asking = Asking {
             live,
             requestor: requestor(),
-            executor: Executor::default(),
+            executor: AnnouncedExecutor::default(),
             arguments,
         };
         let (topic, described) = asking.find().await?;
-        if let Some(parts) = goal::Parts::of(topic, &described) {
+        if let Some(parts) = goal::ActionParts::of(topic, &described) {
             return Box::pin(asking.send_goal((topic, &described), parts)).await;
         }
-        let places = Places::of(topic, &described.name);
+        let places = RunTopics::of(topic, &described.name);
         let takes = described.call().map_or(&[][..], |call| &call.request);
-        let request = parameters::request(&arguments.parameters, takes)
-            .map_err(|wrong| Failure::Usage(format!("{}: {wrong}", called(topic, &described))))?;
+        let request = parameters::request(&arguments.parameters, takes).map_err(|wrong| {
+            CommandFailure::Usage(format!("{}: {wrong}", called(topic, &described)))
+        })?;
         let answer = asking
             .ask((topic, &described), &request, places.as_ref())
             .await?;
@@ -92,7 +93,7 @@ fn requestor() -> Requestor {
 }
 
 /// Returns the topic and name of a call for output.
-fn called(topic: TopicId, described: &Described) -> String {
+fn called(topic: TopicId, described: &AnnouncedDescription) -> String {
     match described.name.as_str() {
         "" => topic.to_string(),
         name => format!("{topic} {}", harmless(name)),
@@ -102,17 +103,17 @@ fn called(topic: TopicId, described: &Described) -> String {
 /// The response of a call.
 struct Answer {
     status: StatusCode,
-    fields: Named,
+    fields: NamedValues,
 }
 
 #[derive(Serialize)]
 #[serde(tag = "event", rename_all = "snake_case")]
-enum Shown<'a> {
+enum CallJson<'a> {
     Answer {
         topic: String,
         name: &'a str,
         status: u32,
-        fields: &'a Named,
+        fields: &'a NamedValues,
     },
 }
 
@@ -127,26 +128,26 @@ struct Asking<'a> {
     live: Live,
     requestor: Requestor,
     /// The sender that announced the call.
-    executor: Executor,
-    arguments: &'a Call,
+    executor: AnnouncedExecutor,
+    arguments: &'a CallArguments,
 }
 
 impl Asking<'_> {
     /// Waits until the call is announced.
-    async fn find(&mut self) -> Result<(TopicId, Arc<Described>), Failure> {
+    async fn find(&mut self) -> Result<(TopicId, Arc<AnnouncedDescription>), CommandFailure> {
         let end = until(self.live.now(), Some(self.arguments.wait));
-        let target = (&self.arguments.target, Some(Kind::Call));
-        let mut ignored = |_: News<'_>, _| Go::On;
+        let target = (&self.arguments.target, Some(NameKind::Call));
+        let mut ignored = |_: DatagramContent<'_>, _| Go::On;
         let topic = self.live.resolve(target, end, &mut ignored).await?;
         let Some(topic) = topic else {
             return Err(self.not_found());
         };
         let mut found = self.announced(topic);
         if found.is_none() {
-            let mut each = |news: News<'_>, _| match news {
-                News::Announced {
+            let mut each = |news: DatagramContent<'_>, _| match news {
+                DatagramContent::Announced {
                     topic: of,
-                    kind: Kind::Call,
+                    kind: NameKind::Call,
                     described,
                     from,
                     ..
@@ -154,16 +155,18 @@ impl Asking<'_> {
                     found = Some((Arc::clone(described), from));
                     Go::Enough
                 }
-                News::Announced { .. } | News::Sample(_) | News::Response(..) => Go::On,
+                DatagramContent::Announced { .. }
+                | DatagramContent::Sample(_)
+                | DatagramContent::Response(..) => Go::On,
             };
-            if self.live.listen(end, &mut each).await? == Ended::Interrupted {
-                return Err(Failure::Interrupted);
+            if self.live.listen(end, &mut each).await? == ListenEnd::Interrupted {
+                return Err(CommandFailure::Interrupted);
             }
         }
         let Some((described, from)) = found else {
             return Err(self.not_found());
         };
-        self.executor = Executor::at(from);
+        self.executor = AnnouncedExecutor::at(from);
         if self.live.book.announcers(topic) > 1 {
             warn(&format!(
                 "{topic} is announced from several addresses; the first one counts"
@@ -173,18 +176,18 @@ impl Asking<'_> {
     }
 
     /// Returns the description of an announced call, and the first sender that announced it.
-    fn announced(&self, topic: TopicId) -> Option<(Arc<Described>, SocketAddr)> {
+    fn announced(&self, topic: TopicId) -> Option<(Arc<AnnouncedDescription>, SocketAddr)> {
         let mut all = self.live.book.announced();
-        let found = all.find(|(of, kind, ..)| (*of, *kind) == (topic, Kind::Call));
+        let found = all.find(|(of, kind, ..)| (*of, *kind) == (topic, NameKind::Call));
         found.map(|(_, _, described, from)| (Arc::clone(described), from))
     }
 
-    fn not_found(&self) -> Failure {
+    fn not_found(&self) -> CommandFailure {
         let calls = self.live.book.calls();
         let calls = calls.map(|(topic, described)| called(topic, described));
         let calls: Vec<String> = calls.take(SHOWN).collect();
         let help = match (calls.as_slice(), &self.arguments.target) {
-            ([], Target::Topic(topic)) if self.live.book.heard(*topic).is_some() => {
+            ([], NamedTarget::Topic(topic)) if self.live.book.heard(*topic).is_some() => {
                 "values come under that name; it is no call".to_owned()
             }
             ([], _) => "no call was announced; is this the group and the interface (--address, --interface)?".to_owned(),
@@ -195,7 +198,7 @@ impl Asking<'_> {
             self.live.group(),
             self.arguments.wait,
         );
-        Failure::Unavailable(format!(
+        CommandFailure::Unavailable(format!(
             "nobody in {group} offers the call {target}, asked for {wait} s\n  = help: {help}"
         ))
     }
@@ -204,10 +207,10 @@ impl Asking<'_> {
     /// the response is still awaited.
     async fn ask(
         &mut self,
-        (topic, described): (TopicId, &Described),
+        (topic, described): (TopicId, &AnnouncedDescription),
         request: &[u8],
-        places: Option<&Places>,
-    ) -> Result<Answer, Failure> {
+        places: Option<&RunTopics>,
+    ) -> Result<Answer, CommandFailure> {
         let mut halts_at = places;
         let mut came = None;
         self.begin((topic, described), request, self.timeout())?;
@@ -216,22 +219,22 @@ impl Asking<'_> {
             match came.take() {
                 Some(Came::Answer(answer)) => return Ok(answer),
                 Some(Came::Refused(why)) => {
-                    return Err(Failure::Failed(format!(
+                    return Err(CommandFailure::Failed(format!(
                         "{}: {why}",
                         called(topic, described)
                     )));
                 }
                 Some(Came::Lost(why)) => {
-                    return Err(Failure::Unavailable(format!(
+                    return Err(CommandFailure::Unavailable(format!(
                         "{}: {why}; whether it was executed is not known",
                         called(topic, described)
                     )));
                 }
                 None => {}
             }
-            if ended == Ended::Interrupted {
+            if ended == ListenEnd::Interrupted {
                 let Some(places) = halts_at.take() else {
-                    return Err(Failure::Interrupted);
+                    return Err(CommandFailure::Interrupted);
                 };
                 self.halt(places)?;
             }
@@ -245,10 +248,10 @@ impl Asking<'_> {
 
     fn begin(
         &mut self,
-        (topic, described): (TopicId, &Described),
+        (topic, described): (TopicId, &AnnouncedDescription),
         request: &[u8],
         timeout: Duration,
-    ) -> Result<CallId, Failure> {
+    ) -> Result<CallId, CommandFailure> {
         let (space, namespace, writer_id) = topic.triple();
         let targets = described.call().map_or(&[][..], |call| &call.targets);
         let request = ActionRequest {
@@ -263,18 +266,18 @@ impl Asking<'_> {
             timeout,
         };
         let begun = self.requestor.call(request, self.live.now());
-        begun.map_err(|error| Failure::Usage(format!("{topic}: {error}")))
+        begun.map_err(|error| CommandFailure::Usage(format!("{topic}: {error}")))
     }
 
     /// Calls Halt. Its response is ignored, because the followed run shows the effect.
-    fn halt(&mut self, places: &Places) -> Result<(), Failure> {
+    fn halt(&mut self, places: &RunTopics) -> Result<(), CommandFailure> {
         warn("interrupted: calling Halt (once more to leave at once)");
-        let halt = Described {
+        let halt = AnnouncedDescription {
             name: String::new(),
             description: String::new(),
             ros_topics: Vec::new(),
             command: false,
-            what: described::What::Value(Vec::new()),
+            what: described::DescribedKind::Value(Vec::new()),
         };
         self.begin((places.halt, &halt), &[0, 0], self.timeout())
             .map(drop)
@@ -284,10 +287,10 @@ impl Asking<'_> {
     /// reached.
     async fn turn(
         &mut self,
-        described: &Described,
+        described: &AnnouncedDescription,
         until: Duration,
         came: &mut Option<Came>,
-    ) -> Result<Ended, Failure> {
+    ) -> Result<ListenEnd, CommandFailure> {
         self.transmit()?;
         let Self {
             live,
@@ -297,8 +300,8 @@ impl Asking<'_> {
         } = self;
         let next = requestor.poll_timeout().unwrap_or(until).min(until);
         let ended = {
-            let mut each = |news: News<'_>, now| {
-                if let News::Response(response, from) = &news
+            let mut each = |news: DatagramContent<'_>, now| {
+                if let DatagramContent::Response(response, from) = &news
                     && executor.answers(requestor, (response, *from))
                 {
                     *came = hear(requestor, response, (described, now));
@@ -316,7 +319,7 @@ impl Asking<'_> {
         Ok(ended)
     }
 
-    fn transmit(&mut self) -> Result<(), Failure> {
+    fn transmit(&mut self) -> Result<(), CommandFailure> {
         let now = self.live.now();
         while let Some(request) = self.requestor.poll_transmit(now) {
             let mut datagram = Vec::new();
@@ -324,7 +327,7 @@ impl Asking<'_> {
             let encoded = request.encode(&mut datagram, &header, &Extras::default());
             encoded
                 .and_then(uadp::action::ActionEncoder::finish)
-                .map_err(|error| Failure::Usage(format!("cannot be asked for: {error}")))?;
+                .map_err(|error| CommandFailure::Usage(format!("cannot be asked for: {error}")))?;
             self.live.send(&datagram);
         }
         Ok(())
@@ -332,12 +335,12 @@ impl Asking<'_> {
 
     fn tell_answer(
         &self,
-        (topic, described): (TopicId, &Described),
+        (topic, described): (TopicId, &AnnouncedDescription),
         answer: &Answer,
-    ) -> Result<(), Failure> {
+    ) -> Result<(), CommandFailure> {
         let mut out = io::stdout().lock();
         if self.arguments.json {
-            let shown = Shown::Answer {
+            let shown = CallJson::Answer {
                 topic: topic.to_string(),
                 name: &described.name,
                 status: answer.status.0,
@@ -352,7 +355,7 @@ impl Asking<'_> {
     }
 
     /// Prints a JSON object, or the lines for people.
-    fn tell(&self, what: &impl Serialize, lines: &str) -> Result<(), Failure> {
+    fn tell(&self, what: &impl Serialize, lines: &str) -> Result<(), CommandFailure> {
         let mut out = io::stdout().lock();
         if self.arguments.json {
             writeln!(out, "{}", json(what)?)?
@@ -366,8 +369,8 @@ impl Asking<'_> {
     }
 
     /// Follows a run to its end.
-    async fn follow(&mut self, places: &Places, number: u64) -> Result<(), Failure> {
-        let mut run = Run::new(number, self.live.now());
+    async fn follow(&mut self, places: &RunTopics, number: u64) -> Result<(), CommandFailure> {
+        let mut run = FollowedRun::new(number, self.live.now());
         let mut halted = false;
         let limit = until(self.live.now(), self.arguments.run_timeout);
         let end = loop {
@@ -383,9 +386,9 @@ impl Asking<'_> {
             if is_over {
                 warn("the time for the run is over");
             }
-            if ended == Ended::Interrupted || is_over {
+            if ended == ListenEnd::Interrupted || is_over {
                 if halted {
-                    return Err(Failure::Interrupted);
+                    return Err(CommandFailure::Interrupted);
                 }
                 halted = true;
                 self.halt(places)?;
@@ -393,27 +396,29 @@ impl Asking<'_> {
         };
         self.acknowledge().await?;
         let unknown = |why| {
-            Err(Failure::Unavailable(format!(
+            Err(CommandFailure::Unavailable(format!(
                 "run {number}: {why}; how it ended is not known"
             )))
         };
         match end {
-            End::Succeeded => Ok(()),
-            End::Failed => Err(Failure::Failed(format!("run {number} did not succeed"))),
-            End::Overtaken => unknown("another one began"),
-            End::NoResult => unknown("it ended and no result came"),
-            End::Silent => unknown("nothing was heard of the component"),
-            End::NoSuchRun => unknown("the component publishes the state of other runs only"),
+            RunEnd::Succeeded => Ok(()),
+            RunEnd::Failed => Err(CommandFailure::Failed(format!(
+                "run {number} did not succeed"
+            ))),
+            RunEnd::Overtaken => unknown("another one began"),
+            RunEnd::NoResult => unknown("it ended and no result came"),
+            RunEnd::Silent => unknown("nothing was heard of the component"),
+            RunEnd::NoSuchRun => unknown("the component publishes the state of other runs only"),
         }
     }
 
     /// Listens for a moment to the values of the run.
     async fn hear_run(
         &mut self,
-        places: &Places,
-        run: &mut Run,
-        steps: &mut Vec<Step>,
-    ) -> Result<Ended, Failure> {
+        places: &RunTopics,
+        run: &mut FollowedRun,
+        steps: &mut Vec<RunEvent>,
+    ) -> Result<ListenEnd, CommandFailure> {
         self.transmit()?;
         let Self {
             live,
@@ -424,15 +429,15 @@ impl Asking<'_> {
         let next = requestor.poll_timeout().unwrap_or(Duration::MAX);
         let next = next.min(live.now() + LOOK);
         let mut undescribed = None;
-        let mut each = |news: News<'_>, now| {
+        let mut each = |news: DatagramContent<'_>, now| {
             match &news {
-                News::Response(response, from) => {
+                DatagramContent::Response(response, from) => {
                     // Acknowledgements, and the response of Halt.
                     if executor.answers(requestor, (response, *from)) {
                         let _heard = requestor.handle_response(response, now).is_ok();
                     }
                 }
-                News::Sample(sample)
+                DatagramContent::Sample(sample)
                     if places.has(sample.topic) && executor.publishes(sample.from) =>
                 {
                     let described = sample.described.as_deref();
@@ -444,7 +449,7 @@ impl Asking<'_> {
                         steps.extend(run.handle(places, (sample.topic, &value), now));
                     }
                 }
-                News::Sample(_) | News::Announced { .. } => {}
+                DatagramContent::Sample(_) | DatagramContent::Announced { .. } => {}
             }
             if steps.is_empty() { Go::On } else { Go::Enough }
         };
@@ -459,18 +464,18 @@ impl Asking<'_> {
     }
 
     /// Lets the Responder release the request, within a short time limit.
-    async fn acknowledge(&mut self) -> Result<(), Failure> {
+    async fn acknowledge(&mut self) -> Result<(), CommandFailure> {
         let end = self.live.now() + ACKNOWLEDGE;
         while self.requestor.open_calls() > 0 && self.live.now() < end {
             let mut came = None;
-            let none = Described {
+            let none = AnnouncedDescription {
                 name: String::new(),
                 description: String::new(),
                 ros_topics: Vec::new(),
                 command: false,
-                what: described::What::Value(Vec::new()),
+                what: described::DescribedKind::Value(Vec::new()),
             };
-            if self.turn(&none, end, &mut came).await? == Ended::Interrupted {
+            if self.turn(&none, end, &mut came).await? == ListenEnd::Interrupted {
                 break;
             }
         }
@@ -482,23 +487,28 @@ impl Asking<'_> {
 fn hear(
     requestor: &mut Requestor,
     response: &ActionMessage<'_>,
-    (described, now): (&Described, Duration),
+    (described, now): (&AnnouncedDescription, Duration),
 ) -> Option<Came> {
-    let Ok(Heard::Done(_, outcome)) = requestor.handle_response(response, now) else {
+    let Ok(ResponseMeaning::Done(_, outcome)) = requestor.handle_response(response, now) else {
         return None;
     };
     Some(match outcome {
-        Outcome::Answered { status, fields } => match plain::response(fields, described.fields()) {
-            Ok(fields) => Came::Answer(Answer { status, fields }),
-            Err(error) => Came::Lost(format!("an answer that cannot be read: {error}")),
-        },
-        Outcome::Refused(why) => Came::Refused(format!("refused: {why}")),
-        Outcome::Unknown(why) => Came::Lost(why.to_string()),
+        ActionOutcome::Answered { status, fields } => {
+            match plain::response(fields, described.fields()) {
+                Ok(fields) => Came::Answer(Answer { status, fields }),
+                Err(error) => Came::Lost(format!("an answer that cannot be read: {error}")),
+            }
+        }
+        ActionOutcome::Refused(why) => Came::Refused(format!("refused: {why}")),
+        ActionOutcome::Unknown(why) => Came::Lost(why.to_string()),
     })
 }
 
 /// Returns an error if the response reports a failure.
-fn refused((topic, described): (TopicId, &Described), answer: &Answer) -> Result<(), Failure> {
+fn refused(
+    (topic, described): (TopicId, &AnnouncedDescription),
+    answer: &Answer,
+) -> Result<(), CommandFailure> {
     let bad = answer.status.0 & BAD != 0;
     let no = answer
         .fields
@@ -525,7 +535,7 @@ fn refused((topic, described): (TopicId, &Described), answer: &Answer) -> Result
         String::new()
     };
     let name = called(topic, described);
-    Err(Failure::Failed(format!(
+    Err(CommandFailure::Failed(format!(
         "{name}: {}{}",
         harmless(&why),
         harmless(&help).replace("\\u{a}", "\n")

@@ -12,33 +12,33 @@ use uadp::discovery::ConnectionState;
 
 use super::carrier::{self, NO_BROKER};
 use super::list::json;
-use super::text::{Table, is_coloured};
-use crate::arguments::List;
-use crate::exit::Failure;
+use super::text::{TextTable, is_coloured};
+use crate::arguments::ListArguments;
+use crate::exit::CommandFailure;
 use crate::report::warn;
 use crate::survey::look;
 
 /// Lists the cells whose prefixes match.
-pub(super) fn list(arguments: &List, prefixes: &str) -> Result<(), Failure> {
+pub(super) fn list(arguments: &ListArguments, prefixes: &str) -> Result<(), CommandFailure> {
     // Each `+` is a level of its own.
     let example = prefixes.split('/').map(|level| match level {
         "+" => "any",
         other => other,
     });
     if !Broker::is_prefix(&example.collect::<Vec<_>>().join("/")) {
-        return Err(Failure::Usage(format!(
+        return Err(CommandFailure::Usage(format!(
             "--cell {prefixes}: not the prefixes of cells; for example plant/+"
         )));
     }
     look(async {
         let broker = carrier::broker(&arguments.group)?;
-        let broker = broker.ok_or_else(|| Failure::Usage(NO_BROKER.to_owned()))?;
+        let broker = broker.ok_or_else(|| CommandFailure::Usage(NO_BROKER.to_owned()))?;
         let mut watch = CellWatch::open(&broker, prefixes)
-            .map_err(|error| Failure::Usage(format!("MQTT: {error}")))?;
+            .map_err(|error| CommandFailure::Usage(format!("MQTT: {error}")))?;
         let known = listen(&mut watch, arguments.seconds).await;
         if known.is_empty() {
             let address = &broker.address;
-            return Err(Failure::Unavailable(match watch.lost() {
+            return Err(CommandFailure::Unavailable(match watch.lost() {
                 Some(why) => format!("waiting for broker {address}: {why}"),
                 None => format!("no cell with the prefix {prefixes} reports a status at {address}"),
             }));
@@ -67,7 +67,10 @@ async fn listen(watch: &mut CellWatch, seconds: f64) -> BTreeMap<(String, u16), 
     }
 }
 
-fn tell(arguments: &List, known: BTreeMap<(String, u16), CellStatus>) -> Result<(), Failure> {
+fn tell(
+    arguments: &ListArguments,
+    known: BTreeMap<(String, u16), CellStatus>,
+) -> Result<(), CommandFailure> {
     let is_wanted = |publisher: u16| {
         let wanted = arguments.space.map(|space| u16::from(space.get()));
         wanted.is_none_or(|wanted| wanted == publisher)
@@ -94,7 +97,7 @@ fn tell(arguments: &List, known: BTreeMap<(String, u16), CellStatus>) -> Result<
         writeln!(out, "{}", json(&ShownCells { cells })?)?;
         return Ok(());
     }
-    let mut table = Table::new(["CELL", "SPACE", "STATE"].map(str::to_owned));
+    let mut table = TextTable::new(["CELL", "SPACE", "STATE"].map(str::to_owned));
     for ShownCell { cell, programs } in &cells {
         for ShownStatus { space, state } in programs {
             table.row([cell.clone(), space.to_string(), (*state).to_owned()]);

@@ -6,18 +6,18 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use bridge_core::decode_fields;
-use bridge_node::{Definitions, Environment, TypePaths};
+use bridge_node::{Definitions, RosEnvironment, TypePaths};
 use mappings::{SpaceId, TopicId};
-use messages::{Dialect, Leaf, MessageType, Plan, Rank, Selection, TypeName, Wire};
+use messages::{ArrayRank, Dialect, Leaf, MessagePlan, MessageType, Selection, TypeName, Wire};
 use serde_json::{Map, Value, json};
 use uadp::{BuiltinType, DataSetMessage, MessageKind, Scalar, Variant};
 
-use super::described::{Described, Field, What};
+use super::described::{AnnouncedDescription, AnnouncedField, DescribedKind};
 use super::plain;
-use super::robot::{self, Model};
+use super::robot::{self, RobotModelMessage};
 
 /// The channels of all topics with values. A topic with a new description gets a new channel.
-pub(super) struct Channels {
+pub(super) struct TopicChannels {
     topics: BTreeMap<TopicId, Slot>,
     /// The names of the channels, and the topics that use them. Models of robots have no topic.
     names: BTreeMap<String, Option<TopicId>>,
@@ -33,12 +33,12 @@ struct Slot {
     /// The time of the first value without a description.
     first: Duration,
     /// All channels of the topic; the one that was used last is at the end.
-    made: Vec<Arc<Channel>>,
+    made: Vec<Arc<TopicChannel>>,
 }
 
 /// The values of a topic in one form.
 #[derive(Debug)]
-pub(super) struct Channel {
+pub(super) struct TopicChannel {
     /// From 1 on.
     pub(super) id: u16,
     /// The ROS topic, or the name of the value, or the topic of the space.
@@ -52,13 +52,13 @@ pub(super) struct Channel {
     /// Further information for users.
     pub(super) metadata: BTreeMap<String, String>,
     form: Form,
-    described: Option<Arc<Described>>,
+    described: Option<Arc<AnnouncedDescription>>,
 }
 
 #[derive(Debug)]
 enum Form {
     /// The fields form a ROS message.
-    Ros(Box<Plan>),
+    Ros(Box<MessagePlan>),
     /// The only field is the ROS message as on the wire.
     Bytes,
     Json,
@@ -66,7 +66,7 @@ enum Form {
 
 /// The reason why a value is not in its channel.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-pub(super) enum Unfit {
+pub(super) enum ChannelMismatch {
     /// The writer is asked for the description.
     Undescribed,
     /// The number of channels is limited, of all topics and of each topic.
@@ -75,7 +75,7 @@ pub(super) enum Unfit {
     Mismatch,
 }
 
-impl Unfit {
+impl ChannelMismatch {
     /// Returns the text for output.
     pub(super) const fn label(self) -> &'static str {
         match self {
@@ -86,12 +86,12 @@ impl Unfit {
     }
 }
 
-impl Channels {
+impl TopicChannels {
     /// Creates the channels with the definitions of ROS types of this host.
     pub(super) fn new() -> Self {
         let definitions = |dialect| {
             let none = Arc::new(TypePaths::default());
-            Definitions::new(dialect, none, Environment::from_env())
+            Definitions::new(dialect, none, RosEnvironment::from_env())
         };
         Self {
             topics: BTreeMap::new(),
@@ -107,13 +107,13 @@ impl Channels {
     /// without a description gets a channel only some time after the first value of its topic.
     ///
     /// # Errors
-    /// [`Unfit`] if there is no channel.
+    /// [`ChannelMismatch`] if there is no channel.
     pub(super) fn channel(
         &mut self,
         topic: TopicId,
-        described: Option<&Arc<Described>>,
+        described: Option<&Arc<AnnouncedDescription>>,
         now: Duration,
-    ) -> Result<Arc<Channel>, Unfit> {
+    ) -> Result<Arc<TopicChannel>, ChannelMismatch> {
         let slot = self.topics.entry(topic).or_insert_with(|| Slot {
             first: now,
             made: Vec::new(),
@@ -122,12 +122,12 @@ impl Channels {
             return Ok(channel);
         }
         if described.is_none() && now < slot.first + DESCRIBED_WITHIN {
-            return Err(Unfit::Undescribed);
+            return Err(ChannelMismatch::Undescribed);
         }
         if slot.made.len() >= MOST_OF_TOPIC {
-            return Err(Unfit::Channels);
+            return Err(ChannelMismatch::Channels);
         }
-        let id = self.last.checked_add(1).ok_or(Unfit::Channels)?;
+        let id = self.last.checked_add(1).ok_or(ChannelMismatch::Channels)?;
         self.last = id;
         let channel = Arc::new(self.make(id, topic, described));
         if let Some(slot) = self.topics.get_mut(&topic) {
@@ -139,13 +139,19 @@ impl Channels {
     /// Makes the channel of the model of a robot.
     ///
     /// # Errors
-    /// [`Unfit`] if there is no channel, or the type of its message is not known.
-    pub(super) fn of_model(&mut self, model: &Model) -> Result<Arc<Channel>, Unfit> {
-        let name: TypeName = robot::TYPE.parse().map_err(|_| Unfit::Mismatch)?;
-        let message = self.ros2.find(&name).map_err(|_| Unfit::Mismatch)?;
-        self.last = self.last.checked_add(1).ok_or(Unfit::Channels)?;
+    /// [`ChannelMismatch`] if there is no channel, or the type of its message is not known.
+    pub(super) fn of_model(
+        &mut self,
+        model: &RobotModelMessage,
+    ) -> Result<Arc<TopicChannel>, ChannelMismatch> {
+        let name: TypeName = robot::TYPE.parse().map_err(|_| ChannelMismatch::Mismatch)?;
+        let message = self
+            .ros2
+            .find(&name)
+            .map_err(|_| ChannelMismatch::Mismatch)?;
+        self.last = self.last.checked_add(1).ok_or(ChannelMismatch::Channels)?;
         self.names.insert(model.topic.clone(), None);
-        Ok(Arc::new(Channel {
+        Ok(Arc::new(TopicChannel {
             id: self.last,
             name: model.topic.clone(),
             encoding: "cdr",
@@ -164,7 +170,12 @@ impl Channels {
         &self.unknown
     }
 
-    fn make(&mut self, id: u16, topic: TopicId, described: Option<&Arc<Described>>) -> Channel {
+    fn make(
+        &mut self,
+        id: u16,
+        topic: TopicId,
+        described: Option<&Arc<AnnouncedDescription>>,
+    ) -> TopicChannel {
         let ros = described.and_then(|described| self.ros(topic, described));
         let mut metadata = BTreeMap::from([
             ("topic".to_owned(), topic.to_string()),
@@ -182,7 +193,7 @@ impl Channels {
                     true => ("ros1", "ros1msg", message.name().to_string()),
                     false => ("cdr", "ros2msg", message.name().ros2()),
                 };
-                Channel {
+                TopicChannel {
                     id,
                     name,
                     encoding,
@@ -194,7 +205,7 @@ impl Channels {
                     described,
                 }
             }
-            None => Channel {
+            None => TopicChannel {
                 id,
                 name,
                 encoding: "json",
@@ -209,7 +220,7 @@ impl Channels {
     }
 
     /// Returns the ROS message of a value; `None` if its definition is not known.
-    fn ros(&mut self, topic: TopicId, described: &Described) -> Option<Ros> {
+    fn ros(&mut self, topic: TopicId, described: &AnnouncedDescription) -> Option<Ros> {
         let name: TypeName = described.ros_type()?.parse().ok()?;
         let bytes = described.is_bytes();
         let found = match bytes && topic.space == SpaceId::ROS1 {
@@ -233,7 +244,12 @@ impl Channels {
 
     /// Returns a name that no other topic uses. A part of a message does not have the name of its
     /// ROS topic.
-    fn name(&mut self, topic: TopicId, described: Option<&Described>, is_ros: bool) -> String {
+    fn name(
+        &mut self,
+        topic: TopicId,
+        described: Option<&AnnouncedDescription>,
+        is_ros: bool,
+    ) -> String {
         let id = topic.to_string();
         let own = topic.space.get();
         let ros = described.filter(|_| is_ros).and_then(|described| {
@@ -262,8 +278,11 @@ impl Channels {
 impl Slot {
     /// Returns the channel of a value with this description. A value without a description is in
     /// the channel that was used last.
-    fn fitting(&mut self, described: Option<&Arc<Described>>) -> Option<Arc<Channel>> {
-        let fits = |channel: &Arc<Channel>| is_same(channel.described.as_ref(), described);
+    fn fitting(
+        &mut self,
+        described: Option<&Arc<AnnouncedDescription>>,
+    ) -> Option<Arc<TopicChannel>> {
+        let fits = |channel: &Arc<TopicChannel>| is_same(channel.described.as_ref(), described);
         let at = self.made.iter().rposition(fits)?;
         let channel = self.made.remove(at);
         self.made.push(Arc::clone(&channel));
@@ -276,7 +295,7 @@ struct Ros {
     form: Form,
 }
 
-impl Channel {
+impl TopicChannel {
     /// Returns whether the channel has values with a description.
     pub(super) const fn is_described(&self) -> bool {
         self.described.is_some()
@@ -285,17 +304,17 @@ impl Channel {
     /// Appends the message of a value to `out`.
     ///
     /// # Errors
-    /// [`Unfit::Mismatch`]; `out` is then unchanged.
+    /// [`ChannelMismatch::Mismatch`]; `out` is then unchanged.
     pub(super) fn encode(
         &self,
         message: &DataSetMessage<'_>,
         out: &mut Vec<u8>,
-    ) -> Result<(), Unfit> {
-        let unfit = |_| Unfit::Mismatch;
+    ) -> Result<(), ChannelMismatch> {
+        let unfit = |_| ChannelMismatch::Mismatch;
         match &self.form {
             Form::Ros(plan) => {
                 let fields = message.fields().map_err(unfit)?;
-                decode_fields(plan, fields, out).map_err(|_| Unfit::Mismatch)
+                decode_fields(plan, fields, out).map_err(|_| ChannelMismatch::Mismatch)
             }
             Form::Bytes => {
                 let mut fields = message.fields().map_err(unfit)?;
@@ -304,7 +323,7 @@ impl Channel {
                         out.extend_from_slice(bytes);
                         Ok(())
                     }
-                    _ => Err(Unfit::Mismatch),
+                    _ => Err(ChannelMismatch::Mismatch),
                 }
             }
             Form::Json => {
@@ -313,7 +332,7 @@ impl Channel {
                 if message.kind == MessageKind::DeltaFrame {
                     named.0.insert(0, (DELTA.to_owned(), json!(true)));
                 }
-                serde_json::to_writer(out, &named).map_err(|_| Unfit::Mismatch)
+                serde_json::to_writer(out, &named).map_err(|_| ChannelMismatch::Mismatch)
             }
         }
     }
@@ -326,7 +345,10 @@ pub(super) fn is_value(message: &DataSetMessage<'_>) -> bool {
 }
 
 /// Returns whether a channel of the first description fits a value with the second.
-fn is_same(known: Option<&Arc<Described>>, described: Option<&Arc<Described>>) -> bool {
+fn is_same(
+    known: Option<&Arc<AnnouncedDescription>>,
+    described: Option<&Arc<AnnouncedDescription>>,
+) -> bool {
     match (known, described) {
         (_, None) => true,
         (None, Some(_)) => false,
@@ -338,10 +360,10 @@ fn is_same(known: Option<&Arc<Described>>, described: Option<&Arc<Described>>) -
 pub(crate) fn ros_plan(
     message: &Arc<MessageType>,
     name: &TypeName,
-    described: &Described,
-) -> Option<Plan> {
+    described: &AnnouncedDescription,
+) -> Option<MessagePlan> {
     let fields = described.fields().iter().map(leaf);
-    let of_writer = bridge_core::Described {
+    let of_writer = bridge_core::TopicMetaData {
         message_type: name.clone(),
         bytes: false,
         name: String::new(),
@@ -349,13 +371,13 @@ pub(crate) fn ros_plan(
         fields: fields.collect::<Option<_>>()?,
     };
     let selection: Selection = of_writer.selection(message)?;
-    Plan::compile(message, &selection, Wire::Cdr).ok()
+    MessagePlan::compile(message, &selection, Wire::Cdr).ok()
 }
 
-fn leaf(field: &Field) -> Option<Leaf> {
+fn leaf(field: &AnnouncedField) -> Option<Leaf> {
     let rank = match field.rank {
-        -1 => Rank::Scalar,
-        1 => Rank::Array {
+        -1 => ArrayRank::Scalar,
+        1 => ArrayRank::Array {
             fixed: field.dimensions.first().copied().filter(|size| *size > 0),
         },
         _ => return None,
@@ -368,10 +390,10 @@ fn leaf(field: &Field) -> Option<Leaf> {
 }
 
 /// Returns the JSON Schema of a value.
-fn schema(described: Option<&Described>) -> Value {
+fn schema(described: Option<&AnnouncedDescription>) -> Value {
     let mut properties = Map::new();
-    if let Some(Described {
-        what: What::Value(fields),
+    if let Some(AnnouncedDescription {
+        what: DescribedKind::Value(fields),
         ..
     }) = described
     {
@@ -386,7 +408,7 @@ fn schema(described: Option<&Described>) -> Value {
     })
 }
 
-fn schema_of(field: &Field) -> Value {
+fn schema_of(field: &AnnouncedField) -> Value {
     let one = match field.builtin.map(kind) {
         Some(kind) if !field.is_array() => json!({"type": kind}),
         Some(kind) => json!({"type": "array", "items": {"type": kind}}),

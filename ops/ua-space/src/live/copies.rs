@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use mappings::TopicId;
 
-use super::book::Sample;
+use super::book::ReceivedSample;
 
 /// The last value of each topic.
 #[derive(Debug, Default)]
@@ -34,7 +34,7 @@ struct Last {
 impl Copies {
     /// Returns whether a value arrived before, a short time ago. A state that is repeated for late
     /// joiners is no copy, because a viewer may be one of them.
-    pub(super) fn is_copy(&mut self, sample: &Sample<'_>, now: Duration) -> bool {
+    pub(super) fn is_copy(&mut self, sample: &ReceivedSample<'_>, now: Duration) -> bool {
         sample.taken().is_some_and(|taken| {
             let identity = Identity {
                 from: sample.from,

@@ -8,15 +8,15 @@ use mappings::TopicId;
 use serde::Serialize;
 use uadp::discovery::{
     ActionMetaData, DataSetMetaDataType, DataTypeSchemaHeader, EUInformation, FieldMetaData, Range,
-    Settings as _,
+    SettingsStructure as _,
 };
 use uadp::{BuiltinType, Scalar, Variant};
 
-use super::structure::Structure;
+use super::structure::StructureFields;
 
 /// The announced description of a topic or call.
 #[derive(Debug, Clone, PartialEq)]
-pub(crate) struct Described {
+pub(crate) struct AnnouncedDescription {
     /// The display name of the DataSet or Action; may be empty.
     pub(crate) name: String,
     /// The description by the writer.
@@ -25,29 +25,29 @@ pub(crate) struct Described {
     pub(crate) ros_topics: Vec<(u8, String)>,
     /// Whether the writer says that the value acts where it arrives.
     pub(crate) command: bool,
-    pub(crate) what: What,
+    pub(crate) what: DescribedKind,
 }
 
 #[derive(Debug, Clone, PartialEq)]
-pub(crate) enum What {
-    Value(Vec<Field>),
-    Call(Call),
+pub(crate) enum DescribedKind {
+    Value(Vec<AnnouncedField>),
+    Call(DescribedCall),
 }
 
 /// The request and response of a call, and its targets.
 #[derive(Debug, Clone, PartialEq)]
-pub(crate) struct Call {
-    pub(crate) request: Vec<Field>,
-    pub(crate) response: Vec<Field>,
+pub(crate) struct DescribedCall {
+    pub(crate) request: Vec<AnnouncedField>,
+    pub(crate) response: Vec<AnnouncedField>,
     /// ActionTargetIds; never empty.
     pub(crate) targets: Vec<u16>,
     /// The parts of the action, for a call that sends goals.
-    pub(crate) action: Option<Action>,
+    pub(crate) action: Option<DescribedAction>,
 }
 
 /// The DataSetWriterIds of an action besides the id of its goals.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) struct Action {
+pub(crate) struct DescribedAction {
     pub(crate) cancel: u16,
     pub(crate) result: u16,
     pub(crate) feedback: u16,
@@ -55,7 +55,7 @@ pub(crate) struct Action {
 
 /// A field of a DataSet.
 #[derive(Debug, Clone, PartialEq)]
-pub(crate) struct Field {
+pub(crate) struct AnnouncedField {
     pub(crate) name: String,
     /// `None` for an id that is not a builtin type.
     pub(crate) builtin: Option<BuiltinType>,
@@ -67,16 +67,16 @@ pub(crate) struct Field {
     pub(crate) max_string_length: u32,
     /// The description for people.
     pub(crate) description: String,
-    pub(crate) meaning: Meaning,
+    pub(crate) meaning: FieldMeaning,
     /// True if a request may leave the field out.
     pub(crate) optional: bool,
     /// The fields of the messages in this field.
-    pub(crate) structure: Option<Structure>,
+    pub(crate) structure: Option<StructureFields>,
 }
 
 /// The meaning of a field, as far as it is announced.
 #[derive(Debug, Clone, Default, PartialEq)]
-pub(crate) struct Meaning {
+pub(crate) struct FieldMeaning {
     /// The symbol of the unit; may be empty.
     pub(crate) unit: String,
     /// The lowest and the highest value.
@@ -103,7 +103,7 @@ pub(crate) struct ShownField<'a> {
     default: Option<&'a str>,
 }
 
-impl Described {
+impl AnnouncedDescription {
     /// Reads the description of a DataSet.
     ///
     /// # Errors
@@ -114,7 +114,7 @@ impl Described {
             description: bounded(meta_data.description.text, "the description")?,
             ros_topics: ros_topics(meta_data),
             command: is_command(meta_data),
-            what: What::Value(fields(meta_data)?),
+            what: DescribedKind::Value(fields(meta_data)?),
         })
     }
 
@@ -133,7 +133,7 @@ impl Described {
             description: bounded(meta_data.request.description.text, "the description")?,
             ros_topics: ros_topics(&meta_data.request),
             command: false,
-            what: What::Call(Call {
+            what: DescribedKind::Call(DescribedCall {
                 request: fields(&meta_data.request)?,
                 response: fields(&meta_data.response)?,
                 targets,
@@ -150,17 +150,17 @@ impl Described {
     }
 
     /// Returns the fields of the values, or of the response of the call.
-    pub(crate) fn fields(&self) -> &[Field] {
+    pub(crate) fn fields(&self) -> &[AnnouncedField] {
         match &self.what {
-            What::Value(fields) => fields,
-            What::Call(call) => &call.response,
+            DescribedKind::Value(fields) => fields,
+            DescribedKind::Call(call) => &call.response,
         }
     }
 
-    pub(crate) fn call(&self) -> Option<&Call> {
+    pub(crate) fn call(&self) -> Option<&DescribedCall> {
         match &self.what {
-            What::Value(_) => None,
-            What::Call(call) => Some(call),
+            DescribedKind::Value(_) => None,
+            DescribedKind::Call(call) => Some(call),
         }
     }
 
@@ -189,28 +189,32 @@ impl Described {
     /// Returns the request and response, or the type, in one line.
     pub(crate) fn summary(&self) -> String {
         match &self.what {
-            What::Value(fields) => match (self.ros_type(), fields.as_slice()) {
+            DescribedKind::Value(fields) => match (self.ros_type(), fields.as_slice()) {
                 (Some(name), _) => name.to_owned(),
                 (None, [one]) => one.kind(),
                 (None, []) => "-".to_owned(),
                 (None, many) => format!("{} fields", many.len()),
             },
-            What::Call(call) => format!("({}) -> ({})", list(&call.request), list(&call.response)),
+            DescribedKind::Call(call) => {
+                format!("({}) -> ({})", list(&call.request), list(&call.response))
+            }
         }
     }
 
     /// Returns the approximate size in bytes.
     pub(crate) fn weight(&self) -> usize {
-        let of = |fields: &[Field]| -> usize {
+        let of = |fields: &[AnnouncedField]| -> usize {
             let texts = fields.iter().map(|field| {
-                let structure = field.structure.as_ref().map_or(0, Structure::weight);
+                let structure = field.structure.as_ref().map_or(0, StructureFields::weight);
                 field.name.len() + field.description.len() + field.dimensions.len() * 4 + structure
             });
             texts.sum::<usize>() + size_of_val(fields)
         };
         let what = match &self.what {
-            What::Value(fields) => of(fields),
-            What::Call(call) => of(&call.request) + of(&call.response) + call.targets.len() * 2,
+            DescribedKind::Value(fields) => of(fields),
+            DescribedKind::Call(call) => {
+                of(&call.request) + of(&call.response) + call.targets.len() * 2
+            }
         };
         let ros = self.ros_topics.iter();
         let ros: usize = ros
@@ -220,7 +224,7 @@ impl Described {
     }
 }
 
-impl Field {
+impl AnnouncedField {
     /// Returns the type of the field, as `Double[6]`.
     pub(crate) fn kind(&self) -> String {
         let name = self.builtin.map_or("?", BuiltinType::name);
@@ -236,7 +240,7 @@ impl Field {
 
     /// Returns unit, range and default in words; empty if none is announced.
     pub(crate) fn meaning(&self) -> String {
-        let Meaning {
+        let FieldMeaning {
             unit,
             range,
             default,
@@ -263,7 +267,7 @@ impl Field {
             dimensions: size.into_iter().collect(),
             max_string_length: 0,
             description: String::new(),
-            meaning: Meaning::default(),
+            meaning: FieldMeaning::default(),
             optional: false,
             structure: None,
         }
@@ -288,7 +292,7 @@ impl Field {
 
 /// Returns a list of fields, as `TargetPosition: Double[6], [MaxVelocity: Double]`, with optional
 /// fields in brackets.
-pub(crate) fn list(fields: &[Field]) -> String {
+pub(crate) fn list(fields: &[AnnouncedField]) -> String {
     let each = fields.iter().map(|field| {
         let text = format!("{}: {}", field.name, field.kind());
         if field.optional {
@@ -311,7 +315,7 @@ fn called(name: Option<&str>) -> Result<String, &'static str> {
     bounded(rest.map(|(_, rest)| rest), "the name")
 }
 
-fn fields(meta_data: &DataSetMetaDataType<'_>) -> Result<Vec<Field>, &'static str> {
+fn fields(meta_data: &DataSetMetaDataType<'_>) -> Result<Vec<AnnouncedField>, &'static str> {
     if meta_data.fields.len() > MOST_FIELDS {
         return Err("too many fields");
     }
@@ -326,14 +330,14 @@ fn read(
     field: &FieldMetaData<'_>,
     schema: &DataTypeSchemaHeader<'_>,
     room: &mut usize,
-) -> Result<Field, &'static str> {
+) -> Result<AnnouncedField, &'static str> {
     if field.array_dimensions.len() > MOST_DIMENSIONS {
         return Err("too many dimensions");
     }
     let builtin = field.builtin_type();
     let is_structure = builtin == Some(BuiltinType::ExtensionObject);
-    let structure = is_structure.then(|| Structure::of(schema, field.data_type, room));
-    Ok(Field {
+    let structure = is_structure.then(|| StructureFields::of(schema, field.data_type, room));
+    Ok(AnnouncedField {
         name: bounded(field.name, "the name of a field")?,
         builtin,
         structure: structure.flatten(),
@@ -347,8 +351,8 @@ fn read(
 }
 
 /// Reads unit, range and default of a field, as far as they are well formed.
-fn meaning(field: &FieldMetaData<'_>) -> Meaning {
-    let mut meaning = Meaning::default();
+fn meaning(field: &FieldMetaData<'_>) -> FieldMeaning {
+    let mut meaning = FieldMeaning::default();
     for property in field.properties.iter().take(MOST_PROPERTIES) {
         match (property.key.name, property.value) {
             (Some("EngineeringUnits"), Variant::Scalar(Scalar::ExtensionObject(object))) => {
@@ -406,7 +410,7 @@ fn has_true(field: &FieldMetaData<'_>, name: &str) -> bool {
 }
 
 /// Reads the parts of an action from the first field of a request that sends goals.
-fn action(request: &DataSetMetaDataType<'_>) -> Option<Action> {
+fn action(request: &DataSetMetaDataType<'_>) -> Option<DescribedAction> {
     let first = request.fields.get(0)?;
     let mut properties = first.properties.iter().take(MOST_PROPERTIES);
     let family = properties.find(|property| property.key.name == Some(ACTION_FAMILY))?;
@@ -420,7 +424,7 @@ fn action(request: &DataSetMetaDataType<'_>) -> Option<Action> {
         (number != 0).then_some(number)
     });
     let mut next = || numbers.next().flatten();
-    Some(Action {
+    Some(DescribedAction {
         cancel: next()?,
         result: next()?,
         feedback: next()?,
@@ -458,13 +462,13 @@ const MOST_TARGETS: usize = 64;
 mod tests {
     use super::*;
 
-    fn described(description: &str) -> Described {
-        Described {
+    fn described(description: &str) -> AnnouncedDescription {
+        AnnouncedDescription {
             name: "gripper.Grasp.State".to_owned(),
             description: description.to_owned(),
             ros_topics: Vec::new(),
             command: false,
-            what: What::Value(Vec::new()),
+            what: DescribedKind::Value(Vec::new()),
         }
     }
 
@@ -483,10 +487,10 @@ mod tests {
 
     #[test]
     fn a_field_is_called_by_its_type_and_sizes() {
-        let field = |rank, dimensions: &[u32]| Field {
+        let field = |rank, dimensions: &[u32]| AnnouncedField {
             rank,
             dimensions: dimensions.to_vec(),
-            ..Field::plain("TargetPosition", BuiltinType::Double, None)
+            ..AnnouncedField::plain("TargetPosition", BuiltinType::Double, None)
         };
         assert_eq!(field(-1, &[]).kind(), "Double");
         assert_eq!(field(1, &[6]).kind(), "Double[6]");

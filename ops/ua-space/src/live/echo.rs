@@ -8,20 +8,20 @@ use mappings::TopicId;
 use serde::Serialize;
 use uadp::{DecodeError, MessageKind};
 
-use super::book::{Kind, News, Sample};
-use super::described::Described;
+use super::book::{DatagramContent, NameKind, ReceivedSample};
+use super::described::AnnouncedDescription;
 use super::list::{json, unheard};
 use super::names::unknown;
-use super::plain::{self, Named};
+use super::plain::{self, NamedValues};
 use super::text::harmless;
-use super::{Ended, Go, Live, in_group, until};
-use crate::arguments::{Echo, Hz};
-use crate::exit::Failure;
+use super::{Go, ListenEnd, Live, in_group, until};
+use crate::arguments::{EchoArguments, Hz};
+use crate::exit::CommandFailure;
 use crate::iso_time;
 use crate::report::warn;
 
 /// Runs `ua-space echo`.
-pub(crate) fn echo(arguments: &Echo) -> Result<(), Failure> {
+pub(crate) fn echo(arguments: &EchoArguments) -> Result<(), CommandFailure> {
     in_group(&arguments.group, async |mut live| {
         let end = until(live.now(), arguments.seconds);
         let (topic, early) = found(&mut live, arguments, end).await?;
@@ -38,13 +38,13 @@ pub(crate) fn echo(arguments: &Echo) -> Result<(), Failure> {
         let named = until(live.now(), Some(NAMED_WITHIN));
         let mut ended = echo.listen(&mut live, named.min(end)).await?;
         echo.print_waiting(live.book.described(topic).map(AsRef::as_ref))?;
-        if ended == Ended::Time && named < end && !echo.is_enough() {
+        if ended == ListenEnd::Time && named < end && !echo.is_enough() {
             ended = echo.listen(&mut live, end).await?;
         }
         live.tell_dropped();
         match (echo.shown, ended) {
-            (0, Ended::Time) => Err(echo.nothing(&live)),
-            (_, Ended::Time | Ended::Enough | Ended::Interrupted) => Ok(()),
+            (0, ListenEnd::Time) => Err(echo.nothing(&live)),
+            (_, ListenEnd::Time | ListenEnd::Enough | ListenEnd::Interrupted) => Ok(()),
         }
     })
 }
@@ -52,12 +52,12 @@ pub(crate) fn echo(arguments: &Echo) -> Result<(), Failure> {
 /// Returns the topic, and its values that came before the topic of a name was known.
 async fn found(
     live: &mut Live,
-    arguments: &Echo,
+    arguments: &EchoArguments,
     end: Duration,
-) -> Result<(TopicId, Vec<Raw>), Failure> {
+) -> Result<(TopicId, Vec<Raw>), CommandFailure> {
     let mut early: VecDeque<(TopicId, Raw)> = VecDeque::new();
-    let mut each = |news: News<'_>, _| {
-        if let News::Sample(sample) = news
+    let mut each = |news: DatagramContent<'_>, _| {
+        if let DatagramContent::Sample(sample) = news
             && let Ok(Some(raw)) = Raw::of(&sample)
         {
             if early.len() >= MOST_EARLY {
@@ -67,7 +67,7 @@ async fn found(
         }
         Go::On
     };
-    let target = (&arguments.target, Some(Kind::Value));
+    let target = (&arguments.target, Some(NameKind::Value));
     let Some(topic) = live.resolve(target, end, &mut each).await? else {
         let seconds = arguments.seconds.unwrap_or_default();
         return Err(unknown(live, &arguments.target, seconds));
@@ -77,7 +77,7 @@ async fn found(
 }
 
 struct Printing<'a> {
-    arguments: &'a Echo,
+    arguments: &'a EchoArguments,
     topic: TopicId,
     shown: u64,
     /// Values that wait for names; `None` once waiting has ended.
@@ -91,13 +91,13 @@ struct Printing<'a> {
 struct Raw {
     /// The announced name of the topic.
     name: Option<String>,
-    shown: Named,
+    shown: NamedValues,
     has_names: bool,
     at: Option<String>,
     kind: MessageKind,
 }
 
-fn first_name(described: &Described) -> Option<String> {
+fn first_name(described: &AnnouncedDescription) -> Option<String> {
     described.names().next().map(str::to_owned)
 }
 
@@ -106,7 +106,7 @@ impl Raw {
     ///
     /// # Errors
     /// [`DecodeError`] if its values cannot be read.
-    fn of(sample: &Sample<'_>) -> Result<Option<Self>, DecodeError> {
+    fn of(sample: &ReceivedSample<'_>) -> Result<Option<Self>, DecodeError> {
         if sample.message.kind == MessageKind::KeepAlive {
             return Ok(None);
         }
@@ -125,7 +125,7 @@ impl Raw {
 }
 
 #[derive(Serialize)]
-struct Shown<'a> {
+struct EchoJson<'a> {
     topic: String,
     #[serde(skip_serializing_if = "Option::is_none")]
     name: Option<&'a str>,
@@ -133,7 +133,7 @@ struct Shown<'a> {
     time: Option<&'a str>,
     #[serde(skip_serializing_if = "Option::is_none")]
     kind: Option<&'static str>,
-    value: &'a Named,
+    value: &'a NamedValues,
 }
 
 impl Printing<'_> {
@@ -144,13 +144,17 @@ impl Printing<'_> {
         }
     }
 
-    async fn listen(&mut self, live: &mut Live, end: Duration) -> Result<Ended, Failure> {
+    async fn listen(
+        &mut self,
+        live: &mut Live,
+        end: Duration,
+    ) -> Result<ListenEnd, CommandFailure> {
         if self.is_enough() && self.waiting.is_none() {
-            return Ok(Ended::Enough);
+            return Ok(ListenEnd::Enough);
         }
         let mut fault = None;
-        let mut each = |news: News<'_>, _| {
-            let News::Sample(sample) = news else {
+        let mut each = |news: DatagramContent<'_>, _| {
+            let DatagramContent::Sample(sample) = news else {
                 return Go::On;
             };
             if sample.topic != self.topic {
@@ -175,7 +179,7 @@ impl Printing<'_> {
         most.is_some_and(|most| self.shown.saturating_add(waiting) >= most)
     }
 
-    fn take(&mut self, sample: &Sample<'_>) -> Result<Go, Failure> {
+    fn take(&mut self, sample: &ReceivedSample<'_>) -> Result<Go, CommandFailure> {
         let described = sample.described.as_deref();
         let raw = match Raw::of(sample) {
             Ok(Some(raw)) => raw,
@@ -210,7 +214,10 @@ impl Printing<'_> {
     }
 
     /// Shows the waiting values by name, or by number if the names are unknown.
-    fn print_waiting(&mut self, described: Option<&Described>) -> Result<(), Failure> {
+    fn print_waiting(
+        &mut self,
+        described: Option<&AnnouncedDescription>,
+    ) -> Result<(), CommandFailure> {
         let waiting = self.waiting.take().unwrap_or_default();
         for mut raw in waiting {
             if let Some(described) = described {
@@ -230,7 +237,7 @@ impl Printing<'_> {
         Ok(())
     }
 
-    fn print(&mut self, raw: &Raw) -> Result<(), Failure> {
+    fn print(&mut self, raw: &Raw) -> Result<(), CommandFailure> {
         self.shown += 1;
         let mut out = io::stdout().lock();
         let kind = match raw.kind {
@@ -239,7 +246,7 @@ impl Printing<'_> {
             MessageKind::KeyFrame | MessageKind::KeepAlive => None,
         };
         if self.arguments.json {
-            let shown = Shown {
+            let shown = EchoJson {
                 topic: self.topic.to_string(),
                 name: raw.name.as_deref(),
                 time: raw.at.as_deref(),
@@ -258,12 +265,14 @@ impl Printing<'_> {
         Ok(())
     }
 
-    fn nothing(&self, live: &Live) -> Failure {
+    fn nothing(&self, live: &Live) -> CommandFailure {
         let topic = self.topic;
         let secured = live.book.heard(topic).is_some_and(|heard| heard.secured);
         match &self.unread {
-            Some(why) => Failure::Data(format!("{topic}: nothing that came can be read: {why}")),
-            None if secured => Failure::Data(format!(
+            Some(why) => {
+                CommandFailure::Data(format!("{topic}: nothing that came can be read: {why}"))
+            }
+            None if secured => CommandFailure::Data(format!(
                 "{topic} is secured, and cannot be read without its keys"
             )),
             None => unheard(live, topic, self.arguments.seconds.unwrap_or_default()),
@@ -272,11 +281,11 @@ impl Printing<'_> {
 }
 
 /// Runs `ua-space hz`.
-pub(crate) fn hz(arguments: &Hz) -> Result<(), Failure> {
+pub(crate) fn hz(arguments: &Hz) -> Result<(), CommandFailure> {
     in_group(&arguments.group, async |mut live| {
         let end = until(live.now(), arguments.seconds);
         let seconds = arguments.seconds.unwrap_or_default();
-        let target = (&arguments.target, Some(Kind::Value));
+        let target = (&arguments.target, Some(NameKind::Value));
         let found = live.resolve(target, end, &mut |_, _| Go::On).await?;
         let Some(topic) = found else {
             return Err(unknown(&live, &arguments.target, seconds));
@@ -285,8 +294,8 @@ pub(crate) fn hz(arguments: &Hz) -> Result<(), Failure> {
         let mut all = 0_u64;
         loop {
             let next = until(live.now(), Some(REPORT)).min(end);
-            let mut each = |news: News<'_>, now| {
-                if let News::Sample(sample) = news
+            let mut each = |news: DatagramContent<'_>, now| {
+                if let DatagramContent::Sample(sample) = news
                     && sample.topic == topic
                     && sample.message.kind != MessageKind::KeepAlive
                 {
@@ -299,13 +308,13 @@ pub(crate) fn hz(arguments: &Hz) -> Result<(), Failure> {
                 Go::On
             };
             let ended = live.listen(next, &mut each).await?;
-            let last = ended == Ended::Interrupted || live.now() >= end;
+            let last = ended == ListenEnd::Interrupted || live.now() >= end;
             if let Some(rhythm) = Rhythm::of(&times, all) {
                 rhythm.print(arguments)?;
             } else if !arguments.json && !last {
                 warn("no two values yet");
             }
-            if last && all == 0 && ended == Ended::Time {
+            if last && all == 0 && ended == ListenEnd::Time {
                 return Err(unheard(&live, topic, seconds));
             }
             if last {
@@ -352,7 +361,7 @@ impl Rhythm {
         })
     }
 
-    fn print(&self, arguments: &Hz) -> Result<(), Failure> {
+    fn print(&self, arguments: &Hz) -> Result<(), CommandFailure> {
         let mut out = io::stdout().lock();
         if arguments.json {
             writeln!(out, "{}", json(self)?)?;

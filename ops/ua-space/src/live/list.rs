@@ -8,20 +8,20 @@ use mappings::{SpaceId, TopicId};
 use serde::Serialize;
 use uadp::StatusCode;
 
-use super::book::{Book, Heard, Kind, News};
-use super::described::{Described, Field, ShownField, What};
+use super::book::{Book, DatagramContent, NameKind, TopicValues};
+use super::described::{AnnouncedDescription, AnnouncedField, DescribedKind, ShownField};
 use super::names::unknown;
-use super::text::{Table, age, harmless, wrapped};
+use super::text::{TextTable, age, harmless, wrapped};
 use super::{Go, Live, in_group, until};
-use crate::arguments::Info;
-use crate::exit::Failure;
+use crate::arguments::InfoArguments;
+use crate::exit::CommandFailure;
 use crate::status;
 
 /// Runs `ua-space info`.
-pub(crate) fn info(arguments: &Info) -> Result<(), Failure> {
+pub(crate) fn info(arguments: &InfoArguments) -> Result<(), CommandFailure> {
     in_group(&arguments.group, async |mut live| {
         let end = until(live.now(), Some(arguments.seconds));
-        let mut ignored = |_: News<'_>, _| Go::On;
+        let mut ignored = |_: DatagramContent<'_>, _| Go::On;
         let target = (&arguments.target, None);
         let Some(topic) = live.resolve(target, end, &mut ignored).await? else {
             return Err(unknown(&live, &arguments.target, arguments.seconds));
@@ -42,7 +42,7 @@ pub(crate) fn info(arguments: &Info) -> Result<(), Failure> {
 }
 
 /// Returns the failure for a topic that was not received.
-pub(super) fn unheard(live: &Live, topic: TopicId, seconds: f64) -> Failure {
+pub(super) fn unheard(live: &Live, topic: TopicId, seconds: f64) -> CommandFailure {
     let group = live.group();
     let heard = live.book.topics().count();
     let announced = live.book.announced();
@@ -55,20 +55,21 @@ pub(super) fn unheard(live: &Live, topic: TopicId, seconds: f64) -> Failure {
         1 => "one other topic was heard; `ua-space list` shows it".to_owned(),
         many => format!("{many} other topics were heard; `ua-space list` shows them"),
     };
-    Failure::Unavailable(format!("{what}\n  = help: {help}"))
+    CommandFailure::Unavailable(format!("{what}\n  = help: {help}"))
 }
 
 /// Returns JSON without characters that control a terminal.
-pub(crate) fn json(shown: &impl Serialize) -> Result<String, Failure> {
-    let text = serde_json::to_string(shown).map_err(|error| Failure::Data(error.to_string()))?;
+pub(crate) fn json(shown: &impl Serialize) -> Result<String, CommandFailure> {
+    let text =
+        serde_json::to_string(shown).map_err(|error| CommandFailure::Data(error.to_string()))?;
     Ok(mappings::harmless_json(&text))
 }
 
 /// A topic or call in the list.
-pub(super) struct Line<'b> {
+pub(super) struct ListRow<'b> {
     pub(super) topic: TopicId,
-    described: Option<&'b Described>,
-    heard: Option<&'b Heard>,
+    described: Option<&'b AnnouncedDescription>,
+    heard: Option<&'b TopicValues>,
     pub(super) is_call: bool,
     from: String,
     /// Time since the last message.
@@ -78,7 +79,7 @@ pub(super) struct Line<'b> {
 }
 
 #[derive(Serialize)]
-pub(super) struct Shown<'l> {
+pub(super) struct ListJson<'l> {
     topic: String,
     kind: &'static str,
     space: u8,
@@ -114,10 +115,10 @@ struct RosTopic<'l> {
     topic: &'l str,
 }
 
-pub(super) fn lines(book: &Book, now: Duration) -> Vec<Line<'_>> {
+pub(super) fn lines(book: &Book, now: Duration) -> Vec<ListRow<'_>> {
     let mut lines = BTreeMap::new();
     for (topic, heard) in book.topics() {
-        let line = Line {
+        let line = ListRow {
             topic,
             described: book.described(topic).map(AsRef::as_ref),
             heard: Some(heard),
@@ -129,8 +130,8 @@ pub(super) fn lines(book: &Book, now: Duration) -> Vec<Line<'_>> {
         lines.insert((topic, false), line);
     }
     for (topic, kind, described, from) in book.announced() {
-        let is_call = kind == Kind::Call;
-        lines.entry((topic, is_call)).or_insert_with(|| Line {
+        let is_call = kind == NameKind::Call;
+        lines.entry((topic, is_call)).or_insert_with(|| ListRow {
             topic,
             described: Some(described),
             heard: None,
@@ -144,7 +145,7 @@ pub(super) fn lines(book: &Book, now: Duration) -> Vec<Line<'_>> {
 }
 
 #[expect(clippy::cast_precision_loss, reason = "a rate shown to people")]
-fn rate(heard: &Heard) -> Option<f64> {
+fn rate(heard: &TopicValues) -> Option<f64> {
     let span = heard.last.saturating_sub(heard.first).as_secs_f64();
     let gaps = heard.values.checked_sub(1).filter(|gaps| *gaps > 0)?;
     (span > 0.0).then(|| gaps as f64 / span)
@@ -165,8 +166,8 @@ const HEAD: [&str; 9] = [
 /// The columns that are shortened first: the type, the ROS topic and the name.
 const YIELDING: [usize; 3] = [8, 2, 1];
 
-pub(super) fn table(lines: &[&Line<'_>]) -> Table {
-    let mut table = Table::new(HEAD.map(str::to_owned)).yielding(YIELDING);
+pub(super) fn table(lines: &[&ListRow<'_>]) -> TextTable {
+    let mut table = TextTable::new(HEAD.map(str::to_owned)).yielding(YIELDING);
     for line in lines {
         let dash = || "-".to_owned();
         let quality = line.quality().filter(|quality| quality != GOOD);
@@ -212,7 +213,7 @@ pub(super) fn origin(space: SpaceId) -> &'static str {
     }
 }
 
-impl Line<'_> {
+impl ListRow<'_> {
     const fn kind(&self) -> &'static str {
         if self.is_call { "call" } else { "value" }
     }
@@ -253,21 +254,21 @@ impl Line<'_> {
         Some(format!("{}{array}", builtin.name()))
     }
 
-    pub(super) fn shown(&self) -> Shown<'_> {
-        fn shown(fields: &[Field]) -> Vec<ShownField<'_>> {
-            fields.iter().map(Field::shown).collect()
+    pub(super) fn shown(&self) -> ListJson<'_> {
+        fn shown(fields: &[AnnouncedField]) -> Vec<ShownField<'_>> {
+            fields.iter().map(AnnouncedField::shown).collect()
         }
-        let call = self.described.and_then(Described::call);
+        let call = self.described.and_then(AnnouncedDescription::call);
         let fields = self.described.and_then(|described| match &described.what {
-            What::Value(fields) => Some(shown(fields)),
-            What::Call(_) => None,
+            DescribedKind::Value(fields) => Some(shown(fields)),
+            DescribedKind::Call(_) => None,
         });
         let description = self
             .described
             .map(|described| described.description.as_str());
         let ros_topics = self.described.map(|described| &described.ros_topics);
         let ros_topics = ros_topics.into_iter().flatten();
-        Shown {
+        ListJson {
             ros_topics: ros_topics
                 .map(|(space, topic)| RosTopic {
                     space: *space,
@@ -340,8 +341,10 @@ impl Line<'_> {
         }
         let parts = match self.described.map(|described| &described.what) {
             None => Vec::new(),
-            Some(What::Value(fields)) => vec![("field", fields)],
-            Some(What::Call(call)) => vec![("takes", &call.request), ("gives", &call.response)],
+            Some(DescribedKind::Value(fields)) => vec![("field", fields)],
+            Some(DescribedKind::Call(call)) => {
+                vec![("takes", &call.request), ("gives", &call.response)]
+            }
         };
         for (what, fields) in parts {
             for field in fields {

@@ -6,12 +6,12 @@ use std::time::Duration;
 
 use mappings::{Mapping, TopicId, Variable};
 
-use super::book::{Book, Kind, News};
-use super::described::Described;
+use super::book::{Book, DatagramContent, NameKind};
+use super::described::AnnouncedDescription;
 use super::text::harmless;
-use super::{Ended, Go, Live};
-use crate::arguments::Target;
-use crate::exit::Failure;
+use super::{Go, ListenEnd, Live};
+use crate::arguments::NamedTarget;
+use crate::exit::CommandFailure;
 use crate::report::warn;
 
 /// How well a name fits; the best fit wins.
@@ -35,15 +35,17 @@ struct Candidate {
 
 /// Returns the topics and calls of a kind that fit the name best, in the order of topics. `None`
 /// stands for all kinds. The name of a skill is its Start.
-fn find(book: &Book, name: &str, kind: Option<Kind>) -> Vec<Candidate> {
+fn find(book: &Book, name: &str, kind: Option<NameKind>) -> Vec<Candidate> {
     let found = find_named(book, name, kind);
     match kind {
-        Some(Kind::Call) if found.is_empty() => find_named(book, &format!("{name}.Start"), kind),
+        Some(NameKind::Call) if found.is_empty() => {
+            find_named(book, &format!("{name}.Start"), kind)
+        }
         _ => found,
     }
 }
 
-fn find_named(book: &Book, name: &str, kind: Option<Kind>) -> Vec<Candidate> {
+fn find_named(book: &Book, name: &str, kind: Option<NameKind>) -> Vec<Candidate> {
     let announced = book.announced();
     let of_kind = announced.filter(|(_, of, ..)| kind.is_none_or(|kind| kind == *of));
     let mut best: Option<Fit> = None;
@@ -66,7 +68,7 @@ fn find_named(book: &Book, name: &str, kind: Option<Kind>) -> Vec<Candidate> {
         .collect()
 }
 
-fn fit(described: &Described, name: &str) -> Option<Fit> {
+fn fit(described: &AnnouncedDescription, name: &str) -> Option<Fit> {
     best_fit(described.names(), name)
 }
 
@@ -102,10 +104,10 @@ pub(crate) fn fitting<'t>(known: &[(&'t str, Vec<&str>)], name: &str) -> Vec<&'t
 }
 
 /// Returns the variables of a mapping that fit the target best.
-pub(super) fn mapped<'m>(mapping: &'m Mapping, target: &Target) -> Vec<&'m Variable> {
+pub(super) fn mapped<'m>(mapping: &'m Mapping, target: &NamedTarget) -> Vec<&'m Variable> {
     let name = match target {
-        Target::Topic(topic) => return mapping.variable(*topic).into_iter().collect(),
-        Target::Name(name) => name,
+        NamedTarget::Topic(topic) => return mapping.variable(*topic).into_iter().collect(),
+        NamedTarget::Name(name) => name,
     };
     let fits = mapping.variables().iter().filter_map(|variable| {
         let ros = variable.ros_names().map(|(_, name)| name);
@@ -119,13 +121,13 @@ pub(super) fn mapped<'m>(mapping: &'m Mapping, target: &Target) -> Vec<&'m Varia
 }
 
 /// Returns the name and the ROS topics of a topic for output.
-fn label(described: &Described) -> String {
+fn label(described: &AnnouncedDescription) -> String {
     let names: Vec<&str> = described.names().collect();
     harmless(&names.join(", "))
 }
 
 /// Returns the error for a name with several topics.
-fn ambiguous(name: &str, found: &[Candidate]) -> Failure {
+fn ambiguous(name: &str, found: &[Candidate]) -> CommandFailure {
     let each = found.iter().take(MOST_SHOWN);
     let each = each.map(|one| format!("\n    {}  {}", one.topic, one.label));
     let each: String = each.collect();
@@ -134,16 +136,16 @@ fn ambiguous(name: &str, found: &[Candidate]) -> Failure {
         rest => format!("\n    and {rest} more"),
     };
     let name = harmless(name);
-    Failure::Usage(format!(
+    CommandFailure::Usage(format!(
         "{name} is the name of {} topics\n  = help: give one of these topics:{each}{rest}",
         found.len()
     ))
 }
 
 /// Returns the error for a target without a topic.
-pub(super) fn unknown(live: &Live, target: &Target, seconds: f64) -> Failure {
+pub(super) fn unknown(live: &Live, target: &NamedTarget, seconds: f64) -> CommandFailure {
     let name = &target.to_string();
-    let all: Vec<&Described> = live
+    let all: Vec<&AnnouncedDescription> = live
         .book
         .announced()
         .map(|(_, _, described, _)| described.as_ref())
@@ -159,7 +161,7 @@ pub(super) fn unknown(live: &Live, target: &Target, seconds: f64) -> Failure {
         (None, _) => "`ua-space list` shows the names".to_owned(),
     };
     let (name, group) = (harmless(name), live.group());
-    Failure::Unavailable(format!(
+    CommandFailure::Unavailable(format!(
         "no topic named {name} was announced in {group} for {seconds} s\n  = help: {help}"
     ))
 }
@@ -179,28 +181,28 @@ impl Live {
     /// Several topics have the name, or the user interrupted the command.
     pub(super) async fn resolve(
         &mut self,
-        (target, kind): (&Target, Option<Kind>),
+        (target, kind): (&NamedTarget, Option<NameKind>),
         end: Duration,
-        each: &mut dyn FnMut(News<'_>, Duration) -> Go,
-    ) -> Result<Option<TopicId>, Failure> {
+        each: &mut dyn FnMut(DatagramContent<'_>, Duration) -> Go,
+    ) -> Result<Option<TopicId>, CommandFailure> {
         let name = match target {
-            Target::Topic(topic) => {
+            NamedTarget::Topic(topic) => {
                 self.want(*topic);
                 return Ok(Some(*topic));
             }
-            Target::Name(name) => name,
+            NamedTarget::Name(name) => name,
         };
         // A bridge without values is found by a probe for applications.
         self.want_all();
-        if kind != Some(Kind::Value) {
+        if kind != Some(NameKind::Value) {
             self.want_calls([0]);
         }
         let mut notice = Some(self.now() + NOTICE);
         let mut settled = None;
         loop {
             let next = (self.now() + STEP).min(end);
-            if self.listen(next, each).await? == Ended::Interrupted {
-                return Err(Failure::Interrupted);
+            if self.listen(next, each).await? == ListenEnd::Interrupted {
+                return Err(CommandFailure::Interrupted);
             }
             let now = self.now();
             let found = find(&self.book, name, kind);
@@ -227,10 +229,10 @@ impl Live {
 const STEP: Duration = Duration::from_millis(50);
 /// Returns the time in which further topics with the same name may be announced. A call, such as
 /// Halt, waits less.
-const fn settle(kind: Option<Kind>) -> Duration {
+const fn settle(kind: Option<NameKind>) -> Duration {
     match kind {
-        Some(Kind::Call) => Duration::from_millis(250),
-        Some(Kind::Value) | None => Duration::from_millis(600),
+        Some(NameKind::Call) => Duration::from_millis(250),
+        Some(NameKind::Value) | None => Duration::from_millis(600),
     }
 }
 
@@ -243,17 +245,17 @@ const MOST_COMPARED: usize = 4096;
 
 #[cfg(test)]
 mod tests {
-    use super::super::described::What;
+    use super::super::described::DescribedKind;
     use super::*;
 
-    fn described(name: &str, ros: &[&str]) -> Described {
+    fn described(name: &str, ros: &[&str]) -> AnnouncedDescription {
         let ros = ros.iter().map(|topic| (1, (*topic).to_owned()));
-        Described {
+        AnnouncedDescription {
             name: name.to_owned(),
             description: String::new(),
             ros_topics: ros.collect(),
             command: false,
-            what: What::Value(Vec::new()),
+            what: DescribedKind::Value(Vec::new()),
         }
     }
 

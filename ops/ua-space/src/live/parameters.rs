@@ -3,8 +3,8 @@
 use serde_json::{Value, json};
 use uadp::BuiltinType;
 
-use super::described::{Field, list};
-use crate::values::FieldValue;
+use super::described::{AnnouncedField, list};
+use crate::values::JsonFieldValue;
 use crate::values::variant_bytes;
 
 /// A wrong argument, and the parameters that the call takes.
@@ -21,14 +21,17 @@ pub(crate) struct WrongParameter {
 /// # Errors
 /// [`WrongParameter`] names the first wrong argument or the missing parameters, and lists the
 /// parameters of the call.
-pub(crate) fn request(words: &[String], takes: &[Field]) -> Result<Vec<u8>, WrongParameter> {
+pub(crate) fn request(
+    words: &[String],
+    takes: &[AnnouncedField],
+) -> Result<Vec<u8>, WrongParameter> {
     encoded(words, takes, "call")
 }
 
 /// Encodes the fields of a call or a value, which `subject` names for errors; see [`request`].
 pub(super) fn encoded(
     words: &[String],
-    takes: &[Field],
+    takes: &[AnnouncedField],
     subject: &str,
 ) -> Result<Vec<u8>, WrongParameter> {
     let wrong = |what: String| WrongParameter {
@@ -67,14 +70,14 @@ pub(super) fn encoded(
     let count = u16::try_from(takes.len()).map_err(|_| wrong("too many parameters".to_owned()))?;
     let mut block = count.to_le_bytes().to_vec();
     for (field, value) in takes.iter().zip(given) {
-        let shown = FieldValue {
+        let shown = JsonFieldValue {
             ua_type: value
                 .is_some()
                 .then_some(field.builtin)
                 .flatten()
                 .map(BuiltinType::id),
             value,
-            ..FieldValue::default()
+            ..JsonFieldValue::default()
         };
         let bytes = variant_bytes(&shown).map_err(|why| {
             wrong(format!("{}: {why}", field.name).replace(": .Value", ": value"))
@@ -84,7 +87,7 @@ pub(super) fn encoded(
     Ok(block)
 }
 
-fn value(field: &Field, text: &str) -> Result<Value, String> {
+fn value(field: &AnnouncedField, text: &str) -> Result<Value, String> {
     let Some(builtin) = field.builtin else {
         return Err("it is of a type that is not known here".to_owned());
     };
@@ -157,14 +160,19 @@ mod tests {
     use super::super::plain;
     use super::*;
 
-    fn field(name: &str, builtin: BuiltinType, size: Option<u32>, optional: bool) -> Field {
-        Field {
+    fn field(
+        name: &str,
+        builtin: BuiltinType,
+        size: Option<u32>,
+        optional: bool,
+    ) -> AnnouncedField {
+        AnnouncedField {
             optional,
-            ..Field::plain(name, builtin, size)
+            ..AnnouncedField::plain(name, builtin, size)
         }
     }
 
-    fn takes() -> [Field; 4] {
+    fn takes() -> [AnnouncedField; 4] {
         [
             field("TargetPosition", BuiltinType::Double, Some(6), false),
             field("MaxVelocity", BuiltinType::Double, None, true),
@@ -173,7 +181,7 @@ mod tests {
         ]
     }
 
-    fn of(words: &[&str], takes: &[Field]) -> Result<String, String> {
+    fn of(words: &[&str], takes: &[AnnouncedField]) -> Result<String, String> {
         let words: Vec<String> = words.iter().map(|word| (*word).to_owned()).collect();
         let block = request(&words, takes).map_err(|wrong| wrong.to_string())?;
         let named = plain::response(ActionFields::Variants(&block), takes).unwrap();

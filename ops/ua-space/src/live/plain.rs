@@ -4,18 +4,18 @@ use serde::ser::{Serialize, SerializeMap as _, Serializer};
 use serde_json::{Value, json};
 use uadp::{Array, DataSetMessage, DecodeError, FieldEncoding, Scalar, Variant};
 
-use super::described::{Described, Field};
+use super::described::{AnnouncedDescription, AnnouncedField};
 use super::text::harmless;
 use crate::arguments::RawReading;
-use crate::raw_data::Layout;
+use crate::raw_data::RawDataLayout;
 use crate::shape::FieldMetaData;
 use crate::values::show_scalar;
 
 /// Named values in order.
 #[derive(Debug, Clone, Default, PartialEq)]
-pub(crate) struct Named(pub(crate) Vec<(String, Value)>);
+pub(crate) struct NamedValues(pub(crate) Vec<(String, Value)>);
 
-impl Named {
+impl NamedValues {
     pub(crate) fn get(&self, name: &str) -> Option<&Value> {
         let found = self.0.iter().find(|(known, _)| known == name);
         found.map(|(_, value)| value)
@@ -30,7 +30,7 @@ impl Named {
     }
 
     /// Renames values that were received before their names.
-    pub(crate) fn rename(&mut self, fields: &[Field]) {
+    pub(crate) fn rename(&mut self, fields: &[AnnouncedField]) {
         for (known, _) in &mut self.0 {
             let (number, rest) = known.split_once('.').unwrap_or((known, ""));
             let number = number
@@ -60,7 +60,7 @@ impl Named {
     }
 }
 
-impl Serialize for Named {
+impl Serialize for NamedValues {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
         let mut map = serializer.serialize_map(Some(self.0.len()))?;
         for (name, value) in &self.0 {
@@ -78,13 +78,13 @@ impl Serialize for Named {
 /// announcement.
 pub(crate) fn message(
     message: &DataSetMessage<'_>,
-    described: Option<&Described>,
-) -> Result<Named, DecodeError> {
-    let fields = described.map_or(&[][..], Described::fields);
+    described: Option<&AnnouncedDescription>,
+) -> Result<NamedValues, DecodeError> {
+    let fields = described.map_or(&[][..], AnnouncedDescription::fields);
     if message.encoding() == FieldEncoding::RawData {
         return raw(message.payload(), fields);
     }
-    let mut named = Named::default();
+    let mut named = NamedValues::default();
     for value in message.values()? {
         let value = value?;
         let (index, status) = (value.index, value.value.status);
@@ -114,12 +114,12 @@ pub(crate) fn message(
 /// See [`message`].
 pub(crate) fn response(
     fields: uadp::action::ActionFields<'_>,
-    described: &[Field],
-) -> Result<Named, DecodeError> {
+    described: &[AnnouncedField],
+) -> Result<NamedValues, DecodeError> {
     if let uadp::action::ActionFields::RawData { payload, .. } = fields {
         return raw(payload, described);
     }
-    let mut named = Named::default();
+    let mut named = NamedValues::default();
     for (value, index) in fields.variants()?.zip(0..) {
         let shown = field(&value?, described, index)?;
         named.0.push((name(described, index), shown));
@@ -129,7 +129,11 @@ pub(crate) fn response(
 
 /// Returns the value of the field with this index; messages in it have the announced names of their
 /// fields.
-fn field(value: &Variant<'_>, fields: &[Field], index: usize) -> Result<Value, DecodeError> {
+fn field(
+    value: &Variant<'_>,
+    fields: &[AnnouncedField],
+    index: usize,
+) -> Result<Value, DecodeError> {
     let Some(structure) = fields.get(index).and_then(|field| field.structure.as_ref()) else {
         return variant(value);
     };
@@ -145,7 +149,7 @@ fn field(value: &Variant<'_>, fields: &[Field], index: usize) -> Result<Value, D
 }
 
 /// Returns the announced name of a field, or `field_1` and so on.
-pub(crate) fn name(fields: &[Field], index: usize) -> String {
+pub(crate) fn name(fields: &[AnnouncedField], index: usize) -> String {
     match fields.get(index) {
         Some(field) if !field.name.is_empty() => field.name.clone(),
         Some(_) | None => format!("{UNNAMED}{}", index + 1),
@@ -155,14 +159,14 @@ pub(crate) fn name(fields: &[Field], index: usize) -> String {
 /// The prefix of the number of an unnamed field.
 const UNNAMED: &str = "field_";
 
-fn raw(payload: &[u8], fields: &[Field]) -> Result<Named, DecodeError> {
+fn raw(payload: &[u8], fields: &[AnnouncedField]) -> Result<NamedValues, DecodeError> {
     const UNKNOWN: DecodeError = DecodeError::Misread("RawData, whose fields nobody announced");
     if fields.is_empty() {
         return Err(UNKNOWN);
     }
     let metadata: Vec<FieldMetaData> = fields.iter().map(metadata).collect();
-    let layout = Layout::new(&metadata, RawReading::Standard).map_err(|_| UNKNOWN)?;
-    let mut named = Named::default();
+    let layout = RawDataLayout::new(&metadata, RawReading::Standard).map_err(|_| UNKNOWN)?;
+    let mut named = NamedValues::default();
     let read = layout.read(payload, |field| {
         let name = name(fields, named.0.len());
         named.0.push((name, field.value.value.unwrap_or_default()));
@@ -175,7 +179,7 @@ fn raw(payload: &[u8], fields: &[Field]) -> Result<Named, DecodeError> {
     }
 }
 
-fn metadata(field: &Field) -> FieldMetaData {
+fn metadata(field: &AnnouncedField) -> FieldMetaData {
     FieldMetaData {
         name: None,
         built_in_type: field.builtin.map_or(0, uadp::BuiltinType::id),
@@ -251,7 +255,7 @@ mod tests {
 
     #[test]
     fn yaml_keeps_the_order_and_shows_control_characters_by_their_number() {
-        let named = Named(vec![
+        let named = NamedValues(vec![
             ("linear.x".to_owned(), json!(0.5)),
             ("a b".to_owned(), json!("\u{1b}[2J\u{9b}2J")),
         ]);

@@ -4,14 +4,14 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 
-use uadp::discovery::{List, Probe};
+use uadp::discovery::{Probe, WireArray};
 use uadp::{PublisherId, SecurityHeader};
 
 /// The open questions. A probe names a space but no WriterGroup: if several programs publish for a
 /// space, each of them answers.
 #[derive(Debug, Default)]
 pub(crate) struct Prober {
-    wanted: BTreeMap<(u16, Question), Wanted>,
+    wanted: BTreeMap<(u16, Question), PendingProbe>,
     /// The time of the last probe.
     sent: Option<Duration>,
     /// The number of probes for applications; `None` if they are not wanted.
@@ -29,7 +29,7 @@ enum Question {
 }
 
 #[derive(Debug, Clone, Copy)]
-struct Wanted {
+struct PendingProbe {
     next: Duration,
     attempts: u32,
     answered: bool,
@@ -67,7 +67,7 @@ impl Prober {
     fn ask(&mut self, space: u16, question: Question, now: Duration) {
         if let Some(wanted) = self.wanted.get_mut(&(space, question)) {
             if wanted.answered && wanted.renewed < RENEWED {
-                *wanted = Wanted {
+                *wanted = PendingProbe {
                     next: now + GATHER,
                     attempts: 0,
                     answered: false,
@@ -75,7 +75,7 @@ impl Prober {
                 };
             }
         } else if self.wanted.len() < MOST {
-            let wanted = Wanted {
+            let wanted = PendingProbe {
                 next: now + GATHER,
                 attempts: 0,
                 answered: false,
@@ -105,7 +105,7 @@ impl Prober {
             self.sent = Some(now);
             return all();
         }
-        let is_due = |wanted: &Wanted| wanted.attempts < ATTEMPTS && wanted.next <= now;
+        let is_due = |wanted: &PendingProbe| wanted.attempts < ATTEMPTS && wanted.next <= now;
         let first = *self.wanted.iter().find(|(_, wanted)| is_due(wanted))?.0;
         let space = first.0;
         let mut ids = BTreeSet::new();
@@ -128,9 +128,9 @@ impl Prober {
         self.sent = Some(now);
         let ids: Vec<u16> = ids.into_iter().collect();
         let probe = match first.1 {
-            Question::Writer(_) => Probe::DataSetMetaData(List::new(&ids)),
+            Question::Writer(_) => Probe::DataSetMetaData(WireArray::new(&ids)),
             Question::Calls => Probe::PubSubConnections {
-                transport_profile_uris: List::null(),
+                transport_profile_uris: WireArray::null(),
                 include_writer_groups: false,
                 include_data_set_writers: false,
             },

@@ -17,24 +17,24 @@ use serde::Serialize;
 use transport::{Received, Senders};
 
 use self::packets::Packets;
-use self::sink::Sink;
-use self::values::{Added, Values};
-use super::book::{Kind, News};
+use self::sink::RecordingFile;
+use self::values::{RecordOutcome, ValueRecorder};
+use super::book::{DatagramContent, NameKind};
 use super::channels::{DESCRIBED_WITHIN, is_value};
 use super::list::{FIRST_ASKED, json};
 use super::text::harmless;
 use super::{Go, Incoming, LOOK, Live, in_group_with_own, take, until};
-use crate::arguments::Record;
-use crate::capture::Link;
+use crate::arguments::RecordArguments;
+use crate::capture::LinkLayer;
 use crate::cell::own_drops;
-use crate::exit::Failure;
+use crate::exit::CommandFailure;
 use crate::report::warn;
 
 /// Runs `ua-space record`.
-pub(crate) fn record(arguments: &Record) -> Result<(), Failure> {
+pub(crate) fn record(arguments: &RecordArguments) -> Result<(), CommandFailure> {
     let format = Format::of(&arguments.file)?;
     if format == Format::PcapNg && !arguments.models.model.is_empty() {
-        return Err(Failure::Usage(
+        return Err(CommandFailure::Usage(
             "--model is for recordings that viewers open: name the file .mcap".to_owned(),
         ));
     }
@@ -68,14 +68,14 @@ pub(crate) fn record(arguments: &Record) -> Result<(), Failure> {
 }
 
 /// Removes the empty recording and returns the failure.
-fn nothing(live: &Live, file: &Path) -> Failure {
+fn nothing(live: &Live, file: &Path) -> CommandFailure {
     // The file has no messages, so nothing is lost with it or left with it.
     let _removed = std::fs::remove_file(file);
     if let Some(why) = live.carrier.lost() {
-        return Failure::Unavailable(why);
+        return CommandFailure::Unavailable(why);
     }
     let group = live.group();
-    Failure::Unavailable(format!(
+    CommandFailure::Unavailable(format!(
         "nothing was recorded from {group}\n  = help: is this the group and the interface (--address, --interface)?"
     ))
 }
@@ -89,12 +89,12 @@ enum Format {
 
 impl Format {
     /// Returns the form by the ending of the file.
-    fn of(file: &Path) -> Result<Self, Failure> {
+    fn of(file: &Path) -> Result<Self, CommandFailure> {
         let ending = file.extension().and_then(|ending| ending.to_str());
         match ending.map(str::to_ascii_lowercase).as_deref() {
             Some("pcapng") => Ok(Self::PcapNg),
             Some("mcap") => Ok(Self::Mcap),
-            _ => Err(Failure::Usage(format!(
+            _ => Err(CommandFailure::Usage(format!(
                 "{}: the name ends with .pcapng (all messages) or .mcap (values)",
                 file.display()
             ))),
@@ -119,12 +119,12 @@ struct Recording {
 
 enum Form {
     Packets(Box<Packets>),
-    Values(Box<Values>),
+    Values(Box<ValueRecorder>),
 }
 
 impl Recording {
-    fn new(format: Format, file: &Path, live: &Live) -> Result<Self, Failure> {
-        let sink = Sink::create(file)?;
+    fn new(format: Format, file: &Path, live: &Live) -> Result<Self, CommandFailure> {
+        let sink = RecordingFile::create(file)?;
         let form = match format {
             Format::PcapNg => {
                 let link = link(live);
@@ -134,7 +134,7 @@ impl Recording {
                     &live.carrier.interface(),
                 )))
             }
-            Format::Mcap => Form::Values(Box::new(Values::new(sink))),
+            Format::Mcap => Form::Values(Box::new(ValueRecorder::new(sink))),
         };
         Ok(Self {
             form,
@@ -147,7 +147,11 @@ impl Recording {
     }
 
     /// Records until the end that the arguments name, or a signal.
-    async fn run(&mut self, live: &mut Live, arguments: &Record) -> Result<(), Failure> {
+    async fn run(
+        &mut self,
+        live: &mut Live,
+        arguments: &RecordArguments,
+    ) -> Result<(), CommandFailure> {
         let end = until(live.now(), arguments.seconds);
         let most_bytes = arguments.size.map_or(u64::MAX, |mib| mib << 20);
         let most = arguments.count.unwrap_or(u64::MAX);
@@ -175,7 +179,7 @@ impl Recording {
 
     /// Waits for the descriptions of recorded values: a short recording ends before their writers
     /// have responded.
-    async fn await_descriptions(&mut self, live: &mut Live) -> Result<(), Failure> {
+    async fn await_descriptions(&mut self, live: &mut Live) -> Result<(), CommandFailure> {
         self.is_over = true;
         let end = live.now() + DESCRIBED_WITHIN;
         while self.awaits_descriptions() && live.now() < end {
@@ -196,7 +200,7 @@ impl Recording {
     }
 
     /// Adds the message in the buffer. Own probes are no part of the cell.
-    fn add(&mut self, live: &mut Live, received: &Received) -> Result<(), Failure> {
+    fn add(&mut self, live: &mut Live, received: &Received) -> Result<(), CommandFailure> {
         let Received { length, from, .. } = *received;
         if live.is_own(from) {
             return Ok(());
@@ -220,14 +224,16 @@ impl Recording {
                 take(read, (datagram, from), now, &mut |_, _| Go::On);
             }
             Form::Values(values) => {
-                let mut each = |news: News<'_>, now| {
+                let mut each = |news: DatagramContent<'_>, now| {
                     let recorded = match &news {
-                        News::Sample(sample) if !is_over && is_value(&sample.message) => {
+                        DatagramContent::Sample(sample)
+                            if !is_over && is_value(&sample.message) =>
+                        {
                             values.add(sample, (now, time))
                         }
-                        News::Announced {
+                        DatagramContent::Announced {
                             topic,
-                            kind: Kind::Value,
+                            kind: NameKind::Value,
                             described,
                             announcement,
                             ..
@@ -235,14 +241,16 @@ impl Recording {
                             values.described((*topic, announcement), described, now);
                             return Go::On;
                         }
-                        News::Sample(_) | News::Announced { .. } | News::Response(..) => {
+                        DatagramContent::Sample(_)
+                        | DatagramContent::Announced { .. }
+                        | DatagramContent::Response(..) => {
                             return Go::On;
                         }
                     };
                     match recorded {
-                        Ok(Added::Value) => added += 1,
-                        Ok(Added::Copy) => {}
-                        Ok(Added::Dropped) => dropped += 1,
+                        Ok(RecordOutcome::Value) => added += 1,
+                        Ok(RecordOutcome::Copy) => {}
+                        Ok(RecordOutcome::Dropped) => dropped += 1,
                         Err(failure) => fault = Some(failure),
                     }
                     Go::On
@@ -256,7 +264,7 @@ impl Recording {
     }
 
     /// Hands over the messages so far, and shows the progress on a terminal.
-    fn flush(&mut self, now: Duration) -> Result<(), Failure> {
+    fn flush(&mut self, now: Duration) -> Result<(), CommandFailure> {
         match &mut self.form {
             Form::Packets(packets) => packets.flush()?,
             Form::Values(values) => {
@@ -284,7 +292,7 @@ impl Recording {
     }
 
     /// Ends the file. Returns its length.
-    fn finish(self, time: i128) -> Result<u64, Failure> {
+    fn finish(self, time: i128) -> Result<u64, CommandFailure> {
         let dropped = self.slow + own_drops().saturating_sub(self.drops_before);
         match self.form {
             Form::Packets(packets) => packets.finish(time, (self.messages, dropped)),
@@ -294,10 +302,10 @@ impl Recording {
 }
 
 /// Returns the form of the packets of a group or broker.
-fn link(live: &Live) -> Link {
+fn link(live: &Live) -> LinkLayer {
     match (live.carrier.senders(), live.group().parse()) {
-        (Senders::Addresses, Ok(SocketAddr::V4(group))) => Link::Udp(group),
-        _ => Link::Exported,
+        (Senders::Addresses, Ok(SocketAddr::V4(group))) => LinkLayer::Udp(group),
+        _ => LinkLayer::Exported,
     }
 }
 
@@ -313,7 +321,7 @@ struct Totals {
 }
 
 impl Totals {
-    fn print(&self, size: u64, arguments: &Record) -> Result<(), Failure> {
+    fn print(&self, size: u64, arguments: &RecordArguments) -> Result<(), CommandFailure> {
         #[derive(Serialize)]
         struct Shown<'a> {
             file: String,

@@ -14,43 +14,43 @@ use std::time::Duration;
 
 use mappings::TopicId;
 use serde::Serialize;
-use transport::{Outgoing, Received, SendError, Senders};
+use transport::{OutgoingMessage, Received, SendError, Senders};
 use uadp::discovery::Probe;
 use uadp::{NetworkMessage, NetworkMessageType};
 
-use self::clock::Clock;
-use self::contents::{Contents, LeftOut, Prepared, space};
+use self::clock::ReplayClock;
+use self::contents::{Prepared, RecordingContents, ReplayOmission, space};
 use super::list::json;
 use super::sealing::Sealing;
-use super::text::{Table, harmless, is_coloured};
+use super::text::{TextTable, harmless, is_coloured};
 use super::{Go, Incoming, Live, in_group, until};
-use crate::arguments::Replay;
-use crate::exit::Failure;
-use crate::recorded::Recorded;
+use crate::arguments::ReplayArguments;
+use crate::exit::CommandFailure;
+use crate::recorded::RecordingReader;
 use crate::report::warn;
 
 /// Runs `ua-space replay`.
-pub(crate) fn replay(arguments: &Replay) -> Result<(), Failure> {
+pub(crate) fn replay(arguments: &ReplayArguments) -> Result<(), CommandFailure> {
     let group = &arguments.group;
     let keys = group.keys.as_deref();
     let mut sealing = keys
         .map(|keys| Sealing::read(keys, group.sign))
         .transpose()?;
-    let contents = Contents::read(arguments, &mut sealing)?;
+    let contents = RecordingContents::read(arguments, &mut sealing)?;
     if arguments.dry_run {
         return plan(&contents);
     }
     let spaces = contents.spaces();
     if spaces.is_empty() {
         let file = arguments.file.display();
-        return Err(Failure::Data(format!(
+        return Err(CommandFailure::Data(format!(
             "{file} has nothing to send\n  = help: `ua-space replay --dry-run {file}` shows its topics, and why they are left out"
         )));
     }
     in_group(group, async |mut live| {
         if live.carrier.senders() != Senders::Addresses {
             let why = "a recording is sent into a UDP group: a broker would store its messages";
-            return Err(Failure::Usage(why.to_owned()));
+            return Err(CommandFailure::Usage(why.to_owned()));
         }
         if !arguments.onto_live {
             look_for_live(&mut live, &spaces).await?;
@@ -63,9 +63,9 @@ pub(crate) fn replay(arguments: &Replay) -> Result<(), Failure> {
 }
 
 /// Shows the topics of a recording, and what is left out.
-fn plan(contents: &Contents) -> Result<(), Failure> {
+fn plan(contents: &RecordingContents) -> Result<(), CommandFailure> {
     let columns = ["TOPIC", "NAME", "TYPE", "MESSAGES", "SENT"];
-    let mut table = Table::new(columns.map(str::to_owned));
+    let mut table = TextTable::new(columns.map(str::to_owned));
     for (topic, values, left_out) in contents.topics() {
         let described = contents.described(topic);
         let or_none = |text: Option<String>| text.unwrap_or_else(|| "-".to_owned());
@@ -85,14 +85,14 @@ fn plan(contents: &Contents) -> Result<(), Failure> {
 }
 
 /// Reports the values of an MCAP file that cannot be sent again.
-fn warn_unusable(contents: &Contents) {
+fn warn_unusable(contents: &RecordingContents) {
     for (why, count) in &contents.unusable {
         warn(&format!("{count} left out: {}", why.label()));
     }
 }
 
 /// Looks for live programs of the spaces.
-async fn look_for_live(live: &mut Live, spaces: &BTreeSet<u16>) -> Result<(), Failure> {
+async fn look_for_live(live: &mut Live, spaces: &BTreeSet<u16>) -> Result<(), CommandFailure> {
     live.want_all();
     live.want_calls(spaces.iter().copied());
     let end = until(live.now(), Some(LISTEN));
@@ -101,7 +101,7 @@ async fn look_for_live(live: &mut Live, spaces: &BTreeSet<u16>) -> Result<(), Fa
     let Some(space) = found.intersection(spaces).next() else {
         return Ok(());
     };
-    Err(Failure::Failed(is_live(*space, live.group())))
+    Err(CommandFailure::Failed(is_live(*space, live.group())))
 }
 
 fn is_live(space: u16, group: &str) -> String {
@@ -112,15 +112,15 @@ fn is_live(space: u16, group: &str) -> String {
 
 /// A recording that is being sent.
 struct Replaying<'a> {
-    contents: &'a Contents,
-    arguments: &'a Replay,
+    contents: &'a RecordingContents,
+    arguments: &'a ReplayArguments,
     spaces: BTreeSet<u16>,
     sealing: Option<Sealing>,
-    clock: Clock,
+    clock: ReplayClock,
     /// The time of the first message since the group was joined.
     begin: Duration,
     sent: u64,
-    left_out: BTreeMap<LeftOut, u64>,
+    left_out: BTreeMap<ReplayOmission, u64>,
     /// Messages that the network did not take.
     unsent: u64,
     /// The times at which topics were described last.
@@ -129,8 +129,8 @@ struct Replaying<'a> {
 
 impl<'a> Replaying<'a> {
     fn new(
-        arguments: &'a Replay,
-        contents: &'a Contents,
+        arguments: &'a ReplayArguments,
+        contents: &'a RecordingContents,
         live: &Live,
         sealing: Option<Sealing>,
     ) -> Self {
@@ -140,7 +140,7 @@ impl<'a> Replaying<'a> {
             arguments,
             spaces: contents.spaces(),
             sealing,
-            clock: Clock::new(contents.first, live.utc(begin), arguments.speed),
+            clock: ReplayClock::new(contents.first, live.utc(begin), arguments.speed),
             begin,
             sent: 0,
             left_out: BTreeMap::new(),
@@ -149,13 +149,13 @@ impl<'a> Replaying<'a> {
         }
     }
 
-    async fn run(&mut self, live: &mut Live) -> Result<(), Failure> {
+    async fn run(&mut self, live: &mut Live) -> Result<(), CommandFailure> {
         let contents = self.contents;
         for (topic, datagram) in contents.announcements() {
             self.described.insert(topic, live.now());
             self.send(live, (datagram, self.sealing.is_some())).await;
         }
-        let mut recorded = Recorded::open(&self.arguments.file)?;
+        let mut recorded = RecordingReader::open(&self.arguments.file)?;
         while let Some(datagram) = recorded.next()? {
             let prepared = match self.contents.prepare(&datagram.bytes, &mut self.sealing) {
                 Ok(prepared) => prepared,
@@ -189,10 +189,10 @@ impl<'a> Replaying<'a> {
     }
 
     /// Waits until a time, and handles the messages of others meanwhile.
-    async fn wait(&mut self, live: &mut Live, due: Duration) -> Result<(), Failure> {
+    async fn wait(&mut self, live: &mut Live, due: Duration) -> Result<(), CommandFailure> {
         loop {
             match live.receive(due).await? {
-                Incoming::Interrupted => return Err(Failure::Interrupted),
+                Incoming::Interrupted => return Err(CommandFailure::Interrupted),
                 Incoming::Nothing => break,
                 Incoming::Message(received) => self.take(live, received).await?,
             }
@@ -212,7 +212,7 @@ impl<'a> Replaying<'a> {
         &mut self,
         live: &mut Live,
         Received { length, from, .. }: Received,
-    ) -> Result<(), Failure> {
+    ) -> Result<(), CommandFailure> {
         if live.is_own(from) {
             return Ok(());
         }
@@ -237,7 +237,7 @@ impl<'a> Replaying<'a> {
         message: &NetworkMessage<'_>,
         from: SocketAddr,
         group: &str,
-    ) -> Result<(), Failure> {
+    ) -> Result<(), CommandFailure> {
         let of_program = match message.message_type() {
             NetworkMessageType::Announcement => true,
             // Requests have the PublisherId of their executor.
@@ -247,7 +247,7 @@ impl<'a> Replaying<'a> {
         let live = space(message).map(u16::from).filter(|_| of_program);
         match live.filter(|space| self.spaces.contains(space)) {
             None => Ok(()),
-            Some(space) => Err(Failure::Failed(format!(
+            Some(space) => Err(CommandFailure::Failed(format!(
                 "stopped at a message from {from}: {}",
                 is_live(space, group)
             ))),
@@ -285,7 +285,7 @@ impl<'a> Replaying<'a> {
             self.unsent += 1;
             return false;
         };
-        let message = Outgoing::new(sealed.as_deref().unwrap_or(plain));
+        let message = OutgoingMessage::new(sealed.as_deref().unwrap_or(plain));
         for _ in 0..MOST_ATTEMPTS {
             match live.carrier.try_send(&message) {
                 Ok(()) => return true,
@@ -299,7 +299,7 @@ impl<'a> Replaying<'a> {
     }
 
     /// Prints the numbers of messages.
-    fn print(&self, now: Duration, arguments: &Replay) -> Result<(), Failure> {
+    fn print(&self, now: Duration, arguments: &ReplayArguments) -> Result<(), CommandFailure> {
         #[derive(Serialize)]
         struct Shown<'a> {
             file: &'a str,

@@ -4,11 +4,11 @@
 use std::str::FromStr;
 use std::time::Duration;
 
-use tcpros::{ParamValue, Parameters};
+use tcpros::{NodeParameters, ParamValue};
 use tokio::time::timeout;
 use type_files::read_bounded;
 
-use crate::exit::Failure;
+use crate::exit::CommandFailure;
 
 /// The source of a model, as an argument.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -30,7 +30,7 @@ enum Origin {
 
 /// A model as a message for viewers.
 #[derive(Debug)]
-pub(super) struct Model {
+pub(super) struct RobotModelMessage {
     pub(super) topic: String,
     /// A `std_msgs/String` in CDR.
     pub(super) data: Vec<u8>,
@@ -72,7 +72,7 @@ impl FromStr for ModelSource {
 
 impl ModelSource {
     /// Reads the model.
-    pub(super) async fn load(&self) -> Result<Model, Failure> {
+    pub(super) async fn load(&self) -> Result<RobotModelMessage, CommandFailure> {
         let (of, text) = match &self.origin {
             Origin::File(file) => (file.clone(), read(file)?),
             Origin::Parameter { master, name } => {
@@ -81,36 +81,37 @@ impl ModelSource {
             }
         };
         if !text.contains("<robot") {
-            return Err(Failure::Data(format!(
+            return Err(CommandFailure::Data(format!(
                 "{of}: no model of a robot: a URDF has an element <robot>\n  = help: xacro files are converted by `xacro FILE`"
             )));
         }
         let topic = self.topic.clone();
-        let data = message(&text)
-            .ok_or_else(|| Failure::Data(format!("{of}: the model is too long for a message")))?;
-        Ok(Model { topic, data })
+        let data = message(&text).ok_or_else(|| {
+            CommandFailure::Data(format!("{of}: the model is too long for a message"))
+        })?;
+        Ok(RobotModelMessage { topic, data })
     }
 }
 
-fn read(file: &str) -> Result<String, Failure> {
+fn read(file: &str) -> Result<String, CommandFailure> {
     let bytes = read_bounded(file.as_ref(), MOST_BYTES)
-        .map_err(|why| Failure::Io(format!("cannot read {file}: {why}")))?;
-    String::from_utf8(bytes).map_err(|_| Failure::Data(format!("{file}: it is not UTF-8")))
+        .map_err(|why| CommandFailure::Io(format!("cannot read {file}: {why}")))?;
+    String::from_utf8(bytes).map_err(|_| CommandFailure::Data(format!("{file}: it is not UTF-8")))
 }
 
-async fn parameter(master: &str, name: &str) -> Result<String, Failure> {
-    let reading = Parameters::of_master(master, CALLER, name);
+async fn parameter(master: &str, name: &str) -> Result<String, CommandFailure> {
+    let reading = NodeParameters::of_master(master, CALLER, name);
     let away = |why: String| {
-        Failure::Unavailable(format!(
+        CommandFailure::Unavailable(format!(
             "cannot read the parameter {name} of the ROS 1 master at {master}: {why}"
         ))
     };
     match timeout(LIMIT, reading).await {
         Ok(Ok(Some(ParamValue::String(text)))) => Ok(text),
-        Ok(Ok(Some(_))) => Err(Failure::Data(format!(
+        Ok(Ok(Some(_))) => Err(CommandFailure::Data(format!(
             "parameter {name} of {master}: it is no text"
         ))),
-        Ok(Ok(None)) => Err(Failure::Unavailable(format!(
+        Ok(Ok(None)) => Err(CommandFailure::Unavailable(format!(
             "the ROS 1 master at {master} has no parameter {name}\n  = help: `rosparam list` shows its parameters; the URL may end with the name of another"
         ))),
         Ok(Err(error)) => Err(away(error.to_string())),

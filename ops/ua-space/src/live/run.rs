@@ -6,11 +6,11 @@ use mappings::TopicId;
 use serde::Serialize;
 use serde_json::Value;
 
-use super::plain::Named;
+use super::plain::NamedValues;
 
 /// The topics of the runs of a skill. Their identifiers follow from the identifier of Start.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct Places {
+pub(super) struct RunTopics {
     state: TopicId,
     events: TopicId,
     result: TopicId,
@@ -21,7 +21,7 @@ pub(super) struct Places {
 /// An event of a run.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 #[serde(tag = "event", rename_all = "snake_case")]
-pub(super) enum Step {
+pub(super) enum RunEvent {
     /// The skill entered another state.
     State {
         state: String,
@@ -34,13 +34,13 @@ pub(super) enum Step {
     Result {
         succeeded: bool,
         message: String,
-        results: Named,
+        results: NamedValues,
     },
 }
 
 /// The end of a run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum End {
+pub(super) enum RunEnd {
     Succeeded,
     Failed,
     /// Another run began, and the result of this run was not received.
@@ -55,18 +55,18 @@ pub(super) enum End {
 
 /// A followed run.
 #[derive(Debug)]
-pub(super) struct Run {
+pub(super) struct FollowedRun {
     number: u64,
     state: Option<String>,
     progress: Option<(u32, String)>,
-    ended: Option<(End, Duration)>,
+    ended: Option<(RunEnd, Duration)>,
     /// The time of the first state of an earlier run, until a state of this run is received.
     earlier: Option<Duration>,
     heard: Duration,
     succeeded: Option<bool>,
 }
 
-impl Places {
+impl RunTopics {
     /// Returns the topics for a call that starts a skill; `None` for other calls.
     pub(super) fn of(start: TopicId, name: &str) -> Option<Self> {
         let (space, namespace, id) = start.triple();
@@ -89,7 +89,7 @@ impl Places {
     }
 }
 
-impl Run {
+impl FollowedRun {
     pub(super) fn new(number: u64, now: Duration) -> Self {
         Self {
             number,
@@ -105,10 +105,10 @@ impl Run {
     /// Returns the new events in a value.
     pub(super) fn handle(
         &mut self,
-        places: &Places,
-        (topic, value): (TopicId, &Named),
+        places: &RunTopics,
+        (topic, value): (TopicId, &NamedValues),
         now: Duration,
-    ) -> Vec<Step> {
+    ) -> Vec<RunEvent> {
         self.heard = now;
         if topic == places.result {
             self.result(value, now)
@@ -119,7 +119,7 @@ impl Run {
         }
     }
 
-    fn event(&mut self, value: &Named) -> Vec<Step> {
+    fn event(&mut self, value: &NamedValues) -> Vec<RunEvent> {
         if value.number("run") != Some(self.number) {
             return Vec::new();
         }
@@ -130,12 +130,12 @@ impl Run {
         }
     }
 
-    fn state(&mut self, value: &Named, now: Duration) -> Vec<Step> {
+    fn state(&mut self, value: &NamedValues, now: Duration) -> Vec<RunEvent> {
         match value.number("run") {
             Some(run) if run == self.number => self.earlier = None,
             // Runs have increasing numbers.
             Some(run) if run > self.number => {
-                self.ended.get_or_insert((End::Overtaken, now));
+                self.ended.get_or_insert((RunEnd::Overtaken, now));
                 return Vec::new();
             }
             Some(_) | None => {
@@ -156,37 +156,37 @@ impl Run {
         let reached = (percent(progress), step);
         let is_news = self.progress.as_ref() != Some(&reached);
         if is_news && reached != (0, String::new()) {
-            steps.push(Step::Progress {
+            steps.push(RunEvent::Progress {
                 progress,
                 step: reached.1.clone(),
             });
         }
         self.progress = Some(reached);
         if !matches!(state, "Running" | "Suspended") {
-            self.ended.get_or_insert((End::NoResult, now));
+            self.ended.get_or_insert((RunEnd::NoResult, now));
         }
         steps
     }
 
-    fn reach(&mut self, state: &str, transition: Option<String>) -> Vec<Step> {
+    fn reach(&mut self, state: &str, transition: Option<String>) -> Vec<RunEvent> {
         if self.state.as_deref() == Some(state) {
             return Vec::new();
         }
         self.state = Some(state.to_owned());
-        vec![Step::State {
+        vec![RunEvent::State {
             state: state.to_owned(),
             transition,
         }]
     }
 
-    fn result(&mut self, value: &Named, now: Duration) -> Vec<Step> {
+    fn result(&mut self, value: &NamedValues, now: Duration) -> Vec<RunEvent> {
         if value.number("run") != Some(self.number) || self.succeeded.is_some() {
             return Vec::new();
         }
         let succeeded = value.get("succeeded").and_then(Value::as_bool) == Some(true);
         self.succeeded = Some(succeeded);
-        self.ended.get_or_insert((End::NoResult, now));
-        vec![Step::Result {
+        self.ended.get_or_insert((RunEnd::NoResult, now));
+        vec![RunEvent::Result {
             succeeded,
             message: value.text("message").unwrap_or_default().to_owned(),
             results: results(value),
@@ -194,7 +194,7 @@ impl Run {
     }
 
     /// Returns the end of the run, once all events are received.
-    pub(super) fn end(&self, now: Duration) -> Option<End> {
+    pub(super) fn end(&self, now: Duration) -> Option<RunEnd> {
         let stands = self
             .state
             .as_deref()
@@ -203,18 +203,18 @@ impl Run {
         match (self.succeeded, self.ended) {
             // The last transition may follow the result.
             (Some(succeeded), _) if stands || since >= Some(LAST) => Some(if succeeded {
-                End::Succeeded
+                RunEnd::Succeeded
             } else {
-                End::Failed
+                RunEnd::Failed
             }),
             (None, Some((end, _))) if since >= Some(LATE) => Some(end),
-            (Some(_) | None, _) if now.saturating_sub(self.heard) >= SILENT => Some(End::Silent),
+            (Some(_) | None, _) if now.saturating_sub(self.heard) >= SILENT => Some(RunEnd::Silent),
             (None, None)
                 if self
                     .earlier
                     .is_some_and(|at| now.saturating_sub(at) >= LATE) =>
             {
-                Some(End::NoSuchRun)
+                Some(RunEnd::NoSuchRun)
             }
             (Some(_) | None, _) => None,
         }
@@ -222,7 +222,7 @@ impl Run {
 }
 
 /// Returns the results by name.
-pub(super) fn results(value: &Named) -> Named {
+pub(super) fn results(value: &NamedValues) -> NamedValues {
     let list = |name: &str| {
         let found = value.get(name).and_then(Value::as_array);
         found.map_or(&[][..], Vec::as_slice)
@@ -233,7 +233,7 @@ pub(super) fn results(value: &Named) -> Named {
         let value = serde_json::from_str(json).unwrap_or_else(|_| json.into());
         Some((name.to_owned(), value))
     });
-    Named(pairs.collect())
+    NamedValues(pairs.collect())
 }
 
 #[expect(
@@ -245,7 +245,7 @@ pub(super) fn percent(progress: f64) -> u32 {
     (progress.clamp(0.0, 1.0) * 100.0).round() as u32
 }
 
-impl Step {
+impl RunEvent {
     /// Returns a line for people.
     pub(super) fn told(&self) -> String {
         match self {
@@ -296,17 +296,17 @@ mod tests {
 
     const START: &str = "gripper.Grasp.Start";
 
-    fn places() -> Places {
-        Places::of("ua_0_7_105".parse().unwrap(), START).unwrap()
+    fn places() -> RunTopics {
+        RunTopics::of("ua_0_7_105".parse().unwrap(), START).unwrap()
     }
 
     fn at(seconds: u64) -> Duration {
         Duration::from_secs(seconds)
     }
 
-    fn named(json: &Value) -> Named {
+    fn named(json: &Value) -> NamedValues {
         let object = json.as_object().unwrap();
-        Named(
+        NamedValues(
             object
                 .iter()
                 .map(|(name, value)| (name.clone(), value.clone()))
@@ -314,18 +314,18 @@ mod tests {
         )
     }
 
-    fn state(run: &mut Run, of: u64, state: &str, progress: f64, now: u64) -> Vec<String> {
+    fn state(run: &mut FollowedRun, of: u64, state: &str, progress: f64, now: u64) -> Vec<String> {
         let value = json!({"run": of, "state": state, "progress": progress, "step": "Closing", "last_transition": "X"});
         let steps = run.handle(&places(), (places().state, &named(&value)), at(now));
-        steps.iter().map(Step::told).collect()
+        steps.iter().map(RunEvent::told).collect()
     }
 
-    fn result(run: &mut Run, of: u64, succeeded: bool, now: u64) -> Vec<String> {
+    fn result(run: &mut FollowedRun, of: u64, succeeded: bool, now: u64) -> Vec<String> {
         let value = json!({
             "run": of, "succeeded": succeeded, "message": "why", "names": ["Gripped"], "values": ["true"]
         });
         let steps = run.handle(&places(), (places().result, &named(&value)), at(now));
-        steps.iter().map(Step::told).collect()
+        steps.iter().map(RunEvent::told).collect()
     }
 
     #[test]
@@ -334,20 +334,23 @@ mod tests {
         assert!(places().has(topic("ua_0_7_101")) && places().has(topic("ua_0_7_104")));
         assert_eq!(places().halt, topic("ua_0_7_106"));
         assert!(!places().has(topic("ua_0_8_101")));
-        assert_eq!(Places::of(topic("ua_0_7_106"), "gripper.Grasp.Halt"), None);
-        assert_eq!(Places::of(topic("ua_0_7_61"), "reset.Start"), None);
+        assert_eq!(
+            RunTopics::of(topic("ua_0_7_106"), "gripper.Grasp.Halt"),
+            None
+        );
+        assert_eq!(RunTopics::of(topic("ua_0_7_61"), "reset.Start"), None);
     }
 
     #[test]
     fn a_run_that_its_component_does_not_know_comes_to_an_end() {
-        let mut run = Run::new(4242, at(0));
+        let mut run = FollowedRun::new(4242, at(0));
         for now in 0..3 {
             assert!(state(&mut run, 2, "Ready", 0.0, now).is_empty());
             assert_eq!(run.end(at(now)), None, "the first state may be an old one");
         }
         assert!(state(&mut run, 2, "Ready", 0.0, 3).is_empty());
-        assert_eq!(run.end(at(3)), Some(End::NoSuchRun));
-        let mut late = Run::new(3, at(0));
+        assert_eq!(run.end(at(3)), Some(RunEnd::NoSuchRun));
+        let mut late = FollowedRun::new(3, at(0));
         assert!(state(&mut late, 2, "Ready", 0.0, 0).is_empty());
         assert!(!state(&mut late, 3, "Running", 0.0, 1).is_empty());
         assert_eq!(late.end(at(5)), None);
@@ -355,7 +358,7 @@ mod tests {
 
     #[test]
     fn only_the_own_run_counts_and_it_ends_with_its_result() {
-        let mut run = Run::new(3, at(0));
+        let mut run = FollowedRun::new(3, at(0));
         assert!(state(&mut run, 2, "Ready", 1.0, 0).is_empty());
         assert!(
             result(&mut run, 2, false, 0).is_empty(),
@@ -376,30 +379,30 @@ mod tests {
         );
         assert_eq!(run.end(at(3)), None, "it is running still");
         assert_eq!(state(&mut run, 3, "Ready", 0.4, 3), ["Ready (X)"]);
-        assert_eq!(run.end(at(3)), Some(End::Succeeded));
+        assert_eq!(run.end(at(3)), Some(RunEnd::Succeeded));
     }
 
     #[test]
     fn a_failure_is_no_success_and_the_last_transition_is_not_waited_for_long() {
-        let mut run = Run::new(1, at(0));
+        let mut run = FollowedRun::new(1, at(0));
         state(&mut run, 1, "Running", 0.0, 0);
         result(&mut run, 1, false, 1);
-        assert_eq!(run.end(at(2)), Some(End::Failed));
+        assert_eq!(run.end(at(2)), Some(RunEnd::Failed));
     }
 
     #[test]
     fn a_run_whose_result_never_comes_has_an_end_all_the_same() {
-        let mut run = Run::new(1, at(0));
+        let mut run = FollowedRun::new(1, at(0));
         state(&mut run, 1, "Running", 0.0, 0);
         assert_eq!(run.end(at(4)), None);
-        assert_eq!(run.end(at(5)), Some(End::Silent));
+        assert_eq!(run.end(at(5)), Some(RunEnd::Silent));
         state(&mut run, 1, "Halted", 0.0, 6);
         assert_eq!(run.end(at(6)), None, "its result may be late");
         state(&mut run, 1, "Halted", 0.0, 9);
-        assert_eq!(run.end(at(9)), Some(End::NoResult));
-        let mut other = Run::new(1, at(0));
+        assert_eq!(run.end(at(9)), Some(RunEnd::NoResult));
+        let mut other = FollowedRun::new(1, at(0));
         state(&mut other, 2, "Running", 0.0, 1);
         state(&mut other, 2, "Running", 0.0, 4);
-        assert_eq!(other.end(at(4)), Some(End::Overtaken));
+        assert_eq!(other.end(at(4)), Some(RunEnd::Overtaken));
     }
 }

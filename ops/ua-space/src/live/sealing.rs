@@ -4,7 +4,7 @@ use std::path::Path;
 
 use uadp::{NetworkMessage, Seal, Sealer, SecurityMode};
 
-use crate::exit::Failure;
+use crate::exit::CommandFailure;
 use crate::keys::{self, KeyFile};
 use crate::report::warn;
 
@@ -19,7 +19,7 @@ pub(crate) struct Sealing {
 }
 
 impl Sealing {
-    pub(crate) fn read(path: &Path, signs_only: bool) -> Result<Self, Failure> {
+    pub(crate) fn read(path: &Path, signs_only: bool) -> Result<Self, CommandFailure> {
         let file = KeyFile::read(path, warn)?;
         let mode = if signs_only {
             SecurityMode::Sign
@@ -27,12 +27,12 @@ impl Sealing {
             SecurityMode::SignAndEncrypt
         };
         let mut sealer = Sealer::new(mode);
-        let (token_id, first) = file
-            .first()
-            .ok_or_else(|| Failure::Data(format!("{}: there is no key in it", file.name())))?;
+        let (token_id, first) = file.first().ok_or_else(|| {
+            CommandFailure::Data(format!("{}: there is no key in it", file.name()))
+        })?;
         sealer
             .update_keys(token_id, [first.clone()])
-            .map_err(|error| Failure::Data(format!("{}: {error}", file.name())))?;
+            .map_err(|error| CommandFailure::Data(format!("{}: {error}", file.name())))?;
         let mut mark = [0; 4];
         keys::random(&mut mark)?;
         Ok(Self {

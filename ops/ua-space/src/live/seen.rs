@@ -6,19 +6,19 @@ use std::net::SocketAddr;
 use mappings::TopicId;
 use serde::Serialize;
 
-use super::book::{Kind, News};
+use super::book::{DatagramContent, NameKind};
 use super::list::quality_name;
-use super::{Application, Go, Live, until, utc};
-use crate::arguments::Group;
-use crate::exit::Failure;
+use super::{AnnouncedProgram, Go, Live, until, utc};
+use crate::arguments::GroupArguments;
+use crate::exit::CommandFailure;
 
 /// The contents of a group after some time of listening.
 pub(crate) struct Listened {
     pub(crate) group: String,
     /// The announced applications, by space and address.
-    pub(crate) applications: BTreeMap<(u16, String), Application>,
+    pub(crate) applications: BTreeMap<(u16, String), AnnouncedProgram>,
     pub(crate) topics: Vec<TopicSeen>,
-    pub(crate) senders: Vec<Timing>,
+    pub(crate) senders: Vec<SenderTiming>,
     /// Messages that were discarded, by reason.
     pub(crate) dropped: BTreeMap<String, u64>,
 }
@@ -40,7 +40,7 @@ pub(crate) struct TopicSeen {
 
 /// The delay of messages from a sender.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize)]
-pub(crate) struct Timing {
+pub(crate) struct SenderTiming {
     pub(crate) from: String,
     /// The shortest time from sending to arrival, in microseconds. A negative time, or a long time
     /// of all messages, shows that the clocks differ.
@@ -51,15 +51,18 @@ pub(crate) struct Timing {
 ///
 /// # Errors
 /// The group or its interface is not available.
-pub(crate) async fn listened(group: &Group, seconds: f64) -> Result<Listened, Failure> {
+pub(crate) async fn listened(
+    group: &GroupArguments,
+    seconds: f64,
+) -> Result<Listened, CommandFailure> {
     let mut live = Live::join(group)?;
     live.want_all();
     live.want_calls(super::list::FIRST_ASKED);
     let end = until(live.now(), Some(seconds));
     let start = live.start_utc();
     let mut senders: BTreeMap<SocketAddr, i128> = BTreeMap::new();
-    let mut each = |news: News<'_>, now: std::time::Duration| {
-        if let News::Sample(sample) = &news
+    let mut each = |news: DatagramContent<'_>, now: std::time::Duration| {
+        if let DatagramContent::Sample(sample) = &news
             && let Some(sent) = sample.sent()
             && (senders.len() < MOST_SENDERS || senders.contains_key(&sample.from))
         {
@@ -70,7 +73,7 @@ pub(crate) async fn listened(group: &Group, seconds: f64) -> Result<Listened, Fa
         Go::On
     };
     live.listen(end, &mut each).await?;
-    let timing = |(from, nanos): (SocketAddr, i128)| Timing {
+    let timing = |(from, nanos): (SocketAddr, i128)| SenderTiming {
         from: from.to_string(),
         shortest_delay_us: i64::try_from(nanos / 1_000).unwrap_or(i64::MAX),
     };
@@ -88,7 +91,7 @@ pub(crate) async fn listened(group: &Group, seconds: f64) -> Result<Listened, Fa
 fn topics(live: &Live) -> Vec<TopicSeen> {
     let mut types: BTreeMap<TopicId, BTreeSet<String>> = BTreeMap::new();
     for (topic, kind, described, _) in live.book.all_announced() {
-        if kind == Kind::Value {
+        if kind == NameKind::Value {
             types.entry(topic).or_default().insert(described.summary());
         }
     }

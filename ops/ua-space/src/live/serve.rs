@@ -13,26 +13,26 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Duration;
 
-use bridge_node::Environment;
+use bridge_node::RosEnvironment;
 use tokio::net::TcpListener;
 
 use self::assets::Assets;
-use self::hub::{Hub, Publication};
-use super::book::{Kind, News};
-use super::channels::{Channels, Unfit, is_value};
+use self::hub::{Publication, ViewerHub};
+use super::book::{DatagramContent, NameKind};
+use super::channels::{ChannelMismatch, TopicChannels, is_value};
 use super::copies::Copies;
-use super::robot::Model;
+use super::robot::RobotModelMessage;
 use super::{Go, in_group, until, utc};
 use crate::arguments::Viewers;
-use crate::exit::Failure;
+use crate::exit::CommandFailure;
 use crate::report::warn;
 
 /// Runs `ua-space live`.
-pub(crate) fn serve(arguments: &Viewers) -> Result<(), Failure> {
+pub(crate) fn serve(arguments: &Viewers) -> Result<(), CommandFailure> {
     in_group(&arguments.group, async |mut live| {
         let address = SocketAddr::new(arguments.host, arguments.port);
         let listener = TcpListener::bind(address).await.map_err(|error| {
-            Failure::Unavailable(format!(
+            CommandFailure::Unavailable(format!(
                 "cannot listen at {address}: {error}\n  = help: is another viewer server running? --port names another port"
             ))
         })?;
@@ -42,10 +42,10 @@ pub(crate) fn serve(arguments: &Viewers) -> Result<(), Failure> {
                 "every host that reaches {address} sees all values, without sign-in"
             ));
         }
-        let assets = Assets::new(Environment::from_env());
-        let hub = Arc::new(Hub::new(live.group(), assets));
+        let assets = Assets::new(RosEnvironment::from_env());
+        let hub = Arc::new(ViewerHub::new(live.group(), assets));
         let start = live.start_utc();
-        let mut channels = Channels::new();
+        let mut channels = TopicChannels::new();
         let mut copies = Copies::default();
         for source in &arguments.models.model {
             let model = source.load().await?;
@@ -58,10 +58,10 @@ pub(crate) fn serve(arguments: &Viewers) -> Result<(), Failure> {
         ));
         writeln!(io::stdout(), "{} at ws://{address}", live.group())?;
         let end = until(live.now(), arguments.seconds);
-        let mut each = |news: News<'_>, now: Duration| {
+        let mut each = |news: DatagramContent<'_>, now: Duration| {
             let is_copy = match &news {
-                News::Sample(sample) => copies.is_copy(sample, now),
-                News::Announced { .. } | News::Response(..) => false,
+                DatagramContent::Sample(sample) => copies.is_copy(sample, now),
+                DatagramContent::Announced { .. } | DatagramContent::Response(..) => false,
             };
             if !is_copy {
                 take(&news, (&mut channels, &hub), (start, now));
@@ -84,7 +84,7 @@ pub(crate) fn serve(arguments: &Viewers) -> Result<(), Failure> {
 }
 
 /// Offers the model of a robot, which does not change.
-fn offer(model: &Model, (channels, hub): (&mut Channels, &Hub), now: i128) {
+fn offer(model: &RobotModelMessage, (channels, hub): (&mut TopicChannels, &ViewerHub), now: i128) {
     match channels.of_model(model) {
         Ok(channel) => {
             let time = u64::try_from(now).unwrap_or_default();
@@ -95,24 +95,28 @@ fn offer(model: &Model, (channels, hub): (&mut Channels, &Hub), now: i128) {
 }
 
 /// Handles a value or description of the group.
-fn take(news: &News<'_>, (channels, hub): (&mut Channels, &Hub), (start, now): (i128, Duration)) {
+fn take(
+    news: &DatagramContent<'_>,
+    (channels, hub): (&mut TopicChannels, &ViewerHub),
+    (start, now): (i128, Duration),
+) {
     let (topic, described) = match news {
-        News::Sample(sample) => (sample.topic, sample.described.as_ref()),
-        News::Announced {
+        DatagramContent::Sample(sample) => (sample.topic, sample.described.as_ref()),
+        DatagramContent::Announced {
             topic,
-            kind: Kind::Value,
+            kind: NameKind::Value,
             described,
             ..
         } => (*topic, Some(*described)),
-        News::Announced { .. } | News::Response(..) => return,
+        DatagramContent::Announced { .. } | DatagramContent::Response(..) => return,
     };
     let channel = match channels.channel(topic, described, now) {
         Ok(channel) => channel,
-        Err(Unfit::Undescribed) => return,
+        Err(ChannelMismatch::Undescribed) => return,
         Err(unfit) => return hub.leave_out(unfit),
     };
     hub.offer(Some(topic), &channel);
-    let News::Sample(sample) = news else {
+    let DatagramContent::Sample(sample) = news else {
         return;
     };
     let message = &sample.message;

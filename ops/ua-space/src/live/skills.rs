@@ -17,14 +17,14 @@ use mappings::TopicId;
 use serde::Serialize;
 use uadp::MessageKind;
 
-use super::book::{Book, News};
-use super::described::{Described, Field};
+use super::book::{Book, DatagramContent};
+use super::described::{AnnouncedDescription, AnnouncedField};
 use super::list::json;
-use super::plain::{self, Named};
-use super::text::{Table, age, is_coloured};
-use super::{Ended, Go, Live, in_group, until};
-use crate::arguments::{Group, ListSkills, Skills, SkillsVerb};
-use crate::exit::Failure;
+use super::plain::{self, NamedValues};
+use super::text::{TextTable, age, is_coloured};
+use super::{Go, ListenEnd, Live, in_group, until};
+use crate::arguments::{GroupArguments, ListSkills, Skills, SkillsVerb};
+use crate::exit::CommandFailure;
 
 /// The suffix of the name of a state, after `<component>.<skill>`.
 const STATE: &str = ".State";
@@ -35,7 +35,7 @@ const RESULT: &str = ".Result";
 const METHODS: [&str; 5] = ["Start", "Halt", "Suspend", "Resume", "Reset"];
 
 /// Runs `ua-space skills`.
-pub(crate) fn skills(arguments: &Skills) -> Result<(), Failure> {
+pub(crate) fn skills(arguments: &Skills) -> Result<(), CommandFailure> {
     match &arguments.verb {
         None => list(&arguments.list),
         Some(SkillsVerb::List(arguments)) => list(arguments),
@@ -45,7 +45,7 @@ pub(crate) fn skills(arguments: &Skills) -> Result<(), Failure> {
     }
 }
 
-fn list(arguments: &ListSkills) -> Result<(), Failure> {
+fn list(arguments: &ListSkills) -> Result<(), CommandFailure> {
     in_group(&arguments.group, async |mut live| {
         let (mut found, _) = hear(&mut live, arguments.seconds, &|_| false).await?;
         if let Some(what) = &arguments.what {
@@ -80,19 +80,19 @@ async fn hear(
     live: &mut Live,
     seconds: f64,
     enough: &dyn Fn(&[Skill]) -> bool,
-) -> Result<(Vec<Skill>, Ended), Failure> {
+) -> Result<(Vec<Skill>, ListenEnd), CommandFailure> {
     live.want_calls([0]);
     let mut states = States::default();
     let end = until(live.now(), Some(seconds));
     loop {
         let next = (live.now() + LOOK).min(end);
-        let each = &mut |news: News<'_>, _| {
+        let each = &mut |news: DatagramContent<'_>, _| {
             states.take(&news);
             Go::On
         };
         let ended = live.listen(next, each).await?;
         let found = find(&live.book, &states, live.now());
-        if ended == Ended::Interrupted || live.now() >= end || enough(&found) {
+        if ended == ListenEnd::Interrupted || live.now() >= end || enough(&found) {
             return Ok((found, ended));
         }
     }
@@ -100,7 +100,7 @@ async fn hear(
 
 /// Returns the names that `call` accepts and that are received within a short time: skills, calls
 /// and topics.
-pub(crate) fn heard_names(group: &Group) -> Result<HeardNames, Failure> {
+pub(crate) fn heard_names(group: &GroupArguments) -> Result<HeardNames, CommandFailure> {
     in_group(group, async |mut live| {
         live.want_all();
         let (found, _) = hear(&mut live, FOR_NAMES, &|_| false).await?;
@@ -141,12 +141,12 @@ pub(crate) struct HeardNames {
 
 /// The last states and results of skills.
 #[derive(Default)]
-struct States(BTreeMap<TopicId, Named>);
+struct States(BTreeMap<TopicId, NamedValues>);
 
 impl States {
     /// Stores a state or result. A value received before its name is recognized by its identifier.
-    fn take(&mut self, news: &News<'_>) {
-        let News::Sample(sample) = news else {
+    fn take(&mut self, news: &DatagramContent<'_>) {
+        let DatagramContent::Sample(sample) = news else {
             return;
         };
         let described = sample.described.as_deref();
@@ -167,7 +167,7 @@ impl States {
     }
 
     /// Returns the state or result of a skill, with the names known at this time.
-    fn of(&self, topic: TopicId, described: &Described) -> Option<Named> {
+    fn of(&self, topic: TopicId, described: &AnnouncedDescription) -> Option<NamedValues> {
         let mut state = self.0.get(&topic)?.clone();
         state.rename(described.fields());
         Some(state)
@@ -196,10 +196,10 @@ struct Skill {
     takes: Option<String>,
     /// The result of the last run.
     #[serde(skip)]
-    result: Option<Named>,
+    result: Option<NamedValues>,
     /// The parameters of Start.
     #[serde(skip)]
-    parameters: Vec<Field>,
+    parameters: Vec<AnnouncedField>,
 }
 
 impl Skill {
@@ -270,8 +270,8 @@ fn result_of(state: TopicId) -> Option<TopicId> {
 
 const HEAD: [&str; 6] = ["COMPONENT", "SKILL", "TYPE", "STATE", "RUN", "CALL"];
 
-fn table(skills: &[Skill]) -> Table {
-    let mut table = Table::new(HEAD.map(str::to_owned)).yielding([5, 2]);
+fn table(skills: &[Skill]) -> TextTable {
+    let mut table = TextTable::new(HEAD.map(str::to_owned)).yielding([5, 2]);
     for skill in skills {
         let dash = || "-".to_owned();
         let silent = Duration::try_from_secs_f64(skill.age_s).unwrap_or_default();

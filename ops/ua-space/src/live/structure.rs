@@ -2,16 +2,16 @@
 
 use serde_json::{Map, Value};
 use uadp::discovery::{DataTypeSchemaHeader, StructureField, StructureType};
-use uadp::{BuiltinType, DecodeError, ExtensionBody, Identifier, NodeId, Scalar, StructureReader};
+use uadp::{BuiltinType, DecodeError, ExtensionBody, NodeId, NodeIdValue, Scalar, StructureReader};
 
 use super::plain;
 
 /// The fields of a structure, including nested structures.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) struct Structure(Vec<Part>);
+pub(crate) struct StructureFields(Vec<StructurePart>);
 
 #[derive(Debug, Clone, PartialEq, Eq)]
-struct Part {
+struct StructurePart {
     name: String,
     kind: Kind,
     is_array: bool,
@@ -20,10 +20,10 @@ struct Part {
 #[derive(Debug, Clone, PartialEq, Eq)]
 enum Kind {
     Builtin(BuiltinType),
-    Structure(Structure),
+    Structure(StructureFields),
 }
 
-impl Structure {
+impl StructureFields {
     /// Returns the structure of a DataType; `None` if the schema does not define it or it exceeds a
     /// limit. `room` is the remaining number of fields, including the fields of nested structures,
     /// because a short schema can define any number of them.
@@ -47,7 +47,7 @@ impl Structure {
         }
         *room = room.checked_sub(found.fields.len())?;
         let parts = found.fields.iter().map(|field| {
-            Some(Part {
+            Some(StructurePart {
                 name: field.name.unwrap_or_default().to_owned(),
                 kind: match builtin(&field) {
                     Some(builtin) => Kind::Builtin(builtin),
@@ -65,12 +65,12 @@ impl Structure {
 
     /// Returns the approximate size in bytes.
     pub(super) fn weight(&self) -> usize {
-        let of = |part: &Part| {
+        let of = |part: &StructurePart| {
             let inner = match &part.kind {
                 Kind::Builtin(_) => 0,
                 Kind::Structure(structure) => structure.weight(),
             };
-            size_of::<Part>() + part.name.len() + inner
+            size_of::<StructurePart>() + part.name.len() + inner
         };
         self.0.iter().map(of).sum()
     }
@@ -114,7 +114,7 @@ impl Structure {
 /// Returns the builtin type of a field if its DataType is a builtin type.
 fn builtin(field: &StructureField<'_>) -> Option<BuiltinType> {
     match (field.data_type.namespace, field.data_type.identifier) {
-        (0, Identifier::Numeric(number)) => BuiltinType::from_id(number.try_into().ok()?),
+        (0, NodeIdValue::Numeric(number)) => BuiltinType::from_id(number.try_into().ok()?),
         _ => None,
     }
 }

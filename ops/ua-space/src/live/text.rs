@@ -4,14 +4,14 @@ use std::io::{self, IsTerminal as _, Write};
 
 /// A table that fits the terminal. Columns have the necessary width; if the table is too wide, the
 /// cells of its widest columns are shortened.
-pub(crate) struct Table {
+pub(crate) struct TextTable {
     head: Vec<String>,
     rows: Vec<Vec<String>>,
     /// The columns that give way first, in this order.
     yielding: Vec<usize>,
 }
 
-impl Table {
+impl TextTable {
     pub(crate) fn new(head: impl IntoIterator<Item = String>) -> Self {
         Self {
             head: head.into_iter().map(|name| harmless(&name)).collect(),
@@ -255,7 +255,7 @@ mod tests {
 
     #[test]
     fn columns_line_up_and_nothing_of_a_stranger_reaches_the_terminal() {
-        let mut table = Table::new(["TOPIC", "NAME"].map(str::to_owned));
+        let mut table = TextTable::new(["TOPIC", "NAME"].map(str::to_owned));
         table.row(["ua_1_2_10".to_owned(), "a\x1b[2Jb\n\u{202e}c".to_owned()]);
         table.row(["ua_1_2_1".to_owned(), "ü".to_owned()]);
         let mut out = Vec::new();
@@ -267,7 +267,7 @@ mod tests {
     #[test]
     fn a_wide_table_is_fitted_by_shortening_the_cells_that_matter_least() {
         let head = ["TOPIC", "NAME", "EMPTY", "TYPE"].map(str::to_owned);
-        let mut table = Table::new(head).yielding([3, 1]);
+        let mut table = TextTable::new(head).yielding([3, 1]);
         let cells = [
             "ua_0_7_101",
             "parallel-gripper.Grasp.State",
@@ -312,7 +312,9 @@ mod tests {
     #[test]
     fn a_pipe_gets_no_colour_and_a_terminal_a_bold_head() {
         let mut out = Vec::new();
-        Table::new(["A".to_owned()]).write(&mut out, true).unwrap();
+        TextTable::new(["A".to_owned()])
+            .write(&mut out, true)
+            .unwrap();
         assert_eq!(out, b"\x1b[1mA\x1b[0m\n");
     }
 }

@@ -11,25 +11,25 @@ use std::time::Duration;
 
 use crossterm::event::{self, Event, KeyCode, KeyEvent, KeyEventKind, KeyModifiers};
 
-use super::text::{Table, is_coloured};
-use super::{Ended, Go, Live, in_group, until};
+use super::text::{TextTable, is_coloured};
+use super::{Go, ListenEnd, Live, in_group, until};
 use crate::arguments::Top;
-use crate::cell::{Page, pages_of_this_host};
-use crate::exit::Failure;
+use crate::cell::{StatusPage, pages_of_this_host};
+use crate::exit::CommandFailure;
 pub(crate) use rows::Sort;
-use rows::{Figures, View};
+use rows::{Figures, TopView};
 
 /// Runs `ua-space top`.
-pub(crate) fn top(arguments: &Top) -> Result<(), Failure> {
+pub(crate) fn top(arguments: &Top) -> Result<(), CommandFailure> {
     in_group(&arguments.group, async |mut live| {
         live.want_all();
         live.want_calls(super::list::FIRST_ASKED);
-        let mut view = View::new(arguments.sort, arguments.filter.clone().unwrap_or_default());
+        let mut view = TopView::new(arguments.sort, arguments.filter.clone().unwrap_or_default());
         if !io::stdout().is_terminal() || !io::stdin().is_terminal() {
             return once(&mut live, arguments, &mut view).await;
         }
         let mut terminal = ratatui::try_init()
-            .map_err(|error| Failure::Io(format!("cannot use the terminal: {error}")))?;
+            .map_err(|error| CommandFailure::Io(format!("cannot use the terminal: {error}")))?;
         let ended = watch(&mut live, &mut terminal, (arguments, &mut view)).await;
         ratatui::restore();
         ended
@@ -37,12 +37,12 @@ pub(crate) fn top(arguments: &Top) -> Result<(), Failure> {
 }
 
 /// Prints a table after some time, for a pipe.
-async fn once(live: &mut Live, arguments: &Top, view: &mut View) -> Result<(), Failure> {
+async fn once(live: &mut Live, arguments: &Top, view: &mut TopView) -> Result<(), CommandFailure> {
     let mut figures = Figures::default();
     let seconds = arguments.seconds.unwrap_or(ONCE);
     let start = live.start_utc();
     let end = until(live.now(), Some(seconds));
-    let mut each = |news: super::book::News<'_>, now| {
+    let mut each = |news: super::book::DatagramContent<'_>, now| {
         figures.take(&news, (start, now));
         Go::On
     };
@@ -51,7 +51,7 @@ async fn once(live: &mut Live, arguments: &Top, view: &mut View) -> Result<(), F
     let now = live.now();
     figures.tick(now);
     let rows = view.rows(&figures, (live, now), &pages);
-    let mut table = Table::new(screen::HEAD.map(str::to_owned)).yielding([7, 1]);
+    let mut table = TextTable::new(screen::HEAD.map(str::to_owned)).yielding([7, 1]);
     for row in &rows {
         table.row(row.cells());
     }
@@ -65,25 +65,25 @@ async fn once(live: &mut Live, arguments: &Top, view: &mut View) -> Result<(), F
 async fn watch(
     live: &mut Live,
     terminal: &mut ratatui::DefaultTerminal,
-    (arguments, view): (&Top, &mut View),
-) -> Result<(), Failure> {
+    (arguments, view): (&Top, &mut TopView),
+) -> Result<(), CommandFailure> {
     let mut figures = Figures::default();
     let end = until(live.now(), arguments.seconds);
     let start = live.start_utc();
-    let mut pages: Vec<Page> = Vec::new();
+    let mut pages: Vec<StatusPage> = Vec::new();
     let mut asked = None;
-    let mut asking: Option<tokio::task::JoinHandle<Vec<Page>>> = None;
+    let mut asking: Option<tokio::task::JoinHandle<Vec<StatusPage>>> = None;
     let mut ticked = Duration::ZERO;
     loop {
         let next = (live.now() + STEP).min(end);
-        let mut each = |news: super::book::News<'_>, now| {
+        let mut each = |news: super::book::DatagramContent<'_>, now| {
             figures.take(&news, (start, now));
             Go::On
         };
         let ended = live.listen(next, &mut each).await?;
         let now = live.now();
         let is_changed = keys(view)?;
-        if view.is_over || ended == Ended::Interrupted || now >= end {
+        if view.is_over || ended == ListenEnd::Interrupted || now >= end {
             return Ok(());
         }
         if asked.is_none_or(|asked| now >= asked + PAGES) {
@@ -106,7 +106,7 @@ async fn watch(
             let group = live.group().to_string();
             terminal
                 .draw(|frame| screen::draw(frame, (view, &rows), &group))
-                .map_err(|error| Failure::Io(format!("cannot draw: {error}")))?;
+                .map_err(|error| CommandFailure::Io(format!("cannot draw: {error}")))?;
         }
     }
 }
@@ -116,8 +116,8 @@ async fn watch(
     clippy::wildcard_enum_match_arm,
     reason = "other events change nothing"
 )]
-fn keys(view: &mut View) -> Result<bool, Failure> {
-    let fault = |error: io::Error| Failure::Io(format!("cannot read keys: {error}"));
+fn keys(view: &mut TopView) -> Result<bool, CommandFailure> {
+    let fault = |error: io::Error| CommandFailure::Io(format!("cannot read keys: {error}"));
     let mut is_changed = false;
     while event::poll(Duration::ZERO).map_err(fault)? {
         match event::read().map_err(fault)? {
@@ -136,7 +136,7 @@ fn keys(view: &mut View) -> Result<bool, Failure> {
 }
 
 #[expect(clippy::wildcard_enum_match_arm, reason = "other keys do nothing")]
-fn press(view: &mut View, key: KeyEvent) {
+fn press(view: &mut TopView, key: KeyEvent) {
     if key.modifiers.contains(KeyModifiers::CONTROL) && key.code == KeyCode::Char('c') {
         view.is_over = true;
         return;
@@ -189,8 +189,9 @@ mod tests {
 
     #[test]
     fn keys_sort_filter_and_end() {
-        let mut view = View::new(Sort::Topic, String::new());
-        let type_in = |view: &mut View, code| press(view, KeyEvent::new(code, KeyModifiers::NONE));
+        let mut view = TopView::new(Sort::Topic, String::new());
+        let type_in =
+            |view: &mut TopView, code| press(view, KeyEvent::new(code, KeyModifiers::NONE));
         type_in(&mut view, KeyCode::Char('s'));
         assert_eq!(view.sort, Sort::Topic.next());
         type_in(&mut view, KeyCode::Char('/'));
@@ -201,7 +202,7 @@ mod tests {
         type_in(&mut view, KeyCode::Enter);
         type_in(&mut view, KeyCode::Char('q'));
         assert!(view.is_over);
-        let mut view = View::new(Sort::Topic, String::new());
+        let mut view = TopView::new(Sort::Topic, String::new());
         press(
             &mut view,
             KeyEvent::new(KeyCode::Char('c'), KeyModifiers::CONTROL),

@@ -25,20 +25,20 @@ use serde::Serialize;
 use uadp::MessageKind;
 
 use self::clocks::Estimate;
-use self::offsets::Offsets;
-use super::book::{News, Sample};
+use self::offsets::ClockOffsets;
+use super::book::{DatagramContent, ReceivedSample};
 use super::list::json;
-use super::text::{Table, is_coloured, micros};
+use super::text::{TextTable, is_coloured, micros};
 use super::{Go, in_group, until, utc};
 use crate::arguments::Trace;
 use crate::cell::{HopPage, page_of_url};
-use crate::exit::Failure;
-use crate::http::Server;
+use crate::exit::CommandFailure;
+use crate::http::HttpServer;
 use crate::report::warn;
 use crate::survey::look;
 
 /// Runs `ua-space trace`.
-pub(crate) fn trace(arguments: &Trace) -> Result<(), Failure> {
+pub(crate) fn trace(arguments: &Trace) -> Result<(), CommandFailure> {
     if let Some(target) = &arguments.follow {
         return follow::follow(arguments, target);
     }
@@ -50,17 +50,17 @@ pub(crate) fn trace(arguments: &Trace) -> Result<(), Failure> {
     }
     let seconds = arguments.seconds.unwrap_or(USUAL);
     for url in &arguments.metrics {
-        Server::parse(url)?;
+        HttpServer::parse(url)?;
     }
     let (mut topics, mut clocks) = (Vec::new(), Vec::new());
     if seconds > 0.0 {
         (topics, clocks) = in_group(&arguments.group, async |mut live| {
-            let mut delays = Delays::by(Offsets::watch(&arguments.metrics).await);
+            let mut delays = Delays::by(ClockOffsets::watch(&arguments.metrics).await);
             let end = until(live.now(), Some(seconds));
             let start = live.start_utc();
             let mut samples = Samples::of(arguments);
             live.listen(end, &mut |news, now| {
-                if let News::Sample(sample) = &news {
+                if let DatagramContent::Sample(sample) = &news {
                     samples.take(delays.take(sample, utc(start, now)));
                 }
                 Go::On
@@ -76,7 +76,7 @@ pub(crate) fn trace(arguments: &Trace) -> Result<(), Failure> {
             Ok((rows, delays.clocks.clocks()))
         })?;
     } else if arguments.perfetto.is_some() || arguments.svg.is_some() {
-        return Err(Failure::Usage(
+        return Err(CommandFailure::Usage(
             "--perfetto and --svg need samples: give another --seconds than 0".to_owned(),
         ));
     }
@@ -92,7 +92,7 @@ pub(crate) fn trace(arguments: &Trace) -> Result<(), Failure> {
     }
     print(arguments, &programs, &topics, &clocks)?;
     if is_missing {
-        Err(Failure::NotThere)
+        Err(CommandFailure::NotThere)
     } else {
         Ok(())
     }
@@ -156,7 +156,7 @@ impl Samples {
         arguments: &Trace,
         delays: &Delays,
         name_of: &dyn Fn(TopicId) -> Option<String>,
-    ) -> Result<(), Failure> {
+    ) -> Result<(), CommandFailure> {
         if let (Some(path), Some(kept)) = (&arguments.perfetto, &self.kept) {
             let (bytes, crowded) = perfetto::trace(kept, name_of);
             write_file(path, &bytes)?;
@@ -179,9 +179,10 @@ impl Samples {
     }
 }
 
-fn write_file(path: &Path, bytes: &[u8]) -> Result<(), Failure> {
+fn write_file(path: &Path, bytes: &[u8]) -> Result<(), CommandFailure> {
     let name = path.display();
-    fs::write(path, bytes).map_err(|error| Failure::Io(format!("cannot write {name}: {error}")))
+    fs::write(path, bytes)
+        .map_err(|error| CommandFailure::Io(format!("cannot write {name}: {error}")))
 }
 
 /// The measurements of a program.
@@ -193,10 +194,10 @@ struct Program {
 }
 
 /// Returns the measurements of a program in each space that it serves.
-async fn measured(url: &str) -> Result<Vec<Program>, Failure> {
+async fn measured(url: &str) -> Result<Vec<Program>, CommandFailure> {
     let pages = page_of_url(url).await?;
     if pages.iter().any(|page| page.hops.is_empty()) {
-        return Err(Failure::Data(format!("{url}/status has no hops")));
+        return Err(CommandFailure::Data(format!("{url}/status has no hops")));
     }
     let programs = pages.into_iter().map(|page| Program {
         program: page.program,
@@ -218,7 +219,7 @@ struct Row {
 }
 
 #[derive(Serialize)]
-struct Shown<'a> {
+struct SpanJson<'a> {
     programs: &'a [Program],
     topics: &'a [Row],
     #[serde(skip_serializing_if = "Vec::is_empty")]
@@ -251,7 +252,7 @@ impl ShownClock {
 struct Delays {
     topics: BTreeMap<TopicId, Topic>,
     /// The clocks of other hosts.
-    clocks: Offsets,
+    clocks: ClockOffsets,
 }
 
 #[derive(Default)]
@@ -272,7 +273,7 @@ struct Window {
 
 impl Delays {
     /// Returns no delays yet, to be corrected by these clocks.
-    fn by(clocks: Offsets) -> Self {
+    fn by(clocks: ClockOffsets) -> Self {
         Self {
             clocks,
             ..Self::default()
@@ -281,7 +282,7 @@ impl Delays {
 
     /// Records a message that arrived at the given time, in nanoseconds since 1970. Returns its
     /// times; `None` for a message without a value, and beyond the largest number of topics.
-    fn take(&mut self, sample: &Sample<'_>, arrived: i128) -> Option<Times> {
+    fn take(&mut self, sample: &ReceivedSample<'_>, arrived: i128) -> Option<Times> {
         if sample.message.kind == MessageKind::KeepAlive
             || (self.topics.len() >= MOST_TOPICS && !self.topics.contains_key(&sample.topic))
         {
@@ -377,10 +378,10 @@ fn print(
     programs: &[Program],
     topics: &[Row],
     clocks: &[(IpAddr, Estimate)],
-) -> Result<(), Failure> {
+) -> Result<(), CommandFailure> {
     let mut out = io::stdout().lock();
     if arguments.json {
-        let shown = Shown {
+        let shown = SpanJson {
             programs,
             topics,
             clocks: clocks.iter().map(ShownClock::of).collect(),
@@ -420,7 +421,7 @@ fn print(
     }
     if !clocks.is_empty() {
         let columns = ["HOST", "OFFSET", "WITHIN", "DRIFT PPM"];
-        let mut table = Table::new(columns.map(str::to_owned));
+        let mut table = TextTable::new(columns.map(str::to_owned));
         for (host, estimate) in clocks {
             let drift = estimate.drift_ppm.map(|drift| format!("{drift:+.1}"));
             table.row([
@@ -450,10 +451,10 @@ fn figures(hop: &HopPage) -> [String; 5] {
 }
 
 /// Returns a table of delays with columns before and behind the delays.
-fn head(first: &[&str], last: &[&str]) -> Table {
+fn head(first: &[&str], last: &[&str]) -> TextTable {
     let rest = ["P50", "P99", "MAX", "COUNT", "NEGATIVE"];
     let names = first.iter().chain(&rest).chain(last);
-    Table::new(names.map(|name| (*name).to_owned()))
+    TextTable::new(names.map(|name| (*name).to_owned()))
 }
 
 /// Returns the description of a hop.

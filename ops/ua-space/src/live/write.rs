@@ -15,18 +15,18 @@ use std::time::Duration;
 use mappings::{SpaceId, TopicId};
 use serde::Serialize;
 
-use super::application::Application;
-use super::book::{Kind, News};
-use super::described::Described;
+use super::application::AnnouncedProgram;
+use super::book::{DatagramContent, NameKind};
+use super::described::AnnouncedDescription;
 use super::list::json;
 use super::text::harmless;
-use super::{Ended, Go, Live, in_group, until};
+use super::{Go, ListenEnd, Live, in_group, until};
 use crate::arguments::Write;
-use crate::exit::Failure;
+use crate::exit::CommandFailure;
 use crate::survey::look;
 
 /// Runs `ua-space write`.
-pub(crate) fn write(arguments: &Write) -> Result<ExitCode, Failure> {
+pub(crate) fn write(arguments: &Write) -> Result<ExitCode, CommandFailure> {
     let found = in_group(&arguments.group, async |mut live| {
         find(&mut live, arguments).await
     })?;
@@ -44,7 +44,7 @@ pub(crate) fn write(arguments: &Write) -> Result<ExitCode, Failure> {
 #[derive(Debug)]
 struct ServedValue {
     topic: TopicId,
-    described: Arc<Described>,
+    described: Arc<AnnouncedDescription>,
     /// The URLs of the server, in the order in which they are tried.
     urls: Vec<String>,
 }
@@ -77,21 +77,21 @@ fn pace(arguments: &Write) -> (Option<Duration>, Option<u64>) {
 }
 
 /// Returns the value at its ua-server; `None` if no server has it.
-async fn find(live: &mut Live, arguments: &Write) -> Result<Option<ServedValue>, Failure> {
+async fn find(live: &mut Live, arguments: &Write) -> Result<Option<ServedValue>, CommandFailure> {
     live.want_all();
     let end = until(live.now(), Some(arguments.wait));
-    let mut ignored = |_: News<'_>, _| Go::On;
+    let mut ignored = |_: DatagramContent<'_>, _| Go::On;
     if arguments.mapping.is_some() && arguments.server.is_none() {
         // The mapping describes the value, so only a server is waited for.
         let first = end.min(live.now() + SERVERS_ANSWER);
-        if live.listen(first, &mut ignored).await? == Ended::Interrupted {
-            return Err(Failure::Interrupted);
+        if live.listen(first, &mut ignored).await? == ListenEnd::Interrupted {
+            return Err(CommandFailure::Interrupted);
         }
         if !has_server(live) {
             return Ok(None);
         }
     }
-    let target = (&arguments.target, Some(Kind::Value));
+    let target = (&arguments.target, Some(NameKind::Value));
     let Some(topic) = live.resolve(target, end, &mut ignored).await? else {
         return Ok(None);
     };
@@ -104,19 +104,19 @@ async fn find(live: &mut Live, arguments: &Write) -> Result<Option<ServedValue>,
         if now >= end {
             return Ok(None);
         }
-        if live.listen(end.min(now + STEP), &mut ignored).await? == Ended::Interrupted {
-            return Err(Failure::Interrupted);
+        if live.listen(end.min(now + STEP), &mut ignored).await? == ListenEnd::Interrupted {
+            return Err(CommandFailure::Interrupted);
         }
     }
 }
 
 /// Refuses values of other origins.
-fn is_origin_0(topic: TopicId, name: Option<&str>) -> Result<(), Failure> {
+fn is_origin_0(topic: TopicId, name: Option<&str>) -> Result<(), CommandFailure> {
     if topic.space == SpaceId::UA {
         return Ok(());
     }
     let (label, space) = (label(topic, name.unwrap_or_default()), topic.space);
-    Err(Failure::Usage(format!(
+    Err(CommandFailure::Usage(format!(
         "{label} is a value of ROS space {space}: its publisher writes it\n  = help: only values of \
          origin 0 are written here; publish this value in ROS"
     )))
@@ -127,16 +127,20 @@ fn has_server(live: &Live) -> bool {
     all.any(|((space, _), one)| *space == 0 && is_server(one))
 }
 
-fn is_server(application: &Application) -> bool {
+fn is_server(application: &AnnouncedProgram) -> bool {
     application.product_uri == SERVER
 }
 
 /// Returns the value at the server that announces it, or at the server `at`; `None` while the
 /// announcements are missing.
-fn served(live: &Live, topic: TopicId, at: Option<&str>) -> Result<Option<ServedValue>, Failure> {
+fn served(
+    live: &Live,
+    topic: TopicId,
+    at: Option<&str>,
+) -> Result<Option<ServedValue>, CommandFailure> {
     let all = live.book.all_announced();
-    let announced = all.filter(|(of, kind, ..)| (*of, *kind) == (topic, Kind::Value));
-    let announced: Vec<(Arc<Described>, SocketAddr)> = announced
+    let announced = all.filter(|(of, kind, ..)| (*of, *kind) == (topic, NameKind::Value));
+    let announced: Vec<(Arc<AnnouncedDescription>, SocketAddr)> = announced
         .map(|(_, _, described, from)| (Arc::clone(described), from))
         .collect();
     if let Some(url) = at {
@@ -171,7 +175,7 @@ fn served(live: &Live, topic: TopicId, at: Option<&str>) -> Result<Option<Served
     }
     match other {
         None => Ok(None),
-        Some((described, owner)) => Err(Failure::Failed(format!(
+        Some((described, owner)) => Err(CommandFailure::Failed(format!(
             "{} is a value of {owner}, which alone writes it: nothing was sent\n  = help: a value of a \
              skill changes by a call: `ua-space skills`",
             label(topic, &described.name)
@@ -181,7 +185,7 @@ fn served(live: &Live, topic: TopicId, at: Option<&str>) -> Result<Option<Served
 
 /// Returns the URLs of a server, and the URL at the address of its announcement, because a name in
 /// a URL may not resolve on this host.
-fn urls(application: &Application, from: SocketAddr) -> Vec<String> {
+fn urls(application: &AnnouncedProgram, from: SocketAddr) -> Vec<String> {
     let given = application.urls.iter();
     let mut urls: Vec<String> = given
         .filter(|url| url.starts_with("opc.tcp://"))
@@ -202,10 +206,10 @@ fn urls(application: &Application, from: SocketAddr) -> Vec<String> {
     urls
 }
 
-fn no_writer(arguments: &Write) -> Failure {
+fn no_writer(arguments: &Write) -> CommandFailure {
     let (target, wait) = (&arguments.target, arguments.wait);
     let target = harmless(&target.to_string());
-    Failure::Unavailable(format!(
+    CommandFailure::Unavailable(format!(
         "no ua-server announced the value {target} within {wait} s: nothing was sent\n  = help: is this \
          the group and the interface (--address, --interface)? Without a ua-server the mapping of the \
          cell is needed: `ua-space write --mapping cell.yaml {target} ..`"
@@ -234,7 +238,7 @@ struct Tally {
 
 #[derive(Serialize)]
 #[serde(rename_all = "camelCase")]
-struct Shown<'a> {
+struct WriteJson<'a> {
     topic: String,
     name: &'a str,
     by: &'a str,
@@ -250,7 +254,7 @@ impl Tally {
         (topic, name, by): (TopicId, &str, &str),
         written: &Written,
         shows: bool,
-    ) -> Result<(), Failure> {
+    ) -> Result<(), CommandFailure> {
         self.written += 1;
         let (outcome, reason) = match written {
             Written::Arrived => ("written", None),
@@ -262,7 +266,7 @@ impl Tally {
             self.why.clone_from(why);
         }
         if shows {
-            let shown = Shown {
+            let shown = WriteJson {
                 topic: topic.to_string(),
                 name,
                 by,
@@ -278,8 +282,8 @@ impl Tally {
                 let (label, unknown) = (label(topic, name), self.unknown);
                 // The earlier values may have arrived, so the command is more than refused.
                 Err(match unknown {
-                    0 => Failure::Failed(format!("{label}: {why}")),
-                    _ => Failure::Unavailable(format!(
+                    0 => CommandFailure::Failed(format!("{label}: {why}")),
+                    _ => CommandFailure::Unavailable(format!(
                         "{label}: {why}; whether {unknown} earlier values arrived is not known"
                     )),
                 })
@@ -289,14 +293,18 @@ impl Tally {
     }
 
     /// Prints the end for people, and returns an error if an outcome is unknown.
-    fn end(&self, (topic, name, by): (TopicId, &str, &str), is_json: bool) -> Result<(), Failure> {
+    fn end(
+        &self,
+        (topic, name, by): (TopicId, &str, &str),
+        is_json: bool,
+    ) -> Result<(), CommandFailure> {
         let (label, written, unknown) = (label(topic, name), self.written, self.unknown);
         if unknown > 0 {
             let count = match written {
                 1 => String::new(),
                 _ => format!("{unknown} of {written} values: "),
             };
-            return Err(Failure::Unavailable(format!(
+            return Err(CommandFailure::Unavailable(format!(
                 "{label}: {count}{}; whether it arrived is not known",
                 self.why
             )));
@@ -325,8 +333,8 @@ const MOST_URLS: usize = 4;
 mod tests {
     use super::*;
 
-    fn application(urls: &[&str]) -> Application {
-        Application {
+    fn application(urls: &[&str]) -> AnnouncedProgram {
+        AnnouncedProgram {
             uri: "urn:cell".to_owned(),
             product_uri: SERVER.to_owned(),
             name: "cell".to_owned(),
@@ -370,7 +378,7 @@ mod tests {
         let unknown = Written::Unknown("BadTimeout".to_owned());
         tally.take(at, &unknown, false).unwrap();
         let wrong = tally.end(at, true).unwrap_err();
-        assert!(matches!(wrong, Failure::Unavailable(_)), "{wrong:?}");
+        assert!(matches!(wrong, CommandFailure::Unavailable(_)), "{wrong:?}");
         assert!(
             wrong
                 .to_string()
@@ -379,7 +387,7 @@ mod tests {
         );
         let refused = Written::Refused("BadUserAccessDenied".to_owned());
         let wrong = tally.take(at, &refused, false).unwrap_err();
-        assert!(matches!(wrong, Failure::Unavailable(_)), "{wrong:?}");
+        assert!(matches!(wrong, CommandFailure::Unavailable(_)), "{wrong:?}");
         assert!(
             wrong
                 .to_string()
@@ -387,6 +395,6 @@ mod tests {
             "{wrong}"
         );
         let wrong = Tally::default().take(at, &refused, false).unwrap_err();
-        assert!(matches!(wrong, Failure::Failed(_)), "{wrong:?}");
+        assert!(matches!(wrong, CommandFailure::Failed(_)), "{wrong:?}");
     }
 }

@@ -10,8 +10,8 @@ use tokio::task::spawn_blocking;
 use uadp::{FieldEncoding, MessageKind, NetworkMessage, NetworkMessageType, Timestamp};
 
 use crate::exit;
-use crate::live::book::{Book, News, Sample};
-use crate::recorded::{Datagram, Recorded};
+use crate::live::book::{Book, DatagramContent, ReceivedSample};
+use crate::recorded::{RecordedDatagram, RecordingReader};
 use crate::report::warn;
 
 /// Shows the recording on the page. The file is read beside the page.
@@ -20,7 +20,8 @@ use crate::report::warn;
 /// The file cannot be read, or is no capture.
 pub(super) fn show(file: &Path, page: Arc<Page>) -> Result<(), Failure> {
     // A file that cannot be read ends the program at its start.
-    Recorded::open(file).map_err(|error| Failure::new(FailureKind::Io, error.to_string()))?;
+    RecordingReader::open(file)
+        .map_err(|error| Failure::new(FailureKind::Io, error.to_string()))?;
     let name = file.file_name().unwrap_or_default().to_string_lossy();
     page.show_recording(&name);
     let file = PathBuf::from(file);
@@ -33,9 +34,9 @@ pub(super) fn show(file: &Path, page: Arc<Page>) -> Result<(), Failure> {
 }
 
 /// Reads the descriptions first, so that all values have their names.
-fn read(file: &Path, page: &Page) -> Result<(), exit::Failure> {
+fn read(file: &Path, page: &Page) -> Result<(), exit::CommandFailure> {
     let mut first = None;
-    let mut recorded = Recorded::open(file)?;
+    let mut recorded = RecordingReader::open(file)?;
     while let Some(datagram) = recorded.next()? {
         let begin = *first.get_or_insert(datagram.time);
         let is_announcement = NetworkMessage::decode(&datagram.bytes)
@@ -45,7 +46,7 @@ fn read(file: &Path, page: &Page) -> Result<(), exit::Failure> {
         }
     }
     let mut book = Book::new();
-    let mut recorded = Recorded::open(file)?;
+    let mut recorded = RecordingReader::open(file)?;
     while let (Some(datagram), Some(begin)) = (recorded.next()?, first) {
         let Ok(message) = NetworkMessage::decode(&datagram.bytes) else {
             continue;
@@ -56,7 +57,7 @@ fn read(file: &Path, page: &Page) -> Result<(), exit::Failure> {
             continue;
         }
         book.handle((&message, datagram.from), at.0, &mut |news| {
-            if let News::Sample(sample) = news {
+            if let DatagramContent::Sample(sample) = news {
                 value(page, &sample, at);
             }
         });
@@ -65,7 +66,7 @@ fn read(file: &Path, page: &Page) -> Result<(), exit::Failure> {
 }
 
 /// Shows a value in Variant encoding; values in other encodings are left out.
-fn value(page: &Page, sample: &Sample<'_>, at: (Duration, Timestamp)) {
+fn value(page: &Page, sample: &ReceivedSample<'_>, at: (Duration, Timestamp)) {
     let message = &sample.message;
     let is_value = matches!(message.kind, MessageKind::KeyFrame | MessageKind::Event);
     if !is_value || message.encoding() != FieldEncoding::Variant || !message.is_valid() {
@@ -82,7 +83,7 @@ fn value(page: &Page, sample: &Sample<'_>, at: (Duration, Timestamp)) {
 }
 
 /// Returns the time since the first datagram, and the time of the day.
-fn time(datagram: &Datagram, begin: i128) -> (Duration, Timestamp) {
+fn time(datagram: &RecordedDatagram, begin: i128) -> (Duration, Timestamp) {
     let since = u64::try_from(datagram.time - begin).unwrap_or_default();
     let utc = Timestamp::from_unix_nanos(datagram.time);
     (Duration::from_nanos(since), utc)

@@ -4,23 +4,24 @@ use serde_json::{Map, Value, json};
 use uadp::{BuiltinType, DataSetHeader, DataValue, Fields, NetworkMessageEncoder, StatusCode};
 use uadp::{EncodeError, Variant};
 
-use super::values::Unusable;
+use super::values::UnusableValue;
 use crate::live::channels::DELTA;
-use crate::live::described::Field;
+use crate::live::described::AnnouncedField;
 use crate::live::plain;
-use crate::values::{FieldValue, variant_bytes};
+use crate::values::{JsonFieldValue, variant_bytes};
 
 /// Writes the fields of a value into a message. A value has a name for each field, and
 /// `NAME.status` for the quality of a field that is not Good.
 ///
 /// # Errors
-/// [`Unusable`]; discard the message in this case.
+/// [`UnusableValue`]; discard the message in this case.
 pub(super) fn write(
     data: &[u8],
-    fields: &[Field],
+    fields: &[AnnouncedField],
     (header, writer): (&DataSetHeader, &mut NetworkMessageEncoder<'_>),
-) -> Result<(), Unusable> {
-    let named: Map<String, Value> = serde_json::from_slice(data).map_err(|_| Unusable::Mismatch)?;
+) -> Result<(), UnusableValue> {
+    let named: Map<String, Value> =
+        serde_json::from_slice(data).map_err(|_| UnusableValue::Mismatch)?;
     let is_delta = named.get(DELTA) == Some(&Value::Bool(true));
     let mut block = Vec::new();
     let mut given = Vec::new();
@@ -42,13 +43,13 @@ pub(super) fn write(
     }
     // Further names are of another description.
     if keys != named.len() {
-        return Err(Unusable::Mismatch);
+        return Err(UnusableValue::Mismatch);
     }
-    let count = u16::try_from(given.len()).map_err(|_| Unusable::Mismatch)?;
+    let count = u16::try_from(given.len()).map_err(|_| UnusableValue::Mismatch)?;
     let block = [&count.to_le_bytes()[..], &block].concat();
-    let values = Fields::parse(&block).map_err(|_| Unusable::Mismatch)?;
+    let values = Fields::parse(&block).map_err(|_| UnusableValue::Mismatch)?;
     let values: Result<Vec<_>, _> = values.collect();
-    let values = values.map_err(|_| Unusable::Mismatch)?;
+    let values = values.map_err(|_| UnusableValue::Mismatch)?;
     let each = || given.iter().copied().zip(&values);
     let written = match (is_delta, given.iter().any(|(_, status)| status.is_some())) {
         (false, false) => writer.key_frame(header).and_then(|mut frame| {
@@ -63,7 +64,7 @@ pub(super) fn write(
         }),
         (is_delta, true) => data_values((header, writer), is_delta, each()),
     };
-    written.map_err(|_| Unusable::Mismatch)
+    written.map_err(|_| UnusableValue::Mismatch)
 }
 
 /// Writes values with their quality.
@@ -93,10 +94,10 @@ fn data_values<'a>(
 }
 
 /// Returns the Variant of a field.
-fn variant(field: &Field, value: &Value) -> Result<Vec<u8>, Unusable> {
+fn variant(field: &AnnouncedField, value: &Value) -> Result<Vec<u8>, UnusableValue> {
     let is_typed = field.structure.is_none() && field.builtin != Some(BuiltinType::Variant);
     let builtin = field.builtin.filter(|_| is_typed || value.is_null());
-    let builtin = builtin.ok_or(Unusable::Untyped)?;
+    let builtin = builtin.ok_or(UnusableValue::Untyped)?;
     let mut dimensions = None;
     let value = match (value, field.rank) {
         (Value::Array(_), 2..) => {
@@ -119,13 +120,13 @@ fn variant(field: &Field, value: &Value) -> Result<Vec<u8>, Unusable> {
         builtin,
         BuiltinType::String | BuiltinType::ByteString | BuiltinType::XmlElement
     );
-    let shown = FieldValue {
+    let shown = JsonFieldValue {
         ua_type: (!value.is_null() || is_text && !field.is_array()).then_some(builtin.id()),
         value: Some(value),
         dimensions,
-        ..FieldValue::default()
+        ..JsonFieldValue::default()
     };
-    variant_bytes(&shown).map_err(|_| Unusable::Mismatch)
+    variant_bytes(&shown).map_err(|_| UnusableValue::Mismatch)
 }
 
 /// Returns a single value in the form with which it is encoded.
@@ -150,8 +151,8 @@ fn flat(nested: &Value) -> (Value, Vec<u32>) {
 }
 
 /// Reads a StatusCode.
-fn quality(shown: &Value) -> Result<StatusCode, Unusable> {
+fn quality(shown: &Value) -> Result<StatusCode, UnusableValue> {
     let code = shown.as_u64().or_else(|| shown.get("Code")?.as_u64());
     let code = code.and_then(|code| u32::try_from(code).ok());
-    code.map(StatusCode).ok_or(Unusable::Mismatch)
+    code.map(StatusCode).ok_or(UnusableValue::Mismatch)
 }

@@ -9,37 +9,37 @@ use crate::capture::CaptureError;
 
 /// Reads the messages of a file.
 #[derive(Debug)]
-pub(super) struct Mcap<R> {
+pub(super) struct McapReader<R> {
     reader: R,
     /// Number of bytes read so far.
     at: u64,
     /// The records of the current chunk, and the number of its bytes that are read.
     chunk: Vec<u8>,
     chunk_at: usize,
-    schemas: BTreeMap<u16, Arc<Schema>>,
-    channels: BTreeMap<u16, Arc<Channel>>,
+    schemas: BTreeMap<u16, Arc<McapSchema>>,
+    channels: BTreeMap<u16, Arc<McapChannel>>,
     /// The size of all schemas and channels.
     weight: usize,
 }
 
 /// The definition of the messages of a channel.
 #[derive(Debug, Default, PartialEq, Eq)]
-pub(super) struct Schema {
+pub(super) struct McapSchema {
     pub(super) data: Vec<u8>,
 }
 
 /// A channel with its schema.
 #[derive(Debug, Default, PartialEq, Eq)]
-pub(super) struct Channel {
+pub(super) struct McapChannel {
     pub(super) encoding: String,
     pub(super) metadata: BTreeMap<String, String>,
-    pub(super) schema: Arc<Schema>,
+    pub(super) schema: Arc<McapSchema>,
 }
 
 /// A message, and its channel.
 #[derive(Debug, PartialEq, Eq)]
-pub(super) struct Message {
-    pub(super) channel: Arc<Channel>,
+pub(super) struct McapMessage {
+    pub(super) channel: Arc<McapChannel>,
     pub(super) channel_id: u16,
     pub(super) sequence: u32,
     /// The time of arrival, in nanoseconds since 1970.
@@ -54,7 +54,7 @@ pub(crate) const fn is_mcap(start: [u8; 4]) -> bool {
     matches!(start, [0x89, b'M', b'C', b'A'])
 }
 
-impl<R: Read> Mcap<R> {
+impl<R: Read> McapReader<R> {
     /// Reads the start of a file; `reader` returns the bytes after the first four.
     pub(super) fn new(reader: R) -> Result<Self, CaptureError> {
         let mut mcap = Self {
@@ -80,7 +80,7 @@ impl<R: Read> Mcap<R> {
 
     /// Returns the next message, or `None` at the end of the data. A file that ends after a whole
     /// record without the end of an MCAP file is read up to there.
-    pub(super) fn next_message(&mut self) -> Result<Option<Message>, CaptureError> {
+    pub(super) fn next_message(&mut self) -> Result<Option<McapMessage>, CaptureError> {
         loop {
             let at = self.at;
             let Some((kind, body)) = self.record()? else {
@@ -108,7 +108,7 @@ impl<R: Read> Mcap<R> {
         let _encoding = body.text()?;
         let data = body.sized()?.to_vec();
         self.weigh(data.len())?;
-        let before = self.schemas.insert(id, Arc::new(Schema { data }));
+        let before = self.schemas.insert(id, Arc::new(McapSchema { data }));
         self.weight -= before.map_or(0, |before| before.data.len());
         Ok(())
     }
@@ -125,7 +125,7 @@ impl<R: Read> Mcap<R> {
             metadata.insert(key, pairs.text()?);
         }
         let schema = self.schemas.get(&schema).cloned().unwrap_or_default();
-        let channel = Channel {
+        let channel = McapChannel {
             encoding,
             metadata,
             schema,
@@ -142,10 +142,10 @@ impl<R: Read> Mcap<R> {
         Ok(())
     }
 
-    fn message(&self, body: &mut Body<'_>) -> Result<Message, &'static str> {
+    fn message(&self, body: &mut Body<'_>) -> Result<McapMessage, &'static str> {
         let channel_id = body.u16()?;
         let channel = self.channels.get(&channel_id);
-        Ok(Message {
+        Ok(McapMessage {
             channel: Arc::clone(channel.ok_or("a message without a channel")?),
             channel_id,
             sequence: body.u32()?,
@@ -355,7 +355,7 @@ mod tests {
     fn read(records: &[Vec<u8>]) -> Result<Vec<Vec<u8>>, String> {
         let mut file = b"P0\r\n".to_vec();
         file.extend(records.concat());
-        let mut mcap = Mcap::new(file.as_slice()).map_err(|error| error.to_string())?;
+        let mut mcap = McapReader::new(file.as_slice()).map_err(|error| error.to_string())?;
         let mut all = Vec::new();
         loop {
             match mcap.next_message() {
@@ -406,6 +406,6 @@ mod tests {
         let mut mcap = [MESSAGE].to_vec();
         mcap.extend(u64::MAX.to_le_bytes());
         assert!(read(&[mcap]).unwrap_err().contains("longer"));
-        assert!(Mcap::new(&b"P1\r\n"[..]).is_err());
+        assert!(McapReader::new(&b"P1\r\n"[..]).is_err());
     }
 }

@@ -10,34 +10,34 @@ use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD as BASE64;
 use bridge_core::encode_fields;
 use mappings::TopicId;
-use messages::{Dialect, Plan, Registry, TypeName};
-use uadp::discovery::{Announced, Announcement};
+use messages::{Dialect, MessagePlan, TypeName, TypeRegistry};
+use uadp::discovery::{AnnouncedContent, Announcement};
 use uadp::{
-    ChunkBudget, Chunks, DataSetHeader, Extras, GroupHeader, NetworkHeader, NetworkMessage,
+    ChunkBudget, ChunkEncoder, DataSetHeader, Extras, GroupHeader, NetworkHeader, NetworkMessage,
     NetworkMessageEncoder, NetworkMessageType, PublisherId, Scalar, Timestamp, Whole,
 };
 
-use super::mcap::{Channel, Mcap, Message};
-use super::{Datagram, json};
+use super::mcap::{McapChannel, McapMessage, McapReader};
+use super::{RecordedDatagram, json};
 use crate::capture::CaptureError;
 use crate::live::channels::{ANNOUNCEMENT, ros_plan};
-use crate::live::described::{Described, topic_of};
+use crate::live::described::{AnnouncedDescription, topic_of};
 use crate::messages as parts;
 
 /// Reads the messages of a recording of values.
-pub(super) struct Values<R> {
-    mcap: Mcap<R>,
+pub(super) struct RecordedValues<R> {
+    mcap: McapReader<R>,
     channels: BTreeMap<u16, Rebuilt>,
     /// Datagrams of the last value that are not read yet.
-    ready: VecDeque<Datagram>,
-    unusable: BTreeMap<Unusable, u64>,
+    ready: VecDeque<RecordedDatagram>,
+    unusable: BTreeMap<UnusableValue, u64>,
     /// The number of the last value that is larger than a datagram.
     large: u16,
 }
 
 /// The reason why a value of the recording cannot be sent again.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-pub(crate) enum Unusable {
+pub(crate) enum UnusableValue {
     /// The channel is not of the space.
     Foreign,
     /// The channel has no description of its topic.
@@ -48,7 +48,7 @@ pub(crate) enum Unusable {
     Mismatch,
 }
 
-impl Unusable {
+impl UnusableValue {
     /// Returns the text for output.
     pub(crate) const fn label(self) -> &'static str {
         match self {
@@ -64,8 +64,8 @@ impl Unusable {
 
 /// A channel of the file as a topic of the space.
 struct Rebuilt {
-    of: Arc<Channel>,
-    topic: Result<Topic, Unusable>,
+    of: Arc<McapChannel>,
+    topic: Result<Topic, UnusableValue>,
 }
 
 struct Topic {
@@ -79,17 +79,17 @@ struct Topic {
 
 /// The conversion of a message to the fields of a value.
 enum Form {
-    Ros(Box<Plan>),
+    Ros(Box<MessagePlan>),
     /// The only field is the message.
     Bytes,
-    Json(Described),
+    Json(AnnouncedDescription),
 }
 
-impl<R: Read> Values<R> {
+impl<R: Read> RecordedValues<R> {
     /// Reads the start of a file; `reader` returns the bytes after the first four.
     pub(super) fn new(reader: R) -> Result<Self, CaptureError> {
         Ok(Self {
-            mcap: Mcap::new(reader)?,
+            mcap: McapReader::new(reader)?,
             channels: BTreeMap::new(),
             ready: VecDeque::new(),
             unusable: BTreeMap::new(),
@@ -98,7 +98,7 @@ impl<R: Read> Values<R> {
     }
 
     /// Returns the next datagram; `None` at the end of the file.
-    pub(super) fn next(&mut self) -> Result<Option<Datagram>, CaptureError> {
+    pub(super) fn next(&mut self) -> Result<Option<RecordedDatagram>, CaptureError> {
         loop {
             if let Some(datagram) = self.ready.pop_front() {
                 return Ok(Some(datagram));
@@ -113,12 +113,12 @@ impl<R: Read> Values<R> {
     }
 
     /// Returns the numbers of values that cannot be sent again, by reason.
-    pub(super) const fn unusable(&self) -> &BTreeMap<Unusable, u64> {
+    pub(super) const fn unusable(&self) -> &BTreeMap<UnusableValue, u64> {
         &self.unusable
     }
 
     /// Makes the datagrams of a message.
-    fn add(&mut self, message: &Message) -> Result<(), Unusable> {
+    fn add(&mut self, message: &McapMessage) -> Result<(), UnusableValue> {
         let known = self.channels.get(&message.channel_id);
         if known.is_none_or(|known| !Arc::ptr_eq(&known.of, &message.channel)) {
             let rebuilt = Rebuilt {
@@ -128,13 +128,13 @@ impl<R: Read> Values<R> {
             self.channels.insert(message.channel_id, rebuilt);
         }
         let rebuilt = self.channels.get_mut(&message.channel_id);
-        let topic = rebuilt.ok_or(Unusable::Foreign)?.topic.as_mut();
+        let topic = rebuilt.ok_or(UnusableValue::Foreign)?.topic.as_mut();
         let topic = topic.map_err(|why| *why)?;
         topic.numbered |= message.sequence != 0;
         let time = i128::from(message.logged);
         let ready = &mut self.ready;
         let mut put = |bytes| {
-            ready.push_back(Datagram {
+            ready.push_back(RecordedDatagram {
                 time,
                 from: SENDER,
                 bytes,
@@ -157,19 +157,19 @@ impl<R: Read> Values<R> {
 }
 
 impl Topic {
-    fn read(channel: &Channel) -> Result<Self, Unusable> {
+    fn read(channel: &McapChannel) -> Result<Self, UnusableValue> {
         let id = channel.metadata.get("topic");
         let id: Option<TopicId> = id.and_then(|topic| topic.parse().ok());
-        let id = id.ok_or(Unusable::Foreign)?;
+        let id = id.ok_or(UnusableValue::Foreign)?;
         let text = channel.metadata.get(ANNOUNCEMENT);
         let bytes = text.and_then(|text| BASE64.decode(text).ok());
-        let announcement = bytes.ok_or(Unusable::Undescribed)?;
-        let described = described(id, &announcement).ok_or(Unusable::Undescribed)?;
+        let announcement = bytes.ok_or(UnusableValue::Undescribed)?;
+        let described = described(id, &announcement).ok_or(UnusableValue::Undescribed)?;
         let form = match channel.encoding.as_str() {
             "json" => Form::Json(described),
             "cdr" | "ros1" if described.is_bytes() => Form::Bytes,
-            "cdr" => ros(channel, &described).ok_or(Unusable::Mismatch)?,
-            _ => return Err(Unusable::Foreign),
+            "cdr" => ros(channel, &described).ok_or(UnusableValue::Mismatch)?,
+            _ => return Err(UnusableValue::Foreign),
         };
         Ok(Self {
             id,
@@ -180,7 +180,7 @@ impl Topic {
     }
 
     /// Returns the NetworkMessage of a value.
-    fn datagram(&self, message: &Message) -> Result<Vec<u8>, Unusable> {
+    fn datagram(&self, message: &McapMessage) -> Result<Vec<u8>, UnusableValue> {
         let (space, namespace, writer_id) = self.id.triple();
         let network = NetworkHeader {
             publisher_id: Some(PublisherId::UInt16(space)),
@@ -199,7 +199,7 @@ impl Topic {
             picoseconds: Some(taken.picoseconds),
             ..DataSetHeader::default()
         };
-        let mismatch = |_| Unusable::Mismatch;
+        let mismatch = |_| UnusableValue::Mismatch;
         let ids = [writer_id];
         let mut datagram = Vec::new();
         let mut writer =
@@ -208,7 +208,7 @@ impl Topic {
             Form::Ros(plan) => {
                 let mut frame = writer.key_frame(&header).map_err(mismatch)?;
                 encode_fields(plan, &message.data, namespace, &mut frame)
-                    .map_err(|_| Unusable::Mismatch)?;
+                    .map_err(|_| UnusableValue::Mismatch)?;
                 frame.finish().map_err(mismatch)?;
             }
             Form::Bytes => {
@@ -227,14 +227,14 @@ impl Topic {
 }
 
 /// Reads the description in an announcement of the topic.
-fn described(topic: TopicId, announcement: &[u8]) -> Option<Described> {
+fn described(topic: TopicId, announcement: &[u8]) -> Option<AnnouncedDescription> {
     let message = NetworkMessage::decode(announcement).ok()?;
     let (space, _, writer) = topic.triple();
     let is_of_space = message.publisher_id() == Some(PublisherId::UInt16(space));
     let announcement = Announcement::decode(&message)
         .ok()
         .filter(|_| is_of_space)?;
-    let Announced::DataSetMetaData {
+    let AnnouncedContent::DataSetMetaData {
         writer_id,
         meta_data,
         ..
@@ -243,24 +243,24 @@ fn described(topic: TopicId, announcement: &[u8]) -> Option<Described> {
         return None;
     };
     let is_topic = topic_of(meta_data.name) == Some(topic) && *writer_id == writer;
-    is_topic.then(|| Described::of_value(meta_data).ok())?
+    is_topic.then(|| AnnouncedDescription::of_value(meta_data).ok())?
 }
 
 /// Returns the conversion of the messages of a channel, by the definition in the file.
-fn ros(channel: &Channel, described: &Described) -> Option<Form> {
+fn ros(channel: &McapChannel, described: &AnnouncedDescription) -> Option<Form> {
     let name: TypeName = described.ros_type()?.parse().ok()?;
     let definition = str::from_utf8(&channel.schema.data).ok()?;
-    let registry = Registry::empty(Dialect::Ros2);
+    let registry = TypeRegistry::empty(Dialect::Ros2);
     let (found, _) = registry.read_ros1_definition(&name, definition).ok()?;
     ros_plan(&found, &name, described).map(|plan| Form::Ros(Box::new(plan)))
 }
 
 /// Returns a NetworkMessage with a single value in chunks.
-fn chunks(datagram: &[u8], number: u16) -> Result<Vec<Vec<u8>>, Unusable> {
-    let mismatch = |_| Unusable::Mismatch;
+fn chunks(datagram: &[u8], number: u16) -> Result<Vec<Vec<u8>>, UnusableValue> {
+    let mismatch = |_| UnusableValue::Mismatch;
     let message = NetworkMessage::decode(datagram).map_err(mismatch)?;
     let (values, _) = parts::split(&message);
-    let value = values.first().ok_or(Unusable::Mismatch)?;
+    let value = values.first().ok_or(UnusableValue::Mismatch)?;
     let whole = Whole {
         message_type: NetworkMessageType::DataSet,
         writer_id: value.writer_id,
@@ -268,14 +268,14 @@ fn chunks(datagram: &[u8], number: u16) -> Result<Vec<Vec<u8>>, Unusable> {
         bytes: value.bytes,
     };
     let extras = Extras::default();
-    let chunks = Chunks::new(&message.header(), &extras, whole, ChunkBudget::IPV4);
-    let mut chunks = chunks.map_err(|_| Unusable::Mismatch)?;
+    let chunks = ChunkEncoder::new(&message.header(), &extras, whole, ChunkBudget::IPV4);
+    let mut chunks = chunks.map_err(|_| UnusableValue::Mismatch)?;
     let mut all = Vec::new();
     loop {
         let mut bytes = Vec::new();
         match chunks.append(&mut bytes, &extras) {
             None => return Ok(all),
-            Some(chunk) => drop(chunk.map_err(|_| Unusable::Mismatch)?),
+            Some(chunk) => drop(chunk.map_err(|_| UnusableValue::Mismatch)?),
         }
         all.push(bytes);
     }

@@ -17,12 +17,12 @@ use mappings::{CallKind, ExpandedNodeIdText, SpaceId};
 use messages::TypeName;
 use uadp::BuiltinType;
 
-use crate::exit::Failure;
+use crate::exit::CommandFailure;
 use crate::live::harmless;
 
 /// The values and calls of a model.
 #[derive(Clone, Debug, Default)]
-pub(crate) struct Model {
+pub(crate) struct NodeModel {
     /// The name of the source, for people.
     pub(crate) place: String,
     /// The spaces of the topics, with their DDS domains.
@@ -142,14 +142,16 @@ impl fmt::Display for Finding {
 /// Reads the values and calls of a model file.
 ///
 /// # Errors
-/// `Failure::Io` if the file cannot be read, `Failure::Data` with all findings of the file.
-pub(crate) fn survey(file: &str) -> Result<Model, Failure> {
+/// `CommandFailure::Io` if the file cannot be read, `CommandFailure::Data` with all findings of the
+/// file.
+pub(crate) fn survey(file: &str) -> Result<NodeModel, CommandFailure> {
     let bytes = type_files::read_bounded(Path::new(file), LARGEST)
-        .map_err(|why| Failure::Io(format!("cannot read {file}: {why}")))?;
+        .map_err(|why| CommandFailure::Io(format!("cannot read {file}: {why}")))?;
     let content =
-        xml_text::decode(&bytes).map_err(|why| Failure::Data(format!("{file}: {why}")))?;
-    let model = parse(&content).map_err(|findings| Failure::Data(report(file, &findings)))?;
-    Ok(Model {
+        xml_text::decode(&bytes).map_err(|why| CommandFailure::Data(format!("{file}: {why}")))?;
+    let model =
+        parse(&content).map_err(|findings| CommandFailure::Data(report(file, &findings)))?;
+    Ok(NodeModel {
         place: format!("SysML model {file}"),
         ..model
     })
@@ -170,7 +172,7 @@ fn report(file: &str, findings: &[Finding]) -> String {
 }
 
 /// Returns the values and calls of a model, or all its findings in the order of their lines.
-fn parse(content: &str) -> Result<Model, Vec<Finding>> {
+fn parse(content: &str) -> Result<NodeModel, Vec<Finding>> {
     let (elements, mut findings) = match content.trim_start().starts_with('<') {
         true => xmi::elements(content),
         false => text::elements(content),

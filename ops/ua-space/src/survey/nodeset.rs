@@ -13,17 +13,18 @@ use quick_xml::reader::Reader;
 use uadp::BuiltinType;
 
 use super::data_types::{self, STRUCTURE};
-use super::{MOST, Nodes, UaVariable};
-use crate::exit::Failure;
+use super::{MOST, SurveyedNodes, UaVariable};
+use crate::exit::CommandFailure;
 
 /// Reads the variables of a NodeSet file.
-pub(crate) fn survey(file: &str) -> Result<Nodes, Failure> {
+pub(crate) fn survey(file: &str) -> Result<SurveyedNodes, CommandFailure> {
     let bytes = type_files::read_bounded(Path::new(file), LARGEST)
-        .map_err(|why| Failure::Io(format!("cannot read {file}: {why}")))?;
-    let xml = xml_text::decode(&bytes).map_err(|why| Failure::Data(format!("{file}: {why}")))?;
+        .map_err(|why| CommandFailure::Io(format!("cannot read {file}: {why}")))?;
+    let xml =
+        xml_text::decode(&bytes).map_err(|why| CommandFailure::Data(format!("{file}: {why}")))?;
     parse(&xml, file).map_err(|fault| {
         let line = xml.get(..fault.at).unwrap_or(&xml).matches('\n').count() + 1;
-        Failure::Data(format!("{file}:{line}: {}", fault.what))
+        CommandFailure::Data(format!("{file}:{line}: {}", fault.what))
     })
 }
 
@@ -34,7 +35,7 @@ struct Fault {
     what: String,
 }
 
-fn parse(xml: &str, place: &str) -> Result<Nodes, Fault> {
+fn parse(xml: &str, place: &str) -> Result<SurveyedNodes, Fault> {
     let mut reader = Reader::from_str(xml.trim_start_matches('\u{feff}'));
     reader.config_mut().expand_empty_elements = true;
     reader.config_mut().trim_text(true);
@@ -219,7 +220,7 @@ impl NodeSet {
         })
     }
 
-    fn nodes(self, place: &str) -> Result<Nodes, String> {
+    fn nodes(self, place: &str) -> Result<SurveyedNodes, String> {
         let variables: HashSet<&NodeIdText> = self.variables.iter().map(|(id, _)| id).collect();
         let mut found = Vec::new();
         for (id, node) in &self.variables {
@@ -250,7 +251,7 @@ impl NodeSet {
         }
         let mut namespaces = vec!["http://opcfoundation.org/UA/".to_owned()];
         namespaces.extend(self.uris);
-        Ok(Nodes {
+        Ok(SurveyedNodes {
             place: format!("NodeSet {place}"),
             server: None,
             namespaces,

@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use mappings::{
     Access, ExpandedNodeIdText, LiveNode, LiveRemote, LiveServer, Mapping, MethodTarget,
-    NamespaceText, NodeIdText, SecurityPolicy,
+    NamespaceText, NodeIdText, ServerSecurityPolicy,
 };
 use opcua::client::{ClientBuilder, IdentityToken, Session};
 use opcua::types::{
@@ -16,16 +16,16 @@ use opcua::types::{
     ObjectId, ReadValueId, ReferenceDescription, ReferenceTypeId, TimestampsToReturn, UAString,
     UserTokenType, VariableId, Variant,
 };
-use plant_opcua::client::{OperationLimits, PartFault, Service};
+use plant_opcua::client::{LimitedService, OperationLimits, PartFault};
 use tokio::time::timeout;
 use uadp::BuiltinType;
 
 use super::data_types::{self, STRUCTURE};
-use super::{MOST, Nodes, UaMethod, UaServer, UaVariable, away};
-use crate::exit::Failure;
+use super::{MOST, SurveyedNodes, UaMethod, UaServer, UaVariable, away};
+use crate::exit::CommandFailure;
 
 /// Browses the server at `url`, starting at its Objects folder.
-pub(crate) async fn survey(url: &str) -> Result<Nodes, Failure> {
+pub(crate) async fn survey(url: &str) -> Result<SurveyedNodes, CommandFailure> {
     let server = Connected::to(url).await?;
     let browsing = async {
         let namespaces = server.namespaces().await?;
@@ -35,7 +35,7 @@ pub(crate) async fn survey(url: &str) -> Result<Nodes, Failure> {
     let (namespaces, found) = server.within(browsing).await?;
     server.leave().await;
     let variables = found.variables.into_iter().map(|(_, one)| one);
-    Ok(Nodes {
+    Ok(SurveyedNodes {
         place: format!("OPC UA server {url}"),
         server: Some(UaServer {
             endpoint: url.to_owned(),
@@ -49,7 +49,7 @@ pub(crate) async fn survey(url: &str) -> Result<Nodes, Failure> {
 }
 
 /// Reads the namespaces of the server at `url` and the nodes of `mapping`.
-pub(crate) async fn check(url: &str, mapping: &Mapping) -> Result<LiveServer, Failure> {
+pub(crate) async fn check(url: &str, mapping: &Mapping) -> Result<LiveServer, CommandFailure> {
     let server = Connected::to(url).await?;
     let asking = async {
         let mut live = LiveServer {
@@ -91,7 +91,7 @@ pub(crate) async fn check(url: &str, mapping: &Mapping) -> Result<LiveServer, Fa
 pub(crate) async fn methods(
     access: &Access,
     wanted: &[&MethodTarget],
-) -> Result<Vec<Option<String>>, Failure> {
+) -> Result<Vec<Option<String>>, CommandFailure> {
     let server = Connected::by(access).await?;
     let asking = async {
         let namespaces = server.namespaces().await?;
@@ -121,7 +121,7 @@ pub(crate) async fn methods(
 pub(crate) async fn remote(
     access: &Access,
     wanted: &[&ExpandedNodeIdText],
-) -> Result<Vec<LiveRemote>, Failure> {
+) -> Result<Vec<LiveRemote>, CommandFailure> {
     let server = Connected::by(access).await?;
     let asking = async {
         let namespaces = server.namespaces().await?;
@@ -192,15 +192,15 @@ struct Connected {
 
 impl Connected {
     /// Connects as an anonymous user.
-    async fn to(url: &str) -> Result<Self, Failure> {
+    async fn to(url: &str) -> Result<Self, CommandFailure> {
         Self::connected(url, IdentityToken::Anonymous).await
     }
 
     /// Connects with the user of the mapping. A password is sent without security only if the
     /// mapping sets `security` to None.
-    async fn by(access: &Access) -> Result<Self, Failure> {
+    async fn by(access: &Access) -> Result<Self, CommandFailure> {
         let url = access.endpoint.to_string();
-        let plain = access.security == Some(SecurityPolicy::None);
+        let plain = access.security == Some(ServerSecurityPolicy::None);
         let may = plain || access.security.is_none() && access.user.is_none();
         if !may {
             return Err(away(
@@ -215,9 +215,9 @@ impl Connected {
         Self::connected(&url, identity).await
     }
 
-    async fn connected(url: &str, identity: IdentityToken) -> Result<Self, Failure> {
+    async fn connected(url: &str, identity: IdentityToken) -> Result<Self, CommandFailure> {
         if !url.starts_with("opc.tcp://") {
-            return Err(Failure::Usage(format!(
+            return Err(CommandFailure::Usage(format!(
                 "`{url}` is no endpoint of an OPC UA server, such as opc.tcp://127.0.0.1:4840"
             )));
         }
@@ -236,7 +236,11 @@ impl Connected {
         found
     }
 
-    async fn connect(url: &str, pki: PathBuf, identity: IdentityToken) -> Result<Self, Failure> {
+    async fn connect(
+        url: &str,
+        pki: PathBuf,
+        identity: IdentityToken,
+    ) -> Result<Self, CommandFailure> {
         let mut client = ClientBuilder::new()
             .application_name("ua-space")
             .application_uri("urn:ua-bridge:ua-space")
@@ -247,7 +251,7 @@ impl Connected {
             .max_message_size(MESSAGE)
             .max_chunk_count(CHUNKS)
             .client()
-            .map_err(|wrong| Failure::Io(wrong.join("; ")))?;
+            .map_err(|wrong| CommandFailure::Io(wrong.join("; ")))?;
         let endpoints = client
             .get_server_endpoints_from_url(url)
             .await
@@ -285,8 +289,8 @@ impl Connected {
     /// Returns the result of `asking`, or an error after the time limit.
     async fn within<T>(
         &self,
-        asking: impl Future<Output = Result<T, Failure>>,
-    ) -> Result<T, Failure> {
+        asking: impl Future<Output = Result<T, CommandFailure>>,
+    ) -> Result<T, CommandFailure> {
         match timeout(BROWSE, asking).await {
             Ok(found) => found,
             Err(_over) => Err(absent(
@@ -301,11 +305,11 @@ impl Connected {
         let _answered = timeout(GOODBYE, self.session.disconnect()).await;
     }
 
-    fn failed(&self, error: &opcua::types::Error) -> Failure {
+    fn failed(&self, error: &opcua::types::Error) -> CommandFailure {
         absent(&self.url, &error.to_string())
     }
 
-    fn refused(&self, fault: PartFault, service: &str) -> Failure {
+    fn refused(&self, fault: PartFault, service: &str) -> CommandFailure {
         match fault {
             PartFault::Short => absent(
                 &self.url,
@@ -316,14 +320,14 @@ impl Connected {
     }
 
     /// Reads the operation limits of the server.
-    async fn learn_limits(&self) -> Result<(), Failure> {
+    async fn learn_limits(&self) -> Result<(), CommandFailure> {
         let nodes = OperationLimits::VARIABLES.map(NodeId::from);
         let values = self.read(&nodes, &[AttributeId::Value]).await?;
         self.limits.learn(&values);
         Ok(())
     }
 
-    async fn namespaces(&self) -> Result<Vec<String>, Failure> {
+    async fn namespaces(&self) -> Result<Vec<String>, CommandFailure> {
         let node = NodeId::from(VariableId::Server_NamespaceArray);
         let read = self.read(&[node], &[AttributeId::Value]).await?;
         let value = read.into_iter().next().and_then(|value| value.value);
@@ -346,7 +350,7 @@ impl Connected {
         node: &ExpandedNodeIdText,
         namespaces: &[String],
         (class, word): (i32, &str),
-    ) -> Result<Option<String>, Failure> {
+    ) -> Result<Option<String>, CommandFailure> {
         let Some(namespace) = index(node, namespaces) else {
             return Ok(Some(format!("{} has no namespace for `{node}`", self.url)));
         };
@@ -367,8 +371,8 @@ impl Connected {
 
     /// Browses the variables and Methods below the Objects folder, without properties and without
     /// nodes below variables.
-    async fn nodes(&self, namespaces: usize) -> Result<Found, Failure> {
-        let mut found = Found::default();
+    async fn nodes(&self, namespaces: usize) -> Result<BrowsedNodes, CommandFailure> {
+        let mut found = BrowsedNodes::default();
         let objects = NodeId::from(ObjectId::ObjectsFolder);
         found.seen.insert(objects.clone());
         let mut next = VecDeque::from([Object {
@@ -391,7 +395,7 @@ impl Connected {
                 next.extend(local.filter_map(|reference| found.take(&object, reference)));
             }
             if found.seen.len() > MOST || found.methods.len() > MOST {
-                return Err(Failure::Unavailable(format!(
+                return Err(CommandFailure::Unavailable(format!(
                     "the OPC UA server at {} has more than {MOST} nodes, which are not looked through",
                     self.url
                 )));
@@ -407,7 +411,10 @@ impl Connected {
     }
 
     /// Returns the forward references of each node.
-    async fn below(&self, nodes: &[NodeId]) -> Result<Vec<Vec<ReferenceDescription>>, Failure> {
+    async fn below(
+        &self,
+        nodes: &[NodeId],
+    ) -> Result<Vec<Vec<ReferenceDescription>>, CommandFailure> {
         let wanted: Vec<BrowseDescription> = nodes
             .iter()
             .map(|node| BrowseDescription {
@@ -422,7 +429,7 @@ impl Connected {
                 result_mask: BrowseResultMask::All as u32,
             })
             .collect();
-        let mut parts = self.limits.parts(Service::Browse, &wanted);
+        let mut parts = self.limits.parts(LimitedService::Browse, &wanted);
         while let Some(part) = parts.next_part() {
             let browsed = self.session.browse(part, REFERENCES, None).await;
             parts
@@ -453,7 +460,7 @@ impl Connected {
         &self,
         nodes: &[NodeId],
         attributes: &[AttributeId],
-    ) -> Result<Vec<DataValue>, Failure> {
+    ) -> Result<Vec<DataValue>, CommandFailure> {
         let mut values = Vec::new();
         for nodes in nodes.chunks(BATCH) {
             let wanted: Vec<ReadValueId> = nodes
@@ -463,7 +470,7 @@ impl Connected {
                     attributes.iter().map(of)
                 })
                 .collect();
-            let mut parts = self.limits.parts(Service::Read, &wanted);
+            let mut parts = self.limits.parts(LimitedService::Read, &wanted);
             while let Some(part) = parts.next_part() {
                 let read = self.session.read(part, TimestampsToReturn::Neither, 0.0);
                 parts
@@ -479,7 +486,7 @@ impl Connected {
     async fn value_types(
         &self,
         nodes: &[NodeId],
-    ) -> Result<Vec<Option<(BuiltinType, bool)>>, Failure> {
+    ) -> Result<Vec<Option<(BuiltinType, bool)>>, CommandFailure> {
         let attributes = [AttributeId::DataType, AttributeId::ValueRank];
         let read = self.read(nodes, &attributes).await?;
         let mut known: HashMap<NodeId, Option<BuiltinType>> = HashMap::new();
@@ -509,7 +516,7 @@ impl Connected {
     }
 
     /// Returns the builtin type of a DataType, by its supertypes.
-    async fn builtin(&self, data_type: &NodeId) -> Result<Option<BuiltinType>, Failure> {
+    async fn builtin(&self, data_type: &NodeId) -> Result<Option<BuiltinType>, CommandFailure> {
         let mut node = data_type.clone();
         for _ in 0..DEEPEST {
             if node.namespace == 0
@@ -553,7 +560,7 @@ struct Object {
 
 /// The nodes below the Objects folder.
 #[derive(Default)]
-struct Found {
+struct BrowsedNodes {
     seen: HashSet<NodeId>,
     variables: Vec<(NodeId, UaVariable)>,
     methods: Vec<UaMethod>,
@@ -561,7 +568,7 @@ struct Found {
     is_cell: bool,
 }
 
-impl Found {
+impl BrowsedNodes {
     /// Stores a node below an Object. Returns the node if it is an Object found for the first time.
     fn take(&mut self, above: &Object, reference: ReferenceDescription) -> Option<Object> {
         let node = reference.node_id.node_id;
@@ -633,7 +640,7 @@ fn open_endpoint(
     })
 }
 
-fn absent(url: &str, why: &str) -> Failure {
+fn absent(url: &str, why: &str) -> CommandFailure {
     away(
         format!("no OPC UA server can be asked at {url}: {why}"),
         "is it running, and is that its endpoint?",

@@ -10,7 +10,7 @@ use tokio::task::JoinSet;
 use tokio::time::timeout;
 
 use super::{MOST, away};
-use crate::exit::Failure;
+use crate::exit::CommandFailure;
 
 /// Returns `ROS_MASTER_URI`, or the default of ROS.
 pub(crate) fn master_uri() -> String {
@@ -21,12 +21,12 @@ pub(crate) fn master_uri() -> String {
 }
 
 /// Queries the master at `uri` without registering a node.
-pub(crate) async fn survey(uri: &str) -> Result<LiveSpace, Failure> {
-    let asked = timeout(LIMIT, tcpros::Graph::of_master(uri, CALLER)).await;
+pub(crate) async fn survey(uri: &str) -> Result<LiveSpace, CommandFailure> {
+    let asked = timeout(LIMIT, tcpros::MasterGraph::of_master(uri, CALLER)).await;
     let graph = match asked {
         Ok(Ok(graph)) => graph,
         Ok(Err(MasterError::Rpc(RpcError::Uri))) => {
-            return Err(Failure::Usage(format!(
+            return Err(CommandFailure::Usage(format!(
                 "`{uri}` is no URI of a ROS 1 master, such as http://localhost:11311"
             )));
         }

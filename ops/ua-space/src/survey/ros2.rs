@@ -5,17 +5,17 @@ use std::time::Duration;
 use mappings::{LiveSpace, LiveTopic};
 use messages::TypeName;
 use ros2_node::domain::{DiscoveryRange, Domain, DomainOptions};
-use ros2_node::graph::{Endpoint, Graph, ros_topic};
+use ros2_node::graph::{Graph, RemoteEndpoint, ros_topic};
 use ros2_node::node::NodeOptions;
-use ros2_node::security::Security;
+use ros2_node::security::RequestedSecurity;
 use tokio::time::{Instant, sleep};
 
 use super::{MOST, away};
-use crate::exit::Failure;
+use crate::exit::CommandFailure;
 
 /// Joins `domain` as a node, and leaves when discovery has brought nothing new for a while, at the
 /// latest after `wait`.
-pub(crate) async fn survey(domain: u16, wait: Duration) -> Result<LiveSpace, Failure> {
+pub(crate) async fn survey(domain: u16, wait: Duration) -> Result<LiveSpace, CommandFailure> {
     let joined = join(domain)?;
     let end = Instant::now() + wait;
     let (mut graph, mut since) = (joined.graph(), Instant::now());
@@ -48,15 +48,15 @@ pub(crate) async fn survey(domain: u16, wait: Duration) -> Result<LiveSpace, Fai
     })
 }
 
-fn join(domain: u16) -> Result<Domain, Failure> {
+fn join(domain: u16) -> Result<Domain, CommandFailure> {
     let variable = |name: &str| std::env::var(name).ok();
-    let security = Security::from_env(variable, None)
-        .map_err(|error| Failure::Unconfigured(error.to_string()))?;
+    let security = RequestedSecurity::from_env(variable, None)
+        .map_err(|error| CommandFailure::Unconfigured(error.to_string()))?;
     let range = DiscoveryRange::from_env(
         variable("ROS_AUTOMATIC_DISCOVERY_RANGE").as_deref(),
         variable("ROS_LOCALHOST_ONLY").as_deref(),
     )
-    .map_err(|error| Failure::Usage(error.to_string()))?;
+    .map_err(|error| CommandFailure::Usage(error.to_string()))?;
     let options = DomainOptions {
         domain,
         networks: range.networks(),
@@ -96,7 +96,7 @@ fn live(graph: &Graph) -> LiveSpace {
 }
 
 /// Adds a type; a type name that is not a ROS type is kept as it is.
-fn learn(topic: &mut LiveTopic, endpoint: &Endpoint) {
+fn learn(topic: &mut LiveTopic, endpoint: &RemoteEndpoint) {
     if topic.types.len() < MOST_TYPES {
         let named = TypeName::from_dds(&endpoint.type_name);
         topic

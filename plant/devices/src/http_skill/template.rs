@@ -4,18 +4,18 @@ use std::fmt;
 use std::time::Duration;
 
 use serde_json::{Map, Value as Json};
-use skills::yaml::{Code, Kind, Node, Reader};
-use skills::{InvalidParameter, Parameters, Value};
+use skills::yaml::{DocumentKind, DocumentNode, YamlFindingCode, YamlReader};
+use skills::{InvalidParameter, Parameters, SkillValue};
 use uri_text::escaped;
 
-use crate::http::{Asked, Fault, Host};
-use crate::tls::{self, Tls};
+use crate::http::{DeviceHost, DeviceRequest, HttpFault};
+use crate::tls::{self, DeviceTls};
 
 /// A request of the YAML.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Template {
     method: String,
-    host: Host,
+    host: DeviceHost,
     /// The path, in which `{Name}` is a parameter.
     path: String,
     /// The body. A text `{Name}` is the value of a parameter.
@@ -25,10 +25,14 @@ pub(super) struct Template {
 impl Template {
     /// Reads a URL, or a map with the keys `method`, `url` and `body`. `usual` is the default
     /// method.
-    pub(super) fn read(node: &Node, usual: &str, reader: &mut Reader<'_>) -> Option<Self> {
+    pub(super) fn read(
+        node: &DocumentNode,
+        usual: &str,
+        reader: &mut YamlReader<'_>,
+    ) -> Option<Self> {
         let [method, url, body] = match &node.kind {
-            Kind::Scalar(_) => [None, Some(node), None],
-            Kind::Null | Kind::List(_) | Kind::Map(_) => {
+            DocumentKind::Scalar(_) => [None, Some(node), None],
+            DocumentKind::Null | DocumentKind::List(_) | DocumentKind::Map(_) => {
                 reader.map(node, ["method", "url", "body"])?
             }
         };
@@ -40,7 +44,7 @@ impl Template {
                 known.then(|| text.to_owned()).or_else(|| {
                     let message =
                         format!("expected GET, POST, PUT, PATCH or DELETE, found `{text}`");
-                    reader.refuse(node, Code::WrongValue, message)
+                    reader.refuse(node, YamlFindingCode::WrongValue, message)
                 })
             }
         };
@@ -57,7 +61,11 @@ impl Template {
     }
 
     /// Reads the URL of a request without a body.
-    pub(super) fn read_url(node: &Node, method: &str, reader: &mut Reader<'_>) -> Option<Self> {
+    pub(super) fn read_url(
+        node: &DocumentNode,
+        method: &str,
+        reader: &mut YamlReader<'_>,
+    ) -> Option<Self> {
         let (host, path) = read_url(node, reader)?;
         Some(Self {
             method: method.to_owned(),
@@ -68,13 +76,13 @@ impl Template {
     }
 
     /// Returns the server.
-    pub(super) const fn host(&self) -> &Host {
+    pub(super) const fn host(&self) -> &DeviceHost {
         &self.host
     }
 
     /// Sends the request without parameters: its path has no `{Name}` to replace.
-    pub(super) async fn ask(&self, within: Duration) -> Result<Json, Fault> {
-        let asked = Asked {
+    pub(super) async fn ask(&self, within: Duration) -> Result<Json, HttpFault> {
+        let asked = DeviceRequest {
             method: &self.method,
             path: &self.path,
             body: None,
@@ -96,7 +104,7 @@ impl Template {
         &self,
         parameters: &Parameters,
         within: Duration,
-    ) -> Result<Json, Fault> {
+    ) -> Result<Json, HttpFault> {
         self.send_unless(parameters, within, || false).await
     }
 
@@ -106,10 +114,10 @@ impl Template {
         parameters: &Parameters,
         within: Duration,
         withdrawn: impl Fn() -> bool + Send,
-    ) -> Result<Json, Fault> {
+    ) -> Result<Json, HttpFault> {
         let filled = self.filled(parameters);
-        let (path, body) = filled.map_err(|why| Fault::Unreachable(why.to_string()))?;
-        let asked = Asked {
+        let (path, body) = filled.map_err(|why| HttpFault::Unreachable(why.to_string()))?;
+        let asked = DeviceRequest {
             method: &self.method,
             path: &path,
             body: body.as_ref(),
@@ -124,7 +132,7 @@ impl Template {
     /// A parameter that is unknown or does not fit in the path.
     fn filled(&self, parameters: &Parameters) -> Result<(String, Option<Json>), InvalidParameter> {
         let value = |name: &str| {
-            let value = parameters.get(name).map(Value::to_json);
+            let value = parameters.get(name).map(SkillValue::to_json);
             value.ok_or_else(|| no_parameter(name))
         };
         let path = filled_path(&self.path, &value)?;
@@ -238,11 +246,11 @@ pub(super) fn plain(json: &Json) -> String {
 }
 
 /// Reads `http://host[:port]/path`, or the same with `https`.
-fn read_url(node: &Node, reader: &mut Reader<'_>) -> Option<(Host, String)> {
+fn read_url(node: &DocumentNode, reader: &mut YamlReader<'_>) -> Option<(DeviceHost, String)> {
     let text = reader.text(node, "a URL, as http://10.0.0.9/api/state")?;
-    let wrong = |reader: &mut Reader<'_>| {
+    let wrong = |reader: &mut YamlReader<'_>| {
         let message = format!("expected http://host[:port]/path or https://, found `{text}`");
-        reader.refuse(node, Code::WrongValue, message)
+        reader.refuse(node, YamlFindingCode::WrongValue, message)
     };
     let schemes = [("http://", 80, false), ("https://", 443, true)];
     let known = schemes
@@ -274,27 +282,31 @@ fn read_url(node: &Node, reader: &mut Reader<'_>) -> Option<(Host, String)> {
         false => format!("/{path}"),
     };
     if !is_secured {
-        return Some((Host::plain(address), path));
+        return Some((DeviceHost::plain(address), path));
     }
-    let tls = tls::authorities().and_then(|authorities| Tls::new(name, authorities));
+    let tls = tls::authorities().and_then(|authorities| DeviceTls::new(name, authorities));
     match tls {
-        Ok(tls) => Some((Host::secured(address, tls), path)),
-        Err(why) => reader.refuse(node, Code::WrongValue, format!("`{text}`: {why}")),
+        Ok(tls) => Some((DeviceHost::secured(address, tls), path)),
+        Err(why) => reader.refuse(
+            node,
+            YamlFindingCode::WrongValue,
+            format!("`{text}`: {why}"),
+        ),
     }
 }
 
 /// Converts a tree to JSON. Scalars are numbers and Booleans as far as they are such.
-fn to_json(node: &Node) -> Json {
+fn to_json(node: &DocumentNode) -> Json {
     match &node.kind {
-        Kind::Null => Json::Null,
-        Kind::Scalar(text) => match serde_json::from_str(text) {
+        DocumentKind::Null => Json::Null,
+        DocumentKind::Scalar(text) => match serde_json::from_str(text) {
             Ok(json @ (Json::Number(_) | Json::Bool(_))) => json,
             Ok(_) | Err(_) => Json::from(text.as_str()),
         },
-        Kind::List(nodes) => nodes.iter().map(to_json).collect(),
-        Kind::Map(pairs) => {
+        DocumentKind::List(nodes) => nodes.iter().map(to_json).collect(),
+        DocumentKind::Map(pairs) => {
             let entries = pairs.iter().filter_map(|(key, value)| {
-                let Kind::Scalar(key) = &key.kind else {
+                let DocumentKind::Scalar(key) = &key.kind else {
                     return None;
                 };
                 Some((key.clone(), to_json(value)))

@@ -2,12 +2,13 @@ use std::path::Path;
 use std::sync::{Arc, Mutex};
 
 use plant_opcua::pki::{OWN_CERTIFICATE, OWN_KEY, Pki};
-use program::{Method, State};
+use program::{ProgramMachineState, ProgramMethod};
 use rustls::RootCertStore;
 use rustls::pki_types::pem::PemObject as _;
 use rustls::pki_types::{CertificateDer, PrivateKeyDer};
 use skills::{
-    Authority, Component, DriverSetup, Facts, Outcome, Owner, Skill, TypeName, conformance, model,
+    Authority, Component, DriverSetup, ParameterType, RunOutcome, Skill, SkillDescription,
+    SkillOwner, conformance, model,
 };
 use tokio::io::{AsyncRead, AsyncReadExt as _, AsyncWrite, AsyncWriteExt as _};
 use tokio::net::TcpListener;
@@ -16,8 +17,8 @@ use tokio_rustls::TlsAcceptor;
 
 use super::*;
 use crate::Kinds;
-use crate::http::{Asked, Host};
-use crate::tls::Tls;
+use crate::http::{DeviceHost, DeviceRequest};
+use crate::tls::DeviceTls;
 
 /// A connection with or without TLS.
 trait Stream: AsyncRead + AsyncWrite + Unpin + Send {}
@@ -147,8 +148,8 @@ impl Bench {
         driver(&http).unwrap()
     }
 
-    async fn run(&self, http: &str) -> Outcome {
-        let force = vec![("Force".to_owned(), Value::from(12.5))];
+    async fn run(&self, http: &str) -> RunOutcome {
+        let force = vec![("Force".to_owned(), SkillValue::from(12.5))];
         conformance::run_once("GraspSkillType", self.driver(http), force)
             .await
             .unwrap()
@@ -160,9 +161,9 @@ impl Bench {
 
     fn skill(&self, http: &str) -> Skill {
         let of = model::find("GraspSkillType").unwrap();
-        let facts = Facts {
+        let facts = SkillDescription {
             name: "Grasp".to_owned(),
-            types: vec![TypeName::own("GraspSkillType")],
+            types: vec![ParameterType::own("GraspSkillType")],
             parameters: of.parameters(),
             results: of.results(),
             capabilities: Vec::new(),
@@ -173,11 +174,11 @@ impl Bench {
     }
 }
 
-const BY: Owner = Owner::Local("the test");
+const BY: SkillOwner = SkillOwner::Local("the test");
 
 async fn start(skill: &Skill) {
-    if skill.shown().state == State::Halted {
-        skill.call(BY, Method::Reset).await.unwrap();
+    if skill.shown().state == ProgramMachineState::Halted {
+        skill.call(BY, ProgramMethod::Reset).await.unwrap();
     }
     skill.start_with(BY, Vec::new()).await.unwrap();
 }
@@ -244,8 +245,8 @@ async fn halt_stops_the_device_also_while_a_response_is_slow() {
         while polls() < 2 {
             sleep(Duration::from_millis(2)).await;
         }
-        skill.call(BY, Method::Halt).await.unwrap();
-        assert_eq!(skill.shown().state, State::Halted);
+        skill.call(BY, ProgramMethod::Halt).await.unwrap();
+        assert_eq!(skill.shown().state, ProgramMachineState::Halted);
         let seen = bench.seen();
         assert!(seen.iter().any(|line| line == "POST /stop"), "{seen:?}");
     }
@@ -254,16 +255,16 @@ async fn halt_stops_the_device_also_while_a_response_is_slow() {
 #[tokio::test]
 async fn a_request_that_is_withdrawn_before_it_is_sent_is_not_sent() {
     let bench = Bench::new(200, &[]).await;
-    let asked = Asked {
+    let asked = DeviceRequest {
         method: "POST",
         path: "/start",
         body: None,
         within: WITHIN,
     };
-    let host = Host::plain(bench.address.clone());
+    let host = DeviceHost::plain(bench.address.clone());
     let fault = host.ask_unless(asked, || true).await.unwrap_err();
     let why = "Halt came before the request was sent".to_owned();
-    assert_eq!(fault, Fault::Unreachable(why));
+    assert_eq!(fault, HttpFault::Unreachable(why));
     assert!(bench.seen().is_empty());
 }
 
@@ -290,9 +291,9 @@ async fn a_device_behind_tls_is_asked_only_if_its_certificate_is_trusted() {
         if trusted {
             authorities.add(own.clone()).unwrap();
         }
-        let tls = Tls::new(host, authorities).unwrap();
-        let host = Host::secured(bench.address.clone(), tls);
-        let asked = Asked {
+        let tls = DeviceTls::new(host, authorities).unwrap();
+        let host = DeviceHost::secured(bench.address.clone(), tls);
+        let asked = DeviceRequest {
             method: "POST",
             path: "/start",
             body: None,
@@ -306,7 +307,7 @@ async fn a_device_behind_tls_is_asked_only_if_its_certificate_is_trusted() {
     for (host, trusted) in [("127.0.0.1", false), ("press.example", true)] {
         let fault = ask(host, trusted).await.unwrap_err();
         let told = fault.to_string();
-        assert!(matches!(fault, Fault::Unreachable(_)), "{told}");
+        assert!(matches!(fault, HttpFault::Unreachable(_)), "{told}");
         assert!(told.starts_with("https://127.0.0.1:"), "{told}");
     }
     assert_eq!(bench.seen(), ["POST /start"], "nothing else was sent");
@@ -318,7 +319,9 @@ async fn damaged_results_are_an_unknown_outcome() {
     let skill = bench.skill("{start: PRESS/start, results: {Gripped: /held}, stop: PRESS/stop}");
     start(&skill).await;
     let mut watch = skill.watch();
-    let ended = watch.wait_for(|shown| shown.state == State::Halted).await;
+    let ended = watch
+        .wait_for(|shown| shown.state == ProgramMachineState::Halted)
+        .await;
     assert!(ended.unwrap().needs_reset);
     assert!(bench.press.lock().unwrap().stopped);
 }

@@ -5,8 +5,8 @@ use std::time::Duration;
 use skills::{DriverError, InvalidParameter, PartnerError, SkillFault};
 
 use super::SWITCHED;
-use super::volts::{InvalidVoltage, Reading};
-use crate::modbus::Fault;
+use super::volts::{ChangerReading, InvalidVoltage};
+use crate::modbus::ModbusFault;
 
 /// The reason why a tool is not changed.
 #[derive(Debug, thiserror::Error)]
@@ -14,7 +14,7 @@ pub(super) enum KelvinError {
     #[error(transparent)]
     Parameter(#[from] InvalidParameter),
     #[error(transparent)]
-    Modbus(#[from] Fault),
+    Modbus(#[from] ModbusFault),
     #[error(transparent)]
     Voltage(#[from] InvalidVoltage),
     #[error(transparent)]
@@ -24,7 +24,7 @@ pub(super) enum KelvinError {
     #[error("the tool changer has not switched within {:?}", SWITCHED)]
     NotSwitched,
     #[error("nothing is moved: {now}, and somebody has to look at it")]
-    Between { now: Reading },
+    Between { now: ChangerReading },
     #[error("nothing is moved: tool {number} has to be detached first")]
     Occupied { number: u8 },
     #[error("nothing is moved: tool {number} is attached, and has no dock")]
@@ -62,7 +62,7 @@ pub(super) enum KelvinError {
     #[error("{why}; {}", now.as_ref().map_or_else(ToString::to_string, ToString::to_string))]
     After {
         why: Box<Self>,
-        now: Result<Reading, Box<Self>>,
+        now: Result<ChangerReading, Box<Self>>,
     },
 }
 

@@ -6,15 +6,15 @@ use skills::Work;
 use tokio::time::{Instant, sleep};
 
 use super::error::KelvinError;
-use super::volts::{Detector, InvalidVoltage, Reading};
+use super::volts::{ChangerReading, InvalidVoltage, VoltageDetector};
 use super::{Converter, POLL, SWITCHED};
-use crate::modbus::{Fault, Modbus};
+use crate::modbus::{Modbus, ModbusFault};
 
 /// Reads the voltage of the changer.
 pub(super) struct Look {
     converter: Converter,
     modbus: Arc<Modbus>,
-    detector: Detector,
+    detector: VoltageDetector,
 }
 
 impl Look {
@@ -23,22 +23,22 @@ impl Look {
         Self {
             converter: converter.clone(),
             modbus: Arc::clone(modbus),
-            detector: Detector::default(),
+            detector: VoltageDetector::default(),
         }
     }
 
     /// Returns the reading of a voltage, which depends on the previous voltages.
-    pub(super) fn reading(&mut self, volts: f64) -> Result<Reading, InvalidVoltage> {
+    pub(super) fn reading(&mut self, volts: f64) -> Result<ChangerReading, InvalidVoltage> {
         self.detector.feed(volts)
     }
 
-    async fn once(&mut self) -> Result<Reading, KelvinError> {
+    async fn once(&mut self) -> Result<ChangerReading, KelvinError> {
         let volts = self.volts().await?;
         Ok(self.reading(volts)?)
     }
 
     /// Returns the voltage at the changer.
-    pub(super) async fn volts(&self) -> Result<f64, Fault> {
+    pub(super) async fn volts(&self) -> Result<f64, ModbusFault> {
         let Converter {
             register,
             divider: (line, ground),
@@ -50,7 +50,7 @@ impl Look {
     }
 
     /// Returns the reading of two equal consecutive measurements.
-    pub(super) async fn steady(&mut self) -> Result<Reading, KelvinError> {
+    pub(super) async fn steady(&mut self) -> Result<ChangerReading, KelvinError> {
         let mut last = self.once().await?;
         for _ in 0..MOST_LOOKS {
             sleep(POLL).await;
@@ -64,11 +64,15 @@ impl Look {
     }
 
     /// Waits until the changer has switched.
-    pub(super) async fn until(&mut self, wanted: Reading, work: &Work) -> Result<(), KelvinError> {
+    pub(super) async fn until(
+        &mut self,
+        wanted: ChangerReading,
+        work: &Work,
+    ) -> Result<(), KelvinError> {
         let until = Instant::now() + SWITCHED;
         loop {
             let now = self.once().await?;
-            if now == wanted || (wanted == Reading::NoTool && now == Reading::Ready) {
+            if now == wanted || (wanted == ChangerReading::NoTool && now == ChangerReading::Ready) {
                 return Ok(());
             }
             if Instant::now() >= until {

@@ -4,21 +4,21 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use skills::{
-    Needs, PartEnd, PartnerError, PeerAccess, Runs, SkillClient, SkillFault, TypeName, Value, Work,
-    run_part,
+    Needs, ParameterType, PartEnd, PartnerError, PeerAccess, RunnableSkill, SkillClient,
+    SkillFault, SkillValue, Work, run_part,
 };
 
 use super::error::KelvinError;
 use super::{Mover, Way};
 
 /// The skills of the robot, and the connection to them.
-pub(super) struct Connected {
-    ptp: Arc<dyn Runs>,
-    linear: Arc<dyn Runs>,
+pub(super) struct ConnectedMover {
+    ptp: Arc<dyn RunnableSkill>,
+    linear: Arc<dyn RunnableSkill>,
     client: Option<SkillClient>,
 }
 
-impl Connected {
+impl ConnectedMover {
     /// Connects to the robot. `found` receives its endpoint.
     pub(super) async fn open(
         mover: &Mover,
@@ -56,16 +56,18 @@ impl Connected {
         }
     }
 
-    async fn with(client: &SkillClient) -> Result<(Arc<dyn Runs>, Arc<dyn Runs>), SkillFault> {
-        let mut both: Vec<Arc<dyn Runs>> = Vec::new();
+    async fn with(
+        client: &SkillClient,
+    ) -> Result<(Arc<dyn RunnableSkill>, Arc<dyn RunnableSkill>), SkillFault> {
+        let mut both: Vec<Arc<dyn RunnableSkill>> = Vec::new();
         for of in ["PtpMoveSkillType", "LinearMoveSkillType"] {
-            let found = client.skills_of(&TypeName::own(of)).await?;
+            let found = client.skills_of(&ParameterType::own(of)).await?;
             let first = found
                 .first()
                 .ok_or_else(|| SkillFault::Unexpected(format!("it has no {of}")))?;
             both.push(Arc::new(client.handle(first)));
         }
-        let both: [Arc<dyn Runs>; 2] = both
+        let both: [Arc<dyn RunnableSkill>; 2] = both
             .try_into()
             .map_err(|_| SkillFault::Unexpected("it has no moves".to_owned()))?;
         let [ptp, linear] = both;
@@ -82,7 +84,7 @@ impl Connected {
         for &(step, straight, to) in ways {
             work.step(step).await;
             let skill = if straight { &self.linear } else { &self.ptp };
-            let parameters = vec![("TargetPosition".to_owned(), Value::from(to))];
+            let parameters = vec![("TargetPosition".to_owned(), SkillValue::from(to))];
             let outcome = match run_part(&**skill, parameters, within, work, work.stopped()).await {
                 PartEnd::Ended(outcome) => outcome,
                 PartEnd::Interrupted { halted, .. } => {

@@ -8,8 +8,8 @@ use tokio::task::JoinSet;
 use tokio::time::sleep;
 use tracing::debug;
 
-use super::{DIVIDER, Reading, volts};
-use crate::modbus::server::{Registers, Table};
+use super::{ChangerReading, DIVIDER, volts};
+use crate::modbus::server::{RegisterTable, Registers};
 use crate::ur::{Follower, RtdeError};
 
 /// A dock, with the tool that is in it at first.
@@ -23,7 +23,7 @@ pub struct Docked {
 
 /// A simulated changer; clones share the same changer.
 #[derive(Debug, Clone)]
-pub struct Simulator {
+pub struct KelvinSimulator {
     changer: Arc<Mutex<Changer>>,
 }
 
@@ -31,7 +31,7 @@ pub struct Simulator {
 struct Changer {
     docks: Vec<Docked>,
     attached: Option<u8>,
-    reading: Reading,
+    reading: ChangerReading,
     cut: bool,
 }
 
@@ -41,14 +41,14 @@ pub struct Following {
     _tasks: JoinSet<()>,
 }
 
-impl Simulator {
+impl KelvinSimulator {
     /// Creates a changer without an attached tool.
     #[must_use]
     pub fn new(docks: Vec<Docked>) -> Self {
         let changer = Changer {
             docks,
             attached: None,
-            reading: Reading::NoTool,
+            reading: ChangerReading::NoTool,
             cut: false,
         };
         Self {
@@ -91,7 +91,7 @@ impl Simulator {
 
     /// Returns the state of the changer.
     #[must_use]
-    pub fn reading(&self) -> Reading {
+    pub fn reading(&self) -> ChangerReading {
         self.lock().reading
     }
 
@@ -100,8 +100,8 @@ impl Simulator {
     }
 }
 
-impl Registers for Simulator {
-    fn read(&self, table: Table, address: u16, count: u16) -> Option<Vec<u16>> {
+impl Registers for KelvinSimulator {
+    fn read(&self, table: RegisterTable, address: u16, count: u16) -> Option<Vec<u16>> {
         let changer = self.lock();
         let (line, ground) = DIVIDER;
         // A cut wire gives a voltage above all valid levels.
@@ -116,7 +116,7 @@ impl Registers for Simulator {
             reason = "from 0 to 3000 mV"
         )]
         let millivolts = (volts * 1000.0 * ground / (line + ground)).round() as u16;
-        (table == Table::Input && address == 0 && count == 1).then(|| vec![millivolts])
+        (table == RegisterTable::Input && address == 0 && count == 1).then(|| vec![millivolts])
     }
 
     fn write(&self, _address: u16, _words: &[u16]) -> bool {
@@ -131,28 +131,30 @@ impl Changer {
             ((x - at_x).powi(2) + (y - at_y).powi(2) + (z - at_z).powi(2)).sqrt() < NEAR
         });
         let Some(dock) = near else {
-            self.reading = self.attached.map_or(Reading::NoTool, Reading::Tool);
+            self.reading = self
+                .attached
+                .map_or(ChangerReading::NoTool, ChangerReading::Tool);
             return;
         };
         let [.., at_c] = dock.dock;
         let turned = (c - at_c).to_degrees();
         self.reading = match (self.attached, dock.number) {
-            (None, 0) => Reading::NoTool,
+            (None, 0) => ChangerReading::NoTool,
             (None, number) if turned <= LOCKS => {
                 self.attached = Some(number);
                 dock.number = 0;
-                Reading::Tool(number)
+                ChangerReading::Tool(number)
             }
-            (None, _) if turned < UNLOCKS => Reading::Intermediate,
-            (None, _) => Reading::NoTool,
+            (None, _) if turned < UNLOCKS => ChangerReading::Intermediate,
+            (None, _) => ChangerReading::NoTool,
             // A tool is put into an empty dock only.
             (Some(attached), 0) if turned >= UNLOCKS => {
                 self.attached = None;
                 dock.number = attached;
-                Reading::NoTool
+                ChangerReading::NoTool
             }
-            (Some(_), 0) if turned > LOCKS => Reading::Intermediate,
-            (Some(attached), _) => Reading::Tool(attached),
+            (Some(_), 0) if turned > LOCKS => ChangerReading::Intermediate,
+            (Some(attached), _) => ChangerReading::Tool(attached),
         };
     }
 }

@@ -2,12 +2,13 @@ use std::path::Path;
 
 use skills::server::{ComponentServer, PowerOff, ServeSettings};
 use skills::{
-    Authority, ClientOptions, Component, Facts, LocalRun, Owner, Skill, conformance, model,
+    Authority, ClientOptions, Component, LocalRun, Skill, SkillDescription, SkillOwner,
+    conformance, model,
 };
 
-use super::simulator::{Docked, Following, Simulator};
+use super::simulator::{Docked, Following, KelvinSimulator};
 use super::*;
-use crate::modbus::server::{Faults, Serving};
+use crate::modbus::server::{LineFaults, ServedDevice};
 use crate::ur;
 
 const DOCKS: [[f64; 6]; 2] = [
@@ -19,17 +20,17 @@ const EMPTY: [f64; 6] = [0.0, 0.4, 0.2, 0.0, 0.0, 0.0];
 const URIS: [&str; 2] = ["urn:test:parallel", "urn:test:vacuum"];
 
 struct Bench {
-    changer: Changer,
-    simulator: Simulator,
-    robot: ur::simulator::Simulator,
-    _served: (Serving, ur::simulator::Serving, Following),
+    changer: KelvinChanger,
+    simulator: KelvinSimulator,
+    robot: ur::simulator::UrSimulator,
+    _served: (ServedDevice, ur::simulator::ServedRobot, Following),
 }
 
-fn skill(name: &str, driver: Arc<dyn Driver>, authority: &Authority) -> Arc<dyn Runs> {
+fn skill(name: &str, driver: Arc<dyn Driver>, authority: &Authority) -> Arc<dyn RunnableSkill> {
     let of = model::find(name).unwrap();
-    let facts = Facts {
+    let facts = SkillDescription {
         name: name.to_owned(),
-        types: vec![TypeName::own(name)],
+        types: vec![ParameterType::own(name)],
         parameters: of.parameters(),
         results: of.results(),
         capabilities: Vec::new(),
@@ -39,20 +40,20 @@ fn skill(name: &str, driver: Arc<dyn Driver>, authority: &Authority) -> Arc<dyn 
     let skill = Skill::spawn(facts, driver, authority.clone(), Vec::new());
     Arc::new(LocalRun {
         skill,
-        by: Owner::Local("changer"),
+        by: SkillOwner::Local("changer"),
     })
 }
 
 async fn bench() -> Bench {
-    let settings = ur::simulator::Settings {
+    let settings = ur::simulator::UrSimulatorSettings {
         time_scale: 50.0,
-        ..ur::simulator::Settings::default()
+        ..ur::simulator::UrSimulatorSettings::default()
     };
-    let robot = ur::simulator::Simulator::new(settings);
-    let robot_served = ur::simulator::Serving::start(&robot, "127.0.0.1:0", "127.0.0.1:0")
+    let robot = ur::simulator::UrSimulator::new(settings);
+    let robot_served = ur::simulator::ServedRobot::start(&robot, "127.0.0.1:0", "127.0.0.1:0")
         .await
         .unwrap();
-    let device = ur::Robot::new(ur::Settings {
+    let device = ur::UrRobot::new(ur::UrSettings {
         rtde: robot_served.rtde().to_string(),
         secondary: robot_served.secondary().to_string(),
         reach: ur::REACH,
@@ -62,7 +63,7 @@ async fn bench() -> Bench {
         skill(
             of,
             device
-                .driver(&[TypeName::own(of)], &PeerAccess::default())
+                .driver(&[ParameterType::own(of)], &PeerAccess::default())
                 .unwrap(),
             &authority,
         )
@@ -79,11 +80,11 @@ async fn bench() -> Bench {
             dock: EMPTY,
         }])
         .collect();
-    let simulator = Simulator::new(docked);
+    let simulator = KelvinSimulator::new(docked);
     let following = simulator.follow(&robot_served.rtde().to_string());
     let registers = Arc::new(simulator.clone());
     let line = "tcp://127.0.0.1:0".parse().unwrap();
-    let serving = Serving::start(&line, 1, registers, Faults::default())
+    let serving = ServedDevice::start(&line, 1, registers, LineFaults::default())
         .await
         .unwrap();
     let converter = Converter {
@@ -100,7 +101,7 @@ async fn bench() -> Bench {
             uri: uri.to_owned(),
             dock,
         });
-    let settings = Settings {
+    let settings = KelvinSettings {
         converter,
         tools: tools.collect(),
         plate: PLATE,
@@ -108,14 +109,14 @@ async fn bench() -> Bench {
         within: Duration::from_secs(20),
     };
     Bench {
-        changer: Changer::new(settings, mover),
+        changer: KelvinChanger::new(settings, mover),
         simulator,
         robot,
         _served: (serving, robot_served, following),
     }
 }
 
-fn given(uri: &str) -> Vec<(String, Value)> {
+fn given(uri: &str) -> Vec<(String, SkillValue)> {
     let dock = URIS
         .iter()
         .position(|known| *known == uri)
@@ -130,7 +131,7 @@ impl Bench {
     async fn run(&self, of: &str, uri: Option<&str>) -> Result<(bool, String), String> {
         let driver = self
             .changer
-            .driver(&[TypeName::own(of)], &PeerAccess::default())
+            .driver(&[ParameterType::own(of)], &PeerAccess::default())
             .unwrap();
         let given = uri.map(given).unwrap_or_default();
         let outcome = conformance::run_once(of, driver, given).await?;
@@ -143,7 +144,7 @@ async fn tools_are_taken_changed_and_put_back() {
     let bench = bench().await;
     let done = Ok((true, String::new()));
     assert_eq!(bench.run("AttachToolSkillType", Some(URIS[0])).await, done);
-    assert_eq!(bench.simulator.reading(), Reading::Tool(1));
+    assert_eq!(bench.simulator.reading(), ChangerReading::Tool(1));
     // A tool that is already attached causes no motion.
     let at = bench.robot.pose();
     assert_eq!(bench.run("ChangeToolSkillType", Some(URIS[0])).await, done);
@@ -154,9 +155,9 @@ async fn tools_are_taken_changed_and_put_back() {
         Ok((false, told))
     );
     assert_eq!(bench.run("ChangeToolSkillType", Some(URIS[1])).await, done);
-    assert_eq!(bench.simulator.reading(), Reading::Tool(2));
+    assert_eq!(bench.simulator.reading(), ChangerReading::Tool(2));
     assert_eq!(bench.run("DetachToolSkillType", None).await, done);
-    assert_eq!(bench.simulator.reading(), Reading::NoTool);
+    assert_eq!(bench.simulator.reading(), ChangerReading::NoTool);
     let unknown = bench
         .run("ChangeToolSkillType", Some("urn:test:hammer"))
         .await
@@ -173,7 +174,7 @@ async fn its_drivers_are_as_drivers_should_be() {
     let driver = bench
         .changer
         .driver(
-            &[TypeName::own("ChangeToolSkillType")],
+            &[ParameterType::own("ChangeToolSkillType")],
             &PeerAccess::default(),
         )
         .unwrap();
@@ -215,7 +216,7 @@ async fn a_ring_that_is_half_way_is_left_to_people() {
     let [x, y, z, a, b, c] = DOCKS[0];
     bench.robot.reset(ur::to_robot([x, y, z, a, b, c - 0.5]));
     let until = Instant::now() + Duration::from_secs(5);
-    while bench.simulator.reading() != Reading::Intermediate {
+    while bench.simulator.reading() != ChangerReading::Intermediate {
         assert!(Instant::now() < until);
         sleep(Duration::from_millis(10)).await;
     }
@@ -231,19 +232,19 @@ async fn a_tool_is_taken_and_put_where_the_tool_position_says_and_then_where_it_
     let mut settings = (*bench.changer.settings).clone();
     // The YAML has another dock than the cell.
     settings.tools[0].dock = [0.1, 0.5, 0.3, 0.0, 0.0, 0.0];
-    bench.changer = Changer::new(settings, bench.changer.mover.clone());
-    let run = async |of: &str, given: Vec<(String, Value)>| {
-        let types = [TypeName::own(of)];
+    bench.changer = KelvinChanger::new(settings, bench.changer.mover.clone());
+    let run = async |of: &str, given: Vec<(String, SkillValue)>| {
+        let types = [ParameterType::own(of)];
         let driver = bench.changer.driver(&types, &PeerAccess::default());
         conformance::run_once(of, driver.unwrap(), given)
             .await
             .unwrap()
     };
-    let at = |dock: [f64; 6]| ("ToolPosition".to_owned(), Value::from(dock));
-    let tool = || ("ToolAppUri".to_owned(), Value::from(URIS[0]));
+    let at = |dock: [f64; 6]| ("ToolPosition".to_owned(), SkillValue::from(dock));
+    let tool = || ("ToolAppUri".to_owned(), SkillValue::from(URIS[0]));
     let outcome = run("AttachToolSkillType", vec![tool(), at(DOCKS[0])]).await;
     assert!(outcome.succeeded, "{}", outcome.message);
-    assert_eq!(bench.simulator.reading(), Reading::Tool(1));
+    assert_eq!(bench.simulator.reading(), ChangerReading::Tool(1));
     let shown = bench.changer.shown.borrow().clone();
     assert_eq!(shown.current.as_deref(), Some(URIS[0]));
 
@@ -257,23 +258,23 @@ async fn a_tool_is_taken_and_put_where_the_tool_position_says_and_then_where_it_
         "{}",
         far.message
     );
-    assert_eq!(bench.simulator.reading(), Reading::Tool(1));
+    assert_eq!(bench.simulator.reading(), ChangerReading::Tool(1));
     let outcome = run("DetachToolSkillType", vec![at(EMPTY)]).await;
     assert!(outcome.succeeded, "{}", outcome.message);
-    assert_eq!(bench.simulator.reading(), Reading::NoTool);
+    assert_eq!(bench.simulator.reading(), ChangerReading::NoTool);
     let outcome = run("AttachToolSkillType", vec![tool()]).await;
     assert!(outcome.succeeded, "{}", outcome.message);
-    assert_eq!(bench.simulator.reading(), Reading::Tool(1));
+    assert_eq!(bench.simulator.reading(), ChangerReading::Tool(1));
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_locked_tool_is_awaited_and_switched_off_before_it_is_put_back() {
     let mut bench = bench().await;
-    let settings = Settings {
+    let settings = KelvinSettings {
         ready_within: Duration::from_millis(300),
         ..(*bench.changer.settings).clone()
     };
-    bench.changer = Changer::new(settings, bench.changer.mover.clone());
+    bench.changer = KelvinChanger::new(settings, bench.changer.mover.clone());
     let options = ClientOptions {
         within: Duration::from_secs(10),
         ..ClientOptions::default()
@@ -282,8 +283,8 @@ async fn a_locked_tool_is_awaited_and_switched_off_before_it_is_put_back() {
         detector: Some(skills::Detector::new(options.clone())),
         options,
     };
-    let run = async |changer: &Changer, of: &str, given: Vec<(String, Value)>| {
-        let driver = changer.driver(&[TypeName::own(of)], &peers);
+    let run = async |changer: &KelvinChanger, of: &str, given: Vec<(String, SkillValue)>| {
+        let driver = changer.driver(&[ParameterType::own(of)], &peers);
         conformance::run_once(of, driver.unwrap(), given)
             .await
             .unwrap()
@@ -311,11 +312,11 @@ async fn a_locked_tool_is_awaited_and_switched_off_before_it_is_put_back() {
     };
     let server = ComponentServer::build(&component, &settings, |_, _| Vec::new()).unwrap();
     server.start();
-    let patient = Settings {
+    let patient = KelvinSettings {
         ready_within: Duration::from_secs(30),
         ..(*bench.changer.settings).clone()
     };
-    bench.changer = Changer::new(patient, bench.changer.mover.clone());
+    bench.changer = KelvinChanger::new(patient, bench.changer.mover.clone());
     let detector = peers.detector.clone().unwrap();
     let attach = run(&bench.changer, "AttachToolSkillType", given(URIS[0]));
     let (attached, ()) = tokio::join!(attach, async { detector.seen("fingers", server.url()) });
@@ -324,7 +325,7 @@ async fn a_locked_tool_is_awaited_and_switched_off_before_it_is_put_back() {
     assert!(noted("urn:test:parallel is ready"), "{:?}", attached.trace);
     let outcome = run(&bench.changer, "DetachToolSkillType", Vec::new()).await;
     assert!(outcome.succeeded, "{}", outcome.message);
-    assert_eq!(*readings.lock().unwrap(), [Reading::Tool(1)]);
-    assert_eq!(bench.simulator.reading(), Reading::NoTool);
+    assert_eq!(*readings.lock().unwrap(), [ChangerReading::Tool(1)]);
+    assert_eq!(bench.simulator.reading(), ChangerReading::NoTool);
     server.stop().await;
 }

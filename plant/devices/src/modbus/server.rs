@@ -12,12 +12,12 @@ use tokio::task::JoinSet;
 use tokio::time::timeout;
 use tracing::debug;
 
-use crate::line::Line;
+use crate::line::ModbusLine;
 use crate::tty::Pty;
 
 /// The kind of registers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Table {
+pub enum RegisterTable {
     /// Registers for reading and writing.
     Holding,
     /// Registers for reading only.
@@ -28,7 +28,7 @@ pub enum Table {
 pub trait Registers: Send + Sync {
     /// Returns the contents of `count` registers from an address on, or `None` if one of them does
     /// not exist.
-    fn read(&self, table: Table, address: u16, count: u16) -> Option<Vec<u16>>;
+    fn read(&self, table: RegisterTable, address: u16, count: u16) -> Option<Vec<u16>>;
 
     /// Writes holding registers. Returns false without writing if one of them does not exist or is
     /// read-only.
@@ -37,12 +37,12 @@ pub trait Registers: Send + Sync {
 
 /// Faults of a line. Clones share the same line.
 #[derive(Debug, Clone, Default)]
-pub struct Faults {
+pub struct LineFaults {
     silent: Arc<AtomicBool>,
     damaged: Arc<AtomicU32>,
 }
 
-impl Faults {
+impl LineFaults {
     /// Sets whether all requests remain without response.
     pub fn set_silent(&self, silent: bool) {
         self.silent.store(silent, Ordering::SeqCst);
@@ -64,13 +64,13 @@ impl Faults {
 
 /// A device that is served, until it is dropped.
 #[derive(Debug)]
-pub struct Serving {
-    line: Line,
+pub struct ServedDevice {
+    line: ModbusLine,
     link: Option<PathBuf>,
     _tasks: JoinSet<()>,
 }
 
-impl Serving {
+impl ServedDevice {
     /// Serves registers as the device with a unit number. Port 0 selects a free port. A serial line
     /// is a new pseudo-terminal; its path, if given, becomes a symbolic link to it. Needs a tokio
     /// runtime.
@@ -78,10 +78,10 @@ impl Serving {
     /// # Errors
     /// Fails if the address cannot be used, or if the link cannot be created.
     pub async fn start(
-        line: &Line,
+        line: &ModbusLine,
         unit: u8,
         registers: Arc<dyn Registers>,
-        faults: Faults,
+        faults: LineFaults,
     ) -> io::Result<Self> {
         let device = Device {
             unit,
@@ -90,19 +90,19 @@ impl Serving {
         };
         let mut tasks = JoinSet::new();
         let (line, link) = match line {
-            Line::Tcp(address) => {
+            ModbusLine::Tcp(address) => {
                 let listener = TcpListener::bind(address).await?;
                 let at = listener.local_addr()?.to_string();
                 tasks.spawn(accept(listener, device, Framing::Tcp));
-                (Line::Tcp(at), None)
+                (ModbusLine::Tcp(at), None)
             }
-            Line::RtuOverTcp(address) => {
+            ModbusLine::RtuOverTcp(address) => {
                 let listener = TcpListener::bind(address).await?;
                 let at = listener.local_addr()?.to_string();
                 tasks.spawn(accept(listener, device, Framing::Rtu));
-                (Line::RtuOverTcp(at), None)
+                (ModbusLine::RtuOverTcp(at), None)
             }
-            Line::Serial { path, baud } => {
+            ModbusLine::Serial { path, baud } => {
                 let pty = Pty::new()?;
                 let target = pty.path.clone();
                 let link = (path != std::path::Path::new("/dev/ptmx")).then(|| path.clone());
@@ -116,7 +116,7 @@ impl Serving {
                     debug!("the line has ended: {ended:?}");
                 });
                 let path = link.clone().unwrap_or(target);
-                (Line::Serial { path, baud: *baud }, link)
+                (ModbusLine::Serial { path, baud: *baud }, link)
             }
         };
         Ok(Self {
@@ -128,12 +128,12 @@ impl Serving {
 
     /// Returns the line for clients.
     #[must_use]
-    pub fn line(&self) -> &Line {
+    pub fn line(&self) -> &ModbusLine {
         &self.line
     }
 }
 
-impl Drop for Serving {
+impl Drop for ServedDevice {
     fn drop(&mut self) {
         if let Some(link) = &self.link
             && let Err(error) = std::fs::remove_file(link)
@@ -147,7 +147,7 @@ impl Drop for Serving {
 struct Device {
     unit: u8,
     registers: Arc<dyn Registers>,
-    faults: Faults,
+    faults: LineFaults,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -296,9 +296,9 @@ impl Device {
         match function {
             0x03 | 0x04 => {
                 let table = if *function == 0x03 {
-                    Table::Holding
+                    RegisterTable::Holding
                 } else {
-                    Table::Input
+                    RegisterTable::Input
                 };
                 let (address, count) = (word(&mut fields)?, word(&mut fields)?);
                 self.read(*function, table, address, count)
@@ -322,13 +322,19 @@ impl Device {
                 let (to, written) = (word(&mut fields)?, word(&mut fields)?);
                 let words = counted(&mut fields, written)?;
                 self.write(to, &words)?;
-                self.read(*function, Table::Holding, from, count)
+                self.read(*function, RegisterTable::Holding, from, count)
             }
             _ => Err(ILLEGAL_FUNCTION),
         }
     }
 
-    fn read(&self, function: u8, table: Table, address: u16, count: u16) -> Result<Vec<u8>, u8> {
+    fn read(
+        &self,
+        function: u8,
+        table: RegisterTable,
+        address: u16,
+        count: u16,
+    ) -> Result<Vec<u8>, u8> {
         let bytes = u8::try_from(count.saturating_mul(2))
             .ok()
             .filter(|_| (1..=125).contains(&count));
@@ -386,8 +392,8 @@ mod tests {
     fn a_question_for_what_is_not_there_is_refused_and_no_length_is_believed() {
         struct Two;
         impl Registers for Two {
-            fn read(&self, table: Table, address: u16, count: u16) -> Option<Vec<u16>> {
-                (table == Table::Holding && address == 7 && count <= 2)
+            fn read(&self, table: RegisterTable, address: u16, count: u16) -> Option<Vec<u16>> {
+                (table == RegisterTable::Holding && address == 7 && count <= 2)
                     .then(|| vec![1; usize::from(count)])
             }
 
@@ -398,7 +404,7 @@ mod tests {
         let device = Device {
             unit: 1,
             registers: Arc::new(Two),
-            faults: Faults::default(),
+            faults: LineFaults::default(),
         };
         assert_eq!(device.answer(&[3, 0, 7, 0, 2]), [3, 4, 0, 1, 0, 1]);
         assert_eq!(device.answer(&[3, 0, 8, 0, 1]), [0x83, 2]);

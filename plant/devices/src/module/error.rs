@@ -5,13 +5,13 @@ use std::time::Duration;
 use mtp::state::{Command, State};
 use plant_opcua::client::ClientError;
 use plant_opcua::types::StatusCode;
-use skills::{DriverError, InvalidParameter, Shape, Value};
+use skills::{DriverError, InvalidParameter, SkillValue, ValueShape};
 
 use super::handshake::StateWord;
 
 /// The reason why a node of a module cannot be read or written.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
-pub enum NodeError {
+pub enum ModuleNodeError {
     /// The server cannot be reached.
     #[error("cannot connect to the module at {endpoint}: {error}")]
     Unreachable {
@@ -39,9 +39,9 @@ pub enum NodeError {
     #[error("{value} is no {shape}")]
     WrongType {
         /// The value.
-        value: Value,
+        value: SkillValue,
         /// The type of the node.
-        shape: Shape,
+        shape: ValueShape,
     },
 }
 
@@ -51,7 +51,7 @@ pub(super) enum ModuleError {
     #[error(transparent)]
     Parameter(#[from] InvalidParameter),
     #[error(transparent)]
-    Node(#[from] NodeError),
+    Node(#[from] ModuleNodeError),
     #[error("the service {service} runs another procedure")]
     Busy { service: String },
     #[error("the manifest has no {node} for {service}")]
@@ -73,7 +73,7 @@ pub(super) enum ModuleError {
     Write {
         what: String,
         node: String,
-        error: NodeError,
+        error: ModuleNodeError,
     },
     #[error("{what} ({node}) has no value")]
     NoValue { what: String, node: String },
@@ -82,7 +82,7 @@ pub(super) enum ModuleError {
         what: String,
         within: Duration,
         node: String,
-        value: Option<Value>,
+        value: Option<SkillValue>,
     },
     #[error("{what}: the service is {state} after {within:?}")]
     NotReached {
@@ -137,6 +137,6 @@ fn bound(limit: Option<f64>) -> String {
     limit.map_or_else(|| "any".to_owned(), |limit| limit.to_string())
 }
 
-fn found(value: Option<&Value>) -> String {
-    value.map_or_else(|| "no value".to_owned(), Value::to_string)
+fn found(value: Option<&SkillValue>) -> String {
+    value.map_or_else(|| "no value".to_owned(), SkillValue::to_string)
 }

@@ -6,11 +6,11 @@ use std::time::Duration;
 use async_trait::async_trait;
 use mtp::pea::{OP_MODE_AUTOMATIC, OP_MODE_AUTOMATIC_ACTIVE, OP_MODE_EXTERNAL};
 use mtp::state::{Command, State};
-use mtp::{Bound, Node, Parameter, Procedure, Role, Service};
-use skills::{ClientOptions, Value};
+use mtp::{ControlRole, MtpService, OpcUaNode, Procedure, ServiceParameter, ValueBound};
+use skills::{ClientOptions, SkillValue};
 use tokio::time::{Instant, sleep};
 
-use super::error::{ModuleError, NodeError};
+use super::error::{ModuleError, ModuleNodeError};
 use super::is_equal;
 
 /// Access to the nodes of a module.
@@ -24,25 +24,25 @@ pub trait ModuleNodes: Send + Sync + 'static {
     /// Waits until the server of a node can be reached.
     ///
     /// # Errors
-    /// [`NodeError::Unreachable`].
-    async fn connect(&self, node: &Node, within: Duration) -> Result<(), NodeError>;
+    /// [`ModuleNodeError::Unreachable`].
+    async fn connect(&self, node: &OpcUaNode, within: Duration) -> Result<(), ModuleNodeError>;
 
     /// Reads the values of nodes of one server; `None` for bad values.
     ///
     /// # Errors
     /// There is no response.
-    async fn read(&self, nodes: &[&Node]) -> Result<Vec<Option<Value>>, NodeError>;
+    async fn read(&self, nodes: &[&OpcUaNode]) -> Result<Vec<Option<SkillValue>>, ModuleNodeError>;
 
     /// Writes a value in the type of the node.
     ///
     /// # Errors
     /// The value was refused, or there is no response.
-    async fn write(&self, node: &Node, value: Value) -> Result<(), NodeError>;
+    async fn write(&self, node: &OpcUaNode, value: SkillValue) -> Result<(), ModuleNodeError>;
 }
 
 /// Time limits of a module.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Timing {
+pub struct HandshakeTiming {
     /// Time limit of the connection.
     pub connect: Duration,
     /// Time limit of each wait of the handshake.
@@ -55,7 +55,7 @@ pub struct Timing {
     pub poll: Duration,
 }
 
-impl Default for Timing {
+impl Default for HandshakeTiming {
     fn default() -> Self {
         Self {
             connect: Duration::from_secs(5),
@@ -69,9 +69,9 @@ impl Default for Timing {
 
 /// A service and the access to its nodes.
 pub(super) struct Handshake<'a> {
-    pub(super) service: &'a Service,
+    pub(super) service: &'a MtpService,
     pub(super) nodes: &'a dyn ModuleNodes,
-    pub(super) timing: Timing,
+    pub(super) timing: HandshakeTiming,
 }
 
 /// The word StateCur.
@@ -94,7 +94,7 @@ impl std::fmt::Display for StateWord {
 impl Handshake<'_> {
     /// Reads the state of the service.
     pub(super) async fn state(&self) -> Result<StateWord, ModuleError> {
-        let node = self.needed(Role::State, "StateCur")?;
+        let node = self.needed(ControlRole::State, "StateCur")?;
         let word = self.word(node, "StateCur").await?;
         Ok(match State::of_bit(word) {
             Some(state) => StateWord::Known(state),
@@ -104,23 +104,23 @@ impl Handshake<'_> {
 
     /// Requests automatic mode and the external source, and waits for both.
     pub(super) async fn mode(&self) -> Result<(), ModuleError> {
-        if let Some(node) = self.node(Role::OperationMode) {
+        if let Some(node) = self.node(ControlRole::OperationMode) {
             return self.mode_word(node).await;
         }
         self.request(
-            self.node(Role::AutomaticActive),
+            self.node(ControlRole::AutomaticActive),
             [
-                self.node(Role::AutomaticByOperator),
-                self.node(Role::AutomaticByAutomation),
+                self.node(ControlRole::AutomaticByOperator),
+                self.node(ControlRole::AutomaticByAutomation),
             ],
             "automatic mode (StateAutAct)",
         )
         .await?;
         self.request(
-            self.node(Role::ExternalActive),
+            self.node(ControlRole::ExternalActive),
             [
-                self.node(Role::ExternalByOperator),
-                self.node(Role::ExternalByAutomation),
+                self.node(ControlRole::ExternalByOperator),
+                self.node(ControlRole::ExternalByAutomation),
             ],
             "the external source (SrcExtAct)",
         )
@@ -128,16 +128,16 @@ impl Handshake<'_> {
     }
 
     /// Requests the mode by the word of early drafts, which confirms automatic mode only.
-    async fn mode_word(&self, node: &Node) -> Result<(), ModuleError> {
+    async fn mode_word(&self, node: &OpcUaNode) -> Result<(), ModuleError> {
         let word = self.word(node, "OpMode").await?;
         if word & OP_MODE_AUTOMATIC_ACTIVE == 0 {
-            self.write(node, Value::UInt32(OP_MODE_AUTOMATIC), "OpMode")
+            self.write(node, SkillValue::UInt32(OP_MODE_AUTOMATIC), "OpMode")
                 .await?;
-            let is_active = |value: &Value| as_word(value) & OP_MODE_AUTOMATIC_ACTIVE != 0;
+            let is_active = |value: &SkillValue| as_word(value) & OP_MODE_AUTOMATIC_ACTIVE != 0;
             self.wait(node, is_active, "automatic mode (OpMode)")
                 .await?;
         }
-        self.write(node, Value::UInt32(OP_MODE_EXTERNAL), "OpMode")
+        self.write(node, SkillValue::UInt32(OP_MODE_EXTERNAL), "OpMode")
             .await
     }
 
@@ -145,8 +145,8 @@ impl Handshake<'_> {
     /// has no such modes.
     async fn request(
         &self,
-        active: Option<&Node>,
-        requests: [Option<&Node>; 2],
+        active: Option<&OpcUaNode>,
+        requests: [Option<&OpcUaNode>; 2],
         what: &str,
     ) -> Result<(), ModuleError> {
         let Some(active) = active else { return Ok(()) };
@@ -159,14 +159,14 @@ impl Handshake<'_> {
             let what = what.to_owned();
             return Err(ModuleError::NoRequest { what });
         };
-        self.write(request, Value::Boolean(true), what).await?;
-        let is_active = |value: &Value| *value == Value::Boolean(true);
+        self.write(request, SkillValue::Boolean(true), what).await?;
+        let is_active = |value: &SkillValue| *value == SkillValue::Boolean(true);
         self.wait(active, is_active, what).await
     }
 
     /// Selects a procedure, and waits until the service has accepted the selection.
     pub(super) async fn select(&self, procedure: &Procedure) -> Result<(), ModuleError> {
-        let Some(node) = self.node(Role::ProcedureWanted) else {
+        let Some(node) = self.node(ControlRole::ProcedureWanted) else {
             let is_only = self.service.procedures.len() == 1;
             return match is_only {
                 true => Ok(()),
@@ -174,10 +174,10 @@ impl Handshake<'_> {
             };
         };
         let number = procedure.number;
-        self.write(node, Value::UInt32(number), "ProcedureExt")
+        self.write(node, SkillValue::UInt32(number), "ProcedureExt")
             .await?;
-        let accepted = self.node(Role::ProcedureRequested).unwrap_or(node);
-        let is_accepted = |value: &Value| as_word(value) == number;
+        let accepted = self.node(ControlRole::ProcedureRequested).unwrap_or(node);
+        let is_accepted = |value: &SkillValue| as_word(value) == number;
         let what = format!("procedure {number} (ProcedureReq)");
         self.wait(accepted, is_accepted, &what).await
     }
@@ -185,8 +185,8 @@ impl Handshake<'_> {
     /// Writes a parameter within its limits, and waits until the module has taken the value.
     pub(super) async fn parameter(
         &self,
-        parameter: &Parameter,
-        value: &Value,
+        parameter: &ServiceParameter,
+        value: &SkillValue,
     ) -> Result<(), ModuleError> {
         let name = &parameter.name;
         let Some(node) = &parameter.write else {
@@ -197,19 +197,23 @@ impl Handshake<'_> {
         self.external(parameter).await?;
         self.write(node, value.clone(), &format!("{name}.VExt"))
             .await?;
-        let is_written = |read: &Value| is_equal(value, read);
+        let is_written = |read: &SkillValue| is_equal(value, read);
         self.wait(node, is_written, &format!("the value of {name} (VExt)"))
             .await?;
         let Some(apply) = shaken(parameter, "ApplyExt") else {
             return Ok(());
         };
         if let Some(enabled) = shaken(parameter, "ApplyEn") {
-            let is_enabled = |read: &Value| *read == Value::Boolean(true);
+            let is_enabled = |read: &SkillValue| *read == SkillValue::Boolean(true);
             self.wait(enabled, is_enabled, &format!("ApplyEn of {name}"))
                 .await?;
         }
-        self.write(apply, Value::Boolean(true), &format!("{name}.ApplyExt"))
-            .await?;
+        self.write(
+            apply,
+            SkillValue::Boolean(true),
+            &format!("{name}.ApplyExt"),
+        )
+        .await?;
         match shaken(parameter, "VReq") {
             Some(requested) => {
                 let what = format!("the applied value of {name} (VReq)");
@@ -221,7 +225,7 @@ impl Handshake<'_> {
 
     /// Makes the value from outside effective: a parameter follows its service (Sync), or has its
     /// own mode and source.
-    async fn external(&self, parameter: &Parameter) -> Result<(), ModuleError> {
+    async fn external(&self, parameter: &ServiceParameter) -> Result<(), ModuleError> {
         let name = &parameter.name;
         let of = |wanted| shaken(parameter, wanted);
         let sync = of("Sync");
@@ -236,8 +240,8 @@ impl Handshake<'_> {
             && sync.access.writes
         {
             let what = format!("{name}.Sync");
-            self.write(sync, Value::Boolean(true), &what).await?;
-            let is_set = |read: &Value| *read == Value::Boolean(true);
+            self.write(sync, SkillValue::Boolean(true), &what).await?;
+            let is_set = |read: &SkillValue| *read == SkillValue::Boolean(true);
             return self.wait(sync, is_set, &what).await;
         }
         let what = format!("automatic mode of {name}");
@@ -249,15 +253,19 @@ impl Handshake<'_> {
     }
 
     /// Checks the limits that the file or the module has.
-    async fn limits(&self, parameter: &Parameter, value: &Value) -> Result<(), ModuleError> {
+    async fn limits(
+        &self,
+        parameter: &ServiceParameter,
+        value: &SkillValue,
+    ) -> Result<(), ModuleError> {
         let Some(number) = value.as_f64() else {
             return Ok(());
         };
         let mut limits = [None, None];
         for (limit, bound) in limits.iter_mut().zip([&parameter.min, &parameter.max]) {
             *limit = match bound {
-                Some(Bound::Constant(limit)) => Some(*limit),
-                Some(Bound::Node(node)) => {
+                Some(ValueBound::Constant(limit)) => Some(*limit),
+                Some(ValueBound::Node(node)) => {
                     let read = self.nodes.read(&[node]).await?;
                     read.into_iter()
                         .next()
@@ -285,7 +293,7 @@ impl Handshake<'_> {
 
     /// Returns whether the service allows a command; true if it does not say so.
     pub(super) async fn allows(&self, command: Command) -> Result<bool, ModuleError> {
-        match self.node(Role::CommandEnabled) {
+        match self.node(ControlRole::CommandEnabled) {
             Some(node) => Ok(self.word(node, "CommandEn").await? & command.bit() != 0),
             None => Ok(true),
         }
@@ -293,29 +301,31 @@ impl Handshake<'_> {
 
     /// Waits until the service allows a command.
     pub(super) async fn allowed(&self, command: Command) -> Result<(), ModuleError> {
-        let Some(node) = self.node(Role::CommandEnabled) else {
+        let Some(node) = self.node(ControlRole::CommandEnabled) else {
             return Ok(());
         };
-        let is_allowed = |value: &Value| as_word(value) & command.bit() != 0;
+        let is_allowed = |value: &SkillValue| as_word(value) & command.bit() != 0;
         self.wait(node, is_allowed, &format!("{command} in CommandEn"))
             .await
     }
 
     /// Writes a command. A command that the service left in place is removed before.
     pub(super) async fn command(&self, command: Command) -> Result<(), ModuleError> {
-        let node = self.needed(Role::Command, "CommandExt")?;
+        let node = self.needed(ControlRole::Command, "CommandExt")?;
         if self.word(node, "CommandExt").await? != 0 {
-            self.write(node, Value::UInt32(0), "CommandExt").await?;
+            self.write(node, SkillValue::UInt32(0), "CommandExt")
+                .await?;
         }
-        self.write(node, Value::UInt32(command.bit()), "CommandExt")
+        self.write(node, SkillValue::UInt32(command.bit()), "CommandExt")
             .await
     }
 
     /// Removes a command that the service did not remove, so that it has no effect later.
     pub(super) async fn withdraw(&self) -> Result<(), ModuleError> {
-        let node = self.needed(Role::Command, "CommandExt")?;
+        let node = self.needed(ControlRole::Command, "CommandExt")?;
         if self.word(node, "CommandExt").await? != 0 {
-            self.write(node, Value::UInt32(0), "CommandExt").await?;
+            self.write(node, SkillValue::UInt32(0), "CommandExt")
+                .await?;
         }
         Ok(())
     }
@@ -349,8 +359,8 @@ impl Handshake<'_> {
 
     async fn wait(
         &self,
-        node: &Node,
-        is: impl Fn(&Value) -> bool,
+        node: &OpcUaNode,
+        is: impl Fn(&SkillValue) -> bool,
         what: &str,
     ) -> Result<(), ModuleError> {
         let within = self.timing.handshake;
@@ -373,7 +383,12 @@ impl Handshake<'_> {
         }
     }
 
-    async fn write(&self, node: &Node, value: Value, what: &str) -> Result<(), ModuleError> {
+    async fn write(
+        &self,
+        node: &OpcUaNode,
+        value: SkillValue,
+        what: &str,
+    ) -> Result<(), ModuleError> {
         let written = self.nodes.write(node, value).await;
         written.map_err(|error| ModuleError::Write {
             what: what.to_owned(),
@@ -382,7 +397,7 @@ impl Handshake<'_> {
         })
     }
 
-    async fn word(&self, node: &Node, what: &str) -> Result<u32, ModuleError> {
+    async fn word(&self, node: &OpcUaNode, what: &str) -> Result<u32, ModuleError> {
         let read = self.nodes.read(&[node]).await?;
         let value = read.into_iter().next().flatten();
         let value = value.ok_or_else(|| ModuleError::NoValue {
@@ -392,16 +407,20 @@ impl Handshake<'_> {
         Ok(as_word(&value))
     }
 
-    async fn is_true(&self, node: &Node) -> Result<bool, ModuleError> {
+    async fn is_true(&self, node: &OpcUaNode) -> Result<bool, ModuleError> {
         let read = self.nodes.read(&[node]).await?;
-        Ok(read.into_iter().next().flatten() == Some(Value::Boolean(true)))
+        Ok(read.into_iter().next().flatten() == Some(SkillValue::Boolean(true)))
     }
 
-    fn node(&self, role: Role) -> Option<&Node> {
+    fn node(&self, role: ControlRole) -> Option<&OpcUaNode> {
         self.service.control.node(role)
     }
 
-    pub(super) fn needed(&self, role: Role, name: &'static str) -> Result<&Node, ModuleError> {
+    pub(super) fn needed(
+        &self,
+        role: ControlRole,
+        name: &'static str,
+    ) -> Result<&OpcUaNode, ModuleError> {
         let node = self.node(role);
         node.ok_or_else(|| ModuleError::NoNode {
             node: name,
@@ -411,10 +430,10 @@ impl Handshake<'_> {
 }
 
 /// Returns the word in an integer of any type; 0 for other values.
-fn as_word(value: &Value) -> u32 {
+fn as_word(value: &SkillValue) -> u32 {
     if matches!(
         value,
-        Value::Boolean(_) | Value::String(_) | Value::Array(..)
+        SkillValue::Boolean(_) | SkillValue::String(_) | SkillValue::Array(..)
     ) {
         return 0;
     }
@@ -425,7 +444,7 @@ fn as_word(value: &Value) -> u32 {
 }
 
 /// Returns the node of a parameter with a name of the handshake.
-fn shaken<'p>(parameter: &'p Parameter, wanted: &str) -> Option<&'p Node> {
+fn shaken<'p>(parameter: &'p ServiceParameter, wanted: &str) -> Option<&'p OpcUaNode> {
     let mut nodes = parameter.handshake.iter();
     let found = nodes.find(|(known, _)| known == wanted);
     found.map(|(_, node)| node)

@@ -5,12 +5,12 @@ use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
 
 use async_trait::async_trait;
-use mtp::{Identifier, Node};
-use plant_opcua::client::{Client, ClientConfig};
+use mtp::{NodeIdentifier, OpcUaNode};
+use plant_opcua::client::{ClientConfig, OpcUaClient};
 use plant_opcua::types::{NodeId, Variant};
-use skills::{ClientOptions, Shape, Value, from_variant, to_variant};
+use skills::{ClientOptions, SkillValue, ValueShape, from_variant, to_variant};
 
-use super::error::NodeError;
+use super::error::ModuleNodeError;
 use super::handshake::ModuleNodes;
 
 /// Clients of the servers of a module. Each is opened at the first connection, and reconnects by
@@ -19,7 +19,7 @@ pub(super) struct UaNodes {
     /// The endpoint in place of the endpoints of the manifest.
     endpoint: Option<String>,
     options: Mutex<ClientOptions>,
-    clients: Mutex<HashMap<String, Client>>,
+    clients: Mutex<HashMap<String, OpcUaClient>>,
 }
 
 impl UaNodes {
@@ -31,7 +31,7 @@ impl UaNodes {
         }
     }
 
-    fn client(&self, node: &Node) -> Client {
+    fn client(&self, node: &OpcUaNode) -> OpcUaClient {
         let endpoint = self.endpoint.as_ref().unwrap_or(&node.endpoint);
         let mut clients = self.clients.lock().unwrap_or_else(PoisonError::into_inner);
         let open = || {
@@ -43,7 +43,7 @@ impl UaNodes {
                 timeout: options.within,
                 ..ClientConfig::new(&options.application_uri, &options.application_name)
             };
-            Client::open(config, endpoint)
+            OpcUaClient::open(config, endpoint)
         };
         clients.entry(endpoint.clone()).or_insert_with(open).clone()
     }
@@ -56,16 +56,16 @@ impl ModuleNodes for UaNodes {
         known.clone_from(options);
     }
 
-    async fn connect(&self, node: &Node, within: Duration) -> Result<(), NodeError> {
+    async fn connect(&self, node: &OpcUaNode, within: Duration) -> Result<(), ModuleNodeError> {
         let endpoint = self.endpoint.as_ref().unwrap_or(&node.endpoint);
         let connected = self.client(node).up(within).await;
-        connected.map_err(|error| NodeError::Unreachable {
+        connected.map_err(|error| ModuleNodeError::Unreachable {
             endpoint: endpoint.clone(),
             error,
         })
     }
 
-    async fn read(&self, nodes: &[&Node]) -> Result<Vec<Option<Value>>, NodeError> {
+    async fn read(&self, nodes: &[&OpcUaNode]) -> Result<Vec<Option<SkillValue>>, ModuleNodeError> {
         let Some(first) = nodes.first() else {
             return Ok(Vec::new());
         };
@@ -82,7 +82,7 @@ impl ModuleNodes for UaNodes {
         Ok(good.map(|value| from_variant(&value?)).collect())
     }
 
-    async fn write(&self, node: &Node, value: Value) -> Result<(), NodeError> {
+    async fn write(&self, node: &OpcUaNode, value: SkillValue) -> Result<(), ModuleNodeError> {
         let client = self.client(node);
         let id = node_id(&client, node)?;
         let [known] = self.read(&[node]).await?.try_into().unwrap_or([None]);
@@ -94,31 +94,31 @@ impl ModuleNodes for UaNodes {
         let statuses = client.write(&[(id, variant)]).await?;
         match statuses.first() {
             Some(status) if status.is_good() => Ok(()),
-            Some(status) => Err(NodeError::Refused(*status)),
-            None => Err(NodeError::NoResult),
+            Some(status) => Err(ModuleNodeError::Refused(*status)),
+            None => Err(ModuleNodeError::NoResult),
         }
     }
 }
 
 /// Returns the NodeId of a node in the namespaces of a server.
-fn node_id(client: &Client, node: &Node) -> Result<NodeId, NodeError> {
+fn node_id(client: &OpcUaClient, node: &OpcUaNode) -> Result<NodeId, ModuleNodeError> {
     let index = match node.namespace.parse() {
         // Some manifests have an index in place of a URI.
         Ok(index) => Some(index),
         Err(_) => client.namespace(&node.namespace),
     };
-    let index: u16 = index.ok_or_else(|| NodeError::NoNamespace {
+    let index: u16 = index.ok_or_else(|| ModuleNodeError::NoNamespace {
         namespace: node.namespace.clone(),
     })?;
     Ok(match &node.identifier {
-        Identifier::Numeric(number) => NodeId::new(index, *number),
-        Identifier::Text(text) => NodeId::new(index, text.as_str()),
+        NodeIdentifier::Numeric(number) => NodeId::new(index, *number),
+        NodeIdentifier::Text(text) => NodeId::new(index, text.as_str()),
     })
 }
 
 /// Converts a value to the type of the present value of a node.
-fn in_type_of(known: &Value, value: &Value) -> Result<Variant, NodeError> {
-    let shape: Shape = known.shape();
+fn in_type_of(known: &SkillValue, value: &SkillValue) -> Result<Variant, ModuleNodeError> {
+    let shape: ValueShape = known.shape();
     let is_same = value.shape() == shape;
     let converted = match (known, value.as_f64()) {
         _ if is_same => Some(value.clone()),
@@ -126,11 +126,11 @@ fn in_type_of(known: &Value, value: &Value) -> Result<Variant, NodeError> {
             clippy::cast_possible_truncation,
             reason = "the module has fewer digits"
         )]
-        (Value::Float(_), Some(number)) => Some(Value::Float(number as f32)),
-        (Value::Boolean(_) | Value::String(_), _) => None,
+        (SkillValue::Float(_), Some(number)) => Some(SkillValue::Float(number as f32)),
+        (SkillValue::Boolean(_) | SkillValue::String(_), _) => None,
         _ => shape.read_json(&value.to_json()).ok(),
     };
-    let converted = converted.ok_or_else(|| NodeError::WrongType {
+    let converted = converted.ok_or_else(|| ModuleNodeError::WrongType {
         value: value.clone(),
         shape,
     })?;

@@ -5,30 +5,30 @@ use std::time::Duration;
 
 use async_trait::async_trait;
 use mtp::state::{Command, State};
-use mtp::{Output, OutputRole, Parameter, Procedure, Role, Service};
-use skills::{Driver, DriverError, InvalidParameter, Results, Value, Work};
+use mtp::{ControlRole, ModuleOutput, MtpService, OutputRole, Procedure, ServiceParameter};
+use skills::{Driver, DriverError, InvalidParameter, RunResults, SkillValue, Work};
 use tokio::sync::Mutex;
 use tokio::time::{Instant, sleep};
 
 use super::error::ModuleError;
-use super::handshake::{Handshake, ModuleNodes, StateWord, Timing};
+use super::handshake::{Handshake, HandshakeTiming, ModuleNodes, StateWord};
 use super::is_equal;
 
 /// The driver of a procedure.
-pub(super) struct Run {
-    pub(super) service: Arc<Service>,
+pub(super) struct ProcedureRun {
+    pub(super) service: Arc<MtpService>,
     pub(super) procedure: Arc<Procedure>,
-    pub(super) parameters: Vec<Parameter>,
+    pub(super) parameters: Vec<ServiceParameter>,
     pub(super) nodes: Arc<dyn ModuleNodes>,
     pub(super) busy: Arc<Mutex<()>>,
-    pub(super) timing: Timing,
+    pub(super) timing: HandshakeTiming,
 }
 
 /// Returns the outputs that a run of a procedure reads.
 pub(super) fn outputs<'s>(
-    service: &'s Service,
+    service: &'s MtpService,
     procedure: &'s Procedure,
-) -> impl Iterator<Item = &'s Output> {
+) -> impl Iterator<Item = &'s ModuleOutput> {
     let all = procedure.outputs.iter().chain(&service.outputs);
     all.filter(|output| output.role != OutputRole::ProcessValueIn && output.node.is_some())
 }
@@ -42,7 +42,7 @@ enum Suspended {
 }
 
 #[async_trait]
-impl Driver for Run {
+impl Driver for ProcedureRun {
     fn can_suspend(&self) -> bool {
         true
     }
@@ -51,7 +51,7 @@ impl Driver for Run {
         Some(self.timing.stop + self.timing.handshake)
     }
 
-    async fn run(&self, work: Work) -> Result<Results, DriverError> {
+    async fn run(&self, work: Work) -> Result<RunResults, DriverError> {
         let Ok(_alone) = self.busy.try_lock() else {
             let service = self.service.name.clone();
             return Err(ModuleError::Busy { service }.into());
@@ -74,11 +74,11 @@ impl Driver for Run {
     }
 }
 
-impl Run {
+impl ProcedureRun {
     /// Prepares the service: nothing moves.
     async fn prepare(&self, shake: &Handshake<'_>, work: &Work) -> Result<(), ModuleError> {
         work.step("connect").await;
-        let state_node = shake.needed(Role::State, "StateCur")?;
+        let state_node = shake.needed(ControlRole::State, "StateCur")?;
         self.nodes.connect(state_node, self.timing.connect).await?;
         work.step("mode and source").await;
         shake.mode().await?;
@@ -168,7 +168,7 @@ impl Run {
     }
 
     /// Follows the procedure to its end.
-    async fn follow(&self, shake: &Handshake<'_>, work: &Work) -> Result<Results, ModuleError> {
+    async fn follow(&self, shake: &Handshake<'_>, work: &Work) -> Result<RunResults, ModuleError> {
         let run_time = match has_run_time(&self.procedure, &self.parameters) {
             true => work.parameters().number(RUN_TIME).unwrap_or_default(),
             false => 0.0,
@@ -376,7 +376,7 @@ impl Run {
         }
     }
 
-    async fn results(&self, shake: &Handshake<'_>, work: &Work) -> Result<Results, ModuleError> {
+    async fn results(&self, shake: &Handshake<'_>, work: &Work) -> Result<RunResults, ModuleError> {
         work.progress(1.0);
         // The procedure is done; a command that stays in place is removed by the next run.
         let _removed = shake.withdraw().await;
@@ -396,7 +396,7 @@ impl Run {
                 }
             };
             let value = match (output.kind, value.as_f64()) {
-                (mtp::ValueKind::Analog, Some(number)) => Value::Double(number),
+                (mtp::ParameterKind::Analog, Some(number)) => SkillValue::Double(number),
                 _ => value,
             };
             results.push((output.name.clone(), value));
@@ -405,7 +405,7 @@ impl Run {
     }
 
     /// Reads a result. A connection that is lost for a moment comes back.
-    async fn result(&self, node: &mtp::Node, end: Instant) -> Result<Value, ModuleError> {
+    async fn result(&self, node: &mtp::OpcUaNode, end: Instant) -> Result<SkillValue, ModuleError> {
         loop {
             let why = match self.nodes.read(&[node]).await {
                 Ok(read) => match read.into_iter().next().flatten() {
@@ -435,7 +435,7 @@ fn show_progress(work: &Work, executed: Duration, run_time: Duration) {
 /// itself, and has no parameter of this name.
 pub(super) fn has_run_time<'p>(
     procedure: &Procedure,
-    parameters: impl IntoIterator<Item = &'p Parameter>,
+    parameters: impl IntoIterator<Item = &'p ServiceParameter>,
 ) -> bool {
     let mut parameters = parameters.into_iter();
     !procedure.is_self_completing && !parameters.any(|one| one.name == RUN_TIME)

@@ -6,12 +6,12 @@ use std::time::Duration;
 use async_trait::async_trait;
 use mtp::pea::{Pea, PeaFaults, PeaValue};
 use mtp::state::{Command, State};
-use mtp::{Module, Node};
+use mtp::{Module, OpcUaNode};
 use plant_opcua::client::ClientError;
-use program::Method;
-use skills::{Outcome, Owner, Skill, Value};
+use program::ProgramMethod;
+use skills::{RunOutcome, Skill, SkillOwner, SkillValue};
 
-use super::{ModuleNodes, NodeError, ProcessModule, Settings, Timing};
+use super::{HandshakeTiming, ModuleNodeError, ModuleNodes, ModuleSettings, ProcessModule};
 
 /// A module in memory.
 struct Memory {
@@ -48,7 +48,7 @@ impl Memory {
             .collect()
     }
 
-    fn answer(&self) -> Result<(), NodeError> {
+    fn answer(&self) -> Result<(), ModuleNodeError> {
         match self.is_silent.load(std::sync::atomic::Ordering::SeqCst) {
             true => Err(ClientError::Lost("no response".to_owned()).into()),
             false => Ok(()),
@@ -58,29 +58,29 @@ impl Memory {
 
 #[async_trait]
 impl ModuleNodes for Memory {
-    async fn connect(&self, _node: &Node, _within: Duration) -> Result<(), NodeError> {
+    async fn connect(&self, _node: &OpcUaNode, _within: Duration) -> Result<(), ModuleNodeError> {
         self.answer()
     }
 
-    async fn read(&self, nodes: &[&Node]) -> Result<Vec<Option<Value>>, NodeError> {
+    async fn read(&self, nodes: &[&OpcUaNode]) -> Result<Vec<Option<SkillValue>>, ModuleNodeError> {
         self.answer()?;
-        let read = |node: &&Node| {
+        let read = |node: &&OpcUaNode| {
             let value = self.with(|pea| pea.value(&node.item).cloned())?;
             Some(match value {
-                PeaValue::Boolean(value) => Value::Boolean(value),
-                PeaValue::Byte(value) => Value::Byte(value),
-                PeaValue::Word(value) => Value::UInt32(value),
-                PeaValue::Integer(value) => Value::Int32(value),
-                PeaValue::Number(value) => Value::Float(value),
-                PeaValue::Text(value) => Value::String(value),
+                PeaValue::Boolean(value) => SkillValue::Boolean(value),
+                PeaValue::Byte(value) => SkillValue::Byte(value),
+                PeaValue::Word(value) => SkillValue::UInt32(value),
+                PeaValue::Integer(value) => SkillValue::Int32(value),
+                PeaValue::Number(value) => SkillValue::Float(value),
+                PeaValue::Text(value) => SkillValue::String(value),
             })
         };
         Ok(nodes.iter().map(read).collect())
     }
 
-    async fn write(&self, node: &Node, value: Value) -> Result<(), NodeError> {
+    async fn write(&self, node: &OpcUaNode, value: SkillValue) -> Result<(), ModuleNodeError> {
         self.answer()?;
-        if let Value::UInt32(word) = value
+        if let SkillValue::UInt32(word) = value
             && node.id().contains("CommandExt")
             && word != 0
         {
@@ -92,13 +92,13 @@ impl ModuleNodes for Memory {
             (Some(PeaValue::Number(_)), value) => {
                 PeaValue::Number(value.as_f64().unwrap_or_default() as f32)
             }
-            (_, Value::Boolean(value)) => PeaValue::Boolean(value),
-            (_, Value::UInt32(value)) => PeaValue::Word(value),
-            (_, Value::Int32(value)) => PeaValue::Integer(value),
-            (_, Value::String(value)) => PeaValue::Text(value),
+            (_, SkillValue::Boolean(value)) => PeaValue::Boolean(value),
+            (_, SkillValue::UInt32(value)) => PeaValue::Word(value),
+            (_, SkillValue::Int32(value)) => PeaValue::Integer(value),
+            (_, SkillValue::String(value)) => PeaValue::Text(value),
             (_, value) => {
                 let shape = value.shape();
-                return Err(NodeError::WrongType { value, shape });
+                return Err(ModuleNodeError::WrongType { value, shape });
             }
         };
         self.with(|pea| pea.write(&node.item, value))
@@ -111,8 +111,8 @@ fn stage() -> Module {
 }
 
 /// Time limits that a loaded machine does not reach.
-fn patient() -> Timing {
-    Timing {
+fn patient() -> HandshakeTiming {
+    HandshakeTiming {
         connect: Duration::from_secs(30),
         handshake: Duration::from_secs(30),
         stop: Duration::from_secs(30),
@@ -122,21 +122,21 @@ fn patient() -> Timing {
 }
 
 /// Time limits for waits that end without success.
-fn short() -> Timing {
-    Timing {
+fn short() -> HandshakeTiming {
+    HandshakeTiming {
         handshake: Duration::from_millis(200),
         ..patient()
     }
 }
 
 /// Returns the skill of a procedure of the stage, and its module.
-fn skill(name: &str, faults: PeaFaults, timing: Timing) -> (Skill, Arc<Memory>) {
+fn skill(name: &str, faults: PeaFaults, timing: HandshakeTiming) -> (Skill, Arc<Memory>) {
     let module = stage();
     let pea = Pea::new(&module)
         .with_times(Duration::from_millis(10), Duration::from_millis(50))
         .with_faults(faults);
     let memory = Memory::new(pea);
-    let settings = Settings {
+    let settings = ModuleSettings {
         module,
         endpoint: None,
         capabilities: std::collections::BTreeMap::new(),
@@ -149,11 +149,11 @@ fn skill(name: &str, faults: PeaFaults, timing: Timing) -> (Skill, Arc<Memory>) 
     (device.spawn(found, Vec::new()).unwrap(), memory)
 }
 
-const BY: Owner = Owner::Local("the test");
+const BY: SkillOwner = SkillOwner::Local("the test");
 
-async fn start(skill: &Skill, parameters: &[(&str, Value)]) {
-    if skill.shown().state == program::State::Halted {
-        skill.call(BY, Method::Reset).await.unwrap();
+async fn start(skill: &Skill, parameters: &[(&str, SkillValue)]) {
+    if skill.shown().state == program::ProgramMachineState::Halted {
+        skill.call(BY, ProgramMethod::Reset).await.unwrap();
     }
     let parameters = parameters
         .iter()
@@ -161,12 +161,12 @@ async fn start(skill: &Skill, parameters: &[(&str, Value)]) {
     skill.start_with(BY, parameters.collect()).await.unwrap();
 }
 
-async fn ended(skill: &Skill) -> Outcome {
+async fn ended(skill: &Skill) -> RunOutcome {
     let mut watch = skill.watch();
-    let is_over = |shown: &Arc<skills::Shown>| {
+    let is_over = |shown: &Arc<skills::SkillSnapshot>| {
         !matches!(
             shown.state,
-            program::State::Running | program::State::Suspended
+            program::ProgramMachineState::Running | program::ProgramMachineState::Suspended
         )
     };
     let ended = watch.wait_for(is_over);
@@ -174,7 +174,7 @@ async fn ended(skill: &Skill) -> Outcome {
         .await
         .unwrap()
         .unwrap();
-    Outcome::clone(shown.outcome.as_ref().unwrap())
+    RunOutcome::clone(shown.outcome.as_ref().unwrap())
 }
 
 /// Waits until a service has a state.
@@ -192,7 +192,7 @@ async fn until(memory: &Memory, service: usize, state: State) {
 async fn a_service_is_started_by_its_name_and_that_of_a_procedure() {
     let module = stage();
     let memory = Memory::new(Pea::new(&module));
-    let settings = Settings {
+    let settings = ModuleSettings {
         module,
         endpoint: None,
         capabilities: std::collections::BTreeMap::new(),
@@ -239,9 +239,9 @@ async fn parameters_are_written_applied_and_read_back() {
     let names: Vec<&str> = tango.parameters.iter().map(|one| &*one.name).collect();
     assert_eq!(names, ["Tempo", "Turns"]);
     let parameters = [
-        ("Tempo", Value::Double(42.1)),
-        ("Turns", Value::Int32(7)),
-        ("RunTime", Value::Double(0.05)),
+        ("Tempo", SkillValue::Double(42.1)),
+        ("Turns", SkillValue::Int32(7)),
+        ("RunTime", SkillValue::Double(0.05)),
     ];
     start(&skill, &parameters).await;
     let outcome = ended(&skill).await;
@@ -255,7 +255,7 @@ async fn parameters_are_written_applied_and_read_back() {
     // The limit of turns is a node of the module.
     start(
         &skill,
-        &[parameters[0].clone(), ("Turns", Value::Int32(700))],
+        &[parameters[0].clone(), ("Turns", SkillValue::Int32(700))],
     )
     .await;
     let outcome = ended(&skill).await;
@@ -274,11 +274,11 @@ async fn halt_stops_the_service_and_suspend_pauses_it() {
     let (skill, memory) = skill("Duet-Waltz", PeaFaults::default(), patient());
     start(&skill, &[]).await;
     until(&memory, 0, State::Execute).await;
-    skill.call(BY, Method::Suspend).await.unwrap();
+    skill.call(BY, ProgramMethod::Suspend).await.unwrap();
     until(&memory, 0, State::Paused).await;
-    skill.call(BY, Method::Resume).await.unwrap();
+    skill.call(BY, ProgramMethod::Resume).await.unwrap();
     until(&memory, 0, State::Execute).await;
-    skill.call(BY, Method::Halt).await.unwrap();
+    skill.call(BY, ProgramMethod::Halt).await.unwrap();
     let outcome = ended(&skill).await;
     assert!(!outcome.succeeded);
     until(&memory, 0, State::Stopped).await;
@@ -345,7 +345,7 @@ async fn a_service_that_runs_is_not_started_again() {
     until(&memory, 0, State::Execute).await;
     let module = stage();
     let nodes = Arc::<Memory>::clone(&memory);
-    let settings = Settings {
+    let settings = ModuleSettings {
         module,
         endpoint: None,
         capabilities: std::collections::BTreeMap::new(),

@@ -2,7 +2,7 @@
 
 use std::fmt::Write as _;
 
-use mtp::{Bound, Output, Parameter, ValueKind, unit_symbol};
+use mtp::{ModuleOutput, ParameterKind, ServiceParameter, ValueBound, unit_symbol};
 use skills::{Builtin, NAMESPACE};
 
 use super::procedure::RUN_TIME;
@@ -11,8 +11,8 @@ use super::procedure::RUN_TIME;
 pub(super) struct SkillTypeXml<'a> {
     pub(super) name: String,
     pub(super) about: String,
-    pub(super) parameters: Vec<&'a Parameter>,
-    pub(super) outputs: Vec<&'a Output>,
+    pub(super) parameters: Vec<&'a ServiceParameter>,
+    pub(super) outputs: Vec<&'a ModuleOutput>,
     pub(super) has_run_time: bool,
 }
 
@@ -188,22 +188,22 @@ fn property(
     );
 }
 
-pub(super) const fn builtin(kind: ValueKind) -> Builtin {
+pub(super) const fn builtin(kind: ParameterKind) -> Builtin {
     match kind {
         // A Double takes each number of a user exactly; the module has a Float.
-        ValueKind::Analog => Builtin::Double,
-        ValueKind::Integer => Builtin::Int32,
-        ValueKind::Binary => Builtin::Boolean,
-        ValueKind::Text => Builtin::String,
+        ParameterKind::Analog => Builtin::Double,
+        ParameterKind::Integer => Builtin::Int32,
+        ParameterKind::Binary => Builtin::Boolean,
+        ParameterKind::Text => Builtin::String,
     }
 }
 
-pub(super) fn unit(bound: Option<&Bound>) -> Option<&'static str> {
-    bound.and_then(Bound::constant).and_then(unit_symbol)
+pub(super) fn unit(bound: Option<&ValueBound>) -> Option<&'static str> {
+    bound.and_then(ValueBound::constant).and_then(unit_symbol)
 }
 
 /// Returns the range of a parameter with both limits in the file.
-pub(super) fn range(parameter: &Parameter) -> Option<(f64, f64)> {
+pub(super) fn range(parameter: &ServiceParameter) -> Option<(f64, f64)> {
     let low = parameter.min.as_ref()?.constant()?;
     let high = parameter.max.as_ref()?.constant()?;
     (low < high).then_some((low, high))

@@ -6,18 +6,18 @@ use std::time::Duration;
 use tokio::time::Instant;
 
 use super::{ACTION, STATUS, STROKE};
-use crate::modbus::server::{Registers, Table};
+use crate::modbus::server::{RegisterTable, Registers};
 
 /// Settings of the simulated gripper.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Settings {
+pub struct RobotiqSettings {
     /// Width of the object between the fingers in m, if any.
     pub object: Option<f64>,
     /// Speed factor of the simulated time.
     pub time_scale: f64,
 }
 
-impl Default for Settings {
+impl Default for RobotiqSettings {
     fn default() -> Self {
         Self {
             object: Some(0.04),
@@ -28,13 +28,13 @@ impl Default for Settings {
 
 /// A simulated gripper; clones share the same gripper.
 #[derive(Debug, Clone)]
-pub struct Simulator {
+pub struct RobotiqSimulator {
     gripper: Arc<Mutex<Gripper>>,
 }
 
 #[derive(Debug)]
 struct Gripper {
-    settings: Settings,
+    settings: RobotiqSettings,
     /// The three command registers as written last.
     written: [u16; 3],
     /// End of the activation.
@@ -46,10 +46,10 @@ struct Gripper {
     object: u8,
 }
 
-impl Simulator {
+impl RobotiqSimulator {
     /// Creates a gripper that was just switched on, with open fingers.
     #[must_use]
-    pub fn new(settings: Settings) -> Self {
+    pub fn new(settings: RobotiqSettings) -> Self {
         let gripper = Gripper {
             settings,
             written: [0; 3],
@@ -91,21 +91,21 @@ impl Simulator {
     }
 }
 
-impl Registers for Simulator {
-    fn read(&self, table: Table, address: u16, count: u16) -> Option<Vec<u16>> {
+impl Registers for RobotiqSimulator {
+    fn read(&self, table: RegisterTable, address: u16, count: u16) -> Option<Vec<u16>> {
         let mut gripper = self.lock();
         gripper.advance();
         let status = gripper.status();
         (address..address.checked_add(count)?)
             .map(|address| match (table, address) {
                 // The gripper answers both functions for both ranges, as in the manual.
-                (Table::Holding | Table::Input, STATUS..) => {
+                (RegisterTable::Holding | RegisterTable::Input, STATUS..) => {
                     status.get(usize::from(address - STATUS)).copied()
                 }
-                (Table::Holding | Table::Input, ACTION..) => {
+                (RegisterTable::Holding | RegisterTable::Input, ACTION..) => {
                     gripper.written.get(usize::from(address - ACTION)).copied()
                 }
-                (Table::Holding | Table::Input, _) => None,
+                (RegisterTable::Holding | RegisterTable::Input, _) => None,
             })
             .collect()
     }

@@ -1,23 +1,23 @@
 use skills::conformance;
 
-use super::simulator::{Settings, Simulator};
+use super::simulator::{RobotiqSettings, RobotiqSimulator};
 use super::*;
-use crate::modbus::server::{Faults, Serving};
+use crate::modbus::server::{LineFaults, ServedDevice};
 
 struct Bench {
-    simulator: Simulator,
-    serving: Serving,
-    faults: Faults,
+    simulator: RobotiqSimulator,
+    serving: ServedDevice,
+    faults: LineFaults,
 }
 
 async fn bench(line: &str, object: Option<f64>) -> Bench {
-    let simulator = Simulator::new(Settings {
+    let simulator = RobotiqSimulator::new(RobotiqSettings {
         object,
         time_scale: 10.0,
     });
-    let faults = Faults::default();
+    let faults = LineFaults::default();
     let registers = Arc::new(simulator.clone());
-    let serving = Serving::start(&line.parse().unwrap(), UNIT, registers, faults.clone())
+    let serving = ServedDevice::start(&line.parse().unwrap(), UNIT, registers, faults.clone())
         .await
         .unwrap();
     Bench {
@@ -29,9 +29,9 @@ async fn bench(line: &str, object: Option<f64>) -> Bench {
 
 impl Bench {
     fn driver(&self, of: &str) -> Arc<dyn Driver> {
-        let gripper = Gripper::new(self.serving.line().clone(), UNIT);
+        let gripper = RobotiqGripper::new(self.serving.line().clone(), UNIT);
         gripper
-            .driver(&[TypeName::own(of)], &PeerAccess::default())
+            .driver(&[ParameterType::own(of)], &PeerAccess::default())
             .unwrap()
     }
 
@@ -162,8 +162,10 @@ async fn a_gripper_that_is_not_there_or_refuses_is_told_by_its_line() {
     let bench = bench(LINES[0], None).await;
     let line = bench.serving.line().clone();
     drop(bench);
-    let driver = Gripper::new(line.clone(), UNIT)
-        .driver(&[TypeName::own("GraspSkillType")], &PeerAccess::default());
+    let driver = RobotiqGripper::new(line.clone(), UNIT).driver(
+        &[ParameterType::own("GraspSkillType")],
+        &PeerAccess::default(),
+    );
     let outcome = conformance::run_once("GraspSkillType", driver.unwrap(), Vec::new())
         .await
         .unwrap();
@@ -191,7 +193,8 @@ fn the_force_is_told_in_the_unit_of_the_gripper() {
 #[tokio::test]
 async fn its_values_follow_the_fingers_beside_its_skills() {
     let bench = bench(LINES[0], Some(0.04)).await;
-    let gripper: Arc<dyn Device> = Arc::new(Gripper::new(bench.serving.line().clone(), UNIT));
+    let gripper: Arc<dyn Device> =
+        Arc::new(RobotiqGripper::new(bench.serving.line().clone(), UNIT));
     let values = crate::sensors::tests::measured(gripper);
     values
         .until("Active", |value| *value == Ok(false.into()))
@@ -205,7 +208,7 @@ async fn its_values_follow_the_fingers_beside_its_skills() {
         .await;
     values
         .until("Width", |value| {
-            let width = value.as_ref().ok().and_then(Value::as_f64);
+            let width = value.as_ref().ok().and_then(SkillValue::as_f64);
             width.is_some_and(|width| (width - 0.04).abs() < 0.001)
         })
         .await;

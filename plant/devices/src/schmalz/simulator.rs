@@ -22,7 +22,7 @@ use super::{BLOW_OFF, DEVICES, VACUUM};
 
 /// Settings of the simulated gripper.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Settings {
+pub struct SchmalzSettings {
     /// The alias of its port.
     pub alias: String,
     /// Whether there is a part below its cups.
@@ -31,7 +31,7 @@ pub struct Settings {
     pub time_scale: f64,
 }
 
-impl Default for Settings {
+impl Default for SchmalzSettings {
     fn default() -> Self {
         Self {
             alias: "master1port1".to_owned(),
@@ -43,25 +43,25 @@ impl Default for Settings {
 
 /// A simulated master with its gripper; clones share the same master.
 #[derive(Debug, Clone)]
-pub struct Simulator {
+pub struct SchmalzSimulator {
     gripper: Arc<Mutex<Gripper>>,
 }
 
 #[derive(Debug)]
 struct Gripper {
-    settings: Settings,
+    settings: SchmalzSettings,
     out: [u8; 2],
     /// mbar
     vacuum: f64,
     held: bool,
     detached: bool,
     seen: Instant,
-    faults: Faults,
+    faults: SchmalzFaults,
 }
 
 /// Faults of the simulator.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub struct Faults {
+pub struct SchmalzFaults {
     /// The master does not answer.
     pub silent: bool,
     /// Its responses are not JSON.
@@ -72,10 +72,10 @@ pub struct Faults {
     pub broken: bool,
 }
 
-impl Simulator {
+impl SchmalzSimulator {
     /// Creates a gripper without a held part.
     #[must_use]
-    pub fn new(settings: Settings) -> Self {
+    pub fn new(settings: SchmalzSettings) -> Self {
         let gripper = Gripper {
             settings,
             out: [0; 2],
@@ -83,7 +83,7 @@ impl Simulator {
             held: false,
             detached: false,
             seen: Instant::now(),
-            faults: Faults::default(),
+            faults: SchmalzFaults::default(),
         };
         Self {
             gripper: Arc::new(Mutex::new(gripper)),
@@ -91,7 +91,7 @@ impl Simulator {
     }
 
     /// Sets the faults.
-    pub fn set_faults(&self, faults: Faults) {
+    pub fn set_faults(&self, faults: SchmalzFaults) {
         self.lock().faults = faults;
     }
 
@@ -232,17 +232,17 @@ fn refused(status: StatusCode, code: u16, message: &str) -> (StatusCode, Option<
 
 /// A master that is served, until it is dropped.
 #[derive(Debug)]
-pub struct Serving {
+pub struct ServedMaster {
     address: SocketAddr,
     _tasks: JoinSet<()>,
 }
 
-impl Serving {
+impl ServedMaster {
     /// Serves a master; port 0 selects a free port. Needs a tokio runtime.
     ///
     /// # Errors
     /// Fails if the address cannot be used.
-    pub async fn start(simulator: &Simulator, address: &str) -> io::Result<Self> {
+    pub async fn start(simulator: &SchmalzSimulator, address: &str) -> io::Result<Self> {
         let listener = TcpListener::bind(address).await?;
         let address = listener.local_addr()?;
         let mut tasks = JoinSet::new();
@@ -260,7 +260,7 @@ impl Serving {
     }
 }
 
-async fn accept(listener: TcpListener, simulator: Simulator) {
+async fn accept(listener: TcpListener, simulator: SchmalzSimulator) {
     let mut clients = JoinSet::new();
     loop {
         let Ok((stream, from)) = listener.accept().await else {
@@ -286,7 +286,7 @@ async fn accept(listener: TcpListener, simulator: Simulator) {
 
 async fn respond(
     request: Request<Incoming>,
-    simulator: &Simulator,
+    simulator: &SchmalzSimulator,
 ) -> Result<Response<Full<Bytes>>, Infallible> {
     let (head, body) = request.into_parts();
     let body = Limited::new(body, LONGEST).collect().await;

@@ -1,33 +1,36 @@
 use skills::conformance;
 
-use super::simulator::{Faults, Serving, Settings, Simulator};
+use super::simulator::{SchmalzFaults, SchmalzSettings, SchmalzSimulator, ServedMaster};
 use super::*;
 
 struct Bench {
-    simulator: Simulator,
-    serving: Serving,
+    simulator: SchmalzSimulator,
+    serving: ServedMaster,
 }
 
 async fn bench(part: bool) -> Bench {
-    let settings = Settings {
+    let settings = SchmalzSettings {
         part,
         time_scale: 10.0,
-        ..Settings::default()
+        ..SchmalzSettings::default()
     };
-    let simulator = Simulator::new(settings);
-    let serving = Serving::start(&simulator, "127.0.0.1:0").await.unwrap();
+    let simulator = SchmalzSimulator::new(settings);
+    let serving = ServedMaster::start(&simulator, "127.0.0.1:0")
+        .await
+        .unwrap();
     Bench { simulator, serving }
 }
 
 impl Bench {
     fn driver(&self, of: &str) -> Arc<dyn Driver> {
-        let timing = Timing {
+        let timing = SchmalzTiming {
             grasp: Duration::from_millis(600),
             release: Duration::from_millis(600),
         };
-        let gripper = Gripper::new(&self.serving.address().to_string(), "master1port1", timing);
+        let gripper =
+            SchmalzGripper::new(&self.serving.address().to_string(), "master1port1", timing);
         gripper
-            .driver(&[TypeName::own(of)], &PeerAccess::default())
+            .driver(&[ParameterType::own(of)], &PeerAccess::default())
             .unwrap()
     }
 
@@ -66,24 +69,24 @@ async fn it_holds_a_part_from_grasp_to_release_and_says_the_vacuum_if_there_is_n
 async fn silence_damaged_answers_and_a_gripper_without_power_are_told_and_do_not_last() {
     let bench = bench(true).await;
     let at = format!("http://{}", bench.serving.address());
-    let none = Faults::default();
+    let none = SchmalzFaults::default();
     for (faults, told) in [
         (
-            Faults {
+            SchmalzFaults {
                 silent: true,
                 ..none
             },
             format!("no answer from {at} within 400 ms"),
         ),
         (
-            Faults {
+            SchmalzFaults {
                 unplugged: true,
                 ..none
             },
             format!("{at} refuses with 404 Not Found: IO-Link Device is not accessible"),
         ),
         (
-            Faults {
+            SchmalzFaults {
                 broken: true,
                 ..none
             },
@@ -93,7 +96,7 @@ async fn silence_damaged_answers_and_a_gripper_without_power_are_told_and_do_not
         bench.simulator.set_faults(faults);
         assert_eq!(bench.run("GraspSkillType").await, (false, told));
     }
-    bench.simulator.set_faults(Faults {
+    bench.simulator.set_faults(SchmalzFaults {
         damaged: true,
         ..none
     });
@@ -111,10 +114,10 @@ async fn silence_damaged_answers_and_a_gripper_without_power_are_told_and_do_not
 #[tokio::test]
 async fn its_values_follow_the_part_and_are_unknown_while_it_is_unplugged() {
     let bench = bench(true).await;
-    let gripper: Arc<dyn Device> = Arc::new(Gripper::new(
+    let gripper: Arc<dyn Device> = Arc::new(SchmalzGripper::new(
         &bench.serving.address().to_string(),
         "master1port1",
-        Timing::default(),
+        SchmalzTiming::default(),
     ));
     let values = crate::sensors::tests::measured(gripper);
     values
@@ -131,12 +134,12 @@ async fn its_values_follow_the_part_and_are_unknown_while_it_is_unplugged() {
                 .is_ok_and(|mbar| mbar.as_f64().is_some_and(|mbar| mbar > 100.0))
         })
         .await;
-    bench.simulator.set_faults(Faults {
+    bench.simulator.set_faults(SchmalzFaults {
         unplugged: true,
-        ..Faults::default()
+        ..SchmalzFaults::default()
     });
     values.until("Vacuum", Result::is_err).await;
-    bench.simulator.set_faults(Faults::default());
+    bench.simulator.set_faults(SchmalzFaults::default());
     values
         .until("PartPresent", |value| *value == Ok(true.into()))
         .await;

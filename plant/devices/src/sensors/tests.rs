@@ -7,7 +7,7 @@ use tokio::time::timeout;
 
 use super::*;
 use crate::Kinds;
-use crate::modbus::server::{Faults, Registers, Serving, Table};
+use crate::modbus::server::{LineFaults, RegisterTable, Registers, ServedDevice};
 
 const SOON: Duration = Duration::from_secs(30);
 
@@ -16,7 +16,7 @@ const SOON: Duration = Duration::from_secs(30);
 struct Meter(Mutex<[u16; 4]>);
 
 impl Registers for Meter {
-    fn read(&self, _table: Table, address: u16, count: u16) -> Option<Vec<u16>> {
+    fn read(&self, _table: RegisterTable, address: u16, count: u16) -> Option<Vec<u16>> {
         let registers = self.0.lock().unwrap();
         let first = usize::from(address);
         Some(registers.get(first..first + usize::from(count))?.to_vec())
@@ -38,7 +38,7 @@ fn served(values: &str) -> ComponentServer {
     ComponentServer::build(&component, &ServeSettings::default(), |_, _| Vec::new()).unwrap()
 }
 
-async fn until(value: &LiveValue, wanted: impl Fn(&Result<Value, String>) -> bool) {
+async fn until(value: &LiveValue, wanted: impl Fn(&Result<SkillValue, String>) -> bool) {
     let mut readings = value.watch();
     let found = timeout(SOON, readings.wait_for(|reading| wanted(&reading.value))).await;
     if found.is_err() {
@@ -49,9 +49,9 @@ async fn until(value: &LiveValue, wanted: impl Fn(&Result<Value, String>) -> boo
 #[tokio::test]
 async fn registers_are_values_and_are_unknown_while_the_device_is_silent() {
     let meter = Arc::new(Meter(Mutex::new([0x00FA, 0x8001, 0x0000, 0x42F7])));
-    let faults = Faults::default();
+    let faults = LineFaults::default();
     let line = "tcp://127.0.0.1:0".parse().unwrap();
-    let serving = Serving::start(&line, 3, meter.clone(), faults.clone())
+    let serving = ServedDevice::start(&line, 3, meter.clone(), faults.clone())
         .await
         .unwrap();
     let at = format!("at: \"{}\", unit: 3", serving.line());
@@ -63,9 +63,9 @@ async fn registers_are_values_and_are_unknown_while_the_device_is_silent() {
     let [heat, full, flow] = served.values() else {
         panic!("{:?}", served.values())
     };
-    until(heat, |value| *value == Ok(Value::Double(20.0))).await;
-    until(full, |value| *value == Ok(Value::Boolean(true))).await;
-    until(flow, |value| *value == Ok(Value::Float(123.5))).await;
+    until(heat, |value| *value == Ok(SkillValue::Double(20.0))).await;
+    until(full, |value| *value == Ok(SkillValue::Boolean(true))).await;
+    until(flow, |value| *value == Ok(SkillValue::Float(123.5))).await;
     faults.set_silent(true);
     until(heat, |value| {
         value
@@ -75,7 +75,7 @@ async fn registers_are_values_and_are_unknown_while_the_device_is_silent() {
     .await;
     meter.0.lock().unwrap()[0] = 0x0032;
     faults.set_silent(false);
-    until(heat, |value| *value == Ok(Value::Double(0.0))).await;
+    until(heat, |value| *value == Ok(SkillValue::Double(0.0))).await;
     served.stop().await;
 }
 
@@ -88,14 +88,17 @@ fn numbers_of_process_data_have_their_formats() {
         scaled: None,
     };
     let bytes = [0xFF, 0x38, 0x00, 0x05];
-    assert_eq!(number(Format::Int8, None).of(&bytes), Ok(Value::SByte(-1)));
+    assert_eq!(
+        number(Format::Int8, None).of(&bytes),
+        Ok(SkillValue::SByte(-1))
+    );
     assert_eq!(
         number(Format::Int16, None).of(&bytes),
-        Ok(Value::Int16(-200))
+        Ok(SkillValue::Int16(-200))
     );
     assert_eq!(
         number(Format::UInt32, None).of(&bytes),
-        Ok(Value::UInt32(0xFF38_0005))
+        Ok(SkillValue::UInt32(0xFF38_0005))
     );
     assert_eq!(
         number(Format::UInt8, Some(3)).of(&bytes[1..]),
@@ -149,7 +152,11 @@ pub(crate) fn measured(device: Arc<dyn skills::Device>) -> MeasuredDevice {
 
 impl MeasuredDevice {
     /// Waits until a value is as wanted.
-    pub(crate) async fn until(&self, name: &str, wanted: impl Fn(&Result<Value, String>) -> bool) {
+    pub(crate) async fn until(
+        &self,
+        name: &str,
+        wanted: impl Fn(&Result<SkillValue, String>) -> bool,
+    ) {
         let live = self.live.iter().find(|live| live.facts().name == name);
         until(live.unwrap(), wanted).await;
     }

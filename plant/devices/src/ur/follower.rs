@@ -2,7 +2,7 @@
 
 use super::of_robot;
 use super::rtde::{Rtde, RtdeError};
-use super::wire::Value;
+use super::wire::RecipeValue;
 
 /// A client that receives the tool position of a robot.
 #[derive(Debug)]
@@ -25,7 +25,7 @@ impl Follower {
     /// Fails if the connection is lost, or silent for a second.
     pub async fn position(&mut self) -> Result<[f64; 6], RtdeError> {
         match self.0.next().await?.as_slice() {
-            [Value::Vector(pose)] => Ok(of_robot(*pose)),
+            [RecipeValue::Vector(pose)] => Ok(of_robot(*pose)),
             _ => Err(self.0.damaged("a position of another type")),
         }
     }

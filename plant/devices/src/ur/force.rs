@@ -3,13 +3,13 @@
 use std::fmt;
 
 use skills::frame::Frame;
-use skills::{InvalidParameter, Parameters, Results};
+use skills::{InvalidParameter, Parameters, RunResults};
 
 use super::pose::of_robot;
 
 /// Compares the force at the tool with the parameter MaxForce.
 #[derive(Debug, Clone, PartialEq)]
-pub(super) struct Guard {
+pub(super) struct ForceGuard {
     /// The highest force along x, y and z of the tool, N; 0 for no limit.
     most: [f64; 3],
     /// The force before the move, in the frame of the base.
@@ -19,13 +19,15 @@ pub(super) struct Guard {
     exceeded: bool,
 }
 
-impl Guard {
+impl ForceGuard {
     /// Creates the guard of a run.
     ///
     /// # Errors
     /// MaxForce has no limit, or not three.
     pub(super) fn of(parameters: &Parameters) -> Result<Self, InvalidParameter> {
-        let most = parameters.get(MAX_FORCE).and_then(skills::Value::as_f64s);
+        let most = parameters
+            .get(MAX_FORCE)
+            .and_then(skills::SkillValue::as_f64s);
         let most: Option<[f64; 3]> = most.and_then(|most| most.try_into().ok());
         let most = most.ok_or_else(|| InvalidParameter::missing(MAX_FORCE, "three numbers"))?;
         if most.iter().any(|limit| *limit < 0.0) || most.iter().all(|limit| *limit <= 0.0) {
@@ -67,7 +69,7 @@ impl Guard {
     }
 
     /// Returns the results of a move.
-    pub(super) fn results(&self) -> Results {
+    pub(super) fn results(&self) -> RunResults {
         vec![
             ("ForceExceeded".to_owned(), self.exceeded.into()),
             ("Force".to_owned(), self.greatest.to_vec().into()),
@@ -78,7 +80,7 @@ impl Guard {
 /// The parameter with the limits.
 const MAX_FORCE: &str = "MaxForce";
 
-impl fmt::Display for Guard {
+impl fmt::Display for ForceGuard {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let [x, y, z] = self.greatest;
         write!(
@@ -94,7 +96,7 @@ mod tests {
 
     use super::*;
 
-    fn guard(most: [f64; 3]) -> Result<Guard, InvalidParameter> {
+    fn guard(most: [f64; 3]) -> Result<ForceGuard, InvalidParameter> {
         let of = skills::model::find("ForceMoveSkillType")
             .unwrap()
             .parameters();
@@ -102,7 +104,7 @@ mod tests {
             ("TargetPosition".to_owned(), [0.0; 6].into()),
             ("MaxForce".to_owned(), most.to_vec().into()),
         ];
-        Guard::of(&Parameters::complete(&of, given).unwrap())
+        ForceGuard::of(&Parameters::complete(&of, given).unwrap())
     }
 
     #[test]

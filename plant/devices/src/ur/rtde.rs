@@ -7,7 +7,7 @@ use tokio::io::{AsyncWriteExt as _, BufReader};
 use tokio::net::TcpStream;
 use tokio::time::timeout;
 
-use super::wire::{Kind, Type, VERSION, Value, chunk, next, package};
+use super::wire::{RecipeType, RecipeValue, Type, VERSION, chunk, next, package};
 use crate::modbus::connected;
 
 /// Time limit for a silent robot, which sends 50 times a second.
@@ -87,7 +87,7 @@ pub enum RtdeError {
 pub(crate) struct Rtde {
     stream: BufReader<TcpStream>,
     address: String,
-    outputs: (u8, Vec<Kind>),
+    outputs: (u8, Vec<RecipeType>),
     /// The recipe of the inputs, unless another client has them.
     inputs: Option<u8>,
 }
@@ -130,7 +130,8 @@ impl Rtde {
         let mut wanted = hertz.to_be_bytes().to_vec();
         wanted.extend(outputs.join(",").bytes());
         let (recipe, kinds) = self.recipe(Type::Outputs, &wanted).await?;
-        let known: Option<Vec<Kind>> = kinds.iter().map(|kind| Kind::of(kind)).collect();
+        let known: Option<Vec<RecipeType>> =
+            kinds.iter().map(|kind| RecipeType::of(kind)).collect();
         let known = known
             .filter(|known| known.len() == outputs.len())
             .ok_or_else(|| RtdeError::Outputs {
@@ -142,7 +143,7 @@ impl Rtde {
         let (recipe, kinds) = self
             .recipe(Type::Inputs, inputs.join(",").as_bytes())
             .await?;
-        if kinds.iter().all(|kind| Kind::of(kind).is_some()) && recipe != 0 {
+        if kinds.iter().all(|kind| RecipeType::of(kind).is_some()) && recipe != 0 {
             self.inputs = Some(recipe);
         }
         self.start().await
@@ -172,7 +173,7 @@ impl Rtde {
     }
 
     /// Returns the next values, in the order of the recipe. Not cancel-safe.
-    pub(crate) async fn next(&mut self) -> Result<Vec<Value>, RtdeError> {
+    pub(crate) async fn next(&mut self) -> Result<Vec<RecipeValue>, RtdeError> {
         let body = self.package(Type::Data).await?;
         let mut rest = body.as_slice();
         let (recipe, kinds) = &self.outputs;
@@ -188,7 +189,7 @@ impl Rtde {
     }
 
     /// Sends the values of the inputs to the robot.
-    pub(crate) async fn tell(&mut self, values: &[Value]) -> Result<(), RtdeError> {
+    pub(crate) async fn tell(&mut self, values: &[RecipeValue]) -> Result<(), RtdeError> {
         let Some(recipe) = self.inputs else {
             let address = self.address();
             return Err(RtdeError::InputsTaken { address });

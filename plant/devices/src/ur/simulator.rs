@@ -13,17 +13,17 @@ use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
-pub use served::Serving;
+pub use served::ServedRobot;
 use skills::simulated::Hole;
 use tokio::time::Instant;
 
-use self::motion::Motion;
+use self::motion::SimulatedMotion;
 use super::pose::{of_vector, to_vector};
 use super::script::Statement;
 
 /// Settings of the simulated robot.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Settings {
+pub struct UrSimulatorSettings {
     /// Speed factor of the simulated time.
     pub time_scale: f64,
     /// Pose of the tool after power-on: x, y, z and a rotation vector.
@@ -34,7 +34,7 @@ pub struct Settings {
     pub hole: Option<Hole>,
 }
 
-impl Default for Settings {
+impl Default for UrSimulatorSettings {
     fn default() -> Self {
         Self {
             time_scale: 1.0,
@@ -47,13 +47,13 @@ impl Default for Settings {
 
 /// A simulated robot; clones share the same robot.
 #[derive(Debug, Clone)]
-pub struct Simulator {
+pub struct UrSimulator {
     robot: Arc<Mutex<Robot>>,
 }
 
 #[derive(Debug)]
 struct Robot {
-    settings: Settings,
+    settings: UrSimulatorSettings,
     switched_on: Instant,
     seen: Instant,
     pose: [f64; 6],
@@ -73,14 +73,14 @@ struct Robot {
 #[derive(Debug)]
 struct Running {
     waiting: VecDeque<Statement>,
-    motion: Option<Motion>,
+    motion: Option<SimulatedMotion>,
     sleep: f64,
 }
 
-impl Simulator {
+impl UrSimulator {
     /// Creates a robot at its home pose.
     #[must_use]
-    pub fn new(settings: Settings) -> Self {
+    pub fn new(settings: UrSimulatorSettings) -> Self {
         let now = Instant::now();
         let robot = Robot {
             pose: settings.home,
@@ -165,7 +165,7 @@ impl Simulator {
         robot.paused = false;
         robot.program = Some(Running {
             waiting: statements.into(),
-            motion: motion.map(Motion::interrupted),
+            motion: motion.map(SimulatedMotion::interrupted),
             sleep: 0.0,
         });
         robot.advance();
@@ -256,7 +256,7 @@ impl Robot {
                 acceleration,
                 speed,
             }) => {
-                let motion = Motion::of_joints(self.joints, to, speed, acceleration);
+                let motion = SimulatedMotion::of_joints(self.joints, to, speed, acceleration);
                 program.motion = Some(motion);
             }
             Some(Statement::Move {
@@ -267,7 +267,12 @@ impl Robot {
             }) => {
                 // A joint that turns by v moves the tool by v times the reach.
                 let by = if linear { 1.0 } else { super::REACH };
-                program.motion = Some(Motion::new(self.pose, to, speed * by, acceleration * by));
+                program.motion = Some(SimulatedMotion::new(
+                    self.pose,
+                    to,
+                    speed * by,
+                    acceleration * by,
+                ));
             }
         }
         true

@@ -1,10 +1,10 @@
 //! The state of a robot, as RTDE sends it.
 
-use super::wire::Value;
+use super::wire::RecipeValue;
 
 /// State of the robot.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct State {
+pub(super) struct UrState {
     pub(super) pose: [f64; 6],
     pub(super) speed: f64,
     pub(super) mode: i32,
@@ -58,20 +58,20 @@ pub(super) enum UnfitRobot {
     NotRunning,
 }
 
-impl State {
+impl UrState {
     /// Returns the state in the values of [`OUTPUTS`]; `None` for values of other types.
-    pub(super) fn of(values: &[Value]) -> Option<Self> {
+    pub(super) fn of(values: &[RecipeValue]) -> Option<Self> {
         let [
-            Value::Vector(pose),
-            Value::Vector([x, y, z, rx, ry, rz]),
-            Value::I32(mode),
-            Value::I32(safety),
-            Value::U32(runtime),
-            Value::F64(slider),
-            Value::I32(started),
-            Value::I32(done),
-            Value::Vector(force),
-            Value::Vector(joints),
+            RecipeValue::Vector(pose),
+            RecipeValue::Vector([x, y, z, rx, ry, rz]),
+            RecipeValue::I32(mode),
+            RecipeValue::I32(safety),
+            RecipeValue::U32(runtime),
+            RecipeValue::F64(slider),
+            RecipeValue::I32(started),
+            RecipeValue::I32(done),
+            RecipeValue::Vector(force),
+            RecipeValue::Vector(joints),
         ] = values
         else {
             return None;

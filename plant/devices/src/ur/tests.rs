@@ -1,11 +1,11 @@
-use skills::{Outcome, conformance};
+use skills::{RunOutcome, conformance};
 
-use super::simulator::{Serving, Simulator};
+use super::simulator::{ServedRobot, UrSimulator};
 use super::*;
 
 struct Bench {
-    simulator: Simulator,
-    serving: Serving,
+    simulator: UrSimulator,
+    serving: ServedRobot,
 }
 
 async fn bench() -> Bench {
@@ -13,29 +13,29 @@ async fn bench() -> Bench {
 }
 
 async fn bench_at(time_scale: f64, surface: Option<f64>) -> Bench {
-    let settings = simulator::Settings {
+    let settings = simulator::UrSimulatorSettings {
         time_scale,
         surface,
-        ..simulator::Settings::default()
+        ..simulator::UrSimulatorSettings::default()
     };
-    let simulator = Simulator::new(settings);
-    let serving = Serving::start(&simulator, "127.0.0.1:0", "127.0.0.1:0")
+    let simulator = UrSimulator::new(settings);
+    let serving = ServedRobot::start(&simulator, "127.0.0.1:0", "127.0.0.1:0")
         .await
         .unwrap();
     Bench { simulator, serving }
 }
 
-fn to(target: [f64; 6]) -> Vec<(String, skills::Value)> {
+fn to(target: [f64; 6]) -> Vec<(String, skills::SkillValue)> {
     vec![("TargetPosition".to_owned(), target.into())]
 }
 
-fn turned(target: [f64; 6]) -> Vec<(String, skills::Value)> {
+fn turned(target: [f64; 6]) -> Vec<(String, skills::SkillValue)> {
     vec![("TargetJointPosition".to_owned(), target.into())]
 }
 
 impl Bench {
-    fn settings(&self) -> Settings {
-        Settings {
+    fn settings(&self) -> UrSettings {
+        UrSettings {
             rtde: self.serving.rtde().to_string(),
             secondary: self.serving.secondary().to_string(),
             reach: REACH,
@@ -43,12 +43,12 @@ impl Bench {
     }
 
     fn driver(&self, of: &str) -> Arc<dyn Driver> {
-        Robot::new(self.settings())
-            .driver(&[TypeName::own(of)], &PeerAccess::default())
+        UrRobot::new(self.settings())
+            .driver(&[ParameterType::own(of)], &PeerAccess::default())
             .unwrap()
     }
 
-    async fn run(&self, of: &str, target: [f64; 6]) -> Outcome {
+    async fn run(&self, of: &str, target: [f64; 6]) -> RunOutcome {
         conformance::run_once(of, self.driver(of), to(target))
             .await
             .unwrap()
@@ -136,7 +136,7 @@ async fn silence_a_protective_stop_and_a_reboot_are_told_and_do_not_last() {
     bench.simulator.set_silent(false);
     assert!(bench.run("LinearMoveSkillType", near).await.succeeded);
 
-    let between = |change: fn(&Simulator)| {
+    let between = |change: fn(&UrSimulator)| {
         let simulator = bench.simulator.clone();
         let running = bench.run("LinearMoveSkillType", far);
         async move {
@@ -155,7 +155,7 @@ async fn silence_a_protective_stop_and_a_reboot_are_told_and_do_not_last() {
     assert_eq!(told, "the robot does not move: it is in a protective stop");
     bench.simulator.set_protective_stop(false);
     assert!(bench.run("LinearMoveSkillType", near).await.succeeded);
-    let told = between(Simulator::reboot).await;
+    let told = between(UrSimulator::reboot).await;
     assert!(told.contains(" is lost: "), "{told}");
     assert!(bench.run("LinearMoveSkillType", near).await.succeeded);
     let told = between(|robot| robot.set_silent(true)).await;
@@ -238,11 +238,11 @@ async fn what_it_cannot_reach_is_refused_before_anything_is_sent() {
 #[tokio::test]
 async fn its_values_follow_the_robot_and_come_back_after_a_silence() {
     let bench = bench().await;
-    let robot: Arc<dyn Device> = Arc::new(Robot::new(bench.settings()));
+    let robot: Arc<dyn Device> = Arc::new(UrRobot::new(bench.settings()));
     let values = crate::sensors::tests::measured(robot);
     let at = |x: f64| {
-        move |value: &Result<skills::Value, String>| {
-            let pose = value.as_ref().ok().and_then(skills::Value::as_f64s);
+        move |value: &Result<skills::SkillValue, String>| {
+            let pose = value.as_ref().ok().and_then(skills::SkillValue::as_f64s);
             pose.is_some_and(|pose| pose.first().is_some_and(|found| (found - x).abs() < 1e-4))
         }
     };
@@ -279,7 +279,7 @@ async fn a_force_move_ends_at_a_contact_and_says_the_force() {
             .await
             .unwrap()
     };
-    let result = |outcome: &Outcome, name: &str| {
+    let result = |outcome: &RunOutcome, name: &str| {
         let found = outcome.results.iter().find(|(known, _)| known == name);
         found.unwrap().1.clone()
     };
@@ -318,13 +318,13 @@ async fn late(robot: std::net::SocketAddr) -> (String, tokio::sync::oneshot::Sen
 async fn a_program_that_is_taken_too_late_is_unknown_and_does_not_move_the_robot() {
     let bench = bench_at(1.0, None).await;
     let (secondary, forward) = late(bench.serving.secondary()).await;
-    let settings = Settings {
+    let settings = UrSettings {
         secondary,
         ..bench.settings()
     };
-    let driver = Robot::new(settings)
+    let driver = UrRobot::new(settings)
         .driver(
-            &[TypeName::own("LinearMoveSkillType")],
+            &[ParameterType::own("LinearMoveSkillType")],
             &PeerAccess::default(),
         )
         .unwrap();
@@ -365,14 +365,14 @@ async fn a_program_that_is_taken_too_late_is_unknown_and_does_not_move_the_robot
 
 /// A run that brakes a robot of which another client has the speed slider.
 struct Brakes {
-    settings: Arc<Settings>,
-    robot: Simulator,
+    settings: Arc<UrSettings>,
+    robot: UrSimulator,
     silent: bool,
 }
 
 #[async_trait]
 impl Driver for Brakes {
-    async fn run(&self, work: Work) -> Result<Results, DriverError> {
+    async fn run(&self, work: Work) -> Result<RunResults, DriverError> {
         let motion = Motion {
             settings: Arc::clone(&self.settings),
             kind: Kind::Linear,

@@ -62,7 +62,7 @@ impl Type {
 
 /// The type of a value.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Kind {
+pub enum RecipeType {
     /// A byte, 0 or 1.
     Bool,
     /// A byte.
@@ -75,15 +75,15 @@ pub enum Kind {
     I32,
     /// Eight bytes of IEEE 754.
     F64,
-    /// Six values of [`Kind::F64`].
+    /// Six values of [`RecipeType::F64`].
     Vector,
-    /// Three values of [`Kind::F64`].
+    /// Three values of [`RecipeType::F64`].
     Triple,
-    /// Six values of [`Kind::I32`].
+    /// Six values of [`RecipeType::I32`].
     Whole,
 }
 
-impl Kind {
+impl RecipeType {
     const ALL: [(Self, &'static str); 9] = [
         (Self::Bool, "BOOL"),
         (Self::U8, "UINT8"),
@@ -116,49 +116,49 @@ impl Kind {
 
     /// Returns the zero value of the type.
     #[must_use]
-    pub fn zero(self) -> Value {
+    pub fn zero(self) -> RecipeValue {
         match self {
-            Self::Bool => Value::Bool(false),
-            Self::U8 => Value::U8(0),
-            Self::U32 => Value::U32(0),
-            Self::U64 => Value::U64(0),
-            Self::I32 => Value::I32(0),
-            Self::F64 => Value::F64(0.0),
-            Self::Vector => Value::Vector([0.0; 6]),
-            Self::Triple => Value::Triple([0.0; 3]),
-            Self::Whole => Value::Whole([0; 6]),
+            Self::Bool => RecipeValue::Bool(false),
+            Self::U8 => RecipeValue::U8(0),
+            Self::U32 => RecipeValue::U32(0),
+            Self::U64 => RecipeValue::U64(0),
+            Self::I32 => RecipeValue::I32(0),
+            Self::F64 => RecipeValue::F64(0.0),
+            Self::Vector => RecipeValue::Vector([0.0; 6]),
+            Self::Triple => RecipeValue::Triple([0.0; 3]),
+            Self::Whole => RecipeValue::Whole([0; 6]),
         }
     }
 
     /// Reads a value of the type from the front of some bytes; returns `None` if they are too few.
-    pub fn take(self, bytes: &mut &[u8]) -> Option<Value> {
+    pub fn take(self, bytes: &mut &[u8]) -> Option<RecipeValue> {
         Some(match self {
-            Self::Bool => Value::Bool(u8::from_be_bytes(chunk(bytes)?) != 0),
-            Self::U8 => Value::U8(u8::from_be_bytes(chunk(bytes)?)),
-            Self::U32 => Value::U32(u32::from_be_bytes(chunk(bytes)?)),
-            Self::U64 => Value::U64(u64::from_be_bytes(chunk(bytes)?)),
-            Self::I32 => Value::I32(i32::from_be_bytes(chunk(bytes)?)),
-            Self::F64 => Value::F64(f64::from_be_bytes(chunk(bytes)?)),
+            Self::Bool => RecipeValue::Bool(u8::from_be_bytes(chunk(bytes)?) != 0),
+            Self::U8 => RecipeValue::U8(u8::from_be_bytes(chunk(bytes)?)),
+            Self::U32 => RecipeValue::U32(u32::from_be_bytes(chunk(bytes)?)),
+            Self::U64 => RecipeValue::U64(u64::from_be_bytes(chunk(bytes)?)),
+            Self::I32 => RecipeValue::I32(i32::from_be_bytes(chunk(bytes)?)),
+            Self::F64 => RecipeValue::F64(f64::from_be_bytes(chunk(bytes)?)),
             Self::Vector => {
                 let mut six = [0.0; 6];
                 for slot in &mut six {
                     *slot = f64::from_be_bytes(chunk(bytes)?);
                 }
-                Value::Vector(six)
+                RecipeValue::Vector(six)
             }
             Self::Triple => {
                 let mut three = [0.0; 3];
                 for slot in &mut three {
                     *slot = f64::from_be_bytes(chunk(bytes)?);
                 }
-                Value::Triple(three)
+                RecipeValue::Triple(three)
             }
             Self::Whole => {
                 let mut six = [0; 6];
                 for slot in &mut six {
                     *slot = i32::from_be_bytes(chunk(bytes)?);
                 }
-                Value::Whole(six)
+                RecipeValue::Whole(six)
             }
         })
     }
@@ -173,28 +173,28 @@ pub fn chunk<const N: usize>(bytes: &mut &[u8]) -> Option<[u8; N]> {
 
 /// A value of a recipe.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Value {
-    /// Value of [`Kind::Bool`].
+pub enum RecipeValue {
+    /// Value of [`RecipeType::Bool`].
     Bool(bool),
-    /// Value of [`Kind::U8`].
+    /// Value of [`RecipeType::U8`].
     U8(u8),
-    /// Value of [`Kind::U32`].
+    /// Value of [`RecipeType::U32`].
     U32(u32),
-    /// Value of [`Kind::U64`].
+    /// Value of [`RecipeType::U64`].
     U64(u64),
-    /// Value of [`Kind::I32`].
+    /// Value of [`RecipeType::I32`].
     I32(i32),
-    /// Value of [`Kind::F64`].
+    /// Value of [`RecipeType::F64`].
     F64(f64),
     /// Value of [`Kind::Vector`].
     Vector([f64; 6]),
     /// Value of [`Kind::Triple`].
     Triple([f64; 3]),
-    /// Value of [`Kind::Whole`].
+    /// Value of [`RecipeType::Whole`].
     Whole([i32; 6]),
 }
 
-impl Value {
+impl RecipeValue {
     /// Appends the bytes of the value.
     pub fn put(self, bytes: &mut Vec<u8>) {
         match self {
@@ -262,16 +262,19 @@ mod tests {
 
     #[test]
     fn values_are_the_same_after_their_way_over_the_line_and_never_read_past_its_end() {
-        for (kind, name) in Kind::ALL {
-            assert_eq!(Kind::of(name), Some(kind));
+        for (kind, name) in RecipeType::ALL {
+            assert_eq!(RecipeType::of(name), Some(kind));
             let mut bytes = Vec::new();
             kind.zero().put(&mut bytes);
             assert_eq!(kind.take(&mut &bytes[..]), Some(kind.zero()));
             assert_eq!(kind.take(&mut &bytes[1..]), None, "{name}");
         }
         let mut bytes = Vec::new();
-        Value::Vector([0.5, -1.0, 0.0, 3.0, 0.0, 1e-9]).put(&mut bytes);
-        let read = Kind::Vector.take(&mut &bytes[..]);
-        assert_eq!(read, Some(Value::Vector([0.5, -1.0, 0.0, 3.0, 0.0, 1e-9])));
+        RecipeValue::Vector([0.5, -1.0, 0.0, 3.0, 0.0, 1e-9]).put(&mut bytes);
+        let read = RecipeType::Vector.take(&mut &bytes[..]);
+        assert_eq!(
+            read,
+            Some(RecipeValue::Vector([0.5, -1.0, 0.0, 3.0, 0.0, 1e-9]))
+        );
     }
 }

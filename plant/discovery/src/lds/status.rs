@@ -66,7 +66,7 @@ pub(super) struct LossStatus {
     pub(super) silent_ms: Option<u64>,
 }
 
-impl service::Told for LdsStatus {
+impl service::PageState for LdsStatus {
     fn json(&self) -> String {
         // Serialization cannot fail: all keys are strings, and all numbers are finite.
         serde_json::to_string(self).unwrap_or_default()

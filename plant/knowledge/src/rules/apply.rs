@@ -18,7 +18,7 @@ use crate::source::DERIVED;
 
 /// The rules of a store.
 #[derive(Debug, Clone, Default)]
-pub(crate) enum Rules {
+pub(crate) enum StoreRules {
     /// Subclasses of subclasses only.
     #[default]
     Off,
@@ -34,7 +34,7 @@ pub(crate) struct Derived {
     pub(crate) added: Vec<Triple>,
     pub(crate) removed: Vec<Triple>,
     /// The rules after the change, if they are others.
-    pub(crate) rules: Option<Rules>,
+    pub(crate) rules: Option<StoreRules>,
 }
 
 /// Reason why no statements are derived.
@@ -49,7 +49,7 @@ impl From<StorageError> for Stop {
     }
 }
 
-impl Rules {
+impl StoreRules {
     pub(crate) fn extent(&self) -> Extent {
         match self {
             Self::Off => Extent::Subclasses,

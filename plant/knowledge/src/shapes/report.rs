@@ -13,7 +13,7 @@ use super::{RDF, SHACL, Shapes, resource};
 
 /// The result of a check of the knowledge.
 #[derive(Debug, Default)]
-pub(crate) struct Report {
+pub(crate) struct ShapeReport {
     pub(crate) violations: Vec<Violation>,
     /// Parts of shapes that were not checked, with the reason.
     pub(crate) unchecked: Vec<String>,
@@ -32,7 +32,7 @@ pub(crate) struct Violation {
     pub(crate) message: String,
 }
 
-impl Report {
+impl ShapeReport {
     pub(crate) fn json(&self) -> Value {
         let one = |violation: &Violation| {
             json!({

@@ -12,7 +12,7 @@ use crate::limits::MOST_PER_REQUEST;
 
 /// The services that have an OperationLimit.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Service {
+pub enum LimitedService {
     /// Read.
     Read,
     /// Write.
@@ -23,7 +23,7 @@ pub enum Service {
     MonitoredItems,
 }
 
-impl Service {
+impl LimitedService {
     const ALL: [Self; 4] = [Self::Read, Self::Write, Self::Browse, Self::MonitoredItems];
 
     const fn index(self) -> usize {
@@ -56,7 +56,7 @@ pub struct OperationLimits([AtomicUsize; 4]);
 
 impl Default for OperationLimits {
     fn default() -> Self {
-        Self(Service::ALL.map(|_| AtomicUsize::new(MOST_PER_REQUEST)))
+        Self(LimitedService::ALL.map(|_| AtomicUsize::new(MOST_PER_REQUEST)))
     }
 }
 
@@ -71,7 +71,7 @@ impl OperationLimits {
 
     /// Adopts the limits of a server. A missing value and 0 mean no limit.
     pub fn learn(&self, values: &[DataValue]) {
-        for (service, value) in Service::ALL.into_iter().zip(values) {
+        for (service, value) in LimitedService::ALL.into_iter().zip(values) {
             if let Some(Variant::UInt32(most)) = value.value
                 && most > 0
             {
@@ -82,12 +82,12 @@ impl OperationLimits {
 
     /// Returns the largest number of operations for a request.
     #[must_use]
-    pub fn most(&self, service: Service) -> usize {
+    pub fn most(&self, service: LimitedService) -> usize {
         let most = self.0.get(service.index());
         most.map_or(1, |most| most.load(Ordering::Relaxed))
     }
 
-    fn lower(&self, service: Service, most: usize) {
+    fn lower(&self, service: LimitedService, most: usize) {
         if let Some(limit) = self.0.get(service.index()) {
             limit.fetch_min(most.max(1), Ordering::Relaxed);
         }
@@ -97,10 +97,10 @@ impl OperationLimits {
     #[must_use]
     pub fn parts<'l, 'q, Q, A>(
         &'l self,
-        service: Service,
+        service: LimitedService,
         questions: &'q [Q],
-    ) -> Parts<'l, 'q, Q, A> {
-        Parts {
+    ) -> PartedRequest<'l, 'q, Q, A> {
+        PartedRequest {
             limits: self,
             service,
             rest: questions,
@@ -113,9 +113,9 @@ impl OperationLimits {
 
 /// A request that is sent in parts, and the results so far.
 #[derive(Debug)]
-pub struct Parts<'l, 'q, Q, A> {
+pub struct PartedRequest<'l, 'q, Q, A> {
     limits: &'l OperationLimits,
-    service: Service,
+    service: LimitedService,
     rest: &'q [Q],
     /// The maximum number of operations in a part of this request, if smaller than the limit of the
     /// connection.
@@ -134,7 +134,7 @@ pub enum PartFault {
     Short,
 }
 
-impl<'q, Q, A> Parts<'_, 'q, Q, A> {
+impl<'q, Q, A> PartedRequest<'_, 'q, Q, A> {
     /// Returns the next part to send, or `None` if all operations have results.
     pub fn next_part(&mut self) -> Option<&'q [Q]> {
         let most = self.limits.most(self.service).min(self.most);
@@ -217,7 +217,7 @@ mod tests {
 
     fn ask(
         limits: &OperationLimits,
-        service: Service,
+        service: LimitedService,
         count: usize,
         server: &mut Server,
     ) -> (Vec<usize>, Result<(), PartFault>) {
@@ -246,10 +246,10 @@ mod tests {
         let limits = OperationLimits::default();
         let named = |most: u32| DataValue::from(Variant::UInt32(most));
         limits.learn(&[named(10), DataValue::null(), named(0), named(7)]);
-        let all = Service::ALL.map(|service| limits.most(service));
+        let all = LimitedService::ALL.map(|service| limits.most(service));
         assert_eq!(all, [10, MOST_PER_REQUEST, MOST_PER_REQUEST, 7]);
         let mut plc = server(10, StatusCode::BadTooManyOperations);
-        let (answers, ended) = ask(&limits, Service::Read, 25, &mut plc);
+        let (answers, ended) = ask(&limits, LimitedService::Read, 25, &mut plc);
         ended.unwrap();
         assert_eq!(answers, (0..25).collect::<Vec<_>>());
         assert_eq!(plc.sizes, [10, 10, 5]);
@@ -259,27 +259,30 @@ mod tests {
     fn limits_that_a_server_does_not_name_are_found_and_remembered() {
         let limits = OperationLimits::default();
         let mut plc = server(10, StatusCode::BadTooManyOperations);
-        let (answers, ended) = ask(&limits, Service::Write, 40, &mut plc);
+        let (answers, ended) = ask(&limits, LimitedService::Write, 40, &mut plc);
         ended.unwrap();
         assert_eq!(answers, (0..40).collect::<Vec<_>>());
         assert_eq!(plc.sizes, [40, 20, 10, 10, 10, 10]);
         plc.sizes.clear();
-        drop(ask(&limits, Service::Write, 15, &mut plc));
+        drop(ask(&limits, LimitedService::Write, 15, &mut plc));
         assert_eq!(plc.sizes, [10, 5]);
-        assert_eq!(limits.most(Service::Read), MOST_PER_REQUEST);
+        assert_eq!(limits.most(LimitedService::Read), MOST_PER_REQUEST);
     }
 
     #[test]
     fn a_full_subscription_does_not_lower_the_limit_of_the_connection() {
         let limits = OperationLimits::default();
         let mut plc = server(25, StatusCode::BadTooManyMonitoredItems);
-        let (answers, ended) = ask(&limits, Service::MonitoredItems, 60, &mut plc);
+        let (answers, ended) = ask(&limits, LimitedService::MonitoredItems, 60, &mut plc);
         ended.unwrap();
         assert_eq!(answers.len(), 60);
-        assert_eq!(limits.most(Service::MonitoredItems), MOST_PER_REQUEST);
+        assert_eq!(
+            limits.most(LimitedService::MonitoredItems),
+            MOST_PER_REQUEST
+        );
         // For a Read request this status does not mean that the request was too large.
         let mut plc = server(25, StatusCode::BadTooManyMonitoredItems);
-        let (_, ended) = ask(&limits, Service::Read, 60, &mut plc);
+        let (_, ended) = ask(&limits, LimitedService::Read, 60, &mut plc);
         assert!(matches!(ended, Err(PartFault::Failed(_))));
     }
 
@@ -288,7 +291,8 @@ mod tests {
         let limits = OperationLimits::default();
         limits.learn(&[DataValue::null(), DataValue::from(Variant::UInt32(10))]);
         let questions: Vec<usize> = (0..25).collect();
-        let mut parts: Parts<'_, '_, usize, usize> = limits.parts(Service::Write, &questions);
+        let mut parts: PartedRequest<'_, '_, usize, usize> =
+            limits.parts(LimitedService::Write, &questions);
         let first = parts.next_part().unwrap().to_vec();
         parts.answered(Ok(first)).unwrap();
         parts.next_part().unwrap();
@@ -303,7 +307,8 @@ mod tests {
         let expected = [(0..10).collect(), vec![77; 10], vec![78; 5]].concat();
         assert_eq!(parts.into_answers(), expected);
 
-        let mut parts: Parts<'_, '_, usize, usize> = limits.parts(Service::Read, &questions);
+        let mut parts: PartedRequest<'_, '_, usize, usize> =
+            limits.parts(LimitedService::Read, &questions);
         parts.next_part().unwrap();
         assert!(matches!(parts.answered(Ok(vec![1])), Err(PartFault::Short)));
     }

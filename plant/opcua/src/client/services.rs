@@ -11,8 +11,8 @@ use opcua::types::{
     TimestampsToReturn, Variant, WriteValue,
 };
 
-use super::supervisor::{Connected, failed};
-use super::{Client, ClientError, Service};
+use super::supervisor::{ConnectedClient, failed};
+use super::{ClientError, LimitedService, OpcUaClient};
 
 /// The references to follow.
 #[derive(Debug, Clone)]
@@ -104,7 +104,7 @@ pub enum CallError {
     Client(#[from] ClientError),
 }
 
-impl Client {
+impl OpcUaClient {
     /// Reads the values of nodes. The result has one value per node, including bad values.
     ///
     /// # Errors
@@ -134,7 +134,7 @@ impl Client {
             })
             .collect();
         let connected = self.shared.connected()?;
-        let mut parts = connected.limits.parts(Service::Read, &nodes);
+        let mut parts = connected.limits.parts(LimitedService::Read, &nodes);
         while let Some(nodes) = parts.next_part() {
             let read = connected.session.read(nodes, TimestampsToReturn::Both, 0.0);
             parts.answered(read.await)?;
@@ -176,7 +176,7 @@ impl Client {
             Ok(connected) => connected,
             Err(error) => return values.iter().map(|_| Err(error.clone())).collect(),
         };
-        let mut parts = connected.limits.parts(Service::Write, &writes);
+        let mut parts = connected.limits.parts(LimitedService::Write, &writes);
         while let Some(writes) = parts.next_part() {
             let written = connected.session.write(writes).await;
             let written = written.map(|statuses| statuses.into_iter().map(Ok).collect());
@@ -221,7 +221,9 @@ impl Client {
     ) -> Result<Vec<Vec<ReferenceDescription>>, ClientError> {
         let connected = self.shared.connected()?;
         let descriptions: Vec<_> = nodes.iter().map(|node| what.of_node(node)).collect();
-        let mut parts = connected.limits.parts(Service::Browse, &descriptions);
+        let mut parts = connected
+            .limits
+            .parts(LimitedService::Browse, &descriptions);
         while let Some(part) = parts.next_part() {
             parts.answered(connected.session.browse(part, 0, None).await)?;
         }
@@ -361,7 +363,7 @@ impl Client {
 
 /// Returns the references of the first page and of the pages that follow.
 async fn pages(
-    connected: &Connected,
+    connected: &ConnectedClient,
     first: BrowseResult,
 ) -> Result<Vec<ReferenceDescription>, ClientError> {
     let session = &connected.session;

@@ -12,32 +12,32 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use opcua::crypto::{CertificateStore, X509, X509Data};
 use opcua::sync::RwLock;
 use opcua::types::{EndpointDescription, MessageSecurityMode, StatusCode};
-use trust::{Certificate, Names};
+use trust::{Certificate, RequiredNames};
 
 use super::ClientConfig;
 use crate::endpoint::EndpointUrl;
-use crate::judge::{Judge, Refused, Shown};
+use crate::judge::{CertificateJudge, PresentedChain, RefusedCertificate};
 use crate::known;
 use crate::pki::{OWN_CERTIFICATE, OWN_KEY};
 
 /// Judges the certificates of the servers of a client.
-pub(super) struct Servers {
-    judge: Judge,
+pub(super) struct ServerJudge {
+    judge: CertificateJudge,
 }
 
 /// An accepted server certificate, and the names for checking it again while the connection lasts.
-pub(super) struct Taken {
-    shown: Shown,
+pub(super) struct AcceptedCertificate {
+    shown: PresentedChain,
     host: String,
     application_uri: String,
 }
 
-impl Servers {
+impl ServerJudge {
     /// Creates the judge of a client; `None` for a client without certificates.
     pub(super) fn of(config: &ClientConfig) -> Option<Self> {
         let root = config.pki.as_ref()?;
         Some(Self {
-            judge: Judge::of(root, config.accept_untrusted)
+            judge: CertificateJudge::of(root, config.accept_untrusted)
                 .host_names(config.host_names)
                 .pinned(config.pinned)
                 .outdated_lists(config.allow_outdated_lists),
@@ -48,7 +48,10 @@ impl Servers {
     ///
     /// # Errors
     /// Returns an error if the certificate is refused.
-    pub(super) fn take(&self, endpoint: &EndpointDescription) -> Result<Option<Taken>, Refused> {
+    pub(super) fn take(
+        &self,
+        endpoint: &EndpointDescription,
+    ) -> Result<Option<AcceptedCertificate>, RefusedCertificate> {
         if endpoint.security_mode == MessageSecurityMode::None {
             return Ok(None);
         }
@@ -57,12 +60,12 @@ impl Servers {
         let host = url.map_or_else(|_| String::new(), |url| url.host().to_owned());
         let application_uri = endpoint.server.application_uri.as_ref().to_owned();
         let der = endpoint.server_certificate.value.as_deref();
-        let names = Names {
+        let names = RequiredNames {
             host: Some(&host),
             application_uri: Some(&application_uri),
         };
         let shown = self.judge.take(der.unwrap_or_default(), names)?;
-        Ok(Some(Taken {
+        Ok(Some(AcceptedCertificate {
             shown,
             host,
             application_uri,
@@ -73,8 +76,8 @@ impl Servers {
     ///
     /// # Errors
     /// Returns an error if the certificate is refused.
-    pub(super) fn again(&self, taken: &Taken) -> Result<(), Refused> {
-        let names = Names {
+    pub(super) fn again(&self, taken: &AcceptedCertificate) -> Result<(), RefusedCertificate> {
+        let names = RequiredNames {
             host: Some(&taken.host),
             application_uri: Some(&taken.application_uri),
         };
@@ -86,7 +89,10 @@ impl Servers {
     ///
     /// # Errors
     /// Returns an error if the store cannot be written.
-    pub(super) fn store(&self, taken: &Taken) -> Result<Arc<RwLock<CertificateStore>>, String> {
+    pub(super) fn store(
+        &self,
+        taken: &AcceptedCertificate,
+    ) -> Result<Arc<RwLock<CertificateStore>>, String> {
         let root = std::path::absolute(self.judge.root()).map_err(|error| error.to_string())?;
         let folder = root.join(JUDGED);
         put(&folder, &taken.shown.0)
@@ -136,8 +142,8 @@ impl From<String> for Why {
     }
 }
 
-impl From<Refused> for Why {
-    fn from(refused: Refused) -> Self {
+impl From<RefusedCertificate> for Why {
+    fn from(refused: RefusedCertificate) -> Self {
         Self {
             reason: refused.to_string(),
             certificate: Some(refused.status),

@@ -14,13 +14,13 @@ use opcua::types::{
 use tokio::sync::mpsc;
 use tracing::warn;
 
-use super::supervisor::{Connected, Shared};
-use super::{Client, ClientError, Service};
+use super::supervisor::{ConnectedClient, ConnectionState};
+use super::{ClientError, LimitedService, OpcUaClient};
 use crate::limits::MOST_NOTIFICATIONS;
 
 /// A monitored item.
 #[derive(Debug, Clone)]
-pub enum Watch {
+pub enum MonitoredWatch {
     /// The value of a variable, sampled at the interval of the subscription.
     Value(NodeId),
     /// The value of a variable with its own sampling interval, queue and deadband.
@@ -116,14 +116,14 @@ pub enum Notice {
 }
 
 /// A subscription, which the server deletes after this handle is dropped.
-pub struct Subscription {
+pub struct ClientSubscription {
     id: u64,
     notices: mpsc::Receiver<Notice>,
     dropped: Arc<AtomicU64>,
-    shared: Arc<Shared>,
+    shared: Arc<ConnectionState>,
 }
 
-impl Subscription {
+impl ClientSubscription {
     /// Waits for the next notice; `None` when the client is closed.
     pub async fn next(&mut self) -> Option<Notice> {
         self.notices.recv().await
@@ -136,7 +136,7 @@ impl Subscription {
     }
 }
 
-impl Drop for Subscription {
+impl Drop for ClientSubscription {
     fn drop(&mut self) {
         if let Some(wanted) = self.shared.wanted.lock().get_mut(&self.id) {
             wanted.gone = true;
@@ -146,8 +146,8 @@ impl Drop for Subscription {
 }
 
 /// A requested subscription and its state at the server.
-pub(crate) struct Wanted {
-    watches: Arc<[Watch]>,
+pub(crate) struct WantedSubscription {
+    watches: Arc<[MonitoredWatch]>,
     interval: Duration,
     queue: Queue,
     state: State,
@@ -164,7 +164,7 @@ enum State {
     Refused,
 }
 
-impl Wanted {
+impl WantedSubscription {
     /// Resets the state after the loss of a connection, which ends the subscriptions at the server.
     pub(crate) fn forget(&mut self) {
         self.state = State::Waiting;
@@ -220,12 +220,17 @@ impl OnSubscriptionNotification for Sink {
     }
 }
 
-impl Client {
+impl OpcUaClient {
     /// Subscribes to values and events with the publishing interval `interval` and a queue of
     /// `queue` notices. The subscription is created on the current connection and on each later
     /// connection.
     #[must_use]
-    pub fn subscribe(&self, watches: Vec<Watch>, interval: Duration, queue: usize) -> Subscription {
+    pub fn subscribe(
+        &self,
+        watches: Vec<MonitoredWatch>,
+        interval: Duration,
+        queue: usize,
+    ) -> ClientSubscription {
         let (tell, notices) = mpsc::channel(queue.max(1));
         let dropped = Arc::new(AtomicU64::new(0));
         let shared = Arc::clone(&self.shared);
@@ -233,7 +238,7 @@ impl Client {
         let id = wanted.last_key_value().map_or(0, |(id, _)| id + 1);
         wanted.insert(
             id,
-            Wanted {
+            WantedSubscription {
                 watches: watches.into(),
                 interval,
                 queue: Queue {
@@ -246,7 +251,7 @@ impl Client {
         );
         drop(wanted);
         shared.changed.notify_one();
-        Subscription {
+        ClientSubscription {
             id,
             notices,
             dropped,
@@ -259,7 +264,10 @@ impl Client {
 ///
 /// # Errors
 /// Returns the reason if the connection is not usable.
-pub(crate) async fn renew(shared: &Shared, connected: &Connected) -> Result<(), String> {
+pub(crate) async fn renew(
+    shared: &ConnectionState,
+    connected: &ConnectedClient,
+) -> Result<(), String> {
     loop {
         let mut gone = None;
         let mut new = None;
@@ -303,12 +311,12 @@ pub(crate) async fn renew(shared: &Shared, connected: &Connected) -> Result<(), 
 /// Creates a subscription for monitored items, and further subscriptions for the items that do not
 /// fit into it.
 async fn make(
-    connected: &Connected,
-    watches: &[Watch],
+    connected: &ConnectedClient,
+    watches: &[MonitoredWatch],
     interval: Duration,
     queue: Queue,
 ) -> Result<State, String> {
-    let mut left: Vec<(usize, &Watch)> = watches.iter().enumerate().collect();
+    let mut left: Vec<(usize, &MonitoredWatch)> = watches.iter().enumerate().collect();
     let mut made = Vec::new();
     loop {
         let id = match create(connected, interval, &queue).await {
@@ -346,7 +354,7 @@ async fn make(
     })
 }
 
-fn refuse(queue: &Queue, watches: &[(usize, &Watch)], status: StatusCode) {
+fn refuse(queue: &Queue, watches: &[(usize, &MonitoredWatch)], status: StatusCode) {
     for (watch, _) in watches {
         let watch = *watch;
         queue.put(Notice::Refused { watch, status });
@@ -354,7 +362,7 @@ fn refuse(queue: &Queue, watches: &[(usize, &Watch)], status: StatusCode) {
 }
 
 async fn create(
-    connected: &Connected,
+    connected: &ConnectedClient,
     interval: Duration,
     queue: &Queue,
 ) -> Result<u32, opcua::types::Error> {
@@ -373,16 +381,18 @@ async fn create(
 
 /// Adds monitored items to a subscription, and returns the items that do not fit.
 async fn fill<'w>(
-    connected: &Connected,
+    connected: &ConnectedClient,
     (id, interval): (u32, Duration),
-    watches: Vec<(usize, &'w Watch)>,
+    watches: Vec<(usize, &'w MonitoredWatch)>,
     queue: &Queue,
-) -> Result<Vec<(usize, &'w Watch)>, String> {
+) -> Result<Vec<(usize, &'w MonitoredWatch)>, String> {
     let requests: Vec<_> = watches
         .iter()
         .map(|(at, watch)| request(handle(*at), watch, interval))
         .collect();
-    let mut parts = connected.limits.parts(Service::MonitoredItems, &requests);
+    let mut parts = connected
+        .limits
+        .parts(LimitedService::MonitoredItems, &requests);
     while let Some(part) = parts.next_part() {
         let both = TimestampsToReturn::Both;
         let made = connected
@@ -420,11 +430,11 @@ fn count(time: Duration, interval: Duration) -> u32 {
     u32::try_from(time.as_millis() / interval.as_millis().max(1)).map_or(u32::MAX, |n| n.max(1))
 }
 
-fn request(handle: u32, watch: &Watch, interval: Duration) -> MonitoredItemCreateRequest {
+fn request(handle: u32, watch: &MonitoredWatch, interval: Duration) -> MonitoredItemCreateRequest {
     let (node, attribute, filter, queue_size) = match watch {
-        Watch::Value(node) => (node, AttributeId::Value, ExtensionObject::null(), VALUES),
-        Watch::Sampled(one) => (&one.node, AttributeId::Value, one.filter(), one.queue),
-        Watch::Events {
+        MonitoredWatch::Value(node) => (node, AttributeId::Value, ExtensionObject::null(), VALUES),
+        MonitoredWatch::Sampled(one) => (&one.node, AttributeId::Value, one.filter(), one.queue),
+        MonitoredWatch::Events {
             node,
             select,
             of_type,
@@ -464,9 +474,9 @@ fn request(handle: u32, watch: &Watch, interval: Duration) -> MonitoredItemCreat
             client_handle: handle,
             // Events have no sampling interval.
             sampling_interval: match watch {
-                Watch::Value(_) => interval.as_secs_f64() * 1e3,
-                Watch::Sampled(one) => one.interval.as_secs_f64() * 1e3,
-                Watch::Events { .. } => 0.0,
+                MonitoredWatch::Value(_) => interval.as_secs_f64() * 1e3,
+                MonitoredWatch::Sampled(one) => one.interval.as_secs_f64() * 1e3,
+                MonitoredWatch::Events { .. } => 0.0,
             },
             filter,
             queue_size,

@@ -25,29 +25,29 @@ use tracing::{debug, info, warn};
 
 use super::connector::Direct;
 use super::reach::{Reach, Silence};
-use super::shown::{Servers, Taken, Why};
-use super::subscription::Wanted;
+use super::shown::{AcceptedCertificate, ServerJudge, Why};
+use super::subscription::WantedSubscription;
 use super::{
-    ClientConfig, ClientError, ClientUser, Link, OperationLimits, SecurityChoice, Service,
+    ClientConfig, ClientError, ClientUser, LimitedService, Link, OperationLimits, SecurityChoice,
 };
 use crate::limits;
 use crate::pki::NO_PKI;
 use crate::pki::{OWN_CERTIFICATE, OWN_KEY, Pki};
 
 /// The state that the handles and the supervisor share.
-pub(crate) struct Shared {
+pub(crate) struct ConnectionState {
     pub(crate) config: ClientConfig,
     url: String,
     pub(crate) link: watch::Sender<Link>,
-    connected: Mutex<Option<Arc<Connected>>>,
-    pub(crate) wanted: Mutex<BTreeMap<u64, Wanted>>,
+    connected: Mutex<Option<Arc<ConnectedClient>>>,
+    pub(crate) wanted: Mutex<BTreeMap<u64, WantedSubscription>>,
     /// Signals a new or dropped subscription.
     pub(crate) changed: Notify,
     closing: watch::Sender<bool>,
     /// How often the certificate of the server was refused.
     pub(crate) refused: AtomicU64,
     /// `None` without certificates.
-    servers: Option<Servers>,
+    servers: Option<ServerJudge>,
     pub(crate) calls: CallsInFlight,
 }
 
@@ -77,7 +77,7 @@ impl Drop for CallInFlight {
 }
 
 /// A connection.
-pub(crate) struct Connected {
+pub(crate) struct ConnectedClient {
     pub(crate) session: Arc<Session>,
     pub(crate) namespaces: Vec<String>,
     /// The OperationLimits of the server.
@@ -92,16 +92,16 @@ pub(crate) struct Connected {
     driving: JoinHandle<()>,
 }
 
-impl Drop for Connected {
+impl Drop for ConnectedClient {
     fn drop(&mut self) {
         self.driving.abort();
     }
 }
 
-impl Shared {
+impl ConnectionState {
     pub(crate) fn new(config: ClientConfig, url: &str) -> Self {
         Self {
-            servers: Servers::of(&config),
+            servers: ServerJudge::of(&config),
             refused: AtomicU64::new(0),
             config,
             url: url.to_owned(),
@@ -126,7 +126,7 @@ impl Shared {
         self.closing.send_replace(true);
     }
 
-    pub(crate) fn connected(&self) -> Result<Arc<Connected>, ClientError> {
+    pub(crate) fn connected(&self) -> Result<Arc<ConnectedClient>, ClientError> {
         let connected = self.connected.lock().clone();
         connected.ok_or_else(|| self.not_connected())
     }
@@ -159,7 +159,7 @@ impl Shared {
 }
 
 /// Connects and reconnects until the client is closed.
-pub(crate) async fn run(shared: Arc<Shared>) {
+pub(crate) async fn run(shared: Arc<ConnectionState>) {
     let mut closing = shared.closing.subscribe();
     {
         let living = pin!(live(&shared));
@@ -179,7 +179,7 @@ pub(crate) async fn run(shared: Arc<Shared>) {
     shared.link.send_replace(Link::Closed);
 }
 
-async fn live(shared: &Shared) {
+async fn live(shared: &ConnectionState) {
     let client = match library_client(&shared.config) {
         Ok(client) => client,
         Err(reason) => {
@@ -212,7 +212,7 @@ struct Life {
 }
 
 /// Serves a connection until it is lost, and returns the reason.
-async fn hold(shared: &Shared, life: &mut Life, mut connection: Connection) -> Why {
+async fn hold(shared: &ConnectionState, life: &mut Life, mut connection: Connection) -> Why {
     life.connects += 1;
     let before = life.started.replace(connection.started);
     let restarted = before.is_some_and(|before| before != connection.started);
@@ -282,10 +282,10 @@ fn library_client(config: &ClientConfig) -> Result<opcua::client::Client, String
 
 /// A connection, and the state that ends with it.
 struct Connection {
-    connected: Arc<Connected>,
+    connected: Arc<ConnectedClient>,
     endpoint: EndpointDescription,
     /// `None` without security.
-    taken: Option<Taken>,
+    taken: Option<AcceptedCertificate>,
     started: DateTime,
     /// The activity of the library's event loop.
     activity: mpsc::Receiver<Activity>,
@@ -327,7 +327,7 @@ fn kept_alive(activity: &SessionActivity) -> Activity {
 }
 
 async fn connect(
-    shared: &Shared,
+    shared: &ConnectionState,
     client: &opcua::client::Client,
     connects: u64,
 ) -> Result<Connection, Why> {
@@ -391,7 +391,7 @@ async fn connect(
         .await
         .map_err(|_| "the server does not return its namespaces".to_owned())??;
     Ok(Connection {
-        connected: Arc::new(Connected {
+        connected: Arc::new(ConnectedClient {
             session,
             namespaces,
             limits,
@@ -428,7 +428,7 @@ impl Drop for AbortOnDrop {
 /// Selects the endpoint with the required security, and replaces its URL with the URL of the
 /// client.
 async fn endpoint(
-    shared: &Shared,
+    shared: &ConnectionState,
     client: &opcua::client::Client,
 ) -> Result<EndpointDescription, String> {
     let config = &shared.config;
@@ -481,7 +481,7 @@ async fn endpoint(
 
 /// Checks that an endpoint admits the kind of user of the client. The library reports only that the
 /// connection was closed. An endpoint without any policy admits anonymous users.
-fn admits_user(shared: &Shared, endpoint: &EndpointDescription) -> Result<(), String> {
+fn admits_user(shared: &ConnectionState, endpoint: &EndpointDescription) -> Result<(), String> {
     let (wanted, why) = match &shared.config.user {
         Some(_) => (UserTokenType::UserName, "does not accept passwords"),
         None => (UserTokenType::Anonymous, "does not admit anonymous users"),
@@ -497,7 +497,7 @@ fn admits_user(shared: &Shared, endpoint: &EndpointDescription) -> Result<(), St
 
 /// Returns the error for a server without a suitable endpoint, with the offered and the required
 /// security.
-fn no_security(shared: &Shared, offered: &[EndpointDescription]) -> String {
+fn no_security(shared: &ConnectionState, offered: &[EndpointDescription]) -> String {
     let each = offered.iter().map(|one| {
         let policy = one.security_policy_uri.as_ref().rsplit('#').next();
         let mode = one.security_mode;
@@ -544,7 +544,7 @@ async fn what_it_is(
         .chain(OperationLimits::VARIABLES)
         .map(|id| ReadValueId::new_value(id.into()))
         .collect();
-    let mut parts = limits.parts(Service::Read, &wanted);
+    let mut parts = limits.parts(LimitedService::Read, &wanted);
     while let Some(part) = parts.next_part() {
         let read = session.read(part, TimestampsToReturn::Neither, 0.0).await;
         parts
@@ -579,7 +579,7 @@ fn strings(value: DataValue) -> Option<Vec<String>> {
 }
 
 /// Creates the subscriptions, supervises the connection, and returns the reason for its end.
-async fn watch_over(shared: &Shared, connection: &mut Connection) -> Why {
+async fn watch_over(shared: &ConnectionState, connection: &mut Connection) -> Why {
     let mut silence = Silence::new(shared.config.patience, Instant::now());
     let mut reach = Reach::new(&shared.url);
     let mut published = Instant::now();
@@ -616,7 +616,7 @@ async fn watch_over(shared: &Shared, connection: &mut Connection) -> Why {
             _ = look.tick() => {
                 let now = Instant::now();
                 let is_calling = shared.calls.any();
-                let subscribed = shared.wanted.lock().values().any(Wanted::is_made);
+                let subscribed = shared.wanted.lock().values().any(WantedSubscription::is_made);
                 if !subscribed || is_calling || silence.is_tolerated(now) {
                     published = now;
                 } else if published.elapsed() > LONGEST_SILENCE {

@@ -5,9 +5,9 @@ use std::collections::HashSet;
 use opcua::types::{NodeId, ReferenceTypeId};
 
 use super::services::Browse;
-use super::{Client, ClientError};
+use super::{ClientError, OpcUaClient};
 
-impl Client {
+impl OpcUaClient {
     /// Returns the supertype of a type. The result is cached for the connection.
     async fn supertype(&self, type_id: &NodeId) -> Result<Option<NodeId>, ClientError> {
         let connected = self.shared.connected()?;

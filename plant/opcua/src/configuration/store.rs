@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use opcua::crypto::{CertificateStore, X509};
 use opcua::types::{ByteString, StatusCode, TrustListDataType, Variant};
 use tracing::{info, warn};
-use trust::{Certificate, Crl, Fault, Known};
+use trust::{Certificate, CertificateFault, Crl, TrustedCertificates};
 
 use super::Answer;
 use crate::certificates::{self, Standing};
@@ -100,7 +100,10 @@ impl StoreList {
         }
         match trust::check(certificate, &[], &known, known::now()) {
             // The authority may publish its revocation lists later.
-            Ok(()) | Err(Fault::RevocationUnknown | Fault::IssuerRevocationUnknown) => Ok(()),
+            Ok(())
+            | Err(
+                CertificateFault::RevocationUnknown | CertificateFault::IssuerRevocationUnknown,
+            ) => Ok(()),
             Err(fault) => {
                 warn!(%fault, "rejected a new certificate of the server");
                 Err(StatusCode::BadSecurityChecksFailed)
@@ -259,7 +262,7 @@ impl TrustList for StoreList {
     }
 }
 
-fn is_trusted(list: &Crl, known: &Known) -> bool {
+fn is_trusted(list: &Crl, known: &TrustedCertificates) -> bool {
     known.trusted.iter().any(|one| list.is_of(one))
 }
 

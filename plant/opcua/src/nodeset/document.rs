@@ -16,7 +16,7 @@ use quick_xml::XmlVersion;
 use quick_xml::events::Event;
 use quick_xml::reader::Reader;
 
-use super::{CORE, NodeSetError, Source};
+use super::{CORE, NodeSetError, NodeSetSource};
 use crate::limits::LARGEST_NODESET;
 
 /// A parsed document.
@@ -29,14 +29,14 @@ pub(super) struct Parsed {
 
 impl Parsed {
     /// Parses a document, without its nodes of the core namespace.
-    pub(super) fn read(source: Source) -> Result<Self, NodeSetError> {
+    pub(super) fn read(source: NodeSetSource) -> Result<Self, NodeSetError> {
         let (file, text) = match source {
-            Source::Text { name, xml } => (name, Text(xml)),
-            Source::Bytes { name, bytes } => {
+            NodeSetSource::Text { name, xml } => (name, Text(xml)),
+            NodeSetSource::Bytes { name, bytes } => {
                 let text = Text::of(&name, &bytes)?;
                 (name, text)
             }
-            Source::File(path) => {
+            NodeSetSource::File(path) => {
                 let file = path.display().to_string();
                 let text = Text::of(&file, &bytes(&path, &file)?)?;
                 (file, text)

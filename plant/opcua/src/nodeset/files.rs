@@ -18,16 +18,18 @@ use opcua::types::{
 use opcua::xml::schema::ua_node_set::{UANode, UANodeSet};
 
 use super::document::{Parsed, Text};
-use super::outline::{self, Found, NodeKind, ValueKind};
+use super::outline::{self, NodeKind, OutlineEntry, ValueKind};
 use super::structures::{self, Structures};
-use super::{CORE, DEEPEST, Facts, NodeSet, NodeSetError, Source, imported, ordered, parted};
+use super::{
+    CORE, DEEPEST, Facts, ImportedNodeSet, NodeSetError, NodeSetSource, imported, ordered, parted,
+};
 use crate::limits::{LARGEST_NODESETS, MOST_NODESETS};
 
 /// NodeSets that are ready for import.
 #[derive(Default)]
-pub struct NodeSets {
+pub struct ImportedNodeSets {
     /// The NodeSets in the order of their dependencies.
-    sets: Vec<NodeSet>,
+    sets: Vec<ImportedNodeSet>,
     /// The namespaces of their nodes, in the order of the files.
     provides: Vec<String>,
     fingerprint: u64,
@@ -83,14 +85,14 @@ impl NodeSetError {
     }
 }
 
-impl std::fmt::Debug for NodeSets {
+impl std::fmt::Debug for ImportedNodeSets {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         let mut list = f.debug_list();
         list.entries(self.provides.iter()).finish()
     }
 }
 
-impl NodeSets {
+impl ImportedNodeSets {
     /// Reads and orders the files. Only regular files are opened.
     #[must_use]
     pub fn read(files: &[PathBuf]) -> (Self, Vec<FileFault>) {
@@ -105,7 +107,7 @@ impl NodeSets {
             }
             match length(path).and_then(|length| {
                 room = room.checked_sub(length).ok_or_else(|| too_large(path))?;
-                Document::read(Source::File(path.clone()))
+                Document::read(NodeSetSource::File(path.clone()))
             }) {
                 Ok(document) => documents.push((file, document)),
                 Err(error) => fault(error),
@@ -117,7 +119,7 @@ impl NodeSets {
     /// Reads a single document.
     #[must_use]
     pub fn of_document(name: &str, bytes: &[u8]) -> (Self, Vec<FileFault>) {
-        let source = Source::Bytes {
+        let source = NodeSetSource::Bytes {
             name: name.to_owned(),
             bytes: bytes.to_vec(),
         };
@@ -187,22 +189,22 @@ impl NodeSets {
         let set = self.of(uri)?;
         let id = set.facts.local(uri, identifier)?;
         Some(match set.facts.nodes.find(&id)? {
-            Found::Variable(data_type, rank) => {
+            OutlineEntry::Variable(data_type, rank) => {
                 NodeKind::Variable(self.value_kind(set, data_type), rank)
             }
-            Found::Method => NodeKind::Method,
-            Found::Other => NodeKind::Other,
+            OutlineEntry::Method => NodeKind::Method,
+            OutlineEntry::Other => NodeKind::Other,
         })
     }
 
-    fn of(&self, uri: &str) -> Option<&NodeSet> {
+    fn of(&self, uri: &str) -> Option<&ImportedNodeSet> {
         self.sets
             .iter()
             .find(|set| set.facts.provides.contains(uri))
     }
 
     /// Returns the kind of the values of a DataType, by its supertypes.
-    fn value_kind(&self, set: &NodeSet, data_type: &NodeId) -> ValueKind {
+    fn value_kind(&self, set: &ImportedNodeSet, data_type: &NodeId) -> ValueKind {
         let (mut set, mut id) = (set, data_type.clone());
         for _ in 0..DEEPEST {
             let Some(uri) = set.facts.uri(id.namespace) else {
@@ -282,7 +284,7 @@ struct Document {
 }
 
 impl Document {
-    fn read(source: Source) -> Result<Self, NodeSetError> {
+    fn read(source: NodeSetSource) -> Result<Self, NodeSetError> {
         let Parsed { file, text, set } = Parsed::read(source)?;
         let facts = Facts::of(&file, &text, &set)?;
         let (types, others) = parted(set);
@@ -301,14 +303,14 @@ impl Document {
         mut self,
         structures: &Arc<Structures>,
         map: &mut NamespaceMap,
-    ) -> (NodeSet, Vec<NodeSetError>) {
+    ) -> (ImportedNodeSet, Vec<NodeSetError>) {
         let loader: Arc<dyn TypeLoader> = Arc::<Structures>::clone(structures);
         let nodes = without_unread(&self.facts, &mut self.others, &loader, map);
         let faults = unread(&self.file, &self.text, &nodes);
         let unread = nodes.iter().filter_map(|(node, _)| node.parse().ok());
         let mut others = imported(self.others);
         others.add_type_loader(loader);
-        let set = NodeSet {
+        let set = ImportedNodeSet {
             unread: unread.collect(),
             file: self.file,
             facts: self.facts,
@@ -406,9 +408,9 @@ fn without_unread(
 
 /// Returns the conflicts between files. Missing namespaces are reported only if all files could be
 /// read, because an unreadable file may contain them.
-fn not_together(read: &[(usize, NodeSet)], is_whole: bool) -> Vec<FileFault> {
+fn not_together(read: &[(usize, ImportedNodeSet)], is_whole: bool) -> Vec<FileFault> {
     let mut faults = Vec::new();
-    let mut owners: HashMap<&str, &NodeSet> = HashMap::new();
+    let mut owners: HashMap<&str, &ImportedNodeSet> = HashMap::new();
     for (file, set) in read {
         for uri in &set.facts.provides {
             if let Some(first) = owners.get(uri.as_str()) {

@@ -47,7 +47,7 @@ enum Entry {
 }
 
 /// The entry of a node.
-pub(super) enum Found<'o> {
+pub(super) enum OutlineEntry<'o> {
     Variable(&'o NodeId, i32),
     Method,
     Other,
@@ -93,11 +93,11 @@ impl Outline {
         self.0.keys()
     }
 
-    pub(super) fn find(&self, id: &NodeId) -> Option<Found<'_>> {
+    pub(super) fn find(&self, id: &NodeId) -> Option<OutlineEntry<'_>> {
         Some(match self.0.get(id)? {
-            Entry::Variable { data_type, rank } => Found::Variable(data_type, *rank),
-            Entry::Method => Found::Method,
-            Entry::DataType(_) | Entry::Other => Found::Other,
+            Entry::Variable { data_type, rank } => OutlineEntry::Variable(data_type, *rank),
+            Entry::Method => OutlineEntry::Method,
+            Entry::DataType(_) | Entry::Other => OutlineEntry::Other,
         })
     }
 

@@ -4,7 +4,7 @@ use opcua::types::{
     ByteString, DateTime, NamespaceMap, NodeId, ObjectId, ReferenceTypeId, Variant,
 };
 
-use super::{Imported, NodeSetError, NodeSets};
+use super::{Imported, ImportedNodeSets, NodeSetError};
 
 /// Returns a NodeSet with a single namespace, with the elements from line 3 on.
 fn document(elements: &str) -> String {
@@ -22,7 +22,7 @@ fn variable(id: u32, data_type: &str, value: &str) -> String {
 
 /// Imports a document, and returns the address space and the findings.
 fn imported(bytes: &[u8]) -> (AddressSpace, Imported, Vec<NodeSetError>) {
-    let (sets, faults) = NodeSets::of_document("a.xml", bytes);
+    let (sets, faults) = ImportedNodeSets::of_document("a.xml", bytes);
     let mut space = AddressSpace::new();
     let there = sets.import(&mut space, &mut NamespaceMap::new()).unwrap();
     let faults = faults.into_iter().map(|fault| fault.error).collect();
@@ -46,7 +46,7 @@ fn read(value: &str) -> Result<Variant, String> {
 }
 
 fn fault(elements: &str) -> String {
-    let (_, faults) = NodeSets::of_document("a.xml", document(elements).as_bytes());
+    let (_, faults) = ImportedNodeSets::of_document("a.xml", document(elements).as_bytes());
     let first = faults.into_iter().next().unwrap();
     first.error.to_string()
 }
@@ -239,7 +239,7 @@ fn the_core_namespace_may_be_listed_as_index_0_and_as_index_1() {
             "<UANodeSet><NamespaceUris><Uri>http://opcfoundation.org/UA/</Uri><Uri>{listed}</Uri></NamespaceUris>\
              <UAObject NodeId=\"ns={index};i=1\" BrowseName=\"{index}:A\"/></UANodeSet>"
         );
-        let (sets, faults) = NodeSets::of_document("a.xml", text.as_bytes());
+        let (sets, faults) = ImportedNodeSets::of_document("a.xml", text.as_bytes());
         assert!(faults.is_empty(), "{faults:?}");
         assert_eq!(sets.provides().collect::<Vec<_>>(), ["urn:a"], "{text}");
     }

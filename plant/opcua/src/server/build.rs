@@ -17,23 +17,23 @@ use opcua::server::{ANONYMOUS_USER_TOKEN_ID, ServerEndpoint};
 use opcua::sync::Mutex;
 use opcua::types::{BuildInfo, DateTime, MessageSecurityMode, TypeLoader, UAString};
 
-use super::calls::Calls;
+use super::calls::MethodCalls;
 use super::capabilities::{Facets, capabilities};
-use super::nodes::{Nodes, Spaces};
+use super::nodes::{AddressSpaces, ServerNodes};
 use super::roles;
 use super::routed::{Front, Routed};
 use super::supplement::Supplement;
-use super::{Inner, Server, Waiting};
+use super::{Inner, OpcUaServer, Waiting};
 use crate::door::{Door, UnknownClients};
 use crate::endpoint::{BindError, EndpointUrl};
 use crate::limits::{self, ClientLimits};
-use crate::nodeset::{self, NodeSet, NodeSetError, Source};
+use crate::nodeset::{self, ImportedNodeSet, NodeSetError, NodeSetSource};
 use crate::pki::{NO_PKI, OWN_CERTIFICATE, OWN_KEY, Pki, PkiError};
-use crate::users::Access;
+use crate::users::UserAccess;
 
 /// A security policy of a server.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Security {
+pub enum ServerSecurity {
     /// SecurityPolicy None.
     None,
     /// Sign and SignAndEncrypt with Basic256Sha256.
@@ -44,7 +44,7 @@ pub enum Security {
     Aes256Sha256RsaPss,
 }
 
-impl Security {
+impl ServerSecurity {
     fn policy(self) -> SecurityPolicy {
         match self {
             Self::None => SecurityPolicy::None,
@@ -102,8 +102,9 @@ pub struct ServerConfig {
     /// The endpoint URL; port 0 selects any free port.
     pub endpoint: EndpointUrl,
     /// The security policies.
-    pub security: Vec<Security>,
-    /// The directory of the certificate store. Required by all policies except [`Security::None`].
+    pub security: Vec<ServerSecurity>,
+    /// The directory of the certificate store. Required by all policies except
+    /// [`ServerSecurity::None`].
     pub pki: Option<PathBuf>,
     /// Trusts every client certificate, and stores it as trusted. For tests and demonstrations
     /// only.
@@ -130,7 +131,7 @@ impl ServerConfig {
             product_uri: "urn:ua-bridge:plant".to_owned(),
             software_version: env!("CARGO_PKG_VERSION").to_owned(),
             endpoint,
-            security: vec![Security::None],
+            security: vec![ServerSecurity::None],
             pki: None,
             trust_unknown_clients: false,
             unknown_clients: UnknownClients::Refuse,
@@ -172,9 +173,9 @@ pub enum ServerError {
 /// Builds a server.
 pub struct ServerBuilder {
     config: ServerConfig,
-    sources: Vec<Source>,
+    sources: Vec<NodeSetSource>,
     namespaces: Vec<String>,
-    users: Option<Arc<Access>>,
+    users: Option<Arc<UserAccess>>,
     loaders: Vec<Arc<dyn TypeLoader>>,
 }
 
@@ -201,7 +202,7 @@ impl ServerBuilder {
 
     /// Sets the users, which are read again when their file changes.
     #[must_use]
-    pub fn users(mut self, users: Arc<Access>) -> Self {
+    pub fn users(mut self, users: Arc<UserAccess>) -> Self {
         self.users = Some(users);
         self
     }
@@ -217,7 +218,7 @@ impl ServerBuilder {
     /// matter.
     #[must_use]
     pub fn nodeset_str(mut self, name: &str, xml: &str) -> Self {
-        self.sources.push(Source::Text {
+        self.sources.push(NodeSetSource::Text {
             name: name.to_owned(),
             xml: xml.to_owned(),
         });
@@ -227,7 +228,7 @@ impl ServerBuilder {
     /// Adds a NodeSet2 file. The order of NodeSets does not matter.
     #[must_use]
     pub fn nodeset_file(mut self, path: impl Into<PathBuf>) -> Self {
-        self.sources.push(Source::File(path.into()));
+        self.sources.push(NodeSetSource::File(path.into()));
         self
     }
 
@@ -239,18 +240,21 @@ impl ServerBuilder {
     }
 
     /// Loads the NodeSets and opens the listening socket. Clients are served after
-    /// [`Server::start`].
+    /// [`OpcUaServer::start`].
     ///
     /// # Errors
     /// Returns an error if a NodeSet cannot be used, if listening on the port fails, or if
     /// certificates cannot be created.
-    pub fn build(self) -> Result<Server, ServerError> {
+    pub fn build(self) -> Result<OpcUaServer, ServerError> {
         let sets = nodeset::load(self.sources)?;
         let config = self.config;
         if config.security.is_empty() {
             return Err(ServerError::NoSecurity);
         }
-        let secured = config.security.iter().any(|one| *one != Security::None);
+        let secured = config
+            .security
+            .iter()
+            .any(|one| *one != ServerSecurity::None);
         let pki = match &config.pki {
             Some(root) => {
                 let pki = Pki::open(root.clone())?;
@@ -274,7 +278,7 @@ impl ServerBuilder {
             None => None,
         };
         let made = Arc::new(Made::default());
-        let calls = Arc::new(Calls::default());
+        let calls = Arc::new(MethodCalls::default());
         let builder = with(described(&config, port), &self.users, self.loaders);
         let builder = match &door {
             Some((door, _)) => door.behind().used_by(builder),
@@ -302,7 +306,7 @@ impl ServerBuilder {
                 "it has no address space".to_owned(),
             ));
         };
-        Ok(Server {
+        Ok(OpcUaServer {
             inner: Arc::new(Inner {
                 handle,
                 manager: Arc::clone(manager),
@@ -378,7 +382,7 @@ fn described(config: &ServerConfig, port: u16) -> opcua::server::ServerBuilder {
 
 fn with(
     mut builder: opcua::server::ServerBuilder,
-    users: &Option<Arc<Access>>,
+    users: &Option<Arc<UserAccess>>,
     loaders: Vec<Arc<dyn TypeLoader>>,
 ) -> opcua::server::ServerBuilder {
     if let Some(users) = users {
@@ -394,14 +398,17 @@ fn with(
 #[derive(Default)]
 struct Made {
     core: OnceLock<Arc<CoreNodeManager>>,
-    own: OnceLock<Arc<InMemoryNodeManager<Nodes>>>,
+    own: OnceLock<Arc<InMemoryNodeManager<ServerNodes>>>,
     error: Mutex<Option<NodeSetError>>,
 }
 
 /// Returns the values and attributes that the library does not serve.
-fn supplement(config: &ServerConfig, users: Option<&Arc<Access>>) -> Supplement {
+fn supplement(config: &ServerConfig, users: Option<&Arc<UserAccess>>) -> Supplement {
     let facets = Facets {
-        is_secured: config.security.iter().any(|one| *one != Security::None),
+        is_secured: config
+            .security
+            .iter()
+            .any(|one| *one != ServerSecurity::None),
         ..Facets::default()
     };
     let mut values = capabilities(&limits::server(config.clients), facets);
@@ -412,7 +419,7 @@ fn supplement(config: &ServerConfig, users: Option<&Arc<Access>>) -> Supplement 
 /// Builds the node manager of the core namespace.
 struct Core {
     made: Arc<Made>,
-    calls: Arc<Calls>,
+    calls: Arc<MethodCalls>,
     supplement: Supplement,
 }
 
@@ -437,10 +444,10 @@ impl NodeManagerBuilder for Core {
 /// Builds the node manager of all other namespaces.
 struct Own {
     made: Arc<Made>,
-    calls: Arc<Calls>,
-    sets: Vec<NodeSet>,
+    calls: Arc<MethodCalls>,
+    sets: Vec<ImportedNodeSet>,
     namespaces: Vec<String>,
-    users: Option<Arc<Access>>,
+    users: Option<Arc<UserAccess>>,
 }
 
 impl NodeManagerBuilder for Own {
@@ -459,7 +466,7 @@ impl NodeManagerBuilder for Own {
             for uri in namespaces
                 .iter()
                 .map(String::as_str)
-                .chain(sets.iter().flat_map(NodeSet::provides))
+                .chain(sets.iter().flat_map(ImportedNodeSet::provides))
             {
                 address_space.add_namespace(uri, map.add_namespace(uri));
             }
@@ -475,15 +482,15 @@ impl NodeManagerBuilder for Own {
                 namespace_index: *index,
                 ..NamespaceMetadata::default()
             });
-            Nodes::new(metadata.collect(), sessions)
+            ServerNodes::new(metadata.collect(), sessions)
         };
         let inner = Box::new(InMemoryNodeManagerBuilder::new(fill)).build(context);
-        let own: Option<Arc<InMemoryNodeManager<Nodes>>> =
+        let own: Option<Arc<InMemoryNodeManager<ServerNodes>>> =
             Arc::clone(&inner).into_any_arc().downcast().ok();
         if let (Some(core), Some(own)) = (made.core.get(), own) {
             let address_space = Arc::clone(own.address_space());
             made.own.get_or_init(|| own);
-            let spaces = Spaces::new(Arc::clone(core), address_space);
+            let spaces = AddressSpaces::new(Arc::clone(core), address_space);
             calls.spaces.get_or_init(|| Arc::new(spaces));
         }
         let last = calls.spaces.get().cloned();

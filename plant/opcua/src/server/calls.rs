@@ -15,8 +15,8 @@ use opcua::types::{
 };
 use tokio::time::{Instant, timeout_at};
 
-use super::nodes::Spaces;
-use super::sessions::{Caller, Presence, Sessions};
+use super::nodes::AddressSpaces;
+use super::sessions::{SessionCaller, SessionPresence, Sessions};
 use crate::client::CallResult;
 use crate::limits::LONGEST_REQUEST;
 
@@ -24,9 +24,9 @@ use crate::limits::LONGEST_REQUEST;
 #[derive(Debug, Clone)]
 pub struct MethodRequest {
     /// The caller.
-    pub caller: Caller,
+    pub caller: SessionCaller,
     /// The state of the caller's session.
-    pub presence: Presence,
+    pub presence: SessionPresence,
     /// The object.
     pub object: NodeId,
     /// The method of the object, also if the client used the method of the type.
@@ -39,7 +39,7 @@ pub struct MethodRequest {
 
 /// The refusal of a call.
 #[derive(Debug, Clone, PartialEq)]
-pub enum Refusal {
+pub enum MethodRefusal {
     /// Refused with this status code.
     Status(StatusCode),
     /// Refused with `BadInvalidArgument` and a status code for each argument.
@@ -49,7 +49,7 @@ pub enum Refusal {
     PassedOn(Box<CallResult>),
 }
 
-impl From<StatusCode> for Refusal {
+impl From<StatusCode> for MethodRefusal {
     fn from(status: StatusCode) -> Self {
         Self::Status(status)
     }
@@ -68,7 +68,7 @@ pub trait MethodHandler: Send + Sync + 'static {
     ///
     /// # Errors
     /// Returns the refusal of the call.
-    async fn call(&self, request: MethodRequest) -> Result<Vec<Variant>, Refusal>;
+    async fn call(&self, request: MethodRequest) -> Result<Vec<Variant>, MethodRefusal>;
 }
 
 struct Function<F>(F);
@@ -76,9 +76,9 @@ struct Function<F>(F);
 #[async_trait]
 impl<F> MethodHandler for Function<F>
 where
-    F: Fn(MethodRequest) -> Result<Vec<Variant>, Refusal> + Send + Sync + 'static,
+    F: Fn(MethodRequest) -> Result<Vec<Variant>, MethodRefusal> + Send + Sync + 'static,
 {
-    async fn call(&self, request: MethodRequest) -> Result<Vec<Variant>, Refusal> {
+    async fn call(&self, request: MethodRequest) -> Result<Vec<Variant>, MethodRefusal> {
         (self.0)(request)
     }
 }
@@ -86,7 +86,7 @@ where
 /// Creates a handler from a function that returns at once.
 pub fn method<F>(function: F) -> Arc<dyn MethodHandler>
 where
-    F: Fn(MethodRequest) -> Result<Vec<Variant>, Refusal> + Send + Sync + 'static,
+    F: Fn(MethodRequest) -> Result<Vec<Variant>, MethodRefusal> + Send + Sync + 'static,
 {
     Arc::new(Function(function))
 }
@@ -101,16 +101,16 @@ struct Route {
 type Key = (NodeId, NodeId);
 
 #[derive(Default)]
-pub(crate) struct Calls {
+pub(crate) struct MethodCalls {
     routes: RwLock<HashMap<Key, Route>>,
     /// The methods that the types of an object declare, and the method of the object for each
     /// declaration.
     declared: RwLock<HashMap<Key, NodeId>>,
     pub(crate) sessions: Arc<Sessions>,
-    pub(crate) spaces: OnceLock<Arc<Spaces>>,
+    pub(crate) spaces: OnceLock<Arc<AddressSpaces>>,
 }
 
-impl Calls {
+impl MethodCalls {
     /// Adds a method of an object, and its declarations in the types of the object.
     pub(crate) fn add(&self, object: &NodeId, method: &NodeId, name: &str, declared: &[NodeId]) {
         let route = Route {
@@ -160,7 +160,7 @@ impl Calls {
                     let checked = self.check(context, &method, call.arguments());
                     let request = MethodRequest {
                         caller: self.sessions.caller(context),
-                        presence: Presence::of(context),
+                        presence: SessionPresence::of(context),
                         object: call.object_id().clone(),
                         method,
                         name,
@@ -216,9 +216,9 @@ impl Calls {
         context: &RequestContext,
         method: &NodeId,
         given: &[Variant],
-    ) -> Result<(), Refusal> {
+    ) -> Result<(), MethodRefusal> {
         let Some(spaces) = self.spaces.get() else {
-            return Err(Refusal::Status(StatusCode::BadShutdown));
+            return Err(MethodRefusal::Status(StatusCode::BadShutdown));
         };
         let declared = spaces.input_arguments(method)?;
         let types = context.type_tree.read();
@@ -227,15 +227,15 @@ impl Calls {
 }
 
 /// Sets the result of a call.
-pub(crate) fn end(call: &mut MethodCall, ended: Result<Vec<Variant>, Refusal>) {
+pub(crate) fn end(call: &mut MethodCall, ended: Result<Vec<Variant>, MethodRefusal>) {
     match ended {
         Ok(outputs) => {
             call.set_outputs(outputs);
             call.set_status(StatusCode::Good);
         }
-        Err(Refusal::Status(status)) => call.set_status(status),
-        Err(Refusal::Arguments(each)) => call.set_argument_error(each),
-        Err(Refusal::PassedOn(result)) => {
+        Err(MethodRefusal::Status(status)) => call.set_status(status),
+        Err(MethodRefusal::Arguments(each)) => call.set_argument_error(each),
+        Err(MethodRefusal::PassedOn(result)) => {
             // Results of arguments are sent only if an argument is invalid (OPC 10000-4, 5.12.2.2).
             if result.arguments.iter().any(|one| !one.is_good()) {
                 // This also sets the status, which is replaced below.
@@ -255,12 +255,12 @@ pub(crate) fn check_arguments(
     declared: &[Argument],
     given: &[Variant],
     types: &dyn TypeTree,
-) -> Result<(), Refusal> {
+) -> Result<(), MethodRefusal> {
     if given.len() < declared.len() {
-        return Err(Refusal::Status(StatusCode::BadArgumentsMissing));
+        return Err(MethodRefusal::Status(StatusCode::BadArgumentsMissing));
     }
     if given.len() > declared.len() {
-        return Err(Refusal::Status(StatusCode::BadTooManyArguments));
+        return Err(MethodRefusal::Status(StatusCode::BadTooManyArguments));
     }
     let each: Vec<StatusCode> = declared
         .iter()
@@ -274,18 +274,18 @@ pub(crate) fn check_arguments(
         })
         .collect();
     if each.contains(&StatusCode::BadTypeMismatch) {
-        return Err(Refusal::Arguments(each));
+        return Err(MethodRefusal::Arguments(each));
     }
     Ok(())
 }
 
 pub(crate) async fn within<T>(
     end: Instant,
-    call: impl Future<Output = Result<T, Refusal>>,
-) -> Result<T, Refusal> {
+    call: impl Future<Output = Result<T, MethodRefusal>>,
+) -> Result<T, MethodRefusal> {
     match timeout_at(end, call).await {
         Ok(ended) => ended,
-        Err(_) => Err(Refusal::Status(StatusCode::BadTimeout)),
+        Err(_) => Err(MethodRefusal::Status(StatusCode::BadTimeout)),
     }
 }
 

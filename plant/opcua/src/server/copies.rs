@@ -8,7 +8,7 @@ use opcua::types::{
 };
 
 use super::instances::insert;
-use super::{InstanceError, Server, events};
+use super::{InstanceError, OpcUaServer, events};
 
 /// The description of a type without declarations.
 #[derive(Debug, Clone)]
@@ -42,7 +42,7 @@ pub struct ForwardedEvent {
     pub fields: Vec<(Vec<QualifiedName>, Variant)>,
 }
 
-impl Server {
+impl OpcUaServer {
     /// Returns the index of a namespace for BrowseNames, and adds the namespace if it is unknown.
     /// `None` if the server has 4096 namespaces.
     #[must_use]

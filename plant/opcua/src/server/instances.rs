@@ -12,8 +12,8 @@ use opcua::types::{
 };
 
 use super::nodes::plain;
-use super::view::{Declared, View};
-use super::{Server, value_of};
+use super::view::{Declared, ServerView};
+use super::{OpcUaServer, value_of};
 
 /// The description of an instance.
 #[derive(Debug, Clone)]
@@ -194,7 +194,7 @@ struct Planned {
     node: NodeType,
 }
 
-impl Server {
+impl OpcUaServer {
     /// Creates an instance of a type. `ids` returns the NodeId of each child by its path.
     ///
     /// # Errors
@@ -374,7 +374,7 @@ impl Server {
 
     pub(super) fn checked(
         &self,
-        view: View<'_>,
+        view: ServerView<'_>,
         id: &NodeId,
         parent: &NodeId,
     ) -> Result<(), InstanceError> {
@@ -458,7 +458,7 @@ pub(super) fn insert(own: &mut AddressSpace, node: NodeType, parent: &NodeId, re
 }
 
 struct Plan<'a> {
-    view: View<'a>,
+    view: ServerView<'a>,
     spec: &'a InstanceSpec,
     ids: &'a mut dyn FnMut(&str) -> NodeId,
     planned: Vec<Planned>,

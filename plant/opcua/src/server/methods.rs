@@ -9,7 +9,7 @@ use opcua::types::{
     QualifiedName, ReferenceTypeId, VariableTypeId, Variant,
 };
 
-use super::Server;
+use super::OpcUaServer;
 use super::calls::MethodHandler;
 use super::instances::{InstanceError, insert};
 
@@ -31,7 +31,7 @@ pub struct MethodSpec {
     pub gives: Vec<Argument>,
 }
 
-impl Server {
+impl OpcUaServer {
     /// Creates a method of an object, and sets its handler.
     ///
     /// # Errors

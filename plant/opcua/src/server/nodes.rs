@@ -18,21 +18,21 @@ use opcua::types::{
 use tokio::time::{Instant, timeout_at};
 
 use super::calls::{self, fits};
-use super::sessions::{Caller, Presence, Sessions};
-use super::view::View;
+use super::sessions::{SessionCaller, SessionPresence, Sessions};
+use super::view::ServerView;
 use crate::limits::LONGEST_REQUEST;
 
 /// A write that passed the checks of access, DataType and ValueRank.
 #[derive(Debug, Clone)]
 pub struct WriteRequest {
     /// The writing client.
-    pub caller: Caller,
+    pub caller: SessionCaller,
     /// The variable.
     pub node: NodeId,
     /// The complete resulting value of the variable.
     pub value: DataValue,
     /// Whether the session of the client is still active.
-    pub presence: Presence,
+    pub presence: SessionPresence,
 }
 
 /// Decides on client writes to a variable. A decision that takes longer than [`LONGEST_REQUEST`] is
@@ -73,14 +73,14 @@ where
 }
 
 /// The address spaces of both node managers.
-pub(crate) struct Spaces {
+pub(crate) struct AddressSpaces {
     core: Arc<CoreNodeManager>,
     own: Arc<RwLock<AddressSpace>>,
     indexes: BTreeSet<u16>,
     no_types: DefaultTypeTree,
 }
 
-impl Spaces {
+impl AddressSpaces {
     pub(crate) fn new(core: Arc<CoreNodeManager>, own: Arc<RwLock<AddressSpace>>) -> Self {
         let indexes = own.read().namespaces().keys().copied().collect();
         Self {
@@ -101,10 +101,10 @@ impl Spaces {
     }
 
     /// Calls a function with a view of both address spaces.
-    pub(crate) fn with<T>(&self, look: impl FnOnce(View<'_>) -> T) -> T {
+    pub(crate) fn with<T>(&self, look: impl FnOnce(ServerView<'_>) -> T) -> T {
         let core = self.core.address_space().read();
         let own = self.own.read();
-        look(View {
+        look(ServerView {
             core: &core,
             own: &own,
             no_types: &self.no_types,
@@ -189,13 +189,13 @@ impl EventFields {
 }
 
 /// The implementation of the node manager.
-pub(crate) struct Nodes {
+pub(crate) struct ServerNodes {
     namespaces: RwLock<Vec<NamespaceMetadata>>,
     writers: RwLock<HashMap<NodeId, Arc<dyn WriteHandler>>>,
     sessions: Arc<Sessions>,
 }
 
-impl Nodes {
+impl ServerNodes {
     pub(crate) fn new(namespaces: Vec<NamespaceMetadata>, sessions: Arc<Sessions>) -> Self {
         Self {
             namespaces: RwLock::new(namespaces),
@@ -338,7 +338,7 @@ pub(crate) fn show(
 }
 
 #[async_trait]
-impl InMemoryNodeManagerImpl for Nodes {
+impl InMemoryNodeManagerImpl for ServerNodes {
     async fn init(&self, _address_space: &mut AddressSpace, _context: ServerContext) {}
 
     fn name(&self) -> &'static str {
@@ -403,7 +403,7 @@ impl InMemoryNodeManagerImpl for Nodes {
                     caller: self.sessions.caller(context),
                     node: node.clone(),
                     value: value.clone(),
-                    presence: Presence::of(context),
+                    presence: SessionPresence::of(context),
                 };
                 let decided = timeout_at(end, handler.write(request)).await;
                 if let Err(status) = decided.unwrap_or(Err(StatusCode::BadTimeout)) {

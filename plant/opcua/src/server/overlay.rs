@@ -15,11 +15,11 @@ use opcua::server::node_manager::{
 use opcua::types::{Argument, BrowseDirection, NodeId, ReferenceTypeId, StatusCode};
 use tokio::time::Instant;
 
-use super::calls::{self, MethodHandler, MethodRequest, Refusal, check_arguments, within};
+use super::calls::{self, MethodHandler, MethodRefusal, MethodRequest, check_arguments, within};
 use super::routed::{Front, Routed};
-use super::sessions::{Caller, Presence};
+use super::sessions::{SessionCaller, SessionPresence};
 use super::supplement::{NodeFacts, Supplement};
-use crate::audit::{Action, Audit};
+use crate::audit::{Audit, AuditedAction};
 use crate::limits::LONGEST_REQUEST;
 
 /// A method of an object of the core namespace, and its handler.
@@ -31,7 +31,7 @@ pub struct CoreMethod {
     methods: Vec<NodeId>,
     name: String,
     handler: Arc<dyn MethodHandler>,
-    audit: fn(&MethodCall) -> Action,
+    audit: fn(&MethodCall) -> AuditedAction,
 }
 
 impl CoreMethod {
@@ -67,7 +67,7 @@ impl CoreMethod {
 
     /// Sets the action by which calls are audited.
     #[must_use]
-    pub fn audited(self, audit: fn(&MethodCall) -> Action) -> Self {
+    pub fn audited(self, audit: fn(&MethodCall) -> AuditedAction) -> Self {
         Self { audit, ..self }
     }
 
@@ -80,8 +80,8 @@ impl CoreMethod {
     }
 }
 
-fn called(call: &MethodCall) -> Action {
-    Action::Called {
+fn called(call: &MethodCall) -> AuditedAction {
+    AuditedAction::Called {
         object: call.object_id().clone(),
         method: call.method_id().clone(),
     }
@@ -164,20 +164,20 @@ impl Overlay {
         context: &RequestContext,
         method: &CoreMethod,
         call: &MethodCall,
-    ) -> Result<MethodRequest, Refusal> {
+    ) -> Result<MethodRequest, MethodRefusal> {
         let own = method.methods.first().unwrap_or_else(|| call.method_id());
         let allowed = context
             .authenticator
             .is_user_executable(&context.token, own);
         if !allowed {
-            return Err(Refusal::Status(StatusCode::BadUserAccessDenied));
+            return Err(MethodRefusal::Status(StatusCode::BadUserAccessDenied));
         }
         let declared = self.input_arguments(context, own)?;
         let types = context.type_tree.read();
         check_arguments(&declared, call.arguments(), &*types)?;
         Ok(MethodRequest {
-            caller: Caller::of(context),
-            presence: Presence::of(context),
+            caller: SessionCaller::of(context),
+            presence: SessionPresence::of(context),
             object: call.object_id().clone(),
             method: own.clone(),
             name: method.name.clone(),

@@ -12,7 +12,7 @@ use opcua::types::{
 };
 
 use super::supplement::CoreValue;
-use crate::users::{Access, Role};
+use crate::users::{UserAccess, UserRole};
 
 /// Removes the roles that the server does not know, and the parts of roles that it does not
 /// support, from the core namespace.
@@ -20,7 +20,10 @@ pub fn prepare(core: &mut AddressSpace) {
     for role in UNKNOWN {
         delete(core, &role.into());
     }
-    let known = Role::ALL.iter().copied().map(super::supplement::node_of);
+    let known = UserRole::ALL
+        .iter()
+        .copied()
+        .map(super::supplement::node_of);
     for role in known.chain([
         ObjectId::WellKnownRole_Anonymous,
         ObjectId::WellKnownRole_AuthenticatedUser,
@@ -48,7 +51,7 @@ pub fn prepare(core: &mut AddressSpace) {
 /// Returns the Identities of the roles. Names and certificates of users are returned to users with
 /// the role SecurityAdmin only.
 #[must_use]
-pub fn values(access: &Arc<Access>) -> Vec<(VariableId, CoreValue)> {
+pub fn values(access: &Arc<UserAccess>) -> Vec<(VariableId, CoreValue)> {
     let fixed = |criteria| CoreValue::from(rules(vec![rule(criteria, "")]));
     let mut values = vec![
         (
@@ -63,7 +66,9 @@ pub fn values(access: &Arc<Access>) -> Vec<(VariableId, CoreValue)> {
     values.extend(IDENTITIES.map(|(role, variable)| {
         let access = Arc::clone(access);
         let read = CoreValue::Read(Arc::new(move |context| {
-            let sees = access.roles(&context.token).contains(Role::SecurityAdmin);
+            let sees = access
+                .roles(&context.token)
+                .contains(UserRole::SecurityAdmin);
             identities(&access, role, sees)
         }));
         (variable, read)
@@ -71,7 +76,7 @@ pub fn values(access: &Arc<Access>) -> Vec<(VariableId, CoreValue)> {
     values
 }
 
-fn identities(access: &Access, role: Role, with_users: bool) -> Variant {
+fn identities(access: &UserAccess, role: UserRole, with_users: bool) -> Variant {
     let mut all = Vec::new();
     if access.roles_of_anonymous().contains(role) {
         all.push(rule(IdentityCriteriaType::Anonymous, ""));
@@ -131,25 +136,25 @@ const UNKNOWN: [ObjectId; 5] = [
     ObjectId::WellKnownRole_SecurityKeyServerAccess,
 ];
 
-const IDENTITIES: [(Role, VariableId); 5] = [
+const IDENTITIES: [(UserRole, VariableId); 5] = [
     (
-        Role::Observer,
+        UserRole::Observer,
         VariableId::WellKnownRole_Observer_Identities,
     ),
     (
-        Role::Operator,
+        UserRole::Operator,
         VariableId::WellKnownRole_Operator_Identities,
     ),
     (
-        Role::Engineer,
+        UserRole::Engineer,
         VariableId::WellKnownRole_Engineer_Identities,
     ),
     (
-        Role::SecurityAdmin,
+        UserRole::SecurityAdmin,
         VariableId::WellKnownRole_SecurityAdmin_Identities,
     ),
     (
-        Role::ConfigureAdmin,
+        UserRole::ConfigureAdmin,
         VariableId::WellKnownRole_ConfigureAdmin_Identities,
     ),
 ];
@@ -157,17 +162,20 @@ const IDENTITIES: [(Role, VariableId); 5] = [
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::users::{Anonymous, Roles, Rules};
+    use crate::users::{AnonymousRights, PermissionRules, Roles};
 
     #[test]
     fn a_role_has_the_identities_that_its_rules_grant() {
-        let access = Access::new(None, false).unwrap();
-        access.set_rules(Rules {
-            anonymous: Anonymous::Has(Roles::of(&[Role::Operator])),
-            ..Rules::default()
+        let access = UserAccess::new(None, false).unwrap();
+        access.set_rules(PermissionRules {
+            anonymous: AnonymousRights::Has(Roles::of(&[UserRole::Operator])),
+            ..PermissionRules::default()
         });
         let anonymous = rules(vec![rule(IdentityCriteriaType::Anonymous, "")]);
-        assert_eq!(identities(&access, Role::Operator, true), anonymous);
-        assert_eq!(identities(&access, Role::Observer, true), rules(Vec::new()));
+        assert_eq!(identities(&access, UserRole::Operator, true), anonymous);
+        assert_eq!(
+            identities(&access, UserRole::Observer, true),
+            rules(Vec::new())
+        );
     }
 }

@@ -22,8 +22,8 @@ use opcua::types::{
     ReadEventDetails, ReadProcessedDetails, ReadRawModifiedDetails, StatusCode, TimestampsToReturn,
 };
 
-use super::calls::Calls;
-use super::nodes::Spaces;
+use super::calls::MethodCalls;
+use super::nodes::AddressSpaces;
 use super::overlay::Overlay;
 use super::supplement::{NodeFacts, Supplement};
 
@@ -31,7 +31,7 @@ pub(crate) struct Routed {
     pub(crate) inner: Arc<DynNodeManager>,
     pub(crate) front: Front,
     /// Set for the last node manager, which is initialized after all types exist.
-    pub(crate) last: Option<Arc<Spaces>>,
+    pub(crate) last: Option<Arc<AddressSpaces>>,
     pub(crate) supplement: Supplement,
 }
 
@@ -50,7 +50,7 @@ impl Routed {
 /// The handler of calls before the library.
 pub(crate) enum Front {
     /// Handles the methods of instances.
-    Calls(Arc<Calls>),
+    Calls(Arc<MethodCalls>),
     /// Handles the methods of objects of the core namespace.
     Core(Arc<Overlay>),
 }

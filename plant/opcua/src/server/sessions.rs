@@ -13,7 +13,7 @@ type Told = Arc<dyn Fn(u32) + Send + Sync>;
 
 /// The client and user of a request.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Caller {
+pub struct SessionCaller {
     /// The session id, unique while the server runs.
     pub session: u32,
     /// The user name; `anonymous` for anonymous users.
@@ -29,7 +29,7 @@ pub struct Caller {
     pub certificate: Option<Arc<[u8]>>,
 }
 
-impl Caller {
+impl SessionCaller {
     /// Returns the client and user of a request.
     #[must_use]
     pub fn of(context: &RequestContext) -> Self {
@@ -56,15 +56,15 @@ impl Caller {
 
 /// Reports whether the session of a request is still active.
 #[derive(Clone)]
-pub struct Presence(Arc<dyn Fn() -> bool + Send + Sync>);
+pub struct SessionPresence(Arc<dyn Fn() -> bool + Send + Sync>);
 
-impl std::fmt::Debug for Presence {
+impl std::fmt::Debug for SessionPresence {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         f.debug_tuple("Presence").field(&self.lasts()).finish()
     }
 }
 
-impl Presence {
+impl SessionPresence {
     pub(crate) fn of(context: &RequestContext) -> Self {
         // The library does not export the type of its sessions.
         let session = Arc::downgrade(&context.session);
@@ -85,7 +85,7 @@ impl Presence {
 /// The supervised sessions.
 #[derive(Default)]
 pub(crate) struct Sessions {
-    watched: Mutex<HashMap<u32, Presence>>,
+    watched: Mutex<HashMap<u32, SessionPresence>>,
     /// Notified when a session is added.
     added: Notify,
     told: RwLock<Vec<Told>>,
@@ -95,15 +95,15 @@ impl Sessions {
     /// Returns the client and user of a request, and starts to supervise the session. What ended
     /// sessions held is released first, so that a client that closes its session and opens the next
     /// one is not refused because of itself.
-    pub(crate) fn caller(&self, context: &RequestContext) -> Caller {
+    pub(crate) fn caller(&self, context: &RequestContext) -> SessionCaller {
         self.look();
         let mut watched = self.watched.lock();
         watched.entry(context.session_id).or_insert_with(|| {
             self.added.notify_one();
-            Presence::of(context)
+            SessionPresence::of(context)
         });
         drop(watched);
-        Caller::of(context)
+        SessionCaller::of(context)
     }
 
     pub(crate) fn tell(&self, told: Told) {
@@ -162,7 +162,7 @@ mod tests {
         let sessions = Sessions::default();
         let longest = Duration::from_millis(1);
         assert_eq!(sessions.wait(longest).await, longest);
-        let presence = Presence::while_(|| true);
+        let presence = SessionPresence::while_(|| true);
         sessions.watched.lock().insert(1, presence);
         assert_eq!(sessions.wait(longest).await, LOOK);
     }
@@ -175,7 +175,7 @@ mod tests {
         sessions.tell(Arc::new(move |session| told.lock().push(session)));
         let lasts = Arc::new(AtomicBool::new(true));
         let present = Arc::clone(&lasts);
-        let presence = Presence::while_(move || present.load(Ordering::Relaxed));
+        let presence = SessionPresence::while_(move || present.load(Ordering::Relaxed));
         sessions.watched.lock().insert(7, presence);
         sessions.look();
         assert!(ended.lock().is_empty());

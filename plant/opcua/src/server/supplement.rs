@@ -12,7 +12,7 @@ use opcua::types::{
     ReadEventDetails, RolePermissionType, StatusCode, TimestampsToReturn, VariableId, Variant,
 };
 
-use crate::users::{Access, Permissions, Role, Roles};
+use crate::users::{NodePermissions, Roles, UserAccess, UserRole};
 
 /// A value of a variable of the core namespace.
 #[derive(Clone)]
@@ -67,7 +67,7 @@ impl NodeFacts {
 #[derive(Clone)]
 pub struct Supplement {
     values: Vec<(VariableId, CoreValue)>,
-    access: Option<Arc<Access>>,
+    access: Option<Arc<UserAccess>>,
     /// The history of the events of the Server object.
     events: Option<Arc<dyn EventHistory>>,
     started: DateTime,
@@ -88,7 +88,7 @@ impl Supplement {
     /// Creates a supplement with values of the core namespace. Without `access`, nodes have no
     /// RolePermissions.
     #[must_use]
-    pub fn new(values: Vec<(VariableId, CoreValue)>, access: Option<Arc<Access>>) -> Self {
+    pub fn new(values: Vec<(VariableId, CoreValue)>, access: Option<Arc<UserAccess>>) -> Self {
         Self {
             values,
             access,
@@ -261,7 +261,7 @@ fn may_replace(status: StatusCode) -> bool {
 }
 
 /// Returns the permissions of roles on a node.
-fn listed(permissions: Permissions, roles: Roles, class: NodeClass) -> Variant {
+fn listed(permissions: NodePermissions, roles: Roles, class: NodeClass) -> Variant {
     let all = roles.iter().map(|role| RolePermissionType {
         role_id: node_of(role).into(),
         permissions: bits(permissions, role, class),
@@ -271,7 +271,7 @@ fn listed(permissions: Permissions, roles: Roles, class: NodeClass) -> Variant {
 }
 
 /// Returns the permissions of a role on a node of a class.
-fn bits(permissions: Permissions, role: Role, class: NodeClass) -> PermissionType {
+fn bits(permissions: NodePermissions, role: UserRole, class: NodeClass) -> PermissionType {
     let mut bits = PermissionType::Browse | PermissionType::ReadRolePermissions;
     let (read, write) = match class {
         NodeClass::Variable => (
@@ -301,13 +301,13 @@ fn bits(permissions: Permissions, role: Role, class: NodeClass) -> PermissionTyp
 }
 
 /// Returns the node of a role.
-pub(super) const fn node_of(role: Role) -> ObjectId {
+pub(super) const fn node_of(role: UserRole) -> ObjectId {
     match role {
-        Role::Observer => ObjectId::WellKnownRole_Observer,
-        Role::Operator => ObjectId::WellKnownRole_Operator,
-        Role::Engineer => ObjectId::WellKnownRole_Engineer,
-        Role::SecurityAdmin => ObjectId::WellKnownRole_SecurityAdmin,
-        Role::ConfigureAdmin => ObjectId::WellKnownRole_ConfigureAdmin,
+        UserRole::Observer => ObjectId::WellKnownRole_Observer,
+        UserRole::Operator => ObjectId::WellKnownRole_Operator,
+        UserRole::Engineer => ObjectId::WellKnownRole_Engineer,
+        UserRole::SecurityAdmin => ObjectId::WellKnownRole_SecurityAdmin,
+        UserRole::ConfigureAdmin => ObjectId::WellKnownRole_ConfigureAdmin,
     }
 }
 
@@ -320,16 +320,16 @@ mod tests {
 
     #[test]
     fn permissions_are_those_of_the_class_and_of_the_role() {
-        let usual = Permissions::default();
+        let usual = NodePermissions::default();
         let seen = PermissionType::Browse | PermissionType::ReadRolePermissions;
         let read = seen | PermissionType::Read | PermissionType::ReadHistory;
         let variable = |role| bits(usual, role, NodeClass::Variable);
-        assert_eq!(variable(Role::Observer), read);
-        assert_eq!(variable(Role::Operator), read | PermissionType::Write);
+        assert_eq!(variable(UserRole::Observer), read);
+        assert_eq!(variable(UserRole::Operator), read | PermissionType::Write);
         let method = |role| bits(usual, role, NodeClass::Method);
-        assert_eq!(method(Role::Observer), seen);
-        assert_eq!(method(Role::Engineer), seen | PermissionType::Call);
-        assert_eq!(bits(usual, Role::Engineer, NodeClass::DataType), seen);
+        assert_eq!(method(UserRole::Observer), seen);
+        assert_eq!(method(UserRole::Engineer), seen | PermissionType::Call);
+        assert_eq!(bits(usual, UserRole::Engineer, NodeClass::DataType), seen);
     }
 
     #[test]

@@ -11,7 +11,7 @@ use opcua::types::{
 
 /// The core namespace and the server's own namespaces.
 #[derive(Clone, Copy)]
-pub(crate) struct View<'a> {
+pub(crate) struct ServerView<'a> {
     pub(crate) core: &'a AddressSpace,
     pub(crate) own: &'a AddressSpace,
     /// An empty type tree: no query of this module includes subtypes of references.
@@ -29,7 +29,7 @@ pub(crate) struct Declared {
 
 /// A child of a node.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Child {
+pub struct ChildNode {
     /// The node.
     pub node_id: NodeId,
     /// Its BrowseName.
@@ -40,7 +40,7 @@ pub struct Child {
     pub node_class: NodeClass,
 }
 
-impl<'a> View<'a> {
+impl<'a> ServerView<'a> {
     pub(crate) fn node(self, id: &NodeId) -> Option<&'a NodeType> {
         if id.namespace == 0 {
             self.core.find(id)
@@ -145,17 +145,17 @@ impl<'a> View<'a> {
     }
 
     /// Returns the children of a node: components, properties, organized nodes and event sources.
-    pub(crate) fn children(self, id: &NodeId) -> Vec<Child> {
+    pub(crate) fn children(self, id: &NodeId) -> Vec<ChildNode> {
         self.below(id, &HIERARCHICAL)
     }
 
-    fn below(self, id: &NodeId, kinds: &[ReferenceTypeId]) -> Vec<Child> {
+    fn below(self, id: &NodeId, kinds: &[ReferenceTypeId]) -> Vec<ChildNode> {
         let references = self.references(id, true, kinds);
         references
             .into_iter()
             .filter_map(|(kind, target)| {
                 let node = self.node(target)?;
-                Some(Child {
+                Some(ChildNode {
                     node_id: target.clone(),
                     browse_name: node.as_node().browse_name().clone(),
                     reference_type: kind.clone(),

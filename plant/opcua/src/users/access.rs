@@ -23,8 +23,8 @@ use tracing::{info, warn};
 
 use super::file::{Credential, FOLDER, LARGEST_PASSWORD, LIST, UserFault, Users};
 use super::password::has_hash;
-use super::{Role, Roles};
-use crate::server::{ANONYMOUS, Caller};
+use super::{Roles, UserRole};
+use crate::server::{ANONYMOUS, SessionCaller};
 
 /// A right of a user on a node.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -39,7 +39,7 @@ pub enum Right {
 
 /// The roles with rights on a node.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Permissions {
+pub struct NodePermissions {
     /// The roles that may read the node.
     pub read: Roles,
     /// The roles that may write the node.
@@ -48,10 +48,10 @@ pub struct Permissions {
     pub call: Roles,
 }
 
-impl Default for Permissions {
+impl Default for NodePermissions {
     /// Grants reading to all roles, and writing and calling to operators and engineers.
     fn default() -> Self {
-        let runs = Roles::of(&[Role::Operator, Role::Engineer]);
+        let runs = Roles::of(&[UserRole::Operator, UserRole::Engineer]);
         Self {
             read: Roles::ALL,
             write: runs,
@@ -60,7 +60,7 @@ impl Default for Permissions {
     }
 }
 
-impl Permissions {
+impl NodePermissions {
     /// Grants every right to all roles.
     pub const OPEN: Self = Self {
         read: Roles::ALL,
@@ -79,7 +79,7 @@ impl Permissions {
 
 /// The rights of anonymous users.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub enum Anonymous {
+pub enum AnonymousRights {
     /// The role Observer. Also Operator if the server listens on loopback only and has no users.
     #[default]
     Usual,
@@ -91,11 +91,11 @@ pub enum Anonymous {
 
 /// The configured permissions of nodes and of anonymous users.
 #[derive(Debug, Clone, Default)]
-pub struct Rules {
+pub struct PermissionRules {
     /// The rights of anonymous users.
-    pub anonymous: Anonymous,
+    pub anonymous: AnonymousRights,
     /// The nodes with other permissions than the default.
-    pub nodes: HashMap<NodeId, Permissions>,
+    pub nodes: HashMap<NodeId, NodePermissions>,
     /// The methods that can be called over encrypted connections only.
     pub encrypted: HashSet<NodeId>,
 }
@@ -145,7 +145,7 @@ impl LoginFault {
 type Told = Arc<dyn Fn(&Login) + Send + Sync>;
 
 /// The users of a server and their permissions.
-pub struct Access {
+pub struct UserAccess {
     /// The folder of the users; `None` for a server without users.
     folder: Option<PathBuf>,
     /// Whether the server listens on loopback only.
@@ -153,13 +153,13 @@ pub struct Access {
     users: RwLock<Users>,
     /// The state of the file when it was read last.
     stamp: Mutex<Option<Stamp>>,
-    rules: RwLock<Rules>,
+    rules: RwLock<PermissionRules>,
     /// Limits concurrent password checks: each check uses a CPU core for some time, and memory.
     checking: Arc<Semaphore>,
     told: RwLock<Vec<Told>>,
 }
 
-impl std::fmt::Debug for Access {
+impl std::fmt::Debug for UserAccess {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         f.debug_struct("Access").finish_non_exhaustive()
     }
@@ -168,7 +168,7 @@ impl std::fmt::Debug for Access {
 /// The length and the modification time of a file.
 type Stamp = (u64, Option<SystemTime>);
 
-impl Access {
+impl UserAccess {
     /// Reads the users in a folder.
     ///
     /// # Errors
@@ -193,15 +193,15 @@ impl Access {
     /// Returns an error if other users can read the file or if its content is invalid.
     pub fn of_store(pki: Option<&Path>, anonymous: Roles) -> Result<Self, UserFault> {
         let access = Self::new(pki.map(|pki| pki.join(FOLDER)), false)?;
-        access.set_rules(Rules {
-            anonymous: Anonymous::Has(anonymous),
-            ..Rules::default()
+        access.set_rules(PermissionRules {
+            anonymous: AnonymousRights::Has(anonymous),
+            ..PermissionRules::default()
         });
         Ok(access)
     }
 
     /// Replaces the rules, also for open sessions.
-    pub fn set_rules(&self, rules: Rules) {
+    pub fn set_rules(&self, rules: PermissionRules) {
         *self.rules.write() = rules;
     }
 
@@ -276,7 +276,7 @@ impl Access {
 
     /// Returns the roles of the user of a caller.
     #[must_use]
-    pub fn roles_of(&self, caller: &Caller) -> Roles {
+    pub fn roles_of(&self, caller: &SessionCaller) -> Roles {
         if caller.user == ANONYMOUS {
             return self.anonymous().unwrap_or(Roles::NONE);
         }
@@ -310,7 +310,7 @@ impl Access {
         let permissions = match rules.nodes.get(node) {
             Some(permissions) => *permissions,
             None if node.namespace == 0 => return true,
-            None => Permissions::default(),
+            None => NodePermissions::default(),
         };
         drop(rules);
         self.roles(token).meets(permissions.of(right))
@@ -318,11 +318,11 @@ impl Access {
 
     /// Returns the permissions on a node.
     #[must_use]
-    pub fn permissions(&self, node: &NodeId) -> Permissions {
+    pub fn permissions(&self, node: &NodeId) -> NodePermissions {
         let rules = self.rules.read();
         let usual = || match node.namespace {
-            0 => Permissions::OPEN,
-            _ => Permissions::default(),
+            0 => NodePermissions::OPEN,
+            _ => NodePermissions::default(),
         };
         rules.nodes.get(node).copied().unwrap_or_else(usual)
     }
@@ -335,7 +335,7 @@ impl Access {
 
     /// Returns the users with a role: their names, and the thumbprints of their certificates.
     #[must_use]
-    pub fn users_of(&self, role: Role) -> Vec<(String, Option<String>)> {
+    pub fn users_of(&self, role: UserRole) -> Vec<(String, Option<String>)> {
         let users = self.users.read();
         let has_role = users.iter().filter(|(_, user)| user.roles.contains(role));
         let identity = has_role.map(|(name, user)| match &user.credential {
@@ -356,12 +356,12 @@ impl Access {
     /// Returns the roles of anonymous users; `None` if they are refused.
     fn anonymous(&self) -> Option<Roles> {
         match self.rules.read().anonymous {
-            Anonymous::Has(roles) => Some(roles),
-            Anonymous::Refused => None,
-            Anonymous::Usual if self.is_loopback && self.users.read().is_empty() => {
-                Some(Roles::of(&[Role::Observer, Role::Operator]))
+            AnonymousRights::Has(roles) => Some(roles),
+            AnonymousRights::Refused => None,
+            AnonymousRights::Usual if self.is_loopback && self.users.read().is_empty() => {
+                Some(Roles::of(&[UserRole::Observer, UserRole::Operator]))
             }
-            Anonymous::Usual => Some(Roles::of(&[Role::Observer])),
+            AnonymousRights::Usual => Some(Roles::of(&[UserRole::Observer])),
         }
     }
 
@@ -424,7 +424,7 @@ fn login(by: &'static str, user: &str, endpoint: &ServerEndpoint) -> Login {
 }
 
 #[async_trait]
-impl AuthManager for Access {
+impl AuthManager for UserAccess {
     async fn authenticate_anonymous_token(&self, endpoint: &ServerEndpoint) -> Result<(), Error> {
         let mut login = login("anonymous", "", endpoint);
         if self.anonymous().is_none() {
@@ -526,7 +526,11 @@ impl AuthManager for Access {
     }
 
     fn core_permissions(&self, token: &UserToken) -> CoreServerPermissions {
-        let sees = Roles::of(&[Role::Operator, Role::Engineer, Role::SecurityAdmin]);
+        let sees = Roles::of(&[
+            UserRole::Operator,
+            UserRole::Engineer,
+            UserRole::SecurityAdmin,
+        ]);
         CoreServerPermissions {
             read_diagnostics: self.roles(token).meets(sees),
         }
@@ -569,14 +573,14 @@ mod tests {
         ] {
             let mut users = Users::default();
             if has_users {
-                let user = super::super::User {
-                    roles: Roles::of(&[Role::Operator]),
+                let user = super::super::StoredUser {
+                    roles: Roles::of(&[UserRole::Operator]),
                     credential: Credential::Certificate("0".repeat(40)),
                 };
                 users.put("plc", user).unwrap();
             }
             users.write(&folder).unwrap();
-            let access = Access::new(Some(folder.clone()), is_loopback).unwrap();
+            let access = UserAccess::new(Some(folder.clone()), is_loopback).unwrap();
             assert!(access.allows(&anonymous(), &node, Right::Read));
             assert_eq!(access.allows(&anonymous(), &node, Right::Write), writes);
             assert_eq!(access.allows(&anonymous(), &node, Right::Call), writes);
@@ -588,13 +592,13 @@ mod tests {
     fn a_user_who_is_taken_away_may_nothing_more() {
         let folder = scratch("gone");
         let mut users = Users::default();
-        let user = super::super::User {
-            roles: Roles::of(&[Role::Engineer]),
+        let user = super::super::StoredUser {
+            roles: Roles::of(&[UserRole::Engineer]),
             credential: Credential::Certificate("0".repeat(40)),
         };
         users.put("anna", user).unwrap();
         users.write(&folder).unwrap();
-        let access = Access::new(Some(folder.clone()), true).unwrap();
+        let access = UserAccess::new(Some(folder.clone()), true).unwrap();
         let anna = UserToken("anna".to_owned());
         let node = NodeId::new(2, 10);
         assert!(access.allows(&anna, &node, Right::Write));
@@ -608,16 +612,16 @@ mod tests {
 
     #[test]
     fn a_node_has_permissions_of_its_own() {
-        let access = Access::new(None, true).unwrap();
+        let access = UserAccess::new(None, true).unwrap();
         let node = NodeId::new(2, 10);
-        let engineers = Permissions {
-            write: Roles::of(&[Role::Engineer]),
-            ..Permissions::default()
+        let engineers = NodePermissions {
+            write: Roles::of(&[UserRole::Engineer]),
+            ..NodePermissions::default()
         };
-        access.set_rules(Rules {
-            anonymous: Anonymous::Has(Roles::of(&[Role::Operator])),
+        access.set_rules(PermissionRules {
+            anonymous: AnonymousRights::Has(Roles::of(&[UserRole::Operator])),
             nodes: HashMap::from([(node.clone(), engineers)]),
-            ..Rules::default()
+            ..PermissionRules::default()
         });
         assert!(!access.allows(&anonymous(), &node, Right::Write));
         assert!(access.allows(&anonymous(), &NodeId::new(2, 11), Right::Write));
@@ -630,13 +634,13 @@ mod tests {
     async fn a_password_opens_for_its_user_alone() {
         let folder = scratch("password");
         let mut users = Users::default();
-        let user = super::super::User {
-            roles: Roles::of(&[Role::Operator]),
+        let user = super::super::StoredUser {
+            roles: Roles::of(&[UserRole::Operator]),
             credential: super::super::hashed(b"correct horse").unwrap(),
         };
         users.put("anna", user).unwrap();
         users.write(&folder).unwrap();
-        let access = Access::new(Some(folder.clone()), true).unwrap();
+        let access = UserAccess::new(Some(folder.clone()), true).unwrap();
         assert!(access.check("anna", "correct horse").await);
         assert!(!access.check("anna", "correct house").await);
         assert!(!access.check("bert", "correct horse").await);
@@ -652,7 +656,7 @@ mod tests {
         );
         assert_eq!(
             access.roles_of_user("anna"),
-            Some(Roles::of(&[Role::Operator]))
+            Some(Roles::of(&[UserRole::Operator]))
         );
         assert_eq!(
             (access.roles_of_user("bert"), access.has_users()),
@@ -661,7 +665,7 @@ mod tests {
         let roles = access
             .roles_by_password("anna", "correct horse", "SPARQL")
             .await;
-        assert_eq!(roles, Roles::of(&[Role::Operator]));
+        assert_eq!(roles, Roles::of(&[UserRole::Operator]));
         let none = access
             .roles_by_password("anna", "correct house", "SPARQL")
             .await;

@@ -20,7 +20,7 @@ use crate::synced::replace;
 
 /// A user and its credential.
 #[derive(Clone, PartialEq, Eq)]
-pub struct User {
+pub struct StoredUser {
     /// The roles of the user.
     pub roles: Roles,
     /// The credential of the user.
@@ -49,7 +49,7 @@ impl std::fmt::Debug for Credential {
     }
 }
 
-impl std::fmt::Debug for User {
+impl std::fmt::Debug for StoredUser {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         f.debug_struct("User")
             .field("roles", &self.roles)
@@ -118,7 +118,7 @@ pub enum UserFault {
 /// The users of a server.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Users {
-    by_name: BTreeMap<String, User>,
+    by_name: BTreeMap<String, StoredUser>,
 }
 
 impl Users {
@@ -200,18 +200,18 @@ impl Users {
 
     /// Returns a user by name.
     #[must_use]
-    pub fn get(&self, name: &str) -> Option<&User> {
+    pub fn get(&self, name: &str) -> Option<&StoredUser> {
         self.by_name.get(name)
     }
 
     /// Returns the users, ordered by name.
-    pub fn iter(&self) -> impl Iterator<Item = (&str, &User)> {
+    pub fn iter(&self) -> impl Iterator<Item = (&str, &StoredUser)> {
         self.by_name.iter().map(|(name, user)| (&name[..], user))
     }
 
     /// Returns the user with the certificate of this thumbprint.
     #[must_use]
-    pub fn of_certificate(&self, thumbprint: &str) -> Option<(&str, &User)> {
+    pub fn of_certificate(&self, thumbprint: &str) -> Option<(&str, &StoredUser)> {
         self.iter().find(|(_, user)| match &user.credential {
             Credential::Certificate(known) => known == thumbprint,
             Credential::Password(_) => false,
@@ -222,7 +222,7 @@ impl Users {
     ///
     /// # Errors
     /// Returns an error for an invalid name or if the user has no role.
-    pub fn put(&mut self, name: &str, user: User) -> Result<(), UserFault> {
+    pub fn put(&mut self, name: &str, user: StoredUser) -> Result<(), UserFault> {
         if !is_name(name) {
             return Err(UserFault::Name);
         }
@@ -251,7 +251,7 @@ impl Users {
     ///
     /// # Errors
     /// Returns an error if the user does not exist.
-    pub fn remove(&mut self, name: &str) -> Result<User, UserFault> {
+    pub fn remove(&mut self, name: &str) -> Result<StoredUser, UserFault> {
         let gone = self.by_name.remove(name);
         gone.ok_or_else(|| UserFault::Unknown(name.to_owned()))
     }
@@ -292,7 +292,7 @@ fn read_certificate(path: &Path) -> Result<X509, UserFault> {
     })
 }
 
-fn user(line: &str) -> Result<(&str, User), String> {
+fn user(line: &str) -> Result<(&str, StoredUser), String> {
     let mut parts = line.split_whitespace();
     let (Some(name), Some(roles), Some(credential), None) =
         (parts.next(), parts.next(), parts.next(), parts.next())
@@ -315,7 +315,7 @@ fn user(line: &str) -> Result<(&str, User), String> {
         }
         None => Credential::Password(sound_hash(credential)?),
     };
-    Ok((name, User { roles, credential }))
+    Ok((name, StoredUser { roles, credential }))
 }
 
 /// Checks that the cost of verifying a hash is bounded.
@@ -399,7 +399,7 @@ const MOST_PASSES: u32 = 32;
 
 #[cfg(test)]
 mod tests {
-    use super::super::Role;
+    use super::super::UserRole;
     use super::*;
 
     fn scratch(name: &str) -> PathBuf {
@@ -409,9 +409,9 @@ mod tests {
         path
     }
 
-    fn operator(credential: Credential) -> User {
-        User {
-            roles: Roles::of(&[Role::Operator]),
+    fn operator(credential: Credential) -> StoredUser {
+        StoredUser {
+            roles: Roles::of(&[UserRole::Operator]),
             credential,
         }
     }

@@ -13,9 +13,9 @@ use opcua::types::{
     DataTypeId, DataValue, LocalizedText, NodeId, ObjectId, QualifiedName, ReferenceTypeId,
     StatusCode, VariableTypeId, Variant,
 };
-use plant_opcua::client::{Client, ClientConfig, Notice, Subscription};
+use plant_opcua::client::{ClientConfig, ClientSubscription, Notice, OpcUaClient};
 use plant_opcua::server::{
-    IdRange, Instance, InstanceSpec, Server, ServerBuilder, ServerConfig, VariableSpec,
+    IdRange, Instance, InstanceSpec, OpcUaServer, ServerBuilder, ServerConfig, VariableSpec,
 };
 
 pub(crate) const MACHINES: &str = "urn:test:machines";
@@ -23,11 +23,11 @@ pub(crate) const VENDOR: &str = "urn:test:vendor";
 /// A timeout that is long enough on a busy machine.
 pub(crate) const PATIENCE: Duration = Duration::from_secs(20);
 
-pub(crate) struct Cell {
-    pub(crate) server: Server,
+pub(crate) struct OpcuaCell {
+    pub(crate) server: OpcUaServer,
 }
 
-impl Cell {
+impl OpcuaCell {
     pub(crate) fn new() -> Self {
         Self::at("opc.tcp://127.0.0.1:0")
     }
@@ -50,8 +50,8 @@ impl Cell {
         Self { server }
     }
 
-    pub(crate) async fn client(&self) -> Client {
-        let client = Client::open(config(), self.server.url());
+    pub(crate) async fn client(&self) -> OpcUaClient {
+        let client = OpcUaClient::open(config(), self.server.url());
         client.up(PATIENCE).await.unwrap();
         client
     }
@@ -64,7 +64,7 @@ pub(crate) fn config() -> ClientConfig {
 }
 
 /// Creates a press with the NodeIds from `first`.
-pub(crate) fn press(server: &Server, first: u32, optional: &[&str]) -> Instance {
+pub(crate) fn press(server: &OpcUaServer, first: u32, optional: &[&str]) -> Instance {
     let type_id = server.find_type(VENDOR, "PressType").unwrap();
     let mut spec = InstanceSpec::new(
         type_id,
@@ -95,7 +95,7 @@ pub(crate) fn variable(node: &NodeId, parent: &NodeId, n: usize) -> VariableSpec
     }
 }
 
-pub(crate) async fn next(subscription: &mut Subscription) -> Notice {
+pub(crate) async fn next(subscription: &mut ClientSubscription) -> Notice {
     let next = tokio::time::timeout(PATIENCE, subscription.next());
     next.await
         .expect("nothing comes")
@@ -103,7 +103,7 @@ pub(crate) async fn next(subscription: &mut Subscription) -> Notice {
 }
 
 /// Waits for the next value.
-pub(crate) async fn next_value(subscription: &mut Subscription) -> (usize, Option<Variant>) {
+pub(crate) async fn next_value(subscription: &mut ClientSubscription) -> (usize, Option<Variant>) {
     loop {
         match next(subscription).await {
             Notice::Value { watch, value } => return (watch, value.value),
@@ -114,7 +114,7 @@ pub(crate) async fn next_value(subscription: &mut Subscription) -> (usize, Optio
 }
 
 /// Waits for the status of the next value.
-pub(crate) async fn next_status(subscription: &mut Subscription) -> StatusCode {
+pub(crate) async fn next_status(subscription: &mut ClientSubscription) -> StatusCode {
     loop {
         if let Notice::Value { value, .. } = next(subscription).await {
             return value.status.unwrap_or(StatusCode::Good);
@@ -124,7 +124,7 @@ pub(crate) async fn next_status(subscription: &mut Subscription) -> StatusCode {
 
 /// Waits for the next event, until the timeout.
 pub(crate) async fn next_event(
-    subscription: &mut Subscription,
+    subscription: &mut ClientSubscription,
     within: Duration,
 ) -> Option<(usize, Vec<Variant>)> {
     loop {

@@ -5,7 +5,7 @@ use oxrdf::{BlankNode, Literal, NamedNode, NamedOrBlankNode, Term};
 use super::fault::{TemplateFault, TriplesMapFault};
 use super::{Reading, Scope, TermNode, named};
 use crate::mapping::{Expression, TemplatePart, TermKind, TermMap, TermValue};
-use crate::xpath::{Namespaces, parse};
+use crate::xpath::{XpathNamespaces, parse};
 
 impl<'a> Reading<'a> {
     /// Returns the term maps of a role, and the constants of its shortcut.
@@ -218,7 +218,7 @@ fn constant(term: &Term, role: &str) -> Result<TermMap, TriplesMapFault> {
     })
 }
 
-fn reference(written: &str, namespaces: &Namespaces) -> Result<Expression, TriplesMapFault> {
+fn reference(written: &str, namespaces: &XpathNamespaces) -> Result<Expression, TriplesMapFault> {
     let expr = parse(written, namespaces).map_err(|fault| TriplesMapFault::Reference {
         written: written.to_owned(),
         fault,
@@ -231,7 +231,7 @@ fn reference(written: &str, namespaces: &Namespaces) -> Result<Expression, Tripl
 }
 
 /// Reads a template: texts with expressions in braces. A backslash escapes a brace.
-fn template(written: &str, namespaces: &Namespaces) -> Result<Expression, TriplesMapFault> {
+fn template(written: &str, namespaces: &XpathNamespaces) -> Result<Expression, TriplesMapFault> {
     let fault = |fault: TemplateFault| TriplesMapFault::Template {
         written: written.to_owned(),
         fault,

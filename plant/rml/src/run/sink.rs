@@ -8,14 +8,14 @@ use super::RunFault;
 
 /// The statements, each once.
 #[derive(Default)]
-pub(super) struct Sink {
+pub(super) struct StatementSink {
     pub(super) quads: Vec<Quad>,
     known: HashSet<Quad>,
     /// The bytes of the terms of all statements.
     bytes: usize,
 }
 
-impl Sink {
+impl StatementSink {
     pub(super) fn add(&mut self, quad: Quad) -> Result<(), RunFault> {
         if self.quads.len() >= MAX_STATEMENTS {
             return Err(RunFault::Statements(MAX_STATEMENTS));

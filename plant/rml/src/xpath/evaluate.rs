@@ -8,7 +8,7 @@ use roxmltree::{Document, Node, NodeId};
 
 use super::functions::{any_pair, bounded, count, holds, of_number, to_number};
 use super::{
-    Axis, Comparison, Expr, Join, LocationPath, NamespaceTest, Operator, Start, Test, XPathStep,
+    Axis, Comparison, Expr, Join, LocationPath, NamespaceTest, Operator, Start, StepTest, XPathStep,
 };
 
 /// A node or an attribute of a document. The order is that of the document.
@@ -381,7 +381,7 @@ impl<'a> Evaluator<'a> {
         let Some(node) = self.document.get_node(NodeId::new(from.id)) else {
             return Ok(Vec::new());
         };
-        let mut found = Found {
+        let mut found = FoundNodes {
             step,
             all: Vec::new(),
             work,
@@ -444,13 +444,13 @@ impl<'a> Evaluator<'a> {
         &self,
         node: Node<'_, '_>,
         attribute: NodeRef,
-        test: &Test,
+        test: &StepTest,
         axis: Axis,
     ) -> Evaluated<bool> {
         match test {
-            Test::Node => Ok(true),
+            StepTest::Node => Ok(true),
             // A name tests elements on all axes but that of attributes.
-            Test::Name(space, name) if axis == Axis::Attribute => {
+            StepTest::Name(space, name) if axis == Axis::Attribute => {
                 let index = usize::try_from(attribute.attribute).unwrap_or(usize::MAX);
                 let Some(attribute) = node.attributes().nth(index.wrapping_sub(1)) else {
                     return Ok(false);
@@ -458,7 +458,9 @@ impl<'a> Evaluator<'a> {
                 let is_named = name.as_ref().is_none_or(|name| name == attribute.name());
                 Ok(is_named && in_space(space, attribute.namespace(), self.document)?)
             }
-            Test::Name(..) | Test::Text | Test::Comment | Test::Instruction(_) => Ok(false),
+            StepTest::Name(..) | StepTest::Text | StepTest::Comment | StepTest::Instruction(_) => {
+                Ok(false)
+            }
         }
     }
 
@@ -566,13 +568,13 @@ impl XPathContext {
 }
 
 /// The nodes of an axis that pass the test of a step.
-struct Found<'s, 'w> {
+struct FoundNodes<'s, 'w> {
     step: &'s XPathStep,
     all: Vec<NodeRef>,
     work: &'w mut WorkBudget,
 }
 
-impl Found<'_, '_> {
+impl FoundNodes<'_, '_> {
     fn nodes<'d, 'i: 'd>(
         &mut self,
         candidates: impl Iterator<Item = Node<'d, 'i>>,
@@ -619,15 +621,15 @@ fn ordered(nodes: &mut Vec<NodeRef>) {
     nodes.dedup();
 }
 
-fn passes(node: Node<'_, '_>, test: &Test) -> Evaluated<bool> {
+fn passes(node: Node<'_, '_>, test: &StepTest) -> Evaluated<bool> {
     Ok(match test {
-        Test::Node => true,
-        Test::Text => node.is_text(),
-        Test::Comment => node.is_comment(),
-        Test::Instruction(target) => node
+        StepTest::Node => true,
+        StepTest::Text => node.is_text(),
+        StepTest::Comment => node.is_comment(),
+        StepTest::Instruction(target) => node
             .pi()
             .is_some_and(|found| target.as_ref().is_none_or(|target| target == found.target)),
-        Test::Name(space, name) => {
+        StepTest::Name(space, name) => {
             let tag = node.tag_name();
             node.is_element()
                 && name.as_ref().is_none_or(|name| name == tag.name())

@@ -2,10 +2,10 @@
 
 use std::sync::Arc;
 
-use super::tokens::{Token, TokenFault, TokenKind, tokens};
+use super::tokens::{TokenFault, TokenKind, XpathToken, tokens};
 use super::{
-    Axis, Comparison, Expr, Function, Join, LocationPath, NamespaceTest, Namespaces, Operator,
-    PathIndex, Start, Test, XPathStep,
+    Axis, Comparison, Expr, Function, Join, LocationPath, NamespaceTest, Operator, PathIndex,
+    Start, StepTest, XPathStep, XpathNamespaces,
 };
 
 /// Reason for which a text is no expression, with the position and the remedy.
@@ -50,7 +50,7 @@ pub(crate) enum XPathSyntaxFault {
 ///
 /// # Errors
 /// [`XPathSyntaxFault`].
-pub(crate) fn parse(text: &str, namespaces: &Namespaces) -> Result<Expr, XPathSyntaxFault> {
+pub(crate) fn parse(text: &str, namespaces: &XpathNamespaces) -> Result<Expr, XPathSyntaxFault> {
     if text.len() > MAX_LENGTH {
         return Err(XPathSyntaxFault::Length(MAX_LENGTH));
     }
@@ -72,11 +72,11 @@ pub(crate) fn parse(text: &str, namespaces: &Namespaces) -> Result<Expr, XPathSy
 }
 
 struct Parser<'a> {
-    tokens: Vec<Token>,
+    tokens: Vec<XpathToken>,
     next: usize,
     depth: usize,
     operators: usize,
-    namespaces: &'a Namespaces,
+    namespaces: &'a XpathNamespaces,
 }
 
 type Parsed<T> = Result<T, XPathSyntaxFault>;
@@ -196,7 +196,7 @@ impl Parser<'_> {
             if self.take(symbol) {
                 return Ok(XPathStep {
                     axis,
-                    test: Test::Node,
+                    test: StepTest::Node,
                     predicates: Vec::new(),
                 });
             }
@@ -235,7 +235,7 @@ impl Parser<'_> {
             })
     }
 
-    fn test(&mut self) -> Parsed<Test> {
+    fn test(&mut self) -> Parsed<StepTest> {
         let Some(TokenKind::Name(prefix, local)) = self.peek(0).cloned() else {
             return Err(self.wrong("the name of an element or attribute"));
         };
@@ -250,10 +250,10 @@ impl Parser<'_> {
             };
             self.expect(")")?;
             return match local.as_str() {
-                "node" => Ok(Test::Node),
-                "text" => Ok(Test::Text),
-                "comment" => Ok(Test::Comment),
-                "processing-instruction" => Ok(Test::Instruction(target)),
+                "node" => Ok(StepTest::Node),
+                "text" => Ok(StepTest::Text),
+                "comment" => Ok(StepTest::Comment),
+                "processing-instruction" => Ok(StepTest::Instruction(target)),
                 _ => Err(XPathSyntaxFault::NodeTest(local)),
             };
         }
@@ -268,7 +268,7 @@ impl Parser<'_> {
                 }
             }
         };
-        Ok(Test::Name(space, (local != "*").then_some(local)))
+        Ok(StepTest::Name(space, (local != "*").then_some(local)))
     }
 
     fn predicate(&mut self) -> Parsed<Expr> {
@@ -400,7 +400,7 @@ fn binary(symbol: &str, left: Expr, right: Expr) -> Expr {
 fn any_descendant() -> XPathStep {
     XPathStep {
         axis: Axis::DescendantOrSelf,
-        test: Test::Node,
+        test: StepTest::Node,
         predicates: Vec::new(),
     }
 }

@@ -4,7 +4,7 @@ use super::parse::XPathSyntaxFault;
 
 /// A token with the position of its first character, from 1.
 #[derive(Debug, Clone, PartialEq)]
-pub(super) struct Token {
+pub(super) struct XpathToken {
     pub(super) kind: TokenKind,
     pub(super) position: usize,
 }
@@ -43,8 +43,8 @@ pub(crate) enum TokenFault {
 }
 
 /// Splits an expression into tokens.
-pub(super) fn tokens(text: &str) -> Result<Vec<Token>, XPathSyntaxFault> {
-    let mut all: Vec<Token> = Vec::new();
+pub(super) fn tokens(text: &str) -> Result<Vec<XpathToken>, XPathSyntaxFault> {
+    let mut all: Vec<XpathToken> = Vec::new();
     let mut rest = text;
     loop {
         rest = rest.trim_start();
@@ -55,7 +55,7 @@ pub(super) fn tokens(text: &str) -> Result<Vec<Token>, XPathSyntaxFault> {
         let position = before.chars().count() + 1;
         let (kind, after) = one(rest, first, all.last().map(|token| &token.kind))
             .map_err(|fault| XPathSyntaxFault::Token { fault, position })?;
-        all.push(Token { kind, position });
+        all.push(XpathToken { kind, position });
         rest = after;
     }
 }

@@ -6,18 +6,18 @@ use std::sync::{Arc, Mutex};
 use tokio::time::Instant;
 
 use crate::driver::Line;
-use crate::shown::Outcome;
+use crate::shown::RunOutcome;
 use crate::skill::lock;
 
 /// The trace of the current run, and the outcomes of the last runs.
-pub(super) struct History {
-    outcomes: Arc<Mutex<VecDeque<Arc<Outcome>>>>,
+pub(super) struct SkillHistory {
+    outcomes: Arc<Mutex<VecDeque<Arc<RunOutcome>>>>,
     trace: Vec<String>,
 }
 
-impl History {
+impl SkillHistory {
     /// Creates a history that adds to these outcomes.
-    pub(super) const fn new(outcomes: Arc<Mutex<VecDeque<Arc<Outcome>>>>) -> Self {
+    pub(super) const fn new(outcomes: Arc<Mutex<VecDeque<Arc<RunOutcome>>>>) -> Self {
         Self {
             outcomes,
             trace: Vec::new(),
@@ -47,7 +47,7 @@ impl History {
     }
 
     /// Adds an outcome. The oldest outcome gives way to it.
-    pub(super) fn keep(&self, outcome: Outcome) -> Arc<Outcome> {
+    pub(super) fn keep(&self, outcome: RunOutcome) -> Arc<RunOutcome> {
         let outcome = Arc::new(outcome);
         let mut outcomes = lock(&self.outcomes);
         if outcomes.len() >= MOST_OUTCOMES {

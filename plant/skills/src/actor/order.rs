@@ -4,36 +4,36 @@ use std::fmt;
 use std::sync::Arc;
 use std::time::Duration;
 
-use program::Method;
+use program::ProgramMethod;
 use tokio::sync::oneshot;
 
-use crate::authority::Owner;
+use crate::authority::SkillOwner;
 use crate::driver::Driver;
-use crate::refusal::Refusal;
-use crate::value::Value;
+use crate::refusal::SkillRefusal;
+use crate::value::SkillValue;
 
 /// A message to the task.
 #[derive(Debug)]
 pub(crate) enum Order {
-    Call(Call),
+    Call(SkillCallRequest),
     /// Closes the component: a run in progress is halted, regardless of the holder of the lease.
     Close(oneshot::Sender<()>),
 }
 
 /// A call of a method, waiting for the task.
 #[derive(Debug)]
-pub(crate) struct Call {
-    pub(crate) by: Owner,
-    pub(crate) method: Method,
+pub(crate) struct SkillCallRequest {
+    pub(crate) by: SkillOwner,
+    pub(crate) method: ProgramMethod,
     pub(crate) given: Given,
-    pub(crate) reply: oneshot::Sender<Result<u32, Refusal>>,
+    pub(crate) reply: oneshot::Sender<Result<u32, SkillRefusal>>,
 }
 
 /// The arguments of a Start call.
 #[derive(Debug, Default)]
 pub(crate) struct Given {
     /// The parameters; `None` uses the parameters that the caller wrote before.
-    pub(crate) parameters: Option<Vec<(String, Value)>>,
+    pub(crate) parameters: Option<Vec<(String, SkillValue)>>,
     /// Time limit of the run. It applies if it is shorter than the limit of the skill.
     pub(crate) within: Option<Duration>,
     /// Whether a Halted skill is reset first.

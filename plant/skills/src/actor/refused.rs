@@ -1,28 +1,28 @@
 //! The reasons why the task of a skill refuses a call.
 
-use program::{Method, Refused, RunId, State};
+use program::{ProgramMachineState, ProgramMethod, RefusedMethod, RunId};
 
-use crate::refusal::{Code, Refusal};
+use crate::refusal::{RefusalCode, SkillRefusal};
 
-pub(super) fn not_now(method: Method, state: State) -> Refusal {
-    refusal(Refused::State { method, state })
+pub(super) fn not_now(method: ProgramMethod, state: ProgramMachineState) -> SkillRefusal {
+    refusal(RefusedMethod::State { method, state })
 }
 
-pub(super) fn refusal(refused: Refused) -> Refusal {
-    let code = if refused == Refused::CannotSuspend {
-        Code::NotSupported
+pub(super) fn refusal(refused: RefusedMethod) -> SkillRefusal {
+    let code = if refused == RefusedMethod::CannotSuspend {
+        RefusalCode::NotSupported
     } else {
-        Code::InvalidState
+        RefusalCode::InvalidState
     };
-    Refusal::new(code, refused.to_string())
+    SkillRefusal::new(code, refused.to_string())
 }
 
-pub(super) fn unknown_outcome(run: u32) -> Refusal {
+pub(super) fn unknown_outcome(run: u32) -> SkillRefusal {
     let text = format!("the outcome of run {run} is unknown; Reset makes the skill ready");
-    Refusal::new(Code::InvalidState, text)
+    SkillRefusal::new(RefusalCode::InvalidState, text)
 }
 
-pub(super) fn still_at_work(run: RunId) -> Refusal {
+pub(super) fn still_at_work(run: RunId) -> SkillRefusal {
     let text = format!("the work of run {} has not come to an end", run.number());
-    Refusal::new(Code::InvalidState, text)
+    SkillRefusal::new(RefusalCode::InvalidState, text)
 }

@@ -9,14 +9,14 @@ use program::RunId;
 use tokio::task::{JoinError, JoinHandle};
 use tokio::time::{Instant, sleep_until};
 
-use super::order::Call;
-use crate::driver::{Driver, Line, Reins, Results, Work};
+use super::order::SkillCallRequest;
+use crate::driver::{Driver, Line, Reins, RunResults, Work};
 use crate::driver_error::DriverError;
 
 /// The work of a run, kept until the work has ended.
 pub(super) struct Running {
     pub(super) run: RunId,
-    pub(super) task: JoinHandle<Result<Results, DriverError>>,
+    pub(super) task: JoinHandle<Result<RunResults, DriverError>>,
     pub(super) reins: Reins,
     /// Time limit of the run.
     pub(super) within: Option<Duration>,
@@ -27,7 +27,7 @@ pub(super) struct Running {
     left: Option<Duration>,
     /// Result of work that ended while the run was suspended. It is applied when the run is
     /// resumed.
-    pub(super) ended: Option<Result<Results, RunFailure>>,
+    pub(super) ended: Option<Result<RunResults, RunFailure>>,
     /// Set after a stop request to work that is done elsewhere, until that work ends.
     pub(super) halting: Option<Halting>,
     /// Reason why the end of the work is unknown. The end may never become known.
@@ -67,7 +67,7 @@ impl Running {
     }
 
     /// Continues the time limit of the run. Returns the result of work that ended meanwhile.
-    pub(super) fn resume(&mut self) -> Option<Result<Results, RunFailure>> {
+    pub(super) fn resume(&mut self) -> Option<Result<RunResults, RunFailure>> {
         self.deadline = self.left.take().map(|left| Instant::now() + left);
         self.ended.take()
     }
@@ -96,18 +96,18 @@ pub(super) enum Then {
     End,
 }
 
-pub(super) enum Happened {
-    Call(Call),
+pub(super) enum WorkEvent {
+    Call(SkillCallRequest),
     Line(Line),
     Progress(f32),
-    Ended(Result<Results, RunFailure>),
+    Ended(Result<RunResults, RunFailure>),
     Late,
 }
 
 /// The reaction of work to a stop request.
 pub(super) enum Stop {
     /// The work finished.
-    Done(Results),
+    Done(RunResults),
     /// The work stopped.
     Stopped,
     /// The work ended with a reason, or did not stop and was aborted.
@@ -155,7 +155,7 @@ impl RunFailure {
 }
 
 /// Returns the next event of the work. Pends while there is no work.
-pub(super) async fn happens(work: &mut Option<Running>) -> Happened {
+pub(super) async fn happens(work: &mut Option<Running>) -> WorkEvent {
     let Some(Running {
         task,
         reins,
@@ -178,19 +178,19 @@ pub(super) async fn happens(work: &mut Option<Running>) -> Happened {
     };
     tokio::select! {
         biased;
-        Some(line) = reins.steps.recv() => Happened::Line(line),
-        ended = task => Happened::Ended(outcome_of(ended, unknown)),
-        Ok(()) = reins.progress.changed() => Happened::Progress(*reins.progress.borrow_and_update()),
-        () = late => Happened::Late,
+        Some(line) = reins.steps.recv() => WorkEvent::Line(line),
+        ended = task => WorkEvent::Ended(outcome_of(ended, unknown)),
+        Ok(()) = reins.progress.changed() => WorkEvent::Progress(*reins.progress.borrow_and_update()),
+        () = late => WorkEvent::Late,
     }
 }
 
 /// Returns the result of ended work. A driver that panicked has not stopped its machine: `unknown`
 /// then receives the reason.
 pub(super) fn outcome_of(
-    ended: Result<Result<Results, DriverError>, JoinError>,
+    ended: Result<Result<RunResults, DriverError>, JoinError>,
     unknown: &mut Option<String>,
-) -> Result<Results, RunFailure> {
+) -> Result<RunResults, RunFailure> {
     let error = match ended {
         Ok(result) => return result.map_err(RunFailure::Driver),
         Err(error) => error,

@@ -10,15 +10,15 @@ use super::partner_error::{
     FailedLocator, LocatorError, NotLocated, PartnerError, Unchosen, UnfitGrasp,
 };
 use super::{Detected, Detector, PeerAccess, SkillClient};
-use crate::choosing::{Attachment, Candidate, Choice, NoChoice, Rank, choose};
+use crate::choosing::{Attachment, CandidateRank, NoChoice, SkillCandidate, SkillChoice, choose};
 use crate::component::{Partner, WorldObject};
 use crate::frame::Frame;
 use crate::grip::PartShape;
-use crate::parameters::TypeName;
-use crate::runs::Runs as _;
-use crate::shown::Outcome;
-use crate::value::Value;
-use crate::workspace::{OutOfWorkspace, Workspace};
+use crate::parameters::ParameterType;
+use crate::runs::RunnableSkill as _;
+use crate::shown::RunOutcome;
+use crate::value::SkillValue;
+use crate::workspace::{OutOfWorkspace, RobotWorkspace};
 
 /// The state of a tool changer, as its component shows it.
 #[derive(Debug, Clone, PartialEq, Default)]
@@ -60,7 +60,7 @@ struct SkilledComponent {
     endpoint: String,
     application_uri: String,
     /// The workspaces of its moves.
-    workspaces: Vec<Workspace>,
+    workspaces: Vec<RobotWorkspace>,
 }
 
 /// A component that was chosen, and the reasons for and against the candidates.
@@ -96,15 +96,15 @@ impl SkilledComponent {
         fits: Result<(), OutOfWorkspace>,
         attachment: Attachment,
         prefer: &[String],
-    ) -> Candidate<&Self> {
-        Candidate {
+    ) -> SkillCandidate<&Self> {
+        SkillCandidate {
             of: self,
             name: self.application_uri.clone(),
             fits: fits.map_err(|why| why.to_string()),
-            rank: Rank {
+            rank: CandidateRank {
                 attachment,
-                preference: Rank::preference(prefer, &self.application_uri),
-                ..Rank::default()
+                preference: CandidateRank::preference(prefer, &self.application_uri),
+                ..CandidateRank::default()
             },
         }
     }
@@ -113,10 +113,10 @@ impl SkilledComponent {
 /// Chooses among components, and returns the reasons by their ApplicationUris.
 fn chosen(
     what: &'static str,
-    candidates: Vec<Candidate<&SkilledComponent>>,
+    candidates: Vec<SkillCandidate<&SkilledComponent>>,
 ) -> Result<Chosen, Unchosen> {
     match choose(candidates) {
-        Ok(Choice {
+        Ok(SkillChoice {
             chosen,
             reason,
             others,
@@ -304,7 +304,7 @@ impl PeerAccess {
 
     /// Reads the state of all tool changers.
     async fn changers(&self, detector: &Detector) -> Vec<(String, ToolState)> {
-        let of = TypeName::own("ToolSkillType");
+        let of = ParameterType::own("ToolSkillType");
         let mut endpoints: BTreeMap<String, (String, ToolState)> = BTreeMap::new();
         for found in detector.of_type(&of) {
             if let Some(state) = found.skill.tool_state {
@@ -328,7 +328,7 @@ impl PeerAccess {
 
     async fn tool_state(&self, endpoint: &str) -> Option<ToolState> {
         let client = self.connect(endpoint).await.ok()?;
-        let found = client.skills_of(&TypeName::own("ToolSkillType")).await;
+        let found = client.skills_of(&ParameterType::own("ToolSkillType")).await;
         client.close().await;
         found.ok()?.into_iter().find_map(|skill| skill.tool_state)
     }
@@ -337,11 +337,11 @@ impl PeerAccess {
     /// the graph of the plant, is asked first.
     pub(super) async fn locate(&self, id: &str) -> Result<WorldObject, NotLocated> {
         let detector = self.detector.as_ref().ok_or(NotLocated::NoDiscovery)?;
-        let of = TypeName::own("LocateObjectSkillType");
+        let of = ParameterType::own("LocateObjectSkillType");
         let some = detector.one(&of, FOUND_WITHIN, |_| true).await;
         some.map_err(|_| NotLocated::NoLocator)?;
         let mut locators = detector.of_type(&of);
-        let executes = TypeName::own("ExecuteProcessSkillType");
+        let executes = ParameterType::own("ExecuteProcessSkillType");
         let executors = detector.of_type(&executes);
         locators.sort_by_key(|one| !executors.iter().any(|of| of.endpoint == one.endpoint));
         let mut failed = Vec::new();
@@ -364,7 +364,7 @@ impl PeerAccess {
             fault,
         })?;
         let handle = client.handle(&locator.skill);
-        let given = vec![("ObjectId".to_owned(), Value::from(id))];
+        let given = vec![("ObjectId".to_owned(), SkillValue::from(id))];
         let ran = handle.run(given, LOCATED_WITHIN).await;
         client.close().await;
         let outcome = ran?;
@@ -377,7 +377,7 @@ impl PeerAccess {
 }
 
 /// Returns the object in the results of a skill that locates objects. Zeros are unknown lengths.
-fn object_of(outcome: &Outcome) -> Option<WorldObject> {
+fn object_of(outcome: &RunOutcome) -> Option<WorldObject> {
     let numbers = |name: &str| {
         let mut results = outcome.results.iter();
         let found = results.find(|(known, _)| known == name);
@@ -451,7 +451,11 @@ fn having(all: &[Detected], types: &[&str]) -> Vec<SkilledComponent> {
         skills.push(&one.skill);
     }
     let has_all = |skills: &[&FoundSkill]| {
-        let has = |name: &&str| skills.iter().any(|skill| skill.is_of(&TypeName::own(name)));
+        let has = |name: &&str| {
+            skills
+                .iter()
+                .any(|skill| skill.is_of(&ParameterType::own(name)))
+        };
         types.iter().all(has)
     };
     let found = components
@@ -474,7 +478,7 @@ pub(super) async fn fitting_grasp(
     client: &SkillClient,
     shape: Option<&PartShape>,
 ) -> Result<(FoundSkill, Vec<UnfitGrasp>), PartnerError> {
-    let of = TypeName::own("GraspSkillType");
+    let of = ParameterType::own("GraspSkillType");
     let endpoint = || client.endpoint().to_owned();
     let found = client.skills_of(&of).await;
     let found = found.map_err(|fault| PartnerError::Component {

@@ -11,12 +11,12 @@ use super::{ClientOptions, Detector, Needs, PeerAccess, Remote, SkillClient, Too
 use crate::choosing::Attachment;
 use crate::component::{Component, Device, DriverFault, DriverSetup, Partner};
 use crate::conformance;
-use crate::driver::{Driver, Results, Work};
+use crate::driver::{Driver, RunResults, Work};
 use crate::driver_error::DriverError;
-use crate::parameters::TypeName;
+use crate::parameters::ParameterType;
 use crate::server::{ComponentServer, ServeSettings};
-use crate::shown::Outcome;
-use crate::value::Value;
+use crate::shown::RunOutcome;
+use crate::value::SkillValue;
 
 const ROBOT: &str = include_str!("../../../../examples/plant/robot.yaml");
 const FINGERS: &str = include_str!("../../../../examples/plant/parallel-gripper.yaml");
@@ -61,7 +61,7 @@ const SKILLS: usize = 8;
 struct Switched(watch::Receiver<ToolState>);
 
 impl Device for Switched {
-    fn driver(&self, _: &[TypeName], _: &PeerAccess) -> Result<Arc<dyn Driver>, DriverFault> {
+    fn driver(&self, _: &[ParameterType], _: &PeerAccess) -> Result<Arc<dyn Driver>, DriverFault> {
         Err(DriverFault("the test changes no tools".to_owned()))
     }
 
@@ -75,14 +75,14 @@ impl Device for Switched {
 struct Camera;
 
 impl Device for Camera {
-    fn driver(&self, _: &[TypeName], _: &PeerAccess) -> Result<Arc<dyn Driver>, DriverFault> {
+    fn driver(&self, _: &[ParameterType], _: &PeerAccess) -> Result<Arc<dyn Driver>, DriverFault> {
         Ok(Arc::new(Self))
     }
 }
 
 #[async_trait]
 impl Driver for Camera {
-    async fn run(&self, work: Work) -> Result<Results, DriverError> {
+    async fn run(&self, work: Work) -> Result<RunResults, DriverError> {
         match work.parameters().text("ObjectId") {
             Some("bolt") => Ok(vec![
                 ("Pose".to_owned(), [0.3, 0.3, 0.1, 0.0, 0.0, 0.0].into()),
@@ -194,12 +194,12 @@ impl Cell {
         client.close().await;
     }
 
-    async fn run(&self, given: &[(&str, &str)]) -> Result<Outcome, String> {
-        let place = Value::from([0.4, -0.2, 0.1, 0.0, 0.0, 0.0]);
+    async fn run(&self, given: &[(&str, &str)]) -> Result<RunOutcome, String> {
+        let place = SkillValue::from([0.4, -0.2, 0.1, 0.0, 0.0, 0.0]);
         let mut parameters = vec![("PlacePosition".to_owned(), place)];
         let texts = given
             .iter()
-            .map(|(name, value)| ((*name).to_owned(), Value::from(*value)));
+            .map(|(name, value)| ((*name).to_owned(), SkillValue::from(*value)));
         parameters.extend(texts);
         let driver = Arc::clone(&self.driver);
         let ran = conformance::run_once("PickAndPlaceSkillType", driver, parameters);
@@ -367,9 +367,9 @@ async fn the_robot_that_reaches_the_positions_is_chosen_with_a_reason_for_each_o
 
     // The robot itself refuses the target, too.
     let skill = &robots[0].skills()[0];
-    let target = Value::from([0.9, 0.0, 0.1, 0.0, 0.0, 0.0]);
+    let target = SkillValue::from([0.9, 0.0, 0.1, 0.0, 0.0, 0.0]);
     let given = vec![("TargetPosition".to_owned(), target)];
-    let me = crate::authority::Owner::Session(1);
+    let me = crate::authority::SkillOwner::Session(1);
     let refused = skill.execute(me, given, None).await.unwrap_err();
     assert_eq!(refused.text, format!("TargetPosition: {too_far}"));
     for server in robots {

@@ -12,7 +12,7 @@ use tracing::debug;
 use super::find::FoundSkill;
 use super::{ClientOptions, SkillClient, SkillHandle, StationChanges};
 use crate::model::alias;
-use crate::parameters::TypeName;
+use crate::parameters::ParameterType;
 use crate::runs::SkillFault;
 use crate::skill::lock;
 
@@ -66,8 +66,8 @@ impl FoundSkill {
     /// Returns whether the skill is of this type or a subtype. Names of the earlier system match
     /// their equivalents.
     #[must_use]
-    pub fn is_of(&self, wanted: &TypeName) -> bool {
-        let known = alias::of(wanted).map(|known| TypeName::own(known.name));
+    pub fn is_of(&self, wanted: &ParameterType) -> bool {
+        let known = alias::of(wanted).map(|known| ParameterType::own(known.name));
         let wanted = known.as_ref().unwrap_or(wanted);
         self.types.iter().any(|of| of.name == *wanted)
     }
@@ -138,7 +138,7 @@ impl Detector {
 
     /// Returns the skills of a type and its subtypes, from any vendor.
     #[must_use]
-    pub fn of_type(&self, wanted: &TypeName) -> Vec<Detected> {
+    pub fn of_type(&self, wanted: &ParameterType) -> Vec<Detected> {
         let mut all = self.all();
         all.retain(|detected| detected.skill.is_of(wanted));
         all
@@ -150,7 +150,7 @@ impl Detector {
     /// [`SkillFault::Unexpected`] if no such skill is found `within` that time.
     pub async fn one(
         &self,
-        wanted: &TypeName,
+        wanted: &ParameterType,
         within: Duration,
         fits: impl Fn(&Detected) -> bool,
     ) -> Result<Detected, SkillFault> {

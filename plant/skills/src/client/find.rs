@@ -3,7 +3,7 @@
 use std::collections::{HashMap, HashSet};
 
 use futures_util::{StreamExt, TryStreamExt, stream};
-use plant_opcua::client::{Browse, Client};
+use plant_opcua::client::{Browse, OpcUaClient};
 use plant_opcua::types::{
     AttributeId, EUInformation, NodeClass, NodeClassMask, NodeId, ObjectId, ObjectTypeId,
     QualifiedName, Range, ReferenceDescription, ReferenceTypeId, VariableId, Variant,
@@ -16,12 +16,12 @@ use crate::grip::GripPoint;
 use crate::model::{
     CURRENT_TOOL, MOVER_ENDPOINT, NAMESPACE, SKILL_TYPE, SkillType, TOOL_PLATE_OFFSET, alias,
 };
-use crate::parameters::TypeName;
+use crate::parameters::ParameterType;
 use crate::runs::SkillFault;
 use crate::server::OUTCOME;
-use crate::value::{Builtin, Shape, Value};
+use crate::value::{Builtin, SkillValue, ValueShape};
 use crate::variant::{builtin_of, from_variant};
-use crate::workspace::Workspace;
+use crate::workspace::RobotWorkspace;
 
 /// A skill of a server.
 #[derive(Debug, Clone, PartialEq)]
@@ -54,7 +54,7 @@ pub struct FoundSkill {
     /// The grip point of a grasp skill, if its component states it.
     pub grip_point: Option<GripPoint>,
     /// The workspace of a move, if its component states it.
-    pub workspace: Option<Workspace>,
+    pub workspace: Option<RobotWorkspace>,
     /// Parameters and results that cannot be used, with the reasons.
     pub strange: Vec<String>,
     pub(super) nodes: Nodes,
@@ -64,7 +64,7 @@ pub struct FoundSkill {
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct FoundType {
     /// Its name.
-    pub name: TypeName,
+    pub name: ParameterType,
     /// The identifier of its node in the namespace of its name, as `i=1200`.
     pub identifier: String,
 }
@@ -75,10 +75,10 @@ pub struct FoundParameter {
     /// Its BrowseName.
     pub name: String,
     /// Type and rank.
-    pub shape: Shape,
+    pub shape: ValueShape,
     /// The current value of the variable. For a parameter it is the default; a parameter without a
     /// value is mandatory.
-    pub default: Option<Value>,
+    pub default: Option<SkillValue>,
     /// Its unit, by the symbol.
     pub unit: Option<String>,
     /// The lowest and the highest value of a number.
@@ -92,7 +92,7 @@ pub struct FoundParameter {
 
 impl FoundParameter {
     /// Converts a value of the variable; `None` if it does not match.
-    pub(super) fn shown(&self, variant: &Variant) -> Option<Value> {
+    pub(super) fn shown(&self, variant: &Variant) -> Option<SkillValue> {
         match self.packed {
             Some(packed) => packed.unpack(variant),
             None => from_variant(variant),
@@ -122,8 +122,8 @@ impl Nodes {
 /// Returns all instances of a type and its subtypes, by the names of this crate or of the earlier
 /// system.
 pub(super) async fn skills(
-    client: &Client,
-    wanted: &TypeName,
+    client: &OpcUaClient,
+    wanted: &ParameterType,
 ) -> Result<Vec<FoundSkill>, SkillFault> {
     let wanted = known_as(wanted).unwrap_or_else(|| wanted.clone());
     let mut roots = Vec::new();
@@ -131,7 +131,7 @@ pub(super) async fn skills(
     for of in programs(client).await? {
         let name = of.name.as_ref();
         let known = name.map(|name| known_as(name).unwrap_or_else(|| name.clone()));
-        if known == Some(TypeName::own(SKILL_TYPE)) {
+        if known == Some(ParameterType::own(SKILL_TYPE)) {
             roots.push(of.id.clone());
         }
         if known.as_ref() == Some(&wanted) && !types.contains(&of.id) {
@@ -150,14 +150,14 @@ pub(super) async fn skills(
 }
 
 /// Returns all Programs, including Programs that are not skills.
-pub(super) async fn all_programs(client: &Client) -> Result<Vec<FoundSkill>, SkillFault> {
+pub(super) async fn all_programs(client: &OpcUaClient) -> Result<Vec<FoundSkill>, SkillFault> {
     let root: NodeId = ObjectTypeId::ProgramStateMachineType.into();
     let types = programs(client).await?.into_iter().map(|of| of.id);
     all(client, &types.collect(), &[root]).await
 }
 
 async fn all(
-    client: &Client,
+    client: &OpcUaClient,
     types: &HashSet<NodeId>,
     roots: &[NodeId],
 ) -> Result<Vec<FoundSkill>, SkillFault> {
@@ -184,7 +184,7 @@ struct Shared {
 
 impl Shared {
     async fn of(
-        client: &Client,
+        client: &OpcUaClient,
         roots: &[NodeId],
         instances: &[Instance],
     ) -> Result<Self, SkillFault> {
@@ -219,19 +219,19 @@ impl Shared {
 }
 
 /// Returns the type of this crate that is the equivalent of a type of the earlier system.
-fn known_as(name: &TypeName) -> Option<TypeName> {
-    alias::of(name).map(|known| TypeName::own(known.name))
+fn known_as(name: &ParameterType) -> Option<ParameterType> {
+    alias::of(name).map(|known| ParameterType::own(known.name))
 }
 
 /// A subtype of ProgramStateMachineType.
 struct ProgramType {
     id: NodeId,
-    name: Option<TypeName>,
+    name: Option<ParameterType>,
 }
 
 /// Returns ProgramStateMachineType and its subtypes. The list is empty if the server does not have
 /// the type.
-async fn programs(client: &Client) -> Result<Vec<ProgramType>, SkillFault> {
+async fn programs(client: &OpcUaClient) -> Result<Vec<ProgramType>, SkillFault> {
     let root: NodeId = ObjectTypeId::ProgramStateMachineType.into();
     let class = client
         .read_attributes(&[(root.clone(), AttributeId::NodeClass)])
@@ -246,7 +246,10 @@ async fn programs(client: &Client) -> Result<Vec<ProgramType>, SkillFault> {
     Ok(both.map(|(id, name)| ProgramType { id, name }).collect())
 }
 
-async fn names(client: &Client, nodes: &[NodeId]) -> Result<Vec<Option<TypeName>>, SkillFault> {
+async fn names(
+    client: &OpcUaClient,
+    nodes: &[NodeId],
+) -> Result<Vec<Option<ParameterType>>, SkillFault> {
     let what: Vec<_> = nodes
         .iter()
         .map(|node| (node.clone(), AttributeId::BrowseName))
@@ -267,7 +270,7 @@ async fn names(client: &Client, nodes: &[NodeId]) -> Result<Vec<Option<TypeName>
         namespaces = texts(value(client, &all).await?);
     }
     let name = |value: Option<Variant>| match value {
-        Some(Variant::QualifiedName(name)) => Some(TypeName {
+        Some(Variant::QualifiedName(name)) => Some(ParameterType {
             namespace: namespaces.get(usize::from(name.namespace_index))?.clone(),
             name: name.name.as_ref().to_owned(),
         }),
@@ -283,7 +286,10 @@ struct Instance {
 }
 
 /// Returns the objects of these types below Objects, level by level, in the order of the server.
-async fn instances(client: &Client, types: &HashSet<NodeId>) -> Result<Vec<Instance>, SkillFault> {
+async fn instances(
+    client: &OpcUaClient,
+    types: &HashSet<NodeId>,
+) -> Result<Vec<Instance>, SkillFault> {
     let mut found = Vec::new();
     let mut seen: HashSet<NodeId> = HashSet::from([ObjectId::Server.into()]);
     let mut level: Vec<Vec<(NodeId, String)>> =
@@ -334,7 +340,7 @@ fn order(id: &NodeId) -> (u16, u32, String) {
 }
 
 async fn read(
-    client: &Client,
+    client: &OpcUaClient,
     shared: &Shared,
     instance: Instance,
 ) -> Result<FoundSkill, SkillFault> {
@@ -382,7 +388,7 @@ async fn read(
     let component = component_of(&above).and_then(|(node, _)| shared.components.get(node));
     let (component, namespace) = component.cloned().unwrap_or_default();
     let types = shared.chains.get(&reference.type_definition.node_id);
-    let grasps = TypeName::own("GraspSkillType");
+    let grasps = ParameterType::own("GraspSkillType");
     let is_grasp = types.is_some_and(|types| types.iter().any(|of| of.name == grasps));
     let grip_point = match is_grasp {
         true => grip::read(client, &nodes, &parameters, &above).await?,
@@ -416,7 +422,7 @@ async fn read(
 }
 
 /// Reads the state of the tool changer of a skill; `None` if the skill has no such properties.
-async fn tool_state(client: &Client, nodes: &Nodes) -> Result<Option<ToolState>, SkillFault> {
+async fn tool_state(client: &OpcUaClient, nodes: &Nodes) -> Result<Option<ToolState>, SkillFault> {
     let Some(plate) = nodes.get(TOOL_PLATE_OFFSET) else {
         return Ok(None);
     };
@@ -457,7 +463,7 @@ fn behind(above: &[(NodeId, String)]) -> Option<&NodeId> {
 }
 
 /// Reads the ApplicationUri of a server that a station shows.
-async fn shown_uri(client: &Client, node: &NodeId) -> Result<Option<String>, SkillFault> {
+async fn shown_uri(client: &OpcUaClient, node: &NodeId) -> Result<Option<String>, SkillFault> {
     let properties = Browse::of(ReferenceTypeId::HasProperty);
     let properties = client.browse(node, properties).await;
     let properties = properties.map_err(|error| lost(&error))?;
@@ -477,7 +483,7 @@ fn component_of(above: &[(NodeId, String)]) -> Option<&(NodeId, String)> {
 }
 
 /// Reads the number of a component in the space.
-async fn number_of(client: &Client, component: &NodeId) -> Result<Option<u16>, SkillFault> {
+async fn number_of(client: &OpcUaClient, component: &NodeId) -> Result<Option<u16>, SkillFault> {
     let Some(index) = client.namespace(NAMESPACE) else {
         return Ok(None);
     };
@@ -488,13 +494,13 @@ async fn number_of(client: &Client, component: &NodeId) -> Result<Option<u16>, S
         Err(_) => None,
     };
     Ok(match number {
-        Some(Value::UInt16(number)) => Some(number),
+        Some(SkillValue::UInt16(number)) => Some(number),
         _ => None,
     })
 }
 
 async fn chain(
-    client: &Client,
+    client: &OpcUaClient,
     roots: &[NodeId],
     own: &NodeId,
 ) -> Result<Vec<FoundType>, SkillFault> {
@@ -504,7 +510,7 @@ async fn chain(
         ids.truncate(last + 1);
     }
     let names = names(client, &ids).await?;
-    let found = |(id, name): (&NodeId, Option<TypeName>)| {
+    let found = |(id, name): (&NodeId, Option<ParameterType>)| {
         let name = name?;
         let identifier = id.identifier.to_string();
         // A station shows a type under an identifier of its own, which contains that of the type.
@@ -526,14 +532,14 @@ async fn chain(
 
 fn own_type(of: &'static SkillType) -> FoundType {
     FoundType {
-        name: TypeName::own(of.name),
+        name: ParameterType::own(of.name),
         identifier: format!("i={}", of.id),
     }
 }
 
 /// Reads the variables of a group with their current values.
 async fn group(
-    client: &Client,
+    client: &OpcUaClient,
     node: Option<&NodeId>,
     without: &[&str],
     strange: &mut Vec<String>,
@@ -576,13 +582,13 @@ async fn group(
         let value = next();
         let packed = data_type.as_deref().and_then(|of| Packed::of(of, array));
         let shape = match packed {
-            Some(_) => Some(Shape {
+            Some(_) => Some(ValueShape {
                 builtin: Builtin::Double,
                 array: true,
             }),
             None => {
                 let builtin = data_type.as_deref().and_then(builtin_of);
-                builtin.map(|builtin| Shape { builtin, array })
+                builtin.map(|builtin| ValueShape { builtin, array })
             }
         };
         let Some(shape) = shape else {
@@ -610,19 +616,19 @@ async fn group(
     Ok(found)
 }
 
-async fn unit(client: &Client, node: &NodeId) -> Result<Option<String>, SkillFault> {
+async fn unit(client: &OpcUaClient, node: &NodeId) -> Result<Option<String>, SkillFault> {
     let unit = property::<EUInformation>(client, node, "EngineeringUnits").await?;
     Ok(unit.map(|unit| unit.display_name.text.as_ref().to_owned()))
 }
 
-async fn range(client: &Client, node: &NodeId) -> Result<Option<(f64, f64)>, SkillFault> {
+async fn range(client: &OpcUaClient, node: &NodeId) -> Result<Option<(f64, f64)>, SkillFault> {
     let range = property::<Range>(client, node, "EURange").await?;
     Ok(range.map(|range| (range.low, range.high)))
 }
 
 /// Returns the structure of a property; `None` if there is no such property.
 async fn property<T: Clone + Send + Sync + 'static>(
-    client: &Client,
+    client: &OpcUaClient,
     node: &NodeId,
     name: &str,
 ) -> Result<Option<T>, SkillFault> {
@@ -637,7 +643,7 @@ async fn property<T: Clone + Send + Sync + 'static>(
     Ok(object.inner_as::<T>().cloned())
 }
 
-async fn value(client: &Client, node: &NodeId) -> Result<Option<Value>, SkillFault> {
+async fn value(client: &OpcUaClient, node: &NodeId) -> Result<Option<SkillValue>, SkillFault> {
     let values = client
         .read(std::slice::from_ref(node))
         .await
@@ -648,9 +654,9 @@ async fn value(client: &Client, node: &NodeId) -> Result<Option<Value>, SkillFau
         .and_then(from_variant))
 }
 
-pub(super) fn texts(value: Option<Value>) -> Vec<String> {
+pub(super) fn texts(value: Option<SkillValue>) -> Vec<String> {
     match value {
-        Some(Value::Array(_, texts)) => texts
+        Some(SkillValue::Array(_, texts)) => texts
             .iter()
             .filter_map(|text| text.as_str().map(str::to_owned))
             .collect(),
@@ -663,7 +669,7 @@ fn name_of(reference: &ReferenceDescription) -> String {
 }
 
 /// Formats a NodeId with the URI of its namespace.
-fn text_of(client: &Client, node: &NodeId) -> String {
+fn text_of(client: &OpcUaClient, node: &NodeId) -> String {
     match client.namespaces().get(usize::from(node.namespace)) {
         Some(uri) => format!("nsu={uri};{}", node.identifier),
         None => node.to_string(),
@@ -671,7 +677,7 @@ fn text_of(client: &Client, node: &NodeId) -> String {
 }
 
 /// Returns the namespace of a server's own nodes, which has index 1.
-fn uri(client: &Client) -> String {
+fn uri(client: &OpcUaClient) -> String {
     client.namespaces().into_iter().nth(1).unwrap_or_default()
 }
 

@@ -1,7 +1,7 @@
 //! Reads the grip point of a grasp skill: its own properties, its parameters, or the grip points of
 //! its gripper in the earlier system.
 
-use plant_opcua::client::{Browse, Client};
+use plant_opcua::client::{Browse, OpcUaClient};
 use plant_opcua::types::{DataTypeId, NodeId, ReferenceDescription, Variant};
 
 use super::find::{FoundParameter, Nodes};
@@ -12,13 +12,13 @@ use crate::model::{
     GRIP_POINT_OFFSET, GRIP_POINT_OPENING, GRIP_POINT_TYPE, REACH, ZONE_BOUNDS, ZONE_NAMES,
 };
 use crate::runs::SkillFault;
-use crate::value::Value;
+use crate::value::SkillValue;
 use crate::variant::from_variant;
-use crate::workspace::Workspace;
+use crate::workspace::RobotWorkspace;
 
 /// Returns the grip point of a grasp skill; `above` are the objects above it, with their names.
 pub(super) async fn read(
-    client: &Client,
+    client: &OpcUaClient,
     nodes: &Nodes,
     parameters: &[FoundParameter],
     above: &[(NodeId, String)],
@@ -55,9 +55,9 @@ pub(super) async fn read(
 
 /// Returns the workspace of a move, if its component states it.
 pub(super) async fn workspace(
-    client: &Client,
+    client: &OpcUaClient,
     nodes: &Nodes,
-) -> Result<Option<Workspace>, SkillFault> {
+) -> Result<Option<RobotWorkspace>, SkillFault> {
     let own = [REACH, ZONE_NAMES, ZONE_BOUNDS].map(|name| nodes.get(name).cloned());
     if own.iter().all(Option::is_none) {
         return Ok(None);
@@ -66,14 +66,14 @@ pub(super) async fn workspace(
     let reach = reach.and_then(|reach| reach.as_f64());
     let bounds = bounds.and_then(|bounds| bounds.as_f64s());
     let names = super::find::texts(names);
-    Ok(Some(Workspace::of(
+    Ok(Some(RobotWorkspace::of(
         reach,
         names,
         &bounds.unwrap_or_default(),
     )))
 }
 
-fn grip_point([offset, grip_type, opening]: [Option<Value>; 3]) -> Option<GripPoint> {
+fn grip_point([offset, grip_type, opening]: [Option<SkillValue>; 3]) -> Option<GripPoint> {
     let number = grip_type.and_then(|value| value.as_f64());
     #[expect(clippy::cast_possible_truncation, reason = "an enumeration value")]
     let number = number.map(|number| number as i64);
@@ -86,9 +86,9 @@ fn grip_point([offset, grip_type, opening]: [Option<Value>; 3]) -> Option<GripPo
 }
 
 async fn values(
-    client: &Client,
+    client: &OpcUaClient,
     nodes: [Option<NodeId>; 3],
-) -> Result<[Option<Value>; 3], SkillFault> {
+) -> Result<[Option<SkillValue>; 3], SkillFault> {
     let mut values = [None, None, None];
     for (value, node) in values.iter_mut().zip(nodes) {
         let Some(node) = node else { continue };
@@ -100,7 +100,7 @@ async fn values(
 }
 
 /// Converts numbers, and the structures of frames and ranges.
-fn plain(variant: &Variant) -> Option<Value> {
+fn plain(variant: &Variant) -> Option<SkillValue> {
     from_variant(variant).or_else(|| {
         let structures = [DataTypeId::ThreeDFrame, DataTypeId::Range];
         let mut packed = structures
@@ -110,12 +110,19 @@ fn plain(variant: &Variant) -> Option<Value> {
     })
 }
 
-async fn below(client: &Client, node: &NodeId) -> Result<Vec<ReferenceDescription>, SkillFault> {
+async fn below(
+    client: &OpcUaClient,
+    node: &NodeId,
+) -> Result<Vec<ReferenceDescription>, SkillFault> {
     let below = client.browse(node, Browse::hierarchical()).await;
     below.map_err(|error| lost(&error))
 }
 
-async fn child(client: &Client, node: &NodeId, name: &str) -> Result<Option<NodeId>, SkillFault> {
+async fn child(
+    client: &OpcUaClient,
+    node: &NodeId,
+    name: &str,
+) -> Result<Option<NodeId>, SkillFault> {
     let below = below(client, node).await?;
     let mut below = below.into_iter();
     let found = below.find(|child| child.browse_name.name.as_ref() == name);

@@ -3,23 +3,25 @@
 use std::time::Duration;
 
 use async_trait::async_trait;
-use plant_opcua::client::{Browse, CallError, Client, ClientError, Link, Notice, Watch};
+use plant_opcua::client::{
+    Browse, CallError, ClientError, Link, MonitoredWatch, Notice, OpcUaClient,
+};
 use plant_opcua::types::{DataValue, NodeId, QualifiedName, StatusCode, UAString, Variant};
-use program::{Method, State};
+use program::{ProgramMachineState, ProgramMethod};
 
 use super::find::{FoundParameter, FoundSkill};
 use super::{called, lost, refused};
 use crate::grip::GripPoint;
 use crate::model::{DEVICES, POWER_OFF};
-use crate::runs::{HALTS_WITHIN, Runs, SkillFault, goes_on};
-use crate::shown::Outcome;
-use crate::value::Value;
+use crate::runs::{HALTS_WITHIN, RunnableSkill, SkillFault, goes_on};
+use crate::shown::RunOutcome;
+use crate::value::SkillValue;
 use crate::variant::{from_pairs, from_variant, to_pairs, to_variant};
 
 /// A skill of another component that can be run. Clones share the connection.
 #[derive(Clone)]
 pub struct SkillHandle {
-    client: Client,
+    client: OpcUaClient,
     found: FoundSkill,
 }
 
@@ -27,7 +29,7 @@ pub struct SkillHandle {
 #[derive(Debug, Clone, PartialEq)]
 pub struct RemoteState {
     /// The state of its state machine.
-    pub state: State,
+    pub state: ProgramMachineState,
     /// The number of the newest run; 0 before the first run, or if the skill does not number its
     /// runs.
     pub run: u32,
@@ -38,7 +40,7 @@ pub struct RemoteState {
 }
 
 impl SkillHandle {
-    pub(super) fn new(client: Client, found: FoundSkill) -> Self {
+    pub(super) fn new(client: OpcUaClient, found: FoundSkill) -> Self {
         Self { client, found }
     }
 
@@ -98,7 +100,7 @@ impl SkillHandle {
     }
 
     /// Reads the current values of the parameters; empty if there is no response.
-    pub(super) async fn parameters(&self) -> Vec<(String, Value)> {
+    pub(super) async fn parameters(&self) -> Vec<(String, SkillValue)> {
         let declared = &self.found.parameters;
         let ids: Vec<NodeId> = declared.iter().map(|of| of.id.clone()).collect();
         let values = self.client.read(&ids).await.unwrap_or_default();
@@ -164,7 +166,7 @@ impl SkillHandle {
     ///
     /// # Errors
     /// A refusal, or no response.
-    pub async fn call(&self, method: Method) -> Result<(), SkillFault> {
+    pub async fn call(&self, method: ProgramMethod) -> Result<(), SkillFault> {
         let node = self.found.nodes.get(method.name());
         let node = node.ok_or_else(|| self.unexpected(&format!("it has no {method}")))?;
         let call = self
@@ -183,9 +185,9 @@ impl SkillHandle {
     /// # Errors
     /// A refusal, or no response. After [`SkillFault::Lost`] it is unknown whether the run has
     /// started.
-    pub async fn start(&self, parameters: Vec<(String, Value)>) -> Result<u32, SkillFault> {
+    pub async fn start(&self, parameters: Vec<(String, SkillValue)>) -> Result<u32, SkillFault> {
         self.write(parameters).await?;
-        self.call(Method::Start).await?;
+        self.call(ProgramMethod::Start).await?;
         let [run] = self.read(["RunId"]).await?;
         Ok(run.as_ref().map_or(0, number))
     }
@@ -199,7 +201,7 @@ impl SkillHandle {
     /// started.
     pub async fn execute(
         &self,
-        parameters: Vec<(String, Value)>,
+        parameters: Vec<(String, SkillValue)>,
         within: Option<Duration>,
     ) -> Result<u32, SkillFault> {
         let Some(node) = self.found.nodes.get("Execute") else {
@@ -219,11 +221,11 @@ impl SkillHandle {
         }
     }
 
-    async fn step_by_step(&self, parameters: Vec<(String, Value)>) -> Result<u32, SkillFault> {
-        if self.state().await?.state == State::Halted {
-            let reset = self.call(Method::Reset).await;
+    async fn step_by_step(&self, parameters: Vec<(String, SkillValue)>) -> Result<u32, SkillFault> {
+        if self.state().await?.state == ProgramMachineState::Halted {
+            let reset = self.call(ProgramMethod::Reset).await;
             // The Reset of a caller that gave up earlier may have taken effect first.
-            if reset.is_err() && self.state().await?.state != State::Ready {
+            if reset.is_err() && self.state().await?.state != ProgramMachineState::Ready {
                 reset?;
             }
         }
@@ -235,7 +237,7 @@ impl SkillHandle {
     ///
     /// # Errors
     /// BadNotFound for an unknown run, no response, or a skill without ReadOutcome.
-    pub async fn outcome_of(&self, run: u32) -> Result<Option<Outcome>, SkillFault> {
+    pub async fn outcome_of(&self, run: u32) -> Result<Option<RunOutcome>, SkillFault> {
         let node = self.found.nodes.get("ReadOutcome");
         let node = node.ok_or_else(|| self.unexpected("it has no ReadOutcome"))?;
         let outputs = self
@@ -261,7 +263,7 @@ impl SkillHandle {
         }
         let results = from_pairs(names, values)
             .ok_or_else(|| self.unexpected("its results are none of a skill"))?;
-        Ok(Some(Outcome {
+        Ok(Some(RunOutcome {
             run,
             succeeded: *succeeded == Variant::Boolean(true),
             unknown: more.first() == Some(&Variant::Boolean(true)),
@@ -277,7 +279,7 @@ impl SkillHandle {
     ///
     /// # Errors
     /// As [`outcome_of`](Self::outcome_of), and [`SkillFault::TimedOut`]; the run is not stopped.
-    pub async fn wait(&self, run: u32, within: Duration) -> Result<Outcome, SkillFault> {
+    pub async fn wait(&self, run: u32, within: Duration) -> Result<RunOutcome, SkillFault> {
         let ended = async {
             let mut look = tokio::time::interval(PUBLISHING);
             look.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
@@ -303,7 +305,11 @@ impl SkillHandle {
     }
 
     /// Returns the declared parameter of this name, and the value in its type.
-    fn taken(&self, name: &str, value: Value) -> Result<(&FoundParameter, Value), SkillFault> {
+    fn taken(
+        &self,
+        name: &str,
+        value: SkillValue,
+    ) -> Result<(&FoundParameter, SkillValue), SkillFault> {
         let wrong = |status: &str, text: String| SkillFault::Refused {
             status: status.to_owned(),
             text,
@@ -321,7 +327,7 @@ impl SkillHandle {
         Ok((declared, value))
     }
 
-    async fn write(&self, parameters: Vec<(String, Value)>) -> Result<(), SkillFault> {
+    async fn write(&self, parameters: Vec<(String, SkillValue)>) -> Result<(), SkillFault> {
         let mut writes = Vec::new();
         let mut names = Vec::new();
         for (name, value) in parameters {
@@ -355,17 +361,17 @@ impl SkillHandle {
     }
 
     /// Waits until the skill is neither Running nor Suspended.
-    async fn ended(&self) -> Result<State, SkillFault> {
+    async fn ended(&self) -> Result<ProgramMachineState, SkillFault> {
         let node = self
             .found
             .nodes
             .get("CurrentState/Id")
             .ok_or_else(|| self.unexpected("it has no state"))?;
-        let mut watch = self
-            .client
-            .subscribe(vec![Watch::Value(node.clone())], PUBLISHING, QUEUE);
+        let mut watch =
+            self.client
+                .subscribe(vec![MonitoredWatch::Value(node.clone())], PUBLISHING, QUEUE);
         let mut look = tokio::time::interval(LOOK);
-        let mut gone = Runs::lost(self);
+        let mut gone = RunnableSkill::lost(self);
         loop {
             let state = tokio::select! {
                 _ = look.tick() => self.state().await?.state,
@@ -379,10 +385,16 @@ impl SkillHandle {
                 },
                 why = &mut gone => return Err(SkillFault::Lost(why)),
             };
-            if matches!(state, State::Ready | State::Halted) {
+            if matches!(
+                state,
+                ProgramMachineState::Ready | ProgramMachineState::Halted
+            ) {
                 // A notification may be older than the run.
                 let now = self.state().await?.state;
-                if matches!(now, State::Ready | State::Halted) {
+                if matches!(
+                    now,
+                    ProgramMachineState::Ready | ProgramMachineState::Halted
+                ) {
                     return Ok(now);
                 }
             }
@@ -396,7 +408,7 @@ impl SkillHandle {
     }
 
     /// Waits for the end of a run that this client has started.
-    async fn end_of(&self, run: u32) -> Result<Outcome, SkillFault> {
+    async fn end_of(&self, run: u32) -> Result<RunOutcome, SkillFault> {
         loop {
             let state = self.ended().await?;
             if !self.asks_component() || run == 0 {
@@ -414,7 +426,10 @@ impl SkillHandle {
         loop {
             if !self.asks_component() {
                 let state = self.state().await?.state;
-                if !matches!(state, State::Ready | State::Halted) {
+                if !matches!(
+                    state,
+                    ProgramMachineState::Ready | ProgramMachineState::Halted
+                ) {
                     self.ended().await?;
                 }
                 return Ok(());
@@ -441,7 +456,11 @@ impl SkillHandle {
         }
     }
 
-    pub(super) async fn outcome(&self, run: u32, state: State) -> Result<Outcome, SkillFault> {
+    pub(super) async fn outcome(
+        &self,
+        run: u32,
+        state: ProgramMachineState,
+    ) -> Result<RunOutcome, SkillFault> {
         let paths = [
             "FinalResultData/Succeeded",
             "FinalResultData/Message",
@@ -464,7 +483,7 @@ impl SkillHandle {
         let succeeded = match succeeded {
             Some(Variant::Boolean(succeeded)) => succeeded,
             // Without a value, the run counts as failed if the skill needs a Reset.
-            _ => state == State::Ready,
+            _ => state == ProgramMachineState::Ready,
         };
         let unknown = match unknown {
             Some(Variant::Boolean(unknown)) => unknown,
@@ -478,7 +497,7 @@ impl SkillHandle {
         let results = results.filter_map(|(result, value)| {
             Some((result.name.clone(), result.shown(value.value.as_ref()?)?))
         });
-        Ok(Outcome {
+        Ok(RunOutcome {
             run,
             succeeded,
             unknown,
@@ -527,7 +546,7 @@ impl SkillHandle {
 }
 
 #[async_trait]
-impl Runs for SkillHandle {
+impl RunnableSkill for SkillHandle {
     fn grip_point(&self) -> Option<GripPoint> {
         self.found.grip_point
     }
@@ -538,16 +557,16 @@ impl Runs for SkillHandle {
 
     async fn run(
         &self,
-        parameters: Vec<(String, Value)>,
+        parameters: Vec<(String, SkillValue)>,
         within: Duration,
-    ) -> Result<Outcome, SkillFault> {
+    ) -> Result<RunOutcome, SkillFault> {
         let run = self.execute(parameters, None).await?;
         let ended = tokio::time::timeout(within, self.end_of(run)).await;
         let Ok(ended) = ended else {
             self.halt().await?;
             let outcome = match self.asks_component() && run != 0 {
                 true => self.outcome_of(run).await.ok().flatten(),
-                false => self.outcome(run, State::Halted).await.ok(),
+                false => self.outcome(run, ProgramMachineState::Halted).await.ok(),
             };
             return match outcome {
                 Some(outcome) if outcome.unknown => Err(SkillFault::NotHalted(outcome.message)),
@@ -558,7 +577,7 @@ impl Runs for SkillHandle {
     }
 
     async fn halt(&self) -> Result<(), SkillFault> {
-        let Some(node) = self.found.nodes.get(Method::Halt.name()) else {
+        let Some(node) = self.found.nodes.get(ProgramMethod::Halt.name()) else {
             return Err(self.unexpected("it has no Halt"));
         };
         let halted = self
@@ -577,7 +596,11 @@ impl Runs for SkillHandle {
                 Ok(true) => Ok(()),
                 Ok(false) | Err(_) => Err(called(&error, &format!("Halt of {}", self.name()))),
             },
-            CallError::Refused { .. } if self.state().await?.state == State::Halted => Ok(()),
+            CallError::Refused { .. }
+                if self.state().await?.state == ProgramMachineState::Halted =>
+            {
+                Ok(())
+            }
             CallError::Client(ClientError::Lost(_))
             | CallError::Client(_)
             | CallError::Refused { .. } => Err(called(&error, &format!("Halt of {}", self.name()))),
@@ -601,8 +624,8 @@ fn why(link: Option<&Link>) -> String {
 }
 
 /// Returns the state that a variable holds: as a NodeId of namespace 0, as a name or as a number.
-pub(super) fn state_in(said: &Variant) -> Option<State> {
-    let mut all = State::ALL.into_iter();
+pub(super) fn state_in(said: &Variant) -> Option<ProgramMachineState> {
+    let mut all = ProgramMachineState::ALL.into_iter();
     if let Variant::NodeId(id) = said {
         let id = (id.namespace == 0).then(|| id.as_u32())??;
         return all.find(|state| state.node_id() == id);
@@ -617,7 +640,7 @@ pub(super) fn state_in(said: &Variant) -> Option<State> {
 
 fn number(value: &Variant) -> u32 {
     match from_variant(value) {
-        Some(Value::UInt32(number)) => number,
+        Some(SkillValue::UInt32(number)) => number,
         _ => 0,
     }
 }
@@ -629,7 +652,7 @@ fn text(value: &Variant) -> String {
     let value = from_variant(value);
     value
         .as_ref()
-        .and_then(Value::as_str)
+        .and_then(SkillValue::as_str)
         .unwrap_or_default()
         .to_owned()
 }

@@ -11,34 +11,34 @@ use std::fmt;
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
-use plant_opcua::client::{Notice, Sampled, Watch};
+use plant_opcua::client::{MonitoredWatch, Notice, Sampled};
 use plant_opcua::types::NodeId;
-use program::{Cause, Method, Rest, State, TRANSITIONS, Transition};
+use program::{ProgramMachineState, ProgramMethod, Rest, TRANSITIONS, Transition, TransitionCause};
 use tokio::sync::{mpsc, oneshot, watch};
 use tokio::task::JoinSet;
 
-use self::seen::{Part, Seen};
+use self::seen::{SeenSkill, SkillAspect};
 use super::find::{FoundParameter, FoundSkill};
 use super::handle::{STATE_PATHS, state_in};
 use super::packed::Packed;
 use super::{SkillClient, lost};
-use crate::parameters::Parameter;
+use crate::parameters::SkillParameter;
 use crate::runs::SkillFault;
-use crate::shown::{Observer, Outcome, Shown};
-use crate::skill::{Facts, lock};
-use crate::value::Value;
+use crate::shown::{RunOutcome, SkillObserver, SkillSnapshot};
+use crate::skill::{SkillDescription, lock};
+use crate::value::SkillValue;
 
 /// A skill of another server. Clones share the skill.
 #[derive(Clone)]
-pub struct Mirror {
-    facts: Arc<Facts>,
-    methods: Arc<[Method]>,
+pub struct MirroredSkill {
+    facts: Arc<SkillDescription>,
+    methods: Arc<[ProgramMethod]>,
     orders: mpsc::Sender<Order>,
-    shown: watch::Receiver<Arc<Shown>>,
-    outcomes: Arc<Mutex<VecDeque<Arc<Outcome>>>>,
+    shown: watch::Receiver<Arc<SkillSnapshot>>,
+    outcomes: Arc<Mutex<VecDeque<Arc<RunOutcome>>>>,
 }
 
-impl fmt::Debug for Mirror {
+impl fmt::Debug for MirroredSkill {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.debug_tuple("Mirror").field(&self.facts.name).finish()
     }
@@ -47,15 +47,15 @@ impl fmt::Debug for Mirror {
 /// A call that waits to be sent to the server.
 #[derive(Debug)]
 struct Order {
-    method: Method,
-    parameters: Vec<(String, Value)>,
+    method: ProgramMethod,
+    parameters: Vec<(String, SkillValue)>,
     reply: oneshot::Sender<Result<u32, SkillFault>>,
 }
 
 /// The skills of a server for the lifetime of a connection. Dropping them ends the reports.
 #[derive(Debug)]
 pub struct Mirrors {
-    skills: Vec<Mirror>,
+    skills: Vec<MirroredSkill>,
     gone: watch::Sender<Option<String>>,
     _tasks: JoinSet<()>,
 }
@@ -124,7 +124,7 @@ impl Mirrors {
     pub fn begin(
         of: &Watchable,
         first_run: u32,
-        mut observers: impl FnMut(usize, &Facts) -> Vec<Box<dyn Observer>>,
+        mut observers: impl FnMut(usize, &SkillDescription) -> Vec<Box<dyn SkillObserver>>,
     ) -> Self {
         let client = &of.client;
         let gone = watch::Sender::new(None);
@@ -134,13 +134,16 @@ impl Mirrors {
             let facts = Arc::new(found.facts());
             let (orders, ordered) = mpsc::channel(MOST_ORDERS);
             let (tell, notices) = mpsc::channel(MOST_NOTICES);
-            let parts = [(Part::Progress, "Progress"), (Part::Step, "SkillStep")];
+            let parts = [
+                (SkillAspect::Progress, "Progress"),
+                (SkillAspect::Step, "SkillStep"),
+            ];
             let parts = parts
                 .into_iter()
                 .filter_map(|(part, path)| Some((part, found.nodes.get(path)?.clone())));
-            let told = state.clone().map(|node| (Part::State, node));
+            let told = state.clone().map(|node| (SkillAspect::State, node));
             for (part, node) in parts.chain(told) {
-                watches.push(Watch::Sampled(Sampled {
+                watches.push(MonitoredWatch::Sampled(Sampled {
                     node,
                     interval: PUBLISHING,
                     queue: QUEUE,
@@ -150,14 +153,14 @@ impl Mirrors {
             }
             let outcomes = Arc::default();
             let observers = observers(at, &facts);
-            let (seen, shown) = Seen::new(
+            let (seen, shown) = SeenSkill::new(
                 client.handle(found),
                 observers,
                 Arc::clone(&outcomes),
                 first_run,
             );
             tasks.spawn(seen.run(notices, ordered, gone.subscribe()));
-            skills.push(Mirror {
+            skills.push(MirroredSkill {
                 facts,
                 methods: found.methods().into(),
                 orders,
@@ -186,7 +189,7 @@ impl Mirrors {
 
     /// Returns the skills in the order of the [`Watchable`].
     #[must_use]
-    pub fn skills(&self) -> &[Mirror] {
+    pub fn skills(&self) -> &[MirroredSkill] {
         &self.skills
     }
 
@@ -196,28 +199,28 @@ impl Mirrors {
     }
 }
 
-impl Mirror {
+impl MirroredSkill {
     /// Returns the description of the skill.
     #[must_use]
-    pub fn facts(&self) -> &Arc<Facts> {
+    pub fn facts(&self) -> &Arc<SkillDescription> {
         &self.facts
     }
 
     /// Returns the methods of the skill.
     #[must_use]
-    pub fn methods(&self) -> &[Method] {
+    pub fn methods(&self) -> &[ProgramMethod] {
         &self.methods
     }
 
     /// Returns the current state of the skill.
     #[must_use]
-    pub fn shown(&self) -> Arc<Shown> {
+    pub fn shown(&self) -> Arc<SkillSnapshot> {
         self.shown.borrow().clone()
     }
 
     /// Returns the outcome of a run, if it is one of the newest observed runs.
     #[must_use]
-    pub fn outcome(&self, run: u32) -> Option<Arc<Outcome>> {
+    pub fn outcome(&self, run: u32) -> Option<Arc<RunOutcome>> {
         let outcomes = lock(&self.outcomes);
         outcomes.iter().find(|one| one.run == run).cloned()
     }
@@ -229,8 +232,8 @@ impl Mirror {
     /// A refusal by the state machine of OPC 10000-10 or by the server, or the loss of the server.
     pub async fn call(
         &self,
-        method: Method,
-        parameters: Vec<(String, Value)>,
+        method: ProgramMethod,
+        parameters: Vec<(String, SkillValue)>,
     ) -> Result<u32, SkillFault> {
         let (reply, answer) = oneshot::channel();
         let order = Order {
@@ -259,9 +262,9 @@ fn is_lost() -> SkillFault {
 impl FoundSkill {
     /// Returns the description of the skill, as far as its server provides it.
     #[must_use]
-    pub fn facts(&self) -> Facts {
+    pub fn facts(&self) -> SkillDescription {
         let declared = |of: &[FoundParameter]| of.iter().map(parameter).collect();
-        Facts {
+        SkillDescription {
             name: self.name.clone(),
             types: self.types.iter().map(|of| of.name.clone()).collect(),
             parameters: declared(&self.parameters),
@@ -274,9 +277,9 @@ impl FoundSkill {
 
     /// Returns the methods of a Program that the skill has.
     #[must_use]
-    pub fn methods(&self) -> Vec<Method> {
-        let has = |method: &Method| self.nodes.get(method.name()).is_some();
-        Method::ALL.into_iter().filter(has).collect()
+    pub fn methods(&self) -> Vec<ProgramMethod> {
+        let has = |method: &ProgramMethod| self.nodes.get(method.name()).is_some();
+        ProgramMethod::ALL.into_iter().filter(has).collect()
     }
 
     /// Returns the reasons why the skill cannot be used fully.
@@ -331,8 +334,8 @@ async fn states(
     Ok(each.collect())
 }
 
-fn parameter(of: &FoundParameter) -> Parameter {
-    Parameter {
+fn parameter(of: &FoundParameter) -> SkillParameter {
+    SkillParameter {
         name: of.name.clone(),
         shape: of.shape,
         length: of.packed.and_then(Packed::length),
@@ -345,8 +348,8 @@ fn parameter(of: &FoundParameter) -> Parameter {
 
 /// Returns the shortest sequence of transitions from one state to another, for states that were not
 /// observed in between.
-fn way(from: State, to: State) -> Vec<&'static Transition> {
-    let mut ways: VecDeque<(State, Vec<&'static Transition>)> =
+fn way(from: ProgramMachineState, to: ProgramMachineState) -> Vec<&'static Transition> {
+    let mut ways: VecDeque<(ProgramMachineState, Vec<&'static Transition>)> =
         VecDeque::from([(from, Vec::new())]);
     let mut known = vec![from];
     while let Some((at, way)) = ways.pop_front() {
@@ -365,12 +368,14 @@ fn way(from: State, to: State) -> Vec<&'static Transition> {
 }
 
 /// Returns the state to which a method leads from a state, if the method is possible there.
-fn leads_to(from: State, method: Method) -> Option<State> {
+fn leads_to(from: ProgramMachineState, method: ProgramMethod) -> Option<ProgramMachineState> {
     let mut transitions = TRANSITIONS.iter();
     let found = transitions.find(|one| {
         let by_method = match one.cause {
-            Cause::Method(cause) | Cause::MethodOrWork(cause) => cause == method,
-            Cause::Work => false,
+            TransitionCause::Method(cause) | TransitionCause::MethodOrWork(cause) => {
+                cause == method
+            }
+            TransitionCause::Work => false,
         };
         by_method && one.from == from
     });
@@ -396,17 +401,20 @@ mod tests {
     fn what_was_not_seen_between_two_states_is_the_shortest_way() {
         let names = |from, to| -> Vec<&str> { way(from, to).iter().map(|one| one.name).collect() };
         assert_eq!(
-            names(State::Halted, State::Running),
+            names(ProgramMachineState::Halted, ProgramMachineState::Running),
             ["HaltedToReady", "ReadyToRunning"]
         );
         assert_eq!(
-            names(State::Ready, State::Suspended),
+            names(ProgramMachineState::Ready, ProgramMachineState::Suspended),
             ["ReadyToRunning", "RunningToSuspended"]
         );
-        assert_eq!(names(State::Suspended, State::Ready), ["SuspendedToReady"]);
-        assert!(names(State::Ready, State::Ready).is_empty());
-        for from in State::ALL {
-            for to in State::ALL {
+        assert_eq!(
+            names(ProgramMachineState::Suspended, ProgramMachineState::Ready),
+            ["SuspendedToReady"]
+        );
+        assert!(names(ProgramMachineState::Ready, ProgramMachineState::Ready).is_empty());
+        for from in ProgramMachineState::ALL {
+            for to in ProgramMachineState::ALL {
                 let way = way(from, to);
                 let ends = way.last().map_or(from, |last| last.to);
                 assert_eq!(ends, to, "{from} {to}");
@@ -416,10 +424,13 @@ mod tests {
 
     #[test]
     fn eight_of_twenty_calls_lead_somewhere() {
-        let all = State::ALL
+        let all = ProgramMachineState::ALL
             .into_iter()
-            .flat_map(|state| Method::ALL.map(|method| leads_to(state, method)));
+            .flat_map(|state| ProgramMethod::ALL.map(|method| leads_to(state, method)));
         assert_eq!(all.flatten().count(), 8);
-        assert_eq!(leads_to(State::Suspended, Method::Start), None);
+        assert_eq!(
+            leads_to(ProgramMachineState::Suspended, ProgramMethod::Start),
+            None
+        );
     }
 }

@@ -7,7 +7,7 @@ use plant_opcua::types::{
     ThreeDOrientation, ThreeDVector, Variant, VariantScalarTypeId,
 };
 
-use crate::value::{Builtin, Value};
+use crate::value::{Builtin, SkillValue};
 
 /// The structure that holds the numbers of a variable.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -33,7 +33,7 @@ enum What {
 }
 
 /// Returns the six numbers of a frame (3DFrame), or `None` for other values.
-pub(crate) fn frame(value: &Variant) -> Option<Value> {
+pub(crate) fn frame(value: &Variant) -> Option<SkillValue> {
     let frame = Packed {
         what: What::Frame,
         many: false,
@@ -69,7 +69,7 @@ impl Packed {
     }
 
     /// Returns the numbers of a value; `None` if the value has another type.
-    pub(super) fn unpack(self, shown: &Variant) -> Option<Value> {
+    pub(super) fn unpack(self, shown: &Variant) -> Option<SkillValue> {
         let mut numbers = Vec::new();
         let mut take = |one: &Variant| {
             let Variant::ExtensionObject(object) = one else {
@@ -82,15 +82,15 @@ impl Packed {
             (true, Variant::Array(array)) => array.values.iter().try_for_each(&mut take)?,
             _ => take(shown)?,
         }
-        let numbers = numbers.into_iter().map(Value::Double);
-        Some(Value::Array(Builtin::Double, numbers.collect()))
+        let numbers = numbers.into_iter().map(SkillValue::Double);
+        Some(SkillValue::Array(Builtin::Double, numbers.collect()))
     }
 
     /// Returns the value to write to the variable.
     ///
     /// # Errors
     /// The expected number of numbers, as text for people.
-    pub(super) fn pack(self, value: &Value) -> Result<Variant, String> {
+    pub(super) fn pack(self, value: &SkillValue) -> Result<Variant, String> {
         let numbers = value.as_f64s().unwrap_or_default();
         let each = self.what.names().len();
         let fits = match self.many {
@@ -188,9 +188,9 @@ impl What {
 mod tests {
     use super::*;
 
-    fn doubles(numbers: &[f64]) -> Value {
-        let numbers = numbers.iter().copied().map(Value::Double);
-        Value::Array(Builtin::Double, numbers.collect())
+    fn doubles(numbers: &[f64]) -> SkillValue {
+        let numbers = numbers.iter().copied().map(SkillValue::Double);
+        SkillValue::Array(Builtin::Double, numbers.collect())
     }
 
     #[test]

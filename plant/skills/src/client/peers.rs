@@ -6,9 +6,9 @@ use plant_opcua::client::SecurityChoice;
 
 use super::remote::FOUND_WITHIN;
 use super::{ClientOptions, Detector, PartnerError, SkillClient};
-use crate::component::{Component, Partner, Security};
+use crate::component::{Component, ComponentSecurity, Partner};
 use crate::model::SKILL_TYPE;
-use crate::parameters::TypeName;
+use crate::parameters::ParameterType;
 use crate::runs::SkillFault;
 
 /// The identity with which the skills of a component connect to other components, and the index of
@@ -26,7 +26,7 @@ impl ClientOptions {
     /// A component that serves secured endpoints only connects to secured endpoints only.
     #[must_use]
     pub fn of_component(component: &Component, pki: Option<&Path>) -> Self {
-        let is_open = component.security.contains(&Security::None);
+        let is_open = component.security.contains(&ComponentSecurity::None);
         Self {
             // Servers refuse a session with another ApplicationUri than that of the certificate.
             application_uri: component.application_uri.clone(),
@@ -80,7 +80,7 @@ impl PeerAccess {
                 return Err(PartnerError::Undiscoverable { uri: uri.clone() });
             }
         };
-        let any = TypeName::own(SKILL_TYPE);
+        let any = ParameterType::own(SKILL_TYPE);
         let found = detector.one(&any, FOUND_WITHIN, |one| one.application_uri == *uri);
         match found.await {
             Ok(found) => Ok(found.endpoint),

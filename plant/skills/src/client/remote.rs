@@ -9,10 +9,10 @@ use super::choice::{Chosen, Needs, fitting_grasp};
 use super::{PartnerError, PeerAccess, SkillClient, SkillHandle};
 use crate::component::{Partner, Partners, World, WorldObject};
 use crate::composite::{Job, PickAndPlace};
-use crate::driver::{Driver, Results, Work};
+use crate::driver::{Driver, RunResults, Work};
 use crate::driver_error::{DriverError, InvalidParameter};
 use crate::frame::Frame;
-use crate::parameters::{Parameters, TypeName};
+use crate::parameters::{ParameterType, Parameters};
 use crate::runs::COMPOSITE_HALT_TIMEOUT;
 
 /// The driver of PickAndPlaceSkillType that runs the skills of a robot and a gripper on separate
@@ -80,7 +80,7 @@ impl Driver for Remote {
         moves.into_iter().chain(grips).collect()
     }
 
-    async fn run(&self, work: Work) -> Result<Results, DriverError> {
+    async fn run(&self, work: Work) -> Result<RunResults, DriverError> {
         let found = tokio::select! {
             found = self.find(&work) => found?,
             () = work.stopped() => return Err(DriverError::Stopped),
@@ -196,7 +196,7 @@ impl Remote {
         gripper: &SkillClient,
         found: &Found,
         work: &Work,
-    ) -> Result<Results, DriverError> {
+    ) -> Result<RunResults, DriverError> {
         let (grasp, unfit) = fitting_grasp(gripper, found.job.shape.as_ref()).await?;
         for unfit in unfit {
             work.note(unfit.to_string()).await;
@@ -254,7 +254,7 @@ fn named(parameters: &Parameters, name: &str) -> Result<Option<Partner>, Invalid
 /// Returns the first skill of a type.
 async fn one(client: &SkillClient, of: &str) -> Result<SkillHandle, PartnerError> {
     let found = client
-        .skills_of(&TypeName::own(of))
+        .skills_of(&ParameterType::own(of))
         .await
         .map_err(|fault| PartnerError::Component {
             endpoint: client.endpoint().to_owned(),

@@ -6,14 +6,14 @@ use std::time::Duration;
 
 use plant_opcua::certificates;
 use plant_opcua::pki::Pki;
-use plant_opcua::users::{Role, Roles, User, Users, hashed};
+use plant_opcua::users::{Roles, StoredUser, UserRole, Users, hashed};
 
 use super::{PeerAccess, Remote};
 use crate::component::{Component, DriverSetup};
 use crate::conformance;
 use crate::server::{ComponentServer, ServeSettings};
-use crate::shown::Outcome;
-use crate::value::Value;
+use crate::shown::RunOutcome;
+use crate::value::SkillValue;
 
 const ROBOT: &str = include_str!("../../../../examples/plant/robot.yaml");
 const GRIPPER: &str = include_str!("../../../../examples/plant/parallel-gripper.yaml");
@@ -51,8 +51,8 @@ impl Secured {
     /// Adds a user that may run the skills of a component.
     fn add_operator(&self, name: &str, user: &str) {
         let mut users = Users::default();
-        let operator = User {
-            roles: Roles::of(&[Role::Operator]),
+        let operator = StoredUser {
+            roles: Roles::of(&[UserRole::Operator]),
             credential: hashed(PASSWORD.as_bytes()).unwrap(),
         };
         users.put(user, operator).unwrap();
@@ -72,7 +72,7 @@ impl Secured {
     }
 
     /// Runs PickAndPlace of a composite with these partners.
-    async fn run(&self, partners: &str, user: &str) -> Outcome {
+    async fn run(&self, partners: &str, user: &str) -> RunOutcome {
         std::fs::write(self.folder.join("password"), PASSWORD).unwrap();
         let text = format!(
             "component: handling\napplication_uri: urn:test:handling\nnamespace: 25\nsecurity: [Basic256Sha256]\n{user}\n\
@@ -86,7 +86,7 @@ impl Secured {
             panic!("another driver");
         };
         let driver = Arc::new(Remote::new(partners, Arc::default(), peers));
-        let pose = |y: f64| Value::from([0.4, y, 0.1, 0.0, 0.0, 0.0]);
+        let pose = |y: f64| SkillValue::from([0.4, y, 0.1, 0.0, 0.0, 0.0]);
         let parameters = vec![
             ("PickPosition".to_owned(), pose(0.2)),
             ("PlacePosition".to_owned(), pose(-0.2)),

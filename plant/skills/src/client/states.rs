@@ -2,8 +2,8 @@
 
 use std::time::Duration;
 
-use plant_opcua::client::{Notice, Subscription, Watch};
-use program::State;
+use plant_opcua::client::{ClientSubscription, MonitoredWatch, Notice};
+use program::ProgramMachineState;
 
 use super::SkillClient;
 use super::find::FoundSkill;
@@ -18,7 +18,7 @@ impl SkillClient {
         for (at, skill) in skills.iter().enumerate() {
             let mut paths = STATE_PATHS.iter();
             if let Some(node) = paths.find_map(|path| skill.nodes.get(path)) {
-                watches.push(Watch::Value(node.clone()));
+                watches.push(MonitoredWatch::Value(node.clone()));
                 of.push(at);
             }
         }
@@ -31,13 +31,13 @@ impl SkillClient {
 
 /// The states of skills, as the server publishes them.
 pub struct SkillStates {
-    subscription: Subscription,
+    subscription: ClientSubscription,
     of: Vec<usize>,
 }
 
 impl SkillStates {
     /// Returns the next state, with the position of its skill; `None` when the client is closed.
-    pub async fn next(&mut self) -> Option<(usize, State)> {
+    pub async fn next(&mut self) -> Option<(usize, ProgramMachineState)> {
         loop {
             let Notice::Value { watch, value } = self.subscription.next().await? else {
                 continue;

@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use plant_opcua::client::{Client, Notice, Select, Subscription, Watch};
+use plant_opcua::client::{ClientSubscription, MonitoredWatch, Notice, OpcUaClient, Select};
 use plant_opcua::types::{NodeId, ObjectId, ObjectTypeId, QualifiedName};
 
 use super::find::{self, FoundSkill};
@@ -11,7 +11,7 @@ use crate::runs::SkillFault;
 
 /// Reports that the components behind a station have changed.
 pub struct StationChanges {
-    events: Subscription,
+    events: ClientSubscription,
 }
 
 impl std::fmt::Debug for StationChanges {
@@ -23,7 +23,7 @@ impl std::fmt::Debug for StationChanges {
 impl StationChanges {
     /// Subscribes to the changes of a station; `None` for other servers. Changes after the return
     /// are reported.
-    pub(super) async fn of(client: &Client) -> Result<Option<Self>, SkillFault> {
+    pub(super) async fn of(client: &OpcUaClient) -> Result<Option<Self>, SkillFault> {
         let objects: NodeId = ObjectId::ObjectsFolder.into();
         let mut is_station = false;
         for folder in find::STATION_FOLDERS {
@@ -33,7 +33,7 @@ impl StationChanges {
         if !is_station {
             return Ok(None);
         }
-        let watch = Watch::Events {
+        let watch = MonitoredWatch::Events {
             node: ObjectId::Server.into(),
             select: vec![Select::new(ObjectTypeId::BaseEventType, "EventType")],
             of_type: Some(ObjectTypeId::BaseModelChangeEventType.into()),

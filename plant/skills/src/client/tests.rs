@@ -1,14 +1,14 @@
 use std::path::Path;
 use std::sync::Arc;
 
-use program::{Method, State};
+use program::{ProgramMachineState, ProgramMethod};
 
 use super::*;
 use crate::component::{Component, Partner, Partners};
 use crate::conformance;
-use crate::runs::Runs;
+use crate::runs::RunnableSkill;
 use crate::server::{ComponentServer, ServeSettings};
-use crate::value::{Builtin, Shape, Value};
+use crate::value::{Builtin, SkillValue, ValueShape};
 
 const EXAMPLES: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../../examples/plant");
 
@@ -33,8 +33,8 @@ async fn client(server: &ComponentServer) -> SkillClient {
     SkillClient::connect(server.url(), &patient).await.unwrap()
 }
 
-fn of(name: &str) -> TypeName {
-    TypeName::own(name)
+fn of(name: &str) -> ParameterType {
+    ParameterType::own(name)
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -66,12 +66,12 @@ async fn a_skill_of_another_maker_is_found_by_the_type_it_is_a_subtype_of_and_ru
             "nsu=urn:ua-bridge:skills;SkillType i=1000",
         ]
     );
-    let parameters: Vec<(&str, Shape, Option<&str>)> = grasp
+    let parameters: Vec<(&str, ValueShape, Option<&str>)> = grasp
         .parameters
         .iter()
         .map(|of| (of.name.as_str(), of.shape, of.unit.as_deref()))
         .collect();
-    let double = Shape::scalar(Builtin::Double);
+    let double = ValueShape::scalar(Builtin::Double);
     assert_eq!(parameters.len(), 2);
     assert!(
         parameters.contains(&("Force", double, Some("N")))
@@ -83,10 +83,13 @@ async fn a_skill_of_another_maker_is_found_by_the_type_it_is_a_subtype_of_and_ru
     );
 
     let handle = client.handle(grasp);
-    let given = vec![("Force".to_owned(), Value::from(7.0))];
+    let given = vec![("Force".to_owned(), SkillValue::from(7.0))];
     let outcome = handle.run(given, Duration::from_secs(10)).await.unwrap();
     assert_eq!((outcome.run, outcome.succeeded), (1, true));
-    assert_eq!(outcome.results, [("Gripped".to_owned(), Value::from(true))]);
+    assert_eq!(
+        outcome.results,
+        [("Gripped".to_owned(), SkillValue::from(true))]
+    );
     assert_eq!(
         server.skills()[0].shown().parameters.number("Force"),
         Some(7.0)
@@ -119,7 +122,7 @@ async fn a_lease_ends_with_its_session_and_a_refusal_has_its_code() {
         grasp(&first, &found),
         grasp(&second, &second.skills().await.unwrap()),
     );
-    mine.call(Method::Reset).await.unwrap();
+    mine.call(ProgramMethod::Reset).await.unwrap();
     let status = |fault: SkillFault| match &fault {
         SkillFault::Refused { status, .. } => status.clone(),
         SkillFault::Lost(_)
@@ -128,7 +131,7 @@ async fn a_lease_ends_with_its_session_and_a_refusal_has_its_code() {
         | SkillFault::Unexpected(_) => panic!("{fault}"),
     };
     assert_eq!(
-        status(theirs.call(Method::Start).await.unwrap_err()),
+        status(theirs.call(ProgramMethod::Start).await.unwrap_err()),
         "BadLocked"
     );
     let locked = theirs
@@ -137,7 +140,7 @@ async fn a_lease_ends_with_its_session_and_a_refusal_has_its_code() {
         .unwrap_err();
     assert_eq!(status(locked), "BadLocked");
     assert_eq!(
-        status(mine.call(Method::Resume).await.unwrap_err()),
+        status(mine.call(ProgramMethod::Resume).await.unwrap_err()),
         "BadInvalidState"
     );
     let weak = mine
@@ -150,7 +153,10 @@ async fn a_lease_ends_with_its_session_and_a_refusal_has_its_code() {
         .await
         .unwrap_err();
     assert_eq!(status(strange), "BadInvalidArgument");
-    assert_eq!(mine.state().await.unwrap().state, State::Ready);
+    assert_eq!(
+        mine.state().await.unwrap().state,
+        ProgramMachineState::Ready
+    );
     // The run continues after its session has closed, and its outcome is available to the next
     // session.
     mine.start(vec![("Force".to_owned(), 9.0.into())])
@@ -159,7 +165,7 @@ async fn a_lease_ends_with_its_session_and_a_refusal_has_its_code() {
     first.close().await;
     let taken = async {
         while theirs
-            .call(Method::Reset)
+            .call(ProgramMethod::Reset)
             .await
             .is_err_and(|fault| status(fault) == "BadLocked")
         {
@@ -261,7 +267,7 @@ const EARLIER: &str = r#"<?xml version="1.0" encoding="utf-8"?>
   </UAObjectType>
 </UANodeSet>"#;
 
-fn earlier_server() -> plant_opcua::server::Server {
+fn earlier_server() -> plant_opcua::server::OpcUaServer {
     use plant_opcua::server::{InstanceSpec, ServerBuilder, ServerConfig};
     use plant_opcua::types::{NodeId, ObjectId, ObjectTypeId, QualifiedName};
     let endpoint = "opc.tcp://127.0.0.1:0".parse().unwrap();
@@ -345,10 +351,13 @@ async fn a_run_begins_in_one_call_and_its_outcome_is_read_by_its_number_by_anybo
         | SkillFault::Unexpected(_) => panic!("{fault}"),
     };
     // A refused call leaves a Halted skill Halted.
-    let force = |force: f64| vec![("Force".to_owned(), Value::from(force))];
+    let force = |force: f64| vec![("Force".to_owned(), SkillValue::from(force))];
     let strong = mine.execute(force(1e9), None).await.unwrap_err();
     assert_eq!(code(strong), "BadInvalidArgument");
-    assert_eq!(mine.state().await.unwrap().state, State::Halted);
+    assert_eq!(
+        mine.state().await.unwrap().state,
+        ProgramMachineState::Halted
+    );
     let unknown = theirs.outcome_of(1).await.unwrap_err();
     assert_eq!(code(unknown), "BadNotFound");
 
@@ -360,7 +369,10 @@ async fn a_run_begins_in_one_call_and_its_outcome_is_read_by_its_number_by_anybo
     first.close().await;
     let outcome = theirs.wait(1, Duration::from_secs(5)).await.unwrap();
     assert_eq!((outcome.run, outcome.succeeded), (1, true));
-    assert_eq!(outcome.results, [("Gripped".to_owned(), Value::from(true))]);
+    assert_eq!(
+        outcome.results,
+        [("Gripped".to_owned(), SkillValue::from(true))]
+    );
     assert_eq!(outcome.trace.len(), 1);
     assert!(outcome.trace[0].ends_with(" Close"), "{:?}", outcome.trace);
     let taken = async {
@@ -405,11 +417,11 @@ async fn a_composite_runs_the_skills_of_two_servers_and_gives_their_leases_back(
     let parameters = vec![
         (
             "PickPosition".to_owned(),
-            Value::from([0.4, 0.2, 0.1, 0.0, 0.0, 0.0]),
+            SkillValue::from([0.4, 0.2, 0.1, 0.0, 0.0, 0.0]),
         ),
         (
             "PlacePosition".to_owned(),
-            Value::from([0.4, -0.2, 0.1, 0.0, 0.0, 0.0]),
+            SkillValue::from([0.4, -0.2, 0.1, 0.0, 0.0, 0.0]),
         ),
     ];
     let detector = Detector::new(ClientOptions::default());

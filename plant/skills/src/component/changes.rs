@@ -3,11 +3,11 @@
 use std::fmt;
 
 use super::Component;
-use crate::yaml::{Kind, Node, parse};
+use crate::yaml::{DocumentKind, DocumentNode, parse};
 
 /// A change of the YAML of a component.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Change {
+pub struct YamlChange {
     /// The path of the changed part, as `skills.Grasp.driver`.
     pub path: String,
     /// The kind of change.
@@ -38,7 +38,7 @@ pub enum Takes {
     Operator,
 }
 
-impl fmt::Display for Change {
+impl fmt::Display for YamlChange {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let kind = match self.kind {
             ChangeKind::Added => "added",
@@ -57,7 +57,7 @@ impl fmt::Display for Change {
 impl Component {
     /// Returns the changes between two versions of the YAML, which both are read without findings.
     #[must_use]
-    pub fn changes(before: &str, after: &str) -> Vec<Change> {
+    pub fn changes(before: &str, after: &str) -> Vec<YamlChange> {
         let (Ok(before), Ok(after)) = (parse(before), parse(after)) else {
             return Vec::new();
         };
@@ -67,13 +67,13 @@ impl Component {
             match key.as_str() {
                 "skills" => skills(was, is, &mut changes),
                 "values" | "configurable" => {
-                    changes.extend(entries(&key, was, is).map(|(path, kind)| Change {
+                    changes.extend(entries(&key, was, is).map(|(path, kind)| YamlChange {
                         path,
                         kind,
                         takes: Takes::Restart,
                     }));
                 }
-                _ => changes.push(Change {
+                _ => changes.push(YamlChange {
                     takes: takes(&key),
                     path: key,
                     kind,
@@ -96,9 +96,12 @@ fn takes(key: &str) -> Takes {
 }
 
 /// Returns the keys of two maps whose values differ.
-fn compared(before: Option<&Node>, after: Option<&Node>) -> Vec<(String, ChangeKind)> {
-    let keys = |node: Option<&Node>| -> Vec<String> {
-        let Some(Kind::Map(pairs)) = node.map(|node| &node.kind) else {
+fn compared(
+    before: Option<&DocumentNode>,
+    after: Option<&DocumentNode>,
+) -> Vec<(String, ChangeKind)> {
+    let keys = |node: Option<&DocumentNode>| -> Vec<String> {
+        let Some(DocumentKind::Map(pairs)) = node.map(|node| &node.kind) else {
             return Vec::new();
         };
         let keys = pairs.iter().filter_map(|(key, _)| key.text());
@@ -108,14 +111,14 @@ fn compared(before: Option<&Node>, after: Option<&Node>) -> Vec<(String, ChangeK
     let removed: Vec<String> = was.into_iter().filter(|key| !all.contains(key)).collect();
     all.extend(removed);
     let differing = all.into_iter().filter_map(|key| {
-        let value = |node: Option<&Node>| node.and_then(|node| node.get(&key)).cloned();
+        let value = |node: Option<&DocumentNode>| node.and_then(|node| node.get(&key)).cloned();
         let kind = kind_of(value(before).as_ref(), value(after).as_ref())?;
         Some((key, kind))
     });
     differing.collect()
 }
 
-fn kind_of(before: Option<&Node>, after: Option<&Node>) -> Option<ChangeKind> {
+fn kind_of(before: Option<&DocumentNode>, after: Option<&DocumentNode>) -> Option<ChangeKind> {
     match (before, after) {
         (Some(before), Some(after)) if before.has_same_content(after) => None,
         (Some(_), Some(_)) => Some(ChangeKind::Changed),
@@ -127,12 +130,12 @@ fn kind_of(before: Option<&Node>, after: Option<&Node>) -> Option<ChangeKind> {
 
 /// Returns the entries of a list by their names, each with its number from 1. Entries without a
 /// name, such as `device: all`, have their number as name.
-fn named(list: Option<&Node>) -> Vec<(String, usize, &Node)> {
-    let Some(Kind::List(nodes)) = list.map(|list| &list.kind) else {
+fn named(list: Option<&DocumentNode>) -> Vec<(String, usize, &DocumentNode)> {
+    let Some(DocumentKind::List(nodes)) = list.map(|list| &list.kind) else {
         return Vec::new();
     };
     let named = (1..).zip(nodes).map(|(number, node)| {
-        let name = node.get("name").and_then(Node::text);
+        let name = node.get("name").and_then(DocumentNode::text);
         let name = name.map_or_else(|| number.to_string(), str::to_owned);
         (name, number, node)
     });
@@ -143,8 +146,8 @@ fn named(list: Option<&Node>) -> Vec<(String, usize, &Node)> {
 /// identifiers follow its number.
 fn entries(
     list: &str,
-    before: Option<&Node>,
-    after: Option<&Node>,
+    before: Option<&DocumentNode>,
+    after: Option<&DocumentNode>,
 ) -> impl Iterator<Item = (String, ChangeKind)> {
     let (was, is) = (named(before), named(after));
     let mut changes = Vec::new();
@@ -163,16 +166,20 @@ fn entries(
     changes.into_iter()
 }
 
-fn skills(before: Option<&Node>, after: Option<&Node>, changes: &mut Vec<Change>) {
+fn skills(
+    before: Option<&DocumentNode>,
+    after: Option<&DocumentNode>,
+    changes: &mut Vec<YamlChange>,
+) {
     let (was, is) = (named(before), named(after));
     for (path, kind) in entries("skills", before, after) {
         let name = path.strip_prefix("skills.").unwrap_or(&path);
-        let find = |all: &[(String, usize, &Node)]| {
+        let find = |all: &[(String, usize, &DocumentNode)]| {
             let found = all.iter().find(|(known, ..)| known == name);
-            found.map(|(_, number, node)| (*number, Node::clone(node)))
+            found.map(|(_, number, node)| (*number, DocumentNode::clone(node)))
         };
         let (Some((at, was)), Some((number, is))) = (find(&was), find(&is)) else {
-            changes.push(Change {
+            changes.push(YamlChange {
                 path,
                 kind,
                 takes: Takes::Restart,
@@ -180,7 +187,7 @@ fn skills(before: Option<&Node>, after: Option<&Node>, changes: &mut Vec<Change>
             continue;
         };
         if at != number {
-            changes.push(Change {
+            changes.push(YamlChange {
                 path: format!("{path}.number"),
                 kind,
                 takes: Takes::Restart,
@@ -199,7 +206,7 @@ fn skills(before: Option<&Node>, after: Option<&Node>, changes: &mut Vec<Change>
                 "timeout" => Takes::NextRun,
                 _ => Takes::Restart,
             };
-            changes.push(Change {
+            changes.push(YamlChange {
                 path: format!("{path}.{key}"),
                 kind,
                 takes,
@@ -246,7 +253,7 @@ mod tests {
     #[test]
     fn values_without_a_name_are_compared_by_their_numbers() {
         let before = "values:\n  - {device: Force}\n  - {device: Speed}\n";
-        assert_eq!(Component::changes(before, before), Vec::<Change>::new());
+        assert_eq!(Component::changes(before, before), Vec::<YamlChange>::new());
         let after = before.replace("Speed", "Current");
         let paths = Component::changes(before, &after);
         let paths: Vec<String> = paths.into_iter().map(|change| change.path).collect();

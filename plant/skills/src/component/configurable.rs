@@ -9,23 +9,25 @@ use super::values::{
     LONGEST_ABOUT, LONGEST_UNIT, check_range, read_line, read_range, read_shape_name,
 };
 use super::{SkillSetup, ValueSetup};
-use crate::configuration::{Configurable, Effect};
+use crate::configuration::{Configurable, FieldEffect};
 use crate::parameters::shortened;
-use crate::value::{Builtin, Shape, Value};
+use crate::value::{Builtin, SkillValue, ValueShape};
 use crate::values::ValueFacts;
-use crate::yaml::{Code, Kind, Node, Reader};
+use crate::yaml::{DocumentKind, DocumentNode, YamlFindingCode, YamlReader};
 
 /// Reads the list `configurable`.
 pub(super) fn read_configurable(
-    node: &Node,
+    node: &DocumentNode,
     known: (&[SkillSetup], &[ValueSetup]),
-    reader: &mut Reader<'_>,
+    reader: &mut YamlReader<'_>,
 ) -> Vec<Configurable> {
     let mut fields: Vec<Configurable> = Vec::new();
     let nodes = reader.list(node);
     if nodes.len() > MOST_FIELDS {
         let message = format!("a component has at most {MOST_FIELDS} configurable fields");
-        reader.findings().error(Code::TooMany, node.place, message);
+        reader
+            .findings()
+            .error(YamlFindingCode::TooMany, node.place, message);
     }
     for node in nodes.iter().take(MOST_FIELDS) {
         let Some(field) = read_field(node, known, reader) else {
@@ -38,7 +40,7 @@ pub(super) fn read_configurable(
             let message = format!("there is a field `{}` already", field.facts.name);
             reader
                 .findings()
-                .error(Code::NameTwice, node.place, message);
+                .error(YamlFindingCode::NameTwice, node.place, message);
         }
         fields.push(field);
     }
@@ -51,9 +53,9 @@ pub(super) const KEYS: [&str; 10] = [
 ];
 
 fn read_field(
-    node: &Node,
+    node: &DocumentNode,
     known: (&[SkillSetup], &[ValueSetup]),
-    reader: &mut Reader<'_>,
+    reader: &mut YamlReader<'_>,
 ) -> Option<Configurable> {
     let [
         name,
@@ -79,12 +81,12 @@ fn read_field(
     let effect = effect?;
     let (shape, unit, range) = match &effect {
         // Milliseconds, in the range of the periods in the YAML.
-        Effect::Period(_) => (
+        FieldEffect::Period(_) => (
             Some(DOUBLE),
             Some("ms".to_owned()),
             whole(range)?.or(Some((10.0, 3_600_000.0))),
         ),
-        Effect::Limits(_) | Effect::Sets(_) | Effect::Data => {
+        FieldEffect::Limits(_) | FieldEffect::Sets(_) | FieldEffect::Data => {
             (whole(shape)?, whole(unit)?, whole(range)?)
         }
     };
@@ -97,9 +99,9 @@ fn read_field(
     };
     check_range(&facts, node.place, reader);
     let is_number = !matches!(facts.shape.builtin, Builtin::Boolean | Builtin::String);
-    if matches!(effect, Effect::Limits(_)) && (!is_number || facts.shape.array) {
+    if matches!(effect, FieldEffect::Limits(_)) && (!is_number || facts.shape.array) {
         let message = "a limit is a number".to_owned();
-        return reader.refuse(node, Code::WrongValue, message);
+        return reader.refuse(node, YamlFindingCode::WrongValue, message);
     }
     let mut field = Configurable {
         facts: Arc::new(facts),
@@ -115,42 +117,42 @@ fn read_field(
 }
 
 fn read_effect(
-    node: &Node,
-    effects: [Option<&Node>; 3],
+    node: &DocumentNode,
+    effects: [Option<&DocumentNode>; 3],
     values: &[ValueSetup],
-    reader: &mut Reader<'_>,
-) -> Option<Effect> {
-    let mut parameter = |node: &Node| {
+    reader: &mut YamlReader<'_>,
+) -> Option<FieldEffect> {
+    let mut parameter = |node: &DocumentNode| {
         reader
             .text(node, "the name of a parameter")
             .map(str::to_owned)
     };
     match effects {
-        [None, None, None] => Some(Effect::Data),
-        [Some(node), None, None] => parameter(node).map(Effect::Limits),
-        [None, Some(node), None] => parameter(node).map(Effect::Sets),
+        [None, None, None] => Some(FieldEffect::Data),
+        [Some(node), None, None] => parameter(node).map(FieldEffect::Limits),
+        [None, Some(node), None] => parameter(node).map(FieldEffect::Sets),
         [None, None, Some(node)] => {
             let text = reader.text(node, "the name of a value, or `all`")?;
             if text == "all" {
-                return Some(Effect::Period(None));
+                return Some(FieldEffect::Period(None));
             }
             if values.iter().any(|value| value.facts.name == text) {
-                return Some(Effect::Period(Some(text.to_owned())));
+                return Some(FieldEffect::Period(Some(text.to_owned())));
             }
             let message = format!("the component has no value `{}`", shortened(text));
-            reader.refuse(node, Code::WrongValue, message)
+            reader.refuse(node, YamlFindingCode::WrongValue, message)
         }
         _ => {
             let message = "a field has one effect: `limits`, `sets` or `period`".to_owned();
-            reader.refuse(node, Code::WrongValue, message)
+            reader.refuse(node, YamlFindingCode::WrongValue, message)
         }
     }
 }
 
 fn read_skill_names(
-    node: Option<&Node>,
+    node: Option<&DocumentNode>,
     known: &[SkillSetup],
-    reader: &mut Reader<'_>,
+    reader: &mut YamlReader<'_>,
 ) -> Option<Vec<String>> {
     let Some(node) = node else {
         return Some(Vec::new());
@@ -160,37 +162,43 @@ fn read_skill_names(
         let text = reader.text(node, "the name of a skill")?;
         if !known.iter().any(|skill| skill.name == text) {
             let message = format!("the component has no skill `{}`", shortened(text));
-            return reader.refuse(node, Code::WrongValue, message);
+            return reader.refuse(node, YamlFindingCode::WrongValue, message);
         }
         names.push(text.to_owned());
     }
     Some(names)
 }
 
-fn read_default(node: &Node, field: &Configurable, reader: &mut Reader<'_>) -> Option<Value> {
+fn read_default(
+    node: &DocumentNode,
+    field: &Configurable,
+    reader: &mut YamlReader<'_>,
+) -> Option<SkillValue> {
     let shape = field.facts.shape;
-    let scalar = |node: &Node, reader: &mut Reader<'_>| {
+    let scalar = |node: &DocumentNode, reader: &mut YamlReader<'_>| {
         let text = reader.text(node, "a value")?;
         let is_text = shape.builtin == Builtin::String;
         let number = serde_json::from_str(text).ok().filter(|_| !is_text);
         Some(number.unwrap_or_else(|| Json::from(text)))
     };
     let json = match &node.kind {
-        Kind::List(nodes) => {
+        DocumentKind::List(nodes) => {
             let all: Option<Vec<Json>> = nodes.iter().map(|node| scalar(node, reader)).collect();
             Json::from(all?)
         }
-        Kind::Null | Kind::Scalar(_) | Kind::Map(_) => scalar(node, reader)?,
+        DocumentKind::Null | DocumentKind::Scalar(_) | DocumentKind::Map(_) => {
+            scalar(node, reader)?
+        }
     };
     let read = shape.read_json(&json).and_then(|value| field.take(value));
     match read {
         Ok(value) => Some(value),
-        Err(why) => reader.refuse(node, Code::WrongValue, why),
+        Err(why) => reader.refuse(node, YamlFindingCode::WrongValue, why),
     }
 }
 
 /// The default type.
-const DOUBLE: Shape = Shape::scalar(Builtin::Double);
+const DOUBLE: ValueShape = ValueShape::scalar(Builtin::Double);
 const MOST_FIELDS: usize = 100;
 
 #[cfg(test)]
@@ -216,13 +224,13 @@ mod tests {
              - {name: Usual, sets: Force}\n  - {name: Period, period: Runs}\n  - {name: Product, type: String, default: \"7\"}\n",
         )
         .unwrap();
-        let effects: Vec<&Effect> = fields.iter().map(|field| &field.effect).collect();
+        let effects: Vec<&FieldEffect> = fields.iter().map(|field| &field.effect).collect();
         let force = "Force".to_owned();
         let expected = [
-            &Effect::Limits(force.clone()),
-            &Effect::Sets(force),
-            &Effect::Period(Some("Runs".to_owned())),
-            &Effect::Data,
+            &FieldEffect::Limits(force.clone()),
+            &FieldEffect::Sets(force),
+            &FieldEffect::Period(Some("Runs".to_owned())),
+            &FieldEffect::Data,
         ];
         assert_eq!(effects, expected);
         assert_eq!(fields[0].default, Some(40.0.into()));

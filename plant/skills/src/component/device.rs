@@ -11,9 +11,11 @@ use tokio::sync::watch;
 use super::{DriverFault, SensorRead, SkillSetup};
 use crate::client::{PeerAccess, ToolState};
 use crate::driver::Driver;
-use crate::parameters::TypeName;
-use crate::values::{DeviceValue, LiveValue, Measured, Sensor, ValueFacts, watch as watch_sensor};
-use crate::yaml::{Code, Node, Reader};
+use crate::parameters::ParameterType;
+use crate::values::{
+    DeviceValue, LiveValue, Measured, ValueFacts, ValueSensor, watch as watch_sensor,
+};
+use crate::yaml::{DocumentNode, YamlFindingCode, YamlReader};
 
 /// A device. Its drivers share the connection to it.
 #[async_trait]
@@ -25,7 +27,7 @@ pub trait Device: Debug + Send + Sync {
     /// The device cannot do the work of that type.
     fn driver(
         &self,
-        types: &[TypeName],
+        types: &[ParameterType],
         peers: &PeerAccess,
     ) -> Result<Arc<dyn Driver>, DriverFault>;
 
@@ -54,7 +56,7 @@ pub trait Device: Debug + Send + Sync {
         &[]
     }
 
-    /// Measures the values of the device until an error occurs, as [`Sensor::measure`].
+    /// Measures the values of the device until an error occurs, as [`ValueSensor::measure`].
     async fn measure(&self, period: Duration, out: &Measured) -> String {
         let _unused = (period, out);
         std::future::pending().await
@@ -71,21 +73,31 @@ pub trait Device: Debug + Send + Sync {
 pub trait DeviceKinds {
     /// Reads the value of the key `device`. Returns `None` after an error, which is added to the
     /// findings. Paths in the value are relative to `folder`.
-    fn read(&self, node: &Node, folder: &Path, reader: &mut Reader<'_>) -> Option<Arc<dyn Device>>;
+    fn read(
+        &self,
+        node: &DocumentNode,
+        folder: &Path,
+        reader: &mut YamlReader<'_>,
+    ) -> Option<Arc<dyn Device>>;
 
     /// Reads the driver `http` of a skill. Returns `None` after an error, which is added to the
     /// findings.
-    fn http(&self, node: &Node, reader: &mut Reader<'_>) -> Option<Arc<dyn Driver>> {
+    fn http(&self, node: &DocumentNode, reader: &mut YamlReader<'_>) -> Option<Arc<dyn Driver>> {
         let message = "this program knows no `http`".to_owned();
-        reader.refuse(node, Code::Driver, message)
+        reader.refuse(node, YamlFindingCode::Driver, message)
     }
 
     /// Reads a source of values: the value of the key `kind` of an entry of `values`, which is
     /// `modbus`, `io_link` or `http`. Returns `None` after an error, which is added to the
     /// findings.
-    fn sensor(&self, kind: &str, node: &Node, reader: &mut Reader<'_>) -> Option<SensorRead> {
+    fn sensor(
+        &self,
+        kind: &str,
+        node: &DocumentNode,
+        reader: &mut YamlReader<'_>,
+    ) -> Option<SensorRead> {
         let message = format!("this program knows no `{kind}`");
-        reader.refuse(node, Code::Source, message)
+        reader.refuse(node, YamlFindingCode::Source, message)
     }
 }
 
@@ -94,7 +106,7 @@ pub trait DeviceKinds {
 pub(crate) struct DeviceSensor(pub(crate) Arc<dyn Device>);
 
 #[async_trait]
-impl Sensor for DeviceSensor {
+impl ValueSensor for DeviceSensor {
     async fn measure(&self, period: Duration, out: &Measured) -> String {
         self.0.measure(period, out).await
     }
@@ -111,12 +123,12 @@ pub struct NoDevices;
 impl DeviceKinds for NoDevices {
     fn read(
         &self,
-        node: &Node,
+        node: &DocumentNode,
         _folder: &Path,
-        reader: &mut Reader<'_>,
+        reader: &mut YamlReader<'_>,
     ) -> Option<Arc<dyn Device>> {
         let message = "this program knows no devices".to_owned();
-        reader.refuse(node, Code::Driver, message)
+        reader.refuse(node, YamlFindingCode::Driver, message)
     }
 }
 

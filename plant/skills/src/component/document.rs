@@ -7,18 +7,21 @@ use std::time::Duration;
 
 use plant_opcua::client::ClientUser;
 use plant_opcua::limits::ClientLimits;
-use plant_opcua::users::{Role, Roles};
+use plant_opcua::users::{Roles, UserRole};
 
 use super::configurable::read_configurable;
 use super::values::{Around, read_values};
 use super::world::{read_grip_point, read_numbers, read_workspace, read_world};
 use super::{
-    Asked, Component, DeviceKinds, DriverSetup, ExecWork, LEASE, Lds, MOST_SKILLS, NoDevices,
-    Partner, Partners, Robot, Security, Simulation, SkillSetup, ValueSetup, anonymous_by_default,
+    Component, ComponentSecurity, DeviceKinds, DriverSetup, ExecWork, LEASE, Lds, MOST_SKILLS,
+    NoDevices, Partner, Partners, RequestKind, Robot, Simulation, SkillSetup, ValueSetup,
+    anonymous_by_default,
 };
 use crate::configuration::Configurable;
-use crate::parameters::{TypeName, shortened};
-use crate::yaml::{Code, Findings, Kind, Node, Place, Reader, parse};
+use crate::parameters::{ParameterType, shortened};
+use crate::yaml::{
+    DocumentKind, DocumentNode, Findings, Place, YamlFindingCode, YamlReader, parse,
+};
 
 impl Component {
     /// The JSON schema of the YAML.
@@ -45,7 +48,7 @@ impl Component {
     ) -> Result<Self, Findings> {
         let mut findings = Findings::default();
         let read = match parse(text) {
-            Ok(root) => component(&root, folder, kinds, &mut Reader::new(&mut findings)),
+            Ok(root) => component(&root, folder, kinds, &mut YamlReader::new(&mut findings)),
             Err(finding) => {
                 findings.push(finding);
                 None
@@ -94,10 +97,10 @@ const SKILL_KEYS: [&str; 6] = [
 ];
 
 fn component(
-    root: &Node,
+    root: &DocumentNode,
     folder: &Path,
     kinds: &dyn DeviceKinds,
-    reader: &mut Reader<'_>,
+    reader: &mut YamlReader<'_>,
 ) -> Option<Component> {
     let [
         name,
@@ -126,16 +129,18 @@ fn component(
     let name = reader.needed(name, "component", root.place);
     let name = name.and_then(|node| read_name(node, reader));
     let uri = reader.needed(uri, "application_uri", root.place);
-    let uri = uri.and_then(|node| read_uri(node, Code::Uri, reader));
+    let uri = uri.and_then(|node| read_uri(node, YamlFindingCode::Uri, reader));
     let namespace = reader
         .needed(namespace, "namespace", root.place)
-        .and_then(|node| read_positive(node, Code::Namespace, reader));
+        .and_then(|node| read_positive(node, YamlFindingCode::Namespace, reader));
     let endpoint = match endpoint {
         Some(node) => read_endpoint(node, reader),
         None => Some(DEFAULT_ENDPOINT.to_owned()),
     };
-    let security =
-        security.map_or_else(|| vec![Security::None], |node| read_security(node, reader));
+    let security = security.map_or_else(
+        || vec![ComponentSecurity::None],
+        |node| read_security(node, reader),
+    );
     let nodesets = read_nodesets(nodesets, folder, reader);
     let lds = lds.map_or(Some(Lds::Local), |node| read_lds(node, reader));
     let open = open.map_or(Some(false), |node| reader.boolean(node));
@@ -191,10 +196,10 @@ struct Parts {
 }
 
 fn read_parts(
-    root: &Node,
-    [skills, values, configurable]: [Option<&Node>; 3],
+    root: &DocumentNode,
+    [skills, values, configurable]: [Option<&DocumentNode>; 3],
     around: &Around<'_>,
-    reader: &mut Reader<'_>,
+    reader: &mut YamlReader<'_>,
 ) -> Parts {
     let of_device = match (around.device, skills) {
         (Some(device), None) => device.skills(),
@@ -229,22 +234,26 @@ pub(super) fn whole<T>(read: Option<Option<T>>) -> Option<Option<T>> {
 }
 
 /// Reads the role of anonymous users.
-fn read_anonymous(node: &Node, reader: &mut Reader<'_>) -> Option<Option<Roles>> {
+fn read_anonymous(node: &DocumentNode, reader: &mut YamlReader<'_>) -> Option<Option<Roles>> {
     match reader.text(node, "off, observer or operator")? {
         "off" => Some(None),
-        "observer" => Some(Some(Roles::of(&[Role::Observer]))),
+        "observer" => Some(Some(Roles::of(&[UserRole::Observer]))),
         "operator" => Some(Some(anonymous_by_default())),
         other => {
             let found = shortened(other);
             let message = format!("expected off, observer or operator, found `{found}`");
-            reader.refuse(node, Code::WrongValue, message)
+            reader.refuse(node, YamlFindingCode::WrongValue, message)
         }
     }
 }
 
 /// Reads the user as which a component uses other components. The file does not contain the
 /// password: it names an environment variable or another file.
-pub fn read_user(node: &Node, folder: &Path, reader: &mut Reader<'_>) -> Option<ClientUser> {
+pub fn read_user(
+    node: &DocumentNode,
+    folder: &Path,
+    reader: &mut YamlReader<'_>,
+) -> Option<ClientUser> {
     let keys = ["name", "password", "password_file"];
     let [name, password, file] = reader.map(node, keys)?;
     let name = reader
@@ -256,7 +265,7 @@ pub fn read_user(node: &Node, folder: &Path, reader: &mut Reader<'_>) -> Option<
         (None, Some(node)) => read_password_file(node, folder, reader),
         (None, None) | (Some(_), Some(_)) => {
             let message = "a user has either `password` or `password_file`".to_owned();
-            reader.refuse(node, Code::WrongValue, message)
+            reader.refuse(node, YamlFindingCode::WrongValue, message)
         }
     };
     Some(ClientUser {
@@ -265,7 +274,7 @@ pub fn read_user(node: &Node, folder: &Path, reader: &mut Reader<'_>) -> Option<
     })
 }
 
-fn read_password(node: &Node, reader: &mut Reader<'_>) -> Option<String> {
+fn read_password(node: &DocumentNode, reader: &mut YamlReader<'_>) -> Option<String> {
     let text = reader.text(node, "the name of an environment variable, as ${PASSWORD}")?;
     let variable = text
         .strip_prefix("${")
@@ -275,7 +284,7 @@ fn read_password(node: &Node, reader: &mut Reader<'_>) -> Option<String> {
         let help = "name an environment variable, as password: \"${PASSWORD}\", or a file, as password_file";
         reader
             .findings()
-            .error_with(Code::WrongValue, node.place, message, help);
+            .error_with(YamlFindingCode::WrongValue, node.place, message, help);
         return None;
     };
     match std::env::var(variable) {
@@ -285,12 +294,16 @@ fn read_password(node: &Node, reader: &mut Reader<'_>) -> Option<String> {
                 "the environment variable {} is not set",
                 shortened(variable)
             );
-            reader.refuse(node, Code::WrongValue, message)
+            reader.refuse(node, YamlFindingCode::WrongValue, message)
         }
     }
 }
 
-fn read_password_file(node: &Node, folder: &Path, reader: &mut Reader<'_>) -> Option<String> {
+fn read_password_file(
+    node: &DocumentNode,
+    folder: &Path,
+    reader: &mut YamlReader<'_>,
+) -> Option<String> {
     let path = folder.join(reader.text(node, "the path of a file")?);
     let cannot = |why: &dyn std::fmt::Display| format!("cannot read {}: {why}", path.display());
     let read = std::fs::metadata(&path).and_then(|about| match about.len() {
@@ -299,15 +312,23 @@ fn read_password_file(node: &Node, folder: &Path, reader: &mut Reader<'_>) -> Op
     });
     let password = match read {
         Ok(text) => text.lines().next().unwrap_or_default().to_owned(),
-        Err(error) => return reader.refuse(node, Code::WrongValue, cannot(&error)),
+        Err(error) => return reader.refuse(node, YamlFindingCode::WrongValue, cannot(&error)),
     };
     match password.is_empty() {
-        true => reader.refuse(node, Code::WrongValue, cannot(&"its first line is empty")),
+        true => reader.refuse(
+            node,
+            YamlFindingCode::WrongValue,
+            cannot(&"its first line is empty"),
+        ),
         false => Some(password),
     }
 }
 
-fn read_nodesets(node: Option<&Node>, folder: &Path, reader: &mut Reader<'_>) -> Vec<PathBuf> {
+fn read_nodesets(
+    node: Option<&DocumentNode>,
+    folder: &Path,
+    reader: &mut YamlReader<'_>,
+) -> Vec<PathBuf> {
     let nodes = node.map(|node| reader.list(node)).unwrap_or_default();
     let paths = nodes
         .iter()
@@ -316,7 +337,7 @@ fn read_nodesets(node: Option<&Node>, folder: &Path, reader: &mut Reader<'_>) ->
 }
 
 /// The keys of `server.limits` of a mapping that bound clients.
-fn read_limits(node: Option<&Node>, reader: &mut Reader<'_>) -> Option<ClientLimits> {
+fn read_limits(node: Option<&DocumentNode>, reader: &mut YamlReader<'_>) -> Option<ClientLimits> {
     let Some(node) = node else {
         return Some(ClientLimits::default());
     };
@@ -328,14 +349,14 @@ fn read_limits(node: Option<&Node>, reader: &mut Reader<'_>) -> Option<ClientLim
     ];
     let mut is_whole = true;
     let given = reader.map(node, keys)?.map(|node| {
-        let number = read_positive(node?, Code::WrongValue, reader);
+        let number = read_positive(node?, YamlFindingCode::WrongValue, reader);
         is_whole &= number.is_some();
         number
     });
     is_whole.then(|| ClientLimits::given(given))
 }
 
-fn read_robot(node: &Node, reader: &mut Reader<'_>) -> Option<Robot> {
+fn read_robot(node: &DocumentNode, reader: &mut YamlReader<'_>) -> Option<Robot> {
     let keys = [
         "manufacturer",
         "model",
@@ -347,7 +368,7 @@ fn read_robot(node: &Node, reader: &mut Reader<'_>) -> Option<Robot> {
     let [manufacturer, model, code, number, category, axes] = reader.map(node, keys)?;
     let manufacturer = reader.needed(manufacturer, "manufacturer", node.place);
     let model = reader.needed(model, "model", node.place);
-    let mut line = |node: Option<&Node>| {
+    let mut line = |node: Option<&DocumentNode>| {
         let node = node?;
         let text = reader.text(node, "a line of text")?;
         if text.len() <= LONGEST_NAME && !text.chars().any(char::is_control) {
@@ -357,10 +378,10 @@ fn read_robot(node: &Node, reader: &mut Reader<'_>) -> Option<Robot> {
             "expected a line of at most {LONGEST_NAME} bytes, found `{}`",
             shortened(text)
         );
-        reader.refuse(node, Code::WrongValue, message)
+        reader.refuse(node, YamlFindingCode::WrongValue, message)
     };
     let (manufacturer, model) = (line(manufacturer), line(model));
-    let mut line_or_none = |node: Option<&Node>| match node {
+    let mut line_or_none = |node: Option<&DocumentNode>| match node {
         Some(_) => line(node),
         None => Some(String::new()),
     };
@@ -378,7 +399,7 @@ fn read_robot(node: &Node, reader: &mut Reader<'_>) -> Option<Robot> {
     })
 }
 
-fn read_axes(node: &Node, reader: &mut Reader<'_>) -> Option<usize> {
+fn read_axes(node: &DocumentNode, reader: &mut YamlReader<'_>) -> Option<usize> {
     let text = reader.text(node, "a number of axes")?;
     let axes = text
         .parse::<usize>()
@@ -387,11 +408,11 @@ fn read_axes(node: &Node, reader: &mut Reader<'_>) -> Option<usize> {
     axes.or_else(|| {
         let text = shortened(text);
         let message = format!("expected a number from 1 to {MOST_AXES}, found `{text}`");
-        reader.refuse(node, Code::WrongValue, message)
+        reader.refuse(node, YamlFindingCode::WrongValue, message)
     })
 }
 
-fn read_category(node: &Node, reader: &mut Reader<'_>) -> Option<i32> {
+fn read_category(node: &DocumentNode, reader: &mut YamlReader<'_>) -> Option<i32> {
     let text = reader.text(node, "the kind of a robot")?;
     let known = (0..).zip(CATEGORIES).find(|(_, name)| *name == text);
     known.map(|(value, _)| value).or_else(|| {
@@ -400,11 +421,11 @@ fn read_category(node: &Node, reader: &mut Reader<'_>) -> Option<i32> {
             CATEGORIES.join(", "),
             shortened(text)
         );
-        reader.refuse(node, Code::WrongValue, message)
+        reader.refuse(node, YamlFindingCode::WrongValue, message)
     })
 }
 
-fn read_lds(node: &Node, reader: &mut Reader<'_>) -> Option<Lds> {
+fn read_lds(node: &DocumentNode, reader: &mut YamlReader<'_>) -> Option<Lds> {
     match Lds::written(reader.text(node, "an endpoint, `embed` or `none`")?) {
         lds @ (Lds::Nowhere | Lds::Local | Lds::Embed(None)) => Some(lds),
         Lds::Embed(Some(url)) => {
@@ -414,7 +435,7 @@ fn read_lds(node: &Node, reader: &mut Reader<'_>) -> Option<Lds> {
     }
 }
 
-pub(super) fn read_name(node: &Node, reader: &mut Reader<'_>) -> Option<String> {
+pub(super) fn read_name(node: &DocumentNode, reader: &mut YamlReader<'_>) -> Option<String> {
     let text = reader.text(node, "a name")?;
     let fits = !text.is_empty()
         && text.len() <= LONGEST_NAME
@@ -428,11 +449,15 @@ pub(super) fn read_name(node: &Node, reader: &mut Reader<'_>) -> Option<String> 
     let help = "letters, digits, - and _, at most 64 of them";
     reader
         .findings()
-        .error_with(Code::Name, node.place, message, help);
+        .error_with(YamlFindingCode::Name, node.place, message, help);
     None
 }
 
-fn read_uri(node: &Node, code: Code, reader: &mut Reader<'_>) -> Option<String> {
+fn read_uri(
+    node: &DocumentNode,
+    code: YamlFindingCode,
+    reader: &mut YamlReader<'_>,
+) -> Option<String> {
     let text = reader.text(node, "a URI")?;
     let scheme = text.split_once(':').is_some_and(|(scheme, rest)| {
         !rest.is_empty()
@@ -457,7 +482,11 @@ fn is_of_scheme(b: u8) -> bool {
     b.is_ascii_alphanumeric() || matches!(b, b'+' | b'-' | b'.')
 }
 
-fn read_positive(node: &Node, code: Code, reader: &mut Reader<'_>) -> Option<u16> {
+fn read_positive(
+    node: &DocumentNode,
+    code: YamlFindingCode,
+    reader: &mut YamlReader<'_>,
+) -> Option<u16> {
     let text = reader.text(node, "a number")?;
     let number = text.parse().ok().filter(|number| *number > 0);
     number.or_else(|| {
@@ -469,12 +498,16 @@ fn read_positive(node: &Node, code: Code, reader: &mut Reader<'_>) -> Option<u16
     })
 }
 
-fn read_endpoint(node: &Node, reader: &mut Reader<'_>) -> Option<String> {
+fn read_endpoint(node: &DocumentNode, reader: &mut YamlReader<'_>) -> Option<String> {
     let text = reader.text(node, "an endpoint")?;
     checked_endpoint(text, node, reader)
 }
 
-fn checked_endpoint(text: &str, node: &Node, reader: &mut Reader<'_>) -> Option<String> {
+fn checked_endpoint(
+    text: &str,
+    node: &DocumentNode,
+    reader: &mut YamlReader<'_>,
+) -> Option<String> {
     match text.parse::<plant_opcua::server::EndpointUrl>() {
         Ok(_) => Some(text.to_owned()),
         Err(error) => {
@@ -482,25 +515,25 @@ fn checked_endpoint(text: &str, node: &Node, reader: &mut Reader<'_>) -> Option<
             let help = format!("for example {DEFAULT_ENDPOINT}, where 0 is any free port");
             reader
                 .findings()
-                .error_with(Code::Endpoint, node.place, message, help);
+                .error_with(YamlFindingCode::Endpoint, node.place, message, help);
             None
         }
     }
 }
 
-fn read_security(node: &Node, reader: &mut Reader<'_>) -> Vec<Security> {
+fn read_security(node: &DocumentNode, reader: &mut YamlReader<'_>) -> Vec<ComponentSecurity> {
     let nodes = reader.list(node);
-    let policies: Vec<Security> = nodes
+    let policies: Vec<ComponentSecurity> = nodes
         .iter()
         .filter_map(|node| match reader.text(node, "None or Basic256Sha256")? {
-            "None" => Some(Security::None),
-            "Basic256Sha256" => Some(Security::Basic256Sha256),
+            "None" => Some(ComponentSecurity::None),
+            "Basic256Sha256" => Some(ComponentSecurity::Basic256Sha256),
             other => {
                 let message = format!(
                     "expected None or Basic256Sha256, found `{}`",
                     shortened(other)
                 );
-                reader.refuse(node, Code::WrongValue, message)
+                reader.refuse(node, YamlFindingCode::WrongValue, message)
             }
         })
         .collect();
@@ -508,7 +541,7 @@ fn read_security(node: &Node, reader: &mut Reader<'_>) -> Vec<Security> {
         let message = "a server without any security policy serves nobody";
         reader
             .findings()
-            .error(Code::WrongValue, node.place, message);
+            .error(YamlFindingCode::WrongValue, node.place, message);
     }
     policies
 }
@@ -516,14 +549,20 @@ fn read_security(node: &Node, reader: &mut Reader<'_>) -> Vec<Security> {
 /// The folder of the document, and the kinds of devices.
 type Surroundings<'a> = (&'a Path, &'a dyn DeviceKinds);
 
-fn read_skills(node: &Node, around: Surroundings<'_>, reader: &mut Reader<'_>) -> Vec<SkillSetup> {
+fn read_skills(
+    node: &DocumentNode,
+    around: Surroundings<'_>,
+    reader: &mut YamlReader<'_>,
+) -> Vec<SkillSetup> {
     let nodes = reader.list(node);
     if nodes.is_empty() || nodes.len() > MOST_SKILLS {
         let message = format!(
             "a component has from 1 to {MOST_SKILLS} skills, and this one {}",
             nodes.len()
         );
-        reader.findings().error(Code::TooMany, node.place, message);
+        reader
+            .findings()
+            .error(YamlFindingCode::TooMany, node.place, message);
     }
     let mut skills: Vec<SkillSetup> = Vec::new();
     for node in nodes.iter().take(MOST_SKILLS) {
@@ -536,7 +575,9 @@ fn read_skills(node: &Node, around: Surroundings<'_>, reader: &mut Reader<'_>) -
             .any(|known| known.name.eq_ignore_ascii_case(&skill.name))
         {
             let message = format!("there is a skill `{}` already", skill.name);
-            reader.findings().error(Code::NameTwice, name_at, message);
+            reader
+                .findings()
+                .error(YamlFindingCode::NameTwice, name_at, message);
         }
         skills.push(skill);
     }
@@ -544,9 +585,9 @@ fn read_skills(node: &Node, around: Surroundings<'_>, reader: &mut Reader<'_>) -
 }
 
 fn read_skill(
-    node: &Node,
+    node: &DocumentNode,
     around: Surroundings<'_>,
-    reader: &mut Reader<'_>,
+    reader: &mut YamlReader<'_>,
 ) -> Option<(SkillSetup, Place)> {
     let [name, skill_type, driver, capabilities, timeout, grip_point] =
         reader.map(node, SKILL_KEYS)?;
@@ -565,7 +606,7 @@ fn read_skill(
         .map(|node| reader.list(node))
         .unwrap_or_default()
         .iter()
-        .filter_map(|node| read_uri(node, Code::Capability, reader))
+        .filter_map(|node| read_uri(node, YamlFindingCode::Capability, reader))
         .collect();
     let timeout = match timeout {
         Some(node) => Some(reader.duration(node)?),
@@ -584,26 +625,26 @@ fn read_skill(
     Some((skill, name_at))
 }
 
-fn read_type(node: &Node, reader: &mut Reader<'_>) -> Option<TypeName> {
+fn read_type(node: &DocumentNode, reader: &mut YamlReader<'_>) -> Option<ParameterType> {
     let text = reader.text(node, "a skill type")?;
     match text.parse() {
         Ok(name) => Some(name),
-        Err(error) => reader.refuse(node, Code::SkillType, error.to_string()),
+        Err(error) => reader.refuse(node, YamlFindingCode::SkillType, error.to_string()),
     }
 }
 
 fn read_driver(
-    node: &Node,
+    node: &DocumentNode,
     (folder, kinds): Surroundings<'_>,
-    reader: &mut Reader<'_>,
+    reader: &mut YamlReader<'_>,
 ) -> Option<DriverSetup> {
-    if matches!(&node.kind, Kind::Scalar(text) if text == "simulated") {
+    if matches!(&node.kind, DocumentKind::Scalar(text) if text == "simulated") {
         return Some(DriverSetup::Simulated(Simulation::default()));
     }
-    if matches!(&node.kind, Kind::Scalar(text) if text == "device") {
+    if matches!(&node.kind, DocumentKind::Scalar(text) if text == "device") {
         return Some(DriverSetup::Device);
     }
-    if matches!(&node.kind, Kind::Scalar(text) if text == "pick_and_place") {
+    if matches!(&node.kind, DocumentKind::Scalar(text) if text == "pick_and_place") {
         return Some(DriverSetup::PickAndPlace(Partners {
             robot: None,
             gripper: None,
@@ -620,7 +661,7 @@ fn read_driver(
         "exec",
         "http",
     ];
-    let space = |asked, node, reader: &mut Reader<'_>| {
+    let space = |asked, node, reader: &mut YamlReader<'_>| {
         let work = super::space::read(asked, node, reader);
         work.map(|work| DriverSetup::Space(Box::new(work)))
     };
@@ -631,8 +672,8 @@ fn read_driver(
         [None, Some(node), None, None, None, None] => {
             read_partners(node, reader).map(DriverSetup::PickAndPlace)
         }
-        [None, None, Some(node), None, None, None] => space(Asked::Call, node, reader),
-        [None, None, None, Some(node), None, None] => space(Asked::Action, node, reader),
+        [None, None, Some(node), None, None, None] => space(RequestKind::Call, node, reader),
+        [None, None, None, Some(node), None, None] => space(RequestKind::Action, node, reader),
         [None, None, None, None, Some(node), None] => {
             read_exec(node, folder, reader).map(|work| DriverSetup::Exec(Box::new(work)))
         }
@@ -641,13 +682,15 @@ fn read_driver(
         }
         _ => {
             let message = "a driver is exactly one of `simulated`, `device`, `pick_and_place`, `call`, `action`, `exec` and `http`";
-            reader.findings().error(Code::Driver, node.place, message);
+            reader
+                .findings()
+                .error(YamlFindingCode::Driver, node.place, message);
             None
         }
     }
 }
 
-fn read_exec(node: &Node, folder: &Path, reader: &mut Reader<'_>) -> Option<ExecWork> {
+fn read_exec(node: &DocumentNode, folder: &Path, reader: &mut YamlReader<'_>) -> Option<ExecWork> {
     let [command, stop, halt_timeout] = reader.map(node, ["command", "stop", "halt_timeout"])?;
     let command = reader
         .needed(command, "command", node.place)
@@ -668,7 +711,10 @@ fn read_exec(node: &Node, folder: &Path, reader: &mut Reader<'_>) -> Option<Exec
 }
 
 /// Reads a program and its arguments.
-pub(super) fn read_command(node: &Node, reader: &mut Reader<'_>) -> Option<Vec<String>> {
+pub(super) fn read_command(
+    node: &DocumentNode,
+    reader: &mut YamlReader<'_>,
+) -> Option<Vec<String>> {
     let nodes = reader.list(node);
     let words: Vec<String> = nodes
         .iter()
@@ -685,12 +731,12 @@ pub(super) fn read_command(node: &Node, reader: &mut Reader<'_>) -> Option<Vec<S
         Some(program) if !program.is_empty() => Some(words),
         _ => {
             let message = "a command is a list: the program, then its arguments".to_owned();
-            reader.refuse(node, Code::WrongValue, message)
+            reader.refuse(node, YamlFindingCode::WrongValue, message)
         }
     }
 }
 
-fn read_simulation(node: &Node, reader: &mut Reader<'_>) -> Option<Simulation> {
+fn read_simulation(node: &DocumentNode, reader: &mut YamlReader<'_>) -> Option<Simulation> {
     let keys = [
         "duration",
         "object",
@@ -710,13 +756,13 @@ fn read_simulation(node: &Node, reader: &mut Reader<'_>) -> Option<Simulation> {
     })
 }
 
-fn read_partners(node: &Node, reader: &mut Reader<'_>) -> Option<Partners> {
+fn read_partners(node: &DocumentNode, reader: &mut YamlReader<'_>) -> Option<Partners> {
     let [robot, gripper, plate, prefer, within] =
         reader.map(node, ["robot", "gripper", "plate", "prefer", "within"])?;
     let prefer = prefer.map(|node| reader.list(node)).unwrap_or_default();
     let prefer: Option<Vec<String>> = prefer
         .iter()
-        .map(|node| read_uri(node, Code::Uri, reader))
+        .map(|node| read_uri(node, YamlFindingCode::Uri, reader))
         .collect();
     let robot = robot.map(|node| read_partner(node, reader));
     let gripper = gripper.map(|node| read_partner(node, reader));
@@ -732,10 +778,10 @@ fn read_partners(node: &Node, reader: &mut Reader<'_>) -> Option<Partners> {
 }
 
 /// Reads an endpoint, or the ApplicationUri of a server that is discovered.
-pub fn read_partner(node: &Node, reader: &mut Reader<'_>) -> Option<Partner> {
-    let is_uri = matches!(&node.kind, Kind::Scalar(text) if text.starts_with("urn:"));
+pub fn read_partner(node: &DocumentNode, reader: &mut YamlReader<'_>) -> Option<Partner> {
+    let is_uri = matches!(&node.kind, DocumentKind::Scalar(text) if text.starts_with("urn:"));
     match is_uri {
-        true => read_uri(node, Code::Uri, reader).map(Partner::Called),
+        true => read_uri(node, YamlFindingCode::Uri, reader).map(Partner::Called),
         false => read_endpoint(node, reader).map(Partner::At),
     }
 }

@@ -7,11 +7,11 @@ use super::{Component, Device, DriverSetup, Simulation, World};
 use crate::client::{PeerAccess, Remote};
 use crate::driver::Driver;
 use crate::model::NAMESPACE;
-use crate::parameters::TypeName;
+use crate::parameters::ParameterType;
 use crate::simulated::{
-    Arm, ArmSettings, Base, Change, Changer, Gripper, GripperSettings, Hole, Path,
+    Arm, ArmSettings, Base, Changer, Gripper, GripperSettings, Hole, Path, ToolChange,
 };
-use crate::workspace::Workspace;
+use crate::workspace::RobotWorkspace;
 
 /// Creates the drivers of a component. Its skills share a gripper, a robot, a tool changer and a
 /// base.
@@ -24,7 +24,7 @@ pub struct Drivers {
     device: Option<Arc<dyn Device>>,
     peers: PeerAccess,
     world: World,
-    workspace: Option<Arc<Workspace>>,
+    workspace: Option<Arc<RobotWorkspace>>,
 }
 
 /// A driver that cannot do the work of a type.
@@ -64,7 +64,7 @@ impl Drivers {
     pub fn make(
         &mut self,
         setup: &DriverSetup,
-        types: &[TypeName],
+        types: &[ParameterType],
     ) -> Result<Arc<dyn Driver>, DriverFault> {
         let driver = self.make_unbounded(setup, types)?;
         Ok(match &self.workspace {
@@ -76,14 +76,17 @@ impl Drivers {
     fn make_unbounded(
         &mut self,
         setup: &DriverSetup,
-        types: &[TypeName],
+        types: &[ParameterType],
     ) -> Result<Arc<dyn Driver>, DriverFault> {
         let is = |name: &str| {
             types
                 .iter()
                 .any(|of| of.namespace == NAMESPACE && of.name == name)
         };
-        let own = types.first().map(TypeName::to_string).unwrap_or_default();
+        let own = types
+            .first()
+            .map(ParameterType::to_string)
+            .unwrap_or_default();
         match setup {
             DriverSetup::Given(driver) => Ok(Arc::clone(driver)),
             DriverSetup::Device => match &self.device {
@@ -131,9 +134,9 @@ impl Drivers {
             "ForceMoveSkillType" => self.arm(how).yields(),
             "LinearMoveSkillType" => self.arm(how).moves(Path::Linear),
             "JointPtpMoveSkillType" | "JointLinearMoveSkillType" => self.arm(how).turns(),
-            "AttachToolSkillType" => self.changer.driver(Change::Attach, takes),
-            "DetachToolSkillType" => self.changer.driver(Change::Detach, takes),
-            "ChangeToolSkillType" => self.changer.driver(Change::Change, takes),
+            "AttachToolSkillType" => self.changer.driver(ToolChange::Attach, takes),
+            "DetachToolSkillType" => self.changer.driver(ToolChange::Detach, takes),
+            "ChangeToolSkillType" => self.changer.driver(ToolChange::Change, takes),
             "NavigateToSkillType" => self.base.navigates(scale),
             _ => return None,
         })

@@ -7,13 +7,13 @@ use serde_json::Value as Json;
 
 use crate::frame::of_angles;
 use crate::parameters::{Parameters, shortened};
-use crate::yaml::{Code, Kind, Node, Reader};
+use crate::yaml::{DocumentKind, DocumentNode, YamlFindingCode, YamlReader};
 
 /// The work of a skill that another participant of the space does.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SpaceWork {
     /// The kind of request.
-    pub asked: Asked,
+    pub asked: RequestKind,
     /// The name of the call or action in the space, as `ua_2_2_70`.
     pub topic: String,
     /// Time limit for the response of a call, or for the acceptance of a goal.
@@ -23,17 +23,17 @@ pub struct SpaceWork {
     pub halt_timeout: Duration,
     /// The sources of the fields of the request or goal, by name. Other fields are set from the
     /// parameters of the same name.
-    pub request: Vec<(String, Source)>,
+    pub request: Vec<(String, SpaceFieldSource)>,
     /// The sources of results, by name. Other results are set from the fields of the response of
     /// the same name.
-    pub results: Vec<(String, Source)>,
+    pub results: Vec<(String, SpaceFieldSource)>,
     /// Fields of the response and the values that they have on success.
     pub succeeds: Vec<(String, String)>,
 }
 
 /// The kind of request that does the work.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Asked {
+pub enum RequestKind {
     /// A call, which ends with its response.
     Call,
     /// An action. Its goal has a result and can be cancelled.
@@ -42,13 +42,13 @@ pub enum Asked {
 
 /// The source of a field.
 #[derive(Debug, Clone, PartialEq)]
-pub enum Source {
+pub enum SpaceFieldSource {
     /// A constant value.
     Constant(Json),
     /// A parameter of the run.
-    Parameter(Part),
+    Parameter(ValuePart),
     /// A field of the response.
-    Field(Part),
+    Field(ValuePart),
     /// A list, as the elements of an array of messages.
     List(Vec<Self>),
     /// A message, by its fields.
@@ -57,7 +57,7 @@ pub enum Source {
 
 /// A value or a part of a value.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Part {
+pub struct ValuePart {
     /// The name of the parameter or field.
     pub name: String,
     /// The index of an array element, from 0; `None` for the whole value.
@@ -79,7 +79,7 @@ pub enum Form {
     Orientation(usize),
 }
 
-impl Part {
+impl ValuePart {
     fn of(&self, whole: Json) -> Result<Json, String> {
         let value = match self.at {
             None => whole,
@@ -111,7 +111,7 @@ impl Part {
     }
 }
 
-impl Source {
+impl SpaceFieldSource {
     /// Returns the value, from the parameters of a run and, after the response, from its fields.
     ///
     /// # Errors
@@ -147,10 +147,14 @@ impl Source {
 }
 
 /// Reads the value of the key `call` or `action`.
-pub(super) fn read(asked: Asked, node: &Node, reader: &mut Reader<'_>) -> Option<SpaceWork> {
+pub(super) fn read(
+    asked: RequestKind,
+    node: &DocumentNode,
+    reader: &mut YamlReader<'_>,
+) -> Option<SpaceWork> {
     let (topic, [within, halt_timeout, request, results, succeeds]) = match (&node.kind, asked) {
-        (Kind::Scalar(_), _) => (Some(node), [None; 5]),
-        (_, Asked::Call) => {
+        (DocumentKind::Scalar(_), _) => (Some(node), [None; 5]),
+        (_, RequestKind::Call) => {
             let keys = [
                 "name",
                 "within",
@@ -162,7 +166,7 @@ pub(super) fn read(asked: Asked, node: &Node, reader: &mut Reader<'_>) -> Option
             let [topic, rest @ ..] = reader.map(node, keys)?;
             (topic, rest)
         }
-        (_, Asked::Action) => {
+        (_, RequestKind::Action) => {
             let keys = [
                 "name",
                 "within",
@@ -200,7 +204,7 @@ pub(super) fn read(asked: Asked, node: &Node, reader: &mut Reader<'_>) -> Option
     })
 }
 
-pub(super) fn read_topic(node: &Node, reader: &mut Reader<'_>) -> Option<String> {
+pub(super) fn read_topic(node: &DocumentNode, reader: &mut YamlReader<'_>) -> Option<String> {
     let text = reader.text(node, "a name of the space")?;
     let number = |text: &str, low: u32, high: u32| {
         let plain = text == "0" || !text.starts_with('0');
@@ -228,20 +232,20 @@ pub(super) fn read_topic(node: &Node, reader: &mut Reader<'_>) -> Option<String>
     let help = "ua_<space>_<namespace>_<identifier>, as ua_2_2_70";
     reader
         .findings()
-        .error_with(Code::Driver, node.place, message, help);
+        .error_with(YamlFindingCode::Driver, node.place, message, help);
     None
 }
 
 /// Reads the entries of a map with arbitrary keys.
 fn entries<T>(
-    node: Option<&Node>,
-    reader: &mut Reader<'_>,
-    mut read: impl FnMut(&Node, &mut Reader<'_>) -> Option<T>,
+    node: Option<&DocumentNode>,
+    reader: &mut YamlReader<'_>,
+    mut read: impl FnMut(&DocumentNode, &mut YamlReader<'_>) -> Option<T>,
 ) -> Vec<(String, T)> {
     let Some(node) = node else {
         return Vec::new();
     };
-    let Kind::Map(pairs) = &node.kind else {
+    let DocumentKind::Map(pairs) = &node.kind else {
         reader.wrong(node, "a map of fields");
         return Vec::new();
     };
@@ -254,7 +258,7 @@ fn entries<T>(
             let message = format!("the key `{}` is repeated", shortened(&name));
             reader
                 .findings()
-                .error(Code::DuplicateKey, key.place, message);
+                .error(YamlFindingCode::DuplicateKey, key.place, message);
         } else if let Some(value) = read(value, reader) {
             entries.push((name, value));
         }
@@ -262,23 +266,36 @@ fn entries<T>(
     entries
 }
 
-fn read_source(node: &Node, of_answer: bool, reader: &mut Reader<'_>) -> Option<Source> {
+fn read_source(
+    node: &DocumentNode,
+    of_answer: bool,
+    reader: &mut YamlReader<'_>,
+) -> Option<SpaceFieldSource> {
     match &node.kind {
-        Kind::Scalar(text) => return Some(Source::Constant(text.as_str().into())),
-        Kind::List(nodes) if nodes.iter().any(|node| matches!(node.kind, Kind::Map(_))) => {
+        DocumentKind::Scalar(text) => {
+            return Some(SpaceFieldSource::Constant(text.as_str().into()));
+        }
+        DocumentKind::List(nodes)
+            if nodes
+                .iter()
+                .any(|node| matches!(node.kind, DocumentKind::Map(_))) =>
+        {
             // All elements are read, so that all of their faults are found.
-            let sources: Vec<Option<Source>> = nodes
+            let sources: Vec<Option<SpaceFieldSource>> = nodes
                 .iter()
                 .map(|node| read_element(node, of_answer, reader))
                 .collect();
-            return sources.into_iter().collect::<Option<_>>().map(Source::List);
+            return sources
+                .into_iter()
+                .collect::<Option<_>>()
+                .map(SpaceFieldSource::List);
         }
-        Kind::List(nodes) => {
+        DocumentKind::List(nodes) => {
             let texts = nodes.iter().map(|node| reader.text(node, "a single value"));
             let texts: Option<Vec<&str>> = texts.collect();
-            return Some(Source::Constant(texts?.into()));
+            return Some(SpaceFieldSource::Constant(texts?.into()));
         }
-        Kind::Map(_) | Kind::Null => {}
+        DocumentKind::Map(_) | DocumentKind::Null => {}
     }
     let [parameter, field, at, form] = reader.map(node, ["parameter", "field", "at", "as"])?;
     let at = match at {
@@ -307,11 +324,11 @@ fn read_source(node: &Node, of_answer: bool, reader: &mut Reader<'_>) -> Option<
     };
     let mut part = |node| {
         let name = reader.text(node, "a name")?.to_owned();
-        Some(Part { name, at, form })
+        Some(ValuePart { name, at, form })
     };
     match (parameter, field) {
-        (Some(node), None) => part(node).map(Source::Parameter),
-        (None, Some(node)) if of_answer => part(node).map(Source::Field),
+        (Some(node), None) => part(node).map(SpaceFieldSource::Parameter),
+        (None, Some(node)) if of_answer => part(node).map(SpaceFieldSource::Field),
         _ => {
             let wanted = match of_answer {
                 true => "a constant, or exactly one of `parameter` and `field`",
@@ -325,12 +342,16 @@ fn read_source(node: &Node, of_answer: bool, reader: &mut Reader<'_>) -> Option<
 
 /// Reads an element of a list of messages, or a field of a message: a message, unless it has the
 /// keys of a source.
-fn read_element(node: &Node, of_answer: bool, reader: &mut Reader<'_>) -> Option<Source> {
-    let Kind::Map(pairs) = &node.kind else {
+fn read_element(
+    node: &DocumentNode,
+    of_answer: bool,
+    reader: &mut YamlReader<'_>,
+) -> Option<SpaceFieldSource> {
+    let DocumentKind::Map(pairs) = &node.kind else {
         return read_source(node, of_answer, reader);
     };
     let is_source = pairs.iter().any(|(key, _)| {
-        matches!(&key.kind, Kind::Scalar(key) if matches!(key.as_str(), "parameter" | "field"))
+        matches!(&key.kind, DocumentKind::Scalar(key) if matches!(key.as_str(), "parameter" | "field"))
     });
     if is_source {
         return read_source(node, of_answer, reader);
@@ -338,7 +359,7 @@ fn read_element(node: &Node, of_answer: bool, reader: &mut Reader<'_>) -> Option
     let fields = entries(Some(node), reader, |node, reader| {
         read_element(node, of_answer, reader)
     });
-    Some(Source::Message(fields))
+    Some(SpaceFieldSource::Message(fields))
 }
 
 /// The values of the key `as`.
@@ -375,7 +396,7 @@ mod tests {
         let work = driver("{call: ua_1_2_61}").unwrap();
         assert_eq!(
             (work.asked, work.topic.as_str()),
-            (Asked::Call, "ua_1_2_61")
+            (RequestKind::Call, "ua_1_2_61")
         );
         assert_eq!(
             (work.within, work.halt_timeout),
@@ -392,7 +413,10 @@ mod tests {
              results: {Pose: {parameter: Goal}, Code: {field: code}}, succeeds: {status: 1}}}",
         )
         .unwrap();
-        let goal = ("Goal".to_owned(), crate::Value::from(vec![1.0, 2.0, 3.0]));
+        let goal = (
+            "Goal".to_owned(),
+            crate::SkillValue::from(vec![1.0, 2.0, 3.0]),
+        );
         let declared = crate::model::find("NavigateToSkillType")
             .unwrap()
             .parameters();
@@ -435,7 +459,10 @@ mod tests {
              points: [{x: {parameter: Goal, at: 1}}, {}]}}, {weight: 1}]}}}",
         )
         .unwrap();
-        let goal = ("Goal".to_owned(), crate::Value::from(vec![1.0, 2.0, 3.0]));
+        let goal = (
+            "Goal".to_owned(),
+            crate::SkillValue::from(vec![1.0, 2.0, 3.0]),
+        );
         let declared = crate::model::find("NavigateToSkillType")
             .unwrap()
             .parameters();
@@ -469,13 +496,13 @@ mod tests {
             ("y", 0.0),
             ("z", 0.0),
         ] {
-            let Source::Parameter(part) = source(&format!("orientation_{name}")) else {
+            let SpaceFieldSource::Parameter(part) = source(&format!("orientation_{name}")) else {
                 panic!("{name}")
             };
             let value = part.of(pose.clone()).unwrap().as_f64().unwrap();
             assert!((value - expected).abs() < 1e-12, "{name}: {value}");
         }
-        let Source::Parameter(part) = source("orientation_x") else {
+        let SpaceFieldSource::Parameter(part) = source("orientation_x") else {
             panic!("no parameter")
         };
         let heading = part.of(serde_json::json!([1.0, 2.0, 3.0])).unwrap_err();

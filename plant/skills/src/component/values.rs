@@ -8,9 +8,9 @@ use super::document::{read_command, read_name, whole};
 use super::space::read_topic;
 use super::{Device, DeviceKinds, SkillSetup};
 use crate::parameters::shortened;
-use crate::value::{Builtin, Shape};
-use crate::values::{Measure, PERIOD, Sensor, ValueFacts};
-use crate::yaml::{Code, Kind, Node, Place, Reader};
+use crate::value::{Builtin, ValueShape};
+use crate::values::{Measure, PERIOD, ValueFacts, ValueSensor};
+use crate::yaml::{DocumentKind, DocumentNode, Place, YamlFindingCode, YamlReader};
 
 /// A value of a component.
 #[derive(Debug, Clone)]
@@ -33,7 +33,7 @@ pub enum ValueSource {
     /// The runs of a skill; `None` for the runs of all skills.
     Computed(Measure, Option<String>),
     /// A sensor, which may measure several values under their names.
-    Sensor(Arc<dyn Sensor>),
+    Sensor(Arc<dyn ValueSensor>),
     /// A topic of the space, which the program that runs the component receives.
     Topic(TopicSource),
     /// A program of the user, which the program that runs the component starts.
@@ -64,9 +64,9 @@ pub struct ExecSource {
 #[derive(Debug)]
 pub struct SensorRead {
     /// The sensor.
-    pub sensor: Arc<dyn Sensor>,
+    pub sensor: Arc<dyn ValueSensor>,
     /// The type of its value, if the YAML does not name it.
-    pub shape: Shape,
+    pub shape: ValueShape,
 }
 
 /// The surroundings of the values in the document.
@@ -82,9 +82,9 @@ pub(super) struct Around<'a> {
 type Known<'a> = (&'a Around<'a>, &'a [SkillSetup]);
 
 pub(super) fn read_values(
-    node: &Node,
+    node: &DocumentNode,
     around: Known<'_>,
-    reader: &mut Reader<'_>,
+    reader: &mut YamlReader<'_>,
 ) -> Vec<ValueSetup> {
     let mut values: Vec<ValueSetup> = Vec::new();
     for node in reader.list(node) {
@@ -97,7 +97,7 @@ pub(super) fn read_values(
                 let message = format!("there is a value `{}` already", value.facts.name);
                 reader
                     .findings()
-                    .error(Code::NameTwice, value.place, message);
+                    .error(YamlFindingCode::NameTwice, value.place, message);
             }
             values.push(value);
         }
@@ -107,7 +107,9 @@ pub(super) fn read_values(
             "a component has at most {MOST_VALUES} values, and this one {}",
             values.len()
         );
-        reader.findings().error(Code::TooMany, node.place, message);
+        reader
+            .findings()
+            .error(YamlFindingCode::TooMany, node.place, message);
     }
     values
 }
@@ -136,12 +138,16 @@ pub(super) const KEYS: [&str; 16] = [
 struct Described {
     name: Option<String>,
     about: Option<String>,
-    shape: Option<Shape>,
+    shape: Option<ValueShape>,
     unit: Option<String>,
     range: Option<(f64, f64)>,
 }
 
-fn read_entry(node: &Node, around: Known<'_>, reader: &mut Reader<'_>) -> Vec<ValueSetup> {
+fn read_entry(
+    node: &DocumentNode,
+    around: Known<'_>,
+    reader: &mut YamlReader<'_>,
+) -> Vec<ValueSetup> {
     let Some([name, about, of_type, unit, range, period, sources @ ..]) = reader.map(node, KEYS)
     else {
         return Vec::new();
@@ -190,8 +196,8 @@ fn read_entry(node: &Node, around: Known<'_>, reader: &mut Reader<'_>) -> Vec<Va
 fn setups(
     source: Source,
     described: &Described,
-    (node, place): (&Node, Place),
-    reader: &mut Reader<'_>,
+    (node, place): (&DocumentNode, Place),
+    reader: &mut YamlReader<'_>,
 ) -> Vec<(ValueFacts, ValueSource)> {
     let mut values = Vec::new();
     match source {
@@ -199,7 +205,9 @@ fn setups(
             let single = of.len() == 1;
             if !single && described.name.is_some() {
                 let message = "`device: all` has several values, and a name is for a single value";
-                reader.findings().error(Code::WrongValue, place, message);
+                reader
+                    .findings()
+                    .error(YamlFindingCode::WrongValue, place, message);
             }
             for value in of {
                 let facts = described.facts(value.name, value.shape);
@@ -238,7 +246,7 @@ fn setups(
                 let message = "`type` is missing: the source does not define the type of the value";
                 reader
                     .findings()
-                    .error(Code::MissingKey, node.place, message);
+                    .error(YamlFindingCode::MissingKey, node.place, message);
             }
             if let (Some(name), Some(shape)) = (name, shape) {
                 values.push((described.facts(&name, shape), source));
@@ -248,16 +256,18 @@ fn setups(
     values
 }
 
-fn needed_name(described: &Described, at: Place, reader: &mut Reader<'_>) -> Option<String> {
+fn needed_name(described: &Described, at: Place, reader: &mut YamlReader<'_>) -> Option<String> {
     if described.name.is_none() {
         let message = "`name` is missing";
-        reader.findings().error(Code::MissingKey, at, message);
+        reader
+            .findings()
+            .error(YamlFindingCode::MissingKey, at, message);
     }
     described.name.clone()
 }
 
 impl Described {
-    fn facts(&self, name: &str, shape: Shape) -> ValueFacts {
+    fn facts(&self, name: &str, shape: ValueShape) -> ValueFacts {
         ValueFacts {
             name: self.name.clone().unwrap_or_else(|| name.to_owned()),
             shape: self.shape.unwrap_or(shape),
@@ -269,14 +279,16 @@ impl Described {
 }
 
 /// Units and ranges belong to numbers.
-pub(super) fn check_range(facts: &ValueFacts, at: Place, reader: &mut Reader<'_>) {
+pub(super) fn check_range(facts: &ValueFacts, at: Place, reader: &mut YamlReader<'_>) {
     let is_number = !matches!(facts.shape.builtin, Builtin::Boolean | Builtin::String);
     if !is_number && (facts.range.is_some() || facts.unit.is_some()) {
         let message = format!(
             "`{}` is {}, and only numbers have a unit and a range",
             facts.name, facts.shape
         );
-        reader.findings().error(Code::WrongValue, at, message);
+        reader
+            .findings()
+            .error(YamlFindingCode::WrongValue, at, message);
     }
 }
 
@@ -285,21 +297,23 @@ enum Source {
     Device(Vec<crate::values::DeviceValue>),
     Computed(Measure, Option<String>),
     /// A source and the type of its value, if it defines a type.
-    Other(ValueSource, Option<Shape>),
+    Other(ValueSource, Option<ValueShape>),
 }
 
 fn read_source(
-    node: &Node,
-    sources: [Option<&Node>; 10],
+    node: &DocumentNode,
+    sources: [Option<&DocumentNode>; 10],
     (around, skills): Known<'_>,
-    reader: &mut Reader<'_>,
+    reader: &mut YamlReader<'_>,
 ) -> Option<Source> {
     let named = KEYS.iter().skip(KEYS.len() - sources.len()).zip(sources);
     let mut given = named.filter_map(|(key, node)| Some((*key, node?)));
     let (Some((key, source)), None) = (given.next(), given.next()) else {
         let all: Vec<&str> = KEYS.iter().skip(6).copied().collect();
         let message = format!("a value has exactly one source of {}", all.join(", "));
-        reader.findings().error(Code::Source, node.place, message);
+        reader
+            .findings()
+            .error(YamlFindingCode::Source, node.place, message);
         return None;
     };
     match key {
@@ -327,9 +341,9 @@ fn read_source(
 
 /// Reads the name of a skill; `all` for all skills.
 fn read_skill_name(
-    node: &Node,
+    node: &DocumentNode,
     skills: &[SkillSetup],
-    reader: &mut Reader<'_>,
+    reader: &mut YamlReader<'_>,
 ) -> Option<Option<String>> {
     let text = reader.text(node, "the name of a skill, or `all`")?;
     if text == "all" {
@@ -349,19 +363,19 @@ fn read_skill_name(
     };
     reader
         .findings()
-        .error_with(Code::Source, node.place, message, help);
+        .error_with(YamlFindingCode::Source, node.place, message, help);
     None
 }
 
 fn read_device(
-    node: &Node,
+    node: &DocumentNode,
     device: Option<&Arc<dyn Device>>,
-    reader: &mut Reader<'_>,
+    reader: &mut YamlReader<'_>,
 ) -> Option<Vec<crate::values::DeviceValue>> {
     let text = reader.text(node, "a value of the device, or `all`")?;
     let Some(device) = device else {
         let message = "the component has no `device`".to_owned();
-        return reader.refuse(node, Code::Source, message);
+        return reader.refuse(node, YamlFindingCode::Source, message);
     };
     let known = device.values();
     if text == "all" && !known.is_empty() {
@@ -379,14 +393,14 @@ fn read_device(
     };
     reader
         .findings()
-        .error_with(Code::Source, node.place, message, help);
+        .error_with(YamlFindingCode::Source, node.place, message, help);
     None
 }
 
-fn read_topic_source(node: &Node, reader: &mut Reader<'_>) -> Option<TopicSource> {
+fn read_topic_source(node: &DocumentNode, reader: &mut YamlReader<'_>) -> Option<TopicSource> {
     let (topic, field) = match &node.kind {
-        Kind::Scalar(_) => (Some(node), None),
-        Kind::Null | Kind::List(_) | Kind::Map(_) => {
+        DocumentKind::Scalar(_) => (Some(node), None),
+        DocumentKind::Null | DocumentKind::List(_) | DocumentKind::Map(_) => {
             let [topic, field] = reader.map(node, ["name", "field"])?;
             (topic, field)
         }
@@ -401,7 +415,7 @@ fn read_topic_source(node: &Node, reader: &mut Reader<'_>) -> Option<TopicSource
             text.parse().ok().or_else(|| {
                 let found = shortened(text);
                 let message = format!("expected the number of a field, from 0, found `{found}`");
-                reader.refuse(node, Code::WrongValue, message)
+                reader.refuse(node, YamlFindingCode::WrongValue, message)
             })
         }
     };
@@ -411,7 +425,11 @@ fn read_topic_source(node: &Node, reader: &mut Reader<'_>) -> Option<TopicSource
     })
 }
 
-fn read_exec_source(node: &Node, folder: &Path, reader: &mut Reader<'_>) -> Option<ExecSource> {
+fn read_exec_source(
+    node: &DocumentNode,
+    folder: &Path,
+    reader: &mut YamlReader<'_>,
+) -> Option<ExecSource> {
     let [command, within] = reader.map(node, ["command", "within"])?;
     let command = reader
         .needed(command, "command", node.place)
@@ -430,7 +448,10 @@ fn read_exec_source(node: &Node, folder: &Path, reader: &mut Reader<'_>) -> Opti
 }
 
 /// Reads a type by its name, as `Double` or `Double[]`.
-pub(super) fn read_shape_name(node: &Node, reader: &mut Reader<'_>) -> Option<Shape> {
+pub(super) fn read_shape_name(
+    node: &DocumentNode,
+    reader: &mut YamlReader<'_>,
+) -> Option<ValueShape> {
     let text = reader.text(node, "a type, as Double or Double[]")?;
     let (name, array) = match text.strip_suffix("[]") {
         Some(name) => (name, true),
@@ -438,7 +459,7 @@ pub(super) fn read_shape_name(node: &Node, reader: &mut Reader<'_>) -> Option<Sh
     };
     let known = Builtin::ALL.iter().find(|builtin| builtin.name() == name);
     if let Some(builtin) = known {
-        return Some(Shape {
+        return Some(ValueShape {
             builtin: *builtin,
             array,
         });
@@ -448,21 +469,25 @@ pub(super) fn read_shape_name(node: &Node, reader: &mut Reader<'_>) -> Option<Sh
     let help = format!("one of {}; with [] for an array", names.join(", "));
     reader
         .findings()
-        .error_with(Code::WrongValue, node.place, message, help);
+        .error_with(YamlFindingCode::WrongValue, node.place, message, help);
     None
 }
 
-pub(super) fn read_line(node: &Node, longest: usize, reader: &mut Reader<'_>) -> Option<String> {
+pub(super) fn read_line(
+    node: &DocumentNode,
+    longest: usize,
+    reader: &mut YamlReader<'_>,
+) -> Option<String> {
     let text = reader.text(node, "a line of text")?;
     if !text.is_empty() && text.len() <= longest && !text.chars().any(char::is_control) {
         return Some(text.to_owned());
     }
     let found = shortened(text);
     let message = format!("expected a line of at most {longest} bytes, found `{found}`");
-    reader.refuse(node, Code::WrongValue, message)
+    reader.refuse(node, YamlFindingCode::WrongValue, message)
 }
 
-pub(super) fn read_range(node: &Node, reader: &mut Reader<'_>) -> Option<(f64, f64)> {
+pub(super) fn read_range(node: &DocumentNode, reader: &mut YamlReader<'_>) -> Option<(f64, f64)> {
     let numbers: Vec<f64> = reader
         .list(node)
         .iter()
@@ -472,18 +497,18 @@ pub(super) fn read_range(node: &Node, reader: &mut Reader<'_>) -> Option<(f64, f
         [low, high] if low < high => Some((*low, *high)),
         _ => {
             let message = "a range is the lowest and the highest value: [0, 900]".to_owned();
-            reader.refuse(node, Code::WrongValue, message)
+            reader.refuse(node, YamlFindingCode::WrongValue, message)
         }
     }
 }
 
-fn read_period(node: &Node, reader: &mut Reader<'_>) -> Option<Duration> {
+fn read_period(node: &DocumentNode, reader: &mut YamlReader<'_>) -> Option<Duration> {
     let period = reader.duration(node)?;
     if (SHORTEST_PERIOD..=LONGEST_PERIOD).contains(&period) {
         return Some(period);
     }
     let message = format!("a period is from {SHORTEST_PERIOD:?} to {LONGEST_PERIOD:?}");
-    reader.refuse(node, Code::Duration, message)
+    reader.refuse(node, YamlFindingCode::Duration, message)
 }
 
 /// Maximum number of values of a component: their identifiers in the space are 11 to 99.
@@ -552,7 +577,7 @@ mod tests {
             (facts.unit.as_deref(), facts.range),
             (Some("%"), Some((0.0, 100.0)))
         );
-        assert_eq!(values[1].facts.shape, Shape::scalar(Builtin::UInt32));
+        assert_eq!(values[1].facts.shape, ValueShape::scalar(Builtin::UInt32));
         assert!(
             matches!(&values[1].source, ValueSource::Computed(Measure::Runs, Some(skill)) if skill == "Grasp")
         );

@@ -6,8 +6,8 @@ use std::sync::Arc;
 use super::document::{read_name, whole};
 use crate::grip::{GripPoint, GripType, PartShape};
 use crate::parameters::shortened;
-use crate::workspace::{Workspace, Zone};
-use crate::yaml::{Code, Kind, Node, Reader};
+use crate::workspace::{RobotWorkspace, Zone};
+use crate::yaml::{DocumentKind, DocumentNode, YamlFindingCode, YamlReader};
 
 /// An object of the cell.
 #[derive(Debug, Clone, PartialEq)]
@@ -24,8 +24,11 @@ pub struct WorldObject {
 pub type World = Arc<BTreeMap<String, WorldObject>>;
 
 /// Reads the table `world`: objects by their ObjectId.
-pub(super) fn read_world(node: &Node, reader: &mut Reader<'_>) -> BTreeMap<String, WorldObject> {
-    let Kind::Map(pairs) = &node.kind else {
+pub(super) fn read_world(
+    node: &DocumentNode,
+    reader: &mut YamlReader<'_>,
+) -> BTreeMap<String, WorldObject> {
+    let DocumentKind::Map(pairs) = &node.kind else {
         reader.wrong(node, "a map from ObjectIds to objects");
         return BTreeMap::new();
     };
@@ -39,13 +42,13 @@ pub(super) fn read_world(node: &Node, reader: &mut Reader<'_>) -> BTreeMap<Strin
         };
         if world.insert(id, object).is_some() {
             let message = "the object is listed twice".to_owned();
-            reader.refuse::<()>(key, Code::DuplicateKey, message);
+            reader.refuse::<()>(key, YamlFindingCode::DuplicateKey, message);
         }
     }
     world
 }
 
-fn read_object(node: &Node, reader: &mut Reader<'_>) -> Option<WorldObject> {
+fn read_object(node: &DocumentNode, reader: &mut YamlReader<'_>) -> Option<WorldObject> {
     let keys = ["pose", "box", "cylinder", "sphere", "mass"];
     let [pose, cuboid, cylinder, sphere, mass] = reader.map(node, keys)?;
     let pose = reader.needed(pose, "pose", node.place)?;
@@ -64,20 +67,20 @@ fn read_object(node: &Node, reader: &mut Reader<'_>) -> Option<WorldObject> {
 
 /// Reads the shape of a part: `{box: [x, y, z]}`, `{cylinder: [diameter, height]}` or
 /// `{sphere: diameter}`, in m.
-pub fn read_shape(node: &Node, reader: &mut Reader<'_>) -> Option<PartShape> {
+pub fn read_shape(node: &DocumentNode, reader: &mut YamlReader<'_>) -> Option<PartShape> {
     let given = reader.map(node, ["box", "cylinder", "sphere"])?;
     let read = shape(node, given, reader)?;
     read.or_else(|| {
         let message = "a shape is one of `box`, `cylinder` and `sphere`".to_owned();
-        reader.refuse(node, Code::WrongValue, message)
+        reader.refuse(node, YamlFindingCode::WrongValue, message)
     })
 }
 
 /// Reads an optional shape; `None` after an error.
 fn shape(
-    node: &Node,
-    given: [Option<&Node>; 3],
-    reader: &mut Reader<'_>,
+    node: &DocumentNode,
+    given: [Option<&DocumentNode>; 3],
+    reader: &mut YamlReader<'_>,
 ) -> Option<Option<PartShape>> {
     match given {
         [None, None, None] => Some(None),
@@ -95,16 +98,16 @@ fn shape(
         }
         _ => {
             let message = "an object has one shape: `box`, `cylinder` or `sphere`".to_owned();
-            reader.refuse(node, Code::WrongValue, message)
+            reader.refuse(node, YamlFindingCode::WrongValue, message)
         }
     }
 }
 
 /// Reads the reach and the zones of a robot. `None` after an error.
 pub(super) fn read_workspace(
-    [reach, zones]: [Option<&Node>; 2],
-    reader: &mut Reader<'_>,
-) -> Option<Option<Workspace>> {
+    [reach, zones]: [Option<&DocumentNode>; 2],
+    reader: &mut YamlReader<'_>,
+) -> Option<Option<RobotWorkspace>> {
     if reach.is_none() && zones.is_none() {
         return Some(None);
     }
@@ -118,18 +121,18 @@ pub(super) fn read_workspace(
         let Some(zone) = zone else { continue };
         if read.iter().any(|known| known.name == zone.name) {
             let message = format!("there is a zone `{}` already", shortened(&zone.name));
-            reader.refuse::<()>(node, Code::NameTwice, message);
+            reader.refuse::<()>(node, YamlFindingCode::NameTwice, message);
         }
         read.push(zone);
     }
-    let workspace = Workspace {
+    let workspace = RobotWorkspace {
         reach: whole(reach)?,
         zones: read,
     };
     is_whole.then_some(Some(workspace))
 }
 
-fn read_zone(node: &Node, reader: &mut Reader<'_>) -> Option<Zone> {
+fn read_zone(node: &DocumentNode, reader: &mut YamlReader<'_>) -> Option<Zone> {
     let [name, bounds] = reader.map(node, ["name", "box"])?;
     let name = reader.needed(name, "name", node.place);
     let name = name.and_then(|node| read_name(node, reader));
@@ -139,7 +142,7 @@ fn read_zone(node: &Node, reader: &mut Reader<'_>) -> Option<Zone> {
     let (low, high) = ([low_x, low_y, low_z], [high_x, high_y, high_z]);
     if low.iter().zip(high).any(|(low, high)| *low > high) {
         let message = "`box` is the smallest x, y, z and the largest x, y, z, in this order";
-        return reader.refuse(bounds, Code::WrongValue, message.to_owned());
+        return reader.refuse(bounds, YamlFindingCode::WrongValue, message.to_owned());
     }
     Some(Zone {
         name: name?,
@@ -149,7 +152,10 @@ fn read_zone(node: &Node, reader: &mut Reader<'_>) -> Option<Zone> {
 }
 
 /// Reads the grip point of a grasp skill.
-pub(super) fn read_grip_point(node: &Node, reader: &mut Reader<'_>) -> Option<GripPoint> {
+pub(super) fn read_grip_point(
+    node: &DocumentNode,
+    reader: &mut YamlReader<'_>,
+) -> Option<GripPoint> {
     let [offset, grip_type, opening] = reader.map(node, ["offset", "type", "opening"])?;
     let offset = reader.needed(offset, "offset", node.place)?;
     let offset = read_numbers(offset, (-10.0, 10.0), reader);
@@ -162,7 +168,7 @@ pub(super) fn read_grip_point(node: &Node, reader: &mut Reader<'_>) -> Option<Gr
             let [low, high] = read_numbers(node, (0.0, 10.0), reader)?;
             if low > high {
                 let message = "`opening` is the smallest and the largest width, in this order";
-                return reader.refuse(node, Code::WrongValue, message.to_owned());
+                return reader.refuse(node, YamlFindingCode::WrongValue, message.to_owned());
             }
             Some((low, high))
         }
@@ -175,21 +181,21 @@ pub(super) fn read_grip_point(node: &Node, reader: &mut Reader<'_>) -> Option<Gr
     })
 }
 
-fn read_grip_type(node: &Node, reader: &mut Reader<'_>) -> Option<GripType> {
+fn read_grip_type(node: &DocumentNode, reader: &mut YamlReader<'_>) -> Option<GripType> {
     let text = reader.text(node, "the type of a grip point")?;
     let known = GripType::ALL.into_iter().find(|of| of.name() == text);
     known.or_else(|| {
         let names = GripType::ALL.map(GripType::name).join(", ");
         let message = format!("expected one of {names}, found `{}`", shortened(text));
-        reader.refuse(node, Code::WrongValue, message)
+        reader.refuse(node, YamlFindingCode::WrongValue, message)
     })
 }
 
 /// Reads a list of `N` numbers.
 pub fn read_numbers<const N: usize>(
-    node: &Node,
+    node: &DocumentNode,
     range: (f64, f64),
-    reader: &mut Reader<'_>,
+    reader: &mut YamlReader<'_>,
 ) -> Option<[f64; N]> {
     let nodes = reader.list(node);
     let numbers: Vec<f64> = nodes
@@ -202,7 +208,7 @@ pub fn read_numbers<const N: usize>(
     let count = numbers.len();
     numbers.try_into().ok().or_else(|| {
         let message = format!("expected {N} numbers, found {count}");
-        reader.refuse(node, Code::WrongValue, message)
+        reader.refuse(node, YamlFindingCode::WrongValue, message)
     })
 }
 

@@ -2,7 +2,7 @@
 //! equivalent types.
 
 use super::{SkillType, find};
-use crate::parameters::TypeName;
+use crate::parameters::ParameterType;
 
 /// The namespaces of that system.
 pub const EARLIER: [&str; 6] = [
@@ -41,7 +41,7 @@ const ALIASES: [(&str, &str); 21] = [
 
 /// Returns the equivalent of a type of the earlier system; `None` for all other types.
 #[must_use]
-pub fn of(name: &TypeName) -> Option<&'static SkillType> {
+pub fn of(name: &ParameterType) -> Option<&'static SkillType> {
     if !EARLIER.contains(&name.namespace.as_str()) {
         return None;
     }
@@ -55,7 +55,7 @@ mod tests {
     use super::*;
 
     fn earlier(namespace: &str, name: &str) -> Option<&'static str> {
-        let name = TypeName {
+        let name = ParameterType {
             namespace: namespace.to_owned(),
             name: name.to_owned(),
         };

@@ -6,18 +6,18 @@ mod methods;
 
 use std::fmt::Write as _;
 
-use program::{Method, Rest};
+use program::{ProgramMethod, Rest};
 
 pub use self::domains::{DomainNodeSet, domain_nodesets};
 
-use super::table::{SkillType, Unit, Variable};
+use super::table::{SkillType, TableUnit, TableVariable};
 use super::types::TYPES;
 use super::{
     CONTROLLER_TYPE, CURRENT_TOOL, EVENT_TYPE, GRIP_POINT_OFFSET, GRIP_POINT_OPENING,
     GRIP_POINT_TYPE, MOVER_ENDPOINT, NAMESPACE, REACH, SKILL_TYPE, TOOL_PLATE_OFFSET,
     USED_SKILL_TYPE, USES_SKILL, ZONE_BOUNDS, ZONE_NAMES,
 };
-use crate::value::{Builtin, Value};
+use crate::value::{Builtin, SkillValue};
 
 /// Returns the NodeSet of [`NAMESPACE`]. The text is deterministic and requires namespace 0 only.
 #[must_use]
@@ -277,7 +277,7 @@ impl Nodes {
             .attribute("DataType", Builtin::Boolean.name())
             .forward("HasTypeDefinition", PROPERTY_TYPE)
             .child_of(parent, "HasProperty", Rule::Mandatory);
-        rests.value = Some(xml_value(&Value::Boolean(value)));
+        rests.value = Some(xml_value(&SkillValue::Boolean(value)));
         self.add(rests);
     }
 
@@ -322,7 +322,7 @@ impl Nodes {
         }
     }
 
-    fn variable(&mut self, variable: &Variable, parent: u32, ids: Ids, access: &str) {
+    fn variable(&mut self, variable: &TableVariable, parent: u32, ids: Ids, access: &str) {
         let browse_name = format!("1:{}", variable.name);
         let mut node = Node::new("UAVariable", ids.node, &browse_name)
             .about(variable.about)
@@ -446,13 +446,13 @@ struct Ids {
     properties: u32,
 }
 
-fn xml_value(value: &Value) -> String {
-    let one = |value: &Value, attributes: &str| {
+fn xml_value(value: &SkillValue) -> String {
+    let one = |value: &SkillValue, attributes: &str| {
         let name = value.shape().builtin.name();
         let text = value.as_str().map_or_else(|| value.to_string(), escaped);
         format!("<{name}{attributes}>{text}</{name}>")
     };
-    let Value::Array(builtin, elements) = value else {
+    let SkillValue::Array(builtin, elements) = value else {
         return one(value, TYPES_NAMESPACE);
     };
     let name = builtin.name();
@@ -460,8 +460,8 @@ fn xml_value(value: &Value) -> String {
     format!("<ListOf{name}{TYPES_NAMESPACE}>{elements}</ListOf{name}>")
 }
 
-fn engineering_unit(unit: &Unit) -> String {
-    let Unit { symbol, name, id } = unit;
+fn engineering_unit(unit: &TableUnit) -> String {
+    let TableUnit { symbol, name, id } = unit;
     let body = format!(
         "<EUInformation><NamespaceUri>http://www.opcfoundation.org/UA/units/un/cefact</NamespaceUri><UnitId>{id}</UnitId>\
          <DisplayName><Text>{symbol}</Text></DisplayName><Description><Text>{name}</Text></Description></EUInformation>"
@@ -620,12 +620,12 @@ const MEMBERS: [(u32, &str, Builtin, bool, bool, &str); 6] = [
     ),
 ];
 
-const METHODS: [Method; 5] = [
-    Method::Start,
-    Method::Halt,
-    Method::Suspend,
-    Method::Resume,
-    Method::Reset,
+const METHODS: [ProgramMethod; 5] = [
+    ProgramMethod::Start,
+    ProgramMethod::Halt,
+    ProgramMethod::Suspend,
+    ProgramMethod::Resume,
+    ProgramMethod::Reset,
 ];
 
 const PARAMETER_SET: u32 = 1;

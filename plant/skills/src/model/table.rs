@@ -2,7 +2,7 @@
 
 use program::Rest;
 
-use crate::value::Shape;
+use crate::value::ValueShape;
 
 /// A skill type.
 #[derive(Debug)]
@@ -20,26 +20,26 @@ pub struct SkillType {
     pub about: &'static str,
     /// The parameters, beside the supertypes' parameters. The order is stable: new parameters are
     /// appended.
-    pub parameters: &'static [Variable],
+    pub parameters: &'static [TableVariable],
     /// The results, beside the supertypes' results; the order is stable too.
-    pub results: &'static [Variable],
+    pub results: &'static [TableVariable],
     /// The state after a successful run.
     pub rests_in: Rest,
 }
 
 /// A parameter or result in the table.
 #[derive(Debug)]
-pub struct Variable {
+pub struct TableVariable {
     /// The BrowseName.
     pub name: &'static str,
     /// Type and rank.
-    pub shape: Shape,
+    pub shape: ValueShape,
     /// The number of elements of an array.
     pub length: Option<u32>,
     /// The default value.
     pub preset: Preset,
     /// The unit.
-    pub unit: Option<&'static Unit>,
+    pub unit: Option<&'static TableUnit>,
     /// The lowest and the highest value of a number.
     pub range: Option<(f64, f64)>,
     /// Description for people.
@@ -63,7 +63,7 @@ pub enum Preset {
 
 /// A unit of UNECE Recommendation 20.
 #[derive(Debug, PartialEq, Eq)]
-pub struct Unit {
+pub struct TableUnit {
     /// The symbol, as `m/s`.
     pub symbol: &'static str,
     /// The name, as `metre per second`.

@@ -2,20 +2,20 @@
 
 use program::Rest;
 
-use super::table::{Preset, SkillType, Unit, Variable};
+use super::table::{Preset, SkillType, TableUnit, TableVariable};
 use super::units::{ACCELERATION, KILOGRAM, METRE, NEWTON, RADIAN, SPEED, TURNING, TURNING_UP};
-use crate::value::{Builtin, Shape};
+use crate::value::{Builtin, ValueShape};
 
 const fn number(
     name: &'static str,
     default: f64,
-    unit: Option<&'static Unit>,
+    unit: Option<&'static TableUnit>,
     range: (f64, f64),
     about: &'static str,
-) -> Variable {
-    Variable {
+) -> TableVariable {
+    TableVariable {
         name,
-        shape: Shape::scalar(Builtin::Double),
+        shape: ValueShape::scalar(Builtin::Double),
         length: None,
         preset: Preset::Number(default),
         unit,
@@ -24,10 +24,10 @@ const fn number(
     }
 }
 
-const fn text(name: &'static str, preset: Preset, about: &'static str) -> Variable {
-    Variable {
+const fn text(name: &'static str, preset: Preset, about: &'static str) -> TableVariable {
+    TableVariable {
         name,
-        shape: Shape::scalar(Builtin::String),
+        shape: ValueShape::scalar(Builtin::String),
         length: None,
         preset,
         unit: None,
@@ -37,10 +37,10 @@ const fn text(name: &'static str, preset: Preset, about: &'static str) -> Variab
 }
 
 /// A mandatory parameter: position and orientation of a tool.
-const fn position(name: &'static str, about: &'static str) -> Variable {
-    Variable {
+const fn position(name: &'static str, about: &'static str) -> TableVariable {
+    TableVariable {
         name,
-        shape: Shape::array(Builtin::Double),
+        shape: ValueShape::array(Builtin::Double),
         length: Some(6),
         preset: Preset::None,
         unit: None,
@@ -50,8 +50,8 @@ const fn position(name: &'static str, about: &'static str) -> Variable {
 }
 
 /// An optional parameter: a position; six zeros if it is not given.
-const fn optional_position(name: &'static str, about: &'static str) -> Variable {
-    Variable {
+const fn optional_position(name: &'static str, about: &'static str) -> TableVariable {
+    TableVariable {
         preset: Preset::Zeros(6),
         ..position(name, about)
     }
@@ -61,12 +61,12 @@ const fn optional_position(name: &'static str, about: &'static str) -> Variable 
 const fn numbers(
     name: &'static str,
     length: Option<u32>,
-    unit: Option<&'static Unit>,
+    unit: Option<&'static TableUnit>,
     about: &'static str,
-) -> Variable {
-    Variable {
+) -> TableVariable {
+    TableVariable {
         name,
-        shape: Shape::array(Builtin::Double),
+        shape: ValueShape::array(Builtin::Double),
         length,
         preset: Preset::None,
         unit,
@@ -78,12 +78,12 @@ const fn numbers(
 /// A result: a number that the run measures.
 const fn measured(
     name: &'static str,
-    unit: Option<&'static Unit>,
+    unit: Option<&'static TableUnit>,
     about: &'static str,
-) -> Variable {
-    Variable {
+) -> TableVariable {
+    TableVariable {
         name,
-        shape: Shape::scalar(Builtin::Double),
+        shape: ValueShape::scalar(Builtin::Double),
         length: None,
         preset: Preset::Number(0.0),
         unit,
@@ -92,10 +92,10 @@ const fn measured(
     }
 }
 
-const fn flag(name: &'static str, about: &'static str) -> Variable {
-    Variable {
+const fn flag(name: &'static str, about: &'static str) -> TableVariable {
+    TableVariable {
         name,
-        shape: Shape::scalar(Builtin::Boolean),
+        shape: ValueShape::scalar(Builtin::Boolean),
         length: None,
         preset: Preset::Flag(false),
         unit: None,
@@ -104,11 +104,11 @@ const fn flag(name: &'static str, about: &'static str) -> Variable {
     }
 }
 
-const TOOL_POSITION: Variable = optional_position(
+const TOOL_POSITION: TableVariable = optional_position(
     "ToolPosition",
     "The pose of the flange at the dock of the tool, as TargetPosition of a move. Zeros: the dock that was used last.",
 );
-const TOOL_APP_URI: Variable = text(
+const TOOL_APP_URI: TableVariable = text(
     "ToolAppUri",
     Preset::None,
     "The ApplicationUri of the component that the tool is.",
@@ -149,9 +149,9 @@ pub static TYPES: [SkillType; 23] = [
             (0.0, 10_000.0),
             "How hard to hold, at most.",
         )],
-        results: &[Variable {
+        results: &[TableVariable {
             name: "Gripped",
-            shape: Shape::scalar(Builtin::Boolean),
+            shape: ValueShape::scalar(Builtin::Boolean),
             length: None,
             preset: Preset::Flag(false),
             unit: None,
@@ -495,9 +495,9 @@ pub static TYPES: [SkillType; 23] = [
         base: Some("SkillType"),
         is_abstract: false,
         about: "Starts or stops a conveyor, which goes on as it is when the run has ended.",
-        parameters: &[Variable {
+        parameters: &[TableVariable {
             name: "On",
-            shape: Shape::scalar(Builtin::Boolean),
+            shape: ValueShape::scalar(Builtin::Boolean),
             length: None,
             preset: Preset::Flag(true),
             unit: None,

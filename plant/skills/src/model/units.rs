@@ -1,18 +1,18 @@
 //! The units of parameters, results and values.
 
-use super::table::Unit;
+use super::table::TableUnit;
 
-pub(super) const NEWTON: Unit = unit("N", "newton", b"NEW");
-pub(super) const METRE: Unit = unit("m", "metre", b"MTR");
-pub(super) const SPEED: Unit = unit("m/s", "metre per second", b"MTS");
-pub(super) const ACCELERATION: Unit = unit("m/s\u{b2}", "metre per second squared", b"MSK");
-pub(super) const KILOGRAM: Unit = unit("kg", "kilogram", b"KGM");
-pub(super) const RADIAN: Unit = unit("rad", "radian", b"C81");
-pub(super) const TURNING: Unit = unit("rad/s", "radian per second", b"2A");
-pub(super) const TURNING_UP: Unit = unit("rad/s\u{b2}", "radian per second squared", b"2B");
+pub(super) const NEWTON: TableUnit = unit("N", "newton", b"NEW");
+pub(super) const METRE: TableUnit = unit("m", "metre", b"MTR");
+pub(super) const SPEED: TableUnit = unit("m/s", "metre per second", b"MTS");
+pub(super) const ACCELERATION: TableUnit = unit("m/s\u{b2}", "metre per second squared", b"MSK");
+pub(super) const KILOGRAM: TableUnit = unit("kg", "kilogram", b"KGM");
+pub(super) const RADIAN: TableUnit = unit("rad", "radian", b"C81");
+pub(super) const TURNING: TableUnit = unit("rad/s", "radian per second", b"2A");
+pub(super) const TURNING_UP: TableUnit = unit("rad/s\u{b2}", "radian per second squared", b"2B");
 
 /// The units that have a UNECE code here.
-const UNITS: &[Unit] = &[
+const UNITS: &[TableUnit] = &[
     NEWTON,
     METRE,
     SPEED,
@@ -49,7 +49,7 @@ const UNITS: &[Unit] = &[
     unit("kW\u{b7}h", "kilowatt hour", b"KWH"),
 ];
 
-impl Unit {
+impl TableUnit {
     /// Returns the unit with this symbol.
     #[must_use]
     pub fn find(symbol: &str) -> Option<&'static Self> {
@@ -57,8 +57,8 @@ impl Unit {
     }
 }
 
-const fn unit(symbol: &'static str, name: &'static str, characters: &[u8]) -> Unit {
-    Unit {
+const fn unit(symbol: &'static str, name: &'static str, characters: &[u8]) -> TableUnit {
+    TableUnit {
         symbol,
         name,
         id: code(characters),

@@ -5,28 +5,28 @@ use std::future::Future;
 use std::sync::Arc;
 
 use plant_opcua::server::{
-    IdRange, InstanceError, MethodRequest, MethodSpec, ObjectSpec, Refusal, Server, VariableSpec,
-    method,
+    IdRange, InstanceError, MethodRefusal, MethodRequest, MethodSpec, ObjectSpec, OpcUaServer,
+    VariableSpec, method,
 };
 use plant_opcua::supervision::{CONFIGURE, Supervision};
 use plant_opcua::types::{
     Argument, DataTypeId, DataValue, KeyValuePair, LocalizedText, NodeId, ObjectTypeId,
     QualifiedName, ReferenceTypeId, StatusCode, Variant,
 };
-use plant_opcua::users::Access;
+use plant_opcua::users::UserAccess;
 use tracing::{info, warn};
 
 use super::values::{describe, variable_type};
-use crate::configuration::{Configurable, Configuration, NotConfigured};
-use crate::value::Value;
+use crate::configuration::{ComponentConfiguration, Configurable, NotConfigured};
+use crate::value::SkillValue;
 use crate::variant::{from_variant, to_variant};
 
 /// Creates the object and its method. The returned future shows each change.
 pub(super) fn serve(
-    server: &Server,
+    server: &OpcUaServer,
     component: &NodeId,
     ids: &mut IdRange,
-    (configuration, by): (&Configuration, (Supervision, Arc<Access>)),
+    (configuration, by): (&ComponentConfiguration, (Supervision, Arc<UserAccess>)),
 ) -> Result<impl Future<Output = ()> + use<>, InstanceError> {
     let mut shown = Vec::new();
     if !configuration.fields().is_empty() {
@@ -81,7 +81,7 @@ pub(super) fn serve(
                 );
             })?;
             let [given] = request.arguments.as_slice() else {
-                return Err(Refusal::from(StatusCode::BadInvalidArgument));
+                return Err(MethodRefusal::from(StatusCode::BadInvalidArgument));
             };
             let set = pairs(given).and_then(|given| configuration.set(given));
             match &set {
@@ -107,7 +107,7 @@ pub(super) fn serve(
 
 /// Adds the variable of a field.
 fn add(
-    server: &Server,
+    server: &OpcUaServer,
     object: &NodeId,
     field: &Configurable,
     ids: &mut IdRange,
@@ -131,7 +131,7 @@ fn add(
 }
 
 /// Shows the fields at each change.
-async fn keep(server: Server, configuration: Configuration, nodes: Vec<NodeId>) {
+async fn keep(server: OpcUaServer, configuration: ComponentConfiguration, nodes: Vec<NodeId>) {
     let mut changes = configuration.watch();
     loop {
         changes.mark_unchanged();
@@ -156,7 +156,7 @@ async fn keep(server: Server, configuration: Configuration, nodes: Vec<NodeId>) 
 }
 
 /// Reads the argument: an array of KeyValuePair.
-fn pairs(given: &Variant) -> Result<Vec<(String, Value)>, NotConfigured> {
+fn pairs(given: &Variant) -> Result<Vec<(String, SkillValue)>, NotConfigured> {
     let wrong = |field: &str, reason: &str| NotConfigured {
         field: field.to_owned(),
         reason: reason.to_owned(),
@@ -203,7 +203,10 @@ mod tests {
             ))
         };
         let force = pairs(&pair(Variant::from(12.5)));
-        assert_eq!(force, Ok(vec![("Force".to_owned(), Value::from(12.5))]));
+        assert_eq!(
+            force,
+            Ok(vec![("Force".to_owned(), SkillValue::from(12.5))])
+        );
         let refused = pairs(&pair(Variant::Empty)).unwrap_err();
         assert_eq!(refused.field, "Force");
         assert!(pairs(&Variant::from("Force")).is_err());

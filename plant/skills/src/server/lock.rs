@@ -7,13 +7,13 @@ use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use plant_opcua::server::{
-    IdRange, Instance, InstanceError, InstanceSpec, MethodRequest, Server, method,
+    IdRange, Instance, InstanceError, InstanceSpec, MethodRequest, OpcUaServer, method,
 };
 use plant_opcua::types::{NodeId, QualifiedName, StatusCode, Variant};
 use tokio::sync::watch;
 use tokio::time::{Instant, sleep_until};
 
-use crate::authority::{Authority, Owner};
+use crate::authority::{Authority, SkillOwner};
 pub(super) use crate::model::DEVICES as NAMESPACE;
 use crate::skill::lock;
 
@@ -31,7 +31,7 @@ pub(super) fn has_di(file: &Path) -> bool {
 /// The object Lock of a component.
 #[derive(Clone)]
 pub(super) struct Lock {
-    server: Server,
+    server: OpcUaServer,
     authority: Authority,
     object: Instance,
     held: Arc<Mutex<Option<Held>>>,
@@ -49,7 +49,7 @@ impl Lock {
     /// Creates the object below the component. The returned future ends locks that are not renewed
     /// and locks of sessions that lost the lease.
     pub(super) fn serve(
-        server: &Server,
+        server: &OpcUaServer,
         authority: &Authority,
         component: &NodeId,
         ids: &mut IdRange,
@@ -93,7 +93,11 @@ impl Lock {
 
     fn init(&self, request: &MethodRequest) -> Answer {
         let session = request.caller.session;
-        if self.authority.lock_for(&Owner::Session(session)).is_err() {
+        if self
+            .authority
+            .lock_for(&SkillOwner::Session(session))
+            .is_err()
+        {
             return Ok(ALREADY_LOCKED);
         }
         let context = match request.arguments.first() {
@@ -147,7 +151,7 @@ impl Lock {
     fn free(&self) {
         let held = lock(&self.held).take();
         if let Some(held) = held {
-            self.authority.release(&Owner::Session(held.session));
+            self.authority.release(&SkillOwner::Session(held.session));
         }
         self.show(None);
         self.changed.send_replace(());
@@ -178,7 +182,8 @@ impl Lock {
                 }
                 continue;
             };
-            let is_another = |now: &Option<Owner>| *now != Some(Owner::Session(held.session));
+            let is_another =
+                |now: &Option<SkillOwner>| *now != Some(SkillOwner::Session(held.session));
             // Dropping the returned reference unlocks the watch channel, so that the holder can
             // change.
             let gone = async { drop(holder.wait_for(is_another).await) };

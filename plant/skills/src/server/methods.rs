@@ -5,21 +5,21 @@ use std::time::Duration;
 
 use async_trait::async_trait;
 use plant_opcua::server::{
-    MethodHandler, MethodRequest, Refusal as CallRefusal, Server, WriteHandler, WriteRequest,
-    method,
+    MethodHandler, MethodRefusal as CallRefusal, MethodRequest, OpcUaServer, WriteHandler,
+    WriteRequest, method,
 };
 use plant_opcua::types::{StatusCode, UAString, Variant};
-use program::Method;
+use program::ProgramMethod;
 
-use super::show::{Nodes, texts};
-use crate::authority::Owner;
+use super::show::{SkillNodes, texts};
+use crate::authority::SkillOwner;
 use crate::client::packed::frame;
-use crate::refusal::Refusal;
+use crate::refusal::SkillRefusal;
 use crate::skill::Skill;
 use crate::variant::{from_pairs, from_variant, to_pairs, to_variant};
 
 /// Registers the handlers for writes of parameters and calls of methods.
-pub(super) fn serve(server: &Server, nodes: &Nodes, skill: &Skill) {
+pub(super) fn serve(server: &OpcUaServer, nodes: &SkillNodes, skill: &Skill) {
     for (name, node) in nodes.parameters() {
         let handler = Given {
             skill: skill.clone(),
@@ -27,7 +27,7 @@ pub(super) fn serve(server: &Server, nodes: &Nodes, skill: &Skill) {
         };
         server.on_write(node, Arc::new(handler));
     }
-    for method in Method::ALL {
+    for method in ProgramMethod::ALL {
         if let Some(node) = nodes.method(method) {
             let handler = Call {
                 skill: skill.clone(),
@@ -60,7 +60,7 @@ impl WriteHandler for Given {
     async fn write(&self, request: WriteRequest) -> Result<(), StatusCode> {
         let value = request.value.value.as_ref().and_then(from_variant);
         let value = value.ok_or(StatusCode::BadTypeMismatch)?;
-        let by = Owner::Session(request.caller.session);
+        let by = SkillOwner::Session(request.caller.session);
         let written = self.skill.write(&by, &self.name, value);
         written.map_err(|refusal| status(&refusal))
     }
@@ -88,7 +88,7 @@ impl MethodHandler for Execute {
         let within = Duration::try_from_secs_f64(*ms / 1_000.0)
             .map_err(|_| StatusCode::BadInvalidArgument)?;
         let within = (!within.is_zero()).then_some(within);
-        let by = Owner::Session(request.caller.session);
+        let by = SkillOwner::Session(request.caller.session);
         match self.skill.execute(by, parameters, within).await {
             Ok(run) => Ok(vec![run.into()]),
             Err(refusal) => Err(status(&refusal).into()),
@@ -128,13 +128,13 @@ fn read_outcome(skill: &Skill, request: &MethodRequest) -> Result<Vec<Variant>, 
 
 struct Call {
     skill: Skill,
-    method: Method,
+    method: ProgramMethod,
 }
 
 #[async_trait]
 impl MethodHandler for Call {
     async fn call(&self, request: MethodRequest) -> Result<Vec<Variant>, CallRefusal> {
-        let by = Owner::Session(request.caller.session);
+        let by = SkillOwner::Session(request.caller.session);
         match self.skill.call(by, self.method).await {
             Ok(_) => Ok(Vec::new()),
             Err(refusal) => Err(status(&refusal).into()),
@@ -142,6 +142,6 @@ impl MethodHandler for Call {
     }
 }
 
-pub(super) fn status(refusal: &Refusal) -> StatusCode {
+pub(super) fn status(refusal: &SkillRefusal) -> StatusCode {
     StatusCode::from(refusal.code.number())
 }

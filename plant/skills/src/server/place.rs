@@ -4,24 +4,25 @@
 use std::sync::Arc;
 
 use plant_opcua::server::{
-    IdRange, InstanceError, MethodRequest, MethodSpec, Refusal, Server, VariableSpec, method,
+    IdRange, InstanceError, MethodRefusal, MethodRequest, MethodSpec, OpcUaServer, VariableSpec,
+    method,
 };
 use plant_opcua::supervision::{CONFIGURE, CONFIGURED, Supervision, configure_takes};
 use plant_opcua::types::{
     DataTypeId, DataValue, LocalizedText, NodeId, QualifiedName, ReferenceTypeId, StatusCode,
     VariableTypeId, Variant,
 };
-use plant_opcua::users::Access;
+use plant_opcua::users::UserAccess;
 use tracing::warn;
 
 /// Adds the method `Configure`, and properties with its last arguments, to the object of a
 /// component. Only the supervisor of the component and users with the role ConfigureAdmin may call
 /// it.
 pub(super) fn configurable(
-    server: &Server,
+    server: &OpcUaServer,
     object: &NodeId,
     ids: &mut IdRange,
-    (supervision, users): (Supervision, Arc<Access>),
+    (supervision, users): (Supervision, Arc<UserAccess>),
 ) -> Result<(), InstanceError> {
     let mut shown = Vec::new();
     for (name, _) in CONFIGURED {
@@ -74,7 +75,7 @@ pub(super) fn configurable(
             });
         let each: Vec<StatusCode> = each.collect();
         if each.contains(&StatusCode::BadOutOfRange) {
-            return Err(Refusal::Arguments(each));
+            return Err(MethodRefusal::Arguments(each));
         }
         let values = shown.iter().cloned().zip(request.arguments);
         let values = values.map(|(node, value)| (node, DataValue::new_now(value)));

@@ -6,13 +6,13 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use plant_opcua::server::{
-    IdRange, InstanceError, MethodRequest, MethodSpec, Refusal, Server, method,
+    IdRange, InstanceError, MethodRefusal, MethodRequest, MethodSpec, OpcUaServer, method,
 };
 use plant_opcua::types::{
     Argument, DataTypeId, LocalizedText, NodeId, QualifiedName, StatusCode, Variant,
 };
-use plant_opcua::users::{Access, Role, Roles};
-use program::State;
+use plant_opcua::users::{Roles, UserAccess, UserRole};
+use program::ProgramMachineState;
 
 use crate::model::POWER_OFF;
 use crate::skill::Skill;
@@ -29,11 +29,11 @@ impl fmt::Debug for PowerOff {
 
 /// Adds the method to the object of a component. It is refused while a skill runs.
 pub(super) fn serve(
-    server: &Server,
+    server: &OpcUaServer,
     object: &NodeId,
     ids: &mut IdRange,
     skills: &[Skill],
-    (power_off, users): (PowerOff, Arc<Access>),
+    (power_off, users): (PowerOff, Arc<UserAccess>),
 ) -> Result<(), InstanceError> {
     let spec = MethodSpec {
         node_id: ids.next(),
@@ -51,19 +51,24 @@ pub(super) fn serve(
     };
     let skills = skills.to_vec();
     let handler = method(move |request: MethodRequest| {
-        let may = Roles::of(&[Role::Operator, Role::Engineer]);
+        let may = Roles::of(&[UserRole::Operator, UserRole::Engineer]);
         if !users.roles_of(&request.caller).meets(may) {
-            return Err(Refusal::from(StatusCode::BadUserAccessDenied));
+            return Err(MethodRefusal::from(StatusCode::BadUserAccessDenied));
         }
-        let runs = |skill: &Skill| matches!(skill.shown().state, State::Running | State::Suspended);
+        let runs = |skill: &Skill| {
+            matches!(
+                skill.shown().state,
+                ProgramMachineState::Running | ProgramMachineState::Suspended
+            )
+        };
         if skills.iter().any(runs) {
-            return Err(Refusal::from(StatusCode::BadInvalidState));
+            return Err(MethodRefusal::from(StatusCode::BadInvalidState));
         }
         let [Variant::UInt32(delay)] = request.arguments.as_slice() else {
-            return Err(Refusal::from(StatusCode::BadInvalidArgument));
+            return Err(MethodRefusal::from(StatusCode::BadInvalidArgument));
         };
         if *delay > LONGEST_DELAY_MS {
-            return Err(Refusal::from(StatusCode::BadOutOfRange));
+            return Err(MethodRefusal::from(StatusCode::BadOutOfRange));
         }
         tracing::info!(delay, application = ?request.caller.application_uri, "switched off");
         (power_off.0)(Duration::from_millis((*delay).into()));

@@ -9,31 +9,31 @@ mod measured;
 use std::future::Future;
 
 use futures_util::future::{join_all, select_all};
-use plant_opcua::server::{IdRange, Instance, InstanceError, InstanceSpec, Server};
+use plant_opcua::server::{IdRange, Instance, InstanceError, InstanceSpec, OpcUaServer};
 use plant_opcua::types::{DataValue, LocalizedText, NodeId, QualifiedName, StatusCode, Variant};
-use program::State;
+use program::ProgramMachineState;
 
 use crate::component::Robot;
 use crate::model::DEVICES;
 use crate::skill::Skill;
 use crate::values::LiveValue;
-use crate::yaml::{Code, Finding};
+use crate::yaml::{YamlFinding, YamlFindingCode};
 
 /// Returns a finding if there is a robot and the types of OPC 40010-1 are missing.
-pub(super) fn lacks_types(server: &Server, robot: Option<&Robot>) -> Option<Finding> {
+pub(super) fn lacks_types(server: &OpcUaServer, robot: Option<&Robot>) -> Option<YamlFinding> {
     let robot = robot?;
     if server.find_type(ROBOTICS, SYSTEM).is_some() {
         return None;
     }
     let message = "a robot is shown by the types of OPC 40010-1, and they are not there";
     let help = "Opc.Ua.Robotics.NodeSet2.xml and Opc.Ua.Di.NodeSet2.xml stand under `nodesets`";
-    Some(Finding::error(Code::NodeSet, robot.place, message).with_help(help))
+    Some(YamlFinding::error(YamlFindingCode::NodeSet, robot.place, message).with_help(help))
 }
 
 /// Creates the motion device system in the DeviceSet of OPC 10000-100. The returned future updates
 /// its task control, and the nodes with values of the component.
 pub(super) fn serve(
-    server: &Server,
+    server: &OpcUaServer,
     (name, robot): (&str, &Robot),
     (skills, values): (&[Skill], &[LiveValue]),
     ids: &mut IdRange,
@@ -92,7 +92,7 @@ pub(super) fn serve(
 }
 
 /// Shows the nameplate of a device.
-fn show_plate(server: &Server, device: &Instance, robot: &Robot) {
+fn show_plate(server: &OpcUaServer, device: &Instance, robot: &Robot) {
     for (name, text) in [
         ("Manufacturer", &robot.manufacturer),
         ("Model", &robot.model),
@@ -108,14 +108,19 @@ fn show_plate(server: &Server, device: &Instance, robot: &Robot) {
 }
 
 /// Shows the running skill at each change.
-async fn keep(server: Server, task: Instance, skills: Vec<Skill>) {
+async fn keep(server: OpcUaServer, task: Instance, skills: Vec<Skill>) {
     let mut watches: Vec<_> = skills.iter().map(Skill::watch).collect();
     let mut before = None;
     loop {
         let shown = watches
             .iter_mut()
             .map(|watch| watch.borrow_and_update().state);
-        let runs = |state: State| matches!(state, State::Running | State::Suspended);
+        let runs = |state: ProgramMachineState| {
+            matches!(
+                state,
+                ProgramMachineState::Running | ProgramMachineState::Suspended
+            )
+        };
         let running = skills.iter().zip(shown).filter(|(_, state)| runs(*state));
         let names: Vec<&str> = running
             .map(|(skill, _)| skill.facts().name.as_str())
@@ -146,7 +151,7 @@ async fn keep(server: Server, task: Instance, skills: Vec<Skill>) {
     }
 }
 
-fn show(server: &Server, of: &Instance, path: &str, value: impl Into<Variant>) {
+fn show(server: &OpcUaServer, of: &Instance, path: &str, value: impl Into<Variant>) {
     if let Some(node) = of.node(path) {
         // The node exists as long as the server.
         let _shown = server.show(node, value);
@@ -159,7 +164,7 @@ fn within(of: &Instance, name: &str) -> Result<NodeId, InstanceError> {
 }
 
 struct Maker<'a> {
-    server: &'a Server,
+    server: &'a OpcUaServer,
     ids: &'a mut IdRange,
 }
 

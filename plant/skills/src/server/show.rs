@@ -4,23 +4,23 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::SystemTime;
 
-use plant_opcua::server::{Instance, Server, StateRef, TransitionEvent};
+use plant_opcua::server::{Instance, OpcUaServer, StateRef, TransitionEvent};
 use plant_opcua::types::{
     DataValue, DateTime, ExtensionObject, LocalizedText, NodeId, ProgramDiagnostic2DataType,
     QualifiedName, StatusCode, UAString, Variant,
 };
-use program::{Method, State, Transition};
+use program::{ProgramMachineState, ProgramMethod, Transition};
 
 use crate::model::{EVENT_TYPE, NAMESPACE};
-use crate::parameters::{Parameter, Parameters};
-use crate::shown::{Observer, Outcome, Shown, Told, Transitioned};
-use crate::skill::Facts;
-use crate::value::{Builtin, Value};
+use crate::parameters::{Parameters, SkillParameter};
+use crate::shown::{RunOutcome, SkillEvent, SkillObserver, SkillSnapshot, Transitioned};
+use crate::skill::SkillDescription;
+use crate::value::{Builtin, SkillValue};
 use crate::variant::to_variant;
 
 /// The nodes of a skill.
 #[derive(Debug)]
-pub(super) struct Nodes {
+pub(super) struct SkillNodes {
     name: String,
     instance: Instance,
     parameters: BTreeMap<String, NodeId>,
@@ -30,10 +30,10 @@ pub(super) struct Nodes {
     types: u16,
 }
 
-impl Nodes {
-    pub(super) fn new(server: &Server, instance: Instance, facts: &Facts) -> Self {
-        let among = |group: &str, of: &[Parameter]| {
-            let named = |parameter: &Parameter| {
+impl SkillNodes {
+    pub(super) fn new(server: &OpcUaServer, instance: Instance, facts: &SkillDescription) -> Self {
+        let among = |group: &str, of: &[SkillParameter]| {
+            let named = |parameter: &SkillParameter| {
                 let node = instance.node(&format!("{group}/{}", parameter.name))?;
                 Some((parameter.name.clone(), node.clone()))
             };
@@ -59,7 +59,7 @@ impl Nodes {
             .map(|(name, node)| (name.as_str(), node))
     }
 
-    pub(super) fn method(&self, method: Method) -> Option<&NodeId> {
+    pub(super) fn method(&self, method: ProgramMethod) -> Option<&NodeId> {
         self.named(method.name())
     }
 
@@ -69,7 +69,12 @@ impl Nodes {
     }
 
     /// Shows the constant values of the skill and its initial state.
-    pub(super) fn show_at_first(&self, server: &Server, facts: &Facts, uses: &[String]) {
+    pub(super) fn show_at_first(
+        &self,
+        server: &OpcUaServer,
+        facts: &SkillDescription,
+        uses: &[String],
+    ) {
         let mut values = Values::new(self);
         values.add("Name", facts.name.as_str());
         values.add("Capabilities", texts(&facts.capabilities));
@@ -77,7 +82,7 @@ impl Nodes {
         values.add("Deletable", false);
         values.add("AutoDelete", false);
         values.add("RecycleCount", 0_i32);
-        values.state(State::Halted);
+        values.state(ProgramMachineState::Halted);
         values.add("RunId", 0_u32);
         values.add("Progress", 0.0_f32);
         values.add("SkillStep", "");
@@ -88,13 +93,13 @@ impl Nodes {
         values.add("FinalResultData/Unknown", false);
         values.show(server);
         self.show_defaults(server, facts);
-        for method in Method::ALL {
-            self.executable(server, method, method == Method::Reset);
+        for method in ProgramMethod::ALL {
+            self.executable(server, method, method == ProgramMethod::Reset);
         }
     }
 
     /// Shows the default parameters, for a client that has not written any.
-    pub(super) fn show_defaults(&self, server: &Server, facts: &Facts) {
+    pub(super) fn show_defaults(&self, server: &OpcUaServer, facts: &SkillDescription) {
         let values = facts.parameters.iter().filter_map(|parameter| {
             let node = self.parameters.get(&parameter.name)?;
             let value = match &parameter.default {
@@ -109,7 +114,7 @@ impl Nodes {
         show(server, &self.name, values.collect());
     }
 
-    fn show_parameters(&self, server: &Server, parameters: &Parameters) {
+    fn show_parameters(&self, server: &OpcUaServer, parameters: &Parameters) {
         show(
             server,
             &self.name,
@@ -117,7 +122,7 @@ impl Nodes {
         );
     }
 
-    fn show_outcome(&self, server: &Server, outcome: &Outcome) {
+    fn show_outcome(&self, server: &OpcUaServer, outcome: &RunOutcome) {
         let mut values = Values::new(self);
         values.add("FinalResultData/Run", outcome.run);
         values.add("FinalResultData/Succeeded", outcome.succeeded);
@@ -128,7 +133,12 @@ impl Nodes {
         values.show(server);
     }
 
-    fn show_transition(&self, server: &Server, happened: &Transitioned, shown: &Shown) {
+    fn show_transition(
+        &self,
+        server: &OpcUaServer,
+        happened: &Transitioned,
+        shown: &SkillSnapshot,
+    ) {
         let Transitioned {
             transition,
             run,
@@ -147,7 +157,7 @@ impl Nodes {
         values.add("SkillStep", shown.step.as_str());
         self.diagnostic(&mut values, shown);
         values.show(server);
-        for (method, executable) in Method::ALL.into_iter().zip(shown.executable) {
+        for (method, executable) in ProgramMethod::ALL.into_iter().zip(shown.executable) {
             self.executable(server, method, executable);
         }
         let Some(event_type) = &self.event_type else {
@@ -158,7 +168,7 @@ impl Nodes {
             source_name: self.name.clone(),
             event_type: event_type.clone(),
             message: message.clone(),
-            severity: if transition.to == State::Halted {
+            severity: if transition.to == ProgramMachineState::Halted {
                 FAILED
             } else {
                 USUAL
@@ -172,7 +182,7 @@ impl Nodes {
         });
     }
 
-    fn show_progress(&self, server: &Server, shown: &Shown) {
+    fn show_progress(&self, server: &OpcUaServer, shown: &SkillSnapshot) {
         let mut values = Values::new(self);
         values.add("Progress", shown.progress);
         values.add("SkillStep", shown.step.as_str());
@@ -181,7 +191,7 @@ impl Nodes {
 
     /// Shows why a run that is being cancelled has not ended, and raises an event without a
     /// transition.
-    fn show_pending(&self, server: &Server, why: &str, shown: &Shown) {
+    fn show_pending(&self, server: &OpcUaServer, why: &str, shown: &SkillSnapshot) {
         self.show_progress(server, shown);
         let source = (self.skill().clone(), &*self.name);
         let state = state_ref(shown.state);
@@ -195,14 +205,14 @@ impl Nodes {
         });
     }
 
-    fn show_called(&self, server: &Server, shown: &Shown) {
+    fn show_called(&self, server: &OpcUaServer, shown: &SkillSnapshot) {
         let mut values = Values::new(self);
         self.diagnostic(&mut values, shown);
         values.show(server);
     }
 
     /// Sets ProgramDiagnostic as a whole and its members (OPC 10000-10, 5.2.9).
-    fn diagnostic(&self, values: &mut Values<'_>, shown: &Shown) {
+    fn diagnostic(&self, values: &mut Values<'_>, shown: &SkillSnapshot) {
         let of = &shown.diagnostic;
         let created = date_time(of.created);
         let since = date_time(shown.since);
@@ -238,7 +248,7 @@ impl Nodes {
         values.add("ProgramDiagnostic/LastMethodReturnStatus", status);
     }
 
-    fn executable(&self, server: &Server, method: Method, executable: bool) {
+    fn executable(&self, server: &OpcUaServer, method: ProgramMethod, executable: bool) {
         if let Some(node) = self.method(method)
             && let Err(status) = server.set_executable(node, executable)
         {
@@ -252,38 +262,38 @@ impl Nodes {
 
 /// An observer that shows the events of a skill.
 pub(super) struct Shower {
-    server: Server,
-    nodes: Arc<Nodes>,
+    server: OpcUaServer,
+    nodes: Arc<SkillNodes>,
 }
 
 impl Shower {
-    pub(super) fn new(server: Server, nodes: Arc<Nodes>) -> Self {
+    pub(super) fn new(server: OpcUaServer, nodes: Arc<SkillNodes>) -> Self {
         Self { server, nodes }
     }
 }
 
-impl Observer for Shower {
-    fn told(&self, what: Told<'_>, shown: &Shown) {
+impl SkillObserver for Shower {
+    fn told(&self, what: SkillEvent<'_>, shown: &SkillSnapshot) {
         let Self { server, nodes } = self;
         match what {
-            Told::Parameters(parameters) => nodes.show_parameters(server, parameters),
-            Told::Transition(happened) => nodes.show_transition(server, happened, shown),
-            Told::Step | Told::Progress => nodes.show_progress(server, shown),
-            Told::Pending(why) => nodes.show_pending(server, why, shown),
-            Told::Outcome(outcome) => nodes.show_outcome(server, outcome),
-            Told::Called => nodes.show_called(server, shown),
+            SkillEvent::Parameters(parameters) => nodes.show_parameters(server, parameters),
+            SkillEvent::Transition(happened) => nodes.show_transition(server, happened, shown),
+            SkillEvent::Step | SkillEvent::Progress => nodes.show_progress(server, shown),
+            SkillEvent::Pending(why) => nodes.show_pending(server, why, shown),
+            SkillEvent::Outcome(outcome) => nodes.show_outcome(server, outcome),
+            SkillEvent::Called => nodes.show_called(server, shown),
         }
     }
 }
 
 /// Values to be written to the nodes of a skill.
 struct Values<'n> {
-    nodes: &'n Nodes,
+    nodes: &'n SkillNodes,
     values: Vec<(NodeId, DataValue)>,
 }
 
 impl<'n> Values<'n> {
-    fn new(nodes: &'n Nodes) -> Self {
+    fn new(nodes: &'n SkillNodes) -> Self {
         Self {
             nodes,
             values: Vec::new(),
@@ -298,24 +308,30 @@ impl<'n> Values<'n> {
         }
     }
 
-    fn state(&mut self, state: State) {
+    fn state(&mut self, state: ProgramMachineState) {
         self.add("CurrentState", LocalizedText::new("en", state.name()));
         self.add("CurrentState/Id", NodeId::new(0, state.node_id()));
         self.add("CurrentState/Number", state.number());
     }
 
-    fn show(self, server: &Server) {
+    fn show(self, server: &OpcUaServer) {
         show(server, &self.nodes.name, self.values);
     }
 }
 
 pub(super) fn texts(of: &[String]) -> Variant {
-    let of = of.iter().map(|text| Value::from(text.as_str())).collect();
-    to_variant(&Value::Array(Builtin::String, of))
+    let of = of
+        .iter()
+        .map(|text| SkillValue::from(text.as_str()))
+        .collect();
+    to_variant(&SkillValue::Array(Builtin::String, of))
 }
 
-fn named(nodes: &BTreeMap<String, NodeId>, values: &[(String, Value)]) -> Vec<(NodeId, DataValue)> {
-    let shown = |(name, value): &(String, Value)| {
+fn named(
+    nodes: &BTreeMap<String, NodeId>,
+    values: &[(String, SkillValue)],
+) -> Vec<(NodeId, DataValue)> {
+    let shown = |(name, value): &(String, SkillValue)| {
         Some((
             nodes.get(name)?.clone(),
             DataValue::new_now(to_variant(value)),
@@ -324,13 +340,13 @@ fn named(nodes: &BTreeMap<String, NodeId>, values: &[(String, Value)]) -> Vec<(N
     values.iter().filter_map(shown).collect()
 }
 
-fn show(server: &Server, skill: &str, values: Vec<(NodeId, DataValue)>) {
+fn show(server: &OpcUaServer, skill: &str, values: Vec<(NodeId, DataValue)>) {
     if let Err(status) = server.show_all(values) {
         tracing::warn!(skill, "cannot show the values of the skill: {status}");
     }
 }
 
-fn state_ref(state: State) -> StateRef {
+fn state_ref(state: ProgramMachineState) -> StateRef {
     StateRef {
         name: state.name().to_owned(),
         id: NodeId::new(0, state.node_id()),

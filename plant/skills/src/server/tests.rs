@@ -1,10 +1,10 @@
 use std::path::Path;
 
 use plant_opcua::types::Variant;
-use program::{Method, State};
+use program::{ProgramMachineState, ProgramMethod};
 
 use super::*;
-use crate::value::Value;
+use crate::value::SkillValue;
 use crate::variant::from_variant;
 
 const EXAMPLES: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../../examples/plant");
@@ -61,10 +61,10 @@ async fn skills_stand_at_their_numbers_and_show_what_happens() {
     assert_eq!(names, expected);
 
     let skill = &component.skills()[0];
-    let me = Owner::Session(1);
-    skill.call(me.clone(), Method::Reset).await.unwrap();
+    let me = SkillOwner::Session(1);
+    skill.call(me.clone(), ProgramMethod::Reset).await.unwrap();
     skill.write(&me, "Force", 12.0.into()).unwrap();
-    skill.call(me, Method::Start).await.unwrap();
+    skill.call(me, ProgramMethod::Start).await.unwrap();
     let state = |value: Option<Variant>| value.map(|value| value.to_string());
     assert!(
         state(value(101)).is_some_and(|text| text.contains("Running")),
@@ -72,7 +72,7 @@ async fn skills_stand_at_their_numbers_and_show_what_happens() {
         value(101)
     );
     let mut watch = skill.watch();
-    let ended = watch.wait_for(|shown| shown.state == State::Ready);
+    let ended = watch.wait_for(|shown| shown.state == ProgramMachineState::Ready);
     tokio::time::timeout(Duration::from_secs(5), ended)
         .await
         .unwrap()
@@ -89,9 +89,9 @@ async fn skills_stand_at_their_numbers_and_show_what_happens() {
             .as_ref()
             .and_then(from_variant)
     };
-    assert_eq!(result("Succeeded"), Some(Value::Boolean(true)));
-    assert_eq!(result("Gripped"), Some(Value::Boolean(true)));
-    assert_eq!(result("Run"), Some(Value::UInt32(1)));
+    assert_eq!(result("Succeeded"), Some(SkillValue::Boolean(true)));
+    assert_eq!(result("Gripped"), Some(SkillValue::Boolean(true)));
+    assert_eq!(result("Run"), Some(SkillValue::UInt32(1)));
     component.stop().await;
 }
 
@@ -110,14 +110,14 @@ async fn a_type_of_another_maker_has_what_its_supertypes_have_and_more() {
         ]
     );
     assert_eq!(facts.types[0].namespace, "urn:example:vacuum");
-    let parameters: Vec<(&str, Option<&Value>)> = facts
+    let parameters: Vec<(&str, Option<&SkillValue>)> = facts
         .parameters
         .iter()
         .map(|of| (of.name.as_str(), of.default.as_ref()))
         .collect();
     let expected = [
-        ("Force", Some(&Value::Double(20.0))),
-        ("Vacuum", Some(&Value::Double(60.0))),
+        ("Force", Some(&SkillValue::Double(20.0))),
+        ("Vacuum", Some(&SkillValue::Double(60.0))),
     ];
     assert_eq!(parameters, expected);
     assert_eq!(facts.parameters[0].unit.as_deref(), Some("N"));
@@ -175,7 +175,7 @@ async fn drivers_are_replaced_all_or_none() {
     let fault = served.replace_drivers(&component, &names).unwrap_err();
     assert!(fault.to_string().contains("no `device`"), "{fault}");
     let grasp = served.skills()[0].clone();
-    let me = Owner::Session(1);
+    let me = SkillOwner::Session(1);
     let ends = async |run: u32| {
         let mut watch = grasp.watch();
         let ended = watch.wait_for(|shown| {

@@ -2,14 +2,14 @@
 
 use std::sync::Arc;
 
-use plant_opcua::server::Server;
+use plant_opcua::server::OpcUaServer;
 use plant_opcua::types::{DataValue, StatusCode, Variant};
 use tokio::sync::watch;
 
-use super::show::Nodes;
+use super::show::SkillNodes;
 use crate::client::ToolState;
 use crate::model::{CURRENT_TOOL, MOVER_ENDPOINT, TOOL_PLATE_OFFSET};
-use crate::value::Value;
+use crate::value::SkillValue;
 use crate::variant::to_variant;
 
 /// The optional properties of the skills of a tool changer.
@@ -17,8 +17,8 @@ pub(super) const PROPERTIES: [&str; 3] = [TOOL_PLATE_OFFSET, CURRENT_TOOL, MOVER
 
 /// Shows each change of the state.
 pub(super) async fn show(
-    server: Server,
-    skills: Vec<Arc<Nodes>>,
+    server: OpcUaServer,
+    skills: Vec<Arc<SkillNodes>>,
     mut state: watch::Receiver<ToolState>,
 ) {
     loop {
@@ -32,7 +32,7 @@ pub(super) async fn show(
     }
 }
 
-fn show_at(server: &Server, nodes: &Nodes, state: &ToolState) {
+fn show_at(server: &OpcUaServer, nodes: &SkillNodes, state: &ToolState) {
     let current = match &state.current {
         Some(tool) => DataValue::new_now(Variant::from(tool.as_str())),
         None => DataValue::new_now_status(Variant::Empty, StatusCode::BadNoCommunication),
@@ -40,7 +40,7 @@ fn show_at(server: &Server, nodes: &Nodes, state: &ToolState) {
     let values = [
         (
             TOOL_PLATE_OFFSET,
-            DataValue::new_now(to_variant(&Value::from(state.plate))),
+            DataValue::new_now(to_variant(&SkillValue::from(state.plate))),
         ),
         (CURRENT_TOOL, current),
         (

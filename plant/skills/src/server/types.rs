@@ -1,20 +1,20 @@
 //! Derives the description of a skill from its type and the instance of the type.
 
-use plant_opcua::server::{Instance, Server};
+use plant_opcua::server::{Instance, OpcUaServer};
 use plant_opcua::types::{NodeId, Variant};
 use program::Rest;
 
 use crate::model::{self, NAMESPACE, SkillType};
-use crate::parameters::{Parameter, TypeName};
-use crate::value::Shape;
+use crate::parameters::{ParameterType, SkillParameter};
+use crate::value::ValueShape;
 use crate::variant::{builtin_of, from_variant};
 
 /// Returns a type and its supertypes, nearest first.
-pub(super) fn chain(server: &Server, type_id: &NodeId) -> Vec<TypeName> {
+pub(super) fn chain(server: &OpcUaServer, type_id: &NodeId) -> Vec<ParameterType> {
     let namespaces = server.namespaces();
     let named = |id: &NodeId| {
         let name = server.browse_name(id)?;
-        Some(TypeName {
+        Some(ParameterType {
             namespace: namespaces.get(usize::from(name.namespace_index))?.clone(),
             name: name.name.as_ref().to_owned(),
         })
@@ -29,12 +29,12 @@ pub(super) fn chain(server: &Server, type_id: &NodeId) -> Vec<TypeName> {
 /// Returns the variables of a group: first the variables of types of the table, in its order, then
 /// the additional variables of other types.
 pub(super) fn parameters(
-    server: &Server,
+    server: &OpcUaServer,
     instance: &Instance,
     group: &str,
-    types: &[TypeName],
-    of_table: impl Fn(&'static SkillType) -> Vec<Parameter>,
-) -> Vec<Parameter> {
+    types: &[ParameterType],
+    of_table: impl Fn(&'static SkillType) -> Vec<SkillParameter>,
+) -> Vec<SkillParameter> {
     let nearest = types
         .iter()
         .find(|of| of.namespace == NAMESPACE)
@@ -69,9 +69,9 @@ pub(super) fn parameters(
             continue;
         };
         let property = |which: &str| instance.node(&format!("{path}/{which}"));
-        all.push(Parameter {
+        all.push(SkillParameter {
             name: name.to_owned(),
-            shape: Shape {
+            shape: ValueShape {
                 builtin,
                 array: facts.value_rank >= 1,
             },
@@ -86,7 +86,7 @@ pub(super) fn parameters(
 }
 
 /// Returns the state after a successful run, as the most derived type defines it.
-pub(super) fn rests_in(server: &Server, instance: &Instance) -> Rest {
+pub(super) fn rests_in(server: &OpcUaServer, instance: &Instance) -> Rest {
     let node = instance.node("ReadyAfterSuccess");
     match node
         .and_then(|node| server.value(node))
@@ -97,7 +97,7 @@ pub(super) fn rests_in(server: &Server, instance: &Instance) -> Rest {
     }
 }
 
-fn unit(server: &Server, node: &NodeId) -> Option<String> {
+fn unit(server: &OpcUaServer, node: &NodeId) -> Option<String> {
     let value = server.value(node)?.value?;
     let Variant::ExtensionObject(object) = value else {
         return None;
@@ -106,7 +106,7 @@ fn unit(server: &Server, node: &NodeId) -> Option<String> {
     Some(unit.display_name.text.as_ref().to_owned())
 }
 
-fn range(server: &Server, node: &NodeId) -> Option<(f64, f64)> {
+fn range(server: &OpcUaServer, node: &NodeId) -> Option<(f64, f64)> {
     let value = server.value(node)?.value?;
     let Variant::ExtensionObject(object) = value else {
         return None;

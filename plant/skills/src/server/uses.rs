@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use plant_opcua::server::{IdRange, InstanceError, InstanceSpec, ObjectSpec, Server};
+use plant_opcua::server::{IdRange, InstanceError, InstanceSpec, ObjectSpec, OpcUaServer};
 use plant_opcua::types::{NodeId, ObjectTypeId, QualifiedName, ReferenceTypeId};
 
 use crate::model::{NAMESPACE, USED_SKILL_TYPE, USES_SKILL};
@@ -10,7 +10,7 @@ use crate::model::{NAMESPACE, USED_SKILL_TYPE, USES_SKILL};
 /// Shows the skills that each skill uses, as `<component> <type>`. Each used skill has an object
 /// below the folder `UsedSkills` of the component, and a reference leads to it.
 pub(super) fn show(
-    server: &Server,
+    server: &OpcUaServer,
     component: &NodeId,
     used: &[(NodeId, Vec<String>)],
     ids: &mut IdRange,

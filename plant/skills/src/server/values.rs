@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Duration;
 
-use plant_opcua::server::{IdRange, InstanceError, ObjectSpec, Server, VariableSpec};
+use plant_opcua::server::{IdRange, InstanceError, ObjectSpec, OpcUaServer, VariableSpec};
 use plant_opcua::types::{
     DataTypeId, DataValue, EUInformation, ExtensionObject, LocalizedText, NodeId, ObjectTypeId,
     QualifiedName, Range, ReferenceTypeId, StatusCode, VariableTypeId, Variant,
@@ -13,12 +13,14 @@ use tokio::task::JoinSet;
 
 use super::show::date_time;
 use crate::component::{Component, DeviceSensor, ValueSource};
-use crate::configuration::Configuration;
-use crate::model::Unit;
-use crate::shown::Observer;
-use crate::values::{LiveValue, Measured, NOT_MEASURED, Reading, Sensor, Tally, ValueFacts, watch};
+use crate::configuration::ComponentConfiguration;
+use crate::model::TableUnit;
+use crate::shown::SkillObserver;
+use crate::values::{
+    LiveValue, Measured, NOT_MEASURED, NewestState, Tally, ValueFacts, ValueSensor, watch,
+};
 use crate::variant::to_variant;
-use crate::yaml::{Code, Finding};
+use crate::yaml::{YamlFinding, YamlFindingCode};
 
 /// The statistics of skills that computed values need, by the names of the skills; `None` for all
 /// skills.
@@ -40,7 +42,7 @@ impl Tallies {
     }
 
     /// Returns the observers of a skill.
-    pub(super) fn observers(&self, number: u16, name: &str) -> Vec<Box<dyn Observer>> {
+    pub(super) fn observers(&self, number: u16, name: &str) -> Vec<Box<dyn SkillObserver>> {
         let of = |skill: &Option<String>| skill.as_deref().is_none_or(|skill| skill == name);
         let counting = self.0.iter().filter(|(skill, _)| of(skill));
         counting.map(|(_, tally)| tally.observer(number)).collect()
@@ -49,13 +51,13 @@ impl Tallies {
 
 /// A source with the values that it measures.
 struct Group {
-    sensor: Arc<dyn Sensor>,
+    sensor: Arc<dyn ValueSensor>,
     period: Duration,
     measured: Measured,
 }
 
 /// The values of a component, by their numbers from 1, and their sources.
-pub(super) struct Made {
+pub(super) struct ComponentValues {
     pub(super) live: Vec<LiveValue>,
     groups: Vec<Group>,
 }
@@ -64,18 +66,25 @@ pub(super) struct Made {
 ///
 /// # Errors
 /// A source that this program does not support.
-pub(super) fn made(component: &Component, tallies: &Tallies) -> Result<Made, Finding> {
-    let mut made = Made {
+pub(super) fn made(
+    component: &Component,
+    tallies: &Tallies,
+) -> Result<ComponentValues, YamlFinding> {
+    let mut made = ComponentValues {
         live: Vec::new(),
         groups: Vec::new(),
     };
-    let mut devices: Option<Arc<dyn Sensor>> = None;
-    let mut computed: BTreeMap<Option<String>, Arc<dyn Sensor>> = BTreeMap::new();
+    let mut devices: Option<Arc<dyn ValueSensor>> = None;
+    let mut computed: BTreeMap<Option<String>, Arc<dyn ValueSensor>> = BTreeMap::new();
     for value in &component.values {
         let unsupported = |what: &str| {
             let message =
                 format!("this program does not support `{what}` as the source of a value");
-            Err(Finding::error(Code::Source, value.place, message))
+            Err(YamlFinding::error(
+                YamlFindingCode::Source,
+                value.place,
+                message,
+            ))
         };
         let (sensor, key) = match &value.source {
             ValueSource::Device(name) => {
@@ -123,13 +132,13 @@ pub(super) fn made(component: &Component, tallies: &Tallies) -> Result<Made, Fin
 
 /// Creates the nodes of the values, and starts the measurements.
 pub(super) fn serve(
-    server: &Server,
+    server: &OpcUaServer,
     component: &NodeId,
     ids: &mut IdRange,
-    (made, configuration): (Made, &Configuration),
+    (made, configuration): (ComponentValues, &ComponentConfiguration),
     tasks: &mut JoinSet<()>,
 ) -> Result<Vec<LiveValue>, InstanceError> {
-    let Made { live, groups } = made;
+    let ComponentValues { live, groups } = made;
     if live.is_empty() {
         return Ok(live);
     }
@@ -165,7 +174,7 @@ pub(super) fn serve(
 
 /// Passes each configured period of the measurements on.
 async fn follow(
-    configuration: Configuration,
+    configuration: ComponentConfiguration,
     (names, usual): (Vec<String>, Duration),
     periods: tokio::sync::watch::Sender<Duration>,
 ) {
@@ -187,7 +196,7 @@ async fn follow(
 
 /// Adds a variable with its properties. Returns the property with the reason of a Bad status.
 fn add(
-    server: &Server,
+    server: &OpcUaServer,
     (folder, node): (&NodeId, &NodeId),
     facts: &ValueFacts,
     ids: &mut IdRange,
@@ -222,7 +231,7 @@ pub(super) fn variable_type(facts: &ValueFacts) -> VariableTypeId {
 
 /// Adds the properties with the unit, the range and the description of a variable.
 pub(super) fn describe(
-    server: &Server,
+    server: &OpcUaServer,
     node: &NodeId,
     facts: &ValueFacts,
     ids: &mut IdRange,
@@ -251,7 +260,7 @@ pub(super) fn describe(
 }
 
 fn add_property(
-    server: &Server,
+    server: &OpcUaServer,
     node: &NodeId,
     ids: &mut IdRange,
     (name, data_type, value): (QualifiedName, DataTypeId, Variant),
@@ -276,7 +285,7 @@ fn add_property(
 /// Returns the description of a unit. A unit without a UNECE code has the UnitId -1 (OPC 10000-8,
 /// 5.6.3).
 pub(super) fn engineering_unit(symbol: &str) -> EUInformation {
-    let known = Unit::find(symbol);
+    let known = TableUnit::find(symbol);
     let id = known.and_then(|unit| i32::try_from(unit.id).ok());
     let namespace = known.map_or("", |_| UNECE);
     EUInformation {
@@ -288,7 +297,7 @@ pub(super) fn engineering_unit(symbol: &str) -> EUInformation {
 }
 
 /// Shows each change of a value.
-async fn show(server: Server, node: NodeId, reason: NodeId, value: LiveValue) {
+async fn show(server: OpcUaServer, node: NodeId, reason: NodeId, value: LiveValue) {
     let mut readings = value.watch();
     loop {
         let reading = readings.borrow_and_update().clone();
@@ -318,7 +327,7 @@ async fn show(server: Server, node: NodeId, reason: NodeId, value: LiveValue) {
 
 /// Returns the status of a reading.
 #[must_use]
-pub fn status(facts: &ValueFacts, reading: &Reading) -> StatusCode {
+pub fn status(facts: &ValueFacts, reading: &NewestState) -> StatusCode {
     match &reading.value {
         Ok(value) => match (facts.range, value.as_f64()) {
             (Some((low, high)), Some(number)) if !(low..=high).contains(&number) => {
@@ -349,9 +358,9 @@ mod tests {
     use super::*;
     use crate::component::{Device, DriverFault};
     use crate::driver::Driver;
-    use crate::parameters::TypeName;
+    use crate::parameters::ParameterType;
     use crate::server::{ComponentServer, ServeSettings};
-    use crate::value::{Builtin, Shape, Value};
+    use crate::value::{Builtin, SkillValue, ValueShape};
     use crate::values::DeviceValue;
     use crate::{DeviceKinds, PeerAccess};
 
@@ -363,7 +372,7 @@ mod tests {
     impl Device for Scale {
         fn driver(
             &self,
-            _types: &[TypeName],
+            _types: &[ParameterType],
             _peers: &PeerAccess,
         ) -> Result<Arc<dyn Driver>, DriverFault> {
             Err(DriverFault("a scale has no skills".to_owned()))
@@ -372,7 +381,7 @@ mod tests {
         fn values(&self) -> &'static [DeviceValue] {
             const VALUES: [DeviceValue; 1] = [DeviceValue {
                 name: "Weight",
-                shape: Shape::scalar(Builtin::Double),
+                shape: ValueShape::scalar(Builtin::Double),
                 unit: Some("kg"),
                 range: Some((0.0, 5.0)),
                 about: "The weight on the scale.",
@@ -394,9 +403,9 @@ mod tests {
     impl DeviceKinds for Scales {
         fn read(
             &self,
-            _node: &crate::yaml::Node,
+            _node: &crate::yaml::DocumentNode,
             _folder: &Path,
-            _reader: &mut crate::yaml::Reader<'_>,
+            _reader: &mut crate::yaml::YamlReader<'_>,
         ) -> Option<Arc<dyn Device>> {
             Some(Arc::new(Scale))
         }
@@ -424,10 +433,10 @@ mod tests {
         }
         let lost = "the scale does not answer".to_owned();
         let expected = [
-            (StatusCode::Good, Ok(Value::Double(1.5))),
+            (StatusCode::Good, Ok(SkillValue::Double(1.5))),
             (
                 StatusCode::UncertainEngineeringUnitsExceeded,
-                Ok(Value::Double(7.0)),
+                Ok(SkillValue::Double(7.0)),
             ),
             (StatusCode::BadNoCommunication, Err(lost)),
         ];
@@ -457,12 +466,12 @@ mod tests {
     fn the_first_reading_waits_for_its_value() {
         let facts = ValueFacts {
             name: "A".to_owned(),
-            shape: Shape::scalar(Builtin::Double),
+            shape: ValueShape::scalar(Builtin::Double),
             unit: None,
             range: None,
             about: String::new(),
         };
-        let reading = Reading {
+        let reading = NewestState {
             value: Err(NOT_MEASURED.to_owned()),
             at: SystemTime::UNIX_EPOCH,
         };

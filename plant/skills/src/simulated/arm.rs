@@ -7,7 +7,7 @@ use async_trait::async_trait;
 use tokio::time::Instant;
 
 use super::Profile;
-use crate::driver::{Driver, Results, Work};
+use crate::driver::{Driver, RunResults, Work};
 use crate::driver_error::{DriverError, InvalidParameter};
 use crate::parameters::Parameters;
 use crate::skill::lock;
@@ -169,7 +169,7 @@ impl Driver for Motion {
         Ok(())
     }
 
-    async fn run(&self, work: Work) -> Result<Results, DriverError> {
+    async fn run(&self, work: Work) -> Result<RunResults, DriverError> {
         let parameters = work.parameters();
         let target = parameters.six(TARGET);
         let target = target.ok_or_else(|| InvalidParameter::missing(TARGET, "six numbers"))?;
@@ -274,7 +274,7 @@ impl Driver for Joints {
         target_joints(parameters).map(drop)
     }
 
-    async fn run(&self, work: Work) -> Result<Results, DriverError> {
+    async fn run(&self, work: Work) -> Result<RunResults, DriverError> {
         let target = target_joints(work.parameters())?;
         let speed = number(work.parameters(), "MaxJointVelocity")?;
         let acceleration = number(work.parameters(), "MaxJointAcceleration")?;
@@ -339,12 +339,12 @@ const TICK: Duration = Duration::from_millis(10);
 mod tests {
     use super::*;
     use crate::conformance;
-    use crate::value::Value;
+    use crate::value::SkillValue;
 
-    fn to(target: [f64; 6], more: &[(&str, f64)]) -> Vec<(String, Value)> {
+    fn to(target: [f64; 6], more: &[(&str, f64)]) -> Vec<(String, SkillValue)> {
         let more = more
             .iter()
-            .map(|(name, value)| ((*name).to_owned(), Value::from(*value)));
+            .map(|(name, value)| ((*name).to_owned(), SkillValue::from(*value)));
         std::iter::once(("TargetPosition".to_owned(), target.into()))
             .chain(more)
             .collect()
@@ -448,7 +448,7 @@ mod tests {
             .unwrap();
     }
 
-    fn pushing(target: [f64; 6]) -> Vec<(String, Value)> {
+    fn pushing(target: [f64; 6]) -> Vec<(String, SkillValue)> {
         let mut parameters = to(target, &[]);
         parameters.push(("MaxForce".to_owned(), vec![0.0, 0.0, 20.0].into()));
         parameters

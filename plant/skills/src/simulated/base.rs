@@ -6,7 +6,7 @@ use std::time::Duration;
 use async_trait::async_trait;
 
 use super::Profile;
-use crate::driver::{Driver, Results, Work};
+use crate::driver::{Driver, RunResults, Work};
 use crate::driver_error::{DriverError, InvalidParameter};
 use crate::parameters::Parameters;
 use crate::skill::lock;
@@ -57,7 +57,7 @@ impl Driver for Navigation {
         }
     }
 
-    async fn run(&self, work: Work) -> Result<Results, DriverError> {
+    async fn run(&self, work: Work) -> Result<RunResults, DriverError> {
         let goal = work.parameters().numbers("Goal").unwrap_or_default();
         let goal: [f64; 3] = goal
             .try_into()
@@ -101,9 +101,9 @@ const TURNING: f64 = 1.0;
 mod tests {
     use super::*;
     use crate::conformance;
-    use crate::value::Value;
+    use crate::value::SkillValue;
 
-    fn to(goal: [f64; 3]) -> Vec<(String, Value)> {
+    fn to(goal: [f64; 3]) -> Vec<(String, SkillValue)> {
         vec![("Goal".to_owned(), goal.to_vec().into())]
     }
 

@@ -5,11 +5,11 @@ use std::time::Duration;
 
 use async_trait::async_trait;
 
-use crate::driver::{Driver, Results, Work};
+use crate::driver::{Driver, RunResults, Work};
 use crate::driver_error::{DriverError, InvalidParameter};
 use crate::parameters::Parameters;
 use crate::skill::lock;
-use crate::value::Value;
+use crate::value::SkillValue;
 
 /// A simulated tool changer. Its drivers share the attached tool.
 #[derive(Debug, Clone, Default)]
@@ -19,7 +19,7 @@ pub struct Changer {
 
 /// A change of the tool.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Change {
+pub enum ToolChange {
     /// AttachToolSkillType.
     Attach,
     /// DetachToolSkillType.
@@ -31,7 +31,7 @@ pub enum Change {
 impl Changer {
     /// Returns the driver of a skill; each attach or detach takes the time `takes`.
     #[must_use]
-    pub fn driver(&self, change: Change, takes: Duration) -> Arc<dyn Driver> {
+    pub fn driver(&self, change: ToolChange, takes: Duration) -> Arc<dyn Driver> {
         Arc::new(Changing {
             changer: self.clone(),
             change,
@@ -53,7 +53,7 @@ struct ToolAttached(String);
 
 struct Changing {
     changer: Changer,
-    change: Change,
+    change: ToolChange,
     takes: Duration,
 }
 
@@ -65,28 +65,28 @@ impl Driver for Changing {
 
     fn check(&self, parameters: &Parameters) -> Result<(), InvalidParameter> {
         let wanted = parameters.text("ToolAppUri");
-        if self.change != Change::Detach && wanted.is_none_or(str::is_empty) {
+        if self.change != ToolChange::Detach && wanted.is_none_or(str::is_empty) {
             return Err(InvalidParameter::Unexpected {
                 name: "ToolAppUri".to_owned(),
-                given: wanted.map(Value::from),
+                given: wanted.map(SkillValue::from),
                 expected: "is empty".to_owned(),
             });
         }
         Ok(())
     }
 
-    async fn run(&self, work: Work) -> Result<Results, DriverError> {
+    async fn run(&self, work: Work) -> Result<RunResults, DriverError> {
         let wanted = work.parameters().text("ToolAppUri").unwrap_or_default();
         let attached = self.changer.tool();
         let ways: &[&str] = match self.change {
-            Change::Attach if !attached.is_empty() && attached != wanted => {
+            ToolChange::Attach if !attached.is_empty() && attached != wanted => {
                 return Err(DriverError::device(ToolAttached(attached)));
             }
-            Change::Attach | Change::Change if attached == wanted => &[],
-            Change::Change if !attached.is_empty() => &["Detach", "Attach"],
-            Change::Attach | Change::Change => &["Attach"],
-            Change::Detach if attached.is_empty() => &[],
-            Change::Detach => &["Detach"],
+            ToolChange::Attach | ToolChange::Change if attached == wanted => &[],
+            ToolChange::Change if !attached.is_empty() => &["Detach", "Attach"],
+            ToolChange::Attach | ToolChange::Change => &["Attach"],
+            ToolChange::Detach if attached.is_empty() => &[],
+            ToolChange::Detach => &["Detach"],
         };
         for (done, way) in (1_u8..).zip(ways) {
             work.step(*way).await;
@@ -109,7 +109,7 @@ mod tests {
 
     const TAKES: Duration = Duration::from_millis(40);
 
-    fn tool(uri: &str) -> Vec<(String, Value)> {
+    fn tool(uri: &str) -> Vec<(String, SkillValue)> {
         vec![
             ("ToolPosition".to_owned(), [0.0; 6].into()),
             ("ToolAppUri".to_owned(), uri.into()),
@@ -119,7 +119,7 @@ mod tests {
     #[tokio::test]
     async fn its_driver_is_as_drivers_should_be() {
         let mut tools = ["urn:a", "urn:b", "urn:c"];
-        let driver = Changer::default().driver(Change::Change, TAKES);
+        let driver = Changer::default().driver(ToolChange::Change, TAKES);
         let another = || {
             tools.rotate_left(1);
             tool(tools[0])
@@ -136,18 +136,18 @@ mod tests {
             let driver = changer.driver(change, TAKES);
             conformance::run_once(of, driver, parameters).await.unwrap()
         };
-        let attached = run(Change::Attach, "AttachToolSkillType", tool("urn:a")).await;
+        let attached = run(ToolChange::Attach, "AttachToolSkillType", tool("urn:a")).await;
         assert_eq!(attached.results, [("Tool".to_owned(), "urn:a".into())]);
-        let second = run(Change::Attach, "AttachToolSkillType", tool("urn:b")).await;
+        let second = run(ToolChange::Attach, "AttachToolSkillType", tool("urn:b")).await;
         assert_eq!(
             (second.succeeded, second.message.as_str()),
             (false, "urn:a is attached")
         );
-        run(Change::Change, "ChangeToolSkillType", tool("urn:b")).await;
+        run(ToolChange::Change, "ChangeToolSkillType", tool("urn:b")).await;
         assert_eq!(changer.tool(), "urn:b");
-        run(Change::Detach, "DetachToolSkillType", Vec::new()).await;
+        run(ToolChange::Detach, "DetachToolSkillType", Vec::new()).await;
         assert_eq!(changer.tool(), "");
-        let nobody = changer.driver(Change::Attach, TAKES);
+        let nobody = changer.driver(ToolChange::Attach, TAKES);
         let refused = conformance::run_once("AttachToolSkillType", nobody, tool("")).await;
         assert_eq!(
             refused.unwrap_err(),

@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use async_trait::async_trait;
 
-use crate::driver::{Driver, Results, Work};
+use crate::driver::{Driver, RunResults, Work};
 use crate::driver_error::{DriverError, InvalidParameter};
 
 /// Settings of a simulated gripper.
@@ -107,7 +107,7 @@ impl Driver for Motion {
         true
     }
 
-    async fn run(&self, work: Work) -> Result<Results, DriverError> {
+    async fn run(&self, work: Work) -> Result<RunResults, DriverError> {
         let (step, holds) = if self.closes {
             ("Close", self.settings.object)
         } else {
@@ -139,7 +139,7 @@ impl Driver for Width {
         true
     }
 
-    async fn run(&self, work: Work) -> Result<Results, DriverError> {
+    async fn run(&self, work: Work) -> Result<RunResults, DriverError> {
         let width = work
             .parameters()
             .number("Width")

@@ -8,13 +8,13 @@ use program::TRANSITIONS;
 use tokio::sync::Semaphore;
 
 use super::*;
-use crate::driver::{Results, Work};
+use crate::driver::{RunResults, Work};
 use crate::driver_error::DriverError;
 use crate::model;
-use crate::shown::{Told, Transitioned};
+use crate::shown::{SkillEvent, Transitioned};
 
-const ME: Owner = Owner::Session(1);
-const OTHER: Owner = Owner::Session(2);
+const ME: SkillOwner = SkillOwner::Session(1);
+const OTHER: SkillOwner = SkillOwner::Session(2);
 const HALT_TIMEOUT: Duration = Duration::from_secs(10);
 
 /// A driver that behaves as `how` defines. A permit of `gate` lets waiting work end.
@@ -68,7 +68,7 @@ impl Driver for Scripted {
         }
     }
 
-    async fn run(&self, work: Work) -> Result<Results, DriverError> {
+    async fn run(&self, work: Work) -> Result<RunResults, DriverError> {
         self.began.fetch_add(1, Ordering::SeqCst);
         match self.how {
             How::AtOnce => {}
@@ -120,22 +120,24 @@ struct Seen {
 
 struct Log(Arc<Mutex<Seen>>);
 
-impl Observer for Log {
-    fn told(&self, what: Told<'_>, shown: &Shown) {
+impl SkillObserver for Log {
+    fn told(&self, what: SkillEvent<'_>, shown: &SkillSnapshot) {
         let mut seen = lock(&self.0);
         match what {
-            Told::Parameters(_) => seen.story.push("parameters".to_owned()),
-            Told::Transition(Transitioned {
+            SkillEvent::Parameters(_) => seen.story.push("parameters".to_owned()),
+            SkillEvent::Transition(Transitioned {
                 transition, run, ..
             }) => {
                 assert_eq!(shown.state, transition.to);
                 seen.transitions.push((transition.number, *run));
                 seen.story.push(transition.name.to_owned());
             }
-            Told::Step => seen.story.push(format!("step {}", shown.step)),
-            Told::Pending(why) => seen.story.push(format!("pending {why}")),
-            Told::Outcome(outcome) => seen.story.push(format!("outcome {}", outcome.succeeded)),
-            Told::Progress | Told::Called => {}
+            SkillEvent::Step => seen.story.push(format!("step {}", shown.step)),
+            SkillEvent::Pending(why) => seen.story.push(format!("pending {why}")),
+            SkillEvent::Outcome(outcome) => {
+                seen.story.push(format!("outcome {}", outcome.succeeded))
+            }
+            SkillEvent::Progress | SkillEvent::Called => {}
         }
     }
 }
@@ -147,13 +149,13 @@ struct Bench {
     seen: Arc<Mutex<Seen>>,
 }
 
-fn facts(type_name: &str, timeout: Option<Duration>) -> Facts {
+fn facts(type_name: &str, timeout: Option<Duration>) -> SkillDescription {
     let skill_type = model::find(type_name).unwrap();
-    Facts {
+    SkillDescription {
         name: "Grasp".to_owned(),
         types: skill_type
             .chain()
-            .map(|of| TypeName::own(of.name))
+            .map(|of| ParameterType::own(of.name))
             .collect(),
         parameters: skill_type.parameters(),
         results: skill_type.results(),
@@ -191,11 +193,11 @@ fn bench(how: How) -> Bench {
 }
 
 impl Bench {
-    async fn call(&self, method: Method) -> Result<u32, Refusal> {
+    async fn call(&self, method: ProgramMethod) -> Result<u32, SkillRefusal> {
         self.skill.call(ME, method).await
     }
 
-    async fn until(&self, state: State) -> Arc<Shown> {
+    async fn until(&self, state: ProgramMachineState) -> Arc<SkillSnapshot> {
         let mut watch = self.skill.watch();
         let found = tokio::time::timeout(
             Duration::from_secs(5),
@@ -205,9 +207,9 @@ impl Bench {
         found.expect("the state comes in time").unwrap().clone()
     }
 
-    async fn run_to(&self, state: State) -> Arc<Shown> {
-        self.call(Method::Reset).await.unwrap();
-        self.call(Method::Start).await.unwrap();
+    async fn run_to(&self, state: ProgramMachineState) -> Arc<SkillSnapshot> {
+        self.call(ProgramMethod::Reset).await.unwrap();
+        self.call(ProgramMethod::Start).await.unwrap();
         self.until(state).await
     }
 
@@ -223,21 +225,25 @@ impl Bench {
 #[tokio::test]
 async fn of_twenty_calls_eight_are_taken_and_the_others_change_nothing() {
     let mut taken = 0;
-    for state in State::ALL {
-        for method in Method::ALL {
+    for state in ProgramMachineState::ALL {
+        for method in ProgramMethod::ALL {
             let bench = bench(How::WhenLet);
-            let way: &[Method] = match state {
-                State::Halted => &[],
-                State::Ready => &[Method::Reset],
-                State::Running => &[Method::Reset, Method::Start],
-                State::Suspended => &[Method::Reset, Method::Start, Method::Suspend],
+            let way: &[ProgramMethod] = match state {
+                ProgramMachineState::Halted => &[],
+                ProgramMachineState::Ready => &[ProgramMethod::Reset],
+                ProgramMachineState::Running => &[ProgramMethod::Reset, ProgramMethod::Start],
+                ProgramMachineState::Suspended => &[
+                    ProgramMethod::Reset,
+                    ProgramMethod::Start,
+                    ProgramMethod::Suspend,
+                ],
             };
             for step in way {
                 bench.call(*step).await.unwrap();
             }
             let before = (bench.skill.shown(), bench.numbers());
             assert_eq!(before.0.state, state);
-            let executable = Method::ALL
+            let executable = ProgramMethod::ALL
                 .iter()
                 .zip(before.0.executable)
                 .any(|(of, can)| *of == method && can);
@@ -248,7 +254,7 @@ async fn of_twenty_calls_eight_are_taken_and_the_others_change_nothing() {
                 }
                 Err(refusal) => {
                     assert!(!executable, "{method} in {state}: {refusal}");
-                    assert_eq!(refusal.code, Code::InvalidState);
+                    assert_eq!(refusal.code, RefusalCode::InvalidState);
                     let after = bench.skill.shown();
                     assert_eq!(
                         (after.state, after.run, &after.parameters),
@@ -266,26 +272,26 @@ async fn of_twenty_calls_eight_are_taken_and_the_others_change_nothing() {
 async fn each_of_the_nine_transitions_is_told_once_and_in_order() {
     let bench = bench(How::WhenLet);
     let calls = [
-        Method::Reset,   // 1
-        Method::Halt,    // 9
-        Method::Reset,   // 1
-        Method::Start,   // 2
-        Method::Suspend, // 5
-        Method::Resume,  // 6
-        Method::Suspend, // 5
-        Method::Reset,   // 8
-        Method::Start,   // 2
-        Method::Suspend, // 5
-        Method::Halt,    // 7
-        Method::Reset,   // 1
-        Method::Start,   // 2
-        Method::Halt,    // 3
+        ProgramMethod::Reset,   // 1
+        ProgramMethod::Halt,    // 9
+        ProgramMethod::Reset,   // 1
+        ProgramMethod::Start,   // 2
+        ProgramMethod::Suspend, // 5
+        ProgramMethod::Resume,  // 6
+        ProgramMethod::Suspend, // 5
+        ProgramMethod::Reset,   // 8
+        ProgramMethod::Start,   // 2
+        ProgramMethod::Suspend, // 5
+        ProgramMethod::Halt,    // 7
+        ProgramMethod::Reset,   // 1
+        ProgramMethod::Start,   // 2
+        ProgramMethod::Halt,    // 3
     ];
     for method in calls {
         bench.call(method).await.unwrap();
     }
     bench.gate.add_permits(1);
-    bench.run_to(State::Ready).await; // 1 2 4
+    bench.run_to(ProgramMachineState::Ready).await; // 1 2 4
     assert_eq!(
         bench.numbers(),
         [1, 9, 1, 2, 5, 6, 5, 8, 2, 5, 7, 1, 2, 3, 1, 2, 4]
@@ -300,7 +306,7 @@ async fn each_of_the_nine_transitions_is_told_once_and_in_order() {
 #[tokio::test]
 async fn the_transition_is_told_before_the_work_begins_and_the_outcome_before_its_end() {
     let bench = bench(How::AtOnce);
-    let shown = bench.run_to(State::Ready).await;
+    let shown = bench.run_to(ProgramMachineState::Ready).await;
     let story = lock(&bench.seen).story.clone();
     let expected = [
         "HaltedToReady",
@@ -313,7 +319,7 @@ async fn the_transition_is_told_before_the_work_begins_and_the_outcome_before_it
     let outcome = shown.outcome.clone().unwrap();
     assert_eq!(
         outcome.results,
-        [("Gripped".to_owned(), Value::Boolean(true))]
+        [("Gripped".to_owned(), SkillValue::Boolean(true))]
     );
     assert_eq!((shown.run, shown.progress), (1, 1.0));
     assert_eq!(bench.skill.outcome(1), Some(outcome));
@@ -323,11 +329,12 @@ async fn the_transition_is_told_before_the_work_begins_and_the_outcome_before_it
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn ten_thousand_runs_that_end_at_once_never_stick() {
     let bench = bench(How::AtOnce);
-    bench.call(Method::Reset).await.unwrap();
+    bench.call(ProgramMethod::Reset).await.unwrap();
     let mut watch = bench.skill.watch();
     for run in 1..=10_000 {
-        assert_eq!(bench.call(Method::Start).await, Ok(run));
-        let ended = watch.wait_for(|shown| shown.state == State::Ready && shown.run == run);
+        assert_eq!(bench.call(ProgramMethod::Start).await, Ok(run));
+        let ended =
+            watch.wait_for(|shown| shown.state == ProgramMachineState::Ready && shown.run == run);
         let ended = tokio::time::timeout(Duration::from_secs(5), ended).await;
         assert!(ended.is_ok(), "run {run} does not end");
     }
@@ -337,7 +344,7 @@ async fn ten_thousand_runs_that_end_at_once_never_stick() {
 #[tokio::test]
 async fn of_two_clients_that_race_one_begins_one_run_with_its_own_parameters() {
     let bench = bench(How::WhenLet);
-    bench.call(Method::Reset).await.unwrap();
+    bench.call(ProgramMethod::Reset).await.unwrap();
     bench.skill.write(&ME, "Force", 7.0.into()).unwrap();
     let refusal = bench
         .skill
@@ -348,29 +355,33 @@ async fn of_two_clients_that_race_one_begins_one_run_with_its_own_parameters() {
         "BadLocked: session 1 has the lease of this component"
     );
     let (first, second) = tokio::join!(
-        bench.call(Method::Start),
-        bench.skill.call(OTHER, Method::Start)
+        bench.call(ProgramMethod::Start),
+        bench.skill.call(OTHER, ProgramMethod::Start)
     );
     assert_eq!(first, Ok(1));
-    assert_eq!(second.unwrap_err().code, Code::Locked);
+    assert_eq!(second.unwrap_err().code, RefusalCode::Locked);
     assert_eq!(bench.skill.shown().parameters.number("Force"), Some(7.0));
     // The authority is checked before everything else.
-    let refusal = bench.skill.call(OTHER, Method::Reset).await.unwrap_err();
-    assert_eq!(refusal.code, Code::Locked);
+    let refusal = bench
+        .skill
+        .call(OTHER, ProgramMethod::Reset)
+        .await
+        .unwrap_err();
+    assert_eq!(refusal.code, RefusalCode::Locked);
     // The run outlives the session; the lease does not.
     bench.skill.authority.release(&ME);
-    assert_eq!(bench.skill.shown().state, State::Running);
+    assert_eq!(bench.skill.shown().state, ProgramMachineState::Running);
     bench.gate.add_permits(1);
-    bench.until(State::Ready).await;
+    bench.until(ProgramMachineState::Ready).await;
     assert!(bench.skill.outcome(1).unwrap().succeeded);
     // The second client does not inherit the parameters of the first.
-    bench.skill.call(OTHER, Method::Start).await.unwrap();
+    bench.skill.call(OTHER, ProgramMethod::Start).await.unwrap();
     assert_eq!(bench.skill.shown().parameters.number("Force"), Some(20.0));
 }
 
 #[tokio::test]
 async fn a_type_that_rests_in_halted_ends_there_and_its_success_is_told() {
-    let facts = Facts {
+    let facts = SkillDescription {
         rests_in: Rest::Halted,
         ..facts("GraspSkillType", None)
     };
@@ -383,32 +394,33 @@ async fn a_type_that_rests_in_halted_ends_there_and_its_success_is_told() {
     for run in 1..=2 {
         assert_eq!(skill.execute(ME, Vec::new(), None).await, Ok(run));
         let mut watch = skill.watch();
-        let halted = watch.wait_for(|shown| shown.state == State::Halted && shown.run == run);
+        let halted =
+            watch.wait_for(|shown| shown.state == ProgramMachineState::Halted && shown.run == run);
         tokio::time::timeout(Duration::from_secs(5), halted)
             .await
             .unwrap()
             .unwrap();
         assert!(skill.outcome_of(run).unwrap().unwrap().succeeded);
     }
-    assert_eq!(skill.outcome_of(3).unwrap_err().code, Code::NotFound);
+    assert_eq!(skill.outcome_of(3).unwrap_err().code, RefusalCode::NotFound);
     assert_eq!(skill.outcome_of(0).unwrap().unwrap().run, 2);
 }
 
 #[tokio::test]
 async fn execute_makes_ready_and_begins_at_once_or_changes_nothing() {
     let bench = bench(How::WhenLet);
-    let wrong = vec![("Force".to_owned(), Value::from("much"))];
+    let wrong = vec![("Force".to_owned(), SkillValue::from("much"))];
     let refusal = bench.skill.execute(ME, wrong, None).await.unwrap_err();
-    assert_eq!(refusal.code, Code::TypeMismatch);
+    assert_eq!(refusal.code, RefusalCode::TypeMismatch);
     assert_eq!(bench.numbers(), Vec::<u32>::new());
     assert_eq!(bench.skill.execute(ME, Vec::new(), None).await, Ok(1));
     assert_eq!(bench.skill.outcome_of(1), Ok(None));
     let refusal = bench.skill.execute(ME, Vec::new(), None).await;
-    assert_eq!(refusal.unwrap_err().code, Code::InvalidState);
+    assert_eq!(refusal.unwrap_err().code, RefusalCode::InvalidState);
     let within = Some(Duration::from_millis(20));
-    bench.call(Method::Halt).await.unwrap();
+    bench.call(ProgramMethod::Halt).await.unwrap();
     assert_eq!(bench.skill.execute(ME, Vec::new(), within).await, Ok(2));
-    let shown = bench.until(State::Halted).await;
+    let shown = bench.until(ProgramMachineState::Halted).await;
     assert_eq!(
         shown.outcome.as_ref().unwrap().message,
         "the work was not done within 20ms"
@@ -419,11 +431,11 @@ async fn execute_makes_ready_and_begins_at_once_or_changes_nothing() {
 #[tokio::test]
 async fn a_full_queue_is_told_of_only_where_nothing_else_is_wrong() {
     let bench = bench(How::Deaf);
-    bench.run_to(State::Running).await;
+    bench.run_to(ProgramMachineState::Running).await;
     // Halt of work that does not react takes a second, in which calls wait.
-    let halting = bench.skill.call(ME, Method::Halt);
+    let halting = bench.skill.call(ME, ProgramMethod::Halt);
     let mut waiting: Vec<_> = (0..MOST_ORDERS)
-        .map(|_| Box::pin(bench.skill.call(ME, Method::Halt)))
+        .map(|_| Box::pin(bench.skill.call(ME, ProgramMethod::Halt)))
         .collect();
     let mut halting = Box::pin(halting);
     assert!(futures_util::poll!(&mut halting).is_pending());
@@ -431,43 +443,43 @@ async fn a_full_queue_is_told_of_only_where_nothing_else_is_wrong() {
     for call in &mut waiting {
         assert!(futures_util::poll!(call).is_pending());
     }
-    let force = |of: f64| vec![("Force".to_owned(), Value::from(of))];
+    let force = |of: f64| vec![("Force".to_owned(), SkillValue::from(of))];
     let code = async |by, given| {
         let refusal = bench.skill.start_with(by, given).await.unwrap_err();
         refusal.code
     };
-    assert_eq!(code(OTHER, force(1e9)).await, Code::Locked);
-    assert_eq!(code(ME, force(1e9)).await, Code::InvalidArgument);
-    assert_eq!(code(ME, force(1.0)).await, Code::TooManyOperations);
+    assert_eq!(code(OTHER, force(1e9)).await, RefusalCode::Locked);
+    assert_eq!(code(ME, force(1e9)).await, RefusalCode::InvalidArgument);
+    assert_eq!(code(ME, force(1.0)).await, RefusalCode::TooManyOperations);
 }
 
 #[tokio::test]
 async fn a_space_has_the_lease_while_its_run_goes_on_and_no_longer() {
     let bench = bench(How::WhenLet);
-    let space = Owner::Space(2);
+    let space = SkillOwner::Space(2);
     bench
         .skill
-        .call(space.clone(), Method::Reset)
+        .call(space.clone(), ProgramMethod::Reset)
         .await
         .unwrap();
     assert_eq!(*bench.skill.authority.holder().borrow(), None);
     bench.skill.start_with(space.clone(), vec![]).await.unwrap();
     assert_eq!(*bench.skill.authority.holder().borrow(), Some(space));
     assert_eq!(
-        bench.call(Method::Halt).await.unwrap_err().code,
-        Code::Locked
+        bench.call(ProgramMethod::Halt).await.unwrap_err().code,
+        RefusalCode::Locked
     );
     bench.gate.add_permits(1);
-    bench.until(State::Ready).await;
+    bench.until(ProgramMachineState::Ready).await;
     assert_eq!(*bench.skill.authority.holder().borrow(), None);
-    assert!(bench.call(Method::Halt).await.is_ok());
+    assert!(bench.call(ProgramMethod::Halt).await.is_ok());
 }
 
 #[tokio::test]
 async fn a_wrong_or_missing_parameter_moves_nothing() {
     let bench = bench_of(How::AtOnce, "PtpMoveSkillType", None);
-    bench.call(Method::Reset).await.unwrap();
-    let refusal = bench.call(Method::Start).await.unwrap_err();
+    bench.call(ProgramMethod::Reset).await.unwrap();
+    let refusal = bench.call(ProgramMethod::Start).await.unwrap_err();
     assert_eq!(
         refusal.to_string(),
         "BadArgumentsMissing: TargetPosition must be given"
@@ -485,25 +497,25 @@ async fn a_wrong_or_missing_parameter_moves_nothing() {
         ("MaxVelocity".to_owned(), 99.0.into()),
     ];
     let refusal = bench.skill.start_with(ME, fast).await.unwrap_err();
-    assert_eq!(refusal.code, Code::InvalidArgument);
+    assert_eq!(refusal.code, RefusalCode::InvalidArgument);
     assert_eq!(
         (bench.skill.shown().state, bench.skill.shown().run),
-        (State::Ready, 0)
+        (ProgramMachineState::Ready, 0)
     );
     assert_eq!(bench.driver.began.load(Ordering::SeqCst), 0);
     bench
         .skill
         .write(&ME, "TargetPosition", [0.1; 6].into())
         .unwrap();
-    assert_eq!(bench.call(Method::Start).await, Ok(1));
+    assert_eq!(bench.call(ProgramMethod::Start).await, Ok(1));
 }
 
 #[tokio::test]
 async fn parameters_of_a_run_are_kept_while_it_goes_on() {
     let bench = bench(How::WhenLet);
-    bench.run_to(State::Running).await;
+    bench.run_to(ProgramMachineState::Running).await;
     let refusal = bench.skill.write(&ME, "Force", 1.0.into()).unwrap_err();
-    assert_eq!(refusal.code, Code::InvalidState);
+    assert_eq!(refusal.code, RefusalCode::InvalidState);
     assert_eq!(bench.skill.shown().parameters.number("Force"), Some(20.0));
 }
 
@@ -518,7 +530,7 @@ async fn a_driver_that_breaks_down_or_fails_leaves_a_halted_skill_that_says_why(
     ] {
         let panics = matches!(how, How::Panics);
         let bench = bench(how);
-        let shown = bench.run_to(State::Halted).await;
+        let shown = bench.run_to(ProgramMachineState::Halted).await;
         let outcome = shown.outcome.clone().unwrap();
         assert_eq!(
             (outcome.run, outcome.succeeded, outcome.message.as_str()),
@@ -527,7 +539,7 @@ async fn a_driver_that_breaks_down_or_fails_leaves_a_halted_skill_that_says_why(
         assert_eq!(outcome.unknown, panics, "{why}");
         assert_eq!(bench.numbers(), [1, 2, 3]);
         assert!(
-            bench.call(Method::Reset).await.is_ok(),
+            bench.call(ProgramMethod::Reset).await.is_ok(),
             "it can be used again"
         );
     }
@@ -536,15 +548,15 @@ async fn a_driver_that_breaks_down_or_fails_leaves_a_halted_skill_that_says_why(
 #[tokio::test]
 async fn a_driver_that_does_not_hear_is_broken_off() {
     let bench = bench(How::Deaf);
-    bench.run_to(State::Running).await;
+    bench.run_to(ProgramMachineState::Running).await;
     let asked = Instant::now();
-    bench.call(Method::Halt).await.unwrap();
+    bench.call(ProgramMethod::Halt).await.unwrap();
     assert!(asked.elapsed() < Duration::from_secs(2));
-    let shown = bench.until(State::Halted).await;
+    let shown = bench.until(ProgramMachineState::Halted).await;
     let message = &shown.outcome.as_ref().unwrap().message;
     assert!(message.ends_with("was broken off"), "{message}");
-    bench.call(Method::Reset).await.unwrap();
-    assert_eq!(bench.call(Method::Start).await, Ok(2));
+    bench.call(ProgramMethod::Reset).await.unwrap();
+    assert_eq!(bench.call(ProgramMethod::Start).await, Ok(2));
 }
 
 #[tokio::test]
@@ -569,16 +581,16 @@ async fn stopped_work_without_a_known_end_needs_a_reset() {
         ),
     ] {
         let bench = bench_of(how, "GraspSkillType", limit);
-        bench.run_to(State::Running).await;
+        bench.run_to(ProgramMachineState::Running).await;
         if limit.is_none() {
-            bench.call(Method::Halt).await.unwrap();
+            bench.call(ProgramMethod::Halt).await.unwrap();
         }
-        let shown = bench.until(State::Halted).await;
+        let shown = bench.until(ProgramMachineState::Halted).await;
         assert!(shown.needs_reset);
         assert_eq!(bench.skill.outcome(1).unwrap().message, why);
         let refused = bench.skill.execute(ME, Vec::new(), None).await.unwrap_err();
-        assert_eq!(refused.code, Code::InvalidState, "{refused}");
-        bench.call(Method::Reset).await.unwrap();
+        assert_eq!(refused.code, RefusalCode::InvalidState, "{refused}");
+        bench.call(ProgramMethod::Reset).await.unwrap();
         assert!(!bench.skill.shown().needs_reset);
         assert_eq!(bench.skill.execute(ME, Vec::new(), None).await, Ok(2));
     }
@@ -587,37 +599,40 @@ async fn stopped_work_without_a_known_end_needs_a_reset() {
 #[tokio::test]
 async fn a_reset_that_stops_suspended_work_without_a_known_end_halts() {
     let bench = bench(How::Lost);
-    bench.run_to(State::Running).await;
-    bench.call(Method::Suspend).await.unwrap();
-    let refused = bench.call(Method::Reset).await.unwrap_err();
-    assert_eq!(refused.code, Code::InvalidState, "{refused}");
+    bench.run_to(ProgramMachineState::Running).await;
+    bench.call(ProgramMethod::Suspend).await.unwrap();
+    let refused = bench.call(ProgramMethod::Reset).await.unwrap_err();
+    assert_eq!(refused.code, RefusalCode::InvalidState, "{refused}");
     let shown = bench.skill.shown();
-    assert_eq!((shown.state, shown.needs_reset), (State::Halted, true));
+    assert_eq!(
+        (shown.state, shown.needs_reset),
+        (ProgramMachineState::Halted, true)
+    );
     assert!(bench.skill.outcome(1).unwrap().unknown);
-    bench.call(Method::Reset).await.unwrap();
-    assert_eq!(bench.skill.shown().state, State::Ready);
+    bench.call(ProgramMethod::Reset).await.unwrap();
+    assert_eq!(bench.skill.shown().state, ProgramMachineState::Ready);
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn what_still_blocks_is_not_started_anew() {
     let bench = bench(How::Blocks(Duration::from_secs(2)));
-    bench.run_to(State::Running).await;
-    bench.call(Method::Halt).await.unwrap();
-    let refusal = bench.call(Method::Reset).await.unwrap_err();
+    bench.run_to(ProgramMachineState::Running).await;
+    bench.call(ProgramMethod::Halt).await.unwrap();
+    let refusal = bench.call(ProgramMethod::Reset).await.unwrap_err();
     assert_eq!(
         refusal.to_string(),
         "BadInvalidState: the work of run 1 has not come to an end"
     );
-    assert_eq!(bench.skill.shown().state, State::Halted);
+    assert_eq!(bench.skill.shown().state, ProgramMachineState::Halted);
     let free = async {
-        while bench.call(Method::Reset).await.is_err() {
+        while bench.call(ProgramMethod::Reset).await.is_err() {
             tokio::time::sleep(Duration::from_millis(20)).await;
         }
     };
     tokio::time::timeout(Duration::from_secs(5), free)
         .await
         .unwrap();
-    assert_eq!(bench.skill.shown().state, State::Ready);
+    assert_eq!(bench.skill.shown().state, ProgramMachineState::Ready);
 }
 
 #[tokio::test]
@@ -627,51 +642,51 @@ async fn a_run_that_takes_too_long_fails() {
         "GraspSkillType",
         Some(Duration::from_millis(20)),
     );
-    let shown = bench.run_to(State::Halted).await;
+    let shown = bench.run_to(ProgramMachineState::Halted).await;
     assert_eq!(
         shown.outcome.as_ref().unwrap().message,
         "the work was not done within 20ms"
     );
     // Suspended time does not count.
-    bench.call(Method::Reset).await.unwrap();
-    bench.call(Method::Start).await.unwrap();
-    bench.call(Method::Suspend).await.unwrap();
+    bench.call(ProgramMethod::Reset).await.unwrap();
+    bench.call(ProgramMethod::Start).await.unwrap();
+    bench.call(ProgramMethod::Suspend).await.unwrap();
     tokio::time::sleep(Duration::from_millis(40)).await;
-    assert_eq!(bench.skill.shown().state, State::Suspended);
+    assert_eq!(bench.skill.shown().state, ProgramMachineState::Suspended);
     bench.gate.add_permits(1);
-    bench.call(Method::Resume).await.unwrap();
-    bench.until(State::Ready).await;
+    bench.call(ProgramMethod::Resume).await.unwrap();
+    bench.until(ProgramMachineState::Ready).await;
 }
 
 #[tokio::test]
 async fn work_that_is_done_while_it_is_suspended_ends_when_it_is_resumed() {
     let bench = bench(How::WhenLet);
-    bench.run_to(State::Running).await;
-    bench.call(Method::Suspend).await.unwrap();
+    bench.run_to(ProgramMachineState::Running).await;
+    bench.call(ProgramMethod::Suspend).await.unwrap();
     bench.gate.add_permits(1);
     while bench.gate.available_permits() > 0 {
         tokio::task::yield_now().await;
     }
     tokio::task::yield_now().await;
-    assert_eq!(bench.skill.shown().state, State::Suspended);
-    bench.call(Method::Resume).await.unwrap();
-    bench.until(State::Ready).await;
+    assert_eq!(bench.skill.shown().state, ProgramMachineState::Suspended);
+    bench.call(ProgramMethod::Resume).await.unwrap();
+    bench.until(ProgramMachineState::Ready).await;
     assert_eq!(bench.numbers(), [1, 2, 5, 6, 4]);
 }
 
 #[tokio::test]
 async fn suspending_is_refused_where_the_driver_cannot() {
     let bench = bench(How::Deaf);
-    let refusal = bench.call(Method::Suspend).await.unwrap_err();
+    let refusal = bench.call(ProgramMethod::Suspend).await.unwrap_err();
     assert_eq!(
         refusal.code,
-        Code::InvalidState,
+        RefusalCode::InvalidState,
         "mode comes before capability"
     );
-    bench.run_to(State::Running).await;
+    bench.run_to(ProgramMachineState::Running).await;
     assert_eq!(
-        bench.call(Method::Suspend).await.unwrap_err().code,
-        Code::NotSupported
+        bench.call(ProgramMethod::Suspend).await.unwrap_err().code,
+        RefusalCode::NotSupported
     );
 }
 
@@ -685,7 +700,7 @@ async fn a_component_does_one_thing_at_a_time() {
     });
     let authority = Authority::new();
     let skill = |name: &str| {
-        let facts = Facts {
+        let facts = SkillDescription {
             name: name.to_owned(),
             ..facts("GraspSkillType", None)
         };
@@ -693,46 +708,46 @@ async fn a_component_does_one_thing_at_a_time() {
     };
     let (one, two) = (skill("One"), skill("Two"));
     for skill in [&one, &two] {
-        skill.call(ME, Method::Reset).await.unwrap();
+        skill.call(ME, ProgramMethod::Reset).await.unwrap();
     }
-    one.call(ME, Method::Start).await.unwrap();
-    let refusal = two.call(ME, Method::Start).await.unwrap_err();
+    one.call(ME, ProgramMethod::Start).await.unwrap();
+    let refusal = two.call(ME, ProgramMethod::Start).await.unwrap_err();
     assert_eq!(
         refusal.to_string(),
         "BadInvalidState: One of this component runs, and it does one thing at a time"
     );
-    assert_eq!(two.shown().state, State::Ready);
-    one.call(ME, Method::Halt).await.unwrap();
-    assert!(two.call(ME, Method::Start).await.is_ok());
+    assert_eq!(two.shown().state, ProgramMachineState::Ready);
+    one.call(ME, ProgramMethod::Halt).await.unwrap();
+    assert!(two.call(ME, ProgramMethod::Start).await.is_ok());
 }
 
 #[tokio::test]
 async fn at_the_end_of_the_component_what_runs_is_halted() {
     let bench = bench(How::WhenLet);
-    bench.run_to(State::Running).await;
+    bench.run_to(ProgramMachineState::Running).await;
     bench.skill.close().await;
     let outcome = bench.skill.outcome(1).unwrap();
     assert_eq!(outcome.message, "halted by the end of the component");
-    assert_eq!(bench.skill.shown().state, State::Halted);
+    assert_eq!(bench.skill.shown().state, ProgramMachineState::Halted);
     assert_eq!(
-        bench.call(Method::Reset).await.unwrap_err().code,
-        Code::Shutdown
+        bench.call(ProgramMethod::Reset).await.unwrap_err().code,
+        RefusalCode::Shutdown
     );
 }
 
 #[tokio::test]
 async fn work_elsewhere_is_halted_when_it_has_ended() {
     let bench = bench(How::Elsewhere(Elsewhere::Cancels));
-    bench.run_to(State::Running).await;
-    bench.call(Method::Halt).await.unwrap();
+    bench.run_to(ProgramMachineState::Running).await;
+    bench.call(ProgramMethod::Halt).await.unwrap();
     let shown = bench.skill.shown();
-    assert_eq!(shown.state, State::Running);
+    assert_eq!(shown.state, ProgramMachineState::Running);
     assert_eq!(shown.pending.as_deref(), Some("the goal has not ended"));
     // A second Halt: the cancellation is in progress.
-    bench.call(Method::Halt).await.unwrap();
-    assert_eq!(bench.skill.shown().state, State::Running);
+    bench.call(ProgramMethod::Halt).await.unwrap();
+    assert_eq!(bench.skill.shown().state, ProgramMachineState::Running);
     bench.gate.add_permits(1);
-    let shown = bench.until(State::Halted).await;
+    let shown = bench.until(ProgramMachineState::Halted).await;
     assert_eq!((shown.pending.as_deref(), shown.needs_reset), (None, false));
     assert_eq!(bench.numbers(), [1, 2, 3]);
     let story = lock(&bench.seen).story.join(", ");
@@ -746,18 +761,21 @@ async fn work_elsewhere_is_halted_when_it_has_ended() {
 async fn work_elsewhere_without_an_end_is_unknown_and_needs_a_reset() {
     for how in [Elsewhere::NeverEnds, Elsewhere::IsLost] {
         let bench = bench(How::Elsewhere(how));
-        bench.run_to(State::Running).await;
-        bench.call(Method::Halt).await.unwrap();
-        assert_eq!(bench.skill.shown().state, State::Running);
-        let run = bench.call(Method::Halt).await.unwrap();
+        bench.run_to(ProgramMachineState::Running).await;
+        bench.call(ProgramMethod::Halt).await.unwrap();
+        assert_eq!(bench.skill.shown().state, ProgramMachineState::Running);
+        let run = bench.call(ProgramMethod::Halt).await.unwrap();
         let shown = bench.skill.shown();
-        assert_eq!((shown.state, shown.needs_reset), (State::Halted, true));
+        assert_eq!(
+            (shown.state, shown.needs_reset),
+            (ProgramMachineState::Halted, true)
+        );
         let outcome = bench.skill.outcome(run).unwrap();
         assert!(outcome.message.contains("unknown"), "{outcome:?}");
         assert!(outcome.unknown);
         let refused = bench.skill.execute(ME, Vec::new(), None).await.unwrap_err();
-        assert_eq!(refused.code, Code::InvalidState, "{refused}");
-        bench.call(Method::Reset).await.unwrap();
+        assert_eq!(refused.code, RefusalCode::InvalidState, "{refused}");
+        bench.call(ProgramMethod::Reset).await.unwrap();
         bench.skill.execute(ME, Vec::new(), None).await.unwrap();
     }
 }
@@ -765,11 +783,11 @@ async fn work_elsewhere_without_an_end_is_unknown_and_needs_a_reset() {
 #[tokio::test]
 async fn a_refused_cancellation_is_shown_as_refused() {
     let bench = bench(How::Elsewhere(Elsewhere::Refuses));
-    bench.run_to(State::Running).await;
-    let refused = bench.call(Method::Halt).await.unwrap_err();
-    assert_eq!(refused.code, Code::RequestNotAllowed, "{refused}");
+    bench.run_to(ProgramMachineState::Running).await;
+    let refused = bench.call(ProgramMethod::Halt).await.unwrap_err();
+    assert_eq!(refused.code, RefusalCode::RequestNotAllowed, "{refused}");
     let shown = bench.skill.shown();
-    assert_eq!(shown.state, State::Running);
+    assert_eq!(shown.state, ProgramMachineState::Running);
     assert_eq!(shown.pending.as_deref(), Some("the robot goes on"));
 }
 
@@ -778,12 +796,12 @@ async fn a_run_that_takes_too_long_elsewhere_ends_with_its_work() {
     let limit = Some(Duration::from_millis(50));
     let how = How::Elsewhere(Elsewhere::Cancels);
     let bench = bench_of(how, "GraspSkillType", limit);
-    bench.run_to(State::Running).await;
+    bench.run_to(ProgramMachineState::Running).await;
     let mut watch = bench.skill.watch();
     let pending = watch.wait_for(|shown| shown.pending.is_some()).await;
-    assert_eq!(pending.unwrap().state, State::Running);
+    assert_eq!(pending.unwrap().state, ProgramMachineState::Running);
     bench.gate.add_permits(1);
-    let shown = bench.until(State::Halted).await;
+    let shown = bench.until(ProgramMachineState::Halted).await;
     let outcome = shown.outcome.clone().unwrap();
     assert!(
         outcome.message.contains("not done within 50ms"),
@@ -794,7 +812,7 @@ async fn a_run_that_takes_too_long_elsewhere_ends_with_its_work() {
 #[tokio::test]
 async fn a_replaced_driver_does_the_next_run_and_not_the_run_in_progress() {
     let bench = bench(How::WhenLet);
-    bench.run_to(State::Running).await;
+    bench.run_to(ProgramMachineState::Running).await;
     let limit = Duration::from_millis(50);
     let gate = Arc::new(Semaphore::new(0));
     let next = Arc::new(Scripted {
@@ -803,10 +821,10 @@ async fn a_replaced_driver_does_the_next_run_and_not_the_run_in_progress() {
         began: AtomicU32::new(0),
     });
     bench.skill.replace(next.clone(), Some(limit));
-    bench.call(Method::Suspend).await.unwrap();
-    bench.call(Method::Resume).await.unwrap();
+    bench.call(ProgramMethod::Suspend).await.unwrap();
+    bench.call(ProgramMethod::Resume).await.unwrap();
     bench.gate.add_permits(1);
-    let first = bench.until(State::Ready).await;
+    let first = bench.until(ProgramMachineState::Ready).await;
     assert!(
         first
             .outcome
@@ -815,11 +833,11 @@ async fn a_replaced_driver_does_the_next_run_and_not_the_run_in_progress() {
     );
     assert_eq!(next.began.load(Ordering::SeqCst), 0);
 
-    bench.call(Method::Start).await.unwrap();
-    let refused = bench.call(Method::Suspend).await.unwrap_err();
-    assert_eq!(refused.code, Code::NotSupported, "{refused}");
+    bench.call(ProgramMethod::Start).await.unwrap();
+    let refused = bench.call(ProgramMethod::Suspend).await.unwrap_err();
+    assert_eq!(refused.code, RefusalCode::NotSupported, "{refused}");
     gate.add_permits(1);
-    let second = bench.until(State::Halted).await;
+    let second = bench.until(ProgramMachineState::Halted).await;
     let outcome = second.outcome.clone().unwrap();
     assert!(outcome.message.contains("within 50ms"), "{outcome:?}");
     let began = [&bench.driver, &next].map(|driver| driver.began.load(Ordering::SeqCst));

@@ -5,13 +5,13 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use async_trait::async_trait;
-use program::State;
+use program::ProgramMachineState;
 use tokio::sync::watch;
 use tokio::time::{Instant, MissedTickBehavior, interval};
 
-use super::{Measured, Sensor};
-use crate::shown::{Observer, Shown, Told};
-use crate::value::{Builtin, Shape, Value};
+use super::{Measured, ValueSensor};
+use crate::shown::{SkillEvent, SkillObserver, SkillSnapshot};
+use crate::value::{Builtin, SkillValue, ValueShape};
 
 /// A computed value.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -43,8 +43,8 @@ impl Measure {
 
     /// Returns the type.
     #[must_use]
-    pub fn shape(self) -> Shape {
-        Shape::scalar(match self {
+    pub fn shape(self) -> ValueShape {
+        ValueShape::scalar(match self {
             Self::Runs | Self::Failures => Builtin::UInt32,
             Self::MeanDuration | Self::Availability => Builtin::Double,
         })
@@ -114,13 +114,18 @@ impl Statistics {
     }
 
     /// Notes a transition of a skill.
-    pub fn moved(&mut self, skill: u16, (from, to): (State, State), now: Instant) {
+    pub fn moved(
+        &mut self,
+        skill: u16,
+        (from, to): (ProgramMachineState, ProgramMachineState),
+        now: Instant,
+    ) {
         match (from, to) {
-            (State::Ready, State::Running) => {
+            (ProgramMachineState::Ready, ProgramMachineState::Running) => {
                 self.running.retain(|(known, _)| *known != skill);
                 self.running.push((skill, now));
             }
-            (State::Halted, State::Ready) => {
+            (ProgramMachineState::Halted, ProgramMachineState::Ready) => {
                 self.down.remove(&skill);
                 if self.down.is_empty()
                     && let Some(since) = self.down_since.take()
@@ -128,7 +133,13 @@ impl Statistics {
                     self.downtime += now.duration_since(since);
                 }
             }
-            (State::Halted | State::Ready | State::Running | State::Suspended, _) => {}
+            (
+                ProgramMachineState::Halted
+                | ProgramMachineState::Ready
+                | ProgramMachineState::Running
+                | ProgramMachineState::Suspended,
+                _,
+            ) => {}
         }
     }
 
@@ -151,7 +162,7 @@ impl Statistics {
     ///
     /// # Errors
     /// There is no successful run yet.
-    pub fn value(&self, of: Measure, now: Instant) -> Result<Value, String> {
+    pub fn value(&self, of: Measure, now: Instant) -> Result<SkillValue, String> {
         Ok(match of {
             Measure::Runs => self.runs.into(),
             Measure::Failures => self.failures.into(),
@@ -193,7 +204,7 @@ impl Tally {
 
     /// Returns an observer of the skill with this number.
     #[must_use]
-    pub fn observer(&self, skill: u16) -> Box<dyn Observer> {
+    pub fn observer(&self, skill: u16) -> Box<dyn SkillObserver> {
         Box::new(Counting {
             tally: self.clone(),
             skill,
@@ -209,7 +220,7 @@ impl Tally {
 }
 
 #[async_trait]
-impl Sensor for Tally {
+impl ValueSensor for Tally {
     /// Computes the values after each change, and once in each period.
     async fn measure(&self, period: Duration, out: &Measured) -> String {
         let mut changed = self.changed.subscribe();
@@ -243,17 +254,23 @@ struct Counting {
     skill: u16,
 }
 
-impl Observer for Counting {
-    fn told(&self, what: Told<'_>, _shown: &Shown) {
+impl SkillObserver for Counting {
+    fn told(&self, what: SkillEvent<'_>, _shown: &SkillSnapshot) {
         let now = Instant::now();
         match what {
-            Told::Transition(happened) => {
+            SkillEvent::Transition(happened) => {
                 let transition = happened.transition;
                 let states = (transition.from, transition.to);
                 self.tally.lock().moved(self.skill, states, now);
             }
-            Told::Outcome(outcome) => self.tally.lock().ended(self.skill, outcome.succeeded, now),
-            Told::Parameters(_) | Told::Step | Told::Progress | Told::Pending(_) | Told::Called => {
+            SkillEvent::Outcome(outcome) => {
+                self.tally.lock().ended(self.skill, outcome.succeeded, now)
+            }
+            SkillEvent::Parameters(_)
+            | SkillEvent::Step
+            | SkillEvent::Progress
+            | SkillEvent::Pending(_)
+            | SkillEvent::Called => {
                 return;
             }
         }
@@ -274,14 +291,18 @@ mod tests {
         let start = Instant::now();
         let mut statistics = Statistics::new(start);
         let at = |count| start + seconds(count);
-        let run = (State::Ready, State::Running);
+        let run = (ProgramMachineState::Ready, ProgramMachineState::Running);
         let value = |statistics: &Statistics, of, now| {
             let value = statistics.value(of, now);
             value.map(|value| value.as_f64().unwrap())
         };
         assert!(value(&statistics, Measure::MeanDuration, start).is_err());
         assert_eq!(value(&statistics, Measure::Availability, start), Ok(100.0));
-        statistics.moved(1, (State::Halted, State::Ready), at(1));
+        statistics.moved(
+            1,
+            (ProgramMachineState::Halted, ProgramMachineState::Ready),
+            at(1),
+        );
         statistics.moved(1, run, at(2));
         statistics.ended(1, true, at(4));
         statistics.moved(2, run, at(4));
@@ -292,9 +313,17 @@ mod tests {
         // A second failure meanwhile is not counted twice as time.
         statistics.moved(2, run, at(21));
         statistics.ended(2, false, at(24));
-        statistics.moved(1, (State::Halted, State::Ready), at(26));
+        statistics.moved(
+            1,
+            (ProgramMachineState::Halted, ProgramMachineState::Ready),
+            at(26),
+        );
         assert_eq!(value(&statistics, Measure::Availability, at(40)), Ok(50.0));
-        statistics.moved(2, (State::Halted, State::Ready), at(40));
+        statistics.moved(
+            2,
+            (ProgramMachineState::Halted, ProgramMachineState::Ready),
+            at(40),
+        );
         assert_eq!(value(&statistics, Measure::Availability, at(80)), Ok(75.0));
         assert_eq!(value(&statistics, Measure::Runs, at(80)), Ok(4.0));
         assert_eq!(value(&statistics, Measure::Failures, at(80)), Ok(2.0));

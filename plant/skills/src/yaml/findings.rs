@@ -11,9 +11,9 @@ macro_rules! codes {
         /// added.
         #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
         #[non_exhaustive]
-        pub enum Code { $(#[doc = concat!($text, ", of which [`explanation`](Self::explanation) tells more.")] $name,)* }
+        pub enum YamlFindingCode { $(#[doc = concat!($text, ", of which [`explanation`](Self::explanation) tells more.")] $name,)* }
 
-        impl Code {
+        impl YamlFindingCode {
             /// All codes, in ascending order.
             pub const ALL: &'static [Self] = &[$(Self::$name),*];
 
@@ -54,7 +54,7 @@ codes! {
     Source = "P025", "A value has one source: `device` with the name of a value of the component's device, `modbus`, `io_link`, `http`, `topic` for a topic of the space, `exec` for a program, or the runs of a skill as `runs`, `failures`, `mean_duration` or `availability`.";
 }
 
-impl fmt::Display for Code {
+impl fmt::Display for YamlFindingCode {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(self.as_str())
     }
@@ -62,9 +62,9 @@ impl fmt::Display for Code {
 
 /// A finding. Each is an error: the document cannot be used with it.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Finding {
+pub struct YamlFinding {
     /// The kind.
-    pub code: Code,
+    pub code: YamlFindingCode,
     /// The location in the text.
     pub place: Place,
     /// The error, with the invalid value.
@@ -73,9 +73,9 @@ pub struct Finding {
     pub help: Option<String>,
 }
 
-impl Finding {
+impl YamlFinding {
     /// Creates an error.
-    pub fn error(code: Code, place: Place, message: impl Into<String>) -> Self {
+    pub fn error(code: YamlFindingCode, place: Place, message: impl Into<String>) -> Self {
         Self {
             code,
             place,
@@ -111,13 +111,13 @@ impl Finding {
 /// The findings of a document.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Findings {
-    found: Vec<Finding>,
+    found: Vec<YamlFinding>,
     left_out: usize,
 }
 
 impl Findings {
     /// Adds a finding. After the first 200, further findings are only counted.
-    pub fn push(&mut self, finding: Finding) {
+    pub fn push(&mut self, finding: YamlFinding) {
         if self.found.len() >= MOST {
             self.left_out += 1;
         } else if !self.found.contains(&finding) {
@@ -126,19 +126,19 @@ impl Findings {
     }
 
     /// Adds an error.
-    pub fn error(&mut self, code: Code, place: Place, message: impl Into<String>) {
-        self.push(Finding::error(code, place, message));
+    pub fn error(&mut self, code: YamlFindingCode, place: Place, message: impl Into<String>) {
+        self.push(YamlFinding::error(code, place, message));
     }
 
     /// Adds an error and how to correct it.
     pub fn error_with(
         &mut self,
-        code: Code,
+        code: YamlFindingCode,
         place: Place,
         message: impl Into<String>,
         help: impl Into<String>,
     ) {
-        self.push(Finding::error(code, place, message).with_help(help));
+        self.push(YamlFinding::error(code, place, message).with_help(help));
     }
 
     /// Returns whether there are no findings.
@@ -155,13 +155,16 @@ impl Findings {
 
     /// Returns the findings in the order of the text.
     #[must_use]
-    pub fn sorted(mut self) -> Vec<Finding> {
+    pub fn sorted(mut self) -> Vec<YamlFinding> {
         self.found
             .sort_by_key(|finding| (finding.place, finding.code));
         if self.left_out > 0 {
             let message = format!("{} more findings are not shown", self.left_out);
-            self.found
-                .push(Finding::error(Code::TooLarge, Place::START, message));
+            self.found.push(YamlFinding::error(
+                YamlFindingCode::TooLarge,
+                Place::START,
+                message,
+            ));
         }
         self.found
     }
@@ -176,8 +179,8 @@ impl Findings {
     }
 }
 
-impl Extend<Finding> for Findings {
-    fn extend<I: IntoIterator<Item = Finding>>(&mut self, findings: I) {
+impl Extend<YamlFinding> for Findings {
+    fn extend<I: IntoIterator<Item = YamlFinding>>(&mut self, findings: I) {
         findings.into_iter().for_each(|finding| self.push(finding));
     }
 }

@@ -2,17 +2,17 @@
 
 use std::time::Duration;
 
-use super::findings::{Code, Finding, Findings};
-use super::{Kind, Node, Place, nearest};
+use super::findings::{Findings, YamlFinding, YamlFindingCode};
+use super::{DocumentKind, DocumentNode, Place, nearest};
 use crate::parameters::shortened;
 
 /// Reads values from nodes and records errors.
 #[derive(Debug)]
-pub struct Reader<'f> {
+pub struct YamlReader<'f> {
     findings: &'f mut Findings,
 }
 
-impl<'f> Reader<'f> {
+impl<'f> YamlReader<'f> {
     /// Creates a reader that records errors in `findings`.
     pub fn new(findings: &'f mut Findings) -> Self {
         Self { findings }
@@ -28,10 +28,10 @@ impl<'f> Reader<'f> {
     /// resembles. Returns `None` if the node is not a map.
     pub fn map<'n, const N: usize>(
         &mut self,
-        node: &'n Node,
+        node: &'n DocumentNode,
         keys: [&str; N],
-    ) -> Option<[Option<&'n Node>; N]> {
-        let Kind::Map(pairs) = &node.kind else {
+    ) -> Option<[Option<&'n DocumentNode>; N]> {
+        let DocumentKind::Map(pairs) = &node.kind else {
             self.wrong(node, &format!("a map with {}", list(&keys)));
             return None;
         };
@@ -39,13 +39,14 @@ impl<'f> Reader<'f> {
         let mut seen: Vec<&str> = Vec::new();
         let mut misspelt = Vec::new();
         for (key, value) in pairs {
-            let Kind::Scalar(text) = &key.kind else {
+            let DocumentKind::Scalar(text) = &key.kind else {
                 self.wrong(key, "a key");
                 continue;
             };
             if seen.contains(&text.as_str()) {
                 let message = format!("the key `{}` is repeated", shortened(text));
-                self.findings.error(Code::DuplicateKey, key.place, message);
+                self.findings
+                    .error(YamlFindingCode::DuplicateKey, key.place, message);
                 continue;
             }
             seen.push(text);
@@ -54,7 +55,9 @@ impl<'f> Reader<'f> {
                 .zip(&mut values)
                 .find(|(known, _)| **known == text)
             {
-                Some((_, slot)) => *slot = Some(value).filter(|value| value.kind != Kind::Null),
+                Some((_, slot)) => {
+                    *slot = Some(value).filter(|value| value.kind != DocumentKind::Null)
+                }
                 None => {
                     let message = format!("unknown key `{}`", shortened(text));
                     let near = nearest(text, keys);
@@ -66,14 +69,14 @@ impl<'f> Reader<'f> {
                         None => format!("known here are {}", list(&keys)),
                     };
                     self.findings
-                        .error_with(Code::UnknownKey, key.place, message, help);
+                        .error_with(YamlFindingCode::UnknownKey, key.place, message, help);
                 }
             }
         }
         for (near, value) in misspelt {
             let mut slots = keys.iter().zip(&mut values);
             if let Some((_, slot @ None)) = slots.find(|(known, _)| **known == near) {
-                *slot = Some(value).filter(|value| value.kind != Kind::Null);
+                *slot = Some(value).filter(|value| value.kind != DocumentKind::Null);
             }
         }
         Some(values)
@@ -82,20 +85,23 @@ impl<'f> Reader<'f> {
     /// Requires a key.
     pub fn needed<'n>(
         &mut self,
-        value: Option<&'n Node>,
+        value: Option<&'n DocumentNode>,
         key: &str,
         of: Place,
-    ) -> Option<&'n Node> {
+    ) -> Option<&'n DocumentNode> {
         if value.is_none() {
-            self.findings
-                .error(Code::MissingKey, of, format!("`{key}` is missing"));
+            self.findings.error(
+                YamlFindingCode::MissingKey,
+                of,
+                format!("`{key}` is missing"),
+            );
         }
         value
     }
 
     /// Returns a scalar as written.
-    pub fn text<'n>(&mut self, node: &'n Node, wanted: &str) -> Option<&'n str> {
-        let Kind::Scalar(text) = &node.kind else {
+    pub fn text<'n>(&mut self, node: &'n DocumentNode, wanted: &str) -> Option<&'n str> {
+        let DocumentKind::Scalar(text) = &node.kind else {
             self.wrong(node, wanted);
             return None;
         };
@@ -103,12 +109,12 @@ impl<'f> Reader<'f> {
     }
 
     /// Returns a list; a scalar counts as a list with one element.
-    pub fn list<'n>(&mut self, node: &'n Node) -> &'n [Node] {
+    pub fn list<'n>(&mut self, node: &'n DocumentNode) -> &'n [DocumentNode] {
         match &node.kind {
-            Kind::List(nodes) => nodes,
-            Kind::Scalar(_) => std::slice::from_ref(node),
-            Kind::Null => &[],
-            Kind::Map(_) => {
+            DocumentKind::List(nodes) => nodes,
+            DocumentKind::Scalar(_) => std::slice::from_ref(node),
+            DocumentKind::Null => &[],
+            DocumentKind::Map(_) => {
                 self.wrong(node, "a list (each entry begins with `- `)");
                 &[]
             }
@@ -116,20 +122,20 @@ impl<'f> Reader<'f> {
     }
 
     /// Reads `true` or `false`.
-    pub fn boolean(&mut self, node: &Node) -> Option<bool> {
+    pub fn boolean(&mut self, node: &DocumentNode) -> Option<bool> {
         match self.text(node, "true or false")? {
             "true" => Some(true),
             "false" => Some(false),
             other => self.refuse(
                 node,
-                Code::WrongValue,
+                YamlFindingCode::WrongValue,
                 format!("expected true or false, found `{}`", shortened(other)),
             ),
         }
     }
 
     /// Reads a number within a range.
-    pub fn number(&mut self, node: &Node, (low, high): (f64, f64)) -> Option<f64> {
+    pub fn number(&mut self, node: &DocumentNode, (low, high): (f64, f64)) -> Option<f64> {
         let text = self.text(node, "a number")?;
         // Rust also parses `inf` and `nan` as numbers.
         let number = text
@@ -142,19 +148,19 @@ impl<'f> Reader<'f> {
                 "expected a number from {low} to {high}, found `{}`",
                 shortened(text)
             );
-            self.refuse(node, Code::WrongValue, message)
+            self.refuse(node, YamlFindingCode::WrongValue, message)
         })
     }
 
     /// Reads a duration with its unit, from 1 ms to 24 h.
-    pub fn duration(&mut self, node: &Node) -> Option<Duration> {
+    pub fn duration(&mut self, node: &DocumentNode) -> Option<Duration> {
         let text = self.text(node, "a duration")?;
         parse_duration(text).or_else(|| {
             let message = format!(
                 "expected a duration from 1 ms to 24 h, found `{}`",
                 shortened(text)
             );
-            let finding = Finding::error(Code::Duration, node.place, message);
+            let finding = YamlFinding::error(YamlFindingCode::Duration, node.place, message);
             self.findings
                 .push(finding.with_help("a number with its unit: 400 ms, 2.5 s, 10 min"));
             None
@@ -162,15 +168,21 @@ impl<'f> Reader<'f> {
     }
 
     /// Records an error at a node. Returns `None`.
-    pub fn refuse<T>(&mut self, node: &Node, code: Code, message: String) -> Option<T> {
+    pub fn refuse<T>(
+        &mut self,
+        node: &DocumentNode,
+        code: YamlFindingCode,
+        message: String,
+    ) -> Option<T> {
         self.findings.error(code, node.place, message);
         None
     }
 
     /// Records that `wanted` (with its article) is expected.
-    pub fn wrong(&mut self, node: &Node, wanted: &str) {
+    pub fn wrong(&mut self, node: &DocumentNode, wanted: &str) {
         let message = format!("expected {wanted}, found {}", node.kind.name());
-        self.findings.error(Code::WrongValue, node.place, message);
+        self.findings
+            .error(YamlFindingCode::WrongValue, node.place, message);
     }
 }
 

@@ -3,30 +3,30 @@
 use documents::SourceSpan as Place;
 use granit_parser::{Event, Parser, ScalarStyle, ScanError, Span};
 
-use super::findings::{Code, Finding};
+use super::findings::{YamlFinding, YamlFindingCode};
 
 /// A value of the document.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Node {
+pub struct DocumentNode {
     /// Its location.
     pub place: Place,
     /// Its content.
-    pub kind: Kind,
+    pub kind: DocumentKind,
 }
 
-impl Node {
+impl DocumentNode {
     /// Returns whether two nodes have the same content, regardless of their locations and of the
     /// order of keys.
     #[must_use]
     pub fn has_same_content(&self, other: &Self) -> bool {
         match (&self.kind, &other.kind) {
-            (Kind::Null, Kind::Null) => true,
-            (Kind::Scalar(one), Kind::Scalar(other)) => one == other,
-            (Kind::List(ones), Kind::List(others)) => {
+            (DocumentKind::Null, DocumentKind::Null) => true,
+            (DocumentKind::Scalar(one), DocumentKind::Scalar(other)) => one == other,
+            (DocumentKind::List(ones), DocumentKind::List(others)) => {
                 let mut pairs = ones.iter().zip(others);
                 ones.len() == others.len() && pairs.all(|(one, other)| one.has_same_content(other))
             }
-            (Kind::Map(ones), Kind::Map(others)) => {
+            (DocumentKind::Map(ones), DocumentKind::Map(others)) => {
                 let has = |(key, value): &(Self, Self)| {
                     others.iter().any(|(other, with)| {
                         key.has_same_content(other) && value.has_same_content(with)
@@ -34,14 +34,20 @@ impl Node {
                 };
                 ones.len() == others.len() && ones.iter().all(has)
             }
-            (Kind::Null | Kind::Scalar(_) | Kind::List(_) | Kind::Map(_), _) => false,
+            (
+                DocumentKind::Null
+                | DocumentKind::Scalar(_)
+                | DocumentKind::List(_)
+                | DocumentKind::Map(_),
+                _,
+            ) => false,
         }
     }
 
     /// Returns the value of a key; `None` without the key, and for other nodes than maps.
     #[must_use]
     pub fn get(&self, key: &str) -> Option<&Self> {
-        let Kind::Map(pairs) = &self.kind else {
+        let DocumentKind::Map(pairs) = &self.kind else {
             return None;
         };
         let found = pairs.iter().find(|(name, _)| name.text() == Some(key));
@@ -51,7 +57,7 @@ impl Node {
     /// Returns the text of a scalar.
     #[must_use]
     pub fn text(&self) -> Option<&str> {
-        if let Kind::Scalar(text) = &self.kind {
+        if let DocumentKind::Scalar(text) = &self.kind {
             return Some(text);
         }
         None
@@ -60,18 +66,18 @@ impl Node {
 
 /// The content of a node.
 #[derive(Debug, Clone, PartialEq)]
-pub enum Kind {
+pub enum DocumentKind {
     /// An empty value, `~` or `null`.
     Null,
     /// A scalar, as written.
     Scalar(String),
     /// A list.
-    List(Vec<Node>),
+    List(Vec<DocumentNode>),
     /// Keys and values in the order of the text, with repeated keys.
-    Map(Vec<(Node, Node)>),
+    Map(Vec<(DocumentNode, DocumentNode)>),
 }
 
-impl Kind {
+impl DocumentKind {
     /// Returns the name with its article.
     #[must_use]
     pub const fn name(&self) -> &'static str {
@@ -88,13 +94,17 @@ impl Kind {
 ///
 /// # Errors
 /// The first location that cannot be parsed; the text after it is not checked.
-pub fn parse(text: &str) -> Result<Node, Finding> {
+pub fn parse(text: &str) -> Result<DocumentNode, YamlFinding> {
     if text.len() > MAX_BYTES {
         let message = format!(
             "the document has {} bytes; at most {MAX_BYTES} are read",
             text.len()
         );
-        return Err(Finding::error(Code::TooLarge, Place::START, message));
+        return Err(YamlFinding::error(
+            YamlFindingCode::TooLarge,
+            Place::START,
+            message,
+        ));
     }
     let options = granit_parser::options! {
         emit_comments: false,
@@ -115,16 +125,16 @@ pub fn parse(text: &str) -> Result<Node, Finding> {
         }
         builder.event(event, place)?;
     }
-    Ok(builder.root.unwrap_or(Node {
+    Ok(builder.root.unwrap_or(DocumentNode {
         place: Place::START,
-        kind: Kind::Null,
+        kind: DocumentKind::Null,
     }))
 }
 
 #[derive(Default)]
 struct Builder {
     open: Vec<Open>,
-    root: Option<Node>,
+    root: Option<DocumentNode>,
     documents: usize,
     nodes: usize,
 }
@@ -133,11 +143,11 @@ struct Builder {
 struct Open {
     place: Place,
     map: bool,
-    children: Vec<Node>,
+    children: Vec<DocumentNode>,
 }
 
 impl Builder {
-    fn event(&mut self, event: Event<'_>, place: Place) -> Result<(), Finding> {
+    fn event(&mut self, event: Event<'_>, place: Place) -> Result<(), YamlFinding> {
         match event {
             Event::DocumentStart(..) => {
                 self.documents += 1;
@@ -154,11 +164,11 @@ impl Builder {
                 let null = style == ScalarStyle::Plain
                     && matches!(&*text, "" | "~" | "null" | "Null" | "NULL");
                 let kind = if null {
-                    Kind::Null
+                    DocumentKind::Null
                 } else {
-                    Kind::Scalar(text.into_owned())
+                    DocumentKind::Scalar(text.into_owned())
                 };
-                self.put(Node { place, kind })
+                self.put(DocumentNode { place, kind })
             }
             Event::SequenceStart(..) => self.begin(place, false),
             Event::MappingStart(..) => self.begin(place, true),
@@ -181,10 +191,14 @@ impl Builder {
         }
     }
 
-    fn begin(&mut self, place: Place, map: bool) -> Result<(), Finding> {
+    fn begin(&mut self, place: Place, map: bool) -> Result<(), YamlFinding> {
         if self.open.len() >= MAX_DEPTH {
             let message = format!("values nest deeper than {MAX_DEPTH} levels");
-            return Err(Finding::error(Code::TooLarge, place, message));
+            return Err(YamlFinding::error(
+                YamlFindingCode::TooLarge,
+                place,
+                message,
+            ));
         }
         self.open.push(Open {
             place,
@@ -194,11 +208,15 @@ impl Builder {
         Ok(())
     }
 
-    fn put(&mut self, node: Node) -> Result<(), Finding> {
+    fn put(&mut self, node: DocumentNode) -> Result<(), YamlFinding> {
         self.nodes += 1;
         if self.nodes > MAX_NODES {
             let message = format!("more than {MAX_NODES} values");
-            return Err(Finding::error(Code::TooLarge, node.place, message));
+            return Err(YamlFinding::error(
+                YamlFindingCode::TooLarge,
+                node.place,
+                message,
+            ));
         }
         match self.open.last_mut() {
             Some(open) => open.children.push(node),
@@ -209,16 +227,16 @@ impl Builder {
 }
 
 impl Open {
-    fn into_node(self) -> Node {
+    fn into_node(self) -> DocumentNode {
         let Self {
             place,
             map,
             children,
         } = self;
         if !map {
-            return Node {
+            return DocumentNode {
                 place,
-                kind: Kind::List(children),
+                kind: DocumentKind::List(children),
             };
         }
         let mut pairs = Vec::with_capacity(children.len() / 2);
@@ -226,18 +244,23 @@ impl Open {
         while let (Some(key), Some(value)) = (children.next(), children.next()) {
             pairs.push((key, value));
         }
-        Node {
+        DocumentNode {
             place,
-            kind: Kind::Map(pairs),
+            kind: DocumentKind::Map(pairs),
         }
     }
 }
 
-fn not_read(place: Place, what: &str, help: &str) -> Finding {
-    Finding::error(Code::Syntax, place, format!("{what} is not read here")).with_help(help)
+fn not_read(place: Place, what: &str, help: &str) -> YamlFinding {
+    YamlFinding::error(
+        YamlFindingCode::Syntax,
+        place,
+        format!("{what} is not read here"),
+    )
+    .with_help(help)
 }
 
-fn syntax(text: &str, error: &ScanError) -> Finding {
+fn syntax(text: &str, error: &ScanError) -> YamlFinding {
     let place = Place::of(text, Span::empty(*error.marker()));
     let line = text.lines().nth(place.line - 1).unwrap_or_default();
     let help = if line.trim_start_matches(' ').starts_with('\t') {
@@ -245,7 +268,7 @@ fn syntax(text: &str, error: &ScanError) -> Finding {
     } else {
         "nothing after this place has been checked"
     };
-    Finding::error(Code::Syntax, place, error.info()).with_help(help)
+    YamlFinding::error(YamlFindingCode::Syntax, place, error.info()).with_help(help)
 }
 
 /// Maximum size of a text, in bytes.

@@ -10,9 +10,9 @@ use std::process::ExitCode;
 use std::time::{Duration, Instant};
 
 use bridge_core::{decode_fields, encode_fields};
-use messages::{Dialect, Plan};
-use payload::Payload;
-use tree::Tree;
+use messages::{Dialect, MessagePlan};
+use payload::BenchPayload;
+use tree::MessageTree;
 use uadp::{
     DataSetHeader, Fields, GroupHeader, NetworkHeader, NetworkMessage, NetworkMessageEncoder,
     PublisherId,
@@ -94,7 +94,7 @@ fn cases() -> Vec<Case> {
 }
 
 /// Adds the cases from ROS bytes to a NetworkMessage.
-fn there(cases: &mut Vec<Case>, payload: Payload, dialect: Dialect, wire: &str) {
+fn there(cases: &mut Vec<Case>, payload: BenchPayload, dialect: Dialect, wire: &str) {
     let (plan, message) = payload.make(dialect);
     let mut datagram = Vec::new();
     let (bytes, by) = (message.clone(), plan.clone());
@@ -133,7 +133,7 @@ fn there(cases: &mut Vec<Case>, payload: Payload, dialect: Dialect, wire: &str) 
         Box::new(move |messages| {
             for _ in 0..messages {
                 datagram.clear();
-                let tree = Tree::read(&plan, black_box(&message));
+                let tree = MessageTree::read(&plan, black_box(&message));
                 into_datagram(&mut datagram, |frame| tree.encode(frame));
                 black_box(&datagram);
             }
@@ -142,7 +142,7 @@ fn there(cases: &mut Vec<Case>, payload: Payload, dialect: Dialect, wire: &str) 
 }
 
 /// Adds the cases from the fields of a DataSetMessage to ROS bytes.
-fn back(cases: &mut Vec<Case>, payload: Payload, dialect: Dialect, wire: &str) {
+fn back(cases: &mut Vec<Case>, payload: BenchPayload, dialect: Dialect, wire: &str) {
     let (plan, message) = payload.make(dialect);
     let mut datagram = Vec::new();
     encode(&plan, &message, &mut datagram);
@@ -184,7 +184,7 @@ fn back(cases: &mut Vec<Case>, payload: Payload, dialect: Dialect, wire: &str) {
         Box::new(move |messages| {
             for _ in 0..messages {
                 out.clear();
-                Tree::decode(fields(black_box(&datagram))).write(&plan, &mut out);
+                MessageTree::decode(fields(black_box(&datagram))).write(&plan, &mut out);
                 black_box(&out);
             }
         }),
@@ -199,7 +199,7 @@ fn copy(from: &[u8], to: &mut Vec<u8>, messages: u32) {
     }
 }
 
-fn encode(plan: &Plan, message: &[u8], datagram: &mut Vec<u8>) {
+fn encode(plan: &MessagePlan, message: &[u8], datagram: &mut Vec<u8>) {
     into_datagram(datagram, |frame| {
         encode_fields(plan, message, 5, frame).unwrap();
     });

@@ -1,11 +1,11 @@
 //! The messages of the benchmark, as sent by a robot.
 
-use messages::{Dialect, Plan, Registry, Selection, Source, SourceError, Wire};
+use messages::{Dialect, FieldSupplier, MessagePlan, Selection, SourceError, TypeRegistry, Wire};
 use uadp::{BuiltinType, DateTime, Scalar};
 
 /// A type, and the lengths of its arrays in order.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Payload {
+pub(crate) struct BenchPayload {
     pub(crate) name: &'static str,
     of: &'static str,
     lengths: &'static [usize],
@@ -13,13 +13,13 @@ pub(crate) struct Payload {
     pub(crate) large: bool,
 }
 
-pub(crate) const ALL: [Payload; 6] = [
+pub(crate) const ALL: [BenchPayload; 6] = [
     payload("Bool", "std_msgs/Bool", &[]),
     payload("Twist", "geometry_msgs/Twist", &[]),
     payload("JointState(6)", "sensor_msgs/JointState", &[6, 6, 6, 6]),
     payload("Odometry", "nav_msgs/Odometry", &[36, 36]),
     payload("LaserScan(720)", "sensor_msgs/LaserScan", &[720, 720]),
-    Payload {
+    BenchPayload {
         large: true,
         ..payload(
             "PointCloud2(1 MB)",
@@ -29,8 +29,8 @@ pub(crate) const ALL: [Payload; 6] = [
     },
 ];
 
-const fn payload(name: &'static str, of: &'static str, lengths: &'static [usize]) -> Payload {
-    Payload {
+const fn payload(name: &'static str, of: &'static str, lengths: &'static [usize]) -> BenchPayload {
+    BenchPayload {
         name,
         of,
         lengths,
@@ -38,16 +38,16 @@ const fn payload(name: &'static str, of: &'static str, lengths: &'static [usize]
     }
 }
 
-impl Payload {
+impl BenchPayload {
     /// Returns the plan of the type and a message.
-    pub(crate) fn make(&self, dialect: Dialect) -> (Plan, Vec<u8>) {
+    pub(crate) fn make(&self, dialect: Dialect) -> (MessagePlan, Vec<u8>) {
         let wire = match dialect {
             Dialect::Ros1 => Wire::Ros1,
             Dialect::Ros2 => Wire::Cdr,
         };
         let of = self.of.parse().unwrap();
-        let message = Registry::bundle(dialect).get(&of).unwrap();
-        let plan = Plan::compile(&message, &Selection::Whole, wire).unwrap();
+        let message = TypeRegistry::bundle(dialect).get(&of).unwrap();
+        let plan = MessagePlan::compile(&message, &Selection::Whole, wire).unwrap();
         let mut out = Vec::new();
         plan.write(&mut Filler(self.lengths.iter()), &mut out)
             .unwrap();
@@ -70,7 +70,7 @@ impl Filler {
     }
 }
 
-impl Source<'static> for Filler {
+impl FieldSupplier<'static> for Filler {
     fn scalar(&mut self, expected: BuiltinType) -> Result<Scalar<'static>, SourceError> {
         Ok(match expected {
             BuiltinType::Boolean => Scalar::Boolean(true),

@@ -1,7 +1,7 @@
 //! The same conversion with a tree of owned values between message and fields, as in bridges
 //! without a plan.
 
-use messages::{Plan, Sink, Source, SourceError, TypeName};
+use messages::{FieldSink, FieldSupplier, MessagePlan, SourceError, TypeName};
 use uadp::{BuiltinType, DateTime, FieldEncoder, NodeId, Scalar};
 
 /// A value with all nested values. Arrays of numbers are one buffer, which favours the tree.
@@ -57,13 +57,13 @@ impl Value {
 
 /// The fields of a message.
 #[derive(Debug, Default)]
-pub(crate) struct Tree {
+pub(crate) struct MessageTree {
     fields: Vec<Value>,
     inside: bool,
 }
 
-impl Tree {
-    pub(crate) fn read(plan: &Plan, message: &[u8]) -> Self {
+impl MessageTree {
+    pub(crate) fn read(plan: &MessagePlan, message: &[u8]) -> Self {
         let mut tree = Self::default();
         plan.read(message, &mut tree).unwrap();
         tree
@@ -85,7 +85,7 @@ impl Tree {
         tree
     }
 
-    pub(crate) fn write(&self, plan: &Plan, out: &mut Vec<u8>) {
+    pub(crate) fn write(&self, plan: &MessagePlan, out: &mut Vec<u8>) {
         let mut walk = Walk {
             fields: self.fields.iter(),
             elements: [].iter(),
@@ -130,7 +130,7 @@ fn encode(value: &Value, frame: &mut FieldEncoder<'_>) {
     }
 }
 
-impl Tree {
+impl MessageTree {
     fn push(&mut self, value: Value) {
         match self.fields.last_mut() {
             Some(Value::Structures(_, structures)) if self.inside => {
@@ -141,7 +141,7 @@ impl Tree {
     }
 }
 
-impl Sink for Tree {
+impl FieldSink for MessageTree {
     type Error = ();
 
     fn scalar(&mut self, value: Scalar<'_>) -> Result<(), ()> {
@@ -190,7 +190,7 @@ struct Walk<'t> {
     elements: std::slice::Iter<'t, Value>,
 }
 
-impl<'t> Source<'t> for Walk<'t> {
+impl<'t> FieldSupplier<'t> for Walk<'t> {
     fn scalar(&mut self, _: BuiltinType) -> Result<Scalar<'t>, SourceError> {
         self.fields
             .next()

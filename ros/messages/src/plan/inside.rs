@@ -4,9 +4,9 @@ use std::convert::Infallible;
 
 use uadp::{BuiltinType, Scalar};
 
-use super::shaped::{ShapingSink, Stop, wide};
-use super::{Op, Part, Plan, read};
-use crate::{Leaf, MessageType, PlanError, Rank, ReadError, Sink, TypeName, ValueFault};
+use super::shaped::{NotPassed, ShapingSink, wide};
+use super::{ArrayPart, MessagePlan, Op, read};
+use crate::{ArrayRank, FieldSink, Leaf, MessageType, PlanError, ReadError, TypeName, ValueFault};
 
 /// Selects a field of a message in an array.
 #[derive(Clone, Debug)]
@@ -34,7 +34,7 @@ impl Inside {
     pub(super) fn compile(
         message: &MessageType,
         array: &str,
-        (of, inner): (&Part, &str),
+        (of, inner): (&ArrayPart, &str),
     ) -> Result<Self, PlanError> {
         let fault = |what: &'static str| PlanError::Shape {
             name: message.name().clone(),
@@ -58,10 +58,10 @@ impl Inside {
         let (target, leaf) = place(inner)?;
         let mut last = target;
         let which = match of {
-            Part::Element(at) => Which::At(wide(*at)),
-            Part::Named { by, name } => {
+            ArrayPart::Element(at) => Which::At(wide(*at)),
+            ArrayPart::Named { by, name } => {
                 let (by, text) = place(by)?;
-                if (text.builtin, text.rank) != (BuiltinType::String, Rank::Scalar) {
+                if (text.builtin, text.rank) != (BuiltinType::String, ArrayRank::Scalar) {
                     return Err(fault("is selected by a field that is not a text"));
                 }
                 last = last.max(by);
@@ -70,7 +70,7 @@ impl Inside {
                     name: name.clone(),
                 }
             }
-            Part::Slice { .. } | Part::Inside { .. } => {
+            ArrayPart::Slice { .. } | ArrayPart::Inside { .. } => {
                 return Err(fault("selects a field of a single message, not of several"));
             }
         };
@@ -90,7 +90,7 @@ impl Inside {
     /// Returns the index of the message in this payload.
     pub(super) fn find<E>(
         &self,
-        plan: &Plan,
+        plan: &MessagePlan,
         ops: &[Op],
         payload: &[u8],
     ) -> Result<usize, ReadError<E>> {
@@ -117,11 +117,11 @@ impl Inside {
     }
 
     /// Returns a sink that passes on only the field of that message.
-    pub(super) fn picking<'p, 's, S: Sink>(
+    pub(super) fn picking<'p, 's, S: FieldSink>(
         &self,
         at: usize,
         sink: &'p mut ShapingSink<'s, S>,
-    ) -> impl Sink<Error = Stop<S::Error>> + use<'p, 's, S> {
+    ) -> impl FieldSink<Error = NotPassed<S::Error>> + use<'p, 's, S> {
         Counting {
             wanted: self.target,
             at: 0,
@@ -146,7 +146,7 @@ struct Counting<W> {
 }
 
 /// The use of the selected value of each message.
-trait Shown {
+trait ValueUse {
     type Error;
     fn count(&mut self, _messages: usize) -> Result<(), Self::Error> {
         Ok(())
@@ -170,7 +170,7 @@ impl<W> Counting<W> {
     }
 }
 
-impl<W: Shown> Sink for Counting<W> {
+impl<W: ValueUse> FieldSink for Counting<W> {
     type Error = W::Error;
 
     fn scalar(&mut self, value: Scalar<'_>) -> Result<(), W::Error> {
@@ -228,7 +228,7 @@ struct Finder<'n> {
     found: Option<usize>,
 }
 
-impl Shown for Finder<'_> {
+impl ValueUse for Finder<'_> {
     type Error = Infallible;
 
     fn scalar(&mut self, at: usize, value: Scalar<'_>) -> Result<(), Infallible> {
@@ -262,14 +262,14 @@ struct Picker<'p, 's, S> {
     sink: &'p mut ShapingSink<'s, S>,
 }
 
-impl<S: Sink> Shown for Picker<'_, '_, S> {
-    type Error = Stop<S::Error>;
+impl<S: FieldSink> ValueUse for Picker<'_, '_, S> {
+    type Error = NotPassed<S::Error>;
 
     fn count(&mut self, messages: usize) -> Result<(), Self::Error> {
         if self.at < messages {
             return Ok(());
         }
-        Err(Stop::Value(ValueFault::Absent {
+        Err(NotPassed::Value(ValueFault::Absent {
             at: self.at,
             found: messages,
         }))

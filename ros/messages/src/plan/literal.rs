@@ -2,10 +2,10 @@
 
 use uadp::{BuiltinType, DateTime, Scalar};
 
-use super::What;
-use crate::definition::{Clock, Constant, Number, Primitive};
-use crate::resolve::{Shape, ShapeKind};
-use crate::{MessageType, PlanError, Source, SourceError, TypeName, millis_to_duration};
+use super::PlanStep;
+use crate::definition::{ClockType, Constant, Number, Primitive};
+use crate::resolve::{MessageShape, ShapeKind};
+use crate::{FieldSupplier, MessageType, PlanError, SourceError, TypeName, millis_to_duration};
 
 /// A value as written by users.
 ///
@@ -55,7 +55,7 @@ pub fn constant(builtin: BuiltinType, text: &str) -> Option<Scalar<'_>> {
 }
 
 /// A constant and its field.
-pub(super) struct Given<'m> {
+pub(super) struct GivenConstant<'m> {
     message: &'m TypeName,
     path: &'m str,
     literal: &'m Literal,
@@ -63,9 +63,9 @@ pub(super) struct Given<'m> {
     names: Vec<&'m Constant>,
 }
 
-impl<'m> Given<'m> {
+impl<'m> GivenConstant<'m> {
     pub(super) fn new(message: &'m MessageType, path: &'m str, literal: &'m Literal) -> Self {
-        let mut around: Vec<&Shape> = vec![&message.shape];
+        let mut around: Vec<&MessageShape> = vec![&message.shape];
         for part in path.split('.') {
             let inner = around.last().and_then(|shape| {
                 let field = shape.fields.iter().find(|field| field.name == part)?;
@@ -85,28 +85,29 @@ impl<'m> Given<'m> {
         }
     }
 
-    pub(super) fn typed(&self, what: &What) -> Result<Typed, PlanError> {
+    pub(super) fn typed(&self, what: &PlanStep) -> Result<Typed, PlanError> {
         match (what, self.literal) {
-            (What::One(primitive), Literal::One(text)) => {
+            (PlanStep::One(primitive), Literal::One(text)) => {
                 Ok(Typed::One(self.value(*primitive, text)?))
             }
-            (What::Bytes(_), Literal::List(texts)) => {
-                Ok(Typed::One(Value::Bytes(self.packed(Number::UInt8, texts)?)))
-            }
-            (What::Packed(number, _), Literal::List(texts)) => {
+            (PlanStep::Bytes(_), Literal::List(texts)) => Ok(Typed::One(LiteralValue::Bytes(
+                self.packed(Number::UInt8, texts)?,
+            ))),
+            (PlanStep::Packed(number, _), Literal::List(texts)) => {
                 Ok(Typed::Packed(texts.len(), self.packed(*number, texts)?))
             }
-            (What::Many(primitive, _), Literal::List(texts)) => {
+            (PlanStep::Many(primitive, _), Literal::List(texts)) => {
                 let values = texts.iter().map(|text| self.value(*primitive, text));
                 Ok(Typed::Many(values.collect::<Result<_, _>>()?))
             }
-            (What::One(primitive), Literal::List(_)) => {
+            (PlanStep::One(primitive), Literal::List(_)) => {
                 Err(self.fault("a list", &self.expected(*primitive)))
             }
-            (What::Bytes(_) | What::Packed(..) | What::Many(..), Literal::One(text)) => {
-                Err(self.fault(text, "a list, as [1, 2]"))
-            }
-            (What::Messages { .. } | What::Skip { .. } | What::Run(..), literal) => {
+            (
+                PlanStep::Bytes(_) | PlanStep::Packed(..) | PlanStep::Many(..),
+                Literal::One(text),
+            ) => Err(self.fault(text, "a list, as [1, 2]")),
+            (PlanStep::Messages { .. } | PlanStep::Skip { .. } | PlanStep::Run(..), literal) => {
                 let text = match literal {
                     Literal::One(text) => text,
                     Literal::List(_) => "a list",
@@ -119,7 +120,7 @@ impl<'m> Given<'m> {
         }
     }
 
-    fn value(&self, primitive: Primitive, text: &str) -> Result<Value, PlanError> {
+    fn value(&self, primitive: Primitive, text: &str) -> Result<LiteralValue, PlanError> {
         parse(primitive, self.said(primitive, text))
             .ok_or_else(|| self.fault(text, &self.expected(primitive)))
     }
@@ -148,10 +149,10 @@ impl<'m> Given<'m> {
     fn expected(&self, primitive: Primitive) -> String {
         let told = match primitive {
             Primitive::Number(number) => expected(number).to_owned(),
-            Primitive::Clock(Clock::Time1 | Clock::Time2) => {
+            Primitive::Clock(ClockType::Time1 | ClockType::Time2) => {
                 return "possible here: a time cannot be a constant".to_owned();
             }
-            Primitive::Clock(Clock::Duration1 | Clock::Duration2) => {
+            Primitive::Clock(ClockType::Duration1 | ClockType::Duration2) => {
                 "a duration with its unit, such as 500ms or 2s".to_owned()
             }
             Primitive::Text(_) => "a text".to_owned(),
@@ -211,20 +212,20 @@ const fn expected(number: Number) -> &'static str {
 /// The constant of a field.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) enum Typed {
-    One(Value),
+    One(LiteralValue),
     /// Number of elements, and the elements little endian without gaps.
     Packed(usize, Vec<u8>),
-    Many(Vec<Value>),
+    Many(Vec<LiteralValue>),
 }
 
 #[derive(Clone, Debug, PartialEq)]
-pub(super) enum Value {
+pub(super) enum LiteralValue {
     Fixed(Scalar<'static>),
     Text(String),
     Bytes(Vec<u8>),
 }
 
-impl Value {
+impl LiteralValue {
     fn scalar(&self) -> Scalar<'_> {
         match self {
             Self::Fixed(scalar) => *scalar,
@@ -235,8 +236,8 @@ impl Value {
 }
 
 impl Typed {
-    pub(super) fn source(&self) -> Player<'_> {
-        Player {
+    pub(super) fn source(&self) -> LiteralSource<'_> {
+        LiteralSource {
             typed: self,
             next: 0,
         }
@@ -244,13 +245,13 @@ impl Typed {
 }
 
 /// Supplies a constant like a received value.
-pub(super) struct Player<'t> {
+pub(super) struct LiteralSource<'t> {
     typed: &'t Typed,
     /// Index of the next element.
     next: usize,
 }
 
-impl<'t> Source<'t> for Player<'t> {
+impl<'t> FieldSupplier<'t> for LiteralSource<'t> {
     fn scalar(&mut self, _expected: BuiltinType) -> Result<Scalar<'t>, SourceError> {
         match self.typed {
             Typed::One(value) => Ok(value.scalar()),
@@ -298,14 +299,14 @@ impl<'t> Source<'t> for Player<'t> {
     }
 }
 
-fn parse(primitive: Primitive, text: &str) -> Option<Value> {
+fn parse(primitive: Primitive, text: &str) -> Option<LiteralValue> {
     match primitive {
-        Primitive::Number(number) => Some(Value::Fixed(self::number(number, text)?.0)),
-        Primitive::Clock(Clock::Duration1 | Clock::Duration2) => {
-            Some(Value::Fixed(Scalar::Double(millis(text)?)))
+        Primitive::Number(number) => Some(LiteralValue::Fixed(self::number(number, text)?.0)),
+        Primitive::Clock(ClockType::Duration1 | ClockType::Duration2) => {
+            Some(LiteralValue::Fixed(Scalar::Double(millis(text)?)))
         }
-        Primitive::Clock(Clock::Time1 | Clock::Time2) => None,
-        Primitive::Text(_) => Some(Value::Text(text.to_owned())),
+        Primitive::Clock(ClockType::Time1 | ClockType::Time2) => None,
+        Primitive::Text(_) => Some(LiteralValue::Text(text.to_owned())),
     }
 }
 

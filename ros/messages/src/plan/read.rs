@@ -4,9 +4,9 @@ use std::marker::PhantomData;
 
 use uadp::{BuiltinType, Scalar};
 
-use super::{Len, MAX_WITHOUT_BYTES, Op, Plan, What, Wire};
-use crate::definition::{Clock, Number, Primitive};
-use crate::{Fault, ReadError, Sink, TypeName, duration_to_millis, time_to_date_time};
+use super::{Len, MAX_WITHOUT_BYTES, MessagePlan, Op, PlanStep, Wire};
+use crate::definition::{ClockType, Number, Primitive};
+use crate::{FieldSink, MessageFault, ReadError, TypeName, duration_to_millis, time_to_date_time};
 
 /// The layout of numbers in the payload.
 trait Layout {
@@ -30,12 +30,12 @@ impl Layout for BigCdr {
 }
 
 enum Stop<E> {
-    Fault(Fault),
+    Fault(MessageFault),
     Sink(E),
 }
 
-impl<E> From<Fault> for Stop<E> {
-    fn from(fault: Fault) -> Self {
+impl<E> From<MessageFault> for Stop<E> {
+    fn from(fault: MessageFault) -> Self {
         Self::Fault(fault)
     }
 }
@@ -54,8 +54,8 @@ struct Reader<'p, 's, L, S> {
     layout: PhantomData<L>,
 }
 
-pub(super) fn read<S: Sink>(
-    plan: &Plan,
+pub(super) fn read<S: FieldSink>(
+    plan: &MessagePlan,
     ops: &[Op],
     payload: &[u8],
     sink: &mut S,
@@ -64,8 +64,8 @@ pub(super) fn read<S: Sink>(
 }
 
 /// Reads a message as a structure.
-pub(super) fn structure<S: Sink>(
-    plan: &Plan,
+pub(super) fn structure<S: FieldSink>(
+    plan: &MessagePlan,
     (of, ops): (&TypeName, &[Op]),
     payload: &[u8],
     sink: &mut S,
@@ -80,8 +80,8 @@ pub(super) fn structure<S: Sink>(
 }
 
 /// Reads a message. `inside`: whether the fields belong to a structure.
-fn as_wire<S: Sink>(
-    plan: &Plan,
+fn as_wire<S: FieldSink>(
+    plan: &MessagePlan,
     (ops, inside): (&[Op], bool),
     payload: &[u8],
     sink: &mut S,
@@ -95,18 +95,18 @@ fn as_wire<S: Sink>(
         fault,
     };
     let Some(([high, low, _, _], data)) = payload.split_first_chunk() else {
-        return Err(malformed(payload.len(), Fault::Truncated));
+        return Err(malformed(payload.len(), MessageFault::Truncated));
     };
     match u16::from_be_bytes([*high, *low]) {
         0 => run::<BigCdr, S>(plan, (ops, inside), (data, 4), sink),
         1 => run::<LittleCdr, S>(plan, (ops, inside), (data, 4), sink),
-        other => Err(malformed(0, Fault::Encapsulation(other))),
+        other => Err(malformed(0, MessageFault::Encapsulation(other))),
     }
 }
 
 /// Runs the steps. `offset`: the start of `data` in the payload.
-fn run<L: Layout, S: Sink>(
-    plan: &Plan,
+fn run<L: Layout, S: FieldSink>(
+    plan: &MessagePlan,
     (ops, inside): (&[Op], bool),
     (data, offset): (&[u8], usize),
     sink: &mut S,
@@ -124,7 +124,7 @@ fn run<L: Layout, S: Sink>(
     let left = data.len().saturating_sub(reader.at);
     if done.is_ok() && !L::ALIGNED && left > 0 {
         reader.leaf = None;
-        done = Err(Stop::Fault(Fault::TrailingBytes(left)));
+        done = Err(Stop::Fault(MessageFault::TrailingBytes(left)));
     }
     let (leaf, at) = (reader.leaf, reader.at);
     done.map_err(|stop| match stop {
@@ -140,25 +140,25 @@ fn run<L: Layout, S: Sink>(
     })
 }
 
-impl<'p, L: Layout, S: Sink> Reader<'p, '_, L, S> {
+impl<'p, L: Layout, S: FieldSink> Reader<'p, '_, L, S> {
     /// Runs steps. `inside`: whether the steps belong to an element.
     fn steps(&mut self, mut ops: &[Op], inside: bool) -> Result<(), Stop<S::Error>> {
         while let Some((op, after)) = ops.split_first() {
             ops = after;
             self.leaf = Some(op.leaf);
             match &op.what {
-                What::One(primitive) if op.carry => self.one(*primitive, S::scalar)?,
-                What::One(primitive) => self.skip_one(*primitive)?,
-                What::Run(number, count) => {
+                PlanStep::One(primitive) if op.carry => self.one(*primitive, S::scalar)?,
+                PlanStep::One(primitive) => self.skip_one(*primitive)?,
+                PlanStep::Run(number, count) => {
                     if self.run(*number, *count).map_err(Stop::Sink)? {
                         ops = ops.get(usize::from(*count)..).unwrap_or_default();
                     }
                 }
-                What::Skip { align, bytes } => {
+                PlanStep::Skip { align, bytes } => {
                     self.take(*align, *bytes)?;
                 }
-                What::Packed(number, len) => self.packed(*number, *len, op.carry)?,
-                What::Bytes(len) => {
+                PlanStep::Packed(number, len) => self.packed(*number, *len, op.carry)?,
+                PlanStep::Bytes(len) => {
                     let count = self.count(*len)?;
                     let bytes = self.take(1, count)?;
                     if op.carry {
@@ -167,8 +167,8 @@ impl<'p, L: Layout, S: Sink> Reader<'p, '_, L, S> {
                             .map_err(Stop::Sink)?;
                     }
                 }
-                What::Many(primitive, len) => self.many(*primitive, *len, op.carry)?,
-                What::Messages {
+                PlanStep::Many(primitive, len) => self.many(*primitive, *len, op.carry)?,
+                PlanStep::Messages {
                     of,
                     len,
                     steps,
@@ -283,7 +283,7 @@ impl<'p, L: Layout, S: Sink> Reader<'p, '_, L, S> {
         Ok(taken)
     }
 
-    fn skip_one(&mut self, primitive: Primitive) -> Result<(), Fault> {
+    fn skip_one(&mut self, primitive: Primitive) -> Result<(), MessageFault> {
         match primitive {
             Primitive::Text(text) => {
                 let said = length(self.u32()?)?;
@@ -339,34 +339,34 @@ impl<'p, L: Layout, S: Sink> Reader<'p, '_, L, S> {
         (0..count).try_for_each(|_| self.one(primitive, S::element))
     }
 
-    fn clock(&mut self, clock: Clock) -> Result<Scalar<'static>, Fault> {
+    fn clock(&mut self, clock: ClockType) -> Result<Scalar<'static>, MessageFault> {
         let (first, second) = (self.u32()?, self.u32()?);
         let signed = first.cast_signed();
         Ok(match clock {
-            Clock::Time1 => Scalar::DateTime(time_to_date_time(i64::from(first), second)),
-            Clock::Time2 => Scalar::DateTime(time_to_date_time(i64::from(signed), second)),
-            Clock::Duration1 => {
+            ClockType::Time1 => Scalar::DateTime(time_to_date_time(i64::from(first), second)),
+            ClockType::Time2 => Scalar::DateTime(time_to_date_time(i64::from(signed), second)),
+            ClockType::Duration1 => {
                 Scalar::Double(duration_to_millis(signed, i64::from(second.cast_signed())))
             }
-            Clock::Duration2 => Scalar::Double(duration_to_millis(signed, i64::from(second))),
+            ClockType::Duration2 => Scalar::Double(duration_to_millis(signed, i64::from(second))),
         })
     }
 
-    fn narrow(&mut self, bound: u32) -> Result<&'p str, Fault> {
+    fn narrow(&mut self, bound: u32) -> Result<&'p str, MessageFault> {
         let said = self.u32()?;
         let mut bytes = self.take(1, length(said)?)?;
         // Some writers encode an empty CDR string with the length 0 instead of a NUL.
         if L::ALIGNED && !bytes.is_empty() {
-            bytes = bytes.strip_suffix(&[0]).ok_or(Fault::Terminator)?;
+            bytes = bytes.strip_suffix(&[0]).ok_or(MessageFault::Terminator)?;
         }
         check(
             bound,
-            u32::try_from(bytes.len()).map_err(|_| Fault::Truncated)?,
+            u32::try_from(bytes.len()).map_err(|_| MessageFault::Truncated)?,
         )?;
-        std::str::from_utf8(bytes).map_err(|_| Fault::Text)
+        std::str::from_utf8(bytes).map_err(|_| MessageFault::Text)
     }
 
-    fn wide(&mut self, bound: u32) -> Result<String, Fault> {
+    fn wide(&mut self, bound: u32) -> Result<String, MessageFault> {
         let said = self.u32()?;
         check(bound, said)?;
         let bytes = self.take(1, product(length(said)?, 4)?)?;
@@ -375,14 +375,14 @@ impl<'p, L: Layout, S: Sink> Reader<'p, '_, L, S> {
             if L::SWAPPED {
                 unit.reverse();
             }
-            u16::try_from(u32::from_le_bytes(unit)).map_err(|_| Fault::Text)
+            u16::try_from(u32::from_le_bytes(unit)).map_err(|_| MessageFault::Text)
         });
-        let units = units.collect::<Result<Vec<u16>, Fault>>()?;
-        String::from_utf16(&units).map_err(|_| Fault::Text)
+        let units = units.collect::<Result<Vec<u16>, MessageFault>>()?;
+        String::from_utf16(&units).map_err(|_| MessageFault::Text)
     }
 
     /// Returns the length of an array, within its bound.
-    fn count(&mut self, len: Len) -> Result<usize, Fault> {
+    fn count(&mut self, len: Len) -> Result<usize, MessageFault> {
         match len {
             Len::Fixed(count) => length(count),
             Len::Counted { bound } => {
@@ -395,15 +395,15 @@ impl<'p, L: Layout, S: Sink> Reader<'p, '_, L, S> {
 
     /// Fails if `count` elements of at least `least` bytes exceed the payload, or if there are too
     /// many elements without bytes.
-    fn room(&mut self, count: usize, least: usize) -> Result<(), Fault> {
+    fn room(&mut self, count: usize, least: usize) -> Result<(), MessageFault> {
         if least == 0 {
             let left = self.without_bytes.checked_sub(count);
-            self.without_bytes = left.ok_or(Fault::WithoutBytes(count))?;
+            self.without_bytes = left.ok_or(MessageFault::WithoutBytes(count))?;
             return Ok(());
         }
         let left = self.data.len().saturating_sub(self.at);
         if product(count, least)? > left {
-            Err(Fault::Truncated)
+            Err(MessageFault::Truncated)
         } else {
             Ok(())
         }
@@ -417,31 +417,31 @@ impl<'p, L: Layout, S: Sink> Reader<'p, '_, L, S> {
     }
 
     #[inline]
-    fn take(&mut self, align: usize, bytes: usize) -> Result<&'p [u8], Fault> {
+    fn take(&mut self, align: usize, bytes: usize) -> Result<&'p [u8], MessageFault> {
         self.align(align);
         let taken = self
             .data
             .get(self.at..)
             .and_then(|rest| rest.get(..bytes))
-            .ok_or(Fault::Truncated)?;
+            .ok_or(MessageFault::Truncated)?;
         self.at += bytes;
         Ok(taken)
     }
 
     #[inline]
-    fn array<const N: usize>(&mut self) -> Result<[u8; N], Fault> {
+    fn array<const N: usize>(&mut self) -> Result<[u8; N], MessageFault> {
         self.align(N);
         let taken = *self
             .data
             .get(self.at..)
             .and_then(|rest| rest.first_chunk())
-            .ok_or(Fault::Truncated)?;
+            .ok_or(MessageFault::Truncated)?;
         self.at += N;
         Ok(taken)
     }
 
     #[inline]
-    fn u16(&mut self) -> Result<u16, Fault> {
+    fn u16(&mut self) -> Result<u16, MessageFault> {
         let value = u16::from_le_bytes(self.array()?);
         Ok(if L::SWAPPED {
             value.swap_bytes()
@@ -451,7 +451,7 @@ impl<'p, L: Layout, S: Sink> Reader<'p, '_, L, S> {
     }
 
     #[inline]
-    fn u32(&mut self) -> Result<u32, Fault> {
+    fn u32(&mut self) -> Result<u32, MessageFault> {
         let value = u32::from_le_bytes(self.array()?);
         Ok(if L::SWAPPED {
             value.swap_bytes()
@@ -461,7 +461,7 @@ impl<'p, L: Layout, S: Sink> Reader<'p, '_, L, S> {
     }
 
     #[inline]
-    fn u64(&mut self) -> Result<u64, Fault> {
+    fn u64(&mut self) -> Result<u64, MessageFault> {
         let value = u64::from_le_bytes(self.array()?);
         Ok(if L::SWAPPED {
             value.swap_bytes()
@@ -471,17 +471,17 @@ impl<'p, L: Layout, S: Sink> Reader<'p, '_, L, S> {
     }
 }
 
-fn length(count: u32) -> Result<usize, Fault> {
-    usize::try_from(count).map_err(|_| Fault::Truncated)
+fn length(count: u32) -> Result<usize, MessageFault> {
+    usize::try_from(count).map_err(|_| MessageFault::Truncated)
 }
 
-fn product(count: usize, size: usize) -> Result<usize, Fault> {
-    count.checked_mul(size).ok_or(Fault::Truncated)
+fn product(count: usize, size: usize) -> Result<usize, MessageFault> {
+    count.checked_mul(size).ok_or(MessageFault::Truncated)
 }
 
-fn check(bound: u32, found: u32) -> Result<(), Fault> {
+fn check(bound: u32, found: u32) -> Result<(), MessageFault> {
     if found > bound {
-        Err(Fault::Bound { bound, found })
+        Err(MessageFault::Bound { bound, found })
     } else {
         Ok(())
     }

@@ -5,10 +5,14 @@ use std::sync::Arc;
 
 use uadp::{BuiltinType, Scalar};
 
-use super::{Conversion, Literal, Op, Part, Plan, Selection, What, Wire, given, ops, range, write};
+use super::{
+    ArrayPart, Conversion, Literal, MessagePlan, Op, PlanStep, Selection, Wire, given, ops, range,
+    write,
+};
 use crate::definition::Primitive;
 use crate::{
-    Leaf, MessageType, PlanError, ReadError, Sink, Source, SourceError, WriteError, WriteFault,
+    FieldSink, FieldSupplier, Leaf, MessageType, PlanError, ReadError, SourceError, WriteError,
+    WriteFault,
 };
 
 /// A selected field, of several.
@@ -17,7 +21,7 @@ pub struct Selected {
     /// The path of a field, or of a nested message.
     pub field: String,
     /// The part of an array; `None` for the whole field.
-    pub part: Option<Part>,
+    pub part: Option<ArrayPart>,
     /// The conversion of each value.
     pub conversion: Conversion,
 }
@@ -54,7 +58,7 @@ impl Selected {
 /// Fields that are read in the given order, independent of their order in the message.
 #[derive(Clone, Debug)]
 pub(super) struct Several {
-    plans: Vec<Plan>,
+    plans: Vec<MessagePlan>,
     /// The steps and conversions of the written fields, or the reason for which nothing can be
     /// written.
     write: Result<(Vec<Op>, Vec<Shaping>), WriteFault>,
@@ -75,7 +79,7 @@ pub(super) fn compile(
     let mut shapings = Vec::new();
     let mut ranges: Vec<std::ops::Range<usize>> = Vec::new();
     for one in selected {
-        let plan = Plan::compile(message, &one.selection(), wire)?;
+        let plan = MessagePlan::compile(message, &one.selection(), wire)?;
         let converted = !one.conversion.is_none();
         shapings.extend(
             plan.leaves()
@@ -121,17 +125,17 @@ fn convert(ops: &mut [Op], message: &MessageType, leaves: &[Leaf], shapings: &[S
         leaf.is_some_and(|leaf| converted.contains(&leaf.path.as_str()))
     };
     for op in ops {
-        if let What::Packed(number, len) = op.what
+        if let PlanStep::Packed(number, len) = op.what
             && op.carry
             && is_converted(op.leaf)
         {
-            op.what = What::Many(Primitive::Number(number), len);
+            op.what = PlanStep::Many(Primitive::Number(number), len);
         }
     }
 }
 
 impl Several {
-    pub(super) fn read<S: Sink>(
+    pub(super) fn read<S: FieldSink>(
         &self,
         payload: &[u8],
         sink: &mut S,
@@ -141,9 +145,9 @@ impl Several {
             .try_for_each(|plan| plan.read(payload, sink))
     }
 
-    pub(super) fn write<'a, S: Source<'a>>(
+    pub(super) fn write<'a, S: FieldSupplier<'a>>(
         &self,
-        plan: &Plan,
+        plan: &MessagePlan,
         source: &mut S,
         out: &mut Vec<u8>,
     ) -> Result<(), WriteError> {
@@ -205,7 +209,7 @@ impl<S> ConvertingSource<'_, S> {
     }
 }
 
-impl<'a, S: Source<'a>> Source<'a> for ConvertingSource<'_, S> {
+impl<'a, S: FieldSupplier<'a>> FieldSupplier<'a> for ConvertingSource<'_, S> {
     fn scalar(&mut self, expected: BuiltinType) -> Result<Scalar<'a>, SourceError> {
         self.step();
         let value = self.source.scalar(self.outside(expected))?;

@@ -6,16 +6,16 @@ use std::convert::Infallible;
 use uadp::{BuiltinType, Scalar};
 
 use super::inside::Inside;
-use super::{Conversion, Op, Plan, Selection, What, index, range, read, write};
+use super::{Conversion, MessagePlan, Op, PlanStep, Selection, index, range, read, write};
 use crate::definition::Primitive;
 use crate::{
-    Leaf, MessageType, PlanError, Rank, ReadError, Sink, Source, SourceError, TypeName, ValueFault,
-    WriteError,
+    ArrayRank, FieldSink, FieldSupplier, Leaf, MessageType, PlanError, ReadError, SourceError,
+    TypeName, ValueFault, WriteError,
 };
 
 /// A part of an array. It can only be read: the values of the rest of the array are unknown.
 #[derive(Clone, Debug, PartialEq, Eq, Hash)]
-pub enum Part {
+pub enum ArrayPart {
     /// An element, from 0: `position[2]`.
     Element(u32),
     /// The element at the index at which another array of the same message has this text:
@@ -36,14 +36,14 @@ pub enum Part {
     /// A field of a message of an array: `points[2].x`, or `status[name=lidar].level` with the
     /// name in the message itself.
     Inside {
-        /// The message: [`Part::Element`] or [`Part::Named`].
+        /// The message: [`ArrayPart::Element`] or [`Part::Named`].
         of: Box<Self>,
         /// The path of the field in the message.
         field: String,
     },
 }
 
-impl Part {
+impl ArrayPart {
     /// Splits `position[2]` into the field and its part; a field without brackets has no part.
     /// Returns `None` if the brackets contain anything else.
     #[must_use]
@@ -82,7 +82,7 @@ impl Part {
     }
 }
 
-impl std::fmt::Display for Part {
+impl std::fmt::Display for ArrayPart {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         match self {
             Self::Element(at) => write!(f, "[{at}]"),
@@ -105,7 +105,7 @@ pub(super) struct Shaped {
     ops: Vec<Op>,
     /// The steps that read the names, if the element is selected by name.
     names: Option<Vec<Op>>,
-    part: Option<Part>,
+    part: Option<ArrayPart>,
     /// Location of the value in the messages of an array.
     inside: Option<Inside>,
     conversion: Conversion,
@@ -119,7 +119,7 @@ impl Shaped {
     /// Returns the steps, and the field in OPC UA. `steps` compiles a selection.
     pub(super) fn compile(
         message: &MessageType,
-        (field, part, conversion): (&str, &Option<Part>, &Conversion),
+        (field, part, conversion): (&str, &Option<ArrayPart>, &Conversion),
         mut steps: impl FnMut(&Selection) -> Result<Vec<Op>, PlanError>,
     ) -> Result<(Self, Leaf), PlanError> {
         let fault = |what: &'static str| PlanError::Shape {
@@ -137,7 +137,7 @@ impl Shaped {
             ));
         };
         let inside = match part {
-            Some(Part::Inside { of, field: inner }) => {
+            Some(ArrayPart::Inside { of, field: inner }) => {
                 Some(Inside::compile(message, field, (of, inner))?)
             }
             Some(_) | None => None,
@@ -151,10 +151,10 @@ impl Shaped {
         };
         let outside = conversion.outside(inner.builtin).map_err(&fault)?;
         let mut names = None;
-        if let Some(Part::Named { by, .. }) = part {
+        if let Some(ArrayPart::Named { by, .. }) = part {
             let by = beside(field, by);
             let texts = message.leaf(&by).is_some_and(|leaf| {
-                leaf.builtin == BuiltinType::String && matches!(leaf.rank, Rank::Array { .. })
+                leaf.builtin == BuiltinType::String && matches!(leaf.rank, ArrayRank::Array { .. })
             });
             if !texts {
                 index(message, &by)?;
@@ -168,14 +168,14 @@ impl Shaped {
         if !conversion.is_none() {
             // Converted elements are passed on individually.
             for op in &mut ops {
-                if let What::Packed(number, len) = op.what
+                if let PlanStep::Packed(number, len) = op.what
                     && op.carry
                 {
-                    op.what = What::Many(Primitive::Number(number), len);
+                    op.what = PlanStep::Many(Primitive::Number(number), len);
                 }
             }
             if inside.is_none() {
-                ops.retain(|op| !matches!(op.what, What::Run(..)));
+                ops.retain(|op| !matches!(op.what, PlanStep::Run(..)));
             }
         }
         let told = part.as_ref().map(ToString::to_string).unwrap_or_default();
@@ -196,18 +196,18 @@ impl Shaped {
         Ok((shaped, outer))
     }
 
-    pub(super) fn read<S: Sink>(
+    pub(super) fn read<S: FieldSink>(
         &self,
-        plan: &Plan,
+        plan: &MessagePlan,
         payload: &[u8],
         sink: &mut S,
     ) -> Result<(), ReadError<S::Error>> {
         let pick = match &self.part {
             None => Pick::All,
-            Some(Part::Element(at)) => Pick::One(wide(*at)),
-            Some(Part::Slice { from, to }) => Pick::Some(wide(*from), wide(*to)),
-            Some(Part::Named { name, .. }) => Pick::One(self.find(plan, payload, name)?),
-            Some(Part::Inside { .. }) => Pick::All,
+            Some(ArrayPart::Element(at)) => Pick::One(wide(*at)),
+            Some(ArrayPart::Slice { from, to }) => Pick::Some(wide(*from), wide(*to)),
+            Some(ArrayPart::Named { name, .. }) => Pick::One(self.find(plan, payload, name)?),
+            Some(ArrayPart::Inside { .. }) => Pick::All,
         };
         let mut shaping = ShapingSink {
             sink,
@@ -232,14 +232,19 @@ impl Shaped {
             ReadError::Malformed { field, at, fault } => ReadError::Malformed { field, at, fault },
             ReadError::Value { field, fault } => ReadError::Value { field, fault },
             ReadError::Sink { field, source } => match source {
-                Stop::Sink(source) => ReadError::Sink { field, source },
-                Stop::Value(fault) => ReadError::Value { field, fault },
+                NotPassed::Sink(source) => ReadError::Sink { field, source },
+                NotPassed::Value(fault) => ReadError::Value { field, fault },
             },
         })
     }
 
     /// Returns the index of the name.
-    fn find<E>(&self, plan: &Plan, payload: &[u8], name: &str) -> Result<usize, ReadError<E>> {
+    fn find<E>(
+        &self,
+        plan: &MessagePlan,
+        payload: &[u8],
+        name: &str,
+    ) -> Result<usize, ReadError<E>> {
         let mut finder = Finder {
             name,
             at: 0,
@@ -257,9 +262,9 @@ impl Shaped {
         })
     }
 
-    pub(super) fn write<'a, S: Source<'a>>(
+    pub(super) fn write<'a, S: FieldSupplier<'a>>(
         &self,
-        plan: &Plan,
+        plan: &MessagePlan,
         source: &mut S,
         out: &mut Vec<u8>,
     ) -> Result<(), WriteError> {
@@ -288,7 +293,10 @@ fn beside(field: &str, name: &str) -> String {
 
 /// Returns the type of a part of a field before its conversion. `bytes`: the fixed length of a byte
 /// array.
-fn shape((leaf, bytes): (&Leaf, Option<u32>), part: Option<&Part>) -> Result<Leaf, &'static str> {
+fn shape(
+    (leaf, bytes): (&Leaf, Option<u32>),
+    part: Option<&ArrayPart>,
+) -> Result<Leaf, &'static str> {
     let Some(part) = part else {
         return Ok(leaf.clone());
     };
@@ -303,28 +311,31 @@ fn shape((leaf, bytes): (&Leaf, Option<u32>), part: Option<&Part>) -> Result<Lea
             ..
         } => (BuiltinType::Byte, bytes),
         Leaf {
-            rank: Rank::Scalar, ..
+            rank: ArrayRank::Scalar,
+            ..
         } => return Err("is not an array"),
         Leaf {
             builtin,
-            rank: Rank::Array { fixed },
+            rank: ArrayRank::Array { fixed },
             ..
         } => (*builtin, *fixed),
     };
     let first = match part {
-        Part::Element(at) => *at,
-        Part::Slice { from, .. } => *from,
-        Part::Named { .. } | Part::Inside { .. } => 0,
+        ArrayPart::Element(at) => *at,
+        ArrayPart::Slice { from, .. } => *from,
+        ArrayPart::Named { .. } | ArrayPart::Inside { .. } => 0,
     };
     if fixed.is_some_and(|fixed| first >= fixed) {
         return Err("always has fewer elements");
     }
     let (builtin, rank) = match (part, leaf.rank) {
         // Handled by the caller.
-        (Part::Inside { .. }, rank) => (element, rank),
-        (Part::Element(_) | Part::Named { .. }, _) => (element, Rank::Scalar),
-        (Part::Slice { .. }, Rank::Scalar) => (leaf.builtin, Rank::Scalar),
-        (Part::Slice { .. }, Rank::Array { .. }) => (element, Rank::Array { fixed: None }),
+        (ArrayPart::Inside { .. }, rank) => (element, rank),
+        (ArrayPart::Element(_) | ArrayPart::Named { .. }, _) => (element, ArrayRank::Scalar),
+        (ArrayPart::Slice { .. }, ArrayRank::Scalar) => (leaf.builtin, ArrayRank::Scalar),
+        (ArrayPart::Slice { .. }, ArrayRank::Array { .. }) => {
+            (element, ArrayRank::Array { fixed: None })
+        }
     };
     Ok(Leaf {
         path: leaf.path.clone(),
@@ -346,7 +357,7 @@ enum Pick {
 }
 
 /// Reason for which a value is not passed on.
-pub(super) enum Stop<E> {
+pub(super) enum NotPassed<E> {
     Sink(E),
     Value(ValueFault),
 }
@@ -360,21 +371,21 @@ pub(super) struct ShapingSink<'s, S> {
     at: usize,
 }
 
-impl<S: Sink> ShapingSink<'_, S> {
-    fn converted<'v>(&self, value: Scalar<'v>) -> Result<Scalar<'v>, Stop<S::Error>> {
+impl<S: FieldSink> ShapingSink<'_, S> {
+    fn converted<'v>(&self, value: Scalar<'v>) -> Result<Scalar<'v>, NotPassed<S::Error>> {
         if self.conversion.is_none() {
             return Ok(value);
         }
-        self.conversion.there(value).map_err(Stop::Value)
+        self.conversion.there(value).map_err(NotPassed::Value)
     }
 
-    fn absent(at: usize, found: usize) -> Stop<S::Error> {
-        Stop::Value(ValueFault::Absent { at, found })
+    fn absent(at: usize, found: usize) -> NotPassed<S::Error> {
+        NotPassed::Value(ValueFault::Absent { at, found })
     }
 }
 
-impl<S: Sink> Sink for ShapingSink<'_, S> {
-    type Error = Stop<S::Error>;
+impl<S: FieldSink> FieldSink for ShapingSink<'_, S> {
+    type Error = NotPassed<S::Error>;
 
     fn scalar(&mut self, value: Scalar<'_>) -> Result<(), Self::Error> {
         let value = match (self.pick, value) {
@@ -391,7 +402,7 @@ impl<S: Sink> Sink for ShapingSink<'_, S> {
             (Pick::One(_) | Pick::Some(..), value) => value,
         };
         let value = self.converted(value)?;
-        self.sink.scalar(value).map_err(Stop::Sink)
+        self.sink.scalar(value).map_err(NotPassed::Sink)
     }
 
     fn packed_array(
@@ -410,13 +421,13 @@ impl<S: Sink> Sink for ShapingSink<'_, S> {
                     .get(from..from.saturating_add(size))
                     .and_then(|bytes| fixed(element, bytes))
                     .ok_or_else(|| Self::absent(at, count))?;
-                return self.sink.scalar(value).map_err(Stop::Sink);
+                return self.sink.scalar(value).map_err(NotPassed::Sink);
             }
         };
         let bytes = cut(bytes, from.saturating_mul(size), to.saturating_mul(size));
         self.sink
             .packed_array(element, bytes.len() / size, bytes)
-            .map_err(Stop::Sink)
+            .map_err(NotPassed::Sink)
     }
 
     fn array(&mut self, _: BuiltinType, count: usize) -> Result<(), Self::Error> {
@@ -427,7 +438,9 @@ impl<S: Sink> Sink for ShapingSink<'_, S> {
             Pick::One(at) if at < count => return Ok(()),
             Pick::One(at) => return Err(Self::absent(at, count)),
         };
-        self.sink.array(self.outside, picked).map_err(Stop::Sink)
+        self.sink
+            .array(self.outside, picked)
+            .map_err(NotPassed::Sink)
     }
 
     fn element(&mut self, value: Scalar<'_>) -> Result<(), Self::Error> {
@@ -436,27 +449,27 @@ impl<S: Sink> Sink for ShapingSink<'_, S> {
         match self.pick {
             Pick::One(picked) if picked == at => {
                 let value = self.converted(value)?;
-                self.sink.scalar(value).map_err(Stop::Sink)
+                self.sink.scalar(value).map_err(NotPassed::Sink)
             }
             Pick::One(_) => Ok(()),
             Pick::Some(from, to) if !(from..to).contains(&at) => Ok(()),
             Pick::Some(..) | Pick::All => {
                 let value = self.converted(value)?;
-                self.sink.element(value).map_err(Stop::Sink)
+                self.sink.element(value).map_err(NotPassed::Sink)
             }
         }
     }
 
     fn structures(&mut self, of: &TypeName, count: usize) -> Result<(), Self::Error> {
-        self.sink.structures(of, count).map_err(Stop::Sink)
+        self.sink.structures(of, count).map_err(NotPassed::Sink)
     }
 
     fn begin_structure(&mut self, of: &TypeName) -> Result<(), Self::Error> {
-        self.sink.begin_structure(of).map_err(Stop::Sink)
+        self.sink.begin_structure(of).map_err(NotPassed::Sink)
     }
 
     fn end_structure(&mut self) -> Result<(), Self::Error> {
-        self.sink.end_structure().map_err(Stop::Sink)
+        self.sink.end_structure().map_err(NotPassed::Sink)
     }
 }
 
@@ -500,7 +513,7 @@ struct Finder<'n> {
     found: Option<usize>,
 }
 
-impl Sink for Finder<'_> {
+impl FieldSink for Finder<'_> {
     type Error = Infallible;
 
     fn scalar(&mut self, _: Scalar<'_>) -> Result<(), Infallible> {
@@ -552,7 +565,7 @@ impl<S> ShapingSource<'_, S> {
     }
 }
 
-impl<'a, S: Source<'a>> Source<'a> for ShapingSource<'_, S> {
+impl<'a, S: FieldSupplier<'a>> FieldSupplier<'a> for ShapingSource<'_, S> {
     fn scalar(&mut self, expected: BuiltinType) -> Result<Scalar<'a>, SourceError> {
         let value = self.source.scalar(self.outside)?;
         self.back(value, expected)

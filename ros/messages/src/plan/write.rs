@@ -3,10 +3,10 @@
 use uadp::{BuiltinType, Scalar};
 
 use super::literal::Typed;
-use super::{Len, MAX_WITHOUT_BYTES, Op, Plan, What, Wire};
+use super::{Len, MAX_WITHOUT_BYTES, MessagePlan, Op, PlanStep, Wire};
 use crate::convert::date_time_within;
-use crate::definition::{Clock, Number, Primitive};
-use crate::{Source, SourceError, WriteError, WriteFault, millis_to_duration};
+use crate::definition::{ClockType, Number, Primitive};
+use crate::{FieldSupplier, SourceError, WriteError, WriteFault, millis_to_duration};
 
 struct Writer<'o, 's, S> {
     out: &'o mut Vec<u8>,
@@ -18,8 +18,8 @@ struct Writer<'o, 's, S> {
     without_value: usize,
 }
 
-pub(super) fn write<'a, S: Source<'a>>(
-    plan: &Plan,
+pub(super) fn write<'a, S: FieldSupplier<'a>>(
+    plan: &MessagePlan,
     ops: &[Op],
     source: &mut S,
     out: &mut Vec<u8>,
@@ -28,8 +28,8 @@ pub(super) fn write<'a, S: Source<'a>>(
 }
 
 /// Writes a message that is a structure.
-pub(super) fn structure<'a, S: Source<'a>>(
-    plan: &Plan,
+pub(super) fn structure<'a, S: FieldSupplier<'a>>(
+    plan: &MessagePlan,
     ops: &[Op],
     source: &mut S,
     out: &mut Vec<u8>,
@@ -38,8 +38,8 @@ pub(super) fn structure<'a, S: Source<'a>>(
 }
 
 /// Writes a message. `structure`: whether the fields belong to a structure.
-fn message<'a, S: Source<'a>>(
-    plan: &Plan,
+fn message<'a, S: FieldSupplier<'a>>(
+    plan: &MessagePlan,
     (ops, structure): (&[Op], bool),
     source: &mut S,
     out: &mut Vec<u8>,
@@ -97,17 +97,17 @@ fn constant_of(
         without_value: MAX_WITHOUT_BYTES,
     };
     match &op.what {
-        What::One(primitive) => writer.single(*primitive),
-        What::Packed(number, len) => writer.packed(*number, *len, true),
-        What::Bytes(len) => writer.bytes(*len, true),
-        What::Many(primitive, len) => writer.many(*primitive, *len, true),
+        PlanStep::One(primitive) => writer.single(*primitive),
+        PlanStep::Packed(number, len) => writer.packed(*number, *len, true),
+        PlanStep::Bytes(len) => writer.bytes(*len, true),
+        PlanStep::Many(primitive, len) => writer.many(*primitive, *len, true),
         // These steps have no constants.
-        What::Messages { .. } | What::Skip { .. } | What::Run(..) => Ok(()),
+        PlanStep::Messages { .. } | PlanStep::Skip { .. } | PlanStep::Run(..) => Ok(()),
     }
 }
 
 /// Writes a message that is transferred unchanged.
-pub(super) fn bytes<'a, S: Source<'a>>(
+pub(super) fn bytes<'a, S: FieldSupplier<'a>>(
     source: &mut S,
     out: &mut Vec<u8>,
 ) -> Result<(), WriteError> {
@@ -126,7 +126,7 @@ pub(super) fn bytes<'a, S: Source<'a>>(
     Ok(())
 }
 
-impl<'a, S: Source<'a>> Writer<'_, '_, S> {
+impl<'a, S: FieldSupplier<'a>> Writer<'_, '_, S> {
     fn body(&mut self, ops: &[Op], structure: bool) -> Result<(), WriteFault> {
         if !structure {
             return self.steps(ops, false);
@@ -147,19 +147,19 @@ impl<'a, S: Source<'a>> Writer<'_, '_, S> {
                 continue;
             }
             match &op.what {
-                What::One(primitive) if op.carry => self.single(*primitive)?,
-                What::One(primitive) => self.zero(*primitive),
-                What::Run(number, count) => {
+                PlanStep::One(primitive) if op.carry => self.single(*primitive)?,
+                PlanStep::One(primitive) => self.zero(*primitive),
+                PlanStep::Run(number, count) => {
                     self.align(number.size());
                     if self.source.scalars(number.builtin(), *count, self.out) {
                         ops = ops.get(usize::from(*count)..).unwrap_or_default();
                     }
                 }
-                What::Skip { align, bytes } => self.zeros(*align, *bytes),
-                What::Packed(number, len) => self.packed(*number, *len, op.carry)?,
-                What::Bytes(len) => self.bytes(*len, op.carry)?,
-                What::Many(primitive, len) => self.many(*primitive, *len, op.carry)?,
-                What::Messages { len, steps, .. } => {
+                PlanStep::Skip { align, bytes } => self.zeros(*align, *bytes),
+                PlanStep::Packed(number, len) => self.packed(*number, *len, op.carry)?,
+                PlanStep::Bytes(len) => self.bytes(*len, op.carry)?,
+                PlanStep::Many(primitive, len) => self.many(*primitive, *len, op.carry)?,
+                PlanStep::Messages { len, steps, .. } => {
                     let (body, after) = ops.split_at_checked(*steps).unwrap_or((ops, &[]));
                     ops = after;
                     self.messages(*len, body, op.carry.then_some(inside))?;
@@ -184,7 +184,10 @@ impl<'a, S: Source<'a>> Writer<'_, '_, S> {
             Some(false) => self.source.structures()?,
         };
         if carry.is_some() {
-            if body.iter().all(|op| matches!(op.what, What::Skip { .. })) {
+            if body
+                .iter()
+                .all(|op| matches!(op.what, PlanStep::Skip { .. }))
+            {
                 // Inline they take no bytes, for any number of elements.
                 let left = self.without_value.checked_sub(count);
                 self.without_value = left.ok_or(WriteFault::WithoutValue(count))?;
@@ -213,8 +216,11 @@ impl<'a, S: Source<'a>> Writer<'_, '_, S> {
             (Primitive::Text(text), Scalar::String(value)) => {
                 return self.narrow(text.bound, value.unwrap_or_default());
             }
-            (Primitive::Clock(clock @ (Clock::Time1 | Clock::Time2)), Scalar::DateTime(value)) => {
-                let (earliest, latest) = if clock == Clock::Time1 {
+            (
+                Primitive::Clock(clock @ (ClockType::Time1 | ClockType::Time2)),
+                Scalar::DateTime(value),
+            ) => {
+                let (earliest, latest) = if clock == ClockType::Time1 {
                     (0, i64::from(u32::MAX))
                 } else {
                     (i64::from(i32::MIN), i64::from(i32::MAX))
@@ -225,7 +231,10 @@ impl<'a, S: Source<'a>> Writer<'_, '_, S> {
                 self.put([a, b, c, d]);
                 self.put(nanosec.to_le_bytes());
             }
-            (Primitive::Clock(Clock::Duration1 | Clock::Duration2), Scalar::Double(value)) => {
+            (
+                Primitive::Clock(ClockType::Duration1 | ClockType::Duration2),
+                Scalar::Double(value),
+            ) => {
                 let (sec, nanosec) = millis_to_duration(value).ok_or(WriteFault::Duration)?;
                 self.put(sec.to_le_bytes());
                 self.put(nanosec.to_le_bytes());

@@ -2,17 +2,17 @@
 use std::collections::HashMap;
 use std::sync::OnceLock;
 
-use messages::{Plan, Source, SourceError, WriteFault};
+use messages::{FieldSupplier, MessagePlan, SourceError, WriteFault};
 use proptest::prelude::Rng as _;
 use proptest::test_runner::TestRng;
 use uadp::{BuiltinType, DateTime, Scalar};
 
-use crate::support::{Event, Value};
+use crate::support::{RecordedEvent, RecordedValue};
 
 /// Supplies random values and records them.
 struct Inventor<'r> {
     rng: &'r mut TestRng,
-    made: Vec<Event>,
+    made: Vec<RecordedEvent>,
     /// Lengths that the type requires, by the index of the array.
     lengths: &'r HashMap<usize, usize>,
     arrays: usize,
@@ -89,7 +89,7 @@ impl Inventor<'_> {
     }
 }
 
-impl Source<'static> for Inventor<'_> {
+impl FieldSupplier<'static> for Inventor<'_> {
     fn scalar(&mut self, expected: BuiltinType) -> Result<Scalar<'static>, SourceError> {
         let value = if expected == BuiltinType::ByteString {
             let length = self.length();
@@ -97,7 +97,8 @@ impl Source<'static> for Inventor<'_> {
         } else {
             self.value(expected)
         };
-        self.made.push(Event::Scalar(Value::of(value)));
+        self.made
+            .push(RecordedEvent::Scalar(RecordedValue::of(value)));
         Ok(value)
     }
     fn packed_array(
@@ -107,30 +108,32 @@ impl Source<'static> for Inventor<'_> {
         let count = self.length();
         let bytes = self.pool(expected, count * expected.fixed_size().unwrap());
         self.made
-            .push(Event::Packed(expected, count, bytes.to_vec()));
+            .push(RecordedEvent::Packed(expected, count, bytes.to_vec()));
         Ok((count, bytes))
     }
     fn array(&mut self, expected: BuiltinType) -> Result<usize, SourceError> {
         let count = self.length();
-        self.made.push(Event::Array(expected, count));
+        self.made.push(RecordedEvent::Array(expected, count));
         Ok(count)
     }
     fn element(&mut self, expected: BuiltinType) -> Result<Scalar<'static>, SourceError> {
         let value = self.value(expected);
-        self.made.push(Event::Element(Value::of(value)));
+        self.made
+            .push(RecordedEvent::Element(RecordedValue::of(value)));
         Ok(value)
     }
     fn structures(&mut self) -> Result<usize, SourceError> {
         let count = self.length();
-        self.made.push(Event::Structures(String::new(), count));
+        self.made
+            .push(RecordedEvent::Structures(String::new(), count));
         Ok(count)
     }
     fn begin_structure(&mut self) -> Result<(), SourceError> {
-        self.made.push(Event::Begin(String::new()));
+        self.made.push(RecordedEvent::Begin(String::new()));
         Ok(())
     }
     fn end_structure(&mut self) -> Result<(), SourceError> {
-        self.made.push(Event::End);
+        self.made.push(RecordedEvent::End);
         Ok(())
     }
     fn finish(&mut self) -> Result<(), SourceError> {
@@ -140,7 +143,7 @@ impl Source<'static> for Inventor<'_> {
 
 /// Returns values of the plan's fields and the message they form. A fixed length is learned from
 /// the refusal of another length.
-pub(crate) fn invent(plan: &Plan, rng: &TestRng) -> (Vec<Event>, Vec<u8>) {
+pub(crate) fn invent(plan: &MessagePlan, rng: &TestRng) -> (Vec<RecordedEvent>, Vec<u8>) {
     let mut lengths = HashMap::new();
     for _ in 0..1000 {
         let mut out = Vec::new();
@@ -169,10 +172,10 @@ pub(crate) fn invent(plan: &Plan, rng: &TestRng) -> (Vec<Event>, Vec<u8>) {
 }
 
 /// Removes the names of structures, because structures of an inventor have no name.
-pub(crate) fn unnamed(events: Vec<Event>) -> Vec<Event> {
+pub(crate) fn unnamed(events: Vec<RecordedEvent>) -> Vec<RecordedEvent> {
     let strip = |event| match event {
-        Event::Structures(_, count) => Event::Structures(String::new(), count),
-        Event::Begin(_) => Event::Begin(String::new()),
+        RecordedEvent::Structures(_, count) => RecordedEvent::Structures(String::new(), count),
+        RecordedEvent::Begin(_) => RecordedEvent::Begin(String::new()),
         other => other,
     };
     events.into_iter().map(strip).collect()

@@ -1,11 +1,11 @@
 //! A sink that records fields, and a source that replays them.
 use std::fmt;
 
-use messages::{Sink, Source, SourceError, TypeName};
+use messages::{FieldSink, FieldSupplier, SourceError, TypeName};
 use uadp::{BuiltinType, DateTime, Scalar};
 
 #[derive(Clone, Debug, PartialEq)]
-pub(crate) enum Value {
+pub(crate) enum RecordedValue {
     /// Numbers and Booleans by their bytes, so that a NaN equals itself.
     Fixed(BuiltinType, Vec<u8>),
     Text(String),
@@ -13,17 +13,17 @@ pub(crate) enum Value {
 }
 
 #[derive(Clone, Debug, PartialEq)]
-pub(crate) enum Event {
-    Scalar(Value),
+pub(crate) enum RecordedEvent {
+    Scalar(RecordedValue),
     Packed(BuiltinType, usize, Vec<u8>),
     Array(BuiltinType, usize),
-    Element(Value),
+    Element(RecordedValue),
     Structures(String, usize),
     Begin(String),
     End,
 }
 
-impl Value {
+impl RecordedValue {
     pub(crate) fn of(scalar: Scalar<'_>) -> Self {
         let builtin = scalar.builtin_type();
         match scalar {
@@ -96,7 +96,7 @@ fn chunk<const N: usize>(bytes: &[u8]) -> [u8; N] {
     bytes.try_into().unwrap()
 }
 
-impl fmt::Display for Value {
+impl fmt::Display for RecordedValue {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self.scalar() {
             Scalar::Boolean(v) => write!(f, "{v}"),
@@ -121,7 +121,7 @@ impl fmt::Display for Value {
     }
 }
 
-impl fmt::Display for Event {
+impl fmt::Display for RecordedEvent {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Scalar(value) => write!(f, "scalar {} {value}", value.builtin().name()),
@@ -131,9 +131,9 @@ impl fmt::Display for Event {
                 write!(f, "packed {} {count}", builtin.name())?;
                 let size = builtin.fixed_size().unwrap();
                 assert_eq!(bytes.len(), count * size);
-                bytes
-                    .chunks(size)
-                    .try_for_each(|each| write!(f, " {}", Value::Fixed(*builtin, each.to_vec())))
+                bytes.chunks(size).try_for_each(|each| {
+                    write!(f, " {}", RecordedValue::Fixed(*builtin, each.to_vec()))
+                })
             }
             Self::Structures(of, count) => write!(f, "structures {of} {count}"),
             Self::Begin(of) => write!(f, "begin {of}"),
@@ -144,67 +144,67 @@ impl fmt::Display for Event {
 
 #[derive(Default)]
 pub(crate) struct Recorder {
-    pub(crate) events: Vec<Event>,
+    pub(crate) events: Vec<RecordedEvent>,
 }
 
 impl Recorder {
-    fn push(&mut self, event: Event) -> Result<(), ()> {
+    fn push(&mut self, event: RecordedEvent) -> Result<(), ()> {
         self.events.push(event);
         Ok(())
     }
 }
 
-impl Sink for Recorder {
+impl FieldSink for Recorder {
     type Error = ();
 
     fn scalar(&mut self, value: Scalar<'_>) -> Result<(), ()> {
-        self.push(Event::Scalar(Value::of(value)))
+        self.push(RecordedEvent::Scalar(RecordedValue::of(value)))
     }
     fn packed_array(&mut self, element: BuiltinType, count: usize, bytes: &[u8]) -> Result<(), ()> {
-        self.push(Event::Packed(element, count, bytes.to_vec()))
+        self.push(RecordedEvent::Packed(element, count, bytes.to_vec()))
     }
     fn array(&mut self, element: BuiltinType, count: usize) -> Result<(), ()> {
-        self.push(Event::Array(element, count))
+        self.push(RecordedEvent::Array(element, count))
     }
     fn element(&mut self, value: Scalar<'_>) -> Result<(), ()> {
-        self.push(Event::Element(Value::of(value)))
+        self.push(RecordedEvent::Element(RecordedValue::of(value)))
     }
     fn structures(&mut self, of: &TypeName, count: usize) -> Result<(), ()> {
-        self.push(Event::Structures(of.to_string(), count))
+        self.push(RecordedEvent::Structures(of.to_string(), count))
     }
     fn begin_structure(&mut self, of: &TypeName) -> Result<(), ()> {
-        self.push(Event::Begin(of.to_string()))
+        self.push(RecordedEvent::Begin(of.to_string()))
     }
     fn end_structure(&mut self) -> Result<(), ()> {
-        self.push(Event::End)
+        self.push(RecordedEvent::End)
     }
 }
 
 /// Replays recorded events.
-pub(crate) struct Player<'e>(pub(crate) std::slice::Iter<'e, Event>);
+pub(crate) struct EventPlayer<'e>(pub(crate) std::slice::Iter<'e, RecordedEvent>);
 
-impl<'e> Player<'e> {
-    pub(crate) fn new(events: &'e [Event]) -> Self {
+impl<'e> EventPlayer<'e> {
+    pub(crate) fn new(events: &'e [RecordedEvent]) -> Self {
         Self(events.iter())
     }
 
-    fn wrong(found: Option<&Event>) -> SourceError {
+    fn wrong(found: Option<&RecordedEvent>) -> SourceError {
         found.map_or(SourceError::Missing, |event| {
             SourceError::Malformed(format!("found {event}"))
         })
     }
 }
 
-impl<'e> Source<'e> for Player<'e> {
+impl<'e> FieldSupplier<'e> for EventPlayer<'e> {
     fn scalar(&mut self, expected: BuiltinType) -> Result<Scalar<'e>, SourceError> {
         match self.0.next() {
-            Some(Event::Scalar(value)) if value.builtin() == expected => Ok(value.scalar()),
+            Some(RecordedEvent::Scalar(value)) if value.builtin() == expected => Ok(value.scalar()),
             other => Err(Self::wrong(other)),
         }
     }
     fn packed_array(&mut self, expected: BuiltinType) -> Result<(usize, &'e [u8]), SourceError> {
         match self.0.next() {
-            Some(Event::Packed(builtin, count, bytes)) if *builtin == expected => {
+            Some(RecordedEvent::Packed(builtin, count, bytes)) if *builtin == expected => {
                 Ok((*count, bytes))
             }
             other => Err(Self::wrong(other)),
@@ -212,19 +212,21 @@ impl<'e> Source<'e> for Player<'e> {
     }
     fn array(&mut self, expected: BuiltinType) -> Result<usize, SourceError> {
         match self.0.next() {
-            Some(Event::Array(builtin, count)) if *builtin == expected => Ok(*count),
+            Some(RecordedEvent::Array(builtin, count)) if *builtin == expected => Ok(*count),
             other => Err(Self::wrong(other)),
         }
     }
     fn element(&mut self, expected: BuiltinType) -> Result<Scalar<'e>, SourceError> {
         match self.0.next() {
-            Some(Event::Element(value)) if value.builtin() == expected => Ok(value.scalar()),
+            Some(RecordedEvent::Element(value)) if value.builtin() == expected => {
+                Ok(value.scalar())
+            }
             other => Err(Self::wrong(other)),
         }
     }
     fn structures(&mut self) -> Result<usize, SourceError> {
         match self.0.next() {
-            Some(Event::Structures(_, count)) => Ok(*count),
+            Some(RecordedEvent::Structures(_, count)) => Ok(*count),
             other => Err(Self::wrong(other)),
         }
     }
@@ -233,13 +235,13 @@ impl<'e> Source<'e> for Player<'e> {
     }
     fn begin_structure(&mut self) -> Result<(), SourceError> {
         match self.0.next() {
-            Some(Event::Begin(_)) => Ok(()),
+            Some(RecordedEvent::Begin(_)) => Ok(()),
             other => Err(Self::wrong(other)),
         }
     }
     fn end_structure(&mut self) -> Result<(), SourceError> {
         match self.0.next() {
-            Some(Event::End) => Ok(()),
+            Some(RecordedEvent::End) => Ok(()),
             other => Err(Self::wrong(other)),
         }
     }

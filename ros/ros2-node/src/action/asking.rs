@@ -14,15 +14,16 @@ use tokio::task::AbortHandle;
 use tokio::time::{Instant, sleep, sleep_until, timeout};
 use tracing::{debug, info};
 
-use super::client_goals::{ClientGoals, Limits, Outcome};
+use super::client_goals::{ClientGoalLimits, ClientGoals, Outcome};
 use super::error::{LostReason, NoServer};
-use super::types::{CancelAnswer, CancelCode, CancelWhat, GoalId, GoalInfo, Status};
-use super::{Action, wire};
+use super::types::{CancelAnswer, CancelCode, CancelWhat, GoalId, GoalInfo, GoalStatusCode};
+use super::{ActionName, wire};
 use crate::cdr::Malformed;
-use crate::clock::RosTime;
+use crate::clock::Ros2Time;
 use crate::domain::Domain;
 use crate::service::{
-    BUSY, CallPhase, IDLE, Recall, Received, Replied, ServiceClient, ServiceError, ServicePeers,
+    BUSY, CallPhase, IDLE, Recall, ReceivedServiceSample, Replied, ServiceClient, ServiceError,
+    ServicePeers,
 };
 
 /// The timeouts of an action client, in steady time, and its limits.
@@ -64,7 +65,7 @@ impl Default for ActionClientOptions {
 
 /// The service clients of the three services of an action.
 #[derive(Debug)]
-pub(super) struct Asked {
+pub(super) struct ActionServiceClients {
     pub(super) send: ServiceClient,
     pub(super) cancel: ServiceClient,
     pub(super) result: ServiceClient,
@@ -72,15 +73,15 @@ pub(super) struct Asked {
 
 /// The state that the client, its tasks and its goals share.
 #[derive(Debug)]
-pub(super) struct Shared {
-    pub(super) action: Action,
+pub(super) struct ActionClientShared {
+    pub(super) action: ActionName,
     options: ActionClientOptions,
     participant: GUID,
     peers: ServicePeers,
-    asked: Asked,
+    asked: ActionServiceClients,
     /// Goals that end once all feedback received before their results is delivered.
     ends: mpsc::Sender<GoalEnd>,
-    state: Mutex<State>,
+    state: Mutex<ActionClientState>,
 }
 
 /// The end of a goal.
@@ -93,7 +94,7 @@ pub(super) struct GoalEnd {
 }
 
 #[derive(Debug)]
-pub(super) struct State {
+pub(super) struct ActionClientState {
     pub(super) goals: ClientGoals,
     /// The tasks of goals that have a handle.
     pub(super) tasks: BTreeMap<GoalId, AbortHandle>,
@@ -101,12 +102,12 @@ pub(super) struct State {
     servers: BTreeMap<GoalId, GUID>,
 }
 
-impl Shared {
+impl ActionClientShared {
     pub(super) fn new(
         (domain, peers): (&Domain, &ServicePeers),
-        action: &Action,
+        action: &ActionName,
         options: ActionClientOptions,
-        (asked, ends): (Asked, mpsc::Sender<GoalEnd>),
+        (asked, ends): (ActionServiceClients, mpsc::Sender<GoalEnd>),
     ) -> Self {
         Self {
             action: action.clone(),
@@ -115,8 +116,8 @@ impl Shared {
             peers: peers.clone(),
             asked,
             ends,
-            state: Mutex::new(State {
-                goals: ClientGoals::new(Limits {
+            state: Mutex::new(ActionClientState {
+                goals: ClientGoals::new(ClientGoalLimits {
                     goals: options.max_goals,
                     feedback_messages: options.feedback_messages,
                     feedback_bytes: options.feedback_bytes,
@@ -127,7 +128,7 @@ impl Shared {
         }
     }
 
-    pub(super) fn lock(&self) -> MutexGuard<'_, State> {
+    pub(super) fn lock(&self) -> MutexGuard<'_, ActionClientState> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
@@ -155,7 +156,7 @@ impl Shared {
         let now = Instant::now();
         let meant = meant.into_iter();
         let withdrawn = meant.filter(|id| state.goals.withdraw(*id, now));
-        let stamp = RosTime::default();
+        let stamp = Ros2Time::default();
         withdrawn.map(|id| GoalInfo { id, stamp }).collect()
     }
 
@@ -324,7 +325,7 @@ impl Shared {
         match result {
             Err(error) => Outcome::Lost(LostReason::ServerLost(error)),
             Ok(result) => match wire::result_status(&result) {
-                Ok(Status::Unknown) => Outcome::Lost(LostReason::Unknown),
+                Ok(GoalStatusCode::Unknown) => Outcome::Lost(LostReason::Unknown),
                 Ok(status) => Outcome::Done { status, result },
                 Err(Malformed) => Outcome::Lost(LostReason::Malformed("result")),
             },
@@ -438,7 +439,7 @@ impl Shared {
         }
     }
 
-    pub(super) fn hear_status(&self, sample: Option<Received>) {
+    pub(super) fn hear_status(&self, sample: Option<ReceivedServiceSample>) {
         let goals = sample.ok_or(Malformed);
         let goals = goals.and_then(|sample| wire::read_status_array(&sample.payload));
         let mut state = self.lock();
@@ -453,7 +454,7 @@ impl Shared {
         }
     }
 
-    pub(super) fn hear_feedback(&self, sample: Option<Received>) {
+    pub(super) fn hear_feedback(&self, sample: Option<ReceivedServiceSample>) {
         let feedback = sample.ok_or(Malformed);
         let feedback = feedback.and_then(|sample| wire::split(&sample.payload));
         let mut state = self.lock();
@@ -463,7 +464,7 @@ impl Shared {
         }
     }
 
-    fn malformed(&self, state: &mut State, what: &'static str) {
+    fn malformed(&self, state: &mut ActionClientState, what: &'static str) {
         state.goals.counters.malformed += 1;
         let action = self.action.name();
         debug!(action, what, "dropped a malformed sample");

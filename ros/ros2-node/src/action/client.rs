@@ -8,14 +8,16 @@ use tokio::task::AbortHandle;
 use tokio::time::Instant;
 use tracing::warn;
 
-use super::asking::{ActionClientOptions, Asked, GoalEnd, Shared, State};
+use super::asking::{
+    ActionClientOptions, ActionClientShared, ActionClientState, ActionServiceClients, GoalEnd,
+};
 use super::client_goals::{ClientCounters, Outcome};
 use super::error::{ActionError, IdInUse, LostReason, NoServer};
 use super::goal::GoalHandle;
 use super::types::{CancelAnswer, CancelWhat, GoalId};
-use super::{Action, STATUS_TYPE, status_policies, wire};
+use super::{ActionName, STATUS_TYPE, status_policies, wire};
 use crate::domain::Domain;
-use crate::raw::Reader;
+use crate::raw::PayloadReader;
 use crate::service::{
     ServiceClient, ServiceClientOptions, ServiceError, ServicePeers, next, policies,
 };
@@ -27,7 +29,7 @@ use crate::service::{
 /// and the first reply counts.
 #[derive(Debug)]
 pub struct ActionClient {
-    shared: Arc<Shared>,
+    shared: Arc<ActionClientShared>,
     task: AbortHandle,
 }
 
@@ -40,7 +42,7 @@ impl ActionClient {
     pub fn open(
         domain: &Domain,
         peers: &ServicePeers,
-        action: &Action,
+        action: &ActionName,
         options: ActionClientOptions,
     ) -> Result<Self, ActionError> {
         action.announce_shared(domain);
@@ -61,12 +63,12 @@ impl ActionClient {
         // withdrawn goal is cancelled after the decision.
         let send = open(action.send_goal(), None)?;
         let (ends, ended) = mpsc::channel(MOST_ENDS);
-        let asked = Asked {
+        let asked = ActionServiceClients {
             send,
             cancel,
             result,
         };
-        let shared = Shared::new((domain, peers), action, options, (asked, ends));
+        let shared = ActionClientShared::new((domain, peers), action, options, (asked, ends));
         let shared = Arc::new(shared);
         let listening = listen(Arc::clone(&shared), (status, feedback), ended);
         let task = tokio::spawn(listening).abort_handle();
@@ -110,7 +112,7 @@ impl ActionClient {
 
     fn send_new(
         &self,
-        mut state: MutexGuard<'_, State>,
+        mut state: MutexGuard<'_, ActionClientState>,
         id: GoalId,
         (body, start_by): (&[u8], Option<Instant>),
     ) -> GoalHandle {
@@ -191,8 +193,8 @@ impl Drop for ActionClient {
 /// Receives statuses and feedback until aborted. Ends each goal after all samples received before
 /// its result are processed.
 async fn listen(
-    shared: Arc<Shared>,
-    (status, feedback): (Reader, Reader),
+    shared: Arc<ActionClientShared>,
+    (status, feedback): (PayloadReader, PayloadReader),
     mut ended: mpsc::Receiver<GoalEnd>,
 ) {
     loop {

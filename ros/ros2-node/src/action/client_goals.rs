@@ -12,19 +12,19 @@ use tokio::sync::Notify;
 use tokio::time::Instant;
 
 use super::error::LostReason;
-use super::types::{CancelCode, GoalId, Status};
+use super::types::{CancelCode, GoalId, GoalStatusCode};
 use super::withdrawal::Withdrawal;
-use crate::clock::RosTime;
+use crate::clock::Ros2Time;
 
 /// An event of a sent goal, in the order of delivery.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum GoalEvent {
     /// A server accepted the goal at this time of the server's clock. The first event, unless the
     /// goal ends before.
-    Accepted(RosTime),
-    /// The goal changed to [`Status::Executing`] or [`Status::Canceling`]. A short state may be
-    /// skipped.
-    Status(Status),
+    Accepted(Ros2Time),
+    /// The goal changed to [`Status::Executing`] or [`GoalStatusCode::Canceling`]. A short state
+    /// may be skipped.
+    Status(GoalStatusCode),
     /// Feedback of the server: the `X_Feedback`, CDR with its encapsulation header, in the server's
     /// byte order.
     Feedback(Bytes),
@@ -47,7 +47,7 @@ pub enum Outcome {
     /// The server ended the goal.
     Done {
         /// Succeeded, canceled or aborted.
-        status: Status,
+        status: GoalStatusCode,
         /// The `X_GetResult_Response`: CDR with its encapsulation header, in the server's byte
         /// order, status first.
         result: Bytes,
@@ -69,7 +69,7 @@ pub struct ClientCounters {
 
 /// The limits of the client: open goals, and waiting feedback per goal.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) struct Limits {
+pub(super) struct ClientGoalLimits {
     pub(super) goals: usize,
     pub(super) feedback_messages: usize,
     pub(super) feedback_bytes: usize,
@@ -79,14 +79,14 @@ pub(super) struct Limits {
 #[derive(Debug)]
 pub(super) struct ClientGoals {
     goals: BTreeMap<GoalId, Goal>,
-    limits: Limits,
+    limits: ClientGoalLimits,
     pub(super) counters: ClientCounters,
 }
 
 #[derive(Debug)]
 struct Goal {
     answer: Answer,
-    status: Status,
+    status: GoalStatusCode,
     events: VecDeque<GoalEvent>,
     /// The number of feedback messages in `events`.
     messages: usize,
@@ -111,7 +111,7 @@ enum Answer {
 }
 
 impl ClientGoals {
-    pub(super) fn new(limits: Limits) -> Self {
+    pub(super) fn new(limits: ClientGoalLimits) -> Self {
         Self {
             goals: BTreeMap::new(),
             limits,
@@ -125,7 +125,7 @@ impl ClientGoals {
         let full = open.count() >= self.limits.goals;
         let goal = Goal {
             answer: Answer::Awaited,
-            status: Status::Unknown,
+            status: GoalStatusCode::Unknown,
             events: VecDeque::new(),
             messages: 0,
             bytes: 0,
@@ -150,7 +150,7 @@ impl ClientGoals {
     }
 
     /// Records that a server accepted the goal.
-    pub(super) fn accepted(&mut self, id: GoalId, stamp: RosTime, now: Instant) {
+    pub(super) fn accepted(&mut self, id: GoalId, stamp: Ros2Time, now: Instant) {
         if let Some(goal) = self.open(id)
             && goal.answer == Answer::Awaited
         {
@@ -159,8 +159,8 @@ impl ClientGoals {
             }
             goal.changed.notify_waiters();
             goal.answer = Answer::Had;
-            if goal.status == Status::Unknown {
-                goal.status = Status::Accepted;
+            if goal.status == GoalStatusCode::Unknown {
+                goal.status = GoalStatusCode::Accepted;
             }
             goal.events.push_front(GoalEvent::Accepted(stamp));
             goal.wake.notify_one();
@@ -170,8 +170,13 @@ impl ClientGoals {
     /// Records a status from the server's list. The list may be older than the known status,
     /// because samples of other topics can overtake it. A goal in the list is accepted, even if the
     /// reply to it is lost.
-    pub(super) fn status(&mut self, id: GoalId, (status, stamp): (Status, RosTime), now: Instant) {
-        if status != Status::Unknown {
+    pub(super) fn status(
+        &mut self,
+        id: GoalId,
+        (status, stamp): (GoalStatusCode, Ros2Time),
+        now: Instant,
+    ) {
+        if status != GoalStatusCode::Unknown {
             self.accepted(id, stamp, now);
         }
         let Some(goal) = self.open(id) else {
@@ -181,14 +186,17 @@ impl ClientGoals {
             return;
         }
         goal.status = status;
-        if matches!(status, Status::Executing | Status::Canceling) {
+        if matches!(
+            status,
+            GoalStatusCode::Executing | GoalStatusCode::Canceling
+        ) {
             goal.tell(GoalEvent::Status(status));
         }
     }
 
     /// Records feedback of the server.
     pub(super) fn feedback(&mut self, id: GoalId, body: Bytes) {
-        let Limits {
+        let ClientGoalLimits {
             feedback_messages,
             feedback_bytes,
             ..
@@ -343,10 +351,10 @@ impl ClientGoals {
     }
 
     /// Returns the known status of a goal: unknown before the server's reply.
-    pub(super) fn known_status(&self, id: GoalId) -> Status {
+    pub(super) fn known_status(&self, id: GoalId) -> GoalStatusCode {
         let goal = self.goals.get(&id);
         let goal = goal.filter(|goal| goal.answer == Answer::Had);
-        goal.map_or(Status::Unknown, |goal| goal.status)
+        goal.map_or(GoalStatusCode::Unknown, |goal| goal.status)
     }
 
     /// Returns the outcome of an ended goal.
@@ -399,13 +407,13 @@ impl Goal {
 }
 
 /// Returns the order of a status; all terminal states are equal.
-const fn rank(status: Status) -> u8 {
+const fn rank(status: GoalStatusCode) -> u8 {
     match status {
-        Status::Unknown => 0,
-        Status::Accepted => 1,
-        Status::Executing => 2,
-        Status::Canceling => 3,
-        Status::Succeeded | Status::Canceled | Status::Aborted => 4,
+        GoalStatusCode::Unknown => 0,
+        GoalStatusCode::Accepted => 1,
+        GoalStatusCode::Executing => 2,
+        GoalStatusCode::Canceling => 3,
+        GoalStatusCode::Succeeded | GoalStatusCode::Canceled | GoalStatusCode::Aborted => 4,
     }
 }
 

@@ -7,14 +7,14 @@ use rustdds::GUID;
 use rustdds::dds::WriteError;
 use tokio::time::Instant;
 
-use crate::graph::Endpoint;
-use crate::raw::{Payload, Writer};
+use crate::graph::RemoteEndpoint;
+use crate::raw::{Payload, PayloadWriter};
 use crate::service::{Audience, Opening};
 
 /// Writes feedback. Feedback waits here while the send window is full, a client of a goal is not
 /// matched yet, or a new reader could miss it ([`Opening`]).
 pub(super) struct FeedbackWriter {
-    writer: Writer,
+    writer: PayloadWriter,
     audience: Audience,
     expected: Expected,
     opening: Opening,
@@ -25,7 +25,7 @@ pub(super) struct FeedbackWriter {
 }
 
 impl FeedbackWriter {
-    pub(super) fn new(writer: Writer) -> Self {
+    pub(super) fn new(writer: PayloadWriter) -> Self {
         Self {
             writer,
             audience: Audience::default(),
@@ -41,7 +41,7 @@ impl FeedbackWriter {
     }
 
     /// Updates the known readers.
-    pub(super) fn meet(&mut self, readers: &[Endpoint], now: Instant) {
+    pub(super) fn meet(&mut self, readers: &[RemoteEndpoint], now: Instant) {
         self.audience
             .meet(readers.iter().map(|reader| reader.guid), now);
     }

@@ -4,23 +4,27 @@ use std::sync::Arc;
 
 use tokio::sync::Notify;
 
-use super::asking::Shared;
+use super::asking::ActionClientShared;
 use super::client_goals::{GoalEvent, Outcome};
 use super::error::LostReason;
-use super::types::{CancelAnswer, CancelWhat, GoalId, Status};
+use super::types::{CancelAnswer, CancelWhat, GoalId, GoalStatusCode};
 use crate::service::ServiceError;
 
 /// The handle of a sent goal. Dropping it does not cancel the goal. A goal that was cancelled
 /// before the server decided about it is still cancelled on acceptance.
 #[derive(Debug)]
 pub struct GoalHandle {
-    shared: Arc<Shared>,
+    shared: Arc<ActionClientShared>,
     id: GoalId,
     wake: Arc<Notify>,
 }
 
 impl GoalHandle {
-    pub(super) const fn new(shared: Arc<Shared>, id: GoalId, wake: Arc<Notify>) -> Self {
+    pub(super) const fn new(
+        shared: Arc<ActionClientShared>,
+        id: GoalId,
+        wake: Arc<Notify>,
+    ) -> Self {
         Self { shared, id, wake }
     }
 
@@ -32,7 +36,7 @@ impl GoalHandle {
 
     /// Returns the last status that the server reported; unknown before its reply.
     #[must_use]
-    pub fn status(&self) -> Status {
+    pub fn status(&self) -> GoalStatusCode {
         self.shared.lock().goals.known_status(self.id)
     }
 

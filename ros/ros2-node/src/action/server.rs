@@ -8,9 +8,9 @@ use tokio::task::AbortHandle;
 use super::error::ActionError;
 use super::server_goals::ServerCounters;
 use super::server_handles::{CancelRequest, NewGoal};
-use super::serving::{ActionServerOptions, Arrived, Shared, run};
-use super::types::Status;
-use super::{Action, wire};
+use super::serving::{ActionServerOptions, ActionServerShared, Arrived, run};
+use super::types::GoalStatusCode;
+use super::{ActionName, wire};
 use crate::domain::Domain;
 use crate::service::{ServicePeers, ServiceServer};
 
@@ -27,7 +27,7 @@ pub enum ServerEvent {
 /// dropped, and clients that wait for results detect the loss of their server.
 #[derive(Debug)]
 pub struct ActionServer {
-    shared: Arc<Shared>,
+    shared: Arc<ActionServerShared>,
     task: AbortHandle,
     _services: [ServiceServer; 3],
 }
@@ -40,14 +40,14 @@ impl ActionServer {
     pub fn open(
         domain: &Domain,
         peers: &ServicePeers,
-        action: &Action,
+        action: &ActionName,
         options: ActionServerOptions,
     ) -> Result<Self, ActionError> {
-        if wire::with_status(&options.empty_result, Status::Unknown).is_none() {
+        if wire::with_status(&options.empty_result, GoalStatusCode::Unknown).is_none() {
             return Err(ActionError::EmptyResult(action.name().to_owned()));
         }
         action.announce_shared(domain);
-        let shared = Arc::new(Shared::new(domain, peers, action, options)?);
+        let shared = Arc::new(ActionServerShared::new(domain, peers, action, options)?);
         let services = shared.serve(domain, peers)?;
         let task = tokio::spawn(run(Arc::clone(&shared))).abort_handle();
         Ok(Self {

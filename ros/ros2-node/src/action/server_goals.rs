@@ -12,8 +12,8 @@ use bytes::Bytes;
 use thiserror::Error;
 use tokio::time::Instant;
 
-use super::types::{CancelCode, CancelWhat, GoalId, GoalInfo, Status};
-use crate::clock::RosTime;
+use super::types::{CancelCode, CancelWhat, GoalId, GoalInfo, GoalStatusCode};
+use crate::clock::Ros2Time;
 
 /// The end of a goal.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -33,7 +33,7 @@ pub enum GoalError {
         /// The id of the goal.
         goal: GoalId,
         /// The status of the goal, which stays.
-        from: Status,
+        from: GoalStatusCode,
         /// The requested state.
         wanted: &'static str,
     },
@@ -76,7 +76,7 @@ pub(super) struct Ticket {
 
 /// The decision about a new goal.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Arrival {
+pub(super) enum NewGoalDecision {
     /// The user has to accept or reject the goal.
     New(Ticket),
     /// A goal with this id exists.
@@ -87,7 +87,7 @@ pub(super) enum Arrival {
 
 /// The result of a request for a goal's result.
 #[derive(Debug, PartialEq, Eq)]
-pub(super) enum Asked<W> {
+pub(super) enum ResultRequest<W> {
     /// The goal is unknown.
     Unknown,
     /// The goal has ended with this result.
@@ -111,7 +111,7 @@ pub(super) struct ServerGoals<W> {
 struct Goal<W> {
     /// Increases in the order of arrival.
     key: u64,
-    stamp: RosTime,
+    stamp: Ros2Time,
     phase: Phase<W>,
 }
 
@@ -120,11 +120,11 @@ enum Phase<W> {
     /// Neither accepted nor rejected. Clients see the goal as unknown.
     Offered,
     Open {
-        status: Status,
+        status: GoalStatusCode,
         waiting: VecDeque<W>,
     },
     Ended {
-        status: Status,
+        status: GoalStatusCode,
         result: Bytes,
         since: Instant,
     },
@@ -143,35 +143,35 @@ impl<W> ServerGoals<W> {
     }
 
     /// Registers a new goal.
-    pub(super) fn arrive(&mut self, id: GoalId) -> Arrival {
+    pub(super) fn arrive(&mut self, id: GoalId) -> NewGoalDecision {
         if self.goals.contains_key(&id) {
             self.counters.repeated += 1;
-            return Arrival::Known;
+            return NewGoalDecision::Known;
         }
         if !self.has_room() {
             self.counters.refused += 1;
-            return Arrival::Full;
+            return NewGoalDecision::Full;
         }
         let key = self.next_key;
         self.next_key += 1;
         let goal = Goal {
             key,
-            stamp: RosTime::default(),
+            stamp: Ros2Time::default(),
             phase: Phase::Offered,
         };
         self.goals.insert(id, goal);
-        Arrival::New(Ticket { id, key })
+        NewGoalDecision::New(Ticket { id, key })
     }
 
     /// Accepts an offered goal.
-    pub(super) fn accept(&mut self, ticket: Ticket, stamp: RosTime) -> Result<(), GoalError> {
+    pub(super) fn accept(&mut self, ticket: Ticket, stamp: Ros2Time) -> Result<(), GoalError> {
         let goal = self.goal(ticket)?;
         if !matches!(goal.phase, Phase::Offered) {
             return Err(goal.refuses(ticket.id, "accepted"));
         }
         goal.stamp = stamp;
         goal.phase = Phase::Open {
-            status: Status::Accepted,
+            status: GoalStatusCode::Accepted,
             waiting: VecDeque::new(),
         };
         Ok(())
@@ -187,17 +187,17 @@ impl<W> ServerGoals<W> {
 
     /// Starts work on an accepted goal.
     pub(super) fn execute(&mut self, ticket: Ticket) -> Result<(), GoalError> {
-        self.step(ticket, Status::Executing, "executed", |from| {
-            matches!(from, Status::Accepted)
+        self.step(ticket, GoalStatusCode::Executing, "executed", |from| {
+            matches!(from, GoalStatusCode::Accepted)
         })
     }
 
     /// Agrees to cancel a goal. An earlier request may have started the cancellation.
     pub(super) fn cancel(&mut self, ticket: Ticket) -> Result<(), GoalError> {
-        self.step(ticket, Status::Canceling, "cancelled", |from| {
+        self.step(ticket, GoalStatusCode::Canceling, "cancelled", |from| {
             matches!(
                 from,
-                Status::Accepted | Status::Executing | Status::Canceling
+                GoalStatusCode::Accepted | GoalStatusCode::Executing | GoalStatusCode::Canceling
             )
         })
     }
@@ -205,9 +205,9 @@ impl<W> ServerGoals<W> {
     fn step(
         &mut self,
         ticket: Ticket,
-        to: Status,
+        to: GoalStatusCode,
         wanted: &'static str,
-        allowed: impl Fn(Status) -> bool,
+        allowed: impl Fn(GoalStatusCode) -> bool,
     ) -> Result<(), GoalError> {
         let goal = self.goal(ticket)?;
         match &mut goal.phase {
@@ -222,12 +222,20 @@ impl<W> ServerGoals<W> {
     }
 
     /// Returns the terminal status for this end, or an error if the goal cannot end in this way.
-    pub(super) fn may_end(&mut self, ticket: Ticket, end: End) -> Result<Status, GoalError> {
+    pub(super) fn may_end(
+        &mut self,
+        ticket: Ticket,
+        end: End,
+    ) -> Result<GoalStatusCode, GoalError> {
         let goal = self.goal(ticket)?;
         match (end, goal.status()) {
-            (End::Succeed, Status::Executing | Status::Canceling) => Ok(Status::Succeeded),
-            (End::Abort, Status::Executing | Status::Canceling) => Ok(Status::Aborted),
-            (End::Cancel, Status::Canceling) => Ok(Status::Canceled),
+            (End::Succeed, GoalStatusCode::Executing | GoalStatusCode::Canceling) => {
+                Ok(GoalStatusCode::Succeeded)
+            }
+            (End::Abort, GoalStatusCode::Executing | GoalStatusCode::Canceling) => {
+                Ok(GoalStatusCode::Aborted)
+            }
+            (End::Cancel, GoalStatusCode::Canceling) => Ok(GoalStatusCode::Canceled),
             (End::Succeed | End::Abort | End::Cancel, _) => {
                 Err(goal.refuses(ticket.id, end.name()))
             }
@@ -294,29 +302,29 @@ impl<W> ServerGoals<W> {
     }
 
     /// Handles a client's request for a result.
-    pub(super) fn ask(&mut self, id: GoalId, who: impl FnOnce() -> W) -> Asked<W> {
+    pub(super) fn ask(&mut self, id: GoalId, who: impl FnOnce() -> W) -> ResultRequest<W> {
         match self.goals.get_mut(&id).map(|goal| &mut goal.phase) {
-            None | Some(Phase::Offered) => Asked::Unknown,
-            Some(Phase::Ended { result, .. }) => Asked::Ended(result.clone()),
+            None | Some(Phase::Offered) => ResultRequest::Unknown,
+            Some(Phase::Ended { result, .. }) => ResultRequest::Ended(result.clone()),
             Some(Phase::Open { waiting, .. }) => {
                 let displaced = (waiting.len() >= MOST_WAITING)
                     .then(|| waiting.pop_front())
                     .flatten();
                 self.counters.displaced += u64::from(displaced.is_some());
                 waiting.push_back(who());
-                Asked::Waits(displaced)
+                ResultRequest::Waits(displaced)
             }
         }
     }
 
     /// Returns the status of a known goal.
-    pub(super) fn status(&self, ticket: Ticket) -> Option<Status> {
+    pub(super) fn status(&self, ticket: Ticket) -> Option<GoalStatusCode> {
         let goal = self.goals.get(&ticket.id)?;
         (goal.key == ticket.key).then(|| goal.status())
     }
 
     /// Returns the status list to publish: the accepted goals in the order of arrival.
-    pub(super) fn list(&self) -> Vec<(GoalInfo, Status)> {
+    pub(super) fn list(&self) -> Vec<(GoalInfo, GoalStatusCode)> {
         let accepted = self.goals.iter().filter(|(_, goal)| goal.is_accepted());
         let mut found: Vec<_> = accepted.collect();
         found.sort_by_key(|(_, goal)| goal.key);
@@ -362,9 +370,9 @@ impl<W> ServerGoals<W> {
 }
 
 impl<W> Goal<W> {
-    const fn status(&self) -> Status {
+    const fn status(&self) -> GoalStatusCode {
         match self.phase {
-            Phase::Offered => Status::Unknown,
+            Phase::Offered => GoalStatusCode::Unknown,
             Phase::Open { status, .. } | Phase::Ended { status, .. } => status,
         }
     }
@@ -374,7 +382,10 @@ impl<W> Goal<W> {
     }
 
     const fn is_cancelable(&self) -> bool {
-        matches!(self.status(), Status::Accepted | Status::Executing)
+        matches!(
+            self.status(),
+            GoalStatusCode::Accepted | GoalStatusCode::Executing
+        )
     }
 
     const fn named(&self, id: GoalId) -> (Ticket, GoalInfo) {

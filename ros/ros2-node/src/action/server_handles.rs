@@ -8,15 +8,15 @@ use tokio::time::Instant;
 use tracing::warn;
 
 use super::server_goals::{End, GoalError, Ticket};
-use super::serving::{Acceptance, CancelAgreed, Shared};
-use super::types::{GoalId, Status};
+use super::serving::{Acceptance, ActionServerShared, CancelAgreed};
+use super::types::{GoalId, GoalStatusCode};
 use super::wire;
 use crate::raw::Payload;
 
 /// A new goal to accept or reject. A dropped goal is rejected.
 #[derive(Debug)]
 pub struct NewGoal {
-    shared: Arc<Shared>,
+    shared: Arc<ActionServerShared>,
     ticket: Ticket,
     body: Bytes,
     answer: Option<oneshot::Sender<Acceptance>>,
@@ -24,7 +24,7 @@ pub struct NewGoal {
 
 impl NewGoal {
     pub(super) const fn new(
-        shared: Arc<Shared>,
+        shared: Arc<ActionServerShared>,
         ticket: Ticket,
         body: Bytes,
         answer: oneshot::Sender<Acceptance>,
@@ -86,14 +86,14 @@ impl Drop for NewGoal {
 /// A request to cancel a goal. A dropped request is rejected: the goal continues.
 #[derive(Debug)]
 pub struct CancelRequest {
-    shared: Arc<Shared>,
+    shared: Arc<ActionServerShared>,
     ticket: Ticket,
     answer: oneshot::Sender<CancelAgreed>,
 }
 
 impl CancelRequest {
     pub(super) const fn new(
-        shared: Arc<Shared>,
+        shared: Arc<ActionServerShared>,
         ticket: Ticket,
         answer: oneshot::Sender<CancelAgreed>,
     ) -> Self {
@@ -110,8 +110,8 @@ impl CancelRequest {
         self.ticket.id
     }
 
-    /// Agrees to cancel: the goal changes to [`Status::Canceling`]. The goal still has to be ended,
-    /// as canceled or otherwise.
+    /// Agrees to cancel: the goal changes to [`GoalStatusCode::Canceling`]. The goal still has to
+    /// be ended, as canceled or otherwise.
     ///
     /// # Errors
     /// [`GoalError`] if the goal has ended in the meantime, or the client no longer waits.
@@ -132,7 +132,7 @@ impl CancelRequest {
 /// An accepted goal. A goal that is dropped before its end is aborted with the empty result.
 #[derive(Debug)]
 pub struct ServerGoal {
-    shared: Arc<Shared>,
+    shared: Arc<ActionServerShared>,
     ticket: Ticket,
     body: Bytes,
 }
@@ -152,9 +152,12 @@ impl ServerGoal {
 
     /// Returns the status of the goal; unknown after the ended goal was removed.
     #[must_use]
-    pub fn status(&self) -> Status {
+    pub fn status(&self) -> GoalStatusCode {
         let state = self.shared.lock();
-        state.goals.status(self.ticket).unwrap_or(Status::Unknown)
+        state
+            .goals
+            .status(self.ticket)
+            .unwrap_or(GoalStatusCode::Unknown)
     }
 
     /// Starts work: changes the goal from accepted to executing.
@@ -224,7 +227,11 @@ impl ServerGoal {
     /// was dropped. Cancel-safe.
     pub async fn cancel_agreed(&self) {
         let mut changed = self.shared.changed.subscribe();
-        while self.shared.is_open() && matches!(self.status(), Status::Accepted | Status::Executing)
+        while self.shared.is_open()
+            && matches!(
+                self.status(),
+                GoalStatusCode::Accepted | GoalStatusCode::Executing
+            )
         {
             // The sender lives as long as this goal.
             if changed.changed().await.is_err() {

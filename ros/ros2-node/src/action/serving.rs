@@ -11,18 +11,20 @@ use tokio::time::{Instant, sleep, sleep_until, timeout, timeout_at};
 use tracing::debug;
 
 use super::feedback::FeedbackWriter;
-use super::server_goals::{Arrival, Asked, GoalError, MOST_WAITING, ServerGoals, Ticket};
-use super::types::{CancelAnswer, CancelCode, CancelWhat, GoalId, GoalInfo, Status};
-use super::{Action, STATUS_TYPE, wire};
+use super::server_goals::{
+    GoalError, MOST_WAITING, NewGoalDecision, ResultRequest, ServerGoals, Ticket,
+};
+use super::types::{CancelAnswer, CancelCode, CancelWhat, GoalId, GoalInfo, GoalStatusCode};
+use super::{ActionName, STATUS_TYPE, wire};
 use crate::cdr::Malformed;
-use crate::clock::{RosClock, RosTime};
+use crate::clock::{Ros2Clock, Ros2Time};
 use crate::domain::{Domain, DomainError};
-use crate::outlet::{Outlet, Refusal};
+use crate::outlet::{Outlet, OutletRefusal};
 use crate::qos::Offered;
 use crate::raw::Payload;
 use crate::service::{
-    Answer, BUSY, IDLE, Never, ServiceOptions, ServicePeers, ServiceRequest, ServiceServer,
-    policies,
+    BUSY, HandlerResult, IDLE, NoValue, ServiceOptions, ServicePeers, ServiceRequest,
+    ServiceServer, policies,
 };
 
 /// The limits of an action server.
@@ -59,11 +61,11 @@ impl ActionServerOptions {
 
 /// The state that the server, its services, its task and its goals share.
 #[derive(Debug)]
-pub(super) struct Shared {
-    action: Action,
+pub(super) struct ActionServerShared {
+    action: ActionName,
     options: ActionServerOptions,
-    clock: RosClock,
-    state: Mutex<State>,
+    clock: Ros2Clock,
+    state: Mutex<ActionServerState>,
     /// Notifies [`ActionServer::recv`](super::ActionServer::recv).
     pub(super) arrival: Notify,
     /// Notifies all goals that a goal has changed.
@@ -73,7 +75,7 @@ pub(super) struct Shared {
 }
 
 #[derive(Debug)]
-pub(super) struct State {
+pub(super) struct ActionServerState {
     pub(super) goals: Goals,
     /// `None` once the server is dropped.
     outputs: Option<Outputs>,
@@ -106,20 +108,20 @@ pub(super) enum Arrived {
 /// The acceptance of a goal, and the sender to drop when its client was notified.
 #[derive(Debug)]
 pub(super) struct Acceptance {
-    pub(super) stamp: RosTime,
-    pub(super) written: oneshot::Sender<Never>,
+    pub(super) stamp: Ros2Time,
+    pub(super) written: oneshot::Sender<NoValue>,
 }
 
 /// The agreement to cancel a goal.
 #[derive(Debug)]
 pub(super) struct CancelAgreed;
 
-impl Shared {
+impl ActionServerShared {
     /// Creates the writers of the topics.
     pub(super) fn new(
         domain: &Domain,
         peers: &ServicePeers,
-        action: &Action,
+        action: &ActionName,
         options: ActionServerOptions,
     ) -> Result<Self, DomainError> {
         let feedback = domain.open_writer(
@@ -137,7 +139,7 @@ impl Shared {
         Ok(Self {
             action: action.clone(),
             clock: domain.clock(),
-            state: Mutex::new(State {
+            state: Mutex::new(ActionServerState {
                 goals: ServerGoals::new(options.max_goals, options.result_timeout),
                 outputs: Some(outputs),
                 arrived: VecDeque::new(),
@@ -188,7 +190,7 @@ impl Shared {
         ])
     }
 
-    pub(super) fn lock(&self) -> MutexGuard<'_, State> {
+    pub(super) fn lock(&self) -> MutexGuard<'_, ActionServerState> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
@@ -215,7 +217,7 @@ impl Shared {
     }
 
     /// Accepts a goal; returns the time of acceptance.
-    pub(super) fn accept(&self, ticket: Ticket) -> Result<RosTime, GoalError> {
+    pub(super) fn accept(&self, ticket: Ticket) -> Result<Ros2Time, GoalError> {
         let stamp = self.clock.now();
         let mut state = self.lock();
         state.open()?;
@@ -281,7 +283,10 @@ impl Shared {
         Ok(())
     }
 
-    async fn goal_requested(self: Arc<Self>, request: ServiceRequest) -> Result<Answer, String> {
+    async fn goal_requested(
+        self: Arc<Self>,
+        request: ServiceRequest,
+    ) -> Result<HandlerResult, String> {
         let (id, body) = wire::split(&request.bytes).map_err(|Malformed| self.malformed())?;
         let accepted = match self.arrive(id, body) {
             Some(decision) => decision.await.ok(),
@@ -293,7 +298,7 @@ impl Shared {
             outputs.feedback.expect(request.client, Instant::now());
         }
         Ok(match accepted {
-            Some(Acceptance { stamp, written }) => Answer {
+            Some(Acceptance { stamp, written }) => HandlerResult {
                 bytes: wire::goal_answer(true, stamp),
                 written: Some(written),
             },
@@ -306,8 +311,8 @@ impl Shared {
     fn arrive(&self, id: GoalId, body: Bytes) -> Option<oneshot::Receiver<Acceptance>> {
         let mut state = self.lock();
         let ticket = match state.goals.arrive(id) {
-            Arrival::New(ticket) => ticket,
-            refused @ (Arrival::Known | Arrival::Full) => {
+            NewGoalDecision::New(ticket) => ticket,
+            refused @ (NewGoalDecision::Known | NewGoalDecision::Full) => {
                 debug!(action = self.action.name(), %id, ?refused, "rejected a goal");
                 return None;
             }
@@ -380,10 +385,12 @@ impl Shared {
         let (who, result) = oneshot::channel();
         let asked = self.lock().goals.ask(id, || who);
         let result = match asked {
-            Asked::Ended(result) => Ok(result),
-            Asked::Unknown => wire::with_status(&self.options.empty_result, Status::Unknown)
-                .ok_or_else(|| "the empty result in the options is not CDR".to_owned()),
-            Asked::Waits(displaced) => {
+            ResultRequest::Ended(result) => Ok(result),
+            ResultRequest::Unknown => {
+                wire::with_status(&self.options.empty_result, GoalStatusCode::Unknown)
+                    .ok_or_else(|| "the empty result in the options is not CDR".to_owned())
+            }
+            ResultRequest::Waits(displaced) => {
                 drop(displaced);
                 let why =
                     "too many clients wait for the result of this goal, or the server was closed";
@@ -415,7 +422,7 @@ impl Shared {
         "dropped a malformed request".to_owned()
     }
 
-    fn publish_status(&self, state: &mut State) {
+    fn publish_status(&self, state: &mut ActionServerState) {
         let Some(outputs) = &mut state.outputs else {
             return;
         };
@@ -450,11 +457,14 @@ impl Shared {
     }
 
     /// Logs a failure to publish the status. The next status repeats the complete list.
-    fn note(&self, sent: Result<(), Refusal>) {
+    fn note(&self, sent: Result<(), OutletRefusal>) {
         match sent {
             // At most the newest status waits.
-            Ok(()) | Err(Refusal::Overflow | Refusal::NoReader) => {}
-            Err(refusal @ (Refusal::TooLarge(_) | Refusal::Late | Refusal::Failed)) => {
+            Ok(()) | Err(OutletRefusal::Overflow | OutletRefusal::NoReader) => {}
+            Err(
+                refusal
+                @ (OutletRefusal::TooLarge(_) | OutletRefusal::Late | OutletRefusal::Failed),
+            ) => {
                 let (action, why) = (self.action.name(), refusal.label());
                 debug!(action, why, "cannot publish the status of the goals");
             }
@@ -462,7 +472,7 @@ impl Shared {
     }
 }
 
-impl State {
+impl ActionServerState {
     const fn open(&self) -> Result<(), GoalError> {
         match self.outputs {
             Some(_) => Ok(()),
@@ -473,7 +483,12 @@ impl State {
 
 impl Outputs {
     /// Updates the known readers from a snapshot no older than `age`, and sends the waiting status.
-    fn meet(&mut self, action: &Action, now: Instant, age: Duration) -> Result<(), Refusal> {
+    fn meet(
+        &mut self,
+        action: &ActionName,
+        now: Instant,
+        age: Duration,
+    ) -> Result<(), OutletRefusal> {
         let seen = self.peers.look(now, age);
         self.feedback
             .meet(seen.readers(&action.feedback_topic()), now);
@@ -485,7 +500,7 @@ impl Outputs {
 
 /// Runs the periodic work until aborted: expires results, updates the readers, and sends waiting
 /// messages.
-pub(super) async fn run(shared: Arc<Shared>) {
+pub(super) async fn run(shared: Arc<ActionServerShared>) {
     let mut due = Instant::now();
     loop {
         tokio::select! {

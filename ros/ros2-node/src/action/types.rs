@@ -2,7 +2,7 @@
 
 use std::fmt;
 
-use crate::clock::RosTime;
+use crate::clock::Ros2Time;
 
 /// The id of a goal, chosen by its client (`unique_identifier_msgs/UUID`).
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -37,7 +37,7 @@ impl fmt::Debug for GoalId {
 
 /// The status of a goal (`action_msgs/GoalStatus`).
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
-pub enum Status {
+pub enum GoalStatusCode {
     /// The goal is unknown.
     Unknown,
     /// The goal is accepted, and its execution has not started.
@@ -54,7 +54,7 @@ pub enum Status {
     Aborted,
 }
 
-impl Status {
+impl GoalStatusCode {
     /// Returns the code used in messages.
     #[must_use]
     pub const fn code(self) -> i8 {
@@ -97,7 +97,7 @@ pub struct GoalInfo {
     /// The id of the goal.
     pub id: GoalId,
     /// The time of acceptance.
-    pub stamp: RosTime,
+    pub stamp: Ros2Time,
 }
 
 /// Selects goals to cancel (`action_msgs/CancelGoal`, request).
@@ -108,9 +108,9 @@ pub enum CancelWhat {
     /// The goal with this id.
     Goal(GoalId),
     /// All goals accepted at or before this time of the server's clock.
-    Until(RosTime),
+    Until(Ros2Time),
     /// The goal with this id and all goals accepted at or before this time.
-    GoalAndUntil(GoalId, RosTime),
+    GoalAndUntil(GoalId, Ros2Time),
 }
 
 /// The server's response code to a cancel request (`action_msgs/CancelGoal`, `return_code`).
@@ -188,7 +188,7 @@ mod tests {
     fn one_goal_that_is_not_among_those_cancelled_is_rejected() {
         let [one, other] = [1, 2].map(|byte| GoalId::from_bytes([byte; 16]));
         let answer = |code, id: Option<GoalId>| {
-            let stamp = RosTime::default();
+            let stamp = Ros2Time::default();
             let goals = id.map(|id| GoalInfo { id, stamp });
             let goals = goals.into_iter().collect();
             CancelAnswer { code, goals }
@@ -202,7 +202,7 @@ mod tests {
         // A request that may select several goals may select none.
         assert_eq!(code(none.clone(), CancelWhat::All), CancelCode::None);
         assert_eq!(
-            code(none, CancelWhat::Until(RosTime::default())),
+            code(none, CancelWhat::Until(Ros2Time::default())),
             CancelCode::None
         );
         let known = answer(CancelCode::None, Some(one));

@@ -3,9 +3,9 @@
 
 use bytes::{Bytes, BytesMut};
 
-use super::types::{CancelAnswer, CancelCode, CancelWhat, GoalId, GoalInfo, Status};
+use super::types::{CancelAnswer, CancelCode, CancelWhat, GoalId, GoalInfo, GoalStatusCode};
 use crate::cdr::{CdrReader, CdrWriter, Malformed};
-use crate::clock::RosTime;
+use crate::clock::Ros2Time;
 
 /// Splits `X_SendGoal_Request` or `X_FeedbackMessage` into the id and the rest, which keeps an
 /// encapsulation header. The id has 16 bytes, so its removal keeps the alignment of the rest.
@@ -34,7 +34,7 @@ pub(super) fn join(id: GoalId, body: &[u8]) -> Option<Bytes> {
 }
 
 /// Encodes `X_SendGoal_Response`.
-pub(super) fn goal_answer(accepted: bool, stamp: RosTime) -> Bytes {
+pub(super) fn goal_answer(accepted: bool, stamp: Ros2Time) -> Bytes {
     let mut writer = CdrWriter::new();
     writer.bool(accepted);
     write_stamp(&mut writer, stamp);
@@ -42,7 +42,7 @@ pub(super) fn goal_answer(accepted: bool, stamp: RosTime) -> Bytes {
 }
 
 /// Decodes `X_SendGoal_Response`: the time of acceptance, or `None` if the goal was rejected.
-pub(super) fn read_goal_answer(message: &[u8]) -> Result<Option<RosTime>, Malformed> {
+pub(super) fn read_goal_answer(message: &[u8]) -> Result<Option<Ros2Time>, Malformed> {
     let mut reader = CdrReader::new(message)?;
     let accepted = reader.bool()?;
     let stamp = read_stamp(&mut reader)?;
@@ -63,7 +63,7 @@ pub(super) fn read_result_request(message: &[u8]) -> Result<GoalId, Malformed> {
 
 /// Replaces the status in `X_GetResult_Response`. Returns `None` if the message is not
 /// little-endian CDR.
-pub(super) fn with_status(result: &[u8], status: Status) -> Option<Bytes> {
+pub(super) fn with_status(result: &[u8], status: GoalStatusCode) -> Option<Bytes> {
     let (_, fields) = little_endian(result)?.split_first()?;
     let mut bytes = BytesMut::with_capacity(result.len());
     bytes.extend_from_slice(&LITTLE_ENDIAN);
@@ -73,18 +73,18 @@ pub(super) fn with_status(result: &[u8], status: Status) -> Option<Bytes> {
 }
 
 /// Decodes the status in `X_GetResult_Response`, which has to be terminal or unknown.
-pub(super) fn result_status(message: &[u8]) -> Result<Status, Malformed> {
+pub(super) fn result_status(message: &[u8]) -> Result<GoalStatusCode, Malformed> {
     let status = read_code(&mut CdrReader::new(message)?)?;
-    Status::from_code(status)
-        .filter(|status| status.is_terminal() || *status == Status::Unknown)
+    GoalStatusCode::from_code(status)
+        .filter(|status| status.is_terminal() || *status == GoalStatusCode::Unknown)
         .ok_or(Malformed)
 }
 
 /// Encodes the request of `action_msgs/CancelGoal`.
 pub(super) fn cancel_request(what: CancelWhat) -> Bytes {
     let (id, stamp) = match what {
-        CancelWhat::All => (NO_ID, RosTime::default()),
-        CancelWhat::Goal(id) => (id, RosTime::default()),
+        CancelWhat::All => (NO_ID, Ros2Time::default()),
+        CancelWhat::Goal(id) => (id, Ros2Time::default()),
         CancelWhat::Until(stamp) => (NO_ID, stamp),
         CancelWhat::GoalAndUntil(id, stamp) => (id, stamp),
     };
@@ -96,7 +96,7 @@ pub(super) fn cancel_request(what: CancelWhat) -> Bytes {
 /// Decodes the request of `action_msgs/CancelGoal`.
 pub(super) fn read_cancel_request(message: &[u8]) -> Result<CancelWhat, Malformed> {
     let GoalInfo { id, stamp } = read_info(&mut CdrReader::new(message)?)?;
-    Ok(match (id == NO_ID, stamp == RosTime::default()) {
+    Ok(match (id == NO_ID, stamp == Ros2Time::default()) {
         (true, true) => CancelWhat::All,
         (true, false) => CancelWhat::Until(stamp),
         (false, true) => CancelWhat::Goal(id),
@@ -122,7 +122,7 @@ pub(super) fn read_cancel_answer(message: &[u8]) -> Result<CancelAnswer, Malform
 }
 
 /// Encodes `action_msgs/GoalStatusArray`.
-pub(super) fn status_array(goals: &[(GoalInfo, Status)]) -> Bytes {
+pub(super) fn status_array(goals: &[(GoalInfo, GoalStatusCode)]) -> Bytes {
     let mut writer = CdrWriter::new();
     writer.sequence(goals, |writer, (info, status)| {
         write_info(writer, info);
@@ -132,12 +132,14 @@ pub(super) fn status_array(goals: &[(GoalInfo, Status)]) -> Bytes {
 }
 
 /// Decodes `action_msgs/GoalStatusArray` and drops goals with an unknown status code.
-pub(super) fn read_status_array(message: &[u8]) -> Result<Vec<(GoalInfo, Status)>, Malformed> {
+pub(super) fn read_status_array(
+    message: &[u8],
+) -> Result<Vec<(GoalInfo, GoalStatusCode)>, Malformed> {
     let goals = CdrReader::new(message)?.sequence(|reader| {
         let info = read_info(reader)?;
-        Ok((info, Status::from_code(read_code(reader)?)))
+        Ok((info, GoalStatusCode::from_code(read_code(reader)?)))
     })?;
-    let known = |(info, status): (GoalInfo, Option<Status>)| Some((info, status?));
+    let known = |(info, status): (GoalInfo, Option<GoalStatusCode>)| Some((info, status?));
     Ok(goals.into_iter().filter_map(known).collect())
 }
 
@@ -162,14 +164,14 @@ fn write_id(writer: &mut CdrWriter, id: GoalId) {
     }
 }
 
-fn read_stamp(reader: &mut CdrReader<'_>) -> Result<RosTime, Malformed> {
-    Ok(RosTime {
+fn read_stamp(reader: &mut CdrReader<'_>) -> Result<Ros2Time, Malformed> {
+    Ok(Ros2Time {
         sec: reader.i32()?,
         nanosec: reader.u32()?,
     })
 }
 
-fn write_stamp(writer: &mut CdrWriter, stamp: RosTime) {
+fn write_stamp(writer: &mut CdrWriter, stamp: Ros2Time) {
     writer.i32(stamp.sec);
     writer.u32(stamp.nanosec);
 }
@@ -207,8 +209,8 @@ mod tests {
 
     const SEVEN: GoalId = GoalId::from_bytes([7; 16]);
 
-    fn stamp(sec: i32) -> RosTime {
-        RosTime { sec, nanosec: 5 }
+    fn stamp(sec: i32) -> Ros2Time {
+        Ros2Time { sec, nanosec: 5 }
     }
 
     #[test]
@@ -236,15 +238,15 @@ mod tests {
         assert_eq!(result_status(&[0, 1, 0, 0]), Err(Malformed));
         assert_eq!(result_status(&[0, 9, 0, 0, 4]), Err(Malformed));
         assert_eq!(join(SEVEN, &[0, 0, 0, 0, 1]), None);
-        assert_eq!(with_status(&[0, 1, 0, 0], Status::Unknown), None);
+        assert_eq!(with_status(&[0, 1, 0, 0], GoalStatusCode::Unknown), None);
     }
 
     #[test]
     fn a_result_is_of_a_goal_that_has_ended_or_is_unknown() {
-        let result = with_status(&[0, 1, 0, 0, 0, 9, 9], Status::Aborted).unwrap();
+        let result = with_status(&[0, 1, 0, 0, 0, 9, 9], GoalStatusCode::Aborted).unwrap();
         assert_eq!(result.as_ref(), [0, 1, 0, 0, 6, 9, 9]);
-        assert_eq!(result_status(&result), Ok(Status::Aborted));
-        assert_eq!(result_status(&[0, 1, 0, 0, 0]), Ok(Status::Unknown));
+        assert_eq!(result_status(&result), Ok(GoalStatusCode::Aborted));
+        assert_eq!(result_status(&[0, 1, 0, 0, 0]), Ok(GoalStatusCode::Unknown));
         assert_eq!(result_status(&[0, 1, 0, 0, 2]), Err(Malformed));
         assert_eq!(result_status(&[0, 1, 0, 0, 7]), Err(Malformed));
     }
@@ -290,13 +292,19 @@ mod tests {
             id: SEVEN,
             stamp: stamp(1),
         };
-        let bytes = status_array(&[(info, Status::Executing), (info, Status::Aborted)]);
+        let bytes = status_array(&[
+            (info, GoalStatusCode::Executing),
+            (info, GoalStatusCode::Aborted),
+        ]);
         // Header, count, the first goal, and the second goal with three bytes of padding before its
         // stamp.
         assert_eq!(bytes.len(), 4 + 4 + 25 + 28);
         assert_eq!(
             read_status_array(&bytes),
-            Ok(vec![(info, Status::Executing), (info, Status::Aborted)])
+            Ok(vec![
+                (info, GoalStatusCode::Executing),
+                (info, GoalStatusCode::Aborted)
+            ])
         );
         assert_eq!(read_status_array(&bytes[..30]), Err(Malformed));
         assert_eq!(

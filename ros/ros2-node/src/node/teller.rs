@@ -16,7 +16,7 @@ use crate::discovery_info::{GidLength, NodeEntities, ParticipantEntitiesInfo};
 use crate::raw::{Payload, RawWriter};
 
 /// The state of the thread.
-pub(super) struct Teller {
+pub(super) struct NodeThread {
     shared: Arc<Shared>,
     channels: Channels,
     /// The time at which the list is due for publication.
@@ -25,7 +25,7 @@ pub(super) struct Teller {
     written: Option<GidLength>,
 }
 
-impl Teller {
+impl NodeThread {
     pub(super) fn new(shared: Arc<Shared>, channels: Channels) -> Self {
         Self {
             shared,

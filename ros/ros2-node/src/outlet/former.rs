@@ -5,11 +5,11 @@ use std::time::Duration;
 use tokio::time::Instant;
 
 use crate::qos::Offered;
-use crate::raw::Writer;
+use crate::raw::PayloadWriter;
 
 /// A former writer that only repairs the samples it has written.
 pub struct Former {
-    writer: Writer,
+    writer: PayloadWriter,
     until: Instant,
 }
 
@@ -18,7 +18,7 @@ impl Former {
     /// last value counts, with which the next writer starts: an old value must not reach a reader
     /// in addition.
     pub(super) fn of(
-        writer: Writer,
+        writer: PayloadWriter,
         offered: Offered,
         in_flight: usize,
         now: Instant,

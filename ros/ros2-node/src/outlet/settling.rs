@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use tokio::time::Instant;
 
-use crate::raw::Writer;
+use crate::raw::PayloadWriter;
 
 /// The wait for readers to discover the writer.
 #[derive(Debug, Clone, Copy)]
@@ -19,7 +19,7 @@ impl Settling {
     #[cfg(feature = "patched-dds")]
     pub(super) fn is_over(
         &self,
-        writer: &Writer,
+        writer: &PayloadWriter,
         seen: usize,
         joined: Instant,
         now: Instant,
@@ -40,7 +40,7 @@ impl Settling {
     #[cfg(not(feature = "patched-dds"))]
     pub(super) fn is_over(
         &self,
-        _writer: &Writer,
+        _writer: &PayloadWriter,
         _seen: usize,
         _joined: Instant,
         now: Instant,

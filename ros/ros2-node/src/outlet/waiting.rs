@@ -9,7 +9,7 @@ use crate::raw::Payload;
 
 /// A sample for the readers of a topic.
 #[derive(Debug, Clone)]
-pub(super) struct Sample {
+pub(super) struct WaitingSample {
     pub(super) payload: Payload,
     pub(super) source: Option<Timestamp>,
     /// Whether late readers receive the sample.
@@ -21,7 +21,7 @@ pub(super) struct Sample {
 /// The waiting samples, oldest first.
 #[derive(Debug, Default)]
 pub(super) struct UnsentSamples {
-    samples: VecDeque<Sample>,
+    samples: VecDeque<WaitingSample>,
     /// A time before which no waiting sample expires.
     expires: Option<Instant>,
     /// Whether an expired sample was dropped and not reported yet.
@@ -43,23 +43,23 @@ impl UnsentSamples {
     }
 
     /// Adds the newest sample.
-    pub(super) fn push(&mut self, sample: Sample) {
+    pub(super) fn push(&mut self, sample: WaitingSample) {
         self.expires = self.expires.into_iter().chain(sample.until).min();
         self.samples.push_back(sample);
     }
 
     /// Takes the oldest sample.
-    pub(super) fn pop(&mut self) -> Option<Sample> {
+    pub(super) fn pop(&mut self) -> Option<WaitingSample> {
         self.samples.pop_front()
     }
 
     /// Returns the oldest sample, which could not be written.
-    pub(super) fn put_back(&mut self, sample: Sample) {
+    pub(super) fn put_back(&mut self, sample: WaitingSample) {
         self.samples.push_front(sample);
     }
 
     /// Takes the newest sample, and drops all others.
-    pub(super) fn take_newest(&mut self) -> Option<Sample> {
+    pub(super) fn take_newest(&mut self) -> Option<WaitingSample> {
         self.samples.drain(..).next_back()
     }
 

@@ -10,7 +10,7 @@ use crate::cdr::{CdrReader, CdrWriter, Malformed};
 
 /// A declared parameter.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Parameter {
+pub struct DeclaredParameter {
     /// The name: parts joined by dots.
     pub name: String,
     /// The value; its type never changes.
@@ -23,11 +23,11 @@ pub struct Parameter {
 
 /// The declared parameters, ordered by name.
 #[derive(Debug, Clone, Default)]
-pub(super) struct Store(Vec<Parameter>);
+pub(super) struct ParameterStore(Vec<DeclaredParameter>);
 
 /// One of the six services.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Question {
+pub(super) enum ParameterService {
     Describe,
     Types,
     Get,
@@ -36,7 +36,7 @@ pub(super) enum Question {
     SetAtomically,
 }
 
-impl Question {
+impl ParameterService {
     pub(super) const ALL: [Self; 6] = [
         Self::Describe,
         Self::Types,
@@ -59,44 +59,44 @@ impl Question {
     }
 }
 
-impl Store {
-    pub(super) fn new(mut parameters: Vec<Parameter>) -> Self {
+impl ParameterStore {
+    pub(super) fn new(mut parameters: Vec<DeclaredParameter>) -> Self {
         parameters.sort_by(|a, b| a.name.cmp(&b.name));
         Self(parameters)
     }
 
-    pub(super) fn get(&self, name: &str) -> Option<&Parameter> {
+    pub(super) fn get(&self, name: &str) -> Option<&DeclaredParameter> {
         self.0.iter().find(|parameter| parameter.name == name)
     }
 
     /// Returns the response to a request, and the parameters that the request changed.
     pub(super) fn answer(
         &mut self,
-        question: Question,
+        question: ParameterService,
         request: &[u8],
-    ) -> Result<(Bytes, Vec<Parameter>), Malformed> {
+    ) -> Result<(Bytes, Vec<DeclaredParameter>), Malformed> {
         let mut reader = CdrReader::new(request)?;
         let mut writer = CdrWriter::new();
         let mut changed = Vec::new();
         match question {
-            Question::Describe => {
+            ParameterService::Describe => {
                 let found = self.declared(&reader.sequence(CdrReader::string)?);
                 writer.sequence(&found, |writer, found| describe(writer, found));
             }
-            Question::Types => {
+            ParameterService::Types => {
                 let found = self.declared(&reader.sequence(CdrReader::string)?);
                 writer.sequence(&found, |writer, found| writer.u8(found.value.kind()));
             }
-            Question::Get => {
+            ParameterService::Get => {
                 let found = self.declared(&reader.sequence(CdrReader::string)?);
                 writer.sequence(&found, |writer, found| found.value.write(writer));
             }
-            Question::List => {
+            ParameterService::List => {
                 let prefixes = reader.sequence(CdrReader::string)?;
                 let depth = reader.u64()?;
                 self.list(&mut writer, &prefixes, depth);
             }
-            Question::Set => {
+            ParameterService::Set => {
                 let wanted = reader.sequence(assignment)?;
                 writer.sequence(&wanted, |writer, one| {
                     let result = self.set(std::slice::from_ref(one));
@@ -104,7 +104,7 @@ impl Store {
                     changed.extend(result.unwrap_or_default());
                 });
             }
-            Question::SetAtomically => {
+            ParameterService::SetAtomically => {
                 let wanted = reader.sequence(assignment)?;
                 let result = self.set(&wanted);
                 write_result(&mut writer, &result);
@@ -116,8 +116,9 @@ impl Store {
 
     /// Returns the parameters with these names. As in rclcpp and rclpy, the result is empty if any
     /// name is not declared; tools show this as "not set".
-    fn declared(&self, names: &[String]) -> Vec<&Parameter> {
-        let found: Option<Vec<&Parameter>> = names.iter().map(|name| self.get(name)).collect();
+    fn declared(&self, names: &[String]) -> Vec<&DeclaredParameter> {
+        let found: Option<Vec<&DeclaredParameter>> =
+            names.iter().map(|name| self.get(name)).collect();
         found.unwrap_or_default()
     }
 
@@ -149,7 +150,10 @@ impl Store {
     }
 
     /// Sets all parameters or none; returns the changed parameters.
-    fn set(&mut self, wanted: &[(String, ParameterValue)]) -> Result<Vec<Parameter>, String> {
+    fn set(
+        &mut self,
+        wanted: &[(String, ParameterValue)],
+    ) -> Result<Vec<DeclaredParameter>, String> {
         for (name, value) in wanted {
             let Some(found) = self.get(name) else {
                 return Err(format!(
@@ -187,7 +191,7 @@ fn assignment(reader: &mut CdrReader<'_>) -> Result<(String, ParameterValue), Ma
 }
 
 /// Encodes a `rcl_interfaces/msg/ParameterDescriptor`.
-fn describe(writer: &mut CdrWriter, parameter: &Parameter) {
+fn describe(writer: &mut CdrWriter, parameter: &DeclaredParameter) {
     writer.string(&parameter.name);
     writer.u8(parameter.value.kind());
     writer.string(&parameter.description);
@@ -200,13 +204,13 @@ fn describe(writer: &mut CdrWriter, parameter: &Parameter) {
 }
 
 /// Encodes a `rcl_interfaces/msg/SetParametersResult`.
-fn write_result(writer: &mut CdrWriter, result: &Result<Vec<Parameter>, String>) {
+fn write_result(writer: &mut CdrWriter, result: &Result<Vec<DeclaredParameter>, String>) {
     writer.bool(result.is_ok());
     writer.string(result.as_ref().err().map_or("", String::as_str));
 }
 
 /// Encodes a `rcl_interfaces/msg/ParameterEvent` about changed parameters.
-pub(super) fn event(node: &str, unix_nanos: i128, changed: &[Parameter]) -> Bytes {
+pub(super) fn event(node: &str, unix_nanos: i128, changed: &[DeclaredParameter]) -> Bytes {
     let (seconds, nanos) = (
         unix_nanos.div_euclid(1_000_000_000),
         unix_nanos.rem_euclid(1_000_000_000),
@@ -230,8 +234,8 @@ pub(super) fn event(node: &str, unix_nanos: i128, changed: &[Parameter]) -> Byte
 mod tests {
     use super::*;
 
-    fn parameter(name: &str, value: ParameterValue, read_only: bool) -> Parameter {
-        Parameter {
+    fn parameter(name: &str, value: ParameterValue, read_only: bool) -> DeclaredParameter {
+        DeclaredParameter {
             name: name.to_owned(),
             value,
             description: String::new(),
@@ -239,8 +243,8 @@ mod tests {
         }
     }
 
-    fn store() -> Store {
-        Store::new(vec![
+    fn store() -> ParameterStore {
+        ParameterStore::new(vec![
             parameter("use_sim_time", ParameterValue::Bool(false), false),
             parameter("arm.speed", ParameterValue::Double(1.0), false),
             parameter("arm.joint.limit", ParameterValue::Integer(3), true),
@@ -251,7 +255,9 @@ mod tests {
         let mut writer = CdrWriter::new();
         writer.sequence(prefixes, |writer, name| writer.string(name));
         writer.i64(i64::try_from(depth).unwrap());
-        let (answer, _) = store().answer(Question::List, &writer.finish()).unwrap();
+        let (answer, _) = store()
+            .answer(ParameterService::List, &writer.finish())
+            .unwrap();
         CdrReader::new(&answer)
             .unwrap()
             .sequence(CdrReader::string)
@@ -269,7 +275,7 @@ mod tests {
     }
 
     /// Returns the number of elements in the response to a request for these names.
-    fn counted(question: Question, names: &[&str]) -> u32 {
+    fn counted(question: ParameterService, names: &[&str]) -> u32 {
         let mut writer = CdrWriter::new();
         writer.sequence(names, |writer, name| writer.string(name));
         let (answer, _) = store().answer(question, &writer.finish()).unwrap();
@@ -278,7 +284,11 @@ mod tests {
 
     #[test]
     fn of_names_that_are_not_all_declared_nothing_is_told_as_by_rclpy() {
-        for question in [Question::Describe, Question::Types, Question::Get] {
+        for question in [
+            ParameterService::Describe,
+            ParameterService::Types,
+            ParameterService::Get,
+        ] {
             assert_eq!(counted(question, &["use_sim_time", "arm.speed"]), 2);
             assert_eq!(counted(question, &["arm.speed", "no_such_parameter"]), 0);
             assert_eq!(counted(question, &["no_such_parameter"]), 0);
@@ -315,7 +325,7 @@ mod tests {
 
     #[test]
     fn a_request_that_ends_early_is_refused() {
-        for question in Question::ALL {
+        for question in ParameterService::ALL {
             for bytes in [&[0, 1, 0][..], &[0, 1, 0, 0, 9, 0, 0, 0]] {
                 assert_eq!(store().answer(question, bytes).unwrap_err(), Malformed);
             }

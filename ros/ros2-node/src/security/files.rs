@@ -15,10 +15,10 @@ use openssl::stack::Stack;
 use openssl::x509::X509;
 use openssl::x509::store::X509StoreBuilder;
 
-use super::{Enclave, REVOKED, SecurityError};
+use super::{DdsSecurityError, Enclave, REVOKED};
 
 /// Checks all files in `folder`; returns advice about faults that do not prevent operation.
-pub(super) fn check(folder: &Path) -> Result<Vec<String>, SecurityError> {
+pub(super) fn check(folder: &Path) -> Result<Vec<String>, DdsSecurityError> {
     if folder.join(REVOKED).is_file() {
         return Err(Enclave::fault(
             folder,
@@ -56,7 +56,7 @@ pub(super) fn check(folder: &Path) -> Result<Vec<String>, SecurityError> {
         .collect())
 }
 
-fn read(folder: &Path, file: &str) -> Result<Vec<u8>, SecurityError> {
+fn read(folder: &Path, file: &str) -> Result<Vec<u8>, DdsSecurityError> {
     let mut bytes = Vec::new();
     File::open(folder.join(file))
         .and_then(|opened| opened.take(LARGEST + 1).read_to_end(&mut bytes))
@@ -71,7 +71,7 @@ fn read(folder: &Path, file: &str) -> Result<Vec<u8>, SecurityError> {
 const LARGEST: u64 = 4 << 20;
 
 /// Reads a certificate that is currently valid.
-fn certificate(folder: &Path, file: &str) -> Result<X509, SecurityError> {
+fn certificate(folder: &Path, file: &str) -> Result<X509, DdsSecurityError> {
     let pem = read(folder, file)?;
     let fault = |why: String| Enclave::fault(folder, file, why);
     let found =
@@ -92,7 +92,7 @@ fn certificate(folder: &Path, file: &str) -> Result<X509, SecurityError> {
     Ok(found)
 }
 
-fn private_key(folder: &Path) -> Result<PKey<Private>, SecurityError> {
+fn private_key(folder: &Path) -> Result<PKey<Private>, DdsSecurityError> {
     let pem = read(folder, "key.pem")?;
     let fault = |why: &str| Enclave::fault(folder, "key.pem", why);
     let text = String::from_utf8_lossy(&pem);
@@ -110,7 +110,11 @@ fn private_key(folder: &Path) -> Result<PKey<Private>, SecurityError> {
 }
 
 /// Returns the content of an S/MIME document if the authority signed it.
-fn signed_document(folder: &Path, file: &str, authority: &X509) -> Result<String, SecurityError> {
+fn signed_document(
+    folder: &Path,
+    file: &str,
+    authority: &X509,
+) -> Result<String, DdsSecurityError> {
     let text = read(folder, file)?;
     let verify = || -> Result<String, ErrorStack> {
         let (signature, content) = Pkcs7::from_smime(&text)?;

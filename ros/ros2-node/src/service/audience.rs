@@ -6,7 +6,7 @@ use std::time::Duration;
 use rustdds::{DataWriterStatus, GUID, StatusEvented};
 use tokio::time::Instant;
 
-use crate::raw::Writer;
+use crate::raw::PayloadWriter;
 
 /// The readers of a writer, from two sources. RustDDS reports each match in a queue that drops
 /// reports when it is full. Discovery knows all readers, shortly before the writer does.
@@ -23,7 +23,7 @@ struct Known {
 
 impl Audience {
     /// Records the matches that the writer reported after the last call.
-    pub(crate) fn listen(&mut self, writer: &Writer, now: Instant) {
+    pub(crate) fn listen(&mut self, writer: &PayloadWriter, now: Instant) {
         while let Some(status) = writer.try_recv_status() {
             if let DataWriterStatus::PublicationMatched {
                 current, reader, ..

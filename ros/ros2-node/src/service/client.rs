@@ -15,14 +15,14 @@ use tokio::time::{Instant, sleep_until, timeout_at};
 use tracing::debug;
 
 use super::error::{CallPhase, ServiceError};
-use super::mapping::{ClientId, Outgoing, Received, RequestKey};
+use super::mapping::{ClientId, OutgoingServiceSample, ReceivedServiceSample, RequestKey};
 use super::met::{Acquaintance, Met, all_in_step};
 use super::opening::Opening;
-use super::pace::{Awaited, FRESH, Pace, may_ask};
+use super::pace::{AwaitedCondition, FRESH, Pace, may_ask};
 use super::peers::{ServicePeers, Snapshot};
-use super::{Service, ServiceMapping, next, policies};
+use super::{ServiceMapping, ServiceName, next, policies};
 use crate::domain::{Domain, DomainError};
-use crate::raw::{Payload, Reader, Writer};
+use crate::raw::{Payload, PayloadReader, PayloadWriter};
 
 /// The limits of a service client.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -52,7 +52,7 @@ pub struct ServiceClient {
 
 #[derive(Debug)]
 struct Shared {
-    service: Service,
+    service: ServiceName,
     options: ServiceClientOptions,
     calls: mpsc::Sender<Call>,
     ignored: Arc<AtomicU64>,
@@ -75,7 +75,7 @@ impl ServiceClient {
     pub fn open(
         domain: &Domain,
         peers: &ServicePeers,
-        service: &Service,
+        service: &ServiceName,
         options: ServiceClientOptions,
     ) -> Result<Self, DomainError> {
         // The reader comes first: a server that has discovered the writer most likely knows the
@@ -365,11 +365,11 @@ enum Failure {
 
 /// Owns the endpoints and all calls in progress.
 struct Driver {
-    service: Service,
+    service: ServiceName,
     id: ClientId,
     peers: ServicePeers,
-    writer: Writer,
-    reader: Reader,
+    writer: PayloadWriter,
+    reader: PayloadReader,
     max_calls: usize,
     /// The servers, keyed by the reader of the requests.
     servers: BTreeMap<GUID, Met>,
@@ -414,11 +414,11 @@ impl Driver {
         }
     }
 
-    fn awaited(&self) -> Awaited {
+    fn awaited(&self) -> AwaitedCondition {
         match (self.waiting.is_empty(), self.servers.is_empty()) {
-            (true, _) => Awaited::Nothing,
-            (false, true) => Awaited::Server,
-            (false, false) => Awaited::Turn,
+            (true, _) => AwaitedCondition::Nothing,
+            (false, true) => AwaitedCondition::Server,
+            (false, false) => AwaitedCondition::Turn,
         }
     }
 
@@ -583,7 +583,7 @@ impl Driver {
     fn write(&self, request: &Bytes, server: GUID) -> Result<RequestKey, Unsent> {
         let mapping = self.peers.mapping_of(server);
         let count = i64::try_from(self.count).unwrap_or(i64::MAX);
-        let Outgoing { payload, related } = self
+        let OutgoingServiceSample { payload, related } = self
             .id
             .seal_request(mapping, count, request.clone())
             .map_err(|fault| Unsent::Request(fault.label()))?;
@@ -612,7 +612,7 @@ impl Driver {
         }
     }
 
-    fn replied(&mut self, reply: Option<Received>) {
+    fn replied(&mut self, reply: Option<ReceivedServiceSample>) {
         // Replies of this process as a server are for no client here.
         let foreign = reply.filter(|reply| !self.peers.is_own(reply.writer));
         let opened = foreign.map(|reply| {

@@ -38,7 +38,7 @@ impl ServiceMapping {
 
 /// A received sample.
 #[derive(Debug, Clone)]
-pub(crate) struct Received {
+pub(crate) struct ReceivedServiceSample {
     /// The payload, which starts with the encapsulation header.
     pub(crate) payload: Bytes,
     pub(crate) writer: GUID,
@@ -48,7 +48,7 @@ pub(crate) struct Received {
 
 /// A sample to be written.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(super) struct Outgoing {
+pub(super) struct OutgoingServiceSample {
     /// The payload, which starts with the encapsulation header and is not padded.
     pub(super) payload: Bytes,
     pub(super) related: Option<SampleIdentity>,
@@ -107,7 +107,7 @@ impl Fault {
 /// Splits a request into the data for its reply and the body after an encapsulation header.
 pub(super) fn open_request(
     mapping: ServiceMapping,
-    received: Received,
+    received: ReceivedServiceSample,
 ) -> Result<(ReplyTo, Bytes), Fault> {
     let order = ByteOrder::of(&received.payload)?;
     let client = received.writer;
@@ -131,13 +131,13 @@ pub(super) fn open_request(
 }
 
 /// Returns the reply with the body, which is little-endian CDR with its encapsulation header.
-pub(super) fn seal_reply(to: &ReplyTo, body: Bytes) -> Result<Outgoing, Fault> {
+pub(super) fn seal_reply(to: &ReplyTo, body: Bytes) -> Result<OutgoingServiceSample, Fault> {
     match to {
-        ReplyTo::Cyclone { header, .. } => Ok(Outgoing {
+        ReplyTo::Cyclone { header, .. } => Ok(OutgoingServiceSample {
             payload: join(*header, &body)?,
             related: None,
         }),
-        ReplyTo::Enhanced { identity, .. } => Ok(Outgoing {
+        ReplyTo::Enhanced { identity, .. } => Ok(OutgoingServiceSample {
             payload: little_endian(body)?,
             related: Some(*identity),
         }),
@@ -168,19 +168,19 @@ impl ClientId {
         mapping: ServiceMapping,
         count: i64,
         body: Bytes,
-    ) -> Result<Outgoing, Fault> {
+    ) -> Result<OutgoingServiceSample, Fault> {
         match mapping {
             ServiceMapping::Cyclone => {
                 let mut header = [0; CYCLONE_HEADER];
                 let (id, number) = header.split_at_mut(8);
                 id.copy_from_slice(&self.cyclone_id());
                 number.copy_from_slice(&count.to_le_bytes());
-                Ok(Outgoing {
+                Ok(OutgoingServiceSample {
                     payload: join(header, &body)?,
                     related: None,
                 })
             }
-            ServiceMapping::Enhanced => Ok(Outgoing {
+            ServiceMapping::Enhanced => Ok(OutgoingServiceSample {
                 payload: little_endian(body)?,
                 // As in rmw_fastrtps: its servers wait for this reader before they reply.
                 related: Some(SampleIdentity {
@@ -196,7 +196,7 @@ impl ClientId {
     pub(super) fn open_reply(
         self,
         mapping: ServiceMapping,
-        received: Received,
+        received: ReceivedServiceSample,
     ) -> Result<Option<(RequestKey, Bytes)>, Fault> {
         let order = ByteOrder::of(&received.payload)?;
         match mapping {
@@ -315,8 +315,8 @@ mod tests {
         }
     }
 
-    fn received(out: Outgoing, writer: GUID, sequence: i64) -> Received {
-        Received {
+    fn received(out: OutgoingServiceSample, writer: GUID, sequence: i64) -> ReceivedServiceSample {
+        ReceivedServiceSample {
             payload: out.payload,
             writer,
             sequence,
@@ -348,7 +348,7 @@ mod tests {
         for (order, number) in [(1, [5, 0, 0, 0, 0, 0, 0, 0]), (0, [0, 0, 0, 0, 0, 0, 0, 5])] {
             let id = [1, 2, 3, 4, 5, 6, 7, 8];
             let payload = [&[0, order, 0, 0][..], &id, &number, &[1]].concat();
-            let request = Received {
+            let request = ReceivedServiceSample {
                 payload: payload.into(),
                 writer: client,
                 sequence: 9,
@@ -370,7 +370,7 @@ mod tests {
     #[test]
     fn a_fast_dds_client_is_answered_under_the_reader_it_names() {
         let (writer, reader) = (guid([1, 0x0f], 3), guid([1, 0x0f], 4));
-        let request = |related| Received {
+        let request = |related| ReceivedServiceSample {
             payload: Bytes::from_static(TRUE),
             writer,
             sequence: 12,
@@ -407,7 +407,7 @@ mod tests {
             // As a server of the vendor replies.
             let reply = match mapping {
                 ServiceMapping::Cyclone => request,
-                ServiceMapping::Enhanced => Outgoing {
+                ServiceMapping::Enhanced => OutgoingServiceSample {
                     related: Some(SampleIdentity {
                         writer_guid: ours().reader,
                         sequence_number: SequenceNumber::from(17),
@@ -431,7 +431,7 @@ mod tests {
             (&[0, 1, 0, 0, 1, 2, 3], Fault::Short),
             (&[0, 3, 0, 0, 1, 2, 3], Fault::Encoding),
         ] {
-            let request = Received {
+            let request = ReceivedServiceSample {
                 payload: Bytes::copy_from_slice(bytes),
                 writer: guid(CYCLONE, 3),
                 sequence: 1,

@@ -6,7 +6,7 @@ use rustdds::GUID;
 use tokio::time::Instant;
 
 use super::SETTLE;
-use crate::raw::{Reader, Writer};
+use crate::raw::{PayloadReader, PayloadWriter};
 
 /// A server from the view of its client.
 #[derive(Debug)]
@@ -47,7 +47,7 @@ impl Met {
 
     /// Returns the acquaintance that our reply reader observed.
     #[cfg(feature = "patched-dds")]
-    pub(super) fn acquaintance(&self, reader: &Reader, all_in_step: bool) -> Acquaintance {
+    pub(super) fn acquaintance(&self, reader: &PayloadReader, all_in_step: bool) -> Acquaintance {
         use rustdds::WriterContact;
 
         let each = self
@@ -64,7 +64,7 @@ impl Met {
     /// Returns `Likely`, because the published RustDDS does not report contacts.
     #[cfg(not(feature = "patched-dds"))]
     #[expect(clippy::unused_self, reason = "the patched RustDDS tells of each")]
-    pub(super) fn acquaintance(&self, _reader: &Reader, _all_in_step: bool) -> Acquaintance {
+    pub(super) fn acquaintance(&self, _reader: &PayloadReader, _all_in_step: bool) -> Acquaintance {
         Acquaintance::Likely
     }
 
@@ -88,13 +88,13 @@ impl Acquaintance {
 /// Returns whether as many readers as there are servers have acknowledged the writer's
 /// announcements.
 #[cfg(feature = "patched-dds")]
-pub(super) fn all_in_step(writer: &Writer, servers: usize) -> bool {
+pub(super) fn all_in_step(writer: &PayloadWriter, servers: usize) -> bool {
     writer.matched_readers().in_step >= servers
 }
 
 /// Returns false, because the published RustDDS does not report acknowledgements.
 #[cfg(not(feature = "patched-dds"))]
-pub(super) fn all_in_step(_writer: &Writer, _servers: usize) -> bool {
+pub(super) fn all_in_step(_writer: &PayloadWriter, _servers: usize) -> bool {
     false
 }
 

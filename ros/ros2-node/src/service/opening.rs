@@ -14,7 +14,7 @@ mod patched {
     use tokio::time::Instant;
 
     use super::PATIENCE;
-    use crate::raw::Writer;
+    use crate::raw::PayloadWriter;
 
     /// Holds a writer until its readers have received a HEARTBEAT of it.
     ///
@@ -37,7 +37,7 @@ mod patched {
         }
 
         /// Returns whether a sample may be written at `now`.
-        pub(crate) fn is_over(&mut self, writer: &Writer, now: Instant) -> bool {
+        pub(crate) fn is_over(&mut self, writer: &PayloadWriter, now: Instant) -> bool {
             let readers = writer.matched_readers();
             self.passes(readers.silent + readers.greeting, now)
         }
@@ -115,7 +115,7 @@ mod published {
     use tokio::time::Instant;
 
     use super::PATIENCE;
-    use crate::raw::Writer;
+    use crate::raw::PayloadWriter;
 
     /// Holds a writer until new readers have received one sample.
     ///
@@ -139,7 +139,7 @@ mod published {
         }
 
         /// Returns whether a sample may be written at `now`.
-        pub(crate) fn is_over(&mut self, writer: &Writer, now: Instant) -> bool {
+        pub(crate) fn is_over(&mut self, writer: &PayloadWriter, now: Instant) -> bool {
             if let Some(since) = self.since
                 && now.saturating_duration_since(since) < PATIENCE
                 // A wait of zero returns immediately.

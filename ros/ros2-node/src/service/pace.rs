@@ -8,7 +8,7 @@ use super::{BUSY, IDLE};
 
 /// The condition that the calls of a client wait for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Awaited {
+pub(super) enum AwaitedCondition {
     /// No call waits, or all calls wait for replies only.
     Nothing,
     /// No server is known.
@@ -23,41 +23,41 @@ pub(super) enum Awaited {
 #[derive(Debug)]
 pub(super) struct Pace {
     next: Duration,
-    awaited: Awaited,
+    awaited: AwaitedCondition,
 }
 
 impl Pace {
     pub(super) fn new() -> Self {
         Self {
             next: BUSY,
-            awaited: Awaited::Nothing,
+            awaited: AwaitedCondition::Nothing,
         }
     }
 
     /// Records a poll.
-    pub(super) fn looked(&mut self, awaited: Awaited) {
+    pub(super) fn looked(&mut self, awaited: AwaitedCondition) {
         self.next = match (self.awaited, awaited) {
-            (Awaited::Server, Awaited::Server) => IDLE.min(self.next * 2),
+            (AwaitedCondition::Server, AwaitedCondition::Server) => IDLE.min(self.next * 2),
             _ => BUSY,
         };
         self.awaited = awaited;
     }
 
     /// Returns the time until the next poll.
-    pub(super) fn pause(&self, awaited: Awaited) -> Duration {
+    pub(super) fn pause(&self, awaited: AwaitedCondition) -> Duration {
         match awaited {
-            Awaited::Nothing => IDLE,
-            Awaited::Server => self.next,
-            Awaited::Turn => BUSY,
+            AwaitedCondition::Nothing => IDLE,
+            AwaitedCondition::Server => self.next,
+            AwaitedCondition::Turn => BUSY,
         }
     }
 
     /// Returns the maximum age of the peers' snapshot at that poll.
-    pub(super) fn age(&self, awaited: Awaited) -> Duration {
+    pub(super) fn age(&self, awaited: AwaitedCondition) -> Duration {
         match awaited {
-            Awaited::Nothing => IDLE,
-            Awaited::Turn => FRESH,
-            Awaited::Server => self.next,
+            AwaitedCondition::Nothing => IDLE,
+            AwaitedCondition::Turn => FRESH,
+            AwaitedCondition::Server => self.next,
         }
     }
 }
@@ -100,7 +100,7 @@ mod tests {
     }
 
     /// Returns the times of the polls within a period, for a constant condition.
-    fn looks(pace: &mut Pace, awaited: Awaited, within: Duration) -> Vec<Duration> {
+    fn looks(pace: &mut Pace, awaited: AwaitedCondition, within: Duration) -> Vec<Duration> {
         let mut at = Duration::ZERO;
         let mut all = Vec::new();
         while at < within {
@@ -113,7 +113,11 @@ mod tests {
 
     #[test]
     fn an_absent_server_is_looked_for_often_at_first_and_five_times_a_second_later() {
-        let all = looks(&mut Pace::new(), Awaited::Server, Duration::from_secs(10));
+        let all = looks(
+            &mut Pace::new(),
+            AwaitedCondition::Server,
+            Duration::from_secs(10),
+        );
         let of_100_ms = |from: u64| {
             let from = Duration::from_millis(from);
             let to = from + Duration::from_millis(100);
@@ -128,12 +132,12 @@ mod tests {
     #[test]
     fn a_server_that_is_known_is_asked_at_once_by_what_is_known_by_then() {
         let mut pace = Pace::new();
-        looks(&mut pace, Awaited::Server, Duration::from_secs(2));
-        pace.looked(Awaited::Turn);
-        assert_eq!(pace.pause(Awaited::Turn), BUSY);
-        assert_eq!(pace.age(Awaited::Turn), FRESH);
+        looks(&mut pace, AwaitedCondition::Server, Duration::from_secs(2));
+        pace.looked(AwaitedCondition::Turn);
+        assert_eq!(pace.pause(AwaitedCondition::Turn), BUSY);
+        assert_eq!(pace.age(AwaitedCondition::Turn), FRESH);
         // The search for the next absent server starts at the same interval as the first search.
-        pace.looked(Awaited::Server);
-        assert_eq!(pace.pause(Awaited::Server), BUSY);
+        pace.looked(AwaitedCondition::Server);
+        assert_eq!(pace.pause(AwaitedCondition::Server), BUSY);
     }
 }

@@ -8,7 +8,7 @@ use rustdds::{DomainParticipant, GUID, RTPSEntity};
 use tokio::time::Instant;
 
 use crate::domain::Domain;
-use crate::graph::{Endpoint, Graph};
+use crate::graph::{Graph, RemoteEndpoint};
 
 use super::ServiceMapping;
 
@@ -35,8 +35,8 @@ struct Seen {
 /// A snapshot of the endpoints, by DDS topic.
 #[derive(Debug, Default)]
 pub struct Snapshot {
-    readers: BTreeMap<String, Vec<Endpoint>>,
-    writers: BTreeMap<String, Vec<Endpoint>>,
+    readers: BTreeMap<String, Vec<RemoteEndpoint>>,
+    writers: BTreeMap<String, Vec<RemoteEndpoint>>,
 }
 
 impl ServicePeers {
@@ -147,7 +147,7 @@ impl Snapshot {
             if reader.reader_proxy.remote_reader_guid.prefix != own
                 && is_wanted(reader.subscription_topic_data.topic_name())
             {
-                let (topic, endpoint) = Endpoint::of_reader(reader);
+                let (topic, endpoint) = RemoteEndpoint::of_reader(reader);
                 snapshot.readers.entry(topic).or_default().push(endpoint);
             }
         }
@@ -155,7 +155,7 @@ impl Snapshot {
             if writer.writer_proxy.remote_writer_guid.prefix != own
                 && is_wanted(&writer.publication_topic_data.topic_name)
             {
-                let (topic, endpoint) = Endpoint::of_writer(writer);
+                let (topic, endpoint) = RemoteEndpoint::of_writer(writer);
                 snapshot.writers.entry(topic).or_default().push(endpoint);
             }
         }
@@ -164,42 +164,42 @@ impl Snapshot {
 
     /// Returns the readers of a DDS topic of a service or action.
     #[must_use]
-    pub fn readers(&self, topic: &str) -> &[Endpoint] {
+    pub fn readers(&self, topic: &str) -> &[RemoteEndpoint] {
         self.readers.get(topic).map_or(&[], Vec::as_slice)
     }
 
     /// Returns the writers of a DDS topic of a service or action.
     #[must_use]
-    pub fn writers(&self, topic: &str) -> &[Endpoint] {
+    pub fn writers(&self, topic: &str) -> &[RemoteEndpoint] {
         self.writers.get(topic).map_or(&[], Vec::as_slice)
     }
 
     /// Returns the offered services, each with the readers of its requests.
-    pub fn offered(&self) -> impl Iterator<Item = (&str, &[Endpoint])> {
+    pub fn offered(&self) -> impl Iterator<Item = (&str, &[RemoteEndpoint])> {
         named(&self.readers, service_name)
     }
 
     /// Returns the called services, each with the writers of its requests.
-    pub fn called(&self) -> impl Iterator<Item = (&str, &[Endpoint])> {
+    pub fn called(&self) -> impl Iterator<Item = (&str, &[RemoteEndpoint])> {
         named(&self.writers, service_name)
     }
 
     /// Returns the served actions, each with the readers of its goals.
-    pub fn served_actions(&self) -> impl Iterator<Item = (&str, &[Endpoint])> {
+    pub fn served_actions(&self) -> impl Iterator<Item = (&str, &[RemoteEndpoint])> {
         named(&self.readers, action_name)
     }
 
     /// Returns the actions that receive goals from clients, each with the writers of its goals.
-    pub fn called_actions(&self) -> impl Iterator<Item = (&str, &[Endpoint])> {
+    pub fn called_actions(&self) -> impl Iterator<Item = (&str, &[RemoteEndpoint])> {
         named(&self.writers, action_name)
     }
 }
 
 /// Returns the names without leading slash that `name` extracts from request topics.
 fn named(
-    topics: &BTreeMap<String, Vec<Endpoint>>,
+    topics: &BTreeMap<String, Vec<RemoteEndpoint>>,
     name: impl Fn(&str) -> Option<&str>,
-) -> impl Iterator<Item = (&str, &[Endpoint])> {
+) -> impl Iterator<Item = (&str, &[RemoteEndpoint])> {
     topics.iter().filter_map(move |(topic, endpoints)| {
         let name = name(topic.strip_prefix("rq/")?.strip_suffix("Request")?)?;
         Some((name, endpoints.as_slice()))

@@ -16,12 +16,12 @@ use tokio::time::{Instant, sleep_until, timeout};
 use tracing::{debug, warn};
 
 use super::audience::Audience;
-use super::mapping::{self, Outgoing, Received, ReplyTo};
+use super::mapping::{self, OutgoingServiceSample, ReceivedServiceSample, ReplyTo};
 use super::opening::Opening;
 use super::peers::ServicePeers;
-use super::{BUSY, IDLE, Service, next, policies};
+use super::{BUSY, IDLE, ServiceName, next, policies};
 use crate::domain::{Domain, DomainError};
-use crate::raw::{Payload, Reader, Writer};
+use crate::raw::{Payload, PayloadReader, PayloadWriter};
 
 /// The limits of a service server.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -113,7 +113,7 @@ impl ServiceServer {
     pub fn open<H, F>(
         domain: &Domain,
         peers: &ServicePeers,
-        service: &Service,
+        service: &ServiceName,
         options: ServiceOptions,
         handler: H,
     ) -> Result<Self, DomainError>
@@ -123,7 +123,7 @@ impl ServiceServer {
     {
         let handler = move |request| {
             let reply = handler(request);
-            async { reply.await.map(Answer::from) }
+            async { reply.await.map(HandlerResult::from) }
         };
         Self::open_told(domain, peers, service, options, handler)
     }
@@ -133,13 +133,13 @@ impl ServiceServer {
     pub(crate) fn open_told<H, F>(
         domain: &Domain,
         peers: &ServicePeers,
-        service: &Service,
+        service: &ServiceName,
         options: ServiceOptions,
         handler: H,
     ) -> Result<Self, DomainError>
     where
         H: Fn(ServiceRequest) -> F + Send + Sync + 'static,
-        F: Future<Output = Result<Answer, String>> + Send + 'static,
+        F: Future<Output = Result<HandlerResult, String>> + Send + 'static,
     {
         let types = &service.types;
         // The writer comes first: a client that has discovered the reader most likely knows the
@@ -203,18 +203,18 @@ impl Drop for ServiceServer {
 
 /// The result of a handler.
 #[derive(Debug)]
-pub(crate) struct Answer {
+pub(crate) struct HandlerResult {
     /// Little-endian CDR with its encapsulation header.
     pub(crate) bytes: Bytes,
     /// Dropped once the reply is written for the client's reader, or given up.
-    pub(crate) written: Option<oneshot::Sender<Never>>,
+    pub(crate) written: Option<oneshot::Sender<NoValue>>,
 }
 
 /// A type without values: only the drop of the sender is signalled.
 #[derive(Debug)]
-pub(crate) enum Never {}
+pub(crate) enum NoValue {}
 
-impl From<Bytes> for Answer {
+impl From<Bytes> for HandlerResult {
     fn from(bytes: Bytes) -> Self {
         Self {
             bytes,
@@ -223,18 +223,18 @@ impl From<Bytes> for Answer {
     }
 }
 
-type Pending = Pin<Box<dyn Future<Output = Result<Answer, String>> + Send>>;
+type Pending = Pin<Box<dyn Future<Output = Result<HandlerResult, String>> + Send>>;
 
 /// Owns the endpoints and all requests in progress.
 struct Driver {
-    service: Service,
+    service: ServiceName,
     peers: ServicePeers,
-    writer: Writer,
+    writer: PayloadWriter,
     options: ServiceOptions,
     handler: Box<dyn Fn(ServiceRequest) -> Pending + Send + Sync>,
     counters: Arc<Counters>,
     waiting: VecDeque<(ReplyTo, Bytes)>,
-    handled: JoinSet<(ReplyTo, Result<Answer, String>)>,
+    handled: JoinSet<(ReplyTo, Result<HandlerResult, String>)>,
     /// Replies that wait for the match of their client or for the send window; oldest first.
     replies: VecDeque<Reply>,
     audience: Audience,
@@ -246,11 +246,11 @@ struct Reply {
     payload: Payload,
     related: Option<rustdds::rpc::SampleIdentity>,
     until: Instant,
-    _written: Option<oneshot::Sender<Never>>,
+    _written: Option<oneshot::Sender<NoValue>>,
 }
 
 impl Driver {
-    async fn run(mut self, reader: Reader) {
+    async fn run(mut self, reader: PayloadReader) {
         loop {
             // Each branch is cancel-safe: only the branch that completes takes an item.
             let tick = Instant::now() + BUSY;
@@ -271,7 +271,7 @@ impl Driver {
         }
     }
 
-    fn received(&mut self, request: Option<Received>) {
+    fn received(&mut self, request: Option<ReceivedServiceSample>) {
         let opened = match request {
             // A request of a client of this bridge: the server is for requests of other
             // participants only.
@@ -330,9 +330,9 @@ impl Driver {
         }
     }
 
-    fn done(&mut self, to: ReplyTo, result: Result<Answer, String>, now: Instant) {
-        let sealed = result.and_then(|Answer { bytes, written }| {
-            let Outgoing { payload, related } =
+    fn done(&mut self, to: ReplyTo, result: Result<HandlerResult, String>, now: Instant) {
+        let sealed = result.and_then(|HandlerResult { bytes, written }| {
+            let OutgoingServiceSample { payload, related } =
                 mapping::seal_reply(&to, bytes).map_err(|fault| fault.label().to_owned())?;
             let payload = Payload::to_write(payload).map_err(|error| error.label().to_owned())?;
             Ok((payload, related, written))

@@ -10,27 +10,27 @@ use tokio::task::AbortHandle;
 use tokio::time::{Instant, sleep_until, timeout};
 
 use super::client_goals::{
-    ClientCounters, ClientGoals, CommState, Feedback, GoalEvent, GoalResult, Limits, LostReason,
-    Source,
+    ActionlibClientCounters, ActionlibClientGoals, ActionlibGoalEvent, CommState, Feedback,
+    GoalLimits, GoalLoss, GoalResult, ServerTopic,
 };
-use super::events::Faults;
+use super::events::UnusableData;
 use super::types::{
-    ActionError, ClientType, GoalId, GoalStatus, check_wrapper, goal_id_type,
+    ActionlibError, ActionlibGoalId, ClientType, GoalStatus, check_wrapper, goal_id_type,
     goal_status_array_type, wanted,
 };
 use super::wire;
 use crate::clock;
-use crate::inbox::{Inbox, InboxEvent, Message};
+use crate::inbox::{Inbox, InboxEvent, InboxMessage};
 use crate::node::{Node, NodeError};
 use crate::outbox::lock;
 use crate::publisher::{Publisher, PublisherOptions};
 use crate::subscription::{SubscriberOptions, Subscription};
-use crate::time::RosClock;
-use crate::time::RosTime;
+use crate::time::Ros1Clock;
+use crate::time::Ros1Time;
 
-/// Time limits, in steady time, and queue sizes of an [`ActionClient`].
+/// Time limits, in steady time, and queue sizes of an [`ActionlibClient`].
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct ActionClientOptions {
+pub struct ActionlibClientOptions {
     /// Limit from sending a goal until a server must have listed it.
     pub acknowledge_timeout: Duration,
     /// Limit without a status of the server, after which its goals are lost. Servers send five
@@ -52,7 +52,7 @@ pub struct ActionClientOptions {
     pub feedback_bytes: usize,
 }
 
-impl Default for ActionClientOptions {
+impl Default for ActionlibClientOptions {
     /// Returns limits of five seconds, except 1 second for a lost connection and 10 ms for
     /// overtaken feedback. Queues hold 100 feedback messages and 16 MiB.
     fn default() -> Self {
@@ -72,13 +72,13 @@ impl Default for ActionClientOptions {
 /// Sends goals to the server of an action. Dropping the client ends its goals as lost; it does not
 /// cancel them.
 #[derive(Debug)]
-pub struct ActionClient {
+pub struct ActionlibClient {
     shared: Arc<Shared>,
     task: AbortHandle,
     _subscriptions: [Subscription; 3],
 }
 
-impl ActionClient {
+impl ActionlibClient {
     /// Opens the topics of the action. The server may start later, stop and restart.
     ///
     /// `name` is the name of the action, such as `arm/move`; it is resolved like the name of a
@@ -91,8 +91,8 @@ impl ActionClient {
         node: &Node,
         name: &str,
         action: impl Into<ClientType>,
-        options: ActionClientOptions,
-    ) -> Result<Self, ActionError> {
+        options: ActionlibClientOptions,
+    ) -> Result<Self, ActionlibError> {
         let action = action.into();
         check_wrapper(&action.goal.name, "ActionGoal")?;
         let name = node.resolve(name).map_err(NodeError::from)?;
@@ -103,9 +103,9 @@ impl ActionClient {
         };
         let status = wanted(goal_status_array_type());
         let subscriptions = [
-            subscribe("status", status, Source::Status)?,
-            subscribe("feedback", action.feedback, Source::Feedback)?,
-            subscribe("result", action.result, Source::Result)?,
+            subscribe("status", status, ServerTopic::Status)?,
+            subscribe("feedback", action.feedback, ServerTopic::Feedback)?,
+            subscribe("result", action.result, ServerTopic::Result)?,
         ];
         let advertise = |topic, topic_type| {
             let options = PublisherOptions::default();
@@ -117,9 +117,9 @@ impl ActionClient {
             seq: 0,
         };
         let state = State {
-            goals: ClientGoals::new(limits(&options)),
+            goals: ActionlibClientGoals::new(limits(&options)),
             outputs: Some(outputs),
-            faults: Faults::new(),
+            faults: UnusableData::new(),
         };
         let shared = Arc::new(Shared {
             name,
@@ -139,7 +139,7 @@ impl ActionClient {
     /// Sends a goal, the serialized `XGoal`. Never waits and never fails: a goal without any
     /// subscriber is lost at once, see [`LostReason::NoServer`]. To send a goal to a server that is
     /// starting, wait for the server first.
-    pub fn send_goal(&self, body: &[u8]) -> GoalHandle {
+    pub fn send_goal(&self, body: &[u8]) -> ActionlibGoal {
         let goal_id = self.shared.new_id();
         self.send(lock(&self.shared.state), goal_id, body)
     }
@@ -150,17 +150,22 @@ impl ActionClient {
     /// with an earlier stamp than the last goal, and the clocks of two hosts differ.
     ///
     /// # Errors
-    /// [`IdInUse`] while a handle of a goal with that id exists; then nothing is sent.
-    pub fn send_goal_as(&self, id: String, body: &[u8]) -> Result<GoalHandle, IdInUse> {
+    /// [`GoalIdInUse`] while a handle of a goal with that id exists; then nothing is sent.
+    pub fn send_goal_as(&self, id: String, body: &[u8]) -> Result<ActionlibGoal, GoalIdInUse> {
         let state = lock(&self.shared.state);
         if state.goals.goal(&id).is_some() {
-            return Err(IdInUse { id });
+            return Err(GoalIdInUse { id });
         }
-        let stamp = RosTime::default();
-        Ok(self.send(state, GoalId { stamp, id }, body))
+        let stamp = Ros1Time::default();
+        Ok(self.send(state, ActionlibGoalId { stamp, id }, body))
     }
 
-    fn send(&self, mut state: MutexGuard<'_, State>, goal_id: GoalId, body: &[u8]) -> GoalHandle {
+    fn send(
+        &self,
+        mut state: MutexGuard<'_, State>,
+        goal_id: ActionlibGoalId,
+        body: &[u8],
+    ) -> ActionlibGoal {
         let wake = Arc::new(Notify::new());
         let id = goal_id.id.clone();
         state
@@ -174,18 +179,18 @@ impl ActionClient {
         });
         if sent_to == 0 {
             let topic = format!("{}/goal", self.shared.name);
-            state.goals.lose(&id, LostReason::NoServer { topic });
+            state.goals.lose(&id, GoalLoss::NoServer { topic });
         }
         drop(state);
         self.shared.deadline_moved.notify_one();
-        GoalHandle {
+        ActionlibGoal {
             shared: Arc::clone(&self.shared),
             goal_id,
             wake,
         }
     }
 
-    /// Requests the server to cancel a goal, as [`GoalHandle::cancel`] does.
+    /// Requests the server to cancel a goal, as [`ActionlibGoal::cancel`] does.
     pub fn cancel_goal(&self, id: &str) -> CancelSent {
         let mut state = lock(&self.shared.state);
         let Some(goal) = state.goals.goal(id) else {
@@ -200,8 +205,8 @@ impl ActionClient {
             | CommState::WaitingForCancelAck => {
                 let _wanted = state.goals.cancel(id);
                 drop(state);
-                let request = GoalId {
-                    stamp: RosTime::default(),
+                let request = ActionlibGoalId {
+                    stamp: Ros1Time::default(),
                     id: id.to_owned(),
                 };
                 match self.shared.send_cancel(&request) {
@@ -220,7 +225,7 @@ impl ActionClient {
     /// Requests the server to cancel all goals of the action, including the goals of other clients.
     /// Returns the number of nodes that the request was sent to. The goals report the outcome.
     pub fn cancel_all(&self) -> usize {
-        self.shared.send_cancel(&GoalId::default())
+        self.shared.send_cancel(&ActionlibGoalId::default())
     }
 
     /// Requests the server to cancel all goals with a stamp of `time` or earlier, including the
@@ -228,8 +233,8 @@ impl ActionClient {
     /// later goals with such a stamp. Returns the number of nodes that the request was sent to.
     ///
     /// The time zero stands for all goals, as with [`Self::cancel_all`].
-    pub fn cancel_before(&self, time: RosTime) -> usize {
-        self.shared.send_cancel(&GoalId {
+    pub fn cancel_before(&self, time: Ros1Time) -> usize {
+        self.shared.send_cancel(&ActionlibGoalId {
             stamp: time,
             id: String::new(),
         })
@@ -238,9 +243,9 @@ impl ActionClient {
     /// Returns the node that serves the action. A server is ready when it publishes feedback and
     /// results, its status came after both connections were made, and it subscribes to goals and
     /// cancel requests.
-    pub fn server(&self) -> Result<String, NoServer> {
+    pub fn server(&self) -> Result<String, NoActionlibServer> {
         let state = lock(&self.shared.state);
-        let missing = |reason| NoServer {
+        let missing = |reason| NoActionlibServer {
             action: self.shared.name.clone(),
             reason,
         };
@@ -264,7 +269,7 @@ impl ActionClient {
     ///
     /// # Errors
     /// Fails with the missing part if no server is ready within `limit`.
-    pub async fn wait_for_server(&self, limit: Duration) -> Result<String, NoServer> {
+    pub async fn wait_for_server(&self, limit: Duration) -> Result<String, NoActionlibServer> {
         let found = async {
             loop {
                 if let Ok(server) = self.server() {
@@ -286,16 +291,16 @@ impl ActionClient {
     }
 
     /// Returns the counts of received data that could not be used.
-    pub fn counters(&self) -> ClientCounters {
+    pub fn counters(&self) -> ActionlibClientCounters {
         lock(&self.shared.state).goals.counters
     }
 }
 
-impl Drop for ActionClient {
+impl Drop for ActionlibClient {
     fn drop(&mut self) {
         self.task.abort();
         let mut state = lock(&self.shared.state);
-        state.goals.lose_all(&LostReason::ClientClosed);
+        state.goals.lose_all(&GoalLoss::ClientClosed);
         let outputs = state.outputs.take();
         drop(state);
         drop(outputs);
@@ -319,14 +324,14 @@ pub enum CancelSent {
 /// A goal with that id has a handle already.
 #[derive(Clone, Debug, PartialEq, Eq, Error)]
 #[error("a goal `{id}` already exists")]
-pub struct IdInUse {
+pub struct GoalIdInUse {
     id: String,
 }
 
 /// No server is ready to receive goals.
 #[derive(Clone, Debug, PartialEq, Eq, Error)]
 #[error("no server of the action {action}: {reason}")]
-pub struct NoServer {
+pub struct NoActionlibServer {
     action: String,
     reason: &'static str,
 }
@@ -334,16 +339,16 @@ pub struct NoServer {
 /// A goal that was sent. Dropping the handle ends the events of the goal; it does not cancel the
 /// goal.
 #[derive(Debug)]
-pub struct GoalHandle {
+pub struct ActionlibGoal {
     shared: Arc<Shared>,
-    goal_id: GoalId,
+    goal_id: ActionlibGoalId,
     wake: Arc<Notify>,
 }
 
-impl GoalHandle {
+impl ActionlibGoal {
     /// Returns the id of the goal and the time it was sent. Generated ids have the form
     /// `<node>-<count>-<seconds>.<nanoseconds>`. A goal with an id of the caller has the time 0.
-    pub fn goal_id(&self) -> &GoalId {
+    pub fn goal_id(&self) -> &ActionlibGoalId {
         &self.goal_id
     }
 
@@ -361,7 +366,7 @@ impl GoalHandle {
         let goal = state.goals.goal(&self.goal_id.id);
         GoalStatus {
             goal_id: self.goal_id.clone(),
-            status: goal.map_or(super::Status::Lost, |goal| goal.status),
+            status: goal.map_or(super::ActionlibStatus::Lost, |goal| goal.status),
             text: goal.map(|goal| goal.text.clone()).unwrap_or_default(),
         }
     }
@@ -369,7 +374,7 @@ impl GoalHandle {
     /// Returns the next event in order, or `None` after the last event. The last event always
     /// arrives within the time limits of the client after its server has stopped sending.
     /// Cancel-safe.
-    pub async fn recv(&mut self) -> Option<GoalEvent> {
+    pub async fn recv(&mut self) -> Option<ActionlibGoalEvent> {
         loop {
             let rung = self.wake.notified();
             {
@@ -389,12 +394,12 @@ impl GoalHandle {
 
     /// Waits for the end of the goal and discards all other events. May be called again.
     /// Cancel-safe.
-    pub async fn outcome(&mut self) -> Result<GoalResult, LostReason> {
+    pub async fn outcome(&mut self) -> Result<GoalResult, GoalLoss> {
         while self.recv().await.is_some() {}
         let state = lock(&self.shared.state);
         let goal = state.goals.goal(&self.goal_id.id);
         goal.and_then(|goal| goal.outcome.clone())
-            .unwrap_or(Err(LostReason::ClientClosed))
+            .unwrap_or(Err(GoalLoss::ClientClosed))
     }
 
     /// Requests the server to cancel the goal. The goal continues until the server reports the
@@ -403,14 +408,14 @@ impl GoalHandle {
     pub fn cancel(&self) -> bool {
         let wanted = lock(&self.shared.state).goals.cancel(&self.goal_id.id);
         wanted
-            && self.shared.send_cancel(&GoalId {
-                stamp: RosTime::default(),
+            && self.shared.send_cancel(&ActionlibGoalId {
+                stamp: Ros1Time::default(),
                 id: self.goal_id.id.clone(),
             }) > 0
     }
 }
 
-impl Drop for GoalHandle {
+impl Drop for ActionlibGoal {
     fn drop(&mut self) {
         lock(&self.shared.state).goals.forget(&self.goal_id.id);
     }
@@ -421,17 +426,17 @@ impl Drop for GoalHandle {
 struct Shared {
     name: String,
     node: String,
-    clock: RosClock,
+    clock: Ros1Clock,
     state: Mutex<State>,
     deadline_moved: Notify,
 }
 
 #[derive(Debug)]
 struct State {
-    goals: ClientGoals,
+    goals: ActionlibClientGoals,
     /// `None` once the client is dropped.
     outputs: Option<Outputs>,
-    faults: Faults,
+    faults: UnusableData,
 }
 
 #[derive(Debug)]
@@ -442,17 +447,17 @@ struct Outputs {
 }
 
 impl Shared {
-    fn new_id(&self) -> GoalId {
+    fn new_id(&self) -> ActionlibGoalId {
         // Shared by all clients of the process: two clients of a node must not create the same
         // id.
         static COUNT: AtomicU64 = AtomicU64::new(1);
         let stamp = self.clock.now();
         let count = COUNT.fetch_add(1, Ordering::Relaxed);
         let id = format!("{}-{count}-{}.{:09}", self.node, stamp.secs, stamp.nsecs);
-        GoalId { stamp, id }
+        ActionlibGoalId { stamp, id }
     }
 
-    fn send_cancel(&self, id: &GoalId) -> usize {
+    fn send_cancel(&self, id: &ActionlibGoalId) -> usize {
         let state = lock(&self.state);
         let outputs = state.outputs.as_ref();
         outputs.map_or(0, |outputs| {
@@ -460,7 +465,7 @@ impl Shared {
         })
     }
 
-    fn take(&self, source: Source, event: InboxEvent) {
+    fn take(&self, source: ServerTopic, event: InboxEvent) {
         let now = clock::now();
         let mut guard = lock(&self.state);
         let state = &mut *guard;
@@ -490,22 +495,22 @@ impl Shared {
 impl State {
     fn message(
         &mut self,
-        source: Source,
-        message: &Message,
+        source: ServerTopic,
+        message: &InboxMessage,
         now: Instant,
-    ) -> Result<(), wire::Malformed> {
+    ) -> Result<(), wire::MalformedAction> {
         let peer = || Arc::clone(&message.peer);
         match source {
-            Source::Status => {
+            ServerTopic::Status => {
                 let list = wire::read_status_array(&message.bytes)?;
                 self.goals.status(&message.peer.caller_id, &list, now);
             }
-            Source::Feedback => {
+            ServerTopic::Feedback => {
                 let (status, body) = wire::read_reply(&message.bytes)?;
                 let feedback = Feedback { body, peer: peer() };
                 self.goals.feedback(&status.id, feedback);
             }
-            Source::Result => {
+            ServerTopic::Result => {
                 let (status, body) = wire::read_reply(&message.bytes)?;
                 self.goals.result(&status, body, peer(), now);
             }
@@ -515,7 +520,7 @@ impl State {
 }
 
 /// Receives the messages of the server and ends goals after their time limits, until aborted.
-async fn run(shared: Arc<Shared>, mut inbox: Inbox<Source>) {
+async fn run(shared: Arc<Shared>, mut inbox: Inbox<ServerTopic>) {
     loop {
         let deadline = lock(&shared.state).goals.deadline();
         let due = async {
@@ -546,8 +551,8 @@ async fn run(shared: Arc<Shared>, mut inbox: Inbox<Source>) {
     }
 }
 
-const fn limits(options: &ActionClientOptions) -> Limits {
-    Limits {
+const fn limits(options: &ActionlibClientOptions) -> GoalLimits {
+    GoalLimits {
         acknowledge: options.acknowledge_timeout,
         silence: options.silence_timeout,
         reconnect: options.reconnect_timeout,

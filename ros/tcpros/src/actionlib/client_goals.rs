@@ -17,10 +17,10 @@ use tokio::sync::Notify;
 use tokio::time::Instant;
 
 use self::goal::Goal;
-use super::types::Status;
+use super::types::ActionlibStatus;
 use super::wire::StatusEntry;
 use crate::clock;
-use crate::inbox::Peer;
+use crate::inbox::ConnectionPeer;
 
 /// State of a goal between its client and its server.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
@@ -41,7 +41,7 @@ pub enum CommState {
     Preempting,
     /// Ended with its result.
     Done,
-    /// Ended without a result, see [`LostReason`].
+    /// Ended without a result, see [`GoalLoss`].
     Lost,
 }
 
@@ -63,7 +63,7 @@ impl CommState {
 
 /// Event of a goal.
 #[derive(Clone, Debug)]
-pub enum GoalEvent {
+pub enum ActionlibGoalEvent {
     /// The goal has entered another state, with an event for each state on the way. `Done` and
     /// `Lost` have events of their own.
     State(CommState),
@@ -74,7 +74,7 @@ pub enum GoalEvent {
     /// The last event of a goal that ended with a result.
     Done(GoalResult),
     /// The last event of a goal that is lost.
-    Lost(LostReason),
+    Lost(GoalLoss),
 }
 
 /// Progress of a goal.
@@ -83,26 +83,26 @@ pub struct Feedback {
     /// The serialized `XFeedback`.
     pub body: Bytes,
     /// The server, with the type of the topic in its header.
-    pub peer: Arc<Peer>,
+    pub peer: Arc<ConnectionPeer>,
 }
 
 /// The end of a goal.
 #[derive(Clone, Debug)]
 pub struct GoalResult {
     /// Final status. `Lost` stands for a code of the server that is not terminal.
-    pub status: Status,
+    pub status: ActionlibStatus,
     /// Text of the server about the result, for people.
     pub text: String,
     /// The serialized `XResult`.
     pub body: Bytes,
     /// The server, with the type of the topic in its header.
-    pub peer: Arc<Peer>,
+    pub peer: Arc<ConnectionPeer>,
 }
 
 /// Reason for which a goal is lost. The server may still work on a goal that it received.
 #[derive(Clone, Debug, PartialEq, Eq, Error)]
 #[non_exhaustive]
-pub enum LostReason {
+pub enum GoalLoss {
     /// No node subscribes to the goals.
     #[error(
         "the goal was not sent: no node subscribes to {topic}; start the action server, or check its name"
@@ -138,7 +138,7 @@ pub enum LostReason {
     #[error("the goal ended as {status:?}, and no result came within {waited:?}")]
     NoResult {
         /// Final status of the goal.
-        status: Status,
+        status: ActionlibStatus,
         /// Time limit that was exceeded.
         waited: Duration,
     },
@@ -149,7 +149,7 @@ pub enum LostReason {
 
 /// Counts of received data that a client could not use.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct ClientCounters {
+pub struct ActionlibClientCounters {
     /// Messages that cannot be decoded.
     pub malformed: u64,
     /// Statuses that cannot follow the state of the goal, or with an unknown code.
@@ -166,7 +166,7 @@ pub struct ClientCounters {
 
 /// The time limits and queues of a client's goals.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Limits {
+pub(super) struct GoalLimits {
     pub(super) acknowledge: Duration,
     pub(super) silence: Duration,
     pub(super) reconnect: Duration,
@@ -178,7 +178,7 @@ pub(super) struct Limits {
 
 /// A topic that the server publishes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Source {
+pub(super) enum ServerTopic {
     Status,
     Feedback,
     Result,
@@ -186,11 +186,11 @@ pub(super) enum Source {
 
 /// All goals that still have a handle, and the known servers.
 #[derive(Debug)]
-pub(super) struct ClientGoals {
-    limits: Limits,
+pub(super) struct ActionlibClientGoals {
+    limits: GoalLimits,
     goals: HashMap<String, Goal>,
     servers: HashMap<String, Server>,
-    pub(super) counters: ClientCounters,
+    pub(super) counters: ActionlibClientCounters,
 }
 
 /// The connections to a node that publishes at least one topic of the action.
@@ -218,13 +218,13 @@ impl Server {
     }
 }
 
-impl ClientGoals {
-    pub(super) fn new(limits: Limits) -> Self {
+impl ActionlibClientGoals {
+    pub(super) fn new(limits: GoalLimits) -> Self {
         Self {
             limits,
             goals: HashMap::new(),
             servers: HashMap::new(),
-            counters: ClientCounters::default(),
+            counters: ActionlibClientCounters::default(),
         }
     }
 
@@ -248,7 +248,7 @@ impl ClientGoals {
         open.map(|(id, _)| id.clone()).collect()
     }
 
-    pub(super) fn next_event(&mut self, id: &str) -> Option<GoalEvent> {
+    pub(super) fn next_event(&mut self, id: &str) -> Option<ActionlibGoalEvent> {
         self.goals.get_mut(id)?.next_event()
     }
 
@@ -295,7 +295,7 @@ impl ClientGoals {
                 && goal.state != CommState::WaitingForResult
             {
                 let server = from.to_owned();
-                goal.lose(LostReason::Forgotten { server });
+                goal.lose(GoalLoss::Forgotten { server });
             }
         }
     }
@@ -305,7 +305,7 @@ impl ClientGoals {
         &mut self,
         entry: &StatusEntry,
         body: Bytes,
-        peer: Arc<Peer>,
+        peer: Arc<ConnectionPeer>,
         now: Instant,
     ) {
         let Some(goal) = self.goals.get_mut(&entry.id) else {
@@ -315,11 +315,11 @@ impl ClientGoals {
             self.counters.late_results += 1;
             return;
         }
-        let status = Status::from_code(entry.code).filter(|status| status.is_terminal());
+        let status = ActionlibStatus::from_code(entry.code).filter(|status| status.is_terminal());
         if !goal.follow(entry, now) || status.is_none() {
             self.counters.invalid_transitions += 1;
         }
-        let status = status.unwrap_or(Status::Lost);
+        let status = status.unwrap_or(ActionlibStatus::Lost);
         let server = self.servers.get(&peer.caller_id);
         let reports = server.is_some_and(|server| server.feedback > 0);
         let result = GoalResult {
@@ -345,12 +345,12 @@ impl ClientGoals {
     }
 
     /// Records that a connection to a publisher of the action was made or ended.
-    pub(super) fn connection(&mut self, node: &str, topic: Source, made: bool, now: Instant) {
+    pub(super) fn connection(&mut self, node: &str, topic: ServerTopic, made: bool, now: Instant) {
         let server = self.server(node);
         let count = match topic {
-            Source::Status => &mut server.status,
-            Source::Feedback => &mut server.feedback,
-            Source::Result => &mut server.result,
+            ServerTopic::Status => &mut server.status,
+            ServerTopic::Feedback => &mut server.feedback,
+            ServerTopic::Result => &mut server.result,
         };
         *count = if made {
             *count + 1
@@ -407,13 +407,13 @@ impl ClientGoals {
         losses.chain(ends).min()
     }
 
-    pub(super) fn lose(&mut self, id: &str, reason: LostReason) {
+    pub(super) fn lose(&mut self, id: &str, reason: GoalLoss) {
         if let Some(goal) = self.goals.get_mut(id) {
             goal.lose(reason);
         }
     }
 
-    pub(super) fn lose_all(&mut self, reason: &LostReason) {
+    pub(super) fn lose_all(&mut self, reason: &GoalLoss) {
         for goal in self.goals.values_mut() {
             goal.lose(reason.clone());
         }
@@ -437,28 +437,28 @@ impl ClientGoals {
 fn next_loss(
     goal: &Goal,
     servers: &HashMap<String, Server>,
-    limits: &Limits,
-) -> Option<(Instant, LostReason)> {
+    limits: &GoalLimits,
+) -> Option<(Instant, GoalLoss)> {
     if goal.state.is_end() {
         return None;
     }
     let Some(node) = &goal.server else {
-        let reason = LostReason::NotAcknowledged(limits.acknowledge);
+        let reason = GoalLoss::NotAcknowledged(limits.acknowledge);
         return Some((clock::after(goal.sent, limits.acknowledge), reason));
     };
     let server = servers.get(node);
     let node = || node.clone();
     let heard = server.and_then(|s| s.last_status).unwrap_or(goal.sent);
-    let silent = LostReason::Silent {
+    let silent = GoalLoss::Silent {
         server: node(),
         silence: limits.silence,
     };
     let gone = server.and_then(|server| server.gone).map(|at| {
-        let reason = LostReason::Disconnected { server: node() };
+        let reason = GoalLoss::Disconnected { server: node() };
         (clock::after(at, limits.reconnect), reason)
     });
     let waiting = goal.ended.map(|at| {
-        let reason = LostReason::NoResult {
+        let reason = GoalLoss::NoResult {
             status: goal.status,
             waited: limits.result,
         };

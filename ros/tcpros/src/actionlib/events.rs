@@ -10,13 +10,13 @@ use crate::clock;
 
 /// Rate limits for logs of unusable data: an entry per kind in ten seconds.
 #[derive(Debug)]
-pub(super) struct Faults {
+pub(super) struct UnusableData {
     malformed: Throttle,
     overrun: Throttle,
     full: Throttle,
 }
 
-impl Faults {
+impl UnusableData {
     pub(super) const fn new() -> Self {
         let every = Duration::from_secs(10);
         Self {

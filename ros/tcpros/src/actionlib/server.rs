@@ -10,24 +10,27 @@ use tokio::sync::{Notify, watch};
 use tokio::task::AbortHandle;
 use tokio::time::sleep_until;
 
-use super::events::Faults;
-use super::server_goals::{Arrival, Decision, GoalError, Key, ServerCounters, ServerGoals};
+use super::events::UnusableData;
+use super::server_goals::{
+    ActionlibGoalError, ActionlibServerCounters, ActionlibServerGoals, Decision, GoalArrival,
+    GoalKey,
+};
 use super::types::{
-    ActionError, ActionType, GoalId, GoalStatus, Status, check_wrapper, goal_id_type,
-    goal_status_array_type, wanted,
+    ActionlibError, ActionlibGoalId, ActionlibStatus, ActionlibTypes, GoalStatus, check_wrapper,
+    goal_id_type, goal_status_array_type, wanted,
 };
 use super::wire;
 use crate::clock;
-use crate::inbox::{Inbox, InboxEvent, Message};
+use crate::inbox::{Inbox, InboxEvent, InboxMessage};
 use crate::node::{Node, NodeError};
 use crate::outbox::lock;
 use crate::publisher::{Publisher, PublisherOptions};
 use crate::subscription::{SubscriberOptions, Subscription};
-use crate::time::RosClock;
+use crate::time::Ros1Clock;
 
-/// Reporting periods, in steady time, and capacity of an [`ActionServer`].
+/// Reporting periods, in steady time, and capacity of an [`ActionlibServer`].
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct ActionServerOptions {
+pub struct ActionlibServerOptions {
     /// The serialized `XResult` without content, for goals that end without a result of the user:
     /// recalled before they arrive, rejected, or dropped. Clients have to be able to decode it.
     pub empty_result: Bytes,
@@ -41,7 +44,7 @@ pub struct ActionServerOptions {
     pub max_goals: usize,
 }
 
-impl ActionServerOptions {
+impl ActionlibServerOptions {
     /// Returns options with five statuses a second, ended goals kept for five seconds, and 1000
     /// goals.
     pub const fn new(empty_result: Bytes) -> Self {
@@ -56,22 +59,22 @@ impl ActionServerOptions {
 
 /// Request of a client to a server.
 #[derive(Debug)]
-pub enum ServerEvent {
+pub enum ActionlibServerEvent {
     /// A new goal, to be accepted or rejected.
-    Goal(ServerGoal),
+    Goal(ActionlibServerGoal),
     /// A client requests to cancel the open goal with this id. The server decides.
-    Cancel(GoalId),
+    Cancel(ActionlibGoalId),
 }
 
 /// Receives the goals of an action. Dropping the server aborts the goals that have not ended.
 #[derive(Debug)]
-pub struct ActionServer {
+pub struct ActionlibServer {
     shared: Arc<Shared>,
     task: AbortHandle,
     _subscriptions: [Subscription; 2],
 }
 
-impl ActionServer {
+impl ActionlibServer {
     /// Opens the topics of the action and starts to publish its status.
     ///
     /// `name` is the name of the action, such as `arm/move`; it is resolved like the name of a
@@ -83,9 +86,9 @@ impl ActionServer {
     pub fn new(
         node: &Node,
         name: &str,
-        action: ActionType,
-        options: ActionServerOptions,
-    ) -> Result<Self, ActionError> {
+        action: ActionlibTypes,
+        options: ActionlibServerOptions,
+    ) -> Result<Self, ActionlibError> {
         check_wrapper(&action.goal.name, "ActionGoal")?;
         check_wrapper(&action.result.name, "ActionResult")?;
         check_wrapper(&action.feedback.name, "ActionFeedback")?;
@@ -114,10 +117,10 @@ impl ActionServer {
             subscribe("cancel", wanted(goal_id_type()), Source::Cancel)?,
         ];
         let state = State {
-            goals: ServerGoals::new(options.max_goals, options.status_list_timeout),
+            goals: ActionlibServerGoals::new(options.max_goals, options.status_list_timeout),
             outputs: Some(outputs),
             arrived: VecDeque::new(),
-            faults: Faults::new(),
+            faults: UnusableData::new(),
         };
         let shared = Arc::new(Shared {
             name,
@@ -138,7 +141,7 @@ impl ActionServer {
 
     /// Waits for the next event. Cancel-safe. The queue holds at most twice as many events as there
     /// are open goals.
-    pub async fn recv(&mut self) -> ServerEvent {
+    pub async fn recv(&mut self) -> ActionlibServerEvent {
         loop {
             if let Some(event) = self.try_recv() {
                 return event;
@@ -148,12 +151,12 @@ impl ActionServer {
     }
 
     /// Returns the next event if an event is queued.
-    pub fn try_recv(&mut self) -> Option<ServerEvent> {
+    pub fn try_recv(&mut self) -> Option<ActionlibServerEvent> {
         let mut state = lock(&self.shared.state);
         loop {
             match state.arrived.pop_front()? {
                 Arrived::Goal(key, goal_id, body) => {
-                    return Some(ServerEvent::Goal(ServerGoal {
+                    return Some(ActionlibServerEvent::Goal(ActionlibServerGoal {
                         shared: Arc::clone(&self.shared),
                         key,
                         goal_id,
@@ -164,7 +167,7 @@ impl ActionServer {
                     let status = state.goals.status(key);
                     // The goal may have ended in the meantime.
                     if let Some(status) = status.filter(|status| !status.status.is_terminal()) {
-                        return Some(ServerEvent::Cancel(status.goal_id.clone()));
+                        return Some(ActionlibServerEvent::Cancel(status.goal_id.clone()));
                     }
                 }
             }
@@ -177,12 +180,12 @@ impl ActionServer {
     }
 
     /// Returns the counts of received data that could not be used.
-    pub fn counters(&self) -> ServerCounters {
+    pub fn counters(&self) -> ActionlibServerCounters {
         lock(&self.shared.state).goals.counters
     }
 }
 
-impl Drop for ActionServer {
+impl Drop for ActionlibServer {
     fn drop(&mut self) {
         self.task.abort();
         let mut guard = lock(&self.shared.state);
@@ -202,16 +205,16 @@ impl Drop for ActionServer {
 /// A goal to decide about. Decisions are published at once and never wait. A goal that is dropped
 /// before its end is aborted.
 #[derive(Debug)]
-pub struct ServerGoal {
+pub struct ActionlibServerGoal {
     shared: Arc<Shared>,
-    key: Key,
-    goal_id: GoalId,
+    key: GoalKey,
+    goal_id: ActionlibGoalId,
     body: Bytes,
 }
 
-impl ServerGoal {
+impl ActionlibServerGoal {
     /// Returns the id of the goal and the time of the request, by the clock of its client.
-    pub const fn goal_id(&self) -> &GoalId {
+    pub const fn goal_id(&self) -> &ActionlibGoalId {
         &self.goal_id
     }
 
@@ -222,14 +225,14 @@ impl ServerGoal {
 
     /// Returns the status of the goal: `Lost` if the goal has ended and left the status of the
     /// server.
-    pub fn status(&self) -> Status {
+    pub fn status(&self) -> ActionlibStatus {
         let state = lock(&self.shared.state);
         let status = state.goals.status(self.key);
-        status.map_or(Status::Lost, |status| status.status)
+        status.map_or(ActionlibStatus::Lost, |status| status.status)
     }
 
     /// Starts work: changes pending to active, and recalling to preempting.
-    pub fn accept(&self, text: &str) -> Result<(), GoalError> {
+    pub fn accept(&self, text: &str) -> Result<(), ActionlibGoalError> {
         let mut guard = lock(&self.shared.state);
         let state = &mut *guard;
         state.open()?;
@@ -243,35 +246,38 @@ impl ServerGoal {
     }
 
     /// Ends a goal that was not accepted, with the empty result.
-    pub fn reject(&self, text: &str) -> Result<(), GoalError> {
+    pub fn reject(&self, text: &str) -> Result<(), ActionlibGoalError> {
         self.end(Decision::Reject, None, text)
     }
 
     /// Ends an accepted goal that was reached, with the serialized `XResult`.
-    pub fn succeed(&self, result: &[u8], text: &str) -> Result<(), GoalError> {
+    pub fn succeed(&self, result: &[u8], text: &str) -> Result<(), ActionlibGoalError> {
         self.end(Decision::Succeed, Some(result), text)
     }
 
     /// Ends an accepted goal that failed, with the serialized `XResult` or, for `None`, the empty
     /// result.
-    pub fn abort(&self, result: Option<&[u8]>, text: &str) -> Result<(), GoalError> {
+    pub fn abort(&self, result: Option<&[u8]>, text: &str) -> Result<(), ActionlibGoalError> {
         self.end(Decision::Abort, result, text)
     }
 
     /// Ends a goal as cancelled, requested or not, with the serialized `XResult` or, for `None`,
     /// the empty result. An accepted goal ends as preempted, any other goal as recalled.
-    pub fn cancelled(&self, result: Option<&[u8]>, text: &str) -> Result<(), GoalError> {
+    pub fn cancelled(&self, result: Option<&[u8]>, text: &str) -> Result<(), ActionlibGoalError> {
         self.end(Decision::Cancelled, result, text)
     }
 
     /// Reports progress, the serialized `XFeedback`. Fails once the goal has ended.
-    pub fn feedback(&self, body: &[u8]) -> Result<(), GoalError> {
+    pub fn feedback(&self, body: &[u8]) -> Result<(), ActionlibGoalError> {
         let mut guard = lock(&self.shared.state);
         let state = &mut *guard;
-        let outputs = state.outputs.as_mut().ok_or(GoalError::Closed)?;
-        let status = state.goals.status(self.key).ok_or(GoalError::Forgotten)?;
+        let outputs = state.outputs.as_mut().ok_or(ActionlibGoalError::Closed)?;
+        let status = state
+            .goals
+            .status(self.key)
+            .ok_or(ActionlibGoalError::Forgotten)?;
         if status.status.is_terminal() {
-            return Err(GoalError::NotFrom {
+            return Err(ActionlibGoalError::NotFrom {
                 goal: self.goal_id.id.clone(),
                 from: status.status,
                 wanted: "given feedback",
@@ -285,7 +291,10 @@ impl ServerGoal {
 
     /// Returns whether a client requested to cancel the goal and the goal has not ended.
     pub fn is_cancel_requested(&self) -> bool {
-        matches!(self.status(), Status::Recalling | Status::Preempting)
+        matches!(
+            self.status(),
+            ActionlibStatus::Recalling | ActionlibStatus::Preempting
+        )
     }
 
     /// Waits until a client requests to cancel the goal, or the goal has ended. Cancel-safe.
@@ -299,7 +308,12 @@ impl ServerGoal {
         }
     }
 
-    fn end(&self, decision: Decision, result: Option<&[u8]>, text: &str) -> Result<(), GoalError> {
+    fn end(
+        &self,
+        decision: Decision,
+        result: Option<&[u8]>,
+        text: &str,
+    ) -> Result<(), ActionlibGoalError> {
         let mut guard = lock(&self.shared.state);
         let state = &mut *guard;
         state.open()?;
@@ -311,7 +325,7 @@ impl ServerGoal {
     }
 }
 
-impl Drop for ServerGoal {
+impl Drop for ActionlibServerGoal {
     fn drop(&mut self) {
         let mut guard = lock(&self.shared.state);
         let state = &mut *guard;
@@ -334,9 +348,9 @@ enum Source {
 struct Shared {
     name: String,
     node: String,
-    clock: RosClock,
+    clock: Ros1Clock,
     state: Mutex<State>,
-    /// Notifies [`ActionServer::recv`].
+    /// Notifies [`ActionlibServer::recv`].
     arrival: Notify,
     /// Notifies all goals that a goal has changed.
     changed: watch::Sender<()>,
@@ -344,17 +358,17 @@ struct Shared {
 
 #[derive(Debug)]
 struct State {
-    goals: ServerGoals,
+    goals: ActionlibServerGoals,
     /// `None` once the server is dropped.
     outputs: Option<Outputs>,
     arrived: VecDeque<Arrived>,
-    faults: Faults,
+    faults: UnusableData,
 }
 
 #[derive(Debug)]
 enum Arrived {
-    Goal(Key, GoalId, Bytes),
-    Cancel(Key),
+    Goal(GoalKey, ActionlibGoalId, Bytes),
+    Cancel(GoalKey),
 }
 
 #[derive(Debug)]
@@ -374,22 +388,22 @@ impl Outputs {
 }
 
 impl State {
-    const fn open(&self) -> Result<(), GoalError> {
+    const fn open(&self) -> Result<(), ActionlibGoalError> {
         match self.outputs {
             Some(_) => Ok(()),
-            None => Err(GoalError::Closed),
+            None => Err(ActionlibGoalError::Closed),
         }
     }
 }
 
 impl Shared {
     /// Returns an id and a stamp for a goal that was received without them.
-    fn new_id(&self) -> GoalId {
+    fn new_id(&self) -> ActionlibGoalId {
         static COUNT: AtomicU64 = AtomicU64::new(1);
         let stamp = self.clock.now();
         let count = COUNT.fetch_add(1, Ordering::Relaxed);
         let id = format!("{}-{count}-{}.{:09}", self.node, stamp.secs, stamp.nsecs);
-        GoalId { stamp, id }
+        ActionlibGoalId { stamp, id }
     }
 
     fn take(&self, source: Source, event: InboxEvent) {
@@ -417,27 +431,31 @@ impl Shared {
         }
     }
 
-    fn goal(&self, state: &mut State, message: &Message) -> Result<(), wire::Malformed> {
+    fn goal(&self, state: &mut State, message: &InboxMessage) -> Result<(), wire::MalformedAction> {
         let (id, body) = wire::read_goal(&message.bytes)?;
         let refused = state.goals.counters.refused;
         match state.goals.goal(id, self.new_id(), clock::now()) {
-            Arrival::New(key, id) => {
+            GoalArrival::New(key, id) => {
                 state.arrived.push_back(Arrived::Goal(key, id, body));
                 self.arrival.notify_one();
                 self.publish_status(state);
             }
-            Arrival::Ended(status) => {
+            GoalArrival::Ended(status) => {
                 if state.goals.counters.refused > refused {
                     state.faults.full(&status.goal_id.id);
                 }
                 self.publish_result(state, &status, None);
             }
-            Arrival::Known => {}
+            GoalArrival::Known => {}
         }
         Ok(())
     }
 
-    fn cancel(&self, state: &mut State, message: &Message) -> Result<(), wire::Malformed> {
+    fn cancel(
+        &self,
+        state: &mut State,
+        message: &InboxMessage,
+    ) -> Result<(), wire::MalformedAction> {
         let request = wire::read_cancel(&message.bytes)?;
         let refused = state.goals.counters.refused;
         let told = state.goals.cancel(&request, clock::now());

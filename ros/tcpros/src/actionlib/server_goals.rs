@@ -9,9 +9,9 @@ use std::time::Duration;
 use thiserror::Error;
 use tokio::time::Instant;
 
-use super::types::{GoalId, GoalStatus, Status};
+use super::types::{ActionlibGoalId, ActionlibStatus, GoalStatus};
 use crate::clock;
-use crate::time::RosTime;
+use crate::time::Ros1Time;
 
 /// Decision of a server about a goal.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -26,14 +26,14 @@ pub(super) enum Decision {
 /// Reason for which a goal refused a decision.
 #[derive(Clone, Debug, PartialEq, Eq, Error)]
 #[non_exhaustive]
-pub enum GoalError {
+pub enum ActionlibGoalError {
     /// The decision cannot follow the status of the goal.
     #[error("the goal {goal} is {from:?}: it cannot be {wanted}")]
     NotFrom {
         /// Id of the goal.
         goal: String,
         /// Status of the goal, which does not change.
-        from: Status,
+        from: ActionlibStatus,
         /// Requested decision.
         wanted: &'static str,
     },
@@ -47,7 +47,7 @@ pub enum GoalError {
 
 /// Counts of received data that a server could not use.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct ServerCounters {
+pub struct ActionlibServerCounters {
     /// Messages that cannot be decoded.
     pub malformed: u64,
     /// Goals rejected and cancel requests ignored because too many goals are open.
@@ -60,9 +60,9 @@ pub struct ServerCounters {
 
 /// Outcome of a received goal.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub(super) enum Arrival {
+pub(super) enum GoalArrival {
     /// A new goal, to be decided by the user.
-    New(Key, GoalId),
+    New(GoalKey, ActionlibGoalId),
     /// The goal has ended before its start, with this status.
     Ended(GoalStatus),
     /// A goal with this id was received before.
@@ -71,76 +71,81 @@ pub(super) enum Arrival {
 
 /// Distinguishes a goal from an earlier goal of the same id that has left the status.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
-pub(super) struct Key(u64);
+pub(super) struct GoalKey(u64);
 
 /// All goals of the status, in the order of arrival.
 #[derive(Debug)]
-pub(super) struct ServerGoals {
+pub(super) struct ActionlibServerGoals {
     entries: Vec<Entry>,
     /// The latest time of a request to cancel all goals up to a time.
-    last_cancel: RosTime,
+    last_cancel: Ros1Time,
     most: usize,
     linger: Duration,
     next_key: u64,
-    pub(super) counters: ServerCounters,
+    pub(super) counters: ActionlibServerCounters,
 }
 
 /// A goal, or a cancel request for a goal that was not received yet. The cancel request is an entry
 /// with the status recalling and an end time.
 #[derive(Debug)]
 struct Entry {
-    key: Key,
+    key: GoalKey,
     status: GoalStatus,
     /// Start of the period in which no more decisions about the goal are made.
     ended: Option<Instant>,
 }
 
-impl ServerGoals {
+impl ActionlibServerGoals {
     /// Creates a list of at most `most` goals that keeps ended goals for `linger`.
     pub(super) fn new(most: usize, linger: Duration) -> Self {
         Self {
             entries: Vec::new(),
-            last_cancel: RosTime::default(),
+            last_cancel: Ros1Time::default(),
             most,
             linger,
             next_key: 0,
-            counters: ServerCounters::default(),
+            counters: ActionlibServerCounters::default(),
         }
     }
 
     /// Adds a received goal. `fallback` supplies a missing id or stamp.
-    pub(super) fn goal(&mut self, mut id: GoalId, fallback: GoalId, now: Instant) -> Arrival {
+    pub(super) fn goal(
+        &mut self,
+        mut id: ActionlibGoalId,
+        fallback: ActionlibGoalId,
+        now: Instant,
+    ) -> GoalArrival {
         let mut entries = self.entries.iter_mut();
         let known = entries.find(|entry| entry.status.goal_id.id == id.id && !id.id.is_empty());
         if let Some(known) = known {
             return known.seen_again(now);
         }
-        let recalled = id.stamp != RosTime::default() && id.stamp <= self.last_cancel;
+        let recalled = id.stamp != Ros1Time::default() && id.stamp <= self.last_cancel;
         if id.id.is_empty() {
             id.id = fallback.id;
         }
-        if id.stamp == RosTime::default() {
+        if id.stamp == Ros1Time::default() {
             id.stamp = fallback.stamp;
         }
         let mut status = GoalStatus {
             goal_id: id.clone(),
-            status: Status::Pending,
+            status: ActionlibStatus::Pending,
             text: String::new(),
         };
         if !self.has_room() {
-            status.status = Status::Rejected;
+            status.status = ActionlibStatus::Rejected;
             TOO_MANY.clone_into(&mut status.text);
-            return Arrival::Ended(status);
+            return GoalArrival::Ended(status);
         }
         if recalled {
-            status.status = Status::Recalled;
+            status.status = ActionlibStatus::Recalled;
             RECALLED.clone_into(&mut status.text);
         }
         let key = self.push(status.clone(), recalled.then_some(now));
         if recalled {
-            Arrival::Ended(status)
+            GoalArrival::Ended(status)
         } else {
-            Arrival::New(key, id)
+            GoalArrival::New(key, id)
         }
     }
 
@@ -150,8 +155,8 @@ impl ServerGoals {
     /// - A time selects all goals with this stamp or an earlier stamp, including goals received
     ///   later.
     /// - An id selects the goal with this id, which may be received later.
-    pub(super) fn cancel(&mut self, request: &GoalId, now: Instant) -> Vec<Key> {
-        let timed = request.stamp != RosTime::default();
+    pub(super) fn cancel(&mut self, request: &ActionlibGoalId, now: Instant) -> Vec<GoalKey> {
+        let timed = request.stamp != Ros1Time::default();
         let all = request.id.is_empty() && !timed;
         let mut told = Vec::new();
         let mut found = request.id.is_empty();
@@ -166,7 +171,7 @@ impl ServerGoals {
         if !found && self.has_room() {
             let status = GoalStatus {
                 goal_id: request.clone(),
-                status: Status::Recalling,
+                status: ActionlibStatus::Recalling,
                 text: String::new(),
             };
             self.push(status, Some(now));
@@ -178,16 +183,16 @@ impl ServerGoals {
     /// Applies a decision and returns the new status.
     pub(super) fn decide(
         &mut self,
-        key: Key,
+        key: GoalKey,
         decision: Decision,
         text: &str,
         now: Instant,
-    ) -> Result<GoalStatus, GoalError> {
+    ) -> Result<GoalStatus, ActionlibGoalError> {
         let entry = self.entries.iter_mut().find(|entry| entry.key == key);
         // A goal that has left the status had ended.
-        let entry = entry.ok_or(GoalError::Forgotten)?;
+        let entry = entry.ok_or(ActionlibGoalError::Forgotten)?;
         let from = entry.status.status;
-        let to = follows(from, decision).ok_or_else(|| GoalError::NotFrom {
+        let to = follows(from, decision).ok_or_else(|| ActionlibGoalError::NotFrom {
             goal: entry.status.goal_id.id.clone(),
             from,
             wanted: decision.name(),
@@ -196,20 +201,20 @@ impl ServerGoals {
     }
 
     /// Ends a goal that is not going to be decided. Returns `None` if it has ended already.
-    pub(super) fn abandon(&mut self, key: Key, text: &str, now: Instant) -> Option<GoalStatus> {
+    pub(super) fn abandon(&mut self, key: GoalKey, text: &str, now: Instant) -> Option<GoalStatus> {
         let mut entries = self.entries.iter_mut();
         let entry = entries.find(|entry| entry.key == key && entry.ended.is_none())?;
-        Some(entry.set(Status::Aborted, text, now))
+        Some(entry.set(ActionlibStatus::Aborted, text, now))
     }
 
     /// Returns the goals that have not ended.
-    pub(super) fn open(&self) -> Vec<Key> {
+    pub(super) fn open(&self) -> Vec<GoalKey> {
         let open = self.entries.iter().filter(|entry| entry.ended.is_none());
         open.map(|entry| entry.key).collect()
     }
 
     /// Returns the status of a goal while it is known.
-    pub(super) fn status(&self, key: Key) -> Option<&GoalStatus> {
+    pub(super) fn status(&self, key: GoalKey) -> Option<&GoalStatus> {
         let entry = self.entries.iter().find(|entry| entry.key == key)?;
         Some(&entry.status)
     }
@@ -222,8 +227,8 @@ impl ServerGoals {
         self.entries.iter().map(|entry| &entry.status)
     }
 
-    fn push(&mut self, status: GoalStatus, ended: Option<Instant>) -> Key {
-        let key = Key(self.next_key);
+    fn push(&mut self, status: GoalStatus, ended: Option<Instant>) -> GoalKey {
+        let key = GoalKey(self.next_key);
         self.next_key += 1;
         self.entries.push(Entry { key, status, ended });
         key
@@ -252,15 +257,15 @@ impl ServerGoals {
 
 impl Entry {
     /// Handles a received goal with the id of this entry.
-    fn seen_again(&mut self, now: Instant) -> Arrival {
+    fn seen_again(&mut self, now: Instant) -> GoalArrival {
         if self.ended.is_none() {
-            return Arrival::Known;
+            return GoalArrival::Known;
         }
         self.ended = Some(now);
-        if self.status.status == Status::Recalling {
-            Arrival::Ended(self.set(Status::Recalled, RECALLED, now))
+        if self.status.status == ActionlibStatus::Recalling {
+            GoalArrival::Ended(self.set(ActionlibStatus::Recalled, RECALLED, now))
         } else {
-            Arrival::Known
+            GoalArrival::Known
         }
     }
 
@@ -271,22 +276,22 @@ impl Entry {
             return false;
         }
         let asked = match self.status.status {
-            Status::Pending => Status::Recalling,
-            Status::Active => Status::Preempting,
-            Status::Preempted
-            | Status::Succeeded
-            | Status::Aborted
-            | Status::Rejected
-            | Status::Preempting
-            | Status::Recalling
-            | Status::Recalled
-            | Status::Lost => return false,
+            ActionlibStatus::Pending => ActionlibStatus::Recalling,
+            ActionlibStatus::Active => ActionlibStatus::Preempting,
+            ActionlibStatus::Preempted
+            | ActionlibStatus::Succeeded
+            | ActionlibStatus::Aborted
+            | ActionlibStatus::Rejected
+            | ActionlibStatus::Preempting
+            | ActionlibStatus::Recalling
+            | ActionlibStatus::Recalled
+            | ActionlibStatus::Lost => return false,
         };
         self.status.status = asked;
         true
     }
 
-    fn set(&mut self, status: Status, text: &str, now: Instant) -> GoalStatus {
+    fn set(&mut self, status: ActionlibStatus, text: &str, now: Instant) -> GoalStatus {
         self.status.status = status;
         text.clone_into(&mut self.status.text);
         self.ended = status.is_terminal().then_some(now);
@@ -307,17 +312,19 @@ impl Decision {
 }
 
 /// Returns the status that follows a decision, or `None` if the decision is not allowed.
-const fn follows(from: Status, decision: Decision) -> Option<Status> {
-    let waiting = matches!(from, Status::Pending | Status::Recalling);
-    let at_work = matches!(from, Status::Active | Status::Preempting);
+const fn follows(from: ActionlibStatus, decision: Decision) -> Option<ActionlibStatus> {
+    let waiting = matches!(from, ActionlibStatus::Pending | ActionlibStatus::Recalling);
+    let at_work = matches!(from, ActionlibStatus::Active | ActionlibStatus::Preempting);
     match decision {
-        Decision::Accept if matches!(from, Status::Pending) => Some(Status::Active),
-        Decision::Accept if waiting => Some(Status::Preempting),
-        Decision::Reject if waiting => Some(Status::Rejected),
-        Decision::Cancelled if waiting => Some(Status::Recalled),
-        Decision::Cancelled if at_work => Some(Status::Preempted),
-        Decision::Abort if at_work => Some(Status::Aborted),
-        Decision::Succeed if at_work => Some(Status::Succeeded),
+        Decision::Accept if matches!(from, ActionlibStatus::Pending) => {
+            Some(ActionlibStatus::Active)
+        }
+        Decision::Accept if waiting => Some(ActionlibStatus::Preempting),
+        Decision::Reject if waiting => Some(ActionlibStatus::Rejected),
+        Decision::Cancelled if waiting => Some(ActionlibStatus::Recalled),
+        Decision::Cancelled if at_work => Some(ActionlibStatus::Preempted),
+        Decision::Abort if at_work => Some(ActionlibStatus::Aborted),
+        Decision::Succeed if at_work => Some(ActionlibStatus::Succeeded),
         Decision::Accept
         | Decision::Reject
         | Decision::Cancelled
@@ -338,57 +345,61 @@ mod tests {
 
     const LINGER: Duration = Duration::from_secs(5);
 
-    fn id(secs: u32, id: &str) -> GoalId {
-        GoalId {
-            stamp: RosTime { secs, nsecs: 0 },
+    fn id(secs: u32, id: &str) -> ActionlibGoalId {
+        ActionlibGoalId {
+            stamp: Ros1Time { secs, nsecs: 0 },
             id: id.to_owned(),
         }
     }
 
-    fn fallback() -> GoalId {
+    fn fallback() -> ActionlibGoalId {
         id(99, "made")
     }
 
     /// Returns goals with these ids, requested at seconds 1, 2, ...
-    fn with(ids: &[&str], now: Instant) -> ServerGoals {
-        let mut goals = ServerGoals::new(10, LINGER);
+    fn with(ids: &[&str], now: Instant) -> ActionlibServerGoals {
+        let mut goals = ActionlibServerGoals::new(10, LINGER);
         for (secs, text) in (1..).zip(ids) {
             let new = goals.goal(id(secs, text), fallback(), now);
-            assert!(matches!(new, Arrival::New(..)));
+            assert!(matches!(new, GoalArrival::New(..)));
         }
         goals
     }
 
-    fn key(goals: &ServerGoals, id: &str) -> Option<Key> {
+    fn key(goals: &ActionlibServerGoals, id: &str) -> Option<GoalKey> {
         let mut entries = goals.entries.iter();
         let entry = entries.find(|entry| entry.status.goal_id.id == id)?;
         Some(entry.key)
     }
 
     fn decide(
-        goals: &mut ServerGoals,
+        goals: &mut ActionlibServerGoals,
         id: &str,
         decision: Decision,
         now: Instant,
-    ) -> Result<GoalStatus, GoalError> {
-        let key = key(goals, id).ok_or(GoalError::Forgotten)?;
+    ) -> Result<GoalStatus, ActionlibGoalError> {
+        let key = key(goals, id).ok_or(ActionlibGoalError::Forgotten)?;
         goals.decide(key, decision, "", now)
     }
 
-    fn cancel(goals: &mut ServerGoals, request: &GoalId, now: Instant) -> Vec<String> {
+    fn cancel(
+        goals: &mut ActionlibServerGoals,
+        request: &ActionlibGoalId,
+        now: Instant,
+    ) -> Vec<String> {
         let told = goals.cancel(request, now).into_iter();
         told.map(|key| goals.status(key).unwrap().goal_id.id.clone())
             .collect()
     }
 
-    fn of(goals: &ServerGoals, id: &str) -> Status {
+    fn of(goals: &ActionlibServerGoals, id: &str) -> ActionlibStatus {
         goals.status(key(goals, id).unwrap()).unwrap().status
     }
 
     #[test]
     fn each_decision_is_taken_from_the_statuses_of_actionlib_and_no_other() {
+        use ActionlibStatus as S;
         use Decision as D;
-        use Status as S;
         let allowed = [
             (D::Accept, S::Pending, S::Active),
             (D::Accept, S::Recalling, S::Preempting),
@@ -404,7 +415,7 @@ mod tests {
             (D::Succeed, S::Preempting, S::Succeeded),
         ];
         for decision in [D::Accept, D::Reject, D::Cancelled, D::Abort, D::Succeed] {
-            for from in (0..10).filter_map(Status::from_code) {
+            for from in (0..10).filter_map(ActionlibStatus::from_code) {
                 let to = allowed
                     .iter()
                     .find(|(d, f, _)| (*d, *f) == (decision, from))
@@ -423,7 +434,7 @@ mod tests {
             refused.to_string(),
             "the goal a is Pending: it cannot be succeeded"
         );
-        assert_eq!(of(&goals, "a"), Status::Pending);
+        assert_eq!(of(&goals, "a"), ActionlibStatus::Pending);
     }
 
     #[test]
@@ -432,12 +443,15 @@ mod tests {
         let mut goals = with(&["a", "b", "c"], now);
         decide(&mut goals, "b", Decision::Accept, now).unwrap();
         decide(&mut goals, "c", Decision::Reject, now).unwrap();
-        assert_eq!(cancel(&mut goals, &GoalId::default(), now), ["a", "b"]);
-        assert_eq!(of(&goals, "a"), Status::Recalling);
-        assert_eq!(of(&goals, "b"), Status::Preempting);
-        assert_eq!(of(&goals, "c"), Status::Rejected);
+        assert_eq!(
+            cancel(&mut goals, &ActionlibGoalId::default(), now),
+            ["a", "b"]
+        );
+        assert_eq!(of(&goals, "a"), ActionlibStatus::Recalling);
+        assert_eq!(of(&goals, "b"), ActionlibStatus::Preempting);
+        assert_eq!(of(&goals, "c"), ActionlibStatus::Rejected);
         assert!(
-            cancel(&mut goals, &GoalId::default(), now).is_empty(),
+            cancel(&mut goals, &ActionlibGoalId::default(), now).is_empty(),
             "they know"
         );
     }
@@ -448,9 +462,11 @@ mod tests {
         let mut goals = with(&["a", "b", "c"], now);
         assert_eq!(cancel(&mut goals, &id(2, ""), now), ["a", "b"]);
         let late = goals.goal(id(2, "late"), fallback(), now);
-        assert!(matches!(late, Arrival::Ended(status) if status.status == Status::Recalled));
+        assert!(
+            matches!(late, GoalArrival::Ended(status) if status.status == ActionlibStatus::Recalled)
+        );
         let newer = goals.goal(id(3, "newer"), fallback(), now);
-        assert!(matches!(newer, Arrival::New(..)));
+        assert!(matches!(newer, GoalArrival::New(..)));
     }
 
     #[test]
@@ -466,10 +482,12 @@ mod tests {
         let now = clock::now();
         let mut goals = with(&[], now);
         assert!(cancel(&mut goals, &id(0, "a"), now).is_empty());
-        assert_eq!(of(&goals, "a"), Status::Recalling);
+        assert_eq!(of(&goals, "a"), ActionlibStatus::Recalling);
         let arrival = goals.goal(id(7, "a"), fallback(), now);
-        assert!(matches!(arrival, Arrival::Ended(status) if status.status == Status::Recalled));
-        assert_eq!(goals.goal(id(7, "a"), fallback(), now), Arrival::Known);
+        assert!(
+            matches!(arrival, GoalArrival::Ended(status) if status.status == ActionlibStatus::Recalled)
+        );
+        assert_eq!(goals.goal(id(7, "a"), fallback(), now), GoalArrival::Known);
     }
 
     #[test]
@@ -477,10 +495,10 @@ mod tests {
         let now = clock::now();
         let mut goals = with(&["a"], now);
         cancel(&mut goals, &id(0, "a"), now);
-        assert_eq!(goals.goal(id(1, "a"), fallback(), now), Arrival::Known);
+        assert_eq!(goals.goal(id(1, "a"), fallback(), now), GoalArrival::Known);
         assert_eq!(
             of(&goals, "a"),
-            Status::Recalling,
+            ActionlibStatus::Recalling,
             "it is the server's to decide"
         );
     }
@@ -489,8 +507,8 @@ mod tests {
     fn a_goal_without_id_and_time_is_given_them() {
         let now = clock::now();
         let mut goals = with(&[], now);
-        let arrival = goals.goal(GoalId::default(), fallback(), now);
-        assert!(matches!(arrival, Arrival::New(_, given) if given == fallback()));
+        let arrival = goals.goal(ActionlibGoalId::default(), fallback(), now);
+        assert!(matches!(arrival, GoalArrival::New(_, given) if given == fallback()));
     }
 
     #[test]
@@ -509,16 +527,18 @@ mod tests {
     #[test]
     fn a_full_status_forgets_ended_goals_first_and_then_rejects() {
         let now = clock::now();
-        let mut goals = ServerGoals::new(2, LINGER);
+        let mut goals = ActionlibServerGoals::new(2, LINGER);
         for text in ["a", "b", "c"] {
             let new = goals.goal(id(1, text), fallback(), now);
-            assert!(matches!(new, Arrival::New(..)), "{text}");
+            assert!(matches!(new, GoalArrival::New(..)), "{text}");
             if text == "a" {
                 decide(&mut goals, "a", Decision::Reject, now).unwrap();
             }
         }
         let full = goals.goal(id(1, "d"), fallback(), now);
-        assert!(matches!(full, Arrival::Ended(status) if status.status == Status::Rejected));
+        assert!(
+            matches!(full, GoalArrival::Ended(status) if status.status == ActionlibStatus::Rejected)
+        );
         assert_eq!((goals.counters.forgotten, goals.counters.refused), (1, 1));
         assert!(key(&goals, "a").is_none() && key(&goals, "d").is_none());
     }
@@ -555,7 +575,7 @@ mod tests {
             inputs in prop::collection::vec(input(), 0..80)
         ) {
             let mut now = clock::now();
-            let mut goals = ServerGoals::new(4, LINGER);
+            let mut goals = ActionlibServerGoals::new(4, LINGER);
             let mut told = std::collections::HashMap::new();
             let name = |n: u8| if n == 0 { String::new() } else { n.to_string() };
             for (step, input) in inputs.into_iter().enumerate() {
@@ -563,7 +583,7 @@ mod tests {
                 match input {
                     Input::Goal(n, at) => {
                         let fallback = id(9, &format!("made {step}"));
-                        if let Arrival::New(key, _) = goals.goal(id(at, &name(n)), fallback, now) {
+                        if let GoalArrival::New(key, _) = goals.goal(id(at, &name(n)), fallback, now) {
                             told.insert(key, 0);
                         }
                     }

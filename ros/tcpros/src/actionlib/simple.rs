@@ -1,19 +1,19 @@
 //! A server that works on one goal at a time; a newer goal replaces an older goal.
 
-use super::server::{ActionServer, ServerEvent, ServerGoal};
+use super::server::{ActionlibServer, ActionlibServerEvent, ActionlibServerGoal};
 
 /// The policy of actionlib's `SimpleActionServer`: one goal is active and one goal waits. A goal
 /// with a later stamp than both replaces the waiting goal, and the active goal should give way to
 /// it.
 #[derive(Debug)]
 pub struct SimpleActionServer {
-    server: ActionServer,
-    waiting: Option<ServerGoal>,
+    server: ActionlibServer,
+    waiting: Option<ActionlibServerGoal>,
 }
 
 impl SimpleActionServer {
     /// Creates a server that takes the goals of `server` one at a time.
-    pub const fn new(server: ActionServer) -> Self {
+    pub const fn new(server: ActionlibServer) -> Self {
         Self {
             server,
             waiting: None,
@@ -22,7 +22,7 @@ impl SimpleActionServer {
 
     /// Waits for the next goal and accepts it. The goal may have a cancel request already.
     /// Cancel-safe.
-    pub async fn next(&mut self) -> ServerGoal {
+    pub async fn next(&mut self) -> ActionlibServerGoal {
         loop {
             while let Some(event) = self.server.try_recv() {
                 self.take(event, None);
@@ -39,9 +39,9 @@ impl SimpleActionServer {
     }
 
     /// Waits until work on `current` should stop: a client requested to cancel the goal, or a newer
-    /// goal waits. Returns at once for a goal that has ended. Then call [`ServerGoal::cancelled`]
-    /// and [`Self::next`]. Cancel-safe.
-    pub async fn preempted(&mut self, current: &ServerGoal) {
+    /// goal waits. Returns at once for a goal that has ended. Then call
+    /// [`ActionlibServerGoal::cancelled`] and [`Self::next`]. Cancel-safe.
+    pub async fn preempted(&mut self, current: &ActionlibServerGoal) {
         loop {
             if self.waiting.is_some()
                 || current.is_cancel_requested()
@@ -56,8 +56,8 @@ impl SimpleActionServer {
 
     /// Keeps the goal with the latest stamp waiting. A cancel request is already in the status of
     /// its goal.
-    fn take(&mut self, event: ServerEvent, current: Option<&ServerGoal>) {
-        let ServerEvent::Goal(goal) = event else {
+    fn take(&mut self, event: ActionlibServerEvent, current: Option<&ActionlibServerGoal>) {
+        let ActionlibServerEvent::Goal(goal) = event else {
             return;
         };
         let newest = self.waiting.as_ref().or(current);

@@ -4,13 +4,13 @@ use thiserror::Error;
 
 use crate::node::NodeError;
 use crate::publisher::TopicType;
-use crate::subscription::Wanted;
-use crate::time::RosTime;
+use crate::subscription::RequestedType;
+use crate::time::Ros1Time;
 
 /// The types of an action's own topics, such as `pkg/XActionGoal`, `pkg/XActionResult` and
 /// `pkg/XActionFeedback`.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct ActionType {
+pub struct ActionlibTypes {
     /// Type of the topic `goal`.
     pub goal: TopicType,
     /// Type of the topic `result`.
@@ -26,9 +26,9 @@ pub struct ClientType {
     /// Type of the topic `goal`.
     pub goal: TopicType,
     /// Type of the topic `result`.
-    pub result: Wanted,
+    pub result: RequestedType,
     /// Type of the topic `feedback`.
-    pub feedback: Wanted,
+    pub feedback: RequestedType,
 }
 
 impl ClientType {
@@ -37,14 +37,14 @@ impl ClientType {
     pub fn of_goal(goal: TopicType) -> Self {
         Self {
             goal,
-            result: Wanted::default(),
-            feedback: Wanted::default(),
+            result: RequestedType::default(),
+            feedback: RequestedType::default(),
         }
     }
 }
 
-impl From<ActionType> for ClientType {
-    fn from(action: ActionType) -> Self {
+impl From<ActionlibTypes> for ClientType {
+    fn from(action: ActionlibTypes) -> Self {
         Self {
             goal: action.goal,
             result: wanted(action.result),
@@ -54,19 +54,19 @@ impl From<ActionType> for ClientType {
 }
 
 /// Returns a subscription request for exactly this type.
-pub(super) fn wanted(topic_type: TopicType) -> Wanted {
-    Wanted {
+pub(super) fn wanted(topic_type: TopicType) -> RequestedType {
+    RequestedType {
         type_name: Some(topic_type.name),
         md5sum: Some(topic_type.md5sum),
     }
 }
 
 /// Refuses the type of a bare `XGoal` where the type of the `XActionGoal` around it is required.
-pub(super) fn check_wrapper(type_name: &str, ending: &'static str) -> Result<(), ActionError> {
+pub(super) fn check_wrapper(type_name: &str, ending: &'static str) -> Result<(), ActionlibError> {
     if type_name.ends_with(ending) {
         Ok(())
     } else {
-        Err(ActionError::NotAWrapper {
+        Err(ActionlibError::NotAWrapper {
             type_name: type_name.to_owned(),
             ending,
         })
@@ -76,7 +76,7 @@ pub(super) fn check_wrapper(type_name: &str, ending: &'static str) -> Result<(),
 /// Reason for which a client or a server could not start.
 #[derive(Debug, Error)]
 #[non_exhaustive]
-pub enum ActionError {
+pub enum ActionlibError {
     /// A topic of the action could not be advertised or subscribed to.
     #[error(transparent)]
     Node(#[from] NodeError),
@@ -94,9 +94,9 @@ pub enum ActionError {
 
 /// Identity of a goal: `actionlib_msgs/GoalID`.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Hash)]
-pub struct GoalId {
+pub struct ActionlibGoalId {
     /// Time of the request, by the clock of the client.
-    pub stamp: RosTime,
+    pub stamp: Ros1Time,
     /// Id, unique among all goals of the action.
     pub id: String,
 }
@@ -105,16 +105,16 @@ pub struct GoalId {
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct GoalStatus {
     /// Identity of the goal.
-    pub goal_id: GoalId,
+    pub goal_id: ActionlibGoalId,
     /// Status code.
-    pub status: Status,
+    pub status: ActionlibStatus,
     /// Text of the server about the status, for people.
     pub text: String,
 }
 
 /// The codes of `actionlib_msgs/GoalStatus`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
-pub enum Status {
+pub enum ActionlibStatus {
     /// 0: received and not decided.
     Pending,
     /// 1: active.
@@ -137,7 +137,7 @@ pub enum Status {
     Lost,
 }
 
-impl Status {
+impl ActionlibStatus {
     /// Returns the code on the wire.
     pub const fn code(self) -> u8 {
         match self {
@@ -223,9 +223,9 @@ mod tests {
     #[test]
     fn every_code_of_the_message_has_its_status_and_no_other_has() {
         for code in 0..10 {
-            assert_eq!(Status::from_code(code).unwrap().code(), code);
+            assert_eq!(ActionlibStatus::from_code(code).unwrap().code(), code);
         }
-        assert_eq!(Status::from_code(10), None);
+        assert_eq!(ActionlibStatus::from_code(10), None);
     }
 
     #[test]

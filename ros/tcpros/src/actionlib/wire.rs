@@ -12,14 +12,14 @@
 use bytes::Bytes;
 use thiserror::Error;
 
-use super::{GoalId, GoalStatus};
-use crate::time::RosTime;
+use super::{ActionlibGoalId, GoalStatus};
+use crate::time::Ros1Time;
 
 /// Error for a message of an action that cannot be decoded: the message ends within the named
 /// field, or the field is not UTF-8.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Error)]
 #[error("the {0} of the message is truncated or not a text")]
-pub(super) struct Malformed(&'static str);
+pub(super) struct MalformedAction(&'static str);
 
 /// A received GoalStatus with an unchecked code.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -30,7 +30,7 @@ pub(super) struct StatusEntry {
 }
 
 /// Reads a goal. The id must be UTF-8, because the server sends it back unchanged.
-pub(super) fn read_goal(message: &Bytes) -> Result<(GoalId, Bytes), Malformed> {
+pub(super) fn read_goal(message: &Bytes) -> Result<(ActionlibGoalId, Bytes), MalformedAction> {
     let mut reader = Reader(message);
     reader.header()?;
     let id = reader.goal_id()?;
@@ -38,12 +38,12 @@ pub(super) fn read_goal(message: &Bytes) -> Result<(GoalId, Bytes), Malformed> {
 }
 
 /// Reads a cancel request. The id must be UTF-8, as in the goal that it names.
-pub(super) fn read_cancel(message: &[u8]) -> Result<GoalId, Malformed> {
+pub(super) fn read_cancel(message: &[u8]) -> Result<ActionlibGoalId, MalformedAction> {
     Reader(message).goal_id()
 }
 
 /// Reads a status array. Ids of other clients need not be UTF-8.
-pub(super) fn read_status_array(message: &[u8]) -> Result<Vec<StatusEntry>, Malformed> {
+pub(super) fn read_status_array(message: &[u8]) -> Result<Vec<StatusEntry>, MalformedAction> {
     let mut reader = Reader(message);
     reader.header()?;
     let count = reader.u32("status count")?;
@@ -52,7 +52,7 @@ pub(super) fn read_status_array(message: &[u8]) -> Result<Vec<StatusEntry>, Malf
 }
 
 /// Reads feedback or a result.
-pub(super) fn read_reply(message: &Bytes) -> Result<(StatusEntry, Bytes), Malformed> {
+pub(super) fn read_reply(message: &Bytes) -> Result<(StatusEntry, Bytes), MalformedAction> {
     let mut reader = Reader(message);
     reader.header()?;
     let status = reader.status()?;
@@ -60,7 +60,7 @@ pub(super) fn read_reply(message: &Bytes) -> Result<(StatusEntry, Bytes), Malfor
 }
 
 /// Writes a goal.
-pub(super) fn goal(seq: u32, stamp: RosTime, id: &GoalId, body: &[u8]) -> Bytes {
+pub(super) fn goal(seq: u32, stamp: Ros1Time, id: &ActionlibGoalId, body: &[u8]) -> Bytes {
     let mut out = header(seq, stamp);
     put_goal_id(&mut out, id);
     out.extend_from_slice(body);
@@ -68,7 +68,7 @@ pub(super) fn goal(seq: u32, stamp: RosTime, id: &GoalId, body: &[u8]) -> Bytes 
 }
 
 /// Writes a cancel request.
-pub(super) fn cancel(id: &GoalId) -> Bytes {
+pub(super) fn cancel(id: &ActionlibGoalId) -> Bytes {
     let mut out = Vec::new();
     put_goal_id(&mut out, id);
     out.into()
@@ -77,7 +77,7 @@ pub(super) fn cancel(id: &GoalId) -> Bytes {
 /// Writes a status array.
 pub(super) fn status_array<'a>(
     seq: u32,
-    stamp: RosTime,
+    stamp: Ros1Time,
     list: impl Iterator<Item = &'a GoalStatus>,
 ) -> Bytes {
     let mut out = header(seq, stamp);
@@ -95,7 +95,7 @@ pub(super) fn status_array<'a>(
 }
 
 /// Writes feedback or a result.
-pub(super) fn reply(seq: u32, stamp: RosTime, status: &GoalStatus, body: &[u8]) -> Bytes {
+pub(super) fn reply(seq: u32, stamp: Ros1Time, status: &GoalStatus, body: &[u8]) -> Bytes {
     let mut out = header(seq, stamp);
     put_status(&mut out, status);
     out.extend_from_slice(body);
@@ -106,7 +106,7 @@ fn rest(message: &Bytes, reader: &Reader<'_>) -> Bytes {
     message.slice_ref(reader.0)
 }
 
-fn header(seq: u32, stamp: RosTime) -> Vec<u8> {
+fn header(seq: u32, stamp: Ros1Time) -> Vec<u8> {
     let mut out = Vec::with_capacity(128);
     out.extend_from_slice(&seq.to_le_bytes());
     put_time(&mut out, stamp);
@@ -114,7 +114,7 @@ fn header(seq: u32, stamp: RosTime) -> Vec<u8> {
     out
 }
 
-fn put_time(out: &mut Vec<u8>, time: RosTime) {
+fn put_time(out: &mut Vec<u8>, time: Ros1Time) {
     out.extend_from_slice(&time.secs.to_le_bytes());
     out.extend_from_slice(&time.nsecs.to_le_bytes());
 }
@@ -127,7 +127,7 @@ fn put_string(out: &mut Vec<u8>, text: &str) {
     out.extend_from_slice(text.as_bytes());
 }
 
-fn put_goal_id(out: &mut Vec<u8>, id: &GoalId) {
+fn put_goal_id(out: &mut Vec<u8>, id: &ActionlibGoalId) {
     put_time(out, id.stamp);
     put_string(out, &id.id);
 }
@@ -142,53 +142,54 @@ fn put_status(out: &mut Vec<u8>, status: &GoalStatus) {
 struct Reader<'a>(&'a [u8]);
 
 impl<'a> Reader<'a> {
-    fn u8(&mut self, field: &'static str) -> Result<u8, Malformed> {
-        let (first, rest) = self.0.split_first().ok_or(Malformed(field))?;
+    fn u8(&mut self, field: &'static str) -> Result<u8, MalformedAction> {
+        let (first, rest) = self.0.split_first().ok_or(MalformedAction(field))?;
         self.0 = rest;
         Ok(*first)
     }
 
-    fn u32(&mut self, field: &'static str) -> Result<u32, Malformed> {
-        let (first, rest) = self.0.split_first_chunk().ok_or(Malformed(field))?;
+    fn u32(&mut self, field: &'static str) -> Result<u32, MalformedAction> {
+        let (first, rest) = self.0.split_first_chunk().ok_or(MalformedAction(field))?;
         self.0 = rest;
         Ok(u32::from_le_bytes(*first))
     }
 
-    fn time(&mut self, field: &'static str) -> Result<RosTime, Malformed> {
-        let time = RosTime {
+    fn time(&mut self, field: &'static str) -> Result<Ros1Time, MalformedAction> {
+        let time = Ros1Time {
             secs: self.u32(field)?,
             nsecs: self.u32(field)?,
         };
         if time.nsecs < 1_000_000_000 {
             Ok(time)
         } else {
-            Err(Malformed(field))
+            Err(MalformedAction(field))
         }
     }
 
-    fn string(&mut self, field: &'static str) -> Result<&'a [u8], Malformed> {
-        let len = usize::try_from(self.u32(field)?).map_err(|_| Malformed(field))?;
-        let (text, rest) = self.0.split_at_checked(len).ok_or(Malformed(field))?;
+    fn string(&mut self, field: &'static str) -> Result<&'a [u8], MalformedAction> {
+        let len = usize::try_from(self.u32(field)?).map_err(|_| MalformedAction(field))?;
+        let (text, rest) = self.0.split_at_checked(len).ok_or(MalformedAction(field))?;
         self.0 = rest;
         Ok(text)
     }
 
-    fn header(&mut self) -> Result<(), Malformed> {
+    fn header(&mut self) -> Result<(), MalformedAction> {
         self.u32("header")?;
         self.time("header")?;
         self.string("header").map(drop)
     }
 
-    fn goal_id(&mut self) -> Result<GoalId, Malformed> {
+    fn goal_id(&mut self) -> Result<ActionlibGoalId, MalformedAction> {
         let stamp = self.time("goal id")?;
-        let id = std::str::from_utf8(self.string("goal id")?).map_err(|_| Malformed("goal id"))?;
-        Ok(GoalId {
+        let id =
+            std::str::from_utf8(self.string("goal id")?).map_err(|_| MalformedAction("goal id"))?;
+        Ok(ActionlibGoalId {
             stamp,
             id: id.to_owned(),
         })
     }
 
-    fn status(&mut self) -> Result<StatusEntry, Malformed> {
+    fn status(&mut self) -> Result<StatusEntry, MalformedAction> {
         self.time("goal id")?;
         let text = |bytes| String::from_utf8_lossy(bytes).into_owned();
         Ok(StatusEntry {
@@ -203,12 +204,12 @@ impl<'a> Reader<'a> {
 mod tests {
     use proptest::prelude::*;
 
-    use super::super::Status;
+    use super::super::ActionlibStatus;
     use super::*;
 
-    fn id(secs: u32, text: &str) -> GoalId {
-        GoalId {
-            stamp: RosTime { secs, nsecs: 7 },
+    fn id(secs: u32, text: &str) -> ActionlibGoalId {
+        ActionlibGoalId {
+            stamp: Ros1Time { secs, nsecs: 7 },
             id: text.to_owned(),
         }
     }
@@ -228,8 +229,8 @@ mod tests {
     #[test]
     fn an_id_that_is_not_utf8_is_refused_by_a_server_and_passed_over_by_a_client() {
         let cancel = b"\0\0\0\0\0\0\0\0\x01\0\0\0\xff";
-        assert_eq!(read_cancel(cancel), Err(Malformed("goal id")));
-        let mut array = header(1, RosTime::default());
+        assert_eq!(read_cancel(cancel), Err(MalformedAction("goal id")));
+        let mut array = header(1, Ros1Time::default());
         array.extend_from_slice(b"\x01\0\0\0\0\0\0\0\0\0\0\0\x01\0\0\0\xff\x01\0\0\0\0");
         assert_eq!(read_status_array(&array).unwrap()[0].id, "\u{fffd}");
     }
@@ -246,15 +247,15 @@ mod tests {
         assert_eq!(last.stamp.nsecs, 999_999_999);
         assert_eq!(
             read_cancel(&cancel(1_000_000_000)),
-            Err(Malformed("goal id"))
+            Err(MalformedAction("goal id"))
         );
     }
 
     #[test]
     fn a_count_beyond_the_message_is_malformed_and_reserves_nothing() {
-        let mut array = header(1, RosTime::default());
+        let mut array = header(1, Ros1Time::default());
         array.extend_from_slice(&u32::MAX.to_le_bytes());
-        assert_eq!(read_status_array(&array), Err(Malformed("goal id")));
+        assert_eq!(read_status_array(&array), Err(MalformedAction("goal id")));
     }
 
     proptest! {
@@ -279,12 +280,12 @@ mod tests {
             (code, said) in (0u8..10, ".{0,12}"),
             cut in 1usize..200,
         ) {
-            let now = RosTime { secs: 5, nsecs: 6 };
+            let now = Ros1Time { secs: 5, nsecs: 6 };
             let goal_id = id(secs, &text);
             let sent = goal(1, now, &goal_id, &body);
             prop_assert_eq!(read_goal(&sent).unwrap(), (goal_id.clone(), body.clone().into()));
             prop_assert_eq!(&read_cancel(&cancel(&goal_id)).unwrap(), &goal_id);
-            let status = GoalStatus { goal_id, status: Status::from_code(code).unwrap(), text: said.clone() };
+            let status = GoalStatus { goal_id, status: ActionlibStatus::from_code(code).unwrap(), text: said.clone() };
             let entry = StatusEntry { id: text, code, text: said };
             let sent = reply(2, now, &status, &body);
             prop_assert_eq!(read_reply(&sent).unwrap(), (entry.clone(), body.into()));

@@ -5,11 +5,11 @@
 
 use std::collections::BTreeMap;
 
-use crate::xmlrpc::Value;
+use crate::xmlrpc::XmlRpcValue;
 
 /// The parameter tree and its subscribers.
 #[derive(Debug, Default)]
-pub(super) struct Tree {
+pub(super) struct ParameterTree {
     root: BTreeMap<String, Node>,
     /// Nodes and their slave APIs by the subscribed name, in canonical form.
     followers: BTreeMap<String, Vec<(String, String)>>,
@@ -17,16 +17,16 @@ pub(super) struct Tree {
 
 #[derive(Clone, Debug)]
 enum Node {
-    Leaf(Value),
+    Leaf(XmlRpcValue),
     Namespace(BTreeMap<String, Self>),
 }
 
 /// A `paramUpdate` to send: the slave API, the key and the value.
-pub(super) type Update = (String, String, Value);
+pub(super) type Update = (String, String, XmlRpcValue);
 
-impl Tree {
+impl ParameterTree {
     /// Returns a parameter, or a namespace as a struct. `/` is the whole tree.
-    pub(super) fn get(&self, name: &str) -> Option<Value> {
+    pub(super) fn get(&self, name: &str) -> Option<XmlRpcValue> {
         let mut parts = parts(name).peekable();
         let mut inside = &self.root;
         while let Some(part) = parts.next() {
@@ -42,7 +42,12 @@ impl Tree {
     /// Sets a parameter, or a namespace to the members of a struct. A value on the path becomes a
     /// namespace. Returns the updates for all subscribers except the caller, or `None` for a root
     /// that is not a struct.
-    pub(super) fn set(&mut self, name: &str, value: &Value, caller: &str) -> Option<Vec<Update>> {
+    pub(super) fn set(
+        &mut self,
+        name: &str,
+        value: &XmlRpcValue,
+        caller: &str,
+    ) -> Option<Vec<Update>> {
         let node = as_node(value.clone());
         let path: Vec<&str> = parts(name).collect();
         match node {
@@ -105,7 +110,7 @@ impl Tree {
 
     /// Adds a subscriber and returns the current value, or an empty struct if the parameter is not
     /// set.
-    pub(super) fn follow(&mut self, name: &str, caller: &str, api: &str) -> Value {
+    pub(super) fn follow(&mut self, name: &str, caller: &str, api: &str) -> XmlRpcValue {
         let followers = self.followers.entry(name.to_owned()).or_default();
         if !followers
             .iter()
@@ -143,7 +148,7 @@ impl Tree {
     /// Returns the updates of a change. Subscribers of the name and of its parent namespaces
     /// receive the new value under the changed name. Subscribers below the name receive their own
     /// part of the value. Keys end in a slash.
-    fn updates(&self, name: &str, value: &Value, ignored: Option<&str>) -> Vec<Update> {
+    fn updates(&self, name: &str, value: &XmlRpcValue, ignored: Option<&str>) -> Vec<Update> {
         let changed = slashed(name);
         let mut updates = Vec::new();
         for (followed, nodes) in &self.followers {
@@ -183,26 +188,26 @@ fn insert(members: &mut BTreeMap<String, Node>, path: &[&str], node: Node) {
     }
 }
 
-fn as_node(value: Value) -> Node {
+fn as_node(value: XmlRpcValue) -> Node {
     match value {
-        Value::Struct(members) => Node::Namespace(
+        XmlRpcValue::Struct(members) => Node::Namespace(
             members
                 .into_iter()
                 .map(|(name, member)| (name, as_node(member)))
                 .collect(),
         ),
-        Value::Int(_)
-        | Value::Bool(_)
-        | Value::Double(_)
-        | Value::String(_)
-        | Value::DateTime(_)
-        | Value::Binary(_)
-        | Value::Array(_)
-        | Value::Nil => Node::Leaf(value),
+        XmlRpcValue::Int(_)
+        | XmlRpcValue::Bool(_)
+        | XmlRpcValue::Double(_)
+        | XmlRpcValue::String(_)
+        | XmlRpcValue::DateTime(_)
+        | XmlRpcValue::Binary(_)
+        | XmlRpcValue::Array(_)
+        | XmlRpcValue::Nil => Node::Leaf(value),
     }
 }
 
-fn as_struct(members: &BTreeMap<String, Node>) -> Value {
+fn as_struct(members: &BTreeMap<String, Node>) -> XmlRpcValue {
     let member = |(name, node): (&String, &Node)| {
         let value = match node {
             Node::Leaf(value) => value.clone(),
@@ -210,12 +215,12 @@ fn as_struct(members: &BTreeMap<String, Node>) -> Value {
         };
         (name.clone(), value)
     };
-    Value::Struct(members.iter().map(member).collect())
+    XmlRpcValue::Struct(members.iter().map(member).collect())
 }
 
 /// Returns the value with which the API reports a parameter that is not set.
-const fn unset() -> Value {
-    Value::Struct(Vec::new())
+const fn unset() -> XmlRpcValue {
+    XmlRpcValue::Struct(Vec::new())
 }
 
 /// Returns the parts between the slashes of a name.
@@ -231,15 +236,15 @@ fn slashed(name: &str) -> String {
 mod tests {
     use super::*;
 
-    fn map(members: &[(&str, Value)]) -> Value {
+    fn map(members: &[(&str, XmlRpcValue)]) -> XmlRpcValue {
         let owned = members
             .iter()
             .map(|(name, v)| ((*name).to_owned(), v.clone()));
-        Value::Struct(owned.collect())
+        XmlRpcValue::Struct(owned.collect())
     }
 
-    fn tree() -> Tree {
-        let mut tree = Tree::default();
+    fn tree() -> ParameterTree {
+        let mut tree = ParameterTree::default();
         let gains = map(&[("p", 1.into()), ("inner", map(&[("d", 2.into())]))]);
         tree.set("/gains", &gains, "/x").unwrap();
         tree.set("/line/gains/p", &3.into(), "/x").unwrap();

@@ -4,7 +4,7 @@ use std::net::IpAddr;
 
 use thiserror::Error;
 
-use crate::names::NameError;
+use crate::names::ResourceNameError;
 
 /// Error of starting a node, or of a topic or service.
 #[derive(Debug, Error)]
@@ -15,7 +15,7 @@ pub enum NodeError {
     NoRuntime,
     /// A name is not a valid ROS name.
     #[error(transparent)]
-    Name(#[from] NameError),
+    Name(#[from] ResourceNameError),
     /// The master's URI is not `http://host:port`.
     #[error("the master's URI `{0}` is not of the form http://host:11311 (ROS_MASTER_URI)")]
     MasterUri(String),

@@ -4,14 +4,14 @@ use std::sync::Arc;
 
 use bytes::Bytes;
 
-use crate::master::{Graph, Master, MasterError};
+use crate::master::{Master, MasterError, MasterGraph};
 
 /// Reads the graph from the master of a node.
 #[derive(Clone, Debug)]
 pub struct GraphReader {
     master: Master,
     /// The last reply of the master, and its graph.
-    last: Option<(Bytes, Arc<Graph>)>,
+    last: Option<(Bytes, Arc<MasterGraph>)>,
 }
 
 impl GraphReader {
@@ -21,7 +21,7 @@ impl GraphReader {
 
     /// Returns the current graph of the master. Takes a few seconds at most; fails without a
     /// master.
-    pub async fn read(&self) -> Result<Graph, MasterError> {
+    pub async fn read(&self) -> Result<MasterGraph, MasterError> {
         self.master.graph().await
     }
 
@@ -30,7 +30,7 @@ impl GraphReader {
     ///
     /// # Errors
     /// Fails without a master.
-    pub async fn read_again(&mut self) -> Result<Arc<Graph>, MasterError> {
+    pub async fn read_again(&mut self) -> Result<Arc<MasterGraph>, MasterError> {
         self.master.graph_since(&mut self.last).await
     }
 }

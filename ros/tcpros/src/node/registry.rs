@@ -3,16 +3,16 @@
 use std::collections::HashMap;
 use std::sync::Arc;
 
-use crate::publisher::Hub;
-use crate::service::Served;
-use crate::subscription::Feed;
+use crate::publisher::PublishedTopic;
+use crate::service::OfferedService;
+use crate::subscription::TopicFeed;
 
 /// The topics and services of a node, by their resolved names.
 #[derive(Debug, Default)]
 pub(super) struct Registry {
-    pub(super) publications: HashMap<String, Arc<Hub>>,
+    pub(super) publications: HashMap<String, Arc<PublishedTopic>>,
     pub(super) subscriptions: HashMap<String, Subscribed>,
-    pub(super) services: HashMap<String, Arc<Served>>,
+    pub(super) services: HashMap<String, Arc<OfferedService>>,
     pub(super) generation: u64,
     pub(super) closed: bool,
 }
@@ -32,7 +32,7 @@ pub(super) struct Subscribed {
     pub(super) updates: u64,
     /// The last received list of publishers.
     pub(super) publishers: Vec<String>,
-    pub(super) feeds: Vec<Arc<Feed>>,
+    pub(super) feeds: Vec<Arc<TopicFeed>>,
 }
 
 /// The registration of a topic or service, with its version.

@@ -20,7 +20,7 @@ use crate::rpc::RpcError;
 
 /// State of a subscribed parameter.
 #[derive(Clone, Debug, PartialEq)]
-pub(crate) enum Heard {
+pub(crate) enum ParameterState {
     /// The parameter was not read from the master yet.
     Nothing,
     /// The last value from the master, or `None` if the parameter is not set.
@@ -62,7 +62,7 @@ struct Followed {
     subscribed: bool,
     /// Whether the parameter has changed after its last read.
     stale: bool,
-    heard: watch::Sender<Heard>,
+    heard: watch::Sender<ParameterState>,
 }
 
 /// A call to make.
@@ -104,10 +104,10 @@ impl Params {
     }
 
     /// Subscribes to a parameter until it is released as often as it was held.
-    pub(crate) fn hold(&self, name: &str) -> watch::Receiver<Heard> {
+    pub(crate) fn hold(&self, name: &str) -> watch::Receiver<ParameterState> {
         let mut table = lock(&self.table);
         if table.closed {
-            return watch::Sender::new(Heard::Nothing).subscribe();
+            return watch::Sender::new(ParameterState::Nothing).subscribe();
         }
         let entry = table
             .followed
@@ -117,7 +117,7 @@ impl Params {
                 told: false,
                 subscribed: false,
                 stale: false,
-                heard: watch::Sender::new(Heard::Nothing),
+                heard: watch::Sender::new(ParameterState::Nothing),
             });
         entry.holders += 1;
         let mut heard = entry.heard.subscribe();
@@ -166,7 +166,7 @@ impl Params {
         table.closed = true;
         for entry in table.followed.values_mut() {
             entry.holders = 0;
-            entry.heard = watch::Sender::new(Heard::Nothing);
+            entry.heard = watch::Sender::new(ParameterState::Nothing);
         }
     }
 
@@ -229,7 +229,7 @@ impl Params {
     fn has_read(&self, name: &str, value: Option<ParamValue>) {
         if let Some(entry) = lock(&self.table).followed.get_mut(name) {
             entry.subscribed = true;
-            let now = Heard::Value(value);
+            let now = ParameterState::Value(value);
             entry.heard.send_if_modified(|heard| {
                 let news = *heard != now;
                 *heard = now;

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use crate::parameters::ParamError;
-use crate::xmlrpc::Value;
+use crate::xmlrpc::XmlRpcValue;
 
 /// The value of a parameter, or of a whole namespace (`wiki.ros.org/Parameter Server`, "Parameter
 /// Types").
@@ -84,40 +84,42 @@ impl ParamValue {
 
     /// Converts a value from the wire. Returns `None` for a value that contains `<nil/>`, which is
     /// not a valid parameter.
-    pub(crate) fn from_wire(value: Value) -> Option<Self> {
+    pub(crate) fn from_wire(value: XmlRpcValue) -> Option<Self> {
         Some(match value {
-            Value::Bool(flag) => Self::Bool(flag),
-            Value::Int(number) => Self::Int(number),
-            Value::Double(number) => Self::Double(number),
-            Value::String(text) => Self::String(text),
-            Value::DateTime(text) => Self::DateTime(text),
-            Value::Binary(bytes) => Self::Binary(bytes),
-            Value::Array(items) => Self::List(
+            XmlRpcValue::Bool(flag) => Self::Bool(flag),
+            XmlRpcValue::Int(number) => Self::Int(number),
+            XmlRpcValue::Double(number) => Self::Double(number),
+            XmlRpcValue::String(text) => Self::String(text),
+            XmlRpcValue::DateTime(text) => Self::DateTime(text),
+            XmlRpcValue::Binary(bytes) => Self::Binary(bytes),
+            XmlRpcValue::Array(items) => Self::List(
                 items
                     .into_iter()
                     .map(Self::from_wire)
                     .collect::<Option<_>>()?,
             ),
-            Value::Struct(members) => Self::Map(
+            XmlRpcValue::Struct(members) => Self::Map(
                 members
                     .into_iter()
                     .map(|(name, member)| Some((name, Self::from_wire(member)?)))
                     .collect::<Option<_>>()?,
             ),
-            Value::Nil => return None,
+            XmlRpcValue::Nil => return None,
         })
     }
 
-    pub(crate) fn into_wire(self) -> Value {
+    pub(crate) fn into_wire(self) -> XmlRpcValue {
         match self {
-            Self::Bool(flag) => Value::Bool(flag),
-            Self::Int(number) => Value::Int(number),
-            Self::Double(number) => Value::Double(number),
-            Self::String(text) => Value::String(text),
-            Self::DateTime(text) => Value::DateTime(text),
-            Self::Binary(bytes) => Value::Binary(bytes),
-            Self::List(items) => Value::Array(items.into_iter().map(Self::into_wire).collect()),
-            Self::Map(members) => Value::Struct(
+            Self::Bool(flag) => XmlRpcValue::Bool(flag),
+            Self::Int(number) => XmlRpcValue::Int(number),
+            Self::Double(number) => XmlRpcValue::Double(number),
+            Self::String(text) => XmlRpcValue::String(text),
+            Self::DateTime(text) => XmlRpcValue::DateTime(text),
+            Self::Binary(bytes) => XmlRpcValue::Binary(bytes),
+            Self::List(items) => {
+                XmlRpcValue::Array(items.into_iter().map(Self::into_wire).collect())
+            }
+            Self::Map(members) => XmlRpcValue::Struct(
                 members
                     .into_iter()
                     .map(|(name, member)| (name, member.into_wire()))
@@ -231,7 +233,7 @@ mod tests {
 
     #[test]
     fn what_holds_a_nil_is_no_parameter() {
-        let list = Value::Array(vec![Value::Int(1), Value::Nil]);
+        let list = XmlRpcValue::Array(vec![XmlRpcValue::Int(1), XmlRpcValue::Nil]);
         assert_eq!(ParamValue::from_wire(list), None);
     }
 

@@ -16,15 +16,15 @@ use tokio::sync::{OwnedSemaphorePermit, Semaphore, watch};
 use tokio::task::JoinSet;
 use tokio::time::{sleep, timeout};
 
-use super::{DEFAULT_MAX_BODY, ServiceType};
+use super::{DEFAULT_MAX_BODY, ServiceTypeSum};
 use crate::clock;
 use crate::events;
 use crate::frame::{FrameTooLong, Frames};
 use crate::header::{ConnectionHeader, clipped};
-use crate::inbox::Peer;
+use crate::inbox::ConnectionPeer;
 use crate::node::Inner;
 use crate::outbox::lock;
-use crate::topic_server::{DRAIN_LIMIT, Ended, STALL_LIMIT, until_closed, write};
+use crate::topic_server::{ConnectionEnd, DRAIN_LIMIT, STALL_LIMIT, until_closed, write};
 
 /// Limits of a service.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -58,19 +58,19 @@ pub struct ServiceRequest {
     /// client connected with the checksum `*`.
     pub bytes: Bytes,
     /// The client.
-    pub client: Arc<Peer>,
+    pub client: Arc<ConnectionPeer>,
 }
 
 /// Offers a service. Dropping it withdraws the service: idle clients are disconnected at once,
 /// and a client with a request in progress gets its response if that takes no more than a second.
 #[derive(Debug)]
 pub struct ServiceServer {
-    served: Arc<Served>,
+    served: Arc<OfferedService>,
     node: Arc<Inner>,
 }
 
 impl ServiceServer {
-    pub(crate) const fn new(served: Arc<Served>, node: Arc<Inner>) -> Self {
+    pub(crate) const fn new(served: Arc<OfferedService>, node: Arc<Inner>) -> Self {
         Self { served, node }
     }
 
@@ -122,12 +122,12 @@ impl Drop for ServiceServer {
 type Answer = Pin<Box<dyn Future<Output = Result<Bytes, String>> + Send>>;
 
 /// An offered service, shared by its server and the tasks that serve its clients.
-pub(crate) struct Served {
+pub(crate) struct OfferedService {
     pub(crate) service: String,
     /// Distinguishes this registration from earlier registrations of the same service.
     pub(crate) generation: u64,
-    pub(crate) counters: Counters,
-    service_type: ServiceType,
+    pub(crate) counters: ServiceServerCounters,
+    service_type: ServiceTypeSum,
     options: ServiceOptions,
     handler: Box<dyn Fn(ServiceRequest) -> Answer + Send + Sync>,
     places: Arc<Semaphore>,
@@ -140,7 +140,7 @@ pub(crate) struct Served {
 
 /// Counters of a service.
 #[derive(Debug, Default)]
-pub(crate) struct Counters {
+pub(crate) struct ServiceServerCounters {
     pub(crate) calls: AtomicU64,
     pub(crate) failures: AtomicU64,
     pub(crate) received: AtomicU64,
@@ -150,21 +150,21 @@ pub(crate) struct Counters {
 
 /// Outcome of a client's handshake.
 #[derive(Debug)]
-pub(crate) enum Admitted {
+pub(crate) enum ClientHandshake {
     /// The client only requested the header.
     Probe,
     /// The client may send requests.
-    Client(Session),
+    Client(ServiceSession),
 }
 
-impl Served {
+impl OfferedService {
     #[expect(
         clippy::too_many_arguments,
         reason = "the properties of a service, given by the only caller"
     )]
     pub(crate) fn new<H, F>(
         service: String,
-        service_type: ServiceType,
+        service_type: ServiceTypeSum,
         options: ServiceOptions,
         generation: u64,
         draining: watch::Sender<usize>,
@@ -177,7 +177,7 @@ impl Served {
         Self {
             service,
             generation,
-            counters: Counters::default(),
+            counters: ServiceServerCounters::default(),
             service_type,
             // Limits the number of clients to the maximum of the semaphore.
             options: ServiceOptions {
@@ -205,7 +205,7 @@ impl Served {
         self: &Arc<Self>,
         request: ConnectionHeader,
         own_name: &str,
-    ) -> Result<(ConnectionHeader, Admitted), String> {
+    ) -> Result<(ConnectionHeader, ClientHandshake), String> {
         let admitted = self.check(&request).and_then(|()| self.take_in(request));
         if admitted.is_err() {
             self.counters.refused.fetch_add(1, Ordering::Relaxed);
@@ -238,12 +238,12 @@ impl Served {
         ))
     }
 
-    fn take_in(self: &Arc<Self>, request: ConnectionHeader) -> Result<Admitted, String> {
+    fn take_in(self: &Arc<Self>, request: ConnectionHeader) -> Result<ClientHandshake, String> {
         if *self.closed.borrow() {
             return Err(nonexistent(&self.service));
         }
         if request.get("probe") == Some("1") {
-            return Ok(Admitted::Probe);
+            return Ok(ClientHandshake::Probe);
         }
         let place = Arc::clone(&self.places).try_acquire_owned().map_err(|_| {
             format!(
@@ -255,9 +255,9 @@ impl Served {
             .get("persistent")
             .is_some_and(|asked| asked == "1" || asked.eq_ignore_ascii_case("true"));
         self.draining.send_modify(|open| *open += 1);
-        Ok(Admitted::Client(Session {
+        Ok(ClientHandshake::Client(ServiceSession {
             served: Arc::clone(self),
-            client: Arc::new(Peer {
+            client: Arc::new(ConnectionPeer {
                 caller_id: request.caller_id().to_owned(),
                 header: request,
             }),
@@ -277,7 +277,7 @@ impl Served {
     }
 }
 
-impl fmt::Debug for Served {
+impl fmt::Debug for OfferedService {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.debug_struct("Served")
             .field("service", &self.service)
@@ -294,14 +294,14 @@ pub(crate) fn nonexistent(service: &str) -> String {
 
 /// The session of a client of a service, which ends on drop.
 #[derive(Debug)]
-pub(crate) struct Session {
-    served: Arc<Served>,
-    client: Arc<Peer>,
+pub(crate) struct ServiceSession {
+    served: Arc<OfferedService>,
+    client: Arc<ConnectionPeer>,
     persistent: bool,
     _place: OwnedSemaphorePermit,
 }
 
-impl Session {
+impl ServiceSession {
     /// Receives and answers requests until the client or the service ends the session.
     pub(crate) async fn serve(self, stream: &mut TcpStream) -> Result<(), ClientFault> {
         let served = &self.served;
@@ -429,7 +429,7 @@ impl Session {
     }
 }
 
-impl Drop for Session {
+impl Drop for ServiceSession {
     fn drop(&mut self) {
         self.served.draining.send_modify(|open| *open -= 1);
     }
@@ -451,5 +451,5 @@ pub(crate) enum ClientFault {
     #[error("its request was cut off: {0}")]
     Io(#[from] std::io::Error),
     #[error("it did not receive the response: {0}")]
-    Answer(Ended),
+    Answer(ConnectionEnd),
 }

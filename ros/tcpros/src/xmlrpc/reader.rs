@@ -3,10 +3,10 @@
 use std::borrow::Cow;
 
 use super::writer::BASE64;
-use super::{MAX_DEPTH, Value, XmlError};
+use super::{MAX_DEPTH, XmlError, XmlRpcValue};
 
 /// A document and the part that is not read yet.
-pub(super) struct Reader<'a> {
+pub(super) struct XmlReader<'a> {
     document: &'a str,
     rest: &'a str,
 }
@@ -24,7 +24,7 @@ struct Tag<'a> {
     kind: Kind,
 }
 
-impl<'a> Reader<'a> {
+impl<'a> XmlReader<'a> {
     pub(super) fn new(document: &'a [u8]) -> Result<Self, XmlError> {
         let document = std::str::from_utf8(document).map_err(|_| XmlError::NotUtf8)?;
         let rest = document.strip_prefix('\u{feff}').unwrap_or(document);
@@ -125,7 +125,7 @@ impl<'a> Reader<'a> {
     }
 
     /// Reads `<params>`, which a peer may omit or leave empty.
-    pub(super) fn params(&mut self) -> Result<Vec<Value>, XmlError> {
+    pub(super) fn params(&mut self) -> Result<Vec<XmlRpcValue>, XmlError> {
         let mut params = Vec::new();
         let (tag, rest) = self.peek()?;
         if tag.name != "params" || tag.kind == Kind::Close {
@@ -144,7 +144,7 @@ impl<'a> Reader<'a> {
         Ok(params)
     }
 
-    pub(super) fn value(&mut self, depth: usize) -> Result<Value, XmlError> {
+    pub(super) fn value(&mut self, depth: usize) -> Result<XmlRpcValue, XmlError> {
         if depth > MAX_DEPTH {
             return Err(XmlError::TooDeep);
         }
@@ -157,7 +157,7 @@ impl<'a> Reader<'a> {
         }
         self.rest = rest;
         if tag.kind == Kind::Empty {
-            return Ok(Value::String(String::new()));
+            return Ok(XmlRpcValue::String(String::new()));
         }
         let before = self.rest;
         let untyped = match self.peek() {
@@ -168,7 +168,7 @@ impl<'a> Reader<'a> {
         let value = if untyped {
             // White space belongs to the text here.
             self.rest = before;
-            Value::String(self.text()?.into_owned())
+            XmlRpcValue::String(self.text()?.into_owned())
         } else {
             self.typed(depth)?
         };
@@ -176,16 +176,16 @@ impl<'a> Reader<'a> {
         Ok(value)
     }
 
-    fn typed(&mut self, depth: usize) -> Result<Value, XmlError> {
+    fn typed(&mut self, depth: usize) -> Result<XmlRpcValue, XmlError> {
         let (tag, rest) = self.peek()?;
         let at = self.position();
         self.rest = rest;
         if tag.kind == Kind::Empty {
             return match tag.name {
-                "nil" | "ex:nil" => Ok(Value::Nil),
-                "string" => Ok(Value::String(String::new())),
-                "base64" => Ok(Value::Binary(Vec::new())),
-                "struct" => Ok(Value::Struct(Vec::new())),
+                "nil" | "ex:nil" => Ok(XmlRpcValue::Nil),
+                "string" => Ok(XmlRpcValue::String(String::new())),
+                "base64" => Ok(XmlRpcValue::Binary(Vec::new())),
+                "struct" => Ok(XmlRpcValue::Struct(Vec::new())),
                 _ => Err(XmlError::Tag {
                     expected: "a type of XML-RPC",
                     at,
@@ -195,7 +195,7 @@ impl<'a> Reader<'a> {
         let value = match tag.name {
             "array" => self.array(depth)?,
             "struct" => self.members(depth)?,
-            "nil" | "ex:nil" => Value::Nil,
+            "nil" | "ex:nil" => XmlRpcValue::Nil,
             "i4" | "int" | "i8" | "ex:i8" | "boolean" | "double" | "string" | "base64"
             | "dateTime.iso8601" => self.scalar(tag.name)?,
             _ => {
@@ -216,7 +216,7 @@ impl<'a> Reader<'a> {
         Ok(value)
     }
 
-    fn scalar(&mut self, name: &str) -> Result<Value, XmlError> {
+    fn scalar(&mut self, name: &str) -> Result<XmlRpcValue, XmlError> {
         let text = self.text()?;
         let trimmed = text.trim();
         let wrong = |expected| XmlError::Content {
@@ -225,21 +225,21 @@ impl<'a> Reader<'a> {
         };
         Ok(match name {
             "i4" | "int" | "i8" | "ex:i8" => {
-                Value::Int(trimmed.parse().map_err(|_| wrong("a 32 bit integer"))?)
+                XmlRpcValue::Int(trimmed.parse().map_err(|_| wrong("a 32 bit integer"))?)
             }
             "boolean" => match trimmed {
-                "0" => Value::Bool(false),
-                "1" => Value::Bool(true),
+                "0" => XmlRpcValue::Bool(false),
+                "1" => XmlRpcValue::Bool(true),
                 _ => return Err(wrong("0 or 1")),
             },
-            "double" => Value::Double(trimmed.parse().map_err(|_| wrong("a number"))?),
-            "base64" => Value::Binary(base64_decode(&text).ok_or_else(|| wrong("base64"))?),
-            "string" => Value::String(text.into_owned()),
-            _ => Value::DateTime(trimmed.to_owned()),
+            "double" => XmlRpcValue::Double(trimmed.parse().map_err(|_| wrong("a number"))?),
+            "base64" => XmlRpcValue::Binary(base64_decode(&text).ok_or_else(|| wrong("base64"))?),
+            "string" => XmlRpcValue::String(text.into_owned()),
+            _ => XmlRpcValue::DateTime(trimmed.to_owned()),
         })
     }
 
-    fn array(&mut self, depth: usize) -> Result<Value, XmlError> {
+    fn array(&mut self, depth: usize) -> Result<XmlRpcValue, XmlError> {
         let mut items = Vec::new();
         let (tag, rest) = self.peek()?;
         if tag.name != "data" || tag.kind == Kind::Close {
@@ -255,10 +255,10 @@ impl<'a> Reader<'a> {
             }
             self.close("data")?;
         }
-        Ok(Value::Array(items))
+        Ok(XmlRpcValue::Array(items))
     }
 
-    fn members(&mut self, depth: usize) -> Result<Value, XmlError> {
+    fn members(&mut self, depth: usize) -> Result<XmlRpcValue, XmlError> {
         let mut members = Vec::new();
         while self.at_open("member")? {
             self.open("member")?;
@@ -268,7 +268,7 @@ impl<'a> Reader<'a> {
             members.push((name, self.value(depth + 1)?));
             self.close("member")?;
         }
-        Ok(Value::Struct(members))
+        Ok(XmlRpcValue::Struct(members))
     }
 
     /// Reads text up to the next tag, with references and CDATA resolved.

@@ -2,24 +2,24 @@
 
 use std::fmt::Write as _;
 
-use super::Value;
+use super::XmlRpcValue;
 
 /// Appends a value in its tags.
-pub(super) fn write_value(value: &Value, out: &mut String) {
+pub(super) fn write_value(value: &XmlRpcValue, out: &mut String) {
     out.push_str("<value>");
     match value {
-        Value::Int(number) => number_tag("i4", number, out),
-        Value::Bool(flag) => number_tag("boolean", &u8::from(*flag), out),
-        Value::Double(number) => number_tag("double", number, out),
-        Value::String(text) => text_tag("string", text, out),
-        Value::DateTime(text) => text_tag("dateTime.iso8601", text, out),
-        Value::Binary(bytes) => text_tag("base64", &base64_encode(bytes), out),
-        Value::Array(items) => {
+        XmlRpcValue::Int(number) => number_tag("i4", number, out),
+        XmlRpcValue::Bool(flag) => number_tag("boolean", &u8::from(*flag), out),
+        XmlRpcValue::Double(number) => number_tag("double", number, out),
+        XmlRpcValue::String(text) => text_tag("string", text, out),
+        XmlRpcValue::DateTime(text) => text_tag("dateTime.iso8601", text, out),
+        XmlRpcValue::Binary(bytes) => text_tag("base64", &base64_encode(bytes), out),
+        XmlRpcValue::Array(items) => {
             out.push_str("<array><data>");
             items.iter().for_each(|item| write_value(item, out));
             out.push_str("</data></array>");
         }
-        Value::Struct(members) => {
+        XmlRpcValue::Struct(members) => {
             out.push_str("<struct>");
             for (name, member) in members {
                 out.push_str("<member>");
@@ -29,7 +29,7 @@ pub(super) fn write_value(value: &Value, out: &mut String) {
             }
             out.push_str("</struct>");
         }
-        Value::Nil => out.push_str("<nil/>"),
+        XmlRpcValue::Nil => out.push_str("<nil/>"),
     }
     out.push_str("</value>");
 }

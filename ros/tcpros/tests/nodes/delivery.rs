@@ -2,7 +2,7 @@
 //! by a late consumer.
 
 use bytes::Bytes;
-use tcpros::{Inbox, InboxEvent, Node, PublisherOptions, SubscriberOptions, Wanted};
+use tcpros::{Inbox, InboxEvent, Node, PublisherOptions, RequestedType, SubscriberOptions};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpListener;
 
@@ -81,7 +81,13 @@ async fn a_burst_longer_than_the_queue_reaches_a_consumer_that_keeps_up() {
         ..Default::default()
     };
     let _subscription = listener
-        .subscribe("/t", Wanted::default(), bounds, "/t".to_owned(), &inbox)
+        .subscribe(
+            "/t",
+            RequestedType::default(),
+            bounds,
+            "/t".to_owned(),
+            &inbox,
+        )
         .unwrap();
     registered(&listener).await;
     let topics = TcpListener::bind("127.0.0.1:0").await.unwrap();
@@ -117,7 +123,7 @@ async fn a_consumer_that_is_late_loses_the_oldest_and_is_told() {
         ..Default::default()
     };
     let subscription = listener
-        .subscribe("/t", Wanted::default(), bounds, (), &inbox)
+        .subscribe("/t", RequestedType::default(), bounds, (), &inbox)
         .unwrap();
     let publisher = advertise(&talker, "/t", PublisherOptions::default());
     eventually("the link", || publisher.subscribers() == 1).await;

@@ -5,7 +5,7 @@ use std::time::Duration;
 use bytes::Bytes;
 use tcpros::{
     Core, Inbox, InboxEvent, MasterState, Node, NodeError, Publisher, PublisherOptions,
-    ServiceOptions, ServiceRequest, ServiceType, TopicType,
+    ServiceOptions, ServiceRequest, ServiceTypeSum, TopicType,
 };
 
 use crate::support::*;
@@ -80,7 +80,7 @@ async fn what_the_master_no_longer_lists_is_registered_again() {
     let _subscription = subscribe(&node, "/heard", &inbox);
     let _publisher = advertise(&node, "/said", PublisherOptions::default());
     let _kept = advertise(&node, "/kept", PublisherOptions::default());
-    let service_type = ServiceType {
+    let service_type = ServiceTypeSum {
         name: "std_srvs/Trigger".to_owned(),
         md5sum: MD5.to_owned(),
         request_type: "std_srvs/TriggerRequest".to_owned(),

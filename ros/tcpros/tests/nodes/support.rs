@@ -5,8 +5,8 @@ use std::net::SocketAddr;
 use std::time::Duration;
 
 use tcpros::{
-    ConnectionHeader, Core, Inbox, InboxEvent, MasterState, Message, Node, NodeOptions, Publisher,
-    PublisherOptions, SubscriberOptions, Subscription, TopicType, Wanted,
+    ConnectionHeader, Core, Inbox, InboxEvent, InboxMessage, MasterState, Node, NodeOptions,
+    Publisher, PublisherOptions, RequestedType, SubscriberOptions, Subscription, TopicType,
 };
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpStream};
@@ -45,8 +45,14 @@ pub(crate) fn advertise(node: &Node, topic: &str, options: PublisherOptions) -> 
 
 pub(crate) fn subscribe(node: &Node, topic: &str, inbox: &Inbox<String>) -> Subscription {
     let options = SubscriberOptions::default();
-    node.subscribe(topic, Wanted::default(), options, topic.to_owned(), inbox)
-        .unwrap()
+    node.subscribe(
+        topic,
+        RequestedType::default(),
+        options,
+        topic.to_owned(),
+        inbox,
+    )
+    .unwrap()
 }
 
 pub(crate) async fn within<T>(what: &str, future: impl Future<Output = T>) -> T {
@@ -65,7 +71,7 @@ pub(crate) async fn eventually(what: &str, mut condition: impl FnMut() -> bool) 
     .await;
 }
 
-pub(crate) async fn message(inbox: &mut Inbox<String>) -> Message {
+pub(crate) async fn message(inbox: &mut Inbox<String>) -> InboxMessage {
     within("a message", async {
         loop {
             match inbox.recv().await.1 {

@@ -7,9 +7,9 @@ use std::process::ExitCode;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use bridge_core::{Heard, Local, Now, Output, Router, Settings};
+use bridge_core::{Local, LocalMessage, Now, Output, Router, RouterSettings};
 use mappings::{Mapping, SpaceId, TopicId};
-use messages::{Dialect, Registry, Selection};
+use messages::{Dialect, Selection, TypeRegistry};
 use uadp::Timestamp;
 
 /// Number of rounds, of which the fastest counts: slower rounds were disturbed.
@@ -179,7 +179,7 @@ impl Bench {
 }
 
 fn router(space: u16) -> Router {
-    let settings = Settings {
+    let settings = RouterSettings {
         own: SpaceId::new(space).unwrap(),
         local: Local::Ros1,
         source: None,
@@ -188,7 +188,7 @@ fn router(space: u16) -> Router {
 }
 
 fn bind(router: &mut Router, topics: &[TopicId], now: Now) {
-    let message = Registry::bundle(Dialect::Ros1)
+    let message = TypeRegistry::bundle(Dialect::Ros1)
         .get(&"geometry_msgs/Twist".parse().unwrap())
         .unwrap();
     for topic in topics {
@@ -200,7 +200,7 @@ fn bind(router: &mut Router, topics: &[TopicId], now: Now) {
 
 /// Gives a Router a Twist.
 fn say(router: &mut Router, topic: TopicId, now: Now) {
-    let heard = Heard {
+    let heard = LocalMessage {
         topic,
         payload: &[0; 48],
         received: now.utc,

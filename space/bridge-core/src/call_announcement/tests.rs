@@ -32,7 +32,7 @@ fn what_is_announced_of_a_call_is_what_is_read_of_it() {
     let message = NetworkMessage::decode(&bytes).unwrap();
     let announced = Announcement::decode(&message).unwrap();
     assert_eq!(announced.sequence_number, 3);
-    let Announced::ActionMetaData(action) = announced.announced else {
+    let AnnouncedContent::ActionMetaData(action) = announced.announced else {
         unreachable!("{announced:?}");
     };
     assert_eq!(action.writer_id, 105);
@@ -65,13 +65,13 @@ fn structures_of_structures_are_believed_up_to_a_size() {
             name: named_in(2, name),
             structure_definition: StructureDefinition {
                 default_encoding_id: of(name),
-                fields: List::new(fields),
+                fields: WireArray::new(fields),
                 ..StructureDefinition::default()
             },
         })
         .collect();
     let schema = DataTypeSchemaHeader {
-        structure_data_types: List::new(&described),
+        structure_data_types: WireArray::new(&described),
         ..DataTypeSchemaHeader::default()
     };
     let known = read_structures(&schema);
@@ -90,7 +90,7 @@ fn named_in(namespace: u16, name: &str) -> QualifiedName<'_> {
 
 #[test]
 fn the_structures_of_a_service_are_read_with_those_in_them() {
-    let registry = messages::Registry::bundle(messages::Dialect::Ros1);
+    let registry = messages::TypeRegistry::bundle(messages::Dialect::Ros1);
     let name = "nav_msgs/GetPlan".parse().unwrap();
     let service = registry.service(&name).unwrap();
     let (request, response) = (service.request(), service.response());
@@ -103,14 +103,15 @@ fn the_structures_of_a_service_are_read_with_those_in_them() {
         response: of(response),
     };
     let topic: TopicId = "ua_2_3_7".parse().unwrap();
-    let types = Types { request, response };
+    let types = CallTypes { request, response };
     let said = (&description, Some(types), &BTreeMap::new(), LASTING_TARGET);
     let utc = Timestamp::from_unix_nanos(1_700_000_000_000_000_000);
     let announcement = CallAnnouncement::new(topic, said, None, utc).unwrap();
     let mut bytes = Vec::new();
     announcement.write((3, LASTING_TARGET), &mut bytes);
     let message = NetworkMessage::decode(&bytes).unwrap();
-    let Announced::ActionMetaData(action) = Announcement::decode(&message).unwrap().announced
+    let AnnouncedContent::ActionMetaData(action) =
+        Announcement::decode(&message).unwrap().announced
     else {
         unreachable!();
     };

@@ -2,9 +2,9 @@
 
 use std::collections::BTreeMap;
 
-use messages::{Leaf, MemberKind, MessageType, Rank, TypeName};
+use messages::{ArrayRank, Leaf, MemberKind, MessageType, TypeName};
 use uadp::discovery::{
-    DataTypeSchemaHeader, List, StructureDefinition, StructureDescription, StructureField,
+    DataTypeSchemaHeader, StructureDefinition, StructureDescription, StructureField, WireArray,
 };
 use uadp::{BuiltinType, EncodeError, NodeId, QualifiedName};
 
@@ -51,8 +51,11 @@ fn namespaces_up_to(namespace: u16, uris: &BTreeMap<u16, String>) -> Vec<Option<
 
 /// Returns the types of the messages in arrays and of the messages nested in them, without
 /// duplicates.
-fn structures<'m>(message_type: &'m MessageType, leaves: &[Leaf]) -> Vec<messages::Structure<'m>> {
-    let mut all: Vec<messages::Structure<'m>> = Vec::new();
+fn structures<'m>(
+    message_type: &'m MessageType,
+    leaves: &[Leaf],
+) -> Vec<messages::MessageStructure<'m>> {
+    let mut all: Vec<messages::MessageStructure<'m>> = Vec::new();
     for leaf in leaves {
         if leaf.builtin != BuiltinType::ExtensionObject {
             continue;
@@ -66,7 +69,7 @@ fn structures<'m>(message_type: &'m MessageType, leaves: &[Leaf]) -> Vec<message
     all
 }
 
-fn member_sizes(structure: &messages::Structure<'_>) -> Vec<Vec<u32>> {
+fn member_sizes(structure: &messages::MessageStructure<'_>) -> Vec<Vec<u32>> {
     let ranks = structure.fields.iter().map(|field| field.rank);
     ranks.map(sizes).collect()
 }
@@ -92,7 +95,7 @@ fn structure_description<'s>(
 }
 
 fn structure_fields<'s>(
-    structure: &'s messages::Structure<'_>,
+    structure: &'s messages::MessageStructure<'_>,
     sizes: &'s [Vec<u32>],
     namespace: u16,
 ) -> Vec<StructureField<'s>> {
@@ -122,26 +125,26 @@ pub(crate) fn data_type(builtin: BuiltinType, of: Option<&TypeName>, namespace: 
     }
 }
 
-pub(crate) const fn value_rank(rank: Rank) -> i32 {
+pub(crate) const fn value_rank(rank: ArrayRank) -> i32 {
     match rank {
-        Rank::Scalar => -1,
-        Rank::Array { .. } => 1,
+        ArrayRank::Scalar => -1,
+        ArrayRank::Array { .. } => 1,
     }
 }
 
 /// Returns the number of elements in each dimension; 0 for a variable length.
-pub(crate) fn sizes(rank: Rank) -> Vec<u32> {
+pub(crate) fn sizes(rank: ArrayRank) -> Vec<u32> {
     match rank {
-        Rank::Scalar => Vec::new(),
-        Rank::Array { fixed } => vec![fixed.unwrap_or(0)],
+        ArrayRank::Scalar => Vec::new(),
+        ArrayRank::Array { fixed } => vec![fixed.unwrap_or(0)],
     }
 }
 
 /// Returns the list of the elements; the null array if there are no elements.
-pub(crate) const fn list<T>(elements: &[T]) -> List<'_, T> {
+pub(crate) const fn list<T>(elements: &[T]) -> WireArray<'_, T> {
     match elements {
-        [] => List::null(),
-        elements => List::new(elements),
+        [] => WireArray::null(),
+        elements => WireArray::new(elements),
     }
 }
 

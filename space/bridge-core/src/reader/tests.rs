@@ -6,8 +6,8 @@ fn address(port: u16) -> SocketAddr {
     ([127, 0, 0, 1], port).into()
 }
 
-fn place(sequence: u16, stamp: i128) -> Place {
-    Place {
+fn place(sequence: u16, stamp: i128) -> SequencePosition {
+    SequencePosition {
         sequence: Some(sequence),
         stamp: Some(Timestamp::from_unix_nanos(stamp)),
         fine: true,
@@ -20,7 +20,11 @@ fn place(sequence: u16, stamp: i128) -> Place {
 }
 
 /// Admits a message for [`Handling::Shown`].
-fn admit(reader: &mut Reader, place: Place, now: Instant) -> Result<(u16, Kept), Reason> {
+fn admit(
+    reader: &mut ReceivedTopicState,
+    place: SequencePosition,
+    now: Instant,
+) -> Result<(u16, ValueRelation), Reason> {
     let admitted = reader.admit(place, None, Handling::Shown, now)?;
     Ok((admitted.missing, admitted.kept))
 }
@@ -29,9 +33,9 @@ fn admit(reader: &mut Reader, place: Place, now: Instant) -> Result<(u16, Kept),
     clippy::disallowed_methods,
     reason = "a test needs some instant to count from"
 )]
-fn reader() -> (Reader, Instant) {
+fn reader() -> (ReceivedTopicState, Instant) {
     let now = Instant::now();
-    (Reader::new(Some(address(1)), now), now)
+    (ReceivedTopicState::new(Some(address(1)), now), now)
 }
 
 #[test]
@@ -39,15 +43,15 @@ fn numbers_wrap_and_gaps_are_counted() {
     let (mut reader, now) = reader();
     assert_eq!(
         admit(&mut reader, place(65_534, 1000), now),
-        Ok((0, Kept::Alone))
+        Ok((0, ValueRelation::Alone))
     );
     assert_eq!(
         admit(&mut reader, place(65_535, 2000), now),
-        Ok((0, Kept::Alone))
+        Ok((0, ValueRelation::Alone))
     );
     assert_eq!(
         admit(&mut reader, place(2, 3000), now),
-        Ok((2, Kept::Alone)),
+        Ok((2, ValueRelation::Alone)),
         "0 and 1 are missing"
     );
 }
@@ -55,7 +59,7 @@ fn numbers_wrap_and_gaps_are_counted() {
 #[test]
 fn old_and_equal_numbers_are_dropped_unless_the_writer_started_over() {
     let (mut reader, now) = reader();
-    assert_eq!(hear(&mut reader, 500, 9000, now), Ok(Kept::Alone));
+    assert_eq!(hear(&mut reader, 500, 9000, now), Ok(ValueRelation::Alone));
     assert_eq!(
         admit(&mut reader, place(500, 9000), now),
         Err(Reason::Repeat),
@@ -67,16 +71,16 @@ fn old_and_equal_numbers_are_dropped_unless_the_writer_started_over() {
     );
     assert_eq!(
         admit(&mut reader, place(0, 10_000), now),
-        Ok((0, Kept::Alone)),
+        Ok((0, ValueRelation::Alone)),
         "a newer stamp tells of a restart"
     );
-    let moved = Place {
+    let moved = SequencePosition {
         from: address(2),
         ..place(0, 10_000)
     };
     assert_eq!(
         admit(&mut reader, moved, now),
-        Ok((0, Kept::Alone)),
+        Ok((0, ValueRelation::Alone)),
         "another address tells of a restart"
     );
 }
@@ -85,13 +89,13 @@ fn old_and_equal_numbers_are_dropped_unless_the_writer_started_over() {
 fn a_datagram_that_comes_after_the_end_of_its_writer_is_handed_on_once() {
     for handling in [Handling::Event, Handling::AsSource, Handling::Shown] {
         let (mut reader, now) = reader();
-        let admit = |reader: &mut Reader, place: Place| {
+        let admit = |reader: &mut ReceivedTopicState, place: SequencePosition| {
             let admitted = reader.admit(place, None, handling, now)?;
             reader.delivered(place.instance(), (admitted.kept, admitted.lasting), now);
             Ok(admitted.kept)
         };
-        assert_eq!(admit(&mut reader, place(7, 1000)), Ok(Kept::Alone));
-        assert_eq!(admit(&mut reader, place(8, 2000)), Ok(Kept::Alone));
+        assert_eq!(admit(&mut reader, place(7, 1000)), Ok(ValueRelation::Alone));
+        assert_eq!(admit(&mut reader, place(8, 2000)), Ok(ValueRelation::Alone));
         assert!(reader.leave());
         // Both datagrams were delayed by the network.
         assert_eq!(admit(&mut reader, place(7, 1000)), Err(Reason::Stale));
@@ -104,19 +108,21 @@ fn a_datagram_that_comes_after_the_end_of_its_writer_is_handed_on_once() {
 #[test]
 fn states_that_a_broker_delivers_again_after_a_silence_are_no_restart() {
     let (mut reader, now) = reader();
-    let coarse = |sequence: u16, stamp: i128| Place {
+    let coarse = |sequence: u16, stamp: i128| SequencePosition {
         fine: false,
         is_relayed: true,
         ..place(sequence, stamp)
     };
-    let hear = |reader: &mut Reader, place: Place| -> Result<Kept, Reason> {
+    let hear = |reader: &mut ReceivedTopicState,
+                place: SequencePosition|
+     -> Result<ValueRelation, Reason> {
         let (_, kept) = admit(reader, place, now)?;
         reader.delivered(place.instance(), (kept, false), now);
         Ok(kept)
     };
     for sequence in 1..=50 {
         let place = coarse(sequence, i128::from(sequence) * 1000);
-        assert_eq!(hear(&mut reader, place), Ok(Kept::Alone));
+        assert_eq!(hear(&mut reader, place), Ok(ValueRelation::Alone));
     }
     assert!(reader.fell_silent(now + PERIOD, PERIOD));
     for sequence in 31..50 {
@@ -125,53 +131,62 @@ fn states_that_a_broker_delivers_again_after_a_silence_are_no_restart() {
     }
     let last = coarse(50, 50_000);
     assert_eq!(hear(&mut reader, last), Err(Reason::Duplicate));
-    assert_eq!(hear(&mut reader, coarse(51, 51_000)), Ok(Kept::Alone));
+    assert_eq!(
+        hear(&mut reader, coarse(51, 51_000)),
+        Ok(ValueRelation::Alone)
+    );
     // A restart shows by a newer stamp, by a number far behind, or without a broker.
     assert!(!reader.leave());
-    assert_eq!(hear(&mut reader, coarse(40, 52_000)), Ok(Kept::Alone));
+    assert_eq!(
+        hear(&mut reader, coarse(40, 52_000)),
+        Ok(ValueRelation::Alone)
+    );
     assert!(!reader.leave());
-    assert_eq!(hear(&mut reader, coarse(0, 500)), Ok(Kept::Alone));
+    assert_eq!(hear(&mut reader, coarse(0, 500)), Ok(ValueRelation::Alone));
     assert!(!reader.leave());
-    let without_broker = Place {
+    let without_broker = SequencePosition {
         is_relayed: false,
         ..coarse(65_535, 400)
     };
-    assert_eq!(hear(&mut reader, without_broker), Ok(Kept::Alone));
+    assert_eq!(hear(&mut reader, without_broker), Ok(ValueRelation::Alone));
 }
 
 #[test]
 fn a_repeated_key_frame_is_known_by_its_stamp() {
     let (mut reader, now) = reader();
     let first = place(1, 1000);
-    assert_eq!(admit(&mut reader, first, now), Ok((0, Kept::Alone)));
-    reader.delivered(first.instance(), (Kept::Alone, false), now);
+    assert_eq!(
+        admit(&mut reader, first, now),
+        Ok((0, ValueRelation::Alone))
+    );
+    reader.delivered(first.instance(), (ValueRelation::Alone, false), now);
     assert_eq!(admit(&mut reader, place(2, 1000), now), Err(Reason::Repeat));
     assert_eq!(
         admit(&mut reader, place(3, 2000), now),
-        Ok((0, Kept::Alone)),
+        Ok((0, ValueRelation::Alone)),
         "another sample"
     );
     let (mut coarse, now) = self::reader();
-    let stamp_without_picoseconds = Place {
+    let stamp_without_picoseconds = SequencePosition {
         fine: false,
         ..place(1, 1000)
     };
     assert_eq!(
         admit(&mut coarse, stamp_without_picoseconds, now),
-        Ok((0, Kept::Alone))
+        Ok((0, ValueRelation::Alone))
     );
     coarse.delivered(
         stamp_without_picoseconds.instance(),
-        (Kept::Alone, false),
+        (ValueRelation::Alone, false),
         now,
     );
-    let next = Place {
+    let next = SequencePosition {
         sequence: Some(2),
         ..stamp_without_picoseconds
     };
     assert_eq!(
         admit(&mut coarse, next, now),
-        Ok((0, Kept::Alone)),
+        Ok((0, ValueRelation::Alone)),
         "a coarse stamp may be shared by two samples"
     );
 }
@@ -179,7 +194,12 @@ fn a_repeated_key_frame_is_known_by_its_stamp() {
 const PERIOD: Duration = Duration::from_secs(1);
 
 /// Admits and delivers a key frame as the Router does.
-fn hear(reader: &mut Reader, sequence: u16, stamp: i128, now: Instant) -> Result<Kept, Reason> {
+fn hear(
+    reader: &mut ReceivedTopicState,
+    sequence: u16,
+    stamp: i128,
+    now: Instant,
+) -> Result<ValueRelation, Reason> {
     let place = place(sequence, stamp);
     let (_, kept) = admit(reader, place, now)?;
     reader.delivered(place.instance(), (kept, false), now);
@@ -194,7 +214,7 @@ fn of_several_values_repeated_side_by_side_each_is_handed_on_once() {
         .zip(1..)
         .map(|(stamp, sequence)| hear(&mut reader, sequence, stamp, start))
         .collect();
-    assert_eq!(first, [Ok(Kept::Alone); 3]);
+    assert_eq!(first, [Ok(ValueRelation::Alone); 3]);
     let mut round = |turn: u16| -> Vec<_> {
         let now = start + PERIOD * u32::from(turn);
         [1000, 2000, 3000]
@@ -203,7 +223,11 @@ fn of_several_values_repeated_side_by_side_each_is_handed_on_once() {
             .map(|(stamp, sequence)| hear(&mut reader, sequence, stamp, now))
             .collect()
     };
-    let kept_again = [Ok(Kept::Again), Ok(Kept::Again), Err(Reason::Repeat)];
+    let kept_again = [
+        Ok(ValueRelation::Again),
+        Ok(ValueRelation::Again),
+        Err(Reason::Repeat),
+    ];
     assert_eq!(
         round(1),
         kept_again,
@@ -224,10 +248,10 @@ fn who_comes_late_gets_all_values_wherever_in_the_round_it_begins() {
         .collect();
     let repeat = Err(Reason::Repeat);
     let expected = [
-        Ok(Kept::Alone),
-        Ok(Kept::Alone),
-        Ok(Kept::Beside),
-        Ok(Kept::Again),
+        Ok(ValueRelation::Alone),
+        Ok(ValueRelation::Alone),
+        Ok(ValueRelation::Beside),
+        Ok(ValueRelation::Again),
         repeat,
         repeat,
     ];
@@ -254,34 +278,34 @@ fn a_value_that_is_no_longer_repeated_is_retired_and_one_value_is_a_state_again(
     }
     assert_eq!(retired, [(6, 1000), (10, 2000)]);
     let next = hear(&mut reader, sequence + 1, 4000, start + PERIOD * 12);
-    assert_eq!(next, Ok(Kept::Alone));
+    assert_eq!(next, Ok(ValueRelation::Alone));
 }
 
 #[test]
 fn a_clock_that_is_set_back_makes_no_older_value_of_a_newer_one() {
     let (mut reader, now) = reader();
-    let sent_at = |sequence, stamp: i128, sent: i128| Place {
+    let sent_at = |sequence, stamp: i128, sent: i128| SequencePosition {
         sent: Some(Timestamp::from_unix_nanos(sent)),
         ..place(sequence, stamp)
     };
     let (second, soon) = (1_000_000_000, 50_000);
-    let mut hear = |place: Place| {
+    let mut hear = |place: SequencePosition| {
         let (_, kept) = admit(&mut reader, place, now)?;
         reader.delivered(place.instance(), (kept, false), now);
         Ok(kept)
     };
     let first = hear(sent_at(1, 1000 * second, 1000 * second + soon));
-    assert_eq!(first, Ok(Kept::Alone));
+    assert_eq!(first, Ok(ValueRelation::Alone));
     let set_back = hear(sent_at(2, 900 * second, 900 * second + soon));
-    assert_eq!(set_back, Ok(Kept::Alone));
+    assert_eq!(set_back, Ok(ValueRelation::Alone));
     let next = hear(sent_at(3, 901 * second, 901 * second + soon));
-    assert_eq!(next, Ok(Kept::Alone));
+    assert_eq!(next, Ok(ValueRelation::Alone));
     let repeated = hear(sent_at(4, 901 * second, 902 * second));
     assert_eq!(repeated, Err(Reason::Repeat));
     // A sample that was taken earlier and sent later is another value, as for several latched
     // publishers.
     let beside = hear(sent_at(5, 890 * second, 903 * second));
-    assert_eq!(beside, Ok(Kept::Beside));
+    assert_eq!(beside, Ok(ValueRelation::Beside));
 }
 
 #[test]

@@ -8,7 +8,7 @@ use uadp::{
     NetworkMessageType, PublisherId, Scalar, Timestamp, Variant,
 };
 
-use super::role::{Rank, Role};
+use super::role::{RedundancyRank, RedundancyRole};
 
 /// The message by which redundant bridges of a space know each other.
 ///
@@ -16,8 +16,8 @@ use super::role::{Rank, Role};
 /// of the space has it. In secured groups it is secured with the keys of the discovery messages.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Heartbeat {
-    pub(super) rank: Rank,
-    pub(super) role: Role,
+    pub(super) rank: RedundancyRank,
+    pub(super) role: RedundancyRole,
     pub(super) epoch: u32,
     pub(super) instance: u32,
     pub(super) is_fit: bool,
@@ -103,8 +103,8 @@ impl Heartbeat {
             None
         };
         let heartbeat = Self {
-            rank: Rank::new(rank)?,
-            role: Role::of(role)?,
+            rank: RedundancyRank::new(rank)?,
+            role: RedundancyRole::of(role)?,
             epoch,
             instance,
             is_fit: flags & 1 != 0,
@@ -119,11 +119,11 @@ impl Heartbeat {
     }
 
     pub(crate) fn is_active(&self) -> bool {
-        self.role == Role::Active
+        self.role == RedundancyRole::Active
     }
 
     /// Returns the order of bridges that are active at once: the highest stays active.
-    pub(crate) const fn precedence(&self) -> (u32, Reverse<Rank>, u32) {
+    pub(crate) const fn precedence(&self) -> (u32, Reverse<RedundancyRank>, u32) {
         (self.epoch, Reverse(self.rank), self.instance)
     }
 }

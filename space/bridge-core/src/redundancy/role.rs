@@ -5,9 +5,9 @@ use std::time::Duration;
 
 /// The rank of a bridge among the redundant bridges of its space; 1 takes over first.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
-pub struct Rank(u8);
+pub struct RedundancyRank(u8);
 
-impl Rank {
+impl RedundancyRank {
     /// The highest rank. It bounds the time of a takeover.
     pub const MOST: u8 = 3;
 
@@ -34,7 +34,7 @@ impl Rank {
 
 /// The role of a redundant bridge.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub enum Role {
+pub enum RedundancyRole {
     /// It listens for an active bridge after its start.
     Starting,
     /// It follows the active bridge and sends no values.
@@ -43,7 +43,7 @@ pub enum Role {
     Active,
 }
 
-impl Role {
+impl RedundancyRole {
     /// Returns the role in lower case.
     #[must_use]
     pub const fn label(self) -> &'static str {
@@ -162,7 +162,7 @@ pub enum RoleChange {
     /// This bridge is a standby and follows an active bridge.
     Follows {
         /// The rank of the active bridge.
-        rank: Rank,
+        rank: RedundancyRank,
         /// The address of the active bridge.
         from: SocketAddr,
     },
@@ -174,7 +174,7 @@ pub enum RoleChange {
     /// Another bridge was active at the same time.
     Rival {
         /// The rank of the other bridge.
-        rank: Rank,
+        rank: RedundancyRank,
         /// The address of the other bridge.
         from: SocketAddr,
     },

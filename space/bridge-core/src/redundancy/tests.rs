@@ -62,7 +62,7 @@ impl Network {
     fn new(ranks: &[u8], seed: u64) -> Self {
         let start = start();
         let bridges = (1..).zip(ranks).map(|(instance, rank)| Bridge {
-            state: Redundancy::new(Rank::new(*rank).unwrap(), instance, start),
+            state: Redundancy::new(RedundancyRank::new(*rank).unwrap(), instance, start),
             stopped: 0,
             is_dead: false,
             socket: Vec::new(),
@@ -149,7 +149,7 @@ impl Network {
     fn active(&self) -> Vec<usize> {
         let states = (0..).zip(&self.bridges);
         states
-            .filter(|(_, bridge)| !bridge.is_dead && bridge.state.role() == Role::Active)
+            .filter(|(_, bridge)| !bridge.is_dead && bridge.state.role() == RedundancyRole::Active)
             .map(|(at, _)| at)
             .collect()
     }
@@ -185,7 +185,7 @@ fn of_two_bridges_that_start_at_once_the_first_rank_is_active() {
         let mut network = Network::new(&[2, 1], seed);
         network.run(600);
         assert_eq!(network.active(), [1]);
-        assert_eq!(network.bridges[0].state.role(), Role::Standby);
+        assert_eq!(network.bridges[0].state.role(), RedundancyRole::Standby);
         network.assert_one_sender();
         assert!(network.changes().is_empty());
     }
@@ -205,7 +205,7 @@ fn a_killed_bridge_is_replaced_in_150_ms_and_returns_as_a_standby() {
         assert!(gap <= 150, "{gap} ms");
         let now = network.now();
         network.bridges[0] = Bridge {
-            state: Redundancy::new(Rank::new(1).unwrap(), 9, now),
+            state: Redundancy::new(RedundancyRank::new(1).unwrap(), 9, now),
             ..Network::new(&[1], 0).bridges.remove(0)
         };
         network.run(1_000);
@@ -285,13 +285,13 @@ fn a_stopped_bridge_sends_nothing_after_its_return_and_follows_the_new_one() {
 #[test]
 fn a_clock_that_jumps_mutes_the_active_bridge_and_steps_back_do_not() {
     let now = start();
-    let mut state = Redundancy::new(Rank::new(1).unwrap(), 1, now);
+    let mut state = Redundancy::new(RedundancyRank::new(1).unwrap(), 1, now);
     let later = |milliseconds: u64, clock: i128| Now {
         monotonic: now.monotonic + Duration::from_millis(milliseconds),
         utc: Timestamp::from_unix_nanos(now.utc.unix_nanos() + clock * 1_000_000),
     };
     let mut at = 0;
-    while state.role() != Role::Active {
+    while state.role() != RedundancyRole::Active {
         let (_, _) = state.poll(later(at, i128::from(at)));
         state.sent(later(at, i128::from(at)));
         at += 20;
@@ -394,15 +394,15 @@ fn a_standby_that_is_cut_off_does_not_take_over_and_an_active_bridge_listens_whe
         monotonic: now.monotonic + PERIOD * count,
         ..now
     };
-    let mut state = Redundancy::new(Rank::new(1).unwrap(), 1, now);
+    let mut state = Redundancy::new(RedundancyRank::new(1).unwrap(), 1, now);
     for count in 0..100 {
         let (heartbeat, change) = state.poll(at(count));
         assert!(heartbeat.is_some() && change.is_none());
         assert_eq!(state.not_sent(at(count)), None);
     }
-    assert_eq!(state.role(), Role::Starting);
+    assert_eq!(state.role(), RedundancyRole::Starting);
     let mut count = 100;
-    while state.role() != Role::Active {
+    while state.role() != RedundancyRole::Active {
         let (_, _) = state.poll(at(count));
         assert_eq!(state.sent(at(count)), None);
         count += 1;
@@ -423,7 +423,7 @@ fn a_standby_that_is_cut_off_does_not_take_over_and_an_active_bridge_listens_whe
 #[test]
 fn a_heartbeat_is_read_as_it_was_written_and_nothing_else_is_one() {
     let now = start();
-    let state = Redundancy::new(Rank::new(2).unwrap(), 77, now);
+    let state = Redundancy::new(RedundancyRank::new(2).unwrap(), 77, now);
     let space = SpaceId::new(3).unwrap();
     // The heartbeat of a bridge, and that of an OPC UA server.
     for service_level in [None, Some(199)] {
@@ -448,8 +448,8 @@ fn a_heartbeat_is_read_as_it_was_written_and_nothing_else_is_one() {
 #[test]
 fn the_service_level_of_a_server_is_known_to_the_others() {
     let now = start();
-    let mut server = Redundancy::new(Rank::new(1).unwrap(), 1, now);
-    let mut other = Redundancy::new(Rank::new(2).unwrap(), 2, now);
+    let mut server = Redundancy::new(RedundancyRank::new(1).unwrap(), 1, now);
+    let mut other = Redundancy::new(RedundancyRank::new(2).unwrap(), 2, now);
     server.set_service_level(Some(199));
     let _change = other.hear(server.heartbeat(), address(1), now);
     let level = |at: Instant| {
@@ -468,10 +468,10 @@ fn a_takeover_waits_for_messages_that_have_arrived_but_not_for_ever() {
         monotonic: start.monotonic + STEP * u32::try_from(ms).unwrap(),
         utc: Timestamp::from_unix_nanos(start.utc.unix_nanos() + i128::from(ms) * 1_000_000),
     };
-    let mut state = Redundancy::new(Rank::new(2).unwrap(), 2, start);
+    let mut state = Redundancy::new(RedundancyRank::new(2).unwrap(), 2, start);
     let active = Heartbeat {
-        rank: Rank::new(1).unwrap(),
-        role: Role::Active,
+        rank: RedundancyRank::new(1).unwrap(),
+        role: RedundancyRole::Active,
         epoch: 1,
         instance: 1,
         is_fit: true,
@@ -488,18 +488,26 @@ fn a_takeover_waits_for_messages_that_have_arrived_but_not_for_ever() {
     };
     state.hear(active, address(1), at(1));
     for ms in 2..=100 {
-        assert_eq!(step(&mut state, ms, false), Role::Standby);
+        assert_eq!(step(&mut state, ms, false), RedundancyRole::Standby);
     }
     // The heartbeat is behind other messages.
     for ms in 101..=400 {
-        assert_eq!(step(&mut state, ms, true), Role::Standby, "{ms} ms");
+        assert_eq!(
+            step(&mut state, ms, true),
+            RedundancyRole::Standby,
+            "{ms} ms"
+        );
     }
     state.hear(active, address(1), at(401));
     for ms in 402..=500 {
-        assert_eq!(step(&mut state, ms, false), Role::Standby, "{ms} ms");
+        assert_eq!(
+            step(&mut state, ms, false),
+            RedundancyRole::Standby,
+            "{ms} ms"
+        );
     }
     // A flood does not end.
-    let taken = (501..2_000).find(|ms| step(&mut state, *ms, true) == Role::Active);
+    let taken = (501..2_000).find(|ms| step(&mut state, *ms, true) == RedundancyRole::Active);
     assert!(
         taken.is_some_and(|ms| (1_500..=1_510).contains(&ms)),
         "{taken:?}"
@@ -509,8 +517,8 @@ fn a_takeover_waits_for_messages_that_have_arrived_but_not_for_ever() {
 #[test]
 fn invented_heartbeats_do_not_displace_a_bridge_that_is_known() {
     let now = start();
-    let mut state = Redundancy::new(Rank::new(2).unwrap(), 2, now);
-    let known = Redundancy::new(Rank::new(1).unwrap(), 1, now).heartbeat();
+    let mut state = Redundancy::new(RedundancyRank::new(2).unwrap(), 2, now);
+    let known = Redundancy::new(RedundancyRank::new(1).unwrap(), 1, now).heartbeat();
     state.hear(known, address(1), now);
     for instance in 100..120 {
         let invented = Heartbeat { instance, ..known };

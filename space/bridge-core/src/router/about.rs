@@ -6,12 +6,12 @@ use mappings::TopicId;
 
 /// The topic and sender of a drop.
 #[derive(Clone, Copy)]
-pub(super) struct About {
+pub(super) struct DropSite {
     pub(super) topic: Option<TopicId>,
     pub(super) from: Option<SocketAddr>,
 }
 
-impl About {
+impl DropSite {
     pub(super) const NOTHING: Self = Self {
         topic: None,
         from: None,

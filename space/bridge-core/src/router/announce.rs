@@ -1,18 +1,18 @@
 //! Announcements of topics of the own space, and probes, as outputs.
 
 use mappings::{SpaceId, TopicId};
-use uadp::discovery::{Announced, Announcement, DataSetMetaDataType, Probe};
+use uadp::discovery::{AnnouncedContent, Announcement, DataSetMetaDataType, Probe};
 use uadp::{PublisherId, SecurityHeader};
 
-use super::about::About;
-use super::values::Values;
+use super::about::DropSite;
+use super::values::TopicQueues;
 use crate::counters::Reason;
 use crate::network::announcement_chunks;
 use crate::output::Output;
 use crate::settings::Now;
 use crate::topic::Topic;
 
-impl Values {
+impl TopicQueues {
     /// Sends the announcement of a topic of the own space.
     pub(super) fn announce(&mut self, topic: TopicId, sequence_number: u16, now: Now) {
         if self.is_withheld(topic) {
@@ -52,7 +52,9 @@ impl Values {
                     self.tell(Output::Discovery { bytes });
                 }
             }
-            Err(error) => self.count(About::topic(topic), Reason::TooBig, 1, || error.to_string()),
+            Err(error) => self.count(DropSite::topic(topic), Reason::TooBig, 1, || {
+                error.to_string()
+            }),
         }
         self.recycle(bytes);
     }
@@ -61,7 +63,7 @@ impl Values {
     pub(super) fn deny(&mut self, writer_id: u16, sequence_number: u16) {
         let announcement = Announcement {
             sequence_number,
-            announced: Announced::DataSetMetaData {
+            announced: AnnouncedContent::DataSetMetaData {
                 writer_id,
                 meta_data: DataSetMetaDataType::default(),
                 status: BAD_NOT_FOUND,

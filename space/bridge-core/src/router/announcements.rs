@@ -11,26 +11,26 @@ use std::time::{Duration, Instant};
 use mappings::{SpaceId, TopicId};
 use messages::{MessageType, Selection};
 use uadp::discovery::{
-    AnnounceLimits, Announcer, ApplicationDescription, Included, List, Probe, Subject,
+    AnnounceLimits, AnnouncedSubject, Announcer, ApplicationDescription, Included, Probe, WireArray,
 };
 
 use self::applications::Applications;
 use self::probes::MetadataProbes;
-pub(super) use self::rolls::Asked;
+pub(super) use self::rolls::ProbedCalls;
 use self::rolls::Rolls;
-use super::about::About;
-use super::values::Values;
+use super::about::DropSite;
+use super::values::TopicQueues;
 use crate::application::Application;
 use crate::counters::Reason;
-use crate::description::{Description, Source, mapped_leaves};
+use crate::description::{MetaDataSource, OwnAnnouncements, mapped_leaves};
 use crate::loop_rule::Owned;
 use crate::output::Output;
 use crate::settings::Now;
-use crate::topic::{Role, Topic};
+use crate::topic::{Topic, TopicSide};
 
 /// The planned announcements of this program, and the pending probes.
 #[derive(Debug)]
-pub(super) struct Announcements {
+pub(super) struct PlannedAnnouncements {
     /// The origin of time for the timers: the first use.
     start: Option<Instant>,
     announcer: Announcer,
@@ -45,7 +45,7 @@ pub(super) struct Announcements {
     due: Option<Instant>,
 }
 
-impl Announcements {
+impl PlannedAnnouncements {
     pub(super) fn new(own: SpaceId) -> Self {
         let limits = AnnounceLimits {
             // Programs that receive the same probe respond at different times.
@@ -93,7 +93,7 @@ impl Announcements {
     }
 
     /// Plans an announcement. A planned announcement already contains the information.
-    fn plan(&mut self, subject: Subject, now: Now) {
+    fn plan(&mut self, subject: AnnouncedSubject, now: Now) {
         let since = self.since_start(now);
         let announced = self.announcer.announce(subject, Included::default(), since);
         let _planned = announced.is_ok();
@@ -102,7 +102,7 @@ impl Announcements {
 
     fn plan_value(&mut self, topic: TopicId, now: Now) {
         let (_, _, writer_id) = topic.triple();
-        self.plan(Subject::DataSetMetaData(writer_id), now);
+        self.plan(AnnouncedSubject::DataSetMetaData(writer_id), now);
     }
 
     /// Plans the announcement of an own call.
@@ -113,12 +113,12 @@ impl Announcements {
             topics.push(topic);
             self.announcer.set_actions(self.actions.keys().copied());
         }
-        self.plan(Subject::ActionMetaData(writer_id), now);
+        self.plan(AnnouncedSubject::ActionMetaData(writer_id), now);
     }
 
     /// Plans the announcement of the own application.
     pub(super) fn plan_application(&mut self, now: Now) {
-        self.plan(Subject::ApplicationInformation, now);
+        self.plan(AnnouncedSubject::ApplicationInformation, now);
     }
 
     /// Sets the description of this program, and announces it.
@@ -147,14 +147,14 @@ impl Announcements {
     }
 
     /// Probes a space or one of its namespaces for its calls.
-    pub(super) fn probe_calls(&mut self, asked: Asked, now: Now) {
+    pub(super) fn probe_calls(&mut self, asked: ProbedCalls, now: Now) {
         let at = self.at(now);
         self.rolls.plan(asked, at);
         self.reckon();
     }
 
     /// Plans the probes that values need.
-    pub(super) fn inquire(&mut self, values: &mut Values, now: Now) {
+    pub(super) fn inquire(&mut self, values: &mut TopicQueues, now: Now) {
         if values.inquiries.is_empty() {
             return;
         }
@@ -174,7 +174,7 @@ impl Announcements {
     /// Handles a probe for the metadata of topics of the space `asked`.
     pub(super) fn handle_probe(
         &mut self,
-        ids: List<'_, u16>,
+        ids: WireArray<'_, u16>,
         (asked, own): (SpaceId, SpaceId),
         now: Now,
     ) {
@@ -188,7 +188,7 @@ impl Announcements {
     }
 
     /// Handles a probe of another program for the calls of a space or of a namespace.
-    pub(super) fn handle_roll(&mut self, asked: Asked, now: Now) {
+    pub(super) fn handle_roll(&mut self, asked: ProbedCalls, now: Now) {
         let since = self.since_start(now);
         self.rolls.handle_probe(asked, since);
         self.reckon();
@@ -209,14 +209,14 @@ impl Announcements {
     /// Stores the announced application of another program.
     pub(super) fn meet_application(
         &mut self,
-        values: &mut Values,
-        (description, capabilities): (&ApplicationDescription<'_>, List<'_, Option<&str>>),
+        values: &mut TopicQueues,
+        (description, capabilities): (&ApplicationDescription<'_>, WireArray<'_, Option<&str>>),
         (space, from): (SpaceId, SocketAddr),
         now: Now,
     ) {
         let Some(application) = Application::read(description, capabilities) else {
             let cause = (Reason::MetaData, "application");
-            values.count(About::sender(from), cause, 1, || {
+            values.count(DropSite::sender(from), cause, 1, || {
                 "its application announcement is too long or contains unprintable characters"
                     .to_owned()
             });
@@ -243,7 +243,7 @@ impl Announcements {
     /// probed any more, except topics with values from another sender.
     pub(super) fn handle_denial(
         &mut self,
-        values: &mut Values,
+        values: &mut TopicQueues,
         (writer_id, (space, from)): (u16, (SpaceId, SocketAddr)),
         now: Now,
     ) {
@@ -252,7 +252,7 @@ impl Announcements {
             .filter(|topic| topic.triple().2 == writer_id)
             .partition(|topic| values.may_be_writer(*topic, from, now));
         for topic in doubtful {
-            let about = About {
+            let about = DropSite {
                 topic: Some(topic),
                 from: Some(from),
             };
@@ -268,7 +268,7 @@ impl Announcements {
     /// `message` the mapping or the local side describes the topic.
     pub(super) fn describe(
         &mut self,
-        values: &mut Values,
+        values: &mut TopicQueues,
         topic: TopicId,
         message: Option<(&MessageType, &Selection)>,
         now: Now,
@@ -300,7 +300,7 @@ impl Announcements {
                 return self.forget(values, topic);
             }
         };
-        let source = Source {
+        let source = MetaDataSource {
             topic,
             message,
             leaves,
@@ -308,7 +308,7 @@ impl Announcements {
             said,
             namespaces: values.mapping.namespaces(),
         };
-        match Description::new(source, description.as_deref(), now.utc) {
+        match OwnAnnouncements::new(source, description.as_deref(), now.utc) {
             Ok(new) if new.differs(description.as_deref()) => {
                 *description = Some(Box::new(new));
                 *announce_at = Some(now.monotonic + period);
@@ -316,7 +316,7 @@ impl Announcements {
             Ok(_) => return,
             Err(error) => {
                 *description = None;
-                values.count(About::topic(topic), Reason::MetaData, 1, || {
+                values.count(DropSite::topic(topic), Reason::MetaData, 1, || {
                     format!("cannot announce its fields: {error}")
                 });
                 return;
@@ -333,7 +333,7 @@ impl Announcements {
     }
 
     /// Stops the announcements of an own topic.
-    pub(super) fn forget(&mut self, values: &mut Values, topic: TopicId) {
+    pub(super) fn forget(&mut self, values: &mut TopicQueues, topic: TopicId) {
         if let Some(entry) = values.topics.get_mut(&topic) {
             entry.said = None;
             entry.description = None;
@@ -352,10 +352,10 @@ impl Announcements {
     }
 
     /// Plans the next announcement of a topic, if it is due and the topic has a producer.
-    pub(super) fn announce_again(&mut self, values: &mut Values, topic: TopicId, now: Now) {
+    pub(super) fn announce_again(&mut self, values: &mut TopicQueues, topic: TopicId, now: Now) {
         let period = values.mapping.pubsub().metadata_period;
         let Some(Topic {
-            role: Role::Ours(writer),
+            role: TopicSide::Ours(writer),
             announce_at: Some(at),
             ..
         }) = values.topics.get_mut(&topic)
@@ -375,8 +375,8 @@ impl Announcements {
     /// with the sequence number.
     pub(super) fn handle_timeout(
         &mut self,
-        values: &mut Values,
-        announce_call: impl Fn(&mut Values, TopicId, u16),
+        values: &mut TopicQueues,
+        announce_call: impl Fn(&mut TopicQueues, TopicId, u16),
         now: Now,
     ) {
         if self.due.is_none_or(|due| due > now.monotonic) {
@@ -386,9 +386,12 @@ impl Announcements {
         while let Some(due) = self.announcer.poll(since) {
             let number = due.sequence_number;
             match due.subject {
-                Subject::ApplicationInformation => self.send_application(values, false, number),
-                Subject::PublisherEndpoints => self.send_application(values, true, number),
-                Subject::DataSetMetaData(writer_id) | Subject::ActionMetaData(writer_id) => {
+                AnnouncedSubject::ApplicationInformation => {
+                    self.send_application(values, false, number)
+                }
+                AnnouncedSubject::PublisherEndpoints => self.send_application(values, true, number),
+                AnnouncedSubject::DataSetMetaData(writer_id)
+                | AnnouncedSubject::ActionMetaData(writer_id) => {
                     let topics = self.writers.get(&writer_id);
                     let calls = self.actions.get(&writer_id);
                     for topic in topics.into_iter().flatten() {
@@ -406,14 +409,14 @@ impl Announcements {
                         values.deny(writer_id, number);
                     }
                 }
-                Subject::PubSubConnections
-                | Subject::WriterGroupConfiguration(_)
-                | Subject::DataSetWriterConfiguration(_)
-                | Subject::ActionResponder => {}
+                AnnouncedSubject::PubSubConnections
+                | AnnouncedSubject::WriterGroupConfiguration(_)
+                | AnnouncedSubject::DataSetWriterConfiguration(_)
+                | AnnouncedSubject::ActionResponder => {}
             }
         }
         for (space, ids) in self.probes.poll(at) {
-            let probe = Probe::DataSetMetaData(List::new(&ids));
+            let probe = Probe::DataSetMetaData(WireArray::new(&ids));
             values.send_probe(&probe, Some(space));
         }
         for asked in self.rolls.poll(at) {
@@ -426,7 +429,7 @@ impl Announcements {
     }
 
     /// Announces the own application or its Endpoints.
-    fn send_application(&self, values: &mut Values, endpoints: bool, sequence_number: u16) {
+    fn send_application(&self, values: &mut TopicQueues, endpoints: bool, sequence_number: u16) {
         let mut bytes = values.buffer();
         let head = (values.settings.own, sequence_number);
         let written = self.applications.write(endpoints, head, &mut bytes);
@@ -437,7 +440,7 @@ impl Announcements {
             }
             Some(Ok(()) | Err(_)) => {
                 values.recycle(bytes);
-                values.count(About::NOTHING, Reason::TooBig, 1, || {
+                values.count(DropSite::NOTHING, Reason::TooBig, 1, || {
                     "the announcement of this program does not fit into a datagram".to_owned()
                 });
             }

@@ -4,20 +4,25 @@ use std::time::Instant;
 
 use mappings::{Overflow, TopicId};
 
-use super::about::About;
-use super::values::Values;
+use super::about::DropSite;
+use super::values::TopicQueues;
 use crate::counters::Reason;
-use crate::message::Encoded;
+use crate::message::EncodedSample;
 use crate::network::join;
 use crate::output::Output;
 use crate::settings::Now;
 use crate::tap::Crossing;
 use crate::topics::Handle;
 
-impl Values {
+impl TopicQueues {
     /// Returns the datagram of a sample, together with other waiting samples of its WriterGroup if
     /// the mapping allows it.
-    pub(super) fn datagram(&mut self, at: Handle, mut first: Encoded, now: Now) -> Option<Output> {
+    pub(super) fn datagram(
+        &mut self,
+        at: Handle,
+        mut first: EncodedSample,
+        now: Now,
+    ) -> Option<Output> {
         let topic = at.topic();
         // Each topic of a broker has its own messages. A message of several writers has the time of
         // its transmission.
@@ -49,7 +54,9 @@ impl Values {
             Ok(()) => Some(Output::Datagram { topic, with, bytes }),
             Err(error) => {
                 for topic in std::iter::once(topic).chain(with) {
-                    self.count(About::topic(topic), Reason::TooBig, 1, || error.to_string());
+                    self.count(DropSite::topic(topic), Reason::TooBig, 1, || {
+                        error.to_string()
+                    });
                 }
                 None
             }
@@ -58,7 +65,12 @@ impl Values {
 
     /// Takes samples that fit into the datagram of `first` from the ready topics in their order.
     /// Other topics keep their position.
-    fn gather(&mut self, topic: TopicId, first: &Encoded, now: Instant) -> Vec<(TopicId, Encoded)> {
+    fn gather(
+        &mut self,
+        topic: TopicId,
+        first: &EncodedSample,
+        now: Instant,
+    ) -> Vec<(TopicId, EncodedSample)> {
         let mut gathered = Vec::new();
         let seals = self.seals();
         let pubsub = self.mapping.pubsub();
@@ -121,7 +133,7 @@ impl Values {
 /// Returns whether the datagram already contains a sample of `topic`. In a topic that keeps the
 /// latest sample, a second sample would replace the first as soon as the datagram is read. Of
 /// several latched publishers, only the last would then be received.
-fn is_in(topic: TopicId, first: TopicId, others: &[(TopicId, Encoded)]) -> bool {
+fn is_in(topic: TopicId, first: TopicId, others: &[(TopicId, EncodedSample)]) -> bool {
     topic == first || others.iter().any(|(other, _)| *other == topic)
 }
 

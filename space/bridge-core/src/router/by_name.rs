@@ -5,12 +5,12 @@ use std::sync::Arc;
 use mappings::{Lasting, TopicId};
 use messages::{MessageType, PlanError, Selection};
 
-use super::{About, Router, Values};
+use super::{DropSite, Router, TopicQueues};
 use crate::by_name::ByName;
 use crate::call::{ValueDescription, ValueNote};
 use crate::counters::Reason;
 use crate::settings::Now;
-use crate::topic::{Role, Topic};
+use crate::topic::{Topic, TopicSide};
 
 impl Router {
     /// Binds a value that is not in the mapping. Otherwise it works as [`bind`](Self::bind).
@@ -37,7 +37,7 @@ impl Router {
         let Some(entry) = self.values.topics.at_mut(at) else {
             return Ok(());
         };
-        let ours = matches!(entry.role, Role::Ours(_));
+        let ours = matches!(entry.role, TopicSide::Ours(_));
         if ours {
             entry.said = Some(Box::new(ValueDescription {
                 name,
@@ -63,7 +63,7 @@ impl Router {
     }
 }
 
-impl Values {
+impl TopicQueues {
     /// Assigns the fields of a value to its message, if the value is bound by name. Returns false
     /// for other values.
     pub(super) fn arrange(&mut self, topic: TopicId, now: Now) -> bool {
@@ -88,7 +88,7 @@ impl Values {
         };
         if let Err(why) = bound {
             let cause = (Reason::Mismatch, "type");
-            self.count(About::topic(topic), cause, 1, || why);
+            self.count(DropSite::topic(topic), cause, 1, || why);
         }
         true
     }

@@ -7,15 +7,15 @@ use std::time::Duration;
 use mappings::{SpaceId, TopicId};
 use messages::ServiceType;
 use uadp::action::{ActionDialect, ActionKind, ExecutionId};
-use uadp::discovery::{Announced, Announcement, DataSetMetaDataType};
+use uadp::discovery::{AnnouncedContent, Announcement, DataSetMetaDataType};
 use uadp::{NetworkMessage, PublisherId, SecurityHeader};
 
 use super::announce::BAD_NOT_FOUND;
 use super::calls::CallTraffic;
-use super::{About, Router};
+use super::{DropSite, Router};
 use crate::call::{
-    AskId, CallCounters, CallDescription, CallMap, CallTypeError, Executed, Offered, OfferedType,
-    join_name,
+    AskId, CallCounters, CallDescription, CallMap, CallTypeError, Executed, OfferedCall,
+    OfferedType, join_name,
 };
 use crate::counters::Reason;
 use crate::late;
@@ -108,7 +108,7 @@ impl Router {
 
     /// Adds or changes a call that the local side executes, and announces it. Calls of namespaces
     /// that this program does not own are ignored.
-    pub fn offer(&mut self, topic: TopicId, offered: Offered, now: Now) {
+    pub fn offer(&mut self, topic: TopicId, offered: OfferedCall, now: Now) {
         self.call_traffic().offer(topic, offered, now);
     }
 
@@ -168,7 +168,7 @@ impl Router {
         let (space, _, writer_id) = topic.triple();
         let announcement = Announcement {
             sequence_number: 0,
-            announced: Announced::DataSetMetaData {
+            announced: AnnouncedContent::DataSetMetaData {
                 writer_id,
                 meta_data: DataSetMetaDataType {
                     name: Some(&join_name(topic, "")),
@@ -214,7 +214,7 @@ impl Router {
             match (topic, action.action.kind) {
                 (None, _) => {
                     self.values
-                        .count(About::sender(from), Reason::NotInSpace, 1, String::new)
+                        .count(DropSite::sender(from), Reason::NotInSpace, 1, String::new)
                 }
                 (Some(topic), ActionKind::Request) if self.values.is_untimed(&message.header()) => {
                     let cause = late::cause(late::UNTIMED);

@@ -20,33 +20,33 @@ use std::time::{Duration, Instant};
 use mappings::{SpaceId, TopicId};
 use messages::{ServiceType, Wire};
 use uadp::action::{
-    ActionAddress, ActionDialect, ActionFields, ActionMessage, ActionRequest, CallId, CallRefusal,
-    ExecutionId, Outcome, Refusal, Requestor, RequestorSettings, Responder, ResponderSettings,
-    ResponseDrop, Unknown,
+    ActionAddress, ActionDialect, ActionFields, ActionMessage, ActionOutcome, ActionRequest,
+    CallId, CallRefusal, ExecutionId, Refusal, Requestor, RequestorSettings, Responder,
+    ResponderSettings, ResponseDrop, Unknown,
 };
 use uadp::{OwnedPublisherId, StatusCode};
 
 use self::chunks::Chunking;
-use self::executors::{Group, Known};
-use self::own::{Own, Running};
-use super::announcements::Announcements;
-use super::security::Security;
+use self::executors::{CallState, NamespaceExecutor};
+use self::own::{Own, RunningRequest};
+use super::announcements::PlannedAnnouncements;
+use super::security::MessageSecurity;
 use super::senders::RedundantSenders;
-use super::{About, Values};
+use super::{DropSite, TopicQueues};
 use crate::call::{
     AskError, AskErrorKind, AskId, CallCounters, CallDescription, CallMap, CallTypeError,
 };
 use crate::call_announcement::LASTING_TARGET;
 use crate::call_plan::CallPlan;
-use crate::counters::{Cause, Reason};
+use crate::counters::{DropCause, Reason};
 use crate::fields;
-use crate::loop_rule::{Side, What};
+use crate::loop_rule::{Crosses, Side};
 use crate::output::Output;
 use crate::settings::{Local, Now};
 
 /// The calls of a Router.
 #[derive(Debug)]
-pub(super) struct Calls {
+pub(super) struct RouterCalls {
     /// The origin of time for the requestor and the responder.
     start: Instant,
     requestor: Requestor,
@@ -56,12 +56,12 @@ pub(super) struct Calls {
     target: u16,
     table: HashMap<TopicId, Call>,
     /// The executors of the calls of each namespace.
-    groups: HashMap<(SpaceId, u16), Group>,
+    groups: HashMap<(SpaceId, u16), NamespaceExecutor>,
     /// The size in bytes of the known call descriptions.
     weight: usize,
-    asked: BTreeMap<CallId, Asked>,
+    asked: BTreeMap<CallId, OwnRequest>,
     asks: HashMap<AskId, CallId>,
-    executions: BTreeMap<ExecutionId, Running>,
+    executions: BTreeMap<ExecutionId, RunningRequest>,
     /// The outputs for the port in their order. Their number is limited by the number of calls and
     /// requests.
     news: VecDeque<Output>,
@@ -77,10 +77,10 @@ pub(super) struct Calls {
 
 /// The calls of a Router with the parts of the Router that they use.
 pub(super) struct CallTraffic<'r> {
-    pub(super) calls: &'r mut Option<Box<Calls>>,
-    pub(super) values: &'r mut Values,
-    pub(super) announcements: &'r mut Announcements,
-    pub(super) security: &'r Security,
+    pub(super) calls: &'r mut Option<Box<RouterCalls>>,
+    pub(super) values: &'r mut TopicQueues,
+    pub(super) announcements: &'r mut PlannedAnnouncements,
+    pub(super) security: &'r MessageSecurity,
     pub(super) senders: &'r RedundantSenders,
     /// Random bytes that distinguish own requests from requests of other programs.
     pub(super) instance: [u8; 16],
@@ -90,7 +90,7 @@ pub(super) struct CallTraffic<'r> {
 #[derive(Debug, Default)]
 struct Call {
     /// The description of a call of another program.
-    known: Option<Known>,
+    known: Option<CallState>,
     /// The local type of the call.
     bound: Option<Bound>,
     /// The state of an own call.
@@ -111,14 +111,14 @@ struct Bound {
 
 /// A request of the local side.
 #[derive(Debug)]
-struct Asked {
+struct OwnRequest {
     ask: AskId,
     topic: TopicId,
     /// The plan for its response, if the local side uses ROS messages.
     plan: Option<Arc<CallPlan>>,
 }
 
-impl Calls {
+impl RouterCalls {
     fn new(
         (own, instance): (SpaceId, [u8; 16]),
         target: u16,
@@ -204,7 +204,7 @@ impl Calls {
     }
 
     /// Removes a completed request.
-    fn close(&mut self, id: CallId) -> Option<Asked> {
+    fn close(&mut self, id: CallId) -> Option<OwnRequest> {
         let asked = self.asked.remove(&id)?;
         self.asks.remove(&asked.ask);
         if let Some(call) = self.table.get_mut(&asked.topic) {
@@ -215,12 +215,17 @@ impl Calls {
 }
 
 impl CallTraffic<'_> {
-    fn calls_mut(&mut self, now: Now) -> &mut Calls {
+    fn calls_mut(&mut self, now: Now) -> &mut RouterCalls {
         let (own, instance) = (self.values.settings.own, self.instance);
         let timeout = self.values.mapping.pubsub().receive_timeout;
         let target = self.target();
         self.calls.get_or_insert_with(|| {
-            Box::new(Calls::new((own, instance), target, timeout, now.monotonic))
+            Box::new(RouterCalls::new(
+                (own, instance),
+                target,
+                timeout,
+                now.monotonic,
+            ))
         })
     }
 
@@ -326,7 +331,7 @@ impl CallTraffic<'_> {
         match begun {
             Ok((id, plan)) => {
                 call.open += 1;
-                calls.asked.insert(id, Asked { ask, topic, plan });
+                calls.asked.insert(id, OwnRequest { ask, topic, plan });
                 calls.asks.insert(ask, id);
                 calls.reckon();
             }
@@ -352,14 +357,14 @@ impl CallTraffic<'_> {
         request: &[u8],
         timeout: Duration,
         now: Now,
-    ) -> Result<Begun, (Cause, AskError)> {
+    ) -> Result<Begun, (DropCause, AskError)> {
         let refuse = |refusal: Refusal, case: &'static str, text: String| {
             (
                 (Reason::CallRefused, case).into(),
                 AskError::refused(refusal, text),
             )
         };
-        if !self.values.may_cross(Side::Local, What::Request, topic) {
+        if !self.values.may_cross(Side::Local, Crosses::Request, topic) {
             let text =
                 format!("{topic} is executed by this program and cannot be called from here");
             return Err((
@@ -461,7 +466,7 @@ impl CallTraffic<'_> {
         from: SocketAddr,
         now: Now,
     ) {
-        if !self.values.may_cross(Side::Ua, What::Response, topic) {
+        if !self.values.may_cross(Side::Ua, Crosses::Response, topic) {
             if self.values.is_redundant_peer(from) {
                 return;
             }
@@ -472,7 +477,7 @@ impl CallTraffic<'_> {
         let Some(calls) = &mut self.calls else {
             return self
                 .values
-                .count(About::sender(from), Reason::NotAsked, 1, String::new);
+                .count(DropSite::sender(from), Reason::NotAsked, 1, String::new);
         };
         let since = calls.since_start(now);
         let known = calls.table.get(&topic).and_then(|call| call.known.as_ref());
@@ -486,14 +491,17 @@ impl CallTraffic<'_> {
             calls.spoke(topic);
         }
         match heard {
-            Ok(uadp::action::Heard::Done(id, outcome)) => {
+            Ok(uadp::action::ResponseMeaning::Done(id, outcome)) => {
                 // The program may have restarted, and its announcement may have been lost.
-                if let Outcome::Unknown(Unknown::Lost) = outcome {
+                if let ActionOutcome::Unknown(Unknown::Lost) = outcome {
                     self.announcements.probe(topic, now);
                 }
                 self.conclude(id, outcome);
             }
-            Ok(uadp::action::Heard::Executing(_) | uadp::action::Heard::Closed(_)) => {}
+            Ok(
+                uadp::action::ResponseMeaning::Executing(_)
+                | uadp::action::ResponseMeaning::Closed(_),
+            ) => {}
             Err(ResponseDrop::Elsewhere) => {
                 self.count_call(topic, Some(from), Reason::Forged, || {
                     format!("{from} responds for {topic}, but does not execute it")
@@ -506,14 +514,14 @@ impl CallTraffic<'_> {
     }
 
     /// Outputs the outcome of a request.
-    fn conclude(&mut self, id: CallId, outcome: Outcome<'_>) {
+    fn conclude(&mut self, id: CallId, outcome: ActionOutcome<'_>) {
         let Some(asked) = self.calls.as_mut().and_then(|calls| calls.close(id)) else {
             return;
         };
-        let Asked { ask, topic, plan } = asked;
+        let OwnRequest { ask, topic, plan } = asked;
         let mut response = self.values.buffer();
         let (answer, cause) = match outcome {
-            Outcome::Answered { status, fields } if status.0 & BAD == 0 => {
+            ActionOutcome::Answered { status, fields } if status.0 & BAD == 0 => {
                 match read(fields, plan.as_deref(), &mut response) {
                     Ok(()) => (Ok(response), None),
                     Err((cause, detail)) => {
@@ -523,14 +531,14 @@ impl CallTraffic<'_> {
                     }
                 }
             }
-            Outcome::Answered { status, .. } => {
+            ActionOutcome::Answered { status, .. } => {
                 let text = format!("it was executed and failed: status 0x{:08X}", status.0);
                 (failed(status, text), None)
             }
-            Outcome::Refused(refusal) => {
+            ActionOutcome::Refused(refusal) => {
                 (Err(AskError::refused(refusal, refusal.to_string())), None)
             }
-            Outcome::Unknown(why) => (Err(unknown(why)), None),
+            ActionOutcome::Unknown(why) => (Err(unknown(why)), None),
         };
         if let Some(calls) = &mut self.calls {
             if let Some(call) = calls.table.get_mut(&topic) {
@@ -558,7 +566,7 @@ impl CallTraffic<'_> {
             .and_then(|calls| calls.requestor.poll_given_up())
         {
             let topic = self.calls.as_ref().and_then(|calls| calls.topic_of(id));
-            self.conclude(id, Outcome::Unknown(why));
+            self.conclude(id, ActionOutcome::Unknown(why));
             if let (Some(topic), Unknown::Silent) = (topic, why) {
                 self.doubt(topic, now);
             }
@@ -592,12 +600,12 @@ impl CallTraffic<'_> {
         self.settle(now);
     }
 
-    /// Counts a drop of a call as `Values::count` does for a topic.
+    /// Counts a drop of a call as `TopicQueues::count` does for a topic.
     pub(super) fn count_call(
         &mut self,
         topic: TopicId,
         from: Option<SocketAddr>,
-        cause: impl Into<Cause>,
+        cause: impl Into<DropCause>,
         detail: impl FnOnce() -> String,
     ) {
         let cause = cause.into();
@@ -607,7 +615,7 @@ impl CallTraffic<'_> {
             None => self.values.topics.others_mut(),
         };
         let total = counters.add(cause, 1);
-        let about = About {
+        let about = DropSite {
             topic: Some(topic),
             from,
         };
@@ -624,7 +632,7 @@ fn read(
     fields: ActionFields<'_>,
     plan: Option<&CallPlan>,
     out: &mut Vec<u8>,
-) -> Result<(), (Cause, String)> {
+) -> Result<(), (DropCause, String)> {
     let variants = fields.variants().map_err(fields::undecodable)?;
     match plan {
         Some(plan) => plan.response(variants.bytes(), out),

@@ -8,7 +8,7 @@ use uadp::{DecodeError, NetworkMessage, NetworkMessageType};
 
 use super::reassembly::{case_of, reason_of, told};
 use super::receive::sent;
-use super::{About, Router, Values};
+use super::{DropSite, Router, TopicQueues};
 use crate::counters::Reason;
 use crate::settings::Now;
 
@@ -25,7 +25,7 @@ impl Router {
         let topic = writer_id.and_then(|id| TopicId::new(u16::from(space.get()), namespace, id));
         if writer_id.is_some() && topic.is_none() {
             self.values
-                .count(About::sender(from), Reason::NotInSpace, 1, String::new);
+                .count(DropSite::sender(from), Reason::NotInSpace, 1, String::new);
             return;
         }
         if topic.is_some_and(|topic| !self.values.hear(topic, from, now)) {
@@ -62,7 +62,7 @@ impl Router {
                     }
                     Ok(message) if self.security.is_smuggled(&message, namespace) => {
                         let cause = (Reason::Unsecured, "in chunks");
-                        self.values.count(About::sender(from), cause, 1, || {
+                        self.values.count(DropSite::sender(from), cause, 1, || {
                             "a message of a secured group in chunks of another".to_owned()
                         });
                     }
@@ -71,7 +71,7 @@ impl Router {
                 },
             },
             Err(refusal) => {
-                let about = About {
+                let about = DropSite {
                     topic,
                     from: Some(from),
                 };
@@ -88,7 +88,7 @@ impl Router {
     }
 }
 
-impl Values {
+impl TopicQueues {
     /// Records a message of the writer of a topic. Returns false if there is no room for the topic.
     fn hear(&mut self, topic: TopicId, from: SocketAddr, now: Now) -> bool {
         let Some(at) = self.entry(topic, from, now) else {

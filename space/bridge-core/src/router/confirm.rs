@@ -7,14 +7,14 @@ use mappings::{SpaceId, TopicId};
 use uadp::Timestamp;
 use uadp::action::ActionMessage;
 
-use super::{About, Router, Values};
-use crate::confirm::{self, Arrival, Confirmer, Handover, Mark, Receipt, Reply};
+use super::{DropSite, Router, TopicQueues};
+use crate::confirm::{self, ConfirmedArrival, Confirmer, Handover, Mark, Receipt, Reply};
 use crate::counters::{Reason, Verdict};
-use crate::output::{Kept, Output};
-use crate::place::Place;
-use crate::reader::Admitted;
+use crate::output::{Output, ValueRelation};
+use crate::place::SequencePosition;
+use crate::reader::AcceptedMessage;
 use crate::settings::Now;
-use crate::topic::{Role, Topic};
+use crate::topic::{Topic, TopicSide};
 use crate::topics::Handle;
 
 impl Router {
@@ -65,7 +65,7 @@ impl Router {
         let Some(writer) = self.values.topics.writer_of(topic) else {
             return true;
         };
-        let about = About {
+        let about = DropSite {
             topic: Some(topic),
             from: Some(from),
         };
@@ -98,11 +98,11 @@ impl Router {
     }
 }
 
-impl Values {
+impl TopicQueues {
     fn receipt(&self, topic: TopicId) -> Option<&Receipt> {
         match &self.topics.get(&topic)?.role {
-            Role::Theirs(reader) => reader.receipt.as_ref(),
-            Role::Ours(_) => None,
+            TopicSide::Theirs(reader) => reader.receipt.as_ref(),
+            TopicSide::Ours(_) => None,
         }
     }
 
@@ -111,13 +111,13 @@ impl Values {
     pub(super) fn receive(
         &mut self,
         topic: TopicId,
-        place: &Place,
-        admitted: Result<Admitted, Reason>,
+        place: &SequencePosition,
+        admitted: Result<AcceptedMessage, Reason>,
         now: Now,
-    ) -> Result<Admitted, Reason> {
+    ) -> Result<AcceptedMessage, Reason> {
         let own = self.settings.own;
         let Some(Topic {
-            role: Role::Theirs(reader),
+            role: TopicSide::Theirs(reader),
             confirming: Some(confirming),
             ..
         }) = self.topics.get_mut(&topic)
@@ -150,9 +150,9 @@ impl Values {
                 instance: stamp,
             }),
             Reply::HandOver => {
-                return Ok(Admitted {
+                return Ok(AcceptedMessage {
                     missing: 0,
-                    kept: Kept::Alone,
+                    kept: ValueRelation::Alone,
                     lasting: false,
                 });
             }
@@ -166,7 +166,9 @@ impl Values {
             Ok(()) => self.tell(Output::Action { topic, bytes }),
             Err(error) => {
                 self.recycle(bytes);
-                self.count(About::topic(topic), Reason::TooBig, 1, || error.to_string());
+                self.count(DropSite::topic(topic), Reason::TooBig, 1, || {
+                    error.to_string()
+                });
             }
         }
     }
@@ -192,7 +194,7 @@ impl Values {
     /// Queues the arrival of the newest event of a topic for the port, once it is known.
     pub(super) fn settle_arrival(&mut self, topic: TopicId) {
         let Some(Topic {
-            role: Role::Ours(writer),
+            role: TopicSide::Ours(writer),
             counters,
             ..
         }) = self.topics.get_mut(&topic)
@@ -200,7 +202,7 @@ impl Values {
             return;
         };
         if writer.take_news() {
-            if let Some(Arrival::Unknown(_)) = writer.arrival() {
+            if let Some(ConfirmedArrival::Unknown(_)) = writer.arrival() {
                 // The port logs it.
                 counters.add(Reason::Unconfirmed, 1);
             }
@@ -213,7 +215,7 @@ impl Values {
         while let Some(topic) = self.settled.pop_front() {
             // A newer event is not settled by the arrival of the event before.
             if let Some(Topic {
-                role: Role::Ours(writer),
+                role: TopicSide::Ours(writer),
                 ..
             }) = self.topics.get(&topic)
                 && let Some(arrival) = writer.arrival().cloned()
@@ -239,7 +241,7 @@ impl Values {
         } else {
             self.tell(Output::Settled {
                 topic,
-                arrival: Arrival::NotSent,
+                arrival: ConfirmedArrival::NotSent,
             });
         }
     }

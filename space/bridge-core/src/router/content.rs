@@ -11,15 +11,15 @@ use uadp::{
     Scalar, StatusCode, Timestamp, Variant,
 };
 
-use super::about::About;
-use super::values::Values;
-use crate::base::Base;
+use super::about::DropSite;
+use super::values::TopicQueues;
+use crate::base::KeyFrame;
 use crate::counters::Reason;
-use crate::layout::Layout;
-use crate::place::Place;
+use crate::layout::DataSetLayout;
+use crate::place::SequencePosition;
 use crate::settings::Now;
-use crate::takes::Takes;
-use crate::topic::{Role, Topic};
+use crate::takes::UsedFields;
+use crate::topic::{Topic, TopicSide};
 use crate::topics::Handle;
 
 /// The selection of fields in a message.
@@ -59,12 +59,12 @@ type Refusal = (Reason, String);
 
 /// The status and timestamp of a DataValue that is the value.
 #[derive(Debug, Clone, Copy, Default)]
-pub(super) struct Quality {
+pub(super) struct ValueQuality {
     pub(super) status: Option<StatusCode>,
     pub(super) source: Option<Timestamp>,
 }
 
-impl Quality {
+impl ValueQuality {
     fn of(value: &DataValue<'_>) -> Self {
         Self {
             status: value.status,
@@ -89,21 +89,21 @@ impl Quality {
     }
 }
 
-impl Values {
+impl TopicQueues {
     /// Stores a key frame for later delta frames, and returns the selection of its fields.
     pub(super) fn take_base(
         &mut self,
         at: Handle,
         message: &DataSetMessage<'_>,
-        place: &Place,
-    ) -> Takes {
+        place: &SequencePosition,
+    ) -> UsedFields {
         let Some(Topic {
-            role: Role::Theirs(reader),
+            role: TopicSide::Theirs(reader),
             takes,
             ..
         }) = self.topics.at_mut(at)
         else {
-            return Takes::All;
+            return UsedFields::All;
         };
         if message.kind != MessageKind::KeyFrame {
             return *takes;
@@ -122,7 +122,7 @@ impl Values {
                     base.renew(message, place);
                     base
                 }
-                None => Box::new(Base::new(message, place)),
+                None => Box::new(KeyFrame::new(message, place)),
             };
             self.base_bytes = others + base.weight();
             reader.base = Some(base);
@@ -133,7 +133,7 @@ impl Values {
     /// Returns the fields of a message if they need no conversion.
     pub(super) fn plain<'a>(
         message: &DataSetMessage<'a>,
-        takes: Takes,
+        takes: UsedFields,
     ) -> Option<Result<Fields<'a>, uadp::DecodeError>> {
         let has_fields = matches!(message.kind, MessageKind::KeyFrame | MessageKind::Event);
         if !has_fields
@@ -144,9 +144,9 @@ impl Values {
         }
         let fields = message.fields();
         let is_taken = match (takes, &fields) {
-            (Takes::All, _) | (_, Err(_)) => true,
-            (Takes::One, Ok(fields)) => fields.len() == 1,
-            (Takes::Named, Ok(_)) => false,
+            (UsedFields::All, _) | (_, Err(_)) => true,
+            (UsedFields::One, Ok(fields)) => fields.len() == 1,
+            (UsedFields::Named, Ok(_)) => false,
         };
         is_taken.then_some(fields)
     }
@@ -157,9 +157,9 @@ impl Values {
         &mut self,
         topic: TopicId,
         message: &DataSetMessage<'_>,
-        place: &Place,
+        place: &SequencePosition,
         out: &mut Vec<u8>,
-    ) -> Result<Option<Quality>, Refusal> {
+    ) -> Result<Option<ValueQuality>, Refusal> {
         if message.kind == MessageKind::KeyFrame && message.payload().is_empty() {
             return Ok(None);
         }
@@ -194,7 +194,7 @@ impl Values {
             let layout = self.announced(topic, from);
             layout.filter(|layout| layout.is_current(header))
         };
-        match (Takes::of(Some(variable)), &variable.ua_field) {
+        match (UsedFields::of(Some(variable)), &variable.ua_field) {
             (_, Some(UaField::Place(place))) => Ok(Choice::Place(*place)),
             (_, Some(UaField::Name(name))) => {
                 let Some(layout) = announced() else {
@@ -209,16 +209,16 @@ impl Values {
                     (Reason::Mismatch, detail)
                 })
             }
-            (Takes::One, None) => {
+            (UsedFields::One, None) => {
                 let named = announced().and_then(|layout| layout.place_of(&variable.name));
                 Ok(Choice::One(named))
             }
-            (Takes::All | Takes::Named, None) => Ok(Choice::All),
+            (UsedFields::All | UsedFields::Named, None) => Ok(Choice::All),
         }
     }
 
     /// Returns the layout of a topic if the sender announced it.
-    fn announced(&self, topic: TopicId, from: SocketAddr) -> Option<&Arc<Layout>> {
+    fn announced(&self, topic: TopicId, from: SocketAddr) -> Option<&Arc<DataSetLayout>> {
         let layout = self.layouts.last(topic)?;
         Some(layout).filter(|layout| layout.is_of(from))
     }
@@ -231,7 +231,7 @@ impl Values {
         (message, from): (&DataSetMessage<'_>, SocketAddr),
         choice: &Choice,
         out: &mut Vec<u8>,
-    ) -> Result<Quality, Refusal> {
+    ) -> Result<ValueQuality, Refusal> {
         let undescribed = |why: &str| Err((Reason::Undescribed, why.to_owned()));
         let layout = match self.announced(topic, from) {
             Some(layout) if layout.is_current(&message.header()) => Some(layout),
@@ -248,7 +248,7 @@ impl Values {
         else {
             return undescribed("RawData before the DataSetMetaData of the writer");
         };
-        let layout = Layout::mapped(variable);
+        let layout = DataSetLayout::mapped(variable);
         fits(message.payload(), &layout)?;
         raw(message.payload(), &layout, choice, out)
     }
@@ -257,10 +257,10 @@ impl Values {
     fn delta(
         &mut self,
         topic: TopicId,
-        delta: (&DataSetMessage<'_>, &Place),
+        delta: (&DataSetMessage<'_>, &SequencePosition),
         choice: &Choice,
         out: &mut Vec<u8>,
-    ) -> Result<Option<Quality>, Refusal> {
+    ) -> Result<Option<ValueQuality>, Refusal> {
         let mut merged = self.buffer();
         let taken = self.merge(topic, delta, (choice, &mut merged), out);
         self.recycle(merged);
@@ -270,10 +270,10 @@ impl Values {
     fn merge(
         &mut self,
         topic: TopicId,
-        (message, place): (&DataSetMessage<'_>, &Place),
+        (message, place): (&DataSetMessage<'_>, &SequencePosition),
         (choice, merged): (&Choice, &mut Vec<u8>),
         out: &mut Vec<u8>,
-    ) -> Result<Option<Quality>, Refusal> {
+    ) -> Result<Option<ValueQuality>, Refusal> {
         let no_key_frame = |why: &str| Err((Reason::NoKeyFrame, why.to_owned()));
         let Some(reader) = self.topics.reader_of(topic) else {
             return Ok(None);
@@ -324,7 +324,12 @@ impl Values {
     }
 
     /// Stores a key frame that the local side already has, because delta frames may follow it.
-    pub(super) fn follow_again(&mut self, at: Handle, message: &DataSetMessage<'_>, place: &Place) {
+    pub(super) fn follow_again(
+        &mut self,
+        at: Handle,
+        message: &DataSetMessage<'_>,
+        place: &SequencePosition,
+    ) {
         let Some(reader) = self.topics.reader(at) else {
             return;
         };
@@ -346,7 +351,7 @@ impl Values {
         if reason == Reason::Undescribed {
             self.ask_layout(topic, now);
         }
-        let about = About {
+        let about = DropSite {
             topic: Some(topic),
             from: Some(from),
         };
@@ -356,7 +361,7 @@ impl Values {
 
 /// Checks that a payload has exactly the layout of the mapping. No writer announced this layout,
 /// and a message of more fields could pass for a padded message.
-fn fits(payload: &[u8], layout: &Layout) -> Result<(), Refusal> {
+fn fits(payload: &[u8], layout: &DataSetLayout) -> Result<(), Refusal> {
     let fields = layout.raw_fields();
     let layout = raw_layout(&fields)?;
     let values: Result<Vec<_>, _> = layout.read(payload, RawDialect::Standard).collect();
@@ -381,10 +386,10 @@ fn raw_layout<'a>(fields: &'a [uadp::RawField<'a>]) -> Result<RawLayout<'a>, Ref
 
 fn raw(
     payload: &[u8],
-    layout: &Layout,
+    layout: &DataSetLayout,
     choice: &Choice,
     out: &mut Vec<u8>,
-) -> Result<Quality, Refusal> {
+) -> Result<ValueQuality, Refusal> {
     let fields = layout.raw_fields();
     let layout = raw_layout(&fields)?;
     let values = layout.read(payload, RawDialect::Standard);
@@ -410,7 +415,7 @@ fn raw(
         }
         Ok(())
     })?;
-    Ok(Quality::default())
+    Ok(ValueQuality::default())
 }
 
 /// Converts Variants or DataValues. A bad DataValue without a value, and a bad DataValue among
@@ -420,7 +425,7 @@ fn flatten(
     message: &DataSetMessage<'_>,
     choice: &Choice,
     out: &mut Vec<u8>,
-) -> Result<Quality, Refusal> {
+) -> Result<ValueQuality, Refusal> {
     let malformed = |error: uadp::DecodeError| (Reason::Malformed, error.to_string());
     let values = message.values().map_err(malformed)?;
     let values = values.map(|field| field.map(|field| field.value));
@@ -441,8 +446,8 @@ fn flatten(
         Ok(())
     })?;
     Ok(match taken {
-        [one] => Quality::of(one),
-        _ => Quality::default(),
+        [one] => ValueQuality::of(one),
+        _ => ValueQuality::default(),
     })
 }
 

@@ -5,13 +5,13 @@ use std::net::SocketAddr;
 
 use mappings::{Lasting, SpaceId, TopicId};
 use messages::{MessageType, Selection};
-use uadp::discovery::{Announced, Announcement, DataSetMetaDataType, Probe};
+use uadp::discovery::{AnnouncedContent, Announcement, DataSetMetaDataType, Probe};
 use uadp::{NetworkMessage, NetworkMessageType, PublisherId, StatusCode};
 
-use super::announcements::Asked;
+use super::announcements::ProbedCalls;
 use super::receive::DISCOVERY;
-use super::values::Values;
-use super::{About, Router};
+use super::values::TopicQueues;
+use super::{DropSite, Router};
 use crate::application::Application;
 use crate::call::{ValueDescription, split_name};
 use crate::counters::Reason;
@@ -70,7 +70,7 @@ impl Router {
     pub fn call_the_roll(&mut self, now: Now) {
         if let Some(namespaces) = self.values.concern.namespaces() {
             for (space, namespace) in namespaces {
-                let asked = Asked::namespace(*space, *namespace);
+                let asked = ProbedCalls::namespace(*space, *namespace);
                 self.announcements.probe_calls(asked, now);
             }
             return;
@@ -81,7 +81,8 @@ impl Router {
         let spaces: BTreeSet<SpaceId> = declared.chain(usual).collect();
         for space in spaces {
             if space != own || own == SpaceId::UA {
-                self.announcements.probe_calls(Asked::space(space), now);
+                self.announcements
+                    .probe_calls(ProbedCalls::space(space), now);
             }
         }
     }
@@ -89,7 +90,9 @@ impl Router {
     /// Counts an announcement or probe that could not be sent.
     pub fn not_announced(&mut self, reason: Reason, detail: &str) {
         self.values
-            .count(About::NOTHING, (reason, "socket"), 1, || detail.to_owned());
+            .count(DropSite::NOTHING, (reason, "socket"), 1, || {
+                detail.to_owned()
+            });
     }
 
     /// Announces a topic of the own space with its type.
@@ -111,7 +114,7 @@ impl Router {
     /// Sends the due announcements and probes.
     pub(super) fn announce_due(&mut self, now: Now) {
         let calls = self.calls.as_deref();
-        let announce_call = |values: &mut Values, topic: TopicId, number: u16| {
+        let announce_call = |values: &mut TopicQueues, topic: TopicId, number: u16| {
             if let Some(calls) = calls {
                 calls.announce(values, topic, number, now);
             }
@@ -189,7 +192,8 @@ impl Router {
             Ok(Probe::PubSubConnections { .. }) if self.values.is_source(from) => {}
             Ok(Probe::PubSubConnections { .. }) => {
                 // It is also used as a probe for calls.
-                self.announcements.handle_roll(Asked::space(space), now);
+                self.announcements
+                    .handle_roll(ProbedCalls::space(space), now);
                 if space == own {
                     self.call_traffic().announce_calls(now);
                 }
@@ -200,7 +204,7 @@ impl Router {
             }) => {
                 // Own probes are received, too.
                 if !self.values.is_source(from) {
-                    let asked = Asked::namespace(space, namespace);
+                    let asked = ProbedCalls::namespace(space, namespace);
                     self.announcements.handle_roll(asked, now);
                     if space == own {
                         self.call_traffic().announce_calls_of(namespace, now);
@@ -226,12 +230,13 @@ impl Router {
         now: Now,
     ) {
         match &announcement.announced {
-            Announced::ActionMetaData(action) => {
+            AnnouncedContent::ActionMetaData(action) => {
                 self.call_traffic().learn_call(action, (space, from), now);
             }
             // A limited program does not use the descriptions of others.
-            Announced::ApplicationDescription { .. } if self.values.concern.is_limited() => {}
-            Announced::ApplicationDescription {
+            AnnouncedContent::ApplicationDescription { .. } if self.values.concern.is_limited() => {
+            }
+            AnnouncedContent::ApplicationDescription {
                 description,
                 capabilities,
             } => self.announcements.meet_application(
@@ -240,7 +245,7 @@ impl Router {
                 (space, from),
                 now,
             ),
-            Announced::DataSetMetaData {
+            AnnouncedContent::DataSetMetaData {
                 writer_id,
                 meta_data,
                 status,
@@ -252,12 +257,12 @@ impl Router {
                 }
                 self.learn_value((*writer_id, *status), meta_data, (space, from), now);
             }
-            Announced::PublisherEndpoints { .. }
-            | Announced::DataSetWriterConfiguration { .. }
-            | Announced::PubSubConnections(_)
-            | Announced::PubSubConnection { .. }
-            | Announced::ApplicationStatus { .. }
-            | Announced::ActionResponder(_) => {
+            AnnouncedContent::PublisherEndpoints { .. }
+            | AnnouncedContent::DataSetWriterConfiguration { .. }
+            | AnnouncedContent::PubSubConnections(_)
+            | AnnouncedContent::PubSubConnection { .. }
+            | AnnouncedContent::ApplicationStatus { .. }
+            | AnnouncedContent::ActionResponder(_) => {
                 self.values.drop_undecoded(None, from, &DISCOVERY);
             }
         }
@@ -299,7 +304,7 @@ impl Router {
                     .handle_denial(&mut self.values, denial, now);
             }
             None => {
-                let about = About::sender(from);
+                let about = DropSite::sender(from);
                 self.values.count(about, Reason::NotInSpace, 1, String::new);
             }
         }

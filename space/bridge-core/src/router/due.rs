@@ -5,19 +5,19 @@ use std::time::{Duration, Instant};
 
 use mappings::TopicId;
 
-use super::about::About;
-use super::values::Values;
+use super::about::DropSite;
+use super::values::TopicQueues;
 use crate::counters::Reason;
 use crate::loss::{Reaction, ReactionFault};
-use crate::message::Message;
+use crate::message::SampleMessage;
 use crate::network::keep_alive;
-use crate::output::{Delivery, GOOD, Kept, Output};
+use crate::output::{Delivery, GOOD, Output, ValueRelation};
 use crate::settings::{Local, Now};
-use crate::topic::{Item, Role};
+use crate::topic::{PolledSample, TopicSide};
 use crate::topics::Handle;
 use crate::writer::Idle;
 
-impl Values {
+impl TopicQueues {
     /// Repeats a value, sends a keep-alive, or detects the silence of a topic.
     pub(super) fn handle_due(&mut self, at: Handle, now: Now) {
         self.expire_held(at.topic(), now);
@@ -29,7 +29,7 @@ impl Values {
             return;
         };
         match &mut entry.role {
-            Role::Theirs(reader) => {
+            TopicSide::Theirs(reader) => {
                 if reader.fell_silent(now.monotonic, silence) {
                     if self.settings.local != Local::Fields {
                         reader.withdraw();
@@ -43,7 +43,7 @@ impl Values {
                     self.lose(at, now);
                 }
             }
-            Role::Ours(writer) => {
+            TopicSide::Ours(writer) => {
                 if let Some(held) = entry
                     .gate
                     .as_mut()
@@ -79,7 +79,7 @@ impl Values {
                                 keep_alive(buffer, at.topic(), expected, now.utc)
                         {
                             entry.counters.keep_alives += 1;
-                            let item = Item::Message(Message::Datagram(datagram));
+                            let item = PolledSample::Message(SampleMessage::Datagram(datagram));
                             let bytes = item.bytes();
                             // The queue is empty, so nothing is dropped.
                             drop(entry.queue.push(item, bytes));
@@ -120,7 +120,7 @@ impl Values {
         if let Err(detail) = written {
             self.recycle(payload);
             self.count(
-                About::topic(at.topic()),
+                DropSite::topic(at.topic()),
                 (Reason::NotPublished, "on_loss"),
                 1,
                 || format!("`on_loss`: {detail}"),
@@ -134,13 +134,13 @@ impl Values {
             status: GOOD,
             arrived: now.utc,
             instance: None,
-            kept: Kept::Alone,
+            kept: ValueRelation::Alone,
             lasting: false,
         };
         if muted {
             self.mute_loss(delivery, now);
         } else {
-            self.push_to(of, Item::Delivery(delivery));
+            self.push_to(of, PolledSample::Delivery(delivery));
         }
     }
 
@@ -151,7 +151,7 @@ impl Values {
             return;
         };
         let due = match &entry.role {
-            Role::Ours(writer) => {
+            TopicSide::Ours(writer) => {
                 let held = entry.gate.as_ref().and_then(|gate| gate.due());
                 let idle = writer.due(key_frames, keep_alives).map(|(at, _)| at);
                 let announce = entry.announce_at;
@@ -159,7 +159,7 @@ impl Values {
                 let due = held.into_iter().chain(idle).chain(announce);
                 due.chain(again).min()
             }
-            Role::Theirs(reader) => {
+            TopicSide::Theirs(reader) => {
                 let hold = entry.loss.as_ref().and_then(|loss| loss.due());
                 let held = reader.held.as_ref().and_then(|held| held.expires());
                 let due = reader.due(silence).into_iter().chain(hold);

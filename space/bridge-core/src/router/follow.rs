@@ -7,17 +7,17 @@ use std::time::Instant;
 use mappings::{Lasting, Overflow, SpaceId, TopicId};
 
 use super::values::MAX_STRAYS;
-use super::{About, Router, Values};
+use super::{DropSite, Router, TopicQueues};
 use crate::confirm::Confirming;
 use crate::counters::Reason;
 use crate::deadline::Deadline;
 use crate::gate::Gate;
-use crate::reader::Reader;
+use crate::reader::ReceivedTopicState;
 use crate::settings::Now;
-use crate::takes::Takes;
-use crate::topic::{Role, Topic};
+use crate::takes::UsedFields;
+use crate::topic::{Topic, TopicSide};
 use crate::topics::Handle;
-use crate::writer::Writer;
+use crate::writer::SentTopicState;
 
 impl Router {
     /// Returns the time of the last message of each topic of another space that was received at
@@ -27,13 +27,13 @@ impl Router {
             .topics
             .iter()
             .filter_map(|(topic, entry)| match &entry.role {
-                Role::Theirs(reader) if reader.was_heard() => Some((topic, reader.heard_at())),
-                Role::Theirs(_) | Role::Ours(_) => None,
+                TopicSide::Theirs(reader) if reader.was_heard() => Some((topic, reader.heard_at())),
+                TopicSide::Theirs(_) | TopicSide::Ours(_) => None,
             })
     }
 }
 
-impl Values {
+impl TopicQueues {
     /// Returns the handle of a topic of a received message, and adds the topic if necessary.
     /// Returns `None` for an unknown topic if the limit is reached.
     pub(super) fn entry(&mut self, topic: TopicId, from: SocketAddr, now: Now) -> Option<Handle> {
@@ -42,7 +42,7 @@ impl Values {
         }
         let is_stray = !self.is_home(topic) && self.mapping.variable(topic).is_none();
         if is_stray && !self.take_place(now) {
-            self.count(About::sender(from), Reason::TooManyTopics, 1, || {
+            self.count(DropSite::sender(from), Reason::TooManyTopics, 1, || {
                 format!(
                     "ignored {topic}: more than {MAX_STRAYS} topics are received that the mapping does not \
                      name and that have no subscriber here"
@@ -70,12 +70,12 @@ impl Values {
             None => <(Overflow, Lasting)>::default(),
         };
         let role = if is_home {
-            Role::Ours(Box::new(Writer::new(now.monotonic)))
+            TopicSide::Ours(Box::new(SentTopicState::new(now.monotonic)))
         } else {
-            Role::Theirs(Box::new(Reader::new(from, now.monotonic)))
+            TopicSide::Theirs(Box::new(ReceivedTopicState::new(from, now.monotonic)))
         };
         let mut entry = Topic::new(role, rules);
-        entry.takes = Takes::of(variable);
+        entry.takes = UsedFields::of(variable);
         entry.confirming = Confirming::of(variable);
         entry.deadline = Deadline::of(variable);
         entry.held_back = variable
@@ -96,7 +96,7 @@ impl Values {
     /// Removes a topic.
     pub(super) fn remove(&mut self, topic: TopicId) {
         if let Some(entry) = self.topics.remove(topic)
-            && let Role::Theirs(reader) = entry.role
+            && let TopicSide::Theirs(reader) = entry.role
             && let Some(base) = reader.base
         {
             self.base_bytes = self.base_bytes.saturating_sub(base.weight());
@@ -119,7 +119,7 @@ impl Values {
         let mut strays = 0_usize;
         let mut silent: Vec<(Instant, TopicId)> = Vec::new();
         for (topic, entry) in self.topics.iter() {
-            if let Role::Theirs(reader) = &entry.role
+            if let TopicSide::Theirs(reader) = &entry.role
                 && entry.plan.is_none()
                 && self.mapping.variable(topic).is_none()
             {

@@ -4,8 +4,8 @@ use std::net::SocketAddr;
 
 use uadp::{KeyError, NetworkMessage};
 
-use super::security::Security;
-use super::{About, Router, Values};
+use super::security::MessageSecurity;
+use super::{DropSite, Router, TopicQueues};
 use crate::counters::Reason;
 use crate::guard::{GroupState, KeyDelivery, Unopened};
 use crate::output::Output;
@@ -37,7 +37,7 @@ impl Router {
         from: SocketAddr,
         now: Now,
     ) {
-        let about = About::sender(from);
+        let about = DropSite::sender(from);
         // An own message that was received again. It is not opened, to save time.
         let is_own = self.values.settings.source.is_some() && self.values.is_source(from);
         if message.is_sealed() && is_own {
@@ -64,19 +64,19 @@ impl Router {
     }
 }
 
-impl Values {
+impl TopicQueues {
     /// Returns whether the current message is unsecured but concerns a secured namespace, and
     /// counts it.
     pub(super) fn is_unsaid(
         &mut self,
-        security: &Security,
+        security: &MessageSecurity,
         namespace: Option<u16>,
         from: SocketAddr,
     ) -> bool {
         let unsaid = security.is_unsaid(namespace);
         if unsaid {
             let cause = (Reason::Unsecured, "announcement");
-            let about = About::sender(from);
+            let about = DropSite::sender(from);
             self.count(about, cause, 1, || match namespace {
                 Some(namespace) => {
                     format!("it is not secured, but its namespace {namespace} is")

@@ -5,19 +5,19 @@ use std::time::Duration;
 use mappings::TopicId;
 use uadp::Fields;
 
-use super::about::About;
-use super::receive::Sample;
-use super::values::Values;
+use super::about::DropSite;
+use super::receive::LocalSample;
+use super::values::TopicQueues;
 use crate::counters::Reason;
-use crate::output::Kept;
-use crate::reader::Held;
+use crate::output::ValueRelation;
+use crate::reader::HeldSample;
 use crate::settings::Now;
 use crate::topics::Handle;
 
-impl Values {
+impl TopicQueues {
     /// Stores a sample until its local type is known, in place of the previous sample.
-    pub(super) fn hold(&mut self, topic: TopicId, sample: &Sample<'_>, now: Now) {
-        let held = Box::new(Held {
+    pub(super) fn hold(&mut self, topic: TopicId, sample: &LocalSample<'_>, now: Now) {
+        let held = Box::new(HeldSample {
             fields: sample.fields.bytes().to_vec(),
             source: sample.source,
             instance: sample.instance,
@@ -41,7 +41,7 @@ impl Values {
             *reader_held = None;
         }
         let cause = (Reason::NoRoom, "before its local type");
-        self.count(About::topic(topic), cause, 1, || {
+        self.count(DropSite::topic(topic), cause, 1, || {
             "the limit of large samples that wait for their local types is reached".to_owned()
         });
     }
@@ -68,7 +68,7 @@ impl Values {
         has_room
     }
 
-    fn held_of(&mut self, topic: TopicId) -> Option<&mut Option<Box<Held>>> {
+    fn held_of(&mut self, topic: TopicId) -> Option<&mut Option<Box<HeldSample>>> {
         let reader = self.topics.reader_of(topic)?;
         Some(&mut reader.held)
     }
@@ -76,7 +76,8 @@ impl Values {
     /// Removes a large sample if its type was not known in time. A state is received again with its
     /// next repetition.
     pub(super) fn expire_held(&mut self, topic: TopicId, now: Now) {
-        let over = |held: &mut Box<Held>| held.expires().is_some_and(|at| at <= now.monotonic);
+        let over =
+            |held: &mut Box<HeldSample>| held.expires().is_some_and(|at| at <= now.monotonic);
         let expired = self.held_of(topic).and_then(|held| held.take_if(over));
         if let Some(held) = expired.filter(|held| !held.lasting) {
             self.came_too_early(topic, &held);
@@ -85,7 +86,7 @@ impl Values {
 
     /// Delivers a sample that waited for its local type. An event is delivered only until it is too
     /// old.
-    pub(super) fn deliver_held(&mut self, at: Handle, held: &Held, now: Now) {
+    pub(super) fn deliver_held(&mut self, at: Handle, held: &HeldSample, now: Now) {
         if !held.lasting && held.until <= now.monotonic {
             self.came_too_early(at.topic(), held);
             return;
@@ -93,11 +94,11 @@ impl Values {
         let Ok(fields) = Fields::parse(&held.fields) else {
             return;
         };
-        let sample = Sample {
+        let sample = LocalSample {
             fields,
             source: held.source,
             instance: held.instance,
-            kept: Kept::Alone,
+            kept: ValueRelation::Alone,
             lasting: held.lasting,
             status: held.status,
             // The waiting time is not a delay of this program.
@@ -106,11 +107,11 @@ impl Values {
         self.deliver(at, &sample, now);
     }
 
-    fn came_too_early(&mut self, topic: TopicId, held: &Held) {
+    fn came_too_early(&mut self, topic: TopicId, held: &HeldSample) {
         if let Some(reader) = self.topics.reader_of(topic) {
             reader.forget(held.instance);
         }
-        self.count(About::topic(topic), Reason::NotPublished, 1, || {
+        self.count(DropSite::topic(topic), Reason::NotPublished, 1, || {
             "its local type was known too late for an event".to_owned()
         });
     }

@@ -5,7 +5,7 @@ use std::time::Duration;
 use mappings::{Lasting, TopicId};
 use uadp::{NetworkHeader, Timestamp};
 
-use super::{Router, Values};
+use super::{Router, TopicQueues};
 use crate::confirm::Confirming;
 use crate::settings::{Forwarding, Now, Relay};
 use crate::topic::Topic;
@@ -61,7 +61,7 @@ impl Router {
     }
 }
 
-impl Values {
+impl TopicQueues {
     /// Returns whether the repetitions of a value carry the time of its first transmission. A
     /// broker could deliver a repetition after the command was given up. A program that forwards
     /// sealed messages to a broker cannot recognise repetitions.

@@ -5,26 +5,26 @@ use std::sync::Arc;
 use mappings::{Lasting, TopicId};
 use uadp::Timestamp;
 
-use super::about::About;
-use super::values::Values;
-use crate::counters::{Cause, Reason, Verdict};
+use super::about::DropSite;
+use super::values::TopicQueues;
+use crate::counters::{DropCause, Reason, Verdict};
 use crate::fields;
 use crate::gate::{Passage, Waiting};
 use crate::hops::Hop;
-use crate::loop_rule::{Side, What};
-use crate::message::{Encoded, Message};
+use crate::loop_rule::{Crosses, Side};
+use crate::message::{EncodedSample, SampleMessage};
 use crate::network::{check_size, data_set_header, encode};
-use crate::output::{Heard, PublisherKey};
+use crate::output::{LocalMessage, PublisherKey};
 use crate::settings::{Local, Now};
 use crate::tap::Crossing;
-use crate::topic::{Item, Role, Topic};
+use crate::topic::{PolledSample, Topic, TopicSide};
 use crate::topics::Handle;
 use crate::writer::MAX_KEPT;
 
-impl Values {
+impl TopicQueues {
     /// Handles a sample of the local side.
-    pub(super) fn take_local(&mut self, heard: Heard<'_>, status: u16, now: Now) -> Verdict {
-        let Heard {
+    pub(super) fn take_local(&mut self, heard: LocalMessage<'_>, status: u16, now: Now) -> Verdict {
+        let LocalMessage {
             topic,
             payload,
             received,
@@ -33,21 +33,21 @@ impl Values {
         self.tap.note(topic, || Crossing::Taken {
             bytes: payload.len(),
         });
-        if !self.may_cross(Side::Local, What::Value, topic) {
+        if !self.may_cross(Side::Local, Crosses::Value, topic) {
             return self.refuse(topic, Reason::Looped, String::new());
         }
         if self.is_elsewhere(topic.triple().1) {
             return Verdict::Drop(Reason::SpaceTaken);
         }
-        let mut encoded = Encoded {
+        let mut encoded = EncodedSample {
             bytes: self.buffer(),
-            ..Encoded::default()
+            ..EncodedSample::default()
         };
         let local = self.settings.local;
         let (max_datagram, max_message) = self.sizes();
         let at = self.follow(topic, now);
         let Some(Topic {
-            role: Role::Ours(writer),
+            role: TopicSide::Ours(writer),
             plan,
             gate,
             description,
@@ -58,8 +58,8 @@ impl Values {
             return Verdict::Drop(Reason::Looped);
         };
         let sample = match (local, plan) {
-            (Local::Fields, _) => fields::Payload::Block(payload),
-            (Local::Ros1 | Local::Cdr, Some(plan)) => fields::Payload::Ros(plan, payload),
+            (Local::Fields, _) => fields::LocalPayload::Block(payload),
+            (Local::Ros1 | Local::Cdr, Some(plan)) => fields::LocalPayload::Ros(plan, payload),
             (Local::Ros1 | Local::Cdr, None) => {
                 let detail = "its message type is not known yet".to_owned();
                 return self.refuse(topic, Reason::Untyped, detail);
@@ -105,7 +105,7 @@ impl Values {
     fn outpaced(&mut self, topic: TopicId, sample: Option<Waiting>) {
         if let Some((outpaced, _)) = sample {
             self.recycle(outpaced.bytes);
-            self.count(About::topic(topic), Reason::Outpaced, 1, String::new);
+            self.count(DropSite::topic(topic), Reason::Outpaced, 1, String::new);
         }
     }
 
@@ -113,7 +113,7 @@ impl Values {
     fn forward(
         &mut self,
         at: Handle,
-        mut encoded: Encoded,
+        mut encoded: EncodedSample,
         (received, latched_by): (Timestamp, Option<PublisherKey>),
         now: Now,
     ) -> Verdict {
@@ -121,7 +121,7 @@ impl Values {
         let large = encoded.bytes.len() > usize::from(max_datagram);
         let muted = self.is_muted();
         let Some(Topic {
-            role: Role::Ours(writer),
+            role: TopicSide::Ours(writer),
             lasting,
             confirming,
             ..
@@ -137,9 +137,9 @@ impl Values {
         };
         encoded.number(sequence);
         let message = if large {
-            Message::Large(Arc::new(encoded))
+            SampleMessage::Large(Arc::new(encoded))
         } else {
-            Message::Datagram(encoded)
+            SampleMessage::Datagram(encoded)
         };
         writer.sent(now.monotonic);
         let is_state = match lasting {
@@ -163,7 +163,7 @@ impl Values {
             self.adopt_followed(at.topic());
         }
         if gave_way {
-            self.count(About::topic(at.topic()), Reason::TooManyPublishers, 1, || {
+            self.count(DropSite::topic(at.topic()), Reason::TooManyPublishers, 1, || {
                 format!(
                     "it has more than {MAX_KEPT} latched publishers: late subscribers receive only the messages of the most recent publishers"
                 )
@@ -171,7 +171,7 @@ impl Values {
         }
         self.hops.record(Hop::Out, received, now.utc);
         self.schedule(at);
-        if self.push(at, Item::Message(message)) {
+        if self.push(at, PolledSample::Message(message)) {
             Verdict::ForwardAfterDroppingOldest
         } else {
             Verdict::Forward
@@ -202,7 +202,7 @@ impl Values {
         }
         let at = self.follow(topic, now);
         let Some(Topic {
-            role: Role::Ours(writer),
+            role: TopicSide::Ours(writer),
             announce_at,
             ..
         }) = self.topics.at_mut(at)
@@ -226,9 +226,9 @@ impl Values {
     }
 
     /// Counts a dropped sample of the local side.
-    fn refuse(&mut self, topic: TopicId, cause: impl Into<Cause>, detail: String) -> Verdict {
+    fn refuse(&mut self, topic: TopicId, cause: impl Into<DropCause>, detail: String) -> Verdict {
         let cause = cause.into();
-        self.count(About::topic(topic), cause, 1, || detail);
+        self.count(DropSite::topic(topic), cause, 1, || detail);
         Verdict::Drop(cause.reason)
     }
 }

@@ -6,19 +6,19 @@ use std::time::{Duration, Instant};
 use mappings::{Mapping, TopicId};
 use uadp::discovery::DataSetMetaDataType;
 
-use super::about::About;
-use super::values::Values;
+use super::about::DropSite;
+use super::values::TopicQueues;
 use crate::counters::Reason;
-use crate::description::{Described, DescriptionFault};
-use crate::layout::Layout;
-use crate::learned::{News, Rank};
+use crate::description::{DescriptionFault, TopicMetaData};
+use crate::layout::DataSetLayout;
+use crate::learned::{AnnouncementEffect, TopicPrecedence};
 use crate::output::Output;
-use crate::reader::Ask;
+use crate::reader::LocalTypeRequest;
 use crate::settings::{Local, Now};
-use crate::topic::{Role, Topic};
-use crate::topics::Topics;
+use crate::topic::{Topic, TopicSide};
+use crate::topics::TopicTable;
 
-impl Values {
+impl TopicQueues {
     /// Handles the metadata of a topic of another space. `answered` is called if the metadata is
     /// accepted as an answer to a probe.
     pub(super) fn learn(
@@ -28,7 +28,7 @@ impl Values {
         answered: impl FnOnce(),
         now: Now,
     ) {
-        let about = About {
+        let about = DropSite {
             topic: Some(topic),
             from: Some(from),
         };
@@ -36,8 +36,8 @@ impl Values {
             return;
         }
         let shape = match self.topics.get(&topic).map(|entry| &entry.role) {
-            Some(Role::Theirs(reader)) => reader.shape.clone(),
-            Some(Role::Ours(_)) | None => None,
+            Some(TopicSide::Theirs(reader)) => reader.shape.clone(),
+            Some(TopicSide::Ours(_)) | None => None,
         };
         let fault = self.learn_layout(topic, meta_data, from, now).err();
         if !self.is_learned(topic) {
@@ -47,7 +47,7 @@ impl Values {
             }
             return;
         }
-        let described = match Described::read(meta_data) {
+        let described = match TopicMetaData::read(meta_data) {
             Ok(described) => described,
             Err(why) => {
                 self.count(about, (Reason::MetaData, "useless"), 1, || why.to_string());
@@ -65,11 +65,11 @@ impl Values {
             return;
         }
         match self.take_note(topic, described, now) {
-            News::Same => {}
-            News::Full => self.count(about, (Reason::MetaData, "no room"), 1, || {
+            AnnouncementEffect::Same => {}
+            AnnouncementEffect::Full => self.count(about, (Reason::MetaData, "no room"), 1, || {
                 "the limit of described topics is reached".to_owned()
             }),
-            News::Other => {
+            AnnouncementEffect::Other => {
                 self.topics.counters(Some(topic)).described += 1;
                 if !self.arrange(topic, now)
                     && shape.is_some()
@@ -86,8 +86,8 @@ impl Values {
     pub(super) fn may_be_writer(&self, topic: TopicId, from: SocketAddr, now: Now) -> bool {
         let timeout = self.mapping.pubsub().receive_timeout;
         match self.topics.get(&topic).map(|of| &of.role) {
-            Some(Role::Theirs(reader)) => reader.may_be(from, now.monotonic, timeout),
-            Some(Role::Ours(_)) | None => true,
+            Some(TopicSide::Theirs(reader)) => reader.may_be(from, now.monotonic, timeout),
+            Some(TopicSide::Ours(_)) | None => true,
         }
     }
 
@@ -149,7 +149,7 @@ impl Values {
         }
         // If the mapping defines the type, a restart at another port is not worth a log entry.
         if self.is_learned(topic) {
-            let about = About {
+            let about = DropSite {
                 topic: Some(topic),
                 from: Some(from),
             };
@@ -168,22 +168,27 @@ impl Values {
         from: SocketAddr,
         now: Now,
     ) -> Result<(), DescriptionFault> {
-        let layout = Layout::read(meta_data, from)?;
+        let layout = DataSetLayout::read(meta_data, from)?;
         let until = (now.monotonic, self.mapping.pubsub().metadata_period);
         let rank = rank(&self.topics, &self.mapping, now.monotonic);
         match self.layouts.learn(topic, layout, until, rank) {
-            News::Full => Err(DescriptionFault::Full),
-            News::Same | News::Other => Ok(()),
+            AnnouncementEffect::Full => Err(DescriptionFault::Full),
+            AnnouncementEffect::Same | AnnouncementEffect::Other => Ok(()),
         }
     }
 
     /// Stores the description of a topic. An announcement without a ROS type removes the stored
     /// description.
-    fn take_note(&mut self, topic: TopicId, described: Option<Described>, now: Now) -> News {
+    fn take_note(
+        &mut self,
+        topic: TopicId,
+        described: Option<TopicMetaData>,
+        now: Now,
+    ) -> AnnouncementEffect {
         let until = (now.monotonic, self.mapping.pubsub().metadata_period);
         let Some(described) = described else {
             self.learned.forget(topic);
-            return News::Same;
+            return AnnouncementEffect::Same;
         };
         let rank = rank(&self.topics, &self.mapping, now.monotonic);
         self.learned.learn(topic, described, until, rank)
@@ -191,7 +196,7 @@ impl Values {
 
     /// Returns whether a topic with values may change to the description. The known description is
     /// always accepted.
-    fn may_be_renamed(&mut self, topic: TopicId, described: &Described, now: Now) -> bool {
+    fn may_be_renamed(&mut self, topic: TopicId, described: &TopicMetaData, now: Now) -> bool {
         let known = self.learned.last(topic);
         if known.is_some_and(|known| **known == *described) {
             return true;
@@ -199,7 +204,7 @@ impl Values {
         let known = known.is_some();
         match self.topics.get_mut(&topic) {
             Some(Topic {
-                role: Role::Theirs(reader),
+                role: TopicSide::Theirs(reader),
                 ..
             }) => reader.may_be_renamed(known, now.monotonic),
             Some(_) | None => true,
@@ -212,7 +217,7 @@ impl Values {
     pub(super) fn asked(
         &mut self,
         topic: TopicId,
-        ask: Ask,
+        ask: LocalTypeRequest,
         shape: Vec<(uadp::BuiltinType, bool)>,
         now: Now,
     ) -> Option<Output> {
@@ -223,16 +228,19 @@ impl Values {
         let fits = described
             .as_ref()
             .is_none_or(|described| described.fits(&shape));
-        if ask == Ask::IfDescribed && (described.is_none() || !fits) {
+        if ask == LocalTypeRequest::IfDescribed && (described.is_none() || !fits) {
             return None;
         }
         if described.is_none() {
             self.ask_what(topic);
         }
         if !fits {
-            self.count(About::topic(topic), (Reason::MetaData, "values"), 1, || {
-                "its values do not match the description of its writer".to_owned()
-            });
+            self.count(
+                DropSite::topic(topic),
+                (Reason::MetaData, "values"),
+                1,
+                || "its values do not match the description of its writer".to_owned(),
+            );
         }
         Some(Output::Unbound {
             topic,
@@ -246,15 +254,19 @@ impl Values {
 const ASK_LAYOUT_AGAIN: Duration = Duration::from_secs(10);
 
 /// Returns the precedence of topics when there is no room for all descriptions.
-fn rank(topics: &Topics, mapping: &Mapping, now: Instant) -> impl Fn(TopicId) -> Rank {
+fn rank(
+    topics: &TopicTable,
+    mapping: &Mapping,
+    now: Instant,
+) -> impl Fn(TopicId) -> TopicPrecedence {
     let timeout = mapping.pubsub().receive_timeout;
     move |topic| match topics.get(&topic).map(|of| &of.role) {
-        _ if mapping.variable(topic).is_some() => Rank::Mapped,
-        Some(Role::Theirs(reader))
+        _ if mapping.variable(topic).is_some() => TopicPrecedence::Mapped,
+        Some(TopicSide::Theirs(reader))
             if now.saturating_duration_since(reader.heard_at()) < timeout =>
         {
-            Rank::Heard
+            TopicPrecedence::Heard
         }
-        Some(_) | None => Rank::Stray,
+        Some(_) | None => TopicPrecedence::Stray,
     }
 }

@@ -6,19 +6,19 @@ use std::net::SocketAddr;
 use mappings::{Lasting, TopicId, Variable};
 use uadp::{MessageKind, NetworkMessage, NetworkMessageType, Timestamp};
 
-use super::about::About;
+use super::about::DropSite;
 use super::redundant::SinceTakeover;
-use super::values::Values;
+use super::values::TopicQueues;
 use crate::counters::Reason;
-use crate::message::Message;
+use crate::message::SampleMessage;
 use crate::output::{Delivery, Output};
-use crate::place::Place;
+use crate::place::SequencePosition;
 use crate::redundancy::Redundancy;
 use crate::settings::Now;
-use crate::topic::{Item, Role, Topic};
+use crate::topic::{PolledSample, Topic, TopicSide};
 use crate::topics::Handle;
 
-impl Values {
+impl TopicQueues {
     /// Returns the state of the redundancy.
     pub(super) fn redundancy(&self) -> Option<&Redundancy> {
         self.redundant.as_ref().map(|redundant| redundant.state())
@@ -124,7 +124,7 @@ impl Values {
                 return true;
             }
             let cause = (Reason::Takeover, "rival");
-            self.count(About::sender(from), cause, 1, || {
+            self.count(DropSite::sender(from), cause, 1, || {
                 format!("{from} sent a value while this bridge was active: it may be doubled")
             });
             return true;
@@ -178,7 +178,7 @@ impl Values {
     /// Takes the stamp of the active bridge for an equal state.
     fn follow_state(&mut self, topic: TopicId, fields: &[u8], at: (Timestamp, Now)) {
         let Some(Topic {
-            role: Role::Ours(writer),
+            role: TopicSide::Ours(writer),
             lasting,
             ..
         }) = self.topics.get_mut(&topic)
@@ -204,7 +204,11 @@ impl Values {
 
     /// Returns the relation of a received message to the last takeover, as long as this program is
     /// active and the network may still hold messages that precede the takeover.
-    pub(super) fn since_takeover(&self, place: &Place, now: Now) -> Option<SinceTakeover> {
+    pub(super) fn since_takeover(
+        &self,
+        place: &SequencePosition,
+        now: Now,
+    ) -> Option<SinceTakeover> {
         self.redundant.as_ref()?.since_takeover(place, now)
     }
 
@@ -227,7 +231,7 @@ impl Values {
             return self.mute_own(topic);
         }
         while let Some(item) = self.topics.get_mut(&topic).and_then(|of| of.queue.pop()) {
-            if let Item::Delivery(delivery) = item {
+            if let PolledSample::Delivery(delivery) = item {
                 self.mute_delivery(delivery, now);
             }
         }
@@ -242,12 +246,12 @@ impl Values {
             return;
         };
         entry.ready = false;
-        if let Role::Ours(writer) = &mut entry.role {
+        if let TopicSide::Ours(writer) = &mut entry.role {
             writer.end_repetitions();
         }
         let mut dropped = u64::from(entry.sending.take().is_some());
         while let Some(item) = self.topics.get_mut(&topic).and_then(|of| of.queue.pop()) {
-            if let Item::Message(Message::Datagram(encoded)) = item {
+            if let PolledSample::Message(SampleMessage::Datagram(encoded)) = item {
                 dropped += u64::from(!encoded.is_keep_alive());
                 // The next message in the buffer must not follow this one.
                 self.recycle(encoded.bytes);
@@ -260,7 +264,7 @@ impl Values {
         };
         if redundant.state().is_cut() {
             let cause = (Reason::NotSent, "cut off");
-            self.count(About::topic(topic), cause, dropped, || {
+            self.count(DropSite::topic(topic), cause, dropped, || {
                 "the group is out of reach".to_owned()
             });
             return;
@@ -293,7 +297,7 @@ impl Values {
     /// again.
     pub(super) fn withdraw_states(&mut self, at: Handle) {
         if let Some(Topic {
-            role: Role::Theirs(reader),
+            role: TopicSide::Theirs(reader),
             confirming: None,
             ..
         }) = self.topics.at_mut(at)
@@ -309,7 +313,7 @@ impl Values {
         let is_written = written.is_some();
         let stops = written.is_some_and(|of| of.loss.is_some());
         let Some(Topic {
-            role: Role::Ours(writer),
+            role: TopicSide::Ours(writer),
             queue,
             gate,
             lasting,
@@ -345,7 +349,7 @@ impl Values {
         if let Some((outdated, _)) = outdated {
             self.recycle(outdated.bytes);
             let cause = (Reason::Takeover, "gap");
-            self.count_only(About::topic(at.topic()), cause, 1, String::new);
+            self.count_only(DropSite::topic(at.topic()), cause, 1, String::new);
         }
         self.schedule(at);
     }

@@ -6,15 +6,15 @@ use std::net::SocketAddr;
 
 use mappings::{SpaceId, TopicId};
 
-use super::announcements::Asked;
+use super::announcements::ProbedCalls;
 use super::claims::FreeNamespace;
-use super::{About, Router, Values};
+use super::{DropSite, Router, TopicQueues};
 use crate::counters::Reason;
 use crate::interest::Interest;
-use crate::loop_rule::{Owned, Side, What, may_cross};
+use crate::loop_rule::{Crosses, Owned, Side, may_cross};
 use crate::output::Output;
 use crate::settings::Now;
-use crate::topic::{Role, Topic};
+use crate::topic::{Topic, TopicSide};
 use crate::topics::Handle;
 
 impl Router {
@@ -31,7 +31,7 @@ impl Router {
             .topics
             .iter()
             .filter(|(topic, entry)| {
-                matches!(entry.role, Role::Ours(_)) != self.values.is_home(*topic)
+                matches!(entry.role, TopicSide::Ours(_)) != self.values.is_home(*topic)
             })
             .map(|(topic, _)| topic)
             .collect();
@@ -63,7 +63,7 @@ impl Router {
     /// It changes with each input.
     #[must_use]
     pub fn interest(&self) -> Option<Interest> {
-        let Values {
+        let TopicQueues {
             concern,
             owned: Owned::Only(owned),
             redundant: None,
@@ -100,7 +100,7 @@ impl Router {
         let own = self.values.settings.own;
         for namespace in self.values.claims.take_probes(now.monotonic) {
             // The programs of other namespaces do not respond: there may be hundreds of them.
-            let asked = Asked::namespace(own, namespace);
+            let asked = ProbedCalls::namespace(own, namespace);
             self.values.send_probe(&asked.probe(), Some(own));
         }
     }
@@ -134,7 +134,7 @@ impl Router {
             let topic = at.topic();
             let (_, of, _) = topic.triple();
             let Some(Topic {
-                role: Role::Ours(writer),
+                role: TopicSide::Ours(writer),
                 announce_at,
                 ..
             }) = self.values.topics.at_mut(at).filter(|_| of == namespace)
@@ -160,13 +160,13 @@ impl Router {
     }
 }
 
-impl Values {
+impl TopicQueues {
     /// Returns whether only this program writes the topic.
     pub(super) fn is_home(&self, topic: TopicId) -> bool {
         self.owned.is_home(self.settings.own, topic)
     }
 
-    pub(super) fn may_cross(&self, heard_on: Side, what: What, topic: TopicId) -> bool {
+    pub(super) fn may_cross(&self, heard_on: Side, what: Crosses, topic: TopicId) -> bool {
         may_cross(self.is_home(topic), heard_on, what)
     }
 
@@ -209,7 +209,7 @@ impl Values {
                 gate.forget_last();
             }
             self.count(
-                About::topic(topic),
+                DropSite::topic(topic),
                 (Reason::SpaceTaken, "withheld"),
                 dropped,
                 String::new,

@@ -7,7 +7,7 @@ use std::net::SocketAddr;
 use mappings::SpaceId;
 use uadp::NetworkMessage;
 
-use super::{About, Router, Values};
+use super::{DropSite, Router, TopicQueues};
 use crate::counters::Reason;
 use crate::output::Output;
 use crate::part::{LOST, OwnPart, PartAnnouncement};
@@ -59,7 +59,7 @@ impl Router {
         let Some((space, announced)) = PartAnnouncement::decode(message) else {
             return false;
         };
-        let about = About::sender(from);
+        let about = DropSite::sender(from);
         if self.security.is_on() && !self.security.is_authentic() {
             let cause = (Reason::Unsecured, "namespaces");
             self.values.count(about, cause, 1, || {
@@ -103,7 +103,7 @@ impl Router {
     }
 }
 
-impl Values {
+impl TopicQueues {
     /// Returns whether another bridge of the space carries the namespace. While that is unknown
     /// after the start, samples wait in their queues.
     pub(super) fn is_elsewhere(&self, namespace: u16) -> bool {

@@ -5,12 +5,12 @@ use std::time::{Duration, Instant};
 
 use mappings::{PubSub, TopicId};
 use uadp::{
-    ChunkRefusal, GiveUp, GivenUp, NetworkMessage, OwnedPublisherId, Reassembled, Reassembler,
-    ReassemblyLimits,
+    ChunkRefusal, GiveUp, IncompleteWhole, NetworkMessage, OwnedPublisherId, Reassembled,
+    Reassembler, ReassemblyLimits,
 };
 
-use super::about::About;
-use super::values::Values;
+use super::about::DropSite;
+use super::values::TopicQueues;
 use crate::counters::Reason;
 use crate::network::number_of;
 use crate::settings::Now;
@@ -19,12 +19,12 @@ use crate::settings::Now;
 #[derive(Debug, Default)]
 pub(super) struct Reassembly {
     /// `None` before the first chunk, and while a complete message is handled.
-    chunks: Option<Box<Chunks>>,
+    chunks: Option<Box<TopicChunks>>,
 }
 
 /// The chunks of all topics.
 #[derive(Debug)]
-pub(super) struct Chunks {
+pub(super) struct TopicChunks {
     reassembler: Reassembler<SocketAddr>,
     /// The origin of time for the reassembler.
     start: Instant,
@@ -32,13 +32,13 @@ pub(super) struct Chunks {
 
 impl Reassembly {
     /// Takes the chunks out for the handling of a complete message, to avoid a copy.
-    pub(super) fn take(&mut self, pubsub: &PubSub, now: Now) -> Box<Chunks> {
+    pub(super) fn take(&mut self, pubsub: &PubSub, now: Now) -> Box<TopicChunks> {
         let chunks = self.chunks.take();
-        chunks.unwrap_or_else(|| Box::new(Chunks::new(pubsub, now.monotonic)))
+        chunks.unwrap_or_else(|| Box::new(TopicChunks::new(pubsub, now.monotonic)))
     }
 
     /// Puts the chunks back, and counts the messages that were given up.
-    pub(super) fn put_back(&mut self, mut chunks: Box<Chunks>, values: &mut Values) {
+    pub(super) fn put_back(&mut self, mut chunks: Box<TopicChunks>, values: &mut TopicQueues) {
         chunks.count_given_up(values);
         self.chunks = Some(chunks);
     }
@@ -50,7 +50,7 @@ impl Reassembly {
     }
 
     /// Gives up messages with overdue chunks.
-    pub(super) fn expire(&mut self, values: &mut Values, now: Now) {
+    pub(super) fn expire(&mut self, values: &mut TopicQueues, now: Now) {
         if self.due() > Some(now.monotonic) {
             return;
         }
@@ -62,21 +62,21 @@ impl Reassembly {
     }
 
     /// Applies changed limits. If they differ, incomplete messages are given up.
-    pub(super) fn renew(&mut self, values: &mut Values, before: &PubSub) {
+    pub(super) fn renew(&mut self, values: &mut TopicQueues, before: &PubSub) {
         let limits = |pubsub: &PubSub| (pubsub.max_message, pubsub.receive_timeout);
         if limits(before) == limits(values.mapping.pubsub()) {
             return;
         }
         let chunks = self.chunks.take();
         if chunks.is_some_and(|chunks| chunks.reassembler.held() > 0) {
-            values.count(About::NOTHING, Reason::Incomplete, 1, || {
+            values.count(DropSite::NOTHING, Reason::Incomplete, 1, || {
                 "the mapping has other limits for large messages now".to_owned()
             });
         }
     }
 }
 
-impl Chunks {
+impl TopicChunks {
     fn new(pubsub: &PubSub, start: Instant) -> Self {
         let whole = pubsub.max_message;
         let bytes = usize::try_from(whole).unwrap_or(usize::MAX);
@@ -120,13 +120,13 @@ impl Chunks {
         drop(self.reassembler.take_whole());
     }
 
-    fn count_given_up(&mut self, values: &mut Values) {
+    fn count_given_up(&mut self, values: &mut TopicQueues) {
         while let Some(given_up) = self.reassembler.poll_given_up() {
             let reason = match given_up.why {
                 GiveUp::Expired | GiveUp::Superseded | GiveUp::Contradicted => Reason::Incomplete,
                 GiveUp::OutOfBytes | GiveUp::OutOfPlaces => Reason::NoRoom,
             };
-            let about = About {
+            let about = DropSite {
                 topic: topic_of(&given_up),
                 from: Some(given_up.sender),
             };
@@ -142,7 +142,7 @@ impl Chunks {
     }
 }
 
-fn topic_of(given_up: &GivenUp<SocketAddr>) -> Option<TopicId> {
+fn topic_of(given_up: &IncompleteWhole<SocketAddr>) -> Option<TopicId> {
     let publisher = given_up.publisher_id.as_ref().map(OwnedPublisherId::as_id);
     let (number, _) = number_of(publisher);
     let space = u16::try_from(number).ok()?;

@@ -9,21 +9,21 @@ use uadp::{
     NetworkMessageType, Timestamp,
 };
 
-use super::content::Quality;
-use super::{About, Router, Values};
+use super::content::ValueQuality;
+use super::{DropSite, Router, TopicQueues};
 use crate::confirm::Confirming;
 use crate::counters::Reason;
 use crate::fields;
 use crate::hops::Hop;
 use crate::late;
-use crate::loop_rule::{Owned, Side, What, may_cross};
+use crate::loop_rule::{Crosses, Owned, Side, may_cross};
 use crate::network::number_of;
-use crate::output::{Delivery, Kept, Output};
-use crate::place::Place;
-use crate::reader::{Admitted, Handling};
+use crate::output::{Delivery, Output, ValueRelation};
+use crate::place::SequencePosition;
+use crate::reader::{AcceptedMessage, Handling};
 use crate::settings::{Forwarding, Local, Now};
 use crate::tap::Crossing;
-use crate::topic::{Item, Role, Topic};
+use crate::topic::{PolledSample, Topic, TopicSide};
 use crate::topics::Handle;
 
 impl Router {
@@ -73,7 +73,7 @@ impl Router {
         if let Some((case, detail)) = late {
             return self
                 .values
-                .count(About::sender(from), late::cause(case), 1, || detail);
+                .count(DropSite::sender(from), late::cause(case), 1, || detail);
         }
         if self.is_for_all(message, from, now)
             || self.roles().is_heartbeat(message, from, now)
@@ -117,21 +117,21 @@ impl Router {
                 }
                 (true, Some(_)) => {
                     let cause = (Reason::CallRefused, "chunk");
-                    let about = About::sender(from);
+                    let about = DropSite::sender(from);
                     self.values.count(about, cause, 1, || closed_to(from));
                 }
                 _ if self.values.follow_peer(message, namespace, from, now) => {}
                 _ if is_request && is_muted => {
                     let cause = (Reason::Takeover, "standby");
                     self.values
-                        .count(About::sender(from), cause, 1, String::new);
+                        .count(DropSite::sender(from), cause, 1, String::new);
                 }
                 _ => self.values.drop_own(namespace, from, now),
             }
             return;
         }
         let Some(namespace) = namespace else {
-            let about = About::sender(from);
+            let about = DropSite::sender(from);
             return self.values.count(about, Reason::NotInSpace, 1, String::new);
         };
         // A chunk without a payload header may belong to a response, and the responding program
@@ -157,7 +157,7 @@ impl Router {
         from: SocketAddr,
         now: Now,
     ) {
-        let about = About::sender(from);
+        let about = DropSite::sender(from);
         let sent = sent(&message.header());
         for message in message.messages() {
             let message = match message {
@@ -185,18 +185,18 @@ impl Router {
     }
 }
 
-impl Values {
+impl TopicQueues {
     /// Returns the space of a NetworkMessage, or counts the reason why it cannot be read.
     fn space_of(&mut self, header: &NetworkHeader<'_>, from: SocketAddr) -> Option<SpaceId> {
         let (number, exact) = number_of(header.publisher_id);
         let Some(space) = u16::try_from(number).ok().and_then(SpaceId::new) else {
-            self.count(About::sender(from), Reason::NotInSpace, 1, String::new);
+            self.count(DropSite::sender(from), Reason::NotInSpace, 1, String::new);
             return None;
         };
         if exact || self.mapping.pubsub().publisher_id == PublisherIdRule::AnyWidth {
             return Some(space);
         }
-        self.count(About::sender(from), Reason::PublisherWidth, 1, || {
+        self.count(DropSite::sender(from), Reason::PublisherWidth, 1, || {
             format!(
                 "PublisherId {number} is not a UInt16; if that writer is meant to be space {space}, \
                  set `publisher_id: any_width`"
@@ -211,7 +211,7 @@ impl Values {
         let home = namespace.map_or(self.owned == Owned::All, |namespace| {
             self.owned.has(namespace)
         });
-        !may_cross(space == self.settings.own && home, Side::Ua, What::Value)
+        !may_cross(space == self.settings.own && home, Side::Ua, Crosses::Value)
     }
 
     /// Counts a message in the name of this program, from this program itself or from another
@@ -219,7 +219,7 @@ impl Values {
     pub(super) fn drop_own(&mut self, namespace: Option<u16>, from: SocketAddr, now: Now) {
         let own = self.settings.own;
         if self.is_source(from) {
-            self.count(About::sender(from), Reason::Looped, 1, String::new);
+            self.count(DropSite::sender(from), Reason::Looped, 1, String::new);
             return;
         }
         let shared = namespace.filter(|_| self.owned != Owned::All);
@@ -228,7 +228,7 @@ impl Values {
         }
         // `Output::Taken` already reported that nothing is sent in the namespace.
         let told = shared.is_some_and(|namespace| self.claims.is_taken(namespace));
-        self.count(About::sender(from), Reason::SpaceTaken, 1, || match shared {
+        self.count(DropSite::sender(from), Reason::SpaceTaken, 1, || match shared {
             Some(_) if told => String::new(),
             Some(namespace) => format!(
                 "another program writes namespace {namespace} of space {own}, so every sample is sent \
@@ -273,7 +273,7 @@ impl Values {
         (from, sent): (SocketAddr, Option<Timestamp>),
         now: Now,
     ) {
-        let about = About::message(topic, from);
+        let about = DropSite::message(topic, from);
         self.note_received(topic, message, from);
         if !self.concern.has_topic(topic) {
             return;
@@ -291,7 +291,7 @@ impl Values {
             return;
         };
         let Some(Topic {
-            role: Role::Theirs(reader),
+            role: TopicSide::Theirs(reader),
             counters,
             lasting,
             held_back,
@@ -378,13 +378,13 @@ impl Values {
         &mut self,
         at: Handle,
         message: &DataSetMessage<'_>,
-        (place, admitted, sent): (&Place, &Admitted, Option<Timestamp>),
+        (place, admitted, sent): (&SequencePosition, &AcceptedMessage, Option<Timestamp>),
         now: Now,
     ) {
         let topic = at.topic();
         let status = message.header().status.unwrap_or_default();
         let arrived = self.arrival(now);
-        let sample = |fields, quality: Quality| Sample {
+        let sample = |fields, quality: ValueQuality| LocalSample {
             fields,
             source: quality.source.or(place.stamp),
             instance: place.instance(),
@@ -397,7 +397,7 @@ impl Values {
         match Self::plain(message, takes) {
             Some(Ok(fields)) => {
                 self.record_way(place, sent, now);
-                self.route(at, &sample(fields, Quality::default()), now);
+                self.route(at, &sample(fields, ValueQuality::default()), now);
                 return;
             }
             Some(Err(error)) => {
@@ -420,7 +420,7 @@ impl Values {
             }
             Ok(None) => {
                 self.lives(at, now);
-                self.count(About::topic(topic), Reason::Repeat, 1, String::new);
+                self.count(DropSite::topic(topic), Reason::Repeat, 1, String::new);
             }
             Err(refusal) => self.refuse_content(topic, place.from, refusal, now),
         }
@@ -452,10 +452,10 @@ impl Values {
     }
 
     /// Delivers a sample, or holds it until its local type is known.
-    fn route(&mut self, at: Handle, sample: &Sample<'_>, now: Now) {
+    fn route(&mut self, at: Handle, sample: &LocalSample<'_>, now: Now) {
         let typed = self.settings.local == Local::Fields;
         let Some(Topic {
-            role: Role::Theirs(reader),
+            role: TopicSide::Theirs(reader),
             plan,
             ..
         }) = self.topics.at_mut(at)
@@ -489,10 +489,10 @@ impl Values {
         // Not a loss yet, because the newest sample waits. It is not logged, because the port
         // reports topics without a type.
         self.is_good(at, now);
-        self.count(About::topic(at.topic()), Reason::Untyped, 1, String::new);
+        self.count(DropSite::topic(at.topic()), Reason::Untyped, 1, String::new);
     }
 
-    pub(super) fn deliver(&mut self, at: Handle, sample: &Sample<'_>, now: Now) {
+    pub(super) fn deliver(&mut self, at: Handle, sample: &LocalSample<'_>, now: Now) {
         let Some(reader) = self.topics.reader(at) else {
             return;
         };
@@ -537,10 +537,10 @@ impl Values {
             self.recycle(payload);
             // The local side does not have the value, so its repetition must be delivered.
             self.forget(at, sample.instance);
-            self.count(About::topic(at.topic()), cause, 1, || detail);
+            self.count(DropSite::topic(at.topic()), cause, 1, || detail);
             return;
         }
-        let Sample {
+        let LocalSample {
             source,
             instance,
             kept,
@@ -559,7 +559,7 @@ impl Values {
         }
         self.push(
             at,
-            Item::Delivery(Delivery {
+            PolledSample::Delivery(Delivery {
                 topic: at.topic(),
                 payload,
                 source,
@@ -594,7 +594,7 @@ impl Values {
 
     /// Records the delays of a sample. A stored value, or a sample held back by its rate limit,
     /// waited intentionally; only its network delay is recorded.
-    fn record_way(&mut self, place: &Place, sent: Option<Timestamp>, now: Now) {
+    fn record_way(&mut self, place: &SequencePosition, sent: Option<Timestamp>, now: Now) {
         // Some stacks send zeros in timestamps that they do not fill.
         let filled = |stamp: &Timestamp| stamp.time.0 != 0;
         let Some(sent) = sent.filter(filled) else {
@@ -617,7 +617,7 @@ impl Values {
         error: &DecodeError,
     ) {
         self.count(
-            About {
+            DropSite {
                 topic,
                 from: Some(from),
             },
@@ -629,11 +629,11 @@ impl Values {
 }
 
 /// The content of a message for the local side.
-pub(super) struct Sample<'a> {
+pub(super) struct LocalSample<'a> {
     pub(super) fields: Fields<'a>,
     pub(super) source: Option<Timestamp>,
     pub(super) instance: Option<Timestamp>,
-    pub(super) kept: Kept,
+    pub(super) kept: ValueRelation,
     pub(super) lasting: bool,
     pub(super) status: u16,
     pub(super) arrived: Timestamp,
@@ -652,9 +652,9 @@ fn place(
     message: &DataSetMessage<'_>,
     (from, sent): (SocketAddr, Option<Timestamp>),
     is_relayed: bool,
-) -> Place {
+) -> SequencePosition {
     let header = message.header();
-    Place {
+    SequencePosition {
         sequence: header.sequence_number,
         stamp: header.timestamp.map(|time| Timestamp {
             time,

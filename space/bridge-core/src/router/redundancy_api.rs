@@ -1,17 +1,17 @@
-//! The inputs and queries of a Router that concern redundancy. [`Roles`] does the work.
+//! The inputs and queries of a Router that concern redundancy. [`SpaceRedundancy`] does the work.
 
 use std::time::Instant;
 
 use super::Router;
 use super::redundant::{MutedSamples, Redundant};
-use super::roles::Roles;
-use crate::redundancy::{LocalSide, Rank, Redundancy, SwitchRefusal};
+use super::roles::SpaceRedundancy;
+use crate::redundancy::{LocalSide, Redundancy, RedundancyRank, SwitchRefusal};
 use crate::settings::Now;
 
 impl Router {
     /// Returns the redundancy with the parts of the Router that a change of the role affects.
-    pub(super) fn roles(&mut self) -> Roles<'_> {
-        Roles {
+    pub(super) fn roles(&mut self) -> SpaceRedundancy<'_> {
+        SpaceRedundancy {
             calls: &mut self.calls,
             values: &mut self.values,
             announcements: &mut self.announcements,
@@ -30,7 +30,7 @@ impl Router {
 
     /// Makes this program one of several redundant bridges of its space. It is muted until it takes
     /// over. Call it after [`set_instance`](Self::set_instance).
-    pub fn set_redundancy(&mut self, rank: Rank, now: Now) {
+    pub fn set_redundancy(&mut self, rank: RedundancyRank, now: Now) {
         let [.., a, b, c, d] = self.instance;
         let instance = u32::from_le_bytes([a, b, c, d]);
         self.values.redundant = Some(Box::new(Redundant::new(rank, instance, now)));

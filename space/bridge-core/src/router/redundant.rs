@@ -12,13 +12,14 @@ use uadp::Timestamp;
 
 pub(super) use self::succession::SinceTakeover;
 use self::succession::Succession;
-use crate::output::{Delivery, Kept};
-use crate::place::Place;
+use crate::output::{Delivery, ValueRelation};
+use crate::place::SequencePosition;
 use crate::redundancy::{
-    Heartbeat, LocalSide, Rank, Redundancy, RoleChange, SenderClocks, SwitchRefusal, TakeoverCause,
+    Heartbeat, LocalSide, Redundancy, RedundancyRank, RoleChange, SenderClocks, SwitchRefusal,
+    TakeoverCause,
 };
 use crate::settings::Now;
-use crate::writer::{MAX_KEPT, Writer};
+use crate::writer::{MAX_KEPT, SentTopicState};
 
 /// The redundancy of the own space.
 #[derive(Debug)]
@@ -78,7 +79,7 @@ pub(super) struct Inheritance {
 }
 
 impl Redundant {
-    pub(super) fn new(rank: Rank, instance: u32, now: Now) -> Self {
+    pub(super) fn new(rank: RedundancyRank, instance: u32, now: Now) -> Self {
         Self {
             state: Redundancy::new(rank, instance, now),
             held: BTreeMap::new(),
@@ -176,7 +177,7 @@ impl Redundant {
         let states = held.map(|HeldState { at, mut delivery }| {
             if !is_unsure(at) {
                 // The former active bridge has published it: it is for late joiners only.
-                delivery.kept = Kept::Again;
+                delivery.kept = ValueRelation::Again;
             }
             delivery
         });
@@ -216,8 +217,8 @@ impl Redundant {
             return Some(delivery.payload);
         }
         let held = self.held.entry(topic).or_default();
-        let is_again = delivery.kept == Kept::Again;
-        if delivery.kept == Kept::Alone {
+        let is_again = delivery.kept == ValueRelation::Again;
+        if delivery.kept == ValueRelation::Alone {
             held.clear();
         }
         let same = held
@@ -262,7 +263,7 @@ impl Redundant {
     /// repetitions of this bridge after a takeover.
     pub(super) fn follow_state(
         &mut self,
-        (topic, writer): (TopicId, &mut Writer),
+        (topic, writer): (TopicId, &mut SentTopicState),
         fields: &[u8],
         (stamp, now): (Timestamp, Now),
     ) {
@@ -283,7 +284,7 @@ impl Redundant {
 
     /// Takes the stamp of the active bridge for a sample of this muted bridge, if the message of
     /// the active bridge was received first.
-    pub(super) fn adopt_followed(&mut self, topic: TopicId, writer: &mut Writer) {
+    pub(super) fn adopt_followed(&mut self, topic: TopicId, writer: &mut SentTopicState) {
         if let Some(followed) = self.followed.get(&topic)
             && writer.adopt(&followed.fields, followed.stamp)
         {
@@ -323,7 +324,11 @@ impl Redundant {
 
     /// Returns the relation of a received message to the last takeover, as long as this program is
     /// active and the network may still hold messages that precede the takeover.
-    pub(super) fn since_takeover(&self, place: &Place, now: Now) -> Option<SinceTakeover> {
+    pub(super) fn since_takeover(
+        &self,
+        place: &SequencePosition,
+        now: Now,
+    ) -> Option<SinceTakeover> {
         self.took_over?.relation(place, &self.clocks, now)
     }
 }

@@ -5,15 +5,15 @@ use std::sync::Arc;
 use mappings::{Lasting, Mapping, Overflow, TopicId};
 use messages::Wire;
 
-use super::{About, Router, Values};
+use super::{DropSite, Router, TopicQueues};
 use crate::confirm::Confirming;
 use crate::counters::Reason;
 use crate::deadline::Deadline;
 use crate::gate::Gate;
-use crate::queue::Queue;
+use crate::queue::SampleQueue;
 use crate::settings::{Local, Now};
-use crate::takes::Takes;
-use crate::topic::{Item, Role, Topic};
+use crate::takes::UsedFields;
+use crate::topic::{PolledSample, Topic, TopicSide};
 
 impl Router {
     /// Returns the current mapping.
@@ -60,11 +60,11 @@ impl Router {
             if let Some(entry) = self.values.topics.get_mut(&topic)
                 && was != is
             {
-                entry.takes = Takes::of(is);
+                entry.takes = UsedFields::of(is);
                 entry.confirming = Confirming::of(is);
                 entry.deadline = Deadline::of(is);
                 entry.held_back = is.map(|is| is.publish.period).unwrap_or_default();
-                if let Role::Theirs(reader) = &mut entry.role {
+                if let TopicSide::Theirs(reader) = &mut entry.role {
                     // The selected field may have changed.
                     reader.owed = true;
                 }
@@ -104,12 +104,12 @@ impl Router {
         entry.loss = None;
         entry.trigger = None;
         match &mut entry.role {
-            Role::Ours(writer) => {
+            TopicSide::Ours(writer) => {
                 writer.keep_nothing();
                 writer.set_live(false);
                 self.values.settle_arrival(topic);
             }
-            Role::Theirs(reader) => {
+            TopicSide::Theirs(reader) => {
                 reader.held = None;
                 reader.shape = None;
                 reader.forget_all();
@@ -139,7 +139,7 @@ impl Router {
     }
 }
 
-impl Values {
+impl TopicQueues {
     /// Drops the deliveries that wait for the local side, because they have the previous type.
     pub(super) fn drop_deliveries(&mut self, topic: TopicId, why: &str) {
         let Some(entry) = self.topics.get_mut(&topic) else {
@@ -148,7 +148,7 @@ impl Values {
         let waiting = std::iter::from_fn(|| entry.queue.pop()).count();
         let count = waiting.try_into().unwrap_or(u64::MAX);
         if count > 0 {
-            self.count(About::topic(topic), Reason::NotPublished, count, || {
+            self.count(DropSite::topic(topic), Reason::NotPublished, count, || {
                 why.to_owned()
             });
         }
@@ -179,14 +179,14 @@ impl Values {
         };
         entry.overflow = overflow;
         entry.lasting = lasting;
-        let mut before = std::mem::replace(&mut entry.queue, Queue::new(overflow));
-        if let Role::Ours(writer) = &mut entry.role
+        let mut before = std::mem::replace(&mut entry.queue, SampleQueue::new(overflow));
+        if let TopicSide::Ours(writer) = &mut entry.role
             && lasting == Lasting::Event
         {
             writer.keep_nothing();
         }
         self.settle_arrival(topic);
-        let waiting: Vec<Item> = std::iter::from_fn(|| before.pop()).collect();
+        let waiting: Vec<PolledSample> = std::iter::from_fn(|| before.pop()).collect();
         for item in waiting {
             self.push_to(topic, item);
         }
@@ -198,7 +198,7 @@ impl Values {
             return;
         };
         let Some(Topic {
-            role: Role::Ours(_),
+            role: TopicSide::Ours(_),
             gate,
             ..
         }) = self.topics.at_mut(at)

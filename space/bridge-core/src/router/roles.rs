@@ -6,30 +6,30 @@ use std::time::Duration;
 
 use uadp::{NetworkMessage, Timestamp};
 
-use super::about::About;
-use super::announcements::Announcements;
-use super::calls::{CallTraffic, Calls};
-use super::security::Security;
+use super::about::DropSite;
+use super::announcements::PlannedAnnouncements;
+use super::calls::{CallTraffic, RouterCalls};
+use super::security::MessageSecurity;
 use super::senders::RedundantSenders;
-use super::values::Values;
+use super::values::TopicQueues;
 use crate::counters::Reason;
 use crate::loop_rule::Owned;
 use crate::output::Output;
 use crate::redundancy::{Heartbeat, RoleChange, SwitchRefusal, TakeoverCause};
 use crate::settings::Now;
-use crate::topic::Item;
+use crate::topic::PolledSample;
 
 /// The redundancy of the own space with the parts of the Router that a change of the role affects.
-pub(super) struct Roles<'r> {
-    pub(super) calls: &'r mut Option<Box<Calls>>,
-    pub(super) values: &'r mut Values,
-    pub(super) announcements: &'r mut Announcements,
-    pub(super) security: &'r Security,
+pub(super) struct SpaceRedundancy<'r> {
+    pub(super) calls: &'r mut Option<Box<RouterCalls>>,
+    pub(super) values: &'r mut TopicQueues,
+    pub(super) announcements: &'r mut PlannedAnnouncements,
+    pub(super) security: &'r MessageSecurity,
     pub(super) senders: &'r mut RedundantSenders,
     pub(super) instance: [u8; 16],
 }
 
-impl Roles<'_> {
+impl SpaceRedundancy<'_> {
     fn call_traffic(&mut self) -> CallTraffic<'_> {
         CallTraffic {
             calls: self.calls,
@@ -120,7 +120,7 @@ impl Roles<'_> {
         };
         if self.security.is_on() && !self.security.is_authentic() {
             let cause = (Reason::Unsecured, "heartbeat");
-            self.values.count(About::sender(from), cause, 1, || {
+            self.values.count(DropSite::sender(from), cause, 1, || {
                 "its heartbeat is in clear, and there are secured groups".to_owned()
             });
             return true;
@@ -139,7 +139,7 @@ impl Roles<'_> {
             };
         if is_forged {
             let cause = (Reason::Forged, "heartbeat");
-            self.values.count(About::sender(from), cause, 1, || {
+            self.values.count(DropSite::sender(from), cause, 1, || {
                 format!(
                     "its heartbeat has the instance of a bridge of space {space} that sends from another address"
                 )
@@ -217,18 +217,19 @@ impl Roles<'_> {
         for (topic, count) in left.unsure {
             let cause = (Reason::Takeover, "gap");
             self.values
-                .count_only(About::topic(topic), cause, count, String::new);
+                .count_only(DropSite::topic(topic), cause, count, String::new);
         }
         for at in topics {
             self.values.continue_own(at, now);
         }
         for state in left.states {
-            self.values.push_to(state.topic, Item::Delivery(state));
+            self.values
+                .push_to(state.topic, PolledSample::Delivery(state));
         }
         for reaction in left.losses {
             let topic = reaction.topic;
             self.values.tell(Output::CommanderLost { topic });
-            self.values.push_to(topic, Item::Delivery(reaction));
+            self.values.push_to(topic, PolledSample::Delivery(reaction));
         }
         for buffer in left.spent {
             self.values.recycle(buffer);

@@ -5,14 +5,14 @@ use std::time::Instant;
 use mappings::SecurityGroup;
 use uadp::{KeyError, NetworkMessage, NetworkMessageType};
 
-use super::about::About;
-use super::values::Values;
+use super::about::DropSite;
+use super::values::TopicQueues;
 use crate::guard::{GroupState, Guard, KeyDelivery, Unopened};
 use crate::output::Output;
 
 /// The secured groups, and the security of the message in processing.
 #[derive(Debug)]
-pub(super) struct Security {
+pub(super) struct MessageSecurity {
     /// The secured groups; `None` without secured groups.
     guard: Option<Box<Guard>>,
     /// Random bytes of this program instance, if they are known.
@@ -21,7 +21,7 @@ pub(super) struct Security {
     in_clear: bool,
 }
 
-impl Security {
+impl MessageSecurity {
     pub(super) fn new(groups: &[SecurityGroup]) -> Self {
         Self {
             guard: Guard::new(groups).map(Box::new),
@@ -137,7 +137,7 @@ impl Security {
     }
 
     /// Seals an output. Returns `None` for a message that cannot be sent, and counts it.
-    pub(super) fn seal(&mut self, values: &mut Values, mut output: Output) -> Option<Output> {
+    pub(super) fn seal(&mut self, values: &mut TopicQueues, mut output: Output) -> Option<Output> {
         let Some(guard) = &mut self.guard else {
             return Some(output);
         };
@@ -159,7 +159,7 @@ impl Security {
                 detail,
             }) => {
                 values.recycle(sealed);
-                let about = About { topic, from: None };
+                let about = DropSite { topic, from: None };
                 values.count(about, (reason, case), 1, || detail);
                 None
             }

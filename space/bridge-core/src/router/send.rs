@@ -2,14 +2,14 @@
 
 use mappings::TopicId;
 
-use super::{About, Router, Values};
+use super::{DropSite, Router, TopicQueues};
 use crate::counters::Reason;
-use crate::message::Message;
+use crate::message::SampleMessage;
 use crate::network::chunk;
 use crate::output::{Output, Unsent};
-use crate::settings::{Link, Now};
+use crate::settings::{LinkCapacity, Now};
 use crate::tap::Crossing;
-use crate::topic::{Item, Role, Sending};
+use crate::topic::{PolledSample, Sending, TopicSide};
 use crate::topics::Handle;
 
 impl Router {
@@ -72,7 +72,7 @@ impl Router {
     }
 
     /// Sets the capacity of the network, which determines the pace of chunks.
-    pub fn set_link(&mut self, link: Link) {
+    pub fn set_link(&mut self, link: LinkCapacity) {
         self.values.pace.follow(link);
     }
 
@@ -107,13 +107,13 @@ impl Router {
             }
         }
         self.values
-            .count(About::topic(topic), (reason, "socket"), 1, || {
+            .count(DropSite::topic(topic), (reason, "socket"), 1, || {
                 detail.to_owned()
             });
     }
 }
 
-impl Values {
+impl TopicQueues {
     /// Returns the next notification about a topic, or the next sample to send or deliver.
     fn next_value(&mut self, now: Now) -> Option<Output> {
         // They alternate, so that many unknown topics do not block the values of other topics.
@@ -161,15 +161,15 @@ impl Values {
         };
         let is_repeat = entry.counters.repeated != repeated;
         let (datagram, delivery) = match item {
-            Some(Item::Message(Message::Datagram(datagram))) => {
+            Some(PolledSample::Message(SampleMessage::Datagram(datagram))) => {
                 entry.counters.sent += 1;
                 (Some(datagram), None)
             }
-            Some(Item::Delivery(delivery)) => {
+            Some(PolledSample::Delivery(delivery)) => {
                 entry.counters.delivered += 1;
                 (None, Some(delivery))
             }
-            Some(Item::Message(Message::Large(message))) => {
+            Some(PolledSample::Message(SampleMessage::Large(message))) => {
                 entry.sending = Some(Sending {
                     message,
                     offset: 0,
@@ -230,7 +230,7 @@ impl Values {
             }
         }
         let is_whole = entry.sending.is_none();
-        if let Role::Ours(writer) = &mut entry.role {
+        if let TopicSide::Ours(writer) = &mut entry.role {
             writer.spoke(now.monotonic);
         }
         entry.ready = entry.has_more();
@@ -250,7 +250,9 @@ impl Values {
                 })
             }
             Err(error) => {
-                self.count(About::topic(topic), Reason::TooBig, 1, || error.to_string());
+                self.count(DropSite::topic(topic), Reason::TooBig, 1, || {
+                    error.to_string()
+                });
                 None
             }
         }

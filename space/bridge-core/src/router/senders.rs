@@ -6,9 +6,9 @@ use std::time::{Duration, Instant};
 
 use mappings::SpaceId;
 
-use super::about::About;
-use super::security::Security;
-use super::values::Values;
+use super::about::DropSite;
+use super::security::MessageSecurity;
+use super::values::TopicQueues;
 use crate::counters::Reason;
 use crate::redundancy::{Heartbeat, SenderAddress};
 use crate::settings::Now;
@@ -78,7 +78,7 @@ impl RedundantSenders {
     /// the space is active: its message was under way at the takeover. Counts it.
     pub(super) fn is_superseded(
         &self,
-        values: &mut Values,
+        values: &mut TopicQueues,
         (space, from): (SpaceId, SocketAddr),
         now: Now,
     ) -> bool {
@@ -93,7 +93,7 @@ impl RedundantSenders {
         if is_superseded {
             let active = sender.from;
             let cause = (Reason::Takeover, "superseded");
-            values.count(About::sender(from), cause, 1, || {
+            values.count(DropSite::sender(from), cause, 1, || {
                 format!("{active} is the active bridge of space {space}, and {from} sent a value")
             });
         }
@@ -104,7 +104,7 @@ impl RedundantSenders {
     /// heartbeat was secured as its message is.
     pub(super) fn is_active(
         &self,
-        security: &Security,
+        security: &MessageSecurity,
         (space, from): (SpaceId, SocketAddr),
     ) -> bool {
         let sender = self.of.get(&space);
@@ -143,7 +143,7 @@ const MOST_MEMBERS: usize = 8;
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::redundancy::{Rank, Redundancy};
+    use crate::redundancy::{Redundancy, RedundancyRank};
 
     #[test]
     #[expect(clippy::disallowed_methods, reason = "some instant to count from")]
@@ -153,7 +153,8 @@ mod tests {
             utc: uadp::Timestamp::from_unix_nanos(1_700_000_000_000_000_000),
         };
         let address = |port: u16| SocketAddr::from(([127, 0, 0, 1], port));
-        let of = |instance| Redundancy::new(Rank::new(1).unwrap(), instance, now).heartbeat();
+        let of =
+            |instance| Redundancy::new(RedundancyRank::new(1).unwrap(), instance, now).heartbeat();
         let space = SpaceId::new(3).unwrap();
         let mut senders = RedundantSenders::default();
         senders.meet(space, of(1), (address(1), now.monotonic));

@@ -1,19 +1,19 @@
 //! Outputs other than samples: drops to log, and notifications about topics of other spaces.
 
-use super::about::About;
-use super::values::Values;
-use crate::counters::{Cause, Reason, is_told};
-use crate::output::{Notice, Output};
-use crate::reader::{Ask, Reader};
+use super::about::DropSite;
+use super::values::TopicQueues;
+use crate::counters::{DropCause, Reason, is_told};
+use crate::output::{DropNotice, Output};
+use crate::reader::{LocalTypeRequest, ReceivedTopicState};
 use crate::settings::Now;
 use crate::topics::Handle;
 
-impl Values {
+impl TopicQueues {
     /// Counts drops, and reports them at the 1st, 10th, 100th ... occurrence of their cause.
     pub(super) fn count(
         &mut self,
-        About { topic, from }: About,
-        cause: impl Into<Cause>,
+        DropSite { topic, from }: DropSite,
+        cause: impl Into<DropCause>,
         count: u64,
         detail: impl FnOnce() -> String,
     ) {
@@ -21,14 +21,14 @@ impl Values {
         if let Some(reader) = topic.and_then(|topic| self.topics.reader_of(topic)) {
             reader.dropped(cause.reason);
         }
-        self.count_only(About { topic, from }, cause, count, detail);
+        self.count_only(DropSite { topic, from }, cause, count, detail);
     }
 
     /// Counts drops as [`count`](Self::count) does, without an effect on the reader of the topic.
     pub(super) fn count_only(
         &mut self,
-        About { topic, from }: About,
-        cause: impl Into<Cause>,
+        DropSite { topic, from }: DropSite,
+        cause: impl Into<DropCause>,
         count: u64,
         detail: impl FnOnce() -> String,
     ) {
@@ -38,21 +38,21 @@ impl Values {
         if let Some(topic) = topic.filter(|topic| self.tap.taps(*topic)) {
             let detail = detail();
             self.tap.note_drop((topic, from), cause, (count, &detail));
-            let about = About {
+            let about = DropSite {
                 topic: Some(topic),
                 from,
             };
             return self.tell_of_drop(about, cause, (before, total), || detail);
         }
-        self.tell_of_drop(About { topic, from }, cause, (before, total), detail);
+        self.tell_of_drop(DropSite { topic, from }, cause, (before, total), detail);
     }
 
     /// Reports drops for a cause if a logged occurrence lies between the previous and the new
     /// total.
     pub(super) fn tell_of_drop(
         &mut self,
-        About { topic, from }: About,
-        cause: Cause,
+        DropSite { topic, from }: DropSite,
+        cause: DropCause,
         (before, total): (u64, u64),
         detail: impl FnOnce() -> String,
     ) {
@@ -61,7 +61,7 @@ impl Values {
         if told {
             let detail = detail();
             if !detail.is_empty() {
-                self.tell(Output::Notice(Notice {
+                self.tell(Output::Notice(DropNotice {
                     topic,
                     from,
                     reason: cause.reason,
@@ -90,18 +90,20 @@ impl Values {
     /// Requests the local type of a topic from the port, with the description known at the time of
     /// output. A pending request is not repeated.
     pub(super) fn tell_unbound(&mut self, at: Handle) {
-        self.tell_of(at, |reader| reader.news.ask = Some(Ask::Always));
+        self.tell_of(at, |reader| {
+            reader.news.ask = Some(LocalTypeRequest::Always)
+        });
     }
 
     /// Requests a check of the writer's description from the port, because the values of an open
     /// topic may have changed.
     pub(super) fn tell_described(&mut self, at: Handle) {
         self.tell_of(at, |reader| {
-            reader.news.ask.get_or_insert(Ask::IfDescribed);
+            reader.news.ask.get_or_insert(LocalTypeRequest::IfDescribed);
         });
     }
 
-    fn tell_of(&mut self, at: Handle, news: impl FnOnce(&mut Reader)) {
+    fn tell_of(&mut self, at: Handle, news: impl FnOnce(&mut ReceivedTopicState)) {
         if let Some(reader) = self.topics.reader(at) {
             news(reader);
             if !std::mem::replace(&mut reader.news.queued, true) {

@@ -9,7 +9,7 @@ use mappings::{Mapping, Overflow, SpaceId, TopicId};
 use messages::{Dialect, MessageType, PlanError, Selection, Wire};
 use uadp::Timestamp;
 
-use super::about::About;
+use super::about::DropSite;
 use super::claims::Claims;
 use super::inquiries::Inquiries;
 use super::redundant::Redundant;
@@ -17,31 +17,31 @@ use crate::buffers::Buffers;
 use crate::concern::Concern;
 use crate::confirm::Confirmer;
 use crate::counters::Reason;
-use crate::description::Described;
+use crate::description::TopicMetaData;
 use crate::hops::Hops;
-use crate::layout::Layout;
+use crate::layout::DataSetLayout;
 use crate::learned::Learned;
 use crate::loop_rule::Owned;
-use crate::loss::{Loss, Stop, trigger};
-use crate::message::{Encoded, Message};
+use crate::loss::{ConstantMessage, LossReaction, trigger};
+use crate::message::{EncodedSample, SampleMessage};
 use crate::output::{Delivery, Output};
-use crate::pace::Pace;
+use crate::pace::ChunkPace;
 use crate::part::OwnPart;
 use crate::plans::Plans;
 use crate::room::Room;
-use crate::settings::{Forwarding, Local, Now, Relay, Settings};
-use crate::tap::Tap;
-use crate::topic::{Item, Role};
-use crate::topics::{Handle, Topics};
+use crate::settings::{Forwarding, Local, Now, Relay, RouterSettings};
+use crate::tap::TappedTopics;
+use crate::topic::{PolledSample, TopicSide};
+use crate::topics::{Handle, TopicTable};
 use crate::transcoder::Transcoder;
 
 /// The topics of the space with their queues, turns and timers, and the outputs about them.
 #[derive(Debug)]
-pub(super) struct Values {
-    pub(super) settings: Settings,
+pub(super) struct TopicQueues {
+    pub(super) settings: RouterSettings,
     pub(super) owned: Owned,
     pub(super) mapping: Arc<Mapping>,
-    pub(super) topics: Topics,
+    pub(super) topics: TopicTable,
     /// The limit for topics that are unknown to the mapping and the local side.
     pub(super) room: Room,
     pub(super) plans: Plans,
@@ -50,7 +50,7 @@ pub(super) struct Values {
     pub(super) ready: VecDeque<Handle>,
     /// Topics with a partly sent large message, which wait for `pace`.
     pub(super) paced: VecDeque<Handle>,
-    pub(super) pace: Pace,
+    pub(super) pace: ChunkPace,
     pub(super) claims: Claims,
     /// The redundancy of the own space; `None` without redundancy.
     pub(super) redundant: Option<Box<Redundant>>,
@@ -69,9 +69,9 @@ pub(super) struct Values {
     /// The sender of the confirmations of each other space.
     pub(super) confirmers: BTreeMap<SpaceId, Confirmer>,
     /// The announced types of topics of other spaces.
-    pub(super) learned: Learned<Described>,
+    pub(super) learned: Learned<TopicMetaData>,
     /// The announced fields, for messages that do not describe their fields.
-    pub(super) layouts: Learned<Layout>,
+    pub(super) layouts: Learned<DataSetLayout>,
     /// The probes that became necessary.
     pub(super) inquiries: Inquiries,
     /// The number of bytes that security adds to a datagram.
@@ -89,25 +89,25 @@ pub(super) struct Values {
     pub(super) base_bytes: usize,
     /// Topics with a large sample that may wait for its local type.
     pub(super) large_held: Vec<TopicId>,
-    pub(super) tap: Tap,
+    pub(super) tap: TappedTopics,
     pub(super) buffers: Buffers,
     pub(super) hops: Hops,
     /// The time at which the kernel received the current datagram, if it is known.
     pub(super) received: Option<Timestamp>,
 }
 
-impl Values {
-    pub(super) fn new(settings: Settings, mapping: Arc<Mapping>, overhead: usize) -> Self {
+impl TopicQueues {
+    pub(super) fn new(settings: RouterSettings, mapping: Arc<Mapping>, overhead: usize) -> Self {
         Self {
             settings,
             owned: Owned::All,
             mapping,
-            topics: Topics::default(),
+            topics: TopicTable::default(),
             room: Room::new(MAX_STRAYS),
             plans: Plans::default(),
             ready: VecDeque::new(),
             paced: VecDeque::new(),
-            pace: Pace::default(),
+            pace: ChunkPace::default(),
             claims: Claims::default(),
             redundant: None,
             concern: Concern::default(),
@@ -128,7 +128,7 @@ impl Values {
             timers: BinaryHeap::new(),
             base_bytes: 0,
             large_held: Vec::new(),
-            tap: Tap::default(),
+            tap: TappedTopics::default(),
             buffers: Buffers::default(),
             hops: Hops::new(),
             received: None,
@@ -182,7 +182,7 @@ impl Values {
         entry.transcoder = transcoder;
         entry.bound = Some(Box::new((Arc::clone(message_type), selection.clone())));
         entry.react(reactions);
-        let Role::Theirs(reader) = &mut entry.role else {
+        let TopicSide::Theirs(reader) = &mut entry.role else {
             return Ok(true);
         };
         reader.forget_all();
@@ -200,16 +200,16 @@ impl Values {
         topic: TopicId,
         of: (&Arc<MessageType>, &Selection),
         wire: Wire,
-    ) -> Result<(Option<Loss>, Option<Stop>), PlanError> {
+    ) -> Result<(Option<LossReaction>, Option<ConstantMessage>), PlanError> {
         if self.is_home(topic) {
             return Ok((None, None));
         }
-        let loss = Loss::new(&self.mapping, topic, of, wire)?;
+        let loss = LossReaction::new(&self.mapping, topic, of, wire)?;
         Ok((loss, trigger(&self.mapping, topic, of.0, wire)?))
     }
 
     /// Queues an item. Returns whether older items were dropped for it.
-    pub(super) fn push(&mut self, at: Handle, item: Item) -> bool {
+    pub(super) fn push(&mut self, at: Handle, item: PolledSample) -> bool {
         let Some(entry) = self.topics.at_mut(at) else {
             return false;
         };
@@ -227,10 +227,12 @@ impl Values {
         let count = dropped.len().try_into().unwrap_or(u64::MAX);
         for item in dropped {
             match item {
-                Item::Message(Message::Datagram(Encoded { bytes, .. })) => self.recycle(bytes),
+                PolledSample::Message(SampleMessage::Datagram(EncodedSample { bytes, .. })) => {
+                    self.recycle(bytes)
+                }
                 // The message is kept for repetition, or freed with its last reference.
-                Item::Message(Message::Large(_)) => {}
-                Item::Delivery(Delivery {
+                PolledSample::Message(SampleMessage::Large(_)) => {}
+                PolledSample::Delivery(Delivery {
                     payload, instance, ..
                 }) => {
                     self.recycle(payload);
@@ -243,14 +245,14 @@ impl Values {
         } else {
             Reason::Overflow
         };
-        self.count(About::topic(topic), reason, count, || {
+        self.count(DropSite::topic(topic), reason, count, || {
             "the queue was full, its oldest sample was dropped".to_owned()
         });
         true
     }
 
     /// Queues an item of a topic by its name.
-    pub(super) fn push_to(&mut self, topic: TopicId, item: Item) {
+    pub(super) fn push_to(&mut self, topic: TopicId, item: PolledSample) {
         if let Some(at) = self.topics.find(topic) {
             // `push` counts dropped items itself.
             let _gave_way = self.push(at, item);

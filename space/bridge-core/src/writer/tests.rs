@@ -4,8 +4,8 @@ use uadp::DateTime;
 
 use super::*;
 
-fn sample() -> Encoded {
-    Encoded {
+fn sample() -> EncodedSample {
+    EncodedSample {
         bytes: vec![0; 20],
         timestamp_at: 2,
         payload_at: 14,
@@ -17,27 +17,27 @@ fn sample() -> Encoded {
     clippy::disallowed_methods,
     reason = "a test needs some instant to count from"
 )]
-fn writer() -> (Writer, Instant) {
+fn writer() -> (SentTopicState, Instant) {
     let now = Instant::now();
-    (Writer::new(now), now)
+    (SentTopicState::new(now), now)
 }
 
-fn keep(writer: &mut Writer, publisher: Option<PublisherKey>, now: Instant) -> bool {
+fn keep(writer: &mut SentTopicState, publisher: Option<PublisherKey>, now: Instant) -> bool {
     let mut sample = sample();
     if let (Some(PublisherKey(key)), Some(byte)) = (publisher, sample.bytes.last_mut()) {
         *byte = u8::try_from(key).unwrap();
     }
-    let gave_way = writer.keep((publisher, true), &Message::Datagram(sample));
+    let gave_way = writer.keep((publisher, true), &SampleMessage::Datagram(sample));
     writer.sent(now);
     gave_way
 }
 
 /// Returns the sequence number and the last byte of each repetition.
-fn round(writer: &mut Writer) -> Vec<(u16, u8)> {
+fn round(writer: &mut SentTopicState) -> Vec<(u16, u8)> {
     std::iter::from_fn(|| writer.repeat(Vec::new))
         .map(|message| match message {
-            Message::Datagram(again) => (again.sequence(), *again.bytes.last().unwrap()),
-            Message::Large(_) => unreachable!("none was kept"),
+            SampleMessage::Datagram(again) => (again.sequence(), *again.bytes.last().unwrap()),
+            SampleMessage::Large(_) => unreachable!("none was kept"),
         })
         .collect()
 }
@@ -87,11 +87,11 @@ fn of_too_many_latched_publishers_the_one_that_spoke_first_gives_way() {
 #[test]
 fn a_large_value_is_repeated_seldom_and_from_the_same_buffer() {
     let (mut writer, now) = writer();
-    let large = Arc::new(Encoded {
+    let large = Arc::new(EncodedSample {
         bytes: vec![0; 20_000_000],
         ..sample()
     });
-    writer.keep((None, true), &Message::Large(Arc::clone(&large)));
+    writer.keep((None, true), &SampleMessage::Large(Arc::clone(&large)));
     writer.sent(now);
     let minute = SECOND * 60;
     assert_eq!(
@@ -103,7 +103,7 @@ fn a_large_value_is_repeated_seldom_and_from_the_same_buffer() {
     let place = large.bytes.as_ptr();
     drop(large);
     writer.begin_round(now);
-    let Some(Message::Large(again)) = writer.repeat(Vec::new) else {
+    let Some(SampleMessage::Large(again)) = writer.repeat(Vec::new) else {
         unreachable!("a large one was kept")
     };
     assert_eq!(again.bytes.as_ptr(), place);

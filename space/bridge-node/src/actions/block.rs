@@ -7,12 +7,12 @@
 use bytes::{BufMut, Bytes, BytesMut};
 use uadp::{DateTime, Fields, Scalar, Timestamp, Variant};
 
-use super::graph::{CancelAnswer, GoalId, NO_GOAL};
-use super::wire::{CancelRequest, GoalAnswer};
+use super::graph::{GraphCancelResponse, GraphGoalId, NO_GOAL};
+use super::wire::{CancelSelection, GoalAnswer};
 
 /// Splits a block into the id and the block of the fields behind it. A missing, null or empty id is
 /// [`NO_GOAL`].
-pub(super) fn split(block: &[u8]) -> Option<(GoalId, Bytes)> {
+pub(super) fn split(block: &[u8]) -> Option<(GraphGoalId, Bytes)> {
     let (count, rest) = block.split_first_chunk()?;
     let Some(count) = u16::from_le_bytes(*count).checked_sub(1) else {
         return Some((NO_GOAL, Bytes::copy_from_slice(block)));
@@ -40,7 +40,7 @@ pub(super) fn split(block: &[u8]) -> Option<(GoalId, Bytes)> {
 }
 
 /// Returns the block of the id and the fields behind it.
-pub(super) fn join(id: GoalId, body: &[u8]) -> Option<Bytes> {
+pub(super) fn join(id: GraphGoalId, body: &[u8]) -> Option<Bytes> {
     let (count, rest) = body.split_first_chunk()?;
     let mut block = Writer::of(u16::from_le_bytes(*count).checked_add(1)?);
     block.bytes(&id);
@@ -57,7 +57,7 @@ pub(super) fn goal_answer(answer: &GoalAnswer) -> Bytes {
     block.0.freeze()
 }
 
-pub(super) fn read_cancel_request(block: &[u8]) -> Option<CancelRequest> {
+pub(super) fn read_cancel_request(block: &[u8]) -> Option<CancelSelection> {
     let (id, rest) = split(block)?;
     let stamp = Fields::parse(&rest).ok()?.next().transpose().ok()?;
     let until = match stamp {
@@ -68,10 +68,10 @@ pub(super) fn read_cancel_request(block: &[u8]) -> Option<CancelRequest> {
     };
     // In a ROS message a time that is not set is the beginning of 1970.
     let until = until.filter(|until| until.unix_nanos() != 0);
-    Some(CancelRequest { id, until })
+    Some(CancelSelection { id, until })
 }
 
-pub(super) fn cancel_answer(answer: &CancelAnswer) -> Bytes {
+pub(super) fn cancel_answer(answer: &GraphCancelResponse) -> Bytes {
     let mut block = Writer::of(2);
     block.signed(answer.code);
     block.bytes(answer.goals.as_flattened());
@@ -89,8 +89,8 @@ pub(super) fn result_answer((status, message): (i8, &str), result: &[u8]) -> Opt
 }
 
 /// Encodes the value with the goal statuses.
-pub(super) fn statuses(goals: &[(GoalId, i8)]) -> Bytes {
-    let ids: Vec<GoalId> = goals.iter().map(|(id, _)| *id).collect();
+pub(super) fn statuses(goals: &[(GraphGoalId, i8)]) -> Bytes {
+    let ids: Vec<GraphGoalId> = goals.iter().map(|(id, _)| *id).collect();
     let of_goals = goals.iter().map(|(_, status)| status.cast_unsigned());
     let statuses: Vec<u8> = of_goals.collect();
     let mut block = Writer::of(2);
@@ -173,7 +173,7 @@ mod tests {
         ];
         assert_eq!(values(&goal_answer(&answer)), wanted);
         let goals = [[1; 16], [2; 16]];
-        let answer = CancelAnswer {
+        let answer = GraphCancelResponse {
             code: -3,
             goals: goals.to_vec(),
         };
@@ -223,7 +223,7 @@ mod tests {
 
     #[test]
     fn a_request_to_cancel_means_all_where_it_says_nothing() {
-        let any = CancelRequest {
+        let any = CancelSelection {
             id: NO_GOAL,
             until: None,
         };
@@ -238,7 +238,7 @@ mod tests {
             block.bytes(&[9; 16]);
             block.time(Timestamp::from(time));
             let read = read_cancel_request(&block.0);
-            assert_eq!(read, Some(CancelRequest { id: [9; 16], until }));
+            assert_eq!(read, Some(CancelSelection { id: [9; 16], until }));
         }
     }
 }

@@ -6,8 +6,8 @@ use bytes::Bytes;
 use messages::{ActionCalls, Wire};
 
 use super::block;
-use super::graph::{CancelAnswer, GoalId};
-use super::wire::{self, CancelRequest, GoalAnswer};
+use super::graph::{GraphCancelResponse, GraphGoalId};
+use super::wire::{self, CancelSelection, GoalAnswer};
 
 /// The encoding of an action.
 #[derive(Debug, Clone)]
@@ -23,7 +23,7 @@ pub(super) enum Encoding {
 
 impl Encoding {
     /// Splits a request into the id and the goal behind it.
-    pub(super) fn split(&self, request: &[u8]) -> Option<(GoalId, Bytes)> {
+    pub(super) fn split(&self, request: &[u8]) -> Option<(GraphGoalId, Bytes)> {
         match self {
             Self::Ros(wire, _) => wire::split(*wire, request),
             Self::Fields { .. } => block::split(request),
@@ -31,7 +31,7 @@ impl Encoding {
     }
 
     /// Joins an id and the feedback behind it.
-    pub(super) fn join(&self, id: GoalId, body: &[u8]) -> Option<Bytes> {
+    pub(super) fn join(&self, id: GraphGoalId, body: &[u8]) -> Option<Bytes> {
         match self {
             Self::Ros(wire, _) => wire::join(*wire, id, body),
             Self::Fields { .. } => block::join(id, body),
@@ -45,21 +45,21 @@ impl Encoding {
         }
     }
 
-    pub(super) fn read_result_request(&self, request: &[u8]) -> Option<GoalId> {
+    pub(super) fn read_result_request(&self, request: &[u8]) -> Option<GraphGoalId> {
         match self {
             Self::Ros(wire, _) => wire::read_result_request(*wire, request),
             Self::Fields { .. } => block::split(request).map(|(id, _)| id),
         }
     }
 
-    pub(super) fn read_cancel_request(&self, request: &[u8]) -> Option<CancelRequest> {
+    pub(super) fn read_cancel_request(&self, request: &[u8]) -> Option<CancelSelection> {
         match self {
             Self::Ros(wire, _) => wire::read_cancel_request(*wire, request),
             Self::Fields { .. } => block::read_cancel_request(request),
         }
     }
 
-    pub(super) fn cancel_answer(&self, answer: &CancelAnswer) -> Bytes {
+    pub(super) fn cancel_answer(&self, answer: &GraphCancelResponse) -> Bytes {
         match self {
             Self::Ros(wire, _) => wire::cancel_answer(*wire, answer),
             Self::Fields { .. } => block::cancel_answer(answer),
@@ -85,7 +85,7 @@ impl Encoding {
     }
 
     /// Encodes the value with the goal statuses.
-    pub(super) fn statuses(&self, goals: &[(GoalId, i8)]) -> Bytes {
+    pub(super) fn statuses(&self, goals: &[(GraphGoalId, i8)]) -> Bytes {
         match self {
             Self::Ros(wire, _) => wire::statuses(*wire, goals),
             Self::Fields { .. } => block::statuses(goals),

@@ -15,7 +15,7 @@ use tokio::task::JoinSet;
 use super::encoding::Encoding;
 use super::graph::{ActionGraph, Waits};
 use super::pending::AllPending;
-use super::serving::{Action, Command, Part, Serving};
+use super::serving::{ActionCommand, ActionRequestPart, ServedAction, Serving};
 use crate::clock::now;
 use crate::policy::Policy;
 use crate::port::Execution;
@@ -29,9 +29,9 @@ pub(super) struct Executors {
     /// Actions that cannot be served with their present settings.
     refused: HashMap<TopicId, Wanted>,
     /// The calls of the served actions: the action that each belongs to, and its part.
-    parts: HashMap<TopicId, (TopicId, Part)>,
+    parts: HashMap<TopicId, (TopicId, ActionRequestPart)>,
     /// The running executions, each with its action and part.
-    running: HashMap<ExecutionId, (TopicId, Part)>,
+    running: HashMap<ExecutionId, (TopicId, ActionRequestPart)>,
     /// Number of running executions that wait for a result.
     held: usize,
     tasks: JoinSet<()>,
@@ -43,7 +43,7 @@ struct Served {
     wanted: Wanted,
     family: ActionFamily,
     calls: Arc<ActionCalls>,
-    commands: mpsc::Sender<Command>,
+    commands: mpsc::Sender<ActionCommand>,
     /// Whether the server of the action is present.
     offered: Arc<AtomicBool>,
     /// Time since which the server of the action is missing.
@@ -62,7 +62,7 @@ struct Wanted {
 }
 
 impl Executors {
-    /// See [`Actions::reconcile`](super::Actions::reconcile).
+    /// See [`Actions::reconcile`](super::BridgeActions::reconcile).
     pub(super) fn reconcile<G: ActionGraph>(
         &mut self,
         (graph, policy): (&mut G, &mut Policy),
@@ -80,7 +80,7 @@ impl Executors {
                 if served.gone.take().is_some() {
                     events.extend(served.offer(topic));
                     // If the queue is full, the task publishes the statuses at the next change.
-                    drop(served.commands.try_send(Command::TellStatuses));
+                    drop(served.commands.try_send(ActionCommand::TellStatuses));
                 }
                 continue;
             }
@@ -175,7 +175,7 @@ impl Executors {
         let (commands, told) = mpsc::channel(MOST_COMMANDS);
         let offered = Arc::new(AtomicBool::new(false));
         let encoding = Encoding::Ros(G::WIRE, Arc::clone(&calls));
-        let action = Action {
+        let action = ServedAction {
             encoding: encoding.clone(),
             topic,
             feedback,
@@ -201,9 +201,9 @@ impl Executors {
             latched_by: None,
         });
         for (of, part) in [
-            (topic, Part::Goal),
-            (cancel, Part::Cancel),
-            (result, Part::Result),
+            (topic, ActionRequestPart::Goal),
+            (cancel, ActionRequestPart::Cancel),
+            (result, ActionRequestPart::Result),
         ] {
             self.parts.insert(of, (topic, part));
         }
@@ -235,26 +235,26 @@ impl Executors {
         let part = self.parts.get(&execution.topic);
         let (action, part) = *part.ok_or(Refusal::NotExecutable)?;
         let served = self.served.get(&action).ok_or(Refusal::NotExecutable)?;
-        if part == Part::Result && self.held >= MOST_HELD {
+        if part == ActionRequestPart::Result && self.held >= MOST_HELD {
             return Err(Refusal::Busy);
         }
         let id = execution.id;
-        let command = Command::Execute(part, execution);
+        let command = ActionCommand::Execute(part, execution);
         let told = served.commands.try_send(command);
         told.map_err(|_| Refusal::Busy)?;
-        self.held += usize::from(part == Part::Result);
+        self.held += usize::from(part == ActionRequestPart::Result);
         self.running.insert(id, (action, part));
         Ok(())
     }
 
-    /// See [`Actions::pending`](super::Actions::pending).
+    /// See [`Actions::pending`](super::BridgeActions::pending).
     pub(super) fn pending(&self) -> Vec<String> {
         self.pending.lines(now().monotonic)
     }
 
     /// Removes an execution that has ended.
     pub(super) fn ended(&mut self, execution: ExecutionId) {
-        if let Some((_, Part::Result)) = self.running.remove(&execution) {
+        if let Some((_, ActionRequestPart::Result)) = self.running.remove(&execution) {
             self.held -= 1;
         }
     }
@@ -268,7 +268,10 @@ impl Executors {
             // may have to be withdrawn. The number of waiting commands is bounded by the number of
             // executions.
             self.tasks.spawn(async move {
-                let _is_over = commands.send(Command::Abandoned(execution)).await.is_err();
+                let _is_over = commands
+                    .send(ActionCommand::Abandoned(execution))
+                    .await
+                    .is_err();
             });
         }
     }

@@ -13,7 +13,9 @@ use tokio::task::JoinSet;
 use tokio::time::{sleep, timeout};
 use tracing::debug;
 
-use super::graph::{ActionServer, CancelRequest, GoalId, NewGoal, ServedGoal, ServerEvent};
+use super::graph::{
+    GraphActionServer, GraphCancelRequest, GraphGoalId, GraphNewGoal, GraphServerEvent, ServedGoal,
+};
 use super::wire;
 use crate::calls::AskFault;
 use crate::clock::now;
@@ -44,11 +46,11 @@ pub(super) struct Facade<A> {
     pub(super) report: mpsc::Sender<PortEvent>,
 }
 
-impl<A: ActionServer> Facade<A> {
+impl<A: GraphActionServer> Facade<A> {
     /// Serves until the task is aborted. Open goals are then aborted in this graph, and go on in
     /// the space.
     pub(super) async fn run(mut self) {
-        let mut goals: HashMap<GoalId, mpsc::Sender<Bytes>> = HashMap::new();
+        let mut goals: HashMap<GraphGoalId, mpsc::Sender<Bytes>> = HashMap::new();
         let mut tasks = JoinSet::new();
         let mut cancels = JoinSet::new();
         let (ends, mut ended) = mpsc::channel::<oneshot::Sender<()>>(MOST_GOALS);
@@ -56,7 +58,7 @@ impl<A: ActionServer> Facade<A> {
             // All branches are cancel-safe.
             tokio::select! {
                 event = self.server.recv() => match event {
-                    ServerEvent::Goal(new) => {
+                    GraphServerEvent::Goal(new) => {
                         goals.retain(|_, feedback| !feedback.is_closed());
                         if let Some(refusal) = refusal(&goals, new.id()) {
                             new.reject(refusal);
@@ -70,10 +72,10 @@ impl<A: ActionServer> Facade<A> {
                         };
                         tasks.spawn(drive(self.asks.clone(), new, told));
                     }
-                    ServerEvent::Cancel(request) if cancels.len() < MOST_CANCELS => {
+                    GraphServerEvent::Cancel(request) if cancels.len() < MOST_CANCELS => {
                         cancels.spawn(cancel(self.asks.clone(), request));
                     }
-                    ServerEvent::Cancel(request) => request.reject(),
+                    GraphServerEvent::Cancel(request) => request.reject(),
                 },
                 value = self.values.recv() => match value {
                     Some(value) => self.hand_on(&goals, &value),
@@ -92,7 +94,7 @@ impl<A: ActionServer> Facade<A> {
 
     /// Forwards feedback to its goal. Ignores feedback of goals that other clients of the action
     /// have sent.
-    fn hand_on(&self, goals: &HashMap<GoalId, mpsc::Sender<Bytes>>, value: &[u8]) {
+    fn hand_on(&self, goals: &HashMap<GraphGoalId, mpsc::Sender<Bytes>>, value: &[u8]) {
         let Some((id, body)) = wire::split(self.asks.wire, value) else {
             return;
         };
@@ -112,7 +114,10 @@ impl<A: ActionServer> Facade<A> {
 }
 
 /// Returns the reason why a goal is rejected, if it is.
-fn refusal(goals: &HashMap<GoalId, mpsc::Sender<Bytes>>, id: GoalId) -> Option<&'static str> {
+fn refusal(
+    goals: &HashMap<GraphGoalId, mpsc::Sender<Bytes>>,
+    id: GraphGoalId,
+) -> Option<&'static str> {
     if goals.contains_key(&id) {
         return Some("a goal with this id already exists");
     }
@@ -127,7 +132,7 @@ struct Told {
 }
 
 /// Drives a goal to its end.
-async fn drive<N: NewGoal>(asks: Asks, new: N, told: Told) {
+async fn drive<N: GraphNewGoal>(asks: Asks, new: N, told: Told) {
     let id = new.id();
     let Some(goal) = begin(&asks, id, new).await else {
         return;
@@ -144,7 +149,7 @@ async fn drive<N: NewGoal>(asks: Asks, new: N, told: Told) {
 }
 
 /// Sends a goal to its executor, and accepts it in this graph once the executor has accepted it.
-async fn begin<N: NewGoal>(asks: &Asks, id: GoalId, new: N) -> Option<N::Goal> {
+async fn begin<N: GraphNewGoal>(asks: &Asks, id: GraphGoalId, new: N) -> Option<N::Goal> {
     let Some(request) = wire::join(asks.wire, id, new.body()) else {
         new.reject("the goal is malformed");
         return None;
@@ -162,7 +167,7 @@ async fn begin<N: NewGoal>(asks: &Asks, id: GoalId, new: N) -> Option<N::Goal> {
 
 /// Forwards feedback until the goal has ended. Feedback reported before the end is forwarded before
 /// it.
-async fn follow(asks: &Asks, id: GoalId, goal: &impl ServedGoal, told: Told) -> End {
+async fn follow(asks: &Asks, id: GraphGoalId, goal: &impl ServedGoal, told: Told) -> End {
     let Told { mut feedback, ends } = told;
     let mut end = Box::pin(wait(asks, id));
     let end = loop {
@@ -191,7 +196,7 @@ fn hand_to(goal: &impl ServedGoal, feedback: &[u8]) {
 
 /// Sends a goal. Sends it a second time if it is unknown whether the first request arrived, because
 /// goals with the same id are the same goal, or if it was refused and the executor has returned.
-async fn send(asks: &Asks, id: GoalId, request: Bytes) -> Result<(), String> {
+async fn send(asks: &Asks, id: GraphGoalId, request: Bytes) -> Result<(), String> {
     let ask = || asks.goal.ask_for(request.clone());
     let answer = match ask().await {
         Err(fault) if fault.kind == AskErrorKind::Unknown || comes_back(asks, &fault).await => {
@@ -212,7 +217,7 @@ async fn send(asks: &Asks, id: GoalId, request: Bytes) -> Result<(), String> {
         Err(AskFault { text, .. }) => text,
     };
     // The goal may be running without any client that knows of it.
-    let request = wire::CancelRequest { id, until: None };
+    let request = wire::CancelSelection { id, until: None };
     let request = wire::cancel_request(asks.wire, request);
     let cancel = asks.cancel.clone().within(CANCEL_WITHIN);
     drop(cancel.ask_for(request).await);
@@ -260,7 +265,7 @@ impl End {
 }
 
 /// Waits for the end of a goal, or until its executor is lost for too long.
-async fn wait(asks: &Asks, id: GoalId) -> End {
+async fn wait(asks: &Asks, id: GraphGoalId) -> End {
     let request = wire::result_request(asks.wire, id);
     let result = asks.result.clone().within(RESULT_WITHIN);
     let mut pause = FIRST_PAUSE;
@@ -307,7 +312,7 @@ fn or(text: String, otherwise: &str) -> String {
 }
 
 /// Requests to cancel a goal. A goal that is unknown to the executor may be on its way.
-async fn cancel<C: CancelRequest>(asks: Asks, request: C) {
+async fn cancel<C: GraphCancelRequest>(asks: Asks, request: C) {
     let id = request.id();
     let agreed = timeout(CANCEL_WITHIN, async {
         while let Some(code) = ask_to_cancel(&asks, id).await {
@@ -326,8 +331,8 @@ async fn cancel<C: CancelRequest>(asks: Asks, request: C) {
 }
 
 /// Returns the code of the response; `None` without a response.
-async fn ask_to_cancel(asks: &Asks, id: GoalId) -> Option<i8> {
-    let request = wire::CancelRequest { id, until: None };
+async fn ask_to_cancel(asks: &Asks, id: GraphGoalId) -> Option<i8> {
+    let request = wire::CancelSelection { id, until: None };
     let request = wire::cancel_request(asks.wire, request);
     let cancel = asks.cancel.clone().within(CANCEL_WITHIN);
     let answer = cancel.ask_for(request).await.ok()?;

@@ -16,7 +16,7 @@ use super::executors::{EVENTS, beside, is_same};
 use super::facade::{Asks, Facade};
 use super::graph::ActionGraph;
 use crate::policy::{Policy, action_type};
-use crate::port::Delivery;
+use crate::port::LocalDelivery;
 use crate::{Asker, GraphError, PortEvent};
 
 /// The known actions of other spaces.
@@ -107,7 +107,7 @@ impl Target {
 }
 
 impl Facades {
-    /// See [`Actions::known`](super::Actions::known).
+    /// See [`Actions::known`](super::BridgeActions::known).
     pub(super) fn known(&mut self, topic: TopicId, described: &Arc<CallDescription>) {
         let CallRole::Goal(family) = described.role else {
             self.forget(topic);
@@ -137,7 +137,7 @@ impl Facades {
         self.known.insert(topic, known);
     }
 
-    /// See [`Actions::gone`](super::Actions::gone).
+    /// See [`Actions::gone`](super::BridgeActions::gone).
     pub(super) fn gone(&mut self, topic: TopicId, now: Instant) {
         match self.known.get(&topic).map(|known| &known.state) {
             Some(State::Offered(offered)) => {
@@ -154,7 +154,8 @@ impl Facades {
         }
     }
 
-    /// See [`Actions::tidy`](super::Actions::tidy). Reports the calls and values that are unbound.
+    /// See [`Actions::tidy`](super::BridgeActions::tidy). Reports the calls and values that are
+    /// unbound.
     pub(super) fn tidy(&mut self, policy: &Policy, now: Instant) -> Vec<PortEvent> {
         while self.tasks.try_join_next().is_some() {}
         let silence = policy.mapping().pubsub().receive_timeout;
@@ -234,7 +235,7 @@ impl Facades {
         offered.collect()
     }
 
-    /// See [`Actions::offer_waiting`](super::Actions::offer_waiting).
+    /// See [`Actions::offer_waiting`](super::BridgeActions::offer_waiting).
     pub(super) fn offer_waiting<G: ActionGraph>(
         &mut self,
         (graph, policy): (&mut G, &mut Policy),
@@ -311,7 +312,7 @@ impl Facades {
     }
 
     /// Passes feedback to the task of its action.
-    pub(super) fn publish(&self, value: &Delivery) -> Result<(), &'static str> {
+    pub(super) fn publish(&self, value: &LocalDelivery) -> Result<(), &'static str> {
         let known = self.values.get(&value.topic);
         let known = known.and_then(|of| Some((*of, self.known.get(of)?)));
         let Some((of, known)) = known else {

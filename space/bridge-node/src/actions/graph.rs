@@ -10,23 +10,23 @@ use bytes::Bytes;
 use messages::{ActionCalls, TypeName};
 use uadp::Timestamp;
 
-use crate::services::{CallFault, Ran};
+use crate::services::{CallFault, MayHaveRun};
 use crate::{GraphError, ServiceGraph};
 
 /// Identifies a goal. In ROS 2 it is the UUID. In ROS 1, where ids are strings, it is the value of
 /// an id of 32 hex digits, or the MD5 of any other id.
-pub type GoalId = [u8; 16];
+pub type GraphGoalId = [u8; 16];
 
 /// The id that means "no goal".
-pub const NO_GOAL: GoalId = [0; 16];
+pub const NO_GOAL: GraphGoalId = [0; 16];
 
 /// A ROS graph with actions, as implemented by a port. [`ServiceGraph::WIRE`] is the encoding of
 /// its messages.
 pub trait ActionGraph: ServiceGraph {
     /// The client of an action.
-    type Sender: ActionClient;
+    type Sender: GraphActionClient;
     /// The server of an action.
-    type Taker: ActionServer;
+    type Taker: GraphActionServer;
 
     /// Returns the calls and values of an action type.
     ///
@@ -67,7 +67,7 @@ pub struct Waits {
 
 /// An event of a goal that was sent.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub enum GoalEvent {
+pub enum GraphGoalEvent {
     /// The server has accepted the goal. Reported once, before the events below.
     Accepted(Timestamp),
     /// The status of the goal as in `action_msgs/GoalStatus`: 1 accepted, 2 executing, 3 canceling.
@@ -96,37 +96,37 @@ pub enum GoalEvent {
         /// The reason.
         text: String,
         /// Whether the server has, or had, the goal.
-        ran: Ran,
+        ran: MayHaveRun,
     },
 }
 
 /// The goals of a request to cancel.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum CancelWhat {
+pub enum GraphCancelSelection {
     /// All goals of the server.
     All,
     /// A single goal.
-    Goal(GoalId),
+    Goal(GraphGoalId),
 }
 
 /// The response of a server to a request to cancel.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct CancelAnswer {
+pub struct GraphCancelResponse {
     /// Code as in `action_msgs/CancelGoal`: 0 none, 1 rejected, 2 unknown goal, 3 terminated.
     pub code: i8,
     /// The goals that are being cancelled, as far as they are known.
-    pub goals: Vec<GoalId>,
+    pub goals: Vec<GraphGoalId>,
 }
 
 /// Sends goals to one action. The goals go on when the client is dropped.
-pub trait ActionClient: Send + Sync + 'static {
+pub trait GraphActionClient: Send + Sync + 'static {
     /// A goal that was sent.
     type Goal: SentGoal;
 
     /// Sends a goal, an `X_Goal`, with an id. Never waits: the returned goal reports the events. A
     /// goal that cannot be sent until `start_by` is lost, and never runs. Called on a tokio
     /// runtime.
-    fn send_goal(&self, id: GoalId, body: &[u8], start_by: Instant) -> Self::Goal;
+    fn send_goal(&self, id: GraphGoalId, body: &[u8], start_by: Instant) -> Self::Goal;
 
     /// Requests the server to cancel goals. Ends within [`Waits::answer`]. A goal that the server
     /// has not decided about is withdrawn: it is not sent, or is cancelled as soon as it is
@@ -136,20 +136,20 @@ pub trait ActionClient: Send + Sync + 'static {
     /// [`CallFault`], if there is no response.
     fn cancel(
         &self,
-        what: CancelWhat,
-    ) -> impl Future<Output = Result<CancelAnswer, CallFault>> + Send;
+        what: GraphCancelSelection,
+    ) -> impl Future<Output = Result<GraphCancelResponse, CallFault>> + Send;
 }
 
 /// A goal that was sent. Dropping it ends the reports of its events, and does not cancel it.
 pub trait SentGoal: Send + 'static {
     /// Returns the next event; `None` after the last. Cancel-safe. Ends shortly after
     /// [`Waits::silence`] if the server is silent.
-    fn recv(&mut self) -> impl Future<Output = Option<GoalEvent>> + Send;
+    fn recv(&mut self) -> impl Future<Output = Option<GraphGoalEvent>> + Send;
 }
 
 /// A request of a client to a server.
 #[derive(Debug)]
-pub enum ServerEvent<N, C> {
+pub enum GraphServerEvent<N, C> {
     /// A new goal, to be accepted or rejected.
     Goal(N),
     /// A request to cancel a goal, to be accepted or rejected.
@@ -157,23 +157,23 @@ pub enum ServerEvent<N, C> {
 }
 
 /// Receives goals for one action. Dropping it withdraws the action.
-pub trait ActionServer: Send + 'static {
+pub trait GraphActionServer: Send + 'static {
     /// A goal to decide about.
-    type New: NewGoal;
+    type New: GraphNewGoal;
     /// A request to cancel a goal.
-    type Cancel: CancelRequest;
+    type Cancel: GraphCancelRequest;
 
     /// Returns the next event. Cancel-safe.
-    fn recv(&mut self) -> impl Future<Output = ServerEvent<Self::New, Self::Cancel>> + Send;
+    fn recv(&mut self) -> impl Future<Output = GraphServerEvent<Self::New, Self::Cancel>> + Send;
 }
 
 /// A goal to decide about. Dropping it rejects the goal.
-pub trait NewGoal: Send + 'static {
+pub trait GraphNewGoal: Send + 'static {
     /// A goal that was accepted.
     type Goal: ServedGoal;
 
     /// Returns the id of the goal.
-    fn id(&self) -> GoalId;
+    fn id(&self) -> GraphGoalId;
 
     /// Returns the `X_Goal`.
     fn body(&self) -> &Bytes;
@@ -189,9 +189,9 @@ pub trait NewGoal: Send + 'static {
 }
 
 /// A request to cancel a goal. Dropping it rejects the request: the goal goes on.
-pub trait CancelRequest: Send + 'static {
+pub trait GraphCancelRequest: Send + 'static {
     /// Returns the id of the goal.
-    fn id(&self) -> GoalId;
+    fn id(&self) -> GraphGoalId;
 
     /// Accepts the request; the goal still has to be ended by [`ServedGoal::end`].
     ///
@@ -216,7 +216,7 @@ pub trait ServedGoal: Send + Sync + 'static {
 
     /// Ends the goal: 4 succeeded, 5 canceled, any other value aborted. If no client has requested
     /// to cancel the goal, 5 aborts it in a ROS without such an end. `result` is as in
-    /// [`GoalEvent::Ended`]; without a result the client receives the empty result.
+    /// [`GraphGoalEvent::Ended`]; without a result the client receives the empty result.
     ///
     /// # Errors
     /// The reason why the goal cannot be ended; the goal is not ended then.

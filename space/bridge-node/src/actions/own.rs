@@ -7,12 +7,12 @@ use std::sync::atomic::AtomicBool;
 use std::task::{Context, Poll};
 
 use bridge_core::{
-    ActionFamily, CallDescription, CallField, CallRole, ExecutionId, Offered, Refusal,
+    ActionFamily, CallDescription, CallField, CallRole, ExecutionId, OfferedCall, Refusal,
     ValueDescription,
 };
 use bytes::Bytes;
 use mappings::{Overflow, TopicId};
-use messages::{Leaf, Rank, TypeName};
+use messages::{ArrayRank, Leaf, TypeName};
 use tokio::sync::mpsc;
 use tokio::task::JoinSet;
 use uadp::BuiltinType;
@@ -20,9 +20,9 @@ use uadp::BuiltinType;
 use super::MOST_REPORTS;
 use super::encoding::Encoding;
 use super::executors::{EVENTS, MOST_COMMANDS, MOST_HELD, beside};
-use super::graph::ActionClient;
-use super::pending::Pending;
-use super::serving::{Action, Command, Part, Serving};
+use super::graph::GraphActionClient;
+use super::pending::WithdrawnGoals;
+use super::serving::{ActionCommand, ActionRequestPart, ServedAction, Serving};
 use crate::PortEvent;
 use crate::clock::now;
 use crate::port::Execution;
@@ -54,11 +54,11 @@ pub struct OwnAction {
 /// declares.
 #[derive(Debug)]
 pub struct OwnActions {
-    commands: HashMap<TopicId, mpsc::Sender<Command>>,
+    commands: HashMap<TopicId, mpsc::Sender<ActionCommand>>,
     /// The calls of the actions: the action that each belongs to, and its part.
-    parts: HashMap<TopicId, (TopicId, Part)>,
+    parts: HashMap<TopicId, (TopicId, ActionRequestPart)>,
     /// The running executions, each with its action and part.
-    running: HashMap<ExecutionId, (TopicId, Part)>,
+    running: HashMap<ExecutionId, (TopicId, ActionRequestPart)>,
     /// Number of running executions that wait for a result.
     held: usize,
     reports: mpsc::Receiver<PortEvent>,
@@ -85,7 +85,7 @@ impl OwnActions {
     /// Offers an action that sends its goals to `client`, and replaces an earlier action of the
     /// same topic. Returns the events of its calls and values, or `None` if there are no
     /// identifiers behind the identifier of its goals. Needs a tokio runtime.
-    pub fn add<C: ActionClient>(
+    pub fn add<C: GraphActionClient>(
         &mut self,
         action: &OwnAction,
         client: C,
@@ -110,7 +110,7 @@ impl OwnActions {
         let (commands, told) = mpsc::channel(MOST_COMMANDS);
         // Reap the tasks of replaced actions.
         while self.tasks.try_join_next().is_some() {}
-        let serving = Action {
+        let serving = ServedAction {
             encoding,
             topic,
             feedback,
@@ -118,13 +118,13 @@ impl OwnActions {
             offered: Arc::new(AtomicBool::new(true)),
             report: self.report.clone(),
             // The program itself shows the skills behind the goals.
-            pending: Pending::default(),
+            pending: WithdrawnGoals::default(),
         };
         self.tasks.spawn(Serving::new(serving, client).run(told));
         let parts = [
-            (topic, Part::Goal),
-            (cancel, Part::Cancel),
-            (result, Part::Result),
+            (topic, ActionRequestPart::Goal),
+            (cancel, ActionRequestPart::Cancel),
+            (result, ActionRequestPart::Result),
         ];
         let parts = parts.map(|(of, part)| (of, (topic, part)));
         self.parts.extend(parts);
@@ -146,13 +146,13 @@ impl OwnActions {
         let part = self.parts.get(&execution.topic);
         let (action, part) = *part.ok_or(Refusal::NotExecutable)?;
         let commands = self.commands.get(&action).ok_or(Refusal::NotExecutable)?;
-        if part == Part::Result && self.held >= MOST_HELD {
+        if part == ActionRequestPart::Result && self.held >= MOST_HELD {
             return Err(Refusal::Busy);
         }
         let id = execution.id;
-        let told = commands.try_send(Command::Execute(part, execution));
+        let told = commands.try_send(ActionCommand::Execute(part, execution));
         told.map_err(|_| Refusal::Busy)?;
-        self.held += usize::from(part == Part::Result);
+        self.held += usize::from(part == ActionRequestPart::Result);
         self.running.insert(id, (action, part));
         Ok(())
     }
@@ -166,7 +166,10 @@ impl OwnActions {
             // The command waits for a place in the queue instead of being dropped. The number of
             // waiting commands is bounded by the number of executions.
             self.tasks.spawn(async move {
-                let _is_over = commands.send(Command::Abandoned(execution)).await.is_err();
+                let _is_over = commands
+                    .send(ActionCommand::Abandoned(execution))
+                    .await
+                    .is_err();
             });
         }
     }
@@ -183,7 +186,7 @@ impl OwnActions {
             return Poll::Pending;
         };
         if let PortEvent::Executed { execution, .. } = &event
-            && let Some((_, Part::Result)) = self.running.remove(execution)
+            && let Some((_, ActionRequestPart::Result)) = self.running.remove(execution)
         {
             self.held -= 1;
         }
@@ -196,7 +199,7 @@ impl OwnAction {
         let leaf = |path: &str, builtin| Leaf {
             path: path.to_owned(),
             builtin,
-            rank: Rank::Scalar,
+            rank: ArrayRank::Scalar,
         };
         let id = [leaf(GOAL_ID, BuiltinType::ByteString)];
         let of_feedback = self.feedback.iter().map(|field| Leaf {
@@ -289,7 +292,7 @@ impl OwnAction {
                 response,
             };
             let open = self.open;
-            let offered = Offered { description, open };
+            let offered = OfferedCall { description, open };
             PortEvent::Offer { topic, offered }
         });
         calls.into()

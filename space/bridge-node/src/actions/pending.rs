@@ -6,20 +6,20 @@ use std::time::Instant;
 
 use mappings::TopicId;
 
-use super::graph::GoalId;
+use super::graph::GraphGoalId;
 
 /// The withdrawn goals of one action that its server has neither ended nor started to cancel.
 #[derive(Debug, Clone, Default)]
-pub(super) struct Pending(Arc<Mutex<Goals>>);
+pub(super) struct WithdrawnGoals(Arc<Mutex<Goals>>);
 
 /// The withdrawn goals of all actions of a program, including actions that are not served any more.
 #[derive(Debug, Default)]
 pub(super) struct AllPending(Vec<(TopicId, Weak<Mutex<Goals>>)>);
 
 /// Each goal with the time of its withdrawal.
-type Goals = Vec<(GoalId, Instant)>;
+type Goals = Vec<(GraphGoalId, Instant)>;
 
-impl Pending {
+impl WithdrawnGoals {
     pub(super) fn show(&self, goals: Goals) {
         *self.0.lock().unwrap_or_else(PoisonError::into_inner) = goals;
     }
@@ -27,9 +27,9 @@ impl Pending {
 
 impl AllPending {
     /// Adds an action.
-    pub(super) fn of(&mut self, action: TopicId) -> Pending {
+    pub(super) fn of(&mut self, action: TopicId) -> WithdrawnGoals {
         self.0.retain(|(_, goals)| goals.strong_count() > 0);
-        let pending = Pending::default();
+        let pending = WithdrawnGoals::default();
         self.0.push((action, Arc::downgrade(&pending.0)));
         pending
     }
@@ -56,7 +56,7 @@ impl AllPending {
 }
 
 /// A goal id as `ros2 action` prints it.
-pub(super) struct Hex(pub(super) GoalId);
+pub(super) struct Hex(pub(super) GraphGoalId);
 
 impl fmt::Display for Hex {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {

@@ -17,19 +17,22 @@ use tracing::{debug, info};
 use uadp::StatusCode;
 
 use super::encoding::Encoding;
-use super::graph::{ActionClient, CancelAnswer, CancelWhat, GoalEvent, GoalId, NO_GOAL, SentGoal};
-use super::pending::{Hex, Pending};
-use super::table::{Asked, GivenUp, Goals, Progress, Wanted};
-use super::wire::CancelRequest;
+use super::graph::{
+    GraphActionClient, GraphCancelResponse, GraphCancelSelection, GraphGoalEvent, GraphGoalId,
+    NO_GOAL, SentGoal,
+};
+use super::pending::{Hex, WithdrawnGoals};
+use super::table::{CancelProgress, GivenUp, GoalDecision, Goals, ResultDecision};
+use super::wire::CancelSelection;
 use crate::PortEvent;
 use crate::clock::now;
 use crate::executing::TOO_LATE;
 use crate::port::Execution;
-use crate::services::{CallFault, Ran};
+use crate::services::{CallFault, MayHaveRun};
 
 /// The part of an action that a request is for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Part {
+pub(super) enum ActionRequestPart {
     Goal,
     Cancel,
     Result,
@@ -37,8 +40,8 @@ pub(super) enum Part {
 
 /// A command to the task of an action.
 #[derive(Debug)]
-pub(super) enum Command {
-    Execute(Part, Execution),
+pub(super) enum ActionCommand {
+    Execute(ActionRequestPart, Execution),
     Abandoned(ExecutionId),
     /// Publishes the goal statuses, because they can be delivered from this moment on.
     TellStatuses,
@@ -46,7 +49,7 @@ pub(super) enum Command {
 
 /// The parameters of an action, and the destinations of its values.
 #[derive(Debug)]
-pub(super) struct Action {
+pub(super) struct ServedAction {
     pub(super) encoding: Encoding,
     /// Topic of the goals.
     pub(super) topic: TopicId,
@@ -56,12 +59,12 @@ pub(super) struct Action {
     pub(super) offered: Arc<AtomicBool>,
     pub(super) report: mpsc::Sender<PortEvent>,
     /// The goals with a pending cancellation.
-    pub(super) pending: Pending,
+    pub(super) pending: WithdrawnGoals,
 }
 
 /// The task of an executed action.
 pub(super) struct Serving<C> {
-    action: Action,
+    action: ServedAction,
     client: Arc<C>,
     goals: Goals,
     /// Events of goals, and outcomes of requests to cancel.
@@ -69,17 +72,21 @@ pub(super) struct Serving<C> {
     tell: mpsc::Sender<News>,
     tasks: JoinSet<()>,
     /// Goals whose server was asked to cancel them, each with the further requests to cancel it.
-    cancels: HashMap<GoalId, Vec<ExecutionId>>,
+    cancels: HashMap<GraphGoalId, Vec<ExecutionId>>,
 }
 
 enum News {
-    Goal(GoalId, GoalEvent),
+    Goal(GraphGoalId, GraphGoalEvent),
     /// The response to a request to cancel a single goal, or several goals.
-    Cancelled(ExecutionId, Option<GoalId>, Result<CancelAnswer, CallFault>),
+    Cancelled(
+        ExecutionId,
+        Option<GraphGoalId>,
+        Result<GraphCancelResponse, CallFault>,
+    ),
 }
 
-impl<C: ActionClient> Serving<C> {
-    pub(super) fn new(action: Action, client: C) -> Self {
+impl<C: GraphActionClient> Serving<C> {
+    pub(super) fn new(action: ServedAction, client: C) -> Self {
         let (tell, news) = mpsc::channel(MOST_NEWS);
         Self {
             action,
@@ -94,16 +101,16 @@ impl<C: ActionClient> Serving<C> {
 
     /// Serves until the command channel closes. Every waiting request is then answered as lost.
     /// Accepted goals go on. Withdrawn goals are followed until they have ended.
-    pub(super) async fn run(mut self, mut commands: mpsc::Receiver<Command>) {
+    pub(super) async fn run(mut self, mut commands: mpsc::Receiver<ActionCommand>) {
         let mut ticks = tokio::time::interval(TICK);
         ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
         loop {
             // All branches are cancel-safe.
             let is_over = tokio::select! {
                 command = commands.recv() => match command {
-                    Some(Command::Execute(part, execution)) => self.execute(part, execution).await,
-                    Some(Command::Abandoned(execution)) => self.abandoned(execution).await,
-                    Some(Command::TellStatuses) => self.tell_statuses().await,
+                    Some(ActionCommand::Execute(part, execution)) => self.execute(part, execution).await,
+                    Some(ActionCommand::Abandoned(execution)) => self.abandoned(execution).await,
+                    Some(ActionCommand::TellStatuses) => self.tell_statuses().await,
                     None => Err(Over),
                 },
                 // Never `None`, because `self` holds a sender.
@@ -136,7 +143,7 @@ impl<C: ActionClient> Serving<C> {
             News::Goal(id, event) => self.goal_event(id, event).await,
             News::Cancelled(execution, id, answer) => {
                 let together = id.and_then(|id| self.cancels.remove(&id));
-                if let Ok(CancelAnswer { code: NONE, goals }) = &answer {
+                if let Ok(GraphCancelResponse { code: NONE, goals }) = &answer {
                     goals.iter().for_each(|id| self.goals.cancel_agreed(*id));
                 }
                 for execution in together.into_iter().flatten() {
@@ -151,15 +158,15 @@ impl<C: ActionClient> Serving<C> {
         self.action.pending.show(self.goals.pending());
     }
 
-    async fn execute(&mut self, part: Part, execution: Execution) -> Result<(), Over> {
-        if part == Part::Goal && now().monotonic > execution.start_by {
+    async fn execute(&mut self, part: ActionRequestPart, execution: Execution) -> Result<(), Over> {
+        if part == ActionRequestPart::Goal && now().monotonic > execution.start_by {
             debug!(action = %self.action.topic, "{TOO_LATE}");
             return self.refuse(execution.id, Refusal::NotExecutable).await;
         }
         match part {
-            Part::Goal => self.ask_goal(execution).await,
-            Part::Cancel => self.cancel(execution).await,
-            Part::Result => self.want_result(execution).await,
+            ActionRequestPart::Goal => self.ask_goal(execution).await,
+            ActionRequestPart::Cancel => self.cancel(execution).await,
+            ActionRequestPart::Result => self.want_result(execution).await,
         }
     }
 
@@ -178,18 +185,18 @@ impl<C: ActionClient> Serving<C> {
             id => id,
         };
         match self.goals.ask(id, run) {
-            Asked::Send => {
+            GoalDecision::Send => {
                 let goal = self.client.send_goal(id, &body, start_by);
                 self.tasks.spawn(follow(id, goal, self.tell.clone()));
                 Ok(())
             }
-            Asked::Waits => Ok(()),
-            Asked::Withdrawn => self.finish(run, Executed::Lost).await,
-            Asked::Answer(answer) => {
+            GoalDecision::Waits => Ok(()),
+            GoalDecision::Withdrawn => self.finish(run, Executed::Lost).await,
+            GoalDecision::Answer(answer) => {
                 let answer = self.action.encoding.goal_answer(&answer);
                 self.finish(run, answered(&answer)).await
             }
-            Asked::Full => self.refuse(run, Refusal::Busy).await,
+            GoalDecision::Full => self.refuse(run, Refusal::Busy).await,
         }
     }
 
@@ -206,17 +213,17 @@ impl<C: ActionClient> Serving<C> {
         // Leaves time for the response to arrive.
         let until = deadline.checked_sub(BEFORE_DEADLINE).unwrap_or(deadline);
         match self.goals.want(id, run, until) {
-            Wanted::Waits => Ok(()),
-            Wanted::Answer(answer) => self.finish(run, answered(&answer)).await,
-            Wanted::NoGoal => {
+            ResultDecision::Waits => Ok(()),
+            ResultDecision::Answer(answer) => self.finish(run, answered(&answer)).await,
+            ResultDecision::NoGoal => {
                 let outcome = self.no_result(UNKNOWN, "unknown goal");
                 self.finish(run, outcome).await
             }
-            Wanted::Rejected(why) => {
+            ResultDecision::Rejected(why) => {
                 let outcome = self.no_result(NEVER_RAN, &why);
                 self.finish(run, outcome).await
             }
-            Wanted::Full => self.refuse(run, Refusal::Busy).await,
+            ResultDecision::Full => self.refuse(run, Refusal::Busy).await,
         }
     }
 
@@ -243,33 +250,35 @@ impl<C: ActionClient> Serving<C> {
             return self.refuse(run, Refusal::InvalidArgument).await;
         };
         let what = match request {
-            CancelRequest {
+            CancelSelection {
                 id: NO_GOAL,
                 until: None,
-            } => vec![CancelWhat::All],
-            CancelRequest { id, until: None } => match self.goals.progress(id) {
-                Progress::Ended => {
-                    let answer = CancelAnswer {
+            } => vec![GraphCancelSelection::All],
+            CancelSelection { id, until: None } => match self.goals.progress(id) {
+                CancelProgress::Ended => {
+                    let answer = GraphCancelResponse {
                         code: TERMINATED,
                         goals: Vec::new(),
                     };
                     return self.cancelled(run, Ok(answer)).await;
                 }
                 // Servers refuse a second cancellation of a goal.
-                progress @ (Progress::Undecided | Progress::Cancelling) => {
-                    if progress == Progress::Undecided {
+                progress @ (CancelProgress::Undecided | CancelProgress::Cancelling) => {
+                    if progress == CancelProgress::Undecided {
                         self.withdraw(id).await?;
                     }
-                    let answer = CancelAnswer {
+                    let answer = GraphCancelResponse {
                         code: NONE,
                         goals: vec![id],
                     };
                     return self.cancelled(run, Ok(answer)).await;
                 }
                 // A client of the graph itself may have sent the goal.
-                Progress::Unknown | Progress::Open => vec![CancelWhat::Goal(id)],
+                CancelProgress::Unknown | CancelProgress::Open => {
+                    vec![GraphCancelSelection::Goal(id)]
+                }
             },
-            CancelRequest {
+            CancelSelection {
                 id,
                 until: Some(until),
             } => {
@@ -277,16 +286,16 @@ impl<C: ActionClient> Serving<C> {
                 if id != NO_GOAL && !goals.contains(&id) {
                     goals.push(id);
                 }
-                goals.into_iter().map(CancelWhat::Goal).collect()
+                goals.into_iter().map(GraphCancelSelection::Goal).collect()
             }
         };
-        if what == [CancelWhat::All] {
+        if what == [GraphCancelSelection::All] {
             for id in self.goals.undecided() {
                 self.withdraw(id).await?;
             }
         }
         let single = match what[..] {
-            [CancelWhat::Goal(id)] => Some(id),
+            [GraphCancelSelection::Goal(id)] => Some(id),
             _ => None,
         };
         if let Some(id) = single {
@@ -305,7 +314,7 @@ impl<C: ActionClient> Serving<C> {
                 Err(CallFault {
                     text: "the server did not respond to the cancellation in time".to_owned(),
                     may_pass: true,
-                    ran: Ran::Perhaps,
+                    ran: MayHaveRun::Perhaps,
                 })
             };
             let answer = answer.unwrap_or_else(late);
@@ -316,18 +325,18 @@ impl<C: ActionClient> Serving<C> {
 
     /// Withdraws a goal: it is cancelled as soon as its server accepts it. Requests for the goal
     /// end with an unknown outcome.
-    async fn withdraw(&mut self, id: GoalId) -> Result<(), Over> {
+    async fn withdraw(&mut self, id: GraphGoalId) -> Result<(), Over> {
         let asked = self.goals.withdraw(id, now().monotonic);
         self.cancel_in_time(id);
         self.finish_all(asked, &Executed::Lost).await
     }
 
     /// Has the client withdraw a goal. The end of the goal shows the effect.
-    fn cancel_in_time(&mut self, id: GoalId) {
+    fn cancel_in_time(&mut self, id: GraphGoalId) {
         info!(action = %self.action.topic, goal = %Hex(id), "the goal was withdrawn before it was accepted; the bridge cancels it as soon as it is accepted");
         let client = Arc::clone(&self.client);
         self.tasks.spawn(async move {
-            if let Err(fault) = client.cancel(CancelWhat::Goal(id)).await {
+            if let Err(fault) = client.cancel(GraphCancelSelection::Goal(id)).await {
                 debug!(goal = %Hex(id), error = fault.text, "cannot cancel the withdrawn goal yet");
             }
         });
@@ -336,7 +345,7 @@ impl<C: ActionClient> Serving<C> {
     async fn cancelled(
         &mut self,
         run: ExecutionId,
-        answer: Result<CancelAnswer, CallFault>,
+        answer: Result<GraphCancelResponse, CallFault>,
     ) -> Result<(), Over> {
         match answer {
             Ok(answer) => {
@@ -350,9 +359,9 @@ impl<C: ActionClient> Serving<C> {
         }
     }
 
-    async fn goal_event(&mut self, id: GoalId, event: GoalEvent) -> Result<(), Over> {
+    async fn goal_event(&mut self, id: GraphGoalId, event: GraphGoalEvent) -> Result<(), Over> {
         match event {
-            GoalEvent::Accepted(stamp) => {
+            GraphGoalEvent::Accepted(stamp) => {
                 if let Some((asked, answer)) = self.goals.accepted(id, stamp) {
                     let answer = self.action.encoding.goal_answer(&answer);
                     self.finish_all(asked, &answered(&answer)).await?;
@@ -360,7 +369,7 @@ impl<C: ActionClient> Serving<C> {
                 }
                 Ok(())
             }
-            GoalEvent::Rejected(why) => match self.goals.rejected(id, why, now().monotonic) {
+            GraphGoalEvent::Rejected(why) => match self.goals.rejected(id, why, now().monotonic) {
                 Some((asked, answer, waiting)) => {
                     self.report_end(id, "rejected");
                     let none = self.no_result(NEVER_RAN, &answer.message);
@@ -370,12 +379,12 @@ impl<C: ActionClient> Serving<C> {
                 }
                 None => Ok(()),
             },
-            GoalEvent::Status(status) => if self.goals.status(id, status) { self.tell_statuses().await } else { Ok(()) },
-            GoalEvent::Feedback(body) => match self.action.encoding.join(id, &body) {
+            GraphGoalEvent::Status(status) => if self.goals.status(id, status) { self.tell_statuses().await } else { Ok(()) },
+            GraphGoalEvent::Feedback(body) => match self.action.encoding.join(id, &body) {
                 Some(value) => self.sample(self.action.feedback, value).await,
                 None => Ok(()),
             },
-            GoalEvent::Ended {
+            GraphGoalEvent::Ended {
                 status,
                 message,
                 result,
@@ -393,13 +402,13 @@ impl<C: ActionClient> Serving<C> {
                 self.report_end(id, end);
                 self.ended(id, (status, answer)).await
             }
-            GoalEvent::Lost { text, ran } => self.lost(id, text, ran).await,
-            GoalEvent::Overdue(text) => {
+            GraphGoalEvent::Lost { text, ran } => self.lost(id, text, ran).await,
+            GraphGoalEvent::Overdue(text) => {
                 self.withdraw_overdue(id).await?;
                 self.tell_failure(text).await
             }
-            GoalEvent::CancelRefused if !self.goals.cancel_refused(id) => Ok(()),
-            GoalEvent::CancelRefused => {
+            GraphGoalEvent::CancelRefused if !self.goals.cancel_refused(id) => Ok(()),
+            GraphGoalEvent::CancelRefused => {
                 self.tell_failure(format!(
                     "the action server refuses to cancel the goal {}, which was withdrawn before it was \
                      accepted: the goal continues; check the robot",
@@ -410,13 +419,13 @@ impl<C: ActionClient> Serving<C> {
         }
     }
 
-    async fn withdraw_overdue(&mut self, id: GoalId) -> Result<(), Over> {
+    async fn withdraw_overdue(&mut self, id: GraphGoalId) -> Result<(), Over> {
         let asked = self.goals.withdraw(id, now().monotonic);
         self.finish_all(asked, &Executed::Lost).await
     }
 
     /// Logs the end of a goal that was withdrawn before it was accepted.
-    fn report_end(&self, id: GoalId, end: &str) {
+    fn report_end(&self, id: GraphGoalId, end: &str) {
         if self.goals.is_withdrawn(id) {
             let action = self.action.topic;
             info!(%action, goal = %Hex(id), end, "the withdrawn goal has ended");
@@ -425,7 +434,7 @@ impl<C: ActionClient> Serving<C> {
 
     async fn ended(
         &mut self,
-        id: GoalId,
+        id: GraphGoalId,
         (status, answer): (i8, Option<Bytes>),
     ) -> Result<(), Over> {
         let outcome = match &answer {
@@ -439,8 +448,8 @@ impl<C: ActionClient> Serving<C> {
         self.tell_statuses().await
     }
 
-    async fn lost(&mut self, id: GoalId, text: String, ran: Ran) -> Result<(), Over> {
-        if ran == Ran::No {
+    async fn lost(&mut self, id: GraphGoalId, text: String, ran: MayHaveRun) -> Result<(), Over> {
+        if ran == MayHaveRun::No {
             self.report_end(id, &format!("not sent: {text}"));
             let (asked, waiting) = self.goals.failed(id, &text, now().monotonic);
             let none = self.no_result(NEVER_RAN, &text);
@@ -533,20 +542,22 @@ impl<C: ActionClient> Serving<C> {
 struct Over;
 
 /// Forwards the events of a goal.
-async fn follow<G: SentGoal>(id: GoalId, mut goal: G, tell: mpsc::Sender<News>) {
+async fn follow<G: SentGoal>(id: GraphGoalId, mut goal: G, tell: mpsc::Sender<News>) {
     let mut is_open = true;
     while is_open {
-        let event = goal.recv().await.unwrap_or_else(|| GoalEvent::Lost {
+        let event = goal.recv().await.unwrap_or_else(|| GraphGoalEvent::Lost {
             text: "no further message about the goal was received".to_owned(),
-            ran: Ran::Perhaps,
+            ran: MayHaveRun::Perhaps,
         });
         is_open = match &event {
-            GoalEvent::Accepted(_)
-            | GoalEvent::Status(_)
-            | GoalEvent::Feedback(_)
-            | GoalEvent::Overdue(_)
-            | GoalEvent::CancelRefused => true,
-            GoalEvent::Ended { .. } | GoalEvent::Rejected(_) | GoalEvent::Lost { .. } => false,
+            GraphGoalEvent::Accepted(_)
+            | GraphGoalEvent::Status(_)
+            | GraphGoalEvent::Feedback(_)
+            | GraphGoalEvent::Overdue(_)
+            | GraphGoalEvent::CancelRefused => true,
+            GraphGoalEvent::Ended { .. }
+            | GraphGoalEvent::Rejected(_)
+            | GraphGoalEvent::Lost { .. } => false,
         };
         if tell.send(News::Goal(id, event)).await.is_err() {
             return;
@@ -555,11 +566,11 @@ async fn follow<G: SentGoal>(id: GoalId, mut goal: G, tell: mpsc::Sender<News>) 
 }
 
 /// Cancels goals one after the other. If any goal is being cancelled, the response reports success.
-async fn cancel_each<C: ActionClient>(
+async fn cancel_each<C: GraphActionClient>(
     client: &C,
-    what: Vec<CancelWhat>,
-) -> Result<CancelAnswer, CallFault> {
-    let mut all = CancelAnswer {
+    what: Vec<GraphCancelSelection>,
+) -> Result<GraphCancelResponse, CallFault> {
+    let mut all = GraphCancelResponse {
         code: NONE,
         goals: Vec::new(),
     };
@@ -567,8 +578,8 @@ async fn cancel_each<C: ActionClient>(
     let mut fault = None;
     for what in what {
         match client.cancel(what).await {
-            Ok(CancelAnswer { code: NONE, goals }) => all.goals.extend(goals),
-            Ok(CancelAnswer { code, .. }) => worst = code,
+            Ok(GraphCancelResponse { code: NONE, goals }) => all.goals.extend(goals),
+            Ok(GraphCancelResponse { code, .. }) => worst = code,
             Err(why) => fault = Some(why),
         }
     }
@@ -587,16 +598,16 @@ fn answered(answer: &Bytes) -> Executed {
     Executed::Answered(answer.to_vec())
 }
 
-const fn failed(ran: Ran) -> Executed {
+const fn failed(ran: MayHaveRun) -> Executed {
     match ran {
-        Ran::No => Executed::Refused(Refusal::NotExecutable),
-        Ran::Perhaps => Executed::Lost,
-        Ran::Yes => Executed::Failed(BAD_UNEXPECTED_ERROR),
+        MayHaveRun::No => Executed::Refused(Refusal::NotExecutable),
+        MayHaveRun::Perhaps => Executed::Lost,
+        MayHaveRun::Yes => Executed::Failed(BAD_UNEXPECTED_ERROR),
     }
 }
 
 /// Returns a random id.
-fn new_id() -> GoalId {
+fn new_id() -> GraphGoalId {
     use std::hash::{BuildHasher, RandomState};
     let random = || RandomState::new().hash_one(now().utc.unix_nanos());
     let mut id = NO_GOAL;

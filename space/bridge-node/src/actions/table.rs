@@ -10,15 +10,15 @@ use bridge_core::ExecutionId;
 use bytes::Bytes;
 use uadp::Timestamp;
 
-use super::graph::GoalId;
+use super::graph::GraphGoalId;
 use super::wire::GoalAnswer;
 
 /// The goals by id. Ended goals are kept for a while.
 #[derive(Debug, Default)]
 pub(super) struct Goals {
-    known: HashMap<GoalId, Goal>,
+    known: HashMap<GraphGoalId, Goal>,
     /// The ids in the order of arrival.
-    order: VecDeque<GoalId>,
+    order: VecDeque<GraphGoalId>,
     /// Total size of the kept results in bytes.
     kept: usize,
 }
@@ -65,7 +65,7 @@ struct Waiting {
 
 /// The outcome of a request for a goal.
 #[derive(Debug, PartialEq, Eq)]
-pub(super) enum Asked {
+pub(super) enum GoalDecision {
     /// The goal is to be sent; the response follows the decision of the server.
     Send,
     /// The goal was sent before; the response follows the decision of the server.
@@ -80,7 +80,7 @@ pub(super) enum Asked {
 
 /// The outcome of a request for a result.
 #[derive(Debug, PartialEq, Eq)]
-pub(super) enum Wanted {
+pub(super) enum ResultDecision {
     /// The response follows the end of the goal.
     Waits,
     /// The goal has ended.
@@ -95,7 +95,7 @@ pub(super) enum Wanted {
 
 /// The progress of a goal that is to be cancelled.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Progress {
+pub(super) enum CancelProgress {
     /// Not a goal of the space.
     Unknown,
     /// The server has not decided about the goal.
@@ -114,7 +114,7 @@ pub(super) enum GivenUp {
     /// Other requests wait for the decision about the same goal.
     ByOne,
     /// No request waits for the decision about this goal.
-    ByAll(GoalId),
+    ByAll(GraphGoalId),
 }
 
 impl Goals {
@@ -124,10 +124,10 @@ impl Goals {
     }
 
     /// Handles a request for a goal.
-    pub(super) fn ask(&mut self, id: GoalId, execution: ExecutionId) -> Asked {
+    pub(super) fn ask(&mut self, id: GraphGoalId, execution: ExecutionId) -> GoalDecision {
         if let Some(goal) = self.known.get_mut(&id) {
             let answer = |accepted, message: &str| {
-                Asked::Answer(GoalAnswer {
+                GoalDecision::Answer(GoalAnswer {
                     accepted,
                     id,
                     stamp: goal.stamp,
@@ -135,18 +135,18 @@ impl Goals {
                 })
             };
             return match &mut goal.state {
-                State::Sent(_) if goal.withdrawn.is_some() => Asked::Withdrawn,
-                State::Sent(asked) if asked.len() >= MOST_WAITING => Asked::Full,
+                State::Sent(_) if goal.withdrawn.is_some() => GoalDecision::Withdrawn,
+                State::Sent(asked) if asked.len() >= MOST_WAITING => GoalDecision::Full,
                 State::Sent(asked) => {
                     asked.push(execution);
-                    Asked::Waits
+                    GoalDecision::Waits
                 }
                 State::Running(_) | State::Ended { .. } => answer(true, ""),
                 State::Rejected { why, .. } => answer(false, why),
             };
         }
         if !self.has_room() {
-            return Asked::Full;
+            return GoalDecision::Full;
         }
         let goal = Goal {
             state: State::Sent(vec![execution]),
@@ -158,7 +158,7 @@ impl Goals {
         };
         self.known.insert(id, goal);
         self.order.push_back(id);
-        Asked::Send
+        GoalDecision::Send
     }
 
     /// Returns whether there is room for one more goal. Removes the oldest ended goal if necessary.
@@ -167,7 +167,7 @@ impl Goals {
             return true;
         }
         let known = &self.known;
-        let ended = |id: &GoalId| known.get(id).is_none_or(Goal::has_ended);
+        let ended = |id: &GraphGoalId| known.get(id).is_none_or(Goal::has_ended);
         let Some(oldest) = self.order.iter().position(ended) else {
             return false;
         };
@@ -184,10 +184,10 @@ impl Goals {
     }
 
     /// Removes the oldest ended goals, except for `but`, while the results exceed the limit.
-    fn make_room(&mut self, but: GoalId) {
+    fn make_room(&mut self, but: GraphGoalId) {
         while self.kept > MOST_BYTES {
             let known = &self.known;
-            let ended = |id: &GoalId| *id != but && known.get(id).is_none_or(Goal::has_ended);
+            let ended = |id: &GraphGoalId| *id != but && known.get(id).is_none_or(Goal::has_ended);
             let Some(oldest) = self.order.iter().position(ended) else {
                 return;
             };
@@ -198,7 +198,7 @@ impl Goals {
     /// Marks the goal as accepted by the server. Returns the requests for the goal.
     pub(super) fn accepted(
         &mut self,
-        id: GoalId,
+        id: GraphGoalId,
         stamp: Timestamp,
     ) -> Option<(Vec<ExecutionId>, GoalAnswer)> {
         let goal = self.known.get_mut(&id)?;
@@ -221,7 +221,7 @@ impl Goals {
     /// requests for its result.
     pub(super) fn rejected(
         &mut self,
-        id: GoalId,
+        id: GraphGoalId,
         why: String,
         now: Instant,
     ) -> Option<(Vec<ExecutionId>, GoalAnswer, Vec<ExecutionId>)> {
@@ -244,7 +244,7 @@ impl Goals {
     /// The goal may be sent again, unless it was withdrawn.
     pub(super) fn failed(
         &mut self,
-        id: GoalId,
+        id: GraphGoalId,
         why: &str,
         now: Instant,
     ) -> (Vec<ExecutionId>, Vec<ExecutionId>) {
@@ -264,7 +264,7 @@ impl Goals {
     }
 
     /// Sets the status of a running goal. Returns false if the status has not changed.
-    pub(super) fn status(&mut self, id: GoalId, status: i8) -> bool {
+    pub(super) fn status(&mut self, id: GraphGoalId, status: i8) -> bool {
         match self.known.get_mut(&id).map(|goal| &mut goal.state) {
             Some(State::Running(known)) => std::mem::replace(known, status) != status,
             Some(State::Sent(_) | State::Rejected { .. } | State::Ended { .. }) | None => false,
@@ -275,7 +275,7 @@ impl Goals {
     /// that were not answered before.
     pub(super) fn ended(
         &mut self,
-        id: GoalId,
+        id: GraphGoalId,
         (status, answer): (i8, Bytes),
         now: Instant,
     ) -> (Vec<ExecutionId>, Vec<ExecutionId>) {
@@ -300,22 +300,27 @@ impl Goals {
     }
 
     /// Handles a request for the result of a goal that waits until `until`.
-    pub(super) fn want(&mut self, id: GoalId, execution: ExecutionId, until: Instant) -> Wanted {
+    pub(super) fn want(
+        &mut self,
+        id: GraphGoalId,
+        execution: ExecutionId,
+        until: Instant,
+    ) -> ResultDecision {
         let waiting: usize = self.known.values().map(|goal| goal.waiting.len()).sum();
         match self.known.get_mut(&id) {
-            None => Wanted::NoGoal,
+            None => ResultDecision::NoGoal,
             Some(Goal {
                 state: State::Rejected { why, .. },
                 ..
-            }) => Wanted::Rejected(why.clone()),
+            }) => ResultDecision::Rejected(why.clone()),
             Some(Goal {
                 state: State::Ended { answer, .. },
                 ..
-            }) => Wanted::Answer(answer.clone()),
-            Some(_) if waiting >= MOST_WAITING => Wanted::Full,
+            }) => ResultDecision::Answer(answer.clone()),
+            Some(_) if waiting >= MOST_WAITING => ResultDecision::Full,
             Some(goal) => {
                 goal.waiting.push(Waiting { execution, until });
-                Wanted::Waits
+                ResultDecision::Waits
             }
         }
     }
@@ -330,7 +335,7 @@ impl Goals {
     }
 
     /// Withdraws a goal that its server has not decided about. Returns the requests for the goal.
-    pub(super) fn withdraw(&mut self, id: GoalId, now: Instant) -> Vec<ExecutionId> {
+    pub(super) fn withdraw(&mut self, id: GraphGoalId, now: Instant) -> Vec<ExecutionId> {
         let Some(goal) = self.known.get_mut(&id) else {
             return Vec::new();
         };
@@ -344,7 +349,7 @@ impl Goals {
     }
 
     /// Returns the goals that their server has not decided about.
-    pub(super) fn undecided(&self) -> Vec<GoalId> {
+    pub(super) fn undecided(&self) -> Vec<GraphGoalId> {
         let sent = self.order.iter().filter(|id| {
             let goal = self.known.get(*id);
             goal.is_some_and(|goal| matches!(goal.state, State::Sent(_)))
@@ -375,7 +380,7 @@ impl Goals {
 
     /// Notes that the server refuses to cancel a withdrawn goal. Returns false if the goal is being
     /// cancelled: servers refuse a second cancellation.
-    pub(super) fn cancel_refused(&mut self, id: GoalId) -> bool {
+    pub(super) fn cancel_refused(&mut self, id: GraphGoalId) -> bool {
         match self.known.get_mut(&id) {
             Some(goal) if goal.is_cancelling() => false,
             Some(goal) => {
@@ -387,14 +392,14 @@ impl Goals {
     }
 
     /// Notes that the server has agreed to cancel the goal.
-    pub(super) fn cancel_agreed(&mut self, id: GoalId) {
+    pub(super) fn cancel_agreed(&mut self, id: GraphGoalId) {
         if let Some(goal) = self.known.get_mut(&id) {
             goal.agreed = true;
         }
     }
 
     /// Returns whether a goal is to be cancelled as soon as it is accepted.
-    pub(super) fn is_withdrawn(&self, id: GoalId) -> bool {
+    pub(super) fn is_withdrawn(&self, id: GraphGoalId) -> bool {
         self.known
             .get(&id)
             .is_some_and(|goal| goal.withdrawn.is_some())
@@ -402,7 +407,7 @@ impl Goals {
 
     /// Returns the withdrawn goals that the server has neither started nor refused to cancel, each
     /// with the time of withdrawal, oldest goal first.
-    pub(super) fn pending(&self) -> Vec<(GoalId, Instant)> {
+    pub(super) fn pending(&self) -> Vec<(GraphGoalId, Instant)> {
         let pending = self.order.iter().filter_map(|id| {
             let goal = self.known.get(id).filter(|goal| !goal.is_refused)?;
             let is_open = match goal.state {
@@ -416,21 +421,21 @@ impl Goals {
     }
 
     /// Returns the progress of a goal.
-    pub(super) fn progress(&self, id: GoalId) -> Progress {
+    pub(super) fn progress(&self, id: GraphGoalId) -> CancelProgress {
         let Some(goal) = self.known.get(&id) else {
-            return Progress::Unknown;
+            return CancelProgress::Unknown;
         };
         let is_pending = goal.withdrawn.is_some() && !goal.is_refused;
         match &goal.state {
-            State::Sent(_) => Progress::Undecided,
-            State::Running(_) if is_pending || goal.is_cancelling() => Progress::Cancelling,
-            State::Running(_) => Progress::Open,
-            State::Rejected { .. } | State::Ended { .. } => Progress::Ended,
+            State::Sent(_) => CancelProgress::Undecided,
+            State::Running(_) if is_pending || goal.is_cancelling() => CancelProgress::Cancelling,
+            State::Running(_) => CancelProgress::Open,
+            State::Rejected { .. } | State::Ended { .. } => CancelProgress::Ended,
         }
     }
 
     /// Returns the running goals that were accepted at `until` or before.
-    pub(super) fn open_until(&self, until: Timestamp) -> Vec<GoalId> {
+    pub(super) fn open_until(&self, until: Timestamp) -> Vec<GraphGoalId> {
         let open = self.known.iter().filter(|(_, goal)| {
             matches!(goal.state, State::Running(_)) && goal.stamp.unix_nanos() <= until.unix_nanos()
         });
@@ -438,7 +443,7 @@ impl Goals {
     }
 
     /// Returns the statuses of the newest goals, oldest goal first.
-    pub(super) fn statuses(&self) -> Vec<(GoalId, i8)> {
+    pub(super) fn statuses(&self) -> Vec<(GraphGoalId, i8)> {
         let newest = self.order.iter().rev();
         let newest = newest.filter_map(|id| {
             let status = match &self.known.get(id)?.state {
@@ -448,7 +453,7 @@ impl Goals {
             };
             Some((*id, status))
         });
-        let mut newest: Vec<(GoalId, i8)> = newest.take(MOST_STATUSES).collect();
+        let mut newest: Vec<(GraphGoalId, i8)> = newest.take(MOST_STATUSES).collect();
         newest.reverse();
         newest
     }
@@ -539,7 +544,7 @@ const CANCELING: i8 = 3;
 mod tests {
     use super::*;
 
-    fn id(number: u16) -> GoalId {
+    fn id(number: u16) -> GraphGoalId {
         let mut id = [0; 16];
         id[..2].copy_from_slice(&number.to_le_bytes());
         id
@@ -556,26 +561,32 @@ mod tests {
     #[test]
     fn a_goal_that_is_asked_for_twice_is_sent_once_and_has_one_answer() {
         let mut goals = Goals::default();
-        assert_eq!(goals.ask(id(1), run(1)), Asked::Send);
-        assert_eq!(goals.ask(id(1), run(2)), Asked::Waits);
+        assert_eq!(goals.ask(id(1), run(1)), GoalDecision::Send);
+        assert_eq!(goals.ask(id(1), run(2)), GoalDecision::Waits);
         let (asked, answer) = goals.accepted(id(1), at(500)).unwrap();
         assert_eq!(asked, [run(1), run(2)]);
         assert!(answer.accepted && answer.stamp == at(500));
-        assert_eq!(goals.ask(id(1), run(3)), Asked::Answer(answer.clone()));
+        assert_eq!(
+            goals.ask(id(1), run(3)),
+            GoalDecision::Answer(answer.clone())
+        );
         let now = crate::now().monotonic;
         goals.ended(id(1), (4, Bytes::new()), now);
-        assert_eq!(goals.ask(id(1), run(4)), Asked::Answer(answer));
+        assert_eq!(goals.ask(id(1), run(4)), GoalDecision::Answer(answer));
         // A rejected goal is answered again too.
         goals.ask(id(2), run(5));
         let (asked, answer, _) = goals.rejected(id(2), "no".to_owned(), now).unwrap();
         assert_eq!((asked, answer.accepted), (vec![run(5)], false));
-        assert_eq!(goals.ask(id(2), run(6)), Asked::Answer(answer));
+        assert_eq!(goals.ask(id(2), run(6)), GoalDecision::Answer(answer));
         let why = "no".to_owned();
-        assert_eq!(goals.want(id(2), run(7), now), Wanted::Rejected(why));
+        assert_eq!(
+            goals.want(id(2), run(7), now),
+            ResultDecision::Rejected(why)
+        );
         // A goal that was never sent may be sent again.
         goals.ask(id(3), run(8));
         assert_eq!(goals.failed(id(3), "none", now), (vec![run(8)], vec![]));
-        assert_eq!(goals.ask(id(3), run(9)), Asked::Send);
+        assert_eq!(goals.ask(id(3), run(9)), GoalDecision::Send);
     }
 
     #[test]
@@ -590,9 +601,9 @@ mod tests {
         assert_eq!(goals.give_up_asking(run(2), now), GivenUp::NotAsked);
         assert_eq!(goals.pending(), [(id(1), now)]);
         // A repeated request does not revive the goal.
-        assert_eq!(goals.ask(id(1), run(3)), Asked::Withdrawn);
+        assert_eq!(goals.ask(id(1), run(3)), GoalDecision::Withdrawn);
         let soon = now + Duration::from_secs(30);
-        assert_eq!(goals.want(id(1), run(4), soon), Wanted::Waits);
+        assert_eq!(goals.want(id(1), run(4), soon), ResultDecision::Waits);
         let (asked, _) = goals.accepted(id(1), at(1)).unwrap();
         assert_eq!((asked, goals.pending()), (vec![], vec![(id(1), now)]));
         goals.status(id(1), CANCELING);
@@ -613,13 +624,16 @@ mod tests {
         let now = crate::now().monotonic;
         goals.ask(id(1), run(1));
         assert_eq!(goals.withdraw(id(1), now), [run(1)]);
-        assert_eq!(goals.want(id(1), run(2), now), Wanted::Waits);
+        assert_eq!(goals.want(id(1), run(2), now), ResultDecision::Waits);
         assert_eq!(goals.failed(id(1), "not sent", now), (vec![], vec![run(2)]));
         let why = "not sent".to_owned();
-        assert_eq!(goals.want(id(1), run(3), now), Wanted::Rejected(why));
+        assert_eq!(
+            goals.want(id(1), run(3), now),
+            ResultDecision::Rejected(why)
+        );
         assert_eq!(
             (goals.progress(id(1)), goals.pending()),
-            (Progress::Ended, vec![])
+            (CancelProgress::Ended, vec![])
         );
         // A refused cancellation is not pending.
         goals.ask(id(2), run(4));
@@ -634,21 +648,27 @@ mod tests {
         let mut goals = Goals::default();
         let start = crate::now().monotonic;
         let soon = start + Duration::from_secs(30);
-        assert_eq!(goals.want(id(1), run(1), soon), Wanted::NoGoal);
+        assert_eq!(goals.want(id(1), run(1), soon), ResultDecision::NoGoal);
         goals.ask(id(1), run(2));
         goals.accepted(id(1), at(1));
-        assert_eq!(goals.want(id(1), run(3), soon), Wanted::Waits);
-        assert_eq!(goals.want(id(1), run(4), soon), Wanted::Waits);
-        assert_eq!(goals.want(id(1), run(5), soon + KEPT), Wanted::Waits);
+        assert_eq!(goals.want(id(1), run(3), soon), ResultDecision::Waits);
+        assert_eq!(goals.want(id(1), run(4), soon), ResultDecision::Waits);
+        assert_eq!(
+            goals.want(id(1), run(5), soon + KEPT),
+            ResultDecision::Waits
+        );
         assert!(goals.give_up(run(4)) && !goals.give_up(run(4)));
         assert_eq!(goals.tidy(soon), (vec![run(3)], false));
         let answer = Bytes::from_static(b"result");
         let (waiting, _) = goals.ended(id(1), (4, answer.clone()), soon);
         assert_eq!(waiting, [run(5)]);
-        assert_eq!(goals.want(id(1), run(6), soon), Wanted::Answer(answer));
+        assert_eq!(
+            goals.want(id(1), run(6), soon),
+            ResultDecision::Answer(answer)
+        );
         assert_eq!(goals.statuses(), [(id(1), 4)]);
         assert_eq!(goals.tidy(soon + KEPT), (vec![], true));
-        assert_eq!(goals.want(id(1), run(7), soon), Wanted::NoGoal);
+        assert_eq!(goals.want(id(1), run(7), soon), ResultDecision::NoGoal);
         assert_eq!(goals.statuses(), []);
     }
 
@@ -665,12 +685,19 @@ mod tests {
             goals.ended(id(number), (4, result.clone()), now);
         }
         let of = |goals: &Goals| [1, 2, 3, 4].map(|number| goals.progress(id(number)));
-        let (open, ended, unknown) = (Progress::Open, Progress::Ended, Progress::Unknown);
+        let (open, ended, unknown) = (
+            CancelProgress::Open,
+            CancelProgress::Ended,
+            CancelProgress::Unknown,
+        );
         assert_eq!(of(&goals), [unknown, ended, ended, open]);
         let large = Bytes::from(vec![0; MOST_BYTES + 1]);
         goals.ended(id(4), (4, large.clone()), now);
         assert_eq!(of(&goals), [unknown, unknown, unknown, ended]);
-        assert_eq!(goals.want(id(4), run(2), now), Wanted::Answer(large));
+        assert_eq!(
+            goals.want(id(4), run(2), now),
+            ResultDecision::Answer(large)
+        );
         goals.tidy(now + KEPT);
         assert_eq!(goals.kept, 0);
     }
@@ -680,15 +707,15 @@ mod tests {
         let mut goals = Goals::default();
         let now = crate::now().monotonic;
         for number in 1..=1000 {
-            assert_eq!(goals.ask(id(number), run(1)), Asked::Send);
+            assert_eq!(goals.ask(id(number), run(1)), GoalDecision::Send);
             goals.accepted(id(number), at(number.into()));
         }
-        assert_eq!(goals.ask(id(1001), run(1)), Asked::Full);
+        assert_eq!(goals.ask(id(1001), run(1)), GoalDecision::Full);
         goals.ended(id(700), (4, Bytes::new()), now);
         goals.ended(id(30), (5, Bytes::new()), now);
-        assert_eq!(goals.ask(id(1001), run(1)), Asked::Send);
-        assert_eq!(goals.progress(id(30)), Progress::Unknown);
-        assert_eq!(goals.progress(id(700)), Progress::Ended);
+        assert_eq!(goals.ask(id(1001), run(1)), GoalDecision::Send);
+        assert_eq!(goals.progress(id(30)), CancelProgress::Unknown);
+        assert_eq!(goals.progress(id(700)), CancelProgress::Ended);
         assert_eq!(goals.open_until(at(30)).len(), 29);
         assert_eq!(goals.statuses().len(), MOST_STATUSES);
         assert_eq!(goals.statuses().last(), Some(&(id(1000), 1)));

@@ -11,16 +11,16 @@ use messages::Wire;
 use tokio::time::timeout;
 use uadp::{StatusCode, Timestamp};
 
-use self::fakes::Told;
-use self::space::{Space, offers};
+use self::fakes::FakeReport;
+use self::space::{SimulatedSpace, offers};
 use super::*;
 use crate::now;
-use crate::services::Ran;
+use crate::services::MayHaveRun;
 
 const NAME: &str = "demo_msgs/Count";
 const TEXT: &str = "int32 order\n---\nint32 last\n---\nint32 so_far\n";
 const GOAL: &str = "ua_1_2_70";
-const ID: GoalId = [9; 16];
+const ID: GraphGoalId = [9; 16];
 const QUICK: &str = "
 spaces: [{id: 1}, {id: 2}]
 pubsub: {receive_timeout: 300ms, keep_alive_period: 100ms, key_frame_period: 100ms}
@@ -36,21 +36,24 @@ fn number(number: i32) -> Bytes {
 
 #[tokio::test]
 async fn a_goal_goes_to_its_server_and_its_feedback_and_result_come_back() {
-    let mut space = Space::offered();
+    let mut space = SimulatedSpace::offered();
     let (goal, mut heard) = space.running().await;
     assert_eq!((goal.id, &goal.body), (ID, &number(7)));
     for so_far in 1..=3 {
-        let feedback = GoalEvent::Feedback(number(so_far));
+        let feedback = GraphGoalEvent::Feedback(number(so_far));
         goal.say.send(feedback).await.unwrap();
-        assert_eq!(space.told(&mut heard).await, Told::Feedback(number(so_far)));
+        assert_eq!(
+            space.told(&mut heard).await,
+            FakeReport::Feedback(number(so_far))
+        );
     }
-    let ended = GoalEvent::Ended {
+    let ended = GraphGoalEvent::Ended {
         status: 4,
         message: "done".to_owned(),
         result: number(42),
     };
     goal.say.send(ended).await.unwrap();
-    let end = Told::Ended(4, "done".to_owned(), Some(number(42)));
+    let end = FakeReport::Ended(4, "done".to_owned(), Some(number(42)));
     assert_eq!(space.told(&mut heard).await, end);
     // The status is accepted, then succeeded.
     let status = |status: u8| {
@@ -64,40 +67,43 @@ async fn a_goal_goes_to_its_server_and_its_feedback_and_result_come_back() {
 
 #[tokio::test]
 async fn a_goal_that_its_server_does_not_take_is_rejected_with_the_reason() {
-    let mut space = Space::offered();
+    let mut space = SimulatedSpace::offered();
     let mut heard = space.client().await;
     let goal = space.server().await;
-    let rejected = GoalEvent::Rejected("too far".to_owned());
+    let rejected = GraphGoalEvent::Rejected("too far".to_owned());
     goal.say.send(rejected).await.unwrap();
     let told = space.told(&mut heard).await;
-    assert_eq!(told, Told::Rejected("too far".to_owned()));
+    assert_eq!(told, FakeReport::Rejected("too far".to_owned()));
     // A rejected goal is rejected again.
     let mut heard = space.client().await;
-    let Told::Rejected(_) = space.told(&mut heard).await else {
+    let FakeReport::Rejected(_) = space.told(&mut heard).await else {
         panic!("a goal that was rejected is rejected again");
     };
 }
 
 #[tokio::test]
 async fn a_goal_is_cancelled_where_its_server_agrees() {
-    let mut space = Space::offered();
+    let mut space = SimulatedSpace::offered();
     let (goal, mut heard) = space.running().await;
     for code in [1, 0] {
         let agreed = space.cancel().await;
         let cancel = space.cancelled().await;
-        assert_eq!(cancel.what, CancelWhat::Goal(ID));
+        assert_eq!(cancel.what, GraphCancelSelection::Goal(ID));
         let goals = vec![ID];
-        cancel.answer.send(Ok(CancelAnswer { code, goals })).ok();
+        cancel
+            .answer
+            .send(Ok(GraphCancelResponse { code, goals }))
+            .ok();
         let agreed = space.until(agreed).await.unwrap();
         assert_eq!(agreed, code == 0);
     }
-    let ended = GoalEvent::Ended {
+    let ended = GraphGoalEvent::Ended {
         status: 5,
         message: String::new(),
         result: number(3),
     };
     goal.say.send(ended).await.unwrap();
-    let end = Told::Ended(5, String::new(), Some(number(3)));
+    let end = FakeReport::Ended(5, String::new(), Some(number(3)));
     assert_eq!(space.told(&mut heard).await, end);
     // A request to cancel an ended goal is rejected without asking the server.
     let agreed = space.cancel().await;
@@ -106,10 +112,10 @@ async fn a_goal_is_cancelled_where_its_server_agrees() {
 
 #[tokio::test]
 async fn a_request_to_cancel_waits_for_a_goal_that_is_on_its_way() {
-    let mut space = Space::offered();
+    let mut space = SimulatedSpace::offered();
     let agreed = space.cancel().await;
     let cancel = space.cancelled().await;
-    let unknown = CancelAnswer {
+    let unknown = GraphCancelResponse {
         code: 2,
         goals: Vec::new(),
     };
@@ -117,33 +123,36 @@ async fn a_request_to_cancel_waits_for_a_goal_that_is_on_its_way() {
     let _goal = space.running().await;
     let cancel = space.cancelled().await;
     let goals = vec![ID];
-    cancel.answer.send(Ok(CancelAnswer { code: 0, goals })).ok();
+    cancel
+        .answer
+        .send(Ok(GraphCancelResponse { code: 0, goals }))
+        .ok();
     assert!(space.until(agreed).await.unwrap());
 }
 
 #[tokio::test]
 async fn a_goal_whose_server_dies_ends_with_the_reason() {
-    let mut space = Space::offered();
+    let mut space = SimulatedSpace::offered();
     let (goal, mut heard) = space.running().await;
-    let lost = GoalEvent::Lost {
+    let lost = GraphGoalEvent::Lost {
         text: "the server has left".to_owned(),
-        ran: Ran::Perhaps,
+        ran: MayHaveRun::Perhaps,
     };
     goal.say.send(lost).await.unwrap();
-    let Told::Ended(6, why, None) = space.told(&mut heard).await else {
+    let FakeReport::Ended(6, why, None) = space.told(&mut heard).await else {
         panic!("it is aborted");
     };
     assert_eq!(why, "the server has left");
     // The client of a goal that was never sent receives the reason.
-    let mut space = Space::offered();
+    let mut space = SimulatedSpace::offered();
     let mut heard = space.client().await;
     let goal = space.server().await;
-    let lost = GoalEvent::Lost {
+    let lost = GraphGoalEvent::Lost {
         text: "no server".to_owned(),
-        ran: Ran::No,
+        ran: MayHaveRun::No,
     };
     goal.say.send(lost).await.unwrap();
-    let Told::Rejected(why) = space.told(&mut heard).await else {
+    let FakeReport::Rejected(why) = space.told(&mut heard).await else {
         panic!("it is rejected");
     };
     assert!(why.starts_with("not executed"), "{why}");
@@ -152,7 +161,7 @@ async fn a_goal_whose_server_dies_ends_with_the_reason() {
 #[tokio::test]
 async fn a_goal_waits_for_a_server_that_is_started_anew_and_is_rejected_where_none_is() {
     const PATIENT: &str = "spaces: [{id: 1}, {id: 2}]\npubsub: {receive_timeout: 60s}\n";
-    let mut space = Space::offered_by(PATIENT);
+    let mut space = SimulatedSpace::offered_by(PATIENT);
     space.offering.gone(of_goals(), now().monotonic);
     space.deserted = true;
     let mut heard = space.client().await;
@@ -160,15 +169,15 @@ async fn a_goal_waits_for_a_server_that_is_started_anew_and_is_rejected_where_no
     space.until(pause).await;
     assert!(heard.try_recv().is_err(), "it waits");
     space.deserted = false;
-    let events = Space::new(PATIENT).reconcile();
+    let events = SimulatedSpace::new(PATIENT).reconcile();
     space.announce(&events);
     let goal = space.server().await;
-    let accepted = GoalEvent::Accepted(Timestamp::from_unix_nanos(1_000));
+    let accepted = GraphGoalEvent::Accepted(Timestamp::from_unix_nanos(1_000));
     goal.say.send(accepted).await.unwrap();
-    assert_eq!(space.told(&mut heard).await, Told::Accepted);
+    assert_eq!(space.told(&mut heard).await, FakeReport::Accepted);
 
     for is_gone in [true, false] {
-        let mut space = Space::offered();
+        let mut space = SimulatedSpace::offered();
         space.deserted = true;
         if is_gone {
             space.offering.gone(of_goals(), now().monotonic);
@@ -177,7 +186,7 @@ async fn a_goal_waits_for_a_server_that_is_started_anew_and_is_rejected_where_no
         let told = space.told(&mut heard).await;
         assert_eq!(
             told,
-            Told::Rejected("not executed: nobody executes it".to_owned())
+            FakeReport::Rejected("not executed: nobody executes it".to_owned())
         );
     }
 }
@@ -185,7 +194,7 @@ async fn a_goal_waits_for_a_server_that_is_started_anew_and_is_rejected_where_no
 #[tokio::test]
 async fn a_goal_goes_on_while_its_action_is_withdrawn_for_a_moment() {
     const PATIENT: &str = "spaces: [{id: 1}, {id: 2}]\npubsub: {receive_timeout: 60s}\n";
-    let mut space = Space::offered_by(PATIENT);
+    let mut space = SimulatedSpace::offered_by(PATIENT);
     let (goal, mut heard) = space.running().await;
     space.offering.gone(of_goals(), now().monotonic);
     // The request for the result is refused, because the action is not known.
@@ -203,24 +212,24 @@ async fn a_goal_goes_on_while_its_action_is_withdrawn_for_a_moment() {
         .until(tokio::time::sleep(Duration::from_millis(300)))
         .await;
     while let Ok(told) = heard.try_recv() {
-        assert!(!matches!(told, Told::Ended(..)), "{told:?}");
+        assert!(!matches!(told, FakeReport::Ended(..)), "{told:?}");
     }
     space.deserted = false;
-    let events = Space::new(PATIENT).reconcile();
+    let events = SimulatedSpace::new(PATIENT).reconcile();
     space.announce(&events);
-    let ended = GoalEvent::Ended {
+    let ended = GraphGoalEvent::Ended {
         status: 4,
         message: String::new(),
         result: number(3),
     };
     goal.say.send(ended).await.unwrap();
-    let end = Told::Ended(4, String::new(), Some(number(3)));
+    let end = FakeReport::Ended(4, String::new(), Some(number(3)));
     assert_eq!(space.told(&mut heard).await, end);
 }
 
 #[tokio::test]
 async fn of_two_cancellations_of_one_moment_a_server_hears_one() {
-    let mut space = Space::offered();
+    let mut space = SimulatedSpace::offered();
     let (goal, mut heard) = space.running().await;
     let first = space.cancel().await;
     let cancel = space.cancelled().await;
@@ -228,33 +237,36 @@ async fn of_two_cancellations_of_one_moment_a_server_hears_one() {
     space.passes(200).await;
     assert!(space.cancels.try_recv().is_err(), "the server hears one");
     let goals = vec![ID];
-    cancel.answer.send(Ok(CancelAnswer { code: 0, goals })).ok();
+    cancel
+        .answer
+        .send(Ok(GraphCancelResponse { code: 0, goals }))
+        .ok();
     assert!(space.until(first).await.unwrap());
     assert!(space.until(second).await.unwrap());
     // A further request is answered without asking the server, which would refuse it.
     let third = space.cancel().await;
     assert!(space.until(third).await.unwrap());
-    let ended = GoalEvent::Ended {
+    let ended = GraphGoalEvent::Ended {
         status: 5,
         message: String::new(),
         result: number(3),
     };
     goal.say.send(ended).await.unwrap();
-    let end = Told::Ended(5, String::new(), Some(number(3)));
+    let end = FakeReport::Ended(5, String::new(), Some(number(3)));
     assert_eq!(space.told(&mut heard).await, end);
 }
 
 #[tokio::test]
 async fn the_goals_of_a_bridge_that_is_gone_are_aborted_and_its_server_withdrawn() {
-    let mut space = Space::offered();
+    let mut space = SimulatedSpace::offered();
     let (_goal, mut heard) = space.running().await;
     // The bridge is silent: requests are not answered any more.
-    space.executing = Actions::default();
+    space.executing = BridgeActions::default();
     space.offering.gone(of_goals(), now().monotonic);
     let end = async {
         loop {
             match heard.recv().await {
-                Some(Told::Ended(status, why, None)) => return (status, why),
+                Some(FakeReport::Ended(status, why, None)) => return (status, why),
                 Some(_) => {}
                 None => panic!("it has an end"),
             }
@@ -291,7 +303,7 @@ async fn the_goals_of_a_bridge_that_is_gone_are_aborted_and_its_server_withdrawn
 
 #[tokio::test]
 async fn a_server_that_goes_is_withdrawn_and_the_ends_of_its_goals_can_still_be_asked_for() {
-    let mut space = Space::offered();
+    let mut space = SimulatedSpace::offered();
     let (goal, _heard) = space.running().await;
     let present = std::mem::take(&mut space.present);
     let events = space.reconcile();
@@ -300,9 +312,9 @@ async fn a_server_that_goes_is_withdrawn_and_the_ends_of_its_goals_can_still_be_
         events.len() == 5 && events.iter().all(withdrawn),
         "{events:?}"
     );
-    let lost = GoalEvent::Lost {
+    let lost = GraphGoalEvent::Lost {
         text: "it has left".to_owned(),
-        ran: Ran::Perhaps,
+        ran: MayHaveRun::Perhaps,
     };
     goal.say.send(lost).await.unwrap();
     space.present = present;
@@ -325,13 +337,13 @@ async fn a_server_that_goes_is_withdrawn_and_the_ends_of_its_goals_can_still_be_
 
 #[tokio::test]
 async fn who_executes_chooses_an_id_and_several_may_wait_for_a_result() {
-    let mut space = Space::offered();
+    let mut space = SimulatedSpace::offered();
     let request = wire::join(Wire::Ros1, NO_GOAL, &number(5)).unwrap();
     let asked = space.calls.asker(of_goals()).ask(request);
     let mut sent = std::mem::replace(&mut space.sent, mpsc::channel(1).1);
     let server = async {
         let goal = sent.recv().await.unwrap();
-        let accepted = GoalEvent::Accepted(Timestamp::from_unix_nanos(5_000));
+        let accepted = GraphGoalEvent::Accepted(Timestamp::from_unix_nanos(5_000));
         goal.say.send(accepted).await.unwrap();
         goal
     };
@@ -340,7 +352,7 @@ async fn who_executes_chooses_an_id_and_several_may_wait_for_a_result() {
     assert!(answer.accepted && answer.id != NO_GOAL && answer.id == goal.id);
     assert_eq!(answer.stamp, Timestamp::from_unix_nanos(5_000));
     let result = executors::beside(of_goals(), 72).unwrap();
-    let ask = |space: &Space| {
+    let ask = |space: &SimulatedSpace| {
         let asker = space.calls.asker(result);
         asker.ask(wire::result_request(Wire::Ros1, goal.id))
     };
@@ -353,7 +365,7 @@ async fn who_executes_chooses_an_id_and_several_may_wait_for_a_result() {
     // The deadline of the request is close.
     let why = space.until(short).await.unwrap_err();
     assert!(why.starts_with("not executed"), "{why}");
-    let ended = GoalEvent::Ended {
+    let ended = GraphGoalEvent::Ended {
         status: 6,
         message: "no way".to_owned(),
         result: number(8),
@@ -367,7 +379,7 @@ async fn who_executes_chooses_an_id_and_several_may_wait_for_a_result() {
     }
     // A request to cancel all goals that were accepted until a time.
     let cancel = executors::beside(of_goals(), 71).unwrap();
-    let request = wire::CancelRequest {
+    let request = wire::CancelSelection {
         id: NO_GOAL,
         until: Some(Timestamp::from_unix_nanos(9_000)),
     };
@@ -381,7 +393,7 @@ async fn who_executes_chooses_an_id_and_several_may_wait_for_a_result() {
 
 #[tokio::test]
 async fn an_action_has_the_name_and_type_of_the_mapping() {
-    let mut space = Space::new(
+    let mut space = SimulatedSpace::new(
         "
 spaces: [{id: 1}, {id: 2}]
 namespaces: {2: 'urn:test:cell'}
@@ -420,10 +432,10 @@ calls:
 #[tokio::test]
 async fn a_variable_of_the_mapping_is_no_value_of_an_action() {
     let variable = "variables: [{node: ns=2;i=73, name: Speed, origin: 1}]\n";
-    let mut space = Space::new(&format!("{QUICK}namespaces: {{2: urn:test}}\n{variable}"));
+    let mut space = SimulatedSpace::new(&format!("{QUICK}namespaces: {{2: urn:test}}\n{variable}"));
     assert!(space.reconcile().is_empty(), "its feedback would be that");
     // A bridge with another mapping announces the action all the same.
-    let events = Space::new(QUICK).reconcile();
+    let events = SimulatedSpace::new(QUICK).reconcile();
     space.announce(&events);
     assert!(space.offer().is_empty());
     let [feedback, status] = [73, 74].map(|id| TopicId::new(1, 2, id).unwrap());
@@ -434,7 +446,7 @@ async fn a_variable_of_the_mapping_is_no_value_of_an_action() {
 
 #[tokio::test]
 async fn actions_that_would_have_the_same_calls_are_not_both_offered() {
-    let mut space = Space::new(QUICK);
+    let mut space = SimulatedSpace::new(QUICK);
     for name in ["/ua_1_2_66", "/ua_1_2_73", "/ua_1_2_75"] {
         space.present.insert(name.to_owned(), NAME.parse().ok());
     }
@@ -453,12 +465,12 @@ async fn actions_that_would_have_the_same_calls_are_not_both_offered() {
 
 #[tokio::test]
 async fn a_goal_that_is_cancelled_before_its_server_decides_is_withdrawn() {
-    let mut space = Space::offered();
+    let mut space = SimulatedSpace::offered();
     let mut heard = space.client().await;
     let goal = space.server().await;
     let agreed = space.cancel().await;
     let cancel = space.cancelled().await;
-    assert_eq!(cancel.what, CancelWhat::Goal(ID));
+    assert_eq!(cancel.what, GraphCancelSelection::Goal(ID));
     assert_eq!(space.until(agreed).await, Ok(true));
     let pending = space.executing.pending();
     assert!(
@@ -467,10 +479,10 @@ async fn a_goal_that_is_cancelled_before_its_server_decides_is_withdrawn() {
     );
     // Its outcome is unknown, and it is not sent again.
     let told = space.told(&mut heard).await;
-    assert!(matches!(told, Told::Rejected(_)), "{told:?}");
-    let accepted = GoalEvent::Accepted(Timestamp::from_unix_nanos(1_000));
+    assert!(matches!(told, FakeReport::Rejected(_)), "{told:?}");
+    let accepted = GraphGoalEvent::Accepted(Timestamp::from_unix_nanos(1_000));
     goal.say.send(accepted).await.unwrap();
-    goal.say.send(GoalEvent::Status(3)).await.unwrap();
+    goal.say.send(GraphGoalEvent::Status(3)).await.unwrap();
     let deadline = now().monotonic + Duration::from_secs(20);
     while !space.executing.pending().is_empty() {
         assert!(now().monotonic < deadline, "it is being cancelled");

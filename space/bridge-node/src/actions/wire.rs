@@ -6,17 +6,17 @@
 use std::sync::Arc;
 
 use bytes::{BufMut, Bytes, BytesMut};
-use messages::{ActionCalls, Literal, NoFields, Plan, Selection, Wire};
+use messages::{ActionCalls, Literal, MessagePlan, NoFields, Selection, Wire};
 use uadp::Timestamp;
 
-use super::graph::{CancelAnswer, GoalId};
+use super::graph::{GraphCancelResponse, GraphGoalId};
 use crate::GraphError;
 
 /// The response to a goal.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct GoalAnswer {
     pub(super) accepted: bool,
-    pub(super) id: GoalId,
+    pub(super) id: GraphGoalId,
     /// Time of acceptance.
     pub(super) stamp: Timestamp,
     pub(super) message: String,
@@ -24,24 +24,24 @@ pub(super) struct GoalAnswer {
 
 /// A result as a facade forwards it.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(super) struct Outcome {
+pub(super) struct ForwardedResult {
     pub(super) status: i8,
     pub(super) message: String,
-    /// As in [`GoalEvent::Ended`](super::GoalEvent::Ended).
+    /// As in [`GoalEvent::Ended`](super::GraphGoalEvent::Ended).
     pub(super) result: Bytes,
 }
 
 /// The goals that a request to cancel selects.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct CancelRequest {
+pub(super) struct CancelSelection {
     /// All zero: any goal.
-    pub(super) id: GoalId,
+    pub(super) id: GraphGoalId,
     /// `None`: any goal; else goals that were accepted at this time or before.
     pub(super) until: Option<Timestamp>,
 }
 
 /// Joins an id and the goal or feedback behind it.
-pub(super) fn join(wire: Wire, id: GoalId, body: &[u8]) -> Option<Bytes> {
+pub(super) fn join(wire: Wire, id: GraphGoalId, body: &[u8]) -> Option<Bytes> {
     let (head, rest) = body.split_at_checked(header(wire))?;
     let mut bytes = BytesMut::with_capacity(body.len() + id.len());
     bytes.put_slice(head);
@@ -52,7 +52,7 @@ pub(super) fn join(wire: Wire, id: GoalId, body: &[u8]) -> Option<Bytes> {
 
 /// Splits a message into the id and the goal or feedback behind it. 16 bytes do not change the
 /// alignment of CDR.
-pub(super) fn split(wire: Wire, message: &[u8]) -> Option<(GoalId, Bytes)> {
+pub(super) fn split(wire: Wire, message: &[u8]) -> Option<(GraphGoalId, Bytes)> {
     let (head, rest) = message.split_at_checked(header(wire))?;
     let (id, rest) = rest.split_first_chunk()?;
     let body = [head, rest].concat();
@@ -60,14 +60,14 @@ pub(super) fn split(wire: Wire, message: &[u8]) -> Option<(GoalId, Bytes)> {
 }
 
 /// Encodes a request for the result of a goal.
-pub(super) fn result_request(wire: Wire, id: GoalId) -> Bytes {
+pub(super) fn result_request(wire: Wire, id: GraphGoalId) -> Bytes {
     let mut out = Writer::new(wire);
     out.raw(&id);
     out.finish()
 }
 
 /// Returns the goal of a request for a result.
-pub(super) fn read_result_request(wire: Wire, message: &[u8]) -> Option<GoalId> {
+pub(super) fn read_result_request(wire: Wire, message: &[u8]) -> Option<GraphGoalId> {
     Reader::new(wire, message)?.id()
 }
 
@@ -90,7 +90,7 @@ pub(super) fn read_goal_answer(wire: Wire, message: &[u8]) -> Option<GoalAnswer>
     })
 }
 
-pub(super) fn cancel_request(wire: Wire, request: CancelRequest) -> Bytes {
+pub(super) fn cancel_request(wire: Wire, request: CancelSelection) -> Bytes {
     let mut out = Writer::new(wire);
     out.raw(&request.id);
     match request.until {
@@ -103,27 +103,27 @@ pub(super) fn cancel_request(wire: Wire, request: CancelRequest) -> Bytes {
     out.finish()
 }
 
-pub(super) fn read_cancel_request(wire: Wire, message: &[u8]) -> Option<CancelRequest> {
+pub(super) fn read_cancel_request(wire: Wire, message: &[u8]) -> Option<CancelSelection> {
     let mut read = Reader::new(wire, message)?;
     let id = read.id()?;
     let until = read.time()?;
     let until = (until.unix_nanos() != 0).then_some(until);
-    Some(CancelRequest { id, until })
+    Some(CancelSelection { id, until })
 }
 
-pub(super) fn cancel_answer(wire: Wire, answer: &CancelAnswer) -> Bytes {
+pub(super) fn cancel_answer(wire: Wire, answer: &GraphCancelResponse) -> Bytes {
     let mut out = Writer::new(wire);
     out.raw(&answer.code.to_le_bytes());
     out.sequence(answer.goals.as_flattened());
     out.finish()
 }
 
-pub(super) fn read_cancel_answer(wire: Wire, message: &[u8]) -> Option<CancelAnswer> {
+pub(super) fn read_cancel_answer(wire: Wire, message: &[u8]) -> Option<GraphCancelResponse> {
     let mut read = Reader::new(wire, message)?;
     let code = read.code()?;
     let (goals, _) = read.sequence()?.as_chunks();
     let goals = goals.to_vec();
-    Some(CancelAnswer { code, goals })
+    Some(GraphCancelResponse { code, goals })
 }
 
 /// Encodes the response with a result. In ROS 2 the fields behind the status of an
@@ -168,7 +168,7 @@ pub(super) fn empty_result_answer(
         ]
         .into(),
     };
-    let plan = Plan::compile(calls.result().response(), &template, wire)?;
+    let plan = MessagePlan::compile(calls.result().response(), &template, wire)?;
     let mut bytes = Vec::new();
     plan.write(&mut NoFields, &mut bytes)?;
     Ok(bytes.into())
@@ -176,20 +176,20 @@ pub(super) fn empty_result_answer(
 
 /// Decodes the response to a facade: the type [`ActionCalls::result`] in ROS 1,
 /// [`ActionCalls::outcome`] in ROS 2.
-pub(super) fn read_outcome(wire: Wire, message: &Bytes) -> Option<Outcome> {
+pub(super) fn read_outcome(wire: Wire, message: &Bytes) -> Option<ForwardedResult> {
     let mut read = Reader::new(wire, message)?;
     let status = read.code()?;
     Some(match wire {
         Wire::Ros1 => {
             let text = read.text()?;
             let result = message.slice(read.at..);
-            Outcome {
+            ForwardedResult {
                 status,
                 message: text,
                 result,
             }
         }
-        Wire::Cdr => Outcome {
+        Wire::Cdr => ForwardedResult {
             status,
             message: String::new(),
             result: message.clone(),
@@ -198,8 +198,8 @@ pub(super) fn read_outcome(wire: Wire, message: &Bytes) -> Option<Outcome> {
 }
 
 /// Encodes the value with the goal statuses.
-pub(super) fn statuses(wire: Wire, goals: &[(GoalId, i8)]) -> Bytes {
-    let ids: Vec<GoalId> = goals.iter().map(|(id, _)| *id).collect();
+pub(super) fn statuses(wire: Wire, goals: &[(GraphGoalId, i8)]) -> Bytes {
+    let ids: Vec<GraphGoalId> = goals.iter().map(|(id, _)| *id).collect();
     let statuses: Vec<u8> = goals
         .iter()
         .map(|(_, status)| status.cast_unsigned())
@@ -309,8 +309,8 @@ impl<'m> Reader<'m> {
         self.byte().map(u8::cast_signed)
     }
 
-    fn id(&mut self) -> Option<GoalId> {
-        self.take(size_of::<GoalId>())?.try_into().ok()
+    fn id(&mut self) -> Option<GraphGoalId> {
+        self.take(size_of::<GraphGoalId>())?.try_into().ok()
     }
 
     fn number(&mut self) -> Option<u32> {
@@ -346,7 +346,7 @@ const NANOS: i128 = 1_000_000_000;
 
 #[cfg(test)]
 mod tests {
-    use messages::{Dialect, Registry};
+    use messages::{Dialect, TypeRegistry};
 
     use super::*;
 
@@ -356,12 +356,12 @@ mod tests {
     fn what_is_written_of_calls_is_read_by_their_types_and_by_us() {
         let name = "demo_msgs/Count".parse().unwrap();
         for (dialect, wire) in [Dialect::Ros1, Dialect::Ros2].into_iter().zip(WIRES) {
-            let mut registry = Registry::bundle(dialect);
+            let mut registry = TypeRegistry::bundle(dialect);
             let text = "float64 x\n---\nint32[] sequence\nfloat64 y\n---\nint32 n\n";
             registry.add_action(&name, text).unwrap();
             let calls = Arc::new(registry.action_calls(&name).unwrap());
             let reads = |of: &Arc<messages::MessageType>, bytes: &[u8]| {
-                let plan = Plan::compile(of, &Selection::Whole, wire).unwrap();
+                let plan = MessagePlan::compile(of, &Selection::Whole, wire).unwrap();
                 plan.read(bytes, &mut Seen::default()).unwrap();
             };
             let stamp = Timestamp::from_unix_nanos(1_700_000_000_123_456_700);
@@ -374,14 +374,14 @@ mod tests {
             let bytes = goal_answer(wire, &answer);
             reads(calls.goal().response(), &bytes);
             assert_eq!(read_goal_answer(wire, &bytes), Some(answer));
-            let request = CancelRequest {
+            let request = CancelSelection {
                 id: [1; 16],
                 until: Some(stamp),
             };
             let bytes = cancel_request(wire, request);
             reads(calls.cancel().request(), &bytes);
             assert_eq!(read_cancel_request(wire, &bytes), Some(request));
-            let answer = CancelAnswer {
+            let answer = GraphCancelResponse {
                 code: 3,
                 goals: vec![[1; 16], [2; 16]],
             };
@@ -407,11 +407,12 @@ mod tests {
         // The response is the status, 7 bytes of padding, and y, without a sequence before it.
         let response = [&[0, 1, 0, 0, 4][..], &[0; 7], &1.5_f64.to_le_bytes()].concat();
         let name = "demo_msgs/Y".parse().unwrap();
-        let mut registry = Registry::bundle(Dialect::Ros2);
+        let mut registry = TypeRegistry::bundle(Dialect::Ros2);
         let text = "int32 a\n---\nfloat64 y\n---\nint32 b\n";
         registry.add_action(&name, text).unwrap();
         let calls = registry.action_calls(&name).unwrap();
-        let plan = Plan::compile(calls.result().response(), &Selection::Whole, Wire::Cdr).unwrap();
+        let plan =
+            MessagePlan::compile(calls.result().response(), &Selection::Whole, Wire::Cdr).unwrap();
         for message in ["", "short", "eight of", "more than eight"] {
             let bytes = result_answer(Wire::Cdr, (5, message), &response).unwrap();
             let mut seen = Seen::default();
@@ -424,7 +425,7 @@ mod tests {
     #[derive(Default)]
     struct Seen(f64);
 
-    impl messages::Sink for Seen {
+    impl messages::FieldSink for Seen {
         type Error = std::convert::Infallible;
 
         fn scalar(&mut self, value: uadp::Scalar<'_>) -> Result<(), Self::Error> {

@@ -101,8 +101,8 @@ mod tests {
     use std::time::Duration;
 
     use bridge_core::{
-        CallDescription, CallRole, Heard, Local, Now, Offered, Output, Owned, Router, Settings,
-        ValueDescription,
+        CallDescription, CallRole, Local, LocalMessage, Now, OfferedCall, Output, Owned, Router,
+        RouterSettings, ValueDescription,
     };
     use mappings::{Mapping, Overflow, SpaceId, TopicId};
     use uadp::{
@@ -118,7 +118,7 @@ mod tests {
     }
 
     fn component(namespace: u16) -> Router {
-        let settings = Settings {
+        let settings = RouterSettings {
             own: SpaceId::UA,
             local: Local::Fields,
             source: Some(SocketAddr::from(([127, 0, 0, 1], namespace))),
@@ -135,7 +135,7 @@ mod tests {
         let field = |path: &str| messages::Leaf {
             path: path.to_owned(),
             builtin: BuiltinType::String,
-            rank: messages::Rank::Scalar,
+            rank: messages::ArrayRank::Scalar,
         };
         let described = ValueDescription {
             name: "gripper.State".to_owned(),
@@ -145,7 +145,7 @@ mod tests {
             overflow: Overflow::KeepLatest,
         };
         router.describe_value(topic(namespace, 10), described, now());
-        let offered = Offered {
+        let offered = OfferedCall {
             description: CallDescription {
                 name: "gripper.Start".to_owned(),
                 about: String::new(),
@@ -159,7 +159,7 @@ mod tests {
         let texts = ["Ready".to_owned(), "x".repeat(100_000)];
         for text in texts {
             let payload = block(&text);
-            let heard = Heard {
+            let heard = LocalMessage {
                 topic: topic(namespace, 10),
                 payload: &payload,
                 received: now().utc,

@@ -26,18 +26,21 @@ use uadp::{
 };
 
 use crate::clock::now;
-use crate::mapping_file::Running;
+use crate::mapping_file::RunningMapping;
 
 /// The routes of the running mapping.
 #[derive(Debug)]
 pub(super) struct LiveRoutes {
     routes: Routes,
     /// The changes of the mapping; `None` if it does not change.
-    changes: Option<watch::Receiver<Running>>,
+    changes: Option<watch::Receiver<RunningMapping>>,
 }
 
 impl LiveRoutes {
-    pub(super) fn new(mapping: &Arc<Mapping>, changes: Option<watch::Receiver<Running>>) -> Self {
+    pub(super) fn new(
+        mapping: &Arc<Mapping>,
+        changes: Option<watch::Receiver<RunningMapping>>,
+    ) -> Self {
         Self {
             routes: Routes::new(mapping),
             changes,

@@ -11,7 +11,7 @@ use mappings::{KeySource, SecurityGroup};
 use tokio::sync::{mpsc, watch};
 use tokio::time::sleep;
 use tracing::{info, warn};
-use uadp::{Keys, SecurityPolicy};
+use uadp::{SecurityPolicy, TokenKeys};
 
 use super::NewKeys;
 
@@ -155,7 +155,9 @@ fn delivery(fetched: Fetched, policy: SecurityPolicy) -> Result<KeyDelivery, Str
         ));
     }
     let keys = fetched.keys.iter();
-    let keys: Result<Vec<Keys>, _> = keys.map(|data| Keys::from_bytes(policy, data)).collect();
+    let keys: Result<Vec<TokenKeys>, _> = keys
+        .map(|data| TokenKeys::from_bytes(policy, data))
+        .collect();
     let keys = keys.map_err(|error| error.to_string())?;
     if keys.is_empty() || fetched.first_token_id == 0 {
         return Err("the service has no keys of the group".to_owned());

@@ -10,7 +10,7 @@ use bridge_core::{KeyDelivery, policy_of};
 use mappings::{KeySource, SecurityGroup};
 use serde::Deserialize;
 use service::{Failure, FailureKind};
-use uadp::{Keys, SecurityPolicy};
+use uadp::{SecurityPolicy, TokenKeys};
 
 /// One key of a SecurityGroup, in its parts; keys and nonce are hexadecimal text.
 #[derive(Deserialize)]
@@ -103,7 +103,7 @@ fn parse(text: &str, policy: SecurityPolicy) -> Result<KeyDelivery, String> {
 }
 
 impl Written {
-    fn keys(&self, policy: SecurityPolicy) -> Result<Keys, String> {
+    fn keys(&self, policy: SecurityPolicy) -> Result<TokenKeys, String> {
         if self.security_token_id == 0 {
             return Err("0 is not a valid securityTokenId".to_owned());
         }
@@ -123,7 +123,7 @@ impl Written {
             let bytes = bytes(text).ok_or_else(|| format!("{name} is not hexadecimal"))?;
             data.extend(bytes);
         }
-        Keys::from_bytes(policy, &data).map_err(|error| error.to_string())
+        TokenKeys::from_bytes(policy, &data).map_err(|error| error.to_string())
     }
 }
 

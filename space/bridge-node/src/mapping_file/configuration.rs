@@ -12,8 +12,8 @@ use tokio::time::{MissedTickBehavior, interval};
 use tracing::info;
 use type_files::read_text_file;
 
-use super::look::{Stamp, stamp};
-use super::{About, LOOK, MappingFile, Running, seconds, shortened};
+use super::look::{FileStamp, stamp};
+use super::{About, LOOK, MappingFile, RunningMapping, seconds, shortened};
 
 /// The configuration file of a program without a mapping.
 ///
@@ -64,7 +64,7 @@ impl MappingFile {
         mut self,
         configuration: Arc<dyn ConfigurationFile>,
         mut hangup: Signal,
-        shells: watch::Sender<Running>,
+        shells: watch::Sender<RunningMapping>,
     ) {
         let mut polls = interval(LOOK);
         polls.set_missed_tick_behavior(MissedTickBehavior::Delay);
@@ -136,9 +136,9 @@ impl MappingFile {
 #[derive(Debug, Clone, Copy, Default)]
 struct Polled {
     /// The stamp of the file at its last reading.
-    read: Option<Stamp>,
+    read: Option<FileStamp>,
     /// The stamp of the file at the last poll.
-    seen: Option<Stamp>,
+    seen: Option<FileStamp>,
 }
 
 /// The parameters of a poll.

@@ -14,14 +14,14 @@ use super::{Known, NodeSetReader, Reading, read};
 
 /// The files and folders that were read or looked for, each with its stamp from before the reading.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub(super) struct Seen {
+pub(super) struct SeenFiles {
     /// The mapping and its includes.
     pub(super) mapping: Stamps,
     /// The files and folders at and below the `type_paths`.
     pub(super) types: Stamps,
 }
 
-impl Seen {
+impl SeenFiles {
     /// Returns whether any definition file or folder of this turn has changed.
     fn types_differ(&self, turn: usize) -> bool {
         let turns = self.types.len().div_ceil(LOOKED_AT_ONCE).max(1);
@@ -32,11 +32,11 @@ impl Seen {
 }
 
 /// The stamps of files; `None` for a missing file.
-pub(super) type Stamps = BTreeMap<PathBuf, Option<Stamp>>;
+pub(super) type Stamps = BTreeMap<PathBuf, Option<FileStamp>>;
 
 /// The properties that change when a file is written or replaced, or when the link to it changes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct Stamp {
+pub(super) struct FileStamp {
     device: u64,
     inode: u64,
     pub(super) len: u64,
@@ -44,9 +44,9 @@ pub(super) struct Stamp {
     changed: (i64, i64),
 }
 
-pub(super) fn stamp(file: &Path) -> Option<Stamp> {
+pub(super) fn stamp(file: &Path) -> Option<FileStamp> {
     let found = std::fs::metadata(file).ok()?;
-    Some(Stamp {
+    Some(FileStamp {
         device: found.dev(),
         inode: found.ino(),
         len: found.len(),
@@ -79,7 +79,7 @@ pub(super) struct Before {
 
 impl Before {
     /// Returns whether the last poll found all files as they were read.
-    pub(super) fn is_unchanged(&self, files: &Seen) -> bool {
+    pub(super) fn is_unchanged(&self, files: &SeenFiles) -> bool {
         self.mapping.as_ref() == Some(&files.mapping) && self.types.is_none()
     }
 }
@@ -95,11 +95,11 @@ pub(super) struct Looked {
 
 /// The parameters of a poll.
 #[derive(Debug)]
-pub(super) struct Look {
+pub(super) struct PollParameters {
     pub(super) file: PathBuf,
     pub(super) nodesets: Option<NodeSetReader>,
     /// The stamps from the last reading.
-    pub(super) files: Arc<Seen>,
+    pub(super) files: Arc<SeenFiles>,
     pub(super) before: Before,
     /// The number of the poll.
     pub(super) turn: usize,
@@ -113,7 +113,7 @@ pub(super) struct Look {
     pub(super) known: Arc<Known>,
 }
 
-impl Look {
+impl PollParameters {
     /// Runs [`take`](Self::take) in another thread, so that no sample waits for a disk.
     pub(super) async fn take_elsewhere(self) -> Looked {
         let mut looking = tokio::task::spawn_blocking(|| self.take());
@@ -204,7 +204,7 @@ mod tests {
     /// A mapping with definitions, in a temporary folder, for repeated polls.
     struct Looks {
         folder: PathBuf,
-        files: Arc<Seen>,
+        files: Arc<SeenFiles>,
         before: Before,
         turn: usize,
     }
@@ -235,7 +235,7 @@ mod tests {
 
         fn look(&mut self, asked: bool) -> Looked {
             self.turn += 1;
-            let look = Look {
+            let look = PollParameters {
                 file: self.folder.join("cell.yaml"),
                 nodesets: None,
                 files: Arc::clone(&self.files),

@@ -81,7 +81,7 @@ const STANDARD: [&str; 3] = ["std_srvs/Trigger", "std_srvs/SetBool", "std_srvs/E
 #[cfg(test)]
 mod tests {
     use bridge_core::{CallField, CallRole};
-    use messages::{Dialect, Registry};
+    use messages::{Dialect, TypeRegistry};
     use uadp::BuiltinType;
 
     use super::*;
@@ -105,7 +105,7 @@ mod tests {
     }
 
     fn chosen(call: &CallDescription, mapped: Option<&str>) -> Result<String, String> {
-        let registry = Registry::bundle(Dialect::Ros2);
+        let registry = TypeRegistry::bundle(Dialect::Ros2);
         let mapped = mapped.map(|name| name.parse().unwrap());
         let find = |name: &TypeName| Ok(registry.service(name)?);
         call_type(call, (mapped.as_ref(), &CallMap::default()), find)

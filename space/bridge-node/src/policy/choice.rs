@@ -1,6 +1,6 @@
 //! Chooses the type in which the values of a topic of another space are written.
 
-use bridge_core::Described;
+use bridge_core::TopicMetaData;
 use messages::{MessageType, Selection, TypeName};
 
 /// The known facts about the type of one topic of another space: from the mapping, from the writer
@@ -11,7 +11,7 @@ pub struct Choice {
     mapped: Option<(TypeName, Selection)>,
     // Boxed, because a mapped value without a received description has neither.
     /// The description by the writer of the value.
-    described: Option<Box<Described>>,
+    described: Option<Box<TopicMetaData>>,
     /// The described type, if it is known here and has the described fields, and the selection that
     /// the value is.
     learned: Option<Box<(TypeName, Selection)>>,
@@ -23,7 +23,7 @@ pub struct Choice {
 #[derive(Debug, Clone, Default)]
 pub struct Word {
     /// The description by the writer.
-    pub described: Option<Described>,
+    pub described: Option<TopicMetaData>,
     /// The described type and the selection that the value is, if both are known here.
     pub learned: Option<(TypeName, Selection)>,
     /// The type that carries such a value and nothing else.
@@ -32,7 +32,7 @@ pub struct Word {
 
 /// The action of a port after new facts.
 #[derive(Debug, Clone, PartialEq)]
-pub enum Step {
+pub enum PortStep {
     /// No action: an open topic stays open.
     Stay,
     /// Opens the topic with the first known type of the [`candidates`](Choice::candidates).
@@ -110,7 +110,7 @@ impl Choice {
     /// whether it has a local subscriber. A type with a subscriber stays, even
     /// if the value is another part of it. Without facts nothing changes.
     #[must_use]
-    pub fn hear(&mut self, word: Word, open: Option<(&TypeName, bool)>) -> Step {
+    pub fn hear(&mut self, word: Word, open: Option<(&TypeName, bool)>) -> PortStep {
         let Word {
             described,
             learned,
@@ -121,28 +121,28 @@ impl Choice {
         let Some((written, subscribed)) = open else {
             self.standard = standard;
             self.learned = learned;
-            return Step::Open;
+            return PortStep::Open;
         };
         let other_type = learned.as_deref().is_some_and(|(name, _)| name != written);
         if self.mapped.is_some() || (subscribed && other_type) || learned.is_none() {
-            return Step::Stay;
+            return PortStep::Stay;
         }
         let before = self.selection(written);
         self.learned = learned;
         let selection = self.selection(written);
         if other_type {
-            Step::Open
+            PortStep::Open
         } else if selection != before {
-            Step::Select(selection)
+            PortStep::Select(selection)
         } else {
-            Step::Stay
+            PortStep::Stay
         }
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use messages::{Dialect, Registry};
+    use messages::{Dialect, TypeRegistry};
 
     use super::*;
 
@@ -169,7 +169,7 @@ mod tests {
             Some(("a_msgs/Turns", Selection::Whole)),
             Some("std_msgs/Float64"),
         );
-        assert_eq!(choice.hear(heard, None), Step::Open);
+        assert_eq!(choice.hear(heard, None), PortStep::Open);
         assert_eq!(
             names(&choice.candidates([])),
             ["a_msgs/Turns", "std_msgs/Float64"]
@@ -185,11 +185,11 @@ mod tests {
     fn the_mapping_decides_before_everybody() {
         let mut choice = Choice::new(Some((name("std_msgs/Bool"), Selection::Whole)));
         let heard = || word(Some(("a_msgs/Turns", Selection::Whole)), None);
-        assert_eq!(choice.hear(heard(), None), Step::Open);
+        assert_eq!(choice.hear(heard(), None), PortStep::Open);
         let asked_for = [name("std_msgs/String")];
         assert_eq!(names(&choice.candidates(asked_for)), ["std_msgs/Bool"]);
         let open = name("std_msgs/Bool");
-        assert_eq!(choice.hear(heard(), Some((&open, false))), Step::Stay);
+        assert_eq!(choice.hear(heard(), Some((&open, false))), PortStep::Stay);
     }
 
     #[test]
@@ -199,28 +199,28 @@ mod tests {
         let field = || Selection::Field("turns".to_owned());
         let other = || word(Some(("a_msgs/Turns", field())), None);
         let step = choice.hear(word(None, Some("std_msgs/Float64")), None);
-        assert_eq!(step, Step::Open);
-        assert_eq!(choice.hear(other(), Some((&open, true))), Step::Stay);
+        assert_eq!(step, PortStep::Open);
+        assert_eq!(choice.hear(other(), Some((&open, true))), PortStep::Stay);
         assert_eq!(names(&choice.candidates([])), ["std_msgs/Float64"]);
         // Without facts nothing changes.
         assert_eq!(
             choice.hear(Word::default(), Some((&open, false))),
-            Step::Stay
+            PortStep::Stay
         );
-        assert_eq!(choice.hear(other(), Some((&open, false))), Step::Open);
+        assert_eq!(choice.hear(other(), Some((&open, false))), PortStep::Open);
         // The same type with another selection.
         let open = name("a_msgs/Turns");
-        assert_eq!(choice.hear(other(), Some((&open, true))), Step::Stay);
+        assert_eq!(choice.hear(other(), Some((&open, true))), PortStep::Stay);
         let whole = || word(Some(("a_msgs/Turns", Selection::Whole)), None);
         let step = choice.hear(whole(), Some((&open, true)));
-        assert_eq!(step, Step::Select(Selection::Whole));
-        assert_eq!(choice.hear(whole(), Some((&open, true))), Step::Stay);
+        assert_eq!(step, PortStep::Select(Selection::Whole));
+        assert_eq!(choice.hear(whole(), Some((&open, true))), PortStep::Stay);
     }
 
     #[test]
     fn a_message_of_one_field_gets_a_stamp_and_a_whole_one_keeps_its_own() {
         for dialect in [Dialect::Ros1, Dialect::Ros2] {
-            let imu = Registry::bundle(dialect)
+            let imu = TypeRegistry::bundle(dialect)
                 .get(&name("sensor_msgs/Imu"))
                 .unwrap();
             let stamps = |selection: Selection| {

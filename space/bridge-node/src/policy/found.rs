@@ -7,7 +7,7 @@ use super::Policy;
 
 /// The meaning in the space of a topic that the mapping does not name.
 #[derive(Debug, Clone, PartialEq)]
-pub enum Found {
+pub enum TopicMeaning {
     /// The name of the topic is a value of the own space. The value is the
     /// whole message, of any type.
     Named(TopicId),
@@ -25,16 +25,16 @@ impl Policy {
     /// Classifies a topic by its full name (`/ua_1_5_3`, `/turtle1/pose`) and its type, if that is
     /// known.
     #[must_use]
-    pub fn found(&self, ros_topic: &str, typed: Option<&TypeName>) -> Found {
+    pub fn found(&self, ros_topic: &str, typed: Option<&TypeName>) -> TopicMeaning {
         let name = ros_topic.strip_prefix('/').unwrap_or_default();
         match name.parse::<TopicId>() {
-            Ok(topic) if topic.space != self.own => Found::Nothing,
-            Ok(topic) if self.is_tied(topic) => Found::Tied(topic),
-            Ok(topic) => Found::Named(topic),
+            Ok(topic) if topic.space != self.own => TopicMeaning::Nothing,
+            Ok(topic) if self.is_tied(topic) => TopicMeaning::Tied(topic),
+            Ok(topic) => TopicMeaning::Named(topic),
             Err(_) => match self.mapping.matching(self.own, ros_topic, typed) {
-                Some(Ok(made)) => Found::Made(made),
-                Some(Err(fault)) => Found::Fault(fault),
-                None => Found::Nothing,
+                Some(Ok(made)) => TopicMeaning::Made(made),
+                Some(Err(fault)) => TopicMeaning::Fault(fault),
+                None => TopicMeaning::Nothing,
             },
         }
     }
@@ -71,7 +71,7 @@ patterns:
   - {topics: "/robot/*", origin: 1, node: "ns=5;i=10{1}", name: "Robot{1}", type: std_msgs/Float64}
 "#;
 
-    fn found(ros_topic: &str, typed: Option<&str>) -> Found {
+    fn found(ros_topic: &str, typed: Option<&str>) -> TopicMeaning {
         let mapping = Mapping::from_yaml(CELL, "cell.yaml");
         let policy = Policy::new(SpaceId::ROS1, Arc::new(mapping.mapping.unwrap()));
         policy.found(ros_topic, typed.map(|name| name.parse().unwrap()).as_ref())
@@ -80,21 +80,37 @@ patterns:
     #[test]
     fn a_topic_with_the_name_of_a_value_of_ours_is_that_value() {
         let topic = |text: &str| text.parse::<TopicId>().unwrap();
-        assert_eq!(found("/ua_1_9_9", None), Found::Named(topic("ua_1_9_9")));
+        assert_eq!(
+            found("/ua_1_9_9", None),
+            TopicMeaning::Named(topic("ua_1_9_9"))
+        );
         // The mapping declares the value without a source.
-        assert_eq!(found("/ua_1_5_12", None), Found::Named(topic("ua_1_5_12")));
-        assert_eq!(found("/ua_1_5_11", None), Found::Tied(topic("ua_1_5_11")));
-        assert_eq!(found("/ua_2_9_9", None), Found::Nothing);
-        assert_eq!(found("/other", None), Found::Nothing);
+        assert_eq!(
+            found("/ua_1_5_12", None),
+            TopicMeaning::Named(topic("ua_1_5_12"))
+        );
+        assert_eq!(
+            found("/ua_1_5_11", None),
+            TopicMeaning::Tied(topic("ua_1_5_11"))
+        );
+        assert_eq!(found("/ua_2_9_9", None), TopicMeaning::Nothing);
+        assert_eq!(found("/other", None), TopicMeaning::Nothing);
     }
 
     #[test]
     fn a_pattern_makes_values_of_topics_of_its_type() {
-        let Found::Made(made) = found("/robot/7", Some("std_msgs/Float64")) else {
+        let TopicMeaning::Made(made) = found("/robot/7", Some("std_msgs/Float64")) else {
             panic!("the pattern is about it");
         };
         assert_eq!(made.node.to_string(), "ns=5;i=107");
-        assert_eq!(found("/robot/7", Some("std_msgs/String")), Found::Nothing);
-        assert_eq!(found("/turn", None), Found::Nothing, "it has a variable");
+        assert_eq!(
+            found("/robot/7", Some("std_msgs/String")),
+            TopicMeaning::Nothing
+        );
+        assert_eq!(
+            found("/turn", None),
+            TopicMeaning::Nothing,
+            "it has a variable"
+        );
     }
 }

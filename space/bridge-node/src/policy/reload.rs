@@ -144,7 +144,7 @@ mod tests {
     use std::convert::Infallible;
 
     use mappings::{Mapping, SpaceId};
-    use messages::{Dialect, Registry};
+    use messages::{Dialect, TypeRegistry};
 
     use super::*;
 
@@ -226,7 +226,7 @@ variables:
 
     #[test]
     fn a_value_that_is_taken_up_hears_what_was_latched_before() {
-        let bool_type = Registry::bundle(Dialect::Ros1).get(&"std_msgs/Bool".parse().unwrap());
+        let bool_type = TypeRegistry::bundle(Dialect::Ros1).get(&"std_msgs/Bool".parse().unwrap());
         let (message, received) = (Bytes::from_static(b"\x01"), Timestamp::from_unix_nanos(7));
         let latched = [(PublisherKey(3), &message)];
         let value = (topic("ua_1_5_1"), Selection::Whole);

@@ -6,9 +6,9 @@ use tracing::warn;
 
 /// The messages already logged. Bounded, because any node in a graph can cause messages.
 #[derive(Debug, Default)]
-pub struct Told(BTreeSet<(String, &'static str)>);
+pub struct LoggedMessages(BTreeSet<(String, &'static str)>);
 
-impl Told {
+impl LoggedMessages {
     /// Logs a message about a topic the first time it occurs; returns whether it was logged. `what`
     /// is the kind of the message.
     pub fn once(
@@ -49,7 +49,7 @@ mod tests {
 
     #[test]
     fn each_kind_is_told_once_of_a_topic_until_it_is_forgotten() {
-        let mut told = Told::default();
+        let mut told = LoggedMessages::default();
         let text = String::new;
         assert!(told.once("/a", "type", text));
         assert!(!told.once("/a", "type", || panic!("it is not made in vain")));
@@ -62,7 +62,7 @@ mod tests {
 
     #[test]
     fn what_a_stranger_makes_up_ends() {
-        let mut told = Told::default();
+        let mut told = LoggedMessages::default();
         let topics = (0..2 * MAX_TOLD).map(|n| format!("/made_up{n}"));
         let lines = topics.filter(|topic| told.once(topic, "type", String::new));
         assert_eq!(lines.count(), MAX_TOLD);

@@ -155,7 +155,7 @@ mod tests {
     use std::net::SocketAddr;
     use std::sync::Arc;
 
-    use bridge_core::{Local, Settings};
+    use bridge_core::{Local, RouterSettings};
     use uadp::{
         DataSetHeader, GroupHeader, NetworkHeader, NetworkMessageEncoder, PublisherId, Scalar,
     };
@@ -175,7 +175,7 @@ calls:
     fn router(own: SpaceId) -> Router {
         let checked = Mapping::from_yaml(CELL, "cell.yaml");
         let mapping = checked.mapping.unwrap();
-        let settings = Settings {
+        let settings = RouterSettings {
             own,
             local: Local::Fields,
             source: None,

@@ -8,7 +8,7 @@ use bytes::Bytes;
 use mappings::TopicId;
 use messages::ServiceType;
 use tracing::{debug, info, warn};
-use transport::Outgoing;
+use transport::OutgoingMessage;
 
 use super::{Shell, not_sent};
 use crate::clock::now;
@@ -94,9 +94,9 @@ impl<P: Port> Shell<P> {
 
     /// Sends a request or a response.
     pub(super) fn send_action(&mut self, topic: TopicId, bytes: Vec<u8>) {
-        let message = Outgoing {
+        let message = OutgoingMessage {
             within: self.carrier.within(),
-            ..Outgoing::new(&bytes)
+            ..OutgoingMessage::new(&bytes)
         };
         if let Err(error) = self.send(&message) {
             self.router
@@ -144,8 +144,8 @@ impl<P: Port> Shell<P> {
     }
 
     /// Lets the port execute a request.
-    pub(super) fn execute(&mut self, execution: bridge_core::Execution) {
-        let bridge_core::Execution {
+    pub(super) fn execute(&mut self, execution: bridge_core::CallExecution) {
+        let bridge_core::CallExecution {
             id,
             topic,
             request,

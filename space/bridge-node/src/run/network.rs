@@ -2,7 +2,7 @@
 
 use bridge_core::{Forwarding, Reason, Relay};
 use tracing::{info, warn};
-use transport::{Arrival, Carrier, CarrierChange, Senders};
+use transport::{Carrier, CarrierChange, NetworkArrival, Senders};
 
 use super::Shell;
 use crate::carrier::{limit, link, relay, rules};
@@ -69,7 +69,7 @@ impl<P: Port> Shell<P> {
 /// Returns the properties of the broker by which the last message was received, `None` if it was
 /// not received from a broker, and its forwarding.
 pub(super) fn arrival(carrier: &dyn Carrier) -> (Option<Relay>, Forwarding) {
-    let Arrival {
+    let NetworkArrival {
         senders,
         within,
         is_forwarded,

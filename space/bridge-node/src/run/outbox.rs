@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use bridge_core::{Reason, Redundancy};
 use mappings::TopicId;
-use transport::{Outgoing, SendError};
+use transport::{OutgoingMessage, SendError};
 
 use super::{Shell, not_sent};
 use crate::port::Port;
@@ -13,7 +13,7 @@ use crate::port::Port;
 /// The datagrams of the Router that wait for the next output that is no datagram, or for the end of
 /// the drain.
 #[derive(Debug, Default)]
-pub(crate) struct Outbox(Vec<Parcel>);
+pub(crate) struct DatagramOutbox(Vec<Parcel>);
 
 /// A datagram of the Router, with the topics of its messages.
 #[derive(Debug)]
@@ -27,8 +27,8 @@ pub(super) struct Parcel {
 }
 
 impl Parcel {
-    fn message(&self) -> Outgoing<'_> {
-        Outgoing {
+    fn message(&self) -> OutgoingMessage<'_> {
+        OutgoingMessage {
             bytes: &self.bytes,
             replaceable: self.replaceable,
             command: self.command,
@@ -101,7 +101,7 @@ impl<P: Port> Shell<P> {
             }
             _ if self.dry_run => BTreeMap::new(),
             many => {
-                let messages: Vec<Outgoing<'_>> = many.iter().map(Parcel::message).collect();
+                let messages: Vec<OutgoingMessage<'_>> = many.iter().map(Parcel::message).collect();
                 self.carrier.try_send_all(&messages)
             }
         }

@@ -3,10 +3,10 @@
 use std::net::SocketAddr;
 use std::time::Duration;
 
-use bridge_core::{LocalSide, MuteCause, Rank, RoleChange, TakeoverCause};
+use bridge_core::{LocalSide, MuteCause, RedundancyRank, RoleChange, TakeoverCause};
 use mappings::Mapping;
 use tracing::{error, info, warn};
-use transport::{Held, Outgoing};
+use transport::{HeldInterfaces, OutgoingMessage};
 
 use super::Shell;
 use crate::clock::now;
@@ -32,7 +32,7 @@ impl<P: Port> Shell<P> {
 
     pub(super) fn send_heartbeat(&mut self, bytes: Vec<u8>) {
         let now = now();
-        let is_sent = self.send(&Outgoing::new(&bytes)).is_ok();
+        let is_sent = self.send(&OutgoingMessage::new(&bytes)).is_ok();
         self.router.heartbeat_sent(is_sent, now);
         self.router.recycle(bytes);
     }
@@ -108,7 +108,7 @@ impl<P: Port> Shell<P> {
         let is_held = self
             .held
             .as_ref()
-            .is_none_or(|held| Held::lost(held).is_none());
+            .is_none_or(|held| HeldInterfaces::lost(held).is_none());
         let side = match (is_held, self.port.hindrance()) {
             (false, _) => LocalSide::NoLink,
             (true, Some(_)) => LocalSide::Silent,
@@ -147,7 +147,7 @@ fn tell_active(rank: Option<u8>, (cause, epoch, gap): (TakeoverCause, u32, Optio
     );
 }
 
-fn tell_standby(rank: Option<u8>, (active, from): (Rank, SocketAddr)) {
+fn tell_standby(rank: Option<u8>, (active, from): (RedundancyRank, SocketAddr)) {
     info!(rank, active_rank = active.get(), active = %from, "this bridge is a standby");
 }
 
@@ -159,7 +159,7 @@ fn tell_muted(rank: Option<u8>, cause: MuteCause) {
     );
 }
 
-fn tell_rival(rank: Option<u8>, (other, from): (Rank, SocketAddr)) {
+fn tell_rival(rank: Option<u8>, (other, from): (RedundancyRank, SocketAddr)) {
     warn!(
         rank,
         other_rank = other.get(),

@@ -44,12 +44,12 @@ pub struct CallFault {
     /// service.
     pub may_pass: bool,
     /// Whether the service ran.
-    pub ran: Ran,
+    pub ran: MayHaveRun,
 }
 
 /// Whether a service ran although there is no response.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Ran {
+pub enum MayHaveRun {
     /// The service never received the request.
     No,
     /// The service received the request; its execution is unknown.
@@ -60,16 +60,16 @@ pub enum Ran {
 
 /// The outcome of a call.
 #[derive(Debug)]
-pub struct Outcome {
+pub struct ServiceOutcome {
     /// The source of the call.
-    pub(super) of: Source,
+    pub(super) of: CallCause,
     /// The response, or the reason why there is none.
     pub(super) result: Result<Bytes, String>,
 }
 
 /// The cause of calls.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub(super) enum Source {
+pub(super) enum CallCause {
     /// The values of a topic.
     Value(TopicId),
     /// A periodic poll, by its number.
@@ -78,16 +78,20 @@ pub(super) enum Source {
 
 /// Calls a service and reports the outcomes.
 #[derive(Debug)]
-pub(super) struct Caller<C> {
+pub(super) struct ServiceCallTask<C> {
     client: C,
-    of: Source,
-    report: mpsc::Sender<Outcome>,
+    of: CallCause,
+    report: mpsc::Sender<ServiceOutcome>,
     /// Whether the last call failed.
     failing: bool,
 }
 
-impl<C: ServiceCall> Caller<C> {
-    pub(super) const fn new(client: C, of: Source, report: mpsc::Sender<Outcome>) -> Self {
+impl<C: ServiceCall> ServiceCallTask<C> {
+    pub(super) const fn new(
+        client: C,
+        of: CallCause,
+        report: mpsc::Sender<ServiceOutcome>,
+    ) -> Self {
         Self {
             client,
             of,
@@ -147,7 +151,10 @@ impl<C: ServiceCall> Caller<C> {
             }
         };
         match &answer {
-            Err(CallFault { ran: Ran::No, .. }) => pending.refused(number),
+            Err(CallFault {
+                ran: MayHaveRun::No,
+                ..
+            }) => pending.refused(number),
             Ok(_) | Err(_) => pending.took(number),
         }
         self.report(answer, insist).await
@@ -169,7 +176,7 @@ impl<C: ServiceCall> Caller<C> {
                 "the service responds again"
             );
         }
-        let outcome = Outcome {
+        let outcome = ServiceOutcome {
             of: self.of,
             result,
         };

@@ -3,7 +3,7 @@
 use std::fmt::Display;
 use std::time::{Duration, Instant};
 
-use bridge_core::{Role, Router};
+use bridge_core::{RedundancyRole, Router};
 use serde::Serialize;
 
 /// The role of the program among the redundant bridges of its space.
@@ -86,7 +86,13 @@ impl RedundancyStatus {
 
     /// Passes the name, the labels and the value of each figure to `line`.
     pub(super) fn figures(&self, own: &str, line: &mut impl FnMut(&str, &str, &dyn Display)) {
-        for role in [Role::Starting, Role::Standby, Role::Active].map(Role::label) {
+        for role in [
+            RedundancyRole::Starting,
+            RedundancyRole::Standby,
+            RedundancyRole::Active,
+        ]
+        .map(RedundancyRole::label)
+        {
             let labels = format!("{own},role=\"{role}\"");
             line("redundancy_role", &labels, &u8::from(role == self.role));
         }

@@ -2,14 +2,14 @@
 
 use std::net::SocketAddr;
 
-use bridge_core::{AskId, Local, Settings};
+use bridge_core::{AskId, Local, RouterSettings};
 use uadp::{DataSetHeader, GroupHeader, NetworkHeader, NetworkMessageEncoder, PublisherId, Scalar};
 
 use super::*;
 
 #[test]
 fn a_topic_that_changes_hands_stands_in_both_pages() {
-    let settings = Settings {
+    let settings = RouterSettings {
         own: SpaceId::ROS1,
         local: Local::Fields,
         source: None,
@@ -42,7 +42,7 @@ fn a_topic_that_changes_hands_stands_in_both_pages() {
         },
     };
     let about = About::default();
-    let status = Status::of(("bridge", SpaceId::ROS1), &router, (&about, &[]), ready);
+    let status = StatusSnapshot::of(("bridge", SpaceId::ROS1), &router, (&about, &[]), ready);
     let line = "ua_sender_changed_total{program=\"bridge\",space=\"1\",topic=\"ua_2_5_10\"} 1\n";
     assert!(
         status.prometheus().contains(line),
@@ -60,7 +60,7 @@ fn the_names_of_a_mapped_topic_are_in_both_pages() {
     let mapping = mappings::Mapping::from_yaml(text, "cell.yaml")
         .mapping
         .unwrap();
-    let settings = Settings {
+    let settings = RouterSettings {
         own: SpaceId::ROS1,
         local: Local::Fields,
         source: None,
@@ -79,7 +79,7 @@ fn the_names_of_a_mapped_topic_are_in_both_pages() {
         },
     };
     let about = About::default();
-    let status = Status::of(("bridge", SpaceId::ROS1), &router, (&about, &[]), ready);
+    let status = StatusSnapshot::of(("bridge", SpaceId::ROS1), &router, (&about, &[]), ready);
     let line = "ua_topic_info{program=\"bridge\",space=\"1\",topic=\"ua_1_2_10\",\
                 name=\"Arm \\\"left\\\"\",ros_topics=\"1 /joint_states\"} 1\n";
     let text = status.prometheus();
@@ -96,7 +96,7 @@ fn the_names_of_a_mapped_topic_are_in_both_pages() {
 
 #[test]
 fn what_became_of_calls_stands_in_both_pages() {
-    let settings = Settings {
+    let settings = RouterSettings {
         own: SpaceId::ROS1,
         local: Local::Fields,
         source: None,
@@ -114,7 +114,7 @@ fn what_became_of_calls_stands_in_both_pages() {
         },
     };
     let about = About::default();
-    let status = Status::of(("bridge", SpaceId::ROS1), &router, (&about, &[]), ready);
+    let status = StatusSnapshot::of(("bridge", SpaceId::ROS1), &router, (&about, &[]), ready);
     let own = "program=\"bridge\",space=\"1\",call=\"ua_0_7_105\"";
     let text = status.prometheus();
     for line in [

@@ -5,7 +5,8 @@ use std::collections::BTreeMap;
 use mappings::TopicId;
 use serde_json::{Value, json};
 use uadp::discovery::{
-    Announced, Announcement, ConfigurationVersion, DataSetMetaDataType, FieldMetaData, List,
+    AnnouncedContent, Announcement, ConfigurationVersion, DataSetMetaDataType, FieldMetaData,
+    WireArray,
 };
 use uadp::{BuiltinType, NetworkMessage, NodeId, PublisherId, SecurityHeader, StatusCode};
 
@@ -83,11 +84,11 @@ impl Descriptions {
             .collect();
         let announcement = Announcement {
             sequence_number: 0,
-            announced: Announced::DataSetMetaData {
+            announced: AnnouncedContent::DataSetMetaData {
                 writer_id: writer,
                 meta_data: DataSetMetaDataType {
                     name: Some(name.trim_end()),
-                    fields: List::new(&meta_data),
+                    fields: WireArray::new(&meta_data),
                     configuration_version: ConfigurationVersion {
                         major: number("MajorVersion"),
                         minor: number("MinorVersion"),
@@ -155,7 +156,7 @@ fn meta_data<'a>(message: &NetworkMessage<'a>) -> Option<(WriterIds, DataSetMeta
         return None;
     }
     let announced = Announcement::decode(message).ok()?.announced;
-    let Announced::DataSetMetaData {
+    let AnnouncedContent::DataSetMetaData {
         meta_data,
         status: StatusCode::GOOD,
         ..

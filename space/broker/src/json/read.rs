@@ -1,10 +1,10 @@
 //! Received JSON messages, of every layout and encoding.
 
-use json_values::{FieldValue, iso_time};
+use json_values::{JsonFieldValue, iso_time};
 use serde_json::{Map, Value};
 use uadp::discovery::{ConnectionState, CyclicStatus};
 use uadp::{
-    DataSetHeader, DateTime, Encoded, GroupHeader, NetworkHeader, NetworkMessageEncoder,
+    DataSetHeader, DateTime, GroupHeader, Nested, NetworkHeader, NetworkMessageEncoder,
     PublisherId, Variant,
 };
 
@@ -219,7 +219,7 @@ fn frame(
     for field in fields {
         match field {
             Some(bytes) => {
-                let value = Encoded::<Variant<'_>>::new(bytes).ok()?.get().ok()?;
+                let value = Nested::<Variant<'_>>::new(bytes).ok()?.get().ok()?;
                 frame.variant(&value).ok()?;
             }
             None => frame.null().ok()?,
@@ -236,7 +236,7 @@ fn delta(
     let mut frame = encoder.delta_frame(header).ok()?;
     for (field, index) in fields.iter().zip(0..) {
         if let Some(bytes) = field {
-            let value = Encoded::<Variant<'_>>::new(bytes).ok()?.get().ok()?;
+            let value = Nested::<Variant<'_>>::new(bytes).ok()?.get().ok()?;
             frame.field(index).ok()?.variant(&value).ok()?;
         }
     }
@@ -260,11 +260,11 @@ fn variant(json: &Value, field: Option<&DataSetField>) -> Result<Vec<u8>, &'stat
                 list.iter().filter_map(number).collect::<Vec<u32>>()
             });
             let is_matrix = dimensions.as_ref().is_some_and(|of| of.len() > 1);
-            return encoded(FieldValue {
+            return encoded(JsonFieldValue {
                 ua_type: Some(kind.ok_or("malformed_json")?),
                 value: value.cloned(),
                 dimensions: dimensions.filter(|_| is_matrix),
-                ..FieldValue::default()
+                ..JsonFieldValue::default()
             });
         }
         // A DataValue of version 1.04, or of a stack that leaves the type out.
@@ -274,17 +274,17 @@ fn variant(json: &Value, field: Option<&DataSetField>) -> Result<Vec<u8>, &'stat
         }
     }
     let builtin = match (field.map(|field| field.builtin), json) {
-        (_, Value::Null) => return encoded(FieldValue::default()),
+        (_, Value::Null) => return encoded(JsonFieldValue::default()),
         (Some(Some(builtin)), _) => builtin,
         (_, Value::Bool(_)) => uadp::BuiltinType::Boolean,
         (_, Value::String(_)) => uadp::BuiltinType::String,
         // The type of a number or structure is unknown.
         _ => return Err("undescribed_json"),
     };
-    encoded(FieldValue {
+    encoded(JsonFieldValue {
         ua_type: Some(builtin.id()),
         value: Some(json.clone()),
-        ..FieldValue::default()
+        ..JsonFieldValue::default()
     })
 }
 
@@ -292,7 +292,7 @@ fn is_structure(field: &DataSetField) -> bool {
     field.builtin == Some(uadp::BuiltinType::ExtensionObject)
 }
 
-fn encoded(value: FieldValue) -> Result<Vec<u8>, &'static str> {
+fn encoded(value: JsonFieldValue) -> Result<Vec<u8>, &'static str> {
     json_values::variant_bytes(&value).map_err(|_| "wrong_json_value")
 }
 

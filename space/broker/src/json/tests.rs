@@ -2,7 +2,9 @@
 //! messages of other stacks in every layout.
 
 use serde_json::json;
-use uadp::discovery::{Announced, Announcement, DataSetMetaDataType, FieldMetaData, List};
+use uadp::discovery::{
+    AnnouncedContent, Announcement, DataSetMetaDataType, FieldMetaData, WireArray,
+};
 use uadp::{
     BuiltinType, DataSetHeader, GroupHeader, NetworkHeader, NetworkMessageEncoder, PublisherId,
     Scalar, SecurityHeader,
@@ -46,11 +48,11 @@ fn announcement() -> Vec<u8> {
     ];
     let announcement = Announcement {
         sequence_number: 1,
-        announced: Announced::DataSetMetaData {
+        announced: AnnouncedContent::DataSetMetaData {
             writer_id: 10,
             meta_data: DataSetMetaDataType {
                 name: Some("ua_1_2_10 arm"),
-                fields: List::new(&fields),
+                fields: WireArray::new(&fields),
                 ..DataSetMetaDataType::default()
             },
             status: StatusCode::GOOD,

@@ -4,22 +4,22 @@ use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD as BASE64;
 use serde_json::{Map, Value, json};
 use uadp::{
-    Array, DataValue, DecodeError, DiagnosticInfo, ExtensionBody, ExtensionObject, Identifier,
-    NodeId, QualifiedName, Scalar, StatusCode, Variant,
+    Array, DataValue, DecodeError, DiagnosticInfo, ExtensionBody, ExtensionObject, NodeId,
+    NodeIdValue, QualifiedName, Scalar, StatusCode, Variant,
 };
 
-use crate::field_value::{FieldValue, Status};
-use crate::structures::Structure;
+use crate::field_value::{JsonFieldValue, JsonStatus};
+use crate::structures::JsonStructure;
 use crate::{iso_time, node_ids, status};
 
 /// Shows a Variant with its type.
 ///
 /// # Errors
 /// The value cannot be decoded or encoded.
-pub fn show_variant(variant: &Variant<'_>) -> Result<FieldValue, DecodeError> {
-    let mut shown = FieldValue {
+pub fn show_variant(variant: &Variant<'_>) -> Result<JsonFieldValue, DecodeError> {
+    let mut shown = JsonFieldValue {
         ua_type: variant.builtin_type().map(uadp::BuiltinType::id),
-        ..FieldValue::default()
+        ..JsonFieldValue::default()
     };
     match variant {
         Variant::Null => {}
@@ -41,16 +41,16 @@ pub fn show_variant(variant: &Variant<'_>) -> Result<FieldValue, DecodeError> {
 ///
 /// # Errors
 /// The value cannot be decoded or encoded.
-pub fn show_data_value(data_value: &DataValue<'_>) -> Result<FieldValue, DecodeError> {
+pub fn show_data_value(data_value: &DataValue<'_>) -> Result<JsonFieldValue, DecodeError> {
     let value = match &data_value.value {
-        None => FieldValue::default(),
-        Some(Variant::Null) => FieldValue {
+        None => JsonFieldValue::default(),
+        Some(Variant::Null) => JsonFieldValue {
             ua_type: Some(0),
-            ..FieldValue::default()
+            ..JsonFieldValue::default()
         },
         Some(variant) => show_variant(variant)?,
     };
-    Ok(FieldValue {
+    Ok(JsonFieldValue {
         status: data_value.status.map(show_status),
         source_timestamp: data_value.source_timestamp.map(iso_time::of_date_time),
         source_picoseconds: data_value.source_picoseconds,
@@ -114,8 +114,8 @@ fn show_double(value: f64) -> Value {
     }
 }
 
-fn show_status(status: StatusCode) -> Status {
-    Status {
+fn show_status(status: StatusCode) -> JsonStatus {
+    JsonStatus {
         code: status.0,
         symbol: status::symbol(status).map(str::to_owned),
     }
@@ -147,12 +147,12 @@ fn show_extension_object(object: ExtensionObject<'_>) -> Value {
     }
 }
 
-fn known(encoding: NodeId<'_>) -> Option<&'static Structure> {
+fn known(encoding: NodeId<'_>) -> Option<&'static JsonStructure> {
     match encoding {
         NodeId {
             namespace: 0,
-            identifier: Identifier::Numeric(id),
-        } => Structure::by_encoding(id),
+            identifier: NodeIdValue::Numeric(id),
+        } => JsonStructure::by_encoding(id),
         _ => None,
     }
 }

@@ -5,15 +5,15 @@ use base64::engine::general_purpose::STANDARD as BASE64;
 use serde::Deserialize;
 use serde_json::{Map, Value};
 use uadp::{
-    Array, BuiltinType, DataValue, DiagnosticInfo, Encoded, ExtensionBody, ExtensionObject,
-    Identifier, LocalizedText, Matrix, NodeId, QualifiedName, Scalar, StatusCode, Variant,
+    Array, BuiltinType, DataValue, DiagnosticInfo, ExtensionBody, ExtensionObject, LocalizedText,
+    Matrix, Nested, NodeId, NodeIdValue, QualifiedName, Scalar, StatusCode, Variant,
 };
 
 use super::WrongValue;
-use crate::field_value::{FieldValue, Status};
+use crate::field_value::{JsonFieldValue, JsonStatus};
 use crate::iso_time;
 use crate::node_ids::{OwnedNodeId, parse_guid};
-use crate::structures::Structure;
+use crate::structures::JsonStructure;
 
 type Written = Result<(), WrongValue>;
 
@@ -21,7 +21,7 @@ type Written = Result<(), WrongValue>;
 ///
 /// # Errors
 /// The value cannot be decoded or encoded.
-pub fn variant_bytes(json: &FieldValue) -> Result<Vec<u8>, WrongValue> {
+pub fn variant_bytes(json: &JsonFieldValue) -> Result<Vec<u8>, WrongValue> {
     let quality = json.status.is_some()
         || json.source_timestamp.is_some()
         || json.source_picoseconds.is_some()
@@ -40,7 +40,7 @@ pub fn variant_bytes(json: &FieldValue) -> Result<Vec<u8>, WrongValue> {
 ///
 /// # Errors
 /// The value cannot be decoded or encoded.
-pub fn data_value_bytes(json: &FieldValue) -> Result<Vec<u8>, WrongValue> {
+pub fn data_value_bytes(json: &JsonFieldValue) -> Result<Vec<u8>, WrongValue> {
     let mut out = Vec::new();
     write_data_value(json, &mut out)?;
     Ok(out)
@@ -88,7 +88,7 @@ pub fn write_scalar(builtin: BuiltinType, json: &Value, out: &mut Vec<u8>) -> Wr
     }
 }
 
-fn write_variant(json: &FieldValue, out: &mut Vec<u8>) -> Written {
+fn write_variant(json: &JsonFieldValue, out: &mut Vec<u8>) -> Written {
     let value = json.value.as_ref().unwrap_or(&Value::Null);
     let builtin = match json.ua_type {
         None | Some(0) if value.is_null() => {
@@ -116,7 +116,7 @@ fn write_variant(json: &FieldValue, out: &mut Vec<u8>) -> Written {
 fn write_array(
     builtin: BuiltinType,
     elements: &[Value],
-    json: &FieldValue,
+    json: &JsonFieldValue,
     out: &mut Vec<u8>,
 ) -> Written {
     let mut bytes = Vec::new();
@@ -131,19 +131,19 @@ fn write_array(
     };
     let mut buffer = Vec::new();
     let encoded = match &json.dimensions {
-        None => Encoded::variant(&Variant::Array(array), &mut buffer)?,
+        None => Nested::variant(&Variant::Array(array), &mut buffer)?,
         Some(dimensions) => {
             let dimensions: Vec<_> = dimensions.iter().map(|size| size.to_le_bytes()).collect();
             let matrix = Matrix::new(array, &dimensions);
             let matrix = matrix.map_err(|wrong| WrongValue::from(wrong).at(".Dimensions"))?;
-            Encoded::variant(&Variant::Matrix(matrix), &mut buffer)?
+            Nested::variant(&Variant::Matrix(matrix), &mut buffer)?
         }
     };
     out.extend_from_slice(encoded.bytes());
     Ok(())
 }
 
-fn write_data_value(json: &FieldValue, out: &mut Vec<u8>) -> Written {
+fn write_data_value(json: &JsonFieldValue, out: &mut Vec<u8>) -> Written {
     let mut variant = Vec::new();
     if json.ua_type.is_some() || json.value.is_some() {
         write_variant(json, &mut variant)?;
@@ -151,7 +151,7 @@ fn write_data_value(json: &FieldValue, out: &mut Vec<u8>) -> Written {
     let value = if variant.is_empty() {
         None
     } else {
-        Some(Encoded::<Variant<'_>>::new(&variant)?.get()?)
+        Some(Nested::<Variant<'_>>::new(&variant)?.get()?)
     };
     let time = |text: &Option<String>, key: &str| match text.as_deref() {
         None => Ok(None),
@@ -169,7 +169,7 @@ fn write_data_value(json: &FieldValue, out: &mut Vec<u8>) -> Written {
         server_picoseconds: json.server_picoseconds,
     };
     let mut buffer = Vec::new();
-    out.extend_from_slice(Encoded::data_value(&data_value, &mut buffer)?.bytes());
+    out.extend_from_slice(Nested::data_value(&data_value, &mut buffer)?.bytes());
     Ok(())
 }
 
@@ -243,7 +243,7 @@ fn write_body(type_id: NodeId<'_>, encoding: u8, body: &Value, out: &mut Vec<u8>
     )
 }
 
-fn decoded_structure(object: &Map<String, Value>) -> Option<&'static Structure> {
+fn decoded_structure(object: &Map<String, Value>) -> Option<&'static JsonStructure> {
     if object.contains_key("UaEncoding") {
         return None;
     }
@@ -251,12 +251,12 @@ fn decoded_structure(object: &Map<String, Value>) -> Option<&'static Structure> 
 }
 
 /// Returns the known structure with this NodeId of its DataType.
-fn structure_named(data_type: &str) -> Option<&'static Structure> {
+fn structure_named(data_type: &str) -> Option<&'static JsonStructure> {
     match OwnedNodeId::parse(data_type)?.node_id()? {
         NodeId {
             namespace: 0,
-            identifier: Identifier::Numeric(id),
-        } => Structure::by_data_type(id),
+            identifier: NodeIdValue::Numeric(id),
+        } => JsonStructure::by_data_type(id),
         _ => None,
     }
 }
@@ -288,18 +288,18 @@ fn write_diagnostic_info(json: &Value, out: &mut Vec<u8>) -> Written {
         inner: if inner.is_empty() {
             None
         } else {
-            Some(Encoded::new(&inner)?)
+            Some(Nested::new(&inner)?)
         },
     };
     let mut buffer = Vec::new();
-    out.extend_from_slice(Encoded::diagnostic_info(&info, &mut buffer)?.bytes());
+    out.extend_from_slice(Nested::diagnostic_info(&info, &mut buffer)?.bytes());
     Ok(())
 }
 
 /// Appends a value as it is encoded after the encoding byte of a Variant.
 fn append(out: &mut Vec<u8>, scalar: Scalar<'_>) -> Written {
     let mut buffer = Vec::new();
-    let variant = Encoded::variant(&Variant::Scalar(scalar), &mut buffer)?;
+    let variant = Nested::variant(&Variant::Scalar(scalar), &mut buffer)?;
     out.extend_from_slice(variant.bytes().get(1..).unwrap_or_default());
     Ok(())
 }
@@ -381,7 +381,7 @@ fn status_code(json: &Value) -> Result<StatusCode, WrongValue> {
         };
     }
     let status =
-        Status::deserialize(json).map_err(|_| WrongValue::expected("{\"Code\": ...}", json))?;
+        JsonStatus::deserialize(json).map_err(|_| WrongValue::expected("{\"Code\": ...}", json))?;
     Ok(StatusCode(status.code))
 }
 
@@ -420,8 +420,8 @@ fn localized_text(json: &Value) -> Result<LocalizedText<'_>, WrongValue> {
     })
 }
 
-fn field_value(json: &Value) -> Result<FieldValue, WrongValue> {
-    FieldValue::deserialize(json).map_err(|error| WrongValue::new(error.to_string()))
+fn field_value(json: &Value) -> Result<JsonFieldValue, WrongValue> {
+    JsonFieldValue::deserialize(json).map_err(|error| WrongValue::new(error.to_string()))
 }
 
 fn check_keys(object: &Map<String, Value>, known: &[&str]) -> Written {

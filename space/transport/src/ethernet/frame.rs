@@ -55,7 +55,7 @@ impl FrameHeader {
 
 /// A received frame. The kernel has removed its tag.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct Frame<'a> {
+pub(super) struct EthernetFrame<'a> {
     pub(super) source: [u8; 6],
     /// The NetworkMessage. The smallest frames have up to 46 bytes, the last of which may be zeros
     /// of padding.
@@ -84,7 +84,7 @@ impl FrameFault {
     }
 }
 
-impl<'a> Frame<'a> {
+impl<'a> EthernetFrame<'a> {
     /// Decodes a frame for one of two addresses: the group, or the own address.
     pub(super) fn decode(bytes: &'a [u8], wanted: [[u8; 6]; 2]) -> Result<Self, FrameFault> {
         let short = FrameFault::Short;
@@ -174,17 +174,17 @@ mod tests {
     fn a_frame_for_the_group_or_the_host_is_received() {
         for to in [GROUP, OWN] {
             let bytes = [header(to, None), vec![1, 2, 3]].concat();
-            let frame = Frame {
+            let frame = EthernetFrame {
                 source: OTHER,
                 message: &[1, 2, 3],
             };
-            assert_eq!(Frame::decode(&bytes, [GROUP, OWN]), Ok(frame));
+            assert_eq!(EthernetFrame::decode(&bytes, [GROUP, OWN]), Ok(frame));
         }
     }
 
     #[test]
     fn frames_of_others_and_cut_frames_are_faults() {
-        let faulty = |bytes: &[u8]| Frame::decode(bytes, [GROUP, OWN]).err();
+        let faulty = |bytes: &[u8]| EthernetFrame::decode(bytes, [GROUP, OWN]).err();
         let to_other = [header(OTHER, None), vec![1]].concat();
         assert_eq!(faulty(&to_other), Some(FrameFault::OtherAddress));
         let mut other_type = [header(GROUP, None), vec![1]].concat();

@@ -39,7 +39,7 @@ impl Wire {
 }
 
 impl Carrier for Memory {
-    fn try_send(&mut self, message: &Outgoing<'_>) -> Result<(), SendError> {
+    fn try_send(&mut self, message: &OutgoingMessage<'_>) -> Result<(), SendError> {
         if self.refuses {
             return Err(SendError::Unreachable);
         }
@@ -137,8 +137,8 @@ fn sent(bytes: &[u8], port: u16) -> (Vec<u8>, u16) {
 #[test]
 fn everyone_receives_a_message_once() {
     let ([mut one, mut two], mut stranger, wire) = two_and_a_stranger();
-    one.try_send(&Outgoing::new(b"a")).unwrap();
-    let more = [Outgoing::new(b"b"), Outgoing::new(b"c")];
+    one.try_send(&OutgoingMessage::new(b"a")).unwrap();
+    let more = [OutgoingMessage::new(b"b"), OutgoingMessage::new(b"c")];
     assert!(two.try_send_all(&more).is_empty());
     wire.send(b"d", SocketAddr::from(([10, 0, 0, 9], 9)));
     // An own message that the network returns is left to the caller's loop rule.
@@ -158,9 +158,9 @@ fn everyone_receives_a_message_once() {
 fn a_message_that_the_network_refuses_reaches_nobody() {
     let ([mut one, mut two], mut stranger, _) = two_and_a_stranger();
     one.network.refuses = true;
-    let refused = one.try_send(&Outgoing::new(b"a"));
+    let refused = one.try_send(&OutgoingMessage::new(b"a"));
     assert_eq!(refused, Err(SendError::Unreachable));
-    let errors = one.try_send_all(&[Outgoing::new(b"b"), Outgoing::new(b"c")]);
+    let errors = one.try_send_all(&[OutgoingMessage::new(b"b"), OutgoingMessage::new(b"c")]);
     assert_eq!(errors.len(), 2);
     assert_eq!(
         (received(&mut two), received(&mut stranger)),
@@ -174,7 +174,7 @@ fn a_member_that_does_not_read_loses_its_own_messages_only_and_they_are_counted(
     let large = vec![7; 60_000];
     let fit = MOST_BYTES / large.len();
     for _ in 0..fit + 3 {
-        one.try_send(&Outgoing::new(&large)).unwrap();
+        one.try_send(&OutgoingMessage::new(&large)).unwrap();
     }
     assert_eq!((one.overflowed(), two.overflowed()), (0, 3));
     assert_eq!(two.overflowed(), 0);
@@ -186,7 +186,7 @@ fn a_member_that_does_not_read_loses_its_own_messages_only_and_they_are_counted(
         count += 1;
     }
     assert_eq!(count, fit);
-    one.try_send(&Outgoing::new(b"again")).unwrap();
+    one.try_send(&OutgoingMessage::new(b"again")).unwrap();
     assert_eq!(received(&mut two), [sent(b"again", 1)]);
 }
 
@@ -194,7 +194,7 @@ fn a_member_that_does_not_read_loses_its_own_messages_only_and_they_are_counted(
 fn neither_the_network_nor_the_process_keeps_the_other_waiting() {
     let ([mut one, mut two], _stranger, wire) = two_and_a_stranger();
     for _ in 0..10 {
-        one.try_send(&Outgoing::new(b"inside")).unwrap();
+        one.try_send(&OutgoingMessage::new(b"inside")).unwrap();
     }
     // The copies that the network returns.
     two.network.received.lock().unwrap().clear();
@@ -238,7 +238,7 @@ fn a_waiting_receiver_is_woken_by_another_thread() {
     let mut cx = Context::from_waker(&waker);
     assert!(two.poll_recv(&mut cx, &mut buffer).is_pending());
     std::thread::scope(|scope| {
-        scope.spawn(|| one.try_send(&Outgoing::new(b"a")).unwrap());
+        scope.spawn(|| one.try_send(&OutgoingMessage::new(b"a")).unwrap());
     });
     assert_eq!(wakes.0.load(Ordering::Relaxed), 1);
     let Poll::Ready(Ok(Received { length, from, .. })) = two.poll_recv(&mut cx, &mut buffer) else {
@@ -254,7 +254,7 @@ fn members_of_different_groups_do_not_meet() {
     let (hub, wire) = (ProcessHub::default(), Wire::default());
     let mut one = InProcess::new(&hub, wire.attach(1), group(4840));
     let mut other = InProcess::new(&hub, Wire::default().attach(2), group(4841));
-    one.try_send(&Outgoing::new(b"a")).unwrap();
+    one.try_send(&OutgoingMessage::new(b"a")).unwrap();
     assert_eq!(received(&mut other), []);
     assert!(other.network.companions.is_empty());
 }
@@ -264,7 +264,7 @@ fn a_sender_that_changes_or_leaves_is_followed() {
     let ([mut one, mut two], _stranger, wire) = two_and_a_stranger();
     one.network.sender.set_port(77);
     assert_eq!(one.follow(), None);
-    one.try_send(&Outgoing::new(b"new")).unwrap();
+    one.try_send(&OutgoingMessage::new(b"new")).unwrap();
     assert_eq!(received(&mut two), [sent(b"new", 77)]);
     // Another program of this host gets the previous port.
     wire.send(b"foreign", SocketAddr::from(([10, 0, 0, 1], 1)));

@@ -3,11 +3,11 @@ use std::time::{Duration, SystemTime};
 use super::*;
 use crate::carrier::{BUFFER, Carrier};
 
-fn on_loopback(address: &str) -> Options {
-    Options {
+fn on_loopback(address: &str) -> UdpOptions {
+    UdpOptions {
         interface: Some("127.0.0.1".into()),
         ttl: 0,
-        ..Options::new(address.parse().unwrap())
+        ..UdpOptions::new(address.parse().unwrap())
     }
 }
 
@@ -36,7 +36,7 @@ fn free_port() -> u16 {
 fn every_member_of_the_group_hears_a_datagram_with_its_sender() {
     run(async {
         let options = on_loopback(&format!("239.255.40.1:{}", free_port()));
-        let own = Options {
+        let own = UdpOptions {
             own: true,
             ..options.clone()
         };
@@ -120,7 +120,7 @@ fn a_port_that_is_not_shared_is_named() {
         let address = holder.local_addr().unwrap();
         let error = Udp::open(&on_loopback(&address.to_string())).unwrap_err();
         assert!(
-            matches!(&error, OpenError::PortTaken(at) if *at == address),
+            matches!(&error, UdpOpenError::PortTaken(at) if *at == address),
             "{error}"
         );
         assert!(
@@ -133,7 +133,7 @@ fn a_port_that_is_not_shared_is_named() {
 #[test]
 fn a_datagram_too_big_is_refused_and_the_next_one_goes() {
     run(async {
-        let options = Options {
+        let options = UdpOptions {
             own: true,
             ..on_loopback(&format!("239.255.40.3:{}", free_port()))
         };
@@ -186,7 +186,7 @@ fn own_datagrams_are_dropped_by_the_kernel_and_received_on_request() {
                 None => format!("127.0.0.1:{}", free_port()),
             };
             for own in [false, true] {
-                let options = Options {
+                let options = UdpOptions {
                     own,
                     interface: interface.clone(),
                     ..on_loopback(&address)
@@ -228,8 +228,11 @@ fn a_burst_is_received_in_order_and_the_datagram_behind_it_too() {
             // Small datagrams: all of them fit a receive buffer of the usual size.
             let datagrams = (0..burst).map(|n| vec![u8::try_from(n).unwrap(); n % 7]);
             let datagrams: Vec<Vec<u8>> = datagrams.collect();
-            let mut messages: Vec<_> = datagrams.iter().map(|of| Outgoing::new(of)).collect();
-            messages.push(Outgoing::new(b"end"));
+            let mut messages: Vec<_> = datagrams
+                .iter()
+                .map(|of| OutgoingMessage::new(of))
+                .collect();
+            messages.push(OutgoingMessage::new(b"end"));
             assert_eq!(sender.try_send_all(&messages), BTreeMap::new());
             assert_eq!(received(&mut receiver, sender.source()).await, datagrams);
         }
@@ -243,7 +246,7 @@ fn a_message_that_cannot_be_sent_is_reported_and_the_others_go() {
         let (sender, mut receiver) = (Udp::open(&options).unwrap(), Udp::open(&options).unwrap());
         let large = vec![0; 70_000];
         let messages = [&b"1"[..], &large, b"2", b"3", &large, b"end"];
-        let messages = messages.map(Outgoing::new);
+        let messages = messages.map(OutgoingMessage::new);
         let errors = sender.try_send_all(&messages);
         let expected = [(1, SendError::TooBig), (4, SendError::TooBig)];
         assert_eq!(errors, BTreeMap::from(expected));

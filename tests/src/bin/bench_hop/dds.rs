@@ -6,18 +6,18 @@ use std::time::Duration;
 use futures_util::StreamExt;
 use ros2_node::domain::{Domain, DomainOptions};
 use ros2_node::qos::Requested;
-use ros2_node::raw::Reader as RawReader;
+use ros2_node::raw::PayloadReader as RawReader;
 use tokio::runtime::Runtime;
 
 /// A reader of a topic of std_msgs/String in domain 2.
-pub(crate) struct Reader {
+pub(crate) struct DdsReader {
     // Declared before its domain, which is dropped last.
     reader: RawReader,
     runtime: Runtime,
     _domain: Domain,
 }
 
-impl Reader {
+impl DdsReader {
     pub(crate) fn new(topic: &str) -> Self {
         let runtime = tokio::runtime::Builder::new_current_thread()
             .enable_all()

@@ -15,7 +15,7 @@ use std::process::ExitCode;
 use std::time::{Duration, Instant};
 
 use socket2::{Domain, Protocol, Socket, Type};
-use system_tests::{BareNode, Cell, PATIENCE, Peer, Started, group_member, string_frame};
+use system_tests::{BareNode, Cell, PATIENCE, Peer, StartedChild, group_member, string_frame};
 use uadp::{DataSetHeader, GroupHeader, NetworkHeader, NetworkMessageEncoder, PublisherId, Scalar};
 
 fn main() -> ExitCode {
@@ -65,7 +65,7 @@ fn bench(rounds: usize) -> ExitCode {
     };
     let _core = cell.roscore();
     let mut floor = Floor::new();
-    let (mut relay, _relay) = ros1::Relay::new(&cell);
+    let (mut relay, _relay) = ros1::TopicToolsRelay::new(&cell);
     let mut bridge1 = Bridge1::new(&cell);
     let mut bridge2 = Bridge2::new(&cell);
     println!(
@@ -124,7 +124,7 @@ impl Floor {
     fn new() -> Self {
         let group = SocketAddrV4::new(Ipv4Addr::new(239, 192, 0, 41), 4841);
         let me = std::env::current_exe().unwrap();
-        let mut relay = Started::new("floor", &me)
+        let mut relay = StartedChild::new("floor", &me)
             .args(["relay".to_owned(), group.to_string()])
             .start();
         let address = relay.wait_for_line("127.0.0.1:", Duration::from_secs(10));
@@ -191,14 +191,14 @@ struct Bridge2 {
     group: SocketAddrV4,
     datagram: Vec<u8>,
     sequence: u16,
-    reader: dds::Reader,
+    reader: dds::DdsReader,
     _bridge: system_tests::Child,
 }
 
 impl Bridge2 {
     fn new(cell: &Cell) -> Self {
         let group = SocketAddrV4::new(Ipv4Addr::new(239, 192, 0, 43), 4843);
-        let reader = dds::Reader::new("rt/ua_1_5_11");
+        let reader = dds::DdsReader::new("rt/ua_1_5_11");
         let bridge = cell.bridge_ros2(&["--address", &format!("opc.udp://{group}")]);
         let mut path = Self {
             sender: sender(),

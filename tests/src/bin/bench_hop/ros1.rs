@@ -9,12 +9,12 @@ use system_tests::{BareNode, BareSubscription, Cell, Child, eventually, string_f
 use crate::Path;
 
 /// roscpp's `topic_tools relay`.
-pub(crate) struct Relay {
+pub(crate) struct TopicToolsRelay {
     publisher: TcpStream,
     subscription: BareSubscription,
 }
 
-impl Relay {
+impl TopicToolsRelay {
     pub(crate) fn new(cell: &Cell) -> (Self, Child) {
         let child = cell.topic_tools_relay("/bench_in", "/bench_out");
         let node = BareNode::start("/bench_relay");
@@ -32,7 +32,7 @@ impl Relay {
     }
 }
 
-impl Path for Relay {
+impl Path for TopicToolsRelay {
     fn name(&self) -> &'static str {
         "roscpp `topic_tools relay`: ROS 1 in, ROS 1 out"
     }

@@ -9,9 +9,9 @@ use std::path::Path;
 use std::process::ExitCode;
 use std::time::{Duration, Instant};
 
-use knowledge::{Knowledge, Lasting, QUESTIONS, Source, SourceKind, nodeset};
+use knowledge::{Knowledge, KnowledgeSource, QUESTIONS, SourceKind, SourceLifetime, nodeset};
 use mtp::{Module, Object, Triple};
-use system_tests::{Cell, Started, eventually, http_get, program, resident};
+use system_tests::{Cell, StartedChild, eventually, http_get, program, resident};
 use test_data::{foreign, read_foreign, read_own};
 
 fn main() -> ExitCode {
@@ -129,7 +129,7 @@ fn foreign_node_sets() -> Option<Vec<String>> {
 fn put_node_sets(knowledge: &Knowledge, texts: &[String]) {
     for text in texts {
         let read = nodeset::read(text).unwrap();
-        let source = Source::new(SourceKind::NodeSet, &read.namespace);
+        let source = KnowledgeSource::new(SourceKind::NodeSet, &read.namespace);
         knowledge.replace(&source, &read.triples, 1).unwrap();
     }
 }
@@ -164,7 +164,7 @@ fn questions(runs: usize) {
     for (number, bytes) in (0..).zip(&manifests) {
         let module = Module::from_bytes(bytes).unwrap();
         let triples = module.triples(&format!("urn:example:m{number}"), &BTreeMap::new());
-        let source = Source::new(SourceKind::Mtp, &format!("m{number}"));
+        let source = KnowledgeSource::new(SourceKind::Mtp, &format!("m{number}"));
         knowledge.replace(&source, &triples, 1).unwrap();
     }
     let statements: usize = knowledge.sources().iter().map(|one| one.statements).sum();
@@ -230,8 +230,8 @@ fn journal(cell: &Cell, statements: usize) {
     let each = 100_000;
     for source in 0..statements.div_ceil(each) {
         let count = each.min(statements - source * each);
-        let name = Source::new(SourceKind::File, &format!("{source}"));
-        let lasting = (1, Lasting::Yes);
+        let name = KnowledgeSource::new(SourceKind::File, &format!("{source}"));
+        let lasting = (1, SourceLifetime::Yes);
         knowledge
             .replace_with(&name, &of(source, count), lasting)
             .unwrap();
@@ -282,7 +282,7 @@ fn plan(cell: &Cell) {
          endpoint: opc.tcp://127.0.0.1:0\nsparql: {AT}\nknowledge: [{turtle}]\n"
     );
     let yaml = cell.file("mes.yaml", &yaml).display().to_string();
-    let _mes = Started::new("mes", &program("ua-mes"))
+    let _mes = StartedChild::new("mes", &program("ua-mes"))
         .args([&yaml, "--interface", "lo", "--lds", "none"])
         .start();
     eventually("ua-mes answers", Duration::from_secs(30), || {

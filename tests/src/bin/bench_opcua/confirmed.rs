@@ -3,7 +3,7 @@
 
 use std::time::Instant;
 
-use plant_opcua::client::{Client, SecurityChoice};
+use plant_opcua::client::{OpcUaClient, SecurityChoice};
 use plant_opcua::types::{NodeId, StatusCode, Variant};
 use system_tests::{Cell, Distribution, SERVER_ENDPOINT, Times};
 
@@ -66,14 +66,14 @@ pub(crate) async fn measure(cell: &Cell, requests: usize) {
     }
 }
 
-async fn write(client: &Client, node: &NodeId, value: f64) -> StatusCode {
+async fn write(client: &OpcUaClient, node: &NodeId, value: f64) -> StatusCode {
     let values = [(node.clone(), Variant::Double(value))];
     let told = client.write(&values).await.unwrap();
     told.first().copied().unwrap_or(StatusCode::Bad)
 }
 
 /// Writes until a write succeeds: the bridge discovers the subscriber.
-async fn until_good(client: &Client, node: &NodeId) {
+async fn until_good(client: &OpcUaClient, node: &NodeId) {
     let until = Instant::now() + START;
     while !write(client, node, -1.0).await.is_good() {
         assert!(Instant::now() < until, "no write to {node} is confirmed");

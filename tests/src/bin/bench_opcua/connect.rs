@@ -2,14 +2,14 @@
 
 use std::time::Instant;
 
-use plant_opcua::client::{Client, SecurityChoice};
+use plant_opcua::client::{OpcUaClient, SecurityChoice};
 use system_tests::{Cell, Times, per_message};
 
-use crate::servers::{START, Server, config, connected};
+use crate::servers::{BenchServer, START, config, connected};
 
 /// Measures from the start to a session in which a value was read. The endpoints are requested over
 /// a separate connection.
-pub(crate) async fn measure(cell: &Cell, servers: &[Server], connects: usize) {
+pub(crate) async fn measure(cell: &Cell, servers: &[BenchServer], connects: usize) {
     println!("\n{connects} connections of each kind, in turns; milliseconds:\n");
     println!("| security | server | p50 | p99 | p50 / asyncua | CPU of the server |");
     println!("|---|---|---|---|---|---|");
@@ -29,7 +29,7 @@ pub(crate) async fn measure(cell: &Cell, servers: &[Server], connects: usize) {
         for _ in 0..connects {
             for (server, times, _) in &mut rows {
                 let began = Instant::now();
-                let client = Client::open(config(cell, security), server.endpoint);
+                let client = OpcUaClient::open(config(cell, security), server.endpoint);
                 client.up(START).await.unwrap();
                 times.add(began.elapsed());
                 client.close().await;

@@ -12,12 +12,12 @@ use uadp::{DataSetHeader, GroupHeader, NetworkHeader, NetworkMessageEncoder, Pub
 use crate::servers::{FIRST, SPACE};
 
 /// A publisher of values.
-pub(crate) struct Sender {
+pub(crate) struct ValueSender {
     socket: UdpSocket,
     datagram: Vec<u8>,
 }
 
-impl Sender {
+impl ValueSender {
     pub(crate) fn new() -> Self {
         Self {
             // The socket joins no group, because it receives nothing.
@@ -60,13 +60,13 @@ impl Sender {
 
 /// Changes all variables each [`PERIOD`] while it is running. The value is the time of the change,
 /// in microseconds of the machine's monotonic clock.
-pub(crate) struct Feed {
+pub(crate) struct ValueFeed {
     variables: usize,
     sequence: u16,
     running: Option<(Arc<AtomicBool>, JoinHandle<u16>)>,
 }
 
-impl Feed {
+impl ValueFeed {
     pub(crate) const fn of(variables: usize) -> Self {
         Self {
             variables,
@@ -89,7 +89,7 @@ impl Feed {
     }
 }
 
-impl Drop for Feed {
+impl Drop for ValueFeed {
     fn drop(&mut self) {
         self.change(false);
     }
@@ -97,7 +97,7 @@ impl Drop for Feed {
 
 fn change(stopped: &AtomicBool, variables: usize, mut sequence: u16) -> u16 {
     let numbers: Vec<usize> = (0..variables).collect();
-    let mut sender = Sender::new();
+    let mut sender = ValueSender::new();
     let mut due = Instant::now();
     while !stopped.load(Ordering::Relaxed) {
         sequence = sequence.wrapping_add(1);

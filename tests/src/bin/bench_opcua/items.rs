@@ -4,15 +4,15 @@
 use std::collections::BTreeSet;
 use std::time::{Duration, Instant};
 
-use plant_opcua::client::{Client, Notice, Sampled, Subscription, Watch};
+use plant_opcua::client::{ClientSubscription, MonitoredWatch, Notice, OpcUaClient, Sampled};
 use plant_opcua::types::Variant;
 use system_tests::{Times, cpu_share, micros, now, resident};
 use tokio::runtime::Runtime;
 
 use crate::feed::PERIOD;
-use crate::servers::{ITEMS, START, Server, plain, variable};
+use crate::servers::{BenchServer, ITEMS, START, plain, variable};
 
-pub(crate) fn measure(runtime: &Runtime, servers: &mut [Server], seconds: u64) {
+pub(crate) fn measure(runtime: &Runtime, servers: &mut [BenchServer], seconds: u64) {
     println!(
         "\n{ITEMS} items that change each {} ms, published each {} ms, each change wanted, {seconds} s for each server; \
          milliseconds from the change:\n",
@@ -29,7 +29,7 @@ pub(crate) fn measure(runtime: &Runtime, servers: &mut [Server], seconds: u64) {
     }
 }
 
-fn row(runtime: &Runtime, server: &mut Server, seconds: u64) {
+fn row(runtime: &Runtime, server: &mut BenchServer, seconds: u64) {
     let began = Instant::now();
     let (client, mut values) = runtime.block_on(subscribed(server.endpoint));
     let made = began.elapsed();
@@ -44,10 +44,10 @@ fn row(runtime: &Runtime, server: &mut Server, seconds: u64) {
         let (to, used) = (now(), server.used() - used);
         // Changes before the end may still be in transit.
         seen.extend(watch(&mut values, SETTLING).await);
-        Seen::within(seen, micros(from), micros(to), used)
+        ReportedChanges::within(seen, micros(from), micros(to), used)
     });
     server.change(false);
-    let Seen {
+    let ReportedChanges {
         ticks,
         distinct,
         mut delays,
@@ -74,11 +74,11 @@ fn row(runtime: &Runtime, server: &mut Server, seconds: u64) {
 }
 
 /// Creates a subscription and waits until all its items have reported their first value.
-async fn subscribed(endpoint: &str) -> (Client, Subscription) {
-    let client = Client::open(plain(), endpoint);
+async fn subscribed(endpoint: &str) -> (OpcUaClient, ClientSubscription) {
+    let client = OpcUaClient::open(plain(), endpoint);
     client.up(START).await.unwrap();
     let watches = (0..ITEMS).map(|number| {
-        Watch::Sampled(Sampled {
+        MonitoredWatch::Sampled(Sampled {
             node: variable(number),
             // Each change, as it occurs.
             interval: Duration::ZERO,
@@ -102,9 +102,9 @@ async fn subscribed(endpoint: &str) -> (Client, Subscription) {
 }
 
 /// An item, the time of its change, and the time of the notification.
-type Told = (usize, f64, f64);
+type ItemChange = (usize, f64, f64);
 
-async fn watch(values: &mut Subscription, during: Duration) -> Vec<Told> {
+async fn watch(values: &mut ClientSubscription, during: Duration) -> Vec<ItemChange> {
     let until = tokio::time::Instant::now() + during;
     let mut seen = Vec::new();
     while let Ok(notice) = tokio::time::timeout_at(until, values.next()).await {
@@ -118,7 +118,7 @@ async fn watch(values: &mut Subscription, during: Duration) -> Vec<Told> {
 }
 
 /// The notifications about the changes in a time span.
-struct Seen {
+struct ReportedChanges {
     /// Number of changes of all variables.
     ticks: usize,
     /// Number of distinct changes that were reported.
@@ -128,8 +128,8 @@ struct Seen {
     used: Duration,
 }
 
-impl Seen {
-    fn within(told: Vec<Told>, from: f64, to: f64, used: Duration) -> Self {
+impl ReportedChanges {
+    fn within(told: Vec<ItemChange>, from: f64, to: f64, used: Duration) -> Self {
         let mut seen = Self {
             ticks: 0,
             distinct: 0,

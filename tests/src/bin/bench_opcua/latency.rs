@@ -2,12 +2,12 @@
 
 use std::time::Duration;
 
-use plant_opcua::client::{Client, Notice, Sampled, Watch};
+use plant_opcua::client::{MonitoredWatch, Notice, OpcUaClient, Sampled};
 use plant_opcua::types::Variant;
 use system_tests::{Cell, Times, micros, now};
 use tokio::runtime::Runtime;
 
-use crate::feed::Sender;
+use crate::feed::ValueSender;
 use crate::servers::{START, ours, plain, variable};
 
 pub(crate) fn measure(cell: &Cell, runtime: &Runtime, values: usize) {
@@ -31,9 +31,9 @@ pub(crate) fn measure(cell: &Cell, runtime: &Runtime, values: usize) {
 }
 
 async fn row(endpoint: &str, publishing: Duration, values: usize) -> Times {
-    let client = Client::open(plain(), endpoint);
+    let client = OpcUaClient::open(plain(), endpoint);
     client.up(START).await.unwrap();
-    let watch = Watch::Sampled(Sampled {
+    let watch = MonitoredWatch::Sampled(Sampled {
         node: variable(0),
         interval: Duration::ZERO,
         queue: 100,
@@ -41,7 +41,7 @@ async fn row(endpoint: &str, publishing: Duration, values: usize) -> Times {
     });
     let mut told = client.subscribe(vec![watch], publishing, 1000);
     while !matches!(told.next().await.unwrap(), Notice::Value { .. }) {}
-    let (mut sender, mut delays) = (Sender::new(), Times::default());
+    let (mut sender, mut delays) = (ValueSender::new(), Times::default());
     // Out of step with the publishing interval.
     let period = publishing * 23 / 20;
     for number in 0..values {

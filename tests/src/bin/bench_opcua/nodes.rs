@@ -4,12 +4,12 @@ use std::fmt::Write as _;
 use std::net::TcpStream;
 use std::time::{Duration, Instant};
 
-use plant_opcua::client::Client;
+use plant_opcua::client::OpcUaClient;
 use plant_opcua::types::{NodeId, StatusCode};
 use system_tests::{Cell, METRICS_SERVER, SERVER_ENDPOINT, cpu_share, eventually, resident};
 use tokio::runtime::Runtime;
 
-use crate::servers::{START, Server, asyncua, node_opcua, pairs, plain, variable};
+use crate::servers::{BenchServer, START, asyncua, node_opcua, pairs, plain, variable};
 
 pub(crate) fn measure(cell: &Cell, runtime: &Runtime, most: usize) {
     println!(
@@ -97,7 +97,7 @@ fn shown(count: usize, name: &str, took: Duration, process: u32) {
 async fn answers(endpoint: &str, node: NodeId) -> StatusCode {
     let mut config = plain();
     config.backoff = (Duration::from_millis(10), Duration::from_millis(50));
-    let client = Client::open(config, endpoint);
+    let client = OpcUaClient::open(config, endpoint);
     client.up(LONGEST).await.unwrap();
     let until = Instant::now() + START;
     loop {
@@ -142,6 +142,6 @@ fn id(number: usize) -> u32 {
 const LEAST: usize = 1000;
 /// A DataSetWriterId has 16 bits.
 const A_NAMESPACE: usize = 50_000;
-type Start = fn(&Cell, usize, &str) -> Server;
+type Start = fn(&Cell, usize, &str) -> BenchServer;
 
 const LONGEST: Duration = Duration::from_secs(600);

@@ -3,14 +3,14 @@
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use plant_opcua::client::{Client, Notice, Sampled, Subscription, Watch};
+use plant_opcua::client::{ClientSubscription, MonitoredWatch, Notice, OpcUaClient, Sampled};
 use system_tests::{
     Cell, METRICS_SERVER, all_overflowed, eventually, metrics, micros, now, number, per_message,
 };
 use tokio::runtime::Runtime;
 
-use crate::feed::Sender;
-use crate::servers::{START, Server, ours, plain, variable};
+use crate::feed::ValueSender;
+use crate::servers::{BenchServer, START, ours, plain, variable};
 
 pub(crate) fn measure(cell: &Cell, runtime: &Runtime, seconds: u64) {
     println!("\n{TOPICS} topics at 1 kHz each from UADP into ua-server, {seconds} s:\n");
@@ -44,9 +44,9 @@ impl Hears {
     }
 }
 
-fn row(server: &Server, runtime: &Runtime, (a_datagram, hears): (usize, Hears), seconds: u64) {
+fn row(server: &BenchServer, runtime: &Runtime, (a_datagram, hears): (usize, Hears), seconds: u64) {
     let heard = (hears != Hears::Nobody).then(|| runtime.block_on(subscribed(server, hears)));
-    let mut sender = Sender::new();
+    let mut sender = ValueSender::new();
     let taken = || metrics(METRICS_SERVER).map(|status| number(&status, "delivered"));
     eventually("a value comes in", START, || {
         sender.send(&[0], 0, 0.0);
@@ -93,7 +93,7 @@ fn settled(count: impl Fn() -> Option<u64>) -> u64 {
 }
 
 /// Sends every topic once in each millisecond, at absolute times.
-fn send(sender: &mut Sender, a_datagram: usize, ticks: u64) {
+fn send(sender: &mut ValueSender, a_datagram: usize, ticks: u64) {
     let numbers: Vec<usize> = (0..TOPICS).collect();
     let mut due = Instant::now();
     for tick in 1..=ticks {
@@ -106,11 +106,11 @@ fn send(sender: &mut Sender, a_datagram: usize, ticks: u64) {
     }
 }
 
-async fn subscribed(server: &Server, hears: Hears) -> (Client, Subscription) {
-    let client = Client::open(plain(), server.endpoint);
+async fn subscribed(server: &BenchServer, hears: Hears) -> (OpcUaClient, ClientSubscription) {
+    let client = OpcUaClient::open(plain(), server.endpoint);
     client.up(START).await.unwrap();
     let watches = (0..TOPICS).map(|number| {
-        Watch::Sampled(Sampled {
+        MonitoredWatch::Sampled(Sampled {
             node: variable(number),
             interval: Duration::ZERO,
             queue: if hears == Hears::Each { 500 } else { 1 },
@@ -129,7 +129,7 @@ async fn subscribed(server: &Server, hears: Hears) -> (Client, Subscription) {
 /// Counts the values that a client receives until it is done and no more values arrive.
 fn counted_by(
     runtime: &Runtime,
-    (client, mut values): (Client, Subscription),
+    (client, mut values): (OpcUaClient, ClientSubscription),
     done: &AtomicBool,
 ) -> u64 {
     runtime.block_on(async {

@@ -4,22 +4,22 @@ use std::fmt::Write as _;
 use std::path::PathBuf;
 use std::time::Duration;
 
-use plant_opcua::client::{Client, ClientConfig, SecurityChoice};
+use plant_opcua::client::{ClientConfig, OpcUaClient, SecurityChoice};
 use plant_opcua::types::NodeId;
 use system_tests::{Cell, Child, Executes, Executor, SERVER_ENDPOINT, processor_time};
 
-use crate::feed::Feed;
+use crate::feed::ValueFeed;
 
 /// A running server.
-pub(crate) struct Server {
+pub(crate) struct BenchServer {
     pub(crate) name: &'static str,
     pub(crate) endpoint: &'static str,
     child: Child,
     /// The space of our own server, in which its variables are changed and its method is called.
-    space: Option<(Feed, Executor)>,
+    space: Option<(ValueFeed, Executor)>,
 }
 
-impl Server {
+impl BenchServer {
     /// Returns the processor time of the server so far.
     pub(crate) fn used(&self) -> Duration {
         processor_time(self.child.id())
@@ -41,7 +41,7 @@ impl Server {
 }
 
 /// Starts all servers, with this number of changing variables.
-pub(crate) fn all(cell: &Cell, variables: usize) -> Vec<Server> {
+pub(crate) fn all(cell: &Cell, variables: usize) -> Vec<BenchServer> {
     let pairs = pairs(cell);
     vec![
         ours(cell, variables),
@@ -60,27 +60,27 @@ pub(crate) fn pairs(cell: &Cell) -> String {
     pairs
 }
 
-pub(crate) fn ours(cell: &Cell, variables: usize) -> Server {
+pub(crate) fn ours(cell: &Cell, variables: usize) -> BenchServer {
     let mapping = cell.file("bench.yaml", &mapping(variables));
     let executor = Executor::start((1, SPACE, METHOD), "Answer", Executes::AtOnce, 1);
     let child = cell.ua_server(&[
         mapping.to_string_lossy().as_ref(),
         "--trust-any-client-certificate",
     ]);
-    Server {
+    BenchServer {
         name: "ua-server",
         endpoint: SERVER_ENDPOINT,
         child,
-        space: Some((Feed::of(variables), executor)),
+        space: Some((ValueFeed::of(variables), executor)),
     }
 }
 
-pub(crate) fn asyncua(cell: &Cell, variables: usize, pairs: &str) -> Server {
+pub(crate) fn asyncua(cell: &Cell, variables: usize, pairs: &str) -> BenchServer {
     let endpoint = "opc.tcp://127.0.0.1:4841";
     let count = variables.to_string();
     let args = [endpoint, "--count", &count, "--pairs", pairs];
     let started = cell.asyncua_started("opcua_bench.py", &args).told();
-    Server {
+    BenchServer {
         name: "asyncua",
         endpoint,
         child: started.start().ready(START),
@@ -88,10 +88,10 @@ pub(crate) fn asyncua(cell: &Cell, variables: usize, pairs: &str) -> Server {
     }
 }
 
-pub(crate) fn node_opcua(cell: &Cell, variables: usize, pairs: &str) -> Server {
+pub(crate) fn node_opcua(cell: &Cell, variables: usize, pairs: &str) -> BenchServer {
     let count = variables.to_string();
     let started = cell.node_opcua_started("bench.js", &["4842", &count, pairs]);
-    Server {
+    BenchServer {
         name: "node-opcua",
         endpoint: "opc.tcp://127.0.0.1:4842",
         child: started.told().start().ready(START),
@@ -121,8 +121,12 @@ fn mapping(variables: usize) -> String {
 }
 
 /// Returns a connected client.
-pub(crate) async fn connected(cell: &Cell, endpoint: &str, security: SecurityChoice) -> Client {
-    let client = Client::open(config(cell, security), endpoint);
+pub(crate) async fn connected(
+    cell: &Cell,
+    endpoint: &str,
+    security: SecurityChoice,
+) -> OpcUaClient {
+    let client = OpcUaClient::open(config(cell, security), endpoint);
     client.up(START).await.unwrap();
     client
 }

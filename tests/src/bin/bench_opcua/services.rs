@@ -2,13 +2,13 @@
 
 use std::time::{Duration, Instant};
 
-use plant_opcua::client::{Browse, Client, SecurityChoice};
+use plant_opcua::client::{Browse, OpcUaClient, SecurityChoice};
 use plant_opcua::types::{NodeId, ObjectId, ReferenceTypeId, Variant};
 use system_tests::{Cell, Times, per_message};
 
-use crate::servers::{METHOD, SPACE, Server, WRITTEN, connected, variable};
+use crate::servers::{BenchServer, METHOD, SPACE, WRITTEN, connected, variable};
 
-pub(crate) async fn measure(cell: &Cell, servers: &[Server], requests: usize) {
+pub(crate) async fn measure(cell: &Cell, servers: &[BenchServer], requests: usize) {
     println!(
         "\n{requests} requests of each kind to each server, one at a time, in turns of {TURN}; microseconds:\n"
     );
@@ -20,7 +20,9 @@ pub(crate) async fn measure(cell: &Cell, servers: &[Server], requests: usize) {
     ] {
         let mut asked = Vec::new();
         for server in servers {
-            asked.push(Asked::of(server, connected(cell, server.endpoint, security).await).await);
+            asked.push(
+                BenchSession::of(server, connected(cell, server.endpoint, security).await).await,
+            );
         }
         for what in KINDS {
             kind(&mut asked, what, shown, requests).await;
@@ -32,7 +34,12 @@ pub(crate) async fn measure(cell: &Cell, servers: &[Server], requests: usize) {
 }
 
 /// Measures a kind of request with all servers.
-async fn kind(asked: &mut [Asked<'_>], what: What, security: &str, requests: usize) {
+async fn kind(
+    asked: &mut [BenchSession<'_>],
+    what: BenchedService,
+    security: &str,
+    requests: usize,
+) {
     // The first request of a kind is not measured: the server may have to look the node up.
     for one in &mut *asked {
         one.ask(what, 0).await;
@@ -67,16 +74,16 @@ async fn kind(asked: &mut [Asked<'_>], what: What, security: &str, requests: usi
     }
 }
 
-const KINDS: [What; 5] = [
-    What::ReadOne,
-    What::ReadMany,
-    What::Browse,
-    What::Write,
-    What::Call,
+const KINDS: [BenchedService; 5] = [
+    BenchedService::ReadOne,
+    BenchedService::ReadMany,
+    BenchedService::Browse,
+    BenchedService::Write,
+    BenchedService::Call,
 ];
 
 #[derive(Clone, Copy)]
-enum What {
+enum BenchedService {
     ReadOne,
     ReadMany,
     Browse,
@@ -84,7 +91,7 @@ enum What {
     Call,
 }
 
-impl What {
+impl BenchedService {
     const fn shown(self) -> &'static str {
         match self {
             Self::ReadOne => "read 1",
@@ -97,15 +104,15 @@ impl What {
 }
 
 /// A server, and the session with it.
-struct Asked<'a> {
-    server: &'a Server,
-    client: Client,
+struct BenchSession<'a> {
+    server: &'a BenchServer,
+    client: OpcUaClient,
     nodes: Vec<NodeId>,
     object: NodeId,
 }
 
-impl<'a> Asked<'a> {
-    async fn of(server: &'a Server, client: Client) -> Self {
+impl<'a> BenchSession<'a> {
+    async fn of(server: &'a BenchServer, client: OpcUaClient) -> Self {
         let parents = Browse::of(ReferenceTypeId::HasComponent).inverse();
         let until = Instant::now() + METHOD_THERE;
         let object = loop {
@@ -125,29 +132,29 @@ impl<'a> Asked<'a> {
         }
     }
 
-    async fn ask(&mut self, what: What, number: usize) {
+    async fn ask(&mut self, what: BenchedService, number: usize) {
         match what {
-            What::ReadOne => {
+            BenchedService::ReadOne => {
                 let one = self.nodes.get(number % MANY..=number % MANY).unwrap();
                 assert_eq!(self.client.read(one).await.unwrap().len(), 1);
             }
-            What::ReadMany => {
+            BenchedService::ReadMany => {
                 let read = self.client.read(&self.nodes).await.unwrap();
                 assert_eq!(read.len(), MANY);
             }
-            What::Browse => {
+            BenchedService::Browse => {
                 // The Server object has about the same references in all servers.
                 let node = ObjectId::Server.into();
                 let found = self.client.browse(&node, Browse::hierarchical()).await;
                 assert!(found.unwrap().len() > 5);
             }
-            What::Write => {
+            BenchedService::Write => {
                 let written = NodeId::new(SPACE, WRITTEN);
                 let value = Variant::Double(number as f64);
                 let told = self.client.write(&[(written, value)]).await.unwrap();
                 assert!(told.iter().all(|status| status.is_good()), "{told:?}");
             }
-            What::Call => {
+            BenchedService::Call => {
                 let called = self.client.call(&self.object, &method(), Vec::new()).await;
                 let told = called.unwrap();
                 assert_eq!(told.first(), Some(&Variant::Boolean(true)), "{told:?}");

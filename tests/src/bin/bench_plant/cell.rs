@@ -3,17 +3,17 @@
 use std::sync::Arc;
 use std::time::{Instant, SystemTime, UNIX_EPOCH};
 
-use bridge_core::{Heard, Local, Now, Output, Relay, Router, Settings};
-use broker::{Identity, Mqtt};
+use bridge_core::{Local, LocalMessage, Now, Output, Relay, Router, RouterSettings};
+use broker::{BrokerIdentity, Mqtt};
 use mappings::{Broker, BrokerAddress, Mapping, SpaceId, TopicId};
-use messages::{Dialect, Registry, Selection};
+use messages::{Dialect, Selection, TypeRegistry};
 use system_tests::BROKER;
-use transport::{BUFFER, Carrier, Outgoing};
+use transport::{BUFFER, Carrier, OutgoingMessage};
 use uadp::Timestamp;
 
 /// Numbers of sent messages.
 #[derive(Debug, Default)]
-pub(crate) struct Sent {
+pub(crate) struct SentMessages {
     pub(crate) values: u64,
     pub(crate) value_bytes: u64,
     pub(crate) announcements: u64,
@@ -35,12 +35,12 @@ impl PlantCell {
     pub(crate) fn new(number: u16, topics: u16) -> Self {
         let mut broker = Broker::new(BrokerAddress::parse(BROKER).unwrap());
         broker.prefix = format!("plant/cell-{number}");
-        let identity = Identity {
+        let identity = BrokerIdentity {
             program: "bench".to_owned(),
             publisher: Some(1),
         };
         let own = SpaceId::new(1).unwrap();
-        let settings = Settings {
+        let settings = RouterSettings {
             own,
             local: Local::Ros1,
             source: None,
@@ -50,7 +50,7 @@ impl PlantCell {
             within: broker.within,
             authorized: false,
         }));
-        let twist = Registry::bundle(Dialect::Ros1)
+        let twist = TypeRegistry::bundle(Dialect::Ros1)
             .get(&"geometry_msgs/Twist".parse().unwrap())
             .unwrap();
         let topics: Vec<TopicId> = (1..=topics)
@@ -78,7 +78,7 @@ impl PlantCell {
     pub(crate) fn say(&mut self, count: u64) {
         let now = clock();
         for _ in 0..count {
-            let heard = Heard {
+            let heard = LocalMessage {
                 topic: self.topics[self.next % self.topics.len()],
                 payload: &[0; 48],
                 received: now.utc,
@@ -90,7 +90,7 @@ impl PlantCell {
     }
 
     /// Sends and receives as a program does.
-    pub(crate) fn turn(&mut self, sent: &mut Sent) {
+    pub(crate) fn turn(&mut self, sent: &mut SentMessages) {
         let now = clock();
         let _change = self.carrier.follow();
         while let Some(received) = self.carrier.try_recv(&mut self.buffer) {
@@ -105,7 +105,7 @@ impl PlantCell {
         while let Some(output) = self.router.poll_output(now) {
             match output {
                 Output::Datagram { topic, bytes, .. } => {
-                    let message = Outgoing {
+                    let message = OutgoingMessage {
                         bytes: &bytes,
                         replaceable: true,
                         command: false,
@@ -121,7 +121,7 @@ impl PlantCell {
                     self.router.recycle(bytes);
                 }
                 Output::Discovery { bytes } => {
-                    if self.carrier.try_send(&Outgoing::new(&bytes)).is_ok() {
+                    if self.carrier.try_send(&OutgoingMessage::new(&bytes)).is_ok() {
                         sent.announcements += 1;
                         sent.announcement_bytes += u64::try_from(bytes.len()).unwrap();
                     }

@@ -12,7 +12,7 @@ use std::time::{Duration, Instant};
 use nix::sys::signal::Signal;
 use system_tests::{Cell, Child, Peer, anonymous, processor_time};
 
-use cell::{PlantCell, Sent};
+use cell::{PlantCell, SentMessages};
 
 fn main() -> ExitCode {
     let args: Vec<String> = std::env::args().skip(1).collect();
@@ -108,7 +108,7 @@ async fn bench(cell: &Cell, size: Size) {
     );
 
     // Each topic gets its first value, and is announced.
-    let mut sent = Sent::default();
+    let mut sent = SentMessages::default();
     run(&mut plant, size, size.period, &mut sent).await;
     settle(&mut plant).await;
     let full = Usage::now(&broker);
@@ -127,7 +127,7 @@ async fn bench(cell: &Cell, size: Size) {
         sent.announcement_bytes / sent.announcements.max(1)
     );
 
-    let mut sent = Sent::default();
+    let mut sent = SentMessages::default();
     let window = size.period * 2;
     run(&mut plant, size, window, &mut sent).await;
     let rate = sent.values as f64 / window.as_secs_f64();
@@ -153,7 +153,7 @@ async fn storm(
     broker.signal(Signal::SIGKILL);
     drop(broker);
     while plant.iter().any(|cell| !cell.is_lost()) {
-        turn(plant, &mut Sent::default()).await;
+        turn(plant, &mut SentMessages::default()).await;
     }
     let start = Instant::now();
     let broker = cell.mosquitto_with(configuration);
@@ -178,7 +178,7 @@ async fn connected(plant: &mut [PlantCell]) {
     let start = Instant::now();
     while plant.iter().any(PlantCell::is_lost) {
         assert!(start.elapsed() < LONGEST, "all cells connect");
-        turn(plant, &mut Sent::default()).await;
+        turn(plant, &mut SentMessages::default()).await;
     }
 }
 
@@ -190,7 +190,7 @@ async fn settle(plant: &mut [PlantCell]) {
         assert!(start.elapsed() < LONGEST, "the cells come to rest");
         let (at, before) = (Instant::now(), processor_time(own));
         while at.elapsed() < Duration::from_millis(500) {
-            turn(plant, &mut Sent::default()).await;
+            turn(plant, &mut SentMessages::default()).await;
         }
         let used = processor_time(own) - before;
         if used.as_secs_f64() < 0.25 * at.elapsed().as_secs_f64() {
@@ -200,7 +200,7 @@ async fn settle(plant: &mut [PlantCell]) {
 }
 
 /// Gives the topics values for the time of `window`.
-async fn run(plant: &mut [PlantCell], size: Size, window: Duration, sent: &mut Sent) {
+async fn run(plant: &mut [PlantCell], size: Size, window: Duration, sent: &mut SentMessages) {
     let start = Instant::now();
     let mut given = 0;
     while start.elapsed() < window {
@@ -215,7 +215,7 @@ async fn run(plant: &mut [PlantCell], size: Size, window: Duration, sent: &mut S
 }
 
 /// Lets each cell send and receive, and the connections work.
-async fn turn(plant: &mut [PlantCell], sent: &mut Sent) {
+async fn turn(plant: &mut [PlantCell], sent: &mut SentMessages) {
     for cell in plant.iter_mut() {
         cell.turn(sent);
     }

@@ -17,7 +17,7 @@ use std::time::{Duration, Instant};
 use nix::sys::signal::Signal;
 use system_tests::{Cell, Child, Peer, eventually};
 
-use network::Network;
+use network::SwitchedNetwork;
 
 fn main() -> ExitCode {
     let args: Vec<String> = std::env::args().skip(1).collect();
@@ -92,13 +92,13 @@ impl Random {
 /// Two bridges on their hosts.
 struct Pair<'c> {
     cell: &'c Cell,
-    network: &'c Network,
+    network: &'c SwitchedNetwork,
     mapping: String,
     bridges: [Option<Child>; 2],
 }
 
 impl<'c> Pair<'c> {
-    fn start(cell: &'c Cell, network: &'c Network) -> Self {
+    fn start(cell: &'c Cell, network: &'c SwitchedNetwork) -> Self {
         let mapping = cell.file("cell.yaml", MAPPING);
         let mut pair = Self {
             cell,
@@ -158,7 +158,7 @@ fn bench(faults: u64, seed: u64) -> ExitCode {
     let Some(cell) = Cell::with(&[Peer::Ros1]) else {
         return ExitCode::FAILURE;
     };
-    let network = Network::lay(&cell);
+    let network = SwitchedNetwork::lay(&cell);
     let _master = network.master(&cell);
     eventually("the master of ROS responds", SOON, || {
         network.has_master().then_some(())

@@ -3,7 +3,9 @@
 use std::path::Path;
 
 use serde_json::Value;
-use system_tests::{Cell, Child, GroupNumbers, Segment, Site, Started, metrics, program, xml_rpc};
+use system_tests::{
+    Cell, Child, GroupNumbers, PlantSite, Segment, StartedChild, metrics, program, xml_rpc,
+};
 
 /// The addresses of the bridges in the group, and in ROS.
 const IN_GROUP: [&str; 2] = ["10.78.0.1", "10.78.0.2"];
@@ -15,14 +17,14 @@ const MASTER: &str = "10.79.0.9:11311";
 const METRICS: &str = "127.0.0.1:9101";
 
 /// A host of a bridge or the station, each with an interface at both networks.
-pub(crate) struct Network {
+pub(crate) struct SwitchedNetwork {
     group: Segment,
     ros: Segment,
-    bridges: [Site; 2],
-    station: Site,
+    bridges: [PlantSite; 2],
+    station: PlantSite,
 }
 
-impl Network {
+impl SwitchedNetwork {
     pub(crate) fn lay(cell: &Cell) -> Self {
         let network = Self {
             group: cell.segment(),
@@ -44,8 +46,8 @@ impl Network {
     }
 
     /// Returns a bridge on its host, not started yet.
-    pub(crate) fn bridge(&self, cell: &Cell, at: usize, mapping: &str) -> Started {
-        let bridge = Started::new("bridge-ros1", &program("bridge-ros1"));
+    pub(crate) fn bridge(&self, cell: &Cell, at: usize, mapping: &str) -> StartedChild {
+        let bridge = StartedChild::new("bridge-ros1", &program("bridge-ros1"));
         of_ros(cell, bridge, IN_ROS[at])
             .args([mapping, "--rank", ["1", "2"][at]])
             .args(["--interface", "group", "--metrics", METRICS])
@@ -54,7 +56,7 @@ impl Network {
 
     /// Starts the master of ROS.
     pub(crate) fn master(&self, cell: &Cell) -> Child {
-        let master = Started::new("rosmaster", Path::new("/usr/bin/rosmaster"));
+        let master = StartedChild::new("rosmaster", Path::new("/usr/bin/rosmaster"));
         let master = of_ros(cell, master, STATION).args(["--core", "-p", "11311"]);
         master.at(&self.station).start()
     }
@@ -65,7 +67,7 @@ impl Network {
     }
 
     /// Returns the publisher of numbers, not started yet.
-    pub(crate) fn publisher(&self, cell: &Cell, args: &[&str]) -> Started {
+    pub(crate) fn publisher(&self, cell: &Cell, args: &[&str]) -> StartedChild {
         let publisher = cell.rospy_started("ros1_pub.py", args);
         of_ros(cell, publisher, STATION).at(&self.station)
     }
@@ -94,7 +96,7 @@ impl Network {
 }
 
 /// Adds the environment of a ROS 1 program with this address.
-fn of_ros(cell: &Cell, started: Started, address: &str) -> Started {
+fn of_ros(cell: &Cell, started: StartedChild, address: &str) -> StartedChild {
     cell.with_ros1(started)
         .env("ROS_MASTER_URI", format!("http://{MASTER}"))
         .env("ROS_HOSTNAME", address)

@@ -1,9 +1,9 @@
 //! 500 messages of 1 KiB in a burst, as sent by a node that had to wait for its data.
 
-use crate::path::Path;
+use crate::path::RelayPath;
 use system_tests::Times;
 
-pub(crate) fn measure(paths: &mut [Path], bursts: u64) {
+pub(crate) fn measure(paths: &mut [RelayPath], bursts: u64) {
     let mut all: Vec<(Times, u64)> = paths.iter().map(|_| (Times::default(), SIZE)).collect();
     for _ in 0..bursts {
         for (path, (times, fewest)) in paths.iter_mut().zip(&mut all) {

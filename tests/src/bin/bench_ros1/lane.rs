@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use system_tests::{BareNode, BareSubscription, PATIENCE, Times, eventually, string_frame};
 
 /// The two ends of a path.
-pub(crate) struct Lane {
+pub(crate) struct PathLane {
     input: TcpStream,
     output: BareSubscription,
     /// The number of the next message, which distinguishes it from late messages of an earlier
@@ -16,7 +16,7 @@ pub(crate) struct Lane {
     start: Instant,
 }
 
-impl Lane {
+impl PathLane {
     pub(crate) fn of(input: TcpStream, output: BareSubscription) -> Self {
         Self {
             input,

@@ -19,7 +19,7 @@ use std::process::ExitCode;
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 use system_tests::{Cell, Peer};
 
-use crate::path::Path;
+use crate::path::RelayPath;
 
 fn main() -> ExitCode {
     let args: Vec<String> = std::env::args().skip(1).collect();
@@ -45,7 +45,7 @@ fn main() -> ExitCode {
     allow_open_files();
     let _core = cell.roscore();
     if plan.relays() {
-        let mut paths = Path::all(&cell);
+        let mut paths = RelayPath::all(&cell);
         if plan.has("round-trip") {
             round_trip::measure(&mut paths, plan.messages);
         }

@@ -2,10 +2,10 @@
 
 use std::time::Duration;
 
-use crate::path::Path;
+use crate::path::RelayPath;
 use system_tests::{Times, per_message};
 
-pub(crate) fn measure(paths: &mut [Path], seconds: u64) {
+pub(crate) fn measure(paths: &mut [RelayPath], seconds: u64) {
     println!(
         "\n1 KiB at 1 kHz, {seconds} s for each path, in turns of {} s; microseconds:\n",
         TURN.min(seconds)

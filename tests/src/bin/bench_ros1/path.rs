@@ -6,18 +6,18 @@ use std::process::ExitCode;
 use std::time::Duration;
 
 use rustix::event::epoll;
-use system_tests::{BareNode, BareSubscription, Cell, Child, Started, processor_time};
+use system_tests::{BareNode, BareSubscription, Cell, Child, StartedChild, processor_time};
 
-use crate::lane::Lane;
+use crate::lane::PathLane;
 
 /// A relay with both ends of its only lane.
-pub(crate) struct Path {
+pub(crate) struct RelayPath {
     pub(crate) name: &'static str,
-    pub(crate) lane: Lane,
+    pub(crate) lane: PathLane,
     relay: Child,
 }
 
-impl Path {
+impl RelayPath {
     /// Starts all relays, the echo first.
     pub(crate) fn all(cell: &Cell) -> Vec<Self> {
         let node = BareNode::start("/bench");
@@ -46,20 +46,20 @@ impl Path {
         let word = name.split(' ').next().unwrap_or(name);
         let pair = (format!("/{word}_in"), format!("/{word}_out"));
         let relay = start(&pair);
-        let lane = Lane::through(node, &[pair]).remove(0);
+        let lane = PathLane::through(node, &[pair]).remove(0);
         Self { name, lane, relay }
     }
 
     fn echo() -> Self {
         let me = std::env::current_exe().unwrap();
-        let mut relay = Started::new("echo", &me).args(["echo"]).start();
+        let mut relay = StartedChild::new("echo", &me).args(["echo"]).start();
         let address = relay.wait_for_line("127.0.0.1:", Duration::from_secs(10));
         let input = TcpStream::connect(&address).unwrap();
         input.set_nodelay(true).unwrap();
         let output = BareSubscription::of(TcpStream::connect(&address).unwrap());
         Self {
             name: "raw TCP echo",
-            lane: Lane::of(input, output),
+            lane: PathLane::of(input, output),
             relay,
         }
     }

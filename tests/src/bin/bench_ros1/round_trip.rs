@@ -5,15 +5,15 @@ use std::time::Duration;
 use system_tests::{Times, per_message, string_frame};
 
 use crate::lane::DIGITS;
-use crate::path::Path;
+use crate::path::RelayPath;
 
-pub(crate) fn measure(paths: &mut [Path], messages: u64) {
+pub(crate) fn measure(paths: &mut [RelayPath], messages: u64) {
     println!("\nRound trip, one message at a time, {messages} per size and path; microseconds:\n");
     println!("| payload | path | p50 | p99 | p50 / echo | CPU per message |");
     println!("|---|---|---|---|---|---|");
     for (size, shown) in [(16, "16 B"), (1024, "1 KiB"), (100 * 1024, "100 KiB")] {
         pass(paths, size, messages / 10);
-        let before: Vec<Duration> = paths.iter().map(Path::processor_time).collect();
+        let before: Vec<Duration> = paths.iter().map(RelayPath::processor_time).collect();
         let mut times = pass(paths, size, messages);
         let mut echo = None;
         for ((path, times), before) in paths.iter().zip(&mut times).zip(before) {
@@ -30,7 +30,7 @@ pub(crate) fn measure(paths: &mut [Path], messages: u64) {
 
 /// The first messages of a turn are not timed: the previous path may still be working, because
 /// threads continue after a message.
-fn pass(paths: &mut [Path], size: usize, messages: u64) -> Vec<Times> {
+fn pass(paths: &mut [RelayPath], size: usize, messages: u64) -> Vec<Times> {
     let padding = " ".repeat(size - DIGITS);
     let mut all: Vec<Times> = paths.iter().map(|_| Times::default()).collect();
     for turn in (0..messages).step_by(TURN) {

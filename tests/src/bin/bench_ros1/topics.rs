@@ -5,17 +5,17 @@ use std::net::TcpStream;
 use std::time::Duration;
 
 use system_tests::{
-    BareNode, BareSubscription, Cell, Child, Started, Times, per_message, processor_time,
+    BareNode, BareSubscription, Cell, Child, StartedChild, Times, per_message, processor_time,
     string_frame,
 };
 
-use crate::lane::{DIGITS, Lane};
+use crate::lane::{DIGITS, PathLane};
 
 /// A relay of many topics, with both ends of each topic.
 struct Crowd {
     name: &'static str,
     relay: Child,
-    lanes: Vec<Lane>,
+    lanes: Vec<PathLane>,
     times: Times,
     used: Duration,
 }
@@ -24,7 +24,7 @@ impl Crowd {
     fn echo(count: usize) -> Self {
         let me = std::env::current_exe().unwrap();
         let lanes = count.to_string();
-        let mut relay = Started::new(&format!("echo_{count}"), &me)
+        let mut relay = StartedChild::new(&format!("echo_{count}"), &me)
             .args(["echo", &lanes])
             .start();
         let address = relay.wait_for_line("127.0.0.1:", Duration::from_secs(10));
@@ -32,7 +32,7 @@ impl Crowd {
         let lane = |_| {
             let input = connect();
             input.set_nodelay(true).unwrap();
-            Lane::of(input, BareSubscription::of(connect()))
+            PathLane::of(input, BareSubscription::of(connect()))
         };
         Self {
             name: "raw TCP echo",
@@ -56,7 +56,7 @@ impl Crowd {
         let node = BareNode::start(&format!("/bench_{count}"));
         Self {
             name: "tcpros `relay`",
-            lanes: Lane::through(&node, &pairs),
+            lanes: PathLane::through(&node, &pairs),
             relay,
             times: Times::default(),
             used: Duration::ZERO,

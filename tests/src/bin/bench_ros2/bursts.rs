@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use system_tests::Cell;
 
-use crate::ends::{Pace, Report};
+use crate::ends::{MeterReport, SendingPace};
 use crate::floods::bridges_dropped;
 use crate::through::{NAMES, WAITING, Ways};
 
@@ -16,11 +16,15 @@ pub(crate) fn measure(cell: &Cell, bursts: u64) {
     );
     println!("|---|---|---|---|---|---|---|---|---|");
     for rate in [10_000, 30_000] {
-        let mut all = [Report::default(), Report::default(), Report::default()];
+        let mut all = [
+            MeterReport::default(),
+            MeterReport::default(),
+            MeterReport::default(),
+        ];
         let mut dropped = [0; 3];
         for _ in 0..bursts {
             for (way, (all, dropped)) in all.iter_mut().zip(&mut dropped).enumerate() {
-                let pace = Pace {
+                let pace = SendingPace {
                     ticks: BURST,
                     size: 1024,
                     period: Duration::from_secs(1) / rate,

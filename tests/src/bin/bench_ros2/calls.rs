@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use serde_json::{Value, json};
-use system_tests::{Asker, Cell, Child, Times, eventually, per_message, processor_time};
+use system_tests::{CallerScript, Cell, Child, Times, eventually, per_message, processor_time};
 
 use crate::ends::{LIMIT, START};
 
@@ -63,7 +63,7 @@ impl Sum {
 }
 
 struct Ways {
-    rospy: Asker,
+    rospy: CallerScript,
     direct: Child,
     through: Child,
     bridges: [Child; 2],

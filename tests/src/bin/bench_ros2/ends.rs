@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use serde_json::Value;
 use system_tests::{
-    BareNode, BareSubscription, Cell, Child, Stamp, Times, eventually, now, string_frame,
+    BareNode, BareSubscription, Cell, Child, TextStamp, Times, eventually, now, string_frame,
 };
 
 /// A sender of stamped texts on topics of DDS.
@@ -15,7 +15,7 @@ pub(crate) struct Pacer(Child);
 
 /// The times of sending: ticks of `period`, with a pause after each `burst` of ticks.
 #[derive(Clone, Copy)]
-pub(crate) struct Pace {
+pub(crate) struct SendingPace {
     pub(crate) ticks: u64,
     pub(crate) size: usize,
     pub(crate) period: Duration,
@@ -23,7 +23,7 @@ pub(crate) struct Pace {
     pub(crate) pause: Duration,
 }
 
-impl Pace {
+impl SendingPace {
     /// Returns a pace of 1 kHz without a pause.
     pub(crate) const fn kilohertz(seconds: u64, size: usize) -> Self {
         Self {
@@ -53,7 +53,7 @@ impl Pacer {
     }
 
     /// Sends at a pace, and returns the number of refused samples.
-    pub(crate) fn send(&mut self, pace: Pace) -> u64 {
+    pub(crate) fn send(&mut self, pace: SendingPace) -> u64 {
         let (period, pause) = (pace.period.as_nanos(), pace.pause.as_nanos());
         let line = format!(
             "{} {} {period} {} {pause}",
@@ -69,14 +69,14 @@ pub(crate) struct Meter(Child);
 
 /// The results of a [`Meter`] or a [`Listener`].
 #[derive(Debug, Default)]
-pub(crate) struct Report {
+pub(crate) struct MeterReport {
     pub(crate) distinct: u64,
     pub(crate) repeated: u64,
     pub(crate) disordered: u64,
     pub(crate) times: Times,
 }
 
-impl Report {
+impl MeterReport {
     pub(crate) fn extend(&mut self, other: Self) {
         self.distinct += other.distinct;
         self.repeated += other.repeated;
@@ -96,19 +96,19 @@ impl Meter {
     }
 
     /// Waits for this many samples, or for silence, and resets the results.
-    pub(crate) fn report(&mut self, expected: u64) -> Report {
+    pub(crate) fn report(&mut self, expected: u64) -> MeterReport {
         self.wait_for(&format!("{expected} {SILENCE_MS}"), PATIENCE)
     }
 
     /// Waits as [`report`](Self::report) does while the samples are sent at a pace. Silence is
     /// longer then, because the repair of a large sample takes its time.
-    pub(crate) fn report_after(&mut self, pace: Pace, expected: u64) -> Report {
+    pub(crate) fn report_after(&mut self, pace: SendingPace, expected: u64) -> MeterReport {
         self.wait_for(&format!("{expected} {REPAIR_MS}"), pace.took_at_most())
     }
 
-    fn wait_for(&mut self, line: &str, patience: Duration) -> Report {
+    fn wait_for(&mut self, line: &str, patience: Duration) -> MeterReport {
         let answer = self.0.ask(line, patience);
-        Report {
+        MeterReport {
             distinct: count(&answer, "distinct"),
             repeated: count(&answer, "repeated"),
             disordered: count(&answer, "disordered"),
@@ -145,7 +145,7 @@ impl Talker {
     }
 
     /// Sends at absolute times.
-    pub(crate) fn send(&mut self, pace: Pace) {
+    pub(crate) fn send(&mut self, pace: SendingPace) {
         let mut due = now();
         for tick in 0..pace.ticks {
             if pace.burst > 0 && tick > 0 && tick % pace.burst == 0 {
@@ -159,7 +159,7 @@ impl Talker {
 
     /// Sends a text, which measurements count, too.
     pub(crate) fn say(&mut self, size: usize) {
-        let text = Stamp::text(0, self.number, size);
+        let text = TextStamp::text(0, self.number, size);
         self.number += 1;
         self.stream.write_all(&string_frame(&text)).unwrap();
     }
@@ -184,14 +184,14 @@ impl Listener {
     }
 
     /// Receives this many texts, or until silence.
-    pub(crate) fn report(&mut self, expected: u64) -> Report {
+    pub(crate) fn report(&mut self, expected: u64) -> MeterReport {
         self.subscription
             .wait_at_most(Duration::from_millis(SILENCE_MS));
-        let mut report = Report::default();
+        let mut report = MeterReport::default();
         while report.distinct < expected
             && let Ok(frame) = self.subscription.receive()
         {
-            let Some(stamp) = Stamp::of(frame) else {
+            let Some(stamp) = TextStamp::of(frame) else {
                 continue;
             };
             if !self.heard.insert(stamp.number) {

@@ -7,7 +7,7 @@ use system_tests::{
     Cell, METRICS_ROS1, METRICS_ROS2, drops, drops_by_reason, metrics, now, number,
 };
 
-use crate::ends::{Pace, SILENCE_MS};
+use crate::ends::{SILENCE_MS, SendingPace};
 use crate::through::{NAMES, Ways};
 
 pub(crate) fn measure(cell: &Cell, floods: u64) {
@@ -25,7 +25,7 @@ pub(crate) fn measure(cell: &Cell, floods: u64) {
 fn flood(ways: &mut Ways, way: usize, floods: u64) {
     for (shown, ticks, rate) in RATES {
         for _ in 0..floods {
-            let pace = Pace {
+            let pace = SendingPace {
                 ticks,
                 size: 1024,
                 period: rate.map_or(Duration::ZERO, |rate| Duration::from_secs(1) / rate),

@@ -5,9 +5,9 @@ use std::io::Write as _;
 use std::net::TcpStream;
 use std::time::Duration;
 
-use system_tests::{BareNode, BareSubscription, Cell, Child, Shape, eventually, now};
+use system_tests::{ArrayShape, BareNode, BareSubscription, Cell, Child, eventually, now};
 
-use crate::ends::{LIMIT, Meter, Pace, Pacer, Report, START};
+use crate::ends::{LIMIT, Meter, MeterReport, Pacer, START, SendingPace};
 use crate::floods::bridges_dropped;
 
 pub(crate) fn measure(cell: &Cell, seconds: u64) {
@@ -33,7 +33,7 @@ pub(crate) fn measure(cell: &Cell, seconds: u64) {
 /// A message type, with its topics of ROS 1 and of ROS 2.
 struct Kind {
     name: &'static str,
-    shape: Shape,
+    shape: ArrayShape,
     topics: [&'static str; 2],
 }
 
@@ -135,7 +135,7 @@ impl Paths {
 }
 
 /// Sends and receives at the same time.
-fn passed((pacer, meter): &mut (Pacer, Meter), pace: Pace) -> Report {
+fn passed((pacer, meter): &mut (Pacer, Meter), pace: SendingPace) -> MeterReport {
     std::thread::scope(|scope| {
         scope.spawn(move || pacer.send(pace));
         meter.report_after(pace, pace.ticks)
@@ -143,8 +143,8 @@ fn passed((pacer, meter): &mut (Pacer, Meter), pace: Pace) -> Report {
 }
 
 impl Load {
-    fn pace(self, ticks: u64) -> Pace {
-        Pace {
+    fn pace(self, ticks: u64) -> SendingPace {
+        SendingPace {
             ticks,
             size: self.size,
             period: Duration::from_secs(1) / self.rate,
@@ -166,7 +166,7 @@ impl Kind {
 /// A sender of a ROS 1 type.
 struct Talker {
     stream: TcpStream,
-    shape: &'static Shape,
+    shape: &'static ArrayShape,
     number: u64,
     /// The frame of the last message, which the next one of the same size reuses.
     frame: Vec<u8>,
@@ -174,7 +174,7 @@ struct Talker {
 }
 
 impl Talker {
-    const fn of(stream: TcpStream, shape: &'static Shape) -> Self {
+    const fn of(stream: TcpStream, shape: &'static ArrayShape) -> Self {
         Self {
             stream,
             shape,
@@ -184,7 +184,7 @@ impl Talker {
         }
     }
 
-    fn send(&mut self, pace: Pace) {
+    fn send(&mut self, pace: SendingPace) {
         if self.size != pace.size {
             self.size = pace.size;
             self.frame = self.shape.frame(pace.size);
@@ -203,7 +203,7 @@ impl Talker {
 /// A receiver of a ROS 1 type.
 struct Listener {
     subscription: BareSubscription,
-    shape: &'static Shape,
+    shape: &'static ArrayShape,
     next: u64,
 }
 
@@ -219,9 +219,9 @@ impl Listener {
     }
 
     /// Receives this many messages, or until silence.
-    fn report(&mut self, expected: u64) -> Report {
+    fn report(&mut self, expected: u64) -> MeterReport {
         self.subscription.wait_at_most(SILENCE);
-        let mut report = Report::default();
+        let mut report = MeterReport::default();
         while report.distinct < expected
             && let Ok(message) = self.subscription.receive()
         {
@@ -278,12 +278,12 @@ const CLOUDS: &[Load] = &[Load {
 
 static IMAGE: Kind = Kind {
     name: "Image",
-    shape: Shape::IMAGE,
+    shape: ArrayShape::IMAGE,
     topics: ["/ua_1_2_10", "/ua_2_2_11"],
 };
 static CLOUD: Kind = Kind {
     name: "PointCloud2",
-    shape: Shape::POINT_CLOUD,
+    shape: ArrayShape::POINT_CLOUD,
     topics: ["/ua_1_2_12", "/ua_2_2_13"],
 };
 

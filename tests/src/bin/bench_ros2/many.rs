@@ -5,12 +5,12 @@ use std::fmt::Write as _;
 use std::time::Duration;
 
 use system_tests::{
-    Cell, GROUP, METRICS_ROS2, Stamp, UaSide, drops, eventually, group_member, metrics, now,
+    Cell, GROUP, METRICS_ROS2, TextStamp, UaSide, drops, eventually, group_member, metrics, now,
     overflowed, overflowed_outside_group, per_message, processor_time,
 };
 use uadp::{NetworkMessage, Scalar};
 
-use crate::ends::{Meter, Pace, Pacer, Report, START};
+use crate::ends::{Meter, MeterReport, Pacer, START, SendingPace};
 
 pub(crate) fn measure(cell: &Cell, seconds: u64) {
     println!(
@@ -36,7 +36,7 @@ fn to_dds(cell: &Cell, seconds: u64) {
     let mut number = 0;
     let mut tick = |number: u64| {
         for topic in 0..TOPICS {
-            let text = Stamp::text(topic, number, SIZE);
+            let text = TextStamp::text(topic, number, SIZE);
             side.write((0, 2, id(topic)), Scalar::String(Some(&text)));
         }
     };
@@ -85,10 +85,10 @@ fn to_uadp(cell: &Cell, way: &str, pubsub: &str, seconds: u64) {
     let (topics, first) = (TOPICS.to_string(), FIRST.to_string());
     let more = ["--topics", &topics, "--first", &first, "--depth", "1000"];
     let mut pacer = Pacer::start(cell, "/ua_2_2_", &more);
-    let mut heard = Heard::default();
+    let mut heard = ReceivedTexts::default();
     let mut buffer = vec![0; 65_536];
     eventually("all topics cross", START, || {
-        pacer.send(Pace::kilohertz(1, SIZE));
+        pacer.send(SendingPace::kilohertz(1, SIZE));
         let mut crossed = HashSet::new();
         let start = now();
         // Keep-alives never end.
@@ -99,7 +99,7 @@ fn to_uadp(cell: &Cell, way: &str, pubsub: &str, seconds: u64) {
         }
         (crossed.len() == TOPICS).then_some(())
     });
-    heard.report = Report::default();
+    heard.report = MeterReport::default();
     let full = || overflowed(&listener).unwrap_or_default();
     let dropped = Dropped::so_far(full());
     let before = processor_time(bridge.id());
@@ -107,7 +107,7 @@ fn to_uadp(cell: &Cell, way: &str, pubsub: &str, seconds: u64) {
     let sent = seconds * 1000 * TOPICS as u64;
     let took = std::thread::scope(|scope| {
         let sender = scope.spawn(|| {
-            pacer.send(Pace::kilohertz(seconds, SIZE));
+            pacer.send(SendingPace::kilohertz(seconds, SIZE));
             now() - start
         });
         let mut last = now();
@@ -163,7 +163,7 @@ impl Dropped {
 /// The results of a way.
 struct Ran {
     sent: u64,
-    report: Report,
+    report: MeterReport,
     dropped: Dropped,
     used: Duration,
     took: Duration,
@@ -192,12 +192,12 @@ fn row(way: &str, ran: Ran) {
 
 /// The stamped texts that a member of the group has received.
 #[derive(Default)]
-struct Heard {
+struct ReceivedTexts {
     seen: HashSet<(usize, u64)>,
-    report: Report,
+    report: MeterReport,
 }
 
-impl Heard {
+impl ReceivedTexts {
     /// Adds a datagram. Returns the topics of its texts that were not received before.
     fn add(&mut self, datagram: &[u8]) -> Vec<usize> {
         let mut topics = Vec::new();
@@ -207,7 +207,7 @@ impl Heard {
         let now = now();
         for message in message.messages().flatten() {
             // A message ends with its last field.
-            let Some(stamp) = Stamp::of(message.payload()) else {
+            let Some(stamp) = TextStamp::of(message.payload()) else {
                 continue;
             };
             if !self.seen.insert((stamp.topic, stamp.number)) {

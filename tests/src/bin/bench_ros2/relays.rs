@@ -5,7 +5,7 @@ use std::net::UdpSocket;
 use std::process::ExitCode;
 use std::time::{Duration, Instant};
 
-use system_tests::{Cell, Child, Started, Times, per_message, processor_time};
+use system_tests::{Cell, Child, StartedChild, Times, per_message, processor_time};
 
 use crate::Plan;
 use crate::ends::{LIMIT, PATIENCE, START, count, times};
@@ -186,7 +186,7 @@ impl Path {
 
     fn echo() -> Self {
         let me = std::env::current_exe().unwrap();
-        let mut relay = Started::new("echo", &me).args(["echo"]).start();
+        let mut relay = StartedChild::new("echo", &me).args(["echo"]).start();
         let address = relay.wait_for_line("127.0.0.1:", Duration::from_secs(10));
         let socket = UdpSocket::bind("127.0.0.1:0").unwrap();
         socket.connect(address).unwrap();

@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use system_tests::{Cell, per_message, program};
 
-use crate::ends::{Pace, Report};
+use crate::ends::{MeterReport, SendingPace};
 use crate::through::{NAMES, WAITING, Ways};
 
 pub(crate) fn measure(cell: &Cell, seconds: u64) {
@@ -35,7 +35,7 @@ pub(crate) fn measure(cell: &Cell, seconds: u64) {
             let mut stood = Ways::secured(cell, WAITING, security);
             for (way, sizes) in ways.iter_mut().enumerate() {
                 for ((size, _), sum) in SIZES.iter().zip(sizes) {
-                    let pace = Pace::kilohertz(turn, *size);
+                    let pace = SendingPace::kilohertz(turn, *size);
                     let before = stood.used(way + 1);
                     sum.sent += pace.ticks;
                     sum.report.extend(stood.send(way + 1, pace));
@@ -72,7 +72,7 @@ fn rows_of<'a>((size, way): (&str, &str), sums: impl Iterator<Item = &'a mut Sum
 
 #[derive(Default)]
 struct Sum {
-    report: Report,
+    report: MeterReport,
     sent: u64,
     used: Duration,
 }

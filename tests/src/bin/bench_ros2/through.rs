@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use system_tests::{BareNode, Cell, Child, eventually, per_message, processor_time};
 
-use crate::ends::{Listener, Meter, Pace, Pacer, Report, START, Talker};
+use crate::ends::{Listener, Meter, MeterReport, Pacer, START, SendingPace, Talker};
 
 pub(crate) fn measure(cell: &Cell, seconds: u64) {
     let mut ways = Ways::stand(cell, WAITING);
@@ -19,7 +19,7 @@ pub(crate) fn measure(cell: &Cell, seconds: u64) {
             left -= turn;
             for (way, all) in all.iter_mut().enumerate() {
                 let before = ways.used(way);
-                let pace = Pace::kilohertz(turn, size);
+                let pace = SendingPace::kilohertz(turn, size);
                 all.sent += pace.ticks;
                 all.report.extend(ways.send(way, pace));
                 all.used += ways.used(way) - before;
@@ -92,11 +92,11 @@ impl Ways {
         let mut from_ros2 = Pacer::start(cell, "/ua_2_2_11", &["--depth", "2000"]);
         to_relay.say(64);
         let mut from_relay = Listener::of(&node, "/relay_out");
-        let hello = Pace {
+        let hello = SendingPace {
             period: Duration::from_millis(20),
-            ..Pace::kilohertz(1, 64)
+            ..SendingPace::kilohertz(1, 64)
         };
-        let hello = Pace { ticks: 25, ..hello };
+        let hello = SendingPace { ticks: 25, ..hello };
         eventually("the relay carries", START, || {
             to_relay.send(hello);
             (from_relay.report(hello.ticks).distinct == hello.ticks).then_some(())
@@ -126,7 +126,7 @@ impl Ways {
     }
 
     /// Sends on a way of [`NAMES`] and returns the results of its receiver.
-    pub(crate) fn send(&mut self, way: usize, pace: Pace) -> Report {
+    pub(crate) fn send(&mut self, way: usize, pace: SendingPace) -> MeterReport {
         let expected = pace.ticks;
         if way == 1 {
             self.to_ros2.send(pace);
@@ -191,7 +191,7 @@ fn mapping(waiting: u32) -> String {
 
 #[derive(Default)]
 struct Sum {
-    report: Report,
+    report: MeterReport,
     sent: u64,
     used: Duration,
 }

@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use system_tests::{Cell, Child, SystemCalls, processor_time, wake_ups};
 
-use crate::ends::Pace;
+use crate::ends::SendingPace;
 use crate::through::{NAMES, WAITING, Ways};
 
 /// Measures the work per message, and the idle programs for some seconds.
@@ -27,7 +27,7 @@ fn per_message(ways: &mut Ways, seconds: u64, names: &[&str]) {
         for way in [1, 2] {
             let name = NAMES.get(way).copied().unwrap_or_default();
             // A first turn lets discovery settle; the calls are counted in a turn of their own.
-            ways.send(way, Pace { ticks: 100, ..pace });
+            ways.send(way, SendingPace { ticks: 100, ..pace });
             let used = |ways: &Ways| ways.bridges().iter().map(Used::of).collect::<Vec<_>>();
             let before = used(ways);
             let mut report = ways.send(way, pace);
@@ -54,12 +54,12 @@ fn per_message(ways: &mut Ways, seconds: u64, names: &[&str]) {
 }
 
 /// Returns the loads with their names.
-fn loads(seconds: u64) -> [(&'static str, Pace); 4] {
-    let kilohertz = |size| Pace::kilohertz(seconds, size);
+fn loads(seconds: u64) -> [(&'static str, SendingPace); 4] {
+    let kilohertz = |size| SendingPace::kilohertz(seconds, size);
     [
         (
             "64 B, 100/s",
-            Pace {
+            SendingPace {
                 ticks: seconds * 100,
                 period: Duration::from_millis(10),
                 ..kilohertz(64)
@@ -68,7 +68,7 @@ fn loads(seconds: u64) -> [(&'static str, Pace); 4] {
         ("64 B, 1000/s", kilohertz(64)),
         (
             "1 KiB, 2000/s in bursts of 20",
-            Pace {
+            SendingPace {
                 ticks: seconds * 2000,
                 period: Duration::ZERO,
                 burst: 20,
@@ -78,7 +78,7 @@ fn loads(seconds: u64) -> [(&'static str, Pace); 4] {
         ),
         (
             "1 KiB, 10 000/s in bursts of 100",
-            Pace {
+            SendingPace {
                 ticks: seconds * 10_000,
                 period: Duration::ZERO,
                 burst: 100,

@@ -2,9 +2,9 @@
 
 use std::time::{Duration, Instant};
 
-use skills::{ClientOptions, Runs as _, SkillClient, TypeName};
+use skills::{ClientOptions, ParameterType, RunnableSkill as _, SkillClient};
 use system_tests::{
-    Cell, Child, Site, Started, Times, cpu_share, eventually, metrics, program, resident,
+    Cell, Child, PlantSite, StartedChild, Times, cpu_share, eventually, metrics, program, resident,
 };
 
 /// Measures the time until the skills of all devices are seen above the station, the duration of
@@ -51,7 +51,7 @@ pub(crate) fn all(devices: usize, skills: usize, runs: usize) -> Option<()> {
     Some(())
 }
 
-fn station(at: &Site) -> Child {
+fn station(at: &PlantSite) -> Child {
     let levels = [
         "--endpoint",
         "opc.tcp://10.80.1.1:4840",
@@ -59,7 +59,7 @@ fn station(at: &Site) -> Child {
         "lower0",
     ];
     let upper = ["--upper-interface", "upper0", "--upper-endpoint", UPPER];
-    Started::new("station", &program("ua-station"))
+    StartedChild::new("station", &program("ua-station"))
         .args([
             "--name",
             "station",
@@ -74,7 +74,7 @@ fn station(at: &Site) -> Child {
 }
 
 /// Starts a component whose skills complete their actions at once.
-fn device(cell: &Cell, at: &Site, (number, skills): (usize, usize)) -> Child {
+fn device(cell: &Cell, at: &PlantSite, (number, skills): (usize, usize)) -> Child {
     let name = format!("device-{number}");
     let mut yaml = format!(
         "component: {name}\napplication_uri: urn:ua-bridge:bench:{name}\nnamespace: {}\nsecurity: [None]\nskills:\n",
@@ -86,7 +86,7 @@ fn device(cell: &Cell, at: &Site, (number, skills): (usize, usize)) -> Child {
         ));
     }
     let endpoint = format!("opc.tcp://10.80.1.21:{}", FIRST_PORT + number);
-    Started::new(&name, &program("ua-component"))
+    StartedChild::new(&name, &program("ua-component"))
         .args([cell.file(&format!("{name}.yaml"), &yaml)])
         .args(["--endpoint", &endpoint, "--lds", "opc.tcp://10.80.1.1:4840"])
         .args(["--interface", "dev0"])
@@ -121,7 +121,7 @@ fn above(runs: usize) -> (Duration, usize, Times) {
         };
         let client = SkillClient::connect(UPPER, &options).await.unwrap();
         let began = Instant::now();
-        let of = TypeName::own("ReleaseSkillType");
+        let of = ParameterType::own("ReleaseSkillType");
         let found = client.skills_of(&of).await.unwrap();
         let listed = began.elapsed();
         let handle = client.handle(&found[0]);

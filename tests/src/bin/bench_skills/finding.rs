@@ -6,14 +6,14 @@ use std::time::{Duration, Instant};
 
 use discovery::client::{find_servers, find_servers_on_network};
 use discovery::{
-    AnnounceSettings, Announced, Found, Interface, Server, WatchSettings, Watcher, announce,
-    be_there, watch,
+    AnnounceSettings, MdnsInterface, ServerAnnouncement, ServerChange, ServerDescription,
+    ServerWatcher, WatchSettings, announce, be_there, watch,
 };
-use plant_opcua::client::{Browse, Client, ClientConfig};
+use plant_opcua::client::{Browse, ClientConfig, OpcUaClient};
 use plant_opcua::types::{NodeId, ObjectId};
 use system_tests::{
-    Cell, Child, HERE, Peer, Segment, Site, Started, Times, WIRE, Wire, cpu_share, eventually,
-    group_member, program, resident,
+    Cell, Child, HERE, Peer, PlantSite, Segment, StartedChild, Times, WIRE, WireEffect, cpu_share,
+    eventually, group_member, program, resident,
 };
 use tokio::net::TcpListener;
 use tokio::runtime::Runtime;
@@ -35,10 +35,10 @@ fn runtime() -> Runtime {
 }
 
 /// Announces a server that has no other function.
-async fn plugged(name: &str, at: Ipv4Addr, lds: Option<&str>) -> Announced {
+async fn plugged(name: &str, at: Ipv4Addr, lds: Option<&str>) -> ServerAnnouncement {
     let listener = TcpListener::bind((at, 0)).await.unwrap();
     let port = listener.local_addr().unwrap().port();
-    let server = Server {
+    let server = ServerDescription {
         application_uri: format!("urn:bench:{name}"),
         product_uri: String::new(),
         name: name.to_owned(),
@@ -48,7 +48,7 @@ async fn plugged(name: &str, at: Ipv4Addr, lds: Option<&str>) -> Announced {
     };
     let settings = AnnounceSettings {
         lds: lds.map(str::to_owned),
-        mdns: lds.is_none().then(|| Interface::parse(&at.to_string())),
+        mdns: lds.is_none().then(|| MdnsInterface::parse(&at.to_string())),
         ..AnnounceSettings::default()
     };
     let announced = announce(server.clone(), settings).unwrap();
@@ -59,7 +59,7 @@ async fn plugged(name: &str, at: Ipv4Addr, lds: Option<&str>) -> Announced {
 /// Measures from the announcement of a server to its discovery by watchers.
 fn seen(runs: usize) -> Option<()> {
     let cell = Cell::with(&[Peer::NodeOpcua])?;
-    let host = cell.host(Wire::default());
+    let host = cell.host(WireEffect::default());
     let _lds = lds(&["--interface", WIRE]);
     let mut other = cell
         .node_opcua_started("lds.js", &["4841", "5"])
@@ -77,7 +77,7 @@ fn seen(runs: usize) -> Option<()> {
     let [mut ours, mut listed, mut theirs] = [(); 3].map(|()| Times::default());
     runtime.block_on(async {
         let settings = WatchSettings {
-            mdns: Some(Interface::parse(HERE)),
+            mdns: Some(MdnsInterface::parse(HERE)),
             ..WatchSettings::default()
         };
         let mut watcher = watch(settings).unwrap();
@@ -123,10 +123,10 @@ fn row(what: &str, times: &mut Times) {
     );
 }
 
-async fn until_seen(watcher: &mut Watcher, name: &str) {
+async fn until_seen(watcher: &mut ServerWatcher, name: &str) {
     let seen = async {
         while let Some(found) = watcher.next().await {
-            if matches!(&found, Found::Seen(known) if known.name.starts_with(name)) {
+            if matches!(&found, ServerChange::Seen(known) if known.name.starts_with(name)) {
                 return;
             }
         }
@@ -248,8 +248,8 @@ fn other_client(
 /// A workstation with two devices.
 struct Level {
     _inside: Segment,
-    station: Site,
-    device: Site,
+    station: PlantSite,
+    device: PlantSite,
     at: usize,
 }
 
@@ -271,7 +271,7 @@ impl Level {
         let example = std::path::Path::new(env!("CARGO_MANIFEST_DIR"))
             .join("../examples/plant/parallel-gripper.yaml");
         let endpoint = format!("opc.tcp://10.80.{}.21:0", self.at);
-        Started::new("ua-component", &program("ua-component"))
+        StartedChild::new("ua-component", &program("ua-component"))
             .args([&example])
             .args([
                 "--endpoint",
@@ -286,9 +286,9 @@ impl Level {
     }
 }
 
-fn station(at: &Site, name: &str, address: &str, more: &[&str]) -> Child {
+fn station(at: &PlantSite, name: &str, address: &str, more: &[&str]) -> Child {
     let endpoint = format!("opc.tcp://{address}:4840");
-    Started::new(name, &program("ua-station"))
+    StartedChild::new(name, &program("ua-station"))
         .args(["--name", name, "--endpoint", &endpoint, "--allow-unsecured"])
         .args(more)
         .at(at)
@@ -296,7 +296,7 @@ fn station(at: &Site, name: &str, address: &str, more: &[&str]) -> Child {
 }
 
 /// Runs a client of the other workstation in the network of this thread.
-fn asking<T>(url: &str, what: impl AsyncFnOnce(&Client) -> T) -> T {
+fn asking<T>(url: &str, what: impl AsyncFnOnce(&OpcUaClient) -> T) -> T {
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_all()
         .build()
@@ -306,7 +306,7 @@ fn asking<T>(url: &str, what: impl AsyncFnOnce(&Client) -> T) -> T {
             timeout: SOON,
             ..ClientConfig::new("urn:ua-bridge:bench:client", "bench")
         };
-        let client = Client::open(config, &neighbour(url).await);
+        let client = OpcUaClient::open(config, &neighbour(url).await);
         client.up(SOON).await.unwrap();
         let told = what(&client).await;
         client.close().await;
@@ -370,7 +370,7 @@ fn gone(lds: &str) {
 }
 
 /// Returns the nodes of a path of names below Objects.
-async fn nodes(client: &Client, path: &[String]) -> Option<Vec<NodeId>> {
+async fn nodes(client: &OpcUaClient, path: &[String]) -> Option<Vec<NodeId>> {
     let mut nodes = vec![NodeId::from(ObjectId::ObjectsFolder)];
     for name in path {
         let below = client.browse(nodes.last()?, Browse::hierarchical()).await;
@@ -384,7 +384,7 @@ async fn nodes(client: &Client, path: &[String]) -> Option<Vec<NodeId>> {
 }
 
 /// Returns the path of the method below the component.
-async fn search(client: &Client) -> Option<Vec<String>> {
+async fn search(client: &OpcUaClient) -> Option<Vec<String>> {
     let path = DEVICE.map(str::to_owned).to_vec();
     let mut left = vec![(nodes(client, &path).await?.pop()?, path)];
     while let Some((node, path)) = left.pop() {
@@ -410,7 +410,7 @@ fn many(servers: usize) -> Option<()> {
     let lds = lds(&[]);
     let runtime = runtime();
     let (began, crowd) = (Instant::now(), servers);
-    let told: Vec<Announced> = runtime.block_on(async {
+    let told: Vec<ServerAnnouncement> = runtime.block_on(async {
         let mut told = Vec::new();
         for at in 0..crowd {
             let name = format!("crowd-{at}");
@@ -471,7 +471,7 @@ fn many(servers: usize) -> Option<()> {
 }
 
 fn lds(args: &[&str]) -> Child {
-    let child = Started::new("ua-lds", &program("ua-lds"))
+    let child = StartedChild::new("ua-lds", &program("ua-lds"))
         .args(args)
         .start();
     eventually("ua-lds answers", SOON, || {

@@ -9,10 +9,10 @@ mod rtt;
 use std::process::ExitCode;
 use std::time::{Duration, Instant};
 
-use plant_opcua::client::{Client, ClientConfig, Notice, Select, Watch};
+use plant_opcua::client::{ClientConfig, MonitoredWatch, Notice, OpcUaClient, Select};
 use plant_opcua::types::{Array, NodeId, ObjectTypeId, Variant, VariantScalarTypeId};
 use skills::{ClientOptions, SkillClient};
-use system_tests::{Cell, Child, Started, Times, cpu_share, eventually, program, resident};
+use system_tests::{Cell, Child, StartedChild, Times, cpu_share, eventually, program, resident};
 use tokio::runtime::Runtime;
 
 fn main() -> ExitCode {
@@ -89,7 +89,7 @@ fn component(cell: &Cell, pairs: usize, ready: &mut Times) -> Child {
         }
     }
     let began = Instant::now();
-    let child = Started::new("ua-component", &program("ua-component"))
+    let child = StartedChild::new("ua-component", &program("ua-component"))
         .args([cell.file("bench.yaml", &yaml)])
         .args(["--endpoint", ENDPOINT, "--lds", "none", "--interface", "lo"])
         .start();
@@ -100,12 +100,12 @@ fn component(cell: &Cell, pairs: usize, ready: &mut Times) -> Child {
     child
 }
 
-async fn client() -> Client {
+async fn client() -> OpcUaClient {
     let config = ClientConfig {
         timeout: SOON,
         ..ClientConfig::new("urn:ua-bridge:bench:client", "bench")
     };
-    let client = Client::open(config, ENDPOINT);
+    let client = OpcUaClient::open(config, ENDPOINT);
     client.up(SOON).await.unwrap();
     client
 }
@@ -119,7 +119,7 @@ fn node(id: u32) -> NodeId {
 async fn events(runs: usize) {
     let client = client().await;
     let select = ["Transition/Number"];
-    let watch = Watch::Events {
+    let watch = MonitoredWatch::Events {
         node: node(100),
         select: select
             .iter()
@@ -167,7 +167,7 @@ async fn events(runs: usize) {
 }
 
 /// Waits for the transition with this number.
-async fn until(events: &mut plant_opcua::client::Subscription, number: u32) {
+async fn until(events: &mut plant_opcua::client::ClientSubscription, number: u32) {
     loop {
         if let Some(Notice::Event { fields, .. }) = events.next().await
             && fields.first() == Some(&Variant::UInt32(number))

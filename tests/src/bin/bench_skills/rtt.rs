@@ -7,19 +7,21 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-use plant_opcua::client::{Client, ClientConfig};
-use plant_opcua::server::{MethodRequest, MethodSpec, Server, ServerBuilder, ServerConfig, method};
+use plant_opcua::client::{ClientConfig, OpcUaClient};
+use plant_opcua::server::{
+    MethodRequest, MethodSpec, OpcUaServer, ServerBuilder, ServerConfig, method,
+};
 use plant_opcua::types::{
     Argument, ByteString, DataTypeId, LocalizedText, NodeId, ObjectId, QualifiedName, Variant,
 };
 use ros2_node::domain::{Domain, DomainOptions};
-use ros2_node::service::{self, Service, ServicePeers, ServiceTypes};
-use skills::{ClientOptions, Runs as _, SkillClient, SkillHandle, TypeName};
+use ros2_node::service::{self, ServiceName, ServicePeers, ServiceTypes};
+use skills::{ClientOptions, ParameterType, RunnableSkill as _, SkillClient, SkillHandle};
 use socket2::SockRef;
-use system_tests::{Cell, Child, Started, Times, program};
-use tcpros::{Core, Node, NodeOptions, ServiceClientOptions, ServiceOptions, ServiceType};
+use system_tests::{Cell, Child, StartedChild, Times, program};
+use tcpros::{Core, Node, NodeOptions, ServiceClientOptions, ServiceOptions, ServiceTypeSum};
 use uadp::{
-    ChunkBudget, Chunks, DataSetHeader, Extras, NetworkHeader, NetworkMessage,
+    ChunkBudget, ChunkEncoder, DataSetHeader, Extras, NetworkHeader, NetworkMessage,
     NetworkMessageEncoder, NetworkMessageType, PublisherId, Reassembler, Scalar, Variant as Field,
     Whole,
 };
@@ -70,7 +72,7 @@ const WARM: usize = 3;
 struct Paths {
     uadp: Echo,
     ros1: tcpros::ServiceClient,
-    opcua: Client,
+    opcua: OpcUaClient,
     ros2: service::ServiceClient,
     skill: SkillHandle,
     _servers: Servers,
@@ -81,7 +83,7 @@ struct Servers {
     _core: Core,
     _nodes: [Node; 2],
     _ros1: tcpros::ServiceServer,
-    _opcua: Server,
+    _opcua: OpcUaServer,
     _domains: [Domain; 2],
     _ros2: service::ServiceServer,
     _component: Child,
@@ -116,7 +118,7 @@ impl Paths {
             timeout: SOON,
             ..ClientConfig::new("urn:ua-bridge:bench:client", "bench")
         };
-        let opcua_client = Client::open(config, opcua.url());
+        let opcua_client = OpcUaClient::open(config, opcua.url());
         opcua_client.up(SOON).await.unwrap();
         let domains = ["server", "client"].map(domain);
         let ros2 = service::ServiceServer::open(
@@ -224,8 +226,8 @@ fn same_length(length: usize, payload: &[u8], more: usize) -> Result<(), String>
 }
 
 /// Returns a type of a request and a response with a list of bytes.
-fn echo_type() -> ServiceType {
-    ServiceType {
+fn echo_type() -> ServiceTypeSum {
+    ServiceTypeSum {
         name: "bench/Echo".to_owned(),
         md5sum: "0".repeat(32),
         request_type: "bench/EchoRequest".to_owned(),
@@ -233,8 +235,8 @@ fn echo_type() -> ServiceType {
     }
 }
 
-fn ros2_service() -> Service {
-    Service {
+fn ros2_service() -> ServiceName {
+    ServiceName {
         name: "/echo".to_owned(),
         types: ServiceTypes {
             request: "bench::srv::dds_::Echo_Request_".to_owned(),
@@ -255,7 +257,7 @@ fn domain(node: &str) -> Domain {
 }
 
 /// Starts a server with a method that returns its argument.
-fn opcua_server() -> Server {
+fn opcua_server() -> OpcUaServer {
     let endpoint = "opc.tcp://127.0.0.1:4857/".parse().unwrap();
     let config = ServerConfig::new("urn:ua-bridge:bench:server", "bench", endpoint);
     let server = ServerBuilder::new(config).build().unwrap();
@@ -285,7 +287,7 @@ async fn skill(cell: &Cell) -> (Child, SkillClient, SkillHandle) {
     let yaml = "{component: echo, application_uri: 'urn:ua-bridge:bench', namespace: 9, skills: [
         {name: Locate, type: LocateObjectSkillType, driver: {simulated: {duration: 1 ms}}}]}";
     let endpoint = "opc.tcp://127.0.0.1:4855";
-    let component = Started::new("ua-component", &program("ua-component"))
+    let component = StartedChild::new("ua-component", &program("ua-component"))
         .args([cell.file("echo.yaml", yaml)])
         .args(["--endpoint", endpoint, "--lds", "none", "--interface", "lo"])
         .start();
@@ -300,7 +302,7 @@ async fn skill(cell: &Cell) -> (Child, SkillClient, SkillHandle) {
             Err(fault) => assert!(Instant::now() < until, "{fault}"),
         }
     };
-    let wanted = TypeName::own("LocateObjectSkillType");
+    let wanted = ParameterType::own("LocateObjectSkillType");
     let found = client.skills_of(&wanted).await.unwrap().remove(0);
     let handle = client.handle(&found);
     (component, client, handle)
@@ -411,7 +413,7 @@ impl UadpEnd {
             network_message: CHUNK,
             trailer: 0,
         };
-        let mut chunks = Chunks::new(&header, &Extras::default(), whole, budget).unwrap();
+        let mut chunks = ChunkEncoder::new(&header, &Extras::default(), whole, budget).unwrap();
         let mut datagram = Vec::new();
         let mut sent = 0;
         while let Some(chunk) = chunks.append(&mut datagram, &Extras::default()) {

@@ -13,7 +13,7 @@ use std::time::{Duration, Instant};
 
 use system_tests::{Cell, Child, METRICS_SERVER, Peer, metrics};
 
-use plant::{Fault, Plant, Random};
+use plant::{Random, RoundFault, SoakPlant};
 
 fn main() -> ExitCode {
     let args: Vec<String> = std::env::args().skip(1).collect();
@@ -153,7 +153,7 @@ struct Tally {
 fn soak(cell: &Cell, duration: Duration, seed: u64) -> ExitCode {
     let clock = cell.wall_clock();
     let _master = cell.roscore();
-    let mut plant = Plant::start(cell, &clock);
+    let mut plant = SoakPlant::start(cell, &clock);
     plant.heal();
     let _publishers = Way::BOTH.map(|way| way.publisher(cell, duration));
     let mut random = Random(seed);
@@ -170,14 +170,14 @@ fn soak(cell: &Cell, duration: Duration, seed: u64) -> ExitCode {
 }
 
 /// A minute with one fault.
-fn round(cell: &Cell, plant: &mut Plant<'_>, random: &mut Random, tally: &mut Tally) {
+fn round(cell: &Cell, plant: &mut SoakPlant<'_>, random: &mut Random, tally: &mut Tally) {
     let end = Instant::now() + ROUND;
     let mut readers = Way::BOTH.map(|way| Reader::new(way, cell));
     let has_begun = watch(&mut readers, HEALED, |all| {
         all.iter().all(|of| of.count > 10)
     });
-    let all = u64::try_from(Fault::ALL.len()).unwrap();
-    let fault = Fault::ALL[usize::try_from(random.below(all)).unwrap()];
+    let all = u64::try_from(RoundFault::ALL.len()).unwrap();
+    let fault = RoundFault::ALL[usize::try_from(random.below(all)).unwrap()];
     let what = plant.strike(fault, random);
     let healed = plant.heal();
     let forwarded = forwarded();
@@ -219,7 +219,7 @@ fn forwarded() -> u64 {
         .unwrap_or_default()
 }
 
-fn report(plant: &mut Plant<'_>, tally: &Tally) -> ExitCode {
+fn report(plant: &mut SoakPlant<'_>, tally: &Tally) -> ExitCode {
     let Tally {
         rounds,
         lost,

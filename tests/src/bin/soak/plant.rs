@@ -6,13 +6,13 @@ use std::time::{Duration, Instant};
 
 use nix::sys::signal::Signal;
 use system_tests::{
-    Cell, Child, METRICS_ROS1, METRICS_ROS2, METRICS_SERVER, Started, WallClock, anonymous,
+    Cell, Child, METRICS_ROS1, METRICS_ROS2, METRICS_SERVER, StartedChild, WallClock, anonymous,
     eventually, http_answer, program,
 };
 
 /// A fault of a round.
 #[derive(Debug, Clone, Copy)]
-pub(crate) enum Fault {
+pub(crate) enum RoundFault {
     Killed,
     Stopped,
     Cut,
@@ -22,7 +22,7 @@ pub(crate) enum Fault {
     BrokerKilled,
 }
 
-impl Fault {
+impl RoundFault {
     pub(crate) const ALL: [Self; 7] = [
         Self::Killed,
         Self::Stopped,
@@ -48,10 +48,10 @@ impl Random {
 }
 
 /// A program of the project.
-pub(crate) struct Program<'c> {
+pub(crate) struct SoakProgram<'c> {
     pub(crate) name: &'static str,
     metrics: &'static str,
-    start: Box<dyn Fn() -> Started + 'c>,
+    start: Box<dyn Fn() -> StartedChild + 'c>,
     child: Option<Child>,
     /// Memory since the last start.
     memory: Vec<(Instant, u64)>,
@@ -59,7 +59,7 @@ pub(crate) struct Program<'c> {
     pub(crate) growth: Option<(Duration, f64)>,
 }
 
-impl Program<'_> {
+impl SoakProgram<'_> {
     fn launch(&mut self) {
         self.note_growth();
         self.memory.clear();
@@ -113,23 +113,23 @@ fn slope(samples: &[(Instant, u64)]) -> f64 {
 }
 
 /// All programs.
-pub(crate) struct Plant<'c> {
+pub(crate) struct SoakPlant<'c> {
     cell: &'c Cell,
-    pub(crate) programs: Vec<Program<'c>>,
+    pub(crate) programs: Vec<SoakProgram<'c>>,
     broker: Option<Child>,
     clock: &'c WallClock,
 }
 
-impl<'c> Plant<'c> {
+impl<'c> SoakPlant<'c> {
     /// Starts the bridges of ROS 1 and ROS 2, two of each, a server that also forwards to a broker,
     /// and the broker.
     pub(crate) fn start(cell: &'c Cell, clock: &'c WallClock) -> Self {
         let mapping = cell.file("cell.yaml", MAPPING).display().to_string();
         let server = cell.file("server.yaml", SERVER).display().to_string();
         let broker = Some(cell.mosquitto());
-        let mut programs: Vec<Program<'c>> = Vec::new();
-        let mut add = |name, metrics, start: Box<dyn Fn() -> Started + 'c>| {
-            programs.push(Program {
+        let mut programs: Vec<SoakProgram<'c>> = Vec::new();
+        let mut add = |name, metrics, start: Box<dyn Fn() -> StartedChild + 'c>| {
+            programs.push(SoakProgram {
                 name,
                 metrics,
                 start,
@@ -163,7 +163,7 @@ impl<'c> Plant<'c> {
         let start = move || cell.ua_server_started(&[&server]).by(clock);
         add("ua-server", METRICS_SERVER, Box::new(start));
         let start = move || {
-            Started::new("ua-lds", &program("ua-lds"))
+            StartedChild::new("ua-lds", &program("ua-lds"))
                 .args([
                     "--interface",
                     "lo",
@@ -197,12 +197,12 @@ impl<'c> Plant<'c> {
     }
 
     /// Causes a fault. Returns its description.
-    pub(crate) fn strike(&mut self, fault: Fault, random: &mut Random) -> String {
+    pub(crate) fn strike(&mut self, fault: RoundFault, random: &mut Random) -> String {
         let count = u64::try_from(self.programs.len()).unwrap();
         let at = usize::try_from(random.below(count)).unwrap();
         let name = self.programs[at].name;
         match fault {
-            Fault::Killed => {
+            RoundFault::Killed => {
                 let program = &mut self.programs[at];
                 let mut child = program.child.take().unwrap();
                 child.signal(Signal::SIGKILL);
@@ -211,14 +211,14 @@ impl<'c> Plant<'c> {
                 program.launch();
                 format!("kill -9 of {name}")
             }
-            Fault::Stopped => {
+            RoundFault::Stopped => {
                 let time = Duration::from_millis(200 + random.below(5_000));
                 self.programs[at].child().signal(Signal::SIGSTOP);
                 sleep(time);
                 self.programs[at].child().signal(Signal::SIGCONT);
                 format!("SIGSTOP of {name} for {time:?}")
             }
-            Fault::Cut => {
+            RoundFault::Cut => {
                 let time = Duration::from_millis(500 + random.below(3_000));
                 ip(&["link", "set", "lo", "down"]);
                 sleep(time);
@@ -226,12 +226,12 @@ impl<'c> Plant<'c> {
                 ip(&["route", "replace", "224.0.0.0/4", "dev", "lo"]);
                 format!("network cut for {time:?}")
             }
-            Fault::ClockJump => {
+            RoundFault::ClockJump => {
                 let seconds = i64::try_from(random.below(7_200)).unwrap() - 3_600;
                 self.clock.set(seconds);
                 format!("clocks of all programs set to {seconds} s beside the time")
             }
-            Fault::Reloaded => {
+            RoundFault::Reloaded => {
                 let name = format!("# {}\n{MAPPING}", random.below(u64::MAX));
                 let _mapping = self.cell.file("cell.yaml", &name);
                 for program in &self.programs[..4] {
@@ -239,12 +239,12 @@ impl<'c> Plant<'c> {
                 }
                 "reload of the mapping by all bridges".to_owned()
             }
-            Fault::SwitchedOver => {
+            RoundFault::SwitchedOver => {
                 let at = at % 4;
                 self.programs[at].child().signal(Signal::SIGUSR1);
                 format!("switch-over asked of {}", self.programs[at].name)
             }
-            Fault::BrokerKilled => {
+            RoundFault::BrokerKilled => {
                 if let Some(broker) = self.broker.take() {
                     broker.signal(Signal::SIGKILL);
                 }

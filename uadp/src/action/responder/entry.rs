@@ -9,7 +9,7 @@ use crate::{OwnedPublisherId, StatusCode};
 
 /// Identity of a request (OPC 10000-14, 6.2.11.2.2).
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash)]
-pub(super) struct Key {
+pub(super) struct ActionRequestKey {
     pub(super) requestor_id: Option<OwnedPublisherId>,
     pub(super) correlation_data: Option<Box<[u8]>>,
     pub(super) request_id: u16,
@@ -17,8 +17,8 @@ pub(super) struct Key {
 
 /// A request, from its first message until it expires.
 #[derive(Debug)]
-pub(super) struct Entry<P> {
-    pub(super) key: Key,
+pub(super) struct RequestEntry<P> {
+    pub(super) key: ActionRequestKey,
     pub(super) address: ActionAddress,
     pub(super) dialect: ActionDialect,
     pub(super) origin: RequestOrigin<P>,
@@ -52,7 +52,7 @@ pub(super) enum Phase {
     Closed,
 }
 
-impl Key {
+impl ActionRequestKey {
     pub(super) fn of(request: &ActionMessage<'_>) -> Self {
         Self {
             requestor_id: request.action.requestor_id.map(Into::into),
@@ -89,7 +89,7 @@ impl Phase {
     }
 }
 
-impl<P> Entry<P> {
+impl<P> RequestEntry<P> {
     /// Schedules the state to be sent again, at least an interval after the last transmission.
     pub(super) fn answer(&mut self, now: Duration, interval: Duration) {
         if !self.can_be_said() {

@@ -4,7 +4,7 @@ use alloc::collections::{BTreeMap, VecDeque};
 use core::hash::{Hash, Hasher};
 use core::time::Duration;
 
-use super::entry::Key;
+use super::entry::ActionRequestKey;
 use super::{RequestDrop, RequestOrigin, ResponderSettings};
 use crate::hashing::{DefaultHasher, HashSet};
 
@@ -16,17 +16,17 @@ pub(super) struct Over<P> {
     hashes: HashSet<u64>,
     /// Expiry times and hashes in the order of insertion.
     queue: VecDeque<(Duration, u64, RequestOrigin<P>)>,
-    counts: Counts<P>,
+    counts: RequestCounts<P>,
 }
 
 /// Number of requests of each sender and of each group.
 #[derive(Debug)]
-pub(super) struct Counts<P> {
+pub(super) struct RequestCounts<P> {
     senders: BTreeMap<RequestOrigin<P>, usize>,
     groups: BTreeMap<usize, usize>,
 }
 
-impl<P: Ord + Clone> Counts<P> {
+impl<P: Ord + Clone> RequestCounts<P> {
     pub(super) const fn new() -> Self {
         Self {
             senders: BTreeMap::new(),
@@ -76,19 +76,19 @@ impl<P: Ord + Clone> Over<P> {
         Self {
             hashes: HashSet::new(),
             queue: VecDeque::new(),
-            counts: Counts::new(),
+            counts: RequestCounts::new(),
         }
     }
 
     /// Returns true if the request is in the set.
-    pub(super) fn has(&self, key: &Key) -> bool {
+    pub(super) fn has(&self, key: &ActionRequestKey) -> bool {
         !self.hashes.is_empty() && self.hashes.contains(&hash(key))
     }
 
     /// Keeps a request until the given time.
     pub(super) fn keep(
         &mut self,
-        (key, origin): (&Key, &RequestOrigin<P>),
+        (key, origin): (&ActionRequestKey, &RequestOrigin<P>),
         until: Duration,
         settings: &ResponderSettings,
     ) -> Result<(), RequestDrop> {
@@ -118,7 +118,7 @@ impl<P: Ord + Clone> Over<P> {
     }
 }
 
-pub(super) fn hash(key: &Key) -> u64 {
+pub(super) fn hash(key: &ActionRequestKey) -> u64 {
     let mut hasher = DefaultHasher::new();
     key.hash(&mut hasher);
     hasher.finish()

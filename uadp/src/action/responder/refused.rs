@@ -4,9 +4,9 @@
 use alloc::collections::VecDeque;
 use core::time::Duration;
 
-use super::entry::Key;
-use super::over::{Counts, hash};
-use super::{RequestDrop, RequestOrigin, Requested, ResponderSettings};
+use super::entry::ActionRequestKey;
+use super::over::{RequestCounts, hash};
+use super::{RequestDrop, RequestOrigin, RequiredAction, ResponderSettings};
 use crate::OwnedPublisherId;
 use crate::action::{
     ActionAddress, ActionDialect, ActionFields, ActionHeader, ActionKind, ActionMessage,
@@ -16,17 +16,17 @@ use crate::hashing::HashMap;
 
 /// Refused requests, by the hash of their key.
 #[derive(Debug)]
-pub(super) struct Refused<P> {
-    known: HashMap<u64, Known<P>>,
+pub(super) struct RefusedRequests<P> {
+    known: HashMap<u64, RefusedEntry<P>>,
     /// Expiry times and hashes in the order of insertion.
     queue: VecDeque<(Duration, u64)>,
-    counts: Counts<P>,
+    counts: RequestCounts<P>,
     /// Responses to send, at most one for each refused request.
-    answers: VecDeque<Answer<P>>,
+    answers: VecDeque<RefusalResponse<P>>,
 }
 
 #[derive(Debug)]
-struct Known<P> {
+struct RefusedEntry<P> {
     origin: RequestOrigin<P>,
     refusal: Refusal,
     /// Time of the last response.
@@ -37,16 +37,16 @@ struct Known<P> {
 
 /// A response to a refused request.
 #[derive(Debug)]
-pub(super) struct Answer<P> {
+pub(super) struct RefusalResponse<P> {
     pub(super) origin: RequestOrigin<P>,
-    key: Key,
+    key: ActionRequestKey,
     address: ActionAddress,
     state: ActionState,
     status: Option<u16>,
     due: Duration,
 }
 
-impl<P> Answer<P> {
+impl<P> RefusalResponse<P> {
     pub(super) fn to_send(&self) -> ActionToSend<'_> {
         ActionToSend {
             address: &self.address,
@@ -67,12 +67,12 @@ impl<P> Answer<P> {
     }
 }
 
-impl<P: Ord + Clone> Refused<P> {
+impl<P: Ord + Clone> RefusedRequests<P> {
     pub(super) fn new() -> Self {
         Self {
             known: HashMap::new(),
             queue: VecDeque::new(),
-            counts: Counts::new(),
+            counts: RequestCounts::new(),
             answers: VecDeque::new(),
         }
     }
@@ -80,18 +80,18 @@ impl<P: Ord + Clone> Refused<P> {
     /// Refuses a new request.
     pub(super) fn refuse(
         &mut self,
-        key: Key,
+        key: ActionRequestKey,
         (request, (origin, refusal)): (&ActionMessage<'_>, (RequestOrigin<P>, Refusal)),
         settings: &ResponderSettings,
         now: Duration,
-    ) -> Result<Requested, RequestDrop> {
+    ) -> Result<RequiredAction, RequestDrop> {
         let limits = (settings.max_refused, settings.max_refused_per_sender);
         self.counts.check(&origin, limits)?;
         let hash = hash(&key);
         let until = now.saturating_add(settings.remember);
         self.counts.add(&origin);
         self.queue.push_back((until, hash));
-        let known = Known {
+        let known = RefusedEntry {
             origin: origin.clone(),
             refusal,
             answered: now,
@@ -99,13 +99,13 @@ impl<P: Ord + Clone> Refused<P> {
         };
         self.known.insert(hash, known);
         self.answer((key, origin, refusal), request, now);
-        Ok(Requested::Declined(refusal))
+        Ok(RequiredAction::Declined(refusal))
     }
 
     /// Responds to a repetition of a refused request; returns `None` for any other request.
     pub(super) fn repeated(
         &mut self,
-        key: &Key,
+        key: &ActionRequestKey,
         request: &ActionMessage<'_>,
         settings: &ResponderSettings,
         now: Duration,
@@ -130,7 +130,7 @@ impl<P: Ord + Clone> Refused<P> {
     /// no field for a status.
     fn answer(
         &mut self,
-        (key, origin, refusal): (Key, RequestOrigin<P>, Refusal),
+        (key, origin, refusal): (ActionRequestKey, RequestOrigin<P>, Refusal),
         request: &ActionMessage<'_>,
         now: Duration,
     ) {
@@ -143,7 +143,7 @@ impl<P: Ord + Clone> Refused<P> {
                 (ActionState::Done, Some(refusal.status_code().status()))
             }
         };
-        self.answers.push_back(Answer {
+        self.answers.push_back(RefusalResponse {
             origin,
             key,
             address: request.into(),
@@ -154,7 +154,7 @@ impl<P: Ord + Clone> Refused<P> {
     }
 
     /// Returns the next response.
-    pub(super) fn pop(&mut self) -> Option<Answer<P>> {
+    pub(super) fn pop(&mut self) -> Option<RefusalResponse<P>> {
         self.answers.pop_front()
     }
 

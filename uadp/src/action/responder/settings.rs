@@ -81,7 +81,7 @@ impl ExecutionId {
 
 /// Action that a request requires of the owner.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Requested {
+pub enum RequiredAction {
     /// Execute the request and report the outcome, or refuse it.
     Execute(ExecutionId),
     /// Nothing: the Responder refuses the request.

@@ -1,5 +1,5 @@
 use super::*;
-use crate::discovery::List;
+use crate::discovery::WireArray;
 
 fn ms(millis: u64) -> Duration {
     Duration::from_millis(millis)
@@ -9,7 +9,7 @@ fn announcer() -> Announcer {
     Announcer::new([(5, 10), (5, 11), (6, 12)], AnnounceLimits::default())
 }
 
-fn due(announcer: &mut Announcer, now: Duration) -> Vec<(Subject, Vec<u16>)> {
+fn due(announcer: &mut Announcer, now: Duration) -> Vec<(AnnouncedSubject, Vec<u16>)> {
     std::iter::from_fn(|| announcer.poll(now))
         .map(|due| (due.subject, due.writer_ids))
         .collect()
@@ -18,30 +18,30 @@ fn due(announcer: &mut Announcer, now: Duration) -> Vec<(Subject, Vec<u16>)> {
 #[test]
 fn actions_are_announced_to_who_asks_for_their_connections_or_metadata() {
     let connections = Probe::PubSubConnections {
-        transport_profile_uris: List::new(&[]),
+        transport_profile_uris: WireArray::new(&[]),
         include_writer_groups: true,
         include_data_set_writers: false,
     };
     let mut announcer = Announcer::new([(5, 10)], AnnounceLimits::default());
     announcer.handle_probe(&connections, Duration::ZERO);
-    let only = [(Subject::PubSubConnections, vec![])];
+    let only = [(AnnouncedSubject::PubSubConnections, vec![])];
     assert_eq!(due(&mut announcer, Duration::from_secs(1)), only);
 
     announcer.set_actions([61]);
     let now = Duration::from_secs(2);
     announcer.handle_probe(&connections, now);
-    announcer.handle_probe(&Probe::DataSetMetaData(List::new(&[10, 61])), now);
+    announcer.handle_probe(&Probe::DataSetMetaData(WireArray::new(&[10, 61])), now);
     let mut subjects = due(&mut announcer, now + Duration::from_secs(1));
     subjects.sort();
     let expected = [
-        (Subject::PubSubConnections, vec![]),
-        (Subject::DataSetMetaData(10), vec![]),
-        (Subject::ActionResponder, vec![]),
-        (Subject::ActionMetaData(61), vec![]),
+        (AnnouncedSubject::PubSubConnections, vec![]),
+        (AnnouncedSubject::DataSetMetaData(10), vec![]),
+        (AnnouncedSubject::ActionResponder, vec![]),
+        (AnnouncedSubject::ActionMetaData(61), vec![]),
     ];
     assert_eq!(subjects, expected);
 
-    let changed = Subject::ActionMetaData(61);
+    let changed = AnnouncedSubject::ActionMetaData(61);
     let now = Duration::from_secs(9);
     let planned = announcer.announce(changed, Included::default(), now);
     assert_eq!(planned, Ok(()), "unasked, after a change");
@@ -50,14 +50,14 @@ fn actions_are_announced_to_who_asks_for_their_connections_or_metadata() {
 #[test]
 fn several_probes_for_one_subject_are_answered_once() {
     let mut announcer = announcer();
-    let probe = Probe::DataSetMetaData(List::new(&[10]));
+    let probe = Probe::DataSetMetaData(WireArray::new(&[10]));
     for millis in [0, 10, 49] {
         announcer.handle_probe(&probe, ms(millis));
     }
     assert_eq!(due(&mut announcer, ms(49)), []);
     assert_eq!(
         due(&mut announcer, ms(50)),
-        [(Subject::DataSetMetaData(10), vec![])]
+        [(AnnouncedSubject::DataSetMetaData(10), vec![])]
     );
     let counters = AnnounceCounters {
         planned: 1,
@@ -77,12 +77,12 @@ fn the_same_subject_is_announced_again_500_ms_later_at_the_earliest() {
     announcer.handle_probe(&Probe::FindApplications, ms(60));
     assert_eq!(
         due(&mut announcer, ms(549)),
-        [(Subject::ApplicationInformation, vec![])]
+        [(AnnouncedSubject::ApplicationInformation, vec![])]
     );
     assert_eq!(announcer.poll_timeout(), Some(ms(550)));
     assert_eq!(
         due(&mut announcer, ms(550)),
-        [(Subject::PublisherEndpoints, vec![])]
+        [(AnnouncedSubject::PublisherEndpoints, vec![])]
     );
     announcer.handle_probe(&Probe::PublisherEndpoints, ms(2000));
     assert_eq!(announcer.poll_timeout(), Some(ms(2050)));
@@ -92,15 +92,21 @@ fn the_same_subject_is_announced_again_500_ms_later_at_the_earliest() {
 fn data_set_writers_of_one_group_share_an_announcement() {
     let mut announcer = announcer();
     announcer.handle_probe(
-        &Probe::DataSetWriterConfiguration(List::new(&[12, 11])),
+        &Probe::DataSetWriterConfiguration(WireArray::new(&[12, 11])),
         ms(0),
     );
-    announcer.handle_probe(&Probe::DataSetWriterConfiguration(List::new(&[10])), ms(40));
+    announcer.handle_probe(
+        &Probe::DataSetWriterConfiguration(WireArray::new(&[10])),
+        ms(40),
+    );
     assert_eq!(
         due(&mut announcer, ms(50)),
         [
-            (Subject::DataSetWriterConfiguration(11), vec![10, 11]),
-            (Subject::DataSetWriterConfiguration(12), vec![12]),
+            (
+                AnnouncedSubject::DataSetWriterConfiguration(11),
+                vec![10, 11]
+            ),
+            (AnnouncedSubject::DataSetWriterConfiguration(12), vec![12]),
         ]
     );
     // Writer 10 is included, so it is not due separately.
@@ -110,19 +116,22 @@ fn data_set_writers_of_one_group_share_an_announcement() {
 #[test]
 fn what_was_announced_just_now_does_not_go_along() {
     let mut announcer = announcer();
-    announcer.handle_probe(&Probe::DataSetWriterConfiguration(List::new(&[10])), ms(0));
+    announcer.handle_probe(
+        &Probe::DataSetWriterConfiguration(WireArray::new(&[10])),
+        ms(0),
+    );
     assert_eq!(due(&mut announcer, ms(50)).len(), 1);
     announcer.handle_probe(
-        &Probe::DataSetWriterConfiguration(List::new(&[10, 11])),
+        &Probe::DataSetWriterConfiguration(WireArray::new(&[10, 11])),
         ms(100),
     );
     assert_eq!(
         due(&mut announcer, ms(150)),
-        [(Subject::DataSetWriterConfiguration(11), vec![11])]
+        [(AnnouncedSubject::DataSetWriterConfiguration(11), vec![11])]
     );
     assert_eq!(
         due(&mut announcer, ms(550)),
-        [(Subject::DataSetWriterConfiguration(10), vec![10])]
+        [(AnnouncedSubject::DataSetWriterConfiguration(10), vec![10])]
     );
 }
 
@@ -131,7 +140,7 @@ fn one_announcement_of_connections_has_what_any_who_asked_wants() {
     let mut announcer = announcer();
     for (include_writer_groups, include_data_set_writers) in [(true, false), (false, true)] {
         let probe = Probe::PubSubConnections {
-            transport_profile_uris: List::null(),
+            transport_profile_uris: WireArray::null(),
             include_writer_groups,
             include_data_set_writers,
         };
@@ -143,7 +152,7 @@ fn one_announcement_of_connections_has_what_any_who_asked_wants() {
     };
     announcer.handle_probe(&probe, ms(0));
     let first = announcer.poll(ms(50)).unwrap();
-    assert_eq!(first.subject, Subject::PubSubConnections);
+    assert_eq!(first.subject, AnnouncedSubject::PubSubConnections);
     // DataSetWriters without their groups cannot be included.
     let groups = Included {
         writer_groups: true,
@@ -151,7 +160,10 @@ fn one_announcement_of_connections_has_what_any_who_asked_wants() {
     };
     assert_eq!(first.included, groups);
     let second = announcer.poll(ms(50)).unwrap();
-    assert_eq!(second.subject, Subject::WriterGroupConfiguration(5));
+    assert_eq!(
+        second.subject,
+        AnnouncedSubject::WriterGroupConfiguration(5)
+    );
     assert!(second.included.data_set_writers);
 }
 
@@ -160,17 +172,20 @@ fn a_flood_of_probes_for_unknown_writers_gets_few_answers_and_the_known_one_firs
     let mut announcer = announcer();
     let ids: Vec<u16> = (10..=60_000).collect();
     for millis in 0..3 {
-        announcer.handle_probe(&Probe::DataSetMetaData(List::new(&ids)), ms(millis));
+        announcer.handle_probe(&Probe::DataSetMetaData(WireArray::new(&ids)), ms(millis));
     }
     let answers = due(&mut announcer, ms(50));
     assert_eq!(answers.len(), 3 + 8);
-    assert_eq!(answers[2], (Subject::DataSetMetaData(12), vec![]));
-    assert_eq!(answers[10], (Subject::DataSetMetaData(20), vec![]));
+    assert_eq!(answers[2], (AnnouncedSubject::DataSetMetaData(12), vec![]));
+    assert_eq!(answers[10], (AnnouncedSubject::DataSetMetaData(20), vec![]));
     assert_eq!(announcer.counters().planned, 11);
     assert_eq!(announcer.counters().duplicate, 2 * 11);
     assert_eq!(announcer.counters().unknown, 3 * (59_991 - 11));
     // After 500 ms other unknown subjects are permitted.
-    announcer.handle_probe(&Probe::DataSetMetaData(List::new(&ids[100..])), ms(550));
+    announcer.handle_probe(
+        &Probe::DataSetMetaData(WireArray::new(&ids[100..])),
+        ms(550),
+    );
     assert_eq!(due(&mut announcer, ms(600)).len(), 8);
 }
 
@@ -182,7 +197,7 @@ fn announcements_beyond_the_rate_wait() {
         ..AnnounceLimits::default()
     };
     let mut announcer = Announcer::new(ids.iter().map(|id| (1, *id)), limits);
-    announcer.handle_probe(&Probe::DataSetMetaData(List::new(&ids)), ms(0));
+    announcer.handle_probe(&Probe::DataSetMetaData(WireArray::new(&ids)), ms(0));
     let mut sent = Vec::new();
     while let Some(at) = announcer.poll_timeout() {
         sent.push((at, due(&mut announcer, at).len()));
@@ -199,10 +214,10 @@ fn no_500_ms_have_more_announcements_than_the_rate() {
     };
     let mut announcer = Announcer::new([(1, 1)], limits);
     for (subject, at) in [
-        (Subject::PublisherEndpoints, 0),
-        (Subject::PubSubConnections, 499),
-        (Subject::DataSetMetaData(1), 499),
-        (Subject::ApplicationInformation, 500),
+        (AnnouncedSubject::PublisherEndpoints, 0),
+        (AnnouncedSubject::PubSubConnections, 499),
+        (AnnouncedSubject::DataSetMetaData(1), 499),
+        (AnnouncedSubject::ApplicationInformation, 500),
     ] {
         announcer
             .announce(subject, Included::default(), ms(at))
@@ -222,7 +237,11 @@ fn sequence_numbers_count_announcements_and_wrap() {
     let mut numbers = Vec::new();
     for _ in 0..=65_536 {
         announcer
-            .announce(Subject::PublisherEndpoints, Included::default(), now)
+            .announce(
+                AnnouncedSubject::PublisherEndpoints,
+                Included::default(),
+                now,
+            )
             .unwrap();
         now = announcer.poll_timeout().unwrap();
         numbers.push(announcer.poll(now).unwrap().sequence_number);
@@ -234,15 +253,15 @@ fn sequence_numbers_count_announcements_and_wrap() {
 #[test]
 fn a_change_of_the_writers_forgets_what_is_planned() {
     let mut announcer = announcer();
-    announcer.handle_probe(&Probe::DataSetMetaData(List::new(&[10, 99])), ms(0));
+    announcer.handle_probe(&Probe::DataSetMetaData(WireArray::new(&[10, 99])), ms(0));
     announcer.set_writers([(7, 99)]);
     assert_eq!(announcer.poll_timeout(), None);
-    announcer.handle_probe(&Probe::DataSetMetaData(List::new(&[10, 99])), ms(0));
+    announcer.handle_probe(&Probe::DataSetMetaData(WireArray::new(&[10, 99])), ms(0));
     assert_eq!(
         due(&mut announcer, ms(50)),
         [
-            (Subject::DataSetMetaData(99), vec![]),
-            (Subject::DataSetMetaData(10), vec![]),
+            (AnnouncedSubject::DataSetMetaData(99), vec![]),
+            (AnnouncedSubject::DataSetMetaData(10), vec![]),
         ]
     );
 }

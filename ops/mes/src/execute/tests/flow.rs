@@ -3,20 +3,20 @@
 use tokio::sync::Barrier;
 
 use super::*;
-use crate::process::{BadEnd, Compare, Condition, Test};
+use crate::process::{BadEnd, Compare, StepCondition, Test};
 
 /// A sequence of these steps, each without an order of its own.
-fn sequence(steps: Vec<Step>) -> Process {
+fn sequence(steps: Vec<ProcessStep>) -> Process {
     Process {
-        work: Job::Sequence,
+        work: StepJob::Sequence,
         steps,
         within: Duration::from_secs(5),
         ..process()
     }
 }
 
-fn when(step: usize, test: Test, is_negated: bool) -> Vec<Vec<Condition>> {
-    vec![vec![Condition {
+fn when(step: usize, test: Test, is_negated: bool) -> Vec<Vec<StepCondition>> {
+    vec![vec![StepCondition {
         step,
         test,
         is_negated,
@@ -200,7 +200,7 @@ async fn an_unknown_end_is_handled_by_no_step() {
 /// Stops the run when two skills have begun.
 struct Stop(Arc<Fakes>);
 #[async_trait]
-impl Teller for Stop {
+impl JobObserver for Stop {
     async fn step(&self, _step: &'static str) {}
 
     async fn stopped(&self) {

@@ -2,13 +2,13 @@
 
 use super::*;
 use crate::execute::sequence::Passed;
-use crate::process::{BadEnd, By, Compare, Condition, Loop, Test};
+use crate::process::{BadEnd, By, Compare, Loop, StepCondition, Test};
 
 /// A loop over steps, which is repeated while a condition about one of them holds.
 fn repeated(steps: &[usize], (step, test): (usize, Test), rounds: u32) -> Loop {
     Loop {
         steps: steps.iter().copied().collect(),
-        again: vec![vec![Condition {
+        again: vec![vec![StepCondition {
             step,
             test,
             is_negated: false,
@@ -28,7 +28,7 @@ fn runs_below(most: u32) -> Test {
 /// Counts its runs, stirs, and ends.
 fn counted(rounds: Loop) -> Process {
     Process {
-        work: Job::Sequence,
+        work: StepJob::Sequence,
         steps: vec![
             alone(0, "count", "CountType"),
             alone(1, "stir", "StirType"),
@@ -115,7 +115,7 @@ async fn an_inner_loop_begins_anew_in_each_round_of_the_outer_one() {
     let mut process = counted(repeated(&[0, 1], (0, runs_below(2)), 10));
     process.steps[1] = alone(1, "stir", "OtherCountType");
     let odd = [1, 3].map(|runs| {
-        vec![Condition {
+        vec![StepCondition {
             step: 1,
             test: Test::Result {
                 name: "Runs".into(),
@@ -149,7 +149,7 @@ async fn an_inner_loop_begins_anew_in_each_round_of_the_outer_one() {
 #[test]
 fn loops_within_loops_have_a_maximum_of_rounds_in_all() {
     let has_failed = |is_negated| {
-        vec![vec![Condition {
+        vec![vec![StepCondition {
             step: 1,
             test: Test::Ended(BadEnd::Failed),
             is_negated,
@@ -166,7 +166,7 @@ fn loops_within_loops_have_a_maximum_of_rounds_in_all() {
         again: has_failed(false),
         rounds: Loop::MOST_ROUNDS,
     });
-    let mut progress = Progress::default();
+    let mut progress = RunProgress::default();
     let mut rounds = 0;
     let why = loop {
         let end = match rounds % 10 {
@@ -192,7 +192,7 @@ async fn each_round_of_a_loop_is_compensated() {
     fakes.offers.lock().unwrap().push(undo);
     fakes.fails_at = Some("three.End");
     let mut process = counted(repeated(&[0], (0, runs_below(2)), 10));
-    process.steps[0].compensation = Some(Box::new(Step {
+    process.steps[0].compensation = Some(Box::new(ProcessStep {
         by: By::SameAs(0),
         ..alone(3, "undo", "UndoType")
     }));
@@ -212,7 +212,7 @@ async fn a_component_of_an_earlier_round_stays_reserved_for_its_compensation() {
     let undo = offer("one", "Undo", "UndoType");
     fakes.offers.lock().unwrap().push(undo);
     let mut process = counted(repeated(&[0], (0, runs_below(2)), 10));
-    process.steps[0].compensation = Some(Box::new(Step {
+    process.steps[0].compensation = Some(Box::new(ProcessStep {
         by: By::SameAs(0),
         ..alone(3, "undo", "UndoType")
     }));

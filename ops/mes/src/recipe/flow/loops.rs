@@ -2,7 +2,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use super::{Edge, Flow, NodeKind};
+use super::{Edge, Flow, FlowNodeKind};
 
 /// A loop of a flow, by the numbers of its nodes.
 #[derive(Debug)]
@@ -50,7 +50,7 @@ impl FlowLoops {
             }
             let is_start = |node: &usize| {
                 let node = flow.nodes.get(*node);
-                node.is_some_and(|node| matches!(node.kind, NodeKind::Start))
+                node.is_some_and(|node| matches!(node.kind, FlowNodeKind::Start))
             };
             if nodes.iter().any(is_start) {
                 let what = format!(
@@ -126,7 +126,7 @@ fn returning(flow: &Flow) -> BTreeSet<usize> {
     let mut returns = BTreeSet::new();
     let mut seen = BTreeSet::new();
     let nodes = flow.nodes.iter().enumerate();
-    let starts = nodes.filter(|(_, node)| matches!(node.kind, NodeKind::Start));
+    let starts = nodes.filter(|(_, node)| matches!(node.kind, FlowNodeKind::Start));
     for (start, _) in starts {
         // Each node of the path, with the number of its flows that were followed.
         let mut path: Vec<(usize, usize)> = vec![(start, 0)];

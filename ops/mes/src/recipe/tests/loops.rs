@@ -49,8 +49,8 @@ fn batchml(transitions: &str) -> String {
 const AGAIN: &str = "<Transition><ID>again</ID><Condition>Stir.Level &lt; 0.5</Condition></Transition>\
                      <Transition><ID>on</ID><Condition>True</Condition></Transition>";
 
-fn low(is_negated: bool) -> Condition {
-    Condition {
+fn low(is_negated: bool) -> StepCondition {
+    StepCondition {
         step: 1,
         test: Test::Result {
             name: "Level".to_owned(),
@@ -76,7 +76,7 @@ fn a_transition_to_an_earlier_step_is_a_loop() {
     // The step behind the loop waits for all steps of it, and comes when no other round does.
     assert_eq!(process.steps[2].waits_for(2)[..2], [0, 1]);
     assert_eq!(process.steps[2].when, [[low(true)]]);
-    assert_eq!(process.steps[0].when, Vec::<Vec<Condition>>::new());
+    assert_eq!(process.steps[0].when, Vec::<Vec<StepCondition>>::new());
 }
 
 #[test]
@@ -99,7 +99,7 @@ fn a_bpmn_task_is_tried_again_by_its_boundary_event_or_by_a_gateway() {
         panic!("{process:?}")
     };
     assert_eq!(one.steps, [0, 1].into());
-    let failed = Condition {
+    let failed = StepCondition {
         step: 0,
         test: Test::Ended(BadEnd::Failed),
         is_negated: false,
@@ -142,7 +142,7 @@ fn a_loop_without_a_clear_end_is_refused() {
 /// Returns the loops of a process in the graph, or the reason why it cannot run.
 fn in_graph(turtle: &str) -> Result<Vec<Loop>, String> {
     let knowledge = knowledge::Knowledge::new().unwrap();
-    let source = knowledge::Source::new(knowledge::SourceKind::File, "p.ttl");
+    let source = knowledge::KnowledgeSource::new(knowledge::SourceKind::File, "p.ttl");
     knowledge.replace_turtle(&source, turtle, 1).unwrap();
     let mut read = crate::read_process::Processes::read(&knowledge).unwrap();
     match read.all.pop() {
@@ -156,7 +156,7 @@ fn loops_come_back_from_the_graph_and_faulty_ones_have_a_reason() {
     let text = batchml(AGAIN);
     let process = read(&text, &Names::new()).unwrap().processes.remove(0);
     let knowledge = knowledge::Knowledge::new().unwrap();
-    let source = knowledge::Source::new(knowledge::SourceKind::Process, "a recipe");
+    let source = knowledge::KnowledgeSource::new(knowledge::SourceKind::Process, "a recipe");
     let triples = process.triples(&|_| None);
     knowledge.replace(&source, &triples, 1).unwrap();
     let read = crate::read_process::Processes::read(&knowledge).unwrap();

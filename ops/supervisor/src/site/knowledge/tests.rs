@@ -10,7 +10,7 @@ use mappings::{NodeIdText, TopicId};
 
 use super::*;
 use crate::operations::{ConditionChange, ConditionState, OperationFault};
-use crate::program::Program;
+use crate::program::ProgramStatus;
 
 /// Users with the role that their name says.
 struct Users;
@@ -106,7 +106,7 @@ fn cell_with(
         answered.collect()
     });
     let page = Page::new("test", Vec::new(), None);
-    page.board().set_programs(vec![Program {
+    page.board().set_programs(vec![ProgramStatus {
         source: url,
         status: Ok(json!({ "processes": [] })),
     }]);
@@ -143,7 +143,7 @@ async fn send(
             let bytes = response.into_body().collect().await.unwrap().to_bytes();
             (status, serde_json::from_slice(&bytes).unwrap())
         }
-        Err(Refusal(status, why)) => (status.as_u16(), json!({ "error": why })),
+        Err(RefusedRequest(status, why)) => (status.as_u16(), json!({ "error": why })),
     }
 }
 

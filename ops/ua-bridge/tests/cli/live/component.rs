@@ -7,14 +7,14 @@ use std::thread::JoinHandle;
 use std::time::Duration;
 
 use tokio::time::Instant;
-use transport::{Options, Udp};
+use transport::{Udp, UdpOptions};
 use uadp::action::{
-    ActionDialect, ActionFields, ActionKind, ActionMessage, Outcome, Requested, Responder,
-    ResponderSettings,
+    ActionDialect, ActionFields, ActionKind, ActionMessage, ActionOutcome, RequiredAction,
+    Responder, ResponderSettings,
 };
 use uadp::discovery::{
-    ActionMetaData, ActionTargetDataType, Announced, Announcement, DataSetMetaDataType,
-    FieldMetaData, KeyValuePair, List, Probe,
+    ActionMetaData, ActionTargetDataType, AnnouncedContent, Announcement, DataSetMetaDataType,
+    FieldMetaData, KeyValuePair, Probe, WireArray,
 };
 use uadp::{
     Array, BuiltinType, DataSetHeader, Extras, FieldEncoder, GroupHeader, LocalizedText,
@@ -28,7 +28,7 @@ const START: u16 = 105;
 const HALT: u16 = 106;
 
 /// A component that runs in a group of its own until it is dropped.
-pub(crate) struct Component {
+pub(crate) struct GroupComponent {
     pub(crate) group: String,
     pub(crate) address: SocketAddr,
     seen: Arc<Seen>,
@@ -44,7 +44,7 @@ struct Seen {
     requestors: Mutex<Vec<String>>,
 }
 
-impl Component {
+impl GroupComponent {
     pub(crate) fn start() -> Self {
         Self::start_beside(false, 0)
     }
@@ -73,10 +73,10 @@ impl Component {
                 .build()
                 .unwrap();
             runtime.block_on(async {
-                let options = Options {
+                let options = UdpOptions {
                     interface: Some("127.0.0.1".to_owned()),
                     ttl: 0,
-                    ..Options::new(address)
+                    ..UdpOptions::new(address)
                 };
                 let udp = Udp::open(&options).unwrap();
                 let mut gripper = Gripper::new(udp, its);
@@ -118,7 +118,7 @@ impl Component {
     }
 }
 
-impl Drop for Component {
+impl Drop for GroupComponent {
     fn drop(&mut self) {
         self.seen.stop.store(true, Ordering::SeqCst);
         if let Some(thread) = self.thread.take() {
@@ -204,9 +204,9 @@ impl Gripper {
                 let asked = self
                     .responder
                     .handle_request(&action, (), self.start.elapsed());
-                if let Ok(Requested::Execute(execution)) = asked {
+                if let Ok(RequiredAction::Execute(execution)) = asked {
                     let block = self.execute(action.writer_id, action.fields);
-                    let outcome = Outcome::Answered {
+                    let outcome = ActionOutcome::Answered {
                         status: StatusCode::GOOD,
                         fields: ActionFields::Variants(&block),
                     };
@@ -224,10 +224,10 @@ impl Gripper {
         let Some((udp, responder)) = &mut self.forger else {
             return;
         };
-        if let Ok(Requested::Execute(execution)) = responder.handle_request(action, (), now) {
+        if let Ok(RequiredAction::Execute(execution)) = responder.handle_request(action, (), now) {
             let mut block = vec![3, 0, 1, 1, 12, 0, 0, 0, 0, 7];
             block.extend(4242_u32.to_le_bytes());
-            let outcome = Outcome::Answered {
+            let outcome = ActionOutcome::Answered {
                 status: StatusCode::GOOD,
                 fields: ActionFields::Variants(&block),
             };
@@ -366,7 +366,7 @@ impl Gripper {
         let request = [
             field(&("Force", BuiltinType::Double, -1)),
             FieldMetaData {
-                properties: List::new(&optional),
+                properties: WireArray::new(&optional),
                 ..field(&("Name", BuiltinType::String, -1))
             },
         ];
@@ -391,16 +391,16 @@ impl Gripper {
             ..ActionTargetDataType::default()
         }];
         let announced = match writer_id {
-            START | HALT => Announced::ActionMetaData(ActionMetaData {
+            START | HALT => AnnouncedContent::ActionMetaData(ActionMetaData {
                 writer_id,
-                action_targets: List::new(&target),
-                request: meta_data(List::new(request)),
-                response: meta_data(List::new(&fields)),
-                action_methods: List::null(),
+                action_targets: WireArray::new(&target),
+                request: meta_data(WireArray::new(request)),
+                response: meta_data(WireArray::new(&fields)),
+                action_methods: WireArray::null(),
             }),
-            _ => Announced::DataSetMetaData {
+            _ => AnnouncedContent::DataSetMetaData {
                 writer_id,
-                meta_data: meta_data(List::new(&fields)),
+                meta_data: meta_data(WireArray::new(&fields)),
                 status: StatusCode::GOOD,
             },
         };

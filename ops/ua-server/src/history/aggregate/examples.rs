@@ -6,8 +6,8 @@ use super::*;
 
 const SECOND: i64 = 10_000_000;
 
-fn samples(values: &[(i64, Option<f64>, Quality)]) -> Vec<Sample> {
-    let samples = values.iter().map(|(second, value, quality)| Sample {
+fn samples(values: &[(i64, Option<f64>, Quality)]) -> Vec<PastValue> {
+    let samples = values.iter().map(|(second, value, quality)| PastValue {
         time: second * SECOND,
         value: *value,
         quality: *quality,
@@ -16,7 +16,7 @@ fn samples(values: &[(i64, Option<f64>, Quality)]) -> Vec<Sample> {
 }
 
 /// A value every 10 s (A.1.1).
-fn periodic() -> Vec<Sample> {
+fn periodic() -> Vec<PastValue> {
     let mut values = vec![(0, None, Quality::Bad)];
     for tens in 1..=9 {
         let quality = match tens {
@@ -30,7 +30,7 @@ fn periodic() -> Vec<Sample> {
 }
 
 /// Values at irregular times (A.1.2).
-fn irregular() -> Vec<Sample> {
+fn irregular() -> Vec<PastValue> {
     samples(&[
         (0, None, Quality::Bad),
         (2, Some(10.0), Quality::Good),
@@ -49,10 +49,10 @@ fn irregular() -> Vec<Sample> {
 }
 
 /// The rules of the first historian: uncertain values are used.
-fn lenient() -> Rules {
-    Rules {
+fn lenient() -> AggregateRules {
+    AggregateRules {
         uncertain_is_bad: false,
-        ..Rules::default()
+        ..AggregateRules::default()
     }
 }
 
@@ -67,22 +67,28 @@ enum Row {
 use Row::{G, NoData, U};
 
 /// Asserts the values of intervals of that many seconds, from 12:00:00.
-fn assert_rows(aggregate: Aggregate, all: &[Sample], (rules, step): (Rules, i64), rows: &[Row]) {
+fn assert_rows(
+    aggregate: Aggregate,
+    all: &[PastValue],
+    (rules, step): (AggregateRules, i64),
+    rows: &[Row],
+) {
     for (row, start) in rows.iter().zip((0..).map(|row: i64| row * step)) {
         let interval = (start * SECOND, (start + step) * SECOND);
         let (value, quality) = match of(aggregate, all, interval, rules) {
-            Outcome::Raw(at) | Outcome::Held(at) => {
+            IntervalOutcome::Raw(at) | IntervalOutcome::Held(at) => {
                 let sample = all.get(at).unwrap();
                 (sample.value, sample.quality)
             }
-            Outcome::Picked(at, quality) | Outcome::Actual(at, quality) => {
+            IntervalOutcome::Picked(at, quality) | IntervalOutcome::Actual(at, quality) => {
                 (all.get(at).unwrap().value, quality)
             }
-            Outcome::Calculated(value, quality) | Outcome::Interpolated(value, quality) => {
-                (Some(value), quality)
+            IntervalOutcome::Calculated(value, quality)
+            | IntervalOutcome::Interpolated(value, quality) => (Some(value), quality),
+            IntervalOutcome::Count(count, quality) => (Some(f64::from(count)), quality),
+            IntervalOutcome::Status(_) | IntervalOutcome::NoData | IntervalOutcome::Bad => {
+                (None, Quality::Bad)
             }
-            Outcome::Count(count, quality) => (Some(f64::from(count)), quality),
-            Outcome::Status(_) | Outcome::NoData | Outcome::Bad => (None, Quality::Bad),
         };
         let wanted = match row {
             NoData => (None, Quality::Bad),
@@ -148,7 +154,7 @@ fn interpolative_of_the_published_examples() {
         G(90.0),
         U(90.0),
     ];
-    let every_five = (Rules::default(), 5);
+    let every_five = (AggregateRules::default(), 5);
     assert_rows(Aggregate::Interpolative, &irregular(), every_five, &rows);
 }
 
@@ -176,14 +182,14 @@ fn average_of_the_published_examples() {
         G(90.0),
         NoData,
     ];
-    let every_five = (Rules::default(), 5);
+    let every_five = (AggregateRules::default(), 5);
     assert_rows(Aggregate::Average, &irregular()[1..], every_five, &rows);
 }
 
 #[test]
 fn extremes_and_numbers_of_the_published_examples() {
     let irregular = &irregular()[1..];
-    let rules = (Rules::default(), 16);
+    let rules = (AggregateRules::default(), 16);
     let rows = [G(10.0), G(25.0), U(30.0), G(50.0), U(60.0), G(90.0)];
     assert_rows(Aggregate::Maximum, irregular, rules, &rows);
     let rows = [G(1.0), G(2.0), U(1.0), G(2.0), U(1.0), G(3.0)];
@@ -194,7 +200,7 @@ fn extremes_and_numbers_of_the_published_examples() {
 
 #[test]
 fn good_times_of_the_published_examples() {
-    let rules = (Rules::default(), 16);
+    let rules = (AggregateRules::default(), 16);
     let rows = [14_000.0, 16_000.0, 10_000.0, 16_000.0, 13_000.0].map(G);
     assert_rows(Aggregate::DurationGood, &irregular(), rules, &rows);
     let rows = [87.5, 100.0, 62.5, 100.0, 81.25].map(G);

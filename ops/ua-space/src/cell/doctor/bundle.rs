@@ -7,12 +7,12 @@ use std::path::Path;
 use flate2::Compression;
 use flate2::write::GzEncoder;
 
-use super::facts::Facts;
-use super::findings::Finding;
+use super::facts::CellFacts;
+use super::findings::DoctorFinding;
 use super::host;
 
 /// Packs findings, facts, configuration and logs. A part that cannot be read is left out.
-pub(super) fn pack(facts: &Facts, findings: &[Finding]) -> Vec<u8> {
+pub(super) fn pack(facts: &CellFacts, findings: &[DoctorFinding]) -> Vec<u8> {
     let mut files: Vec<(String, String)> = Vec::new();
     let mut add = |name: &str, text: String| files.push((name.to_owned(), text));
     add("versions.txt", versions(facts));
@@ -67,7 +67,7 @@ fn configuration(file: &Path) -> Option<String> {
 
 const MOST_CONFIGURATION: u64 = 32 << 20;
 
-fn versions(facts: &Facts) -> String {
+fn versions(facts: &CellFacts) -> String {
     let system = fs::read_to_string("/proc/version").unwrap_or_default();
     let release = fs::read_to_string("/etc/os-release").unwrap_or_default();
     let mut text = format!("ua-space {}\n", facts.version);

@@ -8,22 +8,22 @@ use std::time::Duration;
 use serde::Serialize;
 
 use super::super::overview::{all_pages, applications};
-use super::super::pages::Page;
-use super::host::{self, Host};
+use super::super::pages::StatusPage;
+use super::host::{self, HostFacts};
 use super::ros::{self, Ros1, Ros2};
 use crate::arguments::Doctor;
-use crate::live::{Timing, TopicSeen, listened};
+use crate::live::{SenderTiming, TopicSeen, listened};
 use crate::report::warn;
 
 /// All facts. The findings are functions of them.
 #[derive(Debug, Clone, Default, PartialEq, Serialize)]
-pub(super) struct Facts {
+pub(super) struct CellFacts {
     /// The version of this program.
     pub(super) version: String,
     /// Seconds since 1970.
     pub(super) now: u64,
-    pub(super) host: Host,
-    pub(super) pages: Vec<Page>,
+    pub(super) host: HostFacts,
+    pub(super) pages: Vec<StatusPage>,
     pub(super) group: GroupFacts,
     pub(super) ros1: Ros1,
     pub(super) ros2: Ros2,
@@ -38,17 +38,17 @@ pub(super) struct GroupFacts {
     /// The reason why the group cannot be received.
     pub(super) fault: Option<String>,
     pub(super) seconds: f64,
-    pub(super) applications: Vec<Announced>,
+    pub(super) applications: Vec<AnnouncedApplication>,
     pub(super) topics: Vec<TopicSeen>,
     /// The shortest delay from each sender.
-    pub(super) senders: Vec<Timing>,
+    pub(super) senders: Vec<SenderTiming>,
     /// Messages that were discarded, by reason.
     pub(super) dropped: BTreeMap<String, u64>,
 }
 
 /// An announced application.
 #[derive(Debug, Clone, Default, PartialEq, Serialize)]
-pub(super) struct Announced {
+pub(super) struct AnnouncedApplication {
     pub(super) space: u16,
     pub(super) from: String,
     pub(super) uri: String,
@@ -62,7 +62,7 @@ impl GroupFacts {
 }
 
 /// Reads and measures all facts.
-pub(super) async fn gather(arguments: &Doctor) -> Facts {
+pub(super) async fn gather(arguments: &Doctor) -> CellFacts {
     let root = Path::new("/");
     let mut host = host::read(root);
     let (pages, group, ros1) = tokio::join!(
@@ -73,7 +73,7 @@ pub(super) async fn gather(arguments: &Doctor) -> Facts {
     if let Some(address) = group.socket() {
         host.measure(address).await;
     }
-    Facts {
+    CellFacts {
         version: env!("CARGO_PKG_VERSION").to_owned(),
         now: host::unix_seconds(),
         ros2: ros::ros2(),
@@ -96,7 +96,7 @@ async fn group(arguments: &Doctor) -> GroupFacts {
             facts.address.clone_from(&heard.group);
             facts.applications = applications(heard.applications)
                 .into_iter()
-                .map(|(space, from, one)| Announced {
+                .map(|(space, from, one)| AnnouncedApplication {
                     space,
                     from: from.to_string(),
                     uri: one.uri,
@@ -127,7 +127,7 @@ fn address(arguments: &Doctor) -> String {
     }
 }
 
-impl Facts {
+impl CellFacts {
     /// Returns the names of topics, by topic.
     pub(super) fn names(&self) -> BTreeMap<&str, &str> {
         let seen = self.group.topics.iter();

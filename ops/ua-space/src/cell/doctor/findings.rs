@@ -3,20 +3,20 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::net::IpAddr;
 
-use Severity::{Error, Note, Warning};
+use DoctorSeverity::{Error, Note, Warning};
 use serde::Serialize;
 use supervisor::is_intended_drop;
 
 use super::super::processes::UdpSocket;
-use super::facts::Facts;
+use super::facts::CellFacts;
 use super::host::{HALT_POLL, IPFRAG_HIGH, RMEM_MAX};
-use crate::cell::Page;
+use crate::cell::StatusPage;
 
 /// A fault, or a setting that may cause a fault.
 #[derive(Debug, Clone, PartialEq, Serialize)]
-pub(super) struct Finding {
+pub(super) struct DoctorFinding {
     pub(super) code: &'static str,
-    pub(super) severity: Severity,
+    pub(super) severity: DoctorSeverity,
     pub(super) what: String,
     /// The effect on the cell.
     pub(super) why: String,
@@ -30,7 +30,7 @@ pub(super) struct Finding {
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 #[serde(rename_all = "snake_case")]
-pub(super) enum Severity {
+pub(super) enum DoctorSeverity {
     Error,
     Warning,
     Note,
@@ -44,13 +44,13 @@ pub(super) struct Fix {
 }
 
 /// Returns all findings, the most severe first.
-pub(super) fn of(facts: &Facts) -> Vec<Finding> {
-    let mut found: Vec<Finding> = ALL.iter().flat_map(|check| check(facts)).collect();
+pub(super) fn of(facts: &CellFacts) -> Vec<DoctorFinding> {
+    let mut found: Vec<DoctorFinding> = ALL.iter().flat_map(|check| check(facts)).collect();
     found.sort_by_key(|one| (one.severity, one.code));
     found
 }
 
-const ALL: [fn(&Facts) -> Vec<Finding>; 27] = [
+const ALL: [fn(&CellFacts) -> Vec<DoctorFinding>; 27] = [
     interfaces,
     membership,
     round_trips,
@@ -81,12 +81,12 @@ const ALL: [fn(&Facts) -> Vec<Finding>; 27] = [
 ];
 
 fn finding(
-    (code, severity): (&'static str, Severity),
+    (code, severity): (&'static str, DoctorSeverity),
     what: impl Into<String>,
     why: &str,
     remedy: impl Into<String>,
-) -> Finding {
-    Finding {
+) -> DoctorFinding {
+    DoctorFinding {
         code,
         severity,
         what: what.into(),
@@ -96,7 +96,7 @@ fn finding(
     }
 }
 
-fn interfaces(facts: &Facts) -> Vec<Finding> {
+fn interfaces(facts: &CellFacts) -> Vec<DoctorFinding> {
     let named = facts.group.interface.as_deref();
     if let Some(fault) = &facts.group.fault {
         return vec![finding(
@@ -120,7 +120,7 @@ fn interfaces(facts: &Facts) -> Vec<Finding> {
     }
 }
 
-fn membership(facts: &Facts) -> Vec<Finding> {
+fn membership(facts: &CellFacts) -> Vec<DoctorFinding> {
     let Some(IpAddr::V4(group)) = facts.group.socket().map(|group| group.ip()) else {
         return Vec::new();
     };
@@ -152,7 +152,7 @@ fn membership(facts: &Facts) -> Vec<Finding> {
 /// The programs that join the group.
 const JOINING: [&str; 4] = ["bridge-ros1", "bridge-ros2", "ua-server", "ua-component"];
 
-fn round_trips(facts: &Facts) -> Vec<Finding> {
+fn round_trips(facts: &CellFacts) -> Vec<DoctorFinding> {
     let failed = facts.interfaces().filter_map(|one| {
         let fault = one.round_trip.as_ref()?.as_ref().err()?;
         Some(finding(
@@ -169,7 +169,7 @@ fn round_trips(facts: &Facts) -> Vec<Finding> {
     failed.collect()
 }
 
-fn route(facts: &Facts) -> Vec<Finding> {
+fn route(facts: &CellFacts) -> Vec<DoctorFinding> {
     let Some(IpAddr::V4(group)) = facts.group.socket().map(|group| group.ip()) else {
         return Vec::new();
     };
@@ -189,7 +189,7 @@ fn route(facts: &Facts) -> Vec<Finding> {
     )]
 }
 
-fn port_holders(facts: &Facts) -> Vec<Finding> {
+fn port_holders(facts: &CellFacts) -> Vec<DoctorFinding> {
     let Some(group) = facts.group.socket() else {
         return Vec::new();
     };
@@ -221,7 +221,7 @@ fn port_holders(facts: &Facts) -> Vec<Finding> {
 }
 
 /// Returns whether a socket is of a program of the cell or of its tools.
-fn is_ours(facts: &Facts, socket: &UdpSocket) -> bool {
+fn is_ours(facts: &CellFacts, socket: &UdpSocket) -> bool {
     let is_program = |pid| {
         let mut programs = facts.host.processes.iter();
         programs.any(|program| program.pid == pid) || pid == std::process::id()
@@ -230,7 +230,7 @@ fn is_ours(facts: &Facts, socket: &UdpSocket) -> bool {
     is_tool || socket.pid.is_some_and(is_program)
 }
 
-fn socket_drops(facts: &Facts) -> Vec<Finding> {
+fn socket_drops(facts: &CellFacts) -> Vec<DoctorFinding> {
     let Some(group) = facts.group.socket() else {
         return Vec::new();
     };
@@ -261,7 +261,7 @@ fn socket_drops(facts: &Facts) -> Vec<Finding> {
     dropping.collect()
 }
 
-fn nothing_heard(facts: &Facts) -> Vec<Finding> {
+fn nothing_heard(facts: &CellFacts) -> Vec<DoctorFinding> {
     let group = &facts.group;
     let is_silent = group.topics.is_empty() && group.applications.is_empty();
     if !is_silent || group.fault.is_some() {
@@ -294,7 +294,7 @@ fn nothing_heard(facts: &Facts) -> Vec<Finding> {
     )]
 }
 
-fn master(facts: &Facts) -> Vec<Finding> {
+fn master(facts: &CellFacts) -> Vec<DoctorFinding> {
     let ros = &facts.ros1;
     let Some(fault) = ros.fault.as_ref().filter(|_| ros.is_wanted) else {
         return Vec::new();
@@ -313,7 +313,7 @@ fn master(facts: &Facts) -> Vec<Finding> {
     )]
 }
 
-fn unresolved_nodes(facts: &Facts) -> Vec<Finding> {
+fn unresolved_nodes(facts: &CellFacts) -> Vec<DoctorFinding> {
     let mut by_host: BTreeMap<&str, Vec<&str>> = BTreeMap::new();
     for (node, host) in &facts.ros1.unresolved {
         by_host.entry(host).or_default().push(node);
@@ -338,7 +338,7 @@ fn unresolved_nodes(facts: &Facts) -> Vec<Finding> {
     each.collect()
 }
 
-fn own_ros_address(facts: &Facts) -> Vec<Finding> {
+fn own_ros_address(facts: &CellFacts) -> Vec<DoctorFinding> {
     let ros = &facts.ros1;
     if !ros.is_wanted {
         return Vec::new();
@@ -386,7 +386,7 @@ fn own_ros_address(facts: &Facts) -> Vec<Finding> {
     Vec::new()
 }
 
-fn discovery_range(facts: &Facts) -> Vec<Finding> {
+fn discovery_range(facts: &CellFacts) -> Vec<DoctorFinding> {
     let localhost = facts
         .ros2
         .get("ROS_LOCALHOST_ONLY")
@@ -406,7 +406,7 @@ fn discovery_range(facts: &Facts) -> Vec<Finding> {
     )]
 }
 
-fn discovery_server(facts: &Facts) -> Vec<Finding> {
+fn discovery_server(facts: &CellFacts) -> Vec<DoctorFinding> {
     let Some(server) = facts.ros2.get("ROS_DISCOVERY_SERVER") else {
         return Vec::new();
     };
@@ -419,7 +419,7 @@ fn discovery_server(facts: &Facts) -> Vec<Finding> {
     )]
 }
 
-fn middleware(facts: &Facts) -> Vec<Finding> {
+fn middleware(facts: &CellFacts) -> Vec<DoctorFinding> {
     let name = facts.ros2.get("RMW_IMPLEMENTATION");
     let Some(name) = name.filter(|name| !DDS.contains(name)) else {
         return Vec::new();
@@ -439,7 +439,7 @@ const DDS: [&str; 4] = [
     "rmw_connextdds",
 ];
 
-fn domain(facts: &Facts) -> Vec<Finding> {
+fn domain(facts: &CellFacts) -> Vec<DoctorFinding> {
     let Some(domain) = facts.ros2.get("ROS_DOMAIN_ID") else {
         return Vec::new();
     };
@@ -464,7 +464,7 @@ fn domain(facts: &Facts) -> Vec<Finding> {
     )]
 }
 
-fn two_bridges(facts: &Facts) -> Vec<Finding> {
+fn two_bridges(facts: &CellFacts) -> Vec<DoctorFinding> {
     let twice = facts
         .bridges()
         .into_iter()
@@ -485,7 +485,7 @@ fn two_bridges(facts: &Facts) -> Vec<Finding> {
     each.collect()
 }
 
-fn duplicate_topics(facts: &Facts) -> Vec<Finding> {
+fn duplicate_topics(facts: &CellFacts) -> Vec<DoctorFinding> {
     let known = facts.bridges();
     let two = facts.group.topics.iter().filter(|one| {
         let space = one
@@ -519,7 +519,7 @@ fn called(name: Option<&str>, topic: &str) -> String {
     }
 }
 
-fn different_mappings(facts: &Facts) -> Vec<Finding> {
+fn different_mappings(facts: &CellFacts) -> Vec<DoctorFinding> {
     let mut by_hash: BTreeMap<&str, Vec<String>> = BTreeMap::new();
     for page in facts
         .pages
@@ -546,11 +546,11 @@ fn different_mappings(facts: &Facts) -> Vec<Finding> {
 }
 
 /// Returns whether the file of a program is not the mapping of the cell.
-fn has_own_file(page: &Page) -> bool {
+fn has_own_file(page: &StatusPage) -> bool {
     ["ua-component", "ua-mes", "ua-station"].contains(&page.program.as_str())
 }
 
-fn type_conflicts(facts: &Facts) -> Vec<Finding> {
+fn type_conflicts(facts: &CellFacts) -> Vec<DoctorFinding> {
     let conflicting = facts.group.topics.iter().filter(|one| one.types.len() > 1);
     let each = conflicting.take(MOST_EACH).map(|one| {
         finding(
@@ -567,7 +567,7 @@ fn type_conflicts(facts: &Facts) -> Vec<Finding> {
     each.collect()
 }
 
-fn dropped_samples(facts: &Facts) -> Vec<Finding> {
+fn dropped_samples(facts: &CellFacts) -> Vec<DoctorFinding> {
     let names = facts.names();
     let each = facts.pages.iter().filter_map(|page| {
         let mut drops: Vec<(u64, &str, &str)> = Vec::new();
@@ -606,7 +606,7 @@ fn dropped_samples(facts: &Facts) -> Vec<Finding> {
     each.collect()
 }
 
-fn not_ready(facts: &Facts) -> Vec<Finding> {
+fn not_ready(facts: &CellFacts) -> Vec<DoctorFinding> {
     let each = facts.pages.iter().flat_map(|page| {
         let reasons = page
             .not_ready
@@ -638,7 +638,7 @@ fn not_ready(facts: &Facts) -> Vec<Finding> {
     each.collect()
 }
 
-fn stale_mappings(facts: &Facts) -> Vec<Finding> {
+fn stale_mappings(facts: &CellFacts) -> Vec<DoctorFinding> {
     let each = facts.pages.iter().flat_map(|page| {
         let file = page.mapping.file.as_deref().unwrap_or("the mapping");
         let stale = page.mapping.stale.as_ref().map(|why| {
@@ -667,7 +667,7 @@ fn stale_mappings(facts: &Facts) -> Vec<Finding> {
     each.collect()
 }
 
-fn different_versions(facts: &Facts) -> Vec<Finding> {
+fn different_versions(facts: &CellFacts) -> Vec<DoctorFinding> {
     let mut by_version: BTreeMap<&str, Vec<String>> = BTreeMap::new();
     for page in &facts.pages {
         if let Some(version) = &page.version {
@@ -689,7 +689,7 @@ fn different_versions(facts: &Facts) -> Vec<Finding> {
     )]
 }
 
-fn clocks(facts: &Facts) -> Vec<Finding> {
+fn clocks(facts: &CellFacts) -> Vec<DoctorFinding> {
     let each = facts.group.senders.iter().filter_map(|one| {
         // The transport takes less than this; the rest is the difference of the clocks.
         let offset = one.shortest_delay_us;
@@ -712,9 +712,9 @@ fn clocks(facts: &Facts) -> Vec<Finding> {
     each.collect()
 }
 
-fn kernel_settings(facts: &Facts) -> Vec<Finding> {
+fn kernel_settings(facts: &CellFacts) -> Vec<DoctorFinding> {
     let setting = |path: &str| facts.host.settings.get(path).copied();
-    let with_fix = |one: Finding, path: &str, value| Finding {
+    let with_fix = |one: DoctorFinding, path: &str, value| DoctorFinding {
         fix: Some(Fix {
             path: path.to_owned(),
             value,
@@ -764,7 +764,7 @@ fn kernel_settings(facts: &Facts) -> Vec<Finding> {
     found
 }
 
-fn descriptors(facts: &Facts) -> Vec<Finding> {
+fn descriptors(facts: &CellFacts) -> Vec<DoctorFinding> {
     let full = facts.host.processes.iter().filter_map(|one| {
         let most = one.most_open_files?;
         let open = u64::try_from(one.open_files).unwrap_or(u64::MAX);
@@ -783,7 +783,7 @@ fn descriptors(facts: &Facts) -> Vec<Finding> {
     full.collect()
 }
 
-fn certificates(facts: &Facts) -> Vec<Finding> {
+fn certificates(facts: &CellFacts) -> Vec<DoctorFinding> {
     let today = facts.now / DAY;
     let each = facts.pages.iter().filter_map(|page| {
         let certificate = page.certificate.as_ref()?;
@@ -824,7 +824,7 @@ fn day_number(text: &str) -> Option<u64> {
     days.checked_sub(719_468)
 }
 
-fn filters(facts: &Facts) -> Vec<Finding> {
+fn filters(facts: &CellFacts) -> Vec<DoctorFinding> {
     let mut found = Vec::new();
     if let Some(first) = facts.host.firewall.first() {
         let more = facts.host.firewall.len() - 1;
@@ -840,7 +840,7 @@ fn filters(facts: &Facts) -> Vec<Finding> {
         let is_of_cell = facts.interfaces().any(|one| one.name == switch.name);
         if switch.snooping && !switch.querier && is_of_cell {
             let path = format!("/sys/class/net/{}/bridge/multicast_querier", switch.name);
-            found.push(Finding {
+            found.push(DoctorFinding {
                 fix: Some(Fix { path, value: 1 }),
                 ..finding(
                     ("D071", Warning),

@@ -11,19 +11,19 @@ use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use serde::Serialize;
 use tokio::time::{Instant, timeout};
-use transport::{Options, Udp};
+use transport::{Udp, UdpOptions};
 
-use super::super::processes::{self, Process, UdpSocket};
+use super::super::processes::{self, LocalProcess, UdpSocket};
 use super::facts::ROUND_TRIP;
 
 #[derive(Debug, Clone, Default, PartialEq, Serialize)]
-pub(super) struct Host {
+pub(super) struct HostFacts {
     pub(super) name: String,
     pub(super) interfaces: Vec<InterfaceFacts>,
     /// The multicast groups that are joined, by interface.
     pub(super) memberships: BTreeMap<String, Vec<Ipv4Addr>>,
     pub(super) routes: Vec<Route>,
-    pub(super) processes: Vec<Process>,
+    pub(super) processes: Vec<LocalProcess>,
     pub(super) udp: Vec<UdpSocket>,
     /// Settings of the kernel, by path.
     pub(super) settings: BTreeMap<String, u64>,
@@ -65,7 +65,7 @@ pub(super) const HALT_POLL: &str = "/sys/module/haltpoll/parameters/guest_halt_p
 const SETTINGS: [&str; 3] = [RMEM_MAX, IPFRAG_HIGH, HALT_POLL];
 
 /// Reads the facts below a root.
-pub(super) fn read(root: &Path) -> Host {
+pub(super) fn read(root: &Path) -> HostFacts {
     let text = |path: &str| {
         let path = root.join(path.trim_start_matches('/'));
         fs::read_to_string(path).unwrap_or_default()
@@ -75,7 +75,7 @@ pub(super) fn read(root: &Path) -> Host {
         let value = text(path).trim().parse().ok()?;
         Some(((*path).to_owned(), value))
     });
-    Host {
+    HostFacts {
         name: text("/proc/sys/kernel/hostname").trim().to_owned(),
         interfaces: interfaces(),
         memberships: memberships(&text("/proc/net/igmp")),
@@ -90,7 +90,7 @@ pub(super) fn read(root: &Path) -> Host {
     }
 }
 
-impl Host {
+impl HostFacts {
     /// Sends a datagram to the group on each interface, at a port that no program uses.
     pub(super) async fn measure(&mut self, group: SocketAddr) {
         if !group.ip().is_multicast() {
@@ -108,11 +108,11 @@ async fn round_trip(group: IpAddr, interface: &str) -> Result<f64, String> {
     let free = std::net::UdpSocket::bind((Ipv4Addr::UNSPECIFIED, 0));
     let port = free.and_then(|socket| socket.local_addr());
     let port = port.map_err(|error| error.to_string())?.port();
-    let options = Options {
+    let options = UdpOptions {
         interface: Some(interface.to_owned()),
         ttl: 0,
         own: true,
-        ..Options::new(SocketAddr::new(group, port))
+        ..UdpOptions::new(SocketAddr::new(group, port))
     };
     let mut udp = Udp::open(&options).map_err(|error| error.to_string())?;
     let sent = format!("ua-space doctor {} {interface}", std::process::id());

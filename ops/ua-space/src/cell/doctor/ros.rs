@@ -8,7 +8,7 @@ use serde::Serialize;
 use tokio::task::JoinSet;
 use tokio::time::timeout;
 
-use super::host::Host;
+use super::host::HostFacts;
 use crate::survey::master_uri;
 
 #[derive(Debug, Clone, Default, PartialEq, Serialize)]
@@ -67,7 +67,7 @@ fn variable(name: &str) -> Option<String> {
 }
 
 /// Asks the master for its nodes, and resolves the names of their hosts.
-pub(super) async fn ros1(host: &Host) -> Ros1 {
+pub(super) async fn ros1(host: &HostFacts) -> Ros1 {
     let bridged = host
         .processes
         .iter()
@@ -87,7 +87,7 @@ pub(super) async fn ros1(host: &Host) -> Ros1 {
     if let Some(name) = host_of(&facts.master) {
         facts.master_addresses = resolved(name).await;
     }
-    let graph = timeout(LIMIT, tcpros::Graph::of_master(&facts.master, CALLER)).await;
+    let graph = timeout(LIMIT, tcpros::MasterGraph::of_master(&facts.master, CALLER)).await;
     let graph = match graph {
         Ok(Ok(graph)) => graph,
         Ok(Err(error)) => {
@@ -110,7 +110,7 @@ pub(super) async fn ros1(host: &Host) -> Ros1 {
     for node in nodes.into_iter().take(MOST_NODES).cloned() {
         let master = facts.master.clone();
         asking.spawn(async move {
-            let uri = tcpros::Graph::node_uri(&master, CALLER, &node);
+            let uri = tcpros::MasterGraph::node_uri(&master, CALLER, &node);
             let uri = timeout(LIMIT, uri).await.ok()?.ok()??;
             let name = host_of(&uri)?.to_owned();
             resolved(&name).await.is_empty().then_some((node, name))

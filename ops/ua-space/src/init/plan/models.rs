@@ -4,14 +4,14 @@ use std::collections::HashMap;
 
 use mappings::{ExpandedNodeIdText, Identifier, NamespaceText, NodeIdText};
 
-use super::{Bound, Entry, Planner};
-use crate::init::nodes::Free;
-use crate::init::topics::Form;
-use crate::survey::model::{Model, ModelTopic, ModelValue};
+use super::{BoundTopic, Planner, ProposedVariable};
+use crate::init::nodes::FreeIndexes;
+use crate::init::topics::ValueForm;
+use crate::survey::model::{ModelTopic, ModelValue, NodeModel};
 
 impl Planner<'_> {
     /// Adds the values of the models that are not in the mapping.
-    pub(super) fn models(&mut self, models: &[Model], uri: &str) {
+    pub(super) fn models(&mut self, models: &[NodeModel], uri: &str) {
         let mut all = Vec::new();
         for model in models {
             for (space, domain) in &model.spaces {
@@ -41,9 +41,9 @@ impl Planner<'_> {
     }
 
     /// Returns the nodes of the model in the namespaces of the mapping.
-    fn model_nodes(&mut self, model: &Model) -> HashMap<ExpandedNodeIdText, NodeIdText> {
+    fn model_nodes(&mut self, model: &NodeModel) -> HashMap<ExpandedNodeIdText, NodeIdText> {
         let mut indexes = self.indexes();
-        let mut free = Free::default();
+        let mut free = FreeIndexes::default();
         let mut nodes = HashMap::new();
         for node in model.values.iter().filter_map(|value| value.node.as_ref()) {
             let (uri, wanted) = match &node.namespace {
@@ -100,7 +100,7 @@ impl Planner<'_> {
         if is_known || is_partly_bound || is_left_out {
             return;
         }
-        let bindings: Vec<Bound> = new
+        let bindings: Vec<BoundTopic> = new
             .into_iter()
             .map(|one| self.bound_of(one, value))
             .collect();
@@ -123,7 +123,7 @@ impl Planner<'_> {
             let at = self.plan.entries.len();
             self.of_models.insert(node.clone(), at);
         }
-        self.push(Entry {
+        self.push(ProposedVariable {
             group: value.within.clone(),
             node,
             alias: None,
@@ -139,14 +139,14 @@ impl Planner<'_> {
         });
     }
 
-    fn bound_of(&self, topic: &ModelTopic, value: &ModelValue) -> Bound {
+    fn bound_of(&self, topic: &ModelTopic, value: &ModelValue) -> BoundTopic {
         let [ros1, ros2] = &self.registries;
         let registry = if topic.space.is_ros2() { ros2 } else { ros1 };
         let form = match &topic.field {
-            Some(path) => Form::Field(path.clone(), value.value),
-            None => Form::of(&topic.kind, registry),
+            Some(path) => ValueForm::Field(path.clone(), value.value),
+            None => ValueForm::of(&topic.kind, registry),
         };
-        Bound {
+        BoundTopic {
             space: topic.space,
             topic: topic.topic.clone(),
             kind: topic.kind.clone(),

@@ -1,9 +1,9 @@
 use uadp::discovery::{
     ActionMetaData as ActionMeta, ActionTargetDataType, ApplicationDescription,
-    ConfigurationVersion, DataSetMetaDataType, FieldMetaData, KeyValuePair, List,
+    ConfigurationVersion, DataSetMetaDataType, FieldMetaData, KeyValuePair, WireArray,
 };
 use uadp::{
-    BuiltinType, Chunks, DataSetHeader, GroupHeader, LocalizedText, NetworkMessageEncoder,
+    BuiltinType, ChunkEncoder, DataSetHeader, GroupHeader, LocalizedText, NetworkMessageEncoder,
     QualifiedName, Scalar, SecurityHeader, StatusCode, Variant,
 };
 
@@ -54,13 +54,13 @@ fn meta_data<'a>(name: &'a str, fields: &'a [FieldMetaData<'a>]) -> DataSetMetaD
             locale: None,
             text: Some("ua_msgs/SkillState; GraspSkillType nsu=urn:ua-bridge:skills"),
         },
-        fields: List::new(fields),
+        fields: WireArray::new(fields),
         configuration_version: ConfigurationVersion { major: 1, minor: 1 },
         ..DataSetMetaDataType::default()
     }
 }
 
-fn announcement(announced: Announced<'_>) -> Vec<u8> {
+fn announcement(announced: AnnouncedContent<'_>) -> Vec<u8> {
     let announcement = Announcement {
         sequence_number: 1,
         announced,
@@ -73,7 +73,7 @@ fn announcement(announced: Announced<'_>) -> Vec<u8> {
 }
 
 fn describes(writer_id: u16, name: &str, status: StatusCode) -> Vec<u8> {
-    announcement(Announced::DataSetMetaData {
+    announcement(AnnouncedContent::DataSetMetaData {
         writer_id,
         meta_data: meta_data(name, &[field("state")]),
         status,
@@ -155,12 +155,12 @@ fn a_space_without_values_is_known_by_its_application() {
     let mut book = Book::new();
     let announcement = Announcement {
         sequence_number: 1,
-        announced: Announced::ApplicationDescription {
+        announced: AnnouncedContent::ApplicationDescription {
             description: ApplicationDescription {
                 application_uri: Some("urn:example:bridge"),
                 ..ApplicationDescription::default()
             },
-            capabilities: List::null(),
+            capabilities: WireArray::null(),
         },
     };
     let mut datagram = Vec::new();
@@ -204,7 +204,7 @@ fn a_call_is_known_by_its_name_with_what_may_be_left_out_of_it() {
     let fields = [
         field("Place"),
         FieldMetaData {
-            properties: List::new(&optional),
+            properties: WireArray::new(&optional),
             ..field("Force")
         },
     ];
@@ -212,19 +212,19 @@ fn a_call_is_known_by_its_name_with_what_may_be_left_out_of_it() {
         action_target_id: 1,
         ..ActionTargetDataType::default()
     };
-    let datagram = announcement(Announced::ActionMetaData(ActionMeta {
+    let datagram = announcement(AnnouncedContent::ActionMetaData(ActionMeta {
         writer_id: 105,
-        action_targets: List::new(&[target]),
+        action_targets: WireArray::new(&[target]),
         request: meta_data("ua_0_7_105 gripper.Grasp.Start", &fields),
         response: meta_data("ua_0_7_105 gripper.Grasp.Start", &[field("message")]),
-        action_methods: List::null(),
+        action_methods: WireArray::null(),
     }));
     let mut book = Book::new();
     let mut heard = Vec::new();
     for port in [1, 1, 2] {
         let message = NetworkMessage::decode(&datagram).unwrap();
         book.handle((&message, from(port)), NOW, &mut |news| {
-            if let News::Announced {
+            if let DatagramContent::Announced {
                 topic,
                 kind,
                 described,
@@ -236,7 +236,7 @@ fn a_call_is_known_by_its_name_with_what_may_be_left_out_of_it() {
         });
     }
     let summary = "(Place: String, [Force: String]) -> (message: String)".to_owned();
-    let wanted = (topic("ua_0_7_105"), Kind::Call, summary);
+    let wanted = (topic("ua_0_7_105"), NameKind::Call, summary);
     assert_eq!(heard, [wanted.clone(), wanted], "once from each");
     assert_eq!(
         (book.calls().count(), book.announcers(topic("ua_0_7_105"))),
@@ -251,7 +251,7 @@ fn a_description_in_chunks_is_put_together_for_each_sender() {
     let body = |name: &str| {
         let announcement = Announcement {
             sequence_number: 1,
-            announced: Announced::DataSetMetaData {
+            announced: AnnouncedContent::DataSetMetaData {
                 writer_id: 101,
                 meta_data: meta_data(name, &fields),
                 status: StatusCode::GOOD,
@@ -278,7 +278,7 @@ fn a_description_in_chunks_is_put_together_for_each_sender() {
             trailer: 0,
         };
         let extras = uadp::Extras::default();
-        let mut chunks = Chunks::new(&network, &extras, whole, budget).unwrap();
+        let mut chunks = ChunkEncoder::new(&network, &extras, whole, budget).unwrap();
         let (mut datagrams, mut buffer) = (Vec::new(), Vec::new());
         while let Some(chunk) = chunks.append(&mut buffer, &extras) {
             datagrams.push(buffer.split_off(chunk.unwrap().start));

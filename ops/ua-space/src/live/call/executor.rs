@@ -8,13 +8,13 @@ use crate::report::warn;
 
 /// The sender that announced a call, identified by its address.
 #[derive(Debug, Clone, Copy, Default)]
-pub(super) struct Executor {
+pub(super) struct AnnouncedExecutor {
     from: Option<SocketAddr>,
     /// True if a forged response was reported.
     reported: bool,
 }
 
-impl Executor {
+impl AnnouncedExecutor {
     pub(super) const fn at(from: SocketAddr) -> Self {
         Self {
             from: Some(from),

@@ -10,27 +10,27 @@ use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD as BASE64;
 use mappings::TopicId;
 use serde::Serialize;
-use uadp::action::{CallId, Heard, Outcome, Unknown};
+use uadp::action::{ActionOutcome, CallId, ResponseMeaning, Unknown};
 
-use super::super::book::{Kind, News};
-use super::super::described::Described;
-use super::super::plain::{self, Named};
-use super::super::{Ended, Go, parameters, until};
+use super::super::book::{DatagramContent, NameKind};
+use super::super::described::AnnouncedDescription;
+use super::super::plain::{self, NamedValues};
+use super::super::{Go, ListenEnd, parameters, until};
 use super::{Asking, LOOK, called, refused, words};
-use crate::exit::Failure;
+use crate::exit::CommandFailure;
 use crate::report::warn;
 
 /// The calls and the feedback topic of an action, besides the call that sends goals.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Parts {
+pub(super) struct ActionParts {
     cancel: TopicId,
     result: TopicId,
     feedback: TopicId,
 }
 
-impl Parts {
+impl ActionParts {
     /// Returns the parts of an action; `None` for a call that does not send goals.
-    pub(super) fn of(goal: TopicId, described: &Described) -> Option<Self> {
+    pub(super) fn of(goal: TopicId, described: &AnnouncedDescription) -> Option<Self> {
         let action = described.call()?.action?;
         let (space, namespace, _) = goal.triple();
         let of = |id| TopicId::new(space, namespace, id);
@@ -45,18 +45,18 @@ impl Parts {
 /// An event of a goal.
 #[derive(Debug, Serialize)]
 #[serde(tag = "event", rename_all = "snake_case")]
-pub(super) enum Told {
+pub(super) enum GoalUpdate {
     Feedback {
-        fields: Named,
+        fields: NamedValues,
     },
     Result {
         status: &'static str,
         message: String,
-        fields: Named,
+        fields: NamedValues,
     },
 }
 
-impl Told {
+impl GoalUpdate {
     /// Returns the lines for people.
     pub(super) fn told(&self) -> String {
         match self {
@@ -87,12 +87,12 @@ impl Told {
 
 /// A followed goal.
 struct Goal {
-    parts: Parts,
+    parts: ActionParts,
     /// The goal id as values show it.
     id: String,
     bytes: [u8; 16],
-    result: Arc<Described>,
-    cancel: Arc<Described>,
+    result: Arc<AnnouncedDescription>,
+    cancel: Arc<AnnouncedDescription>,
     /// The call that waits for the result.
     waits: CallId,
     cancelling: Option<Cancelling>,
@@ -141,24 +141,24 @@ enum CancelAnswer {
 
 /// The outcome of the call that waits for the result.
 enum Came {
-    Result(Named),
+    Result(NamedValues),
     /// The time limit passed without a response.
     Nothing,
-    Failed(Failure),
+    Failed(CommandFailure),
 }
 
 impl Asking<'_> {
     /// Sends a goal and, without `--no-wait`, follows it to its end.
     pub(super) async fn send_goal(
         &mut self,
-        (topic, described): (TopicId, &Described),
-        parts: Parts,
-    ) -> Result<(), Failure> {
+        (topic, described): (TopicId, &AnnouncedDescription),
+        parts: ActionParts,
+    ) -> Result<(), CommandFailure> {
         let takes = described.call().map_or(&[][..], |call| &call.request);
         let takes = words::fields(takes);
         let fills = described.ros_type().is_some() && described.skill_type().is_none();
         let usage =
-            |wrong: String| Failure::Usage(format!("{}: {wrong}", called(topic, described)));
+            |wrong: String| CommandFailure::Usage(format!("{}: {wrong}", called(topic, described)));
         let typed = words::spelled(&self.arguments.parameters, &takes, fills).map_err(usage)?;
         let block =
             parameters::request(&typed, &takes).map_err(|wrong| usage(wrong.to_string()))?;
@@ -178,8 +178,8 @@ impl Asking<'_> {
         let answer = match self.ask((topic, described), &request, None).await {
             // The goal may already be accepted, or be accepted later. Its result gives the end in
             // both cases.
-            Err(failure @ (Failure::Interrupted | Failure::Unavailable(_))) => {
-                if let Failure::Unavailable(why) = &failure {
+            Err(failure @ (CommandFailure::Interrupted | CommandFailure::Unavailable(_))) => {
+                if let CommandFailure::Unavailable(why) = &failure {
                     warn(why);
                 }
                 warn("cancelling the goal (Ctrl-C leaves at once)");
@@ -187,7 +187,7 @@ impl Asking<'_> {
                 let mut goal = waiting(waits);
                 self.cancel_goal(&mut goal)?;
                 let end = self.follow_goal(goal).await?;
-                let is_lost = matches!(failure, Failure::Unavailable(_));
+                let is_lost = matches!(failure, CommandFailure::Unavailable(_));
                 return if is_lost { end } else { Err(failure) };
             }
             answer => answer?,
@@ -202,7 +202,7 @@ impl Asking<'_> {
                 why
             };
             let name = called(topic, described);
-            return Err(Failure::Failed(format!(
+            return Err(CommandFailure::Failed(format!(
                 "{name}: the goal is rejected: {why}"
             )));
         }
@@ -217,12 +217,12 @@ impl Asking<'_> {
     async fn parts_of(
         &mut self,
         goal: TopicId,
-        parts: Parts,
-    ) -> Result<[Arc<Described>; 2], Failure> {
+        parts: ActionParts,
+    ) -> Result<[Arc<AnnouncedDescription>; 2], CommandFailure> {
         for topic in [parts.cancel, parts.result, parts.feedback] {
             self.live.want(topic);
         }
-        let mut found: [Option<Arc<Described>>; 2] = [None, None];
+        let mut found: [Option<Arc<AnnouncedDescription>>; 2] = [None, None];
         let mut hears_feedback = false;
         let executor = self.executor;
         for (topic, kind, described, _) in self
@@ -231,11 +231,11 @@ impl Asking<'_> {
             .announced_where(|from| executor.publishes(from))
         {
             take(&mut found, parts, (topic, kind), described);
-            hears_feedback |= (topic, kind) == (parts.feedback, Kind::Value);
+            hears_feedback |= (topic, kind) == (parts.feedback, NameKind::Value);
         }
         let end = until(self.live.now(), Some(self.arguments.wait));
-        let mut each = |news: News<'_>, _| {
-            if let News::Announced {
+        let mut each = |news: DatagramContent<'_>, _| {
+            if let DatagramContent::Announced {
                 topic,
                 kind,
                 described,
@@ -245,7 +245,7 @@ impl Asking<'_> {
                 && executor.publishes(from)
             {
                 take(&mut found, parts, (topic, kind), described);
-                hears_feedback |= (topic, kind) == (parts.feedback, Kind::Value);
+                hears_feedback |= (topic, kind) == (parts.feedback, NameKind::Value);
             }
             if found.iter().all(Option::is_some) && hears_feedback {
                 Go::Enough
@@ -256,8 +256,8 @@ impl Asking<'_> {
         let ended = self.live.listen(end, &mut each).await?;
         match found {
             [Some(result), Some(cancel)] => Ok([result, cancel]),
-            _ if ended == Ended::Interrupted => Err(Failure::Interrupted),
-            _ => Err(Failure::Unavailable(format!(
+            _ if ended == ListenEnd::Interrupted => Err(CommandFailure::Interrupted),
+            _ => Err(CommandFailure::Unavailable(format!(
                 "{goal} sends goals, and nobody offers {} and {}, which belong to it",
                 parts.result, parts.cancel
             ))),
@@ -268,7 +268,10 @@ impl Asking<'_> {
     ///
     /// # Errors
     /// The wait was interrupted or timed out, or the end of the goal is unknown.
-    async fn follow_goal(&mut self, mut goal: Goal) -> Result<Result<(), Failure>, Failure> {
+    async fn follow_goal(
+        &mut self,
+        mut goal: Goal,
+    ) -> Result<Result<(), CommandFailure>, CommandFailure> {
         let limit = until(self.live.now(), self.arguments.run_timeout);
         loop {
             let (ended, told, came) = self.hear_goal(&mut goal).await?;
@@ -291,14 +294,14 @@ impl Asking<'_> {
             }
             let now = self.live.now();
             match &goal.cancelling {
-                Some(_) if ended == Ended::Interrupted => {
+                Some(_) if ended == ListenEnd::Interrupted => {
                     warn(
                         "leaving: the goal may still be accepted or go on, and its outcome is unknown",
                     );
-                    return Err(Failure::Interrupted);
+                    return Err(CommandFailure::Interrupted);
                 }
                 Some(cancelling) if cancelling.until <= now => {
-                    return Err(Failure::Unavailable(format!(
+                    return Err(CommandFailure::Unavailable(format!(
                         "the goal has not ended {} s after it was cancelled: its outcome is unknown",
                         ENDS_WITHIN.as_secs()
                     )));
@@ -312,7 +315,7 @@ impl Asking<'_> {
                     if is_over {
                         warn("the time for the goal is over");
                     }
-                    if is_over || ended == Ended::Interrupted {
+                    if is_over || ended == ListenEnd::Interrupted {
                         warn("cancelling the goal (once more to leave at once)");
                         self.cancel_goal(&mut goal)?;
                     }
@@ -322,7 +325,7 @@ impl Asking<'_> {
     }
 
     /// Requests the cancellation of the goal. The goal is followed to its end for any response.
-    fn cancel_goal(&mut self, goal: &mut Goal) -> Result<(), Failure> {
+    fn cancel_goal(&mut self, goal: &mut Goal) -> Result<(), CommandFailure> {
         let request = cancel_request(&behind_nothing(goal.bytes));
         let cancel = Arc::clone(&goal.cancel);
         let call = self.begin((goal.parts.cancel, &cancel), &request, CANCEL_WITHIN)?;
@@ -343,7 +346,7 @@ impl Asking<'_> {
     async fn hear_goal(
         &mut self,
         goal: &mut Goal,
-    ) -> Result<(Ended, Vec<Told>, Option<Came>), Failure> {
+    ) -> Result<(ListenEnd, Vec<GoalUpdate>, Option<Came>), CommandFailure> {
         self.transmit()?;
         let Self {
             live,
@@ -354,11 +357,11 @@ impl Asking<'_> {
         let next = requestor.poll_timeout().unwrap_or(Duration::MAX);
         let next = next.min(live.now() + LOOK);
         let (mut told, mut came) = (Vec::new(), None);
-        let mut each = |news: News<'_>, now| {
+        let mut each = |news: DatagramContent<'_>, now| {
             match &news {
-                News::Response(response, from) => {
+                DatagramContent::Response(response, from) => {
                     if executor.answers(requestor, (response, *from))
-                        && let Ok(Heard::Done(call, outcome)) =
+                        && let Ok(ResponseMeaning::Done(call, outcome)) =
                             requestor.handle_response(response, now)
                     {
                         if call == goal.waits {
@@ -370,7 +373,7 @@ impl Asking<'_> {
                         }
                     }
                 }
-                News::Sample(sample)
+                DatagramContent::Sample(sample)
                     if sample.topic == goal.parts.feedback && executor.publishes(sample.from) =>
                 {
                     let described = sample.described.as_deref();
@@ -378,10 +381,10 @@ impl Asking<'_> {
                         && value.text(words::GOAL_ID) == Some(&goal.id)
                     {
                         let fields = own(value, "feedback");
-                        told.push(Told::Feedback { fields });
+                        told.push(GoalUpdate::Feedback { fields });
                     }
                 }
-                News::Sample(_) | News::Announced { .. } => {}
+                DatagramContent::Sample(_) | DatagramContent::Announced { .. } => {}
             }
             if told.is_empty() && came.is_none() {
                 Go::On
@@ -402,7 +405,7 @@ impl Asking<'_> {
     }
 
     /// Prints the result of a goal.
-    fn end_goal(&self, fields: &Named) -> Result<Result<(), Failure>, Failure> {
+    fn end_goal(&self, fields: &NamedValues) -> Result<Result<(), CommandFailure>, CommandFailure> {
         let status = fields.get("status").and_then(serde_json::Value::as_i64);
         let status = match status {
             Some(4) => "SUCCEEDED",
@@ -420,7 +423,7 @@ impl Asking<'_> {
         let said = Some(message.trim()).filter(|message| !message.is_empty());
         let why = said.or_else(|| messages::reason_of(texts));
         let why = why.map(|why| format!(": {why}")).unwrap_or_default();
-        let told = Told::Result {
+        let told = GoalUpdate::Result {
             status,
             message,
             fields: own(rest, "result"),
@@ -428,10 +431,10 @@ impl Asking<'_> {
         self.tell(&told, &told.told())?;
         Ok(match status {
             "SUCCEEDED" => Ok(()),
-            "UNKNOWN" => Err(Failure::Unavailable(format!(
+            "UNKNOWN" => Err(CommandFailure::Unavailable(format!(
                 "the executor of the action has lost the goal, and its outcome is unknown{why}"
             ))),
-            _ => Err(Failure::Failed(format!(
+            _ => Err(CommandFailure::Failed(format!(
                 "the goal was {}{why}",
                 status.to_lowercase()
             ))),
@@ -440,43 +443,45 @@ impl Asking<'_> {
 }
 
 fn take(
-    found: &mut [Option<Arc<Described>>; 2],
-    parts: Parts,
-    (topic, kind): (TopicId, Kind),
-    described: &Arc<Described>,
+    found: &mut [Option<Arc<AnnouncedDescription>>; 2],
+    parts: ActionParts,
+    (topic, kind): (TopicId, NameKind),
+    described: &Arc<AnnouncedDescription>,
 ) {
     let [result, cancel] = found;
-    if kind == Kind::Call && topic == parts.result {
+    if kind == NameKind::Call && topic == parts.result {
         *result = Some(Arc::clone(described));
-    } else if kind == Kind::Call && topic == parts.cancel {
+    } else if kind == NameKind::Call && topic == parts.cancel {
         *cancel = Some(Arc::clone(described));
     }
 }
 
-fn hear(outcome: &Outcome<'_>, described: &Described) -> Came {
+fn hear(outcome: &ActionOutcome<'_>, described: &AnnouncedDescription) -> Came {
     match outcome {
-        Outcome::Answered { status, fields } if status.0 & super::BAD == 0 => {
+        ActionOutcome::Answered { status, fields } if status.0 & super::BAD == 0 => {
             match plain::response(*fields, described.fields()) {
                 Ok(fields) => Came::Result(fields),
-                Err(error) => Came::Failed(Failure::Unavailable(format!(
+                Err(error) => Came::Failed(CommandFailure::Unavailable(format!(
                     "the result cannot be read: {error}"
                 ))),
             }
         }
-        Outcome::Answered { status, .. } => Came::Failed(Failure::Unavailable(format!(
-            "there is no result: {:#010x}; how the goal ended is not known",
-            status.0
-        ))),
-        Outcome::Refused(why) => Came::Failed(Failure::Unavailable(format!(
+        ActionOutcome::Answered { status, .. } => {
+            Came::Failed(CommandFailure::Unavailable(format!(
+                "there is no result: {:#010x}; how the goal ended is not known",
+                status.0
+            )))
+        }
+        ActionOutcome::Refused(why) => Came::Failed(CommandFailure::Unavailable(format!(
             "the result is refused: {why}; the goal goes on"
         ))),
-        Outcome::Unknown(why) => unknown(*why),
+        ActionOutcome::Unknown(why) => unknown(*why),
     }
 }
 
 /// Reads the response to a cancel request.
-fn cancel_answer(outcome: &Outcome<'_>, cancel: &Described) -> CancelAnswer {
-    let Outcome::Answered { status, fields } = outcome else {
+fn cancel_answer(outcome: &ActionOutcome<'_>, cancel: &AnnouncedDescription) -> CancelAnswer {
+    let ActionOutcome::Answered { status, fields } = outcome else {
         return CancelAnswer::Other;
     };
     let answer = plain::response(*fields, cancel.fields()).ok();
@@ -495,16 +500,16 @@ fn unknown(why: Unknown) -> Came {
     if why == Unknown::Deadline {
         return Came::Nothing;
     }
-    Came::Failed(Failure::Unavailable(format!(
+    Came::Failed(CommandFailure::Unavailable(format!(
         "{why}; how the goal ended is not known"
     )))
 }
 
 /// Returns the fields of a part, by their names within the part.
-fn own(value: Named, part: &str) -> Named {
+fn own(value: NamedValues, part: &str) -> NamedValues {
     let fields = value.0.into_iter();
     let fields = fields.filter(|(name, _)| name != words::GOAL_ID);
-    Named(
+    NamedValues(
         fields
             .map(|(name, value)| (words::own(&name, part).to_owned(), value))
             .collect(),

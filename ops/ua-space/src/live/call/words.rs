@@ -5,13 +5,13 @@ use granit_parser::{Event, Parser};
 use serde_json::{Value, json};
 use uadp::BuiltinType;
 
-use super::super::described::Field;
+use super::super::described::AnnouncedField;
 
 /// Returns the fields of a goal by their names within the goal, without the goal id.
-pub(super) fn fields(takes: &[Field]) -> Vec<Field> {
+pub(super) fn fields(takes: &[AnnouncedField]) -> Vec<AnnouncedField> {
     let fields = takes.iter().filter(|field| field.name != GOAL_ID);
     fields
-        .map(|field| Field {
+        .map(|field| AnnouncedField {
             name: own(&field.name, GOAL).to_owned(),
             ..field.clone()
         })
@@ -33,7 +33,7 @@ pub(super) fn own<'n>(name: &'n str, part: &str) -> &'n str {
 /// A description of the argument that cannot be parsed.
 pub(super) fn spelled(
     typed: &[String],
-    takes: &[Field],
+    takes: &[AnnouncedField],
     fills: bool,
 ) -> Result<Vec<String>, String> {
     let typed: Vec<String> = typed
@@ -49,7 +49,7 @@ pub(super) fn spelled(
 /// A description of the argument that cannot be parsed.
 pub(in crate::live) fn message(
     typed: &[String],
-    takes: &[Field],
+    takes: &[AnnouncedField],
     fills: bool,
 ) -> Result<Vec<String>, String> {
     let mut words = Vec::new();
@@ -60,7 +60,7 @@ pub(in crate::live) fn message(
         }
     }
     if fills {
-        let is_given = |field: &Field| {
+        let is_given = |field: &AnnouncedField| {
             let mut names = words.iter().filter_map(|word| word.split_once('='));
             names.any(|(name, _)| name == field.name)
         };
@@ -76,7 +76,7 @@ pub(in crate::live) fn message(
 }
 
 /// Returns the default value of a field; `None` for types that ROS messages do not have.
-fn nothing(field: &Field) -> Option<String> {
+fn nothing(field: &AnnouncedField) -> Option<String> {
     let builtin = field.builtin?;
     let one = if builtin == BuiltinType::Boolean {
         "false"
@@ -193,14 +193,14 @@ const MOST_ELEMENTS: usize = 10_000;
 mod tests {
     use super::*;
 
-    fn takes() -> Vec<Field> {
+    fn takes() -> Vec<AnnouncedField> {
         fields(&[
-            Field::plain("goal_id", BuiltinType::ByteString, None),
-            Field::plain("goal.pose.x", BuiltinType::Double, None),
-            Field::plain("goal.pose.frame_id", BuiltinType::String, None),
-            Field::plain("goal.stamp", BuiltinType::DateTime, None),
-            Field::plain("goal.covariance", BuiltinType::Double, Some(2)),
-            Field::plain("goal.poses", BuiltinType::ExtensionObject, Some(0)),
+            AnnouncedField::plain("goal_id", BuiltinType::ByteString, None),
+            AnnouncedField::plain("goal.pose.x", BuiltinType::Double, None),
+            AnnouncedField::plain("goal.pose.frame_id", BuiltinType::String, None),
+            AnnouncedField::plain("goal.stamp", BuiltinType::DateTime, None),
+            AnnouncedField::plain("goal.covariance", BuiltinType::Double, Some(2)),
+            AnnouncedField::plain("goal.poses", BuiltinType::ExtensionObject, Some(0)),
         ])
     }
 

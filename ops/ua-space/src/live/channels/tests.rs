@@ -8,20 +8,20 @@ fn topic(text: &str) -> TopicId {
     text.parse().unwrap()
 }
 
-fn described(description: &str, fields: &[(&str, BuiltinType)]) -> Arc<Described> {
+fn described(description: &str, fields: &[(&str, BuiltinType)]) -> Arc<AnnouncedDescription> {
     let fields = fields.iter();
-    let fields = fields.map(|(name, builtin)| Field::plain(name, *builtin, None));
-    Arc::new(Described {
+    let fields = fields.map(|(name, builtin)| AnnouncedField::plain(name, *builtin, None));
+    Arc::new(AnnouncedDescription {
         name: "Robot.Place".to_owned(),
         description: description.to_owned(),
         ros_topics: vec![(2, "/place".to_owned())],
         command: false,
-        what: What::Value(fields.collect()),
+        what: DescribedKind::Value(fields.collect()),
     })
 }
 
 /// Returns the message of a value in its channel.
-fn encoded(channel: &Channel, values: &[Scalar<'_>]) -> Result<Vec<u8>, Unfit> {
+fn encoded(channel: &TopicChannel, values: &[Scalar<'_>]) -> Result<Vec<u8>, ChannelMismatch> {
     let mut datagram = Vec::new();
     let none = NetworkHeader::default();
     let mut writer = NetworkMessageEncoder::new(&mut datagram, &none, None).unwrap();
@@ -45,7 +45,7 @@ const XYZ: [(&str, BuiltinType); 3] = [
 
 #[test]
 fn fields_of_a_ros_message_are_that_message_again() {
-    let mut channels = Channels::new();
+    let mut channels = TopicChannels::new();
     let point = described("geometry_msgs/Point", &XYZ);
     let channel = channels.channel(topic("ua_2_5_10"), Some(&point), NOW);
     let channel = channel.unwrap();
@@ -58,12 +58,12 @@ fn fields_of_a_ros_message_are_that_message_again() {
     wanted.extend([1.0_f64, 2.0, 3.0].map(f64::to_le_bytes).concat());
     assert_eq!(bytes, wanted);
     let wrong = encoded(&channel, &[Scalar::Byte(1)]);
-    assert_eq!(wrong, Err(Unfit::Mismatch));
+    assert_eq!(wrong, Err(ChannelMismatch::Mismatch));
 }
 
 #[test]
 fn other_values_are_json_under_their_own_names() {
-    let mut channels = Channels::new();
+    let mut channels = TopicChannels::new();
     let x = described("", &XYZ[..1]);
     let mut all = Vec::new();
     for id in ["ua_2_5_10", "ua_2_5_11"] {
@@ -79,7 +79,7 @@ fn other_values_are_json_under_their_own_names() {
 
 #[test]
 fn a_type_without_definition_is_json_and_is_named() {
-    let mut channels = Channels::new();
+    let mut channels = TopicChannels::new();
     let made_up = described("no_msgs/Such", &XYZ);
     let channel = channels.channel(topic("ua_2_5_10"), Some(&made_up), NOW);
     assert_eq!(channel.unwrap().encoding, "json");
@@ -92,10 +92,10 @@ fn a_type_without_definition_is_json_and_is_named() {
 
 #[test]
 fn values_wait_for_their_description_and_a_new_description_makes_a_new_channel() {
-    let mut channels = Channels::new();
+    let mut channels = TopicChannels::new();
     let of = topic("ua_2_5_10");
     let early = channels.channel(of, None, NOW);
-    assert_eq!(early.unwrap_err(), Unfit::Undescribed);
+    assert_eq!(early.unwrap_err(), ChannelMismatch::Undescribed);
     let late = channels.channel(of, None, NOW + DESCRIBED_WITHIN).unwrap();
     assert_eq!((late.name.as_str(), late.encoding), ("/ua_2_5_10", "json"));
     let point = described("geometry_msgs/Point", &XYZ);
@@ -106,7 +106,7 @@ fn values_wait_for_their_description_and_a_new_description_makes_a_new_channel()
 
 #[test]
 fn each_description_of_a_topic_has_one_channel_and_their_number_is_limited() {
-    let mut channels = Channels::new();
+    let mut channels = TopicChannels::new();
     let of = topic("ua_2_5_10");
     let [first, second] = ["first", "second"].map(|text| described(text, &XYZ));
     let one = channels.channel(of, Some(&first), NOW).unwrap().id;
@@ -125,7 +125,7 @@ fn each_description_of_a_topic_has_one_channel_and_their_number_is_limited() {
     }
     let other = described("other", &XYZ);
     let refused = channels.channel(of, Some(&other), NOW);
-    assert_eq!(refused.unwrap_err(), Unfit::Channels);
+    assert_eq!(refused.unwrap_err(), ChannelMismatch::Channels);
     assert_eq!(channels.channel(of, Some(&first), NOW).unwrap().id, one);
 }
 

@@ -6,11 +6,11 @@ use std::collections::BTreeMap;
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD as BASE64;
 
-use crate::live::channels::{ANNOUNCEMENT, Channel};
+use crate::live::channels::{ANNOUNCEMENT, TopicChannel};
 
 /// Encodes the records of a file.
 #[derive(Debug, Default)]
-pub(super) struct Mcap {
+pub(super) struct McapEncoder {
     /// The records of the current chunk.
     chunk: Vec<u8>,
     /// The times and offsets of the messages in the current chunk, by channel.
@@ -27,7 +27,7 @@ pub(super) struct Mcap {
 
 /// A message of a channel.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Message<'a> {
+pub(super) struct EncodedMessage<'a> {
     pub(super) channel: u16,
     pub(super) sequence: u32,
     /// The time of arrival, in nanoseconds since 1970.
@@ -48,7 +48,7 @@ struct ChunkIndex {
     size: u64,
 }
 
-impl Mcap {
+impl McapEncoder {
     /// Appends the start of a file.
     pub(super) fn begin(out: &mut Vec<u8>) -> Self {
         out.extend(MAGIC);
@@ -62,7 +62,7 @@ impl Mcap {
 
     /// Adds a channel with its schema to the current chunk, and the announcement of its topic, with
     /// which its values can be sent again.
-    pub(super) fn channel(&mut self, channel: &Channel, announcement: Option<&[u8]>) {
+    pub(super) fn channel(&mut self, channel: &TopicChannel, announcement: Option<&[u8]>) {
         let mut schema = Vec::new();
         record(SCHEMA, &mut schema, |out| {
             out.extend(channel.id.to_le_bytes());
@@ -96,7 +96,7 @@ impl Mcap {
     }
 
     /// Adds a message to the current chunk.
-    pub(super) fn message(&mut self, message: &Message<'_>) {
+    pub(super) fn message(&mut self, message: &EncodedMessage<'_>) {
         let at = size(self.chunk.len());
         record(MESSAGE, &mut self.chunk, |out| {
             out.extend(message.channel.to_le_bytes());

@@ -2,21 +2,21 @@
 
 use std::net::{Ipv4Addr, SocketAddr, SocketAddrV4};
 
-use super::sink::Sink;
-use crate::capture::{Link, PcapNg};
-use crate::exit::Failure;
+use super::sink::RecordingFile;
+use crate::capture::{LinkLayer, PcapNg};
+use crate::exit::CommandFailure;
 
 /// A recording of the messages as they were received.
 #[derive(Debug)]
 pub(super) struct Packets {
-    sink: Sink,
+    sink: RecordingFile,
     writer: PcapNg,
     /// Whole blocks that are not handed over to the disk.
     part: Vec<u8>,
 }
 
 impl Packets {
-    pub(super) fn new(sink: Sink, link: Link, interface: &str) -> Self {
+    pub(super) fn new(sink: RecordingFile, link: LinkLayer, interface: &str) -> Self {
         let mut part = Vec::new();
         let writer = PcapNg::begin(link, interface, &mut part);
         Self { sink, writer, part }
@@ -28,7 +28,7 @@ impl Packets {
         time: i128,
         from: SocketAddr,
         message: &[u8],
-    ) -> Result<bool, Failure> {
+    ) -> Result<bool, CommandFailure> {
         if self.part.len() >= PART && !self.sink.offer(&mut self.part)? {
             return Ok(false);
         }
@@ -41,7 +41,7 @@ impl Packets {
     }
 
     /// Hands over the messages so far.
-    pub(super) fn flush(&mut self) -> Result<(), Failure> {
+    pub(super) fn flush(&mut self) -> Result<(), CommandFailure> {
         // If the disk is too slow, the part is offered again.
         self.sink.offer(&mut self.part).map(|_| ())
     }
@@ -51,7 +51,7 @@ impl Packets {
         mut self,
         time: i128,
         (received, dropped): (u64, u64),
-    ) -> Result<u64, Failure> {
+    ) -> Result<u64, CommandFailure> {
         PcapNg::end(time, received, dropped, &mut self.part);
         self.sink.finish(self.part)
     }

@@ -6,12 +6,12 @@ use std::path::Path;
 use std::sync::mpsc::{Receiver, SyncSender, TrySendError, sync_channel};
 use std::thread::JoinHandle;
 
-use crate::exit::Failure;
+use crate::exit::CommandFailure;
 
 /// A file that is written in whole parts. A file that cannot be written on ends with its last whole
 /// part.
 #[derive(Debug)]
-pub(super) struct Sink {
+pub(super) struct RecordingFile {
     name: String,
     /// Taken at the end, so that the thread ends.
     queue: Option<SyncSender<Vec<u8>>>,
@@ -27,16 +27,16 @@ struct Unwritten {
     whole: u64,
 }
 
-impl Sink {
+impl RecordingFile {
     /// Creates the file.
     ///
     /// # Errors
-    /// [`Failure::Io`], also if the file exists.
-    pub(super) fn create(path: &Path) -> Result<Self, Failure> {
+    /// [`CommandFailure::Io`], also if the file exists.
+    pub(super) fn create(path: &Path) -> Result<Self, CommandFailure> {
         let name = path.display().to_string();
         let file = OpenOptions::new().write(true).create_new(true).open(path);
         let file = file.map_err(|error| {
-            Failure::Io(if error.kind() == io::ErrorKind::AlreadyExists {
+            CommandFailure::Io(if error.kind() == io::ErrorKind::AlreadyExists {
                 format!("{name} exists; give the recording another name")
             } else {
                 format!("cannot create {name}: {error}")
@@ -46,7 +46,7 @@ impl Sink {
         let thread = std::thread::Builder::new()
             .name("recording".to_owned())
             .spawn(move || write(file, &parts))
-            .map_err(|error| Failure::Io(format!("cannot start a thread: {error}")))?;
+            .map_err(|error| CommandFailure::Io(format!("cannot start a thread: {error}")))?;
         Ok(Self {
             name,
             queue: Some(queue),
@@ -64,8 +64,8 @@ impl Sink {
     /// taken, and then empties it.
     ///
     /// # Errors
-    /// [`Failure::Io`] if the file cannot be written.
-    pub(super) fn offer(&mut self, part: &mut Vec<u8>) -> Result<bool, Failure> {
+    /// [`CommandFailure::Io`] if the file cannot be written.
+    pub(super) fn offer(&mut self, part: &mut Vec<u8>) -> Result<bool, CommandFailure> {
         if part.is_empty() {
             return Ok(true);
         }
@@ -89,8 +89,8 @@ impl Sink {
     /// Writes the last part, and waits for the disk. Returns the length of the file.
     ///
     /// # Errors
-    /// [`Failure::Io`] if the file cannot be written.
-    pub(super) fn finish(mut self, part: Vec<u8>) -> Result<u64, Failure> {
+    /// [`CommandFailure::Io`] if the file cannot be written.
+    pub(super) fn finish(mut self, part: Vec<u8>) -> Result<u64, CommandFailure> {
         self.length += u64::try_from(part.len()).unwrap_or_default();
         let is_sent = self
             .queue
@@ -103,22 +103,22 @@ impl Sink {
     }
 
     /// Ends the thread and returns its failure.
-    fn failed(&mut self) -> Failure {
+    fn failed(&mut self) -> CommandFailure {
         self.queue = None;
         self.end()
-            .unwrap_or_else(|| Failure::Io(format!("cannot write {}", self.name)))
+            .unwrap_or_else(|| CommandFailure::Io(format!("cannot write {}", self.name)))
     }
 
-    fn end(&mut self) -> Option<Failure> {
+    fn end(&mut self) -> Option<CommandFailure> {
         let Ok(ended) = self.thread.take()?.join() else {
-            return Some(Failure::Io(format!(
+            return Some(CommandFailure::Io(format!(
                 "cannot write {}: its thread ended",
                 self.name
             )));
         };
         let Unwritten { error, whole } = ended.err()?;
         let name = &self.name;
-        Some(Failure::Io(format!(
+        Some(CommandFailure::Io(format!(
             "cannot write {name}: {error}; its first {whole} bytes are written, up to a whole message"
         )))
     }
@@ -160,7 +160,7 @@ mod tests {
     #[test]
     fn a_recording_replaces_no_file() {
         let existing = std::env::current_exe().unwrap();
-        let failure = Sink::create(&existing).unwrap_err();
+        let failure = RecordingFile::create(&existing).unwrap_err();
         assert!(failure.to_string().contains("exists"), "{failure}");
     }
 }

@@ -11,22 +11,22 @@ use uadp::{
     NetworkMessageEncoder,
 };
 
-use super::mcap::{Mcap, Message};
-use super::sink::Sink;
-use crate::exit::Failure;
-use crate::live::announcements::Announcements;
-use crate::live::book::Sample;
-use crate::live::channels::{Channel, Channels, DESCRIBED_WITHIN, Unfit};
+use super::mcap::{EncodedMessage, McapEncoder};
+use super::sink::RecordingFile;
+use crate::exit::CommandFailure;
+use crate::live::announcements::LatestAnnouncements;
+use crate::live::book::ReceivedSample;
+use crate::live::channels::{ChannelMismatch, DESCRIBED_WITHIN, TopicChannel, TopicChannels};
 use crate::live::copies::Copies;
-use crate::live::described::Described;
-use crate::live::robot::Model;
+use crate::live::described::AnnouncedDescription;
+use crate::live::robot::RobotModelMessage;
 use crate::report::warn;
 
 /// A recording of the values by topic.
-pub(super) struct Values {
-    sink: Sink,
-    writer: Mcap,
-    channels: Channels,
+pub(super) struct ValueRecorder {
+    sink: RecordingFile,
+    writer: McapEncoder,
+    channels: TopicChannels,
     copies: Copies,
     /// Ids of the channels in the file.
     written: BTreeSet<u16>,
@@ -35,16 +35,16 @@ pub(super) struct Values {
     /// Values that wait for the description of their topic.
     waiting: VecDeque<Waiting>,
     /// The newest announcement of each topic, as a NetworkMessage.
-    announcements: Announcements,
+    announcements: LatestAnnouncements,
     /// The size of all waiting values.
     weight: usize,
-    left_out: BTreeMap<Unfit, u64>,
+    left_out: BTreeMap<ChannelMismatch, u64>,
     scratch: Vec<u8>,
 }
 
 /// The outcome of a value.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Added {
+pub(super) enum RecordOutcome {
     Value,
     /// The same event is in the recording.
     Copy,
@@ -69,19 +69,19 @@ struct Times {
     published: u64,
 }
 
-impl Values {
-    pub(super) fn new(sink: Sink) -> Self {
+impl ValueRecorder {
+    pub(super) fn new(sink: RecordingFile) -> Self {
         let mut part = Vec::new();
-        let writer = Mcap::begin(&mut part);
+        let writer = McapEncoder::begin(&mut part);
         Self {
             sink,
             writer,
-            channels: Channels::new(),
+            channels: TopicChannels::new(),
             copies: Copies::default(),
             written: BTreeSet::new(),
             part,
             waiting: VecDeque::new(),
-            announcements: Announcements::default(),
+            announcements: LatestAnnouncements::default(),
             weight: 0,
             left_out: BTreeMap::new(),
             scratch: Vec::new(),
@@ -89,14 +89,14 @@ impl Values {
     }
 
     /// Adds the model of a robot as the only message of its channel.
-    pub(super) fn add_model(&mut self, model: &Model, time: i128) {
+    pub(super) fn add_model(&mut self, model: &RobotModelMessage, time: i128) {
         let channel = match self.channels.of_model(model) {
             Ok(channel) => channel,
             Err(unfit) => return self.leave_out(unfit),
         };
         let time = u64::try_from(time).unwrap_or_default();
         self.writer.channel(&channel, None);
-        self.writer.message(&Message {
+        self.writer.message(&EncodedMessage {
             channel: channel.id,
             sequence: 0,
             logged: time,
@@ -108,14 +108,14 @@ impl Values {
     /// Adds a value that arrived at `now`; `time` is the same time since 1970.
     pub(super) fn add(
         &mut self,
-        sample: &Sample<'_>,
+        sample: &ReceivedSample<'_>,
         (now, time): (Duration, i128),
-    ) -> Result<Added, Failure> {
+    ) -> Result<RecordOutcome, CommandFailure> {
         if self.writer.waiting() >= CHUNK && !self.flush()? {
-            return Ok(Added::Dropped);
+            return Ok(RecordOutcome::Dropped);
         }
         if self.copies.is_copy(sample, now) {
-            return Ok(Added::Copy);
+            return Ok(RecordOutcome::Copy);
         }
         let times = Times::of(sample, time);
         let described = sample.described.as_ref();
@@ -124,17 +124,17 @@ impl Values {
                 self.release(sample.topic, &channel);
                 self.write((sample.topic, &channel), times, &sample.message);
             }
-            Err(Unfit::Undescribed) => self.hold(sample, times, now),
+            Err(ChannelMismatch::Undescribed) => self.hold(sample, times, now),
             Err(unfit) => self.leave_out(unfit),
         }
-        Ok(Added::Value)
+        Ok(RecordOutcome::Value)
     }
 
     /// Keeps the announcement of a topic, and records the values that wait for it.
     pub(super) fn described(
         &mut self,
         (topic, announcement): (TopicId, &Announcement<'_>),
-        described: &Arc<Described>,
+        described: &Arc<AnnouncedDescription>,
         now: Duration,
     ) {
         self.announcements.keep(topic, announcement);
@@ -169,7 +169,7 @@ impl Values {
     }
 
     /// Hands over the current chunk. Returns false if the disk is too slow.
-    pub(super) fn flush(&mut self) -> Result<bool, Failure> {
+    pub(super) fn flush(&mut self) -> Result<bool, CommandFailure> {
         if self.part.is_empty() {
             self.writer.end_chunk(self.sink.length(), &mut self.part);
         }
@@ -177,7 +177,7 @@ impl Values {
     }
 
     /// Ends the file. Returns its length.
-    pub(super) fn finish(mut self) -> Result<u64, Failure> {
+    pub(super) fn finish(mut self) -> Result<u64, CommandFailure> {
         self.give_up_waiting(Duration::MAX);
         for (unfit, count) in &self.left_out {
             warn(&format!("{count} left out: {}", unfit.label()));
@@ -200,7 +200,7 @@ impl Values {
 
     fn write(
         &mut self,
-        (topic, channel): (TopicId, &Channel),
+        (topic, channel): (TopicId, &TopicChannel),
         times: Times,
         message: &DataSetMessage<'_>,
     ) {
@@ -213,7 +213,7 @@ impl Values {
                     let announcement = announcement.filter(|_| channel.is_described());
                     self.writer.channel(channel, announcement);
                 }
-                self.writer.message(&Message {
+                self.writer.message(&EncodedMessage {
                     channel: channel.id,
                     sequence: message.sequence_number().unwrap_or_default().into(),
                     logged: times.logged,
@@ -226,9 +226,9 @@ impl Values {
         self.scratch = data;
     }
 
-    fn hold(&mut self, sample: &Sample<'_>, times: Times, now: Duration) {
+    fn hold(&mut self, sample: &ReceivedSample<'_>, times: Times, now: Duration) {
         let Some(datagram) = alone(&sample.message) else {
-            return self.leave_out(Unfit::Undescribed);
+            return self.leave_out(ChannelMismatch::Undescribed);
         };
         self.weight += datagram.len();
         self.waiting.push_back(Waiting {
@@ -242,11 +242,11 @@ impl Values {
                 break;
             };
             self.weight -= oldest.datagram.len();
-            self.leave_out(Unfit::Undescribed);
+            self.leave_out(ChannelMismatch::Undescribed);
         }
     }
 
-    fn release(&mut self, topic: TopicId, channel: &Channel) {
+    fn release(&mut self, topic: TopicId, channel: &TopicChannel) {
         if self.waiting.is_empty() {
             return;
         }
@@ -260,18 +260,18 @@ impl Values {
             let message = message.and_then(|message| message.messages().next()?.ok());
             match message {
                 Some(message) => self.write((topic, channel), waiting.times, &message),
-                None => self.leave_out(Unfit::Mismatch),
+                None => self.leave_out(ChannelMismatch::Mismatch),
             }
         }
     }
 
-    fn leave_out(&mut self, unfit: Unfit) {
+    fn leave_out(&mut self, unfit: ChannelMismatch) {
         *self.left_out.entry(unfit).or_default() += 1;
     }
 }
 
 impl Times {
-    fn of(sample: &Sample<'_>, arrived: i128) -> Self {
+    fn of(sample: &ReceivedSample<'_>, arrived: i128) -> Self {
         let logged = u64::try_from(arrived).unwrap_or_default();
         let published = sample.taken().or_else(|| sample.sent());
         let published = published.and_then(|nanos| u64::try_from(nanos).ok());

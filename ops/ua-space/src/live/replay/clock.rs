@@ -5,7 +5,7 @@ use uadp::{DateTime, Timestamp};
 /// Converts times of a recording to the present. Equal times stay equal and keep their order, so
 /// that receivers recognise repetitions.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Clock {
+pub(super) struct ReplayClock {
     /// The time of the first message of the recording, in nanoseconds since 1970.
     recorded: i128,
     /// The time at which the first message is sent.
@@ -13,7 +13,7 @@ pub(super) struct Clock {
     speed: f64,
 }
 
-impl Clock {
+impl ReplayClock {
     pub(super) const fn new(recorded: i128, sent: i128, speed: f64) -> Self {
         Self {
             recorded,
@@ -55,10 +55,10 @@ mod tests {
 
     #[test]
     fn intervals_are_kept_or_scaled() {
-        let normal = Clock::new(1_000, 9_000_000_000_000_000_001, 1.0);
+        let normal = ReplayClock::new(1_000, 9_000_000_000_000_000_001, 1.0);
         assert_eq!(normal.at(1_007), 9_000_000_000_000_000_008);
         assert_eq!(normal.at(900), 8_999_999_999_999_999_901);
-        let fast = Clock::new(1_000, 5_000, 2.0);
+        let fast = ReplayClock::new(1_000, 5_000, 2.0);
         assert_eq!((fast.at(1_000), fast.at(3_000)), (5_000, 6_000));
     }
 }

@@ -5,21 +5,21 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use mappings::{Motion, SpaceId, TopicId};
-use uadp::discovery::{Announced, Announcement};
+use uadp::discovery::{AnnouncedContent, Announcement};
 use uadp::{NetworkMessage, NetworkMessageType, PublisherId};
 
 use super::datagram;
-use crate::arguments::Replay;
-use crate::exit::Failure;
-use crate::live::announcements::Announcements;
-use crate::live::book::{BAD, Book, Kind, News};
-use crate::live::described::{Described, topic_of};
+use crate::arguments::ReplayArguments;
+use crate::exit::CommandFailure;
+use crate::live::announcements::LatestAnnouncements;
+use crate::live::book::{BAD, Book, DatagramContent, NameKind};
+use crate::live::described::{AnnouncedDescription, topic_of};
 use crate::live::sealing::Sealing;
-use crate::recorded::{Recorded, Unusable};
+use crate::recorded::{RecordingReader, UnusableValue};
 
 /// The reason why a message is not sent again.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-pub(super) enum LeftOut {
+pub(super) enum ReplayOmission {
     /// A value of the OPC UA side, or a value that acts where it arrives.
     Command,
     /// A value that may be a command, because the recording has no description of it.
@@ -41,7 +41,7 @@ pub(super) enum LeftOut {
     Malformed,
 }
 
-impl LeftOut {
+impl ReplayOmission {
     /// Returns the text for output.
     pub(super) const fn label(self) -> &'static str {
         match self {
@@ -68,37 +68,40 @@ pub(super) struct Prepared {
     /// Whether it was secured in the recording.
     pub(super) secured: bool,
     /// Values that were removed from it, by reason.
-    pub(super) removed: BTreeMap<LeftOut, u64>,
+    pub(super) removed: BTreeMap<ReplayOmission, u64>,
 }
 
 /// The topics of a recording.
-pub(super) struct Contents {
+pub(super) struct RecordingContents {
     commands: bool,
     only: BTreeSet<SpaceId>,
     /// The time of the first message of the space.
     pub(super) first: i128,
     book: Book,
     /// The first description of each topic, and one that acts.
-    descriptions: BTreeMap<TopicId, Vec<Arc<Described>>>,
-    announcements: Announcements,
+    descriptions: BTreeMap<TopicId, Vec<Arc<AnnouncedDescription>>>,
+    announcements: LatestAnnouncements,
     /// Values of an MCAP file that cannot be sent again.
-    pub(super) unusable: BTreeMap<Unusable, u64>,
+    pub(super) unusable: BTreeMap<UnusableValue, u64>,
 }
 
-impl Contents {
+impl RecordingContents {
     /// Reads the descriptions and topics of a recording.
     ///
     /// # Errors
-    /// A [`Failure`] if the file cannot be read.
-    pub(super) fn read(arguments: &Replay, sealing: &mut Option<Sealing>) -> Result<Self, Failure> {
-        let mut recorded = Recorded::open(&arguments.file)?;
+    /// A [`CommandFailure`] if the file cannot be read.
+    pub(super) fn read(
+        arguments: &ReplayArguments,
+        sealing: &mut Option<Sealing>,
+    ) -> Result<Self, CommandFailure> {
+        let mut recorded = RecordingReader::open(&arguments.file)?;
         let mut contents = Self {
             commands: arguments.commands,
             only: arguments.space.iter().copied().collect(),
             first: i128::MAX,
             book: Book::new(),
             descriptions: BTreeMap::new(),
-            announcements: Announcements::default(),
+            announcements: LatestAnnouncements::default(),
             unusable: BTreeMap::new(),
         };
         let mut scratch = Vec::new();
@@ -120,7 +123,8 @@ impl Contents {
             let from = datagram.from;
             let descriptions = &mut contents.descriptions;
             let announcements = &mut contents.announcements;
-            let mut each = |news: News<'_>| describe((descriptions, announcements), &news);
+            let mut each =
+                |news: DatagramContent<'_>| describe((descriptions, announcements), &news);
             contents.book.handle((&message, from), now, &mut each);
         }
         contents.unusable = recorded.unusable();
@@ -128,18 +132,18 @@ impl Contents {
     }
 
     /// Returns the topics with the number of their values, and the reason why they are left out.
-    pub(super) fn topics(&self) -> impl Iterator<Item = (TopicId, u64, Option<LeftOut>)> {
+    pub(super) fn topics(&self) -> impl Iterator<Item = (TopicId, u64, Option<ReplayOmission>)> {
         self.book.topics().map(|(topic, heard)| {
             let why = self.left_out(topic);
             // The keys do not help if the space is not wanted.
-            let is_closed = heard.secured && why != Some(LeftOut::OtherSpace);
-            let closed = is_closed.then_some(LeftOut::Secured);
+            let is_closed = heard.secured && why != Some(ReplayOmission::OtherSpace);
+            let closed = is_closed.then_some(ReplayOmission::Secured);
             (topic, heard.values, closed.or(why))
         })
     }
 
     /// Returns the description of a topic.
-    pub(super) fn described(&self, topic: TopicId) -> Option<&Arc<Described>> {
+    pub(super) fn described(&self, topic: TopicId) -> Option<&Arc<AnnouncedDescription>> {
         self.descriptions.get(&topic)?.first()
     }
 
@@ -166,19 +170,22 @@ impl Contents {
     }
 
     /// Returns the reason why the values of a topic are left out.
-    fn left_out(&self, topic: TopicId) -> Option<LeftOut> {
+    fn left_out(&self, topic: TopicId) -> Option<ReplayOmission> {
         if !self.is_wanted(topic.space) {
-            return Some(LeftOut::OtherSpace);
+            return Some(ReplayOmission::OtherSpace);
         }
         if self.commands {
             return None;
         }
         if topic.space == SpaceId::UA {
-            return Some(LeftOut::Command);
+            return Some(ReplayOmission::Command);
         }
         match self.descriptions.get(&topic) {
-            None => Some(LeftOut::Undescribed),
-            Some(all) => all.iter().any(|one| acts(one)).then_some(LeftOut::Command),
+            None => Some(ReplayOmission::Undescribed),
+            Some(all) => all
+                .iter()
+                .any(|one| acts(one))
+                .then_some(ReplayOmission::Command),
         }
     }
 
@@ -187,14 +194,14 @@ impl Contents {
         &self,
         datagram: &[u8],
         sealing: &mut Option<Sealing>,
-    ) -> Result<Prepared, LeftOut> {
-        let message = NetworkMessage::decode(datagram).map_err(|_| LeftOut::Malformed)?;
+    ) -> Result<Prepared, ReplayOmission> {
+        let message = NetworkMessage::decode(datagram).map_err(|_| ReplayOmission::Malformed)?;
         if message.message_type() == NetworkMessageType::Probe {
-            return Err(LeftOut::Probe);
+            return Err(ReplayOmission::Probe);
         }
-        let space = space(&message).ok_or(LeftOut::Foreign)?;
+        let space = space(&message).ok_or(ReplayOmission::Foreign)?;
         if !self.is_wanted(space) {
-            return Err(LeftOut::OtherSpace);
+            return Err(ReplayOmission::OtherSpace);
         }
         let secured = message.is_sealed();
         let mut scratch = Vec::new();
@@ -203,23 +210,25 @@ impl Contents {
             None => message,
         };
         if message.is_sealed() {
-            return Err(LeftOut::Secured);
+            return Err(ReplayOmission::Secured);
         }
         let mut removed = BTreeMap::new();
         let plain = datagram::plain(&message);
         let plain = match self.place(&message, space)? {
-            Place::Whole => plain,
-            Place::Values(namespace) => {
+            SendWay::Whole => plain,
+            SendWay::Values(namespace) => {
                 let keeps = |id| {
                     let topic = TopicId::new(space.into(), namespace, id);
-                    let why = topic.map_or(Some(LeftOut::Foreign), |topic| self.left_out(topic));
+                    let why =
+                        topic.map_or(Some(ReplayOmission::Foreign), |topic| self.left_out(topic));
                     if let Some(why) = why {
                         *removed.entry(why).or_default() += 1;
                     }
                     why.is_none()
                 };
                 let kept = datagram::filtered(plain, keeps);
-                kept.map_err(|_| LeftOut::Malformed)?.unwrap_or_default()
+                kept.map_err(|_| ReplayOmission::Malformed)?
+                    .unwrap_or_default()
             }
         };
         Ok(Prepared {
@@ -230,55 +239,59 @@ impl Contents {
     }
 
     /// Returns the way in which a message is sent.
-    fn place(&self, message: &NetworkMessage<'_>, space: SpaceId) -> Result<Place, LeftOut> {
+    fn place(
+        &self,
+        message: &NetworkMessage<'_>,
+        space: SpaceId,
+    ) -> Result<SendWay, ReplayOmission> {
         if message.message_type() == NetworkMessageType::Announcement {
             return self.place_announcement(message, space);
         }
         // Large requests and responses are chunks without a DataSetWriterId.
         let is_call = message.is_action() || message.is_chunk() && message.writer_ids().is_none();
         match (is_call, self.commands) {
-            (true, true) => return Ok(Place::Whole),
-            (true, false) => return Err(LeftOut::Call),
+            (true, true) => return Ok(SendWay::Whole),
+            (true, false) => return Err(ReplayOmission::Call),
             (false, _) => {}
         }
         let group = message.group().and_then(|group| group.writer_group_id);
-        group.map(Place::Values).ok_or(LeftOut::Foreign)
+        group.map(SendWay::Values).ok_or(ReplayOmission::Foreign)
     }
 
     fn place_announcement(
         &self,
         message: &NetworkMessage<'_>,
         space: SpaceId,
-    ) -> Result<Place, LeftOut> {
+    ) -> Result<SendWay, ReplayOmission> {
         if message.is_chunk() {
-            return Err(LeftOut::SentBefore);
+            return Err(ReplayOmission::SentBefore);
         }
-        let announcement = Announcement::decode(message).map_err(|_| LeftOut::Malformed)?;
-        if let Announced::ActionMetaData(_) = announcement.announced {
+        let announcement = Announcement::decode(message).map_err(|_| ReplayOmission::Malformed)?;
+        if let AnnouncedContent::ActionMetaData(_) = announcement.announced {
             return if self.commands {
-                Ok(Place::Whole)
+                Ok(SendWay::Whole)
             } else {
-                Err(LeftOut::Call)
+                Err(ReplayOmission::Call)
             };
         }
         let topic = described_topic(&announcement).filter(|topic| topic.space == space);
         match topic.map(|topic| self.left_out(topic)) {
-            None => Err(LeftOut::Program),
-            Some(None) => Ok(Place::Whole),
+            None => Err(ReplayOmission::Program),
+            Some(None) => Ok(SendWay::Whole),
             Some(Some(why)) => Err(why),
         }
     }
 }
 
 /// The way in which a message is sent.
-enum Place {
+enum SendWay {
     Whole,
     /// Only values that are not left out, of this WriterGroup.
     Values(u16),
 }
 
 /// Returns whether a value acts where it arrives.
-fn acts(described: &Described) -> bool {
+fn acts(described: &AnnouncedDescription) -> bool {
     described.command || described.ros_type().is_some_and(moves)
 }
 
@@ -296,14 +309,14 @@ fn moves(name: &str) -> bool {
 /// program ends.
 fn describe(
     (descriptions, announcements): (
-        &mut BTreeMap<TopicId, Vec<Arc<Described>>>,
-        &mut Announcements,
+        &mut BTreeMap<TopicId, Vec<Arc<AnnouncedDescription>>>,
+        &mut LatestAnnouncements,
     ),
-    news: &News<'_>,
+    news: &DatagramContent<'_>,
 ) {
-    let News::Announced {
+    let DatagramContent::Announced {
         topic,
-        kind: Kind::Value,
+        kind: NameKind::Value,
         described,
         announcement,
         ..
@@ -325,7 +338,7 @@ fn describe(
 )]
 fn described_topic(announcement: &Announcement<'_>) -> Option<TopicId> {
     match &announcement.announced {
-        Announced::DataSetMetaData {
+        AnnouncedContent::DataSetMetaData {
             meta_data, status, ..
         } if status.0 & BAD == 0 => topic_of(meta_data.name),
         _ => None,

@@ -5,8 +5,8 @@ use uadp::{
     SecurityHeader, Timestamp,
 };
 
-use super::clock::Clock;
-use crate::messages::{self, Part};
+use super::clock::ReplayClock;
+use crate::messages::{self, PayloadMessage};
 
 /// Returns the bytes of a message without its security. The message is opened, or was never
 /// secured.
@@ -65,7 +65,7 @@ pub(super) fn filtered(
 }
 
 /// Moves the times of a message and its values to the present. Times in the fields stay.
-pub(super) fn move_times(plain: &mut [u8], clock: &Clock) {
+pub(super) fn move_times(plain: &mut [u8], clock: &ReplayClock) {
     let mut places = Vec::new();
     if let Ok(message) = NetworkMessage::decode(plain) {
         places.extend(network_stamp(&message));
@@ -87,14 +87,14 @@ pub(super) fn move_times(plain: &mut [u8], clock: &Clock) {
 }
 
 /// Returns the DataSetMessages of a message, or the first part of one in a chunk.
-fn parts<'a>(message: &NetworkMessage<'a>) -> Result<Vec<Part<'a>>, DecodeError> {
+fn parts<'a>(message: &NetworkMessage<'a>) -> Result<Vec<PayloadMessage<'a>>, DecodeError> {
     if message.message_type() != NetworkMessageType::DataSet || message.is_action() {
         return Ok(Vec::new());
     }
     if message.is_chunk() {
         let chunk = message.chunk()?;
         let first = chunk.writer_id.filter(|_| chunk.offset == 0);
-        let part = first.map(|writer_id| Part {
+        let part = first.map(|writer_id| PayloadMessage {
             writer_id: Some(writer_id),
             offset: message.payload_offset() + CHUNK_HEADER,
             bytes: chunk.data,
@@ -150,7 +150,7 @@ const CHUNK_HEADER: usize = 2 + 4 + 4;
 #[cfg(test)]
 mod tests {
     use uadp::{
-        ChunkBudget, Chunks, DataSetHeader, Extras, GroupHeader, NetworkHeader, PublisherId,
+        ChunkBudget, ChunkEncoder, DataSetHeader, Extras, GroupHeader, NetworkHeader, PublisherId,
         Scalar, Whole,
     };
 
@@ -189,8 +189,8 @@ mod tests {
         out
     }
 
-    fn clock() -> Clock {
-        Clock::new(100 * SECOND, 1000 * SECOND, 1.0)
+    fn clock() -> ReplayClock {
+        ReplayClock::new(100 * SECOND, 1000 * SECOND, 1.0)
     }
 
     fn seconds(time: Option<DateTime>) -> i128 {
@@ -214,7 +214,10 @@ mod tests {
                 let field = value.fields().unwrap().next().unwrap().unwrap();
                 assert_eq!(field, uadp::Variant::Scalar(Scalar::UInt16(*id)));
             }
-            move_times(&mut after, &Clock::new(1000 * SECOND, 100 * SECOND, 1.0));
+            move_times(
+                &mut after,
+                &ReplayClock::new(1000 * SECOND, 100 * SECOND, 1.0),
+            );
             assert_eq!(after, before);
         }
     }
@@ -240,7 +243,7 @@ mod tests {
             bytes: &whole[1..],
         };
         let extras = Extras::default();
-        let mut chunks = Chunks::new(&header(), &extras, whole, ChunkBudget::IPV4).unwrap();
+        let mut chunks = ChunkEncoder::new(&header(), &extras, whole, ChunkBudget::IPV4).unwrap();
         let mut buffer = Vec::new();
         let mut reassembler: uadp::Reassembler = uadp::Reassembler::default();
         let mut moved = None;

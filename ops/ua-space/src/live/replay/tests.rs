@@ -3,17 +3,17 @@ use std::path::PathBuf;
 
 use clap::Parser as _;
 use uadp::discovery::{
-    Announced, Announcement, DataSetMetaDataType, FieldMetaData, KeyValuePair, List,
+    AnnouncedContent, Announcement, DataSetMetaDataType, FieldMetaData, KeyValuePair, WireArray,
 };
 use uadp::{
-    BuiltinType, ChunkBudget, Chunks, DataSetHeader, Extras, GroupHeader, LocalizedText,
+    BuiltinType, ChunkBudget, ChunkEncoder, DataSetHeader, Extras, GroupHeader, LocalizedText,
     NetworkHeader, NetworkMessageEncoder, PublisherId, QualifiedName, Scalar, SecurityHeader,
     StatusCode, Variant, Whole,
 };
 
 use super::*;
-use crate::arguments::{Arguments, Verb};
-use crate::capture::{Link, PcapNg};
+use crate::arguments::{ToolArguments, Verb};
+use crate::capture::{LinkLayer, PcapNg};
 
 /// Returns a message with values of a group.
 fn values(space: u16, namespace: u16, ids: &[u16]) -> Vec<u8> {
@@ -50,12 +50,12 @@ fn announced(space: u16, id: u16, description: &str, command: bool) -> Vec<u8> {
         name: Some("data"),
         built_in_type: BuiltinType::UInt16.id(),
         value_rank: -1,
-        properties: List::new(&mark),
+        properties: WireArray::new(&mark),
         ..FieldMetaData::default()
     }];
     let announcement = Announcement {
         sequence_number: 1,
-        announced: Announced::DataSetMetaData {
+        announced: AnnouncedContent::DataSetMetaData {
             writer_id: id,
             meta_data: DataSetMetaDataType {
                 name: Some(&name),
@@ -63,7 +63,7 @@ fn announced(space: u16, id: u16, description: &str, command: bool) -> Vec<u8> {
                     locale: None,
                     text: Some(description),
                 },
-                fields: List::new(&fields),
+                fields: WireArray::new(&fields),
                 ..DataSetMetaDataType::default()
             },
             status: StatusCode::GOOD,
@@ -81,7 +81,7 @@ fn announced(space: u16, id: u16, description: &str, command: bool) -> Vec<u8> {
 fn recording(name: &str, messages: &[Vec<u8>]) -> PathBuf {
     let to: SocketAddrV4 = "239.192.0.40:4840".parse().unwrap();
     let mut file = Vec::new();
-    let mut writer = PcapNg::begin(Link::Udp(to), "lo", &mut file);
+    let mut writer = PcapNg::begin(LinkLayer::Udp(to), "lo", &mut file);
     for (message, time) in messages.iter().zip(1_000_000_000_i128..) {
         writer.packet(time, "127.0.0.1:5000".parse().unwrap(), message, &mut file);
     }
@@ -90,17 +90,17 @@ fn recording(name: &str, messages: &[Vec<u8>]) -> PathBuf {
     path
 }
 
-fn read(file: &std::path::Path, more: &[&str]) -> Contents {
+fn read(file: &std::path::Path, more: &[&str]) -> RecordingContents {
     let words = ["ua-space", "replay", file.to_str().unwrap()];
     let words = words.iter().chain(more);
-    let Verb::Replay(arguments) = Arguments::try_parse_from(words).unwrap().verb else {
+    let Verb::Replay(arguments) = ToolArguments::try_parse_from(words).unwrap().verb else {
         panic!("another verb");
     };
-    Contents::read(&arguments, &mut None).unwrap()
+    RecordingContents::read(&arguments, &mut None).unwrap()
 }
 
 /// Returns the DataSetWriterIds that are sent of a message, or the reason why it is left out.
-fn sent(contents: &Contents, datagram: &[u8]) -> Result<Vec<u16>, LeftOut> {
+fn sent(contents: &RecordingContents, datagram: &[u8]) -> Result<Vec<u16>, ReplayOmission> {
     let prepared = contents.prepare(datagram, &mut None)?;
     let Ok(message) = NetworkMessage::decode(&prepared.plain) else {
         return Ok(Vec::new());
@@ -122,12 +122,15 @@ fn commands_and_values_that_may_be_commands_are_left_out() {
     let [.., of_ros, of_server] = &messages;
     assert_eq!(sent(&contents, of_ros), Ok(vec![10]));
     let prepared = contents.prepare(of_ros, &mut None).unwrap();
-    let removed = BTreeMap::from([(LeftOut::Command, 2), (LeftOut::Undescribed, 1)]);
+    let removed = BTreeMap::from([
+        (ReplayOmission::Command, 2),
+        (ReplayOmission::Undescribed, 1),
+    ]);
     assert_eq!(prepared.removed, removed);
     assert_eq!(sent(&contents, of_server), Ok(Vec::new()));
     assert_eq!(contents.spaces(), BTreeSet::from([1]));
     assert_eq!(contents.announcements().count(), 1);
-    assert_eq!(sent(&contents, &messages[1]), Err(LeftOut::Command));
+    assert_eq!(sent(&contents, &messages[1]), Err(ReplayOmission::Command));
 
     let all = read(&file, &["--commands"]);
     assert_eq!(sent(&all, of_ros), Ok(vec![10, 11, 12, 13]));
@@ -135,7 +138,7 @@ fn commands_and_values_that_may_be_commands_are_left_out() {
     assert_eq!(all.spaces(), BTreeSet::from([0, 1]));
 
     let other = read(&file, &["--commands", "--space", "0"]);
-    assert_eq!(sent(&other, of_ros), Err(LeftOut::OtherSpace));
+    assert_eq!(sent(&other, of_ros), Err(ReplayOmission::OtherSpace));
     assert_eq!(other.spaces(), BTreeSet::from([0]));
     std::fs::remove_file(file).unwrap();
 }
@@ -158,7 +161,7 @@ fn large_calls_and_probes_are_left_out() {
         bytes: &[1; 2000],
     };
     let extras = Extras::default();
-    let mut chunks = Chunks::new(&network, &extras, whole, ChunkBudget::IPV4).unwrap();
+    let mut chunks = ChunkEncoder::new(&network, &extras, whole, ChunkBudget::IPV4).unwrap();
     let mut chunk = Vec::new();
     chunks.append(&mut chunk, &extras).unwrap().unwrap();
     let file = recording(
@@ -166,10 +169,10 @@ fn large_calls_and_probes_are_left_out() {
         &[values(1, 2, &[10]), probe.clone(), chunk.clone()],
     );
     let contents = read(&file, &[]);
-    assert_eq!(sent(&contents, &probe), Err(LeftOut::Probe));
-    assert_eq!(sent(&contents, &chunk), Err(LeftOut::Call));
+    assert_eq!(sent(&contents, &probe), Err(ReplayOmission::Probe));
+    assert_eq!(sent(&contents, &chunk), Err(ReplayOmission::Call));
     let all = read(&file, &["--commands"]);
-    assert_eq!(sent(&all, &probe), Err(LeftOut::Probe));
+    assert_eq!(sent(&all, &probe), Err(ReplayOmission::Probe));
     assert_eq!(sent(&all, &chunk), Ok(Vec::new()));
     std::fs::remove_file(file).unwrap();
 }
@@ -191,7 +194,10 @@ fn a_topic_that_commanded_at_any_time_is_left_out() {
     let [.., of_ros] = &messages;
     assert_eq!(sent(&contents, of_ros), Ok(vec![14]));
     let prepared = contents.prepare(of_ros, &mut None).unwrap();
-    assert_eq!(prepared.removed, BTreeMap::from([(LeftOut::Command, 4)]));
+    assert_eq!(
+        prepared.removed,
+        BTreeMap::from([(ReplayOmission::Command, 4)])
+    );
     std::fs::remove_file(file).unwrap();
 }
 
@@ -220,10 +226,10 @@ fn secured_topics_are_shown_as_secured_without_keys() {
     sealed.extend([0; 40]);
     let file = recording("secured", &[sealed]);
     let topic: TopicId = "ua_1_2_10".parse().unwrap();
-    let cases: [(&[&str], LeftOut, &[u16]); 3] = [
-        (&[], LeftOut::Secured, &[]),
-        (&["--commands"], LeftOut::Secured, &[1]),
-        (&["--space", "0"], LeftOut::OtherSpace, &[]),
+    let cases: [(&[&str], ReplayOmission, &[u16]); 3] = [
+        (&[], ReplayOmission::Secured, &[]),
+        (&["--commands"], ReplayOmission::Secured, &[1]),
+        (&["--space", "0"], ReplayOmission::OtherSpace, &[]),
     ];
     for (words, why, spaces) in cases {
         let contents = read(&file, words);

@@ -2,12 +2,12 @@
 
 use std::path::{Component, Path, PathBuf};
 
-use bridge_node::{Environment, read_bounded};
+use bridge_node::{RosEnvironment, read_bounded};
 
 /// The ROS packages of this host with their meshes.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Assets {
-    environment: Environment,
+    environment: RosEnvironment,
 }
 
 /// A request of a viewer.
@@ -18,7 +18,7 @@ pub(in crate::live) struct AssetRequest {
 }
 
 impl Assets {
-    pub(super) const fn new(environment: Environment) -> Self {
+    pub(super) const fn new(environment: RosEnvironment) -> Self {
         Self { environment }
     }
 
@@ -103,7 +103,7 @@ mod tests {
         std::fs::write(package.join("meshes/link.STL"), "solid").unwrap();
         std::fs::write(package.join("secret.txt"), "no").unwrap();
         std::fs::write(root.join("share/other.stl"), "no").unwrap();
-        let assets = Assets::new(Environment {
+        let assets = Assets::new(RosEnvironment {
             ros1: Vec::new(),
             ros2: vec![root.clone()],
         });

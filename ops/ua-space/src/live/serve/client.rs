@@ -19,12 +19,12 @@ use tokio_tungstenite::tungstenite::protocol::WebSocketConfig;
 use tokio_tungstenite::{WebSocketStream, accept_hdr_async_with_config};
 
 use super::assets::AssetRequest;
-use super::hub::{Client, Hub, Next};
+use super::hub::{ConnectedViewer, Next, ViewerHub};
 use crate::live::text::harmless;
 use crate::report::warn;
 
 /// Accepts viewers for as long as the listener works. `origins` are the web pages that may connect.
-pub(super) async fn accept(listener: TcpListener, hub: Arc<Hub>, origins: Arc<[String]>) {
+pub(super) async fn accept(listener: TcpListener, hub: Arc<ViewerHub>, origins: Arc<[String]>) {
     loop {
         match listener.accept().await {
             Ok((stream, _)) => {
@@ -38,7 +38,7 @@ pub(super) async fn accept(listener: TcpListener, hub: Arc<Hub>, origins: Arc<[S
 }
 
 /// Serves a viewer until it leaves.
-async fn serve(stream: TcpStream, hub: &Hub, origins: &[String]) {
+async fn serve(stream: TcpStream, hub: &ViewerHub, origins: &[String]) {
     // Without this option, small values would wait for the confirmations of earlier ones.
     let _faster = stream.set_nodelay(true);
     let Some((id, client)) = hub.connect() else {
@@ -56,7 +56,7 @@ async fn serve(stream: TcpStream, hub: &Hub, origins: &[String]) {
 }
 
 /// Sends the queue of a viewer and handles its messages, until either side ends.
-async fn exchange(stream: WebSocketStream<TcpStream>, hub: &Hub, client: &Client) {
+async fn exchange(stream: WebSocketStream<TcpStream>, hub: &ViewerHub, client: &ConnectedViewer) {
     let (mut sink, mut messages) = stream.split();
     let sending = async {
         loop {
@@ -101,7 +101,7 @@ async fn exchange(stream: WebSocketStream<TcpStream>, hub: &Hub, client: &Client
 
 /// Sends the file of a request. The next request waits until the file is sent, so that a viewer
 /// holds the memory of one file only.
-async fn fetch(hub: &Hub, client: &Client, request: AssetRequest) {
+async fn fetch(hub: &ViewerHub, client: &ConnectedViewer, request: AssetRequest) {
     let assets = hub.assets.clone();
     let reading = tokio::task::spawn_blocking(move || assets.response(&request));
     if let Ok(message) = reading.await {

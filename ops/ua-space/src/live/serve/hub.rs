@@ -8,12 +8,12 @@ use serde_json::{Value, json};
 use tokio::sync::Notify;
 
 use super::assets::{AssetRequest, Assets};
-use crate::live::channels::{Channel, Unfit};
+use crate::live::channels::{ChannelMismatch, TopicChannel};
 use crate::report::warn;
 
 /// Connects the values of a group with the viewers.
 #[derive(Debug)]
-pub(super) struct Hub {
+pub(super) struct ViewerHub {
     /// The name of the server for users.
     name: String,
     pub(super) assets: Assets,
@@ -26,11 +26,11 @@ struct State {
     /// The models of robots have no topic.
     offered: BTreeMap<Option<TopicId>, Vec<Offered>>,
     /// The values that each new subscriber gets, by channel.
-    kept: BTreeMap<u16, Kept>,
-    clients: BTreeMap<u64, Arc<Client>>,
+    kept: BTreeMap<u16, LastValue>,
+    clients: BTreeMap<u64, Arc<ConnectedViewer>>,
     last_client: u64,
     /// The reasons that were reported.
-    told: Vec<Unfit>,
+    told: Vec<ChannelMismatch>,
 }
 
 /// A channel as it is advertised.
@@ -42,7 +42,7 @@ struct Offered {
 
 /// A value for new subscribers.
 #[derive(Debug)]
-struct Kept {
+struct LastValue {
     time: u64,
     data: Vec<u8>,
 }
@@ -58,7 +58,7 @@ pub(super) struct Publication<'a> {
 
 /// A connected viewer.
 #[derive(Debug, Default)]
-pub(super) struct Client {
+pub(super) struct ConnectedViewer {
     queue: Mutex<Queue>,
     /// Wakes the sender of the connection.
     pub(super) wake: Notify,
@@ -100,7 +100,7 @@ pub(super) enum Next {
     Closed,
 }
 
-impl Hub {
+impl ViewerHub {
     /// Creates the hub of a group.
     pub(super) fn new(group: &str, assets: Assets) -> Self {
         Self {
@@ -111,14 +111,14 @@ impl Hub {
     }
 
     /// Adds a viewer; `None` if there are too many.
-    pub(super) fn connect(&self) -> Option<(u64, Arc<Client>)> {
+    pub(super) fn connect(&self) -> Option<(u64, Arc<ConnectedViewer>)> {
         let mut state = self.state();
         if state.clients.len() >= MOST_CLIENTS {
             return None;
         }
         state.last_client += 1;
         let id = state.last_client;
-        let client = Arc::new(Client::default());
+        let client = Arc::new(ConnectedViewer::default());
         let capabilities: &[&str] = match self.assets.is_empty() {
             true => &[],
             false => &["assets"],
@@ -160,15 +160,17 @@ impl Hub {
     }
 
     /// Offers a channel with one value, which each subscriber gets once.
-    pub(super) fn keep(&self, channel: &Channel, (time, data): (u64, Vec<u8>)) {
-        self.state().kept.insert(channel.id, Kept { time, data });
+    pub(super) fn keep(&self, channel: &TopicChannel, (time, data): (u64, Vec<u8>)) {
+        self.state()
+            .kept
+            .insert(channel.id, LastValue { time, data });
         self.offer(None, channel);
     }
 
     /// Offers a channel of a topic, or a channel without a topic. The other channels of the topic
     /// stay, because writers with different descriptions may alternate.
-    /// [`Channels`](crate::live::channels::Channels) limits their number.
-    pub(super) fn offer(&self, topic: Option<TopicId>, channel: &Channel) {
+    /// [`Channels`](crate::live::channels::TopicChannels) limits their number.
+    pub(super) fn offer(&self, topic: Option<TopicId>, channel: &TopicChannel) {
         let mut state = self.state();
         let others = state.offered.entry(topic).or_default();
         if others.iter().any(|one| one.channel == channel.id) {
@@ -215,7 +217,7 @@ impl Hub {
     }
 
     /// Reports values that are not offered, once for each reason.
-    pub(super) fn leave_out(&self, unfit: Unfit) {
+    pub(super) fn leave_out(&self, unfit: ChannelMismatch) {
         let mut state = self.state();
         if !state.told.contains(&unfit) {
             state.told.push(unfit);
@@ -224,7 +226,7 @@ impl Hub {
     }
 
     /// Handles a message of a viewer. Returns the request for a file.
-    pub(super) fn handle(&self, client: &Client, text: &str) -> Option<AssetRequest> {
+    pub(super) fn handle(&self, client: &ConnectedViewer, text: &str) -> Option<AssetRequest> {
         let Ok(message) = serde_json::from_str::<Value>(text) else {
             client.refuse("this is no JSON object");
             return None;
@@ -270,7 +272,7 @@ impl Hub {
         None
     }
 
-    fn subscribe(&self, client: &Client, id: &Value, channel: &Value) {
+    fn subscribe(&self, client: &ConnectedViewer, id: &Value, channel: &Value) {
         let id = id.as_u64().and_then(|id| u32::try_from(id).ok());
         let channel = channel.as_u64().and_then(|of| u16::try_from(of).ok());
         let (Some(id), Some(channel)) = (id, channel) else {
@@ -284,7 +286,7 @@ impl Hub {
         if let Err(why) = client.subscribe(id, channel) {
             return client.refuse(&why);
         }
-        if let Some(Kept { time, data }) = state.kept.get(&channel) {
+        if let Some(LastValue { time, data }) = state.kept.get(&channel) {
             client.push(&Publication {
                 channel,
                 time: *time,
@@ -308,7 +310,7 @@ impl Offered {
     }
 }
 
-impl Client {
+impl ConnectedViewer {
     /// Returns the next message for the viewer.
     pub(super) fn next(&self) -> Next {
         let mut queue = self.queue();

@@ -4,16 +4,16 @@ use std::io::{self, Write as _};
 
 use serde::Serialize;
 
-use super::{Ended, Skill, hear, in_group};
+use super::{ListenEnd, Skill, hear, in_group};
 use crate::arguments::InfoSkill;
-use crate::exit::Failure;
-use crate::live::described::{Field, ShownField};
+use crate::exit::CommandFailure;
+use crate::live::described::{AnnouncedField, ShownField};
 use crate::live::list::json;
-use crate::live::plain::Named;
+use crate::live::plain::NamedValues;
 use crate::live::run::results;
-use crate::live::text::{Table, harmless, is_coloured, wrapped};
+use crate::live::text::{TextTable, harmless, is_coloured, wrapped};
 
-pub(super) fn info(arguments: &InfoSkill) -> Result<(), Failure> {
+pub(super) fn info(arguments: &InfoSkill) -> Result<(), CommandFailure> {
     in_group(&arguments.group, async |mut live| {
         let wanted = &arguments.skill;
         let is_whole = |found: &[Skill]| {
@@ -26,8 +26,8 @@ pub(super) fn info(arguments: &InfoSkill) -> Result<(), Failure> {
         };
         let (found, ended) = hear(&mut live, arguments.seconds, &is_whole).await?;
         let Some(skill) = found.iter().find(|skill| skill.name() == *wanted) else {
-            if ended == Ended::Interrupted {
-                return Err(Failure::Interrupted);
+            if ended == ListenEnd::Interrupted {
+                return Err(CommandFailure::Interrupted);
             }
             return Err(not_found(wanted, &found, arguments.seconds));
         };
@@ -55,7 +55,7 @@ pub(super) fn info(arguments: &InfoSkill) -> Result<(), Failure> {
 }
 
 /// Returns the table of the parameters of Start.
-pub(super) fn parameters(fields: &[Field]) -> Table {
+pub(super) fn parameters(fields: &[AnnouncedField]) -> TextTable {
     let head = [
         "PARAMETER",
         "TYPE",
@@ -64,7 +64,7 @@ pub(super) fn parameters(fields: &[Field]) -> Table {
         "DEFAULT",
         "DESCRIPTION",
     ];
-    let mut table = Table::new(head.map(str::to_owned)).yielding([5, 4]);
+    let mut table = TextTable::new(head.map(str::to_owned)).yielding([5, 4]);
     for field in fields {
         let meaning = &field.meaning;
         let range = meaning.range.map(|(low, high)| format!("{low} to {high}"));
@@ -93,7 +93,7 @@ fn or_dash(text: &str) -> String {
 }
 
 /// Returns the failure for a skill that was not found, with the received skills.
-pub(super) fn not_found(wanted: &str, found: &[Skill], seconds: f64) -> Failure {
+pub(super) fn not_found(wanted: &str, found: &[Skill], seconds: f64) -> CommandFailure {
     let names: Vec<String> = found.iter().take(SHOWN).map(Skill::name).collect();
     let help = if names.is_empty() {
         "no skills were heard; is this the group and the interface (--address, --interface)?"
@@ -102,7 +102,7 @@ pub(super) fn not_found(wanted: &str, found: &[Skill], seconds: f64) -> Failure 
         format!("there are {}", names.join(", "))
     };
     let wanted = harmless(wanted);
-    Failure::Unavailable(format!(
+    CommandFailure::Unavailable(format!(
         "no skill {wanted} was heard for {seconds} s\n  = help: {}",
         harmless(&help)
     ))
@@ -122,11 +122,11 @@ struct Ending {
     run: u64,
     succeeded: bool,
     message: String,
-    results: Named,
+    results: NamedValues,
 }
 
 impl Ending {
-    fn of(value: &Named) -> Option<Self> {
+    fn of(value: &NamedValues) -> Option<Self> {
         let run = value.number("run").filter(|run| *run > 0)?;
         Some(Self {
             run,

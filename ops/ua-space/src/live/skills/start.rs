@@ -1,13 +1,13 @@
 //! `ua-space skills start`: resets a skill if necessary, and runs it.
 
 use super::info::not_found;
-use super::{Ended, Skill, hear, in_group};
-use crate::arguments::{Call, Group, Target};
-use crate::exit::Failure;
+use super::{ListenEnd, Skill, hear, in_group};
+use crate::arguments::{CallArguments, GroupArguments, NamedTarget};
+use crate::exit::CommandFailure;
 use crate::live::call::{call, call_quietly};
 
-pub(super) fn start(arguments: &Call) -> Result<(), Failure> {
-    let Target::Name(wanted) = &arguments.target else {
+pub(super) fn start(arguments: &CallArguments) -> Result<(), CommandFailure> {
+    let NamedTarget::Name(wanted) = &arguments.target else {
         // A topic of Start is called directly, without a Reset.
         return call(arguments);
     };
@@ -23,15 +23,15 @@ pub(super) fn start(arguments: &Call) -> Result<(), Failure> {
         let (found, ended) = hear(&mut live, arguments.wait, &is_whole).await?;
         match one(&found) {
             Some(both) => Ok(both),
-            None if ended == Ended::Interrupted => Err(Failure::Interrupted),
+            None if ended == ListenEnd::Interrupted => Err(CommandFailure::Interrupted),
             None => Err(not_found(wanted, &found, arguments.wait)),
         }
     })?;
     if state == HALTED
         && let Some(reset) = reset.and_then(|topic| topic.parse().ok())
     {
-        call_quietly(&Call {
-            target: Target::Topic(reset),
+        call_quietly(&CallArguments {
+            target: NamedTarget::Topic(reset),
             parameters: Vec::new(),
             run_timeout: None,
             no_wait: true,
@@ -42,8 +42,8 @@ pub(super) fn start(arguments: &Call) -> Result<(), Failure> {
     call(arguments)
 }
 
-fn same(group: &Group) -> Group {
-    Group {
+fn same(group: &GroupArguments) -> GroupArguments {
+    GroupArguments {
         interface: group.interface.clone(),
         address: group.address.clone(),
         broker: group.broker.clone(),

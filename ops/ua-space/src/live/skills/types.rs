@@ -6,14 +6,14 @@ use std::io::{self, Write as _};
 use serde::Serialize;
 
 use super::{Skill, hear, in_group};
-use crate::arguments::Types;
-use crate::exit::Failure;
-use crate::live::described::{Field, ShownField};
+use crate::arguments::TypesArguments;
+use crate::exit::CommandFailure;
+use crate::live::described::{AnnouncedField, ShownField};
 use crate::live::list::json;
 use crate::live::text::{harmless, is_coloured, wrapped};
 
 /// Runs `ua-space types`.
-pub(crate) fn types(arguments: &Types) -> Result<(), Failure> {
+pub(crate) fn types(arguments: &TypesArguments) -> Result<(), CommandFailure> {
     in_group(&arguments.group, async |mut live| {
         let (found, _) = hear(&mut live, arguments.seconds, &|_| false).await?;
         let types = of(&found, arguments.name.as_deref());
@@ -54,7 +54,7 @@ struct SkillType<'a> {
     skills: Vec<String>,
     parameters: Vec<ShownField<'a>>,
     #[serde(skip)]
-    fields: &'a [Field],
+    fields: &'a [AnnouncedField],
 }
 
 fn of<'a>(skills: &'a [Skill], wanted: Option<&str>) -> Vec<SkillType<'a>> {
@@ -77,7 +77,7 @@ fn of<'a>(skills: &'a [Skill], wanted: Option<&str>) -> Vec<SkillType<'a>> {
         one.skills.push(skill.name());
         if one.fields.is_empty() {
             one.fields = &skill.parameters;
-            one.parameters = skill.parameters.iter().map(Field::shown).collect();
+            one.parameters = skill.parameters.iter().map(AnnouncedField::shown).collect();
         }
     }
     types.into_values().collect()
@@ -89,7 +89,7 @@ fn is_meant(name: &str, wanted: &str) -> bool {
     name.eq_ignore_ascii_case(wanted) || short.eq_ignore_ascii_case(wanted)
 }
 
-fn missing(arguments: &Types, found: &[Skill]) -> Failure {
+fn missing(arguments: &TypesArguments, found: &[Skill]) -> CommandFailure {
     let mut names: Vec<&str> = found
         .iter()
         .filter_map(|skill| skill.type_name.as_deref())
@@ -105,7 +105,7 @@ fn missing(arguments: &Types, found: &[Skill]) -> Failure {
         names => format!("there are {}", harmless(&names.join(", "))),
     };
     let seconds = arguments.seconds;
-    Failure::Unavailable(format!(
+    CommandFailure::Unavailable(format!(
         "{what} was heard for {seconds} s\n  = help: {help}"
     ))
 }

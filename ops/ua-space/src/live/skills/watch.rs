@@ -10,25 +10,25 @@ use uadp::MessageKind;
 
 use super::{Go, RESULT, STATE, in_group, until};
 use crate::arguments::WatchSkills;
-use crate::exit::Failure;
+use crate::exit::CommandFailure;
 use crate::iso_time;
-use crate::live::book::{News, Sample};
+use crate::live::book::{DatagramContent, ReceivedSample};
 use crate::live::list::json;
-use crate::live::plain::{self, Named};
-use crate::live::run::{Step, percent, results};
+use crate::live::plain::{self, NamedValues};
+use crate::live::run::{RunEvent, percent, results};
 use crate::live::text::harmless;
 
 /// The suffix of the name of the transitions.
 const EVENTS: &str = ".Events";
 
-pub(super) fn watch(arguments: &WatchSkills) -> Result<(), Failure> {
+pub(super) fn watch(arguments: &WatchSkills) -> Result<(), CommandFailure> {
     in_group(&arguments.group, async |mut live| {
         live.want_calls([0]);
-        let mut known = Known::default();
+        let mut known = LastStates::default();
         let mut fault = None;
         let end = until(live.now(), arguments.seconds);
-        let mut each = |news: News<'_>, _| {
-            let News::Sample(sample) = news else {
+        let mut each = |news: DatagramContent<'_>, _| {
+            let DatagramContent::Sample(sample) = news else {
                 return Go::On;
             };
             for happened in known.take(&sample, arguments.what.as_deref()) {
@@ -45,7 +45,7 @@ pub(super) fn watch(arguments: &WatchSkills) -> Result<(), Failure> {
     })
 }
 
-fn tell(happened: &Happened, as_json: bool) -> Result<(), Failure> {
+fn tell(happened: &Happened, as_json: bool) -> Result<(), CommandFailure> {
     let mut out = io::stdout().lock();
     if as_json {
         writeln!(out, "{}", json(happened)?)?;
@@ -74,12 +74,12 @@ struct Happened {
     skill: String,
     run: u64,
     #[serde(flatten)]
-    step: Step,
+    step: RunEvent,
 }
 
 /// The last reported event of each skill, by the topic of its state.
 #[derive(Debug, Default)]
-struct Known(BTreeMap<TopicId, Last>);
+struct LastStates(BTreeMap<TopicId, Last>);
 
 #[derive(Debug, Default)]
 struct Last {
@@ -89,8 +89,8 @@ struct Last {
     result: Option<u64>,
 }
 
-impl Known {
-    fn take(&mut self, sample: &Sample<'_>, only: Option<&str>) -> Vec<Happened> {
+impl LastStates {
+    fn take(&mut self, sample: &ReceivedSample<'_>, only: Option<&str>) -> Vec<Happened> {
         let Some(described) = sample.described.as_deref() else {
             return Vec::new();
         };
@@ -141,7 +141,7 @@ pub(super) fn is_meant(skill: &str, only: Option<&str>) -> bool {
 }
 
 impl Last {
-    fn event(&mut self, value: &Named) -> Vec<Step> {
+    fn event(&mut self, value: &NamedValues) -> Vec<RunEvent> {
         let Some(state) = value.text("to_state") else {
             return Vec::new();
         };
@@ -151,13 +151,13 @@ impl Last {
             return Vec::new();
         }
         self.state = Some(now);
-        vec![Step::State {
+        vec![RunEvent::State {
             state: state.to_owned(),
             transition: value.text("transition").map(str::to_owned),
         }]
     }
 
-    fn state(&mut self, value: &Named) -> Vec<Step> {
+    fn state(&mut self, value: &NamedValues) -> Vec<RunEvent> {
         let Some(state) = value.text("state") else {
             return Vec::new();
         };
@@ -167,7 +167,7 @@ impl Last {
             let transition = value
                 .text("last_transition")
                 .filter(|text| !text.is_empty());
-            steps.push(Step::State {
+            steps.push(RunEvent::State {
                 state: state.to_owned(),
                 transition: transition.map(str::to_owned),
             });
@@ -181,13 +181,13 @@ impl Last {
         let reached = (percent(progress), step.clone());
         let runs = matches!(state, "Running" | "Suspended");
         if runs && self.progress != reached && reached != (0, String::new()) {
-            steps.push(Step::Progress { progress, step });
+            steps.push(RunEvent::Progress { progress, step });
         }
         self.progress = reached;
         steps
     }
 
-    fn result(&mut self, value: &Named) -> Vec<Step> {
+    fn result(&mut self, value: &NamedValues) -> Vec<RunEvent> {
         let run = value.number("run").unwrap_or_default();
         let told = self.result.replace(run);
         // The first received result belongs to an earlier run, unless the run was followed.
@@ -197,7 +197,7 @@ impl Last {
         if run == 0 || told == Some(run) || (told.is_none() && !seen) {
             return Vec::new();
         }
-        vec![Step::Result {
+        vec![RunEvent::Result {
             succeeded: value.get("succeeded").and_then(Value::as_bool) == Some(true),
             message: value.text("message").unwrap_or_default().to_owned(),
             results: results(value),
@@ -211,9 +211,9 @@ mod tests {
 
     use super::*;
 
-    fn named(json: &Value) -> Named {
+    fn named(json: &Value) -> NamedValues {
         let object = json.as_object().unwrap();
-        Named(
+        NamedValues(
             object
                 .iter()
                 .map(|(name, value)| (name.clone(), value.clone()))
@@ -221,8 +221,8 @@ mod tests {
         )
     }
 
-    fn told(steps: &[Step]) -> Vec<String> {
-        steps.iter().map(Step::told).collect()
+    fn told(steps: &[RunEvent]) -> Vec<String> {
+        steps.iter().map(RunEvent::told).collect()
     }
 
     #[test]

@@ -9,11 +9,11 @@ use mappings::TopicId;
 use supervisor::is_intended_drop;
 use uadp::MessageKind;
 
-use super::super::book::News;
+use super::super::book::DatagramContent;
 use super::super::list::quality_name;
 use super::super::text::{age, harmless, micros};
 use super::super::{Live, utc};
-use crate::cell::Page;
+use crate::cell::StatusPage;
 
 /// The order of the rows.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, ValueEnum)]
@@ -80,8 +80,8 @@ struct Counting {
 
 impl Figures {
     /// Counts a value that arrived at `now` after `start`, which is in nanoseconds since 1970.
-    pub(super) fn take(&mut self, news: &News<'_>, (start, now): (i128, Duration)) {
-        let News::Sample(sample) = news else {
+    pub(super) fn take(&mut self, news: &DatagramContent<'_>, (start, now): (i128, Duration)) {
+        let DatagramContent::Sample(sample) = news else {
             return;
         };
         let is_known = self.topics.contains_key(&sample.topic);
@@ -189,7 +189,7 @@ pub(super) fn summary(rows: &[Row]) -> String {
 }
 
 /// The order, the filter and the position of the screen.
-pub(super) struct View {
+pub(super) struct TopView {
     pub(super) sort: Sort,
     pub(super) is_reversed: bool,
     pub(super) filter: String,
@@ -199,7 +199,7 @@ pub(super) struct View {
     pub(super) is_over: bool,
 }
 
-impl View {
+impl TopView {
     pub(super) const fn new(sort: Sort, filter: String) -> Self {
         Self {
             sort,
@@ -216,7 +216,7 @@ impl View {
         &mut self,
         figures: &Figures,
         (live, now): (&Live, Duration),
-        pages: &[Page],
+        pages: &[StatusPage],
     ) -> Vec<Row> {
         let mut drops: BTreeMap<&str, BTreeMap<String, u64>> = BTreeMap::new();
         for (topic, of) in pages.iter().flat_map(|page| &page.topics) {
@@ -317,11 +317,11 @@ mod tests {
                 row("ua_2_2_1", "Speed2", 1.0),
             ]
         };
-        let order = |view: &mut View| -> Vec<String> {
+        let order = |view: &mut TopView| -> Vec<String> {
             let rows = view.ordered(rows());
             rows.into_iter().map(|row| row.topic).collect()
         };
-        let mut view = View::new(Sort::Topic, String::new());
+        let mut view = TopView::new(Sort::Topic, String::new());
         assert_eq!(order(&mut view), ["ua_1_2_9", "ua_1_2_10", "ua_2_2_1"]);
         view.sort = Sort::Rate;
         view.is_reversed = true;

@@ -7,14 +7,14 @@ use ratatui::text::Line;
 use ratatui::widgets::{Paragraph, Row as Cells, Table};
 
 use super::super::text::{harmless, shortened};
-use super::rows::{Row, View, summary};
+use super::rows::{Row, TopView, summary};
 
 pub(super) const HEAD: [&str; 8] = [
     "TOPIC", "NAME", "RATE/S", "LAST", "DELAY", "DROPPED", "QUALITY", "TYPE",
 ];
 
 /// Draws the rows from the first visible row, a title and the keys.
-pub(super) fn draw(frame: &mut Frame<'_>, (view, rows): (&View, &[Row]), group: &str) {
+pub(super) fn draw(frame: &mut Frame<'_>, (view, rows): (&TopView, &[Row]), group: &str) {
     let areas = Layout::vertical([
         Constraint::Length(1),
         Constraint::Min(2),
@@ -31,7 +31,7 @@ fn bold() -> Style {
     Style::new().add_modifier(Modifier::BOLD)
 }
 
-fn help(view: &View) -> String {
+fn help(view: &TopView) -> String {
     let filter = harmless(&view.filter);
     if view.is_typing {
         return format!("filter: {filter}_  (Enter keeps it, Esc removes it)");
@@ -45,7 +45,7 @@ fn help(view: &View) -> String {
     format!("q quit  s sort  r reverse  / filter  arrows scroll   {order}")
 }
 
-fn table(view: &View, rows: &[Row], width: usize) -> Table<'static> {
+fn table(view: &TopView, rows: &[Row], width: usize) -> Table<'static> {
     let visible: Vec<[String; 8]> = rows.iter().skip(view.first).map(Row::cells).collect();
     let widths = widths(&visible, width);
     let lines = visible.iter().zip(rows.iter().skip(view.first));
@@ -99,7 +99,7 @@ mod tests {
     use super::super::rows::Sort;
     use super::*;
 
-    fn lines(width: u16, view: &View) -> Vec<String> {
+    fn lines(width: u16, view: &TopView) -> Vec<String> {
         let row = |topic: &str, name: &str, quality: &str| Row {
             topic: topic.to_owned(),
             name: name.to_owned(),
@@ -130,7 +130,7 @@ mod tests {
 
     #[test]
     fn the_picture_fits_80_columns_and_uses_200() {
-        let view = View::new(Sort::Rate, String::new());
+        let view = TopView::new(Sort::Rate, String::new());
         let narrow = lines(80, &view);
         assert_eq!(
             narrow[0],
@@ -161,7 +161,7 @@ mod tests {
 
     #[test]
     fn the_last_line_shows_the_filter_while_it_is_typed() {
-        let mut view = View::new(Sort::Topic, "arm".to_owned());
+        let mut view = TopView::new(Sort::Topic, "arm".to_owned());
         view.is_typing = true;
         assert!(lines(80, &view)[5].starts_with("filter: arm_"));
     }

@@ -4,22 +4,22 @@ use std::io::{self, Write as _};
 
 use serde::Serialize;
 
-use super::super::book::{Kind, News};
+use super::super::book::{DatagramContent, NameKind};
 use super::super::list::json;
 use super::super::text::micros;
-use super::super::{Ended, Go, in_group, names, until, utc};
+use super::super::{Go, ListenEnd, in_group, names, until, utc};
 use super::{Delays, Samples, Times};
-use crate::arguments::{Target, Trace};
-use crate::exit::Failure;
+use crate::arguments::{NamedTarget, Trace};
+use crate::exit::CommandFailure;
 use crate::iso_time;
 
 /// Shows the delays of a topic until the time is over or the user interrupts.
-pub(super) fn follow(arguments: &Trace, target: &Target) -> Result<(), Failure> {
+pub(super) fn follow(arguments: &Trace, target: &NamedTarget) -> Result<(), CommandFailure> {
     in_group(&arguments.group, async |mut live| {
         let wait = arguments.seconds.unwrap_or(WAIT).max(WAIT);
         let found = until(live.now(), Some(wait));
-        let mut ignored = |_: News<'_>, _| Go::On;
-        let resolved = live.resolve((target, Some(Kind::Value)), found, &mut ignored);
+        let mut ignored = |_: DatagramContent<'_>, _| Go::On;
+        let resolved = live.resolve((target, Some(NameKind::Value)), found, &mut ignored);
         let Some(topic) = resolved.await? else {
             return Err(names::unknown(&live, target, wait));
         };
@@ -30,7 +30,7 @@ pub(super) fn follow(arguments: &Trace, target: &Target) -> Result<(), Failure> 
         let mut shown: u64 = 0;
         let ended = live
             .listen(end, &mut |news, now| {
-                let News::Sample(sample) = &news else {
+                let DatagramContent::Sample(sample) = &news else {
                     return Go::On;
                 };
                 if sample.topic != topic {
@@ -50,9 +50,9 @@ pub(super) fn follow(arguments: &Trace, target: &Target) -> Result<(), Failure> 
         }
         let name_of = |topic| live.name_of(topic);
         samples.write(arguments, &delays, &name_of)?;
-        if shown == 0 && ended != Ended::Interrupted {
+        if shown == 0 && ended != ListenEnd::Interrupted {
             let group = live.group();
-            return Err(Failure::Unavailable(format!(
+            return Err(CommandFailure::Unavailable(format!(
                 "no sample of {topic} came in {group}\n  = help: `ua-space tap {topic}` shows where it \
                  is dropped"
             )));
@@ -65,7 +65,7 @@ pub(super) fn follow(arguments: &Trace, target: &Target) -> Result<(), Failure> 
 }
 
 #[derive(Serialize)]
-struct Shown {
+struct TraceJson {
     topic: String,
     sequence: Option<u16>,
     /// The time of the arrival here.
@@ -79,7 +79,7 @@ struct Shown {
 }
 
 /// Prints a sample, after the names of the columns for the first sample.
-fn show(times: &Times, is_first: bool, is_json: bool) -> Result<(), Failure> {
+fn show(times: &Times, is_first: bool, is_json: bool) -> Result<(), CommandFailure> {
     let in_micros = |nanos: i128| {
         // Delays of days are faults of clocks, and may be inexact.
         let nanos = i64::try_from(nanos).unwrap_or(i64::MAX);
@@ -94,7 +94,7 @@ fn show(times: &Times, is_first: bool, is_json: bool) -> Result<(), Failure> {
     let arrived = iso_time::of_unix_nanos(times.arrived);
     let mut out = io::stdout().lock();
     if is_json {
-        let shown = Shown {
+        let shown = TraceJson {
             topic: times.topic.to_string(),
             sequence: times.sequence,
             arrived,
@@ -131,7 +131,7 @@ fn show(times: &Times, is_first: bool, is_json: bool) -> Result<(), Failure> {
 }
 
 /// Prints the statistics of all shown samples.
-fn print(delays: &Delays) -> Result<(), Failure> {
+fn print(delays: &Delays) -> Result<(), CommandFailure> {
     let mut out = io::stdout().lock();
     for row in delays.rows() {
         let hop = row.delays;

@@ -14,11 +14,11 @@ use tokio::time::{MissedTickBehavior, interval};
 use super::super::unix_nanos;
 use super::clocks::{Estimate, Exchange, fit};
 use crate::cell::page_of_url;
-use crate::http::Server;
+use crate::http::HttpServer;
 
 /// The clocks of the hosts of programs, by address. Asks again until it is dropped.
 #[derive(Debug, Default)]
-pub(super) struct Offsets {
+pub(super) struct ClockOffsets {
     hosts: Arc<Mutex<BTreeMap<IpAddr, Host>>>,
     asking: Option<AbortHandle>,
 }
@@ -30,7 +30,7 @@ struct Host {
     estimate: Option<Estimate>,
 }
 
-impl Drop for Offsets {
+impl Drop for ClockOffsets {
     fn drop(&mut self) {
         if let Some(asking) = &self.asking {
             asking.abort();
@@ -38,7 +38,7 @@ impl Drop for Offsets {
     }
 }
 
-impl Offsets {
+impl ClockOffsets {
     /// Compares the clocks of the hosts of these programs, and continues in the background. The
     /// clock of this host, and programs that do not answer, are left out.
     pub(super) async fn watch(urls: &[String]) -> Self {
@@ -138,7 +138,7 @@ impl Host {
 
 /// Returns the address of the host of a URL, if it is not this host.
 async fn other_host(url: &str) -> Option<IpAddr> {
-    let server = Server::parse(url).ok()?;
+    let server = HttpServer::parse(url).ok()?;
     let ip = lookup_host(server.authority()).await.ok()?.next()?.ip();
     // The route to an address of this host begins there. Nothing is sent.
     let any: IpAddr = match ip {
@@ -181,7 +181,7 @@ mod tests {
         assert_eq!(host.estimate.unwrap().offset, 3_000 * MS);
         host.add(exchange(20, 0));
         assert_eq!(host.estimate.unwrap().offset, 0);
-        let mut offsets = Offsets::default();
+        let mut offsets = ClockOffsets::default();
         let ip: IpAddr = "10.0.0.2".parse().unwrap();
         host.add(exchange(21, 7 * MS));
         offsets.hosts = Arc::new(Mutex::new(BTreeMap::from([(ip, host)])));
@@ -194,7 +194,7 @@ mod tests {
     #[tokio::test]
     async fn this_host_needs_no_comparison() {
         assert_eq!(other_host("http://127.0.0.1:9100").await, None);
-        let offsets = Offsets::watch(&["http://127.0.0.1:9".to_owned()]).await;
+        let offsets = ClockOffsets::watch(&["http://127.0.0.1:9".to_owned()]).await;
         assert!(offsets.clocks().is_empty() && offsets.asking.is_none());
     }
 }

@@ -9,28 +9,28 @@ use std::time::Duration;
 
 use tokio::time::{MissedTickBehavior, interval, sleep};
 
-use super::super::book::News;
+use super::super::book::DatagramContent;
 use super::super::text::harmless;
-use super::super::{Ended, Go, Live, in_group, unix_nanos, utc};
+use super::super::{Go, ListenEnd, Live, in_group, unix_nanos, utc};
 use super::Delays;
-use super::offsets::Offsets;
-use super::protobuf::Message;
-use super::spans::{self, Sampled, SampledValue};
+use super::offsets::ClockOffsets;
+use super::protobuf::ProtobufMessage;
+use super::spans::{self, SampledPeriod, SampledValue};
 use crate::arguments::Trace;
-use crate::cell::{HopPage, Page, TopicPage, page_of_url, pages_of_this_host};
-use crate::exit::Failure;
-use crate::http::{Change, PROTOBUF, Server};
-use crate::interrupt::Interrupt;
+use crate::cell::{HopPage, StatusPage, TopicPage, page_of_url, pages_of_this_host};
+use crate::exit::CommandFailure;
+use crate::http::{ChangeRequest, HttpServer, PROTOBUF};
+use crate::interrupt::SignalGuard;
 use crate::report::warn;
 use crate::survey::look;
 
 /// Exports until the user interrupts the command.
-pub(super) fn export(arguments: &Trace, url: &str) -> Result<(), Failure> {
+pub(super) fn export(arguments: &Trace, url: &str) -> Result<(), CommandFailure> {
     let seconds = arguments.seconds.unwrap_or(USUAL).max(SHORTEST);
     let period = Duration::try_from_secs_f64(seconds).unwrap_or(LONGEST);
     let mut exporter = Exporter {
         arguments,
-        collector: Server::parse(url)?,
+        collector: HttpServer::parse(url)?,
         period: period.min(LONGEST),
         observer: RandomState::new().hash_one(0_u8),
         is_sent: false,
@@ -49,14 +49,14 @@ pub(super) fn export(arguments: &Trace, url: &str) -> Result<(), Failure> {
     if exporter.is_sent {
         Ok(())
     } else {
-        Err(Failure::NotThere)
+        Err(CommandFailure::NotThere)
     }
 }
 
 /// The export to a collector.
 struct Exporter<'a> {
     arguments: &'a Trace,
-    collector: Server,
+    collector: HttpServer,
     period: Duration,
     /// A random number of this process.
     observer: u64,
@@ -70,8 +70,8 @@ struct Exporter<'a> {
 
 impl Exporter<'_> {
     /// Exports metrics until the user interrupts the command.
-    async fn run_alone(&mut self) -> Result<(), Failure> {
-        let mut interrupt = Interrupt::catch()?;
+    async fn run_alone(&mut self) -> Result<(), CommandFailure> {
+        let mut interrupt = SignalGuard::catch()?;
         let mut ticks = interval(self.period);
         ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
         loop {
@@ -89,16 +89,16 @@ impl Exporter<'_> {
 
     /// Exports metrics and samples until the user interrupts the command. The group is received
     /// while a request is sent.
-    async fn run(&mut self, mut live: Live, most: usize) -> Result<(), Failure> {
-        let mut delays = Delays::by(Offsets::watch(&self.arguments.metrics).await);
+    async fn run(&mut self, mut live: Live, most: usize) -> Result<(), CommandFailure> {
+        let mut delays = Delays::by(ClockOffsets::watch(&self.arguments.metrics).await);
         let (start, period) = (live.start_utc(), self.period);
-        let mut sampled = Sampled::new(most);
+        let mut sampled = SampledPeriod::new(most);
         loop {
             let batch = sampled.take(&|topic| live.name_of(topic));
             let mut round = pin!(self.round(batch));
             let mut is_over = false;
-            let mut each = |news: News<'_>, now| {
-                if let News::Sample(sample) = &news
+            let mut each = |news: DatagramContent<'_>, now| {
+                if let DatagramContent::Sample(sample) = &news
                     && let Some(times) = delays.take(sample, utc(start, now))
                 {
                     sampled.add(times);
@@ -116,7 +116,7 @@ impl Exporter<'_> {
                         () = &mut round, if !is_over => is_over = true,
                     }
                 };
-                if ended == Ended::Interrupted {
+                if ended == ListenEnd::Interrupted {
                     return Ok(());
                 }
             }
@@ -161,7 +161,7 @@ impl Exporter<'_> {
     }
 }
 
-async fn pages(arguments: &Trace) -> Vec<Page> {
+async fn pages(arguments: &Trace) -> Vec<StatusPage> {
     if arguments.metrics.is_empty() {
         return pages_of_this_host().await;
     }
@@ -177,11 +177,11 @@ async fn pages(arguments: &Trace) -> Vec<Page> {
 
 /// Sends a request, once more after a pause if the collector does not take it. Counters are totals,
 /// so the next export makes up for a lost one.
-async fn send(collector: &Server, path: &str, body: Vec<u8>) -> Result<(), String> {
+async fn send(collector: &HttpServer, path: &str, body: Vec<u8>) -> Result<(), String> {
     let mut why = String::new();
     for pause in [Duration::ZERO, RETRY] {
         sleep(pause).await;
-        let change = Change {
+        let change = ChangeRequest {
             method: "POST",
             content_type: PROTOBUF,
             body: body.clone(),
@@ -203,8 +203,8 @@ async fn send(collector: &Server, path: &str, body: Vec<u8>) -> Result<(), Strin
 }
 
 /// Returns the metrics of programs at a time in nanoseconds since 1970.
-fn request(pages: &[Page], now: i128) -> Vec<u8> {
-    let mut request = Message::default();
+fn request(pages: &[StatusPage], now: i128) -> Vec<u8> {
+    let mut request = ProtobufMessage::default();
     let now = u64::try_from(now).unwrap_or_default();
     for page in pages {
         let uptime = Duration::from_secs(page.uptime_s.unwrap_or_default());
@@ -218,7 +218,7 @@ fn request(pages: &[Page], now: i128) -> Vec<u8> {
 /// The start of the program and the present time.
 type Times = (u64, u64);
 
-fn resource(metrics: &mut Message, page: &Page, times: Times) {
+fn resource(metrics: &mut ProtobufMessage, page: &StatusPage, times: Times) {
     metrics.message(RESOURCE, |resource| {
         attribute(resource, RESOURCE_ATTRIBUTES, "service.name", &page.program);
         let version = page.version.as_deref().unwrap_or_default();
@@ -307,10 +307,10 @@ fn topic_attributes<'p>(topic: &'p str, counts: &'p TopicPage) -> Vec<(&'static 
 }
 
 fn metric(
-    scoped: &mut Message,
+    scoped: &mut ProtobufMessage,
     (name, about, unit): (&str, &str, &str),
     kind: u32,
-    fill: impl FnOnce(&mut Message),
+    fill: impl FnOnce(&mut ProtobufMessage),
 ) {
     scoped.message(METRICS, |metric| {
         metric.text(METRIC_NAME, name);
@@ -320,7 +320,11 @@ fn metric(
     });
 }
 
-fn counter(scoped: &mut Message, (name, about): (&str, &str), fill: impl FnOnce(&mut Message)) {
+fn counter(
+    scoped: &mut ProtobufMessage,
+    (name, about): (&str, &str),
+    fill: impl FnOnce(&mut ProtobufMessage),
+) {
     metric(scoped, (name, about, "{sample}"), SUM, |sum| {
         fill(sum);
         sum.number(SUM_TEMPORALITY, CUMULATIVE);
@@ -328,7 +332,7 @@ fn counter(scoped: &mut Message, (name, about): (&str, &str), fill: impl FnOnce(
     });
 }
 
-fn point(sum: &mut Message, (start, now): Times, attributes: &[(&str, &str)], value: u64) {
+fn point(sum: &mut ProtobufMessage, (start, now): Times, attributes: &[(&str, &str)], value: u64) {
     sum.message(POINTS, |point| {
         for (name, value) in attributes {
             attribute(point, POINT_ATTRIBUTES, name, value);
@@ -339,7 +343,7 @@ fn point(sum: &mut Message, (start, now): Times, attributes: &[(&str, &str)], va
     });
 }
 
-fn quantiles(summary: &mut Message, (start, now): Times, name: &str, hop: &HopPage) {
+fn quantiles(summary: &mut ProtobufMessage, (start, now): Times, name: &str, hop: &HopPage) {
     summary.message(POINTS, |point| {
         attribute(point, POINT_ATTRIBUTES, "hop", name);
         point.fixed(POINT_START, start);
@@ -354,7 +358,7 @@ fn quantiles(summary: &mut Message, (start, now): Times, name: &str, hop: &HopPa
     });
 }
 
-pub(super) fn attribute(of: &mut Message, field: u32, name: &str, value: &str) {
+pub(super) fn attribute(of: &mut ProtobufMessage, field: u32, name: &str, value: &str) {
     of.message(field, |attribute| {
         attribute.text(KEY, name);
         attribute.message(VALUE, |any| any.text(STRING_VALUE, value));
@@ -429,7 +433,7 @@ mod tests {
         let status = r#"{"program":"bridge-ros1","version":"1.0","uptime_s":60,"space":1,
             "topics":{"ua_1_2_10":{"name":"Left.Speed","sent":5,"dropped":{"too_big":2}}},
             "hops":{"out":{"count":5,"p50_us":10.0,"p99_us":20.0,"max_us":30.0}}}"#;
-        let page: Page = serde_json::from_str(status).unwrap();
+        let page: StatusPage = serde_json::from_str(status).unwrap();
         let body = request(&[page.clone(), page], 1_700_000_000_000_000_000);
         let resources = fields(&body);
         assert_eq!(resources.len(), 2);

@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 use mappings::TopicId;
 
 use super::Times;
-use super::protobuf::Message;
+use super::protobuf::ProtobufMessage;
 
 /// Returns the bytes of a trace, and the number of samples that are left out because too many
 /// others were in flight at the same time.
@@ -123,15 +123,15 @@ fn uuid(topic: TopicId, hop: Hop, lane: usize) -> u64 {
 /// The encoded packets.
 #[derive(Debug, Default)]
 struct Trace {
-    trace: Message,
+    trace: ProtobufMessage,
     /// Whether the first packet is written, which starts the sequence.
     is_started: bool,
 }
 
 impl Trace {
-    fn packet(&mut self, fill: impl FnOnce(&mut Message)) {
+    fn packet(&mut self, fill: impl FnOnce(&mut ProtobufMessage)) {
         let is_first = !std::mem::replace(&mut self.is_started, true);
-        let mut packet = Message::default();
+        let mut packet = ProtobufMessage::default();
         packet.number(SEQUENCE_ID, 1);
         if is_first {
             packet.number(SEQUENCE_FLAGS, INCREMENTAL_STATE_CLEARED);

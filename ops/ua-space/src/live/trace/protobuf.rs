@@ -2,9 +2,9 @@
 
 /// An encoded protobuf message.
 #[derive(Debug, Default)]
-pub(super) struct Message(Vec<u8>);
+pub(super) struct ProtobufMessage(Vec<u8>);
 
-impl Message {
+impl ProtobufMessage {
     /// Returns the encoded fields.
     pub(super) fn encoded(&self) -> &[u8] {
         &self.0
@@ -113,7 +113,7 @@ pub(super) mod tests {
 
     #[test]
     fn fields_are_encoded_by_their_types() {
-        let mut message = super::Message::default();
+        let mut message = super::ProtobufMessage::default();
         message.number(1, 300);
         message.double(2, 1.5);
         message.message(3, |inner| inner.text(1, "a"));

@@ -16,23 +16,23 @@ use super::clocks::{Estimate, Twice, estimate, median};
 use super::{Window, called, figures, head};
 use crate::arguments::Trace;
 use crate::cell::HopPage;
-use crate::exit::Failure;
-use crate::live::book::{Book, News};
+use crate::exit::CommandFailure;
+use crate::live::book::{Book, DatagramContent};
 use crate::live::list::json;
-use crate::live::text::{Table, is_coloured, micros};
-use crate::recorded::Recorded;
+use crate::live::text::{TextTable, is_coloured, micros};
+use crate::recorded::RecordingReader;
 use crate::report::warn;
 
 /// Shows the delays between the hosts of the recordings.
 ///
 /// # Errors
 /// A recording cannot be read, or is the only one, or two have no message in common.
-pub(super) fn trace(arguments: &Trace) -> Result<(), Failure> {
+pub(super) fn trace(arguments: &Trace) -> Result<(), CommandFailure> {
     let Some((first, others)) = arguments.recording.split_first() else {
         return Ok(());
     };
     if others.is_empty() {
-        return Err(Failure::Usage(
+        return Err(CommandFailure::Usage(
             "one recording has one clock: give a --recording for each host, made at the same time"
                 .to_owned(),
         ));
@@ -67,10 +67,10 @@ struct Arrivals {
 }
 
 impl Arrivals {
-    fn read(file: &Path, keys: &RandomState) -> Result<Self, Failure> {
-        let mut recorded = Recorded::open(file)?;
+    fn read(file: &Path, keys: &RandomState) -> Result<Self, CommandFailure> {
+        let mut recorded = RecordingReader::open(file)?;
         if recorded.has_only_values() {
-            return Err(Failure::Usage(format!(
+            return Err(CommandFailure::Usage(format!(
                 "{}: an MCAP file has no senders; `ua-space record` writes them as .pcapng",
                 file.display()
             )));
@@ -118,7 +118,11 @@ impl Compared {
 
     /// Returns the second clock, and the addresses of the first and of the second host. Messages of
     /// the first host arrive at the second host last, and those of the second host first.
-    fn clock(&self, first: &Path, second: &Path) -> Result<(Clock, IpAddr, IpAddr), Failure> {
+    fn clock(
+        &self,
+        first: &Path,
+        second: &Path,
+    ) -> Result<(Clock, IpAddr, IpAddr), CommandFailure> {
         let names = format!("{} and {}", first.display(), second.display());
         let mut middles: Vec<(i128, IpAddr)> = self
             .0
@@ -130,7 +134,7 @@ impl Compared {
             .collect();
         middles.sort_unstable();
         let (Some((_, other)), Some((_, own))) = (middles.first(), middles.last()) else {
-            return Err(Failure::Data(format!(
+            return Err(CommandFailure::Data(format!(
                 "{names} have no message in common\n  = help: record on both hosts at the same time, in the same group"
             )));
         };
@@ -141,7 +145,7 @@ impl Compared {
             estimate(of(own), of(other))
         };
         let Some(estimate) = found else {
-            return Err(Failure::Data(format!(
+            return Err(CommandFailure::Data(format!(
                 "{names} have messages of one direction only, from {own}\n  = help: a program on each of both hosts has to send"
             )));
         };
@@ -192,11 +196,11 @@ impl Delays {
         (file, number): (&PathBuf, usize),
         hosts: &BTreeMap<IpAddr, usize>,
         clocks: &[Clock],
-    ) -> Result<(), Failure> {
+    ) -> Result<(), CommandFailure> {
         let Some(here) = clocks.get(number) else {
             return Ok(());
         };
-        let mut recorded = Recorded::open(file)?;
+        let mut recorded = RecordingReader::open(file)?;
         let mut book = Book::new();
         let mut first = None;
         while let Some(datagram) = recorded.next()? {
@@ -214,7 +218,7 @@ impl Delays {
             let since = u64::try_from(datagram.time - begin).unwrap_or_default();
             let now = Duration::from_nanos(since);
             book.handle((&message, datagram.from), now, &mut |news| {
-                if let News::Sample(sample) = news
+                if let DatagramContent::Sample(sample) = news
                     && sample.message.kind != MessageKind::KeepAlive
                     && let Some(sent) = sample.sent()
                 {
@@ -269,7 +273,7 @@ struct ShownClock<'a> {
 }
 
 #[derive(Serialize)]
-struct Shown<'a> {
+struct RecordingTraceJson<'a> {
     clocks: Vec<ShownClock<'a>>,
     topics: &'a [Row],
 }
@@ -279,7 +283,7 @@ pub(super) fn in_micros(nanos: i128) -> f64 {
     nanos as f64 / 1000.0
 }
 
-fn print(arguments: &Trace, clocks: &[Clock], rows: &[Row]) -> Result<(), Failure> {
+fn print(arguments: &Trace, clocks: &[Clock], rows: &[Row]) -> Result<(), CommandFailure> {
     let mut out = io::stdout().lock();
     if arguments.json {
         let shown = clocks.iter().map(|clock| ShownClock {
@@ -291,7 +295,7 @@ fn print(arguments: &Trace, clocks: &[Clock], rows: &[Row]) -> Result<(), Failur
             messages_forth: clock.messages.0,
             messages_back: clock.messages.1,
         });
-        let shown = Shown {
+        let shown = RecordingTraceJson {
             clocks: shown.collect(),
             topics: rows,
         };
@@ -307,7 +311,7 @@ fn print(arguments: &Trace, clocks: &[Clock], rows: &[Row]) -> Result<(), Failur
         "BACK",
         "RECORDING",
     ];
-    let mut table = Table::new(columns.map(str::to_owned)).yielding([6]);
+    let mut table = TextTable::new(columns.map(str::to_owned)).yielding([6]);
     for (number, clock) in clocks.iter().enumerate() {
         let host = clock.host.clone().unwrap_or_else(|| "-".to_owned());
         let estimate = &clock.estimate;
@@ -364,7 +368,7 @@ mod tests {
     };
 
     use super::*;
-    use crate::capture::{Link, PcapNg};
+    use crate::capture::{LinkLayer, PcapNg};
 
     const START: i128 = 1_700_000_000_000_000_000;
     const MS: i128 = 1_000_000;
@@ -411,7 +415,7 @@ mod tests {
         let mut bytes = [Vec::new(), Vec::new()];
         let mut writers = Vec::new();
         for out in &mut bytes {
-            writers.push(PcapNg::begin(Link::Udp(group), "eth0", out));
+            writers.push(PcapNg::begin(LinkLayer::Udp(group), "eth0", out));
         }
         for number in 0..600_u16 {
             let at = START + i128::from(number) * 100 * MS;

@@ -7,13 +7,13 @@ use std::collections::BTreeMap;
 use mappings::TopicId;
 
 use super::otlp::attribute;
-use super::protobuf::Message;
+use super::protobuf::ProtobufMessage;
 use super::{NETWORK, ORIGIN, Times};
-use crate::cell::Page;
+use crate::cell::StatusPage;
 
 /// The samples of a period.
 #[derive(Debug)]
-pub(super) struct Sampled {
+pub(super) struct SampledPeriod {
     /// The largest number of samples of a topic.
     most: usize,
     samples: BTreeMap<TopicId, Vec<Times>>,
@@ -27,7 +27,7 @@ pub(super) struct SampledValue {
     pub(super) name: Option<String>,
 }
 
-impl Sampled {
+impl SampledPeriod {
     pub(super) const fn new(most: usize) -> Self {
         Self {
             most,
@@ -72,13 +72,13 @@ impl Sampled {
 
 /// Returns the spans of samples. `pages` name the programs that sent them. The same sample has the
 /// same trace at all observers, whose spans differ by `observer`.
-pub(super) fn request(samples: &[SampledValue], pages: &[Page], observer: u64) -> Vec<u8> {
+pub(super) fn request(samples: &[SampledValue], pages: &[StatusPage], observer: u64) -> Vec<u8> {
     let mut of_writers: BTreeMap<String, Vec<&SampledValue>> = BTreeMap::new();
     for sample in samples {
         let writer = writer(sample.times.topic, pages);
         of_writers.entry(writer).or_default().push(sample);
     }
-    let mut request = Message::default();
+    let mut request = ProtobufMessage::default();
     for (writer, samples) in &of_writers {
         resource(&mut request, writer, |scoped| {
             for sample in samples {
@@ -100,15 +100,15 @@ pub(super) fn request(samples: &[SampledValue], pages: &[Page], observer: u64) -
 }
 
 /// Returns the program that sends a topic, or its space.
-fn writer(topic: TopicId, pages: &[Page]) -> String {
+fn writer(topic: TopicId, pages: &[StatusPage]) -> String {
     let name = topic.to_string();
-    let sends = |page: &&Page| page.topics.get(&name).is_some_and(|topic| topic.sent > 0);
-    let own = |page: &&Page| u16::from(page.space) == u16::from(topic.space) && sends(page);
+    let sends = |page: &&StatusPage| page.topics.get(&name).is_some_and(|topic| topic.sent > 0);
+    let own = |page: &&StatusPage| u16::from(page.space) == u16::from(topic.space) && sends(page);
     let program = pages.iter().find(own).map(|page| page.program.clone());
     program.unwrap_or_else(|| format!("space {}", topic.space))
 }
 
-fn resource(request: &mut Message, service: &str, fill: impl FnOnce(&mut Message)) {
+fn resource(request: &mut ProtobufMessage, service: &str, fill: impl FnOnce(&mut ProtobufMessage)) {
     request.message(RESOURCE_SPANS, |spans| {
         spans.message(RESOURCE, |resource| {
             attribute(resource, RESOURCE_ATTRIBUTES, "service.name", service);
@@ -122,7 +122,7 @@ fn resource(request: &mut Message, service: &str, fill: impl FnOnce(&mut Message
 
 /// Adds a span with its id and the id of its parent.
 fn span(
-    scoped: &mut Message,
+    scoped: &mut ProtobufMessage,
     SampledValue { times, name }: &SampledValue,
     (hop, kind): (&str, u64),
     (from, to): (Option<i128>, Option<i128>),
@@ -231,7 +231,7 @@ mod tests {
 
     #[test]
     fn a_sample_is_a_trace_with_a_span_for_each_hop() {
-        let mut sampled = Sampled::new(2);
+        let mut sampled = SampledPeriod::new(2);
         for sequence in 0..5 {
             sampled.add(times("ua_1_2_10", sequence, (20_000, 300_000)));
         }
@@ -246,7 +246,7 @@ mod tests {
         assert_eq!(samples.len(), 2);
         assert!(sampled.take(&|_| None).is_empty());
         let status = r#"{"program":"bridge-ros1","space":1,"topics":{"ua_1_2_10":{"sent":5}}}"#;
-        let page: Page = serde_json::from_str(status).unwrap();
+        let page: StatusPage = serde_json::from_str(status).unwrap();
         let body = request(&samples, &[page], 77);
         let resources = inner(&body, RESOURCE_SPANS);
         let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();

@@ -7,7 +7,7 @@ use opcua::types::{
     Array, BinaryDecodable as _, ContextOwned, Identifier, NodeClass, NodeId, QualifiedName,
     StatusCode, Variant, VariantScalarTypeId,
 };
-use plant_opcua::client::{Browse, Client, ClientConfig, ClientError, ClientUser, Link};
+use plant_opcua::client::{Browse, ClientConfig, ClientError, ClientUser, Link, OpcUaClient};
 use plant_opcua::pki;
 use tokio::time::{MissedTickBehavior, interval};
 use uadp::Fields;
@@ -15,17 +15,17 @@ use uadp::Fields;
 use super::super::text::harmless;
 use super::{ServedValue, Tally, Written, pace, value};
 use crate::arguments::Write;
-use crate::exit::Failure;
-use crate::interrupt::Interrupt;
+use crate::exit::CommandFailure;
+use crate::interrupt::SignalGuard;
 use crate::live::unix_nanos;
 
 /// Writes the value, once or at the rate of the command line. The session ends with the command, so
 /// `on_loss` of the value follows then.
-pub(super) async fn write(arguments: &Write, found: &ServedValue) -> Result<(), Failure> {
+pub(super) async fn write(arguments: &Write, found: &ServedValue) -> Result<(), CommandFailure> {
     let fields = found.described.fields();
     let encode = || {
         let block = value::encoded(&arguments.values, fields, unix_nanos());
-        block.map_err(|wrong| Failure::Usage(format!("{}: {wrong}", found.label())))
+        block.map_err(|wrong| CommandFailure::Usage(format!("{}: {wrong}", found.label())))
     };
     // A wrong value is reported before a connection is made.
     let mut block = encode()?;
@@ -33,7 +33,7 @@ pub(super) async fn write(arguments: &Write, found: &ServedValue) -> Result<(), 
     let mut pace = Pace::new(arguments)?;
     let (client, url) = tokio::select! {
         connected = connect(arguments, &found.urls) => connected?,
-        () = pace.interrupted() => return Err(Failure::Interrupted),
+        () = pace.interrupted() => return Err(CommandFailure::Interrupted),
     };
     let written = async {
         let node = node(&client, found, &url).await?;
@@ -44,7 +44,7 @@ pub(super) async fn write(arguments: &Write, found: &ServedValue) -> Result<(), 
                 block = encode()?;
             }
             let value = variant(&block).ok_or_else(|| {
-                Failure::Data(format!("{}: the value cannot be written", found.label()))
+                CommandFailure::Data(format!("{}: the value cannot be written", found.label()))
             })?;
             let outcome = tokio::select! {
                 outcome = one(&client, &node, value) => outcome,
@@ -53,7 +53,7 @@ pub(super) async fn write(arguments: &Write, found: &ServedValue) -> Result<(), 
             tally.take(at, &outcome, arguments.json)?;
         }
         match (tally.written, pace.is_interrupted) {
-            (0, true) => Err(Failure::Interrupted),
+            (0, true) => Err(CommandFailure::Interrupted),
             _ => tally.end(at, arguments.json),
         }
     };
@@ -66,12 +66,12 @@ pub(super) async fn write(arguments: &Write, found: &ServedValue) -> Result<(), 
 struct Pace {
     ticks: Option<tokio::time::Interval>,
     left: Option<u64>,
-    interrupt: Interrupt,
+    interrupt: SignalGuard,
     is_interrupted: bool,
 }
 
 impl Pace {
-    fn new(arguments: &Write) -> Result<Self, Failure> {
+    fn new(arguments: &Write) -> Result<Self, CommandFailure> {
         let (period, left) = pace(arguments);
         let ticks = period.map(|period| {
             let mut ticks = interval(period);
@@ -81,7 +81,7 @@ impl Pace {
         Ok(Self {
             ticks,
             left,
-            interrupt: Interrupt::catch()?,
+            interrupt: SignalGuard::catch()?,
             is_interrupted: false,
         })
     }
@@ -114,7 +114,10 @@ impl Pace {
 }
 
 /// Connects to the first URL that answers.
-async fn connect(arguments: &Write, urls: &[String]) -> Result<(Client, String), Failure> {
+async fn connect(
+    arguments: &Write,
+    urls: &[String],
+) -> Result<(OpcUaClient, String), CommandFailure> {
     let user = arguments.user.as_ref().map(|name| ClientUser {
         name: name.clone(),
         password: arguments.password.clone().unwrap_or_default(),
@@ -132,7 +135,7 @@ async fn connect(arguments: &Write, urls: &[String]) -> Result<(Client, String),
     };
     let mut why = "the server announced no URL of opc.tcp".to_owned();
     for url in urls {
-        let client = Client::open(config.clone(), url);
+        let client = OpcUaClient::open(config.clone(), url);
         match reached(&client).await {
             Ok(()) => return Ok((client, url.clone())),
             Err(reason) => why = format!("{}: {}", harmless(url), harmless(&reason)),
@@ -147,13 +150,13 @@ async fn connect(arguments: &Write, urls: &[String]) -> Result<(Client, String),
         None => "name a user with --user, or the certificates of a secured session with --pki"
             .to_owned(),
     };
-    Err(Failure::Unavailable(format!(
+    Err(CommandFailure::Unavailable(format!(
         "cannot write at the ua-server: {why}: nothing was sent\n  = help: {help}"
     )))
 }
 
 /// Waits for the connection; returns the first reason why there is none.
-async fn reached(client: &Client) -> Result<(), String> {
+async fn reached(client: &OpcUaClient) -> Result<(), String> {
     let mut link = client.link();
     let settled = link.wait_for(|link| !matches!(link, Link::Connecting));
     match tokio::time::timeout(CONNECT, settled).await {
@@ -168,9 +171,13 @@ async fn reached(client: &Client) -> Result<(), String> {
 }
 
 /// Returns the node of the value in the folders of the server.
-async fn node(client: &Client, found: &ServedValue, url: &str) -> Result<NodeId, Failure> {
+async fn node(
+    client: &OpcUaClient,
+    found: &ServedValue,
+    url: &str,
+) -> Result<NodeId, CommandFailure> {
     let failed = |why: String| {
-        Failure::Unavailable(format!(
+        CommandFailure::Unavailable(format!(
             "{}: the ua-server at {} does not show it: {why}: nothing was sent",
             found.label(),
             harmless(url)
@@ -241,7 +248,7 @@ fn variant(block: &[u8]) -> Option<Variant> {
     })))
 }
 
-async fn one(client: &Client, node: &NodeId, value: Variant) -> Written {
+async fn one(client: &OpcUaClient, node: &NodeId, value: Variant) -> Written {
     let mut results = client.write_each(&[(node.clone(), value)]).await;
     match results.pop() {
         Some(Ok(status) | Err(ClientError::Status(status))) => judged(status),

@@ -8,8 +8,8 @@ use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 use std::time::Duration;
 
 use bridge_node::{
-    Arguments, Arrival, Context, Delivery, Described, FailureKind, NodeSetReader, Owned, Port,
-    PortEvent, Program, TypePaths, now,
+    Arguments, ConfirmedArrival, Context, FailureKind, LocalDelivery, NodeSetReader, Owned, Port,
+    PortEvent, Program, TopicMetaData, TypePaths, now,
 };
 use bytes::Bytes;
 use mappings::{Mapping, SpaceId, TopicId, Variable};
@@ -20,12 +20,12 @@ use super::super::names::mapped;
 use super::super::text::harmless;
 use super::{Tally, Written, label, pace, value};
 use crate::arguments::Write;
-use crate::exit::Failure;
+use crate::exit::CommandFailure;
 use crate::live::unix_nanos;
 use crate::report::warn;
 
 /// Sends the value to the group by the mapping.
-pub(super) fn write(arguments: &Write, mapping: &Path) -> Result<ExitCode, Failure> {
+pub(super) fn write(arguments: &Write, mapping: &Path) -> Result<ExitCode, CommandFailure> {
     if arguments.user.is_some() {
         warn("no ua-server has the value: --user has no effect");
     }
@@ -63,7 +63,7 @@ pub(super) fn write(arguments: &Write, mapping: &Path) -> Result<ExitCode, Failu
 /// The value to write, and the outcome.
 #[derive(Debug)]
 struct Order {
-    target: crate::arguments::Target,
+    target: crate::arguments::NamedTarget,
     values: Vec<String>,
     /// The time between two values.
     period: Option<Duration>,
@@ -72,7 +72,7 @@ struct Order {
     json: bool,
     /// The topic, once the mapping is read.
     topic: OnceLock<TopicId>,
-    outcome: Mutex<Option<Result<(), Failure>>>,
+    outcome: Mutex<Option<Result<(), CommandFailure>>>,
 }
 
 static ORDER: OnceLock<Order> = OnceLock::new();
@@ -250,7 +250,7 @@ impl WritePort {
         self.finish(outcome);
     }
 
-    fn finish(&mut self, outcome: Result<(), Failure>) {
+    fn finish(&mut self, outcome: Result<(), CommandFailure>) {
         self.phase = Phase::Over;
         let mut place = self
             .order
@@ -268,7 +268,7 @@ impl WritePort {
         let payload = match self.block() {
             Ok(block) => block,
             Err(wrong) => {
-                self.finish(Err(Failure::Usage(wrong)));
+                self.finish(Err(CommandFailure::Usage(wrong)));
                 return None;
             }
         };
@@ -327,21 +327,21 @@ impl Port for WritePort {
         }
     }
 
-    fn publish(&mut self, _sample: Delivery) -> Result<(), &'static str> {
+    fn publish(&mut self, _sample: LocalDelivery) -> Result<(), &'static str> {
         // Values of other programs are not shown.
         Ok(())
     }
 
-    fn settled(&mut self, topic: TopicId, arrival: &Arrival) {
+    fn settled(&mut self, topic: TopicId, arrival: &ConfirmedArrival) {
         if topic != self.variable.topic {
             return;
         }
         let written = match arrival {
-            Arrival::Confirmed => Written::Arrived,
-            Arrival::NotSent => {
+            ConfirmedArrival::Confirmed => Written::Arrived,
+            ConfirmedArrival::NotSent => {
                 Written::Refused("the network took no message: nothing was sent".to_owned())
             }
-            Arrival::Unknown(spaces) => {
+            ConfirmedArrival::Unknown(spaces) => {
                 let spaces: Vec<String> = spaces.iter().map(ToString::to_string).collect();
                 let spaces = spaces.join(", ");
                 Written::Unknown(format!(
@@ -356,7 +356,7 @@ impl Port for WritePort {
         &mut self,
         _topic: TopicId,
         _shape: &[(BuiltinType, bool)],
-        _described: Option<&Described>,
+        _described: Option<&TopicMetaData>,
     ) {
         // Values of other programs are not shown.
     }
@@ -374,7 +374,7 @@ impl Port for WritePort {
             return;
         };
         let label = label(self.variable.topic, &self.variable.name);
-        self.finish(Err(Failure::Failed(format!(
+        self.finish(Err(CommandFailure::Failed(format!(
             "{label}: another program at {by} writes namespace {namespace} of origin 0: nothing was \
              sent\n  = help: write at its ua-server, with --server opc.tcp://HOST:PORT, or end it"
         ))));
@@ -390,7 +390,7 @@ impl Port for WritePort {
         }
         // The user interrupted the command.
         if self.sent == 0 {
-            return self.finish(Err(Failure::Interrupted));
+            return self.finish(Err(CommandFailure::Interrupted));
         }
         match (self.variable.confirmed_within, self.order.count) {
             (None, _) => self.settle(&Written::Arrived),
@@ -417,7 +417,7 @@ const MOST_SHOWN: usize = 12;
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::arguments::Target;
+    use crate::arguments::NamedTarget;
 
     const MAPPING: &str = "
 spaces: [{id: 1}]
@@ -439,7 +439,7 @@ variables:
     /// A rate has no limit of values if its number is 0.
     fn ordered(target: &str, value: &str, rate: Option<(f64, u64)>) -> &'static Order {
         Box::leak(Box::new(Order {
-            target: target.parse::<Target>().unwrap(),
+            target: target.parse::<NamedTarget>().unwrap(),
             values: vec![value.to_owned()],
             period: rate.map(|(rate, _)| Duration::from_secs_f64(1.0 / rate)),
             count: Some(rate.map_or(1, |(_, count)| count)).filter(|count| *count > 0),
@@ -456,7 +456,7 @@ variables:
         port
     }
 
-    fn outcome(order: &Order) -> Result<(), Failure> {
+    fn outcome(order: &Order) -> Result<(), CommandFailure> {
         order.outcome.lock().unwrap().take().unwrap()
     }
 
@@ -470,7 +470,7 @@ variables:
     }
 
     /// Receives events until the outcome is known.
-    async fn ended(port: &mut WritePort) -> Result<(), Failure> {
+    async fn ended(port: &mut WritePort) -> Result<(), CommandFailure> {
         let order = port.order;
         let deadline = Instant::now() + Duration::from_secs(60);
         while order.outcome.lock().unwrap().is_none() {
@@ -522,7 +522,7 @@ variables:
         // Without any answer of the Router.
         assert!(matches!(
             ended(&mut port).await,
-            Err(Failure::Unavailable(_))
+            Err(CommandFailure::Unavailable(_))
         ));
     }
 
@@ -532,10 +532,10 @@ variables:
         let mut port = port(order);
         let topic = port.variable.topic;
         sample(&mut port).await;
-        port.settled(topic, &Arrival::Confirmed);
+        port.settled(topic, &ConfirmedArrival::Confirmed);
         outcome(order).unwrap();
         // A later answer changes nothing.
-        port.settled(topic, &Arrival::Unknown(vec![SpaceId::ROS1]));
+        port.settled(topic, &ConfirmedArrival::Unknown(vec![SpaceId::ROS1]));
         assert!(order.outcome.lock().unwrap().is_none());
     }
 
@@ -545,12 +545,12 @@ variables:
         let mut port = port(order);
         let topic = port.variable.topic;
         sample(&mut port).await;
-        port.settled(topic, &Arrival::Confirmed);
+        port.settled(topic, &ConfirmedArrival::Confirmed);
         let before = Instant::now();
         sample(&mut port).await;
         sample(&mut port).await;
         assert!(before.elapsed() >= Duration::from_millis(190));
-        port.settled(topic, &Arrival::Confirmed);
+        port.settled(topic, &ConfirmedArrival::Confirmed);
         let wrong = outcome(order).unwrap_err().to_string();
         assert!(
             wrong.contains("1 of 3 values: a newer value replaced it"),
@@ -566,14 +566,14 @@ variables:
             let topic = port.variable.topic;
             sample(&mut port).await;
             if is_confirmed {
-                port.settled(topic, &Arrival::Confirmed);
+                port.settled(topic, &ConfirmedArrival::Confirmed);
                 sample(&mut port).await;
             }
             port.shutdown().await;
             let ended = outcome(order);
             assert_eq!(ended.is_ok(), is_confirmed, "{ended:?}");
             assert!(
-                matches!(ended, Ok(()) | Err(Failure::Unavailable(_))),
+                matches!(ended, Ok(()) | Err(CommandFailure::Unavailable(_))),
                 "{ended:?}"
             );
         }
@@ -592,7 +592,7 @@ variables:
         assert!(order.outcome.lock().unwrap().is_none());
         port.taken(2, other);
         assert_eq!(port.phase, Phase::Over, "it is sent");
-        assert!(matches!(outcome(order), Err(Failure::Failed(_))));
+        assert!(matches!(outcome(order), Err(CommandFailure::Failed(_))));
     }
 
     #[tokio::test]

@@ -1,12 +1,12 @@
 //! The typed value of a command line.
 
 use mappings::Variable;
-use messages::Rank;
+use messages::ArrayRank;
 use serde_json::Value;
 use uadp::{BuiltinType, Timestamp};
 
 use super::super::call::words;
-use super::super::described::{Field, Meaning};
+use super::super::described::{AnnouncedField, FieldMeaning};
 use super::super::parameters;
 use crate::iso_time;
 
@@ -15,7 +15,11 @@ use crate::iso_time;
 ///
 /// # Errors
 /// The reason why the value does not fit the fields.
-pub(super) fn encoded(given: &[String], fields: &[Field], now: i128) -> Result<Vec<u8>, String> {
+pub(super) fn encoded(
+    given: &[String],
+    fields: &[AnnouncedField],
+    now: i128,
+) -> Result<Vec<u8>, String> {
     let words = match (fields, given) {
         ([], _) => return Err("its type is not known".to_owned()),
         ([only], [text]) => vec![single(text, only)],
@@ -32,7 +36,7 @@ pub(super) fn encoded(given: &[String], fields: &[Field], now: i128) -> Result<V
 }
 
 /// Returns the only field as `name=value`.
-fn single(text: &str, field: &Field) -> String {
+fn single(text: &str, field: &AnnouncedField) -> String {
     let name = &field.name;
     let own = format!("{name}=");
     let text = if name.is_empty() {
@@ -52,13 +56,13 @@ fn single(text: &str, field: &Field) -> String {
 
 /// Returns the parts of a message as `name=value`. Missing parts are zero, and a missing stamp is
 /// `now`.
-fn parts(given: &[String], fields: &[Field], now: i128) -> Result<Vec<String>, String> {
+fn parts(given: &[String], fields: &[AnnouncedField], now: i128) -> Result<Vec<String>, String> {
     let mut words = words::message(given, fields, false)?;
     let has = |name: &str| {
         let mut names = words.iter().filter_map(|word| word.split_once('='));
         names.any(|(of, _)| of == name)
     };
-    let is_stamp = |field: &&Field| {
+    let is_stamp = |field: &&AnnouncedField| {
         field.name == STAMP && field.builtin == Some(BuiltinType::DateTime) && !field.is_array()
     };
     if fields.iter().any(|field| is_stamp(&field)) && !has(STAMP) {
@@ -69,7 +73,7 @@ fn parts(given: &[String], fields: &[Field], now: i128) -> Result<Vec<String>, S
 }
 
 /// Checks the numbers of fields with a range.
-fn in_range(words: &[String], fields: &[Field]) -> Result<(), String> {
+fn in_range(words: &[String], fields: &[AnnouncedField]) -> Result<(), String> {
     for word in words {
         let Some((name, text)) = word.split_once('=') else {
             continue;
@@ -88,22 +92,22 @@ fn in_range(words: &[String], fields: &[Field]) -> Result<(), String> {
 }
 
 /// Returns the fields of a variable of a mapping; empty if its type is not known.
-pub(super) fn fields_of(variable: &Variable) -> Vec<Field> {
+pub(super) fn fields_of(variable: &Variable) -> Vec<AnnouncedField> {
     if let Some((builtin, is_array)) = variable.value_type {
-        let only = Field::plain(&variable.name, builtin, is_array.then_some(0));
+        let only = AnnouncedField::plain(&variable.name, builtin, is_array.then_some(0));
         let range = variable.meaning.range();
-        let meaning = Meaning {
+        let meaning = FieldMeaning {
             range,
-            ..Meaning::default()
+            ..FieldMeaning::default()
         };
-        return vec![Field { meaning, ..only }];
+        return vec![AnnouncedField { meaning, ..only }];
     }
     let fields = variable.fields.iter().map(|leaf| {
         let size = match leaf.rank {
-            Rank::Scalar => None,
-            Rank::Array { fixed } => Some(fixed.unwrap_or_default()),
+            ArrayRank::Scalar => None,
+            ArrayRank::Array { fixed } => Some(fixed.unwrap_or_default()),
         };
-        Field::plain(&leaf.path, leaf.builtin, size)
+        AnnouncedField::plain(&leaf.path, leaf.builtin, size)
     });
     fields.collect()
 }
@@ -118,7 +122,7 @@ mod tests {
     use super::*;
     use crate::live::plain;
 
-    fn of(given: &[&str], fields: &[Field]) -> Result<Vec<Value>, String> {
+    fn of(given: &[&str], fields: &[AnnouncedField]) -> Result<Vec<Value>, String> {
         let given: Vec<String> = given.iter().map(|word| (*word).to_owned()).collect();
         let block = encoded(&given, fields, 1_700_000_000_123_456_789)?;
         let values = Fields::parse(&block).unwrap().map(Result::unwrap);
@@ -129,14 +133,18 @@ mod tests {
 
     #[test]
     fn a_single_value_needs_no_name_and_has_the_type_of_its_field() {
-        let speed = [Field::plain("Line.Speed", BuiltinType::Double, None)];
+        let speed = [AnnouncedField::plain(
+            "Line.Speed",
+            BuiltinType::Double,
+            None,
+        )];
         assert_eq!(of(&["1"], &speed).unwrap(), [1.0]);
         assert_eq!(of(&["-0.5"], &speed).unwrap(), [-0.5]);
         assert_eq!(of(&["Line.Speed=2"], &speed).unwrap(), [2.0]);
-        let text = [Field::plain("Text", BuiltinType::String, None)];
+        let text = [AnnouncedField::plain("Text", BuiltinType::String, None)];
         assert_eq!(of(&["a=b {c}"], &text).unwrap(), ["a=b {c}"]);
         assert_eq!(of(&[r#""1""#], &text).unwrap(), ["1"]);
-        let list = [Field::plain("Joints", BuiltinType::Float, Some(2))];
+        let list = [AnnouncedField::plain("Joints", BuiltinType::Float, Some(2))];
         assert_eq!(
             of(&["[1, 2.5]"], &list).unwrap(),
             [serde_json::json!([1.0, 2.5])]
@@ -159,9 +167,9 @@ mod tests {
     #[test]
     fn parts_of_a_message_are_given_by_path_or_as_a_map_and_others_are_zero() {
         let twist = [
-            Field::plain("header.stamp", BuiltinType::DateTime, None),
-            Field::plain("twist.linear.x", BuiltinType::Double, None),
-            Field::plain("twist.angular.z", BuiltinType::Double, None),
+            AnnouncedField::plain("header.stamp", BuiltinType::DateTime, None),
+            AnnouncedField::plain("twist.linear.x", BuiltinType::Double, None),
+            AnnouncedField::plain("twist.angular.z", BuiltinType::Double, None),
         ];
         let stamp = "2023-11-14T22:13:20.1234567Z";
         let wanted = [Value::from(stamp), 0.5.into(), 0.0.into()];
@@ -182,12 +190,12 @@ mod tests {
 
     #[test]
     fn numbers_out_of_the_range_are_refused() {
-        let mut speed = Field::plain("Speed", BuiltinType::Double, None);
+        let mut speed = AnnouncedField::plain("Speed", BuiltinType::Double, None);
         speed.meaning.range = Some((0.0, 2.0));
         assert!(of(&["2"], std::slice::from_ref(&speed)).is_ok());
         let wrong = of(&["2.5"], std::slice::from_ref(&speed)).unwrap_err();
         assert_eq!(wrong, "2.5 is out of the range 0 to 2");
-        let mut list = Field::plain("Joints", BuiltinType::Double, Some(2));
+        let mut list = AnnouncedField::plain("Joints", BuiltinType::Double, Some(2));
         list.meaning.range = Some((0.0, 2.0));
         assert!(of(&["[1, -1]"], &[list]).is_err());
     }

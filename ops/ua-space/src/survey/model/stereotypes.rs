@@ -3,11 +3,12 @@
 use std::collections::{BTreeMap, HashMap};
 
 use mappings::{CallKind, NamespaceText, SpaceId, nearest};
-use messages::{Dialect, Rank, Registry, TypeName};
+use messages::{ArrayRank, Dialect, TypeName, TypeRegistry};
 use uadp::BuiltinType;
 
 use super::{
-    Applied, Element, ElementKind, Finding, Model, ModelCall, ModelTopic, ModelValue, Tag, shown,
+    Applied, Element, ElementKind, Finding, ModelCall, ModelTopic, ModelValue, NodeModel, Tag,
+    shown,
 };
 
 /// A stereotype with its elements and values.
@@ -86,15 +87,15 @@ const STEREOTYPES: [Stereotype; 8] = [
 ];
 
 /// Returns the values and calls of the elements, and the findings.
-pub(super) fn interpret(elements: &[Element]) -> (Model, Vec<Finding>) {
+pub(super) fn interpret(elements: &[Element]) -> (NodeModel, Vec<Finding>) {
     let mut reader = Reader {
-        model: Model::default(),
+        model: NodeModel::default(),
         findings: Vec::new(),
         domains: BTreeMap::new(),
         names: HashMap::new(),
         registries: [
-            Registry::bundle(Dialect::Ros1),
-            Registry::bundle(Dialect::Ros2),
+            TypeRegistry::bundle(Dialect::Ros1),
+            TypeRegistry::bundle(Dialect::Ros2),
         ],
     };
     for element in elements {
@@ -107,14 +108,14 @@ pub(super) fn interpret(elements: &[Element]) -> (Model, Vec<Finding>) {
 }
 
 struct Reader {
-    model: Model,
+    model: NodeModel,
     findings: Vec<Finding>,
     /// The domain of each ROS 2 space, and the line that gives it.
     domains: BTreeMap<SpaceId, (u16, usize)>,
     /// The lines of the used ROS names: the space, the kind and the name.
     names: HashMap<(SpaceId, &'static str, String), usize>,
     /// The built-in definitions of ROS 1 and of ROS 2.
-    registries: [Registry; 2],
+    registries: [TypeRegistry; 2],
 }
 
 /// The type of the values of a topic: `None` if it is unknown here or is a whole message.
@@ -367,14 +368,14 @@ impl Reader {
         let leaves = known.leaves();
         let Some(field) = field else {
             return match leaves {
-                [one] => Some((one.builtin, matches!(one.rank, Rank::Array { .. }))),
+                [one] => Some((one.builtin, matches!(one.rank, ArrayRank::Array { .. }))),
                 _ => None,
             };
         };
         let path = field.value.as_str();
         let same = leaves.iter().find(|leaf| leaf.path == path);
         if let Some(leaf) = same {
-            return Some((leaf.builtin, matches!(leaf.rank, Rank::Array { .. })));
+            return Some((leaf.builtin, matches!(leaf.rank, ArrayRank::Array { .. })));
         }
         // Parts of arrays, and messages in messages, are checked with the mapping.
         let begins = |leaf: &str| {

@@ -12,7 +12,7 @@ fn findings(content: &str) -> Vec<String> {
     findings.iter().map(ToString::to_string).collect()
 }
 
-fn model(content: &str) -> Model {
+fn model(content: &str) -> NodeModel {
     parse(content).unwrap_or_else(|findings| panic!("{}", report("model", &findings)))
 }
 

@@ -6,7 +6,7 @@ use crate::ur::REACH;
 use crate::ur::pose::{Quaternion, angle, between, of_vector, to_vector};
 
 #[derive(Debug, Clone)]
-pub(super) struct Motion {
+pub(super) struct SimulatedMotion {
     from: [f64; 6],
     to: [f64; 6],
     turn: (Quaternion, Quaternion),
@@ -22,7 +22,7 @@ pub(super) struct Motion {
     stops: bool,
 }
 
-impl Motion {
+impl SimulatedMotion {
     pub(super) fn new(from: [f64; 6], to: [f64; 6], most: f64, acceleration: f64) -> Self {
         let [x, y, z, rx, ry, rz] = from;
         let [tx, ty, tz, trx, try_, trz] = to;
@@ -140,7 +140,7 @@ mod tests {
     #[test]
     fn it_takes_the_time_of_a_trapezoid_and_is_never_faster_than_it_was_told() {
         let to = [0.5, 0.0, 0.0, 0.0, 0.0, 0.0];
-        let mut motion = Motion::new([0.0; 6], to, 0.25, 1.0);
+        let mut motion = SimulatedMotion::new([0.0; 6], to, 0.25, 1.0);
         let mut steps = 0;
         while !motion.step(0.002) {
             steps += 1;
@@ -155,7 +155,7 @@ mod tests {
 
     #[test]
     fn one_that_is_interrupted_brakes_on_its_way() {
-        let mut motion = Motion::new([0.0; 6], [0.5, 0.0, 0.0, 0.0, 0.0, 0.0], 0.3, 1.0);
+        let mut motion = SimulatedMotion::new([0.0; 6], [0.5, 0.0, 0.0, 0.0, 0.0, 0.0], 0.3, 1.0);
         for _ in 0..300 {
             assert!(!motion.step(0.002));
         }

@@ -14,23 +14,23 @@ use tokio::time::{MissedTickBehavior, interval};
 use tracing::debug;
 
 use super::super::script::programs;
-use super::super::wire::{Kind, Type, VERSION, Value, chunk, next, package};
-use super::{Simulator, variables};
+use super::super::wire::{RecipeType, RecipeValue, Type, VERSION, chunk, next, package};
+use super::{UrSimulator, variables};
 
 /// A robot that is served, until it is dropped.
 #[derive(Debug)]
-pub struct Serving {
+pub struct ServedRobot {
     rtde: SocketAddr,
     secondary: SocketAddr,
     _tasks: JoinSet<()>,
 }
 
-impl Serving {
+impl ServedRobot {
     /// Serves a robot; port 0 selects a free port. Needs a tokio runtime.
     ///
     /// # Errors
     /// Fails if an address cannot be used.
-    pub async fn start(simulator: &Simulator, rtde: &str, secondary: &str) -> io::Result<Self> {
+    pub async fn start(simulator: &UrSimulator, rtde: &str, secondary: &str) -> io::Result<Self> {
         let (told, programs) = (
             TcpListener::bind(rtde).await?,
             TcpListener::bind(secondary).await?,
@@ -63,7 +63,7 @@ impl Serving {
 /// Inputs that belong to a client and are refused to all other clients.
 type Taken = Arc<Mutex<Vec<String>>>;
 
-async fn accept(listener: TcpListener, simulator: Simulator, taken: Option<Taken>) {
+async fn accept(listener: TcpListener, simulator: UrSimulator, taken: Option<Taken>) {
     let mut clients = JoinSet::new();
     loop {
         let Ok((stream, from)) = listener.accept().await else {
@@ -86,7 +86,7 @@ async fn accept(listener: TcpListener, simulator: Simulator, taken: Option<Taken
     }
 }
 
-async fn serve(stream: TcpStream, simulator: &Simulator, taken: Option<Taken>) -> io::Result<()> {
+async fn serve(stream: TcpStream, simulator: &UrSimulator, taken: Option<Taken>) -> io::Result<()> {
     stream.set_nodelay(true)?;
     match taken {
         Some(taken) => Client::new(simulator, taken).serve(stream).await,
@@ -94,7 +94,7 @@ async fn serve(stream: TcpStream, simulator: &Simulator, taken: Option<Taken>) -
     }
 }
 
-async fn switched_off(simulator: &Simulator, life: u32) {
+async fn switched_off(simulator: &UrSimulator, life: u32) {
     let mut looks = interval(LATER);
     while simulator.lock().life == life {
         looks.tick().await;
@@ -102,7 +102,7 @@ async fn switched_off(simulator: &Simulator, life: u32) {
 }
 
 /// Accepts programs, and sends the state of the robot ten times a second.
-async fn secondary(stream: TcpStream, simulator: &Simulator) -> io::Result<()> {
+async fn secondary(stream: TcpStream, simulator: &UrSimulator) -> io::Result<()> {
     let (mut reads, mut writes) = stream.into_split();
     let mut ticks = interval(Duration::from_millis(100));
     ticks.set_missed_tick_behavior(MissedTickBehavior::Skip);
@@ -135,7 +135,7 @@ async fn secondary(stream: TcpStream, simulator: &Simulator) -> io::Result<()> {
     }
 }
 
-impl Simulator {
+impl UrSimulator {
     /// Returns a robot state message of type 16: mode and tool position. Returns `None` while the
     /// robot is silent.
     fn state_message(&self) -> Option<Vec<u8>> {
@@ -175,19 +175,19 @@ impl Simulator {
 
 /// A client of RTDE.
 struct Client<'s> {
-    simulator: &'s Simulator,
+    simulator: &'s UrSimulator,
     taken: Taken,
     /// The inputs of the client.
     has: Vec<String>,
-    outputs: Vec<(String, Kind)>,
+    outputs: Vec<(String, RecipeType)>,
     /// Its recipes of inputs; the number of a recipe is its index plus 1.
-    inputs: Vec<Vec<(String, Kind)>>,
+    inputs: Vec<Vec<(String, RecipeType)>>,
     hertz: f64,
     started: bool,
 }
 
 impl<'s> Client<'s> {
-    fn new(simulator: &'s Simulator, taken: Taken) -> Self {
+    fn new(simulator: &'s UrSimulator, taken: Taken) -> Self {
         Self {
             simulator,
             taken,
@@ -277,12 +277,12 @@ impl<'s> Client<'s> {
     }
 
     fn outputs_agreed(&mut self, names: &str) -> Vec<u8> {
-        let found: Vec<(&str, Option<Kind>)> = listed(names)
+        let found: Vec<(&str, Option<RecipeType>)> = listed(names)
             .map(|name| (name, variables::output(name)))
             .collect();
         let mut answer = vec![1];
         answer.extend(kinds(&found).bytes());
-        let all: Option<Vec<(String, Kind)>> = found
+        let all: Option<Vec<(String, RecipeType)>> = found
             .into_iter()
             .map(|(name, kind)| Some((name.to_owned(), kind?)))
             .collect();
@@ -329,7 +329,7 @@ impl<'s> Client<'s> {
             let place = usize::from(number).checked_sub(1)?;
             self.inputs.get(place)
         });
-        let values: Option<Vec<(String, Value)>> = recipe.and_then(|recipe| {
+        let values: Option<Vec<(String, RecipeValue)>> = recipe.and_then(|recipe| {
             recipe
                 .iter()
                 .map(|(name, kind)| Some((name.clone(), kind.take(&mut fields)?)))
@@ -353,10 +353,10 @@ fn listed(names: &str) -> impl Iterator<Item = &str> {
     names.strip_suffix(',').unwrap_or(names).split(',')
 }
 
-fn kinds(found: &[(&str, Option<Kind>)]) -> String {
+fn kinds(found: &[(&str, Option<RecipeType>)]) -> String {
     let names: Vec<&str> = found
         .iter()
-        .map(|(_, kind)| kind.map_or("NOT_FOUND", Kind::name))
+        .map(|(_, kind)| kind.map_or("NOT_FOUND", RecipeType::name))
         .collect();
     names.join(",")
 }

@@ -1,25 +1,25 @@
 //! The outputs and inputs of the robot over RTDE, by name and type, as listed in the guide of the
 //! manufacturer.
 
-use super::super::wire::{Kind, Value};
-use super::{Robot, Simulator};
+use super::super::wire::{RecipeType, RecipeValue};
+use super::{Robot, UrSimulator};
 
 /// Returns the type of an output.
-pub(super) fn output(name: &str) -> Option<Kind> {
+pub(super) fn output(name: &str) -> Option<RecipeType> {
     if let Some(kind) = register(name, "output_") {
         return Some(kind);
     }
     let of = |names: &[&str]| names.contains(&name);
     if of(&VECTORS) {
-        Some(Kind::Vector)
+        Some(RecipeType::Vector)
     } else if of(&DOUBLES) {
-        Some(Kind::F64)
+        Some(RecipeType::F64)
     } else if of(&["robot_mode", "safety_mode", "tool_mode"]) {
-        Some(Kind::I32)
+        Some(RecipeType::I32)
     } else if of(&["actual_tool_accelerometer", "payload_cog"]) {
-        Some(Kind::Triple)
+        Some(RecipeType::Triple)
     } else if of(&["joint_mode"]) {
-        Some(Kind::Whole)
+        Some(RecipeType::Whole)
     } else if of(&[
         "runtime_state",
         "robot_status_bits",
@@ -27,23 +27,23 @@ pub(super) fn output(name: &str) -> Option<Kind> {
         "safety_status",
         "analog_io_types",
     ]) {
-        Some(Kind::U32)
+        Some(RecipeType::U32)
     } else if of(&["actual_digital_input_bits", "actual_digital_output_bits"]) {
-        Some(Kind::U64)
+        Some(RecipeType::U64)
     } else {
         None
     }
 }
 
 /// Returns the type of an input.
-pub(super) fn input(name: &str) -> Option<Kind> {
+pub(super) fn input(name: &str) -> Option<RecipeType> {
     if let Some(kind) = register(name, "input_") {
         return Some(kind);
     }
     match name {
-        "speed_slider_mask" => Some(Kind::U32),
+        "speed_slider_mask" => Some(RecipeType::U32),
         "speed_slider_fraction" | "standard_analog_output_0" | "standard_analog_output_1" => {
-            Some(Kind::F64)
+            Some(RecipeType::F64)
         }
         "standard_digital_output_mask"
         | "standard_digital_output"
@@ -52,38 +52,38 @@ pub(super) fn input(name: &str) -> Option<Kind> {
         | "tool_digital_output_mask"
         | "tool_digital_output"
         | "standard_analog_output_mask"
-        | "standard_analog_output_type" => Some(Kind::U8),
-        "external_force_torque" => Some(Kind::Vector),
+        | "standard_analog_output_type" => Some(RecipeType::U8),
+        "external_force_torque" => Some(RecipeType::Vector),
         _ => None,
     }
 }
 
 /// Returns the type of a general purpose register: 48 integers, 48 doubles, 64 bits in two words
 /// and from 64 on single bits.
-fn register(name: &str, direction: &str) -> Option<Kind> {
+fn register(name: &str, direction: &str) -> Option<RecipeType> {
     let rest = name.strip_prefix(direction)?;
     if rest == "bit_registers0_to_31" || rest == "bit_registers32_to_63" {
-        return Some(Kind::U32);
+        return Some(RecipeType::U32);
     }
     let (of, number) = rest.rsplit_once('_')?;
     let number: u8 = number.parse().ok()?;
     match of {
-        "int_register" if number < 48 => Some(Kind::I32),
-        "double_register" if number < 48 => Some(Kind::F64),
-        "bit_register" if (64..128).contains(&number) => Some(Kind::Bool),
+        "int_register" if number < 48 => Some(RecipeType::I32),
+        "double_register" if number < 48 => Some(RecipeType::F64),
+        "bit_register" if (64..128).contains(&number) => Some(RecipeType::Bool),
         _ => None,
     }
 }
 
 impl Robot {
     /// Returns the current value of an output; outputs that are not simulated are zero.
-    pub(super) fn tells(&self, name: &str, kind: Kind) -> Value {
+    pub(super) fn tells(&self, name: &str, kind: RecipeType) -> RecipeValue {
         let number = name.strip_prefix("output_int_register_");
         if let Some(register) = number
             .and_then(|number| number.parse::<usize>().ok())
             .and_then(|number| self.registers.get(number))
         {
-            return Value::I32(*register);
+            return RecipeValue::I32(*register);
         }
         let runs = self.program.is_some() && !self.paused;
         // 1: no program; 2: the program runs; 4: the program is paused.
@@ -93,32 +93,34 @@ impl Robot {
             (Some(_), true) => 4,
         };
         match name {
-            "timestamp" => Value::F64(self.seen.duration_since(self.switched_on).as_secs_f64()),
-            "actual_TCP_pose" | "target_TCP_pose" => Value::Vector(self.pose),
-            "actual_q" | "target_q" => Value::Vector(self.joints),
-            "actual_TCP_speed" | "target_TCP_speed" => Value::Vector(self.velocity()),
-            "actual_TCP_force" => Value::Vector(self.force()),
-            "robot_mode" => Value::I32(self.mode()),
-            "safety_mode" => Value::I32(self.safety),
-            "runtime_state" => Value::U32(runtime),
+            "timestamp" => {
+                RecipeValue::F64(self.seen.duration_since(self.switched_on).as_secs_f64())
+            }
+            "actual_TCP_pose" | "target_TCP_pose" => RecipeValue::Vector(self.pose),
+            "actual_q" | "target_q" => RecipeValue::Vector(self.joints),
+            "actual_TCP_speed" | "target_TCP_speed" => RecipeValue::Vector(self.velocity()),
+            "actual_TCP_force" => RecipeValue::Vector(self.force()),
+            "robot_mode" => RecipeValue::I32(self.mode()),
+            "safety_mode" => RecipeValue::I32(self.safety),
+            "runtime_state" => RecipeValue::U32(runtime),
             // Power is on; a program runs.
-            "robot_status_bits" => Value::U32(1 | u32::from(runs) << 1),
-            "safety_status_bits" => Value::U32(if self.safety == 1 { 1 } else { 1 << 2 }),
-            "safety_status" => Value::U32(u32::try_from(self.safety).unwrap_or_default()),
-            "speed_scaling" | "target_speed_fraction" => Value::F64(self.slider),
-            "actual_main_voltage" => Value::F64(230.0),
-            "actual_robot_voltage" => Value::F64(48.0),
+            "robot_status_bits" => RecipeValue::U32(1 | u32::from(runs) << 1),
+            "safety_status_bits" => RecipeValue::U32(if self.safety == 1 { 1 } else { 1 << 2 }),
+            "safety_status" => RecipeValue::U32(u32::try_from(self.safety).unwrap_or_default()),
+            "speed_scaling" | "target_speed_fraction" => RecipeValue::F64(self.slider),
+            "actual_main_voltage" => RecipeValue::F64(230.0),
+            "actual_robot_voltage" => RecipeValue::F64(48.0),
             _ => kind.zero(),
         }
     }
 }
 
-impl Simulator {
+impl UrSimulator {
     /// Applies inputs in the order of a client's recipe.
-    pub(super) fn told(&self, values: &[(String, Value)]) {
+    pub(super) fn told(&self, values: &[(String, RecipeValue)]) {
         let named = |wanted: &str| values.iter().find(|(name, _)| name == wanted);
         let mask = named("speed_slider_mask").map(|(_, value)| *value);
-        if let (Some(Value::U32(1)), Some((_, Value::F64(fraction)))) =
+        if let (Some(RecipeValue::U32(1)), Some((_, RecipeValue::F64(fraction)))) =
             (mask, named("speed_slider_fraction"))
             && fraction.is_finite()
         {

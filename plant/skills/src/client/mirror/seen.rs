@@ -5,7 +5,7 @@ use std::sync::{Arc, Mutex};
 use std::time::{Duration, SystemTime};
 
 use plant_opcua::types::{DataValue, Variant};
-use program::{Method, State, Transition};
+use program::{ProgramMachineState, ProgramMethod, Transition};
 use tokio::sync::{mpsc, watch};
 use tokio::time::{Instant, sleep, sleep_until};
 use tracing::debug;
@@ -14,25 +14,27 @@ use super::super::handle::{SkillHandle, state_in};
 use super::{Order, leads_to, way};
 use crate::parameters::Parameters;
 use crate::runs::SkillFault;
-use crate::shown::{Diagnostic, Observer, Outcome, Shown, Told, Transitioned};
+use crate::shown::{
+    ProgramDiagnostic, RunOutcome, SkillEvent, SkillObserver, SkillSnapshot, Transitioned,
+};
 use crate::skill::lock;
-use crate::value::Value;
+use crate::value::SkillValue;
 use crate::variant::from_variant;
 
 /// The aspect of a skill that a variable holds.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Part {
+pub(super) enum SkillAspect {
     State,
     Progress,
     Step,
 }
 
-pub(super) struct Seen {
+pub(super) struct SeenSkill {
     handle: SkillHandle,
-    observers: Vec<Box<dyn Observer>>,
-    outcomes: Arc<Mutex<VecDeque<Arc<Outcome>>>>,
-    shown: watch::Sender<Arc<Shown>>,
-    now: Shown,
+    observers: Vec<Box<dyn SkillObserver>>,
+    outcomes: Arc<Mutex<VecDeque<Arc<RunOutcome>>>>,
+    shown: watch::Sender<Arc<SkillSnapshot>>,
+    now: SkillSnapshot,
     next_run: u32,
     /// Time at which the server entered the shown state, by its clock. Older notifications are
     /// ignored.
@@ -43,18 +45,18 @@ pub(super) struct Seen {
     look_at: Instant,
 }
 
-type Outcomes = Arc<Mutex<VecDeque<Arc<Outcome>>>>;
+type Outcomes = Arc<Mutex<VecDeque<Arc<RunOutcome>>>>;
 
-impl Seen {
+impl SeenSkill {
     pub(super) fn new(
         handle: SkillHandle,
-        observers: Vec<Box<dyn Observer>>,
+        observers: Vec<Box<dyn SkillObserver>>,
         outcomes: Outcomes,
         first_run: u32,
-    ) -> (Self, watch::Receiver<Arc<Shown>>) {
+    ) -> (Self, watch::Receiver<Arc<SkillSnapshot>>) {
         let created = clock();
-        let now = Shown {
-            state: State::Halted,
+        let now = SkillSnapshot {
+            state: ProgramMachineState::Halted,
             last: None,
             since: created,
             run: 0,
@@ -62,7 +64,7 @@ impl Seen {
             step: String::new(),
             parameters: Arc::default(),
             outcome: None,
-            diagnostic: Diagnostic {
+            diagnostic: ProgramDiagnostic {
                 created,
                 last_call: None,
             },
@@ -88,7 +90,7 @@ impl Seen {
     /// Reports events until the connection is lost.
     pub(super) async fn run(
         mut self,
-        mut notices: mpsc::Receiver<(Part, DataValue)>,
+        mut notices: mpsc::Receiver<(SkillAspect, DataValue)>,
         mut orders: mpsc::Receiver<Order>,
         mut gone: watch::Receiver<Option<String>>,
     ) {
@@ -134,7 +136,7 @@ impl Seen {
                         (0, true) => self.number(),
                         (run, _) => run,
                     };
-                    self.tell(Told::Step);
+                    self.tell(SkillEvent::Step);
                     return;
                 }
                 Err(fault) => debug!("a skill does not say how it is: {fault}"),
@@ -152,28 +154,28 @@ impl Seen {
         }
     }
 
-    async fn take(&mut self, part: Part, value: &DataValue) {
+    async fn take(&mut self, part: SkillAspect, value: &DataValue) {
         let Some(said) = &value.value else {
             return;
         };
         match part {
-            Part::State => self.state(said, value).await,
-            Part::Progress => {
+            SkillAspect::State => self.state(said, value).await,
+            SkillAspect::Progress => {
                 let progress = from_variant(said).and_then(|value| value.as_f64());
                 if let Some(progress) = progress.filter(|progress| !progress.is_nan()) {
                     // Between 0 and 1, so the conversion is safe.
                     #[expect(clippy::cast_possible_truncation, reason = "a share of 1")]
                     let progress = progress.clamp(0.0, 1.0) as f32;
                     self.now.progress = progress;
-                    self.tell(Told::Progress);
+                    self.tell(SkillEvent::Progress);
                 }
             }
-            Part::Step => {
-                if let Some(Value::String(step)) = from_variant(said)
+            SkillAspect::Step => {
+                if let Some(SkillValue::String(step)) = from_variant(said)
                     && step != self.now.step
                 {
                     self.now.step = step;
-                    self.tell(Told::Step);
+                    self.tell(SkillEvent::Step);
                 }
             }
         }
@@ -216,14 +218,14 @@ impl Seen {
         let _told = reply.send(called);
         if begun {
             // Observers that read the state after the reply are notified too.
-            self.tell(Told::Step);
+            self.tell(SkillEvent::Step);
         }
     }
 
     async fn call(
         &mut self,
-        method: Method,
-        parameters: Vec<(String, Value)>,
+        method: ProgramMethod,
+        parameters: Vec<(String, SkillValue)>,
     ) -> Result<u32, SkillFault> {
         // The state machine is checked here, because some servers accept invalid calls, for example
         // Start of a suspended skill.
@@ -235,7 +237,7 @@ impl Seen {
                 text: format!("{method} is not possible in the state {from}"),
             });
         };
-        if method == Method::Start {
+        if method == ProgramMethod::Start {
             self.handle.start(parameters).await?;
             self.look_at = Instant::now() + LOOK;
             // The server may show the state before or after its response.
@@ -260,14 +262,15 @@ impl Seen {
     }
 
     /// Reports all transitions between the shown state and this state.
-    async fn go(&mut self, to: State) {
+    async fn go(&mut self, to: ProgramMachineState) {
         for transition in way(self.now.state, to) {
             self.pass(transition).await;
         }
     }
 
     async fn pass(&mut self, transition: &'static Transition) {
-        let begins = (transition.from, transition.to) == (State::Ready, State::Running);
+        let begins = (transition.from, transition.to)
+            == (ProgramMachineState::Ready, ProgramMachineState::Running);
         let ends = is_work(transition.from) && !is_work(transition.to);
         let mut message = String::new();
         if begins {
@@ -279,7 +282,7 @@ impl Seen {
             };
             let parameters = Arc::new(Parameters::shown(self.handle.parameters().await));
             self.now.parameters = Arc::clone(&parameters);
-            self.tell(Told::Parameters(&parameters));
+            self.tell(SkillEvent::Parameters(&parameters));
         }
         if ends {
             let outcome = Arc::new(self.ended(transition.to).await);
@@ -291,7 +294,7 @@ impl Seen {
             }
             drop(outcomes);
             self.now.outcome = Some(Arc::clone(&outcome));
-            self.tell(Told::Outcome(&outcome));
+            self.tell(SkillEvent::Outcome(&outcome));
         }
         self.now.state = transition.to;
         self.now.last = Some(transition);
@@ -302,15 +305,15 @@ impl Seen {
             message,
             at: self.now.since,
         };
-        self.tell(Told::Transition(&happened));
+        self.tell(SkillEvent::Transition(&happened));
     }
 
     /// Reads the outcome of the run that the server left for this state.
-    async fn ended(&self, state: State) -> Outcome {
+    async fn ended(&self, state: ProgramMachineState) -> RunOutcome {
         let run = self.now.run;
         let numbered = if self.handle.numbers_runs() { run } else { 0 };
         let outcome = self.handle.outcome(numbered, state).await;
-        let mut outcome = outcome.unwrap_or_else(|fault| Outcome {
+        let mut outcome = outcome.unwrap_or_else(|fault| RunOutcome {
             run,
             succeeded: false,
             unknown: true,
@@ -332,7 +335,7 @@ impl Seen {
         number
     }
 
-    fn tell(&self, what: Told<'_>) {
+    fn tell(&self, what: SkillEvent<'_>) {
         self.shown.send_replace(Arc::new(self.now.clone()));
         for observer in &self.observers {
             observer.told(what, &self.now);
@@ -340,8 +343,11 @@ impl Seen {
     }
 }
 
-fn is_work(state: State) -> bool {
-    matches!(state, State::Running | State::Suspended)
+fn is_work(state: ProgramMachineState) -> bool {
+    matches!(
+        state,
+        ProgramMachineState::Running | ProgramMachineState::Suspended
+    )
 }
 
 #[expect(

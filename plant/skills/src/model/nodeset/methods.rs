@@ -3,7 +3,7 @@
 use super::{Node, Nodes, PROPERTY_TYPE, Rule, TYPES_NAMESPACE, escaped};
 
 /// A method that a type declares.
-pub(super) struct Method {
+pub(super) struct DeclaredMethod {
     /// Offset from the identifier of its type; the identifiers of its properties follow.
     offset: u32,
     browse_name: &'static str,
@@ -45,8 +45,8 @@ const BASE_DATA_TYPE: u32 = 24;
 const DURATION: u32 = 290;
 
 /// The methods of a skill beside the methods of a Program.
-pub(super) const OF_A_SKILL: [Method; 2] = [
-    Method {
+pub(super) const OF_A_SKILL: [DeclaredMethod; 2] = [
+    DeclaredMethod {
         offset: 60,
         browse_name: "1:Execute",
         about: "Begins a run with these parameters at once, whatever was written before; one that is Halted is made ready first.",
@@ -65,7 +65,7 @@ pub(super) const OF_A_SKILL: [Method; 2] = [
             "By which ReadOutcome tells how it ended.",
         )],
     },
-    Method {
+    DeclaredMethod {
         offset: 63,
         browse_name: "1:ReadOutcome",
         about: "How a run ended, whoever asks, and whoever began it. BadNotFound for a run of which nothing is known.",
@@ -91,7 +91,7 @@ pub(super) const OF_A_SKILL: [Method; 2] = [
 ];
 
 impl Nodes {
-    pub(super) fn method(&mut self, method: &Method, parent: u32) {
+    pub(super) fn method(&mut self, method: &DeclaredMethod, parent: u32) {
         let id = parent + method.offset;
         let node = Node::new("UAMethod", id, method.browse_name).about(method.about);
         self.add(node.child_of(parent, "HasComponent", Rule::Mandatory));

@@ -4,17 +4,17 @@
 use std::future::Future;
 use std::pin::Pin;
 
-use plant_opcua::server::{Instance, InstanceError, Server};
+use plant_opcua::server::{Instance, InstanceError, OpcUaServer};
 use plant_opcua::types::{DataValue, ExtensionObject, NodeId, StatusCode, Variant};
 
 use super::{Maker, show, within};
 use crate::server::show::date_time;
 use crate::server::values::{engineering_unit, status};
-use crate::value::Value;
-use crate::values::{LiveValue, Reading};
+use crate::value::SkillValue;
+use crate::values::{LiveValue, NewestState};
 
 /// Updates nodes at each change of a value.
-pub(super) type Kept = Pin<Box<dyn Future<Output = ()> + Send>>;
+pub(super) type NodeUpdates = Pin<Box<dyn Future<Output = ()> + Send>>;
 
 /// Creates an axis for each joint of the value `JointPositions`. Returns the update of the axes, if
 /// there is such a value.
@@ -22,7 +22,7 @@ pub(super) fn axes(
     maker: &mut Maker<'_>,
     arm: &Instance,
     (values, count): (&[LiveValue], usize),
-) -> Result<Option<Kept>, InstanceError> {
+) -> Result<Option<NodeUpdates>, InstanceError> {
     let Some(value) = named(values, "JointPositions") else {
         return Ok(None);
     };
@@ -39,8 +39,8 @@ pub(super) fn axes(
         }
         nodes.push(within(&axis, "ParameterSet/ActualPosition")?);
     }
-    let positions = move |value: Option<&Value>| -> Vec<Option<Variant>> {
-        let numbers = value.and_then(Value::as_f64s).unwrap_or_default();
+    let positions = move |value: Option<&SkillValue>| -> Vec<Option<Variant>> {
+        let numbers = value.and_then(SkillValue::as_f64s).unwrap_or_default();
         let at = |axis: usize| numbers.get(axis).copied().map(Variant::Double);
         (0..count).map(at).collect()
     };
@@ -48,11 +48,15 @@ pub(super) fn axes(
 }
 
 /// Returns the update of SpeedOverride from the value `SpeedScaling`, if there is such a value.
-pub(super) fn speed(server: &Server, arm: &Instance, values: &[LiveValue]) -> Option<Kept> {
+pub(super) fn speed(
+    server: &OpcUaServer,
+    arm: &Instance,
+    values: &[LiveValue],
+) -> Option<NodeUpdates> {
     let node = arm.node("ParameterSet/SpeedOverride")?.clone();
     let value = named(values, "SpeedScaling")?;
-    let percent = |value: Option<&Value>| {
-        let number = value.and_then(Value::as_f64);
+    let percent = |value: Option<&SkillValue>| {
+        let number = value.and_then(SkillValue::as_f64);
         vec![number.map(Variant::Double)]
     };
     Some(keep(server, vec![node], value, percent))
@@ -64,7 +68,7 @@ pub(super) fn safety(
     maker: &mut Maker<'_>,
     system: &Instance,
     values: &[LiveValue],
-) -> Result<Option<Kept>, InstanceError> {
+) -> Result<Option<NodeUpdates>, InstanceError> {
     let Some(value) = named(values, "SafetyMode") else {
         return Ok(None);
     };
@@ -74,8 +78,8 @@ pub(super) fn safety(
     let nodes = ["EmergencyStop", "ProtectiveStop"];
     let nodes = nodes.map(|name| within(&state, &format!("ParameterSet/{name}")));
     let nodes: Vec<NodeId> = nodes.into_iter().collect::<Result<_, _>>()?;
-    let stops = |value: Option<&Value>| {
-        let mode = value.and_then(Value::as_f64);
+    let stops = |value: Option<&SkillValue>| {
+        let mode = value.and_then(SkillValue::as_f64);
         let stops = mode.map(|mode| [EMERGENCY, PROTECTIVE].map(|modes| modes.contains(&mode)));
         match stops {
             Some(stops) => stops.map(|stops| Some(Variant::Boolean(stops))).to_vec(),
@@ -91,11 +95,11 @@ fn named<'a>(values: &'a [LiveValue], name: &str) -> Option<&'a LiveValue> {
 
 /// Shows the parts of a value at nodes, with the status and time of the value.
 fn keep(
-    server: &Server,
+    server: &OpcUaServer,
     nodes: Vec<NodeId>,
     value: &LiveValue,
-    parts: impl Fn(Option<&Value>) -> Vec<Option<Variant>> + Send + 'static,
-) -> Kept {
+    parts: impl Fn(Option<&SkillValue>) -> Vec<Option<Variant>> + Send + 'static,
+) -> NodeUpdates {
     let (server, value) = (server.clone(), value.clone());
     Box::pin(async move {
         let mut readings = value.watch();
@@ -116,7 +120,7 @@ fn keep(
 }
 
 /// Returns a part of a value; a part that a good value lacks is Bad.
-fn shown_part(part: Option<Variant>, status: StatusCode, reading: &Reading) -> DataValue {
+fn shown_part(part: Option<Variant>, status: StatusCode, reading: &NewestState) -> DataValue {
     let status = match part {
         None if !status.is_bad() => StatusCode::BadNoData,
         Some(_) | None => status,

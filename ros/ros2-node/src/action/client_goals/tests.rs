@@ -4,7 +4,7 @@ const fn id(number: u8) -> GoalId {
     GoalId::from_bytes([number; 16])
 }
 
-const STAMP: RosTime = RosTime { sec: 3, nanosec: 0 };
+const STAMP: Ros2Time = Ros2Time { sec: 3, nanosec: 0 };
 
 fn now() -> Instant {
     Instant::now()
@@ -14,7 +14,7 @@ fn body(number: u8) -> Bytes {
     Bytes::from(vec![0, 1, 0, 0, number])
 }
 
-fn done(status: Status) -> Outcome {
+fn done(status: GoalStatusCode) -> Outcome {
     Outcome::Done {
         status,
         result: body(9),
@@ -23,7 +23,7 @@ fn done(status: Status) -> Outcome {
 
 /// Returns goals 1 and 2, which were just sent.
 fn sent() -> ClientGoals {
-    let mut goals = ClientGoals::new(Limits {
+    let mut goals = ClientGoals::new(ClientGoalLimits {
         goals: 2,
         feedback_messages: 3,
         feedback_bytes: 1000,
@@ -41,25 +41,25 @@ fn events(goals: &mut ClientGoals, number: u8) -> Vec<GoalEvent> {
 #[test]
 fn a_goal_is_accepted_and_goes_on_to_its_end() {
     let mut goals = sent();
-    assert_eq!(goals.known_status(id(1)), Status::Unknown);
+    assert_eq!(goals.known_status(id(1)), GoalStatusCode::Unknown);
     goals.accepted(id(1), STAMP, now());
-    assert_eq!(goals.known_status(id(1)), Status::Accepted);
-    goals.status(id(1), (Status::Executing, STAMP), now());
+    assert_eq!(goals.known_status(id(1)), GoalStatusCode::Accepted);
+    goals.status(id(1), (GoalStatusCode::Executing, STAMP), now());
     goals.feedback(id(1), body(1));
-    goals.status(id(1), (Status::Canceling, STAMP), now());
-    let _is_left = goals.end(id(1), done(Status::Canceled));
+    goals.status(id(1), (GoalStatusCode::Canceling, STAMP), now());
+    let _is_left = goals.end(id(1), done(GoalStatusCode::Canceled));
     assert_eq!(
         events(&mut goals, 1),
         [
             GoalEvent::Accepted(STAMP),
-            GoalEvent::Status(Status::Executing),
+            GoalEvent::Status(GoalStatusCode::Executing),
             GoalEvent::Feedback(body(1)),
-            GoalEvent::Status(Status::Canceling),
-            GoalEvent::Ended(done(Status::Canceled)),
+            GoalEvent::Status(GoalStatusCode::Canceling),
+            GoalEvent::Ended(done(GoalStatusCode::Canceled)),
         ]
     );
-    assert_eq!(goals.known_status(id(1)), Status::Canceled);
-    assert_eq!(goals.outcome(id(1)), Some(&done(Status::Canceled)));
+    assert_eq!(goals.known_status(id(1)), GoalStatusCode::Canceled);
+    assert_eq!(goals.outcome(id(1)), Some(&done(GoalStatusCode::Canceled)));
     assert_eq!(events(&mut goals, 2), []);
 }
 
@@ -68,19 +68,19 @@ fn what_comes_before_the_acceptance_is_told_after_it() {
     let mut goals = sent();
     goals.feedback(id(1), body(1));
     assert_eq!(events(&mut goals, 1), []);
-    assert_eq!(goals.known_status(id(1)), Status::Unknown);
+    assert_eq!(goals.known_status(id(1)), GoalStatusCode::Unknown);
     // The status implies the acceptance too; the reply to the goal may be lost.
-    goals.status(id(1), (Status::Executing, STAMP), now());
+    goals.status(id(1), (GoalStatusCode::Executing, STAMP), now());
     goals.accepted(id(1), STAMP, now());
     assert_eq!(
         events(&mut goals, 1),
         [
             GoalEvent::Accepted(STAMP),
             GoalEvent::Feedback(body(1)),
-            GoalEvent::Status(Status::Executing),
+            GoalEvent::Status(GoalStatusCode::Executing),
         ]
     );
-    assert_eq!(goals.known_status(id(1)), Status::Executing);
+    assert_eq!(goals.known_status(id(1)), GoalStatusCode::Executing);
 }
 
 #[test]
@@ -96,22 +96,22 @@ fn of_a_rejected_goal_nothing_else_is_told() {
 fn an_old_status_changes_nothing() {
     let mut goals = sent();
     goals.accepted(id(1), STAMP, now());
-    goals.status(id(1), (Status::Canceling, STAMP), now());
-    goals.status(id(1), (Status::Executing, STAMP), now());
-    goals.status(id(1), (Status::Canceling, STAMP), now());
-    goals.status(id(1), (Status::Succeeded, STAMP), now());
-    goals.status(id(1), (Status::Canceled, STAMP), now());
+    goals.status(id(1), (GoalStatusCode::Canceling, STAMP), now());
+    goals.status(id(1), (GoalStatusCode::Executing, STAMP), now());
+    goals.status(id(1), (GoalStatusCode::Canceling, STAMP), now());
+    goals.status(id(1), (GoalStatusCode::Succeeded, STAMP), now());
+    goals.status(id(1), (GoalStatusCode::Canceled, STAMP), now());
     assert_eq!(
         events(&mut goals, 1),
         [
             GoalEvent::Accepted(STAMP),
-            GoalEvent::Status(Status::Canceling)
+            GoalEvent::Status(GoalStatusCode::Canceling)
         ],
         "an end is told with the result"
     );
-    assert_eq!(goals.known_status(id(1)), Status::Succeeded);
-    let _is_left = goals.end(id(1), done(Status::Aborted));
-    assert_eq!(goals.known_status(id(1)), Status::Aborted);
+    assert_eq!(goals.known_status(id(1)), GoalStatusCode::Succeeded);
+    let _is_left = goals.end(id(1), done(GoalStatusCode::Aborted));
+    assert_eq!(goals.known_status(id(1)), GoalStatusCode::Aborted);
 }
 
 #[test]
@@ -119,7 +119,7 @@ fn feedback_for_others_and_after_the_end_is_counted_and_not_told() {
     let mut goals = sent();
     goals.feedback(id(7), body(1));
     goals.accepted(id(1), STAMP, now());
-    let _is_left = goals.end(id(1), done(Status::Succeeded));
+    let _is_left = goals.end(id(1), done(GoalStatusCode::Succeeded));
     goals.feedback(id(1), body(1));
     assert_eq!(goals.counters.others_feedback, 2);
     assert_eq!(events(&mut goals, 1).len(), 2);
@@ -170,9 +170,9 @@ fn of_more_goals_than_allowed_the_next_is_lost_until_one_has_ended() {
 fn goals_are_lost_together_but_for_those_that_have_ended() {
     let mut goals = sent();
     goals.accepted(id(1), STAMP, now());
-    let _is_left = goals.end(id(1), done(Status::Succeeded));
+    let _is_left = goals.end(id(1), done(GoalStatusCode::Succeeded));
     goals.end_all(&Outcome::Lost(LostReason::ClientClosed));
-    assert_eq!(goals.outcome(id(1)), Some(&done(Status::Succeeded)));
+    assert_eq!(goals.outcome(id(1)), Some(&done(GoalStatusCode::Succeeded)));
     assert_eq!(
         events(&mut goals, 2),
         [GoalEvent::Ended(Outcome::Lost(LostReason::ClientClosed))]
@@ -190,7 +190,7 @@ fn a_goal_that_is_withdrawn_is_to_be_cancelled_once_it_is_accepted() {
         assert_eq!(goals.cancel_due(id(1)), None);
         let late = start + Duration::from_secs(3);
         if by_status {
-            goals.status(id(1), (Status::Accepted, STAMP), late)
+            goals.status(id(1), (GoalStatusCode::Accepted, STAMP), late)
         } else {
             goals.accepted(id(1), STAMP, late)
         }
@@ -234,6 +234,6 @@ fn a_withdrawn_goal_is_kept_until_its_end_when_nobody_holds_it() {
     assert!(!goals.forget(id(1)));
     goals.accepted(id(1), STAMP, now());
     assert!(goals.cancel_due(id(1)).is_some());
-    assert!(goals.end(id(1), done(Status::Canceled)));
+    assert!(goals.end(id(1), done(GoalStatusCode::Canceled)));
     assert!(!goals.is_held(id(1)));
 }

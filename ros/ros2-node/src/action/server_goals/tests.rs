@@ -12,8 +12,8 @@ const fn id(number: u8) -> GoalId {
     GoalId::from_bytes([number; 16])
 }
 
-const fn stamp(sec: i32) -> RosTime {
-    RosTime { sec, nanosec: 0 }
+const fn stamp(sec: i32) -> Ros2Time {
+    Ros2Time { sec, nanosec: 0 }
 }
 
 fn result(number: u8) -> Bytes {
@@ -26,7 +26,7 @@ fn goals(most: usize) -> ServerGoals<u8> {
 
 /// Adds a goal with this number, accepted at the second of the same number.
 fn accepted(goals: &mut ServerGoals<u8>, number: u8) -> Ticket {
-    let Arrival::New(ticket) = goals.arrive(id(number)) else {
+    let NewGoalDecision::New(ticket) = goals.arrive(id(number)) else {
         panic!("goal {number} is not new");
     };
     goals.accept(ticket, stamp(number.into())).unwrap();
@@ -34,34 +34,34 @@ fn accepted(goals: &mut ServerGoals<u8>, number: u8) -> Ticket {
 }
 
 /// Adds a goal in this state.
-fn with_status(goals: &mut ServerGoals<u8>, number: u8, status: Status) -> Ticket {
+fn with_status(goals: &mut ServerGoals<u8>, number: u8, status: GoalStatusCode) -> Ticket {
     let ticket = accepted(goals, number);
     match status {
-        Status::Accepted => {}
-        Status::Executing => goals.execute(ticket).unwrap(),
-        Status::Canceling => goals.cancel(ticket).unwrap(),
-        Status::Succeeded | Status::Aborted => {
+        GoalStatusCode::Accepted => {}
+        GoalStatusCode::Executing => goals.execute(ticket).unwrap(),
+        GoalStatusCode::Canceling => goals.cancel(ticket).unwrap(),
+        GoalStatusCode::Succeeded | GoalStatusCode::Aborted => {
             goals.execute(ticket).unwrap();
-            let end = [End::Succeed, End::Abort][usize::from(status == Status::Aborted)];
+            let end = [End::Succeed, End::Abort][usize::from(status == GoalStatusCode::Aborted)];
             goals.end(ticket, end, result(0), now()).unwrap();
         }
-        Status::Canceled => {
+        GoalStatusCode::Canceled => {
             goals.cancel(ticket).unwrap();
             goals.end(ticket, End::Cancel, result(0), now()).unwrap();
         }
-        Status::Unknown => panic!("an accepted goal is known"),
+        GoalStatusCode::Unknown => panic!("an accepted goal is known"),
     }
     assert_eq!(goals.status(ticket), Some(status));
     ticket
 }
 
-fn all() -> impl Iterator<Item = Status> {
-    (1..=6).filter_map(Status::from_code)
+fn all() -> impl Iterator<Item = GoalStatusCode> {
+    (1..=6).filter_map(GoalStatusCode::from_code)
 }
 
 #[test]
 fn each_step_is_taken_from_the_states_of_rcl_and_no_other() {
-    use Status as S;
+    use GoalStatusCode as S;
     type Step = fn(&mut ServerGoals<u8>, Ticket) -> Result<(), GoalError>;
     fn end(goals: &mut ServerGoals<u8>, ticket: Ticket, end: End) -> Result<(), GoalError> {
         goals.end(ticket, end, result(1), now()).map(drop)
@@ -120,19 +120,19 @@ fn a_refused_step_says_what_the_goal_is() {
 #[test]
 fn a_goal_is_unknown_until_it_is_accepted_and_when_it_was_rejected() {
     let mut goals = goals(10);
-    let Arrival::New(ticket) = goals.arrive(id(1)) else {
+    let NewGoalDecision::New(ticket) = goals.arrive(id(1)) else {
         panic!("it is new");
     };
-    assert_eq!(goals.ask(id(1), || 1), Asked::Unknown);
+    assert_eq!(goals.ask(id(1), || 1), ResultRequest::Unknown);
     assert_eq!(
         goals.to_cancel(CancelWhat::Goal(id(1))),
         Err(CancelCode::UnknownGoal)
     );
     assert_eq!(goals.list(), []);
-    assert_eq!(goals.arrive(id(1)), Arrival::Known);
+    assert_eq!(goals.arrive(id(1)), NewGoalDecision::Known);
     goals.reject(ticket);
-    assert_eq!(goals.ask(id(1), || 1), Asked::Unknown);
-    assert!(matches!(goals.arrive(id(1)), Arrival::New(_)));
+    assert_eq!(goals.ask(id(1), || 1), ResultRequest::Unknown);
+    assert!(matches!(goals.arrive(id(1)), NewGoalDecision::New(_)));
     assert_eq!(goals.counters.repeated, 1);
     assert_eq!(
         goals.accept(ticket, stamp(1)),
@@ -144,23 +144,23 @@ fn a_goal_is_unknown_until_it_is_accepted_and_when_it_was_rejected() {
 #[test]
 fn who_asks_for_a_result_waits_for_it_and_who_asks_later_gets_it_at_once() {
     let mut goals = goals(10);
-    let ticket = with_status(&mut goals, 1, Status::Executing);
-    assert_eq!(goals.ask(id(1), || 1), Asked::Waits(None));
-    assert_eq!(goals.ask(id(1), || 2), Asked::Waits(None));
+    let ticket = with_status(&mut goals, 1, GoalStatusCode::Executing);
+    assert_eq!(goals.ask(id(1), || 1), ResultRequest::Waits(None));
+    assert_eq!(goals.ask(id(1), || 2), ResultRequest::Waits(None));
     let told = goals.end(ticket, End::Succeed, result(7), now());
     assert_eq!(told, Ok(vec![1, 2]));
-    assert_eq!(goals.ask(id(1), || 3), Asked::Ended(result(7)));
-    assert_eq!(goals.ask(id(2), || 4), Asked::Unknown);
+    assert_eq!(goals.ask(id(1), || 3), ResultRequest::Ended(result(7)));
+    assert_eq!(goals.ask(id(2), || 4), ResultRequest::Unknown);
 }
 
 #[test]
 fn of_too_many_who_wait_for_one_result_the_oldest_go() {
     let mut goals = goals(10);
-    let ticket = with_status(&mut goals, 1, Status::Executing);
+    let ticket = with_status(&mut goals, 1, GoalStatusCode::Executing);
     for who in 0..8 {
-        assert_eq!(goals.ask(id(1), || who), Asked::Waits(None));
+        assert_eq!(goals.ask(id(1), || who), ResultRequest::Waits(None));
     }
-    assert_eq!(goals.ask(id(1), || 8), Asked::Waits(Some(0)));
+    assert_eq!(goals.ask(id(1), || 8), ResultRequest::Waits(Some(0)));
     assert_eq!(goals.counters.displaced, 1);
     let told = goals.end(ticket, End::Abort, result(7), now());
     assert_eq!(told, Ok((1..9).collect()));
@@ -170,17 +170,17 @@ fn of_too_many_who_wait_for_one_result_the_oldest_go() {
 fn a_result_is_kept_for_its_time() {
     let mut goals = goals(10);
     let start = now();
-    let ticket = with_status(&mut goals, 1, Status::Executing);
-    let other = with_status(&mut goals, 2, Status::Executing);
+    let ticket = with_status(&mut goals, 1, GoalStatusCode::Executing);
+    let other = with_status(&mut goals, 2, GoalStatusCode::Executing);
     goals.end(ticket, End::Succeed, result(7), start).unwrap();
     assert!(!goals.expire(start + KEPT));
-    assert_eq!(goals.ask(id(1), || 1), Asked::Ended(result(7)));
+    assert_eq!(goals.ask(id(1), || 1), ResultRequest::Ended(result(7)));
     assert!(goals.expire(start + KEPT + Duration::from_millis(1)));
-    assert_eq!(goals.ask(id(1), || 1), Asked::Unknown);
+    assert_eq!(goals.ask(id(1), || 1), ResultRequest::Unknown);
     assert_eq!(goals.status(ticket), None);
-    assert_eq!(goals.status(other), Some(Status::Executing));
+    assert_eq!(goals.status(other), Some(GoalStatusCode::Executing));
     let mut for_ever = ServerGoals::<u8>::new(10, None);
-    with_status(&mut for_ever, 1, Status::Succeeded);
+    with_status(&mut for_ever, 1, GoalStatusCode::Succeeded);
     assert!(!for_ever.expire(start + KEPT * 1000));
 }
 
@@ -189,9 +189,9 @@ fn one_goal_is_cancelled_by_its_id_while_it_runs() {
     for status in all() {
         let mut goals = goals(10);
         let ticket = with_status(&mut goals, 1, status);
-        with_status(&mut goals, 2, Status::Executing);
+        with_status(&mut goals, 2, GoalStatusCode::Executing);
         let found = goals.to_cancel(CancelWhat::Goal(id(1)));
-        if matches!(status, Status::Accepted | Status::Executing) {
+        if matches!(status, GoalStatusCode::Accepted | GoalStatusCode::Executing) {
             let info = GoalInfo {
                 id: id(1),
                 stamp: stamp(1),
@@ -207,9 +207,9 @@ fn one_goal_is_cancelled_by_its_id_while_it_runs() {
 fn goals_are_cancelled_by_time_and_all_at_once_in_the_order_they_came() {
     let mut goals = goals(10);
     for number in [5, 2, 3, 4] {
-        with_status(&mut goals, number, Status::Executing);
+        with_status(&mut goals, number, GoalStatusCode::Executing);
     }
-    with_status(&mut goals, 1, Status::Succeeded);
+    with_status(&mut goals, 1, GoalStatusCode::Succeeded);
     let found = |what| -> Vec<u8> {
         let found = goals.to_cancel(what).unwrap().into_iter();
         found.map(|(ticket, _)| ticket.id.to_bytes()[0]).collect()
@@ -225,14 +225,18 @@ fn without_room_what_has_ended_goes_first_and_then_goals_are_refused() {
     let mut goals = goals(2);
     let start = now();
     for number in [1, 2] {
-        let ticket = with_status(&mut goals, number, Status::Executing);
+        let ticket = with_status(&mut goals, number, GoalStatusCode::Executing);
         let at = start + Duration::from_secs(u64::from(10 - number));
         goals.end(ticket, End::Abort, result(0), at).unwrap();
     }
     accepted(&mut goals, 3);
-    assert_eq!(goals.ask(id(2), || 1), Asked::Unknown, "it ended first");
+    assert_eq!(
+        goals.ask(id(2), || 1),
+        ResultRequest::Unknown,
+        "it ended first"
+    );
     accepted(&mut goals, 4);
-    assert_eq!(goals.arrive(id(5)), Arrival::Full);
+    assert_eq!(goals.arrive(id(5)), NewGoalDecision::Full);
     assert_eq!((goals.counters.forgotten, goals.counters.refused), (2, 1));
 }
 
@@ -284,7 +288,7 @@ proptest! {
             let before: Vec<_> = tickets.iter().map(|ticket| goals.status(*ticket)).collect();
             match input {
                 Input::Arrive(number) => {
-                    if let Arrival::New(ticket) = goals.arrive(id(number)) {
+                    if let NewGoalDecision::New(ticket) = goals.arrive(id(number)) {
                         tickets.push(ticket);
                     }
                 }
@@ -299,7 +303,7 @@ proptest! {
                     }
                 }
                 Input::Ask(number) => {
-                    if let Asked::Waits(displaced) = goals.ask(id(number), || step) {
+                    if let ResultRequest::Waits(displaced) = goals.ask(id(number), || step) {
                         waiting.insert(step);
                         prop_assert!(displaced.is_none_or(|who| waiting.remove(&who)));
                     }
@@ -317,7 +321,7 @@ proptest! {
             prop_assert_eq!(owed, waiting.len(), "nobody who waits is lost");
             for (ticket, old) in tickets.iter().zip(before) {
                 let new = goals.status(*ticket);
-                prop_assert!(!old.is_some_and(Status::is_terminal) || new.is_none() || new == old);
+                prop_assert!(!old.is_some_and(GoalStatusCode::is_terminal) || new.is_none() || new == old);
             }
         }
     }

@@ -6,17 +6,17 @@ use std::sync::Arc;
 use tokio::sync::Notify;
 use tokio::time::Instant;
 
-use super::super::types::Status;
+use super::super::types::ActionlibStatus;
 use super::super::wire::StatusEntry;
-use super::{CommState, Feedback, GoalEvent, GoalResult, Limits, LostReason};
+use super::{ActionlibGoalEvent, CommState, Feedback, GoalLimits, GoalLoss, GoalResult};
 
 /// A goal from the moment it is sent.
 #[derive(Debug)]
 pub(in crate::actionlib) struct Goal {
     pub(in crate::actionlib) state: CommState,
-    pub(in crate::actionlib) status: Status,
+    pub(in crate::actionlib) status: ActionlibStatus,
     pub(in crate::actionlib) text: String,
-    pub(in crate::actionlib) outcome: Option<Result<GoalResult, LostReason>>,
+    pub(in crate::actionlib) outcome: Option<Result<GoalResult, GoalLoss>>,
     pub(super) sent: Instant,
     /// The node that has listed the goal.
     pub(super) server: Option<String>,
@@ -25,7 +25,7 @@ pub(in crate::actionlib) struct Goal {
     /// The result, and the end of the wait for feedback that was sent before it on another
     /// connection.
     pub(super) result: Option<(Instant, GoalResult)>,
-    pub(super) events: VecDeque<GoalEvent>,
+    pub(super) events: VecDeque<ActionlibGoalEvent>,
     feedback_messages: usize,
     feedback_bytes: usize,
     unreported: u64,
@@ -36,7 +36,7 @@ impl Goal {
     pub(super) fn new(sent: Instant, wake: Arc<Notify>) -> Self {
         Self {
             state: CommState::WaitingForGoalAck,
-            status: Status::Pending,
+            status: ActionlibStatus::Pending,
             text: String::new(),
             outcome: None,
             sent,
@@ -54,7 +54,7 @@ impl Goal {
     /// Enters the states that a status of the server leads to. Returns false if the status cannot
     /// follow the current state.
     pub(super) fn follow(&mut self, entry: &StatusEntry, now: Instant) -> bool {
-        let Some(status) = Status::from_code(entry.code) else {
+        let Some(status) = ActionlibStatus::from_code(entry.code) else {
             return false;
         };
         let Some(path) = path(self.state, status) else {
@@ -73,7 +73,7 @@ impl Goal {
 
     pub(super) fn go(&mut self, state: CommState) {
         self.state = state;
-        self.push(GoalEvent::State(state));
+        self.push(ActionlibGoalEvent::State(state));
     }
 
     pub(super) fn done(&mut self, result: GoalResult) {
@@ -81,10 +81,10 @@ impl Goal {
         self.status = result.status;
         self.text.clone_from(&result.text);
         self.outcome = Some(Ok(result.clone()));
-        self.push(GoalEvent::Done(result));
+        self.push(ActionlibGoalEvent::Done(result));
     }
 
-    pub(super) fn lose(&mut self, reason: LostReason) {
+    pub(super) fn lose(&mut self, reason: GoalLoss) {
         if let Some((_, result)) = self.result.take() {
             return self.done(result);
         }
@@ -92,19 +92,20 @@ impl Goal {
             return;
         }
         self.state = CommState::Lost;
-        self.status = Status::Lost;
+        self.status = ActionlibStatus::Lost;
         self.outcome = Some(Err(reason.clone()));
-        self.push(GoalEvent::Lost(reason));
+        self.push(ActionlibGoalEvent::Lost(reason));
     }
 
-    pub(super) fn feedback(&mut self, feedback: Feedback, limits: &Limits) -> u64 {
+    pub(super) fn feedback(&mut self, feedback: Feedback, limits: &GoalLimits) -> u64 {
         let len = feedback.body.len();
         let mut dropped = 0;
         while self.feedback_messages > 0
             && (self.feedback_messages >= limits.feedback_messages.max(1)
                 || self.feedback_bytes.saturating_add(len) > limits.feedback_bytes)
         {
-            let oldest = |event: &GoalEvent| matches!(event, GoalEvent::Feedback(_));
+            let oldest =
+                |event: &ActionlibGoalEvent| matches!(event, ActionlibGoalEvent::Feedback(_));
             let at = self.events.iter().position(oldest);
             let Some(event) = at.and_then(|at| self.events.remove(at)) else {
                 break;
@@ -115,18 +116,18 @@ impl Goal {
         self.unreported += dropped;
         self.feedback_messages += 1;
         self.feedback_bytes += len;
-        self.push(GoalEvent::Feedback(feedback));
+        self.push(ActionlibGoalEvent::Feedback(feedback));
         dropped
     }
 
-    fn push(&mut self, event: GoalEvent) {
+    fn push(&mut self, event: ActionlibGoalEvent) {
         self.events.push_back(event);
         self.wake.notify_one();
     }
 
-    pub(super) fn next_event(&mut self) -> Option<GoalEvent> {
+    pub(super) fn next_event(&mut self) -> Option<ActionlibGoalEvent> {
         if self.unreported > 0 {
-            return Some(GoalEvent::FeedbackDropped(std::mem::take(
+            return Some(ActionlibGoalEvent::FeedbackDropped(std::mem::take(
                 &mut self.unreported,
             )));
         }
@@ -135,8 +136,8 @@ impl Goal {
         Some(event)
     }
 
-    fn taken(&mut self, event: &GoalEvent) {
-        if let GoalEvent::Feedback(feedback) = event {
+    fn taken(&mut self, event: &ActionlibGoalEvent) {
+        if let ActionlibGoalEvent::Feedback(feedback) = event {
             self.feedback_messages -= 1;
             self.feedback_bytes -= feedback.body.len();
         }
@@ -147,9 +148,9 @@ impl Goal {
 /// status is not new. Statuses arrive a few times a second and may skip states: the goal enters the
 /// skipped states as well. Returns `None` if the status cannot follow the state, as when messages
 /// of different topics overtake each other.
-const fn path(state: CommState, status: Status) -> Option<&'static [CommState]> {
+const fn path(state: CommState, status: ActionlibStatus) -> Option<&'static [CommState]> {
+    use ActionlibStatus as S;
     use CommState as C;
-    use Status as S;
     Some(match (state, status) {
         (C::Done | C::Lost, _)
         | (C::Pending, S::Pending)

@@ -7,7 +7,7 @@ use crate::clock;
 use crate::header::ConnectionHeader;
 
 const SECOND: Duration = Duration::from_secs(1);
-const LIMITS: Limits = Limits {
+const LIMITS: GoalLimits = GoalLimits {
     acknowledge: Duration::from_secs(5),
     silence: Duration::from_secs(5),
     reconnect: SECOND,
@@ -17,7 +17,7 @@ const LIMITS: Limits = Limits {
     feedback_bytes: 1000,
 };
 
-fn entry(id: &str, status: Status) -> StatusEntry {
+fn entry(id: &str, status: ActionlibStatus) -> StatusEntry {
     StatusEntry {
         id: id.to_owned(),
         code: status.code(),
@@ -25,42 +25,46 @@ fn entry(id: &str, status: Status) -> StatusEntry {
     }
 }
 
-fn peer() -> Arc<Peer> {
-    Arc::new(Peer {
+fn peer() -> Arc<ConnectionPeer> {
+    Arc::new(ConnectionPeer {
         caller_id: "/server".to_owned(),
         header: ConnectionHeader::default(),
     })
 }
 
 /// Returns goals with a goal `g` sent at `start`, and a connected server.
-fn sent() -> (ClientGoals, Instant) {
+fn sent() -> (ActionlibClientGoals, Instant) {
     let start = clock::now();
-    let mut goals = ClientGoals::new(LIMITS);
-    for topic in [Source::Status, Source::Feedback, Source::Result] {
+    let mut goals = ActionlibClientGoals::new(LIMITS);
+    for topic in [
+        ServerTopic::Status,
+        ServerTopic::Feedback,
+        ServerTopic::Result,
+    ] {
         goals.connection("/server", topic, true, start);
     }
     goals.sent("g".to_owned(), start, Arc::default());
     (goals, start)
 }
 
-fn status(goals: &mut ClientGoals, status: Status, now: Instant) {
+fn status(goals: &mut ActionlibClientGoals, status: ActionlibStatus, now: Instant) {
     goals.status("/server", &[entry("g", status)], now);
 }
 
-fn states(goals: &mut ClientGoals) -> Vec<CommState> {
+fn states(goals: &mut ActionlibClientGoals) -> Vec<CommState> {
     let mut states = Vec::new();
     while let Some(event) = goals.next_event("g") {
         match event {
-            GoalEvent::State(state) => states.push(state),
-            GoalEvent::Done(_) => states.push(CommState::Done),
-            GoalEvent::Lost(_) => states.push(CommState::Lost),
-            GoalEvent::Feedback(_) | GoalEvent::FeedbackDropped(_) => {}
+            ActionlibGoalEvent::State(state) => states.push(state),
+            ActionlibGoalEvent::Done(_) => states.push(CommState::Done),
+            ActionlibGoalEvent::Lost(_) => states.push(CommState::Lost),
+            ActionlibGoalEvent::Feedback(_) | ActionlibGoalEvent::FeedbackDropped(_) => {}
         }
     }
     states
 }
 
-fn lost(goals: &ClientGoals) -> Option<LostReason> {
+fn lost(goals: &ActionlibClientGoals) -> Option<GoalLoss> {
     goals.goal("g")?.outcome.clone()?.err()
 }
 
@@ -68,15 +72,15 @@ fn lost(goals: &ClientGoals) -> Option<LostReason> {
 fn a_goal_goes_through_its_states_to_its_result() {
     let (mut goals, now) = sent();
     for step in [
-        Status::Pending,
-        Status::Active,
-        Status::Active,
-        Status::Succeeded,
+        ActionlibStatus::Pending,
+        ActionlibStatus::Active,
+        ActionlibStatus::Active,
+        ActionlibStatus::Succeeded,
     ] {
         status(&mut goals, step, now);
     }
     let body = Bytes::from_static(b"r");
-    goals.result(&entry("g", Status::Succeeded), body, peer(), now);
+    goals.result(&entry("g", ActionlibStatus::Succeeded), body, peer(), now);
     use CommState as C;
     assert_eq!(
         states(&mut goals),
@@ -85,7 +89,7 @@ fn a_goal_goes_through_its_states_to_its_result() {
     let result = goals.goal("g").unwrap().outcome.clone().unwrap().unwrap();
     assert_eq!(
         (result.status, &*result.body),
-        (Status::Succeeded, b"r".as_slice())
+        (ActionlibStatus::Succeeded, b"r".as_slice())
     );
     assert_eq!(result.text, "Succeeded");
 }
@@ -93,8 +97,13 @@ fn a_goal_goes_through_its_states_to_its_result() {
 #[test]
 fn a_result_that_overtakes_its_status_passes_the_states_between() {
     let (mut goals, now) = sent();
-    goals.result(&entry("g", Status::Preempted), Bytes::new(), peer(), now);
-    status(&mut goals, Status::Preempted, now);
+    goals.result(
+        &entry("g", ActionlibStatus::Preempted),
+        Bytes::new(),
+        peer(),
+        now,
+    );
+    status(&mut goals, ActionlibStatus::Preempted, now);
     use CommState as C;
     assert_eq!(
         states(&mut goals),
@@ -105,12 +114,12 @@ fn a_result_that_overtakes_its_status_passes_the_states_between() {
 #[test]
 fn what_comes_after_the_end_changes_nothing_and_is_counted() {
     let (mut goals, now) = sent();
-    for end in [Status::Aborted, Status::Succeeded] {
+    for end in [ActionlibStatus::Aborted, ActionlibStatus::Succeeded] {
         let body = Bytes::new();
         goals.feedback("g", Feedback { body, peer: peer() });
         goals.result(&entry("g", end), Bytes::new(), peer(), now);
     }
-    assert_eq!(goals.goal("g").unwrap().status, Status::Aborted);
+    assert_eq!(goals.goal("g").unwrap().status, ActionlibStatus::Aborted);
     let counted = (goals.counters.late_results, goals.counters.late_feedback);
     assert_eq!(counted, (1, 1));
 }
@@ -121,24 +130,31 @@ fn feedback_that_its_result_overtakes_is_told_before_it() {
     for lost in [false, true] {
         let (mut goals, now) = sent();
         goals.limits.feedback_grace = grace;
-        status(&mut goals, Status::Active, now);
-        goals.result(&entry("g", Status::Succeeded), Bytes::new(), peer(), now);
+        status(&mut goals, ActionlibStatus::Active, now);
+        goals.result(
+            &entry("g", ActionlibStatus::Succeeded),
+            Bytes::new(),
+            peer(),
+            now,
+        );
         let body = Bytes::from_static(b"f");
         goals.feedback("g", Feedback { body, peer: peer() });
         assert_eq!(goals.deadline(), Some(now + grace));
         goals.expire(now + grace - Duration::from_millis(1));
         assert!(goals.goal("g").unwrap().outcome.is_none());
         if lost {
-            goals.lose("g", LostReason::NotAcknowledged(grace));
+            goals.lose("g", GoalLoss::NotAcknowledged(grace));
         } else {
             goals.expire(now + grace);
         }
         let events = std::iter::from_fn(|| goals.next_event("g"));
         let told: Vec<bool> = events
             .filter_map(|event| match event {
-                GoalEvent::Feedback(_) => Some(false),
-                GoalEvent::Done(_) => Some(true),
-                GoalEvent::State(_) | GoalEvent::FeedbackDropped(_) | GoalEvent::Lost(_) => None,
+                ActionlibGoalEvent::Feedback(_) => Some(false),
+                ActionlibGoalEvent::Done(_) => Some(true),
+                ActionlibGoalEvent::State(_)
+                | ActionlibGoalEvent::FeedbackDropped(_)
+                | ActionlibGoalEvent::Lost(_) => None,
             })
             .collect();
         assert_eq!(told, [false, true]);
@@ -149,13 +165,16 @@ fn feedback_that_its_result_overtakes_is_told_before_it() {
 fn a_result_that_says_active_ends_the_goal_as_lost_with_its_body() {
     let (mut goals, now) = sent();
     goals.result(
-        &entry("g", Status::Active),
+        &entry("g", ActionlibStatus::Active),
         Bytes::from_static(b"r"),
         peer(),
         now,
     );
     let result = goals.goal("g").unwrap().outcome.clone().unwrap().unwrap();
-    assert_eq!((result.status, result.body.len()), (Status::Lost, 1));
+    assert_eq!(
+        (result.status, result.body.len()),
+        (ActionlibStatus::Lost, 1)
+    );
     assert_eq!(goals.counters.invalid_transitions, 1);
 }
 
@@ -167,22 +186,22 @@ fn a_goal_that_no_server_lists_is_lost_after_its_time_and_not_before() {
     goals.expire(start + 5 * SECOND - Duration::from_millis(1));
     assert_eq!(lost(&goals), None);
     goals.expire(start + 5 * SECOND);
-    assert_eq!(lost(&goals), Some(LostReason::NotAcknowledged(5 * SECOND)));
+    assert_eq!(lost(&goals), Some(GoalLoss::NotAcknowledged(5 * SECOND)));
     assert_eq!(goals.deadline(), None);
 }
 
 #[test]
 fn a_goal_that_was_listed_and_is_missing_is_lost_at_once() {
     let (mut goals, now) = sent();
-    status(&mut goals, Status::Active, now);
+    status(&mut goals, ActionlibStatus::Active, now);
     goals.status("/other", &[], now);
     assert_eq!(lost(&goals), None);
     goals.status(
         "/server",
-        &[entry("of another client", Status::Active)],
+        &[entry("of another client", ActionlibStatus::Active)],
         now,
     );
-    assert!(matches!(lost(&goals), Some(LostReason::Forgotten { .. })));
+    assert!(matches!(lost(&goals), Some(GoalLoss::Forgotten { .. })));
 }
 
 #[test]
@@ -191,12 +210,12 @@ fn cancelling_before_the_first_status_does_not_lose_the_goal() {
     assert!(goals.cancel("g"));
     goals.status("/server", &[], now);
     assert_eq!(lost(&goals), None);
-    status(&mut goals, Status::Active, now);
+    status(&mut goals, ActionlibStatus::Active, now);
     assert_eq!(
         goals.goal("g").unwrap().state,
         CommState::WaitingForCancelAck
     );
-    status(&mut goals, Status::Preempting, now);
+    status(&mut goals, ActionlibStatus::Preempting, now);
     assert!(!goals.cancel("g"), "the server knows");
 }
 
@@ -204,66 +223,72 @@ fn cancelling_before_the_first_status_does_not_lose_the_goal() {
 fn a_silent_server_loses_its_goals_and_one_that_speaks_does_not() {
     let (mut goals, start) = sent();
     for second in 0..20 {
-        status(&mut goals, Status::Active, start + second * SECOND);
+        status(&mut goals, ActionlibStatus::Active, start + second * SECOND);
         goals.expire(start + second * SECOND);
     }
     assert_eq!(lost(&goals), None);
     goals.expire(start + 24 * SECOND);
-    assert!(matches!(lost(&goals), Some(LostReason::Silent { server, .. }) if server == "/server"));
+    assert!(matches!(lost(&goals), Some(GoalLoss::Silent { server, .. }) if server == "/server"));
 }
 
 #[test]
 fn a_connection_that_comes_back_in_time_loses_nothing() {
     let (mut goals, now) = sent();
-    status(&mut goals, Status::Active, now);
-    goals.connection("/server", Source::Status, false, now);
+    status(&mut goals, ActionlibStatus::Active, now);
+    goals.connection("/server", ServerTopic::Status, false, now);
     assert_eq!(goals.deadline(), Some(now + SECOND));
-    goals.connection("/server", Source::Status, true, now);
+    goals.connection("/server", ServerTopic::Status, true, now);
     goals.expire(now + SECOND);
     assert_eq!(lost(&goals), None);
-    for topic in [Source::Status, Source::Feedback, Source::Result] {
+    for topic in [
+        ServerTopic::Status,
+        ServerTopic::Feedback,
+        ServerTopic::Result,
+    ] {
         goals.connection("/server", topic, false, now);
     }
     goals.expire(now + SECOND);
-    assert!(matches!(
-        lost(&goals),
-        Some(LostReason::Disconnected { .. })
-    ));
+    assert!(matches!(lost(&goals), Some(GoalLoss::Disconnected { .. })));
     assert_eq!(goals.servers.len(), 0);
 }
 
 #[test]
 fn an_end_without_its_result_is_lost_even_when_the_server_forgets_the_goal() {
     let (mut goals, start) = sent();
-    status(&mut goals, Status::Succeeded, start);
+    status(&mut goals, ActionlibStatus::Succeeded, start);
     for second in 0..5 {
         goals.status("/server", &[], start + second * SECOND);
     }
     goals.expire(start + 4 * SECOND);
     assert_eq!(lost(&goals), None);
     goals.expire(start + 5 * SECOND);
-    let status = Status::Succeeded;
+    let status = ActionlibStatus::Succeeded;
     let waited = 5 * SECOND;
-    assert_eq!(lost(&goals), Some(LostReason::NoResult { status, waited }));
+    assert_eq!(lost(&goals), Some(GoalLoss::NoResult { status, waited }));
 }
 
 #[test]
 fn feedback_gives_way_to_newer_and_never_a_result_or_a_state() {
     let (mut goals, now) = sent();
-    status(&mut goals, Status::Active, now);
+    status(&mut goals, ActionlibStatus::Active, now);
     for n in 0..5u8 {
         let body = Bytes::from(vec![n]);
         goals.feedback("g", Feedback { body, peer: peer() });
     }
-    goals.result(&entry("g", Status::Succeeded), Bytes::new(), peer(), now);
+    goals.result(
+        &entry("g", ActionlibStatus::Succeeded),
+        Bytes::new(),
+        peer(),
+        now,
+    );
     let mut seen = Vec::new();
     while let Some(event) = goals.next_event("g") {
         seen.push(match event {
-            GoalEvent::State(state) => format!("{state:?}"),
-            GoalEvent::Feedback(feedback) => format!("{}", feedback.body[0]),
-            GoalEvent::FeedbackDropped(lost) => format!("-{lost}"),
-            GoalEvent::Done(_) => "Done".to_owned(),
-            GoalEvent::Lost(_) => "Lost".to_owned(),
+            ActionlibGoalEvent::State(state) => format!("{state:?}"),
+            ActionlibGoalEvent::Feedback(feedback) => format!("{}", feedback.body[0]),
+            ActionlibGoalEvent::FeedbackDropped(lost) => format!("-{lost}"),
+            ActionlibGoalEvent::Done(_) => "Done".to_owned(),
+            ActionlibGoalEvent::Lost(_) => "Lost".to_owned(),
         });
     }
     assert_eq!(seen, ["-3", "Active", "3", "4", "WaitingForResult", "Done"]);
@@ -273,15 +298,15 @@ fn feedback_gives_way_to_newer_and_never_a_result_or_a_state() {
 #[test]
 fn a_server_is_ready_with_all_three_topics_and_a_status() {
     let now = clock::now();
-    let mut goals = ClientGoals::new(LIMITS);
-    goals.connection("/server", Source::Status, true, now);
+    let mut goals = ActionlibClientGoals::new(LIMITS);
+    goals.connection("/server", ServerTopic::Status, true, now);
     assert!(goals.ready_server(now).unwrap_err().contains("status"));
     goals.status("/server", &[], now);
     assert!(goals.ready_server(now).unwrap_err().contains("feedback"));
-    goals.connection("/server", Source::Feedback, true, now);
-    goals.connection("/other", Source::Result, true, now);
+    goals.connection("/server", ServerTopic::Feedback, true, now);
+    goals.connection("/other", ServerTopic::Result, true, now);
     assert!(goals.ready_server(now).unwrap_err().contains("result"));
-    goals.connection("/server", Source::Result, true, now);
+    goals.connection("/server", ServerTopic::Result, true, now);
     goals.status("/server", &[], now + STATUS_AFTER);
     assert_eq!(goals.ready_server(now + STATUS_AFTER), Ok("/server"));
 }
@@ -289,8 +314,12 @@ fn a_server_is_ready_with_all_three_topics_and_a_status() {
 #[test]
 fn a_server_is_not_ready_before_it_uses_its_connections() {
     let now = clock::now();
-    let mut goals = ClientGoals::new(LIMITS);
-    for topic in [Source::Status, Source::Feedback, Source::Result] {
+    let mut goals = ActionlibClientGoals::new(LIMITS);
+    for topic in [
+        ServerTopic::Status,
+        ServerTopic::Feedback,
+        ServerTopic::Result,
+    ] {
         goals.connection("/server", topic, true, now);
     }
     // The latched status, which may have been sent before the other connections were made.
@@ -299,8 +328,8 @@ fn a_server_is_not_ready_before_it_uses_its_connections() {
     assert!(goals.ready_server(soon).unwrap_err().contains("status"));
     goals.status("/server", &[], soon);
     assert_eq!(goals.ready_server(soon), Ok("/server"));
-    goals.connection("/server", Source::Result, false, soon);
-    goals.connection("/server", Source::Result, true, soon);
+    goals.connection("/server", ServerTopic::Result, false, soon);
+    goals.connection("/server", ServerTopic::Result, true, soon);
     assert!(goals.ready_server(soon).unwrap_err().contains("status"));
     // A server that sends its status on change only.
     assert_eq!(goals.ready_server(soon + SETTLES_WITHIN), Ok("/server"));
@@ -328,7 +357,7 @@ fn input() -> impl Strategy<Value = Input> {
     ]
 }
 
-fn feed(goals: &mut ClientGoals, input: Input, now: Instant) {
+fn feed(goals: &mut ActionlibClientGoals, input: Input, now: Instant) {
     let entry = |code, ours: bool| StatusEntry {
         id: if ours { "g" } else { "other" }.to_owned(),
         code,
@@ -345,7 +374,7 @@ fn feed(goals: &mut ClientGoals, input: Input, now: Instant) {
             },
         ),
         Input::Cancel => drop(goals.cancel("g")),
-        Input::Connection(made) => goals.connection("/server", Source::Status, made, now),
+        Input::Connection(made) => goals.connection("/server", ServerTopic::Status, made, now),
         Input::Wait(_) => {}
     }
 }

@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 
 use mappings::{SpaceId, TopicId};
-use uadp::discovery::{List, ProbeLimits, ProbeStep, ProbeTimer};
+use uadp::discovery::{ProbeLimits, ProbeStep, ProbeTimer, WireArray};
 
 /// The Publishers that are probed for the metadata of their topics.
 #[derive(Debug, Default)]
@@ -37,7 +37,12 @@ impl MetadataProbes {
 
     /// Records the probe of another program. The own probe is not sent if it would ask for nothing
     /// else.
-    pub(super) fn handle_probe(&mut self, space: SpaceId, ids: List<'_, u16>, since: Duration) {
+    pub(super) fn handle_probe(
+        &mut self,
+        space: SpaceId,
+        ids: WireArray<'_, u16>,
+        since: Duration,
+    ) {
         let Some(probing) = self.publishers.get_mut(&space) else {
             return;
         };

@@ -4,17 +4,17 @@ use std::collections::{BTreeMap, HashSet};
 use std::time::Duration;
 
 use mappings::{SpaceId, TopicId};
-use uadp::discovery::{List, Probe, ProbeLimits, ProbeStep, ProbeTimer};
+use uadp::discovery::{Probe, ProbeLimits, ProbeStep, ProbeTimer, WireArray};
 
 /// The calls that a probe asks for: those of a space, or of one of its namespaces. A cell may have
 /// hundreds of programs in space 0, so a probe for a single program names its namespace.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-pub(in super::super) struct Asked {
+pub(in super::super) struct ProbedCalls {
     space: SpaceId,
     namespace: Option<u16>,
 }
 
-impl Asked {
+impl ProbedCalls {
     /// Asks for all calls of a space.
     pub(in super::super) const fn space(space: SpaceId) -> Self {
         Self {
@@ -41,7 +41,7 @@ impl Asked {
     pub(in super::super) const fn probe(self) -> Probe<'static> {
         match self.namespace {
             None => Probe::PubSubConnections {
-                transport_profile_uris: List::null(),
+                transport_profile_uris: WireArray::null(),
                 include_writer_groups: false,
                 include_data_set_writers: false,
             },
@@ -61,15 +61,15 @@ impl Asked {
 /// The spaces and namespaces that are probed for their calls.
 #[derive(Debug, Default)]
 pub(super) struct Rolls {
-    timers: BTreeMap<Asked, ProbeTimer>,
+    timers: BTreeMap<ProbedCalls, ProbeTimer>,
     /// Namespaces with a program that was already probed for its calls.
     met: HashSet<(SpaceId, u16)>,
 }
 
 impl Rolls {
     /// Plans a probe, unless a probe for these calls is in progress.
-    pub(super) fn plan(&mut self, asked: Asked, (since, random): (Duration, u32)) {
-        if self.timers.contains_key(&Asked::space(asked.space)) {
+    pub(super) fn plan(&mut self, asked: ProbedCalls, (since, random): (Duration, u32)) {
+        if self.timers.contains_key(&ProbedCalls::space(asked.space)) {
             return;
         }
         let limits = ProbeLimits {
@@ -85,12 +85,12 @@ impl Rolls {
     pub(super) fn meet(&mut self, topic: TopicId, at: (Duration, u32)) {
         let (_, namespace, _) = topic.triple();
         if self.met.len() < MAX_MET && self.met.insert((topic.space, namespace)) {
-            self.plan(Asked::namespace(topic.space, namespace), at);
+            self.plan(ProbedCalls::namespace(topic.space, namespace), at);
         }
     }
 
     /// Records the probe of another program. Its answer serves this program too.
-    pub(super) fn handle_probe(&mut self, other: Asked, since: Duration) {
+    pub(super) fn handle_probe(&mut self, other: ProbedCalls, since: Duration) {
         for (asked, timer) in &mut self.timers {
             if other.includes(*asked) {
                 timer.handle_probe(since);
@@ -102,8 +102,8 @@ impl Rolls {
     pub(super) fn handle_answer(&mut self, topic: TopicId) {
         let (_, namespace, _) = topic.triple();
         for asked in [
-            Asked::space(topic.space),
-            Asked::namespace(topic.space, namespace),
+            ProbedCalls::space(topic.space),
+            ProbedCalls::namespace(topic.space, namespace),
         ] {
             if let Some(timer) = self.timers.get_mut(&asked) {
                 timer.handle_answer();
@@ -117,7 +117,7 @@ impl Rolls {
     }
 
     /// Returns the probes that are due.
-    pub(super) fn poll(&mut self, (since, random): (Duration, u32)) -> Vec<Asked> {
+    pub(super) fn poll(&mut self, (since, random): (Duration, u32)) -> Vec<ProbedCalls> {
         let mut due = Vec::new();
         self.timers.retain(|asked, timer| {
             let turn =

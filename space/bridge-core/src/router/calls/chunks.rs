@@ -6,7 +6,7 @@ use std::collections::{BTreeMap, VecDeque};
 use mappings::TopicId;
 use uadp::action::{ActionKind, ActionToSend};
 use uadp::{
-    ChunkBudget, ChunkError, Chunks, Extras, GroupHeader, NetworkHeader, NetworkMessageType,
+    ChunkBudget, ChunkEncoder, ChunkError, Extras, GroupHeader, NetworkHeader, NetworkMessageType,
     PublisherId, Whole,
 };
 
@@ -136,7 +136,8 @@ impl Large {
             trailer: 0,
         };
         let extras = Extras::default();
-        let mut chunks = Chunks::new(&header, &extras, whole, budget)?.resumed_at(self.offset);
+        let mut chunks =
+            ChunkEncoder::new(&header, &extras, whole, budget)?.resumed_at(self.offset);
         chunks.append(out, &extras).transpose()?;
         self.offset = chunks.offset();
         Ok(())

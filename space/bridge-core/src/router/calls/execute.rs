@@ -7,22 +7,22 @@ use std::time::{Duration, Instant};
 use mappings::{PubSub, SpaceId, TopicId};
 use messages::MessageType;
 use uadp::action::{
-    ActionFields, ActionMessage, ExecutionId, FinishRefusal, Outcome, Refusal, RequestDrop,
-    RequestOrigin, Requested,
+    ActionFields, ActionMessage, ActionOutcome, ExecutionId, FinishRefusal, Refusal, RequestDrop,
+    RequestOrigin, RequiredAction,
 };
 use uadp::{Fields, StatusCode};
 
-use super::super::About;
-use super::super::values::Values;
+use super::super::DropSite;
+use super::super::values::TopicQueues;
 use super::CallTraffic;
-use super::own::{Own, Running};
+use super::own::{Own, RunningRequest};
 use crate::call::{
-    CallDescription, CallField, CallTypeError, Executed, Execution, Offered, OfferedType,
+    CallDescription, CallExecution, CallField, CallTypeError, Executed, OfferedCall, OfferedType,
 };
-use crate::call_announcement::{CallAnnouncement, LASTING_TARGET, Types};
+use crate::call_announcement::{CallAnnouncement, CallTypes, LASTING_TARGET};
 use crate::call_plan::ExecutedPlan;
-use crate::counters::{Cause, Reason};
-use crate::loop_rule::{Side, What};
+use crate::counters::{DropCause, Reason};
+use crate::loop_rule::{Crosses, Side};
 use crate::network::number_of;
 use crate::output::Output;
 use crate::settings::Now;
@@ -30,8 +30,8 @@ use crate::settings::Now;
 impl CallTraffic<'_> {
     /// Adds or changes a call that the local side executes, and announces it. Calls of namespaces
     /// that this program does not own are ignored.
-    pub(in super::super) fn offer(&mut self, topic: TopicId, offered: Offered, now: Now) {
-        let Offered { description, open } = offered;
+    pub(in super::super) fn offer(&mut self, topic: TopicId, offered: OfferedCall, now: Now) {
+        let OfferedCall { description, open } = offered;
         self.offer_as(topic, (&description, None), (open, None), now);
     }
 
@@ -67,7 +67,7 @@ impl CallTraffic<'_> {
             request: fields(service.request()),
             response: fields(service.response()),
         };
-        let types = Types {
+        let types = CallTypes {
             request: service.request(),
             response: service.response(),
         };
@@ -79,14 +79,14 @@ impl CallTraffic<'_> {
     fn offer_as(
         &mut self,
         topic: TopicId,
-        (description, types): (&CallDescription, Option<Types<'_>>),
+        (description, types): (&CallDescription, Option<CallTypes<'_>>),
         (open, plan): (bool, Option<Arc<ExecutedPlan>>),
         now: Now,
     ) {
         if !self.values.is_home(topic) {
             return self
                 .values
-                .count(About::topic(topic), Reason::Looped, 1, String::new);
+                .count(DropSite::topic(topic), Reason::Looped, 1, String::new);
         }
         let mapping = Arc::clone(&self.values.mapping);
         let namespaces = mapping.namespaces();
@@ -155,7 +155,8 @@ impl CallTraffic<'_> {
         from: SocketAddr,
         now: Now,
     ) {
-        if !self.values.may_cross(Side::Ua, What::Request, topic) || self.values.is_withheld(topic)
+        if !self.values.may_cross(Side::Ua, Crosses::Request, topic)
+            || self.values.is_withheld(topic)
         {
             return self.count_call(topic, Some(from), Reason::NotAsked, String::new);
         }
@@ -177,7 +178,7 @@ impl CallTraffic<'_> {
         let Some(calls) = &mut self.calls else {
             return self
                 .values
-                .count(About::sender(from), Reason::NotAsked, 1, String::new);
+                .count(DropSite::sender(from), Reason::NotAsked, 1, String::new);
         };
         let since = calls.since_start(now);
         let own = calls.table.get(&topic).and_then(|call| call.own.as_ref());
@@ -193,8 +194,8 @@ impl CallTraffic<'_> {
         match requested {
             // An earlier instance of this program may have executed the request with an unknown
             // result.
-            Ok(Requested::Execute(id)) if !calls.is_of_this_life(request) => {
-                let lost = Outcome::Unknown(uadp::action::Unknown::Lost);
+            Ok(RequiredAction::Execute(id)) if !calls.is_of_this_life(request) => {
+                let lost = ActionOutcome::Unknown(uadp::action::Unknown::Lost);
                 // The requestor receives the outcome when it repeats the request.
                 let _told = calls.responder.finish(id, lost, since).is_ok();
                 let cause = (Reason::CallRefused, "earlier life");
@@ -208,30 +209,30 @@ impl CallTraffic<'_> {
                     }
                 });
             }
-            Ok(Requested::Execute(id)) => {
+            Ok(RequiredAction::Execute(id)) => {
                 if let Ok((fields, plan)) = judged {
                     let read = self.read_request(plan.as_deref(), fields);
                     self.execute((topic, id), (request, read, plan), now);
                 }
             }
-            Ok(Requested::Declined(_)) => {
+            Ok(RequiredAction::Declined(_)) => {
                 if let Err((_, case, detail)) = judged {
                     let cause = (Reason::CallRefused, case);
                     self.count_call(topic, Some(from), cause, || detail);
                 }
             }
-            Ok(Requested::Refused(..)) => {
+            Ok(RequiredAction::Refused(..)) => {
                 let cause = (Reason::CallRefused, "busy");
                 self.count_call(topic, Some(from), cause, || {
                     "the limit of simultaneous executions is reached".to_owned()
                 });
             }
-            Ok(Requested::Abandoned(execution)) => {
+            Ok(RequiredAction::Abandoned(execution)) => {
                 if calls.executions.contains_key(&execution) {
                     calls.news.push_back(Output::Abandoned { execution, topic });
                 }
             }
-            Ok(Requested::Repeated(_) | Requested::Closed(_)) => {}
+            Ok(RequiredAction::Repeated(_) | RequiredAction::Closed(_)) => {}
             // A repetition of a refused request, or its acknowledgement. The refusal itself is
             // already counted.
             Err(RequestDrop::Refused) => {
@@ -285,7 +286,7 @@ impl CallTraffic<'_> {
         &mut self,
         plan: Option<&ExecutedPlan>,
         fields: &[u8],
-    ) -> Result<Vec<u8>, (Cause, String)> {
+    ) -> Result<Vec<u8>, (DropCause, String)> {
         let mut request = self.values.buffer();
         match plan {
             Some(plan) => plan.request(fields, &mut request)?,
@@ -319,7 +320,7 @@ impl CallTraffic<'_> {
             Some(_) => deadline.min(now.monotonic + START_WITHIN),
             None => deadline,
         };
-        let running = Running {
+        let running = RunningRequest {
             topic,
             deadline,
             plan,
@@ -329,7 +330,7 @@ impl CallTraffic<'_> {
             call.counters.executed += 1;
         }
         let (number, _) = number_of(request.action.requestor_id);
-        calls.news.push_back(Output::Execute(Execution {
+        calls.news.push_back(Output::Execute(CallExecution {
             id,
             topic,
             request: block,
@@ -349,7 +350,7 @@ impl CallTraffic<'_> {
         let Some(calls) = &mut self.calls else {
             return;
         };
-        let Some(Running { topic, plan, .. }) = calls.executions.remove(&execution) else {
+        let Some(RunningRequest { topic, plan, .. }) = calls.executions.remove(&execution) else {
             return;
         };
         let since = calls.since_start(now);
@@ -364,22 +365,22 @@ impl CallTraffic<'_> {
         let told = match &outcome {
             Executed::Answered(fields) => {
                 match Fields::parse(fields).and_then(|of| of.checked_bytes()) {
-                    Ok(fields) => Outcome::Answered {
+                    Ok(fields) => ActionOutcome::Answered {
                         status: StatusCode::GOOD,
                         fields: ActionFields::Variants(fields),
                     },
-                    Err(_) => Outcome::Answered {
+                    Err(_) => ActionOutcome::Answered {
                         status: BAD_ENCODING_ERROR,
                         fields: ActionFields::NONE,
                     },
                 }
             }
-            Executed::Failed(status) => Outcome::Answered {
+            Executed::Failed(status) => ActionOutcome::Answered {
                 status: *status,
                 fields: ActionFields::NONE,
             },
-            Executed::Refused(refusal) => Outcome::Refused(*refusal),
-            Executed::Lost => Outcome::Unknown(uadp::action::Unknown::Lost),
+            Executed::Refused(refusal) => ActionOutcome::Refused(*refusal),
+            Executed::Lost => ActionOutcome::Unknown(uadp::action::Unknown::Lost),
         };
         let finished = calls.responder.finish(execution, told, since);
         calls.reckon();
@@ -403,11 +404,11 @@ impl CallTraffic<'_> {
     }
 }
 
-impl super::Calls {
+impl super::RouterCalls {
     /// Sends the announcement of an own call.
     pub(in super::super) fn announce(
         &self,
-        values: &mut Values,
+        values: &mut TopicQueues,
         topic: TopicId,
         sequence: u16,
         now: Now,
@@ -438,7 +439,7 @@ impl super::Calls {
 }
 
 /// A request in the local encoding, or the reason why it cannot be converted.
-type ReadRequest = Result<Vec<u8>, (Cause, String)>;
+type ReadRequest = Result<Vec<u8>, (DropCause, String)>;
 /// The fields of a request, and the plan to read them if the local side uses ROS messages.
 type Executable<'a> = (&'a [u8], Option<Arc<ExecutedPlan>>);
 

@@ -8,7 +8,7 @@ use crate::call::CallDescription;
 
 /// The known state of a call.
 #[derive(Debug)]
-pub(super) struct Known {
+pub(super) struct CallState {
     pub(super) description: Arc<CallDescription>,
     /// The address of the executor.
     pub(super) from: SocketAddr,
@@ -25,7 +25,7 @@ pub(super) struct Known {
 /// The executor of the calls of a namespace: a single program, which usually also sends values in
 /// the namespace.
 #[derive(Debug)]
-pub(super) struct Group {
+pub(super) struct NamespaceExecutor {
     pub(super) from: SocketAddr,
     /// The time of the last announcement of a call.
     pub(super) said: Instant,
@@ -41,7 +41,7 @@ pub(super) struct Group {
     pub(super) asked: bool,
 }
 
-impl Group {
+impl NamespaceExecutor {
     /// Returns whether the program must be probed because its values are missing. Its values also
     /// end when their producer leaves, while the program still executes calls.
     pub(super) fn is_to_be_asked(&self, now: Instant, missing: Duration) -> bool {

@@ -8,9 +8,9 @@ use std::time::{Duration, Instant};
 use mappings::{SpaceId, TopicId};
 use uadp::discovery::ActionMetaData;
 
-use super::super::About;
-use super::executors::{Group, Known};
-use super::{CallTraffic, Calls};
+use super::super::DropSite;
+use super::executors::{CallState, NamespaceExecutor};
+use super::{CallTraffic, RouterCalls};
 use crate::call::{CallDescription, CallRole, split_name};
 use crate::call_announcement;
 use crate::counters::Reason;
@@ -18,7 +18,7 @@ use crate::learned::Weight;
 use crate::output::Output;
 use crate::settings::Now;
 
-impl Calls {
+impl RouterCalls {
     /// Records a received message with values of the namespace.
     #[inline]
     pub(in super::super) fn heard(
@@ -102,7 +102,7 @@ impl CallTraffic<'_> {
         let Some((topic, name)) = named else {
             return self
                 .values
-                .count(About::sender(from), Reason::NotInSpace, 1, String::new);
+                .count(DropSite::sender(from), Reason::NotInSpace, 1, String::new);
         };
         let (_, namespace, _) = topic.triple();
         if self.values.is_unsaid(self.security, Some(namespace), from) {
@@ -190,7 +190,7 @@ impl CallTraffic<'_> {
             });
         }
         let group = calls.groups.entry((topic.space, namespace));
-        let group = group.or_insert(Group {
+        let group = group.or_insert(NamespaceExecutor {
             from,
             said: now.monotonic,
             heard: None,
@@ -211,7 +211,7 @@ impl CallTraffic<'_> {
                 (known.said, known.gone) = (now.monotonic, false);
             }
             known => {
-                let before = known.replace(Known {
+                let before = known.replace(CallState {
                     description: Arc::new(description),
                     from,
                     target,

@@ -19,7 +19,7 @@ pub(super) struct Own {
 
 /// A request that the local side executes.
 #[derive(Debug)]
-pub(super) struct Running {
+pub(super) struct RunningRequest {
     pub(super) topic: TopicId,
     pub(super) deadline: Instant,
     /// The plan with which the request was read. A later change of the call does not affect the

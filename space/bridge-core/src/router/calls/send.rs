@@ -60,11 +60,11 @@ impl CallTraffic<'_> {
             }
             let mut bytes = self.values.buffer();
             match self.write_action(&mut bytes, now) {
-                Some(Told::Datagram(topic, _)) if bytes.len() <= self.most() => {
+                Some(CallOutput::Datagram(topic, _)) if bytes.len() <= self.most() => {
                     return Some(Output::Action { topic, bytes });
                 }
-                Some(Told::Datagram(topic, of)) => self.cut_up(topic, of, bytes),
-                Some(Told::News(output)) => {
+                Some(CallOutput::Datagram(topic, of)) => self.cut_up(topic, of, bytes),
+                Some(CallOutput::News(output)) => {
                     self.values.recycle(bytes);
                     return Some(output);
                 }
@@ -76,7 +76,7 @@ impl CallTraffic<'_> {
         }
     }
 
-    fn write_action(&mut self, bytes: &mut Vec<u8>, now: Now) -> Option<Told> {
+    fn write_action(&mut self, bytes: &mut Vec<u8>, now: Now) -> Option<CallOutput> {
         let headers = Headers {
             timed: timed_header(now),
             of_chunks: self.values.chunk_header(now),
@@ -85,7 +85,7 @@ impl CallTraffic<'_> {
         loop {
             let calls = self.calls.as_mut()?;
             if let Some(news) = calls.news.pop_front() {
-                return Some(Told::News(news));
+                return Some(CallOutput::News(news));
             }
             if calls.due.is_none_or(|due| due > now.monotonic) {
                 return None;
@@ -103,10 +103,10 @@ impl CallTraffic<'_> {
                 None => {
                     self.settle(now);
                     let calls = self.calls.as_mut()?;
-                    return calls.news.pop_front().map(Told::News);
+                    return calls.news.pop_front().map(CallOutput::News);
                 }
                 Some((of, (Some(topic), Ok(())))) if !self.values.is_withheld(topic) => {
-                    return Some(Told::Datagram(topic, of));
+                    return Some(CallOutput::Datagram(topic, of));
                 }
                 Some((_, (Some(topic), Ok(())))) => {
                     self.count_call(topic, None, (Reason::SpaceTaken, "withheld"), String::new);
@@ -124,7 +124,7 @@ impl CallTraffic<'_> {
 }
 
 /// The next output about calls.
-enum Told {
+enum CallOutput {
     News(Output),
     Datagram(TopicId, Of),
 }

@@ -7,12 +7,12 @@
 
 use mappings::TopicId;
 use uadp::StatusCode;
-use uadp::action::{CallId, Outcome, Refusal, Unknown};
+use uadp::action::{ActionOutcome, CallId, Refusal, Unknown};
 
 use super::CallTraffic;
 use crate::call::{AskError, AskErrorKind};
 use crate::call_announcement::{target_of, target_of_term};
-use crate::counters::{Cause, Reason};
+use crate::counters::{DropCause, Reason};
 use crate::output::Output;
 use crate::settings::Now;
 
@@ -65,7 +65,7 @@ impl CallTraffic<'_> {
             // The requestor receives the outcome from this program if it is active again.
             let _told = calls
                 .responder
-                .finish(execution.id, Outcome::Unknown(Unknown::Lost), since)
+                .finish(execution.id, ActionOutcome::Unknown(Unknown::Lost), since)
                 .is_ok();
             self.values.recycle(execution.request);
             let cause = (Reason::Takeover, "execution");
@@ -112,7 +112,7 @@ impl CallTraffic<'_> {
 ///
 /// The clients of a server that shows values at standby are connected to a single server, so that
 /// the request is refused.
-pub(super) fn not_asked(is_server: bool) -> (Cause, AskError) {
+pub(super) fn not_asked(is_server: bool) -> (DropCause, AskError) {
     if is_server {
         let text = "this server is the standby of a redundant set; call the Method at the server with the higher \
                     ServiceLevel";
@@ -129,7 +129,7 @@ pub(super) fn not_asked(is_server: bool) -> (Cause, AskError) {
 
 /// Returns the outcome of a request that this program does not send, because another bridge of the
 /// space carries the namespace: that bridge may have received the request of the local side too.
-pub(super) fn not_carried(namespace: u16) -> (Cause, AskError) {
+pub(super) fn not_carried(namespace: u16) -> (DropCause, AskError) {
     let text = format!(
         "another bridge of the space carries namespace {namespace}, so it is unknown whether the call was executed"
     );

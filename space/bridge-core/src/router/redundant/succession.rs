@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use mappings::Lasting;
 
-use crate::place::Place;
+use crate::place::SequencePosition;
 use crate::redundancy::{SenderClocks, SentAt};
 use crate::settings::Now;
 
@@ -23,7 +23,7 @@ impl Succession {
     /// still hold messages that precede it.
     pub(super) fn relation(
         self,
-        place: &Place,
+        place: &SequencePosition,
         clocks: &SenderClocks,
         now: Now,
     ) -> Option<SinceTakeover> {
@@ -63,7 +63,7 @@ impl SinceTakeover {
     /// active.
     pub(in crate::router) fn is_preceded_by(
         self,
-        place: &Place,
+        place: &SequencePosition,
         (lasting, within): (Lasting, Option<Duration>),
     ) -> bool {
         let age = place.stamp.zip(place.sent).map(|(stamp, sent)| {

@@ -4,13 +4,14 @@ use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use bytes::Bytes;
-use messages::{ActionCalls, MessageType, Registry, ServiceType, TypeName, Wire};
+use messages::{ActionCalls, MessageType, ServiceType, TypeName, TypeRegistry, Wire};
 use tokio::sync::{mpsc, oneshot};
 use uadp::BuiltinType;
 
 use super::super::{
-    ActionClient, ActionGraph, ActionServer, CancelAnswer, CancelRequest, CancelWhat, GoalEvent,
-    GoalId, NewGoal, SentGoal, ServedGoal, ServerEvent, Waits,
+    ActionGraph, GraphActionClient, GraphActionServer, GraphCancelRequest, GraphCancelResponse,
+    GraphCancelSelection, GraphGoalEvent, GraphGoalId, GraphNewGoal, GraphServerEvent, SentGoal,
+    ServedGoal, Waits,
 };
 use crate::services::{CallFault, ServiceCall};
 use crate::{Asker, CallGraph, GraphError, ServiceGraph};
@@ -18,24 +19,24 @@ use crate::{Asker, CallGraph, GraphError, ServiceGraph};
 /// The graph on either side. Requests to its servers and events for its clients go through
 /// channels.
 pub(super) struct Fake {
-    pub(super) registry: Registry,
+    pub(super) registry: TypeRegistry,
     pub(super) sent: mpsc::Sender<Sent>,
     pub(super) cancels: mpsc::Sender<Cancel>,
     /// The events of the server of an action of another space.
-    pub(super) events: Mutex<Option<mpsc::Receiver<ServerEvent<New, Request>>>>,
+    pub(super) events: Mutex<Option<mpsc::Receiver<GraphServerEvent<New, FakeRequest>>>>,
     pub(super) served: Arc<Mutex<Vec<String>>>,
 }
 
 /// A goal that a server of the graph has received.
 pub(super) struct Sent {
-    pub(super) id: GoalId,
+    pub(super) id: GraphGoalId,
     pub(super) body: Bytes,
-    pub(super) say: mpsc::Sender<GoalEvent>,
+    pub(super) say: mpsc::Sender<GraphGoalEvent>,
 }
 
 pub(super) struct Cancel {
-    pub(super) what: CancelWhat,
-    pub(super) answer: oneshot::Sender<Result<CancelAnswer, CallFault>>,
+    pub(super) what: GraphCancelSelection,
+    pub(super) answer: oneshot::Sender<Result<GraphCancelResponse, CallFault>>,
 }
 
 pub(super) struct Never;
@@ -79,23 +80,28 @@ impl CallGraph for Fake {
 }
 
 impl ActionGraph for Fake {
-    type Sender = Client;
-    type Taker = Server;
+    type Sender = FakeActionClient;
+    type Taker = FakeActionServer;
 
     fn action_calls(&mut self, name: &TypeName) -> Result<Arc<ActionCalls>, GraphError> {
         Ok(Arc::new(self.registry.action_calls(name)?))
     }
 
-    fn action_client(&mut self, _: &str, _: &TypeName, _: Waits) -> Result<Client, GraphError> {
-        Ok(Client {
+    fn action_client(
+        &mut self,
+        _: &str,
+        _: &TypeName,
+        _: Waits,
+    ) -> Result<FakeActionClient, GraphError> {
+        Ok(FakeActionClient {
             sent: self.sent.clone(),
             cancels: self.cancels.clone(),
         })
     }
 
-    fn serve_action(&mut self, action: &str, _: &TypeName) -> Result<Server, GraphError> {
+    fn serve_action(&mut self, action: &str, _: &TypeName) -> Result<FakeActionServer, GraphError> {
         self.served.lock().unwrap().push(action.to_owned());
-        Ok(Server {
+        Ok(FakeActionServer {
             name: action.to_owned(),
             events: self
                 .events
@@ -108,30 +114,30 @@ impl ActionGraph for Fake {
     }
 }
 
-pub(super) struct Client {
+pub(super) struct FakeActionClient {
     sent: mpsc::Sender<Sent>,
     cancels: mpsc::Sender<Cancel>,
 }
 
-pub(super) struct Heard(mpsc::Receiver<GoalEvent>);
+pub(super) struct Heard(mpsc::Receiver<GraphGoalEvent>);
 
 impl SentGoal for Heard {
-    async fn recv(&mut self) -> Option<GoalEvent> {
+    async fn recv(&mut self) -> Option<GraphGoalEvent> {
         self.0.recv().await
     }
 }
 
-impl ActionClient for Client {
+impl GraphActionClient for FakeActionClient {
     type Goal = Heard;
 
-    fn send_goal(&self, id: GoalId, body: &[u8], _: Instant) -> Heard {
+    fn send_goal(&self, id: GraphGoalId, body: &[u8], _: Instant) -> Heard {
         let (say, heard) = mpsc::channel(16);
         let body = Bytes::copy_from_slice(body);
         self.sent.try_send(Sent { id, body, say }).ok().unwrap();
         Heard(heard)
     }
 
-    async fn cancel(&self, what: CancelWhat) -> Result<CancelAnswer, CallFault> {
+    async fn cancel(&self, what: GraphCancelSelection) -> Result<GraphCancelResponse, CallFault> {
         let (answer, answered) = oneshot::channel();
         let asked = self.cancels.send(Cancel { what, answer }).await;
         asked.ok().unwrap();
@@ -139,13 +145,13 @@ impl ActionClient for Client {
     }
 }
 
-pub(super) struct Server {
+pub(super) struct FakeActionServer {
     name: String,
-    events: mpsc::Receiver<ServerEvent<New, Request>>,
+    events: mpsc::Receiver<GraphServerEvent<New, FakeRequest>>,
     served: Arc<Mutex<Vec<String>>>,
 }
 
-impl Drop for Server {
+impl Drop for FakeActionServer {
     fn drop(&mut self) {
         self.served
             .lock()
@@ -154,11 +160,11 @@ impl Drop for Server {
     }
 }
 
-impl ActionServer for Server {
+impl GraphActionServer for FakeActionServer {
     type New = New;
-    type Cancel = Request;
+    type Cancel = FakeRequest;
 
-    async fn recv(&mut self) -> ServerEvent<New, Request> {
+    async fn recv(&mut self) -> GraphServerEvent<New, FakeRequest> {
         match self.events.recv().await {
             Some(event) => event,
             None => std::future::pending().await,
@@ -168,7 +174,7 @@ impl ActionServer for Server {
 
 /// An event that a client of the graph receives.
 #[derive(Debug, PartialEq, Eq)]
-pub(super) enum Told {
+pub(super) enum FakeReport {
     Accepted,
     Rejected(String),
     Feedback(Bytes),
@@ -176,15 +182,15 @@ pub(super) enum Told {
 }
 
 pub(super) struct New {
-    pub(super) id: GoalId,
+    pub(super) id: GraphGoalId,
     pub(super) body: Bytes,
-    pub(super) told: mpsc::Sender<Told>,
+    pub(super) told: mpsc::Sender<FakeReport>,
 }
 
-impl NewGoal for New {
+impl GraphNewGoal for New {
     type Goal = Taken;
 
-    fn id(&self) -> GoalId {
+    fn id(&self) -> GraphGoalId {
         self.id
     }
 
@@ -193,41 +199,43 @@ impl NewGoal for New {
     }
 
     async fn accept(self) -> Result<Taken, GraphError> {
-        self.told.try_send(Told::Accepted).unwrap();
+        self.told.try_send(FakeReport::Accepted).unwrap();
         Ok(Taken(self.told))
     }
 
     fn reject(self, why: &str) {
-        self.told.try_send(Told::Rejected(why.to_owned())).unwrap();
+        self.told
+            .try_send(FakeReport::Rejected(why.to_owned()))
+            .unwrap();
     }
 }
 
-pub(super) struct Taken(mpsc::Sender<Told>);
+pub(super) struct Taken(mpsc::Sender<FakeReport>);
 
 impl ServedGoal for Taken {
     fn execute(&self) {}
 
     fn feedback(&self, body: &[u8]) -> Result<(), GraphError> {
         let body = Bytes::copy_from_slice(body);
-        self.0.try_send(Told::Feedback(body)).unwrap();
+        self.0.try_send(FakeReport::Feedback(body)).unwrap();
         Ok(())
     }
 
     fn end(&self, status: i8, message: &str, result: Option<&[u8]>) -> Result<(), GraphError> {
         let result = result.map(Bytes::copy_from_slice);
-        let ended = Told::Ended(status, message.to_owned(), result);
+        let ended = FakeReport::Ended(status, message.to_owned(), result);
         self.0.try_send(ended).unwrap();
         Ok(())
     }
 }
 
-pub(super) struct Request {
-    pub(super) id: GoalId,
+pub(super) struct FakeRequest {
+    pub(super) id: GraphGoalId,
     pub(super) agreed: oneshot::Sender<bool>,
 }
 
-impl CancelRequest for Request {
-    fn id(&self) -> GoalId {
+impl GraphCancelRequest for FakeRequest {
+    fn id(&self) -> GraphGoalId {
         self.id
     }
 

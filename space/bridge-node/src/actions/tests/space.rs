@@ -5,47 +5,47 @@ use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use bridge_core::{
-    AskError, AskErrorKind, AskId, CallDescription, CallField, Executed, ExecutionId, Kept,
-    OfferedType,
+    AskError, AskErrorKind, AskId, CallDescription, CallField, Executed, ExecutionId, OfferedType,
+    ValueRelation,
 };
 use bytes::Bytes;
 use mappings::{Mapping, SpaceId, TopicId};
-use messages::{Dialect, MessageType, Registry};
+use messages::{Dialect, MessageType, TypeRegistry};
 use tokio::sync::{mpsc, oneshot};
 use tokio::time::timeout;
 use uadp::{StatusCode, Timestamp};
 
-use super::super::{Actions, GoalEvent, ServerEvent};
-use super::fakes::{Cancel, Fake, New, Request, Sent, Told};
+use super::super::{BridgeActions, GraphGoalEvent, GraphServerEvent};
+use super::fakes::{Cancel, Fake, FakeReport, FakeRequest, New, Sent};
 use super::{GOAL, ID, NAME, QUICK, TEXT};
 use crate::policy::Policy;
-use crate::port::{Delivery, Execution};
+use crate::port::{Execution, LocalDelivery};
 use crate::present::Present;
-use crate::{Calls, PortEvent, now};
+use crate::{PortEvent, SpaceCalls, now};
 
 /// A bridge of space 1 that executes, a bridge of space 2 that offers, and the space between them.
-pub(super) struct Space {
+pub(super) struct SimulatedSpace {
     graph: Fake,
-    pub(super) executing: Actions,
-    pub(super) offering: Actions,
+    pub(super) executing: BridgeActions,
+    pub(super) offering: BridgeActions,
     pub(super) policies: [Policy; 2],
-    pub(super) calls: Calls<()>,
+    pub(super) calls: SpaceCalls<()>,
     pub(super) asked: HashMap<ExecutionId, AskId>,
     next: u64,
     /// The servers of the graph of space 1.
     pub(super) present: Present,
     pub(super) sent: mpsc::Receiver<Sent>,
     pub(super) cancels: mpsc::Receiver<Cancel>,
-    clients: mpsc::Sender<ServerEvent<New, Request>>,
+    clients: mpsc::Sender<GraphServerEvent<New, FakeRequest>>,
     pub(super) statuses: Vec<Bytes>,
     pub(super) served: Arc<Mutex<Vec<String>>>,
     /// Whether no executor is known.
     pub(super) deserted: bool,
 }
 
-impl Space {
+impl SimulatedSpace {
     pub(super) fn new(mapping: &str) -> Self {
-        let mut registry = Registry::bundle(Dialect::Ros1);
+        let mut registry = TypeRegistry::bundle(Dialect::Ros1);
         registry.add_action(&NAME.parse().unwrap(), TEXT).unwrap();
         let (send, sent) = mpsc::channel(16);
         let (cancel, cancels) = mpsc::channel(16);
@@ -62,10 +62,10 @@ impl Space {
                 events: Mutex::new(Some(events)),
                 served: Arc::clone(&served),
             },
-            executing: Actions::default(),
-            offering: Actions::default(),
+            executing: BridgeActions::default(),
+            offering: BridgeActions::default(),
             policies: [1, 2].map(|space| policy(SpaceId::new(space).unwrap())),
-            calls: Calls::default(),
+            calls: SpaceCalls::default(),
             asked: HashMap::new(),
             next: 0,
             present: [(format!("/{GOAL}"), NAME.parse().ok())].into(),
@@ -156,13 +156,13 @@ impl Space {
             PortEvent::Sample { topic, payload, .. } if topic.triple().2 == 73 => {
                 assert!(self.offering.takes(&self.policies[1], topic));
                 let source = None;
-                let delivery = Delivery {
+                let delivery = LocalDelivery {
                     topic,
                     payload,
                     source,
                     status: 0,
                     instance: None,
-                    kept: Kept::Alone,
+                    kept: ValueRelation::Alone,
                     lasting: true,
                 };
                 self.offering.publish(&delivery).unwrap();
@@ -219,12 +219,12 @@ impl Space {
     }
 
     /// Sends a goal from a client of the graph of space 2.
-    pub(super) async fn client(&mut self) -> mpsc::Receiver<Told> {
+    pub(super) async fn client(&mut self) -> mpsc::Receiver<FakeReport> {
         let (told, heard) = mpsc::channel(16);
         let body = Bytes::copy_from_slice(&7_i32.to_le_bytes());
         let new = New { id: ID, body, told };
         let clients = self.clients.clone();
-        let sent = self.until(clients.send(ServerEvent::Goal(new))).await;
+        let sent = self.until(clients.send(GraphServerEvent::Goal(new))).await;
         sent.ok().unwrap();
         heard
     }
@@ -237,17 +237,17 @@ impl Space {
         goal
     }
 
-    pub(super) async fn told(&mut self, heard: &mut mpsc::Receiver<Told>) -> Told {
+    pub(super) async fn told(&mut self, heard: &mut mpsc::Receiver<FakeReport>) -> FakeReport {
         self.until(heard.recv()).await.unwrap()
     }
 
     /// Sends a goal as [`client`](Self::client) does, and waits until it is accepted on both sides.
-    pub(super) async fn running(&mut self) -> (Sent, mpsc::Receiver<Told>) {
+    pub(super) async fn running(&mut self) -> (Sent, mpsc::Receiver<FakeReport>) {
         let mut heard = self.client().await;
         let goal = self.server().await;
-        let accepted = GoalEvent::Accepted(Timestamp::from_unix_nanos(1_000));
+        let accepted = GraphGoalEvent::Accepted(Timestamp::from_unix_nanos(1_000));
         goal.say.send(accepted).await.unwrap();
-        assert_eq!(self.told(&mut heard).await, Told::Accepted);
+        assert_eq!(self.told(&mut heard).await, FakeReport::Accepted);
         (goal, heard)
     }
 
@@ -256,8 +256,10 @@ impl Space {
     pub(super) async fn cancel(&mut self) -> oneshot::Receiver<bool> {
         let (agreed, heard) = oneshot::channel();
         let clients = self.clients.clone();
-        let request = Request { id: ID, agreed };
-        let sent = self.until(clients.send(ServerEvent::Cancel(request))).await;
+        let request = FakeRequest { id: ID, agreed };
+        let sent = self
+            .until(clients.send(GraphServerEvent::Cancel(request)))
+            .await;
         sent.ok().unwrap();
         heard
     }

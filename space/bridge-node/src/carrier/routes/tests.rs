@@ -3,7 +3,7 @@ use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use uadp::action::{ActionCall, ActionEncoder, ActionHeader, ActionStart, ActionState};
 use uadp::discovery::Probe;
 use uadp::{
-    ChunkBudget, Chunks, DataSetHeader, DateTime, Extras, GroupHeader, NetworkHeader,
+    ChunkBudget, ChunkEncoder, DataSetHeader, DateTime, Extras, GroupHeader, NetworkHeader,
     NetworkMessageEncoder, Scalar, SecurityHeader, Whole,
 };
 
@@ -390,7 +390,7 @@ fn chunk(sent: Option<Timestamp>) -> Vec<u8> {
         trailer: 0,
     };
     let (header, extras) = (header(2, 5, sent), Extras::default());
-    let mut chunks = Chunks::new(&header, &extras, whole, budget).unwrap();
+    let mut chunks = ChunkEncoder::new(&header, &extras, whole, budget).unwrap();
     let mut bytes = Vec::new();
     chunks.append(&mut bytes, &extras).unwrap().unwrap();
     bytes

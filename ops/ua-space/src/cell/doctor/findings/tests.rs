@@ -1,18 +1,18 @@
 use std::net::Ipv4Addr;
 
-use super::super::super::pages::{CertificatePage, Page, TopicPage};
-use super::super::super::processes::Process;
-use super::super::facts::Announced;
+use super::super::super::pages::{CertificatePage, StatusPage, TopicPage};
+use super::super::super::processes::LocalProcess;
+use super::super::facts::AnnouncedApplication;
 use super::super::host::{InterfaceFacts, Route, Switch};
 use super::*;
-use crate::live::{Timing, TopicSeen};
+use crate::live::{SenderTiming, TopicSeen};
 
 /// Returns the facts of a host with one bridge, without any fault.
-fn healthy() -> Facts {
-    let mut facts = Facts {
+fn healthy() -> CellFacts {
+    let mut facts = CellFacts {
         version: "0.1.0".to_owned(),
         now: 1_790_000_000,
-        ..Facts::default()
+        ..CellFacts::default()
     };
     facts.group.address = "239.192.0.40:4840".to_owned();
     facts.group.seconds = 3.0;
@@ -40,12 +40,12 @@ fn healthy() -> Facts {
         destination: 0,
         mask: 0,
     });
-    facts.host.processes.push(Process {
+    facts.host.processes.push(LocalProcess {
         pid: 7,
         program: "bridge-ros1".to_owned(),
         open_files: 20,
         most_open_files: Some(1024),
-        ..Process::default()
+        ..LocalProcess::default()
     });
     for (path, value) in [(RMEM_MAX, 8 << 20), (IPFRAG_HIGH, 32 << 20)] {
         facts.host.settings.insert(path.to_owned(), value);
@@ -54,28 +54,28 @@ fn healthy() -> Facts {
     facts
 }
 
-fn announced(space: u16, from: &str) -> Announced {
-    Announced {
+fn announced(space: u16, from: &str) -> AnnouncedApplication {
+    AnnouncedApplication {
         space,
         from: from.to_owned(),
-        ..Announced::default()
+        ..AnnouncedApplication::default()
     }
 }
 
-fn page(program: &str, space: u8) -> Page {
-    let mut page = Page {
+fn page(program: &str, space: u8) -> StatusPage {
+    let mut page = StatusPage {
         program: program.to_owned(),
         version: Some("0.1.0".to_owned()),
         space,
         url: "http://127.0.0.1:9101".to_owned(),
-        ..Page::default()
+        ..StatusPage::default()
     };
     page.mapping.hash = "0123456789abcdef".to_owned();
     page
 }
 
 /// Returns the codes of the findings after a change of the healthy facts.
-fn after(change: impl FnOnce(&mut Facts)) -> Vec<&'static str> {
+fn after(change: impl FnOnce(&mut CellFacts)) -> Vec<&'static str> {
     let mut facts = healthy();
     change(&mut facts);
     of(&facts).iter().map(|one| one.code).collect()
@@ -169,7 +169,7 @@ fn settings_of_ros_2_that_hide_nodes_are_found() {
         ("ROS_DISCOVERY_SERVER", "10.0.0.1:11811", "D021"),
         ("RMW_IMPLEMENTATION", "rmw_zenoh_cpp", "D022"),
     ] {
-        let set = |facts: &mut Facts| {
+        let set = |facts: &mut CellFacts| {
             let variables = &mut facts.ros2.variables;
             variables.insert(name.to_owned(), value.to_owned());
         };
@@ -210,14 +210,14 @@ fn programs_that_disagree_are_found() {
     assert_eq!(types, ["D033"]);
     let version = after(|facts| {
         let version = Some("0.2.0".to_owned());
-        facts.pages.push(Page {
+        facts.pages.push(StatusPage {
             version,
             ..page("ua-server", 0)
         });
     });
     assert_eq!(version, ["D036"]);
     let clock = after(|facts| {
-        facts.group.senders.push(Timing {
+        facts.group.senders.push(SenderTiming {
             from: "10.0.0.6:4000".to_owned(),
             shortest_delay_us: -3_000_000,
         });
@@ -251,7 +251,7 @@ fn what_programs_report_is_found() {
     assert_eq!(stale, ["D037"]);
 }
 
-fn set(facts: &mut Facts, path: &str, value: u64) {
+fn set(facts: &mut CellFacts, path: &str, value: u64) {
     facts.host.settings.insert(path.to_owned(), value);
 }
 

@@ -1,15 +1,15 @@
 use std::net::SocketAddr;
 use std::path::PathBuf;
 
-use uadp::discovery::{Announced, DataSetMetaDataType, FieldMetaData, List};
+use uadp::discovery::{AnnouncedContent, DataSetMetaDataType, FieldMetaData, WireArray};
 use uadp::{
     BuiltinType, DataSetHeader, DataValue, GroupHeader, LocalizedText, PublisherId, Scalar,
     SecurityHeader, StatusCode, Timestamp, Variant,
 };
 
 use super::*;
-use crate::live::book::{Book, Kind, News};
-use crate::recorded::{Recorded, Unusable};
+use crate::live::book::{Book, DatagramContent, NameKind};
+use crate::recorded::{RecordingReader, UnusableValue};
 
 /// The time of arrival of the values.
 const ARRIVED: i128 = 1_700_000_000_123_456_789;
@@ -28,7 +28,7 @@ fn announced(topic: &str, kind: &str, fields: &[(&str, BuiltinType, i32)]) -> Ve
     let name = format!("{topic} Robot.Value");
     let announcement = Announcement {
         sequence_number: 1,
-        announced: Announced::DataSetMetaData {
+        announced: AnnouncedContent::DataSetMetaData {
             writer_id,
             meta_data: DataSetMetaDataType {
                 name: Some(&name),
@@ -36,7 +36,7 @@ fn announced(topic: &str, kind: &str, fields: &[(&str, BuiltinType, i32)]) -> Ve
                     locale: None,
                     text: Some(kind),
                 },
-                fields: List::new(&fields),
+                fields: WireArray::new(&fields),
                 ..DataSetMetaDataType::default()
             },
             status: StatusCode::GOOD,
@@ -93,32 +93,35 @@ fn key_frame(scalars: &[Scalar<'_>]) -> impl Fn(&DataSetHeader, &mut NetworkMess
 }
 
 /// Records the datagrams as MCAP, and reads the recording.
-fn again(name: &str, datagrams: &[Vec<u8>]) -> (Vec<Vec<u8>>, BTreeMap<Unusable, u64>) {
+fn again(name: &str, datagrams: &[Vec<u8>]) -> (Vec<Vec<u8>>, BTreeMap<UnusableValue, u64>) {
     let file = format!("{name}-{}.mcap", std::process::id());
     let file: PathBuf = std::env::temp_dir().join(file);
     let _before = std::fs::remove_file(&file);
-    let mut values = Values::new(Sink::create(&file).unwrap());
+    let mut values = ValueRecorder::new(RecordingFile::create(&file).unwrap());
     let mut book = Book::new();
     let from: SocketAddr = "127.0.0.1:5000".parse().unwrap();
     let now = Duration::from_secs(1);
     for datagram in datagrams {
         let message = NetworkMessage::decode(datagram).unwrap();
         book.handle((&message, from), now, &mut |news| match news {
-            News::Sample(sample) => {
-                assert_ne!(values.add(&sample, (now, ARRIVED)).unwrap(), Added::Dropped)
+            DatagramContent::Sample(sample) => {
+                assert_ne!(
+                    values.add(&sample, (now, ARRIVED)).unwrap(),
+                    RecordOutcome::Dropped
+                )
             }
-            News::Announced {
+            DatagramContent::Announced {
                 topic,
-                kind: Kind::Value,
+                kind: NameKind::Value,
                 described,
                 announcement,
                 ..
             } => values.described((topic, announcement), described, now),
-            News::Announced { .. } | News::Response(..) => {}
+            DatagramContent::Announced { .. } | DatagramContent::Response(..) => {}
         });
     }
     values.finish().unwrap();
-    let mut recorded = Recorded::open(&file).unwrap();
+    let mut recorded = RecordingReader::open(&file).unwrap();
     let mut all = Vec::new();
     while let Some(datagram) = recorded.next().unwrap() {
         assert_eq!(datagram.time, ARRIVED);
@@ -205,7 +208,7 @@ fn large_values_are_sent_in_chunks_and_values_without_a_type_are_counted() {
         value("ua_2_5_12", 1, &key_frame(&[Scalar::Byte(1)])),
     ];
     let (all, unusable) = again("large", &datagrams);
-    let wanted = [(Unusable::Undescribed, 1), (Unusable::Untyped, 1)];
+    let wanted = [(UnusableValue::Undescribed, 1), (UnusableValue::Untyped, 1)];
     assert_eq!(unusable, BTreeMap::from(wanted));
     let mut book = Book::new();
     let from: SocketAddr = "127.0.0.1:5000".parse().unwrap();
@@ -214,7 +217,7 @@ fn large_values_are_sent_in_chunks_and_values_without_a_type_are_counted() {
         assert!(datagram.len() <= 1472);
         let message = NetworkMessage::decode(datagram).unwrap();
         book.handle((&message, from), Duration::ZERO, &mut |news| {
-            if let News::Sample(sample) = news {
+            if let DatagramContent::Sample(sample) = news {
                 let first = sample.message.fields().unwrap().next().unwrap().unwrap();
                 texts.push(first == Variant::Scalar(Scalar::String(Some(&text))));
             }

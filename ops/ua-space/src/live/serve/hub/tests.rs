@@ -1,13 +1,13 @@
 use std::time::Duration;
 
-use bridge_node::Environment;
+use bridge_node::RosEnvironment;
 
 use super::*;
-use crate::live::channels::Channels;
-use crate::live::described::{Described, What};
-use crate::live::robot::Model;
+use crate::live::channels::TopicChannels;
+use crate::live::described::{AnnouncedDescription, DescribedKind};
+use crate::live::robot::RobotModelMessage;
 
-fn published(hub: &Hub, byte: u8, size: usize) {
+fn published(hub: &ViewerHub, byte: u8, size: usize) {
     hub.publish(&Publication {
         channel: 7,
         time: u64::from(byte),
@@ -16,8 +16,8 @@ fn published(hub: &Hub, byte: u8, size: usize) {
 }
 
 /// Returns a hub that offers channel 7.
-fn hub() -> Hub {
-    let hub = Hub::new("239.192.0.40:4840", Assets::default());
+fn hub() -> ViewerHub {
+    let hub = ViewerHub::new("239.192.0.40:4840", Assets::default());
     let topic = "ua_1_2_10".parse().unwrap();
     let offered = Offered {
         channel: 7,
@@ -27,7 +27,7 @@ fn hub() -> Hub {
     hub
 }
 
-fn text(client: &Client) -> Value {
+fn text(client: &ConnectedViewer) -> Value {
     let Next::Text(text) = client.next() else {
         panic!("no message of the protocol");
     };
@@ -94,18 +94,18 @@ fn a_viewer_subscribes_to_a_channel_once() {
 
 #[test]
 fn writers_whose_descriptions_alternate_leave_all_subscriptions_in_place() {
-    let hub = Hub::new("239.192.0.40:4840", Assets::default());
+    let hub = ViewerHub::new("239.192.0.40:4840", Assets::default());
     let topic: TopicId = "ua_1_2_10".parse().unwrap();
     let (_, client) = hub.connect().unwrap();
     text(&client);
-    let mut channels = Channels::new();
+    let mut channels = TopicChannels::new();
     let mut made = |description: &str| {
-        let described = Arc::new(Described {
+        let described = Arc::new(AnnouncedDescription {
             name: "Left.Speed".to_owned(),
             description: description.to_owned(),
             ros_topics: Vec::new(),
             command: false,
-            what: What::Value(Vec::new()),
+            what: DescribedKind::Value(Vec::new()),
         });
         let channel = channels.channel(topic, Some(&described), Duration::ZERO);
         channel.unwrap()
@@ -193,12 +193,12 @@ fn a_viewer_cannot_publish_and_the_number_of_viewers_is_limited() {
 
 #[test]
 fn each_subscriber_gets_the_model_of_a_robot_once() {
-    let hub = Hub::new("239.192.0.40:4840", Assets::default());
-    let model = Model {
+    let hub = ViewerHub::new("239.192.0.40:4840", Assets::default());
+    let model = RobotModelMessage {
         topic: "/robot_description".to_owned(),
         data: vec![1, 2, 3],
     };
-    let channel = Channels::new().of_model(&model).unwrap();
+    let channel = TopicChannels::new().of_model(&model).unwrap();
     hub.keep(&channel, (9, model.data));
     let subscribe = json!({
         "op": "subscribe",
@@ -228,11 +228,11 @@ fn files_are_requested_only_from_a_server_that_has_packages() {
     assert_eq!(without.handle(&client, fetch), None);
     assert_eq!(text(&client)["op"], "status");
 
-    let packages = Environment {
+    let packages = RosEnvironment {
         ros1: vec!["/opt/ros/noetic/share".into()],
         ros2: Vec::new(),
     };
-    let with = Hub::new("239.192.0.40:4840", Assets::new(packages));
+    let with = ViewerHub::new("239.192.0.40:4840", Assets::new(packages));
     let (_, client) = with.connect().unwrap();
     assert_eq!(text(&client)["capabilities"], json!(["assets"]));
     let uri = "package://arm/a.stl".to_owned();
