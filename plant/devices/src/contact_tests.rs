@@ -173,14 +173,10 @@ async fn grippers_of_two_lengths_touch_the_part_at_the_same_point() {
         time_scale: 20.0,
     });
     let line = "tcp://127.0.0.1:0".parse().unwrap();
-    let modbus = ServedDevice::start(
-        &line,
-        robotiq::UNIT,
-        Arc::new(fingers),
-        LineFaults::default(),
-    )
-    .await
-    .unwrap();
+    let faults = LineFaults::default();
+    let modbus = ServedDevice::start(&line, robotiq::UNIT, Arc::new(fingers), faults)
+        .await
+        .unwrap();
     let cup = schmalz::simulator::SchmalzSimulator::new(schmalz::simulator::SchmalzSettings {
         time_scale: 20.0,
         ..schmalz::simulator::SchmalzSettings::default()

@@ -349,22 +349,14 @@ impl Work {
         bounds::check(&query)?;
         let mut prepared = evaluator.for_query(query);
         if !dataset.default.is_empty() || !dataset.named.is_empty() {
-            let graphs = |names: &[String]| {
-                names
-                    .iter()
-                    .map(|name| NamedNode::new(name).map_err(|_| QueryFault::Graph(name.clone())))
-                    .collect::<Result<Vec<_>, _>>()
-            };
-            let default = graphs(&dataset.default)?
-                .into_iter()
-                .map(GraphName::from)
-                .collect();
-            let named = graphs(&dataset.named)?
-                .into_iter()
-                .map(Into::into)
-                .collect();
+            let default = graphs(&dataset.default)?;
+            let named = graphs(&dataset.named)?;
+            let (default, named) = (default.into_iter(), named.into_iter());
             // The dataset of the protocol takes precedence over FROM in the query.
-            prepared.dataset_mut().set_default_graph(default);
+            prepared
+                .dataset_mut()
+                .set_default_graph(default.map(GraphName::from).collect());
+            let named = named.map(Into::into).collect();
             prepared.dataset_mut().set_available_named_graphs(named);
         }
         let results = prepared
@@ -522,6 +514,12 @@ const LOOK: Duration = Duration::from_millis(25);
 const STACK: usize = 256 << 20;
 /// An update may contain many statements.
 pub(crate) const LARGEST_UPDATE: usize = 16 << 20;
+
+/// Reads the IRIs of graphs.
+fn graphs(names: &[String]) -> Result<Vec<NamedNode>, QueryFault> {
+    let read = |name: &String| NamedNode::new(name).map_err(|_| QueryFault::Graph(name.clone()));
+    names.iter().map(read).collect()
+}
 
 #[cfg(test)]
 mod tests {

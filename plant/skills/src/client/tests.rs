@@ -153,10 +153,8 @@ async fn a_lease_ends_with_its_session_and_a_refusal_has_its_code() {
         .await
         .unwrap_err();
     assert_eq!(status(strange), "BadInvalidArgument");
-    assert_eq!(
-        mine.state().await.unwrap().state,
-        ProgramMachineState::Ready
-    );
+    let state = mine.state().await.unwrap().state;
+    assert_eq!(state, ProgramMachineState::Ready);
     // The run continues after its session has closed, and its outcome is available to the next
     // session.
     mine.start(vec![("Force".to_owned(), 9.0.into())])

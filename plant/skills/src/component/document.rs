@@ -137,10 +137,7 @@ fn component(
         Some(node) => read_endpoint(node, reader),
         None => Some(DEFAULT_ENDPOINT.to_owned()),
     };
-    let security = security.map_or_else(
-        || vec![ComponentSecurity::None],
-        |node| read_security(node, reader),
-    );
+    let security = security.map(|node| read_security(node, reader));
     let nodesets = read_nodesets(nodesets, folder, reader);
     let lds = lds.map_or(Some(Lds::Local), |node| read_lds(node, reader));
     let open = open.map_or(Some(false), |node| reader.boolean(node));
@@ -168,7 +165,7 @@ fn component(
         application_uri: uri?,
         namespace: namespace?,
         endpoint: endpoint?,
-        security,
+        security: security.unwrap_or_else(|| vec![ComponentSecurity::None]),
         nodesets,
         lds: lds?,
         open: open?,

@@ -310,14 +310,7 @@ impl<C: GraphActionClient> Serving<C> {
         let (client, tell) = (Arc::clone(&self.client), self.tell.clone());
         self.tasks.spawn(async move {
             let answer = timeout_at(deadline.into(), cancel_each(&*client, what)).await;
-            let late = |_| {
-                Err(CallFault {
-                    text: "the server did not respond to the cancellation in time".to_owned(),
-                    may_pass: true,
-                    ran: MayHaveRun::Perhaps,
-                })
-            };
-            let answer = answer.unwrap_or_else(late);
+            let answer = answer.unwrap_or_else(|_| Err(late_cancellation()));
             drop(tell.send(News::Cancelled(run, single, answer)).await);
         });
         Ok(())
@@ -633,3 +626,12 @@ const NONE: i8 = 0;
 const TERMINATED: i8 = 3;
 /// Bad_UnexpectedError (OPC 10000-6, A.2): the server reports a failure.
 const BAD_UNEXPECTED_ERROR: StatusCode = StatusCode(0x8001_0000);
+
+/// Returns the fault of a cancellation without a response before its deadline.
+fn late_cancellation() -> CallFault {
+    CallFault {
+        text: "the server did not respond to the cancellation in time".to_owned(),
+        may_pass: true,
+        ran: MayHaveRun::Perhaps,
+    }
+}

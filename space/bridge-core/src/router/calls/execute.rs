@@ -176,9 +176,8 @@ impl CallTraffic<'_> {
         let known = origin.group != STRANGERS;
         let group = self.values.mapping.pubsub().address;
         let Some(calls) = &mut self.calls else {
-            return self
-                .values
-                .count(DropSite::sender(from), Reason::NotAsked, 1, String::new);
+            let values = &mut self.values;
+            return values.count(DropSite::sender(from), Reason::NotAsked, 1, String::new);
         };
         let since = calls.since_start(now);
         let own = calls.table.get(&topic).and_then(|call| call.own.as_ref());
