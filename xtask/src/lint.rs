@@ -9,7 +9,7 @@ use std::{
 use anyhow::Context as _;
 
 use crate::{
-    comments,
+    counts,
     patches::Patched,
     shell::{CommandOutcome, line, run as must, status, step, succeeds},
     workspace::Workspace,
@@ -19,7 +19,8 @@ const DENY: &str = "0.20.2";
 /// Time limit of the download of the advisory database, which has a few megabytes.
 const FETCH: Duration = Duration::from_secs(120);
 
-/// Checks formatting, the width of comments, lints and documentation. All checks run, so that one run shows every finding.
+/// Checks formatting, the width of comments, the names of types, lints and documentation. All checks
+/// run, so that one run shows every finding.
 ///
 /// # Errors
 /// Returns an error if cargo cannot be started or the patched sources cannot be prepared.
@@ -30,8 +31,10 @@ pub(crate) fn run(workspace: &Workspace) -> anyhow::Result<CommandOutcome> {
         "formatting",
         &mut workspace.cargo(&["fmt", "--all", "--check"]),
     )?;
-    if !comments::are_narrow(workspace)? {
-        checks.failed.push("width of comments".to_owned());
+    if !counts::have_not_risen(workspace)? {
+        checks
+            .failed
+            .push("width of comments, names of types".to_owned());
     }
     let clippy = ["clippy", "--workspace", "--all-targets", "--locked"];
     checks.run(

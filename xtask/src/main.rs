@@ -7,7 +7,7 @@
 
 mod bench;
 mod chart;
-mod comments;
+mod counts;
 mod demo;
 mod dist;
 mod docs;
