@@ -22,15 +22,16 @@
 //! decoded: the requests of all Requestors carry the PublisherId of the Responder, so only the
 //! ActionHeader identifies the message of a chunk, and a [`Reassembler`](crate::Reassembler) does
 //! not read it. UA-.NETStandard splits the encoded NetworkMessage instead. Such messages pass
-//! through [`Chunks`](crate::ChunkEncoder) and [`Reassembler`](crate::Reassembler) unchanged, as a
-//! [`Whole`](crate::Whole) without DataSetWriter.
+//! through [`ChunkEncoder`](crate::ChunkEncoder) and [`Reassembler`](crate::Reassembler) unchanged,
+//! as a [`Whole`](crate::Whole) without DataSetWriter.
 //! [`NetworkMessage::decode`](crate::NetworkMessage::decode) decodes its bytes.
 //!
 //! # Announcing
 //! An [`ActionMetaData`](crate::discovery::ActionMetaData) announcement describes the arguments,
 //! results and targets of an Action. A second announcement lists the connections with Action
-//! Responders ([`Announced::ActionResponder`](crate::discovery::AnnouncedContent)). The standard
-//! has no probe for either: a Responder sends the first unprompted when it changes (OPC 10000-14,
+//! Responders ([`AnnouncedContent::ActionResponder`](crate::discovery::AnnouncedContent)). The
+//! standard has no probe for either: a Responder sends the first unprompted when it changes (OPC
+//! 10000-14,
 //! 7.2.4.6.11). [`set_actions`](crate::discovery::Announcer::set_actions) lists the further probes
 //! that an [`Announcer`](crate::discovery::Announcer) responds to.
 //!

@@ -39,7 +39,7 @@ use open::{ChunkInsertion, CompletedWhole, KeyRef, OpenWhole};
 /// discovery message may be such a message: decode its [`bytes`](Reassembled::bytes) with
 /// [`NetworkMessage::decode`].
 ///
-/// See [`Chunks`](crate::ChunkEncoder) for an example.
+/// See [`ChunkEncoder`](crate::ChunkEncoder) for an example.
 #[derive(Debug)]
 pub struct Reassembler<S = ()> {
     limits: ReassemblyLimits,

@@ -4,7 +4,7 @@
 //! The listing has no socket and no clock. Send a query when [`Listing::due`] has passed, pass its
 //! result to [`Listing::answered`] or [`Listing::failed`], and call [`Listing::expire`] when
 //! [`Listing::expires`] has passed. [`Listing::answered`] returns the servers for
-//! [`Registry::listed`](crate::ServerRegistry::listed).
+//! [`ServerRegistry::listed`](crate::ServerRegistry::listed).
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::{Duration, Instant};

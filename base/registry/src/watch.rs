@@ -7,7 +7,7 @@ use crate::loss::ServerLoss;
 use crate::network::place;
 
 /// An endpoint to probe: open a connection to it, and pass the result to
-/// [`Registry::probed`](crate::ServerRegistry::probed).
+/// [`ServerRegistry::probed`](crate::ServerRegistry::probed).
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct EndpointProbe {
     /// The URL as registered or announced.

@@ -53,9 +53,9 @@ pub enum UnknownClients {
     #[default]
     Refuse,
     /// The channel is opened. The server decides on the rights of such clients by
-    /// [`Caller::certificate`].
+    /// [`SessionCaller::certificate`].
     ///
-    /// [`Caller::certificate`]: crate::server::Caller::certificate
+    /// [`SessionCaller::certificate`]: crate::server::SessionCaller::certificate
     Admit,
 }
 

@@ -21,8 +21,8 @@ impl TypeNameError {
 /// Error while creating a message type from the available definitions.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum DefinitionError {
-    /// No definition of that name; [`Registry::suggest`](crate::TypeRegistry::suggest) returns a
-    /// similar name.
+    /// No definition of that name; [`TypeRegistry::suggest`](crate::TypeRegistry::suggest) returns
+    /// a similar name.
     #[error("no definition of `{name}`{}", needed_by.as_ref().map(|by| format!(", which `{by}` uses")).unwrap_or_default())]
     Unknown {
         /// The missing type.
@@ -195,7 +195,7 @@ pub enum ValueFault {
     NoNumber,
 }
 
-/// Error of [`Plan::read`](crate::MessagePlan::read).
+/// Error of [`MessagePlan::read`](crate::MessagePlan::read).
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum ReadError<E> {
     /// The payload is not a message of the type.
@@ -226,7 +226,7 @@ pub enum ReadError<E> {
     },
 }
 
-/// Error of a [`Source`](crate::FieldSupplier) without the requested value.
+/// Error of a [`FieldSupplier`](crate::FieldSupplier) without the requested value.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum SourceError {
     /// No field is left.
@@ -294,7 +294,7 @@ pub enum WriteFault {
     Duration,
 }
 
-/// Error of [`Plan::write`](crate::MessagePlan::write); nothing was appended.
+/// Error of [`MessagePlan::write`](crate::MessagePlan::write); nothing was appended.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("{}{fault}", in_field(field))]
 pub struct WriteError {

@@ -2,7 +2,8 @@ use uadp::{BuiltinType, Scalar};
 
 use crate::{SourceError, TypeName};
 
-/// Receives the fields of a message, in the order of [`Plan::leaves`](crate::MessagePlan::leaves).
+/// Receives the fields of a message, in the order of
+/// [`MessagePlan::leaves`](crate::MessagePlan::leaves).
 ///
 /// A field is one of these sequences of calls:
 ///
@@ -62,8 +63,8 @@ pub trait FieldSink {
     fn end_structure(&mut self) -> Result<(), Self::Error>;
 }
 
-/// Supplies the fields of a message, in the order of [`Plan::leaves`](crate::MessagePlan::leaves):
-/// the mirror of [`FieldSink`].
+/// Supplies the fields of a message, in the order of
+/// [`MessagePlan::leaves`](crate::MessagePlan::leaves): the mirror of [`FieldSink`].
 ///
 /// An implementation returns exactly the requested builtin type or an error; it may convert values.
 /// A null array or text counts as empty.

@@ -137,9 +137,9 @@ impl MessageType {
 /// default type.
 ///
 /// DateTime is `std_msgs/Time`, which only ROS 1 has; ROS 2 has `builtin_interfaces/Time`, see
-/// [`Registry::standard_type`](crate::TypeRegistry::standard_type). Returns `None` for arrays and
-/// ByteStrings: the `MultiArray` types of std_msgs have a layout beside their data, so they have
-/// more than one field. Also returns `None` for builtin types without a ROS type.
+/// [`TypeRegistry::standard_type`](crate::TypeRegistry::standard_type). Returns `None` for arrays
+/// and ByteStrings: the `MultiArray` types of std_msgs have a layout beside their data, so they
+/// have more than one field. Also returns `None` for builtin types without a ROS type.
 pub fn standard_type(builtin: BuiltinType, array: bool) -> Option<TypeName> {
     let name = match builtin {
         _ if array => return None,

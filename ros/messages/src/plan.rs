@@ -388,7 +388,7 @@ fn given<'m>(
     each.filter_map(Result::transpose).collect()
 }
 
-/// Inserts a [`What::Run`] before steps that may be moved at once.
+/// Inserts a [`PlanStep::Run`] before steps that may be moved at once.
 fn coalesced(mut ops: &[Op]) -> Vec<Op> {
     let mut all = Vec::with_capacity(ops.len());
     while let Some((op, after)) = ops.split_first() {

@@ -25,7 +25,7 @@ pub const SECURITY: &str = if cfg!(feature = "security") {
 
 /// Returns the size in bytes of the largest serialized sample that all readers with the system's
 /// default socket buffers receive. A larger sample is not written, but refused
-/// ([`Refusal::TooLarge`](crate::outlet::OutletRefusal::TooLarge)).
+/// ([`OutletRefusal::TooLarge`](crate::outlet::OutletRefusal::TooLarge)).
 #[must_use]
 pub fn sample_size(readers: &[RemoteEndpoint]) -> usize {
     if readers.iter().any(RemoteEndpoint::is_fast_dds) {

@@ -157,7 +157,7 @@ impl BridgeActions {
     }
 
     /// Offers at most `most` waiting actions that `may` be offered under their names in this space.
-    /// `asker` returns the [`Asker`] of a call ([`Calls::asker`](crate::SpaceCalls::asker)).
+    /// `asker` returns the [`Asker`] of a call ([`SpaceCalls::asker`](crate::SpaceCalls::asker)).
     /// Reports the types of their calls and values.
     pub fn offer_waiting<G: ActionGraph>(
         &mut self,

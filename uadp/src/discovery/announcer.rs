@@ -70,23 +70,25 @@ pub struct AnnounceLimits {
 /// Subject of an announcement.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum AnnouncedSubject {
-    /// The application, as [`Announced::ApplicationDescription`](super::AnnouncedContent).
+    /// The application, as [`AnnouncedContent::ApplicationDescription`](super::AnnouncedContent).
     ApplicationInformation,
-    /// The Endpoints, as [`Announced::PublisherEndpoints`](super::AnnouncedContent).
+    /// The Endpoints, as [`AnnouncedContent::PublisherEndpoints`](super::AnnouncedContent).
     PublisherEndpoints,
-    /// The connections, as [`Announced::PubSubConnections`](super::AnnouncedContent).
+    /// The connections, as [`AnnouncedContent::PubSubConnections`](super::AnnouncedContent).
     PubSubConnections,
-    /// A WriterGroup, as [`Announced::DataSetWriterConfiguration`](super::AnnouncedContent).
+    /// A WriterGroup, as [`AnnouncedContent::DataSetWriterConfiguration`](super::AnnouncedContent).
     WriterGroupConfiguration(u16),
-    /// A DataSetWriter, as [`Announced::DataSetWriterConfiguration`](super::AnnouncedContent).
+    /// A DataSetWriter, as
+    /// [`AnnouncedContent::DataSetWriterConfiguration`](super::AnnouncedContent).
     DataSetWriterConfiguration(u16),
     /// The content of the DataSet of a DataSetWriter, as
-    /// [`Announced::DataSetMetaData`](super::AnnouncedContent).
+    /// [`AnnouncedContent::DataSetMetaData`](super::AnnouncedContent).
     DataSetMetaData(u16),
     /// The connections with Action Responders, as
-    /// [`Announced::ActionResponder`](super::AnnouncedContent).
+    /// [`AnnouncedContent::ActionResponder`](super::AnnouncedContent).
     ActionResponder,
-    /// The Action of a DataSetWriter, as [`Announced::ActionMetaData`](super::AnnouncedContent).
+    /// The Action of a DataSetWriter, as
+    /// [`AnnouncedContent::ActionMetaData`](super::AnnouncedContent).
     ActionMetaData(u16),
 }
 

@@ -24,7 +24,7 @@ pub enum Probe<'a> {
     /// Requests the configuration of these DataSetWriters and their WriterGroups.
     DataSetWriterConfiguration(WireArray<'a, u16>),
     /// Requests the configuration of a WriterGroup, which is announced as
-    /// [`Announced::DataSetWriterConfiguration`](super::AnnouncedContent).
+    /// [`AnnouncedContent::DataSetWriterConfiguration`](super::AnnouncedContent).
     WriterGroupConfiguration {
         /// Id of the WriterGroup.
         writer_group_id: u16,

@@ -186,9 +186,9 @@ pub enum RecipeValue {
     I32(i32),
     /// Value of [`RecipeType::F64`].
     F64(f64),
-    /// Value of [`Kind::Vector`].
+    /// Value of [`RecipeType::Vector`].
     Vector([f64; 6]),
-    /// Value of [`Kind::Triple`].
+    /// Value of [`RecipeType::Triple`].
     Triple([f64; 3]),
     /// Value of [`RecipeType::Whole`].
     Whole([i32; 6]),

@@ -77,7 +77,7 @@ impl TransitionEvent {
     }
 
     /// Raises the event on its source and on the Server object, as a ProgramTransitionEventType
-    /// without subtype. A [`Server`](super::OpcUaServer) also raises events of its own types.
+    /// without subtype. A [`OpcUaServer`](super::OpcUaServer) also raises events of its own types.
     pub fn raise(&self, subscriptions: &SubscriptionCache) {
         let types = [
             ObjectTypeId::ProgramTransitionEventType,

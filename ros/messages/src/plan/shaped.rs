@@ -36,7 +36,7 @@ pub enum ArrayPart {
     /// A field of a message of an array: `points[2].x`, or `status[name=lidar].level` with the
     /// name in the message itself.
     Inside {
-        /// The message: [`ArrayPart::Element`] or [`Part::Named`].
+        /// The message: [`ArrayPart::Element`] or [`ArrayPart::Named`].
         of: Box<Self>,
         /// The path of the field in the message.
         field: String,

@@ -22,8 +22,8 @@ pub enum GoalEvent {
     /// A server accepted the goal at this time of the server's clock. The first event, unless the
     /// goal ends before.
     Accepted(Ros2Time),
-    /// The goal changed to [`Status::Executing`] or [`GoalStatusCode::Canceling`]. A short state
-    /// may be skipped.
+    /// The goal changed to [`GoalStatusCode::Executing`] or [`GoalStatusCode::Canceling`]. A short
+    /// state may be skipped.
     Status(GoalStatusCode),
     /// Feedback of the server: the `X_Feedback`, CDR with its encapsulation header, in the server's
     /// byte order.

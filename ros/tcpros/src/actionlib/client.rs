@@ -137,7 +137,7 @@ impl ActionlibClient {
     }
 
     /// Sends a goal, the serialized `XGoal`. Never waits and never fails: a goal without any
-    /// subscriber is lost at once, see [`LostReason::NoServer`]. To send a goal to a server that is
+    /// subscriber is lost at once, see [`GoalLoss::NoServer`]. To send a goal to a server that is
     /// starting, wait for the server first.
     pub fn send_goal(&self, body: &[u8]) -> ActionlibGoal {
         let goal_id = self.shared.new_id();

@@ -145,8 +145,8 @@ impl TopicQueues {
         received.unwrap_or(now.utc)
     }
 
-    /// Binds a topic as [`Router::bind`] does. Returns whether it is a topic of the own space,
-    /// which is announced with its type.
+    /// Binds a topic as [`Router::bind`](super::Router::bind) does. Returns whether it is a topic
+    /// of the own space, which is announced with its type.
     pub(super) fn bind_type(
         &mut self,
         topic: TopicId,

@@ -62,7 +62,7 @@ struct Wanted {
 }
 
 impl Executors {
-    /// See [`Actions::reconcile`](super::BridgeActions::reconcile).
+    /// See [`BridgeActions::reconcile`](super::BridgeActions::reconcile).
     pub(super) fn reconcile<G: ActionGraph>(
         &mut self,
         (graph, policy): (&mut G, &mut Policy),
@@ -247,7 +247,7 @@ impl Executors {
         Ok(())
     }
 
-    /// See [`Actions::pending`](super::BridgeActions::pending).
+    /// See [`BridgeActions::pending`](super::BridgeActions::pending).
     pub(super) fn pending(&self) -> Vec<String> {
         self.pending.lines(now().monotonic)
     }

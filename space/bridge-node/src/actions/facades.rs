@@ -107,7 +107,7 @@ impl Target {
 }
 
 impl Facades {
-    /// See [`Actions::known`](super::BridgeActions::known).
+    /// See [`BridgeActions::known`](super::BridgeActions::known).
     pub(super) fn known(&mut self, topic: TopicId, described: &Arc<CallDescription>) {
         let CallRole::Goal(family) = described.role else {
             self.forget(topic);
@@ -137,7 +137,7 @@ impl Facades {
         self.known.insert(topic, known);
     }
 
-    /// See [`Actions::gone`](super::BridgeActions::gone).
+    /// See [`BridgeActions::gone`](super::BridgeActions::gone).
     pub(super) fn gone(&mut self, topic: TopicId, now: Instant) {
         match self.known.get(&topic).map(|known| &known.state) {
             Some(State::Offered(offered)) => {
@@ -154,8 +154,8 @@ impl Facades {
         }
     }
 
-    /// See [`Actions::tidy`](super::BridgeActions::tidy). Reports the calls and values that are
-    /// unbound.
+    /// See [`BridgeActions::tidy`](super::BridgeActions::tidy). Reports the calls and values that
+    /// are unbound.
     pub(super) fn tidy(&mut self, policy: &Policy, now: Instant) -> Vec<PortEvent> {
         while self.tasks.try_join_next().is_some() {}
         let silence = policy.mapping().pubsub().receive_timeout;
@@ -235,7 +235,7 @@ impl Facades {
         offered.collect()
     }
 
-    /// See [`Actions::offer_waiting`](super::BridgeActions::offer_waiting).
+    /// See [`BridgeActions::offer_waiting`](super::BridgeActions::offer_waiting).
     pub(super) fn offer_waiting<G: ActionGraph>(
         &mut self,
         (graph, policy): (&mut G, &mut Policy),

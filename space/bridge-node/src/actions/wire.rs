@@ -27,7 +27,7 @@ pub(super) struct GoalAnswer {
 pub(super) struct ForwardedResult {
     pub(super) status: i8,
     pub(super) message: String,
-    /// As in [`GoalEvent::Ended`](super::GraphGoalEvent::Ended).
+    /// As in [`GraphGoalEvent::Ended`](super::GraphGoalEvent::Ended).
     pub(super) result: Bytes,
 }
 

@@ -169,7 +169,7 @@ impl ViewerHub {
 
     /// Offers a channel of a topic, or a channel without a topic. The other channels of the topic
     /// stay, because writers with different descriptions may alternate.
-    /// [`Channels`](crate::live::channels::TopicChannels) limits their number.
+    /// [`TopicChannels`](crate::live::channels::TopicChannels) limits their number.
     pub(super) fn offer(&self, topic: Option<TopicId>, channel: &TopicChannel) {
         let mut state = self.state();
         let others = state.offered.entry(topic).or_default();
