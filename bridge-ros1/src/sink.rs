@@ -99,7 +99,7 @@ impl OpenPublisher {
         };
         match unqueued {
             Ok(()) => lost,
-            // Behind those that wait.
+            // The event follows the waiting events.
             Err(event) => lost + self.end_opening() + self.send(event),
         }
     }

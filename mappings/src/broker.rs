@@ -25,7 +25,7 @@ pub struct Broker {
     pub acl: bool,
     /// Whether the broker reports the loss of the program, which then alone uses its PublisherId.
     pub will: bool,
-    /// Certificates of authorities, as PEM; `None`: those of the system.
+    /// Certificates of authorities, as PEM; `None` for the certificates of the system.
     pub ca: Option<PathBuf>,
     /// Own certificate and key, as PEM.
     pub client: Option<(PathBuf, PathBuf)>,

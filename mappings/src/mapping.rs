@@ -242,8 +242,8 @@ impl Mapping {
         &self.server
     }
 
-    /// Returns the mapping for the redundant server of a rank, which counts from 1: its
-    /// ApplicationUri and its endpoint, if it is named, are those of the rank. Returns `None` if
+    /// Returns the mapping for the redundant server of a rank, which counts from 1. It has the
+    /// ApplicationUri of the rank, and the endpoint of the rank if it is named. Returns `None` if
     /// the mapping has no such server.
     #[must_use]
     pub fn for_rank(&self, rank: u8) -> Option<Self> {

@@ -53,7 +53,7 @@ pub struct PlacedChunk {
 ///     NetworkMessage, NetworkMessageEncoder, NetworkMessageType, PublisherId, Reassembler, Scalar,
 ///     Variant, Whole, };
 ///
-/// // A DataSetMessage alone: what stands behind the smallest NetworkMessage header, its one byte of flags.
+/// // A DataSetMessage alone, without the smallest NetworkMessage header (one byte of flags).
 /// let mut encoded = Vec::new();
 /// let mut message = NetworkMessageEncoder::new(&mut encoded, &NetworkHeader::default(), None)?;
 /// let mut fields = message.key_frame(&DataSetHeader { sequence_number: Some(7), ..DataSetHeader::default() })?;

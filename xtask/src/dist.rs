@@ -314,8 +314,8 @@ fn files(folder: &Path) -> anyhow::Result<Vec<PathBuf>> {
     Ok(paths)
 }
 
-/// Returns a folder with programs whose help texts are those of the packaged program: links of it,
-/// or the programs of this machine if it does not run here.
+/// Returns a folder with programs that have the help texts of the packaged program: links to it, or
+/// the programs of this machine if the packaged program does not run here.
 fn runnable(workspace: &Workspace, machine: Machine, program: &Path) -> anyhow::Result<PathBuf> {
     if !machine.is_host() {
         build(workspace)?;

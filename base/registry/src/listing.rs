@@ -114,8 +114,8 @@ impl Listing {
         self.answered.map(|answered| answered + valid_for)
     }
 
-    /// Handles a complete answer, and returns its usable servers. They replace those of the answer
-    /// before.
+    /// Handles a complete answer, and returns its usable servers. They replace the servers of the
+    /// previous answer.
     pub fn answered(&mut self, servers: Vec<ListedServer>, now: Instant) -> Vec<AnnouncedServer> {
         self.due = now + self.settings.every;
         self.failures = 0;

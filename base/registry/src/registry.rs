@@ -115,8 +115,8 @@ pub struct ServerRegistry {
     /// registration expires.
     away: BTreeMap<String, Server>,
     network: NetworkRecords,
-    /// The servers that a Global Discovery Server lists, by host and port. Those that answer have a
-    /// record, unless another source reports them.
+    /// The servers that a Global Discovery Server lists, by host and port. A server that answers
+    /// has a record, unless another source reports it.
     listed: BTreeMap<String, AnnouncedServer>,
     watch: EndpointWatch,
     events: VecDeque<RegistryEvent>,

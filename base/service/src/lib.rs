@@ -1,4 +1,4 @@
-//! What every program needs: exit codes, logging, status pages, signals, the watchdog of the
+//! The needs of every program: exit codes, logging, status pages, signals, the watchdog of the
 //! service manager, and restarts.
 //!
 //! A program of the plant that carries no space implements [`ServiceProgram`], and its `main` is

@@ -156,8 +156,8 @@ struct ListedSink {
 
 static SINKS: RwLock<Vec<ListedSink>> = RwLock::new(Vec::new());
 
-/// Returns the span of a program that shares its process with others. Events within the span are
-/// those of the program.
+/// Returns the span of a program that shares its process with others. Events within the span
+/// belong to the program.
 #[must_use]
 pub fn program_span(program: &'static str) -> Span {
     // The level of the least filter, so that each message has its program.

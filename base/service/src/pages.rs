@@ -62,7 +62,7 @@ pub trait Site: Send + Sync + 'static {
     /// Receives the access to the status of the program, before the first request.
     fn start(&self, statuses: Statuses);
 
-    /// Answers a request for another path than those of the status.
+    /// Answers a request for a path that is none of the status pages.
     fn answer(
         self: Arc<Self>,
         request: Request<Incoming>,

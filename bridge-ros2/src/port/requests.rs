@@ -55,7 +55,7 @@ impl Ros2Requests {
         (requests, bound)
     }
 
-    /// Polls for the next events, and adds them to those of the side.
+    /// Polls for the next events, and adds them to the events of the side.
     pub(super) fn poll_events(&mut self, side: &mut Ros2Side, cx: &mut Context<'_>) -> Poll<()> {
         let events = &mut side.events;
         self.both.poll_events::<Ros2Graph<'_>>(cx, events)

@@ -58,8 +58,8 @@ impl Schedule {
         }
     }
 
-    /// Returns the topics with waiting samples, from which [`note_waiting`](Self::note_waiting)
-    /// removes those without.
+    /// Returns the topics with waiting samples. [`note_waiting`](Self::note_waiting) removes topics
+    /// without a waiting sample.
     pub(super) fn waiting(&self) -> Vec<TopicId> {
         self.waiting.iter().copied().collect()
     }

@@ -64,7 +64,7 @@ fn main() -> Result<(), String> {
     });
     let mut out = std::io::stdout().lock();
     run(&action, &lines, |message| {
-        // The component has ended if nobody reads the message.
+        // A message without a reader means that the component has ended.
         let _written = writeln!(out, "{message}").and_then(|()| out.flush());
     })
 }

@@ -52,12 +52,13 @@ struct UaComponent {
     /// Check the YAML and the types it names, print every finding, and exit
     #[arg(long)]
     check: bool,
-    /// Where clients connect, as opc.tcp://127.0.0.1:0, in place of what the YAML says
+    /// The endpoint for clients, as opc.tcp://127.0.0.1:0, in place of the endpoint of the YAML
     #[arg(long, value_name = "URL", env = "UA_ENDPOINT")]
     endpoint: Option<String>,
-    /// The discovery server it registers with, in place of what the YAML says: its URL; one that is heard of on --interface,
-    /// as `any` (the only one there), uri=<ApplicationUri> or name=<mDNS name> (both may end with *); `embed` for that of this
-    /// host at port 4840, or `embed=URL`, which the component is itself while there is none; or `none`
+    /// The discovery server for the registration, in place of the server of the YAML: its URL; an
+    /// announced server on --interface, as `any` (the only server there), uri=<ApplicationUri> or
+    /// name=<mDNS name> (both may end with *); `embed` for the server of this host at port 4840, or
+    /// `embed=URL`, which the component serves itself while there is none; or `none`
     #[arg(long, value_name = "URL|CHOICE|embed", env = "UA_LDS")]
     lds: Option<String>,
     /// The certificate store: own, private, trusted and rejected under one directory

@@ -163,7 +163,7 @@ impl Program {
         }
     }
 
-    /// Runs the command that stops the machine. Returns what happened.
+    /// Runs the command that stops the machine. Returns its outcome as text.
     async fn stop(&self) -> String {
         let Some(command) = &self.work.stop else {
             return "there is no `stop` command".to_owned();

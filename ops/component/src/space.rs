@@ -610,7 +610,7 @@ fn named(of: &[(String, SkillValue)]) -> [SkillValue; 2] {
 
 /// Largest number of skills. Identifiers have 16 bits, and a skill has a hundred of them.
 pub(crate) const MOST_IN_SPACE: usize = 654;
-/// The identifier of value n is larger by n; values have the identifiers below those of skills.
+/// The identifier of value n is larger by n. Values have lower identifiers than skills.
 const FIRST_VALUE: u16 = 10;
 /// Number of identifiers of a skill.
 const PER_SKILL: u16 = 100;

@@ -58,7 +58,7 @@ pub(crate) trait Plant: Send + Sync {
         Ok(())
     }
 
-    /// Returns what a component is attached to, as the tool changers showed last.
+    /// Returns the attachment of a component, as the tool changers showed last.
     fn attachment(&self, _component: &str) -> Attachment {
         Attachment::None
     }
@@ -74,8 +74,8 @@ pub(crate) trait Plant: Send + Sync {
     /// Returns the components that other runs use, with these runs.
     fn used_by_others(&self, run: &str) -> BTreeMap<String, String>;
 
-    /// Gives a run the use of these components, and takes it from all others that it had. Returns
-    /// whether it has them: all of them, or what it had before if another run uses one of them.
+    /// Leases these components to a run, and ends its leases of all other components. Returns
+    /// false, and changes nothing, if another run uses one of the components.
     fn lease(&self, run: &str, components: &BTreeSet<String>) -> bool;
 
     /// Stores the state of a run.
@@ -147,7 +147,7 @@ pub(crate) async fn execute_pausable(
                 true => why,
                 false => format!("{why}; the outcome is unknown"),
             };
-            // Nobody starts the process again before a Reset.
+            // The process cannot be started again before a Reset.
             teller.unknown(&why).await;
             Err(why)
         }
@@ -398,7 +398,7 @@ impl Execution<'_> {
         }
     }
 
-    /// Returns the chosen offers of a plan, without those of the steps that are over.
+    /// Returns the chosen offers of a plan, without the offers of steps that are over.
     fn chosen(&self, plan: &Plan, offers: &[Offer], progress: &RunProgress) -> Chosen {
         let of = |role: SkillRole| {
             let skill = plan.chosen(role)?;

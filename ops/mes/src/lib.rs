@@ -80,21 +80,22 @@ struct UaMes {
     /// Check the YAML and the files it names, print every finding, and exit
     #[arg(long)]
     check: bool,
-    /// Run this process as soon as there is somebody for it, and go on serving
+    /// Run this process as soon as its components are available, and go on serving
     #[arg(long, value_name = "IRI")]
     run: Option<String>,
-    /// Where questions are answered, in place of what the YAML says; loopback only
+    /// The address at which questions are answered, in place of the address of the YAML; loopback
+    /// only
     #[arg(long, value_name = "ADDRESS:PORT", env = "UA_SPARQL")]
     sparql: Option<SocketAddr>,
-    /// The folder in which added sources and records of runs are stored, in place of what the YAML
-    /// says
+    /// The folder for added sources and records of runs, in place of the folder of the YAML
     #[arg(long, value_name = "DIR", env = "UA_STORE")]
     store: Option<PathBuf>,
-    /// Where clients connect, as opc.tcp://127.0.0.1:0, in place of what the YAML says
+    /// The endpoint for clients, as opc.tcp://127.0.0.1:0, in place of the endpoint of the YAML
     #[arg(long, value_name = "URL", env = "UA_ENDPOINT")]
     endpoint: Option<String>,
-    /// The local discovery server it registers with, or `none`, in place of what the YAML says; `embed` for that of this host
-    /// at port 4840, or `embed=URL`, which the program is itself while there is none
+    /// The local discovery server for the registration, or `none`, in place of the server of the
+    /// YAML; `embed` for the server of this host at port 4840, or `embed=URL`, which the program
+    /// serves itself while there is none
     #[arg(long, value_name = "URL|embed", env = "UA_LDS")]
     lds: Option<String>,
     /// The certificate store: own, private, trusted and rejected under one directory

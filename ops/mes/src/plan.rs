@@ -191,7 +191,7 @@ pub(crate) trait Facts {
         Ok(())
     }
 
-    /// Returns what the component of an offer is attached to.
+    /// Returns the attachment of the component of an offer.
     fn attachment(&self, _offer: &Offer) -> Attachment {
         Attachment::None
     }

@@ -294,8 +294,8 @@ impl Reading<'_> {
         })
     }
 
-    /// Reads a step of a composite, or the step with a number that a single skill does; the second
-    /// number is that of all steps.
+    /// Reads a step of a composite, or the step with a number that a single skill does. The second
+    /// number is the number of all steps.
     fn step(
         &mut self,
         node: &DocumentNode,

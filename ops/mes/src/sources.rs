@@ -205,7 +205,7 @@ impl MesSources {
         self.keep(source, finding(source, what, false));
     }
 
-    /// Adds a finding to those of its source.
+    /// Adds a finding to the findings of its source.
     fn keep(&self, source: &KnowledgeSource, found: Finding) {
         let mut state = self.state();
         let findings = state.findings.entry(source.clone()).or_default();

@@ -91,7 +91,7 @@ impl FeedTarget {
         }
     }
 
-    /// Reads the values of variables once, so that clients that are told of them find their values.
+    /// Reads the values of variables once, so that clients find values in announced variables.
     pub(crate) async fn read(&self, client: &OpcUaClient, variables: &[CopiedVariable]) {
         let nodes: Vec<NodeId> = variables.iter().map(|one| one.at_server.clone()).collect();
         match client.read(&nodes).await {

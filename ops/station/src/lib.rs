@@ -3,8 +3,8 @@
 //!
 //! A station is a Local Discovery Server for the level below ([`discovery::lds`]) and an
 //! application with two faces. The face above shows the objects, variables and methods of the
-//! devices, the face below those of the neighbours above. Calls and writes are forwarded, values
-//! and events are repeated. Addresses of one level are not visible on the other.
+//! devices, the face below shows the nodes of the neighbours above. Calls and writes are forwarded,
+//! values and events are repeated. Addresses of one level are not visible on the other.
 //!
 //! Servers that appear on the level below are configured: the station connects, compares the
 //! certificate with the registration, and calls the method `Configure` of the component with its

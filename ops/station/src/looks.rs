@@ -110,7 +110,7 @@ impl Drop for SearchedServer<'_> {
 
 /// Number of searches at the same time.
 const AT_ONCE: usize = 8;
-/// Number of searches at the same time beside these, of those that have waited long.
+/// Number of further searches at the same time, for searches that have waited long.
 const LATE_AT_ONCE: usize = 32;
 /// How long a search waits before it counts among the late ones.
 const MOST_WAIT: Duration = Duration::from_secs(5);

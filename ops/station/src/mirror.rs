@@ -200,7 +200,7 @@ struct Survey<'c> {
 }
 
 impl Survey<'_> {
-    /// Reads the children of a level. Returns those that may have children.
+    /// Reads the children of a level. Returns the children that may have children themselves.
     async fn level(&mut self, parents: Vec<Parent>) -> Result<Vec<Parent>, ClientError> {
         let below = Browse {
             classes: NodeClassMask::OBJECT | NodeClassMask::VARIABLE | NodeClassMask::METHOD,

@@ -221,8 +221,8 @@ impl Tending {
                     return;
                 }
                 () = told => {}
-                // The nodes of a server may change, for example those of another station when a
-                // device appears or disappears.
+                // The nodes of a server may change, for example when a device of another station
+                // appears or disappears.
                 () = changed(&mut changes), if is_told => {}
                 // Not every server notifies model changes.
                 () = sleep(searched.pause()) => {}
@@ -230,7 +230,7 @@ impl Tending {
         }
     }
 
-    /// Keeps the nodes of a server that the face can show beside those of the other servers.
+    /// Keeps the nodes of a server that the face can show beside the nodes of other servers.
     fn within_budget(&self, url: &str, mut mirror: MirroredServer) -> MirroredServer {
         let wanted = mirror.nodes.len();
         let granted = self.nodes.grant(url, wanted);

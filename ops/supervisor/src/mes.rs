@@ -58,7 +58,7 @@ pub(crate) struct MesCredentials {
     pub(crate) password: String,
 }
 
-/// The reason why `ua-mes` has not done what was requested.
+/// The reason why `ua-mes` has not executed a request.
 #[derive(Debug, Error)]
 pub(crate) enum MesFault {
     /// There is no response.

@@ -39,8 +39,8 @@ pub trait Operations: Send + Sync + 'static {
         block: Bytes,
     ) -> BoxFuture<Result<(), OperationFault>>;
 
-    /// Returns the conditions of the program, at most [`MOST_CONDITIONS`]: first those that need
-    /// attention, by falling severity.
+    /// Returns the conditions of the program, at most [`MOST_CONDITIONS`]: first the conditions
+    /// that need attention, by falling severity.
     fn conditions(&self) -> Vec<ConditionState>;
 
     /// Acknowledges or confirms a condition on behalf of a user.

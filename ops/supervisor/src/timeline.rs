@@ -87,7 +87,7 @@ pub(crate) struct CallMessage {
 }
 
 impl Timeline {
-    /// Notes that the events are those of a recording.
+    /// Notes that the events come from a recording.
     pub(crate) fn set_recording(&mut self, name: &str) {
         self.recording = Some(name.to_owned());
     }

@@ -59,8 +59,8 @@ pub(crate) struct Window {
     only_bad: bool,
 }
 
-/// A browser: its view, and what was sent to it. Intermediate states are never queued: the next
-/// event is made of the state at the time at which the browser takes it.
+/// A browser: its view, and the contents that were sent to it. Intermediate states are never
+/// queued: the next event is made of the state at the time at which the browser takes it.
 #[derive(Debug)]
 pub(crate) struct Viewer {
     view: BrowserView,

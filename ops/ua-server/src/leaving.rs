@@ -98,7 +98,7 @@ pub(crate) struct Leaving {
     /// turn.
     order: VecDeque<TopicId>,
     /// The writes of the reported value that the run loop has not handled. The run loop may send
-    /// the values before it first, and their results are not those of this value.
+    /// earlier values first, and their results do not belong to this value.
     reported: Vec<Departure>,
     /// Polls for the next write of a client that waits for each result.
     next: BusyPoll,

@@ -89,7 +89,8 @@ use crate::port::{ServerPort, Setup};
 use crate::sks::{ServerKeys, Sks};
 use crate::structures::MappedTypes;
 
-/// The OPC UA server of the cell: every value of the space as a variable, and a way in for those of origin 0.
+/// The OPC UA server of the cell: every value of the space as a variable; clients write the values
+/// of origin 0.
 #[derive(Debug, clap::Parser)]
 #[command(name = "ua-server", version = plant_opcua::patches::version(), after_help = verbs::HELP)]
 struct UaServer {

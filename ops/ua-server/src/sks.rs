@@ -51,8 +51,8 @@ struct Group {
 struct Members {
     /// The ApplicationUri of the cell's own server.
     server: String,
-    /// The ApplicationUris of its redundant set, and those that the mapping lists; `*` at the end
-    /// stands for any characters.
+    /// The ApplicationUris of its redundant set, and the ApplicationUris that the mapping lists;
+    /// `*` at the end stands for any characters.
     listed: Vec<String>,
 }
 

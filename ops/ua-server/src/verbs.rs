@@ -27,8 +27,9 @@ struct Verbs {
 
 #[derive(Debug, clap::Subcommand)]
 enum Verb {
-    /// Trust the certificate of a client: one that was refused, or that of a file. With that of an authority, all that it has
-    /// issued and not revoked; its revocation list is taken up in the same way
+    /// Trust the certificate of a client: a refused certificate, or a file. With the certificate of
+    /// an authority, all certificates that it has issued and not revoked; its revocation list is
+    /// added in the same way
     Trust {
         /// The first digits of its thumbprint, as the log of the server has them, or a file in DER or PEM
         #[arg(value_name = "THUMBPRINT|FILE")]
@@ -39,7 +40,7 @@ enum Verb {
         #[command(flatten)]
         store: Store,
     },
-    /// Trust a certificate no longer: who has it is refused at the next connection
+    /// Remove the trust in a certificate: its holder is refused at the next connection
     Reject {
         /// The first digits of its thumbprint
         #[arg(value_name = "THUMBPRINT")]
@@ -47,7 +48,8 @@ enum Verb {
         #[command(flatten)]
         store: Store,
     },
-    /// List the server's own certificate, those it trusts, and those of clients that it refused
+    /// List the server's own certificate, the trusted certificates, and the refused certificates of
+    /// clients
     Certificates {
         /// A JSON line for each
         #[arg(long)]
@@ -74,7 +76,8 @@ enum UserVerb {
     /// Make a user, or put another in the place of one of that name. The password is read from stdin
     Add {
         name: String,
-        /// What the user may be: observer, operator, engineer, security_admin, configure_admin; several with commas between them
+        /// The roles of the user: observer, operator, engineer, security_admin, configure_admin;
+        /// several with commas between them
         #[arg(long, value_name = "ROLES")]
         role: Roles,
         /// The user shows this certificate (DER or PEM, as .der or .pem) in place of a password

@@ -224,7 +224,7 @@ pub(crate) async fn connected(address: &str) -> io::Result<TcpStream> {
     Ok(stream)
 }
 
-/// Returns whether an error is that of the connection and not that of a received response.
+/// Returns whether an error comes from the connection, and not from a received response.
 fn is_broken(error: &io::Error) -> bool {
     use io::ErrorKind as Kind;
     !matches!(

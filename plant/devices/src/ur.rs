@@ -346,8 +346,8 @@ impl Motion {
         Ok(stream)
     }
 
-    /// Stops a robot that moves and whose state is not received. Returns the reason with what was
-    /// done.
+    /// Stops a robot that moves and whose state is not received. Returns the reason, followed by
+    /// the action that was taken.
     async fn lost(&self, work: &Work, why: impl Into<UrError>) -> UrError {
         let stop = match self.send(self.stop_program()).await {
             Ok(program) => {
@@ -388,7 +388,7 @@ fn listed(numbers: [f64; 6]) -> String {
     numbers.map(|number| format!("{number:.6}")).join(", ")
 }
 
-/// Reports that the robot may move. Returns the reason with what was done.
+/// Reports that the robot may move. Returns the reason and the action that was taken.
 async fn unknown(work: &Work, why: UrError, stop: StopProgram) -> UrError {
     let why = Box::new(why);
     let error = UrError::Unknown { why, stop };

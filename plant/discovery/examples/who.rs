@@ -13,7 +13,7 @@ use serde_json::{Value, json};
 use service::{Failure, FailureKind, LogFormat, ServiceProgram, run_service};
 use tokio::net::TcpListener;
 
-/// Tells of a server that is not one, or watches who is there.
+/// Announces simulated servers, or watches the announced servers.
 #[derive(Debug, clap::Parser)]
 struct WhoArguments {
     #[command(subcommand)]
@@ -59,7 +59,7 @@ struct Presence {
     /// The ApplicationUri
     #[arg(long)]
     uri: Option<String>,
-    /// Codes of what it can do
+    /// Capability codes of the simulated servers
     #[arg(long, default_value = "DA", value_delimiter = ',')]
     capabilities: Vec<String>,
     /// Be so many servers, `NAME-0` and so on, each at a port of its own

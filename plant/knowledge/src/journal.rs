@@ -63,7 +63,7 @@ pub(crate) struct Journal {
     file: File,
     /// Length of the file in bytes.
     length: u64,
-    /// Length after the file was last written anew.
+    /// Length after the last rewriting of the file.
     compact: u64,
     /// Held while the program uses the folder.
     _lock: File,
@@ -152,7 +152,7 @@ impl Journal {
         Ok(())
     }
 
-    /// Writes the file anew from its own contents.
+    /// Rewrites the file from its own contents.
     fn shrink(&mut self) -> io::Result<()> {
         self.file.seek(SeekFrom::Start(0))?;
         let (contents, length) = read(&self.file)?;

@@ -237,7 +237,7 @@ impl Knowledge {
         self.put(source, triples, (at, SourceLifetime::No))
     }
 
-    /// Adds the statements of a document to a source, or replaces those of the source, and stores
+    /// Adds the statements of a document to a source, or replaces the source by them, and stores
     /// them if the source lasts. Returns whether the source is new.
     ///
     /// # Errors
@@ -265,7 +265,7 @@ impl Knowledge {
         Ok(is_new)
     }
 
-    /// Replaces the statements of a lasting source by those of a Turtle document.
+    /// Replaces the statements of a lasting source by the statements of a Turtle document.
     ///
     /// # Errors
     /// [`KnowledgeFault`]; then nothing has changed.

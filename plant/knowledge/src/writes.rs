@@ -319,7 +319,7 @@ impl ServedSite {
         }
     }
 
-    /// Checks the contents of a source: `/check/KIND/NAME`. The rights are those of a change,
+    /// Checks the contents of a source: `/check/KIND/NAME`. It needs the rights of a change,
     /// because a check reads a file of any contents.
     pub(crate) async fn check(
         &self,

@@ -14,11 +14,11 @@ pub struct SkillCandidate<T> {
     pub rank: CandidateRank,
 }
 
-/// The rank of a candidate: of those that fit, the least is chosen. The fields are compared in
+/// The rank of a candidate: the fitting candidate of least rank is chosen. Fields are compared in
 /// their order.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Default)]
 pub struct CandidateRank {
-    /// What it is attached to.
+    /// The attachment of the candidate.
     pub attachment: Attachment,
     /// Its place in the list of preferred components; the length of the list if it is not there.
     pub preference: usize,
@@ -30,7 +30,7 @@ pub struct CandidateRank {
     pub name: String,
 }
 
-/// What a candidate is attached to, the best first.
+/// The attachment of a candidate, the best first.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Default)]
 pub enum Attachment {
     /// A robot with a tool.
@@ -80,7 +80,7 @@ impl CandidateRank {
         place.unwrap_or(prefer.len())
     }
 
-    /// Returns what this rank has in advantage of a greater rank; `None` if it is not less.
+    /// Returns the advantage of this rank over a greater rank; `None` if it is not less.
     #[must_use]
     pub fn advantage_over(&self, other: &Self) -> Option<&'static str> {
         let Self {

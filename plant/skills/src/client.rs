@@ -254,7 +254,7 @@ async fn connected(client: &OpcUaClient, options: &ClientOptions) -> Result<(), 
     }
 }
 
-/// Adds what an operator has to do if the server refuses this client.
+/// Adds the next step of the operator if the server refuses this client.
 fn not_connected(error: &ClientError, options: &ClientOptions) -> SkillFault {
     let text = error.to_string();
     let refuses_user = ["BadIdentityToken", "BadUserAccessDenied"];

@@ -315,7 +315,7 @@ async fn run<T>(
 /// The step before anything moves.
 const INIT: &str = "Init";
 
-/// Why a robot that was told to stop has not retreated.
+/// The reason why a robot has not retreated after its stop was requested.
 const HALTED: &str = "it was halted, and stands still";
 
 fn lost(skill: &dyn RunnableSkill, why: &str) -> String {

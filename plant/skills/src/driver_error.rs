@@ -41,8 +41,8 @@ impl DriverError {
         Self::Device(Box::new(error))
     }
 
-    /// Returns the error with a reason that a program, call or component gave. The text `stopped`
-    /// has nothing to add, as that of [`Stopped`].
+    /// Returns the error with a reason that a program, call or component gave. The text of
+    /// [`Stopped`] becomes that error.
     #[must_use]
     pub fn reported(why: impl Into<String>) -> Self {
         let why = why.into();

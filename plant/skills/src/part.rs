@@ -113,9 +113,9 @@ fn confirmed(ended: Result<RunOutcome, SkillFault>) -> Result<(), SkillFault> {
     }
 }
 
-/// Number of times that a run is told to halt.
+/// Number of Halt requests to a run.
 const HALTS: u32 = 3;
-/// Pause before a run that goes on is told to halt again.
+/// Pause before Halt is requested again from a run that goes on.
 const HALT_AGAIN: Duration = Duration::from_secs(2);
 
 #[cfg(test)]

@@ -83,8 +83,8 @@ impl ActionType {
         &self.name
     }
 
-    /// Returns `NameAction`, the three messages below in one. It is never sent; its md5 is that of
-    /// the action.
+    /// Returns `NameAction`, the three messages below in one. It is never sent; its md5 is the md5
+    /// of the action.
     pub fn action(&self) -> &Arc<MessageType> {
         &self.action
     }

@@ -68,7 +68,7 @@ impl Ros1Clock {
         }
     }
 
-    /// Returns whether the time is that of `/clock`.
+    /// Returns whether the time comes from `/clock`.
     pub fn is_simulated(&self) -> bool {
         self.simulation.runs.load(Ordering::Acquire)
     }

@@ -86,7 +86,7 @@ struct Secured {
     lifetime: Duration,
     overdue: bool,
     /// Whether new keys are needed, because a message used an unknown key or no next key exists.
-    /// `told` is the time of the last request for keys.
+    /// `told` holds the time of the last request for keys.
     wanted: bool,
     told: Option<Instant>,
 }

@@ -33,7 +33,7 @@ pub(crate) struct SentTopicState {
     next: usize,
     /// Whether any sample was sent.
     started: bool,
-    /// Whether the repetitions of the value are spread among those of other topics.
+    /// Whether the repetitions of the value are spread among the repetitions of other topics.
     is_spread: bool,
     /// The newest event, while it is repeated in case it is lost.
     again: Option<Again>,

@@ -200,7 +200,7 @@ impl SendQueue {
         let states = std::mem::take(&mut self.waiting);
         self.bytes = 0;
         for publication in first {
-            // What does not fit is published again later.
+            // A publication that does not fit is published again later.
             let _full = self.push(publication.clone(), now).is_err();
         }
         for state in states {

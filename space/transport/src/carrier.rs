@@ -199,7 +199,7 @@ pub enum Senders {
 /// The properties of the network by which a message was received.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct NetworkArrival {
-    /// How far the network tells senders apart.
+    /// The extent to which the network distinguishes senders.
     pub senders: Senders,
     /// The time after which the message counts as late; `None` if the network does not store
     /// messages.
@@ -215,7 +215,7 @@ pub struct NetworkArrival {
 pub struct CarrierState {
     /// Name of the network interface or broker.
     pub network: String,
-    /// How far the carrier tells senders apart.
+    /// The extent to which the carrier distinguishes senders.
     pub senders: Senders,
     /// The reason why no messages are received and sent.
     pub lost: Option<String>,

@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 
 use socket2::SockFilter;
 
-/// A rule for the datagrams of a layout: those whose key is not wanted are dropped. Datagrams of
+/// A rule for the datagrams of a layout: datagrams with an unwanted key are dropped. Datagrams of
 /// another layout, and datagrams that end before the key, are not concerned.
 ///
 /// The rule contains offsets only, because the meaning of the bytes is left to the caller.

@@ -59,7 +59,7 @@ use crate::{DecodeError, Fields, OwnedPublisherId};
 /// assert!(NetworkMessage::decode(&datagram)?.is_action());
 /// assert_eq!(requestor.poll_timeout(), Some(Duration::from_millis(100)));
 ///
-/// // Nobody answers.
+/// // No responder answers.
 /// requestor.handle_timeout(Duration::from_secs(3));
 /// assert_eq!(requestor.poll_given_up().map(|(id, _)| id), Some(call));
 /// # Ok::<(), Box<dyn std::error::Error>>(())

@@ -20,7 +20,8 @@ pub(crate) trait WireStructure<'a>: Copy {
     /// fields.
     fn read(reader: &mut ByteReader<'a>, what: &'static str) -> Result<Self, DecodeError>;
 
-    /// Appends the encoding; `what` as in [`read`](Self::read).
+    /// Appends the encoding. The parameter `what` has the meaning that it has in
+    /// [`read`](Self::read).
     fn write(&self, out: &mut Vec<u8>, what: &'static str) -> Result<(), EncodeError>;
 }
 

@@ -48,8 +48,8 @@ impl ServerRegistry {
     }
 
     /// Replaces the servers that a Global Discovery Server lists, at most one for each host and
-    /// port. They are probed. FindServersOnNetwork has those that answer, unless a server of the
-    /// same host and port is registered or announced by mDNS.
+    /// port. They are probed. FindServersOnNetwork returns the servers that answer, unless a server
+    /// of the same host and port is registered or announced by mDNS.
     pub fn listed(&mut self, servers: Vec<AnnouncedServer>, now: Instant) {
         let servers = servers.into_iter().map(|one| (place(&one.url), one));
         let servers: BTreeMap<String, AnnouncedServer> = servers.collect();

@@ -20,7 +20,7 @@ pub(super) struct Done {
     pub(super) is_earlier: bool,
 }
 
-/// Returns the choices that later plans keep: those of completed steps and of their compensations.
+/// Returns the choices that later plans keep: for completed steps and for their compensations.
 /// Steps that are done again are chosen again.
 pub(super) fn kept(process: &Process, done: &[Done]) -> Vec<KeptStep> {
     let one = |done: &Done| {
@@ -86,7 +86,7 @@ fn names(steps: &[Undone<'_>]) -> String {
 }
 
 impl Execution<'_> {
-    /// Compensates the completed steps of a run that failed, and adds what was done to the reason.
+    /// Compensates the completed steps of a failed run, and adds the compensations to the reason.
     ///
     /// Nothing is compensated after the caller stopped the run, and while the end of a skill is not
     /// confirmed: its machine may still move.

@@ -49,7 +49,7 @@ impl RunProgress {
         steps.all(|step| self.is_over(step)) && loops.all(|number| self.left.contains(&number))
     }
 
-    /// Returns the completed steps, without those of earlier rounds.
+    /// Returns the completed steps, without the steps of earlier rounds.
     fn current(&self) -> impl Iterator<Item = &Done> {
         self.done.iter().filter(|done| !done.is_earlier)
     }

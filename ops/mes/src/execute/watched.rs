@@ -168,8 +168,8 @@ impl RunnableSkill for RecordedSkill {
     }
 }
 
-/// Returns whether a run may go on after a fault. `is_late` tells that the time of the run was
-/// over, when a refusal can be that of its Halt.
+/// Returns whether a run may go on after a fault. `is_late` is true if the time of the run was
+/// over: a refusal can then be the refusal of its Halt.
 const fn may_go_on(fault: &SkillFault, is_late: bool) -> bool {
     match fault {
         // The run may have been started, and its end was not seen.

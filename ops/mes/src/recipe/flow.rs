@@ -66,7 +66,7 @@ pub(super) struct RecipeSequence {
     pub(super) loops: Vec<Loop>,
 }
 
-/// What is known about each node, by its number.
+/// The properties of each node, by its number.
 #[derive(Debug)]
 struct Paths {
     guards: Vec<Guard>,
@@ -180,8 +180,7 @@ impl Reading<'_> {
         (self.errors.len() == before).then_some(RecipeSequence { steps, loops })
     }
 
-    /// Returns the steps of tasks in their order, with the numbers of steps in the place of those
-    /// of nodes.
+    /// Returns the steps of tasks in their order. Numbers of steps replace the numbers of nodes.
     fn steps(
         &mut self,
         flow: &Flow,
@@ -327,8 +326,8 @@ impl Reading<'_> {
         }
     }
 
-    /// Returns the nodes in an order in which each comes after those that lead to it. Nodes of one
-    /// rank have the order of the file.
+    /// Returns the nodes in an order in which each node follows the nodes that lead to it. Nodes of
+    /// equal rank have the order of the file.
     fn ordered(&mut self, flow: &Flow, loops: &FlowLoops) -> Option<Vec<usize>> {
         let mut open: Vec<usize> = flow.nodes.iter().map(|_| 0).collect();
         for edge in loops.forward(flow) {

@@ -136,7 +136,7 @@ impl Status<'_> {
 }
 
 impl Inner {
-    /// Applies a DiagnosticArray. Returns the conditions that are new and those that gave way.
+    /// Applies a DiagnosticArray. Returns the new conditions and the displaced conditions.
     pub(super) fn diagnosed(
         &mut self,
         origin: &Origin,

@@ -191,7 +191,7 @@ impl Topic {
             ..NetworkHeader::default()
         };
         let taken = Timestamp::from_unix_nanos(message.published.into());
-        // The upper half is not used: the numbers are those of the writer.
+        // A sequence number of the writer has 16 bits.
         let sequence = u16::try_from(message.sequence).ok();
         let header = DataSetHeader {
             sequence_number: sequence.filter(|_| self.numbered),

@@ -75,7 +75,7 @@ impl fmt::Display for StoppedRobot {
     }
 }
 
-/// What became of the program that stops the robot.
+/// The outcome of the program that stops the robot.
 #[derive(Debug)]
 pub(super) enum StopProgram {
     Sent,

@@ -404,7 +404,7 @@ impl Shapes {
         Some(Check { query, ..check })
     }
 
-    /// Compiles `sh:closed`: no other predicates than those of the property shapes.
+    /// Compiles `sh:closed`: only predicates of the property shapes are permitted.
     fn closed(&self, scope: &Scope<'_>) -> Check {
         let ignored = self.one(scope.shape, "ignoredProperties");
         let ignored = ignored.and_then(|list| self.list(list)).unwrap_or_default();

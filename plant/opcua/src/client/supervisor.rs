@@ -317,7 +317,7 @@ fn identity(config: &ClientConfig) -> IdentityToken {
     }
 }
 
-/// Returns what a keep-alive of a session means for its server.
+/// Returns the meaning of a keep-alive of a session for its server.
 fn kept_alive(activity: &SessionActivity) -> Activity {
     match activity {
         SessionActivity::KeepAliveSucceeded => Activity::KeptAlive,

@@ -121,7 +121,7 @@ impl TopicQueues {
 
     /// Returns whether received values of the namespace are dropped unread: another bridge of the
     /// space delivers them, or this program does not use them. Values in own namespaces show other
-    /// writers, and tapped topics show what arrives.
+    /// writers, and tapped topics show each arrival.
     pub(super) fn is_unused(&self, space: SpaceId, namespace: u16) -> bool {
         let is_used = || {
             self.tap.is_on()

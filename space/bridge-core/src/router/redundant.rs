@@ -56,7 +56,7 @@ struct Followed {
     stamp: Timestamp,
 }
 
-/// What a muted or active bridge did with samples, for the status.
+/// The samples that a muted or active bridge handled, for the status.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct MutedSamples {
     /// Samples of the own space that were not sent to the group.

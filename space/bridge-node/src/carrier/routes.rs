@@ -338,8 +338,8 @@ impl Routes {
         ends.position(|end| end.names.iter().any(covers))
     }
 
-    /// Returns what the mapping says about the contents of a message. A message of several writers
-    /// counts as its most urgent command, if it has one.
+    /// Returns the statement of the mapping about the contents of a message. A message of several
+    /// writers counts as its most urgent command, if it has one.
     fn content(&self, message: &NetworkMessage<'_>, scope: MessageScope) -> Content<'_> {
         let command = || {
             let writers = message.writer_ids().into_iter().flatten();

@@ -28,7 +28,7 @@ impl Turn {
     }
 }
 
-/// What is left of a turn of datagrams.
+/// The remaining limits of a turn of datagrams.
 #[derive(Debug)]
 pub(super) struct TurnLimits {
     datagrams: usize,
