@@ -27,10 +27,10 @@ pub(super) struct HostFacts {
     pub(super) udp: Vec<UdpSocket>,
     /// Settings of the kernel, by path.
     pub(super) settings: BTreeMap<String, u64>,
-    /// IP datagrams that could not be reassembled.
+    /// Failed reassemblies of IP fragments since the start of the host.
     pub(super) reassembly_failures: u64,
     pub(super) is_virtual: bool,
-    /// Rules of the firewall that drop or reject packets, if they are readable.
+    /// Rules of the firewall that drop or reject incoming packets, if they are readable.
     pub(super) firewall: Vec<String>,
     /// Network bridges of this host.
     pub(super) switches: Vec<Switch>,
@@ -227,23 +227,86 @@ fn firewall() -> Vec<String> {
     Vec::new()
 }
 
-/// Returns the lines of a rule set that drop or reject packets.
+/// Returns the rules that drop or reject incoming packets: rules of the input chains, and of the
+/// chains to which these jump. Rules for invalid connections drop no packet of a cell.
 pub(super) fn dropping(rules: &str) -> Vec<String> {
-    let lines = rules.lines().map(str::trim);
-    let drops = lines.filter(|line| {
-        let lower = line.to_lowercase();
-        let is_input = !lower.contains("forward") && !lower.contains("output");
-        let words = [
-            "policy drop",
-            "drop",
-            "reject",
-            "-p input drop",
-            "-j drop",
-            "-j reject",
-        ];
-        is_input && words.iter().any(|word| has_word(&lower, word))
+    let chains = chains(rules);
+    let input = chains.iter().filter(|(_, chain)| chain.is_input);
+    let mut reached: Vec<(&str, &str)> = input.map(|(name, _)| *name).collect();
+    let mut next = 0;
+    while let Some(&(table, name)) = reached.get(next) {
+        next += 1;
+        let chain = chains.get(&(table, name)).into_iter();
+        for target in chain
+            .flat_map(|chain| &chain.rules)
+            .filter_map(|rule| jump_of(rule))
+        {
+            let target = (table, target);
+            if chains.contains_key(&target) && !reached.contains(&target) {
+                reached.push(target);
+            }
+        }
+    }
+    let all = reached.iter().filter_map(|name| chains.get(name));
+    let drops = all.flat_map(|chain| &chain.rules).filter(|rule| {
+        let lower = rule.to_lowercase();
+        let is_drop = has_word(&lower, "drop") || has_word(&lower, "reject");
+        is_drop && !has_word(&lower, "invalid")
     });
-    drops.take(MOST_RULES).map(str::to_owned).collect()
+    drops
+        .take(MOST_RULES)
+        .map(|rule| (*rule).to_owned())
+        .collect()
+}
+
+/// A chain of a firewall.
+#[derive(Debug, Default)]
+struct FirewallChain<'a> {
+    /// True if the kernel passes incoming packets to this chain.
+    is_input: bool,
+    rules: Vec<&'a str>,
+}
+
+/// Parses the output of `nft list ruleset` or `iptables -S`. The key is the line that opens the
+/// table (empty for iptables), and the name of the chain.
+fn chains(text: &str) -> BTreeMap<(&str, &str), FirewallChain<'_>> {
+    let mut chains: BTreeMap<(&str, &str), FirewallChain<'_>> = BTreeMap::new();
+    let (mut table, mut open) = ("", None);
+    for line in text.lines().map(str::trim) {
+        let mut words = line.split_whitespace();
+        let name = match (words.next(), words.next()) {
+            (Some("table"), Some(_)) => {
+                table = line;
+                continue;
+            }
+            (Some("chain"), Some(name)) => {
+                open = Some(name);
+                continue;
+            }
+            (Some("}"), None) => {
+                open = None;
+                continue;
+            }
+            (Some("-P" | "-A"), Some(name)) => name,
+            _ => match open {
+                Some(name) => name,
+                None => continue,
+            },
+        };
+        let chain = chains.entry((table, name)).or_default();
+        let hooks = ["hook input", "hook prerouting", "hook ingress"];
+        chain.is_input |= (table.is_empty() && name == "INPUT")
+            || (line.starts_with("type ") && hooks.iter().any(|hook| line.contains(hook)));
+        chain.rules.push(line);
+    }
+    chains
+}
+
+/// Returns the chain to which a rule jumps.
+fn jump_of(rule: &str) -> Option<&str> {
+    let mut words = rule.split_whitespace();
+    words.find(|word| ["jump", "goto", "-j", "-g"].contains(word))?;
+    words.next()
 }
 
 fn has_word(line: &str, word: &str) -> bool {
@@ -327,5 +390,22 @@ mod tests {
         let expected = ["-P INPUT DROP", "-A INPUT -p udp -j REJECT"];
         assert_eq!(dropping(tables), expected);
         assert!(dropping("counter packets 0 dropped").is_empty());
+    }
+
+    #[test]
+    fn rules_for_forwarded_packets_and_invalid_connections_are_no_fault() {
+        // Docker adds chains of this kind on each host.
+        let docker = "-P INPUT ACCEPT\n-P FORWARD DROP\n-N DOCKER\n-A FORWARD -j DOCKER\n-A DOCKER -o docker0 -j DROP\n";
+        assert_eq!(dropping(docker), Vec::<String>::new());
+        let nft = "table ip filter {\n\tchain DOCKER {\n\t\toifname \"docker0\" counter packets 0 bytes 0 drop\n\t}\n\tchain FORWARD {\n\t\ttype filter hook forward priority filter; policy drop;\n\t\tjump DOCKER\n\t}\n\tchain INPUT {\n\t\ttype filter hook input priority filter; policy accept;\n\t\tct state invalid drop\n\t}\n}\n";
+        assert_eq!(dropping(nft), Vec::<String>::new());
+    }
+
+    #[test]
+    fn rules_of_a_chain_to_which_the_input_jumps_are_found() {
+        let ufw = "-P INPUT ACCEPT\n-N ufw-input\n-N ufw-end\n-A INPUT -j ufw-input\n-A ufw-input -j ufw-end\n-A ufw-end -j DROP\n";
+        assert_eq!(dropping(ufw), ["-A ufw-end -j DROP"]);
+        let nft = "table inet filter {\n\tchain input {\n\t\ttype filter hook input priority filter; policy accept;\n\t\tudp dport 4840 goto cell\n\t}\n\tchain cell {\n\t\tip saddr != 10.0.0.0/8 reject\n\t\tgoto input\n\t}\n}\n";
+        assert_eq!(dropping(nft), ["ip saddr != 10.0.0.0/8 reject"]);
     }
 }

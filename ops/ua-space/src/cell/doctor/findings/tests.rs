@@ -1,9 +1,11 @@
 use std::net::Ipv4Addr;
 
 use super::super::super::pages::{CertificatePage, StatusPage, TopicPage};
-use super::super::super::processes::LocalProcess;
+use super::super::super::processes::{LocalProcess, UdpSocket};
 use super::super::facts::AnnouncedApplication;
-use super::super::host::{InterfaceFacts, Route, Switch};
+use super::super::host::{HALT_POLL, IPFRAG_HIGH, InterfaceFacts, RMEM_MAX, Route, Switch};
+use super::DoctorSeverity::Note;
+use super::programs::{DAY, day_number};
 use super::*;
 use crate::live::{SenderTiming, TopicSeen};
 
@@ -94,6 +96,16 @@ fn faults_of_the_network_are_found() {
     assert_eq!(down, ["D001"]);
     let member = after(|facts| facts.host.memberships.clear());
     assert_eq!(member, ["D002"]);
+    let elsewhere = after(|facts| {
+        facts.host.interfaces.push(InterfaceFacts {
+            name: "wlan0".to_owned(),
+            address: "192.168.0.5".to_owned(),
+            up: true,
+            round_trip: None,
+        });
+        facts.group.interface = Some("wlan0".to_owned());
+    });
+    assert_eq!(elsewhere, ["D002"], "it joined on eth0");
     let trip = after(|facts| {
         let failed = Err("nothing came back".to_owned());
         facts.host.interfaces[0].round_trip = Some(failed);
@@ -261,7 +273,16 @@ fn limits_of_the_host_are_found() {
     assert_eq!(rmem, ["D050"]);
     let frag = after(|facts| set(facts, IPFRAG_HIGH, 262_144));
     assert_eq!(frag, ["D052"]);
-    assert_eq!(after(|facts| facts.host.reassembly_failures = 2), ["D052"]);
+    let lost = after(|facts| {
+        set(facts, IPFRAG_HIGH, 4 << 20);
+        facts.host.reassembly_failures = 2;
+    });
+    assert_eq!(lost, ["D052"]);
+    let mut enlarged = healthy();
+    enlarged.host.reassembly_failures = 2;
+    let found = of(&enlarged);
+    assert_eq!((found[0].code, found[0].severity), ("D052", Note));
+    assert_eq!(found[0].fix, None, "the buffer is large enough");
     let poll = after(|facts| {
         facts.host.is_virtual = true;
         facts.host.settings.insert(HALT_POLL.to_owned(), 0);
