@@ -12,7 +12,7 @@ use std::{
 };
 
 use nix::{
-    mount::{MsFlags, mount},
+    mount::{MntFlags, MsFlags, mount, umount2},
     sched::{CloneFlags, unshare},
 };
 
@@ -176,6 +176,41 @@ impl Cell {
         let path = self.folder.join(name);
         fs::write(&path, text).unwrap();
         path
+    }
+}
+
+/// A file or folder that programs of a cell see at the path of another one, until this is dropped.
+///
+/// It is dropped by the thread that made the cell, because the mount belongs to its namespace.
+#[derive(Debug)]
+pub struct CoveredPath {
+    path: PathBuf,
+    not_send: PhantomData<*const ()>,
+}
+
+impl Cell {
+    /// Shows `source`, a file or a folder, to the programs of this cell at `path`, which exists.
+    /// Files of the kernel can be covered too, as `/proc/sys/net/core/rmem_max`.
+    ///
+    /// # Panics
+    /// Panics if the path cannot be covered.
+    #[must_use]
+    pub fn cover(&self, path: &str, source: &Path) -> CoveredPath {
+        const NOTHING: Option<&str> = None;
+        mount(Some(source), path, NOTHING, MsFlags::MS_BIND, NOTHING)
+            .unwrap_or_else(|error| panic!("{path} cannot be covered: {error}"));
+        CoveredPath {
+            path: path.into(),
+            not_send: PhantomData,
+        }
+    }
+}
+
+impl Drop for CoveredPath {
+    fn drop(&mut self) {
+        if let Err(error) = umount2(&self.path, MntFlags::MNT_DETACH) {
+            eprintln!("{} stays covered: {error}", self.path.display());
+        }
     }
 }
 

@@ -47,7 +47,7 @@ pub use asker::{CallerKind, CallerScript, Counting};
 pub use bare_node::{BareNode, BareSubscription, PATIENCE, string_frame};
 pub use browser::{Browser, EventStream, WebAnswer};
 pub use capture::{CaptureFile, Dissected, hex, is_true};
-pub use cell::{Cell, Distribution, Peer};
+pub use cell::{Cell, CoveredPath, Distribution, Peer};
 pub use child::{Child, StartedChild};
 pub use clock::WallClock;
 pub use codec_asker::{CallEnd, CodecAsker, send_from};

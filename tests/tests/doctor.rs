@@ -1,5 +1,7 @@
 //! `ua-space status` and `ua-space doctor` with cells in which one thing is broken.
 
+mod broken;
+
 use std::net::UdpSocket;
 use std::path::Path;
 use std::time::Duration;
@@ -12,13 +14,19 @@ use system_tests::{
 
 const SOON: Duration = Duration::from_secs(30);
 
-/// Runs `ua-space` with variables. Returns the exit code, and the last JSON object of the output.
+/// Runs `ua-space` on loopback with variables. Returns the exit code, and the last JSON object of
+/// the output.
 fn ua_space(words: &[&str], variables: &[(&str, &str)]) -> (i32, Value) {
+    ua_space_anywhere(&[words, &["--interface", "lo"]].concat(), variables)
+}
+
+/// Like [`ua_space`], on the interface of the routes or of the words.
+fn ua_space_anywhere(words: &[&str], variables: &[(&str, &str)]) -> (i32, Value) {
     let mut started = StartedChild::new("ua-space", &program("ua-space")).args(words);
     for (name, value) in variables {
         started = started.env(name, value);
     }
-    let mut child = started.args(["--interface", "lo", "--json"]).start();
+    let mut child = started.args(["--json"]).start();
     let code = child.wait_for_end(SOON).code().unwrap();
     let lines = child.lines();
     let mut objects = lines.iter().rev().filter_map(|line| {
