@@ -212,7 +212,7 @@ impl Udp {
         let mut made = None;
         let change = self.watch.as_mut().and_then(|watch| {
             watch.see(&present, |interface| {
-                made = Some(anew(options, receiver, interface).map_err(|error| error.to_string())?);
+                made = Some(anew(options, receiver, interface)?);
                 Ok(())
             })
         });

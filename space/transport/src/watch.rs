@@ -5,6 +5,7 @@
 //! a notification of the kernel. So the interfaces are polled each second. Listing them takes less
 //! than a tenth of a millisecond and needs no privilege.
 
+use std::error::Error;
 use std::io;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr, UdpSocket};
 use std::time::Duration;
@@ -21,6 +22,36 @@ pub enum InterfaceChange {
     Lost(String),
     /// The interface can be used again, or was replaced.
     Back(Interface),
+}
+
+/// The reason why the interface of our sockets cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub(crate) enum UnusableInterface {
+    /// No interface has the name or address.
+    #[error("this host has no network interface `{0}` with an IPv4 address")]
+    Missing(String),
+    /// The system has no route to the group.
+    #[error("no network interface leads to {group}: {error}")]
+    NoRoute {
+        /// The multicast group.
+        group: SocketAddr,
+        /// The error of the system.
+        error: io::Error,
+    },
+    /// No interface has the source address of the route to the group.
+    #[error("no network interface of this host has the address {address}, which leads to {group}")]
+    NoAddress {
+        /// The multicast group.
+        group: SocketAddr,
+        /// The source address.
+        address: Ipv4Addr,
+    },
+    /// The link is down.
+    #[error("the network interface {0} is down")]
+    Down(Interface),
+    /// The sockets cannot be recreated.
+    #[error(transparent)]
+    Sockets(#[from] Box<dyn Error + Send + Sync>),
 }
 
 /// Selection of the interface of the sockets.
@@ -67,12 +98,12 @@ impl InterfaceWatch {
     pub(crate) fn see(
         &mut self,
         present: &[Interface],
-        take: impl FnOnce(&Interface) -> Result<(), String>,
+        take: impl FnOnce(&Interface) -> Result<(), Box<dyn Error + Send + Sync>>,
     ) -> Option<InterfaceChange> {
         let found = self.wanted.find(present, Some(&self.held));
         let taken = found.and_then(|found| {
             if !found.up {
-                return Err(format!("the network interface {found} is down"));
+                return Err(UnusableInterface::Down(found));
             }
             if self.lost.is_none() && found == self.held {
                 return Ok(None);
@@ -88,6 +119,7 @@ impl InterfaceWatch {
                 Some(InterfaceChange::Back(found))
             }
             Err(why) => {
+                let why = why.to_string();
                 let told = self.lost.replace(why.clone()).is_some();
                 (!told).then_some(InterfaceChange::Lost(why))
             }
@@ -96,21 +128,19 @@ impl InterfaceWatch {
 }
 
 impl InterfaceSelection {
-    fn find(&self, present: &[Interface], held: Option<&Interface>) -> Result<Interface, String> {
+    fn find(
+        &self,
+        present: &[Interface],
+        held: Option<&Interface>,
+    ) -> Result<Interface, UnusableInterface> {
         let (wanted, missing) = match self {
-            Self::Named(wanted) => (
-                wanted.clone(),
-                format!("this host has no network interface `{wanted}` with an IPv4 address"),
-            ),
+            Self::Named(wanted) => (wanted.clone(), UnusableInterface::Missing(wanted.clone())),
             Self::Towards(group) => {
-                let source = source_towards(*group)
-                    .map_err(|error| format!("no network interface leads to {group}: {error}"))?;
-                (
-                    source.to_string(),
-                    format!(
-                        "no network interface of this host has the address {source}, which leads to {group}"
-                    ),
-                )
+                let group = *group;
+                let address = source_towards(group)
+                    .map_err(|error| UnusableInterface::NoRoute { group, error })?;
+                let missing = UnusableInterface::NoAddress { group, address };
+                (address.to_string(), missing)
             }
         };
         // While the previous address is present, other addresses of the interface are ignored.
@@ -416,7 +446,7 @@ mod tests {
     #[test]
     fn sockets_that_cannot_be_made_are_tried_again() {
         let mut watch = named("wire0");
-        let refuse = |_: &Interface| Err("no".to_owned());
+        let refuse = |_: &Interface| Err("no".into());
         let refused = watch.see(&[wire(4, 1)], refuse);
         assert_eq!(refused, Some(InterfaceChange::Lost("no".to_owned())));
         assert_eq!(watch.see(&[wire(4, 1)], refuse), None);
