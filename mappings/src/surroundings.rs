@@ -1,6 +1,7 @@
 //! Inputs of a check beside the document's text. The caller provides them: this crate opens no file
 //! and reads no environment.
 
+use std::io;
 use std::path::{Component, Path, PathBuf};
 
 use messages::NoTexts;
@@ -14,14 +15,14 @@ pub trait Surroundings {
     /// Returns the text of a file, for `include`.
     ///
     /// # Errors
-    /// The reason that the file cannot be read, for users.
-    fn read(&self, file: &str) -> Result<String, String>;
+    /// The file cannot be read, or is not text.
+    fn read(&self, file: &str) -> io::Result<String>;
 
     /// Returns the names in a folder, in no order, for an `include` with a wildcard.
     ///
     /// # Errors
-    /// The reason that the folder cannot be read, for users.
-    fn list(&self, folder: &str) -> Result<Vec<String>, String>;
+    /// The folder cannot be read.
+    fn list(&self, folder: &str) -> io::Result<Vec<String>>;
 
     /// Returns the value of an environment variable, for `${NAME}`; `None` if it is not set.
     fn variable(&self, name: &str) -> Option<String>;
@@ -66,11 +67,11 @@ pub enum FileReaders {
 pub(crate) struct Alone;
 
 impl Surroundings for Alone {
-    fn read(&self, _: &str) -> Result<String, String> {
-        Err("only this text is available".to_owned())
+    fn read(&self, _: &str) -> io::Result<String> {
+        Err(io::Error::other("only this text is available"))
     }
 
-    fn list(&self, _: &str) -> Result<Vec<String>, String> {
+    fn list(&self, _: &str) -> io::Result<Vec<String>> {
         self.read("").map(|_| Vec::new())
     }
 

@@ -50,11 +50,11 @@ impl OpenTypeFiles for Files {
 struct Beside;
 
 impl Surroundings for Beside {
-    fn read(&self, _: &str) -> Result<String, String> {
-        Err("there is no file".to_owned())
+    fn read(&self, _: &str) -> std::io::Result<String> {
+        Err(std::io::Error::other("there is no file"))
     }
 
-    fn list(&self, _: &str) -> Result<Vec<String>, String> {
+    fn list(&self, _: &str) -> std::io::Result<Vec<String>> {
         Ok(Vec::new())
     }
 

@@ -28,12 +28,12 @@ impl Beside {
 }
 
 impl Surroundings for Beside {
-    fn read(&self, file: &str) -> Result<String, String> {
+    fn read(&self, file: &str) -> std::io::Result<String> {
         let text = self.files.get(file).cloned();
-        text.ok_or_else(|| "there is no such file".to_owned())
+        text.ok_or_else(|| std::io::Error::other("there is no such file"))
     }
 
-    fn list(&self, folder: &str) -> Result<Vec<String>, String> {
+    fn list(&self, folder: &str) -> std::io::Result<Vec<String>> {
         let names = self.files.keys().filter_map(|file| file.rsplit_once('/'));
         let within = names.filter(|(of, _)| *of == folder);
         Ok(within.map(|(_, name)| name.to_owned()).rev().collect())

@@ -38,11 +38,11 @@ struct Around {
 }
 
 impl Surroundings for Around {
-    fn read(&self, file: &str) -> Result<String, String> {
-        Err(format!("{file} is not there"))
+    fn read(&self, file: &str) -> std::io::Result<String> {
+        Err(std::io::Error::other(format!("{file} is not there")))
     }
 
-    fn list(&self, folder: &str) -> Result<Vec<String>, String> {
+    fn list(&self, folder: &str) -> std::io::Result<Vec<String>> {
         self.read(folder).map(|_| Vec::new())
     }
 

@@ -558,7 +558,7 @@ fn component(settings: &Settings, driver: ExecuteProcess, locator: LocateObject)
 /// All findings with their lines.
 fn read_settings(file: &Path) -> Result<Settings, String> {
     let name = file.display().to_string();
-    let text = bridge_node::read_text_file(file)?;
+    let text = bridge_node::read_text_file(file).map_err(|error| error.to_string())?;
     let folder = file.parent().unwrap_or_else(|| Path::new(""));
     Settings::from_yaml(&text, folder).map_err(|findings| findings.render(&name, &text))
 }

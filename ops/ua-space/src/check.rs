@@ -70,9 +70,7 @@ fn read(file: &str) -> Result<String, CommandFailure> {
     let read = match file {
         "-" => type_files::read_text(io::stdin().lock()),
         // The file may be a pipe that the user fills.
-        file => File::open(file)
-            .map_err(|error| error.to_string())
-            .and_then(type_files::read_text),
+        file => File::open(file).and_then(type_files::read_text),
     };
     read.map_err(|why| CommandFailure::Io(format!("cannot read {file}: {why}")))
 }
@@ -84,11 +82,11 @@ struct Around<'a> {
 }
 
 impl Surroundings for Around<'_> {
-    fn read(&self, file: &str) -> Result<String, String> {
+    fn read(&self, file: &str) -> io::Result<String> {
         Disk.read(file)
     }
 
-    fn list(&self, folder: &str) -> Result<Vec<String>, String> {
+    fn list(&self, folder: &str) -> io::Result<Vec<String>> {
         Disk.list(folder)
     }
 

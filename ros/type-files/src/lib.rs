@@ -10,7 +10,7 @@ mod package;
 mod paths;
 
 use std::fs::File;
-use std::io::Read;
+use std::io::{self, Read};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -82,13 +82,13 @@ impl RosEnvironment {
 pub struct Disk;
 
 impl Surroundings for Disk {
-    fn read(&self, file: &str) -> Result<String, String> {
-        read_mapping(file)
+    fn read(&self, file: &str) -> io::Result<String> {
+        read_text(open(Path::new(file))?)
     }
 
-    fn list(&self, folder: &str) -> Result<Vec<String>, String> {
+    fn list(&self, folder: &str) -> io::Result<Vec<String>> {
         let folder = if folder.is_empty() { "." } else { folder };
-        let entries = std::fs::read_dir(folder).map_err(|error| error.to_string())?;
+        let entries = std::fs::read_dir(folder)?;
         let names = entries.filter_map(|entry| entry.ok()?.file_name().into_string().ok());
         Ok(names.collect())
     }
@@ -124,21 +124,13 @@ const fn readers(_: &Path) -> Option<FileReaders> {
     None
 }
 
-fn read_mapping(file: &str) -> Result<String, String> {
-    let file = open(Path::new(file)).map_err(|error| error.to_string())?;
-    read_text(file)
-}
-
 /// Reads a text up to the limit of a mapping. A longer text is cut, which gives a finding (M002).
 ///
 /// # Errors
-/// Returns the reason for users if the text cannot be read.
-pub fn read_text(from: impl Read) -> Result<String, String> {
+/// The text cannot be read, or is not UTF-8.
+pub fn read_text(from: impl Read) -> io::Result<String> {
     let mut text = Vec::new();
-    let length = from
-        .take(MOST_OF_A_MAPPING)
-        .read_to_end(&mut text)
-        .map_err(|error| error.to_string())?;
+    let length = from.take(MOST_OF_A_MAPPING).read_to_end(&mut text)?;
     if u64::try_from(length).is_ok_and(|length| length == MOST_OF_A_MAPPING) {
         // The cut may be within a character.
         return Ok(String::from_utf8_lossy(&text).into_owned());
@@ -149,16 +141,16 @@ pub fn read_text(from: impl Read) -> Result<String, String> {
 /// Reads a file of text, such as the YAML of a program, within the bound of a mapping.
 ///
 /// # Errors
-/// Returns the reason for users: the file cannot be read, has more than 8 MiB, or is not UTF-8.
-pub fn read_text_file(file: &Path) -> Result<String, String> {
-    let bytes = read_bounded(file, MOST_OF_A_MAPPING);
-    utf8(bytes.map_err(|error| error.to_string())?)
+/// The file cannot be read, has more than 8 MiB, or is not UTF-8.
+pub fn read_text_file(file: &Path) -> io::Result<String> {
+    utf8(read_bounded(file, MOST_OF_A_MAPPING).map_err(io::Error::other)?)
 }
 
-fn utf8(bytes: Vec<u8>) -> Result<String, String> {
+fn utf8(bytes: Vec<u8>) -> io::Result<String> {
     String::from_utf8(bytes).map_err(|error| {
         let at = error.utf8_error().valid_up_to();
-        format!("it is not UTF-8 from byte {at} on; save it as UTF-8")
+        let why = format!("it is not UTF-8 from byte {at} on; save it as UTF-8");
+        io::Error::new(io::ErrorKind::InvalidData, why)
     })
 }
 
@@ -261,17 +253,17 @@ fn definition(text: String, path: &Path) -> DefinitionText {
 }
 
 /// Opens a regular file or a link to a regular file: opening a pipe would wait for its writer.
-pub(crate) fn open(path: &Path) -> std::io::Result<File> {
+pub(crate) fn open(path: &Path) -> io::Result<File> {
     if path.metadata()?.is_file() {
         File::open(path)
     } else {
-        Err(std::io::Error::other(
+        Err(io::Error::other(
             "it is not a regular file or a link to a regular file",
         ))
     }
 }
 
-fn read(path: &Path) -> std::io::Result<String> {
+fn read(path: &Path) -> io::Result<String> {
     let mut bytes = Vec::new();
     open(path)?.take(MOST_BYTES).read_to_end(&mut bytes)?;
     // Comments have any encoding; the definitions are ASCII.

@@ -6,7 +6,7 @@ mod look;
 use std::cell::{Cell, RefCell};
 use std::collections::BTreeSet;
 use std::fmt::Write as _;
-use std::io::Write as _;
+use std::io::{self, Write as _};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
@@ -21,6 +21,7 @@ use service::{Failure, FailureKind};
 use sha2::{Digest, Sha256};
 use tokio::signal::unix::Signal;
 use tokio::sync::watch;
+use tokio::task::JoinError;
 use tracing::{error, info, warn};
 use type_files::{RosEnvironment, TypeFiles, TypePaths};
 
@@ -96,17 +97,33 @@ struct Reading {
     files: SeenFiles,
 }
 
+/// The reason why a mapping cannot be read.
+#[derive(Debug, thiserror::Error)]
+enum UnreadMapping {
+    /// The file cannot be read.
+    #[error("cannot read the mapping {name}: {error}")]
+    File {
+        /// The file.
+        name: String,
+        /// The error of the system.
+        error: io::Error,
+    },
+    /// The thread that reads the file failed.
+    #[error(transparent)]
+    Thread(#[from] JoinError),
+}
+
 type Known = BTreeSet<(Dialect, TextKind, TypeName)>;
 
 /// Reads the mapping, its includes, and the definitions of its `type_paths`.
 ///
 /// # Errors
-/// The reason why the file cannot be read.
+/// The file cannot be read.
 fn read(
     (file, nodesets): (&Path, Option<NodeSetReader>),
     running: &TypePaths,
     known: &Known,
-) -> Result<Reading, String> {
+) -> Result<Reading, UnreadMapping> {
     let disk = Disk {
         running,
         nodesets: (nodesets, Cell::default()),
@@ -114,9 +131,10 @@ fn read(
         types: RefCell::default(),
     };
     let name = file.display().to_string();
-    let text = disk
-        .read(&name)
-        .map_err(|error| format!("cannot read the mapping {name}: {error}"))?;
+    let text = disk.read(&name).map_err(|error| UnreadMapping::File {
+        name: name.clone(),
+        error,
+    })?;
     let mut checked = Mapping::from_text(&text, &name, &disk);
     let mut types = disk.types();
     let lost: Vec<&TypeUse> = checked
@@ -195,12 +213,12 @@ impl Disk<'_> {
 }
 
 impl Surroundings for Disk<'_> {
-    fn read(&self, file: &str) -> Result<String, String> {
+    fn read(&self, file: &str) -> io::Result<String> {
         self.see(file);
         type_files::Disk.read(file)
     }
 
-    fn list(&self, folder: &str) -> Result<Vec<String>, String> {
+    fn list(&self, folder: &str) -> io::Result<Vec<String>> {
         self.see(if folder.is_empty() { "." } else { folder });
         type_files::Disk.list(folder)
     }
@@ -300,7 +318,7 @@ impl MappingFile {
             return Ok((!only_check).then(|| Self::none(Mapping::default())));
         };
         let mut reading = read((file, nodesets), &TypePaths::default(), &Known::new())
-            .map_err(|error| Failure::new(FailureKind::Io, error))?;
+            .map_err(|error| Failure::new(FailureKind::Io, error.to_string()))?;
         let spaces = reading.checked.outline().map(spaces).transpose();
         let mut own = Vec::new();
         if let Ok(Some(spaces)) = &spaces {
@@ -311,7 +329,7 @@ impl MappingFile {
             let _rendered_no_more = reading.leave_to_the_run(file);
         }
         // The program runs even if stderr is closed.
-        let _printed = std::io::stderr().write_all(reading.checked.render_all().as_bytes());
+        let _printed = io::stderr().write_all(reading.checked.render_all().as_bytes());
         if !only_check {
             spaces?;
         }
@@ -442,14 +460,14 @@ impl MappingFile {
     }
 
     /// Adopts or refuses a reading. Returns whether the shells have to be notified.
-    fn take(&mut self, reading: Result<Reading, String>, asked: bool) -> bool {
+    fn take(&mut self, reading: Result<Reading, UnreadMapping>, asked: bool) -> bool {
         let Some(file) = self.file.clone() else {
             return false;
         };
         let mut reading = match reading {
             Ok(reading) => reading,
             Err(why) => {
-                self.refuse(why);
+                self.refuse(why.to_string());
                 // Once the file is readable again, the same text counts as new, which clears the
                 // stale status.
                 self.hash.clear();

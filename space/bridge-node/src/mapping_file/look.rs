@@ -10,7 +10,7 @@ use tokio::time::timeout;
 use tracing::warn;
 use type_files::TypePaths;
 
-use super::{Known, NodeSetReader, Reading, read};
+use super::{Known, NodeSetReader, Reading, UnreadMapping, read};
 
 /// The files and folders that were read or looked for, each with its stamp from before the reading.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
@@ -90,7 +90,7 @@ pub(super) struct Looked {
     pub(super) before: Before,
     /// Whether the mapping is missing or empty, and was so at the last poll.
     pub(super) gone: bool,
-    pub(super) reading: Option<Result<Reading, String>>,
+    pub(super) reading: Option<Result<Reading, UnreadMapping>>,
 }
 
 /// The parameters of a poll.
@@ -129,7 +129,7 @@ impl PollParameters {
             }
         };
         looked.unwrap_or_else(|error| Looked {
-            reading: Some(Err(error.to_string())),
+            reading: Some(Err(error.into())),
             ..Looked::default()
         })
     }
