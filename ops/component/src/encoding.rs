@@ -30,7 +30,7 @@ pub(crate) fn encoded(field: &CallField, value: &Json, namespace: u16) -> Result
             .collect(),
         None => typed(builtin, value),
     };
-    let value = shape.read_json(&value)?;
+    let value = shape.read_json(&value).map_err(|error| error.to_string())?;
     if let SkillValue::Array(_, elements) = &value {
         has_length(field.rank, elements.len())?;
     }

@@ -153,7 +153,7 @@ fn parameters(
         let value = parameter
             .shape
             .read_json(&json)
-            .map_err(|why| wrong(&why))?;
+            .map_err(|error| wrong(&error.to_string()))?;
         given.push((name.to_owned(), value));
     }
     Ok(given)

@@ -16,7 +16,7 @@ use tokio::sync::watch;
 use crate::driver::{Driver, RunResults, Work};
 use crate::driver_error::{DriverError, InvalidParameter};
 use crate::parameters::{Parameters, SkillParameter, shortened};
-use crate::value::SkillValue;
+use crate::value::{SkillValue, ValueError};
 use crate::values::ValueFacts;
 use crate::yaml::{Place, YamlFinding, YamlFindingCode, nearest};
 
@@ -49,13 +49,74 @@ pub enum FieldEffect {
 }
 
 /// A configuration that is not accepted.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[error("{field}: {reason}")]
 pub struct NotConfigured {
     /// The first wrong field; empty if the fault is not that of a field.
     pub field: String,
-    /// The reason, as text for people.
-    pub reason: String,
+    /// The reason.
+    pub reason: FieldError,
+}
+
+/// The reason why a field, or a configuration, is not accepted.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum FieldError {
+    /// The argument is not a list of names and values.
+    #[error("the argument is not an array of KeyValuePair")]
+    NoPairs,
+    /// The component has no such field.
+    #[error("there is no field {name}; the fields are {}", fields.join(", "))]
+    Unknown {
+        /// The start of the name.
+        name: String,
+        /// The fields of the component.
+        fields: Vec<String>,
+    },
+    /// The field has two values.
+    #[error("the field is given twice")]
+    Twice,
+    /// A skill cannot have values of the type.
+    #[error("the value has a type that is not supported")]
+    Unsupported,
+    /// The value has another type than the field.
+    #[error(transparent)]
+    Value(#[from] ValueError),
+    /// The value is NaN or infinite.
+    #[error("{0} is not a number")]
+    Unreal(SkillValue),
+    /// The text is too long, or not a single line.
+    #[error("expected a line of at most {LONGEST_TEXT} bytes")]
+    NoLine(String),
+    /// The array is too long.
+    #[error("expected at most {MOST_ELEMENTS} elements")]
+    Elements(usize),
+    /// The number is out of the range of the field.
+    #[error("expected {low} to {high}{}, found {found}", behind(unit.as_deref()))]
+    OutOfRange {
+        /// The lowest value.
+        low: f64,
+        /// The highest value.
+        high: f64,
+        /// The symbol of the unit.
+        unit: Option<String>,
+        /// The number.
+        found: f64,
+    },
+    /// The file of the configured values cannot be used.
+    #[error("cannot {operation} {}: {why}", path.display())]
+    Store {
+        /// The operation, as `write`.
+        operation: &'static str,
+        /// The file.
+        path: PathBuf,
+        /// The reason.
+        why: String,
+    },
+}
+
+/// Returns the symbol of a unit as it follows a number.
+fn behind(unit: Option<&str>) -> String {
+    unit.map_or_else(String::new, |unit| format!(" {unit}"))
 }
 
 /// The values of the fields.
@@ -125,21 +186,16 @@ impl ComponentConfiguration {
         let mut values = Values::clone(&self.values.borrow());
         let mut seen: Vec<String> = Vec::new();
         for (name, value) in given {
-            let wrong = |reason: String| NotConfigured {
+            let wrong = |reason| NotConfigured {
                 field: name.clone(),
                 reason,
             };
             let field = self.fields.iter().find(|field| field.facts.name == name);
             let Some(field) = field else {
-                let names: Vec<&str> = self.fields.iter().map(|of| &*of.facts.name).collect();
-                let names = names.join(", ");
-                let name = shortened(&name);
-                return Err(wrong(format!(
-                    "there is no field {name}; the fields are {names}"
-                )));
+                return Err(wrong(self.unknown(&name)));
             };
             if seen.contains(&name) {
-                return Err(wrong("the field is given twice".to_owned()));
+                return Err(wrong(FieldError::Twice));
             }
             let value = field.take(value).map_err(wrong)?;
             seen.push(name.clone());
@@ -155,19 +211,26 @@ impl ComponentConfiguration {
         Ok(())
     }
 
+    fn unknown(&self, name: &str) -> FieldError {
+        FieldError::Unknown {
+            name: shortened(name),
+            fields: self.fields.iter().map(|of| of.facts.name.clone()).collect(),
+        }
+    }
+
     fn restore(&self, stored: &serde_json::Map<String, Json>) {
         let mut values = Values::new();
         for (name, json) in stored {
             let field = self.fields.iter().find(|field| field.facts.name == *name);
-            let value = match field {
-                None => Err("there is no such field".to_owned()),
-                Some(field) => field
-                    .facts
-                    .shape
-                    .read_json(json)
-                    .and_then(|value| field.take(value)),
+            let Some(field) = field else {
+                tracing::warn!(
+                    field = name,
+                    "ignored a stored value: there is no such field"
+                );
+                continue;
             };
-            match value {
+            let read = field.facts.shape.read_json(json).map_err(FieldError::from);
+            match read.and_then(|value| field.take(value)) {
                 Ok(value) => drop(values.insert(name.clone(), value)),
                 Err(why) => tracing::warn!(field = name, "ignored a stored value: {why}"),
             }
@@ -251,21 +314,22 @@ impl Configurable {
     ///
     /// # Errors
     /// The reason why it does not fit.
-    pub fn take(&self, value: SkillValue) -> Result<SkillValue, String> {
+    pub fn take(&self, value: SkillValue) -> Result<SkillValue, FieldError> {
         let ValueFacts {
             shape, range, unit, ..
         } = &*self.facts;
-        let given = value.shape();
+        let found = value.shape();
         let Some(value) = shape.take(value) else {
-            return Err(format!("expected {shape}, found {given}"));
+            let expected = *shape;
+            return Err(ValueError::Shape { expected, found }.into());
         };
         if value.is_unreal() {
-            return Err(format!("{value} is not a number"));
+            return Err(FieldError::Unreal(value));
         }
         if let SkillValue::String(text) = &value
             && (text.len() > LONGEST_TEXT || text.contains(char::is_control))
         {
-            return Err(format!("expected a line of at most {LONGEST_TEXT} bytes"));
+            return Err(FieldError::NoLine(text.clone()));
         }
         let elements = if let SkillValue::Array(_, elements) = &value {
             elements.as_slice()
@@ -273,17 +337,21 @@ impl Configurable {
             std::slice::from_ref(&value)
         };
         if elements.len() > MOST_ELEMENTS {
-            return Err(format!("expected at most {MOST_ELEMENTS} elements"));
+            return Err(FieldError::Elements(elements.len()));
         }
-        if let Some((low, high)) = range
-            && let Some(outside) = elements
+        if let Some((low, high)) = *range
+            && let Some(found) = elements
                 .iter()
                 .filter_map(SkillValue::as_f64)
-                .find(|number| !(*low..=*high).contains(number))
+                .find(|number| !(low..=high).contains(number))
         {
-            let unit = unit.as_ref().map(|unit| format!(" {unit}"));
-            let unit = unit.unwrap_or_default();
-            return Err(format!("expected {low} to {high}{unit}, found {outside}"));
+            let unit = unit.clone();
+            return Err(FieldError::OutOfRange {
+                low,
+                high,
+                unit,
+                found,
+            });
         }
         Ok(value)
     }
@@ -396,8 +464,12 @@ fn lowered(value: SkillValue, limit: &SkillValue) -> SkillValue {
     }
 }
 
-fn read(path: &Path) -> Result<Option<serde_json::Map<String, Json>>, String> {
-    let cannot = |why: &dyn std::fmt::Display| format!("cannot read {}: {why}", path.display());
+fn read(path: &Path) -> Result<Option<serde_json::Map<String, Json>>, FieldError> {
+    let cannot = |why: &dyn std::fmt::Display| FieldError::Store {
+        operation: "read",
+        path: path.to_owned(),
+        why: why.to_string(),
+    };
     let length = match std::fs::metadata(path) {
         Ok(about) => about.len(),
         Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(None),
@@ -414,8 +486,12 @@ fn read(path: &Path) -> Result<Option<serde_json::Map<String, Json>>, String> {
     }
 }
 
-fn write(path: &Path, values: &Values) -> Result<(), String> {
-    let cannot = |why: &dyn std::fmt::Display| format!("cannot write {}: {why}", path.display());
+fn write(path: &Path, values: &Values) -> Result<(), FieldError> {
+    let cannot = |why: &dyn std::fmt::Display| FieldError::Store {
+        operation: "write",
+        path: path.to_owned(),
+        why: why.to_string(),
+    };
     let json: serde_json::Map<String, Json> = values
         .iter()
         .map(|(name, value)| (name.clone(), value.to_json()))
@@ -553,7 +629,7 @@ mod tests {
         let configuration = ComponentConfiguration::new(fields(), None);
         let refused = |values: Vec<(String, SkillValue)>| {
             let refused = configuration.set(values).unwrap_err();
-            (refused.field, refused.reason)
+            (refused.field, refused.reason.to_string())
         };
         let both = [given("Product", "A"), given("ForceLimit", 60.0)].concat();
         let reason = "expected 5 to 50, found 60".to_owned();
@@ -607,7 +683,7 @@ mod tests {
         std::fs::remove_file(&path).unwrap();
         std::fs::create_dir(&path).unwrap();
         let refused = configuration.set(given("Product", "B")).unwrap_err();
-        assert!(refused.reason.contains("cannot write"), "{refused}");
+        assert!(refused.to_string().contains("cannot write"), "{refused}");
         let product = configuration.watch().borrow().get("Product").cloned();
         assert_eq!(
             product,

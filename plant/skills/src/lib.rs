@@ -46,7 +46,9 @@ pub use component::{
     anonymous_by_default, measure_device, read_numbers, read_partner, read_shape, read_user,
 };
 pub use composite::{Broken, Job, JobObserver, PickAndPlace};
-pub use configuration::{ComponentConfiguration, Configurable, FieldEffect, NotConfigured};
+pub use configuration::{
+    ComponentConfiguration, Configurable, FieldEffect, FieldError, NotConfigured,
+};
 pub use driver::{Driver, RunResults, Stopped, Work};
 pub use driver_error::{DriverError, InvalidParameter};
 pub use grip::{GripError, GripPoint, GripType, NoShape, PartShape};
@@ -59,7 +61,7 @@ pub use shown::{
     LastCall, ProgramDiagnostic, RunOutcome, SkillEvent, SkillObserver, SkillSnapshot, Transitioned,
 };
 pub use skill::{Skill, SkillDescription};
-pub use value::{Builtin, SkillValue, ValueShape};
+pub use value::{Builtin, SkillValue, ValueError, ValueShape};
 pub use values::{
     DeviceValue, LiveValue, Measure, Measured, NewestState, Statistics, Tally, ValueFacts,
     ValueSensor,

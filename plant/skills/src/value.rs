@@ -67,6 +67,30 @@ impl Builtin {
     }
 }
 
+/// The reason why a value does not have an expected shape.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum ValueError {
+    /// A JSON value is not an array.
+    #[error("expected an array of {}", .0.name())]
+    NoArray(Builtin),
+    /// A JSON value is not in the range of the type.
+    #[error("expected {}, found {found}", .expected.name())]
+    Json {
+        /// The expected type.
+        expected: Builtin,
+        /// The start of the JSON text.
+        found: String,
+    },
+    /// A value has another shape.
+    #[error("expected {expected}, found {found}")]
+    Shape {
+        /// The expected shape.
+        expected: ValueShape,
+        /// The shape of the value.
+        found: ValueShape,
+    },
+}
+
 /// A builtin type and its rank: a scalar, or an array of one dimension.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct ValueShape {
@@ -98,13 +122,13 @@ impl ValueShape {
     /// Reads a JSON value in this shape.
     ///
     /// # Errors
-    /// The expected type, as text for people. Numbers are never rounded or truncated.
-    pub fn read_json(self, json: &Json) -> Result<SkillValue, String> {
+    /// The value has another type. Numbers are never rounded or truncated.
+    pub fn read_json(self, json: &Json) -> Result<SkillValue, ValueError> {
         if !self.array {
             return scalar_of_json(self.builtin, json);
         }
         let Json::Array(elements) = json else {
-            return Err(format!("expected an array of {}", self.builtin.name()));
+            return Err(ValueError::NoArray(self.builtin));
         };
         let elements = elements
             .iter()
@@ -336,7 +360,7 @@ fn real(value: f64) -> Json {
     }
 }
 
-fn scalar_of_json(builtin: Builtin, json: &Json) -> Result<SkillValue, String> {
+fn scalar_of_json(builtin: Builtin, json: &Json) -> Result<SkillValue, ValueError> {
     let whole = json.as_i64();
     let natural = json.as_u64();
     let value = match builtin {
@@ -361,7 +385,10 @@ fn scalar_of_json(builtin: Builtin, json: &Json) -> Result<SkillValue, String> {
             .as_str()
             .map(|text| SkillValue::String(text.to_owned())),
     };
-    value.ok_or_else(|| format!("expected {}, found {}", builtin.name(), shown(json)))
+    value.ok_or_else(|| ValueError::Json {
+        expected: builtin,
+        found: shown(json),
+    })
 }
 
 /// Returns at most 40 characters of a JSON text.
@@ -428,8 +455,8 @@ mod tests {
         assert!(read(Builtin::Float, "1e300").is_err());
         assert_eq!(read(Builtin::Double, "3"), Ok(SkillValue::Double(3.0)));
         assert_eq!(
-            read(Builtin::Boolean, "1"),
-            Err("expected Boolean, found 1".to_owned())
+            read(Builtin::Boolean, "1").unwrap_err().to_string(),
+            "expected Boolean, found 1"
         );
     }
 

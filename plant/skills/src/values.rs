@@ -215,7 +215,11 @@ impl Slot {
     fn put_json(&self, json: &Json) {
         self.put(match json.is_null() {
             true => Err("the source does not know the value".to_owned()),
-            false => self.facts.shape.read_json(json),
+            false => self
+                .facts
+                .shape
+                .read_json(json)
+                .map_err(|error| error.to_string()),
         });
     }
 

@@ -30,7 +30,8 @@ pub(super) fn values(
         }
         let wrong = |why: String| format!("{}: {why}", given.name);
         let json = in_unit(given, parameter).map_err(wrong)?;
-        let value = parameter.shape.read_json(&json).map_err(wrong)?;
+        let read = parameter.shape.read_json(&json);
+        let value = read.map_err(|error| wrong(error.to_string()))?;
         let numbers = if let SkillValue::Array(_, elements) = &value {
             elements.iter().filter_map(SkillValue::as_f64).collect()
         } else {

@@ -9,7 +9,7 @@ use super::values::{
     LONGEST_ABOUT, LONGEST_UNIT, check_range, read_line, read_range, read_shape_name,
 };
 use super::{SkillSetup, ValueSetup};
-use crate::configuration::{Configurable, FieldEffect};
+use crate::configuration::{Configurable, FieldEffect, FieldError};
 use crate::parameters::shortened;
 use crate::value::{Builtin, SkillValue, ValueShape};
 use crate::values::ValueFacts;
@@ -190,10 +190,10 @@ fn read_default(
             scalar(node, reader)?
         }
     };
-    let read = shape.read_json(&json).and_then(|value| field.take(value));
-    match read {
+    let read = shape.read_json(&json).map_err(FieldError::from);
+    match read.and_then(|value| field.take(value)) {
         Ok(value) => Some(value),
-        Err(why) => reader.refuse(node, YamlFindingCode::WrongValue, why),
+        Err(why) => reader.refuse(node, YamlFindingCode::WrongValue, why.to_string()),
     }
 }
 

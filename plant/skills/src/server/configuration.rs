@@ -17,7 +17,7 @@ use plant_opcua::users::UserAccess;
 use tracing::{info, warn};
 
 use super::values::{describe, variable_type};
-use crate::configuration::{ComponentConfiguration, Configurable, NotConfigured};
+use crate::configuration::{ComponentConfiguration, Configurable, FieldError, NotConfigured};
 use crate::value::SkillValue;
 use crate::variant::{from_variant, to_variant};
 
@@ -90,14 +90,10 @@ pub(super) fn serve(
                     warn!(application = ?caller.application_uri, "refused a configuration: {why}");
                 }
             }
-            let (status, refused) = match set {
-                Ok(()) => ("configured", None),
-                Err(why) => ("refused", Some(why)),
+            let (status, field, reason) = match set {
+                Ok(()) => ("configured", String::new(), String::new()),
+                Err(why) => ("refused", why.field, why.reason.to_string()),
             };
-            let NotConfigured { field, reason } = refused.unwrap_or_else(|| NotConfigured {
-                field: String::new(),
-                reason: String::new(),
-            });
             Ok([status, &field, &reason].map(Variant::from).to_vec())
         });
         server.add_method(spec, handler)?;
@@ -157,9 +153,9 @@ async fn keep(server: OpcUaServer, configuration: ComponentConfiguration, nodes:
 
 /// Reads the argument: an array of KeyValuePair.
 fn pairs(given: &Variant) -> Result<Vec<(String, SkillValue)>, NotConfigured> {
-    let wrong = |field: &str, reason: &str| NotConfigured {
+    let wrong = |field: &str, reason| NotConfigured {
         field: field.to_owned(),
-        reason: reason.to_owned(),
+        reason,
     };
     let elements = if let Variant::Array(array) = given {
         array.values.as_slice()
@@ -168,10 +164,10 @@ fn pairs(given: &Variant) -> Result<Vec<(String, SkillValue)>, NotConfigured> {
     };
     let pair = |element: &Variant| {
         let Variant::ExtensionObject(object) = element else {
-            return Err(wrong("", "the argument is not an array of KeyValuePair"));
+            return Err(wrong("", FieldError::NoPairs));
         };
         let Some(pair) = object.inner_as::<KeyValuePair>() else {
-            return Err(wrong("", "the argument is not an array of KeyValuePair"));
+            return Err(wrong("", FieldError::NoPairs));
         };
         let name = pair.key.name.as_ref();
         let value = if let Variant::Variant(inner) = &pair.value {
@@ -179,8 +175,7 @@ fn pairs(given: &Variant) -> Result<Vec<(String, SkillValue)>, NotConfigured> {
         } else {
             from_variant(&pair.value)
         };
-        let value =
-            value.ok_or_else(|| wrong(name, "the value has a type that is not supported"))?;
+        let value = value.ok_or_else(|| wrong(name, FieldError::Unsupported))?;
         Ok((name.to_owned(), value))
     };
     elements.iter().map(pair).collect()
