@@ -349,7 +349,10 @@ impl SpaceDriver {
                 fit.next().map(|(_, value)| value.to_json())
             };
             let value = match said {
-                Some((_, source)) => Some(source.value(parameters, &|_| None)?),
+                Some((_, source)) => {
+                    let value = source.value(parameters, &|_| None);
+                    Some(value.map_err(|error| error.to_string())?)
+                }
                 None => of_its_name(),
             };
             written.push(match value {
@@ -391,7 +394,8 @@ impl SpaceDriver {
         }
         let mut results = Vec::new();
         for (name, source) in &self.work.results {
-            let value = source.value(parameters, &of)?;
+            let value = source.value(parameters, &of);
+            let value = value.map_err(|error| error.to_string())?;
             // The texts `true` and `false` become Booleans, because constants are written as texts.
             let value = match value.as_str() {
                 Some("true") => true.into(),

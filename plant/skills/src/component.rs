@@ -23,7 +23,7 @@ pub(crate) use device::DeviceSensor;
 pub use device::{Device, DeviceKinds, NoDevices, measure_device};
 pub use document::{read_partner, read_user};
 pub use drivers::{DriverFault, Drivers};
-pub use space::{Form, RequestKind, SpaceFieldSource, SpaceWork, ValuePart};
+pub use space::{Form, RequestKind, SpaceFieldError, SpaceFieldSource, SpaceWork, ValuePart};
 
 pub use values::{ExecSource, MOST_VALUES, SensorRead, TopicSource, ValueSetup, ValueSource};
 pub use world::{World, WorldObject, read_numbers, read_shape};

@@ -9,9 +9,72 @@ use crate::authority::{Authority, SkillOwner};
 use crate::driver::Driver;
 use crate::model;
 use crate::parameters::ParameterType;
+use crate::refusal::SkillRefusal;
 use crate::shown::{RunOutcome, SkillSnapshot};
 use crate::skill::{Skill, SkillDescription};
 use crate::value::SkillValue;
+
+/// The reason why a driver does not conform, or a run has no outcome.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum ConformanceError {
+    /// The table has no such type.
+    #[error("there is no type {0}")]
+    NoType(String),
+    /// Start is refused.
+    #[error(transparent)]
+    Start(#[from] SkillRefusal),
+    /// Another method is refused.
+    #[error("{method} is refused: {refusal}")]
+    Call {
+        /// The method.
+        method: ProgramMethod,
+        /// The refusal.
+        refusal: SkillRefusal,
+    },
+    /// The actor of the skill has ended.
+    #[error("the skill has ended")]
+    Ended,
+    /// A run does not end.
+    #[error("the run does not end within {WAIT:?}")]
+    TimedOut,
+    /// A run has ended without an outcome.
+    #[error("the run left no outcome")]
+    NoOutcome,
+    /// A run failed.
+    #[error("the run failed: {0}")]
+    Failed(String),
+    /// The results are not those of the type.
+    #[error("the type has the results {declared:?}, the driver gave {given:?}")]
+    Results {
+        /// The results of the type.
+        declared: Vec<String>,
+        /// The results of the run.
+        given: Vec<String>,
+    },
+    /// A halted run has no outcome.
+    #[error("a halted run has no outcome")]
+    NoHaltedOutcome,
+    /// The driver does not follow Halt.
+    #[error("the driver did not hear Halt within {0:?}")]
+    LateHalt(Duration),
+    /// Halt leaves another state.
+    #[error("after Halt the skill is {0}")]
+    NotHalted(ProgramMachineState),
+    /// The work does not rest while it is suspended.
+    #[error("the work went on while it was suspended: {before} to {after}")]
+    NotSuspended {
+        /// The progress.
+        before: f32,
+        /// The progress after a pause.
+        after: f32,
+    },
+    /// A resumed run does not succeed.
+    #[error("the run did not succeed after it was resumed")]
+    NotResumed,
+    /// A run after a stop fails.
+    #[error("it does not work again after it was stopped: {0}")]
+    NotAgain(String),
+}
 
 const BY: SkillOwner = SkillOwner::Local("the conformance check");
 const WAIT: Duration = Duration::from_secs(10);
@@ -21,33 +84,23 @@ const WAIT: Duration = Duration::from_secs(10);
 /// suspended.
 ///
 /// # Errors
-/// The first deviation of the driver, as text for people.
+/// The first deviation of the driver.
 pub async fn check(
     skill_type: &str,
     driver: Arc<dyn Driver>,
     mut parameters: impl FnMut() -> Vec<(String, SkillValue)>,
-) -> Result<(), String> {
+) -> Result<(), ConformanceError> {
     let can_suspend = driver.can_suspend();
     let skill = skill(skill_type, driver)?;
     let outcome = run(&skill, &parameters()).await?;
     if !outcome.succeeded {
-        return Err(format!("the run failed: {}", outcome.message));
+        return Err(ConformanceError::Failed(outcome.message));
     }
-    let declared: Vec<&str> = skill
-        .facts()
-        .results
-        .iter()
-        .map(|result| result.name.as_str())
-        .collect();
-    let given: Vec<&str> = outcome
-        .results
-        .iter()
-        .map(|(name, _)| name.as_str())
-        .collect();
+    let declared = skill.facts().results.iter();
+    let declared: Vec<String> = declared.map(|result| result.name.clone()).collect();
+    let given: Vec<String> = outcome.results.into_iter().map(|(name, _)| name).collect();
     if declared != given {
-        return Err(format!(
-            "the type has the results {declared:?}, the driver gave {given:?}"
-        ));
+        return Err(ConformanceError::Results { declared, given });
     }
 
     start(&skill, &parameters()).await?;
@@ -57,15 +110,13 @@ pub async fn check(
         .shown()
         .outcome
         .clone()
-        .ok_or("a halted run has no outcome")?;
+        .ok_or(ConformanceError::NoHaltedOutcome)?;
     if outcome.message.contains("broken off") {
-        return Err(format!(
-            "the driver did not hear Halt within {:?}",
-            asked.elapsed()
-        ));
+        return Err(ConformanceError::LateHalt(asked.elapsed()));
     }
-    if skill.shown().state != ProgramMachineState::Halted {
-        return Err(format!("after Halt the skill is {}", skill.shown().state));
+    let state = skill.shown().state;
+    if state != ProgramMachineState::Halted {
+        return Err(ConformanceError::NotHalted(state));
     }
 
     if can_suspend {
@@ -79,10 +130,8 @@ pub async fn check(
         if shown.state != ProgramMachineState::Suspended
             || (shown.progress - before).abs() > f32::EPSILON
         {
-            return Err(format!(
-                "the work went on while it was suspended: {before} to {}",
-                shown.progress
-            ));
+            let after = shown.progress;
+            return Err(ConformanceError::NotSuspended { before, after });
         }
         call(&skill, ProgramMethod::Resume).await?;
         let shown = until(&skill, |shown| shown.state != ProgramMachineState::Running).await?;
@@ -91,7 +140,7 @@ pub async fn check(
             .as_ref()
             .is_some_and(|outcome| outcome.run == shown.run && outcome.succeeded);
         if !succeeded {
-            return Err("the run did not succeed after it was resumed".to_owned());
+            return Err(ConformanceError::NotResumed);
         }
         start(&skill, &parameters()).await?;
         call(&skill, ProgramMethod::Suspend).await?;
@@ -99,10 +148,7 @@ pub async fn check(
     }
     let outcome = run(&skill, &parameters()).await?;
     if !outcome.succeeded {
-        return Err(format!(
-            "it does not work again after it was stopped: {}",
-            outcome.message
-        ));
+        return Err(ConformanceError::NotAgain(outcome.message));
     }
     Ok(())
 }
@@ -110,17 +156,18 @@ pub async fn check(
 /// Runs a driver of a skill type of the table once.
 ///
 /// # Errors
-/// The reason why there is no outcome, as text for people; a refusal with its code.
+/// The reason why there is no outcome.
 pub async fn run_once(
     skill_type: &str,
     driver: Arc<dyn Driver>,
     parameters: Vec<(String, SkillValue)>,
-) -> Result<RunOutcome, String> {
+) -> Result<RunOutcome, ConformanceError> {
     run(&skill(skill_type, driver)?, &parameters).await
 }
 
-fn skill(skill_type: &str, driver: Arc<dyn Driver>) -> Result<Skill, String> {
-    let of = model::find(skill_type).ok_or_else(|| format!("there is no type {skill_type}"))?;
+fn skill(skill_type: &str, driver: Arc<dyn Driver>) -> Result<Skill, ConformanceError> {
+    let none = || ConformanceError::NoType(skill_type.to_owned());
+    let of = model::find(skill_type).ok_or_else(none)?;
     let facts = SkillDescription {
         name: of.name.to_owned(),
         types: of.chain().map(|of| ParameterType::own(of.name)).collect(),
@@ -133,7 +180,10 @@ fn skill(skill_type: &str, driver: Arc<dyn Driver>) -> Result<Skill, String> {
     Ok(Skill::spawn(facts, driver, Authority::new(), Vec::new()))
 }
 
-async fn run(skill: &Skill, parameters: &[(String, SkillValue)]) -> Result<RunOutcome, String> {
+async fn run(
+    skill: &Skill,
+    parameters: &[(String, SkillValue)],
+) -> Result<RunOutcome, ConformanceError> {
     start(skill, parameters).await?;
     let shown = until(skill, |shown| {
         matches!(
@@ -148,35 +198,32 @@ async fn run(skill: &Skill, parameters: &[(String, SkillValue)]) -> Result<RunOu
         .filter(|outcome| outcome.run == shown.run);
     outcome
         .map(|outcome| RunOutcome::clone(outcome))
-        .ok_or_else(|| "the run left no outcome".to_owned())
+        .ok_or(ConformanceError::NoOutcome)
 }
 
-async fn start(skill: &Skill, parameters: &[(String, SkillValue)]) -> Result<(), String> {
+async fn start(skill: &Skill, parameters: &[(String, SkillValue)]) -> Result<(), ConformanceError> {
     if skill.shown().state == ProgramMachineState::Halted {
         call(skill, ProgramMethod::Reset).await?;
     }
-    skill
-        .start_with(BY, parameters.to_vec())
-        .await
-        .map_err(|refusal| refusal.to_string())?;
+    skill.start_with(BY, parameters.to_vec()).await?;
     Ok(())
 }
 
-async fn call(skill: &Skill, method: ProgramMethod) -> Result<(), String> {
+async fn call(skill: &Skill, method: ProgramMethod) -> Result<(), ConformanceError> {
     let taken = skill.call(BY, method).await;
     taken
         .map(drop)
-        .map_err(|refusal| format!("{method} is refused: {refusal}"))
+        .map_err(|refusal| ConformanceError::Call { method, refusal })
 }
 
 async fn until(
     skill: &Skill,
     is: impl FnMut(&Arc<SkillSnapshot>) -> bool,
-) -> Result<Arc<SkillSnapshot>, String> {
+) -> Result<Arc<SkillSnapshot>, ConformanceError> {
     let mut watch = skill.watch();
     match tokio::time::timeout(WAIT, watch.wait_for(is)).await {
         Ok(Ok(shown)) => Ok(Arc::clone(&shown)),
-        Ok(Err(_)) => Err("the skill has ended".to_owned()),
-        Err(_) => Err(format!("the run does not end within {WAIT:?}")),
+        Ok(Err(_)) => Err(ConformanceError::Ended),
+        Err(_) => Err(ConformanceError::TimedOut),
     }
 }

@@ -41,9 +41,10 @@ pub use client::{
 pub use component::{
     ChangeKind, Component, ComponentSecurity, Device, DeviceKinds, DriverFault, DriverSetup,
     Drivers, ExecSource, ExecWork, Form, LEASE, Lds, MOST_SKILLS, MOST_VALUES, NoDevices, Partner,
-    Partners, RequestKind, Robot, SensorRead, Simulation, SkillSetup, SpaceFieldSource, SpaceWork,
-    Takes, TopicSource, ValuePart, ValueSetup, ValueSource, World, WorldObject, YamlChange,
-    anonymous_by_default, measure_device, read_numbers, read_partner, read_shape, read_user,
+    Partners, RequestKind, Robot, SensorRead, Simulation, SkillSetup, SpaceFieldError,
+    SpaceFieldSource, SpaceWork, Takes, TopicSource, ValuePart, ValueSetup, ValueSource, World,
+    WorldObject, YamlChange, anonymous_by_default, measure_device, read_numbers, read_partner,
+    read_shape, read_user,
 };
 pub use composite::{Broken, Job, JobObserver, PickAndPlace};
 pub use configuration::{

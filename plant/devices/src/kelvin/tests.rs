@@ -128,7 +128,11 @@ fn given(uri: &str) -> Vec<(String, SkillValue)> {
 }
 
 impl Bench {
-    async fn run(&self, of: &str, uri: Option<&str>) -> Result<(bool, String), String> {
+    async fn run(
+        &self,
+        of: &str,
+        uri: Option<&str>,
+    ) -> Result<(bool, String), conformance::ConformanceError> {
         let driver = self
             .changer
             .driver(&[ParameterType::own(of)], &PeerAccess::default())
@@ -163,7 +167,7 @@ async fn tools_are_taken_changed_and_put_back() {
         .await
         .unwrap_err();
     assert_eq!(
-        unknown,
+        unknown.to_string(),
         "BadInvalidArgument: ToolAppUri is one of urn:test:parallel, urn:test:vacuum"
     );
 }

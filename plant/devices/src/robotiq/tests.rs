@@ -91,13 +91,13 @@ async fn its_fingers_go_to_a_width_and_stop_at_what_is_between_them() {
             width.unwrap().1.as_f64().unwrap(),
             gripped.unwrap().1.as_bool(),
         );
-        Ok::<_, String>(((width * 1000.0).round(), gripped.unwrap()))
+        Ok::<_, conformance::ConformanceError>(((width * 1000.0).round(), gripped.unwrap()))
     };
     assert_eq!(run(0.06).await, Ok((60.0, false)));
     assert_eq!(run(0.02).await, Ok((40.0, true)));
     let refused = run(0.1).await.unwrap_err();
     assert_eq!(
-        refused,
+        refused.to_string(),
         "BadInvalidArgument: Width is 0.1 m, and the fingers open 0.085 m"
     );
     let mut widths = [0.06, 0.08];

@@ -194,7 +194,10 @@ impl Cell {
         client.close().await;
     }
 
-    async fn run(&self, given: &[(&str, &str)]) -> Result<RunOutcome, String> {
+    async fn run(
+        &self,
+        given: &[(&str, &str)],
+    ) -> Result<RunOutcome, conformance::ConformanceError> {
         let place = SkillValue::from([0.4, -0.2, 0.1, 0.0, 0.0, 0.0]);
         let mut parameters = vec![("PlacePosition".to_owned(), place)];
         let texts = given
@@ -250,10 +253,10 @@ async fn a_skill_uses_the_tool_that_is_attached_for_objects_that_are_listed_or_l
 async fn nothing_moves_without_the_object_a_tool_or_a_fitting_grasp() {
     let cell = Cell::new().await;
     cell.attach(Some("urn:test:cup")).await;
-    let none = cell.run(&[]).await.unwrap_err();
+    let none = cell.run(&[]).await.unwrap_err().to_string();
     assert!(none.starts_with("BadInvalidArgument: ObjectId"), "{none}");
     let wrong = [("ToolSkillControllerEndpoint", "cup"), ("ObjectId", "box")];
-    let wrong = cell.run(&wrong).await.unwrap_err();
+    let wrong = cell.run(&wrong).await.unwrap_err().to_string();
     assert!(wrong.contains("an endpoint, an ApplicationUri"), "{wrong}");
     let unknown = [("ObjectId", "nut")];
     let other = [

@@ -89,8 +89,8 @@ impl Packed {
     /// Returns the value to write to the variable.
     ///
     /// # Errors
-    /// The expected number of numbers, as text for people.
-    pub(super) fn pack(self, value: &SkillValue) -> Result<Variant, String> {
+    /// The value has another number of numbers.
+    pub(super) fn pack(self, value: &SkillValue) -> Result<Variant, UnfitNumbers> {
         let numbers = value.as_f64s().unwrap_or_default();
         let each = self.what.names().len();
         let fits = match self.many {
@@ -98,16 +98,11 @@ impl Packed {
             false => numbers.len() == each,
         };
         if !fits {
-            let names = self.what.names().join(", ");
-            let times = if self.many {
-                "any number of times "
-            } else {
-                ""
-            };
-            let given = numbers.len();
-            return Err(format!(
-                "it is {times}{names}, and {given} numbers were given"
-            ));
+            return Err(UnfitNumbers {
+                names: self.what.names(),
+                many: self.many,
+                given: numbers.len(),
+            });
         }
         let structures = numbers
             .chunks(each)
@@ -122,6 +117,22 @@ impl Packed {
         }
         Ok(structures.next().unwrap_or(Variant::Empty))
     }
+}
+
+/// The numbers of a value do not fill a structure.
+#[derive(Debug, thiserror::Error)]
+#[error(
+    "it is {}{}, and {given} numbers were given",
+    if *many { "any number of times " } else { "" },
+    names.join(", ")
+)]
+pub(super) struct UnfitNumbers {
+    /// The fields of the structure.
+    names: &'static [&'static str],
+    /// Whether the value is an array of structures.
+    many: bool,
+    /// The number of given numbers.
+    given: usize,
 }
 
 impl What {
@@ -227,7 +238,10 @@ mod tests {
     fn too_few_numbers_are_told_with_what_they_are() {
         let frame = Packed::of(&DataTypeId::ThreeDFrame.into(), false).unwrap();
         let fault = frame.pack(&doubles(&[1.0, 2.0, 3.0])).unwrap_err();
-        assert_eq!(fault, "it is x, y, z, a, b, c, and 3 numbers were given");
+        assert_eq!(
+            fault.to_string(),
+            "it is x, y, z, a, b, c, and 3 numbers were given"
+        );
         let bounds = Packed::of(&DataTypeId::Range.into(), true).unwrap();
         assert!(bounds.pack(&doubles(&[1.0])).is_err());
         assert_eq!(frame.unpack(&bounds.pack(&doubles(&[])).unwrap()), None);

@@ -79,20 +79,47 @@ pub enum Form {
     Orientation(usize),
 }
 
+/// The reason why a field of a message has no value.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum SpaceFieldError {
+    /// The skill has no such parameter.
+    #[error("the skill has no parameter {0}")]
+    NoParameter(String),
+    /// The response has no such field.
+    #[error("the answer has no field {0}")]
+    NoField(String),
+    /// The array is too short.
+    #[error("{name} has no element {at}")]
+    NoElement {
+        /// The parameter or field.
+        name: String,
+        /// The index of the element.
+        at: usize,
+    },
+    /// The value is not a number.
+    #[error("{0} is no angle")]
+    NoAngle(String),
+    /// The value is not an array of six numbers.
+    #[error("{0} is no pose of six numbers")]
+    NoPose(String),
+}
+
 impl ValuePart {
-    fn of(&self, whole: Json) -> Result<Json, String> {
+    fn of(&self, whole: Json) -> Result<Json, SpaceFieldError> {
+        let name = || self.name.clone();
         let value = match self.at {
             None => whole,
             Some(at) => {
                 let element = whole.as_array().and_then(|elements| elements.get(at));
-                let none = || format!("{} has no element {at}", self.name);
+                let none = || SpaceFieldError::NoElement { name: name(), at };
                 element.cloned().ok_or_else(none)?
             }
         };
         let half = || {
             let angle = value.as_f64();
-            let none = || format!("{} is no angle", self.name);
-            Ok::<_, String>(angle.ok_or_else(none)? / 2.0)
+            angle
+                .map(|angle| angle / 2.0)
+                .ok_or_else(|| SpaceFieldError::NoAngle(name()))
         };
         match self.form {
             Form::Plain => Ok(value),
@@ -102,8 +129,7 @@ impl ValuePart {
                 let numbers = value.as_array().into_iter().flatten();
                 let numbers: Option<Vec<f64>> = numbers.map(Json::as_f64).collect();
                 let pose: Option<[f64; 6]> = numbers.and_then(|all| all.try_into().ok());
-                let [_, _, _, a, b, c] =
-                    pose.ok_or_else(|| format!("{} is no pose of six numbers", self.name))?;
+                let [_, _, _, a, b, c] = pose.ok_or_else(|| SpaceFieldError::NoPose(name()))?;
                 let quaternion = of_angles([a, b, c]);
                 Ok(quaternion.get(element).copied().unwrap_or_default().into())
             }
@@ -115,21 +141,21 @@ impl SpaceFieldSource {
     /// Returns the value, from the parameters of a run and, after the response, from its fields.
     ///
     /// # Errors
-    /// The missing value, as text for people.
+    /// A value is missing or has another type.
     pub fn value(
         &self,
         parameters: &Parameters,
         answer: &dyn Fn(&str) -> Option<Json>,
-    ) -> Result<Json, String> {
+    ) -> Result<Json, SpaceFieldError> {
         match self {
             Self::Constant(value) => Ok(value.clone()),
             Self::Parameter(part) => match parameters.get(&part.name) {
                 Some(value) => part.of(value.to_json()),
-                None => Err(format!("the skill has no parameter {}", part.name)),
+                None => Err(SpaceFieldError::NoParameter(part.name.clone())),
             },
             Self::Field(part) => match answer(&part.name) {
                 Some(value) => part.of(value),
-                None => Err(format!("the answer has no field {}", part.name)),
+                None => Err(SpaceFieldError::NoField(part.name.clone())),
             },
             Self::List(sources) => {
                 let values = sources.iter().map(|one| one.value(parameters, answer));
@@ -139,7 +165,7 @@ impl SpaceFieldSource {
                 let fields = fields
                     .iter()
                     .map(|(name, one)| Ok((name.clone(), one.value(parameters, answer)?)));
-                let fields: Result<serde_json::Map<_, _>, String> = fields.collect();
+                let fields: Result<serde_json::Map<_, _>, SpaceFieldError> = fields.collect();
                 fields.map(Json::Object)
             }
         }
@@ -442,10 +468,9 @@ mod tests {
             pose.value(&parameters, &none),
             Ok(serde_json::json!([1.0, 2.0, 3.0]))
         );
-        assert!(
-            code.value(&parameters, &none)
-                .unwrap_err()
-                .contains("no field code")
+        assert_eq!(
+            code.value(&parameters, &none),
+            Err(SpaceFieldError::NoField("code".to_owned()))
         );
         let answer = |name: &str| (name == "code").then(|| 7.into());
         assert_eq!(code.value(&parameters, &answer), Ok(7.into()));
@@ -506,7 +531,7 @@ mod tests {
             panic!("no parameter")
         };
         let heading = part.of(serde_json::json!([1.0, 2.0, 3.0])).unwrap_err();
-        assert_eq!(heading, "Goal is no pose of six numbers");
+        assert_eq!(heading.to_string(), "Goal is no pose of six numbers");
     }
 
     #[test]

@@ -418,7 +418,7 @@ mod tests {
             to([2.0; 6], &[]),
         )
         .await;
-        let refusal = run.unwrap_err();
+        let refusal = run.unwrap_err().to_string();
         assert!(
             refusal.starts_with("BadInvalidArgument: TargetPosition is 3.464 m"),
             "{refusal}"

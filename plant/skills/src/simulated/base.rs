@@ -137,7 +137,7 @@ mod tests {
         let refused =
             conformance::run_once("NavigateToSkillType", base.navigates(50.0), elsewhere).await;
         assert_eq!(
-            refused.unwrap_err(),
+            refused.unwrap_err().to_string(),
             "BadInvalidArgument: Frame is odom, and only map is known"
         );
     }

@@ -150,7 +150,7 @@ mod tests {
         let nobody = changer.driver(ToolChange::Attach, TAKES);
         let refused = conformance::run_once("AttachToolSkillType", nobody, tool("")).await;
         assert_eq!(
-            refused.unwrap_err(),
+            refused.unwrap_err().to_string(),
             "BadInvalidArgument: ToolAppUri is empty"
         );
     }

@@ -158,16 +158,14 @@ impl Statistics {
         }
     }
 
-    /// Returns a computed value.
-    ///
-    /// # Errors
-    /// There is no successful run yet.
-    pub fn value(&self, of: Measure, now: Instant) -> Result<SkillValue, String> {
-        Ok(match of {
+    /// Returns a computed value; `None` if it needs a successful run, and there is none yet.
+    #[must_use]
+    pub fn value(&self, of: Measure, now: Instant) -> Option<SkillValue> {
+        Some(match of {
             Measure::Runs => self.runs.into(),
             Measure::Failures => self.failures.into(),
             Measure::MeanDuration => match self.succeeded {
-                0 => return Err("there is no successful run yet".to_owned()),
+                0 => return None,
                 count => (self.worked.as_secs_f64() / f64::from(count)).into(),
             },
             Measure::Availability => {
@@ -232,7 +230,9 @@ impl ValueSensor for Tally {
                 let now = Instant::now();
                 for (measure, key) in Measure::ALL {
                     if out.keys().any(|wanted| wanted == key) {
-                        out.put(key, statistics.value(measure, now));
+                        let value = statistics.value(measure, now);
+                        let none = || "there is no successful run yet".to_owned();
+                        out.put(key, value.ok_or_else(none));
                     }
                 }
             }
@@ -296,8 +296,11 @@ mod tests {
             let value = statistics.value(of, now);
             value.map(|value| value.as_f64().unwrap())
         };
-        assert!(value(&statistics, Measure::MeanDuration, start).is_err());
-        assert_eq!(value(&statistics, Measure::Availability, start), Ok(100.0));
+        assert!(value(&statistics, Measure::MeanDuration, start).is_none());
+        assert_eq!(
+            value(&statistics, Measure::Availability, start),
+            Some(100.0)
+        );
         statistics.moved(
             1,
             (ProgramMachineState::Halted, ProgramMachineState::Ready),
@@ -307,7 +310,7 @@ mod tests {
         statistics.ended(1, true, at(4));
         statistics.moved(2, run, at(4));
         statistics.ended(2, true, at(10));
-        assert_eq!(value(&statistics, Measure::MeanDuration, at(10)), Ok(4.0));
+        assert_eq!(value(&statistics, Measure::MeanDuration, at(10)), Some(4.0));
         statistics.moved(1, run, at(10));
         statistics.ended(1, false, at(20));
         // A second failure meanwhile is not counted twice as time.
@@ -318,15 +321,21 @@ mod tests {
             (ProgramMachineState::Halted, ProgramMachineState::Ready),
             at(26),
         );
-        assert_eq!(value(&statistics, Measure::Availability, at(40)), Ok(50.0));
+        assert_eq!(
+            value(&statistics, Measure::Availability, at(40)),
+            Some(50.0)
+        );
         statistics.moved(
             2,
             (ProgramMachineState::Halted, ProgramMachineState::Ready),
             at(40),
         );
-        assert_eq!(value(&statistics, Measure::Availability, at(80)), Ok(75.0));
-        assert_eq!(value(&statistics, Measure::Runs, at(80)), Ok(4.0));
-        assert_eq!(value(&statistics, Measure::Failures, at(80)), Ok(2.0));
-        assert_eq!(value(&statistics, Measure::MeanDuration, at(80)), Ok(4.0));
+        assert_eq!(
+            value(&statistics, Measure::Availability, at(80)),
+            Some(75.0)
+        );
+        assert_eq!(value(&statistics, Measure::Runs, at(80)), Some(4.0));
+        assert_eq!(value(&statistics, Measure::Failures, at(80)), Some(2.0));
+        assert_eq!(value(&statistics, Measure::MeanDuration, at(80)), Some(4.0));
     }
 }
