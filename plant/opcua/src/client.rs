@@ -4,6 +4,7 @@
 //! busy server answers), `shown` (the verified identity of the server), `subscription`, `types`
 //! (type closures), `connector`.
 
+mod connection_fault;
 mod connector;
 mod parts;
 mod reach;

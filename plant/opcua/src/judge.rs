@@ -50,7 +50,7 @@ pub enum HostNames {
 }
 
 /// The refusal of a peer's certificate.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub struct RefusedCertificate {
     /// The status code.
     pub status: StatusCode,

@@ -123,19 +123,15 @@ impl Reach {
         }
     }
 
-    /// Starts the next probe if the server is busy. To be called every half second.
-    ///
-    /// # Errors
-    /// Returns an error if the host has not answered for too long.
-    pub(super) fn look(&mut self, is_busy: bool, now: Instant) -> Result<(), String> {
+    /// Starts the next probe if the server is busy. To be called every half second. Returns `false`
+    /// if the host has not answered for too long.
+    pub(super) fn look(&mut self, is_busy: bool, now: Instant) -> bool {
         match self.state.look(is_busy, now) {
-            Step::Nothing => Ok(()),
-            Step::Connect => {
-                self.tries.spawn(is_reached(self.url.clone()));
-                Ok(())
-            }
-            Step::Lost => Err("the host of the server does not respond".to_owned()),
+            Step::Nothing => {}
+            Step::Connect => drop(self.tries.spawn(is_reached(self.url.clone()))),
+            Step::Lost => return false,
         }
+        true
     }
 
     /// Records an answer of the host or of the server.

@@ -11,10 +11,11 @@ use std::sync::atomic::{AtomicU64, Ordering};
 
 use opcua::crypto::{CertificateStore, X509, X509Data};
 use opcua::sync::RwLock;
-use opcua::types::{EndpointDescription, MessageSecurityMode, StatusCode};
+use opcua::types::{EndpointDescription, MessageSecurityMode};
 use trust::{Certificate, RequiredNames};
 
 use super::ClientConfig;
+use super::connection_fault::ConnectionFault;
 use crate::endpoint::EndpointUrl;
 use crate::judge::{CertificateJudge, PresentedChain, RefusedCertificate};
 use crate::known;
@@ -92,11 +93,13 @@ impl ServerJudge {
     pub(super) fn store(
         &self,
         taken: &AcceptedCertificate,
-    ) -> Result<Arc<RwLock<CertificateStore>>, String> {
-        let root = std::path::absolute(self.judge.root()).map_err(|error| error.to_string())?;
+    ) -> Result<Arc<RwLock<CertificateStore>>, ConnectionFault> {
+        let root = std::path::absolute(self.judge.root()).map_err(ConnectionFault::Path)?;
         let folder = root.join(JUDGED);
-        put(&folder, &taken.shown.0)
-            .map_err(|error| format!("{} cannot be written: {error}", folder.display()))?;
+        put(&folder, &taken.shown.0).map_err(|error| ConnectionFault::Store {
+            folder: folder.clone(),
+            error,
+        })?;
         let own = [root.join(OWN_CERTIFICATE), root.join(OWN_KEY)];
         let [certificate, key] = own.each_ref().map(|path| Some(path.as_path()));
         let (mut store, ..) =
@@ -124,31 +127,6 @@ fn put(folder: &Path, certificate: &Certificate) -> io::Result<()> {
     let whole = folder.join(format!("{}-{number}.new", process::id()));
     fs::write(&whole, certificate.der())?;
     fs::rename(&whole, &path)
-}
-
-/// The reason for a missing connection.
-pub(super) struct Why {
-    pub(super) reason: String,
-    /// The status code if the certificate of the server is refused.
-    pub(super) certificate: Option<StatusCode>,
-}
-
-impl From<String> for Why {
-    fn from(reason: String) -> Self {
-        Self {
-            reason,
-            certificate: None,
-        }
-    }
-}
-
-impl From<RefusedCertificate> for Why {
-    fn from(refused: RefusedCertificate) -> Self {
-        Self {
-            reason: refused.to_string(),
-            certificate: Some(refused.status),
-        }
-    }
 }
 
 static NUMBERS: AtomicU64 = AtomicU64::new(0);

@@ -14,6 +14,7 @@ use opcua::types::{
 use tokio::sync::mpsc;
 use tracing::warn;
 
+use super::connection_fault::ConnectionFault;
 use super::supervisor::{ConnectedClient, ConnectionState};
 use super::{ClientError, LimitedService, OpcUaClient};
 use crate::limits::MOST_NOTIFICATIONS;
@@ -267,7 +268,7 @@ impl OpcUaClient {
 pub(crate) async fn renew(
     shared: &ConnectionState,
     connected: &ConnectedClient,
-) -> Result<(), String> {
+) -> Result<(), ConnectionFault> {
     loop {
         let mut gone = None;
         let mut new = None;
@@ -292,8 +293,7 @@ pub(crate) async fn renew(
         match (gone, new) {
             (Some(State::Made(ids)), _) => {
                 for id in ids {
-                    let deleted = connected.session.delete_subscription(id).await;
-                    deleted.map_err(|error| error.to_string())?;
+                    connected.session.delete_subscription(id).await?;
                 }
             }
             (Some(State::Waiting | State::Making | State::Refused), _) => {}
@@ -315,7 +315,7 @@ async fn make(
     watches: &[MonitoredWatch],
     interval: Duration,
     queue: Queue,
-) -> Result<State, String> {
+) -> Result<State, ConnectionFault> {
     let mut left: Vec<(usize, &MonitoredWatch)> = watches.iter().enumerate().collect();
     let mut made = Vec::new();
     loop {
@@ -325,7 +325,7 @@ async fn make(
                 refuse(&queue, &left, error.status());
                 break;
             }
-            Err(error) => return Err(error.to_string()),
+            Err(error) => return Err(error.into()),
         };
         if made.is_empty() {
             queue.put(Notice::Subscribed);
@@ -338,8 +338,7 @@ async fn make(
         }
         let is_stuck = left.len() == before;
         if is_stuck && !made.is_empty() {
-            let deleted = connected.session.delete_subscription(id).await;
-            deleted.map_err(|error| error.to_string())?;
+            connected.session.delete_subscription(id).await?;
         } else {
             made.push(id);
         }
@@ -385,7 +384,7 @@ async fn fill<'w>(
     (id, interval): (u32, Duration),
     watches: Vec<(usize, &'w MonitoredWatch)>,
     queue: &Queue,
-) -> Result<Vec<(usize, &'w MonitoredWatch)>, String> {
+) -> Result<Vec<(usize, &'w MonitoredWatch)>, ConnectionFault> {
     let requests: Vec<_> = watches
         .iter()
         .map(|(at, watch)| request(handle(*at), watch, interval))
@@ -410,7 +409,7 @@ async fn fill<'w>(
             ClientError::Status(status) => parts.skip(&status),
             lost @ (ClientError::NotConnected(_)
             | ClientError::Lost(_)
-            | ClientError::Answer(_)) => return Err(lost.to_string()),
+            | ClientError::Answer(_)) => return Err(lost.into()),
         }
     }
     let mut left = Vec::new();

@@ -23,9 +23,10 @@ use tokio::task::JoinHandle;
 use tokio::time::{Instant, sleep, timeout};
 use tracing::{debug, info, warn};
 
+use super::connection_fault::ConnectionFault;
 use super::connector::Direct;
 use super::reach::{Reach, Silence};
-use super::shown::{AcceptedCertificate, ServerJudge, Why};
+use super::shown::{AcceptedCertificate, ServerJudge};
 use super::subscription::WantedSubscription;
 use super::{
     ClientConfig, ClientError, ClientUser, LimitedService, Link, OperationLimits, SecurityChoice,
@@ -131,19 +132,21 @@ impl ConnectionState {
         connected.ok_or_else(|| self.not_connected())
     }
 
-    fn down(&self, why: Why) {
-        let is_refused = why.certificate.is_some();
+    fn down(&self, why: &ConnectionFault) {
+        let certificate = why.certificate();
+        let is_refused = certificate.is_some();
         if is_refused {
             self.refused.fetch_add(1, Ordering::Relaxed);
         }
+        let reason = why.to_string();
         let down = Link::Down {
-            reason: why.reason.clone(),
-            certificate: why.certificate,
+            reason: reason.clone(),
+            certificate,
         };
         let is_new = self.link.send_replace(down.clone()) != down;
         match (is_new, is_refused) {
-            (true, true) => warn!(url = self.url, reason = why.reason, "not connected"),
-            (true, false) => info!(url = self.url, reason = why.reason, "not connected"),
+            (true, true) => warn!(url = self.url, reason, "not connected"),
+            (true, false) => info!(url = self.url, reason, "not connected"),
             (false, _) => {}
         }
     }
@@ -182,8 +185,8 @@ pub(crate) async fn run(shared: Arc<ConnectionState>) {
 async fn live(shared: &ConnectionState) {
     let client = match library_client(&shared.config) {
         Ok(client) => client,
-        Err(reason) => {
-            shared.down(reason.into());
+        Err(why) => {
+            shared.down(&why);
             return std::future::pending().await;
         }
     };
@@ -198,7 +201,7 @@ async fn live(shared: &ConnectionState) {
             }
             Err(why) => why,
         };
-        shared.down(why);
+        shared.down(&why);
         sleep(wait).await;
         wait = (wait * 2).min(longest);
     }
@@ -212,7 +215,11 @@ struct Life {
 }
 
 /// Serves a connection until it is lost, and returns the reason.
-async fn hold(shared: &ConnectionState, life: &mut Life, mut connection: Connection) -> Why {
+async fn hold(
+    shared: &ConnectionState,
+    life: &mut Life,
+    mut connection: Connection,
+) -> ConnectionFault {
     life.connects += 1;
     let before = life.started.replace(connection.started);
     let restarted = before.is_some_and(|before| before != connection.started);
@@ -237,13 +244,12 @@ async fn hold(shared: &ConnectionState, life: &mut Life, mut connection: Connect
     why
 }
 
-fn library_client(config: &ClientConfig) -> Result<opcua::client::Client, String> {
+fn library_client(config: &ClientConfig) -> Result<opcua::client::Client, ConnectionFault> {
     let root = match &config.pki {
         Some(root) => {
-            let pki = Pki::open(root.clone()).map_err(|error| error.to_string())?;
+            let pki = Pki::open(root.clone())?;
             let host = opcua::crypto::hostname().unwrap_or_else(|_| "localhost".to_owned());
-            pki.ensure_own(&config.application_uri, &host)
-                .map_err(|error| error.to_string())?;
+            pki.ensure_own(&config.application_uri, &host)?;
             root.clone()
         }
         None => PathBuf::from(NO_PKI),
@@ -277,7 +283,7 @@ fn library_client(config: &ClientConfig) -> Result<opcua::client::Client, String
     } else {
         tracing::subscriber::with_default(tracing::subscriber::NoSubscriber::new(), make)
     };
-    made.map_err(|errors| errors.join(", "))
+    made.map_err(ConnectionFault::Options)
 }
 
 /// A connection, and the state that ends with it.
@@ -330,11 +336,11 @@ async fn connect(
     shared: &ConnectionState,
     client: &opcua::client::Client,
     connects: u64,
-) -> Result<Connection, Why> {
+) -> Result<Connection, ConnectionFault> {
     let within = shared.config.timeout;
     let endpoint = timeout(within * 2, endpoint(shared, client))
         .await
-        .map_err(|_| format!("{} does not return its endpoints", shared.url))??;
+        .map_err(|_| ConnectionFault::NoEndpoints(shared.url.clone()))??;
     let taken = match &shared.servers {
         Some(servers) => servers.take(&endpoint)?,
         None => None,
@@ -349,8 +355,7 @@ async fn connect(
         .user_identity_token(identity(&shared.config))
         .with_connector(source)
         .connect_to_endpoint_directly(endpoint.clone())
-        .and_then(|builder| builder.build(store))
-        .map_err(|error| error.to_string())?;
+        .and_then(|builder| builder.build(store))?;
     session.disable_reconnects();
     let (tell, mut activity) = mpsc::channel(64);
     let (end, mut ended) = oneshot::channel();
@@ -379,17 +384,19 @@ async fn connect(
     });
     let opened = timeout(within * 2, async {
         tokio::select! {
-            reason = &mut ended => Err(reason.unwrap_or_else(|_| "it ended".to_owned())),
+            reason = &mut ended => Err(ConnectionFault::Ended(
+                reason.unwrap_or_else(|_| "it ended".to_owned()),
+            )),
             _ = activity.recv() => Ok(()),
         }
     });
     let opened = opened.await;
     let driving = AbortOnDrop(Some(driving));
-    opened.map_err(|_| format!("{} does not open the session in time", shared.url))??;
+    opened.map_err(|_| ConnectionFault::NoSession(shared.url.clone()))??;
     let limits = OperationLimits::default();
     let (namespaces, started) = timeout(within, what_it_is(&session, &limits))
         .await
-        .map_err(|_| "the server does not return its namespaces".to_owned())??;
+        .map_err(|_| ConnectionFault::NamespacesLate)??;
     Ok(Connection {
         connected: Arc::new(ConnectedClient {
             session,
@@ -430,13 +437,10 @@ impl Drop for AbortOnDrop {
 async fn endpoint(
     shared: &ConnectionState,
     client: &opcua::client::Client,
-) -> Result<EndpointDescription, String> {
+) -> Result<EndpointDescription, ConnectionFault> {
     let config = &shared.config;
     let asked = Direct::new(&shared.url, config.timeout);
-    let offered = client
-        .get_server_endpoints_from_url(asked)
-        .await
-        .map_err(|error| error.to_string())?;
+    let offered = client.get_server_endpoints_from_url(asked).await?;
     let is_plain = |one: &EndpointDescription| one.security_mode == MessageSecurityMode::None;
     let has = |wanted: &dyn Fn(&EndpointDescription) -> bool| {
         let tcp = offered.iter().filter(|one| {
@@ -466,7 +470,7 @@ async fn endpoint(
     );
     let can_secure = config.pki.is_some();
     if !can_secure && !is_best && !is_none {
-        return Err("a secured session needs a directory for certificates".to_owned());
+        return Err(ConnectionFault::NoPki);
     }
     let secured = can_secure.then(|| secured_by(wanted)).flatten();
     // A password must not be sent in clear text.
@@ -481,23 +485,27 @@ async fn endpoint(
 
 /// Checks that an endpoint admits the kind of user of the client. The library reports only that the
 /// connection was closed. An endpoint without any policy admits anonymous users.
-fn admits_user(shared: &ConnectionState, endpoint: &EndpointDescription) -> Result<(), String> {
-    let (wanted, why) = match &shared.config.user {
-        Some(_) => (UserTokenType::UserName, "does not accept passwords"),
-        None => (UserTokenType::Anonymous, "does not admit anonymous users"),
+fn admits_user(
+    shared: &ConnectionState,
+    endpoint: &EndpointDescription,
+) -> Result<(), ConnectionFault> {
+    let url = shared.url.clone();
+    let (wanted, refused) = match &shared.config.user {
+        Some(_) => (UserTokenType::UserName, ConnectionFault::NoPasswords(url)),
+        None => (UserTokenType::Anonymous, ConnectionFault::NotAnonymous(url)),
     };
     let policies = endpoint.user_identity_tokens.iter().flatten();
     let mut offered = policies.map(|policy| policy.token_type).peekable();
     let admits = offered.peek().is_none() || offered.any(|offered| offered == wanted);
     match admits {
         true => Ok(()),
-        false => Err(format!("{} {why} (`user`)", shared.url)),
+        false => Err(refused),
     }
 }
 
 /// Returns the error for a server without a suitable endpoint, with the offered and the required
 /// security.
-fn no_security(shared: &ConnectionState, offered: &[EndpointDescription]) -> String {
+fn no_security(shared: &ConnectionState, offered: &[EndpointDescription]) -> ConnectionFault {
     let each = offered.iter().map(|one| {
         let policy = one.security_policy_uri.as_ref().rsplit('#').next();
         let mode = one.security_mode;
@@ -524,17 +532,18 @@ fn no_security(shared: &ConnectionState, offered: &[EndpointDescription]) -> Str
     if config.user.is_some() && config.security == SecurityChoice::Best {
         wants.push_str(", because a password is sent encrypted only");
     }
-    format!(
-        "no usable security at {}: it offers {offers}, but {wants} is required (`security` in the mapping)",
-        shared.url
-    )
+    ConnectionFault::Security {
+        url: shared.url.clone(),
+        offers,
+        wants,
+    }
 }
 
 /// Reads the namespaces, the start time and the OperationLimits of a server.
 async fn what_it_is(
     session: &Session,
     limits: &OperationLimits,
-) -> Result<(Vec<String>, DateTime), String> {
+) -> Result<(Vec<String>, DateTime), ConnectionFault> {
     let about = [
         VariableId::Server_NamespaceArray,
         VariableId::Server_ServerStatus_StartTime,
@@ -547,9 +556,7 @@ async fn what_it_is(
     let mut parts = limits.parts(LimitedService::Read, &wanted);
     while let Some(part) = parts.next_part() {
         let read = session.read(part, TimestampsToReturn::Neither, 0.0).await;
-        parts
-            .answered(read)
-            .map_err(|fault| ClientError::from(fault).to_string())?;
+        parts.answered(read).map_err(ClientError::from)?;
     }
     let mut values = parts.into_answers().into_iter();
     let namespaces = values.next().and_then(strings);
@@ -560,7 +567,7 @@ async fn what_it_is(
         Some(*time)
     });
     limits.learn(values.as_slice());
-    let namespaces = namespaces.ok_or_else(|| "the server has no NamespaceArray".to_owned())?;
+    let namespaces = namespaces.ok_or(ConnectionFault::NoNamespaces)?;
     // Restarts of a server without StartTime are not detected.
     Ok((namespaces, started.unwrap_or_else(DateTime::null)))
 }
@@ -579,7 +586,7 @@ fn strings(value: DataValue) -> Option<Vec<String>> {
 }
 
 /// Creates the subscriptions, supervises the connection, and returns the reason for its end.
-async fn watch_over(shared: &ConnectionState, connection: &mut Connection) -> Why {
+async fn watch_over(shared: &ConnectionState, connection: &mut Connection) -> ConnectionFault {
     let mut silence = Silence::new(shared.config.patience, Instant::now());
     let mut reach = Reach::new(&shared.url);
     let mut published = Instant::now();
@@ -590,14 +597,14 @@ async fn watch_over(shared: &ConnectionState, connection: &mut Connection) -> Wh
     loop {
         // A busy server does not answer requests, so the subscriptions are created after the call.
         if !shared.calls.any()
-            && let Err(reason) = super::subscription::renew(shared, &connection.connected).await
+            && let Err(fault) = super::subscription::renew(shared, &connection.connected).await
         {
-            return reason.into();
+            return fault;
         }
         tokio::select! {
             reason = &mut connection.ended => {
                 let reason = reason.unwrap_or_else(|_| "the connection ended".to_owned());
-                return reason.into();
+                return ConnectionFault::Ended(reason);
             }
             activity = connection.activity.recv() => match activity {
                 // Missed keep-alives do not count while the server executes a call.
@@ -620,10 +627,10 @@ async fn watch_over(shared: &ConnectionState, connection: &mut Connection) -> Wh
                 if !subscribed || is_calling || silence.is_tolerated(now) {
                     published = now;
                 } else if published.elapsed() > LONGEST_SILENCE {
-                    return "the server sends no messages for its subscriptions".to_owned().into();
+                    return ConnectionFault::NoPublishing;
                 }
-                if let Err(reason) = reach.look(is_calling || silence.is_tolerated(now), now) {
-                    return reason.into();
+                if !reach.look(is_calling || silence.is_tolerated(now), now) {
+                    return ConnectionFault::HostLost;
                 }
             }
             _ = judged.tick() => {
@@ -635,7 +642,7 @@ async fn watch_over(shared: &ConnectionState, connection: &mut Connection) -> Wh
             }
         }
         if silence.is_too_long(shared.calls.any(), Instant::now()) {
-            return "the server does not respond".to_owned().into();
+            return ConnectionFault::Silent;
         }
     }
 }
