@@ -327,7 +327,7 @@ fn issue_own(
     endpoint: &EndpointUrl,
     now: Duration,
 ) -> Result<(), AuthorityStoreFault> {
-    let key = own_key(pki).map_err(AuthorityStoreFault::Key)?;
+    let key = own_key(pki).map_err(|fault| AuthorityStoreFault::Key(fault.to_string()))?;
     let mut hosts = endpoint.hosts();
     for host in ["localhost", "127.0.0.1", "::1"] {
         if !hosts.iter().any(|one| one == host) {

@@ -13,7 +13,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use bridge_core::{Now, policy_of};
-use bridge_node::{Failure, FailureKind, Fetched, Fetching, KeyRequest, KeyService, now};
+use bridge_node::{Failure, Fetched, Fetching, KeyFetchError, KeyRequest, KeyService, now};
 use mappings::{KeySource, Mapping, SecurityGroup, ServedKeys};
 use opcua::crypto::random;
 use opcua::sync::Mutex;
@@ -73,7 +73,6 @@ impl Sks {
     /// # Errors
     /// Returns an error if the file with the keys cannot be used.
     pub(crate) fn follow(&self, mapping: &Mapping) -> Result<(), Failure> {
-        let unusable = |error: String| Failure::new(FailureKind::Io, error);
         let server = mapping.server();
         let groups = mapping.security().iter().filter(|_| server.creates_keys());
         let wanted: Vec<(&SecurityGroup, &ServedKeys)> = groups.filter_map(served).collect();
@@ -81,9 +80,9 @@ impl Sks {
         let state = &mut *state;
         let now = now();
         if !wanted.is_empty() && state.groups.is_empty() {
-            state.load(now).map_err(unusable)?;
+            state.load(now)?;
             // The previous lifetimes apply to the stored keys.
-            state.renew(now).map_err(unusable)?;
+            state.renew(now)?;
         }
         if wanted.is_empty() && state.groups.is_empty() {
             return Ok(());
@@ -112,7 +111,7 @@ impl Sks {
             };
             state.groups.insert(group.id.clone(), made);
         }
-        state.renew(now).map_err(unusable)
+        state.renew(now)
     }
 
     /// Returns the methods of the key service.
@@ -197,11 +196,11 @@ impl Sks {
     }
 
     /// Returns the keys of a group for this program itself.
-    fn own(&self, group: &str) -> Result<Fetched, String> {
+    fn own(&self, group: &str) -> Result<Fetched, KeyFetchError> {
         let mut state = self.state.lock();
         let (policy, handed) = state
             .of(group, (0, ring::FUTURE))
-            .ok_or_else(|| format!("this server makes no keys of `{group}`"))?;
+            .ok_or_else(|| KeyFetchError::NotMade(group.to_owned()))?;
         Ok(Fetched {
             policy_uri: policy.uri().to_owned(),
             first_token_id: handed.first_token_id,
@@ -214,7 +213,7 @@ impl Sks {
 
 impl State {
     /// Loads the keys of the previous run.
-    fn load(&mut self, now: Now) -> Result<(), String> {
+    fn load(&mut self, now: Now) -> Result<(), Failure> {
         for (id, policy, ring) in self.store.load(now)? {
             let members = Members::default();
             self.groups.insert(
@@ -231,7 +230,7 @@ impl State {
 
     /// Creates the next keys. New keys are used only after they are stored, because other keys
     /// would be created after a restart.
-    fn renew(&mut self, now: Now) -> Result<(), String> {
+    fn renew(&mut self, now: Now) -> Result<(), Failure> {
         let mut changed = false;
         let mut before = Vec::new();
         for group in self.groups.values_mut() {

@@ -306,7 +306,8 @@ struct Way {
 /// Returns `None` if the server offers no secured channel. Also returns `None` for an untrusted
 /// server on this host: an attacker on this host has the same power without a forged server.
 async fn way(url: &str, pki: &Path) -> Result<Option<Way>, DiscoveryQueryFault> {
-    let security = ChannelSecurity::existing(pki).map_err(DiscoveryQueryFault::Certificate)?;
+    let security = ChannelSecurity::existing(pki)
+        .map_err(|failure| DiscoveryQueryFault::Certificate(failure.to_string()))?;
     let request = GetEndpointsRequest {
         request_header: header(),
         endpoint_url: url.into(),

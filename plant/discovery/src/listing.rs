@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use std::time::{Duration, SystemTime};
 
 use opcua::types::ServerOnNetwork;
-use plant_opcua::enrolment::{DirectoryClient, Invitation};
+use plant_opcua::enrolment::{DirectoryClient, EnrolmentFault, Invitation};
 use registry::{AnnouncedServer, ListedServer, Listing, ListingSettings};
 use serde::Serialize;
 use tokio::task::JoinSet;
@@ -72,7 +72,7 @@ pub(crate) struct ListingTask {
     client: DirectoryClient,
     pattern: String,
     /// The running query, which is separate so that a slow server delays nothing else.
-    running: JoinSet<Result<Vec<ServerOnNetwork>, String>>,
+    running: JoinSet<Result<Vec<ServerOnNetwork>, EnrolmentFault>>,
     answered: Option<SystemTime>,
 }
 
@@ -108,7 +108,7 @@ impl ListingTask {
             };
             tokio::select! {
                 Some(asked) = self.running.join_next() => {
-                    let asked = asked.unwrap_or_else(|error| Err(error.to_string()));
+                    let asked = asked.unwrap_or_else(|error| Err(error.into()));
                     if let Some(servers) = self.finished(asked) {
                         return servers;
                     }
@@ -137,7 +137,7 @@ impl ListingTask {
     /// Handles the result of a query. Returns the servers of an answer.
     fn finished(
         &mut self,
-        asked: Result<Vec<ServerOnNetwork>, String>,
+        asked: Result<Vec<ServerOnNetwork>, EnrolmentFault>,
     ) -> Option<Vec<AnnouncedServer>> {
         let before = self.listing.fault().map(str::to_owned);
         let gds = &self.client.gds.url;
@@ -153,7 +153,8 @@ impl ListingTask {
                 self.answered = Some(clock::wall());
                 Some(servers)
             }
-            Err(why) => {
+            Err(fault) => {
+                let why = fault.to_string();
                 if before.as_ref() != Some(&why) {
                     warn!(
                         gds,

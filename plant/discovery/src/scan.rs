@@ -14,7 +14,7 @@ use tokio::net::TcpStream;
 use tokio::task::JoinSet;
 use tokio::time::{MissedTickBehavior, interval, timeout};
 
-use crate::client::{SelfDescription, describe};
+use crate::client::{DiscoveryQueryFault, SelfDescription, describe};
 
 /// The limits of a scan.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -95,15 +95,14 @@ pub async fn scan(ranges: &[Range], ports: &[u16], pace: ScanLimits) -> ScanOutc
 }
 
 /// The self-description of a server, or the reason why a listener did not answer.
-type Tried = Result<SelfDescription, String>;
+type Tried = Result<SelfDescription, DiscoveryQueryFault>;
 
 /// Scans an address; `None` without a listener.
 async fn try_one(place: SocketAddr, pace: ScanLimits) -> Option<Tried> {
     let connected = timeout(pace.connect, TcpStream::connect(place)).await;
     drop(connected.ok()?.ok()?);
     let url = Url::of(place.ip(), place.port(), "").to_string();
-    let described = describe(&url, pace.answer).await;
-    Some(described.map_err(|fault| fault.to_string()))
+    Some(describe(&url, pace.answer).await)
 }
 
 /// Merges the results by ApplicationUri.
@@ -112,8 +111,8 @@ fn merged(told: BTreeMap<SocketAddr, Tried>) -> ScanOutcome {
     for (place, tried) in told {
         let described = match tried {
             Ok(described) => described,
-            Err(why) => {
-                outcome.others.push((place, why));
+            Err(fault) => {
+                outcome.others.push((place, fault.to_string()));
                 continue;
             }
         };
@@ -177,7 +176,10 @@ mod tests {
                 place(2, 4840),
                 described("urn:other", "opc.tcp://other:4841/b"),
             ),
-            (place(3, 4840), Err("refused".to_owned())),
+            (
+                place(3, 4840),
+                Err(DiscoveryQueryFault::Protocol("refused".to_owned())),
+            ),
             // Servers without ApplicationUri are not merged.
             (place(20, 4840), described("", "")),
             (place(21, 4840), described("", "")),

@@ -62,8 +62,11 @@ impl ChannelSecurity {
     }
 
     /// Opens the store of an application with an existing certificate and key; nothing is created.
-    pub(crate) fn existing(root: &Path) -> Result<Self, String> {
-        let failed = |error| format!("the certificate store {}: {error}", root.display());
+    pub(crate) fn existing(root: &Path) -> Result<Self, Failure> {
+        let failed = |error| {
+            let message = format!("the certificate store {}: {error}", root.display());
+            Failure::new(FailureKind::Io, message)
+        };
         let (certificate, key) = pair(root);
         Ok(Self {
             certificate: CertificateStore::read_cert(&certificate).map_err(failed)?,

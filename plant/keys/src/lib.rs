@@ -10,7 +10,7 @@ use std::path::PathBuf;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
-use bridge_node::{Fetched, Fetching, KeyRequest, KeyService};
+use bridge_node::{Fetched, Fetching, KeyFetchError, KeyRequest, KeyService};
 use plant_opcua::client::{CallError, CallOptions, ClientConfig, OpcUaClient, SecurityChoice};
 use plant_opcua::pki;
 use plant_opcua::types::{MethodId, NodeId, ObjectId, StatusCode, Variant};
@@ -65,7 +65,7 @@ pub struct KeyFetcher {
 
 struct Asked {
     request: KeyRequest,
-    answer: oneshot::Sender<Result<Fetched, String>>,
+    answer: oneshot::Sender<Result<Fetched, KeyFetchError>>,
 }
 
 impl KeyFetcher {
@@ -79,7 +79,7 @@ impl KeyFetcher {
     }
 
     /// Returns the sender to the fetching thread, which is started again if it has ended.
-    fn thread(&self) -> Result<mpsc::Sender<Asked>, String> {
+    fn thread(&self) -> Result<mpsc::Sender<Asked>, KeyFetchError> {
         let mut asked = self.asked.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some(sender) = asked.as_ref().filter(|sender| !sender.is_closed()) {
             return Ok(sender.clone());
@@ -89,7 +89,7 @@ impl KeyFetcher {
         let started = std::thread::Builder::new()
             .name("keys".to_owned())
             .spawn(move || serve(&identity, requests));
-        started.map_err(|error| format!("cannot start the thread that fetches keys: {error}"))?;
+        started.map_err(KeyFetchError::Thread)?;
         *asked = Some(sender.clone());
         Ok(sender)
     }
@@ -110,9 +110,11 @@ impl KeyService for KeyFetcher {
             let (answer, answered) = oneshot::channel();
             let request = request.clone();
             let asked = Asked { request, answer };
-            let gone = || "the thread that fetches keys has ended".to_owned();
-            thread.send(asked).await.map_err(|_| gone())?;
-            answered.await.map_err(|_| gone())?
+            let ended = KeyFetchError::ThreadEnded;
+            if thread.send(asked).await.is_err() {
+                return Err(ended);
+            }
+            answered.await.unwrap_or(Err(ended))
         })
     }
 }
@@ -141,7 +143,10 @@ fn serve(identity: &KeyClientIdentity, mut requests: mpsc::Receiver<Asked>) {
 }
 
 /// Fetches keys in a session that is opened for the request and closed again.
-async fn fetch(identity: &KeyClientIdentity, request: &KeyRequest) -> Result<Fetched, String> {
+async fn fetch(
+    identity: &KeyClientIdentity,
+    request: &KeyRequest,
+) -> Result<Fetched, KeyFetchError> {
     let config = ClientConfig {
         pki: Some(identity.pki.clone()),
         security: SecurityChoice::Basic256Sha256,
@@ -150,10 +155,8 @@ async fn fetch(identity: &KeyClientIdentity, request: &KeyRequest) -> Result<Fet
     };
     let client = OpcUaClient::open(config, &request.endpoint);
     let asked = async {
-        client
-            .up(LONGEST_CONNECT)
-            .await
-            .map_err(|error| error.to_string())?;
+        let up = client.up(LONGEST_CONNECT).await;
+        up.map_err(|error| error.to_string())?;
         let arguments = vec![
             Variant::from(request.group.as_str()),
             Variant::UInt32(CURRENT),
@@ -172,7 +175,10 @@ async fn fetch(identity: &KeyClientIdentity, request: &KeyRequest) -> Result<Fet
     };
     let fetched = asked.await;
     client.close().await;
-    fetched.map_err(|why| format!("{why} (as {})", identity.application_uri))
+    fetched.map_err(|why: String| KeyFetchError::Session {
+        why,
+        application_uri: identity.application_uri.clone(),
+    })
 }
 
 /// Returns the reason why the service returns no keys.

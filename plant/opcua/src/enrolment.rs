@@ -10,6 +10,7 @@
 //!
 //! Reading order: `invitation` (the option of a program), then this module.
 
+mod fault;
 mod invitation;
 
 use std::path::{Path, PathBuf};
@@ -20,6 +21,7 @@ use tokio::time::{Instant, sleep, timeout};
 use tracing::{debug, info, warn};
 use trust::{Certificate, CertificateSigningRequest, Renewal, RenewalStep};
 
+pub use self::fault::EnrolmentFault;
 pub use self::invitation::{GdsArguments, GdsOption, Invitation, InvitationFault, Token};
 
 use crate::client::{CallError, ClientConfig, ClientError, Link, OpcUaClient, SecurityChoice};
@@ -114,9 +116,6 @@ enum Visit {
     Waiting,
 }
 
-/// The error message of a failed visit.
-type Why = String;
-
 impl Enrolment {
     /// Creates the enrolment of an application. The certificate store at `root` contains its
     /// certificate and key.
@@ -160,12 +159,13 @@ impl Enrolment {
                     Err(_) => LISTS_AGAIN,
                 };
                 lists_at = Instant::now() + again;
-                if wants.is_some() && visited != Ok(Visit::Changed) {
+                let is_changed = matches!(visited, Ok(Visit::Changed));
+                if wants.is_some() && !is_changed {
                     renewal.failed(known::now());
                 }
                 let days_left = renewal.left(known::now()).as_secs() / 86_400;
                 self.report(&visited, days_left, &mut reported);
-                if visited == Ok(Visit::Changed) {
+                if is_changed {
                     plan = None;
                     changed();
                 }
@@ -175,11 +175,16 @@ impl Enrolment {
     }
 
     /// Logs an outcome if it differs from the last outcome.
-    fn report(&self, visited: &Result<Visit, Why>, days_left: u64, reported: &mut Option<String>) {
+    fn report(
+        &self,
+        visited: &Result<Visit, EnrolmentFault>,
+        days_left: u64,
+        reported: &mut Option<String>,
+    ) {
         let message = match visited {
             Ok(Visit::Changed | Visit::Current) => None,
             Ok(Visit::Waiting) => Some(WAITING.to_owned()),
-            Err(why) => Some(why.clone()),
+            Err(why) => Some(why.to_string()),
         };
         if *reported == message {
             return;
@@ -207,7 +212,7 @@ impl Enrolment {
 
     /// Connects to the Global Discovery Server, requests a certificate to replace `old`, and
     /// fetches the trust list.
-    async fn visit(&mut self, old: Option<&Certificate>) -> Result<Visit, Why> {
+    async fn visit(&mut self, old: Option<&Certificate>) -> Result<Visit, EnrolmentFault> {
         let client = DirectoryClient {
             root: self.root.clone(),
             application_uri: self.applicant.application_uri.clone(),
@@ -222,8 +227,7 @@ impl Enrolment {
         &mut self,
         directory: &Directory,
         old: Option<&Certificate>,
-    ) -> Result<Visit, Why> {
-        let text = |error: DirectoryError| error.to_string();
+    ) -> Result<Visit, EnrolmentFault> {
         let issued = match old {
             Some(old) => match self.issued(directory, old).await? {
                 Some(issued) => Some(issued),
@@ -238,7 +242,7 @@ impl Enrolment {
             },
             None => None,
         };
-        let lists = self.lists(directory).await.map_err(text)?;
+        let lists = self.lists(directory).await?;
         let is_first = !known::trusts_authorities(&self.root);
         // The trust list comes first: the certificate is useless until its authority is trusted
         // here.
@@ -264,13 +268,11 @@ impl Enrolment {
         &mut self,
         directory: &Directory,
         old: &Certificate,
-    ) -> Result<Option<(Certificate, Vec<Certificate>)>, Why> {
-        let text = |error: DirectoryError| error.to_string();
+    ) -> Result<Option<(Certificate, Vec<Certificate>)>, EnrolmentFault> {
         let pending = match self.pending.take() {
             Some(pending) => pending,
             None => {
-                let application = directory.registered(&self.applicant.record()).await;
-                let application = application.map_err(text)?;
+                let application = directory.registered(&self.applicant.record()).await?;
                 self.requested(directory, application, old).await?
             }
         };
@@ -285,11 +287,11 @@ impl Enrolment {
                     Ok(None)
                 }
                 // The server does not know the request; the next visit sends a new request.
-                Some(_) => Err(text(error)),
+                Some(_) => Err(error.into()),
                 // The response was lost; the next visit polls the request again.
                 None => {
                     self.pending = Some(pending);
-                    Err(text(error))
+                    Err(error.into())
                 }
             },
         }
@@ -301,7 +303,7 @@ impl Enrolment {
         directory: &Directory,
         application: NodeId,
         old: &Certificate,
-    ) -> Result<Pending, Why> {
+    ) -> Result<Pending, EnrolmentFault> {
         let token = self.gds.token.clone();
         let token = token.filter(|_| !self.is_token_refused && old.is_self_signed());
         let has_token = token.is_some();
@@ -322,14 +324,13 @@ impl Enrolment {
                 );
                 self.is_token_refused = true;
                 let request = self.request(old, None).await?;
-                let number = directory.requested(&application, &request).await;
-                let number = number.map_err(|error| error.to_string())?;
+                let number = directory.requested(&application, &request).await?;
                 Ok(Pending {
                     application,
                     number,
                 })
             }
-            Err(error) => Err(error.to_string()),
+            Err(error) => Err(error.into()),
         }
     }
 
@@ -338,7 +339,7 @@ impl Enrolment {
         &self,
         old: &Certificate,
         token: Option<Token>,
-    ) -> Result<CertificateSigningRequest, Why> {
+    ) -> Result<CertificateSigningRequest, EnrolmentFault> {
         let key = own_key(&self.root)?;
         let (uri, hosts) = (
             self.applicant.application_uri.clone(),
@@ -349,25 +350,23 @@ impl Enrolment {
             let token = token.as_ref().map(Token::secret);
             CertificateSigningRequest::make_with(&key, (&uri, &hosts), (&name, ""), token)
         });
-        let signed = signing.await.map_err(|error| error.to_string())?;
-        signed.map_err(|why| format!("cannot request a certificate: {why}"))
+        Ok(signing.await??)
     }
 
     /// Trusts the certificates of a trust list, and stores its revocation lists.
-    fn trust(&self, lists: &TrustLists) -> Result<(), Why> {
+    fn trust(&self, lists: &TrustLists) -> Result<(), EnrolmentFault> {
         let store = StoreList::new(&self.root);
-        let failed = |error: std::io::Error| format!("cannot store the trust list: {error}");
-        store.trust_all(&lists.trusted).map_err(failed)?;
+        let trusted = store.trust_all(&lists.trusted);
+        trusted.map_err(EnrolmentFault::TrustList)?;
         let kept = store.keep_all(&lists.issuers);
-        kept.map_err(|status| format!("cannot store the trust list: {status}"))?;
+        kept.map_err(EnrolmentFault::Issuers)?;
         for list in &lists.revocation_lists {
-            match known::put_crl(&self.root, list) {
-                Ok(Some(path)) => debug!(file = %path.display(), "stored a revocation list"),
-                Ok(None) => debug!(
+            match known::put_crl(&self.root, list)? {
+                Some(path) => debug!(file = %path.display(), "stored a revocation list"),
+                None => debug!(
                     issuer = ?list.issuer_name(),
                     "ignored a revocation list of an unknown authority"
                 ),
-                Err(error) => return Err(error.to_string()),
             }
         }
         Ok(())
@@ -375,32 +374,33 @@ impl Enrolment {
 
     /// Checks an issued certificate by the rules of UpdateCertificate, and replaces the own
     /// certificate.
-    fn take_up(&self, certificate: &Certificate, above: &[Certificate]) -> Result<(), Why> {
+    fn take_up(
+        &self,
+        certificate: &Certificate,
+        above: &[Certificate],
+    ) -> Result<(), EnrolmentFault> {
         if certificate.application_uri().as_deref() != Some(&self.applicant.application_uri) {
-            return Err("the issued certificate is for another ApplicationUri".to_owned());
+            return Err(EnrolmentFault::OtherApplication);
         }
         if !certificate.is_valid_at(known::now()) {
-            return Err(
-                "the issued certificate is not valid at this time: set the clocks of this host and of the GDS".to_owned(),
-            );
+            return Err(EnrolmentFault::NotValid);
         }
         if !matches!(
             Renewal::of(certificate).step(known::now()),
             RenewalStep::Wait { .. }
         ) {
-            // Otherwise the program would restart endlessly.
-            return Err("the issued certificate must be renewed at once".to_owned());
+            return Err(EnrolmentFault::ShortLived);
         }
         let key = own_key(&self.root)?;
         if !certificate.is_of_private_key(&key) {
-            return Err("the issued certificate is for another key".to_owned());
+            return Err(EnrolmentFault::OtherKey);
         }
-        let refused = |status| format!("rejected the issued certificate: {status}");
         let store = StoreList::new(&self.root);
-        store.judge_among(certificate, above).map_err(refused)?;
-        store.keep_all(above).map_err(refused)?;
+        let kept = store.judge_among(certificate, above);
+        let kept = kept.and_then(|()| store.keep_all(above));
+        kept.map_err(EnrolmentFault::Rejected)?;
         own::replace(&self.root, certificate, &CertificateCause::Enrolment)
-            .map_err(|error| format!("cannot write the certificate: {error}"))?;
+            .map_err(EnrolmentFault::Write)?;
         info!(
             gds = self.gds.url,
             "restarting with the certificate of the plant"
@@ -427,15 +427,15 @@ impl DirectoryClient {
     /// Returns the registered servers whose names match a pattern, up to a limit.
     ///
     /// # Errors
-    /// The reason: the server is unreachable, slow or untrusted, or its answer is invalid.
+    /// The server is unreachable, slow or untrusted, or its answer is invalid.
     pub async fn servers(
         &self,
         pattern: &str,
         most: usize,
-    ) -> Result<Vec<ServerOnNetwork>, String> {
+    ) -> Result<Vec<ServerOnNetwork>, EnrolmentFault> {
         let ask = async |directory: Directory| {
             let servers = directory.servers(pattern, most).await;
-            servers.map_err(|error| error.to_string())
+            servers.map_err(EnrolmentFault::from)
         };
         self.visit(ask).await
     }
@@ -443,8 +443,8 @@ impl DirectoryClient {
     /// Connects over a secured channel, sends requests, and disconnects, all within a time limit.
     async fn visit<T>(
         &self,
-        requests: impl AsyncFnOnce(Directory) -> Result<T, Why>,
-    ) -> Result<T, Why> {
+        requests: impl AsyncFnOnce(Directory) -> Result<T, EnrolmentFault>,
+    ) -> Result<T, EnrolmentFault> {
         let client = OpcUaClient::open(
             ClientConfig {
                 pki: Some(self.root.clone()),
@@ -457,22 +457,15 @@ impl DirectoryClient {
             &self.gds.url,
         );
         let visit = async {
-            let up = client.up(ANSWERS_WITHIN).await;
-            up.map_err(|error| error.to_string())?;
-            // Without verification of the server's certificate, any server could answer.
+            client.up(ANSWERS_WITHIN).await?;
             if !matches!(&*client.link().borrow(), Link::Up { secured: true, .. }) {
-                return Err("the server offers no secured channel".to_owned());
+                return Err(EnrolmentFault::Unsecured);
             }
-            let directory = Directory::of(&client).map_err(|error| error.to_string())?;
-            requests(directory).await
+            requests(Directory::of(&client)?).await
         };
         let visited = timeout(LONGEST_VISIT, visit).await;
         client.close().await;
-        visited.unwrap_or_else(|_| {
-            Err(format!(
-                "the server has not responded within {LONGEST_VISIT:?}"
-            ))
-        })
+        visited.unwrap_or(Err(EnrolmentFault::Late))
     }
 }
 
@@ -492,10 +485,13 @@ fn status_of(error: &DirectoryError) -> Option<StatusCode> {
 ///
 /// # Errors
 /// Returns an error if the file cannot be read or does not contain a key.
-pub fn own_key(root: &Path) -> Result<Vec<u8>, String> {
+pub fn own_key(root: &Path) -> Result<Vec<u8>, EnrolmentFault> {
     let path = root.join(OWN_KEY);
-    let read = std::fs::read(&path).map_err(|error| format!("{}: {error}", path.display()))?;
-    pair::from_pem(&read).ok_or_else(|| format!("{} contains no private key", path.display()))
+    let read = std::fs::read(&path).map_err(|error| EnrolmentFault::KeyFile {
+        path: path.clone(),
+        error,
+    })?;
+    pair::from_pem(&read).ok_or(EnrolmentFault::NoKey(path))
 }
 
 /// The loopback names, which every certificate may contain.

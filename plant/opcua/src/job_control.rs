@@ -290,11 +290,10 @@ impl JobOrder {
     /// Decodes the binary encoding.
     ///
     /// # Errors
-    /// Returns the reason why the bytes are no job order.
-    pub fn from_bytes(bytes: &[u8]) -> Result<Self, String> {
+    /// The bytes are no job order.
+    pub fn from_bytes(bytes: &[u8]) -> EncodingResult<Self> {
         let (mut from, context) = (bytes, ContextOwned::default());
-        let decoded = <Self as BinaryDecodable>::decode(&mut from, &context.context());
-        decoded.map_err(|error| error.to_string())
+        <Self as BinaryDecodable>::decode(&mut from, &context.context())
     }
 }
 

@@ -14,7 +14,8 @@ pub use self::access::{
     AnonymousRights, Login, LoginFault, NodePermissions, PermissionRules, Right, UserAccess,
 };
 pub use self::file::{
-    Credential, FOLDER, LARGEST_PASSWORD, MOST_USERS, StoredUser, UserFault, Users, hashed,
+    Credential, FOLDER, LARGEST_PASSWORD, MOST_USERS, StoredUser, UserFault, UserLineFault, Users,
+    hashed,
 };
 
 /// A well-known role of OPC 10000-18, 4.2.

@@ -15,7 +15,7 @@ use service::{Failure, FailureKind};
 use tokio::sync::{mpsc, watch};
 use tracing::{info, warn};
 
-pub use self::fetch::{Fetched, Fetching, KeyRequest, KeyService};
+pub use self::fetch::{Fetched, Fetching, KeyFetchError, KeyRequest, KeyService};
 use crate::clock::now;
 
 /// New keys of a group.

@@ -50,7 +50,7 @@ pub use clock::{now, timestamp};
 pub use definitions::Definitions;
 pub use executing::{ExecutedServices, ExecutorGraph};
 pub use graph_error::GraphError;
-pub use keys::{Fetched, Fetching, KeyRequest, KeyService};
+pub use keys::{Fetched, Fetching, KeyFetchError, KeyRequest, KeyService};
 pub use mapping_file::{ConfigurationFile, NodeSetReader};
 pub use mappings::harmless_json;
 pub use observer::Observer;

@@ -8,6 +8,7 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use bridge_core::Now;
+use bridge_node::{Failure, FailureKind};
 use plant_opcua::synced::replace;
 use serde::{Deserialize, Serialize};
 use uadp::SecurityPolicy;
@@ -46,9 +47,10 @@ impl Store {
     ///
     /// # Errors
     /// Returns the fault of the file, without key data.
-    pub(super) fn load(&self, now: Now) -> Result<Vec<(String, SecurityPolicy, Ring)>, String> {
+    pub(super) fn load(&self, now: Now) -> Result<Vec<(String, SecurityPolicy, Ring)>, Failure> {
         let name = self.file.display();
-        let unusable = |error: io::Error| format!("the keys in {name} cannot be read: {error}");
+        let unusable =
+            |error: io::Error| failed(format!("the keys in {name} cannot be read: {error}"));
         let file = match File::open(&self.file) {
             Ok(file) => file,
             Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
@@ -56,10 +58,10 @@ impl Store {
         };
         let mode = file.metadata().map_err(unusable)?.permissions().mode() & 0o777;
         if mode & 0o077 != 0 {
-            return Err(format!(
+            return Err(failed(format!(
                 "mode {mode:04o} lets others read or change the keys in {name}; chmod 600 {name}, and remove it for new \
                  keys if somebody may have"
-            ));
+            )));
         }
         let mut text = String::new();
         file.take(MOST_BYTES)
@@ -67,15 +69,15 @@ impl Store {
             .map_err(unusable)?;
         let kept: BTreeMap<String, Kept> = serde_json::from_str(&text).map_err(|error| {
             // The content of the file is not logged.
-            format!(
+            failed(format!(
                 "{name}, line {}: no keys as this program keeps them; remove it for new ones",
                 error.line()
-            )
+            ))
         })?;
         let rings = kept.into_iter().map(|(id, kept)| {
-            let (policy, ring) = kept
-                .ring(now)
-                .ok_or_else(|| format!("{name}: no keys of `{id}`; remove it for new ones"))?;
+            let (policy, ring) = kept.ring(now).ok_or_else(|| {
+                failed(format!("{name}: no keys of `{id}`; remove it for new ones"))
+            })?;
             Ok((id, policy, ring))
         });
         rings.collect()
@@ -89,15 +91,15 @@ impl Store {
         &self,
         rings: impl Iterator<Item = (&'a str, SecurityPolicy, &'a Ring)>,
         now: Now,
-    ) -> Result<(), String> {
+    ) -> Result<(), Failure> {
         let kept: BTreeMap<&str, Kept> = rings
             .map(|(id, policy, ring)| (id, Kept::of(policy, ring, now)))
             .collect();
         self.write(&kept).map_err(|error| {
-            format!(
+            failed(format!(
                 "the keys cannot be kept in {}: {error}",
                 self.file.display()
-            )
+            ))
         })
     }
 
@@ -106,6 +108,10 @@ impl Store {
         text.push('\n');
         replace(&self.file, text.as_bytes())
     }
+}
+
+fn failed(message: String) -> Failure {
+    Failure::new(FailureKind::Io, message)
 }
 
 impl Kept {
@@ -248,7 +254,7 @@ mod tests {
         ] {
             fs::write(&store.file, text).unwrap();
             fs::set_permissions(&store.file, fs::Permissions::from_mode(mode)).unwrap();
-            let why = store.load(now()).unwrap_err();
+            let why = store.load(now()).unwrap_err().to_string();
             assert!(why.contains(told) && !why.contains("5e5e"), "{why}");
         }
         fs::remove_file(&store.file).unwrap();

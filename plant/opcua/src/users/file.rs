@@ -84,7 +84,7 @@ pub enum UserFault {
         /// The line number, from 1.
         line: usize,
         /// The reason.
-        why: String,
+        why: UserLineFault,
     },
     /// The user name is invalid.
     #[error(
@@ -113,6 +113,38 @@ pub enum UserFault {
         /// The reason.
         why: String,
     },
+}
+
+/// The reason why a line is no user. It omits the content, which may be a hash or a password.
+#[derive(Debug, thiserror::Error)]
+pub enum UserLineFault {
+    /// The line has another number of words.
+    #[error("expected a name, roles, and a hash or x509: with a thumbprint")]
+    Words,
+    /// The user name is invalid.
+    #[error("{}", UserFault::Name)]
+    Name,
+    /// A previous line has the same name.
+    #[error("the name occurs twice")]
+    Twice,
+    /// The role does not exist.
+    #[error(transparent)]
+    Role(#[from] UnknownRole),
+    /// The thumbprint of a certificate is invalid.
+    #[error("expected the 40 digits of a SHA-1 thumbprint after x509:")]
+    Thumbprint,
+    /// The text is not a hash.
+    #[error("expected an argon2 hash in the PHC format, as $argon2id$..")]
+    Hash,
+    /// The parameters of the hash are invalid.
+    #[error("the parameters of the hash are not valid")]
+    Parameters,
+    /// The server would spend too much on an attempt to log in.
+    #[error(
+        "a hash may need at most {MOST_MEMORY} KiB and {MOST_PASSES} passes, because the server \
+         computes it for each attempt"
+    )]
+    Costly,
 }
 
 /// The users of a server.
@@ -159,7 +191,7 @@ impl Users {
         Ok(users)
     }
 
-    fn parse(text: &str) -> Result<Self, (usize, String)> {
+    fn parse(text: &str) -> Result<Self, (usize, UserLineFault)> {
         let mut by_name = BTreeMap::new();
         for (line, number) in text.lines().zip(1..) {
             let line = line.trim();
@@ -168,7 +200,7 @@ impl Users {
             }
             let (name, user) = user(line).map_err(|why| (number, why))?;
             if by_name.insert(name.to_owned(), user).is_some() {
-                return Err((number, "the name occurs twice".to_owned()));
+                return Err((number, UserLineFault::Twice));
             }
         }
         Ok(Self { by_name })
@@ -292,24 +324,22 @@ fn read_certificate(path: &Path) -> Result<X509, UserFault> {
     })
 }
 
-fn user(line: &str) -> Result<(&str, StoredUser), String> {
+fn user(line: &str) -> Result<(&str, StoredUser), UserLineFault> {
     let mut parts = line.split_whitespace();
     let (Some(name), Some(roles), Some(credential), None) =
         (parts.next(), parts.next(), parts.next(), parts.next())
     else {
-        return Err("expected a name, roles, and a hash or x509: with a thumbprint".to_owned());
+        return Err(UserLineFault::Words);
     };
     if !is_name(name) {
-        return Err(UserFault::Name.to_string());
+        return Err(UserLineFault::Name);
     }
-    let roles: Roles = roles
-        .parse()
-        .map_err(|error: UnknownRole| error.to_string())?;
+    let roles: Roles = roles.parse()?;
     let credential = match credential.strip_prefix(X509_PREFIX) {
         Some(thumbprint) => {
             let thumbprint = thumbprint.to_lowercase();
             if thumbprint.len() != 40 || !thumbprint.bytes().all(|b| b.is_ascii_hexdigit()) {
-                return Err("expected the 40 digits of a SHA-1 thumbprint after x509:".to_owned());
+                return Err(UserLineFault::Thumbprint);
             }
             Credential::Certificate(thumbprint)
         }
@@ -319,19 +349,14 @@ fn user(line: &str) -> Result<(&str, StoredUser), String> {
 }
 
 /// Checks that the cost of verifying a hash is bounded.
-fn sound_hash(text: &str) -> Result<String, String> {
-    let hash = PasswordHash::new(text)
-        .map_err(|_| "expected an argon2 hash in the PHC format, as $argon2id$..".to_owned())?;
-    let parameters = argon2::Params::try_from(&hash)
-        .map_err(|_| "the parameters of the hash are not valid".to_owned())?;
+fn sound_hash(text: &str) -> Result<String, UserLineFault> {
+    let hash = PasswordHash::new(text).map_err(|_| UserLineFault::Hash)?;
+    let parameters = argon2::Params::try_from(&hash).map_err(|_| UserLineFault::Parameters)?;
     if !hash.algorithm.as_str().starts_with("argon2") || hash.hash.is_none() {
-        return Err("expected an argon2 hash in the PHC format, as $argon2id$..".to_owned());
+        return Err(UserLineFault::Hash);
     }
     if parameters.m_cost() > MOST_MEMORY || parameters.t_cost() > MOST_PASSES {
-        return Err(format!(
-            "a hash may need at most {MOST_MEMORY} KiB and {MOST_PASSES} passes, because the server \
-             computes it for each attempt"
-        ));
+        return Err(UserLineFault::Costly);
     }
     Ok(text.to_owned())
 }
@@ -464,6 +489,7 @@ mod tests {
         ] {
             let (line, told) = Users::parse(&format!("# who\n{text}\n")).unwrap_err();
             assert_eq!(line, 2);
+            let told = told.to_string();
             assert!(told.contains(why) && !told.contains("hunter2"), "{told}");
         }
         let twice = format!("a operator x509:{0}\na engineer x509:{0}\n", "0".repeat(40));

@@ -2,6 +2,7 @@
 //! uses an unknown key.
 
 use std::fmt;
+use std::io;
 use std::pin::Pin;
 use std::sync::Arc;
 use std::time::Duration;
@@ -11,7 +12,7 @@ use mappings::{KeySource, SecurityGroup};
 use tokio::sync::{mpsc, watch};
 use tokio::time::sleep;
 use tracing::{info, warn};
-use uadp::{SecurityPolicy, TokenKeys};
+use uadp::{KeyError, SecurityPolicy, TokenKeys};
 
 use super::NewKeys;
 
@@ -51,12 +52,47 @@ impl fmt::Debug for Fetched {
 }
 
 /// The future of a fetch.
-pub type Fetching<'a> = Pin<Box<dyn Future<Output = Result<Fetched, String>> + Send + 'a>>;
+pub type Fetching<'a> = Pin<Box<dyn Future<Output = Result<Fetched, KeyFetchError>> + Send + 'a>>;
+
+/// The reason why there are no keys.
+#[derive(Debug, thiserror::Error)]
+pub enum KeyFetchError {
+    /// The thread that fetches keys cannot be started.
+    #[error("cannot start the thread that fetches keys: {0}")]
+    Thread(io::Error),
+    /// The thread that fetches keys has ended.
+    #[error("the thread that fetches keys has ended")]
+    ThreadEnded,
+    /// The session with the service failed, or the service refuses the request.
+    #[error("{why} (as {application_uri})")]
+    Session {
+        /// The reason, as text for the user.
+        why: String,
+        /// The ApplicationUri of this program.
+        application_uri: String,
+    },
+    /// The own server does not create the keys of the group.
+    #[error("this server makes no keys of `{0}`")]
+    NotMade(String),
+    /// The keys have another policy.
+    #[error("its keys are for the policy {found:.80}, but the mapping has {}", expected.uri())]
+    Policy {
+        /// The SecurityPolicyUri of the keys.
+        found: String,
+        /// The policy in the mapping.
+        expected: SecurityPolicy,
+    },
+    /// A key has a wrong length.
+    #[error(transparent)]
+    Key(#[from] KeyError),
+    /// The service has no keys.
+    #[error("the service has no keys of the group")]
+    NoKeys,
+}
 
 /// Fetches keys. The program implements it, because this crate does not know OPC UA sessions.
 pub trait KeyService: fmt::Debug + Send + Sync {
-    /// Fetches the keys of a group, or returns the reason of the failure as text for the user. Ends
-    /// within a minute.
+    /// Fetches the keys of a group, or returns the reason of the failure. Ends within a minute.
     fn fetch<'a>(&'a self, request: &'a KeyRequest) -> Fetching<'a>;
 }
 
@@ -87,8 +123,9 @@ pub(super) async fn keep(
                 tell_back(&request, before);
                 rest
             }
-            Err(why) => {
+            Err(error) => {
                 failures = failures.saturating_add(1);
+                let why = error.to_string();
                 if why != told || failures.is_multiple_of(TOLD_AGAIN) {
                     tell_failure(&request, failures, &why);
                     told = why;
@@ -146,21 +183,20 @@ fn rest(delivery: &KeyDelivery) -> Duration {
 }
 
 /// Checks the response against the mapping.
-fn delivery(fetched: Fetched, policy: SecurityPolicy) -> Result<KeyDelivery, String> {
+fn delivery(fetched: Fetched, policy: SecurityPolicy) -> Result<KeyDelivery, KeyFetchError> {
     if fetched.policy_uri != policy.uri() {
-        return Err(format!(
-            "its keys are for the policy {:.80}, but the mapping has {}",
-            fetched.policy_uri,
-            policy.uri()
-        ));
+        return Err(KeyFetchError::Policy {
+            found: fetched.policy_uri,
+            expected: policy,
+        });
     }
     let keys = fetched.keys.iter();
     let keys: Result<Vec<TokenKeys>, _> = keys
         .map(|data| TokenKeys::from_bytes(policy, data))
         .collect();
-    let keys = keys.map_err(|error| error.to_string())?;
+    let keys = keys?;
     if keys.is_empty() || fetched.first_token_id == 0 {
-        return Err("the service has no keys of the group".to_owned());
+        return Err(KeyFetchError::NoKeys);
     }
     Ok(KeyDelivery {
         first_token_id: fetched.first_token_id,

@@ -3,14 +3,14 @@
 use std::fs::File;
 use std::io::Read as _;
 use std::os::unix::fs::PermissionsExt as _;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use bridge_core::{KeyDelivery, policy_of};
 use mappings::{KeySource, SecurityGroup};
 use serde::Deserialize;
 use service::{Failure, FailureKind};
-use uadp::{SecurityPolicy, TokenKeys};
+use uadp::{KeyError, SecurityPolicy, TokenKeys};
 
 /// One key of a SecurityGroup, in its parts; keys and nonce are hexadecimal text.
 #[derive(Deserialize)]
@@ -22,6 +22,61 @@ struct Written {
     signing_key: String,
     encrypting_key: String,
     key_nonce: String,
+}
+
+/// The reason why a text is no list of keys. It contains no key.
+#[derive(Debug, thiserror::Error)]
+enum KeyFileFault {
+    /// Other users can access the file.
+    #[error("mode {mode:04o} lets others read or change the keys; chmod 600 {}", path.display())]
+    Open {
+        /// The file.
+        path: PathBuf,
+        /// Its mode.
+        mode: u32,
+    },
+    /// The text has another form.
+    #[error("line {0}: not a list of keys as `ua-space keys` writes it")]
+    Form(usize),
+    /// The list is empty.
+    #[error("it contains no key")]
+    Empty,
+    /// The list is too long.
+    #[error("{0} keys; at most {MOST_KEYS} are allowed")]
+    TooMany(usize),
+    /// A key is not the successor of the key before.
+    #[error("key {at}: its securityTokenId is {id}, but the ids must ascend by 1")]
+    Order {
+        /// The index of the key.
+        at: u32,
+        /// Its SecurityTokenId.
+        id: u32,
+    },
+    /// A key is invalid.
+    #[error("key {at}: {fault}")]
+    Key {
+        /// The index of the key.
+        at: u32,
+        /// The reason.
+        fault: WrittenKeyFault,
+    },
+}
+
+/// The reason why a key is invalid.
+#[derive(Debug, thiserror::Error)]
+enum WrittenKeyFault {
+    /// The SecurityTokenId is 0.
+    #[error("0 is not a valid securityTokenId")]
+    Zero,
+    /// The group has this policy, and the key another.
+    #[error("its policy differs from {}, the policy of the group in the mapping", .0.uri())]
+    Policy(SecurityPolicy),
+    /// The text of this member is invalid.
+    #[error("{0} is not hexadecimal")]
+    NotHexadecimal(&'static str),
+    /// The key has a wrong length.
+    #[error(transparent)]
+    Data(#[from] KeyError),
 }
 
 /// Reads the keys of a group, in the order of the file.
@@ -40,7 +95,7 @@ pub(super) fn read(path: &Path, group: &SecurityGroup) -> Result<KeyDelivery, Fa
             ),
         )
     };
-    let wrong = |why: String| {
+    let wrong = |why: KeyFileFault| {
         Failure::new(
             FailureKind::Configuration,
             format!("the keys of the group `{}`: {name}: {why}", group.id),
@@ -52,9 +107,8 @@ pub(super) fn read(path: &Path, group: &SecurityGroup) -> Result<KeyDelivery, Fa
     let handed = matches!(group.keys, Some(KeySource::Credential(_)));
     let mode = about.permissions().mode() & 0o777;
     if !handed && mode & 0o077 != 0 {
-        return Err(wrong(format!(
-            "mode {mode:04o} lets others read or change the keys; chmod 600 {name}"
-        )));
+        let path = path.to_owned();
+        return Err(wrong(KeyFileFault::Open { path, mode }));
     }
     let mut text = String::new();
     let mut bounded = (&mut file).take(MOST_BYTES);
@@ -62,37 +116,28 @@ pub(super) fn read(path: &Path, group: &SecurityGroup) -> Result<KeyDelivery, Fa
     parse(&text, policy_of(group.policy)).map_err(wrong)
 }
 
-fn parse(text: &str, policy: SecurityPolicy) -> Result<KeyDelivery, String> {
+fn parse(text: &str, policy: SecurityPolicy) -> Result<KeyDelivery, KeyFileFault> {
     let written = if text.trim_start().starts_with('[') {
         serde_json::from_str(text)
     } else {
         serde_json::from_str(text).map(|one| vec![one])
     };
-    let written: Vec<Written> = written.map_err(|error| {
-        // The content of the file is not shown.
-        format!(
-            "line {}: not a list of keys as `ua-space keys` writes it",
-            error.line()
-        )
-    })?;
+    // The content of the file is not shown.
+    let written: Vec<Written> = written.map_err(|error| KeyFileFault::Form(error.line()))?;
     let first = written.first().map(|key| key.security_token_id);
-    let first = first.ok_or("it contains no key")?;
+    let first = first.ok_or(KeyFileFault::Empty)?;
     let mut keys = Vec::new();
     for (at, key) in (0_u32..).zip(&written) {
         let expected = first.checked_add(at);
         if expected != Some(key.security_token_id) {
-            return Err(format!(
-                "key {at}: its securityTokenId is {}, but the ids must ascend by 1",
-                key.security_token_id
-            ));
+            let id = key.security_token_id;
+            return Err(KeyFileFault::Order { at, id });
         }
-        keys.push(key.keys(policy).map_err(|why| format!("key {at}: {why}"))?);
+        let read = key.keys(policy);
+        keys.push(read.map_err(|fault| KeyFileFault::Key { at, fault })?);
     }
     if keys.len() > MOST_KEYS {
-        return Err(format!(
-            "{} keys; at most {MOST_KEYS} are allowed",
-            keys.len()
-        ));
+        return Err(KeyFileFault::TooMany(keys.len()));
     }
     Ok(KeyDelivery {
         first_token_id: first,
@@ -103,15 +148,12 @@ fn parse(text: &str, policy: SecurityPolicy) -> Result<KeyDelivery, String> {
 }
 
 impl Written {
-    fn keys(&self, policy: SecurityPolicy) -> Result<TokenKeys, String> {
+    fn keys(&self, policy: SecurityPolicy) -> Result<TokenKeys, WrittenKeyFault> {
         if self.security_token_id == 0 {
-            return Err("0 is not a valid securityTokenId".to_owned());
+            return Err(WrittenKeyFault::Zero);
         }
         if SecurityPolicy::from_uri(&self.policy) != Some(policy) {
-            return Err(format!(
-                "its policy differs from {}, the policy of the group in the mapping",
-                policy.uri()
-            ));
+            return Err(WrittenKeyFault::Policy(policy));
         }
         let parts = [
             ("signingKey", &self.signing_key),
@@ -120,10 +162,10 @@ impl Written {
         ];
         let mut data = Vec::new();
         for (name, text) in parts {
-            let bytes = bytes(text).ok_or_else(|| format!("{name} is not hexadecimal"))?;
+            let bytes = bytes(text).ok_or(WrittenKeyFault::NotHexadecimal(name))?;
             data.extend(bytes);
         }
-        TokenKeys::from_bytes(policy, &data).map_err(|error| error.to_string())
+        Ok(TokenKeys::from_bytes(policy, &data)?)
     }
 }
 
@@ -212,7 +254,7 @@ mod tests {
                 "the ids must ascend by 1",
             ),
         ] {
-            let why = parse(&text, policy).unwrap_err();
+            let why = parse(&text, policy).unwrap_err().to_string();
             assert!(why.contains(told), "{why}");
             assert!(!why.contains("0a0a") && !why.contains("xyxy"), "{why}");
         }
