@@ -138,7 +138,7 @@ impl Ros2Side {
         let calls = &mut self.descriptions.calls;
         calls.begin(wanted.clone(), asked, async move {
             match client.call(request).await {
-                Ok(answer) => type_description::read_answer(&answer),
+                Ok(answer) => type_description::read_answer(&answer).map_err(|why| why.to_string()),
                 Err(error) => Err(error.to_string()),
             }
         });

@@ -114,20 +114,37 @@ pub fn request(name: &TypeName, hash: TypeHash) -> Bytes {
     writer.finish()
 }
 
-/// Decodes the type and its referenced types, or the reason for the failure.
-pub fn read_answer(bytes: &[u8]) -> Result<Vec<DescribedType>, String> {
-    let read = || -> Result<Result<Vec<DescribedType>, String>, Malformed> {
-        let mut reader = CdrReader::new(bytes)?;
-        let successful = reader.bool()?;
-        let reason = reader.string()?;
-        if !successful {
-            return Ok(Err(format!("it does not describe the type: {reason}")));
-        }
-        let mut types = vec![read_type(&mut reader)?];
-        types.extend(reader.sequence(read_type)?);
-        Ok(Ok(types))
-    };
-    read().unwrap_or_else(|Malformed| Err("its response is malformed".to_owned()))
+/// The reason why a node does not describe a type.
+#[derive(Debug, thiserror::Error)]
+pub enum NotDescribed {
+    /// The response is not CDR of its type.
+    #[error("its response is malformed")]
+    Malformed,
+    /// The node refuses the request, for this reason.
+    #[error("it does not describe the type: {0}")]
+    Refused(String),
+}
+
+impl From<Malformed> for NotDescribed {
+    fn from(Malformed: Malformed) -> Self {
+        Self::Malformed
+    }
+}
+
+/// Decodes the type and its referenced types.
+///
+/// # Errors
+/// The node does not describe the type.
+pub fn read_answer(bytes: &[u8]) -> Result<Vec<DescribedType>, NotDescribed> {
+    let mut reader = CdrReader::new(bytes)?;
+    let successful = reader.bool()?;
+    let reason = reader.string()?;
+    if !successful {
+        return Err(NotDescribed::Refused(reason));
+    }
+    let mut types = vec![read_type(&mut reader)?];
+    types.extend(reader.sequence(read_type)?);
+    Ok(types)
 }
 
 fn read_type(reader: &mut CdrReader<'_>) -> Result<DescribedType, Malformed> {
@@ -171,7 +188,8 @@ fn answer(known: &Known, request: &TypeRequest) -> Bytes {
     let found = describe(known, &request.name, &request.hash);
     let mut writer = CdrWriter::new();
     writer.bool(found.is_ok());
-    writer.string(found.as_ref().err().map_or("", String::as_str));
+    let reason = found.as_ref().err().map(ToString::to_string);
+    writer.string(reason.as_deref().unwrap_or_default());
     let (described, sources) = match found {
         Ok(found) => (&found.types[..], &found.sources[..]),
         Err(_) => (&[][..], &[][..]),
@@ -193,8 +211,23 @@ fn answer(known: &Known, request: &TypeRequest) -> Bytes {
     writer.finish()
 }
 
-fn describe<'k>(known: &'k Known, name: &str, hash: &str) -> Result<&'k Description, String> {
-    let unknown = || format!("this node does not use the type {name}");
+/// The reason why this node does not describe a type. The client gets its text.
+#[derive(Debug, thiserror::Error)]
+enum UnusedType {
+    /// This node does not use the type with this name.
+    #[error("this node does not use the type {0}")]
+    Name(String),
+    /// This node uses another version of the type.
+    #[error("this node uses the type {name} with the hash {}", hashes.join(", "))]
+    Hash {
+        /// The name of the type.
+        name: String,
+        /// The hashes of the versions that this node uses.
+        hashes: Vec<String>,
+    },
+}
+
+fn describe<'k>(known: &'k Known, name: &str, hash: &str) -> Result<&'k Description, UnusedType> {
     // For messages the short name suffices.
     let full = name.parse::<TypeName>();
     let full = full.map_or_else(|_| name.to_owned(), |name| name.ros2());
@@ -206,12 +239,10 @@ fn describe<'k>(known: &'k Known, name: &str, hash: &str) -> Result<&'k Descript
     }
     let hashes: Vec<String> = of_name().map(|((_, ours), _)| ours.to_string()).collect();
     if hashes.is_empty() {
-        return Err(unknown());
+        return Err(UnusedType::Name(name.to_owned()));
     }
-    Err(format!(
-        "this node uses the type {name} with the hash {}",
-        hashes.join(", ")
-    ))
+    let name = name.to_owned();
+    Err(UnusedType::Hash { name, hashes })
 }
 
 fn write_type(writer: &mut CdrWriter, described: &DescribedType) {
@@ -315,7 +346,9 @@ mod tests {
         for (type_name, type_hash) in [("x/msg/Y", ""), ("sensor_msgs/msg/JointState", "RIHS01_0")]
         {
             let request = asked(type_name, type_hash, true);
-            let refused = read_answer(&answer(&known, &request)).unwrap_err();
+            let refused = read_answer(&answer(&known, &request))
+                .unwrap_err()
+                .to_string();
             assert!(
                 refused.contains("it does not describe the type: "),
                 "{refused}"

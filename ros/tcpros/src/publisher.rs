@@ -11,6 +11,7 @@ use crate::events;
 use crate::header::{ConnectionHeader, clipped};
 use crate::node::Inner;
 use crate::outbox::{Limit, SubscriberQueue, lock};
+use crate::refusal::ConnectionRefusal;
 
 /// The type of a topic, as publishers and subscribers compare it.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -359,28 +360,23 @@ impl PublishedTopic {
         &self,
         request: &ConnectionHeader,
         own_name: &str,
-    ) -> Result<ConnectionHeader, String> {
+    ) -> Result<ConnectionHeader, ConnectionRefusal> {
         let ours = &self.topic_type;
         let fits = |wanted: Option<&str>, ours: &str| wanted.is_none_or(|w| w == "*" || w == ours);
         let Some(md5sum) = request.md5sum() else {
-            return Err(
-                "Header from subscriber did not have the required elements: md5sum, topic"
-                    .to_owned(),
-            );
+            return Err(ConnectionRefusal::SubscriberHeader);
         };
         // As in roscpp and rospy, only the checksum decides. The names alone differ if packages
         // were renamed.
         if !fits(Some(md5sum), &ours.md5sum) {
             let wanted = clipped(request.type_name().unwrap_or("*"));
             lock(&self.state).refused_type = request.type_name().map(|_| wanted.to_owned());
-            return Err(format!(
-                "Client [{}] wants topic {} to have datatype/md5sum [{wanted}/{}], but our version has [{}/{}]. Dropping connection.",
-                clipped(request.caller_id()),
-                self.topic,
-                clipped(md5sum),
-                ours.name,
-                ours.md5sum,
-            ));
+            return Err(ConnectionRefusal::TopicType {
+                topic: self.topic.clone(),
+                caller: clipped(request.caller_id()).to_owned(),
+                wanted: format!("{wanted}/{}", clipped(md5sum)),
+                ours: format!("{}/{}", ours.name, ours.md5sum),
+            });
         }
         let reply = ConnectionHeader::default()
             .with("callerid", own_name)
@@ -523,7 +519,8 @@ mod tests {
     fn the_type_a_subscriber_was_turned_away_with_is_remembered() {
         let hub = hub(false);
         let error = hub.reply_to(&request("0123").with("type", "std_msgs/Bool"), "/n");
-        assert!(error.unwrap_err().contains("[std_msgs/Bool/0123]"));
+        let error = error.unwrap_err().to_string();
+        assert!(error.contains("[std_msgs/Bool/0123]"), "{error}");
         assert_eq!(
             lock(&hub.state).refused_type.as_deref(),
             Some("std_msgs/Bool")
@@ -533,6 +530,7 @@ mod tests {
     #[test]
     fn a_subscriber_of_another_checksum_is_told_both() {
         let error = hub(false).reply_to(&request("0123"), "/n").unwrap_err();
+        let error = error.to_string();
         assert!(
             error.contains("[*/0123]") && error.contains("[std_msgs/String/992ce"),
             "{error}"
@@ -541,6 +539,7 @@ mod tests {
             hub(false)
                 .reply_to(&ConnectionHeader::default(), "/n")
                 .unwrap_err()
+                .to_string()
                 .contains("required")
         );
     }

@@ -8,7 +8,7 @@ mod client;
 mod server;
 
 pub use self::client::{CallPhase, ServiceClient, ServiceClientOptions, ServiceError};
-pub(crate) use self::server::{ClientFault, ClientHandshake, OfferedService, nonexistent};
+pub(crate) use self::server::{ClientFault, ClientHandshake, OfferedService};
 pub use self::server::{ServiceOptions, ServiceRequest, ServiceServer};
 
 /// The type of a service, as its clients compare it and `rosservice` shows it.

@@ -24,6 +24,7 @@ use crate::header::{ConnectionHeader, HeaderError, clipped};
 use crate::link::{prepare, transport_info};
 use crate::node::Inner;
 use crate::publisher::{Joined, Subscriber};
+use crate::refusal::ConnectionRefusal;
 use crate::service::{self, ClientFault};
 
 /// Serves the subscribers and clients of a node until it is dropped. Beyond the limit, connections
@@ -98,11 +99,11 @@ async fn shake_hands(stream: &mut TcpStream, node: &Inner) -> Result<Admitted, R
             stream.write_all(&reply.encode()?).await?;
             Ok(admitted)
         }
-        Err(error) => {
-            let reply = ConnectionHeader::default().with("error", &*error);
+        Err(refusal) => {
+            let reply = ConnectionHeader::default().with("error", refusal.to_string());
             stream.write_all(&reply.encode()?).await?;
             stream.shutdown().await?;
-            Err(Refused::Mismatch(error))
+            Err(Refused::Mismatch(refusal))
         }
     }
 }
@@ -112,23 +113,21 @@ fn admit(
     request: ConnectionHeader,
     node: &Inner,
     transport: String,
-) -> Result<(ConnectionHeader, Admitted), String> {
+) -> Result<(ConnectionHeader, Admitted), ConnectionRefusal> {
     if let Some(name) = request.get("service") {
         let served = node
             .service(name)
-            .ok_or_else(|| service::nonexistent(clipped(name)))?;
+            .ok_or_else(|| ConnectionRefusal::NoService(clipped(name).to_owned()))?;
         let (reply, admitted) = served.admit(request, node.name())?;
         return Ok((reply, Admitted::Service(admitted)));
     }
     let Some(topic) = request.get("topic") else {
-        return Err(
-            "Header from subscriber did not have the required elements: md5sum, topic".to_owned(),
-        );
+        return Err(ConnectionRefusal::SubscriberHeader);
     };
     let caller = clipped(request.caller_id());
-    let gone = || {
-        let topic = clipped(topic);
-        format!("received a connection for a nonexistent topic [{topic}] from [{caller}]")
+    let gone = || ConnectionRefusal::NoTopic {
+        topic: clipped(topic).to_owned(),
+        caller: caller.to_owned(),
     };
     let hub = node.publication(topic).ok_or_else(gone)?;
     let reply = hub.reply_to(&request, node.name())?;
@@ -246,8 +245,8 @@ enum Refused {
     Silent(Duration),
     #[error(transparent)]
     Header(#[from] HeaderError),
-    #[error("{0}")]
-    Mismatch(String),
+    #[error(transparent)]
+    Mismatch(ConnectionRefusal),
     #[error(transparent)]
     Client(#[from] ClientFault),
     #[error(transparent)]

@@ -153,22 +153,16 @@ impl ParameterStore {
     fn set(
         &mut self,
         wanted: &[(String, ParameterValue)],
-    ) -> Result<Vec<DeclaredParameter>, String> {
+    ) -> Result<Vec<DeclaredParameter>, SetParameterError> {
         for (name, value) in wanted {
             let Some(found) = self.get(name) else {
-                return Err(format!(
-                    "parameter '{name}' cannot be set because it was not declared"
-                ));
+                return Err(SetParameterError::Undeclared(name.clone()));
             };
             if found.read_only {
-                return Err(format!(
-                    "parameter '{name}' cannot be set because it is read-only"
-                ));
+                return Err(SetParameterError::ReadOnly(name.clone()));
             }
             if found.value.kind() != value.kind() {
-                return Err(format!(
-                    "parameter '{name}' cannot have a value of another type"
-                ));
+                return Err(SetParameterError::OtherType(name.clone()));
             }
         }
         let mut changed = Vec::new();
@@ -183,6 +177,20 @@ impl ParameterStore {
         }
         Ok(changed)
     }
+}
+
+/// The reason why the parameter with this name is not set. The client gets its text.
+#[derive(Debug, thiserror::Error)]
+enum SetParameterError {
+    /// The node has no such parameter.
+    #[error("parameter '{0}' cannot be set because it was not declared")]
+    Undeclared(String),
+    /// The node sets the parameter itself.
+    #[error("parameter '{0}' cannot be set because it is read-only")]
+    ReadOnly(String),
+    /// The value has another type.
+    #[error("parameter '{0}' cannot have a value of another type")]
+    OtherType(String),
 }
 
 /// Decodes a `rcl_interfaces/msg/Parameter`.
@@ -204,9 +212,13 @@ fn describe(writer: &mut CdrWriter, parameter: &DeclaredParameter) {
 }
 
 /// Encodes a `rcl_interfaces/msg/SetParametersResult`.
-fn write_result(writer: &mut CdrWriter, result: &Result<Vec<DeclaredParameter>, String>) {
+fn write_result(
+    writer: &mut CdrWriter,
+    result: &Result<Vec<DeclaredParameter>, SetParameterError>,
+) {
+    let reason = result.as_ref().err().map(ToString::to_string);
     writer.bool(result.is_ok());
-    writer.string(result.as_ref().err().map_or("", String::as_str));
+    writer.string(reason.as_deref().unwrap_or_default());
 }
 
 /// Encodes a `rcl_interfaces/msg/ParameterEvent` about changed parameters.
@@ -303,7 +315,7 @@ mod tests {
             set("use_sim_time", ParameterValue::Bool(true)),
             set("arm.joint.limit", ParameterValue::Integer(4)),
         ]);
-        assert!(refused.unwrap_err().contains("read-only"));
+        assert!(refused.unwrap_err().to_string().contains("read-only"));
         assert_eq!(
             store.get("use_sim_time").unwrap().value,
             ParameterValue::Bool(false)
@@ -313,7 +325,7 @@ mod tests {
             ("arm.speed", ParameterValue::Integer(1), "another type"),
         ] {
             let refused = store.set(&[set(name, value)]);
-            assert!(refused.unwrap_err().contains(why));
+            assert!(refused.unwrap_err().to_string().contains(why));
         }
         let changed = store.set(&[
             set("use_sim_time", ParameterValue::Bool(true)),

@@ -24,6 +24,7 @@ use crate::header::{ConnectionHeader, clipped};
 use crate::inbox::ConnectionPeer;
 use crate::node::Inner;
 use crate::outbox::lock;
+use crate::refusal::ConnectionRefusal;
 use crate::topic_server::{ConnectionEnd, DRAIN_LIMIT, STALL_LIMIT, until_closed, write};
 
 /// Limits of a service.
@@ -205,7 +206,7 @@ impl OfferedService {
         self: &Arc<Self>,
         request: ConnectionHeader,
         own_name: &str,
-    ) -> Result<(ConnectionHeader, ClientHandshake), String> {
+    ) -> Result<(ConnectionHeader, ClientHandshake), ConnectionRefusal> {
         let admitted = self.check(&request).and_then(|()| self.take_in(request));
         if admitted.is_err() {
             self.counters.refused.fetch_add(1, Ordering::Relaxed);
@@ -221,35 +222,35 @@ impl OfferedService {
         Ok((reply, admitted?))
     }
 
-    fn check(&self, request: &ConnectionHeader) -> Result<(), String> {
+    fn check(&self, request: &ConnectionHeader) -> Result<(), ConnectionRefusal> {
         let Some(md5sum) = request.md5sum() else {
-            return Err(
-                "bogus tcpros header. did not have the required elements: md5sum".to_owned(),
-            );
+            return Err(ConnectionRefusal::ClientHeader);
         };
         let ours = &self.service_type.md5sum;
         if md5sum == "*" || md5sum == ours {
             return Ok(());
         }
-        Err(format!(
-            "client wants service {} to have md5sum {}, but it has {ours}. Dropping connection.",
-            self.service,
-            clipped(md5sum),
-        ))
+        Err(ConnectionRefusal::ServiceType {
+            service: self.service.clone(),
+            wanted: clipped(md5sum).to_owned(),
+            ours: ours.clone(),
+        })
     }
 
-    fn take_in(self: &Arc<Self>, request: ConnectionHeader) -> Result<ClientHandshake, String> {
+    fn take_in(
+        self: &Arc<Self>,
+        request: ConnectionHeader,
+    ) -> Result<ClientHandshake, ConnectionRefusal> {
         if *self.closed.borrow() {
-            return Err(nonexistent(&self.service));
+            return Err(ConnectionRefusal::NoService(self.service.clone()));
         }
         if request.get("probe") == Some("1") {
             return Ok(ClientHandshake::Probe);
         }
-        let place = Arc::clone(&self.places).try_acquire_owned().map_err(|_| {
-            format!(
-                "service [{}] has {} clients and takes no more",
-                self.service, self.options.max_clients
-            )
+        let place = Arc::clone(&self.places).try_acquire_owned();
+        let place = place.map_err(|_| ConnectionRefusal::Full {
+            service: self.service.clone(),
+            clients: self.options.max_clients,
         })?;
         let persistent = request
             .get("persistent")
@@ -285,11 +286,6 @@ impl fmt::Debug for OfferedService {
             .field("counters", &self.counters)
             .finish_non_exhaustive()
     }
-}
-
-/// Returns the text of roscpp for an unknown service.
-pub(crate) fn nonexistent(service: &str) -> String {
-    format!("received a tcpros connection for a nonexistent service [{service}]")
 }
 
 /// The session of a client of a service, which ends on drop.
