@@ -6,7 +6,7 @@ use std::time::Duration;
 use tokio::net::{TcpStream, UdpSocket, lookup_host};
 use tokio::time::timeout;
 
-use crate::announce::ServerDescription;
+use crate::description::ServerDescription;
 use mdns::MdnsInterface;
 use mdns::Url;
 use mdns::is_own;

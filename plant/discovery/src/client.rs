@@ -27,7 +27,7 @@ use tokio::time::timeout;
 
 use plant_opcua::supervision::Registrar;
 
-use crate::announce::ServerDescription;
+use crate::description::ServerDescription;
 use crate::security::ChannelSecurity;
 use crate::wire::{Conversation, FrameKind, MOST_CHUNK, MOST_CHUNKS, MOST_HEARD, WireFault};
 use mdns::Url;

@@ -14,9 +14,9 @@ use tokio::task::JoinHandle;
 use tokio::time::{Instant, sleep, sleep_until, timeout};
 use tracing::{debug, info};
 
-use crate::announce::ServerDescription;
 use crate::client::DiscoveryQueryFault;
 use crate::connection::RegistryRequest;
+use crate::description::ServerDescription;
 use crate::lds::{DiscoveryServer, EmbeddedIn, LdsSettings};
 use crate::line::{OpenChannel, Reached};
 use crate::listen::listen;

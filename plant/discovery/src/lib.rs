@@ -16,6 +16,7 @@ mod chosen;
 pub mod client;
 mod clock;
 mod connection;
+mod description;
 mod embedded;
 mod endpoint;
 #[doc(hidden)]
@@ -34,10 +35,9 @@ pub mod ua_lds;
 mod watch;
 mod wire;
 
-pub use announce::{
-    AnnounceSettings, AnnounceState, ServerAnnouncement, ServerDescription, announce,
-};
+pub use announce::{AnnounceSettings, AnnounceState, ServerAnnouncement, announce};
 pub use chosen::{Marks, find_lds};
+pub use description::ServerDescription;
 pub use listing::{ListingArguments, ServerQuery};
 pub use mdns::{MdnsFault, MdnsInterface, host_name};
 pub use presence::be_there;

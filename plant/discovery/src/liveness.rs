@@ -248,7 +248,7 @@ mod tests {
     use tokio::net::TcpListener;
 
     use super::*;
-    use crate::announce::ServerDescription;
+    use crate::description::ServerDescription;
     use crate::presence::be_there;
 
     async fn tried(liveness: &mut Liveness, url: &str) -> ProbeOutcome {

@@ -6,8 +6,8 @@ use opcua::types::{ApplicationType, ByteString};
 use tokio::net::TcpListener;
 use tokio::sync::mpsc;
 
-use crate::announce::ServerDescription;
 use crate::connection::{RegistryRequest, ServerShared};
+use crate::description::ServerDescription;
 use crate::endpoint;
 use crate::services::{OwnDescription, RegistryAnswer, RegistryQuery};
 

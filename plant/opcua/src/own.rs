@@ -20,7 +20,7 @@ use serde_json::{Value, json};
 use tracing::info;
 use trust::Certificate;
 
-use crate::pki::OWN_CERTIFICATE;
+use crate::pair::OWN_CERTIFICATE;
 
 /// The reason why an application has its present certificate.
 #[derive(Debug, Clone, PartialEq, Eq)]

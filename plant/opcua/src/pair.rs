@@ -9,8 +9,13 @@ use std::path::Path;
 use trust::Certificate;
 use x509_cert::der::pem::{self, LineEnding};
 
-use crate::pki::{OWN_CERTIFICATE, OWN_KEY};
+use crate::certificates;
 use crate::synced::{rename_synced, write_synced, write_synced_for_owner};
+
+/// The path of the application's own certificate below the root.
+pub const OWN_CERTIFICATE: &str = certificates::OWN;
+/// The path of its private key below the root.
+pub const OWN_KEY: &str = "private/private.pem";
 
 /// The existing files of a pair.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -12,6 +12,7 @@ use crate::certificates::{self, REJECTED_KEPT, Standing};
 use crate::known;
 use crate::own::{self, CertificateCause, CertificateOwner};
 use crate::pair::{self, PairFiles};
+pub use crate::pair::{OWN_CERTIFICATE, OWN_KEY};
 
 /// An OPC UA certificate store with the directories `own`, `private`, `trusted` and `rejected`
 /// below a root.
@@ -414,10 +415,6 @@ fn owner_only(_path: &Path) -> io::Result<()> {
     Ok(())
 }
 
-/// The path of the application's own certificate below the root.
-pub const OWN_CERTIFICATE: &str = certificates::OWN;
-/// The path of its private key below the root.
-pub const OWN_KEY: &str = "private/private.pem";
 /// The certificate folder of a peer without certificates: this folder cannot be created.
 pub(crate) const NO_PKI: &str = "/dev/null/pki";
 /// The lock file for creating the pair.

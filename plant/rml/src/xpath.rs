@@ -5,6 +5,7 @@
 
 mod calls;
 mod evaluate;
+mod fault;
 mod functions;
 mod parse;
 mod tokens;
@@ -13,7 +14,8 @@ use std::fmt;
 use std::sync::Arc;
 
 pub(crate) use evaluate::{EvaluationFault, Evaluator, NodeRef, WorkBudget};
-pub(crate) use parse::{XPathSyntaxFault, parse};
+pub(crate) use fault::XPathSyntaxFault;
+pub(crate) use parse::parse;
 
 /// The namespaces of prefixes in expressions. Without any, names match in all namespaces.
 pub(crate) type XpathNamespaces = [(String, String)];

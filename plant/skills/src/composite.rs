@@ -5,14 +5,14 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use async_trait::async_trait;
-use tracing::{debug, warn};
+use tracing::warn;
 
 use crate::driver::{Driver, RunResults, Work};
 use crate::driver_error::{DriverError, InvalidParameter};
 use crate::frame::Frame;
 use crate::grip::{Hold, PartShape};
 use crate::parameters::Parameters;
-use crate::part::{PartEnd, run_part};
+use crate::part::{JobObserver, PartEnd, run_part};
 use crate::runs::{COMPOSITE_HALT_TIMEOUT, RunnableSkill, SkillFault};
 use crate::value::SkillValue;
 
@@ -62,63 +62,6 @@ pub struct Broken {
     pub why: String,
     /// Whether the robot has retreated, or why not.
     pub retreated: Result<(), String>,
-}
-
-/// Receives the steps of a job, and can stop it.
-#[async_trait]
-pub trait JobObserver: Send + Sync {
-    /// Reports the start of a step.
-    async fn step(&self, step: &'static str);
-
-    /// Reports the end of a part of the step.
-    async fn did(&self, what: &str) {
-        debug!("{what}");
-    }
-
-    /// Reports the reason why the work has not ended after it was halted.
-    async fn pending(&self, why: &str) {
-        debug!("{why}");
-    }
-
-    /// Reports that the end of a part is unknown: the skill is not started again before a Reset.
-    async fn unknown(&self, why: &str) {
-        warn!("{why}");
-    }
-
-    /// Completes when the job is to be stopped.
-    async fn stopped(&self) {
-        std::future::pending().await
-    }
-}
-
-#[async_trait]
-impl JobObserver for Work {
-    async fn step(&self, step: &'static str) {
-        Self::step(self, step).await;
-    }
-
-    async fn did(&self, what: &str) {
-        self.note(what).await;
-    }
-
-    async fn pending(&self, why: &str) {
-        Self::pending(self, why).await;
-    }
-
-    async fn unknown(&self, why: &str) {
-        Self::unknown(self, why).await;
-    }
-
-    async fn stopped(&self) {
-        Self::stopped(self).await;
-    }
-}
-
-#[async_trait]
-impl<F: Fn(&'static str) + Send + Sync> JobObserver for F {
-    async fn step(&self, step: &'static str) {
-        self(step);
-    }
 }
 
 /// A retreat move: its name, the skill and the target pose.

@@ -5,7 +5,7 @@ use std::time::Duration;
 use async_trait::async_trait;
 use tokio::sync::{mpsc, watch};
 
-use crate::driver_error::{DriverError, InvalidParameter};
+use crate::driver_error::{DriverError, InvalidParameter, Stopped};
 use crate::parameters::{Parameters, SkillParameter};
 use crate::value::SkillValue;
 
@@ -90,11 +90,6 @@ pub(crate) enum Line {
     /// The end of the work, past or future, is unknown.
     Unknown(String),
 }
-
-/// The work was stopped by Halt, by Reset or by the end of the program.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
-#[error("stopped")]
-pub struct Stopped;
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Signal {

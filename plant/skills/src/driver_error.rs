@@ -4,9 +4,13 @@ use std::error::Error;
 
 use crate::client::PartnerError;
 use crate::composite::Broken;
-use crate::driver::Stopped;
 use crate::value::SkillValue;
 use crate::workspace::OutOfWorkspace;
+
+/// The work was stopped by Halt, by Reset or by the end of the program.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+#[error("stopped")]
+pub struct Stopped;
 
 /// The reason why the work of a skill is not done.
 #[derive(Debug, thiserror::Error)]

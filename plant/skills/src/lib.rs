@@ -46,16 +46,16 @@ pub use component::{
     WorldObject, YamlChange, anonymous_by_default, measure_device, read_numbers, read_partner,
     read_shape, read_user,
 };
-pub use composite::{Broken, Job, JobObserver, PickAndPlace};
+pub use composite::{Broken, Job, PickAndPlace};
 pub use configuration::{
     ComponentConfiguration, Configurable, FieldEffect, FieldError, NotConfigured,
 };
-pub use driver::{Driver, RunResults, Stopped, Work};
-pub use driver_error::{DriverError, InvalidParameter};
+pub use driver::{Driver, RunResults, Work};
+pub use driver_error::{DriverError, InvalidParameter, Stopped};
 pub use grip::{GripError, GripPoint, GripType, NoShape, PartShape};
 pub use model::NAMESPACE;
 pub use parameters::{NoTypeName, ParameterType, Parameters, SkillParameter};
-pub use part::{PartEnd, run_part};
+pub use part::{JobObserver, PartEnd, run_part};
 pub use refusal::{RefusalCode, SkillRefusal};
 pub use runs::{COMPOSITE_HALT_TIMEOUT, LocalRun, RunnableSkill, SkillFault};
 pub use shown::{

@@ -4,12 +4,71 @@ use std::future::Future;
 use std::pin::{Pin, pin};
 use std::time::Duration;
 
+use async_trait::async_trait;
 use tokio::time::timeout;
+use tracing::{debug, warn};
 
-use crate::composite::JobObserver;
+use crate::driver::Work;
 use crate::runs::{RunnableSkill, SkillFault, goes_on};
 use crate::shown::RunOutcome;
 use crate::value::SkillValue;
+
+/// Receives the steps of a job, and can stop it.
+#[async_trait]
+pub trait JobObserver: Send + Sync {
+    /// Reports the start of a step.
+    async fn step(&self, step: &'static str);
+
+    /// Reports the end of a part of the step.
+    async fn did(&self, what: &str) {
+        debug!("{what}");
+    }
+
+    /// Reports the reason why the work has not ended after it was halted.
+    async fn pending(&self, why: &str) {
+        debug!("{why}");
+    }
+
+    /// Reports that the end of a part is unknown: the skill is not started again before a Reset.
+    async fn unknown(&self, why: &str) {
+        warn!("{why}");
+    }
+
+    /// Completes when the job is to be stopped.
+    async fn stopped(&self) {
+        std::future::pending().await
+    }
+}
+
+#[async_trait]
+impl JobObserver for Work {
+    async fn step(&self, step: &'static str) {
+        Self::step(self, step).await;
+    }
+
+    async fn did(&self, what: &str) {
+        self.note(what).await;
+    }
+
+    async fn pending(&self, why: &str) {
+        Self::pending(self, why).await;
+    }
+
+    async fn unknown(&self, why: &str) {
+        Self::unknown(self, why).await;
+    }
+
+    async fn stopped(&self) {
+        Self::stopped(self).await;
+    }
+}
+
+#[async_trait]
+impl<F: Fn(&'static str) + Send + Sync> JobObserver for F {
+    async fn step(&self, step: &'static str) {
+        self(step);
+    }
+}
 
 /// The end of a part.
 #[derive(Debug)]

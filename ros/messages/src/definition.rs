@@ -5,8 +5,10 @@ use std::collections::BTreeSet;
 use uadp::BuiltinType;
 
 use crate::name::is_identifier;
-use crate::resolve::MOST_FIELDS;
 use crate::{DefinitionError, Dialect, TypeName};
+
+/// Maximum number of fields of a message.
+pub(crate) const MOST_FIELDS: usize = 4096;
 
 /// A type that is not a message.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -8,12 +8,11 @@ use md5::{Digest, Md5};
 use uadp::BuiltinType;
 
 use crate::definition::{
-    Arity, ClockType, Constant, FieldType, MessageDefinition, Number, Primitive,
+    Arity, ClockType, Constant, FieldType, MOST_FIELDS, MessageDefinition, Number, Primitive,
 };
 use crate::{ArrayRank, DefinitionError, Dialect, Leaf, MessageType, TypeName};
 
 const DEEPEST: usize = 32;
-pub(crate) const MOST_FIELDS: usize = 4096;
 const BIGGEST: usize = 64 << 20;
 
 /// A message with its nested messages, as the plan compiler traverses it.

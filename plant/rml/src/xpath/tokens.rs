@@ -1,6 +1,6 @@
 //! The tokens of an expression (XPath 1.0, 3.7).
 
-use super::parse::XPathSyntaxFault;
+use super::fault::{TokenFault, XPathSyntaxFault};
 
 /// A token with the position of its first character, from 1.
 #[derive(Debug, Clone, PartialEq)]
@@ -24,23 +24,6 @@ const SYMBOLS: [&str; 21] = [
     "::", "//", "..", "!=", "<=", ">=", "(", ")", "[", "]", "@", ",", "/", "|", "+", "-", "=", "<",
     ">", ".", "$",
 ];
-
-/// A part of an expression that is no token.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-pub(crate) enum TokenFault {
-    #[error("the text has no closing {0}")]
-    Unclosed(char),
-    #[error("`{0}` is not a number")]
-    Number(String),
-    #[error("variables are not supported; write the value")]
-    Variable,
-    #[error("unexpected character `{0}`")]
-    Character(char),
-    #[error("an operator is missing before `{0}`")]
-    NoOperator(String),
-    #[error("no name follows the prefix `{0}`")]
-    NoLocalName(String),
-}
 
 /// Splits an expression into tokens.
 pub(super) fn tokens(text: &str) -> Result<Vec<XpathToken>, XPathSyntaxFault> {
