@@ -6,7 +6,6 @@ use std::sync::Arc;
 use crate::code::Code;
 use crate::diagnostic::{Diagnostic, Severity, Span};
 use crate::key_text::without_keys;
-use crate::read::short;
 use crate::secret;
 use crate::topic::SpaceId;
 use crate::tree::TextSpan;
@@ -292,4 +291,13 @@ impl Note<'_> {
         }
         self
     }
+}
+
+/// Returns at most 64 characters of a text from a document.
+pub(crate) fn short(text: &str) -> String {
+    let mut short: String = text.chars().take(64).collect();
+    if short.len() < text.len() {
+        short.push_str("...");
+    }
+    short
 }

@@ -7,6 +7,7 @@ use std::rc::Rc;
 use schemars::{JsonSchema, Schema, SchemaGenerator};
 
 use crate::code::Code;
+pub(crate) use crate::findings::short;
 use crate::findings::{MappingFindings, Note};
 use crate::tree::{TextSpan, YamlKind, YamlNode};
 use documents::nearest;
@@ -293,15 +294,6 @@ pub(crate) fn help_octal(note: Note<'_>, text: &str) {
             short(plain)
         ));
     }
-}
-
-/// Returns at most 64 characters of a text from a document.
-pub(crate) fn short(text: &str) -> String {
-    let mut short: String = text.chars().take(64).collect();
-    if short.len() < text.len() {
-        short.push_str("...");
-    }
-    short
 }
 
 /// Returns the name of a field that may be a keyword of Rust too.

@@ -92,8 +92,8 @@ pub use announcer::{
     DueAnnouncement, Included,
 };
 pub use configuration::{
-    DataSetReaderDataType, DataSetWriterDataType, KeyValuePair, PubSubConnectionDataType,
-    PubSubGroupDataType, ReaderGroupDataType, WriterGroupDataType,
+    DataSetReaderDataType, DataSetWriterDataType, PubSubConnectionDataType, PubSubGroupDataType,
+    ReaderGroupDataType, WriterGroupDataType,
 };
 pub use endpoint::{
     ApplicationDescription, ApplicationType, EndpointDescription, MessageSecurityMode,
@@ -102,7 +102,7 @@ pub use endpoint::{
 pub use list::{ListIter, WireArray};
 pub use meta_data::{
     DataSetMetaDataType, DataTypeSchemaHeader, EnumDefinition, EnumDescription, EnumField,
-    FieldMetaData, SimpleTypeDescription, StructureDefinition, StructureDescription,
+    FieldMetaData, KeyValuePair, SimpleTypeDescription, StructureDefinition, StructureDescription,
     StructureField, StructureType, VersionMatch,
 };
 pub use probe::Probe;

@@ -7,7 +7,6 @@ use opcua::types::NodeId;
 use trust::Fingerprint;
 
 use crate::records::GdsRecord;
-use crate::service::OWN;
 
 /// The applicants, oldest first. The oldest are dropped if there are too many; they can register
 /// again.
@@ -37,4 +36,6 @@ impl Applicants {
     }
 }
 
+/// The namespace of the server itself.
+pub(crate) const OWN: u16 = 1;
 const MOST: usize = 200;

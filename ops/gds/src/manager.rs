@@ -13,11 +13,12 @@ use trust::{
     TrustedCertificates,
 };
 
+use crate::applicants::OWN;
 use crate::invitations::{self, Invitations, Shows};
 use crate::kept;
 use crate::records::GdsRecord;
 use crate::requests::{self, NewRequest, RequestState, SigningRequest, SigningRequests};
-use crate::service::{CallerStanding, Gds, MethodResult, OWN, now, number, refused, texts, time};
+use crate::service::{CallerStanding, Gds, MethodResult, now, number, refused, texts, time};
 use crate::store::{new_key, pem_of};
 
 /// StartSigningRequest: stores the request and returns the RequestId.

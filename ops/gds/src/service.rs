@@ -19,7 +19,7 @@ use plant_opcua::users::{UserAccess, UserRole};
 use tracing::{info, warn};
 use trust::{Certificate, Fingerprint};
 
-use crate::applicants::Applicants;
+use crate::applicants::{Applicants, OWN};
 use crate::records::{GdsRecord, RecordFault, Records};
 use crate::store::{AuthorityStore, AuthorityStoreFault};
 
@@ -292,8 +292,6 @@ pub(crate) fn texts(argument: &Variant) -> Vec<String> {
     .collect()
 }
 
-/// The namespace of the server itself.
-pub(crate) const OWN: u16 = 1;
 /// Ticks of 100 ns in a second.
 const TICKS: i64 = 10_000_000;
 /// Ticks from 1601 to 1970.

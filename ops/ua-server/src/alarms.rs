@@ -49,7 +49,6 @@ use self::condition::{AlarmCondition, EventStamp, Levels, ReportEffect, SourceRe
 use self::diagnostics::StatusLevels;
 use self::event::{ConditionEvent, ConditionIdentity, ConditionType};
 pub(crate) use self::methods::permissions;
-pub(crate) use self::past::MOST_RETURNED as MOST_EVENTS_RETURNED;
 use self::past::PastEvents;
 use self::publishers::Publishers;
 use self::report::ConditionReports;

@@ -47,9 +47,9 @@ pub(crate) fn server(
     let host = url.advertised_host();
     let mut builder = ServerBuilder::new()
         .without_node_managers()
-        .application_name(APPLICATION_NAME)
+        .application_name(identity::APPLICATION_NAME)
         .application_uri(described.application_uri.as_str())
-        .product_uri(PRODUCT_URI)
+        .product_uri(identity::PRODUCT_URI)
         .build_info(identity::build_info())
         .diagnostics_enabled(true)
         .discovery_urls(vec![url.advertised(port)])
@@ -232,8 +232,6 @@ fn io_fault(error: std::io::Error) -> Failure {
     Failure::new(FailureKind::Io, error.to_string())
 }
 
-pub(crate) const APPLICATION_NAME: &str = "UA bridge server";
-pub(crate) const PRODUCT_URI: &str = "urn:ua-bridge:server";
 /// Largest number of history continuation points of a session.
 const MOST_HISTORY_GOES_ON: usize = 100;
 /// Largest number of histories of events in a request. Only two nodes have one.

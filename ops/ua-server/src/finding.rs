@@ -16,7 +16,7 @@ use tokio::time::{Interval, MissedTickBehavior, interval};
 use tracing::{info, warn};
 
 use self::places::{FreeNumbers, ServerNumbers};
-use crate::endpoint::PRODUCT_URI;
+use crate::identity::PRODUCT_URI;
 
 /// A server with a number in the space.
 #[derive(Debug, Clone, PartialEq, Eq)]

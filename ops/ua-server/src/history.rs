@@ -20,7 +20,6 @@ use opcua::types::{
 use self::aggregate::{Aggregate, AggregateRules, IntervalOutcome, PastValue, Quality};
 pub(crate) use self::past::Past;
 pub(crate) use self::store::{HistoryFile, StoredConditions, StoredValue};
-use crate::alarms::MOST_EVENTS_RETURNED;
 use crate::budget::{LARGEST, SMALL};
 use crate::layout::TopicNode;
 use crate::value;
@@ -685,6 +684,9 @@ const MOST_VALUES: usize = 10_000;
 const MOST_INTERVALS: u64 = 10_000;
 /// Largest size of the values in a response, in bytes.
 const MOST_WEIGHT: usize = 16 << 20;
+
+/// Largest number of events in a response.
+pub(crate) const MOST_EVENTS_RETURNED: usize = 1_000;
 
 #[cfg(test)]
 mod tests;

@@ -9,8 +9,12 @@ use opcua::types::{
     UAString, VariableTypeId, Variant,
 };
 
-use crate::endpoint::{APPLICATION_NAME, PRODUCT_URI};
 use crate::value;
+
+/// The ApplicationName of the server.
+pub(crate) const APPLICATION_NAME: &str = "UA bridge server";
+/// The ProductUri of the server.
+pub(crate) const PRODUCT_URI: &str = "urn:ua-bridge:server";
 
 /// Returns the BuildInfo of the program.
 pub(crate) fn build_info() -> BuildInfo {

@@ -21,7 +21,7 @@ use tokio::time::{Instant, sleep, sleep_until};
 
 use self::template::{Template, plain};
 use crate::http::HttpFault;
-use crate::sensors::ticks;
+use crate::measuring::ticks;
 
 /// A value at a JSON pointer (RFC 6901) and the values that it is compared with.
 #[derive(Debug, Clone, PartialEq)]

@@ -30,8 +30,8 @@ use self::look::Look;
 use self::mover::ConnectedMover;
 pub use self::volts::{ChangerReading, InvalidVoltage, LEVELS, VoltageDetector, volts};
 use crate::line::ModbusLine;
+use crate::measuring::{ticks, value};
 use crate::modbus::Modbus;
-use crate::sensors::{ticks, value};
 
 /// The installation of the changer.
 #[derive(Debug, Clone, PartialEq)]

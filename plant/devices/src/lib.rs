@@ -15,6 +15,7 @@ mod http_skill;
 pub mod kelvin;
 mod kinds;
 mod line;
+mod measuring;
 mod modbus;
 pub mod module;
 pub mod robotiq;

@@ -16,8 +16,8 @@ use skills::{
 use tokio::time::{Instant, sleep};
 
 use crate::line::ModbusLine;
+use crate::measuring::{ticks, value};
 use crate::modbus::{Modbus, ModbusFault};
-use crate::sensors::{ticks, value};
 
 /// Address of the command registers: action, reserved; reserved, position; speed, force.
 pub const ACTION: u16 = 0x03E8;

@@ -20,7 +20,7 @@ use skills::{
 use tokio::time::{Instant, sleep};
 
 use crate::http::{DeviceHost, DeviceRequest, HttpFault};
-use crate::sensors::{ticks, value};
+use crate::measuring::{ticks, value};
 
 /// A gripper.
 #[derive(Debug, Clone)]

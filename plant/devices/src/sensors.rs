@@ -6,36 +6,14 @@ use std::time::Duration;
 
 use async_trait::async_trait;
 use skills::yaml::{DocumentNode, YamlFindingCode, YamlReader};
-use skills::{Builtin, DeviceValue, Measured, SensorRead, SkillValue, ValueSensor, ValueShape};
-use tokio::time::{Interval, MissedTickBehavior, interval};
+use skills::{Builtin, Measured, SensorRead, SkillValue, ValueSensor, ValueShape};
 
 use crate::http_skill;
 use crate::kinds::{read_address, read_alias, read_line, read_register, read_unit};
 use crate::line::ModbusLine;
+use crate::measuring::ticks;
 use crate::modbus::Modbus;
 use crate::schmalz::IoLinkPort;
-
-/// Returns the description of a scalar value without a unit and a range.
-pub(crate) const fn value(
-    name: &'static str,
-    builtin: Builtin,
-    about: &'static str,
-) -> DeviceValue {
-    DeviceValue {
-        name,
-        shape: ValueShape::scalar(builtin),
-        unit: None,
-        range: None,
-        about,
-    }
-}
-
-/// Returns the times of measurements. A late measurement delays the next.
-pub(crate) fn ticks(period: Duration) -> Interval {
-    let mut ticks = interval(period);
-    ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
-    ticks
-}
 
 /// A register of a Modbus device.
 #[derive(Debug)]

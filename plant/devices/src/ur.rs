@@ -35,8 +35,8 @@ use self::rtde::Rtde;
 pub use self::rtde::RtdeError;
 use self::state::{INPUTS, OUTPUTS, PAUSED, STOPPED, UnfitRobot, UrState};
 use self::wire::RecipeValue;
+use crate::measuring::value;
 use crate::modbus::connected;
-use crate::sensors::value;
 
 /// The port for programs.
 pub const SECONDARY: u16 = 30_002;

@@ -9,8 +9,6 @@ use std::task::{Context, Poll};
 use std::time::{Duration, SystemTime};
 
 use crate::key_rule::KeyRule;
-use crate::udp::{SendError, Udp};
-use crate::watch::InterfaceChange;
 
 /// Sends and receives the NetworkMessages of a PubSub connection.
 ///
@@ -260,6 +258,24 @@ impl Capacity {
     }
 }
 
+/// Reason why a datagram was not sent. The socket stays usable: the next datagram may be sent.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, thiserror::Error)]
+#[non_exhaustive]
+pub enum SendError {
+    /// The kernel's send buffer is full.
+    #[error("the send buffer is full")]
+    Busy,
+    /// The message exceeds the maximum size of a UDP datagram or Ethernet frame.
+    #[error("larger than a UDP datagram or Ethernet frame")]
+    TooBig,
+    /// There is no route, the interface is down, or a unicast peer refused the datagram.
+    #[error("the network is unreachable")]
+    Unreachable,
+    /// Another error of the system.
+    #[error("the operating system refused the datagram")]
+    Refused,
+}
+
 /// A change of the network of a carrier.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum CarrierChange {
@@ -267,59 +283,6 @@ pub enum CarrierChange {
     Lost(String),
     /// Messages are received and sent again, on this interface or broker.
     Back(String),
-}
-
-impl Carrier for Udp {
-    fn try_send(&mut self, message: &OutgoingMessage<'_>) -> Result<(), SendError> {
-        Self::try_send(self, message.bytes)
-    }
-
-    fn try_send_all(&mut self, messages: &[OutgoingMessage<'_>]) -> BTreeMap<usize, SendError> {
-        Self::try_send_all(self, messages)
-    }
-
-    fn poll_recv(
-        &mut self,
-        cx: &mut Context<'_>,
-        buffer: &mut Vec<u8>,
-    ) -> Poll<io::Result<Received>> {
-        self.poll_datagram(cx, |batch| batch.take(buffer))
-    }
-
-    fn try_recv(&mut self, buffer: &mut Vec<u8>) -> Option<io::Result<Received>> {
-        self.try_datagram(|batch| batch.take(buffer))
-    }
-
-    fn follow(&mut self) -> Option<CarrierChange> {
-        Some(match Self::follow(self)? {
-            InterfaceChange::Lost(why) => CarrierChange::Lost(why),
-            InterfaceChange::Back(interface) => CarrierChange::Back(interface.to_string()),
-        })
-    }
-
-    fn lost(&self) -> Option<String> {
-        Self::lost(self).map(str::to_owned)
-    }
-
-    fn source(&self) -> Option<SocketAddr> {
-        Some(Self::source(self))
-    }
-
-    fn interface(&self) -> String {
-        Self::interface(self)
-    }
-
-    fn senders(&self) -> Senders {
-        Senders::Addresses
-    }
-
-    fn capacity(&self) -> Capacity {
-        Self::capacity(self)
-    }
-
-    fn drop_by(&mut self, rules: Vec<KeyRule>) {
-        Self::drop_by(self, rules);
-    }
 }
 
 #[cfg(test)]

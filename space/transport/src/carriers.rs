@@ -8,9 +8,8 @@ use std::time::Duration;
 
 use crate::carrier::{
     Capacity, Carrier, CarrierChange, CarrierState, NetworkArrival, OutgoingMessage, Received,
-    Senders, Traffic,
+    SendError, Senders, Traffic,
 };
-use crate::udp::SendError;
 
 /// Decides about the messages that several carriers receive.
 pub trait CarrierRules: std::fmt::Debug + Send {

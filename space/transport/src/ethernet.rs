@@ -18,9 +18,11 @@ use tokio::io::unix::AsyncFd;
 use tracing::{debug, info};
 
 use crate::batch::{self, Batch};
-use crate::carrier::{Capacity, Carrier, CarrierChange, OutgoingMessage, Received, Senders};
+use crate::carrier::{
+    Capacity, Carrier, CarrierChange, OutgoingMessage, Received, SendError, Senders,
+};
 use crate::interface::{InterfaceError, speed};
-use crate::udp::{SEND_BUFFER, SendError, send_error};
+use crate::udp::{SEND_BUFFER, send_error};
 pub use frame::VlanTag;
 use frame::{ETHERTYPE, EthernetFrame, FrameFault, FrameHeader};
 use port::EthernetPort;

@@ -14,10 +14,12 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::task::{Context, Poll, Waker};
 use std::time::Duration;
 
-use crate::carrier::{Capacity, Carrier, CarrierChange, OutgoingMessage, Received, Senders};
+use crate::carrier::{
+    Capacity, Carrier, CarrierChange, OutgoingMessage, Received, SendError, Senders,
+};
 use crate::ethernet::{Ethernet, EthernetOptions};
 use crate::key_rule::KeyRule;
-use crate::udp::{SendError, Udp, UdpOptions};
+use crate::udp::{Udp, UdpOptions};
 
 /// The carriers of one process that exchange messages without the network.
 #[derive(Debug, Clone, Default)]

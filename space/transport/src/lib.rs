@@ -19,12 +19,12 @@ mod watch;
 
 pub use carrier::{
     BUFFER, Capacity, Carrier, CarrierChange, CarrierState, NetworkArrival, OutgoingMessage,
-    Received, Senders, Traffic,
+    Received, SendError, Senders, Traffic,
 };
 pub use carriers::{CarrierRules, Carriers, ForwardTo, Judgement, MessagePath};
 pub use ethernet::{Ethernet, EthernetError, EthernetOptions, VlanTag};
 pub use in_process::ProcessHub;
 pub use interface::{Interface, InterfaceError, interfaces};
 pub use key_rule::{ByteTest, KeyRule};
-pub use udp::{SendError, Udp, UdpOpenError, UdpOptions};
+pub use udp::{Udp, UdpOpenError, UdpOptions};
 pub use watch::{HeldInterfaces, InterfaceChange, InterfaceFinding, LOOK};

@@ -2,19 +2,11 @@
 
 use super::endpoint::{EndpointDescription, MessageSecurityMode};
 use super::list::WireArray;
-use super::meta_data::DataSetMetaDataType;
+use super::meta_data::{DataSetMetaDataType, KeyValuePair};
 use super::wire::structure;
-use crate::{ExtensionObject, QualifiedName, Variant};
+use crate::{ExtensionObject, Variant};
 
 structure! {
-    /// A property by name (OPC 10000-5, 12.21).
-    KeyValuePair<'a> {
-        /// The name.
-        key: QualifiedName<'a> = "Key",
-        /// The value.
-        value: Variant<'a> = "Value",
-    }
-
     /// A PubSubConnection (OPC 10000-14, 6.2.7.5.1).
     PubSubConnectionDataType<'a> {
         /// Unique among the connections.

@@ -1,12 +1,11 @@
 //! DataSetMetaData: names and types of the fields of a DataSet.
 
-use super::configuration::KeyValuePair;
 use super::list::WireArray;
 use super::wire::{WireStructure, enumeration, structure};
 use crate::reader::ByteReader;
 use crate::{
     BuiltinType, ConfigurationVersion, DataSetHeader, DecodeError, EncodeError, Guid,
-    LocalizedText, NodeId, QualifiedName,
+    LocalizedText, NodeId, QualifiedName, Variant,
 };
 use alloc::vec::Vec;
 
@@ -52,6 +51,14 @@ structure! {
         data_set_field_id: Guid = "DataSetFieldId",
         /// Further properties of the field, such as its engineering unit.
         properties: WireArray<'a, KeyValuePair<'a>> = "Properties",
+    }
+
+    /// A property by name (OPC 10000-5, 12.21).
+    KeyValuePair<'a> {
+        /// The name.
+        key: QualifiedName<'a> = "Key",
+        /// The value.
+        value: Variant<'a> = "Value",
     }
 
     /// Type definitions (OPC 10000-14, 6.2.3.2.2, and OPC 10000-5, 12.31).

@@ -10,7 +10,7 @@ use opcua::types::{
 };
 
 use super::event::ConditionEvent;
-use crate::history::{HistoryValue, given, steps};
+use crate::history::{HistoryValue, MOST_EVENTS_RETURNED, given, steps};
 
 /// The last events of all conditions, oldest first.
 #[derive(Default)]
@@ -41,8 +41,8 @@ impl PastEvents {
     ) {
         let most = usize::try_from(details.num_values_per_node).unwrap_or(usize::MAX);
         let most = match most {
-            0 => MOST_RETURNED,
-            most => most.min(MOST_RETURNED),
+            0 => MOST_EVENTS_RETURNED,
+            most => most.min(MOST_EVENTS_RETURNED),
         };
         let fields = details.filter.select_clauses.as_ref().map_or(0, Vec::len);
         let most = most.min((MOST_FIELDS / fields.max(1)).max(1));
@@ -130,7 +130,5 @@ impl PastEvents {
 
 /// Largest number of stored events.
 const MOST_EVENTS: usize = 5_000;
-/// Largest number of events in a response.
-pub(crate) const MOST_RETURNED: usize = 1_000;
 /// Largest number of fields of all events in a response.
 const MOST_FIELDS: usize = 50_000;

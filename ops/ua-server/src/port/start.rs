@@ -33,6 +33,7 @@ use crate::browse::Ordered;
 use crate::components::Components;
 use crate::endpoint;
 use crate::history::{self, HistoryFile, StoredValue};
+use crate::identity;
 use crate::layout::{Layout, LayoutError};
 use crate::methods::Methods;
 use crate::nodes::{ClientWrite, Exits, SpaceManager, SpaceNodes, look_again};
@@ -321,7 +322,7 @@ pub(super) fn told_of(
     let capabilities = ["DA", "HD"].into_iter().chain(redundancy);
     let server = discovery::ServerDescription {
         application_uri: described.application_uri.clone(),
-        product_uri: endpoint::PRODUCT_URI.to_owned(),
+        product_uri: identity::PRODUCT_URI.to_owned(),
         name: "ua-server".to_owned(),
         url,
         capabilities: capabilities.map(str::to_owned).collect(),

@@ -15,7 +15,6 @@ use opcua::types::{
 use plant_opcua::server::{StateRef, TransitionEvent};
 use program::{ProgramMachineState, ProgramMethod, Transition};
 
-use super::run::{NEVER_RAN, SUCCEEDED, whole};
 use crate::address;
 use crate::argument_types::ArgumentTypes;
 use crate::nodes::SpaceManager;
@@ -538,3 +537,22 @@ const EXECUTING: i32 = 2;
 /// Severities from 1 to 1000 (OPC 10000-5, 6.4.2).
 const USUAL: u16 = 100;
 const FAILED: u16 = 400;
+
+/// Converts an integer of any width.
+pub(super) fn whole(value: &Variant) -> Option<i64> {
+    if let Variant::SByte(number) = value {
+        Some((*number).into())
+    } else if let Variant::Byte(number) = value {
+        Some((*number).into())
+    } else if let Variant::Int16(number) = value {
+        Some((*number).into())
+    } else if let Variant::Int32(number) = value {
+        Some((*number).into())
+    } else {
+        None
+    }
+}
+
+/// Statuses of `action_msgs/GoalStatus`; `NEVER_RAN` marks goals that were not executed.
+pub(super) const SUCCEEDED: i64 = 4;
+pub(super) const NEVER_RAN: i64 = -1;

@@ -13,7 +13,7 @@ use tokio::time::{Instant, sleep, timeout};
 use tracing::{info, warn};
 use uadp::Fields;
 
-use super::nodes::{GoalOutcome, ProgramNodes};
+use super::nodes::{GoalOutcome, ProgramNodes, SUCCEEDED, whole};
 use super::unknown::UnknownOutcomes;
 use crate::asking::{CallFailure, Callable, Drive, Questions};
 use crate::value;
@@ -531,21 +531,6 @@ fn in_terms_of_start(refused: CallFailure) -> CallFailure {
     }
 }
 
-/// Converts an integer of any width.
-pub(super) fn whole(value: &Variant) -> Option<i64> {
-    if let Variant::SByte(number) = value {
-        Some((*number).into())
-    } else if let Variant::Byte(number) = value {
-        Some((*number).into())
-    } else if let Variant::Int16(number) = value {
-        Some((*number).into())
-    } else if let Variant::Int32(number) = value {
-        Some((*number).into())
-    } else {
-        None
-    }
-}
-
 const NOT_NOW_AND_NEVER: CallFailure = CallFailure::Status(StatusCode::BadNotSupported);
 const PENDING: &str = "cancellation pending: the goal has not ended";
 pub(super) const GONE: &str =
@@ -553,9 +538,6 @@ pub(super) const GONE: &str =
 const BEFORE_RESTART: &str =
     "the outcome of the last goal before the restart is unknown, the goal may go on";
 pub(super) const ENDS: &str = "the server ends: the outcome is unknown, the goal may go on";
-/// Statuses of `action_msgs/GoalStatus`; `NEVER_RAN` marks goals that were not executed.
-pub(super) const SUCCEEDED: i64 = 4;
-pub(super) const NEVER_RAN: i64 = -1;
 const UNKNOWN: i64 = 0;
 /// ERROR_NONE and ERROR_REJECTED of `action_msgs/CancelGoal`.
 const AGREED: i64 = 0;

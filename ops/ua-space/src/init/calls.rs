@@ -5,7 +5,7 @@ use std::ops::Range;
 
 use mappings::{CallKind, ExecutedBy, Mapping, NodeIdText, ServiceRole, SpaceId, TopicId};
 
-use super::known::OldMapping;
+use super::known::{OldMapping, UNTYPED};
 use super::topics::camel;
 use super::yaml::{comment, scalar, wrapped};
 use crate::survey::model::{ModelCall, NodeModel};
@@ -290,8 +290,6 @@ fn entry(call: &CallEntry, indent: &str, lines: &mut Vec<String>) {
     });
 }
 
-/// The end of the heading of services without a type.
-pub(super) const UNTYPED: &str = "whose type nobody tells, or several differ";
 /// Services with which nodes are administered.
 const EACH_NODE: [&str; 10] = [
     "describe_parameters",

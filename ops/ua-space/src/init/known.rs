@@ -5,7 +5,6 @@ use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet};
 use mappings::{Mapping, NodeIdText, SpaceId, TopicId};
 use messages::TypeName;
 
-use super::calls::UNTYPED;
 use super::nodes::is_same;
 use super::topics::OmittedTopic;
 use super::yaml;
@@ -326,3 +325,6 @@ fn source_in(comment: &str) -> Option<(String, String)> {
     let node = node.trim_end().strip_suffix('}')?;
     Some((server.to_owned(), node.to_owned()))
 }
+
+/// The end of the heading of services without a type.
+pub(super) const UNTYPED: &str = "whose type nobody tells, or several differ";

@@ -7,8 +7,6 @@ use plant_opcua::client::ClientError;
 use plant_opcua::types::StatusCode;
 use skills::{DriverError, InvalidParameter, SkillValue, ValueShape};
 
-use super::handshake::StateWord;
-
 /// The reason why a node of a module cannot be read or written.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum ModuleNodeError {
@@ -139,4 +137,21 @@ fn bound(limit: Option<f64>) -> String {
 
 fn found(value: Option<&SkillValue>) -> String {
     value.map_or_else(|| "no value".to_owned(), SkillValue::to_string)
+}
+
+/// The word StateCur.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum StateWord {
+    Known(State),
+    /// A word that is no state of the standard.
+    Unknown(u32),
+}
+
+impl std::fmt::Display for StateWord {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::Known(state) => state.fmt(f),
+            Self::Unknown(word) => write!(f, "the unknown state {word}"),
+        }
+    }
 }

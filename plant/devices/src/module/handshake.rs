@@ -10,7 +10,7 @@ use mtp::{ControlRole, MtpService, OpcUaNode, Procedure, ServiceParameter, Value
 use skills::{ClientOptions, SkillValue};
 use tokio::time::{Instant, sleep};
 
-use super::error::{ModuleError, ModuleNodeError};
+use super::error::{ModuleError, ModuleNodeError, StateWord};
 use super::is_equal;
 
 /// Access to the nodes of a module.
@@ -72,23 +72,6 @@ pub(super) struct Handshake<'a> {
     pub(super) service: &'a MtpService,
     pub(super) nodes: &'a dyn ModuleNodes,
     pub(super) timing: HandshakeTiming,
-}
-
-/// The word StateCur.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum StateWord {
-    Known(State),
-    /// A word that is no state of the standard.
-    Unknown(u32),
-}
-
-impl std::fmt::Display for StateWord {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        match self {
-            Self::Known(state) => state.fmt(f),
-            Self::Unknown(word) => write!(f, "the unknown state {word}"),
-        }
-    }
 }
 
 impl Handshake<'_> {

@@ -10,8 +10,8 @@ use skills::{Driver, DriverError, InvalidParameter, RunResults, SkillValue, Work
 use tokio::sync::Mutex;
 use tokio::time::{Instant, sleep};
 
-use super::error::ModuleError;
-use super::handshake::{Handshake, HandshakeTiming, ModuleNodes, StateWord};
+use super::error::{ModuleError, StateWord};
+use super::handshake::{Handshake, HandshakeTiming, ModuleNodes};
 use super::is_equal;
 
 /// The driver of a procedure.
