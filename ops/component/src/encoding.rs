@@ -3,22 +3,95 @@
 use bridge_node::{CallField, CallStructure};
 use messages::ArrayRank;
 use serde_json::Value as Json;
-use skills::{Builtin, SkillValue, ValueShape};
+use skills::{Builtin, SkillValue, ValueError, ValueShape};
 use uadp::BuiltinType;
 
 use crate::fields;
 
+/// The reason why a value is not encoded.
+#[derive(Debug, PartialEq, thiserror::Error)]
+pub(crate) enum FieldEncodeError {
+    /// The fields of the message are not known.
+    #[error("the executor does not announce its fields")]
+    NotAnnounced,
+    /// A component has no values of the type.
+    #[error("a {0:?} cannot be written in a component")]
+    Unwritable(BuiltinType),
+    /// The value has another type.
+    #[error(transparent)]
+    Value(#[from] ValueError),
+    /// An element of a list is wrong.
+    #[error("[{at}]: {error}")]
+    Element {
+        /// The index of the element.
+        at: usize,
+        /// The reason.
+        error: Box<Self>,
+    },
+    /// A field of a message is wrong.
+    #[error("{name}: {error}")]
+    Field {
+        /// The name of the field.
+        name: String,
+        /// The reason.
+        error: Box<Self>,
+    },
+    /// A message of this type is not given by its fields.
+    #[error("a map with fields of {0} is needed")]
+    NoMap(String),
+    /// The message has no such field.
+    #[error("{message} has no field `{field}`")]
+    NoField {
+        /// The type of the message.
+        message: String,
+        /// The name of the field.
+        field: String,
+    },
+    /// A field without a default value is missing.
+    #[error("it must be set")]
+    Unset,
+    /// Messages are not given as a list.
+    #[error("a list of messages is needed")]
+    NoList,
+    /// An array of fixed length has another number of values.
+    #[error("it has {length} values, and {given} are given")]
+    Length {
+        /// The length of the array.
+        length: u32,
+        /// The number of given values.
+        given: usize,
+    },
+    /// A list is too long.
+    #[error("{0} elements are too many")]
+    TooMany(usize),
+    /// A message is too large.
+    #[error("it is larger than {MOST_BYTES} bytes")]
+    TooLarge,
+}
+
+impl FieldEncodeError {
+    fn at(self, at: usize) -> Self {
+        let error = Box::new(self);
+        Self::Element { at, error }
+    }
+}
+
 /// Encodes a value as a Variant of the type of a field. `namespace` is the namespace of the call,
 /// in which the types of its structures are.
-pub(crate) fn encoded(field: &CallField, value: &Json, namespace: u16) -> Result<Vec<u8>, String> {
+pub(crate) fn encoded(
+    field: &CallField,
+    value: &Json,
+    namespace: u16,
+) -> Result<Vec<u8>, FieldEncodeError> {
     if let Some(structure) = &field.structure {
         return structures(field.rank, structure, value, namespace);
     }
     let none = || {
         if field.builtin == BuiltinType::ExtensionObject {
-            return "the executor does not announce its fields".to_owned();
+            FieldEncodeError::NotAnnounced
+        } else {
+            FieldEncodeError::Unwritable(field.builtin)
         }
-        format!("a {:?} cannot be written in a component", field.builtin)
     };
     let builtin = Builtin::of_id(u32::from(field.builtin as u8)).ok_or_else(none)?;
     let array = field.rank != ArrayRank::Scalar;
@@ -30,7 +103,7 @@ pub(crate) fn encoded(field: &CallField, value: &Json, namespace: u16) -> Result
             .collect(),
         None => typed(builtin, value),
     };
-    let value = shape.read_json(&value).map_err(|error| error.to_string())?;
+    let value = shape.read_json(&value)?;
     if let SkillValue::Array(_, elements) = &value {
         has_length(field.rank, elements.len())?;
     }
@@ -121,7 +194,7 @@ fn structures(
     structure: &CallStructure,
     value: &Json,
     namespace: u16,
-) -> Result<Vec<u8>, String> {
+) -> Result<Vec<u8>, FieldEncodeError> {
     let one = |value: &Json| {
         let body = body(structure, value)?;
         let mut object = vec![STRING_NODE];
@@ -133,7 +206,7 @@ fn structures(
             object.extend(length(bytes.len())?);
             object.extend(bytes);
         }
-        Ok::<_, String>(object)
+        Ok::<_, FieldEncodeError>(object)
     };
     let id = BuiltinType::ExtensionObject as u8;
     if rank == ArrayRank::Scalar {
@@ -143,24 +216,27 @@ fn structures(
     let mut variant = vec![id | ARRAY];
     variant.extend(length(elements.len())?);
     for (at, element) in elements.iter().enumerate() {
-        variant.extend(one(element).map_err(|why| format!("[{at}]: {why}"))?);
+        variant.extend(one(element).map_err(|error| error.at(at))?);
     }
     Ok(variant)
 }
 
 /// Encodes the fields of a message. Fields that are not given have the default values of ROS.
-fn body(structure: &CallStructure, value: &Json) -> Result<Vec<u8>, String> {
+fn body(structure: &CallStructure, value: &Json) -> Result<Vec<u8>, FieldEncodeError> {
     let empty = serde_json::Map::new();
     let given = match value {
         Json::Null => &empty,
         Json::Object(given) => given,
         Json::Bool(_) | Json::Number(_) | Json::String(_) | Json::Array(_) => {
-            return Err(format!("a map with fields of {} is needed", structure.name));
+            return Err(FieldEncodeError::NoMap(structure.name.clone()));
         }
     };
     let is_field = |name: &String| structure.fields.iter().any(|field| field.name == *name);
     if let Some(unknown) = given.keys().find(|name| !is_field(name)) {
-        return Err(format!("{} has no field `{unknown}`", structure.name));
+        return Err(FieldEncodeError::NoField {
+            message: structure.name.clone(),
+            field: unknown.clone(),
+        });
     }
     let mut body = Vec::new();
     for field in &structure.fields {
@@ -172,10 +248,13 @@ fn body(structure: &CallStructure, value: &Json) -> Result<Vec<u8>, String> {
                 Some(value) => encoded(field, value, 0).map(|variant| untagged(&variant)),
                 None => nothing(field)
                     .map(|variant| untagged(&variant))
-                    .ok_or_else(|| "it must be set".to_owned()),
+                    .ok_or(FieldEncodeError::Unset),
             },
         };
-        body.extend(bytes.map_err(|why| format!("{}: {why}", field.name))?);
+        body.extend(bytes.map_err(|error| FieldEncodeError::Field {
+            name: field.name.clone(),
+            error: Box::new(error),
+        })?);
         has_room(body.len())?;
     }
     Ok(body)
@@ -186,52 +265,50 @@ fn inline(
     rank: ArrayRank,
     structure: &CallStructure,
     value: Option<&Json>,
-) -> Result<Vec<u8>, String> {
+) -> Result<Vec<u8>, FieldEncodeError> {
     let ArrayRank::Array { fixed } = rank else {
         return body(structure, value.unwrap_or(&Json::Null));
     };
     let count = usize::try_from(fixed.unwrap_or_default()).unwrap_or(usize::MAX);
     if count > MOST_ELEMENTS {
-        return Err(format!("{count} elements are too many"));
+        return Err(FieldEncodeError::TooMany(count));
     }
     let empty = Json::Array(vec![Json::Null; count]);
     let value = value.unwrap_or(&empty);
     let elements = list(rank, value)?;
     let mut bytes = length(elements.len())?.to_vec();
     for (at, element) in elements.iter().enumerate() {
-        bytes.extend(body(structure, element).map_err(|why| format!("[{at}]: {why}"))?);
+        bytes.extend(body(structure, element).map_err(|error| error.at(at))?);
         has_room(bytes.len())?;
     }
     Ok(bytes)
 }
 
-fn list(rank: ArrayRank, value: &Json) -> Result<&Vec<Json>, String> {
-    let elements = value.as_array().ok_or("a list of messages is needed")?;
+fn list(rank: ArrayRank, value: &Json) -> Result<&Vec<Json>, FieldEncodeError> {
+    let elements = value.as_array().ok_or(FieldEncodeError::NoList)?;
     has_length(rank, elements.len())?;
     Ok(elements)
 }
 
-fn has_length(rank: ArrayRank, given: usize) -> Result<(), String> {
+fn has_length(rank: ArrayRank, given: usize) -> Result<(), FieldEncodeError> {
     match rank {
         ArrayRank::Array {
             fixed: Some(length),
-        } if u32::try_from(given) != Ok(length) => {
-            Err(format!("it has {length} values, and {given} are given"))
-        }
+        } if u32::try_from(given) != Ok(length) => Err(FieldEncodeError::Length { length, given }),
         ArrayRank::Array { .. } | ArrayRank::Scalar => Ok(()),
     }
 }
 
 /// Checks the size of a message. Arrays of fixed length in each other multiply their lengths.
-fn has_room(size: usize) -> Result<(), String> {
+fn has_room(size: usize) -> Result<(), FieldEncodeError> {
     match size <= MOST_BYTES {
         true => Ok(()),
-        false => Err(format!("it is larger than {MOST_BYTES} bytes")),
+        false => Err(FieldEncodeError::TooLarge),
     }
 }
 
-fn length(of: usize) -> Result<[u8; 4], String> {
-    let length = i32::try_from(of).map_err(|_| format!("{of} elements are too many"))?;
+fn length(of: usize) -> Result<[u8; 4], FieldEncodeError> {
+    let length = i32::try_from(of).map_err(|_| FieldEncodeError::TooMany(of))?;
     Ok(length.to_le_bytes())
 }
 
@@ -359,13 +436,16 @@ mod tests {
             structure: Some(Arc::new(outer)),
             ..CallField::scalar("goal", BuiltinType::ExtensionObject)
         };
-        let why = encoded(&field, &json!({}), 7).unwrap_err();
+        let why = encoded(&field, &json!({}), 7).unwrap_err().to_string();
         assert!(why.contains("larger than"), "{why}");
     }
 
     #[test]
     fn a_wrong_field_is_named_with_its_path() {
-        let wrong = |value: Json| encoded(&constraints(), &value, 7).unwrap_err();
+        let wrong = |value: Json| {
+            let error = encoded(&constraints(), &value, 7).unwrap_err();
+            error.to_string()
+        };
         assert_eq!(
             wrong(json!([{}, {"way": [{"z": 1}]}])),
             "[1]: way: [0]: geometry_msgs/Point has no field `z`"
@@ -375,7 +455,7 @@ mod tests {
         assert!(why.starts_with("[0]: weight: "), "{why}");
         let unknown = CallField::array("poses", BuiltinType::ExtensionObject);
         assert_eq!(
-            encoded(&unknown, &json!([{}]), 7).unwrap_err(),
+            encoded(&unknown, &json!([{}]), 7).unwrap_err().to_string(),
             "the executor does not announce its fields"
         );
     }

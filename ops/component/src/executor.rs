@@ -4,10 +4,11 @@ use std::sync::Arc;
 
 use program::ProgramMethod;
 use skills::{
-    MirroredSkill, RunOutcome, Skill, SkillDescription, SkillOwner, SkillSnapshot, SkillValue,
+    MirroredSkill, RunOutcome, Skill, SkillDescription, SkillFault, SkillOwner, SkillRefusal,
+    SkillSnapshot, SkillValue,
 };
 
-use crate::fields;
+use crate::fields::{self, FieldValueError};
 
 /// An executable skill. Clones refer to the same skill.
 #[derive(Debug, Clone)]
@@ -44,10 +45,14 @@ impl SkillExecutor {
     /// Calls a method and returns the number of the latest run.
     ///
     /// # Errors
-    /// Returns the name of a StatusCode and the reason as text for the operator.
-    pub(crate) async fn call(&self, by: SkillOwner, method: ProgramMethod) -> Result<u32, String> {
+    /// The skill refuses the method, or its component is lost.
+    pub(crate) async fn call(
+        &self,
+        by: SkillOwner,
+        method: ProgramMethod,
+    ) -> Result<u32, SkillRequestError> {
         match self {
-            Self::Own(skill) => skill.call(by, method).await.map_err(|why| why.to_string()),
+            Self::Own(skill) => Ok(skill.call(by, method).await?),
             Self::Theirs(mirror) => theirs(mirror, method, Vec::new()).await,
         }
     }
@@ -60,12 +65,9 @@ impl SkillExecutor {
         &self,
         by: SkillOwner,
         parameters: Vec<(String, SkillValue)>,
-    ) -> Result<u32, String> {
+    ) -> Result<u32, SkillRequestError> {
         match self {
-            Self::Own(skill) => {
-                let started = skill.start_with(by, parameters).await;
-                started.map_err(|why| why.to_string())
-            }
+            Self::Own(skill) => Ok(skill.start_with(by, parameters).await?),
             Self::Theirs(mirror) => theirs(mirror, ProgramMethod::Start, parameters).await,
         }
     }
@@ -80,7 +82,7 @@ impl SkillExecutor {
         let answer = match method {
             ProgramMethod::Start => match self.parameters(request) {
                 Ok(parameters) => self.start_with(by, parameters).await,
-                Err(why) => Err(format!("BadInvalidArgument: {why}")),
+                Err(error) => Err(error),
             },
             ProgramMethod::Suspend
             | ProgramMethod::Resume
@@ -89,24 +91,28 @@ impl SkillExecutor {
         };
         match answer {
             Ok(run) => [true.into(), "".into(), run.into()],
-            Err(message) => [false.into(), message.into(), self.shown().run.into()],
+            Err(error) => [
+                false.into(),
+                error.to_string().into(),
+                self.shown().run.into(),
+            ],
         }
     }
 
     /// Decodes the parameters of a request: a field for each parameter of the type, in its order,
     /// or no field at all. Null fields are not set.
-    fn parameters(&self, request: &[u8]) -> Result<Vec<(String, SkillValue)>, String> {
+    fn parameters(&self, request: &[u8]) -> Result<Vec<(String, SkillValue)>, SkillRequestError> {
         let values = fields::values(request)?;
         let declared = &self.facts().parameters;
         if values.is_empty() {
             return Ok(Vec::new());
         }
         if values.len() != declared.len() {
-            return Err(format!(
-                "the request has {} fields, and the skill {} parameters",
-                values.len(),
-                declared.len()
-            ));
+            return Err(SkillRequestError::Count {
+                of: "request",
+                given: values.len(),
+                declared: declared.len(),
+            });
         }
         let given = declared.iter().zip(values);
         Ok(given
@@ -119,7 +125,43 @@ async fn theirs(
     mirror: &MirroredSkill,
     method: ProgramMethod,
     parameters: Vec<(String, SkillValue)>,
-) -> Result<u32, String> {
-    let called = mirror.call(method, parameters).await;
-    called.map_err(|fault| fault.to_string())
+) -> Result<u32, SkillRequestError> {
+    Ok(mirror.call(method, parameters).await?)
+}
+
+/// The reason why a request to a skill is not executed. Its text starts with the name of a
+/// StatusCode if the skill refuses the request.
+#[derive(Debug, thiserror::Error)]
+pub(crate) enum SkillRequestError {
+    /// A skill of this component refuses the method.
+    #[error(transparent)]
+    Refused(#[from] SkillRefusal),
+    /// A skill of another component does not execute the method.
+    #[error(transparent)]
+    Theirs(#[from] SkillFault),
+    /// A field is no parameter of a skill.
+    #[error("BadInvalidArgument: {0}")]
+    Field(#[from] FieldValueError),
+    /// The request or goal has another number of fields than the skill has parameters.
+    #[error("BadInvalidArgument: the {of} has {given} fields, and the skill {declared} parameters")]
+    Count {
+        /// The kind of request, as `goal`.
+        of: &'static str,
+        /// The number of fields.
+        given: usize,
+        /// The number of parameters.
+        declared: usize,
+    },
+    /// The outcome of this run is unknown.
+    #[error("BadInvalidState: the outcome of run {0} is unknown; Reset makes the skill ready")]
+    NeedsReset(u32),
+    /// The goal was cancelled.
+    #[error("the goal was cancelled before its run began")]
+    Cancelled,
+    /// The goal arrived after its deadline.
+    #[error("the goal came too late, so no run was started")]
+    Late,
+    /// The program stops.
+    #[error("the component ends")]
+    Ends,
 }

@@ -3,7 +3,7 @@
 
 use messages::ArrayRank;
 use skills::{Builtin, SkillValue, ValueShape};
-use uadp::{BuiltinType, Fields, Scalar, Variant};
+use uadp::{BuiltinType, DecodeError, Fields, Scalar, Variant};
 
 /// Encodes a block of values.
 pub(crate) fn block(values: &[SkillValue]) -> Vec<u8> {
@@ -26,15 +26,29 @@ pub(crate) fn no_value(status: u32) -> Vec<u8> {
     out
 }
 
+/// The reason why a field is no value of a skill.
+#[derive(Debug, PartialEq, thiserror::Error)]
+pub(crate) enum FieldValueError {
+    /// The bytes are malformed.
+    #[error(transparent)]
+    Encoding(#[from] DecodeError),
+    /// A skill has no values of the type.
+    #[error("{0:?} is nothing that a skill is told")]
+    Scalar(BuiltinType),
+    /// A skill has no arrays of the type.
+    #[error("an array of {0:?} is nothing that a skill is told")]
+    Array(BuiltinType),
+    /// A skill has no arrays of several dimensions.
+    #[error("an array of several dimensions is nothing that a skill is told")]
+    Matrix,
+}
+
 /// Decodes the values of a block; `None` for a null value.
 ///
 /// # Errors
-/// Returns the unsupported type or the encoding error, as text for the operator.
-pub(crate) fn values(block: &[u8]) -> Result<Vec<Option<SkillValue>>, String> {
-    let fields = Fields::parse(block).map_err(|error| error.to_string())?;
-    fields
-        .map(|field| value(&field.map_err(|error| error.to_string())?))
-        .collect()
+/// The encoding is malformed, or a type is not supported.
+pub(crate) fn values(block: &[u8]) -> Result<Vec<Option<SkillValue>>, FieldValueError> {
+    Fields::parse(block)?.map(|field| value(&field?)).collect()
 }
 
 /// Returns the type of a field.
@@ -107,25 +121,18 @@ fn length(of: usize, out: &mut Vec<u8>) {
 ///
 /// # Errors
 /// Returns the errors of [`values`].
-pub(crate) fn value(field: &Variant<'_>) -> Result<Option<SkillValue>, String> {
+pub(crate) fn value(field: &Variant<'_>) -> Result<Option<SkillValue>, FieldValueError> {
     match field {
         Variant::Null => Ok(None),
         Variant::Scalar(scalar) => single(scalar).map(Some),
         Variant::Array(array) => {
             let of = Builtin::of_id(u32::from(array.element() as u8));
-            let of = of.ok_or_else(|| {
-                format!(
-                    "an array of {:?} is nothing that a skill is told",
-                    array.element()
-                )
-            })?;
-            let elements: Result<Vec<SkillValue>, String> =
+            let of = of.ok_or_else(|| FieldValueError::Array(array.element()))?;
+            let elements: Result<Vec<SkillValue>, _> =
                 array.iter().map(|element| single(&element)).collect();
             Ok(Some(SkillValue::Array(of, elements?)))
         }
-        Variant::Matrix(_) => {
-            Err("an array of several dimensions is nothing that a skill is told".to_owned())
-        }
+        Variant::Matrix(_) => Err(FieldValueError::Matrix),
     }
 }
 
@@ -133,7 +140,7 @@ pub(crate) fn value(field: &Variant<'_>) -> Result<Option<SkillValue>, String> {
     clippy::wildcard_enum_match_arm,
     reason = "of the types of the space those that a skill can be told in are named"
 )]
-fn single(scalar: &Scalar<'_>) -> Result<SkillValue, String> {
+fn single(scalar: &Scalar<'_>) -> Result<SkillValue, FieldValueError> {
     Ok(match scalar {
         Scalar::Boolean(value) => SkillValue::Boolean(*value),
         Scalar::SByte(value) => SkillValue::SByte(*value),
@@ -147,12 +154,7 @@ fn single(scalar: &Scalar<'_>) -> Result<SkillValue, String> {
         Scalar::Float(value) => SkillValue::Float(*value),
         Scalar::Double(value) => SkillValue::Double(*value),
         Scalar::String(text) => SkillValue::String(text.unwrap_or_default().to_owned()),
-        other => {
-            return Err(format!(
-                "{:?} is nothing that a skill is told",
-                other.builtin_type()
-            ));
-        }
+        other => return Err(FieldValueError::Scalar(other.builtin_type())),
     })
 }
 
@@ -192,6 +194,7 @@ mod tests {
         assert!(
             values(&[1, 0, 19, 0, 0, 0, 0])
                 .unwrap_err()
+                .to_string()
                 .contains("StatusCode")
         );
         assert!(values(&[1]).is_err());

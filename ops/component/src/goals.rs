@@ -25,7 +25,7 @@ use tokio::task::JoinHandle;
 use tokio::time::{Instant, sleep_until};
 
 use crate::definition;
-use crate::executor::SkillExecutor;
+use crate::executor::{SkillExecutor, SkillRequestError};
 use crate::fields;
 
 /// Returns the action of a skill. The first part of the tuple is the name of the component.
@@ -176,11 +176,11 @@ impl GraphActionClient for Doer {
         let begun = tokio::spawn(async move {
             if lock(&doing).beginning.get(&id) == Some(&true) {
                 lock(&doing).begun(id);
-                return Err("the goal was cancelled before its run began".to_owned());
+                return Err(SkillRequestError::Cancelled);
             }
             if now().monotonic > start_by {
                 lock(&doing).begun(id);
-                return Err("the goal came too late, so no run was started".to_owned());
+                return Err(SkillRequestError::Late);
             }
             let run = begin(&skill, &body).await;
             let cancelled = {
@@ -269,18 +269,13 @@ impl GraphActionClient for Doer {
 }
 
 /// Starts a run and returns its number.
-async fn begin(skill: &SkillExecutor, body: &[u8]) -> Result<u32, String> {
-    let given =
-        parameters(skill.facts(), body).map_err(|why| format!("BadInvalidArgument: {why}"))?;
+async fn begin(skill: &SkillExecutor, body: &[u8]) -> Result<u32, SkillRequestError> {
+    let given = parameters(skill.facts(), body)?;
     // The parameters are checked before the machine moves; Start checks them again.
-    let complete = Parameters::complete(&skill.facts().parameters, given.clone());
-    complete.map_err(|refusal| refusal.to_string())?;
+    Parameters::complete(&skill.facts().parameters, given.clone())?;
     let shown = skill.shown();
     if shown.needs_reset {
-        return Err(format!(
-            "BadInvalidState: the outcome of run {} is unknown; Reset makes the skill ready",
-            shown.run
-        ));
+        return Err(SkillRequestError::NeedsReset(shown.run));
     }
     if shown.state == ProgramMachineState::Halted {
         skill.call(OWNER, ProgramMethod::Reset).await?;
@@ -290,15 +285,18 @@ async fn begin(skill: &SkillExecutor, body: &[u8]) -> Result<u32, String> {
 
 /// Decodes the parameters of a goal. Null values are not set. Zero or empty values of parameters
 /// with a default are not set either, because all fields of a ROS message have a value.
-fn parameters(facts: &SkillDescription, body: &[u8]) -> Result<Vec<(String, SkillValue)>, String> {
+fn parameters(
+    facts: &SkillDescription,
+    body: &[u8],
+) -> Result<Vec<(String, SkillValue)>, SkillRequestError> {
     let values = fields::values(body)?;
     let declared = &facts.parameters;
     if values.len() > declared.len() {
-        return Err(format!(
-            "the goal has {} fields, and the skill {} parameters",
-            values.len(),
-            declared.len()
-        ));
+        return Err(SkillRequestError::Count {
+            of: "goal",
+            given: values.len(),
+            declared: declared.len(),
+        });
     }
     let given = declared.iter().zip(values);
     let given = given.filter_map(|(parameter, value)| {
@@ -327,7 +325,7 @@ pub(crate) struct SentSkillGoal {
 
 #[derive(Debug)]
 enum Stage {
-    Begins(JoinHandle<Result<u32, String>>),
+    Begins(JoinHandle<Result<u32, SkillRequestError>>),
     Runs(u32),
     /// The run has ended; the end is reported at this time.
     Cancelled(Arc<RunOutcome>, Instant),
@@ -343,7 +341,7 @@ impl SentGoal for SentSkillGoal {
             match &mut self.stage {
                 Stage::Begins(begun) => {
                     let begun = begun.await;
-                    self.begun(begun.unwrap_or_else(|_| Err("the component ends".to_owned())));
+                    self.begun(begun.unwrap_or(Err(SkillRequestError::Ends)));
                 }
                 Stage::Runs(run) => {
                     let run = *run;
@@ -378,7 +376,7 @@ async fn at(time: Option<Instant>) {
 }
 
 impl SentSkillGoal {
-    fn begun(&mut self, begun: Result<u32, String>) {
+    fn begun(&mut self, begun: Result<u32, SkillRequestError>) {
         match begun {
             Ok(run) => {
                 self.stage = Stage::Runs(run);
@@ -387,6 +385,7 @@ impl SentSkillGoal {
             }
             Err(why) => {
                 self.stage = Stage::Ended;
+                let why = why.to_string();
                 self.events.push_back(GraphGoalEvent::Rejected(why));
             }
         }

@@ -48,7 +48,9 @@ impl Topics {
             return;
         };
         let newest = match sample.status & BAD {
-            0 => fields::values(&sample.payload).map(Arc::new),
+            0 => fields::values(&sample.payload)
+                .map(Arc::new)
+                .map_err(|error| error.to_string()),
             _ => Err(format!(
                 "the publisher of {} reports a Bad status (0x{:04X}0000)",
                 sample.topic, sample.status
