@@ -21,12 +21,14 @@ mod node_id;
 mod nodesets;
 mod pattern;
 mod permission;
+mod pubsub;
 mod quality;
 mod read;
 mod remote;
 mod schema;
 mod secret;
 mod security;
+mod server;
 mod server_entries;
 mod surroundings;
 mod topic;
@@ -54,21 +56,23 @@ pub use ethernet::{EthernetGroup, MacAddress};
 
 pub use loss::{Loss, LossAction, Motion};
 pub use mapping::{
-    Binding, Lasting, Mapping, Meaning, Overflow, PubSub, Publish, PublisherIdRule, Server,
-    ServerLimits, ServerSecurityPolicy, ServiceBinding, ServiceRole, Space, Trigger, UaField,
-    Variable,
+    Binding, Lasting, Mapping, Meaning, Overflow, Publish, ServiceBinding, ServiceRole, Space,
+    Trigger, UaField, Variable,
 };
 pub use node_id::{ExpandedNodeIdText, Identifier, NamespaceText, NodeIdError, NodeIdText};
 pub use nodesets::{NodeSetFault, NodeSetNode, NodeSetType, NodeSets};
 pub use pattern::{Pattern, PatternFault, PatternReason, PatternVariable};
 pub use permission::{Anonymous, Permissions, Role};
+pub use pubsub::{PubSub, PublisherIdRule};
 pub use quality::{Ages, Confirm, ConfirmingValues, History};
 pub use remote::{
-    Access, FindSkills, NodeSource, NodeTarget, Password, RemoteServer, SkillsPlace, User,
+    Access, FindSkills, NodeSource, NodeTarget, Password, RemoteServer, ServerSecurityPolicy,
+    SkillsPlace, User,
 };
 pub use schema::schema;
 pub use secret::masked;
 pub use security::{GroupMode, GroupPolicy, KeySource, Replay, SecurityGroup, ServedKeys};
+pub use server::{Server, ServerLimits};
 pub use surroundings::{FileReaders, Surroundings};
 pub use topic::{NamePart, SpaceId, TopicError, TopicId};
 pub use unit::Unit;

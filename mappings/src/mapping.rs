@@ -1,7 +1,6 @@
 //! The checked document: every name resolved, every default filled in.
 
 use std::collections::{BTreeMap, HashMap};
-use std::net::{Ipv4Addr, SocketAddr};
 use std::num::NonZeroU16;
 use std::path::PathBuf;
 use std::time::Duration;
@@ -10,17 +9,16 @@ use messages::{Leaf, Selection, TypeName};
 use uadp::BuiltinType;
 
 use crate::alarm::Alarm;
-use crate::broker::Broker;
 use crate::call::{Call, CallBinding};
-use crate::carriers::ConfiguredCarrier;
-use crate::endpoint::Endpoint;
 use crate::loss::{Loss, Motion};
 use crate::node_id::NodeIdText;
 use crate::pattern::{Pattern, PatternFault, PatternReason, PatternVariable};
-use crate::permission::{Anonymous, Permissions};
-use crate::quality::{Ages, Confirm, History};
-use crate::remote::{FindSkills, NodeSource, NodeTarget, RemoteServer};
+use crate::permission::Permissions;
+use crate::pubsub::PubSub;
+use crate::quality::{Ages, Confirm};
+use crate::remote::{NodeSource, NodeTarget, RemoteServer};
 use crate::security::SecurityGroup;
+use crate::server::Server;
 use crate::topic::{SpaceId, TopicId};
 use crate::unit::Unit;
 
@@ -357,109 +355,6 @@ pub enum Trigger {
     Equals(String),
 }
 
-/// Settings for NetworkMessages between the spaces.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct PubSub {
-    /// Group or host that NetworkMessages are sent to, and its UDP port.
-    pub address: SocketAddr,
-    /// MQTT broker that carries the messages instead of UDP.
-    pub broker: Option<Box<Broker>>,
-    /// Name or address of the network interface; `None` lets the operating system choose.
-    pub interface: Option<String>,
-    /// Hops a multicast datagram may travel; 1 stays on the link.
-    pub ttl: u8,
-    /// Hosts that datagrams are sent to instead of `address`, for networks without multicast.
-    pub peers: Vec<SocketAddr>,
-    /// Rule for the PublisherIds of a space.
-    pub publisher_id: PublisherIdRule,
-    /// A value that does not change is sent again after this time, which heals a lost datagram.
-    pub key_frame_period: Duration,
-    /// A writer without a new value sends a keep-alive message after this time.
-    pub keep_alive_period: Duration,
-    /// A writer that is silent for this long is lost; longer than `keep_alive_period`.
-    pub receive_timeout: Duration,
-    /// Period in which a writer announces the fields of its messages (DataSetMetaData: OPC
-    /// 10000-14, 7.2.4.6.4). It also announces them at its start and on request.
-    pub metadata_period: Duration,
-    /// Bytes of the largest NetworkMessage that is sent as one datagram; a larger message is sent
-    /// in chunks of this size (OPC 10000-14, 7.2.4.4.4).
-    pub max_datagram: u16,
-    /// Bytes of the largest DataSetMessage that is sent, or reassembled from chunks.
-    pub max_message: u32,
-    /// Largest number of DataSetMessages of one WriterGroup that share a NetworkMessage, if they
-    /// wait to be sent and fit into [`max_datagram`](Self::max_datagram) and an Ethernet frame; 1
-    /// sends each alone.
-    pub messages_per_datagram: u8,
-    /// The carriers of a mapping that lists several or uses Ethernet; otherwise empty.
-    /// [`address`](Self::address) and [`broker`](Self::broker) are then the first of each kind.
-    pub carriers: Vec<ConfiguredCarrier>,
-}
-
-impl PubSub {
-    /// The largest number of carriers.
-    pub const MOST_CARRIERS: usize = 4;
-    /// The largest UDP payload over IPv4.
-    pub const LARGEST_DATAGRAM: u16 = 65_507;
-    /// Size for the headers of a chunk and a part of the message.
-    pub const SMALLEST_DATAGRAM: u16 = 512;
-
-    /// 239.192.0.40:4840. The group is of the IPv4 organization-local scope (RFC 2365, 6.2), so no
-    /// router forwards it to the Internet; the port is registered for OPC UA over UDP (OPC
-    /// 10000-14, 7.3.2).
-    pub const ADDRESS: SocketAddr =
-        SocketAddr::new(std::net::IpAddr::V4(Ipv4Addr::new(239, 192, 0, 40)), 4840);
-    /// Reads `opc.udp://<numeric group or host>:<port>`; the default port is 4840 (OPC 10000-14,
-    /// 7.3.2).
-    #[must_use]
-    pub fn parse_address(url: &str) -> Option<SocketAddr> {
-        let rest = url.strip_prefix("opc.udp://")?;
-        let rest = rest.strip_suffix('/').unwrap_or(rest);
-        let alone = || {
-            rest.trim_start_matches('[')
-                .trim_end_matches(']')
-                .parse()
-                .ok()
-        };
-        rest.parse()
-            .ok()
-            .or_else(|| Some(SocketAddr::new(alone()?, Self::ADDRESS.port())))
-    }
-
-    /// Group that OPC 10000-14, 7.3.2.1 reserves for discovery messages: no data may be sent to it.
-    pub const DISCOVERY_GROUP: Ipv4Addr = Ipv4Addr::new(224, 0, 2, 14);
-}
-
-impl Default for PubSub {
-    fn default() -> Self {
-        Self {
-            address: Self::ADDRESS,
-            broker: None,
-            interface: None,
-            ttl: 1,
-            peers: Vec::new(),
-            publisher_id: PublisherIdRule::Exact,
-            key_frame_period: Duration::from_secs(1),
-            keep_alive_period: Duration::from_secs(1),
-            receive_timeout: Duration::from_secs(3),
-            metadata_period: Duration::from_secs(30),
-            max_datagram: Self::LARGEST_DATAGRAM,
-            max_message: 64 << 20,
-            messages_per_datagram: 1,
-            carriers: Vec::new(),
-        }
-    }
-}
-
-/// Rule for the PublisherIds of a space.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub enum PublisherIdRule {
-    /// Only a UInt16 of the space's number: type and value must be equal (OPC 10000-14, 7.2.4.4.2).
-    #[default]
-    Exact,
-    /// The space's number in any unsigned integer type, for publishers that cannot send UInt16.
-    AnyWidth,
-}
-
 /// ROS side of the cell.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Space {
@@ -467,171 +362,6 @@ pub struct Space {
     pub id: SpaceId,
     /// The DDS domain of a ROS 2 space; `None` for ROS 1.
     pub domain: Option<u16>,
-}
-
-/// The OPC UA server of the cell.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Server {
-    /// Endpoint for clients.
-    pub endpoint: Endpoint,
-    /// ApplicationUri of the server.
-    pub application_uri: String,
-    /// ApplicationUris of redundant servers by their rank, which counts from 1; empty without
-    /// redundancy.
-    pub redundant: Vec<String>,
-    /// Endpoints of the redundant servers by their rank; empty if the document names none.
-    pub redundant_endpoints: Vec<Endpoint>,
-    /// Security policies that it offers, without repetition and not empty; `None` if the document
-    /// names none.
-    pub security: Option<Vec<ServerSecurityPolicy>>,
-    /// Permission of anonymous users.
-    pub anonymous: Anonymous,
-    /// `true` if the server refuses other servers at hosts that their trusted certificates do not
-    /// name.
-    pub refuse_other_hosts: bool,
-    /// Time after which uncertain values of other programs are bad, if a variable names no other
-    /// time.
-    pub bad_after: Option<Duration>,
-    /// `true` if it has alarms for the publishers of the space.
-    pub publisher_alarms: bool,
-    /// Listening addresses of the clients to which the server connects.
-    pub reverse_connect: Vec<Endpoint>,
-    /// Size of the history.
-    pub history: History,
-    /// File of the history.
-    pub history_file: Option<PathBuf>,
-    /// Limits for clients.
-    pub limits: ServerLimits,
-    /// Rule for the servers with skills that it represents when they are found, if any.
-    pub find_skills: Option<FindSkills>,
-    /// NodeSet2 files of nodes that it has beside the nodes of the mapping.
-    pub nodesets: Vec<PathBuf>,
-}
-
-/// Limits for clients of the server; the server chooses for `None`.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct ServerLimits {
-    /// Sessions at the same time.
-    pub sessions: Option<u16>,
-    /// Sessions of one client address, enforced while less than an eighth of the sessions is free.
-    pub sessions_per_address: Option<u16>,
-    /// Connections.
-    pub connections: Option<u16>,
-    /// Connections of one client address.
-    pub connections_per_address: Option<u16>,
-    /// Subscriptions of a session.
-    pub subscriptions: Option<u16>,
-    /// Monitored items of a subscription.
-    pub items: Option<u16>,
-    /// Nodes that one request reads or writes, or items that it creates.
-    pub operations: Option<u16>,
-}
-
-impl Server {
-    /// Returns the security policies that it offers. If the document names none, these are all
-    /// policies, and [`ServerSecurityPolicy::None`] only for a server that listens on a loopback
-    /// address.
-    #[must_use]
-    pub fn policies(&self, is_loopback: bool) -> Vec<ServerSecurityPolicy> {
-        if let Some(told) = &self.security {
-            return told.clone();
-        }
-        let all = ServerSecurityPolicy::ALL.iter().copied();
-        all.filter(|policy| is_loopback || *policy != ServerSecurityPolicy::None)
-            .collect()
-    }
-
-    /// Returns `true` if the server, or each server of a redundant set, is reached and connects on
-    /// its own host only.
-    #[must_use]
-    pub fn is_local(&self) -> bool {
-        self.endpoints().all(Endpoint::is_loopback) && self.connects_to_own_host_only()
-    }
-
-    /// Returns the endpoints of the server, or of all servers of a redundant set.
-    pub fn endpoints(&self) -> impl Iterator<Item = &Endpoint> {
-        std::iter::once(&self.endpoint).chain(&self.redundant_endpoints)
-    }
-
-    /// Returns the endpoint of the server, or of the first server of a redundant set. This server
-    /// creates the keys of secured groups.
-    #[must_use]
-    pub fn first_endpoint(&self) -> &Endpoint {
-        self.redundant_endpoints.first().unwrap_or(&self.endpoint)
-    }
-
-    /// Returns whether the server creates the keys of secured groups, by its ApplicationUri. The
-    /// other servers of a redundant set request them.
-    #[must_use]
-    pub fn creates_keys(&self) -> bool {
-        let rank = self
-            .redundant
-            .iter()
-            .position(|uri| *uri == self.application_uri);
-        rank.is_none_or(|rank| rank == 0)
-    }
-
-    /// Returns `true` if the server connects to no client of another host.
-    #[must_use]
-    pub fn connects_to_own_host_only(&self) -> bool {
-        self.reverse_connect.iter().all(Endpoint::is_loopback)
-    }
-}
-
-impl Default for Server {
-    fn default() -> Self {
-        Self {
-            endpoint: Endpoint::default(),
-            application_uri: "urn:ua-bridge:server".to_owned(),
-            redundant: Vec::new(),
-            redundant_endpoints: Vec::new(),
-            security: None,
-            anonymous: Anonymous::Usual,
-            refuse_other_hosts: false,
-            bad_after: None,
-            publisher_alarms: false,
-            reverse_connect: Vec::new(),
-            history: History::default(),
-            history_file: None,
-            limits: ServerLimits::default(),
-            find_skills: None,
-            nodesets: Vec::new(),
-        }
-    }
-}
-
-/// A SecurityPolicy of OPC 10000-7.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
-pub enum ServerSecurityPolicy {
-    /// Neither signed nor encrypted.
-    None,
-    /// `http://opcfoundation.org/UA/SecurityPolicy#Basic256Sha256`
-    Basic256Sha256,
-    /// `http://opcfoundation.org/UA/SecurityPolicy#Aes128_Sha256_RsaOaep`
-    Aes128Sha256RsaOaep,
-    /// `http://opcfoundation.org/UA/SecurityPolicy#Aes256_Sha256_RsaPss`
-    Aes256Sha256RsaPss,
-}
-
-impl ServerSecurityPolicy {
-    /// Every policy, in ascending order of strength.
-    pub const ALL: &'static [Self] = &[
-        Self::None,
-        Self::Aes128Sha256RsaOaep,
-        Self::Basic256Sha256,
-        Self::Aes256Sha256RsaPss,
-    ];
-
-    /// Returns the fragment of the URI.
-    #[must_use]
-    pub const fn name(self) -> &'static str {
-        match self {
-            Self::None => "None",
-            Self::Basic256Sha256 => "Basic256Sha256",
-            Self::Aes128Sha256RsaOaep => "Aes128_Sha256_RsaOaep",
-            Self::Aes256Sha256RsaPss => "Aes256_Sha256_RsaPss",
-        }
-    }
 }
 
 /// Value of the space: an OPC UA node, the topic that carries it, and the ROS topics tied to it.
@@ -939,16 +669,5 @@ variables:
         assert!(!of("Robot.Ready"));
         assert!(of("Robot.Done"));
         assert!(of("Robot.Velocity"));
-    }
-
-    #[test]
-    fn the_default_group_stays_within_the_organization() {
-        let SocketAddr::V4(address) = PubSub::default().address else {
-            panic!("IPv4")
-        };
-        // RFC 2365, 6.2: 239.192.0.0/14
-        assert_eq!(address.ip().octets()[0], 239);
-        assert_eq!(address.ip().octets()[1] & 0b1111_1100, 192);
-        assert!(PubSub::default().receive_timeout > PubSub::default().keep_alive_period);
     }
 }

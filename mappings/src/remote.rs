@@ -6,7 +6,6 @@ use std::ops::RangeInclusive;
 use std::time::Duration;
 
 use crate::endpoint::Endpoint;
-use crate::mapping::ServerSecurityPolicy;
 use crate::node_id::ExpandedNodeIdText;
 
 /// An existing OPC UA server, such as that of a PLC: an entry of `servers`.
@@ -71,6 +70,40 @@ impl FindSkills {
     #[must_use]
     pub const fn namespaces(&self) -> RangeInclusive<u16> {
         self.first..=self.first.saturating_add(self.most.saturating_sub(1))
+    }
+}
+
+/// A SecurityPolicy of OPC 10000-7.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub enum ServerSecurityPolicy {
+    /// Neither signed nor encrypted.
+    None,
+    /// `http://opcfoundation.org/UA/SecurityPolicy#Basic256Sha256`
+    Basic256Sha256,
+    /// `http://opcfoundation.org/UA/SecurityPolicy#Aes128_Sha256_RsaOaep`
+    Aes128Sha256RsaOaep,
+    /// `http://opcfoundation.org/UA/SecurityPolicy#Aes256_Sha256_RsaPss`
+    Aes256Sha256RsaPss,
+}
+
+impl ServerSecurityPolicy {
+    /// Every policy, in ascending order of strength.
+    pub const ALL: &'static [Self] = &[
+        Self::None,
+        Self::Aes128Sha256RsaOaep,
+        Self::Basic256Sha256,
+        Self::Aes256Sha256RsaPss,
+    ];
+
+    /// Returns the fragment of the URI.
+    #[must_use]
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::None => "None",
+            Self::Basic256Sha256 => "Basic256Sha256",
+            Self::Aes128Sha256RsaOaep => "Aes128_Sha256_RsaOaep",
+            Self::Aes256Sha256RsaPss => "Aes256_Sha256_RsaPss",
+        }
     }
 }
 

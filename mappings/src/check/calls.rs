@@ -17,9 +17,10 @@ use crate::call::{Call, CallBinding, CallKind, ExecutedBy, MethodTarget};
 use crate::code::Code;
 use crate::document::{AcknowledgesEntry, CallEntry};
 use crate::findings::MappingFindings;
-use crate::mapping::{Server, Variable};
+use crate::mapping::Variable;
 use crate::node_id::NodeIdText;
 use crate::read::{Located, given, short};
+use crate::server::Server;
 use crate::topic::{SpaceId, TopicId};
 use crate::tree::TextSpan;
 

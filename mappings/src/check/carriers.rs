@@ -9,7 +9,7 @@ use crate::carriers::{CarrierMedium, ConfiguredCarrier, ForwardedName, UdpGroup}
 use crate::code::Code;
 use crate::document::{CarrierEntry, MqttEntry, PubSubEntry, UdpEntry};
 use crate::findings::MappingFindings;
-use crate::mapping::PubSub;
+use crate::pubsub::PubSub;
 use crate::read::{Located, given, short};
 use crate::tree::TextSpan;
 

@@ -15,10 +15,12 @@ use crate::document::{
 };
 use crate::endpoint::Endpoint;
 use crate::findings::MappingFindings;
-use crate::mapping::{PubSub, PublisherIdRule, Server, ServerLimits, ServerSecurityPolicy};
+use crate::pubsub::{PubSub, PublisherIdRule};
 use crate::quality::History;
 use crate::read::{Located, OptionalKey, given, short};
+use crate::remote::ServerSecurityPolicy;
 use crate::secret::has_user;
+use crate::server::{Server, ServerLimits};
 use crate::tree::TextSpan;
 
 pub(super) fn pubsub(

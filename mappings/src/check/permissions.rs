@@ -6,9 +6,9 @@ use crate::document::{
     ServerEntry,
 };
 use crate::findings::MappingFindings;
-use crate::mapping::Server;
 use crate::permission::{Anonymous, Permissions, Role};
 use crate::read::{OptionalKey, given};
+use crate::server::Server;
 use crate::topic::SpaceId;
 
 /// Returns `None` for a faulty entry, which is noted.

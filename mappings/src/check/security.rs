@@ -14,9 +14,11 @@ use crate::document::{
 use crate::endpoint::Endpoint;
 use crate::findings::MappingFindings;
 use crate::key_text::is_key;
-use crate::mapping::{Mapping, Server, ServerSecurityPolicy};
+use crate::mapping::Mapping;
 use crate::read::{Located, given, short};
+use crate::remote::ServerSecurityPolicy;
 use crate::security::{GroupMode, GroupPolicy, KeySource, Replay, SecurityGroup, ServedKeys};
+use crate::server::Server;
 use crate::tree::TextSpan;
 
 /// Maximum number of groups of a document.

@@ -10,10 +10,13 @@ use crate::call::Call;
 use crate::code::Code;
 use crate::endpoint::Endpoint;
 use crate::findings::MappingFindings;
-use crate::mapping::{Server, ServerSecurityPolicy, Variable};
+use crate::mapping::Variable;
 use crate::node_id::ExpandedNodeIdText;
 use crate::read::{Located, OptionalKey, given, short};
-use crate::remote::{Access, NodeSource, NodeTarget, Password, RemoteServer, SkillsPlace, User};
+use crate::remote::{
+    Access, NodeSource, NodeTarget, Password, RemoteServer, ServerSecurityPolicy, SkillsPlace, User,
+};
+use crate::server::Server;
 use crate::server_entries::{FromEntry, RemoteServerEntry, ToEntry};
 use crate::topic::SpaceId;
 use crate::tree::TextSpan;

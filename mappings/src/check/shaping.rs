@@ -203,46 +203,51 @@ impl Shaping {
 
     /// Notes a conversion key beside `fields`: it belongs to one of the fields.
     pub(super) fn of_fields(&self, findings: &mut MappingFindings) -> Option<()> {
-        let Some(place) = self.place else {
-            return Some(());
-        };
-        findings
-            .error(
+        self.misplaced(
+            (
                 Code::Fields,
-                place,
                 "the conversion of `fields` belongs to each field",
-            )
-            .help("move it to the field: `fields: [{field: linear.x, scale: 1000}]`");
-        None
+            ),
+            "move it to the field: `fields: [{field: linear.x, scale: 1000}]`",
+            findings,
+        )
     }
 
     /// Notes a conversion key if no value crosses.
     pub(super) fn of_nothing(&self, findings: &mut MappingFindings) -> Option<()> {
-        let Some(place) = self.place else {
-            return Some(());
-        };
-        findings
-            .error(
+        self.misplaced(
+            (
                 Code::Conversion,
-                place,
                 "the request contains no value, so nothing is converted",
-            )
-            .help("give the field of the request that takes the value: `field: data`");
-        None
+            ),
+            "give the field of the request that takes the value: `field: data`",
+            findings,
+        )
     }
 
     /// Notes a conversion key if a whole message crosses.
     pub(super) fn of_several(&self, findings: &mut MappingFindings) -> Option<()> {
+        self.misplaced(
+            (
+                Code::Conversion,
+                "only a single value can be converted, but this is a message",
+            ),
+            "select the value with `field`",
+            findings,
+        )
+    }
+
+    /// Notes a conversion key, if there is one, with a message and its remedy.
+    fn misplaced(
+        &self,
+        (code, message): (Code, &str),
+        help: &str,
+        findings: &mut MappingFindings,
+    ) -> Option<()> {
         let Some(place) = self.place else {
             return Some(());
         };
-        findings
-            .error(
-                Code::Conversion,
-                place,
-                "only a single value can be converted, but this is a message",
-            )
-            .help("select the value with `field`");
+        findings.error(code, place, message).help(help);
         None
     }
 
