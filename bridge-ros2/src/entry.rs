@@ -27,7 +27,7 @@ use ros2_node::security::RequestedSecurity;
 use tracing::{info, warn};
 use transport::{Interface, InterfaceError};
 
-use crate::ros_args::RosArgs;
+use crate::ros_args::{RosArgs, usage};
 use crate::{Ros2Port, Ros2PortOptions, environment};
 
 /// Runs `bridge-ros2` from its command line to its end. `arguments` begin with the name of the
@@ -102,7 +102,7 @@ struct BridgeRos2 {
 
 impl BridgeRos2 {
     fn ros_args(&self) -> Result<RosArgs, Failure> {
-        RosArgs::parse(&self.ros_args).map_err(|error| Failure::new(FailureKind::Usage, error))
+        RosArgs::parse(&self.ros_args)
     }
 
     /// Returns the security settings of the ROS 2 side.
@@ -148,7 +148,7 @@ impl BridgeRos2 {
             .unwrap_or_else(|| own.into())
     }
 
-    fn chosen(&self, mapping: &Mapping) -> Result<Vec<SpaceId>, String> {
+    fn chosen(&self, mapping: &Mapping) -> Result<Vec<SpaceId>, Failure> {
         choose_spaces(&given(&self.space), &given(&self.domain), mapping)
     }
 
@@ -269,7 +269,6 @@ impl Program for BridgeRos2 {
 
     fn spaces(&self, mapping: &Mapping) -> Result<Vec<SpaceId>, Failure> {
         self.chosen(mapping)
-            .map_err(|message| Failure::new(FailureKind::Usage, message))
     }
 
     fn part(&self) -> BTreeSet<u16> {
@@ -358,18 +357,18 @@ fn choose_spaces(
     spaces: &[u16],
     domains: &[u16],
     mapping: &Mapping,
-) -> Result<Vec<SpaceId>, String> {
+) -> Result<Vec<SpaceId>, Failure> {
     if !spaces.is_empty() && !domains.is_empty() && spaces.len() != domains.len() {
-        return Err(format!(
+        return Err(usage(format!(
             "{} spaces for {} domains: give --space and --domain (ROS_DOMAIN_ID) the same number of values, \
              a space for each domain",
             spaces.len(),
             domains.len()
-        ));
+        )));
     }
     for (what, numbers) in [("domain", domains), ("space", spaces)] {
         if let Some(twice) = repeated(numbers) {
-            return Err(format!("{what} {twice} is given twice"));
+            return Err(usage(format!("{what} {twice} is given twice")));
         }
     }
     let count = spaces.len().max(domains.len()).max(1);
@@ -383,9 +382,9 @@ fn choose_spaces(
         })
         .collect::<Result<_, _>>()?;
     match repeated(&chosen) {
-        Some(twice) => Err(format!(
+        Some(twice) => Err(usage(format!(
             "two of the domains belong to space {twice}; give each domain its own space"
-        )),
+        ))),
         None => Ok(chosen),
     }
 }
@@ -404,17 +403,17 @@ fn choose_space(
     space: Option<u16>,
     domain: Option<u16>,
     mapping: &Mapping,
-) -> Result<SpaceId, String> {
+) -> Result<SpaceId, Failure> {
     if let Some(space) = space {
         let id = SpaceId::new(space)
             .filter(|id| id.is_ros2())
-            .ok_or_else(|| format!("--space {space}: ROS 2 spaces are 2 to 232"))?;
+            .ok_or_else(|| usage(format!("--space {space}: ROS 2 spaces are 2 to 232")))?;
         let declared = mapping.space(id).and_then(|space| space.domain);
         return match (domain, declared) {
-            (Some(asked), Some(declared)) if asked != declared => Err(format!(
+            (Some(asked), Some(declared)) if asked != declared => Err(usage(format!(
                 "space {id} is DDS domain {declared} in the mapping, but --domain or ROS_DOMAIN_ID says \
                  {asked}; make both equal"
-            )),
+            ))),
             _ => Ok(id),
         };
     }
@@ -423,10 +422,10 @@ fn choose_space(
             let free = (FIRST_FREE..=232).filter_map(SpaceId::new);
             let free = free.filter(|id| mapping.space(*id).is_none()).min();
             let id = free.map_or(FIRST_FREE, u16::from);
-            format!(
+            usage(format!(
                 "DDS domain {domain} has no space: add `- {{id: {id}, domain: {domain}}}` to `spaces` of \
                  the mapping, or give --space N (2 to 232)"
-            )
+            ))
         });
     }
     let mut declared = mapping
@@ -436,15 +435,15 @@ fn choose_space(
         .filter(|id| id.is_ros2());
     match (declared.next(), declared.next()) {
         (Some(only), None) => Ok(only),
-        (Some(_), Some(_)) => Err(
+        (Some(_), Some(_)) => Err(usage(
             "the mapping has several ROS 2 spaces: choose with --space N, or --space N,M for several in one program"
                 .to_owned(),
-        ),
-        (None, _) => Err(
+        )),
+        (None, _) => Err(usage(
             "the DDS domain is not given: add `- {id: 2}` to `spaces` of the mapping (space 2 in DDS domain \
              2; `- {id: 2, domain: 0}` for domain 0), or give --domain N (or set ROS_DOMAIN_ID)"
                 .to_owned(),
-        ),
+        )),
     }
 }
 
@@ -518,14 +517,18 @@ mod tests {
             (&[], &[7, 7], "domain 7 is given twice"),
             (&[40, 40], &[], "space 40 is given twice"),
         ] {
-            let error = choose_spaces(spaces, domains, &none).unwrap_err();
+            let error = choose_spaces(spaces, domains, &none)
+                .unwrap_err()
+                .to_string();
             assert!(error.contains(why), "{error}");
         }
     }
 
     #[test]
     fn domain_0_needs_a_space() {
-        let error = choose_space(None, Some(0), &Mapping::default()).unwrap_err();
+        let error = choose_space(None, Some(0), &Mapping::default())
+            .unwrap_err()
+            .to_string();
         assert!(error.contains("--space"), "{error}");
         assert_eq!(
             choose_space(Some(40), Some(0), &Mapping::default())
@@ -537,7 +540,9 @@ mod tests {
 
     #[test]
     fn without_a_domain_or_a_mapping_nothing_is_guessed() {
-        let error = choose_space(None, None, &Mapping::default()).unwrap_err();
+        let error = choose_space(None, None, &Mapping::default())
+            .unwrap_err()
+            .to_string();
         assert!(error.contains("--domain"), "{error}");
         assert!(error.contains("`- {id: 2}`"), "{error}");
     }

@@ -2,6 +2,8 @@
 //! (design.ros2.org, "ROS Command Line Arguments"): the node's name and namespace, and the only
 //! parameter of a bridge.
 
+use bridge_node::{Failure, FailureKind};
+
 /// The settings of a node in ROS arguments.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub(crate) struct RosArgs {
@@ -21,17 +23,19 @@ impl RosArgs {
     /// # Errors
     /// An argument that a bridge does not support, such as another name for a topic: it would be
     /// ignored silently otherwise.
-    pub(crate) fn parse<S: AsRef<str>>(words: &[S]) -> Result<Self, String> {
+    pub(crate) fn parse<S: AsRef<str>>(words: &[S]) -> Result<Self, Failure> {
         let mut found = Self::default();
         let mut words = words.iter().map(AsRef::as_ref);
         while let Some(word) = words.next() {
             let rule = match word {
                 "-r" | "--remap" | "-p" | "--param" => words.next().ok_or_else(|| {
-                    format!("{word}: expected a rule such as NAME:=VALUE after it")
+                    usage(format!(
+                        "{word}: expected a rule such as NAME:=VALUE after it"
+                    ))
                 })?,
                 "-e" | "--enclave" => {
                     let name = words.next().ok_or_else(|| {
-                        format!("{word}: expected the name of an enclave after it")
+                        usage(format!("{word}: expected the name of an enclave after it"))
                     })?;
                     found.enclave = Some(name.to_owned());
                     continue;
@@ -39,14 +43,16 @@ impl RosArgs {
                 "--ros-args" => continue,
                 "--" => break,
                 other => {
-                    return Err(format!(
+                    return Err(usage(format!(
                         "{other}: unknown; a bridge accepts -r, -p and --enclave after --ros-args"
-                    ));
+                    )));
                 }
             };
-            let (name, value) = rule
-                .split_once(":=")
-                .ok_or_else(|| format!("{word} {rule}: expected a rule such as NAME:=VALUE"))?;
+            let (name, value) = rule.split_once(":=").ok_or_else(|| {
+                usage(format!(
+                    "{word} {rule}: expected a rule such as NAME:=VALUE"
+                ))
+            })?;
             let is_parameter = word == "-p" || word == "--param";
             match (is_parameter, name) {
                 (false, "__node" | "__name") => found.name = Some(value.to_owned()),
@@ -56,23 +62,31 @@ impl RosArgs {
                     found.use_sim_time = Some(match value.to_ascii_lowercase().as_str() {
                         "true" => true,
                         "false" => false,
-                        _ => return Err(format!("use_sim_time is true or false, not {value}")),
+                        _ => {
+                            let why = format!("use_sim_time is true or false, not {value}");
+                            return Err(usage(why));
+                        }
                     });
                 }
                 (false, _) => {
-                    return Err(format!(
+                    return Err(usage(format!(
                         "{word} {rule}: a bridge accepts __node and __ns only; the mapping names the topics"
-                    ));
+                    )));
                 }
                 (true, _) => {
-                    return Err(format!(
+                    return Err(usage(format!(
                         "{word} {rule}: use_sim_time is the only parameter of a bridge"
-                    ));
+                    )));
                 }
             }
         }
         Ok(found)
     }
+}
+
+/// Returns the failure for a wrong command line.
+pub(crate) fn usage(message: String) -> Failure {
+    Failure::new(FailureKind::Usage, message)
 }
 
 #[cfg(test)]
@@ -107,7 +121,7 @@ mod tests {
             ("--params-file x.yaml", "--params-file"),
         ] {
             let words: Vec<&str> = words.split(' ').collect();
-            let error = RosArgs::parse(&words).unwrap_err();
+            let error = RosArgs::parse(&words).unwrap_err().to_string();
             assert!(error.contains(why), "{error}");
         }
     }

@@ -130,7 +130,7 @@ impl ServerPort {
             .with_node_manager(Ordered::around(nodes, &access))
             .build()
             .map_err(configuration)?;
-        let manager = start::manager(&handle, &layout).map_err(configuration)?;
+        let manager = start::manager(&handle, &layout)?;
         let shown = ((&*pubsub, &*alarms), start::history(described, &layout)?);
         start::show_limits(mapping, &layout, (&handle, &manager), shown);
         let (runtime, listener) = endpoint::threads(listener)?;

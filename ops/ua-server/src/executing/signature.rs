@@ -4,7 +4,8 @@ use bridge_node::{CallDescription, CallField, CallRole};
 use mappings::{ExpandedNodeIdText, MethodTarget, NamespaceText, NodeIdText};
 use messages::ArrayRank;
 use opcua::types::{
-    Argument, AttributeId, DataTypeId, DataValue, Identifier, NodeId, ReferenceTypeId, Variant,
+    Argument, AttributeId, DataTypeId, DataValue, Identifier, NodeId, ReferenceTypeId, StatusCode,
+    Variant,
 };
 use plant_opcua::client::{Browse, ClientError, OpcUaClient};
 use plant_opcua::server::arguments_in;
@@ -35,31 +36,85 @@ impl Signature {
     }
 }
 
+/// The reason why a Method cannot be called.
+#[derive(Debug, thiserror::Error)]
+pub(crate) enum SignatureError {
+    /// A request failed.
+    #[error(transparent)]
+    Client(#[from] ClientError),
+    /// The response has another number of values.
+    #[error("the server answers with another number of values")]
+    Short,
+    /// The server has no namespace with the URI.
+    #[error("the server has no namespace {0}")]
+    NoNamespace(String),
+    /// A node does not exist, or cannot be read.
+    #[error("the server answers {status} for {node}")]
+    NoNode {
+        /// The answer of the server.
+        status: StatusCode,
+        /// The node.
+        node: String,
+    },
+    /// The node is no Method, or the user may not call it.
+    #[error("{0} is not executable")]
+    NotExecutable(String),
+    /// The value of the property is no list of arguments.
+    #[error("its {0} are none")]
+    NoArguments(&'static str),
+    /// The Method has too many arguments of this kind.
+    #[error("{0} are more than {MOST_FIELDS}")]
+    TooMany(&'static str),
+    /// The name of an argument is too long.
+    #[error("the name of {which} {at} is longer than {LONGEST_NAME} bytes")]
+    LongName {
+        /// The kind of argument.
+        which: &'static str,
+        /// The number of the argument, from 1.
+        at: u32,
+    },
+    /// A call cannot carry an argument.
+    #[error("{which} {at} (`{name}`) {why}, which no call has")]
+    NotCarried {
+        /// The kind of argument.
+        which: &'static str,
+        /// The number of the argument, from 1.
+        at: u32,
+        /// The name of the argument.
+        name: String,
+        /// Its DataType or ValueRank, as a predicate.
+        why: String,
+    },
+}
+
 /// Reads the signature over the current connection.
 ///
 /// # Errors
-/// Returns the reason why the Method cannot be called, as text for the operator.
-pub(super) async fn read(client: &OpcUaClient, target: &MethodTarget) -> Result<Signature, String> {
+/// The Method cannot be called.
+pub(super) async fn read(
+    client: &OpcUaClient,
+    target: &MethodTarget,
+) -> Result<Signature, SignatureError> {
     let object = node(client, &target.object)?;
     let method = node(client, &target.method)?;
     let what = [
         (object.clone(), AttributeId::NodeClass),
         (method.clone(), AttributeId::Executable),
     ];
-    let read = client.read_attributes(&what).await.map_err(told)?;
+    let read = client.read_attributes(&what).await?;
     let [of_object, executable] = &read[..] else {
-        return Err("the server answers with another number of values".to_owned());
+        return Err(SignatureError::Short);
     };
     there(of_object, &target.object)?;
     there(executable, &target.method)?;
     if executable.value != Some(Variant::Boolean(true)) {
-        return Err(format!("{} is not executable", target.method));
+        return Err(SignatureError::NotExecutable(target.method.to_string()));
     }
     let properties = Browse {
         subtypes: false,
         ..Browse::of(ReferenceTypeId::HasProperty)
     };
-    let properties = client.browse(&method, properties).await.map_err(told)?;
+    let properties = client.browse(&method, properties).await?;
     let mut both = Vec::new();
     for which in ["InputArguments", "OutputArguments"] {
         let named = properties
@@ -69,8 +124,8 @@ pub(super) async fn read(client: &OpcUaClient, target: &MethodTarget) -> Result<
             None => Vec::new(),
             Some(property) => {
                 let values = client.read(std::slice::from_ref(&property.node_id.node_id));
-                let value = values.await.map_err(told)?.into_iter().next();
-                arguments_in(value).ok_or_else(|| format!("its {which} are none"))?
+                let value = values.await?.into_iter().next();
+                arguments_in(value).ok_or(SignatureError::NoArguments(which))?
             }
         };
         both.push(fields(client, which, arguments).await?);
@@ -88,13 +143,16 @@ pub(super) async fn read(client: &OpcUaClient, target: &MethodTarget) -> Result<
 /// Converts a NodeId into a NodeId of that server, over the current connection.
 ///
 /// # Errors
-/// Returns the reason why there is no such NodeId, as text for the operator.
-pub(crate) fn node(client: &OpcUaClient, text: &ExpandedNodeIdText) -> Result<NodeId, String> {
+/// The server has no such namespace.
+pub(crate) fn node(
+    client: &OpcUaClient,
+    text: &ExpandedNodeIdText,
+) -> Result<NodeId, SignatureError> {
     let namespace = match &text.namespace {
         NamespaceText::Index(index) => *index,
         NamespaceText::Uri(uri) => client
             .namespace(uri)
-            .ok_or_else(|| format!("the server has no namespace {uri}"))?,
+            .ok_or_else(|| SignatureError::NoNamespace(uri.to_string()))?,
     };
     Ok(layout::node_id(&NodeIdText {
         namespace,
@@ -102,42 +160,41 @@ pub(crate) fn node(client: &OpcUaClient, text: &ExpandedNodeIdText) -> Result<No
     }))
 }
 
-fn there(read: &DataValue, text: &ExpandedNodeIdText) -> Result<(), String> {
+fn there(read: &DataValue, text: &ExpandedNodeIdText) -> Result<(), SignatureError> {
     let status = read.status();
     if status.is_bad() {
-        return Err(format!("the server answers {status} for {text}"));
+        let node = text.to_string();
+        return Err(SignatureError::NoNode { status, node });
     }
     Ok(())
 }
 
-fn told(error: ClientError) -> String {
-    error.to_string()
-}
-
 async fn fields(
     client: &OpcUaClient,
-    which: &str,
+    which: &'static str,
     arguments: Vec<Argument>,
-) -> Result<Vec<CallField>, String> {
+) -> Result<Vec<CallField>, SignatureError> {
     if arguments.len() > MOST_FIELDS {
-        return Err(format!("{which} are more than {MOST_FIELDS}"));
+        return Err(SignatureError::TooMany(which));
     }
     let mut fields: Vec<CallField> = Vec::new();
-    for (at, argument) in (1..).zip(arguments) {
-        let wrong = |why: &str| format!("{which} {at} (`{}`) {why}", argument.name);
-        let builtin = builtin(client, &argument.data_type).await.map_err(told)?;
-        let builtin = builtin
-            .ok_or_else(|| wrong(&format!("is of {}, which no call has", argument.data_type)))?;
+    for (at, argument) in (1_u32..).zip(arguments) {
+        let wrong = |why: String| SignatureError::NotCarried {
+            which,
+            at,
+            name: argument.name.to_string(),
+            why,
+        };
+        let builtin = builtin(client, &argument.data_type).await?;
+        let builtin = builtin.ok_or_else(|| wrong(format!("is of {}", argument.data_type)))?;
         let rank = match argument.value_rank {
             -1 => ArrayRank::Scalar,
             1 => ArrayRank::Array { fixed: None },
-            other => return Err(wrong(&format!("has ValueRank {other}, which no call has"))),
+            other => return Err(wrong(format!("has ValueRank {other}"))),
         };
         let name = argument.name.as_ref();
         if name.len() > LONGEST_NAME {
-            return Err(format!(
-                "the name of {which} {at} is longer than {LONGEST_NAME} bytes"
-            ));
+            return Err(SignatureError::LongName { which, at });
         }
         let taken = fields
             .iter()

@@ -91,7 +91,7 @@ impl Watcher {
         for wanted in all {
             match signature::read(&self.client, &wanted.target).await {
                 Ok(signature) => self.find(wanted, connects, signature).await?,
-                Err(reason) => self.miss(wanted.topic, &reason).await?,
+                Err(error) => self.miss(wanted.topic, &error.to_string()).await?,
             }
         }
         Ok(())

@@ -364,14 +364,18 @@ impl InMemoryNodeManagerImplBuilder for NodesBuilder {
 
 /// Returns the node manager of the space. The server assigns the namespace indexes itself, so they
 /// are compared with the mapping.
-pub(super) fn manager(handle: &ServerHandle, layout: &Layout) -> Result<Arc<SpaceManager>, String> {
+pub(super) fn manager(
+    handle: &ServerHandle,
+    layout: &Layout,
+) -> Result<Arc<SpaceManager>, Failure> {
+    let failed = |message: String| Failure::new(FailureKind::Configuration, message);
     let manager = handle
         .node_managers()
         .get_of_type::<Ordered>()
         .and_then(|ordered| ordered.space())
-        .ok_or_else(|| "the server has no node manager for the space".to_owned())?;
+        .ok_or_else(|| failed("the server has no node manager for the space".to_owned()))?;
     if let Some(fault) = manager.inner().nodesets().fault() {
-        return Err(fault.to_owned());
+        return Err(failed(fault.to_owned()));
     }
     let wanted = layout.namespaces.iter().skip(1);
     for ((index, uri), (expected, wanted)) in manager
@@ -380,9 +384,9 @@ pub(super) fn manager(handle: &ServerHandle, layout: &Layout) -> Result<Arc<Spac
         .zip((1u16..).zip(wanted))
     {
         if index != expected || uri != wanted {
-            return Err(format!(
+            return Err(failed(format!(
                 "namespace {wanted} is to have index {expected}, but in this server it has {index}"
-            ));
+            )));
         }
     }
     Ok(manager)

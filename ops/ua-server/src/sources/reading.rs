@@ -174,8 +174,8 @@ impl Reader {
                     }));
                     watched.push(read);
                 }
-                Err(why) => {
-                    self.fault(&read, StatusCode::BadNodeIdUnknown, &why)
+                Err(error) => {
+                    self.fault(&read, StatusCode::BadNodeIdUnknown, &error.to_string())
                         .await?
                 }
             }

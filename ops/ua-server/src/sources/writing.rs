@@ -2,7 +2,6 @@
 
 use std::sync::Arc;
 
-use mappings::ExpandedNodeIdText;
 use opcua::types::{NodeId, StatusCode, Variant};
 use plant_opcua::client::{ClientError, Link, OpcUaClient};
 use plant_opcua::limits::MOST_PER_REQUEST;
@@ -59,12 +58,14 @@ async fn write(client: &OpcUaClient, outbox: &ServerOutbox) {
         let mut writes: Vec<(Arc<Write>, WaitingValue)> = Vec::new();
         let mut values: Vec<(NodeId, Variant)> = Vec::new();
         for (write, waits) in batch {
-            match (node(client, &write.target.node), one_value(&waits.block)) {
+            let node = local_node(client, &write.target.node);
+            match (node, one_value(&waits.block)) {
                 (Ok(node), Some(value)) => {
                     writes.push((write, waits));
                     values.push((node, value));
                 }
-                (Err(why), _) => {
+                (Err(error), _) => {
+                    let why = error.to_string();
                     outbox.refused(&write, waits, (StatusCode::BadNodeIdUnknown, &why));
                 }
                 (Ok(_), None) => {
@@ -99,10 +100,6 @@ async fn write(client: &OpcUaClient, outbox: &ServerOutbox) {
             return;
         }
     }
-}
-
-fn node(client: &OpcUaClient, text: &ExpandedNodeIdText) -> Result<NodeId, String> {
-    local_node(client, text)
 }
 
 fn refusal(write: &Write, status: StatusCode) -> String {
