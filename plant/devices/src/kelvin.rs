@@ -32,6 +32,7 @@ pub use self::volts::{ChangerReading, InvalidVoltage, LEVELS, VoltageDetector, v
 use crate::line::ModbusLine;
 use crate::measuring::{ticks, value};
 use crate::modbus::Modbus;
+use crate::skill_types::other_type;
 
 /// The installation of the changer.
 #[derive(Debug, Clone, PartialEq)]
@@ -201,14 +202,8 @@ impl Device for KelvinChanger {
         } else if is("DetachToolSkillType") {
             ChangerAction::Detach
         } else {
-            let own = types
-                .first()
-                .map(ParameterType::to_string)
-                .unwrap_or_default();
-            return Err(DriverFault(format!(
-                "`kelvin_tool_changer` does the work of ChangeToolSkillType, AttachToolSkillType, DetachToolSkillType and what is \
-                 below them, and this is {own}"
-            )));
+            let does = "ChangeToolSkillType, AttachToolSkillType, DetachToolSkillType and what is below them";
+            return Err(other_type("kelvin_tool_changer", does, types));
         };
         let changer = Self {
             peers: peers.clone(),

@@ -21,6 +21,7 @@ pub mod module;
 pub mod robotiq;
 pub mod schmalz;
 mod sensors;
+mod skill_types;
 mod tls;
 mod tty;
 pub mod ur;

@@ -30,6 +30,8 @@ pub use handshake::{HandshakeTiming, ModuleNodes};
 use nodes::UaNodes;
 use procedure::ProcedureRun;
 
+use crate::skill_types::other_type;
+
 /// Settings of a module.
 #[derive(Debug, Clone)]
 pub struct ModuleSettings {
@@ -231,19 +233,12 @@ impl Device for ProcessModule {
         self.nodes.identify(&peers.options);
         let of = |skill: &&ModuleSkill| types.contains(&self.type_of(skill));
         let Some(skill) = self.skills.iter().find(of) else {
-            let own = types
-                .first()
-                .map(ParameterType::to_string)
-                .unwrap_or_default();
             let known: Vec<String> = self
                 .skills
                 .iter()
                 .map(|skill| self.type_of(skill).to_string())
                 .collect();
-            return Err(DriverFault(format!(
-                "`mtp` does the work of {}, and this is {own}",
-                known.join(", ")
-            )));
+            return Err(other_type("mtp", &known.join(", "), types));
         };
         if skill
             .service

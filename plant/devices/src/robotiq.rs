@@ -18,6 +18,7 @@ use tokio::time::{Instant, sleep};
 use crate::line::ModbusLine;
 use crate::measuring::{ticks, value};
 use crate::modbus::{Modbus, ModbusFault};
+use crate::skill_types::other_type;
 
 /// Address of the command registers: action, reserved; reserved, position; speed, force.
 pub const ACTION: u16 = 0x03E8;
@@ -63,13 +64,8 @@ impl Device for RobotiqGripper {
         if is("MoveGripperSkillType") {
             return Ok(of(FingerTarget::Width));
         }
-        let own = types
-            .first()
-            .map(ParameterType::to_string)
-            .unwrap_or_default();
-        Err(DriverFault(format!(
-            "`robotiq_2f85` does the work of GraspSkillType, ReleaseSkillType, MoveGripperSkillType and what is below them, and this is {own}"
-        )))
+        let does = "GraspSkillType, ReleaseSkillType, MoveGripperSkillType and what is below them";
+        Err(other_type("robotiq_2f85", does, types))
     }
 
     fn values(&self) -> &'static [DeviceValue] {

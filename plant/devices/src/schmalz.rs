@@ -21,6 +21,7 @@ use tokio::time::{Instant, sleep};
 
 use crate::http::{DeviceHost, DeviceRequest, HttpFault};
 use crate::measuring::{ticks, value};
+use crate::skill_types::other_type;
 
 /// A gripper.
 #[derive(Debug, Clone)]
@@ -79,13 +80,8 @@ impl Device for SchmalzGripper {
         if is("ReleaseSkillType") {
             return Ok(motion(false));
         }
-        let own = types
-            .first()
-            .map(ParameterType::to_string)
-            .unwrap_or_default();
-        Err(DriverFault(format!(
-            "`schmalz_ecbpi` does the work of GraspSkillType, ReleaseSkillType and what is below them, and this is {own}"
-        )))
+        let does = "GraspSkillType, ReleaseSkillType and what is below them";
+        Err(other_type("schmalz_ecbpi", does, types))
     }
 
     fn values(&self) -> &'static [DeviceValue] {

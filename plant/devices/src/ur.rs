@@ -37,6 +37,7 @@ use self::state::{INPUTS, OUTPUTS, PAUSED, STOPPED, UnfitRobot, UrState};
 use self::wire::RecipeValue;
 use crate::measuring::value;
 use crate::modbus::connected;
+use crate::skill_types::other_type;
 
 /// The port for programs.
 pub const SECONDARY: u16 = 30_002;
@@ -101,13 +102,8 @@ impl Device for UrRobot {
         if let Some((_, kind)) = kinds.into_iter().find(|(name, _)| is(name)) {
             return Ok(Arc::new(Motion { settings, kind }));
         }
-        let own = types
-            .first()
-            .map(ParameterType::to_string)
-            .unwrap_or_default();
-        Err(DriverFault(format!(
-            "`universal_robot` does the work of PtpMoveSkillType, LinearMoveSkillType, ForceMoveSkillType, JointPtpMoveSkillType and what is below them, and this is {own}"
-        )))
+        let does = "PtpMoveSkillType, LinearMoveSkillType, ForceMoveSkillType, JointPtpMoveSkillType and what is below them";
+        Err(other_type("universal_robot", does, types))
     }
 
     fn values(&self) -> &'static [DeviceValue] {
