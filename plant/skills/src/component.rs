@@ -5,7 +5,9 @@ mod configurable;
 mod device;
 mod document;
 mod drivers;
+mod skills;
 mod space;
+mod texts;
 mod values;
 mod world;
 
@@ -21,8 +23,9 @@ use plant_opcua::users::{Roles, UserRole};
 pub use changes::{ChangeKind, Takes, YamlChange};
 pub(crate) use device::DeviceSensor;
 pub use device::{Device, DeviceKinds, NoDevices, measure_device};
-pub use document::{read_partner, read_user};
+pub use document::read_user;
 pub use drivers::{DriverFault, Drivers};
+pub use skills::read_partner;
 pub use space::{Form, RequestKind, SpaceFieldError, SpaceFieldSource, SpaceWork, ValuePart};
 
 pub use values::{ExecSource, MOST_VALUES, SensorRead, TopicSource, ValueSetup, ValueSource};

@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use serde_json::Value as Json;
 
-use super::document::{read_name, whole};
+use super::texts::{read_name, whole};
 use super::values::{
     LONGEST_ABOUT, LONGEST_UNIT, check_range, read_line, read_range, read_shape_name,
 };

@@ -3,25 +3,25 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::time::Duration;
 
 use plant_opcua::client::ClientUser;
 use plant_opcua::limits::ClientLimits;
 use plant_opcua::users::{Roles, UserRole};
 
 use super::configurable::read_configurable;
+use super::skills::read_skills;
+use super::texts::{
+    DEFAULT_ENDPOINT, LONGEST_NAME, checked_endpoint, read_endpoint, read_name, read_uri, whole,
+};
 use super::values::{Around, read_values};
-use super::world::{read_grip_point, read_numbers, read_workspace, read_world};
+use super::world::{read_workspace, read_world};
 use super::{
-    Component, ComponentSecurity, DeviceKinds, DriverSetup, ExecWork, LEASE, Lds, MOST_SKILLS,
-    NoDevices, Partner, Partners, RequestKind, Robot, Simulation, SkillSetup, ValueSetup,
-    anonymous_by_default,
+    Component, ComponentSecurity, DeviceKinds, LEASE, Lds, NoDevices, Robot, SkillSetup,
+    ValueSetup, anonymous_by_default,
 };
 use crate::configuration::Configurable;
-use crate::parameters::{ParameterType, shortened};
-use crate::yaml::{
-    DocumentKind, DocumentNode, Findings, Place, YamlFindingCode, YamlReader, parse,
-};
+use crate::parameters::shortened;
+use crate::yaml::{DocumentNode, Findings, YamlFindingCode, YamlReader, parse};
 
 impl Component {
     /// The JSON schema of the YAML.
@@ -84,16 +84,6 @@ const KEYS: [&str; 21] = [
     "values",
     "configurable",
     "skills",
-];
-
-/// Keys of a skill.
-const SKILL_KEYS: [&str; 6] = [
-    "name",
-    "type",
-    "driver",
-    "capabilities",
-    "timeout",
-    "grip_point",
 ];
 
 fn component(
@@ -219,14 +209,6 @@ fn read_parts(
         skills,
         values,
         configurable,
-    }
-}
-
-/// Returns the value of an optional key; `None` if the value is invalid.
-pub(super) fn whole<T>(read: Option<Option<T>>) -> Option<Option<T>> {
-    match read {
-        Some(read) => read.map(Some),
-        None => Some(None),
     }
 }
 
@@ -432,53 +414,6 @@ fn read_lds(node: &DocumentNode, reader: &mut YamlReader<'_>) -> Option<Lds> {
     }
 }
 
-pub(super) fn read_name(node: &DocumentNode, reader: &mut YamlReader<'_>) -> Option<String> {
-    let text = reader.text(node, "a name")?;
-    let fits = !text.is_empty()
-        && text.len() <= LONGEST_NAME
-        && text
-            .bytes()
-            .all(|b| b.is_ascii_alphanumeric() || b == b'-' || b == b'_');
-    if fits {
-        return Some(text.to_owned());
-    }
-    let message = format!("`{}` is no name of a component or skill", shortened(text));
-    let help = "letters, digits, - and _, at most 64 of them";
-    reader
-        .findings()
-        .error_with(YamlFindingCode::Name, node.place, message, help);
-    None
-}
-
-fn read_uri(
-    node: &DocumentNode,
-    code: YamlFindingCode,
-    reader: &mut YamlReader<'_>,
-) -> Option<String> {
-    let text = reader.text(node, "a URI")?;
-    let scheme = text.split_once(':').is_some_and(|(scheme, rest)| {
-        !rest.is_empty()
-            && scheme.starts_with(|c: char| c.is_ascii_alphabetic())
-            && scheme.bytes().all(is_of_scheme)
-    });
-    let clean = !text
-        .chars()
-        .any(|c| c.is_whitespace() || c.is_control() || "<>\"{}|\\^`".contains(c));
-    if scheme && clean && text.len() <= LONGEST_URI {
-        return Some(text.to_owned());
-    }
-    let message = format!("`{}` is no URI", shortened(text));
-    let help = "for example urn:example:gripper";
-    reader
-        .findings()
-        .error_with(code, node.place, message, help);
-    None
-}
-
-fn is_of_scheme(b: u8) -> bool {
-    b.is_ascii_alphanumeric() || matches!(b, b'+' | b'-' | b'.')
-}
-
 fn read_positive(
     node: &DocumentNode,
     code: YamlFindingCode,
@@ -493,29 +428,6 @@ fn read_positive(
         );
         reader.refuse(node, code, message)
     })
-}
-
-fn read_endpoint(node: &DocumentNode, reader: &mut YamlReader<'_>) -> Option<String> {
-    let text = reader.text(node, "an endpoint")?;
-    checked_endpoint(text, node, reader)
-}
-
-fn checked_endpoint(
-    text: &str,
-    node: &DocumentNode,
-    reader: &mut YamlReader<'_>,
-) -> Option<String> {
-    match text.parse::<plant_opcua::server::EndpointUrl>() {
-        Ok(_) => Some(text.to_owned()),
-        Err(error) => {
-            let message = format!("`{}` is no endpoint: {error}", shortened(text));
-            let help = format!("for example {DEFAULT_ENDPOINT}, where 0 is any free port");
-            reader
-                .findings()
-                .error_with(YamlFindingCode::Endpoint, node.place, message, help);
-            None
-        }
-    }
 }
 
 fn read_security(node: &DocumentNode, reader: &mut YamlReader<'_>) -> Vec<ComponentSecurity> {
@@ -543,251 +455,6 @@ fn read_security(node: &DocumentNode, reader: &mut YamlReader<'_>) -> Vec<Compon
     policies
 }
 
-/// The folder of the document, and the kinds of devices.
-type Surroundings<'a> = (&'a Path, &'a dyn DeviceKinds);
-
-fn read_skills(
-    node: &DocumentNode,
-    around: Surroundings<'_>,
-    reader: &mut YamlReader<'_>,
-) -> Vec<SkillSetup> {
-    let nodes = reader.list(node);
-    if nodes.is_empty() || nodes.len() > MOST_SKILLS {
-        let message = format!(
-            "a component has from 1 to {MOST_SKILLS} skills, and this one {}",
-            nodes.len()
-        );
-        reader
-            .findings()
-            .error(YamlFindingCode::TooMany, node.place, message);
-    }
-    let mut skills: Vec<SkillSetup> = Vec::new();
-    for node in nodes.iter().take(MOST_SKILLS) {
-        let Some((skill, name_at)) = read_skill(node, around, reader) else {
-            continue;
-        };
-        // Names are compared without case, because people do not distinguish them by case.
-        if skills
-            .iter()
-            .any(|known| known.name.eq_ignore_ascii_case(&skill.name))
-        {
-            let message = format!("there is a skill `{}` already", skill.name);
-            reader
-                .findings()
-                .error(YamlFindingCode::NameTwice, name_at, message);
-        }
-        skills.push(skill);
-    }
-    skills
-}
-
-fn read_skill(
-    node: &DocumentNode,
-    around: Surroundings<'_>,
-    reader: &mut YamlReader<'_>,
-) -> Option<(SkillSetup, Place)> {
-    let [name, skill_type, driver, capabilities, timeout, grip_point] =
-        reader.map(node, SKILL_KEYS)?;
-    let name_at = name.map_or(node.place, |name| name.place);
-    let place = skill_type.map_or(node.place, |skill_type| skill_type.place);
-    let name = reader
-        .needed(name, "name", node.place)
-        .and_then(|node| read_name(node, reader));
-    let skill_type = reader
-        .needed(skill_type, "type", node.place)
-        .and_then(|node| read_type(node, reader));
-    let driver = reader
-        .needed(driver, "driver", node.place)
-        .and_then(|node| read_driver(node, around, reader));
-    let capabilities = capabilities
-        .map(|node| reader.list(node))
-        .unwrap_or_default()
-        .iter()
-        .filter_map(|node| read_uri(node, YamlFindingCode::Capability, reader))
-        .collect();
-    let timeout = match timeout {
-        Some(node) => Some(reader.duration(node)?),
-        None => None,
-    };
-    let grip_point = grip_point.map(|node| read_grip_point(node, reader));
-    let skill = SkillSetup {
-        name: name?,
-        skill_type: skill_type?,
-        driver: driver?,
-        capabilities,
-        timeout,
-        grip_point: whole(grip_point)?,
-        place,
-    };
-    Some((skill, name_at))
-}
-
-fn read_type(node: &DocumentNode, reader: &mut YamlReader<'_>) -> Option<ParameterType> {
-    let text = reader.text(node, "a skill type")?;
-    match text.parse() {
-        Ok(name) => Some(name),
-        Err(error) => reader.refuse(node, YamlFindingCode::SkillType, error.to_string()),
-    }
-}
-
-fn read_driver(
-    node: &DocumentNode,
-    (folder, kinds): Surroundings<'_>,
-    reader: &mut YamlReader<'_>,
-) -> Option<DriverSetup> {
-    if matches!(&node.kind, DocumentKind::Scalar(text) if text == "simulated") {
-        return Some(DriverSetup::Simulated(Simulation::default()));
-    }
-    if matches!(&node.kind, DocumentKind::Scalar(text) if text == "device") {
-        return Some(DriverSetup::Device);
-    }
-    if matches!(&node.kind, DocumentKind::Scalar(text) if text == "pick_and_place") {
-        return Some(DriverSetup::PickAndPlace(Partners {
-            robot: None,
-            gripper: None,
-            plate: None,
-            prefer: Vec::new(),
-            within: USUALLY_WITHIN,
-        }));
-    }
-    let keys = [
-        "simulated",
-        "pick_and_place",
-        "call",
-        "action",
-        "exec",
-        "http",
-    ];
-    let space = |asked, node, reader: &mut YamlReader<'_>| {
-        let work = super::space::read(asked, node, reader);
-        work.map(|work| DriverSetup::Space(Box::new(work)))
-    };
-    match reader.map(node, keys)? {
-        [Some(node), None, None, None, None, None] => {
-            read_simulation(node, reader).map(DriverSetup::Simulated)
-        }
-        [None, Some(node), None, None, None, None] => {
-            read_partners(node, reader).map(DriverSetup::PickAndPlace)
-        }
-        [None, None, Some(node), None, None, None] => space(RequestKind::Call, node, reader),
-        [None, None, None, Some(node), None, None] => space(RequestKind::Action, node, reader),
-        [None, None, None, None, Some(node), None] => {
-            read_exec(node, folder, reader).map(|work| DriverSetup::Exec(Box::new(work)))
-        }
-        [None, None, None, None, None, Some(node)] => {
-            kinds.http(node, reader).map(DriverSetup::Given)
-        }
-        _ => {
-            let message = "a driver is exactly one of `simulated`, `device`, `pick_and_place`, `call`, `action`, `exec` and `http`";
-            reader
-                .findings()
-                .error(YamlFindingCode::Driver, node.place, message);
-            None
-        }
-    }
-}
-
-fn read_exec(node: &DocumentNode, folder: &Path, reader: &mut YamlReader<'_>) -> Option<ExecWork> {
-    let [command, stop, halt_timeout] = reader.map(node, ["command", "stop", "halt_timeout"])?;
-    let command = reader
-        .needed(command, "command", node.place)
-        .and_then(|node| read_command(node, reader));
-    let stop = stop.map(|node| read_command(node, reader));
-    let halt_timeout = halt_timeout.map_or(Some(USUAL_HALT), |node| reader.duration(node));
-    // The working directory of an empty path would be invalid.
-    let folder = match folder.as_os_str().is_empty() {
-        true => PathBuf::from("."),
-        false => folder.to_owned(),
-    };
-    Some(ExecWork {
-        command: command?,
-        stop: whole(stop)?,
-        folder,
-        halt_timeout: halt_timeout?,
-    })
-}
-
-/// Reads a program and its arguments.
-pub(super) fn read_command(
-    node: &DocumentNode,
-    reader: &mut YamlReader<'_>,
-) -> Option<Vec<String>> {
-    let nodes = reader.list(node);
-    let words: Vec<String> = nodes
-        .iter()
-        .filter_map(|node| {
-            reader
-                .text(node, "a program or an argument")
-                .map(str::to_owned)
-        })
-        .collect();
-    if words.len() < nodes.len() {
-        return None;
-    }
-    match words.first() {
-        Some(program) if !program.is_empty() => Some(words),
-        _ => {
-            let message = "a command is a list: the program, then its arguments".to_owned();
-            reader.refuse(node, YamlFindingCode::WrongValue, message)
-        }
-    }
-}
-
-fn read_simulation(node: &DocumentNode, reader: &mut YamlReader<'_>) -> Option<Simulation> {
-    let keys = [
-        "duration",
-        "object",
-        "reach",
-        "time_scale",
-        "contact",
-        "hole",
-    ];
-    let [duration, object, reach, time_scale, contact, hole] = reader.map(node, keys)?;
-    Some(Simulation {
-        duration: duration.and_then(|node| reader.duration(node)),
-        object: object.and_then(|node| reader.boolean(node)),
-        reach: reach.and_then(|node| reader.number(node, (0.01, 100.0))),
-        time_scale: time_scale.and_then(|node| reader.number(node, (0.01, 1000.0))),
-        contact: contact.and_then(|node| reader.number(node, (-100.0, 100.0))),
-        hole: hole.and_then(|node| read_numbers(node, (-100.0, 100.0), reader)),
-    })
-}
-
-fn read_partners(node: &DocumentNode, reader: &mut YamlReader<'_>) -> Option<Partners> {
-    let [robot, gripper, plate, prefer, within] =
-        reader.map(node, ["robot", "gripper", "plate", "prefer", "within"])?;
-    let prefer = prefer.map(|node| reader.list(node)).unwrap_or_default();
-    let prefer: Option<Vec<String>> = prefer
-        .iter()
-        .map(|node| read_uri(node, YamlFindingCode::Uri, reader))
-        .collect();
-    let robot = robot.map(|node| read_partner(node, reader));
-    let gripper = gripper.map(|node| read_partner(node, reader));
-    let plate = plate.map(|node| read_numbers(node, (-10.0, 10.0), reader));
-    let within = within.map_or(Some(USUALLY_WITHIN), |node| reader.duration(node));
-    Some(Partners {
-        robot: whole(robot)?,
-        gripper: whole(gripper)?,
-        plate: whole(plate)?,
-        prefer: prefer?,
-        within: within?,
-    })
-}
-
-/// Reads an endpoint, or the ApplicationUri of a server that is discovered.
-pub fn read_partner(node: &DocumentNode, reader: &mut YamlReader<'_>) -> Option<Partner> {
-    let is_uri = matches!(&node.kind, DocumentKind::Scalar(text) if text.starts_with("urn:"));
-    match is_uri {
-        true => read_uri(node, YamlFindingCode::Uri, reader).map(Partner::Called),
-        false => read_endpoint(node, reader).map(Partner::At),
-    }
-}
-
-const DEFAULT_ENDPOINT: &str = "opc.tcp://127.0.0.1:0";
-const USUALLY_WITHIN: Duration = Duration::from_secs(60);
-/// Default time from Halt until a program is killed.
-const USUAL_HALT: Duration = Duration::from_secs(5);
-const LONGEST_NAME: usize = 64;
 const USUAL_AXES: usize = 6;
 const MOST_AXES: usize = 32;
 const LONGEST_PASSWORD_FILE: u64 = 4096;
@@ -801,10 +468,13 @@ const CATEGORIES: [&str; 7] = [
     "parallel_robot",
     "cylindrical_robot",
 ];
-const LONGEST_URI: usize = 256;
 
 #[cfg(test)]
 mod tests {
+    use std::time::Duration;
+
+    use super::super::DriverSetup;
+    use super::super::skills::SKILL_KEYS;
     use super::*;
 
     const GRIPPER: &str = include_str!("../../../../examples/plant/parallel-gripper.yaml");

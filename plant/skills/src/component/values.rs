@@ -4,8 +4,9 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 
-use super::document::{read_command, read_name, whole};
+use super::skills::read_command;
 use super::space::read_topic;
+use super::texts::{read_name, whole};
 use super::{Device, DeviceKinds, SkillSetup};
 use crate::parameters::shortened;
 use crate::value::{Builtin, ValueShape};

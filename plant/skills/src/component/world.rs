@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use super::document::{read_name, whole};
+use super::texts::{read_name, whole};
 use crate::grip::{GripPoint, GripType, PartShape};
 use crate::parameters::shortened;
 use crate::workspace::{RobotWorkspace, Zone};
