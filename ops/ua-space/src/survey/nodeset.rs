@@ -32,7 +32,56 @@ pub(crate) fn survey(file: &str) -> Result<SurveyedNodes, CommandFailure> {
 #[derive(Debug)]
 struct Fault {
     at: usize,
-    what: String,
+    what: UnreadNodeSet,
+}
+
+/// The reason why the variables of a NodeSet are not read.
+#[derive(Debug, thiserror::Error)]
+enum UnreadNodeSet {
+    /// The file is malformed.
+    #[error("this is not XML: {0}")]
+    Xml(quick_xml::Error),
+    /// An attribute of an element is malformed.
+    #[error("in <{element}>: {why}")]
+    Attribute {
+        /// The local name of the element.
+        element: String,
+        /// The reason.
+        why: String,
+    },
+    /// An entity is not predefined.
+    #[error("an entity that XML does not have")]
+    Entity,
+    /// The file has a document type, which may define entities.
+    #[error("a NodeSet has no document type; remove the `<!DOCTYPE ..>`")]
+    DocumentType,
+    /// The file has no elements.
+    #[error("there is no <UANodeSet> in it")]
+    Empty,
+    /// The file has another root element.
+    #[error("this is a <{0}>, no <UANodeSet>")]
+    Root(String),
+    /// The end of the file is missing.
+    #[error("the file ends in the middle")]
+    Cut,
+    /// Elements are nested too deeply.
+    #[error("elements are nested deeper than {DEEPEST}")]
+    TooDeep,
+    /// The file has too many variables.
+    #[error("more than {MOST} variables are not read")]
+    TooMany,
+    /// A text is no NodeId.
+    #[error("`{0}` is neither a node id nor an alias")]
+    NodeId(String),
+    /// The namespace index of a NodeId has no URI.
+    #[error("`{id}`: NamespaceUris has no entry {}", id.namespace)]
+    Namespace {
+        /// The NodeId.
+        id: NodeIdText,
+    },
+    /// The ValueRank of the node with this NodeId is malformed.
+    #[error("the ValueRank of `{0}` is no number")]
+    ValueRank(String),
 }
 
 fn parse(xml: &str, place: &str) -> Result<SurveyedNodes, Fault> {
@@ -42,9 +91,9 @@ fn parse(xml: &str, place: &str) -> Result<SurveyedNodes, Fault> {
     let mut set = NodeSet::default();
     loop {
         let at = usize::try_from(reader.buffer_position()).unwrap_or(usize::MAX);
-        let fault = |what: String| Fault { at, what };
+        let fault = |what: UnreadNodeSet| Fault { at, what };
         let event = reader.read_event();
-        match event.map_err(|error| fault(format!("this is not XML: {error}")))? {
+        match event.map_err(|error| fault(UnreadNodeSet::Xml(error)))? {
             Event::Start(element) => set.open(&element).map_err(fault)?,
             Event::End(_) => set.close().map_err(fault)?,
             Event::Text(text) => set.text.push_str(&text.xml10_content()),
@@ -55,20 +104,12 @@ fn parse(xml: &str, place: &str) -> Result<SurveyedNodes, Fault> {
                 match (found, known) {
                     (Some(char), _) => set.text.push(char),
                     (None, Some(text)) => set.text.push_str(text),
-                    (None, None) => return Err(fault("an entity that XML does not have".into())),
+                    (None, None) => return Err(fault(UnreadNodeSet::Entity)),
                 }
             }
-            Event::DocType(_) => {
-                return Err(fault(
-                    "a NodeSet has no document type; remove the `<!DOCTYPE ..>`".to_owned(),
-                ));
-            }
-            Event::Eof if !set.seen => {
-                return Err(fault("there is no <UANodeSet> in it".to_owned()));
-            }
-            Event::Eof if !set.path.is_empty() => {
-                return Err(fault("the file ends in the middle".to_owned()));
-            }
+            Event::DocType(_) => return Err(fault(UnreadNodeSet::DocumentType)),
+            Event::Eof if !set.seen => return Err(fault(UnreadNodeSet::Empty)),
+            Event::Eof if !set.path.is_empty() => return Err(fault(UnreadNodeSet::Cut)),
             Event::Eof => break,
             // An empty element is reported as its start and its end.
             Event::Empty(_) | Event::Comment(_) | Event::Decl(_) | Event::PI(_) => {}
@@ -109,21 +150,25 @@ struct Node {
 }
 
 impl NodeSet {
-    fn open(&mut self, element: &BytesStart<'_>) -> Result<(), String> {
+    fn open(&mut self, element: &BytesStart<'_>) -> Result<(), UnreadNodeSet> {
         let name = element.local_name().into_inner().to_owned();
         self.text.clear();
         self.attributes.clear();
         for attribute in element.attributes() {
-            let attribute = attribute.map_err(|error| format!("in <{name}>: {error}"))?;
+            let wrong = |why: String| UnreadNodeSet::Attribute {
+                element: name.clone(),
+                why,
+            };
+            let attribute = attribute.map_err(|error| wrong(error.to_string()))?;
             let value = attribute
                 .normalized_value(XmlVersion::Implicit1_0)
-                .map_err(|error| format!("in <{name}>: {error}"))?;
+                .map_err(|error| wrong(error.to_string()))?;
             let key = attribute.key.local_name().into_inner().to_owned();
             self.attributes.insert(key, value.into_owned());
         }
         match self.path.len() {
             0 if name != "UANodeSet" => {
-                return Err(format!("this is a <{name}>, no <UANodeSet>"));
+                return Err(UnreadNodeSet::Root(name));
             }
             0 => self.seen = true,
             1 if name.starts_with("UA") => {
@@ -133,14 +178,14 @@ impl NodeSet {
                     references: Vec::new(),
                 });
             }
-            DEEPEST.. => return Err(format!("elements are nested deeper than {DEEPEST}")),
+            DEEPEST.. => return Err(UnreadNodeSet::TooDeep),
             _ => {}
         }
         self.path.push(name);
         Ok(())
     }
 
-    fn close(&mut self) -> Result<(), String> {
+    fn close(&mut self) -> Result<(), UnreadNodeSet> {
         let path: Vec<&str> = self.path.iter().map(String::as_str).collect();
         let text = self.text.trim().to_owned();
         match path.as_slice() {
@@ -173,7 +218,7 @@ impl NodeSet {
         Ok(())
     }
 
-    fn keep(&mut self, kind: &str, mut node: Node) -> Result<(), String> {
+    fn keep(&mut self, kind: &str, mut node: Node) -> Result<(), UnreadNodeSet> {
         let text = node.attributes.get("NodeId").map(String::as_str);
         let id = self.resolve(text.unwrap_or_default())?;
         let references = std::mem::take(&mut node.references);
@@ -198,7 +243,7 @@ impl NodeSet {
         }
         match kind {
             "UAVariable" if self.variables.len() >= MOST => {
-                return Err(format!("more than {MOST} variables are not read"));
+                return Err(UnreadNodeSet::TooMany);
             }
             "UAVariable" => self.variables.push((id, node)),
             "UAObject" => self.objects.extend([(id, node)]),
@@ -209,18 +254,15 @@ impl NodeSet {
     }
 
     /// Parses a node id, or resolves its alias.
-    fn resolve(&self, text: &str) -> Result<NodeIdText, String> {
+    fn resolve(&self, text: &str) -> Result<NodeIdText, UnreadNodeSet> {
         let text = self.aliases.get(text).map_or(text, String::as_str);
         text.parse().map_err(|_| {
             let shown: String = text.chars().take(64).collect();
-            format!(
-                "`{}` is neither a node id nor an alias",
-                shown.escape_debug()
-            )
+            UnreadNodeSet::NodeId(shown.escape_debug().to_string())
         })
     }
 
-    fn nodes(self, place: &str) -> Result<SurveyedNodes, String> {
+    fn nodes(self, place: &str) -> Result<SurveyedNodes, UnreadNodeSet> {
         let variables: HashSet<&NodeIdText> = self.variables.iter().map(|(id, _)| id).collect();
         let mut found = Vec::new();
         for (id, node) in &self.variables {
@@ -228,8 +270,7 @@ impl NodeSet {
                 continue;
             }
             if usize::from(id.namespace) > self.uris.len() {
-                let index = id.namespace;
-                return Err(format!("`{id}`: NamespaceUris has no entry {index}"));
+                return Err(UnreadNodeSet::Namespace { id: id.clone() });
             }
             let parent = match &node.parent {
                 Some(text) => Some(self.resolve(text)?),
@@ -261,7 +302,7 @@ impl NodeSet {
     }
 
     /// Returns true if the chain of parent objects ends at a type or Method.
-    fn is_declaration(&self, mut parent: Option<NodeIdText>) -> Result<bool, String> {
+    fn is_declaration(&self, mut parent: Option<NodeIdText>) -> Result<bool, UnreadNodeSet> {
         for _ in 0..DEEPEST {
             let Some(id) = parent else { return Ok(false) };
             if self.types.contains(&id) {
@@ -276,14 +317,14 @@ impl NodeSet {
         Ok(false)
     }
 
-    fn value(&self, node: &Node) -> Result<Option<(BuiltinType, bool)>, String> {
+    fn value(&self, node: &Node) -> Result<Option<(BuiltinType, bool)>, UnreadNodeSet> {
         // The defaults are BaseDataType and a scalar (UANodeSet.xsd).
         let rank = node.attributes.get("ValueRank");
         let rank = rank
             .map_or(Ok(-1), |text| text.trim().parse())
             .map_err(|_| {
                 let id = node.attributes.get("NodeId").map_or("", String::as_str);
-                format!("the ValueRank of `{id}` is no number")
+                UnreadNodeSet::ValueRank(id.to_owned())
             })?;
         let Some(text) = node.attributes.get("DataType") else {
             return Ok(None);
@@ -400,7 +441,7 @@ mod tests {
 
     #[test]
     fn what_is_no_node_set_is_refused_with_the_reason() {
-        let refused = |xml: &str| parse(xml, "x").unwrap_err().what;
+        let refused = |xml: &str| parse(xml, "x").unwrap_err().what.to_string();
         assert!(refused("").contains("no <UANodeSet>"));
         assert!(refused("<html/>").contains("this is a <html>"));
         assert!(refused("<UANodeSet>").contains("ends in the middle"));
