@@ -34,9 +34,33 @@ pub struct RedundantPeer {
     heartbeat: Heartbeat,
     address: SenderAddress,
     heard: Instant,
+    /// The number of heartbeats in a row that reported a ROS side within reach.
+    fit_in_row: u32,
 }
 
 impl RedundantPeer {
+    fn new(heartbeat: Heartbeat, from: SocketAddr, now: Instant) -> Self {
+        Self {
+            heartbeat,
+            address: SenderAddress::new(from, now),
+            heard: now,
+            fit_in_row: u32::from(heartbeat.is_fit),
+        }
+    }
+
+    /// Records a heartbeat. Returns the heartbeat before it.
+    fn note(&mut self, heartbeat: Heartbeat, from: SocketAddr, now: Instant) -> Heartbeat {
+        self.fit_in_row = match (heartbeat.is_fit, self.is_present(now)) {
+            (false, _) => 0,
+            (true, true) => self.fit_in_row.saturating_add(1),
+            // The state of its ROS side in the meantime is unknown.
+            (true, false) => 1,
+        };
+        self.address.note(from, now);
+        self.heard = now;
+        std::mem::replace(&mut self.heartbeat, heartbeat)
+    }
+
     /// Returns the rank.
     #[must_use]
     pub const fn rank(&self) -> RedundancyRank {
@@ -492,7 +516,7 @@ impl Redundancy {
         if self.role != RedundancyRole::Active {
             return Err(SwitchRefusal::NotActive);
         }
-        if !self.has_standby(false, now.monotonic) {
+        if !self.has_standby(0, now.monotonic) {
             return Err(SwitchRefusal::NoStandby);
         }
         Ok(self.release(MuteCause::Released, now))
@@ -505,16 +529,17 @@ impl Redundancy {
         muted
     }
 
-    /// Returns whether a standby was received within the time of a takeover.
-    fn has_standby(&self, fit: bool, now: Instant) -> bool {
+    /// Returns whether a standby was received within the time of a takeover, whose last
+    /// heartbeats, `fit` in number, reported a ROS side within reach.
+    fn has_standby(&self, fit: u32, now: Instant) -> bool {
         self.peers.iter().any(|peer| {
-            peer.role() == RedundancyRole::Standby
-                && peer.is_present(now)
-                && (peer.is_fit() || !fit)
+            peer.role() == RedundancyRole::Standby && peer.is_present(now) && peer.fit_in_row >= fit
         })
     }
 
-    /// Hands over if the ROS side is out of reach and a standby reaches it.
+    /// Hands over if the ROS side is out of reach and a standby reaches it, both for the same
+    /// number of heartbeats: the ROS side of a standby that was lost a moment ago may be lost
+    /// again, or both sides return together.
     fn look_at_sides(&mut self, now: Now) -> Option<RoleChange> {
         let patience = match self.side {
             LocalSide::Reached => {
@@ -525,7 +550,7 @@ impl Redundancy {
             LocalSide::NoLink => UNLINKED,
         };
         self.unfit = self.unfit.saturating_add(1);
-        let hands_over = self.unfit >= patience && self.has_standby(true, now.monotonic);
+        let hands_over = self.unfit >= patience && self.has_standby(patience, now.monotonic);
         hands_over.then(|| self.release(MuteCause::Unfit, now))
     }
 
@@ -569,17 +594,11 @@ impl Redundancy {
     fn meet(&mut self, heartbeat: Heartbeat, from: SocketAddr, now: Instant) -> Option<Heartbeat> {
         let known = |peer: &&mut RedundantPeer| peer.heartbeat.instance == heartbeat.instance;
         if let Some(known) = self.peers.iter_mut().find(known) {
-            known.address.note(from, now);
-            known.heard = now;
-            return Some(std::mem::replace(&mut known.heartbeat, heartbeat));
+            return Some(known.note(heartbeat, from, now));
         }
         self.peers.retain(|peer| peer.age(now) < FORGOTTEN);
         self.peers.truncate(MOST_PEERS - 1);
-        self.peers.push(RedundantPeer {
-            heartbeat,
-            address: SenderAddress::new(from, now),
-            heard: now,
-        });
+        self.peers.push(RedundantPeer::new(heartbeat, from, now));
         None
     }
 }

@@ -360,7 +360,7 @@ fn a_bridge_without_a_link_to_its_ros_side_hands_over_soon_unless_the_standby_ha
     network.run(2_000);
     assert_eq!(network.active(), [0], "the switch of both is down");
     network.bridges[1].state.set_side(LocalSide::Reached);
-    network.run(150);
+    network.run(200);
     assert_eq!(network.active(), [1]);
     network.assert_one_sender();
     // The time from the loss of the link to the takeover.
@@ -369,6 +369,59 @@ fn a_bridge_without_a_link_to_its_ros_side_hands_over_soon_unless_the_standby_ha
     network.bridges[1].state.set_side(LocalSide::NoLink);
     network.run(150);
     assert_eq!(network.active(), [0]);
+}
+
+#[test]
+fn a_standby_takes_over_when_its_side_has_been_reached_for_as_long_as_the_active_waits() {
+    for (side, flap, steady) in [(LocalSide::NoLink, 40, 200), (LocalSide::Silent, 300, 800)] {
+        let mut network = Network::new(&[1, 2], 3);
+        network.run(700);
+        for at in 0..2 {
+            network.bridges[at].state.set_side(side);
+        }
+        network.run(1_000);
+        for _ in 0..20 {
+            network.bridges[1].state.set_side(LocalSide::Reached);
+            network.run(flap);
+            network.bridges[1].state.set_side(side);
+            network.run(flap);
+        }
+        assert_eq!(network.active(), [0], "the side of the standby flaps");
+        assert!(network.changes().is_empty());
+        // Both sides return together, that of the standby a little earlier.
+        network.bridges[1].state.set_side(LocalSide::Reached);
+        network.run(flap);
+        network.bridges[0].state.set_side(LocalSide::Reached);
+        network.run(1_000);
+        assert_eq!(network.active(), [0], "both reach their sides");
+        network.bridges[0].state.set_side(side);
+        network.run(steady);
+        assert_eq!(network.active(), [1]);
+        network.assert_one_sender();
+    }
+}
+
+#[test]
+fn the_heartbeats_of_a_peer_that_was_out_of_reach_are_counted_anew() {
+    let start = start();
+    let at = |ms: u64| start.monotonic + Duration::from_millis(ms);
+    let fit = Redundancy::new(RedundancyRank::new(2).unwrap(), 2, start).heartbeat();
+    let unfit = Heartbeat {
+        is_fit: false,
+        ..fit
+    };
+    let mut peer = RedundantPeer::new(fit, address(1), at(0));
+    for (heartbeat, ms, in_row) in [
+        (fit, 20, 2),
+        // A lost heartbeat says nothing.
+        (fit, 60, 3),
+        (fit, 180, 1),
+        (unfit, 200, 0),
+        (fit, 220, 1),
+    ] {
+        let _before = peer.note(heartbeat, address(1), at(ms));
+        assert_eq!(peer.fit_in_row, in_row, "{ms} ms");
+    }
 }
 
 #[test]
