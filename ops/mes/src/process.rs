@@ -76,6 +76,47 @@ impl Loop {
     pub(crate) fn is_within(&self, other: &Self) -> bool {
         self.steps.is_subset(&other.steps) && self.steps.len() < other.steps.len()
     }
+
+    /// Returns a condition that cannot decide about another round. `steps` are those of the
+    /// process.
+    pub(crate) fn condition_fault(&self, steps: &[ProcessStep]) -> Option<LoopConditionFault> {
+        let over = self.over_after_round(steps);
+        for alternative in &self.again {
+            let mut named = alternative.iter().map(|condition| condition.step);
+            if let Some(step) = named.clone().find(|step| !over.contains(step)) {
+                return Some(LoopConditionFault::MayNotBeOver(step));
+            }
+            let is_constant = !named.clone().any(|step| self.steps.contains(&step));
+            if let Some(step) = named.next().filter(|_| is_constant) {
+                return Some(LoopConditionFault::IsConstant(step));
+            }
+        }
+        None
+    }
+
+    /// Returns the steps that are over when a round is: those of the loop, and those for which they
+    /// wait.
+    fn over_after_round(&self, steps: &[ProcessStep]) -> BTreeSet<usize> {
+        let mut over = BTreeSet::new();
+        let mut open: Vec<usize> = self.steps.iter().copied().collect();
+        while let Some(number) = open.pop() {
+            if over.insert(number) {
+                let waits = steps.get(number).map(|step| step.waits_for(number));
+                open.extend(waits.into_iter().flatten());
+            }
+        }
+        over
+    }
+}
+
+/// The fault of a loop whose condition names a step outside it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum LoopConditionFault {
+    /// The step with this number may not be over when a round is.
+    MayNotBeOver(usize),
+    /// The alternative that begins with this step names no step of the loop: it holds after each
+    /// round, or after none.
+    IsConstant(usize),
 }
 
 /// A condition about an earlier step.

@@ -6,7 +6,7 @@ use knowledge::QuestionAnswer;
 use serde_json::Value;
 
 use super::{Row, conditions_of, one};
-use crate::process::{Loop, ProcessStep};
+use crate::process::{Loop, LoopConditionFault, ProcessStep};
 
 /// Reads the loops of a process. `order` has the IRIs of the steps.
 ///
@@ -44,6 +44,9 @@ pub(super) fn loops_of(
                 "the loop {iri} waits for the step {step}, which waits for the end of the loop"
             ));
         }
+        if let Some(why) = condition_fault(&read, steps, order) {
+            return Err(format!("the loop {iri} {why}"));
+        }
         all.push(read);
     }
     Ok(all)
@@ -76,6 +79,25 @@ fn read(iri: &str, rows: &[&Row], order: &[&str], conditions: &[Row]) -> Result<
         again,
         rounds,
     })
+}
+
+/// Returns the reason why a condition of a loop cannot decide about another round.
+fn condition_fault(one: &Loop, steps: &[ProcessStep], order: &[&str]) -> Option<String> {
+    let name = |step: usize| order.get(step).copied().unwrap_or_default();
+    let why = match one.condition_fault(steps)? {
+        LoopConditionFault::MayNotBeOver(step) => format!(
+            "has a condition about the step {step}, which may not be over when a round is: name a \
+             step of the loop, repeat {step} too (ua:repeats), or let a step of the loop come \
+             after it (ua:after)",
+            step = name(step)
+        ),
+        LoopConditionFault::IsConstant(step) => format!(
+            "has a ua:when about {} without a step of the loop, so that it holds after each round \
+             or never: add a ua:condition about a step that the loop repeats",
+            name(step)
+        ),
+    };
+    Some(why)
 }
 
 fn rounds(value: &Value) -> Option<u32> {

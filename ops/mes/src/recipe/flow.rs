@@ -10,7 +10,9 @@ mod loops;
 use std::collections::{BTreeMap, BTreeSet};
 
 use super::Reading;
-use crate::process::{BadEnd, Loop, ProcessStep, SkillRole, StepCondition, Test};
+use crate::process::{
+    BadEnd, Loop, LoopConditionFault, ProcessStep, SkillRole, StepCondition, Test,
+};
 use crate::read_process::MOST_STEPS;
 use loops::FlowLoops;
 
@@ -112,6 +114,25 @@ impl Flow {
     }
 }
 
+/// Returns the finding about a condition that cannot decide about another round of the loop that
+/// returns to a node with this name.
+fn condition_fault(one: &Loop, head: &str, steps: &[ProcessStep]) -> Option<String> {
+    let name = |step: usize| steps.get(step).map_or("", |step| step.name.as_str());
+    let what = match one.condition_fault(steps)? {
+        LoopConditionFault::MayNotBeOver(step) => format!(
+            "the flow returns to `{head}` by a condition about `{}`, which may not be over then; \
+             use a result of a step between",
+            name(step)
+        ),
+        LoopConditionFault::IsConstant(step) => format!(
+            "the flow returns to `{head}` by a condition about `{}` only, which holds after each \
+             round or never; add a condition about a step between",
+            name(step)
+        ),
+    };
+    Some(what)
+}
+
 fn negated(condition: &NodeCondition) -> NodeCondition {
     NodeCondition {
         is_negated: !condition.is_negated,
@@ -176,7 +197,7 @@ impl Reading<'_> {
             .map(|(number, node)| (*node, number))
             .collect();
         let steps = self.steps(flow, &tasks, &paths, &numbers);
-        let loops = self.loops((flow, &loops), &paths, &numbers);
+        let loops = self.loops((flow, &loops), &paths, (&numbers, &steps));
         (self.errors.len() == before).then_some(RecipeSequence { steps, loops })
     }
 
@@ -230,12 +251,12 @@ impl Reading<'_> {
         steps
     }
 
-    /// Returns the loops over the steps with these numbers.
+    /// Returns the loops over these steps, which have these numbers.
     fn loops(
         &mut self,
         (flow, loops): (&Flow, &FlowLoops),
         paths: &Paths,
-        numbers: &BTreeMap<usize, usize>,
+        (numbers, done): (&BTreeMap<usize, usize>, &[ProcessStep]),
     ) -> Vec<Loop> {
         let guarded = |edge: &Edge| {
             let guard = paths.guards.get(edge.from);
@@ -282,11 +303,15 @@ impl Reading<'_> {
                     None => self.error_at(at, "a condition names no step".to_owned()),
                 }
             }
-            all.push(Loop {
+            let read = Loop {
                 steps,
                 again,
                 rounds: Loop::USUAL_ROUNDS,
-            });
+            };
+            if let Some(what) = condition_fault(&read, name, done) {
+                self.error_at(at, what);
+            }
+            all.push(read);
         }
         all
     }

@@ -122,6 +122,11 @@ fn a_loop_without_a_clear_end_is_refused() {
             r#"<sequenceFlow id="f3" sourceRef="dose" targetRef="x"/><sequenceFlow id="f6" sourceRef="dose" targetRef="z"/><endEvent id="z"/>"#,
             "the flow leaves the loop that returns to `dose` while it returns",
         ),
+        (
+            "${dose.Level",
+            "${e.Level",
+            "returns to `dose` by a condition about `e`, which may not be over then",
+        ),
     ] {
         let text = r#"<definitions xmlns="http://www.omg.org/spec/BPMN/20100524/MODEL"><process id="p">
             <startEvent id="s"/><sequenceFlow id="f0" sourceRef="s" targetRef="dose"/>
@@ -173,6 +178,16 @@ fn loops_come_back_from_the_graph_and_faulty_ones_have_a_reason() {
             ua:when [ ua:condition [ ua:resultOf <urn:p/2> ; ua:endsAs \"failed\" ] ] .";
     let loops = in_graph(turtle).unwrap();
     assert_eq!((loops[0].rounds, &loops[0].steps), (7, &[0, 1].into()));
+    let only = "ua:repeats <urn:p/2> ;";
+    let turtle_of_two = turtle.replacen("ua:repeats <urn:p/1> , <urn:p/2> ;", only, 1);
+    let and_first = "[ ua:condition [ ua:resultOf <urn:p/1> ; ua:endsAs \"failed\" ] , [";
+    let with_both = turtle_of_two.replacen("[ ua:condition [", and_first, 1);
+    // A step for which the loop waits may be named beside one of its own.
+    assert_eq!(in_graph(&with_both).unwrap()[0].again[0].len(), 2);
+    let before = turtle_of_two.replacen("ua:resultOf <urn:p/2>", "ua:resultOf <urn:p/1>", 1);
+    let why = in_graph(&before).unwrap_err();
+    let expected = "has a ua:when about urn:p/1 without a step of the loop";
+    assert!(why.contains(expected), "{why}");
     for (from, to, why) in [
         ("ua:rounds 7", "ua:rounds 0", "not from 1 to 500: 0"),
         (
@@ -200,6 +215,11 @@ fn loops_come_back_from_the_graph_and_faulty_ones_have_a_reason() {
             "ua:hasLoop <urn:p/l> , <urn:p/m> . <urn:p/m> ua:repeats <urn:p/2> , <urn:p/3> ;
                 ua:when [ ua:condition [ ua:resultOf <urn:p/3> ; ua:endsAs \"failed\" ] ] .",
             "shares steps with another loop",
+        ),
+        (
+            "ua:resultOf <urn:p/2>",
+            "ua:resultOf <urn:p/3>",
+            "the loop urn:p/l has a condition about the step urn:p/3, which may not be over",
         ),
     ] {
         assert!(turtle.contains(from), "{from}");
