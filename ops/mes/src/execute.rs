@@ -355,7 +355,7 @@ impl Execution<'_> {
         tokio::pin!(wait);
         loop {
             changes.mark_unchanged();
-            self.plant.read_tools().await;
+            self.read_tools().await?;
             let offers = self.plant.offers();
             let (fallen, used) = (self.log.fallen(), self.plant.used_by_others(&run));
             let situation = Situation {
@@ -395,6 +395,15 @@ impl Execution<'_> {
                 }
                 () = self.teller.stopped() => return Err("stopped".to_owned()),
             }
+        }
+    }
+
+    /// Reads the tools of the tool changers. A tool changer that does not respond delays no stop.
+    async fn read_tools(&self) -> Result<(), String> {
+        tokio::select! {
+            biased;
+            () = self.teller.stopped() => Err("stopped".to_owned()),
+            () = self.plant.read_tools() => Ok(()),
         }
     }
 

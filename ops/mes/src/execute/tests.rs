@@ -1,11 +1,13 @@
 mod flow;
 mod loops;
+mod stops;
 
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use knowledge::{Knowledge, KnowledgeSource, SourceKind};
 use skills::{ParameterType, RunOutcome, SkillFault};
 
+use self::stops::StopAt;
 use super::*;
 use crate::process::{By, GivenParameter, Need, ProcessStep, ResultOf};
 
@@ -23,6 +25,8 @@ struct Fakes {
     halted_at: Mutex<Option<&'static str>>,
     halts: watch::Sender<u32>,
     unreachable: Option<&'static str>,
+    /// Counts the reads of the tool changers, which do not respond; `None` if they do.
+    silent_tools: Option<watch::Sender<u32>>,
     /// Skills named `Meet` wait for each other here.
     meets: Option<Arc<tokio::sync::Barrier>>,
     journal: Mutex<Vec<String>>,
@@ -94,6 +98,13 @@ impl Plant for Arc<Fakes> {
 
     fn connects(&self, _from: (&str, &str), _to: (&str, &str)) -> Result<(), String> {
         Ok(())
+    }
+
+    async fn read_tools(&self) {
+        if let Some(reads) = &self.silent_tools {
+            reads.send_modify(|reads| *reads += 1);
+            std::future::pending().await
+        }
     }
 
     fn used_by_others(&self, run: &str) -> BTreeMap<String, String> {
@@ -326,6 +337,7 @@ fn plant(offers: Vec<Offer>) -> Fakes {
         halted_at: Mutex::new(None),
         halts: watch::channel(0).0,
         unreachable: None,
+        silent_tools: None,
         meets: None,
         journal: Mutex::default(),
         kept: Mutex::default(),
@@ -695,38 +707,6 @@ async fn a_sequence_gives_each_step_what_it_needs_and_never_does_one_twice() {
             .unwrap()
             .contains("step 1: gripper.Release nothing was gripped")
     );
-}
-
-/// Stops the run at this step.
-struct StopAt(&'static str, watch::Sender<bool>);
-
-#[async_trait]
-impl JobObserver for StopAt {
-    async fn step(&self, step: &'static str) {
-        if step == self.0 {
-            self.1.send_replace(true);
-        }
-    }
-
-    async fn stopped(&self) {
-        let mut stop = self.1.subscribe();
-        let told = stop.wait_for(|stop| *stop).await.is_ok();
-        assert!(told, "the test is over");
-    }
-}
-
-#[tokio::test]
-async fn who_asked_can_stop_it_also_while_it_waits() {
-    let teller = StopAt("Wait", watch::channel(false).0);
-    let plant: Arc<dyn Plant> = Arc::new(Arc::new(plant(vec![])));
-    let slow = Process {
-        wait: Duration::from_secs(600),
-        ..process()
-    };
-    let run = tokio::time::timeout(Duration::from_secs(5), execute(&plant, &slow, 1, &teller))
-        .await
-        .unwrap();
-    assert_eq!(run.reason.as_deref(), Some("stopped"));
 }
 
 #[tokio::test]
