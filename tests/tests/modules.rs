@@ -453,6 +453,14 @@ fn a_manifest_in_a_folder_is_a_component_until_it_is_removed() {
             .contains("broken: its files are faulty")
             .then_some(())
     });
+    // A second supervisor would run the component twice.
+    let second = Command::new(program("ua-component"))
+        .args(["modules", folder.to_str().unwrap()])
+        .output()
+        .unwrap();
+    assert_eq!(second.status.code(), Some(69), "{second:?}");
+    let why = stdout(&second);
+    assert!(why.contains("in use by another"), "{why}");
     std::fs::remove_file(folder.join("dance.aml")).unwrap();
     eventually("its skills are gone", SOON, || {
         let listed = space(&["skills", "--interface", "lo"]);

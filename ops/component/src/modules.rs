@@ -8,7 +8,7 @@ use std::fs;
 use std::io::{self, Read as _};
 use std::os::unix::process::ExitStatusExt as _;
 use std::path::{Path, PathBuf};
-use std::process::{ExitCode, Stdio};
+use std::process::ExitCode;
 use std::time::Duration;
 
 use plant_opcua::synced;
@@ -63,6 +63,8 @@ pub(crate) fn run(arguments: impl Iterator<Item = OsString>) -> ExitCode {
 struct Supervisor {
     settings: Modules,
     state: PathBuf,
+    /// Claims the state folder. Each component has a clone.
+    claim: fs::File,
     numbers: ModuleNumbers,
     folder: ModuleFolder,
     running: JoinSet<(String, ComponentEnd)>,
@@ -72,23 +74,42 @@ struct Supervisor {
 }
 
 impl Supervisor {
+    /// Claims the state folder, and reads its numbers.
+    ///
+    /// # Errors
+    /// The folder cannot be used, or is claimed.
+    fn new(settings: Modules) -> io::Result<Self> {
+        let usual = || settings.folder.join(".ua-component");
+        let state = settings.state.clone().unwrap_or_else(usual);
+        fs::create_dir_all(&state).map_err(|error| about(&state, &error))?;
+        let file = state.join(CLAIM);
+        let claim = synced::claim(&file).map_err(|error| about(&file, &error))?;
+        let claim = claim.ok_or_else(|| {
+            let why = format!(
+                "in use by another `ua-component modules`, or by components that a killed one \
+                 left: stop them (`fuser -v {}` lists them), because each module has one component",
+                file.display()
+            );
+            about(&state, &why)
+        })?;
+        Ok(Self {
+            numbers: read_numbers(&state.join(NUMBERS))?,
+            settings,
+            state,
+            claim,
+            folder: ModuleFolder::default(),
+            running: JoinSet::new(),
+            stops: BTreeMap::new(),
+            findings: BTreeSet::new(),
+        })
+    }
+
     async fn run(settings: Modules) -> io::Result<()> {
         let (mut interrupt, mut terminate) = (
             signal(SignalKind::interrupt())?,
             signal(SignalKind::terminate())?,
         );
-        let usual = || settings.folder.join(".ua-component");
-        let state = settings.state.clone().unwrap_or_else(usual);
-        fs::create_dir_all(&state).map_err(|error| about(&state, &error))?;
-        let mut all = Self {
-            numbers: read_numbers(&state.join(NUMBERS))?,
-            settings,
-            state,
-            folder: ModuleFolder::default(),
-            running: JoinSet::new(),
-            stops: BTreeMap::new(),
-            findings: BTreeSet::new(),
-        };
+        let mut all = Self::new(settings)?;
         let began = Instant::now();
         let mut looks = interval(LOOK_EVERY);
         looks.set_missed_tick_behavior(MissedTickBehavior::Delay);
@@ -174,7 +195,9 @@ impl Supervisor {
             .arg0("ua-component")
             .arg(&file)
             .args(&self.settings.component)
-            .stdin(Stdio::null())
+            // It reads nothing. It keeps the claim if this program is killed, so that no second
+            // component starts for its module.
+            .stdin(self.claim.try_clone()?)
             // Ctrl-C ends this program, which then ends the components.
             .process_group(0)
             .kill_on_drop(true)
@@ -369,6 +392,8 @@ fn about(path: &Path, error: &dyn std::fmt::Display) -> io::Error {
 }
 
 const NUMBERS: &str = "numbers.json";
+/// The file in the state folder that is locked.
+const CLAIM: &str = "running";
 const LOOK_EVERY: Duration = Duration::from_millis(500);
 /// Time for a component to halt its runs and to end.
 const STOP_WITHIN: Duration = Duration::from_secs(30);
@@ -430,18 +455,43 @@ mod tests {
         fs::remove_dir_all(&folder).unwrap();
     }
 
+    fn of_state(state: &Path) -> Modules {
+        let state = state.to_str().unwrap();
+        Modules::try_parse_from(["modules", "/nowhere", "--state", state]).unwrap()
+    }
+
+    #[test]
+    fn a_second_supervisor_of_a_state_folder_is_refused_while_components_of_the_first_run() {
+        let state = std::env::temp_dir().join(format!("ua-claimed-{}", std::process::id()));
+        let first = Supervisor::new(of_state(&state)).unwrap();
+        let refused = || Supervisor::new(of_state(&state)).err().unwrap().to_string();
+        let why = refused();
+        assert!(why.contains("ua-claimed"), "{why}");
+        assert!(
+            why.contains("in use by another `ua-component modules`"),
+            "{why}"
+        );
+        // A killed supervisor leaves its components.
+        let mut component = std::process::Command::new("sleep")
+            .arg("60")
+            .stdin(first.claim.try_clone().unwrap())
+            .spawn()
+            .unwrap();
+        drop(first);
+        assert_eq!(refused(), why);
+        component.kill().unwrap();
+        component.wait().unwrap();
+        // A process that another test forks has the file open until it executes its program.
+        let claimed = (0..200_000).any(|_| Supervisor::new(of_state(&state)).is_ok());
+        assert!(claimed, "{}", refused());
+        fs::remove_dir_all(&state).unwrap();
+    }
+
     #[test]
     fn a_number_that_cannot_be_stored_starts_no_component_also_at_the_next_try() {
         let state = std::env::temp_dir().join(format!("ua-state-{}", std::process::id()));
-        let mut all = Supervisor {
-            settings: Modules::try_parse_from(["modules", "/nowhere"]).unwrap(),
-            state: state.clone(),
-            numbers: ModuleNumbers::default(),
-            folder: ModuleFolder::default(),
-            running: JoinSet::new(),
-            stops: BTreeMap::new(),
-            findings: BTreeSet::new(),
-        };
+        let mut all = Supervisor::new(of_state(&state)).unwrap();
+        fs::remove_dir_all(&state).unwrap();
         for _ in 0..2 {
             let error = all.start("a", Path::new("/nowhere/a.mtp")).unwrap_err();
             assert!(error.to_string().contains("numbers.json"), "{error}");

@@ -2,12 +2,13 @@
 //! revocations.
 
 use std::fmt;
-use std::fs::{self, File, TryLockError};
+use std::fs::{self, File};
 use std::io::{self, Write as _};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use opcua::crypto::{PrivateKey, random};
+use plant_opcua::synced;
 use trust::{
     Certificate, CertificateAuthority, CertificateSigningRequest, Crl, Issue, Revoked, Serial,
     Unfit,
@@ -367,14 +368,8 @@ pub(crate) fn write_key(path: &Path, pem: &str) -> io::Result<()> {
 /// Returns an error if another server has locked the folder.
 pub(crate) fn claim(folder: &Path) -> Result<File, AuthorityStoreFault> {
     let path = folder.join("running");
-    let file = File::create(&path).map_err(io_at(&path))?;
-    match file.try_lock() {
-        Ok(()) => Ok(file),
-        Err(TryLockError::WouldBlock) => Err(AuthorityStoreFault::Claimed(folder.to_owned())),
-        // Some network file systems have no locks.
-        Err(TryLockError::Error(error)) if error.kind() == io::ErrorKind::Unsupported => Ok(file),
-        Err(TryLockError::Error(source)) => Err(AuthorityStoreFault::Io { path, source }),
-    }
+    let claimed = synced::claim(&path).map_err(io_at(&path))?;
+    claimed.ok_or_else(|| AuthorityStoreFault::Claimed(folder.to_owned()))
 }
 
 fn random_serial() -> Serial {

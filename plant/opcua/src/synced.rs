@@ -1,7 +1,7 @@
 //! Crash-safe replacement of files: after a killed process or a full disk, a file has its old or
-//! its new content.
+//! its new content. Claims of files by one of several processes.
 
-use std::fs::{self, File};
+use std::fs::{self, File, TryLockError};
 use std::io::{self, Write as _};
 use std::path::{Path, PathBuf};
 
@@ -16,6 +16,27 @@ pub fn replace(path: &Path, content: &[u8]) -> io::Result<()> {
     let beside = PathBuf::from(beside);
     write_synced_for_owner(&beside, content)?;
     rename_synced(&beside, path)
+}
+
+/// Claims what a file stands for, until the returned file and its clones, also those of child
+/// processes, are closed. The file is created if necessary. Returns `None` if another process has
+/// claimed it.
+///
+/// # Errors
+/// Returns an error if the file cannot be created or locked.
+pub fn claim(path: &Path) -> io::Result<Option<File>> {
+    let mut options = File::options();
+    options.read(true).write(true).create(true).truncate(false);
+    let file = options.open(path)?;
+    match file.try_lock() {
+        Ok(()) => Ok(Some(file)),
+        Err(TryLockError::WouldBlock) => Ok(None),
+        // Some network file systems have no locks.
+        Err(TryLockError::Error(error)) if error.kind() == io::ErrorKind::Unsupported => {
+            Ok(Some(file))
+        }
+        Err(TryLockError::Error(error)) => Err(error),
+    }
 }
 
 pub(crate) fn write_synced(path: &Path, content: &[u8]) -> io::Result<()> {
