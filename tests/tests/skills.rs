@@ -80,6 +80,7 @@ fn state(name: &str) -> (u32, &'static str) {
 mod configuration;
 mod faults;
 mod foreign;
+mod nodesets;
 mod reload;
 mod robot;
 mod values;

@@ -514,6 +514,30 @@ fn types_below_a_type_are_found_over_two_node_sets_in_any_order() {
 }
 
 #[test]
+fn the_node_sets_of_the_domains_are_sources_of_their_own() {
+    let knowledge = Knowledge::new().unwrap();
+    let domains = [
+        include_str!("../../../examples/plant/nodesets/UaBridge.Device.NodeSet2.xml"),
+        include_str!("../../../examples/plant/nodesets/UaBridge.Gripper.NodeSet2.xml"),
+        include_str!("../../../examples/plant/nodesets/UaBridge.ToolChanger.NodeSet2.xml"),
+    ];
+    for text in domains {
+        let read = nodeset::read(text).unwrap();
+        let source = KnowledgeSource::new(SourceKind::NodeSet, &read.namespace);
+        knowledge.replace(&source, &read.triples, 5).unwrap();
+    }
+    let found = ask(
+        &knowledge,
+        "types",
+        &[("type", "urn:ua-bridge:skills#i=1000")],
+    );
+    let names = column(&found, "name");
+    for name in ["GraspSkillType", "ChangeToolSkillType"] {
+        assert!(names.contains(&name.to_owned()), "{name}: {names:?}");
+    }
+}
+
+#[test]
 fn a_node_set_tells_types_below_a_type_and_what_they_declare() {
     let knowledge = Knowledge::new().unwrap();
     let load = |file: &str| {

@@ -2,6 +2,7 @@
 
 mod dictionary;
 mod domains;
+mod head;
 mod methods;
 
 use std::fmt::Write as _;
@@ -10,6 +11,7 @@ use program::{ProgramMethod, Rest};
 
 pub use self::domains::{DomainNodeSet, domain_nodesets};
 
+use self::head::head;
 use super::table::{SkillType, TableUnit, TableVariable};
 use super::types::TYPES;
 use super::{
@@ -22,7 +24,7 @@ use crate::value::{Builtin, SkillValue};
 /// Returns the NodeSet of [`NAMESPACE`]. The text is deterministic and requires namespace 0 only.
 #[must_use]
 pub fn nodeset() -> String {
-    let mut nodes = Nodes(HEAD.replace("{NAMESPACE}", NAMESPACE));
+    let mut nodes = Nodes(head(None));
     for skill_type in &TYPES {
         nodes.skill_type(skill_type);
     }
@@ -653,34 +655,6 @@ const ANALOG_ITEM_TYPE: &str = "i=2368";
 const ANALOG_UNIT_TYPE: &str = "i=17497";
 const ANALOG_UNIT_RANGE_TYPE: &str = "i=17570";
 const TYPES_NAMESPACE: &str = " xmlns=\"http://opcfoundation.org/UA/2008/02/Types.xsd\"";
-
-const HEAD: &str = r#"<?xml version="1.0" encoding="utf-8"?>
-<UANodeSet xmlns="http://opcfoundation.org/UA/2011/03/UANodeSet.xsd" LastModified="2026-11-25T00:00:00Z">
-  <NamespaceUris>
-    <Uri>{NAMESPACE}</Uri>
-  </NamespaceUris>
-  <Models>
-    <Model ModelUri="{NAMESPACE}" Version="0.1.0" PublicationDate="2026-11-25T00:00:00Z">
-      <RequiredModel ModelUri="http://opcfoundation.org/UA/" Version="1.05.02" PublicationDate="2022-11-01T00:00:00Z" />
-    </Model>
-  </Models>
-  <Aliases>
-    <Alias Alias="Boolean">i=1</Alias>
-    <Alias Alias="UInt16">i=5</Alias>
-    <Alias Alias="Int32">i=6</Alias>
-    <Alias Alias="UInt32">i=7</Alias>
-    <Alias Alias="Float">i=10</Alias>
-    <Alias Alias="Double">i=11</Alias>
-    <Alias Alias="String">i=12</Alias>
-    <Alias Alias="HasModellingRule">i=37</Alias>
-    <Alias Alias="HasTypeDefinition">i=40</Alias>
-    <Alias Alias="GeneratesEvent">i=41</Alias>
-    <Alias Alias="HasSubtype">i=45</Alias>
-    <Alias Alias="HasProperty">i=46</Alias>
-    <Alias Alias="HasComponent">i=47</Alias>
-    <Alias Alias="HasDictionaryEntry">i=17597</Alias>
-  </Aliases>
-"#;
 
 #[cfg(test)]
 mod tests;

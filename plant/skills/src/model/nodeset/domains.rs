@@ -1,11 +1,13 @@
 //! The NodeSet in parts, one for each domain, for engineering tools that need some of the types.
 //!
-//! All parts are of one namespace. The part of devices defines the model and is loaded first; the
-//! others have no model of their own.
+//! The nodes of all parts are of one namespace. The part of devices is its model. Each other part
+//! is a model of its own that requires it: loaders order documents by their models, and some load
+//! only one document of a model.
 
 use super::super::table::SkillType;
 use super::super::types::TYPES;
-use super::{HEAD, NAMESPACE, Nodes};
+use super::head::head;
+use super::{NAMESPACE, Nodes};
 
 /// A part of the NodeSet.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -16,27 +18,49 @@ pub struct DomainNodeSet {
     pub text: String,
 }
 
-/// A file, and the types whose subtypes it contains with the types themselves.
-const DOMAINS: [(&str, &[&str]); 6] = [
-    ("UaBridge.Device.NodeSet2.xml", &["SkillType"]),
-    (
-        "UaBridge.Robotics.NodeSet2.xml",
-        &["MotionSkillType", "NavigateToSkillType"],
-    ),
-    ("UaBridge.Gripper.NodeSet2.xml", &["GripperSkillType"]),
-    ("UaBridge.ToolChanger.NodeSet2.xml", &["ToolSkillType"]),
-    (
-        "UaBridge.Composite.NodeSet2.xml",
-        &["PickAndPlaceSkillType"],
-    ),
-    (
-        "UaBridge.Process.NodeSet2.xml",
-        &[
+struct NodeSetDomain {
+    file: &'static str,
+    /// The end of the URI of its model; `None` for the model of the namespace.
+    model: Option<&'static str>,
+    /// The types whose subtypes it contains with the types themselves.
+    types: &'static [&'static str],
+}
+
+const DOMAINS: [NodeSetDomain; 6] = [
+    NodeSetDomain {
+        file: "UaBridge.Device.NodeSet2.xml",
+        model: None,
+        types: &["SkillType"],
+    },
+    NodeSetDomain {
+        file: "UaBridge.Robotics.NodeSet2.xml",
+        model: Some("robotics"),
+        types: &["MotionSkillType", "NavigateToSkillType"],
+    },
+    NodeSetDomain {
+        file: "UaBridge.Gripper.NodeSet2.xml",
+        model: Some("gripper"),
+        types: &["GripperSkillType"],
+    },
+    NodeSetDomain {
+        file: "UaBridge.ToolChanger.NodeSet2.xml",
+        model: Some("tool-changer"),
+        types: &["ToolSkillType"],
+    },
+    NodeSetDomain {
+        file: "UaBridge.Composite.NodeSet2.xml",
+        model: Some("composite"),
+        types: &["PickAndPlaceSkillType"],
+    },
+    NodeSetDomain {
+        file: "UaBridge.Process.NodeSet2.xml",
+        model: Some("process"),
+        types: &[
             "ExecuteProcessSkillType",
             "LocateObjectSkillType",
             "RunConveyorSkillType",
         ],
-    ),
+    },
 ];
 
 /// Returns the NodeSet of [`NAMESPACE`] in parts, in the order in which they are loaded.
@@ -44,24 +68,20 @@ const DOMAINS: [(&str, &[&str]); 6] = [
 pub fn domain_nodesets() -> Vec<DomainNodeSet> {
     let parts = DOMAINS.iter().enumerate();
     parts
-        .map(|(at, (file, _))| DomainNodeSet {
-            file,
-            text: part(at),
+        .map(|(at, part)| DomainNodeSet {
+            file: part.file,
+            text: part_text(at, part.model),
         })
         .collect()
 }
 
-fn part(at: usize) -> String {
-    let head = HEAD.replace("{NAMESPACE}", NAMESPACE);
-    let is_first = at == 0;
-    let mut nodes = Nodes(match is_first {
-        true => head,
-        false => without_model(&head),
-    });
+fn part_text(at: usize, model: Option<&str>) -> String {
+    let model = model.map(|model| format!("{NAMESPACE}:{model}"));
+    let mut nodes = Nodes(head(model.as_deref()));
     for of in TYPES.iter().filter(|of| domain(of) == at) {
         nodes.skill_type(of);
     }
-    if is_first {
+    if model.is_none() {
         nodes.event_type();
         nodes.controller_type();
         nodes.used_skills();
@@ -75,20 +95,13 @@ fn part(at: usize) -> String {
 /// Returns the index of the domain of a type: that of the nearest type of its chain which is
 /// listed.
 fn domain(of: &'static SkillType) -> usize {
-    let listed = |name: &str| DOMAINS.iter().position(|(_, types)| types.contains(&name));
+    let listed = |name: &str| {
+        let mut domains = DOMAINS.iter();
+        domains.position(|domain| domain.types.contains(&name))
+    };
     of.chain()
         .find_map(|above| listed(above.name))
         .unwrap_or_default()
-}
-
-fn without_model(head: &str) -> String {
-    match (
-        head.split_once("  <Models>"),
-        head.split_once("</Models>\n"),
-    ) {
-        (Some((before, _)), Some((_, after))) => format!("{before}{after}"),
-        _ => head.to_owned(),
-    }
 }
 
 #[cfg(test)]
@@ -99,22 +112,44 @@ mod tests {
     use super::*;
     use crate::model::nodeset;
 
+    /// Returns the texts from a mark to the next quotation mark.
+    fn after<'t>(text: &'t str, mark: &str) -> Vec<&'t str> {
+        let rests = text.split(mark).skip(1);
+        rests.filter_map(|rest| rest.split('"').next()).collect()
+    }
+
     fn nodes(text: &str) -> BTreeSet<&str> {
-        let ids = text.split(" NodeId=\"").skip(1);
-        ids.filter_map(|rest| rest.split('"').next()).collect()
+        after(text, " NodeId=\"").into_iter().collect()
     }
 
     #[test]
-    fn the_parts_have_each_node_once_and_the_first_defines_the_model() {
+    fn the_parts_have_each_node_once_and_a_model_each_that_requires_the_first() {
         let parts = domain_nodesets();
         let whole = nodeset();
         let mut all = BTreeSet::new();
+        let mut models = BTreeSet::new();
         for part in &parts {
             for node in nodes(&part.text) {
                 assert!(all.insert(node), "{}: {node}", part.file);
             }
-            let is_first = part.file == "UaBridge.Device.NodeSet2.xml";
-            assert_eq!(part.text.contains("<Models>"), is_first, "{}", part.file);
+            let [model] = after(&part.text, "<Model ModelUri=\"")[..] else {
+                panic!("{}", part.file)
+            };
+            assert!(models.insert(model.to_owned()), "{model} is there twice");
+            let uris = after(&part.text, "<Uri>").into_iter();
+            let uris: Vec<&str> = uris.filter_map(|rest| rest.split('<').next()).collect();
+            let required = after(&part.text, "<RequiredModel ModelUri=\"");
+            let core = "http://opcfoundation.org/UA/";
+            match part.file {
+                "UaBridge.Device.NodeSet2.xml" => {
+                    assert_eq!((uris, required), (vec![NAMESPACE], vec![core]));
+                    assert_eq!(model, NAMESPACE);
+                }
+                _ => assert_eq!(
+                    (uris, required),
+                    (vec![NAMESPACE, model], vec![core, NAMESPACE])
+                ),
+            }
             let supertypes_are_known = part
                 .text
                 .split("ParentNodeId=\"")
