@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use bridge_core::{
     AskErrorKind, AskId, CallDescription, CallField, CallRole, Executed, Local, OfferedCall,
-    Output, Reason,
+    Output, Reason, Relay,
 };
 use cell::{SimulatedCell, SimulatedProgram, component, ms, topic};
 use mappings::TopicId;
@@ -210,10 +210,11 @@ fn requests_say_when_they_were_sent_and_how_long_their_caller_still_waits() {
 }
 
 #[test]
-fn the_chunks_of_a_request_and_of_its_repetitions_have_no_time() {
+fn the_chunks_of_repetitions_have_the_time_of_the_first_transmission() {
     let mut cell = plugged_in();
     cell.kill(GRIPPER);
     let before = cell.datagrams_of(BRIDGE).len();
+    let asked = cell.now().utc.unix_nanos();
     cell.ask(BRIDGE, AskId(1), (start(), &large(50_000)), ms(1_000));
     cell.run(ms(250));
     let sent = cell.datagrams_of(BRIDGE).split_off(before);
@@ -225,7 +226,32 @@ fn the_chunks_of_a_request_and_of_its_repetitions_have_no_time() {
     assert!(!first.is_empty());
     assert_eq!(first, &again[..first.len()]);
     let header = NetworkMessage::decode(first[0]).unwrap().header();
-    assert_eq!(header.timestamp, None);
+    let sent = Timestamp {
+        time: header.timestamp.unwrap(),
+        picoseconds: header.picoseconds.unwrap_or_default(),
+    };
+    assert!((sent.unix_nanos() - asked).abs() < 1_000_000);
+}
+
+#[test]
+fn a_large_request_that_a_broker_held_is_executed_only_while_its_caller_waits() {
+    for (held, executions) in [(700, 1), (1_300, 0)] {
+        let mut cell = plugged_in();
+        // The caller is on UDP alone; its requests are forwarded to the broker of the component.
+        let relay = Relay {
+            within: ms(5_000),
+            authorized: true,
+        };
+        cell.programs[GRIPPER].router.set_relay(Some(relay));
+        cell.stop(GRIPPER);
+        let large = large(50_000);
+        cell.ask(BRIDGE, AskId(1), (start(), &large), ms(1_000));
+        cell.run(ms(held));
+        cell.resume(GRIPPER);
+        assert_eq!(cell.executions(GRIPPER).len(), executions, "{held} ms");
+        let late = cell.dropped(GRIPPER, Reason::Late);
+        assert_eq!(late > 0, executions == 0, "{held} ms: {late}");
+    }
 }
 
 #[test]

@@ -76,14 +76,11 @@ impl TopicQueues {
         self.overhead > 0
     }
 
-    /// Returns the headers of a request or a response that is sent in chunks. Over a broker they
-    /// contain the time of sending. On UDP they do not: the chunks of a repetition fill in lost
-    /// chunks of the first transmission, so both must be equal.
-    pub(super) fn chunk_header(&self, now: Now) -> NetworkHeader<'static> {
-        match self.relay {
-            None => NetworkHeader::default(),
-            Some(_) => timed_header(now),
-        }
+    /// Returns whether each repetition of a request or a response in chunks has its own time of
+    /// sending, as over a broker. On UDP it has the time of the first transmission: its chunks
+    /// replace lost chunks of the first transmission, so both must be equal.
+    pub(super) const fn dates_repetitions(&self) -> bool {
+        self.relay.is_some()
     }
 
     /// Returns whether the caller of a request has stopped waiting while a broker had the request:

@@ -19,9 +19,8 @@ pub(super) struct Chunking {
     waiting: VecDeque<Large>,
     /// The last assigned MessageSequenceNumber.
     next: u16,
-    /// The assigned MessageSequenceNumbers for repetitions, and their messages in the order of
-    /// assignment.
-    numbers: BTreeMap<Of, u16>,
+    /// The first transmissions for repetitions, and their messages in the order of assignment.
+    first: BTreeMap<Of, FirstTransmission>,
     given: VecDeque<Of>,
     /// Whether the queue has given way to a chunk of a value after its last chunk.
     pub(super) gave_way: bool,
@@ -34,12 +33,31 @@ pub(super) enum Of {
     Response(u64),
 }
 
+/// The first transmission of a message.
+#[derive(Clone, Copy, Debug)]
+struct FirstTransmission {
+    /// Its MessageSequenceNumber.
+    number: u16,
+    /// Its times, if its repetitions have them too.
+    times: Option<FirstTimes>,
+}
+
+/// The times of the first transmission of a message. Its repetitions have them too, so that the
+/// chunks of all transmissions are equal.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct FirstTimes {
+    /// The headers with the time of sending.
+    pub(super) header: NetworkHeader<'static>,
+    /// The time in ms for which the requestor still waited, which is the TimeoutHint.
+    pub(super) left: Option<f64>,
+}
+
 /// A message that is sent in chunks.
 #[derive(Debug)]
 struct Large {
     topic: TopicId,
     of: Of,
-    number: u16,
+    first: FirstTransmission,
     bytes: Vec<u8>,
     offset: usize,
 }
@@ -65,36 +83,53 @@ impl Chunking {
         if self.waiting.iter().any(|large| large.of == of) {
             return;
         }
-        let number = match self.numbers.get(&of) {
-            Some(number) => *number,
-            None => self.give(of),
+        let first = match self.first.get(&of) {
+            Some(first) => *first,
+            None => self.give(of, None),
         };
         self.waiting.push_back(Large {
             topic,
             of,
-            number,
+            first,
             bytes,
             offset: 0,
         });
     }
 
-    fn give(&mut self, of: Of) -> u16 {
+    /// Returns the times of the first transmission of a message, which are these ones if there was
+    /// none.
+    pub(super) fn first_times(&mut self, of: Of, times: FirstTimes) -> FirstTimes {
+        match self.first.get_mut(&of) {
+            Some(first) => *first.times.get_or_insert(times),
+            None => {
+                self.give(of, Some(times));
+                times
+            }
+        }
+    }
+
+    fn give(&mut self, of: Of, times: Option<FirstTimes>) -> FirstTransmission {
         if self.given.len() >= MOST_NUMBERS
             && let Some(oldest) = self.given.pop_front()
         {
-            self.numbers.remove(&oldest);
+            self.first.remove(&oldest);
         }
         self.next = self.next.wrapping_add(1);
-        self.numbers.insert(of, self.next);
+        let first = FirstTransmission {
+            number: self.next,
+            times,
+        };
+        self.first.insert(of, first);
         self.given.push_back(of);
-        self.next
+        first
     }
 
-    /// Appends the next chunk.
+    /// Appends the next chunk. `start` are its headers if it does not have those of the first
+    /// transmission.
     pub(super) fn write(
         &mut self,
         most: usize,
-        start: &NetworkHeader<'_>,
+        start: &NetworkHeader<'static>,
         out: &mut Vec<u8>,
     ) -> Option<(TopicId, Result<(), ChunkError>)> {
         let large = self.waiting.front_mut()?;
@@ -113,9 +148,10 @@ impl Large {
     fn write(
         &mut self,
         most: usize,
-        start: &NetworkHeader<'_>,
+        start: &NetworkHeader<'static>,
         out: &mut Vec<u8>,
     ) -> Result<(), ChunkError> {
+        let start = self.first.times.map_or(*start, |times| times.header);
         let (space, namespace, _) = self.topic.triple();
         let header = NetworkHeader {
             publisher_id: Some(PublisherId::UInt16(space)),
@@ -123,12 +159,12 @@ impl Large {
                 writer_group_id: Some(namespace),
                 ..GroupHeader::default()
             }),
-            ..*start
+            ..start
         };
         let whole = Whole {
             message_type: NetworkMessageType::DataSet,
             writer_id: None,
-            message_sequence_number: self.number,
+            message_sequence_number: self.first.number,
             bytes: &self.bytes,
         };
         let budget = ChunkBudget {
@@ -144,6 +180,6 @@ impl Large {
     }
 }
 
-/// The maximum number of stored MessageSequenceNumbers. It exceeds the number of calls that wait
+/// The maximum number of stored first transmissions. It exceeds the number of calls that wait
 /// for a response at the same time.
 const MOST_NUMBERS: usize = 2_048;

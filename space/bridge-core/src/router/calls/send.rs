@@ -6,7 +6,7 @@ use uadp::{EncodeError, Extras, NetworkHeader, PublisherId};
 
 use super::super::late::timed_header;
 use super::CallTraffic;
-use super::chunks::Of;
+use super::chunks::{Chunking, FirstTimes, Of};
 use crate::counters::Reason;
 use crate::output::Output;
 use crate::settings::Now;
@@ -28,7 +28,7 @@ impl CallTraffic<'_> {
     fn next_chunk(&mut self, now: Now) -> Option<Output> {
         let values_wait = !self.values.paced.is_empty();
         let most = self.most();
-        let header = self.values.chunk_header(now);
+        let header = timed_header(now);
         let calls = self.calls.as_mut()?;
         let chunking = &mut calls.chunking;
         if chunking.is_empty() || !self.values.pace.is_open(now.monotonic) {
@@ -79,7 +79,7 @@ impl CallTraffic<'_> {
     fn write_action(&mut self, bytes: &mut Vec<u8>, now: Now) -> Option<CallOutput> {
         let headers = Headers {
             timed: timed_header(now),
-            of_chunks: self.values.chunk_header(now),
+            dates_repetitions: self.values.dates_repetitions(),
             most: self.most(),
         };
         loop {
@@ -92,11 +92,13 @@ impl CallTraffic<'_> {
             }
             let since = calls.since_start(now);
             let answer = calls.responder.poll_transmit(since);
-            let answer =
-                answer.map(|(_, answer)| (Of::message(&answer), headers.encode(&answer, bytes)));
-            let next = answer.or_else(|| {
-                let request = calls.requestor.poll_transmit(since);
-                request.map(|request| (Of::message(&request), headers.encode(&request, bytes)))
+            let action = match answer {
+                Some((_, answer)) => Some(answer),
+                None => calls.requestor.poll_transmit(since),
+            };
+            let next = action.map(|action| {
+                let written = headers.encode(&action, &mut calls.chunking, bytes);
+                (Of::message(&action), written)
             });
             match next {
                 // Timeouts that occurred in the meantime are output.
@@ -131,24 +133,42 @@ enum CallOutput {
 
 /// The headers of requests and responses.
 struct Headers {
-    /// The headers of a message that fits into a datagram.
+    /// The headers with the time of sending.
     timed: NetworkHeader<'static>,
-    of_chunks: NetworkHeader<'static>,
+    /// Whether each repetition in chunks has its own time of sending.
+    dates_repetitions: bool,
     /// The maximum size of a datagram in bytes.
     most: usize,
 }
 
 impl Headers {
-    /// Encodes the NetworkMessage. The time of sending and the TimeoutHint of a request in a single
-    /// datagram say how long its requestor waits. If repetitions in chunks need no time, they are
-    /// equal.
-    fn encode(&self, action: &ActionToSend<'_>, bytes: &mut Vec<u8>) -> Written {
+    /// Encodes the NetworkMessage. The time of sending and the TimeoutHint of a request say how
+    /// long its requestor waits. On UDP the repetitions in chunks are equal to the first
+    /// transmission.
+    fn encode(
+        &self,
+        action: &ActionToSend<'_>,
+        chunking: &mut Chunking,
+        bytes: &mut Vec<u8>,
+    ) -> Written {
         let written = encode(&action.with_time_left(), &self.timed, bytes);
-        if bytes.len() <= self.most || self.of_chunks.timestamp.is_some() {
+        if bytes.len() <= self.most || self.dates_repetitions {
+            return written;
+        }
+        let now = FirstTimes {
+            header: self.timed,
+            left: action.left,
+        };
+        let first = chunking.first_times(Of::message(action), now);
+        if first == now {
             return written;
         }
         bytes.clear();
-        encode(action, &self.of_chunks, bytes)
+        let repetition = ActionToSend {
+            left: first.left,
+            ..*action
+        };
+        encode(&repetition.with_time_left(), &first.header, bytes)
     }
 }
 
