@@ -2,6 +2,7 @@
 //! change, and the outcome of processes.
 
 mod exchange;
+mod opcua_knowledge;
 
 use std::fs;
 use std::io::{Read as _, Write as _};

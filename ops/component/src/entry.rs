@@ -168,7 +168,7 @@ impl UaComponent {
             configuration: Some(self.pki_root(component).join("configuration.json")),
             source: Some((text.clone(), self.file().display().to_string())),
             file: Some(Arc::clone(file)),
-            extension: None,
+            extensions: Vec::new(),
         }
     }
 }

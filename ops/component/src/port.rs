@@ -61,7 +61,7 @@ pub struct ComponentOptions {
     /// The YAML file, which is read again while the component runs.
     pub file: Option<Arc<ComponentFile>>,
     /// Additional objects of the component in its OPC UA server.
-    pub extension: Option<Arc<dyn skills::server::Extension>>,
+    pub extensions: Vec<Arc<dyn skills::server::Extension>>,
 }
 
 /// Returns the mapping of a component, which has a single namespace and no variables.
@@ -126,7 +126,7 @@ impl ComponentPort {
             supervision: Supervision::default(),
             power_off: component.power_off.then(power_off),
             configuration: options.configuration.clone(),
-            extension: options.extension.clone(),
+            extensions: options.extensions.clone(),
         };
         let mut reporters = Vec::new();
         let (mut asking, mut topics) = (Asking::new(), Topics::default());

@@ -16,6 +16,7 @@ use plant_opcua::types::{
     DataValue, DateTime, ExtensionObject, LocalizedText, NodeId, QualifiedName, RelativePath,
     StatusCode, Variant,
 };
+use plant_opcua::users::UserAccess;
 use serde_json::Value as Json;
 use tokio::runtime::Handle;
 use tracing::{info, warn};
@@ -193,7 +194,7 @@ impl skills::server::Extension for JobControl {
 
     fn serve(
         &self,
-        server: &OpcUaServer,
+        (server, _): (&OpcUaServer, &UserAccess),
         component: &NodeId,
         ids: &mut IdRange,
     ) -> Result<(), InstanceError> {

@@ -15,6 +15,7 @@
 //! - `goal`: the search for a sequence that reaches a goal
 //! - `jobs`: processes that clients start, several at a time
 //! - `job_orders`, `order_file`, `job_control`: jobs for clients of OPC 10031-4
+//! - `knowledge_methods`: queries and changes for clients of OPC UA
 //! - `execution_skill` and `locate_skill`: the skills of the MES
 
 mod cell;
@@ -25,6 +26,7 @@ mod goal;
 mod job_control;
 mod job_orders;
 mod jobs;
+mod knowledge_methods;
 mod live;
 mod locate_skill;
 mod order_file;
@@ -46,7 +48,9 @@ use std::time::Duration;
 use bridge_node::{
     Arguments, Context, Failure, FailureKind, KeyService, Made, Owned, Program, WithoutMapping,
 };
-use knowledge::{HttpEndpoint, Knowledge, May, QueryLimits, SourceFiles, Writes};
+use knowledge::{
+    HttpEndpoint, Knowledge, KnowledgeRequests, May, Queries, QueryLimits, SourceFiles, Writes,
+};
 use mappings::{Mapping, SpaceId};
 use plant_opcua::enrolment::GdsArguments;
 use plant_opcua::users::{self, UserAccess, UserRole};
@@ -65,6 +69,7 @@ use crate::execution_skill::ExecuteProcess;
 use crate::job_control::JobControl;
 use crate::job_orders::Orders;
 use crate::jobs::ProcessJobs;
+use crate::knowledge_methods::KnowledgeMethods;
 use crate::locate_skill::LocateObject;
 use crate::order_file::OrderFile;
 use crate::settings::{Connect, Settings};
@@ -235,24 +240,16 @@ impl UaMes {
         Ok(knowledge)
     }
 
-    /// Returns the handlers of changes over HTTP.
-    fn writes(&self, ready: &Ready, jobs: Arc<ProcessJobs>) -> Result<Writes, Failure> {
+    /// Reads the users that may change the knowledge and start jobs.
+    fn access(&self, ready: &Ready) -> Result<Arc<UserAccess>, Failure> {
         let settings = &ready.settings;
         let folder = self.pki_root(settings).join(users::FOLDER);
         let access = UserAccess::new(Some(folder), settings.sparql.ip().is_loopback());
-        let access = access.map_err(|fault| {
+        access.map(Arc::new).map_err(|fault| {
             Failure::new(
                 FailureKind::Configuration,
                 format!("cannot read the users: {fault}"),
             )
-        })?;
-        let access = Arc::new(access);
-        Ok(Writes {
-            now: cell::now,
-            may: has(&access, UserRole::Engineer),
-            may_run: has(&access, UserRole::Operator),
-            files: Arc::clone(ready.cell.sources()) as Arc<dyn SourceFiles>,
-            jobs,
         })
     }
 
@@ -339,7 +336,7 @@ impl UaMes {
             configuration: None,
             source: None,
             file: None,
-            extension: None,
+            extensions: Vec::new(),
         }
     }
 
@@ -352,17 +349,10 @@ impl UaMes {
     }
 
     /// Serves queries, and follows the components of the plant.
-    async fn serve(&self, ready: &Ready, jobs: Arc<ProcessJobs>) -> Result<(), Failure> {
+    async fn serve(&self, ready: &Ready, queries: Queries, writes: Writes) -> Result<(), Failure> {
         let page = page(&ready.cell);
         let address = ready.settings.sparql;
-        let endpoint = HttpEndpoint::bind_with(
-            address,
-            Arc::clone(&ready.knowledge),
-            QueryLimits::default(),
-            page,
-            Some(self.writes(ready, jobs)?),
-        )
-        .await;
+        let endpoint = HttpEndpoint::bind_with(address, queries, page, Some(writes)).await;
         let endpoint = endpoint.map_err(|error| {
             Failure::new(
                 FailureKind::Unavailable,
@@ -470,7 +460,11 @@ impl Program for UaMes {
     async fn start(&self, _context: Context) -> Result<ComponentPort, Failure> {
         let ready = self.ready()?;
         let jobs = Arc::new(ProcessJobs::new(Arc::clone(&ready.cell), Handle::current()));
-        self.serve(ready, Arc::clone(&jobs)).await?;
+        let access = self.access(ready)?;
+        let writes = writes(ready, &access, Arc::clone(&jobs));
+        let queries = Queries::new(Arc::clone(&ready.knowledge), QueryLimits::default());
+        let requests = KnowledgeRequests::new(queries.clone(), &writes);
+        self.serve(ready, queries, writes).await?;
         let folder = self.store.as_ref().or(ready.settings.store.as_ref());
         let orders = match folder {
             Some(folder) => Orders::of_file(OrderFile::open(folder).map_err(|error| {
@@ -481,10 +475,11 @@ impl Program for UaMes {
             None => Orders::default(),
         };
         let control = JobControl::new(jobs, orders, Handle::current());
+        let methods = KnowledgeMethods::new(requests, access, &ready.settings.endpoint);
         let gds = self.gds.invitation();
         let gds = gds.map_err(|fault| Failure::new(FailureKind::Usage, fault.to_string()))?;
         let options = ComponentOptions {
-            extension: Some(Arc::new(control)),
+            extensions: vec![Arc::new(control), Arc::new(methods)],
             gds,
             ..ready.options.clone()
         };
@@ -493,6 +488,17 @@ impl Program for UaMes {
             drop(tokio::spawn(run_process(skill.clone(), iri.clone())));
         }
         Ok(port)
+    }
+}
+
+/// Returns the handlers of changes.
+fn writes(ready: &Ready, access: &Arc<UserAccess>, jobs: Arc<ProcessJobs>) -> Writes {
+    Writes {
+        now: cell::now,
+        may: has(access, UserRole::Engineer),
+        may_run: has(access, UserRole::Operator),
+        files: Arc::clone(ready.cell.sources()) as Arc<dyn SourceFiles>,
+        jobs,
     }
 }
 

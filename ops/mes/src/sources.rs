@@ -7,7 +7,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use knowledge::{
     Knowledge, KnowledgeSource, SourceCheck, SourceFiles, SourceFinding, SourceKind,
-    SourceLifetime, nodeset,
+    SourceLifetime, line_of, nodeset,
 };
 use mtp::{Module, Triple, escaped};
 use rml::{Folder, RmlMapping};
@@ -501,14 +501,10 @@ fn utf8(bytes: &[u8]) -> Result<String, String> {
 
 /// Creates a finding. Its line is the number behind the first `line` of the text.
 fn finding(source: &KnowledgeSource, what: String, refused: bool) -> Finding {
-    let line = what.split_once("line ").and_then(|(_, rest)| {
-        let end = rest.find(|c: char| !c.is_ascii_digit());
-        rest.get(..end.unwrap_or(rest.len()))?.parse().ok()
-    });
     Finding {
         kind: source.kind,
         source: source.name.clone(),
-        line,
+        line: line_of(&what),
         what,
         refused,
     }

@@ -53,7 +53,8 @@ impl ServedSite {
             );
             let running = self.queries.run(asked, Lane::Open(peer));
             match tokio::time::timeout_at(end, running).await {
-                Ok(Ok(BoundedResults::Written(_, rows))) => {
+                Ok(Ok(BoundedResults::Written(written))) => {
+                    let rows = written.bytes;
                     size += rows.len();
                     let each = size_of_each(&check);
                     let reading = tokio::task::spawn_blocking(move || violations_in(&check, &rows));

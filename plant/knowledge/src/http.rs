@@ -54,7 +54,7 @@ impl HttpEndpoint {
         limits: QueryLimits,
         page: ExtraPages,
     ) -> io::Result<Self> {
-        Self::bind_with(address, knowledge, limits, page, None).await
+        Self::bind_with(address, Queries::new(knowledge, limits), page, None).await
     }
 
     /// Listens at a loopback address for queries, and for changes if `writes` has their handlers.
@@ -63,8 +63,7 @@ impl HttpEndpoint {
     /// Fails if the address is in use, or is not a loopback address.
     pub async fn bind_with(
         address: SocketAddr,
-        knowledge: Arc<Knowledge>,
-        limits: QueryLimits,
+        queries: Queries,
         page: ExtraPages,
         writes: Option<Writes>,
     ) -> io::Result<Self> {
@@ -78,7 +77,7 @@ impl HttpEndpoint {
         let listener = TcpListener::bind(address).await?;
         let address = listener.local_addr()?;
         let site = ServedSite {
-            queries: Queries::new(knowledge, limits),
+            queries,
             page,
             writes,
         };
@@ -321,7 +320,7 @@ impl ServedSite {
         lane: Lane,
     ) -> Result<Response<Full<Bytes>>, HttpRefusal> {
         match self.queries.run(asked, lane).await? {
-            BoundedResults::Written(media, bytes) => Ok(content(media, bytes)),
+            BoundedResults::Written(written) => Ok(content(written.media, written.bytes)),
             BoundedResults::Answer(answer) => Ok(json_page(&json!(answer))),
             BoundedResults::Updated(done) => Ok(updated(done.changed)),
         }
@@ -350,7 +349,7 @@ impl ServedSite {
 impl Formats {
     /// Selects the first accepted format of each kind; JSON and N-Triples if all formats are
     /// accepted.
-    fn of(accepted: &[String]) -> Self {
+    pub(crate) fn of(accepted: &[String]) -> Self {
         let is_any = accepted.is_empty()
             || accepted
                 .iter()
@@ -429,25 +428,23 @@ impl HttpRefusal {
 
 impl From<QueryFault> for HttpRefusal {
     fn from(fault: QueryFault) -> Self {
-        let (status, code) = match &fault {
-            QueryFault::Malformed(_) | QueryFault::Graph(_) => {
-                (StatusCode::BAD_REQUEST, "malformed")
+        let status = match &fault {
+            QueryFault::Malformed(_)
+            | QueryFault::Graph(_)
+            | QueryFault::NotAQuery
+            | QueryFault::Service
+            | QueryFault::Load
+            | QueryFault::TooComplex(_) => StatusCode::BAD_REQUEST,
+            QueryFault::ReadOnly | QueryFault::Protected(_) => StatusCode::FORBIDDEN,
+            QueryFault::Change(_) | QueryFault::Memory { .. } | QueryFault::Result { .. } => {
+                StatusCode::INSUFFICIENT_STORAGE
             }
-            QueryFault::NotAQuery => (StatusCode::BAD_REQUEST, "not_a_query"),
-            QueryFault::Service | QueryFault::Load => (StatusCode::BAD_REQUEST, "service"),
-            QueryFault::ReadOnly => (StatusCode::FORBIDDEN, "read_only"),
-            QueryFault::Protected(_) => (StatusCode::FORBIDDEN, "protected"),
-            QueryFault::Change(_) => (StatusCode::INSUFFICIENT_STORAGE, "storage"),
-            QueryFault::TooComplex(_) => (StatusCode::BAD_REQUEST, "too_complex"),
-            QueryFault::TooLong { .. } => (StatusCode::PAYLOAD_TOO_LARGE, "too_large"),
-            QueryFault::Time { .. } => (StatusCode::SERVICE_UNAVAILABLE, "time_limit"),
-            QueryFault::Memory { .. } => (StatusCode::INSUFFICIENT_STORAGE, "memory_limit"),
-            QueryFault::Busy(_) => (StatusCode::SERVICE_UNAVAILABLE, "busy"),
-            QueryFault::Result { .. } => (StatusCode::INSUFFICIENT_STORAGE, "result_limit"),
-            QueryFault::NotAcceptable(_) => (StatusCode::NOT_ACCEPTABLE, "not_acceptable"),
-            QueryFault::Failed(_) => (StatusCode::INTERNAL_SERVER_ERROR, "failed"),
+            QueryFault::TooLong { .. } => StatusCode::PAYLOAD_TOO_LARGE,
+            QueryFault::Time { .. } | QueryFault::Busy(_) => StatusCode::SERVICE_UNAVAILABLE,
+            QueryFault::NotAcceptable(_) => StatusCode::NOT_ACCEPTABLE,
+            QueryFault::Failed(_) => StatusCode::INTERNAL_SERVER_ERROR,
         };
-        Self::new(status, code, &fault.to_string())
+        Self::new(status, fault.code(), &fault.to_string())
     }
 }
 

@@ -27,11 +27,13 @@ pub(crate) enum Lane {
     Plan,
     /// Any query of the client with this address.
     Open(IpAddr),
+    /// Any query of the users whose names have this hash.
+    User(u64),
 }
 
 impl Lane {
     fn is_open(self) -> bool {
-        matches!(self, Self::Open(_))
+        matches!(self, Self::Open(_) | Self::User(_))
     }
 }
 
@@ -116,7 +118,7 @@ impl Lanes {
             Lane::Named => &self.named,
             Lane::Write => &self.write,
             Lane::Plan => &self.plan,
-            Lane::Open(_) => &self.quick,
+            Lane::Open(_) | Lane::User(_) => &self.quick,
         };
         let waits = Waits::new(&self.waiting, lane);
         let place = tokio::time::timeout(WAIT, Arc::clone(places).acquire_owned()).await;

@@ -16,7 +16,8 @@
 //! statements), `journal` (lasting sources), `component` and `nodeset` (facts to statements),
 //! `question` (named queries), `query` and `bounds` (any SPARQL, within limits), `lanes` (the
 //! queries that run at a time), `http`, `update` and `writes` (changes by users), `shapes` and
-//! `checking` (the SHACL report), `units` (conversion of numbers).
+//! `checking` (the SHACL report), `units` (conversion of numbers), `requests` (queries and changes
+//! for other protocols than HTTP).
 
 mod bounds;
 mod checking;
@@ -28,6 +29,7 @@ pub mod nodeset;
 pub mod owl;
 mod query;
 mod question;
+mod requests;
 mod rules;
 mod shapes;
 mod source;
@@ -36,17 +38,20 @@ pub mod units;
 mod update;
 mod writes;
 mod writing;
+mod written;
 
 pub use component::{
     ComponentFacts, NodeName, OPC_UA, ParameterFacts, SkillFacts, TypeFacts, is_iri,
 };
 pub use http::{ExtraPages, HttpEndpoint};
 pub use mtp::vocabulary;
-pub use query::QueryLimits;
+pub use query::{Queries, QueryLimits};
 pub use question::{NamedQuestion, QUESTIONS, QuestionAnswer, QuestionFault};
+pub use requests::{KnowledgeRefusal, KnowledgeRequests, LoadedSource, QueryRequest, line_of};
 pub use source::{KnowledgeSource, SourceKind};
 pub use store::{Knowledge, KnowledgeFault, SourceLifetime, SourceStatus};
 pub use writes::{JobRunner, May, SourceCheck, SourceFiles, SourceFinding, Writes};
+pub use written::WrittenResult;
 
 /// Returns an empty folder for a test.
 #[cfg(test)]

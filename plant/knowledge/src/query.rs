@@ -4,7 +4,7 @@
 //! stack for nesting. A query beyond its time limit is cancelled and reported as such; it counts as
 //! running until its thread has ended. `lanes` decides which queries run.
 
-use std::io::{self, Write};
+use std::io;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -25,6 +25,7 @@ use crate::lanes::{Lane, Lanes, Seat};
 use crate::question::{MOST_ROWS, NamedQuestion, QuestionAnswer};
 use crate::store::{Knowledge, KnowledgeFault};
 use crate::update::{self, Updated};
+use crate::written::{Bounded, ResultCut, ResultSize, WrittenResult};
 
 /// Limits of a query.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -79,8 +80,8 @@ pub(crate) struct Formats {
 /// Result of a query.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) enum BoundedResults {
-    /// Encoded result of SELECT, ASK, CONSTRUCT or DESCRIBE, with its media type.
-    Written(&'static str, Vec<u8>),
+    /// Encoded result of SELECT, ASK, CONSTRUCT or DESCRIBE.
+    Written(WrittenResult),
     /// Result of a named question.
     Answer(QuestionAnswer),
     /// Result of an update.
@@ -166,10 +167,34 @@ pub(crate) enum QueryFault {
 pub(crate) enum QueryOrQuestion {
     /// A query of a client.
     Sparql(String, Dataset, Formats),
+    /// A query of a client, whose result may end early.
+    Cut(String, Formats, ResultCut),
     /// A question with its parameters filled in, for an answer in plain JSON.
     Question(NamedQuestion, String),
     /// An update at a time in milliseconds since 1970.
     Update(String, u64),
+}
+
+impl QueryFault {
+    /// Returns the code of the fault for clients.
+    pub(crate) const fn code(&self) -> &'static str {
+        match self {
+            Self::Malformed(_) | Self::Graph(_) => "malformed",
+            Self::NotAQuery => "not_a_query",
+            Self::Service | Self::Load => "service",
+            Self::ReadOnly => "read_only",
+            Self::Protected(_) => "protected",
+            Self::Change(_) => "storage",
+            Self::TooComplex(_) => "too_complex",
+            Self::TooLong { .. } => "too_large",
+            Self::Time { .. } => "time_limit",
+            Self::Memory { .. } => "memory_limit",
+            Self::Busy(_) => "busy",
+            Self::Result { .. } => "result_limit",
+            Self::NotAcceptable(_) => "not_acceptable",
+            Self::Failed(_) => "failed",
+        }
+    }
 }
 
 impl From<KnowledgeFault> for QueryFault {
@@ -188,16 +213,18 @@ impl From<KnowledgeFault> for QueryFault {
     }
 }
 
-/// The running queries.
+/// The running queries. Clones share their places and limits.
 #[derive(Debug, Clone)]
-pub(crate) struct Queries {
+pub struct Queries {
     knowledge: Arc<Knowledge>,
     limits: QueryLimits,
     lanes: Arc<Lanes>,
 }
 
 impl Queries {
-    pub(crate) fn new(knowledge: Arc<Knowledge>, limits: QueryLimits) -> Self {
+    /// Creates the places for queries on `knowledge`.
+    #[must_use]
+    pub fn new(knowledge: Arc<Knowledge>, limits: QueryLimits) -> Self {
         Self {
             knowledge,
             limits,
@@ -227,9 +254,15 @@ impl Queries {
         asked: QueryOrQuestion,
         lane: Lane,
     ) -> Result<BoundedResults, QueryFault> {
-        let limits = self.limits;
+        let mut limits = self.limits;
+        if let QueryOrQuestion::Cut(.., cut) = &asked {
+            // The last row fits, unless it is larger than all others together.
+            limits.bytes = limits.bytes.min(cut.bytes.saturating_mul(2));
+        }
         let text = match &asked {
-            QueryOrQuestion::Sparql(query, ..) if query.len() > limits.query => {
+            QueryOrQuestion::Sparql(query, ..) | QueryOrQuestion::Cut(query, ..)
+                if query.len() > limits.query =>
+            {
                 return Err(QueryFault::TooLong { most: limits.query });
             }
             QueryOrQuestion::Update(text, _) if text.len() > LARGEST_UPDATE => {
@@ -238,6 +271,7 @@ impl Queries {
                 });
             }
             QueryOrQuestion::Sparql(text, ..)
+            | QueryOrQuestion::Cut(text, ..)
             | QueryOrQuestion::Question(_, text)
             | QueryOrQuestion::Update(text, _) => text.clone(),
         };
@@ -332,7 +366,9 @@ impl Work {
         let evaluator = SparqlEvaluator::new().with_cancellation_token(self.token.clone());
         let (text, dataset) = match &self.asked {
             QueryOrQuestion::Sparql(text, dataset, _) => (text, dataset.clone()),
-            QueryOrQuestion::Question(_, text) => (text, Dataset::default()),
+            QueryOrQuestion::Question(_, text) | QueryOrQuestion::Cut(text, ..) => {
+                (text, Dataset::default())
+            }
             QueryOrQuestion::Update(text, at) => {
                 let update = update::read(text)?;
                 return match self.knowledge.update(&update, &self.token, *at) {
@@ -363,45 +399,60 @@ impl Work {
             .on_store(self.knowledge.store())
             .execute()
             .map_err(|error| self.fault(&error))?;
-        match (results, &self.asked) {
-            (QueryResults::Solutions(solutions), QueryOrQuestion::Question(question, _)) => {
-                let answer = question.answer(solutions);
-                let answer = answer.map_err(|error| self.fault(&error))?;
-                if answer.rows.len() < MOST_ROWS {
-                    Ok(BoundedResults::Answer(answer))
-                } else {
-                    Err(self.too_much())
-                }
+        self.written(results)
+    }
+
+    fn written(&self, results: QueryResults<'_>) -> Result<BoundedResults, QueryFault> {
+        let (formats, cut) = match &self.asked {
+            QueryOrQuestion::Question(question, _) => return self.answer(*question, results),
+            QueryOrQuestion::Sparql(.., formats) => (formats, None),
+            QueryOrQuestion::Cut(_, formats, cut) => (formats, Some(*cut)),
+            QueryOrQuestion::Update(..) => return Err(QueryFault::ReadOnly),
+        };
+        let written = match results {
+            QueryResults::Solutions(solutions) => {
+                let format = formats.solutions;
+                let format = format.ok_or(QueryFault::NotAcceptable("SELECT"))?;
+                self.solutions(solutions, format, cut)
             }
-            (QueryResults::Solutions(solutions), QueryOrQuestion::Sparql(.., formats)) => self
-                .solutions(
-                    solutions,
-                    formats
-                        .solutions
-                        .ok_or(QueryFault::NotAcceptable("SELECT"))?,
-                ),
-            (QueryResults::Boolean(value), QueryOrQuestion::Sparql(.., formats)) => {
+            QueryResults::Boolean(value) => {
                 let format = formats.solutions.ok_or(QueryFault::NotAcceptable("ASK"))?;
                 let written = QueryResultsSerializer::from_format(format)
                     .serialize_boolean_to_writer(Vec::new(), value);
-                written
-                    .map(|bytes| BoundedResults::Written(format.media_type(), bytes))
-                    .map_err(|error| self.broken(&error))
+                let bytes = written.map_err(|error| self.broken(&error))?;
+                Ok(WrittenResult {
+                    media: format.media_type(),
+                    bytes,
+                    rows: 1,
+                    is_truncated: false,
+                })
             }
-            (QueryResults::Graph(triples), QueryOrQuestion::Sparql(.., formats)) => self.triples(
-                triples,
-                formats
-                    .triples
-                    .ok_or(QueryFault::NotAcceptable("CONSTRUCT"))?,
-            ),
-            (_, QueryOrQuestion::Update(..)) => Err(QueryFault::ReadOnly),
-            (
-                QueryResults::Boolean(_) | QueryResults::Graph(_),
-                QueryOrQuestion::Question(question, _),
-            ) => Err(QueryFault::Failed(format!(
+            QueryResults::Graph(triples) => {
+                let format = formats.triples;
+                let format = format.ok_or(QueryFault::NotAcceptable("CONSTRUCT"))?;
+                self.triples(triples, format, cut)
+            }
+        };
+        written.map(BoundedResults::Written)
+    }
+
+    fn answer(
+        &self,
+        question: NamedQuestion,
+        results: QueryResults<'_>,
+    ) -> Result<BoundedResults, QueryFault> {
+        let QueryResults::Solutions(solutions) = results else {
+            return Err(QueryFault::Failed(format!(
                 "the question `{}` is no SELECT",
                 question.name
-            ))),
+            )));
+        };
+        let answer = question.answer(solutions);
+        let answer = answer.map_err(|error| self.fault(&error))?;
+        if answer.rows.len() < MOST_ROWS {
+            Ok(BoundedResults::Answer(answer))
+        } else {
+            Err(self.too_much())
         }
     }
 
@@ -409,47 +460,46 @@ impl Work {
         &self,
         solutions: QuerySolutionIter<'_>,
         format: QueryResultsFormat,
-    ) -> Result<BoundedResults, QueryFault> {
-        let to = Bounded {
-            bytes: Vec::new(),
-            most: self.limits.bytes,
-        };
+        cut: Option<ResultCut>,
+    ) -> Result<WrittenResult, QueryFault> {
+        let to = Bounded::new(self.limits.bytes);
+        let mut size = ResultSize::new(self.limits, cut, &to);
         let variables = solutions.variables().to_vec();
         let mut writer = QueryResultsSerializer::from_format(format)
             .serialize_solutions_to_writer(to, variables)
             .map_err(|error| self.broken(&error))?;
-        for (solution, row) in solutions.zip(0..) {
+        for solution in solutions {
             let solution = solution.map_err(|error| self.fault(&error))?;
-            if row >= self.limits.rows {
-                return Err(self.too_much());
+            if !size.takes_another().ok_or_else(|| self.too_much())? {
+                break;
             }
             writer
                 .serialize(&solution)
                 .map_err(|error| self.broken(&error))?;
         }
         let to = writer.finish().map_err(|error| self.broken(&error))?;
-        Ok(BoundedResults::Written(format.media_type(), to.bytes))
+        Ok(size.written(format.media_type(), to.bytes))
     }
 
     fn triples(
         &self,
         triples: QueryTripleIter<'_>,
         format: RdfFormat,
-    ) -> Result<BoundedResults, QueryFault> {
-        let mut to = RdfSerializer::from_format(format).for_writer(Bounded {
-            bytes: Vec::new(),
-            most: self.limits.bytes,
-        });
-        for (triple, row) in triples.zip(0..) {
+        cut: Option<ResultCut>,
+    ) -> Result<WrittenResult, QueryFault> {
+        let to = Bounded::new(self.limits.bytes);
+        let mut size = ResultSize::new(self.limits, cut, &to);
+        let mut to = RdfSerializer::from_format(format).for_writer(to);
+        for triple in triples {
             let triple = triple.map_err(|error| self.fault(&error))?;
-            if row >= self.limits.rows {
-                return Err(self.too_much());
+            if !size.takes_another().ok_or_else(|| self.too_much())? {
+                break;
             }
             to.serialize_triple(&triple)
                 .map_err(|error| self.broken(&error))?;
         }
         let to = to.finish().map_err(|error| self.broken(&error))?;
-        Ok(BoundedResults::Written(format.media_type(), to.bytes))
+        Ok(size.written(format.media_type(), to.bytes))
     }
 
     fn fault(&self, error: &QueryEvaluationError) -> QueryFault {
@@ -475,26 +525,6 @@ impl Work {
             rows: self.limits.rows,
             bytes: self.limits.bytes,
         }
-    }
-}
-
-/// A writer with a limit of bytes.
-struct Bounded {
-    bytes: Vec<u8>,
-    most: usize,
-}
-
-impl Write for Bounded {
-    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
-        if self.bytes.len().saturating_add(bytes.len()) > self.most {
-            return Err(io::ErrorKind::FileTooLarge.into());
-        }
-        self.bytes.extend_from_slice(bytes);
-        Ok(bytes.len())
-    }
-
-    fn flush(&mut self) -> io::Result<()> {
-        Ok(())
     }
 }
 

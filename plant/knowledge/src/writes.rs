@@ -371,19 +371,22 @@ impl ServedSite {
 /// Returns the source in a path `/KIND/NAME`.
 fn named(path: &str) -> Result<(SourceKind, String), HttpRefusal> {
     let named = path.trim_start_matches('/').split_once('/');
-    let named = named.and_then(|(kind, name)| {
-        let kind: SourceKind = kind.parse().ok()?;
-        let is_file = matches!(
-            kind,
-            SourceKind::NodeSet | SourceKind::Mtp | SourceKind::File | SourceKind::Process
-        );
-        let name = unescaped(name)?;
-        (is_file && !name.is_empty() && name.len() <= LONGEST_NAME).then_some((kind, name))
-    });
+    let named = named.and_then(|(kind, name)| file_source(kind, &unescaped(name)?));
     named.ok_or_else(|| {
         let why = "a source is /sources/KIND/NAME; the kinds are nodeset, mtp, file and process";
         HttpRefusal::unknown(why.to_owned())
     })
+}
+
+/// Returns the kind and name of a source that is read from a file.
+pub(crate) fn file_source(kind: &str, name: &str) -> Option<(SourceKind, String)> {
+    let kind: SourceKind = kind.parse().ok()?;
+    let is_file = matches!(
+        kind,
+        SourceKind::NodeSet | SourceKind::Mtp | SourceKind::File | SourceKind::Process
+    );
+    let is_name = !name.is_empty() && name.len() <= LONGEST_NAME;
+    (is_file && is_name).then(|| (kind, name.to_owned()))
 }
 
 /// Checks whether a client may do something: the request does not come from a page of another site
@@ -457,7 +460,7 @@ pub(crate) fn failed(error: &dyn fmt::Display) -> HttpRefusal {
 /// Concurrent uploads, each of which is in memory as a whole.
 static UPLOADS: Semaphore = Semaphore::const_new(2);
 /// Concurrent checks of sources.
-static CHECKS: Semaphore = Semaphore::const_new(2);
+pub(crate) static CHECKS: Semaphore = Semaphore::const_new(2);
 const LARGEST_FILE: usize = 256 << 20;
 const LONGEST_NAME: usize = 256;
 const LARGEST_JOB: usize = 4096;

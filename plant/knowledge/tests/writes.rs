@@ -5,8 +5,8 @@ use std::net::SocketAddr;
 use std::sync::{Arc, Mutex};
 
 use knowledge::{
-    HttpEndpoint, JobRunner, Knowledge, KnowledgeSource, QueryLimits, SourceCheck, SourceFiles,
-    SourceFinding, SourceKind, Writes,
+    HttpEndpoint, JobRunner, Knowledge, KnowledgeSource, Queries, QueryLimits, SourceCheck,
+    SourceFiles, SourceFinding, SourceKind, Writes,
 };
 
 use crate::http::{Answered, send};
@@ -96,8 +96,7 @@ async fn site(may: bool) -> (HttpEndpoint, Arc<Knowledge>) {
     };
     let endpoint = HttpEndpoint::bind_with(
         "127.0.0.1:0".parse().unwrap(),
-        Arc::clone(&knowledge),
-        QueryLimits::default(),
+        Queries::new(Arc::clone(&knowledge), QueryLimits::default()),
         Arc::new(|_: &str| None),
         Some(writes),
     )

@@ -86,21 +86,23 @@ pub struct ServeSettings {
     /// at the end of the program.
     pub configuration: Option<PathBuf>,
     /// Additional objects of the component.
-    pub extension: Option<Arc<dyn Extension>>,
+    pub extensions: Vec<Arc<dyn Extension>>,
 }
 
 /// Adds objects to the object of a component.
 pub trait Extension: std::fmt::Debug + Send + Sync {
     /// Adds NodeSets and type loaders to the server.
-    fn prepare(&self, builder: ServerBuilder) -> ServerBuilder;
+    fn prepare(&self, builder: ServerBuilder) -> ServerBuilder {
+        builder
+    }
 
-    /// Creates the objects below the object of the component.
+    /// Creates the objects below the object of the component. The users are those of the server.
     ///
     /// # Errors
     /// A node cannot be created.
     fn serve(
         &self,
-        server: &OpcUaServer,
+        server: (&OpcUaServer, &UserAccess),
         component: &NodeId,
         ids: &mut IdRange,
     ) -> Result<(), InstanceError>;
@@ -192,7 +194,7 @@ impl ComponentServer {
         }
         let skills: Vec<Skill> = served.iter().map(|(skill, _)| skill.clone()).collect();
         if let Some(power_off) = settings.power_off.clone() {
-            let by = (power_off, users);
+            let by = (power_off, Arc::clone(&users));
             power::serve(&server, &root.node_id, &mut ids, &skills, by)?;
         }
         let mut tasks = JoinSet::new();
@@ -216,8 +218,8 @@ impl ComponentServer {
         tasks.spawn(shown);
         let values = (values, &configuration);
         let values = values::serve(&server, &root.node_id, &mut ids, values, &mut tasks)?;
-        if let Some(extension) = &settings.extension {
-            extension.serve(&server, &root.node_id, &mut ids)?;
+        for extension in &settings.extensions {
+            extension.serve((&server, &users), &root.node_id, &mut ids)?;
         }
         if let Some(node) = root.node("LeaseHolder").cloned() {
             tasks.spawn(show_holder(server.clone(), node, authority.holder()));
@@ -352,7 +354,7 @@ fn server_of(
     for (namespace, text) in component.device.iter().flat_map(|device| device.nodesets()) {
         builder = builder.nodeset_str(&namespace, &text);
     }
-    if let Some(extension) = &settings.extension {
+    for extension in &settings.extensions {
         builder = extension.prepare(builder);
     }
     Ok(builder.build()?)

@@ -205,6 +205,11 @@ impl UserAccess {
         *self.rules.write() = rules;
     }
 
+    /// Sets the permissions on a node, also for open sessions.
+    pub fn permit(&self, node: NodeId, permissions: NodePermissions) {
+        self.rules.write().nodes.insert(node, permissions);
+    }
+
     /// Registers a callback for login attempts.
     pub fn on_login(&self, told: impl Fn(&Login) + Send + Sync + 'static) {
         self.told.write().push(Arc::new(told));
