@@ -104,7 +104,7 @@ fn plant(manifests: &[(&str, String)], node_sets: &[String]) -> Knowledge {
         let read = nodeset::read(text).unwrap();
         knowledge
             .replace(
-                &KnowledgeSource::new(SourceKind::NodeSet, &read.namespace),
+                &KnowledgeSource::new(SourceKind::NodeSet, &read.model.namespace),
                 &read.triples,
                 1,
             )

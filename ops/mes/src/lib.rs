@@ -11,7 +11,7 @@
 //! - `record`: the record of runs
 //! - `cell`: the current state of the plant
 //! - `follow`: from discovery to the graph
-//! - `sources`: from files to the graph, while the program runs
+//! - `sources`, `nodeset_folder`: from files to the graph, while the program runs
 //! - `goal`: the search for a sequence that reaches a goal
 //! - `jobs`: processes that clients start, several at a time
 //! - `job_orders`, `order_file`, `job_control`: jobs for clients of OPC 10031-4
@@ -29,6 +29,7 @@ mod jobs;
 mod knowledge_methods;
 mod live;
 mod locate_skill;
+mod nodeset_folder;
 mod order_file;
 mod plan;
 mod process;

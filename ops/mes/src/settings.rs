@@ -42,6 +42,8 @@ pub(crate) struct Settings {
     /// Turtle files.
     pub(crate) knowledge: Vec<Source>,
     pub(crate) nodesets: Vec<Source>,
+    /// The folder of the NodeSets that others require.
+    pub(crate) nodeset_folder: Option<Source>,
     pub(crate) manifests: Vec<Manifest>,
     pub(crate) rml: Vec<RmlSource>,
     /// Recipes of BatchML and BPMN.
@@ -75,7 +77,7 @@ impl Settings {
 }
 
 /// Keys of the document.
-const KEYS: [&str; 18] = [
+const KEYS: [&str; 19] = [
     "mes",
     "application_uri",
     "namespace",
@@ -89,6 +91,7 @@ const KEYS: [&str; 18] = [
     "rules",
     "knowledge",
     "nodesets",
+    "nodeset_folder",
     "manifests",
     "rml",
     "recipes",
@@ -117,6 +120,7 @@ impl Reading<'_> {
             rules,
             knowledge,
             nodesets,
+            nodeset_folder,
             manifests,
             rml,
             recipes,
@@ -143,13 +147,11 @@ impl Reading<'_> {
         let open = open.map_or(Some(false), |node| self.reader.boolean(node));
         let user = user.map(|node| skills::read_user(node, self.folder, &mut self.reader));
         let sparql = sparql.map_or(Some(DEFAULT_SPARQL), |node| self.address(node));
-        let store = match store {
-            Some(node) => Some(self.reader.text(node, "the path of a folder")?),
-            None => None,
-        };
+        let store = store.map(|node| self.folder(node));
         let rules = rules.map_or(Some(false), |node| self.reader.boolean(node));
         let knowledge = knowledge.map_or_else(Vec::new, |node| self.files(node));
         let nodesets = nodesets.map_or_else(Vec::new, |node| self.files(node));
+        let nodeset_folder = nodeset_folder.map(|node| self.folder(node));
         let manifests = manifests.map_or_else(Vec::new, |node| self.each(node, Self::manifest));
         let rml = rml.map_or_else(Vec::new, |node| self.each(node, Self::rml));
         let recipes = recipes.map_or_else(Vec::new, |node| self.each(node, Self::recipe));
@@ -171,10 +173,13 @@ impl Reading<'_> {
             open: open?,
             user: user.map_or(Some(None), |user| user.map(Some))?,
             sparql: sparql?,
-            store: store.map(|path| self.folder.join(path)),
+            store: store
+                .map_or(Some(None), |store| store.map(Some))?
+                .map(|store| store.path),
             rules: rules?,
             knowledge,
             nodesets,
+            nodeset_folder: nodeset_folder.map_or(Some(None), |folder| folder.map(Some))?,
             manifests,
             rml,
             recipes,

@@ -3,8 +3,10 @@
 //! A source that cannot be read is a finding of the status page; all other sources are read.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::path::Path;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
+use knowledge::nodeset::{ModelVersion, NodeSetModel};
 use knowledge::{
     Knowledge, KnowledgeSource, SourceCheck, SourceFiles, SourceFinding, SourceKind,
     SourceLifetime, line_of, nodeset,
@@ -15,6 +17,7 @@ use serde::Serialize;
 use tracing::{info, warn};
 
 use crate::cell::now;
+use crate::nodeset_folder::NodeSetFolder;
 use crate::process::Process;
 use crate::recipe::{self, Recipe};
 use crate::settings::{self, Manifest, RmlSource, Settings};
@@ -27,8 +30,12 @@ pub(crate) struct MesSources {
 
 #[derive(Debug, Default)]
 struct State {
-    /// The sources of the YAML.
+    /// The sources of the YAML, and the NodeSets that complete them.
     of_yaml: BTreeSet<KnowledgeSource>,
+    /// The folder of NodeSets that complete others.
+    folder: Option<Arc<NodeSetFolder>>,
+    /// The versions of NodeSets by their namespaces.
+    versions: BTreeMap<String, ModelVersion>,
     /// The findings by the source.
     findings: BTreeMap<KnowledgeSource, Vec<Finding>>,
 }
@@ -69,21 +76,12 @@ impl MesSources {
         self.try_one(units, |source| {
             self.put(source, &knowledge::units::triples(), SourceLifetime::No)
         });
-        for file in &settings.nodesets {
-            // The graph of a NodeSet is named by its namespace, which only the file has.
-            let read = bytes(file).and_then(|bytes| node_set(&decoded(&bytes)?));
-            let name = read.as_ref().map_or(&file.name, |read| &read.namespace);
-            let source = KnowledgeSource::new(SourceKind::NodeSet, name);
-            named.insert(source.clone());
-            self.try_one(source, |source| {
-                self.put(source, &read?.triples, SourceLifetime::No)
-            });
-        }
+        self.node_sets(settings, &mut named);
         for file in &settings.knowledge {
             let source = KnowledgeSource::new(SourceKind::File, &file.name);
             named.insert(source.clone());
             self.try_one(source, |source| {
-                let text = utf8(&bytes(file)?)?;
+                let text = utf8(&bytes(&file.path)?)?;
                 let read = self.knowledge.replace_turtle(source, &text, now());
                 read.map_err(|fault| fault.to_string())
             });
@@ -94,7 +92,7 @@ impl MesSources {
             self.try_one(source, |source| {
                 self.module(
                     source,
-                    &bytes(&manifest.source)?,
+                    &bytes(&manifest.source.path)?,
                     manifest,
                     SourceLifetime::No,
                 )
@@ -114,7 +112,7 @@ impl MesSources {
             let source = KnowledgeSource::new(SourceKind::Process, &recipe.source.name);
             named.insert(source.clone());
             self.try_one(source, |source| {
-                let bytes = bytes(&recipe.source)?;
+                let bytes = bytes(&recipe.source.path)?;
                 let read = recipe::read(&decoded(&bytes)?, &recipe.names);
                 self.recipe(source, read, SourceLifetime::No)
             });
@@ -131,6 +129,105 @@ impl MesSources {
             }
         }
         self.rules(settings.rules);
+    }
+
+    /// Reads the NodeSets, and completes them from the folder.
+    fn node_sets(&self, settings: &Settings, named: &mut BTreeSet<KnowledgeSource>) {
+        let mut models = Vec::new();
+        for file in &settings.nodesets {
+            // The graph of a NodeSet is named by its namespace, which only the file has.
+            let read = bytes(&file.path).and_then(|bytes| node_set(&decoded(&bytes)?));
+            let name = read
+                .as_ref()
+                .map_or(&file.name, |read| &read.model.namespace);
+            let source = KnowledgeSource::new(SourceKind::NodeSet, name);
+            named.insert(source.clone());
+            self.try_one(source, |source| {
+                let read = read?;
+                self.put(source, &read.triples, SourceLifetime::No)?;
+                models.push((source.clone(), read.model));
+                Ok(())
+            });
+        }
+        let mut folder = None;
+        if let Some(of_yaml) = &settings.nodeset_folder {
+            let source = KnowledgeSource::new(SourceKind::NodeSet, &of_yaml.name);
+            named.insert(source.clone());
+            self.try_one(source, |source| {
+                let read = folder.insert(Arc::new(NodeSetFolder::read(&of_yaml.path)?));
+                if let Some(what) = read.finding() {
+                    self.found(source, what, false);
+                }
+                Ok(())
+            });
+        }
+        {
+            let mut state = self.state();
+            state.folder = folder;
+            let versions = models.iter();
+            let versions =
+                versions.map(|(_, model)| (model.namespace.clone(), model.version.clone()));
+            state.versions.extend(versions);
+        }
+        let mut known = self.known_node_sets();
+        known.retain(|namespace, _| {
+            let source = KnowledgeSource::new(SourceKind::NodeSet, namespace);
+            // NodeSets that completed others before are read again.
+            named.contains(&source) || !self.state().of_yaml.contains(&source)
+        });
+        for (source, model) in &models {
+            let added = self.complete(source, model, &mut known, SourceLifetime::No);
+            named.extend(added);
+        }
+    }
+
+    /// Adds the NodeSets that a NodeSet requires from the folder, if there is one, and adds them to
+    /// `known`. Models that are missing or too old are findings of the NodeSet.
+    fn complete(
+        &self,
+        source: &KnowledgeSource,
+        model: &NodeSetModel,
+        known: &mut BTreeMap<String, ModelVersion>,
+        lasting: SourceLifetime,
+    ) -> Vec<KnowledgeSource> {
+        let folder = self.state().folder.clone();
+        let Some(completion) = folder.map(|folder| folder.complete(model, known)) else {
+            return Vec::new();
+        };
+        for what in completion.findings {
+            self.found(source, what, false);
+        }
+        let mut added = Vec::new();
+        for file in completion.files {
+            let namespace = file.model.namespace;
+            let other = KnowledgeSource::new(SourceKind::NodeSet, &namespace);
+            added.push(other.clone());
+            self.try_one(other, |other| {
+                let read = node_set(&decoded(&bytes(&file.path)?)?)?;
+                self.put(other, &read.triples, lasting)?;
+                let path = file.path.display();
+                info!(source = source.name, "{namespace} was added from {path}");
+                Ok(())
+            });
+            let version = file.model.version;
+            self.state()
+                .versions
+                .insert(namespace.clone(), version.clone());
+            known.insert(namespace, version);
+        }
+        added
+    }
+
+    /// Returns the NodeSets of the graph with their versions.
+    fn known_node_sets(&self) -> BTreeMap<String, ModelVersion> {
+        let state = self.state();
+        let sources = self.knowledge.sources().into_iter();
+        let all = sources.filter(|source| source.kind == SourceKind::NodeSet);
+        all.map(|source| {
+            let version = state.versions.get(&source.name).cloned();
+            (source.name, version.unwrap_or_default())
+        })
+        .collect()
     }
 
     fn rules(&self, are_on: bool) {
@@ -216,7 +313,7 @@ impl MesSources {
     fn mapped(&self, source: &KnowledgeSource, rml: &RmlSource) -> Result<(), String> {
         let path = &rml.mapping.path;
         let at = |what: &dyn std::fmt::Display| format!("{}: {what}", path.display());
-        let text = utf8(&bytes(&rml.mapping)?)?;
+        let text = utf8(&bytes(&rml.mapping.path)?)?;
         let mapping = RmlMapping::read(&text).map_err(|fault| at(&fault))?;
         let mut folder = Folder::of(path);
         if let Some(file) = &rml.file {
@@ -228,7 +325,7 @@ impl MesSources {
                     files.join(", ")
                 )));
             };
-            folder = folder.with(only, bytes(file)?);
+            folder = folder.with(only, bytes(&file.path)?);
         }
         let output = mapping.run(&mut folder).map_err(|fault| at(&fault))?;
         let turtle = output.turtle().map_err(|error| error.to_string())?;
@@ -249,6 +346,21 @@ impl MesSources {
         }
         self.state().findings.insert(source.clone(), findings);
         Ok(())
+    }
+
+    /// Returns the models that a NodeSet requires and the folder does not have.
+    fn missing(&self, kind: SourceKind, contents: &[u8]) -> Vec<String> {
+        let folder = self.state().folder.clone();
+        let folder = folder.filter(|_| kind == SourceKind::NodeSet);
+        let model = decoded(contents).ok();
+        let model = model.and_then(|text| nodeset::read_model(&text).ok());
+        match (folder, model) {
+            (Some(folder), Some(model)) => {
+                let known = self.known_node_sets();
+                folder.complete(&model, &known).findings
+            }
+            _ => Vec::new(),
+        }
     }
 
     fn process(&self, source: &KnowledgeSource, process: &Process) -> Result<(), String> {
@@ -326,7 +438,7 @@ impl MesSources {
     fn of_yaml(&self, source: &KnowledgeSource) -> Result<(), String> {
         if self.state().of_yaml.contains(source) {
             return Err(format!(
-                "the {} `{}` is named in the YAML of the MES; change the file there and send SIGHUP",
+                "the {} `{}` is named in the YAML of the MES, or completes a NodeSet there; change the file and send SIGHUP",
                 source.kind, source.name
             ));
         }
@@ -339,7 +451,7 @@ impl SourceFiles for MesSources {
         let mut source = KnowledgeSource::new(kind, name);
         let read = if kind == SourceKind::NodeSet {
             let read = node_set(&decoded(contents)?)?;
-            source = KnowledgeSource::new(kind, &read.namespace);
+            source = KnowledgeSource::new(kind, &read.model.namespace);
             Some(read)
         } else {
             None
@@ -364,6 +476,10 @@ impl SourceFiles for MesSources {
             }
             (SourceKind::NodeSet, Some(read)) => {
                 Self::put(self, &source, &read.triples, SourceLifetime::Yes)?;
+                let mut known = self.known_node_sets();
+                self.complete(&source, &read.model, &mut known, SourceLifetime::Yes);
+                let (namespace, version) = (read.model.namespace, read.model.version);
+                self.state().versions.insert(namespace, version);
             }
             (SourceKind::Mtp, _) => {
                 let manifest = Manifest {
@@ -392,6 +508,10 @@ impl SourceFiles for MesSources {
         let read = examined(&mut source, contents).and_then(|notes| {
             self.of_yaml(&source).map_err(|why| vec![why])?;
             Ok(notes)
+        });
+        let read = read.map(|mut notes| {
+            notes.extend(self.missing(kind, contents));
+            notes
         });
         let accepted = read.is_ok();
         let whats = read.unwrap_or_else(|faults| faults);
@@ -440,7 +560,7 @@ fn examined(source: &mut KnowledgeSource, contents: &[u8]) -> Result<Vec<String>
     match source.kind {
         SourceKind::NodeSet => {
             let text = decoded(contents).map_err(one)?;
-            source.name = node_set(&text).map_err(one)?.namespace;
+            source.name = node_set(&text).map_err(one)?.model.namespace;
             Ok(Vec::new())
         }
         SourceKind::Mtp => {
@@ -484,10 +604,10 @@ fn decoded(bytes: &[u8]) -> Result<std::borrow::Cow<'_, str>, String> {
     xml_text::decode(bytes).map_err(|fault| fault.to_string())
 }
 
-fn bytes(file: &settings::Source) -> Result<Vec<u8>, String> {
-    let path = file.path.display();
-    bridge_node::read_bounded(&file.path, LARGEST)
-        .map_err(|error| format!("cannot read {path}: {error}"))
+fn bytes(path: &Path) -> Result<Vec<u8>, String> {
+    let shown = path.display();
+    bridge_node::read_bounded(path, LARGEST)
+        .map_err(|error| format!("cannot read {shown}: {error}"))
 }
 
 fn utf8(bytes: &[u8]) -> Result<String, String> {
@@ -514,80 +634,4 @@ fn finding(source: &KnowledgeSource, what: String, refused: bool) -> Finding {
 const LARGEST: u64 = 64 << 20;
 
 #[cfg(test)]
-mod tests {
-    use std::path::Path;
-
-    use super::*;
-
-    #[test]
-    fn an_rml_mapping_of_the_yaml_is_a_source_and_its_faults_are_findings() {
-        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../examples/plant");
-        let yaml = |rml: &str| {
-            let text = format!("mes: m\napplication_uri: urn:x\nnamespace: 5\nrml: [{rml}]\n");
-            Settings::from_yaml(&text, &folder).unwrap()
-        };
-        let knowledge = Arc::new(Knowledge::new().unwrap());
-        let sources = MesSources::new(Arc::clone(&knowledge));
-        let statements = |name: &str| {
-            let all = knowledge.sources();
-            let found = all.iter().find(|source| source.name == name);
-            found.map(|source| source.statements)
-        };
-
-        sources.read(&yaml("parts.rml.ttl"));
-        assert_eq!(sources.findings(), []);
-        assert_eq!(statements("parts.rml.ttl"), Some(10));
-
-        sources.read(&yaml(
-            "{mapping: parts.rml.ttl, file: parts.xml, name: parts}",
-        ));
-        assert_eq!(statements("parts.rml.ttl"), None, "it left the YAML");
-        assert_eq!(statements("parts"), Some(10));
-
-        sources.read(&yaml(
-            "{mapping: parts.rml.ttl, file: mes.yaml, name: parts}",
-        ));
-        let findings = sources.findings();
-        let [found] = findings.as_slice() else {
-            panic!("{findings:?}")
-        };
-        assert!(found.refused);
-        let place =
-            "parts.rml.ttl: triples map <urn:example:parts:Parts>: source `parts.xml`: line 1";
-        assert!(found.what.contains(place), "{}", found.what);
-    }
-
-    #[test]
-    fn a_check_has_the_lines_of_the_findings_and_changes_nothing() {
-        let knowledge = Arc::new(Knowledge::new().unwrap());
-        let sources = MesSources::new(Arc::clone(&knowledge));
-        let before = *knowledge.changes().borrow();
-        let check = |kind, contents: &[u8]| sources.check(kind, "a", contents);
-        let good = check(SourceKind::File, b"<urn:a> <urn:p> 1 .");
-        assert_eq!(
-            (good.accepted, good.replaces, good.findings.len()),
-            (true, false, 0)
-        );
-        for (kind, contents, line) in [
-            (SourceKind::File, &b"<urn:a>\n<urn:p> ."[..], Some(2)),
-            (SourceKind::File, &b"<urn:a> <urn:p> 1 .\n\xff"[..], Some(2)),
-            (SourceKind::NodeSet, &b"<UANodeSet>\n</other>"[..], None),
-            (SourceKind::Mtp, &b"<CAEXFile>"[..], None),
-            (SourceKind::Run, &b""[..], None),
-        ] {
-            let bad = check(kind, contents);
-            let [found] = bad.findings.as_slice() else {
-                panic!("{bad:?}")
-            };
-            assert!(!bad.accepted && found.refused, "{bad:?}");
-            assert!(line.is_none() || found.line == line, "{bad:?}");
-        }
-        assert_eq!(*knowledge.changes().borrow(), before);
-        SourceFiles::put(&sources, SourceKind::File, "a", b"<urn:a> <urn:p> 1 .").unwrap();
-        assert!(check(SourceKind::File, b"<urn:a> <urn:p> 2 .").replaces);
-        let manifest = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../tests/data/mtp/stage.aml");
-        let manifest = check(SourceKind::Mtp, &std::fs::read(manifest).unwrap());
-        assert!(manifest.accepted, "{manifest:?}");
-        assert!(manifest.findings.iter().all(|found| found.line.is_some()));
-    }
-}
+mod tests;

@@ -5,6 +5,7 @@
 //! the indirect statements.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::fmt;
 
 use mtp::{Object, Triple, escaped};
 use quick_xml::XmlVersion;
@@ -20,12 +21,75 @@ use crate::vocabulary as v;
 /// The contents of a NodeSet.
 #[derive(Debug, Clone, PartialEq)]
 pub struct NodeSetContents {
-    /// The URI of its model, which is that of its namespace.
-    pub namespace: String,
-    /// The version of its model; empty if unknown.
-    pub version: String,
+    /// Its model.
+    pub model: NodeSetModel,
     /// Its statements.
     pub triples: Vec<Triple>,
+}
+
+/// The model of a NodeSet.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct NodeSetModel {
+    /// Its URI, which is that of its namespace.
+    pub namespace: String,
+    /// Its version.
+    pub version: ModelVersion,
+    /// The models that it requires, with the oldest versions that suffice.
+    pub required: Vec<(String, ModelVersion)>,
+}
+
+/// The version of a model.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct ModelVersion {
+    /// The version for people; empty if unknown.
+    pub version: String,
+    /// The date as in the file; empty if unknown.
+    pub publication_date: String,
+}
+
+impl ModelVersion {
+    /// Returns whether this version is older than another version: by the dates if both are known,
+    /// otherwise by the numbers of the versions. `false` if that cannot be decided.
+    #[must_use]
+    pub fn is_older_than(&self, other: &Self) -> bool {
+        match (self.day(), other.day()) {
+            (Some(own), Some(other)) => own < other,
+            _ => match (self.numbers(), other.numbers()) {
+                (Some(own), Some(other)) => own < other,
+                _ => false,
+            },
+        }
+    }
+
+    /// Returns the date without the time, as `2022-11-03`.
+    fn day(&self) -> Option<&str> {
+        let day = self.publication_date.trim().get(..10)?;
+        let is_date = day.bytes().enumerate().all(|(at, byte)| match at {
+            4 | 7 => byte == b'-',
+            _ => byte.is_ascii_digit(),
+        });
+        is_date.then_some(day)
+    }
+
+    fn numbers(&self) -> Option<Vec<u32>> {
+        let parts = self.version.trim().split('.');
+        let mut numbers: Vec<u32> = parts.map(|part| part.parse().ok()).collect::<Option<_>>()?;
+        while numbers.last() == Some(&0) {
+            numbers.pop();
+        }
+        Some(numbers)
+    }
+}
+
+impl fmt::Display for ModelVersion {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match (self.version.trim(), self.day()) {
+            ("", None) => f.write_str("unknown version"),
+            ("", Some(day)) => write!(f, "version of {day}"),
+            (version, None) => write!(f, "version {version}"),
+            (version, Some(day)) => write!(f, "version {version} of {day}"),
+        }
+    }
 }
 
 /// Error of reading a NodeSet.
@@ -58,6 +122,29 @@ pub enum NodeSetReadFault {
 /// # Errors
 /// [`NodeSetReadFault`].
 pub fn read(xml: &str) -> Result<NodeSetContents, NodeSetReadFault> {
+    let reading = parsed(xml, NodeSetExtent::Whole)?;
+    reading.finish().ok_or(NodeSetReadFault::NoModel)
+}
+
+/// Reads the model of a NodeSet2 file, from a text that may end behind its models.
+///
+/// # Errors
+/// [`NodeSetReadFault`].
+pub fn read_model(xml: &str) -> Result<NodeSetModel, NodeSetReadFault> {
+    let reading = parsed(xml, NodeSetExtent::Models)?;
+    let model = reading.model.filter(|model| !model.namespace.is_empty());
+    model.ok_or(NodeSetReadFault::NoModel)
+}
+
+/// The part of a file that is read.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum NodeSetExtent {
+    Whole,
+    /// All until the end of the models.
+    Models,
+}
+
+fn parsed(xml: &str, extent: NodeSetExtent) -> Result<Reading, NodeSetReadFault> {
     if xml.len() > MAX_FILE {
         return Err(NodeSetReadFault::TooLarge {
             length: xml.len(),
@@ -78,7 +165,13 @@ pub fn read(xml: &str) -> Result<NodeSetContents, NodeSetReadFault> {
             Event::Start(start) => reading
                 .open(&start)
                 .map_err(|error| fault(error.to_string()))?,
-            Event::End(_) => reading.close(),
+            Event::End(_) => {
+                reading.close();
+                let is_behind = reading.open.len() == 1 && reading.closed == "Models";
+                if is_behind && extent == NodeSetExtent::Models {
+                    break;
+                }
+            }
             Event::Text(text) => reading.text.push_str(&text.xml10_content()),
             Event::CData(text) => reading.text.push_str(&text.xml10_content()),
             Event::GeneralRef(reference) => {
@@ -102,17 +195,21 @@ pub fn read(xml: &str) -> Result<NodeSetContents, NodeSetReadFault> {
             Event::Empty(_) | Event::Comment(_) | Event::Decl(_) | Event::PI(_) => {}
         }
     }
-    reading.finish().ok_or(NodeSetReadFault::NoModel)
+    Ok(reading)
 }
 
 #[derive(Debug, Default)]
 struct Reading {
     /// The names of the open elements.
     open: Vec<String>,
+    /// The name of the element that was closed last.
+    closed: String,
     text: String,
     namespaces: Vec<String>,
     aliases: BTreeMap<String, String>,
-    model: Option<(String, String)>,
+    model: Option<NodeSetModel>,
+    /// Whether the first model, which is that of the file, is open.
+    is_first_model: bool,
     nodes: Vec<UaNode>,
     alias: String,
     reference: (String, bool),
@@ -137,6 +234,8 @@ enum NodeFault {
     Depth(usize),
     #[error("there are more than {0} nodes")]
     Number(usize),
+    #[error("the model requires more than {0} models")]
+    Required(usize),
     #[error(transparent)]
     Attribute(#[from] AttrError),
     #[error(transparent)]
@@ -155,6 +254,12 @@ impl Reading {
             let value = attribute.normalized_value(XmlVersion::Implicit1_0)?;
             Ok(value.into_owned())
         };
+        let version = || -> Result<ModelVersion, NodeFault> {
+            Ok(ModelVersion {
+                version: text("Version")?,
+                publication_date: text("PublicationDate")?,
+            })
+        };
         let name = start.local_name().into_inner().to_owned();
         match (self.open.len(), name.as_str()) {
             (1, class) if CLASSES.contains(&class) => {
@@ -169,9 +274,8 @@ impl Reading {
                     ..UaNode::default()
                 });
             }
-            (2, "Model") if self.model.is_none() => {
-                self.model = Some((text("ModelUri")?, text("Version")?))
-            }
+            (2, "Model") => self.model(text("ModelUri")?, version()?),
+            (3, "RequiredModel") => self.required(text("ModelUri")?, version()?)?,
             (2, "Alias") => self.alias = text("Alias")?,
             (3, "Reference") => {
                 self.reference = (text("ReferenceType")?, text("IsForward")? != "false")
@@ -180,6 +284,30 @@ impl Reading {
         }
         self.text.clear();
         self.open.push(name);
+        Ok(())
+    }
+
+    /// Takes a model. The first one is that of the file.
+    fn model(&mut self, namespace: String, version: ModelVersion) {
+        self.is_first_model = self.model.is_none();
+        if self.is_first_model {
+            self.model = Some(NodeSetModel {
+                namespace,
+                version,
+                required: Vec::new(),
+            });
+        }
+    }
+
+    fn required(&mut self, namespace: String, version: ModelVersion) -> Result<(), NodeFault> {
+        let is_read = self.is_first_model && !namespace.is_empty();
+        let Some(model) = self.model.as_mut().filter(|_| is_read) else {
+            return Ok(());
+        };
+        if model.required.len() >= MAX_REQUIRED {
+            return Err(NodeFault::Required(MAX_REQUIRED));
+        }
+        model.required.push((namespace, version));
         Ok(())
     }
 
@@ -211,7 +339,7 @@ impl Reading {
             _ => {}
         }
         self.text.clear();
-        self.open.pop();
+        self.closed = self.open.pop().unwrap_or_default();
     }
 
     /// Resolves a node from its notation in the file, with an alias or an index of the namespace
@@ -239,24 +367,21 @@ impl Reading {
     }
 
     fn finish(self) -> Option<NodeSetContents> {
-        let (namespace, version) = self.model.clone().filter(|(uri, _)| !uri.is_empty())?;
+        let model = self.model.clone();
+        let model = model.filter(|model| !model.namespace.is_empty())?;
         let mut graph = Graph {
             reading: &self,
             all: Vec::new(),
         };
-        let iri = format!("urn:ua-bridge:nodeset:{}", escaped(&namespace));
+        let iri = format!("urn:ua-bridge:nodeset:{}", escaped(&model.namespace));
         graph.link(&iri, v::RDF_TYPE, v::NODE_SET);
-        graph.text(&iri, v::RDFS_LABEL, &namespace);
-        if !version.is_empty() {
-            graph.text(&iri, v::MODEL_VERSION, &version);
+        graph.text(&iri, v::RDFS_LABEL, &model.namespace);
+        if !model.version.version.is_empty() {
+            graph.text(&iri, v::MODEL_VERSION, &model.version.version);
         }
         graph.nodes();
         let triples = graph.all;
-        Some(NodeSetContents {
-            namespace,
-            version,
-            triples,
-        })
+        Some(NodeSetContents { model, triples })
     }
 }
 
@@ -399,4 +524,56 @@ const HAS_ORDERED_COMPONENT: &str = "i=49";
 /// The largest published file has 13 MB.
 pub(crate) const MAX_FILE: usize = 64 << 20;
 const MAX_DEPTH: usize = 64;
+const MAX_REQUIRED: usize = 256;
 pub(crate) const MAX_NODES: usize = 200_000;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn version(version: &str, date: &str) -> ModelVersion {
+        ModelVersion {
+            version: version.to_owned(),
+            publication_date: date.to_owned(),
+        }
+    }
+
+    #[test]
+    fn versions_are_compared_by_their_dates_and_then_by_their_numbers() {
+        let of_2021 = version("2.0", "2021-05-20T00:00:00Z");
+        let of_2022 = version("1.04.0", "2022-11-03T00:00:00.000Z");
+        assert!(of_2021.is_older_than(&of_2022));
+        assert!(!of_2022.is_older_than(&of_2021));
+        assert!(
+            !of_2022.is_older_than(&version("", "2022-11-03")),
+            "the same day"
+        );
+        assert!(version("1.9", "").is_older_than(&version("1.10.0", "2022-11-03")));
+        assert!(!version("1.4", "").is_older_than(&version("1.04.0", "")));
+        for unknown in [version("", ""), version("beta", "soon")] {
+            assert!(!unknown.is_older_than(&of_2022) && !of_2022.is_older_than(&unknown));
+        }
+        assert_eq!(of_2022.to_string(), "version 1.04.0 of 2022-11-03");
+    }
+
+    #[test]
+    fn the_model_is_read_from_the_beginning_of_a_file() {
+        let text = "<UANodeSet><Models><Model ModelUri=\"urn:a\" Version=\"1\">\
+            <RequiredModel ModelUri=\"urn:b\" PublicationDate=\"2022-11-03\"/></Model>\
+            <Model ModelUri=\"urn:c\"><RequiredModel ModelUri=\"urn:d\"/></Model></Models><UAObj";
+        let model = read_model(text).unwrap();
+        assert_eq!(
+            (model.namespace.as_str(), model.version),
+            ("urn:a", version("1", ""))
+        );
+        assert_eq!(
+            model.required,
+            [("urn:b".to_owned(), version("", "2022-11-03"))]
+        );
+        assert_eq!(
+            read_model("<UANodeSet><Models></Models>"),
+            Err(NodeSetReadFault::NoModel)
+        );
+        assert!(read_model("<UANodeSet><Models>").is_err());
+    }
+}

@@ -496,7 +496,7 @@ fn types_below_a_type_are_found_over_two_node_sets_in_any_order() {
     let knowledge = Knowledge::new().unwrap();
     for file in ["machines.xml", "devices.xml"] {
         let read = nodeset::read(&read_own(&format!("nodesets/{file}"))).unwrap();
-        let source = KnowledgeSource::new(SourceKind::NodeSet, &read.namespace);
+        let source = KnowledgeSource::new(SourceKind::NodeSet, &read.model.namespace);
         knowledge.replace(&source, &read.triples, 5).unwrap();
     }
     let below = |id: &str| {
@@ -545,7 +545,7 @@ fn a_node_set_tells_types_below_a_type_and_what_they_declare() {
         let read = nodeset::read(&text).unwrap();
         knowledge
             .replace(
-                &KnowledgeSource::new(SourceKind::NodeSet, &read.namespace),
+                &KnowledgeSource::new(SourceKind::NodeSet, &read.model.namespace),
                 &read.triples,
                 5,
             )

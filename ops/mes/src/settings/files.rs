@@ -62,6 +62,11 @@ impl Reading<'_> {
         })
     }
 
+    pub(super) fn folder(&mut self, node: &DocumentNode) -> Option<Source> {
+        let name = self.reader.text(node, "the path of a folder")?;
+        Some(self.source(name, name))
+    }
+
     fn source(&self, name: &str, path: &str) -> Source {
         Source {
             name: name.to_owned(),

@@ -129,7 +129,7 @@ fn foreign_node_sets() -> Option<Vec<String>> {
 fn put_node_sets(knowledge: &Knowledge, texts: &[String]) {
     for text in texts {
         let read = nodeset::read(text).unwrap();
-        let source = KnowledgeSource::new(SourceKind::NodeSet, &read.namespace);
+        let source = KnowledgeSource::new(SourceKind::NodeSet, &read.model.namespace);
         knowledge.replace(&source, &read.triples, 1).unwrap();
     }
 }

@@ -1,0 +1,169 @@
+use super::*;
+
+#[test]
+fn an_rml_mapping_of_the_yaml_is_a_source_and_its_faults_are_findings() {
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../examples/plant");
+    let yaml = |rml: &str| {
+        let text = format!("mes: m\napplication_uri: urn:x\nnamespace: 5\nrml: [{rml}]\n");
+        Settings::from_yaml(&text, &folder).unwrap()
+    };
+    let knowledge = Arc::new(Knowledge::new().unwrap());
+    let sources = MesSources::new(Arc::clone(&knowledge));
+    let statements = |name: &str| {
+        let all = knowledge.sources();
+        let found = all.iter().find(|source| source.name == name);
+        found.map(|source| source.statements)
+    };
+
+    sources.read(&yaml("parts.rml.ttl"));
+    assert_eq!(sources.findings(), []);
+    assert_eq!(statements("parts.rml.ttl"), Some(10));
+
+    sources.read(&yaml(
+        "{mapping: parts.rml.ttl, file: parts.xml, name: parts}",
+    ));
+    assert_eq!(statements("parts.rml.ttl"), None, "it left the YAML");
+    assert_eq!(statements("parts"), Some(10));
+
+    sources.read(&yaml(
+        "{mapping: parts.rml.ttl, file: mes.yaml, name: parts}",
+    ));
+    let findings = sources.findings();
+    let [found] = findings.as_slice() else {
+        panic!("{findings:?}")
+    };
+    assert!(found.refused);
+    let place = "parts.rml.ttl: triples map <urn:example:parts:Parts>: source `parts.xml`: line 1";
+    assert!(found.what.contains(place), "{}", found.what);
+}
+
+#[test]
+fn a_check_has_the_lines_of_the_findings_and_changes_nothing() {
+    let knowledge = Arc::new(Knowledge::new().unwrap());
+    let sources = MesSources::new(Arc::clone(&knowledge));
+    let before = *knowledge.changes().borrow();
+    let check = |kind, contents: &[u8]| sources.check(kind, "a", contents);
+    let good = check(SourceKind::File, b"<urn:a> <urn:p> 1 .");
+    assert_eq!(
+        (good.accepted, good.replaces, good.findings.len()),
+        (true, false, 0)
+    );
+    for (kind, contents, line) in [
+        (SourceKind::File, &b"<urn:a>\n<urn:p> ."[..], Some(2)),
+        (SourceKind::File, &b"<urn:a> <urn:p> 1 .\n\xff"[..], Some(2)),
+        (SourceKind::NodeSet, &b"<UANodeSet>\n</other>"[..], None),
+        (SourceKind::Mtp, &b"<CAEXFile>"[..], None),
+        (SourceKind::Run, &b""[..], None),
+    ] {
+        let bad = check(kind, contents);
+        let [found] = bad.findings.as_slice() else {
+            panic!("{bad:?}")
+        };
+        assert!(!bad.accepted && found.refused, "{bad:?}");
+        assert!(line.is_none() || found.line == line, "{bad:?}");
+    }
+    assert_eq!(*knowledge.changes().borrow(), before);
+    SourceFiles::put(&sources, SourceKind::File, "a", b"<urn:a> <urn:p> 1 .").unwrap();
+    assert!(check(SourceKind::File, b"<urn:a> <urn:p> 2 .").replaces);
+    let manifest = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../tests/data/mtp/stage.aml");
+    let manifest = check(SourceKind::Mtp, &std::fs::read(manifest).unwrap());
+    assert!(manifest.accepted, "{manifest:?}");
+    assert!(manifest.findings.iter().all(|found| found.line.is_some()));
+}
+
+/// Writes a NodeSet of a date that requires others.
+fn write_node_set(folder: &Path, namespace: &str, date: &str, required: &[&str]) {
+    let required: String = required
+        .iter()
+        .map(|other| {
+            format!("<RequiredModel ModelUri=\"{other}\" PublicationDate=\"2022-01-01\"/>")
+        })
+        .collect();
+    let text = format!(
+        "<UANodeSet><NamespaceUris><Uri>{namespace}</Uri></NamespaceUris>
+         <Models><Model ModelUri=\"{namespace}\" PublicationDate=\"{date}\">{required}</Model></Models>
+         <UAObjectType NodeId=\"ns=1;i=1\" BrowseName=\"1:T\"/></UANodeSet>"
+    );
+    std::fs::create_dir_all(folder).unwrap();
+    let name = namespace.replace(':', "-");
+    std::fs::write(folder.join(format!("{name}.xml")), text).unwrap();
+}
+
+#[test]
+fn nodesets_are_completed_from_a_folder_and_leave_with_their_reason() {
+    let folder = std::env::temp_dir().join(format!("mes-nodesets-{}", std::process::id()));
+    drop(std::fs::remove_dir_all(&folder));
+    write_node_set(
+        &folder,
+        "urn:robotics",
+        "2023-01-01",
+        &["urn:di", "urn:none"],
+    );
+    write_node_set(&folder, "urn:late", "2023-01-01", &["urn:extra", "urn:di"]);
+    write_node_set(
+        &folder.join("sets/di"),
+        "urn:di",
+        "2020-01-01",
+        &["urn:core"],
+    );
+    write_node_set(&folder.join("sets"), "urn:core", "2022-01-01", &[]);
+    write_node_set(&folder.join("sets"), "urn:extra", "2022-01-01", &[]);
+    std::fs::write(folder.join("sets/other.xml"), "<other/>").unwrap();
+    let yaml = |keys: &str| {
+        let text = format!("mes: m\napplication_uri: urn:x\nnamespace: 5\n{keys}\n");
+        Settings::from_yaml(&text, &folder).unwrap()
+    };
+    let knowledge = Arc::new(Knowledge::new().unwrap());
+    let sources = MesSources::new(Arc::clone(&knowledge));
+    let names = || {
+        let all = knowledge.sources().into_iter();
+        let all = all.filter(|one| one.kind == SourceKind::NodeSet && one.name.starts_with("urn:"));
+        let all = all.filter(|one| one.name != skills::model::NAMESPACE);
+        all.map(|one| one.name).collect::<BTreeSet<_>>()
+    };
+    let set = |all: &[&str]| {
+        all.iter()
+            .map(|one| (*one).to_owned())
+            .collect::<BTreeSet<_>>()
+    };
+
+    sources.read(&yaml("nodesets: [urn-robotics.xml]\nnodeset_folder: sets"));
+    assert_eq!(names(), set(&["urn:robotics", "urn:di", "urn:core"]));
+    let findings = sources.findings();
+    let [old, missing] = findings.as_slice() else {
+        panic!("{findings:?}")
+    };
+    assert!(
+        old.what.contains("the newest in") && old.what.contains("2020-01-01"),
+        "{old:?}"
+    );
+    assert!(missing.what.contains("requires urn:none"), "{missing:?}");
+    assert!(
+        findings
+            .iter()
+            .all(|one| one.source == "urn:robotics" && !one.refused)
+    );
+
+    // A NodeSet that is added while the program runs is completed too, and a check says what lacks.
+    let late = std::fs::read(folder.join("urn-late.xml")).unwrap();
+    let checked = sources.check(SourceKind::NodeSet, "late", &late);
+    assert!(
+        checked.accepted && checked.findings[0].what.contains("urn:di"),
+        "{checked:?}"
+    );
+    SourceFiles::put(&sources, SourceKind::NodeSet, "late", &late).unwrap();
+    assert!(names().contains("urn:late") && names().contains("urn:extra"));
+
+    // Completions leave the graph with the NodeSet that requires them.
+    sources.read(&yaml("nodeset_folder: sets"));
+    assert_eq!(names(), set(&["urn:late", "urn:extra"]));
+    sources.read(&yaml("nodeset_folder: nowhere"));
+    let findings = sources.findings();
+    assert!(
+        findings
+            .iter()
+            .any(|one| one.refused && one.what.contains("nowhere")),
+        "{findings:?}"
+    );
+    drop(std::fs::remove_dir_all(&folder));
+}
