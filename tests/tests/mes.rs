@@ -3,6 +3,7 @@
 
 mod exchange;
 mod opcua_knowledge;
+mod queries;
 
 use std::fs;
 use std::io::{Read as _, Write as _};

@@ -13,7 +13,7 @@ use async_trait::async_trait;
 use futures_util::future::join_all;
 use knowledge::{
     ComponentFacts, Knowledge, KnowledgeSource, NodeName, QuestionAnswer, SourceKind,
-    SourceLifetime,
+    SourceLifetime, ValueQuery,
 };
 use serde::Serialize;
 use skills::choosing::Attachment;
@@ -31,7 +31,7 @@ use self::parameters::{connects, parameter, result, values};
 use crate::execute::{OpenFault, Opened, Plant};
 use crate::goal::{GoalAction, GoalConditions, Sequence};
 use crate::plan::Offer;
-use crate::process::{GivenParameter, Process};
+use crate::process::{GivenParameter, ParameterQuery, Process};
 use crate::read_process::Processes;
 use crate::record::{NewestRuns, ProcessRun};
 use crate::sources::{Finding, MesSources};
@@ -530,6 +530,12 @@ impl Plant for PlantState {
         given: &[GivenParameter],
     ) -> Result<Vec<(String, SkillValue)>, String> {
         values(&self.found(skill)?, given)
+    }
+
+    fn query(&self, query: &ParameterQuery) -> Result<serde_json::Value, String> {
+        let read = ValueQuery::read(&query.sparql);
+        let value = read.and_then(|read| read.value(&self.knowledge));
+        value.map_err(|fault| fault.to_string())
     }
 
     fn result(&self, skill: &str, name: &str) -> Result<Option<String>, String> {

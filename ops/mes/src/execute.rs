@@ -6,6 +6,7 @@ mod compensate;
 mod sequence;
 mod watched;
 
+use std::cell::RefCell;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
@@ -18,7 +19,7 @@ use tokio::sync::watch;
 use tracing::{info, warn};
 
 use crate::plan::{Facts, Fallen, Offer, Plan, Situation, plan};
-use crate::process::{GivenParameter, Process, ProcessStep, SkillRole, StepJob};
+use crate::process::{GivenParameter, ParameterQuery, Process, ProcessStep, SkillRole, StepJob};
 use crate::record::{How, Planned, ProcessRun};
 
 use sequence::{RunProgress, StepEnd};
@@ -43,6 +44,12 @@ pub(crate) trait Plant: Send + Sync {
         skill: &str,
         given: &[GivenParameter],
     ) -> Result<Vec<(String, SkillValue)>, String>;
+
+    /// Evaluates the query of a parameter.
+    ///
+    /// # Errors
+    /// The reason why it has no value.
+    fn query(&self, query: &ParameterQuery) -> Result<serde_json::Value, String>;
 
     /// Returns the unit of a result of a skill, if it has one.
     ///
@@ -227,35 +234,71 @@ fn tell(run: &ProcessRun) {
 /// Plans a process without running it, as if no other process was running.
 pub(crate) fn dry_run(plant: &dyn Plant, process: &Process) -> Plan {
     let situation = Situation::default();
-    plan(process, &plant.offers(), situation, &OfPlant(plant))
+    plan(process, &plant.offers(), situation, &OfPlant::new(plant))
 }
 
-/// The facts about skills that the plant knows.
-struct OfPlant<'a>(&'a dyn Plant);
+/// The facts about skills that the plant knows, for one plan.
+struct OfPlant<'a> {
+    plant: &'a dyn Plant,
+    /// The values of queries, which are the same for all skills of a plan.
+    values: RefCell<BTreeMap<String, Result<serde_json::Value, String>>>,
+}
+
+impl<'a> OfPlant<'a> {
+    fn new(plant: &'a dyn Plant) -> Self {
+        Self {
+            plant,
+            values: RefCell::default(),
+        }
+    }
+
+    /// Checks that the queries of the steps that are not over have values. No component that comes
+    /// later can help if they do not.
+    fn can_evaluate(&self, process: &Process, progress: &RunProgress) -> Result<(), String> {
+        let steps = process.steps.iter().enumerate();
+        for (_, step) in steps.filter(|(number, _)| !progress.is_over(*number)) {
+            for given in &step.parameters {
+                let value = given.evaluated(&|query| self.value(query));
+                value.map_err(|why| format!("{}: {why}", step.name))?;
+            }
+        }
+        Ok(())
+    }
+
+    fn value(&self, query: &ParameterQuery) -> Result<serde_json::Value, String> {
+        let mut values = self.values.borrow_mut();
+        let evaluate = || self.plant.query(query);
+        let value = values.entry(query.sparql.clone());
+        value.or_insert_with(evaluate).clone()
+    }
+}
 
 impl Facts for OfPlant<'_> {
     fn takes(&self, offer: &Offer, step: &ProcessStep) -> Result<(), String> {
-        self.0.values(&offer.skill, &step.parameters).map(drop)
+        let given = step.parameters.iter();
+        let given = given.map(|given| given.evaluated(&|query| self.value(query)));
+        let given = given.collect::<Result<Vec<_>, _>>()?;
+        self.plant.values(&offer.skill, &given).map(drop)
     }
 
     fn gives(&self, offer: &Offer, result: &str) -> Result<(), String> {
-        self.0.result(&offer.skill, result).map(drop)
+        self.plant.result(&offer.skill, result).map(drop)
     }
 
     fn connects(&self, from: (&str, &str), to: (&str, &str)) -> Result<(), String> {
-        self.0.connects(from, to)
+        self.plant.connects(from, to)
     }
 
     fn reaches(&self, offer: &Offer, positions: &[[f64; 3]]) -> Result<(), String> {
-        self.0.reaches(&offer.skill, positions)
+        self.plant.reaches(&offer.skill, positions)
     }
 
     fn attachment(&self, offer: &Offer) -> Attachment {
-        self.0.attachment(&offer.component)
+        self.plant.attachment(&offer.component)
     }
 
     fn prefer(&self) -> &[String] {
-        self.0.prefer()
+        self.plant.prefer()
     }
 }
 
@@ -364,7 +407,11 @@ impl Execution<'_> {
                 passed: &passed,
                 used: Some(&used),
             };
-            let plan = plan(self.process, &offers, situation, &OfPlant(self.plant));
+            let facts = OfPlant::new(self.plant);
+            facts
+                .can_evaluate(self.process, progress)
+                .map_err(|why| format!("{after}{why}"))?;
+            let plan = plan(self.process, &offers, situation, &facts);
             if plan.is_complete() {
                 let chosen = self.chosen(&plan, &offers, progress);
                 let all = chosen.open.iter().map(|(_, offer)| offer);

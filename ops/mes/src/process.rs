@@ -247,6 +247,45 @@ pub(crate) struct GivenParameter {
     pub(crate) unit: Option<String>,
     /// The result that is the value; `value` is null then.
     pub(crate) result: Option<ResultOf>,
+    /// The query whose result is the value; `value` is null until it is evaluated.
+    pub(crate) query: Option<ParameterQuery>,
+}
+
+/// A query over the knowledge that gives a parameter its value.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) struct ParameterQuery {
+    /// The name in findings.
+    pub(crate) name: String,
+    /// A SELECT with one variable.
+    pub(crate) sparql: String,
+}
+
+impl GivenParameter {
+    /// Returns the name for findings, with that of its query.
+    pub(crate) fn shown(&self) -> String {
+        match &self.query {
+            None => self.name.clone(),
+            Some(query) => format!("{} (query `{}`)", self.name, query.name),
+        }
+    }
+
+    /// Returns the parameter with the value of its query, if it has one.
+    ///
+    /// # Errors
+    /// The reason why the query has no value, with its name.
+    pub(crate) fn evaluated(
+        &self,
+        value: &dyn Fn(&ParameterQuery) -> Result<serde_json::Value, String>,
+    ) -> Result<Self, String> {
+        let Some(query) = &self.query else {
+            return Ok(self.clone());
+        };
+        let value = value(query).map_err(|why| format!("{}: {why}", self.shown()))?;
+        Ok(Self {
+            value,
+            ..self.clone()
+        })
+    }
 }
 
 /// A result of an earlier step.
@@ -516,14 +555,20 @@ fn of_step(
         say(step_iri, v::HAS_PARAMETER, iri(&parameter));
         let name = Object::Text(given.name.clone());
         say(&parameter, v::HAS_VARIABLE_NAME, name);
-        match &given.result {
-            Some(of) => {
+        match (&given.result, &given.query) {
+            (Some(of), _) => {
                 if let Some(other) = iris.get(of.step) {
                     say(&parameter, v::RESULT_OF, iri(other));
                 }
                 say(&parameter, v::RESULT, Object::Text(of.name.clone()));
             }
-            None => {
+            (None, Some(query)) => {
+                let sparql = Object::Text(query.sparql.clone());
+                say(&parameter, v::VALUE_QUERY, sparql);
+                let name = Object::Text(query.name.clone());
+                say(&parameter, v::QUERY_NAME, name);
+            }
+            (None, None) => {
                 let (predicate, value) = literal(&given.value);
                 say(&parameter, predicate, value);
             }

@@ -5,14 +5,14 @@ mod loops;
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 
-use knowledge::{Knowledge, QuestionAnswer};
+use knowledge::{Knowledge, QuestionAnswer, ValueQuery};
 use serde_json::Value;
 use skills::ParameterType;
 
 use crate::locate_skill::numbers_of;
 use crate::process::{
-    BadEnd, By, Compare, GivenParameter, Loop, Need, Process, ProcessStep, ResultOf, SkillRole,
-    StepCondition, StepJob, Test,
+    BadEnd, By, Compare, GivenParameter, Loop, Need, ParameterQuery, Process, ProcessStep,
+    ResultOf, SkillRole, StepCondition, StepJob, Test,
 };
 
 /// The processes of the graph: each can run, or has a reason why it cannot.
@@ -469,7 +469,20 @@ fn given_by(row: &Row, (order, number): (&[&str], usize)) -> Result<GivenParamet
         value: Value::Null,
         unit,
         result: None,
+        query: None,
     };
+    if let Some(sparql) = is_there("query") {
+        let columns = ["value", "json", "result_of"];
+        if columns.into_iter().any(|column| is_there(column).is_some()) {
+            return Err(format!("has several values for {name}, a query among them"));
+        }
+        let query_name = is_there("query_name").and_then(Value::as_str);
+        given.query = Some(ParameterQuery {
+            name: query_name.unwrap_or(name).to_owned(),
+            sparql: sparql.as_str().unwrap_or_default().to_owned(),
+        });
+        return readable(given).map_err(|why| format!("has the parameter {why}"));
+    }
     match (is_there("value"), is_there("json"), is_there("result_of")) {
         (Some(value), None, None) => given.value = value.clone(),
         (None, Some(json), None) => {
@@ -497,6 +510,21 @@ fn given_by(row: &Row, (order, number): (&[&str], usize)) -> Result<GivenParamet
         _ => return Err(format!("has no value, or several, for {name}")),
     }
     Ok(given)
+}
+
+/// Checks that the query of a parameter can be read.
+///
+/// # Errors
+/// The reason, with the names of the parameter and of the query.
+pub(crate) fn readable(given: GivenParameter) -> Result<GivenParameter, String> {
+    let read = given
+        .query
+        .as_ref()
+        .map(|query| ValueQuery::read(&query.sparql));
+    match read {
+        Some(Err(fault)) => Err(format!("{}: {fault}", given.shown())),
+        Some(Ok(_)) | None => Ok(given),
+    }
 }
 
 /// Returns the value of a column, which must be the same in all rows that have it.
@@ -574,6 +602,7 @@ mod tests {
             value: serde_json::json!(12.5),
             unit: Some("N".into()),
             result: None,
+            query: None,
         };
         assert_eq!(process.steps[0].parameters, [force]);
         assert_eq!(
@@ -593,6 +622,16 @@ mod tests {
                 "which is no earlier step",
             ),
             ("ua:value 12.5 ;", "", "no value, or several, for Force"),
+            (
+                "ua:value 12.5",
+                "ua:value 12.5 ; ua:valueQuery \"SELECT ?f { ?s ?p ?f }\"",
+                "several values for Force, a query among them",
+            ),
+            (
+                "ua:value 12.5",
+                "ua:queryName \"force\" ; ua:valueQuery \"ASK { ?s ?p ?f }\"",
+                "Force (query `force`): it is no SELECT",
+            ),
             (
                 "ua:within 20",
                 "ua:within \"soon\"",
@@ -616,7 +655,7 @@ mod tests {
     #[test]
     fn processes_of_the_yaml_come_back_from_the_graph_as_they_were() {
         let example = include_str!("../../../examples/plant/mes.yaml");
-        let own = "  - process: urn:p\n    wait: 4 s\n    steps:\n      - {step: grip, needs: {skill: urn:c:grasp}, parameters: {Force: {value: 12.5, unit: N}, Name: a, All: [1, true], Deep: -3}}\n      - {step: hold, needs: {skill: {type: GraspSkillType}}, by: attached-tool, parameters: {Width: {result: Width, of: grip}}, compensation: {needs: {skill: urn:c:release}, by: {component_of: grip}}}\n      - {step: hold, needs: {skill: {type: 'nsu=urn:maker;HoldType', capability: urn:c:hold}}, by: {component_of: grip}, compensation: {step: let go, needs: {skill: urn:c:release}, parameters: {Speed: 2}}}\n";
+        let own = "  - process: urn:p\n    wait: 4 s\n    steps:\n      - {step: grip, needs: {skill: urn:c:grasp}, parameters: {Force: {value: 12.5, unit: N}, Name: a, All: [1, true], Deep: -3, Depth: {query: 'SELECT ?d { ?s ?p ?d }', query_name: depth, unit: mm}}}\n      - {step: hold, needs: {skill: {type: GraspSkillType}}, by: attached-tool, parameters: {Width: {result: Width, of: grip}}, compensation: {needs: {skill: urn:c:release}, by: {component_of: grip}}}\n      - {step: hold, needs: {skill: {type: 'nsu=urn:maker;HoldType', capability: urn:c:hold}}, by: {component_of: grip}, compensation: {step: let go, needs: {skill: urn:c:release}, parameters: {Speed: 2}}}\n";
         let shaped = "approach: 0.05, shape: {box: [0.04, 0.06, 0.05]}";
         assert!(example.contains("approach: 0.05"), "{example}");
         let example = example.replacen("approach: 0.05", shaped, 1);

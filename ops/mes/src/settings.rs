@@ -3,6 +3,7 @@
 mod composite;
 mod files;
 mod flow;
+mod parameters;
 
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
@@ -12,9 +13,7 @@ use plant_opcua::client::ClientUser;
 use skills::yaml::{DocumentKind, DocumentNode, Findings, YamlFindingCode, YamlReader, parse};
 use skills::{ComponentSecurity, Lds, ParameterType};
 
-use crate::process::{
-    By, GivenParameter, Need, Process, ProcessStep, ResultOf, SkillRole, StepJob,
-};
+use crate::process::{By, Need, Process, ProcessStep, SkillRole, StepJob};
 use crate::read_process::{MOST_STEPS, USUALLY_WAIT, USUALLY_WITHIN};
 
 pub(crate) use files::{Connect, Manifest, RecipeSource, RmlSource, Source};
@@ -457,70 +456,6 @@ impl Reading<'_> {
             );
         }
         Some(read)
-    }
-
-    /// Reads the parameters of a step, which follows these steps.
-    fn parameters(
-        &mut self,
-        node: &DocumentNode,
-        earlier: &[ProcessStep],
-    ) -> Option<Vec<GivenParameter>> {
-        let DocumentKind::Map(pairs) = &node.kind else {
-            self.reader
-                .wrong(node, "a map from names of parameters to values");
-            return None;
-        };
-        let mut given = Vec::new();
-        for (key, value) in pairs {
-            if let Some(name) = self.reader.text(key, "the name of a parameter") {
-                given.extend(self.given(name, value, earlier));
-            }
-        }
-        Some(given)
-    }
-
-    /// Reads a parameter: its value, a map of `value` and `unit`, or the result of a step.
-    fn given(
-        &mut self,
-        name: &str,
-        node: &DocumentNode,
-        earlier: &[ProcessStep],
-    ) -> Option<GivenParameter> {
-        let mut given = GivenParameter {
-            name: name.to_owned(),
-            value: serde_json::Value::Null,
-            unit: None,
-            result: None,
-        };
-        if !matches!(&node.kind, DocumentKind::Map(_)) {
-            given.value = json(node);
-            return Some(given);
-        }
-        let [value, unit, result, of] = self.reader.map(node, ["value", "unit", "result", "of"])?;
-        if let Some(unit) = unit {
-            given.unit = Some(self.reader.text(unit, "a unit")?.to_owned());
-        }
-        if result.is_none() && of.is_none() {
-            given.value = json(self.reader.needed(value, "value", node.place)?);
-            return Some(given);
-        }
-        if let Some(other) = value.or(unit) {
-            let why = "a result has the value and the unit of its skill";
-            return self
-                .reader
-                .refuse(other, YamlFindingCode::WrongValue, why.to_owned());
-        }
-        let of = self.reader.needed(of, "of", node.place)?;
-        let step = self.earlier(of, earlier)?;
-        let result = match result {
-            Some(result) => self.reader.text(result, "the name of a result")?,
-            None => name,
-        };
-        given.result = Some(ResultOf {
-            step,
-            name: result.to_owned(),
-        });
-        Some(given)
     }
 
     /// Reads the name of an earlier step. Returns its number.

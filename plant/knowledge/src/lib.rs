@@ -17,7 +17,7 @@
 //! `question` (named queries), `query` and `bounds` (any SPARQL, within limits), `lanes` (the
 //! queries that run at a time), `http`, `update` and `writes` (changes by users), `shapes` and
 //! `checking` (the SHACL report), `units` (conversion of numbers), `requests` (queries and changes
-//! for other protocols than HTTP).
+//! for other protocols than HTTP), `value_query` (queries with one value).
 
 mod bounds;
 mod checking;
@@ -36,6 +36,7 @@ mod source;
 mod store;
 pub mod units;
 mod update;
+mod value_query;
 mod writes;
 mod writing;
 mod written;
@@ -50,6 +51,7 @@ pub use question::{NamedQuestion, QUESTIONS, QuestionAnswer, QuestionFault};
 pub use requests::{KnowledgeRefusal, KnowledgeRequests, LoadedSource, QueryRequest, line_of};
 pub use source::{KnowledgeSource, SourceKind};
 pub use store::{Knowledge, KnowledgeFault, SourceLifetime, SourceStatus};
+pub use value_query::{ValueQuery, ValueQueryFault};
 pub use writes::{JobRunner, May, SourceCheck, SourceFiles, SourceFinding, Writes};
 pub use written::WrittenResult;
 

@@ -340,7 +340,7 @@ impl Drop for Stopping {
 }
 
 /// Parses a query. An update is a fault of its own.
-fn parsed(text: &str) -> Result<spargebra::Query, QueryFault> {
+pub(crate) fn parsed(text: &str) -> Result<spargebra::Query, QueryFault> {
     match SparqlParser::new().parse_query(text) {
         Ok(query) => Ok(query),
         Err(_)
@@ -529,7 +529,7 @@ impl Work {
 }
 
 /// Returns the memory of this program in bytes, if the system provides it.
-fn resident() -> Option<u64> {
+pub(crate) fn resident() -> Option<u64> {
     let status = std::fs::read_to_string("/proc/self/status").ok()?;
     let line = status
         .lines()
@@ -541,7 +541,7 @@ fn resident() -> Option<u64> {
 /// Period of the checks of memory and places.
 const LOOK: Duration = Duration::from_millis(25);
 /// Memory is allocated only for the used part.
-const STACK: usize = 256 << 20;
+pub(crate) const STACK: usize = 256 << 20;
 /// An update may contain many statements.
 pub(crate) const LARGEST_UPDATE: usize = 16 << 20;
 

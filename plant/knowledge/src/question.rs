@@ -392,7 +392,7 @@ impl QuestionAnswer {
     }
 }
 
-fn plain(term: Option<&Term>) -> Value {
+pub(crate) fn plain(term: Option<&Term>) -> Value {
     match term {
         None => Value::Null,
         Some(Term::NamedNode(node)) => node.as_str().into(),

@@ -28,7 +28,10 @@ pub(super) fn values(
         if given.result.is_some() {
             return Ok(None);
         }
-        let wrong = |why: String| format!("{}: {why}", given.name);
+        let wrong = |why: String| format!("{}: {why}", given.shown());
+        if given.query.is_some() && given.value.is_null() {
+            return Err(wrong("it is not evaluated".to_owned()));
+        }
         let json = in_unit(given, parameter).map_err(wrong)?;
         let read = parameter.shape.read_json(&json);
         let value = read.map_err(|error| wrong(error.to_string()))?;

@@ -38,10 +38,10 @@ pub(super) fn kept(process: &Process, done: &[Done]) -> Vec<KeptStep> {
     current.flat_map(one).collect()
 }
 
-/// Returns the parameters of a step, with the results of completed steps in them.
+/// Returns the parameters of a step, with the results of completed steps and of queries in them.
 ///
 /// # Errors
-/// The result that a step did not return.
+/// The result that a step did not return, or the query without a value.
 pub(super) fn resolved(
     plant: &dyn Plant,
     step: &ProcessStep,
@@ -49,7 +49,7 @@ pub(super) fn resolved(
 ) -> Result<Vec<GivenParameter>, String> {
     let one = |given: &GivenParameter| {
         let Some(of) = &given.result else {
-            return Ok(given.clone());
+            return given.evaluated(&|query| plant.query(query));
         };
         let from = done.iter().find(|done| done.number == of.step);
         let from = from.ok_or_else(|| format!("{}: its step is not done", given.name))?;
@@ -64,6 +64,7 @@ pub(super) fn resolved(
             value: value.to_json(),
             unit: plant.result(&from.offer.skill, &of.name)?,
             result: None,
+            query: None,
         })
     };
     step.parameters.iter().map(one).collect()

@@ -1,5 +1,6 @@
 mod flow;
 mod loops;
+mod queries;
 mod stops;
 
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -29,6 +30,8 @@ struct Fakes {
     silent_tools: Option<watch::Sender<u32>>,
     /// Skills named `Meet` wait for each other here.
     meets: Option<Arc<tokio::sync::Barrier>>,
+    /// The results of the evaluations of queries, in their order.
+    found: Mutex<Vec<Result<serde_json::Value, String>>>,
     journal: Mutex<Vec<String>>,
     kept: Mutex<Vec<ProcessRun>>,
     clock: AtomicU64,
@@ -87,6 +90,10 @@ impl Plant for Arc<Fakes> {
                 Ok((given.name.clone(), SkillValue::Double(number)))
             })
             .collect()
+    }
+
+    fn query(&self, _query: &ParameterQuery) -> Result<serde_json::Value, String> {
+        self.found.lock().unwrap().remove(0)
     }
 
     fn result(&self, _skill: &str, name: &str) -> Result<Option<String>, String> {
@@ -339,6 +346,7 @@ fn plant(offers: Vec<Offer>) -> Fakes {
         unreachable: None,
         silent_tools: None,
         meets: None,
+        found: Mutex::default(),
         journal: Mutex::default(),
         kept: Mutex::default(),
         clock: AtomicU64::new(1000),
@@ -691,6 +699,7 @@ async fn a_sequence_gives_each_step_what_it_needs_and_never_does_one_twice() {
         value: 12.into(),
         unit: None,
         result: None,
+        query: None,
     });
     let (run, fakes, _) = executed(plant(gripper("gripper")), &process).await;
     assert_eq!(run.outcome, How::Done, "{run:?}");
@@ -1006,6 +1015,7 @@ async fn a_result_of_a_step_is_a_parameter_of_a_later_step() {
             step: 0,
             name: "Width".into(),
         }),
+        query: None,
     }];
     let (run, ..) = executed(drilling(&["drill"]), &process).await;
     assert_eq!(run.outcome, How::Done, "{run:?}");

@@ -518,6 +518,7 @@ fn the_attached_tool_does_what_it_can() {
         value: "urn:example:vacuum".into(),
         unit: None,
         result: None,
+        query: None,
     }];
     let attached = plan(&process, &offers, &[]);
     let expected = [
@@ -577,6 +578,7 @@ fn result_of(step: usize, name: &str, parameter: &str) -> GivenParameter {
             step,
             name: name.into(),
         }),
+        query: None,
     }
 }
 
@@ -692,6 +694,7 @@ fn a_component_that_another_run_uses_is_not_chosen_and_an_attached_tool_stays_at
         value: "urn:example:a".into(),
         unit: None,
         result: None,
+        query: None,
     }];
     let found = with(&process);
     assert_eq!(

@@ -124,6 +124,7 @@ pub(super) fn given(name: &str, value: Value, unit: Option<String>) -> GivenPara
         value,
         unit,
         result: None,
+        query: None,
     }
 }
 

@@ -1,5 +1,5 @@
 use super::*;
-use crate::process::{BadEnd, Compare, StepCondition, Test};
+use crate::process::{BadEnd, Compare, GivenParameter, StepCondition, Test};
 
 const EXAMPLE: &str = include_str!("../../../../examples/plant/mes.yaml");
 
@@ -65,6 +65,7 @@ fn steps_that_are_done_by_themselves_have_parameters() {
         value,
         unit: unit.map(str::to_owned),
         result: None,
+        query: None,
     };
     let expected = [
         given("Force", serde_json::json!(12.5), None),
@@ -164,5 +165,41 @@ processes:
         let told = Settings::from_yaml(&wrong, Path::new("")).unwrap_err();
         let told = told.render("mes.yaml", &wrong);
         assert!(told.contains(why), "{told}");
+    }
+}
+
+#[test]
+fn a_query_of_a_parameter_is_checked_with_the_yaml() {
+    let yaml = |parameter: &str| {
+        format!(
+            "mes: m\napplication_uri: urn:x\nnamespace: 5\nprocesses:\n  - process: urn:p\n    steps:\n      - step: grip\n        needs: {{skill: urn:c:grasp}}\n        parameters:\n          Width: {parameter}\n"
+        )
+    };
+    let text = yaml("{query: 'SELECT ?w { ?part <urn:width> ?w }', unit: mm}");
+    let settings = Settings::from_yaml(&text, Path::new("")).unwrap();
+    let given = &settings.processes[0].steps[0].parameters[0];
+    assert_eq!(given.shown(), "Width (query `Width`)");
+    assert_eq!(
+        (given.unit.as_deref(), given.value.is_null()),
+        (Some("mm"), true)
+    );
+    for (parameter, wanted) in [
+        (
+            "{query: 'SELECT ?a ?b { ?a ?p ?b }'}",
+            "it selects 2 variables",
+        ),
+        (
+            "{query: 'SELECT ?a { ?a ?p ?b }', value: 3}",
+            "a query is the value",
+        ),
+        ("{query_name: width}", "`query` is missing"),
+    ] {
+        let text = yaml(parameter);
+        let findings = Settings::from_yaml(&text, Path::new("")).unwrap_err();
+        let told = findings.render("mes.yaml", &text);
+        assert!(
+            told.contains(wanted) && told.contains("mes.yaml:10:"),
+            "{told}"
+        );
     }
 }

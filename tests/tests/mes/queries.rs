@@ -1,0 +1,91 @@
+//! Parameters of steps that are given by queries over the knowledge of products.
+
+use std::fs;
+use std::path::Path;
+
+use serde_json::Value;
+use system_tests::{Cell, eventually};
+
+use super::{EXAMPLES, SOON, get, list, rows, space, start};
+
+/// Grips a part with the force that its data sheet states.
+const PROCESSES: &str = "processes:
+  - process: urn:grip-part
+    steps:
+      - step: grip
+        needs: {skill: urn:example:capability:grasp}
+        parameters:
+          Force: {query: 'SELECT ?force { <urn:part> <urn:force> ?force }', query_name: force of the part, unit: kN}
+";
+
+fn update(cell: &Cell, text: &str) {
+    let file = cell.file("update.ru", text);
+    let (updated, told) = space(&["source", "update", file.to_str().unwrap()]);
+    assert!(updated, "{told}");
+}
+
+/// Returns whether the plan of the process is complete, and what is missing.
+fn plan() -> (bool, String) {
+    let plan = get("/plan/urn:grip-part").unwrap();
+    let missing = plan["missing"].as_str().unwrap_or_default().to_owned();
+    (plan["complete"] == true, missing)
+}
+
+#[test]
+fn a_step_takes_its_parameter_from_the_data_of_the_product_or_the_process_does_not_run() {
+    let Some(cell) = Cell::with(&[]) else { return };
+    let capabilities = Path::new(EXAMPLES).join("capabilities.ttl");
+    fs::copy(capabilities, cell.folder().join("capabilities.ttl")).unwrap();
+    let _mes = start(
+        &cell,
+        "ua-mes",
+        "mes.yaml",
+        &[("processes:\n", PROCESSES)],
+        &[],
+    );
+    let fast = [("400 ms", "50 ms")];
+    let _gripper = start(&cell, "ua-component", "parallel-gripper.yaml", &fast, &[]);
+    eventually("the gripper is in the graph", SOON, || {
+        rows("components")
+            .iter()
+            .any(|row| row["name"] == "parallel-gripper")
+            .then_some(())
+    });
+    for (force, reason) in [
+        ("", "it has no row"),
+        ("0.01 , 0.02", "it has several rows"),
+        ("\"strong\"", "with the unit kN is no number"),
+        ("500", "is not from"),
+    ] {
+        let insert = match force {
+            "" => String::new(),
+            force => format!(" INSERT DATA {{ <urn:part> <urn:force> {force} }}"),
+        };
+        update(
+            &cell,
+            &format!("DELETE WHERE {{ <urn:part> <urn:force> ?f }} ;{insert}"),
+        );
+        let (is_complete, missing) = plan();
+        assert!(
+            !is_complete && missing.contains(reason),
+            "{force}: {missing}"
+        );
+        let named = "Force (query `force of the part`): ";
+        assert!(missing.contains(named), "{missing}");
+    }
+    let (ran, told) = space(&["job", "start", "urn:grip-part", "--wait"]);
+    assert!(!ran && told.contains("force of the part"), "{told}");
+
+    let right = "DELETE WHERE { <urn:part> <urn:force> ?f } ;
+        INSERT DATA { <urn:part> <urn:force> 0.02 }";
+    update(&cell, right);
+    assert_eq!(plan(), (true, String::new()));
+    let (ran, told) = space(&["job", "start", "urn:grip-part", "--wait"]);
+    assert!(ran, "{told}");
+    let values = get("/ask/run-values").unwrap();
+    let mut all = list(&values, "rows").iter();
+    let force = all
+        .find(|row| row["name"] == "Force")
+        .map(|row| &row["value"]);
+    assert_eq!(force.and_then(Value::as_f64), Some(20.0), "{values}");
+}
