@@ -76,6 +76,12 @@ impl MesSources {
         self.try_one(units, |source| {
             self.put(source, &knowledge::units::triples(), SourceLifetime::No)
         });
+        let operations = KnowledgeSource::new(SourceKind::File, "operations");
+        named.insert(operations.clone());
+        self.try_one(operations, |source| {
+            let all = knowledge::operations::triples();
+            self.put(source, &all, SourceLifetime::No)
+        });
         self.node_sets(settings, &mut named);
         for file in &settings.knowledge {
             let source = KnowledgeSource::new(SourceKind::File, &file.name);

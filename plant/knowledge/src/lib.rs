@@ -17,7 +17,8 @@
 //! `question` (named queries), `query` and `bounds` (any SPARQL, within limits), `lanes` (the
 //! queries that run at a time), `http`, `update` and `writes` (changes by users), `shapes` and
 //! `checking` (the SHACL report), `units` (conversion of numbers), `requests` (queries and changes
-//! for other protocols than HTTP), `value_query` (queries with one value).
+//! for other protocols than HTTP), `value_query` (queries with one value),
+//! `operations` (a taxonomy of capabilities).
 
 mod bounds;
 mod checking;
@@ -26,6 +27,7 @@ mod http;
 mod journal;
 mod lanes;
 pub mod nodeset;
+pub mod operations;
 pub mod owl;
 mod query;
 mod question;

@@ -16,6 +16,10 @@ const PROCESSES: &str = "processes:
         needs: {skill: urn:example:capability:grasp}
         parameters:
           Force: {query: 'SELECT ?force { <urn:part> <urn:force> ?force }', query_name: force of the part, unit: kN}
+  - process: urn:handle-part
+    steps:
+      - {step: grip, needs: {skill: 'http://www.hsu-ifa.de/ontologies/VDI2860#Securing'}}
+      - {step: move, needs: {skill: 'http://www.w3id.org/hsu-aut/DIN8580#Kleben'}}
 ";
 
 fn update(cell: &Cell, text: &str) {
@@ -53,9 +57,9 @@ fn a_step_takes_its_parameter_from_the_data_of_the_product_or_the_process_does_n
     });
     for (force, reason) in [
         ("", "it has no row"),
-        ("0.01 , 0.02", "it has several rows"),
         ("\"strong\"", "with the unit kN is no number"),
         ("500", "is not from"),
+        ("0.01 , 0.02", "it has several rows"),
     ] {
         let insert = match force {
             "" => String::new(),
@@ -88,4 +92,22 @@ fn a_step_takes_its_parameter_from_the_data_of_the_product_or_the_process_does_n
         .find(|row| row["name"] == "Force")
         .map(|row| &row["value"]);
     assert_eq!(force.and_then(Value::as_f64), Some(20.0), "{values}");
+    are_chosen_by_operations();
+}
+
+/// Checks a plan with operations of the taxonomy: the gripper secures, and nothing joins.
+fn are_chosen_by_operations() {
+    let plan = get("/plan/urn:handle-part").unwrap();
+    let steps = list(&plan["plan"], "steps");
+    let chosen = |step: usize| {
+        steps[step]["needs"][0]["chosen"]
+            .as_str()
+            .unwrap_or_default()
+    };
+    assert!(chosen(0).starts_with("urn:example:gripper#"), "{plan}");
+    assert_eq!((chosen(1), &plan["complete"]), ("", &Value::Bool(false)));
+    let candidates = list(&steps[0]["needs"][0], "candidates").iter();
+    let mut why = candidates.filter_map(|one| one["why"].as_str());
+    let expected = "which is below http://www.hsu-ifa.de/ontologies/VDI2860#Securing";
+    assert!(why.any(|why| why.contains(expected)), "{plan}");
 }
