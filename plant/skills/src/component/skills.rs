@@ -23,11 +23,11 @@ pub(super) const SKILL_KEYS: [&str; 6] = [
 ];
 
 /// The folder of the document, and the kinds of devices.
-pub(super) type Surroundings<'a> = (&'a Path, &'a dyn DeviceKinds);
+pub(super) type SkillReading<'a> = (&'a Path, &'a dyn DeviceKinds);
 
 pub(super) fn read_skills(
     node: &DocumentNode,
-    around: Surroundings<'_>,
+    around: SkillReading<'_>,
     reader: &mut YamlReader<'_>,
 ) -> Vec<SkillSetup> {
     let nodes = reader.list(node);
@@ -62,7 +62,7 @@ pub(super) fn read_skills(
 
 fn read_skill(
     node: &DocumentNode,
-    around: Surroundings<'_>,
+    around: SkillReading<'_>,
     reader: &mut YamlReader<'_>,
 ) -> Option<(SkillSetup, Place)> {
     let [name, skill_type, driver, capabilities, timeout, grip_point] =
@@ -111,7 +111,7 @@ fn read_type(node: &DocumentNode, reader: &mut YamlReader<'_>) -> Option<Paramet
 
 fn read_driver(
     node: &DocumentNode,
-    (folder, kinds): Surroundings<'_>,
+    (folder, kinds): SkillReading<'_>,
     reader: &mut YamlReader<'_>,
 ) -> Option<DriverSetup> {
     if matches!(&node.kind, DocumentKind::Scalar(text) if text == "simulated") {
