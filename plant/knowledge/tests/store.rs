@@ -523,7 +523,7 @@ fn the_node_sets_of_the_domains_are_sources_of_their_own() {
     ];
     for text in domains {
         let read = nodeset::read(text).unwrap();
-        let source = KnowledgeSource::new(SourceKind::NodeSet, &read.namespace);
+        let source = KnowledgeSource::new(SourceKind::NodeSet, &read.model.namespace);
         knowledge.replace(&source, &read.triples, 5).unwrap();
     }
     let found = ask(
