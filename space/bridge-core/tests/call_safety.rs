@@ -255,6 +255,29 @@ fn a_large_request_that_a_broker_held_is_executed_only_while_its_caller_waits() 
 }
 
 #[test]
+fn a_large_response_that_a_broker_held_arrives_while_its_caller_waits() {
+    let mut cell = plugged_in();
+    // The component is on UDP alone; its responses are forwarded to the broker of the caller.
+    let relay = Relay {
+        within: ms(1_000),
+        authorized: true,
+    };
+    cell.programs[BRIDGE].router.set_relay(Some(relay));
+    cell.ask(BRIDGE, AskId(1), (start(), &large(1)), ms(10_000));
+    cell.run(ms(50));
+    let execution = cell.executions(GRIPPER).pop().unwrap();
+    cell.stop(BRIDGE);
+    let response = Executed::Answered(large(50_000));
+    cell.executed(GRIPPER, execution.id, response);
+    cell.run(ms(1_300));
+    cell.resume(BRIDGE);
+    cell.run(ms(200));
+    let (_, answer) = cell.answers(BRIDGE).pop().unwrap();
+    assert!(answer.is_ok(), "{answer:?}");
+    assert_eq!(cell.dropped(BRIDGE, Reason::Late), 0);
+}
+
+#[test]
 fn chunks_of_calls_go_out_at_the_pace_of_chunks() {
     let mut cell = plugged_in();
     let sent = |cell: &mut SimulatedCell| -> usize {

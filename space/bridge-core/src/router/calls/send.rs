@@ -144,7 +144,7 @@ struct Headers {
 impl Headers {
     /// Encodes the NetworkMessage. The time of sending and the TimeoutHint of a request say how
     /// long its requestor waits. On UDP the repetitions in chunks are equal to the first
-    /// transmission.
+    /// transmission, and the chunks of responses have no time.
     fn encode(
         &self,
         action: &ActionToSend<'_>,
@@ -155,12 +155,18 @@ impl Headers {
         if bytes.len() <= self.most || self.dates_repetitions {
             return written;
         }
+        let of = Of::message(action);
+        let header = match of {
+            Of::Request(_) => self.timed,
+            // A caller waits for a response of any age: only requests are dropped when they are old.
+            Of::Response(_) => NetworkHeader::default(),
+        };
         let now = FirstTimes {
-            header: self.timed,
+            header,
             left: action.left,
         };
-        let first = chunking.first_times(Of::message(action), now);
-        if first == now {
+        let first = chunking.first_times(of, now);
+        if first == now && header == self.timed {
             return written;
         }
         bytes.clear();
