@@ -443,7 +443,7 @@ impl Redundancy {
         {
             // The former active bridge sends nothing any more; its last values may be under way.
             self.cause = TakeoverCause::Released;
-            let after = now.monotonic + QUIET + self.turn(now.monotonic);
+            let after = now.monotonic + QUIET + self.turn_of_release(now.monotonic);
             self.deadline = self.deadline.min(after);
         }
         let is_new = before.is_none_or(|before| before.rank != self.rank);
@@ -504,6 +504,18 @@ impl Redundancy {
             peer.role() == RedundancyRole::Standby
                 && peer.is_present(now)
                 && peer.rank() < self.rank
+        });
+        LATER * u32::try_from(before.count()).unwrap_or(u32::MAX)
+    }
+
+    /// Returns the time by which this bridge takes over later than others after a release: first the
+    /// standbys that reach their ROS side, then the others, each by their ranks.
+    fn turn_of_release(&self, now: Instant) -> Duration {
+        let own = (self.side != LocalSide::Reached, self.rank);
+        let before = self.peers.iter().filter(|peer| {
+            peer.role() == RedundancyRole::Standby
+                && peer.is_present(now)
+                && (!peer.is_fit(), peer.rank()) < own
         });
         LATER * u32::try_from(before.count()).unwrap_or(u32::MAX)
     }

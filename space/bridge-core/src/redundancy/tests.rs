@@ -372,6 +372,20 @@ fn a_bridge_without_a_link_to_its_ros_side_hands_over_soon_unless_the_standby_ha
 }
 
 #[test]
+fn of_three_bridges_that_with_a_link_to_its_ros_side_takes_over() {
+    for seed in 0..20 {
+        let mut network = Network::new(&[1, 2, 3], seed);
+        network.run(700);
+        for at in 0..2 {
+            network.bridges[at].state.set_side(LocalSide::NoLink);
+        }
+        network.run(1_000);
+        assert_eq!(network.active(), [2], "{seed}");
+        network.assert_one_sender();
+    }
+}
+
+#[test]
 fn a_standby_takes_over_when_its_side_has_been_reached_for_as_long_as_the_active_waits() {
     for (side, flap, steady) in [(LocalSide::NoLink, 40, 200), (LocalSide::Silent, 300, 800)] {
         let mut network = Network::new(&[1, 2], 3);
