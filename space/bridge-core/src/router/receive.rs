@@ -59,7 +59,10 @@ impl Router {
         now: Now,
     ) {
         self.sort_network_message(message, from, now);
-        if self.values.redundant.is_some() {
+        // Chunks of a repeated request, and the request in them, have an old time.
+        let may_be_repeated =
+            message.is_action() || (message.is_chunk() && message.writer_ids().is_none());
+        if self.values.redundant.is_some() && !may_be_repeated {
             self.roles().note_clock(sent(&message.header()), from, now);
         }
     }
