@@ -239,7 +239,7 @@ pub(super) fn dropping(rules: &str) -> Vec<String> {
         let chain = chains.get(&(table, name)).into_iter();
         for target in chain
             .flat_map(|chain| &chain.rules)
-            .filter_map(|rule| jump_of(rule))
+            .flat_map(|rule| jumps_of(rule))
         {
             let target = (table, target);
             if chains.contains_key(&target) && !reached.contains(&target) {
@@ -248,14 +248,18 @@ pub(super) fn dropping(rules: &str) -> Vec<String> {
         }
     }
     let all = reached.iter().filter_map(|name| chains.get(name));
-    let drops = all.flat_map(|chain| &chain.rules).filter(|rule| {
+    let rules = all.flat_map(|chain| chain.rules.iter().map(move |rule| (chain, rule)));
+    let drops = rules.filter(|(chain, rule)| {
         let lower = rule.to_lowercase();
         let is_drop = has_word(&lower, "drop") || has_word(&lower, "reject");
-        is_drop && !has_word(&lower, "invalid")
+        // Docker protects the addresses of its containers in this way.
+        let is_of_container =
+            chain.is_prerouting && lower.contains("ip daddr ") && lower.contains("iifname != ");
+        is_drop && !is_of_container && !has_word(&lower, "invalid")
     });
     drops
         .take(MOST_RULES)
-        .map(|rule| (*rule).to_owned())
+        .map(|(_, rule)| (*rule).to_owned())
         .collect()
 }
 
@@ -264,6 +268,8 @@ pub(super) fn dropping(rules: &str) -> Vec<String> {
 struct FirewallChain<'a> {
     /// True if the kernel passes incoming packets to this chain.
     is_input: bool,
+    /// True if these include packets that are forwarded, such as those of containers.
+    is_prerouting: bool,
     rules: Vec<&'a str>,
 }
 
@@ -297,16 +303,19 @@ fn chains(text: &str) -> BTreeMap<(&str, &str), FirewallChain<'_>> {
         let hooks = ["hook input", "hook prerouting", "hook ingress"];
         chain.is_input |= (table.is_empty() && name == "INPUT")
             || (line.starts_with("type ") && hooks.iter().any(|hook| line.contains(hook)));
+        chain.is_prerouting |= line.starts_with("type ") && line.contains("hook prerouting");
         chain.rules.push(line);
     }
     chains
 }
 
-/// Returns the chain to which a rule jumps.
-fn jump_of(rule: &str) -> Option<&str> {
-    let mut words = rule.split_whitespace();
-    words.find(|word| ["jump", "goto", "-j", "-g"].contains(word))?;
-    words.next()
+/// Returns the chains to which a rule jumps; a verdict map has several.
+fn jumps_of(rule: &str) -> Vec<&str> {
+    let is_edge = |c: char| c.is_whitespace() || [',', ';', '{', '}'].contains(&c);
+    let words = rule.split(is_edge).filter(|word| !word.is_empty());
+    let pairs = words.clone().zip(words.skip(1));
+    let jumps = pairs.filter(|(word, _)| ["jump", "goto", "-j", "-g"].contains(word));
+    jumps.map(|(_, target)| target).collect()
 }
 
 fn has_word(line: &str, word: &str) -> bool {
@@ -407,5 +416,16 @@ mod tests {
         assert_eq!(dropping(ufw), ["-A ufw-end -j DROP"]);
         let nft = "table inet filter {\n\tchain input {\n\t\ttype filter hook input priority filter; policy accept;\n\t\tudp dport 4840 goto cell\n\t}\n\tchain cell {\n\t\tip saddr != 10.0.0.0/8 reject\n\t\tgoto input\n\t}\n}\n";
         assert_eq!(dropping(nft), ["ip saddr != 10.0.0.0/8 reject"]);
+    }
+
+    #[test]
+    fn rules_behind_a_verdict_map_are_found_and_rules_for_containers_are_not() {
+        let map = "table inet filter {\n\tchain input {\n\t\ttype filter hook input priority filter; policy accept;\n\t\tiifname vmap { \"lo\" : accept, \"eth0\" : jump world, \"eth1\" : jump private }\n\t}\n\tchain world {\n\t\tudp dport 4840 drop\n\t}\n\tchain private {\n\t\tudp dport 4841 drop\n\t}\n}\n";
+        assert_eq!(
+            dropping(map),
+            ["udp dport 4840 drop", "udp dport 4841 drop"]
+        );
+        let raw = "table ip raw {\n\tchain PREROUTING {\n\t\ttype filter hook prerouting priority raw; policy accept;\n\t\tip daddr 172.17.0.2 iifname != \"docker0\" counter packets 0 bytes 0 drop\n\t\tudp dport 4840 drop\n\t}\n}\n";
+        assert_eq!(dropping(raw), ["udp dport 4840 drop"]);
     }
 }

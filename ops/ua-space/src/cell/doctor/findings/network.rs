@@ -37,7 +37,9 @@ pub(super) fn membership(facts: &CellFacts) -> Vec<DoctorFinding> {
     };
     let is_member = match facts.group.interface {
         Some(_) => facts.interfaces().any(|one| {
-            let groups = facts.host.memberships.get(&one.name);
+            // An address with a label has the name `eth0:1`.
+            let device = one.name.split(':').next().unwrap_or(&one.name);
+            let groups = facts.host.memberships.get(device);
             groups.is_some_and(|groups| groups.contains(&group))
         }),
         None => {
