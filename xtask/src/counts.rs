@@ -1,5 +1,5 @@
-//! Two counts that may only fall: wide comment lines, which `rustfmt` of the stable toolchain does not
-//! wrap, and names of types that stand for more than one visible type.
+//! Two counts that may only fall: wide comment lines, which `rustfmt` of the stable toolchain does
+//! not wrap, and names of types that stand for more than one visible type.
 
 use std::{
     collections::{BTreeMap, BTreeSet},
@@ -20,8 +20,8 @@ const WIDER: usize = 72;
 /// libraries. The number may only fall.
 const SHARED_NAMES: usize = 9;
 
-/// Returns whether no more comment lines than [`WIDER`] are wider than [`COLUMNS`], and no more names
-/// than [`SHARED_NAMES`] stand for several types. Prints the places otherwise.
+/// Returns whether no more comment lines than [`WIDER`] are wider than [`COLUMNS`], and no more
+/// names than [`SHARED_NAMES`] stand for several types. Prints the places otherwise.
 ///
 /// # Errors
 /// Returns an error if a folder or a source cannot be read.

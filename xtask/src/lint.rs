@@ -19,8 +19,8 @@ const DENY: &str = "0.20.2";
 /// Time limit of the download of the advisory database, which has a few megabytes.
 const FETCH: Duration = Duration::from_secs(120);
 
-/// Checks formatting, the width of comments, the names of types, lints and documentation. All checks
-/// run, so that one run shows every finding.
+/// Checks formatting, the width of comments, the names of types, lints and documentation. All
+/// checks run, so that one run shows every finding.
 ///
 /// # Errors
 /// Returns an error if cargo cannot be started or the patched sources cannot be prepared.
