@@ -112,11 +112,18 @@ impl KnowledgeMethods {
         let [Variant::String(text)] = arguments else {
             return Err(StatusCode::BadInvalidArgument);
         };
+        let (user, length) = (&caller.user, text.as_ref().len());
+        // The change may outlive this call, which ends with the session of the client.
+        info!(
+            user,
+            kind = "update",
+            length,
+            "update of the knowledge begins"
+        );
         let (changed, refusal) = match self.requests.update(text.as_ref().to_owned()).await {
             Ok(changed) => (changed, None),
             Err(refusal) => (0, Some(refusal)),
         };
-        let user = &caller.user;
         info!(user, changed, refused = ?refusal, "update of the knowledge");
         let mut outputs = vec![u64::try_from(changed).unwrap_or(u64::MAX).into()];
         outputs.extend(fault(refusal.as_ref()));
@@ -131,11 +138,13 @@ impl KnowledgeMethods {
     ) -> Result<Vec<Variant>, StatusCode> {
         self.may_change(caller)?;
         let contents = contents.value.clone().unwrap_or_default();
+        let (user, length) = (&caller.user, contents.len());
+        // The change may outlive this call, which ends with the session of the client.
+        info!(user, kind, name, length, "load of a source begins");
         let (is_new, findings, refusal) = match self.requests.load((kind, name), contents).await {
             Ok(loaded) => (loaded.is_new, loaded.findings, None),
             Err(mut refusal) => (false, std::mem::take(&mut refusal.findings), Some(refusal)),
         };
-        let user = &caller.user;
         info!(user, kind, name, refused = ?refusal, "load of a source");
         let texts: Vec<String> = findings.iter().map(|found| found.what.clone()).collect();
         let lines: Vec<u32> = findings.iter().map(line_of_finding).collect();
@@ -304,8 +313,11 @@ struct KnowledgeCall {
 impl MethodHandler for KnowledgeCall {
     fn longest(&self) -> Duration {
         match self.method {
-            KnowledgeMethod::Query | KnowledgeMethod::Update => LONGEST_QUERY,
-            KnowledgeMethod::Load | KnowledgeMethod::ImportMtp => LONGEST_LOAD,
+            KnowledgeMethod::Query => LONGEST_QUERY,
+            // An update is committed behind its query, whose limit does not hold for the commit.
+            KnowledgeMethod::Update | KnowledgeMethod::Load | KnowledgeMethod::ImportMtp => {
+                LONGEST_CHANGE
+            }
         }
     }
 
@@ -403,16 +415,19 @@ impl skills::server::Extension for KnowledgeMethods {
 const OBJECT: &str = "Knowledge";
 /// Exceeds the time limit of a query, with its wait for a place.
 const LONGEST_QUERY: Duration = Duration::from_secs(15);
-const LONGEST_LOAD: Duration = Duration::from_secs(60);
+const LONGEST_CHANGE: Duration = Duration::from_secs(60);
 /// Period of the checks of the session.
 const LOOK: Duration = Duration::from_millis(100);
 
 #[cfg(test)]
 mod tests {
+    use std::sync::Mutex;
     use std::sync::atomic::{AtomicUsize, Ordering};
 
     use knowledge::{JobRunner, Knowledge, Queries, QueryLimits, Writes};
     use plant_opcua::users::{FOLDER, StoredUser, Users, hashed};
+    use tracing::field::Field;
+    use tracing::{Event, Metadata, Subscriber, span};
 
     use super::*;
     use crate::sources::MesSources;
@@ -532,6 +547,78 @@ mod tests {
             let loaded = loaded.unwrap();
             assert_eq!((&loaded[0], &loaded[3]), (&is_new.into(), &"".into()));
         }
+    }
+
+    /// Collects the fields of log entries as texts.
+    #[derive(Clone, Default)]
+    struct Lines(Arc<Mutex<Vec<String>>>);
+
+    impl Subscriber for Lines {
+        fn enabled(&self, _: &Metadata<'_>) -> bool {
+            true
+        }
+
+        fn new_span(&self, _: &span::Attributes<'_>) -> span::Id {
+            span::Id::from_u64(1)
+        }
+
+        fn record(&self, _: &span::Id, _: &span::Record<'_>) {}
+
+        fn record_follows_from(&self, _: &span::Id, _: &span::Id) {}
+
+        fn event(&self, event: &Event<'_>) {
+            let mut line = String::new();
+            event.record(&mut |field: &Field, value: &dyn std::fmt::Debug| {
+                line.push_str(&format!("{field}={value:?} "));
+            });
+            self.0.lock().unwrap().push(line);
+        }
+
+        fn enter(&self, _: &span::Id) {}
+
+        fn exit(&self, _: &span::Id) {}
+    }
+
+    #[tokio::test]
+    async fn a_change_whose_session_ends_has_a_log_entry() {
+        let own = methods(UserAccess::new(None, true).unwrap(), LOOPBACK);
+        let anonymous = caller("anonymous");
+        let lines = Lines::default();
+        let guard = tracing::subscriber::set_default(lines.clone());
+        let update = [Variant::from("INSERT DATA { <urn:a> <urn:p> 1 }")];
+        let turtle = ByteString::from(b"<urn:a> <urn:p> 1 .".to_vec());
+        // Each call is dropped after it has begun.
+        tokio::select! {
+            biased;
+            done = own.update(&anonymous, &update) => drop(done),
+            () = std::future::ready(()) => {}
+        }
+        tokio::select! {
+            biased;
+            done = own.load(&anonymous, ("file", "a.ttl"), &turtle) => drop(done),
+            () = std::future::ready(()) => {}
+        }
+        drop(guard);
+        let lines = lines.0.lock().unwrap();
+        for texts in [
+            &["update of the knowledge begins", "user=\"anonymous\""][..],
+            &["load of a source begins", "kind=\"file\"", "name=\"a.ttl\""],
+        ] {
+            let found = |line: &&String| texts.iter().all(|text| line.contains(text));
+            assert!(lines.iter().find(found).is_some(), "{texts:?}: {lines:?}");
+        }
+    }
+
+    #[test]
+    fn an_update_has_the_time_limit_of_a_load() {
+        let knowledge = methods(UserAccess::new(None, true).unwrap(), LOOPBACK);
+        let longest = |method| {
+            let knowledge = knowledge.clone();
+            KnowledgeCall { knowledge, method }.longest()
+        };
+        let load = longest(KnowledgeMethod::Load);
+        assert_eq!(longest(KnowledgeMethod::Update), load);
+        assert!(longest(KnowledgeMethod::Query) < load);
     }
 
     #[tokio::test]
