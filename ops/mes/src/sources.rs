@@ -17,7 +17,7 @@ use serde::Serialize;
 use tracing::{info, warn};
 
 use crate::cell::now;
-use crate::nodeset_folder::NodeSetFolder;
+use crate::nodeset_folder::{FolderNodeSet, NodeSetFolder};
 use crate::process::Process;
 use crate::recipe::{self, Recipe};
 use crate::settings::{self, Manifest, RmlSource, Settings};
@@ -34,8 +34,6 @@ struct State {
     of_yaml: BTreeSet<KnowledgeSource>,
     /// The folder of NodeSets that complete others.
     folder: Option<Arc<NodeSetFolder>>,
-    /// The versions of NodeSets by their namespaces.
-    versions: BTreeMap<String, ModelVersion>,
     /// The findings by the source.
     findings: BTreeMap<KnowledgeSource, Vec<Finding>>,
 }
@@ -155,25 +153,21 @@ impl MesSources {
                 Ok(())
             });
         }
-        let mut folder = None;
+        let earlier = self.state().folder.take();
         if let Some(of_yaml) = &settings.nodeset_folder {
             let source = KnowledgeSource::new(SourceKind::NodeSet, &of_yaml.name);
             named.insert(source.clone());
+            // A folder that cannot be read completes NodeSets as before.
+            let mut folder = earlier.filter(|folder| folder.path() == of_yaml.path);
             self.try_one(source, |source| {
-                let read = folder.insert(Arc::new(NodeSetFolder::read(&of_yaml.path)?));
-                if let Some(what) = read.finding() {
+                let read = NodeSetFolder::read(&of_yaml.path, folder.as_deref())?;
+                for what in read.findings() {
                     self.found(source, what, false);
                 }
+                folder = Some(Arc::new(read));
                 Ok(())
             });
-        }
-        {
-            let mut state = self.state();
-            state.folder = folder;
-            let versions = models.iter();
-            let versions =
-                versions.map(|(_, model)| (model.namespace.clone(), model.version.clone()));
-            state.versions.extend(versions);
+            self.state().folder = folder;
         }
         let mut known = self.known_node_sets();
         known.retain(|namespace, _| {
@@ -197,9 +191,32 @@ impl MesSources {
         lasting: SourceLifetime,
     ) -> Vec<KnowledgeSource> {
         let folder = self.state().folder.clone();
-        let Some(completion) = folder.map(|folder| folder.complete(model, known)) else {
+        let Some(folder) = folder else {
             return Vec::new();
         };
+        let mut taken: BTreeSet<String> = BTreeSet::new();
+        let mut faults: BTreeMap<String, Vec<String>> = BTreeMap::new();
+        let completion = folder.complete(model, known, &mut |file| {
+            let namespace = file.model.namespace.clone();
+            let path = file.path.display();
+            match self.take_file(file, lasting) {
+                Ok(()) => {
+                    info!(source = source.name, "{namespace} was added from {path}");
+                    taken.insert(namespace);
+                    true
+                }
+                Err(what) => {
+                    let of_namespace = faults.entry(namespace.clone()).or_default();
+                    of_namespace.push(format!("{path}: {what}"));
+                    // An older file does not replace contents that this file gave before.
+                    let is_kept = self.has_version(&file.model);
+                    if is_kept {
+                        taken.insert(namespace);
+                    }
+                    is_kept
+                }
+            }
+        });
         for what in completion.findings {
             self.found(source, what, false);
         }
@@ -207,31 +224,45 @@ impl MesSources {
         for file in completion.files {
             let namespace = file.model.namespace;
             let other = KnowledgeSource::new(SourceKind::NodeSet, &namespace);
-            added.push(other.clone());
-            self.try_one(other, |other| {
-                let read = node_set(&decoded(&bytes(&file.path)?)?)?;
-                self.put(other, &read.triples, lasting)?;
-                let path = file.path.display();
-                info!(source = source.name, "{namespace} was added from {path}");
-                Ok(())
-            });
-            let version = file.model.version;
-            self.state()
-                .versions
-                .insert(namespace.clone(), version.clone());
+            let is_refused = !taken.contains(&namespace);
+            let found: Vec<Finding> = faults
+                .remove(&namespace)
+                .into_iter()
+                .flatten()
+                .map(|what| finding(&other, what, is_refused))
+                .collect();
+            for Finding { source, what, .. } in &found {
+                warn!(kind = %other.kind, source, "cannot read a source: {what}");
+            }
+            self.state().findings.insert(other.clone(), found);
+            added.push(other);
+            let version = self.knowledge.model_version(&namespace);
             known.insert(namespace, version);
         }
         added
     }
 
+    /// Adds a NodeSet of the folder to the graph.
+    fn take_file(&self, file: &FolderNodeSet, lasting: SourceLifetime) -> Result<(), String> {
+        let source = KnowledgeSource::new(SourceKind::NodeSet, &file.model.namespace);
+        let read = node_set(&decoded(&bytes(&file.path)?)?)?;
+        self.put(&source, &read.triples, lasting)
+    }
+
+    /// Returns whether the graph has a NodeSet that is not older than a model.
+    fn has_version(&self, model: &NodeSetModel) -> bool {
+        let source = KnowledgeSource::new(SourceKind::NodeSet, &model.namespace);
+        let version = self.knowledge.model_version(&model.namespace);
+        self.is_known(&source) && !version.is_older_than(&model.version)
+    }
+
     /// Returns the NodeSets of the graph with their versions.
     fn known_node_sets(&self) -> BTreeMap<String, ModelVersion> {
-        let state = self.state();
         let sources = self.knowledge.sources().into_iter();
         let all = sources.filter(|source| source.kind == SourceKind::NodeSet);
         all.map(|source| {
-            let version = state.versions.get(&source.name).cloned();
-            (source.name, version.unwrap_or_default())
+            let version = self.knowledge.model_version(&source.name);
+            (source.name, version)
         })
         .collect()
     }
@@ -363,7 +394,7 @@ impl MesSources {
         match (folder, model) {
             (Some(folder), Some(model)) => {
                 let known = self.known_node_sets();
-                folder.complete(&model, &known).findings
+                folder.complete(&model, &known, &mut |_| true).findings
             }
             _ => Vec::new(),
         }
@@ -484,8 +515,6 @@ impl SourceFiles for MesSources {
                 Self::put(self, &source, &read.triples, SourceLifetime::Yes)?;
                 let mut known = self.known_node_sets();
                 self.complete(&source, &read.model, &mut known, SourceLifetime::Yes);
-                let (namespace, version) = (read.model.namespace, read.model.version);
-                self.state().versions.insert(namespace, version);
             }
             (SourceKind::Mtp, _) => {
                 let manifest = Manifest {

@@ -373,11 +373,19 @@ impl Reading {
             reading: &self,
             all: Vec::new(),
         };
-        let iri = format!("urn:ua-bridge:nodeset:{}", escaped(&model.namespace));
+        let iri = model_iri(&model.namespace);
         graph.link(&iri, v::RDF_TYPE, v::NODE_SET);
         graph.text(&iri, v::RDFS_LABEL, &model.namespace);
         if !model.version.version.is_empty() {
             graph.text(&iri, v::MODEL_VERSION, &model.version.version);
+        }
+        let date = model.version.publication_date.trim();
+        if !date.is_empty() {
+            let date = match date.contains('T') {
+                true => Object::Time(date.to_owned()),
+                false => Object::Text(date.to_owned()),
+            };
+            graph.say(&iri, v::PUBLICATION_DATE, date);
         }
         graph.nodes();
         let triples = graph.all;
@@ -491,6 +499,11 @@ impl Graph<'_> {
             object,
         });
     }
+}
+
+/// Returns the IRI of the model of a namespace.
+pub(crate) fn model_iri(namespace: &str) -> String {
+    format!("urn:ua-bridge:nodeset:{}", escaped(namespace))
 }
 
 impl UaNode {

@@ -142,7 +142,7 @@ impl Reading {
         }
         if let Some(date) = model.attribute("PublicationDate") {
             let date = typed(date, "dateTime");
-            self.say(&uri, &format!("{PLANT}publicationDate"), date);
+            self.say(&uri, v::PUBLICATION_DATE, date);
         }
         for required in children(model, "RequiredModel") {
             if let Some(required) = required.attribute("ModelUri").and_then(iri) {

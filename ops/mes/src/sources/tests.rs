@@ -1,3 +1,5 @@
+use std::path::PathBuf;
+
 use super::*;
 
 #[test]
@@ -165,5 +167,106 @@ fn nodesets_are_completed_from_a_folder_and_leave_with_their_reason() {
             .any(|one| one.refused && one.what.contains("nowhere")),
         "{findings:?}"
     );
+    drop(std::fs::remove_dir_all(&folder));
+}
+
+/// Returns an empty folder that is named for a test, and settings of files in it.
+fn plant(name: &str) -> (PathBuf, impl Fn(&str) -> Settings) {
+    let folder = std::env::temp_dir().join(format!("{name}-{}", std::process::id()));
+    drop(std::fs::remove_dir_all(&folder));
+    let of_yaml = folder.clone();
+    let settings = move |keys: &str| {
+        let text = format!("mes: m\napplication_uri: urn:x\nnamespace: 5\n{keys}\n");
+        Settings::from_yaml(&text, &of_yaml).unwrap()
+    };
+    (folder, settings)
+}
+
+#[test]
+fn nodesets_remain_while_their_folder_cannot_be_read() {
+    let (folder, yaml) = plant("mes-nodesets-away");
+    write_node_set(&folder, "urn:robotics", "2023-01-01", &["urn:di"]);
+    write_node_set(&folder.join("sets"), "urn:di", "2022-01-01", &["urn:core"]);
+    write_node_set(&folder.join("sets"), "urn:core", "2022-01-01", &[]);
+    let yaml = yaml("nodesets: [urn-robotics.xml]\nnodeset_folder: sets");
+    let knowledge = Arc::new(Knowledge::new().unwrap());
+    let sources = MesSources::new(Arc::clone(&knowledge));
+    let is_there = |name: &str| knowledge.sources().iter().any(|one| one.name == name);
+    sources.read(&yaml);
+    assert_eq!(sources.findings(), []);
+    for _ in 0..2 {
+        std::fs::rename(folder.join("sets"), folder.join("away")).unwrap();
+        // Each signal is one more reading.
+        for _ in 0..2 {
+            sources.read(&yaml);
+            assert!(is_there("urn:di") && is_there("urn:core"));
+            let findings = sources.findings();
+            let mut findings = findings.iter();
+            assert!(findings.any(|one| one.refused && one.what.contains("cannot read the folder")));
+        }
+        std::fs::rename(folder.join("away"), folder.join("sets")).unwrap();
+        sources.read(&yaml);
+        assert_eq!(sources.findings(), [], "it can be read again");
+    }
+    drop(std::fs::remove_dir_all(&folder));
+}
+
+#[test]
+fn an_older_nodeset_completes_others_if_the_newest_cannot_be_read() {
+    let (folder, yaml) = plant("mes-nodesets-broken");
+    let (sets, broken) = (folder.join("sets"), folder.join("sets/broken"));
+    write_node_set(&folder, "urn:robotics", "2023-01-01", &["urn:di"]);
+    write_node_set(&sets, "urn:di", "2022-01-01", &[]);
+    write_node_set(&broken, "urn:di", "2024-01-01", &[]);
+    let file = broken.join("urn-di.xml");
+    let text = std::fs::read_to_string(&file).unwrap();
+    let damaged = text.replace("</UANodeSet>", "");
+    std::fs::write(&file, &damaged).unwrap();
+    let knowledge = Arc::new(Knowledge::new().unwrap());
+    let sources = MesSources::new(Arc::clone(&knowledge));
+    let yaml = yaml("nodesets: [urn-robotics.xml]\nnodeset_folder: sets");
+    sources.read(&yaml);
+    let version = knowledge.model_version("urn:di");
+    assert_eq!(version.publication_date, "2022-01-01");
+    let findings = sources.findings();
+    let [found] = findings.as_slice() else {
+        panic!("{findings:?}")
+    };
+    assert!(found.source == "urn:di" && !found.refused, "{found:?}");
+    assert!(found.what.contains("broken"), "{found:?}");
+
+    // Contents that a file gave before remain while it is damaged.
+    for (text, findings) in [(&text, 0), (&damaged, 1)] {
+        std::fs::write(&file, text).unwrap();
+        sources.read(&yaml);
+        let version = knowledge.model_version("urn:di");
+        assert_eq!(version.publication_date, "2024-01-01");
+        assert_eq!(sources.findings().len(), findings);
+    }
+    drop(std::fs::remove_dir_all(&folder));
+}
+
+#[test]
+fn a_stored_nodeset_that_is_too_old_is_a_finding_after_a_restart() {
+    let (folder, yaml) = plant("mes-nodesets-stored");
+    write_node_set(&folder, "urn:robotics", "2023-01-01", &["urn:di"]);
+    write_node_set(&folder, "urn:di", "2020-01-01T00:00:00Z", &[]);
+    let yaml = yaml("nodesets: [urn-robotics.xml]\nnodeset_folder: .");
+    let stored = folder.join("stored");
+    {
+        let (knowledge, _) = Knowledge::open(&stored).unwrap();
+        let sources = MesSources::new(Arc::new(knowledge));
+        let di = std::fs::read(folder.join("urn-di.xml")).unwrap();
+        SourceFiles::put(&sources, SourceKind::NodeSet, "di", &di).unwrap();
+    }
+    let (knowledge, _) = Knowledge::open(&stored).unwrap();
+    let sources = MesSources::new(Arc::new(knowledge));
+    sources.read(&yaml);
+    let findings = sources.findings();
+    let [found] = findings.as_slice() else {
+        panic!("{findings:?}")
+    };
+    let text = "the given NodeSet has the version of 2020-01-01";
+    assert!(found.what.contains(text), "{found:?}");
     drop(std::fs::remove_dir_all(&folder));
 }
