@@ -77,10 +77,14 @@ impl Loop {
         self.steps.is_subset(&other.steps) && self.steps.len() < other.steps.len()
     }
 
-    /// Returns a condition that cannot decide about another round. `steps` are those of the
-    /// process.
-    pub(crate) fn condition_fault(&self, steps: &[ProcessStep]) -> Option<LoopConditionFault> {
-        let over = self.over_after_round(steps);
+    /// Returns a condition that cannot decide about another round. `steps` and `loops` are all of
+    /// the process.
+    pub(crate) fn condition_fault(
+        &self,
+        steps: &[ProcessStep],
+        loops: &[Self],
+    ) -> Option<LoopConditionFault> {
+        let over = self.over_after_round(steps, loops);
         for alternative in &self.again {
             let mut named = alternative.iter().map(|condition| condition.step);
             if let Some(step) = named.clone().find(|step| !over.contains(step)) {
@@ -95,14 +99,21 @@ impl Loop {
     }
 
     /// Returns the steps that are over when a round is: those of the loop, and those for which they
-    /// wait.
-    fn over_after_round(&self, steps: &[ProcessStep]) -> BTreeSet<usize> {
+    /// wait. A step that waits for a step of another loop waits for the last round of that loop.
+    fn over_after_round(&self, steps: &[ProcessStep], loops: &[Self]) -> BTreeSet<usize> {
         let mut over = BTreeSet::new();
         let mut open: Vec<usize> = self.steps.iter().copied().collect();
         while let Some(number) = open.pop() {
-            if over.insert(number) {
-                let waits = steps.get(number).map(|step| step.waits_for(number));
-                open.extend(waits.into_iter().flatten());
+            if !over.insert(number) {
+                continue;
+            }
+            let waits = steps.get(number).map(|step| step.waits_for(number));
+            for other in waits.into_iter().flatten() {
+                open.push(other);
+                let left = loops
+                    .iter()
+                    .filter(|one| one.steps.contains(&other) && !one.steps.contains(&number));
+                open.extend(left.flat_map(|one| &one.steps));
             }
         }
         over

@@ -26,6 +26,7 @@ pub(super) fn loops_of(
             .push(row);
     }
     let mut all: Vec<Loop> = Vec::new();
+    let mut iris = Vec::new();
     for (iri, rows) in by_loop {
         let read = read(iri, &rows, order, conditions);
         let read = read.map_err(|why| format!("the loop {iri} {why}"))?;
@@ -44,10 +45,14 @@ pub(super) fn loops_of(
                 "the loop {iri} waits for the step {step}, which waits for the end of the loop"
             ));
         }
-        if let Some(why) = condition_fault(&read, steps, order) {
+        all.push(read);
+        iris.push(iri);
+    }
+    // The steps of other loops may be over too.
+    for (one, iri) in all.iter().zip(iris) {
+        if let Some(why) = condition_fault(one, (steps, &all), order) {
             return Err(format!("the loop {iri} {why}"));
         }
-        all.push(read);
     }
     Ok(all)
 }
@@ -82,9 +87,13 @@ fn read(iri: &str, rows: &[&Row], order: &[&str], conditions: &[Row]) -> Result<
 }
 
 /// Returns the reason why a condition of a loop cannot decide about another round.
-fn condition_fault(one: &Loop, steps: &[ProcessStep], order: &[&str]) -> Option<String> {
+fn condition_fault(
+    one: &Loop,
+    (steps, loops): (&[ProcessStep], &[Loop]),
+    order: &[&str],
+) -> Option<String> {
     let name = |step: usize| order.get(step).copied().unwrap_or_default();
-    let why = match one.condition_fault(steps)? {
+    let why = match one.condition_fault(steps, loops)? {
         LoopConditionFault::MayNotBeOver(step) => format!(
             "has a condition about the step {step}, which may not be over when a round is: name a \
              step of the loop, repeat {step} too (ua:repeats), or let a step of the loop come \

@@ -116,9 +116,13 @@ impl Flow {
 
 /// Returns the finding about a condition that cannot decide about another round of the loop that
 /// returns to a node with this name.
-fn condition_fault(one: &Loop, head: &str, steps: &[ProcessStep]) -> Option<String> {
+fn condition_fault(
+    one: &Loop,
+    head: &str,
+    (steps, loops): (&[ProcessStep], &[Loop]),
+) -> Option<String> {
     let name = |step: usize| steps.get(step).map_or("", |step| step.name.as_str());
-    let what = match one.condition_fault(steps)? {
+    let what = match one.condition_fault(steps, loops)? {
         LoopConditionFault::MayNotBeOver(step) => format!(
             "the flow returns to `{head}` by a condition about `{}`, which may not be over then; \
              use a result of a step between",
@@ -262,7 +266,7 @@ impl Reading<'_> {
             let guard = paths.guards.get(edge.from);
             guard.map_or_else(Guard::new, |guard| and(guard, &edge.when))
         };
-        let mut all = Vec::new();
+        let (mut all, mut heads) = (Vec::new(), Vec::new());
         for one in &loops.all {
             let name = flow.name(one.head);
             let at = loops.back(flow, one.head).next().map_or(0, |edge| edge.at);
@@ -308,10 +312,14 @@ impl Reading<'_> {
                 again,
                 rounds: Loop::USUAL_ROUNDS,
             };
-            if let Some(what) = condition_fault(&read, name, done) {
+            all.push(read);
+            heads.push((at, name));
+        }
+        // The steps of other loops may be over too.
+        for (one, (at, head)) in all.iter().zip(heads) {
+            if let Some(what) = condition_fault(one, head, (done, &all)) {
                 self.error_at(at, what);
             }
-            all.push(read);
         }
         all
     }

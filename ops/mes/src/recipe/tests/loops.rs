@@ -156,6 +156,16 @@ fn in_graph(turtle: &str) -> Result<Vec<Loop>, String> {
     }
 }
 
+/// A process of three steps, with a loop over two of them.
+const OF_THREE: &str = "@prefix css: <http://www.w3id.org/hsu-aut/css#> . @prefix cask: <http://www.w3id.org/hsu-aut/cask#> .
+        @prefix ua: <urn:ua-bridge:plant#> .
+        <urn:p> a css:Process ; ua:hasStep <urn:p/1> , <urn:p/2> , <urn:p/3> ; ua:hasLoop <urn:p/l> .
+        <urn:p/1> ua:position 1 ; css:requiresCapability [ a cask:RequiredCapability , <urn:c:1> ] .
+        <urn:p/2> ua:position 2 ; css:requiresCapability [ a cask:RequiredCapability , <urn:c:2> ] .
+        <urn:p/3> ua:position 3 ; css:requiresCapability [ a cask:RequiredCapability , <urn:c:3> ] .
+        <urn:p/l> ua:repeats <urn:p/1> , <urn:p/2> ; ua:rounds 7 ;
+            ua:when [ ua:condition [ ua:resultOf <urn:p/2> ; ua:endsAs \"failed\" ] ] .";
+
 #[test]
 fn loops_come_back_from_the_graph_and_faulty_ones_have_a_reason() {
     let text = batchml(AGAIN);
@@ -168,14 +178,7 @@ fn loops_come_back_from_the_graph_and_faulty_ones_have_a_reason() {
     assert_eq!(read.faults, BTreeMap::new());
     assert_eq!(read.all, [process]);
 
-    let turtle = "@prefix css: <http://www.w3id.org/hsu-aut/css#> . @prefix cask: <http://www.w3id.org/hsu-aut/cask#> .
-        @prefix ua: <urn:ua-bridge:plant#> .
-        <urn:p> a css:Process ; ua:hasStep <urn:p/1> , <urn:p/2> , <urn:p/3> ; ua:hasLoop <urn:p/l> .
-        <urn:p/1> ua:position 1 ; css:requiresCapability [ a cask:RequiredCapability , <urn:c:1> ] .
-        <urn:p/2> ua:position 2 ; css:requiresCapability [ a cask:RequiredCapability , <urn:c:2> ] .
-        <urn:p/3> ua:position 3 ; css:requiresCapability [ a cask:RequiredCapability , <urn:c:3> ] .
-        <urn:p/l> ua:repeats <urn:p/1> , <urn:p/2> ; ua:rounds 7 ;
-            ua:when [ ua:condition [ ua:resultOf <urn:p/2> ; ua:endsAs \"failed\" ] ] .";
+    let turtle = OF_THREE;
     let loops = in_graph(turtle).unwrap();
     assert_eq!((loops[0].rounds, &loops[0].steps), (7, &[0, 1].into()));
     let only = "ua:repeats <urn:p/2> ;";
@@ -225,5 +228,33 @@ fn loops_come_back_from_the_graph_and_faulty_ones_have_a_reason() {
         assert!(turtle.contains(from), "{from}");
         let fault = in_graph(&turtle.replacen(from, to, 1)).unwrap_err();
         assert!(fault.contains(why), "{why}: {fault}");
+    }
+}
+
+#[test]
+fn a_loop_decides_by_all_steps_of_a_loop_before_it() {
+    // A step that waits for a step of another loop begins when that whole loop is left.
+    let parallel = OF_THREE
+        .replacen("ua:position 2", "ua:position 2 ; ua:after <urn:p>", 1)
+        .replacen("ua:position 3", "ua:position 3 ; ua:after <urn:p/1>", 1);
+    for iri in ["<urn:p/a>", "<urn:p/z>"] {
+        let also = format!(
+            "ua:hasLoop <urn:p/l> , {iri} . {iri} ua:repeats <urn:p/3> ; ua:when [
+                ua:condition [ ua:resultOf <urn:p/3> ; ua:endsAs \"failed\" ] ,
+                    [ ua:resultOf <urn:p/2> ; ua:endsAs \"failed\" ] ] ."
+        );
+        let legal = parallel.replacen("ua:hasLoop <urn:p/l> .", &also, 1);
+        assert_eq!(in_graph(&legal).map(|loops| loops.len()), Ok(2), "{iri}");
+        let apart = legal.replacen(
+            "<urn:p/1> , <urn:p/2> ; ua:rounds",
+            "<urn:p/1> ; ua:rounds",
+            1,
+        );
+        let of_two = "ua:when [ ua:condition [ ua:resultOf <urn:p/2>";
+        assert!(apart.contains(of_two));
+        let apart = apart.replacen(of_two, &of_two.replace("p/2", "p/1"), 1);
+        let why = in_graph(&apart).unwrap_err();
+        let expected = "has a condition about the step urn:p/2, which may not be over";
+        assert!(why.contains(expected), "{why}");
     }
 }
