@@ -409,7 +409,12 @@ fn number(literal: &Literal) -> Option<Value> {
         .strip_prefix("http://www.w3.org/2001/XMLSchema#")?;
     match of {
         "integer" | "int" | "long" | "short" | "byte" | "nonNegativeInteger"
-        | "positiveInteger" | "unsignedInt" => literal.value().parse::<i64>().ok().map(Value::from),
+        | "positiveInteger" | "nonPositiveInteger" | "negativeInteger" | "unsignedLong"
+        | "unsignedInt" | "unsignedShort" | "unsignedByte" => {
+            let (text, large) = (literal.value(), || literal.value().parse::<u64>());
+            let number = text.parse::<i64>().map(Value::from);
+            number.or_else(|_| large().map(Value::from)).ok()
+        }
         "double" | "float" | "decimal" => literal
             .value()
             .parse::<f64>()

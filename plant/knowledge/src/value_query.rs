@@ -241,7 +241,9 @@ mod tests {
     }
 
     const PART: &str = "<urn:part> <urn:width> 31.5 , 40 ; <urn:name> \"box\" ; <urn:is> true ;
-        <urn:node> [ <urn:depth> 4 ] ; <urn:kind> <urn:box> .";
+        <urn:node> [ <urn:depth> 4 ] ; <urn:kind> <urn:box> ;
+        <urn:serial> \"18446744073709551615\"^^<http://www.w3.org/2001/XMLSchema#unsignedLong> ;
+        <urn:below> \"-5\"^^<http://www.w3.org/2001/XMLSchema#negativeInteger> .";
 
     #[test]
     fn the_only_value_of_a_query_is_its_value() {
@@ -260,6 +262,8 @@ mod tests {
                 "box".into(),
             ),
             ("SELECT ?is { <urn:part> <urn:is> ?is }", true.into()),
+            ("SELECT ?n { <urn:part> <urn:serial> ?n }", u64::MAX.into()),
+            ("SELECT ?n { <urn:part> <urn:below> ?n }", (-5).into()),
             (
                 "SELECT ?kind { <urn:part> <urn:kind> ?kind }",
                 "urn:box".into(),
