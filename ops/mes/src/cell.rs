@@ -22,6 +22,7 @@ use skills::{
     SkillValue, ToolState,
 };
 use tokio::sync::watch;
+use tokio::task::spawn_blocking;
 use tokio::time::timeout;
 use tracing::{error, info, warn};
 
@@ -532,9 +533,11 @@ impl Plant for PlantState {
         values(&self.found(skill)?, given)
     }
 
-    fn query(&self, query: &ParameterQuery) -> Result<serde_json::Value, String> {
-        let read = ValueQuery::read(&query.sparql);
-        let value = read.and_then(|read| read.value(&self.knowledge));
+    async fn query(&self, query: &ParameterQuery) -> Result<serde_json::Value, String> {
+        let (knowledge, sparql) = (Arc::clone(&self.knowledge), query.sparql.clone());
+        let value = move || ValueQuery::read(&sparql).and_then(|read| read.value(&knowledge));
+        let value = spawn_blocking(value).await;
+        let value = value.map_err(|error| format!("it fails: {error}"))?;
         value.map_err(|fault| fault.to_string())
     }
 

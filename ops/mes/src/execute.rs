@@ -3,10 +3,10 @@
 //! run fails.
 
 mod compensate;
+mod facts;
 mod sequence;
 mod watched;
 
-use std::cell::RefCell;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
@@ -18,10 +18,11 @@ use skills::{JobObserver, PickAndPlace, RunnableSkill, SkillValue};
 use tokio::sync::watch;
 use tracing::{info, warn};
 
-use crate::plan::{Facts, Fallen, Offer, Plan, Situation, plan};
+use crate::plan::{Fallen, Offer, Plan, Situation, plan};
 use crate::process::{GivenParameter, ParameterQuery, Process, ProcessStep, SkillRole, StepJob};
 use crate::record::{How, Planned, ProcessRun};
 
+use facts::{EvaluatedProcess, OfPlant};
 use sequence::{RunProgress, StepEnd};
 use watched::RecordedSkill;
 
@@ -45,11 +46,11 @@ pub(crate) trait Plant: Send + Sync {
         given: &[GivenParameter],
     ) -> Result<Vec<(String, SkillValue)>, String>;
 
-    /// Evaluates the query of a parameter.
+    /// Evaluates the query of a parameter, which takes up to a second.
     ///
     /// # Errors
     /// The reason why it has no value.
-    fn query(&self, query: &ParameterQuery) -> Result<serde_json::Value, String>;
+    async fn query(&self, query: &ParameterQuery) -> Result<serde_json::Value, String>;
 
     /// Returns the unit of a result of a skill, if it has one.
     ///
@@ -232,74 +233,11 @@ fn tell(run: &ProcessRun) {
 }
 
 /// Plans a process without running it, as if no other process was running.
-pub(crate) fn dry_run(plant: &dyn Plant, process: &Process) -> Plan {
-    let situation = Situation::default();
-    plan(process, &plant.offers(), situation, &OfPlant::new(plant))
-}
-
-/// The facts about skills that the plant knows, for one plan.
-struct OfPlant<'a> {
-    plant: &'a dyn Plant,
-    /// The values of queries, which are the same for all skills of a plan.
-    values: RefCell<BTreeMap<String, Result<serde_json::Value, String>>>,
-}
-
-impl<'a> OfPlant<'a> {
-    fn new(plant: &'a dyn Plant) -> Self {
-        Self {
-            plant,
-            values: RefCell::default(),
-        }
-    }
-
-    /// Checks that the queries of the steps that are not over have values. No component that comes
-    /// later can help if they do not.
-    fn can_evaluate(&self, process: &Process, progress: &RunProgress) -> Result<(), String> {
-        let steps = process.steps.iter().enumerate();
-        for (_, step) in steps.filter(|(number, _)| !progress.is_over(*number)) {
-            for given in &step.parameters {
-                let value = given.evaluated(&|query| self.value(query));
-                value.map_err(|why| format!("{}: {why}", step.name))?;
-            }
-        }
-        Ok(())
-    }
-
-    fn value(&self, query: &ParameterQuery) -> Result<serde_json::Value, String> {
-        let mut values = self.values.borrow_mut();
-        let evaluate = || self.plant.query(query);
-        let value = values.entry(query.sparql.clone());
-        value.or_insert_with(evaluate).clone()
-    }
-}
-
-impl Facts for OfPlant<'_> {
-    fn takes(&self, offer: &Offer, step: &ProcessStep) -> Result<(), String> {
-        let given = step.parameters.iter();
-        let given = given.map(|given| given.evaluated(&|query| self.value(query)));
-        let given = given.collect::<Result<Vec<_>, _>>()?;
-        self.plant.values(&offer.skill, &given).map(drop)
-    }
-
-    fn gives(&self, offer: &Offer, result: &str) -> Result<(), String> {
-        self.plant.result(&offer.skill, result).map(drop)
-    }
-
-    fn connects(&self, from: (&str, &str), to: (&str, &str)) -> Result<(), String> {
-        self.plant.connects(from, to)
-    }
-
-    fn reaches(&self, offer: &Offer, positions: &[[f64; 3]]) -> Result<(), String> {
-        self.plant.reaches(&offer.skill, positions)
-    }
-
-    fn attachment(&self, offer: &Offer) -> Attachment {
-        self.plant.attachment(&offer.component)
-    }
-
-    fn prefer(&self) -> &[String] {
-        self.plant.prefer()
-    }
+pub(crate) async fn dry_run(plant: &dyn Plant, process: &Process) -> Plan {
+    let evaluated = EvaluatedProcess::of(plant, process, &RunProgress::default()).await;
+    let (process, evaluated) = (&evaluated.process, &evaluated);
+    let facts = OfPlant { plant, evaluated };
+    plan(process, &plant.offers(), Situation::default(), &facts)
 }
 
 struct Execution<'a> {
@@ -328,6 +266,8 @@ struct Chosen {
     open: Vec<(SkillRole, Offer)>,
     /// The offers of compensations, by the numbers of the steps.
     undo: BTreeMap<usize, Offer>,
+    /// The steps of the process with the values of their queries, as the plan used them.
+    steps: Vec<ProcessStep>,
 }
 
 impl Execution<'_> {
@@ -398,7 +338,11 @@ impl Execution<'_> {
         tokio::pin!(wait);
         loop {
             changes.mark_unchanged();
-            self.read_tools().await?;
+            // A tool changer or a query that does not respond delays no stop.
+            self.unless_stopped(self.plant.read_tools()).await?;
+            let evaluated = EvaluatedProcess::of(self.plant, self.process, progress);
+            let evaluated = self.unless_stopped(evaluated).await?;
+            evaluated.check().map_err(|why| format!("{after}{why}"))?;
             let offers = self.plant.offers();
             let (fallen, used) = (self.log.fallen(), self.plant.used_by_others(&run));
             let situation = Situation {
@@ -407,11 +351,11 @@ impl Execution<'_> {
                 passed: &passed,
                 used: Some(&used),
             };
-            let facts = OfPlant::new(self.plant);
-            facts
-                .can_evaluate(self.process, progress)
-                .map_err(|why| format!("{after}{why}"))?;
-            let plan = plan(self.process, &offers, situation, &facts);
+            let facts = OfPlant {
+                plant: self.plant,
+                evaluated: &evaluated,
+            };
+            let plan = plan(&evaluated.process, &offers, situation, &facts);
             if plan.is_complete() {
                 let chosen = self.chosen(&plan, &offers, progress);
                 let all = chosen.open.iter().map(|(_, offer)| offer);
@@ -421,7 +365,8 @@ impl Execution<'_> {
                 let all = all.chain(progress.done.iter().filter_map(|done| done.undo.as_ref()));
                 let components = all.map(|offer| offer.component.clone()).collect();
                 if self.plant.lease(&run, &components) {
-                    return Ok((plan, chosen));
+                    let steps = evaluated.process.steps;
+                    return Ok((plan, Chosen { steps, ..chosen }));
                 }
             }
             let missing = plan.missing();
@@ -445,12 +390,15 @@ impl Execution<'_> {
         }
     }
 
-    /// Reads the tools of the tool changers. A tool changer that does not respond delays no stop.
-    async fn read_tools(&self) -> Result<(), String> {
+    /// Waits for the plant.
+    ///
+    /// # Errors
+    /// The caller stopped the run meanwhile.
+    async fn unless_stopped<T>(&self, wait: impl Future<Output = T> + Send) -> Result<T, String> {
         tokio::select! {
             biased;
             () = self.teller.stopped() => Err("stopped".to_owned()),
-            () = self.plant.read_tools() => Ok(()),
+            value = wait => Ok(value),
         }
     }
 
@@ -476,6 +424,7 @@ impl Execution<'_> {
         Chosen {
             open,
             undo: undo.collect(),
+            steps: Vec::new(),
         }
     }
 

@@ -80,7 +80,7 @@ impl Driver for ExecuteProcess {
             )])
         };
         if work.parameters().text("ExecutionMode") == Some("plan") {
-            let plan = dry_run(&*self.cell, &process);
+            let plan = dry_run(&*self.cell, &process).await;
             let (complete, missing) = (plan.is_complete(), plan.missing());
             let whole = serde_json::json!({ "process": iri, "complete": complete, "missing": missing, "plan": plan });
             if whole.to_string().len() <= MOST_REPORT {

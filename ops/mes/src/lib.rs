@@ -589,7 +589,9 @@ fn page(cell: &Arc<PlantState>) -> knowledge::ExtraPages {
             Some(process) => process.clone(),
             None => cell.goal(iri).ok()?.process,
         };
-        let plan = execute::dry_run(&*cell, &process);
+        // Pages are made in a thread that may block.
+        let runtime = Handle::try_current().ok()?;
+        let plan = runtime.block_on(execute::dry_run(&*cell, &process));
         Some(serde_json::json!({ "process": process.iri, "complete": plan.is_complete(), "missing": plan.missing(), "plan": plan }).to_string())
     })
 }

@@ -14,6 +14,7 @@ use skills::choosing::{self, Attachment, CandidateRank, choose};
 use crate::process::{By, Group, Need, Process, ProcessStep, SkillRole, StepJob};
 
 use judging::Judging;
+pub(crate) use judging::TOOL;
 
 /// An available skill, as a row of the query `candidates`.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -177,8 +178,8 @@ impl Situation<'_> {
 
 /// The facts about skills that a plan needs. Each check returns the reason why it fails.
 pub(crate) trait Facts {
-    /// Checks that an offer takes the parameters of a step.
-    fn takes(&self, offer: &Offer, step: &ProcessStep) -> Result<(), String>;
+    /// Checks that an offer takes the parameters of the step or compensation with a number.
+    fn takes(&self, offer: &Offer, step: (usize, &ProcessStep)) -> Result<(), String>;
 
     /// Checks that an offer has the result of a name.
     fn gives(&self, offer: &Offer, result: &str) -> Result<(), String>;
@@ -213,7 +214,8 @@ fn rank(needs: &[&Need], offer: &Offer, facts: &dyn Facts) -> CandidateRank {
     }
 }
 
-/// Plans a process with the available skills.
+/// Plans a process with the available skills. The parameters that queries give have their values
+/// in the process; a parameter whose value is null gets it when its step begins.
 pub(crate) fn plan(
     process: &Process,
     offers: &[Offer],

@@ -280,22 +280,23 @@ impl GivenParameter {
         }
     }
 
-    /// Returns the parameter with the value of its query, if it has one.
+    /// Returns the parameter with the value of its query.
     ///
     /// # Errors
     /// The reason why the query has no value, with its name.
     pub(crate) fn evaluated(
         &self,
-        value: &dyn Fn(&ParameterQuery) -> Result<serde_json::Value, String>,
+        value: Result<serde_json::Value, String>,
     ) -> Result<Self, String> {
-        let Some(query) = &self.query else {
-            return Ok(self.clone());
-        };
-        let value = value(query).map_err(|why| format!("{}: {why}", self.shown()))?;
-        Ok(Self {
-            value,
-            ..self.clone()
-        })
+        let wrong = |why: String| format!("{}: {why}", self.shown());
+        let value = value.map_err(wrong)?;
+        match value.is_null() {
+            true => Err(wrong("it has no value".to_owned())),
+            false => Ok(Self {
+                value,
+                ..self.clone()
+            }),
+        }
     }
 }
 

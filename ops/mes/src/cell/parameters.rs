@@ -1,7 +1,7 @@
 //! The parameters and results of skills: names, types, units and limits.
 
 use knowledge::units;
-use skills::{Builtin, FoundParameter, FoundSkill, SkillValue};
+use skills::{Builtin, FoundParameter, FoundSkill, SkillValue, ValueShape};
 
 use crate::process::GivenParameter;
 
@@ -24,17 +24,13 @@ pub(super) fn values(
     }
     let value = |given: &GivenParameter| {
         let parameter = parameter(found, &given.name)?;
-        // The value is known when its step is done.
-        if given.result.is_some() {
+        // The value is known when its step is done, or when the step of its query begins.
+        if given.result.is_some() || (given.query.is_some() && given.value.is_null()) {
             return Ok(None);
         }
         let wrong = |why: String| format!("{}: {why}", given.shown());
-        if given.query.is_some() && given.value.is_null() {
-            return Err(wrong("it is not evaluated".to_owned()));
-        }
         let json = in_unit(given, parameter).map_err(wrong)?;
-        let read = parameter.shape.read_json(&json);
-        let value = read.map_err(|error| wrong(error.to_string()))?;
+        let value = read(parameter.shape, &json).map_err(wrong)?;
         let numbers = if let SkillValue::Array(_, elements) = &value {
             elements.iter().filter_map(SkillValue::as_f64).collect()
         } else {
@@ -60,6 +56,15 @@ pub(super) fn values(
         allowed.map_err(|why| why.to_string())?;
     }
     Ok(values)
+}
+
+/// Reads a value that may be sent to a machine.
+fn read(shape: ValueShape, json: &serde_json::Value) -> Result<SkillValue, String> {
+    let value = shape.read_json(json).map_err(|error| error.to_string())?;
+    match value.is_unreal() {
+        true => Err(format!("{json} is not a number")),
+        false => Ok(value),
+    }
 }
 
 /// Returns the parameter of a skill with a name.
@@ -158,4 +163,19 @@ fn in_unit(
         return all.iter().map(one).collect();
     }
     one(&given.value)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_value_that_is_not_finite_is_refused() {
+        let shape = ValueShape::scalar(Builtin::Double);
+        assert_eq!(read(shape, &2.5.into()), Ok(SkillValue::Double(2.5)));
+        for text in ["NaN", "Infinity", "-Infinity"] {
+            let why = read(shape, &text.into()).unwrap_err();
+            assert!(why.contains("is not a number"), "{why}");
+        }
+    }
 }

@@ -12,6 +12,8 @@ use crate::record::{How, Planned, ProcessRun};
 #[derive(Debug, Clone)]
 pub(super) struct Done {
     pub(super) number: usize,
+    /// The step with the values of its queries, as the plan used them.
+    pub(super) step: ProcessStep,
     pub(super) offer: Offer,
     /// The skill of its compensation, if it has one.
     pub(super) undo: Option<Offer>,
@@ -42,14 +44,14 @@ pub(super) fn kept(process: &Process, done: &[Done]) -> Vec<KeptStep> {
 ///
 /// # Errors
 /// The result that a step did not return, or the query without a value.
-pub(super) fn resolved(
+pub(super) async fn resolved(
     plant: &dyn Plant,
     step: &ProcessStep,
     done: &[&Done],
 ) -> Result<Vec<GivenParameter>, String> {
-    let one = |given: &GivenParameter| {
+    let one = |given: &GivenParameter| -> Result<GivenParameter, String> {
         let Some(of) = &given.result else {
-            return given.evaluated(&|query| plant.query(query));
+            return Ok(given.clone());
         };
         let from = done.iter().find(|done| done.number == of.step);
         let from = from.ok_or_else(|| format!("{}: its step is not done", given.name))?;
@@ -67,7 +69,14 @@ pub(super) fn resolved(
             query: None,
         })
     };
-    step.parameters.iter().map(one).collect()
+    let mut all = Vec::new();
+    for given in &step.parameters {
+        all.push(match &given.query {
+            Some(query) => given.evaluated(plant.query(query).await)?,
+            None => one(given)?,
+        });
+    }
+    Ok(all)
 }
 
 /// A completed step to compensate.
@@ -95,10 +104,9 @@ impl Execution<'_> {
         let undone = (1..=done.len()).rev().filter_map(|count| {
             let until = done.get(..count)?;
             let done = until.last()?;
-            let step = self.process.steps.get(done.number)?;
             Some(Undone {
-                step,
-                compensation: step.compensation.as_deref()?,
+                step: &done.step,
+                compensation: done.step.compensation.as_deref()?,
                 offer: done.undo.as_ref()?,
                 until,
             })
@@ -175,7 +183,8 @@ impl Execution<'_> {
         let ended = match skills.first() {
             // The results of the same round are the latest before it.
             Some(skill) => {
-                match self.prepared(step, offer, &undone.until.iter().rev().collect::<Vec<_>>()) {
+                let done: Vec<_> = undone.until.iter().rev().collect();
+                match self.prepared(step, offer, &done).await {
                     Ok(values) => self.one(step, (offer, &**skill), values).await,
                     Err(end) => end,
                 }
@@ -187,6 +196,7 @@ impl Execution<'_> {
             StepEnd::Done(_) => Ok(()),
             StepEnd::Failed(why)
             | StepEnd::TimedOut(why)
+            | StepEnd::Outdated(why)
             | StepEnd::Lost(why)
             | StepEnd::LostInRun(why)
             | StepEnd::Stopped(why)

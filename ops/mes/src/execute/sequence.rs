@@ -11,6 +11,7 @@ use tracing::info;
 
 use super::compensate::{self, Done};
 use super::{Chosen, Ended, Execution, Fallen, Offer, ProcessStep, SkillRole};
+use crate::plan::TOOL;
 use crate::process::{BadEnd, Loop, Process, StepCondition, Test};
 
 /// The steps of a run that are over.
@@ -50,7 +51,7 @@ impl RunProgress {
     }
 
     /// Returns the completed steps, without the steps of earlier rounds.
-    fn current(&self) -> impl Iterator<Item = &Done> {
+    pub(super) fn current(&self) -> impl Iterator<Item = &Done> {
         self.done.iter().filter(|done| !done.is_earlier)
     }
 
@@ -185,6 +186,8 @@ pub(super) enum StepEnd {
     Stopped(String),
     /// An earlier step did not return a result.
     Unresolved(String),
+    /// It has not begun, because its plan does not apply any longer.
+    Outdated(String),
     Failed(String),
     /// It was halted after its time limit.
     TimedOut(String),
@@ -199,13 +202,14 @@ type Ready = (usize, usize);
 
 impl Execution<'_> {
     /// Runs the steps that are not over. When a step fails, no other step begins, and the running
-    /// steps are awaited.
+    /// steps are awaited. The queries of a step are evaluated while other steps run.
     pub(super) async fn sequence(
         &self,
         chosen: &Chosen,
         skills: &[Arc<dyn RunnableSkill>],
         progress: &mut RunProgress,
     ) -> Ended {
+        let mut preparing = FuturesUnordered::new();
         let mut running = FuturesUnordered::new();
         let mut begun: BTreeMap<usize, &str> = BTreeMap::new();
         let mut ended = Ended::Done;
@@ -222,41 +226,52 @@ impl Execution<'_> {
                 let (Some((_, offer)), Some(skill), Some(step)) = (
                     chosen.open.get(place),
                     skills.get(place),
-                    self.process.steps.get(number),
+                    chosen.steps.get(number),
                 ) else {
                     ended = Ended::Over("the plan has another step than the process".to_owned());
                     break;
                 };
                 begun.insert(number, &offer.component);
-                match self.prepared(step, offer, &progress.current().collect::<Vec<_>>()) {
-                    Ok(values) => running.push(async move {
-                        self.teller.step("Step").await;
-                        let end = self.one(step, (offer, &**skill), values).await;
-                        (number, offer, end)
-                    }),
-                    Err(end) => {
-                        begun.remove(&number);
-                        self.over((number, offer), end, (chosen, &mut *progress), &mut ended);
-                    }
-                }
+                let done: Vec<Done> = progress.current().cloned().collect();
+                preparing.push(async move {
+                    let done: Vec<&Done> = done.iter().collect();
+                    let values = self.prepared(step, offer, &done).await;
+                    (number, (step, offer, skill), values)
+                });
+            }
+            if !matches!(ended, Ended::Done) {
+                preparing.clear();
             }
             let is_left = !progress.is_complete(self.process);
             let is_paused = *self.paused.borrow() && matches!(ended, Ended::Done) && is_left;
-            let next = match is_paused {
-                false => running.next().await,
-                true => tokio::select! {
-                    biased;
-                    Some(next) = running.next() => Some(next),
-                    () = self.resumed() => continue,
-                    // A running step ends by itself when the run is stopped.
-                    () = self.teller.stopped(), if running.is_empty() => {
-                        ended = Ended::Over("stopped".to_owned());
-                        None
+            let (number, offer, end) = tokio::select! {
+                biased;
+                Some((number, (step, offer, skill), values)) = preparing.next() => match values {
+                    // It is prepared again when steps may begin.
+                    Ok(_) if *self.paused.borrow() => {
+                        begun.remove(&number);
+                        continue;
                     }
+                    Ok(values) => {
+                        running.push(async move {
+                            self.teller.step("Step").await;
+                            let end = self.one(step, (offer, &**skill), values).await;
+                            (number, offer, end)
+                        });
+                        continue;
+                    }
+                    Err(end) => (number, offer, end),
                 },
-            };
-            let Some((number, offer, end)) = next else {
-                break;
+                Some(next) = running.next() => next,
+                () = self.resumed(), if is_paused => continue,
+                // A step that runs or is prepared ends by itself when the run is stopped.
+                () = self.teller.stopped(),
+                    if is_paused && running.is_empty() && preparing.is_empty() =>
+                {
+                    ended = Ended::Over("stopped".to_owned());
+                    break;
+                }
+                else => break,
             };
             begun.remove(&number);
             self.over((number, offer), end, (chosen, &mut *progress), &mut ended);
@@ -351,8 +366,13 @@ impl Execution<'_> {
         };
         let (bad, why) = match end {
             StepEnd::Done(results) => {
+                let step = chosen
+                    .steps
+                    .get(number)
+                    .or_else(|| self.process.steps.get(number));
                 progress.done.push(Done {
                     number,
+                    step: step.cloned().unwrap_or_default(),
                     offer: offer.clone(),
                     undo: chosen.undo.get(&number).cloned(),
                     results,
@@ -365,7 +385,7 @@ impl Execution<'_> {
                 (Some(BadEnd::TimedOut), Ended::Broken(why))
             }
             StepEnd::TimedOut(why) => (Some(BadEnd::Failed), Ended::Broken(why)),
-            StepEnd::Lost(why) => (None, Ended::Broken(why)),
+            StepEnd::Lost(why) | StepEnd::Outdated(why) => (None, Ended::Broken(why)),
             // Another component must not repeat the step.
             StepEnd::Stopped(why) | StepEnd::Unresolved(why) | StepEnd::LostInRun(why) => {
                 (None, Ended::Over(why))
@@ -383,15 +403,31 @@ impl Execution<'_> {
         ended.and(why);
     }
 
-    /// Returns the parameters of a step, or the end of a step that cannot begin.
-    pub(super) fn prepared(
+    /// Returns the parameters of a step as its plan used it, or the end of a step that cannot
+    /// begin.
+    pub(super) async fn prepared(
         &self,
         step: &ProcessStep,
         offer: &Offer,
         done: &[&Done],
     ) -> Result<Vec<(String, SkillValue)>, StepEnd> {
-        let given = compensate::resolved(self.plant, step, done)
-            .map_err(|why| StepEnd::Unresolved(format!("{}: {why}", step.name)))?;
+        let given = self.unless_stopped(compensate::resolved(self.plant, step, done));
+        let given = given.await.map_err(StepEnd::Stopped)?;
+        let given = given.map_err(|why| StepEnd::Unresolved(format!("{}: {why}", step.name)))?;
+        // The plan has chosen the later steps for the tool that it knows.
+        let other = step.parameters.iter().zip(&given).find(|(planned, given)| {
+            let is_tool = planned.name == TOOL && planned.query.is_some();
+            is_tool && planned.value != given.value
+        });
+        if let Some((planned, given)) = other {
+            return Err(StepEnd::Outdated(format!(
+                "{}: {}: its value is {}, and was {} for the plan",
+                step.name,
+                planned.shown(),
+                given.value,
+                planned.value
+            )));
+        }
         self.plant.values(&offer.skill, &given).map_err(|why| {
             self.log.fell(Fallen {
                 component: offer.component.clone(),

@@ -3,6 +3,7 @@ mod loops;
 mod queries;
 mod stops;
 
+use std::collections::VecDeque;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use knowledge::{Knowledge, KnowledgeSource, SourceKind};
@@ -31,7 +32,9 @@ struct Fakes {
     /// Skills named `Meet` wait for each other here.
     meets: Option<Arc<tokio::sync::Barrier>>,
     /// The results of the evaluations of queries, in their order.
-    found: Mutex<Vec<Result<serde_json::Value, String>>>,
+    found: Mutex<VecDeque<Result<serde_json::Value, String>>>,
+    /// Counts the evaluations after these, which do not end.
+    silent_queries: watch::Sender<u32>,
     journal: Mutex<Vec<String>>,
     kept: Mutex<Vec<ProcessRun>>,
     clock: AtomicU64,
@@ -85,15 +88,26 @@ impl Plant for Arc<Fakes> {
         given
             .iter()
             .filter(|given| given.result.is_none())
+            .filter(|given| given.query.is_none() || !given.value.is_null())
             .map(|given| {
-                let number = given.value.as_f64().ok_or("no number")?;
-                Ok((given.name.clone(), SkillValue::Double(number)))
+                let value = match given.value.as_str() {
+                    Some(text) => SkillValue::String(text.to_owned()),
+                    None => SkillValue::Double(given.value.as_f64().ok_or("no number")?),
+                };
+                Ok((given.name.clone(), value))
             })
             .collect()
     }
 
-    fn query(&self, _query: &ParameterQuery) -> Result<serde_json::Value, String> {
-        self.found.lock().unwrap().remove(0)
+    async fn query(&self, _query: &ParameterQuery) -> Result<serde_json::Value, String> {
+        let found = self.found.lock().unwrap().pop_front();
+        match found {
+            Some(found) => found,
+            None => {
+                self.silent_queries.send_modify(|queries| *queries += 1);
+                std::future::pending().await
+            }
+        }
     }
 
     fn result(&self, _skill: &str, name: &str) -> Result<Option<String>, String> {
@@ -347,6 +361,7 @@ fn plant(offers: Vec<Offer>) -> Fakes {
         silent_tools: None,
         meets: None,
         found: Mutex::default(),
+        silent_queries: watch::channel(0).0,
         journal: Mutex::default(),
         kept: Mutex::default(),
         clock: AtomicU64::new(1000),

@@ -288,8 +288,9 @@ impl<'a> Judging<'a> {
     /// Checks that an offer takes the parameters of its step, and has the results that other steps
     /// take.
     fn takes(&self, need: &Need, offer: &Offer) -> Result<(), NotFit> {
-        if let Some(step) = self.step(need.role) {
-            self.facts.takes(offer, step).map_err(NotFit::Because)?;
+        if let (SkillRole::Alone(number), Some(step)) = (need.role, self.step(need.role)) {
+            let taken = self.facts.takes(offer, (number, step));
+            taken.map_err(NotFit::Because)?;
         }
         if let (StepJob::PickAndPlace(job), SkillRole::Ptp | SkillRole::Linear) =
             (&self.process.work, need.role)
@@ -392,4 +393,4 @@ impl<'a> Judging<'a> {
 }
 
 /// The parameter that names a tool by its ApplicationUri.
-const TOOL: &str = "ToolAppUri";
+pub(crate) const TOOL: &str = "ToolAppUri";

@@ -24,7 +24,7 @@ struct Known {
 }
 
 impl Facts for Known {
-    fn takes(&self, offer: &Offer, step: &ProcessStep) -> Result<(), String> {
+    fn takes(&self, offer: &Offer, (_, step): (usize, &ProcessStep)) -> Result<(), String> {
         match self.refuses == (&*offer.component_name, &*step.name) {
             true => Err(format!("{} has no parameter Nonsense", offer.name)),
             false => Ok(()),
@@ -55,7 +55,7 @@ struct Preferring {
 }
 
 impl Facts for Preferring {
-    fn takes(&self, _: &Offer, _: &ProcessStep) -> Result<(), String> {
+    fn takes(&self, _: &Offer, _: (usize, &ProcessStep)) -> Result<(), String> {
         Ok(())
     }
 
