@@ -459,7 +459,7 @@ fn a_manifest_in_a_folder_is_a_component_until_it_is_removed() {
         .output()
         .unwrap();
     assert_eq!(second.status.code(), Some(69), "{second:?}");
-    let why = stdout(&second);
+    let why = String::from_utf8_lossy(&second.stderr);
     assert!(why.contains("in use by another"), "{why}");
     std::fs::remove_file(folder.join("dance.aml")).unwrap();
     eventually("its skills are gone", SOON, || {
