@@ -68,7 +68,8 @@ fn an_opcua_client_queries_the_knowledge_and_changes_it_as_an_engineer() {
         panic!("{all:?}")
     };
     assert_eq!(update["outputs"], json!([3, "", "", 0]));
-    let expected = json!(["o\r\n1\r\n2\r\n", "text/csv", 2, true, "", "", 0]);
+    let csv = "text/csv; charset=utf-8";
+    let expected = json!(["o\r\n1\r\n2\r\n", csv, 2, true, "", "", 0]);
     assert_eq!(cut["outputs"], expected, "two of three rows");
     let outputs = &wrong["outputs"];
     assert_eq!((&outputs[4], &outputs[6]), (&json!("malformed"), &json!(2)));
