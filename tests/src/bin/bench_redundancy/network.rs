@@ -39,7 +39,7 @@ impl SwitchedNetwork {
             (&network.station, READER, STATION),
         ];
         for (site, in_group, in_ros) in hosts {
-            network.group.plug(site, "group", in_group);
+            network.group.plug(site, "cell", in_group);
             network.ros.plug(site, "ros", in_ros);
         }
         network
@@ -50,7 +50,7 @@ impl SwitchedNetwork {
         let bridge = StartedChild::new("bridge-ros1", &program("bridge-ros1"));
         of_ros(cell, bridge, IN_ROS[at])
             .args([mapping, "--rank", ["1", "2"][at]])
-            .args(["--interface", "group", "--metrics", METRICS])
+            .args(["--interface", "cell", "--metrics", METRICS])
             .at(&self.bridges[at])
     }
 
