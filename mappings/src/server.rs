@@ -129,7 +129,7 @@ pub struct ServerLimits {
     pub sessions_per_address: Option<u16>,
     /// Connections.
     pub connections: Option<u16>,
-    /// Connections of one client address.
+    /// Maximum number of connections of a client address.
     pub connections_per_address: Option<u16>,
     /// Subscriptions of a session.
     pub subscriptions: Option<u16>,

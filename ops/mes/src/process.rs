@@ -98,8 +98,9 @@ impl Loop {
         None
     }
 
-    /// Returns the steps that are over when a round is: those of the loop, and those for which they
-    /// wait. A step that waits for a step of another loop waits for the last round of that loop.
+    /// Returns the steps that are over at the end of a round: the steps of the loop, and the steps
+    /// for which they wait. A step that waits for a step of another loop waits for the last round
+    /// of that loop.
     fn over_after_round(&self, steps: &[ProcessStep], loops: &[Self]) -> BTreeSet<usize> {
         let mut over = BTreeSet::new();
         let mut open: Vec<usize> = self.steps.iter().copied().collect();

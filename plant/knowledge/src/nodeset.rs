@@ -287,7 +287,7 @@ impl Reading {
         Ok(())
     }
 
-    /// Takes a model. The first one is that of the file.
+    /// Adds a model. The first model of a file describes the file.
     fn model(&mut self, namespace: String, version: ModelVersion) {
         self.is_first_model = self.model.is_none();
         if self.is_first_model {

@@ -55,7 +55,7 @@ pub const VDI_2860: &str = "http://www.hsu-ifa.de/ontologies/VDI2860#";
 /// The namespace of the manufacturing processes.
 pub const DIN_8580: &str = "http://www.w3id.org/hsu-aut/DIN8580#";
 
-/// The name of an operation, and that of the operation above it; none for the root.
+/// The name of an operation, and the name of the more general operation; empty for the root.
 type Operation = (&'static str, &'static str);
 
 const HANDLING: &[Operation] = &[

@@ -15,7 +15,7 @@ use crate::query::{self, QueryFault};
 use crate::question;
 use crate::store::Knowledge;
 
-/// A SELECT with one variable, whose result has one row.
+/// A SELECT query with a single variable, whose result must have a single row.
 #[derive(Debug, Clone)]
 pub struct ValueQuery(Query);
 

@@ -18,9 +18,8 @@ pub fn replace(path: &Path, content: &[u8]) -> io::Result<()> {
     rename_synced(&beside, path)
 }
 
-/// Claims what a file stands for, until the returned file and its clones, also those of child
-/// processes, are closed. The file is created if necessary. Returns `None` if another process has
-/// claimed it.
+/// Locks a file until the returned file and its clones, including the clones of child processes,
+/// are closed. The file is created if necessary. Returns `None` if another process holds the lock.
 ///
 /// # Errors
 /// Returns an error if the file cannot be created or locked.

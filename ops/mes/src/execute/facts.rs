@@ -9,7 +9,7 @@ use super::sequence::RunProgress;
 use crate::plan::{Facts, Offer};
 use crate::process::{GivenParameter, Process, ProcessStep};
 
-/// A process whose queries have been evaluated for one plan.
+/// A process with the results of its queries, evaluated before a plan is made.
 pub(super) struct EvaluatedProcess {
     /// The process with the values of its queries. A completed step has the values of the plan
     /// that did it, such as the tool that it attached.
