@@ -237,6 +237,10 @@ impl Port for Ros1Port {
         self.requests.is_one_of_several();
     }
 
+    fn link_changed(&mut self, has_link: bool) {
+        self.side.node.set_network(has_link);
+    }
+
     fn call_known(&mut self, topic: TopicId, description: &Arc<CallDescription>) {
         self.requests.known(&mut self.side, topic, description);
     }

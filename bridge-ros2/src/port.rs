@@ -386,6 +386,10 @@ impl Port for Ros2Port {
         self.sinks.drop_waiting(&mut self.side, at_once);
     }
 
+    fn link_changed(&mut self, _has_link: bool) {
+        self.sinks.drop_unreceived(&mut self.side);
+    }
+
     fn role_changed(&mut self, _is_active: bool) {
         self.requests.is_one_of_several();
     }

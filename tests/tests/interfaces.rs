@@ -1,14 +1,15 @@
 //! Network interfaces that are deleted and recreated, or get another address, while the bridges
 //! run.
 
+use std::cell::RefCell;
 use std::time::{Duration, Instant};
 
 use system_tests::{
-    BareNode, Cable, Cell, Child, HERE, METRICS_ROS1, METRICS_ROS2, StartedChild, TopicTriple,
-    UaSide, WIRE, eventually, http_answer, http_get, metrics, program, string_frame,
+    BareNode, Cable, Cell, Child, HERE, METRICS_ROS1, METRICS_ROS2, Peer, StartedChild, THERE,
+    TopicTriple, UaSide, WIRE, eventually, http_answer, http_get, metrics, program, string_frame,
 };
 use tcpros::Core;
-use uadp::Scalar;
+use uadp::{Scalar, Variant};
 
 /// Another address of this host on the cable.
 const ELSEWHERE: &str = "10.77.0.3";
@@ -189,4 +190,92 @@ fn a_bridge_whose_ros_1_address_is_another_ends_to_be_started_again() {
     cable.lay(ELSEWHERE);
     assert_eq!(bridge.wait_for_end(SOON).code(), Some(69));
     bridge.wait_for_line("should restart this program", SOON);
+}
+
+/// The numbers that rospy published on another host, as they arrive in the group.
+struct Numbers(RefCell<Vec<u32>>);
+
+impl Numbers {
+    /// Reads values until the number `last`, or the next number.
+    fn read(&self, ua: &UaSide, last: Option<u32>) -> u32 {
+        ua.hear(OUT.0, "a number of rospy", |fields| {
+            let [Variant::Scalar(Scalar::String(Some(text)))] = fields else {
+                return None;
+            };
+            let number: u32 = text.parse().ok()?;
+            self.0.borrow_mut().push(number);
+            last.is_none_or(|last| number >= last).then_some(number)
+        })
+    }
+}
+
+/// TCP holds what is sent while a link is down, and delivers it when the link is up again: values
+/// and commands as old as the cut.
+#[test]
+fn what_was_sent_while_the_link_of_ros_1_was_down_does_not_arrive_when_it_is_up() {
+    let Some(cell) = Cell::with(&[Peer::Ros1]) else {
+        return;
+    };
+    let cable = cell.cable();
+    cable.lay(HERE);
+    let runtime = tokio::runtime::Runtime::new().unwrap();
+    let _inside = runtime.enter();
+    let _master = Core::start(([0, 0, 0, 0], 11311).into()).unwrap();
+    let _bridge = bridge_ros1(HERE, &["--interface", "lo"]);
+    let beyond = |script: &str, args: &[&str]| {
+        cell.rospy_started(script, args)
+            .env("ROS_MASTER_URI", format!("http://{HERE}:11311"))
+            .env("ROS_HOSTNAME", THERE)
+            .beyond(&cable)
+            .start()
+            .ready(START)
+    };
+    let subscriber = beyond("ros1_sub.py", &["/ua_2_2_20", "std_msgs/String"]);
+    let arrives = |ua: &mut UaSide, text: &str| {
+        eventually(text, SOON, || {
+            ua.write(IN.0, Scalar::String(Some(text)));
+            let mut lines = subscriber.lines().into_iter();
+            lines.any(|line| line.contains(text)).then_some(())
+        });
+    };
+    let mut ua = UaSide::join();
+    arrives(&mut ua, "before the cut");
+    let numbered = [
+        OUT.1,
+        "std_msgs/String",
+        "--numbered",
+        "9999",
+        "--rate",
+        "100",
+    ];
+    let _publisher = beyond("ros1_pub.py", &numbered);
+    let numbers = Numbers(RefCell::default());
+    numbers.read(&ua, Some(50));
+
+    cable.cut();
+    let cut = Instant::now();
+    let before = numbers.read(&ua, None);
+    until_not_ready(METRICS_ROS1);
+    for _ in 0..20 {
+        ua.write(IN.0, Scalar::String(Some("while it was cut")));
+    }
+    eventually("the cut lasts", SOON, || {
+        (cut.elapsed() > Duration::from_millis(1500)).then_some(())
+    });
+    cable.mend();
+
+    // The numbers that arrived around the cut: the bridge notices it within 0.1 s.
+    let after = numbers.read(&ua, Some(before + 130));
+    let stale = before + 50..before + 100;
+    let numbers = numbers.0.borrow();
+    assert!(
+        !numbers.iter().any(|number| stale.contains(number)),
+        "{before} before the cut, {after} after it: {numbers:?}"
+    );
+    arrives(&mut ua, "after the cut");
+    let lines = subscriber.lines();
+    assert!(
+        !lines.iter().any(|line| line.contains("while it was cut")),
+        "{lines:?}"
+    );
 }

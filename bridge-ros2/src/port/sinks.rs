@@ -291,6 +291,23 @@ impl WrittenTopics {
         }
     }
 
+    /// Drops the events that readers have not received, because the link is down or was down. States
+    /// are delivered when it is up.
+    pub(super) fn drop_unreceived(&mut self, side: &mut Ros2Side) {
+        let now = Instant::now();
+        for (topic, sink) in &mut self.topics {
+            let Some(open) = sink.open.as_mut() else {
+                continue;
+            };
+            let count = open.outlet.drop_unreceived_events(now);
+            side.schedule.note_waiting(*topic, open.outlet.is_waiting());
+            if count > 0 {
+                let cause = (Reason::NotPublished, "the link of the ROS side was down");
+                side.events.push_back(lost(*topic, cause, count));
+            }
+        }
+    }
+
     /// Drops replaced writers after their readers have received all samples.
     pub(super) fn drop_former(&mut self, now: Instant) {
         self.former.retain(|former| !former.is_done(now));

@@ -474,6 +474,26 @@ impl Outlet {
         count
     }
 
+    /// Drops the events that wait, and those that readers have not acknowledged, and returns their
+    /// number: readers that are out of reach would receive them late. A state is not dropped.
+    pub fn drop_unreceived_events(&mut self, now: Instant) -> u64 {
+        if self.offered == Offered::KeepLatest {
+            return 0;
+        }
+        let unreceived = self.unacknowledged();
+        self.drop_waiting(true, now).saturating_add(unreceived)
+    }
+
+    /// Returns the number of samples that present readers have not acknowledged; 0 with the
+    /// published RustDDS.
+    fn unacknowledged(&self) -> u64 {
+        #[cfg(feature = "patched-dds")]
+        let samples = self.writer.unacknowledged().samples;
+        #[cfg(not(feature = "patched-dds"))]
+        let samples = 0_usize;
+        u64::try_from(samples).unwrap_or(u64::MAX)
+    }
+
     /// Handles the loss of the last reader.
     fn leave_alone(&mut self, now: Instant) {
         let mut held = None;

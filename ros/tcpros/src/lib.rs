@@ -39,6 +39,7 @@ mod options;
 mod outbox;
 mod parameters;
 mod publisher;
+mod reach;
 mod refusal;
 mod registrar;
 mod rpc;

@@ -2,6 +2,7 @@
 //! reconnecting.
 
 use std::os::fd::AsRawFd;
+use std::pin::{Pin, pin};
 use std::sync::atomic::Ordering;
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
@@ -22,6 +23,7 @@ use crate::header::{ConnectionHeader, HeaderError, clipped};
 use crate::inbox::{ConnectionPeer, InboxMessage};
 use crate::master::{Master, MasterError, unwrap_triple};
 use crate::outbox::lock;
+use crate::reach::{NetworkReach, stays_on_host};
 use crate::rpc::{self, RpcEndpoint, RpcError};
 use crate::subscription::{TopicFeed, TopicLink};
 use crate::xmlrpc::XmlRpcValue;
@@ -32,6 +34,8 @@ pub(crate) struct LinkContext {
     caller_id: String,
     max_message: usize,
     pub(crate) master: Master,
+    /// Whether the publishers on other hosts are within reach.
+    pub(crate) reach: NetworkReach,
     /// Maximum number of connected publishers of a topic.
     pub(crate) publishers_of_topic: usize,
     /// A permit for each publisher that is connected or being connected.
@@ -45,13 +49,14 @@ impl LinkContext {
     pub(crate) fn new(
         caller_id: String,
         max_message: usize,
-        master: Master,
+        (master, reach): (Master, NetworkReach),
         shares: &Shares,
     ) -> Self {
         Self {
             caller_id,
             max_message,
             master,
+            reach,
             publishers_of_topic: shares.publishers_of_topic,
             places: Semaphore::new(shares.publishers),
             failures: Mutex::new(Throttle::several(FAILURES_LOGGED, LOG_PERIOD)),
@@ -98,18 +103,23 @@ pub(crate) async fn run(
     let mut throttle = Throttle::new(LOG_PERIOD);
     loop {
         let before = state.messages.load(Ordering::Relaxed);
+        let mut changed = pin!(context.reach.changed());
         let place = context.place(&feed.topic).await;
         let started = clock::now();
-        let error = match connect(&feed, &context, &uri).await {
-            Ok((stream, peer)) => follow(stream, peer, &feed, &context, &state).await,
-            Err(error) => error,
-        };
+        let link = (&*feed, &*context, &*state);
+        let error = connect_and_follow(link, &uri, changed.as_mut()).await;
         drop(place);
         if matches!(error, LinkError::Ourselves) {
             // The entry stays, so that the next update does not try again.
             return;
         }
-        if !feed.still_wanted(&uri, &state) {
+        if matches!(error, LinkError::NetworkChanged) {
+            events::link_retried(&feed.topic, &uri, &error, Duration::ZERO);
+            (wait, failures) = (FIRST_WAIT, 0);
+            continue;
+        }
+        // A publisher that cannot be reached at present is not given up.
+        if !context.reach.is_lost() && !feed.still_wanted(&uri, &state) {
             return;
         }
         let lived = state.messages.load(Ordering::Relaxed) > before
@@ -132,7 +142,35 @@ pub(crate) async fn run(
         tokio::select! {
             () = sleep(wait) => wait = (wait * 2).min(LAST_WAIT),
             () = state.named_again.notified() => wait = FIRST_WAIT,
+            () = changed => wait = FIRST_WAIT,
         }
+    }
+}
+
+/// Connects to a publisher and delivers its messages until the connection ends. Returns the reason
+/// of the end.
+///
+/// When the network is lost or found again (`changed`), a connection to another host ends: what the
+/// publisher sent meanwhile is still in its socket, and would be delivered as if it were new.
+async fn connect_and_follow(
+    (feed, context, state): (&TopicFeed, &LinkContext, &TopicLink),
+    uri: &str,
+    mut changed: Pin<&mut impl Future<Output = ()>>,
+) -> LinkError {
+    let connected = tokio::select! {
+        biased;
+        () = changed.as_mut() => return LinkError::NetworkChanged,
+        connected = connect(feed, context, uri) => connected,
+    };
+    let (stream, peer) = match connected {
+        Ok(connected) => connected,
+        Err(error) => return error,
+    };
+    let stays = stays_on_host(&stream);
+    tokio::select! {
+        biased;
+        () = changed, if !stays => LinkError::NetworkChanged,
+        error = follow(stream, peer, feed, context, state) => error,
     }
 }
 
@@ -328,6 +366,8 @@ enum LinkError {
     Ourselves,
     #[error(transparent)]
     FrameTooLong(#[from] FrameTooLong),
+    #[error("the network of this host was lost or found again")]
+    NetworkChanged,
     #[error("it closed the connection")]
     Closed,
     #[error("the connection failed: {0}")]

@@ -30,6 +30,7 @@ use crate::options::NodeOptions;
 use crate::outbox::{Limit, lock};
 use crate::parameters::{NodeParameters, ParamValue, Params};
 use crate::publisher::{PublishedTopic, Publisher, PublisherOptions, TopicType};
+use crate::reach::NetworkReach;
 use crate::service::{
     OfferedService, ServiceClient, ServiceClientOptions, ServiceOptions, ServiceRequest,
     ServiceServer, ServiceTypeSum,
@@ -73,7 +74,13 @@ impl Node {
         let caller_id = names.node().to_owned();
         let master = Master::new(endpoint, options.master_uri, caller_id.clone(), uri.clone());
         let shares = Shares::of_process();
-        let context = LinkContext::new(caller_id, options.max_message, master.clone(), &shares);
+        let (network, reach) = NetworkReach::new();
+        let context = LinkContext::new(
+            caller_id,
+            options.max_message,
+            (master.clone(), reach),
+            &shares,
+        );
         let inner = Arc::new(Inner {
             names,
             uri,
@@ -85,6 +92,7 @@ impl Node {
             topics_port,
             master,
             links: Arc::new(context),
+            network,
             params,
             clock: Ros1Clock::default(),
             clock_feed: Mutex::default(),
@@ -293,6 +301,20 @@ impl Node {
         GraphReader::new(self.inner.master.clone())
     }
 
+    /// Sets whether other hosts are within reach, as the network interfaces of the node tell. With
+    /// each change the connections to publishers on other hosts are opened anew, because TCP
+    /// delivers what was sent meanwhile as if it were new. While the network is lost, messages to
+    /// subscribers on other hosts are dropped, except those of latching topics; what was written to
+    /// the sockets before still arrives late. Connections within this host go on.
+    pub fn set_network(&self, is_reachable: bool) {
+        let set = |state: &mut bool| std::mem::replace(state, is_reachable) != is_reachable;
+        if self.inner.network.send_if_modified(set) && !is_reachable {
+            for hub in self.inner.publications() {
+                hub.drop_cut_off();
+            }
+        }
+    }
+
     /// Unregisters everything from the master and stops within two seconds. Connections to
     /// subscribers end after their queues are written, connections to clients after their requests
     /// are answered. Registrations that stay behind in an unreachable master are logged by name; a
@@ -342,6 +364,8 @@ pub(crate) struct Inner {
     pub(crate) topics_port: u16,
     pub(crate) master: Master,
     links: Arc<LinkContext>,
+    /// Whether other hosts are within reach.
+    network: watch::Sender<bool>,
     pub(crate) params: Params,
     clock: Ros1Clock,
     /// The subscription to `/clock` while time is simulated.
@@ -370,6 +394,11 @@ impl Inner {
 
     pub(crate) fn next_connection_id(&self) -> i32 {
         self.next_id.fetch_add(1, Ordering::Relaxed)
+    }
+
+    /// Returns whether other hosts are within reach, for a connection.
+    pub(crate) fn reach(&self) -> NetworkReach {
+        self.links.reach.clone()
     }
 
     pub(crate) fn publication(&self, topic: &str) -> Option<Arc<PublishedTopic>> {

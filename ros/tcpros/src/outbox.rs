@@ -66,6 +66,16 @@ impl SubscriberQueue {
         dropped
     }
 
+    /// Drops all messages and returns their number.
+    pub(crate) fn clear(&self) -> u64 {
+        let mut state = lock(&self.state);
+        let count = u64::try_from(state.queue.len()).unwrap_or(u64::MAX);
+        state.queue.clear();
+        state.bytes = 0;
+        state.dropped = state.dropped.saturating_add(count);
+        count
+    }
+
     /// Moves up to `batch` bytes of messages, and at least one message, to `into`. Waits for the
     /// first message. Returns false if the queue is closed and empty. Cancel-safe: no message is
     /// removed before the function returns.

@@ -11,6 +11,7 @@ use crate::events;
 use crate::header::{ConnectionHeader, clipped};
 use crate::node::Inner;
 use crate::outbox::{Limit, SubscriberQueue, lock};
+use crate::reach::NetworkReach;
 use crate::refusal::ConnectionRefusal;
 
 /// The type of a topic, as publishers and subscribers compare it.
@@ -218,6 +219,8 @@ pub(crate) struct Subscriber {
     pub(crate) caller_id: String,
     /// Description of the connection for `rosnode info`.
     pub(crate) transport: String,
+    /// Whether the subscriber is within reach; `None` if it is on this host.
+    reach: Option<NetworkReach>,
     /// The topic's count of messages at the time of joining.
     joined: u64,
     /// The keys of the messages that were latched at the time of joining.
@@ -225,6 +228,13 @@ pub(crate) struct Subscriber {
     pub(crate) outbox: SubscriberQueue,
     pub(crate) bytes: AtomicU64,
     pub(crate) messages: AtomicU64,
+}
+
+impl Subscriber {
+    /// Returns whether the subscriber is on another host, and the network is lost.
+    fn is_cut_off(&self) -> bool {
+        self.reach.as_ref().is_some_and(NetworkReach::is_lost)
+    }
 }
 
 impl PublishedTopic {
@@ -260,11 +270,17 @@ impl PublishedTopic {
             sent_to: 0,
             dropped_oldest: 0,
         };
+        let mut dropped = 0;
         for subscriber in &state.subscribers {
+            if subscriber.is_cut_off() && !self.is_latching() {
+                // It would arrive when the network is found again.
+                dropped += 1;
+                continue;
+            }
             published.dropped_oldest += subscriber.outbox.push(message.clone());
             published.sent_to += 1;
         }
-        let mut dropped = published.dropped_oldest;
+        dropped += published.dropped_oldest;
         state.note(latched.key());
         if self.is_latching() {
             dropped += state.latch(message, latched);
@@ -288,13 +304,25 @@ impl PublishedTopic {
         }
     }
 
+    /// Drops the messages that wait for subscribers out of reach, unless the topic is latching.
+    pub(crate) fn drop_cut_off(&self) {
+        if self.is_latching() {
+            return;
+        }
+        let state = lock(&self.state);
+        let cut_off = state.subscribers.iter().filter(|s| s.is_cut_off());
+        let dropped = cut_off.map(|subscriber| subscriber.outbox.clear()).sum();
+        drop(state);
+        self.dropped.fetch_add(dropped, Ordering::Relaxed);
+    }
+
     /// Adds a subscriber; its queue starts with the latched messages. Returns `None` if the topic
     /// is withdrawn.
     pub(crate) fn join(
         self: &Arc<Self>,
         id: i32,
         caller_id: &str,
-        transport: String,
+        (transport, reach): (String, Option<NetworkReach>),
     ) -> Option<Joined> {
         let limit = Limit {
             messages: self.options.queue_messages,
@@ -308,6 +336,7 @@ impl PublishedTopic {
             id,
             caller_id: caller_id.to_owned(),
             transport,
+            reach,
             joined: state.count,
             found: state.latched.iter().map(|(key, _)| *key).collect(),
             outbox: SubscriberQueue::new(limit),
@@ -556,7 +585,7 @@ mod tests {
                     dropped_oldest: 0
                 }
             );
-            let late = hub.join(1, "/late", String::new()).unwrap();
+            let late = hub.join(1, "/late", Default::default()).unwrap();
             hub.close();
             let mut taken = Vec::new();
             assert_eq!(late.subscriber.outbox.take(&mut taken, 64).await, latch);
@@ -573,7 +602,7 @@ mod tests {
         hub.latch(message("2"), Latched::Beside(20));
         let _again = hub.publish(message("4"), Latched::Beside(30));
         let late = async |id| {
-            let late = hub.join(id, "/late", String::new()).unwrap();
+            let late = hub.join(id, "/late", Default::default()).unwrap();
             let mut taken = Vec::new();
             late.subscriber.outbox.take(&mut taken, 64).await;
             taken
@@ -616,7 +645,7 @@ mod tests {
         for key in 0..5 {
             hub.latch(Bytes::new(), Latched::Beside(key));
         }
-        let late = hub.join(1, "/late", String::new()).unwrap();
+        let late = hub.join(1, "/late", Default::default()).unwrap();
         assert_eq!(late.subscriber.outbox.dropped(), 3);
         assert_eq!(hub.dropped.load(Ordering::Relaxed), 3);
     }
@@ -628,7 +657,7 @@ mod tests {
         for (key, message) in [(1, "left"), (2, "right"), (3, "base")] {
             let _published = hub.publish(text(message.as_bytes()), Latched::Alone(key));
         }
-        let early = hub.join(1, "/early", String::new()).unwrap();
+        let early = hub.join(1, "/early", Default::default()).unwrap();
         let mut heard = Vec::new();
         assert!(early.subscriber.outbox.take(&mut heard, 64).await);
         for _ in 0..2 {
@@ -644,7 +673,7 @@ mod tests {
     #[test]
     fn a_subscriber_that_does_not_read_costs_only_itself() {
         let hub = hub(false);
-        let joined = hub.join(1, "/slow", String::new()).unwrap();
+        let joined = hub.join(1, "/slow", Default::default()).unwrap();
         let published: Vec<_> = (0..3u8)
             .map(|n| {
                 hub.publish(Bytes::from(vec![n]), Latched::Alone(0))
@@ -655,5 +684,28 @@ mod tests {
         assert_eq!(joined.subscriber.outbox.dropped(), 1);
         drop(joined);
         assert_eq!(hub.publish(Bytes::new(), Latched::Alone(0)).sent_to, 0);
+    }
+
+    #[test]
+    fn a_subscriber_out_of_reach_gets_no_message_late_unless_the_topic_is_latching() {
+        for latch in [false, true] {
+            let hub = hub_of(latch, 10);
+            let (network, reach) = NetworkReach::new();
+            let away = (String::new(), Some(reach));
+            let away = hub.join(1, "/away", away).unwrap();
+            let here = hub.join(2, "/here", Default::default()).unwrap();
+            let _both = hub.publish(Bytes::from_static(b"1"), Latched::Alone(0));
+            network.send_replace(false);
+            hub.drop_cut_off();
+            let cut = hub.publish(Bytes::from_static(b"2"), Latched::Alone(0));
+            network.send_replace(true);
+            let back = hub.publish(Bytes::from_static(b"3"), Latched::Alone(0));
+            let reached = if latch { 2 } else { 1 };
+            assert_eq!((cut.sent_to, back.sent_to), (reached, 2));
+            let lost = if latch { 0 } else { 2 };
+            assert_eq!(hub.dropped.load(Ordering::Relaxed), lost);
+            assert_eq!(here.subscriber.outbox.clear(), 3);
+            assert_eq!(away.subscriber.outbox.clear(), 3 - lost);
+        }
     }
 }

@@ -24,6 +24,7 @@ use crate::header::{ConnectionHeader, HeaderError, clipped};
 use crate::link::{prepare, transport_info};
 use crate::node::Inner;
 use crate::publisher::{Joined, Subscriber};
+use crate::reach::stays_on_host;
 use crate::refusal::ConnectionRefusal;
 use crate::service::{self, ClientFault};
 
@@ -94,7 +95,7 @@ enum Admitted {
 async fn shake_hands(stream: &mut TcpStream, node: &Inner) -> Result<Admitted, Refused> {
     prepare(stream)?;
     let request = ConnectionHeader::read(stream).await?;
-    match admit(request, node, transport_info(stream)) {
+    match admit(request, node, stream) {
         Ok((reply, admitted)) => {
             stream.write_all(&reply.encode()?).await?;
             Ok(admitted)
@@ -112,7 +113,7 @@ async fn shake_hands(stream: &mut TcpStream, node: &Inner) -> Result<Admitted, R
 fn admit(
     request: ConnectionHeader,
     node: &Inner,
-    transport: String,
+    stream: &TcpStream,
 ) -> Result<(ConnectionHeader, Admitted), ConnectionRefusal> {
     if let Some(name) = request.get("service") {
         let served = node
@@ -131,8 +132,13 @@ fn admit(
     };
     let hub = node.publication(topic).ok_or_else(gone)?;
     let reply = hub.reply_to(&request, node.name())?;
+    let reach = (!stays_on_host(stream)).then(|| node.reach());
     let joined = hub
-        .join(node.next_connection_id(), caller, transport)
+        .join(
+            node.next_connection_id(),
+            caller,
+            (transport_info(stream), reach),
+        )
         .ok_or_else(gone)?;
     let nodelay = request.get("tcp_nodelay") == Some("1");
     events::subscriber_joined(&joined.hub.topic, caller, nodelay);

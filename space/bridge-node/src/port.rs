@@ -107,6 +107,12 @@ pub trait Port: Send + 'static {
         let _alone = is_active;
     }
 
+    /// Notes that the network interfaces of this side have no link, repeatedly while it lasts, or
+    /// that one has it again. What was sent meanwhile is not to arrive late, in either direction.
+    fn link_changed(&mut self, has_link: bool) {
+        let _no_connections = has_link;
+    }
+
     /// Notes that a call of another program is available or has changed.
     fn call_known(&mut self, topic: TopicId, description: &Arc<CallDescription>) {
         let _not_served = (topic, description);

@@ -373,6 +373,7 @@ async fn prepare<P: Program>(
         own,
         router,
         held: port.addresses().and_then(HeldInterfaces::start),
+        has_no_link: false,
         port,
         carrier,
         interest: None,

@@ -63,6 +63,8 @@ pub(crate) struct Shell<P> {
     pub(crate) outbox: DatagramOutbox,
     /// The network interfaces that the port cannot change while it runs.
     pub(crate) held: Option<HeldInterfaces>,
+    /// True while the interfaces of the ROS side have no link.
+    pub(crate) has_no_link: bool,
     /// Returns the namespaces that only this program writes, by the mapping.
     pub(crate) owned: fn(&Mapping) -> Owned,
     /// Whether it listens for other writers in these namespaces before it sends.
@@ -166,8 +168,8 @@ impl<P: Port> Shell<P> {
                 () = &mut stop => return Ok(()),
                 heard = self.carrier.recv(&mut buffer) => more = self.heard_all(heard, &mut buffer),
                 event = self.port.recv() => more = self.port_events(event).await?,
-                () = links.as_mut(), if self.watches_links() => {
-                    links.as_mut().reset(TokioInstant::now() + redundancy::LINK_LOOK);
+                () = links.as_mut(), if self.held.is_some() => {
+                    links.as_mut().reset(TokioInstant::now() + self.link_period());
                     self.look_at_links();
                 }
                 () = timer.as_mut() => {

@@ -85,10 +85,14 @@ impl<P: Port> Shell<P> {
         }
     }
 
-    /// Returns whether the links of the ROS side are checked every [`LINK_LOOK`], so that a bridge
-    /// that lost its link hands over within the time of a takeover.
-    pub(super) fn watches_links(&self) -> bool {
-        self.held.is_some() && self.router.redundancy().is_some()
+    /// Returns the interval in which the links of the ROS side are checked. A redundant bridge that
+    /// lost its link hands over within the time of a takeover.
+    pub(super) fn link_period(&self) -> Duration {
+        if self.router.redundancy().is_some() {
+            LINK_LOOK
+        } else {
+            LINK_LOOK_ALONE
+        }
     }
 
     /// Checks the links of the ROS side. Changes are reported by the check of each second, so that
@@ -102,13 +106,16 @@ impl<P: Port> Shell<P> {
 
     /// Sets whether the ROS side is within reach.
     pub(super) fn look_at_fitness(&mut self) {
-        if self.router.redundancy().is_none() {
-            return;
-        }
         let is_held = self
             .held
             .as_ref()
             .is_none_or(|held| HeldInterfaces::lost(held).is_none());
+        if std::mem::replace(&mut self.has_no_link, !is_held) || !is_held {
+            self.port.link_changed(is_held);
+        }
+        if self.router.redundancy().is_none() {
+            return;
+        }
         let side = match (is_held, self.port.hindrance()) {
             (false, _) => LocalSide::NoLink,
             (true, Some(_)) => LocalSide::Silent,
@@ -175,6 +182,9 @@ fn tell_same_rank(rank: Option<u8>, from: SocketAddr) {
 
 /// The interval in which redundant bridges check the links of the ROS side. Listing the interfaces
 /// takes less than 0.1 ms.
-pub(super) const LINK_LOOK: Duration = Duration::from_millis(25);
+const LINK_LOOK: Duration = Duration::from_millis(25);
+/// The interval in which a bridge that runs alone does so. What it published since the loss of the
+/// link arrives late.
+const LINK_LOOK_ALONE: Duration = Duration::from_millis(100);
 /// The maximum number of datagrams that are handled in a row before a takeover.
 const READ_AT_ONCE: usize = 256;
