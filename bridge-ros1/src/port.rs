@@ -237,8 +237,8 @@ impl Port for Ros1Port {
         self.requests.is_one_of_several();
     }
 
-    fn link_changed(&mut self, has_link: bool) {
-        self.side.node.set_network(has_link);
+    fn links_lost(&mut self, lost: &[IpAddr]) {
+        self.side.node.set_lost_addresses(lost);
     }
 
     fn call_known(&mut self, topic: TopicId, description: &Arc<CallDescription>) {

@@ -30,6 +30,8 @@ pub(crate) struct OpenPublisher {
     pub(crate) publisher: Publisher,
     /// Number of reported losses of slow subscribers.
     pub(crate) reported: u64,
+    /// Number of reported losses of subscribers out of reach.
+    pub(crate) reported_cut_off: u64,
     /// True if a subscriber was present for the last value.
     pub(crate) reached: bool,
     /// True if the bridge sets the stamp of the header: the value is a single field of the message
@@ -124,7 +126,7 @@ impl OpenPublisher {
 
     fn send(&self, (message, latched): (Bytes, Latched)) -> u64 {
         let published = self.publisher.publish_latched(message, latched);
-        u64::from(published.sent_to == 0)
+        u64::from(published.sent_to == 0 && published.cut_off == 0)
     }
 
     /// Returns the message with the time in its header, if the header is not part of the value.

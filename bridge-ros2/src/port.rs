@@ -386,8 +386,8 @@ impl Port for Ros2Port {
         self.sinks.drop_waiting(&mut self.side, at_once);
     }
 
-    fn link_changed(&mut self, _has_link: bool) {
-        self.sinks.drop_unreceived(&mut self.side);
+    fn links_lost(&mut self, lost: &[IpAddr]) {
+        self.sinks.drop_unreceived(&mut self.side, !lost.is_empty());
     }
 
     fn role_changed(&mut self, _is_active: bool) {

@@ -96,7 +96,7 @@ impl AdvertisedTopics {
             lost += open.end_opening();
             let (payload, latched) = event;
             let published = open.publisher.publish_latched(payload, latched);
-            open.reached = published.sent_to > 0;
+            open.reached = published.sent_to > 0 && published.cut_off == 0;
         } else {
             lost += open.publish_once(event, now().monotonic);
             open.reached = lost == 0 && open.opening.is_none();
@@ -250,6 +250,15 @@ impl AdvertisedTopics {
                 let why = "subscriber too slow or late";
                 side.lost(topic, (Reason::Overflow, why), count);
             }
+            let count = open
+                .publisher
+                .cut_off()
+                .saturating_sub(open.reported_cut_off);
+            if count > 0 {
+                open.reported_cut_off += count;
+                let why = "the link to the subscriber is down";
+                side.lost(topic, (Reason::NotPublished, why), count);
+            }
         }
         if !sink.serves() {
             self.open(side, topic);
@@ -308,6 +317,7 @@ impl AdvertisedTopics {
                     message_type: Arc::clone(&message_type),
                     publisher,
                     reported: 0,
+                    reported_cut_off: 0,
                     reached: false,
                     stamps: sink.choice.stamps(&message_type),
                     opening: TopicOpening::of(

@@ -291,18 +291,18 @@ impl WrittenTopics {
         }
     }
 
-    /// Drops the events that readers have not received, because the link is down or was down. States
-    /// are delivered when it is up.
-    pub(super) fn drop_unreceived(&mut self, side: &mut Ros2Side) {
+    /// Drops the events that readers have not received for a while, because a link is down or was
+    /// down. States are delivered when it is up.
+    pub(super) fn drop_unreceived(&mut self, side: &mut Ros2Side, is_lost: bool) {
         let now = Instant::now();
         for (topic, sink) in &mut self.topics {
             let Some(open) = sink.open.as_mut() else {
                 continue;
             };
-            let count = open.outlet.drop_unreceived_events(now);
+            let count = open.outlet.drop_unreceived_events(is_lost, now);
             side.schedule.note_waiting(*topic, open.outlet.is_waiting());
             if count > 0 {
-                let cause = (Reason::NotPublished, "the link of the ROS side was down");
+                let cause = (Reason::NotPublished, "the link to the subscriber is down");
                 side.events.push_back(lost(*topic, cause, count));
             }
         }

@@ -10,6 +10,7 @@
 
 mod former;
 mod settling;
+mod unreceived;
 mod waiting;
 
 use std::collections::VecDeque;
@@ -21,6 +22,7 @@ use tokio::time::Instant;
 
 pub use self::former::Former;
 use self::settling::{PATIENCE, SETTLE, Settling};
+use self::unreceived::UnreceivedSamples;
 use self::waiting::{UnsentSamples, WaitingSample};
 use crate::graph::RemoteEndpoint;
 use crate::limits;
@@ -46,6 +48,8 @@ pub struct Outlet {
     to_forget: Option<Instant>,
     /// Replaced writers, oldest first, while their readers may miss some of their samples.
     former: VecDeque<Former>,
+    /// The samples that readers have not acknowledged while a link is lost.
+    unreceived: UnreceivedSamples,
 }
 
 /// The readers of the topic.
@@ -124,6 +128,7 @@ impl Outlet {
             last: None,
             to_forget: None,
             former: VecDeque::new(),
+            unreceived: UnreceivedSamples::default(),
         }
     }
 
@@ -311,7 +316,13 @@ impl Outlet {
     pub fn progress(&self) -> OutletProgress {
         match self.audience {
             Audience::Nobody { .. } => OutletProgress::NoReader,
-            Audience::Present { .. } if self.waiting.is_empty() => OutletProgress::Written,
+            Audience::Present { .. } if self.unreceived.is_dropped() => OutletProgress::NoReader,
+            Audience::Present { .. }
+                if self.waiting.is_empty()
+                    && (!self.unreceived.is_followed() || self.unacknowledged() == 0) =>
+            {
+                OutletProgress::Written
+            }
             Audience::Present { .. } => OutletProgress::Waiting,
         }
     }
@@ -474,24 +485,33 @@ impl Outlet {
         count
     }
 
-    /// Drops the events that wait, and those that readers have not acknowledged, and returns their
-    /// number: readers that are out of reach would receive them late. A state is not dropped.
-    pub fn drop_unreceived_events(&mut self, now: Instant) -> u64 {
+    /// Drops the events that readers have not acknowledged for 0.3 s, and returns their number: DDS
+    /// would repeat them to readers out of reach when these are within reach again. To be called
+    /// repeatedly while a link is lost (`is_lost`), and once when it is back.
+    pub fn drop_unreceived_events(&mut self, is_lost: bool, now: Instant) -> u64 {
         if self.offered == Offered::KeepLatest {
             return 0;
         }
-        let unreceived = self.unacknowledged();
-        self.drop_waiting(true, now).saturating_add(unreceived)
+        let dropped = self.unreceived.look(self.unacknowledged(), now);
+        if let Some(dropped) = dropped {
+            self.keep_last(dropped.kept);
+        }
+        if !is_lost {
+            self.unreceived.end();
+        }
+        dropped.map_or(0, |dropped| {
+            u64::try_from(dropped.count).unwrap_or(u64::MAX)
+        })
     }
 
     /// Returns the number of samples that present readers have not acknowledged; 0 with the
     /// published RustDDS.
-    fn unacknowledged(&self) -> u64 {
+    fn unacknowledged(&self) -> usize {
         #[cfg(feature = "patched-dds")]
         let samples = self.writer.unacknowledged().samples;
         #[cfg(not(feature = "patched-dds"))]
-        let samples = 0_usize;
-        u64::try_from(samples).unwrap_or(u64::MAX)
+        let samples = 0;
+        samples
     }
 
     /// Handles the loss of the last reader.
@@ -510,17 +530,21 @@ impl Outlet {
     /// Returns whether the present readers have acknowledged all written samples; always false with
     /// the published RustDDS.
     fn is_acknowledged(&self) -> bool {
-        #[cfg(feature = "patched-dds")]
-        let acknowledged = self.writer.unacknowledged().samples == 0;
-        #[cfg(not(feature = "patched-dds"))]
-        let acknowledged = false;
-        acknowledged
+        cfg!(feature = "patched-dds") && self.unacknowledged() == 0
     }
 
     /// Removes the written samples from the history. Does nothing with the published RustDDS.
     fn forget_written(&self) {
+        self.keep_last(0);
+    }
+
+    /// Removes the written samples from the history but the last ones. Does nothing with the
+    /// published RustDDS.
+    fn keep_last(&self, samples: usize) {
         #[cfg(feature = "patched-dds")]
-        self.writer.keep_last(0);
+        self.writer.keep_last(samples);
+        #[cfg(not(feature = "patched-dds"))]
+        let _unpatched = samples;
     }
 
     /// Handles matches between two snapshots: samples written after a match are for the matched
@@ -614,6 +638,7 @@ impl Outlet {
             Ok(()) => {
                 self.full_since = None;
                 self.in_flight += size;
+                self.unreceived.wrote();
                 // The newest sample removes the former sample from the history.
                 self.to_forget = (is_state && !lasting).then_some(now);
                 self.last = kept;

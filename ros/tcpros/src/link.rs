@@ -23,9 +23,9 @@ use crate::header::{ConnectionHeader, HeaderError, clipped};
 use crate::inbox::{ConnectionPeer, InboxMessage};
 use crate::master::{Master, MasterError, unwrap_triple};
 use crate::outbox::lock;
-use crate::reach::{NetworkReach, stays_on_host};
+use crate::reach::{NetworkReach, left_by};
 use crate::rpc::{self, RpcEndpoint, RpcError};
-use crate::subscription::{TopicFeed, TopicLink};
+use crate::subscription::{PublisherConnection, TopicFeed, TopicLink};
 use crate::xmlrpc::XmlRpcValue;
 
 /// State shared by all links of a node.
@@ -101,25 +101,32 @@ pub(crate) async fn run(
     let mut wait = FIRST_WAIT;
     let mut failures = 0u32;
     let mut throttle = Throttle::new(LOG_PERIOD);
+    let mut link = PublisherLink {
+        feed: &feed,
+        context: &context,
+        state: &state,
+        held: None,
+        failed: 0,
+    };
     loop {
         let before = state.messages.load(Ordering::Relaxed);
         let mut changed = pin!(context.reach.changed());
         let place = context.place(&feed.topic).await;
         let started = clock::now();
-        let link = (&*feed, &*context, &*state);
-        let error = connect_and_follow(link, &uri, changed.as_mut()).await;
+        let error = link.follow(&uri, changed.as_mut()).await;
         drop(place);
         if matches!(error, LinkError::Ourselves) {
             // The entry stays, so that the next update does not try again.
             return;
         }
         if matches!(error, LinkError::NetworkChanged) {
-            events::link_retried(&feed.topic, &uri, &error, Duration::ZERO);
+            events::link_retried(&feed.topic, &uri, &error, FIRST_WAIT);
             (wait, failures) = (FIRST_WAIT, 0);
+            sleep(FIRST_WAIT).await;
             continue;
         }
-        // A publisher that cannot be reached at present is not given up.
-        if !context.reach.is_lost() && !feed.still_wanted(&uri, &state) {
+        let is_kept = link.failed();
+        if !is_kept && !feed.still_wanted(&uri, &state) {
             return;
         }
         let lived = state.messages.load(Ordering::Relaxed) > before
@@ -128,7 +135,8 @@ pub(crate) async fn run(
             (wait, failures) = (FIRST_WAIT, 0);
         }
         failures += 1;
-        if error.is_fault() || failures == PATIENCE {
+        let is_lost = context.reach.is_lost();
+        if !is_lost && (error.is_fault() || failures == PATIENCE) {
             if throttle.admit(clock::now()).is_some()
                 && let Some(more) = context.may_tell()
             {
@@ -137,6 +145,9 @@ pub(crate) async fn run(
             }
             failures = failures.min(PATIENCE - 1);
         } else {
+            if is_lost {
+                failures = 0;
+            }
             events::link_retried(&feed.topic, &uri, &error, wait);
         }
         tokio::select! {
@@ -147,30 +158,72 @@ pub(crate) async fn run(
     }
 }
 
-/// Connects to a publisher and delivers its messages until the connection ends. Returns the reason
-/// of the end.
-///
-/// When the network is lost or found again (`changed`), a connection to another host ends: what the
-/// publisher sent meanwhile is still in its socket, and would be delivered as if it were new.
-async fn connect_and_follow(
-    (feed, context, state): (&TopicFeed, &LinkContext, &TopicLink),
-    uri: &str,
-    mut changed: Pin<&mut impl Future<Output = ()>>,
-) -> LinkError {
-    let connected = tokio::select! {
-        biased;
-        () = changed.as_mut() => return LinkError::NetworkChanged,
-        connected = connect(feed, context, uri) => connected,
-    };
-    let (stream, peer) = match connected {
-        Ok(connected) => connected,
-        Err(error) => return error,
-    };
-    let stays = stays_on_host(&stream);
-    tokio::select! {
-        biased;
-        () = changed, if !stays => LinkError::NetworkChanged,
-        error = follow(stream, peer, feed, context, state) => error,
+/// A link to a publisher: its connection, and the former one while the network is lost.
+struct PublisherLink<'a> {
+    feed: &'a TopicFeed,
+    context: &'a LinkContext,
+    state: &'a TopicLink,
+    /// The connection that the loss of the network ended. The publisher counts as connected until
+    /// the attempts after the loss fail, so that nothing is given up for a link that was down.
+    held: Option<PublisherConnection<'a>>,
+    /// The number of failed attempts since the network was found again.
+    failed: u32,
+}
+
+impl PublisherLink<'_> {
+    /// Connects to the publisher and delivers its messages until the connection ends. Returns the
+    /// reason of the end.
+    ///
+    /// When the network is lost, a connection to another host ends: what the publisher sends
+    /// meanwhile stays in its socket, and would be delivered later as if it were new. A change of
+    /// the network (`changed`) ends an attempt to connect.
+    async fn follow(
+        &mut self,
+        uri: &str,
+        changed: Pin<&mut impl Future<Output = ()>>,
+    ) -> LinkError {
+        let connected = tokio::select! {
+            biased;
+            () = changed => return LinkError::NetworkChanged,
+            connected = connect(self.feed, self.context, uri) => connected,
+        };
+        let (stream, peer) = match connected {
+            Ok(connected) => connected,
+            Err(error) => return error,
+        };
+        let address = left_by(&stream);
+        events::publisher_joined(&self.feed.topic, &peer.caller_id);
+        let connection = self.feed.connected(Arc::clone(&peer), self.state);
+        self.release();
+        self.state.connected.store(true, Ordering::Release);
+        tokio::select! {
+            biased;
+            () = self.context.reach.cut_off(address) => {
+                self.held = Some(connection);
+                LinkError::NetworkChanged
+            }
+            error = read_messages(stream, peer, (self.feed, self.context, self.state)) => error,
+        }
+    }
+
+    /// Notes a failed attempt to connect. Returns whether the link is still to be kept for the
+    /// publisher that was connected before the network was lost.
+    fn failed(&mut self) -> bool {
+        if self.context.reach.is_lost() {
+            self.failed = 0;
+            return self.held.is_some();
+        }
+        self.failed += 1;
+        if self.failed >= ATTEMPTS_AFTER_LOSS {
+            self.release();
+        }
+        self.held.is_some()
+    }
+
+    /// Gives the former connection up.
+    fn release(&mut self) {
+        self.held = None;
+        self.failed = 0;
     }
 }
 
@@ -269,16 +322,12 @@ async fn shake_hands(
 
 /// Delivers the messages of the publisher until the connection ends, and returns the reason of the
 /// end.
-async fn follow(
+async fn read_messages(
     mut stream: TcpStream,
     peer: Arc<ConnectionPeer>,
-    feed: &TopicFeed,
-    context: &LinkContext,
-    state: &TopicLink,
+    (feed, context, state): (&TopicFeed, &LinkContext, &TopicLink),
 ) -> LinkError {
-    events::publisher_joined(&feed.topic, &peer.caller_id);
     *lock(&state.transport) = transport_info(&stream);
-    let _connected = feed.connected(Arc::clone(&peer), state);
     let mut frames = Frames::new(context.max_message);
     let mut ahead = 0;
     loop {
@@ -408,6 +457,9 @@ const LAST_WAIT: Duration = Duration::from_secs(20);
 /// Number of consecutive failures before the first warning: a publisher that is starting or
 /// stopping is not worth a warning.
 const PATIENCE: u32 = 4;
+/// The number of failed attempts after a loss of the network until a publisher that was connected
+/// before counts as lost.
+const ATTEMPTS_AFTER_LOSS: u32 = 3;
 const LOG_PERIOD: Duration = Duration::from_secs(60);
 /// Number of unreachable publishers named in the log per period; the others are counted.
 const FAILURES_LOGGED: u32 = 20;

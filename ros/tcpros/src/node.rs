@@ -301,16 +301,22 @@ impl Node {
         GraphReader::new(self.inner.master.clone())
     }
 
-    /// Sets whether other hosts are within reach, as the network interfaces of the node tell. With
-    /// each change the connections to publishers on other hosts are opened anew, because TCP
-    /// delivers what was sent meanwhile as if it were new. While the network is lost, messages to
-    /// subscribers on other hosts are dropped, except those of latching topics; what was written to
-    /// the sockets before still arrives late. Connections within this host go on.
-    pub fn set_network(&self, is_reachable: bool) {
-        let set = |state: &mut bool| std::mem::replace(state, is_reachable) != is_reachable;
-        if self.inner.network.send_if_modified(set) && !is_reachable {
+    /// Sets the addresses of this host that have lost their link. A connection to another host that
+    /// uses one of them is cut off: what is sent over it would arrive late, as if it were new.
+    ///
+    /// The connection to a publisher is closed, and opened anew when the link is back. Messages for
+    /// a subscriber are dropped, except those of [`PublisherOptions::keep_cut_off`]; when the link
+    /// is back, the subscriber receives the latched messages. What was written to its socket before
+    /// the call still arrives. Connections within this host go on.
+    pub fn set_lost_addresses(&self, lost: &[IpAddr]) {
+        let set = |state: &mut Arc<[IpAddr]>| {
+            let is_changed = **state != *lost;
+            *state = lost.into();
+            is_changed
+        };
+        if self.inner.network.send_if_modified(set) {
             for hub in self.inner.publications() {
-                hub.drop_cut_off();
+                hub.reach_changed();
             }
         }
     }
@@ -364,8 +370,8 @@ pub(crate) struct Inner {
     pub(crate) topics_port: u16,
     pub(crate) master: Master,
     links: Arc<LinkContext>,
-    /// Whether other hosts are within reach.
-    network: watch::Sender<bool>,
+    /// The addresses of this host without a link.
+    network: watch::Sender<Arc<[IpAddr]>>,
     pub(crate) params: Params,
     clock: Ros1Clock,
     /// The subscription to `/clock` while time is simulated.
@@ -396,7 +402,7 @@ impl Inner {
         self.next_id.fetch_add(1, Ordering::Relaxed)
     }
 
-    /// Returns whether other hosts are within reach, for a connection.
+    /// Returns the reach of other hosts, for a connection.
     pub(crate) fn reach(&self) -> NetworkReach {
         self.links.reach.clone()
     }

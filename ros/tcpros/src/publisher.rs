@@ -1,6 +1,7 @@
 //! Publishing: one topic, its subscribers, and the messages for late subscribers.
 
 use std::collections::VecDeque;
+use std::net::IpAddr;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 
@@ -37,6 +38,9 @@ pub struct PublisherOptions {
     /// the waiting messages, which are stored once. In addition, each subscriber needs memory for
     /// the data being written: 64 KiB or a longer message.
     pub queue_bytes: usize,
+    /// Whether messages for subscribers out of reach wait until they are within reach. For messages
+    /// that do no harm when they are late.
+    pub keep_cut_off: bool,
 }
 
 impl Default for PublisherOptions {
@@ -46,18 +50,21 @@ impl Default for PublisherOptions {
             latch: false,
             queue_messages: 1000,
             queue_bytes: 16 * 1024 * 1024,
+            keep_cut_off: false,
         }
     }
 }
 
 /// Outcome of publishing a message.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 #[must_use]
 pub struct Published {
     /// Number of subscribers that the message was queued for.
     pub sent_to: usize,
     /// Number of older messages that were dropped for it, over all subscribers.
     pub dropped_oldest: u64,
+    /// Number of subscribers that do not receive it because they are out of reach.
+    pub cut_off: usize,
 }
 
 /// Selects how a message is kept for late subscribers. They receive the kept messages in the order
@@ -171,6 +178,12 @@ impl Publisher {
     pub fn dropped(&self) -> u64 {
         self.hub.dropped.load(Ordering::Relaxed)
     }
+
+    /// Returns the number of messages dropped because a subscriber was out of reach, over all
+    /// subscribers.
+    pub fn cut_off(&self) -> u64 {
+        self.hub.cut_off.load(Ordering::Relaxed)
+    }
 }
 
 impl Drop for Publisher {
@@ -192,6 +205,8 @@ pub(crate) struct PublishedTopic {
     latching: AtomicBool,
     state: Mutex<HubState>,
     dropped: AtomicU64,
+    /// The number of messages dropped for subscribers out of reach.
+    cut_off: AtomicU64,
     /// The node's count of connections to subscribers.
     draining: watch::Sender<usize>,
 }
@@ -219,8 +234,9 @@ pub(crate) struct Subscriber {
     pub(crate) caller_id: String,
     /// Description of the connection for `rosnode info`.
     pub(crate) transport: String,
-    /// Whether the subscriber is within reach; `None` if it is on this host.
-    reach: Option<NetworkReach>,
+    reach: SubscriberReach,
+    /// Whether a message was dropped because the subscriber was cut off.
+    missed: AtomicBool,
     /// The topic's count of messages at the time of joining.
     joined: u64,
     /// The keys of the messages that were latched at the time of joining.
@@ -231,11 +247,16 @@ pub(crate) struct Subscriber {
 }
 
 impl Subscriber {
-    /// Returns whether the subscriber is on another host, and the network is lost.
+    /// Returns whether the subscriber is on another host, and its connection has no link.
     fn is_cut_off(&self) -> bool {
-        self.reach.as_ref().is_some_and(NetworkReach::is_lost)
+        let reach = self.reach.as_ref();
+        reach.is_some_and(|(network, address)| network.has_lost(*address))
     }
 }
+
+/// The network of a subscriber on another host, and the address of this host that its connection
+/// uses.
+pub(crate) type SubscriberReach = Option<(NetworkReach, IpAddr)>;
 
 impl PublishedTopic {
     pub(crate) fn new(
@@ -253,6 +274,7 @@ impl PublishedTopic {
             latching: AtomicBool::new(options.latch),
             state: Mutex::default(),
             dropped: AtomicU64::new(0),
+            cut_off: AtomicU64::new(0),
             draining,
         }
     }
@@ -260,33 +282,27 @@ impl PublishedTopic {
     fn publish(&self, message: Bytes, latched: Latched) -> Published {
         if u32::try_from(message.len()).is_err() {
             events::message_too_long(&self.topic, message.len());
-            return Published {
-                sent_to: 0,
-                dropped_oldest: 0,
-            };
+            return Published::default();
         }
         let mut state = lock(&self.state);
-        let mut published = Published {
-            sent_to: 0,
-            dropped_oldest: 0,
-        };
-        let mut dropped = 0;
+        let mut published = Published::default();
         for subscriber in &state.subscribers {
-            if subscriber.is_cut_off() && !self.is_latching() {
-                // It would arrive when the network is found again.
-                dropped += 1;
-                continue;
+            if !self.options.keep_cut_off && subscriber.is_cut_off() {
+                subscriber.missed.store(true, Ordering::Relaxed);
+                published.cut_off += 1;
+            } else {
+                published.dropped_oldest += subscriber.outbox.push(message.clone());
+                published.sent_to += 1;
             }
-            published.dropped_oldest += subscriber.outbox.push(message.clone());
-            published.sent_to += 1;
         }
-        dropped += published.dropped_oldest;
+        let mut dropped = published.dropped_oldest;
         state.note(latched.key());
         if self.is_latching() {
             dropped += state.latch(message, latched);
         }
         drop(state);
         self.dropped.fetch_add(dropped, Ordering::Relaxed);
+        self.note_cut_off(published.cut_off);
         published
     }
 
@@ -304,16 +320,33 @@ impl PublishedTopic {
         }
     }
 
-    /// Drops the messages that wait for subscribers out of reach, unless the topic is latching.
-    pub(crate) fn drop_cut_off(&self) {
-        if self.is_latching() {
+    /// Drops the messages that wait for subscribers out of reach, and queues the latched messages
+    /// for subscribers that are within reach again.
+    pub(crate) fn reach_changed(&self) {
+        if self.options.keep_cut_off {
             return;
         }
+        let (mut dropped, mut cut_off) = (0, 0);
         let state = lock(&self.state);
-        let cut_off = state.subscribers.iter().filter(|s| s.is_cut_off());
-        let dropped = cut_off.map(|subscriber| subscriber.outbox.clear()).sum();
+        for subscriber in &state.subscribers {
+            if subscriber.is_cut_off() {
+                let waiting = subscriber.outbox.clear();
+                cut_off += waiting;
+                subscriber.missed.fetch_or(waiting > 0, Ordering::Relaxed);
+            } else if subscriber.missed.swap(false, Ordering::Relaxed) {
+                for (_, latched) in &state.latched {
+                    dropped += subscriber.outbox.push(latched.clone());
+                }
+            }
+        }
         drop(state);
         self.dropped.fetch_add(dropped, Ordering::Relaxed);
+        self.note_cut_off(cut_off);
+    }
+
+    fn note_cut_off(&self, count: impl TryInto<u64>) {
+        let count = count.try_into().unwrap_or(u64::MAX);
+        self.cut_off.fetch_add(count, Ordering::Relaxed);
     }
 
     /// Adds a subscriber; its queue starts with the latched messages. Returns `None` if the topic
@@ -322,7 +355,7 @@ impl PublishedTopic {
         self: &Arc<Self>,
         id: i32,
         caller_id: &str,
-        (transport, reach): (String, Option<NetworkReach>),
+        (transport, reach): (String, SubscriberReach),
     ) -> Option<Joined> {
         let limit = Limit {
             messages: self.options.queue_messages,
@@ -337,6 +370,7 @@ impl PublishedTopic {
             caller_id: caller_id.to_owned(),
             transport,
             reach,
+            missed: AtomicBool::new(false),
             joined: state.count,
             found: state.latched.iter().map(|(key, _)| *key).collect(),
             outbox: SubscriberQueue::new(limit),
@@ -508,15 +542,18 @@ mod tests {
     }
 
     fn hub_of(latch: bool, queue_messages: usize) -> Arc<PublishedTopic> {
+        hub_with(PublisherOptions {
+            latch,
+            queue_messages,
+            ..PublisherOptions::default()
+        })
+    }
+
+    fn hub_with(options: PublisherOptions) -> Arc<PublishedTopic> {
         let topic_type = TopicType {
             name: "std_msgs/String".to_owned(),
             md5sum: "992ce8a1687cec8c8bd883ec73ca41d1".to_owned(),
             definition: "string data\n".to_owned(),
-        };
-        let options = PublisherOptions {
-            latch,
-            queue_messages,
-            ..PublisherOptions::default()
         };
         Arc::new(PublishedTopic::new(
             "/chatter".to_owned(),
@@ -578,13 +615,7 @@ mod tests {
         for latch in [true, false] {
             let hub = hub(latch);
             let none = hub.publish(Bytes::from_static(b"1"), Latched::Alone(0));
-            assert_eq!(
-                none,
-                Published {
-                    sent_to: 0,
-                    dropped_oldest: 0
-                }
-            );
+            assert_eq!(none, Published::default());
             let late = hub.join(1, "/late", Default::default()).unwrap();
             hub.close();
             let mut taken = Vec::new();
@@ -687,25 +718,47 @@ mod tests {
     }
 
     #[test]
-    fn a_subscriber_out_of_reach_gets_no_message_late_unless_the_topic_is_latching() {
-        for latch in [false, true] {
-            let hub = hub_of(latch, 10);
+    fn a_subscriber_out_of_reach_gets_no_message_late_but_the_latched_one() {
+        for (latch, keep_cut_off) in [(false, false), (true, false), (false, true)] {
+            let options = PublisherOptions {
+                latch,
+                keep_cut_off,
+                ..PublisherOptions::default()
+            };
+            let hub = hub_with(options);
             let (network, reach) = NetworkReach::new();
-            let away = (String::new(), Some(reach));
-            let away = hub.join(1, "/away", away).unwrap();
-            let here = hub.join(2, "/here", Default::default()).unwrap();
-            let _both = hub.publish(Bytes::from_static(b"1"), Latched::Alone(0));
-            network.send_replace(false);
-            hub.drop_cut_off();
-            let cut = hub.publish(Bytes::from_static(b"2"), Latched::Alone(0));
-            network.send_replace(true);
-            let back = hub.publish(Bytes::from_static(b"3"), Latched::Alone(0));
-            let reached = if latch { 2 } else { 1 };
-            assert_eq!((cut.sent_to, back.sent_to), (reached, 2));
-            let lost = if latch { 0 } else { 2 };
-            assert_eq!(hub.dropped.load(Ordering::Relaxed), lost);
-            assert_eq!(here.subscriber.outbox.clear(), 3);
-            assert_eq!(away.subscriber.outbox.clear(), 3 - lost);
+            let lost = IpAddr::from([10, 0, 0, 1]);
+            let other = IpAddr::from([10, 0, 1, 1]);
+            let join = |id, name: &str, reach| hub.join(id, name, (String::new(), reach)).unwrap();
+            let away = join(1, "/away", Some((reach.clone(), lost)));
+            let beside = join(2, "/beside", Some((reach, other)));
+            let here = join(3, "/here", None);
+            let publish =
+                |text: &'static [u8]| hub.publish(Bytes::from_static(text), Latched::Alone(0));
+            let _all = publish(b"1");
+            network.send_replace([lost].into());
+            hub.reach_changed();
+            let cut = publish(b"2");
+            network.send_replace(Arc::default());
+            hub.reach_changed();
+            let back = publish(b"3");
+            let dropped = usize::from(!keep_cut_off);
+            assert_eq!((cut.sent_to, cut.cut_off), (3 - dropped, dropped));
+            assert_eq!((back.sent_to, back.cut_off), (3, 0));
+            let counted = (
+                hub.dropped.load(Ordering::Relaxed),
+                hub.cut_off.load(Ordering::Relaxed),
+            );
+            assert_eq!(counted, (0, if keep_cut_off { 0 } else { 2 }));
+            for whole in [here, beside] {
+                assert_eq!(whole.subscriber.outbox.clear(), 3);
+            }
+            let expected = if keep_cut_off {
+                3
+            } else {
+                1 + u64::from(latch)
+            };
+            assert_eq!(away.subscriber.outbox.clear(), expected);
         }
     }
 }

@@ -24,7 +24,7 @@ use crate::header::{ConnectionHeader, HeaderError, clipped};
 use crate::link::{prepare, transport_info};
 use crate::node::Inner;
 use crate::publisher::{Joined, Subscriber};
-use crate::reach::stays_on_host;
+use crate::reach::left_by;
 use crate::refusal::ConnectionRefusal;
 use crate::service::{self, ClientFault};
 
@@ -132,7 +132,7 @@ fn admit(
     };
     let hub = node.publication(topic).ok_or_else(gone)?;
     let reply = hub.reply_to(&request, node.name())?;
-    let reach = (!stays_on_host(stream)).then(|| node.reach());
+    let reach = left_by(stream).map(|address| (node.reach(), address));
     let joined = hub
         .join(
             node.next_connection_id(),

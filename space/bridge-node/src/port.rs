@@ -107,10 +107,10 @@ pub trait Port: Send + 'static {
         let _alone = is_active;
     }
 
-    /// Notes that the network interfaces of this side have no link, repeatedly while it lasts, or
-    /// that one has it again. What was sent meanwhile is not to arrive late, in either direction.
-    fn link_changed(&mut self, has_link: bool) {
-        let _no_connections = has_link;
+    /// Notes the addresses of this host that have lost their link, repeatedly while it lasts; an
+    /// empty list when all links are back. What is sent meanwhile is not to arrive late.
+    fn links_lost(&mut self, lost: &[IpAddr]) {
+        let _no_connections = lost;
     }
 
     /// Notes that a call of another program is available or has changed.

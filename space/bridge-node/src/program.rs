@@ -33,7 +33,7 @@ use crate::mapping_file::{ConfigurationFile, MappingFile, NodeSetReader, Running
 use crate::observer::Observer;
 use crate::port::Port;
 use crate::redundancy;
-use crate::run::{DatagramOutbox, Fixed, Shell, Turn};
+use crate::run::{DatagramOutbox, Fixed, LinkLoss, Shell, Turn};
 use crate::signals;
 use crate::status::StatusSnapshot;
 
@@ -373,7 +373,7 @@ async fn prepare<P: Program>(
         own,
         router,
         held: port.addresses().and_then(HeldInterfaces::start),
-        has_no_link: false,
+        links: LinkLoss::default(),
         port,
         carrier,
         interest: None,

@@ -3,6 +3,7 @@
 mod awaited;
 mod calls;
 mod fixed;
+mod links;
 mod network;
 mod outbox;
 mod redundancy;
@@ -42,6 +43,7 @@ use crate::status::{Interfaces, Readiness, RedundancyStatus, StatusSnapshot};
 use crate::tap::Taps;
 
 pub(crate) use fixed::Fixed;
+pub(crate) use links::LinkLoss;
 pub(crate) use outbox::DatagramOutbox;
 use outbox::Parcel;
 pub(crate) use turn::Turn;
@@ -63,8 +65,7 @@ pub(crate) struct Shell<P> {
     pub(crate) outbox: DatagramOutbox,
     /// The network interfaces that the port cannot change while it runs.
     pub(crate) held: Option<HeldInterfaces>,
-    /// True while the interfaces of the ROS side have no link.
-    pub(crate) has_no_link: bool,
+    pub(crate) links: LinkLoss,
     /// Returns the namespaces that only this program writes, by the mapping.
     pub(crate) owned: fn(&Mapping) -> Owned,
     /// Whether it listens for other writers in these namespaces before it sends.
@@ -169,7 +170,7 @@ impl<P: Port> Shell<P> {
                 heard = self.carrier.recv(&mut buffer) => more = self.heard_all(heard, &mut buffer),
                 event = self.port.recv() => more = self.port_events(event).await?,
                 () = links.as_mut(), if self.held.is_some() => {
-                    links.as_mut().reset(TokioInstant::now() + self.link_period());
+                    links.as_mut().reset(TokioInstant::now() + self.link_pause());
                     self.look_at_links();
                 }
                 () = timer.as_mut() => {

@@ -263,6 +263,13 @@ impl HeldInterfaces {
         none.then(|| first.why())
     }
 
+    /// Returns the addresses whose interfaces are removed or down.
+    #[must_use]
+    pub fn lost_addresses(&self) -> Vec<IpAddr> {
+        let lost = self.held.iter().filter(|held| held.state != State::There);
+        lost.map(|held| held.interface.address.into()).collect()
+    }
+
     fn update(&mut self, present: &[Interface]) {
         for holding in &mut self.held {
             let now = present.iter().find(|one| one.is_same(&holding.interface));

@@ -108,7 +108,11 @@ impl ActionlibClient {
             subscribe("result", action.result, ServerTopic::Result)?,
         ];
         let advertise = |topic, topic_type| {
-            let options = PublisherOptions::default();
+            let options = PublisherOptions {
+                // A late cancel request stops what it would have stopped before.
+                keep_cut_off: topic == "cancel",
+                ..PublisherOptions::default()
+            };
             node.advertise(&format!("{name}/{topic}"), topic_type, options)
         };
         let outputs = Outputs {

@@ -96,6 +96,8 @@ impl ActionlibServer {
         let advertise = |topic, topic_type, latch| {
             let options = PublisherOptions {
                 latch,
+                // A client waits for the result of its goal without end.
+                keep_cut_off: topic == "result",
                 ..PublisherOptions::default()
             };
             node.advertise(&format!("{name}/{topic}"), topic_type, options)

@@ -442,6 +442,16 @@ struct Connection {
     sound: bool,
 }
 
+impl Drop for Connection {
+    /// Discards a request that was not answered and may still wait in the socket: it would reach the
+    /// server late, after its caller has given it up.
+    fn drop(&mut self) {
+        if !self.sound {
+            let _closed_already = SockRef::from(&self.stream).set_linger(Some(Duration::ZERO));
+        }
+    }
+}
+
 impl Connection {
     fn if_sound(self) -> Option<Self> {
         self.sound.then_some(self)

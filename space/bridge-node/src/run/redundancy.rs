@@ -85,37 +85,51 @@ impl<P: Port> Shell<P> {
         }
     }
 
-    /// Returns the interval in which the links of the ROS side are checked. A redundant bridge that
-    /// lost its link hands over within the time of a takeover.
-    pub(super) fn link_period(&self) -> Duration {
-        if self.router.redundancy().is_some() {
+    /// Returns the time to the next check of the links of the ROS side. A redundant bridge that lost
+    /// its link hands over within the time of a takeover.
+    pub(super) fn link_pause(&self) -> Duration {
+        let is_redundant = self.router.redundancy().is_some();
+        let period = if is_redundant {
             LINK_LOOK
         } else {
             LINK_LOOK_ALONE
-        }
+        };
+        self.links.pause(period)
     }
 
     /// Checks the links of the ROS side. Changes are reported by the check of each second, so that
     /// a link that is down for a moment does not end the program.
     pub(super) fn look_at_links(&mut self) {
         if let Some(held) = &mut self.held {
+            let before = now().monotonic;
             held.refresh();
+            self.links.took(now().monotonic.duration_since(before));
         }
         self.look_at_fitness();
     }
 
     /// Sets whether the ROS side is within reach.
     pub(super) fn look_at_fitness(&mut self) {
+        let is_redundant = self.router.redundancy().is_some();
+        if let Some(held) = &self.held {
+            // A standby must not become active with values that wait in a connection.
+            let patience = if is_redundant {
+                Duration::ZERO
+            } else {
+                PATIENCE
+            };
+            let lost = held.lost_addresses();
+            if let Some(lost) = self.links.look(lost, patience, now().monotonic) {
+                self.port.links_lost(lost);
+            }
+        }
+        if !is_redundant {
+            return;
+        }
         let is_held = self
             .held
             .as_ref()
             .is_none_or(|held| HeldInterfaces::lost(held).is_none());
-        if std::mem::replace(&mut self.has_no_link, !is_held) || !is_held {
-            self.port.link_changed(is_held);
-        }
-        if self.router.redundancy().is_none() {
-            return;
-        }
         let side = match (is_held, self.port.hindrance()) {
             (false, _) => LocalSide::NoLink,
             (true, Some(_)) => LocalSide::Silent,
@@ -181,10 +195,12 @@ fn tell_same_rank(rank: Option<u8>, from: SocketAddr) {
 }
 
 /// The interval in which redundant bridges check the links of the ROS side. Listing the interfaces
-/// takes less than 0.1 ms.
+/// takes less than 0.1 ms on a host with few.
 const LINK_LOOK: Duration = Duration::from_millis(25);
-/// The interval in which a bridge that runs alone does so. What it published since the loss of the
-/// link arrives late.
+/// The interval in which a bridge that runs alone does so.
 const LINK_LOOK_ALONE: Duration = Duration::from_millis(100);
+/// How long a link may be down until a bridge that runs alone closes connections. What is sent in
+/// this time arrives late.
+const PATIENCE: Duration = Duration::from_millis(200);
 /// The maximum number of datagrams that are handled in a row before a takeover.
 const READ_AT_ONCE: usize = 256;

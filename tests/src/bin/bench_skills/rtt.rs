@@ -204,7 +204,7 @@ impl Paths {
             }
             _ => {
                 let object = String::from_utf8_lossy(payload).into_owned();
-                let given = vec![("ObjectId".to_owned(), object.into())];
+                let given = vec![("ToolAppUri".to_owned(), object.into())];
                 let outcome = self.skill.run(given, SOON).await;
                 outcome.map(drop).map_err(|error| error.to_string())
             }
@@ -285,7 +285,7 @@ fn opcua_server() -> OpcUaServer {
 /// Starts a component, and returns its skill, which takes a text of any length.
 async fn skill(cell: &Cell) -> (Child, SkillClient, SkillHandle) {
     let yaml = "{component: echo, application_uri: 'urn:ua-bridge:bench', namespace: 9, skills: [
-        {name: Locate, type: LocateObjectSkillType, driver: {simulated: {duration: 1 ms}}}]}";
+        {name: Attach, type: AttachToolSkillType, driver: {simulated: {duration: 1 ms}}}]}";
     let endpoint = "opc.tcp://127.0.0.1:4855";
     let component = StartedChild::new("ua-component", &program("ua-component"))
         .args([cell.file("echo.yaml", yaml)])
@@ -302,7 +302,7 @@ async fn skill(cell: &Cell) -> (Child, SkillClient, SkillHandle) {
             Err(fault) => assert!(Instant::now() < until, "{fault}"),
         }
     };
-    let wanted = ParameterType::own("LocateObjectSkillType");
+    let wanted = ParameterType::own("AttachToolSkillType");
     let found = client.skills_of(&wanted).await.unwrap().remove(0);
     let handle = client.handle(&found);
     (component, client, handle)
