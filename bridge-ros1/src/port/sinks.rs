@@ -96,7 +96,7 @@ impl AdvertisedTopics {
             lost += open.end_opening();
             let (payload, latched) = event;
             let published = open.publisher.publish_latched(payload, latched);
-            open.reached = published.sent_to > 0 && published.cut_off == 0;
+            open.reached = published.sent_to > 0;
         } else {
             lost += open.publish_once(event, now().monotonic);
             open.reached = lost == 0 && open.opening.is_none();

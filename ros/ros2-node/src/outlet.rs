@@ -75,7 +75,8 @@ enum Audience {
 pub enum OutletProgress {
     /// The topic has no reader.
     NoReader,
-    /// Samples wait for readers or for room in the send window.
+    /// Samples wait for readers or for room in the send window, or were dropped because a reader is
+    /// out of reach.
     Waiting,
     /// Every sample was written.
     Written,
@@ -316,15 +317,17 @@ impl Outlet {
     pub fn progress(&self) -> OutletProgress {
         match self.audience {
             Audience::Nobody { .. } => OutletProgress::NoReader,
-            Audience::Present { .. } if self.unreceived.is_dropped() => OutletProgress::NoReader,
-            Audience::Present { .. }
-                if self.waiting.is_empty()
-                    && (!self.unreceived.is_followed() || self.unacknowledged() == 0) =>
-            {
+            Audience::Present { .. } if self.waiting.is_empty() && !self.is_uncertain() => {
                 OutletProgress::Written
             }
             Audience::Present { .. } => OutletProgress::Waiting,
         }
+    }
+
+    /// Returns whether a reader out of reach may have missed the last sample.
+    fn is_uncertain(&self) -> bool {
+        let is_followed = self.unreceived.is_followed();
+        self.unreceived.is_dropped() || (is_followed && !self.is_acknowledged())
     }
 
     fn offer_sample(&mut self, sample: WaitingSample, now: Instant) -> Result<(), OutletRefusal> {
@@ -504,14 +507,17 @@ impl Outlet {
         })
     }
 
-    /// Returns the number of samples that present readers have not acknowledged; 0 with the
-    /// published RustDDS.
-    fn unacknowledged(&self) -> usize {
+    /// Returns the number of samples that present readers have not acknowledged, and for how long
+    /// the last of these readers was silent; 0 with the published RustDDS.
+    fn unacknowledged(&self) -> (usize, Duration) {
         #[cfg(feature = "patched-dds")]
-        let samples = self.writer.unacknowledged().samples;
+        let lacked = {
+            let lacked = self.writer.unacknowledged();
+            (lacked.samples, lacked.silent_for)
+        };
         #[cfg(not(feature = "patched-dds"))]
-        let samples = 0;
-        samples
+        let lacked = (0, Duration::ZERO);
+        lacked
     }
 
     /// Handles the loss of the last reader.
@@ -530,7 +536,7 @@ impl Outlet {
     /// Returns whether the present readers have acknowledged all written samples; always false with
     /// the published RustDDS.
     fn is_acknowledged(&self) -> bool {
-        cfg!(feature = "patched-dds") && self.unacknowledged() == 0
+        cfg!(feature = "patched-dds") && self.unacknowledged().0 == 0
     }
 
     /// Removes the written samples from the history. Does nothing with the published RustDDS.

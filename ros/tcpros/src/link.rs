@@ -1,6 +1,7 @@
 //! The link to a publisher of a topic: requesting its address, connecting, reading, and
 //! reconnecting.
 
+use std::net::IpAddr;
 use std::os::fd::AsRawFd;
 use std::pin::{Pin, pin};
 use std::sync::atomic::Ordering;
@@ -163,9 +164,10 @@ struct PublisherLink<'a> {
     feed: &'a TopicFeed,
     context: &'a LinkContext,
     state: &'a TopicLink,
-    /// The connection that the loss of the network ended. The publisher counts as connected until
-    /// the attempts after the loss fail, so that nothing is given up for a link that was down.
-    held: Option<PublisherConnection<'a>>,
+    /// The connection that the loss of its network ended, and the address that it used. The
+    /// publisher counts as connected until the attempts after the loss fail, so that nothing is
+    /// given up for a link that was down.
+    held: Option<(PublisherConnection<'a>, Option<IpAddr>)>,
     /// The number of failed attempts since the network was found again.
     failed: u32,
 }
@@ -191,15 +193,17 @@ impl PublisherLink<'_> {
             Ok(connected) => connected,
             Err(error) => return error,
         };
-        let address = left_by(&stream);
+        let address = left_by(&stream).filter(|_| !self.feed.keep_cut_off);
         events::publisher_joined(&self.feed.topic, &peer.caller_id);
         let connection = self.feed.connected(Arc::clone(&peer), self.state);
-        self.release();
-        self.state.connected.store(true, Ordering::Release);
+        self.failed = 0;
+        if let Some((former, _)) = self.held.take() {
+            former.replaced();
+        }
         tokio::select! {
             biased;
             () = self.context.reach.cut_off(address) => {
-                self.held = Some(connection);
+                self.held = Some((connection, address));
                 LinkError::NetworkChanged
             }
             error = read_messages(stream, peer, (self.feed, self.context, self.state)) => error,
@@ -209,21 +213,20 @@ impl PublisherLink<'_> {
     /// Notes a failed attempt to connect. Returns whether the link is still to be kept for the
     /// publisher that was connected before the network was lost.
     fn failed(&mut self) -> bool {
-        if self.context.reach.is_lost() {
+        let Some((_, address)) = &self.held else {
+            return false;
+        };
+        if address.is_some_and(|address| self.context.reach.has_lost(address)) {
             self.failed = 0;
-            return self.held.is_some();
+            return true;
         }
         self.failed += 1;
-        if self.failed >= ATTEMPTS_AFTER_LOSS {
-            self.release();
+        if self.failed < ATTEMPTS_AFTER_LOSS {
+            return true;
         }
-        self.held.is_some()
-    }
-
-    /// Gives the former connection up.
-    fn release(&mut self) {
         self.held = None;
         self.failed = 0;
+        false
     }
 }
 

@@ -230,7 +230,8 @@ impl Node {
             bytes: options.queue_bytes,
         };
         let entrance = Box::new(inbox.open(key, limit));
-        let feed = Arc::new(TopicFeed::new(topic, wanted, entrance));
+        let feed = TopicFeed::new(topic, wanted, entrance).keeping_cut_off(options.keep_cut_off);
+        let feed = Arc::new(feed);
         // A node that can still be called is open.
         let _open = self.inner.follow(&feed);
         Ok(Subscription::new(feed, Arc::clone(&self.inner)))
@@ -305,9 +306,10 @@ impl Node {
     /// uses one of them is cut off: what is sent over it would arrive late, as if it were new.
     ///
     /// The connection to a publisher is closed, and opened anew when the link is back. Messages for
-    /// a subscriber are dropped, except those of [`PublisherOptions::keep_cut_off`]; when the link
-    /// is back, the subscriber receives the latched messages. What was written to its socket before
-    /// the call still arrives. Connections within this host go on.
+    /// a subscriber are dropped; when the link is back and the subscriber responds, its connection
+    /// is reset, so that it connects again and receives the latched messages. Topics with
+    /// [`PublisherOptions::keep_cut_off`] or [`SubscriberOptions::keep_cut_off`], connections within
+    /// this host and those over other interfaces go on.
     pub fn set_lost_addresses(&self, lost: &[IpAddr]) {
         let set = |state: &mut Arc<[IpAddr]>| {
             let is_changed = **state != *lost;
@@ -316,7 +318,7 @@ impl Node {
         };
         if self.inner.network.send_if_modified(set) {
             for hub in self.inner.publications() {
-                hub.reach_changed();
+                hub.drop_cut_off();
             }
         }
     }

@@ -1,7 +1,7 @@
 //! Publishing: one topic, its subscribers, and the messages for late subscribers.
 
 use std::collections::VecDeque;
-use std::net::IpAddr;
+use std::net::{IpAddr, SocketAddr};
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 
@@ -148,10 +148,11 @@ impl Publisher {
         lock(&self.hub.state).subscribers.len()
     }
 
-    /// Returns whether the node of this resolved name is connected.
+    /// Returns whether the node of this resolved name is connected and not cut off.
     pub fn is_subscribed_by(&self, node: &str) -> bool {
         let state = lock(&self.hub.state);
-        state.subscribers.iter().any(|s| s.caller_id == node)
+        let mut subscribers = state.subscribers.iter();
+        subscribers.any(|s| s.caller_id == node && !s.is_cut_off())
     }
 
     /// Returns whether the node of this resolved name requested the topic without TCPROS among its
@@ -235,8 +236,8 @@ pub(crate) struct Subscriber {
     /// Description of the connection for `rosnode info`.
     pub(crate) transport: String,
     reach: SubscriberReach,
-    /// Whether a message was dropped because the subscriber was cut off.
-    missed: AtomicBool,
+    /// Whether the connection was cut off. It ends when the link is back.
+    was_cut_off: AtomicBool,
     /// The topic's count of messages at the time of joining.
     joined: u64,
     /// The keys of the messages that were latched at the time of joining.
@@ -247,10 +248,23 @@ pub(crate) struct Subscriber {
 }
 
 impl Subscriber {
-    /// Returns whether the subscriber is on another host, and its connection has no link.
+    /// Returns whether the subscriber is on another host, and its connection has or had no link.
     fn is_cut_off(&self) -> bool {
-        let reach = self.reach.as_ref();
-        reach.is_some_and(|(network, address)| network.has_lost(*address))
+        let Some((network, address)) = &self.reach else {
+            return false;
+        };
+        let is_lost = network.has_lost(*address);
+        self.was_cut_off.fetch_or(is_lost, Ordering::Relaxed) || is_lost
+    }
+
+    /// Waits until the connection was cut off, its link is back, and the subscriber is to connect
+    /// again: what was written before the loss was noticed would arrive late, and so would all that
+    /// follows it. Never returns for a subscriber on this host.
+    pub(crate) async fn is_to_reconnect(&self, peer: SocketAddr) {
+        match &self.reach {
+            Some((network, address)) => network.back_after_loss(*address, peer).await,
+            None => std::future::pending().await,
+        }
     }
 }
 
@@ -287,8 +301,7 @@ impl PublishedTopic {
         let mut state = lock(&self.state);
         let mut published = Published::default();
         for subscriber in &state.subscribers {
-            if !self.options.keep_cut_off && subscriber.is_cut_off() {
-                subscriber.missed.store(true, Ordering::Relaxed);
+            if subscriber.is_cut_off() {
                 published.cut_off += 1;
             } else {
                 published.dropped_oldest += subscriber.outbox.push(message.clone());
@@ -320,28 +333,13 @@ impl PublishedTopic {
         }
     }
 
-    /// Drops the messages that wait for subscribers out of reach, and queues the latched messages
-    /// for subscribers that are within reach again.
-    pub(crate) fn reach_changed(&self) {
-        if self.options.keep_cut_off {
-            return;
-        }
-        let (mut dropped, mut cut_off) = (0, 0);
+    /// Drops the messages that wait for subscribers out of reach.
+    pub(crate) fn drop_cut_off(&self) {
         let state = lock(&self.state);
-        for subscriber in &state.subscribers {
-            if subscriber.is_cut_off() {
-                let waiting = subscriber.outbox.clear();
-                cut_off += waiting;
-                subscriber.missed.fetch_or(waiting > 0, Ordering::Relaxed);
-            } else if subscriber.missed.swap(false, Ordering::Relaxed) {
-                for (_, latched) in &state.latched {
-                    dropped += subscriber.outbox.push(latched.clone());
-                }
-            }
-        }
+        let cut_off = state.subscribers.iter().filter(|s| s.is_cut_off());
+        let dropped: u64 = cut_off.map(|subscriber| subscriber.outbox.clear()).sum();
         drop(state);
-        self.dropped.fetch_add(dropped, Ordering::Relaxed);
-        self.note_cut_off(cut_off);
+        self.note_cut_off(dropped);
     }
 
     fn note_cut_off(&self, count: impl TryInto<u64>) {
@@ -369,8 +367,8 @@ impl PublishedTopic {
             id,
             caller_id: caller_id.to_owned(),
             transport,
-            reach,
-            missed: AtomicBool::new(false),
+            reach: reach.filter(|_| !self.options.keep_cut_off),
+            was_cut_off: AtomicBool::new(false),
             joined: state.count,
             found: state.latched.iter().map(|(key, _)| *key).collect(),
             outbox: SubscriberQueue::new(limit),
@@ -737,19 +735,21 @@ mod tests {
                 |text: &'static [u8]| hub.publish(Bytes::from_static(text), Latched::Alone(0));
             let _all = publish(b"1");
             network.send_replace([lost].into());
-            hub.reach_changed();
+            hub.drop_cut_off();
             let cut = publish(b"2");
             network.send_replace(Arc::default());
-            hub.reach_changed();
+            // It is cut off until it connects again.
             let back = publish(b"3");
             let dropped = usize::from(!keep_cut_off);
-            assert_eq!((cut.sent_to, cut.cut_off), (3 - dropped, dropped));
-            assert_eq!((back.sent_to, back.cut_off), (3, 0));
+            for published in [cut, back] {
+                let counts = (published.sent_to, published.cut_off);
+                assert_eq!(counts, (3 - dropped, dropped));
+            }
             let counted = (
                 hub.dropped.load(Ordering::Relaxed),
                 hub.cut_off.load(Ordering::Relaxed),
             );
-            assert_eq!(counted, (0, if keep_cut_off { 0 } else { 2 }));
+            assert_eq!(counted, (0, if keep_cut_off { 0 } else { 3 }));
             for whole in [here, beside] {
                 assert_eq!(whole.subscriber.outbox.clear(), 3);
             }

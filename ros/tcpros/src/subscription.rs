@@ -34,6 +34,9 @@ pub struct SubscriberOptions {
     /// Maximum number of waiting bytes; beyond it the oldest messages are dropped. The newest
     /// message is always kept.
     pub queue_bytes: usize,
+    /// Whether a connection that is cut off is kept, so that messages sent meanwhile arrive when its
+    /// link is back. For messages that do no harm when they are late.
+    pub keep_cut_off: bool,
 }
 
 impl Default for SubscriberOptions {
@@ -42,6 +45,7 @@ impl Default for SubscriberOptions {
         Self {
             queue_messages: 1000,
             queue_bytes: 16 * 1024 * 1024,
+            keep_cut_off: false,
         }
     }
 }
@@ -91,6 +95,8 @@ impl Drop for Subscription {
 pub(crate) struct TopicFeed {
     pub(crate) topic: String,
     pub(crate) wanted: RequestedType,
+    /// Whether a connection that is cut off is kept.
+    pub(crate) keep_cut_off: bool,
     pub(crate) refused_frames: AtomicU64,
     entrance: Box<dyn Deliver>,
     links: Mutex<Links>,
@@ -146,6 +152,7 @@ impl TopicFeed {
         Self {
             topic,
             wanted,
+            keep_cut_off: false,
             refused_frames: AtomicU64::new(0),
             entrance,
             links: Mutex::default(),
@@ -153,6 +160,13 @@ impl TopicFeed {
             dropped: AtomicU64::new(0),
             crowded: Mutex::new(Throttle::new(LOG_PERIOD)),
         }
+    }
+
+    /// Keeps connections that are cut off.
+    #[must_use]
+    pub(crate) fn keeping_cut_off(mut self, keep: bool) -> Self {
+        self.keep_cut_off = keep;
+        self
     }
 
     /// Applies the master's list of publishers: starts links to new publishers, and ends links to
@@ -241,6 +255,7 @@ impl TopicFeed {
             feed: self,
             peer,
             state,
+            is_replaced: false,
         }
     }
 
@@ -293,11 +308,22 @@ pub(crate) struct PublisherConnection<'a> {
     feed: &'a TopicFeed,
     peer: Arc<ConnectionPeer>,
     state: &'a TopicLink,
+    /// Whether another connection of the link follows at once.
+    is_replaced: bool,
+}
+
+impl PublisherConnection<'_> {
+    /// Ends a connection in favour of another one of its link.
+    pub(crate) fn replaced(mut self) {
+        self.is_replaced = true;
+    }
 }
 
 impl Drop for PublisherConnection<'_> {
     fn drop(&mut self) {
-        self.state.connected.store(false, Ordering::Release);
+        if !self.is_replaced {
+            self.state.connected.store(false, Ordering::Release);
+        }
         let publishers = self.feed.publishers.fetch_sub(1, Ordering::AcqRel) - 1;
         self.feed
             .entrance

@@ -11,6 +11,7 @@ use std::sync::atomic::Ordering;
 use std::time::Duration;
 
 use bytes::{Buf, BufMut, Bytes, BytesMut};
+use socket2::SockRef;
 use thiserror::Error;
 use tokio::io::{AsyncReadExt, AsyncWrite, AsyncWriteExt};
 use tokio::net::tcp::ReadHalf;
@@ -80,7 +81,16 @@ async fn serve_one(mut stream: TcpStream, node: &Inner, settled: &Settled) -> Re
         Admitted::Service(service::ClientHandshake::Probe) => return Ok(()),
     };
     let subscriber = &joined.subscriber;
-    let ended = write_messages(&mut stream, subscriber).await;
+    let peer = stream.peer_addr()?;
+    let ended = tokio::select! {
+        biased;
+        () = subscriber.is_to_reconnect(peer) => {
+            // Discards what waits in the socket.
+            SockRef::from(&stream).set_linger(Some(Duration::ZERO))?;
+            ConnectionEnd::CutOff
+        }
+        ended = write_messages(&mut stream, subscriber) => ended,
+    };
     let dropped = subscriber.outbox.dropped();
     events::subscriber_left(&joined.hub.topic, &subscriber.caller_id, dropped, &ended);
     Ok(())
@@ -262,6 +272,8 @@ enum Refused {
 /// Reason for the end of a connection.
 #[derive(Debug, Error)]
 pub(crate) enum ConnectionEnd {
+    #[error("its link was lost and is back, so it has to connect again")]
+    CutOff,
     #[error("it closed the connection")]
     Closed,
     #[error("the topic or service was withdrawn")]

@@ -181,6 +181,10 @@ struct Holding {
     reported: State,
     /// True if the interface was removed at that call or since.
     was_gone: bool,
+    /// True if the interface was up once.
+    was_there: bool,
+    /// True if another interface has its address.
+    is_elsewhere: bool,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -232,6 +236,8 @@ impl HeldInterfaces {
                 state,
                 reported: state,
                 was_gone: false,
+                was_there: state == State::There,
+                is_elsewhere: false,
             }
         };
         Self {
@@ -263,10 +269,13 @@ impl HeldInterfaces {
         none.then(|| first.why())
     }
 
-    /// Returns the addresses whose interfaces are removed or down.
+    /// Returns the addresses whose interfaces were up and are removed or down, unless another
+    /// interface has the address now.
     #[must_use]
     pub fn lost_addresses(&self) -> Vec<IpAddr> {
-        let lost = self.held.iter().filter(|held| held.state != State::There);
+        let is_lost =
+            |held: &&Holding| held.was_there && held.state != State::There && !held.is_elsewhere;
+        let lost = self.held.iter().filter(is_lost);
         lost.map(|held| held.interface.address.into()).collect()
     }
 
@@ -279,6 +288,10 @@ impl HeldInterfaces {
                 None => State::Gone,
             };
             holding.was_gone |= holding.state == State::Gone;
+            holding.was_there |= holding.state == State::There;
+            let address = holding.interface.address;
+            let mut up = present.iter().filter(|one| one.up);
+            holding.is_elsewhere = up.any(|one| one.address == address);
         }
     }
 

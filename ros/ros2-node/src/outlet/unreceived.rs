@@ -16,7 +16,9 @@ pub(super) struct UnreceivedSamples {
     /// The times of the calls of [`look`](Self::look) while a link is lost, each with the number of
     /// samples written before. Only the first one may be older than [`UNRECEIVED`].
     looks: VecDeque<(Instant, u64)>,
-    /// Whether the last written samples were dropped.
+    /// Whether a reader was silent at the last call.
+    is_silent: bool,
+    /// Whether the last written sample was dropped.
     is_dropped: bool,
 }
 
@@ -40,14 +42,20 @@ impl UnreceivedSamples {
         !self.looks.is_empty()
     }
 
-    /// Returns whether samples were dropped since the last one was written.
+    /// Returns whether the last written sample was dropped.
     pub(super) const fn is_dropped(&self) -> bool {
         self.is_dropped
     }
 
-    /// Returns the samples that are to be dropped while a link is lost: of the `unacknowledged`
-    /// samples those that were written before [`UNRECEIVED`].
-    pub(super) fn look(&mut self, unacknowledged: usize, now: Instant) -> Option<DroppedSamples> {
+    /// Returns the samples that are to be dropped while a link is lost: of the unacknowledged
+    /// samples those that were written before [`UNRECEIVED`], if a reader is silent for this time,
+    /// or was at the last call. A slow reader within reach is not silent.
+    pub(super) fn look(
+        &mut self,
+        (unacknowledged, silent): (usize, Duration),
+        now: Instant,
+    ) -> Option<DroppedSamples> {
+        let was_silent = std::mem::replace(&mut self.is_silent, silent >= UNRECEIVED);
         let is_old = |at: Instant| now.duration_since(at) >= UNRECEIVED;
         self.looks.push_back((now, self.written));
         while self.looks.get(1).is_some_and(|(at, _)| is_old(*at)) {
@@ -56,8 +64,11 @@ impl UnreceivedSamples {
         let (_, before) = self.looks.front().filter(|(at, _)| is_old(*at))?;
         let kept = usize::try_from(self.written - before).unwrap_or(usize::MAX);
         let count = unacknowledged.saturating_sub(kept);
-        self.is_dropped |= count > 0;
-        (count > 0).then_some(DroppedSamples { count, kept })
+        if count == 0 || !(was_silent || self.is_silent) {
+            return None;
+        }
+        self.is_dropped |= kept == 0;
+        Some(DroppedSamples { count, kept })
     }
 
     /// Notes that the link is back.
@@ -80,7 +91,8 @@ mod tests {
         let mut unacknowledged = 1;
         let mut dropped = Vec::new();
         for ms in (0..=600).step_by(100) {
-            if let Some(found) = samples.look(unacknowledged, at(ms)) {
+            let silent = Duration::from_millis(ms);
+            if let Some(found) = samples.look((unacknowledged, silent), at(ms)) {
                 dropped.push((ms, found.count, found.kept));
                 unacknowledged = found.kept;
             }
@@ -90,21 +102,28 @@ mod tests {
         let expected = [(300, 1, 3), (400, 1, 3), (500, 1, 3), (600, 1, 3)];
         assert_eq!(dropped, expected);
         assert!(samples.is_followed() && !samples.is_dropped());
-        assert!(samples.look(unacknowledged, at(700)).is_some());
+        // The link is back, and the reader is heard again.
+        assert!(samples.look((4, Duration::ZERO), at(700)).is_some());
+        for ms in [800, 900, 1000] {
+            samples.look((1, Duration::from_millis(ms - 700)), at(ms));
+        }
         samples.end();
         // The last event was dropped, so it must not be confirmed.
         assert!(!samples.is_followed() && samples.is_dropped());
-        assert!(samples.looks.len() < 8);
+        samples.wrote();
+        assert!(!samples.is_dropped());
     }
 
     #[test]
-    fn events_that_readers_acknowledge_are_not_dropped_while_another_link_is_lost() {
+    fn events_of_a_slow_reader_are_not_dropped_while_another_link_is_lost() {
         let start = Instant::now();
         let mut samples = UnreceivedSamples::default();
-        for ms in 0..100 {
+        for turn in 0..100 {
             samples.wrote();
-            let now = start + Duration::from_millis(25 * ms);
-            assert_eq!(samples.look(1, now), None, "{ms}");
+            let now = start + Duration::from_millis(25 * turn);
+            let silent = Duration::from_millis(20);
+            assert_eq!(samples.look((50, silent), now), None, "{turn}");
+            assert!(samples.looks.len() < 15);
         }
     }
 }

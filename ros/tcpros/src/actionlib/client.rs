@@ -97,8 +97,12 @@ impl ActionlibClient {
         check_wrapper(&action.goal.name, "ActionGoal")?;
         let name = node.resolve(name).map_err(NodeError::from)?;
         let inbox = Inbox::new();
-        let queues = SubscriberOptions::default();
         let subscribe = |topic, wanted, source| {
+            let queues = SubscriberOptions {
+                // The result of a goal is sent once.
+                keep_cut_off: topic == "result",
+                ..SubscriberOptions::default()
+            };
             node.subscribe(&format!("{name}/{topic}"), wanted, queues, source, &inbox)
         };
         let status = wanted(goal_status_array_type());

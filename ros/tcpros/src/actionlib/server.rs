@@ -111,7 +111,11 @@ impl ActionlibServer {
         };
         let inbox = Inbox::new();
         let subscribe = |topic, wanted, source| {
-            let queues = SubscriberOptions::default();
+            let queues = SubscriberOptions {
+                // A late request to cancel stops what it would have stopped before.
+                keep_cut_off: topic == "cancel",
+                ..SubscriberOptions::default()
+            };
             node.subscribe(&format!("{name}/{topic}"), wanted, queues, source, &inbox)
         };
         let subscriptions = [

@@ -163,7 +163,9 @@ impl ServiceClient {
     pub async fn probe(&self) -> Result<ConnectionHeader, ServiceError> {
         let deadline = self.shared.deadline();
         let probing = self.shared.connect(deadline, Purpose::Probe);
-        Ok(Box::pin(probing).await?.1)
+        let (mut connection, header) = Box::pin(probing).await?;
+        connection.sound = true;
+        Ok(header)
     }
 }
 

@@ -1,74 +1,96 @@
 //! The links of the local side that are lost, as they are reported to the port.
 
+use std::collections::BTreeMap;
 use std::net::IpAddr;
 use std::time::{Duration, Instant};
 
 /// Decides which lost links are reported.
 #[derive(Debug, Default)]
 pub(crate) struct LinkLoss {
-    /// When the links were lost.
-    since: Option<Instant>,
+    /// The lost addresses, and when they were lost.
+    lost: BTreeMap<IpAddr, Instant>,
     reported: Vec<IpAddr>,
-    /// How long the last check took.
+    /// How long a check takes, as a mean in which longer times count less.
     cost: Duration,
 }
 
 impl LinkLoss {
-    /// Returns what the port is told: the lost addresses, once the loss lasts for `patience` and
-    /// repeatedly while it lasts, and an empty list when the links are back.
+    /// Returns what the port is told: the addresses that are lost for `patience`, repeatedly while
+    /// the loss lasts, and an empty list when all links are back.
     pub(super) fn look(
         &mut self,
-        lost: Vec<IpAddr>,
+        lost: &[IpAddr],
         patience: Duration,
         now: Instant,
     ) -> Option<&[IpAddr]> {
-        let was_reported = !self.reported.is_empty();
-        if lost.is_empty() {
-            self.since = None;
-            self.reported.clear();
-            return was_reported.then_some(&self.reported);
+        self.lost.retain(|address, _| lost.contains(address));
+        for address in lost {
+            self.lost.entry(*address).or_insert(now);
         }
-        let since = *self.since.get_or_insert(now);
-        if !was_reported && now.duration_since(since) < patience {
-            return None;
-        }
-        self.reported = lost;
-        Some(&self.reported)
+        let is_due = |since: &Instant| now.duration_since(*since) >= patience;
+        let due = self.lost.iter().filter(|(_, since)| is_due(since));
+        let before = std::mem::replace(&mut self.reported, due.map(|(one, _)| *one).collect());
+        let is_told = !self.reported.is_empty() || !before.is_empty();
+        is_told.then_some(&self.reported)
     }
 
     /// Notes how long a check of the links took.
-    pub(super) const fn took(&mut self, cost: Duration) {
-        self.cost = cost;
+    pub(super) fn took(&mut self, cost: Duration) {
+        let more = cost.saturating_sub(self.cost);
+        self.cost = cost.min(self.cost + more / 8);
     }
 
     /// Returns the time to the next check: `period`, or longer on a host with so many interfaces
     /// that the checks would take more than a fiftieth of the time.
     pub(super) fn pause(&self, period: Duration) -> Duration {
-        period.max(self.cost.saturating_mul(50))
+        period.max(self.cost.saturating_mul(50).min(LONGEST_PAUSE))
     }
 }
+
+const LONGEST_PAUSE: Duration = Duration::from_millis(250);
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
+    const PATIENCE: Duration = Duration::from_millis(200);
+
+    fn address(last: u8) -> IpAddr {
+        IpAddr::from([10, 0, 0, last])
+    }
+
     #[test]
     fn a_link_that_is_lost_for_a_moment_is_not_reported_unless_there_is_no_patience() {
         let start = crate::clock::now().monotonic;
         let at = |ms| start + Duration::from_millis(ms);
-        let patience = Duration::from_millis(200);
-        let lost = || vec![IpAddr::from([10, 0, 0, 1])];
+        let lost = [address(1)];
         let mut links = LinkLoss::default();
-        assert_eq!(links.look(lost(), patience, at(0)), None);
-        assert_eq!(links.look(lost(), patience, at(100)), None);
-        assert_eq!(links.look(Vec::new(), patience, at(150)), None);
-        assert_eq!(links.look(lost(), patience, at(300)), None);
-        assert_eq!(links.look(lost(), patience, at(500)), Some(&*lost()));
-        assert_eq!(links.look(lost(), patience, at(600)), Some(&*lost()));
-        assert_eq!(links.look(Vec::new(), patience, at(700)), Some(&[][..]));
-        assert_eq!(links.look(Vec::new(), patience, at(800)), None);
-        let at_once = links.look(lost(), Duration::ZERO, at(900));
-        assert_eq!(at_once, Some(&*lost()));
+        for (ms, now_lost, told) in [
+            (0, &lost[..], None),
+            (100, &lost[..], None),
+            (150, &[][..], None),
+            (300, &lost[..], None),
+            (500, &lost[..], Some(&lost[..])),
+            (600, &lost[..], Some(&lost[..])),
+            (700, &[][..], Some(&[][..])),
+            (800, &[][..], None),
+        ] {
+            assert_eq!(links.look(now_lost, PATIENCE, at(ms)), told, "{ms}");
+        }
+        let at_once = links.look(&lost, Duration::ZERO, at(900));
+        assert_eq!(at_once, Some(&lost[..]));
+    }
+
+    #[test]
+    fn each_link_has_its_own_patience() {
+        let start = crate::clock::now().monotonic;
+        let at = |ms| start + Duration::from_millis(ms);
+        let mut links = LinkLoss::default();
+        let (first, both) = ([address(1)], [address(1), address(2)]);
+        assert_eq!(links.look(&first, PATIENCE, at(0)), None);
+        assert_eq!(links.look(&first, PATIENCE, at(200)), Some(&first[..]));
+        assert_eq!(links.look(&both, PATIENCE, at(300)), Some(&first[..]));
+        assert_eq!(links.look(&first, PATIENCE, at(400)), Some(&first[..]));
     }
 
     #[test]
@@ -76,7 +98,16 @@ mod tests {
         let mut links = LinkLoss::default();
         let period = Duration::from_millis(25);
         assert_eq!(links.pause(period), period);
-        links.took(Duration::from_millis(20));
-        assert_eq!(links.pause(period), Duration::from_secs(1));
+        // The process was not scheduled for a moment.
+        links.took(Duration::from_millis(4));
+        assert_eq!(links.pause(period), period);
+        for _ in 0..20 {
+            links.took(Duration::from_millis(3));
+        }
+        assert!(links.pause(period) > Duration::from_millis(100));
+        for _ in 0..20 {
+            links.took(Duration::from_millis(30));
+        }
+        assert_eq!(links.pause(period), Duration::from_millis(250));
     }
 }

@@ -119,7 +119,7 @@ impl<P: Port> Shell<P> {
                 PATIENCE
             };
             let lost = held.lost_addresses();
-            if let Some(lost) = self.links.look(lost, patience, now().monotonic) {
+            if let Some(lost) = self.links.look(&lost, patience, now().monotonic) {
                 self.port.links_lost(lost);
             }
         }
