@@ -10,7 +10,7 @@ use messages::{DefinitionText, DefinitionTexts, Dialect, Language, Literal, Text
 
 const HEAD: &str = "spaces: [{id: 1}, {id: 2}]\nnamespaces: {2: 'urn:my-plant:line'}\ncalls:\n";
 
-/// An action of ROS 2 whose definition is in a file.
+/// An action of ROS 2 with its definition in a file.
 struct Files;
 
 impl DefinitionTexts for Files {

@@ -7,7 +7,7 @@
 //!
 //! `cells/` has the mappings of the tests' cells.
 //!
-//! A test whose peer is missing on this machine is skipped with the reason; with `CI=true` it
+//! A test without its peer on this machine is skipped with the reason; with `CI=true` it
 //! fails.
 
 mod announcer;

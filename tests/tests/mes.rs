@@ -373,7 +373,7 @@ const COMPENSATED: &str = r"processes:
       - {step: put down, needs: {skill: {type: ReleaseSkillType}}}
 ";
 
-/// Starts the MES with these processes, whose last move goes so far.
+/// Starts the MES with these processes and a last move that goes so far.
 fn compensating(cell: &Cell, away: &str) -> Child {
     let object = "<urn:box> <urn:ua-bridge:plant#objectId> \"box\" ; <urn:ua-bridge:plant#pose> \"0.4 0.2 0.1 0 0 0\" .";
     fs::write(cell.folder().join("box.ttl"), object).unwrap();

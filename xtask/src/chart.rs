@@ -139,7 +139,7 @@ struct Table {
 }
 
 impl Table {
-    /// Returns the columns whose names fulfil a condition.
+    /// Returns the columns with names that fulfil a condition.
     fn columns(&self, wanted: impl Fn(&str) -> bool) -> Vec<usize> {
         let names = self.names.iter().enumerate();
         names

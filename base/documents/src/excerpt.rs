@@ -25,8 +25,8 @@ pub struct Excerpt<'a> {
 
 impl Excerpt<'_> {
     /// Renders the finding with its source line: several lines of text that end in a newline. A
-    /// finding whose line `source` lacks is rendered without it. `masked` replaces secrets of the
-    /// line. Control characters are replaced, so that a document cannot control the terminal.
+    /// finding with a line that `source` lacks is rendered without it. `masked` replaces secrets of
+    /// the line. Control characters are replaced, so that a document cannot control the terminal.
     #[must_use]
     pub fn render(&self, source: &str, masked: impl FnOnce(&str) -> String) -> String {
         let SourceSpan { line, column, len } = self.span;

@@ -86,7 +86,7 @@ pub struct Listing {
 }
 
 impl Listing {
-    /// Creates a listing whose first query is due now.
+    /// Creates a listing with a first query that is due now.
     #[must_use]
     pub fn new(settings: ListingSettings, now: Instant) -> Self {
         Self {

@@ -77,7 +77,7 @@ impl DemoFailure {
     }
 }
 
-/// Returns the exit code of a scenario whose end was printed, or not.
+/// Returns the exit code of a scenario, for an end that was printed or not.
 pub(crate) fn exit_code(outcome: &Result<(), DemoFailure>, printed: &io::Result<()>) -> u8 {
     match (outcome, printed) {
         (Err(failure), _) => failure.exit_code(),

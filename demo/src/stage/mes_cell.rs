@@ -1,4 +1,4 @@
-//! A cell whose MES runs processes: discovery server, MES, components and simulated devices.
+//! A cell with a MES that runs processes: discovery server, MES, components and simulated devices.
 
 use std::fs;
 use std::path::PathBuf;
@@ -12,7 +12,7 @@ use super::{
 };
 use crate::pace::Speed;
 
-/// The programs of a cell whose MES runs processes.
+/// The programs of a cell with a MES that runs processes.
 pub(crate) struct MesCell {
     pub(crate) programs: RunningPrograms,
     pub(crate) mes: Mes,

@@ -397,7 +397,7 @@ const CLAIM: &str = "running";
 const LOOK_EVERY: Duration = Duration::from_millis(500);
 /// Time for a component to halt its runs and to end.
 const STOP_WITHIN: Duration = Duration::from_secs(30);
-/// The exit codes of a component whose files are faulty: usage, data and configuration.
+/// The exit codes of a component with faulty files: usage, data and configuration.
 const FAULTY: [i32; 3] = [64, 65, 78];
 const MOST_ENTRIES: usize = 10_000;
 const LARGEST_SETTINGS: u64 = 64 << 10;

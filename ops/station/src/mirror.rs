@@ -177,7 +177,7 @@ pub(crate) async fn look(client: &OpcUaClient) -> Result<MirroredServer, ClientE
     Ok(survey.mirror)
 }
 
-/// A node whose children are read.
+/// A node to read the children of.
 struct Parent {
     id: NodeId,
     path: Vec<String>,

@@ -169,7 +169,7 @@ impl Page {
         }
     }
 
-    /// Returns the MES among the programs whose status is read.
+    /// Returns the MES among the programs with a status.
     pub(crate) async fn mes(&self) -> Option<MesClient> {
         let known = self.board().mes();
         if known.is_some() {

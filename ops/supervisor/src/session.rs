@@ -59,7 +59,7 @@ impl BrowserSessions {
         }
     }
 
-    /// Forgets the failed attempts of a user who has signed in.
+    /// Forgets the failed attempts of a user after a sign-in.
     pub(crate) fn succeed(&mut self, user: &str) {
         self.failed.retain(|(_, failed)| failed != user);
     }

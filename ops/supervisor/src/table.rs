@@ -127,7 +127,7 @@ fn solutions(results: Results) -> Value {
     table("select", &columns, rows.collect(), all.total)
 }
 
-/// Reads expanded JSON-LD, whose nodes are in a list.
+/// Reads expanded JSON-LD, which has its nodes in a list.
 fn statements(document: &Value) -> Value {
     let nodes = document.get("@graph").unwrap_or(document).as_array();
     let mut rows = Vec::new();

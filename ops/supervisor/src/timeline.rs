@@ -30,7 +30,7 @@ pub(crate) struct Timeline {
     called: (u64, u32),
     /// The time of the day at the start of the page, in milliseconds since 1970.
     start_ms: Option<i64>,
-    /// The name of the recording whose events are shown.
+    /// The name of the recording with the shown events.
     recording: Option<String>,
 }
 

@@ -527,7 +527,7 @@ impl Alarms {
         }
     }
 
-    /// Applies the values whose delay is over. Returns the values that report the conditions, if
+    /// Applies the values after their delay. Returns the values that report the conditions, if
     /// they are due: the topic and the fields of its DataSet.
     pub(crate) fn elapse(&self) -> Vec<(TopicId, Bytes)> {
         let Some(place) = self.place.get() else {

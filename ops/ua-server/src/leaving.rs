@@ -295,7 +295,7 @@ static SEVERAL_CORES: LazyLock<bool> =
 
 /// The status of a write while another server is active.
 pub(crate) const NOT_ACTIVE: StatusCode = StatusCode::BadInvalidState;
-/// The status of a write whose value a newer write replaced before it was sent.
+/// The status of a write that a newer write replaced before its value was sent.
 const REPLACED: StatusCode = StatusCode::BadRequestCancelledByRequest;
 /// Time limit for a write to be sent by the run loop.
 pub(crate) const LONGEST_WAY_OUT: Duration = Duration::from_secs(10);

@@ -205,7 +205,7 @@ fn conclusion(unchecked: &[String]) -> &'static str {
     }
 }
 
-/// Returns the end of a check, whose violations were printed.
+/// Returns the end of a check after its violations were printed.
 fn told(conforms: bool) -> Result<(), CommandFailure> {
     if conforms {
         Ok(())

@@ -82,7 +82,7 @@ impl ProcessModule {
         Self::over(settings, Arc::new(UaNodes::new(endpoint)))
     }
 
-    /// Creates the device of a module whose nodes are reached by `nodes`.
+    /// Creates the device of a module with nodes that are reached by `nodes`.
     #[must_use]
     pub fn over(settings: ModuleSettings, nodes: Arc<dyn ModuleNodes>) -> Self {
         let mut skills: Vec<ModuleSkill> = Vec::new();

@@ -1,4 +1,4 @@
-//! The skill types whose work a kind of device does.
+//! The skill types that a kind of device does.
 
 use skills::{DriverFault, ParameterType};
 

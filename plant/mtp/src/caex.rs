@@ -294,7 +294,7 @@ fn line(file: &str, position: u64) -> usize {
     before.iter().filter(|byte| **byte == b'\n').count() + 1
 }
 
-/// The type of attributes of CAEX 3.0 whose value is the ID of an element.
+/// The type of attributes of CAEX 3.0 that have the ID of an element as their value.
 const ID_LINK: &str = "/IDLinkAttributeType";
 /// The largest of the available manifests has 0.8 MB.
 pub(crate) const MAX_FILE: usize = 64 << 20;

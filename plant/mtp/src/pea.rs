@@ -209,7 +209,7 @@ impl Pea {
         }
     }
 
-    /// Returns the items whose values changed since the previous call.
+    /// Returns the items with values that changed since the previous call.
     pub fn take_changes(&mut self) -> BTreeSet<String> {
         std::mem::take(&mut self.changed)
     }

@@ -424,7 +424,7 @@ pub struct DirectoryClient {
 }
 
 impl DirectoryClient {
-    /// Returns the registered servers whose names match a pattern, up to a limit.
+    /// Returns the registered servers with names that match a pattern, up to a limit.
     ///
     /// # Errors
     /// The server is unreachable, slow or untrusted, or its answer is invalid.

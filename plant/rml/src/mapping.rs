@@ -134,7 +134,7 @@ pub(crate) enum TemplatePart {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum TermKind {
     Iri,
-    /// An IRI whose values are not escaped.
+    /// An IRI with values that are not escaped.
     UnsafeIri,
     BlankNode,
     Literal,

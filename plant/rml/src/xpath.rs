@@ -95,7 +95,7 @@ impl PartialEq for PathIndex {
     }
 }
 
-/// A step whose nodes are found by a value.
+/// A step to nodes that are found by a value.
 ///
 /// The expressions are shared: a path inside of them has an index too, which would double with each
 /// level of nesting.

@@ -263,7 +263,7 @@ mod tests {
         }
     }
 
-    /// A started composite whose Grasp ends as given.
+    /// A started composite with a Grasp that ends as given.
     async fn at_grasp(way: Way) -> (Skill, Arc<Scripted>) {
         let grasp = Scripted::new(way);
         let composite = PickAndPlace {

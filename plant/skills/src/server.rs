@@ -69,7 +69,7 @@ use crate::yaml::{Findings, YamlFinding, YamlFindingCode};
 /// Settings of the server of a component, beside the component.
 #[derive(Debug, Clone, Default)]
 pub struct ServeSettings {
-    /// Reaches the components whose skills the component uses.
+    /// Reaches the components with the skills that the component uses.
     pub peers: PeerAccess,
     /// The directory of certificates, required for Basic256Sha256.
     pub pki: Option<PathBuf>,

@@ -11,6 +11,6 @@ pub struct Interest {
     /// The namespaces that it uses, and its own. It handles their values, and their probes for
     /// calls.
     pub namespaces: BTreeSet<(SpaceId, u16)>,
-    /// The spaces whose announcements it handles.
+    /// The spaces of the announcements that it handles.
     pub announced: BTreeSet<SpaceId>,
 }

@@ -29,7 +29,7 @@ fn start(cell: &mut SimulatedCell, at: usize) {
     offer(cell, at);
 }
 
-/// Returns a network whose datagrams are lost while the flag is set.
+/// Returns a network that loses its datagrams while the flag is set.
 fn lossy(cell: &mut SimulatedCell) -> Rc<Flag<bool>> {
     let is_lost = Rc::new(Flag::new(false));
     let flag = Rc::clone(&is_lost);

@@ -20,7 +20,7 @@ use uadp::BuiltinType;
 /// The next responses of a service.
 type Answers = Arc<Mutex<VecDeque<Result<Bytes, CallFault>>>>;
 
-/// A graph whose services respond once the test permits it.
+/// A graph with services that respond once the test permits it.
 struct Fake {
     registry: TypeRegistry,
     may: Arc<Semaphore>,

@@ -294,7 +294,7 @@ mod tests {
         queue.push(publication("a", None, false), start).unwrap();
     }
 
-    /// Returns a state whose payload is its number, and the time at which it expires.
+    /// Returns a state with its number as payload, and the time at which it expires.
     fn state(topic: &str, number: u8, until: Instant) -> QueuedMessage {
         let state = QueuedPublish {
             payload: vec![number],

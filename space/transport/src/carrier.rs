@@ -188,7 +188,8 @@ pub struct Received {
 pub enum Senders {
     /// A broker hides the senders, and accepts messages from every client.
     Hidden,
-    /// A broker hides the senders, and its access rules decide who may publish on which topic.
+    /// A broker hides the senders, and its access rules decide which client may publish on which
+    /// topic.
     Authorized,
     /// Each sender has an address.
     Addresses,

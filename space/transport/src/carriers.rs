@@ -407,7 +407,7 @@ mod tests {
 
     use super::*;
 
-    /// A network in memory, whose end a test holds.
+    /// A network in memory with its end in a test.
     #[derive(Debug, Default)]
     struct Wire {
         incoming: VecDeque<(Vec<u8>, SocketAddr)>,

@@ -154,7 +154,7 @@ fn a_client_finds_the_active_server_by_the_service_level_and_a_standby_refuses_w
     });
     let mut sequence = 1;
     eventually("its level shows it", SOON, || {
-        // A space whose writers are silent has a low level.
+        // A space with silent writers has a low level.
         sequence += 1;
         let value_of = key_frame(TEMPERATURE, sequence, 21.5, DataSetHeader::default());
         group.send(&value_of);

@@ -101,8 +101,8 @@ impl RawLayout<'_> {
     /// ExtensionObjects.
     ///
     /// # Errors
-    /// The first field whose value does not fit. Values are not truncated: a text or array longer
-    /// than its field is an error.
+    /// The first field with a value that does not fit. Values are not truncated: a text or array
+    /// longer than its field is an error.
     pub fn write<'v, V: Into<RawValue<'v>>>(
         &self,
         buf: &mut Vec<u8>,

@@ -15,7 +15,7 @@ use crate::{
     workspace::Workspace,
 };
 
-/// The release whose C library is linked. glibc 2.31.
+/// The release of the C library that is linked. glibc 2.31.
 const RELEASE: &str = "bullseye";
 /// The mirror of Debian; `UA_DEBIAN_MIRROR` names another one.
 const MIRROR: &str = "http://deb.debian.org/debian";

@@ -14,7 +14,7 @@ pub enum ServerChoice {
     Uri(NamePattern),
     /// By its mDNS instance name.
     Name(NamePattern),
-    /// The discovery server whose address space has this node, such as `nsu=urn:cell;s=Marker`.
+    /// The discovery server with this node in its address space, such as `nsu=urn:cell;s=Marker`.
     Marker(String),
 }
 

@@ -55,7 +55,7 @@ pub(super) enum QueryBody {
     },
 }
 
-/// Returns the media type of a request whose body is a file.
+/// Returns the media type of a request with a file as its body.
 pub(super) fn media(path: &str) -> Option<&'static str> {
     matches!(path, CHECK | LOAD).then_some("application/octet-stream")
 }
@@ -178,7 +178,7 @@ fn outcome(done: &Result<Value, RefusedRequest>) -> &'static str {
     }
 }
 
-/// Returns the file of a request, whose kind its name and its contents show.
+/// Returns the file of a request. Its name and its contents show its kind.
 async fn source_file(request: Request<impl RequestBody>) -> Result<SourceFile, RefusedRequest> {
     let name = parameter(request.uri(), "name").unwrap_or_default();
     if name.is_empty() || name.len() > LONGEST_NAME {

@@ -69,7 +69,7 @@ fn an_alias_once_given_stays_with_its_node() {
     let before = fs::read_to_string(&out).unwrap();
     run(&["init", "--nodeset", &second, "-o", &out, "--merge"]).quiet();
     assert_eq!(fs::read_to_string(&out).unwrap(), before);
-    // A node whose number is already an alias cannot be added, and is reported once.
+    // A node with a number that is already an alias cannot be added, and is reported once.
     let third = file("third.xml", node_set(&[("ns=1;i=9", "Nine")]));
     let told = run(&["init", "--nodeset", &third, "-o", &out, "--merge", "--json"]).quiet();
     let told: Value = serde_json::from_str(&told).unwrap();

@@ -66,7 +66,7 @@ impl Place {
         }
     }
 
-    /// Removes stored conditions, whose alarms do not exist any more.
+    /// Removes stored conditions of alarms that do not exist any more.
     pub(super) fn remove_stored<'n>(&self, nodes: impl Iterator<Item = &'n NodeId>) {
         let stored = self.stored.lock();
         for node in nodes {

@@ -133,7 +133,7 @@ impl AlarmCause {
         self.pending.as_ref().map(|(due, ..)| *due)
     }
 
-    /// Returns the levels whose delay is over, and the value that caused them.
+    /// Returns the levels that are due after their delay, and the value that caused them.
     pub(crate) fn elapsed(&mut self, now: Instant) -> Option<(Levels, AlarmInput)> {
         let (_, levels, reading) = self.pending.take_if(|(due, ..)| *due <= now)?;
         self.levels = levels;

@@ -18,7 +18,7 @@ use crate::exit::CommandFailure;
 use crate::report::warn;
 use crate::survey::look;
 
-/// Lists the cells whose prefixes match.
+/// Lists the cells with matching prefixes.
 pub(super) fn list(arguments: &ListArguments, prefixes: &str) -> Result<(), CommandFailure> {
     // Each `+` is a level of its own.
     let example = prefixes.split('/').map(|level| match level {

@@ -98,7 +98,7 @@ impl ProcedureRun {
         shake.allowed(Command::Start).await
     }
 
-    /// Resets a service whose last run has ended.
+    /// Resets a service after its last run.
     async fn make_idle(&self, shake: &Handshake<'_>, work: &Work) -> Result<(), ModuleError> {
         let state = shake.state().await?;
         let is_at_end = matches!(

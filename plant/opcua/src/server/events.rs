@@ -181,7 +181,7 @@ impl EventField for Raised {
     }
 }
 
-/// Returns the types whose select clauses apply to events of this type.
+/// Returns the types with select clauses that apply to events of this type.
 pub(crate) fn answered(event_type: &NodeId, supertypes: Vec<&NodeId>) -> Vec<NodeId> {
     let above = supertypes.into_iter().cloned();
     let mut types: Vec<NodeId> = std::iter::once(event_type.clone()).chain(above).collect();

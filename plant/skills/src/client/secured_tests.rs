@@ -1,4 +1,4 @@
-//! Composites in a cell whose channels are all secured.
+//! Composites in a cell with secured channels only.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;

@@ -95,7 +95,7 @@ fn takes(key: &str) -> Takes {
     }
 }
 
-/// Returns the keys of two maps whose values differ.
+/// Returns the keys of two maps with different values.
 fn compared(
     before: Option<&DocumentNode>,
     after: Option<&DocumentNode>,

@@ -88,7 +88,7 @@ fn usage() -> ExitCode {
     ExitCode::from(64)
 }
 
-/// A Router of space 1 whose topics all have a value, and the messages for it.
+/// A Router of space 1 with a value for each topic, and the messages for it.
 struct Bench {
     router: Router,
     now: Now,

@@ -8,7 +8,7 @@ use mappings::{SpaceId, TopicId};
 /// input, so their number is bounded by the messages of a datagram and the due topics.
 #[derive(Debug, Default)]
 pub(super) struct Inquiries {
-    /// The topics of other spaces whose metadata is needed.
+    /// The topics of other spaces that need metadata.
     topics: Vec<TopicId>,
     /// Topics of programs that were received for the first time.
     met: Vec<TopicId>,
@@ -41,7 +41,7 @@ impl Inquiries {
         self.topics.is_empty() && self.met.is_empty() && !self.applications
     }
 
-    /// Takes the topics whose metadata is needed.
+    /// Takes the topics that need metadata.
     pub(super) fn take_topics(&mut self) -> Vec<TopicId> {
         mem::take(&mut self.topics)
     }

@@ -178,7 +178,7 @@ impl MessageSecurity {
         }
     }
 
-    /// Returns a group whose keys are to be fetched.
+    /// Returns a group that needs its keys.
     pub(super) fn wanted(&mut self, now: Instant) -> Option<String> {
         self.guard.as_mut()?.wanted(now)
     }

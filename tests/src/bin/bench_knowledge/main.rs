@@ -1,7 +1,7 @@
 //! `cargo xtask bench knowledge`: manifests, NodeSets and questions of the knowledge of the plant,
 //! its journal, and the search for a plan.
 //!
-//! Rows whose data of other makers is missing are left out with a line.
+//! Rows without the data of other makers are left out with a line.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;

@@ -73,7 +73,7 @@ fn station(at: &PlantSite) -> Child {
         .start()
 }
 
-/// Starts a component whose skills complete their actions at once.
+/// Starts a component with skills that complete their actions at once.
 fn device(cell: &Cell, at: &PlantSite, (number, skills): (usize, usize)) -> Child {
     let name = format!("device-{number}");
     let mut yaml = format!(

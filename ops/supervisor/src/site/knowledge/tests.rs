@@ -74,7 +74,7 @@ fn cell(answers: &[(u16, &'static str, &'static str)]) -> Cell {
     cell_with(answers, || ())
 }
 
-/// Creates a cell whose MES calls `before` with each request, before it answers.
+/// Creates a cell with a MES that calls `before` with each request, before it answers.
 fn cell_with(
     answers: &[(u16, &'static str, &'static str)],
     before: impl Fn() + Send + 'static,
@@ -113,7 +113,7 @@ fn cell_with(
     Cell { page, received }
 }
 
-/// A page whose users sign in, without a MES.
+/// A page with users that sign in, without a MES.
 fn page() -> Arc<Page> {
     let page = Page::new("test", Vec::new(), None);
     page.operate(Arc::new(Users));

@@ -352,7 +352,7 @@ pub(super) fn output(program: &str, arguments: &[&str]) -> Option<String> {
     }
     let status = child.wait().ok();
     let _ended = reader.join();
-    // A program whose output is cut ends by a broken pipe.
+    // A program ends by a broken pipe when its output is cut.
     let text = text.filter(|text| {
         let is_cut = u64::try_from(text.len()).is_ok_and(|length| length >= MOST_OUTPUT);
         is_cut || status.is_some_and(|status| status.success())

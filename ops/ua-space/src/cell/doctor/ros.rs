@@ -20,7 +20,7 @@ pub(super) struct Ros1 {
     /// The reason why the master does not answer; `None` if it answers or was not asked.
     pub(super) fault: Option<String>,
     pub(super) nodes: usize,
-    /// The nodes whose host does not resolve from here: node, and host.
+    /// The nodes on hosts that do not resolve from here: node, and host.
     pub(super) unresolved: Vec<(String, String)>,
     /// The addresses of the host of the master.
     pub(super) master_addresses: Vec<IpAddr>,
