@@ -71,7 +71,7 @@ struct SignIn {
 
 /// The body of a request for a call.
 #[derive(Deserialize)]
-struct Call {
+struct CallRequest {
     topic: String,
     #[serde(default)]
     fields: Map<String, Value>,
@@ -294,7 +294,7 @@ impl Page {
         &self,
         operations: &Arc<dyn Operations>,
         session: &BrowserSession,
-        Call { topic, fields }: Call,
+        CallRequest { topic, fields }: CallRequest,
     ) -> Result<Response<PageBody>, RefusedRequest> {
         let topic = parse_topic(&topic)?;
         let known = self.board().calls.get(&topic).cloned();

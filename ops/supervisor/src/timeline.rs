@@ -49,7 +49,7 @@ struct Last {
 struct Event {
     number: u64,
     topic: TopicId,
-    kind: Kind,
+    kind: EventKind,
     text: String,
     severity: &'static str,
     /// The time at the producer, in milliseconds since 1970.
@@ -59,14 +59,14 @@ struct Event {
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Kind {
+enum EventKind {
     Value,
     State,
     Request,
     Response,
 }
 
-impl Kind {
+impl EventKind {
     const fn word(self) -> &'static str {
         match self {
             Self::Value => "value",
@@ -120,7 +120,7 @@ impl Timeline {
         last.left_out = None;
         last.count += 1;
         let severity = match (quality(entry.status, false).0, kind) {
-            ("good", Kind::State) => of_state(&text),
+            ("good", EventKind::State) => of_state(&text),
             ("good", _) if text == "true" => "run",
             ("good", _) => "none",
             (other, _) => other,
@@ -163,9 +163,9 @@ impl Timeline {
         }
         self.calls.push_back(call);
         let (kind, text, severity) = match (call.is_request, call.is_done) {
-            (true, _) => (Kind::Request, "requested", "run"),
-            (false, true) => (Kind::Response, "answered", "good"),
-            (false, false) => (Kind::Response, "executing", "run"),
+            (true, _) => (EventKind::Request, "requested", "run"),
+            (false, true) => (EventKind::Response, "answered", "good"),
+            (false, false) => (EventKind::Response, "executing", "run"),
         };
         let event = Event {
             number: 0,
@@ -251,14 +251,14 @@ fn participant(name: &str, space: SpaceId) -> (String, String) {
 }
 
 /// Returns the kind and the text of a discrete value.
-fn text_of(entry: &TopicEntry) -> Option<(Kind, String)> {
+fn text_of(entry: &TopicEntry) -> Option<(EventKind, String)> {
     let names = &entry.description.fields;
     let has_state = names.iter().any(|name| name == "state");
     if has_state && entry.description.name.ends_with(STATE) {
         let shown = value::fields(&entry.block, names).ok()?;
         let state = shown.iter().find(|(name, _)| name == "state");
         let state = state.and_then(|(_, value)| value.as_str())?;
-        return Some((Kind::State, value::cut(state, LONGEST_TEXT)));
+        return Some((EventKind::State, value::cut(state, LONGEST_TEXT)));
     }
     let mut fields = Fields::parse(&entry.block).ok()?;
     let first = fields.next()?.ok()?;
@@ -285,7 +285,7 @@ fn text_of(entry: &TopicEntry) -> Option<(Kind, String)> {
         Scalar::String(Some(text)) => value::cut(text, LONGEST_TEXT),
         _ => return None,
     };
-    Some((Kind::Value, text))
+    Some((EventKind::Value, text))
 }
 
 /// Returns the severity of a state of a skill.

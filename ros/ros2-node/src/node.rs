@@ -85,7 +85,7 @@ impl From<&str> for NodeOptions {
 /// A reader or writer that is on its node's list as long as it exists.
 pub struct Listed<E> {
     endpoint: E,
-    entry: Entry,
+    entry: ListedEndpoint,
 }
 
 impl<E> Listed<E> {
@@ -104,19 +104,19 @@ impl<E> Deref for Listed<E> {
 }
 
 /// An entry in the node's list, removed when dropped.
-struct Entry {
-    node: Arc<Shared>,
+struct ListedEndpoint {
+    node: Arc<NodeShared>,
     guid: GUID,
-    kind: Kind,
+    kind: EndpointKind,
 }
 
 #[derive(Debug, Clone, Copy)]
-enum Kind {
+enum EndpointKind {
     Reader,
     Writer,
 }
 
-impl Drop for Entry {
+impl Drop for ListedEndpoint {
     fn drop(&mut self) {
         self.node.change(|own| {
             own.unseen.remove(&self.guid);
@@ -127,7 +127,7 @@ impl Drop for Entry {
 
 /// The node. Its own thread announces it until it is dropped; then its name is withdrawn.
 pub(crate) struct DomainNode {
-    shared: Arc<Shared>,
+    shared: Arc<NodeShared>,
     thread: Option<JoinHandle<()>>,
 }
 
@@ -144,7 +144,7 @@ pub(crate) struct NodeServices {
     pub(crate) clock: Option<PayloadReader>,
 }
 
-struct Shared {
+struct NodeShared {
     options: NodeOptions,
     clock: Ros2Clock,
     own: Mutex<Own>,
@@ -185,7 +185,7 @@ impl DomainNode {
     /// # Errors
     /// If the thread cannot be started.
     pub(crate) fn start(options: NodeOptions, channels: Channels) -> std::io::Result<Self> {
-        let shared = Arc::new(Shared {
+        let shared = Arc::new(NodeShared {
             clock: Ros2Clock::new(options.use_sim_time),
             options,
             own: Mutex::new(Own {
@@ -234,21 +234,21 @@ impl DomainNode {
 
     pub(crate) fn list_reader(&self, endpoint: RawReader) -> PayloadReader {
         let guid = endpoint.guid();
-        self.list(endpoint, guid, Kind::Reader)
+        self.list(endpoint, guid, EndpointKind::Reader)
     }
 
     pub(crate) fn list_writer(&self, endpoint: RawWriter) -> PayloadWriter {
         let guid = endpoint.guid();
-        self.list(endpoint, guid, Kind::Writer)
+        self.list(endpoint, guid, EndpointKind::Writer)
     }
 
-    fn list<E>(&self, endpoint: E, guid: GUID, kind: Kind) -> Listed<E> {
+    fn list<E>(&self, endpoint: E, guid: GUID, kind: EndpointKind) -> Listed<E> {
         lock(&self.shared.own).unseen.insert(guid, Instant::now());
         self.shared
             .change(|own| own.of(kind).insert(guid.to_bytes()));
         Listed {
             endpoint,
-            entry: Entry {
+            entry: ListedEndpoint {
                 node: Arc::clone(&self.shared),
                 guid,
                 kind,
@@ -345,7 +345,7 @@ impl Drop for DomainNode {
     }
 }
 
-impl Shared {
+impl NodeShared {
     fn change(&self, change: impl FnOnce(&mut Own) -> bool) {
         let mut own = lock(&self.own);
         own.changed |= change(&mut own);
@@ -361,10 +361,10 @@ impl Shared {
 }
 
 impl Own {
-    fn of(&mut self, kind: Kind) -> &mut BTreeSet<GuidBytes> {
+    fn of(&mut self, kind: EndpointKind) -> &mut BTreeSet<GuidBytes> {
         match kind {
-            Kind::Reader => &mut self.readers,
-            Kind::Writer => &mut self.writers,
+            EndpointKind::Reader => &mut self.readers,
+            EndpointKind::Writer => &mut self.writers,
         }
     }
 }

@@ -28,11 +28,11 @@ use crate::service::{ServiceCounters, ServiceName, ServiceOptions, ServicePeers,
 /// Serves the parameters of a node. Dropping it withdraws the services.
 #[derive(Debug)]
 pub struct ParameterServer {
-    shared: Arc<Shared>,
+    shared: Arc<ParametersShared>,
     services: Vec<ServiceServer>,
 }
 
-struct Shared {
+struct ParametersShared {
     node: String,
     store: Mutex<ParameterStore>,
     events: Mutex<PayloadWriter>,
@@ -55,7 +55,7 @@ impl ParameterServer {
             domain.learn_type_hash(EVENT_TYPE, hash.to_string());
         }
         let events = domain.open_writer(EVENTS, EVENT_TYPE, &policies())?;
-        let shared = Arc::new(Shared {
+        let shared = Arc::new(ParametersShared {
             node: node.clone(),
             store: Mutex::new(ParameterStore::new(parameters)),
             events: Mutex::new(events),
@@ -101,7 +101,7 @@ impl ParameterServer {
     }
 }
 
-impl Shared {
+impl ParametersShared {
     fn answer(&self, question: ParameterService, request: &[u8]) -> Result<Bytes, Malformed> {
         let (answer, changed) = self
             .store
@@ -125,7 +125,7 @@ impl Shared {
     }
 }
 
-impl std::fmt::Debug for Shared {
+impl std::fmt::Debug for ParametersShared {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         f.debug_struct("Shared")
             .field("node", &self.node)

@@ -16,13 +16,13 @@ use crate::discovery_info::Cdr;
 /// Collects warnings and errors of all threads, for the node's thread to publish.
 #[derive(Debug)]
 pub struct Rosout {
-    waiting: Mutex<Waiting>,
+    waiting: Mutex<WaitingLogs>,
     clock: Ros2Clock,
     publisher: Thread,
 }
 
 #[derive(Debug, Default)]
-struct Waiting {
+struct WaitingLogs {
     records: VecDeque<(Ros2Time, LogRecord)>,
     dropped: u64,
 }
@@ -66,7 +66,7 @@ impl Rosout {
         Some((stamp, record))
     }
 
-    fn lock(&self) -> MutexGuard<'_, Waiting> {
+    fn lock(&self) -> MutexGuard<'_, WaitingLogs> {
         self.waiting.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }

@@ -15,7 +15,7 @@ use crate::service::{
 };
 
 /// The types of the node by their full names, such as `std_msgs/msg/Bool`.
-type Known = BTreeMap<(String, TypeHash), Description>;
+type DescriptionTable = BTreeMap<(String, TypeHash), Description>;
 
 /// A type with its referenced types, itself first.
 #[derive(Debug)]
@@ -39,7 +39,7 @@ pub struct TypeSource {
 /// service.
 #[derive(Debug)]
 pub struct TypeServer {
-    known: Arc<Mutex<Known>>,
+    known: Arc<Mutex<DescriptionTable>>,
     server: ServiceServer,
 }
 
@@ -53,7 +53,7 @@ impl TypeServer {
         if let Some(hashes) = hashes {
             service.announce(domain, &hashes);
         }
-        let known = Arc::new(Mutex::new(Known::new()));
+        let known = Arc::new(Mutex::new(DescriptionTable::new()));
         let asked = Arc::clone(&known);
         let handler = move |request: ServiceRequest| {
             let answer = read_request(&request.bytes).map(|request| {
@@ -184,7 +184,7 @@ fn read_request(bytes: &[u8]) -> Result<TypeRequest, Malformed> {
 }
 
 /// Encodes the response to a request, for a known or an unknown type.
-fn answer(known: &Known, request: &TypeRequest) -> Bytes {
+fn answer(known: &DescriptionTable, request: &TypeRequest) -> Bytes {
     let found = describe(known, &request.name, &request.hash);
     let mut writer = CdrWriter::new();
     writer.bool(found.is_ok());
@@ -227,7 +227,11 @@ enum UnusedType {
     },
 }
 
-fn describe<'k>(known: &'k Known, name: &str, hash: &str) -> Result<&'k Description, UnusedType> {
+fn describe<'k>(
+    known: &'k DescriptionTable,
+    name: &str,
+    hash: &str,
+) -> Result<&'k Description, UnusedType> {
     // For messages the short name suffices.
     let full = name.parse::<TypeName>();
     let full = full.map_or_else(|_| name.to_owned(), |name| name.ros2());
@@ -312,7 +316,7 @@ mod tests {
     }
 
     /// Returns a node that has only this type of the bundle.
-    fn known(name: &TypeName) -> (Known, TypeHash) {
+    fn known(name: &TypeName) -> (DescriptionTable, TypeHash) {
         let registry = TypeRegistry::bundle(Dialect::Ros2);
         let hash = registry.type_hash(name).unwrap();
         let types = registry.describe(name).unwrap();
@@ -323,7 +327,10 @@ mod tests {
         };
         let sources = types.iter().map(source).collect();
         let description = Description { types, sources };
-        (Known::from([((name.ros2(), hash), description)]), hash)
+        (
+            DescriptionTable::from([((name.ros2(), hash), description)]),
+            hash,
+        )
     }
 
     fn asked(name: &str, hash: &str, sources: bool) -> TypeRequest {

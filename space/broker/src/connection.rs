@@ -113,7 +113,7 @@ struct Unsent {
 }
 
 /// The reason why a connection ended.
-enum Ended {
+enum BrokerConnectionEnd {
     Closed,
     Lost(String),
 }
@@ -142,12 +142,12 @@ pub(crate) async fn run(
             pause = FIRST_PAUSE;
         }
         match ended {
-            Ended::Lost(why)
+            BrokerConnectionEnd::Lost(why)
                 if !received.is_closed() && shared.waits(&why, session.take_unsent()) =>
             {
                 debug!(broker = %settings.broker.address, "cannot connect: {why}");
             }
-            Ended::Lost(_) | Ended::Closed => return shared.closed(),
+            BrokerConnectionEnd::Lost(_) | BrokerConnectionEnd::Closed => return shared.closed(),
         }
         // Programs that lost the same broker return at different times.
         let jitter = Duration::from_millis(random() % 100);
@@ -222,24 +222,27 @@ impl<'a> Session<'a> {
         }
     }
 
-    async fn run(&mut self, received: &mpsc::Sender<(ReceivedPublish, SocketAddr)>) -> Ended {
+    async fn run(
+        &mut self,
+        received: &mpsc::Sender<(ReceivedPublish, SocketAddr)>,
+    ) -> BrokerConnectionEnd {
         let connected = tokio::select! {
             connected = connect(self.settings) => connected,
-            () = self.closing() => return Ended::Closed,
+            () = self.closing() => return BrokerConnectionEnd::Closed,
         };
         let mut stream = match connected {
             Ok((stream, at)) => {
                 self.at = at;
                 stream
             }
-            Err(error) => return Ended::Lost(error.to_string()),
+            Err(error) => return BrokerConnectionEnd::Lost(error.to_string()),
         };
         match packets::connect(self.settings, self.version) {
             Ok(packet) => self.send(packet),
-            Err(error) => return Ended::Lost(format!("cannot connect: {error:?}")),
+            Err(error) => return BrokerConnectionEnd::Lost(format!("cannot connect: {error:?}")),
         }
         let ended = self.exchange(&mut stream, received).await;
-        if let Ended::Closed = ended {
+        if let BrokerConnectionEnd::Closed = ended {
             self.finish(&mut stream).await;
         }
         ended
@@ -260,24 +263,24 @@ impl<'a> Session<'a> {
         &mut self,
         stream: &mut Box<dyn BrokerStream>,
         received: &mpsc::Sender<(ReceivedPublish, SocketAddr)>,
-    ) -> Ended {
+    ) -> BrokerConnectionEnd {
         let begin = TokioInstant::now();
         let (mut reader, mut writer) = tokio::io::split(stream);
         let mut buffer = vec![0; READ];
         loop {
             if let Some(why) = self.over.take() {
-                return Ended::Lost(why);
+                return BrokerConnectionEnd::Lost(why);
             }
             for message in std::mem::take(&mut self.messages) {
                 match received.try_send((message, self.at)) {
                     Ok(()) => {}
                     // Waiting would stop the connection in both directions.
                     Err(TrySendError::Full(_)) => self.shared.state().overflow += 1,
-                    Err(TrySendError::Closed(_)) => return Ended::Closed,
+                    Err(TrySendError::Closed(_)) => return BrokerConnectionEnd::Closed,
                 }
             }
             if self.fill() {
-                return Ended::Closed;
+                return BrokerConnectionEnd::Closed;
             }
             let connected = self.is_connected();
             // A cluster may need seconds for each subscription.
@@ -291,21 +294,21 @@ impl<'a> Session<'a> {
                 read = reader.read(&mut buffer) => match read {
                     Ok(0) => {
                         self.refuses_version = self.accepted.is_none();
-                        return Ended::Lost("the broker closed the connection".to_owned());
+                        return BrokerConnectionEnd::Lost("the broker closed the connection".to_owned());
                     }
                     Ok(length) => self.receive(buffer.get(..length).unwrap_or_default()),
-                    Err(error) => return Ended::Lost(lost(&error)),
+                    Err(error) => return BrokerConnectionEnd::Lost(lost(&error)),
                 },
                 written = writer.write(self.out.0.get(self.out.1..).unwrap_or_default()), if pending => {
                     match written {
-                        Ok(0) => return Ended::Lost("the broker closed the connection".to_owned()),
+                        Ok(0) => return BrokerConnectionEnd::Lost("the broker closed the connection".to_owned()),
                         Ok(length) => self.written(length),
-                        Err(error) => return Ended::Lost(lost(&error)),
+                        Err(error) => return BrokerConnectionEnd::Lost(lost(&error)),
                     }
                 }
                 () = sleep_until(timer) => {
                     if !connected && TokioInstant::now() >= ready {
-                        return Ended::Lost("the broker does not respond".to_owned());
+                        return BrokerConnectionEnd::Lost("the broker does not respond".to_owned());
                     }
                     self.fire(TokioInstant::now());
                 }

@@ -419,9 +419,9 @@ mod tests {
     }
 
     #[derive(Debug, Clone, Default)]
-    struct End(Arc<Mutex<Wire>>);
+    struct MemoryEnd(Arc<Mutex<Wire>>);
 
-    impl Carrier for End {
+    impl Carrier for MemoryEnd {
         fn try_send(&mut self, message: &OutgoingMessage<'_>) -> Result<(), SendError> {
             let mut wire = self.0.lock().unwrap();
             if wire.is_lost {
@@ -502,13 +502,13 @@ mod tests {
         }
     }
 
-    fn pair() -> (Carriers, End, End) {
-        let (a, b) = (End::default(), End::default());
+    fn pair() -> (Carriers, MemoryEnd, MemoryEnd) {
+        let (a, b) = (MemoryEnd::default(), MemoryEnd::default());
         let both: Vec<Box<dyn Carrier>> = vec![Box::new(a.clone()), Box::new(b.clone())];
         (Carriers::new(both, Box::new(Ones)), a, b)
     }
 
-    fn arrives(end: &End, bytes: &[u8], port: u16) {
+    fn arrives(end: &MemoryEnd, bytes: &[u8], port: u16) {
         let mut wire = end.0.lock().unwrap();
         wire.incoming.push_back((bytes.to_vec(), from(port)));
     }

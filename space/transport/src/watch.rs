@@ -176,9 +176,9 @@ pub struct HeldInterfaces {
 #[derive(Debug)]
 struct Holding {
     interface: Interface,
-    state: State,
+    state: HoldingState,
     /// State at the last call of [`HeldInterfaces::look`].
-    reported: State,
+    reported: HoldingState,
     /// True if the interface was removed at that call or since.
     was_gone: bool,
     /// True if the interface was up once.
@@ -188,7 +188,7 @@ struct Holding {
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum State {
+enum HoldingState {
     There,
     Down,
     Gone,
@@ -227,16 +227,16 @@ impl HeldInterfaces {
     fn of(held: Vec<Interface>, all: bool) -> Self {
         let holding = |interface: Interface| {
             let state = if interface.up {
-                State::There
+                HoldingState::There
             } else {
-                State::Down
+                HoldingState::Down
             };
             Holding {
                 interface,
                 state,
                 reported: state,
                 was_gone: false,
-                was_there: state == State::There,
+                was_there: state == HoldingState::There,
                 is_elsewhere: false,
             }
         };
@@ -265,7 +265,10 @@ impl HeldInterfaces {
     #[must_use]
     pub fn lost(&self) -> Option<String> {
         let first = self.held.first()?;
-        let none = self.held.iter().all(|held| held.state != State::There);
+        let none = self
+            .held
+            .iter()
+            .all(|held| held.state != HoldingState::There);
         none.then(|| first.why())
     }
 
@@ -274,7 +277,7 @@ impl HeldInterfaces {
     #[must_use]
     pub fn lost_addresses(&self) -> Vec<IpAddr> {
         let is_lost =
-            |held: &&Holding| held.was_there && held.state != State::There && !held.is_elsewhere;
+            |held: &&Holding| held.was_there && held.state != HoldingState::There && !held.is_elsewhere;
         let lost = self.held.iter().filter(is_lost);
         lost.map(|held| held.interface.address.into()).collect()
     }
@@ -283,12 +286,12 @@ impl HeldInterfaces {
         for holding in &mut self.held {
             let now = present.iter().find(|one| one.is_same(&holding.interface));
             holding.state = match now {
-                Some(now) if now.up => State::There,
-                Some(_) => State::Down,
-                None => State::Gone,
+                Some(now) if now.up => HoldingState::There,
+                Some(_) => HoldingState::Down,
+                None => HoldingState::Gone,
             };
-            holding.was_gone |= holding.state == State::Gone;
-            holding.was_there |= holding.state == State::There;
+            holding.was_gone |= holding.state == HoldingState::Gone;
+            holding.was_there |= holding.state == HoldingState::There;
             let address = holding.interface.address;
             let mut up = present.iter().filter(|one| one.up);
             holding.is_elsewhere = up.any(|one| one.address == address);
@@ -297,25 +300,25 @@ impl HeldInterfaces {
 
     fn see(&mut self, present: &[Interface]) -> Vec<InterfaceFinding> {
         self.update(present);
-        let is_there = |holding: &Holding| holding.reported == State::There;
+        let is_there = |holding: &Holding| holding.reported == HoldingState::There;
         let was_there = self.held.iter().any(is_there);
         let mut findings = Vec::new();
         for holding in &mut self.held {
             let state = holding.state;
             let before = std::mem::replace(&mut holding.reported, state);
-            let was_gone = std::mem::replace(&mut holding.was_gone, state == State::Gone);
+            let was_gone = std::mem::replace(&mut holding.was_gone, state == HoldingState::Gone);
             match (before, state) {
                 // The kernel removed its state together with the interface.
-                (_, State::There | State::Down) if was_gone => {
+                (_, HoldingState::There | HoldingState::Down) if was_gone => {
                     findings.push(InterfaceFinding::Void(format!(
                         "the network interface {} was created again",
                         holding.interface
                     )));
                 }
-                (State::Down, State::There) => {
+                (HoldingState::Down, HoldingState::There) => {
                     findings.push(InterfaceFinding::Back(holding.interface.clone()));
                 }
-                (State::There, State::Down | State::Gone) => {
+                (HoldingState::There, HoldingState::Down | HoldingState::Gone) => {
                     findings.push(InterfaceFinding::Lost(holding.why()));
                 }
                 _ => {}
@@ -331,14 +334,17 @@ impl HeldInterfaces {
     fn changed(&mut self, present: &[Interface], was_there: bool) -> Vec<InterfaceFinding> {
         let mut findings = Vec::new();
         let usable = |one: &&Interface| one.up && !one.address.is_loopback();
-        let is_there = self.held.iter().any(|held| held.state == State::There);
+        let is_there = self
+            .held
+            .iter()
+            .any(|held| held.state == HoldingState::There);
         for one in present.iter().filter(usable) {
             let mut of_name = self.held.iter().filter(|h| h.interface.name == one.name);
             if of_name.any(|h| h.interface.is_same(one)) {
                 continue;
             }
             let mut of_name = self.held.iter().filter(|h| h.interface.name == one.name);
-            if let Some(gone) = of_name.find(|h| h.state == State::Gone) {
+            if let Some(gone) = of_name.find(|h| h.state == HoldingState::Gone) {
                 findings.push(InterfaceFinding::Void(
                     if gone.interface.address == one.address {
                         format!("the network interface {one} was created again")
@@ -365,8 +371,8 @@ impl HeldInterfaces {
 impl Holding {
     fn why(&self) -> String {
         let state = match self.state {
-            State::Gone => "removed, or has another address",
-            State::Down | State::There => "down",
+            HoldingState::Gone => "removed, or has another address",
+            HoldingState::Down | HoldingState::There => "down",
         };
         format!("the network interface {} is {state}", self.interface)
     }

@@ -78,14 +78,14 @@ pub(super) struct ClientGoalLimits {
 /// The goals that have a handle or are withdrawn.
 #[derive(Debug)]
 pub(super) struct ClientGoals {
-    goals: BTreeMap<GoalId, Goal>,
+    goals: BTreeMap<GoalId, ClientGoalState>,
     limits: ClientGoalLimits,
     pub(super) counters: ClientCounters,
 }
 
 #[derive(Debug)]
-struct Goal {
-    answer: Answer,
+struct ClientGoalState {
+    answer: GoalReply,
     status: GoalStatusCode,
     events: VecDeque<GoalEvent>,
     /// The number of feedback messages in `events`.
@@ -105,7 +105,7 @@ struct Goal {
 
 /// Whether the server has replied. Earlier events are kept and delivered after the reply.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Answer {
+enum GoalReply {
     Awaited,
     Had,
 }
@@ -123,8 +123,8 @@ impl ClientGoals {
     pub(super) fn sent(&mut self, id: GoalId, wake: Arc<Notify>) {
         let open = self.goals.values().filter(|goal| goal.outcome.is_none());
         let full = open.count() >= self.limits.goals;
-        let goal = Goal {
-            answer: Answer::Awaited,
+        let goal = ClientGoalState {
+            answer: GoalReply::Awaited,
             status: GoalStatusCode::Unknown,
             events: VecDeque::new(),
             messages: 0,
@@ -152,13 +152,13 @@ impl ClientGoals {
     /// Records that a server accepted the goal.
     pub(super) fn accepted(&mut self, id: GoalId, stamp: Ros2Time, now: Instant) {
         if let Some(goal) = self.open(id)
-            && goal.answer == Answer::Awaited
+            && goal.answer == GoalReply::Awaited
         {
             if let Some(withdrawal) = &mut goal.withdrawal {
                 withdrawal.accepted(now);
             }
             goal.changed.notify_waiters();
-            goal.answer = Answer::Had;
+            goal.answer = GoalReply::Had;
             if goal.status == GoalStatusCode::Unknown {
                 goal.status = GoalStatusCode::Accepted;
             }
@@ -223,7 +223,7 @@ impl ClientGoals {
     /// Returns false if the server has decided about the goal, or the goal is unknown.
     pub(super) fn withdraw(&mut self, id: GoalId, now: Instant) -> bool {
         let goal = self.open(id);
-        let Some(goal) = goal.filter(|goal| goal.answer == Answer::Awaited) else {
+        let Some(goal) = goal.filter(|goal| goal.answer == GoalReply::Awaited) else {
             return false;
         };
         goal.withdrawal.get_or_insert_with(|| Withdrawal::new(now));
@@ -236,7 +236,7 @@ impl ClientGoals {
         let open = self
             .goals
             .iter()
-            .filter(|(_, goal)| goal.outcome.is_none() && goal.answer == Answer::Awaited);
+            .filter(|(_, goal)| goal.outcome.is_none() && goal.answer == GoalReply::Awaited);
         open.map(|(id, _)| *id).collect()
     }
 
@@ -260,7 +260,7 @@ impl ClientGoals {
     /// Returns whether a server has accepted the goal.
     pub(super) fn is_accepted(&self, id: GoalId) -> bool {
         let goal = self.goals.get(&id);
-        goal.is_some_and(|goal| goal.answer == Answer::Had)
+        goal.is_some_and(|goal| goal.answer == GoalReply::Had)
     }
 
     /// Returns the notification for the acceptance or withdrawal of the goal.
@@ -311,10 +311,10 @@ impl ClientGoals {
         match &outcome {
             Outcome::Rejected => goal.forget_events(),
             Outcome::Done { status, .. } => goal.status = *status,
-            Outcome::Lost(_) if goal.answer == Answer::Awaited => goal.forget_events(),
+            Outcome::Lost(_) if goal.answer == GoalReply::Awaited => goal.forget_events(),
             Outcome::Lost(_) => {}
         }
-        goal.answer = Answer::Had;
+        goal.answer = GoalReply::Had;
         goal.outcome = Some(outcome.clone());
         goal.tell(GoalEvent::Ended(outcome));
         false
@@ -333,7 +333,7 @@ impl ClientGoals {
         if let Some(limit) = goal.overdue.take() {
             return Some(GoalEvent::Overdue(limit));
         }
-        if goal.answer == Answer::Awaited {
+        if goal.answer == GoalReply::Awaited {
             return None;
         }
         // Dropped feedback is older than the waiting events, except for the acceptance.
@@ -353,7 +353,7 @@ impl ClientGoals {
     /// Returns the known status of a goal: unknown before the server's reply.
     pub(super) fn known_status(&self, id: GoalId) -> GoalStatusCode {
         let goal = self.goals.get(&id);
-        let goal = goal.filter(|goal| goal.answer == Answer::Had);
+        let goal = goal.filter(|goal| goal.answer == GoalReply::Had);
         goal.map_or(GoalStatusCode::Unknown, |goal| goal.status)
     }
 
@@ -376,13 +376,13 @@ impl ClientGoals {
         true
     }
 
-    fn open(&mut self, id: GoalId) -> Option<&mut Goal> {
+    fn open(&mut self, id: GoalId) -> Option<&mut ClientGoalState> {
         let goal = self.goals.get_mut(&id);
         goal.filter(|goal| goal.outcome.is_none())
     }
 }
 
-impl Goal {
+impl ClientGoalState {
     fn tell(&mut self, event: GoalEvent) {
         if self.is_left {
             return;

@@ -99,7 +99,7 @@ pub(super) enum ResultRequest<W> {
 /// All goals, with the requests that wait for their results, each a `W`.
 #[derive(Debug)]
 pub(super) struct ServerGoals<W> {
-    goals: BTreeMap<GoalId, Goal<W>>,
+    goals: BTreeMap<GoalId, ServerGoalState<W>>,
     most: usize,
     /// `None` keeps results until room is needed.
     result_timeout: Option<Duration>,
@@ -108,7 +108,7 @@ pub(super) struct ServerGoals<W> {
 }
 
 #[derive(Debug)]
-struct Goal<W> {
+struct ServerGoalState<W> {
     /// Increases in the order of arrival.
     key: u64,
     stamp: Ros2Time,
@@ -154,7 +154,7 @@ impl<W> ServerGoals<W> {
         }
         let key = self.next_key;
         self.next_key += 1;
-        let goal = Goal {
+        let goal = ServerGoalState {
             key,
             stamp: Ros2Time::default(),
             phase: Phase::Offered,
@@ -179,7 +179,7 @@ impl<W> ServerGoals<W> {
 
     /// Removes an offered goal; an accepted goal stays.
     pub(super) fn reject(&mut self, ticket: Ticket) {
-        let offered = |goal: &mut Goal<W>| matches!(goal.phase, Phase::Offered);
+        let offered = |goal: &mut ServerGoalState<W>| matches!(goal.phase, Phase::Offered);
         if self.goal(ticket).is_ok_and(offered) {
             self.goals.remove(&ticket.id);
         }
@@ -286,7 +286,7 @@ impl<W> ServerGoals<W> {
                 Err(CancelCode::Terminated)
             };
         }
-        let meant = |id: GoalId, goal: &Goal<W>| match what {
+        let meant = |id: GoalId, goal: &ServerGoalState<W>| match what {
             CancelWhat::All => true,
             CancelWhat::Goal(one) => id == one,
             CancelWhat::Until(stamp) => goal.stamp <= stamp,
@@ -328,7 +328,7 @@ impl<W> ServerGoals<W> {
         let accepted = self.goals.iter().filter(|(_, goal)| goal.is_accepted());
         let mut found: Vec<_> = accepted.collect();
         found.sort_by_key(|(_, goal)| goal.key);
-        let said = |(id, goal): (&GoalId, &Goal<W>)| (goal.named(*id).1, goal.status());
+        let said = |(id, goal): (&GoalId, &ServerGoalState<W>)| (goal.named(*id).1, goal.status());
         found.into_iter().map(said).collect()
     }
 
@@ -345,7 +345,7 @@ impl<W> ServerGoals<W> {
         self.goals.len() < before
     }
 
-    fn goal(&mut self, ticket: Ticket) -> Result<&mut Goal<W>, GoalError> {
+    fn goal(&mut self, ticket: Ticket) -> Result<&mut ServerGoalState<W>, GoalError> {
         let goal = self.goals.get_mut(&ticket.id);
         goal.filter(|goal| goal.key == ticket.key)
             .ok_or(GoalError::Forgotten(ticket.id))
@@ -369,7 +369,7 @@ impl<W> ServerGoals<W> {
     }
 }
 
-impl<W> Goal<W> {
+impl<W> ServerGoalState<W> {
     const fn status(&self) -> GoalStatusCode {
         match self.phase {
             Phase::Offered => GoalStatusCode::Unknown,

@@ -11,13 +11,13 @@ use bytes::Bytes;
 use tokio::time::Instant;
 use tracing::{debug, warn};
 
-use super::{Channels, ParticipantPrefix, Shared, lock};
+use super::{Channels, NodeShared, ParticipantPrefix, lock};
 use crate::discovery_info::{GidLength, NodeEntities, ParticipantEntitiesInfo};
 use crate::raw::{Payload, RawWriter};
 
 /// The state of the thread.
 pub(super) struct NodeThread {
-    shared: Arc<Shared>,
+    shared: Arc<NodeShared>,
     channels: Channels,
     /// The time at which the list is due for publication.
     due: Option<Instant>,
@@ -26,7 +26,7 @@ pub(super) struct NodeThread {
 }
 
 impl NodeThread {
-    pub(super) fn new(shared: Arc<Shared>, channels: Channels) -> Self {
+    pub(super) fn new(shared: Arc<NodeShared>, channels: Channels) -> Self {
         Self {
             shared,
             channels,

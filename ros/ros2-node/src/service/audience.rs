@@ -12,11 +12,11 @@ use crate::raw::PayloadWriter;
 /// reports when it is full. Discovery knows all readers, shortly before the writer does.
 #[derive(Debug, Default)]
 pub(crate) struct Audience {
-    known: BTreeMap<GUID, Known>,
+    known: BTreeMap<GUID, KnownClient>,
 }
 
 #[derive(Debug)]
-struct Known {
+struct KnownClient {
     since: Instant,
     matched: bool,
 }
@@ -39,7 +39,7 @@ impl Audience {
     }
 
     fn matched(&mut self, reader: GUID, now: Instant) {
-        let fresh = Known {
+        let fresh = KnownClient {
             since: now,
             matched: true,
         };
@@ -57,7 +57,7 @@ impl Audience {
             readers.contains(guid) || now.saturating_duration_since(known.since) < FRESH
         });
         for reader in readers {
-            let found = Known {
+            let found = KnownClient {
                 since: now,
                 matched: false,
             };

@@ -47,21 +47,21 @@ impl Default for ServiceClientOptions {
 /// Calls a service. Clones share its endpoints, which are removed with the last clone.
 #[derive(Clone, Debug)]
 pub struct ServiceClient {
-    shared: Arc<Shared>,
+    shared: Arc<ClientShared>,
 }
 
 #[derive(Debug)]
-struct Shared {
+struct ClientShared {
     service: ServiceName,
     options: ServiceClientOptions,
-    calls: mpsc::Sender<Call>,
+    calls: mpsc::Sender<WaitingCall>,
     ignored: Arc<AtomicU64>,
     servers: Arc<AtomicU64>,
     acquainted: Arc<AtomicU64>,
     task: AbortHandle,
 }
 
-impl Drop for Shared {
+impl Drop for ClientShared {
     fn drop(&mut self) {
         self.task.abort();
     }
@@ -115,7 +115,7 @@ impl ServiceClient {
         };
         let task = tokio::spawn(driver.run(inbox)).abort_handle();
         Ok(Self {
-            shared: Arc::new(Shared {
+            shared: Arc::new(ClientShared {
                 service: service.clone(),
                 options,
                 calls,
@@ -208,7 +208,7 @@ impl ServiceClient {
         Recall { phase, start_by }: &Recall,
     ) -> Result<Replied, ServiceError> {
         let (done, reply) = oneshot::channel();
-        let call = Call {
+        let call = WaitingCall {
             request,
             companion: endpoint.map(|endpoint| (endpoint, Instant::now() + COMPANION)),
             phase: Arc::clone(phase),
@@ -308,7 +308,7 @@ pub struct Replied {
 }
 
 #[derive(Debug)]
-struct Call {
+struct WaitingCall {
     request: Bytes,
     /// An endpoint of the participant that has to be among the servers, and the time limit for
     /// this.
@@ -319,7 +319,7 @@ struct Call {
     done: oneshot::Sender<Result<Replied, Failure>>,
 }
 
-impl Call {
+impl WaitingCall {
     /// Enters a phase. Returns false if the request was recalled and must not be sent.
     fn enter(&self, phase: CallPhase) -> bool {
         let moved = |now: u8| (now != RECALLED).then_some(phase.into());
@@ -376,7 +376,7 @@ struct Driver {
     /// The type of a server that differs from our type.
     other_type: Option<String>,
     /// Calls that wait for a server, for its capacity, or for the send window; oldest first.
-    waiting: VecDeque<Call>,
+    waiting: VecDeque<WaitingCall>,
     /// Calls that wait for a reply.
     asked: BTreeMap<u64, Asked>,
     keys: HashMap<RequestKey, u64>,
@@ -392,14 +392,14 @@ struct Driver {
 }
 
 struct Asked {
-    call: Call,
+    call: WaitingCall,
     keys: Vec<RequestKey>,
     servers: Vec<GUID>,
     since: Instant,
 }
 
 impl Driver {
-    async fn run(mut self, mut calls: mpsc::Receiver<Call>) {
+    async fn run(mut self, mut calls: mpsc::Receiver<WaitingCall>) {
         loop {
             // Each branch is cancel-safe: only the branch that completes takes an item.
             let tick = self.next_look().unwrap_or_else(Instant::now);
@@ -427,7 +427,7 @@ impl Driver {
         self.looked.map(|looked| looked + pause)
     }
 
-    fn called(&mut self, call: Call) {
+    fn called(&mut self, call: WaitingCall) {
         if self.waiting.len() + self.asked.len() >= self.max_calls {
             self.forget_given_up();
         }
@@ -510,7 +510,7 @@ impl Driver {
     }
 
     /// Returns the call that has waited longest for the present servers.
-    fn next_call(&mut self, now: Instant) -> Option<Call> {
+    fn next_call(&mut self, now: Instant) -> Option<WaitingCall> {
         let mut waiting = self.waiting.iter();
         let at = waiting.position(|call| call.is_for(&self.servers, now))?;
         self.waiting.remove(at)
@@ -546,7 +546,7 @@ impl Driver {
     }
 
     /// Writes a request to the servers; returns it if the send window is full.
-    fn ask(&mut self, call: Call, servers: &[GUID], now: Instant) -> Option<Call> {
+    fn ask(&mut self, call: WaitingCall, servers: &[GUID], now: Instant) -> Option<WaitingCall> {
         self.count += 1;
         let (mut keys, mut asked) = (Vec::new(), Vec::new());
         for server in servers {

@@ -18,14 +18,14 @@ use super::ServiceMapping;
 /// The bridge's own endpoints are left out: a client of the bridge does not make a service
 /// available.
 #[derive(Clone)]
-pub struct ServicePeers(Arc<Shared>);
+pub struct ServicePeers(Arc<PeersShared>);
 
-struct Shared {
+struct PeersShared {
     participant: DomainParticipant,
-    seen: Mutex<Option<Seen>>,
+    seen: Mutex<Option<SeenGraph>>,
 }
 
-struct Seen {
+struct SeenGraph {
     at: Instant,
     /// The change count of discovery at the copy; see [`changes_of`].
     changes: Option<u64>,
@@ -44,7 +44,7 @@ impl ServicePeers {
     /// [`Domain::leave`].
     #[must_use]
     pub fn new(domain: &Domain) -> Self {
-        Self(Arc::new(Shared {
+        Self(Arc::new(PeersShared {
             participant: domain.participant().clone(),
             seen: Mutex::default(),
         }))
@@ -72,7 +72,7 @@ impl ServicePeers {
             return Arc::clone(&seen.snapshot);
         }
         let snapshot = Arc::new(Snapshot::of(&self.0.participant));
-        *seen = Some(Seen {
+        *seen = Some(SeenGraph {
             at: now,
             changes,
             snapshot: Arc::clone(&snapshot),
