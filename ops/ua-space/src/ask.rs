@@ -149,11 +149,11 @@ pub(crate) fn parsed<'a, T: Deserialize<'a>>(body: &'a str) -> Result<T, Command
 /// Returns the reason of a response with an error status.
 pub(crate) fn refusal(answer: &HttpResponse) -> CommandFailure {
     #[derive(Deserialize)]
-    struct Told {
+    struct RefusedQuestion {
         error: String,
         message: String,
     }
-    let told: Option<Told> = serde_json::from_str(&answer.body).ok();
+    let told: Option<RefusedQuestion> = serde_json::from_str(&answer.body).ok();
     let why = match &told {
         Some(told) => format!("{}: {}", harmless(&told.error), harmless(&told.message)),
         None => format!("HTTP status {}", answer.status),

@@ -22,12 +22,12 @@ pub(crate) fn discover(arguments: &Discover) -> Result<(), CommandFailure> {
         return Ok(out.flush()?);
     }
     if found.entries.is_empty() {
-        writeln!(out, "nobody was found")?;
+        writeln!(out, "no program was found")?;
     } else {
         table(&found.entries).write(&mut out, is_coloured())?;
     }
     if let Some(tried) = found.tried {
-        writeln!(out, "{tried} places were tried")?;
+        writeln!(out, "{tried} addresses were tried")?;
     }
     Ok(out.flush()?)
 }

@@ -25,7 +25,7 @@ use crate::raw_data::RawDataLayout;
 use crate::values::{WrongValue, data_value_bytes, variant_bytes};
 use crate::{actions, discovery, hex, iso_time, node_ids, shape};
 
-type Written = Result<(), WrongValue>;
+type EncodingResult = Result<(), WrongValue>;
 
 /// Returns the bytes of a datagram.
 pub(crate) fn write(
@@ -130,7 +130,7 @@ impl Writing<'_> {
 
     /// Writes a chunk: encodes its data as a complete message, then replaces the offset and total
     /// size.
-    fn chunk(&self, chunk: &shape::ChunkJson, out: &mut Vec<u8>) -> Written {
+    fn chunk(&self, chunk: &shape::ChunkJson, out: &mut Vec<u8>) -> EncodingResult {
         let data = bytes(&chunk.chunk_data_hex).map_err(|wrong| wrong.at("chunk.chunkDataHex"))?;
         let payload_at = self.chunk_headers(chunk.message_sequence_number, &data, out)?;
         // The ChunkOffset and TotalSize follow the MessageSequenceNumber.
@@ -204,13 +204,13 @@ impl Writing<'_> {
         Ok(out.len() - body.len())
     }
 
-    fn probe(&self, body: &[u8], out: &mut Vec<u8>) -> Written {
+    fn probe(&self, body: &[u8], out: &mut Vec<u8>) -> EncodingResult {
         self.only_discovery_headers()?;
         let security = self.security.map_or(SecurityHeader::NONE, Security::header);
         Ok(Probe::decode_body(body)?.encode(self.header.publisher_id, security, out)?)
     }
 
-    fn announcement(&self, body: &[u8], out: &mut Vec<u8>) -> Written {
+    fn announcement(&self, body: &[u8], out: &mut Vec<u8>) -> EncodingResult {
         self.only_discovery_headers()?;
         let publisher_id = self.header.publisher_id;
         let missing = || WrongValue::new("an announcement wants one").at("publisherId");
@@ -222,7 +222,7 @@ impl Writing<'_> {
         )?)
     }
 
-    fn only_discovery_headers(&self) -> Written {
+    fn only_discovery_headers(&self) -> EncodingResult {
         let NetworkHeader {
             publisher_id: _,
             data_set_class_id: None,
@@ -398,7 +398,7 @@ fn write_message(
     known: Option<&RawDataLayout<'_>>,
     reading: RawReading,
     encoder: &mut NetworkMessageEncoder<'_>,
-) -> Written {
+) -> EncodingResult {
     use shape::{FieldEncodingJson, MessageKindJson};
 
     if let Some(why) = &json.malformed {
@@ -464,7 +464,7 @@ fn write_message(
 }
 
 /// Writes the fields of a key frame or event.
-fn write_variants(json: &shape::DataSetMessageJson, mut frame: FieldEncoder<'_>) -> Written {
+fn write_variants(json: &shape::DataSetMessageJson, mut frame: FieldEncoder<'_>) -> EncodingResult {
     each_field(json, |field| {
         if field.index.is_some() {
             return Err(WrongValue::new(
@@ -499,8 +499,8 @@ fn raw_data(
 
 fn each_field(
     json: &shape::DataSetMessageJson,
-    mut write: impl FnMut(&shape::FieldJson) -> Written,
-) -> Written {
+    mut write: impl FnMut(&shape::FieldJson) -> EncodingResult,
+) -> EncodingResult {
     for (field, at) in json.fields.iter().zip(0..) {
         write(field).map_err(|wrong| wrong.at(&format!(".fields[{at}]")))?;
     }

@@ -17,13 +17,17 @@ pub(crate) fn explain(arguments: &Explain) -> Result<(), CommandFailure> {
             }
         }
         Some(code) => {
-            let (document, told) = code.example();
-            writeln!(out, "{code}: {}\n\nFor example, of\n", code.explanation())?;
+            let (document, findings) = code.example();
+            writeln!(
+                out,
+                "{code}: {}\n\nFor example, this mapping:\n",
+                code.explanation()
+            )?;
             for (number, line) in document.lines().enumerate() {
                 writeln!(out, "{:3} | {line}", number + 1)?;
             }
-            writeln!(out, "\nis told:\n")?;
-            out.write_all(told.as_bytes())?;
+            writeln!(out, "\nhas these findings:\n")?;
+            out.write_all(findings.as_bytes())?;
         }
     }
     Ok(out.flush()?)

@@ -56,14 +56,14 @@ pub(crate) fn goal(arguments: &GoalArguments) -> Result<(), CommandFailure> {
 struct Planned {
     reachable: bool,
     #[serde(default)]
-    steps: Vec<Step>,
+    steps: Vec<GoalStep>,
     #[serde(default)]
     reached: Vec<Condition>,
     reason: Option<String>,
 }
 
 #[derive(Debug, Deserialize)]
-struct Step {
+struct GoalStep {
     name: String,
     capability: String,
     because: Vec<Condition>,

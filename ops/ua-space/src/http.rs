@@ -136,7 +136,7 @@ impl HttpServer {
         let asked = timeout(limit, self.asked(method, path, content, user)).await;
         let answer = asked.unwrap_or_else(|_| Err(format!("no answer within {limit:?}")));
         answer.map_err(|why| {
-            let help = "is it running, and is this its address?";
+            let help = "start the program, or give the address at which it runs";
             CommandFailure::Unavailable(format!(
                 "http://{}: {why}\n  = help: {help}",
                 self.authority
@@ -198,7 +198,7 @@ impl HttpServer {
 /// Plain JSON, which is accepted even where the server also offers the SPARQL results format.
 const JSON: &str = "application/json";
 const RESULTS: &str = "application/sparql-results+json, application/n-triples";
-/// The content of a request whose answer need not be text.
+/// The content of a request with an answer that need not be text.
 pub(crate) const PROTOBUF: &str = "application/x-protobuf";
 /// The time limit of a request, longer than the time limit of a query.
 const LIMIT: Duration = Duration::from_secs(15);

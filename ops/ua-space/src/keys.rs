@@ -16,19 +16,19 @@ use crate::{hex, json_file, selector};
 #[derive(Debug)]
 pub(crate) struct KeyFile {
     name: String,
-    entries: Vec<Entry>,
+    entries: Vec<KeyFileEntry>,
 }
 
 #[derive(Debug)]
-struct Entry {
-    written: Written,
+struct KeyFileEntry {
+    written: WrittenKey,
     keys: TokenKeys,
 }
 
 /// The parts of a key of a SecurityGroup; texts are hexadecimal.
 #[derive(Debug, Deserialize)]
 #[serde(rename_all = "camelCase", deny_unknown_fields)]
-struct Written {
+struct WrittenKey {
     /// The SecurityPolicyUri.
     policy: String,
     security_token_id: u32,
@@ -64,14 +64,14 @@ impl KeyFile {
                 "{name}: mode {mode:04o} lets others read the keys; chmod 600 {name}"
             ));
         }
-        let written: Vec<Written> =
+        let written: Vec<WrittenKey> =
             json_file::one_or_many(&text).map_err(|error| json_file::explain(&name, &error))?;
         let mut entries = Vec::new();
         for (written, at) in written.into_iter().zip(0..) {
             let keys = written.keys();
             let keys =
                 keys.map_err(|error| CommandFailure::Data(format!("{name}: key {at}: {error}")))?;
-            entries.push(Entry { written, keys });
+            entries.push(KeyFileEntry { written, keys });
         }
         Ok(Self { name, entries })
     }
@@ -112,7 +112,7 @@ impl KeyFile {
         publisher_id: Option<&PublisherIdJson>,
         writer_group_id: Option<u16>,
     ) -> Option<&TokenKeys> {
-        let wanted = |entry: &&Entry| entry.is_of(token_id, publisher_id, writer_group_id);
+        let wanted = |entry: &&KeyFileEntry| entry.is_of(token_id, publisher_id, writer_group_id);
         self.entries.iter().find(wanted).map(|entry| &entry.keys)
     }
 
@@ -150,7 +150,7 @@ pub(crate) fn open<'a>(
     Ok(opener.open(message, Duration::ZERO, scratch)?.message)
 }
 
-impl Entry {
+impl KeyFileEntry {
     fn fits(&self, message: &NetworkMessage<'_>) -> bool {
         let header = message.header();
         let publisher_id = header.publisher_id.map(PublisherIdJson::from);
@@ -174,7 +174,7 @@ impl Entry {
     }
 }
 
-impl Written {
+impl WrittenKey {
     fn keys(&self) -> Result<TokenKeys, String> {
         let policy = SecurityPolicy::from_uri(&self.policy)
             .ok_or_else(|| format!("`{}` is no SecurityPolicy of PubSub", self.policy))?;

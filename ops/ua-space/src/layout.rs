@@ -12,13 +12,13 @@ pub(crate) fn lines(compact: &str) -> String {
 }
 
 /// A part of the JSON, with its text and its parts.
-struct Node<'a> {
+struct LayoutNode<'a> {
     text: &'a str,
     /// The parts of an array or object; in an object with their keys and colons.
     parts: Vec<(&'a str, Self)>,
 }
 
-impl Node<'_> {
+impl LayoutNode<'_> {
     /// Writes the part; `before` is the number of columns already used on the line.
     fn write(&self, indent: usize, before: usize, out: &mut String) {
         let plain_list =
@@ -55,7 +55,7 @@ impl Node<'_> {
 }
 
 /// Parses one value from the front.
-fn read<'a>(rest: &mut &'a str) -> Option<Node<'a>> {
+fn read<'a>(rest: &mut &'a str) -> Option<LayoutNode<'a>> {
     let start = *rest;
     let mut parts = Vec::new();
     match start.as_bytes().first()? {
@@ -80,7 +80,7 @@ fn read<'a>(rest: &mut &'a str) -> Option<Node<'a>> {
             *rest = start.get(end..)?;
         }
     }
-    Some(Node {
+    Some(LayoutNode {
         text: taken(start, rest)?,
         parts,
     })

@@ -34,7 +34,7 @@ pub(crate) fn make_keys(arguments: &MakeKeys) -> Result<(), CommandFailure> {
         all.push(made(token, policy)?);
         replace(file, &all)?;
         format!(
-            "{name}: key {token} comes next; bring the file to all programs, then --drop the first"
+            "{name}: key {token} comes next; copy the file to all programs, then --drop the first"
         )
     } else if arguments.drop {
         let mut all = listed(file)?;
@@ -45,14 +45,17 @@ pub(crate) fn make_keys(arguments: &MakeKeys) -> Result<(), CommandFailure> {
         let gone = all.remove(0);
         replace(file, &all)?;
         let token = gone.get("securityTokenId").map(ToString::to_string);
-        format!("{name}: key {} is out of it", token.unwrap_or_default())
+        format!(
+            "{name}: removed key {}; copy the file to all programs",
+            token.unwrap_or_default()
+        )
     } else {
         let policy = match arguments.policy {
             KeyPolicy::Aes128 => SecurityPolicy::PubSubAes128Ctr,
             KeyPolicy::Aes256 => SecurityPolicy::PubSubAes256Ctr,
         };
         write(file, &[made(1, policy)?])?;
-        format!("{name}: key 1; bring the file to all programs of the group, and to nobody else")
+        format!("{name}: key 1; copy the file to all programs of the group, and to no other place")
     };
     let mut out = std::io::stdout().lock();
     writeln!(out, "{told}")?;

@@ -14,12 +14,12 @@ use crate::{json_file, selector};
 /// The metadata of a file. The first entry that matches a message is used.
 #[derive(Debug, Default)]
 pub(crate) struct MetaDataFile {
-    entries: Vec<Entry>,
+    entries: Vec<MetadataEntry>,
 }
 
 #[derive(Debug, Deserialize)]
 #[serde(rename_all = "camelCase", deny_unknown_fields)]
-struct Entry {
+struct MetadataEntry {
     publisher_id: Option<selector::PublisherSelector>,
     writer_group_id: Option<u16>,
     data_set_writer_id: Option<u16>,
@@ -40,7 +40,7 @@ impl MetaDataFile {
         let text = json_file::read(path)?;
         let read = if is_list_of_fields(&text) {
             serde_json::from_str(&text).map(|meta_data| {
-                vec![Entry {
+                vec![MetadataEntry {
                     publisher_id: None,
                     writer_group_id: None,
                     data_set_writer_id: None,
@@ -61,7 +61,7 @@ impl MetaDataFile {
 
     /// Returns the fields of a message, if an entry matches.
     pub(crate) fn find(&self, writer: WriterKey<'_>) -> Option<&[FieldMetaData]> {
-        let fits = |entry: &&Entry| {
+        let fits = |entry: &&MetadataEntry| {
             selector::publisher_fits(entry.publisher_id.as_ref(), writer.publisher_id)
                 && selector::number_fits(entry.writer_group_id, writer.writer_group_id)
                 && selector::number_fits(entry.data_set_writer_id, writer.data_set_writer_id)

@@ -26,14 +26,14 @@ pub(crate) fn alarms(arguments: &MtpAlarms) -> Result<(), CommandFailure> {
 struct AlarmMapping {
     /// Names and endpoints.
     servers: Vec<(String, String)>,
-    variables: Vec<Row>,
+    variables: Vec<AlarmVariable>,
     /// The alarms without a variable, with the reason.
     left_out: Vec<String>,
 }
 
 /// A variable with an alarm.
 #[derive(Debug, PartialEq)]
-struct Row {
+struct AlarmVariable {
     node: String,
     name: String,
     data_type: &'static str,
@@ -65,7 +65,7 @@ impl AlarmMapping {
                 format!("{plain} ({})", alarm.id)
             };
             let (data_type, when) = value;
-            part.variables.push(Row {
+            part.variables.push(AlarmVariable {
                 node: format!("ns={};i={id}", arguments.namespace),
                 name,
                 data_type,
@@ -113,6 +113,9 @@ impl AlarmMapping {
             "# Alarms of the process module {}: a part of the mapping of ua-server.\n",
             harmless(&module.name)
         );
+        if self.variables.is_empty() && self.left_out.is_empty() {
+            text.push_str("# The manifest has no alarms.\n");
+        }
         for why in &self.left_out {
             text.push_str(&format!("# left out: {}\n", harmless(why)));
         }
@@ -269,5 +272,14 @@ mod tests {
         let module = with_trigger(|value| matches!(value, PeaValue::Boolean(_)), "maybe");
         let part = AlarmMapping::of(&module, &arguments()).unwrap();
         assert_eq!(part.left_out.len(), 1, "{part:?}");
+    }
+
+    #[test]
+    fn a_manifest_without_alarms_is_said_to_have_none() {
+        let mut module = column();
+        module.alarms.clear();
+        let part = AlarmMapping::of(&module, &arguments()).unwrap();
+        let text = part.yaml(&module).unwrap();
+        assert!(text.ends_with("# The manifest has no alarms.\n"), "{text}");
     }
 }

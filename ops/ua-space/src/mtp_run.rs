@@ -57,7 +57,7 @@ async fn follow(
     arguments: &MtpRun,
     skill: &Skill,
     parameters: Vec<(String, SkillValue)>,
-    (told, mut interrupt): (&mut Waiting, SignalGuard),
+    (told, mut interrupt): (&mut PrintedSteps, SignalGuard),
 ) -> Result<Result<(), CommandFailure>, CommandFailure> {
     let within = arguments.run_timeout;
     let within = within.and_then(|within| Duration::try_from_secs_f64(within).ok());
@@ -112,7 +112,7 @@ async fn follow(
     }
     let outcome =
         outcome.ok_or_else(|| CommandFailure::Failed("the run left no outcome".to_owned()))?;
-    print(arguments.json, &RunLine::End(End::of(&outcome)))?;
+    print(arguments.json, &RunLine::End(MtpRunEnd::of(&outcome)))?;
     let message = harmless(&outcome.message);
     Ok(match (outcome.succeeded, outcome.unknown) {
         (true, _) => Ok(()),
@@ -184,19 +184,19 @@ fn takes(declared: &[SkillParameter]) -> String {
 enum RunLine {
     /// A step of the handshake, or a state of the service.
     Step(String),
-    End(End),
+    End(MtpRunEnd),
 }
 
 /// The end of the run.
 #[derive(Debug, Serialize)]
-struct End {
+struct MtpRunEnd {
     succeeded: bool,
     unknown: bool,
     message: String,
     results: BTreeMap<String, Json>,
 }
 
-impl End {
+impl MtpRunEnd {
     fn of(outcome: &RunOutcome) -> Self {
         let results = outcome.results.iter();
         Self {
@@ -232,17 +232,17 @@ struct Steps {
 }
 
 /// The steps that are to be printed.
-struct Waiting {
+struct PrintedSteps {
     steps: mpsc::Receiver<RunLine>,
     /// Number of steps that did not fit.
     lost: Arc<AtomicUsize>,
 }
 
 impl Steps {
-    fn new() -> (Self, Waiting) {
+    fn new() -> (Self, PrintedSteps) {
         let (steps, waiting) = mpsc::channel(MOST_STEPS);
         let lost = Arc::new(AtomicUsize::new(0));
-        let waiting = Waiting {
+        let waiting = PrintedSteps {
             steps: waiting,
             lost: Arc::clone(&lost),
         };

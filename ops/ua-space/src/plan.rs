@@ -64,11 +64,11 @@ struct Planned {
 
 #[derive(Debug, Deserialize)]
 struct Steps {
-    steps: Vec<Step>,
+    steps: Vec<ListedPlanStep>,
 }
 
 #[derive(Debug, Deserialize)]
-struct Step {
+struct ListedPlanStep {
     step: String,
     needs: Vec<Need>,
 }

@@ -136,8 +136,9 @@ fn show_raw(value: &RawValue<'_>) -> Result<JsonFieldValue, DecodeError> {
 
 /// Returns a known structure that RawData may hold; all its fields are Doubles.
 fn structure(data_type: &str) -> Option<&'static RawStructure<'static>> {
-    static RANGE: Known = LazyLock::new(|| doubles(NodeId::numeric(0, 886), &DOUBLES[..2]));
-    static THREE_D_FRAME: Known = LazyLock::new(|| doubles(NodeId::numeric(0, 18823), &DOUBLES));
+    static RANGE: LazyStructure = LazyLock::new(|| doubles(NodeId::numeric(0, 886), &DOUBLES[..2]));
+    static THREE_D_FRAME: LazyStructure =
+        LazyLock::new(|| doubles(NodeId::numeric(0, 18823), &DOUBLES));
     let node_id = OwnedNodeId::parse(data_type)?;
     if node_id.node_id()? == NodeId::numeric(0, 884) {
         RANGE.as_ref()
@@ -148,7 +149,7 @@ fn structure(data_type: &str) -> Option<&'static RawStructure<'static>> {
     }
 }
 
-type Known = LazyLock<Option<RawStructure<'static>>>;
+type LazyStructure = LazyLock<Option<RawStructure<'static>>>;
 
 fn doubles(
     encoding: NodeId<'static>,

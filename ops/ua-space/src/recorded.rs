@@ -21,10 +21,10 @@ pub(crate) use self::values::UnusableValue;
 /// Reads the NetworkMessages of a recording.
 pub(crate) struct RecordingReader {
     name: String,
-    source: Source,
+    source: RecordedSource,
 }
 
-enum Source {
+enum RecordedSource {
     Packets(Packets),
     Values(Box<RecordedValues<Box<dyn Read>>>),
 }
@@ -54,7 +54,7 @@ impl RecordingReader {
     pub(crate) fn open(file: &Path) -> Result<Self, CommandFailure> {
         let name = file.display().to_string();
         let source = match input::open(&name, false)? {
-            InputFile::Capture(capture) => Source::Packets(Packets {
+            InputFile::Capture(capture) => RecordedSource::Packets(Packets {
                 capture,
                 fragments: Fragments::default(),
                 time: 0,
@@ -62,7 +62,7 @@ impl RecordingReader {
             InputFile::Mcap(reader) => {
                 let values =
                     RecordedValues::new(reader).map_err(|error| input::failure(&name, error))?;
-                Source::Values(Box::new(values))
+                RecordedSource::Values(Box::new(values))
             }
             InputFile::Datagram(_) | InputFile::Lines(_) => {
                 return Err(CommandFailure::Data(format!(
@@ -77,22 +77,22 @@ impl RecordingReader {
     /// MCAP file.
     pub(crate) fn next(&mut self) -> Result<Option<RecordedDatagram>, CommandFailure> {
         let next = match &mut self.source {
-            Source::Packets(packets) => packets.next(),
-            Source::Values(values) => values.next(),
+            RecordedSource::Packets(packets) => packets.next(),
+            RecordedSource::Values(values) => values.next(),
         };
         next.map_err(|error| input::failure(&self.name, error))
     }
 
     /// Returns whether the recording has values only, without security.
     pub(crate) const fn has_only_values(&self) -> bool {
-        matches!(self.source, Source::Values(_))
+        matches!(self.source, RecordedSource::Values(_))
     }
 
     /// Returns the numbers of values so far that cannot be sent again, by reason.
     pub(crate) fn unusable(&self) -> BTreeMap<UnusableValue, u64> {
         match &self.source {
-            Source::Packets(_) => BTreeMap::new(),
-            Source::Values(values) => values.unusable().clone(),
+            RecordedSource::Packets(_) => BTreeMap::new(),
+            RecordedSource::Values(values) => values.unusable().clone(),
         }
     }
 }

@@ -33,14 +33,15 @@ pub(crate) fn status(arguments: &StatusArguments) -> Result<(), CommandFailure> 
         )?;
     } else if !programs.is_empty() {
         table(&programs).write(&mut out, is_coloured())?;
-        for line in programs.iter().flat_map(Program::reasons) {
+        for line in programs.iter().flat_map(ListedProgram::reasons) {
             write!(out, "{line}")?;
         }
+        write!(out, "{}", without_status(&programs).unwrap_or_default())?;
     }
     out.flush()?;
     let unready = programs
         .iter()
-        .filter(|one| one.state == State::NotReady)
+        .filter(|one| one.state == ProgramCondition::NotReady)
         .count();
     match (programs.len(), unready) {
         (0, _) => Err(CommandFailure::Unavailable(NOBODY.to_owned())),
@@ -133,7 +134,7 @@ pub(super) fn own_addresses() -> BTreeSet<IpAddr> {
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
-enum State {
+enum ProgramCondition {
     Ready,
     NotReady,
     /// It runs on this host without a status page.
@@ -144,10 +145,10 @@ enum State {
 
 /// A program in a space.
 #[derive(Debug, Serialize)]
-struct Program {
+struct ListedProgram {
     program: String,
     space: Option<u16>,
-    state: State,
+    state: ProgramCondition,
     #[serde(skip_serializing_if = "Vec::is_empty")]
     not_ready: Vec<String>,
     #[serde(skip_serializing_if = "Vec::is_empty")]
@@ -166,11 +167,11 @@ struct Program {
 
 #[derive(Serialize)]
 struct ProgramJson<'a> {
-    programs: &'a [Program],
+    programs: &'a [ListedProgram],
 }
 
-fn programs(cell: &CellOverview) -> Vec<Program> {
-    let mut all: Vec<Program> = cell.pages.iter().map(of_page).collect();
+fn programs(cell: &CellOverview) -> Vec<ListedProgram> {
+    let mut all: Vec<ListedProgram> = cell.pages.iter().map(of_page).collect();
     let mut local = BTreeSet::new();
     for process in &cell.processes {
         let has_page = cell.pages.iter().any(|page| page.pid == Some(process.pid));
@@ -202,7 +203,7 @@ fn programs(cell: &CellOverview) -> Vec<Program> {
     all
 }
 
-fn of_page(page: &StatusPage) -> Program {
+fn of_page(page: &StatusPage) -> ListedProgram {
     let has_mapping = !page.mapping.hash.is_empty();
     let mut not_ready = page.not_ready.clone();
     // A mapping that cannot run is no reason for /readyz, because the previous mapping runs.
@@ -211,13 +212,13 @@ fn of_page(page: &StatusPage) -> Program {
         waiting_for.push(format!("a mapping that can run: {stale}"));
     }
     not_ready.retain(|reason| !reason.is_empty());
-    Program {
+    ListedProgram {
         program: page.program.clone(),
         space: Some(page.space.into()),
         state: if not_ready.is_empty() {
-            State::Ready
+            ProgramCondition::Ready
         } else {
-            State::NotReady
+            ProgramCondition::NotReady
         },
         not_ready,
         waiting_for,
@@ -231,11 +232,11 @@ fn of_page(page: &StatusPage) -> Program {
     }
 }
 
-fn of_process(process: &LocalProcess, space: Option<u16>) -> Program {
-    Program {
+fn of_process(process: &LocalProcess, space: Option<u16>) -> ListedProgram {
+    ListedProgram {
         program: process.program.clone(),
         space,
-        state: State::Running,
+        state: ProgramCondition::Running,
         not_ready: Vec::new(),
         waiting_for: Vec::new(),
         version: None,
@@ -248,15 +249,18 @@ fn of_process(process: &LocalProcess, space: Option<u16>) -> Program {
     }
 }
 
-fn of_application((space, from): (u16, SocketAddr), application: &AnnouncedProgram) -> Program {
+fn of_application(
+    (space, from): (u16, SocketAddr),
+    application: &AnnouncedProgram,
+) -> ListedProgram {
     let name = match application.name.as_str() {
         "" => &application.uri,
         name => name,
     };
-    Program {
+    ListedProgram {
         program: name.to_owned(),
         space: Some(space),
-        state: State::Announced,
+        state: ProgramCondition::Announced,
         not_ready: Vec::new(),
         waiting_for: Vec::new(),
         version: None,
@@ -269,48 +273,69 @@ fn of_application((space, from): (u16, SocketAddr), application: &AnnouncedProgr
     }
 }
 
-impl Program {
+impl ListedProgram {
     const fn word(&self) -> &'static str {
         match self.state {
-            State::Ready if self.waiting_for.is_empty() => "ready",
-            State::Ready => "ready, waiting",
-            State::NotReady => "NOT READY",
-            State::Running => "running",
-            State::Announced => "announced",
+            ProgramCondition::Ready if self.waiting_for.is_empty() => "ready",
+            ProgramCondition::Ready => "ready, waiting",
+            ProgramCondition::NotReady => "NOT READY",
+            ProgramCondition::Running => "running",
+            ProgramCondition::Announced => "announced",
         }
     }
 
-    /// Returns the state, with the role of a redundant bridge.
+    /// Returns the state. A ready redundant bridge has its role, which matters more than the peers
+    /// for which it waits.
     fn state_text(&self) -> String {
-        match &self.redundancy {
-            Some(redundancy) => format!("{}, {}", self.word(), redundancy.role),
-            None => self.word().to_owned(),
+        match (&self.redundancy, self.state) {
+            (Some(redundancy), ProgramCondition::Ready) => format!("ready, {}", redundancy.role),
+            (
+                Some(redundancy),
+                ProgramCondition::NotReady
+                | ProgramCondition::Running
+                | ProgramCondition::Announced,
+            ) => {
+                format!("{}, {}", self.word(), redundancy.role)
+            }
+            (None, _) => self.word().to_owned(),
         }
     }
 
     /// Returns a line for each reason and each missing peer, and a line about the redundancy.
     fn reasons(&self) -> Vec<String> {
         let space = self.space.map(|space| format!(" (space {space})"));
-        let who = format!("{}{}", self.program, space.unwrap_or_default());
+        let program = format!("{}{}", self.program, space.unwrap_or_default());
         let not_ready = self.not_ready.iter().map(|why| format!("not ready: {why}"));
         let waiting = self
             .waiting_for
             .iter()
             .map(|peer| format!("waiting for {peer}"));
-        let redundancy = self.redundancy.iter().map(told);
-        let mut lines: Vec<String> = not_ready.chain(waiting).chain(redundancy).collect();
-        if self.state == State::Running {
-            lines.push("no status: start it with --metrics 127.0.0.1:PORT to see more".to_owned());
-        }
-        let lines = lines.into_iter();
+        let redundancy = self.redundancy.iter().map(role_and_peers);
+        let lines = not_ready.chain(waiting).chain(redundancy);
         lines
-            .map(|line| wrapped(&format!("  {}: ", harmless(&who)), &harmless(&line)))
+            .map(|line| wrapped(&format!("  {}: ", harmless(&program)), &harmless(&line)))
             .collect()
     }
 }
 
+/// Returns a line about the programs of this host without a status page.
+fn without_status(programs: &[ListedProgram]) -> Option<String> {
+    let silent = programs
+        .iter()
+        .filter(|one| one.state == ProgramCondition::Running);
+    let names: BTreeSet<&str> = silent.map(|one| one.program.as_str()).collect();
+    let names: Vec<&str> = names.into_iter().collect();
+    (!names.is_empty()).then(|| {
+        let text = format!(
+            "no status of {}: start them with --metrics 127.0.0.1:PORT to see more",
+            names.join(", ")
+        );
+        wrapped("  ", &harmless(&text))
+    })
+}
+
 /// Describes the role of a redundant bridge.
-fn told(redundancy: &RedundancyPage) -> String {
+fn role_and_peers(redundancy: &RedundancyPage) -> String {
     let RedundancyPage {
         role,
         rank,
@@ -341,10 +366,11 @@ fn told(redundancy: &RedundancyPage) -> String {
     }
     if let Some(last) = last_takeover {
         let ago = uptime(last.seconds_ago);
-        text.push_str(&format!(
-            "; became active {ago} ago, because {}",
-            last.reason
-        ));
+        let became = match role.as_str() {
+            "active" => "became active",
+            _ => "was last made active",
+        };
+        text.push_str(&format!("; {became} {ago} ago, because {}", last.reason));
     }
     if *rivals > 0 {
         text.push_str(&format!("; {rivals} times with another active bridge"));
@@ -356,7 +382,7 @@ const HEAD: [&str; 7] = [
     "PROGRAM", "SPACE", "STATE", "VERSION", "UPTIME", "MAPPING", "WHERE",
 ];
 
-fn table(programs: &[Program]) -> TextTable {
+fn table(programs: &[ListedProgram]) -> TextTable {
     let mut table = TextTable::new(HEAD.map(str::to_owned)).yielding([6, 0]);
     for one in programs {
         let dash = || "-".to_owned();
@@ -449,6 +475,8 @@ mod tests {
             reasons,
             ["  bridge-ros1 (space 1): not ready: no ROS master\n"]
         );
+        let line = without_status(&all).unwrap();
+        assert!(line.contains("no status of bridge-ros2: "), "{line}");
     }
 
     #[test]
@@ -477,16 +505,41 @@ mod tests {
         };
         let shown = of_page(&page);
         assert_eq!(shown.state_text(), "ready, active");
-        let line = shown
-            .reasons()
-            .concat()
-            .split_whitespace()
-            .collect::<Vec<_>>()
-            .join(" ");
+        let line = one_line(&shown.reasons());
         assert_eq!(
             line,
             "bridge-ros1 (space 1): active, rank 1, epoch 3; rank 2 at 10.0.0.2:4000 is standby; rank 3 at \
              10.0.0.3:4000 is lost; became active 5 s ago, because the active bridge was lost"
+        );
+    }
+
+    fn one_line(lines: &[String]) -> String {
+        let text = lines.concat();
+        text.split_whitespace().collect::<Vec<_>>().join(" ")
+    }
+
+    #[test]
+    fn a_standby_shows_its_role_while_it_waits_and_when_it_was_active() {
+        let shown = of_page(&StatusPage {
+            program: "bridge-ros1".to_owned(),
+            space: 1,
+            waiting_for: vec!["space 2".to_owned()],
+            redundancy: Some(RedundancyPage {
+                role: "standby".to_owned(),
+                last_takeover: Some(TakeoverPage {
+                    reason: "the active bridge was lost".to_owned(),
+                    seconds_ago: 9,
+                }),
+                ..RedundancyPage::default()
+            }),
+            ..StatusPage::default()
+        });
+        assert_eq!(shown.state_text(), "ready, standby");
+        let line = one_line(&shown.reasons());
+        assert!(line.contains("waiting for space 2"), "{line}");
+        assert!(
+            line.ends_with("was last made active 9 s ago, because the active bridge was lost"),
+            "{line}"
         );
     }
 

@@ -157,11 +157,11 @@ pub(crate) fn parse(body: &str) -> Option<Vec<StatusPage>> {
         .then_some(pages)
 }
 
-/// Returns the pages of programs on this host, at the addresses where they listen.
+/// Returns the status pages of programs on this host.
 pub(crate) async fn of_processes(processes: &[LocalProcess]) -> Vec<StatusPage> {
     let mut asking = JoinSet::new();
     for process in processes {
-        for address in process.listening.iter().take(MOST_PORTS) {
+        for address in process.status_at.iter().take(MOST_PORTS) {
             let (pid, at) = (process.pid, reachable(*address));
             asking.spawn(async move {
                 let server = HttpServer::parse(&format!("http://{at}")).ok()?;

@@ -15,6 +15,10 @@ pub(crate) struct LocalProcess {
     pub(crate) program: String,
     /// The addresses at which it listens for TCP connections.
     pub(crate) listening: Vec<SocketAddr>,
+    /// The addresses of `listening` that may serve its status page. A request to any other port is
+    /// an error in the log of the program.
+    #[serde(skip)]
+    pub(crate) status_at: Vec<SocketAddr>,
     /// The local addresses of its UDP sockets.
     pub(crate) udp: Vec<SocketAddr>,
     pub(crate) uptime_s: Option<u64>,
@@ -52,23 +56,28 @@ pub(crate) fn read(root: &Path) -> (Vec<LocalProcess>, Vec<UdpSocket>) {
         if !is_same_network(&proc, &folder) {
             continue;
         }
-        let of = |rows: &[Row]| -> Vec<SocketAddr> {
+        let of = |rows: &[ProcSocket]| -> Vec<SocketAddr> {
             let own = rows
                 .iter()
                 .filter(|row| owners.get(&row.inode) == Some(&pid));
             let all: BTreeSet<SocketAddr> = own.map(|row| row.local).collect();
             all.into_iter().collect()
         };
-        let listening: Vec<Row> = tcp
+        let listening: Vec<ProcSocket> = tcp
             .iter()
             .filter(|row| row.state == LISTEN)
             .cloned()
             .collect();
         let limits = fs::read_to_string(folder.join("limits")).unwrap_or_default();
+        let listening = of(&listening);
+        let words = |file: &str| fs::read(folder.join(file)).map(|bytes| split(&bytes)).ok();
+        let arguments = words("cmdline").unwrap_or_default();
+        let status = StatusPort::of(&program, &arguments, words("environ").as_deref());
         programs.push(LocalProcess {
             pid,
             program,
-            listening: of(&listening),
+            status_at: status.among(&listening),
+            listening,
             udp: of(&udp),
             uptime_s: uptime(&proc, &folder),
             open_files: fs::read_dir(folder.join("fd")).map_or(0, Iterator::count),
@@ -86,6 +95,55 @@ pub(crate) fn read(root: &Path) -> (Vec<LocalProcess>, Vec<UdpSocket>) {
         }
     });
     (programs, sockets.collect())
+}
+
+/// Returns the texts of a file of `/proc` that separates them by zero bytes.
+fn split(bytes: &[u8]) -> Vec<String> {
+    let text = String::from_utf8_lossy(bytes);
+    text.split('\0').map(str::to_owned).collect()
+}
+
+/// The port at which a program serves its status page.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum StatusPort {
+    At(u16),
+    /// The program was started without a status page.
+    None,
+    Unknown,
+}
+
+impl StatusPort {
+    /// Returns the port that the arguments name, or else the environment, which only root and the
+    /// user of the program can read.
+    fn of(program: &str, arguments: &[String], environment: Option<&[String]>) -> Self {
+        let mut words = arguments.iter().map(String::as_str);
+        let named = words.find_map(|word| word.strip_prefix("--metrics"));
+        let named = match named {
+            Some("") => words.next(),
+            Some(value) => value.strip_prefix('='),
+            None => environment
+                .unwrap_or_default()
+                .iter()
+                .find_map(|setting| setting.strip_prefix("UA_METRICS=")),
+        };
+        let address = named.map(|text| text.parse::<SocketAddr>());
+        match (address, environment) {
+            // Port 0 stands for any free port.
+            (Some(Ok(address)), _) if address.port() > 0 => Self::At(address.port()),
+            (None, Some(_)) if !WITH_OTHER_PAGES.contains(&program) => Self::None,
+            (Some(_) | None, _) => Self::Unknown,
+        }
+    }
+
+    fn among(self, listening: &[SocketAddr]) -> Vec<SocketAddr> {
+        let all = listening.iter().copied();
+        all.filter(|address| match self {
+            Self::At(port) => address.port() == port,
+            Self::None => false,
+            Self::Unknown => true,
+        })
+        .collect()
+    }
 }
 
 fn pids(proc: &Path) -> Vec<u32> {
@@ -178,22 +236,22 @@ fn most_open_files(limits: &str) -> Option<u64> {
 
 /// A row of `/proc/net/udp` or `/proc/net/tcp`.
 #[derive(Debug, Clone, PartialEq)]
-struct Row {
+struct ProcSocket {
     local: SocketAddr,
     state: u8,
     inode: u64,
     drops: u64,
 }
 
-fn sockets(proc: &Path, table: &str) -> Vec<Row> {
+fn sockets(proc: &Path, table: &str) -> Vec<ProcSocket> {
     let path = proc.join("net").join(table);
     let text = fs::read_to_string(path).unwrap_or_default();
     text.lines().skip(1).filter_map(row).collect()
 }
 
-fn row(line: &str) -> Option<Row> {
+fn row(line: &str) -> Option<ProcSocket> {
     let words: Vec<&str> = line.split_whitespace().collect();
-    Some(Row {
+    Some(ProcSocket {
         local: address(words.get(1)?)?,
         state: u8::from_str_radix(words.get(3)?, 16).ok()?,
         inode: words.get(9)?.parse().ok()?,
@@ -235,6 +293,8 @@ const PROGRAMS: [&str; 9] = [
     "ua-station",
     "ua-mes",
 ];
+/// Programs with a status page without `--metrics`: `ua-mes` has it beside its questions.
+const WITH_OTHER_PAGES: [&str; 2] = ["ua-mes", "ua-cell"];
 /// The state of a listening TCP socket.
 const LISTEN: u8 = 0x0A;
 /// Clock ticks per second in `/proc`, which is 100 on all architectures of Linux.
@@ -255,6 +315,36 @@ mod tests {
         assert_eq!(of("ua-bridge cell cell.yaml").as_deref(), Some("ua-cell"));
         assert_eq!(of("ua-bridge space list"), None);
         assert_eq!(of("/bin/bash"), None);
+    }
+
+    #[test]
+    fn only_the_port_of_the_status_page_is_requested() {
+        let words = |text: &str| -> Vec<String> { text.split(' ').map(str::to_owned).collect() };
+        let of = |line: &str, environment: Option<&str>| {
+            let environment = environment.map(words);
+            StatusPort::of("bridge-ros1", &words(line), environment.as_deref())
+        };
+        let set = Some("HOME=/root UA_METRICS=127.0.0.1:9101");
+        let nothing = Some("HOME=/root");
+        let line = "bridge-ros1 cell.yaml --metrics 127.0.0.1:9102";
+        assert_eq!(of(line, set), StatusPort::At(9102));
+        assert_eq!(
+            of("bridge-ros1 --metrics=0.0.0.0:9102", None),
+            StatusPort::At(9102)
+        );
+        assert_eq!(of("bridge-ros1", set), StatusPort::At(9101));
+        assert_eq!(of("bridge-ros1", nothing), StatusPort::None);
+        assert_eq!(of("bridge-ros1", None), StatusPort::Unknown);
+        assert_eq!(
+            of("bridge-ros1 --metrics 127.0.0.1:0", set),
+            StatusPort::Unknown
+        );
+        let mes = StatusPort::of("ua-mes", &words("ua-mes mes.yaml"), Some(&words("HOME=/")));
+        assert_eq!(mes, StatusPort::Unknown);
+        let listening = ["127.0.0.1:4840", "127.0.0.1:9102"].map(|text| text.parse().unwrap());
+        assert_eq!(StatusPort::At(9102).among(&listening), listening[1..]);
+        assert_eq!(StatusPort::None.among(&listening), []);
+        assert_eq!(StatusPort::Unknown.among(&listening), listening);
     }
 
     #[test]

@@ -29,11 +29,11 @@ pub(crate) fn tap(arguments: &TapArguments) -> Result<(), CommandFailure> {
 async fn run(arguments: &TapArguments) -> Result<(), CommandFailure> {
     let pages = pages(arguments).await?;
     let topic = topic(&arguments.target, &pages)?;
-    let mut programs: Vec<Program> = Vec::new();
+    let mut programs: Vec<TappedProgram> = Vec::new();
     for page in &pages {
         match programs.iter_mut().find(|one| one.url == page.url) {
             Some(known) => known.name = page.program.clone(),
-            None => programs.push(Program {
+            None => programs.push(TappedProgram {
                 name: page.program.clone(),
                 url: page.url.clone(),
                 server: HttpServer::parse(&page.url)?,
@@ -148,7 +148,7 @@ fn topic(target: &NamedTarget, pages: &[StatusPage]) -> Result<TopicId, CommandF
 }
 
 /// A program that is asked.
-struct Program {
+struct TappedProgram {
     name: String,
     url: String,
     server: HttpServer,
@@ -160,7 +160,7 @@ struct Program {
 }
 
 #[derive(Debug, Deserialize)]
-struct Answer {
+struct TapReply {
     next: u64,
     lost: u64,
     events: Vec<Event>,
@@ -176,7 +176,7 @@ struct Event {
     more: BTreeMap<String, Value>,
 }
 
-impl Program {
+impl TappedProgram {
     /// Returns the new events of the topic.
     async fn events(&mut self, topic: TopicId) -> Vec<(String, Event)> {
         if self.fault.is_some() {
@@ -201,7 +201,7 @@ impl Program {
                 return Vec::new();
             }
         };
-        let Ok(answer) = serde_json::from_str::<Answer>(&answer.body) else {
+        let Ok(answer) = serde_json::from_str::<TapReply>(&answer.body) else {
             let why = format!("{} at {}: not the events of a topic", self.name, self.url);
             warn(&why);
             self.fault = Some(why);

@@ -327,4 +327,4 @@ fn source_in(comment: &str) -> Option<(String, String)> {
 }
 
 /// The end of the heading of services without a type.
-pub(super) const UNTYPED: &str = "whose type nobody tells, or several differ";
+pub(super) const UNTYPED: &str = "whose type is not known, or differs";

@@ -26,7 +26,7 @@ impl OmittedTopic {
             Self::Configuration => "dynamic_reconfigure and bonds of nodelets",
             Self::Hidden => "hidden, by an underscore",
             Self::InSpace => "names of the space, which cross without a mapping",
-            Self::Untyped => "nobody tells a type, or several differ",
+            Self::Untyped => "its type is not known, or differs",
         }
     }
 

@@ -70,6 +70,8 @@ pub(crate) struct TopicValues {
 pub(crate) enum Drop {
     /// The datagram is not a NetworkMessage, or a part of it is malformed.
     Malformed,
+    /// A secured announcement without its keys.
+    Secured,
     /// The PublisherId is not a space, or the ids that make a topic are missing.
     NotInSpace,
     /// The table of topics is full.
@@ -85,10 +87,11 @@ impl Drop {
     pub(crate) const fn label(self) -> &'static str {
         match self {
             Self::Malformed => "malformed",
+            Self::Secured => "secured; `--keys FILE` reads them",
             Self::NotInSpace => "not in the space",
-            Self::Topics => "more topics than there is room for",
-            Self::Descriptions => "more descriptions than there is room for",
-            Self::Useless => "descriptions of no use",
+            Self::Topics => "more topics than the table holds",
+            Self::Descriptions => "more descriptions than the table holds",
+            Self::Useless => "descriptions that are too large, or of no topic",
         }
     }
 }
@@ -183,6 +186,9 @@ impl Book {
             return self.chunk(message, (space, from), now, each);
         }
         if message.message_type() == NetworkMessageType::Announcement {
+            if message.is_sealed() {
+                return self.count(Drop::Secured);
+            }
             match Announcement::decode(message) {
                 Ok(announcement) => self.announcement(&announcement, (space, from), now, each),
                 Err(_) => self.count(Drop::Malformed),

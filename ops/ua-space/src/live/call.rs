@@ -101,7 +101,7 @@ fn called(topic: TopicId, described: &AnnouncedDescription) -> String {
 }
 
 /// The response of a call.
-struct Answer {
+struct CallAnswer {
     status: StatusCode,
     fields: NamedValues,
 }
@@ -119,7 +119,7 @@ enum CallJson<'a> {
 
 /// The outcome of a call.
 enum Came {
-    Answer(Answer),
+    Answer(CallAnswer),
     Lost(String),
     Refused(String),
 }
@@ -199,7 +199,7 @@ impl Asking<'_> {
             self.arguments.wait,
         );
         CommandFailure::Unavailable(format!(
-            "nobody in {group} offers the call {target}, asked for {wait} s\n  = help: {help}"
+            "no program in {group} offers the call {target}, asked for {wait} s\n  = help: {help}"
         ))
     }
 
@@ -210,7 +210,7 @@ impl Asking<'_> {
         (topic, described): (TopicId, &AnnouncedDescription),
         request: &[u8],
         places: Option<&RunTopics>,
-    ) -> Result<Answer, CommandFailure> {
+    ) -> Result<CallAnswer, CommandFailure> {
         let mut halts_at = places;
         let mut came = None;
         self.begin((topic, described), request, self.timeout())?;
@@ -336,7 +336,7 @@ impl Asking<'_> {
     fn tell_answer(
         &self,
         (topic, described): (TopicId, &AnnouncedDescription),
-        answer: &Answer,
+        answer: &CallAnswer,
     ) -> Result<(), CommandFailure> {
         let mut out = io::stdout().lock();
         if self.arguments.json {
@@ -495,7 +495,7 @@ fn hear(
     Some(match outcome {
         ActionOutcome::Answered { status, fields } => {
             match plain::response(fields, described.fields()) {
-                Ok(fields) => Came::Answer(Answer { status, fields }),
+                Ok(fields) => Came::Answer(CallAnswer { status, fields }),
                 Err(error) => Came::Lost(format!("an answer that cannot be read: {error}")),
             }
         }
@@ -507,7 +507,7 @@ fn hear(
 /// Returns an error if the response reports a failure.
 fn refused(
     (topic, described): (TopicId, &AnnouncedDescription),
-    answer: &Answer,
+    answer: &CallAnswer,
 ) -> Result<(), CommandFailure> {
     let bad = answer.status.0 & BAD != 0;
     let no = answer
@@ -528,18 +528,26 @@ fn refused(
             status::symbol(code).map_or_else(|| format!("{:#010x}", code.0), str::to_owned);
         why = format!("{symbol}: {why}");
     }
-    let takes = described.call().map_or(&[][..], |call| &call.request);
-    let help = if why.contains("BadInvalidArgument") && !takes.is_empty() {
-        format!("\n  = help: this call takes {}", described::list(takes))
-    } else {
-        String::new()
-    };
+    let help = remedy(described, &why).map(|help| format!("\n  = help: {help}"));
+    let help = help.unwrap_or_default();
     let name = called(topic, described);
     Err(CommandFailure::Failed(format!(
         "{name}: {}{}",
         harmless(&why),
         harmless(&help).replace("\\u{a}", "\n")
     )))
+}
+
+/// Returns the next step after a refused call.
+fn remedy(described: &AnnouncedDescription, why: &str) -> Option<String> {
+    let takes = described.call().map_or(&[][..], |call| &call.request);
+    if why.contains("BadInvalidArgument") && !takes.is_empty() {
+        return Some(format!("this call takes {}", described::list(takes)));
+    }
+    let skill = described.name.strip_suffix(".Start")?;
+    why.contains("in the state Halted").then(|| {
+        format!("reset it first, `ua-space call {skill}.Reset`; `ua-space skills start` does both")
+    })
 }
 
 /// The bit of a StatusCode that marks the severity Bad.
@@ -550,3 +558,29 @@ const SHOWN: usize = 20;
 const LOOK: Duration = Duration::from_millis(100);
 /// Time limit of an acknowledgement.
 const ACKNOWLEDGE: Duration = Duration::from_millis(500);
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_refused_start_of_a_halted_skill_names_its_reset() {
+        let described = |name: &str| AnnouncedDescription {
+            name: name.to_owned(),
+            description: String::new(),
+            ros_topics: Vec::new(),
+            command: false,
+            what: described::DescribedKind::Value(Vec::new()),
+        };
+        let why = "BadInvalidState: Start is not possible in the state Halted";
+        let help = remedy(&described("handling.Place.Start"), why);
+        let help = help.expect("there is a next step");
+        assert!(
+            help.contains("`ua-space call handling.Place.Reset`"),
+            "{help}"
+        );
+        assert_eq!(remedy(&described("handling.Place.Halt"), why), None);
+        let running = "BadInvalidState: Start is not possible in the state Running";
+        assert_eq!(remedy(&described("handling.Place.Start"), running), None);
+    }
+}

@@ -51,12 +51,12 @@ pub(super) struct TopicChannel {
     pub(super) schema: String,
     /// Further information for users.
     pub(super) metadata: BTreeMap<String, String>,
-    form: Form,
+    form: ChannelForm,
     described: Option<Arc<AnnouncedDescription>>,
 }
 
 #[derive(Debug)]
-enum Form {
+enum ChannelForm {
     /// The fields form a ROS message.
     Ros(Box<MessagePlan>),
     /// The only field is the ROS message as on the wire.
@@ -159,7 +159,7 @@ impl TopicChannels {
             schema_encoding: "ros2msg",
             schema: message.definition().to_owned(),
             metadata: BTreeMap::new(),
-            form: Form::Bytes,
+            form: ChannelForm::Bytes,
             described: None,
         }))
     }
@@ -213,7 +213,7 @@ impl TopicChannels {
                 schema_encoding: "jsonschema",
                 schema: schema(described.as_deref()).to_string(),
                 metadata,
-                form: Form::Json,
+                form: ChannelForm::Json,
                 described,
             },
         }
@@ -228,8 +228,10 @@ impl TopicChannels {
             false => self.ros2.find(&name).ok(),
         };
         let form = found.as_ref().and_then(|message| match bytes {
-            true => Some(Form::Bytes),
-            false => ros_plan(message, &name, described).map(|plan| Form::Ros(Box::new(plan))),
+            true => Some(ChannelForm::Bytes),
+            false => {
+                ros_plan(message, &name, described).map(|plan| ChannelForm::Ros(Box::new(plan)))
+            }
         });
         match (found, form) {
             (Some(message), Some(form)) => Some(Ros { message, form }),
@@ -292,7 +294,7 @@ impl Slot {
 
 struct Ros {
     message: Arc<MessageType>,
-    form: Form,
+    form: ChannelForm,
 }
 
 impl TopicChannel {
@@ -312,11 +314,11 @@ impl TopicChannel {
     ) -> Result<(), ChannelMismatch> {
         let unfit = |_| ChannelMismatch::Mismatch;
         match &self.form {
-            Form::Ros(plan) => {
+            ChannelForm::Ros(plan) => {
                 let fields = message.fields().map_err(unfit)?;
                 decode_fields(plan, fields, out).map_err(|_| ChannelMismatch::Mismatch)
             }
-            Form::Bytes => {
+            ChannelForm::Bytes => {
                 let mut fields = message.fields().map_err(unfit)?;
                 match (fields.next(), fields.next()) {
                     (Some(Ok(Variant::Scalar(Scalar::ByteString(Some(bytes))))), None) => {
@@ -326,7 +328,7 @@ impl TopicChannel {
                     _ => Err(ChannelMismatch::Mismatch),
                 }
             }
-            Form::Json => {
+            ChannelForm::Json => {
                 let mut named =
                     plain::message(message, self.described.as_deref()).map_err(unfit)?;
                 if message.kind == MessageKind::DeltaFrame {

@@ -273,7 +273,7 @@ impl Printing<'_> {
                 CommandFailure::Data(format!("{topic}: nothing that came can be read: {why}"))
             }
             None if secured => CommandFailure::Data(format!(
-                "{topic} is secured, and cannot be read without its keys"
+                "{topic} is secured, and cannot be read without its keys: give them with --keys FILE"
             )),
             None => unheard(live, topic, self.arguments.seconds.unwrap_or_default()),
         }

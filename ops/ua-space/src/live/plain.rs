@@ -160,7 +160,7 @@ pub(crate) fn name(fields: &[AnnouncedField], index: usize) -> String {
 const UNNAMED: &str = "field_";
 
 fn raw(payload: &[u8], fields: &[AnnouncedField]) -> Result<NamedValues, DecodeError> {
-    const UNKNOWN: DecodeError = DecodeError::Misread("RawData, whose fields nobody announced");
+    const UNKNOWN: DecodeError = DecodeError::Misread("RawData, whose fields are not announced");
     if fields.is_empty() {
         return Err(UNKNOWN);
     }

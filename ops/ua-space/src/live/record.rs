@@ -48,7 +48,7 @@ pub(crate) fn record(arguments: &RecordArguments) -> Result<(), CommandFailure> 
         }
         let mut recording = Recording::new(format, &arguments.file, &live)?;
         let start = live.utc(live.now());
-        if let Form::Values(values) = &mut recording.form {
+        if let RecordingForm::Values(values) = &mut recording.form {
             for model in &models {
                 values.add_model(model, start);
             }
@@ -104,7 +104,7 @@ impl Format {
 
 /// A recording in progress.
 struct Recording {
-    form: Form,
+    form: RecordingForm,
     /// Messages or values in the recording.
     messages: u64,
     /// Bytes of the received messages.
@@ -117,7 +117,7 @@ struct Recording {
     is_over: bool,
 }
 
-enum Form {
+enum RecordingForm {
     Packets(Box<Packets>),
     Values(Box<ValueRecorder>),
 }
@@ -128,13 +128,13 @@ impl Recording {
         let form = match format {
             Format::PcapNg => {
                 let link = link(live);
-                Form::Packets(Box::new(Packets::new(
+                RecordingForm::Packets(Box::new(Packets::new(
                     sink,
                     link,
                     &live.carrier.interface(),
                 )))
             }
-            Format::Mcap => Form::Values(Box::new(ValueRecorder::new(sink))),
+            Format::Mcap => RecordingForm::Values(Box::new(ValueRecorder::new(sink))),
         };
         Ok(Self {
             form,
@@ -194,8 +194,8 @@ impl Recording {
 
     fn awaits_descriptions(&self) -> bool {
         match &self.form {
-            Form::Packets(_) => false,
-            Form::Values(values) => values.is_waiting(),
+            RecordingForm::Packets(_) => false,
+            RecordingForm::Values(values) => values.is_waiting(),
         }
     }
 
@@ -216,14 +216,14 @@ impl Recording {
         let (mut added, mut dropped) = (0, 0);
         let mut fault = None;
         match &mut self.form {
-            Form::Packets(packets) => {
+            RecordingForm::Packets(packets) => {
                 match packets.add(time, from, datagram)? {
                     true => added += 1,
                     false => dropped += 1,
                 }
                 take(read, (datagram, from), now, &mut |_, _| Go::On);
             }
-            Form::Values(values) => {
+            RecordingForm::Values(values) => {
                 let mut each = |news: DatagramContent<'_>, now| {
                     let recorded = match &news {
                         DatagramContent::Sample(sample)
@@ -266,8 +266,8 @@ impl Recording {
     /// Hands over the messages so far, and shows the progress on a terminal.
     fn flush(&mut self, now: Duration) -> Result<(), CommandFailure> {
         match &mut self.form {
-            Form::Packets(packets) => packets.flush()?,
-            Form::Values(values) => {
+            RecordingForm::Packets(packets) => packets.flush()?,
+            RecordingForm::Values(values) => {
                 values.give_up_waiting(now);
                 values.flush()?;
             }
@@ -295,8 +295,8 @@ impl Recording {
     fn finish(self, time: i128) -> Result<u64, CommandFailure> {
         let dropped = self.slow + own_drops().saturating_sub(self.drops_before);
         match self.form {
-            Form::Packets(packets) => packets.finish(time, (self.messages, dropped)),
-            Form::Values(values) => values.finish(),
+            RecordingForm::Packets(packets) => packets.finish(time, (self.messages, dropped)),
+            RecordingForm::Values(values) => values.finish(),
         }
     }
 }
@@ -323,7 +323,7 @@ struct Totals {
 impl Totals {
     fn print(&self, size: u64, arguments: &RecordArguments) -> Result<(), CommandFailure> {
         #[derive(Serialize)]
-        struct Shown<'a> {
+        struct RecordSummary<'a> {
             file: String,
             bytes: u64,
             #[serde(flatten)]
@@ -332,7 +332,7 @@ impl Totals {
         let file = harmless(&arguments.file.display().to_string());
         let mut out = io::stdout().lock();
         if arguments.json {
-            let shown = Shown {
+            let shown = RecordSummary {
                 file,
                 bytes: size,
                 totals: self,

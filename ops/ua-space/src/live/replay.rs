@@ -301,7 +301,7 @@ impl<'a> Replaying<'a> {
     /// Prints the numbers of messages.
     fn print(&self, now: Duration, arguments: &ReplayArguments) -> Result<(), CommandFailure> {
         #[derive(Serialize)]
-        struct Shown<'a> {
+        struct ReplaySummary<'a> {
             file: &'a str,
             sent: u64,
             seconds: f64,
@@ -316,7 +316,7 @@ impl<'a> Replaying<'a> {
             let left_out = left_out.map(|(why, count)| (why.label(), *count));
             let unusable = self.contents.unusable.iter();
             let unusable = unusable.map(|(why, count)| (why.label(), *count));
-            let shown = Shown {
+            let shown = ReplaySummary {
                 file: &file,
                 sent: self.sent,
                 seconds,

@@ -13,12 +13,12 @@ pub(crate) struct StructureFields(Vec<StructurePart>);
 #[derive(Debug, Clone, PartialEq, Eq)]
 struct StructurePart {
     name: String,
-    kind: Kind,
+    kind: ReadFieldKind,
     is_array: bool,
 }
 
 #[derive(Debug, Clone, PartialEq, Eq)]
-enum Kind {
+enum ReadFieldKind {
     Builtin(BuiltinType),
     Structure(StructureFields),
 }
@@ -50,8 +50,12 @@ impl StructureFields {
             Some(StructurePart {
                 name: field.name.unwrap_or_default().to_owned(),
                 kind: match builtin(&field) {
-                    Some(builtin) => Kind::Builtin(builtin),
-                    None => Kind::Structure(Self::within(schema, field.data_type, (depth, room))?),
+                    Some(builtin) => ReadFieldKind::Builtin(builtin),
+                    None => ReadFieldKind::Structure(Self::within(
+                        schema,
+                        field.data_type,
+                        (depth, room),
+                    )?),
                 },
                 is_array: match field.value_rank {
                     -1 => false,
@@ -67,8 +71,8 @@ impl StructureFields {
     pub(super) fn weight(&self) -> usize {
         let of = |part: &StructurePart| {
             let inner = match &part.kind {
-                Kind::Builtin(_) => 0,
-                Kind::Structure(structure) => structure.weight(),
+                ReadFieldKind::Builtin(_) => 0,
+                ReadFieldKind::Structure(structure) => structure.weight(),
             };
             size_of::<StructurePart>() + part.name.len() + inner
         };
@@ -98,12 +102,14 @@ impl StructureFields {
         let mut shown = Map::new();
         for part in &self.0 {
             let value = match (&part.kind, part.is_array) {
-                (Kind::Builtin(builtin), false) => plain::scalar(body.scalar(*builtin)?)?,
-                (Kind::Builtin(builtin), true) => plain::elements(body.array(*builtin)?)?,
-                (Kind::Structure(structure), false) => structure.read(body, room)?,
-                (Kind::Structure(structure), true) => (0..body.length()?.unwrap_or_default())
-                    .map(|_| structure.read(body, room))
-                    .collect::<Result<_, _>>()?,
+                (ReadFieldKind::Builtin(builtin), false) => plain::scalar(body.scalar(*builtin)?)?,
+                (ReadFieldKind::Builtin(builtin), true) => plain::elements(body.array(*builtin)?)?,
+                (ReadFieldKind::Structure(structure), false) => structure.read(body, room)?,
+                (ReadFieldKind::Structure(structure), true) => {
+                    (0..body.length()?.unwrap_or_default())
+                        .map(|_| structure.read(body, room))
+                        .collect::<Result<_, _>>()?
+                }
             };
             shown.insert(part.name.clone(), value);
         }

@@ -187,19 +187,19 @@ fn write_file(path: &Path, bytes: &[u8]) -> Result<(), CommandFailure> {
 
 /// The measurements of a program.
 #[derive(Debug, Serialize)]
-struct Program {
+struct MeasuredProgram {
     program: String,
     space: u8,
     hops: BTreeMap<String, HopPage>,
 }
 
 /// Returns the measurements of a program in each space that it serves.
-async fn measured(url: &str) -> Result<Vec<Program>, CommandFailure> {
+async fn measured(url: &str) -> Result<Vec<MeasuredProgram>, CommandFailure> {
     let pages = page_of_url(url).await?;
     if pages.iter().any(|page| page.hops.is_empty()) {
         return Err(CommandFailure::Data(format!("{url}/status has no hops")));
     }
-    let programs = pages.into_iter().map(|page| Program {
+    let programs = pages.into_iter().map(|page| MeasuredProgram {
         program: page.program,
         space: page.space,
         hops: page.hops,
@@ -209,7 +209,7 @@ async fn measured(url: &str) -> Result<Vec<Program>, CommandFailure> {
 
 /// A hop of a topic.
 #[derive(Debug, Serialize)]
-struct Row {
+struct HopRow {
     topic: String,
     #[serde(skip_serializing_if = "Option::is_none")]
     name: Option<String>,
@@ -220,8 +220,8 @@ struct Row {
 
 #[derive(Serialize)]
 struct SpanJson<'a> {
-    programs: &'a [Program],
-    topics: &'a [Row],
+    programs: &'a [MeasuredProgram],
+    topics: &'a [HopRow],
     #[serde(skip_serializing_if = "Vec::is_empty")]
     clocks: Vec<ShownClock>,
 }
@@ -313,7 +313,7 @@ impl Delays {
         Some(times)
     }
 
-    fn rows(&self) -> Vec<Row> {
+    fn rows(&self) -> Vec<HopRow> {
         let hops = self.topics.iter().flat_map(|(topic, delays)| {
             [
                 (*topic, ORIGIN, &delays.origin),
@@ -321,7 +321,7 @@ impl Delays {
             ]
         });
         hops.filter_map(|(topic, hop, window)| {
-            Some(Row {
+            Some(HopRow {
                 topic: topic.to_string(),
                 name: None,
                 hop,
@@ -375,8 +375,8 @@ fn in_micros(nanos: u64) -> f64 {
 
 fn print(
     arguments: &Trace,
-    programs: &[Program],
-    topics: &[Row],
+    programs: &[MeasuredProgram],
+    topics: &[HopRow],
     clocks: &[(IpAddr, Estimate)],
 ) -> Result<(), CommandFailure> {
     let mut out = io::stdout().lock();

@@ -218,7 +218,7 @@ fn no_writer(arguments: &Write) -> CommandFailure {
 
 /// The outcome of a written value.
 #[derive(Debug, Clone, PartialEq, Eq)]
-enum Written {
+enum WriteOutcome {
     /// Confirmed, as far as the mapping asks for it.
     Arrived,
     /// The value was not sent, for this reason.
@@ -252,16 +252,16 @@ impl Tally {
     fn take(
         &mut self,
         (topic, name, by): (TopicId, &str, &str),
-        written: &Written,
+        written: &WriteOutcome,
         shows: bool,
     ) -> Result<(), CommandFailure> {
         self.written += 1;
         let (outcome, reason) = match written {
-            Written::Arrived => ("written", None),
-            Written::Refused(why) => ("refused", Some(why.as_str())),
-            Written::Unknown(why) => ("unknown", Some(why.as_str())),
+            WriteOutcome::Arrived => ("written", None),
+            WriteOutcome::Refused(why) => ("refused", Some(why.as_str())),
+            WriteOutcome::Unknown(why) => ("unknown", Some(why.as_str())),
         };
-        if let Written::Unknown(why) = written {
+        if let WriteOutcome::Unknown(why) = written {
             self.unknown += 1;
             self.why.clone_from(why);
         }
@@ -278,7 +278,7 @@ impl Tally {
             out.flush()?;
         }
         match written {
-            Written::Refused(why) => {
+            WriteOutcome::Refused(why) => {
                 let (label, unknown) = (label(topic, name), self.unknown);
                 // The earlier values may have arrived, so the command is more than refused.
                 Err(match unknown {
@@ -288,7 +288,7 @@ impl Tally {
                     )),
                 })
             }
-            Written::Arrived | Written::Unknown(_) => Ok(()),
+            WriteOutcome::Arrived | WriteOutcome::Unknown(_) => Ok(()),
         }
     }
 
@@ -373,9 +373,9 @@ mod tests {
     fn an_unknown_outcome_is_an_error_and_a_refusal_ends_the_command() {
         let at = ("ua_0_2_30".parse().unwrap(), "Setpoint", "ua-server");
         let mut tally = Tally::default();
-        tally.take(at, &Written::Arrived, false).unwrap();
+        tally.take(at, &WriteOutcome::Arrived, false).unwrap();
         tally.end(at, true).unwrap();
-        let unknown = Written::Unknown("BadTimeout".to_owned());
+        let unknown = WriteOutcome::Unknown("BadTimeout".to_owned());
         tally.take(at, &unknown, false).unwrap();
         let wrong = tally.end(at, true).unwrap_err();
         assert!(matches!(wrong, CommandFailure::Unavailable(_)), "{wrong:?}");
@@ -385,7 +385,7 @@ mod tests {
                 .contains("1 of 2 values: BadTimeout; whether"),
             "{wrong}"
         );
-        let refused = Written::Refused("BadUserAccessDenied".to_owned());
+        let refused = WriteOutcome::Refused("BadUserAccessDenied".to_owned());
         let wrong = tally.take(at, &refused, false).unwrap_err();
         assert!(matches!(wrong, CommandFailure::Unavailable(_)), "{wrong:?}");
         assert!(

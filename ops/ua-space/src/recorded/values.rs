@@ -70,7 +70,7 @@ struct Rebuilt {
 
 struct Topic {
     id: TopicId,
-    form: Form,
+    form: RecordedForm,
     /// The announcement, until it is read.
     announcement: Option<Vec<u8>>,
     /// Whether the writer numbers its messages.
@@ -78,7 +78,7 @@ struct Topic {
 }
 
 /// The conversion of a message to the fields of a value.
-enum Form {
+enum RecordedForm {
     Ros(Box<MessagePlan>),
     /// The only field is the message.
     Bytes,
@@ -166,8 +166,8 @@ impl Topic {
         let announcement = bytes.ok_or(UnusableValue::Undescribed)?;
         let described = described(id, &announcement).ok_or(UnusableValue::Undescribed)?;
         let form = match channel.encoding.as_str() {
-            "json" => Form::Json(described),
-            "cdr" | "ros1" if described.is_bytes() => Form::Bytes,
+            "json" => RecordedForm::Json(described),
+            "cdr" | "ros1" if described.is_bytes() => RecordedForm::Bytes,
             "cdr" => ros(channel, &described).ok_or(UnusableValue::Mismatch)?,
             _ => return Err(UnusableValue::Foreign),
         };
@@ -205,19 +205,19 @@ impl Topic {
         let mut writer =
             NetworkMessageEncoder::new(&mut datagram, &network, Some(&ids)).map_err(mismatch)?;
         match &self.form {
-            Form::Ros(plan) => {
+            RecordedForm::Ros(plan) => {
                 let mut frame = writer.key_frame(&header).map_err(mismatch)?;
                 encode_fields(plan, &message.data, namespace, &mut frame)
                     .map_err(|_| UnusableValue::Mismatch)?;
                 frame.finish().map_err(mismatch)?;
             }
-            Form::Bytes => {
+            RecordedForm::Bytes => {
                 let mut frame = writer.key_frame(&header).map_err(mismatch)?;
                 let bytes = Scalar::ByteString(Some(&message.data));
                 frame.scalar(bytes).map_err(mismatch)?;
                 frame.finish().map_err(mismatch)?;
             }
-            Form::Json(described) => {
+            RecordedForm::Json(described) => {
                 json::write(&message.data, described.fields(), (&header, &mut writer))?;
             }
         }
@@ -247,12 +247,12 @@ fn described(topic: TopicId, announcement: &[u8]) -> Option<AnnouncedDescription
 }
 
 /// Returns the conversion of the messages of a channel, by the definition in the file.
-fn ros(channel: &McapChannel, described: &AnnouncedDescription) -> Option<Form> {
+fn ros(channel: &McapChannel, described: &AnnouncedDescription) -> Option<RecordedForm> {
     let name: TypeName = described.ros_type()?.parse().ok()?;
     let definition = str::from_utf8(&channel.schema.data).ok()?;
     let registry = TypeRegistry::empty(Dialect::Ros2);
     let (found, _) = registry.read_ros1_definition(&name, definition).ok()?;
-    ros_plan(&found, &name, described).map(|plan| Form::Ros(Box::new(plan)))
+    ros_plan(&found, &name, described).map(|plan| RecordedForm::Ros(Box::new(plan)))
 }
 
 /// Returns a NetworkMessage with a single value in chunks.

@@ -30,7 +30,7 @@ pub(crate) fn survey(file: &str) -> Result<SurveyedNodes, CommandFailure> {
 
 /// The fault of a NodeSet, with its byte offset.
 #[derive(Debug)]
-struct Fault {
+struct SurveyFault {
     at: usize,
     what: UnreadNodeSet,
 }
@@ -84,14 +84,14 @@ enum UnreadNodeSet {
     ValueRank(String),
 }
 
-fn parse(xml: &str, place: &str) -> Result<SurveyedNodes, Fault> {
+fn parse(xml: &str, place: &str) -> Result<SurveyedNodes, SurveyFault> {
     let mut reader = Reader::from_str(xml.trim_start_matches('\u{feff}'));
     reader.config_mut().expand_empty_elements = true;
     reader.config_mut().trim_text(true);
     let mut set = NodeSet::default();
     loop {
         let at = usize::try_from(reader.buffer_position()).unwrap_or(usize::MAX);
-        let fault = |what: UnreadNodeSet| Fault { at, what };
+        let fault = |what: UnreadNodeSet| SurveyFault { at, what };
         let event = reader.read_event();
         match event.map_err(|error| fault(UnreadNodeSet::Xml(error)))? {
             Event::Start(element) => set.open(&element).map_err(fault)?,
@@ -115,7 +115,7 @@ fn parse(xml: &str, place: &str) -> Result<SurveyedNodes, Fault> {
             Event::Empty(_) | Event::Comment(_) | Event::Decl(_) | Event::PI(_) => {}
         }
     }
-    set.nodes(place).map_err(|what| Fault {
+    set.nodes(place).map_err(|what| SurveyFault {
         at: xml.len(),
         what,
     })
@@ -131,9 +131,9 @@ struct NodeSet {
     attributes: HashMap<String, String>,
     uris: Vec<String>,
     aliases: HashMap<String, String>,
-    node: Option<Node>,
-    variables: Vec<(NodeIdText, Node)>,
-    objects: HashMap<NodeIdText, Node>,
+    node: Option<NodeSetEntry>,
+    variables: Vec<(NodeIdText, NodeSetEntry)>,
+    objects: HashMap<NodeIdText, NodeSetEntry>,
     /// Types and Methods; nodes below them are declarations, not values.
     types: HashSet<NodeIdText>,
     /// Supertypes of DataTypes.
@@ -143,7 +143,7 @@ struct NodeSet {
 
 /// A node with its attributes and references.
 #[derive(Clone, Debug, Default)]
-struct Node {
+struct NodeSetEntry {
     attributes: HashMap<String, String>,
     parent: Option<String>,
     references: Vec<(String, bool, String)>,
@@ -172,7 +172,7 @@ impl NodeSet {
             }
             0 => self.seen = true,
             1 if name.starts_with("UA") => {
-                self.node = Some(Node {
+                self.node = Some(NodeSetEntry {
                     parent: self.attributes.get("ParentNodeId").cloned(),
                     attributes: std::mem::take(&mut self.attributes),
                     references: Vec::new(),
@@ -218,7 +218,7 @@ impl NodeSet {
         Ok(())
     }
 
-    fn keep(&mut self, kind: &str, mut node: Node) -> Result<(), UnreadNodeSet> {
+    fn keep(&mut self, kind: &str, mut node: NodeSetEntry) -> Result<(), UnreadNodeSet> {
         let text = node.attributes.get("NodeId").map(String::as_str);
         let id = self.resolve(text.unwrap_or_default())?;
         let references = std::mem::take(&mut node.references);
@@ -317,7 +317,7 @@ impl NodeSet {
         Ok(false)
     }
 
-    fn value(&self, node: &Node) -> Result<Option<(BuiltinType, bool)>, UnreadNodeSet> {
+    fn value(&self, node: &NodeSetEntry) -> Result<Option<(BuiltinType, bool)>, UnreadNodeSet> {
         // The defaults are BaseDataType and a scalar (UANodeSet.xsd).
         let rank = node.attributes.get("ValueRank");
         let rank = rank
@@ -352,7 +352,7 @@ impl NodeSet {
 }
 
 /// Returns the BrowseName without its namespace index.
-fn browse_name(node: &Node) -> String {
+fn browse_name(node: &NodeSetEntry) -> String {
     let text = node.attributes.get("BrowseName").map_or("", String::as_str);
     let name = text
         .split_once(':')

@@ -33,7 +33,7 @@ pub(crate) async fn survey(domain: u16, wait: Duration) -> Result<LiveSpace, Com
     }
     joined.leave(()).await;
     if graph.participants().is_empty() {
-        let what = format!("nobody was discovered in DDS domain {domain} within {wait:?}");
+        let what = format!("no participant was discovered in DDS domain {domain} within {wait:?}");
         return Err(away(what, HELP));
     }
     let services = services.into_iter().take(MOST).map(|(name, mut types)| {

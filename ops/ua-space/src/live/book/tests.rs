@@ -4,7 +4,8 @@ use uadp::discovery::{
 };
 use uadp::{
     BuiltinType, ChunkEncoder, DataSetHeader, GroupHeader, LocalizedText, NetworkMessageEncoder,
-    QualifiedName, Scalar, SecurityHeader, StatusCode, Variant,
+    QualifiedName, Scalar, Sealer, SecurityHeader, SecurityMode, SecurityPolicy, StatusCode,
+    TokenKeys, Variant,
 };
 
 use super::*;
@@ -321,4 +322,19 @@ fn a_flood_fills_no_more_than_there_is_room_for_and_is_counted() {
     assert_eq!(dropped[&Drop::Malformed], 4);
     take(&mut book, &value((2, 7, 10), Scalar::Byte(2)), 1);
     assert_eq!(book.heard(topic("ua_2_7_10")).unwrap().values, 2);
+}
+
+#[test]
+fn a_secured_announcement_without_keys_is_no_malformed_message() {
+    let policy = SecurityPolicy::PubSubAes256Ctr;
+    let keys = TokenKeys::from_bytes(policy, &vec![7; policy.key_data_length()]).unwrap();
+    let mut sealer = Sealer::new(SecurityMode::SignAndEncrypt);
+    sealer.update_keys(1, [keys]).unwrap();
+    let seal = sealer.seal([1, 2, 3, 4]).unwrap();
+    let mut sealed = Vec::new();
+    let plain = describes(101, "ua_0_7_101 gripper", StatusCode::GOOD);
+    seal.secure(&plain, &mut sealed).unwrap();
+    let mut book = Book::new();
+    take(&mut book, &sealed, 1);
+    assert_eq!(book.dropped().collect::<Vec<_>>(), [(Drop::Secured, 1)]);
 }

@@ -86,7 +86,7 @@ impl GoalUpdate {
 }
 
 /// A followed goal.
-struct Goal {
+struct FollowedGoal {
     parts: ActionParts,
     /// The goal id as values show it.
     id: String,
@@ -165,7 +165,7 @@ impl Asking<'_> {
         let [result, cancel] = self.parts_of(topic, parts).await?;
         let bytes = new_id();
         let request = behind(bytes, &block).ok_or_else(|| usage("too many fields".to_owned()))?;
-        let waiting = |waits| Goal {
+        let waiting = |waits| FollowedGoal {
             parts,
             id: BASE64.encode(bytes),
             bytes,
@@ -197,7 +197,7 @@ impl Asking<'_> {
         if answer.fields.get("accepted") != Some(&true.into()) {
             let why = answer.fields.text("message").unwrap_or_default();
             let why = if why.is_empty() {
-                "no reason is told"
+                "no reason is given"
             } else {
                 why
             };
@@ -258,7 +258,7 @@ impl Asking<'_> {
             [Some(result), Some(cancel)] => Ok([result, cancel]),
             _ if ended == ListenEnd::Interrupted => Err(CommandFailure::Interrupted),
             _ => Err(CommandFailure::Unavailable(format!(
-                "{goal} sends goals, and nobody offers {} and {}, which belong to it",
+                "{goal} sends goals, and no program offers {} and {}, which belong to it",
                 parts.result, parts.cancel
             ))),
         }
@@ -270,7 +270,7 @@ impl Asking<'_> {
     /// The wait was interrupted or timed out, or the end of the goal is unknown.
     async fn follow_goal(
         &mut self,
-        mut goal: Goal,
+        mut goal: FollowedGoal,
     ) -> Result<Result<(), CommandFailure>, CommandFailure> {
         let limit = until(self.live.now(), self.arguments.run_timeout);
         loop {
@@ -325,7 +325,7 @@ impl Asking<'_> {
     }
 
     /// Requests the cancellation of the goal. The goal is followed to its end for any response.
-    fn cancel_goal(&mut self, goal: &mut Goal) -> Result<(), CommandFailure> {
+    fn cancel_goal(&mut self, goal: &mut FollowedGoal) -> Result<(), CommandFailure> {
         let request = cancel_request(&behind_nothing(goal.bytes));
         let cancel = Arc::clone(&goal.cancel);
         let call = self.begin((goal.parts.cancel, &cancel), &request, CANCEL_WITHIN)?;
@@ -345,7 +345,7 @@ impl Asking<'_> {
     /// Listens for a moment to the feedback and result of a goal.
     async fn hear_goal(
         &mut self,
-        goal: &mut Goal,
+        goal: &mut FollowedGoal,
     ) -> Result<(ListenEnd, Vec<GoalUpdate>, Option<Came>), CommandFailure> {
         self.transmit()?;
         let Self {

@@ -33,7 +33,7 @@ pub(super) struct ValueRecorder {
     /// Bytes that are not handed over to the disk.
     part: Vec<u8>,
     /// Values that wait for the description of their topic.
-    waiting: VecDeque<Waiting>,
+    waiting: VecDeque<UndescribedSample>,
     /// The newest announcement of each topic, as a NetworkMessage.
     announcements: LatestAnnouncements,
     /// The size of all waiting values.
@@ -53,7 +53,7 @@ pub(super) enum RecordOutcome {
 }
 
 /// A value that waits for the description of its topic.
-struct Waiting {
+struct UndescribedSample {
     topic: TopicId,
     /// The time of arrival, since the group was joined.
     since: Duration,
@@ -231,7 +231,7 @@ impl ValueRecorder {
             return self.leave_out(ChannelMismatch::Undescribed);
         };
         self.weight += datagram.len();
-        self.waiting.push_back(Waiting {
+        self.waiting.push_back(UndescribedSample {
             topic: sample.topic,
             since: now,
             times,

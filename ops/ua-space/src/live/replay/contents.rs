@@ -55,7 +55,9 @@ impl ReplayOmission {
             Self::SentBefore => "large descriptions, which are sent before the values",
             Self::Secured => "secured messages, which need --keys",
             Self::OtherSpace => "messages of other spaces than --space",
-            Self::Foreign => "datagrams that are not of the space",
+            Self::Foreign => {
+                "heartbeats of redundant bridges, and datagrams without a name of the space"
+            }
             Self::Malformed => "malformed messages",
         }
     }

@@ -17,11 +17,11 @@ pub(super) struct ViewerHub {
     /// The name of the server for users.
     name: String,
     pub(super) assets: Assets,
-    state: Mutex<State>,
+    state: Mutex<ViewerHubState>,
 }
 
 #[derive(Debug, Default)]
-struct State {
+struct ViewerHubState {
     /// The channels of each topic, as they are advertised: one for each description of the topic.
     /// The models of robots have no topic.
     offered: BTreeMap<Option<TopicId>, Vec<Offered>>,
@@ -295,7 +295,7 @@ impl ViewerHub {
         }
     }
 
-    fn state(&self) -> MutexGuard<'_, State> {
+    fn state(&self) -> MutexGuard<'_, ViewerHubState> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }

@@ -135,7 +135,7 @@ fn push<T>(queue: &mut VecDeque<T>, one: T, most: usize) {
 
 /// A row of the screen.
 #[derive(Debug, Clone, Default, PartialEq)]
-pub(super) struct Row {
+pub(super) struct TopRow {
     pub(super) topic: String,
     pub(super) name: String,
     pub(super) rate: Option<f64>,
@@ -147,7 +147,7 @@ pub(super) struct Row {
     pub(super) type_name: String,
 }
 
-impl Row {
+impl TopRow {
     /// Returns the texts of the columns.
     pub(super) fn cells(&self) -> [String; 8] {
         let dash = || "-".to_owned();
@@ -182,9 +182,9 @@ impl Row {
 }
 
 /// Returns the sums of all rows.
-pub(super) fn summary(rows: &[Row]) -> String {
+pub(super) fn summary(rows: &[TopRow]) -> String {
     let rate: f64 = rows.iter().filter_map(|row| row.rate).sum();
-    let drops: u64 = rows.iter().map(Row::dropped).sum();
+    let drops: u64 = rows.iter().map(TopRow::dropped).sum();
     format!("{} topics, {rate:.1} values/s, {drops} dropped", rows.len())
 }
 
@@ -217,7 +217,7 @@ impl TopView {
         figures: &Figures,
         (live, now): (&Live, Duration),
         pages: &[StatusPage],
-    ) -> Vec<Row> {
+    ) -> Vec<TopRow> {
         let mut drops: BTreeMap<&str, BTreeMap<String, u64>> = BTreeMap::new();
         for (topic, of) in pages.iter().flat_map(|page| &page.topics) {
             let all = drops.entry(topic).or_default();
@@ -233,7 +233,7 @@ impl TopView {
                 true => "secured".to_owned(),
                 false => quality_name(heard.quality),
             };
-            Row {
+            TopRow {
                 drops: drops.remove(text.as_str()).unwrap_or_default(),
                 topic: text,
                 name: live.name_of(topic).unwrap_or_else(|| "-".to_owned()),
@@ -248,7 +248,7 @@ impl TopView {
         self.ordered(rows)
     }
 
-    pub(super) fn ordered(&mut self, mut rows: Vec<Row>) -> Vec<Row> {
+    pub(super) fn ordered(&mut self, mut rows: Vec<TopRow>) -> Vec<TopRow> {
         let filter = self.filter.to_lowercase();
         rows.retain(|row| {
             let texts = [&row.topic, &row.name, &row.quality, &row.type_name];
@@ -268,7 +268,7 @@ impl TopView {
         rows
     }
 
-    fn compare(&self, a: &Row, b: &Row) -> Ordering {
+    fn compare(&self, a: &TopRow, b: &TopRow) -> Ordering {
         let most = |a: Option<f64>, b: Option<f64>| {
             let value = |of: Option<f64>| of.unwrap_or(f64::NEG_INFINITY);
             value(b).total_cmp(&value(a))
@@ -299,12 +299,12 @@ const MOST_RATES: usize = 3;
 mod tests {
     use super::*;
 
-    fn row(topic: &str, name: &str, rate: f64) -> Row {
-        Row {
+    fn row(topic: &str, name: &str, rate: f64) -> TopRow {
+        TopRow {
             topic: topic.to_owned(),
             name: name.to_owned(),
             rate: Some(rate),
-            ..Row::default()
+            ..TopRow::default()
         }
     }
 

@@ -7,14 +7,14 @@ use ratatui::text::Line;
 use ratatui::widgets::{Paragraph, Row as Cells, Table};
 
 use super::super::text::{harmless, shortened};
-use super::rows::{Row, TopView, summary};
+use super::rows::{TopRow, TopView, summary};
 
 pub(super) const HEAD: [&str; 8] = [
     "TOPIC", "NAME", "RATE/S", "LAST", "DELAY", "DROPPED", "QUALITY", "TYPE",
 ];
 
 /// Draws the rows from the first visible row, a title and the keys.
-pub(super) fn draw(frame: &mut Frame<'_>, (view, rows): (&TopView, &[Row]), group: &str) {
+pub(super) fn draw(frame: &mut Frame<'_>, (view, rows): (&TopView, &[TopRow]), group: &str) {
     let areas = Layout::vertical([
         Constraint::Length(1),
         Constraint::Min(2),
@@ -45,8 +45,8 @@ fn help(view: &TopView) -> String {
     format!("q quit  s sort  r reverse  / filter  arrows scroll   {order}")
 }
 
-fn table(view: &TopView, rows: &[Row], width: usize) -> Table<'static> {
-    let visible: Vec<[String; 8]> = rows.iter().skip(view.first).map(Row::cells).collect();
+fn table(view: &TopView, rows: &[TopRow], width: usize) -> Table<'static> {
+    let visible: Vec<[String; 8]> = rows.iter().skip(view.first).map(TopRow::cells).collect();
     let widths = widths(&visible, width);
     let lines = visible.iter().zip(rows.iter().skip(view.first));
     let lines = lines.map(|(cells, row)| {
@@ -100,7 +100,7 @@ mod tests {
     use super::*;
 
     fn lines(width: u16, view: &TopView) -> Vec<String> {
-        let row = |topic: &str, name: &str, quality: &str| Row {
+        let row = |topic: &str, name: &str, quality: &str| TopRow {
             topic: topic.to_owned(),
             name: name.to_owned(),
             rate: Some(49.98),

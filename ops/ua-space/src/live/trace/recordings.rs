@@ -233,13 +233,13 @@ impl Delays {
         Ok(())
     }
 
-    fn rows(&self, clocks: &[Clock]) -> Vec<Row> {
+    fn rows(&self, clocks: &[Clock]) -> Vec<HostDelayRow> {
         let name = |number: usize| {
             let host = clocks.get(number).and_then(|clock| clock.host.clone());
             host.unwrap_or_else(|| "-".to_owned())
         };
         let rows = self.0.iter().filter_map(|((topic, from, to), window)| {
-            Some(Row {
+            Some(HostDelayRow {
                 topic: topic.to_string(),
                 from: name(*from),
                 to: name(*to),
@@ -252,7 +252,7 @@ impl Delays {
 
 /// The network delays of a topic between two hosts.
 #[derive(Serialize)]
-struct Row {
+struct HostDelayRow {
     topic: String,
     from: String,
     to: String,
@@ -275,7 +275,7 @@ struct ShownClock<'a> {
 #[derive(Serialize)]
 struct RecordingTraceJson<'a> {
     clocks: Vec<ShownClock<'a>>,
-    topics: &'a [Row],
+    topics: &'a [HostDelayRow],
 }
 
 #[expect(clippy::cast_precision_loss, reason = "a time shown to people")]
@@ -283,7 +283,7 @@ pub(super) fn in_micros(nanos: i128) -> f64 {
     nanos as f64 / 1000.0
 }
 
-fn print(arguments: &Trace, clocks: &[Clock], rows: &[Row]) -> Result<(), CommandFailure> {
+fn print(arguments: &Trace, clocks: &[Clock], rows: &[HostDelayRow]) -> Result<(), CommandFailure> {
     let mut out = io::stdout().lock();
     if arguments.json {
         let shown = clocks.iter().map(|clock| ShownClock {

@@ -13,7 +13,7 @@ use tokio::time::{MissedTickBehavior, interval};
 use uadp::Fields;
 
 use super::super::text::harmless;
-use super::{ServedValue, Tally, Written, pace, value};
+use super::{ServedValue, Tally, WriteOutcome, pace, value};
 use crate::arguments::Write;
 use crate::exit::CommandFailure;
 use crate::interrupt::SignalGuard;
@@ -48,7 +48,7 @@ pub(super) async fn write(arguments: &Write, found: &ServedValue) -> Result<(), 
             })?;
             let outcome = tokio::select! {
                 outcome = one(&client, &node, value) => outcome,
-                () = pace.interrupted() => Written::Unknown("interrupted".to_owned()),
+                () = pace.interrupted() => WriteOutcome::Unknown("interrupted".to_owned()),
             };
             tally.take(at, &outcome, arguments.json)?;
         }
@@ -248,30 +248,30 @@ fn variant(block: &[u8]) -> Option<Variant> {
     })))
 }
 
-async fn one(client: &OpcUaClient, node: &NodeId, value: Variant) -> Written {
+async fn one(client: &OpcUaClient, node: &NodeId, value: Variant) -> WriteOutcome {
     let mut results = client.write_each(&[(node.clone(), value)]).await;
     match results.pop() {
         Some(Ok(status) | Err(ClientError::Status(status))) => judged(status),
-        Some(Err(ClientError::NotConnected(why))) => Written::Refused(format!(
+        Some(Err(ClientError::NotConnected(why))) => WriteOutcome::Refused(format!(
             "there is no connection: {}: nothing was sent",
             harmless(&why)
         )),
-        Some(Err(error)) => Written::Unknown(harmless(&error.to_string())),
-        None => Written::Unknown("the server did not answer".to_owned()),
+        Some(Err(error)) => WriteOutcome::Unknown(harmless(&error.to_string())),
+        None => WriteOutcome::Unknown("the server did not answer".to_owned()),
     }
 }
 
 /// Returns the outcome of a write from its status, as docs/server.md lists them.
-fn judged(status: StatusCode) -> Written {
+fn judged(status: StatusCode) -> WriteOutcome {
     match status {
-        StatusCode::GoodCompletesAsynchronously => Written::Unknown(
+        StatusCode::GoodCompletesAsynchronously => WriteOutcome::Unknown(
             "the server of this variable is not connected: it gets the value when it returns"
                 .to_owned(),
         ),
         StatusCode::BadTimeout => {
-            Written::Unknown("BadTimeout, the value was not confirmed in time".to_owned())
+            WriteOutcome::Unknown("BadTimeout, the value was not confirmed in time".to_owned())
         }
-        StatusCode::BadRequestCancelledByRequest => Written::Unknown(
+        StatusCode::BadRequestCancelledByRequest => WriteOutcome::Unknown(
             "BadRequestCancelledByRequest, a newer write replaced the value".to_owned(),
         ),
         // The last four tell of a fault while or after the value was handled.
@@ -280,14 +280,14 @@ fn judged(status: StatusCode) -> Written {
         | StatusCode::BadInternalError
         | StatusCode::BadUnexpectedError
         | StatusCode::BadDecodingError
-        | StatusCode::BadUnknownResponse => Written::Unknown(status.to_string()),
-        StatusCode::BadUserAccessDenied => {
-            Written::Refused("BadUserAccessDenied: the user may not write it (--user)".to_owned())
-        }
-        status if status.is_good() => Written::Arrived,
+        | StatusCode::BadUnknownResponse => WriteOutcome::Unknown(status.to_string()),
+        StatusCode::BadUserAccessDenied => WriteOutcome::Refused(
+            "BadUserAccessDenied: the user may not write it (--user)".to_owned(),
+        ),
+        status if status.is_good() => WriteOutcome::Arrived,
         // An uncertain status.
-        status if !status.is_bad() => Written::Unknown(status.to_string()),
-        status => Written::Refused(status.to_string()),
+        status if !status.is_bad() => WriteOutcome::Unknown(status.to_string()),
+        status => WriteOutcome::Refused(status.to_string()),
     }
 }
 
@@ -335,11 +335,17 @@ mod tests {
             StatusCode::UncertainLastUsableValue,
             StatusCode::GoodCompletesAsynchronously,
         ] {
-            assert!(matches!(judged(status), Written::Unknown(_)), "{status}");
+            assert!(
+                matches!(judged(status), WriteOutcome::Unknown(_)),
+                "{status}"
+            );
         }
         for status in [StatusCode::BadOutOfRange, StatusCode::BadUserAccessDenied] {
-            assert!(matches!(judged(status), Written::Refused(_)), "{status}");
+            assert!(
+                matches!(judged(status), WriteOutcome::Refused(_)),
+                "{status}"
+            );
         }
-        assert_eq!(judged(StatusCode::Good), Written::Arrived);
+        assert_eq!(judged(StatusCode::Good), WriteOutcome::Arrived);
     }
 }

@@ -18,7 +18,7 @@ use uadp::{BuiltinType, Timestamp};
 
 use super::super::names::mapped;
 use super::super::text::harmless;
-use super::{Tally, Written, label, pace, value};
+use super::{Tally, WriteOutcome, label, pace, value};
 use crate::arguments::Write;
 use crate::exit::CommandFailure;
 use crate::live::unix_nanos;
@@ -231,7 +231,7 @@ impl WritePort {
     }
 
     /// Records the outcome of the last value.
-    fn settle(&mut self, written: &Written) {
+    fn settle(&mut self, written: &WriteOutcome) {
         if !std::mem::replace(&mut self.is_open, false) {
             return;
         }
@@ -274,8 +274,8 @@ impl WritePort {
         };
         // A newer value ends the repetition of the value before.
         self.settle(&match self.variable.confirmed_within {
-            Some(_) => Written::Unknown("a newer value replaced it".to_owned()),
-            None => Written::Arrived,
+            Some(_) => WriteOutcome::Unknown("a newer value replaced it".to_owned()),
+            None => WriteOutcome::Arrived,
         });
         self.sent += 1;
         self.is_open = true;
@@ -318,8 +318,8 @@ impl Port for WritePort {
                 Phase::Waiting(until) => {
                     sleep_until(until).await;
                     self.settle(&match self.variable.confirmed_within {
-                        Some(_) => Written::Unknown("no bridge answered in time".to_owned()),
-                        None => Written::Arrived,
+                        Some(_) => WriteOutcome::Unknown("no bridge answered in time".to_owned()),
+                        None => WriteOutcome::Arrived,
                     });
                 }
                 Phase::Over => std::future::pending().await,
@@ -337,14 +337,14 @@ impl Port for WritePort {
             return;
         }
         let written = match arrival {
-            ConfirmedArrival::Confirmed => Written::Arrived,
+            ConfirmedArrival::Confirmed => WriteOutcome::Arrived,
             ConfirmedArrival::NotSent => {
-                Written::Refused("the network took no message: nothing was sent".to_owned())
+                WriteOutcome::Refused("the network took no message: nothing was sent".to_owned())
             }
             ConfirmedArrival::Unknown(spaces) => {
                 let spaces: Vec<String> = spaces.iter().map(ToString::to_string).collect();
                 let spaces = spaces.join(", ");
-                Written::Unknown(format!(
+                WriteOutcome::Unknown(format!(
                     "not confirmed in time by the bridge of space {spaces}"
                 ))
             }
@@ -393,10 +393,10 @@ impl Port for WritePort {
             return self.finish(Err(CommandFailure::Interrupted));
         }
         match (self.variable.confirmed_within, self.order.count) {
-            (None, _) => self.settle(&Written::Arrived),
+            (None, _) => self.settle(&WriteOutcome::Arrived),
             // The usual end of a stream. Its last value is not waited for.
             (Some(_), None) if self.tally.written > 0 => self.is_open = false,
-            (Some(_), _) => self.settle(&Written::Unknown("interrupted".to_owned())),
+            (Some(_), _) => self.settle(&WriteOutcome::Unknown("interrupted".to_owned())),
         }
         if self.phase != Phase::Over {
             self.end();

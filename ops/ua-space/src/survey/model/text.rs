@@ -198,10 +198,10 @@ const SYMBOLS: [&str; 26] = [
 
 #[derive(Default)]
 struct Parser {
-    nodes: Vec<Node>,
+    nodes: Vec<SysmlNode>,
     /// The first child of each name of an element.
     children: HashMap<(Option<usize>, String), usize>,
-    open: Vec<Open>,
+    open: Vec<OpenBody>,
     /// The tokens of the statement read so far.
     statement: Vec<Token>,
     metadata: Vec<Metadata>,
@@ -209,7 +209,7 @@ struct Parser {
 }
 
 /// An open brace, with its line.
-struct Open {
+struct OpenBody {
     what: Body,
     line: usize,
 }
@@ -222,7 +222,7 @@ enum Body {
 }
 
 /// An element of the model.
-struct Node {
+struct SysmlNode {
     keyword: String,
     is_definition: bool,
     name: String,
@@ -258,7 +258,7 @@ impl Parser {
                     ));
                 }
                 let line = token.line;
-                self.open.push(Open { what, line });
+                self.open.push(OpenBody { what, line });
             }
             Lexeme::Symbol("}") => {
                 // A calculation ends with an expression without `;`.
@@ -424,7 +424,7 @@ impl Parser {
         }
         let at = self.nodes.len();
         let parent = self.owner();
-        let mut node = Node {
+        let mut node = SysmlNode {
             keyword: String::new(),
             is_definition: false,
             name: String::new(),

@@ -86,15 +86,15 @@ impl Lines {
 
 #[derive(Default)]
 struct Document {
-    path: Vec<Open>,
+    path: Vec<OpenElement>,
     text: String,
-    nodes: Vec<Node>,
+    nodes: Vec<XmiNode>,
     ids: HashMap<String, usize>,
     applications: Vec<Application>,
 }
 
 /// An open XML element.
-enum Open {
+enum OpenElement {
     /// The element around the model and its stereotypes.
     Xmi,
     Node(usize),
@@ -106,7 +106,7 @@ enum Open {
 
 /// An element of the model.
 #[derive(Default)]
-struct Node {
+struct XmiNode {
     /// The name of the XML element.
     tag: String,
     /// The UML class, such as `Property`.
@@ -147,8 +147,8 @@ impl Document {
             return Err(format!("elements are nested deeper than {DEEPEST}"));
         }
         let open = match self.path.last() {
-            None if local == "XMI" => Open::Xmi,
-            None | Some(Open::Xmi) if is_uml => self.node(local, attributes, line)?,
+            None if local == "XMI" => OpenElement::Xmi,
+            None | Some(OpenElement::Xmi) if is_uml => self.node(local, attributes, line)?,
             None => {
                 return Err(format!(
                     "this is a <{}>, no model; Papyrus keeps the model in the file that ends in \
@@ -156,10 +156,12 @@ impl Document {
                     shown(&local)
                 ));
             }
-            Some(Open::Xmi) => self.application(local, attributes, line)?,
-            Some(Open::Application(at)) => self.tag(*at, local, &attributes, line),
-            Some(Open::Node(_) | Open::Other) => self.inside(local, attributes, line)?,
-            Some(Open::Tag(..)) => Open::Other,
+            Some(OpenElement::Xmi) => self.application(local, attributes, line)?,
+            Some(OpenElement::Application(at)) => self.tag(*at, local, &attributes, line),
+            Some(OpenElement::Node(_) | OpenElement::Other) => {
+                self.inside(local, attributes, line)?
+            }
+            Some(OpenElement::Tag(..)) => OpenElement::Other,
         };
         self.path.push(open);
         Ok(())
@@ -168,7 +170,7 @@ impl Document {
     fn close(&mut self) {
         let text = self.text.trim().to_owned();
         self.text.clear();
-        if let Some(Open::Tag(at, name, line)) = self.path.pop()
+        if let Some(OpenElement::Tag(at, name, line)) = self.path.pop()
             && let Some(application) = self.applications.get_mut(at)
         {
             let value = text;
@@ -179,8 +181,11 @@ impl Document {
     /// Returns the nearest element of the model around the open XML element.
     fn owner(&self) -> Option<usize> {
         self.path.iter().rev().find_map(|open| match open {
-            Open::Node(at) => Some(*at),
-            Open::Xmi | Open::Application(_) | Open::Tag(..) | Open::Other => None,
+            OpenElement::Node(at) => Some(*at),
+            OpenElement::Xmi
+            | OpenElement::Application(_)
+            | OpenElement::Tag(..)
+            | OpenElement::Other => None,
         })
     }
 
@@ -189,9 +194,9 @@ impl Document {
         local: String,
         attributes: Vec<(String, String)>,
         line: usize,
-    ) -> Result<Open, String> {
+    ) -> Result<OpenElement, String> {
         let owner = self.owner();
-        let is_direct = matches!(self.path.last(), Some(Open::Node(_)));
+        let is_direct = matches!(self.path.last(), Some(OpenElement::Node(_)));
         if let Some(owner) = owner
             .and_then(|at| self.nodes.get_mut(at))
             .filter(|_| is_direct)
@@ -203,19 +208,19 @@ impl Document {
                     if let Some(id) = value(&attributes, "xmi:idref") {
                         owner.type_id = Some(id.to_owned());
                     }
-                    return Ok(Open::Other);
+                    return Ok(OpenElement::Other);
                 }
                 "upperValue" => {
                     let upper = value(&attributes, "value").unwrap_or("0");
                     owner.is_array = !matches!(upper, "0" | "1");
-                    return Ok(Open::Other);
+                    return Ok(OpenElement::Other);
                 }
                 _ => {}
             }
         }
         match value(&attributes, "xmi:id") {
             Some(_) if local != "eAnnotations" => self.node(local, attributes, line),
-            Some(_) | None => Ok(Open::Other),
+            Some(_) | None => Ok(OpenElement::Other),
         }
     }
 
@@ -224,17 +229,17 @@ impl Document {
         tag: String,
         attributes: Vec<(String, String)>,
         line: usize,
-    ) -> Result<Open, String> {
+    ) -> Result<OpenElement, String> {
         if self.nodes.len() >= MOST_ELEMENTS {
             return Err(format!("more than {MOST_ELEMENTS} elements are not read"));
         }
         let at = self.nodes.len();
-        let mut node = Node {
+        let mut node = XmiNode {
             class: tag.clone(),
             tag,
             parent: self.owner(),
             line,
-            ..Node::default()
+            ..XmiNode::default()
         };
         for (key, value) in attributes {
             match key.as_str() {
@@ -249,7 +254,7 @@ impl Document {
             }
         }
         self.nodes.push(node);
-        Ok(Open::Node(at))
+        Ok(OpenElement::Node(at))
     }
 
     fn application(
@@ -257,7 +262,7 @@ impl Document {
         stereotype: String,
         attributes: Vec<(String, String)>,
         line: usize,
-    ) -> Result<Open, String> {
+    ) -> Result<OpenElement, String> {
         if self.applications.len() >= MOST_ELEMENTS {
             return Err(format!(
                 "more than {MOST_ELEMENTS} stereotypes are not read"
@@ -279,7 +284,9 @@ impl Document {
             }
         }
         self.applications.push(application);
-        Ok(Open::Application(self.applications.len().saturating_sub(1)))
+        Ok(OpenElement::Application(
+            self.applications.len().saturating_sub(1),
+        ))
     }
 
     fn tag(
@@ -288,11 +295,11 @@ impl Document {
         name: String,
         attributes: &[(String, String)],
         line: usize,
-    ) -> Open {
+    ) -> OpenElement {
         if !name.starts_with("base_") {
             return match value(attributes, "xsi:nil") {
-                Some("true") => Open::Other,
-                Some(_) | None => Open::Tag(at, name, line),
+                Some("true") => OpenElement::Other,
+                Some(_) | None => OpenElement::Tag(at, name, line),
             };
         }
         if let Some(application) = self.applications.get_mut(at) {
@@ -302,7 +309,7 @@ impl Document {
                 application.elsewhere = Some(href.to_owned());
             }
         }
-        Open::Other
+        OpenElement::Other
     }
 
     /// Returns the elements with stereotypes in the order of the file, and the stereotypes without

@@ -114,42 +114,86 @@ pub(super) fn type_conflicts(facts: &CellFacts) -> Vec<DoctorFinding> {
 
 pub(super) fn dropped_samples(facts: &CellFacts) -> Vec<DoctorFinding> {
     let names = facts.names();
-    let each = facts.pages.iter().filter_map(|page| {
-        let mut drops: Vec<(u64, &str, &str)> = Vec::new();
-        for (topic, of) in &page.topics {
-            for (reason, count) in &of.dropped {
-                drops.push((*count, topic, reason));
-            }
-        }
-        for (reason, count) in &page.others.dropped {
-            drops.push((*count, "others", reason));
-        }
-        drops.retain(|(count, _, reason)| *count > 0 && !is_intended_drop(reason));
-        drops.sort_by(|a, b| b.cmp(a));
-        let total: u64 = drops.iter().map(|(count, ..)| count).sum();
-        let most = drops.iter().take(3).map(|(count, topic, reason)| {
-            let topic = called(names.get(topic).copied(), topic);
-            format!("{count} of {topic} ({reason})")
-        });
-        let most: Vec<String> = most.collect();
-        let samples = if total == 1 { "sample" } else { "samples" };
-        (total > 0).then(|| {
+    let each = facts.pages.iter().flat_map(|page| {
+        let (unneeded, lost): (Vec<TopicDrop<'_>>, Vec<TopicDrop<'_>>) =
+            drops(page).into_iter().partition(TopicDrop::is_unneeded);
+        let lost = (!lost.is_empty()).then(|| {
             finding(
                 ("D034", Warning),
-                format!(
-                    "{} dropped {total} {samples}: {}",
-                    page.label(),
-                    most.join(", ")
-                ),
+                described_drops(page, &lost, &names),
                 "dropped samples do not reach the other side",
                 format!(
                     "docs/running.md explains each reason; `curl {}/status` shows all counters",
                     page.url
                 ),
             )
-        })
+        });
+        let unneeded = (!unneeded.is_empty()).then(|| {
+            finding(
+                ("D034", Note),
+                described_drops(page, &unneeded, &names),
+                "no node subscribed to these events, or the first sample waited for its type",
+                "nothing, if no node needs these samples",
+            )
+        });
+        lost.into_iter().chain(unneeded)
     });
     each.collect()
+}
+
+/// Samples that a program dropped for one reason.
+#[derive(Debug, PartialEq, Eq, PartialOrd, Ord)]
+struct TopicDrop<'a> {
+    count: u64,
+    /// The topic, or `others`.
+    topic: &'a str,
+    reason: &'a str,
+}
+
+impl TopicDrop<'_> {
+    /// Returns true for events without a subscriber, and for the first sample of a topic, which
+    /// waited for its type.
+    fn is_unneeded(&self) -> bool {
+        match self.reason {
+            "no_subscriber" => true,
+            "untyped" => self.count == 1,
+            _ => false,
+        }
+    }
+}
+
+/// Returns the unintended drops of a program, the highest count first.
+fn drops(page: &StatusPage) -> Vec<TopicDrop<'_>> {
+    let topics = page.topics.iter().map(|(topic, of)| (topic.as_str(), of));
+    let all = topics.chain([("others", &page.others)]);
+    let mut drops: Vec<TopicDrop<'_>> = all
+        .flat_map(|(topic, of)| {
+            of.dropped.iter().map(move |(reason, count)| TopicDrop {
+                count: *count,
+                topic,
+                reason,
+            })
+        })
+        .filter(|drop| drop.count > 0 && !is_intended_drop(drop.reason))
+        .collect();
+    drops.sort_by(|a, b| b.cmp(a));
+    drops
+}
+
+fn described_drops(
+    page: &StatusPage,
+    drops: &[TopicDrop<'_>],
+    names: &BTreeMap<&str, &str>,
+) -> String {
+    let total: u64 = drops.iter().map(|drop| drop.count).sum();
+    let samples = if total == 1 { "sample" } else { "samples" };
+    let most = drops.iter().take(3).map(|drop| {
+        let topic = called(names.get(drop.topic).copied(), drop.topic);
+        format!("{} of {topic} ({})", drop.count, drop.reason)
+    });
+    let most: Vec<String> = most.collect();
+    let most = most.join(", ");
+    format!("{} dropped {total} {samples}: {most}", page.label())
 }
 
 pub(super) fn not_ready(facts: &CellFacts) -> Vec<DoctorFinding> {

@@ -4,7 +4,7 @@ use super::super::super::pages::{CertificatePage, StatusPage, TopicPage};
 use super::super::super::processes::{LocalProcess, UdpSocket};
 use super::super::facts::AnnouncedApplication;
 use super::super::host::{HALT_POLL, IPFRAG_HIGH, InterfaceFacts, RMEM_MAX, Route, Switch};
-use super::DoctorSeverity::Note;
+use super::DoctorSeverity::{Note, Warning};
 use super::programs::{DAY, day_number};
 use super::*;
 use crate::live::{SenderTiming, TopicSeen};
@@ -254,6 +254,24 @@ fn what_programs_report_is_found() {
             .what
             .ends_with("dropped 4 samples: 4 of Speed (ua_1_2_10) (too_big)"),
         "{found:?}"
+    );
+    facts.pages[0].topics.insert(
+        "ua_1_2_11".to_owned(),
+        TopicPage {
+            dropped: [("no_subscriber", 7), ("untyped", 1)]
+                .map(|(reason, count)| (reason.to_owned(), count))
+                .into(),
+            ..TopicPage::default()
+        },
+    );
+    let shown: Vec<_> = of(&facts)
+        .into_iter()
+        .map(|one| (one.code, one.severity))
+        .collect();
+    assert_eq!(
+        shown,
+        [("D034", Warning), ("D034", Note)],
+        "events without a subscriber are no fault"
     );
     let ready = after(|facts| facts.pages[0].not_ready.push("no keys".to_owned()));
     assert_eq!(ready, ["D035"]);
