@@ -337,6 +337,14 @@ pub(super) fn lost(topic: TopicId, (reason, why): (Reason, &'static str), count:
     }
 }
 
+/// Returns the name of a DDS topic as ROS tools show it, for messages.
+pub(super) fn shown_topic(dds_topic: &str) -> String {
+    match ros_topic(dds_topic) {
+        Some(name) => format!("/{name}"),
+        None => dds_topic.to_owned(),
+    }
+}
+
 /// The reason for drops on a topic of unknown type.
 pub(super) const UNKNOWN_TYPE: &str = "type without a definition";
 /// The delay after joining a domain before services are offered.

@@ -71,11 +71,11 @@ pub(crate) fn shutdown_asked(reason: &str) {
     warn!(reason, "shutting down on request, as by `rosnode kill`");
 }
 
-/// `more`: the number of suppressed entries since the last entry.
-pub(crate) fn name_kept(name: &str, more: u64) {
+/// `suppressed`: the number of suppressed entries since the last entry.
+pub(crate) fn name_kept(name: &str, suppressed: u64) {
     warn!(
         name,
-        more,
+        suppressed,
         "another node has registered with the name of this node: this node continues; give the other node another name"
     );
 }
@@ -110,21 +110,21 @@ pub(crate) fn message_too_long(topic: &str, bytes: usize) {
     );
 }
 
-/// `more`: the number of suppressed entries since the last entry.
-pub(crate) fn service_failed(service: &str, client: &str, why: &str, more: u64) {
-    warn!(service, client, why, more, "a service request failed");
+/// `suppressed`: the number of suppressed entries since the last entry.
+pub(crate) fn service_failed(service: &str, client: &str, why: &str, suppressed: u64) {
+    warn!(service, client, why, suppressed, "a service request failed");
 }
 
 pub(crate) fn publisher_joined(topic: &str, publisher: &str) {
     debug!(topic, publisher, "connected to a publisher");
 }
 
-/// `more`: the number of suppressed entries since the last entry.
+/// `suppressed`: the number of suppressed entries since the last entry.
 pub(crate) fn link_failed(
     (topic, uri): (&str, &str),
     node: Option<&str>,
     error: &dyn Display,
-    more: u64,
+    suppressed: u64,
 ) {
     let node = node.unwrap_or("(unknown)");
     warn!(
@@ -132,7 +132,7 @@ pub(crate) fn link_failed(
         node,
         uri,
         %error,
-        more,
+        suppressed,
         "cannot connect to a registered publisher, trying again: if the node has died, remove it with \
          `rosnode cleanup`; if it runs, check that its host name resolves on this host"
     );
@@ -141,23 +141,23 @@ pub(crate) fn link_failed(
 pub(crate) fn links_not_told(period: Duration) {
     warn!(
         ?period,
-        "cannot connect to further registered publishers: the next such line has their number in `more`"
+        "cannot connect to further registered publishers: the next such line has their number in `suppressed`"
     );
 }
 
-pub(crate) fn link_waits(topic: &str, more: u64) {
+pub(crate) fn link_waits(topic: &str, suppressed: u64) {
     warn!(
         topic,
-        more,
+        suppressed,
         "cannot connect to a further publisher: the limit of connections is reached; raise the limit of open files (`LimitNOFILE=`, `ulimit -n`)"
     );
 }
 
 /// `named`: the number of publishers of the topic in the list from the master or another caller.
-pub(crate) fn too_many_publishers(topic: &str, named: usize, limit: usize, more: u64) {
+pub(crate) fn too_many_publishers(topic: &str, named: usize, limit: usize, suppressed: u64) {
     warn!(
         topic,
-        named, limit, more, "ignored publishers of a topic above the limit"
+        named, limit, suppressed, "ignored publishers of a topic above the limit"
     );
 }
 
@@ -186,18 +186,18 @@ impl Refusals {
 
     /// Waits briefly, so that a lack of file descriptors does not cause a busy loop.
     pub(crate) async fn accept_failed(&mut self, error: &std::io::Error) {
-        if let Some(more) = self.accept.admit(clock::now()) {
-            warn!(server = self.server, %error, more, "cannot accept a connection");
+        if let Some(suppressed) = self.accept.admit(clock::now()) {
+            warn!(server = self.server, %error, suppressed, "cannot accept a connection");
         }
         tokio::time::sleep(Duration::from_millis(100)).await;
     }
 
     pub(crate) fn too_many(&mut self, limit: usize) {
-        if let Some(more) = self.crowd.admit(clock::now()) {
+        if let Some(suppressed) = self.crowd.admit(clock::now()) {
             warn!(
                 server = self.server,
                 limit,
-                more,
+                suppressed,
                 "refused a connection: the limit of connections, in total or of this address, is reached; it follows from the limit of open files (`LimitNOFILE=`, `ulimit -n`)"
             );
         }
@@ -205,19 +205,19 @@ impl Refusals {
 
     /// Logs that a connection was closed in favour of another connection.
     pub(crate) fn gave_way(&mut self, address: IpAddr) {
-        if let Some(more) = self.crowd.admit(clock::now()) {
+        if let Some(suppressed) = self.crowd.admit(clock::now()) {
             warn!(
                 server = self.server,
                 %address,
-                more,
+                suppressed,
                 "closed an idle connection: too many are open"
             );
         }
     }
 
     pub(crate) fn handshake_failed(&mut self, peer: &dyn Display, error: &dyn Display) {
-        if let Some(more) = self.handshake.admit(clock::now()) {
-            warn!(server = self.server, %peer, %error, more, "refused a peer");
+        if let Some(suppressed) = self.handshake.admit(clock::now()) {
+            warn!(server = self.server, %peer, %error, suppressed, "refused a peer");
         }
     }
 }

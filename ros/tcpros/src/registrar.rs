@@ -259,7 +259,7 @@ impl Registrar {
     fn lose_name(&self, uri: &str) {
         let name = self.node.name();
         self.node.ask_to_shut_down(&format!(
-            "another node with the name {name} runs at {uri}; give one of them another name, as with __name:=other"
+            "another node with the name {name} runs at {uri}; stop one of them, or give it another name, as with __name:=other"
         ));
     }
 

@@ -14,7 +14,7 @@ use ros2_node::outlet::Outlet;
 use tokio::time::Instant;
 use tracing::{info, warn};
 
-use super::super::side::{Ros2Side, lost};
+use super::super::side::{Ros2Side, lost, shown_topic};
 use super::{WrittenTopics, cause, unwritten};
 use crate::sink::{OpenWriter, Ros2Sink, shortest_deadline};
 
@@ -245,7 +245,7 @@ impl WrittenTopics {
         else {
             return;
         };
-        info!(topic = dds_topic, message_type = %definition.name(), definition = %definition.from, %offered, "advertised");
+        info!(topic = shown_topic(&dds_topic), message_type = %definition.name(), definition = %definition.from, %offered, "advertised");
         let mut outlet = Outlet::new(writer, offered, side.domain.joined());
         if let Err(refusal) = outlet.set_readers(&readers, Instant::now()) {
             side.events.push_back(lost(topic, cause(refusal), 1));

@@ -7,7 +7,7 @@ use std::time::Duration;
 use bridge_node::policy::MAX_TOPICS;
 use bridge_node::{PortEvent, Reason};
 use mappings::TopicId;
-use messages::Selection;
+use messages::{Selection, TypeName};
 use ros2_node::compatibility::Incompatibility;
 use ros2_node::graph::RemoteEndpoint;
 use ros2_node::inbox::SlotId;
@@ -16,7 +16,7 @@ use rustdds::GUID;
 use tokio::time::Instant;
 use tracing::{debug, info};
 
-use super::super::side::{Ros2Side, SETTLED, UNKNOWN_TYPE, lost};
+use super::super::side::{Ros2Side, SETTLED, UNKNOWN_TYPE, lost, shown_topic};
 use super::ReadTopics;
 use crate::definitions::TypeDefinition;
 use crate::source::{OTHER_DEFINITION, OTHER_TYPE, ReaderState};
@@ -274,7 +274,7 @@ impl ReadTopics {
         if let Some(source) = self.list.get_mut(index) {
             source.reading = ReaderState::Open { slot, requested };
             source.announced = source.announced.or(definition.hash);
-            info!(topic, message_type = %name, definition = %definition.from, %requested, "subscribed");
+            info!(topic = shown_topic(&topic), message_type = %name, definition = %definition.from, %requested, "subscribed");
             for (topic, selection) in &source.values {
                 side.events.push_back(PortEvent::Bound {
                     topic: *topic,
@@ -363,10 +363,13 @@ impl ReadTopics {
             });
             return;
         }
+        let owner = side.domain.owner(stranger.guid);
         side.policy.told.once(&topic, OTHER_TYPE, || {
+            let theirs = TypeName::from_dds(&stranger.type_name);
             format!(
-                "messages of a publisher are dropped: its type is {}, but the topic uses {name}",
-                stranger.type_name
+                "messages of {} are dropped: it publishes {}, but the topic uses {name}",
+                owner.as_deref().unwrap_or("an unnamed node"),
+                theirs.map_or_else(|_| stranger.type_name.clone(), |theirs| theirs.to_string())
             )
         });
     }

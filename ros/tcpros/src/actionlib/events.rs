@@ -27,25 +27,25 @@ impl UnusableData {
     }
 
     pub(super) fn malformed(&mut self, topic: &str, node: &str, error: &dyn Display) {
-        if let Some(more) = self.malformed.admit(clock::now()) {
-            warn!(topic, node, %error, more, "dropped a malformed message of an action");
+        if let Some(suppressed) = self.malformed.admit(clock::now()) {
+            warn!(topic, node, %error, suppressed, "dropped a malformed message of an action");
         }
     }
 
     pub(super) fn overrun(&mut self, topic: &str, lost: u64) {
-        if let Some(more) = self.overrun.admit(clock::now()) {
+        if let Some(suppressed) = self.overrun.admit(clock::now()) {
             warn!(
                 topic,
-                lost, more, "messages of an action were lost: this process is too slow"
+                lost, suppressed, "messages of an action were lost: this process is too slow"
             );
         }
     }
 
     pub(super) fn full(&mut self, goal: &str) {
-        if let Some(more) = self.full.admit(clock::now()) {
+        if let Some(suppressed) = self.full.admit(clock::now()) {
             warn!(
                 goal,
-                more, "rejected a goal or a cancel request: too many are open"
+                suppressed, "rejected a goal or a cancel request: too many are open"
             );
         }
     }

@@ -79,7 +79,7 @@ impl TopicQueues {
             let about = DropSite::sender(from);
             self.count(about, cause, 1, || match namespace {
                 Some(namespace) => {
-                    format!("it is not secured, but its namespace {namespace} is")
+                    format!("the message is not secured, but its namespace {namespace} is")
                 }
                 None => {
                     "the announcement is not secured, but the mapping has secured groups".to_owned()

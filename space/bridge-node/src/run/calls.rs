@@ -75,7 +75,7 @@ impl<P: Port> Shell<P> {
         let bound = self.router.bind_call(topic, (service_type, map), now());
         let service_type = service_type.name();
         match bound {
-            Ok(()) => info!(%topic, %service_type, "call bound"),
+            Ok(()) => debug!(%topic, %service_type, "knows the types of the call"),
             Err(why) => warn!(%topic, %service_type, "the call is not available here: {why}"),
         }
     }

@@ -72,15 +72,15 @@ impl<P: Port> Shell<P> {
     /// Hands over to a standby on request of the operator.
     pub(super) fn switch_over(&mut self) {
         match self.router.switch_over(now()) {
-            Ok(()) => info!("hands over to the standby"),
-            Err(refusal) => warn!("does not hand over: {refusal}"),
+            Ok(()) => info!("handing over to the standby"),
+            Err(refusal) => warn!("cannot hand over: {refusal}"),
         }
     }
 
     /// Hands over to a standby at the end of the program.
     pub(super) fn hand_over_at_end(&mut self) {
         if self.router.switch_over(now()).is_ok() {
-            info!("hands over to the standby");
+            info!("handing over to the standby");
             while self.drain() {}
         }
     }
@@ -175,7 +175,7 @@ fn tell_standby(rank: Option<u8>, (active, from): (RedundancyRank, SocketAddr)) 
 fn tell_muted(rank: Option<u8>, cause: MuteCause) {
     warn!(
         rank,
-        "this bridge was active and sends nothing: {}",
+        "this bridge is not active any more and sends nothing: {}",
         cause.text()
     );
 }
