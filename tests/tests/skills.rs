@@ -438,6 +438,7 @@ fn a_yaml_with_faults_is_refused_with_all_of_them() {
     for example in ["parallel-gripper.yaml", "robot.yaml", "vacuum-gripper.yaml"] {
         let mut child = component_started(&Path::new(EXAMPLES).join(example), &["--check"]).start();
         assert!(child.wait_for_end(SOON).success(), "{child}");
+        child.wait_for_line(&format!("{example} can run"), SOON);
     }
 }
 

@@ -222,6 +222,8 @@ impl Program for UaComponent {
         let read = self.read()?;
         if self.check {
             crate::check(&read.started().component, &self.options(read))?;
+            let file = self.component.as_deref().unwrap_or_else(|| Path::new("-"));
+            tracing::info!("{} can run", file.display());
             return Ok(Some(Made::Checked));
         }
         Ok(Some(Made::Run(made(&read.started().component))))

@@ -278,7 +278,12 @@ impl PubSubNodes {
                 if !inner.states.enable(at, ask == Ask::Enable) {
                     return Err(StatusCode::BadInvalidState);
                 }
-                info!(?kind, user, "{ask:?} of a PubSub component");
+                info!(
+                    ?kind,
+                    user,
+                    ?ask,
+                    "a user changed the state of a PubSub component"
+                );
                 self.settle(inner);
             }
             Ask::Reset => {

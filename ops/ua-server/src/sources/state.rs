@@ -103,7 +103,7 @@ impl ServerState {
             warn!(
                 server = told.name,
                 variable,
-                "it does not go {} its node: {why}",
+                "cannot transfer the value {} its node at the server: {why}",
                 way.word()
             );
         }
@@ -115,7 +115,7 @@ impl ServerState {
             info!(
                 server = told.name,
                 variable,
-                "it goes {} its node",
+                "transfers the value {} its node at the server again",
                 way.word()
             );
         }
