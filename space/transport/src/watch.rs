@@ -276,8 +276,9 @@ impl HeldInterfaces {
     /// interface has the address now.
     #[must_use]
     pub fn lost_addresses(&self) -> Vec<IpAddr> {
-        let is_lost =
-            |held: &&Holding| held.was_there && held.state != HoldingState::There && !held.is_elsewhere;
+        let is_lost = |held: &&Holding| {
+            held.was_there && held.state != HoldingState::There && !held.is_elsewhere
+        };
         let lost = self.held.iter().filter(is_lost);
         lost.map(|held| held.interface.address.into()).collect()
     }
