@@ -18,9 +18,9 @@ use tokio::task::JoinHandle;
 use tokio::time::timeout;
 use tracing::{debug, info, warn};
 
+use crate::announcement::MdnsFault;
 use crate::host_name;
 use crate::interface::MdnsInterface;
-use crate::servers::MdnsFault;
 
 /// The command line option for the announcement of a bridge.
 #[derive(Debug, Clone, PartialEq, Eq, clap::Args)]

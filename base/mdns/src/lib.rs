@@ -1,26 +1,34 @@
 //! mDNS of a cell on one interface: announcements and goodbyes of OPC UA servers, and announcements
 //! of bridges.
 //!
-//! Reading order: `url`, `range` and `interface` (addresses), `servers` and `goodbye`
-//! (announcements of OPC UA servers, OPC 10000-12, Annex C), `bridges` (programs that carry a
-//! space).
+//! Reading order: `url`, `range` and `interface` (addresses), `packet` and `group` (packets of the
+//! mDNS group), `announcement` (announcements of OPC UA servers, OPC 10000-12, Annex C), `own`,
+//! `announcer` and `nearby` (a program that announces its server), `servers` (a program that also
+//! discovers others), `bridges` (programs that carry a space).
 
+mod announcement;
+mod announcer;
 mod bridges;
-mod goodbye;
+mod group;
 mod interface;
+mod nearby;
+mod own;
+mod packet;
 mod range;
 mod servers;
 mod url;
 
+pub use announcement::{
+    Aside, MdnsEvent, MdnsFault, OwnAnnouncement, SERVICE, heard, is_own, same_place,
+};
+pub use announcer::MdnsAnnouncer;
 pub use bridges::{
     Bridge, HeardBridge, Telling, TellingArguments, ToldBridge, heard_bridges, tell_bridge,
 };
-pub use goodbye::{goodbyes, listen};
+pub use group::goodbyes;
 pub use interface::{MdnsInterface, Subnets};
 pub use range::{Range, RangeFault};
-pub use servers::{
-    Aside, Mdns, MdnsEvent, MdnsFault, OwnAnnouncement, SERVICE, heard, is_own, same_place,
-};
+pub use servers::Mdns;
 pub use url::Url;
 
 /// Returns the name of this host, without a domain.

@@ -1,112 +1,33 @@
-//! Announcements by mDNS and DNS-SD (OPC 10000-12, Annex C): `_opcua-tcp._tcp.local.`, on one
-//! interface.
+//! Servers on one interface, announced and discovered by mDNS and DNS-SD (OPC 10000-12, Annex C):
+//! `_opcua-tcp._tcp.local.`
 //!
-//! Any host on the network can send announcements, so their number is bounded, and URLs and
-//! capabilities are validated. Invalid announcements are ignored and counted.
+//! Any host on the network can send announcements, so their number is bounded. Invalid
+//! announcements are ignored and counted.
 
 use std::collections::BTreeMap;
-use std::net::{IpAddr, Ipv4Addr};
-use std::num::NonZeroU16;
-use std::ops::RangeInclusive;
 use std::time::Duration;
 
 use log_limit::LogLimit;
-use mdns_sd::{
-    DaemonEvent, IfKind, MDNS_PORT, Receiver, ResolvedService, ServiceDaemon, ServiceEvent,
-    ServiceInfo,
-};
-use registry::{AnnouncedServer, label, renamed};
-use tokio::net::UdpSocket;
+use mdns_sd::{MDNS_PORT, Receiver, ResolvedService, ServiceEvent};
+use registry::AnnouncedServer;
 use tokio::time::{Instant, sleep_until};
-use tracing::{debug, info, warn};
+use tracing::{debug, info};
 
-use crate::goodbye::{goodbyes, listen};
-use crate::host_name;
+use crate::announcement::{
+    Aside, MdnsEvent, MdnsFault, OwnAnnouncement, SERVICE, address, heard, instance, same_place,
+};
+use crate::group::{GroupSocket, goodbyes};
 use crate::interface::{MdnsInterface, Subnets};
-use crate::url::Url;
-
-/// Error of starting the mDNS daemon.
-#[derive(Debug, thiserror::Error)]
-#[error("cannot use mDNS on {interface}: {source}")]
-pub struct MdnsFault {
-    interface: String,
-    #[source]
-    source: mdns_sd::Error,
-}
-
-impl MdnsFault {
-    pub(crate) fn new(interface: &MdnsInterface, source: mdns_sd::Error) -> Self {
-        Self {
-            interface: interface.to_string(),
-            source,
-        }
-    }
-}
-
-/// Event on the network.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub enum MdnsEvent {
-    /// A server was announced for the first time or with changes.
-    Announced {
-        /// Announcement of the server.
-        announcement: AnnouncedServer,
-        /// Additional properties of programs of this project.
-        aside: Aside,
-    },
-    /// A server has ended: a goodbye was received, or its announcement has expired.
-    Withdrawn {
-        /// The instance name of the server.
-        instance: String,
-    },
-    /// Another host has the name of an announced server, which is renamed.
-    Renamed {
-        /// The previous instance name.
-        from: String,
-        /// The new instance name.
-        to: String,
-    },
-}
-
-/// An announcement of this program.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct OwnAnnouncement {
-    /// The standard part of the announcement.
-    pub announcement: AnnouncedServer,
-    /// The keys that programs of this project add.
-    pub aside: Aside,
-}
-
-/// Additional properties of programs of this project, in TXT keys that other programs ignore.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub struct Aside {
-    /// Start time of the program, in 100 ns since 1601.
-    pub start_time: Option<i64>,
-    /// Number of the program in the space: the namespace of its values there.
-    pub number: Option<NonZeroU16>,
-}
-
-impl Aside {
-    /// Returns the properties of a program without a number.
-    pub const fn of_start(start_time: i64) -> Self {
-        Self {
-            start_time: Some(start_time),
-            number: None,
-        }
-    }
-}
+use crate::own::{ANNOUNCE_EVERY, OwnServers};
 
 /// mDNS on one interface, with a thread of its own for queries and responses.
 pub struct Mdns {
     interface: MdnsInterface,
-    daemon: ServiceDaemon,
+    ours: OwnServers,
     events: Receiver<ServiceEvent>,
-    monitor: Option<Receiver<DaemonEvent>>,
-    ours: BTreeMap<String, Announced>,
-    announce_at: Instant,
     /// Receives goodbyes before the daemon reports them; without this socket they are a second
     /// late.
-    goodbyes: Option<UdpSocket>,
-    packet: Vec<u8>,
+    group: GroupSocket,
     /// Goodbyes that have not been reported yet.
     left: Vec<String>,
     /// Instances on the network, as announced last. A new instance has not received the
@@ -127,38 +48,20 @@ pub struct Mdns {
     ignored_log: LogLimit,
 }
 
-#[derive(Debug)]
-struct Announced {
-    ours: OwnAnnouncement,
-    fullname: String,
-    /// The URL in the received announcement: with an address in place of a host name.
-    place: String,
-    /// Number of announcements of another server under this name that had to give way.
-    contested: u32,
-}
-
 impl Mdns {
     /// Opens an interface and starts to receive announcements at once.
     pub fn open(interface: &MdnsInterface) -> Result<Self, MdnsFault> {
         Self::open_at(interface, MDNS_PORT)
     }
 
-    fn open_at(interface: &MdnsInterface, port: u16) -> Result<Self, MdnsFault> {
-        let fault = |source| MdnsFault::new(interface, source);
-        let daemon = ServiceDaemon::new_with_port(port).map_err(fault)?;
-        daemon.disable_interface(IfKind::All).map_err(fault)?;
-        daemon.enable_interface(interface.kind()).map_err(fault)?;
-        let events = daemon.browse(SERVICE).map_err(fault)?;
-        let monitor = daemon.monitor().ok();
+    pub(crate) fn open_at(interface: &MdnsInterface, port: u16) -> Result<Self, MdnsFault> {
+        let ours = OwnServers::open(interface, port)?;
+        let events = ours.daemon().browse(SERVICE);
         Ok(Self {
             interface: interface.clone(),
-            daemon,
-            events,
-            monitor,
-            ours: BTreeMap::new(),
-            announce_at: Instant::now() + ANNOUNCE_EVERY,
-            goodbyes: hear_goodbyes(interface),
-            packet: vec![0; PACKET],
+            ours,
+            events: events.map_err(|source| MdnsFault::new(interface, source))?,
+            group: GroupSocket::open(interface, port),
             left: Vec::new(),
             there: BTreeMap::new(),
             doubted: BTreeMap::new(),
@@ -171,40 +74,12 @@ impl Mdns {
 
     /// Announces a server at once, in place of the previous announcement of its name.
     pub fn put(&mut self, ours: OwnAnnouncement) {
-        let Some(info) = self.info(&ours) else {
-            warn!(
-                name = ours.announcement.instance,
-                url = ours.announcement.url,
-                "cannot announce a server on {}: it does not listen on an address of this interface, or its host name belongs to another host",
-                self.interface
-            );
-            return;
-        };
-        let fullname = info.get_fullname().to_owned();
-        let place = heard(&info.clone().as_resolved_service(), &self.subnets.0);
-        let place = place.map_or_else(
-            || ours.announcement.url.clone(),
-            |(announcement, _)| announcement.url,
-        );
-        self.register(info);
-        let instance = ours.announcement.instance.clone();
-        let announced = Announced {
-            ours,
-            fullname,
-            place,
-            contested: 0,
-        };
-        self.ours.insert(instance, announced);
+        self.ours.put(ours, &self.subnets.0);
     }
 
     /// Withdraws the announcement of a name. The future completes after the goodbye was sent.
     pub fn take_back(&mut self, instance: &str) -> Option<impl Future<Output = ()> + Send + use<>> {
-        let announced = self.ours.remove(instance)?;
-        let told = self.daemon.unregister(&announced.fullname).ok()?;
-        Some(async move {
-            // An error is the end of the daemon, which sends all goodbyes.
-            let _told = told.recv_async().await;
-        })
+        self.ours.take_back(instance)
     }
 
     /// Returns the number of received announcements that were ignored.
@@ -219,7 +94,7 @@ impl Mdns {
                 if self.outdated.remove(&instance).is_some() {
                     return MdnsEvent::Withdrawn { instance };
                 }
-                if !self.ours.contains_key(&instance)
+                if !self.ours.has(&instance)
                     && let Some((announcement, aside)) = self.there.remove(&instance)
                 {
                     let until = Instant::now() + DOUBT;
@@ -234,31 +109,25 @@ impl Mdns {
             if let Some(heard) = self.still_there().or_else(|| self.not_heard_again()) {
                 return heard;
             }
-            let announce_at = self.announce_at;
+            let announce_at = self.ours.announce_at();
             let waiting = self.doubted.values().chain(self.outdated.values());
             let due = waiting.map(|(_, _, until)| *until).min();
             let wake_at = due.map_or(announce_at, |until| until.min(announce_at));
-            let Self {
-                goodbyes,
-                packet,
-                events,
-                ..
-            } = &mut *self;
+            let Self { group, events, .. } = &mut *self;
             let heard = async {
-                match goodbyes {
-                    Some(socket) => socket.recv(packet).await,
-                    None => std::future::pending().await,
-                }
+                let (packet, _) = group.recv().await;
+                goodbyes(packet)
             };
             let event = tokio::select! {
                 event = events.recv_async() => event,
-                heard = heard => {
-                    self.take_goodbyes(heard);
+                left = heard => {
+                    self.left = left;
                     continue;
                 }
                 () = sleep_until(wake_at) => {
                     if Instant::now() >= announce_at {
-                        self.announce_again();
+                        self.group.reopen();
+                        self.ours.announce_again(self.there.len());
                     }
                     continue;
                 }
@@ -302,74 +171,15 @@ impl Mdns {
         Some(MdnsEvent::Withdrawn { instance })
     }
 
-    fn take_goodbyes(&mut self, heard: std::io::Result<usize>) {
-        match heard {
-            Ok(length) => self.left = goodbyes(self.packet.get(..length).unwrap_or_default()),
-            // Opened again with the next announcement.
-            Err(error) => {
-                debug!(%error, "goodbyes on {} are received a second late", self.interface);
-                self.goodbyes = None;
-            }
-        }
-    }
-
     /// Opens the channel again, which the crate closes without notice for a slow receiver.
     async fn browse_again(&mut self) {
         debug!("receiving mDNS on {} again", self.interface);
-        match self.daemon.browse(SERVICE) {
+        match self.ours.daemon().browse(SERVICE) {
             Ok(events) => self.events = events,
             Err(error) => {
                 debug!(%error, "cannot receive mDNS on {}", self.interface);
                 tokio::time::sleep(ANNOUNCE_EVERY).await;
             }
-        }
-    }
-
-    /// Plans an announcement for a new or changed server, which is not one for each of many servers
-    /// that appear together.
-    fn announce_soon(&mut self) {
-        let settled = Instant::now() + shared(SETTLE..=SETTLE_LATE, self.there.len());
-        self.announce_at = self.announce_at.min(settled);
-    }
-
-    /// Repeats the announcements. A late starter that sends its query from another port than that
-    /// of mDNS gets the response at that port. Some programs do not listen there, and need
-    /// announcements without a query.
-    fn announce_again(&mut self) {
-        self.announce_at =
-            Instant::now() + shared(ANNOUNCE_EVERY..=ANNOUNCE_SELDOM, self.there.len());
-        self.follow_renames();
-        if self.goodbyes.is_none() {
-            self.goodbyes = hear_goodbyes(&self.interface);
-        }
-        let infos: Vec<ServiceInfo> = self
-            .ours
-            .values()
-            .filter_map(|ours| self.info(&ours.ours))
-            .collect();
-        for info in infos {
-            self.register(info);
-        }
-    }
-
-    /// Logs the conflicts that the daemon itself resolved.
-    fn follow_renames(&mut self) {
-        let changes = self.monitor.iter().flat_map(Receiver::try_iter);
-        for event in changes {
-            if let DaemonEvent::NameChange(change) = event {
-                info!(
-                    from = change.original,
-                    to = change.new_name,
-                    "another host uses the mDNS name: this server is announced with another name"
-                );
-            }
-        }
-    }
-
-    fn register(&self, info: ServiceInfo) {
-        // A full queue is emptied in a moment, and announcements are repeated.
-        if let Err(error) = self.daemon.register(info) {
-            debug!(%error, "cannot send an announcement");
         }
     }
 
@@ -385,15 +195,16 @@ impl Mdns {
                     self.ignore(&service);
                     return None;
                 };
-                if let Some(ours) = self.ours.get(&announcement.instance) {
-                    let theirs = &announcement.url;
-                    return if same_place(&ours.place, theirs) {
+                if let Some(place) = self.ours.place(&announcement.instance) {
+                    let theirs = (&*announcement.instance, &*announcement.url);
+                    return if same_place(place, theirs.1) {
                         Some(MdnsEvent::Announced {
                             announcement,
                             aside,
                         })
                     } else {
-                        self.conflict(&announcement.instance, theirs)
+                        let is_taken = |name: &str| self.there.contains_key(name);
+                        self.ours.conflict(theirs, &self.subnets.0, is_taken)
                     };
                 }
                 self.doubted.remove(&announcement.instance);
@@ -406,7 +217,7 @@ impl Mdns {
                 if !is_known && self.there.len() < MOST {
                     // At once, but not for each of many that appear together: a record is sent at
                     // most once a second.
-                    self.announce_soon();
+                    self.ours.announce_soon(self.there.len());
                 }
                 let is_as_before = outdated.is_some_and(|(before, beside, _)| {
                     (before, beside) == (announcement.clone(), aside)
@@ -421,7 +232,7 @@ impl Mdns {
                 let known = self.there.remove(&instance);
                 self.doubted.remove(&instance);
                 if let Some((announcement, aside)) = known
-                    && self.goodbyes.is_some()
+                    && self.group.is_open()
                     && self.outdated.len() < MOST
                 {
                     let until = Instant::now() + DOUBT;
@@ -430,7 +241,7 @@ impl Mdns {
                 }
                 // If this program still announces the name, the goodbye is that of another server
                 // of the same name.
-                (!self.ours.contains_key(&instance)).then_some(MdnsEvent::Withdrawn { instance })
+                (!self.ours.has(&instance)).then_some(MdnsEvent::Withdrawn { instance })
             }
             _ => None,
         }
@@ -466,228 +277,17 @@ impl Mdns {
             )
         }
     }
-
-    /// Resolves a conflict for a name of this program (RFC 6762, 9). Of two programs of this
-    /// project, the program with the later URL gives way. A program that does not give way in spite
-    /// of repeated announcements is of another manufacturer, and keeps the name.
-    fn conflict(&mut self, from: &str, theirs: &str) -> Option<MdnsEvent> {
-        let announced = self.ours.get_mut(from)?;
-        announced.contested += 1;
-        let first = *announced.place < *theirs;
-        if first && announced.contested < MOST_CONTESTED {
-            self.announce_at = self.announce_at.min(Instant::now() + SETTLE);
-            return None;
-        }
-        let mut ours = announced.ours.clone();
-        let mut to = renamed(from);
-        while self.there.contains_key(&to) || self.ours.contains_key(&to) {
-            to = renamed(&to);
-        }
-        info!(
-            from,
-            to,
-            theirs,
-            "another server uses the mDNS name: this server is announced with another name"
-        );
-        ours.announcement.instance.clone_from(&to);
-        drop(self.take_back(from));
-        self.put(ours);
-        Some(MdnsEvent::Renamed {
-            from: from.to_owned(),
-            to,
-        })
-    }
-
-    /// Returns an announcement for the daemon, or `None` if the server listens on no address of the
-    /// interface.
-    fn info(&self, ours: &OwnAnnouncement) -> Option<ServiceInfo> {
-        let AnnouncedServer {
-            instance,
-            url,
-            capabilities,
-        } = &ours.announcement;
-        let url = Url::parse(url)?;
-        let addresses = match url.ip() {
-            Some(IpAddr::V4(ip)) if ip.is_loopback() && !self.interface.is_loopback() => {
-                return None;
-            }
-            Some(IpAddr::V4(ip)) if !ip.is_unspecified() => vec![ip],
-            Some(IpAddr::V6(ip)) if !ip.is_unspecified() => return None,
-            // The address of another host is unknown to this program.
-            None if !is_own(&url.host) => return None,
-            _ => self.interface.addresses(),
-        };
-        let first = addresses.first()?;
-        // A unique host name: the goodbye of a server removes the host's address from all servers
-        // that share the name. No other program of this host has this name. A server that was
-        // renamed after a conflict gets a new host name. The reason is that the goodbye to its
-        // previous name is sent twice, and an address is sent at most once a second.
-        let host = first.to_string().replace('.', "-");
-        let number = instance
-            .strip_suffix(')')
-            .and_then(|name| name.rsplit_once(" ("))
-            .and_then(|(_, number)| number.parse::<u32>().ok())
-            .map_or_else(String::new, |number| format!("-{number}"));
-        let host = format!("ua-{host}-{}{number}.local.", url.port);
-        let addresses: Vec<IpAddr> = addresses.iter().copied().map(IpAddr::V4).collect();
-        let path = match url.path.as_str() {
-            "" => "/",
-            path => path,
-        };
-        let mut texts = vec![
-            ("path".to_owned(), path.to_owned()),
-            ("caps".to_owned(), capabilities.join(",")),
-        ];
-        let Aside { start_time, number } = ours.aside;
-        texts.extend(start_time.map(|at| (START.to_owned(), at.to_string())));
-        texts.extend(number.map(|number| (NUMBER.to_owned(), number.to_string())));
-        let info = ServiceInfo::new(SERVICE, instance, &host, &*addresses, url.port, &*texts);
-        let mut info = info.ok()?;
-        info.set_requires_probe(false);
-        Some(info)
-    }
 }
 
-impl Drop for Mdns {
-    fn drop(&mut self) {
-        for announced in self.ours.values() {
-            drop(self.daemon.unregister(&announced.fullname));
-        }
-        // The thread ends in any case: it has no more senders of commands.
-        drop(self.daemon.shutdown());
-    }
-}
-
-fn hear_goodbyes(interface: &MdnsInterface) -> Option<UdpSocket> {
-    let socket = listen(interface);
-    let why = socket.as_ref().err();
-    if let Some(error) = why {
-        debug!(%error, "goodbyes on {interface} are received a second late");
-    }
-    socket.ok()
-}
-
-/// Returns whether a name is that of this host, with or without a domain.
-pub fn is_own(name: &str) -> bool {
-    let first = |name: &str| {
-        name.split('.')
-            .next()
-            .unwrap_or_default()
-            .to_ascii_lowercase()
-    };
-    let name = first(name);
-    name == "localhost" || name == first(&host_name())
-}
-
-/// Returns whether two URLs have the same endpoint.
-pub fn same_place(one: &str, other: &str) -> bool {
-    one.trim_end_matches('/') == other.trim_end_matches('/')
-}
-
-/// Converts a received announcement for the registry.
-pub fn heard(service: &ResolvedService, subnets: &Subnets) -> Option<(AnnouncedServer, Aside)> {
-    let instance = instance(&service.fullname)?;
-    let text = |key| service.get_property_val(key).flatten();
-    let path = match text("path").map(std::str::from_utf8) {
-        None => "",
-        Some(Ok(path)) if path.bytes().all(|byte| byte.is_ascii_graphic()) => path,
-        Some(_) => return None,
-    };
-    let slash = if path.is_empty() || path.starts_with('/') {
-        ""
-    } else {
-        "/"
-    };
-    let ip = address(service.get_addresses_v4(), subnets)?;
-    let port = service.port;
-    if port == 0 {
-        return None;
-    }
-    let url = Url::of(IpAddr::V4(ip), port, &format!("{slash}{path}")).to_string();
-    let texts = |key| text(key).and_then(|value| std::str::from_utf8(value).ok());
-    let capabilities = texts("caps").unwrap_or_default().split(',').map(str::trim);
-    let capabilities = capabilities
-        .filter(|code| is_code(code))
-        .take(MOST_CAPABILITIES);
-    let announcement = AnnouncedServer {
-        instance,
-        url,
-        capabilities: capabilities.map(str::to_owned).collect(),
-    };
-    let aside = Aside {
-        start_time: texts(START).and_then(|at| at.parse().ok()),
-        number: texts(NUMBER).and_then(|number| number.parse().ok()),
-    };
-    Some((announcement, aside))
-}
-
-/// Returns the address to try. Loopback addresses of a network and addresses outside its subnets
-/// are excluded.
-fn address(all: impl IntoIterator<Item = Ipv4Addr>, subnets: &Subnets) -> Option<Ipv4Addr> {
-    let loopback = subnets.is_loopback();
-    let usable = |ip: &Ipv4Addr| {
-        let one = !(ip.is_unspecified() || ip.is_multicast() || ip.is_broadcast());
-        one && (loopback || !ip.is_loopback()) && subnets.contains(*ip)
-    };
-    // The more specific address first: a loopback address among several addresses is valid on its
-    // own host only.
-    let all = all.into_iter().filter(usable);
-    all.min_by_key(|ip| (ip.is_loopback() != loopback, ip.is_link_local(), *ip))
-}
-
-/// Returns whether a text is a code of OPC 10000-12, Annex D, or of a manufacturer.
-fn is_code(text: &str) -> bool {
-    !text.is_empty() && text.len() <= 32 && text.bytes().all(|byte| byte.is_ascii_graphic())
-}
-
-/// Returns the name before the service, or `None` if the name cannot be displayed.
-fn instance(fullname: &str) -> Option<String> {
-    let at = fullname.len().checked_sub(SERVICE.len() + 1)?;
-    let (name, service) = fullname.split_at_checked(at)?;
-    let service = service.strip_prefix('.')?;
-    if !service.eq_ignore_ascii_case(SERVICE) || name.is_empty() {
-        return None;
-    }
-    let name = name.replace("\\.", ".").replace("\\\\", "\\");
-    (label(&name) == name).then_some(name)
-}
-
-/// Returns a time in the range that grows with the number of servers: each of them receives the
-/// announcements of all others.
-fn shared(range: RangeInclusive<Duration>, servers: usize) -> Duration {
-    let (least, most) = range.into_inner();
-    let servers = u32::try_from(servers).unwrap_or(u32::MAX);
-    let wanted = least.saturating_mul(servers) / SERVERS_AT_FULL_RATE;
-    wanted.clamp(least, most)
-}
-
-/// The service of OPC UA servers over TCP (OPC 10000-12, Annex C).
-pub const SERVICE: &str = "_opcua-tcp._tcp.local.";
-/// The key of the TXT record with the start time, which distinguishes the runs of a program. Only
-/// programs of this project use it.
-const START: &str = "start";
-/// The key of the TXT record with the number in the space. Only programs of this project use it.
-const NUMBER: &str = "ns";
-const ANNOUNCE_EVERY: Duration = Duration::from_secs(5);
-/// Half of the time for which records of addresses are valid (RFC 6762, 10).
-const ANNOUNCE_SELDOM: Duration = Duration::from_secs(60);
-const SETTLE: Duration = Duration::from_millis(200);
-const SETTLE_LATE: Duration = Duration::from_secs(5);
-/// The number of servers above which announcements become less frequent.
-const SERVERS_AT_FULL_RATE: u32 = 8;
 /// Exceeds the second for which the daemon keeps a server that left (RFC 6762, 10.1).
 const DOUBT: Duration = Duration::from_millis(2500);
-/// The largest packet of mDNS (RFC 6762, 17).
-const PACKET: usize = 9000;
 /// Maximum number of stored instances.
 const MOST: usize = 4096;
-const MOST_CAPABILITIES: usize = 32;
 /// Maximum number of characters of a name in the log.
 const MOST_NAME: usize = 256;
 const READ_SUBNETS_EVERY: Duration = Duration::from_secs(1);
 /// Period in which ignored announcements with the same cause are logged once.
 const LOG_EVERY: Duration = Duration::from_secs(60);
-const MOST_CONTESTED: u32 = 4;
 
 #[cfg(test)]
 mod tests;

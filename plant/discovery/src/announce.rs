@@ -21,7 +21,7 @@ use crate::embedded::{Embedded, Embedding, lost};
 use mdns::MdnsInterface;
 use mdns::Url;
 use mdns::host_name;
-use mdns::{Aside, Mdns, MdnsEvent, MdnsFault, OwnAnnouncement, same_place};
+use mdns::{Aside, MdnsAnnouncer, MdnsEvent, MdnsFault, OwnAnnouncement, same_place};
 
 /// The settings of announcement and registration.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -137,7 +137,8 @@ pub fn announce(
     server: ServerDescription,
     settings: AnnounceSettings,
 ) -> Result<ServerAnnouncement, MdnsFault> {
-    let mdns = settings.mdns.as_ref().map(Mdns::open).transpose()?;
+    let mdns = settings.mdns.as_ref().map(MdnsAnnouncer::open);
+    let mdns = mdns.transpose()?;
     let register_every = match mdns {
         Some(_) => settings.register_every,
         // Without mDNS the restart of a discovery server is not noticed.
@@ -151,7 +152,7 @@ pub fn announce(
     let (sender, changes) = watch::channel(server);
     let (tell, state) = watch::channel(AnnounceState::default());
     let (stop, stopped) = mpsc::channel(1);
-    let telling = Telling {
+    let mut telling = Telling {
         settings,
         mdns,
         found,
@@ -167,6 +168,7 @@ pub fn announce(
         look_from: Instant::now(),
         look_wait: FIRST_WAIT,
     };
+    telling.heed_lds();
     let task = tokio::spawn(telling.run(stopped));
     Ok(ServerAnnouncement {
         server: sender,
@@ -198,7 +200,9 @@ fn found(settings: AnnounceSettings) -> Result<(AnnounceSettings, Looked), MdnsF
 
 struct Telling {
     settings: AnnounceSettings,
-    mdns: Option<Mdns>,
+    /// Discovers no servers: hundreds of programs that only announce themselves may be on a
+    /// network.
+    mdns: Option<MdnsAnnouncer>,
     /// The discovery server found by mDNS, if it is selected by a choice.
     found: Looked,
     server: watch::Receiver<ServerDescription>,
@@ -373,7 +377,15 @@ impl Telling {
         };
         self.state.send_modify(|state| state.registered = None);
         self.lds_run = None;
+        self.heed_lds();
         self.soon();
+    }
+
+    /// Follows the announcements of the discovery server.
+    fn heed_lds(&mut self) {
+        if let Some(mdns) = &mut self.mdns {
+            mdns.heed(self.settings.lds.as_deref());
+        }
     }
 
     /// Handles the loss of the embedded or external discovery server.

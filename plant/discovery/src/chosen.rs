@@ -38,6 +38,7 @@ pub fn find_lds(
     }
     let watcher = crate::watch(WatchSettings {
         mdns: Some(interface.clone()),
+        lds_only: true,
         ..WatchSettings::default()
     })?;
     let (tell, chosen) = watch::channel(None);

@@ -43,6 +43,8 @@ pub(crate) struct Keeper {
     /// Limits the log messages for servers that cannot be probed.
     untried_log: LogLimit,
     most: usize,
+    /// Whether announcements of other servers than discovery servers are ignored.
+    lds_only: bool,
 }
 
 /// The start time of a program, in 100 ns since 1601.
@@ -87,7 +89,13 @@ impl Keeper {
             numbers: BTreeMap::new(),
             untried_log: LogLimit::every(LOG_EVERY),
             most: settings.most,
+            lds_only: false,
         }
+    }
+
+    /// Sets whether only discovery servers are watched.
+    pub(crate) fn lds_only(self, lds_only: bool) -> Self {
+        Self { lds_only, ..self }
     }
 
     /// Waits for the next event and processes it. Cancel safe.
@@ -202,6 +210,13 @@ impl Keeper {
     fn hear(&mut self, heard: MdnsEvent) {
         let at = now();
         match heard {
+            // It may have been a discovery server before.
+            MdnsEvent::Announced { announcement, .. }
+                if self.lds_only && !is_lds(&announcement.capabilities) =>
+            {
+                self.asleep.remove(&announcement.instance);
+                self.registry.withdrawn(&announcement.instance);
+            }
             MdnsEvent::Announced {
                 announcement,
                 aside: Aside { start_time, number },
@@ -335,6 +350,12 @@ impl Keeper {
     }
 }
 
+/// Returns whether the capabilities are those of a Local Discovery Server (OPC 10000-12, Annex D).
+pub(crate) fn is_lds(capabilities: &[String]) -> bool {
+    let mut codes = capabilities.iter();
+    codes.any(|code| code.eq_ignore_ascii_case("LDS"))
+}
+
 /// Stores a value of an endpoint, up to a limit of entries. Entries of endpoints that are no longer
 /// watched are removed every second.
 fn keep<T>(map: &mut BTreeMap<String, T>, most: usize, url: &str, value: T) {
@@ -359,3 +380,41 @@ const LONGEST_PAUSE_KNOWN: Duration = Duration::from_secs(2);
 const LONGEST_PAUSE: Duration = Duration::from_secs(64);
 /// The caches of mDNS have expired by then, so that mDNS reports a returning server.
 const FORGET_ASLEEP: Duration = Duration::from_secs(150);
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn keeper() -> Keeper {
+        Keeper::new(RegistrySettings::default(), None, None)
+    }
+
+    fn announced(instance: &str, capability: &str) -> MdnsEvent {
+        MdnsEvent::Announced {
+            announcement: AnnouncedServer {
+                instance: instance.to_owned(),
+                url: "opc.tcp://127.0.0.1:4840/".to_owned(),
+                capabilities: vec![capability.to_owned()],
+            },
+            aside: Aside::default(),
+        }
+    }
+
+    /// Returns whether an endpoint is watched after these announcements.
+    fn watches(mut keeper: Keeper, announcements: &[(&str, &str)]) -> bool {
+        for (instance, capability) in announcements {
+            keeper.hear(announced(instance, capability));
+        }
+        while keeper.event().is_some() {}
+        keeper.registry.watches("opc.tcp://127.0.0.1:4840/")
+    }
+
+    #[test]
+    fn a_program_that_looks_for_a_discovery_server_probes_no_other_server() {
+        assert!(watches(keeper(), &[("arm", "DA")]));
+        assert!(!watches(keeper().lds_only(true), &[("arm", "DA")]));
+        assert!(watches(keeper().lds_only(true), &[("lds", "lds")]));
+        let no_longer = [("lds", "LDS"), ("lds", "DA")];
+        assert!(!watches(keeper().lds_only(true), &no_longer));
+    }
+}

@@ -10,7 +10,7 @@ use tokio::task::JoinSet;
 
 use crate::client;
 use crate::clock;
-use crate::keeper::Keeper;
+use crate::keeper::{Keeper, is_lds};
 use mdns::MdnsInterface;
 use mdns::Url;
 use mdns::{Mdns, MdnsFault, same_place};
@@ -24,6 +24,9 @@ pub struct WatchSettings {
     pub probe_every: Duration,
     /// The time without any answer after which a server is lost.
     pub lost_after: Duration,
+    /// Whether only discovery servers are watched. Others are neither probed nor queried, so that
+    /// a hundred programs that look for a discovery server do not connect to each other.
+    pub lds_only: bool,
 }
 
 impl Default for WatchSettings {
@@ -33,6 +36,7 @@ impl Default for WatchSettings {
             mdns: Some(MdnsInterface::LOOPBACK),
             probe_every: settings.probe_every,
             lost_after: settings.lost_after,
+            lds_only: false,
         }
     }
 }
@@ -61,9 +65,7 @@ impl PresentServer {
     /// Returns whether the server is a Local Discovery Server, which has no functions of its own.
     #[must_use]
     pub fn is_lds(&self) -> bool {
-        self.capabilities
-            .iter()
-            .any(|code| code.eq_ignore_ascii_case("LDS"))
+        is_lds(&self.capabilities)
     }
 }
 
@@ -118,7 +120,7 @@ pub fn watch(settings: WatchSettings) -> Result<ServerWatcher, MdnsFault> {
     };
     let (tell, found) = mpsc::channel(16);
     let watching = Watching {
-        keeper: Keeper::new(registry, mdns, None),
+        keeper: Keeper::new(registry, mdns, None).lds_only(settings.lds_only),
         servers: Servers::default(),
         asking: JoinSet::new(),
         ask: VecDeque::new(),

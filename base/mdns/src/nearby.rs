@@ -1,0 +1,238 @@
+//! What a program that only announces its server reads of the packets of others: how many servers
+//! there are, whether another server has its name, and when its discovery server starts.
+//!
+//! Packets without these contents cost a pass over their records, and no memory.
+
+use std::collections::BTreeMap;
+use std::hash::{DefaultHasher, Hasher as _};
+use std::net::SocketAddr;
+use std::time::Duration;
+
+use mdns_sd::MDNS_PORT;
+use registry::AnnouncedServer;
+use tokio::time::Instant;
+
+use crate::announcement::{Aside, ServerRecords, same_place};
+use crate::group::{OPCUA_TCP, instance_of};
+use crate::interface::Subnets;
+use crate::own::SERVERS_AT_FULL_RATE;
+use crate::packet::{DnsName, DnsPacket, DnsRecord};
+use crate::url::Url;
+
+/// The servers of other programs on the network.
+#[derive(Debug, Default)]
+pub(crate) struct NearbyServers {
+    /// The last announcement of each server, by the hash of its name.
+    heard: BTreeMap<u64, Instant>,
+    /// The discovery server of this program.
+    heeded: Option<HeededServer>,
+}
+
+/// A server whose announcements are read.
+#[derive(Debug)]
+struct HeededServer {
+    url: String,
+    port: u16,
+    last: Option<(AnnouncedServer, Aside, Instant)>,
+}
+
+/// A content of a packet that concerns this program.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) enum Sighting {
+    /// The heeded server was announced for the first time, with changes, or after a pause.
+    Heeded {
+        announcement: AnnouncedServer,
+        aside: Aside,
+    },
+    /// A name of this program is announced with another port or host name.
+    Rival { announcement: AnnouncedServer },
+    /// A program on the network may need the announcements of this program.
+    Newcomer,
+}
+
+impl NearbyServers {
+    /// Reads the announcements of the server with this URL, or of none.
+    pub(crate) fn heed(&mut self, url: Option<&str>) {
+        self.heeded = url.and_then(|url| {
+            Some(HeededServer {
+                url: url.to_owned(),
+                port: Url::parse(url)?.port,
+                last: None,
+            })
+        });
+    }
+
+    /// Returns the number of servers that were announced in the last minutes.
+    pub(crate) fn count(&self) -> usize {
+        self.heard.len()
+    }
+
+    /// Removes the servers that were not announced for longer than their records are valid.
+    pub(crate) fn forget(&mut self, now: Instant) {
+        self.heard
+            .retain(|_, at| now.saturating_duration_since(*at) < VALID);
+    }
+
+    /// Reads a packet. `own` returns the port and the host name in the announcement of a name of
+    /// this program.
+    pub(crate) fn take<'o>(
+        &mut self,
+        (packet, from): (&[u8], SocketAddr),
+        own: impl Fn(&str) -> Option<(u16, &'o str)>,
+        subnets: &Subnets,
+        now: Instant,
+    ) -> Vec<Sighting> {
+        let Some(packet) = DnsPacket::new(packet) else {
+            return Vec::new();
+        };
+        if !packet.is_response() {
+            // The response is sent to the port of the query, where its sender may not listen.
+            let mut asked = packet.questions();
+            let asks = from.port() != MDNS_PORT && asked.any(|name| name.is(&OPCUA_TCP));
+            return asks.then_some(Sighting::Newcomer).into_iter().collect();
+        }
+        let mut seen = Vec::new();
+        let mut descriptions = MOST_DESCRIPTIONS;
+        for record in packet.records() {
+            let Some(server) = ServerName::of(&record) else {
+                continue;
+            };
+            if record.is_withdrawn {
+                self.left(server.label);
+                continue;
+            }
+            // Each description is another pass over the records.
+            let mut described = || {
+                descriptions = descriptions.checked_sub(1)?;
+                described(packet, &record, subnets)
+            };
+            let name = std::str::from_utf8(server.label).ok();
+            if let Some(own) = name.and_then(&own) {
+                let rival = (!server.is_at(own)).then(&mut described).flatten();
+                seen.extend(rival.map(|(announcement, _)| Sighting::Rival { announcement }));
+                continue;
+            }
+            if self.hear(server.label, now) && is_to_be_told(from.port(), self.count()) {
+                seen.push(Sighting::Newcomer);
+            }
+            let heeded = self.heeded.as_ref();
+            if heeded.is_some_and(|heeded| heeded.port == server.port) {
+                seen.extend(described().and_then(|told| self.heeded_told(told, now)));
+            }
+        }
+        seen
+    }
+
+    /// Records an announcement. Returns whether the server is new.
+    fn hear(&mut self, label: &[u8], now: Instant) -> bool {
+        let key = hash(label);
+        if let Some(at) = self.heard.get_mut(&key) {
+            *at = now;
+            return false;
+        }
+        let has_room = self.heard.len() < MOST;
+        if has_room {
+            self.heard.insert(key, now);
+        }
+        has_room
+    }
+
+    fn left(&mut self, label: &[u8]) {
+        self.heard.remove(&hash(label));
+        if let Some(heeded) = &mut self.heeded {
+            // The next announcement is that of another run.
+            heeded.last = heeded.last.take().filter(|(known, ..)| {
+                let instance = known.instance.as_bytes();
+                !instance.eq_ignore_ascii_case(label)
+            });
+        }
+    }
+
+    /// Returns an announcement of the heeded server, unless it repeats the last announcement.
+    fn heeded_told(
+        &mut self,
+        (announcement, aside): (AnnouncedServer, Aside),
+        now: Instant,
+    ) -> Option<Sighting> {
+        let heeded = self.heeded.as_mut()?;
+        if !same_place(&heeded.url, &announcement.url) {
+            return None;
+        }
+        let last = heeded
+            .last
+            .replace((announcement.clone(), aside, now))
+            .filter(|(.., at)| now.saturating_duration_since(*at) < VALID);
+        let is_repeated =
+            last.is_some_and(|(known, beside, _)| (known, beside) == (announcement.clone(), aside));
+        (!is_repeated).then_some(Sighting::Heeded {
+            announcement,
+            aside,
+        })
+    }
+}
+
+/// The name of a server in its SRV record, and its port and host name.
+struct ServerName<'p> {
+    label: &'p [u8],
+    port: u16,
+    host: DnsName<'p>,
+}
+
+impl<'p> ServerName<'p> {
+    /// Returns `None` for records of other types and of other services.
+    fn of(record: &DnsRecord<'p>) -> Option<Self> {
+        let (port, host) = record.server()?;
+        let (label, service) = record.owner.split_first()??;
+        service.is(&OPCUA_TCP).then_some(Self { label, port, host })
+    }
+
+    /// Returns whether the server has this port and this host name.
+    fn is_at(&self, (port, host): (u16, &str)) -> bool {
+        let name = self.host.text();
+        self.port == port && name.is_some_and(|name| name.eq_ignore_ascii_case(host))
+    }
+}
+
+/// Returns whether a new server is a reason to announce the servers of this program soon. A server
+/// that sends from the port of mDNS receives the responses to its queries. Others may not receive
+/// them.
+fn is_to_be_told(from_port: u16, servers: usize) -> bool {
+    from_port != MDNS_PORT || u32::try_from(servers).is_ok_and(|few| few <= SERVERS_AT_FULL_RATE)
+}
+
+/// Returns the announcement of a server whose records are all in one packet, as in announcements.
+fn described(
+    packet: DnsPacket<'_>,
+    server: &DnsRecord<'_>,
+    subnets: &Subnets,
+) -> Option<(AnnouncedServer, Aside)> {
+    let (port, host) = server.server()?;
+    let is_text = |record: &DnsRecord<'_>| record.is_text() && record.owner.is_same(server.owner);
+    let texts = packet.records().find(is_text)?;
+    let of_host = packet.records().filter(|record| record.owner.is_same(host));
+    let records = ServerRecords {
+        instance: instance_of(server.owner)?,
+        addresses: of_host.filter_map(|record| record.address()).collect(),
+        port,
+    };
+    records.announcement(|key| texts.text(key), subnets)
+}
+
+fn hash(label: &[u8]) -> u64 {
+    let mut hasher = DefaultHasher::new();
+    for byte in label {
+        hasher.write_u8(byte.to_ascii_lowercase());
+    }
+    hasher.finish()
+}
+
+/// The lifetime of the records of an address (RFC 6762, 10), and some time for a late
+/// announcement.
+const VALID: Duration = Duration::from_secs(150);
+/// Maximum number of descriptions that are read from a packet.
+const MOST_DESCRIPTIONS: u32 = 4;
+/// Maximum number of stored servers.
+const MOST: usize = 4096;
+
+#[cfg(test)]
+mod tests;
