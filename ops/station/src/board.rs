@@ -1,7 +1,7 @@
 //! The state of both levels, for the status pages and the discovery server.
 
 use std::collections::BTreeMap;
-use std::sync::{Mutex, PoisonError};
+use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use discovery::lds::{Added, Gated};
 use registry::renamed;
@@ -18,7 +18,7 @@ pub(crate) enum Level {
 }
 
 /// A server in the status.
-#[derive(Debug, Clone, Default, Serialize)]
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize)]
 pub(crate) struct StatusPeer {
     /// The displayed name, unique on its level.
     pub(crate) name: String,
@@ -77,14 +77,22 @@ impl Board {
         (board, added)
     }
 
+    fn lock(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
     fn change<T>(&self, how: impl FnOnce(&mut State) -> T) -> T {
-        let mut state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut state = self.lock();
         let done = how(&mut state);
-        self.tell.send_replace(Added {
-            gated: gated(&state),
-            status: Some(status(&state)),
-        });
+        self.report(&state);
         done
+    }
+
+    fn report(&self, state: &State) {
+        self.tell.send_replace(Added {
+            gated: gated(state),
+            status: Some(status(state)),
+        });
     }
 
     /// Adds the face below.
@@ -118,19 +126,24 @@ impl Board {
         })
     }
 
-    /// Updates the entry of a server, if it exists.
+    /// Updates the entry of a server, if it exists. An entry that stays the same is not reported:
+    /// each report contains all servers.
     pub(crate) fn note(&self, level: Level, url: &str, how: impl FnOnce(&mut StatusPeer)) {
-        self.change(|state| {
-            if let Some(peer) = state.peers.get_mut(&(level, url.to_owned())) {
-                how(peer);
-            }
-        });
+        let mut state = self.lock();
+        let Some(peer) = state.peers.get_mut(&(level, url.to_owned())) else {
+            return;
+        };
+        let before = peer.clone();
+        how(peer);
+        if *peer != before {
+            self.report(&state);
+        }
     }
 
     /// Returns whether a connected server of the level has this ApplicationUri in a verified
     /// certificate.
     pub(crate) fn knows(&self, level: Level, application_uri: &str) -> bool {
-        let state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
+        let state = self.lock();
         state.peers.iter().any(|((at, _), peer)| {
             *at == level && peer.is_there() && peer.secured && peer.uri == application_uri
         })
@@ -211,5 +224,19 @@ mod tests {
         assert_eq!(added.borrow().gated, [own, through]);
         assert_eq!(board.leave(Level::Above, "u1").as_deref(), Some("b"));
         assert_eq!(added.borrow().gated.len(), 1);
+    }
+
+    #[test]
+    fn a_server_that_is_searched_again_without_a_change_is_not_reported() {
+        let (board, mut added) = Board::new();
+        board.enter(Level::Below, "u1", "a");
+        let connected = |peer: &mut StatusPeer| peer.state = CONNECTED;
+        board.note(Level::Below, "u1", connected);
+        added.mark_unchanged();
+        board.note(Level::Below, "u1", connected);
+        board.note(Level::Below, "u2", connected);
+        assert!(!added.has_changed().unwrap());
+        board.note(Level::Below, "u1", |peer| peer.state = BUSY);
+        assert!(added.has_changed().unwrap());
     }
 }
