@@ -223,14 +223,16 @@ impl Router {
             self.roles().handle_timeout(now);
         }
         self.look_at_part(now);
+        let mut repeated = 0;
         while let Some(at) = self.values.next_due(now) {
             let topic = at.topic();
             self.announcements
                 .announce_again(&mut self.values, topic, now);
-            self.values.handle_due(at, now);
+            repeated += usize::from(self.values.handle_due(at, now.monotonic, now));
             self.values.settle_arrival(topic);
             self.values.schedule(at);
         }
+        self.values.send_early(repeated, now);
         self.look_at_claims(now);
         self.call_traffic().look_at_calls(now);
         self.inquire(now);

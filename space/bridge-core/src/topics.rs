@@ -139,10 +139,15 @@ impl TopicTable {
             .collect()
     }
 
+    /// Returns whether there are so many topics that their repetitions are spread over the period.
+    pub(crate) fn is_spread(&self) -> bool {
+        self.index.len() >= SPREAD
+    }
+
     /// Returns by how much a topic repeats earlier than after `period`, once. Many topics that
     /// start together are then spread over the period instead of being repeated in a burst.
     pub(crate) fn lead(&self, at: Handle, period: Duration) -> Duration {
-        if self.index.len() < SPREAD {
+        if !self.is_spread() {
             return Duration::ZERO;
         }
         // Multiples of the golden ratio divide the period evenly for any number of slots.

@@ -1,6 +1,7 @@
 //! Ten thousand topics: memory of the start, and repetitions that are spread over their
 //! period.
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -34,16 +35,12 @@ impl Many {
         }
     }
 
-    fn topics() -> impl Iterator<Item = TopicId> {
-        (1..=TOPICS).map(|id| TopicId::new(1, 5, id).unwrap())
-    }
-
-    /// Binds all topics, and gives each a value.
-    fn start(&mut self) {
+    /// Binds this number of topics, and gives each a value.
+    fn start(&mut self, topics: u16) {
         let message = TypeRegistry::bundle(Dialect::Ros1)
             .get(&"geometry_msgs/Twist".parse().unwrap())
             .unwrap();
-        for topic in Self::topics() {
+        for topic in (1..=topics).map(|id| TopicId::new(1, 5, id).unwrap()) {
             self.router
                 .bind(topic, &message, &Selection::Whole, self.now)
                 .unwrap();
@@ -87,7 +84,7 @@ fn ten_thousand_topics_take_less_than_6_kb_each() {
     let mut many = None;
     let counted = measure(|| {
         let mut made = Many::new();
-        made.start();
+        made.start(TOPICS);
         many = Some(made);
     });
     let each = counted.bytes_current / i64::from(TOPICS);
@@ -98,7 +95,7 @@ fn ten_thousand_topics_take_less_than_6_kb_each() {
 #[test]
 fn repetitions_of_ten_thousand_topics_are_spread_over_their_period() {
     let mut many = Many::new();
-    many.start();
+    many.start(TOPICS);
     let pubsub = Mapping::default().pubsub().clone();
     let period = pubsub.key_frame_period;
     let step = period / 100;
@@ -113,4 +110,39 @@ fn repetitions_of_ten_thousand_topics_are_spread_over_their_period() {
     );
     // A hundredth of them in a hundredth of the period.
     assert!(most <= 3 * usize::from(TOPICS) / 100, "{sent:?}");
+}
+
+#[test]
+fn a_program_of_eighty_topics_wakes_for_several_repetitions_at_once() {
+    let mut many = Many::new();
+    many.start(80);
+    let period = Mapping::default().pubsub().key_frame_period;
+    let start = many.now.monotonic;
+    let seconds = 10;
+    let (mut wakes, mut sent) = (0, 0);
+    let mut last = BTreeMap::new();
+    while let Some(due) = many.router.poll_timeout() {
+        let since = due.saturating_duration_since(start);
+        if since > period * seconds {
+            break;
+        }
+        many.now.monotonic = due.max(many.now.monotonic);
+        many.router.handle_timeout(many.now);
+        let before = sent;
+        while let Some(output) = many.router.poll_output(many.now) {
+            if let Output::Datagram { topic, .. } = output {
+                sent += 1;
+                if let Some(before) = last.insert(topic, since) {
+                    assert!(since - before <= period, "{topic} is repeated in time");
+                }
+            }
+        }
+        wakes += u32::from(sent > before);
+    }
+    // Each topic once a period, apart from the repetitions that spread them.
+    assert!((80 * seconds..=100 * seconds).contains(&sent), "{sent}");
+    assert!(
+        wakes <= 25 * seconds,
+        "{wakes} times for {sent} repetitions"
+    );
 }

@@ -18,15 +18,16 @@ use crate::topics::Handle;
 use crate::writer::Idle;
 
 impl TopicQueues {
-    /// Repeats a value, sends a keep-alive, or detects the silence of a topic.
-    pub(super) fn handle_due(&mut self, at: Handle, now: Now) {
+    /// Repeats a value, sends a keep-alive, or detects the silence of a topic. Repetitions and
+    /// keep-alives are sent if they are due at `until`. Returns whether one is sent.
+    pub(super) fn handle_due(&mut self, at: Handle, until: Instant, now: Now) -> bool {
         self.expire_held(at.topic(), now);
         let (key_frames, keep_alives, silence) = self.periods();
         let muted = self.is_muted();
         let leads = [key_frames, keep_alives].map(|period| self.topics.lead(at, period));
         let [repeat_lead, keep_alive_lead] = leads;
         let Some(entry) = self.topics.at_mut(at) else {
-            return;
+            return false;
         };
         match &mut entry.role {
             TopicSide::Theirs(reader) => {
@@ -42,6 +43,7 @@ impl TopicQueues {
                 {
                     self.lose(at, now);
                 }
+                false
             }
             TopicSide::Ours(writer) => {
                 if let Some(held) = entry
@@ -50,17 +52,17 @@ impl TopicQueues {
                     .and_then(|gate| gate.release(now.monotonic))
                 {
                     self.let_go(at, Some(held), now);
-                    return;
+                    return false;
                 }
                 if writer.look_again(now.monotonic) && !entry.ready {
                     entry.ready = true;
                     self.ready.push_back(at);
                 }
                 let Some((due, idle)) = writer.due(key_frames, keep_alives) else {
-                    return;
+                    return false;
                 };
-                if due > now.monotonic {
-                    return;
+                if due > until {
+                    return false;
                 }
                 match idle {
                     Idle::Repeat => {
@@ -90,6 +92,7 @@ impl TopicQueues {
                     entry.ready = true;
                     self.ready.push_back(at);
                 }
+                true
             }
         }
     }
@@ -201,6 +204,44 @@ impl TopicQueues {
         None
     }
 
+    /// Sends repetitions and keep-alives that are due soon together with those that were `sent`
+    /// because they are due. Otherwise the program would wake for each of many topics, whose
+    /// repetitions are spread over their period.
+    pub(super) fn send_early(&mut self, sent: usize, now: Now) {
+        let mut sent = sent;
+        let (key_frames, ..) = self.periods();
+        let until = now.monotonic + key_frames / EARLY;
+        while (1..SENT_TOGETHER).contains(&sent)
+            && self.topics.is_spread()
+            && let Some(at) = self.next_idle(until)
+        {
+            let is_sent = self.handle_due(at, until, now);
+            self.schedule(at);
+            if !is_sent {
+                return;
+            }
+            sent += 1;
+        }
+    }
+
+    /// Returns the next topic if it is due at `until` and only for a repetition or a keep-alive.
+    fn next_idle(&mut self, until: Instant) -> Option<Handle> {
+        let (key_frames, keep_alives, _) = self.periods();
+        let Reverse((due, at)) = self.timers.peek().copied()?;
+        let entry = self.topics.at_mut(at)?;
+        let TopicSide::Ours(writer) = &entry.role else {
+            return None;
+        };
+        let idle = writer.due(key_frames, keep_alives).map(|(at, _)| at);
+        let is_idle = due <= until && entry.timer == Some(due) && idle == Some(due);
+        if !is_idle || entry.gate.is_some() || writer.again_at().is_some() {
+            return None;
+        }
+        entry.timer = None;
+        self.timers.pop();
+        Some(at)
+    }
+
     /// Returns the time at which the next topic is due.
     pub(super) fn due(&self) -> Option<Instant> {
         self.timers.peek().map(|Reverse((due, _))| *due)
@@ -217,3 +258,8 @@ impl TopicQueues {
         )
     }
 }
+
+/// Part of the period by which a repetition may be sent early.
+const EARLY: u32 = 10;
+/// Number of repetitions for which the program wakes once.
+const SENT_TOGETHER: usize = 8;
