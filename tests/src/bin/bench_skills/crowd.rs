@@ -1,10 +1,13 @@
 //! `cargo xtask bench skills station`: many devices with many skills below one station.
 
+use std::fs;
+use std::ops::Range;
 use std::time::{Duration, Instant};
 
 use skills::{ClientOptions, ParameterType, RunnableSkill as _, SkillClient};
 use system_tests::{
-    Cell, Child, PlantSite, StartedChild, Times, cpu_share, eventually, metrics, program, resident,
+    Cell, Child, PlantSite, StartedChild, Times, cpu_share, eventually, metrics, processor_time,
+    program, resident,
 };
 
 /// Measures the time until the skills of all devices are seen above the station, the duration of
@@ -26,20 +29,28 @@ pub(crate) fn all(devices: usize, skills: usize, runs: usize) -> Option<()> {
         .map(|number| device(&cell, &bottom, (number, skills)))
         .collect();
     let started = began.elapsed();
+    let serve = eventually("all devices serve", SOON, || {
+        pause();
+        let serving = bottom.within(|| listening(FIRST_PORT..FIRST_PORT + devices));
+        (serving >= devices).then(|| began.elapsed())
+    });
     let shown = eventually("all devices are shown", SOON, || {
+        pause();
         let seen = middle.within(|| seen(skills))?;
         (seen >= devices).then(|| began.elapsed())
     });
+    let load = Load::until_now(&station, &children, &bottom);
     let (listed, found, mut times) = top.within(|| above(runs));
     assert_eq!(found, devices * skills, "skills above the station");
     let idle = cpu_share(station.id(), WINDOW);
     println!("\n{devices} devices of {skills} skills below one station:\n");
     println!(
-        "| all started | all shown above | listed by a client in | run of 1 ms, p50 | p99 | RAM of the station | of a processor, idle |\n|---|---|---|---|---|---|---|"
+        "| all started | all serve | all shown above | listed by a client in | run of 1 ms, p50 | p99 | RAM of the station | of a processor, idle |\n|---|---|---|---|---|---|---|---|"
     );
     println!(
-        "| {:.1} s | {:.1} s | {:.2} s | {:.1} ms | {:.1} ms | {:.1} MB | {:.1} % |",
+        "| {:.1} s | {:.1} s | {:.1} s | {:.2} s | {:.1} ms | {:.1} ms | {:.1} MB | {:.1} % |",
         started.as_secs_f64(),
+        serve.as_secs_f64(),
         shown.as_secs_f64(),
         listed.as_secs_f64(),
         times.at(0.5) / 1e3,
@@ -47,8 +58,67 @@ pub(crate) fn all(devices: usize, skills: usize, runs: usize) -> Option<()> {
         resident(station.id()) as f64 / 1e6,
         idle * 100.0
     );
+    println!(
+        "\nUntil all were shown, the devices took {:.1} s of processor time ({:.0} ms each), the station {:.1} s. Each device received {:.0} UDP datagrams, and the kernel dropped {:.0} for it.",
+        load.devices.as_secs_f64(),
+        load.devices.as_secs_f64() * 1e3 / devices as f64,
+        load.station.as_secs_f64(),
+        load.received as f64 / devices as f64,
+        load.dropped as f64 / devices as f64
+    );
     drop(children);
     Some(())
+}
+
+/// The work of the programs so far.
+struct Load {
+    devices: Duration,
+    station: Duration,
+    /// UDP datagrams that the devices received.
+    received: u64,
+    /// UDP datagrams that the kernel dropped for the devices, by their filters and for full buffers.
+    dropped: u64,
+}
+
+impl Load {
+    fn until_now(station: &Child, children: &[Child], bottom: &PlantSite) -> Self {
+        let times = children.iter().map(|child| processor_time(child.id()));
+        Self {
+            devices: times.sum(),
+            station: processor_time(station.id()),
+            received: bottom
+                .within(|| datagrams("InDatagrams"))
+                .unwrap_or_default(),
+            dropped: bottom.within(|| datagrams("InErrors")).unwrap_or_default(),
+        }
+    }
+}
+
+/// Returns a count of UDP datagrams of this host by its name in `/proc/net/snmp`.
+fn datagrams(counted: &str) -> Option<u64> {
+    let counters = fs::read_to_string("/proc/thread-self/net/snmp").ok()?;
+    let mut of_udp = counters.lines().filter(|line| line.starts_with("Udp: "));
+    let (names, counts) = (of_udp.next()?, of_udp.next()?);
+    let mut both = names.split(' ').zip(counts.split(' '));
+    both.find(|(name, _)| *name == counted)?.1.parse().ok()
+}
+
+/// Returns the number of these TCP ports of this host that accept connections.
+fn listening(ports: Range<usize>) -> usize {
+    let sockets = fs::read_to_string("/proc/thread-self/net/tcp").unwrap_or_default();
+    let open = sockets.lines().filter_map(|line| {
+        let mut fields = line.split_whitespace().skip(1);
+        let (local, _, state) = (fields.next()?, fields.next()?, fields.next()?);
+        let (_, port) = local.split_once(':')?;
+        (state == LISTENS).then(|| usize::from_str_radix(port, 16).ok())?
+    });
+    open.filter(|port| ports.contains(port)).count()
+}
+
+/// Waits before the next look at the programs, so that looking is not what they are busy with: the
+/// status of a hundred servers is a page of its own.
+fn pause() {
+    std::thread::sleep(LOOK_EVERY);
 }
 
 fn station(at: &PlantSite) -> Child {
@@ -141,4 +211,7 @@ const UPPER: &str = "opc.tcp://10.80.0.11:4841";
 const STATUS: &str = "127.0.0.1:9104";
 const FIRST_PORT: usize = 20_000;
 const SOON: Duration = Duration::from_secs(300);
+const LOOK_EVERY: Duration = Duration::from_millis(100);
+/// The state of a listening socket in `/proc/net/tcp`.
+const LISTENS: &str = "0A";
 const WINDOW: Duration = Duration::from_secs(20);
