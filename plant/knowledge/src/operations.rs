@@ -18,19 +18,21 @@ pub fn triples() -> Vec<Triple> {
             object,
         });
     };
-    for (standard, base, operations) in [
-        ("VDI 2860", VDI_2860, HANDLING),
-        ("DIN 8580", DIN_8580, MANUFACTURING),
-    ] {
-        for (name, above) in operations {
-            let class = format!("{base}{name}");
-            let above = match *above {
-                "" => v::CAPABILITY.to_owned(),
-                above => format!("{base}{above}"),
-            };
+    for standard in [HANDLING, MANUFACTURING] {
+        let OperationStandard {
+            name, namespace, ..
+        } = standard;
+        let root = std::iter::once((standard.root, v::CAPABILITY.to_owned()));
+        let below = standard.groups.iter().flat_map(|group| {
+            let above = format!("{namespace}{}", group.above);
+            let names = group.names.split(' ');
+            names.map(move |operation| (operation, above.clone()))
+        });
+        for (operation, above) in root.chain(below) {
+            let class = format!("{namespace}{operation}");
             say(&class, v::RDFS_SUB_CLASS_OF, Object::Iri(above));
-            say(&class, v::RDFS_LABEL, Object::Text(label(name)));
-            say(&class, v::RDFS_COMMENT, Object::Text(standard.to_owned()));
+            say(&class, v::RDFS_LABEL, Object::Text(label(operation)));
+            say(&class, v::RDFS_COMMENT, Object::Text(name.to_owned()));
         }
     }
     all
@@ -55,154 +57,114 @@ pub const VDI_2860: &str = "http://www.hsu-ifa.de/ontologies/VDI2860#";
 /// The namespace of the manufacturing processes.
 pub const DIN_8580: &str = "http://www.w3id.org/hsu-aut/DIN8580#";
 
-/// The name of an operation, and the name of the more general operation; empty for the root.
-type Operation = (&'static str, &'static str);
+/// A standard whose operations are classes of capabilities.
+struct OperationStandard {
+    name: &'static str,
+    namespace: &'static str,
+    /// The operation above all others.
+    root: &'static str,
+    /// The other operations. Each is in the group of the operation above it.
+    groups: &'static [OperationGroup],
+}
 
-const HANDLING: &[Operation] = &[
-    ("Handling", ""),
-    ("Storing", "Handling"),
-    ("SortedStoring", "Storing"),
-    ("PartiallySortedStoring", "Storing"),
-    ("UnsortedStoring", "Storing"),
-    ("AlteringQuantities", "Handling"),
-    ("Dividing", "AlteringQuantities"),
-    ("Pooling", "AlteringQuantities"),
-    ("Separating", "AlteringQuantities"),
-    ("Allocating", "AlteringQuantities"),
-    ("Forking", "AlteringQuantities"),
-    ("Merging", "AlteringQuantities"),
-    ("Sorting", "AlteringQuantities"),
-    ("Moving", "Handling"),
-    ("Rotating", "Moving"),
-    ("Translating", "Moving"),
-    ("Pivoting", "Moving"),
-    ("Orienting", "Moving"),
-    ("Positioning", "Moving"),
-    ("Arranging", "Moving"),
-    ("Guiding", "Moving"),
-    ("Forwarding", "Moving"),
-    ("Conveying", "Moving"),
-    ("Securing", "Handling"),
-    ("Holding", "Securing"),
-    ("Releasing", "Securing"),
-    ("Tensioning", "Holding"),
-    ("Slackening", "Releasing"),
-    ("Controlling", "Handling"),
-    ("Analyzing", "Controlling"),
-    ("AnalyzingPresence", "Analyzing"),
-    ("AnalyzingIdentity", "Analyzing"),
-    ("AnalyzingForm", "Analyzing"),
-    ("AnalyzingSize", "Analyzing"),
-    ("AnalyzingColor", "Analyzing"),
-    ("AnalyzingWeight", "Analyzing"),
-    ("AnalyzingPosition", "Analyzing"),
-    ("AnalyzingOrientation", "Analyzing"),
-    ("Measuring", "Controlling"),
-    ("MeasuringPosition", "Measuring"),
-    ("MeasuringOrientation", "Measuring"),
-    ("Counting", "Controlling"),
-];
+/// The operations directly below an operation.
+struct OperationGroup {
+    above: &'static str,
+    /// Their names, with spaces between them.
+    names: &'static str,
+}
 
-const MANUFACTURING: &[Operation] = &[
-    ("Fertigungsverfahren", ""),
-    ("Urformen", "Fertigungsverfahren"),
-    ("Umformen", "Fertigungsverfahren"),
-    ("Druckumformen", "Umformen"),
-    ("Zugdruckumformen", "Umformen"),
-    ("Zugumformen", "Umformen"),
-    ("Biegeumformen", "Umformen"),
-    ("Schubumformen", "Umformen"),
-    ("Trennen", "Fertigungsverfahren"),
-    ("Zerteilen", "Trennen"),
-    ("Spanen_mit_geometrisch_bestimmten_Schneiden", "Trennen"),
-    ("Drehen", "Spanen_mit_geometrisch_bestimmten_Schneiden"),
-    (
-        "Bohren_oder_Senken_oder_Reiben",
-        "Spanen_mit_geometrisch_bestimmten_Schneiden",
-    ),
-    ("Fraesen", "Spanen_mit_geometrisch_bestimmten_Schneiden"),
-    (
-        "Hobeln_oder_Stossen",
-        "Spanen_mit_geometrisch_bestimmten_Schneiden",
-    ),
-    ("Raeumen", "Spanen_mit_geometrisch_bestimmten_Schneiden"),
-    ("Saegen", "Spanen_mit_geometrisch_bestimmten_Schneiden"),
-    (
-        "Feilen_oder_Raspeln",
-        "Spanen_mit_geometrisch_bestimmten_Schneiden",
-    ),
-    (
-        "Buerstenspanen",
-        "Spanen_mit_geometrisch_bestimmten_Schneiden",
-    ),
-    (
-        "Schaben_oder_Meisseln",
-        "Spanen_mit_geometrisch_bestimmten_Schneiden",
-    ),
-    ("Spanen_mit_geometrisch_unbestimmten_Schneiden", "Trennen"),
-    (
-        "Schleifen_mit_rotierendem_Werkzeug",
-        "Spanen_mit_geometrisch_unbestimmten_Schneiden",
-    ),
-    (
-        "Bandschleifen",
-        "Spanen_mit_geometrisch_unbestimmten_Schneiden",
-    ),
-    (
-        "Hubschleifen",
-        "Spanen_mit_geometrisch_unbestimmten_Schneiden",
-    ),
-    ("Honen", "Spanen_mit_geometrisch_unbestimmten_Schneiden"),
-    ("Laeppen", "Spanen_mit_geometrisch_unbestimmten_Schneiden"),
-    (
-        "Strahlspanen",
-        "Spanen_mit_geometrisch_unbestimmten_Schneiden",
-    ),
-    (
-        "Gleitspanen",
-        "Spanen_mit_geometrisch_unbestimmten_Schneiden",
-    ),
-    ("Abtragen", "Trennen"),
-    ("Zerlegen", "Trennen"),
-    ("Reinigen", "Trennen"),
-    ("Fuegen", "Fertigungsverfahren"),
-    ("Zusammensetzen", "Fuegen"),
-    ("Auflegen_oder_Aufsetzen_oder_Schichten", "Zusammensetzen"),
-    ("Einlegen_oder_Einsetzen", "Zusammensetzen"),
-    ("Ineinanderschieben", "Zusammensetzen"),
-    ("Einhaengen", "Zusammensetzen"),
-    ("Einrenken", "Zusammensetzen"),
-    ("Federnd_Einspreizen", "Zusammensetzen"),
-    ("Fuellen", "Fuegen"),
-    ("Einfuellen", "Fuellen"),
-    ("Traenken_oder_Impraegnieren", "Fuellen"),
-    ("An-_und_Einpressen", "Fuegen"),
-    ("Schrauben", "An-_und_Einpressen"),
-    ("Klemmen", "An-_und_Einpressen"),
-    ("Klammern", "An-_und_Einpressen"),
-    ("Fuegen_durch_Presspassung", "An-_und_Einpressen"),
-    (
-        "Nageln_oder_Verstiften_oder_Einschlagen",
-        "An-_und_Einpressen",
-    ),
-    ("Verkeilen", "An-_und_Einpressen"),
-    ("Verspannen", "An-_und_Einpressen"),
-    ("Fuegen_durch_Urformen", "Fuegen"),
-    ("Fuegen_durch_Umformen", "Fuegen"),
-    ("Fuegen_durch_Schweissen", "Fuegen"),
-    ("Fuegen_durch_Loeten", "Fuegen"),
-    ("Kleben", "Fuegen"),
-    ("Textiles_Fuegen", "Fuegen"),
-    ("Beschichten", "Fertigungsverfahren"),
-    ("Stoffeigenschaft_aendern", "Fertigungsverfahren"),
-    ("Verfestigen_durch_Umformen", "Stoffeigenschaft_aendern"),
-    ("Waermebehandeln", "Stoffeigenschaft_aendern"),
-    ("Thermomechanisches_Behandeln", "Stoffeigenschaft_aendern"),
-    ("Sintern_oder_Brennen", "Stoffeigenschaft_aendern"),
-    ("Magnetisieren", "Stoffeigenschaft_aendern"),
-    ("Bestrahlen", "Stoffeigenschaft_aendern"),
-    ("Photochemische_Verfahren", "Stoffeigenschaft_aendern"),
-];
+const fn below(above: &'static str, names: &'static str) -> OperationGroup {
+    OperationGroup { above, names }
+}
+
+const HANDLING: OperationStandard = OperationStandard {
+    name: "VDI 2860",
+    namespace: VDI_2860,
+    root: "Handling",
+    groups: &[
+        below(
+            "Handling",
+            "Storing AlteringQuantities Moving Securing Controlling",
+        ),
+        below(
+            "Storing",
+            "SortedStoring PartiallySortedStoring UnsortedStoring",
+        ),
+        below(
+            "AlteringQuantities",
+            "Dividing Pooling Separating Allocating Forking Merging Sorting",
+        ),
+        below(
+            "Moving",
+            "Rotating Translating Pivoting Orienting Positioning Arranging Guiding Forwarding \
+             Conveying",
+        ),
+        below("Securing", "Holding Releasing"),
+        below("Holding", "Tensioning"),
+        below("Releasing", "Slackening"),
+        below("Controlling", "Analyzing Measuring Counting"),
+        below(
+            "Analyzing",
+            "AnalyzingPresence AnalyzingIdentity AnalyzingForm AnalyzingSize AnalyzingColor \
+             AnalyzingWeight AnalyzingPosition AnalyzingOrientation",
+        ),
+        below("Measuring", "MeasuringPosition MeasuringOrientation"),
+    ],
+};
+
+const MANUFACTURING: OperationStandard = OperationStandard {
+    name: "DIN 8580",
+    namespace: DIN_8580,
+    root: "Fertigungsverfahren",
+    groups: &[
+        below(
+            "Fertigungsverfahren",
+            "Urformen Umformen Trennen Fuegen Beschichten Stoffeigenschaft_aendern",
+        ),
+        below(
+            "Umformen",
+            "Druckumformen Zugdruckumformen Zugumformen Biegeumformen Schubumformen",
+        ),
+        below(
+            "Trennen",
+            "Zerteilen Spanen_mit_geometrisch_bestimmten_Schneiden \
+             Spanen_mit_geometrisch_unbestimmten_Schneiden Abtragen Zerlegen Reinigen",
+        ),
+        below(
+            "Spanen_mit_geometrisch_bestimmten_Schneiden",
+            "Drehen Bohren_oder_Senken_oder_Reiben Fraesen Hobeln_oder_Stossen Raeumen Saegen \
+             Feilen_oder_Raspeln Buerstenspanen Schaben_oder_Meisseln",
+        ),
+        below(
+            "Spanen_mit_geometrisch_unbestimmten_Schneiden",
+            "Schleifen_mit_rotierendem_Werkzeug Bandschleifen Hubschleifen Honen Laeppen \
+             Strahlspanen Gleitspanen",
+        ),
+        below(
+            "Fuegen",
+            "Zusammensetzen Fuellen An-_und_Einpressen Fuegen_durch_Urformen \
+             Fuegen_durch_Umformen Fuegen_durch_Schweissen Fuegen_durch_Loeten Kleben \
+             Textiles_Fuegen",
+        ),
+        below(
+            "Zusammensetzen",
+            "Auflegen_oder_Aufsetzen_oder_Schichten Einlegen_oder_Einsetzen Ineinanderschieben \
+             Einhaengen Einrenken Federnd_Einspreizen",
+        ),
+        below("Fuellen", "Einfuellen Traenken_oder_Impraegnieren"),
+        below(
+            "An-_und_Einpressen",
+            "Schrauben Klemmen Klammern Fuegen_durch_Presspassung \
+             Nageln_oder_Verstiften_oder_Einschlagen Verkeilen Verspannen",
+        ),
+        below(
+            "Stoffeigenschaft_aendern",
+            "Verfestigen_durch_Umformen Waermebehandeln Thermomechanisches_Behandeln \
+             Sintern_oder_Brennen Magnetisieren Bestrahlen Photochemische_Verfahren",
+        ),
+    ],
+};
 
 #[cfg(test)]
 mod tests {
@@ -214,14 +176,13 @@ mod tests {
 
     #[test]
     fn each_operation_has_one_name_and_is_below_an_operation_before_it() {
-        for operations in [HANDLING, MANUFACTURING] {
-            let mut known: BTreeSet<&str> = BTreeSet::new();
-            for (name, above) in operations {
-                assert!(
-                    known.contains(above) || known.is_empty(),
-                    "{name} is below {above}"
-                );
-                assert!(known.insert(name), "{name} is there twice");
+        for standard in [HANDLING, MANUFACTURING] {
+            let mut known = BTreeSet::from([standard.root]);
+            for OperationGroup { above, names } in standard.groups {
+                assert!(known.contains(above), "{above} is not there yet");
+                for name in names.split(' ') {
+                    assert!(known.insert(name), "{name} is there twice");
+                }
             }
         }
     }
