@@ -11,7 +11,7 @@ use serde::Serialize;
 use skills::ParameterType;
 use skills::choosing::{self, Attachment, CandidateRank, choose};
 
-use crate::process::{By, Group, Need, Process, ProcessStep, SkillRole, StepJob};
+use crate::process::{BadEnd, By, Group, Need, Process, ProcessStep, SkillRole, StepJob};
 
 use judging::Judging;
 pub(crate) use judging::TOOL;
@@ -152,6 +152,15 @@ pub(crate) struct KeptStep {
     pub(crate) offer: Offer,
 }
 
+/// The reason why the process goes on behind a step that is not done.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Passed {
+    /// Its conditions did not hold.
+    Skipped,
+    /// Other steps handle its end, which is confirmed.
+    Ended(BadEnd),
+}
+
 /// The facts about a run that its next plan has to respect.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct Situation<'a> {
@@ -159,8 +168,8 @@ pub(crate) struct Situation<'a> {
     pub(crate) fallen: &'a [Fallen],
     /// The steps that are done.
     pub(crate) kept: &'a [KeptStep],
-    /// The numbers of the steps that were passed without being done.
-    pub(crate) passed: &'a [usize],
+    /// The steps that were passed without being done, by their numbers.
+    pub(crate) passed: Option<&'a BTreeMap<usize, Passed>>,
     /// The components that other runs use, with these runs.
     pub(crate) used: Option<&'a BTreeMap<String, String>>,
 }
@@ -168,7 +177,7 @@ pub(crate) struct Situation<'a> {
 impl Situation<'_> {
     /// Returns whether a role belongs to a step that was passed, or to its compensation.
     fn is_passed(&self, process: &Process, role: SkillRole) -> bool {
-        self.passed.iter().any(|number| {
+        self.passed.into_iter().flatten().any(|(number, _)| {
             [*number, process.compensation_of(*number)]
                 .map(SkillRole::Alone)
                 .contains(&role)

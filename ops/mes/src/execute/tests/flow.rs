@@ -235,3 +235,64 @@ async fn a_stop_ends_all_branches() {
     let ended = run.plans[0].ran.iter().map(|ran| ran.outcome);
     assert_eq!(ended.collect::<Vec<_>>(), [How::Stopped, How::Stopped]);
 }
+
+/// Counts, attaches a tool, attaches another tool if a test holds, and grasps.
+fn changing(test: Test) -> Process {
+    let attach = |number, name, tool: &str| ProcessStep {
+        parameters: vec![GivenParameter {
+            name: "ToolAppUri".into(),
+            value: tool.into(),
+            unit: None,
+            result: None,
+            query: None,
+        }],
+        ..alone(number, name, "AttachToolSkillType")
+    };
+    let mut steps = vec![
+        alone(0, "count", "CountType"),
+        attach(1, "attach", "urn:example:other"),
+        attach(2, "attach another", GRIPPER),
+        alone(3, "grasp", "GraspSkillType"),
+    ];
+    steps[2].when = when(0, test, false);
+    sequence(steps)
+}
+
+#[tokio::test]
+async fn a_skipped_or_failed_step_attaches_no_tool_for_later_steps() {
+    let offers = || {
+        let mut offers = [gripper("gripper"), gripper("other")].concat();
+        offers.push(offer("one", "Count", "CountType"));
+        offers.push(offer("changer", "Attach", "AttachToolSkillType"));
+        offers
+    };
+    let runs = |compare| Test::Result {
+        name: "Runs".into(),
+        compare,
+        value: 1.into(),
+    };
+    for (test, grasp, plans) in [
+        (runs(Compare::Equal), "gripper.Grasp", 1),
+        (runs(Compare::Greater), "other.Grasp", 2),
+    ] {
+        let (run, fakes, _) = executed(plant(offers()), &changing(test)).await;
+        assert_eq!((run.outcome, run.plans.len()), (How::Done, plans));
+        assert_eq!(ran(&fakes).last().map(String::as_str), Some(grasp));
+    }
+    // The failed step is handled, and no tool is known to be attached.
+    let mut process = changing(runs(Compare::Equal));
+    process.steps.remove(2);
+    process.steps[2] = alone(2, "rinse", "CountType");
+    process.steps[2].when = when(1, Test::Ended(BadEnd::Failed), false);
+    let mut grasp = alone(3, "grasp", "GraspSkillType");
+    grasp.by = By::AttachedTool;
+    process.steps.push(grasp);
+    let mut fakes = plant(offers());
+    fakes.fails_at = Some("changer.Attach");
+    let (run, fakes, _) = executed(fakes, &process).await;
+    assert_eq!(run.outcome, How::Failed);
+    let reason = run.reason.unwrap();
+    let expected = "no step before it attaches a tool";
+    assert!(reason.contains(expected), "{reason}");
+    assert_eq!(ran(&fakes), ["one.Count", "changer.Attach 1"]);
+}
