@@ -13,7 +13,7 @@ use async_trait::async_trait;
 use futures_util::future::join_all;
 use knowledge::{
     ComponentFacts, Knowledge, KnowledgeSource, NodeName, QuestionAnswer, SourceKind,
-    SourceLifetime, ValueQuery,
+    SourceLifetime, ValueQuery, ValueQueryFault,
 };
 use serde::Serialize;
 use skills::choosing::Attachment;
@@ -30,7 +30,8 @@ use self::facts::skill_facts;
 use self::opened::OpenedSkills;
 use self::parameters::{connects, parameter, result, values};
 use crate::execute::{OpenFault, Opened, Plant};
-use crate::goal::{GoalAction, GoalConditions, Sequence};
+use crate::goal::{GoalAction, GoalConditions, GoalFault, Sequence};
+use crate::parameter_fault::ParameterFault;
 use crate::plan::Offer;
 use crate::process::{GivenParameter, ParameterQuery, Process};
 use crate::read_process::Processes;
@@ -203,8 +204,8 @@ impl PlantState {
         }
         match self.goal(iri) {
             Ok(planned) => return Ok(planned.process),
-            Err(Some(why)) => return Err(format!("the goal `{shown}` cannot be reached: {why}")),
-            Err(None) => {}
+            Err(GoalFault::Unknown) => {}
+            Err(fault) => return Err(format!("the goal `{shown}` cannot be reached: {fault}")),
         }
         let known = processes.all.iter().take(MOST_SHOWN);
         let known: Vec<_> = known.map(|process| process.iri.as_str()).collect();
@@ -217,10 +218,10 @@ impl PlantState {
     /// Plans a goal with the actions whose capabilities have skills.
     ///
     /// # Errors
-    /// The reason why it cannot be reached; `None` if there is no such goal.
-    pub(crate) fn goal(&self, iri: &str) -> Result<PlannedGoal, Option<String>> {
+    /// The reason why it cannot be reached.
+    pub(crate) fn goal(&self, iri: &str) -> Result<PlannedGoal, GoalFault> {
         let goal = GoalConditions::read(&self.knowledge, iri)?;
-        let all = GoalAction::read(&self.knowledge).map_err(Some)?;
+        let all = GoalAction::read(&self.knowledge)?;
         let offers = self.offers();
         let (actions, without): (Vec<_>, Vec<_>) = all.into_iter().partition(|action| {
             let mut skills = offers.iter().filter(|offer| offer.is_skill);
@@ -230,12 +231,12 @@ impl PlantState {
         let searching = searching.unwrap_or_else(PoisonError::into_inner);
         let sequence = goal.search(&actions);
         drop(searching);
-        let sequence = sequence.map_err(|why| {
-            let without: Vec<_> = without.iter().map(|action| action.name.as_str()).collect();
-            Some(match without.as_slice() {
-                [] => why,
-                without => format!("{why}; no skill is there for {}", without.join(", ")),
-            })
+        let sequence = sequence.map_err(|fault| match without.is_empty() {
+            true => fault,
+            false => GoalFault::WithoutSkills {
+                fault: Box::new(fault),
+                actions: without.into_iter().map(|action| action.name).collect(),
+            },
         })?;
         Ok(PlannedGoal {
             process: goal.process(&sequence, &actions),
@@ -256,7 +257,9 @@ impl PlantState {
                 "goal": iri, "reachable": true, "steps": planned.sequence.steps,
                 "reached": planned.sequence.reached,
             }),
-            Err(why) => serde_json::json!({ "goal": iri, "reachable": false, "reason": why }),
+            Err(fault) => serde_json::json!({
+                "goal": iri, "reachable": false, "reason": fault.to_string(),
+            }),
         };
         Some(page)
     }
@@ -403,7 +406,7 @@ impl PlantState {
             kind: SourceKind::Process,
             source: iri.clone(),
             line: None,
-            what: why.clone(),
+            what: why.to_string(),
             refused: true,
         }));
         findings
@@ -436,13 +439,11 @@ impl PlantState {
     }
 
     /// Returns a skill of a component that is present.
-    fn found(&self, skill: &str) -> Result<FoundSkill, String> {
+    fn found(&self, skill: &str) -> Result<FoundSkill, ParameterFault> {
         let present = self.present();
         let mut components = present.components.values();
         let found = components.find_map(|component| component.found.get(skill));
-        found
-            .cloned()
-            .ok_or_else(|| "its component is gone".to_owned())
+        found.cloned().ok_or(ParameterFault::Gone)
     }
 
     fn present(&self) -> MutexGuard<'_, Present> {
@@ -529,33 +530,31 @@ impl Plant for PlantState {
         &self,
         skill: &str,
         given: &[GivenParameter],
-    ) -> Result<Vec<(String, SkillValue)>, String> {
+    ) -> Result<Vec<(String, SkillValue)>, ParameterFault> {
         values(&self.found(skill)?, given)
     }
 
-    async fn query(&self, query: &ParameterQuery) -> Result<serde_json::Value, String> {
+    async fn query(&self, query: &ParameterQuery) -> Result<serde_json::Value, ValueQueryFault> {
         let (knowledge, sparql) = (Arc::clone(&self.knowledge), query.sparql.clone());
         let value = move || ValueQuery::read(&sparql).and_then(|read| read.value(&knowledge));
         let value = spawn_blocking(value).await;
-        let value = value.map_err(|error| format!("it fails: {error}"))?;
-        value.map_err(|fault| fault.to_string())
+        value.unwrap_or_else(|error| Err(ValueQueryFault::Failed(error.to_string())))
     }
 
-    fn result(&self, skill: &str, name: &str) -> Result<Option<String>, String> {
+    fn result(&self, skill: &str, name: &str) -> Result<Option<String>, ParameterFault> {
         Ok(result(&self.found(skill)?, name)?.unit.clone())
     }
 
-    fn connects(&self, from: (&str, &str), to: (&str, &str)) -> Result<(), String> {
+    fn connects(&self, from: (&str, &str), to: (&str, &str)) -> Result<(), ParameterFault> {
         let (source, target) = (self.found(from.0)?, self.found(to.0)?);
         connects(result(&source, from.1)?, parameter(&target, to.1)?)
     }
 
-    fn reaches(&self, skill: &str, positions: &[[f64; 3]]) -> Result<(), String> {
-        let workspace = self.found(skill)?.workspace;
-        workspace.map_or(Ok(()), |workspace| {
-            let allowed = workspace.allows_all(positions);
-            allowed.map_err(|why| why.to_string())
-        })
+    fn reaches(&self, skill: &str, positions: &[[f64; 3]]) -> Result<(), ParameterFault> {
+        if let Some(workspace) = self.found(skill)?.workspace {
+            workspace.allows_all(positions)?;
+        }
+        Ok(())
     }
 
     fn attachment(&self, component: &str) -> Attachment {

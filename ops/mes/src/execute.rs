@@ -12,12 +12,14 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use async_trait::async_trait;
+use knowledge::ValueQueryFault;
 use skills::choosing::Attachment;
 use skills::frame::Frame;
 use skills::{JobObserver, PickAndPlace, RunnableSkill, SkillValue};
 use tokio::sync::watch;
 use tracing::{info, warn};
 
+use crate::parameter_fault::ParameterFault;
 use crate::plan::{Fallen, Offer, Plan, Situation, plan};
 use crate::process::{GivenParameter, ParameterQuery, Process, ProcessStep, SkillRole, StepJob};
 use crate::record::{How, Planned, ProcessRun};
@@ -44,25 +46,25 @@ pub(crate) trait Plant: Send + Sync {
         &self,
         skill: &str,
         given: &[GivenParameter],
-    ) -> Result<Vec<(String, SkillValue)>, String>;
+    ) -> Result<Vec<(String, SkillValue)>, ParameterFault>;
 
     /// Evaluates the query of a parameter, which takes up to a second.
     ///
     /// # Errors
     /// The reason why it has no value.
-    async fn query(&self, query: &ParameterQuery) -> Result<serde_json::Value, String>;
+    async fn query(&self, query: &ParameterQuery) -> Result<serde_json::Value, ValueQueryFault>;
 
     /// Returns the unit of a result of a skill, if it has one.
     ///
     /// # Errors
     /// The reason why the skill does not have the result.
-    fn result(&self, skill: &str, name: &str) -> Result<Option<String>, String>;
+    fn result(&self, skill: &str, name: &str) -> Result<Option<String>, ParameterFault>;
 
     /// Checks that a result of a skill can be a parameter of another skill.
-    fn connects(&self, from: (&str, &str), to: (&str, &str)) -> Result<(), String>;
+    fn connects(&self, from: (&str, &str), to: (&str, &str)) -> Result<(), ParameterFault>;
 
     /// Checks that the robot with a skill reaches positions.
-    fn reaches(&self, _skill: &str, _positions: &[[f64; 3]]) -> Result<(), String> {
+    fn reaches(&self, _skill: &str, _positions: &[[f64; 3]]) -> Result<(), ParameterFault> {
         Ok(())
     }
 
@@ -344,7 +346,9 @@ impl Execution<'_> {
             self.unless_stopped(self.plant.read_tools()).await?;
             let evaluated = EvaluatedProcess::of(self.plant, self.process, progress);
             let evaluated = self.unless_stopped(evaluated).await?;
-            evaluated.check().map_err(|why| format!("{after}{why}"))?;
+            if let Some(fault) = evaluated.fault() {
+                return Err(format!("{after}{fault}"));
+            }
             let offers = self.plant.offers();
             let (fallen, used) = (self.log.fallen(), self.plant.used_by_others(&run));
             let situation = Situation {

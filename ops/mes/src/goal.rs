@@ -7,11 +7,13 @@
 use std::collections::{BTreeMap, BTreeSet, HashMap, VecDeque};
 use std::time::Duration;
 
-use knowledge::{Knowledge, QuestionAnswer};
+use knowledge::{Knowledge, QuestionAnswer, QuestionFault};
 use serde::Serialize;
 
 use crate::process::{By, GivenParameter, Need, Process, ProcessStep, SkillRole, StepJob};
-use crate::read_process::{MOST_STEPS, USUALLY_WAIT, USUALLY_WITHIN, parameters_of, seconds};
+use crate::read_process::{
+    MOST_STEPS, StatementFault, USUALLY_WAIT, USUALLY_WITHIN, parameters_of, seconds,
+};
 
 /// An action.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -75,17 +77,53 @@ pub(crate) struct Sequence {
     pub(crate) reached: Vec<GoalCondition>,
 }
 
+/// The reason why no sequence of actions reaches a goal.
+#[derive(Debug, thiserror::Error)]
+pub(crate) enum GoalFault {
+    #[error("there is no such goal")]
+    Unknown,
+    #[error(transparent)]
+    Question(#[from] QuestionFault),
+    #[error("it {0}")]
+    Goal(#[from] StatementFault),
+    #[error("the action {iri} {fault}")]
+    Action {
+        iri: String,
+        fault: Box<StatementFault>,
+    },
+    #[error("the action {0} has two names or two capabilities")]
+    AmbiguousAction(String),
+    #[error("its conditions have more than {} facts", u128::BITS)]
+    TooManyFacts,
+    #[error(
+        "its shortest sequence has {0} steps, and a process has at most {MOST_STEPS}; \
+         split it into several goals"
+    )]
+    TooLong(usize),
+    #[error("no available action adds {0}")]
+    NotAdded(String),
+    #[error("no sequence of the {actions} available actions reaches it")]
+    Unreachable { actions: usize },
+    #[error("the search was given up after {MOST_STATES} states; split it into several goals")]
+    TooManyStates,
+    /// The actions whose capabilities have no skills.
+    #[error("{fault}; no skill is there for {}", actions.join(", "))]
+    WithoutSkills {
+        fault: Box<Self>,
+        actions: Vec<String>,
+    },
+}
+
 impl GoalConditions {
     /// Reads a goal of the graph.
     ///
     /// # Errors
-    /// The reason why it cannot be planned; `None` if there is no such goal.
-    pub(crate) fn read(knowledge: &Knowledge, iri: &str) -> Result<Self, Option<String>> {
-        let answer = knowledge.ask("goals", &[]);
-        let answer = answer.map_err(|fault| Some(fault.to_string()))?;
+    /// The reason why it cannot be planned.
+    pub(crate) fn read(knowledge: &Knowledge, iri: &str) -> Result<Self, GoalFault> {
+        let answer = knowledge.ask("goals", &[])?;
         let of_goal =
             |row: &&BTreeMap<String, serde_json::Value>| QuestionAnswer::text(row, "goal") == iri;
-        let row = answer.rows.iter().find(of_goal).ok_or(None)?;
+        let row = answer.rows.iter().find(of_goal).ok_or(GoalFault::Unknown)?;
         let facts = |column| QuestionAnswer::texts(row, column).into_iter().collect();
         let time = |column| seconds(row.get(column).filter(|value| !value.is_null()), column);
         let name = QuestionAnswer::text(row, "name");
@@ -95,11 +133,11 @@ impl GoalConditions {
             given: facts("given"),
             wants: facts("wants"),
             avoids: facts("avoids"),
-            within: time("within").map_err(Some)?,
-            wait: time("wait").map_err(Some)?,
+            within: time("within")?,
+            wait: time("wait")?,
         };
         match goal.wants.is_empty() && goal.avoids.is_empty() {
-            true => Err(Some("it has no ua:wants or ua:avoids".to_owned())),
+            true => Err(StatementFault::Missing("ua:wants or ua:avoids").into()),
             false => Ok(goal),
         }
     }
@@ -108,7 +146,7 @@ impl GoalConditions {
     ///
     /// # Errors
     /// The reason why there is none.
-    pub(crate) fn search(&self, actions: &[GoalAction]) -> Result<Sequence, String> {
+    pub(crate) fn search(&self, actions: &[GoalAction]) -> Result<Sequence, GoalFault> {
         let mut facts = Facts::default();
         let goal = Bits {
             yes: facts.set(&self.wants)?,
@@ -132,28 +170,23 @@ impl GoalConditions {
         }
         let start = facts.known(&self.given);
         match found(start, goal, &steps)? {
-            Some(order) if order.len() > MOST_STEPS => Err(format!(
-                "its shortest sequence has {} steps, and a process has at most {MOST_STEPS}; \
-                 split it into several goals",
-                order.len()
-            )),
+            Some(order) if order.len() > MOST_STEPS => Err(GoalFault::TooLong(order.len())),
             Some(order) => Ok(self.proved(actions, &order)),
             None => Err(self.unreachable(actions)),
         }
     }
 
     /// Returns the reason why no sequence of actions reaches the goal.
-    fn unreachable(&self, actions: &[GoalAction]) -> String {
+    fn unreachable(&self, actions: &[GoalAction]) -> GoalFault {
         let nobody = self.wants.iter().find(|fact| {
             let is_added = actions.iter().any(|action| action.adds.contains(*fact));
             !self.given.contains(*fact) && !is_added
         });
         match nobody {
-            Some(fact) => format!("no available action adds {fact}"),
-            None => format!(
-                "no sequence of the {} available actions reaches it",
-                actions.len()
-            ),
+            Some(fact) => GoalFault::NotAdded(fact.clone()),
+            None => GoalFault::Unreachable {
+                actions: actions.len(),
+            },
         }
     }
 
@@ -239,21 +272,22 @@ impl GoalAction {
     ///
     /// # Errors
     /// The first action that is not whole, with the reason.
-    pub(crate) fn read(knowledge: &Knowledge) -> Result<Vec<Self>, String> {
-        let ask = |question| {
-            let answer = knowledge.ask(question, &[]);
-            answer.map_err(|fault| fault.to_string())
-        };
+    pub(crate) fn read(knowledge: &Knowledge) -> Result<Vec<Self>, GoalFault> {
+        let ask = |question| knowledge.ask(question, &[]);
         let (actions, parameters) = (ask("actions")?, ask("action-parameters")?);
         let mut all: Vec<Self> = Vec::new();
         for row in &actions.rows {
             let text = |column| QuestionAnswer::text(row, column).to_owned();
             let facts = |column| QuestionAnswer::texts(row, column).into_iter().collect();
             let (iri, name) = (text("action"), text("name"));
-            let wrong = |why: String| format!("the action {iri} {why}");
             if all.iter().any(|known| known.iri == iri) {
-                return Err(wrong("has two names or two capabilities".to_owned()));
+                return Err(GoalFault::AmbiguousAction(iri));
             }
+            let parameters = parameters_of(&iri, (&[], 0), &parameters.rows);
+            let parameters = parameters.map_err(|fault| GoalFault::Action {
+                iri: iri.clone(),
+                fault: Box::new(fault),
+            })?;
             all.push(Self {
                 name: if name.is_empty() { iri.clone() } else { name },
                 capability: text("capability"),
@@ -261,7 +295,7 @@ impl GoalAction {
                 forbids: facts("forbids"),
                 adds: facts("adds"),
                 removes: facts("removes"),
-                parameters: parameters_of(&iri, (&[], 0), &parameters.rows).map_err(wrong)?,
+                parameters,
                 iri,
             });
         }
@@ -275,14 +309,13 @@ struct Facts<'a>(BTreeMap<&'a str, u32>);
 
 impl<'a> Facts<'a> {
     /// Returns facts as a set of bits; new facts get numbers.
-    fn set(&mut self, facts: &'a BTreeSet<String>) -> Result<u128, String> {
+    fn set(&mut self, facts: &'a BTreeSet<String>) -> Result<u128, GoalFault> {
         let mut set = 0;
         for fact in facts {
             let next = u32::try_from(self.0.len()).unwrap_or(u128::BITS);
             let number = *self.0.entry(fact).or_insert(next);
             let bit = 1_u128.checked_shl(number);
-            set |=
-                bit.ok_or_else(|| format!("its conditions have more than {} facts", u128::BITS))?;
+            set |= bit.ok_or(GoalFault::TooManyFacts)?;
         }
         Ok(set)
     }
@@ -316,7 +349,7 @@ struct Effect {
 }
 
 /// Searches breadth first: the first sequence found is one of the shortest.
-fn found(start: u128, goal: Bits, steps: &[Effect]) -> Result<Option<Vec<usize>>, String> {
+fn found(start: u128, goal: Bits, steps: &[Effect]) -> Result<Option<Vec<usize>>, GoalFault> {
     // The previous state and the action that led from it.
     let mut came: HashMap<u128, Option<(u128, usize)>> = HashMap::from([(start, None)]);
     let mut waiting = VecDeque::from([start]);
@@ -340,9 +373,7 @@ fn found(start: u128, goal: Bits, steps: &[Effect]) -> Result<Option<Vec<usize>>
                 continue;
             }
             if came.len() >= MOST_STATES {
-                return Err(format!(
-                    "the search was given up after {MOST_STATES} states; split it into several goals"
-                ));
+                return Err(GoalFault::TooManyStates);
             }
             came.insert(next, Some((state, action)));
             waiting.push_back(next);

@@ -31,6 +31,7 @@ mod live;
 mod locate_skill;
 mod nodeset_folder;
 mod order_file;
+mod parameter_fault;
 mod plan;
 mod process;
 mod read_process;

@@ -11,6 +11,7 @@ use serde::Serialize;
 use skills::ParameterType;
 use skills::choosing::{self, Attachment, CandidateRank, choose};
 
+use crate::parameter_fault::ParameterFault;
 use crate::process::{BadEnd, By, Group, Need, Process, ProcessStep, SkillRole, StepJob};
 
 use judging::Judging;
@@ -188,16 +189,16 @@ impl Situation<'_> {
 /// The facts about skills that a plan needs. Each check returns the reason why it fails.
 pub(crate) trait Facts {
     /// Checks that an offer takes the parameters of the step or compensation with a number.
-    fn takes(&self, offer: &Offer, step: (usize, &ProcessStep)) -> Result<(), String>;
+    fn takes(&self, offer: &Offer, step: (usize, &ProcessStep)) -> Result<(), ParameterFault>;
 
     /// Checks that an offer has the result of a name.
-    fn gives(&self, offer: &Offer, result: &str) -> Result<(), String>;
+    fn gives(&self, offer: &Offer, result: &str) -> Result<(), ParameterFault>;
 
     /// Checks that a result of a skill, given by its IRI, can be a parameter of another skill.
-    fn connects(&self, from: (&str, &str), to: (&str, &str)) -> Result<(), String>;
+    fn connects(&self, from: (&str, &str), to: (&str, &str)) -> Result<(), ParameterFault>;
 
     /// Checks that the robot of an offer reaches positions.
-    fn reaches(&self, _offer: &Offer, _positions: &[[f64; 3]]) -> Result<(), String> {
+    fn reaches(&self, _offer: &Offer, _positions: &[[f64; 3]]) -> Result<(), ParameterFault> {
         Ok(())
     }
 

@@ -3,9 +3,11 @@
 use std::collections::BTreeSet;
 use std::time::Duration;
 
-use knowledge::{is_iri, vocabulary as v};
+use knowledge::{ValueQueryFault, is_iri, vocabulary as v};
 use mtp::{Object, Triple, escaped};
 use skills::ParameterType;
+
+use crate::parameter_fault::ParameterFault;
 
 /// A process that the MES can run, identified by its IRI.
 #[derive(Debug, Clone, PartialEq)]
@@ -173,6 +175,14 @@ pub(crate) enum BadEnd {
     TimedOut,
 }
 
+/// A result and a value of different types, or without an order.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("{result} cannot be compared with {value}")]
+pub(crate) struct Incomparable {
+    result: serde_json::Value,
+    value: serde_json::Value,
+}
+
 impl Compare {
     /// All comparisons, with their signs. A sign that begins with another sign comes before it.
     pub(crate) const ALL: [(Self, &'static str); 6] = [
@@ -198,7 +208,7 @@ impl Compare {
         self,
         result: &serde_json::Value,
         value: &serde_json::Value,
-    ) -> Result<bool, String> {
+    ) -> Result<bool, Incomparable> {
         use std::cmp::Ordering;
         let order = match (result.as_f64(), value.as_f64()) {
             (Some(one), Some(other)) => one.partial_cmp(&other),
@@ -210,7 +220,10 @@ impl Compare {
                 _ => None,
             },
         };
-        let order = order.ok_or_else(|| format!("{result} cannot be compared with {value}"))?;
+        let order = order.ok_or_else(|| Incomparable {
+            result: result.clone(),
+            value: value.clone(),
+        })?;
         Ok(match self {
             Self::Equal => order.is_eq(),
             Self::NotEqual => order.is_ne(),
@@ -287,17 +300,18 @@ impl GivenParameter {
     /// The reason why the query has no value, with its name.
     pub(crate) fn evaluated(
         &self,
-        value: Result<serde_json::Value, String>,
-    ) -> Result<Self, String> {
-        let wrong = |why: String| format!("{}: {why}", self.shown());
-        let value = value.map_err(wrong)?;
-        match value.is_null() {
-            true => Err(wrong("it has no value".to_owned())),
-            false => Ok(Self {
-                value,
-                ..self.clone()
-            }),
-        }
+        value: Result<serde_json::Value, ValueQueryFault>,
+    ) -> Result<Self, ParameterFault> {
+        let is_there = |value: serde_json::Value| match value.is_null() {
+            true => Err(ValueQueryFault::NoValue),
+            false => Ok(value),
+        };
+        let value = value.and_then(is_there);
+        let value = value.map_err(|why| ParameterFault::Given(self.shown(), why.into()))?;
+        Ok(Self {
+            value,
+            ..self.clone()
+        })
     }
 }
 

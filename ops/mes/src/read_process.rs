@@ -1,15 +1,18 @@
 //! Reads processes from the graph, which decides which processes run.
 
+mod fault;
 mod loops;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 
-use knowledge::{Knowledge, QuestionAnswer, ValueQuery};
+use knowledge::{Knowledge, QuestionAnswer, QuestionFault, ValueQuery};
 use serde_json::Value;
 use skills::ParameterType;
 
+pub(crate) use self::fault::{ProcessFault, StatementFault};
 use crate::locate_skill::numbers_of;
+use crate::parameter_fault::ParameterFault;
 use crate::process::{
     BadEnd, By, Compare, GivenParameter, Loop, Need, ParameterQuery, Process, ProcessStep,
     ResultOf, SkillRole, StepCondition, StepJob, Test,
@@ -20,18 +23,15 @@ use crate::process::{
 pub(crate) struct Processes {
     pub(crate) all: Vec<Process>,
     /// The reasons by the IRI of the process.
-    pub(crate) faults: BTreeMap<String, String>,
+    pub(crate) faults: BTreeMap<String, ProcessFault>,
 }
 
 type Row = BTreeMap<String, Value>;
 
 impl Processes {
     /// Reads all processes.
-    pub(crate) fn read(knowledge: &Knowledge) -> Result<Self, String> {
-        let ask = |question| {
-            let answer = knowledge.ask(question, &[]);
-            answer.map_err(|fault| fault.to_string())
-        };
+    pub(crate) fn read(knowledge: &Knowledge) -> Result<Self, QuestionFault> {
+        let ask = |question| knowledge.ask(question, &[]);
         let (steps, parameters) = (ask("process-steps")?, ask("process-parameters")?);
         let (conditions, loops) = (ask("process-conditions")?, ask("process-loops")?);
         let mut by_process: BTreeMap<&str, Vec<&Row>> = BTreeMap::new();
@@ -63,7 +63,7 @@ struct Facts<'a> {
     loops: &'a [Row],
 }
 
-fn process(iri: &str, rows: &[&Row], facts: Facts<'_>) -> Result<Process, String> {
+fn process(iri: &str, rows: &[&Row], facts: Facts<'_>) -> Result<Process, ProcessFault> {
     let parameters = facts.parameters;
     let within = seconds(one(rows, "within")?, "ua:within")?.unwrap_or(USUALLY_WITHIN);
     let wait = seconds(one(rows, "wait")?, "ua:wait")?.unwrap_or(USUALLY_WAIT);
@@ -81,10 +81,10 @@ fn process(iri: &str, rows: &[&Row], facts: Facts<'_>) -> Result<Process, String
         }
     }
     if by_part.is_empty() {
-        return Err("it has no ua:hasStep".to_owned());
+        return Err(StatementFault::Missing("ua:hasStep").into());
     }
     if by_part.len() > MOST_STEPS {
-        return Err(format!("it has more than {MOST_STEPS} steps"));
+        return Err(ProcessFault::TooManySteps);
     }
     let ordered = in_order(by_part)?;
     let job = job(rows)?;
@@ -93,24 +93,30 @@ fn process(iri: &str, rows: &[&Row], facts: Facts<'_>) -> Result<Process, String
     for (number, (_, part, rows)) in ordered.iter().enumerate() {
         let role = job.is_none().then_some(SkillRole::Alone(number));
         let read = step(part, rows, role, (&order, number), parameters);
-        let mut read = read.map_err(|why| format!("the step {part} {why}"))?;
+        let mut read = read.map_err(ProcessFault::of("step", part))?;
         let ordered = order_of(&mut read, rows, iri, (&order, number))
             .and_then(|()| conditions_of(part, (&order, number), facts.conditions))
             .map(|when| read.when = when);
-        ordered.map_err(|why| format!("the step {part} {why}"))?;
+        ordered.map_err(ProcessFault::of("step", part))?;
         let is_plain = read.after.is_none() && read.when.is_empty() && read.within.is_none();
         if job.is_some() && !is_plain {
-            return Err(format!(
-                "the step {part} has an order, a condition or a time limit, and a pick-and-place process has its own"
+            return Err(ProcessFault::of("step", part)(
+                StatementFault::NotInPickAndPlace {
+                    has: "an order, a condition or a time limit",
+                    instead: "has its own",
+                },
             ));
         }
         if let Some(rows) = undone.get(part) {
             let role = SkillRole::Alone(order.len().saturating_add(number));
             let undone = compensation(&read.name, rows, role, (&order, number), parameters);
-            let undone = undone.map_err(|why| format!("the compensation of {part} {why}"))?;
+            let undone = undone.map_err(ProcessFault::of("compensation of", part))?;
             if job.is_some() {
-                return Err(format!(
-                    "the step {part} has a ua:compensatedBy, and a pick-and-place process retreats by itself"
+                return Err(ProcessFault::of("step", part)(
+                    StatementFault::NotInPickAndPlace {
+                        has: "a ua:compensatedBy",
+                        instead: "retreats by itself",
+                    },
                 ));
             }
             read.compensation = Some(Box::new(undone));
@@ -133,9 +139,13 @@ fn process(iri: &str, rows: &[&Row], facts: Facts<'_>) -> Result<Process, String
 }
 
 /// Checks that a pick-and-place process has all roles, and no loop.
-fn is_composite(steps: &[ProcessStep], loops: &[Loop]) -> Result<(), String> {
+fn is_composite(steps: &[ProcessStep], loops: &[Loop]) -> Result<(), ProcessFault> {
     if !loops.is_empty() {
-        return Err("it has a ua:hasLoop, and a pick-and-place process has none".to_owned());
+        let fault = StatementFault::NotInPickAndPlace {
+            has: "a ua:hasLoop",
+            instead: "has none",
+        };
+        return Err(fault.into());
     }
     let has = |role: &SkillRole| {
         let mut needs = steps.iter().flat_map(|step| &step.needs);
@@ -143,10 +153,7 @@ fn is_composite(steps: &[ProcessStep], loops: &[Loop]) -> Result<(), String> {
     };
     match SkillRole::OF_COMPOSITE.iter().find(|role| !has(role)) {
         None => Ok(()),
-        Some(role) => Err(format!(
-            "no step has a need with the ua:role `{}`",
-            role.name()
-        )),
+        Some(role) => Err(ProcessFault::NoRole(role.name())),
     }
 }
 
@@ -154,12 +161,14 @@ fn is_composite(steps: &[ProcessStep], loops: &[Loop]) -> Result<(), String> {
 type Positioned<'a> = (i64, &'a str, Vec<&'a Row>);
 
 /// Returns the steps with their rows, in the order of their positions.
-fn in_order<'a>(by_part: BTreeMap<&'a str, Vec<&'a Row>>) -> Result<Vec<Positioned<'a>>, String> {
+fn in_order<'a>(
+    by_part: BTreeMap<&'a str, Vec<&'a Row>>,
+) -> Result<Vec<Positioned<'a>>, ProcessFault> {
     let mut ordered: Vec<Positioned<'_>> = Vec::new();
     for (part, rows) in by_part {
         let position = one(&rows, "position")?.and_then(Value::as_i64);
-        let position =
-            position.ok_or_else(|| format!("the step {part} has no number as its ua:position"))?;
+        let position = position.ok_or(StatementFault::Missing("number as its ua:position"));
+        let position = position.map_err(ProcessFault::of("step", part))?;
         ordered.push((position, part, rows));
     }
     ordered.sort_by_key(|(position, ..)| *position);
@@ -167,9 +176,11 @@ fn in_order<'a>(by_part: BTreeMap<&'a str, Vec<&'a Row>>) -> Result<Vec<Position
         .windows(2)
         .find_map(|pair| <&[_; 2]>::try_from(pair).ok().filter(|[a, b]| a.0 == b.0))
     {
-        return Err(format!(
-            "the steps {one} and {other} have the ua:position {position}"
-        ));
+        return Err(ProcessFault::SamePosition {
+            one: (*one).to_owned(),
+            other: (*other).to_owned(),
+            position: *position,
+        });
     }
     Ok(ordered)
 }
@@ -180,7 +191,7 @@ fn order_of(
     rows: &[&Row],
     process: &str,
     (order, number): (&[&str], usize),
-) -> Result<(), String> {
+) -> Result<(), StatementFault> {
     step.within = seconds(one(rows, "limit")?, "ua:within")?;
     let named = rows.iter().map(|row| QuestionAnswer::text(row, "after"));
     let named: BTreeSet<&str> = named.filter(|after| !after.is_empty()).collect();
@@ -197,10 +208,10 @@ fn order_of(
 }
 
 /// Returns the number of a step that comes before the step with a number.
-fn earlier(other: &str, (order, number): (&[&str], usize)) -> Result<usize, String> {
+fn earlier(other: &str, (order, number): (&[&str], usize)) -> Result<usize, StatementFault> {
     let step = order.iter().position(|known| *known == other);
     step.filter(|step| *step < number)
-        .ok_or_else(|| format!("names {other}, which is no earlier step"))
+        .ok_or_else(|| StatementFault::NotEarlier(other.to_owned()))
 }
 
 /// Reads the alternatives of a step, of which one must hold.
@@ -208,7 +219,7 @@ fn conditions_of(
     part: &str,
     place: (&[&str], usize),
     rows: &[Row],
-) -> Result<Vec<Vec<StepCondition>>, String> {
+) -> Result<Vec<Vec<StepCondition>>, StatementFault> {
     let mut alternatives: BTreeMap<&str, Vec<&Row>> = BTreeMap::new();
     for row in rows
         .iter()
@@ -222,13 +233,13 @@ fn conditions_of(
         let mut conditions: Vec<(i64, StepCondition)> = Vec::new();
         for row in rows {
             if QuestionAnswer::text(row, "condition").is_empty() {
-                return Err(format!("has the ua:when {iri} without a ua:condition"));
+                return Err(StatementFault::NoCondition(iri.to_owned()));
             }
             let position = row.get("position").and_then(Value::as_i64);
             let read = condition(row, place);
             conditions.push((
                 position.unwrap_or_default(),
-                read.map_err(|why| format!("has a condition that {why}"))?,
+                read.map_err(|fault| StatementFault::Condition(Box::new(fault)))?,
             ));
         }
         conditions.sort_by_key(|(position, _)| *position);
@@ -237,21 +248,19 @@ fn conditions_of(
     Ok(all)
 }
 
-fn condition(row: &Row, place: (&[&str], usize)) -> Result<StepCondition, String> {
+fn condition(row: &Row, place: (&[&str], usize)) -> Result<StepCondition, StatementFault> {
     let is_there = |column: &str| row.get(column).filter(|value| !value.is_null());
     let step = earlier(QuestionAnswer::text(row, "of"), place)?;
     let test = match (is_there("result"), is_there("ends_as")) {
         (Some(name), None) => {
             let sign = QuestionAnswer::text(row, "compare");
             let compare = Compare::ALL.iter().find(|(_, known)| *known == sign);
-            let compare = compare.ok_or_else(|| {
-                format!("has the ua:compare `{sign}`; use ==, !=, <, <=, > or >=")
-            })?;
+            let compare = compare.ok_or_else(|| StatementFault::Compare(sign.to_owned()))?;
             let value = match (is_there("value"), is_there("json")) {
                 (Some(value), None) => value.clone(),
                 (None, Some(json)) => serde_json::from_str(json.as_str().unwrap_or_default())
-                    .map_err(|error| format!("has a ua:valueJson that is no JSON: {error}"))?,
-                _ => return Err("has no value, or several".to_owned()),
+                    .map_err(|error| StatementFault::ConditionJson(error.to_string()))?,
+                _ => return Err(StatementFault::ConditionValue),
             };
             Test::Result {
                 name: name.as_str().unwrap_or_default().to_owned(),
@@ -264,11 +273,9 @@ fn condition(row: &Row, place: (&[&str], usize)) -> Result<StepCondition, String
             let known = all
                 .into_iter()
                 .find(|known| Some(known.name()) == end.as_str());
-            Test::Ended(known.ok_or_else(|| {
-                format!("has the ua:endsAs {end}; use \"failed\" or \"timed out\"")
-            })?)
+            Test::Ended(known.ok_or_else(|| StatementFault::EndsAs(end.clone()))?)
         }
-        _ => return Err("has neither a ua:result nor a ua:endsAs, or both".to_owned()),
+        _ => return Err(StatementFault::NoTest),
     };
     Ok(StepCondition {
         step,
@@ -277,17 +284,15 @@ fn condition(row: &Row, place: (&[&str], usize)) -> Result<StepCondition, String
     })
 }
 
-fn job(rows: &[&Row]) -> Result<Option<skills::Job>, String> {
-    let position = |column: &str| {
+fn job(rows: &[&Row]) -> Result<Option<skills::Job>, ProcessFault> {
+    let position = |column: &'static str| {
         let Some(value) = one(rows, column)? else {
             return Ok(None);
         };
         let text = value.as_str().unwrap_or_default();
         let numbers = numbers_of(text, 6);
         let position = numbers.and_then(|numbers| numbers.try_into().ok());
-        position
-            .map(Some)
-            .ok_or_else(|| format!("its ua:{column} is not six numbers: m, m, m, rad, rad, rad"))
+        position.map(Some).ok_or(ProcessFault::NoPosition(column))
     };
     let (Some(pick), Some(place)) = (position("pick")?, position("place")?) else {
         return Ok(None);
@@ -297,7 +302,7 @@ fn job(rows: &[&Row]) -> Result<Option<skills::Job>, String> {
         Some(value) => value
             .as_f64()
             .filter(|approach| (0.0..=10.0).contains(approach))
-            .ok_or_else(|| format!("its ua:approach is not from 0 to 10 m: {value}"))?,
+            .ok_or_else(|| ProcessFault::Approach(value.clone()))?,
     };
     Ok(Some(skills::Job {
         pick,
@@ -307,15 +312,16 @@ fn job(rows: &[&Row]) -> Result<Option<skills::Job>, String> {
     }))
 }
 
-fn shape(rows: &[&Row]) -> Result<Option<skills::PartShape>, String> {
+fn shape(rows: &[&Row]) -> Result<Option<skills::PartShape>, ProcessFault> {
     let Some(value) = one(rows, "shape")? else {
         return Ok(None);
     };
     let text = value.as_str().unwrap_or_default();
-    let shape = text.parse();
-    shape
-        .map(Some)
-        .map_err(|why| format!("its ua:shape `{text}` {why}"))
+    let shape = text.parse::<skills::PartShape>();
+    shape.map(Some).map_err(|fault| ProcessFault::Shape {
+        shape: text.to_owned(),
+        fault,
+    })
 }
 
 fn step(
@@ -324,19 +330,13 @@ fn step(
     role: Option<SkillRole>,
     (order, number): (&[&str], usize),
     parameters: &[Row],
-) -> Result<ProcessStep, String> {
+) -> Result<ProcessStep, StatementFault> {
     let name = one(rows, "step")?.and_then(Value::as_str).unwrap_or(part);
     let with = one(rows, "with")?.and_then(Value::as_str);
     let is_attached = one(rows, "attached")?.and_then(Value::as_bool) == Some(true);
     let by = match with {
-        Some(_) if is_attached => {
-            return Err("has ua:byComponentOf and ua:byAttachedTool; give one".to_owned());
-        }
-        Some(with) => {
-            let other = order.iter().position(|known| *known == with);
-            let other = other.filter(|other| *other < number);
-            By::SameAs(other.ok_or_else(|| format!("names {with}, which is no earlier step"))?)
-        }
+        Some(_) if is_attached => return Err(StatementFault::TwoComponents),
+        Some(with) => By::SameAs(earlier(with, (order, number))?),
         None if is_attached => By::AttachedTool,
         None => By::Any,
     };
@@ -349,10 +349,10 @@ fn step(
         by_need.entry(need).or_default().push(row);
     }
     if by_need.is_empty() {
-        return Err("has no css:requiresCapability".to_owned());
+        return Err(StatementFault::Missing("css:requiresCapability"));
     }
     if role.is_some() && by_need.len() > 1 {
-        return Err("needs several skills, and a step of a sequence is one skill".to_owned());
+        return Err(StatementFault::SeveralSkills);
     }
     let needs = by_need.values().map(|rows| need(rows, role));
     let needs = needs.collect::<Result<_, _>>()?;
@@ -374,20 +374,18 @@ fn compensation(
     role: SkillRole,
     (order, number): (&[&str], usize),
     parameters: &[Row],
-) -> Result<ProcessStep, String> {
+) -> Result<ProcessStep, StatementFault> {
     let mut parts = rows.iter().map(|row| QuestionAnswer::text(row, "part"));
     let part = parts.next().unwrap_or_default();
     if parts.any(|other| other != part) {
-        return Err("is given twice".to_owned());
+        return Err(StatementFault::Twice);
     }
     let next = number.saturating_add(1);
     let mut read = step(part, rows, Some(role), (order, next), parameters)?;
     match read.by {
         By::Any => read.by = By::SameAs(number),
         By::SameAs(_) => {}
-        By::AttachedTool => {
-            return Err("has ua:byAttachedTool; give ua:byComponentOf".to_owned());
-        }
+        By::AttachedTool => return Err(StatementFault::UndoneByTool),
     }
     if one(rows, "step")?.is_none() {
         read.name = format!("compensation of {of}");
@@ -395,16 +393,13 @@ fn compensation(
     Ok(read)
 }
 
-fn need(rows: &[&Row], role: Option<SkillRole>) -> Result<Need, String> {
+fn need(rows: &[&Row], role: Option<SkillRole>) -> Result<Need, StatementFault> {
     let role = match (role, one(rows, "role")?.and_then(Value::as_str)) {
         (Some(role), _) => role,
         (None, named) => {
             let known = SkillRole::OF_COMPOSITE.into_iter();
             let mut known = known.filter(|role| Some(role.name()) == named);
-            let names = "ptp, linear, grasp or release";
-            known
-                .next()
-                .ok_or_else(|| format!("has a need whose ua:role is not {names}"))?
+            known.next().ok_or(StatementFault::Role)?
         }
     };
     let capability = one(rows, "capability")?.and_then(Value::as_str);
@@ -418,16 +413,12 @@ fn need(rows: &[&Row], role: Option<SkillRole>) -> Result<Need, String> {
                     namespace: namespace.to_owned(),
                     name: name.to_owned(),
                 }),
-                _ => {
-                    return Err(format!(
-                        "needs the type {of}, which no NodeSet here describes"
-                    ));
-                }
+                _ => return Err(StatementFault::UnknownType(of.clone())),
             }
         }
     };
     if capability.is_none() && skill_type.is_none() {
-        return Err("has a need without a capability or type".to_owned());
+        return Err(StatementFault::EmptyNeed);
     }
     Ok(Need {
         role,
@@ -441,7 +432,7 @@ pub(crate) fn parameters_of(
     part: &str,
     (order, number): (&[&str], usize),
     parameters: &[Row],
-) -> Result<Vec<GivenParameter>, String> {
+) -> Result<Vec<GivenParameter>, StatementFault> {
     let mut given: Vec<GivenParameter> = Vec::new();
     for row in parameters
         .iter()
@@ -449,7 +440,7 @@ pub(crate) fn parameters_of(
     {
         let parameter = given_by(row, (order, number))?;
         if given.iter().any(|known| known.name == parameter.name) {
-            return Err(format!("gives the parameter {} twice", parameter.name));
+            return Err(StatementFault::ParameterTwice(parameter.name));
         }
         given.push(parameter);
     }
@@ -457,10 +448,13 @@ pub(crate) fn parameters_of(
 }
 
 /// Reads a parameter of the step with a number.
-fn given_by(row: &Row, (order, number): (&[&str], usize)) -> Result<GivenParameter, String> {
+fn given_by(
+    row: &Row,
+    (order, number): (&[&str], usize),
+) -> Result<GivenParameter, StatementFault> {
     let name = QuestionAnswer::text(row, "name");
     if name.is_empty() {
-        return Err("has a parameter without cask:hasVariableName".to_owned());
+        return Err(StatementFault::NamelessParameter);
     }
     let is_there = |column: &str| row.get(column).filter(|value| !value.is_null());
     let unit = is_there("unit").and_then(Value::as_str).map(str::to_owned);
@@ -474,40 +468,42 @@ fn given_by(row: &Row, (order, number): (&[&str], usize)) -> Result<GivenParamet
     if let Some(sparql) = is_there("query") {
         let columns = ["value", "json", "result_of"];
         if columns.into_iter().any(|column| is_there(column).is_some()) {
-            return Err(format!("has several values for {name}, a query among them"));
+            return Err(StatementFault::QueryAndValue(name.to_owned()));
         }
         let query_name = is_there("query_name").and_then(Value::as_str);
         given.query = Some(ParameterQuery {
             name: query_name.unwrap_or(name).to_owned(),
             sparql: sparql.as_str().unwrap_or_default().to_owned(),
         });
-        return readable(given).map_err(|why| format!("has the parameter {why}"));
+        return readable(given).map_err(StatementFault::Parameter);
     }
     match (is_there("value"), is_there("json"), is_there("result_of")) {
         (Some(value), None, None) => given.value = value.clone(),
         (None, Some(json), None) => {
             given.value =
                 serde_json::from_str(json.as_str().unwrap_or_default()).map_err(|error| {
-                    format!("has a ua:valueJson of {name} that is no JSON: {error}")
+                    StatementFault::ParameterJson {
+                        name: name.to_owned(),
+                        error: error.to_string(),
+                    }
                 })?;
         }
         (None, None, Some(of)) => {
             if given.unit.is_some() {
-                return Err(format!(
-                    "has a ua:unit for {name}; a result has the unit of its skill"
-                ));
+                return Err(StatementFault::UnitOfResult(name.to_owned()));
             }
             let of = of.as_str().unwrap_or_default();
-            let step = order.iter().position(|known| *known == of);
-            let step = step.filter(|step| *step < number);
+            let step = earlier(of, (order, number));
             let result = is_there("result").and_then(Value::as_str).unwrap_or(name);
             given.result = Some(ResultOf {
-                step: step
-                    .ok_or_else(|| format!("takes {name} from {of}, which is no earlier step"))?,
+                step: step.map_err(|_not_earlier| StatementFault::ResultNotEarlier {
+                    name: name.to_owned(),
+                    step: of.to_owned(),
+                })?,
                 name: result.to_owned(),
             });
         }
-        _ => return Err(format!("has no value, or several, for {name}")),
+        _ => return Err(StatementFault::ParameterValue(name.to_owned())),
     }
     Ok(given)
 }
@@ -516,19 +512,19 @@ fn given_by(row: &Row, (order, number): (&[&str], usize)) -> Result<GivenParamet
 ///
 /// # Errors
 /// The reason, with the names of the parameter and of the query.
-pub(crate) fn readable(given: GivenParameter) -> Result<GivenParameter, String> {
+pub(crate) fn readable(given: GivenParameter) -> Result<GivenParameter, ParameterFault> {
     let read = given
         .query
         .as_ref()
         .map(|query| ValueQuery::read(&query.sparql));
     match read {
-        Some(Err(fault)) => Err(format!("{}: {fault}", given.shown())),
+        Some(Err(fault)) => Err(ParameterFault::Given(given.shown(), fault.into())),
         Some(Ok(_)) | None => Ok(given),
     }
 }
 
 /// Returns the value of a column, which must be the same in all rows that have it.
-fn one<'a>(rows: &[&'a Row], column: &str) -> Result<Option<&'a Value>, String> {
+fn one<'a>(rows: &[&'a Row], column: &str) -> Result<Option<&'a Value>, StatementFault> {
     let values = rows.iter().filter_map(|row| row.get(column));
     let mut values = values.filter(|value| !value.is_null());
     let Some(first) = values.next() else {
@@ -536,18 +532,27 @@ fn one<'a>(rows: &[&'a Row], column: &str) -> Result<Option<&'a Value>, String> 
     };
     match values.find(|value| *value != first) {
         None => Ok(Some(first)),
-        Some(other) => Err(format!("has two values of {column}: {first} and {other}")),
+        Some(other) => Err(StatementFault::TwoValues {
+            column: column.to_owned(),
+            first: first.clone(),
+            other: other.clone(),
+        }),
     }
 }
 
-pub(crate) fn seconds(value: Option<&Value>, name: &str) -> Result<Option<Duration>, String> {
+pub(crate) fn seconds(
+    value: Option<&Value>,
+    name: &str,
+) -> Result<Option<Duration>, StatementFault> {
     let Some(value) = value else {
         return Ok(None);
     };
     let seconds = value.as_f64().filter(|seconds| *seconds <= LONGEST);
     let time = seconds.and_then(|seconds| Duration::try_from_secs_f64(seconds).ok());
-    time.map(Some)
-        .ok_or_else(|| format!("its {name} is not a number of seconds: {value}"))
+    time.map(Some).ok_or_else(|| StatementFault::NoTime {
+        name: name.to_owned(),
+        value: value.clone(),
+    })
 }
 
 pub(crate) const USUALLY_WITHIN: Duration = Duration::from_secs(30);
@@ -647,7 +652,7 @@ mod tests {
             assert!(TURTLE.contains(from), "{from}");
             let processes = read(&TURTLE.replace(from, to));
             assert!(processes.all.is_empty());
-            let why = &processes.faults["urn:p"];
+            let why = processes.faults["urn:p"].to_string();
             assert!(why.contains(reason), "{reason}: {why}");
         }
     }

@@ -3,6 +3,7 @@
 use knowledge::units;
 use skills::{Builtin, FoundParameter, FoundSkill, SkillValue, ValueShape};
 
+use crate::parameter_fault::{GivenFault, ParameterFault};
 use crate::process::GivenParameter;
 
 /// Converts the parameters of a step to the parameters of a skill.
@@ -12,14 +13,14 @@ use crate::process::GivenParameter;
 pub(super) fn values(
     found: &FoundSkill,
     given: &[GivenParameter],
-) -> Result<Vec<(String, SkillValue)>, String> {
+) -> Result<Vec<(String, SkillValue)>, ParameterFault> {
     for known in &found.parameters {
         let is_given = given.iter().any(|given| given.name == known.name);
         if known.default.is_none() && !is_given {
-            return Err(format!(
-                "{} needs the parameter {}, and the step does not give it",
-                found.name, known.name
-            ));
+            return Err(ParameterFault::Missing {
+                skill: found.name.clone(),
+                parameter: known.name.clone(),
+            });
         }
     }
     let value = |given: &GivenParameter| {
@@ -28,7 +29,7 @@ pub(super) fn values(
         if given.result.is_some() || (given.query.is_some() && given.value.is_null()) {
             return Ok(None);
         }
-        let wrong = |why: String| format!("{}: {why}", given.shown());
+        let wrong = |why| ParameterFault::Given(given.shown(), why);
         let json = in_unit(given, parameter).map_err(wrong)?;
         let value = read(parameter.shape, &json).map_err(wrong)?;
         let numbers = if let SkillValue::Array(_, elements) = &value {
@@ -41,9 +42,12 @@ pub(super) fn values(
                 .into_iter()
                 .find(|number| !(low..=high).contains(number))
         {
-            let unit = parameter.unit.as_deref().unwrap_or_default();
-            let why = format!("{number} is not from {low} to {high} {unit}");
-            return Err(wrong(why.trim_end().to_owned()));
+            return Err(wrong(GivenFault::OutOfRange {
+                number,
+                low,
+                high,
+                unit: parameter.unit.clone().unwrap_or_default(),
+            }));
         }
         Ok(Some((given.name.clone(), value)))
     };
@@ -52,17 +56,16 @@ pub(super) fn values(
         .filter_map(|given| value(given).transpose())
         .collect::<Result<_, _>>()?;
     if let Some(workspace) = &found.workspace {
-        let allowed = workspace.allows_target(values.iter());
-        allowed.map_err(|why| why.to_string())?;
+        workspace.allows_target(values.iter())?;
     }
     Ok(values)
 }
 
 /// Reads a value that may be sent to a machine.
-fn read(shape: ValueShape, json: &serde_json::Value) -> Result<SkillValue, String> {
-    let value = shape.read_json(json).map_err(|error| error.to_string())?;
+fn read(shape: ValueShape, json: &serde_json::Value) -> Result<SkillValue, GivenFault> {
+    let value = shape.read_json(json)?;
     match value.is_unreal() {
-        true => Err(format!("{json} is not a number")),
+        true => Err(GivenFault::Unreal(json.clone())),
         false => Ok(value),
     }
 }
@@ -71,44 +74,48 @@ fn read(shape: ValueShape, json: &serde_json::Value) -> Result<SkillValue, Strin
 pub(super) fn parameter<'a>(
     found: &'a FoundSkill,
     name: &str,
-) -> Result<&'a FoundParameter, String> {
-    named(&found.parameters, name)
-        .map_err(|known| format!("{} has no parameter {name}; {known}", found.name))
+) -> Result<&'a FoundParameter, ParameterFault> {
+    named(&found.name, ("parameter", &found.parameters), name)
 }
 
 /// Returns the result of a skill with a name.
-pub(super) fn result<'a>(found: &'a FoundSkill, name: &str) -> Result<&'a FoundParameter, String> {
-    named(&found.results, name)
-        .map_err(|known| format!("{} has no result {name}; {known}", found.name))
+pub(super) fn result<'a>(
+    found: &'a FoundSkill,
+    name: &str,
+) -> Result<&'a FoundParameter, ParameterFault> {
+    named(&found.name, ("result", &found.results), name)
 }
 
-fn named<'a>(all: &'a [FoundParameter], name: &str) -> Result<&'a FoundParameter, String> {
-    all.iter().find(|known| known.name == name).ok_or_else(|| {
-        let known: Vec<_> = all.iter().map(|known| known.name.as_str()).collect();
-        match known.as_slice() {
-            [] => "it has none".to_owned(),
-            known => format!("it has {}", known.join(", ")),
-        }
+fn named<'a>(
+    skill: &str,
+    (kind, all): (&'static str, &'a [FoundParameter]),
+    name: &str,
+) -> Result<&'a FoundParameter, ParameterFault> {
+    let found = all.iter().find(|known| known.name == name);
+    found.ok_or_else(|| ParameterFault::Unknown {
+        skill: skill.to_owned(),
+        kind,
+        name: name.to_owned(),
+        known: all.iter().map(|known| known.name.clone()).collect(),
     })
 }
 
 /// Checks that a result can be a parameter: its kind of value and its unit.
-pub(super) fn connects(from: &FoundParameter, to: &FoundParameter) -> Result<(), String> {
+pub(super) fn connects(from: &FoundParameter, to: &FoundParameter) -> Result<(), ParameterFault> {
     let (has, wanted) = (kind(from), kind(to));
+    let result = from.name.clone();
     if has != wanted {
-        return Err(format!("{} is {has}, and {wanted} is expected", from.name));
+        return Err(ParameterFault::Kind {
+            result,
+            has,
+            wanted,
+        });
     }
-    match (from.unit.as_deref(), to.unit.as_deref()) {
-        (Some(from_unit), Some(to_unit)) if units::convert(1.0, from_unit, to_unit).is_none() => {
-            Err(format!(
-                "{} has the unit {from_unit}, which cannot be converted to {to_unit}",
-                from.name
-            ))
+    match (from.unit.clone(), to.unit.clone()) {
+        (Some(unit), Some(to)) if units::convert(1.0, &unit, &to).is_none() => {
+            Err(ParameterFault::ResultUnit { result, unit, to })
         }
-        (Some(unit), None) => Err(format!(
-            "{} has the unit {unit}, and the skill gives no unit",
-            from.name
-        )),
+        (Some(unit), None) => Err(ParameterFault::SkillWithoutUnit { result, unit }),
         _ => Ok(()),
     }
 }
@@ -140,24 +147,26 @@ fn kind(of: &FoundParameter) -> &'static str {
 fn in_unit(
     given: &GivenParameter,
     parameter: &FoundParameter,
-) -> Result<serde_json::Value, String> {
+) -> Result<serde_json::Value, GivenFault> {
     let Some(from) = given.unit.as_deref() else {
         return Ok(given.value.clone());
     };
     let Some(to) = parameter.unit.as_deref() else {
-        return Err(format!("the skill gives no unit, and {from} is given"));
+        return Err(GivenFault::NoUnit(from.to_owned()));
     };
     if from == to {
         return Ok(given.value.clone());
     }
     let one = |value: &serde_json::Value| {
-        let number = value.as_f64();
-        let number =
-            number.ok_or_else(|| format!("`{value}` with the unit {from} is no number"))?;
+        let number = value.as_f64().ok_or_else(|| GivenFault::NoNumber {
+            value: value.clone(),
+            unit: from.to_owned(),
+        })?;
         let converted = units::convert(number, from, to);
-        converted
-            .map(Into::into)
-            .ok_or_else(|| format!("its unit is {to}, and {from} cannot be converted to it"))
+        converted.map(Into::into).ok_or_else(|| GivenFault::Unit {
+            from: from.to_owned(),
+            to: to.to_owned(),
+        })
     };
     if let serde_json::Value::Array(all) = &given.value {
         return all.iter().map(one).collect();
@@ -174,8 +183,8 @@ mod tests {
         let shape = ValueShape::scalar(Builtin::Double);
         assert_eq!(read(shape, &2.5.into()), Ok(SkillValue::Double(2.5)));
         for text in ["NaN", "Infinity", "-Infinity"] {
-            let why = read(shape, &text.into()).unwrap_err();
-            assert!(why.contains("is not a number"), "{why}");
+            let unreal = GivenFault::Unreal(text.into());
+            assert_eq!(read(shape, &text.into()), Err(unreal));
         }
     }
 }

@@ -4,6 +4,7 @@ use skills::SkillValue;
 use tracing::{info, warn};
 
 use super::{Execution, Plant, StepEnd, close};
+use crate::parameter_fault::{GivenFault, ParameterFault};
 use crate::plan::{KeptStep, Offer, Plan};
 use crate::process::{GivenParameter, Process, ProcessStep};
 use crate::record::{How, Planned, ProcessRun};
@@ -48,18 +49,21 @@ pub(super) async fn resolved(
     plant: &dyn Plant,
     step: &ProcessStep,
     done: &[&Done],
-) -> Result<Vec<GivenParameter>, String> {
-    let one = |given: &GivenParameter| -> Result<GivenParameter, String> {
+) -> Result<Vec<GivenParameter>, ParameterFault> {
+    let one = |given: &GivenParameter| -> Result<GivenParameter, ParameterFault> {
         let Some(of) = &given.result else {
             return Ok(given.clone());
         };
+        let wrong = |why| ParameterFault::Given(given.name.clone(), why);
         let from = done.iter().find(|done| done.number == of.step);
-        let from = from.ok_or_else(|| format!("{}: its step is not done", given.name))?;
+        let from = from.ok_or_else(|| wrong(GivenFault::NotDone))?;
         let mut results = from.results.iter();
         let value = results.find(|(name, _)| *name == of.name);
         let (_, value) = value.ok_or_else(|| {
-            let skill = &from.offer.name;
-            format!("{}: {skill} returned no result {}", given.name, of.name)
+            wrong(GivenFault::NoResult {
+                skill: from.offer.name.clone(),
+                result: of.name.clone(),
+            })
         })?;
         Ok(GivenParameter {
             name: given.name.clone(),

@@ -2,10 +2,12 @@
 
 use std::collections::BTreeMap;
 
+use knowledge::ValueQueryFault;
 use skills::choosing::Attachment;
 
 use super::Plant;
 use super::sequence::RunProgress;
+use crate::parameter_fault::ParameterFault;
 use crate::plan::{Facts, Offer};
 use crate::process::{GivenParameter, Process, ProcessStep};
 
@@ -16,7 +18,7 @@ pub(super) struct EvaluatedProcess {
     pub(super) process: Process,
     /// The queries without a value, by the numbers of their steps and compensations. A step with
     /// conditions may be skipped, so its queries are not among them.
-    faults: BTreeMap<usize, String>,
+    faults: BTreeMap<usize, ParameterFault>,
 }
 
 impl EvaluatedProcess {
@@ -49,15 +51,12 @@ impl EvaluatedProcess {
         evaluated
     }
 
-    /// Checks that the queries of the steps without conditions, and of their compensations, have
-    /// values. No component that comes later can help if they do not.
-    pub(super) fn check(&self) -> Result<(), String> {
-        let Some((number, why)) = self.faults.first_key_value() else {
-            return Ok(());
-        };
-        let step = self.process.step(*number);
-        let name = step.map_or("", |step| step.name.as_str());
-        Err(format!("{name}: {why}"))
+    /// Returns the reason why a query of a step without conditions, or of its compensation, has no
+    /// value. No component that comes later can help.
+    pub(super) fn fault(&self) -> Option<String> {
+        let (number, why) = self.faults.first_key_value()?;
+        let step = self.process.step(*number)?;
+        Some(format!("{}: {why}", step.name))
     }
 }
 
@@ -66,8 +65,8 @@ impl EvaluatedProcess {
 async fn fill_in(
     plant: &dyn Plant,
     parameters: &mut [GivenParameter],
-    values: &mut BTreeMap<String, Result<serde_json::Value, String>>,
-) -> Option<String> {
+    values: &mut BTreeMap<String, Result<serde_json::Value, ValueQueryFault>>,
+) -> Option<ParameterFault> {
     let mut fault = None;
     for given in parameters {
         let Some(query) = &given.query else { continue };
@@ -94,7 +93,11 @@ pub(super) struct OfPlant<'a> {
 }
 
 impl Facts for OfPlant<'_> {
-    fn takes(&self, offer: &Offer, (number, step): (usize, &ProcessStep)) -> Result<(), String> {
+    fn takes(
+        &self,
+        offer: &Offer,
+        (number, step): (usize, &ProcessStep),
+    ) -> Result<(), ParameterFault> {
         if let Some(why) = self.evaluated.faults.get(&number) {
             return Err(why.clone());
         }
@@ -102,15 +105,15 @@ impl Facts for OfPlant<'_> {
         values.map(drop)
     }
 
-    fn gives(&self, offer: &Offer, result: &str) -> Result<(), String> {
+    fn gives(&self, offer: &Offer, result: &str) -> Result<(), ParameterFault> {
         self.plant.result(&offer.skill, result).map(drop)
     }
 
-    fn connects(&self, from: (&str, &str), to: (&str, &str)) -> Result<(), String> {
+    fn connects(&self, from: (&str, &str), to: (&str, &str)) -> Result<(), ParameterFault> {
         self.plant.connects(from, to)
     }
 
-    fn reaches(&self, offer: &Offer, positions: &[[f64; 3]]) -> Result<(), String> {
+    fn reaches(&self, offer: &Offer, positions: &[[f64; 3]]) -> Result<(), ParameterFault> {
         self.plant.reaches(&offer.skill, positions)
     }
 

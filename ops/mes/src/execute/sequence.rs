@@ -12,7 +12,7 @@ use tracing::info;
 use super::compensate::{self, Done};
 use super::{Chosen, Ended, Execution, Fallen, Offer, ProcessStep, SkillRole};
 use crate::plan::{Passed, TOOL};
-use crate::process::{BadEnd, Loop, Process, StepCondition, Test};
+use crate::process::{BadEnd, Incomparable, Loop, Process, StepCondition, Test};
 
 /// The steps of a run that are over.
 #[derive(Debug, Default)]
@@ -61,7 +61,7 @@ impl RunProgress {
     ///
     /// # Errors
     /// The condition that cannot be decided, or the maximum number of rounds.
-    pub(super) fn next_round(&mut self, process: &Process) -> Result<bool, String> {
+    pub(super) fn next_round(&mut self, process: &Process) -> Result<bool, ConditionFault> {
         loop {
             let mut loops = process.loops.iter().enumerate();
             let over = loops.find(|(number, one)| {
@@ -77,22 +77,27 @@ impl RunProgress {
             let first = over.steps.first().and_then(|step| process.steps.get(*step));
             let name = first.map_or("", |step| step.name.as_str());
             let is_due = self.holds_one(process, &over.again);
-            if !is_due.map_err(|why| format!("the loop of `{name}`: {why}"))? {
+            let is_due = is_due.map_err(|fault| ConditionFault::Loop {
+                first: name.to_owned(),
+                fault: Box::new(fault),
+            });
+            if !is_due? {
                 self.left.insert(number);
                 continue;
             }
             let rounds = self.rounds.entry(number).or_default();
             *rounds = rounds.saturating_add(1);
             if *rounds >= over.rounds {
-                return Err(format!(
-                    "the loop of `{name}` has had {rounds} rounds, its maximum, and another one is due"
-                ));
+                return Err(ConditionFault::Rounds {
+                    first: name.to_owned(),
+                    rounds: *rounds,
+                });
             }
             if self.all_rounds >= Loop::MOST_ROUNDS_OF_RUN {
-                return Err(format!(
-                    "the loops of the process have had {} rounds in all, the maximum of a run, and another one of `{name}` is due",
-                    self.all_rounds
-                ));
+                return Err(ConditionFault::AllRounds {
+                    first: name.to_owned(),
+                    rounds: self.all_rounds,
+                });
             }
             self.all_rounds = self.all_rounds.saturating_add(1);
             info!(step = name, rounds, "another round of a loop begins");
@@ -119,7 +124,7 @@ impl RunProgress {
     ///
     /// # Errors
     /// The condition that cannot be decided.
-    fn allows(&self, process: &Process, step: &ProcessStep) -> Result<bool, String> {
+    fn allows(&self, process: &Process, step: &ProcessStep) -> Result<bool, ConditionFault> {
         match step.when.is_empty() {
             true => Ok(true),
             false => self.holds_one(process, &step.when),
@@ -127,7 +132,11 @@ impl RunProgress {
     }
 
     /// Returns whether all conditions of one of the alternatives hold.
-    fn holds_one(&self, process: &Process, all: &[Vec<StepCondition>]) -> Result<bool, String> {
+    fn holds_one(
+        &self,
+        process: &Process,
+        all: &[Vec<StepCondition>],
+    ) -> Result<bool, ConditionFault> {
         for alternative in all {
             let mut holds = true;
             // The conditions of an outer branch come first: an inner condition is not decidable
@@ -145,7 +154,7 @@ impl RunProgress {
         Ok(false)
     }
 
-    fn holds(&self, process: &Process, condition: &StepCondition) -> Result<bool, String> {
+    fn holds(&self, process: &Process, condition: &StepCondition) -> Result<bool, ConditionFault> {
         let test = match &condition.test {
             Test::Ended(end) => self.passed.get(&condition.step) == Some(&Passed::Ended(*end)),
             Test::Result {
@@ -154,19 +163,53 @@ impl RunProgress {
                 value,
             } => {
                 let of = process.steps.get(condition.step);
-                let of = of.map_or("", |step| step.name.as_str());
+                let step = || of.map_or_else(String::new, |step| step.name.clone());
                 let done = self.current().find(|done| done.number == condition.step);
-                let done = done.ok_or_else(|| format!("`{of}` is not done, and has no {name}"))?;
+                let done = done.ok_or_else(|| ConditionFault::NotDone {
+                    step: step(),
+                    result: name.clone(),
+                })?;
                 let mut results = done.results.iter();
                 let result = results.find(|(known, _)| known == name);
-                let (_, result) =
-                    result.ok_or_else(|| format!("`{of}` returned no result {name}"))?;
+                let (_, result) = result.ok_or_else(|| ConditionFault::NoResult {
+                    step: step(),
+                    result: name.clone(),
+                })?;
                 let holds = compare.holds(&result.to_json(), value);
-                holds.map_err(|why| format!("{name} of `{of}`: {why}"))?
+                holds.map_err(|fault| ConditionFault::Incomparable {
+                    step: step(),
+                    result: name.clone(),
+                    fault,
+                })?
             }
         };
         Ok(test != condition.is_negated)
     }
+}
+
+/// The reason why a run cannot decide about a step or another round of a loop, or must not begin
+/// the round. `first` is the first step of the loop.
+#[derive(Debug, thiserror::Error)]
+pub(super) enum ConditionFault {
+    #[error("`{step}` is not done, and has no {result}")]
+    NotDone { step: String, result: String },
+    #[error("`{step}` returned no result {result}")]
+    NoResult { step: String, result: String },
+    #[error("{result} of `{step}`: {fault}")]
+    Incomparable {
+        step: String,
+        result: String,
+        fault: Incomparable,
+    },
+    #[error("the loop of `{first}`: {fault}")]
+    Loop { first: String, fault: Box<Self> },
+    #[error("the loop of `{first}` has had {rounds} rounds, its maximum, and another one is due")]
+    Rounds { first: String, rounds: u32 },
+    #[error(
+        "the loops of the process have had {rounds} rounds in all, the maximum of a run, \
+         and another one of `{first}` is due"
+    )]
+    AllRounds { first: String, rounds: u32 },
 }
 
 /// The end of a step.
@@ -293,7 +336,8 @@ impl Execution<'_> {
         progress: &mut RunProgress,
     ) -> Result<Option<Ready>, Ended> {
         loop {
-            if progress.next_round(self.process).map_err(Ended::Over)? {
+            let is_due = progress.next_round(self.process);
+            if is_due.map_err(|fault| Ended::Over(fault.to_string()))? {
                 return Err(Ended::Round);
             }
             let skipped = progress.passed.len();

@@ -32,7 +32,7 @@ struct Fakes {
     /// Skills named `Meet` wait for each other here.
     meets: Option<Arc<tokio::sync::Barrier>>,
     /// The results of the evaluations of queries, in their order.
-    found: Mutex<VecDeque<Result<serde_json::Value, String>>>,
+    found: Mutex<VecDeque<Result<serde_json::Value, ValueQueryFault>>>,
     /// Counts the evaluations after these, which do not end.
     silent_queries: watch::Sender<u32>,
     journal: Mutex<Vec<String>>,
@@ -84,7 +84,7 @@ impl Plant for Arc<Fakes> {
         &self,
         _skill: &str,
         given: &[GivenParameter],
-    ) -> Result<Vec<(String, SkillValue)>, String> {
+    ) -> Result<Vec<(String, SkillValue)>, ParameterFault> {
         given
             .iter()
             .filter(|given| given.result.is_none())
@@ -92,14 +92,14 @@ impl Plant for Arc<Fakes> {
             .map(|given| {
                 let value = match given.value.as_str() {
                     Some(text) => SkillValue::String(text.to_owned()),
-                    None => SkillValue::Double(given.value.as_f64().ok_or("no number")?),
+                    None => SkillValue::Double(given.value.as_f64().unwrap()),
                 };
                 Ok((given.name.clone(), value))
             })
             .collect()
     }
 
-    async fn query(&self, _query: &ParameterQuery) -> Result<serde_json::Value, String> {
+    async fn query(&self, _query: &ParameterQuery) -> Result<serde_json::Value, ValueQueryFault> {
         let found = self.found.lock().unwrap().pop_front();
         match found {
             Some(found) => found,
@@ -110,14 +110,19 @@ impl Plant for Arc<Fakes> {
         }
     }
 
-    fn result(&self, _skill: &str, name: &str) -> Result<Option<String>, String> {
+    fn result(&self, skill: &str, name: &str) -> Result<Option<String>, ParameterFault> {
         match name {
             "Width" => Ok(None),
-            other => Err(format!("no result {other}")),
+            other => Err(ParameterFault::Unknown {
+                skill: skill.to_owned(),
+                kind: "result",
+                name: other.to_owned(),
+                known: vec!["Width".to_owned()],
+            }),
         }
     }
 
-    fn connects(&self, _from: (&str, &str), _to: (&str, &str)) -> Result<(), String> {
+    fn connects(&self, _from: (&str, &str), _to: (&str, &str)) -> Result<(), ParameterFault> {
         Ok(())
     }
 

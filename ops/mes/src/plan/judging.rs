@@ -6,12 +6,19 @@ use std::collections::BTreeMap;
 use skills::ParameterType;
 
 use super::{Facts, Offer, Passed, Plan, PlanCandidate, PlannedNeed, Situation, Team, rank};
+use crate::parameter_fault::ParameterFault;
 use crate::process::{By, Group, Need, Process, ProcessStep, SkillRole, StepJob};
 
 #[derive(Debug, Clone, PartialEq, Eq)]
 enum NotFit {
     Unrelated,
     Because(String),
+}
+
+impl From<ParameterFault> for NotFit {
+    fn from(fault: ParameterFault) -> Self {
+        Self::Because(fault.to_string())
+    }
 }
 
 /// The judgement of offers for a process.
@@ -295,18 +302,16 @@ impl<'a> Judging<'a> {
     /// take.
     fn takes(&self, need: &Need, offer: &Offer) -> Result<(), NotFit> {
         if let (SkillRole::Alone(number), Some(step)) = (need.role, self.step(need.role)) {
-            let taken = self.facts.takes(offer, (number, step));
-            taken.map_err(NotFit::Because)?;
+            self.facts.takes(offer, (number, step))?;
         }
         if let (StepJob::PickAndPlace(job), SkillRole::Ptp | SkillRole::Linear) =
             (&self.process.work, need.role)
         {
             let positions = [job.pick, job.place].map(|[x, y, z, ..]| [x, y, z]);
-            let reached = self.facts.reaches(offer, &positions);
-            reached.map_err(NotFit::Because)?;
+            self.facts.reaches(offer, &positions)?;
         }
         for result in self.taken(need.role) {
-            self.facts.gives(offer, result).map_err(NotFit::Because)?;
+            self.facts.gives(offer, result)?;
         }
         Ok(())
     }

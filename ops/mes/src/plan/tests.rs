@@ -26,25 +26,38 @@ struct Known {
 }
 
 impl Facts for Known {
-    fn takes(&self, offer: &Offer, (_, step): (usize, &ProcessStep)) -> Result<(), String> {
+    fn takes(&self, offer: &Offer, (_, step): (usize, &ProcessStep)) -> Result<(), ParameterFault> {
         match self.refuses == (&*offer.component_name, &*step.name) {
-            true => Err(format!("{} has no parameter Nonsense", offer.name)),
+            true => Err(unknown(offer, "parameter", "Nonsense")),
             false => Ok(()),
         }
     }
 
-    fn gives(&self, offer: &Offer, result: &str) -> Result<(), String> {
+    fn gives(&self, offer: &Offer, result: &str) -> Result<(), ParameterFault> {
         match result.starts_with(&offer.name) {
             true => Ok(()),
-            false => Err(format!("{} has no result {result}", offer.name)),
+            false => Err(unknown(offer, "result", result)),
         }
     }
 
-    fn connects(&self, from: (&str, &str), to: (&str, &str)) -> Result<(), String> {
+    fn connects(&self, from: (&str, &str), to: (&str, &str)) -> Result<(), ParameterFault> {
         match to.1 == "Text" {
-            true => Err(format!("{} is a number", from.1)),
+            true => Err(ParameterFault::Kind {
+                result: from.1.into(),
+                has: "a number",
+                wanted: "a text",
+            }),
             false => Ok(()),
         }
+    }
+}
+
+fn unknown(offer: &Offer, kind: &'static str, name: &str) -> ParameterFault {
+    ParameterFault::Unknown {
+        skill: offer.name.clone(),
+        kind,
+        name: name.to_owned(),
+        known: Vec::new(),
     }
 }
 
@@ -57,26 +70,25 @@ struct Preferring {
 }
 
 impl Facts for Preferring {
-    fn takes(&self, _: &Offer, _: (usize, &ProcessStep)) -> Result<(), String> {
+    fn takes(&self, _: &Offer, _: (usize, &ProcessStep)) -> Result<(), ParameterFault> {
         Ok(())
     }
 
-    fn gives(&self, _: &Offer, _: &str) -> Result<(), String> {
+    fn gives(&self, _: &Offer, _: &str) -> Result<(), ParameterFault> {
         Ok(())
     }
 
-    fn connects(&self, _: (&str, &str), _: (&str, &str)) -> Result<(), String> {
+    fn connects(&self, _: (&str, &str), _: (&str, &str)) -> Result<(), ParameterFault> {
         Ok(())
     }
 
-    fn reaches(&self, offer: &Offer, positions: &[[f64; 3]]) -> Result<(), String> {
+    fn reaches(&self, offer: &Offer, positions: &[[f64; 3]]) -> Result<(), ParameterFault> {
         assert_eq!(positions, [[0.0; 3], [1.0; 3]]);
         let workspace = skills::RobotWorkspace {
             reach: (offer.component_name == "short").then_some(0.5),
             zones: Vec::new(),
         };
-        let allowed = workspace.allows_all(positions);
-        allowed.map_err(|why| why.to_string())
+        Ok(workspace.allows_all(positions)?)
     }
 
     fn attachment(&self, offer: &Offer) -> Attachment {
@@ -537,7 +549,7 @@ fn a_skill_without_the_result_that_a_later_step_takes_is_not_chosen() {
     process.steps[1].parameters = vec![result_of(0, "GraspWidth", "Width")];
     let found = plan(&process, &offers, &[]);
     assert_eq!(chosen(&found, 2), ["gripper#Grasp", "gripper#Release"]);
-    let expected = "Hold has no result GraspWidth";
+    let expected = "Hold has no result GraspWidth; it has none";
     assert_eq!(why(&found, SkillRole::Alone(0), "a-plain#Grasp"), expected);
     // A result of another type is a reason too.
     process.steps[1].parameters[0].name = "Text".into();

@@ -5,7 +5,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use knowledge::QuestionAnswer;
 use serde_json::Value;
 
-use super::{Row, conditions_of, one};
+use super::{ProcessFault, Row, StatementFault, conditions_of, one};
 use crate::process::{Loop, LoopConditionFault, ProcessStep};
 
 /// Reads the loops of a process. `order` has the IRIs of the steps.
@@ -16,7 +16,7 @@ pub(super) fn loops_of(
     process: &str,
     (order, steps): (&[&str], &[ProcessStep]),
     (loops, conditions): (&[Row], &[Row]),
-) -> Result<Vec<Loop>, String> {
+) -> Result<Vec<Loop>, ProcessFault> {
     let mut by_loop: BTreeMap<&str, Vec<&Row>> = BTreeMap::new();
     let of_process = |row: &&Row| QuestionAnswer::text(row, "process") == process;
     for row in loops.iter().filter(of_process) {
@@ -29,55 +29,54 @@ pub(super) fn loops_of(
     let mut iris = Vec::new();
     for (iri, rows) in by_loop {
         let read = read(iri, &rows, order, conditions);
-        let read = read.map_err(|why| format!("the loop {iri} {why}"))?;
+        let read = read.map_err(ProcessFault::of("loop", iri))?;
         let is_apart =
             |other: &Loop| other.steps.is_disjoint(&read.steps) || other.is_within(&read);
         if !all
             .iter()
             .all(|other| is_apart(other) || read.is_within(other))
         {
-            return Err(format!(
-                "the loop {iri} shares steps with another loop; one has to be within the other"
-            ));
+            return Err(ProcessFault::of("loop", iri)(StatementFault::SharedSteps));
         }
         if let Some(step) = caught(&read, steps).and_then(|step| order.get(step)) {
-            return Err(format!(
-                "the loop {iri} waits for the step {step}, which waits for the end of the loop"
-            ));
+            let fault = StatementFault::WaitsForItself((*step).to_owned());
+            return Err(ProcessFault::of("loop", iri)(fault));
         }
         all.push(read);
         iris.push(iri);
     }
     // The steps of other loops may be over too.
     for (one, iri) in all.iter().zip(iris) {
-        if let Some(why) = condition_fault(one, (steps, &all), order) {
-            return Err(format!("the loop {iri} {why}"));
+        if let Some(fault) = condition_fault(one, (steps, &all), order) {
+            return Err(ProcessFault::of("loop", iri)(fault));
         }
     }
     Ok(all)
 }
 
-fn read(iri: &str, rows: &[&Row], order: &[&str], conditions: &[Row]) -> Result<Loop, String> {
+fn read(
+    iri: &str,
+    rows: &[&Row],
+    order: &[&str],
+    conditions: &[Row],
+) -> Result<Loop, StatementFault> {
     let mut steps = BTreeSet::new();
     let named = rows.iter().map(|row| QuestionAnswer::text(row, "step"));
     for step in named.filter(|step| !step.is_empty()) {
         let number = order.iter().position(|known| *known == step);
-        steps.insert(number.ok_or_else(|| format!("repeats {step}, which is no step"))?);
+        steps.insert(number.ok_or_else(|| StatementFault::UnknownStep(step.to_owned()))?);
     }
     if steps.is_empty() {
-        return Err("has no ua:repeats".to_owned());
+        return Err(StatementFault::Missing("ua:repeats"));
     }
     let rounds = match one(rows, "rounds")? {
         None => Loop::USUAL_ROUNDS,
-        Some(value) => rounds(value).ok_or_else(|| {
-            let most = Loop::MOST_ROUNDS;
-            format!("has a ua:rounds that is not from 1 to {most}: {value}")
-        })?,
+        Some(value) => rounds(value).ok_or_else(|| StatementFault::Rounds(value.clone()))?,
     };
     // Its conditions are decided when all its steps are over.
     let again = conditions_of(iri, (order, order.len()), conditions)?;
     if again.is_empty() {
-        return Err("has no ua:when".to_owned());
+        return Err(StatementFault::Missing("ua:when"));
     }
     Ok(Loop {
         steps,
@@ -91,22 +90,12 @@ fn condition_fault(
     one: &Loop,
     (steps, loops): (&[ProcessStep], &[Loop]),
     order: &[&str],
-) -> Option<String> {
-    let name = |step: usize| order.get(step).copied().unwrap_or_default();
-    let why = match one.condition_fault(steps, loops)? {
-        LoopConditionFault::MayNotBeOver(step) => format!(
-            "has a condition about the step {step}, which may not be over when a round is: name a \
-             step of the loop, repeat {step} too (ua:repeats), or let a step of the loop come \
-             after it (ua:after)",
-            step = name(step)
-        ),
-        LoopConditionFault::IsConstant(step) => format!(
-            "has a ua:when about {} without a step of the loop, so that it holds after each round \
-             or never: add a ua:condition about a step that the loop repeats",
-            name(step)
-        ),
-    };
-    Some(why)
+) -> Option<StatementFault> {
+    let name = |step: usize| order.get(step).copied().unwrap_or_default().to_owned();
+    Some(match one.condition_fault(steps, loops)? {
+        LoopConditionFault::MayNotBeOver(step) => StatementFault::MayNotBeOver(name(step)),
+        LoopConditionFault::IsConstant(step) => StatementFault::ConstantCondition(name(step)),
+    })
 }
 
 fn rounds(value: &Value) -> Option<u32> {

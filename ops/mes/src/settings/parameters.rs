@@ -102,7 +102,7 @@ impl Reading<'_> {
         let read = readable(given);
         read.map_err(|why| {
             self.reader
-                .refuse::<()>(query, YamlFindingCode::WrongValue, why);
+                .refuse::<()>(query, YamlFindingCode::WrongValue, why.to_string());
         })
         .ok()
     }

@@ -182,6 +182,7 @@ fn loops_within_loops_have_a_maximum_of_rounds_in_all() {
         rounds += 1;
     };
     assert_eq!(rounds, Loop::MOST_ROUNDS_OF_RUN);
+    let why = why.to_string();
     assert!(why.contains("2000 rounds in all"), "{why}");
 }
 

@@ -24,7 +24,7 @@ fn by_query() -> Process {
     process
 }
 
-fn finding(found: &[Result<serde_json::Value, String>]) -> Fakes {
+fn finding(found: &[Result<serde_json::Value, ValueQueryFault>]) -> Fakes {
     Fakes {
         found: Mutex::new(found.to_vec().into()),
         ..plant([gripper("gripper"), gripper("other")].concat())
@@ -46,7 +46,12 @@ async fn a_query_is_evaluated_for_the_plan_and_again_when_its_step_begins() {
 
 #[tokio::test]
 async fn a_query_without_a_value_ends_the_run_before_its_step() {
-    let fault = || Err("it has several rows".to_owned());
+    let fault = || {
+        Err(ValueQueryFault::SeveralRows {
+            first: "30".to_owned(),
+            second: "31".to_owned(),
+        })
+    };
     let cases: [(&[_], usize); 2] = [(&[fault()], 0), (&[Ok(31.into()), fault()], 1)];
     for (found, plans) in cases {
         let (run, fakes, _) = executed(finding(found), &by_query()).await;
@@ -64,7 +69,7 @@ async fn a_query_without_a_value_ends_the_run_before_its_step() {
 
 #[tokio::test]
 async fn a_dry_run_names_the_query_without_a_value() {
-    let fakes = Arc::new(finding(&[Err("it has no row".to_owned())]));
+    let fakes = Arc::new(finding(&[Err(ValueQueryFault::NoRow)]));
     let plan = dry_run(&fakes, &by_query()).await;
     assert!(!plan.is_complete());
     let expected = "Width (query `grasp width`): it has no row";
@@ -183,7 +188,7 @@ fn conditional(is_negated: bool) -> Process {
 
 #[tokio::test]
 async fn a_query_of_a_step_with_conditions_needs_a_value_when_the_step_begins() {
-    let fault = || Err("it has no row".to_owned());
+    let fault = || Err(ValueQueryFault::NoRow);
     let (run, ..) = executed(finding(&[fault()]), &conditional(false)).await;
     assert_eq!((run.outcome, &run.reason), (How::Done, &None), "skipped");
     let (run, fakes, _) = executed(finding(&[fault(), fault()]), &conditional(true)).await;
@@ -200,7 +205,7 @@ async fn a_query_of_a_compensation_without_a_value_ends_the_run_before_its_first
     process.steps[0].compensation = undone_by(0, 2, "ReleaseSkillType");
     let undo = process.steps[0].compensation.as_mut().unwrap();
     undo.parameters = queried("Width", "release width");
-    let fakes = finding(&[Err("it has no row".to_owned())]);
+    let fakes = finding(&[Err(ValueQueryFault::NoRow)]);
     let (run, ..) = executed(fakes, &process).await;
     let reason = run.reason.unwrap();
     let expected = "compensation 0: Width (query `release width`): it has no row";

@@ -152,7 +152,7 @@ fn in_graph(turtle: &str) -> Result<Vec<Loop>, String> {
     let mut read = crate::read_process::Processes::read(&knowledge).unwrap();
     match read.all.pop() {
         Some(process) => Ok(process.loops),
-        None => Err(read.faults.into_values().next().unwrap()),
+        None => Err(read.faults.into_values().next().unwrap().to_string()),
     }
 }
 
