@@ -191,6 +191,23 @@ impl<'f> NodeReader<'f> {
         Some(values)
     }
 
+    /// Reads a list, or its only entry: the node itself if `is_one`.
+    pub(crate) fn one_or_list<T: FromNode>(
+        &mut self,
+        node: &YamlNode<'_>,
+        is_one: bool,
+        wanted: &str,
+    ) -> Option<Vec<Located<T>>> {
+        match &node.kind {
+            YamlKind::List(_) => Vec::read(node, self),
+            _ if is_one => Some(vec![self.at(node)]),
+            YamlKind::Null | YamlKind::Scalar(_) | YamlKind::Map(_) => {
+                self.wrong(node, wanted);
+                None
+            }
+        }
+    }
+
     /// Returns the value of a key; a key without a value counts as left out.
     pub(crate) fn field<T: FromNode>(&mut self, node: Option<&YamlNode<'_>>) -> OptionalKey<T> {
         let node = node.filter(|node| !matches!(node.kind, YamlKind::Null))?;
@@ -310,7 +327,7 @@ pub(crate) const fn plain(name: &'static str) -> &'static str {
 /// A map of known keys, each of which may be left out; the names of the fields are the keys.
 macro_rules! document {
     ($($(#[$meta:meta])* struct $name:ident { $($(#[$field_meta:meta])* $field:ident: $type:ty,)* })*) => {$(
-        #[derive(Clone, Debug, schemars::JsonSchema)]
+        #[derive(Clone, Debug, Default, schemars::JsonSchema)]
         $(#[$meta])*
         #[schemars(deny_unknown_fields)]
         pub(crate) struct $name { $($(#[$field_meta])* pub(crate) $field: $crate::read::OptionalKey<$type>,)* }
@@ -350,4 +367,23 @@ macro_rules! choice {
     )*};
 }
 
-pub(crate) use {choice, document};
+/// The schema of a type, written where the type is used.
+macro_rules! inline_schema {
+    ($name:ident, $generator:ident => $schema:expr) => {
+        impl schemars::JsonSchema for $name {
+            fn inline_schema() -> bool {
+                true
+            }
+
+            fn schema_name() -> std::borrow::Cow<'static, str> {
+                stringify!($name).into()
+            }
+
+            fn json_schema($generator: &mut schemars::SchemaGenerator) -> schemars::Schema {
+                $schema
+            }
+        }
+    };
+}
+
+pub(crate) use {choice, document, inline_schema};

@@ -1,9 +1,7 @@
 //! `alarm` of a variable in the document.
 
-use schemars::JsonSchema;
-
-use crate::document::DURATION;
-use crate::read::{FromNode, Located, NodeReader, choice, document};
+use super::DURATION;
+use crate::read::{FromNode, Located, NodeReader, choice, document, inline_schema};
 use crate::tree::{YamlKind, YamlNode};
 
 document! {
@@ -70,28 +68,13 @@ pub(crate) struct ValueList(pub(crate) Vec<Located<String>>);
 
 impl FromNode for ValueList {
     fn read(node: &YamlNode<'_>, reader: &mut NodeReader<'_>) -> Option<Self> {
-        match &node.kind {
-            YamlKind::List(_) => Vec::read(node, reader).map(Self),
-            YamlKind::Scalar(_) => Some(Self(vec![reader.at(node)])),
-            YamlKind::Null | YamlKind::Map(_) => {
-                reader.wrong(node, "a value such as `3`, or a list of them");
-                None
-            }
-        }
+        let is_one = matches!(node.kind, YamlKind::Scalar(_));
+        let wanted = "a value such as `3`, or a list of them";
+        reader.one_or_list(node, is_one, wanted).map(Self)
     }
 }
 
-impl JsonSchema for ValueList {
-    fn inline_schema() -> bool {
-        true
-    }
-
-    fn schema_name() -> std::borrow::Cow<'static, str> {
-        "ValueList".into()
-    }
-
-    fn json_schema(_: &mut schemars::SchemaGenerator) -> schemars::Schema {
-        let one = schemars::json_schema!({ "type": ["string", "boolean", "number"] });
-        schemars::json_schema!({ "anyOf": [one, { "type": "array", "items": one, "minItems": 1 }] })
-    }
-}
+inline_schema!(ValueList, _generator => {
+    let one = schemars::json_schema!({ "type": ["string", "boolean", "number"] });
+    schemars::json_schema!({ "anyOf": [one, { "type": "array", "items": one, "minItems": 1 }] })
+});
