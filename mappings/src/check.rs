@@ -14,35 +14,38 @@ mod loss;
 mod meaning;
 mod names;
 mod network;
+mod nodes;
 mod nodesets;
 mod patterns;
 mod permissions;
 mod quality;
+mod quantity;
 mod remote;
 mod security;
 mod selection;
+mod server;
 mod servers;
 mod services;
 mod several;
 mod shaping;
+mod site;
 mod types;
 mod variables;
 
 use std::collections::BTreeSet;
 use std::path::PathBuf;
-use std::sync::Arc;
 
-use messages::{DefinitionTexts, Dialect, NoTexts, TextKind, TypeName};
+use messages::{Dialect, TextKind, TypeName};
 
 use crate::code::Code;
 use crate::diagnostic::{Diagnostic, Severity};
 use crate::document::Document;
 use crate::findings::MappingFindings;
-use crate::include::Loader;
+use crate::include::{CheckedText, Loader};
 use crate::mapping::Mapping;
 use crate::read::{Located, OptionalKey};
 use crate::server::Server;
-use crate::surroundings::{Alone, Surroundings};
+use crate::surroundings::{Alone, PathFault, PathFaultKind, Surroundings};
 use crate::topic::SpaceId;
 use crate::tree::TextSpan;
 
@@ -88,46 +91,6 @@ pub enum TypeOrigin {
     File(String),
     /// The definition is not known yet.
     Unknown,
-}
-
-/// Definition files, as [`Surroundings::types`] opens them.
-pub trait OpenTypeFiles: DefinitionTexts {
-    /// Returns the faults of the `type_paths`; called once.
-    fn faults(&mut self) -> Vec<PathFault>;
-}
-
-impl OpenTypeFiles for NoTexts {
-    fn faults(&mut self) -> Vec<PathFault> {
-        Vec::new()
-    }
-}
-
-/// Fault of one of the `type_paths`.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct PathFault {
-    /// Index of the path in `type_paths`, from 0.
-    pub path: usize,
-    /// Kind of the fault.
-    pub what: PathFaultKind,
-}
-
-/// Kind of a fault of one of the `type_paths`.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub enum PathFaultKind {
-    /// The path does not exist, cannot be read, or has no definitions. The text is the reason, for
-    /// users.
-    Empty(String),
-    /// A file of the path is ignored. The text gives file, line and reason, for users.
-    File(String),
-}
-
-/// A text that was checked.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct CheckedText {
-    /// Name of the text in findings.
-    pub name: Arc<str>,
-    /// Content of the file.
-    pub text: String,
 }
 
 impl Checked {
@@ -308,12 +271,12 @@ fn compile(
     let mut types = MessageTypes::new(files);
     let spaces = cell::spaces(document.spaces.as_ref(), findings);
     let namespaces = cell::namespaces(document.namespaces.as_ref(), findings);
-    let pubsub = network::pubsub(document.pubsub.as_ref(), findings);
+    let pubsub = carriers::check(document.pubsub.as_ref(), findings);
     let (files, named) = nodesets::files(document.server.as_ref(), findings);
     let server = Server {
         find_skills: finding::check(document.server.as_ref(), findings),
         nodesets: files,
-        ..network::server(document.server.as_ref(), findings)
+        ..server::check(document.server.as_ref(), findings)
     };
     let near = (&server, &namespaces);
     let servers = servers::check(document.servers.as_ref(), near, findings);

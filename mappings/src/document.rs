@@ -5,10 +5,12 @@ mod alarm;
 mod binding;
 mod call;
 mod carriers;
+mod patterns;
 mod permissions;
 mod request;
 mod security;
 mod server;
+mod servers;
 mod variable;
 
 use std::collections::BTreeMap;
@@ -17,7 +19,6 @@ use crate::code::Code;
 use crate::read::{
     FromNode, Located, NodeReader, document, help_octal, inline_schema, is_octal, short,
 };
-use crate::server_entries::RemoteServerEntry;
 use crate::tree::{TextSpan, YamlKind, YamlNode};
 
 pub(crate) use alarm::{AcknowledgesEntry, AlarmEntry, ReportsEntry};
@@ -34,7 +35,8 @@ pub(crate) use request::Request;
 pub(crate) use security::{
     GroupEntry, GroupModeEntry, GroupPolicyEntry, KeysEntry, ReplayEntry, SksEntry,
 };
-pub(crate) use server::{AnonymousEntry, HistoryEntry, LimitsEntry, SecurityEntry, ServerEntry};
+pub(crate) use server::{AnonymousEntry, HistoryEntry, LimitsEntry, ServerEntry};
+pub(crate) use servers::{FromEntry, RemoteServerEntry, SecurityEntry, ToEntry};
 pub(crate) use variable::{
     ConfirmEntry, ConfirmWhenEntry, ConfirmedEntry, OnLossEntry, PublishEntry, Queue,
     StopCallEntry, UaFieldEntry, VariableEntry,
@@ -89,10 +91,6 @@ document! {
         domain: u16,
     }
 }
-
-pub(crate) const EXPANDED_NODE_ID: &str = r"^(ns=[0-9]+;|nsu=[^;]+;)?[isgb]=";
-
-pub(crate) const DURATION: &str = r"^[0-9]+(\.[0-9]+)?(ms|s|min|h)$";
 
 /// Index and URI, each with its position.
 pub(crate) type Namespaces = Vec<(Located<u16>, Located<String>)>;

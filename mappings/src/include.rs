@@ -1,12 +1,22 @@
 //! A document and the files that it includes, as one document.
 
-use crate::check::CheckedText;
+use std::sync::Arc;
+
 use crate::code::Code;
 use crate::document::{self, Document, PubSubForm};
 use crate::findings::MappingFindings;
 use crate::read::{Located, NodeReader, OptionalKey};
 use crate::surroundings::{FileReaders, Surroundings, beside, fits};
 use crate::tree::{self, MAX_BYTES, MAX_EXPANDED, TextSpan};
+
+/// A text that was checked.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct CheckedText {
+    /// Name of the text in findings.
+    pub name: Arc<str>,
+    /// Content of the file.
+    pub text: String,
+}
 
 /// Reads files into one document.
 pub(crate) struct Loader<'a> {

@@ -29,7 +29,6 @@ mod schema;
 mod secret;
 mod security;
 mod server;
-mod server_entries;
 mod surroundings;
 mod topic;
 mod tree;
@@ -43,9 +42,7 @@ pub use call::{
     MethodTarget,
 };
 pub use carriers::{CarrierMedium, ConfiguredCarrier, ForwardedName, UdpGroup};
-pub use check::{
-    Checked, CheckedText, OpenTypeFiles, PathFault, PathFaultKind, TypeOrigin, TypeUse,
-};
+pub use check::{Checked, TypeOrigin, TypeUse};
 pub use code::{Code, UnknownCode};
 pub use diagnostic::{Diagnostic, Severity, Span};
 pub use difference::Difference;
@@ -54,6 +51,7 @@ pub use endpoint::Endpoint;
 pub use environment::{Environment, LiveNode, LiveRemote, LiveServer, LiveSpace, LiveTopic};
 pub use ethernet::{EthernetGroup, MacAddress};
 
+pub use include::CheckedText;
 pub use loss::{Loss, LossAction, Motion};
 pub use mapping::{
     Binding, Lasting, Mapping, Meaning, Overflow, Publish, ServiceBinding, ServiceRole, Space,
@@ -73,6 +71,6 @@ pub use schema::schema;
 pub use secret::masked;
 pub use security::{GroupMode, GroupPolicy, KeySource, Replay, SecurityGroup, ServedKeys};
 pub use server::{Server, ServerLimits};
-pub use surroundings::{FileReaders, Surroundings};
+pub use surroundings::{FileReaders, OpenTypeFiles, PathFault, PathFaultKind, Surroundings};
 pub use topic::{NamePart, SpaceId, TopicError, TopicId};
 pub use unit::Unit;

@@ -198,14 +198,14 @@ impl<'f> NodeReader<'f> {
         is_one: bool,
         wanted: &str,
     ) -> Option<Vec<Located<T>>> {
-        match &node.kind {
-            YamlKind::List(_) => Vec::read(node, self),
-            _ if is_one => Some(vec![self.at(node)]),
-            YamlKind::Null | YamlKind::Scalar(_) | YamlKind::Map(_) => {
-                self.wrong(node, wanted);
-                None
-            }
+        if is_one {
+            return Some(vec![self.at(node)]);
         }
+        if matches!(node.kind, YamlKind::List(_)) {
+            return Vec::read(node, self);
+        }
+        self.wrong(node, wanted);
+        None
     }
 
     /// Returns the value of a key; a key without a value counts as left out.

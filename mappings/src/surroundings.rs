@@ -4,9 +4,8 @@
 use std::io;
 use std::path::{Component, Path, PathBuf};
 
-use messages::NoTexts;
+use messages::{DefinitionTexts, NoTexts};
 
-use crate::check::OpenTypeFiles;
 use crate::environment::Environment;
 use crate::nodesets::NodeSets;
 
@@ -61,6 +60,37 @@ pub enum FileReaders {
     Group,
     /// Every user of the host.
     Everybody,
+}
+
+/// Definition files, as [`Surroundings::types`] opens them.
+pub trait OpenTypeFiles: DefinitionTexts {
+    /// Returns the faults of the `type_paths`; called once.
+    fn faults(&mut self) -> Vec<PathFault>;
+}
+
+impl OpenTypeFiles for NoTexts {
+    fn faults(&mut self) -> Vec<PathFault> {
+        Vec::new()
+    }
+}
+
+/// Fault of one of the `type_paths`.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct PathFault {
+    /// Index of the path in `type_paths`, from 0.
+    pub path: usize,
+    /// Kind of the fault.
+    pub what: PathFaultKind,
+}
+
+/// Kind of a fault of one of the `type_paths`.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum PathFaultKind {
+    /// The path does not exist, cannot be read, or has no definitions. The text is the reason, for
+    /// users.
+    Empty(String),
+    /// A file of the path is ignored. The text gives file, line and reason, for users.
+    File(String),
 }
 
 /// A document that stands alone.

@@ -6,7 +6,7 @@ use std::time::Duration;
 use messages::Leaf;
 use uadp::BuiltinType;
 
-use super::network;
+use super::quantity::duration;
 use super::types::{self, ValueType};
 use crate::alarm::{Alarm, AlarmLimits, AlarmTrigger, AlarmValue};
 use crate::code::Code;
@@ -82,7 +82,7 @@ fn alarm(
     let severity = severity(said, findings);
     let delay = match &said.delay {
         None => Some(Duration::ZERO),
-        Some(_) => network::duration(&said.delay, findings),
+        Some(_) => duration(&said.delay, findings),
     };
     let message = message(said, findings);
     Some(Alarm {

@@ -6,32 +6,21 @@ use std::sync::Arc;
 
 use messages::{DefinitionError, Dialect, Leaf, MessageType, Selection, TextKind, TypeName};
 
-use super::names::{mended, topic_fault};
+use super::nodes::{Spaces, space};
+use super::required;
 use super::selection::{self, SelectionKeys};
 use super::services::{self, BindingKind, CheckedService, DocumentCalls, ServiceContext};
 use super::several;
 use super::shaping::ValueDirection;
-use super::types::{self, MessageTypes, ValueType, dialect};
-use super::{Declared, required, variables};
+use super::site::{BindingSite, BoundVariable, compare, ros, ros_name};
+use super::types::{self, MessageTypes, ValueType, dialect, told};
 use crate::code::Code;
 use crate::document::{self, BindingEntry};
 use crate::findings::MappingFindings;
-use crate::mapping::{Binding, Space};
-use crate::read::{Located, list, short};
+use crate::mapping::Binding;
+use crate::read::{Located, short};
 use crate::topic::{SpaceId, TopicId};
 use crate::tree::TextSpan;
-
-/// Maximum number of fields that a help lists.
-const TOLD: usize = 12;
-
-/// Variable of the bindings that are checked.
-pub(super) struct BoundVariable {
-    pub(super) topic: Option<TopicId>,
-    pub(super) origin: Option<SpaceId>,
-    pub(super) declared: Option<ValueType>,
-    /// The variable has a `type`, which is not a value type.
-    pub(super) type_faulty: bool,
-}
 
 pub(super) struct Bound {
     pub(super) bindings: Vec<Binding>,
@@ -47,19 +36,6 @@ struct ReadBinding {
     fields: Option<Vec<Leaf>>,
 }
 
-/// Position of a binding in the document.
-pub(super) struct BindingSite<'s> {
-    pub(super) place: TextSpan,
-    pub(super) space: Option<SpaceId>,
-    pub(super) subject: &'s BoundVariable,
-}
-
-impl BindingSite<'_> {
-    pub(super) fn dialect(&self) -> Dialect {
-        self.space.map_or(Dialect::Ros1, dialect)
-    }
-}
-
 /// Use of one ROS topic of one space by a variable.
 struct Use {
     place: TextSpan,
@@ -68,7 +44,7 @@ struct Use {
 }
 
 pub(super) struct VariableBindings<'c> {
-    spaces: &'c Declared<Vec<Space>>,
+    spaces: &'c Spaces,
     types: &'c mut MessageTypes,
     calls: DocumentCalls,
     uses: HashMap<(SpaceId, String), Vec<Use>>,
@@ -78,7 +54,7 @@ pub(super) struct VariableBindings<'c> {
 
 impl<'c> VariableBindings<'c> {
     pub(super) fn new(
-        spaces: &'c Declared<Vec<Space>>,
+        spaces: &'c Spaces,
         calls: DocumentCalls,
         types: &'c mut MessageTypes,
     ) -> Self {
@@ -191,8 +167,8 @@ impl<'c> VariableBindings<'c> {
             return (subject.origin, owner);
         };
         let number = at.value;
-        let space = number
-            .and_then(|number| variables::space(number, at.place, "space", self.spaces, findings));
+        let space =
+            number.and_then(|number| space(number, at.place, "space", self.spaces, findings));
         if space == Some(SpaceId::UA) {
             let note = findings.error(
                 Code::OpcUaBinding,
@@ -470,89 +446,6 @@ fn topic_name(
         return None;
     }
     Some((text.to_owned(), place))
-}
-
-/// Returns `None` for a text that is not the name of a topic or service, which is noted.
-pub(super) fn ros_name(
-    text: &str,
-    place: TextSpan,
-    (dialect, what): (Dialect, &str),
-    findings: &mut MappingFindings,
-) -> Option<()> {
-    if let Some(fault) = topic_fault(text, dialect) {
-        let note = findings
-            .error(
-                Code::RosTopic,
-                place,
-                format!("`{}` is not a ROS {what} name", short(text)),
-            )
-            .label(fault);
-        if let Some(mended) = mended(text, dialect) {
-            note.help(format!("did you mean `{mended}`?"));
-        }
-        return None;
-    }
-    Some(())
-}
-
-const fn ros(dialect: Dialect) -> &'static str {
-    match dialect {
-        Dialect::Ros1 => "ROS 1",
-        Dialect::Ros2 => "ROS 2",
-    }
-}
-
-pub(super) fn told(paths: &[&str]) -> String {
-    match paths.split_at_checked(TOLD) {
-        Some((first, rest)) if !rest.is_empty() => {
-            format!("{} and {} more", list(first), rest.len())
-        }
-        Some(_) | None if paths.is_empty() => "none".to_owned(),
-        Some(_) | None => list(paths),
-    }
-}
-
-pub(super) fn compare(
-    fields: &[Leaf],
-    name: &TypeName,
-    subject: &BoundVariable,
-    place: TextSpan,
-    findings: &mut MappingFindings,
-) {
-    let Some(declared) = subject.declared else {
-        return;
-    };
-    let told_type = types::print(declared);
-    match fields {
-        [one] if types::value_type(one) == declared => {}
-        [one] if *one == Leaf::bytes() => {
-            let message = format!("the variable is {told_type}, but bytes are a ByteString");
-            findings
-                .error(Code::TypeDiffers, place, message)
-                .help("remove the `type` of the variable, or write `type: ByteString`");
-        }
-        [one] => {
-            let found = types::print(types::value_type(one));
-            let message = format!(
-                "the variable is {told_type}, but `{}` of `{name}` is {found}",
-                one.path
-            );
-            let help = format!("remove the `type` of the variable, or write `type: {found}`");
-            findings.error(Code::TypeDiffers, place, message).help(help);
-        }
-        several => {
-            let paths: Vec<&str> = several.iter().map(|leaf| leaf.path.as_str()).collect();
-            let message = format!(
-                "the variable is a single {told_type}, but `{name}` has {} fields",
-                several.len()
-            );
-            let help = format!(
-                "bind one `field` of {}, or remove the `type` of the variable",
-                told(&paths)
-            );
-            findings.error(Code::TypeDiffers, place, message).help(help);
-        }
-    }
 }
 
 /// Returns `true` if both bindings bind raw messages and the types or dialects differ, so that the

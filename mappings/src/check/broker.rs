@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use super::network::{duration, within};
+use super::quantity::{duration, within};
 use crate::broker::{Broker, BrokerAddress, MessageMapping, MqttVersion, TopicForm};
 use crate::code::Code;
 use crate::document::{EncodingEntry, MqttEntry, MqttVersionEntry, PubSubEntry, TopicFormEntry};

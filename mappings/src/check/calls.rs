@@ -8,10 +8,10 @@ use std::collections::{BTreeMap, HashMap};
 use std::time::Duration;
 
 use self::bindings::FoundBinding;
-use super::network::duration;
+use super::nodes::{CheckedNamespaces, NAMESPACE_ZERO, Spaces, checked_name, node_id, space};
+use super::quantity::duration;
 use super::servers::Servers;
 use super::types::MessageTypes;
-use super::variables::{CheckedNamespaces, NAMESPACE_ZERO, Spaces, checked_name, node_id, space};
 use super::{permissions, required};
 use crate::call::{Call, CallBinding, CallKind, ExecutedBy, MethodTarget};
 use crate::code::Code;

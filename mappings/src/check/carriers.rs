@@ -7,14 +7,30 @@ use super::{broker, ethernet};
 use crate::broker::{Broker, BrokerAddress};
 use crate::carriers::{CarrierMedium, ConfiguredCarrier, ForwardedName, UdpGroup};
 use crate::code::Code;
-use crate::document::{CarrierEntry, MqttEntry, PubSubEntry, UdpEntry};
+use crate::document::{CarrierEntry, MqttEntry, PubSubEntry, PubSubForm, UdpEntry};
 use crate::findings::MappingFindings;
 use crate::pubsub::PubSub;
 use crate::read::{Located, given, short};
 use crate::tree::TextSpan;
 
+/// Returns the settings of the carriers, with defaults for faulty keys, which are noted.
+pub(super) fn check(entry: Option<&Located<PubSubForm>>, findings: &mut MappingFindings) -> PubSub {
+    let Some(Located { place, value }) = entry else {
+        return PubSub::default();
+    };
+    match value {
+        None => PubSub::default(),
+        Some(PubSubForm::One(entry)) => {
+            let mut pubsub = settings(entry, findings);
+            pubsub.carriers.extend(ethernet::alone(entry, findings));
+            pubsub
+        }
+        Some(PubSubForm::Several(entries)) => listed(entries, *place, findings),
+    }
+}
+
 /// Returns the settings of a list of carriers.
-pub(super) fn check(
+fn listed(
     entries: &[Located<CarrierEntry>],
     place: TextSpan,
     findings: &mut MappingFindings,

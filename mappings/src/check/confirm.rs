@@ -5,7 +5,8 @@ use std::time::Duration;
 
 use uadp::BuiltinType;
 
-use super::{network, required, types};
+use super::quantity::duration;
+use super::{required, types};
 use crate::code::Code;
 use crate::document::{ConfirmEntry, ConfirmWhenEntry, ConfirmedEntry, VariableEntry};
 use crate::findings::MappingFindings;
@@ -123,7 +124,7 @@ fn by_bridges(
         return Some(CONFIRMED_WITHIN);
     };
     let place = entry.within.as_ref().map_or(place, |within| within.place);
-    let within = network::duration(&entry.within, findings)?;
+    let within = duration(&entry.within, findings)?;
     if within > LONGEST {
         findings
             .error(
@@ -150,7 +151,7 @@ fn confirm(
             .help("`confirm` with `by` requires `origin: 0`, and excludes `from`");
         return None;
     }
-    let within = network::duration(&entry.within, findings);
+    let within = duration(&entry.within, findings);
     if entry.within.is_some() && within.is_none() {
         return None;
     }

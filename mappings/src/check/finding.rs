@@ -3,8 +3,9 @@
 use std::net::Ipv4Addr;
 
 use super::cell::is_uri;
-use super::network::{policy, within};
+use super::quantity::within;
 use super::required;
+use super::server::policy;
 use super::servers::Servers;
 use crate::call::Call;
 use crate::code::Code;

@@ -5,8 +5,9 @@ use std::sync::Arc;
 
 use messages::{MessagePlan, MessageType, Selection, TypeName, Wire};
 
+use super::quantity::duration;
+use super::required;
 use super::types::{MessageTypes, dialect};
-use super::{network, required};
 use crate::code::Code;
 use crate::document::{OnLossEntry, Request, VariableEntry};
 use crate::findings::MappingFindings;
@@ -50,7 +51,7 @@ fn loss(
     (by_node, types): (&HashMap<NodeIdText, TopicId>, &mut MessageTypes),
     findings: &mut MappingFindings,
 ) -> Option<Loss> {
-    let hold = network::duration(&entry.hold, findings);
+    let hold = duration(&entry.hold, findings);
     let Some(at) = &entry.on_loss else {
         if let Some(hold) = &entry.hold {
             findings

@@ -1,17 +1,15 @@
 //! Patterns: topics that become variables when they appear.
 
-use std::collections::BTreeMap;
-
 use messages::{Selection, TypeName};
 
+use super::nodes::{CheckedNamespaces, Spaces, space};
+use super::required;
 use super::selection::{self, SelectionKeys};
 use super::shaping::ValueDirection;
 use super::types::{MessageTypes, dialect};
-use super::{Declared, required, variables};
 use crate::code::Code;
 use crate::document::PatternEntry;
 use crate::findings::MappingFindings;
-use crate::mapping::Space;
 use crate::node_id::NodeIdText;
 use crate::pattern::{Glob, NameTemplate, Pattern};
 use crate::read::{Located, given, short};
@@ -23,7 +21,7 @@ const MAX_PATTERNS: usize = 1000;
 
 pub(super) fn check(
     entries: &[Located<PatternEntry>],
-    (spaces, namespaces): (&Declared<Vec<Space>>, &Declared<BTreeMap<u16, String>>),
+    (spaces, namespaces): (&Spaces, &CheckedNamespaces),
     types: &mut MessageTypes,
     findings: &mut MappingFindings,
 ) -> Vec<Pattern> {
@@ -80,10 +78,10 @@ pub(super) fn check(
 fn origin_of(
     number: u16,
     place: TextSpan,
-    spaces: &Declared<Vec<Space>>,
+    spaces: &Spaces,
     findings: &mut MappingFindings,
 ) -> Option<SpaceId> {
-    let origin = variables::space(number, place, "origin", spaces, findings)?;
+    let origin = space(number, place, "origin", spaces, findings)?;
     if origin == SpaceId::UA {
         let message = "space 0 is the OPC UA side and has no ROS topics";
         findings
@@ -105,7 +103,7 @@ struct Texts {
 fn texts(
     entry: &PatternEntry,
     owner: TextSpan,
-    namespaces: &Declared<BTreeMap<u16, String>>,
+    namespaces: &CheckedNamespaces,
     findings: &mut MappingFindings,
 ) -> Option<Texts> {
     let topics = required(&entry.topics, "topics", "the pattern", owner, findings);
@@ -202,7 +200,7 @@ fn node(
     text: &str,
     place: TextSpan,
     (captures, alias): (usize, bool),
-    namespaces: &Declared<BTreeMap<u16, String>>,
+    namespaces: &CheckedNamespaces,
     findings: &mut MappingFindings,
 ) -> Option<NameTemplate> {
     let template = numbered(text, place, captures, findings)?;

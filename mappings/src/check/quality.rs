@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use super::network;
+use super::quantity::duration;
 use crate::code::Code;
 use crate::document::VariableEntry;
 use crate::findings::MappingFindings;
@@ -40,8 +40,8 @@ pub(super) fn check(
         return None;
     }
     let ages = Ages {
-        uncertain_after: network::duration(&said.uncertain_after, findings),
-        bad_after: network::duration(&said.bad_after, findings),
+        uncertain_after: duration(&said.uncertain_after, findings),
+        bad_after: duration(&said.bad_after, findings),
         deadline,
     };
     let faulty = (said.uncertain_after.is_some() && ages.uncertain_after.is_none())
@@ -71,7 +71,7 @@ fn deadline(
     let Some((_, place)) = given(&entry.deadline) else {
         return Some(None);
     };
-    let limit = network::duration(&entry.deadline, findings)?;
+    let limit = duration(&entry.deadline, findings)?;
     let fits =
         publish.is_none_or(|publish| is_frequent(publish, (limit, place), "deadline", findings));
     fits.then_some(Some(limit))

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::time::Duration;
 
-use super::network::duration;
+use super::quantity::duration;
 use super::required;
 use crate::call::Call;
 use crate::code::Code;

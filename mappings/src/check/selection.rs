@@ -5,15 +5,14 @@ use std::sync::Arc;
 
 use messages::{Leaf, MessageType, Selection};
 
-use super::bindings::told;
 use super::several;
 use super::shaping::{self, ConversionKeys, ValueDirection};
+use super::types;
 use crate::code::Code;
 use crate::document::{AsEntry, BindingEntry, FieldList, PatternEntry};
 use crate::findings::MappingFindings;
-use crate::read::{OptionalKey, given, short};
+use crate::read::{OptionalKey, given};
 use crate::tree::TextSpan;
-use documents::nearest;
 
 /// Keys of a binding or a pattern that select fields.
 #[derive(Clone, Copy)]
@@ -65,6 +64,25 @@ impl SelectionKeys<'_> {
         shaping::shaping(self.keys, findings)?.of_nothing(findings)
     }
 
+    /// Checks that `fields` stands without `field` and `as`. A fault is noted.
+    fn are_alone(&self, findings: &mut MappingFindings) -> Option<()> {
+        let beside = [
+            ("field", self.field.as_ref().map(|at| at.place)),
+            ("as", self.r#as.as_ref().map(|at| at.place)),
+        ];
+        let mut beside = beside
+            .into_iter()
+            .filter_map(|(key, place)| Some((key, place?)));
+        let Some((key, place)) = beside.next() else {
+            return Some(());
+        };
+        let message = format!("`{key}` cannot be combined with `fields`");
+        findings
+            .error(Code::Fields, place, message)
+            .help("remove one of them");
+        None
+    }
+
     /// Returns `None` for a faulty selection, which is noted.
     pub(super) fn selection(
         self,
@@ -75,7 +93,9 @@ impl SelectionKeys<'_> {
         let shaping = shaping::shaping(self.keys, findings)?;
         if let Some(at) = self.fields {
             shaping.of_fields(findings)?;
-            return several::fields(self, at, message_type, way, findings);
+            at.value.as_ref()?;
+            self.are_alone(findings)?;
+            return several::fields(at, message_type, way, findings);
         }
         let r#as = given(self.r#as).map_or(AsEntry::Fields, |(r#as, _)| *r#as);
         match (self.field, r#as) {
@@ -136,43 +156,6 @@ pub(super) fn leaves(
         }
         Selection::Value { .. } => shaping::leaves(message_type, selection, place, findings),
         Selection::Whole => Some(message_type.leaves().to_vec()),
-        Selection::Field(path) => field(message_type, path, place, findings),
+        Selection::Field(path) => types::field(message_type, path, place, findings),
     }
-}
-
-/// Returns a field, or the fields of a message inside of the message; `None` if the type lacks the
-/// path, which is noted.
-pub(super) fn field(
-    message_type: &MessageType,
-    path: &str,
-    place: TextSpan,
-    findings: &mut MappingFindings,
-) -> Option<Vec<Leaf>> {
-    if let Some(leaf) = message_type.leaf(path) {
-        return Some(vec![leaf.clone()]);
-    }
-    let inside: Vec<Leaf> = message_type
-        .leaves()
-        .iter()
-        .filter(|leaf| leaf.is_inside(path))
-        .cloned()
-        .collect();
-    if !inside.is_empty() {
-        return Some(inside);
-    }
-    let paths: Vec<&str> = message_type
-        .leaves()
-        .iter()
-        .map(|leaf| leaf.path.as_str())
-        .collect();
-    let name = message_type.name();
-    let message = format!("`{name}` has no field `{}`", short(path));
-    let note = findings.error(Code::UnknownField, place, message);
-    let near = nearest(path, paths.iter().copied()).map(|near| format!("did you mean `{near}`? "));
-    note.help(format!(
-        "{}its fields are {}",
-        near.unwrap_or_default(),
-        told(&paths)
-    ));
-    None
 }

@@ -3,11 +3,13 @@
 use std::collections::HashMap;
 use std::num::NonZeroU16;
 
-use super::network::{duration, is_own, policy, remote_endpoint};
-use super::variables::CheckedNamespaces;
+use super::nodes::CheckedNamespaces;
+use super::quantity::duration;
+use super::server::{is_own, policy, remote_endpoint};
 use super::{Declared, required};
 use crate::call::Call;
 use crate::code::Code;
+use crate::document::{FromEntry, RemoteServerEntry, ToEntry};
 use crate::endpoint::Endpoint;
 use crate::findings::MappingFindings;
 use crate::mapping::Variable;
@@ -17,7 +19,7 @@ use crate::remote::{
     Access, NodeSource, NodeTarget, Password, RemoteServer, ServerSecurityPolicy, SkillsPlace, User,
 };
 use crate::server::Server;
-use crate::server_entries::{FromEntry, RemoteServerEntry, ToEntry};
+
 use crate::topic::SpaceId;
 use crate::tree::TextSpan;
 

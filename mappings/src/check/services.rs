@@ -10,12 +10,12 @@ use messages::{
 };
 use uadp::BuiltinType;
 
-use super::bindings::{BindingSite, compare, ros_name, told};
-use super::network::duration;
+use super::quantity::duration;
 use super::selection::{self, SelectionKeys};
 use super::several;
 use super::shaping::ValueDirection;
-use super::types::{self, MessageTypes, ValueType};
+use super::site::{BindingSite, compare, ros_name};
+use super::types::{self, MessageTypes, ValueType, told};
 use crate::code::Code;
 use crate::document::{self, BindingEntry, Request};
 use crate::findings::MappingFindings;

@@ -6,8 +6,8 @@ use std::sync::Arc;
 use messages::{ArrayRank, Leaf, MessageType, Selected, Selection};
 use uadp::BuiltinType;
 
-use super::selection::{self, SelectionKeys};
 use super::shaping::{self, ValueDirection};
+use super::types;
 use crate::code::Code;
 use crate::document::FieldList;
 use crate::findings::MappingFindings;
@@ -17,26 +17,12 @@ use crate::tree::TextSpan;
 
 /// Returns the fields of a binding; `None` for a faulty entry, which is noted.
 pub(super) fn fields(
-    chosen: SelectionKeys<'_>,
     at: &Located<FieldList>,
     message_type: Option<&MessageType>,
     way: ValueDirection,
     findings: &mut MappingFindings,
 ) -> Option<Selection> {
     let list = at.value.as_ref()?;
-    let beside = [
-        ("field", chosen.field.as_ref().map(|at| at.place)),
-        ("as", chosen.r#as.as_ref().map(|at| at.place)),
-    ];
-    for (key, place) in beside {
-        if let Some(place) = place {
-            let message = format!("`{key}` cannot be combined with `fields`");
-            findings
-                .error(Code::Fields, place, message)
-                .help("remove one of them");
-            return None;
-        }
-    }
     if list.0.is_empty() {
         findings
             .error(Code::Fields, at.place, "`fields` is empty")
@@ -151,7 +137,7 @@ pub(super) fn leaves(
                 selected.iter().any(under)
             })
             .collect();
-        let help = format!("the order here is {}", super::bindings::told(&paths));
+        let help = format!("the order here is {}", types::told(&paths));
         findings.error(Code::FieldOrder, place, message).help(help);
         return None;
     }
@@ -172,7 +158,7 @@ pub(super) fn structure(
             rank: ArrayRank::Scalar,
         }]);
     }
-    selection::field(message_type, path, place, findings)?;
+    types::field(message_type, path, place, findings)?;
     let message = format!(
         "`{}` is not a message, so it cannot be a structure",
         short(path)

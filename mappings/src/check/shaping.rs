@@ -6,7 +6,7 @@ use messages::{
 };
 use uadp::BuiltinType;
 
-use super::types::ValueType;
+use super::types::{self, ValueType};
 use crate::code::Code;
 use crate::document::{BindingEntry, FieldEntry, OutOfRangeEntry, PatternEntry};
 use crate::findings::MappingFindings;
@@ -335,7 +335,7 @@ pub(super) fn leaves(
     let (field, part) = match selection {
         Selection::Value { field, part, .. } => (field, part),
         Selection::Field(path) => {
-            return super::selection::field(message_type, path, place, findings);
+            return types::field(message_type, path, place, findings);
         }
         Selection::Whole
         | Selection::Fields(_)
@@ -365,7 +365,7 @@ pub(super) fn leaves(
     let (code, error) = match found {
         Ok(plan) => return Some(plan.leaves().to_vec()),
         Err((_, PlanError::UnknownField { name, path, .. })) if name == *message_type.name() => {
-            super::selection::field(message_type, &path, place, findings);
+            types::field(message_type, &path, place, findings);
             return None;
         }
         Err(fault) => fault,

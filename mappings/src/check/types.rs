@@ -9,10 +9,11 @@ use messages::{
 };
 use uadp::BuiltinType;
 
-use super::bindings::told;
-use super::{OpenTypeFiles, TypeOrigin, TypeUse};
+use super::{TypeOrigin, TypeUse};
 use crate::code::Code;
 use crate::findings::MappingFindings;
+use crate::read::{list, short};
+use crate::surroundings::OpenTypeFiles;
 use crate::topic::SpaceId;
 use crate::tree::TextSpan;
 use documents::nearest;
@@ -78,6 +79,57 @@ pub(super) const fn dialect(space: SpaceId) -> Dialect {
         Dialect::Ros2
     } else {
         Dialect::Ros1
+    }
+}
+
+/// Returns a field, or the fields of a message inside of the message; `None` if the type lacks the
+/// path, which is noted.
+pub(super) fn field(
+    message_type: &MessageType,
+    path: &str,
+    place: TextSpan,
+    findings: &mut MappingFindings,
+) -> Option<Vec<Leaf>> {
+    if let Some(leaf) = message_type.leaf(path) {
+        return Some(vec![leaf.clone()]);
+    }
+    let inside: Vec<Leaf> = message_type
+        .leaves()
+        .iter()
+        .filter(|leaf| leaf.is_inside(path))
+        .cloned()
+        .collect();
+    if !inside.is_empty() {
+        return Some(inside);
+    }
+    let paths: Vec<&str> = message_type
+        .leaves()
+        .iter()
+        .map(|leaf| leaf.path.as_str())
+        .collect();
+    let name = message_type.name();
+    let message = format!("`{name}` has no field `{}`", short(path));
+    let note = findings.error(Code::UnknownField, place, message);
+    let near = nearest(path, paths.iter().copied()).map(|near| format!("did you mean `{near}`? "));
+    note.help(format!(
+        "{}its fields are {}",
+        near.unwrap_or_default(),
+        told(&paths)
+    ));
+    None
+}
+
+/// Maximum number of fields that a help lists.
+const TOLD: usize = 12;
+
+/// Lists the paths of fields.
+pub(super) fn told(paths: &[&str]) -> String {
+    match paths.split_at_checked(TOLD) {
+        Some((first, rest)) if !rest.is_empty() => {
+            format!("{} and {} more", list(first), rest.len())
+        }
+        Some(_) | None if paths.is_empty() => "none".to_owned(),
+        Some(_) | None => list(paths),
     }
 }
 

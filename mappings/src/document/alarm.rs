@@ -1,6 +1,6 @@
 //! `alarm` of a variable in the document.
 
-use super::DURATION;
+use super::patterns::DURATION;
 use crate::read::{FromNode, Located, NodeReader, choice, document, inline_schema};
 use crate::tree::{YamlKind, YamlNode};
 

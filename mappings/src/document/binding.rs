@@ -1,7 +1,7 @@
 //! Bindings in the document: the ROS topics and services of a value, and the fields that it has
 //! there. Patterns of topics.
 
-use super::DURATION;
+use super::patterns::DURATION;
 use super::request::Request;
 use crate::read::{FromNode, Located, NodeReader, choice, document, inline_schema};
 use crate::tree::{YamlKind, YamlNode};

@@ -1,10 +1,9 @@
 //! Calls in the document: their executors, and the services and actions that offer them.
 
-use messages::Literal;
-
+use super::alarm::AcknowledgesEntry;
+use super::patterns::{DURATION, EXPANDED_NODE_ID};
 use super::permissions::CallPermissionsEntry;
 use super::request::{LeafForm, is_scalar};
-use super::{AcknowledgesEntry, DURATION, EXPANDED_NODE_ID};
 use crate::call::Assigned;
 use crate::read::{FromNode, Located, NodeReader, document, inline_schema};
 use crate::tree::{TextSpan, YamlKind, YamlNode};

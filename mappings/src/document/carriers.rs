@@ -1,6 +1,6 @@
 //! Carriers in the document: how values travel between the spaces.
 
-use super::DURATION;
+use super::patterns::DURATION;
 use crate::read::{FromNode, Located, NodeReader, OptionalKey, choice, document, inline_schema};
 use crate::tree::{YamlKind, YamlNode};
 

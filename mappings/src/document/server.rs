@@ -1,8 +1,8 @@
 //! The OPC UA server of the cell in the document.
 
-use super::DURATION;
+use super::patterns::DURATION;
+use super::servers::{FindSkillsEntry, SecurityEntry};
 use crate::read::{Located, choice, document};
-use crate::server_entries::FindSkillsEntry;
 
 document! {
     /// The OPC UA server of the cell.
@@ -110,16 +110,5 @@ choice! {
         Operator = "operator",
         /// Anonymous users have the permissions of engineers.
         Engineer = "engineer",
-    }
-
-    enum SecurityEntry {
-        /// Neither signed nor encrypted.
-        None = "None",
-        /// Signed, or signed and encrypted.
-        Basic256Sha256 = "Basic256Sha256",
-        /// Signed, or signed and encrypted with AES of 128 bits.
-        Aes128Sha256RsaOaep = "Aes128_Sha256_RsaOaep",
-        /// Signed with RSA-PSS, or signed so and encrypted.
-        Aes256Sha256RsaPss = "Aes256_Sha256_RsaPss",
     }
 }

@@ -5,16 +5,17 @@ use std::collections::BTreeMap;
 use messages::Literal;
 use schemars::JsonSchema;
 
+use super::alarm::{AlarmEntry, ReportsEntry};
 use super::binding::Bindings;
+use super::patterns::DURATION;
 use super::permissions::PermissionsEntry;
 use super::request::{Request, is_scalar};
-use super::{AlarmEntry, DURATION, ReportsEntry};
+use super::servers::{FromEntry, ToEntry};
 use crate::code::Code;
 use crate::mapping::UaField;
 use crate::read::{
     FromNode, Located, NodeReader, choice, document, help_octal, inline_schema, is_octal, short,
 };
-use crate::server_entries::{FromEntry, ToEntry};
 use crate::tree::{YamlKind, YamlNode};
 
 document! {

@@ -6,11 +6,11 @@ use messages::{ActionCalls, Dialect, ServiceType, TypeName};
 
 use super::Checker;
 use crate::call::{Assigned, Assignment, CallKind, CallTarget, FieldMap};
-use crate::check::bindings::ros_name;
+use crate::check::nodes::space;
 use crate::check::required;
 use crate::check::services;
+use crate::check::site::ros_name;
 use crate::check::types::{MessageTypes, dialect};
-use crate::check::variables::space;
 use crate::code::Code;
 use crate::document::{CallBindingEntry, CallEntry, FieldMapEntry};
 use crate::findings::MappingFindings;

@@ -2,7 +2,7 @@
 
 use super::Checker;
 use crate::call::MethodTarget;
-use crate::check::network::{is_own, remote_endpoint};
+use crate::check::server::{is_own, remote_endpoint};
 use crate::check::servers::{named, node};
 use crate::code::Code;
 use crate::document::{CallEntry, MethodEntry};

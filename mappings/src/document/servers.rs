@@ -1,7 +1,7 @@
 //! `servers` of the document, and the keys of variables that refer to them.
 
-use crate::document::{DURATION, EXPANDED_NODE_ID, SecurityEntry};
-use crate::read::{Located, document};
+use super::patterns::{DURATION, EXPANDED_NODE_ID};
+use crate::read::{Located, choice, document};
 
 document! {
     /// An existing OPC UA server, such as the server of a PLC. The server of the cell is its
@@ -87,5 +87,18 @@ document! {
         /// The variable there, as in `from`.
         #[schemars(required, regex(pattern = EXPANDED_NODE_ID))]
         node: String,
+    }
+}
+
+choice! {
+    enum SecurityEntry {
+        /// Neither signed nor encrypted.
+        None = "None",
+        /// Signed, or signed and encrypted.
+        Basic256Sha256 = "Basic256Sha256",
+        /// Signed, or signed and encrypted with AES of 128 bits.
+        Aes128Sha256RsaOaep = "Aes128_Sha256_RsaOaep",
+        /// Signed with RSA-PSS, or signed so and encrypted.
+        Aes256Sha256RsaPss = "Aes256_Sha256_RsaPss",
     }
 }
