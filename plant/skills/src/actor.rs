@@ -24,12 +24,14 @@ use self::work::{
     Halting, RunFailure, Running, Started, Stop, Then, WorkEvent, happens, outcome_of,
 };
 use crate::authority::{Authority, SkillOwner};
+use crate::description::SkillDescription;
 use crate::driver::{Driver, Line, RunResults, Signal, Work};
 use crate::driver_error::DriverError;
+use crate::lock::lock;
 use crate::parameters::Parameters;
+use crate::pending::PendingParameters;
 use crate::refusal::{RefusalCode, SkillRefusal};
 use crate::shown::{LastCall, RunOutcome, SkillEvent, SkillObserver, SkillSnapshot, Transitioned};
-use crate::skill::{PendingParameters, SkillDescription, lock};
 
 pub(crate) struct Actor {
     facts: Arc<SkillDescription>,

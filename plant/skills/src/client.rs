@@ -12,7 +12,6 @@
 //! - `mirror`: the skills of a server, presented like local skills
 //! - `detector`: the skills of all servers
 //! - `peers`: how the skills of a component reach other components
-//! - `partner_error`: the reasons why a component is not found, or does not fit
 //! - `choice`: the robot, the tool and the object of a pick and place
 //! - `remote`: a composite of the skills of several servers
 
@@ -25,7 +24,6 @@ mod grip;
 mod handle;
 mod mirror;
 pub(crate) mod packed;
-mod partner_error;
 mod peers;
 mod remote;
 #[cfg(test)]
@@ -46,16 +44,16 @@ pub use detector::{Detected, Detector};
 pub use find::{FoundParameter, FoundSkill, FoundType};
 pub use handle::{RemoteState, SkillHandle};
 pub use mirror::{MirroredSkill, Mirrors, Watchable};
-pub use partner_error::{
-    FailedLocator, LocatorError, NotLocated, PartnerError, Unchosen, UnfitGrasp,
-};
 pub use peers::PeerAccess;
 pub use remote::Remote;
 pub use states::SkillStates;
 pub use stations::StationChanges;
 
 use crate::parameters::ParameterType;
-use crate::runs::SkillFault;
+pub use crate::partner_error::{
+    FailedLocator, LocatorError, NotLocated, PartnerError, Unchosen, UnfitGrasp,
+};
+use crate::skill_fault::SkillFault;
 
 /// Identity and settings of a client.
 #[derive(Debug, Clone)]

@@ -8,12 +8,13 @@ use async_trait::async_trait;
 use tracing::warn;
 
 use crate::driver::{Driver, RunResults, Work};
-use crate::driver_error::{DriverError, InvalidParameter};
+use crate::driver_error::{Broken, DriverError, INIT, InvalidParameter};
 use crate::frame::Frame;
 use crate::grip::{Hold, PartShape};
 use crate::parameters::Parameters;
 use crate::part::{JobObserver, PartEnd, run_part};
-use crate::runs::{COMPOSITE_HALT_TIMEOUT, RunnableSkill, SkillFault};
+use crate::runs::{COMPOSITE_HALT_TIMEOUT, RunnableSkill};
+use crate::skill_fault::SkillFault;
 use crate::value::SkillValue;
 
 /// Skills of other components that together move an object from one pose to another.
@@ -46,22 +47,6 @@ pub struct Job {
     pub approach: f64,
     /// The shape of the object, if it is known.
     pub shape: Option<PartShape>,
-}
-
-/// The failure of a job.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("{step}: {why}; {}", match retreated {
-    Ok(()) if *step == INIT => "nothing has moved".to_owned(),
-    Ok(()) => "the robot has retreated".to_owned(),
-    Err(why) => format!("the robot has not retreated: {why}"),
-})]
-pub struct Broken {
-    /// The failed step.
-    pub step: &'static str,
-    /// The reason.
-    pub why: String,
-    /// Whether the robot has retreated, or why not.
-    pub retreated: Result<(), String>,
 }
 
 /// A retreat move: its name, the skill and the target pose.
@@ -255,9 +240,6 @@ async fn run<T>(
     }
 }
 
-/// The step before anything moves.
-const INIT: &str = "Init";
-
 /// The reason why a robot has not retreated after its stop was requested.
 const HALTED: &str = "it was halted, and stands still";
 
@@ -308,12 +290,14 @@ mod tests {
     use super::*;
     use crate::authority::{Authority, SkillOwner};
     use crate::conformance;
+    use crate::description::SkillDescription;
+    use crate::lock::lock;
     use crate::model;
     use crate::parameters::ParameterType;
     use crate::runs::LocalRun;
     use crate::shown::RunOutcome;
     use crate::simulated::{Arm, ArmSettings, Gripper, GripperSettings, Path};
-    use crate::skill::{Skill, SkillDescription, lock};
+    use crate::skill::Skill;
 
     const PICK: [f64; 6] = [0.4, 0.2, 0.1, 0.0, 0.0, 0.0];
     const PLACE: [f64; 6] = [0.4, -0.2, 0.1, 0.0, 0.0, 0.0];

@@ -6,12 +6,13 @@ use std::time::Duration;
 use program::{ProgramMachineState, ProgramMethod};
 
 use crate::authority::{Authority, SkillOwner};
+use crate::description::SkillDescription;
 use crate::driver::Driver;
 use crate::model;
 use crate::parameters::ParameterType;
 use crate::refusal::SkillRefusal;
 use crate::shown::{RunOutcome, SkillSnapshot};
-use crate::skill::{Skill, SkillDescription};
+use crate::skill::Skill;
 use crate::value::SkillValue;
 
 /// The reason why a driver does not conform, or a run has no outcome.

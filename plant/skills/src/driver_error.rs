@@ -2,10 +2,8 @@
 
 use std::error::Error;
 
-use crate::client::PartnerError;
-use crate::composite::Broken;
+use crate::partner_error::PartnerError;
 use crate::value::SkillValue;
-use crate::workspace::OutOfWorkspace;
 
 /// The work was stopped by Halt, by Reset or by the end of the program.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
@@ -125,6 +123,52 @@ impl InvalidParameter {
             | Self::Unexpected { name, .. } => name,
         }
     }
+}
+
+/// The failure of a job.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("{step}: {why}; {}", match retreated {
+    Ok(()) if *step == INIT => "nothing has moved".to_owned(),
+    Ok(()) => "the robot has retreated".to_owned(),
+    Err(why) => format!("the robot has not retreated: {why}"),
+})]
+pub struct Broken {
+    /// The failed step.
+    pub step: &'static str,
+    /// The reason.
+    pub why: String,
+    /// Whether the robot has retreated, or why not.
+    pub retreated: Result<(), String>,
+}
+
+/// The step before anything moves.
+pub(crate) const INIT: &str = "Init";
+
+/// A position that a robot does not reach.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum OutOfWorkspace {
+    /// The position is too far from the base.
+    #[error("{} is {far:.3} m from its base, and it reaches {reach} m", metres(*position))]
+    Reach {
+        /// The position, m.
+        position: [f64; 3],
+        /// Its distance from the base, m.
+        far: f64,
+        /// The largest distance, m.
+        reach: f64,
+    },
+    /// The position is in no zone.
+    #[error("{} is in none of its zones: {}", metres(*position), zones.join(", "))]
+    Zones {
+        /// The position, m.
+        position: [f64; 3],
+        /// The names of the zones.
+        zones: Vec<String>,
+    },
+}
+
+fn metres([x, y, z]: [f64; 3]) -> String {
+    format!("{x:.3}, {y:.3}, {z:.3} m")
 }
 
 #[cfg(test)]

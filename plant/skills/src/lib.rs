@@ -12,19 +12,24 @@ mod component;
 mod composite;
 mod configuration;
 pub mod conformance;
+mod description;
 mod driver;
 mod driver_error;
 pub mod frame;
 mod grip;
+mod lock;
 pub mod model;
 mod parameters;
 mod part;
+mod partner_error;
+mod pending;
 mod refusal;
 mod runs;
 pub mod server;
 mod shown;
 pub mod simulated;
 mod skill;
+mod skill_fault;
 mod value;
 mod values;
 mod variant;
@@ -46,26 +51,28 @@ pub use component::{
     WorldObject, YamlChange, anonymous_by_default, measure_device, read_numbers, read_partner,
     read_shape, read_user,
 };
-pub use composite::{Broken, Job, PickAndPlace};
+pub use composite::{Job, PickAndPlace};
 pub use configuration::{
     ComponentConfiguration, Configurable, FieldEffect, FieldError, NotConfigured,
 };
+pub use description::SkillDescription;
 pub use driver::{Driver, RunResults, Work};
-pub use driver_error::{DriverError, InvalidParameter, Stopped};
+pub use driver_error::{Broken, DriverError, InvalidParameter, OutOfWorkspace, Stopped};
 pub use grip::{GripError, GripPoint, GripType, NoShape, PartShape};
 pub use model::NAMESPACE;
 pub use parameters::{NoTypeName, ParameterType, Parameters, SkillParameter};
 pub use part::{JobObserver, PartEnd, run_part};
 pub use refusal::{RefusalCode, SkillRefusal};
-pub use runs::{COMPOSITE_HALT_TIMEOUT, LocalRun, RunnableSkill, SkillFault};
+pub use runs::{COMPOSITE_HALT_TIMEOUT, LocalRun, RunnableSkill};
 pub use shown::{
     LastCall, ProgramDiagnostic, RunOutcome, SkillEvent, SkillObserver, SkillSnapshot, Transitioned,
 };
-pub use skill::{Skill, SkillDescription};
+pub use skill::Skill;
+pub use skill_fault::SkillFault;
 pub use value::{Builtin, SkillValue, ValueError, ValueShape};
 pub use values::{
     DeviceValue, LiveValue, Measure, Measured, NewestState, Statistics, Tally, ValueFacts,
     ValueSensor,
 };
 pub use variant::{from_variant, to_variant};
-pub use workspace::{OutOfWorkspace, RobotWorkspace, Zone};
+pub use workspace::{RobotWorkspace, Zone};

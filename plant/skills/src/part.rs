@@ -9,8 +9,9 @@ use tokio::time::timeout;
 use tracing::{debug, warn};
 
 use crate::driver::Work;
-use crate::runs::{RunnableSkill, SkillFault, goes_on};
+use crate::runs::{RunnableSkill, goes_on};
 use crate::shown::RunOutcome;
+use crate::skill_fault::SkillFault;
 use crate::value::SkillValue;
 
 /// Receives the steps of a job, and can stop it.
@@ -189,10 +190,11 @@ mod tests {
     use super::*;
     use crate::authority::{Authority, SkillOwner};
     use crate::composite::PickAndPlace;
+    use crate::description::SkillDescription;
     use crate::model;
     use crate::parameters::ParameterType;
     use crate::shown::SkillSnapshot;
-    use crate::skill::{Skill, SkillDescription};
+    use crate::skill::Skill;
 
     const BY: SkillOwner = SkillOwner::Local("the test");
 

@@ -8,9 +8,10 @@ use program::{ProgramMachineState, ProgramMethod};
 
 use crate::authority::SkillOwner;
 use crate::grip::GripPoint;
-use crate::refusal::{RefusalCode, SkillRefusal};
+use crate::refusal::RefusalCode;
 use crate::shown::RunOutcome;
 use crate::skill::Skill;
+use crate::skill_fault::SkillFault;
 use crate::value::SkillValue;
 
 /// A skill that can be run: a skill of another component or of this program.
@@ -46,41 +47,6 @@ pub trait RunnableSkill: Send + Sync {
     /// available.
     async fn lost(&self) -> String {
         pending().await
-    }
-}
-
-/// The reason why a request to a skill failed.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-pub enum SkillFault {
-    /// The component does not respond: the state of the run is unknown.
-    #[error("its component is lost: {0}")]
-    Lost(String),
-    /// The component refused the request; nothing has changed.
-    #[error("{status}: {text}")]
-    Refused {
-        /// The name of the StatusCode, as `BadInvalidState`.
-        status: String,
-        /// The reason, for people.
-        text: String,
-    },
-    /// The run did not end in time and was halted.
-    #[error("it did not end within {0:?} and was halted")]
-    TimedOut(Duration),
-    /// The end of the run is unknown, for example after a Halt that was not confirmed: its machine
-    /// may move.
-    #[error("{0}")]
-    NotHalted(String),
-    /// The skill does not have the expected form.
-    #[error("{0}")]
-    Unexpected(String),
-}
-
-impl From<SkillRefusal> for SkillFault {
-    fn from(refusal: SkillRefusal) -> Self {
-        Self::Refused {
-            status: refusal.code.name().to_owned(),
-            text: refusal.text,
-        }
     }
 }
 

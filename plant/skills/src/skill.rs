@@ -1,55 +1,22 @@
-//! A skill that is executed in this process: its handle and its description.
+//! A skill that is executed in this process: its handle.
 
-use std::collections::{BTreeMap, VecDeque};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::collections::VecDeque;
+use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
-use program::{ProgramMachineState, ProgramMethod, Rest};
+use program::{ProgramMachineState, ProgramMethod};
 use tokio::sync::{mpsc, oneshot, watch};
-use tracing::debug;
 
 use crate::actor::{Actor, Given, Order, SkillCallRequest, Successor};
 use crate::authority::{Authority, SkillOwner};
-use crate::driver::{Driver, RunResults};
-use crate::parameters::{ParameterType, Parameters, SkillParameter, shortened};
+use crate::description::SkillDescription;
+use crate::driver::Driver;
+use crate::lock::lock;
+use crate::parameters::{Parameters, shortened};
+use crate::pending::PendingParameters;
 use crate::refusal::{RefusalCode, SkillRefusal};
 use crate::shown::{RunOutcome, SkillObserver, SkillSnapshot};
 use crate::value::SkillValue;
-
-/// The constant description of a skill.
-#[derive(Debug, Clone)]
-pub struct SkillDescription {
-    /// The name of the skill in its component.
-    pub name: String,
-    /// Its type and all supertypes, nearest first.
-    pub types: Vec<ParameterType>,
-    /// The parameters of a run.
-    pub parameters: Vec<SkillParameter>,
-    /// The results of a run.
-    pub results: Vec<SkillParameter>,
-    /// The IRIs of the capabilities that it provides.
-    pub capabilities: Vec<String>,
-    /// Time limit of a run; `None` for no limit.
-    pub timeout: Option<Duration>,
-    /// The state after a successful run, as its type defines it.
-    pub rests_in: Rest,
-}
-
-impl SkillDescription {
-    /// Returns the results that the type declares, in the order of the type.
-    pub(crate) fn in_order(&self, results: RunResults) -> RunResults {
-        let mut ordered = Vec::new();
-        for declared in &self.results {
-            let found = results.iter().find(|(name, _)| *name == declared.name);
-            let fits = found.and_then(|(_, value)| declared.shape.take(value.clone()));
-            match fits {
-                Some(value) => ordered.push((declared.name.clone(), value)),
-                None => debug!(skill = self.name, "the driver gave no {}", declared.name),
-            }
-        }
-        ordered
-    }
-}
 
 /// A skill that is executed in this process. Clones share the skill. It ends when the last clone is
 /// dropped, and its run is stopped then.
@@ -62,33 +29,6 @@ pub struct Skill {
     shown: watch::Receiver<Arc<SkillSnapshot>>,
     outcomes: Arc<Mutex<VecDeque<Arc<RunOutcome>>>>,
     successor: Arc<Mutex<Option<Successor>>>,
-}
-
-/// The parameters that an owner has written for the next run. A write by another owner discards
-/// them.
-#[derive(Debug, Default)]
-pub(crate) struct PendingParameters {
-    by: Option<SkillOwner>,
-    values: BTreeMap<String, SkillValue>,
-}
-
-impl PendingParameters {
-    /// Returns the values of this owner; discards the values of another owner.
-    fn of(&mut self, by: &SkillOwner) -> &mut BTreeMap<String, SkillValue> {
-        if self.by.as_ref() != Some(by) {
-            self.by = Some(by.clone());
-            self.values.clear();
-        }
-        &mut self.values
-    }
-
-    pub(crate) fn given(&mut self, by: &SkillOwner) -> Vec<(String, SkillValue)> {
-        self.of(by).clone().into_iter().collect()
-    }
-
-    pub(crate) fn kept(&mut self, by: &SkillOwner, values: &[(String, SkillValue)]) {
-        *self.of(by) = values.iter().cloned().collect();
-    }
 }
 
 impl Skill {
@@ -209,19 +149,14 @@ impl Skill {
             return Err(SkillRefusal::new(RefusalCode::InvalidArgument, text));
         };
         let value = parameter.take(value)?;
-        lock(&self.pending).of(by).insert(name.to_owned(), value);
+        lock(&self.pending).write(by, name, value);
         Ok(())
     }
 
     /// Discards the parameters that an owner wrote, for example when its session has closed.
     /// Returns whether the owner had written any.
     pub fn forget(&self, by: &SkillOwner) -> bool {
-        let mut pending = lock(&self.pending);
-        let theirs = pending.by.as_ref() == Some(by);
-        if theirs {
-            *pending = PendingParameters::default();
-        }
-        theirs
+        lock(&self.pending).forget(by)
     }
 
     /// Calls a method. Start starts a run with the parameters that the same owner has written.
@@ -346,11 +281,6 @@ impl Skill {
 
 fn ends() -> SkillRefusal {
     SkillRefusal::new(RefusalCode::Shutdown, "the component ends")
-}
-
-pub(crate) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    // Each change is complete before the mutex is released, so a poisoned mutex is usable.
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 /// Maximum number of waiting calls of a skill.

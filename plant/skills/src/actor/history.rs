@@ -6,8 +6,8 @@ use std::sync::{Arc, Mutex};
 use tokio::time::Instant;
 
 use crate::driver::Line;
+use crate::lock::lock;
 use crate::shown::RunOutcome;
-use crate::skill::lock;
 
 /// The trace of the current run, and the outcomes of the last runs.
 pub(super) struct SkillHistory {

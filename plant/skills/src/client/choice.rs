@@ -6,19 +6,20 @@ use std::time::Duration;
 use tokio::time::timeout;
 
 use super::find::FoundSkill;
-use super::partner_error::{
-    FailedLocator, LocatorError, NotLocated, PartnerError, Unchosen, UnfitGrasp,
-};
 use super::{Detected, Detector, PeerAccess, SkillClient};
 use crate::choosing::{Attachment, CandidateRank, NoChoice, SkillCandidate, SkillChoice, choose};
 use crate::component::{Partner, WorldObject};
+use crate::driver_error::OutOfWorkspace;
 use crate::frame::Frame;
 use crate::grip::PartShape;
 use crate::parameters::ParameterType;
+use crate::partner_error::{
+    FailedLocator, LocatorError, NotLocated, PartnerError, Unchosen, UnfitGrasp,
+};
 use crate::runs::RunnableSkill as _;
 use crate::shown::RunOutcome;
 use crate::value::SkillValue;
-use crate::workspace::{OutOfWorkspace, RobotWorkspace};
+use crate::workspace::RobotWorkspace;
 
 /// The state of a tool changer, as its component shows it.
 #[derive(Debug, Clone, PartialEq, Default)]

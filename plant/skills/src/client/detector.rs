@@ -11,10 +11,10 @@ use tracing::debug;
 
 use super::find::FoundSkill;
 use super::{ClientOptions, SkillClient, SkillHandle, StationChanges};
+use crate::lock::lock;
 use crate::model::alias;
 use crate::parameters::ParameterType;
-use crate::runs::SkillFault;
-use crate::skill::lock;
+use crate::skill_fault::SkillFault;
 
 /// An index of the skills of known servers. It reads the skills of each server and retries until
 /// the server responds. Clones share the index. It keeps no connection open, except to stations,

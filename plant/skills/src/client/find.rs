@@ -17,8 +17,8 @@ use crate::model::{
     CURRENT_TOOL, MOVER_ENDPOINT, NAMESPACE, SKILL_TYPE, SkillType, TOOL_PLATE_OFFSET, alias,
 };
 use crate::parameters::ParameterType;
-use crate::runs::SkillFault;
 use crate::server::OUTCOME;
+use crate::skill_fault::SkillFault;
 use crate::value::{Builtin, SkillValue, ValueShape};
 use crate::variant::{builtin_of, from_variant};
 use crate::workspace::RobotWorkspace;

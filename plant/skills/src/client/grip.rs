@@ -11,7 +11,7 @@ use crate::grip::{GripPoint, GripType};
 use crate::model::{
     GRIP_POINT_OFFSET, GRIP_POINT_OPENING, GRIP_POINT_TYPE, REACH, ZONE_BOUNDS, ZONE_NAMES,
 };
-use crate::runs::SkillFault;
+use crate::skill_fault::SkillFault;
 use crate::value::SkillValue;
 use crate::variant::from_variant;
 use crate::workspace::RobotWorkspace;

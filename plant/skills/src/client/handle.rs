@@ -13,8 +13,9 @@ use super::find::{FoundParameter, FoundSkill};
 use super::{called, lost, refused};
 use crate::grip::GripPoint;
 use crate::model::{DEVICES, POWER_OFF};
-use crate::runs::{HALTS_WITHIN, RunnableSkill, SkillFault, goes_on};
+use crate::runs::{HALTS_WITHIN, RunnableSkill, goes_on};
 use crate::shown::RunOutcome;
+use crate::skill_fault::SkillFault;
 use crate::value::SkillValue;
 use crate::variant::{from_pairs, from_variant, to_pairs, to_variant};
 

@@ -22,10 +22,11 @@ use super::find::{FoundParameter, FoundSkill};
 use super::handle::{STATE_PATHS, state_in};
 use super::packed::Packed;
 use super::{SkillClient, lost};
+use crate::description::SkillDescription;
+use crate::lock::lock;
 use crate::parameters::SkillParameter;
-use crate::runs::SkillFault;
 use crate::shown::{RunOutcome, SkillObserver, SkillSnapshot};
-use crate::skill::{SkillDescription, lock};
+use crate::skill_fault::SkillFault;
 use crate::value::SkillValue;
 
 /// A skill of another server. Clones share the skill.

@@ -9,7 +9,7 @@ use super::{ClientOptions, Detector, PartnerError, SkillClient};
 use crate::component::{Component, ComponentSecurity, Partner};
 use crate::model::SKILL_TYPE;
 use crate::parameters::ParameterType;
-use crate::runs::SkillFault;
+use crate::skill_fault::SkillFault;
 
 /// The identity with which the skills of a component connect to other components, and the index of
 /// discovered components.

@@ -7,7 +7,7 @@ use plant_opcua::types::{NodeId, ObjectId, ObjectTypeId, QualifiedName};
 
 use super::find::{self, FoundSkill};
 use super::lost;
-use crate::runs::SkillFault;
+use crate::skill_fault::SkillFault;
 
 /// Reports that the components behind a station have changed.
 pub struct StationChanges {

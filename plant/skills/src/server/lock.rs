@@ -14,8 +14,8 @@ use tokio::sync::watch;
 use tokio::time::{Instant, sleep_until};
 
 use crate::authority::{Authority, SkillOwner};
+use crate::lock::lock;
 pub(super) use crate::model::DEVICES as NAMESPACE;
-use crate::skill::lock;
 
 /// The part of the DI NodeSet that defines locking, for components that need no other part of it.
 pub(super) const NODESET: &str = include_str!("locking.xml");

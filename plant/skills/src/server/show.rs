@@ -11,10 +11,10 @@ use plant_opcua::types::{
 };
 use program::{ProgramMachineState, ProgramMethod, Transition};
 
+use crate::description::SkillDescription;
 use crate::model::{EVENT_TYPE, NAMESPACE};
 use crate::parameters::{Parameters, SkillParameter};
 use crate::shown::{RunOutcome, SkillEvent, SkillObserver, SkillSnapshot, Transitioned};
-use crate::skill::SkillDescription;
 use crate::value::{Builtin, SkillValue};
 use crate::variant::to_variant;
 

@@ -9,8 +9,8 @@ use tokio::time::Instant;
 use super::Profile;
 use crate::driver::{Driver, RunResults, Work};
 use crate::driver_error::{DriverError, InvalidParameter};
+use crate::lock::lock;
 use crate::parameters::Parameters;
-use crate::skill::lock;
 
 /// Settings of a simulated robot.
 #[derive(Debug, Clone, PartialEq)]

@@ -8,8 +8,8 @@ use async_trait::async_trait;
 use super::Profile;
 use crate::driver::{Driver, RunResults, Work};
 use crate::driver_error::{DriverError, InvalidParameter};
+use crate::lock::lock;
 use crate::parameters::Parameters;
-use crate::skill::lock;
 
 /// A simulated mobile base, in the frame `map`.
 #[derive(Debug, Clone, Default)]

@@ -7,8 +7,8 @@ use async_trait::async_trait;
 
 use crate::driver::{Driver, RunResults, Work};
 use crate::driver_error::{DriverError, InvalidParameter};
+use crate::lock::lock;
 use crate::parameters::Parameters;
-use crate::skill::lock;
 use crate::value::SkillValue;
 
 /// A simulated tool changer. Its drivers share the attached tool.

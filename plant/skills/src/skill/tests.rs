@@ -4,13 +4,14 @@ use std::sync::atomic::{AtomicU32, Ordering};
 use tokio::time::Instant;
 
 use async_trait::async_trait;
-use program::TRANSITIONS;
+use program::{Rest, TRANSITIONS};
 use tokio::sync::Semaphore;
 
 use super::*;
 use crate::driver::{RunResults, Work};
 use crate::driver_error::DriverError;
 use crate::model;
+use crate::parameters::ParameterType;
 use crate::shown::{SkillEvent, Transitioned};
 
 const ME: SkillOwner = SkillOwner::Session(1);

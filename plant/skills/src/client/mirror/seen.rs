@@ -12,12 +12,12 @@ use tracing::debug;
 
 use super::super::handle::{SkillHandle, state_in};
 use super::{Order, leads_to, way};
+use crate::lock::lock;
 use crate::parameters::Parameters;
-use crate::runs::SkillFault;
 use crate::shown::{
     ProgramDiagnostic, RunOutcome, SkillEvent, SkillObserver, SkillSnapshot, Transitioned,
 };
-use crate::skill::lock;
+use crate::skill_fault::SkillFault;
 use crate::value::SkillValue;
 use crate::variant::from_variant;
 

@@ -1,8 +1,8 @@
 //! The reasons why the components of a pick and place are not found, or do not fit.
 
+use crate::driver_error::OutOfWorkspace;
 use crate::grip::GripError;
-use crate::runs::SkillFault;
-use crate::workspace::OutOfWorkspace;
+use crate::skill_fault::SkillFault;
 
 /// The reason why a composite skill has no robot, no tool or no object.
 #[derive(Debug, thiserror::Error)]
