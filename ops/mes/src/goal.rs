@@ -10,10 +10,10 @@ use std::time::Duration;
 use knowledge::{Knowledge, QuestionAnswer, QuestionFault};
 use serde::Serialize;
 
-use crate::process::{By, GivenParameter, Need, Process, ProcessStep, SkillRole, StepJob};
-use crate::read_process::{
-    MOST_STEPS, StatementFault, USUALLY_WAIT, USUALLY_WITHIN, parameters_of, seconds,
+use crate::process::{
+    By, GivenParameter, MOST_STEPS, Need, Process, ProcessStep, SkillRole, StepJob,
 };
+use crate::read_process::{StatementFault, USUALLY_WAIT, USUALLY_WITHIN, parameters_of, seconds};
 
 /// An action.
 #[derive(Debug, Clone, Default, PartialEq)]

@@ -21,7 +21,8 @@ use serde_json::Value as Json;
 use tokio::runtime::Handle;
 use tracing::{info, warn};
 
-use crate::job_orders::{CommandStatus, JobCommand, JobRuns, KeptJobOrder, MOST_ORDERS, Orders};
+use crate::job_order::{KeptJobOrder, MOST_ORDERS};
+use crate::job_orders::{CommandStatus, JobCommand, JobRuns, Orders};
 use crate::jobs::ProcessJobs;
 
 /// The objects of Job Control.

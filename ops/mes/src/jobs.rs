@@ -11,7 +11,8 @@ use tokio::sync::watch;
 
 use crate::cell::{PlantState, now};
 use crate::execute::{Plant, execute_pausable};
-use crate::job_orders::{JobOutcome, JobProgress, JobRuns};
+use crate::job_order::{JobOutcome, JobProgress};
+use crate::job_orders::JobRuns;
 use crate::process::StepJob as Work;
 use crate::record::{How, ProcessRun};
 

@@ -24,6 +24,7 @@ mod execution_skill;
 mod follow;
 mod goal;
 mod job_control;
+mod job_order;
 mod job_orders;
 mod jobs;
 mod knowledge_methods;

@@ -8,7 +8,7 @@ use plant_opcua::job_control::JobOrder;
 use serde::{Deserialize, Serialize};
 use tracing::warn;
 
-use crate::job_orders::{JobProgress, KeptJobOrder, MOST_ORDERS, OrderState};
+use crate::job_order::{JobProgress, KeptJobOrder, MOST_ORDERS, OrderState};
 
 /// An open file of job orders.
 #[derive(Debug)]

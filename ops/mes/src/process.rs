@@ -666,3 +666,6 @@ pub(crate) fn literal(value: &serde_json::Value) -> (&'static str, Object) {
 pub(crate) fn step_iri(process: &str, step: &str) -> String {
     format!("{process}/step/{}", escaped(step))
 }
+
+/// Maximum number of steps of a process.
+pub(crate) const MOST_STEPS: usize = 100;

@@ -14,8 +14,8 @@ pub(crate) use self::fault::{ProcessFault, StatementFault};
 use crate::locate_skill::numbers_of;
 use crate::parameter_fault::ParameterFault;
 use crate::process::{
-    BadEnd, By, Compare, GivenParameter, Loop, Need, ParameterQuery, Process, ProcessStep,
-    ResultOf, SkillRole, StepCondition, StepJob, Test,
+    BadEnd, By, Compare, GivenParameter, Loop, MOST_STEPS, Need, ParameterQuery, Process,
+    ProcessStep, ResultOf, SkillRole, StepCondition, StepJob, Test,
 };
 
 /// The processes of the graph: each can run, or has a reason why it cannot.
@@ -558,8 +558,6 @@ pub(crate) fn seconds(
 pub(crate) const USUALLY_WITHIN: Duration = Duration::from_secs(30);
 pub(crate) const USUALLY_WAIT: Duration = Duration::from_secs(60);
 pub(crate) const USUALLY_APPROACH: f64 = 0.05;
-/// Maximum number of steps of a process.
-pub(crate) const MOST_STEPS: usize = 100;
 /// Longest time of a process in seconds.
 const LONGEST: f64 = 7.0 * 86_400.0;
 

@@ -13,8 +13,8 @@ use plant_opcua::client::ClientUser;
 use skills::yaml::{DocumentKind, DocumentNode, Findings, YamlFindingCode, YamlReader, parse};
 use skills::{ComponentSecurity, Lds, ParameterType};
 
-use crate::process::{By, Need, Process, ProcessStep, SkillRole, StepJob};
-use crate::read_process::{MOST_STEPS, USUALLY_WAIT, USUALLY_WITHIN};
+use crate::process::{By, MOST_STEPS, Need, Process, ProcessStep, SkillRole, StepJob};
+use crate::read_process::{USUALLY_WAIT, USUALLY_WITHIN};
 
 pub(crate) use files::{Connect, Manifest, RecipeSource, RmlSource, Source};
 

@@ -3,9 +3,8 @@
 use serde_json::Value;
 use skills::NoShape;
 
-use super::MOST_STEPS;
 use crate::parameter_fault::ParameterFault;
-use crate::process::Loop;
+use crate::process::{Loop, MOST_STEPS};
 
 /// The reason why a process cannot run.
 #[derive(Debug, PartialEq, thiserror::Error)]

@@ -11,9 +11,8 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use super::Reading;
 use crate::process::{
-    BadEnd, Loop, LoopConditionFault, ProcessStep, SkillRole, StepCondition, Test,
+    BadEnd, Loop, LoopConditionFault, MOST_STEPS, ProcessStep, SkillRole, StepCondition, Test,
 };
-use crate::read_process::MOST_STEPS;
 use loops::FlowLoops;
 
 /// The nodes of a process, and the flows between them.
