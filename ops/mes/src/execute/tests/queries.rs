@@ -1,5 +1,6 @@
 //! Parameters that are given by queries.
 
+use super::stops::StopAt;
 use super::*;
 use crate::process::{BadEnd, StepCondition, Test};
 
