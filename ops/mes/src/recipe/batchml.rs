@@ -5,35 +5,35 @@
 //! first whose condition holds. A transition that leads to an earlier step is a loop. Recipe
 //! elements with a procedure logic of their own are replaced by it; the others are steps.
 
+mod formula;
+
 use std::collections::BTreeMap;
 
-use knowledge::units;
 use mtp::escaped;
 use roxmltree::Node;
-use serde_json::Value;
 
 use super::flow::{
     Edge, Flow, FlowNodeKind, MOST_FLOW_NODES, NodeCondition, RecipeSequence, too_large,
 };
-use super::values::{self, WrittenValue};
+use super::values;
 use super::{Reading, child, children, text_of};
-use crate::process::{GivenParameter, Need, Process, ProcessStep, ResultOf, SkillRole, StepJob};
+use crate::process::{Need, Process, ProcessStep, SkillRole, StepJob};
 use crate::read_process::{USUALLY_WAIT, USUALLY_WITHIN};
+
+use formula::{Formula, StepReference};
 
 pub(super) const NAMESPACE: &str = "http://www.mesa.org/xml/B2MML";
 
 /// A recipe that is being read.
 struct RecipeParts<'d> {
-    /// The parameters of its formula by their IDs.
-    formula: BTreeMap<&'d str, Node<'d, 'd>>,
+    formula: Formula<'d>,
     /// Recipe elements that other elements refer to.
     blocks: Vec<Node<'d, 'd>>,
     flow: Flow,
     /// The nodes of the steps by the IDs of the steps; `None` if several steps have the ID.
     steps: BTreeMap<&'d str, Option<usize>>,
-    /// Parameters with the result of a step: the node, the place among its parameters, the ID of
-    /// the other step, and the offset.
-    results: Vec<(usize, usize, String, usize)>,
+    /// Parameters with the result of a step, with the nodes of the steps that take them.
+    results: Vec<(usize, StepReference)>,
 }
 
 /// The first and the last node of a procedure logic.
@@ -92,10 +92,8 @@ impl<'d> Reading<'d> {
             self.error(recipe, "the recipe has no ID".to_owned());
             return None;
         }
-        let parameters = child(recipe, "Formula").into_iter();
-        let parameters = parameters.flat_map(|formula| children(formula, "Parameter"));
         let mut parts = RecipeParts {
-            formula: parameters.map(|node| (text_of(node, "ID"), node)).collect(),
+            formula: Formula::of(recipe),
             blocks,
             flow: Flow::default(),
             steps: BTreeMap::new(),
@@ -135,14 +133,20 @@ impl<'d> Reading<'d> {
             results,
             ..
         } = parts;
-        for (node, parameter, of, at) in results {
-            let Some(step) = steps.get(of.as_str()).copied().flatten() else {
-                self.error_at(
-                    at,
-                    format!(
-                        "the value refers to the step `{of}`, which is unknown or not the only one"
-                    ),
+        for (
+            node,
+            StepReference {
+                parameter,
+                step,
+                at,
+            },
+        ) in results
+        {
+            let Some(step) = steps.get(step.as_str()).copied().flatten() else {
+                let what = format!(
+                    "the value refers to the step `{step}`, which is unknown or not the only one"
                 );
+                self.error_at(at, what);
                 continue;
             };
             if let Some(FlowNodeKind::Task(task)) =
@@ -520,7 +524,9 @@ impl<'d> Reading<'d> {
         let (id, at) = (text_of(step, "ID"), step.range().start);
         let need = self.need_of(element, block_id)?;
         let node = parts.flow.nodes.len();
-        let parameters = self.recipe_parameters(element, node, parts);
+        let parameters = parts.formula.parameters(element, self);
+        let results = parameters.results.into_iter();
+        parts.results.extend(results.map(|of| (node, of)));
         let description = text_of(step, "Description");
         let name = if description.is_empty() {
             id
@@ -530,7 +536,7 @@ impl<'d> Reading<'d> {
         let task = ProcessStep {
             name: name.to_owned(),
             needs: vec![need],
-            parameters,
+            parameters: parameters.given,
             ..ProcessStep::default()
         };
         let node = parts.flow.node(at, id, FlowNodeKind::Task(Box::new(task)));
@@ -588,139 +594,6 @@ impl<'d> Reading<'d> {
         None
     }
 
-    /// Reads the parameters of a recipe element. `node` is the number that its node gets.
-    fn recipe_parameters(
-        &mut self,
-        element: Node<'d, 'd>,
-        node: usize,
-        parts: &mut RecipeParts<'d>,
-    ) -> Vec<GivenParameter> {
-        let mut all: Vec<GivenParameter> = Vec::new();
-        for parameter in children(element, "Parameter") {
-            let id = text_of(parameter, "ID");
-            if text_of(parameter, "ParameterType") == "ProcessOutput" {
-                self.note(
-                    parameter,
-                    format!("the output `{id}` is left out: skills return their results"),
-                );
-                continue;
-            }
-            let whole = match child(parameter, "Value") {
-                Some(_) => parameter,
-                None => parts.formula.get(id).copied().unwrap_or(parameter),
-            };
-            let formula = (whole != parameter).then_some(whole);
-            for at in [Some(parameter), formula].into_iter().flatten() {
-                self.only(
-                    at,
-                    &[
-                        "ID",
-                        "Description",
-                        "ParameterType",
-                        "ParameterSubType",
-                        "Value",
-                        "Scaled",
-                    ],
-                );
-            }
-            if text_of(whole, "Scaled") == "Yes" {
-                let what =
-                    format!("`{id}` is not scaled: the recipe runs with the size of its formula");
-                self.note(whole, what);
-            }
-            let name = self.named(id).to_owned();
-            let place = all.len();
-            let Some((given, of)) = self.value(whole, &name, parts) else {
-                continue;
-            };
-            if all.iter().any(|known| known.name == name) {
-                self.error(parameter, format!("the parameter `{name}` is given twice"));
-                continue;
-            }
-            let at = whole.range().start;
-            parts.results.extend(of.map(|of| (node, place, of, at)));
-            all.push(given);
-        }
-        all
-    }
-
-    /// Reads the value of a parameter, and the ID of the step whose result it is.
-    fn value(
-        &mut self,
-        parameter: Node<'d, 'd>,
-        name: &str,
-        parts: &RecipeParts<'d>,
-    ) -> Option<(GivenParameter, Option<String>)> {
-        let mut parameter = parameter;
-        for _ in 0..MOST_LEVELS {
-            let mut values = children(parameter, "Value");
-            let (Some(value), None) = (values.next(), values.next()) else {
-                self.error(parameter, format!("`{name}` has no value, or several"));
-                return None;
-            };
-            self.only(
-                value,
-                &[
-                    "ValueString",
-                    "DataInterpretation",
-                    "DataType",
-                    "UnitOfMeasure",
-                ],
-            );
-            let texts: Vec<&str> = children(value, "ValueString")
-                .map(|node| node.text().unwrap_or_default().trim())
-                .collect();
-            let text = texts.first().copied().unwrap_or_default();
-            match text_of(value, "DataInterpretation") {
-                "" | "Constant" => {
-                    let read = constant(&texts, text_of(value, "DataType"));
-                    let read = read.or_else(|| {
-                        let kind = text_of(value, "DataType");
-                        self.error(
-                            value,
-                            format!("the value `{text}` of `{name}` is not of the type `{kind}`"),
-                        );
-                        None
-                    })?;
-                    let unit = self.named(text_of(value, "UnitOfMeasure")).to_owned();
-                    if !unit.is_empty() && !units::is_known(&unit) {
-                        self.note(value, format!("the unit `{unit}` of `{name}` is not known"));
-                    }
-                    let unit = (!unit.is_empty()).then_some(unit);
-                    return Some((values::given(name, read, unit), None));
-                }
-                "Reference" => {
-                    if let Some(other) = parts.formula.get(text) {
-                        parameter = *other;
-                        continue;
-                    }
-                    if let WrittenValue::Result(step, result) = values::value(&format!("={text}")) {
-                        let mut given = values::given(name, Value::Null, None);
-                        given.result = Some(ResultOf {
-                            step: usize::MAX,
-                            name: result,
-                        });
-                        return Some((given, Some(step)));
-                    }
-                    let what = format!(
-                        "`{name}` refers to `{text}`, which is neither a parameter of the formula nor a result as step.Result"
-                    );
-                    self.error(value, what);
-                    return None;
-                }
-                other => {
-                    let what = format!(
-                        "the DataInterpretation `{other}` of `{name}` is not supported; give a Constant or a Reference"
-                    );
-                    self.error(value, what);
-                    return None;
-                }
-            }
-        }
-        self.error(parameter, format!("the references of `{name}` do not end"));
-        None
-    }
-
     /// Notes the constraints of equipment, which no plan checks.
     fn constraints(&mut self, node: Node<'d, 'd>) {
         for requirement in children(node, "EquipmentRequirement") {
@@ -733,36 +606,6 @@ impl<'d> Reading<'d> {
                 );
             }
         }
-    }
-}
-
-/// Reads a constant of a type; several texts are a list.
-fn constant(texts: &[&str], kind: &str) -> Option<Value> {
-    let one = |text: &str| -> Option<Value> {
-        let kind = kind.rsplit_once(':').map_or(kind, |(_, kind)| kind);
-        match kind.to_ascii_lowercase().as_str() {
-            "boolean" | "bool" => match text {
-                "true" | "True" | "1" => Some(Value::Bool(true)),
-                "false" | "False" | "0" => Some(Value::Bool(false)),
-                _ => None,
-            },
-            "string" | "text" | "identifier" => Some(Value::String(text.to_owned())),
-            "" | "other" => match values::value(text) {
-                WrittenValue::Value { value, unit: None } => Some(value),
-                WrittenValue::Value { .. } | WrittenValue::Result(..) => {
-                    Some(Value::String(text.to_owned()))
-                }
-            },
-            _ => {
-                let value: Value = serde_json::from_str(text).ok()?;
-                value.is_number().then_some(value)
-            }
-        }
-    };
-    match texts {
-        [] => None,
-        [text] => one(text),
-        texts => texts.iter().map(|text| one(text)).collect(),
     }
 }
 
