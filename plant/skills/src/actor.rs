@@ -5,9 +5,8 @@ mod order;
 mod refused;
 mod work;
 
-use std::collections::VecDeque;
 use std::sync::{Arc, Mutex};
-use std::time::{Duration, SystemTime};
+use std::time::Duration;
 
 use log_limit::LogLimit;
 use program::{
@@ -28,10 +27,13 @@ use crate::description::SkillDescription;
 use crate::driver::{Driver, Line, RunResults, Signal, Work};
 use crate::driver_error::DriverError;
 use crate::lock::lock;
+use crate::outcomes::NewestOutcomes;
 use crate::parameters::Parameters;
 use crate::pending::PendingParameters;
 use crate::refusal::{RefusalCode, SkillRefusal};
-use crate::shown::{LastCall, RunOutcome, SkillEvent, SkillObserver, SkillSnapshot, Transitioned};
+use crate::shown::{
+    LastCall, RunOutcome, SkillEvent, SkillObserver, SkillSnapshot, Transitioned, clock, is_work,
+};
 
 pub(crate) struct Actor {
     facts: Arc<SkillDescription>,
@@ -52,16 +54,11 @@ pub(crate) struct Actor {
     refusals: LogLimit,
 }
 
-type Store = (
-    Arc<Mutex<PendingParameters>>,
-    Arc<Mutex<VecDeque<Arc<RunOutcome>>>>,
-);
-
 impl Actor {
     pub(crate) fn new(
         (facts, driver): (Arc<SkillDescription>, Arc<dyn Driver>),
         authority: Authority,
-        (pending, outcomes): Store,
+        (pending, outcomes): (Arc<Mutex<PendingParameters>>, NewestOutcomes),
         (observers, first_run): (Vec<Box<dyn SkillObserver>>, u32),
         successor: Arc<Mutex<Option<Successor>>>,
     ) -> (Self, watch::Receiver<Arc<SkillSnapshot>>) {
@@ -70,7 +67,7 @@ impl Actor {
             rests_in: facts.rests_in,
         };
         let program = ProgramInstance::counting_from(nature, first_run);
-        let now = SkillSnapshot::first(&program, clock());
+        let now = SkillSnapshot::first(program.state(), executable(&program), clock());
         let (shown, watched) = watch::channel(Arc::new(now.clone()));
         let actor = Self {
             timeout: facts.timeout,
@@ -138,11 +135,10 @@ impl Actor {
             }
         });
         if ended.await.is_err() {
-            let run = self.now.run;
             let why = self.now.pending.clone().unwrap_or_default();
             warn!(
                 skill = self.facts.name,
-                run,
+                run = self.now.run,
                 why,
                 "the component stops with a pending cancellation: the outcome of the run is unknown; check the machine"
             );
@@ -283,12 +279,8 @@ impl Actor {
     }
 
     async fn halt(&mut self, by: &str) -> Result<(), SkillRefusal> {
-        let goes_on = matches!(
-            self.program.state(),
-            ProgramMachineState::Running | ProgramMachineState::Suspended
-        );
         let mut message = format!("halted by {by}");
-        if goes_on {
+        if is_work(self.program.state()) {
             if let Some(over) = self.is_halting() {
                 if over {
                     self.give_up(&message);
@@ -344,11 +336,11 @@ impl Actor {
 
     /// Handles a run that exceeded its time limit.
     async fn late(&mut self) {
-        let within = self.work.as_ref().and_then(|work| work.within);
-        let within = within.unwrap_or_default();
-        if let Some(work) = &mut self.work {
+        let within = self.work.as_mut().and_then(|work| {
             work.deadline = None;
-        }
+            work.within
+        });
+        let within = within.unwrap_or_default();
         let message = format!("the work was not done within {within:?}");
         match self.stop_work().await {
             Stop::Done(result) => self.settle(Ok(result)),
@@ -419,14 +411,12 @@ impl Actor {
             };
             match happened {
                 WorkEvent::Line(line) => {
-                    let refused = match &line {
-                        Line::Refused(why) => Some(why.clone()),
-                        Line::Step(_) | Line::Note(_) | Line::Pending(_) | Line::Unknown(_) => None,
-                    };
-                    self.line(line);
-                    if let Some(why) = refused {
+                    if let Line::Refused(why) = &line {
+                        let why = why.clone();
+                        self.line(line);
                         return Stop::Refused(why);
                     }
+                    self.line(line);
                 }
                 WorkEvent::Ended(ended) => {
                     self.end_stopped();
@@ -443,14 +433,13 @@ impl Actor {
 
     /// Keeps the run going until the end of its work is known.
     fn await_end(&mut self, message: String, then: Then) {
-        let limit = self.driver.halt_timeout().unwrap_or_default();
         let Some(work) = &mut self.work else {
             return;
         };
         work.halting = Some(Halting {
             message: message.clone(),
             then,
-            over: Instant::now() + limit,
+            over: Instant::now() + self.driver.halt_timeout().unwrap_or_default(),
         });
         let why = self.now.pending.clone();
         let why = why.unwrap_or_else(|| "cancellation pending: the work has not ended".to_owned());
@@ -565,11 +554,11 @@ impl Actor {
             run: run.number(),
             succeeded: result.is_ok(),
             unknown: result.is_err() && self.now.needs_reset,
-            message: if result.is_ok() {
-                String::new()
-            } else {
-                message.clone()
-            },
+            message: result
+                .as_ref()
+                .err()
+                .map(ToString::to_string)
+                .unwrap_or_default(),
             results: self.facts.in_order(result.unwrap_or_default()),
             trace: self.history.take_trace(),
         };
@@ -620,28 +609,17 @@ impl Actor {
 
     fn transition(&mut self, transition: &'static Transition, message: String) {
         let at = clock();
-        self.now.state = transition.to;
-        self.now.last = Some(transition);
-        self.now.since = at;
-        self.now.executable = ProgramMethod::ALL.map(|method| self.program.is_executable(method));
-        if matches!(
-            transition.to,
-            ProgramMachineState::Halted | ProgramMachineState::Ready
-        ) {
+        self.now.executable = executable(&self.program);
+        self.now.enter(transition, at);
+        if !is_work(transition.to) {
             self.now.step.clear();
             self.now.pending = None;
+            if is_work(transition.from) {
+                self.authority.end(&self.facts.name);
+            }
         }
         if transition.to == ProgramMachineState::Ready {
             self.now.needs_reset = false;
-        }
-        if matches!(
-            transition.from,
-            ProgramMachineState::Running | ProgramMachineState::Suspended
-        ) && !matches!(
-            transition.to,
-            ProgramMachineState::Running | ProgramMachineState::Suspended
-        ) {
-            self.authority.end(&self.facts.name);
         }
         debug!(skill = self.facts.name, "{}: {message}", transition.name);
         self.tell(SkillEvent::Transition(&Transitioned {
@@ -707,12 +685,8 @@ impl Actor {
     }
 }
 
-#[expect(
-    clippy::disallowed_methods,
-    reason = "when a machine did something is told by the clock of its host"
-)]
-fn clock() -> SystemTime {
-    SystemTime::now()
+fn executable(program: &ProgramInstance) -> [bool; 5] {
+    ProgramMethod::ALL.map(|method| program.is_executable(method))
 }
 
 /// Time that the work has to end after it was stopped.

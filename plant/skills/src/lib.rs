@@ -19,6 +19,7 @@ pub mod frame;
 mod grip;
 mod lock;
 pub mod model;
+mod outcomes;
 mod parameters;
 mod part;
 mod partner_error;

@@ -9,7 +9,7 @@ use program::{ProgramMachineState, ProgramMethod};
 use crate::authority::SkillOwner;
 use crate::grip::GripPoint;
 use crate::refusal::RefusalCode;
-use crate::shown::RunOutcome;
+use crate::shown::{RunOutcome, is_work};
 use crate::skill::Skill;
 use crate::skill_fault::SkillFault;
 use crate::value::SkillValue;
@@ -89,13 +89,7 @@ impl RunnableSkill for LocalRun {
         }
         let run = self.skill.start_with(self.by.clone(), parameters).await?;
         let mut watch = self.skill.watch();
-        let ended = watch.wait_for(|shown| {
-            shown.run != run
-                || matches!(
-                    shown.state,
-                    ProgramMachineState::Ready | ProgramMachineState::Halted
-                )
-        });
+        let ended = watch.wait_for(|shown| shown.run != run || !is_work(shown.state));
         let ended = tokio::time::timeout(within, ended).await;
         match ended.map(|ended| ended.is_ok()) {
             Ok(true) => {}
@@ -123,12 +117,7 @@ impl RunnableSkill for LocalRun {
                 .await?;
         }
         let mut watch = self.skill.watch();
-        let ended = watch.wait_for(|shown| {
-            matches!(
-                shown.state,
-                ProgramMachineState::Ready | ProgramMachineState::Halted
-            )
-        });
+        let ended = watch.wait_for(|shown| !is_work(shown.state));
         match tokio::time::timeout(HALTS_WITHIN, ended).await {
             Ok(_ended_or_gone) => Ok(()),
             Err(_) => Err(goes_on(&self.name())),

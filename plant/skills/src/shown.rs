@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::time::SystemTime;
 
-use program::{ProgramInstance, ProgramMachineState, ProgramMethod, Transition};
+use program::{ProgramMachineState, ProgramMethod, Transition};
 
 use crate::authority::SkillOwner;
 use crate::parameters::Parameters;
@@ -41,9 +41,13 @@ pub struct SkillSnapshot {
 
 impl SkillSnapshot {
     /// Returns the snapshot of a skill that was created at this time and has had no run.
-    pub(crate) fn first(program: &ProgramInstance, created: SystemTime) -> Self {
+    pub(crate) fn first(
+        state: ProgramMachineState,
+        executable: [bool; 5],
+        created: SystemTime,
+    ) -> Self {
         Self {
-            state: program.state(),
+            state,
             last: None,
             since: created,
             run: 0,
@@ -57,9 +61,33 @@ impl SkillSnapshot {
             },
             pending: None,
             needs_reset: false,
-            executable: ProgramMethod::ALL.map(|method| program.is_executable(method)),
+            executable,
         }
     }
+
+    /// Records a transition at this time.
+    pub(crate) fn enter(&mut self, transition: &'static Transition, at: SystemTime) {
+        self.state = transition.to;
+        self.last = Some(transition);
+        self.since = at;
+    }
+}
+
+/// Returns whether a run is in progress in a state.
+pub(crate) fn is_work(state: ProgramMachineState) -> bool {
+    matches!(
+        state,
+        ProgramMachineState::Running | ProgramMachineState::Suspended
+    )
+}
+
+/// Returns the time of an event of a skill.
+#[expect(
+    clippy::disallowed_methods,
+    reason = "when a machine did something is told by the clock of its host"
+)]
+pub(crate) fn clock() -> SystemTime {
+    SystemTime::now()
 }
 
 /// The end of a run.

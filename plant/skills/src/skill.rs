@@ -1,10 +1,9 @@
 //! A skill that is executed in this process: its handle.
 
-use std::collections::VecDeque;
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
-use program::{ProgramMachineState, ProgramMethod};
+use program::ProgramMethod;
 use tokio::sync::{mpsc, oneshot, watch};
 
 use crate::actor::{Actor, Given, Order, SkillCallRequest, Successor};
@@ -12,10 +11,11 @@ use crate::authority::{Authority, SkillOwner};
 use crate::description::SkillDescription;
 use crate::driver::Driver;
 use crate::lock::lock;
+use crate::outcomes::NewestOutcomes;
 use crate::parameters::{Parameters, shortened};
 use crate::pending::PendingParameters;
 use crate::refusal::{RefusalCode, SkillRefusal};
-use crate::shown::{RunOutcome, SkillObserver, SkillSnapshot};
+use crate::shown::{RunOutcome, SkillObserver, SkillSnapshot, is_work};
 use crate::value::SkillValue;
 
 /// A skill that is executed in this process. Clones share the skill. It ends when the last clone is
@@ -27,7 +27,7 @@ pub struct Skill {
     pending: Arc<Mutex<PendingParameters>>,
     orders: mpsc::Sender<Order>,
     shown: watch::Receiver<Arc<SkillSnapshot>>,
-    outcomes: Arc<Mutex<VecDeque<Arc<RunOutcome>>>>,
+    outcomes: NewestOutcomes,
     successor: Arc<Mutex<Option<Successor>>>,
 }
 
@@ -55,13 +55,13 @@ impl Skill {
     ) -> Self {
         let facts = Arc::new(facts);
         let pending = Arc::new(Mutex::new(PendingParameters::default()));
-        let outcomes = Arc::default();
+        let outcomes = NewestOutcomes::default();
         let successor = Arc::default();
         let (orders, waiting) = mpsc::channel(MOST_ORDERS);
         let (actor, shown) = Actor::new(
             (Arc::clone(&facts), driver),
             authority.clone(),
-            (Arc::clone(&pending), Arc::clone(&outcomes)),
+            (Arc::clone(&pending), outcomes.clone()),
             (observers, first_run),
             Arc::clone(&successor),
         );
@@ -105,10 +105,7 @@ impl Skill {
     /// Returns the outcome of a run, if it is one of the newest runs.
     #[must_use]
     pub fn outcome(&self, run: u32) -> Option<Arc<RunOutcome>> {
-        lock(&self.outcomes)
-            .iter()
-            .find(|outcome| outcome.run == run)
-            .cloned()
+        self.outcomes.of(run)
     }
 
     /// Writes a parameter for the next run. A refused write changes nothing.
@@ -132,10 +129,7 @@ impl Skill {
 
     fn written(&self, by: &SkillOwner, name: &str, value: SkillValue) -> Result<(), SkillRefusal> {
         let state = self.shown.borrow().state;
-        if matches!(
-            state,
-            ProgramMachineState::Running | ProgramMachineState::Suspended
-        ) {
+        if is_work(state) {
             let text = format!("parameters are kept while the skill is {state}");
             return Err(SkillRefusal::new(RefusalCode::InvalidState, text));
         }

@@ -1,23 +1,22 @@
 //! The trace of the current run, and the outcomes of the last runs.
 
-use std::collections::VecDeque;
-use std::sync::{Arc, Mutex};
+use std::sync::Arc;
 
 use tokio::time::Instant;
 
 use crate::driver::Line;
-use crate::lock::lock;
+use crate::outcomes::NewestOutcomes;
 use crate::shown::RunOutcome;
 
 /// The trace of the current run, and the outcomes of the last runs.
 pub(super) struct SkillHistory {
-    outcomes: Arc<Mutex<VecDeque<Arc<RunOutcome>>>>,
+    outcomes: NewestOutcomes,
     trace: Vec<String>,
 }
 
 impl SkillHistory {
     /// Creates a history that adds to these outcomes.
-    pub(super) const fn new(outcomes: Arc<Mutex<VecDeque<Arc<RunOutcome>>>>) -> Self {
+    pub(super) const fn new(outcomes: NewestOutcomes) -> Self {
         Self {
             outcomes,
             trace: Vec::new(),
@@ -46,20 +45,12 @@ impl SkillHistory {
         }
     }
 
-    /// Adds an outcome. The oldest outcome gives way to it.
+    /// Adds an outcome.
     pub(super) fn keep(&self, outcome: RunOutcome) -> Arc<RunOutcome> {
-        let outcome = Arc::new(outcome);
-        let mut outcomes = lock(&self.outcomes);
-        if outcomes.len() >= MOST_OUTCOMES {
-            outcomes.pop_front();
-        }
-        outcomes.push_back(Arc::clone(&outcome));
-        outcome
+        self.outcomes.keep(outcome)
     }
 }
 
 /// Maximum number of trace lines of a run, and the maximum length of each in characters.
 const MOST_TRACED: usize = 256;
 const LONGEST_TRACED: usize = 240;
-/// Number of outcomes that are kept.
-const MOST_OUTCOMES: usize = 64;

@@ -8,7 +8,7 @@ mod seen;
 
 use std::collections::VecDeque;
 use std::fmt;
-use std::sync::{Arc, Mutex};
+use std::sync::Arc;
 use std::time::Duration;
 
 use plant_opcua::client::{MonitoredWatch, Notice, Sampled};
@@ -23,7 +23,7 @@ use super::handle::{STATE_PATHS, state_in};
 use super::packed::Packed;
 use super::{SkillClient, lost};
 use crate::description::SkillDescription;
-use crate::lock::lock;
+use crate::outcomes::NewestOutcomes;
 use crate::parameters::SkillParameter;
 use crate::shown::{RunOutcome, SkillObserver, SkillSnapshot};
 use crate::skill_fault::SkillFault;
@@ -36,7 +36,7 @@ pub struct MirroredSkill {
     methods: Arc<[ProgramMethod]>,
     orders: mpsc::Sender<Order>,
     shown: watch::Receiver<Arc<SkillSnapshot>>,
-    outcomes: Arc<Mutex<VecDeque<Arc<RunOutcome>>>>,
+    outcomes: NewestOutcomes,
 }
 
 impl fmt::Debug for MirroredSkill {
@@ -152,14 +152,10 @@ impl Mirrors {
                 }));
                 ways.push((part, tell.clone()));
             }
-            let outcomes = Arc::default();
+            let outcomes = NewestOutcomes::default();
             let observers = observers(at, &facts);
-            let (seen, shown) = SeenSkill::new(
-                client.handle(found),
-                observers,
-                Arc::clone(&outcomes),
-                first_run,
-            );
+            let (seen, shown) =
+                SeenSkill::new(client.handle(found), observers, outcomes.clone(), first_run);
             tasks.spawn(seen.run(notices, ordered, gone.subscribe()));
             skills.push(MirroredSkill {
                 facts,
@@ -222,8 +218,7 @@ impl MirroredSkill {
     /// Returns the outcome of a run, if it is one of the newest observed runs.
     #[must_use]
     pub fn outcome(&self, run: u32) -> Option<Arc<RunOutcome>> {
-        let outcomes = lock(&self.outcomes);
-        outcomes.iter().find(|one| one.run == run).cloned()
+        self.outcomes.of(run)
     }
 
     /// Calls a method; the parameters are written before Start. Returns the number of the newest

@@ -12,9 +12,9 @@ use plant_opcua::types::{
     Argument, DataTypeId, LocalizedText, NodeId, QualifiedName, StatusCode, Variant,
 };
 use plant_opcua::users::{Roles, UserAccess, UserRole};
-use program::ProgramMachineState;
 
 use crate::model::POWER_OFF;
+use crate::shown::is_work;
 use crate::skill::Skill;
 
 /// Ends the program after a delay.
@@ -55,12 +55,7 @@ pub(super) fn serve(
         if !users.roles_of(&request.caller).meets(may) {
             return Err(MethodRefusal::from(StatusCode::BadUserAccessDenied));
         }
-        let runs = |skill: &Skill| {
-            matches!(
-                skill.shown().state,
-                ProgramMachineState::Running | ProgramMachineState::Suspended
-            )
-        };
+        let runs = |skill: &Skill| is_work(skill.shown().state);
         if skills.iter().any(runs) {
             return Err(MethodRefusal::from(StatusCode::BadInvalidState));
         }

@@ -11,10 +11,10 @@ use std::future::Future;
 use futures_util::future::{join_all, select_all};
 use plant_opcua::server::{IdRange, Instance, InstanceError, InstanceSpec, OpcUaServer};
 use plant_opcua::types::{DataValue, LocalizedText, NodeId, QualifiedName, StatusCode, Variant};
-use program::ProgramMachineState;
 
 use crate::component::Robot;
 use crate::model::DEVICES;
+use crate::shown::is_work;
 use crate::skill::Skill;
 use crate::values::LiveValue;
 use crate::yaml::{YamlFinding, YamlFindingCode};
@@ -115,13 +115,10 @@ async fn keep(server: OpcUaServer, task: Instance, skills: Vec<Skill>) {
         let shown = watches
             .iter_mut()
             .map(|watch| watch.borrow_and_update().state);
-        let runs = |state: ProgramMachineState| {
-            matches!(
-                state,
-                ProgramMachineState::Running | ProgramMachineState::Suspended
-            )
-        };
-        let running = skills.iter().zip(shown).filter(|(_, state)| runs(*state));
+        let running = skills
+            .iter()
+            .zip(shown)
+            .filter(|(_, state)| is_work(*state));
         let names: Vec<&str> = running
             .map(|(skill, _)| skill.facts().name.as_str())
             .collect();

@@ -4,7 +4,7 @@ use std::sync::atomic::{AtomicU32, Ordering};
 use tokio::time::Instant;
 
 use async_trait::async_trait;
-use program::{Rest, TRANSITIONS};
+use program::{ProgramMachineState, Rest, TRANSITIONS};
 use tokio::sync::Semaphore;
 
 use super::*;

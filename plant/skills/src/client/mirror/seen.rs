@@ -1,8 +1,7 @@
 //! The task of one skill of another server: processes its notifications and calls.
 
-use std::collections::VecDeque;
-use std::sync::{Arc, Mutex};
-use std::time::{Duration, SystemTime};
+use std::sync::Arc;
+use std::time::Duration;
 
 use plant_opcua::types::{DataValue, Variant};
 use program::{ProgramMachineState, ProgramMethod, Transition};
@@ -12,10 +11,10 @@ use tracing::debug;
 
 use super::super::handle::{SkillHandle, state_in};
 use super::{Order, leads_to, way};
-use crate::lock::lock;
+use crate::outcomes::NewestOutcomes;
 use crate::parameters::Parameters;
 use crate::shown::{
-    ProgramDiagnostic, RunOutcome, SkillEvent, SkillObserver, SkillSnapshot, Transitioned,
+    RunOutcome, SkillEvent, SkillObserver, SkillSnapshot, Transitioned, clock, is_work,
 };
 use crate::skill_fault::SkillFault;
 use crate::value::SkillValue;
@@ -32,7 +31,7 @@ pub(super) enum SkillAspect {
 pub(super) struct SeenSkill {
     handle: SkillHandle,
     observers: Vec<Box<dyn SkillObserver>>,
-    outcomes: Arc<Mutex<VecDeque<Arc<RunOutcome>>>>,
+    outcomes: NewestOutcomes,
     shown: watch::Sender<Arc<SkillSnapshot>>,
     now: SkillSnapshot,
     next_run: u32,
@@ -45,33 +44,14 @@ pub(super) struct SeenSkill {
     look_at: Instant,
 }
 
-type Outcomes = Arc<Mutex<VecDeque<Arc<RunOutcome>>>>;
-
 impl SeenSkill {
     pub(super) fn new(
         handle: SkillHandle,
         observers: Vec<Box<dyn SkillObserver>>,
-        outcomes: Outcomes,
+        outcomes: NewestOutcomes,
         first_run: u32,
     ) -> (Self, watch::Receiver<Arc<SkillSnapshot>>) {
-        let created = clock();
-        let now = SkillSnapshot {
-            state: ProgramMachineState::Halted,
-            last: None,
-            since: created,
-            run: 0,
-            progress: 0.0,
-            step: String::new(),
-            parameters: Arc::default(),
-            outcome: None,
-            diagnostic: ProgramDiagnostic {
-                created,
-                last_call: None,
-            },
-            pending: None,
-            needs_reset: false,
-            executable: [false; 5],
-        };
+        let now = SkillSnapshot::first(ProgramMachineState::Halted, [false; 5], clock());
         let (shown, watched) = watch::channel(Arc::new(now.clone()));
         let seen = Self {
             handle,
@@ -285,20 +265,12 @@ impl SeenSkill {
             self.tell(SkillEvent::Parameters(&parameters));
         }
         if ends {
-            let outcome = Arc::new(self.ended(transition.to).await);
+            let outcome = self.outcomes.keep(self.ended(transition.to).await);
             message.clone_from(&outcome.message);
-            let mut outcomes = lock(&self.outcomes);
-            outcomes.push_back(Arc::clone(&outcome));
-            if outcomes.len() > MOST_OUTCOMES {
-                outcomes.pop_front();
-            }
-            drop(outcomes);
             self.now.outcome = Some(Arc::clone(&outcome));
             self.tell(SkillEvent::Outcome(&outcome));
         }
-        self.now.state = transition.to;
-        self.now.last = Some(transition);
-        self.now.since = clock();
+        self.now.enter(transition, clock());
         let happened = Transitioned {
             transition,
             run: self.now.run,
@@ -343,22 +315,5 @@ impl SeenSkill {
     }
 }
 
-fn is_work(state: ProgramMachineState) -> bool {
-    matches!(
-        state,
-        ProgramMachineState::Running | ProgramMachineState::Suspended
-    )
-}
-
-#[expect(
-    clippy::disallowed_methods,
-    reason = "when a machine did something is told by the clock of its host"
-)]
-fn clock() -> SystemTime {
-    SystemTime::now()
-}
-
 /// Interval in which a running skill is polled, in case its server does not notify changes.
 const LOOK: Duration = Duration::from_secs(1);
-/// Number of outcomes that are kept of a skill.
-const MOST_OUTCOMES: usize = 64;
