@@ -5,6 +5,7 @@
 //! it has them; otherwise they are counted here.
 
 mod seen;
+mod state_order;
 
 use std::collections::VecDeque;
 use std::fmt;

@@ -10,6 +10,7 @@ use tokio::time::{Instant, sleep, sleep_until};
 use tracing::debug;
 
 use super::super::handle::{SkillHandle, state_in};
+use super::state_order::{StateNotice, StateOrder};
 use super::{Order, leads_to, way};
 use crate::outcomes::NewestOutcomes;
 use crate::parameters::Parameters;
@@ -35,11 +36,7 @@ pub(super) struct SeenSkill {
     shown: watch::Sender<Arc<SkillSnapshot>>,
     now: SkillSnapshot,
     next_run: u32,
-    /// Time at which the server entered the shown state, by its clock. Older notifications are
-    /// ignored.
-    since: Option<i64>,
-    /// Whether a run was started from here that the server does not show yet.
-    begun: bool,
+    states: StateOrder,
     /// Time of the next poll during a run.
     look_at: Instant,
 }
@@ -60,8 +57,7 @@ impl SeenSkill {
             shown,
             now,
             next_run: first_run.max(1),
-            since: None,
-            begun: false,
+            states: StateOrder::default(),
             look_at: Instant::now(),
         };
         (seen, watched)
@@ -107,7 +103,7 @@ impl SeenSkill {
         loop {
             match self.handle.seen().await {
                 Ok((state, since)) => {
-                    self.since = since;
+                    self.states.read(since);
                     self.now.state = state.state;
                     self.now.progress = state.progress;
                     self.now.step = state.step;
@@ -128,8 +124,7 @@ impl SeenSkill {
     async fn look(&mut self) {
         self.look_at = Instant::now() + LOOK;
         if let Ok((state, since)) = self.handle.seen().await {
-            self.since = since.or(self.since);
-            self.begun = false;
+            self.states.read(since);
             self.go(state.state).await;
         }
     }
@@ -166,24 +161,11 @@ impl SeenSkill {
             return;
         };
         let at = value.source_timestamp.map(|at| at.ticks());
-        if let (Some(at), Some(since)) = (at, self.since)
-            && at <= since
-        {
-            return;
+        match self.states.notified(state == self.now.state, at) {
+            StateNotice::Known => {}
+            StateNotice::Entered => self.go(state).await,
+            StateNotice::Unclear => self.look().await,
         }
-        if state == self.now.state {
-            self.begun = false;
-            self.since = at.or(self.since);
-            return;
-        }
-        if self.begun && at.is_none() {
-            // The value may be from before the run and arrive late.
-            self.look().await;
-            return;
-        }
-        self.begun = false;
-        self.since = at.or(self.since);
-        self.go(state).await;
     }
 
     async fn order(&mut self, order: Order) {
@@ -222,19 +204,20 @@ impl SeenSkill {
             self.look_at = Instant::now() + LOOK;
             // The server may show the state before or after its response.
             self.go(to).await;
-            match self.handle.seen().await {
-                Ok((state, at)) if at > self.since || is_work(state.state) => {
-                    self.since = at.or(self.since);
-                    self.go(state.state).await;
-                }
-                Ok(_) | Err(_) => self.begun = true,
+            let read = self.handle.seen().await.ok();
+            let read = read.map(|(state, at)| (state.state, at));
+            let is_of_run = read.map(|(state, at)| (is_work(state), at));
+            if self.states.started(is_of_run)
+                && let Some((state, _)) = read
+            {
+                self.go(state).await;
             }
         } else {
             self.handle.call(method).await?;
             if let Ok((state, at)) = self.handle.seen().await
                 && state.state != from
             {
-                self.since = at.or(self.since);
+                self.states.called(at);
                 self.go(state.state).await;
             }
         }
