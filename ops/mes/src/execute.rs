@@ -256,8 +256,6 @@ enum Ended {
     Done,
     /// Another round of a loop is due, which is planned anew.
     Round,
-    /// A step attached no tool. The steps that are left were planned for the tool of this step.
-    OtherTool,
     /// Another plan can do the work.
     Broken(String),
     /// No other plan can do the work.
@@ -299,7 +297,7 @@ impl Execution<'_> {
             });
             let ended = self.carry_out(&chosen, progress).await;
             let (outcome, reason) = match &ended {
-                Ended::Done | Ended::Round | Ended::OtherTool => (How::Done, None),
+                Ended::Done | Ended::Round => (How::Done, None),
                 Ended::Broken(why) | Ended::Over(why) => (How::Failed, Some(why.clone())),
             };
             self.log.change(|kept, now| {
@@ -313,7 +311,6 @@ impl Execution<'_> {
                     self.log.forgive();
                     last.clear();
                 }
-                Ended::OtherTool => last.clear(),
                 Ended::Over(why) => return Err(why),
                 // The step whose end is unknown may go on; no other component repeats it.
                 Ended::Broken(why) if self.log.run().is_unknown() => return Err(why),
@@ -332,6 +329,7 @@ impl Execution<'_> {
     async fn planned(&self, last: &str, progress: &RunProgress) -> Result<(Plan, Chosen), String> {
         let run = self.log.run().run;
         let kept = compensate::kept(self.process, &progress.done);
+        let passed: Vec<usize> = progress.passed.keys().copied().collect();
         let after = if last.is_empty() {
             String::new()
         } else {
@@ -354,7 +352,7 @@ impl Execution<'_> {
             let situation = Situation {
                 fallen: &fallen,
                 kept: &kept,
-                passed: Some(&progress.passed),
+                passed: &passed,
                 used: Some(&used),
             };
             let facts = OfPlant {

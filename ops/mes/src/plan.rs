@@ -12,7 +12,7 @@ use skills::ParameterType;
 use skills::choosing::{self, Attachment, CandidateRank, choose};
 
 use crate::parameter_fault::ParameterFault;
-use crate::process::{BadEnd, By, Group, Need, Process, ProcessStep, SkillRole, StepJob};
+use crate::process::{By, Group, Need, Process, ProcessStep, SkillRole, StepJob};
 
 use judging::Judging;
 pub(crate) use judging::TOOL;
@@ -153,15 +153,6 @@ pub(crate) struct KeptStep {
     pub(crate) offer: Offer,
 }
 
-/// The reason why the process goes on behind a step that is not done.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Passed {
-    /// Its conditions did not hold.
-    Skipped,
-    /// Other steps handle its end, which is confirmed.
-    Ended(BadEnd),
-}
-
 /// The facts about a run that its next plan has to respect.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct Situation<'a> {
@@ -169,8 +160,8 @@ pub(crate) struct Situation<'a> {
     pub(crate) fallen: &'a [Fallen],
     /// The steps that are done.
     pub(crate) kept: &'a [KeptStep],
-    /// The steps that were passed without being done, by their numbers.
-    pub(crate) passed: Option<&'a BTreeMap<usize, Passed>>,
+    /// The numbers of the steps that were passed without being done.
+    pub(crate) passed: &'a [usize],
     /// The components that other runs use, with these runs.
     pub(crate) used: Option<&'a BTreeMap<String, String>>,
 }
@@ -178,7 +169,7 @@ pub(crate) struct Situation<'a> {
 impl Situation<'_> {
     /// Returns whether a role belongs to a step that was passed, or to its compensation.
     fn is_passed(&self, process: &Process, role: SkillRole) -> bool {
-        self.passed.into_iter().flatten().any(|(number, _)| {
+        self.passed.iter().any(|number| {
             [*number, process.compensation_of(*number)]
                 .map(SkillRole::Alone)
                 .contains(&role)

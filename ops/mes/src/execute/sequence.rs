@@ -11,7 +11,7 @@ use tracing::info;
 
 use super::compensate::{self, Done};
 use super::{Chosen, Ended, Execution, Fallen, Offer, ProcessStep, SkillRole};
-use crate::plan::{Passed, TOOL};
+use crate::plan::TOOL;
 use crate::process::{BadEnd, Incomparable, Loop, Process, StepCondition, Test};
 
 /// The steps of a run that are over.
@@ -27,6 +27,15 @@ pub(super) struct RunProgress {
     all_rounds: u32,
     /// The loops after their last round.
     left: BTreeSet<usize>,
+}
+
+/// The reason why the process goes on behind a step that is not done.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Passed {
+    /// Its conditions did not hold.
+    Skipped,
+    /// Other steps handle its end, which is confirmed.
+    Ended(BadEnd),
 }
 
 impl RunProgress {
@@ -262,7 +271,7 @@ impl Execution<'_> {
                     skills.get(place),
                     chosen.steps.get(number),
                 ) else {
-                    ended = other_step();
+                    ended = Ended::Over("the plan has another step than the process".to_owned());
                     break;
                 };
                 begun.insert(number, &offer.component);
@@ -341,7 +350,8 @@ impl Execution<'_> {
                 return Err(Ended::Round);
             }
             let skipped = progress.passed.len();
-            let ready = self.ready(chosen, begun, progress)?;
+            let ready = self.ready(chosen, begun, progress);
+            let ready = ready.map_err(Ended::Over)?;
             // A skipped step may be the last one of its round.
             if ready.is_some() || progress.passed.len() == skipped {
                 return Ok(ready);
@@ -351,16 +361,12 @@ impl Execution<'_> {
 
     /// Returns a step that can begin. Steps whose conditions do not hold are skipped. A component
     /// does one step at a time.
-    ///
-    /// # Errors
-    /// The end of the plan: later steps are planned for another tool, or the reason why the process
-    /// cannot go on.
     fn ready(
         &self,
         chosen: &Chosen,
         begun: &BTreeMap<usize, &str>,
         progress: &mut RunProgress,
-    ) -> Result<Option<Ready>, Ended> {
+    ) -> Result<Option<Ready>, String> {
         let busy: BTreeSet<&str> = begun.values().copied().collect();
         for (number, step) in self.process.steps.iter().enumerate() {
             let mut waits = step.waits_for(number).into_iter();
@@ -369,34 +375,24 @@ impl Execution<'_> {
                 continue;
             }
             let allows = progress.allows(self.process, step);
-            if !allows.map_err(|why| Ended::Over(format!("{}: {why}", step.name)))? {
+            if !allows.map_err(|why| format!("{}: {why}", step.name))? {
                 info!(
                     step = step.name,
                     "a step is skipped: its conditions do not hold"
                 );
                 progress.passed.insert(number, Passed::Skipped);
-                if self.is_relied_on(number, progress) {
-                    return Err(Ended::OtherTool);
-                }
                 continue;
             }
             let mut open = chosen.open.iter();
             let place = open.position(|(role, _)| *role == SkillRole::Alone(number));
-            let place = place.ok_or_else(other_step)?;
+            let place =
+                place.ok_or_else(|| "the plan has another step than the process".to_owned())?;
             let offer = chosen.open.get(place).map(|(_, offer)| offer);
             if offer.is_some_and(|offer| !busy.contains(offer.component.as_str())) {
                 return Ok(Some((number, place)));
             }
         }
         Ok(None)
-    }
-
-    /// Returns whether the plan has chosen steps that are left for the tool that a step attaches.
-    fn is_relied_on(&self, number: usize, progress: &RunProgress) -> bool {
-        let step = self.process.steps.get(number);
-        let mut given = step.into_iter().flat_map(|step| &step.parameters);
-        let mut later = number..self.process.steps.len();
-        given.any(|given| given.name == TOOL) && later.any(|step| !progress.is_over(step))
     }
 
     /// Records the end of a step.
@@ -446,11 +442,6 @@ impl Execution<'_> {
                 "other steps handle the end of a step"
             );
             progress.passed.insert(number, Passed::Ended(bad));
-            if self.is_relied_on(number, progress) {
-                // A step that handles the end may use the skill again.
-                self.log.forgive();
-                ended.and(Ended::OtherTool);
-            }
             return;
         }
         ended.and(why);
@@ -536,16 +527,12 @@ impl Execution<'_> {
     }
 }
 
-fn other_step() -> Ended {
-    Ended::Over("the plan has another step than the process".to_owned())
-}
-
 impl Ended {
     /// Adds the end of another step. No other plan can do the work if it cannot for one of them.
     fn and(&mut self, other: Self) {
         *self = match (std::mem::replace(self, Self::Done), other) {
-            (Self::Done | Self::Round | Self::OtherTool, other) => other,
-            (before, Self::Done | Self::Round | Self::OtherTool) => before,
+            (Self::Done | Self::Round, other) => other,
+            (before, Self::Done | Self::Round) => before,
             (Self::Broken(one), Self::Broken(two)) => Self::Broken(format!("{one}; {two}")),
             // All running steps are stopped together.
             (Self::Over(one), Self::Over(two)) if one == two => Self::Over(one),

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 
 use skills::ParameterType;
 
-use super::{Facts, Offer, Passed, Plan, PlanCandidate, PlannedNeed, Situation, Team, rank};
+use super::{Facts, Offer, Plan, PlanCandidate, PlannedNeed, Situation, Team, rank};
 use crate::parameter_fault::ParameterFault;
 use crate::process::{By, Group, Need, Process, ProcessStep, SkillRole, StepJob};
 
@@ -157,7 +157,7 @@ impl<'a> Judging<'a> {
     }
 
     /// Returns the tools that have to fill roles: a tool that a step attaches does all later steps
-    /// that it can do, until another tool is attached. A step that was skipped attaches nothing.
+    /// that it can do, until another tool is attached.
     fn attached_tools(&self, offers: &[Offer]) -> BTreeMap<SkillRole, Option<Attached>> {
         let mut tools = BTreeMap::new();
         if self.process.work != StepJob::Sequence {
@@ -166,10 +166,6 @@ impl<'a> Judging<'a> {
         let mut attached: Option<Attached> = None;
         for (number, step) in self.process.steps.iter().enumerate() {
             let role = SkillRole::Alone(number);
-            let passed = self.situation.passed.and_then(|all| all.get(&number));
-            if passed == Some(&Passed::Skipped) {
-                continue;
-            }
             // A tool that has failed or is in use stays attached.
             let fits = |offer: &&Offer| {
                 let mut needs = step.needs.iter();
@@ -189,8 +185,6 @@ impl<'a> Judging<'a> {
             };
             if is_tool("AttachToolSkillType") || is_tool("ChangeToolSkillType") {
                 let named = step.parameters.iter().find(|given| given.name == TOOL);
-                // The tool is unknown after a step that failed.
-                let named = named.filter(|_| passed.is_none());
                 attached = named
                     .and_then(|given| given.value.as_str())
                     .map(|tool| (tool.to_owned(), step.name.clone()));

@@ -1,5 +1,3 @@
-mod tools;
-
 use std::time::Duration;
 
 use skills::ParameterType;
@@ -512,6 +510,62 @@ fn a_step_is_done_by_the_component_of_another_step_if_the_process_says_so() {
 }
 
 #[test]
+fn the_attached_tool_does_what_it_can() {
+    let change = offer(
+        "changer",
+        "Change",
+        &["ChangeToolSkillType"],
+        &["urn:change"],
+    );
+    let offers = [
+        vec![change],
+        gripper("finger"),
+        robot("robot"),
+        gripper("vacuum"),
+    ]
+    .concat();
+    let mut process = sequence(&["urn:change", GRASP, MOVE, RELEASE]);
+    process.steps[0].parameters = vec![GivenParameter {
+        name: "ToolAppUri".into(),
+        value: "urn:example:vacuum".into(),
+        unit: None,
+        result: None,
+        query: None,
+    }];
+    let attached = plan(&process, &offers, &[]);
+    let expected = [
+        "changer#Change",
+        "vacuum#Grasp",
+        "robot#Lin",
+        "vacuum#Release",
+    ];
+    assert_eq!(chosen(&attached, 4), expected);
+    assert_eq!(
+        why(&attached, SkillRole::Alone(1), "finger#Grasp"),
+        "it is not of the tool urn:example:vacuum, which the step `step 0` attaches"
+    );
+    // A tool that is not there is waited for, if the process says that it does the step.
+    process.steps[0].parameters[0].value = "urn:example:absent".into();
+    process.steps[1].by = By::AttachedTool;
+    assert!(!plan(&process, &offers, &[]).is_complete());
+    process.steps.remove(0);
+    process
+        .steps
+        .iter_mut()
+        .zip(0..)
+        .for_each(|(step, number)| {
+            step.needs[0].role = SkillRole::Alone(number);
+        });
+    let without = plan(&process, &offers, &[]);
+    let expected = "no step before it attaches a tool";
+    assert!(
+        without.missing().contains(expected),
+        "{}",
+        without.missing()
+    );
+}
+
+#[test]
 fn a_skill_that_cannot_take_the_parameters_of_a_step_is_not_chosen() {
     let offers = [gripper("finger"), gripper("vacuum")].concat();
     let process = sequence(&[GRASP, RELEASE]);
@@ -631,7 +685,7 @@ fn a_step_that_is_done_keeps_its_component_in_the_next_plan() {
 }
 
 #[test]
-fn a_component_that_another_run_uses_is_not_chosen() {
+fn a_component_that_another_run_uses_is_not_chosen_and_an_attached_tool_stays_attached() {
     let offers = [gripper("a"), gripper("b")].concat();
     let used = BTreeMap::from([("urn:example:a".to_owned(), "urn:run:1".to_owned())]);
     let with = |process: &Process| {
@@ -645,4 +699,19 @@ fn a_component_that_another_run_uses_is_not_chosen() {
     assert_eq!(chosen(&found, 2), ["b#Grasp", "b#Release"]);
     let expected = "it would fit, but the run urn:run:1 uses its component";
     assert_eq!(why(&found, SkillRole::Alone(0), "a#Grasp"), expected);
+    let mut process = sequence(&["urn:change", GRASP]);
+    process.steps[0].needs[0].skill_type = Some(ParameterType::own("ChangeToolSkillType"));
+    process.steps[0].parameters = vec![GivenParameter {
+        name: "ToolAppUri".into(),
+        value: "urn:example:a".into(),
+        unit: None,
+        result: None,
+        query: None,
+    }];
+    let found = with(&process);
+    assert_eq!(
+        chosen(&found, 2)[1],
+        "none",
+        "the other gripper is not attached"
+    );
 }

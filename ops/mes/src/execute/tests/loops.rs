@@ -1,7 +1,7 @@
 //! Steps that are done in rounds.
 
 use super::*;
-use crate::plan::Passed;
+use crate::execute::sequence::Passed;
 use crate::process::{BadEnd, By, Compare, Loop, StepCondition, Test};
 
 /// A loop over steps, which is repeated while a condition about one of them holds.
