@@ -25,6 +25,14 @@ enum Which {
     Address(IpAddr),
 }
 
+/// An IPv4 address of an interface.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub(crate) struct InterfaceAddress {
+    /// The index of the interface in the system.
+    index: Option<u32>,
+    pub(crate) address: Ipv4Addr,
+}
+
 impl MdnsInterface {
     /// The loopback interface, for this host only.
     pub const LOOPBACK: Self = Self::of(Which::Address(IpAddr::V4(Ipv4Addr::LOCALHOST)));
@@ -76,14 +84,23 @@ impl MdnsInterface {
     /// Returns the IPv4 addresses of the interface, which are used for mDNS.
     #[must_use]
     pub fn addresses(&self) -> Vec<Ipv4Addr> {
+        let all = self.indexed_addresses().into_iter();
+        all.map(|one| one.address).collect()
+    }
+
+    /// Returns the IPv4 addresses of the interface with its index in the system. An interface
+    /// that is created again has another index.
+    pub(crate) fn indexed_addresses(&self) -> Vec<InterfaceAddress> {
         let all = if_addrs::get_if_addrs().unwrap_or_default();
-        let addresses = all.iter().filter(|interface| self.is(interface));
-        addresses
-            .filter_map(|interface| match interface.ip() {
-                IpAddr::V4(address) => Some(address),
-                IpAddr::V6(_) => None,
-            })
-            .collect()
+        let own = all.iter().filter(|interface| self.is(interface));
+        own.filter_map(|interface| match interface.ip() {
+            IpAddr::V4(address) => Some(InterfaceAddress {
+                index: interface.index,
+                address,
+            }),
+            IpAddr::V6(_) => None,
+        })
+        .collect()
     }
 
     /// Returns whether only this host is on the interface.

@@ -5,7 +5,7 @@
 
 use std::collections::BTreeMap;
 use std::hash::{DefaultHasher, Hasher as _};
-use std::net::SocketAddr;
+use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::time::Duration;
 
 use mdns_sd::MDNS_PORT;
@@ -44,6 +44,11 @@ pub(crate) enum Sighting {
         announcement: AnnouncedServer,
         aside: Aside,
     },
+    /// The heeded server said goodbye.
+    Left {
+        /// The instance name of the server.
+        instance: String,
+    },
     /// A name of this program is announced with another port or host name.
     Rival { announcement: AnnouncedServer },
     /// A program on the network may need the announcements of this program.
@@ -62,6 +67,11 @@ impl NearbyServers {
         });
     }
 
+    /// Returns whether another server was announced with this name in the last minutes.
+    pub(crate) fn knows(&self, name: &str) -> bool {
+        self.heard.contains_key(&hash(name.as_bytes()))
+    }
+
     /// Returns the number of servers that were announced in the last minutes.
     pub(crate) fn count(&self) -> usize {
         self.heard.len()
@@ -73,7 +83,7 @@ impl NearbyServers {
             .retain(|_, at| now.saturating_duration_since(*at) < VALID);
     }
 
-    /// Reads a packet. `own` returns the port and the host name in the announcement of a name of
+    /// Reads a packet of a host in the subnets. `own` returns the port and the host name in the announcement of a name of
     /// this program.
     pub(crate) fn take<'o>(
         &mut self,
@@ -82,7 +92,11 @@ impl NearbyServers {
         subnets: &Subnets,
         now: Instant,
     ) -> Vec<Sighting> {
-        let Some(packet) = DnsPacket::new(packet) else {
+        let IpAddr::V4(sender) = from.ip().to_canonical() else {
+            return Vec::new();
+        };
+        let packet = DnsPacket::new(packet).filter(|_| subnets.contains(sender));
+        let Some(packet) = packet else {
             return Vec::new();
         };
         if !packet.is_response() {
@@ -98,18 +112,20 @@ impl NearbyServers {
                 continue;
             };
             if record.is_withdrawn {
-                self.left(server.label);
+                seen.extend(self.left(server.label));
                 continue;
             }
             // Each description is another pass over the records.
             let mut described = || {
                 descriptions = descriptions.checked_sub(1)?;
-                described(packet, &record, subnets)
+                described((packet, sender), &record, subnets)
             };
             let name = std::str::from_utf8(server.label).ok();
             if let Some(own) = name.and_then(&own) {
                 let rival = (!server.is_at(own)).then(&mut described).flatten();
-                seen.extend(rival.map(|(announcement, _)| Sighting::Rival { announcement }));
+                seen.extend(rival.map(|described| Sighting::Rival {
+                    announcement: described.announcement,
+                }));
                 continue;
             }
             if self.hear(server.label, now) && is_to_be_told(from.port(), self.count()) {
@@ -137,25 +153,29 @@ impl NearbyServers {
         has_room
     }
 
-    fn left(&mut self, label: &[u8]) {
+    /// Records a goodbye. Returns a sighting if it is that of the heeded server.
+    fn left(&mut self, label: &[u8]) -> Option<Sighting> {
         self.heard.remove(&hash(label));
-        if let Some(heeded) = &mut self.heeded {
-            // The next announcement is that of another run.
-            heeded.last = heeded.last.take().filter(|(known, ..)| {
-                let instance = known.instance.as_bytes();
-                !instance.eq_ignore_ascii_case(label)
-            });
-        }
+        let last = &mut self.heeded.as_mut()?.last;
+        // The next announcement is that of another run.
+        let (known, ..) = last.take_if(|(known, ..)| {
+            let instance = known.instance.as_bytes();
+            instance.eq_ignore_ascii_case(label)
+        })?;
+        Some(Sighting::Left {
+            instance: known.instance,
+        })
     }
 
     /// Returns an announcement of the heeded server, unless it repeats the last announcement.
-    fn heeded_told(
-        &mut self,
-        (announcement, aside): (AnnouncedServer, Aside),
-        now: Instant,
-    ) -> Option<Sighting> {
+    fn heeded_told(&mut self, described: ServerInPacket, now: Instant) -> Option<Sighting> {
+        let ServerInPacket {
+            announcement,
+            aside,
+            has_texts,
+        } = described;
         let heeded = self.heeded.as_mut()?;
-        if !same_place(&heeded.url, &announcement.url) {
+        if !has_texts || !same_place(&heeded.url, &announcement.url) {
             return None;
         }
         let last = heeded
@@ -200,22 +220,42 @@ fn is_to_be_told(from_port: u16, servers: usize) -> bool {
     from_port != MDNS_PORT || u32::try_from(servers).is_ok_and(|few| few <= SERVERS_AT_FULL_RATE)
 }
 
-/// Returns the announcement of a server whose records are all in one packet, as in announcements.
+/// The announcement of a server in one packet.
+struct ServerInPacket {
+    announcement: AnnouncedServer,
+    aside: Aside,
+    /// Whether the packet has the texts of the server, which complete its URL.
+    has_texts: bool,
+}
+
+/// Returns the announcement of a server by the records in one packet. The address is that of the
+/// sender if the packet has none of the host: some programs announce their addresses apart.
 fn described(
-    packet: DnsPacket<'_>,
+    (packet, sender): (DnsPacket<'_>, Ipv4Addr),
     server: &DnsRecord<'_>,
     subnets: &Subnets,
-) -> Option<(AnnouncedServer, Aside)> {
+) -> Option<ServerInPacket> {
     let (port, host) = server.server()?;
+    let valid = || packet.records().filter(|record| !record.is_withdrawn);
     let is_text = |record: &DnsRecord<'_>| record.is_text() && record.owner.is_same(server.owner);
-    let texts = packet.records().find(is_text)?;
-    let of_host = packet.records().filter(|record| record.owner.is_same(host));
+    let texts = valid().find(is_text);
+    let of_host = valid().filter(|record| record.owner.is_same(host));
+    let mut addresses: Vec<_> = of_host.filter_map(|record| record.address()).collect();
+    if addresses.is_empty() {
+        addresses.push(sender);
+    }
     let records = ServerRecords {
         instance: instance_of(server.owner)?,
-        addresses: of_host.filter_map(|record| record.address()).collect(),
+        addresses,
         port,
     };
-    records.announcement(|key| texts.text(key), subnets)
+    let text = |key: &str| texts.and_then(|texts| texts.text(key));
+    let (announcement, aside) = records.announcement(text, subnets)?;
+    Some(ServerInPacket {
+        announcement,
+        aside,
+        has_texts: texts.is_some(),
+    })
 }
 
 fn hash(label: &[u8]) -> u64 {

@@ -24,20 +24,44 @@ pub(crate) struct OwnServers {
     monitor: Option<Receiver<DaemonEvent>>,
     ours: BTreeMap<String, Announced>,
     announce_at: Instant,
+    /// The time of the last repetition of the announcements.
+    announced_at: Option<Instant>,
 }
 
 #[derive(Debug)]
 struct Announced {
     ours: OwnAnnouncement,
+    /// `None` while the server listens on no address of the interface.
+    sent: Option<SentRecords>,
+    /// Number of announcements of another server under this name that had to give way.
+    contested: u32,
+    /// The time of the last of them.
+    contested_at: Option<Instant>,
+}
+
+/// The records of an announcement.
+#[derive(Debug)]
+struct SentRecords {
     fullname: String,
     /// The URL in the received announcement: with an address in place of a host name.
     place: String,
     /// The host name of the announcement, which is unique.
     host: String,
-    /// Number of announcements of another server under this name that had to give way.
-    contested: u32,
-    /// The time of the last of them.
-    contested_at: Option<Instant>,
+}
+
+impl SentRecords {
+    fn of(info: &ServiceInfo, ours: &OwnAnnouncement, subnets: &Subnets) -> Self {
+        let place = heard(&info.clone().as_resolved_service(), subnets);
+        let place = place.map_or_else(
+            || ours.announcement.url.clone(),
+            |(announcement, _)| announcement.url,
+        );
+        Self {
+            fullname: info.get_fullname().to_owned(),
+            place,
+            host: info.get_hostname().to_owned(),
+        }
+    }
 }
 
 impl OwnServers {
@@ -53,6 +77,7 @@ impl OwnServers {
             monitor,
             ours: BTreeMap::new(),
             announce_at: Instant::now() + ANNOUNCE_EVERY,
+            announced_at: None,
         })
     }
 
@@ -64,33 +89,30 @@ impl OwnServers {
         &self.daemon
     }
 
-    /// Announces a server at once, in place of the previous announcement of its name.
+    /// Announces a server at once, in place of the previous announcement of its name; or as soon as
+    /// the interface has its address.
     pub(crate) fn put(&mut self, ours: OwnAnnouncement, subnets: &Subnets) {
-        let Some(info) = self.info(&ours) else {
+        let info = self.info(&ours);
+        if info.is_none() {
             warn!(
                 name = ours.announcement.instance,
                 url = ours.announcement.url,
                 "cannot announce a server on {}: it does not listen on an address of this interface, or its host name belongs to another host",
                 self.interface
             );
-            return;
-        };
-        let fullname = info.get_fullname().to_owned();
-        let place = heard(&info.clone().as_resolved_service(), subnets);
-        let place = place.map_or_else(
-            || ours.announcement.url.clone(),
-            |(announcement, _)| announcement.url,
-        );
+        }
+        let instance = ours.announcement.instance.clone();
         let announced = Announced {
-            fullname,
-            place,
-            host: info.get_hostname().to_owned(),
+            sent: info
+                .as_ref()
+                .map(|info| SentRecords::of(info, &ours, subnets)),
             contested: 0,
             contested_at: None,
             ours,
         };
-        self.register(info);
-        let instance = announced.ours.announcement.instance.clone();
+        if let Some(info) = info {
+            self.register(info);
+        }
         self.ours.insert(instance, announced);
     }
 
@@ -99,8 +121,8 @@ impl OwnServers {
         &mut self,
         instance: &str,
     ) -> Option<impl Future<Output = ()> + Send + use<>> {
-        let announced = self.ours.remove(instance)?;
-        let told = self.daemon.unregister(&announced.fullname).ok()?;
+        let sent = self.ours.remove(instance)?.sent?;
+        let told = self.daemon.unregister(&sent.fullname).ok()?;
         Some(async move {
             // An error is the end of the daemon, which sends all goodbyes.
             let _told = told.recv_async().await;
@@ -109,19 +131,28 @@ impl OwnServers {
 
     /// Returns whether this program announces a name.
     pub(crate) fn has(&self, instance: &str) -> bool {
-        self.ours.contains_key(instance)
+        self.sent(instance).is_some()
     }
 
     /// Returns the URL in the announcement of a name of this program.
     pub(crate) fn place(&self, instance: &str) -> Option<&str> {
-        Some(&self.ours.get(instance)?.place)
+        Some(&self.sent(instance)?.place)
     }
 
     /// Returns the port and the host name in the announcement of a name of this program.
     pub(crate) fn host(&self, instance: &str) -> Option<(u16, &str)> {
         let announced = self.ours.get(instance)?;
         let port = Url::parse(&announced.ours.announcement.url)?.port;
-        Some((port, &announced.host))
+        Some((port, &announced.sent.as_ref()?.host))
+    }
+
+    /// Returns the names of this program.
+    pub(crate) fn names(&self) -> impl Iterator<Item = &str> {
+        self.ours.keys().map(String::as_str)
+    }
+
+    fn sent(&self, instance: &str) -> Option<&SentRecords> {
+        self.ours.get(instance)?.sent.as_ref()
     }
 
     /// Returns the time of the next announcement.
@@ -130,24 +161,29 @@ impl OwnServers {
     }
 
     /// Plans an announcement for a new or changed server, which is not one for each of many servers
-    /// that appear together.
+    /// that appear together. Any host can pretend to be a new server, so announcements are not
+    /// repeated more often than usual.
     pub(crate) fn announce_soon(&mut self, servers: usize) {
-        let settled = Instant::now() + shared(SETTLE..=SETTLE_LATE, servers);
-        self.announce_at = self.announce_at.min(settled);
+        let now = Instant::now();
+        self.announce_at = self.announce_at.min(soon(now, self.announced_at, servers));
     }
 
     /// Repeats the announcements, and plans the next. A late starter that sends its query from
     /// another port than that of mDNS gets the response at that port. Some programs do not listen
     /// there, and need announcements without a query.
-    pub(crate) fn announce_again(&mut self, servers: usize) {
-        self.announce_at = Instant::now() + shared(ANNOUNCE_EVERY..=ANNOUNCE_SELDOM, servers);
+    pub(crate) fn announce_again(&mut self, servers: usize, subnets: &Subnets) {
+        let now = Instant::now();
+        self.announced_at = Some(now);
+        self.announce_at = now + shared(ANNOUNCE_EVERY..=ANNOUNCE_SELDOM, servers);
         self.follow_renames();
-        let infos: Vec<ServiceInfo> = self
-            .ours
-            .values()
-            .filter_map(|ours| self.info(&ours.ours))
-            .collect();
-        for info in infos {
+        let infos = self.ours.iter().filter_map(|(instance, announced)| {
+            Some((instance.clone(), self.info(&announced.ours)?))
+        });
+        for (instance, info) in infos.collect::<Vec<_>>() {
+            if let Some(announced) = self.ours.get_mut(&instance) {
+                // The address of the interface may have changed.
+                announced.sent = Some(SentRecords::of(&info, &announced.ours, subnets));
+            }
             self.register(info);
         }
     }
@@ -185,7 +221,7 @@ impl OwnServers {
     ) -> Option<MdnsEvent> {
         let now = Instant::now();
         let announced = self.ours.get_mut(from)?;
-        let first = *announced.place < *theirs;
+        let first = *announced.sent.as_ref()?.place < *theirs;
         let answered = announced.contested_at.map(|at| at + CONTEST_AGAIN);
         if first && answered.is_some_and(|until| now < until) {
             // An announcement that was sent before the answer of this program.
@@ -269,8 +305,8 @@ impl OwnServers {
 
 impl Drop for OwnServers {
     fn drop(&mut self) {
-        for announced in self.ours.values() {
-            drop(self.daemon.unregister(&announced.fullname));
+        for sent in self.ours.values().filter_map(|ours| ours.sent.as_ref()) {
+            drop(self.daemon.unregister(&sent.fullname));
         }
         // The thread ends in any case: it has no more senders of commands.
         drop(self.daemon.shutdown());
@@ -284,6 +320,12 @@ pub(crate) fn shared(range: RangeInclusive<Duration>, servers: usize) -> Duratio
     let servers = u32::try_from(servers).unwrap_or(u32::MAX);
     let wanted = least.saturating_mul(servers) / SERVERS_AT_FULL_RATE;
     wanted.clamp(least, most)
+}
+
+/// Returns the time of the next announcement for a new server, after the last announcement.
+fn soon(now: Instant, last: Option<Instant>, servers: usize) -> Instant {
+    let settled = now + shared(SETTLE..=SETTLE_LATE, servers);
+    last.map_or(settled, |last| settled.max(last + ANNOUNCE_EVERY))
 }
 
 pub(crate) const ANNOUNCE_EVERY: Duration = Duration::from_secs(5);
@@ -308,6 +350,14 @@ mod tests {
         assert_eq!([0, 8, 100].map(soon), [ms(200), ms(200), ms(2_500)]);
         // Invented servers do not silence this program.
         assert_eq!(soon(usize::MAX), SETTLE_LATE);
+        let now = Instant::now();
+        let after = |ago| super::soon(now, Some(now - ms(ago)), 1) - now;
+        assert_eq!(super::soon(now, None, 1) - now, SETTLE);
+        // Many queries of a host do not cause many announcements.
+        assert_eq!(
+            [0, 4_000, 10_000].map(after),
+            [ms(5_000), ms(1_000), SETTLE]
+        );
         let again = |servers| shared(ANNOUNCE_EVERY..=ANNOUNCE_SELDOM, servers);
         assert_eq!([1, 100].map(again), [ms(5_000), ms(60_000)]);
     }

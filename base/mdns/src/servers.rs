@@ -127,7 +127,8 @@ impl Mdns {
                 () = sleep_until(wake_at) => {
                     if Instant::now() >= announce_at {
                         self.group.reopen();
-                        self.ours.announce_again(self.there.len());
+                        self.read_subnets();
+                        self.ours.announce_again(self.there.len(), &self.subnets.0);
                     }
                     continue;
                 }

@@ -36,7 +36,7 @@ pub struct AnnounceSettings {
     /// The interface for mDNS; `None` for no mDNS announcement by the program. The Local Discovery
     /// Server is then asked to announce the server.
     pub mdns: Option<MdnsInterface>,
-    /// The interval of registrations; at most ten seconds without mDNS.
+    /// The interval of registrations; at most ten seconds while no mDNS packets are received.
     pub register_every: Duration,
     /// The certificate store of the server, which contains its certificate and key. The server
     /// registers over a secured channel if the discovery server offers such a channel and is
@@ -139,15 +139,6 @@ pub fn announce(
 ) -> Result<ServerAnnouncement, MdnsFault> {
     let mdns = settings.mdns.as_ref().map(MdnsAnnouncer::open);
     let mdns = mdns.transpose()?;
-    let register_every = match mdns {
-        Some(_) => settings.register_every,
-        // Without mDNS the restart of a discovery server is not noticed.
-        None => settings.register_every.min(MOST_UNHEARD),
-    };
-    let settings = AnnounceSettings {
-        register_every,
-        ..settings
-    };
     let (settings, found) = found(settings)?;
     let (sender, changes) = watch::channel(server);
     let (tell, state) = watch::channel(AnnounceState::default());
@@ -201,7 +192,7 @@ fn found(settings: AnnounceSettings) -> Result<(AnnounceSettings, Looked), MdnsF
 struct Telling {
     settings: AnnounceSettings,
     /// Discovers no servers: hundreds of programs that only announce themselves may be on a
-    /// network.
+    /// network. A search for the discovery server by mDNS is in [`found`](Self::found).
     mdns: Option<MdnsAnnouncer>,
     /// The discovery server found by mDNS, if it is selected by a choice.
     found: Looked,
@@ -210,8 +201,8 @@ struct Telling {
     start_time: i64,
     /// The mDNS instance name.
     instance: Option<String>,
-    /// The start time of the discovery server in its last announcement, which identifies its run.
-    lds_run: Option<Option<i64>>,
+    /// The last announced run of the discovery server.
+    lds_run: Option<AnnouncedRun>,
     register_at: Instant,
     wait: Duration,
     /// The embedded discovery server.
@@ -224,6 +215,15 @@ struct Telling {
     look_from: Instant,
     /// The delay of that connection after the loss of the previous connection.
     look_wait: Duration,
+}
+
+/// A run of a discovery server.
+#[derive(Debug, PartialEq, Eq)]
+enum AnnouncedRun {
+    /// It was announced, with its start time if it is known.
+    Started(Option<i64>),
+    /// It said goodbye, so the next announcement is that of another run.
+    Ended,
 }
 
 type Registering = Pin<Box<dyn Future<Output = Result<Done, DiscoveryQueryFault>> + Send>>;
@@ -354,14 +354,15 @@ impl Telling {
                 let lds = self.settings.lds.as_deref();
                 if lds.is_some_and(|lds| same_place(lds, &announcement.url)) {
                     // A discovery server that started or restarted has no registrations yet.
-                    let before = self.lds_run.replace(start_time);
+                    let before = self.lds_run.replace(AnnouncedRun::Started(start_time));
                     let is_registered = self.state.borrow().registered.is_some();
-                    if !is_registered || before.is_some_and(|before| before != start_time) {
+                    if !is_registered || before.is_some_and(|before| Some(before) != self.lds_run) {
                         self.soon();
                     }
                 }
             }
-            MdnsEvent::Withdrawn { .. } => {}
+            // Only the goodbyes of the discovery server are reported.
+            MdnsEvent::Withdrawn { .. } => self.lds_run = Some(AnnouncedRun::Ended),
         }
     }
 
@@ -459,6 +460,17 @@ impl Telling {
         }
     }
 
+    /// Returns the interval of registrations. Without mDNS packets the restart of a discovery server
+    /// is not noticed.
+    fn register_every(&self) -> Duration {
+        let every = self.settings.register_every;
+        if self.mdns.as_ref().is_some_and(MdnsAnnouncer::receives) {
+            every
+        } else {
+            every.min(MOST_UNHEARD)
+        }
+    }
+
     fn registered(&mut self, result: Result<Done, DiscoveryQueryFault>) {
         let lds = self.settings.lds.as_deref().unwrap_or_default();
         match result {
@@ -473,7 +485,7 @@ impl Telling {
                 if let Some(registrar) = registrar {
                     self.settings.supervision.registered_with(registrar);
                 }
-                self.register_at = Instant::now() + self.settings.register_every;
+                self.register_at = Instant::now() + self.register_every();
                 self.wait = FIRST_WAIT;
                 self.state.send_modify(|state| {
                     if state.registered.is_none() {
@@ -494,7 +506,7 @@ impl Telling {
                 // Including the share of `spread`, the wait stays below its limit.
                 self.wait = (self.wait * 2)
                     .min(MOST_WAIT / 2)
-                    .min(self.settings.register_every / 2);
+                    .min(self.register_every() / 2);
                 let fault = error.to_string();
                 self.state.send_modify(|state| {
                     state.registered = None;

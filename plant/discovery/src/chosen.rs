@@ -23,7 +23,8 @@ pub trait Marks: Send + Sync + 'static {
 }
 
 /// Follows the chosen discovery server of a network while the receiver exists. The value is `None`
-/// while no discovery server fits, or while several fit, which is logged.
+/// while no discovery server fits, or while several fit, which is logged. The search browses the
+/// announcements of all servers by mDNS, beside the announcement of the program itself.
 ///
 /// # Errors
 /// Returns an error if the mDNS daemon cannot be started.

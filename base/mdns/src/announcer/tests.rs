@@ -2,7 +2,7 @@ use registry::AnnouncedServer;
 use tokio::time::timeout;
 
 use super::*;
-use crate::announcement::Aside;
+use crate::announcement::{Aside, SERVICE};
 use crate::packet::DnsPacket;
 use crate::servers::Mdns;
 
@@ -24,36 +24,61 @@ fn own(instance: &str, url: &str) -> OwnAnnouncement {
     }
 }
 
-/// Returns the number of queries on the network until there were `wanted` responses.
-async fn queries(mut group: GroupSocket, wanted: usize) -> usize {
-    let (mut queries, mut responses) = (0, 0);
+/// Returns the names in queries on the network until there were `wanted` responses.
+async fn asked(mut group: GroupSocket, wanted: usize) -> Vec<String> {
+    let (mut asked, mut responses) = (Vec::new(), 0);
     let counting = async {
         while responses < wanted {
             let (packet, _) = group.recv().await;
-            if DnsPacket::new(packet).unwrap().is_response() {
+            let packet = DnsPacket::new(packet).unwrap();
+            if packet.is_response() {
                 responses += 1;
             } else {
-                queries += 1;
+                asked.extend(packet.questions().map(|name| name.text().unwrap()));
             }
         }
     };
     timeout(LIMIT, counting).await.unwrap();
-    queries
+    asked
 }
 
 #[tokio::test]
-async fn a_program_that_only_announces_sends_no_query() {
+async fn a_program_that_only_announces_asks_for_its_own_name_and_for_no_others() {
     let interface = MdnsInterface::LOOPBACK;
     let port = port(0);
     let group = GroupSocket::open(&interface, port);
     let mut announcer = MdnsAnnouncer::open_at(&interface, port).unwrap();
     announcer.put(own("arm", "opc.tcp://127.0.0.1:1001/"));
-    // The second announcement follows after a second.
-    assert_eq!(queries(group, 2).await, 0);
+    // Two announcements at the start, and their repetition.
+    let seen = tokio::select! {
+        seen = asked(group, 3) => seen,
+        event = announcer.next() => panic!("{event:?}"),
+    };
+    assert_eq!(seen, ["arm._opcua-tcp._tcp.local."; 2]);
     let group = GroupSocket::open(&interface, port);
     let _browser = Mdns::open_at(&interface, port).unwrap();
-    assert!(queries(group, 1).await > 0, "a browser does");
+    let seen = asked(group, 1).await;
+    assert!(seen.contains(&SERVICE.to_owned()), "{seen:?}");
     drop(announcer);
+}
+
+#[tokio::test]
+async fn a_server_that_announced_its_name_before_is_noticed() {
+    let interface = MdnsInterface::LOOPBACK;
+    let port = port(2);
+    let group = GroupSocket::open(&interface, port);
+    let mut before = OwnServers::open(&interface, port).unwrap();
+    before.put(
+        own("arm", "opc.tcp://127.0.0.1:1001/"),
+        &interface.subnets(),
+    );
+    // Both announcements of a responder that does not repeat them.
+    assert!(asked(group, 2).await.is_empty());
+    let mut announcer = MdnsAnnouncer::open_at(&interface, port).unwrap();
+    announcer.put(own("arm", "opc.tcp://127.0.0.1:1002/"));
+    let event = timeout(LIMIT, announcer.next()).await.unwrap();
+    let (from, to) = ("arm".to_owned(), "arm (2)".to_owned());
+    assert_eq!(event, MdnsEvent::Renamed { from, to });
 }
 
 #[tokio::test]

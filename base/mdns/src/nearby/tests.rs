@@ -25,6 +25,14 @@ fn record(owner: &[u8], kind: u8, lifetime: u8, data: &[u8]) -> Vec<u8> {
     [owner, &[0, kind, 0, 1, 0, 0, 0, lifetime], &length, data].concat()
 }
 
+/// Returns the SRV record of a server.
+fn server((instance, port, host): (&str, u16, &str)) -> Vec<u8> {
+    let instance = name(&[instance, "_opcua-tcp", "_tcp", "local"]);
+    let host = name(&[host.trim_end_matches(".local."), "local"]);
+    let server = [&[0, 0, 0, 0][..], &port.to_be_bytes(), &host].concat();
+    record(&instance, 33, 120, &server)
+}
+
 /// Returns the announcement of a server of the host 10.0.0.7, or its goodbye.
 fn announced((instance, port, host): (&str, u16, &str), start: &str, lifetime: u8) -> Vec<u8> {
     let instance = name(&[instance, "_opcua-tcp", "_tcp", "local"]);
@@ -151,6 +159,53 @@ fn another_server_with_the_name_of_this_program_is_a_rival() {
 }
 
 #[test]
+fn a_rival_that_announces_its_address_apart_is_at_the_address_of_the_sender() {
+    let mut program = Program::new();
+    let header = |records: u8| vec![0, 0, 0x84, 0, 0, 0, 0, records, 0, 0, 0, 0];
+    let url = |sightings: Vec<Sighting>| match &sightings[..] {
+        [Sighting::Rival { announcement }] => announcement.url.clone(),
+        _ => panic!("{sightings:?}"),
+    };
+    let other = (OWN.0, 4842, "other.local.");
+    let alone = [header(1), server(other)].concat();
+    assert_eq!(
+        url(program.take(&alone, MDNS_PORT)),
+        "opc.tcp://10.0.0.9:4842"
+    );
+    // A withdrawn address is not that of the server.
+    let host = name(&["other", "local"]);
+    let withdrawn = record(&host, 1, 0, &[10, 0, 0, 8]);
+    let packet = [header(2), server(other), withdrawn].concat();
+    assert_eq!(
+        url(program.take(&packet, MDNS_PORT)),
+        "opc.tcp://10.0.0.9:4842"
+    );
+    let address = record(&host, 1, 120, &[10, 0, 0, 8]);
+    let packet = [header(2), server(other), address].concat();
+    assert_eq!(
+        url(program.take(&packet, MDNS_PORT)),
+        "opc.tcp://10.0.0.8:4842"
+    );
+}
+
+#[test]
+fn packets_of_hosts_outside_the_subnets_are_ignored() {
+    let mut program = Program::new();
+    let packet = announced(("device", 4842, "device"), "1", 120);
+    let outside = SocketAddr::from(([10, 0, 1, 9], 40_000));
+    let none = |_: &str| None;
+    for packet in [&packet, &query()] {
+        let seen = program
+            .nearby
+            .take((packet, outside), none, &network(), program.now);
+        assert_eq!(seen, []);
+    }
+    assert!(!program.nearby.knows("device"));
+    program.take(&packet, MDNS_PORT);
+    assert!(program.nearby.knows("Device"));
+}
+
+#[test]
 fn the_discovery_server_is_reported_once_for_each_run() {
     let mut program = Program::new();
     program.nearby.heed(Some("opc.tcp://10.0.0.7:4840"));
@@ -159,7 +214,7 @@ fn the_discovery_server_is_reported_once_for_each_run() {
         let seen = program.take(&announced(lds, start, 120), MDNS_PORT);
         let heeded = seen.iter().find_map(|sighting| match sighting {
             Sighting::Heeded { aside, .. } => Some(aside.start_time),
-            Sighting::Rival { .. } | Sighting::Newcomer => None,
+            Sighting::Left { .. } | Sighting::Rival { .. } | Sighting::Newcomer => None,
         });
         heeded.map(Option::unwrap)
     };
@@ -167,7 +222,9 @@ fn the_discovery_server_is_reported_once_for_each_run() {
     assert_eq!(started(&mut program, "1"), None);
     assert_eq!(started(&mut program, "2"), Some(2));
     // It is another run, even with the same start time, as of a server without a clock.
-    program.take(&announced(lds, "2", 0), MDNS_PORT);
+    let left = program.take(&announced(lds, "2", 0), MDNS_PORT);
+    let instance = lds.0.to_owned();
+    assert_eq!(left, [Sighting::Left { instance }]);
     assert_eq!(started(&mut program, "2"), Some(2));
     program.now += VALID;
     assert_eq!(started(&mut program, "2"), Some(2));
