@@ -81,8 +81,8 @@ impl MdnsAnnouncer {
         self.group.is_open()
     }
 
-    /// Returns the next event: an announcement or a goodbye of the [heeded](Self::heed) server, or a
-    /// change of an own name. Cancel-safe.
+    /// Returns the next event: an announcement or a goodbye of the [heeded](Self::heed) server, or
+    /// a change of an own name. Cancel-safe.
     pub async fn next(&mut self) -> MdnsEvent {
         loop {
             if let Some(event) = self.events.pop_front() {

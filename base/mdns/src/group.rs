@@ -131,7 +131,8 @@ fn listen(addresses: &[Ipv4Addr], port: u16) -> std::io::Result<UdpSocket> {
     UdpSocket::from_std(socket.into())
 }
 
-/// Joins the group on the interfaces with these addresses, and sends from one of them. Fails if no interface has joined.
+/// Joins the group on the interfaces with these addresses, and sends from one of them. Fails if no
+/// interface has joined.
 fn join(socket: &Socket, addresses: &[Ipv4Addr]) -> std::io::Result<()> {
     let none = std::io::Error::other("the interface has no IPv4 address");
     let mut result = Err(none);

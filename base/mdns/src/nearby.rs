@@ -83,8 +83,8 @@ impl NearbyServers {
             .retain(|_, at| now.saturating_duration_since(*at) < VALID);
     }
 
-    /// Reads a packet of a host in the subnets. `own` returns the port and the host name in the announcement of a name of
-    /// this program.
+    /// Reads a packet of a host in the subnets. `own` returns the port and the host name in the
+    /// announcement of a name of this program.
     pub(crate) fn take<'o>(
         &mut self,
         (packet, from): (&[u8], SocketAddr),

@@ -192,7 +192,7 @@ fn found(settings: AnnounceSettings) -> Result<(AnnounceSettings, Looked), MdnsF
 struct Telling {
     settings: AnnounceSettings,
     /// Discovers no servers: hundreds of programs that only announce themselves may be on a
-    /// network. A search for the discovery server by mDNS is in [`found`](Self::found).
+    /// network. A search for a discovery server by mDNS browses besides.
     mdns: Option<MdnsAnnouncer>,
     /// The discovery server found by mDNS, if it is selected by a choice.
     found: Looked,
@@ -460,8 +460,8 @@ impl Telling {
         }
     }
 
-    /// Returns the interval of registrations. Without mDNS packets the restart of a discovery server
-    /// is not noticed.
+    /// Returns the interval of registrations. Without mDNS packets the restart of a discovery
+    /// server is not noticed.
     fn register_every(&self) -> Duration {
         let every = self.settings.register_every;
         if self.mdns.as_ref().is_some_and(MdnsAnnouncer::receives) {
@@ -591,6 +591,73 @@ mod tests {
         assert_eq!(AnnounceSettings::registering(None).lds, None);
         assert!(same_port(elsewhere, "opc.tcp://10.0.0.2:4841/server"));
         assert!(!same_port(elsewhere, "opc.tcp://10.0.0.2:4840/server"));
+    }
+
+    /// Returns the announcement of a server that is registered with a discovery server.
+    fn registered(lds: &str) -> Telling {
+        let server = ServerDescription {
+            application_uri: "urn:arm".to_owned(),
+            product_uri: String::new(),
+            name: "arm".to_owned(),
+            url: "opc.tcp://127.0.0.1:43121/".to_owned(),
+            capabilities: Vec::new(),
+            number: None,
+        };
+        let state = AnnounceState {
+            registered: Some(clock::wall()),
+            ..AnnounceState::default()
+        };
+        Telling {
+            settings: AnnounceSettings::registering(Some(lds)),
+            mdns: None,
+            found: None,
+            server: watch::channel(server).1,
+            state: watch::channel(state).0,
+            start_time: 0,
+            instance: None,
+            lds_run: None,
+            register_at: Instant::now() + MOST_WAIT,
+            wait: FIRST_WAIT,
+            here: None,
+            there: None,
+            look_from: Instant::now(),
+            look_wait: FIRST_WAIT,
+        }
+    }
+
+    #[test]
+    fn a_server_registers_again_when_its_discovery_server_starts_again() {
+        let lds = "opc.tcp://127.0.0.1:4840/";
+        let instance = || "lds".to_owned();
+        let started = |start_time| MdnsEvent::Announced {
+            announcement: AnnouncedServer {
+                instance: instance(),
+                url: lds.to_owned(),
+                capabilities: Vec::new(),
+            },
+            aside: Aside {
+                start_time,
+                number: None,
+            },
+        };
+        let mut telling = registered(lds);
+        let mut registers = |event| {
+            telling.register_at = Instant::now() + MOST_WAIT;
+            telling.hear(event);
+            telling.register_at <= Instant::now()
+        };
+        assert!(!registers(started(None)));
+        assert!(!registers(started(None)), "with other capabilities");
+        let left = MdnsEvent::Withdrawn {
+            instance: instance(),
+        };
+        assert!(!registers(left));
+        assert!(registers(started(None)), "another run without a start time");
+        assert!(registers(started(Some(1))));
+        assert!(!registers(started(Some(1))));
+        assert!(registers(started(Some(2))));
+        // Without mDNS packets, the server does not wait for such an announcement.
+        assert_eq!(telling.register_every(), MOST_UNHEARD);
     }
 
     #[test]

@@ -3,7 +3,8 @@ use super::*;
 #[tokio::test]
 async fn of_two_servers_with_one_name_one_is_called_otherwise() {
     // On a port of its own, so that no other program on this host takes part.
-    let port = 20_000 + u16::try_from(std::process::id() % 20_000).unwrap();
+    // The tests of announcers use higher ports.
+    let port = 10_000 + u16::try_from(std::process::id() % 10_000).unwrap();
     let open = |url: &str| {
         let mut mdns = Mdns::open_at(&MdnsInterface::LOOPBACK, port).unwrap();
         mdns.put(OwnAnnouncement {
