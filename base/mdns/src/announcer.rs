@@ -175,22 +175,32 @@ impl MdnsAnnouncer {
                 aside,
             }),
             Sighting::Rival { announcement } => {
-                let (from, theirs) = (&*announcement.instance, &*announcement.url);
-                if same_place(self.ours.place(from)?, theirs) {
-                    return None;
-                }
-                let nearby = &self.nearby;
-                let is_taken = |name: &str| nearby.knows(name);
-                let event = self
-                    .ours
-                    .conflict((from, theirs), &self.subnets.0, is_taken)?;
-                if let MdnsEvent::Renamed { from, to } = &event {
-                    self.queries.retain(|query| query.instance != *from);
-                    self.plan_queries(to);
-                }
-                Some(event)
+                self.resolve(&announcement.instance, &announcement.url)
             }
         }
+    }
+
+    /// Resolves a conflict for a name of this program with the server at another URL.
+    fn resolve(&mut self, from: &str, theirs: &str) -> Option<MdnsEvent> {
+        if same_place(self.ours.place(from)?, theirs) {
+            return None;
+        }
+        let nearby = &self.nearby;
+        let is_taken = |name: &str| nearby.knows(name);
+        let event = self
+            .ours
+            .conflict((from, theirs), &self.subnets.0, is_taken);
+        if let Some(MdnsEvent::Renamed { to, .. }) = &event {
+            self.queries.retain(|query| query.instance != from);
+            self.plan_queries(to);
+        } else if !self.queries.iter().any(|query| query.instance == from) {
+            // The other program has to give way, and may not announce whether it does.
+            self.queries.push(PlannedQuery {
+                instance: from.to_owned(),
+                at: Instant::now() + ASK_AGAIN,
+            });
+        }
+        event
     }
 }
 

@@ -62,23 +62,30 @@ async fn a_program_that_only_announces_asks_for_its_own_name_and_for_no_others()
     drop(announcer);
 }
 
-#[tokio::test]
-async fn a_server_that_announced_its_name_before_is_noticed() {
+/// Returns the event of a program at port 1002 whose name was announced before with this URL, by a
+/// responder that repeats and changes nothing.
+async fn announced_before(url: &str, port: u16) -> MdnsEvent {
     let interface = MdnsInterface::LOOPBACK;
-    let port = port(2);
     let group = GroupSocket::open(&interface, port);
     let mut before = OwnServers::open(&interface, port).unwrap();
-    before.put(
-        own("arm", "opc.tcp://127.0.0.1:1001/"),
-        &interface.subnets(),
-    );
-    // Both announcements of a responder that does not repeat them.
+    before.put(own("arm", url), &interface.subnets());
     assert!(asked(group, 2).await.is_empty());
     let mut announcer = MdnsAnnouncer::open_at(&interface, port).unwrap();
     announcer.put(own("arm", "opc.tcp://127.0.0.1:1002/"));
-    let event = timeout(LIMIT, announcer.next()).await.unwrap();
-    let (from, to) = ("arm".to_owned(), "arm (2)".to_owned());
-    assert_eq!(event, MdnsEvent::Renamed { from, to });
+    timeout(LIMIT, announcer.next()).await.unwrap()
+}
+
+#[tokio::test]
+async fn a_server_that_announced_its_name_before_and_does_not_give_way_keeps_it() {
+    let renamed = MdnsEvent::Renamed {
+        from: "arm".to_owned(),
+        to: "arm (2)".to_owned(),
+    };
+    let (first, later) = tokio::join!(
+        announced_before("opc.tcp://127.0.0.1:1001/", port(2)),
+        announced_before("opc.tcp://127.0.0.1:1003/", port(3)),
+    );
+    assert_eq!([first, later], [renamed.clone(), renamed]);
 }
 
 #[tokio::test]
