@@ -166,9 +166,10 @@ fn in_order<'a>(
 ) -> Result<Vec<Positioned<'a>>, ProcessFault> {
     let mut ordered: Vec<Positioned<'_>> = Vec::new();
     for (part, rows) in by_part {
-        let position = one(&rows, "position")?.and_then(Value::as_i64);
-        let position = position.ok_or(StatementFault::Missing("number as its ua:position"));
-        let position = position.map_err(ProcessFault::of("step", part))?;
+        let missing = StatementFault::Missing("number as its ua:position");
+        let position = one(&rows, "position")
+            .and_then(|value| value.and_then(Value::as_i64).ok_or(missing))
+            .map_err(ProcessFault::of("step", part))?;
         ordered.push((position, part, rows));
     }
     ordered.sort_by_key(|(position, ..)| *position);
