@@ -4,6 +4,7 @@ mod error;
 mod graph_reader;
 mod registry;
 
+use std::collections::HashSet;
 use std::net::{IpAddr, SocketAddr};
 use std::sync::atomic::{AtomicI32, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
@@ -97,6 +98,7 @@ impl Node {
             clock: Ros1Clock::default(),
             clock_feed: Mutex::default(),
             registry: Mutex::default(),
+            renewed: Mutex::default(),
             changed: Notify::new(),
             master_state: watch::Sender::new(MasterState::Awaited),
             shutdown: watch::Sender::new(None),
@@ -379,6 +381,8 @@ pub(crate) struct Inner {
     /// The subscription to `/clock` while time is simulated.
     clock_feed: Mutex<Option<Arc<TopicFeed>>>,
     registry: Mutex<Registry>,
+    /// Published topics that are to be registered once more.
+    renewed: Mutex<HashSet<String>>,
     /// Notifies that the registry differs from the state of the master.
     pub(crate) changed: Notify,
     pub(crate) master_state: watch::Sender<MasterState>,
@@ -541,6 +545,18 @@ impl Inner {
         }
         drop(registry);
         self.changed.notify_one();
+    }
+
+    /// Registers a published topic once more, so that the master sends its publishers to all
+    /// subscribers: a subscriber of rospy does not connect again by itself.
+    pub(crate) fn renew_publication(&self, topic: &str) {
+        lock(&self.renewed).insert(topic.to_owned());
+        self.changed.notify_one();
+    }
+
+    /// Takes the published topics that are to be registered once more.
+    pub(crate) fn take_renewed(&self) -> HashSet<String> {
+        std::mem::take(&mut *lock(&self.renewed))
     }
 
     /// Returns all registrations that the master should have.

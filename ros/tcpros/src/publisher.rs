@@ -150,9 +150,7 @@ impl Publisher {
 
     /// Returns whether the node of this resolved name is connected and not cut off.
     pub fn is_subscribed_by(&self, node: &str) -> bool {
-        let state = lock(&self.hub.state);
-        let mut subscribers = state.subscribers.iter();
-        subscribers.any(|s| s.caller_id == node && !s.is_cut_off())
+        self.hub.is_subscribed_by(node)
     }
 
     /// Returns whether the node of this resolved name requested the topic without TCPROS among its
@@ -345,6 +343,13 @@ impl PublishedTopic {
     fn note_cut_off(&self, count: impl TryInto<u64>) {
         let count = count.try_into().unwrap_or(u64::MAX);
         self.cut_off.fetch_add(count, Ordering::Relaxed);
+    }
+
+    /// Returns whether the node of this resolved name is connected and not cut off.
+    pub(crate) fn is_subscribed_by(&self, node: &str) -> bool {
+        let state = lock(&self.state);
+        let mut subscribers = state.subscribers.iter();
+        subscribers.any(|s| s.caller_id == node && !s.is_cut_off())
     }
 
     /// Adds a subscriber; its queue starts with the latched messages. Returns `None` if the topic

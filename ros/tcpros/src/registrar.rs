@@ -275,6 +275,11 @@ impl Registrar {
                 })
             });
         }
+        for topic in self.node.take_renewed() {
+            if let Some(told) = self.told.get_mut(&(topic, ResourceKind::Published)) {
+                told.confirmed = false;
+            }
+        }
         let mut gone = self.told.clone();
         let mut jobs = Vec::new();
         for registration in wanted {

@@ -93,8 +93,37 @@ async fn serve_one(mut stream: TcpStream, node: &Inner, settled: &Settled) -> Re
     };
     let dropped = subscriber.outbox.dropped();
     events::subscriber_left(&joined.hub.topic, &subscriber.caller_id, dropped, &ended);
+    if matches!(ended, ConnectionEnd::CutOff) {
+        drop(stream);
+        call_back(joined, node).await;
+    }
     Ok(())
 }
+
+/// Has the master call a subscriber whose connection was reset: one of roscpp connects again by
+/// itself, one of rospy when it receives the publishers of the topic. Ends when it is connected, or
+/// after the last of [`CALLS`].
+async fn call_back(joined: Joined, node: &Inner) {
+    let hub = Arc::clone(&joined.hub);
+    let caller = joined.subscriber.caller_id.clone();
+    drop(joined);
+    for wait in CALLS {
+        sleep(wait).await;
+        if hub.is_subscribed_by(&caller) {
+            return;
+        }
+        node.renew_publication(&hub.topic);
+    }
+}
+
+/// The times until the topic is registered once more. A subscriber that has not yet noticed the end
+/// of its connection ignores the publishers.
+const CALLS: [Duration; 4] = [
+    Duration::from_millis(200),
+    Duration::from_secs(1),
+    Duration::from_secs(4),
+    Duration::from_secs(15),
+];
 
 /// Role of an admitted peer.
 enum Admitted {

@@ -34,6 +34,11 @@ impl LinkLoss {
         is_told.then_some(&self.reported)
     }
 
+    /// Returns whether a link is lost, reported or not.
+    pub(super) fn is_lost(&self) -> bool {
+        !self.lost.is_empty()
+    }
+
     /// Notes how long a check of the links took.
     pub(super) fn took(&mut self, cost: Duration) {
         let more = cost.saturating_sub(self.cost);
