@@ -77,7 +77,7 @@ impl Driver for Program {
             Ended::Unknown(why) => {
                 kill(group);
                 let stopped = self.stop().await;
-                let why = format!("{why}; {stopped}");
+                let why = format!("the outcome is unknown: {why}; {stopped}");
                 work.unknown(&why).await;
                 Err(DriverError::reported(why))
             }

@@ -128,7 +128,7 @@ enum HttpSkillError {
     NoResult { name: String, pointer: String },
     #[error("{name}: {pointer} has a wrong type")]
     ResultType { name: String, pointer: String },
-    #[error("{why}; {stop}")]
+    #[error("the outcome is unknown: {why}; {stop}")]
     Unknown { why: Box<Self>, stop: StopRequest },
 }
 

@@ -379,7 +379,8 @@ async fn a_response_can_be_the_end_of_the_run() {
     let outcome = bench
         .run("{start: PRESS/start, results: {Gripped: /held}}")
         .await;
-    let expected = "Gripped: the response has no /held; there is no `stop` request";
+    let expected = "the outcome is unknown: Gripped: the response has no /held; there is no `stop` \
+                    request";
     assert_eq!(outcome.message, expected);
 }
 
