@@ -758,12 +758,11 @@ mod tests {
             for whole in [here, beside] {
                 assert_eq!(whole.subscriber.outbox.clear(), 3);
             }
-            let expected = if keep_cut_off {
-                3
-            } else {
-                1 + u64::from(latch)
-            };
+            let expected = if keep_cut_off { 3 } else { 0 };
             assert_eq!(away.subscriber.outbox.clear(), expected);
+            // When it connects again, it receives what is latched.
+            let again = join(4, "/away", None);
+            assert_eq!(again.subscriber.outbox.clear(), u64::from(latch));
         }
     }
 }

@@ -609,7 +609,7 @@ fn a_skill_without_the_result_that_a_later_step_takes_is_not_chosen() {
     process.steps[1].parameters[0].name = "Text".into();
     let found = plan(&process, &offers, &[]);
     assert!(!found.is_complete());
-    let expected = "Text: GraspWidth is a number";
+    let expected = "Text: GraspWidth is a number, and a text is expected";
     assert_eq!(
         why(&found, SkillRole::Alone(1), "gripper#Release"),
         expected
