@@ -114,7 +114,7 @@ impl Skill {
     /// - BadLocked
     /// - BadInvalidState during a run
     /// - BadInvalidArgument for a name that the type does not have
-    /// - As [`SkillParameter::take`]
+    /// - As [`SkillParameter::take`](crate::SkillParameter::take)
     pub fn write(
         &self,
         by: &SkillOwner,
