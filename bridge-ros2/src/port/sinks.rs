@@ -12,7 +12,7 @@ use messages::{ActionCalls, Selection, TypeName};
 use ros2_node::clock::Ros2Clock;
 use ros2_node::graph::Graph;
 use ros2_node::limits;
-use ros2_node::outlet::{Former, OutletProgress, OutletRefusal};
+use ros2_node::outlet::{Former, Outlet, OutletProgress, OutletRefusal};
 use ros2_node::raw::Payload;
 use rustdds::GUID;
 use tokio::time::Instant;
@@ -277,32 +277,34 @@ impl WrittenTopics {
     /// Drops the waiting samples, because another bridge publishes. With `at_once` the present
     /// readers do not receive written samples either.
     pub(super) fn drop_waiting(&mut self, side: &mut Ros2Side, at_once: bool) {
-        let now = Instant::now();
-        for (topic, sink) in &mut self.topics {
-            let Some(open) = sink.open.as_mut() else {
-                continue;
-            };
-            let count = open.outlet.drop_waiting(at_once, now);
-            side.schedule.note_waiting(*topic, open.outlet.is_waiting());
-            if count > 0 {
-                let cause = (Reason::Takeover, "waited in its writer");
-                side.events.push_back(lost(*topic, cause, count));
-            }
-        }
+        let cause = (Reason::Takeover, "waited in its writer");
+        self.drop_samples(side, cause, |outlet, now| outlet.drop_waiting(at_once, now));
     }
 
     /// Drops the events that readers have not received for a while, because a link is down or was
     /// down. States are delivered when it is up.
     pub(super) fn drop_unreceived(&mut self, side: &mut Ros2Side, is_lost: bool) {
+        let cause = (Reason::NotPublished, "the link to the subscriber is down");
+        self.drop_samples(side, cause, |outlet, now| {
+            outlet.drop_unreceived_events(is_lost, now)
+        });
+    }
+
+    /// Drops samples of each writer, as `drop_of` does, and reports their number.
+    fn drop_samples(
+        &mut self,
+        side: &mut Ros2Side,
+        cause: (Reason, &'static str),
+        drop_of: impl Fn(&mut Outlet, Instant) -> u64,
+    ) {
         let now = Instant::now();
         for (topic, sink) in &mut self.topics {
             let Some(open) = sink.open.as_mut() else {
                 continue;
             };
-            let count = open.outlet.drop_unreceived_events(is_lost, now);
+            let count = drop_of(&mut open.outlet, now);
             side.schedule.note_waiting(*topic, open.outlet.is_waiting());
             if count > 0 {
-                let cause = (Reason::NotPublished, "the link to the subscriber is down");
                 side.events.push_back(lost(*topic, cause, count));
             }
         }
