@@ -53,8 +53,8 @@ impl MdnsAnnouncer {
         })
     }
 
-    /// Reports the announcements of the server with this URL by [`next`](Self::next), in place of
-    /// those of an earlier URL: the first one, and those of each restart.
+    /// Follows the server with this URL, and no earlier one: [`next`](Self::next) reports its first
+    /// announcement, and the first one after each restart.
     pub fn heed(&mut self, url: Option<&str>) {
         self.nearby.heed(url);
     }

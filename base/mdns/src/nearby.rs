@@ -28,7 +28,7 @@ pub(crate) struct NearbyServers {
     heeded: Option<HeededServer>,
 }
 
-/// A server whose announcements are read.
+/// The discovery server that this program follows.
 #[derive(Debug)]
 struct HeededServer {
     url: String,
@@ -157,7 +157,7 @@ impl NearbyServers {
     fn left(&mut self, label: &[u8]) -> Option<Sighting> {
         self.heard.remove(&hash(label));
         let last = &mut self.heeded.as_mut()?.last;
-        // The next announcement is that of another run.
+        // The server has ended, so its next announcement is a restart.
         let (known, ..) = last.take_if(|(known, ..)| {
             let instance = known.instance.as_bytes();
             instance.eq_ignore_ascii_case(label)
@@ -228,8 +228,8 @@ struct ServerInPacket {
     has_texts: bool,
 }
 
-/// Returns the announcement of a server by the records in one packet. The address is that of the
-/// sender if the packet has none of the host: some programs announce their addresses apart.
+/// Reads the announcement of a server from one packet. If the packet has no address of the host,
+/// the address of the sender is used: some programs announce their addresses in another packet.
 fn described(
     (packet, sender): (DnsPacket<'_>, Ipv4Addr),
     server: &DnsRecord<'_>,

@@ -15,8 +15,8 @@ pub(crate) struct LinkLoss {
 }
 
 impl LinkLoss {
-    /// Returns what the port is told: the addresses that are lost for `patience`, repeatedly while
-    /// the loss lasts, and an empty list when all links are back.
+    /// Returns the addresses that have been lost for `patience`, at each call while the loss lasts.
+    /// Returns an empty list once when all links are back, and `None` if there is nothing new.
     pub(super) fn look(
         &mut self,
         lost: &[IpAddr],

@@ -1,4 +1,4 @@
-//! The parameters of a recipe: those of its formula, and those of its recipe elements.
+//! The parameters of a recipe, from its formula and from its recipe elements.
 
 use std::collections::BTreeMap;
 
