@@ -310,8 +310,8 @@ impl Node {
     /// The connection to a publisher is closed, and opened anew when the link is back. Messages for
     /// a subscriber are dropped; when the link is back and the subscriber responds, its connection
     /// is reset, so that it connects again and receives the latched messages. Topics with
-    /// [`PublisherOptions::keep_cut_off`] or [`SubscriberOptions::keep_cut_off`], connections within
-    /// this host and those over other interfaces go on.
+    /// [`PublisherOptions::keep_cut_off`] or [`SubscriberOptions::keep_cut_off`], connections
+    /// within this host and those over other interfaces go on.
     pub fn set_lost_addresses(&self, lost: &[IpAddr]) {
         let set = |state: &mut Arc<[IpAddr]>| {
             let is_changed = **state != *lost;

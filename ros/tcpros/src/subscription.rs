@@ -34,8 +34,8 @@ pub struct SubscriberOptions {
     /// Maximum number of waiting bytes; beyond it the oldest messages are dropped. The newest
     /// message is always kept.
     pub queue_bytes: usize,
-    /// Whether a connection that is cut off is kept, so that messages sent meanwhile arrive when its
-    /// link is back. For messages that do no harm when they are late.
+    /// Whether a connection that is cut off is kept, so that messages sent meanwhile arrive when
+    /// its link is back. For messages that do no harm when they are late.
     pub keep_cut_off: bool,
 }
 

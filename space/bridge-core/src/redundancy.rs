@@ -508,8 +508,8 @@ impl Redundancy {
         LATER * u32::try_from(before.count()).unwrap_or(u32::MAX)
     }
 
-    /// Returns the time by which this bridge takes over later than others after a release: first the
-    /// standbys that reach their ROS side, then the others, each by their ranks.
+    /// Returns the time by which this bridge takes over later than others after a release: first
+    /// the standbys that reach their ROS side, then the others, each by their ranks.
     fn turn_of_release(&self, now: Instant) -> Duration {
         let own = (self.side != LocalSide::Reached, self.rank);
         let before = self.peers.iter().filter(|peer| {

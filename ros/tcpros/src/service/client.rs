@@ -445,8 +445,8 @@ struct Connection {
 }
 
 impl Drop for Connection {
-    /// Discards a request that was not answered and may still wait in the socket: it would reach the
-    /// server late, after its caller has given it up.
+    /// Discards a request that was not answered and may still wait in the socket: it would reach
+    /// the server late, after its caller has given it up.
     fn drop(&mut self) {
         if !self.sound {
             let _closed_already = SockRef::from(&self.stream).set_linger(Some(Duration::ZERO));

@@ -180,8 +180,8 @@ impl<P: Port> Shell<P> {
         self.port.taken(namespace, by);
     }
 
-    /// Returns why this program publishes nothing in a namespace that another program writes; `name`
-    /// is empty if the other program does not announce which namespaces it carries.
+    /// Returns why this program publishes nothing in a namespace that another program writes;
+    /// `name` is empty if the other program does not announce which namespaces it carries.
     fn why_taken(&self, namespace: u16, by: std::net::SocketAddr, name: &str) -> String {
         let (own, program) = (self.own, self.program);
         if name.is_empty() {

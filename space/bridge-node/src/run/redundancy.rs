@@ -85,8 +85,8 @@ impl<P: Port> Shell<P> {
         }
     }
 
-    /// Returns the time to the next check of the links of the ROS side. A redundant bridge that lost
-    /// its link hands over within the time of a takeover.
+    /// Returns the time to the next check of the links of the ROS side. A redundant bridge that
+    /// lost its link hands over within the time of a takeover.
     pub(super) fn link_pause(&self) -> Duration {
         let is_urgent = self.router.redundancy().is_some() || self.links.is_lost();
         let period = if is_urgent {

@@ -76,7 +76,8 @@ struct Load {
     station: Duration,
     /// UDP datagrams that the devices received.
     received: u64,
-    /// UDP datagrams that the kernel dropped for the devices, by their filters and for full buffers.
+    /// UDP datagrams that the kernel dropped for the devices, by their filters and for full
+    /// buffers.
     dropped: u64,
 }
 

@@ -158,7 +158,8 @@ impl Headers {
         let of = Of::message(action);
         let header = match of {
             Of::Request(_) => self.timed,
-            // A caller waits for a response of any age: only requests are dropped when they are old.
+            // A caller waits for a response of any age: only requests are dropped when they are
+            // old.
             Of::Response(_) => NetworkHeader::default(),
         };
         let now = FirstTimes {
