@@ -88,7 +88,7 @@ pub(crate) fn run(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<C
 }
 
 const USAGE: &str =
-    "--deb, --rpm, --tar, --container, --machine amd64 or arm64, and --program FILE";
+    "--deb, --rpm, --tar, --container, --machine amd64, arm64 or armhf, and --program FILE";
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Format {

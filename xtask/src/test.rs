@@ -8,9 +8,9 @@ mod outcome;
 mod programs;
 
 use std::{
-    fs,
+    env, fs,
     io::ErrorKind,
-    path::Path,
+    path::{Path, PathBuf},
     process::Command,
     time::{Duration, Instant},
 };
@@ -132,9 +132,12 @@ impl Plan {
                 eprintln!("xtask: with CI=true no test is skipped, so the system tests fail");
             }
         }
+        // The variable names other programs to test, such as those of a package.
+        let binaries = env::var_os("UA_BIN_DIR");
+        let binaries = binaries.map_or_else(|| workspace.target.join("debug"), PathBuf::from);
         let surround = |mut command: Command| {
             command
-                .env("UA_BIN_DIR", workspace.target.join("debug"))
+                .env("UA_BIN_DIR", &binaries)
                 .env("UA_PEERS_PYTHON", peers::python(workspace))
                 .env("UA_PEERS", workspace.peers())
                 .env("UA_SKIPPED", skipped);

@@ -29,19 +29,29 @@ pub(crate) struct Machine {
     pub(crate) debian: &'static str,
     /// The architecture in names of RPM and of containers' base systems.
     pub(crate) rpm: &'static str,
+    /// The name of GNU, which begins those of the tools and names the folders of libraries.
+    gnu: &'static str,
 }
 
 /// All machines that packages can be made for.
-const MACHINES: [Machine; 2] = [
+const MACHINES: [Machine; 3] = [
     Machine {
         triple: "x86_64-unknown-linux-gnu",
         debian: "amd64",
         rpm: "x86_64",
+        gnu: "x86_64-linux-gnu",
     },
     Machine {
         triple: "aarch64-unknown-linux-gnu",
         debian: "arm64",
         rpm: "aarch64",
+        gnu: "aarch64-linux-gnu",
+    },
+    Machine {
+        triple: "armv7-unknown-linux-gnueabihf",
+        debian: "armhf",
+        rpm: "armv7hl",
+        gnu: "arm-linux-gnueabihf",
     },
 ];
 
@@ -49,7 +59,8 @@ impl Machine {
     /// Returns the machine that this program runs on.
     pub(crate) fn host() -> Option<Self> {
         let here = std::env::consts::ARCH;
-        MACHINES.into_iter().find(|machine| machine.rpm == here)
+        let begins = |machine: &Machine| machine.triple.split('-').next() == Some(here);
+        MACHINES.into_iter().find(begins)
     }
 
     /// Returns the machine with this architecture of Debian.
@@ -68,7 +79,7 @@ impl Machine {
     pub(crate) fn tool(self, name: &str) -> String {
         match self.is_host() {
             true => name.to_owned(),
-            false => format!("{}-linux-gnu-{name}", self.rpm),
+            false => format!("{}-{name}", self.gnu),
         }
     }
 
@@ -87,7 +98,7 @@ impl Machine {
             "{gcc} is missing: install it (on Debian `apt-get install {}`)",
             match self.is_host() {
                 true => "gcc libc6-dev".to_owned(),
-                false => format!("gcc-{}-linux-gnu", self.rpm),
+                false => format!("gcc-{}", self.gnu),
             }
         );
         let standard = printed(&["target-libdir", "--target", self.triple])?;
@@ -105,7 +116,7 @@ impl Machine {
         // gcc searches the folders of this host, too, and those of `-B` before them.
         let mut flags = vec![format!("-Clink-arg=--sysroot={sysroot}")];
         for folder in ["usr/lib", "lib"] {
-            let folder = format!("{sysroot}/{folder}/{}-linux-gnu/", self.rpm);
+            let folder = format!("{sysroot}/{folder}/{}/", self.gnu);
             flags.push(format!("-Clink-arg=-B{folder}"));
         }
         flags.extend(fold()?);
