@@ -8,7 +8,9 @@
 //! known here before our writer is known there. Samples written in between are history, which a
 //! volatile reader does not receive.
 
+mod audience;
 mod former;
+mod outcome;
 mod settling;
 mod unreceived;
 mod waiting;
@@ -20,7 +22,9 @@ use rustdds::dds::WriteError;
 use rustdds::{DataWriterStatus, GUID, StatusEvented, Timestamp};
 use tokio::time::Instant;
 
+use self::audience::Audience;
 pub use self::former::Former;
+pub use self::outcome::{OutletProgress, OutletRefusal};
 use self::settling::{PATIENCE, SETTLE, Settling};
 use self::unreceived::UnreceivedSamples;
 use self::waiting::{UnsentSamples, WaitingSample};
@@ -50,67 +54,6 @@ pub struct Outlet {
     former: VecDeque<Former>,
     /// The samples that readers have not acknowledged while a link is lost.
     unreceived: UnreceivedSamples,
-}
-
-/// The readers of the topic.
-#[derive(Debug)]
-enum Audience {
-    /// No reader. The history holds only the last state, for transient-local readers that appear
-    /// later; volatile readers receive nothing that was written before. The history of the
-    /// published RustDDS would keep all values without acknowledgement, so with it the state is
-    /// held back until only transient-local readers have appeared.
-    Nobody { held: Option<WaitingSample> },
-    /// At least one reader, which receives samples of up to this size.
-    Present {
-        /// Set until written samples reach the readers.
-        settling: Option<Settling>,
-        /// The number of discovered readers.
-        seen: usize,
-        sample_size: usize,
-    },
-}
-
-/// The progress of the samples that were offered.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum OutletProgress {
-    /// The topic has no reader.
-    NoReader,
-    /// Samples wait for readers or for room in the send window, or were dropped because a reader is
-    /// out of reach.
-    Waiting,
-    /// Every sample was written.
-    Written,
-}
-
-/// The reason for which a sample was not delivered.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum OutletRefusal {
-    /// The send window and the queue are full: the oldest waiting sample was dropped for this
-    /// sample.
-    Overflow,
-    /// Larger than this number of bytes, which readers of this topic certainly receive
-    /// ([`limits`]). Not written.
-    TooLarge(usize),
-    /// An event without a present reader.
-    NoReader,
-    /// The sample expired while it waited for its readers.
-    Late,
-    /// RustDDS failed, which happens only when one of its threads has died.
-    Failed,
-}
-
-impl OutletRefusal {
-    /// Returns the label under which the refusal is counted.
-    #[must_use]
-    pub fn label(self) -> &'static str {
-        match self {
-            Self::Overflow => "subscriber too slow",
-            Self::TooLarge(_) => "too large for DDS",
-            Self::NoReader => "no subscriber is present",
-            Self::Late => "subscriber not ready in time",
-            Self::Failed => "DDS writer failed",
-        }
-    }
 }
 
 impl Outlet {

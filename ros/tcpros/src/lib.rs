@@ -53,9 +53,9 @@ mod xmlrpc;
 pub use crate::core::Core;
 pub use crate::header::{ConnectionHeader, HeaderError};
 pub use crate::inbox::{ConnectionPeer, Inbox, InboxEvent, InboxMessage};
-pub use crate::master::{MasterError, MasterGraph};
+pub use crate::master::{MasterError, MasterGraph, MasterState};
 pub use crate::names::ResourceNameError;
-pub use crate::node::{GraphReader, MasterState, Node, NodeError};
+pub use crate::node::{GraphReader, Node, NodeError};
 pub use crate::options::{ArgumentError, NodeOptions};
 pub use crate::parameters::{NodeParameters, ParamError, ParamSubscription, ParamValue};
 pub use crate::publisher::{

@@ -11,6 +11,16 @@ use thiserror::Error;
 use crate::rpc::{self, RpcEndpoint, RpcError};
 use crate::xmlrpc::XmlRpcValue;
 
+/// State of the connection to the master.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum MasterState {
+    /// Not found yet, or lost: the node tries to connect.
+    Awaited,
+    /// The master replies, and was sent all registrations of that time. Refused registrations are
+    /// logged and retried, and later registrations may still be on their way.
+    Registered,
+}
+
 /// The publishers, subscribers and services that are registered with the master.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct MasterGraph {

@@ -2,30 +2,32 @@
 
 mod error;
 mod graph_reader;
+mod listener;
+mod name_contests;
 mod registry;
 
 use std::collections::HashSet;
-use std::net::{IpAddr, SocketAddr};
-use std::sync::atomic::{AtomicI32, AtomicU64, Ordering};
+use std::net::IpAddr;
+use std::sync::atomic::{AtomicI32, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use bytes::Bytes;
-use socket2::{Domain, Socket, Type};
-use tokio::net::TcpListener;
 use tokio::sync::{Notify, watch};
 use tokio::task::JoinSet;
 use tokio::time::timeout;
 
 pub use self::error::NodeError;
 pub use self::graph_reader::GraphReader;
+use self::listener::listen;
+use self::name_contests::NameContests;
 pub(crate) use self::registry::{Registration, ResourceKind};
 use self::registry::{Registry, Subscribed};
 use crate::crowd::Shares;
 use crate::events;
 use crate::inbox::Inbox;
 use crate::link::LinkContext;
-use crate::master::{Master, MasterError, MasterGraph};
+use crate::master::{Master, MasterError, MasterGraph, MasterState};
 use crate::names::{NameResolver, ResourceNameError};
 use crate::options::NodeOptions;
 use crate::outbox::{Limit, lock};
@@ -102,8 +104,7 @@ impl Node {
             changed: Notify::new(),
             master_state: watch::Sender::new(MasterState::Awaited),
             shutdown: watch::Sender::new(None),
-            contests: AtomicU64::new(0),
-            decided: AtomicU64::new(0),
+            name_contests: NameContests::default(),
             settled: watch::Sender::new(false),
             draining: watch::Sender::new(0),
             next_id: AtomicI32::new(1),
@@ -353,16 +354,6 @@ impl Drop for Node {
     }
 }
 
-/// State of the connection to the master.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum MasterState {
-    /// Not found yet, or lost: the node tries to connect.
-    Awaited,
-    /// The master replies, and was sent all registrations of that time. Refused registrations are
-    /// logged and retried, and later registrations may still be on their way.
-    Registered,
-}
-
 /// State shared by the handles and tasks of the node.
 #[derive(Debug)]
 pub(crate) struct Inner {
@@ -388,10 +379,8 @@ pub(crate) struct Inner {
     pub(crate) master_state: watch::Sender<MasterState>,
     /// The reason of the master's request to shut down.
     shutdown: watch::Sender<Option<String>>,
-    /// Number of reports of the master that another node has taken this node's name, and the number
-    /// of these reports for which the name turned out to be this node's.
-    contests: AtomicU64,
-    decided: AtomicU64,
+    /// The contests for this node's name.
+    name_contests: NameContests,
     /// True once everything is closed and unregistered at the master.
     pub(crate) settled: watch::Sender<bool>,
     /// Number of connections to subscribers and clients, including withdrawn topics and services.
@@ -561,33 +550,7 @@ impl Inner {
 
     /// Returns all registrations that the master should have.
     pub(crate) fn wanted_registrations(&self) -> Vec<Registration> {
-        let registry = lock(&self.registry);
-        let published = registry.publications.values().map(|hub| Registration {
-            name: hub.topic.clone(),
-            kind: ResourceKind::Published,
-            generation: hub.generation,
-            type_name: hub.topic_type.name.clone(),
-        });
-        let subscribed = registry
-            .subscriptions
-            .iter()
-            .map(|(topic, entry)| Registration {
-                name: topic.clone(),
-                kind: ResourceKind::Subscribed,
-                generation: entry.generation,
-                type_name: entry
-                    .feeds
-                    .iter()
-                    .find_map(|feed| feed.wanted.type_name.clone())
-                    .unwrap_or_else(|| "*".to_owned()),
-            });
-        let offered = registry.services.values().map(|served| Registration {
-            name: served.service.clone(),
-            kind: ResourceKind::Service,
-            generation: served.generation,
-            type_name: String::new(),
-        });
-        published.chain(subscribed).chain(offered).collect()
+        lock(&self.registry).wanted()
     }
 
     /// Returns the number of received lists of publishers of a topic.
@@ -654,20 +617,19 @@ impl Inner {
     /// Records the master's report that another node has taken this node's name. Nothing is
     /// registered until the owner of the name is known.
     pub(crate) fn name_is_contested(&self) {
-        self.contests.fetch_add(1, Ordering::AcqRel);
+        self.name_contests.begin();
         self.changed.notify_one();
     }
 
     /// Returns the number of the contest for the name that is open.
     pub(crate) fn contest(&self) -> Option<u64> {
-        let last = self.contests.load(Ordering::Acquire);
-        let open = last != self.decided.load(Ordering::Acquire) && !self.is_asked_to_shut_down();
-        open.then_some(last)
+        let open = self.name_contests.open();
+        open.filter(|_| !self.is_asked_to_shut_down())
     }
 
     /// Records that the name was this node's after this number of contests.
     pub(crate) fn decided(&self, contest: u64) {
-        self.decided.store(contest, Ordering::Release);
+        self.name_contests.decide(contest);
     }
 
     /// Returns whether the name is this node's, as far as it knows.
@@ -723,25 +685,7 @@ fn params(names: &NameResolver, given: Vec<(String, ParamValue)>) -> Result<Para
     Ok(Params::new(last, names.resolve("/use_sim_time")?))
 }
 
-/// Listens on a port chosen by the system.
-fn listen(address: IpAddr) -> Result<(TcpListener, u16), NodeError> {
-    let open = || {
-        let address = SocketAddr::from((address, 0));
-        let socket = Socket::new(Domain::for_address(address), Type::STREAM, None)?;
-        socket.bind(&address.into())?;
-        socket.listen(BACKLOG)?;
-        socket.set_nonblocking(true)?;
-        let listener = TcpListener::from_std(socket.into())?;
-        let port = listener.local_addr()?.port();
-        Ok((listener, port))
-    };
-    open().map_err(|source| NodeError::Listen { address, source })
-}
-
 const SHUTDOWN_LIMIT: Duration = Duration::from_secs(2);
-/// Number of peers that may connect at the same moment: a launch file starts a whole graph at once,
-/// and a refused peer tries again after a second.
-const BACKLOG: i32 = 1024;
 
 #[cfg(test)]
 mod tests;

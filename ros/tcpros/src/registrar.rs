@@ -14,8 +14,8 @@ use tokio::time::{Instant, timeout};
 
 use crate::clock;
 use crate::events;
-use crate::master::{self, Master, MasterError, MasterRequest};
-use crate::node::{Inner, MasterState, Registration, ResourceKind};
+use crate::master::{self, Master, MasterError, MasterRequest, MasterState};
+use crate::node::{Inner, Registration, ResourceKind};
 use crate::parameters;
 use crate::xmlrpc::XmlRpcValue;
 

@@ -59,7 +59,7 @@ impl Machine {
     /// Returns the machine that this program runs on.
     pub(crate) fn host() -> Option<Self> {
         let here = std::env::consts::ARCH;
-        let begins = |machine: &Machine| machine.triple.split('-').next() == Some(here);
+        let begins = |machine: &Self| machine.triple.split('-').next() == Some(here);
         MACHINES.into_iter().find(begins)
     }
 

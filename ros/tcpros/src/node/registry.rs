@@ -18,6 +18,36 @@ pub(super) struct Registry {
 }
 
 impl Registry {
+    /// Returns all registrations that the master should have.
+    pub(super) fn wanted(&self) -> Vec<Registration> {
+        let published = self.publications.values().map(|hub| Registration {
+            name: hub.topic.clone(),
+            kind: ResourceKind::Published,
+            generation: hub.generation,
+            type_name: hub.topic_type.name.clone(),
+        });
+        let subscribed = self
+            .subscriptions
+            .iter()
+            .map(|(topic, entry)| Registration {
+                name: topic.clone(),
+                kind: ResourceKind::Subscribed,
+                generation: entry.generation,
+                type_name: entry
+                    .feeds
+                    .iter()
+                    .find_map(|feed| feed.wanted.type_name.clone())
+                    .unwrap_or_else(|| "*".to_owned()),
+            });
+        let offered = self.services.values().map(|served| Registration {
+            name: served.service.clone(),
+            kind: ResourceKind::Service,
+            generation: served.generation,
+            type_name: String::new(),
+        });
+        published.chain(subscribed).chain(offered).collect()
+    }
+
     pub(super) const fn next_generation(&mut self) -> u64 {
         self.generation += 1;
         self.generation
