@@ -296,6 +296,17 @@ impl Child {
             .collect()
     }
 
+    /// Returns when each JSON object with a value arrived.
+    #[must_use]
+    pub fn arrivals(&self) -> Vec<Instant> {
+        let lines = self.output.lines.lock().unwrap();
+        let values = lines.kept.iter().filter(|line| {
+            let json = line.json();
+            json.is_some_and(|json| json.get("value").is_some())
+        });
+        values.map(|line| line.at).collect()
+    }
+
     /// Returns the process id.
     #[must_use]
     pub fn id(&self) -> u32 {
@@ -416,6 +427,7 @@ impl Stream {
 struct OutputLine {
     stream: Stream,
     text: String,
+    at: Instant,
 }
 
 impl OutputLine {
@@ -457,7 +469,8 @@ fn collect(
             bytes.clear();
             let mut lines = output.lines.lock().unwrap();
             if lines.kept.len() < KEPT {
-                lines.kept.push(OutputLine { stream, text });
+                let at = Instant::now();
+                lines.kept.push(OutputLine { stream, text, at });
             } else {
                 lines.not_kept += 1;
             }

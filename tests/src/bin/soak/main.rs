@@ -2,8 +2,9 @@
 //! minute.
 //!
 //! Numbers go from ROS 1 to ROS 2 and back, ten a second. After each fault, the programs must be
-//! ready again and both subscribers must receive new numbers: otherwise a state is lost. The
-//! longest gap of each minute and the growth of memory are printed.
+//! ready again, both subscribers must receive new numbers, and a process must run the skill of a
+//! component: otherwise a state is lost, or a process failed. The longest gap of each minute and the
+//! growth of memory are printed.
 
 mod plant;
 
@@ -80,18 +81,12 @@ impl Way {
 /// A subscriber of a round.
 struct Reader {
     child: Child,
-    count: usize,
-    last: Instant,
-    gap: Duration,
 }
 
 impl Reader {
     fn new(way: Way, cell: &Cell) -> Self {
         Self {
             child: way.subscriber(cell),
-            count: 0,
-            last: Instant::now(),
-            gap: Duration::ZERO,
         }
     }
 
@@ -103,16 +98,17 @@ impl Reader {
             .collect()
     }
 
-    /// Notes new numbers.
-    fn look(&mut self) {
-        let count = self.child.values().len();
-        // The first number ends the discovery, not a gap.
-        if count > self.count {
-            if self.count > 0 {
-                self.gap = self.gap.max(self.last.elapsed());
-            }
-            (self.count, self.last) = (count, Instant::now());
-        }
+    /// Returns the number of values so far.
+    fn count(&self) -> usize {
+        self.child.values().len()
+    }
+
+    /// Returns the longest time between two values, or since the last one.
+    fn gap(&self) -> Duration {
+        let mut arrivals = self.child.arrivals();
+        arrivals.push(Instant::now());
+        let gaps = arrivals.windows(2).map(|pair| pair[1] - pair[0]);
+        gaps.max().unwrap_or_default()
     }
 
     /// Returns the numbers that arrived twice or after a newer one.
@@ -122,21 +118,14 @@ impl Reader {
     }
 }
 
-/// Looks at the readers until `done` or the end of the time. Returns whether it is done.
-fn watch(
-    readers: &mut [Reader; 2],
-    time: Duration,
-    mut done: impl FnMut(&[Reader; 2]) -> bool,
-) -> bool {
+/// Waits for `done` or the end of the time. Returns whether it is done.
+fn is_soon(time: Duration, mut done: impl FnMut() -> bool) -> bool {
     let start = Instant::now();
     while start.elapsed() < time {
-        for reader in readers.iter_mut() {
-            reader.look();
-        }
-        if done(readers) {
+        if done() {
             return true;
         }
-        sleep(Duration::from_millis(20));
+        sleep(Duration::from_millis(50));
     }
     false
 }
@@ -146,6 +135,7 @@ fn watch(
 struct Tally {
     rounds: u64,
     lost: u64,
+    failed_processes: u64,
     disordered: usize,
     longest: Duration,
 }
@@ -172,34 +162,30 @@ fn soak(cell: &Cell, duration: Duration, seed: u64) -> ExitCode {
 /// A minute with one fault.
 fn round(cell: &Cell, plant: &mut SoakPlant<'_>, random: &mut Random, tally: &mut Tally) {
     let end = Instant::now() + ROUND;
-    let mut readers = Way::BOTH.map(|way| Reader::new(way, cell));
-    let has_begun = watch(&mut readers, HEALED, |all| {
-        all.iter().all(|of| of.count > 10)
-    });
+    let readers = Way::BOTH.map(|way| Reader::new(way, cell));
+    let has_begun = is_soon(HEALED, || readers.iter().all(|of| of.count() > NEW));
     let all = u64::try_from(RoundFault::ALL.len()).unwrap();
     let fault = RoundFault::ALL[usize::try_from(random.below(all)).unwrap()];
     let what = plant.strike(fault, random);
     let healed = plant.heal();
     let forwarded = forwarded();
-    let before = readers.each_ref().map(|of| of.child.values().len());
-    let is_new = watch(&mut readers, HEALED, |all| {
-        let mut pairs = all.iter().zip(before);
-        pairs.all(|(of, before)| of.count > before + NEW) && self::forwarded() > forwarded
+    let before = readers.each_ref().map(Reader::count);
+    let is_new = is_soon(HEALED, || {
+        let mut pairs = readers.iter().zip(before);
+        pairs.all(|(of, before)| of.count() > before + NEW) && self::forwarded() > forwarded
     });
-    watch(
-        &mut readers,
-        end.saturating_duration_since(Instant::now()),
-        |_| false,
-    );
+    let runs = SoakPlant::start_process().wait_for_end(PROCESS).success();
+    sleep(end.saturating_duration_since(Instant::now()));
     for program in &mut plant.programs {
         program.sample();
     }
     tally.rounds += 1;
     let is_lost = !has_begun || !is_new;
     tally.lost += u64::from(is_lost);
+    tally.failed_processes += u64::from(!runs);
     let disordered: usize = readers.iter().map(Reader::disordered).sum();
     tally.disordered += disordered;
-    let [forth, back] = readers.each_ref().map(|of| of.gap);
+    let [forth, back] = readers.each_ref().map(Reader::gap);
     tally.longest = tally.longest.max(forth).max(back);
     println!(
         "{:4} {what}: ready after {:.1} s, gaps {:.2} s forth and {:.2} s back, {disordered} out of order{}",
@@ -207,7 +193,11 @@ fn round(cell: &Cell, plant: &mut SoakPlant<'_>, random: &mut Random, tally: &mu
         healed.as_secs_f64(),
         forth.as_secs_f64(),
         back.as_secs_f64(),
-        if is_lost { ", A STATE IS LOST" } else { "" }
+        match (is_lost, runs) {
+            (true, _) => ", A STATE IS LOST",
+            (false, false) => ", THE PROCESS FAILED",
+            (false, true) => "",
+        }
     );
 }
 
@@ -223,12 +213,13 @@ fn report(plant: &mut SoakPlant<'_>, tally: &Tally) -> ExitCode {
     let Tally {
         rounds,
         lost,
+        failed_processes,
         disordered,
         longest,
     } = tally;
     println!(
-        "{rounds} faults: {lost} without new states afterwards, {disordered} values doubled or out of order, \
-         longest gap {:.2} s",
+        "{rounds} faults: {lost} without new states afterwards, {failed_processes} processes failed, \
+         {disordered} values doubled or out of order, longest gap {:.2} s",
         longest.as_secs_f64()
     );
     let mut grows = false;
@@ -246,7 +237,7 @@ fn report(plant: &mut SoakPlant<'_>, tally: &Tally) -> ExitCode {
             None => println!("memory of {}: restarted too often", program.name),
         }
     }
-    match *lost == 0 && *disordered == 0 && !grows {
+    match *lost == 0 && *failed_processes == 0 && *disordered == 0 && !grows {
         true => ExitCode::SUCCESS,
         false => ExitCode::FAILURE,
     }
@@ -257,6 +248,8 @@ const RATE: u64 = 10;
 const ROUND: Duration = Duration::from_secs(60);
 /// The time for new states after a fault.
 const HEALED: Duration = Duration::from_secs(30);
+/// The time for a process of one step.
+const PROCESS: Duration = Duration::from_secs(100);
 /// The number of new values that show that states arrive again.
 const NEW: usize = 10;
 /// The growth of memory in percent an hour that fails the soak.

@@ -20,10 +20,12 @@ pub(crate) enum RoundFault {
     Reloaded,
     SwitchedOver,
     BrokerKilled,
+    /// Ended and started again, as an upgrade of the package does.
+    Upgraded,
 }
 
 impl RoundFault {
-    pub(crate) const ALL: [Self; 7] = [
+    pub(crate) const ALL: [Self; 8] = [
         Self::Killed,
         Self::Stopped,
         Self::Cut,
@@ -31,6 +33,7 @@ impl RoundFault {
         Self::Reloaded,
         Self::SwitchedOver,
         Self::BrokerKilled,
+        Self::Upgraded,
     ];
 }
 
@@ -122,7 +125,7 @@ pub(crate) struct SoakPlant<'c> {
 
 impl<'c> SoakPlant<'c> {
     /// Starts the bridges of ROS 1 and ROS 2, two of each, a server that also forwards to a broker,
-    /// and the broker.
+    /// the broker, a discovery server, a component and an MES that runs its skill.
     pub(crate) fn start(cell: &'c Cell, clock: &'c WallClock) -> Self {
         let mapping = cell.file("cell.yaml", MAPPING).display().to_string();
         let server = cell.file("server.yaml", SERVER).display().to_string();
@@ -174,6 +177,23 @@ impl<'c> SoakPlant<'c> {
                 .by(clock)
         };
         add("ua-lds", METRICS_LDS, Box::new(start));
+        let gripper = cell.file("gripper.yaml", GRIPPER).display().to_string();
+        let start = move || {
+            StartedChild::new("ua-component", &program("ua-component"))
+                .args([&gripper[..], "--interface", "lo", "--lds", "none"])
+                .args(["--endpoint", "opc.tcp://127.0.0.1:4842"])
+                .args(["--metrics", METRICS_COMPONENT])
+                .by(clock)
+        };
+        add("ua-component", METRICS_COMPONENT, Box::new(start));
+        let mes = cell.file("mes.yaml", MES).display().to_string();
+        let start = move || {
+            StartedChild::new("ua-mes", &program("ua-mes"))
+                .args([&mes[..], "--interface", "lo", "--lds", "none"])
+                .args(["--metrics", METRICS_MES])
+                .by(clock)
+        };
+        add("ua-mes", METRICS_MES, Box::new(start));
         for program in &mut programs {
             program.launch();
         }
@@ -194,6 +214,14 @@ impl<'c> SoakPlant<'c> {
             });
         }
         start.elapsed()
+    }
+
+    /// Starts the process of the MES, with `ua-space` that ends when it has ended.
+    pub(crate) fn start_process() -> Child {
+        StartedChild::new("ua-space", &program("ua-space"))
+            .args(["skills", "start", "mes.ExecuteProcess"])
+            .args(["ProcessIri=urn:soak:hold", "--interface", "lo"])
+            .start()
     }
 
     /// Causes a fault. Returns its description.
@@ -252,6 +280,14 @@ impl<'c> SoakPlant<'c> {
                 self.broker = Some(self.cell.mosquitto());
                 "kill -9 of the broker".to_owned()
             }
+            RoundFault::Upgraded => {
+                let program = &mut self.programs[at];
+                let mut child = program.child.take().unwrap();
+                child.signal(Signal::SIGTERM);
+                child.wait_for_end(SOON);
+                program.launch();
+                format!("end and start of {name}, as for an upgrade")
+            }
         }
     }
 }
@@ -271,7 +307,29 @@ spaces: [{id: 1}, {id: 2}]
 namespaces: {2: urn:ua-bridge:soak}
 server: {security: [None]}
 ";
+const GRIPPER: &str = "
+component: gripper
+application_uri: urn:soak:gripper
+namespace: 9
+security: [None]
+skills:
+  - {name: Grasp, type: GraspSkillType, capabilities: [urn:soak:grasp], driver: {simulated: {duration: 200 ms}}}
+";
+const MES: &str = "
+mes: mes
+application_uri: urn:soak:mes
+namespace: 50
+endpoint: opc.tcp://127.0.0.1:4843
+security: [None]
+processes:
+  - process: urn:soak:hold
+    wait: 60 s
+    steps:
+      - {step: grip, needs: {skill: urn:soak:grasp}}
+";
 const METRICS_LDS: &str = "127.0.0.1:9104";
+const METRICS_COMPONENT: &str = "127.0.0.1:9105";
+const METRICS_MES: &str = "127.0.0.1:9106";
 const SOON: Duration = Duration::from_secs(120);
 /// Samples of memory that belong to the start of a program.
 const WARM_UP: usize = 5;
