@@ -5,6 +5,7 @@
 mod compensate;
 mod facts;
 mod sequence;
+mod tools;
 mod watched;
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -256,6 +257,8 @@ enum Ended {
     Done,
     /// Another round of a loop is due, which is planned anew.
     Round,
+    /// The next step was planned for another tool than the attached one, and is planned anew.
+    OtherTool(String),
     /// Another plan can do the work.
     Broken(String),
     /// No other plan can do the work.
@@ -268,6 +271,8 @@ struct Chosen {
     open: Vec<(SkillRole, Offer)>,
     /// The offers of compensations, by the numbers of the steps.
     undo: BTreeMap<usize, Offer>,
+    /// The components that can do steps with the right tool, by the numbers of the steps.
+    able: BTreeMap<usize, BTreeSet<String>>,
     /// The steps of the process with the values of their queries, as the plan used them.
     steps: Vec<ProcessStep>,
 }
@@ -279,7 +284,7 @@ impl Execution<'_> {
         let ended = self.forward(&mut progress).await;
         match ended {
             Ok(()) => Ok(()),
-            Err(why) => Err(self.compensated(why, &progress.done).await),
+            Err(why) => Err(self.compensated(why, &mut progress).await),
         }
     }
 
@@ -288,6 +293,8 @@ impl Execution<'_> {
         let mut last = String::new();
         let mut number = 0_usize;
         let mut broken = 0_usize;
+        // The steps that were over when a plan had another tool than the attached one.
+        let mut retooled = None;
         while broken < MOST_PLANS {
             number = number.saturating_add(1);
             let (plan, chosen) = self.planned(&last, progress).await?;
@@ -298,6 +305,7 @@ impl Execution<'_> {
             let ended = self.carry_out(&chosen, progress).await;
             let (outcome, reason) = match &ended {
                 Ended::Done | Ended::Round => (How::Done, None),
+                Ended::OtherTool(why) => (How::Done, Some(why.clone())),
                 Ended::Broken(why) | Ended::Over(why) => (How::Failed, Some(why.clone())),
             };
             self.log.change(|kept, now| {
@@ -309,6 +317,15 @@ impl Execution<'_> {
                 Ended::Done => return Ok(()),
                 Ended::Round => {
                     self.log.forgive();
+                    last.clear();
+                }
+                Ended::OtherTool(why) => {
+                    info!(plan = number, "the next step is planned again: {why}");
+                    let over = (progress.done.len(), progress.passed.len());
+                    // The new plan knew the tools of its first step.
+                    if retooled.replace(over) == Some(over) {
+                        return Err(why);
+                    }
                     last.clear();
                 }
                 Ended::Over(why) => return Err(why),
@@ -329,7 +346,7 @@ impl Execution<'_> {
     async fn planned(&self, last: &str, progress: &RunProgress) -> Result<(Plan, Chosen), String> {
         let run = self.log.run().run;
         let kept = compensate::kept(self.process, &progress.done);
-        let passed: Vec<usize> = progress.passed.keys().copied().collect();
+        let passed = progress.passed_or_ruled_out(self.process);
         let after = if last.is_empty() {
             String::new()
         } else {
@@ -354,6 +371,7 @@ impl Execution<'_> {
                 kept: &kept,
                 passed: &passed,
                 used: Some(&used),
+                tools: Some(&progress.tools),
             };
             let facts = OfPlant {
                 plant: self.plant,
@@ -428,6 +446,9 @@ impl Execution<'_> {
         Chosen {
             open,
             undo: undo.collect(),
+            able: (0..self.process.steps.len())
+                .map(|number| (number, plan.able(SkillRole::Alone(number))))
+                .collect(),
             steps: Vec::new(),
         }
     }

@@ -2,6 +2,7 @@
 //! its input is the result of a query, its output is a plan.
 
 mod judging;
+mod tools;
 
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, BTreeSet};
@@ -16,6 +17,7 @@ use crate::process::{By, Group, Need, Process, ProcessStep, SkillRole, StepJob};
 
 use judging::Judging;
 pub(crate) use judging::TOOL;
+pub(crate) use tools::{AttachedTools, ToolFault, ToolStep, ToolUser, ToolWork};
 
 /// An available skill, as a row of the query `candidates`.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -80,6 +82,9 @@ pub(crate) struct PlannedNeed {
     /// Whether the component of a completed step has to do it.
     #[serde(skip)]
     is_bound: bool,
+    /// The components that can do it with the right tool.
+    #[serde(skip)]
+    able: BTreeSet<String>,
     /// Whether the step was passed, so that it needs no skill.
     #[serde(skip)]
     is_passed: bool,
@@ -103,6 +108,7 @@ impl PlannedNeed {
             }],
             role_is: need.role,
             is_bound: true,
+            able: BTreeSet::new(),
             is_passed: false,
         }
     }
@@ -160,10 +166,12 @@ pub(crate) struct Situation<'a> {
     pub(crate) fallen: &'a [Fallen],
     /// The steps that are done.
     pub(crate) kept: &'a [KeptStep],
-    /// The numbers of the steps that were passed without being done.
+    /// The numbers of the steps that were passed without being done, or will be.
     pub(crate) passed: &'a [usize],
     /// The components that other runs use, with these runs.
     pub(crate) used: Option<&'a BTreeMap<String, String>>,
+    /// The tools that the run has attached and detached.
+    pub(crate) tools: Option<&'a AttachedTools>,
 }
 
 impl Situation<'_> {
@@ -256,7 +264,7 @@ pub(crate) fn plan(
             let roles: Vec<_> = of_group
                 .map(|(role, needs)| (*role, needs.clone()))
                 .collect();
-            (group, Team::of(&roles, &fitting, facts))
+            (group, Team::of(&roles, &fitting, (facts, &judging)))
         })
         .collect();
     let team = |need: &Need| groups.get(&need.role).and_then(|group| teams.get(group));
@@ -403,6 +411,13 @@ impl Plan {
             .and_then(|(_, need)| need.chosen.as_deref())
     }
 
+    /// Returns the components that can do a step with the right tool.
+    pub(crate) fn able(&self, role: SkillRole) -> BTreeSet<String> {
+        let mut needs = self.needs();
+        let need = needs.find(|(_, need)| need.role_is == role);
+        need.map(|(_, need)| need.able.clone()).unwrap_or_default()
+    }
+
     /// Takes back the choice for a role.
     fn refuse(&mut self, role: SkillRole, why: &str) {
         let needs = self.steps.iter_mut().flat_map(|step| &mut step.needs);
@@ -435,7 +450,7 @@ impl<'a> Team<'a> {
     fn of(
         roles: &[(SkillRole, Vec<&Need>)],
         fitting: &BTreeMap<SkillRole, Vec<&'a Offer>>,
-        facts: &dyn Facts,
+        (facts, judging): (&dyn Facts, &Judging<'_>),
     ) -> Self {
         let of_role = |role: &SkillRole| fitting.get(role).into_iter().flatten().copied();
         let components: BTreeSet<&str> = roles
@@ -448,6 +463,7 @@ impl<'a> Team<'a> {
         for component in components {
             let mut chosen = BTreeMap::new();
             let mut whole = CandidateRank::default();
+            let mut wrong = 0_usize;
             for (role, needs) in roles {
                 let of_component = of_role(role).filter(|offer| offer.component == component);
                 let best = of_component
@@ -459,15 +475,17 @@ impl<'a> Team<'a> {
                         ..rank
                     };
                     chosen.insert(*role, best);
+                    wrong = wrong.saturating_add(judging.wrong_tools(*role, best));
                 }
             }
             if chosen.len() == roles.len() {
-                teams.push(choosing::SkillCandidate {
+                let candidate = choosing::SkillCandidate {
                     of: chosen,
                     name: component.to_owned(),
                     fits: Ok(()),
                     rank: whole,
-                });
+                };
+                teams.push((wrong, candidate));
             } else {
                 let missing = roles
                     .iter()
@@ -477,6 +495,10 @@ impl<'a> Team<'a> {
                 lacks.insert(component, missing);
             }
         }
+        // The choice is right for as many of the tools that may be attached as possible.
+        let least = teams.iter().map(|(wrong, _)| *wrong).min();
+        teams.retain(|(wrong, _)| Some(*wrong) == least);
+        let teams = teams.into_iter().map(|(_, candidate)| candidate).collect();
         // The names of components differ, so no two of them are equal.
         let chosen = choose(teams).map(|choice| choice.chosen);
         Self {

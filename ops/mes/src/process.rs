@@ -101,26 +101,35 @@ impl Loop {
     }
 
     /// Returns the steps that are over at the end of a round: the steps of the loop, and the steps
-    /// for which they wait. A step that waits for a step of another loop waits for the last round
-    /// of that loop.
+    /// for which they wait.
     fn over_after_round(&self, steps: &[ProcessStep], loops: &[Self]) -> BTreeSet<usize> {
-        let mut over = BTreeSet::new();
-        let mut open: Vec<usize> = self.steps.iter().copied().collect();
-        while let Some(number) = open.pop() {
-            if !over.insert(number) {
-                continue;
-            }
-            let waits = steps.get(number).map(|step| step.waits_for(number));
-            for other in waits.into_iter().flatten() {
-                open.push(other);
-                let left = loops
-                    .iter()
-                    .filter(|one| one.steps.contains(&other) && !one.steps.contains(&number));
-                open.extend(left.flat_map(|one| &one.steps));
-            }
-        }
-        over
+        waited_for(self.steps.iter().copied(), steps, loops)
     }
+}
+
+/// Returns steps and the steps for which they wait, directly or not. A step that waits for a step
+/// of another loop waits for the last round of that loop.
+fn waited_for(
+    first: impl Iterator<Item = usize>,
+    steps: &[ProcessStep],
+    loops: &[Loop],
+) -> BTreeSet<usize> {
+    let mut over = BTreeSet::new();
+    let mut open: Vec<usize> = first.collect();
+    while let Some(number) = open.pop() {
+        if !over.insert(number) {
+            continue;
+        }
+        let waits = steps.get(number).map(|step| step.waits_for(number));
+        for other in waits.into_iter().flatten() {
+            open.push(other);
+            let left = loops
+                .iter()
+                .filter(|one| one.steps.contains(&other) && !one.steps.contains(&number));
+            open.extend(left.flat_map(|one| &one.steps));
+        }
+    }
+    over
 }
 
 /// The fault of a loop whose condition names a step outside it.
@@ -427,6 +436,13 @@ impl Process {
         let conditions = of_steps.chain(of_loops).flatten();
         let mut handlers = conditions.filter(|condition| !condition.is_negated);
         handlers.any(|condition| condition.step == number && condition.test == Test::Ended(end))
+    }
+
+    /// Returns the steps that end before the step with this number begins.
+    pub(crate) fn behind(&self, number: usize) -> BTreeSet<usize> {
+        let mut behind = waited_for(std::iter::once(number), &self.steps, &self.loops);
+        behind.remove(&number);
+        behind
     }
 
     /// Returns the number of the role of the compensation of a step.

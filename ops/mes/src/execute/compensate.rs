@@ -3,9 +3,10 @@
 use skills::SkillValue;
 use tracing::{info, warn};
 
-use super::{Execution, Plant, StepEnd, close};
+use super::sequence::RunProgress;
+use super::{Execution, Plant, StepEnd, close, tools};
 use crate::parameter_fault::{GivenFault, ParameterFault};
-use crate::plan::{KeptStep, Offer, Plan};
+use crate::plan::{AttachedTools, KeptStep, Offer, Plan};
 use crate::process::{GivenParameter, Process, ProcessStep};
 use crate::record::{How, Planned, ProcessRun};
 
@@ -85,6 +86,7 @@ pub(super) async fn resolved(
 
 /// A completed step to compensate.
 struct Undone<'a> {
+    number: usize,
     step: &'a ProcessStep,
     compensation: &'a ProcessStep,
     /// The skill that runs the compensation.
@@ -104,11 +106,13 @@ impl Execution<'_> {
     ///
     /// Nothing is compensated after the caller stopped the run, and while the end of a skill is not
     /// confirmed: its machine may still move.
-    pub(super) async fn compensated(&self, why: String, done: &[Done]) -> String {
+    pub(super) async fn compensated(&self, why: String, progress: &mut RunProgress) -> String {
+        let RunProgress { done, tools, .. } = progress;
         let undone = (1..=done.len()).rev().filter_map(|count| {
             let until = done.get(..count)?;
             let done = until.last()?;
             Some(Undone {
+                number: done.number,
                 step: &done.step,
                 compensation: done.step.compensation.as_deref()?,
                 offer: done.undo.as_ref()?,
@@ -139,7 +143,7 @@ impl Execution<'_> {
                 ..Planned::begins(number, now, plan)
             });
         });
-        match self.undo_all(&undone).await {
+        match self.undo_all(&undone, tools).await {
             Ok(()) => {
                 self.end(How::Done, None);
                 format!("{why}; compensated: {}", names(&undone))
@@ -160,12 +164,13 @@ impl Execution<'_> {
     async fn undo_all<'a>(
         &self,
         undone: &'a [Undone<'a>],
+        tools: &mut AttachedTools,
     ) -> Result<(), (String, &'a [Undone<'a>])> {
         let mut left = undone;
         while let [one, rest @ ..] = left {
             left = rest;
             let name = &one.step.name;
-            if let Err(fault) = self.undo(one).await {
+            if let Err(fault) = self.undo(one, tools).await {
                 warn!(step = name, "the compensation of a step failed: {fault}");
                 let reason = format!("the compensation of `{name}` failed: {fault}");
                 return Err((reason, left));
@@ -176,8 +181,10 @@ impl Execution<'_> {
     }
 
     /// Runs the skill of a compensation.
-    async fn undo(&self, undone: &Undone<'_>) -> Result<(), String> {
+    async fn undo(&self, undone: &Undone<'_>, attached: &mut AttachedTools) -> Result<(), String> {
         let (step, offer) = (undone.compensation, undone.offer);
+        let allows = attached.check_attached(&offer.component);
+        allows.map_err(|fault| format!("{}: {fault}", offer.component_name))?;
         self.teller.step("Compensate").await;
         let opened = self.open(std::slice::from_ref(offer)).await;
         let (opened, skills) = opened.map_err(|fault| {
@@ -189,7 +196,13 @@ impl Execution<'_> {
             Some(skill) => {
                 let done: Vec<_> = undone.until.iter().rev().collect();
                 match self.prepared(step, offer, &done).await {
-                    Ok(values) => self.one(step, (offer, &**skill), values).await,
+                    Ok(values) => {
+                        let tool = tools::named(&values);
+                        let end = self.one(step, (offer, &**skill), values).await;
+                        let number = self.process.compensation_of(undone.number);
+                        tools::ended(self.process, (number, offer, tool), &end, attached);
+                        end
+                    }
                     Err(end) => end,
                 }
             }

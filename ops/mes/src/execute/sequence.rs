@@ -10,8 +10,9 @@ use skills::{PartEnd, RunnableSkill, SkillFault, SkillValue, run_part};
 use tracing::info;
 
 use super::compensate::{self, Done};
+use super::tools;
 use super::{Chosen, Ended, Execution, Fallen, Offer, ProcessStep, SkillRole};
-use crate::plan::TOOL;
+use crate::plan::{AttachedTools, TOOL};
 use crate::process::{BadEnd, Incomparable, Loop, Process, StepCondition, Test};
 
 /// The steps of a run that are over.
@@ -27,6 +28,8 @@ pub(super) struct RunProgress {
     all_rounds: u32,
     /// The loops after their last round.
     left: BTreeSet<usize>,
+    /// The tools that the steps and compensations have attached and detached.
+    pub(super) tools: AttachedTools,
 }
 
 /// The reason why the process goes on behind a step that is not done.
@@ -121,12 +124,40 @@ impl RunProgress {
             done.is_earlier |= over.steps.contains(&done.number);
         }
         self.passed.retain(|step, _| !over.steps.contains(step));
+        self.tools.repeat(&over.steps);
         for (number, inner) in process.loops.iter().enumerate() {
             if inner.is_within(over) {
                 self.left.remove(&number);
                 self.rounds.remove(&number);
             }
         }
+    }
+
+    /// Returns the steps that are passed, or are not over and will be skipped in this round: each of
+    /// their alternatives has a condition that is decided and does not hold.
+    pub(super) fn passed_or_ruled_out(&self, process: &Process) -> Vec<usize> {
+        let steps = process.steps.iter().enumerate();
+        let is_passed = |(number, step): &(usize, &ProcessStep)| {
+            self.passed.contains_key(number)
+                || (!self.is_over(*number) && self.is_ruled_out(process, (*number, step)))
+        };
+        steps.filter(is_passed).map(|(number, _)| number).collect()
+    }
+
+    fn is_ruled_out(&self, process: &Process, (number, step): (usize, &ProcessStep)) -> bool {
+        let does_not_hold = |alternative: &Vec<StepCondition>| {
+            for condition in alternative {
+                let is_decided = self.is_behind(process, (number, condition.step));
+                match self.holds(process, condition) {
+                    Ok(true) if is_decided => {}
+                    Ok(false) if is_decided => return true,
+                    // The fault ends the run when the step is due.
+                    Ok(_) | Err(_) => return false,
+                }
+            }
+            false
+        };
+        !step.when.is_empty() && step.when.iter().all(does_not_hold)
     }
 
     /// Returns whether a step is not skipped: it has no alternatives, or one of them holds.
@@ -298,14 +329,19 @@ impl Execution<'_> {
                     Ok(values) => {
                         running.push(async move {
                             self.teller.step("Step").await;
+                            let tool = tools::named(&values);
                             let end = self.one(step, (offer, &**skill), values).await;
-                            (number, offer, end)
+                            (number, (offer, tool), end)
                         });
                         continue;
                     }
                     Err(end) => (number, offer, end),
                 },
-                Some(next) = running.next() => next,
+                Some((number, (offer, tool), end)) = running.next() => {
+                    let begun = (number, offer, tool);
+                    tools::ended(self.process, begun, &end, &mut progress.tools);
+                    (number, offer, end)
+                }
                 () = self.resumed(), if is_paused => continue,
                 // A step that runs or is prepared ends by itself when the run is stopped.
                 () = self.teller.stopped(),
@@ -350,8 +386,7 @@ impl Execution<'_> {
                 return Err(Ended::Round);
             }
             let skipped = progress.passed.len();
-            let ready = self.ready(chosen, begun, progress);
-            let ready = ready.map_err(Ended::Over)?;
+            let ready = self.ready(chosen, begun, progress)?;
             // A skipped step may be the last one of its round.
             if ready.is_some() || progress.passed.len() == skipped {
                 return Ok(ready);
@@ -360,14 +395,22 @@ impl Execution<'_> {
     }
 
     /// Returns a step that can begin. Steps whose conditions do not hold are skipped. A component
-    /// does one step at a time.
+    /// does one step at a time, and a tool does none while it is attached or detached.
+    ///
+    /// # Errors
+    /// The end of the plan: the step was planned for another tool than the attached one, or the
+    /// reason why the process cannot go on.
     fn ready(
         &self,
         chosen: &Chosen,
         begun: &BTreeMap<usize, &str>,
         progress: &mut RunProgress,
-    ) -> Result<Option<Ready>, String> {
-        let busy: BTreeSet<&str> = begun.values().copied().collect();
+    ) -> Result<Option<Ready>, Ended> {
+        let other_step = || Ended::Over("the plan has another step than the process".to_owned());
+        let busy: BTreeSet<String> = begun
+            .keys()
+            .flat_map(|number| chosen.uses(*number, &progress.tools))
+            .collect();
         for (number, step) in self.process.steps.iter().enumerate() {
             let mut waits = step.waits_for(number).into_iter();
             let is_waiting = waits.any(|other| !progress.is_behind(self.process, (number, other)));
@@ -375,7 +418,7 @@ impl Execution<'_> {
                 continue;
             }
             let allows = progress.allows(self.process, step);
-            if !allows.map_err(|why| format!("{}: {why}", step.name))? {
+            if !allows.map_err(|why| Ended::Over(format!("{}: {why}", step.name)))? {
                 info!(
                     step = step.name,
                     "a step is skipped: its conditions do not hold"
@@ -385,12 +428,18 @@ impl Execution<'_> {
             }
             let mut open = chosen.open.iter();
             let place = open.position(|(role, _)| *role == SkillRole::Alone(number));
-            let place =
-                place.ok_or_else(|| "the plan has another step than the process".to_owned())?;
-            let offer = chosen.open.get(place).map(|(_, offer)| offer);
-            if offer.is_some_and(|offer| !busy.contains(offer.component.as_str())) {
-                return Ok(Some((number, place)));
+            let place = place.ok_or_else(other_step)?;
+            let (_, offer) = chosen.open.get(place).ok_or_else(other_step)?;
+            let mut uses = chosen.uses(number, &progress.tools).into_iter();
+            if uses.any(|component| busy.contains(&component)) {
+                continue;
             }
+            let checked = tools::check(self.process, (number, step), (chosen, offer), progress);
+            checked.map_err(|fault| {
+                let (name, component) = (&step.name, &offer.component_name);
+                Ended::OtherTool(format!("{name}: {component}: {fault}"))
+            })?;
+            return Ok(Some((number, place)));
         }
         Ok(None)
     }
@@ -531,8 +580,8 @@ impl Ended {
     /// Adds the end of another step. No other plan can do the work if it cannot for one of them.
     fn and(&mut self, other: Self) {
         *self = match (std::mem::replace(self, Self::Done), other) {
-            (Self::Done | Self::Round, other) => other,
-            (before, Self::Done | Self::Round) => before,
+            (Self::Done | Self::Round | Self::OtherTool(_), other) => other,
+            (before, Self::Done | Self::Round | Self::OtherTool(_)) => before,
             (Self::Broken(one), Self::Broken(two)) => Self::Broken(format!("{one}; {two}")),
             // All running steps are stopped together.
             (Self::Over(one), Self::Over(two)) if one == two => Self::Over(one),

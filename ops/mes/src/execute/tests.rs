@@ -4,6 +4,7 @@ mod flow;
 mod loops;
 mod queries;
 mod stops;
+mod tools;
 mod unknown;
 
 use std::collections::VecDeque;
@@ -114,7 +115,7 @@ impl Plant for Arc<Fakes> {
 
     fn result(&self, skill: &str, name: &str) -> Result<Option<String>, ParameterFault> {
         match name {
-            "Width" => Ok(None),
+            "Width" | "Tool" => Ok(None),
             other => Err(ParameterFault::Unknown {
                 skill: skill.to_owned(),
                 kind: "result",
@@ -185,6 +186,7 @@ impl FakeSkill {
         match name.rsplit('.').next() {
             Some("Grasp") => vec![("Width".to_owned(), SkillValue::Double(0.03))],
             Some("Count") => vec![("Runs".to_owned(), runs)],
+            Some("Find" | "Swap") => vec![("Tool".to_owned(), "urn:example:other".into())],
             _ => vec![],
         }
     }

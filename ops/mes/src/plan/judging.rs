@@ -1,13 +1,14 @@
 //! The judgement of offers for the needs of a process, with reasons.
 
 use std::cmp::Reverse;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use skills::ParameterType;
 
+use super::tools::{AttachedTools, PlannedToolStep, PossibleTools, ToolStep, ToolUser, ToolWork};
 use super::{Facts, Offer, Plan, PlanCandidate, PlannedNeed, Situation, Team, rank};
 use crate::parameter_fault::ParameterFault;
-use crate::process::{By, Group, Need, Process, ProcessStep, SkillRole, StepJob};
+use crate::process::{By, Group, Loop, Need, Process, ProcessStep, SkillRole, StepJob};
 
 #[derive(Debug, Clone, PartialEq, Eq)]
 enum NotFit {
@@ -26,8 +27,8 @@ pub(super) struct Judging<'a> {
     process: &'a Process,
     situation: Situation<'a>,
     facts: &'a dyn Facts,
-    /// The tools that have to fill roles, with the steps that attach them.
-    tools: BTreeMap<SkillRole, Option<Attached>>,
+    /// The steps that may need a tool.
+    tools: BTreeMap<SkillRole, StepTools>,
     /// The completed steps whose components have to fill roles.
     bound: BTreeMap<SkillRole, Bound<'a>>,
 }
@@ -56,8 +57,63 @@ impl Bound<'_> {
     }
 }
 
-/// A tool by its IRI, and the name of the step that attaches it.
-type Attached = (String, String);
+/// A step that may need a tool, and the tools that may be attached when it begins.
+struct StepTools {
+    number: usize,
+    by: By,
+    behind: BTreeSet<usize>,
+    able: BTreeSet<String>,
+    possible: PossibleTools,
+    loops: Vec<Loop>,
+}
+
+impl StepTools {
+    fn user(&self) -> ToolUser<'_> {
+        ToolUser {
+            number: self.number,
+            by: self.by,
+            behind: &self.behind,
+            able: &self.able,
+            loops: &self.loops,
+        }
+    }
+}
+
+/// Returns the effect of a step on tools, if it has one. `fitting` are the skills that can do it.
+fn planned_tool_step(
+    (number, step): (usize, &ProcessStep),
+    fitting: &[&Offer],
+) -> Option<PlannedToolStep> {
+    let mut types = step
+        .needs
+        .iter()
+        .filter_map(|need| need.skill_type.as_ref());
+    let named = types.find_map(|named| {
+        let mut known = ToolWork::TYPES.into_iter();
+        known.find(|(of, _)| ParameterType::own(of) == *named)
+    });
+    let named = named.map(|(_, work)| work);
+    let work = named.or_else(|| fitting.iter().find_map(|offer| ToolWork::of(offer)))?;
+    let changers = fitting.iter().filter(|offer| ToolWork::of(offer).is_some());
+    let changers: BTreeSet<String> = changers.map(|offer| offer.component.clone()).collect();
+    let given = step.parameters.iter().find(|given| given.name == TOOL);
+    Some(PlannedToolStep {
+        work,
+        changers: changers.into_iter().collect(),
+        same_as: match step.by {
+            By::SameAs(with) => Some(with),
+            By::Any | By::AttachedTool => None,
+        },
+        tool: given
+            .and_then(|given| given.value.as_str())
+            .map(str::to_owned),
+        step: ToolStep {
+            number,
+            name: step.name.clone(),
+        },
+        may_be_skipped: !step.when.is_empty(),
+    })
+}
 
 impl<'a> Judging<'a> {
     pub(super) const fn new(
@@ -76,7 +132,14 @@ impl<'a> Judging<'a> {
 
     /// Requires the tools that steps attach for the steps that they can do.
     pub(super) fn require_tools(&mut self, offers: &[Offer]) {
-        self.tools = self.attached_tools(offers);
+        self.tools = self.tool_users(offers);
+    }
+
+    /// Returns the components with a skill that can do a step of a sequence, whether the tools that
+    /// may be attached allow it or not.
+    fn able(&self, role: SkillRole) -> BTreeSet<String> {
+        let tools = self.tools.get(&role);
+        tools.map(|tools| tools.able.clone()).unwrap_or_default()
     }
 
     /// Returns whether an offer fits a need, and no other run uses its component.
@@ -156,54 +219,61 @@ impl<'a> Judging<'a> {
             .map(|of| of.name.as_str())
     }
 
-    /// Returns the tools that have to fill roles: a tool that a step attaches does all later steps
-    /// that it can do, until another tool is attached.
-    fn attached_tools(&self, offers: &[Offer]) -> BTreeMap<SkillRole, Option<Attached>> {
-        let mut tools = BTreeMap::new();
+    /// Returns the steps that may need a tool, with the tools that may be attached when they begin.
+    fn tool_users(&self, offers: &[Offer]) -> BTreeMap<SkillRole, StepTools> {
+        let mut users = BTreeMap::new();
         if self.process.work != StepJob::Sequence {
-            return tools;
+            return users;
         }
-        let mut attached: Option<Attached> = None;
-        for (number, step) in self.process.steps.iter().enumerate() {
+        let nothing = AttachedTools::default();
+        let now = self.situation.tools.unwrap_or(&nothing);
+        let left = self.process.steps.iter().enumerate();
+        let is_left = |number: usize| {
             let role = SkillRole::Alone(number);
-            // A tool that has failed or is in use stays attached.
-            let fits = |offer: &&Offer| {
-                let mut needs = step.needs.iter();
-                needs.all(|need| self.suits(need, offer).is_ok() && self.takes(need, offer).is_ok())
+            self.kept(role).is_none() && !self.situation.is_passed(self.process, role)
+        };
+        let left = left.filter(|(number, _)| is_left(*number));
+        // A tool that has failed or is in use stays attached.
+        let able: BTreeMap<usize, Vec<&Offer>> = left
+            .clone()
+            .map(|(number, step)| {
+                let fits = |offer: &&Offer| {
+                    let mut needs = step.needs.iter();
+                    needs.all(|need| {
+                        self.suits(need, offer).is_ok() && self.takes(need, offer).is_ok()
+                    })
+                };
+                (number, offers.iter().filter(fits).collect())
+            })
+            .collect();
+        let of_step = |number: usize| able.get(&number).into_iter().flatten().copied();
+        let changes = left.clone().filter_map(|(number, step)| {
+            let planned = planned_tool_step((number, step), &of_step(number).collect::<Vec<_>>())?;
+            Some((number, planned))
+        });
+        let changes: BTreeMap<usize, PlannedToolStep> = changes.collect();
+        for (number, step) in left.filter(|(number, _)| !changes.contains_key(number)) {
+            let tools = StepTools {
+                number,
+                by: step.by,
+                behind: self.process.behind(number),
+                able: of_step(number)
+                    .map(|offer| offer.component.clone())
+                    .collect(),
+                possible: PossibleTools::before(number, self.process, (now, &changes)),
+                loops: self.process.loops.clone(),
             };
-            let is_tool = |of: &str| {
-                let of = ParameterType::own(of).to_string();
-                let named = step
-                    .needs
-                    .iter()
-                    .filter_map(|need| need.skill_type.as_ref());
-                named.into_iter().any(|named| named.to_string() == of)
-                    || offers
-                        .iter()
-                        .filter(fits)
-                        .any(|offer| offer.types.contains(&of))
-            };
-            if is_tool("AttachToolSkillType") || is_tool("ChangeToolSkillType") {
-                let named = step.parameters.iter().find(|given| given.name == TOOL);
-                attached = named
-                    .and_then(|given| given.value.as_str())
-                    .map(|tool| (tool.to_owned(), step.name.clone()));
-                continue;
-            }
-            let can = |tool: &str| {
-                let mut fitting = offers.iter().filter(fits);
-                fitting.any(|offer| offer.component == tool)
-            };
-            let is_bound = match (&attached, step.by) {
-                (_, By::AttachedTool) => true,
-                (Some((tool, _)), By::Any) => can(tool),
-                (None, By::Any) | (_, By::SameAs(_)) => false,
-            };
-            if is_bound {
-                tools.insert(role, attached.clone());
-            }
+            users.insert(SkillRole::Alone(number), tools);
         }
-        tools
+        users
+    }
+
+    /// Returns the number of cases in which an offer is not of the tool that a role needs.
+    pub(super) fn wrong_tools(&self, role: SkillRole, offer: &Offer) -> usize {
+        let tools = self.tools.get(&role);
+        tools.map_or(0, |tools| {
+            tools.possible.wrong(&tools.user(), &offer.component).0
+        })
     }
 
     pub(super) fn planned(
@@ -250,6 +320,7 @@ impl<'a> Judging<'a> {
             candidates,
             role_is: need.role,
             is_bound: self.bound.contains_key(&need.role),
+            able: self.able(need.role),
             is_passed: self.situation.is_passed(self.process, need.role),
         }
     }
@@ -325,14 +396,9 @@ impl<'a> Judging<'a> {
         if let Some(fallen) = fell {
             return because(fallen.why.clone());
         }
-        match self.tools.get(&need.role) {
-            Some(None) => return because("no step before it attaches a tool".to_owned()),
-            Some(Some((tool, step))) if *tool != offer.component => {
-                return because(format!(
-                    "it is not of the tool {tool}, which the step `{step}` attaches"
-                ));
-            }
-            Some(Some(_)) | None => {}
+        if let Some(tools) = self.tools.get(&need.role) {
+            let allows = tools.possible.allows(&tools.user(), &offer.component);
+            allows.map_err(|fault| NotFit::Because(fault.to_string()))?;
         }
         self.takes(need, offer)?;
         let capability = need.capability.as_ref().map(|wanted| {
@@ -387,6 +453,10 @@ impl<'a> Judging<'a> {
         let Some(chosen) = chosen else {
             return "it would fit this step".to_owned();
         };
+        let wrong = self.wrong_tools(need.role, offer);
+        if wrong > self.wrong_tools(need.role, chosen) {
+            return "it would fit only while another tool is attached".to_owned();
+        }
         let (mut best, mut rank) = (
             rank(&[need], chosen, self.facts),
             rank(&[need], offer, self.facts),

@@ -1,0 +1,265 @@
+//! The tools that steps attach and detach.
+
+use super::*;
+use crate::process::{BadEnd, Compare, Loop, StepCondition, Test};
+
+const OTHER: &str = "urn:example:other";
+
+fn named(tool: &str) -> GivenParameter {
+    GivenParameter {
+        name: "ToolAppUri".into(),
+        value: tool.into(),
+        unit: None,
+        result: None,
+        query: None,
+    }
+}
+
+fn attach(number: usize, name: &str, tool: &str) -> ProcessStep {
+    ProcessStep {
+        parameters: vec![named(tool)],
+        ..alone(number, name, "ChangeToolSkillType")
+    }
+}
+
+/// A grasp by the attached tool.
+fn grasp(number: usize) -> ProcessStep {
+    ProcessStep {
+        by: By::AttachedTool,
+        ..alone(number, "grasp", "GraspSkillType")
+    }
+}
+
+fn runs(compare: Compare, count: i32, is_negated: bool) -> Vec<Vec<StepCondition>> {
+    vec![vec![StepCondition {
+        step: 0,
+        test: Test::Result {
+            name: "Runs".into(),
+            compare,
+            value: count.into(),
+        },
+        is_negated,
+    }]]
+}
+
+/// A sequence that counts first.
+fn sequence(steps: Vec<ProcessStep>) -> Process {
+    let count = alone(0, "count", "CountType");
+    Process {
+        work: StepJob::Sequence,
+        steps: std::iter::once(count).chain(steps).collect(),
+        ..process()
+    }
+}
+
+/// A changer and two grippers.
+fn changing() -> Fakes {
+    let mut offers = [gripper("gripper"), gripper("other")].concat();
+    offers.push(offer("one", "Count", "CountType"));
+    offers.push(offer("changer", "Change", "ChangeToolSkillType"));
+    offers.push(offer("changer", "Detach", "DetachToolSkillType"));
+    offers.push(offer("changer", "Swap", "SwapType"));
+    offers.push(offer("one", "Find", "FindType"));
+    plant(offers)
+}
+
+fn ran(fakes: &Fakes) -> Vec<String> {
+    let mut journal = fakes.journal.lock().unwrap().clone();
+    journal.retain(|line| line != "closed");
+    journal
+}
+
+#[tokio::test]
+async fn a_step_is_done_by_the_tool_that_conditional_steps_have_attached() {
+    for by in [By::Any, By::AttachedTool] {
+        for (compare, expected) in [
+            (Compare::Equal, "gripper.Grasp"),
+            (Compare::Greater, "other.Grasp"),
+        ] {
+            let mut process = sequence(vec![
+                attach(1, "attach", OTHER),
+                attach(2, "attach another", GRIPPER),
+                ProcessStep { by, ..grasp(3) },
+            ]);
+            process.steps[2].when = runs(compare, 1, false);
+            let (run, fakes, _) = executed(changing(), &process).await;
+            assert_eq!((run.outcome, &run.reason), (How::Done, &None));
+            assert_eq!(ran(&fakes).last().map(String::as_str), Some(expected));
+        }
+    }
+}
+
+#[tokio::test]
+async fn each_alternative_has_a_tool_and_steps_of_its_own() {
+    for (compare, expected) in [
+        (Compare::Equal, ["changer.Change 1", "gripper.Grasp"]),
+        (Compare::Greater, ["changer.Change 1", "other.Grasp"]),
+    ] {
+        // Only the tool of each alternative can do its steps.
+        let own = |number, of: &str| ProcessStep {
+            by: By::AttachedTool,
+            ..alone(number, of, of)
+        };
+        let mut process = sequence(vec![
+            attach(1, "one", GRIPPER),
+            attach(2, "two", OTHER),
+            own(3, "SuckType"),
+            own(4, "HoldType"),
+            grasp(5),
+        ]);
+        for (number, is_negated) in [(1, false), (2, true), (3, false), (4, true)] {
+            process.steps[number].when = runs(compare, 1, is_negated);
+        }
+        let fakes = changing();
+        let more = [
+            offer("gripper", "Suck", "SuckType"),
+            offer("other", "Hold", "HoldType"),
+        ];
+        fakes.offers.lock().unwrap().extend(more);
+        let (run, fakes, _) = executed(fakes, &process).await;
+        assert_eq!((run.outcome, &run.reason), (How::Done, &None));
+        let ran = ran(&fakes);
+        assert_eq!([&*ran[1], &*ran[3]], expected, "{ran:?}");
+    }
+}
+
+#[tokio::test]
+async fn each_round_of_a_loop_uses_the_tool_that_is_attached_then() {
+    let mut process = sequence(vec![
+        attach(1, "attach", GRIPPER),
+        grasp(2),
+        alone(3, "count again", "CountType"),
+        attach(4, "change", OTHER),
+    ]);
+    let mut again = runs(Compare::Less, 3, false);
+    again[0][0].step = 3;
+    process.loops = vec![Loop {
+        steps: [2, 3, 4].into(),
+        again,
+        rounds: 5,
+    }];
+    let (run, fakes, _) = executed(changing(), &process).await;
+    assert_eq!((run.outcome, &run.reason), (How::Done, &None));
+    let mut grasps = ran(&fakes);
+    grasps.retain(|line| line.ends_with("Grasp"));
+    assert_eq!(grasps, ["gripper.Grasp", "other.Grasp"]);
+}
+
+#[tokio::test]
+async fn the_tool_that_a_result_names_does_the_later_steps() {
+    let mut find = attach(2, "attach", "");
+    find.parameters[0].value = serde_json::Value::Null;
+    find.parameters[0].result = Some(ResultOf {
+        step: 1,
+        name: "Tool".into(),
+    });
+    for by in [By::Any, By::AttachedTool] {
+        let steps = vec![
+            alone(1, "find", "FindType"),
+            find.clone(),
+            ProcessStep { by, ..grasp(3) },
+        ];
+        let (run, fakes, _) = executed(changing(), &sequence(steps)).await;
+        assert_eq!((run.outcome, &run.reason), (How::Done, &None));
+        assert_eq!(ran(&fakes)[2..], ["changer.Change 1", "other.Grasp"]);
+    }
+}
+
+#[tokio::test]
+async fn the_tool_that_a_skill_reports_is_the_attached_one() {
+    let mut fakes = changing();
+    let offers = fakes.offers.get_mut().unwrap();
+    offers.retain(|offer| offer.name != "Change");
+    let swap = offers
+        .iter_mut()
+        .find(|offer| offer.name == "Swap")
+        .unwrap();
+    let of = ParameterType::own("ChangeToolSkillType");
+    swap.types = vec![of.to_string()];
+    let process = sequence(vec![attach(1, "attach", GRIPPER), grasp(2)]);
+    let (run, fakes, _) = executed(fakes, &process).await;
+    assert_eq!((run.outcome, &run.reason), (How::Done, &None));
+    // It names the gripper, and has attached the other one.
+    assert_eq!(run.plans.len(), 2);
+    assert_eq!(ran(&fakes)[1..], ["changer.Swap 1", "other.Grasp"]);
+}
+
+#[tokio::test]
+async fn no_tool_is_used_after_its_step_failed() {
+    for (by, expected) in [
+        (
+            By::AttachedTool,
+            "the tool that the step `attach` attaches is not known",
+        ),
+        (
+            By::Any,
+            "it is not known whether this tool is attached after the step `attach`",
+        ),
+    ] {
+        let mut handles = alone(2, "handle", "CountType");
+        handles.when = vec![vec![StepCondition {
+            step: 1,
+            test: Test::Ended(BadEnd::Failed),
+            is_negated: false,
+        }]];
+        let steps = vec![
+            attach(1, "attach", GRIPPER),
+            handles,
+            ProcessStep { by, ..grasp(3) },
+        ];
+        let mut fakes = changing();
+        fakes.fails_at = Some("changer.Change");
+        // Another gripper is a component that can, but it is not the attached tool.
+        let offers = fakes.offers.get_mut().unwrap();
+        offers.retain(|offer| by == By::AttachedTool || offer.component_name != "other");
+        let (run, fakes, _) = executed(fakes, &sequence(steps)).await;
+        assert_eq!(run.outcome, How::Failed, "{run:?}");
+        let reason = run.reason.unwrap();
+        assert!(reason.contains(expected), "{reason}");
+        assert_eq!(ran(&fakes), ["one.Count", "changer.Change 1", "one.Count"]);
+    }
+}
+
+#[tokio::test]
+async fn a_tool_that_is_detached_undoes_nothing() {
+    let mut process = sequence(vec![
+        attach(1, "attach", GRIPPER),
+        grasp(2),
+        attach(3, "change", OTHER),
+        alone(4, "fail", "FailType"),
+    ]);
+    process.steps[2].compensation = undone_by(2, 5, "ReleaseSkillType");
+    let mut fakes = changing();
+    fakes
+        .offers
+        .get_mut()
+        .unwrap()
+        .push(offer("one", "Fail", "FailType"));
+    fakes.fails_at = Some("one.Fail");
+    let (run, fakes, _) = executed(fakes, &process).await;
+    let reason = run.reason.unwrap();
+    let expected =
+        "the compensation of `grasp` failed: gripper: the step `change` detaches this tool";
+    assert!(reason.contains(expected), "{reason}");
+    assert_eq!(ran(&fakes).last().map(String::as_str), Some("one.Fail"));
+}
+
+#[tokio::test]
+async fn a_tool_waits_while_another_branch_detaches_it() {
+    // The grasp does not wait for the step that detaches its tool.
+    let mut process = sequence(vec![
+        attach(1, "attach", GRIPPER),
+        alone(2, "detach", "DetachToolSkillType"),
+        grasp(3),
+    ]);
+    process.steps[3].after = Some(vec![1]);
+    let (run, fakes, _) = executed(changing(), &process).await;
+    assert_eq!(run.outcome, How::Failed);
+    let reason = run.reason.unwrap();
+    let expected = "the step `detach` detaches this tool";
+    assert!(reason.contains(expected), "{reason}");
+    assert_eq!(
+        ran(&fakes).last().map(String::as_str),
+        Some("changer.Detach")
+    );
+}

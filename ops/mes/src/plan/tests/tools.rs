@@ -1,0 +1,159 @@
+//! The tools that steps attach and detach.
+
+use super::*;
+use crate::process::{BadEnd, Loop, StepCondition, Test};
+
+fn named(tool: &str) -> Vec<GivenParameter> {
+    vec![GivenParameter {
+        value: tool.into(),
+        result: None,
+        ..result_of(0, "", "ToolAppUri")
+    }]
+}
+
+/// A changer and two grippers.
+fn offers() -> Vec<Offer> {
+    let skill = |name: &str, of: &str| {
+        offer(
+            "changer",
+            name,
+            &[of],
+            &[&format!("urn:{}", name.to_lowercase())],
+        )
+    };
+    let changer = vec![
+        skill("Change", "ChangeToolSkillType"),
+        skill("Detach", "DetachToolSkillType"),
+    ];
+    [changer, gripper("finger"), gripper("vacuum")].concat()
+}
+
+/// A condition that is decided in the run.
+fn if_failed(step: usize) -> Vec<Vec<StepCondition>> {
+    vec![vec![StepCondition {
+        step,
+        test: Test::Ended(BadEnd::Failed),
+        is_negated: true,
+    }]]
+}
+
+#[test]
+fn a_detached_tool_does_no_later_step() {
+    let mut process = sequence(&["urn:change", GRASP, "urn:detach", GRASP]);
+    process.steps[0].parameters = named("urn:example:vacuum");
+    let found = plan(&process, &offers(), &[]);
+    let expected = [
+        "changer#Change",
+        "vacuum#Grasp",
+        "changer#Detach",
+        "finger#Grasp",
+    ];
+    assert_eq!(chosen(&found, 4), expected);
+    assert_eq!(
+        why(&found, SkillRole::Alone(3), "vacuum#Grasp"),
+        "the step `step 2` detaches this tool"
+    );
+    process.steps[3].by = By::AttachedTool;
+    let none = plan(&process, &offers(), &[]);
+    assert!(!none.is_complete());
+    let expected = "finger.Grasp: the step `step 2` detaches the tool, and no step after it";
+    assert!(none.missing().contains(expected), "{}", none.missing());
+}
+
+#[test]
+fn a_step_that_may_be_skipped_leaves_both_tools_possible() {
+    let mut process = sequence(&["urn:change", "urn:change", GRASP]);
+    process.steps[0].parameters = named("urn:example:vacuum");
+    process.steps[1].parameters = named("urn:example:finger");
+    let certain = plan(&process, &offers(), &[]);
+    assert_eq!(chosen(&certain, 3)[2], "finger#Grasp");
+    process.steps[1].when = if_failed(0);
+    process.steps[2].by = By::AttachedTool;
+    for only in ["finger", "vacuum"] {
+        let mut offers = offers();
+        offers.retain(|offer| ["changer", only].contains(&&*offer.component_name));
+        let found = plan(&process, &offers, &[]);
+        assert!(found.is_complete(), "{}", found.missing());
+    }
+    // The step is passed.
+    let situation = Situation {
+        passed: &[1],
+        ..Situation::default()
+    };
+    let found = super::super::plan(&process, &offers(), situation, &KNOWN);
+    assert_eq!(
+        found.chosen(SkillRole::Alone(2)),
+        Some("urn:example:vacuum#Grasp")
+    );
+}
+
+#[test]
+fn a_choice_is_right_for_as_many_cases_as_possible() {
+    let mut process = sequence(&["urn:change", GRASP]);
+    process.steps[0].parameters = named("urn:example:vacuum");
+    process.steps[0].when = if_failed(0);
+    let found = plan(&process, &offers(), &[]);
+    assert_eq!(chosen(&found, 2)[1], "vacuum#Grasp");
+    assert_eq!(
+        why(&found, SkillRole::Alone(1), "finger#Grasp"),
+        "it would fit only while another tool is attached"
+    );
+}
+
+#[test]
+fn a_tool_that_a_result_names_is_not_the_tool_before_it() {
+    let mut process = sequence(&["urn:change", "urn:change", GRASP]);
+    process.steps[0].parameters = named("urn:example:vacuum");
+    process.steps[1].parameters = vec![result_of(0, "Change", "ToolAppUri")];
+    process.steps[2].by = By::AttachedTool;
+    let mut offers = offers();
+    offers.retain(|offer| offer.component_name != "vacuum");
+    let found = plan(&process, &offers, &[]);
+    assert_eq!(chosen(&found, 3)[2], "finger#Grasp");
+}
+
+#[test]
+fn the_tool_of_another_branch_is_not_the_attached_tool() {
+    let mut process = sequence(&["urn:change", GRASP, GRASP]);
+    process.steps[0].parameters = named("urn:example:vacuum");
+    process.steps[1].after = Some(vec![]);
+    process.steps[1].by = By::AttachedTool;
+    process.steps[2].after = Some(vec![0]);
+    let found = plan(&process, &offers(), &[]);
+    let expected = "step 1 needs urn:example:capability:grasp for skill (finger.Grasp: no step before it attaches a tool";
+    assert!(found.missing().contains(expected), "{}", found.missing());
+    process.steps[1].by = By::Any;
+    let found = plan(&process, &offers(), &[]);
+    assert_eq!(
+        chosen(&found, 3),
+        ["changer#Change", "finger#Grasp", "vacuum#Grasp"]
+    );
+}
+
+#[test]
+fn the_tools_of_the_run_come_before_those_of_the_steps_that_are_left() {
+    let mut process = sequence(&[GRASP, "urn:change"]);
+    process.steps[1].parameters = named("urn:example:finger");
+    process.loops = vec![Loop {
+        steps: [0, 1].into(),
+        again: Vec::new(),
+        rounds: 2,
+    }];
+    let mut tools = AttachedTools::default();
+    let by = ToolStep {
+        number: 1,
+        name: "step 1".to_owned(),
+    };
+    tools.attach(
+        "urn:example:changer",
+        Some("urn:example:vacuum".to_owned()),
+        by,
+    );
+    tools.repeat(&[0, 1].into());
+    let situation = Situation {
+        tools: Some(&tools),
+        ..Situation::default()
+    };
+    let found = super::super::plan(&process, &offers(), situation, &KNOWN);
+    assert_eq!(chosen(&found, 2), ["vacuum#Grasp", "changer#Change"]);
+}
