@@ -133,8 +133,8 @@ impl RunProgress {
         }
     }
 
-    /// Returns the steps that are passed, or are not over and will be skipped in this round: each of
-    /// their alternatives has a condition that is decided and does not hold.
+    /// Returns the steps that are passed, or are not over and will be skipped in this round: each
+    /// of their alternatives has a condition that is decided and does not hold.
     pub(super) fn passed_or_ruled_out(&self, process: &Process) -> Vec<usize> {
         let steps = process.steps.iter().enumerate();
         let is_passed = |(number, step): &(usize, &ProcessStep)| {

@@ -129,8 +129,8 @@ impl AttachedTools {
         }
     }
 
-    /// Records that the tool of a changer is not known after a step, such as one that failed: neither
-    /// the tool that was attached nor the named tool is known to be attached.
+    /// Records that the tool of a changer is not known after a step, such as one that failed:
+    /// neither the tool that was attached nor the named tool is known to be attached.
     pub(crate) fn lose(&mut self, changer: &str, tool: Option<String>, by: ToolStep) {
         let before = self.take(changer).and_then(|before| before.tool);
         for tool in before.into_iter().chain(tool) {
