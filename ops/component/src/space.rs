@@ -513,16 +513,11 @@ impl Speaker {
     fn result(&self, outcome: &RunOutcome) {
         let [.., result] = self.topics;
         let [names, values] = named(&outcome.results);
-        let RunOutcome {
-            run,
-            succeeded,
-            message,
-            ..
-        } = outcome;
+        let RunOutcome { run, succeeded, .. } = outcome;
         let values = [
             (*run).into(),
             (*succeeded).into(),
-            message.as_str().into(),
+            outcome.shown_message().as_ref().into(),
             names,
             values,
         ];

@@ -14,7 +14,7 @@ pub(crate) use discover::{Discover, DiscoverArguments};
 pub(crate) use live::{
     AskArguments, CallArguments, EchoArguments, GroupArguments, Hz, InfoArguments, InfoSkill,
     ListArguments, ListSkills, MesAt, NamedTarget, PlanArguments, Skills, SkillsVerb,
-    SourceArguments, SourceAt, SourceVerb, Top, Trace, TypesArguments, WatchSkills,
+    SourceArguments, SourceAt, SourceVerb, StartSkill, Top, Trace, TypesArguments, WatchSkills,
 };
 pub(crate) use recording::{RecordArguments, ReplayArguments, Viewers};
 pub(crate) use tap::TapArguments;

@@ -185,8 +185,9 @@ impl Actor {
         // BadNotSupported only while it is Running.
         let is_running = self.program.state() == ProgramMachineState::Running;
         let is_its_capability = method == ProgramMethod::Suspend && is_running;
-        let is_made_ready = given.readies && self.program.state() == ProgramMachineState::Halted;
-        if is_made_ready && self.now.needs_reset {
+        let is_halted = self.program.state() == ProgramMachineState::Halted;
+        let is_made_ready = given.readies && is_halted;
+        if method == ProgramMethod::Start && is_halted && self.now.needs_reset {
             return Err(unknown_outcome(self.now.run));
         }
         if !self.program.is_executable(method) && !is_its_capability && !is_made_ready {
@@ -597,7 +598,7 @@ impl Actor {
 
     fn keep(&mut self, outcome: RunOutcome) {
         let outcome = self.history.keep(outcome);
-        self.now.outcome = Some(Arc::clone(&outcome));
+        self.now.end(&outcome);
         self.tell(SkillEvent::Outcome(&outcome));
     }
 
@@ -617,9 +618,6 @@ impl Actor {
             if is_work(transition.from) {
                 self.authority.end(&self.facts.name);
             }
-        }
-        if transition.to == ProgramMachineState::Ready {
-            self.now.needs_reset = false;
         }
         debug!(skill = self.facts.name, "{}: {message}", transition.name);
         self.tell(SkillEvent::Transition(&Transitioned {

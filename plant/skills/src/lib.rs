@@ -66,7 +66,8 @@ pub use part::{JobObserver, PartEnd, run_part};
 pub use refusal::{RefusalCode, SkillRefusal};
 pub use runs::{COMPOSITE_HALT_TIMEOUT, LocalRun, RunnableSkill};
 pub use shown::{
-    LastCall, ProgramDiagnostic, RunOutcome, SkillEvent, SkillObserver, SkillSnapshot, Transitioned,
+    LastCall, ProgramDiagnostic, RunOutcome, SkillEvent, SkillObserver, SkillSnapshot,
+    Transitioned, UNKNOWN_OUTCOME,
 };
 pub use skill::Skill;
 pub use skill_fault::SkillFault;

@@ -1,5 +1,6 @@
 //! The visible state of a skill and its observers.
 
+use std::borrow::Cow;
 use std::sync::Arc;
 use std::time::SystemTime;
 
@@ -65,11 +66,18 @@ impl SkillSnapshot {
         }
     }
 
-    /// Records a transition at this time.
+    /// Records a transition at this time. A skill that is Ready needs no Reset.
     pub(crate) fn enter(&mut self, transition: &'static Transition, at: SystemTime) {
         self.state = transition.to;
         self.last = Some(transition);
         self.since = at;
+        self.needs_reset &= transition.to != ProgramMachineState::Ready;
+    }
+
+    /// Records the outcome of the newest run. If it is unknown, the skill needs a Reset.
+    pub(crate) fn end(&mut self, outcome: &Arc<RunOutcome>) {
+        self.outcome = Some(Arc::clone(outcome));
+        self.needs_reset |= outcome.unknown;
     }
 }
 
@@ -106,6 +114,25 @@ pub struct RunOutcome {
     /// The steps and their parts in order, each with the seconds since the start of the run: `0.412
     /// MovePick`.
     pub trace: Vec<String>,
+}
+
+/// The words in the message of an outcome that is unknown, for observers that receive a message
+/// only.
+pub const UNKNOWN_OUTCOME: &str = "the outcome is unknown";
+
+impl RunOutcome {
+    /// Returns the message for observers that receive a message only: it says that the outcome is
+    /// unknown, if it is.
+    #[must_use]
+    pub fn shown_message(&self) -> Cow<'_, str> {
+        match (self.unknown, self.message.as_str()) {
+            (true, "") => Cow::Borrowed(UNKNOWN_OUTCOME),
+            (true, message) if !message.contains(UNKNOWN_OUTCOME) => {
+                Cow::Owned(format!("{UNKNOWN_OUTCOME}: {message}"))
+            }
+            (_, message) => Cow::Borrowed(message),
+        }
+    }
 }
 
 /// The content of ProgramDiagnostic (OPC 10000-10, 5.2.9).
@@ -171,5 +198,66 @@ pub trait SkillObserver: Send + Sync + 'static {
     /// Reports that the server of a mirrored skill is lost; no further events follow.
     fn lost(&self, why: &str) {
         let _is_told_otherwise = why;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use program::{Nature, ProgramInstance, Rest};
+
+    use super::*;
+
+    #[test]
+    fn an_unknown_outcome_needs_a_reset_until_the_skill_is_ready() {
+        let mut program = ProgramInstance::new(Nature {
+            can_suspend: false,
+            rests_in: Rest::Halted,
+        });
+        let at = SystemTime::UNIX_EPOCH;
+        let mut shown = SkillSnapshot::first(program.state(), [false; 5], at);
+        let mut call = |method| program.call(method).expect("it is possible");
+        shown.enter(call(ProgramMethod::Reset), at);
+        shown.enter(call(ProgramMethod::Start), at);
+        let outcome = |unknown| {
+            Arc::new(RunOutcome {
+                run: 1,
+                succeeded: false,
+                unknown,
+                message: String::new(),
+                results: Vec::new(),
+                trace: Vec::new(),
+            })
+        };
+        shown.end(&outcome(false));
+        assert!(!shown.needs_reset, "it failed");
+        shown.end(&outcome(true));
+        shown.enter(call(ProgramMethod::Halt), at);
+        assert!(shown.needs_reset);
+        shown.enter(call(ProgramMethod::Reset), at);
+        assert!(!shown.needs_reset);
+    }
+
+    #[test]
+    fn a_message_says_that_the_outcome_is_unknown() {
+        let outcome = |unknown, message: &str| RunOutcome {
+            run: 1,
+            succeeded: false,
+            unknown,
+            message: message.to_owned(),
+            results: Vec::new(),
+            trace: Vec::new(),
+        };
+        for (unknown, message, shown) in [
+            (true, "no response", "the outcome is unknown: no response"),
+            (true, "", "the outcome is unknown"),
+            (
+                true,
+                "halted; the outcome is unknown",
+                "halted; the outcome is unknown",
+            ),
+            (false, "nothing was gripped", "nothing was gripped"),
+        ] {
+            assert_eq!(outcome(unknown, message).shown_message(), shown);
+        }
     }
 }

@@ -150,10 +150,20 @@ pub(crate) enum SkillsVerb {
     List(ListSkills),
     /// Show a skill: its parameters, its state, the end of its last run
     Info(InfoSkill),
-    /// Start a skill, after a Reset if it is Halted, and follow it to its end; Ctrl-C halts it
-    Start(CallArguments),
+    /// Start a skill, after a Reset if it is Halted, and follow it to its end; Ctrl-C halts it. A
+    /// skill whose last outcome is unknown is not reset
+    Start(StartSkill),
     /// Watch transitions, progress and results of skills
     Watch(WatchSkills),
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct StartSkill {
+    /// Reset the skill also if its last outcome is unknown, after a look at the machine
+    #[arg(long)]
+    pub(crate) reset: bool,
+    #[command(flatten)]
+    pub(crate) call: CallArguments,
 }
 
 #[derive(Debug, Args)]

@@ -545,9 +545,20 @@ fn remedy(described: &AnnouncedDescription, why: &str) -> Option<String> {
         return Some(format!("this call takes {}", described::list(takes)));
     }
     let skill = described.name.strip_suffix(".Start")?;
+    if why.contains("is unknown; Reset makes the skill ready") {
+        return Some(look_first(skill));
+    }
     why.contains("in the state Halted").then(|| {
         format!("reset it first, `ua-space call {skill}.Reset`; `ua-space skills start` does both")
     })
+}
+
+/// Returns the next step after an unknown outcome.
+pub(super) fn look_first(skill: &str) -> String {
+    format!(
+        "the machine may move: look at it, then `ua-space call {skill}.Reset`, or \
+         `ua-space skills start {skill} --reset`"
+    )
 }
 
 /// The bit of a StatusCode that marks the severity Bad.
@@ -580,6 +591,14 @@ mod tests {
             "{help}"
         );
         assert_eq!(remedy(&described("handling.Place.Halt"), why), None);
+        let unknown =
+            "BadInvalidState: the outcome of run 5 is unknown; Reset makes the skill ready";
+        let help = remedy(&described("handling.Place.Start"), unknown);
+        let help = help.expect("there is a next step");
+        assert!(
+            help.contains("look at it, then `ua-space call handling.Place.Reset`"),
+            "{help}"
+        );
         let running = "BadInvalidState: Start is not possible in the state Running";
         assert_eq!(remedy(&described("handling.Place.Start"), running), None);
     }

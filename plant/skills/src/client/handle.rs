@@ -13,8 +13,9 @@ use super::find::{FoundParameter, FoundSkill};
 use super::{called, lost, refused};
 use crate::grip::GripPoint;
 use crate::model::{DEVICES, POWER_OFF};
+use crate::refusal::RefusalCode;
 use crate::runs::{HALTS_WITHIN, RunnableSkill, goes_on};
-use crate::shown::RunOutcome;
+use crate::shown::{RunOutcome, UNKNOWN_OUTCOME};
 use crate::skill_fault::SkillFault;
 use crate::value::SkillValue;
 use crate::variant::{from_pairs, from_variant, to_pairs, to_variant};
@@ -224,6 +225,7 @@ impl SkillHandle {
 
     async fn step_by_step(&self, parameters: Vec<(String, SkillValue)>) -> Result<u32, SkillFault> {
         if self.state().await?.state == ProgramMachineState::Halted {
+            self.refuse_unknown().await?;
             let reset = self.call(ProgramMethod::Reset).await;
             // The Reset of a caller that gave up earlier may have taken effect first.
             if reset.is_err() && self.state().await?.state != ProgramMachineState::Ready {
@@ -231,6 +233,18 @@ impl SkillHandle {
             }
         }
         self.start(parameters).await
+    }
+
+    /// Refuses to reset a skill whose newest run may go on.
+    async fn refuse_unknown(&self) -> Result<(), SkillFault> {
+        let outcome = self.outcome(0, ProgramMachineState::Halted).await?;
+        match outcome.unknown {
+            false => Ok(()),
+            true => Err(SkillFault::Refused {
+                status: RefusalCode::InvalidState.name().to_owned(),
+                text: format!("{UNKNOWN_OUTCOME}; Reset makes the skill ready"),
+            }),
+        }
     }
 
     /// Returns the outcome of a run of any client; `None` while the run is in progress. Run 0 is

@@ -591,6 +591,9 @@ async fn stopped_work_without_a_known_end_needs_a_reset() {
         assert_eq!(bench.skill.outcome(1).unwrap().message, why);
         let refused = bench.skill.execute(ME, Vec::new(), None).await.unwrap_err();
         assert_eq!(refused.code, RefusalCode::InvalidState, "{refused}");
+        let refused = bench.call(ProgramMethod::Start).await.unwrap_err();
+        let expected = "the outcome of run 1 is unknown; Reset makes the skill ready";
+        assert!(refused.to_string().contains(expected), "{refused}");
         bench.call(ProgramMethod::Reset).await.unwrap();
         assert!(!bench.skill.shown().needs_reset);
         assert_eq!(bench.skill.execute(ME, Vec::new(), None).await, Ok(2));

@@ -112,12 +112,27 @@ impl SeenSkill {
                         (0, true) => self.number(),
                         (run, _) => run,
                     };
+                    if self.now.state == ProgramMachineState::Halted {
+                        self.last_outcome().await;
+                    }
                     self.tell(SkillEvent::Step);
                     return;
                 }
                 Err(fault) => debug!("a skill does not say how it is: {fault}"),
             }
             sleep(LOOK).await;
+        }
+    }
+
+    /// Reads the outcome of the run before this program saw the skill. If it is unknown, the skill
+    /// needs a Reset.
+    async fn last_outcome(&mut self) {
+        let outcome = self.ended(ProgramMachineState::Halted).await;
+        // A skill that has had no run has no outcome.
+        if self.now.run > 0 || outcome.unknown {
+            let outcome = self.outcomes.keep(outcome);
+            self.now.end(&outcome);
+            self.tell(SkillEvent::Outcome(&outcome));
         }
     }
 
@@ -250,7 +265,7 @@ impl SeenSkill {
         if ends {
             let outcome = self.outcomes.keep(self.ended(transition.to).await);
             message.clone_from(&outcome.message);
-            self.now.outcome = Some(Arc::clone(&outcome));
+            self.now.end(&outcome);
             self.tell(SkillEvent::Outcome(&outcome));
         }
         self.now.enter(transition, clock());
