@@ -25,6 +25,9 @@ pub enum Reason {
     Untyped,
     /// The value does not match the message type of the topic.
     Mismatch,
+    /// The source of the value is lost: its status is Bad, and it has no value of the message type
+    /// of the topic.
+    NoValue,
     /// The sequence number was already received.
     Duplicate,
     /// The sample is older than the last delivered sample.
@@ -101,7 +104,7 @@ pub enum Reason {
 
 impl Reason {
     /// All reasons in the order of their counters.
-    pub const ALL: [Self; 40] = [
+    pub const ALL: [Self; 41] = [
         Self::Looped,
         Self::SpaceTaken,
         Self::NotInSpace,
@@ -111,6 +114,7 @@ impl Reason {
         Self::Invalid,
         Self::Untyped,
         Self::Mismatch,
+        Self::NoValue,
         Self::Duplicate,
         Self::Stale,
         Self::Repeat,
@@ -157,6 +161,7 @@ impl Reason {
             Self::Invalid => "invalid",
             Self::Untyped => "untyped",
             Self::Mismatch => "mismatch",
+            Self::NoValue => "no_value",
             Self::Duplicate => "duplicate",
             Self::Stale => "stale",
             Self::Repeat => "repeat",
@@ -204,6 +209,7 @@ impl Reason {
             Self::Invalid => "the writer marked the message as invalid",
             Self::Untyped => "the local message type of the topic is not known",
             Self::Mismatch => "the value does not fit the message type of the topic",
+            Self::NoValue => "the source of the value is lost",
             Self::Duplicate => "the sequence number was already received",
             Self::Stale => "the sample is older than the last delivered sample",
             Self::Repeat => "a repetition for late joiners, which was already delivered",
@@ -249,6 +255,7 @@ impl Reason {
                 | Self::Unsupported
                 | Self::Invalid
                 | Self::Mismatch
+                | Self::NoValue
                 | Self::Duplicate
                 | Self::Stale
                 | Self::Late

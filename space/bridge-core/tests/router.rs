@@ -14,7 +14,8 @@ use messages::{Dialect, Selection, TypeRegistry};
 use uadp::discovery::{Probe, WireArray};
 use uadp::{
     BuiltinType, DataSetHeader, Extras, Fields, GroupHeader, MessageKind, NetworkHeader,
-    NetworkMessage, NetworkMessageEncoder, PublisherId, Scalar, SecurityHeader, Timestamp, Variant,
+    NetworkMessage, NetworkMessageEncoder, PublisherId, Scalar, SecurityHeader, StatusCode,
+    Timestamp, Variant,
 };
 
 /// A bridge under test with a manual clock.
@@ -362,6 +363,37 @@ fn a_value_of_another_type_than_the_topic_has_is_a_mismatch() {
         "{}",
         notices[0].detail
     );
+}
+
+#[test]
+fn a_value_whose_source_is_lost_is_not_a_mismatch() {
+    let mut bench = Bench::new(1, Local::Ros1);
+    bench.bind(topic("ua_2_5_10"), "std_msgs/Float64");
+    let lost = |sequence, status| Frame {
+        header: DataSetHeader {
+            status,
+            ..Frame::new(10, sequence, 0).header
+        },
+        ..Frame::new(10, sequence, 0)
+    };
+    // BadNoCommunication in the place of the value, and in the header of a null value.
+    let status = Variant::Scalar(Scalar::StatusCode(StatusCode(0x8031_0000)));
+    bench.hear(&lost(1, None).bytes_with(&status));
+    bench.hear(&lost(2, Some(0x8031)).bytes_with(&Variant::Null));
+    let notices = bench.notices();
+    assert_eq!(notices[0].reason, Reason::NoValue);
+    assert!(
+        notices[0].detail.contains("0x80310000"),
+        "{}",
+        notices[0].detail
+    );
+    assert_eq!(bench.dropped(Reason::NoValue), 2);
+    // A status that is not Bad, and a null value that is not, do not fit the type.
+    let good = Variant::Scalar(Scalar::StatusCode(StatusCode(0)));
+    bench.hear(&lost(3, None).bytes_with(&good));
+    bench.hear(&lost(4, None).bytes_with(&Variant::Null));
+    assert_eq!(bench.dropped(Reason::Mismatch), 2);
+    assert_eq!(bench.dropped(Reason::NoValue), 2);
 }
 
 #[test]

@@ -441,11 +441,12 @@ const WHOLE_SUB_ERROR: u32 = 17_422;
 /// Reasons why a message could not be sent.
 const FAILED: [Reason; 2] = [Reason::NotSent, Reason::TooBig];
 /// Reasons why a message for this program was rejected.
-const WRONG: [Reason; 13] = [
+const WRONG: [Reason; 14] = [
     Reason::Malformed,
     Reason::Unsupported,
     Reason::Invalid,
     Reason::Mismatch,
+    Reason::NoValue,
     Reason::Incomplete,
     Reason::NoKeyFrame,
     Reason::Undescribed,

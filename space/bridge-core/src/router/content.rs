@@ -478,7 +478,7 @@ fn write(
 }
 
 /// The severity of a Bad StatusCode (OPC 10000-4, 7.39.1).
-const STATUS_BAD: u32 = 0x8000_0000;
+pub(super) const STATUS_BAD: u32 = 0x8000_0000;
 /// The maximum size of a stored key frame: the size of a datagram.
 const MAX_BASE: usize = 1 << 16;
 /// The maximum size of all stored key frames. It is limited, because any sender in the group can

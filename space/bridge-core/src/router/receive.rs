@@ -6,10 +6,10 @@ use std::time::Duration;
 use mappings::{PublisherIdRule, SpaceId, TopicId};
 use uadp::{
     DataSetMessage, DecodeError, Fields, MessageKind, NetworkHeader, NetworkMessage,
-    NetworkMessageType, Timestamp,
+    NetworkMessageType, Scalar, StatusCode, Timestamp, Variant,
 };
 
-use super::content::ValueQuality;
+use super::content::{STATUS_BAD, ValueQuality};
 use super::{DropSite, Router, TopicQueues};
 use crate::confirm::Confirming;
 use crate::counters::Reason;
@@ -538,6 +538,13 @@ impl TopicQueues {
         }
         if let Err((cause, detail)) = written {
             self.recycle(payload);
+            let (cause, detail) = match sample.no_value() {
+                Some(status) => {
+                    let detail = format!("the status of the value is {:#010x}", status.0);
+                    (Reason::NoValue.into(), detail)
+                }
+                None => (cause, detail),
+            };
             // The local side does not have the value, so its repetition must be delivered.
             self.forget(at, sample.instance);
             self.count(DropSite::topic(at.topic()), cause, 1, || detail);
@@ -640,6 +647,22 @@ pub(super) struct LocalSample<'a> {
     pub(super) lasting: bool,
     pub(super) status: u16,
     pub(super) arrived: Timestamp,
+}
+
+impl LocalSample<'_> {
+    /// Returns the status of a sample whose source is lost: a Bad StatusCode in the place of a
+    /// value, or a null value of Bad status.
+    fn no_value(&self) -> Option<StatusCode> {
+        let of_sample = StatusCode::from_status(self.status);
+        let is_bad = |status: StatusCode| status.0 & STATUS_BAD != 0;
+        let mut fields = self.fields.clone().filter_map(Result::ok);
+        let status = fields.find_map(|field| match field {
+            Variant::Scalar(Scalar::StatusCode(status)) => Some(status),
+            Variant::Null => Some(of_sample),
+            Variant::Scalar(_) | Variant::Array(_) | Variant::Matrix(_) => None,
+        });
+        status.filter(|status| is_bad(*status))
+    }
 }
 
 /// Returns the time at which a NetworkMessage was sent.
