@@ -105,32 +105,29 @@ pub(super) async fn keep(
     let Some(request) = request_of(&group) else {
         return;
     };
-    let mut failures = 0_u32;
-    let mut told = String::new();
+    let mut fetches = FetchLog::default();
     loop {
         let fetched = service.fetch(&request).await;
         let fetched = fetched.and_then(|fetched| delivery(fetched, policy_of(group.policy)));
-        let before = failures;
         let rest = match fetched {
             Ok(delivery) => {
-                failures = 0;
-                told.clear();
                 let rest = rest(&delivery);
                 let group = group.id.clone();
                 if out.send(NewKeys { group, delivery }).await.is_err() {
                     return;
                 }
-                tell_back(&request, before);
+                let failures = fetches.received();
+                tell_back(&request, failures);
                 rest
             }
             Err(error) => {
-                failures = failures.saturating_add(1);
-                let why = error.to_string();
-                if why != told || failures.is_multiple_of(TOLD_AGAIN) {
-                    tell_failure(&request, failures, &why);
-                    told = why;
+                if let Some(message) = fetches.failed(&error.to_string()) {
+                    let (group, endpoint, failures) =
+                        (&request.group, &request.endpoint, fetches.failures);
+                    warn!(group, endpoint, failures, "{message}");
                 }
-                RETRY.saturating_mul(1 << failures.min(5)).min(RETRY_MOST)
+                let doubled = RETRY.saturating_mul(1 << fetches.failures.min(5));
+                doubled.min(RETRY_MOST)
             }
         };
         tokio::select! {
@@ -166,14 +163,41 @@ fn tell_back(request: &KeyRequest, failures: u32) {
     }
 }
 
-fn tell_failure(request: &KeyRequest, failures: u32, why: &str) {
-    let (group, endpoint) = (&request.group, &request.endpoint);
-    warn!(
-        group,
-        endpoint,
-        failures,
-        "cannot get keys from the Security Key Service: {why}; trying again, and the previous keys stay in use"
-    );
+/// The fetches of a group, for the log.
+#[derive(Debug, Default)]
+struct FetchLog {
+    /// The failures since the last keys.
+    failures: u32,
+    /// The reason that was logged last.
+    logged: String,
+    /// Keys were received since the start of the program.
+    has_keys: bool,
+}
+
+impl FetchLog {
+    /// Records received keys. Returns the number of failures before them.
+    fn received(&mut self) -> u32 {
+        self.has_keys = true;
+        self.logged.clear();
+        std::mem::take(&mut self.failures)
+    }
+
+    /// Records a failure. Returns the message if it is to be logged: at the first occurrence of a
+    /// reason, and then from time to time.
+    fn failed(&mut self, why: &str) -> Option<String> {
+        self.failures = self.failures.saturating_add(1);
+        if why == self.logged && !self.failures.is_multiple_of(TOLD_AGAIN) {
+            return None;
+        }
+        why.clone_into(&mut self.logged);
+        let meanwhile = match self.has_keys {
+            true => "the previous keys stay in use",
+            false => "nothing is sent or received in the group before there are keys",
+        };
+        Some(format!(
+            "cannot get keys from the Security Key Service: {why}; trying again, and {meanwhile}"
+        ))
+    }
 }
 
 /// Returns the time until the next fetch: half the lifetime of a key (OPC 10000-14, 8.3.2). It is
@@ -213,3 +237,21 @@ const RETRY_MOST: Duration = Duration::from_secs(5);
 const TOLD_AGAIN: u32 = 60;
 const LEAST_REST: Duration = Duration::from_millis(500);
 const MOST_REST: Duration = Duration::from_secs(300);
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_failure_says_whether_there_are_keys_to_use() {
+        let mut fetches = FetchLog::default();
+        let first = fetches.failed("no route").unwrap();
+        assert!(first.contains("no route; trying again"), "{first}");
+        let without = "nothing is sent or received in the group before there are keys";
+        assert!(first.ends_with(without), "{first}");
+        assert_eq!(fetches.failed("no route"), None, "it was logged");
+        assert_eq!(fetches.received(), 2);
+        let later = fetches.failed("no route").unwrap();
+        assert!(later.ends_with("the previous keys stay in use"), "{later}");
+    }
+}
