@@ -158,7 +158,7 @@ impl TopicChannels {
             schema_name: name.ros2(),
             schema_encoding: "ros2msg",
             schema: message.definition().to_owned(),
-            metadata: BTreeMap::new(),
+            metadata: BTreeMap::from([(MODEL.to_owned(), "urdf".to_owned())]),
             form: ChannelForm::Bytes,
             described: None,
         }))
@@ -448,6 +448,8 @@ pub(super) const DESCRIBED_WITHIN: Duration = Duration::from_millis(1500);
 pub(crate) const DELTA: &str = "$delta";
 /// The key of the metadata of a recorded channel with the announcement of its topic, in Base64.
 pub(crate) const ANNOUNCEMENT: &str = "announcement";
+/// The metadata of a channel with the model of a robot, which is no value of the space.
+pub(crate) const MODEL: &str = "robot_model";
 const MOST_UNKNOWN: usize = 64;
 /// Maximum number of channels of a topic, one for each of its descriptions.
 const MOST_OF_TOPIC: usize = 8;

@@ -20,7 +20,7 @@ use uadp::{
 use super::mcap::{McapChannel, McapMessage, McapReader};
 use super::{RecordedDatagram, json};
 use crate::capture::CaptureError;
-use crate::live::channels::{ANNOUNCEMENT, ros_plan};
+use crate::live::channels::{ANNOUNCEMENT, MODEL, ros_plan};
 use crate::live::described::{AnnouncedDescription, topic_of};
 use crate::messages as parts;
 
@@ -38,6 +38,8 @@ pub(super) struct RecordedValues<R> {
 /// The reason why a value of the recording cannot be sent again.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) enum UnusableValue {
+    /// The channel has the model of a robot for viewers (`--model`).
+    Model,
     /// The channel is not of the space.
     Foreign,
     /// The channel has no description of its topic.
@@ -52,6 +54,7 @@ impl UnusableValue {
     /// Returns the text for output.
     pub(crate) const fn label(self) -> &'static str {
         match self {
+            Self::Model => "models of robots, which are for viewers and no values of the space",
             Self::Foreign => "values of channels that `ua-space record` did not write",
             Self::Undescribed => "values of channels without the description of their topic",
             Self::Untyped => {
@@ -158,6 +161,9 @@ impl<R: Read> RecordedValues<R> {
 
 impl Topic {
     fn read(channel: &McapChannel) -> Result<Self, UnusableValue> {
+        if channel.metadata.contains_key(MODEL) {
+            return Err(UnusableValue::Model);
+        }
         let id = channel.metadata.get("topic");
         let id: Option<TopicId> = id.and_then(|topic| topic.parse().ok());
         let id = id.ok_or(UnusableValue::Foreign)?;

@@ -94,10 +94,22 @@ fn key_frame(scalars: &[Scalar<'_>]) -> impl Fn(&DataSetHeader, &mut NetworkMess
 
 /// Records the datagrams as MCAP, and reads the recording.
 fn again(name: &str, datagrams: &[Vec<u8>]) -> (Vec<Vec<u8>>, BTreeMap<UnusableValue, u64>) {
+    again_with(name, datagrams, None)
+}
+
+/// Records the model of a robot too.
+fn again_with(
+    name: &str,
+    datagrams: &[Vec<u8>],
+    model: Option<&RobotModelMessage>,
+) -> (Vec<Vec<u8>>, BTreeMap<UnusableValue, u64>) {
     let file = format!("{name}-{}.mcap", std::process::id());
     let file: PathBuf = std::env::temp_dir().join(file);
     let _before = std::fs::remove_file(&file);
     let mut values = ValueRecorder::new(RecordingFile::create(&file).unwrap());
+    if let Some(model) = model {
+        values.add_model(model, ARRIVED);
+    }
     let mut book = Book::new();
     let from: SocketAddr = "127.0.0.1:5000".parse().unwrap();
     let now = Duration::from_secs(1);
@@ -195,6 +207,21 @@ fn ros_messages_bytes_and_other_values_are_the_same_messages_again() {
         assert_eq!(before.message_type(), after.message_type());
         assert_eq!(before.datagram(), after.datagram(), "{before:?}");
     }
+}
+
+#[test]
+fn the_model_of_a_robot_is_left_out_as_such() {
+    let datagrams = [
+        announced("ua_2_5_10", "", &[("level", BuiltinType::Byte, -1)]),
+        value("ua_2_5_10", 1, &key_frame(&[Scalar::Byte(1)])),
+    ];
+    let model = RobotModelMessage {
+        topic: "/robot_description".to_owned(),
+        data: vec![0, 1, 0, 0, 1, 0, 0, 0, 0],
+    };
+    let (all, unusable) = again_with("model", &datagrams, Some(&model));
+    assert_eq!(all.len(), 2);
+    assert_eq!(unusable, BTreeMap::from([(UnusableValue::Model, 1)]));
 }
 
 #[test]
