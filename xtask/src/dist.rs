@@ -4,6 +4,7 @@ mod completion;
 mod manual;
 mod notices;
 mod package;
+mod pages;
 mod sysroot;
 mod tree;
 mod units;
@@ -18,6 +19,7 @@ use anyhow::{Context as _, ensure};
 
 use self::{
     package::{DebianPackage, MAINTAINER},
+    pages::ShippedSources,
     sysroot::Machine,
     tree::PackageFiles,
 };
@@ -248,41 +250,57 @@ fn tree(
     }
     tree.folder("etc/ua-bridge/components", 0o755);
     tree.folder("etc/ua-bridge/keys", 0o750);
-    tree.file(
-        "usr/share/ua-bridge/schema.json",
-        text("mappings/schema.json")?,
-    );
-    tree.file(
-        "usr/share/ua-bridge/wireshark/uadp.lua",
-        text("docs/wireshark/uadp.lua")?,
-    );
-    for folder in ROS_FOLDERS {
-        for path in files(&workspace.root.join("ros").join(folder))? {
-            let name = path.file_name().unwrap_or_default().to_string_lossy();
-            let to = format!("usr/share/ua-bridge/ros/{folder}/{name}");
-            match folder.ends_with("scripts") {
-                true => tree.program(to, read(&path)?),
-                false => tree.file(to, read(&path)?),
-            }
-        }
-    }
-    for (from, to) in EXAMPLES {
-        for path in files(&workspace.root.join(from))? {
-            let name = path.file_name().unwrap_or_default().to_string_lossy();
-            tree.file(format!("{DOC}/examples/{to}{name}"), read(&path)?);
-        }
-    }
-    for (from, to) in [("docs", ""), ("docs/reference", "reference/")] {
-        for path in files(&workspace.root.join(from))? {
-            let name = path.file_name().unwrap_or_default().to_string_lossy();
-            tree.file(format!("{DOC}/{to}{name}"), read(&path)?);
+    let sources = shipped(&workspace.root, pages::repository(workspace)?)?;
+    for (source, to) in sources.files() {
+        let path = workspace.root.join(source);
+        let contents = read(&path)?;
+        let is_page = source.extension().is_some_and(|end| end == "md");
+        let page = is_page.then(|| str::from_utf8(&contents).ok());
+        let page = page.flatten().and_then(|text| sources.page(source, text));
+        match page {
+            Some(page) => tree.file(to, page),
+            None if is_script(source) => tree.program(to, contents),
+            None => tree.file(to, contents),
         }
     }
     documents(workspace, patched, (machine, commit), &mut tree)?;
     Ok(tree)
 }
 
+/// Returns the files of the sources that a package has.
+fn shipped(root: &Path, repository: Option<String>) -> anyhow::Result<ShippedSources> {
+    let mut sources = ShippedSources::new(repository);
+    for (from, to) in FILES {
+        sources.add(from, to);
+    }
+    let ros = ROS_FOLDERS.map(|folder| {
+        let to = format!("usr/share/ua-bridge/ros/{folder}/");
+        (format!("ros/{folder}"), to)
+    });
+    let documents = DOCUMENTS.map(|(from, to)| (from.to_owned(), format!("{DOC}/{to}")));
+    for (from, to) in ros.into_iter().chain(documents) {
+        for path in files(&root.join(&from))? {
+            let name = path.file_name().unwrap_or_default().to_string_lossy();
+            sources.add(Path::new(&from).join(&*name), format!("{to}{name}"));
+        }
+    }
+    Ok(sources)
+}
+
+fn is_script(source: &Path) -> bool {
+    let folder = source.parent().and_then(Path::file_name);
+    source.starts_with("ros") && folder.is_some_and(|folder| folder == "scripts")
+}
+
 const DOC: &str = "usr/share/doc/ua-bridge";
+/// Files with places of their own in a package.
+const FILES: [(&str, &str); 2] = [
+    ("mappings/schema.json", "usr/share/ua-bridge/schema.json"),
+    (
+        "docs/wireshark/uadp.lua",
+        "usr/share/ua-bridge/wireshark/uadp.lua",
+    ),
+];
 /// Folders of the ROS packages below `ros/`.
 const ROS_FOLDERS: [&str; 7] = [
     "ua_bridge",
@@ -293,12 +311,16 @@ const ROS_FOLDERS: [&str; 7] = [
     "ua_msgs/msg",
     "ua_msgs/srv",
 ];
-/// Folders with examples, and their places below the examples of a package.
-const EXAMPLES: [(&str, &str); 4] = [
-    ("packages/examples", ""),
-    ("packages/examples/robots", "robots/"),
-    ("mappings", "mappings/"),
-    ("examples/plant", "plant/"),
+/// Folders with pages and examples, and their places below the documents of a package.
+const DOCUMENTS: [(&str, &str); 8] = [
+    ("docs", ""),
+    ("docs/reference", "reference/"),
+    ("docs/decisions", "decisions/"),
+    ("docs/images", "images/"),
+    ("packages/examples", "examples/"),
+    ("packages/examples/robots", "examples/robots/"),
+    ("mappings", "examples/mappings/"),
+    ("examples/plant", "examples/plant/"),
 ];
 
 /// Returns the files of a folder with text for users, without folders below.
@@ -472,4 +494,39 @@ fn programs(workspace: &Workspace) -> anyhow::Result<CommandOutcome> {
         println!("{} -> {}", link.display(), links::TARGET);
     }
     Ok(CommandOutcome::WELL)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeSet;
+
+    use super::*;
+    use crate::markdown::{joined, links};
+
+    /// All links of the packaged pages lead to files of the package.
+    #[test]
+    fn packaged_pages_link_to_packaged_files() {
+        let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
+        let sources = shipped(&root, None).unwrap();
+        let packaged: BTreeSet<&Path> = sources.files().map(|(_, to)| Path::new(to)).collect();
+        let has = |target: &Path| packaged.iter().any(|file| file.starts_with(target));
+        let (mut broken, mut checked) = (Vec::new(), 0);
+        for (source, to) in sources.files() {
+            if source.extension().is_none_or(|end| end != "md") {
+                continue;
+            }
+            let text = fs::read_to_string(root.join(source)).unwrap();
+            let page = sources.page(source, &text).unwrap();
+            let folder = Path::new(to).parent().unwrap();
+            for link in links(&page).filter(|link| !link.contains("://")) {
+                let (path, _) = link.split_once('#').unwrap_or((link, ""));
+                checked += 1;
+                if !path.is_empty() && !has(&joined(folder, path)) {
+                    broken.push(format!("{to}: {link}"));
+                }
+            }
+        }
+        assert!(broken.is_empty(), "{broken:#?}");
+        assert!(checked > 100, "{checked} links");
+    }
 }

@@ -68,7 +68,7 @@ fn prose(text: &str) -> impl Iterator<Item = &str> {
 }
 
 /// Returns the targets of all links `[text](target)`.
-fn links(text: &str) -> impl Iterator<Item = &str> {
+pub(crate) fn links(text: &str) -> impl Iterator<Item = &str> {
     prose(text).flat_map(|line| {
         let behind = line.split("](").skip(1);
         behind.filter_map(|rest| rest.split_once(')').map(|(target, _)| target))
@@ -87,7 +87,7 @@ fn anchors(text: &str) -> BTreeSet<String> {
 }
 
 /// Returns a path relative to a folder, without `..`.
-fn joined(folder: &Path, path: &str) -> PathBuf {
+pub(crate) fn joined(folder: &Path, path: &str) -> PathBuf {
     let mut joined = folder.to_path_buf();
     for component in Path::new(path).components() {
         match component {
