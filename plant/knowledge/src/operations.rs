@@ -2,12 +2,12 @@
 //! processes (DIN 8580) as classes of capabilities, with the classes above them.
 //!
 //! The IRIs and the hierarchy are those of the ontologies of the Helmut Schmidt University. The
-//! standards define the operations.
+//! standards define the operations. The types of skills of this project perform operations, too.
 
 use mtp::{Object, Triple, vocabulary as v};
 
-/// Returns the classes as statements: each with its label, its standard as a comment, and the class
-/// above it.
+/// Returns the classes as statements: each with its label, its standard as a comment, the class
+/// above it, and its number if the standard numbers it. The operations of skill types follow.
 #[must_use]
 pub fn triples() -> Vec<Triple> {
     let mut all = Vec::new();
@@ -22,21 +22,61 @@ pub fn triples() -> Vec<Triple> {
         let OperationStandard {
             name, namespace, ..
         } = standard;
-        let root = std::iter::once((standard.root, v::CAPABILITY.to_owned()));
+        let root = std::iter::once((None, standard.root, v::CAPABILITY.to_owned()));
         let below = standard.groups.iter().flat_map(|group| {
             let above = format!("{namespace}{}", group.above);
-            let names = group.names.split(' ');
-            names.map(move |operation| (operation, above.clone()))
+            let operations = group.operations();
+            operations.map(move |(number, operation)| (number, operation, above.clone()))
         });
-        for (operation, above) in root.chain(below) {
+        for (number, operation, above) in root.chain(below) {
             let class = format!("{namespace}{operation}");
+            if let Some(number) = number {
+                say(&class, v::OPERATION_NUMBER, Object::Text(number.to_owned()));
+            }
             say(&class, v::RDFS_SUB_CLASS_OF, Object::Iri(above));
             say(&class, v::RDFS_LABEL, Object::Text(label(operation)));
             say(&class, v::RDFS_COMMENT, Object::Text(name.to_owned()));
         }
     }
+    for (skill_type, operation) in SKILL_TYPES {
+        let subject = format!("urn:ua-bridge:skill-type-operation:{skill_type}");
+        say(
+            &subject,
+            v::RDF_TYPE,
+            Object::Iri(v::SKILL_TYPE_OPERATION.to_owned()),
+        );
+        say(
+            &subject,
+            v::BROWSE_NAME,
+            Object::Text(skill_type.to_owned()),
+        );
+        say(&subject, v::NODE_NAMESPACE, Object::Text(SKILLS.to_owned()));
+        say(
+            &subject,
+            v::PERFORMS,
+            Object::Iri(format!("{VDI_2860}{operation}")),
+        );
+    }
     all
 }
+
+/// The namespace of the types of skills.
+const SKILLS: &str = "urn:ua-bridge:skills";
+/// The types of skills, and the functions of handling that their skills perform. They are those of
+/// the dictionary entries of the types.
+const SKILL_TYPES: [(&str, &str); 11] = [
+    ("PickAndPlaceSkillType", "Handling"),
+    ("GripperSkillType", "Securing"),
+    ("GraspSkillType", "Tensioning"),
+    ("ReleaseSkillType", "Slackening"),
+    ("MotionSkillType", "Moving"),
+    ("PtpMoveSkillType", "Positioning"),
+    ("JointPtpMoveSkillType", "Positioning"),
+    ("LinearMoveSkillType", "Guiding"),
+    ("JointLinearMoveSkillType", "Guiding"),
+    ("RunConveyorSkillType", "Conveying"),
+    ("LocateObjectSkillType", "MeasuringPosition"),
+];
 
 /// Returns the words of a name: `AnalyzingWeight` is `Analyzing weight`.
 fn label(name: &str) -> String {
@@ -70,8 +110,20 @@ struct OperationStandard {
 /// The operations directly below an operation.
 struct OperationGroup {
     above: &'static str,
-    /// Their names, with spaces between them.
+    /// Their names, with spaces between them. A number comes before its name, as `4.3:Name`.
     names: &'static str,
+}
+
+impl OperationGroup {
+    /// Returns the numbers and the names.
+    fn operations(&self) -> impl Iterator<Item = (Option<&'static str>, &'static str)> {
+        self.names
+            .split(' ')
+            .map(|name| match name.split_once(':') {
+                Some((number, name)) => (Some(number), name),
+                None => (None, name),
+            })
+    }
 }
 
 const fn below(above: &'static str, names: &'static str) -> OperationGroup {
@@ -120,48 +172,80 @@ const MANUFACTURING: OperationStandard = OperationStandard {
     groups: &[
         below(
             "Fertigungsverfahren",
-            "Urformen Umformen Trennen Fuegen Beschichten Stoffeigenschaft_aendern",
+            "1:Urformen 2:Umformen 3:Trennen 4:Fuegen 5:Beschichten \
+             6:Stoffeigenschaft_aendern",
+        ),
+        below(
+            "Urformen",
+            "1.1:Urformen_aus_dem_fluessigen_Zustand \
+             1.2:Urformen_aus_dem_plastischen_Zustand \
+             1.3:Urformen_aus_dem_breiigen_Zustand \
+             1.4:Urformen_aus_dem_koernigen_oder_pulverfoermigen_Zustand \
+             1.5:Urformen_aus_dem_span-_oder_faserfoermigen_Zustand \
+             1.8:Urformen_aus_dem_gas-_oder_dampffoermigen_Zustand \
+             1.9:Urformen_aus_dem_ionisierten_Zustand",
         ),
         below(
             "Umformen",
-            "Druckumformen Zugdruckumformen Zugumformen Biegeumformen Schubumformen",
+            "2.1:Druckumformen 2.2:Zugdruckumformen 2.3:Zugumformen 2.4:Biegeumformen \
+             2.5:Schubumformen",
         ),
         below(
             "Trennen",
-            "Zerteilen Spanen_mit_geometrisch_bestimmten_Schneiden \
-             Spanen_mit_geometrisch_unbestimmten_Schneiden Abtragen Zerlegen Reinigen",
+            "3.1:Zerteilen 3.2:Spanen_mit_geometrisch_bestimmten_Schneiden \
+             3.3:Spanen_mit_geometrisch_unbestimmten_Schneiden 3.4:Abtragen 3.5:Zerlegen \
+             3.6:Reinigen",
         ),
         below(
             "Spanen_mit_geometrisch_bestimmten_Schneiden",
-            "Drehen Bohren_oder_Senken_oder_Reiben Fraesen Hobeln_oder_Stossen Raeumen Saegen \
-             Feilen_oder_Raspeln Buerstenspanen Schaben_oder_Meisseln",
+            "3.2.1:Drehen 3.2.2:Bohren_oder_Senken_oder_Reiben 3.2.3:Fraesen \
+             3.2.4:Hobeln_oder_Stossen 3.2.5:Raeumen 3.2.6:Saegen \
+             3.2.7:Feilen_oder_Raspeln 3.2.8:Buerstenspanen 3.2.9:Schaben_oder_Meisseln",
         ),
         below(
             "Spanen_mit_geometrisch_unbestimmten_Schneiden",
-            "Schleifen_mit_rotierendem_Werkzeug Bandschleifen Hubschleifen Honen Laeppen \
-             Strahlspanen Gleitspanen",
+            "3.3.1:Schleifen_mit_rotierendem_Werkzeug 3.3.2:Bandschleifen \
+             3.3.3:Hubschleifen 3.3.4:Honen 3.3.5:Laeppen 3.3.6:Strahlspanen \
+             3.3.7:Gleitspanen",
         ),
         below(
             "Fuegen",
-            "Zusammensetzen Fuellen An-_und_Einpressen Fuegen_durch_Urformen \
-             Fuegen_durch_Umformen Fuegen_durch_Schweissen Fuegen_durch_Loeten Kleben \
-             Textiles_Fuegen",
+            "4.1:Zusammensetzen 4.2:Fuellen 4.3:An-_und_Einpressen \
+             4.4:Fuegen_durch_Urformen 4.5:Fuegen_durch_Umformen \
+             4.6:Fuegen_durch_Schweissen 4.7:Fuegen_durch_Loeten 4.8:Kleben \
+             4.9:Textiles_Fuegen",
         ),
         below(
             "Zusammensetzen",
-            "Auflegen_oder_Aufsetzen_oder_Schichten Einlegen_oder_Einsetzen Ineinanderschieben \
-             Einhaengen Einrenken Federnd_Einspreizen",
+            "4.1.1:Auflegen_oder_Aufsetzen_oder_Schichten 4.1.2:Einlegen_oder_Einsetzen \
+             4.1.3:Ineinanderschieben 4.1.4:Einhaengen 4.1.5:Einrenken \
+             4.1.6:Federnd_Einspreizen",
         ),
-        below("Fuellen", "Einfuellen Traenken_oder_Impraegnieren"),
+        below(
+            "Fuellen",
+            "4.2.1:Einfuellen 4.2.2:Traenken_oder_Impraegnieren",
+        ),
         below(
             "An-_und_Einpressen",
-            "Schrauben Klemmen Klammern Fuegen_durch_Presspassung \
-             Nageln_oder_Verstiften_oder_Einschlagen Verkeilen Verspannen",
+            "4.3.1:Schrauben 4.3.2:Klemmen 4.3.3:Klammern 4.3.4:Fuegen_durch_Presspassung \
+             4.3.5:Nageln_oder_Verstiften_oder_Einschlagen 4.3.6:Verkeilen \
+             4.3.7:Verspannen",
+        ),
+        below(
+            "Beschichten",
+            "5.1:Beschichten_aus_dem_fluessigen_Zustand \
+             5.2:Beschichten_aus_dem_plastischen_Zustand \
+             5.3:Beschichten_aus_dem_breiigen_Zustand \
+             5.4:Beschichten_aus_dem_koernigen_oder_pulverfoermigen_Zustand \
+             5.6:Beschichten_durch_Schweissen 5.7:Beschichten_durch_Loeten \
+             5.8:Beschichten_aus_dem_gas-_oder_dampffoermigen_Zustand \
+             5.9:Beschichten_aus_dem_ionisierten_Zustand",
         ),
         below(
             "Stoffeigenschaft_aendern",
-            "Verfestigen_durch_Umformen Waermebehandeln Thermomechanisches_Behandeln \
-             Sintern_oder_Brennen Magnetisieren Bestrahlen Photochemische_Verfahren",
+            "6.1:Verfestigen_durch_Umformen 6.2:Waermebehandeln \
+             6.3:Thermomechanisches_Behandeln 6.4:Sintern_oder_Brennen 6.5:Magnetisieren \
+             6.6:Bestrahlen 6.7:Photochemische_Verfahren",
         ),
     ],
 };
@@ -178,9 +262,10 @@ mod tests {
     fn each_operation_has_one_name_and_is_below_an_operation_before_it() {
         for standard in [HANDLING, MANUFACTURING] {
             let mut known = BTreeSet::from([standard.root]);
-            for OperationGroup { above, names } in standard.groups {
+            for group in standard.groups {
+                let above = group.above;
                 assert!(known.contains(above), "{above} is not there yet");
-                for name in names.split(' ') {
+                for (_, name) in group.operations() {
                     assert!(known.insert(name), "{name} is there twice");
                 }
             }
@@ -211,6 +296,83 @@ mod tests {
             );
             assert!(!below(&above, &class), "{name}");
         }
+    }
+
+    #[test]
+    fn the_main_groups_and_groups_of_din_8580_have_their_numbers() {
+        let knowledge = Arc::new(Knowledge::new().unwrap());
+        let source = KnowledgeSource::new(SourceKind::File, "operations");
+        knowledge.replace(&source, &triples(), 1).unwrap();
+        let value = |query: &str| ValueQuery::read(query).unwrap().value(&knowledge).unwrap();
+        let number = v::OPERATION_NUMBER;
+        let count = |pattern: &str| {
+            value(&format!(
+                "SELECT (COUNT(?number) AS ?n) {{ ?operation <{number}> ?number \
+                 FILTER(REGEX(?number, '{pattern}')) }}"
+            ))
+        };
+        // 6 main groups, and 7 + 5 + 6 + 9 + 8 + 7 groups.
+        assert_eq!((count("^.$"), count("^.[.].$")), (6.into(), 42.into()));
+        for (name, expected) in [
+            ("Urformen_aus_dem_ionisierten_Zustand", "1.9"),
+            ("Beschichten_durch_Schweissen", "5.6"),
+            ("Schrauben", "4.3.1"),
+        ] {
+            let found = format!("SELECT ?number {{ <{DIN_8580}{name}> <{number}> ?number }}");
+            assert_eq!(value(&found), expected, "{name}");
+        }
+    }
+
+    #[test]
+    fn skills_are_found_by_the_operation_of_their_type_or_capability() {
+        let (skills, own) = ("urn:ua-bridge:skills", "urn:example:capability:grasp");
+        let text = "@prefix css: <http://www.w3id.org/hsu-aut/css#> .
+@prefix ua: <urn:ua-bridge:plant#> .
+@prefix rdfs: <http://www.w3.org/2000/01/rdf-schema#> .
+<urn:type:grasp> a rdfs:Class ; ua:browseName 'GraspSkillType' ; ua:nodeNamespace 'SKILLS' ;
+    rdfs:subClassOf <urn:type:grasp> .
+<urn:type:own> a rdfs:Class ; ua:browseName 'OwnType' ; ua:nodeNamespace 'urn:maker' ;
+    rdfs:subClassOf <urn:type:grasp> , <urn:type:own> .
+<urn:gripper> css:providesSkill <urn:gripper#Hold> ; rdfs:label 'gripper' .
+<urn:gripper#Hold> a css:Skill , <urn:type:own> ; rdfs:label 'Hold' .
+<urn:press> css:providesSkill <urn:press#Fix> ; rdfs:label 'press' .
+<urn:press#Fix> a css:Skill ; rdfs:label 'Fix' .
+<urn:provided> css:isRealizedBySkill <urn:press#Fix> ; a <OWN> .
+<OWN> rdfs:subClassOf <http://www.w3id.org/hsu-aut/DIN8580#Schrauben> .";
+        let knowledge = Knowledge::new().unwrap();
+        let source = |name| KnowledgeSource::new(SourceKind::File, name);
+        knowledge
+            .replace(&source("operations"), &triples(), 1)
+            .unwrap();
+        let text = text.replace("SKILLS", skills).replace("OWN", own);
+        knowledge
+            .replace_turtle(&source("plant"), &text, 1)
+            .unwrap();
+        let found = |operation: &str| {
+            let given = [("operation".to_owned(), operation.to_owned())];
+            let answer = knowledge.ask("operations", &given).unwrap();
+            let text = |row, column| crate::QuestionAnswer::text(row, column).to_owned();
+            let rows = answer.rows.iter();
+            let rows = rows.map(|row| (text(row, "name"), text(row, "by"), text(row, "number")));
+            rows.collect::<Vec<_>>()
+        };
+        let row = |name: &str, by: &str, number: &str| {
+            vec![(name.to_owned(), by.to_owned(), number.to_owned())]
+        };
+        // A type of a maker below the type, and an operation above that of the type.
+        assert_eq!(
+            found(&format!("{VDI_2860}Tensioning")),
+            row("Hold", "type", "")
+        );
+        assert_eq!(
+            found(&format!("{VDI_2860}Securing")),
+            row("Hold", "type", "")
+        );
+        assert_eq!(
+            found(&format!("{DIN_8580}Fuegen")),
+            row("Fix", "capability", "4")
+        );
+        assert_eq!(found(&format!("{DIN_8580}Kleben")), []);
     }
 
     #[test]

@@ -116,6 +116,10 @@ pub const QUESTIONS: &[NamedQuestion] = &[
         sparql: include_str!("../queries/objects.rq"),
     },
     NamedQuestion {
+        name: "operations",
+        sparql: include_str!("../queries/operations.rq"),
+    },
+    NamedQuestion {
         name: "outputs-of",
         sparql: include_str!("../queries/outputs-of.rq"),
     },
