@@ -115,6 +115,24 @@ fn transport_does_not_know_what_a_datagram_means() {
 }
 
 #[test]
+fn http_requests_alone_have_no_tls_and_know_no_space() {
+    does_not_reach(
+        "http-client",
+        &[
+            "rustls*",
+            "tokio-rustls",
+            "ring",
+            "uadp",
+            "mappings",
+            "bridge-*",
+            "transport",
+            "service",
+        ],
+    );
+    does_not_reach("tcpros", &["rustls*", "tokio-rustls", "ring"]);
+}
+
+#[test]
 fn json_values_reaches_no_io_and_knows_no_space() {
     does_not_reach("json-values", IMPURE);
     does_not_reach(

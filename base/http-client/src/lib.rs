@@ -1,109 +1,39 @@
-//! HTTP/1.1 requests: a connection for each request, and responses bounded in size.
+//! HTTP/1.1 requests: a connection for each request, with or without TLS, and responses bounded in
+//! time and size.
 //!
-//! The caller opens the stream and sets the time limit, because programs differ in both.
+//! - [`HttpHost`] sends a request within a time limit.
+//! - [`HttpUrl`] is a parsed URL of `http` or `https`.
+//! - [`Connection`] sends a request over a stream of the caller.
+//! - `TlsAuthorities` and `TlsVerification`, with the feature `tls`, verify the certificates of
+//!   hosts.
+//!
+//! No redirection is followed.
 
-use bytes::Bytes;
-use http_body_util::{BodyExt as _, Full, Limited};
-use hyper::client::conn::http1::{SendRequest, handshake};
-use hyper_util::rt::TokioIo;
-use thiserror::Error;
-use tokio::io::{AsyncRead, AsyncWrite};
-use tokio::task::JoinSet;
+mod connection;
+mod host;
+#[cfg(feature = "tls")]
+mod tls;
+mod url;
 
+pub use connection::{Connection, HttpError};
+pub use host::{HttpHost, HttpLimits, RequestError};
 pub use hyper::{Method, Request, Response, StatusCode, header};
+#[cfg(feature = "tls")]
+pub use tls::{TlsAuthorities, TlsError, TlsVerification};
+pub use url::{HttpUrl, HttpUrlError};
 
-/// A connection for a single request.
-#[derive(Debug)]
-pub struct Connection {
-    sender: SendRequest<Full<Bytes>>,
-    /// Reads and writes until the connection is dropped.
-    _driving: JoinSet<hyper::Result<()>>,
-}
+use base64::Engine as _;
+use base64::engine::general_purpose::STANDARD;
+use header::{HeaderValue, InvalidHeaderValue};
 
-/// The reason why a request has no response. The request may have been executed.
-#[derive(Debug, Error)]
-pub enum HttpError {
-    /// The connection ended, or the server does not speak HTTP.
-    #[error(transparent)]
-    Exchange(#[from] hyper::Error),
-    /// The body of the response ended early or exceeds the bound.
-    #[error("the body of the response cannot be read: {0}")]
-    Body(#[source] Box<dyn std::error::Error + Send + Sync>),
-}
-
-impl Connection {
-    /// Prepares a stream, such as a TCP connection with or without TLS, for a request.
-    ///
-    /// # Errors
-    /// [`HttpError::Exchange`].
-    pub async fn open<S>(stream: S) -> Result<Self, HttpError>
-    where
-        S: AsyncRead + AsyncWrite + Unpin + Send + 'static,
-    {
-        let (sender, connection) = handshake(TokioIo::new(stream)).await?;
-        let mut driving = JoinSet::new();
-        driving.spawn(connection);
-        Ok(Self {
-            sender,
-            _driving: driving,
-        })
-    }
-
-    /// Sends the request and returns the response with a body of at most `most` bytes.
-    ///
-    /// # Errors
-    /// [`HttpError`].
-    pub async fn send(
-        mut self,
-        request: Request<Bytes>,
-        most: usize,
-    ) -> Result<Response<Bytes>, HttpError> {
-        let response = self.sender.send_request(request.map(Full::new)).await?;
-        let (head, body) = response.into_parts();
-        let body = Limited::new(body, most).collect().await;
-        let body = body.map_err(HttpError::Body)?.to_bytes();
-        Ok(Response::from_parts(head, body))
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
-    use tokio::net::{TcpListener, TcpStream};
-
-    use super::*;
-
-    async fn answered(answer: &'static str, most: usize) -> Result<Response<Bytes>, HttpError> {
-        let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
-        let address = listener.local_addr().unwrap();
-        let serve = async {
-            let (mut stream, _) = listener.accept().await.unwrap();
-            let mut request = [0; 1024];
-            let read = stream.read(&mut request).await.unwrap();
-            assert!(request[..read].starts_with(b"GET /status HTTP/1.1\r\n"));
-            stream.write_all(answer.as_bytes()).await.unwrap();
-        };
-        let ask = async {
-            let stream = TcpStream::connect(address).await.unwrap();
-            let request = Request::get("/status").header(header::HOST, "cell");
-            let request = request.body(Bytes::new()).unwrap();
-            Connection::open(stream).await?.send(request, most).await
-        };
-        tokio::join!(ask, serve).0
-    }
-
-    #[tokio::test]
-    async fn a_response_has_its_status_and_its_whole_body() {
-        let answer = "HTTP/1.1 404 Not Found\r\nconnection: close\r\n\r\nno page";
-        let response = answered(answer, 7).await.unwrap();
-        assert_eq!(response.status(), StatusCode::NOT_FOUND);
-        assert_eq!(response.body(), "no page");
-    }
-
-    #[tokio::test]
-    async fn a_body_above_the_bound_and_a_connection_that_ends_are_errors() {
-        let answer = "HTTP/1.1 200 OK\r\nconnection: close\r\n\r\nno page";
-        assert!(matches!(answered(answer, 6).await, Err(HttpError::Body(_))));
-        assert!(matches!(answered("", 6).await, Err(HttpError::Exchange(_))));
-    }
+/// Returns the value of `Authorization` with a name and a password (RFC 7617), which logs do not
+/// show.
+///
+/// # Errors
+/// The text is too long for a header.
+pub fn basic_authorization(user: &str, password: &str) -> Result<HeaderValue, InvalidHeaderValue> {
+    let encoded = STANDARD.encode(format!("{user}:{password}"));
+    let mut value = HeaderValue::from_str(&format!("Basic {encoded}"))?;
+    value.set_sensitive(true);
+    Ok(value)
 }

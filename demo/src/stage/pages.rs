@@ -1,36 +1,19 @@
 //! Reads status pages of programs over HTTP.
 
-use std::net::{Ipv4Addr, SocketAddr};
 use std::time::Duration;
 
 use bytes::Bytes;
-use http_client::header::HOST;
-use http_client::{Connection, HttpError, Request};
+use http_client::{HttpHost, HttpLimits, Request, RequestError};
 use serde::de::DeserializeOwned;
 use thiserror::Error;
-use tokio::net::TcpStream;
-use tokio::time::timeout;
 
 /// Reads the status page of a program on this host.
 pub(crate) async fn fetch<T: DeserializeOwned>(port: u16) -> Result<T, PageError> {
-    timeout(LIMIT, request(port))
-        .await
-        .map_err(|_| PageError::Timeout)?
-}
-
-async fn request<T: DeserializeOwned>(port: u16) -> Result<T, PageError> {
-    let address = SocketAddr::from((Ipv4Addr::LOCALHOST, port));
-    let stream = TcpStream::connect(address)
-        .await
-        .map_err(PageError::Connect)?;
+    let host = HttpHost::plain(format!("127.0.0.1:{port}"));
     let request = Request::get("/status")
-        .header(HOST, address.to_string())
         .body(Bytes::new())
         .map_err(|error| PageError::Answer(error.to_string()))?;
-    let response = Connection::open(stream)
-        .await?
-        .send(request, MAX_BODY)
-        .await?;
+    let response = host.send(request, LIMITS).await?;
     if !response.status().is_success() {
         return Err(PageError::Answer(response.status().to_string()));
     }
@@ -40,18 +23,16 @@ async fn request<T: DeserializeOwned>(port: u16) -> Result<T, PageError> {
 /// The reason why a page is not available.
 #[derive(Debug, Error)]
 pub(crate) enum PageError {
-    #[error("cannot connect: {0}")]
-    Connect(#[source] std::io::Error),
-    #[error("HTTP failed: {0}")]
-    Http(#[from] HttpError),
+    #[error(transparent)]
+    Http(#[from] RequestError),
     #[error("the answer was not understood: {0}")]
     Answer(String),
-    #[error("no answer within {LIMIT:?}")]
-    Timeout,
 }
 
-const LIMIT: Duration = Duration::from_secs(2);
-const MAX_BODY: usize = 1024 * 1024;
+const LIMITS: HttpLimits = HttpLimits {
+    within: Duration::from_secs(2),
+    most: 1024 * 1024,
+};
 
 #[cfg(test)]
 mod tests {

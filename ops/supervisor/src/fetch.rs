@@ -5,13 +5,10 @@ use std::str::FromStr;
 use std::time::Duration;
 
 use bytes::Bytes;
-use http_client::header::{HOST, HeaderValue, InvalidHeaderValue};
-use http_client::{Connection, HttpError, Request, Response};
+use http_client::{HttpHost, HttpLimits, Request, RequestError, Response};
 use hyper::{StatusCode, Uri};
 use serde_json::Value;
 use thiserror::Error;
-use tokio::net::TcpStream;
-use tokio::time::timeout;
 
 /// The location of the status of a program, as `http://127.0.0.1:9100` or `127.0.0.1:9100`.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
@@ -58,18 +55,9 @@ impl fmt::Display for StatusUrl {
 /// The reason why a request to a program has no response.
 #[derive(Debug, Error)]
 pub(crate) enum FetchFault {
-    /// The program was not reached.
-    #[error("no connection: {0}")]
-    Connection(#[source] std::io::Error),
-    /// The response is late. The request may have been executed.
-    #[error("no response within {} s", .0.as_secs())]
-    Late(Duration),
-    /// The response is no HTTP, or its body is too large. The request may have been executed.
+    /// The program was not reached, or its response is late, too large or no HTTP.
     #[error(transparent)]
-    Exchange(#[from] HttpError),
-    /// The request has a value that no header holds.
-    #[error("the request cannot be made: {0}")]
-    Header(#[from] InvalidHeaderValue),
+    Request(#[from] RequestError),
     /// The program refuses to return its status.
     #[error("the response is {0}")]
     Response(StatusCode),
@@ -83,34 +71,28 @@ impl StatusUrl {
     pub(crate) async fn fetch(&self) -> Result<Value, FetchFault> {
         let mut request = Request::new(Bytes::new());
         *request.uri_mut() = Uri::from_static("/status");
-        let response = self.send(request, (MOST_BYTES, LIMIT)).await?;
+        let limits = HttpLimits {
+            within: LIMIT,
+            most: MOST_BYTES,
+        };
+        let response = self.send(request, limits).await?;
         if !response.status().is_success() {
             return Err(FetchFault::Response(response.status()));
         }
         serde_json::from_slice(response.body()).map_err(FetchFault::Status)
     }
 
-    /// Sends a request to the program. Returns the response, whose body has at most `most` bytes.
+    /// Sends a request to the program, and returns the response.
     ///
     /// # Errors
-    /// [`FetchFault`].
+    /// [`RequestError`].
     pub(crate) async fn send(
         &self,
-        mut request: Request<Bytes>,
-        (most, limit): (usize, Duration),
-    ) -> Result<Response<Bytes>, FetchFault> {
-        let host = HeaderValue::from_str(&self.authority)?;
-        request.headers_mut().insert(HOST, host);
-        let exchange = async {
-            let stream = TcpStream::connect(&self.authority).await;
-            let stream = stream.map_err(FetchFault::Connection)?;
-            let connection = Connection::open(stream).await?;
-            Ok(connection.send(request, most).await?)
-        };
-        match timeout(limit, exchange).await {
-            Ok(answer) => answer,
-            Err(_) => Err(FetchFault::Late(limit)),
-        }
+        request: Request<Bytes>,
+        limits: HttpLimits,
+    ) -> Result<Response<Bytes>, RequestError> {
+        let host = HttpHost::plain(self.authority.clone());
+        host.send(request, limits).await
     }
 
     /// Returns the host with its port.

@@ -5,11 +5,11 @@ use std::path::Path;
 use std::sync::Arc;
 use std::time::Duration;
 
-use base64::Engine as _;
-use base64::engine::general_purpose::STANDARD;
 use bytes::Bytes;
 use http_client::header::{ACCEPT, AUTHORIZATION, CONTENT_TYPE, HeaderValue};
-use http_client::{HttpError, Method, Request, Response, StatusCode};
+use http_client::{
+    HttpError, HttpLimits, Method, Request, RequestError, Response, StatusCode, basic_authorization,
+};
 use hyper::header::InvalidHeaderValue;
 use hyper::http::uri::InvalidUri;
 use serde::Deserialize;
@@ -18,7 +18,7 @@ use thiserror::Error;
 use tokio::sync::Semaphore;
 use uri_text::escaped;
 
-use crate::fetch::{FetchFault, StatusUrl};
+use crate::fetch::StatusUrl;
 use crate::table;
 
 /// The program `ua-mes` at its address for queries.
@@ -63,7 +63,7 @@ pub(crate) struct MesCredentials {
 pub(crate) enum MesFault {
     /// There is no response.
     #[error("ua-mes does not answer: {0}")]
-    Fetch(#[from] FetchFault),
+    Request(#[source] RequestError),
     /// The response is too large, or ended early.
     #[error("the response of ua-mes has more than {} MiB, or ended early: a query may need a LIMIT", LARGEST_RESULT >> 20)]
     TooLarge,
@@ -181,12 +181,16 @@ impl MesClient {
         request: Request<Bytes>,
         limit: Duration,
     ) -> Result<Response<Bytes>, MesFault> {
-        let sent = self.0.send(request, (LARGEST_RESULT, limit)).await;
-        let response = sent.map_err(|fault| {
-            if matches!(fault, FetchFault::Exchange(HttpError::Body(_))) {
+        let limits = HttpLimits {
+            within: limit,
+            most: LARGEST_RESULT,
+        };
+        let sent = self.0.send(request, limits).await;
+        let response = sent.map_err(|error| {
+            if matches!(error, RequestError::Exchange(HttpError::Body(_))) {
                 MesFault::TooLarge
             } else {
-                MesFault::Fetch(fault)
+                MesFault::Request(error)
             }
         })?;
         let status = response.status();
@@ -218,9 +222,7 @@ fn upload(
     let path = format!("/{verb}/{}/{}", file.kind, escaped(&file.name));
     *request.uri_mut() = path.parse()?;
     if let Some(MesCredentials { user, password }) = by {
-        let basic = format!("Basic {}", STANDARD.encode(format!("{user}:{password}")));
-        let mut basic = HeaderValue::from_str(&basic)?;
-        basic.set_sensitive(true);
+        let basic = basic_authorization(user, password)?;
         request.headers_mut().insert(AUTHORIZATION, basic);
     }
     Ok(request)

@@ -2,13 +2,9 @@
 
 use std::time::Duration;
 
-use base64::Engine as _;
-use base64::engine::general_purpose::STANDARD;
 use bytes::Bytes;
-use http_client::header::{ACCEPT, AUTHORIZATION, CONTENT_TYPE, HOST};
-use http_client::{Connection, HttpError, Method, Request};
-use tokio::net::TcpStream;
-use tokio::time::timeout;
+use http_client::header::{ACCEPT, AUTHORIZATION, CONTENT_TYPE, HeaderValue};
+use http_client::{HttpHost, HttpLimits, Method, Request, basic_authorization};
 
 use crate::exit::CommandFailure;
 
@@ -109,10 +105,10 @@ impl HttpServer {
         let method = Method::from_bytes(change.method.as_bytes())
             .map_err(|error| CommandFailure::Usage(error.to_string()))?;
         let content = (JSON, change.content_type, change.body.into());
-        let user = change.user.map(|(name, password)| {
-            let encoded = STANDARD.encode(format!("{name}:{password}"));
-            format!("Basic {encoded}")
-        });
+        let user = change.user.as_ref();
+        let user = user.map(|(name, password)| basic_authorization(name, password));
+        let user = user.transpose();
+        let user = user.map_err(|error| CommandFailure::Usage(error.to_string()))?;
         self.request_as(method, path, content, (user, CHANGE_LIMIT))
             .await
     }
@@ -131,10 +127,9 @@ impl HttpServer {
         method: Method,
         path: &str,
         content: (&str, &str, Bytes),
-        (user, limit): (Option<String>, Duration),
+        user: (Option<HeaderValue>, Duration),
     ) -> Result<HttpResponse, CommandFailure> {
-        let asked = timeout(limit, self.asked(method, path, content, user)).await;
-        let answer = asked.unwrap_or_else(|_| Err(format!("no answer within {limit:?}")));
+        let answer = self.asked(method, path, content, user).await;
         answer.map_err(|why| {
             let help = "start the program, or give the address at which it runs";
             CommandFailure::Unavailable(format!(
@@ -149,16 +144,12 @@ impl HttpServer {
         method: Method,
         path: &str,
         (accept, content_type, body): (&str, &str, Bytes),
-        user: Option<String>,
+        (user, within): (Option<HeaderValue>, Duration),
     ) -> Result<HttpResponse, String> {
-        let stream = TcpStream::connect(&self.authority)
-            .await
-            .map_err(|error| format!("cannot connect to {} ({error})", self.authority))?;
         let is_protobuf = content_type == PROTOBUF;
         let mut request = Request::builder()
             .method(method)
             .uri(format!("{}{path}", self.prefix_path()))
-            .header(HOST, &self.authority)
             .header(ACCEPT, accept);
         if !content_type.is_empty() {
             request = request.header(CONTENT_TYPE, content_type);
@@ -167,9 +158,13 @@ impl HttpServer {
             request = request.header(AUTHORIZATION, user);
         }
         let request = request.body(body).map_err(|error| error.to_string())?;
-        let text = |error: HttpError| error.to_string();
-        let connection = Connection::open(stream).await.map_err(text)?;
-        let response = connection.send(request, MOST_BYTES).await.map_err(text)?;
+        let limits = HttpLimits {
+            within,
+            most: MOST_BYTES,
+        };
+        let host = HttpHost::plain(self.authority.clone());
+        let sent = host.send(request, limits).await;
+        let response = sent.map_err(|error| error.to_string())?;
         let status = response.status().as_u16();
         let content_type = response.headers().get(CONTENT_TYPE);
         let content_type = content_type.and_then(|value| value.to_str().ok());

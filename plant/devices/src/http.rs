@@ -1,37 +1,20 @@
-//! HTTP/1.1 client of devices, with or without TLS: one connection per request, responses bounded
-//! in time and size.
+//! Requests to devices with an HTTP interface, with or without TLS: JSON there and back.
 
 use std::fmt;
 use std::time::Duration;
 
 use bytes::Bytes;
-use http_client::header::{CONTENT_TYPE, HOST};
-use http_client::{Connection, Request, Response};
+use http_client::header::CONTENT_TYPE;
+use http_client::{HttpHost, HttpLimits, Request, RequestError, Response};
 use serde_json::Value;
-use tokio::time::{Instant, timeout_at};
-
-use crate::modbus::connected;
-use crate::tls::DeviceTls;
 
 /// The server of a device.
-#[derive(Debug, Clone)]
-pub(crate) struct DeviceHost {
-    /// Host and port.
-    address: String,
-    /// `None` for plain HTTP.
-    tls: Option<DeviceTls>,
-}
-
-impl PartialEq for DeviceHost {
-    fn eq(&self, other: &Self) -> bool {
-        self.address == other.address && self.tls.is_some() == other.tls.is_some()
-    }
-}
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct DeviceHost(HttpHost);
 
 impl fmt::Display for DeviceHost {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let scheme = if self.tls.is_some() { "https" } else { "http" };
-        write!(f, "{scheme}://{}", self.address)
+        self.0.fmt(f)
     }
 }
 
@@ -66,17 +49,14 @@ pub(crate) enum HttpFault {
 }
 
 impl DeviceHost {
-    /// Creates a server without TLS, by its host and port.
-    pub(crate) const fn plain(address: String) -> Self {
-        Self { address, tls: None }
+    /// Creates the server of a device from its host.
+    pub(crate) const fn new(host: HttpHost) -> Self {
+        Self(host)
     }
 
-    /// Creates a server with TLS.
-    pub(crate) const fn secured(address: String, tls: DeviceTls) -> Self {
-        Self {
-            address,
-            tls: Some(tls),
-        }
+    /// Creates a server without TLS, by its host and port.
+    pub(crate) const fn plain(address: String) -> Self {
+        Self(HttpHost::plain(address))
     }
 
     /// Sends a request and returns its response; null for a response without a body.
@@ -97,48 +77,40 @@ impl DeviceHost {
         asked: DeviceRequest<'_>,
         withdrawn: impl Fn() -> bool + Send,
     ) -> Result<Value, HttpFault> {
-        let until = Instant::now() + asked.within;
-        let late = || {
-            let within = asked.within.as_millis();
-            format!("no answer from {self} within {within} ms")
-        };
-        let unreachable = |error: &dyn fmt::Display| {
-            HttpFault::Unreachable(format!("{self} cannot be reached: {error}"))
-        };
-        let connecting = async {
-            let stream = connected(&self.address)
-                .await
-                .map_err(|error| unreachable(&error))?;
-            let opened = match &self.tls {
-                None => Connection::open(stream).await,
-                Some(tls) => {
-                    let secured = tls.connect(stream).await;
-                    Connection::open(secured.map_err(|error| unreachable(&error))?).await
-                }
-            };
-            opened.map_err(|error| unreachable(&error))
-        };
-        let connection = timeout_at(until, connecting)
-            .await
-            .map_err(|_| HttpFault::Unreachable(late()))??;
         let body = asked.body.map(Value::to_string).unwrap_or_default();
         let request = Request::builder()
             .method(asked.method)
             .uri(asked.path)
-            .header(HOST, &self.address)
             .header(CONTENT_TYPE, "application/json")
             .body(Bytes::from(body))
             .map_err(|error| {
                 HttpFault::Unreachable(format!("{} cannot be asked for: {error}", asked.path))
             })?;
-        if withdrawn() {
-            let why = "Halt came before the request was sent".to_owned();
-            return Err(HttpFault::Unreachable(why));
+        let limits = HttpLimits {
+            within: asked.within,
+            most: LONGEST,
+        };
+        let answer = self.0.send_unless(request, limits, withdrawn).await;
+        self.read(&answer.map_err(|error| self.fault(&error, asked.within))?)
+    }
+
+    /// Returns the fault of a request without a response.
+    fn fault(&self, error: &RequestError, within: Duration) -> HttpFault {
+        let why = match error {
+            RequestError::Withdrawn => "Halt came before the request was sent".to_owned(),
+            RequestError::ConnectTimeout(_) | RequestError::ResponseTimeout(_) => {
+                let within = within.as_millis();
+                format!("no answer from {self} within {within} ms")
+            }
+            RequestError::Address { .. } | RequestError::Connect(_) | RequestError::Tls(_) => {
+                format!("{self} cannot be reached: {error}")
+            }
+            RequestError::Exchange(_) => return self.damaged(error),
+        };
+        match error.is_unsent() {
+            true => HttpFault::Unreachable(why),
+            false => HttpFault::Lost(why),
         }
-        let answer = timeout_at(until, connection.send(request, LONGEST))
-            .await
-            .map_err(|_| HttpFault::Lost(late()))?;
-        self.read(&answer.map_err(|error| self.damaged(&error))?)
     }
 
     fn read(&self, answer: &Response<Bytes>) -> Result<Value, HttpFault> {

@@ -22,7 +22,6 @@ pub mod robotiq;
 pub mod schmalz;
 mod sensors;
 mod skill_types;
-mod tls;
 mod tty;
 pub mod ur;
 

@@ -6,6 +6,7 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use http_body_util::{BodyExt, Full, Limited};
+use http_client::{Connection, HttpError};
 use hyper::body::{Body, Incoming};
 use hyper::header::{CONTENT_TYPE, HOST, HeaderValue};
 use hyper::service::service_fn;
@@ -116,38 +117,18 @@ async fn exchange(endpoint: &RpcEndpoint, body: String) -> Result<Bytes, RpcErro
     let stream = connect(&endpoint.host, endpoint.port, endpoint.ipv6_first)
         .await
         .map_err(RpcError::Connect)?;
-    let (mut sender, connection) = hyper::client::conn::http1::Builder::new()
-        .handshake(TokioIo::new(stream))
-        .await?;
     let host = format!("{}:{}", bracketed(&endpoint.host), endpoint.port);
     let request = Request::post(&endpoint.path)
         .header(HOST, host)
         .header(CONTENT_TYPE, XML)
         .header("Connection", "close")
-        .body(Full::new(Bytes::from(body)))
+        .body(Bytes::from(body))
         .map_err(|_| RpcError::Uri)?;
-    let answer = async {
-        let response = sender.send_request(request).await?;
-        let status = response.status();
-        if status != StatusCode::OK {
-            return Err(RpcError::Status(status.as_u16()));
-        }
-        let body = Limited::new(response.into_body(), MAX_BODY).collect().await;
-        Ok(body
-            .map_err(|error| RpcError::Body(error.to_string()))?
-            .to_bytes())
-    };
-    // The connection does the reading and writing. Once it ends, received data still waits in the
-    // response.
-    let drive = async {
-        if let Err(error) = connection.await {
-            tracing::trace!(%error, "an XML-RPC connection ended early");
-        }
-        std::future::pending().await
-    };
-    tokio::select! {
-        result = answer => result,
-        never = drive => never,
+    let connection = Connection::open(stream).await?;
+    let response = connection.send(request, MAX_BODY).await?;
+    match response.status() {
+        StatusCode::OK => Ok(response.into_body()),
+        status => Err(RpcError::Status(status.as_u16())),
     }
 }
 
@@ -277,7 +258,7 @@ pub enum RpcError {
     Timeout(Duration),
     /// The peer does not use HTTP, or stopped midway.
     #[error("HTTP failed: {0}")]
-    Http(#[from] hyper::Error),
+    Http(#[source] hyper::Error),
     /// The body of the response was not received or is longer than 4 MiB.
     #[error("cannot read the response: {0}")]
     Body(String),
@@ -290,6 +271,15 @@ pub enum RpcError {
     /// The method failed at the peer.
     #[error(transparent)]
     Fault(#[from] XmlRpcFault),
+}
+
+impl From<HttpError> for RpcError {
+    fn from(error: HttpError) -> Self {
+        match error {
+            HttpError::Exchange(error) => Self::Http(error),
+            HttpError::Body(error) => Self::Body(error.to_string()),
+        }
+    }
 }
 
 const XML: &str = "text/xml";

@@ -20,7 +20,6 @@ use tokio::sync::oneshot;
 use tracing::{info, warn};
 
 use super::{RequestBody, bytes};
-use crate::fetch::FetchFault;
 use crate::mes::{MesClient, MesCredentials, MesFault, SourceFile, source_kind};
 use crate::operations::Operations;
 use crate::page::Page;
@@ -310,7 +309,7 @@ fn refusal(fault: MesFault) -> RefusedRequest {
         }
         MesFault::Refused { status, .. } => *status,
         MesFault::TooLarge => StatusCode::INSUFFICIENT_STORAGE,
-        MesFault::Fetch(_) | MesFault::Unreadable(_) | MesFault::Uri(_) | MesFault::Header(_) => {
+        MesFault::Request(_) | MesFault::Unreadable(_) | MesFault::Uri(_) | MesFault::Header(_) => {
             StatusCode::BAD_GATEWAY
         }
     };
@@ -319,10 +318,14 @@ fn refusal(fault: MesFault) -> RefusedRequest {
 
 /// Returns the refusal of a change: without a response the change may have been made.
 fn unknown_or_refused(fault: MesFault) -> RefusedRequest {
-    let was_sent = matches!(
-        fault,
-        MesFault::Fetch(FetchFault::Late(_) | FetchFault::Exchange(_)) | MesFault::TooLarge
-    );
+    let was_sent = match &fault {
+        MesFault::Request(error) => !error.is_unsent(),
+        MesFault::TooLarge => true,
+        MesFault::Refused { .. }
+        | MesFault::Unreadable(_)
+        | MesFault::Uri(_)
+        | MesFault::Header(_) => false,
+    };
     if was_sent {
         let why = format!("the outcome is unknown, the file may have been loaded: {fault}");
         return RefusedRequest(StatusCode::GATEWAY_TIMEOUT, why);

@@ -3,13 +3,13 @@
 use std::fmt;
 use std::time::Duration;
 
+use http_client::{HttpHost, HttpUrl};
 use serde_json::{Map, Value as Json};
 use skills::yaml::{DocumentKind, DocumentNode, YamlFindingCode, YamlReader};
 use skills::{InvalidParameter, Parameters, SkillValue};
 use uri_text::escaped;
 
 use crate::http::{DeviceHost, DeviceRequest, HttpFault};
-use crate::tls::{self, DeviceTls};
 
 /// A request of the YAML.
 #[derive(Debug, Clone, PartialEq)]
@@ -248,50 +248,17 @@ pub(super) fn plain(json: &Json) -> String {
 /// Reads `http://host[:port]/path`, or the same with `https`.
 fn read_url(node: &DocumentNode, reader: &mut YamlReader<'_>) -> Option<(DeviceHost, String)> {
     let text = reader.text(node, "a URL, as http://10.0.0.9/api/state")?;
-    let wrong = |reader: &mut YamlReader<'_>| {
+    let url = text.parse::<HttpUrl>().ok().filter(|url| !url.has_user());
+    let Some(url) = url else {
         let message = format!("expected http://host[:port]/path or https://, found `{text}`");
-        reader.refuse(node, YamlFindingCode::WrongValue, message)
+        return reader.refuse(node, YamlFindingCode::WrongValue, message);
     };
-    let schemes = [("http://", 80, false), ("https://", 443, true)];
-    let known = schemes
-        .iter()
-        .find_map(|(scheme, port, secured)| Some((text.strip_prefix(scheme)?, port, *secured)));
-    let Some((rest, usual_port, is_secured)) = known else {
-        return wrong(reader);
-    };
-    let (host, path) = match rest.find(['/', '?']) {
-        Some(at) => rest.split_at(at),
-        None => (rest, ""),
-    };
-    let (name, address) = match host.rsplit_once(':') {
-        Some((name, port)) if port.parse::<u16>().is_ok_and(|port| port > 0) => {
-            (name, host.to_owned())
+    match HttpHost::of(&url) {
+        Ok(host) => Some((DeviceHost::new(host), url.target().to_owned())),
+        Err(error) => {
+            let message = format!("`{text}`: {error}");
+            reader.refuse(node, YamlFindingCode::WrongValue, message)
         }
-        Some(_) => return wrong(reader),
-        None => (host, format!("{host}:{usual_port}")),
-    };
-    let clean = |text: &str| {
-        text.bytes()
-            .all(|b| b.is_ascii_graphic() && !b"\"<>\\^`|#".contains(&b))
-    };
-    if host.starts_with(':') || host.is_empty() || host.contains(['@', '{']) || !clean(rest) {
-        return wrong(reader);
-    }
-    let path = match path.starts_with('/') {
-        true => path.to_owned(),
-        false => format!("/{path}"),
-    };
-    if !is_secured {
-        return Some((DeviceHost::plain(address), path));
-    }
-    let tls = tls::authorities().and_then(|authorities| DeviceTls::new(name, authorities));
-    match tls {
-        Ok(tls) => Some((DeviceHost::secured(address, tls), path)),
-        Err(why) => reader.refuse(
-            node,
-            YamlFindingCode::WrongValue,
-            format!("`{text}`: {why}"),
-        ),
     }
 }
 

@@ -1,9 +1,9 @@
 use std::path::Path;
 use std::sync::{Arc, Mutex};
 
+use http_client::{HttpHost, TlsAuthorities, TlsVerification};
 use plant_opcua::pki::{OWN_CERTIFICATE, OWN_KEY, Pki};
 use program::{ProgramMachineState, ProgramMethod};
-use rustls::RootCertStore;
 use rustls::pki_types::pem::PemObject as _;
 use rustls::pki_types::{CertificateDer, PrivateKeyDer};
 use skills::{
@@ -18,7 +18,6 @@ use tokio_rustls::TlsAcceptor;
 use super::*;
 use crate::Kinds;
 use crate::http::{DeviceHost, DeviceRequest};
-use crate::tls::DeviceTls;
 
 /// A connection with or without TLS.
 trait Stream: AsyncRead + AsyncWrite + Unpin + Send {}
@@ -287,12 +286,9 @@ async fn a_device_behind_tls_is_asked_only_if_its_certificate_is_trusted() {
     let acceptor = TlsAcceptor::from(Arc::new(config));
     let bench = Bench::over(Some(acceptor), 200, &[]).await;
     let ask = async |host: &str, trusted: bool| {
-        let mut authorities = RootCertStore::empty();
-        if trusted {
-            authorities.add(own.clone()).unwrap();
-        }
-        let tls = DeviceTls::new(host, authorities).unwrap();
-        let host = DeviceHost::secured(bench.address.clone(), tls);
+        let authorities = TlsAuthorities::of(trusted.then(|| own.clone()));
+        let tls = TlsVerification::new(host, &authorities).unwrap();
+        let host = DeviceHost::new(HttpHost::secured(bench.address.clone(), tls));
         let asked = DeviceRequest {
             method: "POST",
             path: "/start",
