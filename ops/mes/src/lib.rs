@@ -11,7 +11,7 @@
 //! - `record`: the record of runs
 //! - `cell`: the current state of the plant
 //! - `follow`: from discovery to the graph
-//! - `sources`, `nodeset_folder`: from files to the graph, while the program runs
+//! - `sources`, `nodeset_folder`, `nodeset_url`: from files to the graph, while the program runs
 //! - `goal`: the search for a sequence that reaches a goal
 //! - `jobs`: processes that clients start, several at a time
 //! - `job_orders`, `order_file`, `job_control`: jobs for clients of OPC 10031-4
@@ -31,6 +31,7 @@ mod knowledge_methods;
 mod live;
 mod locate_skill;
 mod nodeset_folder;
+mod nodeset_url;
 mod order_file;
 mod parameter_fault;
 mod plan;
@@ -180,7 +181,10 @@ impl UaMes {
         }
         let settings = self.settings()?;
         let knowledge = Arc::new(self.knowledge(&settings)?);
-        let sources = Arc::new(MesSources::new(Arc::clone(&knowledge)));
+        let folder = self.store.as_ref().or(settings.store.as_ref());
+        let folder = folder.filter(|_| !self.check).cloned();
+        let sources = MesSources::new(Arc::clone(&knowledge)).cached_in(folder);
+        let sources = Arc::new(sources);
         sources.read(&settings);
         let options = self.options(&settings);
         let client = ClientOptions {
@@ -370,6 +374,8 @@ impl UaMes {
         );
         drop(self.serving.set(endpoint));
         drop(tokio::spawn(self.reload(ready)?));
+        let sources = Arc::clone(ready.cell.sources());
+        drop(tokio::spawn(sources::supply(sources)));
         let interface = self.interface();
         let only_loopback = self.arguments.0.flags.interface.is_none()
             || interface == discovery::MdnsInterface::LOOPBACK;

@@ -16,7 +16,7 @@ use skills::{ComponentSecurity, Lds, ParameterType};
 use crate::process::{By, MOST_STEPS, Need, Process, ProcessStep, SkillRole, StepJob};
 use crate::read_process::{USUALLY_WAIT, USUALLY_WITHIN};
 
-pub(crate) use files::{Connect, Manifest, RecipeSource, RmlSource, Source};
+pub(crate) use files::{Connect, Manifest, NodeSetOrigin, RecipeSource, RmlSource, Source};
 
 /// The settings of the MES.
 #[derive(Debug, Clone)]
@@ -41,8 +41,8 @@ pub(crate) struct Settings {
     /// Turtle files.
     pub(crate) knowledge: Vec<Source>,
     pub(crate) nodesets: Vec<Source>,
-    /// The folder of the NodeSets that others require.
-    pub(crate) nodeset_folder: Option<Source>,
+    /// The folder or URL of the NodeSets that others require.
+    pub(crate) nodeset_folder: Option<NodeSetOrigin>,
     pub(crate) manifests: Vec<Manifest>,
     pub(crate) rml: Vec<RmlSource>,
     /// Recipes of BatchML and BPMN.
@@ -150,7 +150,7 @@ impl Reading<'_> {
         let rules = rules.map_or(Some(false), |node| self.reader.boolean(node));
         let knowledge = knowledge.map_or_else(Vec::new, |node| self.files(node));
         let nodesets = nodesets.map_or_else(Vec::new, |node| self.files(node));
-        let nodeset_folder = nodeset_folder.map(|node| self.folder(node));
+        let nodeset_folder = nodeset_folder.map(|node| self.nodeset_origin(node));
         let manifests = manifests.map_or_else(Vec::new, |node| self.each(node, Self::manifest));
         let rml = rml.map_or_else(Vec::new, |node| self.each(node, Self::rml));
         let recipes = recipes.map_or_else(Vec::new, |node| self.each(node, Self::recipe));

@@ -2,11 +2,14 @@
 //!
 //! A source that cannot be read is a finding of the status page; all other sources are read.
 
+mod completion;
+mod supply;
+
 use std::collections::{BTreeMap, BTreeSet};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-use knowledge::nodeset::{ModelVersion, NodeSetModel};
+use knowledge::nodeset::ModelVersion;
 use knowledge::{
     Knowledge, KnowledgeSource, SourceCheck, SourceFiles, SourceFinding, SourceKind,
     SourceLifetime, line_of, nodeset,
@@ -14,18 +17,27 @@ use knowledge::{
 use mtp::{Module, Triple, escaped};
 use rml::{Folder, RmlMapping};
 use serde::Serialize;
+use tokio::sync::Notify;
 use tracing::{info, warn};
 
 use crate::cell::now;
-use crate::nodeset_folder::{FolderNodeSet, NodeSetFolder};
+use crate::nodeset_folder::NodeSetFolder;
 use crate::process::Process;
 use crate::recipe::{self, Recipe};
-use crate::settings::{self, Manifest, RmlSource, Settings};
+use crate::settings::{self, Manifest, NodeSetOrigin, RmlSource, Settings};
+
+pub(crate) use self::supply::supply;
 
 /// The sources, and the findings about them.
 pub(crate) struct MesSources {
     knowledge: Arc<Knowledge>,
     state: Mutex<State>,
+    /// Held while NodeSets are added, removed or read again.
+    order: Mutex<()>,
+    /// Notified when a NodeSet may be missing that can be fetched.
+    wanted: Notify,
+    /// The folder of the program, for fetched NodeSets.
+    cache: Option<PathBuf>,
 }
 
 #[derive(Debug, Default)]
@@ -34,6 +46,8 @@ struct State {
     of_yaml: BTreeSet<KnowledgeSource>,
     /// The folder of NodeSets that complete others.
     folder: Option<Arc<NodeSetFolder>>,
+    /// The URL of NodeSets that complete others.
+    supply: supply::NodeSetSupply,
     /// The findings by the source.
     findings: BTreeMap<KnowledgeSource, Vec<Finding>>,
 }
@@ -56,11 +70,15 @@ impl MesSources {
         Self {
             knowledge,
             state: Mutex::default(),
+            order: Mutex::default(),
+            wanted: Notify::new(),
+            cache: None,
         }
     }
 
     /// Reads all files that the YAML names, and removes the sources that it named before.
     pub(crate) fn read(&self, settings: &Settings) {
+        let _order = self.order.lock().unwrap_or_else(PoisonError::into_inner);
         let mut named = BTreeSet::new();
         let ours = skills::model::nodeset();
         let source = KnowledgeSource::new(SourceKind::NodeSet, skills::model::NAMESPACE);
@@ -135,7 +153,7 @@ impl MesSources {
         self.rules(settings.rules);
     }
 
-    /// Reads the NodeSets, and completes them from the folder.
+    /// Reads the NodeSets, and completes them from the folder or the URL.
     fn node_sets(&self, settings: &Settings, named: &mut BTreeSet<KnowledgeSource>) {
         let mut models = Vec::new();
         for file in &settings.nodesets {
@@ -154,21 +172,14 @@ impl MesSources {
             });
         }
         let earlier = self.state().folder.take();
-        if let Some(of_yaml) = &settings.nodeset_folder {
-            let source = KnowledgeSource::new(SourceKind::NodeSet, &of_yaml.name);
-            named.insert(source.clone());
-            // A folder that cannot be read completes NodeSets as before.
-            let mut folder = earlier.filter(|folder| folder.path() == of_yaml.path);
-            self.try_one(source, |source| {
-                let read = NodeSetFolder::read(&of_yaml.path, folder.as_deref())?;
-                for what in read.findings() {
-                    self.found(source, what, false);
-                }
-                folder = Some(Arc::new(read));
-                Ok(())
-            });
-            self.state().folder = folder;
-        }
+        let url = match &settings.nodeset_folder {
+            Some(NodeSetOrigin::Folder(of_yaml)) => {
+                self.read_folder(of_yaml, earlier, named);
+                None
+            }
+            Some(NodeSetOrigin::Url(url)) => Some(url),
+            None => None,
+        };
         let mut known = self.known_node_sets();
         known.retain(|namespace, _| {
             let source = KnowledgeSource::new(SourceKind::NodeSet, namespace);
@@ -179,81 +190,8 @@ impl MesSources {
             let added = self.complete(source, model, &mut known, SourceLifetime::No);
             named.extend(added);
         }
-    }
-
-    /// Adds the NodeSets that a NodeSet requires from the folder, if there is one, and adds them to
-    /// `known`. Models that are missing or too old are findings of the NodeSet.
-    fn complete(
-        &self,
-        source: &KnowledgeSource,
-        model: &NodeSetModel,
-        known: &mut BTreeMap<String, ModelVersion>,
-        lasting: SourceLifetime,
-    ) -> Vec<KnowledgeSource> {
-        let folder = self.state().folder.clone();
-        let Some(folder) = folder else {
-            return Vec::new();
-        };
-        let mut taken: BTreeSet<String> = BTreeSet::new();
-        let mut faults: BTreeMap<String, Vec<String>> = BTreeMap::new();
-        let completion = folder.complete(model, known, &mut |file| {
-            let namespace = file.model.namespace.clone();
-            let path = file.path.display();
-            match self.take_file(file, lasting) {
-                Ok(()) => {
-                    info!(source = source.name, "{namespace} was added from {path}");
-                    taken.insert(namespace);
-                    true
-                }
-                Err(what) => {
-                    let of_namespace = faults.entry(namespace.clone()).or_default();
-                    of_namespace.push(format!("{path}: {what}"));
-                    // An older file does not replace contents that this file gave before.
-                    let is_kept = self.has_version(&file.model);
-                    if is_kept {
-                        taken.insert(namespace);
-                    }
-                    is_kept
-                }
-            }
-        });
-        for what in completion.findings {
-            self.found(source, what, false);
-        }
-        let mut added = Vec::new();
-        for file in completion.files {
-            let namespace = file.model.namespace;
-            let other = KnowledgeSource::new(SourceKind::NodeSet, &namespace);
-            let is_refused = !taken.contains(&namespace);
-            let found: Vec<Finding> = faults
-                .remove(&namespace)
-                .into_iter()
-                .flatten()
-                .map(|what| finding(&other, what, is_refused))
-                .collect();
-            for Finding { source, what, .. } in &found {
-                warn!(kind = %other.kind, source, "cannot read a source: {what}");
-            }
-            self.state().findings.insert(other.clone(), found);
-            added.push(other);
-            let version = self.knowledge.model_version(&namespace);
-            known.insert(namespace, version);
-        }
-        added
-    }
-
-    /// Adds a NodeSet of the folder to the graph.
-    fn take_file(&self, file: &FolderNodeSet, lasting: SourceLifetime) -> Result<(), String> {
-        let source = KnowledgeSource::new(SourceKind::NodeSet, &file.model.namespace);
-        let read = node_set(&decoded(&bytes(&file.path)?)?)?;
-        self.put(&source, &read.triples, lasting)
-    }
-
-    /// Returns whether the graph has a NodeSet that is not older than a model.
-    fn has_version(&self, model: &NodeSetModel) -> bool {
-        let source = KnowledgeSource::new(SourceKind::NodeSet, &model.namespace);
-        let version = self.knowledge.model_version(&model.namespace);
-        self.is_known(&source) && !version.is_older_than(&model.version)
+        let models = models.into_iter().map(|(_, model)| model).collect();
+        self.supply_anew(url, models, named, &mut known);
     }
 
     /// Returns the NodeSets of the graph with their versions.
@@ -385,10 +323,13 @@ impl MesSources {
         Ok(())
     }
 
-    /// Returns the models that a NodeSet requires and the folder does not have.
+    /// Returns the models that a NodeSet requires and that the folder does not have, or that would
+    /// be fetched.
     fn missing(&self, kind: SourceKind, contents: &[u8]) -> Vec<String> {
+        if kind != SourceKind::NodeSet {
+            return Vec::new();
+        }
         let folder = self.state().folder.clone();
-        let folder = folder.filter(|_| kind == SourceKind::NodeSet);
         let model = decoded(contents).ok();
         let model = model.and_then(|text| nodeset::read_model(&text).ok());
         match (folder, model) {
@@ -396,7 +337,8 @@ impl MesSources {
                 let known = self.known_node_sets();
                 folder.complete(&model, &known, &mut |_| true).findings
             }
-            _ => Vec::new(),
+            (None, Some(model)) => self.would_fetch(&model),
+            (_, None) => Vec::new(),
         }
     }
 
@@ -493,6 +435,7 @@ impl SourceFiles for MesSources {
         } else {
             None
         };
+        let _order = self.order.lock().unwrap_or_else(PoisonError::into_inner);
         self.of_yaml(&source)?;
         let is_new = !self.is_known(&source);
         self.state().findings.remove(&source);
@@ -515,6 +458,7 @@ impl SourceFiles for MesSources {
                 Self::put(self, &source, &read.triples, SourceLifetime::Yes)?;
                 let mut known = self.known_node_sets();
                 self.complete(&source, &read.model, &mut known, SourceLifetime::Yes);
+                self.supply_for(read.model);
             }
             (SourceKind::Mtp, _) => {
                 let manifest = Manifest {
@@ -567,11 +511,15 @@ impl SourceFiles for MesSources {
 
     fn remove(&self, kind: SourceKind, name: &str) -> Result<bool, String> {
         let source = KnowledgeSource::new(kind, name);
+        let _order = self.order.lock().unwrap_or_else(PoisonError::into_inner);
         self.of_yaml(&source)?;
         let removed = self.knowledge.remove(&source);
         let removed = removed.map_err(|fault| fault.to_string())?;
         if removed {
             self.state().findings.remove(&source);
+            if kind == SourceKind::NodeSet {
+                self.supply_without(name);
+            }
             info!(kind = %kind, source = name, "a source was removed");
         }
         Ok(removed)

@@ -6,6 +6,7 @@ use std::path::PathBuf;
 use skills::yaml::{DocumentKind, DocumentNode, YamlFindingCode};
 
 use super::Reading;
+use crate::nodeset_url::NodeSetUrl;
 use crate::recipe::Names;
 
 /// A file, with its name in the YAML.
@@ -13,6 +14,13 @@ use crate::recipe::Names;
 pub(crate) struct Source {
     pub(crate) name: String,
     pub(crate) path: PathBuf,
+}
+
+/// The origin of NodeSets that others require.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) enum NodeSetOrigin {
+    Folder(Source),
+    Url(NodeSetUrl),
 }
 
 /// An RML mapping of XML files.
@@ -65,6 +73,22 @@ impl Reading<'_> {
     pub(super) fn folder(&mut self, node: &DocumentNode) -> Option<Source> {
         let name = self.reader.text(node, "the path of a folder")?;
         Some(self.source(name, name))
+    }
+
+    /// Reads the origin of NodeSets: a URL if the text has a scheme, or else a folder.
+    pub(super) fn nodeset_origin(&mut self, node: &DocumentNode) -> Option<NodeSetOrigin> {
+        let text = self.reader.text(node, "the path of a folder, or a URL")?;
+        if !text.contains("://") {
+            return Some(NodeSetOrigin::Folder(self.source(text, text)));
+        }
+        match text.parse::<NodeSetUrl>() {
+            Ok(url) => Some(NodeSetOrigin::Url(url)),
+            Err(error) => {
+                let message = format!("no NodeSets can be fetched from there: {error}");
+                self.reader
+                    .refuse(node, YamlFindingCode::WrongValue, message)
+            }
+        }
     }
 
     fn source(&self, name: &str, path: &str) -> Source {

@@ -203,3 +203,34 @@ fn a_query_of_a_parameter_is_checked_with_the_yaml() {
         );
     }
 }
+
+#[test]
+fn nodesets_come_from_a_folder_or_a_url_that_is_checked() {
+    let read = |origin: &str| {
+        let text =
+            format!("mes: m\napplication_uri: urn:x\nnamespace: 5\nnodeset_folder: '{origin}'\n");
+        let read = Settings::from_yaml(&text, Path::new("plant"));
+        let read = read.map_err(|findings| findings.render("mes.yaml", &text));
+        read.map(|settings| settings.nodeset_folder.unwrap())
+    };
+    let folder = read("sets").unwrap();
+    let NodeSetOrigin::Folder(folder) = folder else {
+        panic!("{folder:?}")
+    };
+    assert_eq!(folder.path, Path::new("plant/sets"));
+    for url in ["http://h/{uri}.xml", "https://h/nodesets/index.json"] {
+        let origin = read(url).unwrap();
+        assert!(matches!(origin, NodeSetOrigin::Url(_)), "{origin:?}");
+    }
+    for (url, why) in [
+        ("ftp://h/{uri}", "does not begin with http:// or https://"),
+        ("http://h/nodesets/", "the URL has no {uri}"),
+        ("http://h:x/{uri}", "`x` is no port"),
+    ] {
+        let told = read(url).unwrap_err();
+        assert!(
+            told.contains(why) && told.contains("mes.yaml:4:17"),
+            "{told}"
+        );
+    }
+}
