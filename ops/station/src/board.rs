@@ -92,6 +92,7 @@ impl Board {
         self.tell.send_replace(Added {
             gated: gated(state),
             status: Some(status(state)),
+            not_ready: not_ready(state),
         });
     }
 
@@ -188,7 +189,28 @@ fn status(state: &State) -> serde_json::Value {
     })
 }
 
+/// Returns the reasons why the station is not ready: the levels whose servers are all refused, or
+/// not connected beside a refused server.
+fn not_ready(state: &State) -> Vec<String> {
+    let levels = [(Level::Above, "above"), (Level::Below, "below")];
+    let reasons = levels.into_iter().filter_map(|(level, name)| {
+        let peers = state.peers.iter().filter(|((at, _), _)| *at == level);
+        let mut refused = peers.clone().filter(|(_, peer)| peer.state == REFUSED);
+        let ((_, url), first) = refused.next()?;
+        if peers.clone().any(|(_, peer)| peer.is_there()) {
+            return None;
+        }
+        let (peer, count) = (&first.name, refused.count().saturating_add(1));
+        let why = first.fault.as_deref().unwrap_or("no reason is known");
+        Some(format!(
+            "no server of the level {name} is connected; refused: {count}, the first {peer} ({url}): {why}"
+        ))
+    });
+    reasons.collect()
+}
+
 pub(crate) const CONNECTED: &str = "connected";
+pub(crate) const REFUSED: &str = "refused";
 /// Connected, but not responding: the server is executing a method.
 pub(crate) const BUSY: &str = "busy";
 
@@ -224,6 +246,34 @@ mod tests {
         assert_eq!(added.borrow().gated, [own, through]);
         assert_eq!(board.leave(Level::Above, "u1").as_deref(), Some("b"));
         assert_eq!(added.borrow().gated.len(), 1);
+    }
+
+    #[test]
+    fn a_station_whose_servers_are_refused_is_not_ready() {
+        let (board, added) = Board::new();
+        let not_ready = || added.borrow().not_ready.clone();
+        board.enter(Level::Below, "u1", "press");
+        board.enter(Level::Below, "u2", "robot");
+        assert_eq!(not_ready(), [""; 0], "no server is refused");
+        let refuse = |url: &str| {
+            board.note(Level::Below, url, |peer| {
+                peer.state = REFUSED;
+                peer.fault = Some("not trusted".to_owned());
+            });
+        };
+        refuse("u1");
+        let one = "no server of the level below is connected; refused: 1, the first press (u1): \
+                   not trusted";
+        assert_eq!(not_ready(), [one]);
+        refuse("u2");
+        let two = one.replace("refused: 1", "refused: 2");
+        assert_eq!(not_ready(), [two]);
+        board.note(Level::Below, "u2", |peer| peer.state = BUSY);
+        assert_eq!(not_ready(), [""; 0], "a server is connected");
+        board.leave(Level::Below, "u2");
+        assert_eq!(not_ready(), [one]);
+        board.leave(Level::Below, "u1");
+        assert_eq!(not_ready(), [""; 0]);
     }
 
     #[test]

@@ -123,6 +123,7 @@ pub async fn run(
         tokio::spawn(tend_below(events, tending)).abort_handle(),
     ));
     let around = LdsEmbedding {
+        program: "ua-station",
         events: tell,
         added,
     };

@@ -18,7 +18,7 @@ use tokio::task::JoinHandle;
 use tokio::time::sleep;
 use tracing::{info, warn};
 
-use crate::board::{BUSY, Board, CONNECTED, Level};
+use crate::board::{BUSY, Board, CONNECTED, Level, REFUSED};
 use crate::budget::NodeBudget;
 use crate::callers::Callers;
 use crate::configure::ConfigureArguments;
@@ -98,7 +98,7 @@ impl Tending {
                     let fault = format!(
                         "its ApplicationUri is {application_uri}, but another was announced"
                     );
-                    self.fault(&url, "refused", fault);
+                    self.fault(&url, REFUSED, fault);
                 }
                 Link::Down {
                     reason,
@@ -108,7 +108,7 @@ impl Tending {
                     self.board.note(self.level, &url, |peer| {
                         peer.certificates_refused = refused;
                     });
-                    let state = certificate.map_or("away", |_| "refused");
+                    let state = certificate.map_or("away", |_| REFUSED);
                     self.fault(&url, state, reason);
                 }
                 Link::Connecting => {}

@@ -185,11 +185,15 @@ pub struct Added {
     pub gated: Vec<Gated>,
     /// The value of `level` in `/status`.
     pub status: Option<serde_json::Value>,
+    /// The reasons why the program is not ready.
+    pub not_ready: Vec<String>,
 }
 
 /// The connection between an embedding program and its discovery server.
 #[derive(Debug)]
 pub struct LdsEmbedding {
+    /// The name of the program in `/status`.
+    pub program: &'static str,
     /// Receives changes of the servers. Events that do not fit into the channel are dropped, and
     /// counted as `level_missed_total`: the discovery server never waits.
     pub events: mpsc::Sender<OnLevel>,
@@ -576,24 +580,25 @@ impl DiscoveryServer {
         });
         let no_interface = self.interface.addresses().is_empty();
         let why = format!("the interface {} has no IPv4 address", self.interface);
+        let around = self.around.as_ref();
+        let added = around.map(|around| around.added.borrow().clone());
+        let added = added.unwrap_or_default();
+        let no_interface = no_interface.then_some(why).into_iter();
         LdsStatus {
-            program: "ua-lds",
+            program: around.map_or("ua-lds", |around| around.program),
             version: build_info::version(),
             library: plant_opcua::patches::library(),
             application_uri: self.shared.own.application_uri.clone(),
             endpoint: self.shared.own.url.clone(),
             interface: self.interface.to_string(),
             since_ms: clock::millis(self.started),
-            not_ready: no_interface.then_some(why).into_iter().collect(),
+            not_ready: no_interface.chain(added.not_ready).collect(),
             servers: servers.collect(),
             network: network.collect(),
             losses: self.losses.clone(),
             counters: self.counters(),
             gds: self.listing.as_ref().map(ListingTask::status),
-            level: self
-                .around
-                .as_ref()
-                .and_then(|around| around.added.borrow().status.clone()),
+            level: added.status,
             certificate: self.pki.as_deref().and_then(own::status),
         }
     }

@@ -8,7 +8,8 @@ use std::time::{Duration, Instant};
 use nix::sys::signal::Signal;
 use serde_json::{Value, json};
 use system_tests::{
-    CaptureFile, Cell, Child, Peer, PlantSite, Segment, StartedChild, eventually, metrics, program,
+    CaptureFile, Cell, Child, Peer, PlantSite, Segment, StartedChild, eventually, http_answer,
+    metrics, program,
 };
 
 use super::{MDNS, SOON, STATUS, list};
@@ -616,12 +617,27 @@ fn over_secured_channels_a_device_is_configured_and_called_and_one_that_is_not_t
     plant.supervisor.wait_for_line(line, SOON);
     let lines = stranger.json_lines();
     assert!(lines.iter().all(|line| line.get("place").is_none()));
+    // Without the adder every server of the level is refused.
+    let ready = || plant.station.within(|| http_answer(STATUS, "/readyz"));
+    assert_eq!(ready().unwrap().0, 200, "the adder is connected");
+    drop(adder);
+    let reason = eventually("the station is not ready", SOON * 3, || {
+        let (code, reason) = ready()?;
+        (code == 503).then_some(reason)
+    });
+    let expected = "no server of the level below is connected; refused: 1, the first stranger";
+    assert!(reason.contains(expected), "{reason}");
+    let shown = status(&plant.station).unwrap();
+    assert_eq!(shown["program"], "ua-station", "{shown}");
     // The command suggested by the station solves the problem.
     let (_, command) = why.rsplit_once("`ua-server trust ").unwrap();
     let (digits, _) = command.split_once(' ').unwrap();
     trust(&cell, "station-pki", digits);
     stranger.wait_for_json("its place", SOON * 3, |line| {
         (line["place"] == "plant/cell-1/stranger").then_some(())
+    });
+    eventually("the station is ready", SOON, || {
+        (ready()?.0 == 200).then_some(())
     });
 }
 
