@@ -274,12 +274,13 @@ fn are_answered_alike(cell: &Cell, knowledge: &Knowledge, device: &str) {
             question.name
         );
     }
-    // No process has run, and no process is known.
+    // No process has run, and neither processes nor operations are known.
     let expected = [
         "action-parameters",
         "actions",
         "goals",
         "objects",
+        "operations",
         "process-conditions",
         "process-loops",
         "process-parameters",
