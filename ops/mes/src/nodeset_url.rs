@@ -1,5 +1,5 @@
-//! NodeSets by their namespaces from a URL that the YAML names: a template with `{uri}`, or an index
-//! in JSON.
+//! NodeSets by their namespaces from a URL that the YAML names: a template with `{uri}`, or an
+//! index in JSON.
 
 use std::collections::BTreeMap;
 use std::fmt;
