@@ -24,7 +24,9 @@ use tokio::sync::watch;
 use trust::Fingerprint;
 
 pub use self::parts::{LimitedService, OperationLimits, PartFault, PartedRequest};
-pub use self::services::{Browse, CallError, CallOptions, CallResult, MOST_REFERENCES};
+pub use self::services::{
+    Browse, BrowsedReferences, CallError, CallOptions, CallResult, MOST_REFERENCES,
+};
 pub use self::subscription::{ClientSubscription, MonitoredWatch, Notice, Sampled, Select};
 pub use self::types::MOST_TYPES;
 pub use crate::judge::HostNames;

@@ -15,10 +15,10 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use async_trait::async_trait;
-use cell::{OpcuaCell, PATIENCE, config, next, next_value, press};
+use cell::{OpcuaCell, PATIENCE, config, next, next_value, press, variable};
 use opcua::types::{NodeId, ObjectId, QualifiedName, StatusCode, VariableId, Variant};
 use plant_opcua::client::{
-    CallOptions, ClientConfig, ClientError, Link, MonitoredWatch, Notice, OpcUaClient,
+    Browse, CallOptions, ClientConfig, ClientError, Link, MonitoredWatch, Notice, OpcUaClient,
     SecurityChoice,
 };
 use plant_opcua::server::{
@@ -402,10 +402,7 @@ async fn still_serves(server: &OpcUaServer) {
     let client = OpcUaClient::open(quick(), server.url());
     client.up(PATIENCE).await.unwrap();
     let root: NodeId = ObjectId::ObjectsFolder.into();
-    let below = client
-        .browse(&root, plant_opcua::client::Browse::hierarchical())
-        .await
-        .unwrap();
+    let below = client.browse(&root, Browse::hierarchical()).await.unwrap();
     assert!(!below.is_empty());
 }
 
@@ -463,4 +460,33 @@ async fn a_server_with_small_limits_is_asked_in_parts() {
     }
     client.close().await;
     server.cancel();
+}
+
+#[tokio::test]
+async fn references_are_browsed_page_by_page_up_to_a_number() {
+    let cell = OpcuaCell::new();
+    let folder: NodeId = ObjectId::ObjectsFolder.into();
+    for n in 0..25_usize {
+        let node = NodeId::new(1, u32::try_from(9000 + n).unwrap());
+        cell.server
+            .add_variable(&variable(&node, &folder, n))
+            .unwrap();
+    }
+    let client = cell.client().await;
+    let nodes = [folder.clone(), NodeId::new(1, 77_777_u32), folder];
+    let what = Browse::hierarchical();
+    let all = client
+        .browse_within(&nodes, &what, (1000, 4))
+        .await
+        .unwrap();
+    let [first, missing, second] = all.as_slice() else {
+        panic!("{all:?}")
+    };
+    assert!(first.is_whole && first.references.len() >= 25);
+    assert_eq!(first, second);
+    assert_eq!(missing.status, StatusCode::BadNodeIdUnknown);
+    let few = client.browse_within(&nodes, &what, (10, 4)).await.unwrap();
+    let counts: Vec<usize> = few.iter().map(|one| one.references.len()).collect();
+    assert_eq!(counts, [10, 0, 0]);
+    assert!(!few[0].is_whole && !few[2].is_whole);
 }

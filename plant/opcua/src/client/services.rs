@@ -66,6 +66,17 @@ impl Browse {
     }
 }
 
+/// The references of a node, as far as they were read.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct BrowsedReferences {
+    /// The references.
+    pub references: Vec<ReferenceDescription>,
+    /// Whether the server has no more references of the node.
+    pub is_whole: bool,
+    /// The status of the node, which is Bad for a node that does not exist.
+    pub status: StatusCode,
+}
+
 /// The options of a method call.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct CallOptions {
@@ -206,7 +217,54 @@ impl OpcUaClient {
         let description = what.of_node(node);
         let browsed = connected.session.browse(&[description], 0, None).await;
         let first = as_many(browsed, 1)?.pop().unwrap_or_default();
-        pages(&connected, first).await
+        let found = pages(&connected, first, MOST_REFERENCES).await?;
+        match found.status.is_bad() {
+            true => Err(ClientError::Status(found.status)),
+            false => Ok(found.references),
+        }
+    }
+
+    /// Returns the references of several nodes, at most `most` altogether and `page` of a node in a
+    /// response. A lying server is bounded: it cannot make a result endless.
+    ///
+    /// # Errors
+    /// Returns an error if a request has no response.
+    pub async fn browse_within(
+        &self,
+        nodes: &[NodeId],
+        what: &Browse,
+        (most, page): (usize, u32),
+    ) -> Result<Vec<BrowsedReferences>, ClientError> {
+        let connected = self.shared.connected()?;
+        let descriptions: Vec<_> = nodes.iter().map(|node| what.of_node(node)).collect();
+        let mut all: Vec<BrowsedReferences> = Vec::with_capacity(nodes.len());
+        let mut left = most;
+        // The continuation points of a part are used before another part needs some.
+        while let Some(rest) = descriptions
+            .get(all.len()..)
+            .filter(|rest| !rest.is_empty())
+        {
+            let size = connected.limits.most(LimitedService::Browse);
+            let part = rest.get(..size.min(rest.len())).unwrap_or(rest);
+            let mut parts = connected.limits.parts(LimitedService::Browse, part);
+            while let Some(part) = parts.next_part() {
+                parts.answered(connected.session.browse(part, page, None).await)?;
+            }
+            for (description, first) in part.iter().zip(parts.into_answers()) {
+                let first = match first.status_code {
+                    StatusCode::BadNoContinuationPoints => {
+                        let again = std::slice::from_ref(description);
+                        let browsed = connected.session.browse(again, page, None).await;
+                        as_many(browsed, 1)?.pop().unwrap_or_default()
+                    }
+                    _ => first,
+                };
+                let found = pages(&connected, first, left).await?;
+                left = left.saturating_sub(found.references.len());
+                all.push(found);
+            }
+        }
+        Ok(all)
     }
 
     /// Returns the references of several nodes, at most [`MOST_REFERENCES`] of each. A node that
@@ -232,7 +290,9 @@ impl OpcUaClient {
             let found = match first.status_code {
                 // A server has a limited number of continuation points.
                 StatusCode::BadNoContinuationPoints => self.browse(node, what.clone()).await,
-                _ => pages(&connected, first).await,
+                _ => pages(&connected, first, MOST_REFERENCES)
+                    .await
+                    .map(|found| found.references),
             };
             all.push(match found {
                 Err(ClientError::Status(_)) => Vec::new(),
@@ -361,31 +421,51 @@ impl OpcUaClient {
     }
 }
 
-/// Returns the references of the first page and of the pages that follow.
+/// Returns the references of the first page and of the pages that follow, at most `most`. References
+/// that precede a Bad page are dropped.
 async fn pages(
     connected: &ConnectedClient,
     first: BrowseResult,
-) -> Result<Vec<ReferenceDescription>, ClientError> {
+    most: usize,
+) -> Result<BrowsedReferences, ClientError> {
     let session = &connected.session;
-    let mut found = Vec::new();
+    let mut found = BrowsedReferences {
+        is_whole: true,
+        ..BrowsedReferences::default()
+    };
+    let mut empty_pages = 0;
     let mut page = Some(first);
     while let Some(result) = page.take() {
         if result.status_code.is_bad() {
-            return Err(ClientError::Status(result.status_code));
+            return Ok(BrowsedReferences {
+                status: result.status_code,
+                ..BrowsedReferences::default()
+            });
         }
-        found.extend(result.references.into_iter().flatten());
+        let before = found.references.len();
+        found
+            .references
+            .extend(result.references.into_iter().flatten());
         let more: ByteString = result.continuation_point;
         if more.is_null_or_empty() {
             break;
         }
-        let enough = found.len() >= MOST_REFERENCES;
+        // A faulty server may continue without end.
+        if found.references.len() == before {
+            empty_pages += 1;
+        }
+        let enough = found.references.len() >= most || empty_pages > MOST_EMPTY_PAGES;
         let next = session.browse_next(enough, &[more]).await;
         if enough {
+            found.is_whole = false;
             break;
         }
         page = as_many(next, 1)?.pop();
     }
-    found.truncate(MOST_REFERENCES);
+    if found.references.len() > most {
+        found.references.truncate(most);
+        found.is_whole = false;
+    }
     Ok(found)
 }
 
@@ -401,5 +481,7 @@ fn as_many<T>(
     Ok(answer)
 }
 
+/// Maximum number of pages without a reference in the references of a node.
+const MOST_EMPTY_PAGES: usize = 8;
 /// Maximum number of references of a node that are returned.
 pub const MOST_REFERENCES: usize = 10_000;
