@@ -1,57 +1,39 @@
 //! Values of variables (OPC 10000-6, 5.3). A single scalar is a literal or a node; an array or a
 //! structure is JSON.
 
-use oxigraph::model::{NamedNode, Term};
 use roxmltree::Node;
 use serde_json::{Map, Value};
 
-use super::{Reading, children, typed};
-use crate::vocabulary as v;
+use super::facts::OntologyValue;
+use super::{Reading, children};
 
 impl Reading {
-    pub(super) fn value(&mut self, subject: &NamedNode, value: Node<'_, '_>) {
+    /// Reads a value; `None` with a finding if it nests too deep.
+    pub(super) fn value(&mut self, value: Node<'_, '_>) -> Option<OntologyValue> {
         let kind = value.tag_name().name();
-        let text = value.text().unwrap_or_default().trim();
-        let datatype = match kind {
-            "Boolean" => "boolean",
-            "SByte" | "Byte" | "Int16" | "UInt16" | "Int32" | "UInt32" | "Int64" | "UInt64" => {
-                "integer"
-            }
-            "Float" | "Double" => "double",
-            "String" => {
-                self.text(subject, v::VALUE, value.text().unwrap_or_default());
-                return;
-            }
-            "DateTime" => "dateTime",
-            "ByteString" => "base64Binary",
+        let text = match kind {
             "LocalizedText" => {
-                let locale = part(value, "Locale");
-                self.localized(subject, v::VALUE, (part(value, "Text"), locale.trim()));
-                return;
+                return Some(OntologyValue::Localized {
+                    text: part(value, "Text").to_owned(),
+                    locale: part(value, "Locale").trim().to_owned(),
+                });
             }
             "NodeId" | "ExpandedNodeId" => {
                 let written = part(value, "Identifier").trim();
-                let name = self.name(written);
-                let node = name.and_then(|name| NamedNode::new(name.iri()).ok());
-                match node {
-                    Some(node) => self.say(subject, v::VALUE, Term::from(node)),
-                    None => self.text(subject, v::VALUE, written),
-                }
-                return;
+                let node = self.name(written).map(OntologyValue::Node);
+                return Some(node.unwrap_or_else(|| OntologyValue::Text(written.to_owned())));
             }
-            "Guid" => {
-                self.text(subject, v::VALUE, part(value, "String").trim());
-                return;
-            }
-            _ => {
-                match json(value, 0) {
-                    Some(json) => self.text(subject, v::VALUE_JSON, &json.to_string()),
-                    None => self.find(value, format!("the value nests more than {MAX_DEPTH} deep")),
-                }
-                return;
-            }
+            "Guid" => part(value, "String"),
+            _ => value.text().unwrap_or_default(),
         };
-        self.say(subject, v::VALUE, typed(text, datatype));
+        if let Some(scalar) = OntologyValue::scalar(kind, text) {
+            return Some(scalar);
+        }
+        let json = json(value, 0);
+        if json.is_none() {
+            self.find(value, format!("the value nests more than {MAX_DEPTH} deep"));
+        }
+        json.map(OntologyValue::Json)
     }
 }
 
@@ -61,7 +43,7 @@ fn part<'a>(value: Node<'a, '_>, name: &'a str) -> &'a str {
 }
 
 /// Returns an array or structure as JSON; `None` if it nests too deep.
-fn json(value: Node<'_, '_>, depth: usize) -> Option<Value> {
+pub(super) fn json(value: Node<'_, '_>, depth: usize) -> Option<Value> {
     if depth > MAX_DEPTH {
         return None;
     }
