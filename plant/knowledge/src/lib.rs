@@ -13,7 +13,8 @@
 //! source.
 //!
 //! Reading order: `source` (the named graphs), `store`, `writing` (replacement), `rules` (derived
-//! statements), `journal` (lasting sources), `component` and `nodeset` (facts to statements),
+//! statements), `journal` (lasting sources), `component`, `nodeset`,
+//! `owl` and `served` (facts to statements),
 //! `question` (named queries), `query` and `bounds` (any SPARQL, within limits), `lanes` (the
 //! queries that run at a time), `http`, `update` and `writes` (changes by users), `shapes` and
 //! `checking` (the SHACL report), `units` (conversion of numbers), `requests` (queries and changes
@@ -33,6 +34,7 @@ mod query;
 mod question;
 mod requests;
 mod rules;
+mod served;
 mod shapes;
 mod source;
 mod store;
@@ -51,6 +53,7 @@ pub use mtp::vocabulary;
 pub use query::{Queries, QueryLimits};
 pub use question::{NamedQuestion, QUESTIONS, QuestionAnswer, QuestionFault};
 pub use requests::{KnowledgeRefusal, KnowledgeRequests, LoadedSource, QueryRequest, line_of};
+pub use served::{ServedNode, ServedSpace};
 pub use source::{KnowledgeSource, SourceKind};
 pub use store::{Knowledge, KnowledgeFault, SourceLifetime, SourceStatus};
 pub use value_query::{ValueQuery, ValueQueryFault};

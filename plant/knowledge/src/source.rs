@@ -33,6 +33,8 @@ pub enum SourceKind {
     Run,
     /// The current states of the skills of a component or a module, by its name.
     State,
+    /// The address space of a running server, by its ApplicationUri.
+    Server,
     /// A graph that users write; its name is its IRI.
     Graph,
     /// The results of the rules, which are read-only.
@@ -72,6 +74,7 @@ impl fmt::Display for SourceKind {
             Self::Process => "process",
             Self::Run => "run",
             Self::State => "state",
+            Self::Server => "server",
             Self::Graph => "graph",
             Self::Derived => "derived",
         })

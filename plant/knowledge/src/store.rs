@@ -224,6 +224,20 @@ impl Knowledge {
         self.put(source, triples.collect::<Result<_, _>>()?, (at, lasting))
     }
 
+    /// Replaces the statements of a source by the statements about nodes.
+    ///
+    /// # Errors
+    /// [`KnowledgeFault`]; then nothing has changed.
+    pub fn replace_ontology(
+        &self,
+        source: &KnowledgeSource,
+        triples: Vec<Triple>,
+        at: u64,
+    ) -> Result<(), KnowledgeFault> {
+        let triples = triples.into_iter().collect();
+        self.put(source, triples, (at, SourceLifetime::No))
+    }
+
     /// Replaces the statements of a source by the statements of a Turtle file.
     ///
     /// # Errors
