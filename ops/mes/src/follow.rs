@@ -14,9 +14,14 @@ use tracing::{debug, warn};
 
 use crate::cell::{PlantState, SeenServer, now, since_1970};
 use crate::live;
+use crate::servers::LiveServers;
 
 /// Follows discovery until it ends. With `only_loopback`, servers at other addresses are ignored.
-pub(crate) async fn follow(cell: Arc<PlantState>, mut watcher: ServerWatcher, only_loopback: bool) {
+pub(crate) async fn follow(
+    (cell, servers): (Arc<PlantState>, Arc<LiveServers>),
+    mut watcher: ServerWatcher,
+    only_loopback: bool,
+) {
     let mut looks = JoinSet::new();
     let mut looking: HashMap<String, AbortHandle> = HashMap::new();
     loop {
@@ -28,6 +33,9 @@ pub(crate) async fn follow(cell: Arc<PlantState>, mut watcher: ServerWatcher, on
         let known = found.known();
         if known.is_lds() {
             continue;
+        }
+        if !only_loopback || is_loopback(&known.url) {
+            servers.discovered(&found);
         }
         if let Some(earlier) = looking.remove(&known.name) {
             earlier.abort();

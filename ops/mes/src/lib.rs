@@ -11,6 +11,7 @@
 //! - `record`: the record of runs
 //! - `cell`: the current state of the plant
 //! - `follow`: from discovery to the graph
+//! - `servers`: from the address spaces of running servers to the graph
 //! - `sources`, `nodeset_folder`, `nodeset_url`: from files to the graph, while the program runs
 //! - `goal`: the search for a sequence that reaches a goal
 //! - `jobs`: processes that clients start, several at a time
@@ -39,6 +40,7 @@ mod process;
 mod read_process;
 mod recipe;
 mod record;
+mod servers;
 mod settings;
 mod sources;
 
@@ -76,6 +78,7 @@ use crate::jobs::ProcessJobs;
 use crate::knowledge_methods::KnowledgeMethods;
 use crate::locate_skill::LocateObject;
 use crate::order_file::OrderFile;
+use crate::servers::LiveServers;
 use crate::settings::{Connect, Settings};
 use crate::sources::MesSources;
 
@@ -139,6 +142,7 @@ struct Ready {
     component: Component,
     cell: Arc<PlantState>,
     knowledge: Arc<Knowledge>,
+    servers: Arc<LiveServers>,
     options: ComponentOptions,
 }
 
@@ -198,6 +202,13 @@ impl UaMes {
             ..ClientOptions::default()
         };
         let prefer = settings.prefer.clone();
+        let servers = Arc::new(LiveServers::new(
+            Arc::clone(&knowledge),
+            Arc::clone(&sources),
+            client.clone(),
+            &settings.application_uri,
+        ));
+        servers.configure(settings.servers.clone());
         let cell = Arc::new(PlantState::new(
             Arc::clone(&knowledge),
             sources,
@@ -220,6 +231,7 @@ impl UaMes {
             component,
             cell,
             knowledge,
+            servers,
             options,
         }))
     }
@@ -270,15 +282,18 @@ impl UaMes {
             )
         })?;
         let sources = Arc::clone(ready.cell.sources());
+        let servers = Arc::clone(&ready.servers);
         let (file, name) = (self.mes.clone(), self.mes.display().to_string());
         Ok(async move {
             while hangups.recv().await.is_some() {
                 let (file, name) = (file.clone(), name.clone());
                 let sources = Arc::clone(&sources);
+                let servers = Arc::clone(&servers);
                 let read = tokio::task::spawn_blocking(move || match read_settings(&file) {
                     Ok(settings) => {
                         sources.read(&settings);
                         sources.yaml(&name, None);
+                        servers.configure(settings.servers);
                         let findings = sources.findings().len();
                         info!(findings, "SIGHUP: the sources of {name} were read again");
                     }
@@ -358,7 +373,7 @@ impl UaMes {
 
     /// Serves queries, and follows the components of the plant.
     async fn serve(&self, ready: &Ready, queries: Queries, writes: Writes) -> Result<(), Failure> {
-        let page = page(&ready.cell);
+        let page = page(&ready.cell, &ready.servers);
         let address = ready.settings.sparql;
         let endpoint = HttpEndpoint::bind_with(address, queries, page, Some(writes)).await;
         let endpoint = endpoint.map_err(|error| {
@@ -404,8 +419,9 @@ impl UaMes {
                 module,
             )));
         }
+        drop(tokio::spawn(Arc::clone(&ready.servers).run()));
         drop(tokio::spawn(follow::follow(
-            Arc::clone(&ready.cell),
+            (Arc::clone(&ready.cell), Arc::clone(&ready.servers)),
             watcher,
             only_loopback,
         )));
@@ -581,11 +597,15 @@ fn read_settings(file: &Path) -> Result<Settings, String> {
 
 /// Returns the pages `/status`, `/plan/IRI` and `/goal/IRI`. `/plan/` shows the plan that would be
 /// run, with its reasons; `/goal/` the sequence that reaches a goal, with its proof.
-fn page(cell: &Arc<PlantState>) -> knowledge::ExtraPages {
-    let cell = Arc::clone(cell);
+fn page(cell: &Arc<PlantState>, servers: &Arc<LiveServers>) -> knowledge::ExtraPages {
+    let (cell, servers) = (Arc::clone(cell), Arc::clone(servers));
     Arc::new(move |path| {
         if path == "/status" {
-            return Some(cell.status().to_string());
+            let mut status = cell.status();
+            if let Some(status) = status.as_object_mut() {
+                status.insert("servers".to_owned(), servers.status());
+            }
+            return Some(status.to_string());
         }
         if let Some(iri) = path.strip_prefix("/goal/") {
             return cell.goal_page(iri).map(|page| page.to_string());

@@ -4,6 +4,7 @@ mod composite;
 mod files;
 mod flow;
 mod parameters;
+mod servers;
 
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
@@ -17,6 +18,7 @@ use crate::process::{By, MOST_STEPS, Need, Process, ProcessStep, SkillRole, Step
 use crate::read_process::{USUALLY_WAIT, USUALLY_WITHIN};
 
 pub(crate) use files::{Connect, Manifest, NodeSetOrigin, RecipeSource, RmlSource, Source};
+pub(crate) use servers::{NamedServers, ServerEntry};
 
 /// The settings of the MES.
 #[derive(Debug, Clone)]
@@ -45,6 +47,8 @@ pub(crate) struct Settings {
     pub(crate) nodeset_folder: Option<NodeSetOrigin>,
     pub(crate) manifests: Vec<Manifest>,
     pub(crate) rml: Vec<RmlSource>,
+    /// Running servers whose nodes are in the graph.
+    pub(crate) servers: Vec<ServerEntry>,
     /// Recipes of BatchML and BPMN.
     pub(crate) recipes: Vec<RecipeSource>,
     pub(crate) processes: Vec<Process>,
@@ -76,7 +80,7 @@ impl Settings {
 }
 
 /// Keys of the document.
-const KEYS: [&str; 19] = [
+const KEYS: [&str; 20] = [
     "mes",
     "application_uri",
     "namespace",
@@ -93,6 +97,7 @@ const KEYS: [&str; 19] = [
     "nodeset_folder",
     "manifests",
     "rml",
+    "servers",
     "recipes",
     "processes",
     "prefer",
@@ -122,6 +127,7 @@ impl Reading<'_> {
             nodeset_folder,
             manifests,
             rml,
+            servers,
             recipes,
             processes,
             prefer,
@@ -153,6 +159,7 @@ impl Reading<'_> {
         let nodeset_folder = nodeset_folder.map(|node| self.nodeset_origin(node));
         let manifests = manifests.map_or_else(Vec::new, |node| self.each(node, Self::manifest));
         let rml = rml.map_or_else(Vec::new, |node| self.each(node, Self::rml));
+        let servers = servers.map_or_else(Vec::new, |node| self.each(node, Self::server));
         let recipes = recipes.map_or_else(Vec::new, |node| self.each(node, Self::recipe));
         let processes = processes.map_or_else(Vec::new, |node| self.each(node, Self::process));
         let prefer = prefer.map_or_else(Vec::new, |node| self.each(node, Self::preferred));
@@ -162,6 +169,8 @@ impl Reading<'_> {
         let iris = processes.iter().map(|process| &*process.iri);
         let iris = iris.chain(recipes.iter().map(|recipe| &*recipe.source.name));
         self.once(root, iris, "process");
+        let names = servers.iter().map(|server| server.which.text());
+        self.once(root, names, "server");
         Some(Settings {
             name: name?,
             application_uri: uri?,
@@ -181,6 +190,7 @@ impl Reading<'_> {
             nodeset_folder: nodeset_folder.map_or(Some(None), |folder| folder.map(Some))?,
             manifests,
             rml,
+            servers,
             recipes,
             processes,
             prefer,

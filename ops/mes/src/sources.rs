@@ -225,6 +225,26 @@ impl MesSources {
             .insert(source, found.into_iter().collect());
     }
 
+    /// Replaces the findings of a source. Each has a text, and whether the source is not in the
+    /// graph because of it. New findings are logged.
+    pub(crate) fn replace_findings(&self, source: &KnowledgeSource, whats: Vec<(String, bool)>) {
+        let findings = whats.into_iter();
+        let findings: Vec<Finding> = findings
+            .map(|(what, refused)| finding(source, what, refused))
+            .collect();
+        let before = match findings.is_empty() {
+            true => self.state().findings.remove(source),
+            false => self
+                .state()
+                .findings
+                .insert(source.clone(), findings.clone()),
+        };
+        let before = before.unwrap_or_default();
+        for found in findings.iter().filter(|found| !before.contains(found)) {
+            warn!(kind = %source.kind, source = source.name, "{}", found.what);
+        }
+    }
+
     /// Reads a source. Its faults become findings.
     fn try_one(
         &self,
@@ -574,6 +594,7 @@ fn examined(source: &mut KnowledgeSource, contents: &[u8]) -> Result<Vec<String>
         kind @ (SourceKind::Component
         | SourceKind::Run
         | SourceKind::State
+        | SourceKind::Server
         | SourceKind::Graph
         | SourceKind::Derived) => Err(one(format!("a {kind} is not read from a file"))),
     }

@@ -234,3 +234,48 @@ fn nodesets_come_from_a_folder_or_a_url_that_is_checked() {
         );
     }
 }
+
+#[test]
+fn servers_are_named_by_endpoints_uris_and_discovery() {
+    let text = "mes: m\napplication_uri: urn:x\nnamespace: 5\nservers:\n  - opc.tcp://press:4840\n  - {server: urn:example:robot, start: ['nsu=urn:robot;i=5', i=2253], nodes: 100, depth: 4, every: 30 s}\n  - discovered\n";
+    let settings = Settings::from_yaml(text, Path::new("")).unwrap();
+    let which: Vec<&NamedServers> = settings.servers.iter().map(|one| &one.which).collect();
+    assert_eq!(
+        which,
+        [
+            &NamedServers::Endpoint("opc.tcp://press:4840".to_owned()),
+            &NamedServers::Application("urn:example:robot".to_owned()),
+            &NamedServers::Discovered,
+        ]
+    );
+    let robot = &settings.servers[1];
+    let start: Vec<String> = robot.start.iter().map(knowledge::NodeName::id).collect();
+    assert_eq!(
+        start,
+        [
+            "nsu=urn:robot;i=5",
+            "nsu=http://opcfoundation.org/UA/;i=2253"
+        ]
+    );
+    assert_eq!((robot.limits.nodes, robot.limits.depth), (100, 4));
+    assert_eq!(robot.every, std::time::Duration::from_secs(30));
+    let wrong = "mes: m\napplication_uri: urn:x\nnamespace: 5\nservers:\n  - press\n  - {server: discovered, start: [ns=2;i=5], nodes: 0, every: 10 ms}\n  - discovered\n  - {start: [i=85]}\n";
+    let told = Settings::from_yaml(wrong, Path::new(""))
+        .unwrap_err()
+        .render("mes.yaml", wrong);
+    for wanted in [
+        "mes.yaml:5:5",
+        "an ApplicationUri or `discovered`, found `press`",
+        "as nsu=urn:example:press;i=5001",
+        "a number from 1 to 100000, found `0`",
+        "every second at most",
+        "`server` is missing",
+    ] {
+        assert!(told.contains(wanted), "{wanted}:\n{told}");
+    }
+    let twice = "mes: m\napplication_uri: urn:x\nnamespace: 5\nservers: [discovered, discovered]\n";
+    let told = Settings::from_yaml(twice, Path::new(""))
+        .unwrap_err()
+        .render("mes.yaml", twice);
+    assert!(told.contains("two of the server `discovered`"), "{told}");
+}

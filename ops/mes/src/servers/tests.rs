@@ -1,0 +1,115 @@
+use std::path::Path;
+use std::time::{Duration, SystemTime};
+
+use super::*;
+use crate::settings::Settings;
+
+fn present(name: &str, url: &str, uri: Option<&str>) -> (String, PresentServer) {
+    let server = PresentServer {
+        name: name.to_owned(),
+        url: url.to_owned(),
+        capabilities: vec!["DA".to_owned()],
+        application_uri: uri.map(str::to_owned),
+        since: SystemTime::UNIX_EPOCH,
+        started: None,
+        number: None,
+    };
+    (name.to_owned(), server)
+}
+
+fn wanted(servers: &str) -> WantedServers {
+    let text = format!("mes: m\napplication_uri: urn:mes\nnamespace: 5\nservers:\n{servers}");
+    let settings = Settings::from_yaml(&text, Path::new(""))
+        .unwrap_or_else(|findings| panic!("{}", findings.render("mes.yaml", &text)));
+    WantedServers {
+        entries: settings.servers,
+        ..WantedServers::default()
+    }
+}
+
+/// Returns the names, endpoints and limits of the planned servers, and the names of the missing.
+fn plan(wanted: &WantedServers) -> (Vec<(String, String, usize)>, Vec<String>) {
+    let (planned, missing) = wanted.plan("urn:mes");
+    let planned = planned.into_iter();
+    let planned = planned.map(|(name, one)| (name, one.endpoint, one.entry.limits.nodes));
+    (planned.collect(), missing.into_keys().collect())
+}
+
+#[test]
+fn a_discovered_server_with_an_entry_of_its_own_is_followed_once() {
+    let mut wanted = wanted(
+        "  - discovered\n  - opc.tcp://127.0.0.1:1\n  - {server: urn:press, nodes: 7}\n  - urn:away\n",
+    );
+    wanted.present = BTreeMap::from([
+        present("a", "opc.tcp://127.0.0.1:1/", Some("urn:first")),
+        present("b", "opc.tcp://127.0.0.1:2/", Some("urn:press")),
+        present("c", "opc.tcp://127.0.0.1:3/", None),
+        present("d", "opc.tcp://127.0.0.1:4/", Some("urn:mes")),
+    ]);
+    let usual = SearchLimits::default().nodes;
+    let expected = [
+        ("opc.tcp://127.0.0.1:1", "opc.tcp://127.0.0.1:1", usual),
+        ("opc.tcp://127.0.0.1:3/", "opc.tcp://127.0.0.1:3/", usual),
+        ("urn:press", "opc.tcp://127.0.0.1:2/", 7),
+    ]
+    .map(|(name, endpoint, nodes)| (name.to_owned(), endpoint.to_owned(), nodes));
+    assert_eq!(
+        plan(&wanted),
+        (expected.to_vec(), vec!["urn:away".to_owned()])
+    );
+    let discovery = "a discovered server that is lost";
+    wanted.present.clear();
+    let (planned, missing) = plan(&wanted);
+    assert_eq!((planned.len(), missing.len()), (1, 2), "{discovery}");
+}
+
+#[test]
+fn the_number_of_servers_is_limited() {
+    let mut wanted = wanted("  - discovered\n");
+    for port in 1..=MOST_SERVERS + 5 {
+        let url = format!("opc.tcp://127.0.0.1:{port}/");
+        wanted.present.extend([present(&url, &url, None)]);
+    }
+    let (planned, missing) = plan(&wanted);
+    assert_eq!(planned.len(), MOST_SERVERS);
+    assert_eq!(missing, ["discovered"]);
+}
+
+#[test]
+fn an_entry_with_other_settings_is_another_search() {
+    let one = |text: &str| wanted(&format!("  - {{server: 'opc.tcp://h:1', {text}}}\n")).entries;
+    let usual = one("depth: 32");
+    let is_same = |text: &str| {
+        let other = one(text);
+        usual[0].is_same(&other[0])
+    };
+    assert!(is_same("nodes: 20000"));
+    for text in ["depth: 31", "nodes: 5", "every: 5 s", "start: [i=2253]"] {
+        assert!(!is_same(text), "{text}");
+    }
+    assert_eq!(usual[0].every, Duration::from_secs(600));
+}
+
+#[tokio::test]
+async fn an_application_uri_has_one_server_until_its_graph_is_removed() {
+    let uris = ServerUris::default();
+    let taken = uris.take("urn:a", "left").unwrap();
+    assert_eq!(uris.take("urn:a", "right").unwrap_err(), "left");
+    let knowledge = Arc::new(Knowledge::new().unwrap());
+    let graph = graph::ServerGraph::new(Arc::clone(&knowledge), taken);
+    let space = || knowledge::ServedSpace {
+        application_uri: "urn:a".to_owned(),
+        browsed: "2026-11-27T10:00:00Z".to_owned(),
+        ..knowledge::ServedSpace::default()
+    };
+    assert!(graph.write(space()).await.unwrap() > 0);
+    let is_there = || {
+        let mut sources = knowledge.sources().into_iter();
+        sources.any(|source| source.kind == SourceKind::Server)
+    };
+    assert!(is_there());
+    drop(graph);
+    uris.free("urn:a").await;
+    assert!(!is_there());
+    uris.take("urn:a", "right").unwrap();
+}
