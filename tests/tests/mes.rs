@@ -2,6 +2,7 @@
 //! change, and the outcome of processes.
 
 mod exchange;
+mod live_servers;
 mod nodeset_url;
 mod opcua_knowledge;
 mod queries;
