@@ -1,11 +1,12 @@
 //! The nodes of running servers in the graph: which servers, and their connections.
 //!
-//! Reading order: `connection` (when a server is read), `walk` (the search through its address
-//! space), `facts` (attributes and values), `graph`.
+//! Reading order: `connection` (when a server is read), `searched` and `walk` (the search through
+//! its address space), `facts` (attributes and values), `graph`.
 
 mod connection;
 mod facts;
 mod graph;
+mod searched;
 mod walk;
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -20,7 +21,7 @@ use tokio::task::JoinHandle;
 
 use self::connection::FollowedServer;
 use self::graph::ServerUris;
-pub(crate) use self::walk::SearchLimits;
+pub(crate) use self::searched::SearchLimits;
 use crate::settings::{NamedServers, ServerEntry};
 use crate::sources::MesSources;
 

@@ -2,11 +2,12 @@
 //!
 //! Types, and the nodes that types declare, have the IRIs that NodeSets have for them, so that a
 //! query for a class finds the instances of all servers. All other nodes have IRIs of their server:
-//! two servers of one maker may have nodes with equal names in one namespace. The IRI of a node
-//! that is a skill is the IRI of the skill.
+//! two servers of one maker may have nodes with equal names in one namespace. The IRIs differ from
+//! those of components and skills, so that named questions have each label of a skill once.
 
 use std::collections::HashSet;
 
+use mtp::escaped;
 use oxigraph::model::Triple;
 
 use crate::component::{ComponentFacts, NodeName, OPC_UA};
@@ -111,9 +112,11 @@ impl ServedSpace {
         }
     }
 
+    /// Returns the server in the place of a component, whose nodes have IRIs below its own.
     fn identity(&self) -> ComponentFacts {
+        let uri = escaped(&self.application_uri);
         ComponentFacts {
-            application_uri: self.application_uri.clone(),
+            application_uri: format!("urn:ua-bridge:server:{uri}"),
             ..ComponentFacts::default()
         }
     }
@@ -198,15 +201,15 @@ mod tests {
         let quads = quads(&knowledge);
         let is_a = "<http://www.w3.org/1999/02/22-rdf-syntax-ns#type>";
         for line in [
-            format!("<urn:left#urn%3Amaker;i=10> {is_a} <urn:maker#i=1>"),
-            format!("<urn:right#urn%3Amaker;i=10> {is_a} <urn:maker#i=1>"),
-            "<urn:left#urn%3Amaker;i=10> <http://opcfoundation.org/UA/#i=47> \
-             <urn:left#urn%3Amaker;i=11>"
+            format!("<urn:ua-bridge:server:urn%3Aleft#urn%3Amaker;i=10> {is_a} <urn:maker#i=1>"),
+            format!("<urn:ua-bridge:server:urn%3Aright#urn%3Amaker;i=10> {is_a} <urn:maker#i=1>"),
+            "<urn:ua-bridge:server:urn%3Aleft#urn%3Amaker;i=10> <http://opcfoundation.org/UA/#i=47> \
+             <urn:ua-bridge:server:urn%3Aleft#urn%3Amaker;i=11>"
                 .to_owned(),
-            "<urn:right#urn%3Amaker;i=11> <urn:ua-bridge:plant#nodeId> \"nsu=urn:maker;i=11\""
+            "<urn:ua-bridge:server:urn%3Aright#urn%3Amaker;i=11> <urn:ua-bridge:plant#nodeId> \"nsu=urn:maker;i=11\""
                 .to_owned(),
-            format!("<urn:left#urn%3Amaker;i=11> {is_a} <http://opcfoundation.org/UA/#i=63>"),
-            "<urn:left> <urn:ua-bridge:plant#hasNode> <http://opcfoundation.org/UA/#i=85>"
+            format!("<urn:ua-bridge:server:urn%3Aleft#urn%3Amaker;i=11> {is_a} <http://opcfoundation.org/UA/#i=63>"),
+            "<urn:ua-bridge:server:urn%3Aleft> <urn:ua-bridge:plant#hasNode> <http://opcfoundation.org/UA/#i=85>"
                 .to_owned(),
         ] {
             assert!(quads.contains(&line), "{line}\n{quads}");

@@ -7,8 +7,8 @@ use knowledge::owl::{
 use plant_opcua::types::xml::{XmlEncodable as _, XmlStreamWriter};
 use plant_opcua::types::{
     AttributeId, ByteStringBody, ContextOwned, DataValue, DateTime, DecodingOptions,
-    EnumDefinition, ExpandedNodeId, ExtensionObject, LocalizedText, NamespaceMap, NodeClass,
-    NodeId, StructureDefinition, StructureType, UAString, Variant,
+    EnumDefinition, ExpandedNodeId, LocalizedText, NamespaceMap, NodeClass, NodeId,
+    StructureDefinition, StructureType, UAString, Variant,
 };
 
 /// The namespaces of a server, by which it numbers them.
@@ -361,7 +361,7 @@ const MOST_DIMENSIONS: usize = 16;
 
 #[cfg(test)]
 mod tests {
-    use plant_opcua::types::{Array, EUInformation, VariantScalarTypeId};
+    use plant_opcua::types::{Array, EUInformation, ExtensionObject, VariantScalarTypeId};
 
     use super::*;
 

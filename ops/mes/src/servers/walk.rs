@@ -1,79 +1,20 @@
 //! The search through the address space of a server: bounded requests, in levels.
 
 use std::collections::{HashMap, HashSet};
-use std::time::Duration;
 
-use async_trait::async_trait;
 use knowledge::owl::{
     OntologyNode, OntologyReference, OntologyText, OntologyTextKind, OwlNodeClass,
 };
 use knowledge::{NodeName, OPC_UA, ServedNode, ServedSpace};
-use plant_opcua::client::{Browse, BrowsedReferences, ClientError, OpcUaClient};
+use plant_opcua::client::{Browse, BrowsedReferences, ClientError};
 use plant_opcua::types::{
     AttributeId, DataValue, LocalizedText, NodeClass, NodeId, ObjectId, ReferenceTypeId,
-    StatusCode, UAString, UaEnum as _, VariableId, Variant,
+    StatusCode, UAString, UaEnum as _, Variant,
 };
 use tokio::time::Instant;
 
 use super::facts::{self, Names, ValueFault};
-
-/// A server, as the search uses it.
-#[async_trait]
-pub(super) trait SearchedServer: Send + Sync {
-    /// Returns the references of each node, at most `most` altogether.
-    async fn references(
-        &self,
-        nodes: &[NodeId],
-        what: &Browse,
-        most: usize,
-    ) -> Result<Vec<BrowsedReferences>, ClientError>;
-
-    /// Returns the attributes, one value for each.
-    async fn attributes(
-        &self,
-        what: &[(NodeId, AttributeId)],
-    ) -> Result<Vec<DataValue>, ClientError>;
-}
-
-#[async_trait]
-impl SearchedServer for OpcUaClient {
-    async fn references(
-        &self,
-        nodes: &[NodeId],
-        what: &Browse,
-        most: usize,
-    ) -> Result<Vec<BrowsedReferences>, ClientError> {
-        self.browse_within(nodes, what, (most, PAGE)).await
-    }
-
-    async fn attributes(
-        &self,
-        what: &[(NodeId, AttributeId)],
-    ) -> Result<Vec<DataValue>, ClientError> {
-        self.read_attributes(what).await
-    }
-}
-
-/// The limits of a search.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) struct SearchLimits {
-    /// Maximum number of nodes.
-    pub(crate) nodes: usize,
-    /// Maximum number of references from a start node.
-    pub(crate) depth: usize,
-    /// Time after which the search ends.
-    pub(crate) within: Duration,
-}
-
-impl Default for SearchLimits {
-    fn default() -> Self {
-        Self {
-            nodes: 20_000,
-            depth: 32,
-            within: Duration::from_secs(120),
-        }
-    }
-}
+use super::searched::{SearchFaults, SearchLimits, SearchedServer, namespaces};
 
 /// The nodes of a server, with remarks for people.
 #[derive(Debug)]
@@ -115,24 +56,6 @@ pub(super) async fn search(
     Ok(search.finish())
 }
 
-/// Reads the NamespaceArray, which may change while a server runs.
-async fn namespaces(server: &dyn SearchedServer) -> Result<Vec<String>, ClientError> {
-    let id: NodeId = VariableId::Server_NamespaceArray.into();
-    let read = server.attributes(&[(id, AttributeId::Value)]).await?;
-    let value = read.into_iter().next().and_then(|value| value.value);
-    let Some(Variant::Array(array)) = value else {
-        return Err(ClientError::Answer("no NamespaceArray"));
-    };
-    let uris = array.values.into_iter().map(|uri| {
-        if let Variant::String(uri) = uri {
-            uri.as_ref().to_owned()
-        } else {
-            String::new()
-        }
-    });
-    Ok(uris.collect())
-}
-
 struct Search<'a> {
     server: &'a dyn SearchedServer,
     names: Names,
@@ -154,18 +77,6 @@ struct FoundNode {
     id: NodeId,
     served: ServedNode,
     is_readable: bool,
-}
-
-/// The counts of all that is not in the graph.
-#[derive(Debug, Default)]
-struct SearchFaults {
-    /// Reasons for which the search ended early.
-    ends: Vec<String>,
-    missing: Vec<String>,
-    names: usize,
-    bad: usize,
-    large: usize,
-    undecoded: usize,
 }
 
 /// The parts of a node that its references have too.
@@ -322,6 +233,12 @@ impl Search<'_> {
         }
     }
 
+    fn end_of_references(&mut self) {
+        self.end(format!(
+            "it has more than {MOST_REFERENCES} references, or continues them without end"
+        ));
+    }
+
     /// Returns whether the search ends because of its time.
     fn is_late(&mut self) -> bool {
         let is_late = Instant::now() >= self.ends;
@@ -346,11 +263,15 @@ impl Search<'_> {
             depth += 1;
             let mut next = Vec::new();
             for part in frontier.chunks(PART) {
+                let left = MOST_REFERENCES.saturating_sub(self.references);
+                if left == 0 {
+                    self.end_of_references();
+                    return Ok(());
+                }
                 if self.is_late() {
                     return Ok(());
                 }
                 let ids: Vec<NodeId> = self.ids(part);
-                let left = MOST_REFERENCES.saturating_sub(self.references);
                 let browsed = self.server.references(&ids, &what, left).await?;
                 for (at, browsed) in part.iter().zip(browsed) {
                     self.node(*at, browsed, &hierarchical, &mut next);
@@ -401,7 +322,7 @@ impl Search<'_> {
         if browsed.status.is_bad() {
             self.faults.bad += 1;
         } else if !browsed.is_whole {
-            self.end(format!("it has more than {MOST_REFERENCES} references"));
+            self.end_of_references();
         }
         let is_shared = self.nodes.get(at).is_some_and(|node| {
             let name = &node.served.node.name;
@@ -565,7 +486,7 @@ impl Search<'_> {
                 return Ok(());
             }
             done.extend(level.iter().cloned());
-            let added = self.add_all(&level, true).await?;
+            self.add_all(&level, true).await?;
             for part in level.chunks(PART) {
                 for (what, is_forward) in [(&up, false), (&interfaces, true)] {
                     let browsed = self.server.references(part, what, MOST_TYPES).await?;
@@ -574,7 +495,6 @@ impl Search<'_> {
                     }
                 }
             }
-            drop(added);
         }
     }
 
@@ -663,36 +583,6 @@ impl Search<'_> {
     }
 }
 
-impl SearchFaults {
-    fn findings(self) -> Vec<String> {
-        let ends = self.ends.into_iter();
-        let mut all: Vec<String> = ends
-            .map(|why| format!("the graph is incomplete: {why}"))
-            .collect();
-        let missing = self.missing.into_iter();
-        all.extend(
-            missing.map(|id| format!("the server has no start node `{id}`; correct `start`")),
-        );
-        for (count, what) in [
-            (
-                self.names,
-                "references are left out: the server does not list their namespaces, or their NodeIds are too long",
-            ),
-            (self.bad, "nodes cannot be browsed"),
-            (self.large, "values are left out because they are too large"),
-            (
-                self.undecoded,
-                "values are left out: they are structures that cannot be decoded",
-            ),
-        ] {
-            if count > 0 {
-                all.push(format!("{count} {what}"));
-            }
-        }
-        all
-    }
-}
-
 /// The attributes that name a node.
 const NAMING: [AttributeId; 3] = [
     AttributeId::NodeClass,
@@ -705,8 +595,6 @@ const CURRENT_READ: u8 = 1;
 const PART: usize = 100;
 /// Number of values in a step of the search.
 const VALUES: usize = 50;
-/// Maximum number of references of a node in a response.
-const PAGE: u32 = 1000;
 const MOST_REFERENCES: usize = 500_000;
 const MOST_TYPES: usize = 5000;
 /// Number of types after which repetitions are removed.

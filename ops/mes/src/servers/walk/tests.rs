@@ -1,7 +1,10 @@
+use std::time::Duration;
+
+use async_trait::async_trait;
 use knowledge::owl::OntologyValue;
 use knowledge::{Knowledge, KnowledgeSource, SourceKind};
 use plant_opcua::types::{
-    DateTime, ExpandedNodeId, QualifiedName, ReferenceDescription, VariableTypeId,
+    DateTime, ExpandedNodeId, QualifiedName, ReferenceDescription, VariableId, VariableTypeId,
 };
 
 use super::*;
@@ -235,7 +238,7 @@ async fn a_query_for_a_class_finds_the_instance_and_its_value() {
         ?force <urn:ua-bridge:plant#browseName> \"Force\" ; <urn:ua-bridge:plant#value> 12.5e0 }";
     let query = knowledge::ValueQuery::read(query).unwrap();
     let press = query.value(&std::sync::Arc::new(knowledge)).unwrap();
-    assert_eq!(press, "urn:server#urn%3Amaker;i=10");
+    assert_eq!(press, "urn:ua-bridge:server:urn%3Aserver#urn%3Amaker;i=10");
 }
 
 #[tokio::test]
