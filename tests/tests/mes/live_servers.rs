@@ -7,7 +7,7 @@ use nix::sys::signal::Signal;
 use serde_json::Value;
 use system_tests::{Cell, Child, Peer, StartedChild, eventually, http_get, program};
 
-use super::{AT, SOON, get, list, space};
+use super::{AT, SOON, get, list, rows, space, start};
 
 const LEFT: &str = "opc.tcp://127.0.0.1:48411";
 const RIGHT: &str = "opc.tcp://127.0.0.1:48412";
@@ -122,10 +122,14 @@ fn a_running_server_answers_the_question_of_its_nodeset_and_its_loss_removes_its
     let graph = status["graph"].as_str().unwrap().to_owned();
     assert_eq!(graph, "urn:ua-bridge:graph:server:urn%3Aexample%3Aleft");
     let live = question(&graph);
-    assert_eq!(live, [row("one", "1.25E1")]);
+    assert_eq!(live, [row("one", "12.5")]);
     current(RIGHT);
     let maker = "urn%3Aexample%3Apresses";
-    let of = |server: &str, id: u32| vec![format!("urn:example:{server}#{maker};i={id}")];
+    let of = |server: &str, id: u32| {
+        vec![format!(
+            "urn:ua-bridge:server:urn%3Aexample%3A{server}#{maker};i={id}"
+        )]
+    };
     assert_eq!(
         iris(),
         [of("left", 5000), of("right", 5000)],
@@ -153,7 +157,7 @@ fn a_running_server_answers_the_question_of_its_nodeset_and_its_loss_removes_its
     // The server reports a change of its model.
     left.tell("another press");
     eventually("the new press is in the graph", SOON, || {
-        (question(&graph) == [row("late", "2.15E1"), row("one", "1.25E1")]).then_some(())
+        (question(&graph) == [row("late", "21.5"), row("one", "12.5")]).then_some(())
     });
 
     right.signal(Signal::SIGKILL);
@@ -164,7 +168,7 @@ fn a_running_server_answers_the_question_of_its_nodeset_and_its_loss_removes_its
     assert_eq!(lost["nodes"], 0, "{lost}");
     let own = [of("left", 5000), of("left", 5090)];
     let of_nodeset = vec!["urn:example:presses#i=5000".to_owned()];
-    let rest = || [&own[..], &[of_nodeset.clone()]].concat();
+    let rest = || [&[of_nodeset.clone()], &own[..]].concat();
     eventually("its nodes are removed", SOON, || {
         (iris() == rest()).then_some(())
     });
@@ -194,8 +198,6 @@ fn servers_of_the_yaml_are_read_again_by_sighup_and_removed_with_their_entries()
     let first = current(BULK);
     let nodes = first["nodes"].as_u64().unwrap();
     assert!(nodes > 10_100, "{first}");
-    let milliseconds = first["took_ms"].as_u64().unwrap();
-    println!("{nodes} nodes, {milliseconds} ms, {first}");
     mes.signal(Signal::SIGHUP);
     server(BULK, "the nodes are read again", |server| {
         server["state"] == "current" && server["reads"] == 2 && server["reason"] == "command"
@@ -225,4 +227,40 @@ fn servers_of_the_yaml_are_read_again_by_sighup_and_removed_with_their_entries()
         let is_kept = graphs.filter(|graph| graph["kind"] == "server").count();
         (is_gone && is_kept == 0).then_some(())
     });
+}
+
+#[test]
+fn the_nodes_of_a_discovered_component_leave_its_rows_in_named_questions_alone() {
+    let Some(cell) = Cell::with(&[]) else { return };
+    let _gripper = start(&cell, "ua-component", "parallel-gripper.yaml", &[], &[]);
+    let _mes = mes(&cell, "  - discovered\n");
+    eventually("the nodes of the gripper are in the graph", SOON, || {
+        let status = get("/status")?;
+        let mut servers = list(&status, "servers").iter();
+        let is_read = |server: &&Value| {
+            server["application_uri"] == "urn:example:gripper" && server["state"] == "current"
+        };
+        servers.find(is_read).cloned()
+    });
+    let of = |question: &str, column: &str| {
+        let rows = rows(question);
+        let own = rows.iter().filter(|row| row[column] == "parallel-gripper");
+        own.count()
+    };
+    eventually("the gripper is a component", SOON, || {
+        (of("components", "name") > 0).then_some(())
+    });
+    assert_eq!(of("components", "name"), 1);
+    assert_eq!(
+        of("what-can-run", "component"),
+        2,
+        "{:?}",
+        rows("what-can-run")
+    );
+    let skills = "PREFIX ua: <urn:ua-bridge:plant#>
+        SELECT ?name { ?skill a <http://www.w3id.org/hsu-aut/css#Skill> ; ua:nodeId ?id .
+          GRAPH ?graph { ?server a ua:Server ; ua:applicationUri \"urn:example:gripper\" .
+            ?node ua:nodeId ?id ; ua:browseName ?name } }";
+    let names = select(skills, &["name"]);
+    assert_eq!(names.len(), 2, "{names:?}");
 }
