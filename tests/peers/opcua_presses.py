@@ -10,6 +10,7 @@ change of the model. With `--export`, the model is written as a NodeSet2 file fi
 
 import argparse
 import asyncio
+import pathlib
 
 from asyncua import Server, ua, uamethod
 
@@ -61,6 +62,13 @@ async def add_variables(server, space, count):
         await folder.add_variable(ua.NodeId(200000 + number, space), f"{space}:Value{number}", float(number))
 
 
+def name_model(file):
+    """Adds the model, which asyncua leaves out and NodeSet2 files have."""
+    end = "</NamespaceUris>"
+    model = f'{end}<Models><Model ModelUri="{MAKER}"/></Models>'
+    file.write_text(file.read_text().replace(end, model, 1))
+
+
 async def run(args):
     server = Server()
     await server.init()
@@ -74,6 +82,7 @@ async def run(args):
     await add_variables(server, space, args.variables)
     if args.export:
         await server.export_xml_by_ns(args.export, [space], export_values=True)
+        name_model(pathlib.Path(args.export))
     changes = await server.get_event_generator(ua.ObjectIds.GeneralModelChangeEventType)
     told = lifetime.told()
     async with server:
