@@ -18,6 +18,7 @@ mod driver_error;
 pub mod frame;
 mod grip;
 mod lock;
+mod machine;
 pub mod model;
 mod outcomes;
 mod parameters;

@@ -79,6 +79,11 @@ impl SkillRefusal {
             text: text.into(),
         }
     }
+
+    /// Returns the refusal of calls of a skill that has ended.
+    pub(crate) fn closed() -> Self {
+        Self::new(RefusalCode::Shutdown, "the component ends")
+    }
 }
 
 impl fmt::Display for SkillRefusal {

@@ -6,13 +6,14 @@ use std::time::Duration;
 use program::ProgramMethod;
 use tokio::sync::{mpsc, oneshot, watch};
 
-use crate::actor::{Actor, Given, Order, SkillCallRequest, Successor};
+use crate::actor::{Actor, Order};
 use crate::authority::{Authority, SkillOwner};
 use crate::description::SkillDescription;
 use crate::driver::Driver;
 use crate::lock::lock;
+use crate::machine::{Given, MachineParts, SkillCallRequest, Successor};
 use crate::outcomes::NewestOutcomes;
-use crate::parameters::{Parameters, shortened};
+use crate::parameters::shortened;
 use crate::pending::PendingParameters;
 use crate::refusal::{RefusalCode, SkillRefusal};
 use crate::shown::{RunOutcome, SkillObserver, SkillSnapshot, is_work};
@@ -58,13 +59,16 @@ impl Skill {
         let outcomes = NewestOutcomes::default();
         let successor = Arc::default();
         let (orders, waiting) = mpsc::channel(MOST_ORDERS);
-        let (actor, shown) = Actor::new(
-            (Arc::clone(&facts), driver),
-            authority.clone(),
-            (Arc::clone(&pending), outcomes.clone()),
-            (observers, first_run),
-            Arc::clone(&successor),
-        );
+        let parts = MachineParts {
+            facts: Arc::clone(&facts),
+            driver,
+            authority: authority.clone(),
+            pending: Arc::clone(&pending),
+            outcomes: outcomes.clone(),
+            successor: Arc::clone(&successor),
+            first_run,
+        };
+        let (actor, shown) = Actor::new(parts, observers);
         drop(tokio::spawn(actor.run(waiting)));
         Self {
             facts,
@@ -165,6 +169,8 @@ impl Skill {
     /// 4. BadArgumentsMissing, BadTypeMismatch or BadInvalidArgument (parameters)
     /// 5. BadInvalidState while another skill of the component runs, and BadTooManyOperations
     ///    (queue)
+    ///
+    /// A Start or Resume whose future is dropped while it waits for a stop is not executed.
     pub async fn call(&self, by: SkillOwner, method: ProgramMethod) -> Result<u32, SkillRefusal> {
         self.order(by, method, Given::default()).await
     }
@@ -240,44 +246,21 @@ impl Skill {
         given: Given,
     ) -> Result<u32, SkillRefusal> {
         let (reply, answer) = oneshot::channel();
-        let room = match self.orders.try_reserve() {
-            Ok(room) => room,
-            Err(mpsc::error::TrySendError::Full(())) => {
-                return Err(self.no_room(&by, given.parameters));
-            }
-            Err(mpsc::error::TrySendError::Closed(())) => return Err(ends()),
-        };
-        room.send(Order::Call(SkillCallRequest {
+        let call = SkillCallRequest {
             by,
             method,
             given,
             reply,
-        }));
-        answer.await.unwrap_or_else(|_| Err(ends()))
-    }
-
-    /// Returns the refusal of a call for which the queue has no space. Errors that do not depend on
-    /// the queue come first.
-    fn no_room(&self, by: &SkillOwner, given: Option<Vec<(String, SkillValue)>>) -> SkillRefusal {
-        if let Err(refusal) = self.authority.allows(by) {
-            return refusal;
+        };
+        // The task takes each call at once; it counts and bounds the calls that wait.
+        if self.orders.send(Order::Call(call)).await.is_err() {
+            return Err(SkillRefusal::closed());
         }
-        let wrong =
-            given.and_then(|given| Parameters::complete(&self.facts.parameters, given).err());
-        wrong.unwrap_or_else(|| {
-            SkillRefusal::new(
-                RefusalCode::TooManyOperations,
-                "too many calls of this skill wait already",
-            )
-        })
+        answer.await.unwrap_or_else(|_| Err(SkillRefusal::closed()))
     }
 }
 
-fn ends() -> SkillRefusal {
-    SkillRefusal::new(RefusalCode::Shutdown, "the component ends")
-}
-
-/// Maximum number of waiting calls of a skill.
+/// Maximum number of calls on their way to the task.
 const MOST_ORDERS: usize = 16;
 
 #[cfg(test)]

@@ -16,6 +16,7 @@ use tokio::time::{Instant, sleep_until};
 use crate::authority::{Authority, SkillOwner};
 use crate::lock::lock;
 pub(super) use crate::model::DEVICES as NAMESPACE;
+use crate::refusal::SkillRefusal;
 
 /// The part of the DI NodeSet that defines locking, for components that need no other part of it.
 pub(super) const NODESET: &str = include_str!("locking.xml");
@@ -34,15 +35,9 @@ pub(super) struct Lock {
     server: OpcUaServer,
     authority: Authority,
     object: Instance,
-    held: Arc<Mutex<Option<Held>>>,
+    /// Serializes changes of the lock with the values that show them.
+    shows: Arc<Mutex<()>>,
     changed: watch::Sender<()>,
-}
-
-/// A lock that a session holds.
-#[derive(Debug, Clone)]
-struct Held {
-    session: u32,
-    until: Instant,
 }
 
 impl Lock {
@@ -65,7 +60,7 @@ impl Lock {
             server: server.clone(),
             authority: authority.clone(),
             object,
-            held: Arc::default(),
+            shows: Arc::default(),
             changed: watch::channel(()).0,
         };
         lock.show(None);
@@ -92,19 +87,14 @@ impl Lock {
     }
 
     fn init(&self, request: &MethodRequest) -> Answer {
-        let session = request.caller.session;
-        if self
-            .authority
-            .lock_for(&SkillOwner::Session(session))
-            .is_err()
-        {
+        let _shows = lock(&self.shows);
+        if self.lock_for(request).is_err() {
             return Ok(ALREADY_LOCKED);
         }
         let context = match request.arguments.first() {
             Some(Variant::String(context)) => context.as_ref().to_owned(),
             _ => String::new(),
         };
-        self.hold(session);
         // Without a context, the lock is shown with the ApplicationUri of the client.
         let client = if context.is_empty() {
             request.caller.application_uri.clone()
@@ -119,15 +109,16 @@ impl Lock {
         if !self.is_held_by(request) {
             return Ok(NOT_LOCKED);
         }
-        self.hold(request.caller.session);
-        Ok(DONE)
+        // The session has held the lock until now.
+        Ok(self.lock_for(request).map_or(NOT_LOCKED, |()| DONE))
     }
 
     fn exit(&self, request: &MethodRequest) -> Answer {
         if !self.is_held_by(request) {
             return Ok(NOT_LOCKED);
         }
-        self.free();
+        self.authority.release(&owner_of(request));
+        self.show_end();
         Ok(DONE)
     }
 
@@ -137,37 +128,20 @@ impl Lock {
     }
 
     fn is_held_by(&self, request: &MethodRequest) -> bool {
-        lock(&self.held)
-            .as_ref()
-            .is_some_and(|held| held.session == request.caller.session)
+        self.authority.is_locked_by(&owner_of(request))
     }
 
-    fn hold(&self, session: u32) {
-        let until = Instant::now() + LONGEST_LOCK;
-        *lock(&self.held) = Some(Held { session, until });
+    fn lock_for(&self, request: &MethodRequest) -> Result<(), SkillRefusal> {
+        let locked = self.authority.lock_for(&owner_of(request), LONGEST_LOCK);
         self.changed.send_replace(());
+        locked
     }
 
-    fn free(&self) {
-        let held = lock(&self.held).take();
-        if let Some(held) = held {
-            self.authority.release(&SkillOwner::Session(held.session));
-        }
-        self.show(None);
-        self.changed.send_replace(());
-    }
-
-    /// Ends an expired lock. Activity of the holder extends the lock without a renewal.
-    fn end_or_extend(&self, held: &Held) {
-        let now = Instant::now();
-        let idle = self.authority.idle(now);
-        match idle.map_or(Some(LONGEST_LOCK), |idle| LONGEST_LOCK.checked_sub(idle)) {
-            Some(left) if !left.is_zero() => {
-                let session = held.session;
-                let until = now + left;
-                *lock(&self.held) = Some(Held { session, until });
-            }
-            Some(_) | None => self.free(),
+    /// Shows that there is no lock, unless another session has locked the component meanwhile.
+    fn show_end(&self) {
+        let _shows = lock(&self.shows);
+        if self.authority.locked_until().is_none() {
+            self.show(None);
         }
     }
 
@@ -175,22 +149,20 @@ impl Lock {
         let mut changed = self.changed.subscribe();
         let mut holder = self.authority.holder();
         loop {
-            let held = lock(&self.held).clone();
-            let Some(held) = held else {
+            let Some(until) = self.authority.locked_until() else {
+                self.show_end();
                 if changed.changed().await.is_err() {
                     return;
                 }
                 continue;
             };
-            let is_another =
-                |now: &Option<SkillOwner>| *now != Some(SkillOwner::Session(held.session));
-            // Dropping the returned reference unlocks the watch channel, so that the holder can
-            // change.
-            let gone = async { drop(holder.wait_for(is_another).await) };
             tokio::select! {
                 renewed = changed.changed() => if renewed.is_err() { return },
-                () = sleep_until(held.until) => self.end_or_extend(&held),
-                () = gone => self.free(),
+                // The session lost the lease, and the lock with it.
+                lost = holder.changed() => if lost.is_err() { return },
+                () = sleep_until(until) => {
+                    let _previous = self.authority.expire_lock(Instant::now());
+                }
             }
         }
     }
@@ -218,6 +190,10 @@ impl Lock {
             }
         }
     }
+}
+
+fn owner_of(request: &MethodRequest) -> SkillOwner {
+    SkillOwner::Session(request.caller.session)
 }
 
 type Answer = Result<i32, StatusCode>;

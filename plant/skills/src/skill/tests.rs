@@ -4,7 +4,7 @@ use std::sync::atomic::{AtomicU32, Ordering};
 use tokio::time::Instant;
 
 use async_trait::async_trait;
-use program::{ProgramMachineState, Rest, TRANSITIONS};
+use program::{ProgramMachineState, Rest};
 use tokio::sync::Semaphore;
 
 use super::*;
@@ -34,6 +34,8 @@ enum How {
     Deaf,
     /// Ends when it is stopped, and reports that its end is unknown.
     Lost,
+    /// Ends when it is stopped and a permit is there.
+    StopsWhenLet,
     /// Blocks its thread.
     Blocks(Duration),
     /// Is done elsewhere and reports this when it is stopped. It ends as stopped at the next
@@ -44,9 +46,7 @@ enum How {
 #[derive(Clone, Copy)]
 enum Elsewhere {
     Cancels,
-    NeverEnds,
     Refuses,
-    IsLost,
 }
 
 #[async_trait]
@@ -57,7 +57,6 @@ impl Driver for Scripted {
 
     fn halt_timeout(&self) -> Option<Duration> {
         match self.how {
-            How::Elsewhere(Elsewhere::NeverEnds) => Some(Duration::ZERO),
             How::Elsewhere(_) => Some(HALT_TIMEOUT),
             How::AtOnce
             | How::WhenLet
@@ -65,6 +64,7 @@ impl Driver for Scripted {
             | How::Fails
             | How::Deaf
             | How::Lost
+            | How::StopsWhenLet
             | How::Blocks(_) => None,
         }
     }
@@ -87,15 +87,17 @@ impl Driver for Scripted {
                 work.unknown("the robot is lost").await;
                 return Err(DriverError::reported("the robot is lost"));
             }
+            How::StopsWhenLet => {
+                work.stopped().await;
+                self.gate.acquire().await.unwrap().forget();
+                return Err(DriverError::Stopped);
+            }
             How::Blocks(time) => block(time),
             How::Elsewhere(how) => {
                 work.stopped().await;
                 match how {
-                    Elsewhere::Cancels | Elsewhere::NeverEnds => {
-                        work.pending("the goal has not ended").await
-                    }
+                    Elsewhere::Cancels => work.pending("the goal has not ended").await,
                     Elsewhere::Refuses => work.cancel_refused("the robot goes on").await,
-                    Elsewhere::IsLost => work.unknown("the robot is lost").await,
                 }
                 self.gate.acquire().await.unwrap().forget();
                 return Err(DriverError::Stopped);
@@ -221,87 +223,6 @@ impl Bench {
             .map(|(number, _)| *number)
             .collect()
     }
-}
-
-#[tokio::test]
-async fn of_twenty_calls_eight_are_taken_and_the_others_change_nothing() {
-    let mut taken = 0;
-    for state in ProgramMachineState::ALL {
-        for method in ProgramMethod::ALL {
-            let bench = bench(How::WhenLet);
-            let way: &[ProgramMethod] = match state {
-                ProgramMachineState::Halted => &[],
-                ProgramMachineState::Ready => &[ProgramMethod::Reset],
-                ProgramMachineState::Running => &[ProgramMethod::Reset, ProgramMethod::Start],
-                ProgramMachineState::Suspended => &[
-                    ProgramMethod::Reset,
-                    ProgramMethod::Start,
-                    ProgramMethod::Suspend,
-                ],
-            };
-            for step in way {
-                bench.call(*step).await.unwrap();
-            }
-            let before = (bench.skill.shown(), bench.numbers());
-            assert_eq!(before.0.state, state);
-            let executable = ProgramMethod::ALL
-                .iter()
-                .zip(before.0.executable)
-                .any(|(of, can)| *of == method && can);
-            match bench.call(method).await {
-                Ok(_) => {
-                    assert!(executable);
-                    taken += 1;
-                }
-                Err(refusal) => {
-                    assert!(!executable, "{method} in {state}: {refusal}");
-                    assert_eq!(refusal.code, RefusalCode::InvalidState);
-                    let after = bench.skill.shown();
-                    assert_eq!(
-                        (after.state, after.run, &after.parameters),
-                        (state, before.0.run, &before.0.parameters)
-                    );
-                    assert_eq!(bench.numbers(), before.1);
-                }
-            }
-        }
-    }
-    assert_eq!(taken, 8);
-}
-
-#[tokio::test]
-async fn each_of_the_nine_transitions_is_told_once_and_in_order() {
-    let bench = bench(How::WhenLet);
-    let calls = [
-        ProgramMethod::Reset,   // 1
-        ProgramMethod::Halt,    // 9
-        ProgramMethod::Reset,   // 1
-        ProgramMethod::Start,   // 2
-        ProgramMethod::Suspend, // 5
-        ProgramMethod::Resume,  // 6
-        ProgramMethod::Suspend, // 5
-        ProgramMethod::Reset,   // 8
-        ProgramMethod::Start,   // 2
-        ProgramMethod::Suspend, // 5
-        ProgramMethod::Halt,    // 7
-        ProgramMethod::Reset,   // 1
-        ProgramMethod::Start,   // 2
-        ProgramMethod::Halt,    // 3
-    ];
-    for method in calls {
-        bench.call(method).await.unwrap();
-    }
-    bench.gate.add_permits(1);
-    bench.run_to(ProgramMachineState::Ready).await; // 1 2 4
-    assert_eq!(
-        bench.numbers(),
-        [1, 9, 1, 2, 5, 6, 5, 8, 2, 5, 7, 1, 2, 3, 1, 2, 4]
-    );
-    let mut kinds = bench.numbers();
-    kinds.sort_unstable();
-    kinds.dedup();
-    assert_eq!(kinds.len(), TRANSITIONS.len());
-    assert_eq!(bench.skill.shown().run, 4);
 }
 
 #[tokio::test]
@@ -435,7 +356,7 @@ async fn a_full_queue_is_told_of_only_where_nothing_else_is_wrong() {
     bench.run_to(ProgramMachineState::Running).await;
     // Halt of work that does not react takes a second, in which calls wait.
     let halting = bench.skill.call(ME, ProgramMethod::Halt);
-    let mut waiting: Vec<_> = (0..MOST_ORDERS)
+    let mut waiting: Vec<_> = (0..crate::machine::MOST_WAITING)
         .map(|_| Box::pin(bench.skill.call(ME, ProgramMethod::Halt)))
         .collect();
     let mut halting = Box::pin(halting);
@@ -452,6 +373,22 @@ async fn a_full_queue_is_told_of_only_where_nothing_else_is_wrong() {
     assert_eq!(code(OTHER, force(1e9)).await, RefusalCode::Locked);
     assert_eq!(code(ME, force(1e9)).await, RefusalCode::InvalidArgument);
     assert_eq!(code(ME, force(1.0)).await, RefusalCode::TooManyOperations);
+}
+
+#[tokio::test]
+async fn a_start_whose_caller_gave_up_during_a_halt_is_not_executed() {
+    let bench = bench(How::StopsWhenLet);
+    bench.run_to(ProgramMachineState::Running).await;
+    let mut halting = Box::pin(bench.call(ProgramMethod::Halt));
+    assert!(futures_util::poll!(&mut halting).is_pending());
+    {
+        let mut start = Box::pin(bench.skill.execute(ME, Vec::new(), None));
+        assert!(futures_util::poll!(&mut start).is_pending());
+    }
+    bench.gate.add_permits(1);
+    halting.await.unwrap();
+    assert_eq!(bench.call(ProgramMethod::Reset).await, Ok(1));
+    assert_eq!(bench.driver.began.load(Ordering::SeqCst), 1);
 }
 
 #[tokio::test]
@@ -600,23 +537,6 @@ async fn stopped_work_without_a_known_end_needs_a_reset() {
     }
 }
 
-#[tokio::test]
-async fn a_reset_that_stops_suspended_work_without_a_known_end_halts() {
-    let bench = bench(How::Lost);
-    bench.run_to(ProgramMachineState::Running).await;
-    bench.call(ProgramMethod::Suspend).await.unwrap();
-    let refused = bench.call(ProgramMethod::Reset).await.unwrap_err();
-    assert_eq!(refused.code, RefusalCode::InvalidState, "{refused}");
-    let shown = bench.skill.shown();
-    assert_eq!(
-        (shown.state, shown.needs_reset),
-        (ProgramMachineState::Halted, true)
-    );
-    assert!(bench.skill.outcome(1).unwrap().unknown);
-    bench.call(ProgramMethod::Reset).await.unwrap();
-    assert_eq!(bench.skill.shown().state, ProgramMachineState::Ready);
-}
-
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn what_still_blocks_is_not_started_anew() {
     let bench = bench(How::Blocks(Duration::from_secs(2)));
@@ -663,69 +583,6 @@ async fn a_run_that_takes_too_long_fails() {
 }
 
 #[tokio::test]
-async fn work_that_is_done_while_it_is_suspended_ends_when_it_is_resumed() {
-    let bench = bench(How::WhenLet);
-    bench.run_to(ProgramMachineState::Running).await;
-    bench.call(ProgramMethod::Suspend).await.unwrap();
-    bench.gate.add_permits(1);
-    while bench.gate.available_permits() > 0 {
-        tokio::task::yield_now().await;
-    }
-    tokio::task::yield_now().await;
-    assert_eq!(bench.skill.shown().state, ProgramMachineState::Suspended);
-    bench.call(ProgramMethod::Resume).await.unwrap();
-    bench.until(ProgramMachineState::Ready).await;
-    assert_eq!(bench.numbers(), [1, 2, 5, 6, 4]);
-}
-
-#[tokio::test]
-async fn suspending_is_refused_where_the_driver_cannot() {
-    let bench = bench(How::Deaf);
-    let refusal = bench.call(ProgramMethod::Suspend).await.unwrap_err();
-    assert_eq!(
-        refusal.code,
-        RefusalCode::InvalidState,
-        "mode comes before capability"
-    );
-    bench.run_to(ProgramMachineState::Running).await;
-    assert_eq!(
-        bench.call(ProgramMethod::Suspend).await.unwrap_err().code,
-        RefusalCode::NotSupported
-    );
-}
-
-#[tokio::test]
-async fn a_component_does_one_thing_at_a_time() {
-    let gate = Arc::new(Semaphore::new(0));
-    let driver = Arc::new(Scripted {
-        how: How::WhenLet,
-        gate: Arc::clone(&gate),
-        began: AtomicU32::new(0),
-    });
-    let authority = Authority::new();
-    let skill = |name: &str| {
-        let facts = SkillDescription {
-            name: name.to_owned(),
-            ..facts("GraspSkillType", None)
-        };
-        Skill::spawn(facts, driver.clone(), authority.clone(), Vec::new())
-    };
-    let (one, two) = (skill("One"), skill("Two"));
-    for skill in [&one, &two] {
-        skill.call(ME, ProgramMethod::Reset).await.unwrap();
-    }
-    one.call(ME, ProgramMethod::Start).await.unwrap();
-    let refusal = two.call(ME, ProgramMethod::Start).await.unwrap_err();
-    assert_eq!(
-        refusal.to_string(),
-        "BadInvalidState: One of this component runs, and it does one thing at a time"
-    );
-    assert_eq!(two.shown().state, ProgramMachineState::Ready);
-    one.call(ME, ProgramMethod::Halt).await.unwrap();
-    assert!(two.call(ME, ProgramMethod::Start).await.is_ok());
-}
-
-#[tokio::test]
 async fn at_the_end_of_the_component_what_runs_is_halted() {
     let bench = bench(How::WhenLet);
     bench.run_to(ProgramMachineState::Running).await;
@@ -762,29 +619,6 @@ async fn work_elsewhere_is_halted_when_it_has_ended() {
 }
 
 #[tokio::test]
-async fn work_elsewhere_without_an_end_is_unknown_and_needs_a_reset() {
-    for how in [Elsewhere::NeverEnds, Elsewhere::IsLost] {
-        let bench = bench(How::Elsewhere(how));
-        bench.run_to(ProgramMachineState::Running).await;
-        bench.call(ProgramMethod::Halt).await.unwrap();
-        assert_eq!(bench.skill.shown().state, ProgramMachineState::Running);
-        let run = bench.call(ProgramMethod::Halt).await.unwrap();
-        let shown = bench.skill.shown();
-        assert_eq!(
-            (shown.state, shown.needs_reset),
-            (ProgramMachineState::Halted, true)
-        );
-        let outcome = bench.skill.outcome(run).unwrap();
-        assert!(outcome.message.contains("unknown"), "{outcome:?}");
-        assert!(outcome.unknown);
-        let refused = bench.skill.execute(ME, Vec::new(), None).await.unwrap_err();
-        assert_eq!(refused.code, RefusalCode::InvalidState, "{refused}");
-        bench.call(ProgramMethod::Reset).await.unwrap();
-        bench.skill.execute(ME, Vec::new(), None).await.unwrap();
-    }
-}
-
-#[tokio::test]
 async fn a_refused_cancellation_is_shown_as_refused() {
     let bench = bench(How::Elsewhere(Elsewhere::Refuses));
     bench.run_to(ProgramMachineState::Running).await;
@@ -793,24 +627,6 @@ async fn a_refused_cancellation_is_shown_as_refused() {
     let shown = bench.skill.shown();
     assert_eq!(shown.state, ProgramMachineState::Running);
     assert_eq!(shown.pending.as_deref(), Some("the robot goes on"));
-}
-
-#[tokio::test]
-async fn a_run_that_takes_too_long_elsewhere_ends_with_its_work() {
-    let limit = Some(Duration::from_millis(50));
-    let how = How::Elsewhere(Elsewhere::Cancels);
-    let bench = bench_of(how, "GraspSkillType", limit);
-    bench.run_to(ProgramMachineState::Running).await;
-    let mut watch = bench.skill.watch();
-    let pending = watch.wait_for(|shown| shown.pending.is_some()).await;
-    assert_eq!(pending.unwrap().state, ProgramMachineState::Running);
-    bench.gate.add_permits(1);
-    let shown = bench.until(ProgramMachineState::Halted).await;
-    let outcome = shown.outcome.clone().unwrap();
-    assert!(
-        outcome.message.contains("not done within 50ms"),
-        "{outcome:?}"
-    );
 }
 
 #[tokio::test]

@@ -1,4 +1,4 @@
-//! The reasons why the task of a skill refuses a call.
+//! The reasons why a skill refuses a call.
 
 use program::{ProgramMachineState, ProgramMethod, RefusedMethod, RunId};
 
@@ -25,4 +25,19 @@ pub(super) fn unknown_outcome(run: u32) -> SkillRefusal {
 pub(super) fn still_at_work(run: RunId) -> SkillRefusal {
     let text = format!("the work of run {} has not come to an end", run.number());
     SkillRefusal::new(RefusalCode::InvalidState, text)
+}
+
+pub(super) fn is_stopped(method: ProgramMethod, run: RunId) -> SkillRefusal {
+    let text = format!(
+        "{method} is not possible: run {} is being stopped",
+        run.number()
+    );
+    SkillRefusal::new(RefusalCode::InvalidState, text)
+}
+
+pub(super) fn no_room() -> SkillRefusal {
+    SkillRefusal::new(
+        RefusalCode::TooManyOperations,
+        "too many calls of this skill wait already",
+    )
 }

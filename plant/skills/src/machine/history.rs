@@ -1,8 +1,7 @@
 //! The trace of the current run, and the outcomes of the last runs.
 
 use std::sync::Arc;
-
-use tokio::time::Instant;
+use std::time::Duration;
 
 use crate::driver::Line;
 use crate::outcomes::NewestOutcomes;
@@ -31,8 +30,8 @@ impl SkillHistory {
         std::mem::take(&mut self.trace)
     }
 
-    /// Adds a report to the trace of a run that began at this time.
-    pub(super) fn add(&mut self, began: Instant, line: &Line) {
+    /// Adds a report to the trace, with the time since the start of the run.
+    pub(super) fn add(&mut self, since_start: Duration, line: &Line) {
         let (Line::Step(text)
         | Line::Note(text)
         | Line::Pending(text)
@@ -40,7 +39,7 @@ impl SkillHistory {
         | Line::Unknown(text)) = line;
         if self.trace.len() < MOST_TRACED {
             let text: String = text.chars().take(LONGEST_TRACED).collect();
-            let seconds = began.elapsed().as_secs_f64();
+            let seconds = since_start.as_secs_f64();
             self.trace.push(format!("{seconds:.3} {text}"));
         }
     }
