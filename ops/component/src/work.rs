@@ -1,6 +1,8 @@
 //! A skill that is executed by a call or an action of the space: of ROS, of another component, or
 //! of a server.
 
+mod answer;
+
 use std::hash::{BuildHasher as _, RandomState};
 use std::pin::pin;
 use std::sync::{Arc, OnceLock};
@@ -12,16 +14,15 @@ use bytes::Bytes;
 use mappings::TopicId;
 use serde_json::Value as Json;
 use skills::{
-    Builtin, Component, Driver, DriverError, DriverSetup, Parameters, RequestKind, RunResults,
-    SkillValue, SpaceWork, Stopped, ValueShape, Work,
+    Component, Driver, DriverError, DriverSetup, Parameters, RequestKind, RunResults, SpaceWork,
+    Stopped, Work,
 };
 use tokio::time::sleep;
-use uadp::Fields;
 
+use self::answer::{AnsweredEnd, SpaceAnswer, is, plain};
 use crate::asking::{Asking, RequestSender};
 use crate::definition::field_name;
 use crate::encoding::{NULL, block, bytes, encoded, no_time, nothing};
-use crate::fields;
 use crate::topics::Topics;
 
 /// Returns the component with drivers for the skills that other participants of the space execute,
@@ -103,7 +104,7 @@ impl SpaceDriver {
         {
             work.unknown(why(fault.clone())).await;
         }
-        let answer = read(&answer.map_err(why)?, &call.response)?;
+        let answer = SpaceAnswer::read(&answer.map_err(why)?, &call.response)?;
         self.outcome(&answer, "", work.parameters())
     }
 
@@ -141,12 +142,12 @@ impl SpaceDriver {
             }
             Some(Ok(answer)) => answer,
         };
-        match End::of(&answer) {
-            End::Succeeded => self.outcome(&answer, "result.", work.parameters()),
-            End::Canceled => Err(end("cancelled by somebody else", &answer)),
-            End::Aborted => Err(end("aborted", &answer)),
-            End::NeverRan => Err(end("rejected", &answer)),
-            End::Unknown => {
+        match answer.end() {
+            AnsweredEnd::Succeeded => self.outcome(&answer, "result.", work.parameters()),
+            AnsweredEnd::Canceled => Err(answer.end_text("cancelled by somebody else")),
+            AnsweredEnd::Aborted => Err(answer.end_text("aborted")),
+            AnsweredEnd::NeverRan => Err(answer.end_text("rejected")),
+            AnsweredEnd::Unknown => {
                 let why = self.lost(&answer);
                 work.unknown(why.clone()).await;
                 Err(why)
@@ -169,9 +170,12 @@ impl SpaceDriver {
         let ended = async {
             loop {
                 let why = match self.result(action, id).await {
-                    Ok(answer) => match End::of(&answer) {
-                        End::Unknown => self.lost(&answer),
-                        End::Succeeded | End::Canceled | End::Aborted | End::NeverRan => {
+                    Ok(answer) => match answer.end() {
+                        AnsweredEnd::Unknown => self.lost(&answer),
+                        AnsweredEnd::Succeeded
+                        | AnsweredEnd::Canceled
+                        | AnsweredEnd::Aborted
+                        | AnsweredEnd::NeverRan => {
                             return Ok(answer);
                         }
                     },
@@ -204,21 +208,21 @@ impl SpaceDriver {
         };
         let why = |how: &str| match why == Stopped.to_string() {
             true => why.to_owned(),
-            false => format!("{why}; {}", end(how, &answer)),
+            false => format!("{why}; {}", answer.end_text(how)),
         };
-        match End::of(&answer) {
-            End::Succeeded => self.outcome(&answer, "result.", work.parameters()),
-            End::Canceled => Err(why("cancelled")),
-            End::NeverRan => Err(why("rejected")),
-            End::Aborted | End::Unknown => Err(why("aborted")),
+        match answer.end() {
+            AnsweredEnd::Succeeded => self.outcome(&answer, "result.", work.parameters()),
+            AnsweredEnd::Canceled => Err(why("cancelled")),
+            AnsweredEnd::NeverRan => Err(why("rejected")),
+            AnsweredEnd::Aborted | AnsweredEnd::Unknown => Err(why("aborted")),
         }
     }
 
-    fn lost(&self, answer: &Answer) -> String {
+    fn lost(&self, answer: &SpaceAnswer) -> String {
         format!(
             "the executor of {} has lost the goal, whose end is unknown: {}",
             self.topic,
-            text(answer, "message")
+            answer.text("message")
         )
     }
 
@@ -243,11 +247,11 @@ impl SpaceDriver {
             true => NotSent::Unknown(why(fault)),
             false => NotSent::Never(why(fault)),
         })?;
-        let answer = read(&answer, &goal.response).map_err(NotSent::Unknown)?;
-        if field(&answer, "accepted") != Some(&true.into()) {
+        let answer = SpaceAnswer::read(&answer, &goal.response).map_err(NotSent::Unknown)?;
+        if answer.field("accepted") != Some(&true.into()) {
             return Err(NotSent::Never(format!(
                 "the goal is rejected: {}",
-                text(&answer, "message")
+                answer.text("message")
             )));
         }
         Ok(())
@@ -278,11 +282,11 @@ impl SpaceDriver {
     }
 
     /// Waits for the end of the goal.
-    async fn result(&self, action: &Action, id: [u8; 16]) -> Result<Answer, String> {
+    async fn result(&self, action: &Action, id: [u8; 16]) -> Result<SpaceAnswer, String> {
         loop {
             let request = Bytes::from(block(&[bytes(&id)]));
             let fault = match self.asks.ask(action.result, request, RESULT_WITHIN).await {
-                Ok(answer) => return read(&answer, &action.described.response),
+                Ok(answer) => return SpaceAnswer::read(&answer, &action.described.response),
                 Err(fault) => fault,
             };
             let goes_on = fault
@@ -308,9 +312,8 @@ impl SpaceDriver {
     async fn cancel(&self, action: &Action, id: [u8; 16]) -> Option<i64> {
         let request = Bytes::from(block(&[bytes(&id), no_time()]));
         let answer = self.asks.ask(action.cancel, request, CANCEL_WITHIN).await;
-        let answer = read(&answer.ok()?, &action.cancels.response).ok()?;
-        let (_, code) = answer.first()?;
-        code.as_i64()
+        let answer = SpaceAnswer::read(&answer.ok()?, &action.cancels.response).ok()?;
+        answer.code()
     }
 
     /// Encodes the request: fields that the YAML file sets, parameters with the same names, and
@@ -371,11 +374,11 @@ impl SpaceDriver {
     /// Returns the results if the answer reports success.
     fn outcome(
         &self,
-        answer: &Answer,
+        answer: &SpaceAnswer,
         prefix: &str,
         parameters: &Parameters,
     ) -> Result<RunResults, String> {
-        let of = |name: &str| field(answer, &format!("{prefix}{name}")).cloned();
+        let of = |name: &str| answer.field(&format!("{prefix}{name}")).cloned();
         let message = of("message").and_then(|message| message.as_str().map(str::to_owned));
         let no = |name: &str, value: &Json| match &message {
             Some(message) if !message.is_empty() => Err(format!("{message} ({name} is {value})")),
@@ -406,11 +409,7 @@ impl SpaceDriver {
             results.push((name.clone(), value));
         }
         let said = |name: &str| self.work.results.iter().any(|(known, _)| known == name);
-        let rest = answer.iter().filter_map(|(name, value)| {
-            let name = camel(name.strip_prefix(prefix)?);
-            (!said(&name)).then(|| Some((name, plain(value)?)))?
-        });
-        results.extend(rest);
+        results.extend(answer.results(prefix).filter(|(name, _)| !said(name)));
         Ok(results)
     }
 }
@@ -423,123 +422,9 @@ struct Action {
     described: Arc<CallDescription>,
 }
 
-/// The end of a goal.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum End {
-    Succeeded,
-    Canceled,
-    Aborted,
-    /// The goal was rejected or not sent.
-    NeverRan,
-    Unknown,
-}
-
-impl End {
-    fn of(answer: &Answer) -> Self {
-        match field(answer, "status").and_then(Json::as_i64) {
-            Some(4) => Self::Succeeded,
-            Some(5) => Self::Canceled,
-            Some(6) => Self::Aborted,
-            Some(-1) => Self::NeverRan,
-            Some(_) | None => Self::Unknown,
-        }
-    }
-}
-
-/// Returns the end of a goal as text for the operator, with the message of its server if it has a
-/// message.
-fn end(how: &str, answer: &Answer) -> String {
-    let message = text(answer, "message").trim();
-    let fields = answer.iter();
-    let texts = fields.filter_map(|(name, value)| Some((name.as_str(), value.as_str()?)));
-    let message = Some(message).filter(|message| !message.is_empty());
-    match message.or_else(|| messages::reason_of(texts)) {
-        None => format!("the goal was {how}"),
-        Some(message) => format!("the goal was {how}: {message}"),
-    }
-}
-
 /// Returns true if the request may have been executed, or may be executed later.
 fn is_unknown(fault: Option<&AskError>) -> bool {
     fault.is_none_or(|fault| fault.kind == AskErrorKind::Unknown)
-}
-
-/// The fields of an answer with types that a skill supports.
-type Answer = Vec<(String, Json)>;
-
-fn read(block: &[u8], response: &[CallField]) -> Result<Answer, String> {
-    let unread = |error: &dyn std::fmt::Display| format!("the answer does not read: {error}");
-    let values = Fields::parse(block).map_err(|error| unread(&error))?;
-    let mut answer = Vec::new();
-    for (value, field) in values.zip(response) {
-        let value = value.map_err(|error| unread(&error))?;
-        if let Ok(Some(value)) = fields::value(&value) {
-            answer.push((field.name.clone(), value.to_json()));
-        }
-    }
-    Ok(answer)
-}
-
-fn field<'a>(answer: &'a Answer, name: &str) -> Option<&'a Json> {
-    let found = answer.iter().find(|(known, _)| known == name);
-    found.map(|(_, value)| value)
-}
-
-fn text<'a>(answer: &'a Answer, name: &str) -> &'a str {
-    field(answer, name)
-        .and_then(Json::as_str)
-        .unwrap_or_default()
-}
-
-/// Returns true if a value equals the written value.
-fn is(value: &Json, wanted: &str) -> bool {
-    match value {
-        Json::String(text) => text == wanted,
-        Json::Number(number) => wanted
-            .parse::<f64>()
-            .is_ok_and(|wanted| number.as_f64() == Some(wanted)),
-        Json::Bool(truth) => wanted.parse() == Ok(*truth),
-        Json::Null => wanted == "null",
-        Json::Array(_) | Json::Object(_) => false,
-    }
-}
-
-/// Converts a value of an answer into the widest type of its kind. The type of the skill narrows
-/// it.
-fn plain(value: &Json) -> Option<SkillValue> {
-    let of = |builtin| ValueShape::scalar(builtin).read_json(value).ok();
-    match value {
-        Json::Bool(_) => of(Builtin::Boolean),
-        Json::String(_) => of(Builtin::String),
-        Json::Number(number) if number.is_i64() => of(Builtin::Int64),
-        Json::Number(_) => of(Builtin::Double),
-        Json::Array(elements) => {
-            let builtin = match elements.first() {
-                Some(Json::Bool(_)) => Builtin::Boolean,
-                Some(Json::String(_)) => Builtin::String,
-                Some(_) | None => Builtin::Double,
-            };
-            ValueShape::array(builtin).read_json(value).ok()
-        }
-        Json::Null | Json::Object(_) => None,
-    }
-}
-
-/// Converts a name of ROS into a result name of OPC UA: `TargetPosition` for `target_position`.
-fn camel(name: &str) -> String {
-    let mut spelled = String::new();
-    let mut begins = true;
-    for c in name.chars() {
-        match (c, begins) {
-            ('_', _) => begins = true,
-            (c, true) => {
-                spelled.push(c.to_ascii_uppercase());
-                begins = false;
-            }
-            (c, false) => spelled.push(c),
-        }
-    }
-    spelled
 }
 
 fn new_id() -> [u8; 16] {
@@ -575,152 +460,4 @@ const PAUSE: Duration = Duration::from_millis(200);
 const REJECTED: i64 = 1;
 
 #[cfg(test)]
-mod tests {
-    use std::path::Path;
-
-    use skills::model;
-    use uadp::BuiltinType;
-
-    use super::*;
-
-    fn example(name: &str) -> Component {
-        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../examples/plant");
-        let text = std::fs::read_to_string(folder.join(name)).unwrap();
-        Component::from_yaml(&text, &folder).unwrap()
-    }
-
-    fn driver(component: &Component, number: usize) -> SpaceDriver {
-        let DriverSetup::Space(work) = &component.skills[number].driver else {
-            panic!("{:?}", component.skills[number].driver)
-        };
-        let topic = work.topic.parse().unwrap();
-        SpaceDriver {
-            work: SpaceWork::clone(work),
-            topic,
-            asks: Asking::new().asks(topic),
-        }
-    }
-
-    fn parameters(of: &str, given: Vec<(&str, SkillValue)>) -> Parameters {
-        let declared = model::find(of).unwrap().parameters();
-        let given = given
-            .into_iter()
-            .map(|(name, value)| (name.to_owned(), value));
-        Parameters::complete(&declared, given.collect()).unwrap()
-    }
-
-    /// Returns the fields of an encoded request.
-    fn asked(block: &[u8]) -> Vec<Option<SkillValue>> {
-        let fields = Fields::parse(block).unwrap();
-        fields
-            .map(|field| fields::value(&field.unwrap()).unwrap_or(None))
-            .collect()
-    }
-
-    fn scalar(name: &str, builtin: BuiltinType) -> CallField {
-        CallField::scalar(name, builtin)
-    }
-
-    #[test]
-    fn a_goal_is_made_of_constants_parameters_and_nothing_where_nothing_is_said() {
-        let driver = driver(&example("niryo-ned.yaml"), 0);
-        let takes = [
-            scalar("goal_id", BuiltinType::ByteString),
-            scalar("goal.cmd.cmd_type", BuiltinType::Int32),
-            scalar("goal.cmd.position.x", BuiltinType::Double),
-            scalar("goal.cmd.position.y", BuiltinType::Double),
-            scalar("goal.cmd.position.z", BuiltinType::Double),
-            scalar("goal.cmd.rpy.roll", BuiltinType::Double),
-            scalar("goal.cmd.rpy.pitch", BuiltinType::Double),
-            scalar("goal.cmd.rpy.yaw", BuiltinType::Double),
-            scalar("goal.cmd.trajectory.header.frame_id", BuiltinType::String),
-            scalar("goal.cmd.trajectory.header.stamp", BuiltinType::DateTime),
-            CallField::array("goal.cmd.list_poses", BuiltinType::ExtensionObject),
-            CallField::array("goal.cmd.args", BuiltinType::Double),
-        ];
-        let target = [0.25, 0.5, 0.75, 1.0, 1.25, 1.5];
-        let given = parameters(
-            "PtpMoveSkillType",
-            vec![("TargetPosition", SkillValue::from(target))],
-        );
-        let block = driver.request(&takes, &given, Some([7; 16])).unwrap();
-        let fields = asked(&block);
-        assert_eq!(fields.len(), takes.len());
-        assert_eq!(fields[1], Some(SkillValue::Int32(1)));
-        for (place, value) in target.iter().enumerate() {
-            assert_eq!(fields[2 + place], Some(SkillValue::Double(*value)));
-        }
-        assert_eq!(fields[8], Some("".into()));
-        assert_eq!(
-            fields[11],
-            Some(SkillValue::Array(Builtin::Double, Vec::new()))
-        );
-        let wrong = driver
-            .request(&takes[..3], &given, Some([7; 16]))
-            .unwrap_err();
-        assert!(wrong.contains("no field `cmd.position.y`"), "{wrong}");
-    }
-
-    #[test]
-    fn parameters_go_by_name_and_in_the_types_that_are_asked_for() {
-        let component = example("niryo-ned.yaml");
-        let mut driver = driver(&component, 4);
-        driver.work.request.clear();
-        let takes = [
-            scalar("ON", BuiltinType::Boolean),
-            scalar("speed", BuiltinType::Int16),
-            scalar("extra", BuiltinType::Int32).optional(),
-        ];
-        let given = parameters("RunConveyorSkillType", Vec::new());
-        let block = driver.request(&takes, &given, None).unwrap();
-        assert_eq!(
-            asked(&block),
-            [Some(true.into()), Some(SkillValue::Int16(0)), None]
-        );
-        let move_to = [scalar("target_position", BuiltinType::Double)];
-        let target = parameters(
-            "PtpMoveSkillType",
-            vec![("TargetPosition", SkillValue::from([1.0; 6]))],
-        );
-        let wrong = driver.request(&move_to, &target, None).unwrap_err();
-        assert!(
-            wrong.starts_with("target_position: "),
-            "six are not one: {wrong}"
-        );
-    }
-
-    #[test]
-    fn an_answer_says_whether_the_work_is_done_and_what_came_out() {
-        let component = example("niryo-ned.yaml");
-        let grasp = driver(&component, 2);
-        let none = parameters("GraspSkillType", Vec::new());
-        let answer = |status: i64| -> Answer {
-            vec![
-                ("result.status".to_owned(), status.into()),
-                ("result.message".to_owned(), "said".into()),
-            ]
-        };
-        let done = grasp.outcome(&answer(1), "result.", &none).unwrap();
-        assert_eq!(done[0], ("Gripped".to_owned(), true.into()));
-        let failed = grasp.outcome(&answer(-52), "result.", &none).unwrap_err();
-        assert_eq!(failed, "said (status is -52)");
-        let mut plain = driver(&component, 4);
-        plain.work.succeeds.clear();
-        let no: Answer = vec![("success".to_owned(), false.into())];
-        assert_eq!(
-            plain.outcome(&no, "", &none),
-            Err("success is false".to_owned())
-        );
-    }
-
-    #[test]
-    fn the_examples_are_read_and_served() {
-        for name in ["niryo-ned.yaml", "turtlebot3.yaml", "moveit-arm.yaml"] {
-            let component = example(name);
-            let mut asking = Asking::new();
-            let made = with_drivers(&component, &mut asking, &mut Topics::default());
-            let given = |skill: &skills::SkillSetup| matches!(skill.driver, DriverSetup::Given(_));
-            assert!(made.skills.iter().all(given), "{name}");
-        }
-    }
-}
+mod tests;
