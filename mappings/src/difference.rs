@@ -26,11 +26,7 @@ impl Mapping {
     pub fn difference(&self, older: &Self) -> Difference {
         let mut difference = Difference::default();
         for variable in self.variables() {
-            match older.variable(variable.topic) {
-                None => difference.added.push(variable.topic),
-                Some(before) if before == variable => difference.same += 1,
-                Some(_) => difference.changed.push(variable.topic),
-            }
+            difference.add(variable.topic, older.variable(variable.topic), variable);
         }
         let gone = older.variables().iter().map(|variable| variable.topic);
         difference.removed = gone
@@ -42,11 +38,7 @@ impl Mapping {
         };
         let (before, after) = (by_topic(older), by_topic(self));
         for call in self.calls() {
-            match before.get(&call.topic) {
-                None => difference.added.push(call.topic),
-                Some(before) if before == call => difference.same += 1,
-                Some(_) => difference.changed.push(call.topic),
-            }
+            difference.add(call.topic, before.get(&call.topic), call);
         }
         let gone = older.calls().iter().map(|call| call.topic);
         let gone = gone.filter(|topic| !after.contains_key(topic));
@@ -55,11 +47,22 @@ impl Mapping {
     }
 }
 
+impl Difference {
+    /// Adds a topic of the newer mapping.
+    fn add<T: PartialEq>(&mut self, topic: TopicId, before: Option<&T>, now: &T) {
+        match before {
+            None => self.added.push(topic),
+            Some(before) if before == now => self.same += 1,
+            Some(_) => self.changed.push(topic),
+        }
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    fn of(variables: &[(u16, &str)]) -> Mapping {
+    fn variables(variables: &[(u16, &str)]) -> Mapping {
         let mut text = "spaces: [{id: 1}]\nnamespaces: {2: 'urn:test'}\nvariables:\n".to_owned();
         for (id, name) in variables {
             text += &format!("  - {{node: ns=2;i={id}, name: {name}, type: Double, origin: 1}}\n");
@@ -67,44 +70,31 @@ mod tests {
         Mapping::from_yaml(&text, "test.yaml").mapping.unwrap()
     }
 
-    #[test]
-    fn variables_are_told_apart_by_their_topics() {
-        let difference =
-            of(&[(1, "A"), (3, "X"), (4, "D")]).difference(&of(&[(1, "A"), (2, "B"), (3, "C")]));
-        let topic = |id: u16| TopicId::new(1, 2, id).unwrap();
-        assert_eq!(
-            difference,
-            Difference {
-                added: vec![topic(4)],
-                changed: vec![topic(3)],
-                removed: vec![topic(2)],
-                same: 1,
-            }
-        );
+    fn calls(calls: &[(u16, &str)]) -> Mapping {
+        let mut text = "spaces: [{id: 1}]\nnamespaces: {2: 'urn:test'}\ncalls:\n".to_owned();
+        for (id, service) in calls {
+            text += &format!(
+                "  - {{node: ns=2;i={id}, name: C{id}, origin: 1, ros: {{service: /{service}, type: std_srvs/Empty}}}}\n"
+            );
+        }
+        Mapping::from_yaml(&text, "test.yaml").mapping.unwrap()
     }
 
     #[test]
-    fn calls_are_told_apart_as_variables_are() {
-        let of = |calls: &[(u16, &str)]| {
-            let mut text = "spaces: [{id: 1}]\nnamespaces: {2: 'urn:test'}\ncalls:\n".to_owned();
-            for (id, service) in calls {
-                text += &format!(
-                    "  - {{node: ns=2;i={id}, name: C{id}, origin: 1, ros: {{service: {service}, type: std_srvs/Empty}}}}\n"
-                );
-            }
-            Mapping::from_yaml(&text, "test.yaml").mapping.unwrap()
-        };
-        let newer = of(&[(1, "/a"), (3, "/x"), (4, "/d")]);
-        let difference = newer.difference(&of(&[(1, "/a"), (2, "/b"), (3, "/c")]));
+    fn variables_and_calls_are_told_apart_by_their_topics() {
+        let newer = [(1, "A"), (3, "X"), (4, "D")];
+        let older = [(1, "A"), (2, "B"), (3, "C")];
         let topic = |id: u16| TopicId::new(1, 2, id).unwrap();
-        assert_eq!(
-            difference,
-            Difference {
-                added: vec![topic(4)],
-                changed: vec![topic(3)],
-                removed: vec![topic(2)],
-                same: 1,
-            }
-        );
+        for of in [variables, calls] {
+            assert_eq!(
+                of(&newer).difference(&of(&older)),
+                Difference {
+                    added: vec![topic(4)],
+                    changed: vec![topic(3)],
+                    removed: vec![topic(2)],
+                    same: 1,
+                }
+            );
+        }
     }
 }

@@ -113,16 +113,25 @@ fn topic(
         ));
         return;
     };
+    let subject = format!("`{}` is bound", short(name));
     let wanted = binding.message_type.as_str();
-    if let Some(other) = live.types.iter().find(|one| one.as_str() != wanted) {
-        let message = format!(
-            "`{}` is bound as {wanted}, but its current type is {}",
-            short(name),
-            short(other)
-        );
+    compare_type(&subject, wanted, &live.types, place, findings);
+}
+
+/// Warns if a name of the running cell has another type than the mapping has for it.
+fn compare_type<'t>(
+    subject: &str,
+    wanted: &str,
+    types: impl IntoIterator<Item = &'t String>,
+    place: TextSpan,
+    findings: &mut MappingFindings,
+) {
+    let other = types.into_iter().find(|of| of.as_str() != wanted);
+    if let Some(other) = other.map(|other| short(other)) {
+        let message = format!("{subject} as {wanted}, but its current type is {other}");
         findings
             .warning(Code::LiveTypeDiffers, place, message)
-            .help(format!("type: {}", short(other)));
+            .help(format!("type: {other}"));
     }
 }
 
@@ -175,17 +184,8 @@ fn service(
         }
         return;
     };
-    let wanted = service_type.as_str();
-    if let Some(other) = types.iter().find(|one| one.as_str() != wanted) {
-        let message = format!(
-            "the service `{}` is called as {wanted}, but its current type is {}",
-            short(service),
-            short(other)
-        );
-        findings
-            .warning(Code::LiveTypeDiffers, place, message)
-            .help(format!("type: {}", short(other)));
-    }
+    let subject = format!("the service `{}` is called", short(service));
+    compare_type(&subject, service_type.as_str(), types, place, findings);
 }
 
 fn unmatched(

@@ -95,17 +95,8 @@ fn executed(
         });
         return;
     };
-    let wanted = target.type_name.as_str();
-    if let Some(other) = types.iter().find(|one| one.as_str() != wanted) {
-        let message = format!(
-            "the {word} `{}` is bound as {wanted}, but its current type is {}",
-            short(name),
-            short(other)
-        );
-        findings
-            .warning(Code::LiveTypeDiffers, place, message)
-            .help(format!("type: {}", short(other)));
-    }
+    let subject = format!("the {word} `{}` is bound", short(name));
+    super::compare_type(&subject, target.type_name.as_str(), types, place, findings);
 }
 
 /// Returns the position of the name of the service or action of a space.
