@@ -386,8 +386,10 @@ impl<R: CallReply> SkillMachine<R> {
         let state = self.work.record().state();
         let is_its_capability =
             method == ProgramMethod::Suspend && state == ProgramMachineState::Running;
-        let is_made_ready = given.readies && state == ProgramMachineState::Halted;
-        if is_made_ready && self.work.record().snapshot().needs_reset {
+        let is_halted = state == ProgramMachineState::Halted;
+        let is_made_ready = given.readies && is_halted;
+        let needs_reset = self.work.record().snapshot().needs_reset;
+        if method == ProgramMethod::Start && is_halted && needs_reset {
             return Err(unknown_outcome(self.work.record().run_number()));
         }
         if !self.work.record().is_executable(method) && !is_its_capability && !is_made_ready {

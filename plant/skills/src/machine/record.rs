@@ -203,7 +203,7 @@ impl<R> SkillRecord<R> {
 
     fn keep(&mut self, outcome: RunOutcome) {
         let outcome = self.history.keep(outcome);
-        self.now.outcome = Some(Arc::clone(&outcome));
+        self.now.end(&outcome);
         self.tell(SkillNotice::Outcome(outcome));
     }
 
@@ -219,9 +219,6 @@ impl<R> SkillRecord<R> {
                 let at = now.monotonic;
                 self.push(SkillOutput::Release { at });
             }
-        }
-        if transition.to == ProgramMachineState::Ready {
-            self.now.needs_reset = false;
         }
         debug!(skill = self.facts.name, "{}: {message}", transition.name);
         self.tell(SkillNotice::Transition(Transitioned {
