@@ -7,7 +7,7 @@ use std::time::Duration;
 use plant_opcua::client::{
     ClientConfig, ClientSubscription, Link, MonitoredWatch, Notice, OpcUaClient, Select,
 };
-use plant_opcua::types::{DateTime, NodeId, ObjectId, ObjectTypeId, VariableId, Variant};
+use plant_opcua::types::{DateTime, ObjectId, ObjectTypeId, VariableId, Variant};
 use skills::ClientOptions;
 use tokio::sync::Notify;
 use tokio::time::{Instant, sleep_until, timeout};
@@ -110,7 +110,6 @@ impl FollowedServer {
         let mut failed = FIRST_PAUSE;
         let mut reason = "connected";
         loop {
-            let began = Instant::now();
             let is_read = self.read(client, &graph, uri, reason).await;
             let pause = match is_read {
                 true => self.entry.every,
@@ -126,7 +125,8 @@ impl FollowedServer {
                 () = self.again.notified() => "command",
                 why = changes.next() => why,
             };
-            changes.settle(began.max(read) + SETTLED).await;
+            let burst = Instant::now() + BURST;
+            changes.settle(burst.max(read + SETTLED)).await;
         }
     }
 
@@ -221,15 +221,17 @@ struct ModelChanges {
 impl ModelChanges {
     fn new(client: &OpcUaClient) -> Self {
         let value = |id: VariableId| MonitoredWatch::Value(id.into());
-        let server: NodeId = ObjectId::Server.into();
+        let events = |of_type: ObjectTypeId| MonitoredWatch::Events {
+            node: ObjectId::Server.into(),
+            select: vec![Select::new(ObjectTypeId::BaseEventType, "EventType")],
+            of_type: Some(of_type.into()),
+        };
         let watches = vec![
             value(VariableId::Server_NamespaceArray),
             value(VariableId::Server_ServerStatus_State),
-            MonitoredWatch::Events {
-                node: server,
-                select: vec![Select::new(ObjectTypeId::BaseEventType, "EventType")],
-                of_type: Some(ObjectTypeId::BaseModelChangeEventType.into()),
-            },
+            events(ObjectTypeId::BaseModelChangeEventType),
+            // Some servers, such as those of asyncua, do not include subtypes.
+            events(ObjectTypeId::GeneralModelChangeEventType),
         ];
         Self {
             subscription: client.subscribe(watches, INTERVAL, QUEUE),
@@ -288,6 +290,8 @@ const FIRST_PAUSE: Duration = Duration::from_secs(2);
 const LONGEST_PAUSE: Duration = Duration::from_secs(60);
 /// Shortest time between two searches.
 const SETTLED: Duration = Duration::from_secs(1);
+/// Time in which further changes belong to the first change.
+const BURST: Duration = Duration::from_millis(200);
 /// Publishing interval of the subscription.
 const INTERVAL: Duration = Duration::from_millis(500);
 const QUEUE: usize = 64;
