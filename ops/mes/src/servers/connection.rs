@@ -55,7 +55,7 @@ impl FollowedServer {
                     application_uri,
                     ..
                 } => {
-                    let is_other = |link: &Link| !matches!(link, Link::Up { connects: now, .. } if *now == connects);
+                    let is_other = |link: &Link| !matches!(link, Link::Up { connects: other, .. } if *other == connects);
                     tokio::select! {
                         () = self.connected(&client, &application_uri) => {}
                         _ = link.wait_for(is_other) => {}
