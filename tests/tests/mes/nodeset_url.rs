@@ -157,9 +157,10 @@ fn nodesets_come_from_a_server_by_their_namespaces_and_outlast_a_restart() {
     // A NodeSet that is added is completed too; neither it nor a query waits for the server.
     add(&cell, "silent.xml", &node_set("urn:a", &["urn:silent"]));
     finding(&["urn:a requires urn:silent, which is fetched from"]);
-    let asked = |path: &str| move || requests(&server).iter().any(|(of, _)| of.contains(path));
-    let is_asked = asked("silent");
-    eventually("the server is asked", SOON, || is_asked().then_some(()));
+    eventually("the server is asked", SOON, || {
+        let mut asked = requests(&server).into_iter();
+        asked.any(|(of, _)| of.contains("silent")).then_some(())
+    });
     assert!(get("/ask/components").is_some());
     let (removed, told) = space(&["source", "remove", "nodeset", "urn:a"]);
     assert!(removed, "{told}");
