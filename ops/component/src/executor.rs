@@ -57,6 +57,23 @@ impl SkillExecutor {
         }
     }
 
+    /// Resets a skill that is Halted, unless the outcome of its last run is unknown.
+    ///
+    /// # Errors
+    /// As [`call`](Self::call); the outcome of the last run is unknown.
+    pub(crate) async fn make_ready(&self, by: SkillOwner) -> Result<u32, SkillRequestError> {
+        match self {
+            Self::Own(skill) => {
+                let shown = skill.shown();
+                if shown.needs_reset {
+                    return Err(SkillRequestError::NeedsReset(shown.run));
+                }
+                Ok(skill.call(by, ProgramMethod::Reset).await?)
+            }
+            Self::Theirs(mirror) => Ok(mirror.make_ready().await?),
+        }
+    }
+
     /// Starts a run with these parameters and returns its number.
     ///
     /// # Errors

@@ -2,7 +2,7 @@
 //! and cancelling halts the run.
 //!
 //! A goal resets a skill that is Halted, because clients of actions have no Reset, and every run
-//! that fails ends in Halted.
+//! that fails ends in Halted. After an unknown outcome it does not: the machine may move.
 
 use std::collections::{HashMap, VecDeque};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -278,7 +278,7 @@ async fn begin(skill: &SkillExecutor, body: &[u8]) -> Result<u32, SkillRequestEr
         return Err(SkillRequestError::NeedsReset(shown.run));
     }
     if shown.state == ProgramMachineState::Halted {
-        skill.call(OWNER, ProgramMethod::Reset).await?;
+        skill.make_ready(OWNER).await?;
     }
     skill.start_with(OWNER, given).await
 }

@@ -40,7 +40,7 @@ pub(crate) use self::call::{CallReply, Given, SkillCallRequest, Successor};
 use self::call::{Caller, DriverSlot};
 pub(crate) use self::output::{Moment, SkillOutput};
 use self::record::SkillRecord;
-use self::refused::{no_room, not_now, unknown_outcome};
+use self::refused::{no_room, not_now};
 pub(crate) use self::run::{RunFailure, WorkEnd};
 use self::run::{RunState, Stop, StopCause, StopInProgress};
 use self::work::SkillWork;
@@ -390,7 +390,9 @@ impl<R: CallReply> SkillMachine<R> {
         let is_made_ready = given.readies && is_halted;
         let needs_reset = self.work.record().snapshot().needs_reset;
         if method == ProgramMethod::Start && is_halted && needs_reset {
-            return Err(unknown_outcome(self.work.record().run_number()));
+            return Err(SkillRefusal::unknown_outcome(
+                self.work.record().run_number(),
+            ));
         }
         if !self.work.record().is_executable(method) && !is_its_capability && !is_made_ready {
             return Err(not_now(method, state));

@@ -73,6 +73,12 @@ pub struct SkillRefusal {
 }
 
 impl SkillRefusal {
+    /// Creates the refusal of a skill whose run has an unknown outcome.
+    pub(crate) fn unknown_outcome(run: u32) -> Self {
+        let text = format!("the outcome of run {run} is unknown; Reset makes the skill ready");
+        Self::new(RefusalCode::InvalidState, text)
+    }
+
     pub(crate) fn new(code: RefusalCode, text: impl Into<String>) -> Self {
         Self {
             code,

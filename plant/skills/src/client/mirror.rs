@@ -51,6 +51,8 @@ impl fmt::Debug for MirroredSkill {
 struct Order {
     method: ProgramMethod,
     parameters: Vec<(String, SkillValue)>,
+    /// It must not reset a skill after an unknown outcome.
+    is_cautious: bool,
     reply: oneshot::Sender<Result<u32, SkillFault>>,
 }
 
@@ -227,15 +229,33 @@ impl MirroredSkill {
     ///
     /// # Errors
     /// A refusal by the state machine of OPC 10000-10 or by the server, or the loss of the server.
+    /// A call is refused until the state of the skill has been read.
     pub async fn call(
         &self,
         method: ProgramMethod,
         parameters: Vec<(String, SkillValue)>,
     ) -> Result<u32, SkillFault> {
+        self.order(method, (parameters, false)).await
+    }
+
+    /// Resets a skill that is Halted, unless its last outcome is unknown.
+    ///
+    /// # Errors
+    /// As [`call`](Self::call); the last outcome is unknown.
+    pub async fn make_ready(&self) -> Result<u32, SkillFault> {
+        self.order(ProgramMethod::Reset, (Vec::new(), true)).await
+    }
+
+    async fn order(
+        &self,
+        method: ProgramMethod,
+        (parameters, is_cautious): (Vec<(String, SkillValue)>, bool),
+    ) -> Result<u32, SkillFault> {
         let (reply, answer) = oneshot::channel();
         let order = Order {
             method,
             parameters,
+            is_cautious,
             reply,
         };
         match self.orders.try_send(order) {

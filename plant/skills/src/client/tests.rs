@@ -12,7 +12,7 @@ use crate::value::{Builtin, SkillValue, ValueShape};
 
 const EXAMPLES: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../../examples/plant");
 
-fn serve(name: &str, changes: &[(&str, &str)]) -> ComponentServer {
+pub(super) fn serve(name: &str, changes: &[(&str, &str)]) -> ComponentServer {
     let folder = Path::new(EXAMPLES);
     let text = std::fs::read_to_string(folder.join(name)).unwrap();
     let text = changes
@@ -25,7 +25,7 @@ fn serve(name: &str, changes: &[(&str, &str)]) -> ComponentServer {
     server
 }
 
-async fn client(server: &ComponentServer) -> SkillClient {
+pub(super) async fn client(server: &ComponentServer) -> SkillClient {
     let patient = ClientOptions {
         within: Duration::from_secs(10),
         ..ClientOptions::default()
@@ -475,4 +475,41 @@ async fn a_composite_runs_the_skills_of_two_servers_and_gives_their_leases_back(
         outcome.message
     );
     robot.stop().await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_mirror_refuses_calls_until_it_knows_the_skill_and_then_has_its_last_outcome() {
+    let server = serve("vacuum-gripper.yaml", &[("300 ms", "30 ms")]);
+    let client = client(&server).await;
+    let found = client.skills_of(&of("GraspSkillType")).await.unwrap();
+    let within = Duration::from_secs(10);
+    let ran = client.handle(&found[0]).run(Vec::new(), within).await;
+    let ran = ran.unwrap();
+    let watchable = Watchable::of(client).await.unwrap();
+    let place = watchable.found().position(|one| one.node == found[0].node);
+    let mirrors = Mirrors::begin(&watchable, 1, |_, _| Vec::new());
+    let mirror = &mirrors.skills()[place.unwrap()];
+    let start = mirror.call(ProgramMethod::Start, Vec::new());
+    let (reset, start) = tokio::join!(mirror.make_ready(), start);
+    for early in [reset, start] {
+        let text = early.unwrap_err().to_string();
+        assert!(
+            text.contains("the state of the skill is not known yet"),
+            "{text}"
+        );
+    }
+    let known = async {
+        while mirror.shown().outcome.is_none() {
+            tokio::task::yield_now().await;
+        }
+    };
+    tokio::time::timeout(within, known).await.unwrap();
+    let shown = mirror.shown();
+    assert_eq!(
+        (shown.state, shown.needs_reset),
+        (ProgramMachineState::Ready, false)
+    );
+    assert_eq!(mirror.outcome(shown.run).unwrap().results, ran.results);
+    drop(mirrors);
+    server.stop().await;
 }

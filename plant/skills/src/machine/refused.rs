@@ -17,11 +17,6 @@ pub(super) fn refusal(refused: RefusedMethod) -> SkillRefusal {
     SkillRefusal::new(code, refused.to_string())
 }
 
-pub(super) fn unknown_outcome(run: u32) -> SkillRefusal {
-    let text = format!("the outcome of run {run} is unknown; Reset makes the skill ready");
-    SkillRefusal::new(RefusalCode::InvalidState, text)
-}
-
 pub(super) fn still_at_work(run: RunId) -> SkillRefusal {
     let text = format!("the work of run {} has not come to an end", run.number());
     SkillRefusal::new(RefusalCode::InvalidState, text)

@@ -9,7 +9,7 @@ use tracing::{info, warn};
 use super::call::{DriverSlot, Given};
 use super::output::{Moment, SkillOutput};
 use super::record::SkillRecord;
-use super::refused::{is_stopped, still_at_work, unknown_outcome};
+use super::refused::{is_stopped, still_at_work};
 use super::run::{Halting, RunState, Stop, StopCause, Then, WorkEnd};
 use crate::authority::SkillOwner;
 use crate::driver::{Line, Signal};
@@ -270,7 +270,7 @@ impl<R> SkillWork<R> {
         self.record.end_without_work(message.clone());
         if self.record.snapshot().needs_reset {
             self.record.take(ProgramMethod::Halt, &message, now)?;
-            return Err(unknown_outcome(self.record.run_number()));
+            return Err(SkillRefusal::unknown_outcome(self.record.run_number()));
         }
         let message = by.map_or(message, |by| format!("reset by {by}"));
         self.record.take(ProgramMethod::Reset, &message, now)

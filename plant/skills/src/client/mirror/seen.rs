@@ -14,6 +14,7 @@ use super::state_order::{StateNotice, StateOrder};
 use super::{Order, leads_to, way};
 use crate::outcomes::NewestOutcomes;
 use crate::parameters::Parameters;
+use crate::refusal::SkillRefusal;
 use crate::shown::{
     RunOutcome, SkillEvent, SkillObserver, SkillSnapshot, Transitioned, clock, is_work,
 };
@@ -71,7 +72,7 @@ impl SeenSkill {
         mut gone: watch::Receiver<Option<String>>,
     ) {
         let lives = async {
-            self.first().await;
+            self.first_without(&mut orders).await;
             loop {
                 let look = self.look_at;
                 tokio::select! {
@@ -98,6 +99,23 @@ impl SeenSkill {
         }
     }
 
+    /// Reads the initial state. Calls are refused until it is known: a call that waits for it would
+    /// be carried out in a state that its caller did not see.
+    async fn first_without(&mut self, orders: &mut mpsc::Receiver<Order>) {
+        let first = self.first();
+        tokio::pin!(first);
+        loop {
+            tokio::select! {
+                biased;
+                () = &mut first => break,
+                Some(order) = orders.recv() => order.refuse(),
+            }
+        }
+        while let Ok(order) = orders.try_recv() {
+            order.refuse();
+        }
+    }
+
     /// Reads the initial state.
     async fn first(&mut self) {
         loop {
@@ -112,7 +130,7 @@ impl SeenSkill {
                         (0, true) => self.number(),
                         (run, _) => run,
                     };
-                    if self.now.state == ProgramMachineState::Halted {
+                    if !is_work(self.now.state) {
                         self.last_outcome().await;
                     }
                     self.tell(SkillEvent::Step);
@@ -124,14 +142,16 @@ impl SeenSkill {
         }
     }
 
-    /// Reads the outcome of the run before this program saw the skill. If it is unknown, the skill
-    /// needs a Reset.
+    /// Reads the outcome of the run before this program saw the skill. If it is unknown, a skill
+    /// that is Halted needs a Reset.
     async fn last_outcome(&mut self) {
-        let outcome = self.ended(ProgramMachineState::Halted).await;
+        let outcome = self.ended(self.now.state).await;
+        let is_halted = self.now.state == ProgramMachineState::Halted;
         // A skill that has had no run has no outcome.
-        if self.now.run > 0 || outcome.unknown {
+        if self.now.run > 0 || (outcome.unknown && is_halted) {
             let outcome = self.outcomes.keep(outcome);
             self.now.end(&outcome);
+            self.now.needs_reset &= is_halted;
             self.tell(SkillEvent::Outcome(&outcome));
         }
     }
@@ -187,9 +207,10 @@ impl SeenSkill {
         let Order {
             method,
             parameters,
+            is_cautious,
             reply,
         } = order;
-        let called = self.call(method, parameters).await;
+        let called = self.call(method, (parameters, is_cautious)).await;
         let begun = called.is_ok() && is_work(self.now.state);
         // The caller may have stopped waiting.
         let _told = reply.send(called);
@@ -202,17 +223,21 @@ impl SeenSkill {
     async fn call(
         &mut self,
         method: ProgramMethod,
-        parameters: Vec<(String, SkillValue)>,
+        (parameters, is_cautious): (Vec<(String, SkillValue)>, bool),
     ) -> Result<u32, SkillFault> {
         // The state machine is checked here, because some servers accept invalid calls, for example
         // Start of a suspended skill.
         self.look().await;
         let from = self.now.state;
+        let is_without_look = method == ProgramMethod::Start || is_cautious;
+        if from == ProgramMachineState::Halted && self.now.needs_reset && is_without_look {
+            let refusal = SkillRefusal::unknown_outcome(self.now.run);
+            return Err(refused(&refusal.text));
+        }
         let Some(to) = leads_to(from, method) else {
-            return Err(SkillFault::Refused {
-                status: "BadInvalidState".to_owned(),
-                text: format!("{method} is not possible in the state {from}"),
-            });
+            return Err(refused(&format!(
+                "{method} is not possible in the state {from}"
+            )));
         };
         if method == ProgramMethod::Start {
             self.handle.start(parameters).await?;
@@ -313,5 +338,53 @@ impl SeenSkill {
     }
 }
 
+impl Order {
+    /// Refuses the call, because the state of the skill is not known yet.
+    fn refuse(self) {
+        let text = format!(
+            "the state of the skill is not known yet; call {} again",
+            self.method
+        );
+        // The caller may have stopped waiting.
+        let _told = self.reply.send(Err(refused(&text)));
+    }
+}
+
+fn refused(text: &str) -> SkillFault {
+    SkillFault::Refused {
+        status: "BadInvalidState".to_owned(),
+        text: text.to_owned(),
+    }
+}
+
 /// Interval in which a running skill is polled, in case its server does not notify changes.
 const LOOK: Duration = Duration::from_secs(1);
+
+#[cfg(test)]
+mod tests {
+    use super::super::super::tests::{client, serve};
+    use super::*;
+
+    #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+    async fn a_goal_and_a_start_leave_a_skill_halted_after_an_unknown_outcome() {
+        let server = serve("parallel-gripper.yaml", &[]);
+        let client = client(&server).await;
+        let found = client.skills().await.unwrap();
+        let handle = client.handle(&found[0]);
+        let (mut seen, _shown) = SeenSkill::new(handle, Vec::new(), NewestOutcomes::default(), 1);
+        seen.first().await;
+        assert_eq!(seen.now.state, ProgramMachineState::Halted);
+        seen.now.needs_reset = true;
+        for (method, is_cautious) in [(ProgramMethod::Reset, true), (ProgramMethod::Start, false)] {
+            let refused = seen.call(method, (Vec::new(), is_cautious)).await;
+            let text = refused.unwrap_err().to_string();
+            let expected = "the outcome of run 0 is unknown; Reset makes the skill ready";
+            assert!(text.contains(expected), "{text}");
+        }
+        assert_eq!(seen.now.state, ProgramMachineState::Halted);
+        let reset = seen.call(ProgramMethod::Reset, (Vec::new(), false)).await;
+        assert_eq!(reset, Ok(0));
+        assert!(!seen.now.needs_reset);
+        server.stop().await;
+    }
+}
