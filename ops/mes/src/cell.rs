@@ -32,7 +32,7 @@ use self::parameters::{connects, parameter, result, values};
 use crate::execute::{OpenFault, Opened, Plant};
 use crate::goal::{GoalAction, GoalConditions, GoalFault, Sequence};
 use crate::parameter_fault::ParameterFault;
-use crate::plan::Offer;
+use crate::plan::{Offer, ShownTools};
 use crate::process::{GivenParameter, ParameterQuery, Process};
 use crate::read_process::Processes;
 use crate::record::{NewestRuns, ProcessRun};
@@ -83,6 +83,9 @@ struct Component {
     /// The skills by their IRIs.
     #[serde(skip)]
     found: BTreeMap<String, FoundSkill>,
+    /// The ApplicationUris of the tools that its tool changers have shown.
+    #[serde(skip)]
+    tools: BTreeSet<String>,
 }
 
 /// A component that was lost.
@@ -318,13 +321,21 @@ impl PlantState {
                 .collect(),
             discovered: seen.name.clone(),
             found: found.into_iter().filter_map(by_iri).collect(),
+            tools: BTreeSet::new(),
         };
         let (skills, endpoint) = (component.skills.len(), &component.endpoint);
         info!(
             component = component.name,
             skills, endpoint, "a component is in the graph"
         );
-        self.present().components.insert(iri, component);
+        {
+            let mut present = self.present();
+            let before = present.components.insert(iri.clone(), component);
+            if let Some(component) = present.components.get_mut(&iri) {
+                component.tools = before.map(|before| before.tools).unwrap_or_default();
+                component.keep_tools();
+            }
+        }
         self.changed.send_modify(|changes| *changes += 1);
     }
 
@@ -582,8 +593,10 @@ impl Plant for PlantState {
         let states = join_all(read).await;
         let mut present = self.present();
         for ((iri, _, skill), state) in changers.into_iter().zip(states) {
-            let component = present.components.get_mut(&iri);
-            let found = component.and_then(|component| component.found.get_mut(&skill));
+            let Some(component) = present.components.get_mut(&iri) else {
+                continue;
+            };
+            let found = component.found.get_mut(&skill);
             if let Some(known) = found.and_then(|found| found.tool_state.as_mut()) {
                 // The tool of a changer that does not respond is unknown.
                 let unknown = || ToolState {
@@ -592,7 +605,21 @@ impl Plant for PlantState {
                 };
                 *known = state.unwrap_or_else(unknown);
             }
+            component.keep_tools();
         }
+    }
+
+    fn tools(&self) -> ShownTools {
+        let present = self.present();
+        let mut shown = ShownTools::default();
+        for (iri, component) in &present.components {
+            shown.tools.extend(component.tools.iter().cloned());
+            for (_, state) in component.tool_states() {
+                let attached = shown.attached.entry(iri.clone()).or_default();
+                *attached = attached.take().or_else(|| state.current.clone());
+            }
+        }
+        shown
     }
 
     fn prefer(&self) -> &[String] {
@@ -672,6 +699,16 @@ impl Component {
         let found = self.found.iter();
         found.filter_map(|(skill, found)| Some((skill, found.tool_state.as_ref()?)))
     }
+
+    /// Adds the tools that its tool changers show to the known tools.
+    fn keep_tools(&mut self) {
+        let current = self
+            .tool_states()
+            .filter_map(|(_, state)| state.current.clone());
+        let tools: Vec<String> = current.filter(|tool| !tool.is_empty()).collect();
+        let room = MOST_TOOLS.saturating_sub(self.tools.len());
+        self.tools.extend(tools.into_iter().take(room));
+    }
 }
 
 /// Returns the time in ms since 1970.
@@ -694,5 +731,7 @@ pub(crate) fn since_1970(at: SystemTime) -> u64 {
 const MOST_GONE: usize = 100;
 /// Time limit to read the state of a tool changer.
 const TOOL_WITHIN: Duration = Duration::from_secs(2);
+/// Maximum number of known tools of a component.
+const MOST_TOOLS: usize = 100;
 /// Number of processes that an error names.
 const MOST_SHOWN: usize = 50;

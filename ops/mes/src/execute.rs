@@ -21,7 +21,7 @@ use tokio::sync::watch;
 use tracing::{info, warn};
 
 use crate::parameter_fault::ParameterFault;
-use crate::plan::{Fallen, Offer, Plan, Situation, plan};
+use crate::plan::{AttachedTools, Fallen, Offer, Plan, ShownTools, Situation, plan};
 use crate::process::{GivenParameter, ParameterQuery, Process, ProcessStep, SkillRole, StepJob};
 use crate::record::{How, Planned, ProcessRun};
 
@@ -76,6 +76,11 @@ pub(crate) trait Plant: Send + Sync {
 
     /// Reads the tools of the tool changers.
     async fn read_tools(&self) {}
+
+    /// Returns the tools of the tool changers, as they were read last.
+    fn tools(&self) -> ShownTools {
+        ShownTools::default()
+    }
 
     /// Returns the components that the user prefers, the most preferred first.
     fn prefer(&self) -> &[String] {
@@ -240,7 +245,15 @@ pub(crate) async fn dry_run(plant: &dyn Plant, process: &Process) -> Plan {
     let evaluated = EvaluatedProcess::of(plant, process, &RunProgress::default()).await;
     let (process, evaluated) = (&evaluated.process, &evaluated);
     let facts = OfPlant { plant, evaluated };
-    plan(process, &plant.offers(), Situation::default(), &facts)
+    plant.read_tools().await;
+    let offers = plant.offers();
+    let mut tools = AttachedTools::default();
+    tools.observe(&tools::shown(plant, process, &offers));
+    let situation = Situation {
+        tools: Some(&tools),
+        ..Situation::default()
+    };
+    plan(process, &offers, situation, &facts)
 }
 
 struct Execution<'a> {
@@ -273,6 +286,8 @@ struct Chosen {
     undo: BTreeMap<usize, Offer>,
     /// The components that can do steps with the right tool, by the numbers of the steps.
     able: BTreeMap<usize, BTreeSet<String>>,
+    /// The components that the plan knew.
+    known: BTreeSet<String>,
     /// The steps of the process with the values of their queries, as the plan used them.
     steps: Vec<ProcessStep>,
 }
@@ -297,7 +312,8 @@ impl Execution<'_> {
         let mut retooled = None;
         while broken < MOST_PLANS {
             number = number.saturating_add(1);
-            let (plan, chosen) = self.planned(&last, progress).await?;
+            let after = (&*last, retooled.is_some());
+            let (plan, chosen) = self.planned(after, progress).await?;
             self.log.change(|kept, now| {
                 kept.run.waits_for = None;
                 kept.run.plans.push(Planned::begins(number, now, plan));
@@ -317,6 +333,7 @@ impl Execution<'_> {
                 Ended::Done => return Ok(()),
                 Ended::Round => {
                     self.log.forgive();
+                    retooled = None;
                     last.clear();
                 }
                 Ended::OtherTool(why) => {
@@ -342,8 +359,13 @@ impl Execution<'_> {
     }
 
     /// Waits for a complete plan of the steps that are not done, and returns it with the chosen
-    /// offers. The run has the use of their components then.
-    async fn planned(&self, last: &str, progress: &RunProgress) -> Result<(Plan, Chosen), String> {
+    /// offers. The run has the use of their components then. A plan for another tool is not waited
+    /// for if the tools of the run exclude all candidates of a step.
+    async fn planned(
+        &self,
+        (last, is_retooled): (&str, bool),
+        progress: &mut RunProgress,
+    ) -> Result<(Plan, Chosen), String> {
         let run = self.log.run().run;
         let kept = compensate::kept(self.process, &progress.done);
         let passed = progress.passed_or_ruled_out(self.process);
@@ -365,6 +387,12 @@ impl Execution<'_> {
                 return Err(format!("{after}{fault}"));
             }
             let offers = self.plant.offers();
+            let shown = tools::shown(self.plant, &evaluated.process, &offers);
+            if progress.done.is_empty() && !progress.tools.is_changed() {
+                // The run has not begun, and other runs may change the tools.
+                progress.tools = AttachedTools::default();
+            }
+            progress.tools.observe(&shown);
             let (fallen, used) = (self.log.fallen(), self.plant.used_by_others(&run));
             let situation = Situation {
                 fallen: &fallen,
@@ -378,6 +406,7 @@ impl Execution<'_> {
                 evaluated: &evaluated,
             };
             let plan = plan(&evaluated.process, &offers, situation, &facts);
+            let mut in_use = None;
             if plan.is_complete() {
                 let chosen = self.chosen(&plan, &offers, progress);
                 let all = chosen.open.iter().map(|(_, offer)| offer);
@@ -385,14 +414,20 @@ impl Execution<'_> {
                 let all = all.chain(kept.iter().map(|kept| &kept.offer));
                 // Earlier rounds of loops are compensated by their own components.
                 let all = all.chain(progress.done.iter().filter_map(|done| done.undo.as_ref()));
-                let components = all.map(|offer| offer.component.clone()).collect();
+                let components = all.map(|offer| offer.component.clone());
+                let mut components: BTreeSet<String> = components.collect();
+                components.extend(tools::used_by_steps(&evaluated.process, progress, &chosen));
+                let other = components
+                    .iter()
+                    .find_map(|one| Some((one, used.get(one)?)));
+                in_use = other.map(|(one, run)| format!("the run {run} uses {one}"));
                 if self.plant.lease(&run, &components) {
                     let steps = evaluated.process.steps;
                     return Ok((plan, Chosen { steps, ..chosen }));
                 }
             }
-            let missing = plan.missing();
-            if plan.is_hopeless() {
+            let missing = in_use.unwrap_or_else(|| plan.missing());
+            if plan.is_hopeless() || (is_retooled && plan.lacks_tool()) {
                 return Err(format!("{after}{missing}"));
             }
             self.log
@@ -449,6 +484,7 @@ impl Execution<'_> {
             able: (0..self.process.steps.len())
                 .map(|number| (number, plan.able(SkillRole::Alone(number))))
                 .collect(),
+            known: offers.iter().map(|offer| offer.component.clone()).collect(),
             steps: Vec::new(),
         }
     }

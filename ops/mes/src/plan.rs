@@ -17,7 +17,7 @@ use crate::process::{By, Group, Need, Process, ProcessStep, SkillRole, StepJob};
 
 use judging::Judging;
 pub(crate) use judging::TOOL;
-pub(crate) use tools::{AttachedTools, ToolFault, ToolStep, ToolUser, ToolWork};
+pub(crate) use tools::{AttachedTools, ShownTools, ToolFault, ToolStep, ToolUser, ToolWork};
 
 /// An available skill, as a row of the query `candidates`.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -85,6 +85,9 @@ pub(crate) struct PlannedNeed {
     /// The components that can do it with the right tool.
     #[serde(skip)]
     able: BTreeSet<String>,
+    /// Whether the tools that steps have changed exclude all candidates for good.
+    #[serde(skip)]
+    is_without_tool: bool,
     /// Whether the step was passed, so that it needs no skill.
     #[serde(skip)]
     is_passed: bool,
@@ -109,6 +112,7 @@ impl PlannedNeed {
             role_is: need.role,
             is_bound: true,
             able: BTreeSet::new(),
+            is_without_tool: false,
             is_passed: false,
         }
     }
@@ -170,7 +174,7 @@ pub(crate) struct Situation<'a> {
     pub(crate) passed: &'a [usize],
     /// The components that other runs use, with these runs.
     pub(crate) used: Option<&'a BTreeMap<String, String>>,
-    /// The tools that the run has attached and detached.
+    /// The tools that were attached before the run, and those that the run has changed.
     pub(crate) tools: Option<&'a AttachedTools>,
 }
 
@@ -372,6 +376,12 @@ impl Plan {
     pub(crate) fn is_hopeless(&self) -> bool {
         self.needs()
             .any(|(_, need)| need.chosen.is_none() && need.is_bound)
+    }
+
+    /// Returns whether a need has no skill because of the tools that steps have changed.
+    pub(crate) fn lacks_tool(&self) -> bool {
+        self.needs()
+            .any(|(_, need)| need.chosen.is_none() && need.is_without_tool)
     }
 
     /// Returns the needs without a skill, as text for people.

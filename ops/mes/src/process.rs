@@ -8,6 +8,7 @@ use mtp::{Object, Triple, escaped};
 use skills::ParameterType;
 
 use crate::parameter_fault::ParameterFault;
+use crate::plan::Offer;
 
 /// A process that the MES can run, identified by its IRI.
 #[derive(Debug, Clone, PartialEq)]
@@ -255,6 +256,17 @@ impl BadEnd {
 }
 
 impl ProcessStep {
+    /// Returns whether a skill has the capability and the type of each need. Its parameters and
+    /// results are not compared.
+    pub(crate) fn may_be_done_by(&self, offer: &Offer) -> bool {
+        self.needs.iter().all(|need| {
+            let capability = need.capability.as_ref();
+            let of = need.skill_type.as_ref();
+            capability.is_none_or(|wanted| offer.closure.contains(wanted))
+                && of.is_none_or(|wanted| offer.types.contains(&wanted.to_string()))
+        })
+    }
+
     /// Returns the numbers of the steps that end before this step begins. `number` is that of this
     /// step: it waits for the steps of its order, its conditions and the results that it takes.
     pub(crate) fn waits_for(&self, number: usize) -> Vec<usize> {

@@ -434,7 +434,9 @@ impl Execution<'_> {
             if uses.any(|component| busy.contains(&component)) {
                 continue;
             }
-            let checked = tools::check(self.process, (number, step), (chosen, offer), progress);
+            let offers = || self.plant.offers();
+            let of_step = (number, step);
+            let checked = tools::check(self.process, of_step, (chosen, offer), (progress, &offers));
             checked.map_err(|fault| {
                 let (name, component) = (&step.name, &offer.component_name);
                 Ended::OtherTool(format!("{name}: {component}: {fault}"))

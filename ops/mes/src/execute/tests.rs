@@ -44,6 +44,9 @@ struct Fakes {
     leases: Mutex<BTreeMap<String, String>>,
     /// Appears when a component is lost.
     spare: Mutex<Vec<Offer>>,
+    /// A skill, and the offers that appear when it is run.
+    powers: Option<(&'static str, Vec<Offer>)>,
+    tools: ShownTools,
 }
 
 struct FakeSkill {
@@ -136,6 +139,10 @@ impl Plant for Arc<Fakes> {
         }
     }
 
+    fn tools(&self) -> ShownTools {
+        self.tools.clone()
+    }
+
     fn used_by_others(&self, run: &str) -> BTreeMap<String, String> {
         let mut leases = self.leases.lock().unwrap().clone();
         leases.retain(|_, holder| holder != run);
@@ -210,6 +217,10 @@ impl RunnableSkill for FakeSkill {
             format!("{name} {}", parameters.len())
         };
         self.plant.journal.lock().unwrap().push(told);
+        if let Some((_, more)) = self.plant.powers.as_ref().filter(|(at, _)| *at == name) {
+            let mut offers = self.plant.offers.lock().unwrap();
+            offers.extend(more.iter().cloned());
+        }
         if let Some(meets) = self
             .plant
             .meets
@@ -376,6 +387,8 @@ fn plant(offers: Vec<Offer>) -> Fakes {
         clock: AtomicU64::new(1000),
         leases: Mutex::default(),
         spare: Mutex::default(),
+        powers: None,
+        tools: ShownTools::default(),
     }
 }
 

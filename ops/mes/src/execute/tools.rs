@@ -1,10 +1,13 @@
 //! The tools that are attached in a run.
 
+use std::collections::BTreeSet;
+
 use skills::SkillValue;
 
 use super::sequence::{RunProgress, StepEnd};
-use super::{Chosen, Offer, Process, ProcessStep, SkillRole};
-use crate::plan::{AttachedTools, TOOL, ToolFault, ToolStep, ToolUser, ToolWork};
+use super::{Chosen, Offer, Plant, Process, ProcessStep, SkillRole};
+use crate::plan::{AttachedTools, ShownTools, TOOL, ToolFault, ToolStep, ToolUser, ToolWork};
+use crate::process::By;
 
 /// The result of a skill that changes tools: the ApplicationUri of the attached tool.
 const ATTACHED: &str = "Tool";
@@ -20,6 +23,47 @@ fn text(values: &[(String, SkillValue)], name: &str) -> Option<String> {
     value.as_str().map(str::to_owned)
 }
 
+/// Returns the tools of the tool changers: those that the changers show, and the tools that the
+/// steps of a process name. The tool of a changer that shows none is not known.
+pub(super) fn shown(plant: &dyn Plant, process: &Process, offers: &[Offer]) -> ShownTools {
+    let mut shown = plant.tools();
+    let changers = offers.iter().filter(|offer| ToolWork::of(offer).is_some());
+    for changer in changers {
+        shown.attached.entry(changer.component.clone()).or_default();
+    }
+    let named = process.numbered().filter_map(|(_, step)| literal(step));
+    shown.tools.extend(named.map(str::to_owned));
+    shown
+}
+
+/// Returns the tool that the parameters of a step name; `None` if a result of a step names it.
+fn literal(step: &ProcessStep) -> Option<&str> {
+    let given = step.parameters.iter().find(|given| given.name == TOOL);
+    let tool = given.and_then(|given| given.value.as_str());
+    tool.filter(|tool| !tool.is_empty())
+}
+
+/// Returns the tools that the steps that are left attach or detach, and the tools of the changers
+/// that do so: another run must not use them meanwhile.
+pub(super) fn used_by_steps(
+    process: &Process,
+    progress: &RunProgress,
+    chosen: &Chosen,
+) -> BTreeSet<String> {
+    let offers = chosen.open.iter().map(|(_, offer)| offer);
+    let offers = offers.chain(chosen.undo.values());
+    let at = offers
+        .filter(|offer| ToolWork::of(offer).is_some())
+        .filter_map(|offer| progress.tools.at(&offer.component));
+    let passed = progress.passed_or_ruled_out(process);
+    let steps = process.steps.iter().enumerate();
+    let left = steps
+        .filter(|(number, _)| !progress.is_over(*number) && !passed.contains(number))
+        .flat_map(|(_, step)| std::iter::once(step).chain(step.compensation.as_deref()));
+    let named = left.filter_map(literal);
+    at.chain(named).map(str::to_owned).collect()
+}
+
 impl Chosen {
     /// Returns the components that a step uses: that of its skill, and the tools that it changes.
     pub(super) fn uses(&self, number: usize, tools: &AttachedTools) -> Vec<String> {
@@ -31,13 +75,8 @@ impl Chosen {
         let mut uses = vec![offer.component.clone()];
         if ToolWork::of(offer).is_some() {
             uses.extend(tools.at(&offer.component).map(str::to_owned));
-            let given = self.steps.get(number).map(|step| &step.parameters);
-            let named = given.into_iter().flatten().find(|given| given.name == TOOL);
-            uses.extend(
-                named
-                    .and_then(|given| given.value.as_str())
-                    .map(str::to_owned),
-            );
+            let step = self.steps.get(number);
+            uses.extend(step.and_then(literal).map(str::to_owned));
         }
         uses
     }
@@ -51,7 +90,7 @@ pub(super) fn check(
     process: &Process,
     (number, step): (usize, &ProcessStep),
     (chosen, offer): (&Chosen, &Offer),
-    progress: &RunProgress,
+    (progress, offers): (&RunProgress, &dyn Fn() -> Vec<Offer>),
 ) -> Result<(), ToolFault> {
     if ToolWork::of(offer).is_some() {
         return Ok(());
@@ -64,7 +103,22 @@ pub(super) fn check(
         able: &able,
         loops: &process.loops,
     };
-    progress.tools.check(&user, &offer.component)
+    progress.tools.check(&user, &offer.component)?;
+    // A tool that gets its power from its changer enters the graph after it is attached.
+    let is_new = |tool: &&str| *tool != offer.component && !chosen.known.contains(*tool);
+    if let (Some(tool), By::Any) = (progress.tools.tool_for(&user).filter(is_new), step.by)
+        && offers()
+            .iter()
+            .any(|of| of.component == tool && step.may_be_done_by(of))
+    {
+        let tool = BTreeSet::from([tool.to_owned()]);
+        let user = ToolUser {
+            able: &tool,
+            ..user
+        };
+        return progress.tools.check(&user, &offer.component);
+    }
+    Ok(())
 }
 
 /// Records the effect of a step or compensation that has ended. `tool` is the tool that its
@@ -95,10 +149,15 @@ pub(super) fn ended(
             return;
         }
     };
-    match (work, text(results, ATTACHED).or(tool)) {
-        (ToolWork::Detach, None) => tools.detach(changer, &step),
-        (_, Some(none)) if none.is_empty() => tools.detach(changer, &step),
-        (_, Some(tool)) => tools.attach(changer, Some(tool), step),
-        (ToolWork::Attach, None) => tools.lose(changer, None, step),
+    match (work, text(results, ATTACHED).or_else(|| tool.clone())) {
+        (ToolWork::Detach, _) => tools.detach(changer, &step),
+        (ToolWork::Attach, Some(shown)) if !shown.is_empty() => {
+            tools.attach(changer, Some(shown), step);
+        }
+        // Servers of others leave the result empty: the named tool may be attached.
+        (ToolWork::Attach, _) => {
+            let named = tool.filter(|tool| !tool.is_empty());
+            tools.lose(changer, named, step);
+        }
     }
 }

@@ -5,7 +5,9 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use skills::ParameterType;
 
-use super::tools::{AttachedTools, PlannedToolStep, PossibleTools, ToolStep, ToolUser, ToolWork};
+use super::tools::{
+    AttachedTools, PlannedToolStep, PossibleTools, ToolFault, ToolStep, ToolUser, ToolWork,
+};
 use super::{Facts, Offer, Plan, PlanCandidate, PlannedNeed, Situation, Team, rank};
 use crate::parameter_fault::ParameterFault;
 use crate::process::{By, Group, Loop, Need, Process, ProcessStep, SkillRole, StepJob};
@@ -14,6 +16,7 @@ use crate::process::{By, Group, Loop, Need, Process, ProcessStep, SkillRole, Ste
 enum NotFit {
     Unrelated,
     Because(String),
+    Tool(ToolFault),
 }
 
 impl From<ParameterFault> for NotFit {
@@ -64,6 +67,8 @@ struct StepTools {
     behind: BTreeSet<usize>,
     able: BTreeSet<String>,
     possible: PossibleTools,
+    /// Steps of other branches that begin no later, and change a tool.
+    beside: Vec<PlannedToolStep>,
     loops: Vec<Loop>,
 }
 
@@ -253,10 +258,19 @@ impl<'a> Judging<'a> {
         });
         let changes: BTreeMap<usize, PlannedToolStep> = changes.collect();
         for (number, step) in left.filter(|(number, _)| !changes.contains_key(number)) {
+            let behind = self.process.behind(number);
+            let is_beside = |other: &&PlannedToolStep| {
+                let of = other.step.number;
+                let waits = self.process.steps.get(of).map(|step| step.waits_for(of));
+                let is_no_later =
+                    waits.is_some_and(|all| all.iter().all(|one| behind.contains(one)));
+                of < number && is_no_later && !other.may_be_skipped && !behind.contains(&of)
+            };
             let tools = StepTools {
                 number,
                 by: step.by,
-                behind: self.process.behind(number),
+                beside: changes.values().filter(is_beside).cloned().collect(),
+                behind,
                 able: of_step(number)
                     .map(|offer| offer.component.clone())
                     .collect(),
@@ -287,8 +301,16 @@ impl<'a> Judging<'a> {
             return PlannedNeed::chosen(need, kept, "an earlier plan of this run chose it");
         }
         let mut candidates = Vec::new();
+        let mut lasting = Vec::new();
+        let is_there = |component: &str| offers.iter().any(|of| of.component == component);
         for offer in offers {
             let judged = self.judge(need, offer);
+            if self.suits(need, offer).is_ok() {
+                lasting.push(match &judged {
+                    Err(NotFit::Tool(fault)) => fault.is_lasting(is_there),
+                    Ok(_) | Err(NotFit::Unrelated | NotFit::Because(_)) => false,
+                });
+            }
             // Skills with neither the capability nor the type are not listed as candidates.
             if judged == Err(NotFit::Unrelated) {
                 continue;
@@ -299,6 +321,7 @@ impl<'a> Judging<'a> {
                 Ok(_) => self.why_not(need, offer, chosen, team),
                 Err(NotFit::Unrelated) => String::new(),
                 Err(NotFit::Because(why)) => why,
+                Err(NotFit::Tool(fault)) => fault.to_string(),
             };
             candidates.push(PlanCandidate {
                 skill: offer.skill.clone(),
@@ -321,6 +344,7 @@ impl<'a> Judging<'a> {
             role_is: need.role,
             is_bound: self.bound.contains_key(&need.role),
             able: self.able(need.role),
+            is_without_tool: !lasting.is_empty() && lasting.iter().all(|one| *one),
             is_passed: self.situation.is_passed(self.process, need.role),
         }
     }
@@ -397,8 +421,14 @@ impl<'a> Judging<'a> {
             return because(fallen.why.clone());
         }
         if let Some(tools) = self.tools.get(&need.role) {
-            let allows = tools.possible.allows(&tools.user(), &offer.component);
-            allows.map_err(|fault| NotFit::Because(fault.to_string()))?;
+            let (user, component) = (tools.user(), &offer.component);
+            let allows = tools.possible.allows(&user, component);
+            allows.map_err(NotFit::Tool)?;
+            let other = tools.possible.changed_by((&user, &tools.beside), component);
+            if let Some(ToolStep { name, .. }) = other {
+                let step = name.clone();
+                return Err(NotFit::Tool(ToolFault::AnyTime { step }));
+            }
         }
         self.takes(need, offer)?;
         let capability = need.capability.as_ref().map(|wanted| {

@@ -33,13 +33,27 @@ impl ToolWork {
     }
 }
 
-/// The tools of a run at one time, as its steps attached and detached them.
+/// The tools of a run at one time: the tools of the changers before the run, as its steps attached
+/// and detached them.
 #[derive(Debug, Clone, Default, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) struct AttachedTools {
-    /// In the order in which they were attached; at most one of each changer.
+    /// In the order in which they were attached, those from before the run first; at most one of
+    /// each changer.
     attached: Vec<AttachedTool>,
     /// The tools that are not attached, or not known to be, by their ApplicationUris.
     away: BTreeMap<String, ToolAway>,
+    /// The changers whose tools the run has changed.
+    changed: BTreeSet<String>,
+}
+
+/// The tools of the tool changers of a cell, as the changers show them.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub(crate) struct ShownTools {
+    /// The ApplicationUri of the attached tool of each changer, by the IRI of the changer; empty
+    /// for no tool, `None` if it is not known.
+    pub(crate) attached: BTreeMap<String, Option<String>>,
+    /// The ApplicationUris of all known tools.
+    pub(crate) tools: BTreeSet<String>,
 }
 
 /// A tool at a changer.
@@ -49,8 +63,8 @@ struct AttachedTool {
     changer: String,
     /// The ApplicationUri of the tool; `None` if it is not known.
     tool: Option<String>,
-    /// The step that attached it.
-    by: ToolStep,
+    /// The step that attached it; `None` if it was attached before the run.
+    by: Option<ToolStep>,
     /// The step did so in an earlier round of a loop.
     is_earlier: bool,
 }
@@ -62,11 +76,13 @@ pub(crate) struct ToolStep {
     pub(crate) name: String,
 }
 
-/// The step after which a tool is not attached, or not known to be.
+/// The reason why a tool is not attached, or not known to be: a step, or the tools before the run.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
 enum ToolAway {
     Detached { step: String },
     Uncertain { step: String },
+    NotAttached,
+    NotShown,
 }
 
 /// A step that may need a tool.
@@ -96,9 +112,85 @@ pub(crate) enum ToolFault {
     Unknown { step: String },
     #[error("it is not of the tool {tool}, which the step `{step}` attaches")]
     Other { tool: String, step: String },
+    #[error("the step `{step}` detaches this tool at any time; order the two steps with `after`")]
+    AnyTime { step: String },
+    #[error("no tool changer shows this tool, and no step before it attaches it")]
+    NotAttached,
+    #[error("a tool changer does not show whether it has this tool, and no step attaches it")]
+    NotShown,
+    #[error("no step before it attaches a tool, and a tool changer does not show its tool")]
+    NoToolShown,
+    #[error("it is not of a tool that was attached before the run, such as {tool}")]
+    OtherBefore { tool: String },
+}
+
+impl ToolFault {
+    /// Returns whether no change outside the run can end the fault. `is_there` returns whether a
+    /// component is in the graph.
+    pub(super) fn is_lasting(&self, is_there: impl Fn(&str) -> bool) -> bool {
+        match self {
+            // The tool may enter the graph, and do the step.
+            Self::Other { tool, .. } => is_there(tool),
+            Self::NoTool
+            | Self::NoneLeft { .. }
+            | Self::Detached { .. }
+            | Self::Uncertain { .. }
+            | Self::Unknown { .. }
+            | Self::AnyTime { .. } => true,
+            Self::NotAttached | Self::NotShown | Self::NoToolShown | Self::OtherBefore { .. } => {
+                false
+            }
+        }
+    }
 }
 
 impl AttachedTools {
+    /// Returns whether the run has changed the tool of a changer.
+    pub(crate) fn is_changed(&self) -> bool {
+        !self.changed.is_empty()
+    }
+
+    /// Takes over the tools of the changers that the run has not changed. A changer that showed its
+    /// tool, and does not respond, still has the tool.
+    pub(crate) fn observe(&mut self, shown: &ShownTools) {
+        let is_before = |tool: &AttachedTool| tool.by.is_none();
+        let (before, by_steps): (Vec<_>, Vec<_>) = std::mem::take(&mut self.attached)
+            .into_iter()
+            .partition(is_before);
+        let known = |changer: &str| {
+            let tool = before.iter().find(|tool| tool.changer == changer);
+            tool.and_then(|tool| tool.tool.clone())
+        };
+        let others = shown.attached.iter();
+        let others = others.filter(|(changer, _)| !self.changed.contains(*changer));
+        let observed = others.filter_map(|(changer, tool)| {
+            let tool = tool.clone().or_else(|| known(changer));
+            (tool.as_deref() != Some("")).then(|| AttachedTool {
+                changer: changer.clone(),
+                tool,
+                by: None,
+                is_earlier: false,
+            })
+        });
+        let lost = before.iter().filter(|tool| {
+            let is_shown = shown.attached.contains_key(&tool.changer);
+            !is_shown && !self.changed.contains(&tool.changer)
+        });
+        self.attached = observed.chain(lost.cloned()).chain(by_steps).collect();
+        self.away
+            .retain(|_, away| !matches!(away, ToolAway::NotAttached | ToolAway::NotShown));
+        let mut before = self.attached.iter().filter(|tool| is_before(tool));
+        let away = match before.any(|tool| tool.tool.is_none()) {
+            true => ToolAway::NotShown,
+            false => ToolAway::NotAttached,
+        };
+        let known = names(&self.attached);
+        for tool in shown.tools.iter().filter(|tool| !known.contains(*tool)) {
+            let away = away.clone();
+            self.away.entry(tool.clone()).or_insert(away);
+        }
+    }
+
     /// Records that a changer has attached a tool; `None` if it is not known which.
     pub(crate) fn attach(&mut self, changer: &str, tool: Option<String>, by: ToolStep) {
         let before = self.take(changer);
@@ -116,7 +208,7 @@ impl AttachedTools {
         self.attached.push(AttachedTool {
             changer: changer.to_owned(),
             tool,
-            by,
+            by: Some(by),
             is_earlier: false,
         });
     }
@@ -140,7 +232,7 @@ impl AttachedTools {
         self.attached.push(AttachedTool {
             changer: changer.to_owned(),
             tool: None,
-            by,
+            by: Some(by),
             is_earlier: false,
         });
     }
@@ -148,7 +240,8 @@ impl AttachedTools {
     /// Records that another round does steps again.
     pub(crate) fn repeat(&mut self, steps: &BTreeSet<usize>) {
         for tool in &mut self.attached {
-            tool.is_earlier |= steps.contains(&tool.by.number);
+            let by = tool.by.as_ref();
+            tool.is_earlier |= by.is_some_and(|by| steps.contains(&by.number));
         }
     }
 
@@ -167,6 +260,8 @@ impl AttachedTools {
         match self.away.get(component).cloned() {
             Some(ToolAway::Detached { step }) => Err(ToolFault::Detached { step }),
             Some(ToolAway::Uncertain { step }) => Err(ToolFault::Uncertain { step }),
+            Some(ToolAway::NotAttached) => Err(ToolFault::NotAttached),
+            Some(ToolAway::NotShown) => Err(ToolFault::NotShown),
             None => Ok(()),
         }
     }
@@ -179,28 +274,53 @@ impl AttachedTools {
     /// The reason why the component must not do the step.
     pub(crate) fn check(&self, user: &ToolUser<'_>, component: &str) -> Result<(), ToolFault> {
         self.check_attached(component)?;
-        let step = |tool: &AttachedTool| tool.by.name.clone();
-        match (self.last(user), user.by) {
-            (_, By::SameAs(_)) | (None, By::Any) => Ok(()),
-            (None, By::AttachedTool) => Err(self.no_tool()),
-            (Some(last), by) => match &last.tool {
+        let (last, by) = (self.last(user), user.by);
+        let step = last.and_then(|last| last.by.as_ref());
+        match (last, step) {
+            _ if matches!(by, By::SameAs(_)) => Ok(()),
+            (Some(last), Some(step)) => match &last.tool {
                 Some(tool) if tool == component => Ok(()),
                 Some(tool) if by == By::AttachedTool || user.able.contains(tool) => {
                     Err(ToolFault::Other {
                         tool: tool.clone(),
-                        step: step(last),
+                        step: step.name.clone(),
                     })
                 }
-                None if by == By::AttachedTool => Err(ToolFault::Unknown { step: step(last) }),
+                None if by == By::AttachedTool => Err(ToolFault::Unknown {
+                    step: step.name.clone(),
+                }),
                 Some(_) | None => Ok(()),
             },
+            // A component beside the tools from before the run may do a step too.
+            _ if by == By::AttachedTool => self.check_before(component),
+            _ => Ok(()),
         }
+    }
+
+    /// Checks that a component is a tool that was attached before the run and still is.
+    fn check_before(&self, component: &str) -> Result<(), ToolFault> {
+        let before = || self.attached.iter().filter(|tool| tool.by.is_none());
+        let mut tools = before().filter_map(|tool| tool.tool.as_ref());
+        match tools.clone().any(|tool| tool == component) {
+            true => Ok(()),
+            false if before().any(|tool| tool.tool.is_none()) => Err(ToolFault::NoToolShown),
+            false => Err(tools.next().map_or_else(
+                || self.no_tool(),
+                |tool| ToolFault::OtherBefore { tool: tool.clone() },
+            )),
+        }
+    }
+
+    /// Returns the tool that a step before a step has attached last, if it is known.
+    pub(crate) fn tool_for(&self, user: &ToolUser<'_>) -> Option<&str> {
+        let last = self.last(user).filter(|last| last.by.is_some());
+        last?.tool.as_deref()
     }
 
     /// Returns whether the tool of a step is known.
     fn is_known(&self, user: &ToolUser<'_>) -> bool {
         let last = self.last(user);
-        last.is_none_or(|last| last.tool.is_some())
+        last.is_none_or(|last| last.by.is_none() || last.tool.is_some())
     }
 
     /// Returns the tool that was attached last before a step.
@@ -213,22 +333,32 @@ impl AttachedTools {
         let mut away = self.away.values();
         let detached = away.find_map(|away| match away {
             ToolAway::Detached { step } => Some(ToolFault::NoneLeft { step: step.clone() }),
-            ToolAway::Uncertain { .. } => None,
+            ToolAway::Uncertain { .. } | ToolAway::NotAttached | ToolAway::NotShown => None,
         });
         detached.unwrap_or(ToolFault::NoTool)
     }
 
+    /// Removes the tool of a changer that the run changes.
     fn take(&mut self, changer: &str) -> Option<AttachedTool> {
+        self.changed.insert(changer.to_owned());
         let mut attached = self.attached.iter();
         let place = attached.position(|tool| tool.changer == changer)?;
         Some(self.attached.remove(place))
     }
 }
 
+/// Returns the ApplicationUris of attached tools.
+fn names(attached: &[AttachedTool]) -> BTreeSet<&String> {
+    let tools = attached.iter().filter_map(|tool| tool.tool.as_ref());
+    tools.collect()
+}
+
 impl ToolUser<'_> {
     /// Returns whether the step begins after a tool was attached.
     fn follows(&self, tool: &AttachedTool) -> bool {
-        let of = tool.by.number;
+        let Some(of) = tool.by.as_ref().map(|by| by.number) else {
+            return true;
+        };
         // An earlier round of a loop is over when a step of the loop begins.
         let is_again = |one: &Loop| one.steps.contains(&of) && one.steps.contains(&self.number);
         self.behind.contains(&of) || (tool.is_earlier && self.loops.iter().any(is_again))
@@ -375,6 +505,25 @@ impl PossibleTools {
         (faults.len(), faults.into_iter().next())
     }
 
+    /// Returns the step of another branch that certainly changes the tool of a component in each
+    /// case, although it has no order to the step that uses the tool.
+    pub(super) fn changed_by<'a>(
+        &self,
+        (user, beside): (&ToolUser<'_>, &'a [PlannedToolStep]),
+        component: &str,
+    ) -> Option<&'a ToolStep> {
+        let changes = |case: &AttachedTools, step: &PlannedToolStep| {
+            let last = case.last(user).filter(|last| last.by.is_some());
+            last.is_some_and(|last| {
+                let is_its = last.tool.as_deref() == Some(component);
+                is_its && step.changers == std::slice::from_ref(&last.changer)
+            })
+        };
+        let mut beside = beside.iter();
+        let always = |step: &&PlannedToolStep| self.cases.iter().all(|case| changes(case, step));
+        beside.find(always).map(|step| &step.step)
+    }
+
     /// Checks that a component may do a step in one of the cases. Which case it is is known when
     /// the step begins.
     ///
@@ -399,21 +548,28 @@ impl PlannedToolStep {
     fn changers_in<'a>(&'a self, case: &'a AttachedTools) -> Vec<&'a str> {
         let attached = || case.attached.iter().rev();
         let same = self.same_as.and_then(|with| {
-            let of_step = attached().find(|tool| tool.by.number == with);
+            let of_step = attached().find(|tool| {
+                let by = tool.by.as_ref();
+                by.is_some_and(|by| by.number == with)
+            });
             of_step.map(|tool| tool.changer.as_str())
         });
         let can = |changer: &str| self.changers.iter().any(|known| known == changer);
-        let last = || {
-            let mut with_tool = attached().map(|tool| tool.changer.as_str());
-            with_tool.find(|changer| can(changer))
-        };
+        let mut with_tool = attached().filter(|tool| can(&tool.changer));
+        let last = with_tool.clone().find(|tool| tool.by.is_some());
         let all = || self.changers.iter().map(String::as_str).collect::<Vec<_>>();
         match (same, self.work) {
             (Some(same), _) => vec![same],
-            (None, ToolWork::Detach) => match last() {
-                Some(last) => vec![last],
-                // It has no tool of this run.
-                None => vec![self.changers.first().map_or("", String::as_str)],
+            (None, ToolWork::Detach) => match (last, with_tool.next()) {
+                (Some(last), _) => vec![last.changer.as_str()],
+                // Each changer with a tool from before the run may do it.
+                (None, Some(before)) => {
+                    let others = with_tool.map(|tool| tool.changer.as_str());
+                    std::iter::once(before.changer.as_str())
+                        .chain(others)
+                        .collect()
+                }
+                (None, None) => vec![self.changers.first().map_or("", String::as_str)],
             },
             (None, ToolWork::Attach) if self.changers.is_empty() => vec![""],
             (None, ToolWork::Attach) => all(),

@@ -245,21 +245,179 @@ async fn a_tool_that_is_detached_undoes_nothing() {
 }
 
 #[tokio::test]
-async fn a_tool_waits_while_another_branch_detaches_it() {
-    // The grasp does not wait for the step that detaches its tool.
-    let mut process = sequence(vec![
-        attach(1, "attach", GRIPPER),
-        alone(2, "detach", "DetachToolSkillType"),
-        grasp(3),
-    ]);
-    process.steps[3].after = Some(vec![1]);
-    let (run, fakes, _) = executed(changing(), &process).await;
+async fn a_tool_that_another_branch_detaches_finishes_its_step_first() {
+    let branches = |grasps: usize| {
+        let mut steps = [
+            grasp(grasps),
+            alone(5 - grasps, "detach", "DetachToolSkillType"),
+        ];
+        steps.sort_by_key(|step| step.needs[0].role);
+        let [one, mut two] = steps;
+        two.after = Some(vec![1]);
+        sequence(vec![attach(1, "attach", GRIPPER), one, two])
+    };
+    let (run, fakes, _) = executed(changing(), &branches(2)).await;
+    assert_eq!((run.outcome, &run.reason), (How::Done, &None));
+    assert_eq!(ran(&fakes)[2..], ["gripper.Grasp", "changer.Detach"]);
+    // The step that detaches the tool would come first.
+    let (run, fakes, _) = executed(changing(), &branches(3)).await;
     assert_eq!(run.outcome, How::Failed);
     let reason = run.reason.unwrap();
-    let expected = "the step `detach` detaches this tool";
+    let expected = "the step `detach` detaches this tool at any time";
     assert!(reason.contains(expected), "{reason}");
-    assert_eq!(
-        ran(&fakes).last().map(String::as_str),
-        Some("changer.Detach")
-    );
+    assert_eq!(ran(&fakes), Vec::<String>::new());
+}
+
+fn shown(tool: &str) -> ShownTools {
+    ShownTools {
+        attached: [("urn:example:changer".to_owned(), Some(tool.to_owned()))].into(),
+        tools: [GRIPPER, OTHER].map(str::to_owned).into(),
+    }
+}
+
+#[tokio::test]
+async fn a_tool_whose_step_is_skipped_does_nothing() {
+    for (compare, expected) in [
+        (Compare::Equal, "gripper.Grasp"),
+        (Compare::Greater, "other.Grasp"),
+    ] {
+        let grasp = ProcessStep {
+            by: By::Any,
+            ..grasp(2)
+        };
+        let mut process = sequence(vec![attach(1, "attach", GRIPPER), grasp]);
+        process.steps[1].when = runs(compare, 1, false);
+        let fakes = Fakes {
+            tools: shown(OTHER),
+            ..changing()
+        };
+        let (run, fakes, _) = executed(fakes, &process).await;
+        assert_eq!((run.outcome, &run.reason), (How::Done, &None));
+        assert_eq!(ran(&fakes).last().map(String::as_str), Some(expected));
+    }
+}
+
+#[tokio::test]
+async fn an_attached_tool_that_is_not_reported_is_not_known() {
+    let mut fakes = changing();
+    fakes.ends = Some((
+        "changer.Change",
+        Some(Ok(RunOutcome {
+            succeeded: true,
+            results: vec![("Tool".to_owned(), "".into())],
+            ..failed("")
+        })),
+    ));
+    let process = sequence(vec![attach(1, "attach", GRIPPER), grasp(2)]);
+    let (run, _, _) = executed(fakes, &process).await;
+    let reason = run.reason.unwrap();
+    let expected = "the tool that the step `attach` attaches is not known";
+    assert!(reason.contains(expected), "{reason}");
+}
+
+#[tokio::test]
+async fn a_step_that_detaches_attaches_nothing() {
+    let mut fakes = changing();
+    fakes.ends = Some((
+        "changer.Detach",
+        Some(Ok(RunOutcome {
+            succeeded: true,
+            results: vec![("Tool".to_owned(), GRIPPER.into())],
+            ..failed("")
+        })),
+    ));
+    let process = sequence(vec![
+        attach(1, "attach", GRIPPER),
+        alone(2, "detach", "DetachToolSkillType"),
+        ProcessStep {
+            by: By::Any,
+            ..grasp(3)
+        },
+    ]);
+    let (run, fakes, _) = executed(fakes, &process).await;
+    assert_eq!((run.outcome, &run.reason), (How::Done, &None));
+    assert_eq!(ran(&fakes).last().map(String::as_str), Some("other.Grasp"));
+}
+
+#[tokio::test]
+async fn a_tool_that_gets_its_power_when_it_is_attached_does_the_step() {
+    let mut fakes = changing();
+    let offers = fakes.offers.get_mut().unwrap();
+    offers.retain(|offer| offer.component != GRIPPER);
+    fakes.powers = Some(("changer.Change", gripper("gripper")));
+    let grasp = ProcessStep {
+        by: By::Any,
+        ..grasp(2)
+    };
+    let process = sequence(vec![attach(1, "attach", GRIPPER), grasp]);
+    let (run, fakes, _) = executed(fakes, &process).await;
+    assert_eq!((run.outcome, &run.reason), (How::Done, &None));
+    assert_eq!(ran(&fakes)[1..], ["changer.Change 1", "gripper.Grasp"]);
+}
+
+#[tokio::test]
+async fn a_tool_that_another_run_uses_is_waited_for() {
+    let mut fakes = changing();
+    fakes
+        .leases
+        .get_mut()
+        .unwrap()
+        .insert(GRIPPER.to_owned(), "another run".to_owned());
+    let process = sequence(vec![attach(1, "attach", GRIPPER)]);
+    let (run, fakes, _) = executed(fakes, &process).await;
+    assert_eq!(run.outcome, How::Failed);
+    let reason = run.reason.unwrap();
+    let expected = "the run another run uses urn:example:gripper";
+    assert!(reason.contains(expected), "{reason}");
+    assert_eq!(ran(&fakes), Vec::<String>::new());
+}
+
+#[tokio::test]
+async fn no_tool_is_waited_for_that_no_component_can_replace() {
+    let mut handles = alone(2, "handle", "CountType");
+    handles.when = vec![vec![StepCondition {
+        step: 1,
+        test: Test::Ended(BadEnd::Failed),
+        is_negated: false,
+    }]];
+    let grasp = ProcessStep {
+        by: By::Any,
+        ..grasp(3)
+    };
+    let mut process = sequence(vec![attach(1, "attach", GRIPPER), handles, grasp]);
+    // Longer than the time limit of the test.
+    process.wait = Duration::from_secs(3600);
+    let mut fakes = changing();
+    fakes.fails_at = Some("changer.Change");
+    let offers = fakes.offers.get_mut().unwrap();
+    offers.retain(|offer| offer.component != OTHER);
+    let (run, _, _) = executed(fakes, &process).await;
+    let reason = run.reason.unwrap();
+    let expected = "not known whether this tool is attached after the step `attach`";
+    assert!(reason.contains(expected), "{reason}");
+}
+
+#[tokio::test]
+async fn each_round_may_be_planned_for_another_tool() {
+    let grasp = ProcessStep {
+        by: By::Any,
+        ..grasp(2)
+    };
+    let mut process = sequence(vec![attach(1, "attach", GRIPPER), grasp]);
+    let failed_at = |step| StepCondition {
+        step,
+        test: Test::Ended(BadEnd::Failed),
+        is_negated: false,
+    };
+    process.loops = vec![Loop {
+        steps: [1, 2].into(),
+        again: vec![vec![failed_at(1), failed_at(2)]],
+        rounds: 3,
+    }];
+    let mut fakes = changing();
+    fakes.fails_at = Some("changer.Change");
+    fakes.ends = Some(("other.Grasp", Some(Ok(failed("nothing was gripped")))));
+    let (run, _, _) = executed(fakes, &process).await;
+    let reason = run.reason.unwrap();
+    assert!(reason.contains("has had 3 rounds"), "{reason}");
 }

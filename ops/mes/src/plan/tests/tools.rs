@@ -87,17 +87,94 @@ fn a_step_that_may_be_skipped_leaves_both_tools_possible() {
     );
 }
 
+/// Plans a process while the changer has a tool.
+fn plan_with(process: &Process, attached: &str) -> Plan {
+    let mut tools = AttachedTools::default();
+    let attached = Some(attached.to_owned());
+    tools.observe(&ShownTools {
+        attached: [("urn:example:changer".to_owned(), attached)].into(),
+        tools: ["urn:example:finger", "urn:example:vacuum"]
+            .map(str::to_owned)
+            .into(),
+    });
+    let situation = Situation {
+        tools: Some(&tools),
+        ..Situation::default()
+    };
+    super::super::plan(process, &offers(), situation, &KNOWN)
+}
+
 #[test]
-fn a_choice_is_right_for_as_many_cases_as_possible() {
+fn a_tool_that_a_step_may_not_attach_is_not_the_only_choice() {
     let mut process = sequence(&["urn:change", GRASP]);
     process.steps[0].parameters = named("urn:example:vacuum");
     process.steps[0].when = if_failed(0);
-    let found = plan(&process, &offers(), &[]);
+    let found = plan_with(&process, "urn:example:finger");
+    assert_eq!(chosen(&found, 2)[1], "finger#Grasp");
+    // The step attaches it in any case.
+    process.steps[0].when = Vec::new();
+    let found = plan_with(&process, "urn:example:finger");
     assert_eq!(chosen(&found, 2)[1], "vacuum#Grasp");
+    let process = sequence(&[GRASP]);
+    for (attached, expected) in [
+        ("urn:example:finger", "finger#Grasp"),
+        ("urn:example:vacuum", "vacuum#Grasp"),
+        ("", "none"),
+    ] {
+        assert_eq!(chosen(&plan_with(&process, attached), 1), [expected]);
+    }
+    let found = plan_with(&process, "urn:example:finger");
     assert_eq!(
-        why(&found, SkillRole::Alone(1), "finger#Grasp"),
+        why(&found, SkillRole::Alone(0), "vacuum#Grasp"),
+        "no tool changer shows this tool, and no step before it attaches it"
+    );
+}
+
+#[test]
+fn a_choice_is_right_for_as_many_cases_as_possible() {
+    let mut process = sequence(&["urn:change", "urn:change", GRASP]);
+    process.steps[0].parameters = named("urn:example:vacuum");
+    process.steps[1].parameters = named("urn:example:finger");
+    process.steps[1].when = if_failed(0);
+    process.steps[0].when = if_failed(0);
+    let found = plan_with(&process, "urn:example:vacuum");
+    assert_eq!(chosen(&found, 3)[2], "vacuum#Grasp");
+    assert_eq!(
+        why(&found, SkillRole::Alone(2), "finger#Grasp"),
         "it would fit only while another tool is attached"
     );
+}
+
+#[test]
+fn a_tool_from_before_the_run_does_no_step_after_it_is_detached() {
+    let mut process = sequence(&["urn:detach", GRASP]);
+    let found = plan_with(&process, "urn:example:finger");
+    assert!(!found.is_complete());
+    assert_eq!(
+        why(&found, SkillRole::Alone(1), "finger#Grasp"),
+        "the step `step 0` detaches this tool"
+    );
+    process.steps.swap_remove(0);
+    process.steps[0].needs[0].role = SkillRole::Alone(0);
+    let found = plan_with(&process, "urn:example:finger");
+    assert_eq!(chosen(&found, 1), ["finger#Grasp"]);
+}
+
+#[test]
+fn a_tool_that_another_branch_detaches_at_any_time_is_refused() {
+    let mut process = sequence(&["urn:change", "urn:detach", GRASP]);
+    process.steps[0].parameters = named("urn:example:vacuum");
+    process.steps[2].after = Some(vec![0]);
+    process.steps[2].by = By::AttachedTool;
+    let found = plan_with(&process, "urn:example:finger");
+    assert_eq!(
+        why(&found, SkillRole::Alone(2), "vacuum#Grasp"),
+        "the step `step 1` detaches this tool at any time; order the two steps with `after`"
+    );
+    // The branch may not be taken.
+    process.steps[1].when = if_failed(0);
+    let found = plan_with(&process, "urn:example:finger");
+    assert_eq!(chosen(&found, 3)[2], "vacuum#Grasp");
 }
 
 #[test]

@@ -121,6 +121,63 @@ fn a_tool_of_an_earlier_round_is_attached_before_all_steps_of_the_loop() {
     assert_eq!(tools.check(&user, A), Ok(()));
 }
 
+fn shown(attached: &[(&str, Option<&str>)]) -> ShownTools {
+    let attached = attached.iter().copied();
+    ShownTools {
+        attached: attached
+            .map(|(changer, tool)| (changer.to_owned(), tool.map(str::to_owned)))
+            .collect(),
+        tools: [A, B].map(str::to_owned).into(),
+    }
+}
+
+#[test]
+fn the_tools_before_the_run_come_before_all_steps() {
+    let mut tools = AttachedTools::default();
+    tools.observe(&shown(&[(CHANGER, Some(A))]));
+    for by in [By::Any, By::AttachedTool] {
+        assert_eq!(check(&tools, by, &[], A), Ok(()));
+        assert_eq!(check(&tools, by, &[], B), Err(ToolFault::NotAttached));
+    }
+    assert_eq!(check(&tools, By::Any, &[], "urn:third"), Ok(()));
+    let tool = A.to_owned();
+    let third = check(&tools, By::AttachedTool, &[], "urn:third");
+    assert_eq!(third, Err(ToolFault::OtherBefore { tool }));
+    assert_eq!(tools.at(CHANGER), Some(A));
+    // A step attaches another tool, and the changer is read again.
+    tools.attach(CHANGER, Some(B.to_owned()), step(0));
+    tools.observe(&shown(&[(CHANGER, Some(A))]));
+    assert_eq!(check(&tools, By::Any, &[0], A), detached(0));
+    assert_eq!(check(&tools, By::AttachedTool, &[0], B), Ok(()));
+}
+
+#[test]
+fn a_tool_from_before_the_run_is_not_used_after_a_step_detaches_it() {
+    let mut tools = AttachedTools::default();
+    tools.observe(&shown(&[(CHANGER, Some(A))]));
+    tools.detach(CHANGER, &step(0));
+    tools.observe(&shown(&[(CHANGER, Some(A))]));
+    assert_eq!(check(&tools, By::Any, &[0], A), detached(0));
+    assert_eq!(tools.at(CHANGER), None);
+}
+
+#[test]
+fn no_tool_is_used_while_a_changer_does_not_show_its_tool() {
+    let mut tools = AttachedTools::default();
+    tools.observe(&shown(&[(CHANGER, None)]));
+    assert_eq!(check(&tools, By::Any, &[], A), Err(ToolFault::NotShown));
+    let third = check(&tools, By::AttachedTool, &[], "urn:third");
+    assert_eq!(third, Err(ToolFault::NoToolShown));
+    // It shows its tool, and does not respond afterwards.
+    tools.observe(&shown(&[(CHANGER, Some(A))]));
+    for attached in [&[(CHANGER, None)][..], &[]] {
+        tools.observe(&shown(attached));
+        assert_eq!(check(&tools, By::AttachedTool, &[], A), Ok(()));
+    }
+    tools.observe(&shown(&[(CHANGER, Some(""))]));
+    assert_eq!(check(&tools, By::Any, &[], A), Err(ToolFault::NotAttached));
+}
+
 fn planned(number: usize, work: ToolWork, tool: Option<&str>) -> PlannedToolStep {
     PlannedToolStep {
         work,
