@@ -186,6 +186,7 @@ fn what_a_server_does_not_have_is_a_finding() {
         "urn:a requires urn:moved",
         "302 Found, a redirection, which is not followed",
     ]);
+    finding(&["urn:a requires urn:late", "404"]);
     let late = node_set("urn:late", &["urn:later"]);
     fs::write(site.served.join("late.xml"), late).unwrap();
     let later = node_set("urn:later", &[]);
