@@ -11,13 +11,15 @@ mod walk;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
 
 use discovery::{PresentServer, ServerChange};
 use knowledge::{Knowledge, KnowledgeSource, SourceKind};
 use serde::Serialize;
 use skills::ClientOptions;
-use tokio::sync::{Notify, Semaphore};
+use tokio::sync::{Notify, Semaphore, watch};
 use tokio::task::JoinHandle;
+use tokio::time::sleep;
 
 use self::connection::FollowedServer;
 use self::graph::ServerUris;
@@ -49,6 +51,8 @@ struct ServerBoard {
     knowledge: Arc<Knowledge>,
     sources: Arc<MesSources>,
     uris: ServerUris,
+    /// The namespaces of the NodeSets in the graph, whose types are not read from servers.
+    nodesets: watch::Sender<BTreeSet<String>>,
     reading: Semaphore,
     statuses: Mutex<BTreeMap<String, ServerStatus>>,
 }
@@ -63,8 +67,11 @@ struct ServerStatus {
     /// The IRI of its graph.
     graph: String,
     nodes: usize,
+    /// Maximum number of nodes of the read that is under way.
+    #[serde(skip)]
+    reserved: usize,
     statements: usize,
-    /// Whether no limit was reached.
+    /// Whether no nodes and no references are missing.
     complete: bool,
     /// Time of the last read in ms since 1970, its duration in ms, and the number of reads.
     read_ms: u64,
@@ -114,6 +121,7 @@ impl LiveServers {
     ) -> Self {
         Self {
             board: Arc::new(ServerBoard {
+                nodesets: watch::Sender::new(nodesets(&knowledge)),
                 knowledge,
                 sources,
                 uris: ServerUris::default(),
@@ -191,7 +199,12 @@ impl LiveServers {
                     None => drop(running.insert(name.clone(), self.start(name, planned))),
                 }
             }
-            self.changed.notified().await;
+            loop {
+                tokio::select! {
+                    () = self.changed.notified() => break,
+                    () = sleep(NODESETS_EVERY) => self.board.compare_nodesets(),
+                }
+            }
         }
     }
 
@@ -283,11 +296,40 @@ impl PlannedServer {
 }
 
 impl ServerBoard {
-    /// Returns the namespaces of the NodeSets in the graph.
-    fn nodesets(&self) -> BTreeSet<String> {
+    /// Compares the NodeSets in the graph with those that are known. A change makes all servers be
+    /// read again.
+    fn compare_nodesets(&self) {
+        let current = nodesets(&self.knowledge);
+        self.nodesets.send_if_modified(|known| {
+            let is_changed = *known != current;
+            *known = current;
+            is_changed
+        });
+    }
+
+    /// Returns the namespaces whose types a server does not state: those of the NodeSets in the
+    /// graph, and the ApplicationUris of other components and servers.
+    fn left_out(&self, own: &str) -> BTreeSet<String> {
+        let mut all = nodesets(&self.knowledge);
         let sources = self.knowledge.sources().into_iter();
-        let nodesets = sources.filter(|source| source.kind == SourceKind::NodeSet);
-        nodesets.map(|source| source.name).collect()
+        let components = sources
+            .filter(|source| matches!(source.kind, SourceKind::Component | SourceKind::Server))
+            .map(|source| source.name);
+        let others = components.chain(self.uris.all());
+        all.extend(others.filter(|uri| uri != own));
+        all
+    }
+
+    /// Reserves nodes of the number that all servers may have together. Returns their number.
+    fn reserve(&self, name: &str, wanted: usize) -> usize {
+        let mut statuses = self.statuses();
+        let others = statuses.iter().filter(|(other, _)| *other != name);
+        let taken: usize = others
+            .map(|(_, status)| status.nodes.max(status.reserved))
+            .sum();
+        let reserved = wanted.min(MOST_NODES_OF_ALL.saturating_sub(taken));
+        statuses.entry(name.to_owned()).or_default().reserved = reserved;
+        reserved
     }
 
     /// Changes the status of a server.
@@ -335,6 +377,17 @@ impl ServerBoard {
     }
 }
 
+/// Returns the namespaces of the NodeSets in the graph.
+fn nodesets(knowledge: &Knowledge) -> BTreeSet<String> {
+    let sources = knowledge.sources().into_iter();
+    let nodesets = sources.filter(|source| source.kind == SourceKind::NodeSet);
+    nodesets.map(|source| source.name).collect()
+}
+
+/// Interval of comparing the NodeSets in the graph.
+const NODESETS_EVERY: Duration = Duration::from_secs(5);
+/// Maximum number of nodes of all servers, without types that are read beside them.
+const MOST_NODES_OF_ALL: usize = 200_000;
 /// Number of servers that are read at a time.
 const READ_AT_A_TIME: usize = 2;
 const MOST_SERVERS: usize = 100;

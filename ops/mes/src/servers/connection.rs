@@ -15,7 +15,7 @@ use tracing::{debug, info};
 
 use super::graph::ServerGraph;
 use super::walk::{self, Searched};
-use super::{ServerBoard, ServerState, ServerStatus};
+use super::{MOST_NODES_OF_ALL, SearchLimits, ServerBoard, ServerState, ServerStatus};
 use crate::cell::now;
 use crate::settings::{NamedServers, ServerEntry};
 
@@ -46,6 +46,8 @@ impl FollowedServer {
             )
         };
         let client = OpcUaClient::open(config, &self.endpoint);
+        // A server that ends the session during a read is not read after each connect.
+        let mut retry = ReadRetry::default();
         let mut link = client.link();
         loop {
             let state = link.borrow_and_update().clone();
@@ -57,12 +59,12 @@ impl FollowedServer {
                 } => {
                     let is_other = |link: &Link| !matches!(link, Link::Up { connects: other, .. } if *other == connects);
                     tokio::select! {
-                        () = self.connected(&client, &application_uri) => {}
+                        () = self.connected(&client, &application_uri, &mut retry) => {}
                         _ = link.wait_for(is_other) => {}
                     }
                     // The graph is removed with the connection.
                     self.board.status(&self.name, |status| {
-                        (status.nodes, status.statements) = (0, 0);
+                        (status.nodes, status.statements, status.reserved) = (0, 0, 0);
                     });
                     continue;
                 }
@@ -79,21 +81,48 @@ impl FollowedServer {
         }
     }
 
+    /// Returns why the connected server is not the server of the entry.
+    fn other(&self, application_uri: &str) -> Option<String> {
+        if application_uri == self.options.application_uri {
+            return Some("it is this MES, which is not read itself; remove the entry".to_owned());
+        }
+        match &self.entry.which {
+            NamedServers::Application(wanted) if wanted != application_uri => Some(format!(
+                "the server at {} has the ApplicationUri `{application_uri}`; correct the entry, or \
+                 give the endpoint instead",
+                self.endpoint
+            )),
+            _ => None,
+        }
+    }
+
     /// Keeps the graph current while the server is connected.
-    async fn connected(&self, client: &OpcUaClient, application_uri: &str) {
+    async fn connected(&self, client: &OpcUaClient, application_uri: &str, retry: &mut ReadRetry) {
+        let only_discovered = self.entry.which == NamedServers::Discovered;
+        if let Some(why) = self.other(application_uri) {
+            self.state(ServerState::Failed);
+            if only_discovered {
+                self.board.findings(&self.name, Vec::new());
+            } else {
+                self.finding(&why);
+            }
+            return std::future::pending().await;
+        }
         let uri = match application_uri.is_empty() || application_uri.len() > LONGEST_URI {
             true => self.endpoint.as_str(),
             false => application_uri,
         };
+        let uris = &self.board.uris;
+        let _claim = (!only_discovered).then(|| uris.claim(uri, &self.name));
         let taken = loop {
-            match self.board.uris.take(uri, &self.name) {
+            match uris.take(uri, &self.name, only_discovered) {
                 Ok(taken) => break taken,
                 // The graph of the previous connection is still being removed.
                 Err(owner) if owner == self.name => {}
                 Err(owner) => {
                     self.state(ServerState::Duplicate);
                     // Discovery may find a server that has an entry under another address.
-                    if self.entry.which == NamedServers::Discovered {
+                    if only_discovered {
                         self.board.findings(&self.name, Vec::new());
                     } else {
                         self.finding(&format!(
@@ -103,30 +132,64 @@ impl FollowedServer {
                     }
                 }
             }
-            self.board.uris.free(uri).await;
+            uris.free(uri, only_discovered).await;
         };
         let graph = ServerGraph::new(Arc::clone(&self.board.knowledge), taken);
+        let claimed = async {
+            match only_discovered {
+                true => uris.claimed(uri).await,
+                false => std::future::pending().await,
+            }
+        };
+        tokio::select! {
+            () = self.reads(client, &graph, uri, retry) => {}
+            () = claimed => {}
+        }
+    }
+
+    /// Reads the nodes again and again.
+    async fn reads(
+        &self,
+        client: &OpcUaClient,
+        graph: &ServerGraph,
+        uri: &str,
+        retry: &mut ReadRetry,
+    ) {
         let mut changes = ModelChanges::new(client);
-        let mut failed = FIRST_PAUSE;
+        let mut nodesets = self.board.nodesets.subscribe();
         let mut reason = "connected";
+        tokio::select! {
+            () = sleep_until(retry.not_before) => {}
+            () = self.again.notified() => reason = COMMAND,
+        }
         loop {
-            let is_read = self.read(client, &graph, uri, reason).await;
-            let pause = match is_read {
-                true => self.entry.every,
-                false => failed,
+            nodesets.mark_unchanged();
+            let began = Instant::now();
+            retry.begins(began);
+            let is_read = self.read(client, graph, uri, reason).await;
+            let ended = Instant::now();
+            if is_read {
+                retry.is_over(ended);
+            }
+            let next = match is_read {
+                true => ended + self.entry.every,
+                false => retry.not_before,
             };
-            failed = match is_read {
-                true => FIRST_PAUSE,
-                false => (failed * 2).min(LONGEST_PAUSE),
-            };
-            let read = Instant::now();
+            let earliest = ended + rest_after(reason, ended - began);
             reason = tokio::select! {
-                () = sleep_until(read + pause) => "interval",
-                () = self.again.notified() => "command",
+                () = sleep_until(next) => "interval",
+                () = self.again.notified() => COMMAND,
+                _ = nodesets.changed() => "NodeSets",
                 why = changes.next() => why,
             };
+            if reason == COMMAND {
+                continue;
+            }
             let burst = Instant::now() + BURST;
-            changes.settle(burst.max(read + SETTLED)).await;
+            tokio::select! {
+                () = changes.settle(burst.max(earliest).max(retry.not_before)) => {}
+                () = self.again.notified() => reason = COMMAND,
+            }
         }
     }
 
@@ -144,9 +207,17 @@ impl FollowedServer {
         };
         self.state(ServerState::Reading);
         let began = Instant::now();
-        let known = self.board.nodesets();
-        let is_known = move |namespace: &str| known.contains(namespace);
-        let search = walk::search(client, &self.entry.start, &self.entry.limits, &is_known);
+        let left_out = self.board.left_out(uri);
+        let is_known = |namespace: &str| left_out.contains(namespace);
+        let most = self.board.reserve(&self.name, self.entry.limits.nodes);
+        if most == 0 {
+            return self.failed(&too_many_nodes());
+        }
+        let limits = SearchLimits {
+            nodes: most,
+            ..self.entry.limits.clone()
+        };
+        let search = walk::search(client, &self.entry.start, &limits, &is_known);
         let found = timeout(self.entry.limits.within + SLOWEST_END, search).await;
         let searched = match found {
             Ok(Ok(searched)) => searched,
@@ -155,13 +226,16 @@ impl FollowedServer {
         };
         let Searched {
             mut space,
-            findings,
+            mut findings,
         } = searched;
+        if most < self.entry.limits.nodes && !space.is_complete {
+            findings.push(too_many_nodes());
+        }
         uri.clone_into(&mut space.application_uri);
         space.endpoint.clone_from(&self.endpoint);
         space.browsed = super::facts::time_text(&DateTime::now());
         let (nodes, is_complete) = (space.nodes.len(), space.is_complete);
-        let statements = match graph.write(space).await {
+        let statements = match graph.write(space, left_out).await {
             Ok(statements) => statements,
             Err(why) => return self.failed(&why),
         };
@@ -181,6 +255,7 @@ impl FollowedServer {
                 application_uri: uri.to_owned(),
                 graph: graph.iri(),
                 nodes,
+                reserved: 0,
                 statements,
                 complete: is_complete,
                 read_ms: now(),
@@ -196,7 +271,9 @@ impl FollowedServer {
     }
 
     fn failed(&self, why: &str) -> bool {
-        self.state(ServerState::Failed);
+        self.board.status(&self.name, |status| {
+            (status.state, status.reserved) = (ServerState::Failed, 0);
+        });
         self.finding(&format!("its nodes cannot be read: {why}"));
         false
     }
@@ -211,15 +288,61 @@ impl FollowedServer {
     }
 }
 
+/// The time before which a server is not read again after a read that failed or was interrupted.
+/// It lasts over connections.
+struct ReadRetry {
+    pause: Duration,
+    not_before: Instant,
+}
+
+impl Default for ReadRetry {
+    fn default() -> Self {
+        Self {
+            pause: FIRST_PAUSE,
+            not_before: Instant::now(),
+        }
+    }
+}
+
+impl ReadRetry {
+    /// Takes the begin of a read, which may end with the connection.
+    fn begins(&mut self, now: Instant) {
+        self.not_before = now + self.pause;
+        self.pause = (self.pause * 2).min(LONGEST_PAUSE);
+    }
+
+    /// Takes the end of a completed read.
+    fn is_over(&mut self, ended: Instant) {
+        self.pause = FIRST_PAUSE;
+        self.not_before = ended;
+    }
+}
+
+/// Returns the shortest time until the next read. A server whose changes cause reads is not read
+/// most of the time.
+fn rest_after(reason: &str, took: Duration) -> Duration {
+    match reason {
+        MODEL_CHANGE | SERVER_CHANGE => (took * REST).max(SHORTEST_REST),
+        _ => SETTLED,
+    }
+}
+
+fn too_many_nodes() -> String {
+    format!(
+        "all servers have more than {MOST_NODES_OF_ALL} nodes; name fewer servers, or lower `nodes`"
+    )
+}
+
 /// The changes of its model that a server reports.
-struct ModelChanges {
+struct ModelChanges<'c> {
+    client: &'c OpcUaClient,
     subscription: ClientSubscription,
     /// The known values of the watched variables.
     known: [Option<Variant>; 2],
 }
 
-impl ModelChanges {
-    fn new(client: &OpcUaClient) -> Self {
+impl<'c> ModelChanges<'c> {
+    fn new(client: &'c OpcUaClient) -> Self {
         let value = |id: VariableId| MonitoredWatch::Value(id.into());
         let events = |of_type: ObjectTypeId| MonitoredWatch::Events {
             node: ObjectId::Server.into(),
@@ -234,6 +357,7 @@ impl ModelChanges {
             events(ObjectTypeId::GeneralModelChangeEventType),
         ];
         Self {
+            client,
             subscription: client.subscribe(watches, INTERVAL, QUEUE),
             known: [None, None],
         }
@@ -246,20 +370,28 @@ impl ModelChanges {
                 // The client is closed, and so is the task.
                 return std::future::pending().await;
             };
-            if let Some(change) = self.change(notice) {
+            if let Some(change) = self.change(notice).await {
                 return change;
             }
         }
     }
 
-    fn change(&mut self, notice: Notice) -> Option<&'static str> {
+    async fn change(&mut self, notice: Notice) -> Option<&'static str> {
         match notice {
-            Notice::Event { .. } => Some("model change"),
+            Notice::Event { fields, .. } => {
+                // A server may ignore the filter, and send events of all types.
+                let Some(Variant::NodeId(of_type)) = fields.into_iter().next() else {
+                    return None;
+                };
+                let base: NodeId = ObjectTypeId::BaseModelChangeEventType.into();
+                let is_change = self.client.is_subtype_of(&of_type, &base).await;
+                is_change.unwrap_or(false).then_some(MODEL_CHANGE)
+            }
             Notice::Value { watch, value } => {
                 let known = self.known.get_mut(watch)?;
                 let before = std::mem::replace(known, value.value);
                 let is_changed = before.is_some() && *known != before;
-                is_changed.then_some("change of the server")
+                is_changed.then_some(SERVER_CHANGE)
             }
             Notice::Refused { watch, status } => {
                 debug!(watch, %status, "a server does not report changes of its model");
@@ -292,8 +424,46 @@ const LONGEST_PAUSE: Duration = Duration::from_secs(60);
 const SETTLED: Duration = Duration::from_secs(1);
 /// Time in which further changes belong to the first change.
 const BURST: Duration = Duration::from_millis(200);
+/// Shortest time between two searches because of changes, and the same as a multiple of the duration
+/// of the last search.
+const SHORTEST_REST: Duration = Duration::from_secs(10);
+const REST: u32 = 10;
+/// Reasons of a search.
+const COMMAND: &str = "command";
+const MODEL_CHANGE: &str = "model change";
+const SERVER_CHANGE: &str = "change of the server";
 /// Publishing interval of the subscription.
 const INTERVAL: Duration = Duration::from_millis(500);
 const QUEUE: usize = 64;
 const LONGEST_URI: usize = 512;
 const LONGEST_FINDING: usize = 1000;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn interrupted_reads_are_repeated_ever_later_until_one_is_completed() {
+        let mut retry = ReadRetry::default();
+        let now = Instant::now();
+        let pauses: Vec<u64> = (0..7)
+            .map(|_| {
+                retry.begins(now);
+                (retry.not_before - now).as_secs()
+            })
+            .collect();
+        assert_eq!(pauses, [2, 4, 8, 16, 32, 60, 60]);
+        retry.is_over(now);
+        assert_eq!(retry.not_before, now);
+        retry.begins(now);
+        assert_eq!((retry.not_before - now).as_secs(), 2);
+    }
+
+    #[test]
+    fn reads_because_of_changes_leave_the_server_most_of_the_time() {
+        let seconds = Duration::from_secs;
+        assert_eq!(rest_after(MODEL_CHANGE, seconds(3)), seconds(30));
+        assert_eq!(rest_after(SERVER_CHANGE, seconds(0)), seconds(10));
+        assert_eq!(rest_after("connected", seconds(3)), SETTLED);
+    }
+}

@@ -1,5 +1,5 @@
 use std::path::Path;
-use std::time::{Duration, SystemTime};
+use std::time::SystemTime;
 
 use super::*;
 use crate::settings::Settings;
@@ -93,8 +93,8 @@ fn an_entry_with_other_settings_is_another_search() {
 #[tokio::test]
 async fn an_application_uri_has_one_server_until_its_graph_is_removed() {
     let uris = ServerUris::default();
-    let taken = uris.take("urn:a", "left").unwrap();
-    assert_eq!(uris.take("urn:a", "right").unwrap_err(), "left");
+    let taken = uris.take("urn:a", "left", false).unwrap();
+    assert_eq!(uris.take("urn:a", "right", false).unwrap_err(), "left");
     let knowledge = Arc::new(Knowledge::new().unwrap());
     let graph = graph::ServerGraph::new(Arc::clone(&knowledge), taken);
     let space = || knowledge::ServedSpace {
@@ -102,14 +102,60 @@ async fn an_application_uri_has_one_server_until_its_graph_is_removed() {
         browsed: "2026-11-27T10:00:00Z".to_owned(),
         ..knowledge::ServedSpace::default()
     };
-    assert!(graph.write(space()).await.unwrap() > 0);
+    assert!(graph.write(space(), BTreeSet::new()).await.unwrap() > 0);
     let is_there = || {
         let mut sources = knowledge.sources().into_iter();
         sources.any(|source| source.kind == SourceKind::Server)
     };
     assert!(is_there());
     drop(graph);
-    uris.free("urn:a").await;
+    uris.free("urn:a", true).await;
     assert!(!is_there());
-    uris.take("urn:a", "right").unwrap();
+    uris.take("urn:a", "right", true).unwrap();
+}
+
+#[tokio::test]
+async fn an_entry_takes_the_application_uri_from_a_discovered_server() {
+    let uris = ServerUris::default();
+    let found = uris.take("urn:a", "found", true).unwrap();
+    let claim = uris.claim("urn:a", "entry");
+    uris.claimed("urn:a").await;
+    assert_eq!(uris.take("urn:a", "entry", false).unwrap_err(), "found");
+    drop(found);
+    assert_eq!(uris.take("urn:a", "found", true).unwrap_err(), "entry");
+    uris.free("urn:a", false).await;
+    let entry = uris.take("urn:a", "entry", false).unwrap();
+    assert_eq!(uris.all(), ["urn:a"]);
+    drop((claim, entry));
+    uris.free("urn:a", true).await;
+    uris.take("urn:a", "found", true).unwrap();
+}
+
+#[test]
+fn all_servers_share_a_number_of_nodes_and_state_no_types_of_others() {
+    let knowledge = Arc::new(Knowledge::new().unwrap());
+    let sources = Arc::new(MesSources::new(Arc::clone(&knowledge)));
+    let servers = LiveServers::new(knowledge, sources, ClientOptions::default(), "urn:mes");
+    let board = &servers.board;
+    board.status("a", |status| status.nodes = 150_000);
+    assert_eq!(board.reserve("b", 40_000), 40_000);
+    assert_eq!(board.reserve("c", 40_000), 10_000, "b is being read");
+    assert_eq!(board.reserve("d", 40_000), 0);
+    assert_eq!(board.reserve("a", 100_000), 100_000, "its own do not count");
+
+    let _other = board.uris.take("urn:other", "a", false).unwrap();
+    let _own = board.uris.take("urn:own", "b", false).unwrap();
+    let left_out = board.left_out("urn:own");
+    assert!(left_out.contains("urn:other") && !left_out.contains("urn:own"));
+
+    let nodesets = board.nodesets.subscribe();
+    board.compare_nodesets();
+    assert!(!nodesets.has_changed().unwrap());
+    let source = KnowledgeSource::new(SourceKind::NodeSet, "urn:maker");
+    board
+        .knowledge
+        .replace_ontology(&source, Vec::new(), 1)
+        .unwrap();
+    board.compare_nodesets();
+    assert!(nodesets.has_changed().unwrap());
 }
