@@ -24,7 +24,7 @@ pub struct ServedSpace {
     pub endpoint: String,
     /// The time at which the nodes were read, as `xsd:dateTime`.
     pub browsed: String,
-    /// Whether no limit was reached.
+    /// Whether no nodes and no references are missing.
     pub is_complete: bool,
     /// The nodes at which the search began.
     pub start: Vec<NodeName>,

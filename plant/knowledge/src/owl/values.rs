@@ -70,7 +70,7 @@ pub(super) fn json(value: Node<'_, '_>, depth: usize) -> Option<Value> {
                 plain.parse::<i64>().ok().map(Value::from)
             }
             "UInt64" => plain.parse::<u64>().ok().map(Value::from),
-            "Float" | "Double" => plain.parse::<f64>().ok().map(Value::from),
+            "Float" | "Double" => plain.parse::<f64>().ok().map(number),
             _ => None,
         };
         return Some(number.unwrap_or_else(|| Value::from(text)));
@@ -87,6 +87,19 @@ pub(super) fn json(value: Node<'_, '_>, depth: usize) -> Option<Value> {
         }
     }
     Some(Value::Object(members))
+}
+
+/// Returns a number as JSON, which has no NaN and no infinity: they are the lexical forms of XML
+/// Schema.
+fn number(value: f64) -> Value {
+    if value.is_finite() {
+        return Value::from(value);
+    }
+    Value::from(match value {
+        f64::INFINITY => "INF",
+        f64::NEG_INFINITY => "-INF",
+        _ => "NaN",
+    })
 }
 
 const MAX_DEPTH: usize = 64;
