@@ -7,7 +7,7 @@ use std::time::Duration;
 use plant_opcua::client::{
     ClientConfig, ClientSubscription, Link, MonitoredWatch, Notice, OpcUaClient, Select,
 };
-use plant_opcua::types::{DateTime, ObjectId, ObjectTypeId, VariableId, Variant};
+use plant_opcua::types::{DateTime, NodeId, ObjectId, ObjectTypeId, VariableId, Variant};
 use skills::ClientOptions;
 use tokio::sync::Notify;
 use tokio::time::{Instant, sleep_until, timeout};
