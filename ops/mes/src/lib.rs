@@ -99,8 +99,8 @@ struct UaMes {
     /// only
     #[arg(long, value_name = "ADDRESS:PORT", env = "UA_SPARQL")]
     sparql: Option<SocketAddr>,
-    /// The folder for added sources, fetched NodeSets and records of runs, in place of the folder of
-    /// the YAML
+    /// The folder for added sources, fetched NodeSets and records of runs, in place of the folder
+    /// of the YAML
     #[arg(long, value_name = "DIR", env = "UA_STORE")]
     store: Option<PathBuf>,
     /// The endpoint for clients, as opc.tcp://127.0.0.1:0, in place of the endpoint of the YAML

@@ -22,7 +22,7 @@ use rustdds::dds::WriteError;
 use rustdds::{DataWriterStatus, GUID, StatusEvented, Timestamp};
 use tokio::time::Instant;
 
-use self::audience::Audience;
+use self::audience::TopicReaders;
 pub use self::former::Former;
 pub use self::outcome::{OutletProgress, OutletRefusal};
 use self::settling::{PATIENCE, SETTLE, Settling};
@@ -38,7 +38,7 @@ pub struct Outlet {
     writer: PayloadWriter,
     offered: Offered,
     joined: Instant,
-    audience: Audience,
+    audience: TopicReaders,
     /// Samples for which the send window had no room.
     waiting: UnsentSamples,
     /// The time since when the send window has no room.
@@ -65,7 +65,7 @@ impl Outlet {
             writer,
             offered,
             joined,
-            audience: Audience::Nobody { held: None },
+            audience: TopicReaders::Nobody { held: None },
             waiting: UnsentSamples::default(),
             full_since: None,
             in_flight: 0,
@@ -103,14 +103,14 @@ impl Outlet {
             self.former.pop_front();
         }
         // A held value is newer than the last written value.
-        let is_held = matches!(self.audience, Audience::Nobody { held: Some(_) });
+        let is_held = matches!(self.audience, TopicReaders::Nobody { held: Some(_) });
         if let Some(last) = &self.last
             && self.waiting.is_empty()
             && !is_held
         {
             self.waiting.push(last.clone());
         }
-        if let Audience::Present { settling, .. } = &mut self.audience {
+        if let TopicReaders::Present { settling, .. } = &mut self.audience {
             *settling = Some(Settling {
                 since: now,
                 patience,
@@ -140,8 +140,8 @@ impl Outlet {
     #[must_use]
     pub fn stores_newer_than(&self, source: Option<Timestamp>) -> bool {
         let held = match &self.audience {
-            Audience::Nobody { held } => held.as_ref(),
-            Audience::Present { .. } => None,
+            TopicReaders::Nobody { held } => held.as_ref(),
+            TopicReaders::Present { .. } => None,
         };
         held.or(self.last.as_ref())
             .is_some_and(|stored| stored.source >= source)
@@ -150,7 +150,7 @@ impl Outlet {
     /// Removes the written values from the history. Present readers still receive them, late
     /// readers do not.
     pub fn forget_stored(&mut self, now: Instant) {
-        if let Audience::Nobody { held } = &mut self.audience {
+        if let TopicReaders::Nobody { held } = &mut self.audience {
             *held = None;
         }
         self.waiting.forget();
@@ -222,8 +222,8 @@ impl Outlet {
             now,
         )?;
         match self.audience {
-            Audience::Nobody { .. } => Err(OutletRefusal::NoReader),
-            Audience::Present { .. } => Ok(()),
+            TopicReaders::Nobody { .. } => Err(OutletRefusal::NoReader),
+            TopicReaders::Present { .. } => Ok(()),
         }
     }
 
@@ -238,10 +238,10 @@ impl Outlet {
         source: Option<Timestamp>,
         (now, within): (Instant, Duration),
     ) -> Result<(), OutletRefusal> {
-        if matches!(self.audience, Audience::Nobody { .. }) {
+        if matches!(self.audience, TopicReaders::Nobody { .. }) {
             self.notice_matches(now);
         }
-        if matches!(self.audience, Audience::Nobody { .. }) {
+        if matches!(self.audience, TopicReaders::Nobody { .. }) {
             return Ok(());
         }
         self.offer_sample(
@@ -259,11 +259,11 @@ impl Outlet {
     #[must_use]
     pub fn progress(&self) -> OutletProgress {
         match self.audience {
-            Audience::Nobody { .. } => OutletProgress::NoReader,
-            Audience::Present { .. } if self.waiting.is_empty() && !self.is_uncertain() => {
+            TopicReaders::Nobody { .. } => OutletProgress::NoReader,
+            TopicReaders::Present { .. } if self.waiting.is_empty() && !self.is_uncertain() => {
                 OutletProgress::Written
             }
-            Audience::Present { .. } => OutletProgress::Waiting,
+            TopicReaders::Present { .. } => OutletProgress::Waiting,
         }
     }
 
@@ -274,18 +274,18 @@ impl Outlet {
     }
 
     fn offer_sample(&mut self, sample: WaitingSample, now: Instant) -> Result<(), OutletRefusal> {
-        if matches!(self.audience, Audience::Nobody { .. }) {
+        if matches!(self.audience, TopicReaders::Nobody { .. }) {
             self.notice_matches(now);
         }
         match &mut self.audience {
-            Audience::Nobody { .. } if self.offered == Offered::KeepLatest => {
+            TopicReaders::Nobody { .. } if self.offered == Offered::KeepLatest => {
                 return self.store(sample, now);
             }
-            Audience::Nobody { .. } => {}
-            Audience::Present { sample_size, .. } if sample.payload.len() > *sample_size => {
+            TopicReaders::Nobody { .. } => {}
+            TopicReaders::Present { sample_size, .. } if sample.payload.len() > *sample_size => {
                 return Err(OutletRefusal::TooLarge(*sample_size));
             }
-            Audience::Present { .. } => {}
+            TopicReaders::Present { .. } => {}
         }
         if !self.is_settled(now) {
             if self.waiting.len() < self.settling_room() && self.waiting.bytes() < MAX_IN_FLIGHT {
@@ -347,7 +347,7 @@ impl Outlet {
         self.former.retain(|former| !former.is_done(now));
         if readers.is_empty() {
             self.former.clear();
-            if !matches!(self.audience, Audience::Nobody { .. }) {
+            if !matches!(self.audience, TopicReaders::Nobody { .. }) {
                 self.leave_alone(now);
             }
             return Ok(());
@@ -375,7 +375,7 @@ impl Outlet {
                 Some(sample)
             };
         }
-        if let Audience::Nobody { held } = &mut self.audience {
+        if let TopicReaders::Nobody { held } = &mut self.audience {
             *held = rest;
         }
         Ok(())
@@ -387,7 +387,7 @@ impl Outlet {
         self.former.retain(|former| !former.is_done(now));
         // Repaired samples are older than new samples.
         let repaired = self.former.is_empty();
-        let Audience::Present { settling, seen, .. } = &mut self.audience else {
+        let TopicReaders::Present { settling, seen, .. } = &mut self.audience else {
             return true;
         };
         settling.take_if(|settling| {
@@ -407,7 +407,7 @@ impl Outlet {
     }
 
     fn settle(&mut self) {
-        if let Audience::Present { settling, .. } = &mut self.audience {
+        if let TopicReaders::Present { settling, .. } = &mut self.audience {
             *settling = None;
         }
     }
@@ -469,7 +469,7 @@ impl Outlet {
         if self.offered == Offered::KeepLatest {
             held = self.waiting.take_newest();
         }
-        self.audience = Audience::Nobody { held: None };
+        self.audience = TopicReaders::Nobody { held: None };
         if let Some(held) = held {
             // A writer that fails reports it at the next value.
             let _stored = self.store(held, now);
@@ -512,15 +512,15 @@ impl Outlet {
     /// Records the readers; returns the value that was held while there was no reader.
     fn greet(&mut self, now: Instant, number: usize, size: usize) -> Option<WaitingSample> {
         match &mut self.audience {
-            Audience::Present {
+            TopicReaders::Present {
                 seen, sample_size, ..
             } => {
                 (*seen, *sample_size) = (number, size);
                 None
             }
-            Audience::Nobody { held } => {
+            TopicReaders::Nobody { held } => {
                 let held = held.take();
-                self.audience = Audience::Present {
+                self.audience = TopicReaders::Present {
                     settling: Some(Settling {
                         since: now,
                         patience: PATIENCE,

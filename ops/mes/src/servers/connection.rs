@@ -424,8 +424,8 @@ const LONGEST_PAUSE: Duration = Duration::from_secs(60);
 const SETTLED: Duration = Duration::from_secs(1);
 /// Time in which further changes belong to the first change.
 const BURST: Duration = Duration::from_millis(200);
-/// Shortest time between two searches because of changes, and the same as a multiple of the duration
-/// of the last search.
+/// Shortest time between two searches because of changes, and the same as a multiple of the
+/// duration of the last search.
 const SHORTEST_REST: Duration = Duration::from_secs(10);
 const REST: u32 = 10;
 /// Reasons of a search.

@@ -12,21 +12,21 @@ use plant_opcua::types::{
 };
 
 /// The namespaces of a server, by which it numbers them.
-pub(super) struct Names {
+pub(super) struct NamespaceNames {
     uris: Vec<String>,
     context: ContextOwned,
 }
 
 /// Reason for which a value is not in the graph.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum ValueFault {
+pub(super) enum UnreadValue {
     /// Larger than the limit.
     TooLarge,
     /// A structure of a DataType that this program cannot decode.
     Undecoded,
 }
 
-impl Names {
+impl NamespaceNames {
     /// Reads the NamespaceArray of a server.
     pub(super) fn new(uris: Vec<String>) -> Self {
         let mut namespaces = NamespaceMap::new();
@@ -79,11 +79,11 @@ impl Names {
     /// Converts a value. `None` without a value.
     ///
     /// # Errors
-    /// [`ValueFault`].
-    pub(super) fn value(&self, value: &Variant) -> Result<Option<OntologyValue>, ValueFault> {
+    /// [`UnreadValue`].
+    pub(super) fn value(&self, value: &Variant) -> Result<Option<OntologyValue>, UnreadValue> {
         let typed = |built_in: &str, text: String| match text.len() <= LARGEST_VALUE {
             true => Ok(OntologyValue::scalar(built_in, &text)),
-            false => Err(ValueFault::TooLarge),
+            false => Err(UnreadValue::TooLarge),
         };
         match value {
             Variant::Empty => Ok(None),
@@ -115,7 +115,7 @@ impl Names {
                 Ok(self.target(id).map(|(name, _)| OntologyValue::Node(name)))
             }
             Variant::Variant(inner) => self.value(inner),
-            Variant::LocalizedText(_) => Err(ValueFault::TooLarge),
+            Variant::LocalizedText(_) => Err(UnreadValue::TooLarge),
             Variant::StatusCode(_)
             | Variant::QualifiedName(_)
             | Variant::XmlElement(_)
@@ -123,7 +123,7 @@ impl Names {
             | Variant::DiagnosticInfo(_) => self.encoded(value),
             Variant::ExtensionObject(object) if object.is_null() => Ok(None),
             Variant::ExtensionObject(object) if object.inner_is::<ByteStringBody>() => {
-                Err(ValueFault::Undecoded)
+                Err(UnreadValue::Undecoded)
             }
             Variant::ExtensionObject(_) => self.encoded(value),
             Variant::Array(array) => {
@@ -132,7 +132,7 @@ impl Names {
                         if object.inner_is::<ByteStringBody>())
                 };
                 match array.values.iter().any(is_undecoded) {
-                    true => Err(ValueFault::Undecoded),
+                    true => Err(UnreadValue::Undecoded),
                     false => self.encoded(value),
                 }
             }
@@ -140,7 +140,7 @@ impl Names {
     }
 
     /// Converts an array or a structure by its XML encoding, which NodeSets have too.
-    fn encoded(&self, value: &Variant) -> Result<Option<OntologyValue>, ValueFault> {
+    fn encoded(&self, value: &Variant) -> Result<Option<OntologyValue>, UnreadValue> {
         let mut buffer = vec![0; LARGEST_VALUE];
         let mut rest: &mut [u8] = &mut buffer;
         let written = {
@@ -152,12 +152,12 @@ impl Names {
         let length = LARGEST_VALUE.saturating_sub(rest.len());
         match (written, is_full) {
             (Ok(()), _) => {}
-            (Err(_), true) => return Err(ValueFault::TooLarge),
-            (Err(_), false) => return Err(ValueFault::Undecoded),
+            (Err(_), true) => return Err(UnreadValue::TooLarge),
+            (Err(_), false) => return Err(UnreadValue::Undecoded),
         }
         let xml = buffer.get(..length).unwrap_or_default();
-        let xml = std::str::from_utf8(xml).map_err(|_| ValueFault::Undecoded)?;
-        let value = OntologyValue::from_xml(xml).ok_or(ValueFault::Undecoded)?;
+        let xml = std::str::from_utf8(xml).map_err(|_| UnreadValue::Undecoded)?;
+        let value = OntologyValue::from_xml(xml).ok_or(UnreadValue::Undecoded)?;
         Ok(Some(value))
     }
 
@@ -365,9 +365,9 @@ mod tests {
 
     use super::*;
 
-    fn names() -> Names {
+    fn names() -> NamespaceNames {
         let uris = ["http://opcfoundation.org/UA/", "urn:server", "urn:maker"];
-        Names::new(uris.map(str::to_owned).to_vec())
+        NamespaceNames::new(uris.map(str::to_owned).to_vec())
     }
 
     #[test]
@@ -412,10 +412,10 @@ mod tests {
         };
         let json = OntologyValue::Json(serde_json::json!([7, 7]));
         assert_eq!(names.value(&array(2)), Ok(Some(json)));
-        assert_eq!(names.value(&array(100_000)), Err(ValueFault::TooLarge));
+        assert_eq!(names.value(&array(100_000)), Err(UnreadValue::TooLarge));
         let long = "x".repeat(LARGEST_VALUE + 1);
         let long = Variant::String(long.as_str().into());
-        assert_eq!(names.value(&long), Err(ValueFault::TooLarge));
+        assert_eq!(names.value(&long), Err(UnreadValue::TooLarge));
         // A namespace that the server does not list is refused.
         assert_eq!(names.name(&NodeId::new(9, 1)), None);
         assert_eq!(names.name(&NodeId::new(2, "y".repeat(5000))), None);

@@ -8,7 +8,7 @@ use plant_opcua::types::{AttributeId, DataValue, NodeId, VariableId, Variant};
 
 /// A server, as the search uses it.
 #[async_trait]
-pub(super) trait SearchedServer: Send + Sync {
+pub(super) trait BrowsableServer: Send + Sync {
     /// Returns the references of each node, at most `most` altogether.
     async fn references(
         &self,
@@ -25,7 +25,7 @@ pub(super) trait SearchedServer: Send + Sync {
 }
 
 #[async_trait]
-impl SearchedServer for OpcUaClient {
+impl BrowsableServer for OpcUaClient {
     async fn references(
         &self,
         nodes: &[NodeId],
@@ -65,7 +65,7 @@ impl Default for SearchLimits {
 }
 
 /// Reads the NamespaceArray, which may change while a server runs.
-pub(super) async fn namespaces(server: &dyn SearchedServer) -> Result<Vec<String>, ClientError> {
+pub(super) async fn namespaces(server: &dyn BrowsableServer) -> Result<Vec<String>, ClientError> {
     let id: NodeId = VariableId::Server_NamespaceArray.into();
     let read = server.attributes(&[(id, AttributeId::Value)]).await?;
     let value = read.into_iter().next().and_then(|value| value.value);

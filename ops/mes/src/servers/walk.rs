@@ -13,8 +13,8 @@ use plant_opcua::types::{
 };
 use tokio::time::Instant;
 
-use super::facts::{self, Names, ValueFault};
-use super::searched::{SearchFaults, SearchLimits, SearchedServer, namespaces};
+use super::facts::{self, NamespaceNames, UnreadValue};
+use super::searched::{BrowsableServer, SearchFaults, SearchLimits, namespaces};
 
 /// The nodes of a server, with remarks for people.
 #[derive(Debug)]
@@ -28,14 +28,14 @@ pub(super) struct Searched {
 /// # Errors
 /// The first request without a response.
 pub(super) async fn search(
-    server: &dyn SearchedServer,
+    server: &dyn BrowsableServer,
     start: &[NodeName],
     limits: &SearchLimits,
     is_known: &(dyn Fn(&str) -> bool + Sync),
 ) -> Result<Searched, ClientError> {
     let mut search = Search {
         server,
-        names: Names::new(namespaces(server).await?),
+        names: NamespaceNames::new(namespaces(server).await?),
         limits,
         ends: Instant::now() + limits.within,
         nodes: Vec::new(),
@@ -57,8 +57,8 @@ pub(super) async fn search(
 }
 
 struct Search<'a> {
-    server: &'a dyn SearchedServer,
-    names: Names,
+    server: &'a dyn BrowsableServer,
+    names: NamespaceNames,
     limits: &'a SearchLimits,
     ends: Instant,
     nodes: Vec<FoundNode>,
@@ -554,11 +554,11 @@ impl Search<'_> {
         let converted = value.value.as_ref().filter(|_| !status.is_bad());
         let converted = match converted.map(|value| self.names.value(value)) {
             Some(Ok(converted)) => converted,
-            Some(Err(ValueFault::TooLarge)) => {
+            Some(Err(UnreadValue::TooLarge)) => {
                 self.faults.large += 1;
                 None
             }
-            Some(Err(ValueFault::Undecoded)) => {
+            Some(Err(UnreadValue::Undecoded)) => {
                 self.faults.undecoded += 1;
                 None
             }

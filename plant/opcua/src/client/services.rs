@@ -421,8 +421,8 @@ impl OpcUaClient {
     }
 }
 
-/// Returns the references of the first page and of the pages that follow, at most `most`. References
-/// that precede a Bad page are dropped.
+/// Returns the references of the first page and of the pages that follow, at most `most`.
+/// References that precede a Bad page are dropped.
 async fn pages(
     connected: &ConnectedClient,
     first: BrowseResult,

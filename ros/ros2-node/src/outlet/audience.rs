@@ -5,7 +5,7 @@ use super::waiting::WaitingSample;
 
 /// The readers of the topic.
 #[derive(Debug)]
-pub(super) enum Audience {
+pub(super) enum TopicReaders {
     /// No reader. The history holds only the last state, for transient-local readers that appear
     /// later; volatile readers receive nothing that was written before. The history of the
     /// published RustDDS would keep all values without acknowledgement, so with it the state is

@@ -3,8 +3,8 @@
 //!
 //! Numbers go from ROS 1 to ROS 2 and back, ten a second. After each fault, the programs must be
 //! ready again, both subscribers must receive new numbers, and a process must run the skill of a
-//! component: otherwise a state is lost, or a process failed. The longest gap of each minute and the
-//! growth of memory are printed.
+//! component: otherwise a state is lost, or a process failed. The longest gap of each minute and
+//! the growth of memory are printed.
 
 mod plant;
 

@@ -62,7 +62,7 @@ impl InMemory {
 }
 
 #[async_trait]
-impl SearchedServer for InMemory {
+impl BrowsableServer for InMemory {
     async fn references(
         &self,
         nodes: &[NodeId],
@@ -192,7 +192,7 @@ fn found<'s>(searched: &'s Searched, name: &NodeName) -> Option<&'s ServedNode> 
     nodes.find(|served| served.node.name == *name)
 }
 
-async fn searched(server: &dyn SearchedServer, limits: &SearchLimits) -> Searched {
+async fn searched(server: &dyn BrowsableServer, limits: &SearchLimits) -> Searched {
     search(server, &[], limits, &|_| false).await.unwrap()
 }
 
@@ -257,7 +257,7 @@ async fn types_of_known_nodesets_are_not_searched() {
 struct Endless;
 
 #[async_trait]
-impl SearchedServer for Endless {
+impl BrowsableServer for Endless {
     async fn references(
         &self,
         nodes: &[NodeId],
