@@ -523,11 +523,7 @@ fn a_query_is_sent_as_it_is_and_what_is_wrong_with_it_is_told() {
     );
     let away = run(&["ask", "what-can-run", "--url", &url]);
     assert_eq!(away.code, 69);
-    assert!(
-        away.stderr.contains("no connection: "),
-        "{}",
-        away.stderr
-    );
+    assert!(away.stderr.contains("no connection: "), "{}", away.stderr);
 }
 
 #[test]

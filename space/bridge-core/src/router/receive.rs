@@ -538,13 +538,9 @@ impl TopicQueues {
         }
         if let Err((cause, detail)) = written {
             self.recycle(payload);
-            let (cause, detail) = match sample.no_value() {
-                Some(status) => {
-                    let detail = format!("the status of the value is {:#010x}", status.0);
-                    (Reason::NoValue.into(), detail)
-                }
-                None => (cause, detail),
-            };
+            let no_value = sample.no_value();
+            let (cause, detail) =
+                no_value.map_or((cause, detail), |detail| (Reason::NoValue.into(), detail));
             // The local side does not have the value, so its repetition must be delivered.
             self.forget(at, sample.instance);
             self.count(DropSite::topic(at.topic()), cause, 1, || detail);
@@ -650,9 +646,9 @@ pub(super) struct LocalSample<'a> {
 }
 
 impl LocalSample<'_> {
-    /// Returns the status of a sample whose source is lost: a Bad StatusCode in the place of a
-    /// value, or a null value of Bad status.
-    fn no_value(&self) -> Option<StatusCode> {
+    /// Returns the status of a sample whose source is lost, as text: a Bad StatusCode in the place
+    /// of a value, or a null value of Bad status.
+    fn no_value(&self) -> Option<String> {
         let of_sample = StatusCode::from_status(self.status);
         let is_bad = |status: StatusCode| status.0 & STATUS_BAD != 0;
         let mut fields = self.fields.clone().filter_map(Result::ok);
@@ -661,7 +657,8 @@ impl LocalSample<'_> {
             Variant::Null => Some(of_sample),
             Variant::Scalar(_) | Variant::Array(_) | Variant::Matrix(_) => None,
         });
-        status.filter(|status| is_bad(*status))
+        let status = status.filter(|status| is_bad(*status))?;
+        Some(format!("the status of the value is {:#010x}", status.0))
     }
 }
 
