@@ -1,0 +1,522 @@
+//! Surfaces of faces, with two coordinates on each.
+
+use std::f64::consts::TAU;
+
+use crate::edge::TOLERANCE;
+use crate::fault::ShapeFault;
+use crate::spline::{BezierCurve, BezierPatch, SplineSurface};
+use crate::vector::{Placement, Vector};
+
+/// A surface.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) enum Surface {
+    Plane(Placement),
+    Cylinder { placement: Placement, radius: f64 },
+    /// A cone with its radius at the origin, which grows by `slope` along z.
+    Cone { placement: Placement, radius: f64, slope: f64 },
+    Sphere { placement: Placement, radius: f64 },
+    Torus { placement: Placement, major: f64, minor: f64 },
+    Spline(Box<PatchGrid>),
+    /// A curve that is moved along z of the placement.
+    Extrusion { placement: Placement, profile: ProfileCurve },
+    /// A curve that is turned around z of the placement.
+    Revolution { placement: Placement, profile: ProfileCurve },
+}
+
+/// The curve of an extrusion or a revolution.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct ProfileCurve {
+    pub(crate) pieces: Vec<BezierCurve>,
+}
+
+/// The coordinates of a point on a surface.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct ChartPoint {
+    /// `None` at a pole, where all values are the same point.
+    pub(crate) s: Option<f64>,
+    pub(crate) t: f64,
+    /// The distance of the point from the surface in millimetres.
+    pub(crate) distance: f64,
+}
+
+/// The course of the coordinates of a surface. The normal of the surface is that of s and t, in
+/// this order.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct ChartForm {
+    /// The period of s, if the surface is closed along it.
+    pub(crate) s: Option<f64>,
+    pub(crate) t: Option<f64>,
+    /// Whether the surface ends in a point where t is least.
+    pub(crate) has_bottom_pole: bool,
+    /// Whether the surface ends in a point where t is largest.
+    pub(crate) has_top_pole: bool,
+}
+
+impl ChartForm {
+    /// Returns whether the surface has no border.
+    pub(crate) fn is_closed(self) -> bool {
+        self.s.is_some() && (self.t.is_some() || (self.has_bottom_pole && self.has_top_pole))
+    }
+}
+
+impl ProfileCurve {
+    pub(crate) fn new(pieces: Vec<BezierCurve>) -> Result<Self, ShapeFault> {
+        if pieces.is_empty() {
+            return Err(ShapeFault::Empty("points"));
+        }
+        Ok(Self { pieces })
+    }
+
+    fn ends(&self) -> (Vector, Vector) {
+        let first = self.pieces.first().map_or(Vector::default(), BezierCurve::first);
+        let last = self.pieces.last().map_or(Vector::default(), BezierCurve::last);
+        (first, last)
+    }
+
+    fn is_ring(&self) -> bool {
+        let (first, last) = self.ends();
+        (first - last).length() <= TOLERANCE
+    }
+
+    /// Returns the length of the range of parameters.
+    fn period(&self) -> f64 {
+        let from = self.pieces.first().map_or(0.0, |piece| piece.from);
+        self.pieces.last().map_or(0.0, |piece| piece.to) - from
+    }
+
+    /// Returns the parameter with the least distance, and the distance.
+    fn nearest(&self, distance: &impl Fn(Vector) -> f64) -> (f64, f64) {
+        let found = self.pieces.iter().map(|piece| piece.nearest(distance));
+        let found = found.min_by(|a, b| a.1.total_cmp(&b.1));
+        found.unwrap_or((0.0, f64::INFINITY))
+    }
+
+    /// Returns the point at a parameter.
+    fn at(&self, parameter: f64) -> Vector {
+        let piece = self.pieces.iter().find(|piece| parameter <= piece.to);
+        piece.or(self.pieces.last()).map_or(Vector::default(), |piece| {
+            let share = (parameter - piece.from) / (piece.to - piece.from);
+            piece.at(share.clamp(0.0, 1.0))
+        })
+    }
+}
+
+impl Surface {
+    /// Returns the surface with other axes, if this has no effect on its points: a sphere whose
+    /// poles are far from some points.
+    pub(crate) fn with_poles_far_from(self, points: &[Vector]) -> Self {
+        let Self::Sphere { placement, radius } = self else {
+            return self;
+        };
+        let mut best = (f64::NEG_INFINITY, placement);
+        let steps = [-1.0, -0.37, 0.21, 0.83];
+        for (x, y, z) in steps
+            .iter()
+            .flat_map(|x| steps.iter().map(move |y| (x, y)))
+            .flat_map(|(x, y)| steps.iter().map(move |z| (*x, *y, *z)))
+        {
+            let axis = Vector::new(x, y, z);
+            let reference = Some(Vector::new(-y, z, x));
+            let Some(tried) = Placement::new(placement.origin, axis, reference) else {
+                continue;
+            };
+            let off = points.iter().map(|point| {
+                let local = tried.local(*point);
+                local.x.hypot(local.y)
+            });
+            let off = off.fold(f64::INFINITY, f64::min);
+            if off > best.0 {
+                best = (off, tried);
+            }
+        }
+        Self::Sphere {
+            placement: best.1,
+            radius,
+        }
+    }
+
+    /// Returns about the number of comparisons that the coordinates of a point need.
+    pub(crate) fn cost(&self) -> u64 {
+        let count = match self {
+            Self::Spline(grid) => grid.starts.len() + 1000,
+            Self::Extrusion { profile, .. } | Self::Revolution { profile, .. } => {
+                profile.pieces.len() * 500
+            }
+            Self::Plane(_)
+            | Self::Cylinder { .. }
+            | Self::Cone { .. }
+            | Self::Sphere { .. }
+            | Self::Torus { .. } => 64,
+        };
+        u64::try_from(count).unwrap_or(u64::MAX)
+    }
+
+    /// Returns how the coordinates of the surface run.
+    pub(crate) fn form(&self) -> ChartForm {
+        let open = ChartForm {
+            s: None,
+            t: None,
+            has_bottom_pole: false,
+            has_top_pole: false,
+        };
+        let round = ChartForm {
+            s: Some(TAU),
+            ..open
+        };
+        match self {
+            Self::Plane(_) => open,
+            Self::Cylinder { .. } => round,
+            Self::Cone { .. } => ChartForm {
+                has_bottom_pole: true,
+                ..round
+            },
+            Self::Sphere { .. } => ChartForm {
+                has_bottom_pole: true,
+                has_top_pole: true,
+                ..round
+            },
+            Self::Torus { .. } => ChartForm {
+                t: Some(TAU),
+                ..round
+            },
+            Self::Spline(grid) => grid.form,
+            Self::Extrusion { profile, .. } => ChartForm {
+                s: profile.is_ring().then(|| profile.period()),
+                ..open
+            },
+            Self::Revolution { placement, profile } => {
+                let is_pole = |point: Vector| {
+                    let local = placement.local(point);
+                    local.x.hypot(local.y) <= TOLERANCE
+                };
+                let (first, last) = profile.ends();
+                ChartForm {
+                    t: profile.is_ring().then(|| profile.period()),
+                    has_bottom_pole: is_pole(first),
+                    has_top_pole: is_pole(last),
+                    ..round
+                }
+            }
+        }
+    }
+
+    /// Returns whether s and t are in the reverse order about the normal of the surface.
+    pub(crate) fn is_mirrored(&self) -> bool {
+        matches!(self, Self::Spline(grid) if grid.is_swapped)
+    }
+
+    /// Returns the coordinates of a point.
+    pub(crate) fn chart(&self, point: Vector) -> ChartPoint {
+        match self {
+            Self::Plane(placement) => {
+                let local = placement.local(point);
+                ChartPoint {
+                    s: Some(local.x),
+                    t: local.y,
+                    distance: local.z.abs(),
+                }
+            }
+            Self::Cylinder { placement, radius } => {
+                let local = placement.local(point);
+                ChartPoint {
+                    s: Some(local.y.atan2(local.x)),
+                    t: local.z,
+                    distance: (local.x.hypot(local.y) - radius).abs(),
+                }
+            }
+            Self::Cone {
+                placement,
+                radius,
+                slope,
+            } => {
+                let local = placement.local(point);
+                let (flat, expected) = (local.x.hypot(local.y), radius + local.z * slope);
+                // Behind the apex is another cone.
+                let distance = if expected < 0.0 {
+                    flat.hypot(local.z + radius / slope)
+                } else {
+                    (flat - expected).abs() / slope.hypot(1.0)
+                };
+                ChartPoint {
+                    s: (flat > TOLERANCE).then(|| local.y.atan2(local.x)),
+                    t: local.z,
+                    distance,
+                }
+            }
+            Self::Sphere { placement, radius } => {
+                let local = placement.local(point);
+                let flat = local.x.hypot(local.y);
+                ChartPoint {
+                    s: (flat > TOLERANCE).then(|| local.y.atan2(local.x)),
+                    t: local.z.atan2(flat),
+                    distance: (local.length() - radius).abs(),
+                }
+            }
+            Self::Torus {
+                placement,
+                major,
+                minor,
+            } => {
+                let local = placement.local(point);
+                let off = local.x.hypot(local.y) - major;
+                ChartPoint {
+                    s: Some(local.y.atan2(local.x)),
+                    t: local.z.atan2(off),
+                    distance: (off.hypot(local.z) - minor).abs(),
+                }
+            }
+            Self::Spline(grid) => grid.chart(point),
+            Self::Extrusion { placement, profile } => {
+                let flat = |at: Vector| {
+                    let local = placement.local_direction(at - point);
+                    local.x.hypot(local.y)
+                };
+                let (s, distance) = profile.nearest(&flat);
+                let t = placement.local_direction(point - profile.at(s)).z;
+                ChartPoint {
+                    s: Some(s),
+                    t,
+                    distance,
+                }
+            }
+            Self::Revolution { placement, profile } => {
+                let local = placement.local(point);
+                let radius = local.x.hypot(local.y);
+                let off = |at: Vector| {
+                    let at = placement.local(at);
+                    (at.x.hypot(at.y) - radius).hypot(at.z - local.z)
+                };
+                let (t, distance) = profile.nearest(&off);
+                let at = placement.local(profile.at(t));
+                let turn = local.y.atan2(local.x) - at.y.atan2(at.x);
+                ChartPoint {
+                    s: (radius > TOLERANCE).then_some(turn),
+                    t,
+                    distance,
+                }
+            }
+        }
+    }
+}
+
+/// The patches of a B-spline surface, with points to begin searches at.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct PatchGrid {
+    pub(crate) patches: Vec<BezierPatch>,
+    /// Points of the patches: the number of the patch, both shares and the point.
+    starts: Vec<(usize, f64, f64, Vector)>,
+    form: ChartForm,
+    /// Whether s is v: the surface is closed along v only, or ends in a point along u.
+    is_swapped: bool,
+}
+
+impl PatchGrid {
+    pub(crate) fn new(surface: &SplineSurface) -> Result<Self, ShapeFault> {
+        let patches = surface.patches();
+        if patches.len() > MOST_PATCHES {
+            return Err(ShapeFault::TooLarge);
+        }
+        let mut starts = Vec::new();
+        for (number, patch) in patches.iter().enumerate() {
+            for (u, v) in SHARES.iter().flat_map(|u| SHARES.iter().map(move |v| (*u, *v))) {
+                starts.push((number, u, v, patch.at(u, v).0));
+            }
+        }
+        let ((u0, u1), (v0, v1)) = surface.domain();
+        let side = |is_side: &dyn Fn(&BezierPatch) -> Option<bool>| -> Vec<Vector> {
+            let of_patch = |patch: &BezierPatch| {
+                let along_u = is_side(patch)?;
+                let points = SHARES.iter().map(|at| match along_u {
+                    true => patch.at(*at, 0.0).0,
+                    false => patch.at(0.0, *at).0,
+                });
+                Some(points.collect::<Vec<Vector>>())
+            };
+            patches.iter().filter_map(of_patch).flatten().collect()
+        };
+        let end = |is_side: &dyn Fn(&BezierPatch) -> Option<bool>| -> Vec<Vector> {
+            let of_patch = |patch: &BezierPatch| {
+                let along_u = is_side(patch)?;
+                let points = SHARES.iter().map(|at| match along_u {
+                    true => patch.at(*at, 1.0).0,
+                    false => patch.at(1.0, *at).0,
+                });
+                Some(points.collect::<Vec<Vector>>())
+            };
+            patches.iter().filter_map(of_patch).flatten().collect()
+        };
+        let left = side(&|patch| (patch.u.0 <= u0).then_some(false));
+        let right = end(&|patch| (patch.u.1 >= u1).then_some(false));
+        let bottom = side(&|patch| (patch.v.0 <= v0).then_some(true));
+        let top = end(&|patch| (patch.v.1 >= v1).then_some(true));
+        let is_same = |a: &[Vector], b: &[Vector]| {
+            a.len() == b.len() && a.iter().zip(b).all(|(a, b)| (*a - *b).length() <= TOLERANCE)
+        };
+        let is_point = |side: &[Vector]| {
+            let first = side.first().copied().unwrap_or_default();
+            side.iter().all(|point| (*point - first).length() <= TOLERANCE)
+        };
+        let (closed_u, closed_v) = (is_same(&left, &right), is_same(&bottom, &top));
+        let is_swapped =
+            !closed_u && (closed_v || is_point(&left) || is_point(&right));
+        let form = if is_swapped {
+            ChartForm {
+                s: closed_v.then_some(v1 - v0),
+                t: closed_u.then_some(u1 - u0),
+                has_bottom_pole: is_point(&left),
+                has_top_pole: is_point(&right),
+            }
+        } else {
+            ChartForm {
+                s: closed_u.then_some(u1 - u0),
+                t: closed_v.then_some(v1 - v0),
+                has_bottom_pole: is_point(&bottom),
+                has_top_pole: is_point(&top),
+            }
+        };
+        Ok(Self {
+            patches,
+            starts,
+            form,
+            is_swapped,
+        })
+    }
+
+    /// Returns s and t for the parameters u and v.
+    pub(crate) fn coordinates(&self, u: f64, v: f64) -> (f64, f64) {
+        if self.is_swapped { (v, u) } else { (u, v) }
+    }
+
+    /// Finds the nearest point of the surface.
+    fn chart(&self, point: Vector) -> ChartPoint {
+        // The best starts, each in another patch.
+        let mut starts: Vec<(f64, usize, f64, f64)> = Vec::new();
+        for (number, u, v, start) in &self.starts {
+            let distance = (*start - point).length();
+            if let Some(same) = starts.iter_mut().find(|start| start.1 == *number) {
+                if distance < same.0 {
+                    *same = (distance, *number, *u, *v);
+                }
+            } else if starts.len() < TRIED {
+                starts.push((distance, *number, *u, *v));
+            } else if let Some(worst) = starts.iter_mut().max_by(|a, b| a.0.total_cmp(&b.0))
+                && distance < worst.0
+            {
+                *worst = (distance, *number, *u, *v);
+            }
+        }
+        let mut best = ChartPoint {
+            s: None,
+            t: 0.0,
+            distance: f64::INFINITY,
+        };
+        starts.sort_by(|a, b| a.0.total_cmp(&b.0));
+        for (_, number, u, v) in starts {
+            if best.distance < TOLERANCE / 100.0 {
+                break;
+            }
+            let Some(patch) = self.patches.get(number) else {
+                continue;
+            };
+            let (u, v) = nearest(patch, point, (u, v));
+            let (on, du, dv) = patch.at(u, v);
+            let distance = (on - point).length();
+            if distance < best.distance {
+                let of = |(from, to): (f64, f64), share: f64| from + (to - from) * share;
+                let (s, t) = self.coordinates(of(patch.u, u), of(patch.v, v));
+                let along = if self.is_swapped { dv } else { du };
+                best = ChartPoint {
+                    s: (along.length() > TOLERANCE).then_some(s),
+                    t,
+                    distance,
+                };
+            }
+        }
+        best
+    }
+}
+
+/// Finds the shares of the nearest point of a patch by the method of Gauss and Newton.
+fn nearest(patch: &BezierPatch, point: Vector, (mut u, mut v): (f64, f64)) -> (f64, f64) {
+    for _ in 0..ROUNDS {
+        let (on, du, dv) = patch.at(u, v);
+        let off = point - on;
+        let (a, b, c) = (du.dot(du), du.dot(dv), dv.dot(dv));
+        let (e, f) = (off.dot(du), off.dot(dv));
+        let determinant = a * c - b * b;
+        let alone = |slope: f64, square: f64| if square > 1e-18 { slope / square } else { 0.0 };
+        let (mut by_u, mut by_v) = if determinant > 1e-9 * a * c && determinant > 0.0 {
+            ((e * c - f * b) / determinant, (f * a - e * b) / determinant)
+        } else {
+            (alone(e, a), alone(f, c))
+        };
+        // At a border that the step would cross, only the other share changes.
+        let is_out = |at: f64, by: f64| (at <= 0.0 && by < 0.0) || (at >= 1.0 && by > 0.0);
+        if is_out(u, by_u) {
+            (by_u, by_v) = (0.0, alone(f, c));
+        } else if is_out(v, by_v) {
+            (by_u, by_v) = (alone(e, a), 0.0);
+        }
+        let (next_u, next_v) = ((u + by_u).clamp(0.0, 1.0), (v + by_v).clamp(0.0, 1.0));
+        let change = (next_u - u).abs().max((next_v - v).abs());
+        (u, v) = (next_u, next_v);
+        if change < 1e-12 {
+            break;
+        }
+    }
+    (u, v)
+}
+
+/// Shares of a patch at which searches begin.
+const SHARES: [f64; 5] = [0.0, 0.25, 0.5, 0.75, 1.0];
+/// Number of patches that are searched for the nearest point.
+const TRIED: usize = 5;
+/// Maximum number of steps of a search.
+const ROUNDS: u32 = 30;
+/// Maximum number of patches of a surface.
+const MOST_PATCHES: usize = 4096;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn points_off_a_surface_have_their_distance() {
+        let placement = Placement::IDENTITY;
+        let radius = 5.0;
+        for (surface, point, distance) in [
+            (Surface::Plane(placement), Vector::new(1.0, 2.0, -3.0), 3.0),
+            (
+                Surface::Cylinder { placement, radius },
+                Vector::new(0.0, 6.5, 9.0),
+                1.5,
+            ),
+            (
+                Surface::Sphere { placement, radius },
+                Vector::new(0.0, 3.0, 0.0),
+                2.0,
+            ),
+            (
+                Surface::Torus {
+                    placement,
+                    major: 5.0,
+                    minor: 1.0,
+                },
+                Vector::new(5.0, 0.0, 3.0),
+                2.0,
+            ),
+            (
+                Surface::Cone {
+                    placement,
+                    radius,
+                    slope: 1.0,
+                },
+                Vector::new(5.0 + 2.0_f64.sqrt(), 0.0, 0.0),
+                1.0,
+            ),
+        ] {
+            let found = surface.chart(point).distance;
+            assert!((found - distance).abs() < 1e-9, "{surface:?} {found}");
+        }
+    }
+}
