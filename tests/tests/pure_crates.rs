@@ -245,6 +245,7 @@ fn what_the_plant_thinks_with_reaches_no_io_and_knows_no_space() {
         "program",
         "registry",
         "rml",
+        "step-files",
         "trust",
         "uri-text",
         "xml-text",

@@ -3,7 +3,7 @@
 use std::f64::consts::TAU;
 
 use crate::fault::ShapeFault;
-use crate::spline::{BezierCurve, SplineCurve};
+use crate::spline::{BezierCurve, SplineCurve, nearest_of};
 use crate::vector::{Placement, Vector};
 
 /// Largest distance in millimetres at which points, curves and surfaces count as coincident.
@@ -20,9 +20,16 @@ const MOST_POINTS: usize = 8192;
 /// A curve without ends.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) enum Curve {
-    Line { point: Vector, direction: Vector },
+    Line {
+        point: Vector,
+        direction: Vector,
+    },
     /// A circle or an ellipse, with its radii along x and y.
-    Ellipse { placement: Placement, x: f64, y: f64 },
+    Ellipse {
+        placement: Placement,
+        x: f64,
+        y: f64,
+    },
     Spline(SplineCurve),
 }
 
@@ -123,7 +130,10 @@ impl EdgeSpan {
                 from,
                 sweep,
             } => {
-                let (a, b) = (placement.x.dot(direction) * x, placement.y.dot(direction) * y);
+                let (a, b) = (
+                    placement.x.dot(direction) * x,
+                    placement.y.dot(direction) * y,
+                );
                 let extreme = b.atan2(a);
                 let (start, length) = if *sweep < 0.0 {
                     (from + sweep, -sweep)
@@ -146,7 +156,9 @@ impl EdgeSpan {
 /// are above the points of the curve are halved.
 fn extreme(pieces: &[BezierCurve], direction: Vector) -> Bounds {
     let value = |point: Vector| point.dot(direction);
-    let ends = pieces.iter().flat_map(|piece| [piece.first(), piece.last()]);
+    let ends = pieces
+        .iter()
+        .flat_map(|piece| [piece.first(), piece.last()]);
     let mut bounds = Bounds::NONE;
     bounds.reached = ends.map(value).fold(bounds.reached, f64::max);
     let mut open: Vec<BezierCurve> = pieces.to_vec();
@@ -249,16 +261,18 @@ fn ordered_pieces(
     let (from, to) = if along { (first, last) } else { (last, first) };
     let at_end = |point: Vector, end: Vector| (point - end).length() <= TOLERANCE;
     let find = |point: Vector| {
-        let found = whole.iter().map(|piece| piece.nearest(&|at| (at - point).length()));
-        let found = found.min_by(|a, b| a.1.total_cmp(&b.1));
-        let (at, distance) = found.unwrap_or((start, f64::INFINITY));
+        let (at, distance) = nearest_of(&whole, &|at: Vector| (at - point).length());
         if distance <= TOLERANCE {
             Ok(at)
         } else {
             Err(ShapeFault::VertexOffCurve { distance })
         }
     };
-    let from = if at_end(from, head) { start } else { find(from)? };
+    let from = if at_end(from, head) {
+        start
+    } else {
+        find(from)?
+    };
     let to = if at_end(to, tail) { end } else { find(to)? };
     let mut pieces = if from < to {
         if is_closed && !is_ring {
@@ -311,7 +325,8 @@ impl Span {
                 Ok((0..=count).map(point).collect())
             }
             Self::Pieces(pieces) => {
-                let mut points: Vec<Vector> = pieces.iter().take(1).map(BezierCurve::first).collect();
+                let mut points: Vec<Vector> =
+                    pieces.iter().take(1).map(BezierCurve::first).collect();
                 for piece in pieces {
                     flatten(piece, &mut points, 0)?;
                 }
@@ -363,7 +378,10 @@ mod tests {
         let off = Vector::new(5.02, 0.0, 0.0);
         let up = Vector::new(0.0, 5.0, 0.0);
         let edge = EdgeSpan::new(&circle(), (off, up), false, true);
-        assert!(matches!(edge, Err(ShapeFault::VertexOffCurve { .. })), "{edge:?}");
+        assert!(
+            matches!(edge, Err(ShapeFault::VertexOffCurve { .. })),
+            "{edge:?}"
+        );
         let line = Curve::Line {
             point: Vector::default(),
             direction: Vector::X,

@@ -4,6 +4,9 @@
 //! normal points. The number of a place is the sum of the windings of the edges around it. It is 1
 //! within the face and 0 outside; any other number refutes the face.
 
+use std::cmp::Ordering;
+use std::collections::BinaryHeap;
+
 use crate::edge::{Bounds, EdgeSpan, MOST_STEPS, NARROW, TOLERANCE};
 use crate::fault::ShapeFault;
 use crate::spline::{BezierCurve, BezierPatch, off_segment};
@@ -64,10 +67,12 @@ impl CheckedFace {
             .flat_map(|edge| edge.span.points.iter().copied())
             .collect();
         let surface = surface.with_poles_far_from(&points);
-        let count = edges.iter().map(|edge| edge.span.points.len()).sum::<usize>();
-        let most = u64::try_from(count).map_or(u64::MAX, |count| {
-            count.saturating_mul(surface.cost())
-        });
+        let count = edges
+            .iter()
+            .map(|edge| edge.span.points.len())
+            .sum::<usize>();
+        let most =
+            u64::try_from(count).map_or(u64::MAX, |count| count.saturating_mul(surface.cost()));
         *work = work.saturating_add(most);
         if *work > MOST_WORK {
             return Err(ShapeFault::TooLarge);
@@ -107,12 +112,7 @@ impl CheckedFace {
 
     /// Returns bounds of the largest values in a direction of length 1 within the face, above a
     /// value that edges reach.
-    pub(crate) fn inner(
-        &self,
-        direction: Vector,
-        reached: f64,
-        work: &mut u64,
-    ) -> InnerExtreme {
+    pub(crate) fn inner(&self, direction: Vector, reached: f64, work: &mut u64) -> InnerExtreme {
         match &self.surface {
             // A straight line goes through each point, so that the extremes are on edges.
             Surface::Plane(_) | Surface::Cylinder { .. } | Surface::Extrusion { .. } => {
@@ -154,9 +154,10 @@ impl CheckedFace {
         let at = self.surface.chart(point);
         let mut bounds = Bounds::NONE;
         match self.chart.contains(point, (at.s, at.t), 0.0) {
-            Some(true) => bounds = Bounds::exact(value),
-            Some(false) => {}
-            None => bounds.limit = value,
+            Membership::Inside => bounds = Bounds::exact(value),
+            Membership::Outside => {}
+            // The value is not above that of the edge by more than their distance.
+            Membership::Near(_) => bounds.limit = value,
         }
         InnerExtreme {
             bounds,
@@ -172,43 +173,29 @@ impl CheckedFace {
         work: &mut u64,
     ) -> InnerExtreme {
         let value = |point: Vector| point.dot(direction);
-        let mut found = InnerExtreme::NONE;
-        let mut best = reached;
-        let mut open: Vec<BezierPatch> = grid.patches.clone();
-        let mut steps = 0;
-        while let Some(patch) = open.pop() {
-            let most = patch.most(value);
-            if most <= best + NARROW || steps >= MOST_STEPS || *work > MOST_WORK {
-                found.bounds.limit = found.bounds.limit.max(most);
-                continue;
-            }
-            steps += 1;
+        let ranked = |patch: BezierPatch| (patch.most(value), patch);
+        let mut search = Search::new(grid.patches.iter().cloned().map(ranked), reached);
+        while let Some(Ranked { most, piece }) = search.next(*work <= MOST_WORK) {
             *work = work.saturating_add(self.chart.cost());
-            let (middle, du, dv) = patch.at(0.5, 0.5);
-            let (u, v) = ((patch.u.0 + patch.u.1) / 2.0, (patch.v.0 + patch.v.1) / 2.0);
-            let radius = patch.most(|point| (point - middle).length());
+            let (middle, du, dv) = piece.at(0.5, 0.5);
+            let (u, v) = (
+                f64::midpoint(piece.u.0, piece.u.1),
+                f64::midpoint(piece.v.0, piece.v.1),
+            );
+            let radius = piece.most(|point| (point - middle).length());
             let (s, t) = grid.coordinates(u, v);
-            match self.chart.contains(middle, (Some(s), t), radius) {
-                Some(false) => continue,
-                Some(true) if value(middle) > best => {
-                    best = value(middle);
-                    found.bounds.reached = best;
-                    let normal = du.cross(dv).dot(direction);
-                    found.is_inward = (normal < 0.0) == self.is_outward;
-                }
-                Some(true) => {}
-                None if radius < NARROW => {
-                    found.bounds.limit = found.bounds.limit.max(most);
-                    continue;
-                }
-                // The surface may be in the face near its middle although an edge is near.
-                None => {}
+            let probe = Probe {
+                value: value(middle),
+                radius,
+                membership: self.chart.contains(middle, (Some(s), t), radius),
+                is_inward: (du.cross(dv).dot(direction) < 0.0) == self.is_outward,
+            };
+            if search.goes_on(most, &probe) {
+                let (low, high) = piece.halves();
+                search.push([ranked(low), ranked(high)]);
             }
-            let (low, high) = patch.halves();
-            open.extend([low, high]);
         }
-        found.bounds.limit = found.bounds.limit.max(found.bounds.reached);
-        found
+        search.end()
     }
 
     /// Searches the curve of a surface of revolution, turned to where it is highest.
@@ -228,17 +215,9 @@ impl CheckedFace {
             let at = placement.local(point);
             origin + at.z * local.z + at.x.hypot(at.y) * tilt
         };
-        let mut found = InnerExtreme::NONE;
-        let mut best = reached;
-        let mut open: Vec<BezierCurve> = profile.pieces.clone();
-        let mut steps = 0;
-        while let Some(piece) = open.pop() {
-            let most = piece.most(height);
-            if most <= best + NARROW || steps >= MOST_STEPS || *work > MOST_WORK {
-                found.bounds.limit = found.bounds.limit.max(most);
-                continue;
-            }
-            steps += 1;
+        let ranked = |piece: BezierCurve| (piece.most(height), piece);
+        let mut search = Search::new(profile.pieces.iter().cloned().map(ranked), reached);
+        while let Some(Ranked { most, piece }) = search.next(*work <= MOST_WORK) {
             *work = work.saturating_add(self.chart.cost());
             let (low, high) = piece.split(0.5);
             let at = placement.local(low.last());
@@ -246,22 +225,146 @@ impl CheckedFace {
             let middle = placement.point(middle);
             let radius = piece.most(|point| (point - low.last()).length());
             let chart = self.surface.chart(middle);
-            match self.chart.contains(middle, (chart.s, chart.t), radius) {
-                Some(false) => continue,
-                Some(true) if middle.dot(direction) > best => {
-                    best = middle.dot(direction);
-                    found.bounds.reached = best;
-                }
-                None if radius < NARROW => {
-                    found.bounds.limit = found.bounds.limit.max(most);
-                    continue;
-                }
-                Some(true) | None => {}
+            let probe = Probe {
+                value: middle.dot(direction),
+                radius,
+                membership: self.chart.contains(middle, (chart.s, chart.t), radius),
+                is_inward: self
+                    .normal(middle)
+                    .is_some_and(|normal| normal.dot(direction) < 0.0),
+            };
+            if search.goes_on(most, &probe) {
+                search.push([ranked(low), ranked(high)]);
             }
-            open.extend([low, high]);
         }
-        found.bounds.limit = found.bounds.limit.max(found.bounds.reached);
-        found
+        search.end()
+    }
+
+    /// Returns the normal of the face at a point; `None` where it has none.
+    pub(crate) fn normal(&self, point: Vector) -> Option<Vector> {
+        let normal = self.surface.normal(point)?;
+        Some(if self.is_outward { normal } else { -normal })
+    }
+
+    /// Returns whether the edges enclose two places of the surface, of which the sense of the face
+    /// chooses one.
+    pub(crate) fn has_choice(&self) -> bool {
+        let form = self.surface.form();
+        (form.has_top_pole || form.t.is_some()) && !self.chart.is_whole
+    }
+}
+
+/// The place of the points around a point.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum Membership {
+    Inside,
+    Outside,
+    /// The edges of the face are at this distance from the point.
+    Near(f64),
+}
+
+/// A piece of a surface or a curve, by its upper bound.
+struct Ranked<T> {
+    most: f64,
+    piece: T,
+}
+
+impl<T> PartialEq for Ranked<T> {
+    fn eq(&self, other: &Self) -> bool {
+        self.cmp(other).is_eq()
+    }
+}
+
+impl<T> Eq for Ranked<T> {}
+
+impl<T> PartialOrd for Ranked<T> {
+    fn partial_cmp(&self, other: &Self) -> Option<Ordering> {
+        Some(self.cmp(other))
+    }
+}
+
+impl<T> Ord for Ranked<T> {
+    fn cmp(&self, other: &Self) -> Ordering {
+        self.most.total_cmp(&other.most)
+    }
+}
+
+/// The search for the largest value of pieces, the piece with the largest bound first.
+struct Search<T> {
+    open: BinaryHeap<Ranked<T>>,
+    /// The value that edges reach.
+    edges: f64,
+    /// The largest value so far.
+    best: f64,
+    found: InnerExtreme,
+    steps: usize,
+}
+
+/// A point of a piece: its value, the largest distance of the piece from it, and its place.
+struct Probe {
+    value: f64,
+    radius: f64,
+    membership: Membership,
+    is_inward: bool,
+}
+
+impl<T> Search<T> {
+    fn new(pieces: impl Iterator<Item = (f64, T)>, edges: f64) -> Self {
+        Self {
+            open: pieces.map(|(most, piece)| Ranked { most, piece }).collect(),
+            edges,
+            best: edges,
+            found: InnerExtreme::NONE,
+            steps: 0,
+        }
+    }
+
+    /// Returns the next piece that may exceed the largest value so far.
+    fn next(&mut self, has_work: bool) -> Option<Ranked<T>> {
+        let next = self.open.pop()?;
+        if next.most <= self.best + NARROW || self.steps >= MOST_STEPS || !has_work {
+            let bounds = &mut self.found.bounds;
+            bounds.limit = bounds.limit.max(next.most);
+            return None;
+        }
+        self.steps += 1;
+        Some(next)
+    }
+
+    /// Takes a point of a piece into account. Returns whether the piece has to be split.
+    fn goes_on(&mut self, most: f64, probe: &Probe) -> bool {
+        match probe.membership {
+            Membership::Outside => return false,
+            Membership::Inside => {
+                if probe.value > self.best {
+                    self.best = probe.value;
+                    self.found.bounds.reached = probe.value;
+                    self.found.is_inward = probe.is_inward;
+                }
+            }
+            Membership::Near(distance) => {
+                // No point of the piece is farther from an edge than this.
+                let of_edge = self.edges + NARROW + distance + probe.radius;
+                if of_edge <= self.best + NEAR_EDGE {
+                    let bounds = &mut self.found.bounds;
+                    bounds.limit = bounds.limit.max(most.min(of_edge));
+                    return false;
+                }
+            }
+        }
+        true
+    }
+
+    fn push(&mut self, pieces: [(f64, T); 2]) {
+        let pieces = pieces.into_iter();
+        self.open
+            .extend(pieces.map(|(most, piece)| Ranked { most, piece }));
+    }
+
+    fn end(mut self) -> InnerExtreme {
+        let bounds = &mut self.found.bounds;
+        bounds.limit = bounds.limit.max(bounds.reached);
+        self.found
     }
 }
 
@@ -338,6 +441,7 @@ impl Chart {
             bottom: None,
             is_whole: false,
         };
+        let offset = chart.offset();
         for (number, (course, edge)) in courses.iter().zip(edges).enumerate() {
             for (from, to) in course.iter().zip(course.iter().skip(1)) {
                 let dt = reduced(to.2 - from.2, form.t);
@@ -345,7 +449,7 @@ impl Chart {
                 chart.segments.push(Segment {
                     edge: number,
                     s: from.1 + shear * from.2,
-                    t: within(from.2, form.t),
+                    t: within(from.2 + offset, form.t),
                     ds,
                     dt,
                     first: from.0,
@@ -367,6 +471,12 @@ impl Chart {
         Ok(chart)
     }
 
+    /// Returns a distance along t by which the line where a closed surface begins is moved away
+    /// from vertices, which are often there.
+    fn offset(&self) -> f64 {
+        self.form.t.map_or(0.0, |period| 0.117_31 * period)
+    }
+
     /// Checks the numbers on both sides of each edge.
     fn check(&mut self, edges: &[FaceEdge<'_>]) -> Result<(), ShapeFault> {
         // The place at the top is outside, unless the surface has no border there.
@@ -383,7 +493,10 @@ impl Chart {
                 let Some(segment) = self.segments.get(at).copied() else {
                     continue;
                 };
-                let (s, t) = (segment.s + segment.ds / 2.0, segment.t + segment.dt / 2.0);
+                let (s, t) = (
+                    segment.s + segment.ds * TRIED,
+                    segment.t + segment.dt * TRIED,
+                );
                 let above = self.number((s, t), Some(at));
                 let expected = i64::from(segment.is_seam || segment.ds > 0.0);
                 if !is_base_known {
@@ -419,7 +532,10 @@ impl Chart {
             .map(|(at, _)| at)
             .collect();
         let quarters = [1, 2, 3].map(|quarter| own.len() * quarter / 4);
-        let mut all: Vec<usize> = quarters.iter().filter_map(|at| own.get(*at).copied()).collect();
+        let mut all: Vec<usize> = quarters
+            .iter()
+            .filter_map(|at| own.get(*at).copied())
+            .collect();
         all.dedup();
         all
     }
@@ -460,23 +576,25 @@ impl Chart {
     }
 
     /// Returns whether all points of the surface within a radius around a point are in the face,
-    /// or all outside; `None` if an edge is near.
-    fn contains(&self, point: Vector, (s, t): (Option<f64>, f64), radius: f64) -> Option<bool> {
+    /// or all outside.
+    fn contains(&self, point: Vector, (s, t): (Option<f64>, f64), radius: f64) -> Membership {
         if self.is_whole {
-            return Some(true);
+            return Membership::Inside;
         }
-        let near = radius + 2.0 * TOLERANCE;
         let own = self.segments.iter().filter(|segment| !segment.is_seam);
-        let mut own = own.map(|segment| off_segment(point, segment.first, segment.last));
-        if own.any(|distance| distance <= near) {
-            return None;
+        let own = own.map(|segment| off_segment(point, segment.first, segment.last));
+        let distance = own.fold(f64::INFINITY, f64::min);
+        if distance <= radius + MARGIN {
+            return Membership::Near(distance);
         }
         // At a pole, any s will do.
-        let s = s.unwrap_or_default() + self.shear * t;
-        match self.number((s, t), None) {
-            0 => Some(false),
-            1 => Some(true),
-            _ => None,
+        // Beside the point, because vertices are often exactly above points of note.
+        let beside = 1.371e-9 * self.form.s.unwrap_or_default();
+        let s = s.unwrap_or_default() + self.shear * t + beside;
+        match self.number((s, t + self.offset()), None) {
+            0 => Membership::Outside,
+            1 => Membership::Inside,
+            _ => Membership::Near(distance),
         }
     }
 }
@@ -508,7 +626,10 @@ fn course(surface: &Surface, edge: &FaceEdge<'_>) -> Result<EdgeCourse, ShapeFau
     for point in &edge.span.points {
         let at = surface.chart(*point);
         // A NaN is no distance.
-        if !matches!(at.distance.partial_cmp(&(1.5 * TOLERANCE)), Some(std::cmp::Ordering::Less)) {
+        if !matches!(
+            at.distance.partial_cmp(&(1.5 * TOLERANCE)),
+            Some(Ordering::Less)
+        ) {
             let edge = edge.id;
             let distance = at.distance;
             return Err(ShapeFault::EdgeOffSurface { edge, distance });
@@ -519,7 +640,13 @@ fn course(surface: &Surface, edge: &FaceEdge<'_>) -> Result<EdgeCourse, ShapeFau
     // At a pole, an edge has the s of the point beside it.
     let known: Vec<Option<f64>> = points.iter().map(|point| point.1).collect();
     let beside = |at: usize| {
-        let before = known.get(..at).unwrap_or_default().iter().rev().flatten().next();
+        let before = known
+            .get(..at)
+            .unwrap_or_default()
+            .iter()
+            .rev()
+            .flatten()
+            .next();
         let behind = known.get(at..).unwrap_or_default().iter().flatten().next();
         before.or(behind).copied().unwrap_or_default()
     };
@@ -548,5 +675,12 @@ fn whole(number: f64) -> Option<i64> {
     turns.map(i64::from)
 }
 
+/// The share of a segment at which its sides are compared. Halves are often above vertices.
+const TRIED: f64 = 0.437_21;
+/// Distance in millimetres from edges within which the place of a point is not certain. It is
+/// larger than the tolerances of edges.
+const MARGIN: f64 = 0.016;
+/// The largest uncertainty in millimetres of pieces near edges.
+const NEAR_EDGE: f64 = 0.03;
 /// Maximum number of comparisons of edges with each other, of all faces.
 pub(crate) const MOST_WORK: u64 = 200_000_000;

@@ -80,7 +80,9 @@ pub enum ShapeFault {
         edge: u64,
     },
     /// The edges of a face do not enclose it.
-    #[error("its edges do not enclose it on their left (at edge #{edge}); a sense is wrong, or edges cross")]
+    #[error(
+        "its edges do not enclose it on their left (at edge #{edge}); a sense is wrong, or edges cross"
+    )]
     Orientation {
         /// The edge.
         edge: u64,
@@ -89,8 +91,11 @@ pub enum ShapeFault {
     #[error("its edges do not bound it: the surface goes on without end")]
     Unbounded,
     /// The outside of an extreme point is inside of the solid.
-    #[error("it is the outermost face, but its normal points inwards; a same_sense is wrong")]
+    #[error("it is an outermost face, but its normal points inwards; a same_sense is wrong")]
     Inward,
+    /// Two faces lie on each other.
+    #[error("the faces beside it lie on each other; a same_sense is wrong")]
+    Fold,
     /// A list has no members.
     #[error("it has no {0}")]
     Empty(&'static str),

@@ -5,7 +5,7 @@ use std::f64::consts::FRAC_PI_2;
 use crate::edge::{Curve, TOLERANCE};
 use crate::fault::ShapeFault;
 use crate::part21::ExchangeFile;
-use crate::records::{EntityArguments, AtEntity, FaultAt};
+use crate::records::{AtEntity, EntityArguments, FaultAt};
 use crate::spline::{Knots, SplineCurve, SplineFault, SplineSurface};
 use crate::surface::{PatchGrid, ProfileCurve, Surface};
 use crate::units::Units;
@@ -157,7 +157,9 @@ impl Geometry<'_> {
             "POLYLINE" => {
                 let points = self.points(&arguments.references(1)?)?;
                 let knots = implied("QUASI_UNIFORM", 1, points.len()).at(id)?;
-                SplineCurve::new(knots, &points, None).map(Curve::Spline).at(id)
+                SplineCurve::new(knots, &points, None)
+                    .map(Curve::Spline)
+                    .at(id)
             }
             _ => self.spline_curve(id).map(Curve::Spline),
         }
@@ -352,7 +354,11 @@ fn ellipse(placement: &Placement, x: f64, y: f64) -> Result<SplineCurve, SplineF
     let points = corners.map(|(u, v)| placement.point(Vector::new(u * x, v * y, 0.0)));
     let half = std::f64::consts::FRAC_1_SQRT_2;
     let weights = [1.0, half, 1.0, half, 1.0, half, 1.0, half, 1.0];
-    let knots = Knots::new(2, (&[3, 2, 2, 2, 3], &[0.0, 1.0, 2.0, 3.0, 4.0]), points.len())?;
+    let knots = Knots::new(
+        2,
+        (&[3, 2, 2, 2, 3], &[0.0, 1.0, 2.0, 3.0, 4.0]),
+        points.len(),
+    )?;
     SplineCurve::new(knots, &points, Some(&weights))
 }
 

@@ -198,7 +198,9 @@ impl Reader<'_> {
     }
 
     fn part(&mut self, depth: usize) -> Result<EntityPart, StepFault> {
-        let name = self.word().ok_or_else(|| self.wrong("the name of an entity"))?;
+        let name = self
+            .word()
+            .ok_or_else(|| self.wrong("the name of an entity"))?;
         let parameters = self.list(depth)?;
         Ok(EntityPart { name, parameters })
     }
@@ -267,11 +269,17 @@ impl Reader<'_> {
         let text = text.strip_prefix('+').unwrap_or(text);
         if !text.contains('.') && !text.contains(['e', 'E']) {
             let read = text.parse().map(Parameter::Integer);
-            return read.map_err(|_| StepFault::Number { line, text: shown() });
+            return read.map_err(|_| StepFault::Number {
+                line,
+                text: shown(),
+            });
         }
         match text.parse::<f64>() {
             Ok(number) if number.is_finite() => Ok(Parameter::Real(number)),
-            Ok(_) => Err(StepFault::Number { line, text: shown() }),
+            Ok(_) => Err(StepFault::Number {
+                line,
+                text: shown(),
+            }),
             Err(_) => Err(StepFault::Syntax {
                 line,
                 found: format!("`{}`", shown()),
@@ -288,7 +296,9 @@ impl Reader<'_> {
         }
         let digits = self.bytes.get(from..self.at).unwrap_or_default();
         let digits = std::str::from_utf8(digits).unwrap_or_default();
-        digits.parse().map_err(|_| self.wrong("the number of a record"))
+        digits
+            .parse()
+            .map_err(|_| self.wrong("the number of a record"))
     }
 
     /// Reads a string in quotes. A quote in it is doubled.
@@ -378,7 +388,10 @@ impl Reader<'_> {
         let is_next = rest
             .get(..text.len())
             .is_some_and(|next| next.eq_ignore_ascii_case(text.as_bytes()));
-        let is_word = text.as_bytes().last().is_some_and(u8::is_ascii_alphanumeric);
+        let is_word = text
+            .as_bytes()
+            .last()
+            .is_some_and(u8::is_ascii_alphanumeric);
         let goes_on = rest
             .get(text.len())
             .is_some_and(|byte| byte.is_ascii_alphanumeric() || *byte == b'_');
@@ -478,7 +491,11 @@ mod tests {
             Parameter::Typed("LENGTH".to_owned(), vec![Parameter::Real(3.0)]),
         ];
         assert_eq!(read.records[&1].parts[0].parameters, expected);
-        let names: Vec<&str> = read.records[&2].parts.iter().map(|part| &*part.name).collect();
+        let names: Vec<&str> = read.records[&2]
+            .parts
+            .iter()
+            .map(|part| &*part.name)
+            .collect();
         assert_eq!((names, read.records[&2].line), (vec!["B", "C_D"], 8));
     }
 
@@ -486,12 +503,18 @@ mod tests {
     fn a_fault_has_the_line_and_the_text() {
         let deep = format!("#1=A({}{});", "(".repeat(40), ")".repeat(40));
         for (data, expected) in [
-            ("#1=A(1.0E999);", "line 6: the number `1.0E999` is too large"),
+            (
+                "#1=A(1.0E999);",
+                "line 6: the number `1.0E999` is too large",
+            ),
             ("#1=A();\n#1=B();", "line 7: the number #1 is used twice"),
             ("#1=A(1;", "line 6: found `;`, expected ,"),
             ("#1=A('x", "expected the end of a string"),
             ("#1=A(1.2.3);", "line 6: found `1.2.3`, expected a number"),
-            ("#1=A(#99999999999999999999);", "expected the number of a record"),
+            (
+                "#1=A(#99999999999999999999);",
+                "expected the number of a record",
+            ),
             (&deep, "more than 16 lists within each other"),
         ] {
             let fault = ExchangeFile::read(file(data).as_bytes()).unwrap_err();

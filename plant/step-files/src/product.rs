@@ -244,7 +244,10 @@ impl<'f> ProductStructure<'f> {
                 self.shapes.entry(definition).or_default().push(shape);
             }
         }
-        for name in ["SHAPE_REPRESENTATION_RELATIONSHIP", "REPRESENTATION_RELATIONSHIP"] {
+        for name in [
+            "SHAPE_REPRESENTATION_RELATIONSHIP",
+            "REPRESENTATION_RELATIONSHIP",
+        ] {
             for id in file.all(name) {
                 if file.is(id, "REPRESENTATION_RELATIONSHIP_WITH_TRANSFORMATION") {
                     continue;
@@ -304,11 +307,16 @@ impl<'f> ProductStructure<'f> {
     }
 
     fn items(&self, representation: u64) -> Result<Vec<u64>, FaultAt> {
-        self.file.one_of(representation, &REPRESENTATIONS)?.references(1)
+        self.file
+            .one_of(representation, &REPRESENTATIONS)?
+            .references(1)
     }
 
     fn geometry(&self, representation: u64) -> Result<Geometry<'f>, FaultAt> {
-        let context = self.file.one_of(representation, &REPRESENTATIONS)?.reference(2)?;
+        let context = self
+            .file
+            .one_of(representation, &REPRESENTATIONS)?
+            .reference(2)?;
         Ok(Geometry {
             file: self.file,
             units: Units::of(self.file, context)?,
@@ -316,8 +324,16 @@ impl<'f> ProductStructure<'f> {
     }
 
     /// Returns the placement of an occurrence: from the part to the assembly.
-    fn placement(&self, occurrence: u64, (assembly, part): (u64, u64)) -> Result<Placement, FaultAt> {
-        let places = self.places.get(&occurrence).map(Vec::as_slice).unwrap_or_default();
+    fn placement(
+        &self,
+        occurrence: u64,
+        (assembly, part): (u64, u64),
+    ) -> Result<Placement, FaultAt> {
+        let places = self
+            .places
+            .get(&occurrence)
+            .map(Vec::as_slice)
+            .unwrap_or_default();
         let [relation] = places else {
             return Err(ShapeFault::Placements(places.len())).at(occurrence);
         };
@@ -327,7 +343,9 @@ impl<'f> ProductStructure<'f> {
             &["REPRESENTATION_RELATIONSHIP_WITH_TRANSFORMATION"],
         )?;
         let transformation = with.reference(with.len().saturating_sub(1))?;
-        let between = self.file.one_of(transformation, &["ITEM_DEFINED_TRANSFORMATION"])?;
+        let between = self
+            .file
+            .one_of(transformation, &["ITEM_DEFINED_TRANSFORMATION"])?;
         let (of_first, of_second) = (between.reference(2)?, between.reference(3)?);
         let (of_part, of_assembly) = (self.representations(part), self.representations(assembly));
         let is_forward = of_part.contains(&first) && of_assembly.contains(&second);
@@ -395,7 +413,10 @@ impl ShapeReading<'_> {
         let parts = self.structure.parts.get(&assembly);
         let parts = parts.map(Vec::as_slice).unwrap_or_default();
         let occurrences = parts.iter().map(|(entity, part)| {
-            let usage = self.structure.file.find(*entity, "NEXT_ASSEMBLY_USAGE_OCCURRENCE");
+            let usage = self
+                .structure
+                .file
+                .find(*entity, "NEXT_ASSEMBLY_USAGE_OCCURRENCE");
             let text = |at: usize| usage.map_or("", |usage| usage.text(at)).to_owned();
             let placement = self.structure.placement(*entity, (assembly, *part));
             ProductOccurrence {
@@ -506,7 +527,10 @@ impl ShapeReading<'_> {
                 .solids
                 .entry(key)
                 .or_insert_with(|| CheckedSolid::read(&geometry, item, work));
-            let found = solid.as_ref().map_err(Clone::clone)?.bounds(direction, work)?;
+            let found = solid
+                .as_ref()
+                .map_err(Clone::clone)?
+                .bounds(direction, work)?;
             all = with(all, found);
         }
         Ok(all)
@@ -514,7 +538,11 @@ impl ShapeReading<'_> {
 }
 
 fn with(all: (Bounds, u64), more: (Bounds, u64)) -> (Bounds, u64) {
-    let entity = if more.0.limit > all.0.limit { more.1 } else { all.1 };
+    let entity = if more.0.limit > all.0.limit {
+        more.1
+    } else {
+        all.1
+    };
     (all.0.with(more.0), entity)
 }
 

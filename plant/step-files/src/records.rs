@@ -40,7 +40,10 @@ impl ExchangeFile {
         let Some(record) = self.records.get(&id) else {
             return "missing".to_owned();
         };
-        let names = record.parts.iter().map(|part| part.name.chars().take(60).collect());
+        let names = record
+            .parts
+            .iter()
+            .map(|part| part.name.chars().take(60).collect());
         let mut names: Vec<String> = names.take(8).collect();
         if names.len() > 1 {
             // All complex instances have these, which say little.

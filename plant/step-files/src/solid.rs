@@ -6,15 +6,25 @@ use crate::edge::{Bounds, EdgeSpan, TOLERANCE};
 use crate::face::{CheckedFace, FaceEdge, MOST_WORK};
 use crate::fault::{EdgeUse, ShapeFault};
 use crate::geometry::Geometry;
-use crate::records::{EntityArguments, AtEntity, FaultAt};
+use crate::records::{AtEntity, EntityArguments, FaultAt};
 use crate::vector::Vector;
 
 /// A solid whose shell is closed.
 #[derive(Debug)]
 pub(crate) struct CheckedSolid {
     id: u64,
-    edges: Vec<(u64, EdgeSpan)>,
+    edges: Vec<SolidEdge>,
     faces: Vec<(u64, CheckedFace)>,
+    /// Whether the sense of a face chooses between two parts of its surface.
+    has_choice: bool,
+}
+
+/// An edge of a solid with the indices of its faces.
+#[derive(Debug)]
+struct SolidEdge {
+    id: u64,
+    span: EdgeSpan,
+    faces: Vec<usize>,
 }
 
 /// An edge of the file.
@@ -84,21 +94,87 @@ impl CheckedSolid {
             }
             faces.push(read_face(geometry, id, &mut edges)?);
         }
+        turn_tori(geometry, &mut faces);
         check_uses(&faces)?;
         let mut checked = Vec::new();
         for face in &faces {
             checked.push((face.id, check_face(geometry, face, &edges, work)?));
         }
-        let mut edges: Vec<(u64, EdgeSpan)> = edges
-            .into_iter()
-            .map(|(id, edge)| (id, edge.span))
-            .collect();
-        edges.sort_by_key(|(id, _)| *id);
-        Ok(Self {
+        let mut users: HashMap<u64, Vec<usize>> = HashMap::new();
+        for (at, face) in faces.iter().enumerate() {
+            for (edge, _) in &face.uses {
+                users.entry(*edge).or_default().push(at);
+            }
+        }
+        let edges = edges.into_iter().map(|(id, edge)| SolidEdge {
+            id,
+            span: edge.span,
+            faces: users.remove(&id).unwrap_or_default(),
+        });
+        let mut edges: Vec<SolidEdge> = edges.collect();
+        edges.sort_by_key(|edge| edge.id);
+        let has_choice = checked.iter().any(|(_, face)| face.has_choice());
+        let solid = Self {
             id: solid,
             edges,
             faces: checked,
-        })
+            has_choice,
+        };
+        solid.check_folds()?;
+        Ok(solid)
+    }
+
+    /// Checks that no two faces lie on each other at their edge: one of them has the wrong sense.
+    fn check_folds(&self) -> Result<(), FaultAt> {
+        for edge in &self.edges {
+            let middle = edge.span.points.get(edge.span.points.len() / 2);
+            let middle = middle.copied().unwrap_or_default();
+            let faces = edge.faces.iter().filter_map(|at| self.faces.get(*at));
+            let mut normals = faces.filter_map(|(_, face)| face.normal(middle));
+            if let (Some(a), Some(b)) = (normals.next(), normals.next())
+                && a.dot(b) < FOLDED
+            {
+                return Err(ShapeFault::Fold).at(edge.id);
+            }
+        }
+        Ok(())
+    }
+
+    /// Checks that the solid is inside of the faces at its outermost edge. A solid that is inside
+    /// out may have the wrong parts of spheres and tori.
+    fn check_outside(&self, direction: Vector) -> Result<(), FaultAt> {
+        let mut top = (f64::NEG_INFINITY, None);
+        for edge in &self.edges {
+            for point in &edge.span.points {
+                let value = point.dot(direction);
+                if value > top.0 {
+                    top = (value, Some((edge, *point)));
+                }
+            }
+        }
+        let Some((_, point)) = top.1 else {
+            return Ok(());
+        };
+        // All faces that meet at the point, of which one is steepest.
+        let mut steepest = (0.0_f64, 0);
+        for edge in &self.edges {
+            let is_here = |at: &Vector| (*at - point).length() <= TOLERANCE;
+            if !edge.span.points.iter().any(is_here) {
+                continue;
+            }
+            for (id, face) in edge.faces.iter().filter_map(|at| self.faces.get(*at)) {
+                let slope = face
+                    .normal(point)
+                    .map_or(0.0, |normal| normal.dot(direction));
+                if slope.abs() > steepest.0.abs() {
+                    steepest = (slope, *id);
+                }
+            }
+        }
+        if steepest.0 < -LEAST_SLOPE {
+            return Err(ShapeFault::Inward).at(steepest.1);
+        }
+        Ok(())
     }
 
     /// Returns bounds of the largest value in a direction of length 1, and the entity that has the
@@ -117,10 +193,10 @@ impl CheckedSolid {
         if *work > MOST_WORK {
             return Err(ShapeFault::TooLarge).at(self.id);
         }
-        for (id, edge) in &self.edges {
-            let bounds = edge.bounds(direction);
+        for edge in &self.edges {
+            let bounds = edge.span.bounds(direction);
             if bounds.limit > all.limit {
-                decisive = *id;
+                decisive = edge.id;
             }
             all = all.with(bounds);
         }
@@ -142,6 +218,15 @@ impl CheckedSolid {
         if inward.0 > outward + 2.0 * TOLERANCE {
             return Err(ShapeFault::Inward).at(inward.1);
         }
+        if self.has_choice && outward <= of_edges + TOLERANCE {
+            let count = self
+                .edges
+                .iter()
+                .map(|edge| edge.span.points.len())
+                .sum::<usize>();
+            *work = work.saturating_add(u64::try_from(count).unwrap_or(u64::MAX));
+            self.check_outside(direction)?;
+        }
         Ok((all, decisive))
     }
 }
@@ -149,7 +234,9 @@ impl CheckedSolid {
 /// Returns the shell with its faces; an oriented shell names another one.
 fn shell_of<'f>(geometry: &Geometry<'f>, id: u64) -> Result<EntityArguments<'f>, FaultAt> {
     if let Some(oriented) = geometry.file.find(id, "ORIENTED_CLOSED_SHELL") {
-        return geometry.file.one_of(oriented.reference(2)?, &["CLOSED_SHELL"]);
+        return geometry
+            .file
+            .one_of(oriented.reference(2)?, &["CLOSED_SHELL"]);
     }
     geometry.file.one_of(id, &["CLOSED_SHELL"])
 }
@@ -159,18 +246,25 @@ fn read_face(
     id: u64,
     edges: &mut HashMap<u64, ReadEdge>,
 ) -> Result<ReadFace, FaultAt> {
-    let face = geometry.file.one_of(id, &["ADVANCED_FACE", "FACE_SURFACE"])?;
+    let face = geometry
+        .file
+        .one_of(id, &["ADVANCED_FACE", "FACE_SURFACE"])?;
     let mut uses = Vec::new();
     let mut points = Vec::new();
     for bound in face.references(1)? {
-        let bound = geometry.file.one_of(bound, &["FACE_OUTER_BOUND", "FACE_BOUND"])?;
+        let bound = geometry
+            .file
+            .one_of(bound, &["FACE_OUTER_BOUND", "FACE_BOUND"])?;
         let (ring, is_same) = (bound.reference(1)?, bound.boolean(2)?);
         if let Some(vertex) = geometry.file.find(ring, "VERTEX_LOOP") {
             points.push(vertex.reference(1)?);
             continue;
         }
         let ring = read_loop(geometry, ring, edges)?;
-        uses.extend(ring.into_iter().map(|(edge, along)| (edge, along == is_same)));
+        uses.extend(
+            ring.into_iter()
+                .map(|(edge, along)| (edge, along == is_same)),
+        );
     }
     Ok(ReadFace {
         id,
@@ -233,6 +327,28 @@ fn vertex(geometry: &Geometry<'_>, id: u64) -> Result<Vector, FaultAt> {
     geometry.point(vertex.reference(1)?)
 }
 
+/// Turns the loops of a torus whose edges all run as in the faces beside it. Some writers give the
+/// bounds of tori the wrong orientation; the faces beside leave no choice.
+fn turn_tori(geometry: &Geometry<'_>, faces: &mut [ReadFace]) {
+    let mut uses: HashMap<(u64, bool), usize> = HashMap::new();
+    for (edge, along) in faces.iter().flat_map(|face| &face.uses) {
+        *uses.entry((*edge, *along)).or_default() += 1;
+    }
+    for face in faces {
+        if !geometry.file.is(face.surface, "TOROIDAL_SURFACE") {
+            continue;
+        }
+        let is_seam = |(edge, along): &(u64, bool)| face.uses.contains(&(*edge, !*along));
+        let mut own = face.uses.iter().filter(|used| !is_seam(used)).peekable();
+        let is_turned = own.peek().is_some() && own.all(|used| uses.get(used) == Some(&2));
+        if is_turned {
+            for (_, along) in &mut face.uses {
+                *along = !*along;
+            }
+        }
+    }
+}
+
 /// Checks that each edge is used twice, in opposite directions.
 fn check_uses(faces: &[ReadFace]) -> Result<(), FaultAt> {
     let mut uses: HashMap<u64, (usize, usize)> = HashMap::new();
@@ -264,7 +380,10 @@ fn check_face(
     let surface = geometry.surface(face.surface)?;
     for point in &face.points {
         let distance = surface.chart(vertex(geometry, *point)?).distance;
-        if !matches!(distance.partial_cmp(&TOLERANCE), Some(std::cmp::Ordering::Less)) {
+        if !matches!(
+            distance.partial_cmp(&TOLERANCE),
+            Some(std::cmp::Ordering::Less)
+        ) {
             return Err(ShapeFault::VertexOffCurve { distance }).at(*point);
         }
     }
@@ -289,4 +408,8 @@ fn check_face(
 
 /// Solids whose extents are read.
 pub(crate) const SOLIDS: [&str; 2] = ["MANIFOLD_SOLID_BREP", "BREP_WITH_VOIDS"];
+/// The cosine of the angle of two normals beyond which faces lie on each other.
+const FOLDED: f64 = -0.995;
+/// The least cosine of a normal and a direction that says on which side the solid is.
+const LEAST_SLOPE: f64 = 0.05;
 const AXES: [Vector; 3] = [Vector::X, Vector::Y, Vector::Z];

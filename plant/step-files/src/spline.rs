@@ -88,7 +88,11 @@ impl Knots {
         }
         let knots = Self { degree, all };
         let (from, to) = knots.domain();
-        if from < to { Ok(knots) } else { Err(SplineFault::Knots) }
+        if from < to {
+            Ok(knots)
+        } else {
+            Err(SplineFault::Knots)
+        }
     }
 
     fn knot(&self, at: usize) -> f64 {
@@ -152,14 +156,19 @@ impl Knots {
 /// Creates control points; without weights, all weights are 1.
 fn controls(points: &[Vector], weights: Option<&[f64]>) -> Result<Vec<ControlPoint>, SplineFault> {
     let Some(weights) = weights else {
-        return Ok(points.iter().map(|point| ControlPoint::new(*point, 1.0)).collect());
+        return Ok(points
+            .iter()
+            .map(|point| ControlPoint::new(*point, 1.0))
+            .collect());
     };
     if weights.len() != points.len() {
         return Err(SplineFault::Count);
     }
     let smallest = weights.iter().copied().fold(f64::INFINITY, f64::min);
     let largest = weights.iter().copied().fold(0.0, f64::max);
-    let are_fit = weights.iter().all(|weight| weight.is_finite() && *weight > 0.0);
+    let are_fit = weights
+        .iter()
+        .all(|weight| weight.is_finite() && *weight > 0.0);
     if !are_fit || largest > smallest * 1e6 {
         return Err(SplineFault::Weights);
     }
@@ -214,11 +223,15 @@ pub(crate) struct BezierCurve {
 
 impl BezierCurve {
     pub(crate) fn first(&self) -> Vector {
-        self.controls.first().map_or(Vector::default(), |all| all.position())
+        self.controls
+            .first()
+            .map_or(Vector::default(), |all| all.position())
     }
 
     pub(crate) fn last(&self) -> Vector {
-        self.controls.last().map_or(Vector::default(), |all| all.position())
+        self.controls
+            .last()
+            .map_or(Vector::default(), |all| all.position())
     }
 
     pub(crate) fn reversed(&self) -> Self {
@@ -263,16 +276,20 @@ impl BezierCurve {
         self.most(|point| off_segment(point, first, last))
     }
 
-    /// Returns the nearest point to another one: its parameter and its distance.
-    pub(crate) fn nearest(&self, distance: &impl Fn(Vector) -> f64) -> (f64, f64) {
-        const TRIES: i32 = 24;
+    /// Returns the share of several that is nearest to a point, and its distance.
+    fn about_nearest(&self, distance: &impl Fn(Vector) -> f64) -> (f64, f64) {
         let tries = (0..=TRIES).map(|at| f64::from(at) / f64::from(TRIES));
         let tries = tries.map(|share| (share, distance(self.at(share))));
-        let best = tries.min_by(|a, b| a.1.total_cmp(&b.1)).unwrap_or((0.0, f64::INFINITY));
-        let step = 1.0 / f64::from(TRIES);
-        let (mut low, mut high) = ((best.0 - step).max(0.0), (best.0 + step).min(1.0));
+        let best = tries.min_by(|a, b| a.1.total_cmp(&b.1));
+        best.unwrap_or((0.0, f64::INFINITY))
+    }
+
+    /// Returns the parameter of the nearest point, and its distance.
+    fn nearest(&self, best: (f64, f64), distance: &impl Fn(Vector) -> f64) -> (f64, f64) {
         // The golden section: the interval shrinks below 1e-9 of the piece.
         const GOLDEN: f64 = 0.618_033_988_749_894_9;
+        let step = 1.0 / f64::from(TRIES);
+        let (mut low, mut high) = ((best.0 - step).max(0.0), (best.0 + step).min(1.0));
         for _ in 0..40 {
             let (a, b) = (high - (high - low) * GOLDEN, low + (high - low) * GOLDEN);
             if distance(self.at(a)) <= distance(self.at(b)) {
@@ -281,11 +298,27 @@ impl BezierCurve {
                 low = a;
             }
         }
-        let ends = [low, high, (low + high) / 2.0, best.0];
+        let ends = [low, high, f64::midpoint(low, high), best.0];
         let ends = ends.map(|share| (share, distance(self.at(share))));
-        let best = ends.into_iter().min_by(|a, b| a.1.total_cmp(&b.1)).unwrap_or(best);
+        let best = ends
+            .into_iter()
+            .min_by(|a, b| a.1.total_cmp(&b.1))
+            .unwrap_or(best);
         (self.from + (self.to - self.from) * best.0, best.1)
     }
+}
+
+/// Returns the parameter of the nearest point of several pieces, and its distance.
+pub(crate) fn nearest_of(pieces: &[BezierCurve], distance: &impl Fn(Vector) -> f64) -> (f64, f64) {
+    let about = pieces
+        .iter()
+        .map(|piece| (piece, piece.about_nearest(distance)));
+    let mut about: Vec<_> = about.collect();
+    about.sort_by(|a, b| a.1.1.total_cmp(&b.1.1));
+    let near = about.into_iter().take(REFINED);
+    let near = near.map(|(piece, best)| piece.nearest(best, distance));
+    let best = near.min_by(|a, b| a.1.total_cmp(&b.1));
+    best.unwrap_or((0.0, f64::INFINITY))
 }
 
 /// Returns the distance of a point from a segment.
@@ -393,6 +426,12 @@ impl BezierPatch {
         values.fold(f64::NEG_INFINITY, f64::max)
     }
 
+    /// Returns the degrees along u and v.
+    pub(crate) fn degrees(&self) -> (usize, usize) {
+        let of_v = self.rows.first().map_or(0, Vec::len);
+        (self.rows.len().saturating_sub(1), of_v.saturating_sub(1))
+    }
+
     /// Returns both halves, along the longer side of the patch.
     pub(crate) fn halves(&self) -> (Self, Self) {
         let corner = |row: Option<&Vec<ControlPoint>>, is_last: bool| {
@@ -412,7 +451,11 @@ impl BezierPatch {
         } else {
             du > dv
         };
-        if is_u { self.split_u(0.5) } else { self.split_v(0.5) }
+        if is_u {
+            self.split_u(0.5)
+        } else {
+            self.split_v(0.5)
+        }
     }
 
     pub(crate) fn split_u(&self, at: f64) -> (Self, Self) {
@@ -482,7 +525,9 @@ fn near(controls: &[ControlPoint], at: f64) -> Vec<ControlPoint> {
 fn transposed(rows: &[Vec<ControlPoint>]) -> Vec<Vec<ControlPoint>> {
     let width = rows.first().map_or(0, Vec::len);
     let column = |at: usize| {
-        let column = rows.iter().map(|row| row.get(at).copied().unwrap_or_default());
+        let column = rows
+            .iter()
+            .map(|row| row.get(at).copied().unwrap_or_default());
         column.collect()
     };
     (0..width).map(column).collect()
@@ -493,6 +538,10 @@ pub(crate) fn f64_of(count: usize) -> f64 {
     u32::try_from(count).map_or(f64::INFINITY, f64::from)
 }
 
+/// Number of parts of a piece that are compared in the search for the nearest point.
+const TRIES: u32 = 24;
+/// Number of pieces in which the nearest point is searched closely.
+const REFINED: usize = 3;
 /// Maximum degree, that of ISO 10303-42 implementations.
 const MOST_DEGREE: usize = 25;
 
@@ -511,8 +560,7 @@ mod tests {
             Vector::new(-5.0, 0.0, 0.0),
         ];
         let knots = Knots::new(2, (&[3, 2, 3], &[0.0, 1.0, 4.0]), 5).unwrap();
-        let curve =
-            SplineCurve::new(knots, &points, Some(&[1.0, half, 1.0, half, 1.0])).unwrap();
+        let curve = SplineCurve::new(knots, &points, Some(&[1.0, half, 1.0, half, 1.0])).unwrap();
         let pieces = curve.pieces((0.5, 3.0));
         assert_eq!(pieces.len(), 2);
         for piece in &pieces {
@@ -526,7 +574,9 @@ mod tests {
     #[test]
     fn unclamped_knots_are_evaluated_in_their_domain() {
         // A uniform cubic through points on a line is this line.
-        let points: Vec<Vector> = (0..6).map(|x| Vector::new(f64::from(x), 0.0, 0.0)).collect();
+        let points: Vec<Vector> = (0..6)
+            .map(|x| Vector::new(f64::from(x), 0.0, 0.0))
+            .collect();
         let values: Vec<f64> = (0..10).map(f64::from).collect();
         let knots = Knots::new(3, (&[1; 10], &values), 6).unwrap();
         let curve = SplineCurve::new(knots, &points, None).unwrap();

@@ -4,23 +4,43 @@ use std::f64::consts::TAU;
 
 use crate::edge::TOLERANCE;
 use crate::fault::ShapeFault;
-use crate::spline::{BezierCurve, BezierPatch, SplineSurface};
+use crate::spline::{BezierCurve, BezierPatch, SplineSurface, f64_of, nearest_of};
 use crate::vector::{Placement, Vector};
 
 /// A surface.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) enum Surface {
     Plane(Placement),
-    Cylinder { placement: Placement, radius: f64 },
+    Cylinder {
+        placement: Placement,
+        radius: f64,
+    },
     /// A cone with its radius at the origin, which grows by `slope` along z.
-    Cone { placement: Placement, radius: f64, slope: f64 },
-    Sphere { placement: Placement, radius: f64 },
-    Torus { placement: Placement, major: f64, minor: f64 },
+    Cone {
+        placement: Placement,
+        radius: f64,
+        slope: f64,
+    },
+    Sphere {
+        placement: Placement,
+        radius: f64,
+    },
+    Torus {
+        placement: Placement,
+        major: f64,
+        minor: f64,
+    },
     Spline(Box<PatchGrid>),
     /// A curve that is moved along z of the placement.
-    Extrusion { placement: Placement, profile: ProfileCurve },
+    Extrusion {
+        placement: Placement,
+        profile: ProfileCurve,
+    },
     /// A curve that is turned around z of the placement.
-    Revolution { placement: Placement, profile: ProfileCurve },
+    Revolution {
+        placement: Placement,
+        profile: ProfileCurve,
+    },
 }
 
 /// The curve of an extrusion or a revolution.
@@ -68,8 +88,14 @@ impl ProfileCurve {
     }
 
     fn ends(&self) -> (Vector, Vector) {
-        let first = self.pieces.first().map_or(Vector::default(), BezierCurve::first);
-        let last = self.pieces.last().map_or(Vector::default(), BezierCurve::last);
+        let first = self
+            .pieces
+            .first()
+            .map_or(Vector::default(), BezierCurve::first);
+        let last = self
+            .pieces
+            .last()
+            .map_or(Vector::default(), BezierCurve::last);
         (first, last)
     }
 
@@ -86,18 +112,29 @@ impl ProfileCurve {
 
     /// Returns the parameter with the least distance, and the distance.
     fn nearest(&self, distance: &impl Fn(Vector) -> f64) -> (f64, f64) {
-        let found = self.pieces.iter().map(|piece| piece.nearest(distance));
-        let found = found.min_by(|a, b| a.1.total_cmp(&b.1));
-        found.unwrap_or((0.0, f64::INFINITY))
+        nearest_of(&self.pieces, distance)
+    }
+
+    /// Returns the point at a parameter, and the change of points beside it.
+    fn beside(&self, parameter: f64) -> (Vector, Vector) {
+        let step = self.period() * 1e-5;
+        let from = self.pieces.first().map_or(0.0, |piece| piece.from);
+        let (low, high) = (
+            (parameter - step).max(from),
+            (parameter + step).min(from + self.period()),
+        );
+        (self.at(parameter), self.at(high) - self.at(low))
     }
 
     /// Returns the point at a parameter.
     fn at(&self, parameter: f64) -> Vector {
         let piece = self.pieces.iter().find(|piece| parameter <= piece.to);
-        piece.or(self.pieces.last()).map_or(Vector::default(), |piece| {
-            let share = (parameter - piece.from) / (piece.to - piece.from);
-            piece.at(share.clamp(0.0, 1.0))
-        })
+        piece
+            .or(self.pieces.last())
+            .map_or(Vector::default(), |piece| {
+                let share = (parameter - piece.from) / (piece.to - piece.from);
+                piece.at(share.clamp(0.0, 1.0))
+            })
     }
 }
 
@@ -203,6 +240,50 @@ impl Surface {
     /// Returns whether s and t are in the reverse order about the normal of the surface.
     pub(crate) fn is_mirrored(&self) -> bool {
         matches!(self, Self::Spline(grid) if grid.is_swapped)
+    }
+
+    /// Returns the normal at a point; `None` where it has none, such as at a tip.
+    pub(crate) fn normal(&self, point: Vector) -> Option<Vector> {
+        let radial = |placement: &Placement, height: f64, scale: f64| {
+            let local = placement.local(point);
+            let flat = Vector::new(local.x, local.y, 0.0).unit()?;
+            (flat * scale + Vector::Z * height)
+                .unit()
+                .map(|local| placement.turned(local))
+        };
+        match self {
+            Self::Plane(placement) => Some(placement.z),
+            Self::Cylinder { placement, .. } => radial(placement, 0.0, 1.0),
+            Self::Cone {
+                placement, slope, ..
+            } => radial(placement, -slope, 1.0),
+            Self::Sphere { placement, .. } => (point - placement.origin).unit(),
+            Self::Torus {
+                placement, major, ..
+            } => {
+                let local = placement.local(point);
+                let off = local.x.hypot(local.y) - major;
+                radial(placement, local.z, off)
+            }
+            Self::Spline(grid) => {
+                let (patch, u, v, _) = grid.closest(point)?;
+                let (_, du, dv) = patch.at(u, v);
+                du.cross(dv).unit()
+            }
+            Self::Extrusion { placement, profile } => {
+                let (_, slope) = profile.beside(self.chart(point).s?);
+                slope.cross(placement.z).unit()
+            }
+            Self::Revolution { placement, profile } => {
+                let (at, slope) = profile.beside(self.chart(point).t);
+                let (at, slope) = (placement.local(at), placement.local_direction(slope));
+                let outwards = (at.x * slope.x + at.y * slope.y) / at.x.hypot(at.y);
+                if slope.z.hypot(outwards) < 1e-9 {
+                    return None;
+                }
+                radial(placement, -outwards, slope.z)
+            }
+        }
     }
 
     /// Returns the coordinates of a point.
@@ -318,8 +399,13 @@ impl PatchGrid {
         }
         let mut starts = Vec::new();
         for (number, patch) in patches.iter().enumerate() {
-            for (u, v) in SHARES.iter().flat_map(|u| SHARES.iter().map(move |v| (*u, *v))) {
+            let (of_u, of_v) = patch.degrees();
+            let (of_u, of_v) = (shares(of_u), shares(of_v));
+            for (u, v) in of_u.iter().flat_map(|u| of_v.iter().map(move |v| (*u, *v))) {
                 starts.push((number, u, v, patch.at(u, v).0));
+            }
+            if starts.len() > MOST_STARTS {
+                return Err(ShapeFault::TooLarge);
             }
         }
         let ((u0, u1), (v0, v1)) = surface.domain();
@@ -350,15 +436,18 @@ impl PatchGrid {
         let bottom = side(&|patch| (patch.v.0 <= v0).then_some(true));
         let top = end(&|patch| (patch.v.1 >= v1).then_some(true));
         let is_same = |a: &[Vector], b: &[Vector]| {
-            a.len() == b.len() && a.iter().zip(b).all(|(a, b)| (*a - *b).length() <= TOLERANCE)
+            a.len() == b.len()
+                && a.iter()
+                    .zip(b)
+                    .all(|(a, b)| (*a - *b).length() <= TOLERANCE)
         };
         let is_point = |side: &[Vector]| {
             let first = side.first().copied().unwrap_or_default();
-            side.iter().all(|point| (*point - first).length() <= TOLERANCE)
+            side.iter()
+                .all(|point| (*point - first).length() <= TOLERANCE)
         };
         let (closed_u, closed_v) = (is_same(&left, &right), is_same(&bottom, &top));
-        let is_swapped =
-            !closed_u && (closed_v || is_point(&left) || is_point(&right));
+        let is_swapped = !closed_u && (closed_v || is_point(&left) || is_point(&right));
         let form = if is_swapped {
             ChartForm {
                 s: closed_v.then_some(v1 - v0),
@@ -387,53 +476,65 @@ impl PatchGrid {
         if self.is_swapped { (v, u) } else { (u, v) }
     }
 
-    /// Finds the nearest point of the surface.
+    /// Returns the coordinates of the nearest point of the surface.
     fn chart(&self, point: Vector) -> ChartPoint {
-        // The best starts, each in another patch.
+        let Some((patch, u, v, distance)) = self.closest(point) else {
+            return ChartPoint {
+                s: None,
+                t: 0.0,
+                distance: f64::INFINITY,
+            };
+        };
+        let (_, du, dv) = patch.at(u, v);
+        let of = |(from, to): (f64, f64), share: f64| from + (to - from) * share;
+        let (s, t) = self.coordinates(of(patch.u, u), of(patch.v, v));
+        let along = if self.is_swapped { dv } else { du };
+        ChartPoint {
+            s: (along.length() > TOLERANCE).then_some(s),
+            t,
+            distance,
+        }
+    }
+
+    /// Finds the nearest point: its patch, both shares and the distance.
+    fn closest(&self, point: Vector) -> Option<(&BezierPatch, f64, f64, f64)> {
+        // Several starts, because points of a seam and of the borders of patches are equally near.
         let mut starts: Vec<(f64, usize, f64, f64)> = Vec::new();
         for (number, u, v, start) in &self.starts {
-            let distance = (*start - point).length();
-            if let Some(same) = starts.iter_mut().find(|start| start.1 == *number) {
-                if distance < same.0 {
-                    *same = (distance, *number, *u, *v);
-                }
-            } else if starts.len() < TRIED {
-                starts.push((distance, *number, *u, *v));
+            let found = ((*start - point).length(), *number, *u, *v);
+            if starts.len() < TRIED {
+                starts.push(found);
             } else if let Some(worst) = starts.iter_mut().max_by(|a, b| a.0.total_cmp(&b.0))
-                && distance < worst.0
+                && found.0 < worst.0
             {
-                *worst = (distance, *number, *u, *v);
+                *worst = found;
             }
         }
-        let mut best = ChartPoint {
-            s: None,
-            t: 0.0,
-            distance: f64::INFINITY,
-        };
         starts.sort_by(|a, b| a.0.total_cmp(&b.0));
+        let mut best: Option<(&BezierPatch, f64, f64, f64)> = None;
         for (_, number, u, v) in starts {
-            if best.distance < TOLERANCE / 100.0 {
+            if best.is_some_and(|best| best.3 < TOLERANCE / 100.0) {
                 break;
             }
             let Some(patch) = self.patches.get(number) else {
                 continue;
             };
             let (u, v) = nearest(patch, point, (u, v));
-            let (on, du, dv) = patch.at(u, v);
-            let distance = (on - point).length();
-            if distance < best.distance {
-                let of = |(from, to): (f64, f64), share: f64| from + (to - from) * share;
-                let (s, t) = self.coordinates(of(patch.u, u), of(patch.v, v));
-                let along = if self.is_swapped { dv } else { du };
-                best = ChartPoint {
-                    s: (along.length() > TOLERANCE).then_some(s),
-                    t,
-                    distance,
-                };
+            let distance = (patch.at(u, v).0 - point).length();
+            if best.is_none_or(|best| distance < best.3) {
+                best = Some((patch, u, v, distance));
             }
         }
         best
     }
+}
+
+/// Returns shares of a patch at which searches begin: several in each turn that a curve of a degree
+/// can have.
+fn shares(degree: usize) -> Vec<f64> {
+    let count = (2 * degree).clamp(4, 32);
+    let count_f = f64_of(count);
+    (0..=count).map(|at| f64_of(at) / count_f).collect()
 }
 
 /// Finds the shares of the nearest point of a patch by the method of Gauss and Newton.
@@ -457,7 +558,17 @@ fn nearest(patch: &BezierPatch, point: Vector, (mut u, mut v): (f64, f64)) -> (f
         } else if is_out(v, by_v) {
             (by_u, by_v) = (alone(e, a), 0.0);
         }
-        let (next_u, next_v) = ((u + by_u).clamp(0.0, 1.0), (v + by_v).clamp(0.0, 1.0));
+        let (mut next_u, mut next_v);
+        let mut part = 1.0;
+        loop {
+            next_u = (u + by_u * part).clamp(0.0, 1.0);
+            next_v = (v + by_v * part).clamp(0.0, 1.0);
+            // A step that leads away was too long.
+            if (patch.at(next_u, next_v).0 - point).length() <= off.length() || part < 1e-3 {
+                break;
+            }
+            part /= 4.0;
+        }
         let change = (next_u - u).abs().max((next_v - v).abs());
         (u, v) = (next_u, next_v);
         if change < 1e-12 {
@@ -467,12 +578,14 @@ fn nearest(patch: &BezierPatch, point: Vector, (mut u, mut v): (f64, f64)) -> (f
     (u, v)
 }
 
-/// Shares of a patch at which searches begin.
+/// Shares of a border at which borders are compared.
 const SHARES: [f64; 5] = [0.0, 0.25, 0.5, 0.75, 1.0];
-/// Number of patches that are searched for the nearest point.
-const TRIED: usize = 5;
+/// Number of points at which the nearest point is searched.
+const TRIED: usize = 8;
 /// Maximum number of steps of a search.
 const ROUNDS: u32 = 30;
+/// Maximum number of points at which searches begin.
+const MOST_STARTS: usize = 200_000;
 /// Maximum number of patches of a surface.
 const MOST_PATCHES: usize = 4096;
 

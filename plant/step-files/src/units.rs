@@ -4,7 +4,7 @@ use std::f64::consts::FRAC_PI_2;
 
 use crate::fault::ShapeFault;
 use crate::part21::ExchangeFile;
-use crate::records::{EntityArguments, AtEntity, FaultAt};
+use crate::records::{AtEntity, EntityArguments, FaultAt};
 
 /// The units of a context.
 #[derive(Debug, Clone, Copy, PartialEq)]

@@ -80,6 +80,7 @@ pub(crate) struct Placement {
 }
 
 impl Placement {
+    #[cfg(test)]
     pub(crate) const IDENTITY: Self = Self {
         origin: Vector::new(0.0, 0.0, 0.0),
         x: Vector::X,
@@ -94,13 +95,15 @@ impl Placement {
         let reference = match reference {
             Some(reference) => reference.unit()?,
             // ISO 10303-42, first_proj_axis: x, or y if the axis is x.
-            None if (z - Vector::X).length() < 1e-9 || (z + Vector::X).length() < 1e-9 => {
-                Vector::Y
-            }
+            None if (z - Vector::X).length() < 1e-9 || (z + Vector::X).length() < 1e-9 => Vector::Y,
             None => Vector::X,
         };
         let x = reference - z * reference.dot(z);
-        let x = if x.length() > 1e-6 { x.unit()? } else { return None };
+        let x = if x.length() > 1e-6 {
+            x.unit()?
+        } else {
+            return None;
+        };
         let y = z.cross(x);
         Some(Self { origin, x, y, z })
     }
