@@ -208,7 +208,7 @@ impl KnowledgeMethod {
                 argument(
                     "Kind",
                     DataTypeId::String,
-                    "nodeset, mtp, file (Turtle) or process (Turtle, BatchML, BPMN)",
+                    "nodeset, mtp, file (Turtle), process (Turtle, BatchML, BPMN) or product (STEP)",
                 ),
                 name,
                 argument(

@@ -49,6 +49,8 @@ pub(crate) struct Settings {
     pub(crate) rml: Vec<RmlSource>,
     /// Running servers whose nodes are in the graph.
     pub(crate) servers: Vec<ServerEntry>,
+    /// STEP files.
+    pub(crate) products: Vec<Source>,
     /// Recipes of BatchML and BPMN.
     pub(crate) recipes: Vec<RecipeSource>,
     pub(crate) processes: Vec<Process>,
@@ -80,7 +82,7 @@ impl Settings {
 }
 
 /// Keys of the document.
-const KEYS: [&str; 20] = [
+const KEYS: [&str; 21] = [
     "mes",
     "application_uri",
     "namespace",
@@ -98,6 +100,7 @@ const KEYS: [&str; 20] = [
     "manifests",
     "rml",
     "servers",
+    "products",
     "recipes",
     "processes",
     "prefer",
@@ -128,6 +131,7 @@ impl Reading<'_> {
             manifests,
             rml,
             servers,
+            products,
             recipes,
             processes,
             prefer,
@@ -160,12 +164,15 @@ impl Reading<'_> {
         let manifests = manifests.map_or_else(Vec::new, |node| self.each(node, Self::manifest));
         let rml = rml.map_or_else(Vec::new, |node| self.each(node, Self::rml));
         let servers = servers.map_or_else(Vec::new, |node| self.each(node, Self::server));
+        let products = products.map_or_else(Vec::new, |node| self.files(node));
         let recipes = recipes.map_or_else(Vec::new, |node| self.each(node, Self::recipe));
         let processes = processes.map_or_else(Vec::new, |node| self.each(node, Self::process));
         let prefer = prefer.map_or_else(Vec::new, |node| self.each(node, Self::preferred));
         let names = manifests.iter().map(|manifest| &*manifest.source.name);
         self.once(root, names, "manifest");
         self.files_once(root, &knowledge, &rml);
+        let names = products.iter().map(|product| &*product.name);
+        self.once(root, names, "product");
         let iris = processes.iter().map(|process| &*process.iri);
         let iris = iris.chain(recipes.iter().map(|recipe| &*recipe.source.name));
         self.once(root, iris, "process");
@@ -191,6 +198,7 @@ impl Reading<'_> {
             manifests,
             rml,
             servers,
+            products,
             recipes,
             processes,
             prefer,

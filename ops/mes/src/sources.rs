@@ -28,6 +28,8 @@ use crate::settings::{self, Manifest, NodeSetOrigin, RmlSource, Settings};
 
 pub(crate) use self::supply::supply;
 
+mod products;
+
 /// The sources, and the findings about them.
 pub(crate) struct MesSources {
     knowledge: Arc<Knowledge>,
@@ -124,6 +126,13 @@ impl MesSources {
             let source = KnowledgeSource::new(SourceKind::File, &rml.mapping.name);
             named.insert(source.clone());
             self.try_one(source, |source| self.mapped(source, rml));
+        }
+        for file in &settings.products {
+            let source = KnowledgeSource::new(SourceKind::Product, &file.name);
+            named.insert(source.clone());
+            self.try_one(source, |source| {
+                self.products(source, &bytes(&file.path)?, SourceLifetime::No)
+            });
         }
         for process in &settings.processes {
             let source = KnowledgeSource::new(SourceKind::Process, &process.iri);
@@ -492,6 +501,9 @@ impl SourceFiles for MesSources {
                 };
                 self.module(&source, contents, &manifest, SourceLifetime::Yes)?;
             }
+            (SourceKind::Product, _) => {
+                self.products(&source, contents, SourceLifetime::Yes)?;
+            }
             (SourceKind::File | SourceKind::Process, _) => {
                 let taken = self.knowledge.take_turtle(&source, &utf8(contents)?, now());
                 taken.map_err(|fault| fault.to_string())?;
@@ -572,6 +584,7 @@ fn examined(source: &mut KnowledgeSource, contents: &[u8]) -> Result<Vec<String>
             let module = read.map_err(|fault| one(fault.to_string()))?;
             Ok(module.findings.iter().map(ToString::to_string).collect())
         }
+        SourceKind::Product => products::examined(contents).map_err(one),
         SourceKind::File | SourceKind::Process => {
             let recipe = if source.kind == SourceKind::Process {
                 recipe::in_source(contents).map_err(one)?

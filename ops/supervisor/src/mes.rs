@@ -246,6 +246,7 @@ pub fn source_kind(file: &str, contents: &[u8]) -> Option<&'static str> {
         "aml" | "mtp" | "amlx" => Some("mtp"),
         "xml" if has(b"UANodeSet") => Some("nodeset"),
         "xml" if has(b"CAEXFile") => Some("mtp"),
+        "step" | "stp" | "p21" => Some("product"),
         "bpmn" | "batchml" => Some("process"),
         "xml" if has(b"http://www.mesa.org/xml/B2MML") || has(b"/spec/BPMN/20100524/MODEL") => {
             Some("process")
@@ -277,6 +278,7 @@ mod tests {
                 Some("process"),
             ),
             ("b.bpmn", "", Some("process")),
+            ("Part.STP", "", Some("product")),
             ("x.xml", "<html>", None),
             ("-", "", None),
         ] {

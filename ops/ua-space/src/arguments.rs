@@ -326,6 +326,15 @@ pub(crate) enum Verb {
     /// Exit codes: 0 done, 64 usage, 65 the mapping or a file is wrong, 74 a file cannot be read or
     /// the output cannot be written.
     Rml(Rml),
+    /// Show the products of STEP files with their extents
+    ///
+    /// Extents are the box around a product in its own axes, in millimetres. They are shown if they
+    /// are proven to 0.1 mm; otherwise a finding names the face or edge and the reason. `ua-space
+    /// source add FILE` adds the products to the knowledge of the plant.
+    ///
+    /// Exit codes: 0 done, 65 a file is no STEP file of products, or the extents of a product are
+    /// not proven, 74 a file cannot be read or the output cannot be written.
+    Products(ProductsArguments),
     /// Print NodeSets as OWL ontologies
     ///
     /// Prints all nodes, references, modelling rules, interfaces, DataTypes and values as Turtle.
@@ -399,6 +408,16 @@ pub(crate) struct Rml {
     /// The format of the output
     #[arg(long, value_name = "FORMAT", value_enum, default_value = "turtle")]
     pub(crate) format: RdfFormat,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct ProductsArguments {
+    /// STEP files of AP203, AP214 or AP242, or - for stdin
+    #[arg(value_name = "FILE", required = true)]
+    pub(crate) files: Vec<String>,
+    /// Print JSON, in metres
+    #[arg(long)]
+    pub(crate) json: bool,
 }
 
 #[derive(Debug, Args)]

@@ -42,6 +42,7 @@ mod page;
 mod pea;
 mod plan;
 mod process;
+mod products;
 mod raw_data;
 mod recorded;
 mod report;
@@ -135,6 +136,7 @@ pub fn run(arguments: Vec<OsString>) -> ExitCode {
         Verb::Process(arguments) => process::process(arguments),
         Verb::Job(arguments) => job::job(arguments),
         Verb::Rml(arguments) => rml::rml(arguments),
+        Verb::Products(arguments) => products::products(arguments),
         Verb::Owl(arguments) => owl::owl(arguments),
         Verb::Mtp(arguments) => mtp_files::mtp(arguments),
         Verb::Aas(arguments) => aas::aas(arguments),

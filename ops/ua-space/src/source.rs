@@ -249,7 +249,8 @@ pub(crate) fn change(
 fn kind_of(file: &str, contents: &[u8]) -> Result<&'static str, CommandFailure> {
     supervisor::source_kind(file, contents).ok_or_else(|| {
         CommandFailure::Usage(format!(
-            "{file}: give its --kind: file (Turtle), nodeset, mtp or process (Turtle, or a recipe)"
+            "{file}: give its --kind: file (Turtle), nodeset, mtp, process (Turtle, or a recipe) or \
+             product (STEP)"
         ))
     })
 }

@@ -19,7 +19,7 @@
 //! queries that run at a time), `http`, `update` and `writes` (changes by users), `shapes` and
 //! `checking` (the SHACL report), `units` (conversion of numbers), `requests` (queries and changes
 //! for other protocols than HTTP), `value_query` (queries with one value),
-//! `operations` (a taxonomy of capabilities).
+//! `operations` (a taxonomy of capabilities), `products` (STEP files).
 
 mod bounds;
 mod checking;
@@ -30,6 +30,7 @@ mod lanes;
 pub mod nodeset;
 pub mod operations;
 pub mod owl;
+pub mod products;
 mod query;
 mod question;
 mod requests;

@@ -130,7 +130,8 @@ impl KnowledgeRequests {
         let Some((kind, name)) = file_source(kind, name) else {
             let shown: String = kind.chars().take(SHOWN).collect();
             let why = format!(
-                "the source has the kind `{shown}` and a name of {} bytes: the kinds are nodeset,                  mtp, file and process, and a name has 1 to 256 bytes",
+                "the source has the kind `{shown}` and a name of {} bytes: the kinds are nodeset, mtp, \
+                 file, process and product, and a name has 1 to 256 bytes",
                 name.len()
             );
             return Err(KnowledgeRefusal::new("unknown", why));

@@ -29,6 +29,8 @@ pub enum SourceKind {
     File,
     /// A process.
     Process,
+    /// A STEP file of products.
+    Product,
     /// A run of a process.
     Run,
     /// The current states of the skills of a component or a module, by its name.
@@ -72,6 +74,7 @@ impl fmt::Display for SourceKind {
             Self::NodeSet => "nodeset",
             Self::File => "file",
             Self::Process => "process",
+            Self::Product => "product",
             Self::Run => "run",
             Self::State => "state",
             Self::Server => "server",
@@ -91,6 +94,7 @@ impl FromStr for SourceKind {
             Self::NodeSet,
             Self::File,
             Self::Process,
+            Self::Product,
             Self::Run,
             Self::Graph,
         ];

@@ -373,7 +373,8 @@ fn named(path: &str) -> Result<(SourceKind, String), HttpRefusal> {
     let named = path.trim_start_matches('/').split_once('/');
     let named = named.and_then(|(kind, name)| file_source(kind, &unescaped(name)?));
     named.ok_or_else(|| {
-        let why = "a source is /sources/KIND/NAME; the kinds are nodeset, mtp, file and process";
+        let why = "a source is /sources/KIND/NAME; the kinds are nodeset, mtp, file, process \
+                   and product";
         HttpRefusal::unknown(why.to_owned())
     })
 }
@@ -383,7 +384,11 @@ pub(crate) fn file_source(kind: &str, name: &str) -> Option<(SourceKind, String)
     let kind: SourceKind = kind.parse().ok()?;
     let is_file = matches!(
         kind,
-        SourceKind::NodeSet | SourceKind::Mtp | SourceKind::File | SourceKind::Process
+        SourceKind::NodeSet
+            | SourceKind::Mtp
+            | SourceKind::File
+            | SourceKind::Process
+            | SourceKind::Product
     );
     let is_name = !name.is_empty() && name.len() <= LONGEST_NAME;
     (is_file && is_name).then(|| (kind, name.to_owned()))

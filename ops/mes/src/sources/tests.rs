@@ -270,3 +270,35 @@ fn a_stored_nodeset_that_is_too_old_is_a_finding_after_a_restart() {
     assert!(found.what.contains(text), "{found:?}");
     drop(std::fs::remove_dir_all(&folder));
 }
+
+#[test]
+fn a_step_file_gives_a_process_the_width_of_its_part() {
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../examples/plant");
+    let text = include_str!("../../../../examples/plant/grip-cover.yaml");
+    let settings = Settings::from_yaml(text, &folder).unwrap();
+    let knowledge = Arc::new(Knowledge::new().unwrap());
+    let sources = MesSources::new(Arc::clone(&knowledge));
+    sources.read(&settings);
+    assert_eq!(sources.findings(), []);
+    let given = &settings.processes[0].steps[0].parameters[0];
+    let query = given.query.as_ref().unwrap();
+    let query = ::knowledge::ValueQuery::read(&query.sparql).unwrap();
+    let width = query.value(&knowledge).unwrap();
+    assert!((width.as_f64().unwrap() - 0.041).abs() < 1e-9, "{width}");
+
+    // An open shell has a finding with its line, and no size.
+    let step = include_str!("../../../../examples/plant/cover.step");
+    let open = step.replacen("CLOSED_SHELL", "OPEN_SHELL", 1);
+    let checked = sources.check(SourceKind::Product, "open.step", open.as_bytes());
+    let [found] = checked.findings.as_slice() else {
+        panic!("{checked:?}")
+    };
+    assert!(checked.accepted && found.line.is_some() && found.what.contains("OPEN_SHELL"));
+    let is_new = SourceFiles::put(&sources, SourceKind::Product, "open.step", open.as_bytes());
+    assert_eq!(is_new, Ok(true));
+    assert_eq!(sources.findings().len(), 1);
+    let both = query.value(&knowledge).unwrap();
+    assert_eq!(both, width, "the product without a size does not count");
+    let cut = sources.check(SourceKind::Product, "cut.step", &step.as_bytes()[..900]);
+    assert!(!cut.accepted && cut.findings[0].line.is_some(), "{cut:?}");
+}

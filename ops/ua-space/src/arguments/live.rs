@@ -328,12 +328,12 @@ pub(crate) enum SourceVerb {
     },
     /// Add or replace a source
     Add {
-        /// A NodeSet, a manifest (.aml, .mtp, .amlx), Turtle (.ttl), a recipe (BatchML, BPMN), or XML
-        /// with --rml; - for stdin
+        /// A NodeSet, a manifest (.aml, .mtp, .amlx), Turtle (.ttl), a recipe (BatchML, BPMN), a STEP
+        /// file (.step, .stp), or XML with --rml; - for stdin
         #[arg(value_name = "FILE")]
         file: String,
-        /// file (Turtle), nodeset, mtp or process (Turtle, or a recipe); found by the name and
-        /// contents of the file
+        /// file (Turtle), nodeset, mtp, process (Turtle, or a recipe) or product (STEP); found by
+        /// the name and contents of the file
         #[arg(long, value_name = "KIND")]
         kind: Option<String>,
         /// The name of the source; the name of the file unless given. A NodeSet is named by its
@@ -348,7 +348,7 @@ pub(crate) enum SourceVerb {
     },
     /// Remove a source
     Remove {
-        /// file, nodeset, mtp or process
+        /// file, nodeset, mtp, process or product
         #[arg(value_name = "KIND")]
         kind: String,
         /// The name of the source, as `ua-space source list` shows it
