@@ -22,6 +22,7 @@ mod recipe;
 mod registry;
 mod rml;
 mod secured;
+mod step;
 #[path = "../../ros/messages/tests/support/mod.rs"]
 mod tape;
 
@@ -42,6 +43,7 @@ pub use model::model;
 pub use nodeset::nodeset;
 pub use recipe::recipe;
 pub use secured::secured;
+pub use step::step;
 
 /// A function that panics if the tested code violates a guarantee on the input.
 pub type Target = fn(&[u8]);
@@ -65,4 +67,5 @@ pub const TARGETS: &[(&str, Target)] = &[
     ("registry", registry),
     ("rml", rml),
     ("secured", secured),
+    ("step", step),
 ];
