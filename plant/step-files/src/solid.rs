@@ -157,12 +157,17 @@ impl CheckedSolid {
         };
         // All faces that meet at the point, of which one is steepest.
         let mut steepest = (0.0_f64, 0);
+        let mut tried = 0;
         for edge in &self.edges {
             let is_here = |at: &Vector| (*at - point).length() <= TOLERANCE;
             if !edge.span.points.iter().any(is_here) {
                 continue;
             }
             for (id, face) in edge.faces.iter().filter_map(|at| self.faces.get(*at)) {
+                tried += 1;
+                if tried > MOST_MEETING {
+                    return Err(ShapeFault::TooLarge).at(*id);
+                }
                 let slope = face
                     .normal(point)
                     .map_or(0.0, |normal| normal.dot(direction));
@@ -410,6 +415,8 @@ fn check_face(
 pub(crate) const SOLIDS: [&str; 2] = ["MANIFOLD_SOLID_BREP", "BREP_WITH_VOIDS"];
 /// The cosine of the angle of two normals beyond which faces lie on each other.
 const FOLDED: f64 = -0.995;
+/// Maximum number of faces, counted by edge, that meet at a point.
+const MOST_MEETING: usize = 256;
 /// The least cosine of a normal and a direction that says on which side the solid is.
 const LEAST_SLOPE: f64 = 0.05;
 const AXES: [Vector; 3] = [Vector::X, Vector::Y, Vector::Z];
