@@ -92,15 +92,16 @@ impl CheckedFace {
         if !is_whole {
             chart.check(edges)?;
         }
-        let apex = match &surface {
-            Surface::Cone {
-                placement,
-                radius,
-                slope,
-            } if chart.bottom == Some(1) => {
-                Some(placement.point(Vector::new(0.0, 0.0, -radius / slope)))
-            }
-            _ => None,
+        let apex = if let Surface::Cone {
+            placement,
+            radius,
+            slope,
+        } = &surface
+            && chart.bottom == Some(1)
+        {
+            Some(placement.point(Vector::new(0.0, 0.0, -radius / slope)))
+        } else {
+            None
         };
         Ok(Self {
             surface,
@@ -428,10 +429,10 @@ impl Chart {
             Some(period) => width / period,
             None => 0.317_3 * width / range(|point| point.2),
         };
-        if !(width.is_finite() && shear.is_finite()) && !edges.is_empty() {
-            return Err(ShapeFault::Orientation {
-                edge: edges.first().map_or(0, |edge| edge.id),
-            });
+        if let Some(edge) = edges.first()
+            && !(width.is_finite() && shear.is_finite())
+        {
+            return Err(ShapeFault::Orientation { edge: edge.id });
         }
         let mut chart = Self {
             form,

@@ -113,7 +113,8 @@ impl Geometry<'_> {
         let on_surface = ["SURFACE_CURVE", "SEAM_CURVE", "INTERSECTION_CURVE"];
         if let Ok(arguments) = self.file.one_of(id, &on_surface) {
             if !self.file.is_simple(id) {
-                return self.file.one_of(id, &CURVES).and(Err(self.unknown(id)));
+                self.file.one_of(id, &CURVES)?;
+                return Err(self.unknown(id));
             }
             return self.plain_curve(arguments.reference(1)?);
         }

@@ -439,9 +439,11 @@ fn schemas(part: &EntityPart) -> Vec<String> {
     let Some(Parameter::List(names)) = part.parameters.first() else {
         return Vec::new();
     };
-    let names = names.iter().filter_map(|name| match name {
-        Parameter::Text(name) => name.split_whitespace().next(),
-        _ => None,
+    let names = names.iter().filter_map(|name| {
+        let Parameter::Text(name) = name else {
+            return None;
+        };
+        name.split_whitespace().next()
     });
     names.map(str::to_ascii_uppercase).collect()
 }

@@ -55,7 +55,7 @@ impl ProductExtents {
     /// Returns the middle of the box in metres.
     #[must_use]
     pub fn centre(&self) -> [f64; 3] {
-        pairwise(self.max, self.min, |max, min| f64::midpoint(max, min))
+        pairwise(self.max, self.min, f64::midpoint)
     }
 }
 
@@ -466,12 +466,19 @@ impl ShapeReading<'_> {
             let placement = structure.placement(*occurrence, (id, *part))?;
             let shape = Shape::Definition(*part);
             let found = self.placed((shape, &placement), direction, within);
-            let found = found.map_err(|fault| match fault.fault {
-                ShapeFault::Cycle | ShapeFault::TooLarge | ShapeFault::OfPart(_) => fault,
-                _ => FaultAt {
-                    entity: *occurrence,
-                    fault: ShapeFault::OfPart(*part),
-                },
+            let found = found.map_err(|fault| {
+                let is_kept = matches!(
+                    fault.fault,
+                    ShapeFault::Cycle | ShapeFault::TooLarge | ShapeFault::OfPart(_)
+                );
+                if is_kept {
+                    fault
+                } else {
+                    FaultAt {
+                        entity: *occurrence,
+                        fault: ShapeFault::OfPart(*part),
+                    }
+                }
             })?;
             all = with(all, found);
         }

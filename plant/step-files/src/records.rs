@@ -187,9 +187,11 @@ impl<'f> EntityArguments<'f> {
     }
 
     pub(crate) fn integers(&self, at: usize) -> Result<Vec<i64>, FaultAt> {
-        self.list(at, "a list of whole numbers", |item| match item {
-            Parameter::Integer(number) => Some(*number),
-            _ => None,
+        self.list(at, "a list of whole numbers", |item| {
+            let Parameter::Integer(number) = item else {
+                return None;
+            };
+            Some(*number)
         })
     }
 
@@ -203,17 +205,17 @@ impl<'f> EntityArguments<'f> {
 }
 
 fn rows<T>(row: &Parameter, read: impl Fn(&Parameter) -> Option<T>) -> Option<Vec<T>> {
-    match row {
-        Parameter::List(row) => row.iter().map(read).collect(),
-        _ => None,
-    }
+    let Parameter::List(row) = row else {
+        return None;
+    };
+    row.iter().map(read).collect()
 }
 
 fn reference(item: &Parameter) -> Option<u64> {
-    match item {
-        Parameter::Reference(id) => Some(*id),
-        _ => None,
-    }
+    let Parameter::Reference(id) = item else {
+        return None;
+    };
+    Some(*id)
 }
 
 /// Returns a number, also within the name of its measure.
@@ -226,7 +228,11 @@ fn number(item: &Parameter) -> Option<f64> {
             [Parameter::Real(number)] => Some(*number),
             _ => None,
         },
-        _ => None,
+        Parameter::Omitted
+        | Parameter::Text(_)
+        | Parameter::Enumeration(_)
+        | Parameter::Reference(_)
+        | Parameter::List(_) => None,
     }
 }
 

@@ -1,6 +1,7 @@
 //! Solids: their topology, checked, and bounds of their extents.
 
 use std::collections::HashMap;
+use std::collections::hash_map::Entry;
 
 use crate::edge::{Bounds, EdgeSpan, TOLERANCE};
 use crate::face::{CheckedFace, FaceEdge, MOST_WORK};
@@ -292,8 +293,8 @@ fn read_loop(
     for oriented in ring.references(1)? {
         let oriented = geometry.file.one_of(oriented, &["ORIENTED_EDGE"])?;
         let (edge, along) = (oriented.reference(3)?, oriented.boolean(4)?);
-        if !edges.contains_key(&edge) {
-            edges.insert(edge, read_edge(geometry, edge)?);
+        if let Entry::Vacant(free) = edges.entry(edge) {
+            free.insert(read_edge(geometry, edge)?);
         }
         if let Some(read) = edges.get(&edge) {
             let (from, to) = if along {

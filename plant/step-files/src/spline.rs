@@ -225,13 +225,13 @@ impl BezierCurve {
     pub(crate) fn first(&self) -> Vector {
         self.controls
             .first()
-            .map_or(Vector::default(), |all| all.position())
+            .map_or_else(Vector::default, |all| all.position())
     }
 
     pub(crate) fn last(&self) -> Vector {
         self.controls
             .last()
-            .map_or(Vector::default(), |all| all.position())
+            .map_or_else(Vector::default, |all| all.position())
     }
 
     pub(crate) fn reversed(&self) -> Self {
@@ -437,7 +437,7 @@ impl BezierPatch {
         let corner = |row: Option<&Vec<ControlPoint>>, is_last: bool| {
             let row = row.map(Vec::as_slice).unwrap_or_default();
             let control = if is_last { row.last() } else { row.first() };
-            control.map_or(Vector::default(), |control| control.position())
+            control.map_or_else(Vector::default, |control| control.position())
         };
         let (first, last) = (self.rows.first(), self.rows.last());
         let along_u = (corner(first, false) - corner(last, false)).length()

@@ -91,11 +91,11 @@ impl ProfileCurve {
         let first = self
             .pieces
             .first()
-            .map_or(Vector::default(), BezierCurve::first);
+            .map_or_else(Vector::default, BezierCurve::first);
         let last = self
             .pieces
             .last()
-            .map_or(Vector::default(), BezierCurve::last);
+            .map_or_else(Vector::default, BezierCurve::last);
         (first, last)
     }
 
@@ -115,6 +115,24 @@ impl ProfileCurve {
         nearest_of(&self.pieces, distance)
     }
 
+    /// Returns the coordinates of a point on the curve turned around z of a placement.
+    fn turned(&self, axis: &Placement, point: Vector) -> ChartPoint {
+        let local = axis.local(point);
+        let radius = local.x.hypot(local.y);
+        let off = |at: Vector| {
+            let at = axis.local(at);
+            (at.x.hypot(at.y) - radius).hypot(at.z - local.z)
+        };
+        let (t, distance) = self.nearest(&off);
+        let at = axis.local(self.at(t));
+        let turn = local.y.atan2(local.x) - at.y.atan2(at.x);
+        ChartPoint {
+            s: (radius > TOLERANCE).then_some(turn),
+            t,
+            distance,
+        }
+    }
+
     /// Returns the point at a parameter, and the change of points beside it.
     fn beside(&self, parameter: f64) -> (Vector, Vector) {
         let step = self.period() * 1e-5;
@@ -130,8 +148,8 @@ impl ProfileCurve {
     fn at(&self, parameter: f64) -> Vector {
         let piece = self.pieces.iter().find(|piece| parameter <= piece.to);
         piece
-            .or(self.pieces.last())
-            .map_or(Vector::default(), |piece| {
+            .or_else(|| self.pieces.last())
+            .map_or_else(Vector::default, |piece| {
                 let share = (parameter - piece.from) / (piece.to - piece.from);
                 piece.at(share.clamp(0.0, 1.0))
             })
@@ -360,22 +378,7 @@ impl Surface {
                     distance,
                 }
             }
-            Self::Revolution { placement, profile } => {
-                let local = placement.local(point);
-                let radius = local.x.hypot(local.y);
-                let off = |at: Vector| {
-                    let at = placement.local(at);
-                    (at.x.hypot(at.y) - radius).hypot(at.z - local.z)
-                };
-                let (t, distance) = profile.nearest(&off);
-                let at = placement.local(profile.at(t));
-                let turn = local.y.atan2(local.x) - at.y.atan2(at.x);
-                ChartPoint {
-                    s: (radius > TOLERANCE).then_some(turn),
-                    t,
-                    distance,
-                }
-            }
+            Self::Revolution { placement, profile } => profile.turned(placement, point),
         }
     }
 }
