@@ -1,7 +1,7 @@
 //! Solids: their topology, checked, and bounds of their extents.
 
-use std::collections::HashMap;
 use std::collections::hash_map::Entry;
+use std::collections::{HashMap, HashSet};
 
 use crate::edge::{Bounds, EdgeSpan, TOLERANCE};
 use crate::face::{CheckedFace, FaceEdge, MOST_WORK};
@@ -88,14 +88,14 @@ impl CheckedSolid {
         }
         let mut edges: HashMap<u64, ReadEdge> = HashMap::new();
         let mut faces = Vec::new();
-        let mut seen = std::collections::HashSet::new();
+        let mut seen = HashSet::new();
         for id in ids {
             if !seen.insert(id) {
                 return Err(ShapeFault::EdgeUse(EdgeUse::Often(2))).at(id);
             }
             faces.push(read_face(geometry, id, &mut edges)?);
         }
-        turn_tori(geometry, &mut faces);
+        let turned = turn_tori(geometry, &mut faces);
         check_uses(&faces)?;
         let mut checked = Vec::new();
         for face in &faces {
@@ -122,6 +122,7 @@ impl CheckedSolid {
             has_choice,
         };
         solid.check_folds()?;
+        solid.check_turned(&turned)?;
         Ok(solid)
     }
 
@@ -136,6 +137,34 @@ impl CheckedSolid {
                 && a.dot(b) < FOLDED
             {
                 return Err(ShapeFault::Fold).at(edge.id);
+            }
+        }
+        Ok(())
+    }
+
+    /// Checks that tori whose loops were turned go on smoothly in the faces beside all their edges.
+    /// Then the sense of the face is right, and only the orientation of its bounds was wrong. At a
+    /// sharp edge the whole face may be reversed instead, and would be the other part of the torus.
+    fn check_turned(&self, turned: &[usize]) -> Result<(), FaultAt> {
+        for edge in &self.edges {
+            let [a, b] = edge.faces.as_slice() else {
+                continue;
+            };
+            if a == b || !(turned.contains(a) || turned.contains(b)) {
+                continue;
+            }
+            let (Some((_, a)), Some((_, b))) = (self.faces.get(*a), self.faces.get(*b)) else {
+                continue;
+            };
+            let is_smooth = |at: &Vector| match (a.normal(*at), b.normal(*at)) {
+                (Some(a), Some(b)) => a.dot(b) > SMOOTH,
+                _ => false,
+            };
+            let points = &edge.span.points;
+            let middle = points.get(points.len() / 2);
+            let tried = [points.first(), middle, points.last()];
+            if !tried.into_iter().flatten().all(is_smooth) {
+                return Err(ShapeFault::EdgeUse(EdgeUse::SameDirection)).at(edge.id);
             }
         }
         Ok(())
@@ -333,26 +362,31 @@ fn vertex(geometry: &Geometry<'_>, id: u64) -> Result<Vector, FaultAt> {
     geometry.point(vertex.reference(1)?)
 }
 
-/// Turns the loops of a torus whose edges all run as in the faces beside it. Some writers give the
-/// bounds of tori the wrong orientation; the faces beside leave no choice.
-fn turn_tori(geometry: &Geometry<'_>, faces: &mut [ReadFace]) {
+/// Turns the loops of a torus whose edges all run as in the faces beside it, and returns the
+/// indices of these faces. Some writers give the bounds of tori the wrong orientation.
+fn turn_tori(geometry: &Geometry<'_>, faces: &mut [ReadFace]) -> Vec<usize> {
     let mut uses: HashMap<(u64, bool), usize> = HashMap::new();
     for (edge, along) in faces.iter().flat_map(|face| &face.uses) {
         *uses.entry((*edge, *along)).or_default() += 1;
     }
-    for face in faces {
+    let mut turned = Vec::new();
+    for (at, face) in faces.iter_mut().enumerate() {
         if !geometry.file.is(face.surface, "TOROIDAL_SURFACE") {
             continue;
         }
-        let is_seam = |(edge, along): &(u64, bool)| face.uses.contains(&(*edge, !*along));
-        let mut own = face.uses.iter().filter(|used| !is_seam(used)).peekable();
-        let is_turned = own.peek().is_some() && own.all(|used| uses.get(used) == Some(&2));
+        let own: HashSet<(u64, bool)> = face.uses.iter().copied().collect();
+        let is_seam = |(edge, along): &(u64, bool)| own.contains(&(*edge, !*along));
+        let mut own_uses = face.uses.iter().filter(|used| !is_seam(used)).peekable();
+        let is_turned =
+            own_uses.peek().is_some() && own_uses.all(|used| uses.get(used) == Some(&2));
         if is_turned {
+            turned.push(at);
             for (_, along) in &mut face.uses {
                 *along = !*along;
             }
         }
     }
+    turned
 }
 
 /// Checks that each edge is used twice, in opposite directions.
@@ -416,6 +450,8 @@ fn check_face(
 pub(crate) const SOLIDS: [&str; 2] = ["MANIFOLD_SOLID_BREP", "BREP_WITH_VOIDS"];
 /// The cosine of the angle of two normals beyond which faces lie on each other.
 const FOLDED: f64 = -0.995;
+/// The cosine of the angle of two normals above which faces go on smoothly at their edge.
+const SMOOTH: f64 = 0.999;
 /// Maximum number of faces, counted by edge, that meet at a point.
 const MOST_MEETING: usize = 256;
 /// The least cosine of a normal and a direction that says on which side the solid is.
