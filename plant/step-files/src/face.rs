@@ -69,7 +69,7 @@ impl CheckedFace {
         let surface = surface.with_poles_far_from(&points);
         let count = edges
             .iter()
-            .map(|edge| edge.span.points.len())
+            .map(|edge| surface.tried(&edge.span.points).count())
             .sum::<usize>();
         let most =
             u64::try_from(count).map_or(u64::MAX, |count| count.saturating_mul(surface.cost()));
@@ -624,8 +624,8 @@ struct EdgeCourse {
 /// Returns the coordinates of the points of an edge, from its start to its end.
 fn course(surface: &Surface, edge: &FaceEdge<'_>) -> Result<EdgeCourse, ShapeFault> {
     let mut points: Vec<(Vector, Option<f64>, f64)> = Vec::new();
-    for point in &edge.span.points {
-        let at = surface.chart(*point);
+    for (point, is_between) in surface.tried(&edge.span.points) {
+        let at = surface.chart(point);
         // A NaN is no distance.
         if !matches!(
             at.distance.partial_cmp(&(1.5 * TOLERANCE)),
@@ -635,7 +635,9 @@ fn course(surface: &Surface, edge: &FaceEdge<'_>) -> Result<EdgeCourse, ShapeFau
             let distance = at.distance;
             return Err(ShapeFault::EdgeOffSurface { edge, distance });
         }
-        points.push((*point, at.s, at.t));
+        if !is_between {
+            points.push((point, at.s, at.t));
+        }
     }
     let has_pole = points.iter().any(|point| point.1.is_none());
     // At a pole, an edge has the s of the point beside it.

@@ -119,6 +119,15 @@ pub enum ShapeFault {
     /// A unit is not known.
     #[error("the unit is not a metre with a prefix, a radian, or a multiple of them")]
     Unit,
+    /// The context of a cone has no unit of angles.
+    #[error("its context has no unit of angles, so that its half angle is not certain")]
+    NoAngleUnit,
+    /// A shape is related to that of another product without a placement.
+    #[error("its shape is also that of #{0}, or related to it without a placement")]
+    OtherProduct(u64),
+    /// A part or a shape is related in a way that is not read, so that it may be missing.
+    #[error("{0} is not read, so that a part or a shape may be missing")]
+    Unread(String),
     /// A product has no shape.
     #[error("the product has no shape")]
     NoShape,

@@ -6,7 +6,7 @@ use crate::edge::{Curve, TOLERANCE};
 use crate::fault::ShapeFault;
 use crate::part21::ExchangeFile;
 use crate::records::{AtEntity, EntityArguments, FaultAt};
-use crate::spline::{Knots, SplineCurve, SplineFault, SplineSurface};
+use crate::spline::{Knots, MOST_DEGREE, SplineCurve, SplineFault, SplineSurface};
 use crate::surface::{PatchGrid, ProfileCurve, Surface};
 use crate::units::Units;
 use crate::vector::{Placement, Vector};
@@ -219,7 +219,8 @@ impl Geometry<'_> {
             }),
             "CONICAL_SURFACE" => {
                 let (radius, angle) = (self.length(&arguments, 2)?, arguments.number(3)?);
-                let angle = angle * self.units.angle;
+                let unit = self.units.angle.ok_or(ShapeFault::NoAngleUnit).at(id)?;
+                let angle = angle * unit;
                 if radius < 0.0 {
                     return Err(ShapeFault::Radius { radius }).at(id);
                 }
@@ -315,12 +316,13 @@ impl Geometry<'_> {
 
 /// Returns the knots of splines that do not name them (ISO 10303-42, 4.4.34 to 4.4.37).
 fn implied(kind: &str, degree: i64, count: usize) -> Result<Knots, SplineFault> {
+    if !(1..=MOST_DEGREE).contains(&usize::try_from(degree).unwrap_or_default()) {
+        return Err(SplineFault::Degree);
+    }
     let points = i64::try_from(count).map_err(|_| SplineFault::Count)?;
     let (ends, inner, spans) = match kind {
         "UNIFORM" => (1, 1, points.saturating_add(degree)),
-        "BEZIER" if degree > 0 && (points - 1) % degree == 0 => {
-            (degree + 1, degree, (points - 1) / degree)
-        }
+        "BEZIER" if (points - 1) % degree == 0 => (degree + 1, degree, (points - 1) / degree),
         "QUASI_UNIFORM" => (degree.saturating_add(1), 1, points.saturating_sub(degree)),
         _ => return Err(SplineFault::Count),
     };

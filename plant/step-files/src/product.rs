@@ -191,6 +191,10 @@ struct ProductStructure<'f> {
     parts: HashMap<u64, Vec<(u64, u64)>>,
     /// The relations that place each occurrence.
     places: HashMap<u64, Vec<u64>>,
+    /// The first relation of each definition that is not read. It may have another part or shape.
+    unread: HashMap<u64, FaultAt>,
+    /// The first relation that is not read and names no definition.
+    lost: Option<FaultAt>,
 }
 
 impl<'f> ProductStructure<'f> {
@@ -202,6 +206,8 @@ impl<'f> ProductStructure<'f> {
             same: HashMap::new(),
             parts: HashMap::new(),
             places: HashMap::new(),
+            unread: HashMap::new(),
+            lost: None,
         };
         for name in [
             "PRODUCT_DEFINITION",
@@ -214,6 +220,7 @@ impl<'f> ProductStructure<'f> {
             }
         }
         all.relations();
+        all.other_relations();
         all
     }
 
@@ -231,7 +238,6 @@ impl<'f> ProductStructure<'f> {
 
     fn relations(&mut self) {
         let file = self.file;
-        // Records that are wrong relate nothing: their products have no shape, or no placement.
         for id in file.all("SHAPE_DEFINITION_REPRESENTATION") {
             let Some(relation) = file.find(id, "SHAPE_DEFINITION_REPRESENTATION") else {
                 continue;
@@ -240,8 +246,17 @@ impl<'f> ProductStructure<'f> {
                 let shape = file.one_of(shape, &["PRODUCT_DEFINITION_SHAPE"])?;
                 Ok((shape.reference(2)?, relation.reference(1)?))
             });
+            let property = relation.reference(0).ok();
+            let property = property.and_then(|id| file.find(id, "PROPERTY_DEFINITION"));
             if let Ok((definition, shape)) = pair {
                 self.shapes.entry(definition).or_default().push(shape);
+            } else if let Some(Ok(of)) = property.map(|property| property.reference(2)) {
+                // Properties of features, such as tolerances, are no shapes of products.
+                if self.definitions.contains_key(&of) {
+                    self.miss(id, Some(of));
+                }
+            } else {
+                self.miss(id, None);
             }
         }
         for name in [
@@ -255,6 +270,8 @@ impl<'f> ProductStructure<'f> {
                 if let Ok((a, b)) = self.related(id) {
                     self.same.entry(a).or_default().push(b);
                     self.same.entry(b).or_default().push(a);
+                } else {
+                    self.miss(id, None);
                 }
             }
         }
@@ -262,8 +279,17 @@ impl<'f> ProductStructure<'f> {
             let Some(usage) = file.find(id, "NEXT_ASSEMBLY_USAGE_OCCURRENCE") else {
                 continue;
             };
-            if let (Ok(assembly), Ok(part)) = (usage.reference(3), usage.reference(4)) {
-                self.parts.entry(assembly).or_default().push((id, part));
+            let usage = file
+                .find(id, "PRODUCT_DEFINITION_RELATIONSHIP")
+                .unwrap_or(usage);
+            let is_known = |part: &u64| self.definitions.contains_key(part);
+            let assembly = usage.reference(3).ok().filter(is_known);
+            let part = usage.reference(4).ok().filter(is_known);
+            match (assembly, part) {
+                (Some(assembly), Some(part)) if file.is_simple(id) => {
+                    self.parts.entry(assembly).or_default().push((id, part));
+                }
+                _ => self.miss(id, assembly),
             }
         }
         for id in file.all("CONTEXT_DEPENDENT_SHAPE_REPRESENTATION") {
@@ -276,6 +302,85 @@ impl<'f> ProductStructure<'f> {
             });
             if let Ok((occurrence, relation)) = pair {
                 self.places.entry(occurrence).or_default().push(relation);
+            }
+        }
+    }
+
+    /// Notes a relation that is not read, of a definition if it is known.
+    fn miss(&mut self, id: u64, definition: Option<u64>) {
+        let fault = ShapeFault::Unread(self.file.shown(id));
+        let fault = FaultAt { entity: id, fault };
+        match definition {
+            Some(definition) => drop(self.unread.entry(definition).or_insert(fault)),
+            None => drop(self.lost.get_or_insert(fault)),
+        }
+    }
+
+    /// Notes parts and placements of kinds that are not read.
+    fn other_relations(&mut self) {
+        let file = self.file;
+        for name in [
+            "ASSEMBLY_COMPONENT_USAGE",
+            "PROMISSORY_USAGE_OCCURRENCE",
+            "QUANTIFIED_ASSEMBLY_COMPONENT_USAGE",
+        ] {
+            for id in file.all(name) {
+                let is_other = |name: &&str| file.is(id, name);
+                if [
+                    "NEXT_ASSEMBLY_USAGE_OCCURRENCE",
+                    "SPECIFIED_HIGHER_USAGE_OCCURRENCE",
+                ]
+                .iter()
+                .any(is_other)
+                {
+                    continue;
+                }
+                let usage = file.find(id, "PRODUCT_DEFINITION_RELATIONSHIP");
+                let assembly = usage.or_else(|| file.find(id, name));
+                let assembly = assembly.and_then(|usage| usage.reference(3).ok());
+                self.miss(id, assembly.filter(|of| self.definitions.contains_key(of)));
+            }
+        }
+        let occurrences = self.parts.values().flatten();
+        let placed: BTreeSet<u64> = occurrences
+            .filter_map(|(occurrence, _)| self.places.get(occurrence))
+            .flatten()
+            .copied()
+            .collect();
+        let mut owners: BTreeMap<u64, Vec<u64>> = BTreeMap::new();
+        for definition in self.definitions.keys() {
+            for representation in self.representations(*definition) {
+                owners.entry(representation).or_default().push(*definition);
+            }
+        }
+        for id in file.all("REPRESENTATION_RELATIONSHIP_WITH_TRANSFORMATION") {
+            if placed.contains(&id) {
+                continue;
+            }
+            let related = self.related(id).map(|(a, b)| [a, b]).unwrap_or_default();
+            let related = related.iter().filter_map(|of| owners.get(of)).flatten();
+            let related: BTreeSet<u64> = related.copied().collect();
+            // A part does not lack what its assembly lacks.
+            let is_part = |of: &u64| {
+                let assemblies = related.iter().filter_map(|other| self.parts.get(other));
+                assemblies.flatten().any(|(_, part)| part == of)
+            };
+            let lacking: Vec<u64> = related.iter().copied().filter(|of| !is_part(of)).collect();
+            for definition in lacking {
+                self.miss(id, Some(definition));
+            }
+        }
+        for of_one in owners.values() {
+            let [first, .., last] = of_one.as_slice() else {
+                continue;
+            };
+            for definition in of_one {
+                let other = if definition == first { last } else { first };
+                let fault = FaultAt {
+                    entity: *definition,
+                    fault: ShapeFault::OtherProduct(*other),
+                };
+                self.unread.entry(*definition).or_insert(fault);
             }
         }
     }
@@ -378,8 +483,8 @@ type Found = Result<(Bounds, u64), FaultAt>;
 
 struct ShapeReading<'f> {
     structure: &'f ProductStructure<'f>,
-    /// Solids that were read, by their number and the unit of length.
-    solids: HashMap<(u64, u64), Result<CheckedSolid, FaultAt>>,
+    /// Solids that were read, by their number and the units of length and angle.
+    solids: HashMap<(u64, [u64; 2]), Result<CheckedSolid, FaultAt>>,
     /// Bounds by the shape and the direction.
     known: HashMap<(Shape, [u64; 3]), Found>,
     work: u64,
@@ -482,6 +587,9 @@ impl ShapeReading<'_> {
             })?;
             all = with(all, found);
         }
+        if let Some(fault) = structure.unread.get(&id).or(structure.lost.as_ref()) {
+            return Err(fault.clone());
+        }
         if all.0.reached.is_finite() {
             Ok(all)
         } else {
@@ -528,7 +636,8 @@ impl ShapeReading<'_> {
                 continue;
             }
             structure.file.one_of(item, &SOLIDS)?;
-            let key = (item, geometry.units.length.to_bits());
+            let Units { length, angle } = geometry.units;
+            let key = (item, [length, angle.unwrap_or_default()].map(f64::to_bits));
             let work = &mut self.work;
             let solid = self
                 .solids

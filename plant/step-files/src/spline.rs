@@ -543,7 +543,7 @@ const TRIES: u32 = 24;
 /// Number of pieces in which the nearest point is searched closely.
 const REFINED: usize = 3;
 /// Maximum degree, that of ISO 10303-42 implementations.
-const MOST_DEGREE: usize = 25;
+pub(crate) const MOST_DEGREE: usize = 25;
 
 #[cfg(test)]
 mod tests {

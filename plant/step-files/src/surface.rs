@@ -206,6 +206,35 @@ impl Surface {
         u64::try_from(count).unwrap_or(u64::MAX)
     }
 
+    /// Returns points of an edge at which it is compared with the surface, and whether each is
+    /// between the given points. Surfaces of any form may meet an edge at regular distances only.
+    pub(crate) fn tried<'p>(
+        &self,
+        points: &'p [Vector],
+    ) -> impl Iterator<Item = (Vector, bool)> + 'p {
+        let shares: &'static [f64] = match self {
+            Self::Plane(_)
+            | Self::Cylinder { .. }
+            | Self::Cone { .. }
+            | Self::Sphere { .. }
+            | Self::Torus { .. } => &[],
+            Self::Spline(_) | Self::Extrusion { .. } | Self::Revolution { .. } => {
+                if points.len() <= FEW {
+                    &[0.137, 0.382, 0.719]
+                } else {
+                    &[0.382]
+                }
+            }
+        };
+        let between = points.iter().zip(points.iter().skip(1));
+        let between = between.flat_map(move |(a, b)| {
+            shares
+                .iter()
+                .map(move |share| (*a + (*b - *a) * *share, true))
+        });
+        points.iter().map(|point| (*point, false)).chain(between)
+    }
+
     /// Returns how the coordinates of the surface run.
     pub(crate) fn form(&self) -> ChartForm {
         let open = ChartForm {
@@ -583,6 +612,8 @@ fn nearest(patch: &BezierPatch, point: Vector, (mut u, mut v): (f64, f64)) -> (f
 
 /// Shares of a border at which borders are compared.
 const SHARES: [f64; 5] = [0.0, 0.25, 0.5, 0.75, 1.0];
+/// Number of points up to which more points between them are compared.
+const FEW: usize = 64;
 /// Number of points at which the nearest point is searched.
 const TRIED: usize = 8;
 /// Maximum number of steps of a search.

@@ -11,8 +11,8 @@ use crate::records::{AtEntity, EntityArguments, FaultAt};
 pub(crate) struct Units {
     /// Millimetres.
     pub(crate) length: f64,
-    /// Radians.
-    pub(crate) angle: f64,
+    /// Radians; `None` without a unit.
+    pub(crate) angle: Option<f64>,
 }
 
 impl Units {
@@ -33,8 +33,8 @@ impl Units {
             return Err(ShapeFault::Units(lengths.len())).at(context);
         };
         let angle = match angles.as_slice() {
-            [] => 1.0,
-            [angle] => *angle,
+            [] => None,
+            [angle] => Some(*angle),
             several => return Err(ShapeFault::Units(several.len())).at(context),
         };
         Ok(Self {

@@ -461,3 +461,82 @@ fn no_flag_of_a_shape_changes_its_extents_unnoticed() {
     }
     assert!(noticed > 140 && kept < 10, "{noticed} {kept}");
 }
+
+#[test]
+fn parts_and_shapes_that_are_not_read_leave_their_products_without_extents() {
+    let assembly = text("assembly.step");
+    let usage = assembly
+        .lines()
+        .find(|line| line.contains("'right'"))
+        .unwrap();
+    let number = usage.split('=').next().unwrap();
+    let references: Vec<&str> = usage.split(',').skip(3).take(2).collect();
+    let [parent, child] = references.as_slice() else {
+        panic!("{usage}")
+    };
+    let quantified = format!(
+        "{number}=(ASSEMBLY_COMPONENT_USAGE($)NEXT_ASSEMBLY_USAGE_OCCURRENCE()\
+        PRODUCT_DEFINITION_RELATIONSHIP('2','right','',{parent},{child})\
+        PRODUCT_DEFINITION_USAGE()QUANTIFIED_ASSEMBLY_COMPONENT_USAGE($));"
+    );
+    let between = format!("{parent},{child}");
+    for changed in [
+        usage.replace("NEXT_ASSEMBLY", "PROMISSORY"),
+        usage.replace(&between, &format!("{parent},$")),
+        usage.replace(&between, &format!("$,{child}")),
+        usage.replace(&between, &format!("#999999,{child}")),
+        quantified,
+        // The placement of the part remains without the part.
+        String::new(),
+    ] {
+        let read = StepProducts::read(assembly.replace(usage, &changed).as_bytes()).unwrap();
+        let [_, pair, cell] = read.products.as_slice() else {
+            panic!("{read:?}")
+        };
+        assert_eq!((pair.extents, cell.extents), (None, None), "{changed}");
+        assert!(read.findings.iter().all(|found| found.line.is_some()));
+    }
+}
+
+#[test]
+fn a_shape_that_is_related_to_another_product_is_a_finding() {
+    let read = StepProducts::read(text("related_products.step").as_bytes()).unwrap();
+    let shown: Vec<String> = read.findings.iter().map(ToString::to_string).collect();
+    assert_eq!(shown.len(), 2, "{shown:?}");
+    assert!(shown[0].contains("without a placement"), "{shown:?}");
+    assert!(read.products.iter().all(|part| part.extents.is_none()));
+}
+
+#[test]
+fn a_cone_needs_the_unit_of_its_angle() {
+    let tip = text("tip.step");
+    let without = tip.replace("PLANE_ANGLE_UNIT()", "SOLID_ANGLE_UNIT()");
+    let found = finding(&without);
+    assert!(found.contains("no unit of angles"), "{found}");
+
+    // The same solid with its angle of 1 in degrees, and in radians.
+    let read = StepProducts::read(text("two_angle_contexts.step").as_bytes()).unwrap();
+    let depths = read.products.iter().map(|tip| tip.extents.unwrap().min[2]);
+    let depths: Vec<f64> = depths.map(|metres| (metres * 1e5).round()).collect();
+    assert_eq!(depths, [-28645.0, -321.0]);
+}
+
+#[test]
+fn an_edge_that_meets_its_surface_at_regular_distances_is_a_finding() {
+    let found = finding(&text("zigzag.step"));
+    assert!(found.contains("mm off its surface"), "{found}");
+}
+
+#[test]
+fn the_degree_of_a_spline_is_bounded() {
+    let circle = text("dome.step");
+    let line = circle
+        .lines()
+        .find(|line| line.contains("CIRCLE("))
+        .unwrap();
+    let number = line.split('=').next().unwrap();
+    let curve =
+        format!("{number}=BEZIER_CURVE('',9223372036854775807,(#1),.UNSPECIFIED.,.F.,.F.);");
+    let found = finding(&circle.replace(line, &curve));
+    assert!(found.contains("its degree is not from"), "{found}");
+}
