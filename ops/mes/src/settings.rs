@@ -171,11 +171,7 @@ impl Reading<'_> {
         let names = manifests.iter().map(|manifest| &*manifest.source.name);
         self.once(root, names, "manifest");
         self.files_once(root, &knowledge, &rml);
-        let names = products.iter().map(|product| &*product.name);
-        self.once(root, names, "product");
-        let iris = processes.iter().map(|process| &*process.iri);
-        let iris = iris.chain(recipes.iter().map(|recipe| &*recipe.source.name));
-        self.once(root, iris, "process");
+        self.each_once(root, &products, &processes, &recipes);
         let names = servers.iter().map(|server| server.which.text());
         self.once(root, names, "server");
         Some(Settings {
@@ -222,6 +218,21 @@ impl Reading<'_> {
     ) -> Vec<T> {
         let nodes = self.reader.list(node);
         nodes.iter().filter_map(|node| read(self, node)).collect()
+    }
+
+    /// Reports names of products and IRIs of processes that are given twice.
+    fn each_once(
+        &mut self,
+        root: &DocumentNode,
+        products: &[Source],
+        processes: &[Process],
+        recipes: &[RecipeSource],
+    ) {
+        let names = products.iter().map(|product| &*product.name);
+        self.once(root, names, "product");
+        let iris = processes.iter().map(|process| &*process.iri);
+        let iris = iris.chain(recipes.iter().map(|recipe| &*recipe.source.name));
+        self.once(root, iris, "process");
     }
 
     fn once<'n>(&mut self, root: &DocumentNode, names: impl Iterator<Item = &'n str>, what: &str) {
