@@ -87,6 +87,12 @@ pub enum ShapeFault {
         /// The edge.
         edge: u64,
     },
+    /// A face uses an edge in both directions, although its surface is not closed.
+    #[error("it uses edge #{edge} in both directions, but its surface has no seam")]
+    Slit {
+        /// The edge.
+        edge: u64,
+    },
     /// No edge bounds a face of an infinite surface.
     #[error("its edges do not bound it: the surface goes on without end")]
     Unbounded,

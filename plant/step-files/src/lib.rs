@@ -20,9 +20,10 @@
 //! opens no file. The size, depth and work of a file are bounded.
 //!
 //! Reading order: `part21` and `strings` (text), `records` and `units` (parameters), `vector`,
-//! `spline`, `edge`, `surface` and `geometry` (curves and surfaces), `face` and `solid` (the
-//! proof), `product` (assemblies).
+//! `spline`, `edge`, `surface` and `geometry` (curves and surfaces), `chart`, `face` and
+//! `solid` (the proof), `product` (assemblies).
 
+mod chart;
 mod edge;
 mod face;
 mod fault;

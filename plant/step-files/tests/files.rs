@@ -540,3 +540,11 @@ fn the_degree_of_a_spline_is_bounded() {
     let found = finding(&circle.replace(line, &curve));
     assert!(found.contains("its degree is not from"), "{found}");
 }
+
+#[test]
+fn edges_that_cross_and_slits_are_findings() {
+    let found = finding(&text("crossing.step"));
+    assert!(found.contains("do not enclose it"), "{found}");
+    let found = finding(&text("slit.step"));
+    assert!(found.contains("has no seam"), "{found}");
+}
