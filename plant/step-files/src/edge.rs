@@ -3,7 +3,7 @@
 use std::f64::consts::TAU;
 
 use crate::fault::ShapeFault;
-use crate::spline::{BezierCurve, SplineCurve, nearest_of};
+use crate::spline::{BezierCurve, SplineCurve, cost_of, nearest_of};
 use crate::vector::{Placement, Vector};
 
 /// Largest distance in millimetres at which points, curves and surfaces count as coincident.
@@ -31,6 +31,16 @@ pub(crate) enum Curve {
         y: f64,
     },
     Spline(SplineCurve),
+}
+
+impl Curve {
+    /// Returns about the number of steps that an edge on the curve needs.
+    pub(crate) fn cost(&self) -> u64 {
+        match self {
+            Self::Line { .. } | Self::Ellipse { .. } => 16,
+            Self::Spline(spline) => spline.cost(),
+        }
+    }
 }
 
 /// Bounds of the largest value of a linear function: the value is certainly reached, and certainly
@@ -117,8 +127,17 @@ impl EdgeSpan {
         })
     }
 
-    /// Returns bounds of the largest value in a direction.
-    pub(crate) fn bounds(&self, direction: Vector) -> Bounds {
+    /// Returns about the number of steps that made the points of the edge.
+    pub(crate) fn cost(&self) -> u64 {
+        let of_piece = match &self.span {
+            Span::Pieces(pieces) => pieces.first().map_or(1, BezierCurve::cost),
+            Span::Line | Span::Arc { .. } => 1,
+        };
+        cost_of(&[self.points.len(), of_piece])
+    }
+
+    /// Returns bounds of the largest value in a direction, and counts its work.
+    pub(crate) fn bounds(&self, direction: Vector, work: &mut u64) -> Bounds {
         let ends = self.first.dot(direction).max(self.last.dot(direction));
         let mut bounds = Bounds::exact(ends);
         match &self.span {
@@ -146,7 +165,7 @@ impl EdgeSpan {
                     bounds = bounds.with(Bounds::exact(value));
                 }
             }
-            Span::Pieces(pieces) => bounds = bounds.with(extreme(pieces, direction)),
+            Span::Pieces(pieces) => bounds = bounds.with(extreme(pieces, direction, work)),
         }
         bounds
     }
@@ -154,7 +173,7 @@ impl EdgeSpan {
 
 /// Returns bounds of the largest value of Bezier pieces in a direction: pieces whose control points
 /// are above the points of the curve are halved.
-fn extreme(pieces: &[BezierCurve], direction: Vector) -> Bounds {
+fn extreme(pieces: &[BezierCurve], direction: Vector, work: &mut u64) -> Bounds {
     let value = |point: Vector| point.dot(direction);
     let ends = pieces
         .iter()
@@ -164,6 +183,7 @@ fn extreme(pieces: &[BezierCurve], direction: Vector) -> Bounds {
     let mut open: Vec<BezierCurve> = pieces.to_vec();
     let mut steps = 0;
     while let Some(piece) = open.pop() {
+        *work = work.saturating_add(cost_of(&[piece.cost(), 2]));
         let most = piece.most(value);
         if most <= bounds.reached + NARROW || steps >= MOST_STEPS {
             bounds.limit = bounds.limit.max(most);
@@ -366,11 +386,11 @@ mod tests {
     fn the_direction_of_an_arc_decides_its_extent() {
         let (right, up) = (Vector::new(5.0, 0.0, 0.0), Vector::new(0.0, 5.0, 0.0));
         let quarter = EdgeSpan::new(&circle(), (right, up), false, true).unwrap();
-        assert!((quarter.bounds(-Vector::X).limit - 0.0).abs() < 1e-9);
+        assert!((quarter.bounds(-Vector::X, &mut 0).limit - 0.0).abs() < 1e-9);
         let rest = EdgeSpan::new(&circle(), (right, up), false, false).unwrap();
-        assert!((rest.bounds(-Vector::X).reached - 5.0).abs() < 1e-9);
+        assert!((rest.bounds(-Vector::X, &mut 0).reached - 5.0).abs() < 1e-9);
         let whole = EdgeSpan::new(&circle(), (right, right), true, true).unwrap();
-        assert!((whole.bounds(-Vector::Y).reached - 5.0).abs() < 1e-9);
+        assert!((whole.bounds(-Vector::Y, &mut 0).reached - 5.0).abs() < 1e-9);
     }
 
     #[test]

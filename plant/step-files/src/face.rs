@@ -10,7 +10,7 @@ use std::collections::BinaryHeap;
 use crate::chart::{FaceChart, FacePlace};
 use crate::edge::{Bounds, EdgeSpan, MOST_STEPS, NARROW};
 use crate::fault::ShapeFault;
-use crate::spline::{BezierCurve, BezierPatch};
+use crate::spline::{BezierCurve, BezierPatch, cost_of};
 use crate::surface::{PatchGrid, ProfileCurve, Surface};
 use crate::vector::{Placement, Vector};
 
@@ -185,7 +185,8 @@ impl CheckedFace {
         let ranked = |patch: BezierPatch| (patch.most(value), patch);
         let mut search = Search::new(grid.patches.iter().cloned().map(ranked), reached);
         while let Some(Ranked { most, piece }) = search.next(*work <= MOST_WORK) {
-            *work = work.saturating_add(self.chart.cost());
+            let of_patch = cost_of(&[piece.cost(), 8]);
+            *work = work.saturating_add(self.chart.cost().saturating_add(of_patch));
             let (middle, du, dv) = piece.at(0.5, 0.5);
             let (u, v) = (
                 f64::midpoint(piece.u.0, piece.u.1),
@@ -227,7 +228,8 @@ impl CheckedFace {
         let ranked = |piece: BezierCurve| (piece.most(height), piece);
         let mut search = Search::new(profile.pieces.iter().cloned().map(ranked), reached);
         while let Some(Ranked { most, piece }) = search.next(*work <= MOST_WORK) {
-            *work = work.saturating_add(self.chart.cost());
+            let of_search = self.surface.cost();
+            *work = work.saturating_add(self.chart.cost().saturating_add(of_search));
             let (low, high) = piece.split(0.5);
             let at = placement.local(low.last());
             let middle = turn * at.x.hypot(at.y) + Vector::Z * at.z;
@@ -247,6 +249,18 @@ impl CheckedFace {
             }
         }
         search.end()
+    }
+
+    /// Counts the work of some normals.
+    ///
+    /// # Errors
+    /// The work of the file is too much.
+    pub(crate) fn count_normals(&self, count: u64, work: &mut u64) -> Result<(), ShapeFault> {
+        *work = work.saturating_add(self.surface.cost().saturating_mul(count));
+        if *work > MOST_WORK {
+            return Err(ShapeFault::TooLarge);
+        }
+        Ok(())
     }
 
     /// Returns the normal of the face at a point; `None` where it has none.

@@ -44,6 +44,11 @@ pub enum ShapeFault {
     /// A B-spline is wrong.
     #[error("{0}")]
     Spline(#[from] SplineFault),
+    /// The curve of an extrusion or a revolution has several pieces.
+    #[error(
+        "the curve of a surface has {0} pieces, so that edges on the surface are not certain; one is supported"
+    )]
+    Pieces(usize),
     /// A vertex is not on its curve.
     #[error("a vertex is {distance:.3} mm off the curve")]
     VertexOffCurve {

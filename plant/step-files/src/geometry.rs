@@ -1,6 +1,7 @@
 //! Reads points, placements, curves and surfaces from records. Lengths become millimetres.
 
 use std::f64::consts::FRAC_PI_2;
+use std::rc::Rc;
 
 use crate::edge::{Curve, TOLERANCE};
 use crate::fault::ShapeFault;
@@ -205,7 +206,7 @@ impl Geometry<'_> {
         kind.map(|(_, kind)| *kind).ok_or_else(|| self.unknown(id))
     }
 
-    pub(crate) fn surface(&self, id: u64) -> Result<Surface, FaultAt> {
+    pub(crate) fn surface(&self, id: u64, work: &mut u64) -> Result<Surface, FaultAt> {
         let arguments = self.file.one_of(id, &SURFACES)?;
         if !SPLINE_SURFACES.contains(&arguments.name) && !self.file.is_simple(id) {
             return Err(self.unknown(id));
@@ -260,21 +261,25 @@ impl Geometry<'_> {
                 profile: self.profile(arguments.reference(1)?)?,
                 placement: self.axis(arguments.reference(2)?)?,
             }),
-            _ => self.spline_surface(id),
+            _ => self.spline_surface(id, work),
         }
     }
 
     /// Reads a curve with ends, or a closed one, that makes a surface.
     fn profile(&self, id: u64) -> Result<ProfileCurve, FaultAt> {
-        let spline = match self.curve(id)? {
+        let (spline, is_spline) = match self.curve(id)? {
             Curve::Line { .. } => return Err(self.unknown(id)),
-            Curve::Ellipse { placement, x, y } => ellipse(&placement, x, y).at(id)?,
-            Curve::Spline(spline) => spline,
+            Curve::Ellipse { placement, x, y } => (ellipse(&placement, x, y).at(id)?, false),
+            Curve::Spline(spline) => (spline, true),
         };
-        ProfileCurve::new(spline.pieces(spline.domain())).at(id)
+        let pieces = spline.pieces(spline.domain());
+        if is_spline && pieces.len() > 1 {
+            return Err(ShapeFault::Pieces(pieces.len())).at(id);
+        }
+        ProfileCurve::new(pieces).at(id)
     }
 
-    fn spline_surface(&self, id: u64) -> Result<Surface, FaultAt> {
+    fn spline_surface(&self, id: u64, work: &mut u64) -> Result<Surface, FaultAt> {
         let is_simple = self.file.is_simple(id);
         let (base, skipped) = if is_simple {
             (self.file.one_of(id, &SPLINE_SURFACES)?, 1)
@@ -309,8 +314,8 @@ impl Geometry<'_> {
             None => None,
         };
         let surface = SplineSurface::new(u, v, &points, weights.as_deref()).at(id)?;
-        let grid = PatchGrid::new(&surface).at(id)?;
-        Ok(Surface::Spline(Box::new(grid)))
+        let grid = PatchGrid::new(&surface, work).at(id)?;
+        Ok(Surface::Spline(Rc::new(grid)))
     }
 }
 

@@ -453,7 +453,7 @@ const LARGEST: usize = 64 << 20;
 /// Maximum number of records.
 const MOST_RECORDS: usize = 1_000_000;
 /// Maximum number of parameters of all records.
-const MOST_PARAMETERS: usize = 10_000_000;
+const MOST_PARAMETERS: usize = 3_000_000;
 /// Maximum number of entities of a complex instance.
 const MOST_PARTS: usize = 64;
 /// Maximum depth of lists.

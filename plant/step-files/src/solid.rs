@@ -3,11 +3,13 @@
 use std::collections::hash_map::Entry;
 use std::collections::{HashMap, HashSet};
 
-use crate::edge::{Bounds, EdgeSpan, TOLERANCE};
+use crate::edge::{Bounds, Curve, EdgeSpan, TOLERANCE};
 use crate::face::{CheckedFace, FaceEdge, MOST_WORK};
 use crate::fault::{EdgeUse, ShapeFault};
 use crate::geometry::Geometry;
 use crate::records::{AtEntity, EntityArguments, FaultAt};
+use crate::spline::cost_of;
+use crate::surface::Surface;
 use crate::vector::Vector;
 
 /// A solid whose shell is closed.
@@ -33,6 +35,13 @@ struct ReadEdge {
     span: EdgeSpan,
     start: u64,
     end: u64,
+}
+
+/// The edges of a shell, and their curves, each of which is read once.
+#[derive(Default)]
+struct ReadEdges {
+    all: HashMap<u64, ReadEdge>,
+    curves: HashMap<u64, Curve>,
 }
 
 /// A face of the file with its loops.
@@ -86,20 +95,27 @@ impl CheckedSolid {
         if ids.is_empty() {
             return Err(ShapeFault::Empty("faces")).at(shell.id);
         }
-        let mut edges: HashMap<u64, ReadEdge> = HashMap::new();
+        let mut edges = ReadEdges::default();
+        let mut surfaces: HashMap<u64, Surface> = HashMap::new();
         let mut faces = Vec::new();
         let mut seen = HashSet::new();
         for id in ids {
             if !seen.insert(id) {
                 return Err(ShapeFault::EdgeUse(EdgeUse::Often(2))).at(id);
             }
-            faces.push(read_face(geometry, id, &mut edges)?);
+            faces.push(read_face(geometry, id, &mut edges, work)?);
         }
         let turned = turn_tori(geometry, &mut faces);
         check_uses(&faces)?;
+        let edges = edges.all;
         let mut checked = Vec::new();
         for face in &faces {
-            checked.push((face.id, check_face(geometry, face, &edges, work)?));
+            let surface = match surfaces.entry(face.surface) {
+                Entry::Occupied(known) => known.get().clone(),
+                Entry::Vacant(free) => free.insert(geometry.surface(face.surface, work)?).clone(),
+            };
+            let found = check_face((geometry, surface), face, &edges, work)?;
+            checked.push((face.id, found));
         }
         let mut users: HashMap<u64, Vec<usize>> = HashMap::new();
         for (at, face) in faces.iter().enumerate() {
@@ -121,17 +137,21 @@ impl CheckedSolid {
             faces: checked,
             has_choice,
         };
-        solid.check_folds()?;
+        solid.check_folds(work)?;
         solid.check_turned(&turned)?;
         Ok(solid)
     }
 
     /// Checks that no two faces lie on each other at their edge: one of them has the wrong sense.
-    fn check_folds(&self) -> Result<(), FaultAt> {
+    fn check_folds(&self, work: &mut u64) -> Result<(), FaultAt> {
         for edge in &self.edges {
             let middle = edge.span.points.get(edge.span.points.len() / 2);
             let middle = middle.copied().unwrap_or_default();
             let faces = edge.faces.iter().filter_map(|at| self.faces.get(*at));
+            for (id, face) in faces.clone() {
+                // As many again for the checks of tori and of the outermost edges.
+                face.count_normals(8, work).at(*id)?;
+            }
             let mut normals = faces.filter_map(|(_, face)| face.normal(middle));
             if let (Some(a), Some(b)) = (normals.next(), normals.next())
                 && a.dot(b) < FOLDED
@@ -172,7 +192,7 @@ impl CheckedSolid {
 
     /// Checks that the solid is inside of the faces at its outermost edge. A solid that is inside
     /// out may have the wrong parts of spheres and tori.
-    fn check_outside(&self, direction: Vector) -> Result<(), FaultAt> {
+    fn check_outside(&self, direction: Vector, work: &mut u64) -> Result<(), FaultAt> {
         let mut top = (f64::NEG_INFINITY, None);
         for edge in &self.edges {
             for point in &edge.span.points {
@@ -198,6 +218,7 @@ impl CheckedSolid {
                 if tried > MOST_MEETING {
                     return Err(ShapeFault::TooLarge).at(*id);
                 }
+                face.count_normals(1, work).at(*id)?;
                 let slope = face
                     .normal(point)
                     .map_or(0.0, |normal| normal.dot(direction));
@@ -229,7 +250,10 @@ impl CheckedSolid {
             return Err(ShapeFault::TooLarge).at(self.id);
         }
         for edge in &self.edges {
-            let bounds = edge.span.bounds(direction);
+            let bounds = edge.span.bounds(direction, work);
+            if *work > MOST_WORK {
+                return Err(ShapeFault::TooLarge).at(edge.id);
+            }
             if bounds.limit > all.limit {
                 decisive = edge.id;
             }
@@ -260,7 +284,7 @@ impl CheckedSolid {
                 .map(|edge| edge.span.points.len())
                 .sum::<usize>();
             *work = work.saturating_add(u64::try_from(count).unwrap_or(u64::MAX));
-            self.check_outside(direction)?;
+            self.check_outside(direction, work)?;
         }
         Ok((all, decisive))
     }
@@ -279,7 +303,8 @@ fn shell_of<'f>(geometry: &Geometry<'f>, id: u64) -> Result<EntityArguments<'f>,
 fn read_face(
     geometry: &Geometry<'_>,
     id: u64,
-    edges: &mut HashMap<u64, ReadEdge>,
+    edges: &mut ReadEdges,
+    work: &mut u64,
 ) -> Result<ReadFace, FaultAt> {
     let face = geometry
         .file
@@ -295,7 +320,7 @@ fn read_face(
             points.push(vertex.reference(1)?);
             continue;
         }
-        let ring = read_loop(geometry, ring, edges)?;
+        let ring = read_loop(geometry, ring, edges, work)?;
         uses.extend(
             ring.into_iter()
                 .map(|(edge, along)| (edge, along == is_same)),
@@ -314,7 +339,8 @@ fn read_face(
 fn read_loop(
     geometry: &Geometry<'_>,
     id: u64,
-    edges: &mut HashMap<u64, ReadEdge>,
+    edges: &mut ReadEdges,
+    work: &mut u64,
 ) -> Result<Vec<(u64, bool)>, FaultAt> {
     let ring = geometry.file.one_of(id, &["EDGE_LOOP"])?;
     let mut uses = Vec::new();
@@ -322,10 +348,10 @@ fn read_loop(
     for oriented in ring.references(1)? {
         let oriented = geometry.file.one_of(oriented, &["ORIENTED_EDGE"])?;
         let (edge, along) = (oriented.reference(3)?, oriented.boolean(4)?);
-        if let Entry::Vacant(free) = edges.entry(edge) {
-            free.insert(read_edge(geometry, edge)?);
+        if let Entry::Vacant(free) = edges.all.entry(edge) {
+            free.insert(read_edge(geometry, edge, &mut edges.curves, work)?);
         }
-        if let Some(read) = edges.get(&edge) {
+        if let Some(read) = edges.all.get(&edge) {
             let (from, to) = if along {
                 (read.start, read.end)
             } else {
@@ -348,12 +374,26 @@ fn read_loop(
     Ok(uses)
 }
 
-fn read_edge(geometry: &Geometry<'_>, id: u64) -> Result<ReadEdge, FaultAt> {
+fn read_edge(
+    geometry: &Geometry<'_>,
+    id: u64,
+    curves: &mut HashMap<u64, Curve>,
+    work: &mut u64,
+) -> Result<ReadEdge, FaultAt> {
     let edge = geometry.file.one_of(id, &["EDGE_CURVE"])?;
     let (start, end) = (edge.reference(1)?, edge.reference(2)?);
     let ends = (vertex(geometry, start)?, vertex(geometry, end)?);
-    let curve = geometry.curve(edge.reference(3)?)?;
-    let span = EdgeSpan::new(&curve, ends, start == end, edge.boolean(4)?).at(id)?;
+    let of = edge.reference(3)?;
+    let curve = match curves.entry(of) {
+        Entry::Occupied(known) => known.into_mut(),
+        Entry::Vacant(free) => free.insert(geometry.curve(of)?),
+    };
+    *work = work.saturating_add(curve.cost());
+    if *work > MOST_WORK {
+        return Err(ShapeFault::TooLarge).at(id);
+    }
+    let span = EdgeSpan::new(curve, ends, start == end, edge.boolean(4)?).at(id)?;
+    *work = work.saturating_add(span.cost());
     Ok(ReadEdge { span, start, end })
 }
 
@@ -412,12 +452,15 @@ fn check_uses(faces: &[ReadFace]) -> Result<(), FaultAt> {
 }
 
 fn check_face(
-    geometry: &Geometry<'_>,
+    (geometry, surface): (&Geometry<'_>, Surface),
     face: &ReadFace,
     edges: &HashMap<u64, ReadEdge>,
     work: &mut u64,
 ) -> Result<CheckedFace, FaultAt> {
-    let surface = geometry.surface(face.surface)?;
+    *work = work.saturating_add(surface.cost().saturating_mul(cost_of(&[face.points.len()])));
+    if *work > MOST_WORK {
+        return Err(ShapeFault::TooLarge).at(face.id);
+    }
     for point in &face.points {
         let distance = surface.chart(vertex(geometry, *point)?).distance;
         if !matches!(

@@ -118,6 +118,12 @@ impl Knots {
         spans.collect()
     }
 
+    /// Returns the number of spans, and the square of the number of control points of each.
+    fn size(&self) -> (usize, usize) {
+        let order = self.degree + 1;
+        (self.spans(self.domain()).len(), order * order)
+    }
+
     /// Evaluates the polar form of the piece of a span at `degree` arguments: the first `firsts`
     /// are `to`, all others are `from`.
     fn polar(
@@ -200,6 +206,12 @@ impl SplineCurve {
         self.knots.domain()
     }
 
+    /// Returns about the number of steps that a search on the curve needs.
+    pub(crate) fn cost(&self) -> u64 {
+        let (spans, square) = self.knots.size();
+        cost_of(&[spans, square, OF_SEARCH])
+    }
+
     /// Returns the Bezier pieces in a range of parameters.
     pub(crate) fn pieces(&self, range: (f64, f64)) -> Vec<BezierCurve> {
         let spans = self.knots.spans(range).into_iter();
@@ -222,6 +234,11 @@ pub(crate) struct BezierCurve {
 }
 
 impl BezierCurve {
+    /// Returns about the number of steps that splitting needs.
+    pub(crate) fn cost(&self) -> usize {
+        self.controls.len() * self.controls.len()
+    }
+
     pub(crate) fn first(&self) -> Vector {
         self.controls
             .first()
@@ -321,6 +338,14 @@ pub(crate) fn nearest_of(pieces: &[BezierCurve], distance: &impl Fn(Vector) -> f
     best.unwrap_or((0.0, f64::INFINITY))
 }
 
+/// Returns the product of some counts.
+pub(crate) fn cost_of(counts: &[usize]) -> u64 {
+    let product = counts
+        .iter()
+        .fold(1, |all: usize, count| all.saturating_mul(*count));
+    u64::try_from(product).unwrap_or(u64::MAX)
+}
+
 /// Returns the distance of a point from a segment.
 pub(crate) fn off_segment(point: Vector, first: Vector, last: Vector) -> f64 {
     let chord = last - first;
@@ -376,6 +401,17 @@ impl SplineSurface {
         Ok(Self { u, v, rows })
     }
 
+    /// Returns the number of patches, and about the number of steps that making them needs.
+    pub(crate) fn size(&self) -> (usize, u64) {
+        let ((of_u, u), (of_v, v)) = (self.u.size(), self.v.size());
+        let count = of_u.saturating_mul(of_v);
+        let width = self.rows.first().map_or(0, Vec::len);
+        let of_columns = cost_of(&[of_u, width, u, self.u.degree + 1]);
+        // Each patch has more points at which searches begin than control points.
+        let of_patches = cost_of(&[count, u, v, 8]);
+        (count, of_columns.saturating_add(of_patches))
+    }
+
     /// Returns the Bezier patches of the whole surface.
     pub(crate) fn patches(&self) -> Vec<BezierPatch> {
         let mut all = Vec::new();
@@ -420,6 +456,12 @@ pub(crate) struct BezierPatch {
 }
 
 impl BezierPatch {
+    /// Returns about the number of steps that a point of the patch needs.
+    pub(crate) fn cost(&self) -> usize {
+        let width = self.rows.first().map_or(0, Vec::len);
+        self.rows.len().saturating_mul(width)
+    }
+
     pub(crate) fn most(&self, of: impl Fn(Vector) -> f64) -> f64 {
         let values = self.rows.iter().flatten();
         let values = values.map(|control| of(control.position()));
@@ -543,7 +585,9 @@ const TRIES: u32 = 24;
 /// Number of pieces in which the nearest point is searched closely.
 const REFINED: usize = 3;
 /// Maximum degree, that of ISO 10303-42 implementations.
-pub(crate) const MOST_DEGREE: usize = 25;
+pub(crate) const MOST_DEGREE: usize = 15;
+/// Number of points of a piece that a search tries.
+pub(crate) const OF_SEARCH: usize = 56;
 
 #[cfg(test)]
 mod tests {

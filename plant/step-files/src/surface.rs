@@ -1,10 +1,12 @@
 //! Surfaces of faces, with two coordinates on each.
 
 use std::f64::consts::TAU;
+use std::rc::Rc;
 
 use crate::edge::TOLERANCE;
+use crate::face::MOST_WORK;
 use crate::fault::ShapeFault;
-use crate::spline::{BezierCurve, BezierPatch, SplineSurface, f64_of, nearest_of};
+use crate::spline::{BezierCurve, BezierPatch, OF_SEARCH, SplineSurface, f64_of, nearest_of};
 use crate::vector::{Placement, Vector};
 
 /// A surface.
@@ -30,7 +32,7 @@ pub(crate) enum Surface {
         major: f64,
         minor: f64,
     },
-    Spline(Box<PatchGrid>),
+    Spline(Rc<PatchGrid>),
     /// A curve that is moved along z of the placement.
     Extrusion {
         placement: Placement,
@@ -193,9 +195,13 @@ impl Surface {
     /// Returns about the number of comparisons that the coordinates of a point need.
     pub(crate) fn cost(&self) -> u64 {
         let count = match self {
-            Self::Spline(grid) => grid.starts.len() + 1000,
+            Self::Spline(grid) => {
+                let of_patch = grid.patches.first().map_or(0, BezierPatch::cost);
+                grid.starts.len() + OF_SEARCH * of_patch
+            }
             Self::Extrusion { profile, .. } | Self::Revolution { profile, .. } => {
-                profile.pieces.len() * 500
+                let of_pieces: usize = profile.pieces.iter().map(BezierCurve::cost).sum();
+                of_pieces * OF_SEARCH
             }
             Self::Plane(_)
             | Self::Cylinder { .. }
@@ -424,11 +430,13 @@ pub(crate) struct PatchGrid {
 }
 
 impl PatchGrid {
-    pub(crate) fn new(surface: &SplineSurface) -> Result<Self, ShapeFault> {
-        let patches = surface.patches();
-        if patches.len() > MOST_PATCHES {
+    pub(crate) fn new(surface: &SplineSurface, work: &mut u64) -> Result<Self, ShapeFault> {
+        let (count, cost) = surface.size();
+        *work = work.saturating_add(cost);
+        if count > MOST_PATCHES || *work > MOST_WORK {
             return Err(ShapeFault::TooLarge);
         }
+        let patches = surface.patches();
         let mut starts = Vec::new();
         for (number, patch) in patches.iter().enumerate() {
             let (of_u, of_v) = patch.degrees();

@@ -522,9 +522,12 @@ fn a_cone_needs_the_unit_of_its_angle() {
 }
 
 #[test]
-fn an_edge_that_meets_its_surface_at_regular_distances_is_a_finding() {
+fn an_extrusion_of_a_curve_of_several_pieces_is_a_finding() {
     let found = finding(&text("zigzag.step"));
-    assert!(found.contains("mm off its surface"), "{found}");
+    assert!(
+        found.contains("so that edges on the surface are not certain"),
+        "{found}"
+    );
 }
 
 #[test]
