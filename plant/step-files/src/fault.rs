@@ -133,6 +133,9 @@ pub enum ShapeFault {
     /// The context of a cone has no unit of angles.
     #[error("its context has no unit of angles, so that its half angle is not certain")]
     NoAngleUnit,
+    /// Representations of one shape have different contexts.
+    #[error("it relates representations with different contexts, whose units may differ")]
+    Contexts,
     /// A shape is related to that of another product without a placement.
     #[error("its shape is also that of #{0}, or related to it without a placement")]
     OtherProduct(u64),

@@ -21,7 +21,7 @@
 //!
 //! Reading order: `part21` and `strings` (text), `records` and `units` (parameters), `vector`,
 //! `spline`, `edge`, `surface` and `geometry` (curves and surfaces), `chart`, `face` and
-//! `solid` (the proof), `product` (assemblies).
+//! `solid` (the proof), `structure` and `product` (assemblies).
 
 mod chart;
 mod edge;
@@ -34,6 +34,7 @@ mod records;
 mod solid;
 mod spline;
 mod strings;
+mod structure;
 mod surface;
 mod units;
 mod vector;

@@ -1,14 +1,15 @@
 //! Products and assemblies: which shapes they have, where their parts are, and their extents.
 
-use std::collections::{BTreeMap, BTreeSet, HashMap};
+use std::collections::HashMap;
 
 use crate::edge::Bounds;
 use crate::face::MOST_WORK;
 use crate::fault::ShapeFault;
-use crate::geometry::Geometry;
 use crate::part21::{ExchangeFile, StepFault};
 use crate::records::{AtEntity, FaultAt};
 use crate::solid::{CheckedSolid, SOLIDS};
+use crate::spline::cost_of;
+use crate::structure::ProductStructure;
 use crate::units::Units;
 use crate::vector::{Placement, Vector};
 
@@ -138,6 +139,7 @@ impl StepProducts {
             structure: &structure,
             solids: HashMap::new(),
             known: HashMap::new(),
+            placements: HashMap::new(),
             work: 0,
         };
         let mut all = Self {
@@ -178,299 +180,6 @@ impl StepProducts {
     }
 }
 
-/// The relations of products, shapes and parts.
-struct ProductStructure<'f> {
-    file: &'f ExchangeFile,
-    /// The id and name of each product by its definition.
-    definitions: BTreeMap<u64, (String, String)>,
-    /// The representations of the shape of each definition.
-    shapes: HashMap<u64, Vec<u64>>,
-    /// Representations of one shape, in both directions.
-    same: HashMap<u64, Vec<u64>>,
-    /// The occurrences of each assembly, with their parts.
-    parts: HashMap<u64, Vec<(u64, u64)>>,
-    /// The relations that place each occurrence.
-    places: HashMap<u64, Vec<u64>>,
-    /// The first relation of each definition that is not read. It may have another part or shape.
-    unread: HashMap<u64, FaultAt>,
-    /// The first relation that is not read and names no definition.
-    lost: Option<FaultAt>,
-}
-
-impl<'f> ProductStructure<'f> {
-    fn read(file: &'f ExchangeFile) -> Self {
-        let mut all = Self {
-            file,
-            definitions: BTreeMap::new(),
-            shapes: HashMap::new(),
-            same: HashMap::new(),
-            parts: HashMap::new(),
-            places: HashMap::new(),
-            unread: HashMap::new(),
-            lost: None,
-        };
-        for name in [
-            "PRODUCT_DEFINITION",
-            "PRODUCT_DEFINITION_WITH_ASSOCIATED_DOCUMENTS",
-        ] {
-            for id in file.all(name) {
-                if let Ok(named) = all.product(id, name) {
-                    all.definitions.insert(id, named);
-                }
-            }
-        }
-        all.relations();
-        all.other_relations();
-        all
-    }
-
-    /// Returns the id and name of the product of a definition.
-    fn product(&self, id: u64, name: &'static str) -> Result<(String, String), FaultAt> {
-        let formation = self.file.one_of(id, &[name])?.reference(2)?;
-        let formations = [
-            "PRODUCT_DEFINITION_FORMATION",
-            "PRODUCT_DEFINITION_FORMATION_WITH_SPECIFIED_SOURCE",
-        ];
-        let formation = self.file.one_of(formation, &formations)?;
-        let product = self.file.one_of(formation.reference(2)?, &["PRODUCT"])?;
-        Ok((product.text(0).to_owned(), product.text(1).to_owned()))
-    }
-
-    fn relations(&mut self) {
-        let file = self.file;
-        for id in file.all("SHAPE_DEFINITION_REPRESENTATION") {
-            let Some(relation) = file.find(id, "SHAPE_DEFINITION_REPRESENTATION") else {
-                continue;
-            };
-            let pair = relation.reference(0).and_then(|shape| {
-                let shape = file.one_of(shape, &["PRODUCT_DEFINITION_SHAPE"])?;
-                Ok((shape.reference(2)?, relation.reference(1)?))
-            });
-            let property = relation.reference(0).ok();
-            let property = property.and_then(|id| file.find(id, "PROPERTY_DEFINITION"));
-            if let Ok((definition, shape)) = pair {
-                self.shapes.entry(definition).or_default().push(shape);
-            } else if let Some(Ok(of)) = property.map(|property| property.reference(2)) {
-                // Properties of features, such as tolerances, are no shapes of products.
-                if self.definitions.contains_key(&of) {
-                    self.miss(id, Some(of));
-                }
-            } else {
-                self.miss(id, None);
-            }
-        }
-        for name in [
-            "SHAPE_REPRESENTATION_RELATIONSHIP",
-            "REPRESENTATION_RELATIONSHIP",
-        ] {
-            for id in file.all(name) {
-                if file.is(id, "REPRESENTATION_RELATIONSHIP_WITH_TRANSFORMATION") {
-                    continue;
-                }
-                if let Ok((a, b)) = self.related(id) {
-                    self.same.entry(a).or_default().push(b);
-                    self.same.entry(b).or_default().push(a);
-                } else {
-                    self.miss(id, None);
-                }
-            }
-        }
-        for id in file.all("NEXT_ASSEMBLY_USAGE_OCCURRENCE") {
-            let Some(usage) = file.find(id, "NEXT_ASSEMBLY_USAGE_OCCURRENCE") else {
-                continue;
-            };
-            let usage = file
-                .find(id, "PRODUCT_DEFINITION_RELATIONSHIP")
-                .unwrap_or(usage);
-            let is_known = |part: &u64| self.definitions.contains_key(part);
-            let assembly = usage.reference(3).ok().filter(is_known);
-            let part = usage.reference(4).ok().filter(is_known);
-            match (assembly, part) {
-                (Some(assembly), Some(part)) if file.is_simple(id) => {
-                    self.parts.entry(assembly).or_default().push((id, part));
-                }
-                _ => self.miss(id, assembly),
-            }
-        }
-        for id in file.all("CONTEXT_DEPENDENT_SHAPE_REPRESENTATION") {
-            let Some(place) = file.find(id, "CONTEXT_DEPENDENT_SHAPE_REPRESENTATION") else {
-                continue;
-            };
-            let pair = place.reference(1).and_then(|shape| {
-                let shape = file.one_of(shape, &["PRODUCT_DEFINITION_SHAPE"])?;
-                Ok((shape.reference(2)?, place.reference(0)?))
-            });
-            if let Ok((occurrence, relation)) = pair {
-                self.places.entry(occurrence).or_default().push(relation);
-            }
-        }
-    }
-
-    /// Notes a relation that is not read, of a definition if it is known.
-    fn miss(&mut self, id: u64, definition: Option<u64>) {
-        let fault = ShapeFault::Unread(self.file.shown(id));
-        let fault = FaultAt { entity: id, fault };
-        match definition {
-            Some(definition) => drop(self.unread.entry(definition).or_insert(fault)),
-            None => drop(self.lost.get_or_insert(fault)),
-        }
-    }
-
-    /// Notes parts and placements of kinds that are not read.
-    fn other_relations(&mut self) {
-        let file = self.file;
-        for name in [
-            "ASSEMBLY_COMPONENT_USAGE",
-            "PROMISSORY_USAGE_OCCURRENCE",
-            "QUANTIFIED_ASSEMBLY_COMPONENT_USAGE",
-        ] {
-            for id in file.all(name) {
-                let is_other = |name: &&str| file.is(id, name);
-                if [
-                    "NEXT_ASSEMBLY_USAGE_OCCURRENCE",
-                    "SPECIFIED_HIGHER_USAGE_OCCURRENCE",
-                ]
-                .iter()
-                .any(is_other)
-                {
-                    continue;
-                }
-                let usage = file.find(id, "PRODUCT_DEFINITION_RELATIONSHIP");
-                let assembly = usage.or_else(|| file.find(id, name));
-                let assembly = assembly.and_then(|usage| usage.reference(3).ok());
-                self.miss(id, assembly.filter(|of| self.definitions.contains_key(of)));
-            }
-        }
-        let occurrences = self.parts.values().flatten();
-        let placed: BTreeSet<u64> = occurrences
-            .filter_map(|(occurrence, _)| self.places.get(occurrence))
-            .flatten()
-            .copied()
-            .collect();
-        let mut owners: BTreeMap<u64, Vec<u64>> = BTreeMap::new();
-        for definition in self.definitions.keys() {
-            for representation in self.representations(*definition) {
-                owners.entry(representation).or_default().push(*definition);
-            }
-        }
-        for id in file.all("REPRESENTATION_RELATIONSHIP_WITH_TRANSFORMATION") {
-            if placed.contains(&id) {
-                continue;
-            }
-            let related = self.related(id).map(|(a, b)| [a, b]).unwrap_or_default();
-            let related = related.iter().filter_map(|of| owners.get(of)).flatten();
-            let related: BTreeSet<u64> = related.copied().collect();
-            // A part does not lack what its assembly lacks.
-            let is_part = |of: &u64| {
-                let assemblies = related.iter().filter_map(|other| self.parts.get(other));
-                assemblies.flatten().any(|(_, part)| part == of)
-            };
-            let lacking: Vec<u64> = related.iter().copied().filter(|of| !is_part(of)).collect();
-            for definition in lacking {
-                self.miss(id, Some(definition));
-            }
-        }
-        for of_one in owners.values() {
-            let [first, .., last] = of_one.as_slice() else {
-                continue;
-            };
-            for definition in of_one {
-                let other = if definition == first { last } else { first };
-                let fault = FaultAt {
-                    entity: *definition,
-                    fault: ShapeFault::OtherProduct(*other),
-                };
-                self.unread.entry(*definition).or_insert(fault);
-            }
-        }
-    }
-
-    /// Returns both representations of a relation.
-    fn related(&self, id: u64) -> Result<(u64, u64), FaultAt> {
-        let relation = self.file.one_of(
-            id,
-            &[
-                "REPRESENTATION_RELATIONSHIP",
-                "SHAPE_REPRESENTATION_RELATIONSHIP",
-                "REPRESENTATION_RELATIONSHIP_WITH_TRANSFORMATION",
-            ],
-        )?;
-        Ok((relation.reference(2)?, relation.reference(3)?))
-    }
-
-    /// Returns all representations of the shape of a definition.
-    fn representations(&self, definition: u64) -> BTreeSet<u64> {
-        let direct = self.shapes.get(&definition);
-        let mut open: Vec<u64> = direct.cloned().unwrap_or_default();
-        let mut all = BTreeSet::new();
-        while let Some(id) = open.pop() {
-            if all.insert(id) {
-                open.extend(self.same.get(&id).into_iter().flatten());
-            }
-        }
-        all
-    }
-
-    fn items(&self, representation: u64) -> Result<Vec<u64>, FaultAt> {
-        self.file
-            .one_of(representation, &REPRESENTATIONS)?
-            .references(1)
-    }
-
-    fn geometry(&self, representation: u64) -> Result<Geometry<'f>, FaultAt> {
-        let context = self
-            .file
-            .one_of(representation, &REPRESENTATIONS)?
-            .reference(2)?;
-        Ok(Geometry {
-            file: self.file,
-            units: Units::of(self.file, context)?,
-        })
-    }
-
-    /// Returns the placement of an occurrence: from the part to the assembly.
-    fn placement(
-        &self,
-        occurrence: u64,
-        (assembly, part): (u64, u64),
-    ) -> Result<Placement, FaultAt> {
-        let places = self
-            .places
-            .get(&occurrence)
-            .map(Vec::as_slice)
-            .unwrap_or_default();
-        let [relation] = places else {
-            return Err(ShapeFault::Placements(places.len())).at(occurrence);
-        };
-        let (first, second) = self.related(*relation)?;
-        let with = self.file.one_of(
-            *relation,
-            &["REPRESENTATION_RELATIONSHIP_WITH_TRANSFORMATION"],
-        )?;
-        let transformation = with.reference(with.len().saturating_sub(1))?;
-        let between = self
-            .file
-            .one_of(transformation, &["ITEM_DEFINED_TRANSFORMATION"])?;
-        let (of_first, of_second) = (between.reference(2)?, between.reference(3)?);
-        let (of_part, of_assembly) = (self.representations(part), self.representations(assembly));
-        let is_forward = of_part.contains(&first) && of_assembly.contains(&second);
-        let is_backward = of_part.contains(&second) && of_assembly.contains(&first);
-        if is_forward == is_backward
-            || !self.items(first)?.contains(&of_first)
-            || !self.items(second)?.contains(&of_second)
-        {
-            return Err(ShapeFault::Unrelated).at(*relation);
-        }
-        let from = self.geometry(first)?.placement(of_first)?;
-        let to = self.geometry(second)?.placement(of_second)?;
-        Ok(if is_forward {
-            to.after(&from.inverse())
-        } else {
-            from.after(&to.inverse())
-        })
-    }
-}
-
 /// Something that has a shape.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 enum Shape {
@@ -487,6 +196,7 @@ struct ShapeReading<'f> {
     solids: HashMap<(u64, [u64; 2]), Result<CheckedSolid, FaultAt>>,
     /// Bounds by the shape and the direction.
     known: HashMap<(Shape, [u64; 3]), Found>,
+    placements: HashMap<u64, Result<Placement, FaultAt>>,
     work: u64,
 }
 
@@ -515,15 +225,15 @@ impl ShapeReading<'_> {
     }
 
     fn occurrences(&mut self, assembly: u64) -> Vec<ProductOccurrence> {
-        let parts = self.structure.parts.get(&assembly);
+        let structure = self.structure;
+        let parts = structure.parts.get(&assembly);
         let parts = parts.map(Vec::as_slice).unwrap_or_default();
         let occurrences = parts.iter().map(|(entity, part)| {
-            let usage = self
-                .structure
+            let usage = structure
                 .file
                 .find(*entity, "NEXT_ASSEMBLY_USAGE_OCCURRENCE");
             let text = |at: usize| usage.map_or("", |usage| usage.text(at)).to_owned();
-            let placement = self.structure.placement(*entity, (assembly, *part));
+            let placement = self.placement(*entity, (assembly, *part));
             ProductOccurrence {
                 entity: *entity,
                 id: text(0),
@@ -533,6 +243,15 @@ impl ShapeReading<'_> {
             }
         });
         occurrences.collect()
+    }
+
+    /// Returns the placement of an occurrence, which is read once.
+    fn placement(&mut self, occurrence: u64, between: (u64, u64)) -> Result<Placement, FaultAt> {
+        let (structure, work) = (self.structure, &mut self.work);
+        let known = self.placements.entry(occurrence);
+        known
+            .or_insert_with(|| structure.placement(occurrence, between, work))
+            .clone()
     }
 
     /// Returns bounds of the largest value of a shape in a direction. `within` are the shapes that
@@ -568,7 +287,7 @@ impl ShapeReading<'_> {
             all = with(all, self.bounds(shape, direction, within)?);
         }
         for (occurrence, part) in structure.parts.get(&id).into_iter().flatten() {
-            let placement = structure.placement(*occurrence, (id, *part))?;
+            let placement = self.placement(*occurrence, (id, *part))?;
             let shape = Shape::Definition(*part);
             let found = self.placed((shape, &placement), direction, within);
             let found = found.map_err(|fault| {
@@ -620,7 +339,9 @@ impl ShapeReading<'_> {
         let structure = self.structure;
         let geometry = structure.geometry(id)?;
         let mut all = (Bounds::NONE, id);
-        for item in structure.items(id)? {
+        let items = structure.items(id)?;
+        self.work = self.work.saturating_add(cost_of(&[items.len()]));
+        for item in items {
             if structure.file.is(item, "AXIS2_PLACEMENT_3D") {
                 continue;
             }
@@ -682,11 +403,4 @@ const SCHEMAS: [&str; 6] = [
     "AUTOMOTIVE_DESIGN",
     "AP214",
     "AP242",
-];
-/// Representations of shapes.
-const REPRESENTATIONS: [&str; 4] = [
-    "ADVANCED_BREP_SHAPE_REPRESENTATION",
-    "SHAPE_REPRESENTATION",
-    "MANIFOLD_SURFACE_SHAPE_REPRESENTATION",
-    "FACETED_BREP_SHAPE_REPRESENTATION",
 ];

@@ -551,3 +551,40 @@ fn edges_that_cross_and_slits_are_findings() {
     let found = finding(&text("slit.step"));
     assert!(found.contains("has no seam"), "{found}");
 }
+
+#[test]
+fn a_product_of_an_unknown_formation_is_a_finding() {
+    let read = StepProducts::read(text("dropped_product.step").as_bytes()).unwrap();
+    assert_eq!(read.products.len(), 2, "{read:?}");
+    let shown: Vec<String> = read.findings.iter().map(ToString::to_string).collect();
+    let is_named = |found: &String| found.contains("PRODUCT_DEFINITION_FORMATION_X");
+    assert!(shown.iter().any(is_named), "{shown:?}");
+}
+
+#[test]
+fn representations_of_one_shape_need_the_same_context() {
+    let cover = text("cover.step");
+    let shape = cover
+        .lines()
+        .find(|line| line.contains("BREP_SHAPE_REPRESENTATION"))
+        .unwrap();
+    let number = shape.split('=').next().unwrap();
+    let context = shape.rsplit('#').next().unwrap().trim_end_matches(");");
+    let original = cover
+        .lines()
+        .find(|line| line.starts_with(&format!("#{context}=")))
+        .unwrap();
+    let end = cover.rfind("ENDSEC;").unwrap();
+    let related = |of: &str| {
+        let (_, copy) = original.split_once('=').unwrap();
+        format!(
+            "{}#90001={copy}\n#90002=SHAPE_REPRESENTATION('',(),#{of});\n\
+            #90003=SHAPE_REPRESENTATION_RELATIONSHIP('','',{number},#90002);\n{}",
+            &cover[..end],
+            &cover[end..]
+        )
+    };
+    assert_eq!(bounds(&related(context)), bounds(&cover));
+    let found = finding(&related("90001"));
+    assert!(found.contains("different contexts"), "{found}");
+}
