@@ -82,6 +82,8 @@ pub(super) struct Halting {
     /// Reason of the stop, as text for the outcome.
     pub(super) message: String,
     pub(super) then: Then,
+    /// Whether the run exceeded its time limit. Its stop is not withdrawn by a refusal.
+    pub(super) is_late: bool,
     /// From this time on, a second Halt ends the run with an unknown outcome.
     pub(super) over: Instant,
 }

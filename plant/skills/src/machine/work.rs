@@ -304,6 +304,7 @@ impl<R> SkillWork<R> {
         work.halting = Some(Halting {
             message,
             then,
+            is_late: then == Then::End,
             over,
         });
         self.record.pends(why);
@@ -369,8 +370,12 @@ impl<R> SkillWork<R> {
             Line::Note(_) => {}
             Line::Pending(why) => self.record.pends(why),
             Line::Refused(why) => {
-                // The Halt has no effect. A run that exceeded its limit stays in its stop.
-                work.halting.take_if(|halting| halting.then == Then::Halt);
+                // The Halt has no effect. A run that exceeded its limit stays in its stop, so that
+                // a later Halt can give it up.
+                match &mut work.halting {
+                    Some(halting) if halting.is_late => halting.then = Then::End,
+                    halting => *halting = None,
+                }
                 self.record.pends_once(why);
             }
             Line::Unknown(why) => {

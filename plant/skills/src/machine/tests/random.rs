@@ -28,6 +28,8 @@ impl Numbers {
 /// The rules, as seen by the driver, the callers and the observers.
 #[derive(Default)]
 struct Rules {
+    /// Whether every run has a time limit.
+    has_limit: bool,
     /// The run whose work goes on.
     at_work: Option<RunId>,
     is_aborted: bool,
@@ -87,6 +89,14 @@ impl Rules {
         assert!(
             !waits || bench.machine.poll_deadline().is_some(),
             "a call waits without an end"
+        );
+        let is_running = bench.state() == ProgramMachineState::Running;
+        let is_stopped = bench.machine.work.is_halting(bench.now()).is_some();
+        assert!(
+            !(is_running && self.has_limit)
+                || is_stopped
+                || bench.machine.poll_deadline().is_some(),
+            "a run has lost its time limit"
         );
     }
 
@@ -183,17 +193,35 @@ fn end(bench: &mut Bench, rules: &mut Rules, numbers: &mut Numbers) {
     rules.end(bench, result);
 }
 
+/// A run exceeds its limit, a Halt is accepted, and the executor refuses it.
+fn refuse_late(bench: &mut Bench, rules: &mut Rules) {
+    bench.pass(seconds(4));
+    rules.check(bench);
+    rules.halts.insert(bench.calls.len());
+    bench.call(ProgramMethod::Halt);
+    rules.check(bench);
+    if let Some(run) = rules.at_work {
+        rules.is_halted = false;
+        bench.report(run, Line::Refused("the robot goes on".to_owned()));
+    }
+}
+
 /// One life of a skill: calls, reports and times in a random order, and then its end.
 fn live(seed: u64) -> (usize, u64) {
     let mut numbers = Numbers(seed.wrapping_mul(0x9E37_79B9_7F4A_7C15) | 1);
-    let mut bench = Bench::new(setup(&mut numbers));
-    let mut rules = Rules::default();
+    let setup = setup(&mut numbers);
+    let mut bench = Bench::new(setup);
+    let mut rules = Rules {
+        has_limit: setup.timeout.is_some(),
+        ..Rules::default()
+    };
     for _ in 0..400 {
         match numbers.below(10) {
             0..4 => call(&mut bench, &mut rules, &mut numbers),
             4..6 => report(&mut bench, &mut rules, &mut numbers),
             6 => end(&mut bench, &mut rules, &mut numbers),
             7 if numbers.one_in(4) => bench.authority.release(&ME),
+            7 if numbers.one_in(16) => refuse_late(&mut bench, &mut rules),
             _ => {
                 let time = millis(numbers.pick(&[0, 50, 100, 500, 1_000, 2_500]));
                 bench.pass(time);

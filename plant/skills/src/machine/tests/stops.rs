@@ -372,6 +372,31 @@ fn a_refused_cancellation_is_reported_and_the_run_goes_on() {
     );
 }
 
+/// The executor refuses a Halt that was accepted after the time limit: the run stays in its stop.
+#[test]
+fn a_late_run_whose_halt_is_refused_can_be_given_up() {
+    for gives_up in [true, false] {
+        let mut bench = with_limit(ELSEWHERE, seconds(60));
+        let run = bench.run();
+        bench.pass(seconds(61));
+        bench.ask(ProgramMethod::Halt).unwrap();
+        bench.report(run, Line::Refused("the robot goes on".to_owned()));
+        assert!(bench.ask(ProgramMethod::Suspend).is_err(), "it is stopped");
+        if !gives_up {
+            // The refused Halt does not decide the state.
+            bench.end(run, done());
+            assert_eq!(bench.state(), ProgramMachineState::Ready);
+            continue;
+        }
+        bench.pass(seconds(10));
+        let halt = bench.call(ProgramMethod::Halt);
+        bench.end(run, aborted());
+        assert_eq!(bench.answer(halt), Some(Ok(1)));
+        assert!(bench.outcome(run).unknown);
+        assert_eq!(bench.state(), ProgramMachineState::Halted);
+    }
+}
+
 #[test]
 fn a_closed_skill_waits_for_work_elsewhere_and_then_gives_it_up() {
     for is_ended in [true, false] {
