@@ -78,6 +78,12 @@ impl Authority {
         self.change(|lease| lease.lock(by, limit, Instant::now()))
     }
 
+    /// Renews the lock of this owner: it ends after `limit` without an action of the owner.
+    /// Returns false, and changes nothing, if the owner has no lock.
+    pub(crate) fn renew_lock(&self, by: &SkillOwner, limit: Duration) -> bool {
+        self.change(|lease| lease.renew(by, limit, Instant::now()))
+    }
+
     /// Returns whether this owner has locked the lease.
     #[must_use]
     pub fn is_locked_by(&self, by: &SkillOwner) -> bool {

@@ -70,6 +70,11 @@ impl ComponentLease {
         Ok(())
     }
 
+    /// Renews the lock of this owner. Returns false, and changes nothing, without such a lock.
+    pub(super) fn renew(&mut self, by: &SkillOwner, limit: Duration, now: Instant) -> bool {
+        self.is_locked_by(by) && self.lock(by, limit, now).is_ok()
+    }
+
     /// Returns whether this owner holds the lock.
     pub(super) fn is_locked_by(&self, by: &SkillOwner) -> bool {
         self.lock.is_some() && self.lease.holder() == Some(by)
@@ -256,6 +261,22 @@ mod tests {
         assert_eq!(lease.expire(at(600)), None);
         assert_eq!(lease.locked_until(), Some(at(1_199)));
         assert_eq!(lease.expire(at(1_199)), Some(ME));
+        assert_eq!((lease.locked_until(), lease.holder()), (None, None));
+    }
+
+    #[test]
+    fn only_a_lock_that_its_owner_holds_is_renewed() {
+        let (mut lease, at) = lease();
+        let limit = Duration::from_secs(600);
+        lease.claim(&ME, at(0)).unwrap();
+        assert!(!lease.renew(&ME, limit, at(0)), "a lease without a lock");
+        lease.lock(&ME, limit, at(0)).unwrap();
+        assert!(lease.renew(&ME, limit, at(500)));
+        assert!(!lease.renew(&OTHER, limit, at(501)));
+        assert_eq!(lease.locked_until(), Some(at(1_100)));
+        // The lock ends first, and then its owner renews it.
+        assert_eq!(lease.expire(at(1_100)), Some(ME));
+        assert!(!lease.renew(&ME, limit, at(1_100)));
         assert_eq!((lease.locked_until(), lease.holder()), (None, None));
     }
 

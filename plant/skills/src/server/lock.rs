@@ -106,11 +106,11 @@ impl Lock {
     }
 
     fn renew(&self, request: &MethodRequest) -> Answer {
-        if !self.is_held_by(request) {
+        if !self.authority.renew_lock(&owner_of(request), LONGEST_LOCK) {
             return Ok(NOT_LOCKED);
         }
-        // The session has held the lock until now.
-        Ok(self.lock_for(request).map_or(NOT_LOCKED, |()| DONE))
+        self.changed.send_replace(());
+        Ok(DONE)
     }
 
     fn exit(&self, request: &MethodRequest) -> Answer {
