@@ -88,7 +88,7 @@ enum Closing {
     Halts,
     /// The run was asked to halt.
     Asked,
-    /// The work is done elsewhere, and its end is awaited until this time.
+    /// The work is done elsewhere, and its end is awaited until this time. Then the run is given up.
     Pends(Instant),
     Done,
 }
@@ -302,7 +302,8 @@ impl<R: CallReply> SkillMachine<R> {
                 }
                 Closing::Asked
             }
-            Closing::Asked if self.work.is_halting(now).is_some() => {
+            // The cancellation is in progress, or is refused: the run ends with an outcome anyway.
+            Closing::Asked if self.work.record().is_at_work() => {
                 Closing::Pends(now.monotonic + PENDING_AT_END)
             }
             Closing::Asked => Closing::Done,
@@ -505,7 +506,7 @@ impl<R: CallReply> SkillMachine<R> {
             skill = self.work.record().facts().name,
             run = shown.run,
             why = shown.pending.as_deref().unwrap_or_default(),
-            "the component stops with a pending cancellation: the outcome of the run is unknown; check the machine"
+            "the component stops before the work has ended: the outcome of the run is unknown; check the machine"
         );
         let message = "the end of the component".to_owned();
         self.stop(StopCause::GiveUp, message, None, now);

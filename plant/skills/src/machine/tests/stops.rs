@@ -420,7 +420,7 @@ fn a_closed_skill_waits_for_work_elsewhere_and_then_gives_it_up() {
 }
 
 #[test]
-fn a_closed_skill_ends_at_once_if_it_does_not_run_or_its_work_cannot_be_cancelled() {
+fn a_closed_skill_ends_at_once_if_it_does_not_run() {
     let mut bench = Bench::new(HERE);
     bench.close();
     assert!(bench.machine.is_closed());
@@ -429,9 +429,39 @@ fn a_closed_skill_ends_at_once_if_it_does_not_run_or_its_work_cannot_be_cancelle
     bench.close();
     assert!(bench.machine.is_closed());
     assert_eq!(bench.state(), ProgramMachineState::Halted);
-    let mut bench = Bench::new(ELSEWHERE);
-    let run = bench.run();
-    bench.close();
-    bench.report(run, Line::Refused("the robot goes on".to_owned()));
-    assert!(bench.machine.is_closed());
+}
+
+/// A refused cancellation does not leave a run without an outcome.
+#[test]
+fn a_closed_skill_gives_up_work_whose_cancellation_is_refused() {
+    for is_ended in [true, false] {
+        let mut bench = Bench::new(ELSEWHERE);
+        let run = bench.run();
+        bench.close();
+        bench.report(run, Line::Refused("the robot goes on".to_owned()));
+        bench.pass(millis(4_499));
+        assert!(!bench.machine.is_closed());
+        bench.story();
+        if is_ended {
+            bench.end(run, done());
+            assert_eq!(
+                bench.story(),
+                ["outcome 1 done", "RunningToReady", "ReadyToHalted"]
+            );
+        } else {
+            bench.pass(millis(1));
+            bench.end(run, aborted());
+            assert_eq!(
+                bench.story(),
+                ["abort", "outcome 1 unknown", "RunningToHalted"]
+            );
+            assert_eq!(
+                bench.outcome(run).message,
+                "the end of the component; the outcome is unknown: the robot goes on"
+            );
+        }
+        assert!(bench.machine.is_closed());
+        let idle = bench.authority.idle(bench.now().monotonic);
+        assert_eq!(idle, Some(Duration::ZERO), "the component is released");
+    }
 }
