@@ -264,11 +264,16 @@ impl<R> SkillWork<R> {
             Stop::BrokenOff(how) => message = format!("{message}; {how}"),
             Stop::Done(_) | Stop::Stopped | Stop::Refused(_) => {}
         }
-        if let Some(work) = &self.work {
+        // Aborted work that blocks its thread may still move the machine: its run ends, so that it
+        // cannot be resumed, and the work is kept until its end.
+        let is_unknown = self.record.snapshot().needs_reset;
+        if let Some(work) = &self.work
+            && !is_unknown
+        {
             return Err(still_at_work(work.run));
         }
         self.record.end_without_work(message.clone());
-        if self.record.snapshot().needs_reset {
+        if is_unknown {
             self.record.take(ProgramMethod::Halt, &message, now)?;
             return Err(SkillRefusal::unknown_outcome(self.record.run_number()));
         }

@@ -57,7 +57,10 @@ impl Rules {
                     self.at_work = Some(bench.newest());
                     (self.is_aborted, self.is_unknown) = (false, false);
                 }
-                ["signal", "Go"] => assert!(!self.is_halted, "a Halt was accepted"),
+                ["signal", "Go"] => {
+                    assert!(!self.is_halted, "a Halt was accepted");
+                    assert!(!self.is_aborted, "the work was aborted");
+                }
                 ["signal", _] => assert!(self.at_work.is_some(), "a signal without work"),
                 ["abort"] => {
                     assert!(self.at_work.is_some(), "an abort without work");

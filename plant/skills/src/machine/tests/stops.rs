@@ -165,17 +165,40 @@ fn a_reset_of_suspended_work_without_a_known_end_halts() {
     assert!(bench.outcome(run).unknown);
     assert_eq!(bench.state(), ProgramMachineState::Halted);
     bench.ask(ProgramMethod::Reset).unwrap();
+}
 
-    // Work that blocks its thread keeps the run Suspended until it ends.
-    bench.ask(ProgramMethod::Start).unwrap();
+/// Aborted work that blocks its thread gets no Go: its run ends at once, and cannot be resumed.
+#[test]
+fn a_reset_of_suspended_work_that_does_not_end_halts_with_an_unknown_outcome() {
+    let mut bench = Bench::new(HERE);
+    let run = bench.run();
     bench.ask(ProgramMethod::Suspend).unwrap();
     let reset = bench.call(ProgramMethod::Reset);
-    bench.pass(seconds(2));
-    assert!(bench.answer(reset).unwrap().is_err());
-    assert_eq!(bench.state(), ProgramMachineState::Suspended);
-    bench.end(bench.newest(), aborted());
-    assert_eq!(bench.state(), ProgramMachineState::Halted);
-    assert!(bench.outcome(bench.newest()).unknown);
+    bench.story();
+    bench.pass(seconds(1));
+    bench.pass(millis(100));
+    assert_eq!(
+        bench.story(),
+        [
+            "abort",
+            "outcome 1 unknown",
+            "SuspendedToHalted",
+            "called",
+            "reply 2: BadInvalidState"
+        ]
+    );
+    assert_eq!(
+        bench.answer(reset).unwrap().unwrap_err().text,
+        "the outcome of run 1 is unknown; Reset makes the skill ready"
+    );
+    assert!(bench.ask(ProgramMethod::Resume).is_err());
+    let refusal = bench.ask(ProgramMethod::Reset).unwrap_err();
+    assert_eq!(refusal.text, "the work of run 1 has not come to an end");
+    bench.story();
+    bench.end(run, aborted());
+    assert_eq!(bench.story(), Vec::<String>::new());
+    bench.ask(ProgramMethod::Reset).unwrap();
+    assert_eq!(bench.ask(ProgramMethod::Start), Ok(2));
 }
 
 #[test]
