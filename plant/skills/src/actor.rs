@@ -11,7 +11,7 @@ use tokio::task::{JoinError, JoinHandle};
 use tokio::time::{Instant, sleep_until};
 
 use crate::authority::Authority;
-use crate::driver::{Line, Reins, RunResults, Work};
+use crate::driver::{Line, MOST_STEPS, Reins, RunResults, Work};
 use crate::driver_error::DriverError;
 use crate::machine::{
     CallReply, MachineParts, Moment, RunFailure, SkillCallRequest, SkillMachine, SkillOutput,
@@ -88,7 +88,7 @@ impl Actor {
             tokio::select! {
                 order = orders.recv(), if has_handles => match order {
                     Some(Order::Call(call)) => {
-                        self.take_end().await;
+                        self.take_arrived().await;
                         self.machine.call(call);
                     }
                     Some(Order::Close(closed)) => {
@@ -102,7 +102,7 @@ impl Actor {
                     }
                 },
                 event = next_event(&mut self.task) => self.task_event(event),
-                () = at(deadline) => self.machine.handle_deadline(moment()),
+                () = at(deadline) => self.handle_deadline(moment()).await,
             }
             self.carry_out();
         }
@@ -112,11 +112,37 @@ impl Actor {
         }
     }
 
-    /// Processes the end of work that has ended already, so that a call finds the run ended.
-    async fn take_end(&mut self) {
-        while self.task.as_ref().is_some_and(|of| of.task.is_finished()) {
+    /// Processes a time limit that has passed, and before it all that came in time.
+    async fn handle_deadline(&mut self, now: Moment) {
+        self.take_arrived().await;
+        self.machine.handle_deadline(now);
+    }
+
+    /// Processes the reports that wait, and the end of work that has ended already, so that a call
+    /// or a deadline finds the run ended.
+    async fn take_arrived(&mut self) {
+        let has_ended = self.task.as_ref().is_some_and(|of| of.task.is_finished());
+        if has_ended {
+            // The end comes before the reports, and processes them.
             let event = next_event(&mut self.task).await;
             self.task_event(event);
+        } else {
+            self.take_reports();
+        }
+        self.carry_out();
+    }
+
+    /// Processes the reports that wait: at most a full queue, because a task that the driver
+    /// started may report without end.
+    fn take_reports(&mut self) {
+        for _ in 0..MOST_STEPS {
+            let Some(RunTask { run, reins, .. }) = &mut self.task else {
+                return;
+            };
+            let Ok(line) = reins.steps.try_recv() else {
+                return;
+            };
+            self.machine.report(*run, line, moment());
             self.carry_out();
         }
     }
@@ -130,9 +156,7 @@ impl Actor {
             TaskEvent::Progress(done) => self.machine.progress(run, done),
             TaskEvent::Ended(result) => {
                 // Reports that came before the end.
-                while let Some(line) = self.task.as_mut().and_then(RunTask::report) {
-                    self.machine.report(run, line, moment());
-                }
+                self.take_reports();
                 self.task = None;
                 self.machine.ended(run, result, moment());
             }
@@ -177,13 +201,6 @@ impl Actor {
     }
 }
 
-impl RunTask {
-    /// Returns the next waiting report.
-    fn report(&mut self) -> Option<Line> {
-        self.reins.steps.try_recv().ok()
-    }
-}
-
 /// Returns the next event of the work. Pends while there is no work.
 async fn next_event(task: &mut Option<RunTask>) -> TaskEvent {
     let Some(RunTask { task, reins, .. }) = task else {
@@ -191,8 +208,9 @@ async fn next_event(task: &mut Option<RunTask>) -> TaskEvent {
     };
     tokio::select! {
         biased;
-        Some(line) = reins.steps.recv() => TaskEvent::Line(line),
+        // Reports without end do not delay the end of the work, which processes those before it.
         ended = task => TaskEvent::Ended(end_of(ended)),
+        Some(line) = reins.steps.recv() => TaskEvent::Line(line),
         Ok(()) = reins.progress.changed() => {
             TaskEvent::Progress(*reins.progress.borrow_and_update())
         }
@@ -232,3 +250,6 @@ async fn at(deadline: Option<Instant>) {
         None => pending().await,
     }
 }
+
+#[cfg(test)]
+mod tests;

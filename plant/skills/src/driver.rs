@@ -254,4 +254,4 @@ impl Work {
 }
 
 /// Maximum number of waiting reports.
-const MOST_STEPS: usize = 64;
+pub(crate) const MOST_STEPS: usize = 64;
