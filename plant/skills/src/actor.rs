@@ -1,14 +1,15 @@
 //! The task of a skill. It waits for calls, reports of the work and time limits, and carries out
 //! the outputs of the [`SkillMachine`].
 
-use std::any::Any;
 use std::future::pending;
+use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
 
 use program::RunId;
 use tokio::sync::{mpsc, oneshot, watch};
 use tokio::task::{JoinError, JoinHandle};
 use tokio::time::{Instant, sleep_until};
+use tracing::error;
 
 use crate::authority::Authority;
 use crate::driver::{Line, MOST_STEPS, Reins, RunResults, Work};
@@ -17,6 +18,7 @@ use crate::machine::{
     CallReply, MachineParts, Moment, RunFailure, SkillCallRequest, SkillMachine, SkillOutput,
     WorkEnd,
 };
+use crate::panics::panic_text;
 use crate::refusal::SkillRefusal;
 use crate::shown::{SkillObserver, SkillSnapshot, clock};
 
@@ -201,6 +203,43 @@ impl Actor {
     }
 }
 
+impl Drop for Actor {
+    /// Ends a run in progress with an unknown outcome, and releases the component. An observer that
+    /// panics, and the end of the runtime, drop the task before the skill is closed.
+    fn drop(&mut self) {
+        if self.machine.is_closed() {
+            return;
+        }
+        if std::thread::panicking() {
+            error!(
+                skill = self.name,
+                hint = "restart the component",
+                "the skill broke down"
+            );
+        }
+        self.machine.abandon(moment());
+        while let Some(output) = self.machine.poll_output(moment()) {
+            match output {
+                SkillOutput::Event(notice, shown) => {
+                    for observer in &self.observers {
+                        let told = || observer.told(notice.event(), &shown);
+                        // The observer that broke down may do so again.
+                        let _told = catch_unwind(AssertUnwindSafe(told));
+                    }
+                }
+                SkillOutput::Release { at } => self.authority.end(&self.name, at),
+                SkillOutput::Reply(caller, answer) => {
+                    let _told = caller.send(answer);
+                }
+                // The work sees the end of its skill as a stop.
+                SkillOutput::Run { .. } | SkillOutput::Signal(_) | SkillOutput::Abort => {}
+            }
+        }
+        let shown = self.machine.snapshot().clone();
+        self.shown.send_replace(Arc::new(shown));
+    }
+}
+
 /// Returns the next event of the work. Pends while there is no work.
 async fn next_event(task: &mut Option<RunTask>) -> TaskEvent {
     let Some(RunTask { task, reins, .. }) = task else {
@@ -225,16 +264,10 @@ fn end_of(ended: Result<Result<RunResults, DriverError>, JoinError>) -> WorkEnd 
     };
     Err(match error.try_into_panic() {
         Ok(panic) => RunFailure::Panicked {
-            panic: text_of(&*panic).to_owned(),
+            panic: panic_text(&*panic).to_owned(),
         },
         Err(_) => RunFailure::Aborted,
     })
-}
-
-fn text_of(panic: &(dyn Any + Send)) -> &str {
-    let text = panic.downcast_ref::<String>().map(String::as_str);
-    text.or_else(|| panic.downcast_ref::<&str>().copied())
-        .unwrap_or("no reason given")
 }
 
 fn moment() -> Moment {

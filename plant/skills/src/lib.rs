@@ -21,6 +21,7 @@ mod lock;
 mod machine;
 pub mod model;
 mod outcomes;
+mod panics;
 mod parameters;
 mod part;
 mod partner_error;

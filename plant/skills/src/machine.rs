@@ -194,6 +194,22 @@ impl<R: CallReply> SkillMachine<R> {
         }
     }
 
+    /// Ends the skill at once, without its work: the outcome of a run in progress is unknown.
+    pub(crate) fn abandon(&mut self, now: Moment) {
+        self.close();
+        self.closing = Some(Closing::Done);
+        if let Some(caller) = self.stopping.take().and_then(|stopping| stopping.caller) {
+            let reply = SkillOutput::Reply(caller.reply, Err(SkillRefusal::closed()));
+            self.work.record_mut().push(reply);
+        }
+        let record = self.work.record_mut();
+        if record.is_at_work() {
+            record.require_reset();
+            let message = "the skill broke down; the outcome is unknown, check the machine";
+            record.halt_without_work(message.to_owned(), now);
+        }
+    }
+
     /// Processes a report of the work of a run.
     pub(crate) fn report(&mut self, run: RunId, line: Line, now: Moment) {
         if !self.work.is_in_progress(run) {

@@ -1,4 +1,4 @@
-//! Tests of the task of a skill: the order of simultaneous inputs.
+//! Tests of the task of a skill: the order of simultaneous inputs, and parts that panic.
 
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -7,19 +7,22 @@ use std::time::Duration;
 use async_trait::async_trait;
 use futures_util::FutureExt;
 use program::ProgramMethod;
+use tokio::sync::Semaphore;
 use tokio::time::timeout;
 
 use super::*;
 use crate::authority::SkillOwner;
 use crate::description::SkillDescription;
 use crate::driver::Driver;
+use crate::driver_error::InvalidParameter;
 use crate::lock::lock;
 use crate::machine::Given;
 use crate::model;
 use crate::outcomes::NewestOutcomes;
-use crate::parameters::ParameterType;
+use crate::parameters::{ParameterType, Parameters, SkillParameter};
 use crate::shown::{RunOutcome, SkillEvent, is_work};
 use crate::skill::Skill;
+use crate::value::SkillValue;
 
 const ME: SkillOwner = SkillOwner::Session(1);
 /// Time limit of a wait.
@@ -54,7 +57,9 @@ async fn start(skill: &Skill) {
 async fn ended(skill: &Skill) -> Arc<RunOutcome> {
     let mut watch = skill.watch();
     let shown = watch.wait_for(|shown| shown.run == 1 && !is_work(shown.state));
-    let shown = timeout(PATIENCE, shown).await.expect("the run ends in time");
+    let shown = timeout(PATIENCE, shown)
+        .await
+        .expect("the run ends in time");
     assert!(shown.is_ok(), "the run ends");
     skill.outcome(1).expect("the run has an outcome")
 }
@@ -167,4 +172,92 @@ async fn reports_without_end_do_not_delay_the_end_of_the_work() {
     assert!(ended(&skill).await.succeeded);
     let steps = steps.load(Ordering::SeqCst);
     assert!((1..=2 * MOST_STEPS).contains(&steps), "{steps} steps");
+}
+
+/// A driver that panics before its run, in one of the two checks.
+struct Careless {
+    prepares: bool,
+}
+
+#[async_trait]
+impl Driver for Careless {
+    fn prepared(
+        &self,
+        _declared: &[SkillParameter],
+        given: Vec<(String, SkillValue)>,
+    ) -> Vec<(String, SkillValue)> {
+        assert!(!self.prepares, "a table is empty");
+        given
+    }
+
+    fn check(&self, _parameters: &Parameters) -> Result<(), InvalidParameter> {
+        panic!("a table is empty")
+    }
+
+    async fn run(&self, _work: Work) -> Result<RunResults, DriverError> {
+        Ok(Vec::new())
+    }
+}
+
+#[tokio::test]
+async fn a_driver_that_panics_in_a_check_refuses_the_start() {
+    for prepares in [true, false] {
+        let authority = Authority::new();
+        let skill = skill(Careless { prepares }, &authority, Vec::new());
+        let by = SkillOwner::Local("mes");
+        for _ in 0..2 {
+            let refused = skill.execute(by.clone(), Vec::new(), None).await;
+            assert_eq!(
+                refused.unwrap_err().to_string(),
+                "BadInvalidArgument: the driver broke down while it checked the parameters: a table is empty"
+            );
+        }
+        assert_eq!(*authority.holder().borrow(), None);
+        assert!(authority.reserve(), "the component is free");
+    }
+}
+
+/// Panics at a step of a run.
+struct Fragile;
+
+impl SkillObserver for Fragile {
+    fn told(&self, what: SkillEvent<'_>, _shown: &SkillSnapshot) {
+        assert!(!matches!(what, SkillEvent::Step), "the disk is full");
+    }
+}
+
+/// Reports a step, and works until it is stopped.
+struct Steady(Arc<Semaphore>);
+
+#[async_trait]
+impl Driver for Steady {
+    async fn run(&self, work: Work) -> Result<RunResults, DriverError> {
+        work.step("first").await;
+        work.stopped().await;
+        self.0.add_permits(1);
+        Err(DriverError::Stopped)
+    }
+}
+
+#[tokio::test]
+async fn an_observer_that_panics_ends_the_run_as_unknown_and_releases_the_component() {
+    let (authority, stops) = (Authority::new(), Arc::new(Semaphore::new(0)));
+    let skill = skill(
+        Steady(Arc::clone(&stops)),
+        &authority,
+        vec![Box::new(Fragile)],
+    );
+    start(&skill).await;
+    let outcome = ended(&skill).await;
+    assert!(outcome.unknown && !outcome.succeeded);
+    assert_eq!(
+        outcome.message,
+        "the skill broke down; the outcome is unknown, check the machine"
+    );
+    assert!(skill.shown().needs_reset);
+    assert_eq!(authority.begin("Lift"), Ok(()), "the component is free");
+    let refused = skill.call(ME, ProgramMethod::Reset).await.unwrap_err();
+    assert_eq!(refused, SkillRefusal::closed());
+    let stopped = timeout(PATIENCE, stops.acquire()).await;
+    assert!(stopped.is_ok(), "the work is stopped");
 }

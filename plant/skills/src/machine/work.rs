@@ -1,5 +1,6 @@
 //! The program of a skill with its driver and the work in progress: the start and the end of runs.
 
+use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
@@ -12,11 +13,13 @@ use super::record::SkillRecord;
 use super::refused::{is_stopped, still_at_work};
 use super::run::{Halting, RunState, Stop, StopCause, Then, WorkEnd};
 use crate::authority::SkillOwner;
-use crate::driver::{Line, Signal};
+use crate::driver::{Driver, Line, Signal};
 use crate::lock::lock;
-use crate::parameters::Parameters;
+use crate::panics::panic_text;
+use crate::parameters::{Parameters, SkillParameter};
 use crate::pending::PendingParameters;
 use crate::refusal::{RefusalCode, SkillRefusal};
+use crate::value::SkillValue;
 
 /// The program of a skill, its driver and the work of its newest run.
 pub(super) struct SkillWork<R> {
@@ -100,11 +103,7 @@ impl<R> SkillWork<R> {
             .unwrap_or_else(|| lock(&self.pending).given(by));
         let driver = Arc::clone(self.slot.driver());
         let facts = Arc::clone(self.record.facts());
-        let prepared = driver.prepared(&facts.parameters, given.clone());
-        let parameters = Parameters::complete(&facts.parameters, prepared)?;
-        driver
-            .check(&parameters)
-            .map_err(|why| SkillRefusal::new(RefusalCode::InvalidArgument, why.to_string()))?;
+        let parameters = accepted(&*driver, &facts.parameters, given.clone())?;
         self.record.authority().begin(&facts.name)?;
         let run = self.begin(by, &parameters, now);
         let run = run.inspect_err(|_| self.record.authority().end(&facts.name, now.monotonic))?;
@@ -389,6 +388,29 @@ impl<R> SkillWork<R> {
             }
         }
     }
+}
+
+/// Returns the complete parameters of a run, if the driver accepts them. A driver that panics
+/// accepts nothing.
+fn accepted(
+    driver: &dyn Driver,
+    declared: &[SkillParameter],
+    given: Vec<(String, SkillValue)>,
+) -> Result<Parameters, SkillRefusal> {
+    let invalid = |why: String| SkillRefusal::new(RefusalCode::InvalidArgument, why);
+    let checked = catch_unwind(AssertUnwindSafe(|| {
+        let prepared = driver.prepared(declared, given);
+        let parameters = Parameters::complete(declared, prepared)?;
+        let checked = driver.check(&parameters);
+        checked.map_err(|why| invalid(why.to_string()))?;
+        Ok(parameters)
+    }));
+    checked.unwrap_or_else(|panic| {
+        let panic = panic_text(&*panic);
+        Err(invalid(format!(
+            "the driver broke down while it checked the parameters: {panic}"
+        )))
+    })
 }
 
 /// Halt timeout of a driver whose own exceeds the range of the clock.
