@@ -130,11 +130,20 @@ impl SeenSkill {
                         (0, true) => self.number(),
                         (run, _) => run,
                     };
-                    if !is_work(self.now.state) {
-                        self.last_outcome().await;
+                    let known = match is_work(self.now.state) {
+                        true => Ok(()),
+                        false => {
+                            let read = self.outcome(self.now.state).await;
+                            self.last_outcome(read)
+                        }
+                    };
+                    match known {
+                        Ok(()) => {
+                            self.tell(SkillEvent::Step);
+                            return;
+                        }
+                        Err(fault) => debug!("cannot read the last outcome of a skill: {fault}"),
                     }
-                    self.tell(SkillEvent::Step);
-                    return;
                 }
                 Err(fault) => debug!("a skill does not say how it is: {fault}"),
             }
@@ -142,10 +151,22 @@ impl SeenSkill {
         }
     }
 
-    /// Reads the outcome of the run before this program saw the skill. If it is unknown, a skill
-    /// that is Halted needs a Reset.
-    async fn last_outcome(&mut self) {
-        let outcome = self.ended(self.now.state).await;
+    /// Takes the outcome of the run before this program saw the skill. If it is unknown, a skill
+    /// that is Halted needs a Reset. An outcome of another run counts as unknown.
+    ///
+    /// # Errors
+    /// The outcome could not be read, so it has to be read again.
+    fn last_outcome(&mut self, read: Result<RunOutcome, SkillFault>) -> Result<(), SkillFault> {
+        let outcome = match read {
+            Ok(outcome) => outcome,
+            Err(SkillFault::Unexpected(why)) => unknown(self.now.run, why),
+            Err(
+                fault @ (SkillFault::Lost(_)
+                | SkillFault::Refused { .. }
+                | SkillFault::TimedOut(_)
+                | SkillFault::NotHalted(_)),
+            ) => return Err(fault),
+        };
         let is_halted = self.now.state == ProgramMachineState::Halted;
         // A skill that has had no run has no outcome.
         if self.now.run > 0 || (outcome.unknown && is_halted) {
@@ -154,6 +175,7 @@ impl SeenSkill {
             self.now.needs_reset &= is_halted;
             self.tell(SkillEvent::Outcome(&outcome));
         }
+        Ok(())
     }
 
     async fn look(&mut self) {
@@ -303,24 +325,23 @@ impl SeenSkill {
         self.tell(SkillEvent::Transition(&happened));
     }
 
-    /// Reads the outcome of the run that the server left for this state.
+    /// Reads the outcome of the run that the server left for this state; unknown if it cannot be
+    /// read.
     async fn ended(&self, state: ProgramMachineState) -> RunOutcome {
+        let outcome = self.outcome(state).await;
+        outcome.unwrap_or_else(|fault| unknown(self.now.run, fault.to_string()))
+    }
+
+    /// Reads the outcome of the run that the server left for this state.
+    async fn outcome(&self, state: ProgramMachineState) -> Result<RunOutcome, SkillFault> {
         let run = self.now.run;
         let numbered = if self.handle.numbers_runs() { run } else { 0 };
-        let outcome = self.handle.outcome(numbered, state).await;
-        let mut outcome = outcome.unwrap_or_else(|fault| RunOutcome {
-            run,
-            succeeded: false,
-            unknown: true,
-            message: fault.to_string(),
-            results: Vec::new(),
-            trace: Vec::new(),
-        });
+        let mut outcome = self.handle.outcome(numbered, state).await?;
         outcome.run = run;
         if !outcome.succeeded && outcome.message.is_empty() {
             outcome.message = format!("it ended in {state}, which says nothing of why");
         }
-        outcome
+        Ok(outcome)
     }
 
     /// Returns the number of a run that the server does not number.
@@ -347,6 +368,17 @@ impl Order {
         );
         // The caller may have stopped waiting.
         let _told = self.reply.send(Err(refused(&text)));
+    }
+}
+
+fn unknown(run: u32, message: String) -> RunOutcome {
+    RunOutcome {
+        run,
+        succeeded: false,
+        unknown: true,
+        message,
+        results: Vec::new(),
+        trace: Vec::new(),
     }
 }
 
@@ -385,6 +417,23 @@ mod tests {
         let reset = seen.call(ProgramMethod::Reset, (Vec::new(), false)).await;
         assert_eq!(reset, Ok(0));
         assert!(!seen.now.needs_reset);
+        server.stop().await;
+    }
+
+    #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+    async fn an_outcome_that_could_not_be_read_at_first_is_read_again() {
+        let server = serve("parallel-gripper.yaml", &[]);
+        let client = client(&server).await;
+        let found = client.skills().await.unwrap();
+        let handle = client.handle(&found[0]);
+        let (mut seen, _shown) = SeenSkill::new(handle, Vec::new(), NewestOutcomes::default(), 1);
+        for fault in [SkillFault::Lost("no answer".to_owned()), refused("busy")] {
+            assert_eq!(seen.last_outcome(Err(fault.clone())), Err(fault));
+            assert!(!seen.now.needs_reset && seen.now.outcome.is_none());
+        }
+        let mismatch = SkillFault::Unexpected("its outcome is of another run than 3".to_owned());
+        assert_eq!(seen.last_outcome(Err(mismatch)), Ok(()));
+        assert!(seen.now.needs_reset);
         server.stop().await;
     }
 }
