@@ -181,8 +181,9 @@ impl SkillHandle {
         }
     }
 
-    /// Writes parameters and starts a run. Returns the number of the run, 0 if the skill does not
-    /// number its runs. Parameters that are not given keep their values.
+    /// Writes parameters and starts a run. Returns the number of the run; 0 if the skill does not
+    /// number its runs or the number cannot be read. Parameters that are not given keep their
+    /// values.
     ///
     /// # Errors
     /// A refusal, or no response. After [`SkillFault::Lost`] it is unknown whether the run has
@@ -190,8 +191,8 @@ impl SkillHandle {
     pub async fn start(&self, parameters: Vec<(String, SkillValue)>) -> Result<u32, SkillFault> {
         self.write(parameters).await?;
         self.call(ProgramMethod::Start).await?;
-        let [run] = self.read(["RunId"]).await?;
-        Ok(run.as_ref().map_or(0, number))
+        // The run has started: an error of this read must not hide it.
+        Ok(self.run_id().await)
     }
 
     /// Starts a run in one call; a Halted skill is reset first. Uses Execute if the skill has it,
@@ -426,7 +427,7 @@ impl SkillHandle {
     async fn end_of(&self, run: u32) -> Result<RunOutcome, SkillFault> {
         loop {
             let state = self.ended().await?;
-            if !self.asks_component() || run == 0 {
+            if !self.asks_component() || (run == 0 && !self.numbers_runs()) {
                 return self.outcome(run, state).await;
             }
             if let Some(outcome) = self.outcome_of(run).await? {
