@@ -43,7 +43,7 @@ pub use choice::{Chosen, Needs, ToolState};
 pub use detector::{Detected, Detector};
 pub use find::{FoundParameter, FoundSkill, FoundType};
 pub use handle::{RemoteState, SkillHandle};
-pub use mirror::{MirroredSkill, Mirrors, Watchable};
+pub use mirror::{MirroredSkill, Mirrors, StartCondition, Watchable};
 pub use peers::PeerAccess;
 pub use remote::Remote;
 pub use states::SkillStates;

@@ -43,8 +43,8 @@ pub use authority::{Authority, SkillOwner};
 pub use client::{
     Chosen, ClientOptions, Detected, Detector, FailedLocator, FoundParameter, FoundSkill,
     FoundType, LocatorError, MirroredSkill, Mirrors, Needs, NotLocated, PartnerError, PeerAccess,
-    RemoteState, SkillClient, SkillHandle, SkillStates, StationChanges, ToolState, Unchosen,
-    UnfitGrasp, Watchable,
+    RemoteState, SkillClient, SkillHandle, SkillStates, StartCondition, StationChanges, ToolState,
+    Unchosen, UnfitGrasp, Watchable,
 };
 pub use component::{
     ChangeKind, Component, ComponentSecurity, Device, DeviceKinds, DriverFault, DriverSetup,

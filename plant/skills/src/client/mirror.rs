@@ -46,13 +46,17 @@ impl fmt::Debug for MirroredSkill {
     }
 }
 
+/// The condition under which a run may start. A mirror evaluates it just before it calls Start.
+pub type StartCondition = Box<dyn Fn() -> bool + Send + Sync>;
+
 /// A call that waits to be sent to the server.
-#[derive(Debug)]
 struct Order {
     method: ProgramMethod,
     parameters: Vec<(String, SkillValue)>,
     /// It must not reset a skill after an unknown outcome.
     is_cautious: bool,
+    /// A call that moves the machine is not sent if this is false.
+    condition: Option<StartCondition>,
     reply: oneshot::Sender<Result<u32, SkillFault>>,
 }
 
@@ -235,7 +239,21 @@ impl MirroredSkill {
         method: ProgramMethod,
         parameters: Vec<(String, SkillValue)>,
     ) -> Result<u32, SkillFault> {
-        self.order(method, (parameters, false)).await
+        self.order(method, (parameters, false), None).await
+    }
+
+    /// Calls Start as [`call`](Self::call) does, if the condition is true when the call is sent.
+    ///
+    /// # Errors
+    /// As [`call`](Self::call); the condition is false, so no run was started.
+    pub async fn start_if(
+        &self,
+        condition: StartCondition,
+        parameters: Vec<(String, SkillValue)>,
+    ) -> Result<u32, SkillFault> {
+        let given = (parameters, false);
+        self.order(ProgramMethod::Start, given, Some(condition))
+            .await
     }
 
     /// Resets a skill that is Halted, unless its last outcome is unknown.
@@ -243,19 +261,22 @@ impl MirroredSkill {
     /// # Errors
     /// As [`call`](Self::call); the last outcome is unknown.
     pub async fn make_ready(&self) -> Result<u32, SkillFault> {
-        self.order(ProgramMethod::Reset, (Vec::new(), true)).await
+        let given = (Vec::new(), true);
+        self.order(ProgramMethod::Reset, given, None).await
     }
 
     async fn order(
         &self,
         method: ProgramMethod,
         (parameters, is_cautious): (Vec<(String, SkillValue)>, bool),
+        condition: Option<StartCondition>,
     ) -> Result<u32, SkillFault> {
         let (reply, answer) = oneshot::channel();
         let order = Order {
             method,
             parameters,
             is_cautious,
+            condition,
             reply,
         };
         match self.orders.try_send(order) {

@@ -230,9 +230,20 @@ impl SeenSkill {
             method,
             parameters,
             is_cautious,
+            condition,
             reply,
         } = order;
-        let called = self.call(method, (parameters, is_cautious)).await;
+        let is_wanted = || {
+            let is_met = condition.as_ref().is_none_or(|is_met| is_met());
+            !is_motion(method) || (is_met && !reply.is_closed())
+        };
+        let called = match is_wanted() {
+            true => {
+                self.call(method, (parameters, is_cautious), &is_wanted)
+                    .await
+            }
+            false => Err(withdrawn(method)),
+        };
         let begun = called.is_ok() && is_work(self.now.state);
         // The caller may have stopped waiting.
         let _told = reply.send(called);
@@ -246,6 +257,7 @@ impl SeenSkill {
         &mut self,
         method: ProgramMethod,
         (parameters, is_cautious): (Vec<(String, SkillValue)>, bool),
+        is_wanted: &(impl Fn() -> bool + Sync),
     ) -> Result<u32, SkillFault> {
         // The state machine is checked here, because some servers accept invalid calls, for example
         // Start of a suspended skill.
@@ -261,6 +273,10 @@ impl SeenSkill {
                 "{method} is not possible in the state {from}"
             )));
         };
+        // The caller may have given up while the state was read.
+        if !is_wanted() {
+            return Err(withdrawn(method));
+        }
         if method == ProgramMethod::Start {
             self.handle.start(parameters).await?;
             self.look_at = Instant::now() + LOOK;
@@ -382,6 +398,22 @@ fn unknown(run: u32, message: String) -> RunOutcome {
     }
 }
 
+/// Returns whether a method lets the machine move.
+fn is_motion(method: ProgramMethod) -> bool {
+    match method {
+        ProgramMethod::Start | ProgramMethod::Resume => true,
+        ProgramMethod::Suspend | ProgramMethod::Halt | ProgramMethod::Reset => false,
+    }
+}
+
+/// Refuses a call that its caller has given up. The call was not sent to the server.
+fn withdrawn(method: ProgramMethod) -> SkillFault {
+    SkillFault::Refused {
+        status: "BadRequestCancelledByClient".to_owned(),
+        text: format!("{method} was withdrawn or came too late, so it was not sent"),
+    }
+}
+
 fn refused(text: &str) -> SkillFault {
     SkillFault::Refused {
         status: "BadInvalidState".to_owned(),
@@ -394,7 +426,10 @@ const LOOK: Duration = Duration::from_secs(1);
 
 #[cfg(test)]
 mod tests {
+    use tokio::sync::oneshot;
+
     use super::super::super::tests::{client, serve};
+    use super::super::StartCondition;
     use super::*;
 
     #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -408,15 +443,58 @@ mod tests {
         assert_eq!(seen.now.state, ProgramMachineState::Halted);
         seen.now.needs_reset = true;
         for (method, is_cautious) in [(ProgramMethod::Reset, true), (ProgramMethod::Start, false)] {
-            let refused = seen.call(method, (Vec::new(), is_cautious)).await;
+            let refused = seen.call(method, (Vec::new(), is_cautious), &|| true).await;
             let text = refused.unwrap_err().to_string();
             let expected = "the outcome of run 0 is unknown; Reset makes the skill ready";
             assert!(text.contains(expected), "{text}");
         }
         assert_eq!(seen.now.state, ProgramMachineState::Halted);
-        let reset = seen.call(ProgramMethod::Reset, (Vec::new(), false)).await;
+        let given = (Vec::new(), false);
+        let reset = seen.call(ProgramMethod::Reset, given, &|| true).await;
         assert_eq!(reset, Ok(0));
         assert!(!seen.now.needs_reset);
+        server.stop().await;
+    }
+
+    #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+    async fn a_start_that_its_caller_gave_up_is_not_sent() {
+        let server = serve("parallel-gripper.yaml", &[]);
+        let client = client(&server).await;
+        let found = client.skills().await.unwrap();
+        let handle = client.handle(&found[0]);
+        let (mut seen, _shown) = SeenSkill::new(handle, Vec::new(), NewestOutcomes::default(), 1);
+        seen.first().await;
+        let given = || (Vec::new(), false);
+        let reset = seen.call(ProgramMethod::Reset, given(), &|| true).await;
+        assert_eq!(reset, Ok(0));
+        let start = |condition: Option<StartCondition>| {
+            let (reply, answer) = oneshot::channel();
+            let order = Order {
+                method: ProgramMethod::Start,
+                parameters: Vec::new(),
+                is_cautious: false,
+                condition,
+                reply,
+            };
+            (order, answer)
+        };
+        // The caller gave up while the call waited in the queue.
+        let (order, answer) = start(None);
+        drop(answer);
+        seen.order(order).await;
+        // The goal was cancelled while the call waited in the queue.
+        let (order, answer) = start(Some(Box::new(|| false)));
+        seen.order(order).await;
+        let refused = answer.await.unwrap();
+        assert_eq!(refused, Err(withdrawn(ProgramMethod::Start)));
+        // The caller gives up while the state is read.
+        let refused = seen.call(ProgramMethod::Start, given(), &|| false).await;
+        assert_eq!(refused, Err(withdrawn(ProgramMethod::Start)));
+        let shown = server.skills()[0].shown();
+        assert_eq!((shown.state, shown.run), (ProgramMachineState::Ready, 0));
+        let (order, answer) = start(Some(Box::new(|| true)));
+        seen.order(order).await;
+        assert_eq!(answer.await.unwrap(), Ok(1));
         server.stop().await;
     }
 
