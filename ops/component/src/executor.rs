@@ -2,11 +2,13 @@
 
 use std::sync::Arc;
 
+use bridge_node::Executed;
 use program::ProgramMethod;
 use skills::{
     MirroredSkill, RunOutcome, Skill, SkillDescription, SkillFault, SkillOwner, SkillRefusal,
-    SkillSnapshot, SkillValue,
+    SkillSnapshot, SkillValue, StartCondition,
 };
+use tracing::warn;
 
 use crate::fields::{self, FieldValueError};
 
@@ -53,7 +55,7 @@ impl SkillExecutor {
     ) -> Result<u32, SkillRequestError> {
         match self {
             Self::Own(skill) => Ok(skill.call(by, method).await?),
-            Self::Theirs(mirror) => theirs(mirror, method, Vec::new()).await,
+            Self::Theirs(mirror) => Ok(mirror.call(method, Vec::new()).await?),
         }
     }
 
@@ -74,31 +76,38 @@ impl SkillExecutor {
         }
     }
 
-    /// Starts a run with these parameters and returns its number.
+    /// Starts a run with these parameters if the condition is true just before the start, and
+    /// returns its number.
     ///
     /// # Errors
-    /// Returns the errors of [`call`](Self::call).
+    /// Returns the errors of [`call`](Self::call). The run may have started if the error
+    /// [`hides_start`](SkillRequestError::hides_start).
     pub(crate) async fn start_with(
         &self,
         by: SkillOwner,
         parameters: Vec<(String, SkillValue)>,
+        condition: StartCondition,
     ) -> Result<u32, SkillRequestError> {
+        if !condition() {
+            return Err(SkillRequestError::NotStarted);
+        }
         match self {
             Self::Own(skill) => Ok(skill.start_with(by, parameters).await?),
-            Self::Theirs(mirror) => theirs(mirror, ProgramMethod::Start, parameters).await,
+            Self::Theirs(mirror) => Ok(mirror.start_if(condition, parameters).await?),
         }
     }
 
-    /// Executes a call of the space and returns its response: success, message and run.
-    pub(crate) async fn answer(
+    /// Executes a call of the space. The response has the fields success, message and run. Start is
+    /// not executed if the condition is false.
+    pub(crate) async fn execute(
         &self,
-        by: SkillOwner,
-        method: ProgramMethod,
+        (by, method): (SkillOwner, ProgramMethod),
         request: &[u8],
-    ) -> [SkillValue; 3] {
+        condition: StartCondition,
+    ) -> Executed {
         let answer = match method {
             ProgramMethod::Start => match self.parameters(request) {
-                Ok(parameters) => self.start_with(by, parameters).await,
+                Ok(parameters) => self.start_with(by, parameters, condition).await,
                 Err(error) => Err(error),
             },
             ProgramMethod::Suspend
@@ -106,14 +115,20 @@ impl SkillExecutor {
             | ProgramMethod::Halt
             | ProgramMethod::Reset => self.call(by, method).await,
         };
-        match answer {
+        let answer = match answer {
             Ok(run) => [true.into(), "".into(), run.into()],
+            Err(error) if error.is_unknown(method) => {
+                let skill = &self.facts().name;
+                warn!(skill, %method, "it is unknown whether the skill executed a call: {error}");
+                return Executed::Lost;
+            }
             Err(error) => [
                 false.into(),
                 error.to_string().into(),
                 self.shown().run.into(),
             ],
-        }
+        };
+        Executed::Answered(fields::block(&answer))
     }
 
     /// Decodes the parameters of a request: a field for each parameter of the type, in its order,
@@ -136,14 +151,6 @@ impl SkillExecutor {
             .filter_map(|(parameter, value)| Some((parameter.name.clone(), value?)))
             .collect())
     }
-}
-
-async fn theirs(
-    mirror: &MirroredSkill,
-    method: ProgramMethod,
-    parameters: Vec<(String, SkillValue)>,
-) -> Result<u32, SkillRequestError> {
-    Ok(mirror.call(method, parameters).await?)
 }
 
 /// The reason why a request to a skill is not executed. Its text starts with the name of a
@@ -172,13 +179,64 @@ pub(crate) enum SkillRequestError {
     /// The outcome of this run is unknown.
     #[error("BadInvalidState: the outcome of run {0} is unknown; Reset makes the skill ready")]
     NeedsReset(u32),
-    /// The goal was cancelled.
-    #[error("the goal was cancelled before its run began")]
-    Cancelled,
+    /// The request was cancelled, or its deadline passed before the run started.
+    #[error("the request was cancelled or came too late, so no run was started")]
+    NotStarted,
     /// The goal arrived after its deadline.
     #[error("the goal came too late, so no run was started")]
     Late,
-    /// The program stops.
-    #[error("the component ends")]
-    Ends,
+}
+
+impl SkillRequestError {
+    /// Returns true if a run may have started although a start returned this error.
+    pub(crate) fn hides_start(&self) -> bool {
+        match self {
+            Self::Theirs(fault) => match fault {
+                SkillFault::Lost(_) | SkillFault::Unexpected(_) | SkillFault::NotHalted(_) => true,
+                SkillFault::Refused { .. } | SkillFault::TimedOut(_) => false,
+            },
+            Self::Refused(_)
+            | Self::Field(_)
+            | Self::Count { .. }
+            | Self::NeedsReset(_)
+            | Self::NotStarted
+            | Self::Late => false,
+        }
+    }
+
+    /// Returns true if the skill may have executed a method that returned this error.
+    pub(crate) fn is_unknown(&self, method: ProgramMethod) -> bool {
+        let is_start = method == ProgramMethod::Start;
+        // A skill that does not have a method is not lost.
+        let has_no_method = matches!(self, Self::Theirs(SkillFault::Unexpected(_)));
+        self.hides_start() && (is_start || !has_no_method)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_a_lost_start_may_have_started_a_run() {
+        let text = || "no answer".to_owned();
+        let lost = SkillRequestError::Theirs(SkillFault::Lost(text()));
+        assert!(lost.hides_start() && lost.is_unknown(ProgramMethod::Halt));
+        let missing = SkillRequestError::Theirs(SkillFault::Unexpected(text()));
+        assert!(missing.hides_start() && missing.is_unknown(ProgramMethod::Start));
+        assert!(!missing.is_unknown(ProgramMethod::Suspend));
+        let moves = SkillRequestError::Theirs(SkillFault::NotHalted(text()));
+        assert!(moves.hides_start());
+        let refused = SkillRequestError::Theirs(SkillFault::Refused {
+            status: "BadInvalidState".to_owned(),
+            text: text(),
+        });
+        for error in [
+            refused,
+            SkillRequestError::NotStarted,
+            SkillRequestError::Late,
+        ] {
+            assert!(!error.hides_start() && !error.is_unknown(ProgramMethod::Start));
+        }
+    }
 }

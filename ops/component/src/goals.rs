@@ -23,6 +23,7 @@ use skills::{
 use tokio::sync::broadcast;
 use tokio::task::JoinHandle;
 use tokio::time::{Instant, sleep_until};
+use tracing::warn;
 
 use crate::definition;
 use crate::executor::{SkillExecutor, SkillRequestError};
@@ -139,6 +140,18 @@ impl Doing {
     fn begun(&mut self, id: GraphGoalId) -> bool {
         self.beginning.remove(&id).unwrap_or_default()
     }
+
+    /// Handles that a run continues, because the skill refused to halt it.
+    fn resume(&mut self, run: u32) {
+        if let Some(current) = self.current.as_mut().filter(|current| current.run == run) {
+            current.cancelled = false;
+        }
+    }
+
+    /// Returns true if a goal was cancelled before its run started.
+    fn is_cancelled(&self, id: GraphGoalId) -> bool {
+        self.beginning.get(&id).copied().unwrap_or_default()
+    }
 }
 
 /// The goal with the latest run among the runs that goals started.
@@ -174,31 +187,25 @@ impl GraphActionClient for Doer {
         let doing = Arc::clone(&self.doing);
         lock(&doing).beginning.insert(id, false);
         let begun = tokio::spawn(async move {
-            if lock(&doing).beginning.get(&id) == Some(&true) {
-                lock(&doing).begun(id);
-                return Err(SkillRequestError::Cancelled);
-            }
-            if now().monotonic > start_by {
-                lock(&doing).begun(id);
-                return Err(SkillRequestError::Late);
-            }
-            let run = begin(&skill, &body).await;
+            let of = Arc::clone(&doing);
+            let condition =
+                Arc::new(move || !lock(&of).is_cancelled(id) && now().monotonic <= start_by);
+            let begun = match now().monotonic > start_by {
+                true => Err(BeginFault::NotStarted(SkillRequestError::Late)),
+                false => begin(&skill, &body, condition).await,
+            };
             let cancelled = {
                 let mut doing = lock(&doing);
                 let cancelled = doing.begun(id);
-                if let Ok(run) = &run {
-                    let run = *run;
+                if let Ok(run) = begun {
                     doing.current = Some(Current { id, run, cancelled });
                 }
                 cancelled
             };
-            if cancelled && run.is_ok() {
-                // The end of the run shows if it could be halted.
-                let _halted = skill.call(OWNER, ProgramMethod::Halt).await;
-            }
-            run
+            settle(&skill, &doing, (begun, cancelled)).await
         });
         SentSkillGoal {
+            id,
             skill: self.skill.clone(),
             doing: Arc::clone(&self.doing),
             heard,
@@ -257,19 +264,101 @@ impl GraphActionClient for Doer {
             }),
             Err(_) if self.skill.outcome(open.run).is_some() => none(TERMINATED),
             Err(_) => {
-                // The run continues.
-                let mut doing = lock(&self.doing);
-                if let Some(current) = doing.current.as_mut().filter(|now| now.run == open.run) {
-                    current.cancelled = false;
-                }
+                lock(&self.doing).resume(open.run);
                 none(REJECTED)
             }
         }
     }
 }
 
-/// Starts a run and returns its number.
-async fn begin(skill: &SkillExecutor, body: &[u8]) -> Result<u32, SkillRequestError> {
+/// The reason why the start of a goal's run is not confirmed.
+#[derive(Debug)]
+enum BeginFault {
+    /// No run was started.
+    NotStarted(SkillRequestError),
+    /// A run may have started.
+    Unknown(SkillRequestError),
+}
+
+/// The start of a goal's run.
+#[derive(Debug)]
+enum GoalStart {
+    /// The run with this number was started.
+    Started(u32),
+    /// The run with this number was started. The goal was cancelled meanwhile, and the skill does
+    /// not confirm the Halt.
+    NotHalted(u32),
+    /// The goal was cancelled before its run started.
+    Cancelled,
+    /// No run was started, for this reason.
+    Rejected(String),
+    /// A run may have started. The text is the reason.
+    Unknown(String),
+}
+
+/// Halts the skill if its goal was cancelled while the run was started, and returns the result of
+/// both.
+async fn settle(
+    skill: &SkillExecutor,
+    doing: &Mutex<Doing>,
+    (begun, cancelled): (Result<u32, BeginFault>, bool),
+) -> GoalStart {
+    match begun {
+        Ok(run) if cancelled => match skill.call(OWNER, ProgramMethod::Halt).await {
+            Ok(_) => GoalStart::Started(run),
+            Err(_) if skill.outcome(run).is_some() => GoalStart::Started(run),
+            Err(error) => {
+                let name = &skill.facts().name;
+                warn!(skill = name, run, %error, "cannot halt the run of a cancelled goal");
+                // The skill may have executed a Halt without a response.
+                if !error.is_unknown(ProgramMethod::Halt) {
+                    lock(doing).resume(run);
+                }
+                GoalStart::NotHalted(run)
+            }
+        },
+        Ok(run) => GoalStart::Started(run),
+        Err(BeginFault::NotStarted(_)) if cancelled => GoalStart::Cancelled,
+        Err(BeginFault::NotStarted(error)) => GoalStart::Rejected(error.to_string()),
+        Err(BeginFault::Unknown(error)) if cancelled => {
+            let halted = match skill.call(OWNER, ProgramMethod::Halt).await {
+                Ok(_) => "the goal was cancelled, and the skill was halted".to_owned(),
+                Err(error) => format!("the goal was cancelled, and Halt failed: {error}"),
+            };
+            GoalStart::Unknown(format!("{}; {halted}", unknown_start(&error)))
+        }
+        Err(BeginFault::Unknown(error)) => GoalStart::Unknown(unknown_start(&error)),
+    }
+}
+
+fn unknown_start(error: &SkillRequestError) -> String {
+    format!("it is unknown whether the run was started, so the machine may move: {error}")
+}
+
+/// Starts a run and returns its number. The condition is checked just before the start.
+async fn begin(
+    skill: &SkillExecutor,
+    body: &[u8],
+    condition: Arc<impl Fn() -> bool + Send + Sync + 'static>,
+) -> Result<u32, BeginFault> {
+    let ready = match condition() {
+        true => prepare(skill, body).await,
+        false => Err(SkillRequestError::NotStarted),
+    };
+    let given = ready.map_err(BeginFault::NotStarted)?;
+    let condition = Box::new(move || condition());
+    let started = skill.start_with(OWNER, given, condition).await;
+    started.map_err(|error| match error.hides_start() {
+        true => BeginFault::Unknown(error),
+        false => BeginFault::NotStarted(error),
+    })
+}
+
+/// Makes the skill ready for a goal, and returns the parameters of the goal.
+async fn prepare(
+    skill: &SkillExecutor,
+    body: &[u8],
+) -> Result<Vec<(String, SkillValue)>, SkillRequestError> {
     let given = parameters(skill.facts(), body)?;
     // The parameters are checked before the machine moves; Start checks them again.
     Parameters::complete(&skill.facts().parameters, given.clone())?;
@@ -280,7 +369,7 @@ async fn begin(skill: &SkillExecutor, body: &[u8]) -> Result<u32, SkillRequestEr
     if shown.state == ProgramMachineState::Halted {
         skill.make_ready(OWNER).await?;
     }
-    skill.start_with(OWNER, given).await
+    Ok(given)
 }
 
 /// Decodes the parameters of a goal. Null values are not set. Zero or empty values of parameters
@@ -310,6 +399,7 @@ fn parameters(
 /// A goal that was sent.
 #[derive(Debug)]
 pub(crate) struct SentSkillGoal {
+    id: GraphGoalId,
     skill: SkillExecutor,
     doing: Arc<Mutex<Doing>>,
     heard: broadcast::Receiver<Heard>,
@@ -325,10 +415,12 @@ pub(crate) struct SentSkillGoal {
 
 #[derive(Debug)]
 enum Stage {
-    Begins(JoinHandle<Result<u32, SkillRequestError>>),
+    Begins(JoinHandle<GoalStart>),
     Runs(u32),
     /// The run has ended; the end is reported at this time.
     Cancelled(Arc<RunOutcome>, Instant),
+    /// No run was started; the cancellation is reported at this time.
+    NeverStarted(Instant),
     Ended,
 }
 
@@ -341,7 +433,13 @@ impl SentGoal for SentSkillGoal {
             match &mut self.stage {
                 Stage::Begins(begun) => {
                     let begun = begun.await;
-                    self.begun(begun.unwrap_or(Err(SkillRequestError::Ends)));
+                    let begun = begun.unwrap_or_else(|_| {
+                        lock(&self.doing).begun(self.id);
+                        GoalStart::Unknown(
+                            "the start of the run was aborted, so the machine may move".to_owned(),
+                        )
+                    });
+                    self.begun(begun);
                 }
                 Stage::Runs(run) => {
                     let run = *run;
@@ -361,6 +459,11 @@ impl SentGoal for SentSkillGoal {
                     sleep_until(*until).await;
                     self.end(&outcome);
                 }
+                Stage::NeverStarted(until) => {
+                    sleep_until(*until).await;
+                    let message = "the goal was cancelled before its run started";
+                    self.ended(CANCELED, message, (0, &[]));
+                }
                 Stage::Ended => return None,
             }
         }
@@ -376,19 +479,30 @@ async fn at(time: Option<Instant>) {
 }
 
 impl SentSkillGoal {
-    fn begun(&mut self, begun: Result<u32, SkillRequestError>) {
+    fn begun(&mut self, begun: GoalStart) {
         match begun {
-            Ok(run) => {
-                self.stage = Stage::Runs(run);
-                self.events.push_back(GraphGoalEvent::Accepted(now().utc));
-                self.events.push_back(GraphGoalEvent::Status(EXECUTING));
+            GoalStart::Started(run) => self.started(run),
+            GoalStart::NotHalted(run) => {
+                self.started(run);
+                self.events.push_back(GraphGoalEvent::CancelRefused);
             }
-            Err(why) => {
+            GoalStart::Cancelled => {
+                self.stage = Stage::NeverStarted(Instant::now() + BEHIND_CANCEL);
+                self.events.push_back(GraphGoalEvent::Accepted(now().utc));
+                self.events.push_back(GraphGoalEvent::Status(CANCELING));
+            }
+            GoalStart::Rejected(why) => {
                 self.stage = Stage::Ended;
-                let why = why.to_string();
                 self.events.push_back(GraphGoalEvent::Rejected(why));
             }
+            GoalStart::Unknown(why) => self.lost(why),
         }
+    }
+
+    fn started(&mut self, run: u32) {
+        self.stage = Stage::Runs(run);
+        self.events.push_back(GraphGoalEvent::Accepted(now().utc));
+        self.events.push_back(GraphGoalEvent::Status(EXECUTING));
     }
 
     fn heard(&mut self, run: u32, heard: Result<Heard, broadcast::error::RecvError>) {
@@ -465,11 +579,15 @@ impl SentSkillGoal {
             (false, true) => CANCELED,
             (false, false) => ABORTED,
         };
+        self.ended(status, &outcome.message, (outcome.run, &outcome.results));
+    }
+
+    fn ended(&mut self, status: i8, message: &str, results: (u32, &[(String, SkillValue)])) {
         self.stage = Stage::Ended;
         self.events.push_back(GraphGoalEvent::Ended {
             status,
-            message: outcome.message.clone(),
-            result: result(self.skill.facts(), (outcome.run, &outcome.results)),
+            message: message.to_owned(),
+            result: result(self.skill.facts(), results),
         });
     }
 }
@@ -501,3 +619,6 @@ const NONE: i8 = 0;
 const REJECTED: i8 = 1;
 const UNKNOWN_GOAL: i8 = 2;
 const TERMINATED: i8 = 3;
+
+#[cfg(test)]
+mod tests;

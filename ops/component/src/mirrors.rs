@@ -16,7 +16,6 @@ use tokio::task::AbortHandle;
 use tracing::{info, warn};
 
 use crate::executor::SkillExecutor;
-use crate::fields;
 use crate::goals::{self, Doer, Reporter};
 use crate::port::run_number_of_now;
 use crate::space::{ComponentOutbox, ComponentPlace, GOAL, MOST_IN_SPACE, Speaker};
@@ -218,8 +217,8 @@ impl ForeignSkills {
                 // The program was stopped, and another redundant server may have taken over.
                 Executed::Refused(Refusal::NotExecutable)
             } else {
-                let answer = executor.answer(by, method, &request).await;
-                Executed::Answered(fields::block(&answer))
+                let condition = Box::new(move || now().monotonic <= start_by);
+                executor.execute((by, method), &request, condition).await
             };
             drop(room.send(PortEvent::Executed {
                 execution: id,

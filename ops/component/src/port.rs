@@ -9,7 +9,7 @@ use std::time::{Duration, SystemTime, UNIX_EPOCH};
 use bridge_node::actions::OwnActions;
 use bridge_node::{
     Application, AskId, CallDescription, CallResponse, Executed, Execution, ExecutionId, Failure,
-    FailureKind, LinkState, LocalDelivery, Port, PortEvent, TopicMetaData, TypePaths,
+    FailureKind, LinkState, LocalDelivery, Port, PortEvent, TopicMetaData, TypePaths, now,
 };
 use bytes::Bytes;
 use discovery::{AnnounceSettings, MdnsInterface, ServerAnnouncement};
@@ -31,7 +31,6 @@ use uadp::BuiltinType;
 
 use crate::asking::Asking;
 use crate::executor::SkillExecutor;
-use crate::fields;
 use crate::goals::{self, Doer, Reporter};
 use crate::idle::{Usage, restart_when_idle};
 use crate::partners;
@@ -347,11 +346,16 @@ impl Port for ComponentPort {
             .map_or(SkillOwner::Local("a tool in the space"), |space| {
                 SkillOwner::Space(space.get().into())
             });
-        let Execution { id, request, .. } = execution;
+        let Execution {
+            id,
+            request,
+            start_by,
+            ..
+        } = execution;
         let skill = SkillExecutor::Own(skill);
         drop(tokio::spawn(async move {
-            let answer = skill.answer(by, method, &request).await;
-            let outcome = Executed::Answered(fields::block(&answer));
+            let condition = Box::new(move || now().monotonic <= start_by);
+            let outcome = skill.execute((by, method), &request, condition).await;
             drop(room.send(PortEvent::Executed {
                 execution: id,
                 outcome,
