@@ -181,10 +181,11 @@ pub(super) fn repository(workspace: &Workspace) -> anyhow::Result<Option<String>
 
 fn repository_of(metadata: &[u8], package: &str) -> anyhow::Result<Option<String>> {
     let metadata: Value = serde_json::from_slice(metadata).context("cargo metadata")?;
-    let packages = metadata["packages"].as_array();
+    let packages = metadata.get("packages").and_then(Value::as_array);
     let mut packages = packages.into_iter().flatten();
-    let own = packages.find(|of| of["name"] == package);
-    let url = own.and_then(|own| own["repository"].as_str());
+    let text = |of: &'_ Value, key: &str| Some(of.get(key)?.as_str()?.to_owned());
+    let own = packages.find(|of| text(of, "name").is_some_and(|name| name == package));
+    let url = own.and_then(|own| text(own, "repository"));
     Ok(url.map(|url| format!("{}/blob/HEAD", url.trim_end_matches('/'))))
 }
 
