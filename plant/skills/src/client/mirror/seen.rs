@@ -118,37 +118,31 @@ impl SeenSkill {
 
     /// Reads the initial state.
     async fn first(&mut self) {
-        loop {
-            match self.handle.seen().await {
-                Ok((state, since)) => {
-                    self.states.read(since);
-                    self.now.state = state.state;
-                    self.now.progress = state.progress;
-                    self.now.step = state.step;
-                    self.now.run = match (state.run, is_work(self.now.state)) {
-                        // A run without a number is in progress.
-                        (0, true) => self.number(),
-                        (run, _) => run,
-                    };
-                    let known = match is_work(self.now.state) {
-                        true => Ok(()),
-                        false => {
-                            let read = self.outcome(self.now.state).await;
-                            self.last_outcome(read)
-                        }
-                    };
-                    match known {
-                        Ok(()) => {
-                            self.tell(SkillEvent::Step);
-                            return;
-                        }
-                        Err(fault) => debug!("cannot read the last outcome of a skill: {fault}"),
-                    }
-                }
-                Err(fault) => debug!("a skill does not say how it is: {fault}"),
-            }
+        while let Err(fault) = self.read_first().await {
+            debug!("a skill does not say how it is: {fault}");
             sleep(LOOK).await;
         }
+        self.tell(SkillEvent::Step);
+    }
+
+    /// Reads the state, and the last outcome of a skill that is not at work.
+    async fn read_first(&mut self) -> Result<(), SkillFault> {
+        let (state, since) = self.handle.seen().await?;
+        self.states.read(since);
+        self.now.state = state.state;
+        self.now.progress = state.progress;
+        self.now.step = state.step;
+        let is_at_work = is_work(self.now.state);
+        self.now.run = match (state.run, is_at_work) {
+            // A run without a number is in progress.
+            (0, true) => self.number(),
+            (run, _) => run,
+        };
+        if is_at_work {
+            return Ok(());
+        }
+        let read = self.outcome(self.now.state).await;
+        self.last_outcome(read)
     }
 
     /// Takes the outcome of the run before this program saw the skill. If it is unknown, a skill
