@@ -207,36 +207,38 @@ fn rdflib_answers_every_question_alike_about_data_of_other_makers() {
     are_answered_alike(&cell, &knowledge, "http://opcfoundation.org/UA/DI/#i=15063");
 }
 
+/// The queries with a parameter, and its value.
+fn narrowed(device: &str) -> [(&'static str, &'static str, &str); 14] {
+    [
+        ("what-can-run", "capability", GRASP),
+        ("who-provides", "capability", GRASP),
+        ("skills", "type", "urn:ua-bridge:skills#i=1200"),
+        ("types", "type", device),
+        ("parameters", "skill", "urn:example:gripper#i=100"),
+        ("where-is", "name", "Grasp"),
+        ("components", "component", "urn:ua-bridge:mtp:two"),
+        ("components-of", "module", "urn:ua-bridge:mtp:two"),
+        ("services-of", "module", "urn:ua-bridge:mtp:one"),
+        ("skills-for", "capability", GRASP),
+        ("transitions-now", "state", "Idle"),
+        ("access-of", "name", "Grasp"),
+        ("modules-with", "what", "AnaServParam"),
+        ("what-can-hold", "quantity", "300 g"),
+    ]
+}
+
 /// Compares the answers of all queries, some of them with parameters; `device` is a type with
 /// subtypes.
 fn are_answered_alike(cell: &Cell, knowledge: &Knowledge, device: &str) {
     let asked: Vec<(NamedQuestion, Vec<(String, String)>)> = QUESTIONS
         .iter()
         .map(|question| (*question, Vec::new()))
-        .chain(
-            [
-                ("what-can-run", "capability", GRASP),
-                ("who-provides", "capability", GRASP),
-                ("skills", "type", "urn:ua-bridge:skills#i=1200"),
-                ("types", "type", device),
-                ("parameters", "skill", "urn:example:gripper#i=100"),
-                ("where-is", "name", "Grasp"),
-                ("components", "component", "urn:ua-bridge:mtp:two"),
-                ("components-of", "module", "urn:ua-bridge:mtp:two"),
-                ("services-of", "module", "urn:ua-bridge:mtp:one"),
-                ("skills-for", "capability", GRASP),
-                ("transitions-now", "state", "Idle"),
-                ("access-of", "name", "Grasp"),
-                ("modules-with", "what", "AnaServParam"),
-                ("what-can-hold", "quantity", "300 g"),
-            ]
-            .map(|(question, parameter, value)| {
-                (
-                    NamedQuestion::of(question).unwrap(),
-                    vec![(parameter.to_owned(), value.to_owned())],
-                )
-            }),
-        )
+        .chain(narrowed(device).map(|(question, parameter, value)| {
+            (
+                NamedQuestion::of(question).unwrap(),
+                vec![(parameter.to_owned(), value.to_owned())],
+            )
+        }))
         .collect();
     let mut quads = Vec::new();
     knowledge.write_quads(None, &mut quads).unwrap();
@@ -251,7 +253,7 @@ fn are_answered_alike(cell: &Cell, knowledge: &Knowledge, device: &str) {
             )
         });
     let files: Vec<_> = std::iter::once(quads).chain(texts).collect();
-    let args: Vec<&str> = files.iter().map(|file| file.to_str().unwrap()).collect();
+    let args: Vec<_> = files.iter().map(|file| file.to_str().unwrap()).collect();
     let mut judge = cell.asyncua_started("knowledge_judge.py", &args).start();
     let status = judge.wait_for_end(JUDGED);
     assert!(status.success(), "the judge ended with {status}: {judge}");

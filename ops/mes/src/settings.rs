@@ -136,18 +136,12 @@ impl Reading<'_> {
             processes,
             prefer,
         ] = self.reader.map(root, KEYS)?;
-        let name = self
-            .reader
-            .needed(name, "mes", root.place)
-            .and_then(|node| self.name(node));
-        let uri = self
-            .reader
-            .needed(uri, "application_uri", root.place)
-            .and_then(|node| self.iri(node, YamlFindingCode::Uri));
-        let namespace = self
-            .reader
-            .needed(namespace, "namespace", root.place)
-            .and_then(|node| self.namespace(node));
+        let name = self.reader.needed(name, "mes", root.place);
+        let name = name.and_then(|node| self.name(node));
+        let uri = self.reader.needed(uri, "application_uri", root.place);
+        let uri = uri.and_then(|node| self.iri(node, YamlFindingCode::Uri));
+        let namespace = self.reader.needed(namespace, "namespace", root.place);
+        let namespace = namespace.and_then(|node| self.namespace(node));
         let usual = || Some(DEFAULT_ENDPOINT.to_owned());
         let endpoint = endpoint.map_or_else(usual, |node| self.endpoint(node));
         let usual = || Some(vec![ComponentSecurity::None]);

@@ -168,7 +168,7 @@ fn a_running_server_answers_the_question_of_its_nodeset_and_its_loss_removes_its
     assert_eq!(lost["nodes"], 0, "{lost}");
     let own = [of("left", 5000), of("left", 5090)];
     let of_nodeset = vec!["urn:example:presses#i=5000".to_owned()];
-    let rest = || [&[of_nodeset.clone()], &own[..]].concat();
+    let rest = || [std::slice::from_ref(&of_nodeset), &own[..]].concat();
     eventually("its nodes are removed", SOON, || {
         (iris() == rest()).then_some(())
     });

@@ -92,7 +92,7 @@ fn are_there(namespaces: &[&str]) {
         let status = get("/status")?;
         let graphs = list(&status, "graphs");
         let is_there = |name: &&str| graphs.iter().any(|graph| graph["name"] == **name);
-        let are_there = namespaces.iter().all(|name| is_there(name));
+        let are_there = namespaces.iter().all(is_there);
         (are_there && findings()?.is_empty()).then_some(())
     });
 }

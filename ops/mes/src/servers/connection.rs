@@ -36,7 +36,11 @@ impl FollowedServer {
     pub(super) async fn run(self) {
         let config = ClientConfig {
             pki: self.options.pki.clone(),
-            user: self.entry.user.clone().or(self.options.user.clone()),
+            user: self
+                .entry
+                .user
+                .clone()
+                .or_else(|| self.options.user.clone()),
             security: self.options.security,
             timeout: REQUEST,
             backoff: BACKOFF,
@@ -92,7 +96,9 @@ impl FollowedServer {
                  give the endpoint instead",
                 self.endpoint
             )),
-            _ => None,
+            NamedServers::Endpoint(_) | NamedServers::Application(_) | NamedServers::Discovered => {
+                None
+            }
         }
     }
 

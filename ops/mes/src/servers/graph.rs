@@ -44,8 +44,9 @@ impl ServerUris {
     /// discovery found gives it back.
     pub(super) fn claim(&self, uri: &str, name: &str) -> UriClaim {
         let claim = (uri.to_owned(), name.to_owned());
-        self.0
-            .send_modify(|owners| drop(owners.claimed.insert(claim.clone())));
+        self.0.send_modify(|owners| {
+            let _is_new = owners.claimed.insert(claim.clone());
+        });
         UriClaim {
             uris: self.clone(),
             claim,
@@ -118,9 +119,9 @@ pub(super) struct UriClaim {
 
 impl Drop for UriClaim {
     fn drop(&mut self) {
-        self.uris
-            .0
-            .send_modify(|owners| drop(owners.claimed.remove(&self.claim)));
+        self.uris.0.send_modify(|owners| {
+            let _was_there = owners.claimed.remove(&self.claim);
+        });
     }
 }
 
