@@ -22,7 +22,7 @@ pub(crate) enum FacePlace {
 #[derive(Debug)]
 pub(crate) struct FaceChart {
     form: ChartForm,
-    pub(crate) segments: Vec<Segment>,
+    pub(crate) segments: Vec<ChartSegment>,
     /// The shear of s along t, by which straight lines of surfaces are not vertical.
     shear: f64,
     /// The number of the place that all others are counted from.
@@ -35,7 +35,7 @@ pub(crate) struct FaceChart {
 
 /// A short piece of an edge.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Segment {
+pub(crate) struct ChartSegment {
     /// The number of its edge in the face.
     edge: usize,
     s: f64,
@@ -96,7 +96,7 @@ impl FaceChart {
             for (from, to) in course.iter().zip(course.iter().skip(1)) {
                 let dt = reduced(to.2 - from.2, form.t);
                 let ds = reduced(to.1 - from.1, form.s) + shear * dt;
-                chart.segments.push(Segment {
+                chart.segments.push(ChartSegment {
                     edge: number,
                     s: from.1 + shear * from.2,
                     t: within(from.2 + offset, form.t),
@@ -261,7 +261,7 @@ impl FaceChart {
     }
 }
 
-impl Segment {
+impl ChartSegment {
     /// Returns whether another segment crosses this one, farther from the ends of both than edges
     /// may be from their vertices.
     fn crosses(&self, other: &Self, form: ChartForm) -> bool {

@@ -328,8 +328,8 @@ pub(crate) enum SourceVerb {
     },
     /// Add or replace a source
     Add {
-        /// A NodeSet, a manifest (.aml, .mtp, .amlx), Turtle (.ttl), a recipe (BatchML, BPMN), a STEP
-        /// file (.step, .stp), or XML with --rml; - for stdin
+        /// A NodeSet, a manifest (.aml, .mtp, .amlx), Turtle (.ttl), a recipe (BatchML, BPMN), a
+        /// STEP file (.step, .stp), or XML with --rml; - for stdin
         #[arg(value_name = "FILE")]
         file: String,
         /// file (Turtle), nodeset, mtp, process (Turtle, or a recipe) or product (STEP); found by
