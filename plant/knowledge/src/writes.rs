@@ -300,7 +300,12 @@ impl ServedSite {
         let done = match method {
             Method::PUT => {
                 let contents = self.upload(request, LARGEST_FILE).await?;
-                tokio::task::spawn_blocking(move || files.put(kind, &name, &contents)).await
+                let place = CHECKS.acquire().await.map_err(|error| failed(&error))?;
+                let put = tokio::task::spawn_blocking(move || {
+                    let _place = place;
+                    files.put(kind, &name, &contents)
+                });
+                put.await
             }
             Method::DELETE => {
                 let removed = tokio::task::spawn_blocking(move || files.remove(kind, &name)).await;
