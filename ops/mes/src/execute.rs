@@ -270,7 +270,7 @@ enum Ended {
     Done,
     /// Another round of a loop is due, which is planned anew.
     Round,
-    /// The next step was planned for another tool than the attached one, and is planned anew.
+    /// The attached tool is not the tool of the plan for the next step: a new plan is needed.
     OtherTool(String),
     /// Another plan can do the work.
     Broken(String),
