@@ -14,7 +14,7 @@ use crate::topic::{NamePart, SpaceId, TopicError, decimal};
 pub struct ConfiguredCarrier {
     /// The network.
     pub medium: CarrierMedium,
-    /// Names of publishers at this carrier whose messages are forwarded to the other carriers.
+    /// Names of publishers at this carrier; their messages are forwarded to the other carriers.
     pub forward: Vec<ForwardedName>,
 }
 

@@ -70,7 +70,7 @@ codes! {
     Alias = "M052", "An alias is 1 to 65535 and replaces a node id that is not such a number; other nodes keep their own number.";
     NodeTwice = "M053", "Two variables have the same node. A value has one origin, so each variable needs its own node.";
     TopicTwice = "M054", "Two variables have the same topic, so their values cannot be distinguished.";
-    NameTwice = "M055", "Two variables of a namespace have the same name, so users who browse the server cannot distinguish them.";
+    NameTwice = "M055", "Two variables of a namespace have the same name, so users cannot distinguish them in the server.";
     Name = "M056", "The name of a variable has 1 to 512 characters without control characters.";
     ValueType = "M057", "The type is an OPC UA builtin type, followed by `[]` for an array of one dimension.";
     RosTopic = "M060", "A ROS topic name begins with / and has letters, digits and underscores between slashes; in ROS 1 the first character is a letter, in ROS 2 no part begins with a digit.";

@@ -32,7 +32,7 @@ impl ArrayShape {
         tail: b"\x01",
     };
 
-    /// Returns a frame of ROS 1 whose array has `size` bytes and a zero.
+    /// Returns a frame of ROS 1 with an array of `size` bytes and a zero.
     ///
     /// # Panics
     /// Panics if the frame is longer than 4 GiB.

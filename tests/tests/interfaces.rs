@@ -20,7 +20,7 @@ const SOON: Duration = Duration::from_secs(20);
 const OUT: (TopicTriple, &str) = ((1, 2, 10), "/ua_1_2_10");
 const IN: (TopicTriple, &str) = ((2, 2, 20), "ua_2_2_20");
 
-/// A ROS 1 graph on loopback with a published topic, for a bridge whose PubSub network is
+/// A ROS 1 graph on loopback with a published topic, for a bridge with a PubSub network that is
 /// elsewhere.
 struct Graph {
     _master: Core,

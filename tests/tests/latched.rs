@@ -259,9 +259,11 @@ fn a_late_ros_1_subscriber_gets_each_value_the_space_repeats_and_an_update_repla
             .map(|value| value["data"].as_str().unwrap().to_owned())
             .collect::<Vec<_>>()
     };
-    eventually("who comes late gets all three, oldest first", SOON, || {
-        (late("late", "base") == ["left", "right", "base"]).then_some(())
-    });
+    eventually(
+        "a late subscriber gets all three, oldest first",
+        SOON,
+        || (late("late", "base") == ["left", "right", "base"]).then_some(()),
+    );
     values.lock().unwrap()[0] = (FIRST + 3, "left anew");
     eventually(
         "the update is there and what it replaced is not",

@@ -220,7 +220,7 @@ fn our_client_calls_a_rospy_server_of_known_and_of_unknown_type() {
         );
         assert_eq!(ours.call(&client, true).unwrap(), DONE);
     }
-    rospy.wait_for_json("who calls, on a kept connection", SOON, |line| {
+    rospy.wait_for_json("the caller, on a kept connection", SOON, |line| {
         (line["callerid"] == "/cell" && line["persistent"] == true).then_some(())
     });
     eventually("nine calls are told of", SOON, || {

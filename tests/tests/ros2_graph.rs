@@ -229,11 +229,11 @@ fn nodes_with_either_length_of_gid_are_known_and_most_of_them_know_us() {
     eventually("all three are known", SOON, || {
         (names(&domain) == set(&["/foxy", "/humble", "/iron"])).then_some(())
     });
-    eventually("the older ones, who are more, know us", SOON, || {
+    eventually("the older nodes, which are more, know us", SOON, || {
         node(&older, "/bridge")
     });
     newer.end();
-    eventually("who left is forgotten", SOON, || {
+    eventually("a node that left is forgotten", SOON, || {
         domain.graph();
         (names(&domain) == set(&["/foxy", "/humble"])).then_some(())
     });

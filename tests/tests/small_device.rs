@@ -1,4 +1,4 @@
-//! A device whose program has the codec only: the example `publisher` of `uadp`, which needs no
+//! A device with the codec only: the example `publisher` of `uadp`, which needs no
 //! standard library for its messages.
 
 use std::time::Duration;

@@ -127,7 +127,7 @@ impl HttpHost {
         &self.address
     }
 
-    /// Sends a request, whose URI is a path with its query. Adds the header `Host`.
+    /// Sends a request with a URI that is a path with its query. Adds the header `Host`.
     ///
     /// # Errors
     /// [`RequestError`].

@@ -678,7 +678,7 @@ fn made_up_servers_take_no_more_room_than_there_is() {
     assert_eq!(
         register(&mut registry, &gripper(), now),
         Ok(Registered::Again),
-        "who is there stays"
+        "present servers stay"
     );
 }
 

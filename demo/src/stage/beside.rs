@@ -85,7 +85,7 @@ static RESERVED: Mutex<Vec<UdpSocket>> = Mutex::new(Vec::new());
 const LEAST: u16 = 12_000;
 /// The least number of ports to choose from.
 const ENOUGH: u16 = 1_000;
-/// Distance of the first ports of two demos whose process numbers follow each other.
+/// Distance of the first ports of two demos with process numbers that follow each other.
 const SPREAD: usize = 97;
 
 #[cfg(test)]

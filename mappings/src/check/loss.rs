@@ -97,7 +97,7 @@ fn loss(
     Some(Loss { action, hold })
 }
 
-/// Returns the variable whose service stops the robot.
+/// Returns the variable with the service that stops the robot.
 fn stop_call(
     call: &crate::document::StopCallEntry,
     place: TextSpan,

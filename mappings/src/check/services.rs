@@ -315,7 +315,7 @@ fn answer(
         let message = format!("no variable with a `call` has the node `{}`", short(text));
         findings
             .error(Code::Answer, place, message)
-            .help("give the node of the variable whose values call the service");
+            .help("give the node of the variable with the values that call the service");
         return None;
     };
     let service = call.service_type.as_ref().and_then(|name| {

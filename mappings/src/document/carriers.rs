@@ -110,7 +110,7 @@ document! {
         mqtt: MqttEntry,
         /// Ethernet frames with the EtherType of UADP, B62C; their `interface` is required.
         eth: EthernetEntry,
-        /// Names of publishers at this carrier, whose messages are forwarded to the other carriers:
+        /// Names of publishers at this carrier; their messages are forwarded to the other carriers:
         /// a space (ua_1), a namespace of it (ua_1_2) or a topic (ua_1_2_10), at most 1000. Requests
         /// of calls and confirmations of commands cross in the other direction. Default: none.
         forward: Vec<Located<String>>,

@@ -112,7 +112,7 @@ impl Site for Page {
             )
         };
         match &self.proxy {
-            Some(proxy) => format!("{here}, and at {proxy}/ for users who sign in"),
+            Some(proxy) => format!("{here}, and at {proxy}/ for signed-in users"),
             None => here,
         }
     }

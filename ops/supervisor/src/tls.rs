@@ -79,7 +79,7 @@ impl Page {
                 format!("cannot serve the page at {address}: {error}; give another --page-tls"),
             )
         })?;
-        info!("page at https://{at}/, by the names in the certificate, for users who sign in");
+        info!("page at https://{at}/, by the names in the certificate, for signed-in users");
         Ok(())
     }
 }

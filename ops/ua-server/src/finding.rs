@@ -335,7 +335,7 @@ impl DiscoveredServers {
             info!(
                 server = placed.name,
                 url = %placed.access.endpoint,
-                "lost a server whose skills were shown"
+                "lost a server that had its skills shown"
             );
         }
         self.placed = now;

@@ -592,7 +592,7 @@ fn texts(all: Option<&[UAString]>) -> Vec<String> {
     all.unwrap_or_default().iter().take(64).map(text).collect()
 }
 
-/// Maximum number of endpoints whose security is returned.
+/// Maximum number of endpoints with their security in a response.
 const MOST_ENDPOINTS: usize = 64;
 const SCHEME: &str = "opc.tcp:";
 const REGISTER_LIMIT: Duration = Duration::from_secs(5);

@@ -59,7 +59,7 @@ pub struct LdsSettings {
     pub pki: Option<PathBuf>,
     /// The Global Discovery Server that issues the certificate. Requires `pki`.
     pub gds: Option<Invitation>,
-    /// The Global Discovery Server whose servers are listed too. Requires `pki`.
+    /// The Global Discovery Server; its servers are listed too. Requires `pki`.
     pub listing: Option<ServerQuery>,
     /// Whether every client certificate is trusted. For tests only.
     pub trust_any: bool,

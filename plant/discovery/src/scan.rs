@@ -56,7 +56,7 @@ pub struct Scanned {
 pub struct ScanOutcome {
     /// The servers, one per ApplicationUri, ordered by address.
     pub servers: Vec<Scanned>,
-    /// Addresses whose listener is not an OPC UA server, with the reason, ordered by address.
+    /// Addresses with a listener that is not an OPC UA server, with the reason, ordered by address.
     pub others: Vec<(SocketAddr, String)>,
     /// The number of scanned addresses.
     pub tried: u32,

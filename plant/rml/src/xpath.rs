@@ -71,7 +71,7 @@ pub(crate) enum Start {
     Filter(Box<Expr>, Vec<Expr>),
 }
 
-/// The leading steps of an absolute path whose nodes do not depend on the row.
+/// The leading steps of an absolute path with nodes that do not depend on the row.
 #[derive(Clone)]
 pub(crate) struct PathIndex {
     /// Identifies the steps within a document.

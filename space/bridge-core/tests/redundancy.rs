@@ -517,7 +517,7 @@ fn a_bridge_that_is_active_again_has_the_states_for_late_joiners() {
     assert_eq!(of_a(&world).last(), Some(&(70, ValueRelation::Again)));
 }
 
-/// Two redundant servers, whose clients write [`STATE`].
+/// Two redundant servers with clients that write [`STATE`].
 fn servers(text: &str, seed: u64) -> World {
     let mut world = World::new(text, seed);
     for at in [A, B] {

@@ -595,7 +595,7 @@ fn a_state_is_repeated_with_its_time_and_its_readers_deliver_it_once() {
     assert_eq!(
         late.deliveries().len(),
         1,
-        "who comes late gets it from the repetition"
+        "a late reader gets it from the repetition"
     );
 }
 

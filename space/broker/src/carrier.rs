@@ -408,7 +408,7 @@ impl Mqtt {
         };
         let now = instant();
         if let Some(status) = self.reports.status(publisher, (now, utc())) {
-            // NATS ends the connection of a client whose message with QoS 1 it cannot store in
+            // NATS ends the connection of a client if it cannot store its message with QoS 1 in
             // 4 s, so a cyclic status would end each connection while there is no leader.
             let is_cyclic = self.settings.will.is_none();
             self.announce_status(publisher, &status, is_cyclic);

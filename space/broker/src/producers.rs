@@ -36,7 +36,7 @@ impl Producers {
         };
         let left = cyclic.map(|cyclic| time_left(cyclic.next_report_time, utc));
         producer.until = left.flatten().map(|left| now + left);
-        // A status whose successor is overdue is of a publisher that ended.
+        // A status with an overdue successor is of a publisher that ended.
         producer.operational = state == ConnectionState::OPERATIONAL && left != Some(None);
         self.release(publisher)
     }

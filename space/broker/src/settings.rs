@@ -20,7 +20,7 @@ use crate::topics::{self, Address, TopicFilter, TopicMessageType, UADP};
 pub struct BrokerIdentity {
     /// Name of the program, for its ClientId.
     pub program: String,
-    /// PublisherId of own messages, whose status is reported. `None` for a program that only
+    /// PublisherId of own messages; their status is reported. `None` for a program that only
     /// looks.
     pub publisher: Option<u16>,
 }

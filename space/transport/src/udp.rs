@@ -275,7 +275,7 @@ impl Udp {
         change
     }
 
-    /// Sets the senders of the other programs of this process, whose datagrams are dropped like own
+    /// Sets the senders of the other programs of this process; their datagrams are dropped like own
     /// datagrams. Without `own` datagrams only.
     pub(crate) fn drop_companions(&mut self, companions: Vec<SocketAddr>) {
         self.companions = companions;

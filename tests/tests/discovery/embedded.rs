@@ -101,7 +101,12 @@ fn the_first_component_of_a_host_is_its_discovery_server_and_the_next_one_when_i
     let promised = Duration::from_secs(5);
     second.wait_for_line(TAKES_OVER, promised);
     second.wait_for_line(&format!("registered uri=\"{QUIET}\""), promised);
-    let lines = listed(&cell, "who is left is listed", SOON, &[ROBOT, QUIET]);
+    let lines = listed(
+        &cell,
+        "the remaining servers are listed",
+        SOON,
+        &[ROBOT, QUIET],
+    );
     assert_eq!(called(&lines), "UA bridge discovery server in robot");
     second.end();
     for name in ["ua-lds", "robot"] {

@@ -75,7 +75,7 @@ fn a_node_of_ros_2_without_an_enclave_gets_and_gives_nothing_and_is_told_of() {
         ua.drain();
         let values = ua.triples_for(std::time::Duration::from_millis(500));
         assert!(!values.contains(&BACK.0), "{values:?}");
-        eventually("who is kept out is counted", SOON, || {
+        eventually("a refused participant is counted", SOON, || {
             let status = metrics(METRICS_ROS2)?;
             (status["others"]["dropped"]["unsecured"] == 1).then_some(())
         });

@@ -156,7 +156,7 @@ impl<P: Ord + Clone> Responder<P> {
         }
     }
 
-    /// Handles a request whose response goes to `reply_to`. The response to a repetition goes to
+    /// Handles a request and responds to `reply_to`. The response to a repetition goes to
     /// the address of the first request.
     ///
     /// # Errors

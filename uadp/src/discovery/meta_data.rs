@@ -168,7 +168,7 @@ enumeration! {
         UNION = 2,
         /// The fields in sequence; "optional" fields are encoded as ExtensionObjects or Variants.
         STRUCTURE_WITH_SUBTYPED_VALUES = 3,
-        /// A union whose "optional" fields can hold subtypes, encoded as above.
+        /// A union with "optional" fields that can hold subtypes, encoded as above.
         UNION_WITH_SUBTYPED_VALUES = 4,
     }
 }

@@ -35,5 +35,5 @@ async fn of_two_servers_with_one_name_one_is_called_otherwise() {
     let limit = Duration::from_secs(20);
     let (from, to, first) = tokio::time::timeout(limit, renamed).await.unwrap();
     assert_eq!((&*from, &*to), ("arm", "arm (2)"));
-    assert!(!first, "the one whose URL comes later gives way");
+    assert!(!first, "the server with the later URL gives way");
 }

@@ -353,7 +353,7 @@ impl ProcedureRun {
         }
     }
 
-    /// Notes parameters whose effective value differs from the written value.
+    /// Notes parameters with an effective value other than the written value.
     async fn compare(&self, work: &Work) {
         for parameter in &self.parameters {
             let (Some(node), Some(written)) =

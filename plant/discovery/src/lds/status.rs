@@ -21,7 +21,7 @@ pub struct LdsStatus {
     pub(super) network: Vec<RecordStatus>,
     pub(super) losses: VecDeque<LossStatus>,
     pub(super) counters: BTreeMap<&'static str, u64>,
-    /// The Global Discovery Server whose servers are listed too.
+    /// The Global Discovery Server; its servers are listed too.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(super) gds: Option<ListingStatus>,
     #[serde(skip_serializing_if = "Option::is_none")]

@@ -270,7 +270,7 @@ impl<'a> Evaluator<'a> {
         Ok(nodes)
     }
 
-    /// Returns the nodes of a step whose values equal the values of the probe.
+    /// Returns the nodes of a step with values equal to the values of the probe.
     fn joined(
         &mut self,
         before: &[NodeRef],

@@ -49,7 +49,7 @@ pub(super) fn any_pair(comparison: Comparison, a: &[String], b: &[String]) -> bo
     }
 }
 
-/// Returns the characters whose positions are in the range (XPath 1.0, 4.2).
+/// Returns the characters at positions in the range (XPath 1.0, 4.2).
 pub(super) fn substring(text: &str, start: f64, length: Option<f64>) -> String {
     let first = round(start);
     let end = length.map_or(f64::INFINITY, |length| first + round(length));

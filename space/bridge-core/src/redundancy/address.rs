@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 /// The address of a bridge.
 ///
 /// The first address counts while the bridge sends from it: a heartbeat from another address is
-/// forged. A bridge whose interface has changed sends from another address only.
+/// forged. A bridge with a changed interface sends from another address only.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct SenderAddress {
     first: SocketAddr,

@@ -646,7 +646,7 @@ pub(super) struct LocalSample<'a> {
 }
 
 impl LocalSample<'_> {
-    /// Returns the status of a sample whose source is lost, as text: a Bad StatusCode in the place
+    /// Returns the status of a sample with a lost source, as text: a Bad StatusCode in the place
     /// of a value, or a null value of Bad status.
     fn no_value(&self) -> Option<String> {
         let of_sample = StatusCode::from_status(self.status);

@@ -71,7 +71,7 @@ pub(super) struct Serving<C> {
     news: mpsc::Receiver<News>,
     tell: mpsc::Sender<News>,
     tasks: JoinSet<()>,
-    /// Goals whose server was asked to cancel them, each with the further requests to cancel it.
+    /// Goals that the server was asked to cancel, each with the further requests to cancel it.
     cancels: HashMap<GraphGoalId, Vec<ExecutionId>>,
 }
 

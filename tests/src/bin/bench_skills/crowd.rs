@@ -165,7 +165,7 @@ fn device(cell: &Cell, at: &PlantSite, (number, skills): (usize, usize)) -> Chil
         .start()
 }
 
-/// Returns the number of devices whose skills the station shows, each with at least five methods.
+/// Returns the number of devices in the station that have skills with at least five methods.
 fn seen(skills: usize) -> Option<usize> {
     let status = metrics(STATUS)?;
     let below = status["level"]["below"].as_array()?;
