@@ -111,10 +111,18 @@ impl Reader {
         gaps.max().unwrap_or_default()
     }
 
-    /// Returns the numbers that arrived twice or after a newer one.
+    /// Returns how many numbers arrived again directly after themselves.
+    fn doubled(&self) -> usize {
+        let numbers = self.numbers();
+        numbers.windows(2).filter(|pair| pair[1] == pair[0]).count()
+    }
+
+    /// Returns how many numbers arrived after a newer number, and again beyond the single state that
+    /// a takeover may repeat.
     fn disordered(&self) -> usize {
         let numbers = self.numbers();
-        numbers.windows(2).filter(|pair| pair[1] <= pair[0]).count()
+        let older = numbers.windows(2).filter(|pair| pair[1] < pair[0]).count();
+        older + self.doubled().saturating_sub(1)
     }
 }
 
@@ -136,6 +144,7 @@ struct Tally {
     rounds: u64,
     lost: u64,
     failed_processes: u64,
+    doubled: usize,
     disordered: usize,
     longest: Duration,
 }
@@ -185,10 +194,13 @@ fn round(cell: &Cell, plant: &mut SoakPlant<'_>, random: &mut Random, tally: &mu
     tally.failed_processes += u64::from(!runs);
     let disordered: usize = readers.iter().map(Reader::disordered).sum();
     tally.disordered += disordered;
+    let doubled: usize = readers.iter().map(Reader::doubled).sum();
+    tally.doubled += doubled;
     let [forth, back] = readers.each_ref().map(Reader::gap);
     tally.longest = tally.longest.max(forth).max(back);
     println!(
-        "{:4} {what}: ready after {:.1} s, gaps {:.2} s forth and {:.2} s back, {disordered} out of order{}",
+        "{:4} {what}: ready after {:.1} s, gaps {:.2} s forth and {:.2} s back, {doubled} doubled, \
+         {disordered} out of order{}",
         tally.rounds,
         healed.as_secs_f64(),
         forth.as_secs_f64(),
@@ -214,12 +226,13 @@ fn report(plant: &mut SoakPlant<'_>, tally: &Tally) -> ExitCode {
         rounds,
         lost,
         failed_processes,
+        doubled,
         disordered,
         longest,
     } = tally;
     println!(
         "{rounds} faults: {lost} without new states afterwards, {failed_processes} processes failed, \
-         {disordered} values doubled or out of order, longest gap {:.2} s",
+         {doubled} states doubled, {disordered} values out of order, longest gap {:.2} s",
         longest.as_secs_f64()
     );
     let mut grows = false;
