@@ -4,7 +4,7 @@
 //! Discovery data is unauthenticated, so each server is queried for its identity before it gets a
 //! number.
 
-mod places;
+mod numbers;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
@@ -15,7 +15,7 @@ use tokio::task::JoinSet;
 use tokio::time::{Interval, MissedTickBehavior, interval};
 use tracing::{info, warn};
 
-use self::places::{FreeNumbers, ServerNumbers};
+use self::numbers::{FreeNumbers, ServerNumbers};
 use crate::identity::PRODUCT_URI;
 
 /// A server with a number in the space.
