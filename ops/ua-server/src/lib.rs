@@ -6,7 +6,7 @@
 //!
 //! Modules in reading order:
 //! - Nodes and values: `layout` (nodes of the mapping), `structures` (their DataTypes), `address`
-//!   (nodes of the address space), `values` (current values), `wear` (ageing of values), `history`
+//!   (nodes of the address space), `values` (current values), `staleness` (age of values), `history`
 //!   (past values), `nodes` (the node manager), `browse` (the order of nodes), `budget` (memory
 //!   limits of clients), `space` (received values), `nodesets` (nodes from files), `folders`
 //!   (folders of dotted names), `properties` (units, ranges and texts of values), `value`
@@ -61,11 +61,11 @@ mod reverse;
 mod sks;
 mod sources;
 mod space;
+mod staleness;
 mod structures;
 mod value;
 mod values;
 mod verbs;
-mod wear;
 
 use std::ffi::OsString;
 use std::net::SocketAddr;

@@ -17,7 +17,7 @@ use crate::layout::{Layout, TopicNode, VariableShape};
 use crate::nodes::SpaceManager;
 use crate::structures::Structure;
 use crate::values::{self, SampleStamp, ShownValue};
-use crate::wear::{Looks, Wear, Worn};
+use crate::staleness::{Looks, Wear, Worn};
 
 /// Writes values of the space to the address space.
 pub(crate) struct SpaceWriter {
