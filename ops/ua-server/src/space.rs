@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use bridge_node::{Room, now};
 use bytes::Bytes;
-use mappings::{Ages, Mapping, SpaceId, TopicId};
+use mappings::{Ages, Mapping, TopicId};
 use opcua::server::SubscriptionCache;
 use opcua::types::{DateTime, StatusCode};
 use uadp::{Fields, Scalar, Timestamp};
@@ -17,7 +17,7 @@ use crate::layout::{Layout, TopicNode, VariableShape};
 use crate::nodes::SpaceManager;
 use crate::structures::Structure;
 use crate::values::{self, SampleStamp, ShownValue};
-use crate::staleness::{Looks, Wear, Worn};
+use crate::staleness::{StaleValues, Staleness};
 
 /// Writes values of the space to the address space.
 pub(crate) struct SpaceWriter {
@@ -27,11 +27,10 @@ pub(crate) struct SpaceWriter {
     structures: Vec<Structure>,
     /// Limits the number of unmapped topics.
     room: Room,
-    /// Topics with a writer that is active again, but without a new sample.
-    returned: Vec<TopicId>,
     /// Topics that lost their nodes to other topics.
     gave_way: Vec<TopicId>,
-    looks: Looks,
+    /// The ages of the values, of the same topics.
+    ages: StaleValues,
     /// Maximum age of uncertain values of unmapped topics.
     unmapped_ages: Ages,
 }
@@ -44,7 +43,6 @@ struct Known {
     status: StatusCode,
     /// The last sample, while it is too old to be shown.
     over: Option<Bytes>,
-    wear: Wear,
 }
 
 impl SpaceWriter {
@@ -53,6 +51,10 @@ impl SpaceWriter {
         manager: Arc<SpaceManager>,
         subscriptions: Arc<SubscriptionCache>,
     ) -> Self {
+        let mut ages = StaleValues::default();
+        for node in &layout.topics {
+            ages.add(node.topic, Ages::default());
+        }
         let topics = layout
             .topics
             .iter()
@@ -64,9 +66,8 @@ impl SpaceWriter {
             topics,
             structures: layout.structures.clone(),
             room: Room::new(MOST_UNMAPPED),
-            returned: Vec::new(),
             gave_way: Vec::new(),
-            looks: Looks::default(),
+            ages,
             unmapped_ages: Ages::default(),
         }
     }
@@ -87,20 +88,15 @@ impl SpaceWriter {
         let usual = mapping.server().bad_after;
         self.unmapped_ages = Ages::default().or(usual);
         let now = now().monotonic;
-        let mut others = Vec::new();
-        for (topic, known) in &mut self.topics {
+        for (topic, known) in &self.topics {
             let ages = match mapping.variable(*topic) {
                 Some(variable) if !known.node.writable() => variable.ages.or(usual),
                 Some(_) => Ages::default(),
                 None => self.unmapped_ages,
             };
-            known.wear.set_ages(ages);
-            self.looks.plan(*topic, &mut known.wear, now);
-            others.extend(known.wear.turn(now).map(|worn| (*topic, worn)));
+            self.ages.set_ages(*topic, ages, now);
         }
-        for (topic, worn) in others {
-            self.show_worn(topic, worn);
-        }
+        self.show_changes();
     }
 
     /// Switches to the nodes of another layout. Unchanged nodes keep their values. Returns the
@@ -124,6 +120,9 @@ impl SpaceWriter {
             .map(|(_, known)| known)
             .collect();
         let gone: Vec<TopicNode> = gone.into_iter().map(|known| known.node).collect();
+        for node in &gone {
+            self.ages.remove(node.topic);
+        }
         let new = layout.topics.iter();
         let new: Vec<TopicNode> = new
             .filter(|node| !self.topics.contains_key(&node.topic))
@@ -138,6 +137,7 @@ impl SpaceWriter {
         for node in &new {
             let known = Known::new(node.clone(), true);
             self.topics.insert(node.topic, known);
+            self.ages.add(node.topic, Ages::default());
         }
         let topics = |nodes: Vec<TopicNode>| nodes.into_iter().map(|node| node.topic).collect();
         (topics(gone), topics(new))
@@ -205,12 +205,9 @@ impl SpaceWriter {
         {
             known.retype(block, &self.manager);
         }
-        let now = now().monotonic;
-        known.wear.came(now);
+        self.ages.received(topic, now().monotonic);
         known.over = None;
-        self.looks.plan(topic, &mut known.wear, now);
         known.status = stamp.status;
-        self.returned.retain(|returned| *returned != topic);
         let shown = ShownValue {
             block: shown,
             stamp,
@@ -259,27 +256,14 @@ impl SpaceWriter {
     /// Marks the last value of a topic as stale or as current. The value and its source timestamp
     /// stay (OPC 10000-8, 6.3.2). A topic without a value continues to wait.
     pub(crate) fn set_silent(&mut self, topic: TopicId, silent: bool) {
-        let Some(known) = self.topics.get_mut(&topic) else {
-            return;
-        };
-        if known.wear.silent().is_some() == silent {
-            return;
-        }
-        known.wear.set_silent(silent, now().monotonic);
-        if silent {
-            self.wear(topic);
-        } else {
-            // A sample probably follows at once. Otherwise `settle` restores the status of the last
-            // sample.
-            self.returned.push(topic);
-        }
+        self.ages.set_silent(topic, silent, now().monotonic);
+        self.show_changes();
     }
 
     /// Restores the status of last values if the writer is active again without a new sample.
     pub(crate) fn settle(&mut self) {
-        for topic in std::mem::take(&mut self.returned) {
-            self.wear(topic);
-        }
+        self.ages.settle(now().monotonic);
+        self.show_changes();
     }
 
     /// Updates the times of the last messages. If a publisher sends nothing for `timeout`, its
@@ -289,64 +273,31 @@ impl SpaceWriter {
         heard: impl Iterator<Item = (TopicId, Instant)>,
         timeout: Duration,
     ) {
-        if self
-            .topics
-            .values()
-            .all(|known| known.wear.silent().is_none())
-        {
-            return;
-        }
-        let mut last: HashMap<(SpaceId, Option<u16>), Instant> = HashMap::new();
-        for (topic, at) in heard {
-            let of = last.entry(publisher(topic)).or_insert(at);
-            *of = at.max(*of);
-        }
-        let now = now().monotonic;
-        let mut silent = Vec::new();
-        for (topic, known) in &mut self.topics {
-            if known.wear.silent().is_some() {
-                let at = last.get(&publisher(*topic));
-                let away = at.is_none_or(|at| now.saturating_duration_since(*at) >= timeout);
-                known.wear.set_away(away);
-                silent.push(*topic);
-            }
-        }
-        for topic in silent {
-            self.wear(topic);
-        }
+        self.ages.set_last_messages(heard, timeout, now().monotonic);
+        self.show_changes();
     }
 
     /// Returns the time at which the next value becomes too old.
     pub(crate) fn due(&self) -> Option<Instant> {
-        self.looks.due()
+        self.ages.poll_deadline()
     }
 
     /// Updates the values that have become too old.
     pub(crate) fn grow_old(&mut self) {
-        let now = now().monotonic;
-        while let Some((at, topic)) = self.looks.take(now) {
-            let known = self.topics.get_mut(&topic);
-            if known.is_some_and(|known| known.wear.looked(at)) {
-                self.wear(topic);
-            }
-        }
+        self.ages.handle_deadline(now().monotonic);
+        self.show_changes();
     }
 
-    /// Updates the staleness of a topic's value.
-    fn wear(&mut self, topic: TopicId) {
-        let Some(known) = self.topics.get_mut(&topic) else {
-            return;
-        };
-        let now = now().monotonic;
-        self.looks.plan(topic, &mut known.wear, now);
-        if let Some(worn) = known.wear.turn(now) {
-            self.show_worn(topic, worn);
+    /// Shows the changes of the staleness of values.
+    fn show_changes(&mut self) {
+        while let Some((topic, staleness)) = self.ages.poll_change() {
+            self.show_staleness(topic, staleness);
         }
     }
 
     /// Shows the last sample with the status of its staleness. A sample that is too old is kept
     /// here.
-    fn show_worn(&mut self, topic: TopicId, worn: Worn) {
+    fn show_staleness(&mut self, topic: TopicId, staleness: Staleness) {
         let Some(known) = self.topics.get_mut(&topic) else {
             return;
         };
@@ -358,10 +309,10 @@ impl SpaceWriter {
         if shown.block.is_none() {
             return;
         }
-        if worn == Worn::Over {
+        if staleness == Staleness::Expired {
             known.over = shown.block.take();
         }
-        shown.stamp.status = worn.status().unwrap_or(known.status);
+        shown.stamp.status = staleness.status().unwrap_or(known.status);
         shown.stamp.server = DateTime::now();
         live.show_again(&self.subscriptions, &known.node, shown);
     }
@@ -376,13 +327,16 @@ impl SpaceWriter {
         let unmapped = self.topics.iter().filter(|(_, known)| !known.mapped);
         let there = unmapped.clone().count();
         let mut silent: Vec<(Instant, TopicId)> = unmapped
-            .filter_map(|(topic, known)| known.wear.silent().map(|since| (since, *topic)))
+            .filter_map(|(topic, _)| Some((self.ages.silent_since(*topic)?, *topic)))
             .collect();
         silent.sort_unstable();
         silent.truncate(MOST_LET_GO);
         let topics: Vec<TopicId> = silent.into_iter().map(|(_, topic)| topic).collect();
         let gone = topics.iter().filter_map(|topic| self.topics.remove(topic));
         let gone: Vec<TopicNode> = gone.map(|known| known.node).collect();
+        for topic in &topics {
+            self.ages.remove(*topic);
+        }
         if !gone.is_empty() {
             self.manager.inner().exchange(
                 self.manager.address_space(),
@@ -413,9 +367,8 @@ impl SpaceWriter {
             &address::unmapped_folder(),
         );
         self.manager.inner().know(&node);
-        let mut known = Known::new(node, false);
-        known.wear.set_ages(self.unmapped_ages);
-        self.topics.insert(topic, known);
+        self.topics.insert(topic, Known::new(node, false));
+        self.ages.add(topic, self.unmapped_ages);
         Ok(())
     }
 }
@@ -427,7 +380,6 @@ impl Known {
             mapped,
             status: StatusCode::Good,
             over: None,
-            wear: Wear::new(Ages::default()),
         }
     }
 
@@ -467,12 +419,6 @@ impl Known {
             manager.inner().know(&self.node);
         }
     }
-}
-
-/// Returns the publisher of a topic. A program publishes a whole space, or a namespace of space 0.
-fn publisher(topic: TopicId) -> (SpaceId, Option<u16>) {
-    let namespace = (topic.space == SpaceId::UA).then(|| topic.namespace.get());
-    (topic.space, namespace)
 }
 
 /// Returns the shape of a single field. Several fields have no shape.
