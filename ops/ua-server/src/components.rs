@@ -16,10 +16,11 @@ use opcua::types::{
     QualifiedName, VariableTypeId, Variant,
 };
 use tracing::info;
+use uadp::Timestamp;
 
 use crate::address;
 use crate::nodes::SpaceManager;
-use crate::presence::ValuePresence;
+use crate::presence::{OnlineState, ValuePresence};
 
 /// The next event of [`Components`].
 pub(crate) enum ComponentEvent {
@@ -90,15 +91,17 @@ impl Components {
         } else {
             self.gone.push_back(name.clone())
         }
-        let since = if online { known.since } else { wall() };
-        let topic = self.presence.show(known, (online, since));
+        let now = now().utc;
+        let since = if online { known.since } else { system_time(now) };
+        let state = OnlineState { online, since };
+        let topic = self.presence.show(known, state, now);
         let oldest = (self.gone.len() > MOST_GONE)
             .then(|| self.gone.pop_front())
             .flatten();
         if let Some(oldest) = &oldest {
             self.presence.forget(oldest);
         }
-        let values = values(known, (online, since), (topic, self.presence.level()));
+        let values = values(known, state, (topic, self.presence.level()));
         {
             let mut address_space = self.manager.address_space().write();
             if let Some(oldest) = oldest {
@@ -136,7 +139,7 @@ type Property = (&'static str, DataTypeId, i32, Variant);
 
 fn values(
     known: &PresentServer,
-    (online, since): (bool, SystemTime),
+    state: OnlineState,
     (topic, level): (Option<TopicId>, &str),
 ) -> [Property; 9] {
     let capabilities: Vec<_> = known
@@ -153,8 +156,8 @@ fn values(
         ("ApplicationUri", DataTypeId::String, -1, uri.into()),
         ("Url", DataTypeId::String, -1, known.url.as_str().into()),
         ("Capabilities", DataTypeId::String, 1, capabilities.into()),
-        ("Online", DataTypeId::Boolean, -1, online.into()),
-        ("Since", DataTypeId::UtcTime, -1, time(since).into()),
+        ("Online", DataTypeId::Boolean, -1, state.online.into()),
+        ("Since", DataTypeId::UtcTime, -1, time(state.since).into()),
         ("StartTime", DataTypeId::UtcTime, -1, started.into()),
         ("Number", DataTypeId::UInt16, -1, number.into()),
         ("Level", DataTypeId::String, -1, level.into()),
@@ -195,9 +198,8 @@ fn node(name: &str, property: &str) -> NodeId {
     )
 }
 
-/// Returns the current time.
-fn wall() -> SystemTime {
-    let nanos = u64::try_from(now().utc.unix_nanos()).unwrap_or_default();
+fn system_time(at: Timestamp) -> SystemTime {
+    let nanos = u64::try_from(at.unix_nanos()).unwrap_or_default();
     SystemTime::UNIX_EPOCH + Duration::from_nanos(nanos)
 }
 

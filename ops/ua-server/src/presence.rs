@@ -8,20 +8,28 @@ use std::collections::{BTreeMap, VecDeque};
 use std::time::{SystemTime, UNIX_EPOCH};
 
 use bridge_core::ValueDescription;
-use bridge_node::{PortEvent, now};
+use bridge_node::PortEvent;
 use bytes::Bytes;
 use discovery::PresentServer;
 use mappings::{Overflow, TopicId};
 use messages::{ArrayRank, Leaf, TypeName};
 use opcua::types::{UAString, Variant};
 use tracing::warn;
-use uadp::BuiltinType;
+use uadp::{BuiltinType, Timestamp};
 
 use crate::value;
 
+/// Whether a server is online or offline.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct OnlineState {
+    pub(crate) online: bool,
+    /// The time since which it is.
+    pub(crate) since: SystemTime,
+}
+
 /// A published server.
 #[derive(Debug)]
-struct Told {
+struct PublishedServer {
     identifier: u16,
     /// The name on the network. A component has another name for each port at which it is started.
     name: String,
@@ -34,7 +42,7 @@ pub(crate) struct ValuePresence {
     /// The network on which the servers are discovered.
     level: String,
     /// The published servers by their identities.
-    told: BTreeMap<String, Told>,
+    told: BTreeMap<String, PublishedServer>,
     /// Identifiers of servers without a number, by their identities. They are stable as long as
     /// this program runs.
     given: BTreeMap<String, u16>,
@@ -59,13 +67,15 @@ impl ValuePresence {
         &self.level
     }
 
-    /// Publishes that a server is online, or offline from the given time. Returns its name in the
+    /// Publishes at the time `now` that a server is online or offline. Returns its name in the
     /// space.
     pub(crate) fn show(
         &mut self,
         known: &PresentServer,
-        (online, since): (bool, SystemTime),
+        state: OnlineState,
+        now: Timestamp,
     ) -> Option<TopicId> {
+        let online = state.online;
         let who = who(known);
         let before = self.told.get(who);
         let other = before.filter(|before| before.name != known.name && before.online);
@@ -80,12 +90,12 @@ impl ValuePresence {
         }
         // An offline server gives way to an online server.
         let is_new = self.give_way(identifier, who) || before != Some(identifier);
-        let told = Told {
+        let server = PublishedServer {
             identifier,
             name: known.name.clone(),
             online,
         };
-        self.told.insert(who.to_owned(), told);
+        self.told.insert(who.to_owned(), server);
         let topic = TopicId::new(0, NAMESPACE, identifier)?;
         if is_new {
             let description = description(known.application_uri.as_deref());
@@ -96,12 +106,12 @@ impl ValuePresence {
         // Unreported samples of this server are outdated.
         let of_it = |event: &PortEvent| matches!(event, PortEvent::Sample { topic: of, .. } if *of == topic);
         self.events.retain(|event| !of_it(event));
-        let fields = fields(known, (online, since), &self.level);
+        let fields = fields(known, state, &self.level);
         match value::fields_block(&fields) {
             Ok(block) => self.events.push_back(PortEvent::Sample {
                 topic,
                 payload: Bytes::from(block),
-                received: now().utc,
+                received: now,
                 latched_by: None,
             }),
             Err(status) => {
@@ -113,7 +123,7 @@ impl ValuePresence {
 
     /// Stops publishing an offline server with that name.
     pub(crate) fn forget(&mut self, name: &str) {
-        let is_it = |told: &Told| told.name == name && !told.online;
+        let is_it = |told: &PublishedServer| told.name == name && !told.online;
         let gone = self.told.values().filter(|told| is_it(told));
         let gone: Vec<u16> = gone.map(|told| told.identifier).collect();
         self.told.retain(|_, told| !is_it(told));
@@ -203,15 +213,15 @@ fn description(uri: Option<&str>) -> ValueDescription {
     }
 }
 
-fn fields(known: &PresentServer, (online, since): (bool, SystemTime), level: &str) -> [Variant; 9] {
+fn fields(known: &PresentServer, state: OnlineState, level: &str) -> [Variant; 9] {
     let text = |text: &str| Variant::from(text);
     let texts = |all: &[String]| {
         let all: Vec<UAString> = all.iter().map(|one| one.as_str().into()).collect();
         Variant::from(all)
     };
     [
-        online.into(),
-        seconds(since).into(),
+        state.online.into(),
+        seconds(state.since).into(),
         known.started.map_or(0.0, seconds).into(),
         known.number.map_or(0, u16::from).into(),
         text(&known.name),
@@ -252,9 +262,18 @@ mod tests {
         }
     }
 
+    fn show(presence: &mut ValuePresence, known: &PresentServer, online: bool) -> Option<TopicId> {
+        let since = UNIX_EPOCH;
+        let now = Timestamp::from_unix_nanos(0);
+        presence.show(known, OnlineState { online, since }, now)
+    }
+
     fn shown(presence: &mut ValuePresence, known: &PresentServer) -> u16 {
-        let topic = presence.show(known, (true, UNIX_EPOCH)).unwrap();
-        topic.triple().2
+        show(presence, known, true).unwrap().triple().2
+    }
+
+    fn events(presence: &mut ValuePresence) -> Vec<PortEvent> {
+        std::iter::from_fn(|| presence.event()).collect()
     }
 
     #[test]
@@ -266,7 +285,7 @@ mod tests {
         assert_eq!(shown(&mut presence, &known("gripper", 7)), 7);
         assert_eq!(shown(&mut presence, &known("plc", 0)), FIRST_GIVEN);
         // The gripper is offline: its number is free for an online server.
-        presence.show(&known("gripper", 7), (false, UNIX_EPOCH));
+        show(&mut presence, &known("gripper", 7), false);
         assert_eq!(shown(&mut presence, &known("thief", 7)), 7);
     }
 
@@ -280,9 +299,9 @@ mod tests {
         };
         assert_eq!(shown(&mut presence, &first), 7);
         assert_eq!(shown(&mut presence, &again), 7);
-        while presence.event().is_some() {}
+        events(&mut presence);
         // The previous name is reported as lost only after that.
-        let topic = presence.show(&first, (false, UNIX_EPOCH));
+        let topic = show(&mut presence, &first, false);
         assert_eq!(topic.unwrap().triple(), (0, 1, 7));
         assert!(presence.event().is_none(), "it is there");
         presence.forget(&first.name);
@@ -294,9 +313,9 @@ mod tests {
         let mut presence = ValuePresence::new("lo".to_owned());
         let gripper = known("gripper", 7);
         for online in [true, false, true] {
-            presence.show(&gripper, (online, UNIX_EPOCH)).unwrap();
+            show(&mut presence, &gripper, online).unwrap();
         }
-        let events: Vec<PortEvent> = std::iter::from_fn(|| presence.event()).collect();
+        let events = events(&mut presence);
         assert!(
             matches!(
                 &events[..],
@@ -308,5 +327,49 @@ mod tests {
             ),
             "{events:?}"
         );
+    }
+
+    #[test]
+    fn an_offline_server_is_published_until_it_is_forgotten_or_its_number_is_used() {
+        let mut presence = ValuePresence::new("lo".to_owned());
+        let (gripper, thief) = (known("gripper", 7), known("thief", 7));
+        shown(&mut presence, &gripper);
+        presence.forget(&gripper.name);
+        show(&mut presence, &gripper, false);
+        let reported = events(&mut presence);
+        assert!(
+            !reported
+                .iter()
+                .any(|event| matches!(event, PortEvent::Withdrawn { .. })),
+            "an online server is not forgotten: {reported:?}"
+        );
+        presence.forget(&gripper.name);
+        let topic = TopicId::new(0, NAMESPACE, 7).unwrap();
+        let reported = events(&mut presence);
+        assert!(
+            matches!(&reported[..], [PortEvent::Withdrawn { topic: of }] if *of == topic),
+            "{reported:?}"
+        );
+        // The name of a server that gave way is described again for the other server.
+        shown(&mut presence, &gripper);
+        show(&mut presence, &gripper, false);
+        events(&mut presence);
+        assert_eq!(shown(&mut presence, &thief), 7);
+        let reported = events(&mut presence);
+        assert!(
+            matches!(&reported[0], PortEvent::Described { topic: of, .. } if *of == topic),
+            "{reported:?}"
+        );
+    }
+
+    #[test]
+    fn numbers_are_given_to_so_many_servers_as_there_are_identifiers() {
+        let mut presence = ValuePresence::new("lo".to_owned());
+        for at in FIRST_GIVEN..=u16::MAX {
+            assert_eq!(shown(&mut presence, &known(&at.to_string(), 0)), at);
+            events(&mut presence);
+        }
+        assert_eq!(show(&mut presence, &known("more", 0), true), None);
+        assert_eq!(shown(&mut presence, &known("gripper", 7)), 7);
     }
 }
