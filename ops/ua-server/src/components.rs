@@ -92,7 +92,11 @@ impl Components {
             self.gone.push_back(name.clone())
         }
         let now = now().utc;
-        let since = if online { known.since } else { system_time(now) };
+        let since = if online {
+            known.since
+        } else {
+            system_time(now)
+        };
         let state = OnlineState { online, since };
         let topic = self.presence.show(known, state, now);
         let oldest = (self.gone.len() > MOST_GONE)

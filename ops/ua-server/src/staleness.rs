@@ -132,8 +132,7 @@ impl StaleValues {
         for (topic, age) in &mut self.ages {
             if age.silent.is_some() {
                 let at = last.get(&publisher(*topic));
-                age.is_offline =
-                    at.is_none_or(|at| now.saturating_duration_since(*at) >= timeout);
+                age.is_offline = at.is_none_or(|at| now.saturating_duration_since(*at) >= timeout);
                 silent.push(*topic);
             }
         }

@@ -112,16 +112,25 @@ fn silence_makes_a_value_uncertain_and_bad_and_an_active_writer_restores_it() {
     values.received(of);
     values.until(10);
     assert_eq!(values.set_silent(of, true), [(of, Staleness::Stale)]);
-    assert!(values.set_silent(of, true).is_empty(), "it is silent already");
+    assert!(
+        values.set_silent(of, true).is_empty(),
+        "it is silent already"
+    );
     values.until(11);
     assert_eq!(values.set_last_messages(&[]), [(of, Staleness::Offline)]);
-    assert_eq!(values.set_last_messages(&[(of, 9)]), [(of, Staleness::Stale)]);
+    assert_eq!(
+        values.set_last_messages(&[(of, 9)]),
+        [(of, Staleness::Stale)]
+    );
     assert_eq!(values.until(20), [(13, of, Staleness::Expired)]);
     // A writer that is active again probably sends a value at once, so nothing changes before.
     assert!(values.set_silent(of, false).is_empty());
     values.values.settle(values.now);
     assert_eq!(values.changes(), [(of, Staleness::Fresh)]);
-    assert!(values.set_last_messages(&[]).is_empty(), "its writer is active");
+    assert!(
+        values.set_last_messages(&[]).is_empty(),
+        "its writer is active"
+    );
 }
 
 #[test]
@@ -147,7 +156,10 @@ fn a_publisher_is_offline_when_none_of_its_topics_has_messages() {
     }
     values.until(5);
     for silent in [one, first] {
-        assert_eq!(values.set_silent(silent, true), [(silent, Staleness::Stale)]);
+        assert_eq!(
+            values.set_silent(silent, true),
+            [(silent, Staleness::Stale)]
+        );
     }
     // A space has one publisher; each namespace of space 0 has its own.
     let mut changes = values.set_last_messages(&[(one, 1), (other, 4), (first, 1), (second, 4)]);
@@ -193,7 +205,12 @@ impl Dice {
 /// follows from the ages: no deadline is missed, whatever is lost.
 #[test]
 fn the_changes_at_the_deadlines_give_the_staleness_at_every_second() {
-    let limits = [(None, None), (Some(2), None), (None, Some(5)), (Some(3), Some(4))];
+    let limits = [
+        (None, None),
+        (Some(2), None),
+        (None, Some(5)),
+        (Some(3), Some(4)),
+    ];
     for seed in 1..=200 {
         let mut dice = Dice(seed * 0x9e37_79b9);
         let topics: Vec<(TopicId, Ages)> = (10..)

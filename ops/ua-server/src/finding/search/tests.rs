@@ -65,9 +65,10 @@ impl SimulatedNetwork {
                 });
                 SearchAnswer::Identity(url.clone(), identity)
             }
-            SearchQuery::List { lds, .. } => {
-                SearchAnswer::List(lds.clone(), self.lists.get(lds).cloned().unwrap_or_default())
-            }
+            SearchQuery::List { lds, .. } => SearchAnswer::List(
+                lds.clone(),
+                self.lists.get(lds).cloned().unwrap_or_default(),
+            ),
         }
     }
 
@@ -270,16 +271,29 @@ fn an_announced_discovery_server_is_read_as_such_until_it_is_lost() {
     network.search.handle_deadline(network.now);
     let query = network.search.poll_query().unwrap();
     assert!(
-        matches!(&query, SearchQuery::List { is_named: false, .. }),
+        matches!(
+            &query,
+            SearchQuery::List {
+                is_named: false,
+                ..
+            }
+        ),
         "{query:?}"
     );
     network.start(5005, "urn:v:saw");
     let saw = vec![("urn:v:saw".to_owned(), at(5005))];
-    network.search.answered(SearchAnswer::List(lds.url.clone(), saw));
+    network
+        .search
+        .answered(SearchAnswer::List(lds.url.clone(), saw));
     assert_eq!(network.settle().len(), 1);
     let loss = ServerLoss::Goodbye;
-    network.search.heard(&ServerChange::Gone { known: lds, loss });
-    assert!(network.settle().is_empty(), "its list is not valid any more");
+    network
+        .search
+        .heard(&ServerChange::Gone { known: lds, loss });
+    assert!(
+        network.settle().is_empty(),
+        "its list is not valid any more"
+    );
     assert_eq!(network.search.poll_query(), None);
 }
 
@@ -323,7 +337,9 @@ fn a_search_that_is_disabled_asks_nobody_and_has_no_deadline() {
     network.start(5001, "urn:v:saw");
     network.search.heard(&seen("saw", 5001, 0));
     assert_eq!(network.round().len(), 1);
-    network.search.reload(&mapping("server: {endpoint: 'opc.tcp://127.0.0.1:4858'}"));
+    network
+        .search
+        .reload(&mapping("server: {endpoint: 'opc.tcp://127.0.0.1:4858'}"));
     assert_eq!(network.search.poll_deadline(), None);
     assert!(network.look().is_empty());
     network.search.handle_deadline(network.now + 10 * ROUND);
