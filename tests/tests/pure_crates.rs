@@ -242,6 +242,7 @@ fn what_the_plant_thinks_with_reaches_no_io_and_knows_no_space() {
         "build-info",
         "documents",
         "mtp",
+        "nodeset-files",
         "program",
         "registry",
         "rml",

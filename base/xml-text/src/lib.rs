@@ -3,9 +3,14 @@
 //!
 //! Engineering tools export UTF-16 and ISO-8859-1 as well as UTF-8. The parsers of the workspace
 //! read text only, and compare the attributes of an element pairwise, so that
-//! [`has_more_attributes`] limits their number.
+//! [`has_more_attributes`] limits their number. [`walk`] reads the elements of a document one after
+//! the other.
+
+mod walk;
 
 use std::borrow::Cow;
+
+pub use walk::{LocatedXmlFault, XmlAttributeFault, XmlElement, XmlFault, XmlVisitor, walk};
 
 /// Error of decoding a document.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]

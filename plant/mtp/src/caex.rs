@@ -1,11 +1,9 @@
 //! CAEX (IEC 62424): the tree of elements in the file, without their meaning.
 
-use quick_xml::XmlVersion;
-use quick_xml::escape::resolve_predefined_entity;
-use quick_xml::events::attributes::AttrError;
-use quick_xml::events::{BytesStart, Event};
-use quick_xml::reader::Reader;
+use std::ops::ControlFlow;
+
 use thiserror::Error;
+use xml_text::{XmlAttributeFault, XmlElement, XmlVisitor, walk};
 
 /// Error of reading a manifest.
 #[derive(Debug, Clone, PartialEq, Eq, Error)]
@@ -74,48 +72,15 @@ impl CaexElement {
                 most: MAX_FILE,
             });
         }
-        let file = file.trim_start_matches('\u{feff}');
-        let mut reader = Reader::from_str(file);
-        reader.config_mut().expand_empty_elements = true;
         let mut building = Building::default();
-        let mut lines = Lines::new(file);
-        loop {
-            let start = reader.buffer_position();
-            let event = reader.read_event();
-            let fault = |what: String| ManifestError::Xml {
-                line: line(file, reader.buffer_position()),
-                what,
-            };
-            match event.map_err(|error| fault(error.to_string()))? {
-                Event::Start(element) => {
-                    let line = lines.at(start);
-                    let opened = building.open(&element, line);
-                    opened.map_err(|error| fault(error.to_string()))?;
-                }
-                Event::End(_) => building.close(),
-                Event::Text(text) => building.text(&text.xml10_content()),
-                Event::CData(text) => building.text(&text.xml10_content()),
-                Event::GeneralRef(reference) => {
-                    let character = reference.resolve_char_ref().ok().flatten();
-                    let name = reference.xml10_content();
-                    match (character, resolve_predefined_entity(&name)) {
-                        (Some(character), _) => building.text(character.encode_utf8(&mut [0; 4])),
-                        (None, Some(text)) => building.text(text),
-                        (None, None) => return Err(fault(format!("XML has no entity &{name};"))),
-                    }
-                }
-                Event::DocType(_) => {
-                    let what = "a manifest has no document type; remove the <!DOCTYPE ..>";
-                    return Err(fault(what.to_owned()));
-                }
-                Event::Eof => break,
-                // An empty element is reported as its start and its end.
-                Event::Empty(_) | Event::Comment(_) | Event::Decl(_) | Event::PI(_) => {}
-            }
-        }
-        building.root().ok_or_else(|| ManifestError::Xml {
-            line: line(file, u64::MAX),
-            what: "the file ends in the middle".to_owned(),
+        let walked = walk(file, MAX_DEPTH, &mut building);
+        walked.map_err(|located| ManifestError::Xml {
+            line: located.line,
+            what: located.fault.to_string(),
+        })?;
+        building.root.ok_or_else(|| ManifestError::Xml {
+            line: file.matches('\n').count() + 1,
+            what: "there is no CAEX element in the file".to_owned(),
         })
     }
 
@@ -168,33 +133,24 @@ enum CaexPart {
 /// Reason for which an element cannot be read.
 #[derive(Debug, Error)]
 enum ElementFault {
-    #[error("elements nest more than {0} deep")]
-    Depth(usize),
     #[error("there are more than {0} elements")]
     Number(usize),
     #[error(transparent)]
-    Attribute(#[from] AttrError),
-    #[error(transparent)]
-    Value(#[from] quick_xml::Error),
+    Attribute(#[from] XmlAttributeFault),
 }
 
-impl Building {
-    fn open(&mut self, start: &BytesStart<'_>, line: usize) -> Result<(), ElementFault> {
-        if self.open.len() >= MAX_DEPTH {
-            return Err(ElementFault::Depth(MAX_DEPTH));
-        }
+impl XmlVisitor for Building {
+    type Fault = ElementFault;
+
+    fn open(&mut self, element: &XmlElement<'_>) -> Result<(), ElementFault> {
         self.elements += 1;
         if self.elements > MAX_ELEMENTS {
             return Err(ElementFault::Number(MAX_ELEMENTS));
         }
         let text = |name: &str| -> Result<String, ElementFault> {
-            let Some(attribute) = start.try_get_attribute(name)? else {
-                return Ok(String::new());
-            };
-            let value = attribute.normalized_value(XmlVersion::Implicit1_0)?;
-            Ok(value.into_owned())
+            Ok(element.attribute(name)?.unwrap_or_default())
         };
-        let tag = start.local_name().into_inner();
+        let tag = element.name();
         let part = match tag {
             "CAEXFile" | "InstanceHierarchy" | "InternalElement" | "ExternalInterface" => {
                 let mut path = text("RefBaseSystemUnitPath")?;
@@ -205,7 +161,7 @@ impl Building {
                     name: text("Name")?,
                     id: text("ID")?,
                     path,
-                    line,
+                    line: element.line(),
                     is_interface: tag == "ExternalInterface",
                     ..CaexElement::default()
                 })
@@ -228,11 +184,23 @@ impl Building {
         Ok(())
     }
 
-    fn close(&mut self) {
-        // The reader has checked that each end has a start.
-        let Some(part) = self.open.pop() else {
-            return;
-        };
+    fn text(&mut self, text: &str) {
+        if let [.., CaexPart::Attribute(attribute), CaexPart::Value] = &mut *self.open {
+            attribute.value.push_str(text);
+        }
+    }
+
+    fn close(&mut self) -> Result<ControlFlow<()>, ElementFault> {
+        if let Some(part) = self.open.pop() {
+            self.add(part);
+        }
+        Ok(ControlFlow::Continue(()))
+    }
+}
+
+impl Building {
+    /// Adds a complete part to the element around it.
+    fn add(&mut self, part: CaexPart) {
         let parent = self.open.iter_mut().rev().find_map(|part| match part {
             CaexPart::Element(element) => Some(element),
             CaexPart::Attribute(_) | CaexPart::Value | CaexPart::Other => None,
@@ -244,54 +212,6 @@ impl Building {
             (CaexPart::Attribute(_), None) | (CaexPart::Value | CaexPart::Other, _) => {}
         }
     }
-
-    fn text(&mut self, text: &str) {
-        if let [.., CaexPart::Attribute(attribute), CaexPart::Value] = &mut *self.open {
-            attribute.value.push_str(text);
-        }
-    }
-
-    /// Returns the root element if it is complete.
-    fn root(self) -> Option<CaexElement> {
-        self.root.filter(|_| self.open.is_empty())
-    }
-}
-
-/// Counts the lines of ascending positions, each byte once.
-struct Lines<'f> {
-    rest: &'f [u8],
-    position: u64,
-    line: usize,
-}
-
-impl<'f> Lines<'f> {
-    fn new(file: &'f str) -> Self {
-        Self {
-            rest: file.as_bytes(),
-            position: 0,
-            line: 1,
-        }
-    }
-
-    fn at(&mut self, position: u64) -> usize {
-        let passed = usize::try_from(position.saturating_sub(self.position)).unwrap_or(usize::MAX);
-        let (before, rest) = self
-            .rest
-            .split_at_checked(passed)
-            .unwrap_or((self.rest, &[]));
-        self.line += before.iter().filter(|byte| **byte == b'\n').count();
-        self.rest = rest;
-        self.position = position;
-        self.line
-    }
-}
-
-fn line(file: &str, position: u64) -> usize {
-    let position = usize::try_from(position)
-        .unwrap_or(usize::MAX)
-        .min(file.len());
-    let before = file.as_bytes().get(..position).unwrap_or_default();
-    before.iter().filter(|byte| **byte == b'\n').count() + 1
 }
 
 /// The type of attributes of CAEX 3.0 that have the ID of an element as their value.

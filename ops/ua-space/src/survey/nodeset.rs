@@ -1,15 +1,10 @@
 //! Reads the variables of a NodeSet, an XML file by `UANodeSet.xsd` (OPC 10000-6, F).
-//!
-//! The file is not trusted: a document type is refused, so no entity is ever expanded, and sizes
-//! are bounded.
 
 use std::collections::{HashMap, HashSet};
 use std::path::Path;
 
 use mappings::{Identifier, NodeIdText};
-use quick_xml::XmlVersion;
-use quick_xml::events::{BytesStart, Event};
-use quick_xml::reader::Reader;
+use nodeset_files::{MAX_FILE, NodeSetDocument, NodeSetFileFault, NodeSetFileNode};
 use uadp::BuiltinType;
 
 use super::data_types::{self, STRUCTURE};
@@ -18,55 +13,46 @@ use crate::exit::CommandFailure;
 
 /// Reads the variables of a NodeSet file.
 pub(crate) fn survey(file: &str) -> Result<SurveyedNodes, CommandFailure> {
-    let bytes = type_files::read_bounded(Path::new(file), LARGEST)
+    let largest = u64::try_from(MAX_FILE).unwrap_or(u64::MAX);
+    let bytes = type_files::read_bounded(Path::new(file), largest)
         .map_err(|why| CommandFailure::Io(format!("cannot read {file}: {why}")))?;
     let xml =
         xml_text::decode(&bytes).map_err(|why| CommandFailure::Data(format!("{file}: {why}")))?;
-    parse(&xml, file).map_err(|fault| {
-        let line = xml.get(..fault.at).unwrap_or(&xml).matches('\n').count() + 1;
-        CommandFailure::Data(format!("{file}:{line}: {}", fault.what))
-    })
-}
-
-/// The fault of a NodeSet, with its byte offset.
-#[derive(Debug)]
-struct SurveyFault {
-    at: usize,
-    what: UnreadNodeSet,
+    parse(&xml, file).map_err(|fault| CommandFailure::Data(fault.located(file)))
 }
 
 /// The reason why the variables of a NodeSet are not read.
 #[derive(Debug, thiserror::Error)]
-enum UnreadNodeSet {
-    /// The file is malformed.
-    #[error("this is not XML: {0}")]
-    Xml(quick_xml::Error),
-    /// An attribute of an element is malformed.
-    #[error("in <{element}>: {why}")]
-    Attribute {
-        /// The local name of the element.
-        element: String,
-        /// The reason.
-        why: String,
+enum SurveyFault {
+    /// The file is not read.
+    #[error(transparent)]
+    File(#[from] NodeSetFileFault),
+    /// A node of the file is not usable.
+    #[error("line {line}: {fault}")]
+    Node {
+        /// The line of the node, from 1.
+        line: usize,
+        /// The fault.
+        fault: UnusableNode,
     },
-    /// An entity is not predefined.
-    #[error("an entity that XML does not have")]
-    Entity,
-    /// The file has a document type, which may define entities.
-    #[error("a NodeSet has no document type; remove the `<!DOCTYPE ..>`")]
-    DocumentType,
-    /// The file has no elements.
-    #[error("there is no <UANodeSet> in it")]
-    Empty,
-    /// The file has another root element.
-    #[error("this is a <{0}>, no <UANodeSet>")]
-    Root(String),
-    /// The end of the file is missing.
-    #[error("the file ends in the middle")]
-    Cut,
-    /// Elements are nested too deeply.
-    #[error("elements are nested deeper than {DEEPEST}")]
-    TooDeep,
+}
+
+impl SurveyFault {
+    /// Returns the fault with its location in the file.
+    fn located(&self, file: &str) -> String {
+        match self {
+            Self::File(NodeSetFileFault::Document { line, fault }) => {
+                format!("{file}:{line}: {fault}")
+            }
+            Self::File(fault) => format!("{file}: {fault}"),
+            Self::Node { line, fault } => format!("{file}:{line}: {fault}"),
+        }
+    }
+}
+
+/// The reason why a node is not usable.
+#[derive(Debug, thiserror::Error)]
+enum UnusableNode {
     /// The file has too many variables.
     #[error("more than {MOST} variables are not read")]
     TooMany,
@@ -85,55 +71,30 @@ enum UnreadNodeSet {
 }
 
 fn parse(xml: &str, place: &str) -> Result<SurveyedNodes, SurveyFault> {
-    let mut reader = Reader::from_str(xml.trim_start_matches('\u{feff}'));
-    reader.config_mut().expand_empty_elements = true;
-    reader.config_mut().trim_text(true);
-    let mut set = NodeSet::default();
-    loop {
-        let at = usize::try_from(reader.buffer_position()).unwrap_or(usize::MAX);
-        let fault = |what: UnreadNodeSet| SurveyFault { at, what };
-        let event = reader.read_event();
-        match event.map_err(|error| fault(UnreadNodeSet::Xml(error)))? {
-            Event::Start(element) => set.open(&element).map_err(fault)?,
-            Event::End(_) => set.close().map_err(fault)?,
-            Event::Text(text) => set.text.push_str(&text.xml10_content()),
-            Event::CData(text) => set.text.push_str(&text.xml10_content()),
-            Event::GeneralRef(entity) => {
-                let found = entity.resolve_char_ref().ok().flatten();
-                let known = quick_xml::escape::resolve_predefined_entity(&entity.xml10_content());
-                match (found, known) {
-                    (Some(char), _) => set.text.push(char),
-                    (None, Some(text)) => set.text.push_str(text),
-                    (None, None) => return Err(fault(UnreadNodeSet::Entity)),
-                }
-            }
-            Event::DocType(_) => return Err(fault(UnreadNodeSet::DocumentType)),
-            Event::Eof if !set.seen => return Err(fault(UnreadNodeSet::Empty)),
-            Event::Eof if !set.path.is_empty() => return Err(fault(UnreadNodeSet::Cut)),
-            Event::Eof => break,
-            // An empty element is reported as its start and its end.
-            Event::Empty(_) | Event::Comment(_) | Event::Decl(_) | Event::PI(_) => {}
-        }
+    let document = NodeSetDocument::read(xml)?;
+    let mut set = NodeSet::new(&document);
+    for node in &document.nodes {
+        let line = node.line;
+        set.add(node)
+            .map_err(|fault| SurveyFault::Node { line, fault })?;
     }
-    set.nodes(place).map_err(|what| SurveyFault {
-        at: xml.len(),
-        what,
+    let variables = set.values()?;
+    let mut namespaces = vec!["http://opcfoundation.org/UA/".to_owned()];
+    namespaces.extend(document.namespaces.iter().cloned());
+    Ok(SurveyedNodes {
+        place: format!("NodeSet {place}"),
+        server: None,
+        namespaces,
+        variables,
+        methods: Vec::new(),
     })
 }
 
-/// The parts of the NodeSet read so far.
-#[derive(Default)]
-struct NodeSet {
-    seen: bool,
-    /// Local names of the open elements.
-    path: Vec<String>,
-    text: String,
-    attributes: HashMap<String, String>,
-    uris: Vec<String>,
-    aliases: HashMap<String, String>,
-    node: Option<NodeSetEntry>,
-    variables: Vec<(NodeIdText, NodeSetEntry)>,
-    objects: HashMap<NodeIdText, NodeSetEntry>,
+/// The nodes of a document by their meaning.
+struct NodeSet<'d> {
+    document: &'d NodeSetDocument,
+    variables: Vec<NodeSetEntry<'d>>,
+    objects: HashMap<NodeIdText, NodeSetEntry<'d>>,
     /// Types and Methods; nodes below them are declarations, not values.
     types: HashSet<NodeIdText>,
     /// Supertypes of DataTypes.
@@ -141,168 +102,109 @@ struct NodeSet {
     properties: HashSet<NodeIdText>,
 }
 
-/// A node with its attributes and references.
-#[derive(Clone, Debug, Default)]
-struct NodeSetEntry {
-    attributes: HashMap<String, String>,
+/// A node, and its parent as written.
+struct NodeSetEntry<'d> {
+    id: NodeIdText,
+    node: &'d NodeSetFileNode,
     parent: Option<String>,
-    references: Vec<(String, bool, String)>,
 }
 
-impl NodeSet {
-    fn open(&mut self, element: &BytesStart<'_>) -> Result<(), UnreadNodeSet> {
-        let name = element.local_name().into_inner().to_owned();
-        self.text.clear();
-        self.attributes.clear();
-        for attribute in element.attributes() {
-            let wrong = |why: String| UnreadNodeSet::Attribute {
-                element: name.clone(),
-                why,
-            };
-            let attribute = attribute.map_err(|error| wrong(error.to_string()))?;
-            let value = attribute
-                .normalized_value(XmlVersion::Implicit1_0)
-                .map_err(|error| wrong(error.to_string()))?;
-            let key = attribute.key.local_name().into_inner().to_owned();
-            self.attributes.insert(key, value.into_owned());
+impl<'d> NodeSet<'d> {
+    fn new(document: &'d NodeSetDocument) -> Self {
+        Self {
+            document,
+            variables: Vec::new(),
+            objects: HashMap::new(),
+            types: HashSet::new(),
+            supertypes: HashMap::new(),
+            properties: HashSet::new(),
         }
-        match self.path.len() {
-            0 if name != "UANodeSet" => {
-                return Err(UnreadNodeSet::Root(name));
-            }
-            0 => self.seen = true,
-            1 if name.starts_with("UA") => {
-                self.node = Some(NodeSetEntry {
-                    parent: self.attributes.get("ParentNodeId").cloned(),
-                    attributes: std::mem::take(&mut self.attributes),
-                    references: Vec::new(),
-                });
-            }
-            DEEPEST.. => return Err(UnreadNodeSet::TooDeep),
-            _ => {}
-        }
-        self.path.push(name);
-        Ok(())
     }
 
-    fn close(&mut self) -> Result<(), UnreadNodeSet> {
-        let path: Vec<&str> = self.path.iter().map(String::as_str).collect();
-        let text = self.text.trim().to_owned();
-        match path.as_slice() {
-            [_, "NamespaceUris", "Uri"] => self.uris.push(text),
-            [_, "Aliases", "Alias"] => {
-                if let Some(alias) = self.attributes.remove("Alias") {
-                    self.aliases.insert(alias, text);
-                }
-            }
-            [_, _, "References", "Reference"] => {
-                let kind = self.attributes.remove("ReferenceType").unwrap_or_default();
-                let forward = self
-                    .attributes
-                    .get("IsForward")
-                    .is_none_or(|it| it != "false");
-                if let Some(node) = &mut self.node {
-                    node.references.push((kind, forward, text));
-                }
-            }
-            [_, kind] => {
-                let kind = (*kind).to_owned();
-                if let Some(node) = self.node.take() {
-                    self.keep(&kind, node)?;
-                }
-            }
-            _ => {}
-        }
-        self.text.clear();
-        self.path.pop();
-        Ok(())
-    }
-
-    fn keep(&mut self, kind: &str, mut node: NodeSetEntry) -> Result<(), UnreadNodeSet> {
-        let text = node.attributes.get("NodeId").map(String::as_str);
-        let id = self.resolve(text.unwrap_or_default())?;
-        let references = std::mem::take(&mut node.references);
-        let mut kept = Vec::new();
-        for (reference, forward, target) in references {
-            let reference = self.resolve(&reference)?;
-            let target = self.resolve(&target)?;
+    fn add(&mut self, node: &'d NodeSetFileNode) -> Result<(), UnusableNode> {
+        let id = self.resolve(&node.id)?;
+        let mut parents = Vec::new();
+        for one in &node.references {
+            let reference = self.resolve(&one.reference_type)?;
+            let target = self.resolve(&one.target)?;
             let Identifier::Numeric(number) = reference.identifier else {
                 continue;
             };
-            match (reference.namespace, number, forward) {
+            match (reference.namespace, number, one.is_forward) {
                 (0, HAS_PROPERTY, true) => self.properties.extend([target]),
                 (0, HAS_PROPERTY, false) => self.properties.extend([id.clone()]),
                 (0, HAS_SUBTYPE, false) => self.supertypes.extend([(id.clone(), target)]),
                 (0, HAS_MODELLING_RULE, true) => self.types.extend([id.clone()]),
-                (0, ORGANIZES | HAS_COMPONENT, false) => kept.push(target),
+                (0, ORGANIZES | HAS_COMPONENT, false) => parents.push(target),
                 _ => {}
             }
         }
-        if node.parent.is_none() {
-            node.parent = kept.first().map(ToString::to_string);
-        }
-        match kind {
-            "UAVariable" if self.variables.len() >= MOST => {
-                return Err(UnreadNodeSet::TooMany);
-            }
-            "UAVariable" => self.variables.push((id, node)),
-            "UAObject" => self.objects.extend([(id, node)]),
-            "UAObjectType" | "UAVariableType" | "UAMethod" => self.types.extend([id]),
+        let parent = node.parent.clone();
+        let parent = parent.or_else(|| parents.first().map(ToString::to_string));
+        let entry = NodeSetEntry { id, node, parent };
+        match node.class.as_str() {
+            "Variable" if self.variables.len() >= MOST => return Err(UnusableNode::TooMany),
+            "Variable" => self.variables.push(entry),
+            "Object" => self.objects.extend([(entry.id.clone(), entry)]),
+            "ObjectType" | "VariableType" | "Method" => self.types.extend([entry.id]),
             _ => {}
         }
         Ok(())
     }
 
     /// Parses a node id, or resolves its alias.
-    fn resolve(&self, text: &str) -> Result<NodeIdText, UnreadNodeSet> {
-        let text = self.aliases.get(text).map_or(text, String::as_str);
+    fn resolve(&self, text: &str) -> Result<NodeIdText, UnusableNode> {
+        let text = self.document.resolved(text);
         text.parse().map_err(|_| {
             let shown: String = text.chars().take(64).collect();
-            UnreadNodeSet::NodeId(shown.escape_debug().to_string())
+            UnusableNode::NodeId(shown.escape_debug().to_string())
         })
     }
 
-    fn nodes(self, place: &str) -> Result<SurveyedNodes, UnreadNodeSet> {
-        let variables: HashSet<&NodeIdText> = self.variables.iter().map(|(id, _)| id).collect();
+    /// Returns the variables with values, without properties and declarations.
+    fn values(&self) -> Result<Vec<UaVariable>, SurveyFault> {
+        let ids: HashSet<&NodeIdText> = self.variables.iter().map(|entry| &entry.id).collect();
         let mut found = Vec::new();
-        for (id, node) in &self.variables {
-            if id.namespace == 0 || self.properties.contains(id) || self.types.contains(id) {
-                continue;
-            }
-            if usize::from(id.namespace) > self.uris.len() {
-                return Err(UnreadNodeSet::Namespace { id: id.clone() });
-            }
-            let parent = match &node.parent {
-                Some(text) => Some(self.resolve(text)?),
-                None => None,
-            };
-            if parent.as_ref().is_some_and(|id| variables.contains(id))
-                || self.is_declaration(parent.clone())?
-            {
-                continue;
-            }
-            let within = parent.and_then(|parent| self.objects.get(&parent));
-            found.push(UaVariable {
-                source: None,
-                node: id.clone(),
-                name: browse_name(node),
-                within: within.map(browse_name).unwrap_or_default(),
-                value: self.value(node)?,
-            });
+        for entry in &self.variables {
+            let line = entry.node.line;
+            let variable = self.variable(entry, &ids);
+            found.extend(variable.map_err(|fault| SurveyFault::Node { line, fault })?);
         }
-        let mut namespaces = vec!["http://opcfoundation.org/UA/".to_owned()];
-        namespaces.extend(self.uris);
-        Ok(SurveyedNodes {
-            place: format!("NodeSet {place}"),
-            server: None,
-            namespaces,
-            variables: found,
-            methods: Vec::new(),
-        })
+        Ok(found)
+    }
+
+    fn variable(
+        &self,
+        entry: &NodeSetEntry<'_>,
+        variables: &HashSet<&NodeIdText>,
+    ) -> Result<Option<UaVariable>, UnusableNode> {
+        let NodeSetEntry { id, node, parent } = entry;
+        if id.namespace == 0 || self.properties.contains(id) || self.types.contains(id) {
+            return Ok(None);
+        }
+        if usize::from(id.namespace) > self.document.namespaces.len() {
+            return Err(UnusableNode::Namespace { id: id.clone() });
+        }
+        let parent = parent.as_deref().map(|text| self.resolve(text));
+        let parent = parent.transpose()?;
+        if parent.as_ref().is_some_and(|id| variables.contains(id))
+            || self.is_declaration(parent.clone())?
+        {
+            return Ok(None);
+        }
+        let within = parent.and_then(|parent| self.objects.get(&parent));
+        let within = within.map(|object| object.node.plain_browse_name());
+        Ok(Some(UaVariable {
+            source: None,
+            node: id.clone(),
+            name: node.plain_browse_name().to_owned(),
+            within: within.unwrap_or_default().to_owned(),
+            value: self.value(node)?,
+        }))
     }
 
     /// Returns true if the chain of parent objects ends at a type or Method.
-    fn is_declaration(&self, mut parent: Option<NodeIdText>) -> Result<bool, UnreadNodeSet> {
+    fn is_declaration(&self, mut parent: Option<NodeIdText>) -> Result<bool, UnusableNode> {
         for _ in 0..DEEPEST {
             let Some(id) = parent else { return Ok(false) };
             if self.types.contains(&id) {
@@ -311,22 +213,18 @@ impl NodeSet {
             let above = self
                 .objects
                 .get(&id)
-                .and_then(|node| node.parent.as_deref());
+                .and_then(|object| object.parent.as_deref());
             parent = above.map(|text| self.resolve(text)).transpose()?;
         }
         Ok(false)
     }
 
-    fn value(&self, node: &NodeSetEntry) -> Result<Option<(BuiltinType, bool)>, UnreadNodeSet> {
+    fn value(&self, node: &NodeSetFileNode) -> Result<Option<(BuiltinType, bool)>, UnusableNode> {
         // The defaults are BaseDataType and a scalar (UANodeSet.xsd).
-        let rank = node.attributes.get("ValueRank");
-        let rank = rank
-            .map_or(Ok(-1), |text| text.trim().parse())
-            .map_err(|_| {
-                let id = node.attributes.get("NodeId").map_or("", String::as_str);
-                UnreadNodeSet::ValueRank(id.to_owned())
-            })?;
-        let Some(text) = node.attributes.get("DataType") else {
+        let rank = node.value_rank.as_deref();
+        let rank = rank.map_or(Ok(-1), |text| text.trim().parse());
+        let rank = rank.map_err(|_| UnusableNode::ValueRank(node.id.clone()))?;
+        let Some(text) = &node.data_type else {
             return Ok(None);
         };
         let mut id = self.resolve(text)?;
@@ -351,18 +249,7 @@ impl NodeSet {
     }
 }
 
-/// Returns the BrowseName without its namespace index.
-fn browse_name(node: &NodeSetEntry) -> String {
-    let text = node.attributes.get("BrowseName").map_or("", String::as_str);
-    let name = text
-        .split_once(':')
-        .filter(|(index, _)| index.bytes().all(|b| b.is_ascii_digit()))
-        .map_or(text, |(_, name)| name);
-    name.to_owned()
-}
-
-/// Maximum size of a file in bytes, about five times the NodeSet of the standard.
-const LARGEST: u64 = 64 << 20;
+/// Largest number of parents of an object, and of supertypes of a DataType.
 const DEEPEST: usize = 64;
 /// ReferenceTypes of namespace 0.
 const ORGANIZES: u32 = 35;
@@ -441,7 +328,7 @@ mod tests {
 
     #[test]
     fn what_is_no_node_set_is_refused_with_the_reason() {
-        let refused = |xml: &str| parse(xml, "x").unwrap_err().what.to_string();
+        let refused = |xml: &str| parse(xml, "x").unwrap_err().to_string();
         assert!(refused("").contains("no <UANodeSet>"));
         assert!(refused("<html/>").contains("this is a <html>"));
         assert!(refused("<UANodeSet>").contains("ends in the middle"));

@@ -4,10 +4,9 @@
 //! Their values are attributes or child elements. A value that equals its default is not written.
 
 use std::collections::HashMap;
+use std::ops::ControlFlow;
 
-use quick_xml::XmlVersion;
-use quick_xml::events::{BytesStart, Event};
-use quick_xml::reader::Reader;
+use xml_text::{XmlElement, XmlVisitor, walk};
 
 use super::{Applied, DEEPEST, Element, ElementKind, Finding, MOST_ELEMENTS, Tag, shown};
 
@@ -22,66 +21,13 @@ pub(super) fn elements(xml: &str) -> Result<(Vec<Element>, Vec<Finding>), Findin
             format!("an element has more than {MOST_ATTRIBUTES} attributes"),
         ));
     }
-    let mut reader = Reader::from_str(xml);
-    reader.config_mut().expand_empty_elements = true;
-    reader.config_mut().trim_text(true);
     let mut document = Document::default();
-    let mut lines = Lines::default();
-    loop {
-        let at = usize::try_from(reader.buffer_position()).unwrap_or(usize::MAX);
-        let line = lines.at(xml, at);
-        let fault = |what: String| Finding::new(line, what);
-        let event = reader.read_event();
-        match event.map_err(|error| fault(format!("this is not XML: {error}")))? {
-            Event::Start(element) => document.open(&element, line).map_err(fault)?,
-            Event::End(_) => document.close(),
-            Event::Text(text) => document.text.push_str(&text.xml10_content()),
-            Event::CData(text) => document.text.push_str(&text.xml10_content()),
-            Event::GeneralRef(entity) => {
-                let found = entity.resolve_char_ref().ok().flatten();
-                let known = quick_xml::escape::resolve_predefined_entity(&entity.xml10_content());
-                match (found, known) {
-                    (Some(char), _) => document.text.push(char),
-                    (None, Some(text)) => document.text.push_str(text),
-                    (None, None) => return Err(fault("an entity that XML does not have".into())),
-                }
-            }
-            Event::DocType(_) => {
-                return Err(fault(
-                    "a model has no document type; remove the `<!DOCTYPE ..>`".to_owned(),
-                ));
-            }
-            Event::Eof if !document.path.is_empty() => {
-                return Err(fault("the file ends in the middle".to_owned()));
-            }
-            Event::Eof => break,
-            // An empty element is reported as its start and its end.
-            Event::Empty(_) | Event::Comment(_) | Event::Decl(_) | Event::PI(_) => {}
-        }
-    }
+    let walked = walk(xml, DEEPEST, &mut document);
+    walked.map_err(|located| Finding::new(located.line, located.fault.to_string()))?;
     if document.nodes.is_empty() {
         return Err(Finding::new(1, "there is no `uml:Model` in the file"));
     }
     Ok(document.elements())
-}
-
-/// Counts the lines up to ascending offsets.
-#[derive(Default)]
-struct Lines {
-    at: usize,
-    before: usize,
-}
-
-impl Lines {
-    /// Returns the line, from 1, of the first character at or after `at` that is not a space.
-    fn at(&mut self, text: &str, at: usize) -> usize {
-        let rest = text.get(at..).unwrap_or_default();
-        let at = at + (rest.len() - rest.trim_start().len());
-        let passed = text.get(self.at..at).unwrap_or_default();
-        self.before += passed.matches('\n').count();
-        self.at = at.max(self.at);
-        self.before + 1
-    }
 }
 
 #[derive(Default)]
@@ -130,22 +76,16 @@ struct Application {
     elsewhere: Option<String>,
 }
 
-impl Document {
-    fn open(&mut self, element: &BytesStart<'_>, line: usize) -> Result<(), String> {
-        let local = element.local_name().into_inner().to_owned();
-        let is_uml = element.name().into_inner().starts_with("uml:");
+impl XmlVisitor for Document {
+    type Fault = String;
+
+    fn open(&mut self, element: &XmlElement<'_>) -> Result<(), String> {
+        let local = element.name().to_owned();
+        let line = element.line();
+        let is_uml = element.qualified_name().starts_with("uml:");
         self.text.clear();
-        let mut attributes = Vec::new();
-        for attribute in element.attributes() {
-            let attribute = attribute.map_err(|error| format!("in <{local}>: {error}"))?;
-            let value = attribute
-                .normalized_value(XmlVersion::Implicit1_0)
-                .map_err(|error| format!("in <{local}>: {error}"))?;
-            attributes.push((attribute.key.into_inner().to_owned(), value.into_owned()));
-        }
-        if self.path.len() >= DEEPEST {
-            return Err(format!("elements are nested deeper than {DEEPEST}"));
-        }
+        let attributes = element.attributes();
+        let attributes = attributes.map_err(|fault| fault.to_string())?;
         let open = match self.path.last() {
             None if local == "XMI" => OpenElement::Xmi,
             None | Some(OpenElement::Xmi) if is_uml => self.node(local, attributes, line)?,
@@ -167,7 +107,11 @@ impl Document {
         Ok(())
     }
 
-    fn close(&mut self) {
+    fn text(&mut self, text: &str) {
+        self.text.push_str(text);
+    }
+
+    fn close(&mut self) -> Result<ControlFlow<()>, String> {
         let text = self.text.trim().to_owned();
         self.text.clear();
         if let Some(OpenElement::Tag(at, name, line)) = self.path.pop()
@@ -176,8 +120,11 @@ impl Document {
             let value = text;
             application.applied.tags.push(Tag { name, value, line });
         }
+        Ok(ControlFlow::Continue(()))
     }
+}
 
+impl Document {
     /// Returns the nearest element of the model around the open XML element.
     fn owner(&self) -> Option<usize> {
         self.path.iter().rev().find_map(|open| match open {
