@@ -8,7 +8,7 @@ use opcua::nodes::{NodeType, ObjectBuilder, VariableBuilder};
 use opcua::server::address_space::{AccessLevel, AddressSpace};
 use opcua::types::{LocalizedText, NodeId, ObjectId, QualifiedName, VariableTypeId};
 
-use crate::layout::{Layout, TopicNode, VariableShape};
+use crate::layout::{APPLICATION, Layout, TopicNode, VariableShape};
 use crate::properties;
 
 /// Adds a variable without a value under `folder` for each node of a topic.
@@ -203,15 +203,7 @@ pub(crate) fn program(action: TopicId, path: &str) -> NodeId {
     NodeId::new(APPLICATION, format!("{action}.program{dot}{path}"))
 }
 
-/// Returns the node of a topic that the mapping does not name.
-pub(crate) fn unmapped_node(topic: TopicId) -> NodeId {
-    NodeId::new(APPLICATION, topic.to_string())
-}
-
 /// Returns the node of a call that the mapping does not name. A value may have the same name.
 pub(crate) fn unmapped_call(topic: TopicId) -> NodeId {
     NodeId::new(APPLICATION, format!("{topic}.call"))
 }
-
-/// The namespace index of the application's own URI.
-const APPLICATION: u16 = 1;

@@ -8,7 +8,6 @@ use messages::{ArrayRank, Leaf};
 use opcua::types::{ByteString, DataTypeId, Identifier, NodeId, Variant, VariantTypeId};
 use uadp::BuiltinType;
 
-use crate::address::unmapped_node;
 use crate::structures::{MappedTypes, Structure, VariableStructures};
 
 /// The nodes of the mapped topics and their namespaces.
@@ -473,8 +472,15 @@ impl VariableShape {
     }
 }
 
+/// Returns the node of a topic that the mapping does not name.
+pub(crate) fn unmapped_node(topic: TopicId) -> NodeId {
+    NodeId::new(APPLICATION, topic.to_string())
+}
+
 /// Largest number of folders around a variable, plus its own name.
 const MOST_PARTS: usize = 9;
+/// The namespace index of the application's own URI.
+pub(crate) const APPLICATION: u16 = 1;
 pub(crate) const OPC_UA_URI: &str = "http://opcfoundation.org/UA/";
 /// Limit of namespace indexes. A higher index in a mapping is a typing error.
 const MOST_NAMESPACES: u16 = 1_000;

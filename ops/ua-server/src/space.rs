@@ -13,11 +13,11 @@ use uadp::{Fields, Scalar, Timestamp};
 
 use crate::address;
 use crate::changes;
-use crate::layout::{Layout, TopicNode, VariableShape};
+use crate::layout::{Layout, TopicNode, VariableShape, unmapped_node};
 use crate::nodes::SpaceManager;
+use crate::staleness::{StaleValues, Staleness};
 use crate::structures::Structure;
 use crate::values::{self, SampleStamp, ShownValue};
-use crate::staleness::{StaleValues, Staleness};
 
 /// Writes values of the space to the address space.
 pub(crate) struct SpaceWriter {
@@ -357,7 +357,7 @@ impl SpaceWriter {
         let name = topic.to_string();
         let node = TopicNode::new(
             topic,
-            address::unmapped_node(topic),
+            unmapped_node(topic),
             name.clone(),
             vec![(name, shape_of(block))],
         );
