@@ -293,6 +293,29 @@ impl Mapping {
             (service.space == space).then_some((v, service))
         })
     }
+
+    /// Returns the SecurityGroups, in the order of the document. Without groups, all messages are
+    /// sent in clear.
+    #[must_use]
+    pub fn security(&self) -> &[SecurityGroup] {
+        &self.security
+    }
+
+    /// Returns the mapping with other SecurityGroups.
+    #[must_use]
+    pub fn with_security(mut self, groups: Vec<SecurityGroup>) -> Self {
+        self.security = groups;
+        self
+    }
+
+    /// Returns the group of a namespace, secured or not.
+    #[must_use]
+    pub fn group_of(&self, namespace: u16) -> Option<&SecurityGroup> {
+        let named = |group: &&SecurityGroup| group.namespaces.contains(&namespace);
+        let rest = |group: &&SecurityGroup| group.namespaces.is_empty();
+        let found = self.security.iter().find(named);
+        found.or_else(|| self.security.iter().find(rest))
+    }
 }
 
 /// A ROS service tied to a variable.

@@ -4,7 +4,6 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use crate::endpoint::Endpoint;
-use crate::mapping::Mapping;
 
 /// SecurityGroup (OPC 10000-14, 8.2): the programs that have its keys.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -91,30 +90,5 @@ impl GroupMode {
             Self::Sign => "sign",
             Self::SignAndEncrypt => "sign-and-encrypt",
         }
-    }
-}
-
-impl Mapping {
-    /// Returns the SecurityGroups, in the order of the document. Without groups, all messages are
-    /// sent in clear.
-    #[must_use]
-    pub fn security(&self) -> &[SecurityGroup] {
-        &self.security
-    }
-
-    /// Returns the mapping with other SecurityGroups.
-    #[must_use]
-    pub fn with_security(mut self, groups: Vec<SecurityGroup>) -> Self {
-        self.security = groups;
-        self
-    }
-
-    /// Returns the group of a namespace, secured or not.
-    #[must_use]
-    pub fn group_of(&self, namespace: u16) -> Option<&SecurityGroup> {
-        let named = |group: &&SecurityGroup| group.namespaces.contains(&namespace);
-        let rest = |group: &&SecurityGroup| group.namespaces.is_empty();
-        let found = self.security.iter().find(named);
-        found.or_else(|| self.security.iter().find(rest))
     }
 }
