@@ -27,6 +27,7 @@ use ros2_node::security::RequestedSecurity;
 use tracing::{info, warn};
 use transport::{Interface, InterfaceError};
 
+use crate::NAME;
 use crate::ros_args::{RosArgs, usage};
 use crate::{Ros2Port, Ros2PortOptions, environment};
 
@@ -463,8 +464,6 @@ fn gid_length(text: &str) -> Result<GidChoice, &'static str> {
 /// The first number that is proposed for the space of another domain. Lower numbers are kept for
 /// domains of the same number.
 const FIRST_FREE: u16 = 40;
-/// The name of the program.
-pub(crate) const NAME: &str = "bridge-ros2";
 /// The name of the bridge in `ros2 node list`.
 const NODE_NAME: &str = "ua_bridge_ros2";
 

@@ -13,3 +13,6 @@ mod sink;
 mod source;
 
 pub use port::{Ros2Port, Ros2PortOptions};
+
+/// The name of the program.
+pub(crate) const NAME: &str = "bridge-ros2";

@@ -58,9 +58,9 @@ use self::schedule::Schedule;
 use self::side::Ros2Side;
 use self::sinks::WrittenTopics;
 use self::sources::ReadTopics;
+use crate::NAME;
 use crate::definitions::Ros2Definitions;
 use crate::descriptors::Descriptors;
-use crate::entry::NAME;
 
 /// The options with which a [`Ros2Port`] starts.
 #[derive(Debug, Clone)]

@@ -7,6 +7,7 @@ use serde::Serialize;
 
 use super::fact::{CanRunAnswer, PlugComponent, Ros, VisibilityLevel};
 use super::story::{Grasp, LOST_FROM, PlugStory};
+use crate::clock::millis;
 use crate::pace::Speed;
 
 /// The outcome, as printed by `--json`. Times are in milliseconds; `null` for events that have not
@@ -247,16 +248,6 @@ fn shown(ms: Option<f64>) -> String {
             }
         },
     )
-}
-
-/// Converts nanoseconds to milliseconds with three decimal places.
-pub(crate) fn millis(nanos: i64) -> f64 {
-    #[expect(
-        clippy::cast_precision_loss,
-        reason = "a story lasts far less than 2^53 ns"
-    )]
-    let nanos = nanos as f64;
-    (nanos / 1e3).round() / 1e3
 }
 
 #[cfg(test)]

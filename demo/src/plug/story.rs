@@ -5,7 +5,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use super::fact::{CanRunAnswer, Fact, MesRun, NodeEvent, PlugComponent, Ros, VisibilityLevel};
 use super::pages::nanos;
-use super::report::millis;
+use crate::clock::millis;
 
 /// An act of the scenario, in order.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
