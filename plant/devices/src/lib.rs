@@ -8,6 +8,7 @@
 //! [`robotiq`], [`schmalz`], [`ur`], [`kelvin`] (which moves a robot), [`module`] (services of
 //! process modules), `sensors` (values without skills).
 
+mod addresses;
 #[cfg(test)]
 mod contact_tests;
 mod http;

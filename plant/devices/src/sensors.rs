@@ -8,8 +8,8 @@ use async_trait::async_trait;
 use skills::yaml::{DocumentNode, YamlFindingCode, YamlReader};
 use skills::{Builtin, Measured, SensorRead, SkillValue, ValueSensor, ValueShape};
 
+use crate::addresses::{read_address, read_alias, read_line, read_register, read_unit};
 use crate::http_skill;
-use crate::kinds::{read_address, read_alias, read_line, read_register, read_unit};
 use crate::line::ModbusLine;
 use crate::measuring::ticks;
 use crate::modbus::Modbus;
