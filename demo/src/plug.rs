@@ -37,7 +37,7 @@ use self::files::{ModuleManifest, PROCESS};
 use self::pages::{Dated, StatusPageKind};
 use self::story::{Act, ActStart, PlugStory};
 use self::watchers::Watchers;
-use crate::clock::wall_nanos;
+use crate::clock::{millis, wall_nanos};
 use crate::event::{ChildEvent, MasterEvent};
 use crate::line::DOMAIN;
 use crate::pace::Speed;
@@ -116,7 +116,7 @@ impl Show {
     /// Prints the lines that are due at a time, or all lines.
     fn print(&mut self, now_ns: Option<i64>) -> std::io::Result<()> {
         let began_at = self.began_at;
-        let seconds = |at_ns: i64| Some(report::millis(at_ns - began_at) / 1e3);
+        let seconds = |at_ns: i64| Some(millis(at_ns - began_at) / 1e3);
         match now_ns {
             Some(now_ns) => self.timeline.print_before(now_ns, &seconds),
             None => self.timeline.print_all(&seconds),
