@@ -210,7 +210,10 @@ impl PubSubNodes {
             } else {
                 NodesToAdd::All
             };
-            *inner = insert::all(mapping, layout, &mut address_space, wanted);
+            *inner = Inner {
+                content: Content::of(mapping, layout),
+                ..insert::all(mapping, layout, &mut address_space, wanted)
+            };
             inner.unseen = is_unseen.then(|| (Arc::clone(mapping), Arc::clone(layout)));
             inner.switched = switched;
         }

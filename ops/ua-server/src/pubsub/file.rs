@@ -10,7 +10,7 @@ use std::sync::Arc;
 use mappings::{Mapping, SpaceId, TopicId};
 use opcua::types::{
     BinaryEncodable as _, ContextOwned, DataSetFieldContentMask, DataSetReaderDataType,
-    DataSetWriterDataType, ExtensionObject, MethodId, NetworkAddressUrlDataType, NodeId, ObjectId,
+    DataSetWriterDataType, ExtensionObject, MethodId, NetworkAddressUrlDataType, NodeId,
     PubSubConfiguration2DataType, PubSubConnectionDataType, PublishedDataItemsDataType,
     PublishedDataSetDataType, ReaderGroupDataType, StatusCode, TargetVariablesDataType,
     UABinaryFileDataType, UAString, UadpDataSetMessageContentMask,
@@ -20,7 +20,7 @@ use opcua::types::{
 use plant_opcua::file::{FileAnswer, FileMethod, READ};
 use plant_opcua::server::{CoreMethod, MethodRequest, method};
 
-use super::insert::{self, DATA_SET_MESSAGE, NETWORK_MESSAGE};
+use super::insert::{self, DATA_SET_MESSAGE, FILE, NETWORK_MESSAGE};
 use super::{Kind, PubSubNodes};
 use crate::layout::{Layout, TopicNode};
 
@@ -232,7 +232,7 @@ impl PubSubNodes {
             let what = *what;
             let handler = method(move |request: MethodRequest| this.in_file(what, &request));
             let nodes: [NodeId; 2] = [(*own).into(), (*of_type).into()];
-            CoreMethod::new(OBJECT, nodes, name, handler)
+            CoreMethod::new(FILE, nodes, name, handler)
         });
         methods.collect()
     }
@@ -299,8 +299,6 @@ impl PubSubNodes {
     }
 }
 
-/// The file object.
-pub(super) const OBJECT: ObjectId = ObjectId::PublishSubscribe_PubSubConfiguration;
 /// The other modes of the file beside read: erase and write, and read and write (OPC 10000-14,
 /// 9.1.3.7.1).
 const MODES: [u8; 2] = [6, 3];

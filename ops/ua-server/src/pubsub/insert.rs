@@ -14,7 +14,6 @@ use opcua::types::{
 use tracing::warn;
 
 use super::counts::{Counter, Counts, LiveCounts, PubSubCounters};
-use super::file::{self, Content};
 use super::states::PubSubNodeState;
 use super::tree::{At, Tree};
 use super::{Ask, Inner, Kind, Part};
@@ -76,7 +75,6 @@ pub(super) fn all(
     let Insert { inner, tree, .. } = insert;
     Inner {
         made: tree.made,
-        content: Content::of(mapping, layout),
         ..inner
     }
 }
@@ -104,7 +102,7 @@ impl Insert<'_> {
 
     /// Adds the MimeType of the configuration file. The file object exists already.
     fn file(&mut self) {
-        let file = At::core(file::OBJECT, "PubSub.Configuration");
+        let file = At::core(FILE, "PubSub.Configuration");
         let mime = (DataTypeId::String, -1);
         self.tree.property("MimeType", mime, UA_BINARY, &file);
     }
@@ -557,6 +555,8 @@ pub(super) const DATA_SET_MESSAGE: u32 = 0b0010_1111;
 const VARIANT: u8 = 24;
 /// The MIME type of a file in the binary encoding (OPC 10000-5, 12.36).
 const UA_BINARY: &str = "application/opcua+uabinary";
+/// The file object.
+pub(super) const FILE: ObjectId = ObjectId::PublishSubscribe_PubSubConfiguration;
 /// Largest number of writers and readers that are shown, and largest number with counters.
 pub(super) const MOST_SHOWN: usize = 5_000;
 const MOST_DETAILED: usize = 500;
