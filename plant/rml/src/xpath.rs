@@ -13,8 +13,8 @@ mod tokens;
 use std::fmt;
 use std::sync::Arc;
 
-pub(crate) use evaluate::{EvaluationFault, Evaluator, NodeRef, WorkBudget};
-pub(crate) use fault::XPathSyntaxFault;
+pub(crate) use evaluate::{Evaluator, NodeRef, WorkBudget};
+pub(crate) use fault::{EvaluationFault, XPathSyntaxFault};
 pub(crate) use parse::parse;
 
 /// The namespaces of prefixes in expressions. Without any, names match in all namespaces.

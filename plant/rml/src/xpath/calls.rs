@@ -2,7 +2,8 @@
 
 use roxmltree::NodeId;
 
-use super::evaluate::{Evaluated, Evaluator, NodeRef, WorkBudget, XPathContext, XPathValue};
+use super::evaluate::{Evaluator, NodeRef, WorkBudget, XPathContext, XPathValue};
+use super::fault::Evaluated;
 use super::functions::{bounded, count, round, substring, to_number, translated};
 use super::{Expr, Function};
 

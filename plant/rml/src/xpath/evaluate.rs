@@ -6,6 +6,7 @@ use std::sync::Arc;
 
 use roxmltree::{Document, Node, NodeId};
 
+use super::fault::{Evaluated, EvaluationFault};
 use super::functions::{any_pair, bounded, count, holds, of_number, to_number};
 use super::{
     Axis, Comparison, Expr, Join, LocationPath, NamespaceTest, Operator, Start, StepTest, XPathStep,
@@ -17,27 +18,6 @@ pub(crate) struct NodeRef {
     pub(super) id: u32,
     /// 0 for the node itself, else the number of its attribute, from 1.
     pub(super) attribute: u32,
-}
-
-/// Reason for which an expression has no value.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-pub(crate) enum EvaluationFault {
-    #[error(
-        "the mapping reads more than {0} nodes and bytes; narrow its paths, for example `/a/b` \
-         instead of `//b`"
-    )]
-    Work(u64),
-    #[error("the iterator is no path")]
-    Iterator,
-    #[error("a path was expected, and not a text, number or truth value")]
-    NoPath,
-    #[error("a value has more than {0} bytes")]
-    Text(usize),
-    #[error(
-        "the prefix `{0}` is declared neither by rml:namespace of the reference formulation, nor \
-         by the root element of the file"
-    )]
-    Prefix(String),
 }
 
 /// The remaining work of a run: visited nodes, and bytes of text.
@@ -87,8 +67,6 @@ pub(crate) struct Evaluator<'a> {
     fixed: HashMap<Arc<str>, Nodes>,
     tables: HashMap<Arc<str>, Table>,
 }
-
-pub(crate) type Evaluated<T> = Result<T, EvaluationFault>;
 
 impl<'a> Evaluator<'a> {
     pub(crate) fn new(document: &'a Document<'a>) -> Self {

@@ -1,4 +1,27 @@
-//! The reasons why a text is no expression.
+//! The reasons why a text is no expression, and why an expression has no value.
+
+/// Reason for which an expression has no value.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub(crate) enum EvaluationFault {
+    #[error(
+        "the mapping reads more than {0} nodes and bytes; narrow its paths, for example `/a/b` \
+         instead of `//b`"
+    )]
+    Work(u64),
+    #[error("the iterator is no path")]
+    Iterator,
+    #[error("a path was expected, and not a text, number or truth value")]
+    NoPath,
+    #[error("a value has more than {0} bytes")]
+    Text(usize),
+    #[error(
+        "the prefix `{0}` is declared neither by rml:namespace of the reference formulation, nor \
+         by the root element of the file"
+    )]
+    Prefix(String),
+}
+
+pub(crate) type Evaluated<T> = Result<T, EvaluationFault>;
 
 /// Reason for which a text is no expression, with the position and the remedy.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]

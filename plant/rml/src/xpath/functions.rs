@@ -3,7 +3,7 @@
 use std::collections::{HashMap, HashSet};
 
 use super::Comparison;
-use super::evaluate::{Evaluated, EvaluationFault};
+use super::fault::{Evaluated, EvaluationFault};
 
 pub(super) fn holds<T: PartialOrd>(comparison: Comparison, a: &T, b: &T) -> bool {
     match comparison {
