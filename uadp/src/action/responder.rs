@@ -4,6 +4,7 @@ mod entry;
 mod over;
 mod refused;
 mod settings;
+mod space;
 
 use alloc::collections::{BTreeMap, BTreeSet};
 use core::hash::{Hash, Hasher};
@@ -24,6 +25,7 @@ pub use settings::{
     ExecutionId, FinishRefusal, RequestDrop, RequestOrigin, RequiredAction, ResponderCounters,
     ResponderSettings,
 };
+use space::{RequestSpace, SpaceLeft};
 
 /// Responds to requests over a network that can lose, duplicate, delay and reorder messages
 /// (OPC 10000-14, 6.2.11.2.2).
@@ -111,10 +113,8 @@ pub struct Responder<P> {
     entries: BTreeMap<u64, RequestEntry<P>>,
     ids: BTreeMap<ActionRequestKey, u64>,
     timers: Timers,
-    /// Space used by each sender of each group.
-    usage: BTreeMap<RequestOrigin<P>, Usage>,
-    /// Space used by each group.
-    totals: BTreeMap<usize, Usage>,
+    /// The space that the entries use.
+    space: RequestSpace<P>,
     /// Finished requests of which only a hash is kept.
     over: Over<P>,
     /// Requests that were refused before space was allocated.
@@ -124,16 +124,6 @@ pub struct Responder<P> {
     /// Executions past their deadline that were not yet polled.
     overdue: BTreeSet<u64>,
     counters: ResponderCounters,
-}
-
-/// Used space.
-#[derive(Debug, Default)]
-struct Usage {
-    requests: usize,
-    bytes: usize,
-    executing: usize,
-    /// Closed requests, oldest first.
-    closed: BTreeSet<u64>,
 }
 
 impl<P: Ord + Clone> Responder<P> {
@@ -146,8 +136,7 @@ impl<P: Ord + Clone> Responder<P> {
             entries: BTreeMap::new(),
             ids: BTreeMap::new(),
             timers: Timers::new(),
-            usage: BTreeMap::new(),
-            totals: BTreeMap::new(),
+            space: RequestSpace::new(),
             over: Over::new(),
             refused: RefusedRequests::new(),
             answer: None,
@@ -343,10 +332,7 @@ impl<P: Ord + Clone> Responder<P> {
     #[must_use]
     pub fn held(&self) -> (usize, usize) {
         let (over, refused) = (self.over.len(), self.refused.len());
-        let totals = self.totals.values();
-        let (requests, bytes) = totals.fold((0, 0), |(requests, bytes), total| {
-            (requests + total.requests, bytes + total.bytes)
-        });
+        let (requests, bytes) = self.space.used();
         (
             requests + over + refused,
             bytes + (over + refused) * over::COST,
@@ -406,8 +392,8 @@ impl<P: Ord + Clone> Responder<P> {
     ) -> Result<RequiredAction, RequestDrop> {
         let cost = key.cost();
         self.make_room(&origin, cost)?;
-        let is_busy = self.is_busy(&origin);
         let settings = &self.settings;
+        let is_busy = self.space.is_busy(&origin, settings);
         let id = self.next;
         self.next += 1;
         let execution = ExecutionId(id);
@@ -433,14 +419,13 @@ impl<P: Ord + Clone> Responder<P> {
                 (phase, RequiredAction::Execute(execution))
             }
         };
-        let executing = usize::from(matches!(phase, Phase::Executing { .. }));
-        let is_closed = matches!(phase, Phase::Closed);
+        self.space.admit(&origin, (id, &phase), cost);
         let interval = self.interval();
         let mut entry = RequestEntry {
             key: key.clone(),
             address: request.into(),
             dialect: request.dialect,
-            origin: origin.clone(),
+            origin,
             arguments: fingerprint(request),
             next_send: None,
             phase,
@@ -450,47 +435,32 @@ impl<P: Ord + Clone> Responder<P> {
             wake: now,
         };
         entry.answer(now, interval);
-        self.account(&origin, |usage| {
-            usage.requests += 1;
-            usage.bytes += cost;
-            usage.executing += executing;
-            if is_closed {
-                usage.closed.insert(id);
-            }
-        });
         self.ids.insert(key, id);
         self.entries.insert(id, entry);
         self.schedule(id);
         Ok(requested)
     }
 
-    /// Returns true if the sender or its group has reached the limit of concurrent executions.
-    fn is_busy(&self, origin: &RequestOrigin<P>) -> bool {
-        let executing = |usage: Option<&Usage>| usage.map_or(0, |usage| usage.executing);
-        let settings = &self.settings;
-        executing(self.usage.get(origin)) >= settings.max_executing_per_sender
-            || executing(self.totals.get(&origin.group)) >= settings.max_executing
-    }
-
     /// Makes space for a request by reducing closed requests to their hashes.
     fn make_room(&mut self, origin: &RequestOrigin<P>, cost: usize) -> Result<(), RequestDrop> {
         let settings = self.settings;
-        while let Some(used) = self.usage.get(origin)
-            && (used.requests >= settings.max_requests_per_sender
-                || used.bytes + cost > settings.max_bytes_per_sender)
-        {
-            let oldest = used.closed.first().copied();
-            self.shrink(oldest.ok_or(RequestDrop::SenderFull)?)?;
+        loop {
+            match self.space.of_sender(origin, cost, &settings) {
+                SpaceLeft::Enough => break,
+                SpaceLeft::Behind(oldest) => self.shrink(oldest)?,
+                SpaceLeft::Full => return Err(RequestDrop::SenderFull),
+            }
         }
-        while let Some(used) = self.totals.get(&origin.group)
-            && (used.requests >= settings.max_requests || used.bytes + cost > settings.max_bytes)
-        {
-            let oldest = used.closed.first().copied();
-            let shrunk = self.shrink(oldest.ok_or(RequestDrop::Full)?);
-            // The sender has space, but its group does not.
-            shrunk.map_err(|_| RequestDrop::Full)?;
+        loop {
+            match self.space.of_group(origin, cost, &settings) {
+                SpaceLeft::Enough => return Ok(()),
+                // The sender has space, but its group does not.
+                SpaceLeft::Behind(oldest) => {
+                    self.shrink(oldest).map_err(|_| RequestDrop::Full)?;
+                }
+                SpaceLeft::Full => return Err(RequestDrop::Full),
+            }
         }
-        Ok(())
     }
 
     /// Reduces a closed request to its hash.
@@ -585,11 +555,10 @@ impl<P: Ord + Clone> Responder<P> {
         let Phase::Executing { abandoned, .. } = entry.phase else {
             return;
         };
-        let origin = entry.origin.clone();
         if abandoned {
             entry.phase = Phase::Closed;
             entry.next_send = None;
-            self.account(&origin, |usage| usage.executing -= 1);
+            self.space.conclude(&entry.origin, 0);
             self.closed(id);
         } else {
             let bytes = fields.bytes().len();
@@ -599,26 +568,17 @@ impl<P: Ord + Clone> Responder<P> {
             entry.last_sent = None;
             entry.next_send = None;
             entry.answer(now, Duration::ZERO);
-            self.account(&origin, |usage| {
-                usage.executing -= 1;
-                usage.bytes += bytes;
-            });
+            self.space.conclude(&entry.origin, bytes);
         }
         self.schedule(id);
     }
 
     fn has_room_for(&self, id: u64, bytes: usize) -> bool {
-        let Some(entry) = self.entries.get(&id) else {
-            return false;
-        };
-        let used = |usage: Option<&Usage>| usage.map_or(0, |usage| usage.bytes);
-        let (sender, group) = (
-            used(self.usage.get(&entry.origin)),
-            used(self.totals.get(&entry.origin.group)),
-        );
-        bytes <= self.settings.max_answer
-            && group + bytes <= self.settings.max_bytes
-            && sender + bytes <= self.settings.max_bytes_per_sender
+        let entry = self.entries.get(&id);
+        entry.is_some_and(|entry| {
+            self.space
+                .has_room_for(&entry.origin, bytes, &self.settings)
+        })
     }
 
     /// Closes a request: its response is not requested again, so the bytes of the response are
@@ -626,11 +586,7 @@ impl<P: Ord + Clone> Responder<P> {
     fn closed(&mut self, id: u64) {
         if let Some(entry) = self.entries.get_mut(&id) {
             let bytes = core::mem::take(&mut entry.answer_bytes);
-            let origin = entry.origin.clone();
-            self.account(&origin, |usage| {
-                usage.bytes -= bytes;
-                usage.closed.insert(id);
-            });
+            self.space.close(&entry.origin, id, bytes);
         }
     }
 
@@ -641,27 +597,8 @@ impl<P: Ord + Clone> Responder<P> {
         self.timers.remove(id, entry.wake);
         self.ids.remove(&entry.key);
         self.overdue.remove(&id);
-        let executing = usize::from(matches!(entry.phase, Phase::Executing { .. }));
         let bytes = entry.key.cost() + entry.answer_bytes;
-        self.account(&entry.origin, |usage| {
-            usage.executing -= executing;
-            usage.requests -= 1;
-            usage.bytes -= bytes;
-            usage.closed.remove(&id);
-        });
-    }
-
-    fn account(&mut self, origin: &RequestOrigin<P>, change: impl Fn(&mut Usage)) {
-        let usage = self.usage.entry(origin.clone()).or_default();
-        change(usage);
-        if usage.requests == 0 {
-            self.usage.remove(origin);
-        }
-        let total = self.totals.entry(origin.group).or_default();
-        change(total);
-        if total.requests == 0 {
-            self.totals.remove(&origin.group);
-        }
+        self.space.forget(&entry.origin, (id, &entry.phase), bytes);
     }
 
     fn schedule(&mut self, id: u64) {
