@@ -3,7 +3,8 @@
 use std::net::SocketAddr;
 use std::time::Duration;
 
-use uadp::Timestamp;
+use mappings::{SpaceId, TopicId};
+use uadp::{DataSetMessage, MessageKind, Timestamp};
 
 /// The position of a DataSetMessage in the sequence of its writer, from its headers.
 #[derive(Debug, Clone, Copy)]
@@ -25,6 +26,31 @@ pub(crate) struct SequencePosition {
 }
 
 impl SequencePosition {
+    /// Returns the position of a message of a topic, which a sender sent at a time, if that is
+    /// known. The time for which the writer may hold back a sample is not in the message.
+    pub(crate) fn of(
+        topic: TopicId,
+        message: &DataSetMessage<'_>,
+        (from, sent): (SocketAddr, Option<Timestamp>),
+        is_relayed: bool,
+    ) -> Self {
+        let header = message.header();
+        Self {
+            sequence: header.sequence_number,
+            stamp: header.timestamp.map(|time| Timestamp {
+                time,
+                picoseconds: header.picoseconds.unwrap_or_default(),
+            }),
+            // Only key frames are repeated.
+            fine: header.picoseconds.is_some() && message.kind == MessageKind::KeyFrame,
+            sent,
+            from,
+            is_relayed,
+            held_back: Duration::ZERO,
+            by_clients: topic.space == SpaceId::UA,
+        }
+    }
+
     /// Returns the stamp if it distinguishes the sample from all other samples of the writer.
     pub(crate) fn instance(&self) -> Option<Timestamp> {
         self.stamp.filter(|_| self.fine)

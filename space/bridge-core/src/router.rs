@@ -19,6 +19,7 @@ mod held;
 mod inquiries;
 mod late;
 mod local;
+mod local_sample;
 mod metadata;
 mod muted;
 mod own;

@@ -6,7 +6,7 @@ use mappings::TopicId;
 use uadp::Fields;
 
 use super::about::DropSite;
-use super::receive::LocalSample;
+use super::local_sample::LocalSample;
 use super::values::TopicQueues;
 use crate::counters::Reason;
 use crate::output::ValueRelation;

@@ -5,11 +5,12 @@ use std::time::Duration;
 
 use mappings::{PublisherIdRule, SpaceId, TopicId};
 use uadp::{
-    DataSetMessage, DecodeError, Fields, MessageKind, NetworkHeader, NetworkMessage,
-    NetworkMessageType, Scalar, StatusCode, Timestamp, Variant,
+    DataSetMessage, DecodeError, MessageKind, NetworkHeader, NetworkMessage, NetworkMessageType,
+    Timestamp,
 };
 
-use super::content::{STATUS_BAD, ValueQuality};
+use super::content::ValueQuality;
+use super::local_sample::LocalSample;
 use super::{DropSite, Router, TopicQueues};
 use crate::confirm::Confirming;
 use crate::counters::Reason;
@@ -18,7 +19,7 @@ use crate::hops::Hop;
 use crate::late;
 use crate::loop_rule::{Crosses, Owned, Side, may_cross};
 use crate::network::number_of;
-use crate::output::{Delivery, Output, ValueRelation};
+use crate::output::{Delivery, Output};
 use crate::place::SequencePosition;
 use crate::reader::{AcceptedMessage, Handling};
 use crate::settings::{Forwarding, Local, Now};
@@ -287,7 +288,7 @@ impl TopicQueues {
             });
         }
         let relay = self.arrival;
-        let mut place = place(topic, message, (from, sent), relay.is_some());
+        let mut place = SequencePosition::of(topic, message, (from, sent), relay.is_some());
         let local = self.settings.local;
         let since_takeover = self.since_takeover(&place, now);
         let Some(at) = self.entry(topic, from, now) else {
@@ -634,63 +635,12 @@ impl TopicQueues {
     }
 }
 
-/// The content of a message for the local side.
-pub(super) struct LocalSample<'a> {
-    pub(super) fields: Fields<'a>,
-    pub(super) source: Option<Timestamp>,
-    pub(super) instance: Option<Timestamp>,
-    pub(super) kept: ValueRelation,
-    pub(super) lasting: bool,
-    pub(super) status: u16,
-    pub(super) arrived: Timestamp,
-}
-
-impl LocalSample<'_> {
-    /// Returns the status of a sample with a lost source, as text: a Bad StatusCode in the place
-    /// of a value, or a null value of Bad status.
-    fn no_value(&self) -> Option<String> {
-        let of_sample = StatusCode::from_status(self.status);
-        let is_bad = |status: StatusCode| status.0 & STATUS_BAD != 0;
-        let mut fields = self.fields.clone().filter_map(Result::ok);
-        let status = fields.find_map(|field| match field {
-            Variant::Scalar(Scalar::StatusCode(status)) => Some(status),
-            Variant::Null => Some(of_sample),
-            Variant::Scalar(_) | Variant::Array(_) | Variant::Matrix(_) => None,
-        });
-        let status = status.filter(|status| is_bad(*status))?;
-        Some(format!("the status of the value is {:#010x}", status.0))
-    }
-}
-
 /// Returns the time at which a NetworkMessage was sent.
 pub(super) fn sent(header: &NetworkHeader<'_>) -> Option<Timestamp> {
     header.timestamp.map(|time| Timestamp {
         time,
         picoseconds: header.picoseconds.unwrap_or_default(),
     })
-}
-
-fn place(
-    topic: TopicId,
-    message: &DataSetMessage<'_>,
-    (from, sent): (SocketAddr, Option<Timestamp>),
-    is_relayed: bool,
-) -> SequencePosition {
-    let header = message.header();
-    SequencePosition {
-        sequence: header.sequence_number,
-        stamp: header.timestamp.map(|time| Timestamp {
-            time,
-            picoseconds: header.picoseconds.unwrap_or_default(),
-        }),
-        // Only key frames are repeated.
-        fine: header.picoseconds.is_some() && message.kind == MessageKind::KeyFrame,
-        sent,
-        from,
-        is_relayed,
-        held_back: Duration::ZERO,
-        by_clients: topic.space == SpaceId::UA,
-    }
 }
 
 pub(super) const DISCOVERY: DecodeError = DecodeError::Misread("a discovery message");
