@@ -1,5 +1,7 @@
 //! The state of a DataSetWriter of another space.
 
+mod held_sample;
+
 use std::collections::VecDeque;
 use std::net::SocketAddr;
 use std::time::{Duration, Instant};
@@ -7,6 +9,7 @@ use std::time::{Duration, Instant};
 use mappings::Lasting;
 use uadp::{BuiltinType, DataSetMessage, SequenceOrder, Timestamp};
 
+pub(crate) use self::held_sample::HeldSample;
 use crate::base::KeyFrame;
 use crate::confirm::Receipt;
 use crate::counters::Reason;
@@ -153,30 +156,6 @@ pub(crate) struct AcceptedMessage {
     pub(crate) kept: ValueRelation,
     /// Whether late joiners receive the value.
     pub(crate) lasting: bool,
-}
-
-/// A sample received before its local type was known. Only the newest sample is held.
-#[derive(Debug)]
-pub(crate) struct HeldSample {
-    pub(crate) fields: Vec<u8>,
-    pub(crate) source: Option<Timestamp>,
-    pub(crate) instance: Option<Timestamp>,
-    pub(crate) status: u16,
-    pub(crate) lasting: bool,
-    /// The time at which an event is too old for delivery, and at which a large sample is removed.
-    pub(crate) until: Instant,
-}
-
-impl HeldSample {
-    /// Returns whether the sample counts towards the limit for large samples.
-    pub(crate) const fn is_large(&self) -> bool {
-        self.fields.len() > MAX_SMALL
-    }
-
-    /// Returns the time at which the sample is removed, if it is large.
-    pub(crate) fn expires(&self) -> Option<Instant> {
-        self.is_large().then_some(self.until)
-    }
 }
 
 impl ReceivedTopicState {
@@ -361,7 +340,12 @@ impl ReceivedTopicState {
         handling: Handling,
         now: Instant,
     ) -> Result<AcceptedMessage, Reason> {
-        let moved = self.from.is_some_and(|from| from != place.from);
+        let is_elsewhere = self.from.is_some_and(|from| from != place.from);
+        let moved = is_elsewhere && !self.is_copy(&place);
+        if is_elsewhere && !moved {
+            self.moved += 1;
+            self.from = Some(place.from);
+        }
         let again = place.stamp.is_some() && place.stamp == self.stamp;
         let restarted = moved
             || (self.over && !again && !self.came_before(&place, handling))
@@ -439,6 +423,17 @@ impl ReceivedTopicState {
             kept,
             lasting,
         })
+    }
+
+    /// Returns whether a message is a copy of the newest message, by its number and its precise
+    /// stamp. A restarted writer takes its samples anew, so a copy from another address is of the
+    /// same writer, which has another socket: its network interface was lost and is back.
+    fn is_copy(&self, place: &SequencePosition) -> bool {
+        let stamp = place.instance().filter(|_| !self.still);
+        place.sequence.is_some()
+            && place.sequence == self.sequence
+            && stamp.is_some()
+            && stamp == self.stamp
     }
 
     /// Handles a repetition of the newest message under its own number. Writers repeat events in
@@ -674,10 +669,6 @@ impl ReceivedTopicState {
     }
 }
 
-/// The maximum size of a sample that may wait for its local type in each topic. It is small,
-/// because any sender in the group can invent topics, and all of them together must not occupy more
-/// than some megabytes.
-const MAX_SMALL: usize = 4_096;
 /// The maximum number of states that a writer sends to a broker again. Bridges send at most 20.
 const MOST_RESENT: u32 = 32;
 /// The number of samples with recognised repetitions: as many as a writer keeps.

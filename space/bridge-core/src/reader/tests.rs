@@ -76,13 +76,44 @@ fn old_and_equal_numbers_are_dropped_unless_the_writer_started_over() {
     );
     let moved = SequencePosition {
         from: address(2),
-        ..place(0, 10_000)
+        ..place(0, 9_500)
     };
     assert_eq!(
-        admit(&mut reader, moved, now),
-        Ok((0, ValueRelation::Alone)),
+        reader
+            .admit(moved, None, Handling::Event, now)
+            .map(|admitted| admitted.missing),
+        Ok(0),
         "another address tells of a restart"
     );
+}
+
+#[test]
+fn a_copy_from_another_socket_of_the_writer_is_not_delivered_again() {
+    for handling in [Handling::Event, Handling::AsSource, Handling::State] {
+        let (mut reader, now) = reader();
+        let admit = |reader: &mut ReceivedTopicState, place: SequencePosition| {
+            let admitted = reader.admit(place, None, handling, now)?;
+            reader.delivered(place.instance(), (admitted.kept, admitted.lasting), now);
+            Ok(admitted.missing)
+        };
+        assert_eq!(admit(&mut reader, place(7, 1000)), Ok(0));
+        let elsewhere = |sequence, stamp| SequencePosition {
+            from: address(2),
+            ..place(sequence, stamp)
+        };
+        let copy = elsewhere(7, 1000);
+        for _ in 0..2 {
+            assert_eq!(
+                admit(&mut reader, copy),
+                Err(Reason::Repeat),
+                "{handling:?}"
+            );
+        }
+        assert_eq!(reader.take_moved(), 1);
+        // The numbers of the writer continue.
+        assert_eq!(admit(&mut reader, elsewhere(9, 2000)), Ok(1));
+        assert_eq!(reader.take_moved(), 0);
+    }
 }
 
 #[test]
