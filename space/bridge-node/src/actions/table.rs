@@ -3,13 +3,16 @@
 //!
 //! No IO and no clock: requests and events are the input, responses are the output.
 
+mod goal;
+
 use std::collections::{HashMap, VecDeque};
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use bridge_core::ExecutionId;
 use bytes::Bytes;
 use uadp::Timestamp;
 
+use self::goal::Goal;
 use super::graph::GraphGoalId;
 use super::wire::GoalAnswer;
 
@@ -21,46 +24,6 @@ pub(super) struct Goals {
     order: VecDeque<GraphGoalId>,
     /// Total size of the kept results in bytes.
     kept: usize,
-}
-
-#[derive(Debug)]
-struct Goal {
-    state: State,
-    /// Time of acceptance; zero before.
-    stamp: Timestamp,
-    /// Requests that wait for the result.
-    waiting: Vec<Waiting>,
-    /// Time of withdrawal: the goal is to be cancelled as soon as its server has accepted it.
-    withdrawn: Option<Instant>,
-    /// Whether the server refuses to cancel the goal.
-    is_refused: bool,
-    /// Whether the server has agreed to cancel the goal.
-    agreed: bool,
-}
-
-#[derive(Debug)]
-enum State {
-    /// The server has not decided. Holds the requests for the goal.
-    Sent(Vec<ExecutionId>),
-    /// Holds the status of `action_msgs/GoalStatus`.
-    Running(i8),
-    Rejected {
-        why: String,
-        since: Instant,
-    },
-    /// Holds the response to requests for the result.
-    Ended {
-        status: i8,
-        answer: Bytes,
-        since: Instant,
-    },
-}
-
-#[derive(Debug, Clone, Copy)]
-struct Waiting {
-    execution: ExecutionId,
-    /// When the request is refused, so that its caller repeats it.
-    until: Instant,
 }
 
 /// The outcome of a request for a goal.
@@ -126,37 +89,12 @@ impl Goals {
     /// Handles a request for a goal.
     pub(super) fn ask(&mut self, id: GraphGoalId, execution: ExecutionId) -> GoalDecision {
         if let Some(goal) = self.known.get_mut(&id) {
-            let answer = |accepted, message: &str| {
-                GoalDecision::Answer(GoalAnswer {
-                    accepted,
-                    id,
-                    stamp: goal.stamp,
-                    message: message.to_owned(),
-                })
-            };
-            return match &mut goal.state {
-                State::Sent(_) if goal.withdrawn.is_some() => GoalDecision::Withdrawn,
-                State::Sent(asked) if asked.len() >= MOST_WAITING => GoalDecision::Full,
-                State::Sent(asked) => {
-                    asked.push(execution);
-                    GoalDecision::Waits
-                }
-                State::Running(_) | State::Ended { .. } => answer(true, ""),
-                State::Rejected { why, .. } => answer(false, why),
-            };
+            return goal.ask_again(id, execution);
         }
         if !self.has_room() {
             return GoalDecision::Full;
         }
-        let goal = Goal {
-            state: State::Sent(vec![execution]),
-            stamp: Timestamp::from_unix_nanos(0),
-            waiting: Vec::new(),
-            withdrawn: None,
-            is_refused: false,
-            agreed: false,
-        };
-        self.known.insert(id, goal);
+        self.known.insert(id, Goal::new(execution));
         self.order.push_back(id);
         GoalDecision::Send
     }
@@ -179,7 +117,7 @@ impl Goals {
     fn forget(&mut self, place: usize) {
         let id = self.order.remove(place);
         if let Some(goal) = id.and_then(|id| self.known.remove(&id)) {
-            self.kept -= goal.state.bytes();
+            self.kept -= goal.bytes();
         }
     }
 
@@ -202,19 +140,8 @@ impl Goals {
         stamp: Timestamp,
     ) -> Option<(Vec<ExecutionId>, GoalAnswer)> {
         let goal = self.known.get_mut(&id)?;
-        let State::Sent(asked) = &mut goal.state else {
-            return None;
-        };
-        let asked = std::mem::take(asked);
-        goal.state = State::Running(ACCEPTED);
-        goal.stamp = stamp;
-        let answer = GoalAnswer {
-            accepted: true,
-            id,
-            stamp,
-            message: String::new(),
-        };
-        Some((asked, answer))
+        let asked = goal.accept(stamp)?;
+        Some((asked, goal.answer(id, Ok(()))))
     }
 
     /// Marks the goal as rejected by the server. Returns the requests for the goal, and the
@@ -226,17 +153,8 @@ impl Goals {
         now: Instant,
     ) -> Option<(Vec<ExecutionId>, GoalAnswer, Vec<ExecutionId>)> {
         let goal = self.known.get_mut(&id)?;
-        let State::Sent(asked) = &mut goal.state else {
-            return None;
-        };
-        let asked = std::mem::take(asked);
-        let answer = GoalAnswer {
-            accepted: false,
-            id,
-            stamp: goal.stamp,
-            message: why.clone(),
-        };
-        goal.state = State::Rejected { why, since: now };
+        let asked = goal.reject(why.clone(), now)?;
+        let answer = goal.answer(id, Err(why));
         Some((asked, answer, goal.take_waiting()))
     }
 
@@ -256,19 +174,13 @@ impl Goals {
             return (Vec::new(), Vec::new());
         };
         self.order.retain(|of| *of != id);
-        let asked = match &mut goal.state {
-            State::Sent(asked) => std::mem::take(asked),
-            State::Running(_) | State::Rejected { .. } | State::Ended { .. } => Vec::new(),
-        };
-        (asked, goal.take_waiting())
+        (goal.take_asked(), goal.take_waiting())
     }
 
     /// Sets the status of a running goal. Returns false if the status has not changed.
     pub(super) fn status(&mut self, id: GraphGoalId, status: i8) -> bool {
-        match self.known.get_mut(&id).map(|goal| &mut goal.state) {
-            Some(State::Running(known)) => std::mem::replace(known, status) != status,
-            Some(State::Sent(_) | State::Rejected { .. } | State::Ended { .. }) | None => false,
-        }
+        let goal = self.known.get_mut(&id);
+        goal.is_some_and(|goal| goal.set_status(status))
     }
 
     /// Marks the goal as ended. Returns the requests for its result, and the requests for the goal
@@ -282,18 +194,10 @@ impl Goals {
         let Some(goal) = self.known.get_mut(&id) else {
             return (Vec::new(), Vec::new());
         };
-        let state = State::Ended {
-            status,
-            answer,
-            since: now,
-        };
-        self.kept += state.bytes();
-        let before = std::mem::replace(&mut goal.state, state);
-        self.kept -= before.bytes();
-        let asked = match before {
-            State::Sent(asked) => asked,
-            State::Running(_) | State::Rejected { .. } | State::Ended { .. } => Vec::new(),
-        };
+        let before = goal.bytes();
+        let asked = goal.end((status, answer), now);
+        self.kept += goal.bytes();
+        self.kept -= before;
         let waiting = goal.take_waiting();
         self.make_room(id);
         (waiting, asked)
@@ -306,53 +210,30 @@ impl Goals {
         execution: ExecutionId,
         until: Instant,
     ) -> ResultDecision {
-        let waiting: usize = self.known.values().map(|goal| goal.waiting.len()).sum();
-        match self.known.get_mut(&id) {
-            None => ResultDecision::NoGoal,
-            Some(Goal {
-                state: State::Rejected { why, .. },
-                ..
-            }) => ResultDecision::Rejected(why.clone()),
-            Some(Goal {
-                state: State::Ended { answer, .. },
-                ..
-            }) => ResultDecision::Answer(answer.clone()),
-            Some(_) if waiting >= MOST_WAITING => ResultDecision::Full,
-            Some(goal) => {
-                goal.waiting.push(Waiting { execution, until });
-                ResultDecision::Waits
-            }
-        }
+        let waiting: usize = self.known.values().map(Goal::waiting).sum();
+        let goal = self.known.get_mut(&id);
+        goal.map_or(ResultDecision::NoGoal, |goal| {
+            goal.want((execution, until), waiting >= MOST_WAITING)
+        })
     }
 
     /// Removes a request for a result. Returns false if the request was not waiting.
     pub(super) fn give_up(&mut self, execution: ExecutionId) -> bool {
-        self.known.values_mut().any(|goal| {
-            let before = goal.waiting.len();
-            goal.waiting.retain(|one| one.execution != execution);
-            goal.waiting.len() < before
-        })
+        let mut goals = self.known.values_mut();
+        goals.any(|goal| goal.give_up(execution))
     }
 
     /// Withdraws a goal that its server has not decided about. Returns the requests for the goal.
     pub(super) fn withdraw(&mut self, id: GraphGoalId, now: Instant) -> Vec<ExecutionId> {
-        let Some(goal) = self.known.get_mut(&id) else {
-            return Vec::new();
-        };
-        match &mut goal.state {
-            State::Sent(asked) => {
-                goal.withdrawn.get_or_insert(now);
-                std::mem::take(asked)
-            }
-            State::Running(_) | State::Rejected { .. } | State::Ended { .. } => Vec::new(),
-        }
+        let goal = self.known.get_mut(&id);
+        goal.map_or_else(Vec::new, |goal| goal.withdraw(now))
     }
 
     /// Returns the goals that their server has not decided about.
     pub(super) fn undecided(&self) -> Vec<GraphGoalId> {
         let sent = self.order.iter().filter(|id| {
             let goal = self.known.get(*id);
-            goal.is_some_and(|goal| matches!(goal.state, State::Sent(_)))
+            goal.is_some_and(Goal::is_undecided)
         });
         sent.copied().collect()
     }
@@ -361,19 +242,11 @@ impl Goals {
     /// withdrawn, because it would start late.
     pub(super) fn give_up_asking(&mut self, execution: ExecutionId, now: Instant) -> GivenUp {
         for (id, goal) in &mut self.known {
-            let State::Sent(asked) = &mut goal.state else {
-                continue;
-            };
-            let before = asked.len();
-            asked.retain(|one| *one != execution);
-            if asked.len() == before {
-                continue;
+            match goal.give_up_asking(execution, now) {
+                Some(0) => return GivenUp::ByAll(*id),
+                Some(_) => return GivenUp::ByOne,
+                None => {}
             }
-            if asked.is_empty() {
-                goal.withdrawn.get_or_insert(now);
-                return GivenUp::ByAll(*id);
-            }
-            return GivenUp::ByOne;
         }
         GivenUp::NotAsked
     }
@@ -381,64 +254,42 @@ impl Goals {
     /// Notes that the server refuses to cancel a withdrawn goal. Returns false if the goal is being
     /// cancelled: servers refuse a second cancellation.
     pub(super) fn cancel_refused(&mut self, id: GraphGoalId) -> bool {
-        match self.known.get_mut(&id) {
-            Some(goal) if goal.is_cancelling() => false,
-            Some(goal) => {
-                goal.is_refused = true;
-                true
-            }
-            None => true,
-        }
+        let goal = self.known.get_mut(&id);
+        goal.is_none_or(Goal::refuse_cancel)
     }
 
     /// Notes that the server has agreed to cancel the goal.
     pub(super) fn cancel_agreed(&mut self, id: GraphGoalId) {
         if let Some(goal) = self.known.get_mut(&id) {
-            goal.agreed = true;
+            goal.agree_to_cancel();
         }
     }
 
     /// Returns whether a goal is to be cancelled as soon as it is accepted.
     pub(super) fn is_withdrawn(&self, id: GraphGoalId) -> bool {
-        self.known
-            .get(&id)
-            .is_some_and(|goal| goal.withdrawn.is_some())
+        self.known.get(&id).is_some_and(Goal::is_withdrawn)
     }
 
     /// Returns the withdrawn goals that the server has neither started nor refused to cancel, each
     /// with the time of withdrawal, oldest goal first.
     pub(super) fn pending(&self) -> Vec<(GraphGoalId, Instant)> {
         let pending = self.order.iter().filter_map(|id| {
-            let goal = self.known.get(id).filter(|goal| !goal.is_refused)?;
-            let is_open = match goal.state {
-                State::Sent(_) => true,
-                State::Running(status) => status != CANCELING,
-                State::Rejected { .. } | State::Ended { .. } => false,
-            };
-            goal.withdrawn.filter(|_| is_open).map(|since| (*id, since))
+            let since = self.known.get(id)?.pending_since()?;
+            Some((*id, since))
         });
         pending.collect()
     }
 
     /// Returns the progress of a goal.
     pub(super) fn progress(&self, id: GraphGoalId) -> CancelProgress {
-        let Some(goal) = self.known.get(&id) else {
-            return CancelProgress::Unknown;
-        };
-        let is_pending = goal.withdrawn.is_some() && !goal.is_refused;
-        match &goal.state {
-            State::Sent(_) => CancelProgress::Undecided,
-            State::Running(_) if is_pending || goal.is_cancelling() => CancelProgress::Cancelling,
-            State::Running(_) => CancelProgress::Open,
-            State::Rejected { .. } | State::Ended { .. } => CancelProgress::Ended,
-        }
+        let goal = self.known.get(&id);
+        goal.map_or(CancelProgress::Unknown, Goal::progress)
     }
 
     /// Returns the running goals that were accepted at `until` or before.
     pub(super) fn open_until(&self, until: Timestamp) -> Vec<GraphGoalId> {
-        let open = self.known.iter().filter(|(_, goal)| {
-            matches!(goal.state, State::Running(_)) && goal.stamp.unix_nanos() <= until.unix_nanos()
-        });
+        let known = self.known.iter();
+        let open = known.filter(|(_, goal)| goal.is_open_until(until));
         open.map(|(id, _)| *id).collect()
     }
 
@@ -446,11 +297,7 @@ impl Goals {
     pub(super) fn statuses(&self) -> Vec<(GraphGoalId, i8)> {
         let newest = self.order.iter().rev();
         let newest = newest.filter_map(|id| {
-            let status = match &self.known.get(id)?.state {
-                State::Sent(_) | State::Rejected { .. } => return None,
-                State::Running(status) => *status,
-                State::Ended { status, .. } => *status,
-            };
+            let status = self.known.get(id)?.status()?;
             Some((*id, status))
         });
         let mut newest: Vec<(GraphGoalId, i8)> = newest.take(MOST_STATUSES).collect();
@@ -463,19 +310,15 @@ impl Goals {
     pub(super) fn tidy(&mut self, now: Instant) -> (Vec<ExecutionId>, bool) {
         let known = &mut self.known;
         let before = known.len();
-        known.retain(|_, goal| match &goal.state {
-            State::Rejected { since, .. } | State::Ended { since, .. } => *since + KEPT > now,
-            State::Sent(_) | State::Running(_) => true,
-        });
-        self.kept = known.values().map(|goal| goal.state.bytes()).sum();
+        known.retain(|_, goal| !goal.is_expired(now));
+        self.kept = known.values().map(Goal::bytes).sum();
         let forgotten = known.len() < before;
         if forgotten {
             self.order.retain(|id| known.contains_key(id));
         }
         let mut late = Vec::new();
         for goal in known.values_mut() {
-            let over = goal.waiting.extract_if(.., |one| one.until <= now);
-            late.extend(over.map(|one| one.execution));
+            late.extend(goal.take_late(now));
         }
         (late, forgotten)
     }
@@ -486,40 +329,9 @@ impl Goals {
         let mut all = Vec::new();
         for goal in self.known.values_mut() {
             all.extend(goal.take_waiting());
-            if let State::Sent(asked) = &mut goal.state {
-                all.append(asked);
-            }
+            all.extend(goal.take_asked());
         }
         all
-    }
-}
-
-impl State {
-    /// Returns the size of the kept result.
-    const fn bytes(&self) -> usize {
-        match self {
-            Self::Ended { answer, .. } => answer.len(),
-            Self::Sent(_) | Self::Running(_) | Self::Rejected { .. } => 0,
-        }
-    }
-}
-
-impl Goal {
-    /// Returns whether the server is cancelling the goal.
-    fn is_cancelling(&self) -> bool {
-        self.agreed || matches!(self.state, State::Running(CANCELING))
-    }
-
-    const fn has_ended(&self) -> bool {
-        match &self.state {
-            State::Rejected { .. } | State::Ended { .. } => true,
-            State::Sent(_) | State::Running(_) => false,
-        }
-    }
-
-    fn take_waiting(&mut self) -> Vec<ExecutionId> {
-        let waiting = std::mem::take(&mut self.waiting);
-        waiting.into_iter().map(|one| one.execution).collect()
     }
 }
 
@@ -528,20 +340,17 @@ const MOST_GOALS: usize = 1000;
 /// The maximal size in bytes of the kept results of one action. The oldest results give way; the
 /// newest is kept at any size.
 const MOST_BYTES: usize = 64 << 20;
-/// How long a goal is known after its end.
-const KEPT: Duration = Duration::from_secs(15 * 60);
 /// The maximal number of requests that wait for results of one action: each occupies a place of the
 /// Responder.
 const MOST_WAITING: usize = 128;
 /// The maximal number of goals in the value with the statuses.
 const MOST_STATUSES: usize = 100;
-/// `action_msgs/GoalStatus`, STATUS_ACCEPTED.
-const ACCEPTED: i8 = 1;
-/// `action_msgs/GoalStatus`, STATUS_CANCELING.
-const CANCELING: i8 = 3;
 
 #[cfg(test)]
 mod tests {
+    use std::time::Duration;
+
+    use super::goal::{CANCELING, KEPT};
     use super::*;
 
     fn id(number: u16) -> GraphGoalId {
