@@ -13,7 +13,8 @@ use tracing::info;
 use type_files::read_text_file;
 
 use super::look::{FileStamp, stamp};
-use super::{About, LOOK, MappingFile, RunningMapping, seconds, shortened};
+use super::reading::shortened;
+use super::{About, LOOK, MappingFile, RunningMapping, seconds};
 
 /// The configuration file of a program without a mapping.
 ///

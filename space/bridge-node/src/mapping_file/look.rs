@@ -10,7 +10,8 @@ use tokio::time::timeout;
 use tracing::warn;
 use type_files::TypePaths;
 
-use super::{Known, NodeSetReader, Reading, UnreadMapping, read};
+use super::NodeSetReader;
+use super::reading::{DefinedTypes, Reading, UnreadMapping, read};
 
 /// The files and folders that were read or looked for, each with its stamp from before the reading.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
@@ -110,7 +111,7 @@ pub(super) struct PollParameters {
     /// Whether the definitions are to be read even if they are unchanged.
     pub(super) again: bool,
     pub(super) running: Arc<TypePaths>,
-    pub(super) known: Arc<Known>,
+    pub(super) known: Arc<DefinedTypes>,
 }
 
 impl PollParameters {
