@@ -19,7 +19,7 @@ use tokio::signal::unix::SignalKind;
 use tokio::sync::watch;
 use tokio::task::{JoinError, JoinSet};
 use tracing::{Instrument, Span, error, info, info_span};
-use transport::{Carrier, HeldInterfaces};
+use transport::Carrier;
 use type_files::TypePaths;
 
 use crate::arguments::Arguments;
@@ -33,7 +33,7 @@ use crate::mapping_file::{ConfigurationFile, MappingFile, NodeSetReader, Running
 use crate::observer::Observer;
 use crate::port::Port;
 use crate::redundancy;
-use crate::run::{DatagramOutbox, Fixed, LinkLoss, Shell, Turn};
+use crate::run::{DatagramOutbox, Fixed, LinkLoss, Shell, SideInterfaces, Turn};
 use crate::signals;
 use crate::status::StatusSnapshot;
 
@@ -372,7 +372,7 @@ async fn prepare<P: Program>(
         library: P::library(),
         own,
         router,
-        held: port.addresses().and_then(HeldInterfaces::start),
+        side: SideInterfaces::start(port.addresses()),
         links: LinkLoss::default(),
         port,
         carrier,

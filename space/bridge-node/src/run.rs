@@ -7,6 +7,7 @@ mod links;
 mod network;
 mod outbox;
 mod redundancy;
+mod side;
 mod taps;
 mod turn;
 
@@ -25,9 +26,7 @@ use service::{Failure, FailureKind, PageState as _, Requests};
 use tokio::sync::watch;
 use tokio::time::{Instant as TokioInstant, Sleep};
 use tracing::{debug, info, warn};
-use transport::{
-    BUFFER, Carrier, HeldInterfaces, InterfaceFinding, OutgoingMessage, Received, SendError,
-};
+use transport::{BUFFER, Carrier, OutgoingMessage, Received, SendError};
 use uadp::Timestamp;
 
 use crate::awaited::PeerWatch;
@@ -46,6 +45,7 @@ pub(crate) use fixed::Fixed;
 pub(crate) use links::LinkLoss;
 pub(crate) use outbox::DatagramOutbox;
 use outbox::Parcel;
+pub(crate) use side::SideInterfaces;
 pub(crate) use turn::Turn;
 
 /// The run loop of one space, with its Router, port and carrier, and the requests for the status.
@@ -63,8 +63,8 @@ pub(crate) struct Shell<P> {
     pub(crate) interest: Option<Interest>,
     /// The datagrams to send together.
     pub(crate) outbox: DatagramOutbox,
-    /// The network interfaces that the port cannot change while it runs.
-    pub(crate) held: Option<HeldInterfaces>,
+    /// The network interfaces of the local side.
+    pub(crate) side: SideInterfaces,
     pub(crate) links: LinkLoss,
     /// Returns the namespaces that only this program writes, by the mapping.
     pub(crate) owned: fn(&Mapping) -> Owned,
@@ -169,7 +169,7 @@ impl<P: Port> Shell<P> {
                 () = &mut stop => return Ok(()),
                 heard = self.carrier.recv(&mut buffer) => more = self.heard_all(heard, &mut buffer),
                 event = self.port.recv() => more = self.port_events(event).await?,
-                () = links.as_mut(), if self.held.is_some() => {
+                () = links.as_mut(), if self.side.is_watched() => {
                     links.as_mut().reset(TokioInstant::now() + self.link_pause());
                     self.look_at_links();
                 }
@@ -180,7 +180,7 @@ impl<P: Port> Shell<P> {
                 () = looks.as_mut() => {
                     looks.as_mut().reset(idle_ticks::next(TokioInstant::now(), transport::LOOK));
                     self.follow_group();
-                    self.look_at_held()?;
+                    self.side.report()?;
                     self.port.counted(&self.router);
                     self.look_at_fitness();
                     self.look_for_peers();
@@ -269,16 +269,8 @@ impl<P: Port> Shell<P> {
         let about = Arc::clone(&self.changes.borrow().about);
         let interfaces = Interfaces {
             pubsub: u8::from(self.carrier.lost().is_none()),
-            local: self
-                .held
-                .as_ref()
-                .map(|held| u8::from(held.lost().is_none())),
+            local: self.side.up(),
         };
-        let side_lost = self
-            .held
-            .as_ref()
-            .and_then(HeldInterfaces::lost)
-            .map(side_lost);
         StatusSnapshot::of(
             (self.program, self.own),
             &self.router,
@@ -286,7 +278,7 @@ impl<P: Port> Shell<P> {
             Readiness {
                 not_ready: self
                     .lost_carriers()
-                    .chain(side_lost)
+                    .chain(self.side.lost())
                     .chain(self.port.hindrance())
                     .chain(self.taken.values().cloned())
                     .chain(self.keyless())
@@ -312,34 +304,6 @@ impl<P: Port> Shell<P> {
         let groups = self.router.groups();
         let keyless = groups.filter(|state| state.token_id.is_none());
         keyless.map(|state| format!("no keys of the group `{}` yet", state.group))
-    }
-
-    /// Checks the network interfaces of the local side; fails if the local side cannot follow a
-    /// change.
-    fn look_at_held(&mut self) -> Result<(), Failure> {
-        let findings = self.held.as_mut().map(HeldInterfaces::look);
-        for finding in findings.into_iter().flatten() {
-            let told = match finding {
-                InterfaceFinding::Lost(why) => side_lost(why),
-                InterfaceFinding::Late(interface) => format!(
-                    "the network interface {interface} appeared after the start: the ROS side does not use \
-                     it until this program is restarted"
-                ),
-                InterfaceFinding::Back(interface) => {
-                    info!(%interface, "the network interface of the ROS side is up again");
-                    continue;
-                }
-                InterfaceFinding::Void(why) => {
-                    let message = format!(
-                        "{why}, and the ROS side cannot switch to it: stopping; the service manager should \
-                         restart this program"
-                    );
-                    return Err(Failure::new(FailureKind::Unavailable, message));
-                }
-            };
-            warn!("{told}");
-        }
-        Ok(())
     }
 
     /// Adopts the mapping if it has changed.
@@ -671,10 +635,6 @@ impl<P: Port> Shell<P> {
         self.router.handed(topic, instance, handover);
         Some(handover)
     }
-}
-
-fn side_lost(why: String) -> String {
-    format!("the network of the ROS side is out of reach: {why}")
 }
 
 fn not_sent(error: SendError) -> Reason {

@@ -6,7 +6,7 @@ use std::time::Duration;
 use bridge_core::{LocalSide, MuteCause, RedundancyRank, RoleChange, TakeoverCause};
 use mappings::Mapping;
 use tracing::{error, info, warn};
-use transport::{HeldInterfaces, OutgoingMessage};
+use transport::OutgoingMessage;
 
 use super::Shell;
 use crate::clock::now;
@@ -100,9 +100,9 @@ impl<P: Port> Shell<P> {
     /// Checks the links of the ROS side. Changes are reported by the check of each second, so that
     /// a link that is down for a moment does not end the program.
     pub(super) fn look_at_links(&mut self) {
-        if let Some(held) = &mut self.held {
+        if self.side.is_watched() {
             let before = now().monotonic;
-            held.refresh();
+            self.side.refresh();
             self.links.took(now().monotonic.duration_since(before));
         }
         self.look_at_fitness();
@@ -111,14 +111,13 @@ impl<P: Port> Shell<P> {
     /// Sets whether the ROS side is within reach.
     pub(super) fn look_at_fitness(&mut self) {
         let is_redundant = self.router.redundancy().is_some();
-        if let Some(held) = &self.held {
+        if let Some(lost) = self.side.lost_addresses() {
             // A standby must not become active with values that wait in a connection.
             let patience = if is_redundant {
                 Duration::ZERO
             } else {
                 PATIENCE
             };
-            let lost = held.lost_addresses();
             if let Some(lost) = self.links.look(&lost, patience, now().monotonic) {
                 self.port.links_lost(lost);
             }
@@ -126,10 +125,7 @@ impl<P: Port> Shell<P> {
         if !is_redundant {
             return;
         }
-        let is_held = self
-            .held
-            .as_ref()
-            .is_none_or(|held| HeldInterfaces::lost(held).is_none());
+        let is_held = self.side.lost().is_none();
         let side = match (is_held, self.port.hindrance()) {
             (false, _) => LocalSide::NoLink,
             (true, Some(_)) => LocalSide::Silent,
