@@ -133,6 +133,21 @@ fn http_requests_alone_have_no_tls_and_know_no_space() {
 }
 
 #[test]
+fn tls_of_clients_knows_no_space() {
+    does_not_reach(
+        "tls-client",
+        &[
+            "hyper*",
+            "uadp",
+            "mappings",
+            "bridge-*",
+            "transport",
+            "service",
+        ],
+    );
+}
+
+#[test]
 fn json_values_reaches_no_io_and_knows_no_space() {
     does_not_reach("json-values", IMPURE);
     does_not_reach(

@@ -8,12 +8,12 @@ use bytes::Bytes;
 use hyper::header::{HOST, HeaderValue, InvalidHeaderValue};
 use hyper::{Request, Response};
 use thiserror::Error;
+#[cfg(feature = "tls")]
+use tls_client::{TlsAuthorities, TlsError, TlsVerification};
 use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::net::TcpStream;
 use tokio::time::{Instant, timeout_at};
 
-#[cfg(feature = "tls")]
-use crate::tls::{TlsAuthorities, TlsError, TlsVerification};
 #[cfg(feature = "tls")]
 use crate::url::HttpUrl;
 use crate::{Connection, HttpError};

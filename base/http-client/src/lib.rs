@@ -11,15 +11,13 @@
 
 mod connection;
 mod host;
-#[cfg(feature = "tls")]
-mod tls;
 mod url;
 
 pub use connection::{Connection, HttpError};
 pub use host::{HttpHost, HttpLimits, RequestError};
 pub use hyper::{Method, Request, Response, StatusCode, header};
 #[cfg(feature = "tls")]
-pub use tls::{TlsAuthorities, TlsError, TlsVerification};
+pub use tls_client::{TlsAuthorities, TlsError, TlsVerification};
 pub use url::{HttpUrl, HttpUrlError};
 
 use base64::Engine as _;

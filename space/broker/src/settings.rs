@@ -5,12 +5,9 @@ use std::fs;
 use std::hash::{BuildHasher, Hasher};
 use std::io;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
 
 use mappings::Broker;
-use rustls::pki_types::pem::PemObject;
-use rustls::pki_types::{CertificateDer, InvalidDnsNameError, PrivateKeyDer, ServerName};
-use rustls::{ClientConfig, RootCertStore, crypto};
+use tls_client::{TlsAuthorities, TlsError, TlsIdentity, TlsVerification};
 
 use crate::reports::BrokerReports;
 use crate::topics::{self, Address, TopicFilter, TopicMessageType, UADP};
@@ -45,12 +42,9 @@ pub enum OpenError {
         /// The problem.
         problem: String,
     },
-    /// The host cannot be named in a certificate.
-    #[error("the host of the broker is not valid in a certificate: {0}")]
-    Host(#[from] InvalidDnsNameError),
-    /// The client certificate and its key do not belong together.
-    #[error("the client certificate cannot be used: {0}")]
-    Certificate(#[from] rustls::Error),
+    /// TLS cannot be used.
+    #[error(transparent)]
+    Tls(#[from] TlsError),
 }
 
 /// The settings of a connection.
@@ -59,7 +53,7 @@ pub(crate) struct BrokerSettings {
     pub(crate) client_id: String,
     pub(crate) publisher: Option<u16>,
     pub(crate) credentials: Option<Credentials>,
-    pub(crate) tls: Option<Tls>,
+    pub(crate) tls: Option<TlsVerification>,
     pub(crate) will: Option<Will>,
     /// The topics to subscribe, in their order.
     pub(crate) filters: Vec<TopicFilter>,
@@ -75,12 +69,6 @@ pub(crate) struct Will {
 pub(crate) struct Credentials {
     pub(crate) user: String,
     pub(crate) password: String,
-}
-
-/// The configuration of TLS.
-pub(crate) struct Tls {
-    pub(crate) config: Arc<ClientConfig>,
-    pub(crate) host: ServerName<'static>,
 }
 
 impl BrokerSettings {
@@ -157,50 +145,13 @@ fn credentials(path: &Path) -> Result<Credentials, OpenError> {
     })
 }
 
-fn tls(broker: &Broker) -> Result<Tls, OpenError> {
-    let provider = Arc::new(crypto::ring::default_provider());
-    let mut roots = RootCertStore::empty();
-    let path = broker.ca.as_deref().unwrap_or_else(|| Path::new(SYSTEM_CA));
-    for certificate in certificates(path)? {
-        // An authority that cannot be used is not trusted.
-        let _unusable = roots.add(certificate).is_err();
-    }
-    if roots.is_empty() {
-        return Err(OpenError::Content {
-            path: path.to_owned(),
-            problem: "it contains no certificate of an authority".to_owned(),
-        });
-    }
-    let config = ClientConfig::builder_with_provider(provider)
-        .with_safe_default_protocol_versions()?
-        .with_root_certificates(roots);
-    let config = match &broker.client {
-        None => config.with_no_client_auth(),
-        Some((certificate, key)) => {
-            let key_file = key;
-            let key =
-                PrivateKeyDer::from_pem_file(key_file).map_err(|error| OpenError::Content {
-                    path: key_file.clone(),
-                    problem: format!("cannot read a private key: {error}"),
-                })?;
-            config.with_client_auth_cert(certificates(certificate)?, key)?
-        }
+/// Returns the verification of the broker. Its authorities are those of the mapping, or the usual.
+fn tls(broker: &Broker) -> Result<TlsVerification, TlsError> {
+    let authorities = match &broker.ca {
+        Some(file) => TlsAuthorities::read(file)?,
+        None => TlsAuthorities::usual()?,
     };
-    Ok(Tls {
-        config: Arc::new(config),
-        host: ServerName::try_from(broker.address.host.clone())?,
-    })
+    let client = broker.client.as_ref();
+    let identity = client.map(|(certificate, key)| TlsIdentity::read(certificate, key));
+    TlsVerification::with_identity(&broker.address.host, &authorities, identity.transpose()?)
 }
-
-fn certificates(path: &Path) -> Result<Vec<CertificateDer<'static>>, OpenError> {
-    let content = |error: &dyn std::fmt::Display| OpenError::Content {
-        path: path.to_owned(),
-        problem: format!("cannot read a certificate: {error}"),
-    };
-    let all = CertificateDer::pem_file_iter(path).map_err(|error| content(&error))?;
-    all.collect::<Result<_, _>>()
-        .map_err(|error| content(&error))
-}
-
-/// The authorities of Debian and its relatives.
-const SYSTEM_CA: &str = "/etc/ssl/certs/ca-certificates.crt";

@@ -7,7 +7,6 @@ use std::time::Duration;
 use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::net::{TcpStream, lookup_host};
 use tokio::time::timeout;
-use tokio_rustls::TlsConnector;
 
 use crate::settings::BrokerSettings;
 
@@ -50,10 +49,7 @@ async fn secure(settings: &BrokerSettings, tcp: TcpStream) -> io::Result<Box<dyn
     socket2::SockRef::from(&tcp).set_linger(Some(Duration::ZERO))?;
     match &settings.tls {
         None => Ok(Box::new(tcp)),
-        Some(tls) => {
-            let connector = TlsConnector::from(tls.config.clone());
-            Ok(Box::new(connector.connect(tls.host.clone(), tcp).await?))
-        }
+        Some(tls) => Ok(Box::new(tls.connect(tcp).await?)),
     }
 }
 
