@@ -27,6 +27,7 @@ use tracing::debug;
 
 use crate::security::{ChannelSecurity, application_uri};
 use crate::services::{self, OwnDescription, RegistryAnswer, RegistryQuery};
+use crate::uses::{ConnectionUse, UseOrder};
 use crate::wire::{
     Conversation, FrameKind, MOST_CHUNK, MOST_CHUNKS, MOST_HEARD, ReceivedMessage, WireFault,
     policy,
@@ -46,6 +47,7 @@ pub(crate) struct ServerShared {
     /// Whether clients on this host may register over an unsecured channel.
     host_may: bool,
     last_channel: AtomicU32,
+    pub(crate) uses: UseOrder,
 }
 
 /// Counters of requests and faults.
@@ -77,6 +79,7 @@ impl ServerShared {
             counters: RequestCounters::default(),
             host_may: true,
             last_channel: AtomicU32::new(0),
+            uses: UseOrder::default(),
         }
     }
 
@@ -105,8 +108,11 @@ impl ServerShared {
 }
 
 /// Serves a client until it disconnects, times out, or violates the protocol.
-pub(crate) async fn serve<S>(stream: S, peer: SocketAddr, shared: &ServerShared)
-where
+pub(crate) async fn serve<S>(
+    stream: S,
+    (peer, used): (SocketAddr, ConnectionUse),
+    shared: &ServerShared,
+) where
     S: AsyncRead + AsyncWrite + Unpin,
 {
     let mut conversation = Conversation::new(stream, Role::Server);
@@ -118,6 +124,7 @@ where
     let mut connection = Connection {
         conversation,
         peer,
+        used,
         shared,
         lifetime: FIRST_IDLE,
         url: shared.own.url.clone(),
@@ -145,6 +152,7 @@ where
 struct Connection<'a, S> {
     conversation: Conversation<S>,
     peer: SocketAddr,
+    used: ConnectionUse,
     shared: &'a ServerShared,
     /// The timeout without a message.
     lifetime: Duration,
@@ -164,6 +172,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<'_, S> {
             let Ok(received) = timeout(self.lifetime, request).await else {
                 return Err(LATE);
             };
+            self.shared.uses.note(&self.used);
             let (response, request_id) = match received {
                 Ok(ReceivedMessage {
                     message: RequestMessage::CloseSecureChannel(_),
@@ -442,7 +451,10 @@ mod tests {
     fn connect(shared: &Arc<ServerShared>) -> DuplexStream {
         let (here, there) = duplex(1 << 20);
         let shared = Arc::clone(shared);
-        tokio::spawn(async move { serve(there, PEER, &shared).await });
+        tokio::spawn(async move {
+            let used = shared.uses.begin();
+            serve(there, (PEER, used), &shared).await;
+        });
         here
     }
 

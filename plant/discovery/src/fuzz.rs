@@ -40,7 +40,8 @@ pub async fn answered(said: &[u8]) -> (Vec<u8>, usize) {
     let shared = Arc::new(ServerShared::new(own, None, ask));
     let mut heard = Vec::new();
     let peer = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 9);
-    serve(tokio::io::join(said, &mut heard), peer, &shared).await;
+    let client = (peer, shared.uses.begin());
+    serve(tokio::io::join(said, &mut heard), client, &shared).await;
     drop(shared);
     (heard, answers.await.unwrap_or_default())
 }

@@ -32,6 +32,7 @@ pub mod scan;
 mod security;
 mod services;
 pub mod ua_lds;
+mod uses;
 mod watch;
 mod wire;
 
