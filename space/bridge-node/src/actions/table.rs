@@ -12,14 +12,14 @@ use bridge_core::ExecutionId;
 use bytes::Bytes;
 use uadp::Timestamp;
 
-use self::goal::Goal;
+use self::goal::ExecutedGoal;
 use super::graph::GraphGoalId;
 use super::wire::GoalAnswer;
 
 /// The goals by id. Ended goals are kept for a while.
 #[derive(Debug, Default)]
 pub(super) struct Goals {
-    known: HashMap<GraphGoalId, Goal>,
+    known: HashMap<GraphGoalId, ExecutedGoal>,
     /// The ids in the order of arrival.
     order: VecDeque<GraphGoalId>,
     /// Total size of the kept results in bytes.
@@ -94,7 +94,7 @@ impl Goals {
         if !self.has_room() {
             return GoalDecision::Full;
         }
-        self.known.insert(id, Goal::new(execution));
+        self.known.insert(id, ExecutedGoal::new(execution));
         self.order.push_back(id);
         GoalDecision::Send
     }
@@ -105,7 +105,7 @@ impl Goals {
             return true;
         }
         let known = &self.known;
-        let ended = |id: &GraphGoalId| known.get(id).is_none_or(Goal::has_ended);
+        let ended = |id: &GraphGoalId| known.get(id).is_none_or(ExecutedGoal::has_ended);
         let Some(oldest) = self.order.iter().position(ended) else {
             return false;
         };
@@ -125,7 +125,8 @@ impl Goals {
     fn make_room(&mut self, but: GraphGoalId) {
         while self.kept > MOST_BYTES {
             let known = &self.known;
-            let ended = |id: &GraphGoalId| *id != but && known.get(id).is_none_or(Goal::has_ended);
+            let ended =
+                |id: &GraphGoalId| *id != but && known.get(id).is_none_or(ExecutedGoal::has_ended);
             let Some(oldest) = self.order.iter().position(ended) else {
                 return;
             };
@@ -210,7 +211,7 @@ impl Goals {
         execution: ExecutionId,
         until: Instant,
     ) -> ResultDecision {
-        let waiting: usize = self.known.values().map(Goal::waiting).sum();
+        let waiting: usize = self.known.values().map(ExecutedGoal::waiting).sum();
         let goal = self.known.get_mut(&id);
         goal.map_or(ResultDecision::NoGoal, |goal| {
             goal.want((execution, until), waiting >= MOST_WAITING)
@@ -233,7 +234,7 @@ impl Goals {
     pub(super) fn undecided(&self) -> Vec<GraphGoalId> {
         let sent = self.order.iter().filter(|id| {
             let goal = self.known.get(*id);
-            goal.is_some_and(Goal::is_undecided)
+            goal.is_some_and(ExecutedGoal::is_undecided)
         });
         sent.copied().collect()
     }
@@ -255,7 +256,7 @@ impl Goals {
     /// cancelled: servers refuse a second cancellation.
     pub(super) fn cancel_refused(&mut self, id: GraphGoalId) -> bool {
         let goal = self.known.get_mut(&id);
-        goal.is_none_or(Goal::refuse_cancel)
+        goal.is_none_or(ExecutedGoal::refuse_cancel)
     }
 
     /// Notes that the server has agreed to cancel the goal.
@@ -267,7 +268,7 @@ impl Goals {
 
     /// Returns whether a goal is to be cancelled as soon as it is accepted.
     pub(super) fn is_withdrawn(&self, id: GraphGoalId) -> bool {
-        self.known.get(&id).is_some_and(Goal::is_withdrawn)
+        self.known.get(&id).is_some_and(ExecutedGoal::is_withdrawn)
     }
 
     /// Returns the withdrawn goals that the server has neither started nor refused to cancel, each
@@ -283,7 +284,7 @@ impl Goals {
     /// Returns the progress of a goal.
     pub(super) fn progress(&self, id: GraphGoalId) -> CancelProgress {
         let goal = self.known.get(&id);
-        goal.map_or(CancelProgress::Unknown, Goal::progress)
+        goal.map_or(CancelProgress::Unknown, ExecutedGoal::progress)
     }
 
     /// Returns the running goals that were accepted at `until` or before.
@@ -311,7 +312,7 @@ impl Goals {
         let known = &mut self.known;
         let before = known.len();
         known.retain(|_, goal| !goal.is_expired(now));
-        self.kept = known.values().map(Goal::bytes).sum();
+        self.kept = known.values().map(ExecutedGoal::bytes).sum();
         let forgotten = known.len() < before;
         if forgotten {
             self.order.retain(|id| known.contains_key(id));

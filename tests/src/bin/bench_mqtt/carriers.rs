@@ -13,13 +13,13 @@ use uadp::{
 };
 
 /// Two carriers. The second runs in a thread of its own until the program ends.
-pub(crate) struct Carriers {
+pub(crate) struct CarrierPair {
     runtime: Runtime,
     carrier: Mqtt,
     number: u32,
 }
 
-impl Carriers {
+impl CarrierPair {
     /// Connects both with a broker.
     pub(crate) fn connect(broker: &str) -> Self {
         let address = broker.to_owned();

@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use system_tests::{BROKER, Cell, Child, Peer};
 
-use carriers::Carriers;
+use carriers::CarrierPair;
 
 fn main() -> ExitCode {
     let args: Vec<String> = std::env::args().skip(1).collect();
@@ -23,7 +23,7 @@ fn main() -> ExitCode {
     let broker = cell.mosquitto_with("listener 1883 127.0.0.1\nallow_anonymous true\n");
     println!("| bytes | path | round trips | p50 | p99 | p50 / paho |");
     println!("|---|---|---|---|---|---|");
-    let mut own = Carriers::connect(BROKER);
+    let mut own = CarrierPair::connect(BROKER);
     let mut is_met = true;
     for size in [100, 1000, 10_000] {
         is_met &= measure((&cell, &mut own), size, round_trips);
@@ -40,7 +40,7 @@ fn main() -> ExitCode {
 
 /// Measures round trips of messages of a size in bytes, and prints the results in microseconds.
 /// Returns whether those of the carriers are short enough.
-fn measure((cell, own): (&Cell, &mut Carriers), size: usize, round_trips: usize) -> bool {
+fn measure((cell, own): (&Cell, &mut CarrierPair), size: usize, round_trips: usize) -> bool {
     let mut paho = Paho::connect(cell, size);
     let (mut of_own, mut of_paho) = (Vec::new(), Vec::new());
     let each = round_trips.div_ceil(TURNS);

@@ -12,7 +12,7 @@ use crate::actions::wire::GoalAnswer;
 
 /// A goal that was sent to its server.
 #[derive(Debug)]
-pub(super) struct Goal {
+pub(super) struct ExecutedGoal {
     state: State,
     /// Time of acceptance; zero before.
     stamp: Timestamp,
@@ -51,7 +51,7 @@ struct Waiting {
     until: Instant,
 }
 
-impl Goal {
+impl ExecutedGoal {
     /// Creates a goal that is sent for a request.
     pub(super) fn new(execution: ExecutionId) -> Self {
         Self {
