@@ -39,7 +39,7 @@ use plant_opcua::client::{
 };
 use plant_opcua::types::StatusCode;
 
-pub use choice::{Chosen, Needs, ToolState};
+pub use choice::{Chosen, Needs, ToolState, plate_between};
 pub use detector::{Detected, Detector};
 pub use find::{FoundParameter, FoundSkill, FoundType};
 pub use handle::{RemoteState, SkillHandle};

@@ -44,7 +44,7 @@ pub use client::{
     Chosen, ClientOptions, Detected, Detector, FailedLocator, FoundParameter, FoundSkill,
     FoundType, LocatorError, MirroredSkill, Mirrors, Needs, NotLocated, PartnerError, PeerAccess,
     RemoteState, SkillClient, SkillHandle, SkillStates, StartCondition, StationChanges, ToolState,
-    Unchosen, UnfitGrasp, Watchable,
+    Unchosen, UnfitGrasp, Watchable, plate_between,
 };
 pub use component::{
     ChangeKind, Component, ComponentSecurity, Device, DeviceKinds, DriverFault, DriverSetup,

@@ -112,6 +112,19 @@ pub enum Unchosen {
         /// The ApplicationUri of the changer.
         changer: String,
     },
+    /// The tool is attached to a tool changer that is not known to be at the robot.
+    #[error("{tool} is attached to {changer}, {}", match &**robot {
+        "" => "which does not show its robot".to_owned(),
+        robot => format!("which is at another robot, {robot}"),
+    })]
+    AttachedElsewhere {
+        /// The ApplicationUri of the tool.
+        tool: String,
+        /// The ApplicationUri of the changer.
+        changer: String,
+        /// The robot that the changer shows; empty if it shows none.
+        robot: String,
+    },
     /// The named tool is not attached.
     #[error("{named} is not attached to {changer}, which has {current}")]
     OtherTool {

@@ -38,6 +38,13 @@ impl ToolState {
         self.current.as_deref().filter(|tool| !tool.is_empty())
     }
 
+    /// Returns whether the tool changer is at a robot, given by its ApplicationUri and its
+    /// endpoint.
+    fn is_at(&self, (application_uri, endpoint): (&str, &str)) -> bool {
+        let is_it = self.mover == application_uri || is_same_endpoint(&self.mover, endpoint);
+        !self.mover.is_empty() && is_it
+    }
+
     /// Returns what a component is attached to by this tool changer. The component is given by its
     /// ApplicationUri, and by its endpoint if that is known.
     pub fn attachment(&self, component: &str, endpoint: Option<&str>) -> Attachment {
@@ -94,14 +101,14 @@ impl SkilledComponent {
 
     fn candidate(
         &self,
-        fits: Result<(), OutOfWorkspace>,
+        fits: Result<(), String>,
         attachment: Attachment,
         prefer: &[String],
     ) -> SkillCandidate<&Self> {
         SkillCandidate {
             of: self,
             name: self.application_uri.clone(),
-            fits: fits.map_err(|why| why.to_string()),
+            fits,
             rank: CandidateRank {
                 attachment,
                 preference: CandidateRank::preference(prefer, &self.application_uri),
@@ -190,13 +197,9 @@ impl PeerAccess {
         }
         let detector = self.detector.as_ref();
         let detector = detector.ok_or_else(|| wrong(Unchosen::NoDiscovery))?;
-        let moves = ["PtpMoveSkillType", "LinearMoveSkillType"];
-        let robots = candidates(detector, &moves).await;
+        let robots = candidates(detector, &MOVES).await;
         if robots.is_empty() {
-            return Err(wrong(Unchosen::Missing {
-                candidate: format!("robot with {}", moves.join(" and ")),
-                unreadable: detector.unreadable(),
-            }));
+            return Err(wrong(no_robot(detector)));
         }
         let reached: Vec<_> = robots
             .iter()
@@ -212,9 +215,45 @@ impl PeerAccess {
                 true => Attachment::CarriesTool,
                 false => Attachment::None,
             };
+            let fits = fits.map_err(|why| why.to_string());
             robot.candidate(fits, attachment, needs.prefer)
         });
         chosen("robot", judged.collect()).map_err(wrong)
+    }
+
+    /// Returns the robot that carries a tool changer: the given robot, or the only robot. It is
+    /// chosen neither by its reach nor by its tool, because the changer is on one robot only.
+    ///
+    /// # Errors
+    /// There is no robot, there are several, or the robot does not reach a position, m.
+    pub async fn carrier(
+        &self,
+        given: Option<&Partner>,
+        positions: &[[f64; 3]],
+    ) -> Result<Chosen, PartnerError> {
+        let robot = match given {
+            Some(partner) => partner.clone(),
+            None => Partner::At(self.only_robot().await.map_err(PartnerError::Robot)?),
+        };
+        let needs = Needs {
+            positions,
+            ..Needs::default()
+        };
+        self.robot(Some(&robot), &needs).await
+    }
+
+    /// Returns the endpoint of the only robot.
+    async fn only_robot(&self) -> Result<String, Unchosen> {
+        let detector = self.detector.as_ref().ok_or(Unchosen::NoDiscovery)?;
+        let robots = candidates(detector, &MOVES).await;
+        match robots.as_slice() {
+            [] => Err(no_robot(detector)),
+            [robot] => Ok(robot.endpoint.clone()),
+            several => Err(Unchosen::Several {
+                candidate: "robot",
+                list: list(&several.iter().collect::<Vec<_>>()),
+            }),
+        }
     }
 
     /// Returns the robots that carry a tool at a tool changer.
@@ -240,12 +279,17 @@ impl PeerAccess {
                 reason: "named".to_owned(),
             });
         };
-        let mounted = self.mounted(detector, mover).await;
+        let changers = self.changers(detector).await;
+        let uri = uri_at(detector, mover);
+        let mounted = changers
+            .iter()
+            .find(|(_, state)| state.is_at((&uri, mover)));
         let named = match given {
             Some(partner) => Some(self.endpoint(partner).await?),
             None => None,
         };
         if let Some((changer, state)) = mounted {
+            let changer = changer.clone();
             let Some(current) = &state.current else {
                 return Err(wrong(Unchosen::UnknownTool { changer }));
             };
@@ -272,6 +316,8 @@ impl PeerAccess {
             reason: reason.to_owned(),
         };
         if let Some(named) = named {
+            let gripper = uri_at(detector, &named);
+            attached_elsewhere(&changers, &gripper).map_err(wrong)?;
             return Ok(at_flange(named, "named"));
         }
         let grippers = candidates(detector, &["GraspSkillType", "ReleaseSkillType"]).await;
@@ -287,20 +333,15 @@ impl PeerAccess {
             }));
         }
         let all = grippers.iter();
-        let judged = all.map(|gripper| gripper.candidate(Ok(()), Attachment::None, prefer));
+        let judged = all.map(|gripper| {
+            let fits = attached_elsewhere(&changers, &gripper.application_uri);
+            let fits = fits.map_err(|why| why.to_string());
+            gripper.candidate(fits, Attachment::None, prefer)
+        });
         let Chosen {
             endpoint, reason, ..
         } = chosen("gripper", judged.collect()).map_err(wrong)?;
         Ok(at_flange(endpoint, &reason))
-    }
-
-    /// Returns the tool changer on a robot with its current state, and its name.
-    async fn mounted(&self, detector: &Detector, mover: &str) -> Option<(String, ToolState)> {
-        let uri = uri_at(detector, mover);
-        let changers = self.changers(detector).await;
-        changers.into_iter().find(|(_, state)| {
-            is_same_endpoint(&state.mover, mover) || (!uri.is_empty() && state.mover == uri)
-        })
     }
 
     /// Reads the state of all tool changers.
@@ -374,6 +415,56 @@ impl PeerAccess {
             return Err(LocatorError::Failed { message });
         }
         object_of(&outcome).ok_or(LocatorError::NoPose)
+    }
+}
+
+/// Returns the pose of the tool plate of a gripper in the frame of the flange of a robot: that of
+/// the tool changer between them, or zeros without one. The robot is given by its ApplicationUri
+/// and its endpoint, the gripper by its ApplicationUri, and the tool changers by their names.
+///
+/// # Errors
+/// The tool changer of the robot has another tool, no tool or an unknown one, or the gripper is
+/// attached to the tool changer of another robot.
+pub fn plate_between(
+    changers: &[(String, ToolState)],
+    robot: (&str, &str),
+    gripper: &str,
+) -> Result<[f64; 6], Unchosen> {
+    let mut all = changers.iter();
+    let Some((changer, state)) = all.find(|(_, state)| state.is_at(robot)) else {
+        attached_elsewhere(changers, gripper)?;
+        return Ok([0.0; 6]);
+    };
+    let changer = changer.clone();
+    match state.current.as_deref() {
+        None => Err(Unchosen::UnknownTool { changer }),
+        Some("") => Err(Unchosen::NoTool { changer }),
+        Some(current) if current == gripper => Ok(state.plate),
+        Some(current) => Err(Unchosen::OtherTool {
+            named: gripper.to_owned(),
+            changer,
+            current: current.to_owned(),
+        }),
+    }
+}
+
+/// Checks that a gripper is attached to no tool changer, so that it may be at a flange.
+fn attached_elsewhere(changers: &[(String, ToolState)], gripper: &str) -> Result<(), Unchosen> {
+    let mut all = changers.iter();
+    let holder = all.find(|(_, state)| state.tool() == Some(gripper));
+    holder.map_or(Ok(()), |(changer, state)| {
+        Err(Unchosen::AttachedElsewhere {
+            tool: gripper.to_owned(),
+            changer: changer.clone(),
+            robot: state.mover.clone(),
+        })
+    })
+}
+
+fn no_robot(detector: &Detector) -> Unchosen {
+    Unchosen::Missing {
+        candidate: format!("robot with {}", MOVES.join(" and ")),
+        unreadable: detector.unreadable(),
     }
 }
 
@@ -508,6 +599,8 @@ pub(super) async fn fitting_grasp(
     Err(PartnerError::NoFittingGrasp { unfit })
 }
 
+/// The skills of a robot.
+const MOVES: [&str; 2] = ["PtpMoveSkillType", "LinearMoveSkillType"];
 /// Time limit to find a component.
 const FOUND_WITHIN: Duration = Duration::from_secs(10);
 /// Time limit to read the state of a tool changer.

@@ -7,7 +7,9 @@ use std::time::Duration;
 use async_trait::async_trait;
 use tokio::sync::watch;
 
-use super::{ClientOptions, Detector, Needs, PeerAccess, Remote, SkillClient, ToolState};
+use super::{
+    ClientOptions, Detector, Needs, PeerAccess, Remote, SkillClient, ToolState, plate_between,
+};
 use crate::choosing::Attachment;
 use crate::component::{Component, Device, DriverFault, DriverSetup, Partner};
 use crate::conformance;
@@ -368,6 +370,14 @@ async fn the_robot_that_reaches_the_positions_is_chosen_with_a_reason_for_each_o
     let named = choose([0.9, 0.0, 0.1], &[], Some("urn:test:short")).await;
     assert!(named.unwrap_err().to_string().contains(too_far));
 
+    // A tool changer is on one robot, which its reach and its tool do not tell.
+    let far = [[0.9, 0.0, 0.1]];
+    let any = peers.carrier(None, &far).await.unwrap_err().to_string();
+    assert!(any.contains("several robots are found"), "{any}");
+    let short = Partner::Called("urn:test:short".to_owned());
+    let short = peers.carrier(Some(&short), &far).await.unwrap_err();
+    assert!(short.to_string().contains(too_far), "{short}");
+
     // The robot itself refuses the target, too.
     let skill = &robots[0].skills()[0];
     let target = SkillValue::from([0.9, 0.0, 0.1, 0.0, 0.0, 0.0]);
@@ -377,6 +387,76 @@ async fn the_robot_that_reaches_the_positions_is_chosen_with_a_reason_for_each_o
     assert_eq!(refused.text, format!("TargetPosition: {too_far}"));
     for server in robots {
         server.stop().await;
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_gripper_at_the_tool_changer_of_another_robot_is_not_used() {
+    let cell = Cell::new().await;
+    let other = "which is at another robot, opc.tcp://127.0.0.1:9";
+    for (mover, expected) in [
+        ("opc.tcp://127.0.0.1:9", other),
+        ("", "which does not show its robot"),
+    ] {
+        cell.tool
+            .send_modify(|state| state.mover = mover.to_owned());
+        cell.attach(Some("urn:test:cup")).await;
+        let given = [
+            ("ObjectId", "box"),
+            ("ToolSkillControllerEndpoint", "urn:test:cup"),
+        ];
+        let outcome = cell.run(&given).await.unwrap();
+        let expected = format!("urn:test:cup is attached to urn:test:changer, {expected}");
+        assert!(
+            !outcome.succeeded && outcome.message.contains(&expected),
+            "{}",
+            outcome.message
+        );
+        cell.attach(None).await;
+    }
+    assert_eq!(cell.runs(), [0, 0, 0]);
+    // The other gripper is the only one that may be at the flange.
+    cell.attach(Some("urn:test:cup")).await;
+    let outcome = cell.run(&[("ObjectId", "box")]).await.unwrap();
+    assert!(outcome.succeeded, "{}", outcome.message);
+    assert_eq!(cell.runs()[1..], [1, 0]);
+    for server in cell.others {
+        server.stop().await;
+    }
+}
+
+#[test]
+fn the_plate_is_that_of_the_changer_between_robot_and_gripper() {
+    let plate = [0.0, 0.0, 0.047, 0.0, 0.0, 0.0];
+    let at = |current: Option<&str>| {
+        let state = ToolState {
+            plate,
+            current: current.map(str::to_owned),
+            mover: "opc.tcp://one:4840".to_owned(),
+        };
+        [("urn:test:changer".to_owned(), state)]
+    };
+    let one = ("urn:test:one", "opc.tcp://one:4840/");
+    let two = ("urn:test:two", "opc.tcp://two:4840");
+    let of = |current, robot, gripper| {
+        let found = plate_between(&at(current), robot, gripper);
+        found.map_err(|why| why.to_string())
+    };
+    assert_eq!(of(Some("urn:cup"), one, "urn:cup"), Ok(plate));
+    assert_eq!(of(Some("urn:cup"), two, "urn:fingers"), Ok([0.0; 6]));
+    for (current, robot, gripper, expected) in [
+        (
+            Some("urn:cup"),
+            one,
+            "urn:fingers",
+            "urn:fingers is not attached",
+        ),
+        (Some(""), one, "urn:cup", "no tool is attached"),
+        (None, one, "urn:cup", "is unknown"),
+        (Some("urn:cup"), two, "urn:cup", "which is at another robot"),
+    ] {
+        let why = of(current, robot, gripper).unwrap_err();
+        assert!(why.contains(expected), "{why}");
     }
 }
 
