@@ -17,10 +17,11 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use async_trait::async_trait;
+use skills::frame::Frame;
 use skills::{
     Builtin, COMPOSITE_HALT_TIMEOUT, Chosen, Device, DeviceValue, Driver, DriverError, DriverFault,
-    InvalidParameter, Measured, Needs, ParameterType, Parameters, Partner, PartnerError,
-    PeerAccess, RunResults, RunnableSkill, SkillFault, SkillValue, ToolState, Work,
+    InvalidParameter, Measured, ParameterType, Parameters, Partner, PartnerError, PeerAccess,
+    RunResults, RunnableSkill, SkillFault, SkillValue, ToolState, Work,
 };
 use tokio::sync::watch;
 use tokio::time::{Instant, sleep, timeout};
@@ -274,8 +275,7 @@ impl KelvinChanger {
         if !is_called && !self.shown.borrow().mover.is_empty() {
             return;
         }
-        if let Ok(Chosen { endpoint, .. }) = peers.robot(partner.as_ref(), &Needs::default()).await
-        {
+        if let Ok(Chosen { endpoint, .. }) = peers.carrier(partner.as_ref(), &[]).await {
             self.change(|state| state.mover = endpoint);
         }
     }
@@ -317,6 +317,11 @@ impl Tool {
         ]
     }
 
+    /// Returns the move away from the dock with the tool.
+    fn leave(&self) -> Way {
+        ("Approach", true, self.beside((FRONT, APPROACH), LOCKED))
+    }
+
     /// Returns the moves to put the tool back, in the reverse direction.
     fn put(&self) -> [Way; 6] {
         [
@@ -330,6 +335,23 @@ impl Tool {
     }
 }
 
+/// Returns the positions of the moves to put a tool and to take another one, m.
+fn targets(put: Option<&Tool>, take: Option<&Tool>) -> Vec<[f64; 3]> {
+    let put = put.into_iter().flat_map(Tool::put);
+    let take = take.into_iter();
+    let take = take.flat_map(|tool| tool.take().into_iter().chain([tool.leave()]));
+    let position = |(_, _, [x, y, z, ..]): Way| [x, y, z];
+    put.chain(take).map(position).collect()
+}
+
+/// Returns whether the axis of a flange is vertical. The ring of the changer is turned about the
+/// vertical axis of the robot's base, so docks that are tilted do not fit.
+pub(crate) fn is_vertical([.., a, b, c]: [f64; 6]) -> bool {
+    let flange = Frame::of_pose([0.0, 0.0, 0.0, a, b, c]);
+    let [.., along] = flange.then(&Frame::at([0.0, 0.0, 1.0])).position();
+    along.abs() >= LEAST_VERTICAL
+}
+
 #[async_trait]
 impl Driver for Change {
     /// Halt waits for the moves of the robot.
@@ -338,6 +360,13 @@ impl Driver for Change {
     }
 
     fn check(&self, parameters: &Parameters) -> Result<(), InvalidParameter> {
+        if let Some(pose) = tool_position(parameters).filter(|pose| !is_vertical(*pose)) {
+            return Err(InvalidParameter::Unexpected {
+                name: TOOL_POSITION.to_owned(),
+                given: Some(pose.into()),
+                expected: format!("is no dock: {NOT_VERTICAL}"),
+            });
+        }
         match self.what {
             ChangerAction::Detach => Ok(()),
             ChangerAction::Attach | ChangerAction::Change => self.wanted(parameters).map(drop),
@@ -390,7 +419,9 @@ impl Driver for Change {
         let put = put.as_ref();
         let changer = &self.changer;
         let found = |endpoint: &str| changer.change(|state| endpoint.clone_into(&mut state.mover));
-        let mover = ConnectedMover::open(&changer.mover, &changer.peers, found, &work).await?;
+        let targets = targets(put, wanted);
+        let opened = ConnectedMover::open(&changer.mover, &changer.peers, &targets, found, &work);
+        let mover = opened.await?;
         let moved = self.moved(&mover, &mut look, (put, wanted), &work).await;
         mover.close().await;
         match moved {
@@ -437,8 +468,7 @@ impl Change {
 
     /// Returns a tool at the ToolPosition of a request, or at its dock.
     fn at(&self, tool: &Tool, parameters: Option<&Parameters>) -> Tool {
-        let given = parameters.and_then(|parameters| parameters.six("ToolPosition"));
-        let given = given.filter(|pose| pose.iter().any(|number| *number != 0.0));
+        let given = parameters.and_then(tool_position);
         Tool {
             dock: given.unwrap_or_else(|| self.changer.dock(tool)),
             ..tool.clone()
@@ -576,11 +606,16 @@ impl Change {
             look.until(ChangerReading::Tool(tool.number), work).await?;
             self.changer.remember(tool);
             self.changer.show(Some(ChangerReading::Tool(tool.number)));
-            let approach = ("Approach", true, tool.beside((FRONT, APPROACH), LOCKED));
-            mover.go(&[approach], within, work).await?;
+            mover.go(&[tool.leave()], within, work).await?;
         }
         Ok(())
     }
+}
+
+/// Returns the ToolPosition of a request, unless it is left to the changer.
+fn tool_position(parameters: &Parameters) -> Option<[f64; 6]> {
+    let given = parameters.six(TOOL_POSITION)?;
+    given.iter().any(|number| *number != 0.0).then_some(given)
 }
 
 fn attached_tool(tool: Option<&Tool>) -> RunResults {
@@ -602,6 +637,12 @@ const VALUES: [DeviceValue; 2] = [
     ),
 ];
 
+const TOOL_POSITION: &str = "ToolPosition";
+/// The reason against a dock whose flange is tilted.
+pub(crate) const NOT_VERTICAL: &str =
+    "the axis of the flange has to be vertical, with rotations about x and y of 0 or half a turn";
+/// The cosine of the largest tilt of a flange at a dock, 1 degree.
+const LEAST_VERTICAL: f64 = 0.999_85;
 /// Offsets for moving into and out of a dock, in m.
 const BACK: f64 = 0.045;
 const FRONT: f64 = 0.15;

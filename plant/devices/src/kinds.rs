@@ -189,6 +189,13 @@ fn read_tool(node: &DocumentNode, reader: &mut YamlReader<'_>) -> Option<kelvin:
         let message = "a dock is six numbers: x, y, z in m and rotations about x, y, z in rad";
         reader.refuse(dock, YamlFindingCode::WrongValue, message.to_owned())
     });
+    if six.is_some_and(|pose| !kelvin::is_vertical(pose)) {
+        let message = format!(
+            "a dock of this changer is not tilted: {}",
+            kelvin::NOT_VERTICAL
+        );
+        return reader.refuse(dock, YamlFindingCode::WrongValue, message);
+    }
     Some(kelvin::Tool {
         number: number?,
         uri: uri?.to_owned(),
@@ -307,6 +314,10 @@ mod tests {
             (
                 "{kelvin_tool_changer: {converter: tcp://h:1, robot: h, tools: [{number: 11, uri: urn:t, dock: [1]}]}}",
                 "a dock is six numbers",
+            ),
+            (
+                "{kelvin_tool_changer: {converter: tcp://h:1, robot: h, tools: [{number: 1, uri: urn:t, dock: [0, 0, 0, 1.5, 0, 0]}]}}",
+                "a dock of this changer is not tilted",
             ),
         ];
         for (device, part) in cases {

@@ -23,6 +23,8 @@ pub(super) enum KelvinError {
     Unsteady,
     #[error("the tool changer has not switched within {:?}", SWITCHED)]
     NotSwitched,
+    #[error("the tool changer has tool {found} in the place of tool {wanted}")]
+    OtherTool { wanted: u8, found: u8 },
     #[error("nothing is moved: {now}, and somebody has to look at it")]
     Between { now: ChangerReading },
     #[error("nothing is moved: tool {number} has to be detached first")]
@@ -83,6 +85,7 @@ impl From<KelvinError> for DriverError {
             | KelvinError::Voltage(_)
             | KelvinError::Unsteady
             | KelvinError::NotSwitched
+            | KelvinError::OtherTool { .. }
             | KelvinError::Between { .. }
             | KelvinError::Occupied { .. }
             | KelvinError::NoDock { .. }

@@ -70,10 +70,18 @@ impl Look {
         work: &Work,
     ) -> Result<(), KelvinError> {
         let until = Instant::now() + SWITCHED;
+        // The voltage passes the levels of other tools while it rises.
+        let mut last = None;
         loop {
             let now = self.once().await?;
             if now == wanted || (wanted == ChangerReading::NoTool && now == ChangerReading::Ready) {
                 return Ok(());
+            }
+            let is_steady = last.replace(now) == Some(now);
+            if let (ChangerReading::Tool(wanted), ChangerReading::Tool(found)) = (wanted, now)
+                && is_steady
+            {
+                return Err(KelvinError::OtherTool { wanted, found });
             }
             if Instant::now() >= until {
                 return Err(KelvinError::NotSwitched);

@@ -4,8 +4,8 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use skills::{
-    Needs, ParameterType, PartEnd, PartnerError, PeerAccess, RunnableSkill, SkillClient,
-    SkillFault, SkillValue, Work, run_part,
+    ParameterType, PartEnd, PartnerError, PeerAccess, RunnableSkill, SkillClient, SkillFault,
+    SkillValue, Work, run_part,
 };
 
 use super::error::KelvinError;
@@ -19,10 +19,11 @@ pub(super) struct ConnectedMover {
 }
 
 impl ConnectedMover {
-    /// Connects to the robot. `found` receives its endpoint.
+    /// Connects to the robot, if it reaches the targets. `found` receives its endpoint.
     pub(super) async fn open(
         mover: &Mover,
         peers: &PeerAccess,
+        targets: &[[f64; 3]],
         found: impl FnOnce(&str) + Send,
         work: &Work,
     ) -> Result<Self, KelvinError> {
@@ -36,9 +37,8 @@ impl ConnectedMover {
             }
             Mover::Component(partner) => partner,
         };
-        let needs = Needs::default();
         let endpoint = tokio::select! {
-            chosen = peers.robot(partner.as_ref(), &needs) => chosen?.endpoint,
+            chosen = peers.carrier(partner.as_ref(), targets) => chosen?.endpoint,
             () = work.stopped() => return Err(KelvinError::Stopped),
         };
         found(&endpoint);

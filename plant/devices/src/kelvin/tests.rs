@@ -271,6 +271,46 @@ async fn a_tool_is_taken_and_put_where_the_tool_position_says_and_then_where_it_
     assert_eq!(bench.simulator.reading(), ChangerReading::Tool(1));
 }
 
+#[tokio::test]
+async fn a_tilted_tool_position_is_refused_before_anything_moves() {
+    let bench = bench().await;
+    let at = bench.robot.pose();
+    let down = std::f64::consts::PI;
+    for (angles, is_dock) in [([down, 0.0, 1.0], true), ([0.3, 0.0, 0.0], false)] {
+        let [a, b, c] = angles;
+        let pose = [2.0, 0.0, 0.2, a, b, c];
+        let given = vec![("ToolPosition".to_owned(), SkillValue::from(pose))];
+        let types = [ParameterType::own("DetachToolSkillType")];
+        let driver = bench.changer.driver(&types, &PeerAccess::default());
+        let ran = conformance::run_once("DetachToolSkillType", driver.unwrap(), given).await;
+        let refused = ran.err().map(|why| why.to_string());
+        let is_tilted = refused.is_some_and(|why| why.contains("the axis of the flange"));
+        assert_eq!(is_tilted, !is_dock);
+    }
+    assert_eq!(bench.robot.pose(), at);
+}
+
+#[tokio::test]
+async fn another_tool_than_the_wanted_one_is_named_and_stays_attached() {
+    let mut bench = bench().await;
+    let mut settings = (*bench.changer.settings).clone();
+    // Somebody has exchanged the tools in the docks.
+    settings.tools[0].dock = DOCKS[1];
+    bench.changer = KelvinChanger::new(settings, bench.changer.mover.clone());
+    let given = vec![("ToolAppUri".to_owned(), SkillValue::from(URIS[0]))];
+    let types = [ParameterType::own("AttachToolSkillType")];
+    let driver = bench.changer.driver(&types, &PeerAccess::default());
+    let ran = conformance::run_once("AttachToolSkillType", driver.unwrap(), given).await;
+    let outcome = ran.unwrap();
+    let expected = "the tool changer has tool 2 in the place of tool 1; tool 2 is attached";
+    assert_eq!(
+        (outcome.succeeded, outcome.message.as_str()),
+        (false, expected)
+    );
+    let shown = bench.changer.shown.borrow().current.clone();
+    assert_eq!(shown.as_deref(), Some(URIS[1]));
+}
+
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_locked_tool_is_awaited_and_switched_off_before_it_is_put_back() {
     let mut bench = bench().await;
