@@ -35,6 +35,12 @@ pub trait JobObserver: Send + Sync {
         warn!("{why}");
     }
 
+    /// Reports that the component of a part was lost after the start of the run: its machine may
+    /// move.
+    async fn lost_in_run(&self, why: &str) {
+        debug!("{why}");
+    }
+
     /// Completes when the job is to be stopped.
     async fn stopped(&self) {
         std::future::pending().await
@@ -56,6 +62,10 @@ impl JobObserver for Work {
     }
 
     async fn unknown(&self, why: &str) {
+        Self::unknown(self, why).await;
+    }
+
+    async fn lost_in_run(&self, why: &str) {
         Self::unknown(self, why).await;
     }
 
@@ -87,7 +97,8 @@ pub enum PartEnd<T> {
 
 /// Runs one skill to its end, or until `interrupted` is ready. An interrupted run is halted, and
 /// the function returns when the run has ended. Until then the teller shows that the cancellation
-/// is pending. If the end is unknown, the composite needs a Reset.
+/// is pending. If the end is unknown, the composite needs a Reset; the end of a run whose component
+/// is lost is unknown too.
 pub async fn run_part<T>(
     skill: &dyn RunnableSkill,
     parameters: Vec<(String, SkillValue)>,
@@ -100,15 +111,30 @@ pub async fn run_part<T>(
     let by = tokio::select! {
         // A run is never started after the interruption.
         biased;
-        why = skill.lost() => return PartEnd::Ended(Err(SkillFault::Lost(why))),
+        why = skill.lost() => {
+            let fault = SkillFault::Lost(why);
+            if has_begun {
+                teller.lost_in_run(&lost_in_run(skill, &fault)).await;
+            }
+            return PartEnd::Ended(Err(fault));
+        }
         by = interrupted => by,
         ended = async {
             has_begun = true;
             run.as_mut().await
         } => {
             let ended = known(skill, ended);
-            if let Err(fault @ SkillFault::NotHalted(_)) = &ended {
-                teller.unknown(&fault.to_string()).await;
+            match &ended {
+                Err(fault @ SkillFault::NotHalted(_)) => teller.unknown(&fault.to_string()).await,
+                Err(fault @ SkillFault::Lost(_)) => {
+                    teller.lost_in_run(&lost_in_run(skill, fault)).await;
+                }
+                Ok(_)
+                | Err(
+                    SkillFault::Refused { .. }
+                    | SkillFault::TimedOut(_)
+                    | SkillFault::Unexpected(_),
+                ) => {}
             }
             return PartEnd::Ended(ended);
         }
@@ -121,6 +147,11 @@ pub async fn run_part<T>(
         teller.unknown(&fault.to_string()).await;
     }
     PartEnd::Interrupted { by, halted }
+}
+
+fn lost_in_run(skill: &dyn RunnableSkill, fault: &SkillFault) -> String {
+    let name = skill.name();
+    format!("{name} was lost in its run, whose end is unknown: {fault}")
 }
 
 /// Halts a skill and waits for the end of its run.
@@ -209,6 +240,8 @@ mod tests {
         Refuses,
         /// The run takes a Halt, and its outcome is unknown.
         Lost,
+        /// The component is lost when the test lets it.
+        Vanishes,
     }
 
     struct Scripted {
@@ -243,8 +276,10 @@ mod tests {
             let run = self.runs.fetch_add(1, Ordering::Relaxed) + 1;
             let mut may_end = self.may_end.subscribe();
             may_end.wait_for(|may_end| *may_end).await.unwrap();
-            if self.way == Way::Refuses {
-                return Err(goes_on("gripper.Grasp"));
+            match self.way {
+                Way::Refuses => return Err(goes_on("gripper.Grasp")),
+                Way::Vanishes => return Err(SkillFault::Lost("no response".to_owned())),
+                Way::Done | Way::Halts | Way::Lost => {}
             }
             Ok(RunOutcome {
                 run,
@@ -259,7 +294,7 @@ mod tests {
         async fn halt(&self) -> Result<(), SkillFault> {
             self.halts.fetch_add(1, Ordering::Relaxed);
             match self.way {
-                Way::Done | Way::Halts | Way::Lost => Ok(()),
+                Way::Done | Way::Halts | Way::Lost | Way::Vanishes => Ok(()),
                 Way::Refuses => Err(goes_on("gripper.Grasp")),
             }
         }
@@ -347,6 +382,23 @@ mod tests {
             let why = "the end of run 1 of gripper.Grasp is unknown";
             assert!(outcome.message.contains(why), "{outcome:?}");
         }
+    }
+
+    #[tokio::test]
+    async fn a_composite_whose_part_is_lost_in_its_run_has_an_unknown_outcome() {
+        let (skill, grasp) = at_grasp(Way::Vanishes).await;
+        grasp.may_end.send_replace(true);
+        let shown = until(&skill, |shown| shown.state == ProgramMachineState::Halted).await;
+        assert!(shown.needs_reset);
+        let outcome = shown.outcome.clone().unwrap();
+        assert!(outcome.unknown);
+        // The robot, which is not lost, has retreated.
+        assert!(
+            outcome.message.ends_with("the robot has retreated"),
+            "{outcome:?}"
+        );
+        let start = skill.start_with(BY, Vec::new()).await.unwrap_err();
+        assert!(start.text.contains("Reset"), "{start:?}");
     }
 
     #[tokio::test]
