@@ -261,7 +261,11 @@ impl<R> SkillWork<R> {
         match stop {
             Stop::Pending => self.await_end(message.clone(), Then::Halt, now),
             Stop::BrokenOff(how) => message = format!("{message}; {how}"),
-            Stop::Done(_) | Stop::Stopped | Stop::Refused(_) => {}
+            // The run stays suspended, and can be resumed.
+            Stop::Refused(why) => {
+                return Err(SkillRefusal::new(RefusalCode::RequestNotAllowed, why));
+            }
+            Stop::Done(_) | Stop::Stopped => {}
         }
         // Aborted work that blocks its thread may still move the machine: its run ends, so that it
         // cannot be resumed, and the work is kept until its end.

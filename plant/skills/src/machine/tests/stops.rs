@@ -167,6 +167,30 @@ fn a_reset_of_suspended_work_without_a_known_end_halts() {
     bench.ask(ProgramMethod::Reset).unwrap();
 }
 
+#[test]
+fn a_reset_whose_cancellation_is_refused_leaves_the_run_suspended() {
+    let mut bench = Bench::new(ELSEWHERE);
+    let run = bench.run();
+    bench.ask(ProgramMethod::Suspend).unwrap();
+    for _ in 0..2 {
+        let reset = bench.call(ProgramMethod::Reset);
+        bench.report(run, Line::Refused("the robot goes on".to_owned()));
+        let refusal = bench.answer(reset).unwrap().unwrap_err();
+        assert_eq!(
+            refusal.to_string(),
+            "BadRequestNotAllowed: the robot goes on"
+        );
+        assert_eq!(bench.state(), ProgramMachineState::Suspended);
+    }
+    // The work goes on with the run.
+    bench.story();
+    bench.ask(ProgramMethod::Resume).unwrap();
+    assert!(bench.story().contains(&"signal Go".to_owned()));
+    bench.end(run, done());
+    assert!(!bench.outcome(run).unknown);
+    assert_eq!(bench.state(), ProgramMachineState::Ready);
+}
+
 /// Aborted work that blocks its thread gets no Go: its run ends at once, and cannot be resumed.
 #[test]
 fn a_reset_of_suspended_work_that_does_not_end_halts_with_an_unknown_outcome() {
