@@ -230,15 +230,26 @@ impl HttpSkill {
         work.step("Run").await;
         let mut answered = Instant::now();
         let mut until = None;
+        // After a Halt without a `stop` request: the time of the next report that it is refused.
+        let mut refusal = None;
         let mut step = None;
         loop {
             tokio::select! {
                 () = sleep(poll.every) => {}
-                () = work.stopped(), if until.is_none() => {
-                    until = Some(Instant::now() + self.halt_timeout);
-                    if let Err(fault) = self.halt(work).await {
-                        return Ended::Unknown(fault.into());
+                () = work.stopped(), if until.is_none() && refusal.is_none() => {
+                    match self.halt(work).await {
+                        Some(Ok(())) => until = Some(Instant::now() + self.halt_timeout),
+                        Some(Err(fault)) => return Ended::Unknown(fault.into()),
+                        None => {
+                            work.cancel_refused(NO_STOP).await;
+                            refusal = Some(Instant::now() + REFUSED_AGAIN);
+                        }
                     }
+                }
+                // A later Halt is refused too.
+                () = at(refusal) => {
+                    work.cancel_refused(NO_STOP).await;
+                    refusal = Some(Instant::now() + REFUSED_AGAIN);
                 }
                 () = at(until) => {
                     let limit = self.halt_timeout;
@@ -249,7 +260,7 @@ impl HttpSkill {
             // A slow response does not delay the stop.
             let asked = tokio::select! {
                 asked = poll.request.send(work.parameters(), within) => asked,
-                () = work.stopped(), if until.is_none() => continue,
+                () = work.stopped(), if until.is_none() && refusal.is_none() => continue,
                 () = at(until) => continue,
             };
             let answer = match asked {
@@ -270,15 +281,12 @@ impl HttpSkill {
         }
     }
 
-    /// Asks the device to stop on Halt.
-    async fn halt(&self, work: &Work) -> Result<(), HttpFault> {
-        work.pending("the device is asked to stop").await;
-        let Some(stopped) = self.stop(work.parameters()).await else {
-            let why = "the YAML has no `stop` request: the work goes on";
-            work.cancel_refused(why).await;
-            return Ok(());
-        };
-        stopped
+    /// Asks the device to stop on Halt; `None` if the YAML has no `stop` request.
+    async fn halt(&self, work: &Work) -> Option<Result<(), HttpFault>> {
+        if self.stop.is_some() {
+            work.pending("the device is asked to stop").await;
+        }
+        self.stop(work.parameters()).await
     }
 
     /// Sends the `stop` request; `None` if there is none.
@@ -495,6 +503,10 @@ const POLL: Duration = Duration::from_millis(100);
 /// The longest time without a response to polling.
 const LONGEST_SILENCE: Duration = Duration::from_secs(3);
 const LONGEST_REASON: usize = 200;
+const NO_STOP: &str = "the YAML has no `stop` request: the work goes on";
+/// Time between two reports that a Halt is refused. It is shorter than the time in which a Halt
+/// waits for the end of the work.
+const REFUSED_AGAIN: Duration = Duration::from_millis(500);
 
 #[cfg(test)]
 mod tests;

@@ -252,6 +252,25 @@ async fn halt_stops_the_device_also_while_a_response_is_slow() {
 }
 
 #[tokio::test]
+async fn without_a_stop_request_halt_is_refused_and_the_run_is_followed_to_its_end() {
+    let bench = Bench::new(200, &["running"]).await;
+    let without = POLLED.replace("stop: PRESS/stop, ", "");
+    let skill = bench.skill(&without.replace("halt_timeout: 2 s", "halt_timeout: 1 ms"));
+    start(&skill).await;
+    for _ in 0..2 {
+        let refused = skill.call(BY, ProgramMethod::Halt).await.unwrap_err();
+        let expected = "BadRequestNotAllowed: the YAML has no `stop` request: the work goes on";
+        assert_eq!(refused.to_string(), expected);
+        assert_eq!(skill.shown().state, ProgramMachineState::Running);
+    }
+    bench.press.lock().unwrap().states = vec!["done"];
+    let mut watch = skill.watch();
+    let ended = watch.wait_for(|shown| shown.state == ProgramMachineState::Ready);
+    let outcome = ended.await.unwrap().outcome.clone().unwrap();
+    assert!(outcome.succeeded && !outcome.unknown, "{outcome:?}");
+}
+
+#[tokio::test]
 async fn a_request_that_is_withdrawn_before_it_is_sent_is_not_sent() {
     let bench = Bench::new(200, &[]).await;
     let asked = DeviceRequest {
