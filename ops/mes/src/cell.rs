@@ -3,14 +3,14 @@
 mod facts;
 mod opened;
 mod parameters;
+mod tools;
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
-use std::time::{Duration, SystemTime};
+use std::time::SystemTime;
 
 use async_trait::async_trait;
-use futures_util::future::join_all;
 use knowledge::{
     ComponentFacts, Knowledge, KnowledgeSource, NodeName, QuestionAnswer, SourceKind,
     SourceLifetime, ValueQuery, ValueQueryFault,
@@ -18,12 +18,11 @@ use knowledge::{
 use serde::Serialize;
 use skills::choosing::Attachment;
 use skills::{
-    ClientOptions, FoundSkill, ParameterType, RunnableSkill as RunsOfSkill, SkillClient,
-    SkillValue, ToolState,
+    ClientOptions, FoundSkill, RunnableSkill as RunsOfSkill, SkillClient,
+    SkillValue, Unchosen,
 };
 use tokio::sync::watch;
 use tokio::task::spawn_blocking;
-use tokio::time::timeout;
 use tracing::{error, info, warn};
 
 use self::facts::skill_facts;
@@ -569,57 +568,19 @@ impl Plant for PlantState {
     }
 
     fn attachment(&self, component: &str) -> Attachment {
-        let present = self.present();
-        let endpoint = present.components.get(component).map(|of| &*of.endpoint);
-        let states = present.components.values().flat_map(Component::tool_states);
-        let mut all = states.map(|(_, state)| state.attachment(component, endpoint));
-        let attached = all.find(|attachment| *attachment != Attachment::None);
-        attached.unwrap_or_default()
+        self.attachment_of(component)
+    }
+
+    fn plate(&self, robot: &str, gripper: &str) -> Result<[f64; 6], Unchosen> {
+        self.plate_of(robot, gripper)
     }
 
     async fn read_tools(&self) {
-        let changers: Vec<(String, String, String)> = {
-            let present = self.present();
-            let all = present.components.iter();
-            let states = all.flat_map(|(iri, of)| of.tool_states().map(move |one| (iri, of, one)));
-            let changers = states
-                .map(|(iri, of, (skill, _))| (iri.clone(), of.endpoint.clone(), skill.clone()));
-            changers.collect()
-        };
-        let read = changers.iter().map(|(_, endpoint, skill)| async move {
-            let state = timeout(TOOL_WITHIN, self.tool_state(endpoint, skill)).await;
-            state.ok().flatten()
-        });
-        let states = join_all(read).await;
-        let mut present = self.present();
-        for ((iri, _, skill), state) in changers.into_iter().zip(states) {
-            let Some(component) = present.components.get_mut(&iri) else {
-                continue;
-            };
-            let found = component.found.get_mut(&skill);
-            if let Some(known) = found.and_then(|found| found.tool_state.as_mut()) {
-                // The tool of a changer that does not respond is unknown.
-                let unknown = || ToolState {
-                    current: None,
-                    ..known.clone()
-                };
-                *known = state.unwrap_or_else(unknown);
-            }
-            component.keep_tools();
-        }
+        self.read_changers().await;
     }
 
     fn tools(&self) -> ShownTools {
-        let present = self.present();
-        let mut shown = ShownTools::default();
-        for (iri, component) in &present.components {
-            shown.tools.extend(component.tools.iter().cloned());
-            for (_, state) in component.tool_states() {
-                let attached = shown.attached.entry(iri.clone()).or_default();
-                *attached = attached.take().or_else(|| state.current.clone());
-            }
-        }
-        shown
+        self.shown_tools()
     }
 
     fn prefer(&self) -> &[String] {
@@ -681,36 +642,6 @@ impl Plant for PlantState {
     }
 }
 
-impl PlantState {
-    /// Reads the state of the tool changer with a skill.
-    async fn tool_state(&self, endpoint: &str, skill: &str) -> Option<ToolState> {
-        let node = self.found(skill).ok()?.node;
-        let client = SkillClient::connect(endpoint, &self.client).await.ok()?;
-        let found = client.skills_of(&ParameterType::own("ToolSkillType")).await;
-        client.close().await;
-        let mut found = found.ok()?.into_iter();
-        found.find(|found| found.node == node)?.tool_state
-    }
-}
-
-impl Component {
-    /// Returns the states of its tool changers, with the IRIs of their skills.
-    fn tool_states(&self) -> impl Iterator<Item = (&String, &ToolState)> {
-        let found = self.found.iter();
-        found.filter_map(|(skill, found)| Some((skill, found.tool_state.as_ref()?)))
-    }
-
-    /// Adds the tools that its tool changers show to the known tools.
-    fn keep_tools(&mut self) {
-        let current = self
-            .tool_states()
-            .filter_map(|(_, state)| state.current.clone());
-        let tools: Vec<String> = current.filter(|tool| !tool.is_empty()).collect();
-        let room = MOST_TOOLS.saturating_sub(self.tools.len());
-        self.tools.extend(tools.into_iter().take(room));
-    }
-}
-
 /// Returns the time in ms since 1970.
 #[expect(
     clippy::disallowed_methods,
@@ -729,9 +660,5 @@ pub(crate) fn since_1970(at: SystemTime) -> u64 {
 }
 
 const MOST_GONE: usize = 100;
-/// Time limit to read the state of a tool changer.
-const TOOL_WITHIN: Duration = Duration::from_secs(2);
-/// Maximum number of known tools of a component.
-const MOST_TOOLS: usize = 100;
 /// Number of processes that an error names.
 const MOST_SHOWN: usize = 50;

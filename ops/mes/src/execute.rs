@@ -3,6 +3,7 @@
 //! run fails.
 
 mod compensate;
+mod composite;
 mod facts;
 mod sequence;
 mod tools;
@@ -15,8 +16,7 @@ use std::time::Duration;
 use async_trait::async_trait;
 use knowledge::ValueQueryFault;
 use skills::choosing::Attachment;
-use skills::frame::Frame;
-use skills::{JobObserver, PickAndPlace, RunnableSkill, SkillValue};
+use skills::{JobObserver, RunnableSkill, SkillValue, Unchosen};
 use tokio::sync::watch;
 use tracing::{info, warn};
 
@@ -72,6 +72,15 @@ pub(crate) trait Plant: Send + Sync {
     /// Returns the attachment of a component, as the tool changers showed last.
     fn attachment(&self, _component: &str) -> Attachment {
         Attachment::None
+    }
+
+    /// Returns the tool plate of a gripper in the frame of the flange of a robot, given by their
+    /// components, as the tool changers showed last.
+    ///
+    /// # Errors
+    /// The gripper is not at this robot, or it is not known whether it is.
+    fn plate(&self, _robot: &str, _gripper: &str) -> Result<[f64; 6], Unchosen> {
+        Ok([0.0; 6])
     }
 
     /// Reads the tools of the tool changers.
@@ -533,60 +542,16 @@ impl Execution<'_> {
             StepJob::PickAndPlace(job) => {
                 let roles = chosen.open.iter().map(|(role, _)| *role);
                 let roles: Vec<_> = roles.zip(skills).collect();
-                self.pick_and_place(job, &roles).await
+                match self.plate(chosen) {
+                    Ok(plate) => self.pick_and_place(job, plate, &roles).await,
+                    // The tool was changed after the plan, which has to know it.
+                    Err(why) => Ended::Broken(why.to_string()),
+                }
             }
             StepJob::Sequence => self.sequence(chosen, &skills, progress).await,
         };
         close(opened).await;
         ended
-    }
-
-    async fn pick_and_place(
-        &self,
-        job: &skills::Job,
-        roles: &[(SkillRole, Arc<dyn RunnableSkill>)],
-    ) -> Ended {
-        let of = |wanted: SkillRole| {
-            roles
-                .iter()
-                .find(|(role, _)| *role == wanted)
-                .map(|(_, skill)| Arc::clone(skill))
-        };
-        let (Some(ptp), Some(linear), Some(grasp), Some(release)) = (
-            of(SkillRole::Ptp),
-            of(SkillRole::Linear),
-            of(SkillRole::Grasp),
-            of(SkillRole::Release),
-        ) else {
-            return Ended::Over(
-                "the process does not say who moves, grasps and releases".to_owned(),
-            );
-        };
-        let composite = PickAndPlace {
-            ptp,
-            linear,
-            grasp,
-            release,
-            plate: Frame::IDENTITY,
-            within: self.process.within,
-        };
-        match composite.run(job, self).await {
-            Ok(()) => Ended::Done,
-            Err(broken) => {
-                let has_retreated = broken.retreated.is_ok();
-                self.log.change(|kept, _| {
-                    if let Some(plan) = kept.run.plan() {
-                        plan.retreated = Some(has_retreated);
-                    }
-                });
-                // If the robot may still be above the place, another robot must not start.
-                if has_retreated {
-                    Ended::Broken(broken.to_string())
-                } else {
-                    Ended::Over(broken.to_string())
-                }
-            }
-        }
     }
 }
 

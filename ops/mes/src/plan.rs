@@ -9,8 +9,8 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use knowledge::QuestionAnswer;
 use serde::Serialize;
-use skills::ParameterType;
 use skills::choosing::{self, Attachment, CandidateRank, choose};
+use skills::{ParameterType, Unchosen};
 
 use crate::parameter_fault::ParameterFault;
 use crate::process::{By, Group, Need, Process, ProcessStep, SkillRole, StepJob};
@@ -205,6 +205,11 @@ pub(crate) trait Facts {
         Ok(())
     }
 
+    /// Checks that the gripper of an offer may be at the flange of the robot of another offer.
+    fn mounts(&self, _robot: &Offer, _gripper: &Offer) -> Result<(), Unchosen> {
+        Ok(())
+    }
+
     /// Returns the attachment of the component of an offer.
     fn attachment(&self, _offer: &Offer) -> Attachment {
         Attachment::None
@@ -259,6 +264,9 @@ pub(crate) fn plan(
             fitting.retain(|offer| judging.is_allowed(*role, offer));
         }
     }
+    if process.work != StepJob::Sequence {
+        pair(&roles, &mut fitting, (facts, &mut judging));
+    }
     let all: BTreeSet<Group> = groups.values().copied().collect();
     let teams: BTreeMap<Group, Team<'_>> = all
         .into_iter()
@@ -285,6 +293,58 @@ pub(crate) fn plan(
     };
     judging.connect(&mut plan);
     plan
+}
+
+/// Leaves the robots with a gripper that may be at their flange, and then the grippers that may be
+/// at the flange of the chosen robot.
+fn pair<'a>(
+    roles: &BTreeMap<SkillRole, Vec<&Need>>,
+    fitting: &mut BTreeMap<SkillRole, Vec<&'a Offer>>,
+    (facts, judging): (&dyn Facts, &mut Judging<'_>),
+) {
+    // One offer of each component.
+    let components = |fitting: &BTreeMap<SkillRole, Vec<&'a Offer>>, group: Group| {
+        let of_group = fitting.iter().filter(|(role, _)| role.group() == group);
+        let offers = of_group.flat_map(|(_, offers)| offers.iter().copied());
+        let offers: BTreeMap<&str, &'a Offer> = offers
+            .map(|offer| (offer.component.as_str(), offer))
+            .collect();
+        offers
+    };
+    let grippers = components(fitting, Group::Tool);
+    let faults = |robot: &Offer| -> BTreeMap<String, String> {
+        let faults = grippers.iter().filter_map(|(name, gripper)| {
+            let why = facts.mounts(robot, gripper).err()?;
+            Some(((*name).to_owned(), why.to_string()))
+        });
+        faults.collect()
+    };
+    for (name, robot) in components(fitting, Group::Robot) {
+        let mut faults = faults(robot);
+        if faults.len() == grippers.len()
+            && let Some((_, why)) = faults.pop_first()
+        {
+            judging.exclude(Group::Robot, name, why);
+        }
+    }
+    let retain = |fitting: &mut BTreeMap<SkillRole, Vec<&'a Offer>>, judging: &Judging<'_>| {
+        for (role, offers) in fitting.iter_mut() {
+            offers.retain(|offer| judging.excluded(*role, offer).is_none());
+        }
+    };
+    retain(fitting, &*judging);
+    let of_robot = roles.iter();
+    let of_robot = of_robot.filter(|(role, _)| role.group() == Group::Robot);
+    let of_robot: Vec<_> = of_robot
+        .map(|(role, needs)| (*role, needs.clone()))
+        .collect();
+    let chosen = Team::of(&of_robot, fitting, (facts, &*judging)).chosen;
+    if let Some(robot) = chosen.into_values().next() {
+        for (name, why) in faults(robot) {
+            judging.exclude(Group::Tool, &name, why);
+        }
+        retain(fitting, &*judging);
+    }
 }
 
 /// Returns the group of each role: the roles of a group are filled by one component. In a sequence

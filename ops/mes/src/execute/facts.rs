@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 
 use knowledge::ValueQueryFault;
+use skills::Unchosen;
 use skills::choosing::Attachment;
 
 use super::Plant;
@@ -115,6 +116,11 @@ impl Facts for OfPlant<'_> {
 
     fn reaches(&self, offer: &Offer, positions: &[[f64; 3]]) -> Result<(), ParameterFault> {
         self.plant.reaches(&offer.skill, positions)
+    }
+
+    fn mounts(&self, robot: &Offer, gripper: &Offer) -> Result<(), Unchosen> {
+        let plate = self.plant.plate(&robot.component, &gripper.component);
+        plate.map(drop)
     }
 
     fn attachment(&self, offer: &Offer) -> Attachment {

@@ -34,6 +34,9 @@ pub(super) struct Judging<'a> {
     tools: BTreeMap<SkillRole, StepTools>,
     /// The completed steps whose components have to fill roles.
     bound: BTreeMap<SkillRole, Bound<'a>>,
+    /// The robots and grippers that are excluded because they are not attached to each other, with
+    /// the reasons.
+    apart: BTreeMap<(Group, String), String>,
 }
 
 /// A completed step, and the component that did it.
@@ -132,7 +135,18 @@ impl<'a> Judging<'a> {
             facts,
             tools: BTreeMap::new(),
             bound: BTreeMap::new(),
+            apart: BTreeMap::new(),
         }
+    }
+
+    /// Excludes a component from the roles of a group.
+    pub(super) fn exclude(&mut self, group: Group, component: &str, why: String) {
+        self.apart.insert((group, component.to_owned()), why);
+    }
+
+    /// Returns the reason why the component of an offer is excluded from a role, if it is.
+    pub(super) fn excluded(&self, role: SkillRole, offer: &Offer) -> Option<&String> {
+        self.apart.get(&(role.group(), offer.component.clone()))
     }
 
     /// Requires the tools that steps attach for the steps that they can do.
@@ -431,6 +445,9 @@ impl<'a> Judging<'a> {
             }
         }
         self.takes(need, offer)?;
+        if let Some(why) = self.excluded(need.role, offer) {
+            return because(why.clone());
+        }
         let capability = need.capability.as_ref().map(|wanted| {
             if offer.capabilities.contains(wanted) {
                 format!("it realises {wanted}")

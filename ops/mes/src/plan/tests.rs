@@ -160,6 +160,77 @@ fn reach_attached_tools_and_the_rules_of_the_user_decide_with_a_reason_for_each(
     );
 }
 
+/// Facts by which grippers are attached to robots, given by their names.
+struct Mounted(&'static [(&'static str, &'static str)]);
+
+impl Facts for Mounted {
+    fn takes(&self, _: &Offer, _: (usize, &ProcessStep)) -> Result<(), ParameterFault> {
+        Ok(())
+    }
+
+    fn gives(&self, _: &Offer, _: &str) -> Result<(), ParameterFault> {
+        Ok(())
+    }
+
+    fn connects(&self, _: (&str, &str), _: (&str, &str)) -> Result<(), ParameterFault> {
+        Ok(())
+    }
+
+    fn mounts(&self, robot: &Offer, gripper: &Offer) -> Result<(), Unchosen> {
+        let pair = (&*robot.component_name, &*gripper.component_name);
+        match self.0.contains(&pair) {
+            true => Ok(()),
+            false => Err(Unchosen::NoTool {
+                changer: format!("the changer of {}", pair.0),
+            }),
+        }
+    }
+
+    fn attachment(&self, offer: &Offer) -> Attachment {
+        let name = &*offer.component_name;
+        match self.0.iter().any(|(robot, _)| *robot == name) {
+            true => Attachment::CarriesTool,
+            false => Attachment::AtRobot,
+        }
+    }
+}
+
+#[test]
+fn a_robot_and_a_gripper_that_are_not_attached_to_each_other_do_no_work_together() {
+    let offers = [
+        robot("a-robot"),
+        robot("b-robot"),
+        gripper("a-fingers"),
+        gripper("vacuum"),
+    ]
+    .concat();
+    let planned = |pairs| {
+        let facts = Mounted(pairs);
+        super::plan(&process(), &offers, Situation::default(), &facts)
+    };
+    let chosen = |plan: &Plan| {
+        [SkillRole::Linear, SkillRole::Release].map(|role| plan.chosen(role).map(str::to_owned))
+    };
+    let of = |robot: &str, gripper: &str| {
+        [format!("{robot}#Lin"), format!("{gripper}#Release")]
+            .map(|skill| Some(format!("urn:example:{skill}")))
+    };
+    let both = planned(&[("a-robot", "vacuum"), ("b-robot", "a-fingers")]);
+    assert_eq!(chosen(&both), of("a-robot", "vacuum"));
+    assert_eq!(
+        why(&both, SkillRole::Grasp, "a-fingers#Grasp"),
+        "no tool is attached to the changer of a-robot"
+    );
+    // The robot without a gripper is not chosen, although its name comes first.
+    let one = planned(&[("b-robot", "a-fingers")]);
+    assert_eq!(chosen(&one), of("b-robot", "a-fingers"));
+    assert_eq!(
+        why(&one, SkillRole::Ptp, "a-robot#Ptp"),
+        "no tool is attached to the changer of a-robot"
+    );
+    assert!(!planned(&[]).is_complete());
+}
+
 fn situation(fallen: &[Fallen]) -> Situation<'_> {
     Situation {
         fallen,
