@@ -82,7 +82,7 @@ enum ToolAway {
     Detached { step: String },
     Uncertain { step: String },
     NotAttached,
-    NotShown,
+    NotShown { changer: String },
 }
 
 /// A step that may need a tool.
@@ -116,10 +116,15 @@ pub(crate) enum ToolFault {
     AnyTime { step: String },
     #[error("no tool changer shows this tool, and no step before it attaches it")]
     NotAttached,
-    #[error("a tool changer does not show whether it has this tool, and no step attaches it")]
-    NotShown,
-    #[error("no step before it attaches a tool, and a tool changer does not show its tool")]
-    NoToolShown,
+    #[error(
+        "the tool changer {changer} does not show whether it has this tool; \
+         let a step before it attach the tool"
+    )]
+    NotShown { changer: String },
+    #[error(
+        "the tool changer {changer} does not show its tool; let a step before it attach the tool"
+    )]
+    NoToolShown { changer: String },
     #[error("it is not of a tool that was attached before the run, such as {tool}")]
     OtherBefore { tool: String },
 }
@@ -137,9 +142,10 @@ impl ToolFault {
             | Self::Uncertain { .. }
             | Self::Unknown { .. }
             | Self::AnyTime { .. } => true,
-            Self::NotAttached | Self::NotShown | Self::NoToolShown | Self::OtherBefore { .. } => {
-                false
-            }
+            Self::NotAttached
+            | Self::NotShown { .. }
+            | Self::NoToolShown { .. }
+            | Self::OtherBefore { .. } => false,
         }
     }
 }
@@ -178,11 +184,10 @@ impl AttachedTools {
         });
         self.attached = observed.chain(lost.cloned()).chain(by_steps).collect();
         self.away
-            .retain(|_, away| !matches!(away, ToolAway::NotAttached | ToolAway::NotShown));
-        let mut before = self.attached.iter().filter(|tool| is_before(tool));
-        let away = match before.any(|tool| tool.tool.is_none()) {
-            true => ToolAway::NotShown,
-            false => ToolAway::NotAttached,
+            .retain(|_, away| !matches!(away, ToolAway::NotAttached | ToolAway::NotShown { .. }));
+        let away = match self.silent_changer() {
+            Some(changer) => ToolAway::NotShown { changer },
+            None => ToolAway::NotAttached,
         };
         let known = names(&self.attached);
         for tool in shown.tools.iter().filter(|tool| !known.contains(*tool)) {
@@ -261,7 +266,7 @@ impl AttachedTools {
             Some(ToolAway::Detached { step }) => Err(ToolFault::Detached { step }),
             Some(ToolAway::Uncertain { step }) => Err(ToolFault::Uncertain { step }),
             Some(ToolAway::NotAttached) => Err(ToolFault::NotAttached),
-            Some(ToolAway::NotShown) => Err(ToolFault::NotShown),
+            Some(ToolAway::NotShown { changer }) => Err(ToolFault::NotShown { changer }),
             None => Ok(()),
         }
     }
@@ -299,16 +304,25 @@ impl AttachedTools {
 
     /// Checks that a component is a tool that was attached before the run and still is.
     fn check_before(&self, component: &str) -> Result<(), ToolFault> {
-        let before = || self.attached.iter().filter(|tool| tool.by.is_none());
-        let mut tools = before().filter_map(|tool| tool.tool.as_ref());
-        match tools.clone().any(|tool| tool == component) {
-            true => Ok(()),
-            false if before().any(|tool| tool.tool.is_none()) => Err(ToolFault::NoToolShown),
-            false => Err(tools.next().map_or_else(
-                || self.no_tool(),
-                |tool| ToolFault::OtherBefore { tool: tool.clone() },
-            )),
+        let before = self.attached.iter().filter(|tool| tool.by.is_none());
+        let mut tools = before.filter_map(|tool| tool.tool.as_ref());
+        if tools.clone().any(|tool| tool == component) {
+            return Ok(());
         }
+        if let Some(changer) = self.silent_changer() {
+            return Err(ToolFault::NoToolShown { changer });
+        }
+        Err(tools.next().map_or_else(
+            || self.no_tool(),
+            |tool| ToolFault::OtherBefore { tool: tool.clone() },
+        ))
+    }
+
+    /// Returns a tool changer whose tool from before the run is not known.
+    fn silent_changer(&self) -> Option<String> {
+        let mut before = self.attached.iter().filter(|tool| tool.by.is_none());
+        let silent = before.find(|tool| tool.tool.is_none())?;
+        Some(silent.changer.clone())
     }
 
     /// Returns the tool that a step before a step has attached last, if it is known.
@@ -333,7 +347,7 @@ impl AttachedTools {
         let mut away = self.away.values();
         let detached = away.find_map(|away| match away {
             ToolAway::Detached { step } => Some(ToolFault::NoneLeft { step: step.clone() }),
-            ToolAway::Uncertain { .. } | ToolAway::NotAttached | ToolAway::NotShown => None,
+            ToolAway::Uncertain { .. } | ToolAway::NotAttached | ToolAway::NotShown { .. } => None,
         });
         detached.unwrap_or(ToolFault::NoTool)
     }

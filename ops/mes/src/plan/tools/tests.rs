@@ -165,9 +165,15 @@ fn a_tool_from_before_the_run_is_not_used_after_a_step_detaches_it() {
 fn no_tool_is_used_while_a_changer_does_not_show_its_tool() {
     let mut tools = AttachedTools::default();
     tools.observe(&shown(&[(CHANGER, None)]));
-    assert_eq!(check(&tools, By::Any, &[], A), Err(ToolFault::NotShown));
+    let changer = || CHANGER.to_owned();
+    let hidden = Err(ToolFault::NotShown { changer: changer() });
+    assert_eq!(check(&tools, By::Any, &[], A), hidden);
     let third = check(&tools, By::AttachedTool, &[], "urn:third");
-    assert_eq!(third, Err(ToolFault::NoToolShown));
+    assert_eq!(third, Err(ToolFault::NoToolShown { changer: changer() }));
+    // A step attaches the tool with that changer.
+    let mut attached = tools.clone();
+    attached.attach(CHANGER, Some(A.to_owned()), step(0));
+    assert_eq!(check(&attached, By::AttachedTool, &[0], A), Ok(()));
     // It shows its tool, and does not respond afterwards.
     tools.observe(&shown(&[(CHANGER, Some(A))]));
     for attached in [&[(CHANGER, None)][..], &[]] {
