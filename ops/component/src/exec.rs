@@ -7,6 +7,7 @@
 
 use std::path::Path;
 use std::process::Stdio;
+use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
 
 use async_trait::async_trait;
@@ -93,12 +94,11 @@ impl Program {
             return unknown("its input and output are not connected");
         };
         let errors = child.stderr.take();
-        let skill = self.skill.clone();
-        let logging = async move {
+        let last_error = LastLine::default();
+        let logging = async {
             if let Some(errors) = errors {
-                log(&skill, BufReader::new(errors)).await;
+                log(&self.skill, BufReader::new(errors), &last_error).await;
             }
-            std::future::pending::<()>().await;
         };
         let mut output = BufReader::new(output);
         let parameters = work.parameters().all().iter();
@@ -120,12 +120,20 @@ impl Program {
         work.step("Run").await;
         tokio::pin!(logging);
         let mut line = Vec::new();
+        let mut is_logged = false;
         loop {
             tokio::select! {
                 read = next_line(&mut output, &mut line) => {
                     let told = match read {
                         Ok(Some(text)) => reported(&text),
-                        Ok(None) => return unknown("it has ended without a result"),
+                        Ok(None) => {
+                            // The reason is on its standard error, which may come a little later.
+                            if !is_logged {
+                                let _ended = timeout(ERRORS_WITHIN, &mut logging).await;
+                            }
+                            let last = last_error.shown();
+                            return unknown(&format!("it has ended without a result{last}"));
+                        }
                         Err(why) => Err(why),
                     };
                     match told {
@@ -158,7 +166,7 @@ impl Program {
                     let limit = self.work.halt_timeout;
                     return unknown(&format!("it has not halted within {limit:?} and was killed"));
                 }
-                () = &mut logging => {}
+                () = &mut logging, if !is_logged => is_logged = true,
             }
         }
     }
@@ -281,13 +289,42 @@ async fn next_line(
     }
 }
 
+/// The last line of the standard error of a program.
+#[derive(Debug, Default)]
+struct LastLine(Mutex<String>);
+
+impl LastLine {
+    fn put(&self, text: &str) {
+        if !text.is_empty() {
+            let shown = text.chars().take(LONGEST_ERROR).collect();
+            *self.0.lock().unwrap_or_else(PoisonError::into_inner) = shown;
+        }
+    }
+
+    /// Returns the line as the end of a reason; empty if there is none.
+    fn shown(&self) -> String {
+        let line = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        match line.is_empty() {
+            true => String::new(),
+            false => format!(", and its last error is `{}`", line.escape_debug()),
+        }
+    }
+}
+
 /// Logs the standard error of a program to its end.
-async fn log(skill: &str, mut errors: impl AsyncBufRead + Unpin) {
+async fn log(skill: &str, mut errors: impl AsyncBufRead + Unpin, last: &LastLine) {
     let mut line = Vec::new();
     loop {
         match next_line(&mut errors, &mut line).await {
-            Ok(Some(text)) => show(skill, &text),
-            Ok(None) => return show(skill, &String::from_utf8_lossy(&line)),
+            Ok(Some(text)) => {
+                last.put(&text);
+                show(skill, &text);
+            }
+            Ok(None) => {
+                let text = String::from_utf8_lossy(&line);
+                last.put(&text);
+                return show(skill, &text);
+            }
             Err(_) if line.is_empty() => return,
             Err(_) => {
                 show_discarded(skill);
@@ -376,6 +413,10 @@ fn reported(text: &str) -> Result<Report, String> {
 const KEPT_VARIABLES: [&str; 5] = ["PATH", "HOME", "LANG", "TZ", "PYTHONPATH"];
 /// Longest line of a program, in bytes.
 const LONGEST_LINE: u64 = 64 << 10;
+/// Time for the standard error of a program that has ended. The machine is stopped after it.
+const ERRORS_WITHIN: Duration = Duration::from_millis(100);
+/// Characters of the last error of a program in a reason.
+const LONGEST_ERROR: usize = 160;
 /// Time limit for the `stop` command.
 const STOP_WITHIN: Duration = Duration::from_secs(5);
 /// Time after its result in which a program ends by itself.

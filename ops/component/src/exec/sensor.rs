@@ -9,7 +9,7 @@ use serde_json::Value as Json;
 use skills::{Component, ExecSource, Measured, ValueSensor, ValueSource};
 use tokio::io::BufReader;
 
-use super::{KilledGroup, group_of, log, next_line, start};
+use super::{KilledGroup, LastLine, group_of, log, next_line, start};
 
 /// Replaces the description of programs by sensors. Values of the same program share a process.
 pub(super) fn with_sensors(component: &mut Component) {
@@ -54,7 +54,7 @@ impl ValueSensor for ProgramSensor {
             return failed("its output is not connected");
         };
         let logging = async {
-            log(&self.source(), BufReader::new(errors)).await;
+            log(&self.source(), BufReader::new(errors), &LastLine::default()).await;
             std::future::pending::<()>().await;
         };
         let measuring = async {

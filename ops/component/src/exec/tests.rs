@@ -82,6 +82,10 @@ async fn a_program_that_ends_or_talks_otherwise_leaves_an_unknown_machine_that_i
             "it has ended without a result; the `stop` command is done",
         ),
         (
+            "echo starts >&2; echo no port >&2; exit 3",
+            "without a result, and its last error is `no port`; the `stop` command is done",
+        ),
+        (
             "echo hello; sleep 60",
             "its line `hello` is not a JSON object",
         ),
