@@ -11,6 +11,8 @@ Its object `machine` has
   structure without numbers; at its end it returns the frame as a vector;
 - Odd, a Program that does not show its state.
 
+With --deaf the Start of the first Stamp never returns, and nobody sees whether it runs.
+
 The Start of all of them is accepted in any state, like in an earlier system: the caller has to
 check the state.
 """
@@ -46,8 +48,9 @@ async def bare(parent, node, name, of_type):
 
 
 class Program:
-    def __init__(self, space, first, name, seconds):
+    def __init__(self, space, first, name, seconds, deaf=False):
         self.space, self.first, self.name, self.seconds = space, first, name, seconds
+        self.deaf = deaf
         self.state, self.run = "Halted", None
 
     def id(self, offset):
@@ -110,6 +113,8 @@ class Program:
             reached = ua.ThreeDVector(at.X, at.Y, at.Z)
             await self.reached.write_value(ua.Variant(reached, ua.VariantType.ExtensionObject))
         lifetime.say(started=self.name, first=self.first, state=self.state, force=force, **more)
+        if self.deaf:
+            await asyncio.Event().wait()
         await self.go("Running")
         if self.seconds:
             self.run = asyncio.create_task(self.work(force))
@@ -158,7 +163,7 @@ async def run(args):
     name = ua.QualifiedName("GraspGripperSkillType", earlier)
     grasp_type = await of_all.add_object_type(ua.NodeId(2, earlier), name)
     machine = await server.nodes.objects.add_object(ua.NodeId(1, space), ua.QualifiedName("machine", space))
-    await Program(space, 1000, "Stamp", args.seconds).build(machine)
+    await Program(space, 1000, "Stamp", args.seconds, args.deaf).build(machine)
     await Program(space, 2000, "Blink", 0).build(machine, parts=False)
     await Program(space, 3000, "Grasp", 0.2).build(machine, of_type=grasp_type.nodeid, with_id=False)
     await Program(space, 4000, "Stamp", 0.2).build(machine, structured=True)
@@ -173,6 +178,7 @@ def main():
     parser.add_argument("endpoint")
     parser.add_argument("--seconds", type=float, default=2.5)
     parser.add_argument("--uri", default=URI, help="its ApplicationUri")
+    parser.add_argument("--deaf", action="store_true", help="the Start of the first Stamp never returns")
     parser.add_argument("--limit", type=float, default=120.0)
     args = parser.parse_args()
     lifetime.bound(args.limit)

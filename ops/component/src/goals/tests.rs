@@ -1,6 +1,7 @@
 use std::path::Path;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
+use bridge_node::Executed;
 use skills::server::{ComponentServer, ServeSettings};
 use skills::{ClientOptions, Component, MirroredSkill, Mirrors, SkillClient, Watchable};
 
@@ -77,6 +78,32 @@ async fn a_goal_whose_start_is_lost_has_an_unknown_outcome() {
     assert_eq!(*ran, MayHaveRun::Perhaps);
     assert!(text.contains("the machine may move"), "{text}");
     assert!(lock(&doer.doing).beginning.is_empty());
+    server.stop().await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_call_whose_execution_is_lost_is_answered_as_lost_and_a_refused_one_with_the_reason() {
+    let server = serve();
+    let (mirrors, mirror) = mirror(&server).await;
+    drop(mirrors);
+    let skill = SkillExecutor::Theirs(mirror);
+    let execute = async |method, is_wanted: bool| {
+        let by = SkillOwner::Local("the test");
+        let condition = Box::new(move || is_wanted);
+        skill
+            .execute((by, method), &fields::block(&[]), condition)
+            .await
+    };
+    // The connection is closed: nobody knows whether the request was executed.
+    for method in [ProgramMethod::Start, ProgramMethod::Halt] {
+        let executed = execute(method, true).await;
+        assert!(matches!(executed, Executed::Lost), "{method}: {executed:?}");
+    }
+    let withdrawn = execute(ProgramMethod::Start, false).await;
+    assert!(
+        matches!(withdrawn, Executed::Answered(_)),
+        "it was not sent: {withdrawn:?}"
+    );
     server.stop().await;
 }
 
