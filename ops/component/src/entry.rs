@@ -12,7 +12,7 @@ use bridge_node::{
 };
 use mappings::{Mapping, SpaceId};
 use plant_opcua::enrolment::GdsArguments;
-use skills::yaml::YamlFindingCode;
+use skills::yaml::{Findings, YamlFindingCode};
 use skills::{Component, ComponentSecurity, Lds};
 
 use crate::reload::{ComponentFile, Overrides, ReadComponent, Version};
@@ -91,6 +91,26 @@ enum Schema {
     Exec,
 }
 
+/// Runs `ua-component` with devices of a program: `read` returns the component of the YAML file with
+/// the device or the drivers of the program. Everything else is as in [`run`]. A second call in a
+/// process keeps the function of the first one.
+#[must_use]
+pub fn run_with(arguments: Vec<OsString>, read: ReadComponent) -> ExitCode {
+    READER.get_or_init(|| read);
+    run(arguments)
+}
+
+/// Reads a component with the devices of this project.
+///
+/// # Errors
+/// The findings in the text.
+pub fn read_component(text: &str, folder: &Path) -> Result<Component, Findings> {
+    Component::from_yaml_with(text, folder, &devices::Kinds)
+}
+
+/// The function that reads a component, if a program has an own one.
+static READER: OnceLock<ReadComponent> = OnceLock::new();
+
 /// Runs `ua-component` from its command line to its end. `arguments` begin with the name of the
 /// program.
 #[must_use]
@@ -120,9 +140,8 @@ impl UaComponent {
             endpoint: self.endpoint.clone(),
             lds: self.lds.as_deref().map(Lds::written),
         };
-        let with_devices: ReadComponent =
-            |text, folder| Component::from_yaml_with(text, folder, &devices::Kinds);
-        let read = ComponentFile::new(self.file().to_owned(), text, with_devices, overrides);
+        let reader = READER.get().copied().unwrap_or(read_component);
+        let read = ComponentFile::new(self.file().to_owned(), text, reader, overrides);
         let read = read.map_err(|(text, findings)| {
             let count = findings.len();
             crate::print(&findings.render(&file, &text));
