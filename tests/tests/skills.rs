@@ -81,8 +81,10 @@ mod configuration;
 mod faults;
 mod foreign;
 mod nodesets;
+mod own;
 mod reload;
 mod robot;
+mod unknown;
 mod values;
 mod worse;
 
