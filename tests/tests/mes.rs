@@ -1,6 +1,7 @@
 //! The MES with components that start, are killed and are replaced: its knowledge, which users
 //! change, and the outcome of processes.
 
+mod configuring;
 mod exchange;
 mod live_servers;
 mod nodeset_url;

@@ -1,5 +1,6 @@
 //! The current state of the plant: the components in the graph, their skills, and the runs.
 
+mod configuring;
 mod facts;
 mod opened;
 mod parameters;
@@ -18,8 +19,7 @@ use knowledge::{
 use serde::Serialize;
 use skills::choosing::Attachment;
 use skills::{
-    ClientOptions, FoundSkill, RunnableSkill as RunsOfSkill, SkillClient,
-    SkillValue, Unchosen,
+    ClientOptions, FoundSkill, RunnableSkill as RunsOfSkill, SkillClient, SkillValue, Unchosen,
 };
 use tokio::sync::watch;
 use tokio::task::spawn_blocking;

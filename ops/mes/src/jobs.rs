@@ -4,6 +4,9 @@ use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use async_trait::async_trait;
+use futures_util::future::join_all;
+use knowledge::Configuring;
+use mtp::product_configuration;
 use serde::Serialize;
 use skills::JobObserver;
 use tokio::runtime::Handle;
@@ -14,6 +17,7 @@ use crate::execute::{Plant, execute_pausable};
 use crate::job_order::{JobOutcome, JobProgress};
 use crate::job_orders::JobRuns;
 use crate::process::StepJob as Work;
+use crate::product_configuration::configure;
 use crate::record::{How, ProcessRun};
 
 /// The jobs.
@@ -21,6 +25,8 @@ pub(crate) struct ProcessJobs {
     cell: Arc<PlantState>,
     runtime: Handle,
     all: Arc<Mutex<BTreeMap<u64, Job>>>,
+    /// Held while a product is configured.
+    configuring: Arc<tokio::sync::Mutex<()>>,
 }
 
 /// A job.
@@ -57,6 +63,7 @@ impl ProcessJobs {
             cell,
             runtime,
             all: Arc::default(),
+            configuring: Arc::default(),
         }
     }
 }
@@ -127,6 +134,26 @@ impl knowledge::JobRunner for ProcessJobs {
             self.cell.give_back(&run);
         }
         true
+    }
+
+    fn configure(&self, document: Vec<u8>, checks_only: bool) -> Configuring {
+        let (cell, runtime) = (Arc::clone(&self.cell), self.runtime.clone());
+        let alone = Arc::clone(&self.configuring);
+        Box::pin(async move {
+            let text = String::from_utf8(document);
+            let text = text.map_err(|_| "the document is not UTF-8".to_owned())?;
+            let named = product_configuration(&text).map_err(|fault| fault.to_string())?;
+            let alone = alone.try_lock_owned();
+            let alone = alone.map_err(|_| "another product is being configured".to_owned())?;
+            // A configuration that has begun ends also if its client leaves.
+            let configured = runtime.spawn(async move {
+                let _alone = alone;
+                let components = join_all(named.iter().map(|of| cell.configured(of))).await;
+                configure(&components, checks_only).await
+            });
+            let report = configured.await.map_err(|error| error.to_string())?;
+            serde_json::to_value(&report).map_err(|error| error.to_string())
+        })
     }
 
     fn list(&self) -> serde_json::Value {

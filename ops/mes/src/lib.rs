@@ -37,6 +37,7 @@ mod order_file;
 mod parameter_fault;
 mod plan;
 mod process;
+mod product_configuration;
 mod read_process;
 mod recipe;
 mod record;

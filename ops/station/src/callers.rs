@@ -9,6 +9,7 @@ use std::time::Duration;
 
 use plant_opcua::client::{ClientError, OpcUaClient};
 use plant_opcua::server::SessionCaller;
+use plant_opcua::supervision::Supervision;
 use plant_opcua::types::{DateTime, StatusCode};
 use plant_opcua::users::{Roles, UserAccess, UserRole};
 use tokio::time::Instant;
@@ -22,6 +23,8 @@ pub(crate) struct CallerCheck {
     pub(crate) board: Arc<Board>,
     /// The level of the callers.
     pub(crate) level: Level,
+    /// The supervisor of the station, which may configure the servers behind it.
+    pub(crate) supervision: Supervision,
 }
 
 impl CallerCheck {
@@ -39,6 +42,17 @@ impl CallerCheck {
             true => Ok(()),
             false => Err(StatusCode::BadUserAccessDenied),
         }
+    }
+
+    /// Checks that a caller may configure the servers behind the station, which accept what the
+    /// station sends them: only the supervisor of the station, and users with the role
+    /// ConfigureAdmin.
+    ///
+    /// # Errors
+    /// BadUserAccessDenied for other callers.
+    pub(crate) fn check_configures(&self, caller: &SessionCaller) -> Result<(), StatusCode> {
+        let roles = self.users.roles_of(caller);
+        self.supervision.admits(caller, roles)
     }
 }
 
@@ -133,6 +147,8 @@ const LONGEST_WAIT: Duration = Duration::from_secs(60);
 
 #[cfg(test)]
 mod tests {
+    use plant_opcua::supervision::Registrar;
+
     use super::*;
     use crate::board::CONNECTED;
 
@@ -145,6 +161,7 @@ mod tests {
             users: Arc::new(UserAccess::of_store(None, anonymous).unwrap()),
             board: Arc::clone(&board),
             level: Level::Above,
+            supervision: Supervision::default(),
         };
         let strict = admission(observer);
         let caller = |proven: bool| SessionCaller {
@@ -173,5 +190,18 @@ mod tests {
         assert_eq!(strict.check(&caller(false)), denied, "anybody says so");
         let operator = Roles::of(&[UserRole::Operator]);
         assert_eq!(admission(operator).check(&caller(false)), Ok(()));
+
+        // Devices accept what their station sends, so an operator configures nothing through it.
+        for check in [&strict, &admission(operator)] {
+            assert_eq!(check.check_configures(&caller(true)), denied);
+        }
+        strict.supervision.registered_with(Registrar {
+            application_uri: "urn:b".to_owned(),
+            proven: true,
+        });
+        assert_eq!(strict.check_configures(&caller(true)), Ok(()));
+        assert_eq!(strict.check_configures(&caller(false)), denied);
+        let admin = Roles::of(&[UserRole::ConfigureAdmin]);
+        assert_eq!(admission(admin).check_configures(&caller(false)), Ok(()));
     }
 }

@@ -5,6 +5,7 @@ use std::collections::{BTreeMap, HashMap};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, RwLock};
 
 use plant_opcua::server::{InstanceError, MethodSpec, ObjectSpec, TypeSpec, VariableSpec};
+use plant_opcua::supervision::SET_FIELDS;
 use plant_opcua::types::{
     Array, DataValue, DateTime, ExpandedNodeId, LocalizedText, NodeId, ObjectTypeId, QualifiedName,
     StatusCode, Variant,
@@ -265,6 +266,7 @@ impl ServerCopy {
                     passing: self.passing(),
                     object: object.clone(),
                     method: found.id.clone(),
+                    configures: found.name.name == SET_FIELDS,
                 };
                 self.face.server.add_method(spec, Arc::new(handler))?;
                 Ok(None)

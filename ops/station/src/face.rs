@@ -13,6 +13,7 @@ use plant_opcua::server::{
     OpcUaServer, ServerBuilder, ServerConfig, ServerError, ServerSecurity, SessionCaller,
     SessionPresence, VariableSpec, WriteHandler, WriteRequest,
 };
+use plant_opcua::supervision::SET_FIELDS;
 use plant_opcua::types::{
     DataTypeId, DataValue, LocalizedText, NodeId, ObjectId, ObjectTypeId, QualifiedName,
     ReferenceTypeId, StatusCode, VariableTypeId, Variant,
@@ -201,6 +202,8 @@ pub(crate) struct Calling {
     pub(crate) passing: Passing,
     pub(crate) object: NodeId,
     pub(crate) method: NodeId,
+    /// Whether the method configures the server.
+    pub(crate) configures: bool,
 }
 
 #[async_trait]
@@ -210,6 +213,15 @@ impl MethodHandler for Calling {
     }
 
     async fn call(&self, request: MethodRequest) -> Result<Vec<Variant>, MethodRefusal> {
+        if self.configures {
+            let check = self.passing.admission.check_configures(&request.caller);
+            check.inspect_err(|_| {
+                warn!(
+                    application = ?request.caller.application_uri, user = ?request.caller.user,
+                    "refused {SET_FIELDS}: the caller needs the role configure_admin"
+                );
+            })?;
+        }
         let session = self
             .passing
             .session(&request.caller, &request.presence, &request.name);

@@ -173,15 +173,20 @@ impl Common<'_> {
             client,
             ..
         } = self;
-        let below = open_below(settings, uri, self.callers(Level::Below))?;
+        let below = open_below(
+            settings,
+            uri,
+            self.callers(Level::Below, Supervision::default()),
+        )?;
         board.own(Gated {
             application_uri: (*uri).to_owned(),
             name: settings.name.clone(),
             gateway_uri: String::new(),
             url: below.server.url().to_owned(),
         });
-        let above = open_above(settings, upper, uri, self.callers(Level::Above))?;
         let supervision = Supervision::default();
+        let callers = self.callers(Level::Above, supervision.clone());
+        let above = open_above(settings, upper, uri, callers)?;
         let by = (supervision.clone(), Arc::clone(&self.users));
         configurable(&above, &settings.name, (board, place.clone()), by)?;
         above.server.start();
@@ -206,11 +211,12 @@ impl Common<'_> {
     }
 
     /// Returns the certificate store of a face, and the check of its callers.
-    fn callers(&self, level: Level) -> (Option<PathBuf>, CallerCheck) {
+    fn callers(&self, level: Level, supervision: Supervision) -> (Option<PathBuf>, CallerCheck) {
         let admission = CallerCheck {
             users: Arc::clone(&self.users),
             board: Arc::clone(&self.board),
             level,
+            supervision,
         };
         (self.pki.clone(), admission)
     }

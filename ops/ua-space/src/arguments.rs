@@ -20,7 +20,9 @@ pub(crate) use recording::{RecordArguments, ReplayArguments, Viewers};
 pub(crate) use tap::TapArguments;
 pub(crate) use write::Write;
 
-pub(crate) use job::{GoalArguments, JobArguments, JobVerb, ProcessArguments, ProcessVerb};
+pub(crate) use job::{
+    ConfigureArguments, GoalArguments, JobArguments, JobVerb, ProcessArguments, ProcessVerb,
+};
 pub(crate) use module::{
     AasArguments, MtpAlarms, MtpArguments, MtpConnect, MtpRdf, MtpRun, MtpSkills, MtpVerb,
     PeaArguments,
@@ -308,6 +310,18 @@ pub(crate) enum Verb {
     /// 69 no answer in time, the outcome of the job is unknown, or the user may not run jobs, 74
     /// the output cannot be written.
     Job(JobArguments),
+    /// Configure the components of a product from an AutomationML file
+    ///
+    /// Each element of the file with an attribute ApplicationUri is a component, and its other
+    /// attributes are the fields of its configuration. ua-mes checks all fields at all components
+    /// first, and then sets them. If a component refuses or is lost meanwhile, the others are set
+    /// back.
+    ///
+    /// Exit codes: 0 all fields are set, or accepted with --check, 1 a component refuses its fields
+    /// or was lost, and all have their values from before, 64 usage, or the file is wrong, 69 no
+    /// answer in time, it is unknown which values a component has, or the user may not configure,
+    /// 74 the file cannot be read or the output cannot be written.
+    Configure(ConfigureArguments),
     /// Show the sequence of actions that reaches a goal, with the proof of each step
     ///
     /// Actions are capabilities with facts that hold before and after them. Those with a skill in

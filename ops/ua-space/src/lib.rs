@@ -9,6 +9,7 @@ mod capture;
 mod cell;
 mod check;
 mod completion;
+mod configure;
 mod decode;
 mod discover;
 mod discovery;
@@ -135,6 +136,7 @@ pub fn run(arguments: Vec<OsString>) -> ExitCode {
         Verb::Goal(arguments) => goal::goal(arguments),
         Verb::Process(arguments) => process::process(arguments),
         Verb::Job(arguments) => job::job(arguments),
+        Verb::Configure(arguments) => configure::configure(arguments),
         Verb::Rml(arguments) => rml::rml(arguments),
         Verb::Products(arguments) => products::products(arguments),
         Verb::Owl(arguments) => owl::owl(arguments),

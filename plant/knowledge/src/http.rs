@@ -171,6 +171,7 @@ impl ServedSite {
             path if path == "/sources" || path.starts_with("/sources/") => {
                 return self.sources(request).await;
             }
+            "/configuration" => return self.configure(request).await,
             path if path.starts_with("/check/") => return self.check(request).await,
             path if path == "/jobs" || path.starts_with("/jobs/") => {
                 return self.jobs(request).await;
@@ -197,7 +198,7 @@ impl ServedSite {
                 None => match self.made_page(path).await? {
                     Some(page) => Ok(content(JSON, page.into_bytes())),
                     None => Err(HttpRefusal::unknown(
-                        "there are /sparql, /update, /store, /sources, /check, /jobs, /ask, /ask/NAME, /graphs, /data, /report and /status here"
+                        "there are /sparql, /update, /store, /sources, /check, /configuration, /jobs, /ask, /ask/NAME, /graphs, /data, /report and /status here"
                             .to_owned(),
                     )),
                 },

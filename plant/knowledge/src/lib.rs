@@ -58,7 +58,7 @@ pub use served::{ServedNode, ServedSpace};
 pub use source::{KnowledgeSource, SourceKind};
 pub use store::{Knowledge, KnowledgeFault, SourceLifetime, SourceStatus};
 pub use value_query::{ValueQuery, ValueQueryFault};
-pub use writes::{JobRunner, May, SourceCheck, SourceFiles, SourceFinding, Writes};
+pub use writes::{Configuring, JobRunner, May, SourceCheck, SourceFiles, SourceFinding, Writes};
 pub use written::WrittenResult;
 
 /// Returns an empty folder for a test.

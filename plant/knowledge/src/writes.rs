@@ -101,7 +101,21 @@ pub trait JobRunner: Send + Sync {
 
     /// Returns all jobs as JSON.
     fn list(&self) -> serde_json::Value;
+
+    /// Sets the fields of the components that a product configuration in AutomationML names, or
+    /// only checks them. Returns what became of each component, as JSON.
+    ///
+    /// # Errors
+    /// The reason why the document cannot be read, or why it is not applied at the moment.
+    fn configure(&self, document: Vec<u8>, checks_only: bool) -> Configuring {
+        let _both = (document, checks_only);
+        Box::pin(async { Err("no components are configured here".to_owned()) })
+    }
 }
+
+/// The configuration of a product in progress.
+pub type Configuring =
+    Pin<Box<dyn Future<Output = Result<serde_json::Value, String>> + Send + 'static>>;
 
 impl fmt::Debug for Writes {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
@@ -171,6 +185,27 @@ impl ServedSite {
                 "GET, POST at /jobs, DELETE at /jobs/NUMBER",
             )),
         }
+    }
+
+    /// Configures the components of a product: `/configuration`, with `?check=true` for a check.
+    pub(crate) async fn configure(
+        &self,
+        request: Request<Incoming>,
+    ) -> Result<Response<Full<Bytes>>, HttpRefusal> {
+        let pairs = form(request.uri().query().unwrap_or_default())?;
+        let writes = self.may_write(&request).await?.clone();
+        if request.method() != Method::POST {
+            return Err(HttpRefusal::method("POST"));
+        }
+        let checks_only = match pairs.as_slice() {
+            [] => false,
+            [(name, value)] if name == "check" && value == "true" => true,
+            _ => return Err(HttpRefusal::malformed("the only parameter is check=true")),
+        };
+        let document = self.upload(request, LARGEST_CONFIGURATION).await?;
+        let report = writes.jobs.configure(document, checks_only).await;
+        let report = report.map_err(|why| HttpRefusal::malformed(&why))?;
+        Ok(json_page(&report))
     }
 
     /// Runs an update of the SPARQL protocol.
@@ -474,3 +509,5 @@ pub(crate) static CHECKS: Semaphore = Semaphore::const_new(2);
 const LARGEST_FILE: usize = 256 << 20;
 const LONGEST_NAME: usize = 256;
 const LARGEST_JOB: usize = 4096;
+/// Largest product configuration, in bytes.
+const LARGEST_CONFIGURATION: usize = 4 << 20;

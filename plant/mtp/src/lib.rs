@@ -22,6 +22,7 @@ mod container;
 mod elements;
 mod model;
 pub mod pea;
+mod product;
 mod rdf;
 mod rdf_module;
 mod read;
@@ -35,6 +36,7 @@ pub use model::{
     NodeItem, OpcUaNode, OutputRole, ParameterKind, Procedure, ServiceParameter, ValueBound,
     VariableLink,
 };
+pub use product::{ConfiguredComponent, ConfiguredValue, ProductFileFault, product_configuration};
 pub use rdf::{Object, Triple, unit_symbol};
 pub use rdf_module::state_iri;
 pub use uri_text::escaped;

@@ -12,6 +12,10 @@ use crate::users::{Roles, UserRole};
 /// The BrowseName of the method with which a supervisor configures a program, in any namespace.
 pub const CONFIGURE: &str = "Configure";
 
+/// The BrowseName of the method of a component with which its supervisor sets configured fields.
+/// Stations pass it on for callers that may configure them.
+pub const SET_FIELDS: &str = "SetFields";
+
 /// The arguments of [`CONFIGURE`], in this order, all Strings.
 pub const CONFIGURED: [(&str, &str); 3] = [
     (

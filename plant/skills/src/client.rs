@@ -7,6 +7,7 @@
 //! - `find`: the skills of a server
 //! - `grip`: the grip point of a skill
 //! - `handle`: a skill of a server
+//! - `fields`: the configured fields of a component
 //! - `states`: the states of the skills of a server
 //! - `stations`: the components behind a station
 //! - `mirror`: the skills of a server, presented like local skills
@@ -19,6 +20,7 @@ mod choice;
 #[cfg(test)]
 mod choice_tests;
 mod detector;
+mod fields;
 mod find;
 mod grip;
 mod handle;
@@ -41,6 +43,7 @@ use plant_opcua::types::StatusCode;
 
 pub use choice::{Chosen, Needs, ToolState, plate_between};
 pub use detector::{Detected, Detector};
+pub use fields::SetFieldsFault;
 pub use find::{FoundParameter, FoundSkill, FoundType};
 pub use handle::{RemoteState, SkillHandle};
 pub use mirror::{MirroredSkill, Mirrors, StartCondition, Watchable};

@@ -4,9 +4,11 @@
 //! A configuration is checked as a whole, stored, and then applied as a whole. It acts on the next
 //! run of each skill; a run in progress keeps its parameters.
 
+mod change;
+
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use async_trait::async_trait;
@@ -19,6 +21,8 @@ use crate::parameters::{Parameters, SkillParameter, shortened};
 use crate::value::{SkillValue, ValueError};
 use crate::values::ValueFacts;
 use crate::yaml::{Place, YamlFinding, YamlFindingCode, nearest};
+
+pub use self::change::FieldChange;
 
 /// A field of the configuration.
 #[derive(Debug, Clone, PartialEq)]
@@ -174,41 +178,6 @@ impl ComponentConfiguration {
     #[must_use]
     pub fn value(&self, field: &Configurable) -> Option<SkillValue> {
         field.value_in(&self.values.borrow())
-    }
-
-    /// Sets some fields; other fields keep their values. Nothing is set if one of them is wrong or
-    /// if the configuration cannot be stored.
-    ///
-    /// # Errors
-    /// The first wrong field, with the reason.
-    pub fn set(&self, given: Vec<(String, SkillValue)>) -> Result<(), NotConfigured> {
-        let _setting = self.setting.lock().unwrap_or_else(PoisonError::into_inner);
-        let mut values = Values::clone(&self.values.borrow());
-        let mut seen: Vec<String> = Vec::new();
-        for (name, value) in given {
-            let wrong = |reason| NotConfigured {
-                field: name.clone(),
-                reason,
-            };
-            let field = self.fields.iter().find(|field| field.facts.name == name);
-            let Some(field) = field else {
-                return Err(wrong(self.unknown(&name)));
-            };
-            if seen.contains(&name) {
-                return Err(wrong(FieldError::Twice));
-            }
-            let value = field.take(value).map_err(wrong)?;
-            seen.push(name.clone());
-            values.insert(name, value);
-        }
-        if let Some(store) = &self.store {
-            write(store, &values).map_err(|reason| NotConfigured {
-                field: String::new(),
-                reason,
-            })?;
-        }
-        self.values.send_replace(Arc::new(values));
-        Ok(())
     }
 
     fn unknown(&self, name: &str) -> FieldError {

@@ -43,8 +43,8 @@ pub use authority::{Authority, SkillOwner};
 pub use client::{
     Chosen, ClientOptions, Detected, Detector, FailedLocator, FoundParameter, FoundSkill,
     FoundType, LocatorError, MirroredSkill, Mirrors, Needs, NotLocated, PartnerError, PeerAccess,
-    RemoteState, SkillClient, SkillHandle, SkillStates, StartCondition, StationChanges, ToolState,
-    Unchosen, UnfitGrasp, Watchable, plate_between,
+    RemoteState, SetFieldsFault, SkillClient, SkillHandle, SkillStates, StartCondition,
+    StationChanges, ToolState, Unchosen, UnfitGrasp, Watchable, plate_between,
 };
 pub use component::{
     ChangeKind, Component, ComponentSecurity, Device, DeviceKinds, DriverFault, DriverSetup,
@@ -56,7 +56,7 @@ pub use component::{
 };
 pub use composite::{Job, PickAndPlace};
 pub use configuration::{
-    ComponentConfiguration, Configurable, FieldEffect, FieldError, NotConfigured,
+    ComponentConfiguration, Configurable, FieldChange, FieldEffect, FieldError, NotConfigured,
 };
 pub use description::SkillDescription;
 pub use driver::{Driver, RunResults, Work};

@@ -45,6 +45,7 @@ use tokio::sync::{mpsc, watch};
 use tokio::task::JoinSet;
 use tokio::time::{Instant, MissedTickBehavior};
 
+pub(crate) use self::configuration::{CONFIGURED, OBJECT as CONFIGURATION, SET_FIELDS};
 use self::grip::Stated;
 use self::lock::Lock;
 use self::methods::status;

@@ -52,6 +52,53 @@ pub(crate) fn to_pairs(of: &[(String, SkillValue)]) -> [Variant; 2] {
     ]
 }
 
+/// Returns names and values as two arrays. A missing value is an empty Variant.
+pub(crate) fn to_optional_pairs(of: &[(String, Option<SkillValue>)]) -> [Variant; 2] {
+    let names = of.iter().map(|(name, _)| (name.clone(), false.into()));
+    let [names, _] = to_pairs(&names.collect::<Vec<_>>());
+    let values = of.iter().map(|(_, value)| {
+        let value = value.as_ref().map_or(Variant::Empty, to_variant);
+        Variant::Variant(Box::new(value))
+    });
+    let values = Array {
+        value_type: VariantScalarTypeId::Variant,
+        values: values.collect(),
+        dimensions: None,
+    };
+    [names, Variant::Array(Box::new(values))]
+}
+
+/// Reads pairs from two arrays, with empty Variants as missing values; `None` if their lengths
+/// differ or a value is not supported.
+pub(crate) fn from_optional_pairs(
+    names: &Variant,
+    values: &Variant,
+) -> Option<Vec<(String, Option<SkillValue>)>> {
+    let array = |of: &Variant| {
+        if let Variant::Array(array) = of {
+            return Some(array.values.clone());
+        }
+        matches!(of, Variant::Empty).then(Vec::new)
+    };
+    let (names, values) = (array(names)?, array(values)?);
+    if names.len() != values.len() {
+        return None;
+    }
+    let pair = |(name, value): (&Variant, &Variant)| {
+        let value = if let Variant::Variant(inner) = value {
+            inner
+        } else {
+            value
+        };
+        let value = match *value == Variant::Empty {
+            true => None,
+            false => Some(from_variant(value)?),
+        };
+        Some((from_variant(name)?.as_str()?.to_owned(), value))
+    };
+    names.iter().zip(&values).map(pair).collect()
+}
+
 /// Reads pairs from two arrays; `None` if their lengths differ or a value is not supported.
 pub(crate) fn from_pairs(names: &Variant, values: &Variant) -> Option<Vec<(String, SkillValue)>> {
     let elements = |of: &Variant| {
@@ -203,5 +250,12 @@ mod tests {
             Some(Vec::new())
         );
         assert_eq!(from_pairs(&names, &Variant::Empty), None);
+        let some = vec![
+            ("Force".to_owned(), Some(SkillValue::from(0.5))),
+            ("Product".to_owned(), None),
+        ];
+        let [names, values] = to_optional_pairs(&some);
+        assert_eq!(from_optional_pairs(&names, &values), Some(some));
+        assert_eq!(from_optional_pairs(&names, &Variant::Empty), None);
     }
 }

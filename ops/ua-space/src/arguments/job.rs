@@ -77,6 +77,21 @@ pub(crate) enum ProcessVerb {
 }
 
 #[derive(Debug, Args)]
+pub(crate) struct ConfigureArguments {
+    /// The AutomationML file, or - for stdin
+    #[arg(value_name = "FILE")]
+    pub(crate) file: String,
+    /// Only check the fields: nothing is set
+    #[arg(long)]
+    pub(crate) check: bool,
+    /// Print the response unchanged
+    #[arg(long)]
+    pub(crate) json: bool,
+    #[command(flatten)]
+    pub(crate) at: SourceAt,
+}
+
+#[derive(Debug, Args)]
 pub(crate) struct GoalArguments {
     /// The IRI of the goal
     #[arg(value_name = "GOAL")]

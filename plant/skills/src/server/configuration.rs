@@ -1,12 +1,14 @@
 //! The configuration of a component, for clients: an object with a variable for each field, and a
 //! method that sets fields.
 
+mod fields;
+
 use std::future::Future;
 use std::sync::Arc;
 
 use plant_opcua::server::{
     IdRange, InstanceError, MethodRefusal, MethodRequest, MethodSpec, ObjectSpec, OpcUaServer,
-    VariableSpec, method,
+    SessionCaller, VariableSpec, method,
 };
 use plant_opcua::supervision::{CONFIGURE, Supervision};
 use plant_opcua::types::{
@@ -70,35 +72,63 @@ pub(super) fn serve(
                 text("Reason", "The reason of the refusal."),
             ],
         };
-        let (configuration, (supervision, users)) = (configuration.clone(), by);
+        let rights = Rights {
+            supervision: by.0,
+            users: by.1,
+        };
+        fields::add(server, &object.node_id, ids, (configuration, &rights))?;
+        let configuration = configuration.clone();
         let handler = method(move |request: MethodRequest| {
             let caller = &request.caller;
-            let admitted = supervision.admits(caller, users.roles_of(caller));
-            admitted.inspect_err(|_| {
-                warn!(
-                    application = ?caller.application_uri, user = ?caller.user, proven = caller.proven,
-                    "refused Configure: the component is not registered with this client"
-                );
-            })?;
+            rights.check(caller)?;
             let [given] = request.arguments.as_slice() else {
                 return Err(MethodRefusal::from(StatusCode::BadInvalidArgument));
             };
             let set = pairs(given).and_then(|given| configuration.set(given));
-            match &set {
-                Ok(()) => info!(application = ?caller.application_uri, "configured"),
-                Err(why) => {
-                    warn!(application = ?caller.application_uri, "refused a configuration: {why}");
-                }
-            }
-            let (status, field, reason) = match set {
-                Ok(()) => ("configured", String::new(), String::new()),
-                Err(why) => ("refused", why.field, why.reason.to_string()),
-            };
-            Ok([status, &field, &reason].map(Variant::from).to_vec())
+            let fault = set.err();
+            log(caller, fault.as_ref());
+            Ok(answer(fault).map(Variant::from).to_vec())
         });
         server.add_method(spec, handler)?;
     }
     Ok(keep(server.clone(), configuration.clone(), shown))
+}
+
+/// The right to configure the component.
+#[derive(Clone)]
+struct Rights {
+    supervision: Supervision,
+    users: Arc<UserAccess>,
+}
+
+impl Rights {
+    fn check(&self, caller: &SessionCaller) -> Result<(), StatusCode> {
+        let admitted = self.supervision.admits(caller, self.users.roles_of(caller));
+        admitted.inspect_err(|_| {
+            warn!(
+                application = ?caller.application_uri, user = ?caller.user, proven = caller.proven,
+                "refused a configuration: the component is not registered with this client"
+            );
+        })
+    }
+}
+
+/// Logs a change of the configuration.
+fn log(caller: &SessionCaller, fault: Option<&NotConfigured>) {
+    match fault {
+        None => info!(application = ?caller.application_uri, "configured"),
+        Some(why) => {
+            warn!(application = ?caller.application_uri, "refused a configuration: {why}");
+        }
+    }
+}
+
+/// Returns `Status`, `Field` and `Reason` of a change.
+fn answer(fault: Option<NotConfigured>) -> [String; 3] {
+    fault.map_or_else(
+        || [CONFIGURED.to_owned(), String::new(), String::new()],
+        |why| [REFUSED.to_owned(), why.field, why.reason.to_string()],
+    )
 }
 
 /// Adds the variable of a field.
@@ -181,7 +211,13 @@ fn pairs(given: &Variant) -> Result<Vec<(String, SkillValue)>, NotConfigured> {
     elements.iter().map(pair).collect()
 }
 
-const OBJECT: &str = "Configuration";
+/// The object with the fields of a component.
+pub(crate) const OBJECT: &str = "Configuration";
+/// The method that sets fields, or checks them, through stations too.
+pub(crate) const SET_FIELDS: &str = plant_opcua::supervision::SET_FIELDS;
+/// The values of `Status`.
+pub(crate) const CONFIGURED: &str = "configured";
+const REFUSED: &str = "refused";
 
 #[cfg(test)]
 mod tests {

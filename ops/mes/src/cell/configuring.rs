@@ -1,0 +1,55 @@
+//! The components of a product configuration, as discovery found them.
+
+use async_trait::async_trait;
+use mtp::ConfiguredComponent;
+use skills::{FieldChange, SetFieldsFault, SkillClient, SkillHandle};
+
+use super::PlantState;
+use crate::product_configuration::{ConfigurationTarget, ProductComponent, fields};
+
+/// A connected component.
+struct ConnectedTarget {
+    handle: SkillHandle,
+    /// Keeps the connection.
+    _client: SkillClient,
+}
+
+#[async_trait]
+impl ConfigurationTarget for ConnectedTarget {
+    async fn set(
+        &self,
+        fields: &FieldChange,
+        checks_only: bool,
+    ) -> Result<FieldChange, SetFieldsFault> {
+        self.handle.set_fields(fields, checks_only).await
+    }
+}
+
+impl PlantState {
+    /// Connects to a component of a product configuration.
+    pub(crate) async fn configured(&self, of: &ConfiguredComponent) -> ProductComponent {
+        let target = self.target(&of.application_uri).await;
+        ProductComponent {
+            application_uri: of.application_uri.clone(),
+            fields: fields(of),
+            target: target.map(|target| Box::new(target) as Box<dyn ConfigurationTarget>),
+        }
+    }
+
+    async fn target(&self, application_uri: &str) -> Result<ConnectedTarget, String> {
+        let found = {
+            let present = self.present();
+            let mut all = present.components.values();
+            let component = all.find(|one| one.application_uri == application_uri);
+            component
+                .and_then(|one| Some((one.endpoint.clone(), one.found.values().next()?.clone())))
+        };
+        let (endpoint, skill) = found.ok_or("it is not in the plant, or has no skills")?;
+        let client = SkillClient::connect(&endpoint, &self.client).await;
+        let client = client.map_err(|fault| format!("{endpoint}: {fault}"))?;
+        Ok(ConnectedTarget {
+            handle: client.handle(&skill),
+            _client: client,
+        })
+    }
+}
