@@ -114,13 +114,20 @@ impl GroupSocket {
     }
 }
 
+/// The error of Linux for an option of a socket that it does not know.
+const ENOPROTOOPT: i32 = 92;
+
 /// Opens a socket for the packets of the mDNS group on the interface with these addresses.
 fn listen(addresses: &[Ipv4Addr], port: u16) -> std::io::Result<UdpSocket> {
     let socket = Socket::new(Domain::IPV4, Type::DGRAM, Some(Protocol::UDP))?;
     socket.set_reuse_address(true)?;
     socket.set_reuse_port(true)?;
-    // Excludes the groups that other programs have joined on other interfaces.
-    socket.set_multicast_all_v4(false)?;
+    // Excludes the groups that other programs have joined on other interfaces. Emulators of other
+    // processors (qemu-user) do not know the option.
+    match socket.set_multicast_all_v4(false) {
+        Err(error) if error.raw_os_error() != Some(ENOPROTOOPT) => return Err(error),
+        Ok(()) | Err(_) => {}
+    }
     // Binds to the group only: unicast packets to this host are for the program that sent the
     // query.
     socket.bind(&SocketAddrV4::new(GROUP, port).into())?;

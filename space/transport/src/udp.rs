@@ -7,6 +7,7 @@ use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::os::fd::AsRawFd as _;
 use std::task::{Context, Poll, ready};
 
+use nix::errno::Errno;
 use nix::sys::socket::setsockopt;
 use nix::sys::socket::sockopt::ReceiveTimestampns;
 use socket2::{Domain, Protocol, Socket, Type};
@@ -608,15 +609,13 @@ fn join(
             source,
         })?;
     // Off, so that the socket does not receive groups that other programs of this host have joined
-    // on other interfaces.
+    // on other interfaces. Emulators of other processors (qemu-user) do not know the option.
     socket
         .set_multicast_all_v4(false)
         .or_else(|error| {
-            if error.kind() == io::ErrorKind::Unsupported {
-                Ok(())
-            } else {
-                Err(error)
-            }
+            let is_unknown = error.kind() == io::ErrorKind::Unsupported
+                || error.raw_os_error().map(Errno::from_raw) == Some(Errno::ENOPROTOOPT);
+            if is_unknown { Ok(()) } else { Err(error) }
         })
         .map_err(|source| UdpOpenError::Join {
             group,
