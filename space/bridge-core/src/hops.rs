@@ -19,6 +19,19 @@ pub enum Hop {
     In,
 }
 
+impl Hop {
+    /// Returns the name of the hop in status pages and metrics.
+    #[must_use]
+    pub const fn label(self) -> &'static str {
+        match self {
+            Self::Out => "out",
+            Self::Origin => "origin",
+            Self::Network => "network",
+            Self::In => "in",
+        }
+    }
+}
+
 /// The delays of a hop.
 #[derive(Debug, Clone)]
 pub struct Delays {

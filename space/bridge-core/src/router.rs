@@ -35,6 +35,7 @@ mod send;
 mod senders;
 mod told;
 mod values;
+mod way;
 
 use std::sync::Arc;
 use std::time::Instant;

@@ -6,6 +6,7 @@ use std::net::SocketAddr;
 use mappings::TopicId;
 
 use crate::counters::{DropCause, Reason};
+use crate::hops::Hop;
 
 /// The tapped topics and the events that were not taken yet.
 #[derive(Debug, Default)]
@@ -56,6 +57,13 @@ pub enum Crossing {
     Published {
         /// The time from the arrival of the datagram, in nanoseconds.
         after: i128,
+    },
+    /// The delay of a hop of a sample was measured.
+    Measured {
+        /// The hop.
+        hop: Hop,
+        /// The delay in nanoseconds; negative between hosts whose clocks differ.
+        nanos: i128,
     },
     /// Samples were dropped.
     Dropped {

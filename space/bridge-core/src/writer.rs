@@ -552,6 +552,11 @@ impl SentTopicState {
         }
     }
 
+    /// Returns whether any sample was sent.
+    pub(crate) const fn has_sent(&self) -> bool {
+        self.started
+    }
+
     /// Returns whether the topic has a producer.
     pub(crate) const fn is_live(&self) -> bool {
         self.live

@@ -536,6 +536,39 @@ fn a_mapped_topic_is_announced_with_its_name_and_its_ros_topics() {
 }
 
 #[test]
+fn a_probe_for_connections_finds_topics_that_have_not_sent_a_value() {
+    let (mut bridge, mut now) = (Bridge::new(1, ""), clock());
+    for topic in ["ua_1_5_10", "ua_1_5_11", "ua_1_5_12"] {
+        bridge.bind(topic, "std_msgs/UInt32", &Selection::Whole, now);
+    }
+    let lost = "ua_1_5_12".parse().unwrap();
+    bridge.router.set_live(lost, false, now);
+    bridge.say("ua_1_5_11", &[7, 0, 0, 0], now);
+    assert_eq!(announced(&bridge.sent_within(SECOND, &mut now)), 3);
+    let mut asked = |publisher: u16, bridge: &mut Bridge| {
+        let mut probe = Vec::new();
+        let connections = Probe::PubSubConnections {
+            transport_profile_uris: WireArray::null(),
+            include_writer_groups: false,
+            include_data_set_writers: false,
+        };
+        let publisher = Some(PublisherId::UInt16(publisher));
+        connections
+            .encode(publisher, SecurityHeader::NONE, &mut probe)
+            .unwrap();
+        bridge.hear(&Bridge::new(2, ""), &[probe], now);
+        let mut writers = Vec::new();
+        each_meta_data(&bridge.sent_within(SECOND, &mut now), |writer, _| {
+            writers.push(writer);
+        });
+        writers
+    };
+    // 11 is known by its value, and 12 has no producer.
+    assert_eq!(asked(1, &mut bridge), [10]);
+    assert_eq!(asked(0, &mut bridge), [0; 0]);
+}
+
+#[test]
 fn what_is_written_in_opc_ua_is_announced_as_the_mapping_says_it() {
     let mut now = clock();
     let text = |unit: &str| {

@@ -905,6 +905,7 @@ fn a_tapped_topic_shows_each_step_of_its_samples_and_others_none() {
             ..
         },
         Crossing::Taken { bytes: 4 },
+        Crossing::Measured { hop: Hop::Out, .. },
         Crossing::Sent { .. },
     ] = &seen[..]
     else {

@@ -169,6 +169,7 @@ struct HopStatus {
     negative: u64,
     p50_us: f64,
     p99_us: f64,
+    p999_us: f64,
     max_us: f64,
 }
 
@@ -208,7 +209,7 @@ impl StatusSnapshot {
             .collect();
         let hops = HOPS
             .into_iter()
-            .map(|(hop, label)| (label, router.hops().of(hop).into()))
+            .map(|hop| (hop.label(), router.hops().of(hop).into()))
             .collect();
         Self {
             program,
@@ -460,6 +461,7 @@ impl HopStatus {
         line("hop_negative_total", labels, &self.negative);
         line("hop_p50_microseconds", labels, &self.p50_us);
         line("hop_p99_microseconds", labels, &self.p99_us);
+        line("hop_p999_microseconds", labels, &self.p999_us);
         line("hop_max_microseconds", labels, &self.max_us);
     }
 }
@@ -567,17 +569,13 @@ impl From<&Delays> for HopStatus {
             negative: delays.negative(),
             p50_us: delays.quantile_us(0.5),
             p99_us: delays.quantile_us(0.99),
+            p999_us: delays.quantile_us(0.999),
             max_us: delays.max_us(),
         }
     }
 }
 
-const HOPS: [(Hop, &str); 4] = [
-    (Hop::Out, "out"),
-    (Hop::Origin, "origin"),
-    (Hop::Network, "network"),
-    (Hop::In, "in"),
-];
+const HOPS: [Hop; 4] = [Hop::Out, Hop::Origin, Hop::Network, Hop::In];
 
 #[cfg(test)]
 mod tests;

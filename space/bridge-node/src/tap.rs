@@ -212,6 +212,10 @@ enum Step<'a> {
     Published {
         after_us: f64,
     },
+    Measured {
+        hop: &'static str,
+        delay_us: f64,
+    },
     Dropped {
         reason: &'static str,
         meaning: &'static str,
@@ -242,6 +246,10 @@ impl<'a> Step<'a> {
             Crossing::Forwarded { refused } => Self::Forwarded { refused: *refused },
             Crossing::Published { after } => Self::Published {
                 after_us: microseconds(*after),
+            },
+            Crossing::Measured { hop, nanos } => Self::Measured {
+                hop: hop.label(),
+                delay_us: microseconds(*nanos),
             },
             Crossing::Dropped {
                 reason,

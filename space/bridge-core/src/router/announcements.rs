@@ -116,6 +116,17 @@ impl PlannedAnnouncements {
         self.plan(AnnouncedSubject::ActionMetaData(writer_id), now);
     }
 
+    /// Plans the announcements of described topics that have a producer and no value yet. No message
+    /// of such a topic shows others that it exists.
+    pub(super) fn plan_silent(&mut self, values: &TopicQueues, now: Now) {
+        let topics = self.writers.values().flatten();
+        let silent = topics.filter(|topic| values.is_silent(**topic));
+        let silent: Vec<TopicId> = silent.take(MOST_SILENT).copied().collect();
+        for topic in silent {
+            self.plan_value(topic, now);
+        }
+    }
+
     /// Plans the announcement of the own application.
     pub(super) fn plan_application(&mut self, now: Now) {
         self.plan(AnnouncedSubject::ApplicationInformation, now);
@@ -448,3 +459,6 @@ impl PlannedAnnouncements {
         }
     }
 }
+
+/// The largest number of topics without a value that are announced for a probe.
+const MOST_SILENT: usize = 512;

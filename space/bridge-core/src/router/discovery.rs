@@ -196,6 +196,7 @@ impl Router {
                     .handle_roll(ProbedCalls::space(space), now);
                 if space == own {
                     self.call_traffic().announce_calls(now);
+                    self.announcements.plan_silent(&self.values, now);
                 }
             }
             Ok(Probe::WriterGroupConfiguration {

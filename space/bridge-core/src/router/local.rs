@@ -169,7 +169,7 @@ impl TopicQueues {
                 )
             });
         }
-        self.hops.record(Hop::Out, received, now.utc);
+        self.record_hop(at.topic(), Hop::Out, (received, now.utc));
         self.schedule(at);
         if self.push(at, PolledSample::Message(message)) {
             Verdict::ForwardAfterDroppingOldest

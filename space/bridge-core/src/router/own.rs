@@ -166,6 +166,12 @@ impl TopicQueues {
         self.owned.is_home(self.settings.own, topic)
     }
 
+    /// Returns whether the topic of the own space has a producer that has not sent a value yet.
+    pub(super) fn is_silent(&self, topic: TopicId) -> bool {
+        let role = self.topics.get(&topic).map(|entry| &entry.role);
+        matches!(role, Some(TopicSide::Ours(writer)) if writer.is_live() && !writer.has_sent())
+    }
+
     pub(super) fn may_cross(&self, heard_on: Side, what: Crosses, topic: TopicId) -> bool {
         may_cross(self.is_home(topic), heard_on, what)
     }

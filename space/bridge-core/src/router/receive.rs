@@ -15,7 +15,6 @@ use super::{DropSite, Router, TopicQueues};
 use crate::confirm::Confirming;
 use crate::counters::Reason;
 use crate::fields;
-use crate::hops::Hop;
 use crate::late;
 use crate::loop_rule::{Crosses, Owned, Side, may_cross};
 use crate::network::number_of;
@@ -400,7 +399,7 @@ impl TopicQueues {
         let takes = self.take_base(at, message, place);
         match Self::plain(message, takes) {
             Some(Ok(fields)) => {
-                self.record_way(place, sent, now);
+                self.record_way(topic, (place, sent), now);
                 self.route(at, &sample(fields, ValueQuality::default()), now);
                 return;
             }
@@ -416,7 +415,7 @@ impl TopicQueues {
                 let message = DataSetMessage::decode(None, &content);
                 match message.and_then(|message| message.fields()) {
                     Ok(fields) => {
-                        self.record_way(place, sent, now);
+                        self.record_way(topic, (place, sent), now);
                         self.route(at, &sample(fields, quality), now);
                     }
                     Err(error) => self.drop_undecoded(Some(topic), place.from, &error),
@@ -596,24 +595,6 @@ impl TopicQueues {
                 topic: at.topic(),
                 instance,
             });
-        }
-    }
-
-    /// Records the delays of a sample. A stored value, or a sample held back by its rate limit,
-    /// waited intentionally; only its network delay is recorded.
-    fn record_way(&mut self, place: &SequencePosition, sent: Option<Timestamp>, now: Now) {
-        // Some stacks send zeros in timestamps that they do not fill.
-        let filled = |stamp: &Timestamp| stamp.time.0 != 0;
-        let Some(sent) = sent.filter(filled) else {
-            return;
-        };
-        let arrived = self.arrival(now);
-        self.hops.record(Hop::Network, sent, arrived);
-        let waited = place.is_stored() || (!place.held_back.is_zero() && !place.is_fresh());
-        if let Some(taken) = place.stamp.filter(filled)
-            && !waited
-        {
-            self.hops.record(Hop::Origin, taken, sent);
         }
     }
 
