@@ -58,8 +58,16 @@ enum Names {
     /// Components and skills.
     Either,
     Calls,
+    /// Values of the OPC UA side, which `write` writes.
+    Written,
+    /// Values, without calls.
+    Values,
+    /// Values and calls.
     Topics,
 }
+
+/// The verbs of values.
+const VALUES: [&str; 5] = ["echo", "hz", "bw", "tap", "trace"];
 
 impl WordPosition {
     fn of(before: &[String]) -> Self {
@@ -132,15 +140,14 @@ impl WordPosition {
     }
 
     fn names(&self) -> Option<Names> {
-        if self.option.is_some() {
-            return None;
-        }
-        let names = self.positional()?.get_value_names()?;
-        match names.first()?.as_str() {
+        let completed = self.option.as_ref().or_else(|| self.positional())?;
+        match completed.get_value_names()?.first()?.as_str() {
             "SKILL" => Some(Names::Skills),
             "COMPONENT|SKILL" => Some(Names::Either),
             "TOPIC|NAME" if self.command.get_name() == "start" => Some(Names::Skills),
             "TOPIC|NAME" if self.command.get_name() == "call" => Some(Names::Calls),
+            "TOPIC|NAME" if self.command.get_name() == "write" => Some(Names::Written),
+            "TOPIC|NAME" if VALUES.contains(&self.command.get_name()) => Some(Names::Values),
             "TOPIC|NAME" => Some(Names::Topics),
             _ => None,
         }
@@ -159,6 +166,8 @@ impl Names {
             calls,
             mut topics,
             names,
+            values,
+            written,
         } = heard;
         match self {
             Self::Skills => skills,
@@ -171,6 +180,11 @@ impl Names {
                 // The Start call of a skill is completed by the name of the skill alone.
                 skills.extend(calls.into_iter().filter(|name| !name.ends_with(".Start")));
                 skills
+            }
+            Self::Written => written,
+            Self::Values => {
+                topics.extend(values);
+                topics
             }
             Self::Topics => {
                 topics.extend(names);
@@ -264,13 +278,16 @@ mod tests {
             (&["skills", "watch"], Some(Names::Either)),
             (&["call"], Some(Names::Calls)),
             (&["call", "gripper.Grasp"], None),
-            (&["echo", "--seconds", "3"], Some(Names::Topics)),
+            (&["echo", "--seconds", "3"], Some(Names::Values)),
+            (&["info"], Some(Names::Topics)),
+            (&["write"], Some(Names::Written)),
+            (&["trace", "--follow"], Some(Names::Values)),
             (&["echo", "--seconds"], None),
             (&["check"], None),
         ] {
             assert_eq!(place(line).names(), names, "{line:?}");
         }
-        let heard = HeardNames {
+        let heard = || HeardNames {
             components: vec!["gripper".to_owned()],
             skills: vec!["gripper.Grasp".to_owned()],
             calls: vec![
@@ -279,9 +296,16 @@ mod tests {
             ],
             topics: vec!["ua_0_7_101".to_owned()],
             names: vec!["JointStates".to_owned(), "/joint_states".to_owned()],
+            values: vec!["JointStates".to_owned()],
+            written: vec!["Speed".to_owned()],
         };
+        assert_eq!(Names::Written.of(heard(), "S"), ["Speed"]);
         assert_eq!(
-            Names::Calls.of(heard, "g"),
+            Names::Values.of(heard(), "J"),
+            ["ua_0_7_101", "JointStates"]
+        );
+        assert_eq!(
+            Names::Calls.of(heard(), "g"),
             ["gripper.Grasp", "gripper.Grasp.Halt"]
         );
         let words = ["skills", "--interface", "lo", "info"].map(str::to_owned);

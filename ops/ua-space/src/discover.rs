@@ -43,7 +43,9 @@ const HEAD: [&str; 7] = [
 ];
 
 fn table(entries: &[DiscoveredEntry]) -> TextTable {
-    let mut table = TextTable::new(HEAD.map(str::to_owned)).yielding([6, 5, 4, 3, 2]);
+    let mut table = TextTable::new(HEAD.map(str::to_owned))
+        .yielding([5, 2])
+        .leaving_out([6, 4, 3]);
     let dash = |text: String| {
         if text.is_empty() {
             "-".to_owned()

@@ -19,8 +19,22 @@ pub(crate) enum InputFile {
     Mcap(Box<dyn Read>),
 }
 
-/// Opens a file, `-` for stdin. With `lines`, every line of hexadecimal text is a datagram.
-pub(crate) fn open(file: &str, lines: bool) -> Result<InputFile, CommandFailure> {
+/// A file whose format is known by its first bytes, or any other file.
+enum DetectedFile {
+    Recording(InputFile),
+    /// The first bytes, and the rest.
+    Other(Vec<u8>, Box<dyn Read>),
+}
+
+/// Opens a capture or an MCAP file, `-` for stdin; `None` if it is another file.
+pub(crate) fn open_recording(file: &str) -> Result<Option<InputFile>, CommandFailure> {
+    match detect(file)? {
+        DetectedFile::Recording(recording) => Ok(Some(recording)),
+        DetectedFile::Other(..) => Ok(None),
+    }
+}
+
+fn detect(file: &str) -> Result<DetectedFile, CommandFailure> {
     let reading = |error: io::Error| CommandFailure::reading(name(file), &error);
     let mut reader: Box<dyn Read> = match file {
         "-" => Box::new(io::stdin().lock()),
@@ -33,7 +47,7 @@ pub(crate) fn open(file: &str, lines: bool) -> Result<InputFile, CommandFailure>
         .read_to_end(&mut start)
         .map_err(reading)?;
     if start.first_chunk().copied().is_some_and(is_mcap) {
-        return Ok(InputFile::Mcap(reader));
+        return Ok(DetectedFile::Recording(InputFile::Mcap(reader)));
     }
     if let Some(magic) = start
         .first_chunk()
@@ -41,9 +55,18 @@ pub(crate) fn open(file: &str, lines: bool) -> Result<InputFile, CommandFailure>
         .filter(|magic| is_capture(*magic))
     {
         let capture = CaptureReader::new(magic, reader).map_err(|error| failure(file, error))?;
-        return Ok(InputFile::Capture(capture));
+        return Ok(DetectedFile::Recording(InputFile::Capture(capture)));
     }
-    let mut bytes = start;
+    Ok(DetectedFile::Other(start, reader))
+}
+
+/// Opens a file, `-` for stdin. With `lines`, every line of hexadecimal text is a datagram.
+pub(crate) fn open(file: &str, lines: bool) -> Result<InputFile, CommandFailure> {
+    let reading = |error: io::Error| CommandFailure::reading(name(file), &error);
+    let (mut bytes, reader) = match detect(file)? {
+        DetectedFile::Recording(recording) => return Ok(recording),
+        DetectedFile::Other(start, reader) => (start, reader),
+    };
     reader
         .take(MAX_BYTES)
         .read_to_end(&mut bytes)

@@ -53,18 +53,18 @@ impl RecordingReader {
     /// A [`CommandFailure`] if the file cannot be read or is no recording.
     pub(crate) fn open(file: &Path) -> Result<Self, CommandFailure> {
         let name = file.display().to_string();
-        let source = match input::open(&name, false)? {
-            InputFile::Capture(capture) => RecordedSource::Packets(Packets {
+        let source = match input::open_recording(&name)? {
+            Some(InputFile::Capture(capture)) => RecordedSource::Packets(Packets {
                 capture,
                 fragments: Fragments::default(),
                 time: 0,
             }),
-            InputFile::Mcap(reader) => {
+            Some(InputFile::Mcap(reader)) => {
                 let values =
                     RecordedValues::new(reader).map_err(|error| input::failure(&name, error))?;
                 RecordedSource::Values(Box::new(values))
             }
-            InputFile::Datagram(_) | InputFile::Lines(_) => {
+            Some(InputFile::Datagram(_) | InputFile::Lines(_)) | None => {
                 return Err(CommandFailure::Data(format!(
                     "{name} is no pcapng, pcap or MCAP file; `ua-space record` makes one"
                 )));

@@ -168,7 +168,7 @@ pub(crate) struct StartSkill {
 
 #[derive(Debug, Args)]
 pub(crate) struct InfoSkill {
-    /// The skill, as parallel-gripper.Grasp
+    /// The skill, as parallel-gripper.Grasp, or Grasp if only one has that name
     #[arg(value_name = "SKILL")]
     pub(crate) skill: String,
     /// Time to listen
@@ -183,7 +183,8 @@ pub(crate) struct InfoSkill {
 
 #[derive(Debug, Args)]
 pub(crate) struct WatchSkills {
-    /// Only this component, as parallel-gripper, or only this skill, as parallel-gripper.Grasp
+    /// Only this component, as parallel-gripper, or only this skill, as parallel-gripper.Grasp or
+    /// Grasp
     #[arg(value_name = "COMPONENT|SKILL")]
     pub(crate) what: Option<String>,
     /// End after this time. Without it: at Ctrl-C
@@ -199,7 +200,7 @@ pub(crate) struct WatchSkills {
 #[derive(Debug, Args)]
 pub(crate) struct ListSkills {
     /// Only the skills of this component, as parallel-gripper, or only this skill, as
-    /// parallel-gripper.Grasp
+    /// parallel-gripper.Grasp or Grasp
     #[arg(value_name = "COMPONENT|SKILL")]
     pub(crate) what: Option<String>,
     /// Time to listen
@@ -243,7 +244,11 @@ pub(crate) struct CallArguments {
 
 #[derive(Debug, Args)]
 pub(crate) struct Trace {
-    /// Ask the program with this address of --metrics. May be repeated
+    /// Show the hops of this topic at each program: ua_1_2_10, or its name. Without it: of all topics
+    #[arg(value_name = "TOPIC|NAME", conflicts_with_all = ["follow", "recording", "otlp", "perfetto", "svg"])]
+    pub(crate) target: Option<NamedTarget>,
+    /// Ask the program with this address of --metrics. May be repeated. Without it: all programs of
+    /// this host with --metrics
     #[arg(long, value_name = "URL")]
     pub(crate) metrics: Vec<String>,
     /// Time to listen in the group; 0 asks the programs only. Without it: 3 s, or with --follow

@@ -395,10 +395,16 @@ fn table(programs: &[ListedProgram]) -> TextTable {
             one.version.clone().unwrap_or_else(dash),
             one.uptime_s.map_or_else(dash, uptime),
             hash.unwrap_or_else(dash),
-            one.address.clone().unwrap_or_else(dash),
+            one.address.as_deref().map_or_else(dash, without_scheme),
         ]);
     }
     table
+}
+
+/// Returns an address of a status page without the scheme that all of them have.
+fn without_scheme(address: &str) -> String {
+    let short = address.strip_prefix("http://").unwrap_or(address);
+    short.trim_end_matches('/').to_owned()
 }
 
 /// Formats a time as `42 s`, `12 min`, `3 h 5 min` or `2 d 4 h`.

@@ -128,6 +128,9 @@ pub(crate) struct ServerPage {
 pub(crate) struct HopPage {
     pub(crate) p50_us: f64,
     pub(crate) p99_us: f64,
+    /// `None` from a program that does not report it.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(crate) p999_us: Option<f64>,
     pub(crate) max_us: f64,
     pub(crate) count: u64,
     /// Number of negative delays, which are caused by clocks that disagree.

@@ -2,7 +2,7 @@
 //! it does not cross.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::io::{self, Write as _};
+use std::io::{self, IsTerminal as _, Write as _};
 use std::time::Duration;
 
 use mappings::TopicId;
@@ -17,7 +17,7 @@ use crate::exit::CommandFailure;
 use crate::http::HttpServer;
 use crate::interrupt::SignalGuard;
 use crate::iso_time;
-use crate::live::{fitting, harmless, json};
+use crate::live::{fitting, harmless, json, wrapped};
 use crate::report::warn;
 use crate::survey::look;
 
@@ -27,22 +27,9 @@ pub(crate) fn tap(arguments: &TapArguments) -> Result<(), CommandFailure> {
 }
 
 async fn run(arguments: &TapArguments) -> Result<(), CommandFailure> {
-    let pages = pages(arguments).await?;
+    let pages = pages(&arguments.metrics).await?;
     let topic = topic(&arguments.target, &pages)?;
-    let mut programs: Vec<TappedProgram> = Vec::new();
-    for page in &pages {
-        match programs.iter_mut().find(|one| one.url == page.url) {
-            Some(known) => known.name = page.program.clone(),
-            None => programs.push(TappedProgram {
-                name: page.program.clone(),
-                url: page.url.clone(),
-                server: HttpServer::parse(&page.url)?,
-                from: 0,
-                lost: 0,
-                fault: None,
-            }),
-        }
-    }
+    let mut programs = TappedProgram::of(&pages)?;
     let mut interrupt = SignalGuard::catch()?;
     let limit = arguments.seconds.map(Duration::try_from_secs_f64);
     let end = limit
@@ -89,14 +76,14 @@ async fn run(arguments: &TapArguments) -> Result<(), CommandFailure> {
 }
 
 /// Returns the status pages of the programs to ask.
-async fn pages(arguments: &TapArguments) -> Result<Vec<StatusPage>, CommandFailure> {
+pub(crate) async fn pages(metrics: &[String]) -> Result<Vec<StatusPage>, CommandFailure> {
     let mut found = Vec::new();
-    if arguments.metrics.is_empty() {
+    if metrics.is_empty() {
         found = pages_of_this_host().await;
         // The MES passes on no values.
         found.retain(|page| !page.topics.is_empty() || !page.hops.is_empty());
     }
-    for url in &arguments.metrics {
+    for url in metrics {
         found.extend(pages::of_url(url).await?);
     }
     if found.is_empty() {
@@ -111,7 +98,7 @@ async fn pages(arguments: &TapArguments) -> Result<Vec<StatusPage>, CommandFailu
 }
 
 /// Returns the topic of the target, by the names that the programs know.
-fn topic(target: &NamedTarget, pages: &[StatusPage]) -> Result<TopicId, CommandFailure> {
+pub(crate) fn topic(target: &NamedTarget, pages: &[StatusPage]) -> Result<TopicId, CommandFailure> {
     let name = match target {
         NamedTarget::Topic(topic) => return Ok(*topic),
         NamedTarget::Name(name) => name,
@@ -148,8 +135,8 @@ fn topic(target: &NamedTarget, pages: &[StatusPage]) -> Result<TopicId, CommandF
 }
 
 /// A program that is asked.
-struct TappedProgram {
-    name: String,
+pub(crate) struct TappedProgram {
+    pub(crate) name: String,
     url: String,
     server: HttpServer,
     /// The number of the next event.
@@ -163,22 +150,49 @@ struct TappedProgram {
 struct TapReply {
     next: u64,
     lost: u64,
-    events: Vec<Event>,
+    events: Vec<TapEvent>,
 }
 
 /// A step of a sample at a program.
 #[derive(Debug, Clone, Deserialize, Serialize)]
-struct Event {
-    space: u8,
+pub(crate) struct TapEvent {
+    pub(crate) space: u8,
     at_us: i64,
-    step: String,
+    pub(crate) step: String,
     #[serde(flatten)]
     more: BTreeMap<String, Value>,
 }
 
 impl TappedProgram {
+    /// Returns the programs with these pages; a program may have a page for each of its spaces.
+    ///
+    /// # Errors
+    /// The address of a page is no URL.
+    pub(crate) fn of(pages: &[StatusPage]) -> Result<Vec<Self>, CommandFailure> {
+        let mut programs: Vec<Self> = Vec::new();
+        for page in pages {
+            match programs.iter_mut().find(|one| one.url == page.url) {
+                Some(known) => known.name = page.program.clone(),
+                None => programs.push(Self {
+                    name: page.program.clone(),
+                    url: page.url.clone(),
+                    server: HttpServer::parse(&page.url)?,
+                    from: 0,
+                    lost: 0,
+                    fault: None,
+                }),
+            }
+        }
+        Ok(programs)
+    }
+
+    /// Returns the number of events that the program has lost.
+    pub(crate) const fn lost(&self) -> u64 {
+        self.lost
+    }
+
     /// Returns the new events of the topic.
-    async fn events(&mut self, topic: TopicId) -> Vec<(String, Event)> {
+    pub(crate) async fn events(&mut self, topic: TopicId) -> Vec<(String, TapEvent)> {
         if self.fault.is_some() {
             return Vec::new();
         }
@@ -227,7 +241,7 @@ struct SampleJson<'a> {
     topic: String,
     program: &'a str,
     #[serde(flatten)]
-    event: &'a Event,
+    event: &'a TapEvent,
 }
 
 impl<'a> PrintedEvents<'a> {
@@ -241,10 +255,10 @@ impl<'a> PrintedEvents<'a> {
     }
 
     /// Prints events. Returns true if enough lines are printed.
-    fn tell(&mut self, events: Vec<(String, Event)>) -> Result<bool, CommandFailure> {
+    fn tell(&mut self, events: Vec<(String, TapEvent)>) -> Result<bool, CommandFailure> {
         let mut out = io::stdout().lock();
         for (program, event) in events {
-            if self.arguments.drops && event.step != DROPPED {
+            if event.step == MEASURED || (self.arguments.drops && event.step != DROPPED) {
                 continue;
             }
             let program = harmless(&program);
@@ -259,7 +273,11 @@ impl<'a> PrintedEvents<'a> {
                 let time = iso_time::of_unix_nanos(i128::from(event.at_us) * 1_000);
                 let time = time.get(11..26).unwrap_or_default();
                 let space = event.space;
-                writeln!(out, "{time}  {program} (space {space})  {}", event.text())?;
+                let head = format!("{time}  {program} (space {space})  ");
+                match io::stdout().is_terminal() {
+                    true => write!(out, "{}", wrapped(&head, &event.text()))?,
+                    false => writeln!(out, "{head}{}", event.text())?,
+                }
             }
             let count = event.number("count").unwrap_or(1);
             let sum = self.sums.entry((program, event.kind())).or_default();
@@ -296,8 +314,8 @@ impl<'a> PrintedEvents<'a> {
     }
 }
 
-impl Event {
-    fn text_of(&self, name: &str) -> &str {
+impl TapEvent {
+    pub(crate) fn text_of(&self, name: &str) -> &str {
         self.more
             .get(name)
             .and_then(Value::as_str)
@@ -306,6 +324,11 @@ impl Event {
 
     fn number(&self, name: &str) -> Option<u64> {
         self.more.get(name)?.as_u64()
+    }
+
+    /// Returns a time in microseconds.
+    pub(crate) fn micros(&self, name: &str) -> Option<f64> {
+        self.more.get(name)?.as_f64()
     }
 
     fn is(&self, name: &str) -> bool {
@@ -342,11 +365,8 @@ impl Event {
                 reason => harmless(reason),
             },
             "published" => {
-                let after = self.more.get("after_us").and_then(Value::as_f64);
-                format!(
-                    "published {:.0} us after its arrival",
-                    after.unwrap_or_default()
-                )
+                let after = self.micros("after_us").unwrap_or_default();
+                format!("published {after:.0} us after its arrival")
             }
             DROPPED => {
                 let parts = [
@@ -374,7 +394,9 @@ impl Event {
 }
 
 /// The step of a drop.
-const DROPPED: &str = "dropped";
+pub(crate) const DROPPED: &str = "dropped";
+/// The step of a measured delay, which `ua-space trace` shows.
+pub(crate) const MEASURED: &str = "measured";
 /// The period of requests; a program records for longer without them.
 const PERIOD: Duration = Duration::from_millis(200);
 
@@ -382,7 +404,7 @@ const PERIOD: Duration = Duration::from_millis(200);
 mod tests {
     use super::*;
 
-    fn event(text: &str) -> Event {
+    fn event(text: &str) -> TapEvent {
         serde_json::from_str(text).unwrap()
     }
 

@@ -251,7 +251,9 @@ fn table_of_programs(programs: &[&DiscoveredEntry]) -> TextTable {
         "CAPABILITIES",
         "URI",
     ];
-    let mut table = TextTable::new(head.map(str::to_owned)).yielding([6, 5, 4, 2]);
+    let mut table = TextTable::new(head.map(str::to_owned))
+        .yielding([2])
+        .leaving_out([6, 5, 4]);
     for one in programs {
         let shown = one.shown();
         let space = one.space.map(|space| space.to_string());

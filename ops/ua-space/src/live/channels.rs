@@ -265,16 +265,28 @@ impl TopicChannels {
             found.map(|(_, topic)| topic.clone())
         });
         let named = || {
-            let name = described.map(|described| described.name.clone());
-            name.filter(|name| !name.is_empty())
+            let name = described.map(|described| viewed(&described.name));
+            name.filter(|name| name.len() > 1)
         };
         let wanted = ros.or_else(named).unwrap_or_else(|| format!("/{id}"));
         let owner = *self.names.entry(wanted.clone()).or_insert(Some(topic));
         match owner == Some(topic) {
             true => wanted,
-            false => format!("{wanted}@{id}"),
+            false => format!("{wanted}/{id}"),
         }
     }
+}
+
+/// Returns the name of a value as a topic: `/Line/Speed` of `Line.Speed`. Viewers select parts of a
+/// message by `TOPIC.FIELD`, so that their topics have no dots.
+fn viewed(name: &str) -> String {
+    let plain = |c: char| match c {
+        '.' => '/',
+        c if c.is_ascii_alphanumeric() || matches!(c, '_' | '-' | '/') => c,
+        _ => '_',
+    };
+    let parts: String = name.chars().map(plain).collect();
+    format!("/{}", parts.trim_matches('/'))
 }
 
 impl Slot {

@@ -165,9 +165,13 @@ const HEAD: [&str; 9] = [
 
 /// The columns that are shortened first: the type, the ROS topic and the name.
 const YIELDING: [usize; 3] = [8, 2, 1];
+/// The columns that a narrow table has not: the origin, which is the first number of the topic.
+const SPARE: [usize; 1] = [4];
 
 pub(super) fn table(lines: &[&ListRow<'_>]) -> TextTable {
-    let mut table = TextTable::new(HEAD.map(str::to_owned)).yielding(YIELDING);
+    let mut table = TextTable::new(HEAD.map(str::to_owned))
+        .yielding(YIELDING)
+        .leaving_out(SPARE);
     for line in lines {
         let dash = || "-".to_owned();
         let quality = line.quality().filter(|quality| quality != GOOD);

@@ -8,6 +8,7 @@ use mappings::{Mapping, TopicId, Variable};
 
 use super::book::{Book, DatagramContent, NameKind};
 use super::described::AnnouncedDescription;
+use super::list::FIRST_ASKED;
 use super::text::harmless;
 use super::{Go, ListenEnd, Live};
 use crate::arguments::NamedTarget;
@@ -91,6 +92,11 @@ fn best_fit<'n>(names: impl Iterator<Item = &'n str>, name: &str) -> Option<Fit>
     fits.flatten().min()
 }
 
+/// Returns true if a user may mean the known name by `name`: the whole name or its last parts.
+pub(super) fn is_fitting(known: &str, name: &str) -> bool {
+    best_fit(std::iter::once(known), name).is_some()
+}
+
 /// Returns the topics with the names that fit best.
 pub(crate) fn fitting<'t>(known: &[(&'t str, Vec<&str>)], name: &str) -> Vec<&'t str> {
     let fits = known.iter().filter_map(|(topic, names)| {
@@ -158,7 +164,9 @@ pub(super) fn unknown(live: &Live, target: &NamedTarget, seconds: f64) -> Comman
             "no names were announced; is this the group and the interface (--address, --interface)?"
                 .to_owned()
         }
-        (None, _) => "`ua-space list` shows the names".to_owned(),
+        (None, _) => {
+            "`ua-space list` shows the names, `ua-space status` what programs wait for".to_owned()
+        }
     };
     let (name, group) = (harmless(name), live.group());
     CommandFailure::Unavailable(format!(
@@ -198,6 +206,7 @@ impl Live {
             self.want_calls([0]);
         }
         let mut notice = Some(self.now() + NOTICE);
+        let silent = self.now() + SILENT;
         let mut settled = None;
         loop {
             let next = (self.now() + STEP).min(end);
@@ -216,6 +225,9 @@ impl Live {
                 }
             } else if now >= end {
                 return Ok(None);
+            } else if !self.wants_calls && now >= silent {
+                // In response, programs also announce topics that have no value yet.
+                self.want_calls(FIRST_ASKED);
             } else if notice.is_some_and(|at| now >= at) {
                 notice = None;
                 let name = harmless(name);
@@ -236,6 +248,8 @@ const fn settle(kind: Option<NameKind>) -> Duration {
     }
 }
 
+/// The time after which a name may be that of a topic without a value.
+const SILENT: Duration = Duration::from_millis(400);
 /// The time after which a missing name is reported.
 const NOTICE: Duration = Duration::from_secs(3);
 /// Maximum number of candidates in an error message.

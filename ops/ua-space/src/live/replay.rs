@@ -65,7 +65,7 @@ pub(crate) fn replay(arguments: &ReplayArguments) -> Result<(), CommandFailure> 
 /// Shows the topics of a recording, and what is left out.
 fn plan(contents: &RecordingContents) -> Result<(), CommandFailure> {
     let columns = ["TOPIC", "NAME", "TYPE", "MESSAGES", "SENT"];
-    let mut table = TextTable::new(columns.map(str::to_owned));
+    let mut table = TextTable::new(columns.map(str::to_owned)).leaving_out([2]);
     for (topic, values, left_out) in contents.topics() {
         let described = contents.described(topic);
         let or_none = |text: Option<String>| text.unwrap_or_else(|| "-".to_owned());

@@ -11,17 +11,18 @@ pub(crate) use types::types;
 
 use std::collections::BTreeMap;
 use std::io::{self, Write as _};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
-use mappings::TopicId;
+use mappings::{SpaceId, TopicId};
 use serde::Serialize;
 use uadp::MessageKind;
 
-use super::book::{Book, DatagramContent};
+use super::book::{Book, DatagramContent, NameKind};
 use super::described::{AnnouncedDescription, AnnouncedField};
 use super::list::json;
+use super::names::fitting;
 use super::plain::{self, NamedValues};
-use super::text::{TextTable, age, is_coloured};
+use super::text::{TextTable, age, harmless, is_coloured};
 use super::{Go, ListenEnd, Live, in_group, until};
 use crate::arguments::{GroupArguments, ListSkills, Skills, SkillsVerb};
 use crate::exit::CommandFailure;
@@ -110,7 +111,7 @@ pub(crate) fn heard_names(group: &GroupArguments) -> Result<HeardNames, CommandF
         let calls = live.book.calls();
         let named = calls.map(|(_, described)| described.name.clone());
         Ok(HeardNames {
-            components,
+            components: components.clone(),
             skills: found.iter().map(Skill::name).collect(),
             calls: named.filter(|name| !name.is_empty()).collect(),
             topics: live
@@ -124,8 +125,28 @@ pub(crate) fn heard_names(group: &GroupArguments) -> Result<HeardNames, CommandF
                 .flat_map(|(_, _, described, _)| described.names())
                 .map(str::to_owned)
                 .collect(),
+            values: names_of_values(&live.book, |_, _| true),
+            written: names_of_values(&live.book, |topic, name| {
+                topic.space == SpaceId::UA && !components.iter().any(|one| is_of(name, one))
+            }),
         })
     })
+}
+
+/// Returns the names of the values for which `is_wanted` returns true.
+fn names_of_values(book: &Book, is_wanted: impl Fn(TopicId, &str) -> bool) -> Vec<String> {
+    let values = book.announced();
+    let values = values.filter(|(topic, kind, described, _)| {
+        *kind == NameKind::Value && is_wanted(*topic, &described.name)
+    });
+    let names = values.flat_map(|(_, _, described, _)| described.names());
+    names.map(str::to_owned).collect()
+}
+
+/// Returns true if the name is that of a value of the component, which nobody else writes.
+fn is_of(name: &str, component: &str) -> bool {
+    let rest = name.strip_prefix(component);
+    rest.is_some_and(|rest| rest.starts_with('.'))
 }
 
 /// Names received in a space.
@@ -137,6 +158,10 @@ pub(crate) struct HeardNames {
     pub(crate) topics: Vec<String>,
     /// The names of values and calls, and the ROS topics.
     pub(crate) names: Vec<String>,
+    /// The names of values and their ROS topics.
+    pub(crate) values: Vec<String>,
+    /// The names of values that `write` can write.
+    pub(crate) written: Vec<String>,
 }
 
 /// The last states and results of skills.
@@ -206,6 +231,52 @@ impl Skill {
     /// Returns the name that `call` accepts.
     fn name(&self) -> String {
         format!("{}.{}", self.component, self.skill)
+    }
+}
+
+/// Returns the skill with a name, or with a name that ends with it; `None` if there is none.
+///
+/// # Errors
+/// Several skills have such a name.
+fn chosen<'s>(found: &'s [Skill], wanted: &str) -> Result<Option<&'s Skill>, CommandFailure> {
+    let names: Vec<String> = found.iter().map(Skill::name).collect();
+    let known: Vec<(&str, Vec<&str>)> = names
+        .iter()
+        .map(|name| (name.as_str(), vec![name.as_str()]))
+        .collect();
+    let mut fit = fitting(&known, wanted);
+    fit.dedup();
+    match fit.as_slice() {
+        [] => Ok(None),
+        [one] => Ok(found.iter().find(|skill| skill.name() == *one)),
+        several => Err(CommandFailure::Usage(format!(
+            "{} is the name of {} skills\n  = help: give one of {}",
+            harmless(wanted),
+            several.len(),
+            harmless(&several.join(", "))
+        ))),
+    }
+}
+
+/// Whether the skills that were heard may be all with a name that ends in the wanted one.
+struct SkillName<'a> {
+    wanted: &'a str,
+    /// The time at which each component that runs has sent its states.
+    settled: Instant,
+}
+
+impl<'a> SkillName<'a> {
+    fn new(wanted: &'a str) -> Self {
+        Self {
+            wanted,
+            settled: Instant::now() + SETTLE,
+        }
+    }
+
+    /// Returns the skill; `None` if it was not heard, if others may follow, or if there are several.
+    fn of<'s>(&self, found: &'s [Skill]) -> Option<&'s Skill> {
+        let skill = chosen(found, self.wanted).ok()??;
+        (skill.name() == self.wanted || Instant::now() >= self.settled).then_some(skill)
     }
 }
 
@@ -297,6 +368,8 @@ fn table(skills: &[Skill]) -> TextTable {
     table
 }
 
+/// The period in which each component that runs repeats its states, with a margin.
+const SETTLE: Duration = Duration::from_millis(1_500);
 /// Offset of the state among the identifiers of a skill.
 const STATE_ID: u16 = 1;
 /// Offset of the result.

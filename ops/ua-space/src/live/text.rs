@@ -1,14 +1,18 @@
 //! Terminal output: tables, and texts from the network without control characters.
 
+use std::borrow::Cow;
 use std::io::{self, IsTerminal as _, Write};
 
 /// A table that fits the terminal. Columns have the necessary width; if the table is too wide, the
 /// cells of its widest columns are shortened.
+#[derive(Clone)]
 pub(crate) struct TextTable {
     head: Vec<String>,
     rows: Vec<Vec<String>>,
     /// The columns that give way first, in this order.
     yielding: Vec<usize>,
+    /// The columns that are left out first if the table is too wide, in this order.
+    spare: Vec<usize>,
 }
 
 impl TextTable {
@@ -17,7 +21,15 @@ impl TextTable {
             head: head.into_iter().map(|name| harmless(&name)).collect(),
             rows: Vec::new(),
             yielding: Vec::new(),
+            spare: Vec::new(),
         }
+    }
+
+    /// Sets the columns that are left out, in their order, while the table is too wide: columns
+    /// that follow from others, or that matter least.
+    pub(crate) fn leaving_out(mut self, columns: impl Into<Vec<usize>>) -> Self {
+        self.spare = columns.into();
+        self
     }
 
     /// Sets the columns that are shortened before all other columns, in their order.
@@ -33,17 +45,22 @@ impl TextTable {
     }
 
     /// Removes the columns that have no content in any row.
-    pub(crate) fn without_empty_columns(mut self) -> Self {
+    pub(crate) fn without_empty_columns(self) -> Self {
         let is_empty = |cell: Option<&String>| {
             cell.is_none_or(|cell| cell.is_empty() || cell == "-" || cell == "?")
         };
         let kept: Vec<bool> = (0..self.head.len())
             .map(|at| at == 0 || !self.rows.iter().all(|row| is_empty(row.get(at))))
             .collect();
-        let keep = |cells: Vec<String>| -> Vec<String> {
-            let cells = cells.into_iter().zip(&kept);
+        self.with_columns(&kept)
+    }
+
+    /// Returns the table with the columns for which `kept` is true.
+    fn with_columns(&self, kept: &[bool]) -> Self {
+        let keep = |cells: &[String]| -> Vec<String> {
+            let cells = cells.iter().zip(kept);
             cells
-                .filter_map(|(cell, kept)| kept.then_some(cell))
+                .filter_map(|(cell, kept)| kept.then(|| cell.clone()))
                 .collect()
         };
         let moved = |at: &usize| {
@@ -51,10 +68,41 @@ impl TextTable {
             let before = kept.iter().take(*at).filter(|kept| **kept).count();
             is_kept.then_some(before)
         };
-        self.yielding = self.yielding.iter().filter_map(moved).collect();
-        self.head = keep(self.head);
-        self.rows = self.rows.into_iter().map(keep).collect();
-        self
+        Self {
+            head: keep(&self.head),
+            rows: self.rows.iter().map(|row| keep(row)).collect(),
+            yielding: self.yielding.iter().filter_map(moved).collect(),
+            spare: self.spare.iter().filter_map(moved).collect(),
+        }
+    }
+
+    /// Returns the table without as many of the spare columns as are too wide for `limit`.
+    fn fitted(&self, limit: usize) -> Cow<'_, Self> {
+        let mut table = Cow::Borrowed(self);
+        while let Some(spare) = table.spare.first().copied()
+            && table.natural_width() > limit
+        {
+            let kept: Vec<bool> = (0..table.head.len()).map(|at| at != spare).collect();
+            table = Cow::Owned(table.with_columns(&kept));
+        }
+        table
+    }
+
+    /// Returns the width of the table if no cell is shortened.
+    fn natural_width(&self) -> usize {
+        let widths = self.natural_widths();
+        widths.iter().sum::<usize>() + GAP * widths.len().saturating_sub(1)
+    }
+
+    /// Returns the widths of the columns if no cell is shortened.
+    fn natural_widths(&self) -> Vec<usize> {
+        let mut widths: Vec<usize> = self.head.iter().map(|text| text.chars().count()).collect();
+        for row in &self.rows {
+            for (width, cell) in widths.iter_mut().zip(row) {
+                *width = (*width).max(cell.chars().count());
+            }
+        }
+        widths
     }
 
     /// Writes the table in the width of the terminal; with `bold`, the head is bold.
@@ -63,6 +111,10 @@ impl TextTable {
     }
 
     fn write_within(&self, limit: usize, out: &mut impl Write, bold: bool) -> io::Result<()> {
+        self.fitted(limit).write_columns(limit, out, bold)
+    }
+
+    fn write_columns(&self, limit: usize, out: &mut impl Write, bold: bool) -> io::Result<()> {
         let widths = self.widths(limit);
         let line = |cells: &mut dyn Iterator<Item = &str>| {
             let mut line = String::new();
@@ -88,12 +140,7 @@ impl TextTable {
     /// Returns the widths of the columns. Columns keep their heads if possible.
     fn widths(&self, limit: usize) -> Vec<usize> {
         let heads: Vec<usize> = self.head.iter().map(|text| text.chars().count()).collect();
-        let mut widths = heads.clone();
-        for row in &self.rows {
-            for (width, cell) in widths.iter_mut().zip(row) {
-                *width = (*width).max(cell.chars().count());
-            }
-        }
+        let mut widths = self.natural_widths();
         let gaps = GAP * widths.len().saturating_sub(1);
         let mut excess = (widths.iter().sum::<usize>() + gaps).saturating_sub(limit);
         for at in &self.yielding {
@@ -116,12 +163,20 @@ impl TextTable {
     }
 }
 
-/// Returns a text of at most `width` characters. A name loses its middle, because names often
-/// differ at their ends only; a text with spaces loses its end.
+/// Returns a text of at most `width` characters. A type or ROS topic keeps its last part, if that
+/// fits. A name loses its middle, because names often differ at their ends only; a text with spaces
+/// loses its end.
 pub(crate) fn shortened(text: &str, width: usize) -> String {
     let length = text.chars().count();
     if length <= width {
         return text.to_owned();
+    }
+    if let Some((_, last)) = text.rsplit_once('/')
+        && !last.is_empty()
+        && !text.contains([' ', ':'])
+        && last.chars().count() + 2 <= width
+    {
+        return format!("…/{last}");
     }
     let Some(room) = width.checked_sub(1) else {
         return String::new();
@@ -299,6 +354,38 @@ mod tests {
                     .all(|line| line.chars().count() <= limit)
             );
         }
+    }
+
+    #[test]
+    fn columns_that_follow_from_others_are_left_out_of_a_table_that_is_too_wide() {
+        let head = ["TOPIC", "NAME", "ORIGIN", "TYPE"].map(str::to_owned);
+        let mut table = TextTable::new(head).yielding([3, 1]).leaving_out([2, 0]);
+        let cells = [
+            "ua_1_2_10",
+            "Arm.JointStates",
+            "ROS 1",
+            "sensor_msgs/JointState",
+        ];
+        table.row(cells.map(str::to_owned));
+        let shown = |limit| {
+            let mut out = Vec::new();
+            table.write_within(limit, &mut out, false).unwrap();
+            String::from_utf8(out).unwrap()
+        };
+        assert_eq!(
+            shown(80),
+            "TOPIC      NAME             ORIGIN  TYPE\n\
+             ua_1_2_10  Arm.JointStates  ROS 1   sensor_msgs/JointState\n"
+        );
+        assert_eq!(
+            shown(55),
+            "TOPIC      NAME             TYPE\n\
+             ua_1_2_10  Arm.JointStates  sensor_msgs/JointState\n"
+        );
+        assert_eq!(
+            shown(30),
+            "NAME             TYPE\nArm.JointStates  …/JointState\n"
+        );
     }
 
     #[test]

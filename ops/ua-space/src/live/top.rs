@@ -51,7 +51,9 @@ async fn once(live: &mut Live, arguments: &Top, view: &mut TopView) -> Result<()
     let now = live.now();
     figures.tick(now);
     let rows = view.rows(&figures, (live, now), &pages);
-    let mut table = TextTable::new(screen::HEAD.map(str::to_owned)).yielding([7, 1]);
+    let mut table = TextTable::new(screen::HEAD.map(str::to_owned))
+        .yielding([7, 1])
+        .leaving_out([7]);
     for row in &rows {
         table.row(row.cells());
     }

@@ -13,6 +13,7 @@ mod perfetto;
 mod protobuf;
 mod recordings;
 mod spans;
+mod topic;
 
 use std::collections::{BTreeMap, VecDeque};
 use std::fs;
@@ -31,7 +32,7 @@ use super::list::json;
 use super::text::{TextTable, is_coloured, micros};
 use super::{Go, in_group, until, utc};
 use crate::arguments::Trace;
-use crate::cell::{HopPage, page_of_url};
+use crate::cell::{HopPage, StatusPage, page_of_url, pages_of_this_host};
 use crate::exit::CommandFailure;
 use crate::http::HttpServer;
 use crate::report::warn;
@@ -39,6 +40,9 @@ use crate::survey::look;
 
 /// Runs `ua-space trace`.
 pub(crate) fn trace(arguments: &Trace) -> Result<(), CommandFailure> {
+    if let Some(target) = &arguments.target {
+        return topic::trace(arguments, target);
+    }
     if let Some(target) = &arguments.follow {
         return follow::follow(arguments, target);
     }
@@ -81,6 +85,10 @@ pub(crate) fn trace(arguments: &Trace) -> Result<(), CommandFailure> {
         ));
     }
     let (mut programs, mut is_missing) = (Vec::new(), false);
+    if arguments.metrics.is_empty() {
+        let pages = look(async { Ok(pages_of_this_host().await) })?;
+        programs.extend(with_hops(pages));
+    }
     for url in &arguments.metrics {
         match look(measured(url)) {
             Ok(found) => programs.extend(found),
@@ -199,12 +207,17 @@ async fn measured(url: &str) -> Result<Vec<MeasuredProgram>, CommandFailure> {
     if pages.iter().any(|page| page.hops.is_empty()) {
         return Err(CommandFailure::Data(format!("{url}/status has no hops")));
     }
-    let programs = pages.into_iter().map(|page| MeasuredProgram {
+    Ok(with_hops(pages).collect())
+}
+
+/// Returns the measurements of programs that measure hops.
+fn with_hops(pages: Vec<StatusPage>) -> impl Iterator<Item = MeasuredProgram> {
+    let measuring = pages.into_iter().filter(|page| !page.hops.is_empty());
+    measuring.map(|page| MeasuredProgram {
         program: page.program,
         space: page.space,
         hops: page.hops,
-    });
-    Ok(programs.collect())
+    })
 }
 
 /// A hop of a topic.
@@ -352,16 +365,17 @@ impl Window {
         }
         let mut sorted: Vec<u64> = self.nanos.iter().copied().collect();
         sorted.sort_unstable();
-        // The smallest delay that at least `percent` of all delays do not exceed.
-        let quantile = |percent: usize| {
-            let rank = (sorted.len() * percent).div_ceil(100);
+        // The smallest delay that at least `thousandths` of all delays do not exceed.
+        let quantile = |thousandths: usize| {
+            let rank = (sorted.len() * thousandths).div_ceil(1000);
             let nanos = sorted.get(rank.saturating_sub(1)).copied();
             in_micros(nanos.unwrap_or_default())
         };
         Some(HopPage {
-            p50_us: quantile(50),
-            p99_us: quantile(99),
-            max_us: quantile(100),
+            p50_us: quantile(500),
+            p99_us: quantile(990),
+            p999_us: Some(quantile(999)),
+            max_us: quantile(1000),
             count: self.count,
             negative: self.negative,
         })
@@ -391,11 +405,11 @@ fn print(
     }
     let bold = is_coloured();
     if !programs.is_empty() {
-        let mut table = head(&["PROGRAM", "SPACE", "HOP"], &[]).yielding([2]);
+        let mut table = head(&["PROGRAM", "SPACE", "HOP"]).leaving_out([1]);
         for program in programs {
             for (hop, delays) in &program.hops {
                 let first = [
-                    program.program.clone(),
+                    program.label(programs),
                     program.space.to_string(),
                     called(hop),
                 ];
@@ -408,12 +422,13 @@ fn print(
         if !programs.is_empty() {
             writeln!(out)?;
         }
-        let mut table = head(&["TOPIC", "HOP"], &["NAME"]).yielding([7]);
+        let mut table = head(&["TOPIC", "NAME", "HOP"])
+            .leaving_out([0])
+            .yielding([1]);
         for row in topics {
-            let name = row.name.clone().unwrap_or_else(|| "-".to_owned());
-            let first = [row.topic.clone(), called(row.hop)];
-            let cells = first.into_iter().chain(figures(&row.delays));
-            table.row(cells.chain([name]));
+            let name = row.name.clone().unwrap_or_else(|| row.topic.clone());
+            let first = [row.topic.clone(), name, row.hop.to_owned()];
+            table.row(first.into_iter().chain(figures(&row.delays)));
         }
         table.without_empty_columns().write(&mut out, bold)?;
     } else if programs.is_empty() {
@@ -437,23 +452,40 @@ fn print(
     Ok(())
 }
 
+impl MeasuredProgram {
+    /// Returns the name of the program, with its space if it has several of these programs.
+    fn label(&self, all: &[Self]) -> String {
+        let (name, space) = (&self.program, self.space);
+        match all.iter().filter(|one| one.program == *name).count() {
+            0 | 1 => name.clone(),
+            _ => format!("{name} {space}"),
+        }
+    }
+}
+
 /// Returns the cells of the delays of a hop.
-fn figures(hop: &HopPage) -> [String; 5] {
+fn figures(hop: &HopPage) -> [String; 6] {
     let negative = match hop.negative {
         0 => "-".to_owned(),
         count => count.to_string(),
     };
-    let [p50, p99, max] = match hop.count {
-        0 => ["-", "-", "-"].map(str::to_owned),
-        _ => [hop.p50_us, hop.p99_us, hop.max_us].map(micros),
-    };
-    [p50, p99, max, hop.count.to_string(), negative]
+    let delays = [
+        Some(hop.p50_us),
+        Some(hop.p99_us),
+        hop.p999_us,
+        Some(hop.max_us),
+    ];
+    let [p50, p99, p999, max] = delays.map(|delay| {
+        let delay = delay.filter(|_| hop.count > 0);
+        delay.map_or_else(|| "-".to_owned(), micros)
+    });
+    [p50, p99, p999, max, hop.count.to_string(), negative]
 }
 
-/// Returns a table of delays with columns before and behind the delays.
-fn head(first: &[&str], last: &[&str]) -> TextTable {
-    let rest = ["P50", "P99", "MAX", "COUNT", "NEGATIVE"];
-    let names = first.iter().chain(&rest).chain(last);
+/// Returns a table of delays with columns before the delays.
+fn head(first: &[&str]) -> TextTable {
+    let rest = ["P50", "P99", "P99.9", "MAX", "COUNT", "NEGATIVE"];
+    let names = first.iter().chain(&rest);
     TextTable::new(names.map(|name| (*name).to_owned()))
 }
 

@@ -70,7 +70,7 @@ fn other_values_are_json_under_their_own_names() {
         all.push(channels.channel(topic(id), Some(&x), NOW).unwrap());
     }
     let names: Vec<&str> = all.iter().map(|channel| channel.name.as_str()).collect();
-    assert_eq!(names, ["Robot.Place", "Robot.Place@ua_2_5_11"]);
+    assert_eq!(names, ["/Robot/Place", "/Robot/Place/ua_2_5_11"]);
     let bytes = encoded(&all[0], &[Scalar::Double(0.5)]).unwrap();
     assert_eq!(bytes, b"{\"x\":0.5}");
     let schema: Value = serde_json::from_str(&all[0].schema).unwrap();

@@ -178,7 +178,7 @@ impl ViewerHub {
         }
         // Viewers refuse a second channel of the same name.
         let name = match others.iter().any(|one| one.name() == channel.name) {
-            true => format!("{}#{}", channel.name, others.len() + 1),
+            true => format!("{}/{}", channel.name, others.len() + 1),
             false => channel.name.clone(),
         };
         let shown = json!({

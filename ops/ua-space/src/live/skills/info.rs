@@ -4,7 +4,7 @@ use std::io::{self, Write as _};
 
 use serde::Serialize;
 
-use super::{ListenEnd, Skill, hear, in_group};
+use super::{ListenEnd, Skill, SkillName, chosen, hear, in_group};
 use crate::arguments::InfoSkill;
 use crate::exit::CommandFailure;
 use crate::live::described::{AnnouncedField, ShownField};
@@ -16,16 +16,16 @@ use crate::live::text::{TextTable, harmless, is_coloured, wrapped};
 pub(super) fn info(arguments: &InfoSkill) -> Result<(), CommandFailure> {
     in_group(&arguments.group, async |mut live| {
         let wanted = &arguments.skill;
+        let name = SkillName::new(wanted);
         let is_whole = |found: &[Skill]| {
-            let one = found.iter().find(|skill| skill.name() == *wanted);
-            one.is_some_and(|skill| {
+            name.of(found).is_some_and(|skill| {
                 skill.state.is_some()
                     && skill.calls.len() == super::METHODS.len()
                     && skill.result.is_some()
             })
         };
         let (found, ended) = hear(&mut live, arguments.seconds, &is_whole).await?;
-        let Some(skill) = found.iter().find(|skill| skill.name() == *wanted) else {
+        let Some(skill) = chosen(&found, wanted)? else {
             if ended == ListenEnd::Interrupted {
                 return Err(CommandFailure::Interrupted);
             }

@@ -4,7 +4,7 @@
 use skills::UNKNOWN_OUTCOME;
 
 use super::info::not_found;
-use super::{ListenEnd, Skill, hear, in_group};
+use super::{ListenEnd, Skill, SkillName, chosen, hear, in_group};
 use crate::arguments::{CallArguments, GroupArguments, NamedTarget, StartSkill};
 use crate::exit::CommandFailure;
 use crate::live::call::{call, call_quietly, look_first};
@@ -17,23 +17,27 @@ pub(super) fn start(StartSkill { reset, call: of }: &StartSkill) -> Result<(), C
         return call(of);
     };
     let wanted = wanted.strip_suffix(".Start").unwrap_or(wanted);
-    let topic = in_group(&of.group, async |mut live| {
-        let one = |found: &[Skill]| {
-            let mut found = found.iter();
-            let one = found.find(|skill| skill.name() == wanted)?;
-            one.calls.contains_key("Start").then(|| one.reset(*reset))?
+    let (name, topic) = in_group(&of.group, async |mut live| {
+        let one = |skill: &Skill| {
+            let is_whole = skill.calls.contains_key("Start");
+            is_whole.then(|| skill.reset(*reset))?
         };
-        let is_whole =
-            |found: &[Skill]| one(found).is_some_and(|reset| reset != ResetBefore::NoResult);
+        let name = SkillName::new(wanted);
+        let is_whole = |found: &[Skill]| {
+            let reset = name.of(found).and_then(one);
+            reset.is_some_and(|reset| reset != ResetBefore::NoResult)
+        };
         let (found, ended) = hear(&mut live, of.wait, &is_whole).await?;
-        match one(&found) {
-            Some(ResetBefore::Not) => Ok(None),
-            Some(ResetBefore::By(topic)) => Ok(Some(topic)),
-            Some(ResetBefore::Unknown(why)) => Err(refused(wanted, &why)),
+        let skill = chosen(&found, wanted)?;
+        let name = skill.map_or_else(|| wanted.to_owned(), Skill::name);
+        match skill.and_then(one) {
+            Some(ResetBefore::Not) => Ok((name, None)),
+            Some(ResetBefore::By(topic)) => Ok((name, Some(topic))),
+            Some(ResetBefore::Unknown(why)) => Err(refused(&name, &why)),
             _ if ended == ListenEnd::Interrupted => Err(CommandFailure::Interrupted),
             Some(ResetBefore::NoResult) => {
                 let why = format!("its last outcome was not received for {} s", of.wait);
-                Err(refused(wanted, &why))
+                Err(refused(&name, &why))
             }
             None => Err(not_found(wanted, &found, of.wait)),
         }
@@ -48,7 +52,12 @@ pub(super) fn start(StartSkill { reset, call: of }: &StartSkill) -> Result<(), C
             ..*of
         })?;
     }
-    call(of)
+    call(&CallArguments {
+        target: NamedTarget::Name(name),
+        parameters: of.parameters.clone(),
+        group: same(&of.group),
+        ..*of
+    })
 }
 
 /// The Reset before a Start.

@@ -14,6 +14,7 @@ use crate::exit::CommandFailure;
 use crate::iso_time;
 use crate::live::book::{DatagramContent, ReceivedSample};
 use crate::live::list::json;
+use crate::live::names::is_fitting;
 use crate::live::plain::{self, NamedValues};
 use crate::live::run::{RunEvent, percent, results};
 use crate::live::text::harmless;
@@ -131,13 +132,14 @@ impl LastStates {
     }
 }
 
-/// Returns true if the skill is the wanted skill, or belongs to the wanted component.
+/// Returns true if the skill is the wanted skill, also by the last parts of its name, or belongs to
+/// the wanted component.
 pub(super) fn is_meant(skill: &str, only: Option<&str>) -> bool {
     let Some(only) = only else {
         return true;
     };
     let component = skill.rsplit_once('.').map(|(component, _)| component);
-    skill == only || component == Some(only)
+    component == Some(only) || is_fitting(skill, only)
 }
 
 impl Last {

@@ -334,7 +334,7 @@ fn print(arguments: &Trace, clocks: &[Clock], rows: &[HostDelayRow]) -> Result<(
     table.write(&mut out, bold)?;
     if !rows.is_empty() {
         writeln!(out)?;
-        let mut table = head(&["TOPIC", "HOP", "FROM", "TO"], &[]);
+        let mut table = head(&["TOPIC", "HOP", "FROM", "TO"]).leaving_out([1]);
         for row in rows {
             let first = [
                 row.topic.clone(),
