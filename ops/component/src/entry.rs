@@ -91,9 +91,9 @@ enum Schema {
     Exec,
 }
 
-/// Runs `ua-component` with devices of a program: `read` returns the component of the YAML file with
-/// the device or the drivers of the program. Everything else is as in [`run`]. A second call in a
-/// process keeps the function of the first one.
+/// Runs `ua-component` with devices of a program: `read` returns the component of the YAML file
+/// with the device or the drivers of the program. Everything else is as in [`run`]. A second call
+/// in a process keeps the function of the first one.
 #[must_use]
 pub fn run_with(arguments: Vec<OsString>, read: ReadComponent) -> ExitCode {
     READER.get_or_init(|| read);
