@@ -91,7 +91,7 @@ fn a_start_that_a_machine_does_not_answer_is_sent_once_and_reported_as_unknown()
         (ua_space(&["call", "press.Stamp.Reset", "--wait", "20"]).0 == 0).then_some(())
     });
     let (code, told) = ua_space(&["call", "press.Stamp", "Force=5", "--timeout", "20"]);
-    assert!(code == 69 && told.contains("unknown"), "{code} {told}");
+    assert!(code == 69 && told.contains("is not known"), "{code} {told}");
     let started = |lines: Vec<serde_json::Value>| {
         let started = lines
             .iter()
