@@ -169,15 +169,8 @@ impl Cell {
     /// Returns the Cyclone DDS peer in C in domain 2, not started yet.
     #[must_use]
     pub fn cyclone_c_started(&self, args: &[&str]) -> StartedChild {
-        self.cyclone_c_announced("", args)
-    }
-
-    /// Returns the Cyclone DDS peer in C with more elements in the section `Discovery` of its
-    /// configuration, not started yet.
-    #[must_use]
-    pub fn cyclone_c_announced(&self, discovery: &str, args: &[&str]) -> StartedChild {
         StartedChild::new("cyclone-peer", &compiled(CYCLONE))
-            .env("CYCLONEDDS_URI", cyclone_uri("lo", discovery))
+            .env("CYCLONEDDS_URI", cyclone_uri("lo", ""))
             .args(args)
             .args(["--domain", "2"])
             .told()

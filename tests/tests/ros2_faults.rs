@@ -154,27 +154,6 @@ fn a_participant_that_was_lost_and_has_not_lost_us_is_asked_with_counts_that_go_
     assert!(after.first() > highest, "{after:?} after {before:?}");
 }
 
-/// The announcements of a participant may be lost, for example while a cable is out, and its lease
-/// ends before the next announcement. Its samples show that it lives.
-#[test]
-fn a_participant_that_sends_samples_is_not_lost_between_its_announcements() {
-    let Some(cell) = Cell::with(&[Peer::CycloneC]) else {
-        return;
-    };
-    let ua = UaSide::join();
-    let _bridge = cell.bridge_ros2(&[]);
-    let seldom = "<SPDPInterval>60s</SPDPInterval><LeaseDuration>3s</LeaseDuration>";
-    let writer = cell.cyclone_c_announced(seldom, &sends(BACK.1, "back"));
-    let _writer = writer.start().ready(SOON);
-    ua.hear_scalar(BACK.0, Scalar::String(Some("back")));
-    let sent = || metrics(METRICS_ROS2).unwrap()["topics"]["ua_2_2_20"]["sent"].as_u64();
-    let before = sent().unwrap();
-    let _window = ua.triples_for(Duration::from_secs(10));
-    let samples = sent().unwrap() - before;
-    // Twenty a second; the lease is checked every two seconds.
-    assert!(samples > 150, "{samples} samples in 10 s");
-}
-
 /// Receives texts of the topics `2_3_k` until each of `count` topics has sent its k.
 fn hear_each(ua: &UaSide, count: u16) {
     for number in 1..=count {
