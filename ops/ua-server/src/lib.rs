@@ -6,9 +6,9 @@
 //!
 //! Modules in reading order:
 //! - Nodes and values: `layout` (nodes of the mapping), `structures` (their DataTypes), `address`
-//!   (nodes of the address space), `values` (current values), `staleness` (age of values), `history`
-//!   (past values), `nodes` (the node manager), `browse` (the order of nodes), `budget` (memory
-//!   limits of clients), `space` (received values), `nodesets` (nodes from files), `folders`
+//!   (nodes of the address space), `values` (current values), `staleness` (age of values),
+//!   `history` (past values), `nodes` (the node manager), `browse` (the order of nodes), `budget`
+//!   (memory limits of clients), `space` (received values), `nodesets` (nodes from files), `folders`
 //!   (folders of dotted names), `properties` (units, ranges and texts of values), `value`
 //!   (conversion between the two codecs).
 //! - Calls and discovery: `components` and `presence` (servers in the network), `methods` and

@@ -21,7 +21,7 @@ pub(crate) use tap::TapArguments;
 pub(crate) use write::Write;
 
 pub(crate) use job::{
-    ConfigureArguments, GoalArguments, JobArguments, JobVerb, ProcessArguments, ProcessVerb,
+    GoalArguments, JobArguments, JobVerb, ProcessArguments, ProcessVerb, ProductArguments,
 };
 pub(crate) use module::{
     AasArguments, MtpAlarms, MtpArguments, MtpConnect, MtpRdf, MtpRun, MtpSkills, MtpVerb,
@@ -321,7 +321,7 @@ pub(crate) enum Verb {
     /// or was lost, and all have their values from before, 64 usage, or the file is wrong, 69 no
     /// answer in time, it is unknown which values a component has, or the user may not configure,
     /// 74 the file cannot be read or the output cannot be written.
-    Configure(ConfigureArguments),
+    Configure(ProductArguments),
     /// Show the sequence of actions that reaches a goal, with the proof of each step
     ///
     /// Actions are capabilities with facts that hold before and after them. Those with a skill in

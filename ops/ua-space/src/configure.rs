@@ -4,14 +4,14 @@ use std::io::{self, Write as _};
 
 use serde::Deserialize;
 
-use crate::arguments::ConfigureArguments;
+use crate::arguments::ProductArguments;
 use crate::exit::CommandFailure;
 use crate::input::read;
 use crate::live::{TextTable, harmless, is_coloured};
 use crate::source::change;
 
 /// Runs `ua-space configure`.
-pub(crate) fn configure(arguments: &ConfigureArguments) -> Result<(), CommandFailure> {
+pub(crate) fn configure(arguments: &ProductArguments) -> Result<(), CommandFailure> {
     let document = read(&arguments.file)?;
     let path = match arguments.check {
         true => "/configuration?check=true",

@@ -1,8 +1,9 @@
 //! NodeSet2 files (OPC 10000-6, annex F) as documents: namespaces, aliases, models, and nodes with
 //! their references. Values are not read.
 //!
-//! A file is not trusted: its size, the number and depth of its elements are bounded, and a document
-//! type is refused. NodeIds stay as written; [`NodeSetDocument::resolved`] applies the aliases.
+//! A file is not trusted: its size, the number and depth of its elements are bounded, and a
+//! document type is refused. NodeIds stay as written; [`NodeSetDocument::resolved`] applies the
+//! aliases.
 //!
 //! The server imports NodeSets with the reader of its OPC UA library, which decodes values too.
 
@@ -14,7 +15,7 @@ use std::collections::BTreeMap;
 use xml_text::{LocatedXmlFault, XmlAttributeFault, XmlFault, walk};
 
 pub use self::model::{ModelVersion, NodeSetModel};
-use self::reading::{Reading, ReadingExtent};
+use self::reading::{NodeSetReading, ReadingExtent};
 
 /// A NodeSet2 file.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
@@ -165,7 +166,7 @@ fn read(xml: &str, extent: ReadingExtent) -> Result<NodeSetDocument, NodeSetFile
             most: MAX_FILE,
         });
     }
-    let mut reading = Reading::new(extent);
+    let mut reading = NodeSetReading::new(extent);
     let walked = walk(xml, MAX_DEPTH, &mut reading);
     walked.map_err(|LocatedXmlFault { line, fault }| NodeSetFileFault::Document { line, fault })?;
     reading.finish().ok_or(NodeSetFileFault::Empty)

@@ -19,7 +19,7 @@ pub(crate) enum ReadingExtent {
 
 /// The document as far as it was read.
 #[derive(Debug)]
-pub(crate) struct Reading {
+pub(crate) struct NodeSetReading {
     extent: ReadingExtent,
     document: NodeSetDocument,
     /// The names of the open elements.
@@ -33,7 +33,7 @@ pub(crate) struct Reading {
     reference: NodeSetFileReference,
 }
 
-impl Reading {
+impl NodeSetReading {
     pub(crate) fn new(extent: ReadingExtent) -> Self {
         Self {
             extent,
@@ -97,7 +97,7 @@ impl Reading {
     }
 }
 
-impl XmlVisitor for Reading {
+impl XmlVisitor for NodeSetReading {
     type Fault = NodeSetElementFault;
 
     fn open(&mut self, element: &XmlElement<'_>) -> Result<(), NodeSetElementFault> {

@@ -37,8 +37,8 @@ pub(crate) enum JobVerb {
     /// Stop a job
     ///
     /// The running skill is halted; nothing is compensated. The command does not wait for the halt:
-    /// `ua-space job list` shows the end of the job. The components of a job with an unknown outcome
-    /// are given back, so that other jobs can use them: look at the machines first.
+    /// `ua-space job list` shows the end of the job. The components of a job with an unknown
+    /// outcome are given back, so that other jobs can use them: look at the machines first.
     Stop {
         /// The number of the job
         #[arg(value_name = "NUMBER")]
@@ -77,7 +77,7 @@ pub(crate) enum ProcessVerb {
 }
 
 #[derive(Debug, Args)]
-pub(crate) struct ConfigureArguments {
+pub(crate) struct ProductArguments {
     /// The AutomationML file, or - for stdin
     #[arg(value_name = "FILE")]
     pub(crate) file: String,

@@ -244,7 +244,8 @@ pub(crate) struct CallArguments {
 
 #[derive(Debug, Args)]
 pub(crate) struct Trace {
-    /// Show the hops of this topic at each program: ua_1_2_10, or its name. Without it: of all topics
+    /// Show the hops of this topic at each program: ua_1_2_10, or its name. Without it: of all
+    /// topics
     #[arg(value_name = "TOPIC|NAME", conflicts_with_all = ["follow", "recording", "otlp", "perfetto", "svg"])]
     pub(crate) target: Option<NamedTarget>,
     /// Ask the program with this address of --metrics. May be repeated. Without it: all programs of

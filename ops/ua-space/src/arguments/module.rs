@@ -20,7 +20,8 @@ pub(crate) enum MtpVerb {
     Rdf(MtpRdf),
     /// List the procedures of a manifest with their parameters and outputs
     Skills(MtpSkills),
-    /// Print the alarms of a manifest as a part of a mapping: variables with conditions at ua-server
+    /// Print the alarms of a manifest as a part of a mapping: variables with conditions at
+    /// ua-server
     Alarms(MtpAlarms),
     /// Propose process values of modules as inputs of others, as a part of a mapping
     ///

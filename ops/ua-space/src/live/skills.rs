@@ -273,7 +273,7 @@ impl<'a> SkillName<'a> {
         }
     }
 
-    /// Returns the skill; `None` if it was not heard, if others may follow, or if there are several.
+    /// Returns the skill; `None` if it was not heard, others may follow, or there are several.
     fn of<'s>(&self, found: &'s [Skill]) -> Option<&'s Skill> {
         let skill = chosen(found, self.wanted).ok()??;
         (skill.name() == self.wanted || Instant::now() >= self.settled).then_some(skill)

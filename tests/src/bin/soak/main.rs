@@ -117,8 +117,8 @@ impl Reader {
         numbers.windows(2).filter(|pair| pair[1] == pair[0]).count()
     }
 
-    /// Returns how many numbers arrived after a newer number, and again beyond the single state that
-    /// a takeover may repeat.
+    /// Returns how many numbers arrived after a newer number, and again beyond the single state
+    /// that a takeover may repeat.
     fn disordered(&self) -> usize {
         let numbers = self.numbers();
         let older = numbers.windows(2).filter(|pair| pair[1] < pair[0]).count();
