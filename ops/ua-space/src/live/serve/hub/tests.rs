@@ -140,7 +140,7 @@ fn writers_whose_descriptions_alternate_leave_all_subscriptions_in_place() {
     text(&late);
     let advertised = text(&late);
     let names = [0, 1].map(|at| advertised["channels"][at]["topic"].clone());
-    assert_eq!(names, ["Left.Speed", "Left.Speed/2"]);
+    assert_eq!(names, ["/Left/Speed", "/Left/Speed/2"]);
 }
 
 #[test]
