@@ -99,6 +99,16 @@ fn what_a_ros_1_node_publishes_is_listed_echoed_and_measured_without_a_mapping()
             "{row}"
         );
     }
+    // The hops of one topic, of the programs of this host.
+    let (code, lines) = ua_space(&["trace", "ua_1_2_10", "--seconds", "2", "--json"]);
+    let traced = objects(&lines).pop().unwrap_or_default();
+    let out = &traced["hops"][0];
+    assert_eq!(
+        (code, &out["hop"], &out["program"]),
+        (0, &json!("out"), &json!("bridge-ros1")),
+        "{lines:?}"
+    );
+    assert!(out["p999_us"].as_f64() > Some(0.0), "{out}");
 }
 
 const NAMED: &str = r#"

@@ -132,6 +132,10 @@ fn beside_a_server_a_value_is_written_at_the_server() {
         cell.asyncua_try("opcua_read.py", &[SERVER_ENDPOINT, "ns=0;i=2258"])
     });
     let mut robot = robot(&cell);
+    // The server has not sent a value yet, so that only its announcement shows that it has this
+    // one.
+    let (_, _, told) = write(&["Setpoint", "5"]);
+    assert!(!told.contains("nothing was sent"), "{told}");
     // With a mapping, too: two programs must not send in one namespace.
     let value = confirmed(&["--mapping", mapping], 20.0);
     came(&mut robot, value);

@@ -83,10 +83,10 @@ fn a_pipe_gets_a_table_without_colour() {
     let head = lines.next().unwrap();
     assert_eq!(
         head.split_whitespace().collect::<Vec<_>>().join(" "),
-        "TOPIC NAME KIND ORIGIN RATE LAST TYPE"
+        "TOPIC NAME KIND RATE LAST TYPE"
     );
     assert!(
-        lines.any(|line| line.starts_with("ua_0_7_101  gripper.Grasp.State  value  OPC UA")),
+        lines.any(|line| line.starts_with("ua_0_7_101  gripper.Grasp.State  value  ")),
         "{ended}"
     );
     assert!(!ended.contains('\x1b'));
@@ -557,11 +557,13 @@ fn delays_are_told_by_program_and_by_topic() {
         ]),
         "{table}"
     );
-    assert!(
-        has(&["ua_0_7_101", "origin: at writer", "1.00 ms"]),
-        "{table}"
-    );
-    assert!(has(&["ua_0_7_101", "network: to here"]), "{table}");
+    let has_hop = |cells: &[&str]| {
+        let named = |row: &Vec<&str>| row.contains(&"gripper.Grasp.State");
+        let mut of_it = rows.iter().filter(|row| named(row));
+        of_it.any(|row| row.windows(cells.len()).any(|part| part == cells))
+    };
+    assert!(has_hop(&["origin", "1.00 ms"]), "{table}");
+    assert!(has_hop(&["network"]), "{table}");
     let ended = run(&["trace", "--seconds", "0", "--metrics", &url]);
     assert_eq!(ended.code, 69);
 }

@@ -80,7 +80,7 @@ impl TextTable {
     fn fitted(&self, limit: usize) -> Cow<'_, Self> {
         let mut table = Cow::Borrowed(self);
         while let Some(spare) = table.spare.first().copied()
-            && table.natural_width() > limit
+            && table.wanted_width() > limit
         {
             let kept: Vec<bool> = (0..table.head.len()).map(|at| at != spare).collect();
             table = Cow::Owned(table.with_columns(&kept));
@@ -88,9 +88,13 @@ impl TextTable {
         table
     }
 
-    /// Returns the width of the table if no cell is shortened.
-    fn natural_width(&self) -> usize {
-        let widths = self.natural_widths();
+    /// Returns the width of the table if only the longest texts of its first yielding column are
+    /// shortened.
+    fn wanted_width(&self) -> usize {
+        let mut widths = self.natural_widths();
+        if let Some(width) = self.yielding.first().and_then(|at| widths.get_mut(*at)) {
+            *width = (*width).min(LONG);
+        }
         widths.iter().sum::<usize>() + GAP * widths.len().saturating_sub(1)
     }
 
@@ -256,6 +260,8 @@ pub(crate) fn width() -> usize {
 const GAP: usize = 2;
 /// The number of characters that a shortened cell keeps.
 const LEAST: usize = 8;
+/// The width of a yielding column that is worth another column.
+const LONG: usize = 24;
 /// The width below which output is not fitted.
 const NARROWEST: usize = 40;
 

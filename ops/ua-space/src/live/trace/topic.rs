@@ -305,7 +305,7 @@ impl PathRow {
 /// Returns nanoseconds of a time in microseconds.
 #[expect(
     clippy::cast_possible_truncation,
-    reason = "a conversion to a larger number saturates, and fractions of a nanosecond do not matter"
+    reason = "larger numbers saturate, and fractions of a nanosecond do not matter"
 )]
 fn nanos(micros: f64) -> i128 {
     (micros * 1_000.0) as i128
