@@ -193,7 +193,10 @@ async fn set_back(
             Ok(_) => component.report(FieldsOutcome::SetBack, reason),
             Err((_, why)) => {
                 let why = format!("its values from before are not set: {why}");
-                let why = reason.map_or(why.clone(), |reason| format!("{reason}; {why}"));
+                let why = match reason {
+                    Some(reason) => format!("{reason}; {why}"),
+                    None => why,
+                };
                 component.report(FieldsOutcome::Unknown, Some(why))
             }
         };

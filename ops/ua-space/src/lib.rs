@@ -75,6 +75,23 @@ pub fn read_model(content: &str) -> Result<usize, Vec<usize>> {
     survey::model::counted(content)
 }
 
+/// Prints the help, the version or the error of a command line.
+fn show_usage(usage: &clap::Error) -> ExitCode {
+    // A closed stdout or stderr cannot be reported.
+    let is_help = usage.kind() == ErrorKind::DisplayHelp;
+    let _printed = if is_help && io::stdout().is_terminal() {
+        let text = live::help_within_width(&usage.to_string());
+        io::stdout().write_all(text.as_bytes())
+    } else {
+        usage.print()
+    };
+    let asked = [ErrorKind::DisplayHelp, ErrorKind::DisplayVersion];
+    match asked.contains(&usage.kind()) {
+        true => ExitCode::SUCCESS,
+        false => ExitCode::from(exit::USAGE),
+    }
+}
+
 /// Runs `ua-space` from its command line to its end. `arguments` begin with the name of the
 /// program.
 #[must_use]
@@ -82,21 +99,7 @@ pub fn run(arguments: Vec<OsString>) -> ExitCode {
     let given = arguments.clone();
     let arguments = match ToolArguments::try_parse_from(arguments) {
         Ok(arguments) => arguments,
-        Err(usage) => {
-            // A closed stdout or stderr cannot be reported.
-            let is_help = usage.kind() == ErrorKind::DisplayHelp;
-            let _printed = if is_help && io::stdout().is_terminal() {
-                let text = live::help_within_width(&usage.to_string());
-                io::stdout().write_all(text.as_bytes())
-            } else {
-                usage.print()
-            };
-            let asked = [ErrorKind::DisplayHelp, ErrorKind::DisplayVersion];
-            return match asked.contains(&usage.kind()) {
-                true => ExitCode::SUCCESS,
-                false => ExitCode::from(exit::USAGE),
-            };
-        }
+        Err(usage) => return show_usage(&usage),
     };
     let ended = match &arguments.verb {
         Verb::Check(arguments) => check::check(arguments),

@@ -78,7 +78,7 @@ fn configure(document: &Path, more: &[&str]) -> (i32, Value) {
 /// Returns the stored configuration of a component.
 fn stored(cell: &Cell, file: &str) -> Value {
     let text = fs::read_to_string(store(cell, file).join("configuration.json"));
-    text.map_or(json!({}), |text| serde_json::from_str(&text).unwrap())
+    text.map_or_else(|_| json!({}), |text| serde_json::from_str(&text).unwrap())
 }
 
 #[test]

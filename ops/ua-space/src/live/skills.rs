@@ -261,22 +261,22 @@ fn chosen<'s>(found: &'s [Skill], wanted: &str) -> Result<Option<&'s Skill>, Com
 /// Whether the skills that were heard may be all with a name that ends in the wanted one.
 struct SkillName<'a> {
     wanted: &'a str,
-    /// The time at which each component that runs has sent its states.
-    settled: Instant,
+    start: Instant,
 }
 
 impl<'a> SkillName<'a> {
+    #[expect(clippy::disallowed_methods, reason = "the one read of this clock")]
     fn new(wanted: &'a str) -> Self {
         Self {
             wanted,
-            settled: Instant::now() + SETTLE,
+            start: Instant::now(),
         }
     }
 
     /// Returns the skill; `None` if it was not heard, others may follow, or there are several.
     fn of<'s>(&self, found: &'s [Skill]) -> Option<&'s Skill> {
         let skill = chosen(found, self.wanted).ok()??;
-        (skill.name() == self.wanted || Instant::now() >= self.settled).then_some(skill)
+        (skill.name() == self.wanted || self.start.elapsed() >= SETTLE).then_some(skill)
     }
 }
 

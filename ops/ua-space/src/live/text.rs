@@ -60,7 +60,8 @@ impl TextTable {
         let keep = |cells: &[String]| -> Vec<String> {
             let cells = cells.iter().zip(kept);
             cells
-                .filter_map(|(cell, kept)| kept.then(|| cell.clone()))
+                .filter(|(_, kept)| **kept)
+                .map(|(cell, _)| cell.clone())
                 .collect()
         };
         let moved = |at: &usize| {
