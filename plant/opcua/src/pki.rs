@@ -305,7 +305,7 @@ impl Pki {
         warn!(
             name = ?stored.name,
             application_uri = ?stored.application_uri.unwrap_or_default(),
-            "rejected a client with a certificate that is not trusted; to trust it: `ua-server trust {} --pki \
+            "rejected a client whose certificate is not trusted; to trust it: `ua-server trust {} --pki \
              {:?}`, or move {path:?} into {trusted:?}",
             stored.thumbprint.get(..16).unwrap_or_default(),
             self.root,
