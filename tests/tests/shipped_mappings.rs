@@ -104,6 +104,7 @@ fn every_shipped_mapping_has_a_test_that_runs_it() {
         include_str!("call_services.rs"),
         include_str!("moveit.rs"),
         include_str!("niryo.rs"),
+        include_str!("skills/own.rs"),
         include_str!("turtlebot3.rs"),
     ];
     for entry in std::fs::read_dir(FOLDER).unwrap() {
