@@ -127,7 +127,8 @@ impl Program {
                     let told = match read {
                         Ok(Some(text)) => reported(&text),
                         Ok(None) => {
-                            // The reason is on its standard error, which may come a little later.
+                            // The reason is on its standard error, which its descendants keep open.
+                            kill(group_of(child));
                             if !is_logged {
                                 let _ended = timeout(ERRORS_WITHIN, &mut logging).await;
                             }
@@ -413,7 +414,8 @@ fn reported(text: &str) -> Result<Report, String> {
 const KEPT_VARIABLES: [&str; 5] = ["PATH", "HOME", "LANG", "TZ", "PYTHONPATH"];
 /// Longest line of a program, in bytes.
 const LONGEST_LINE: u64 = 64 << 10;
-/// Time for the standard error of a program that has ended. The machine is stopped after it.
+/// Time for the standard error of a program that has ended and was killed. The machine is stopped
+/// after it.
 const ERRORS_WITHIN: Duration = Duration::from_millis(100);
 /// Characters of the last error of a program in a reason.
 const LONGEST_ERROR: usize = 160;

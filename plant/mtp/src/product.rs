@@ -97,12 +97,13 @@ pub enum ProductFileFault {
 pub fn product_configuration(file: &str) -> Result<Vec<ConfiguredComponent>, ProductFileFault> {
     let root = CaexElement::read(file)?;
     let mut components: Vec<ConfiguredComponent> = Vec::new();
+    let mut uris = BTreeSet::new();
     for element in root.all().filter(|element| !element.is_interface) {
         let Some(uri) = element.value(&[APPLICATION_URI]) else {
             continue;
         };
         let (uri, line) = (uri.to_owned(), element.line);
-        if components.iter().any(|known| known.application_uri == uri) {
+        if !uris.insert(uri.clone()) {
             return Err(ProductFileFault::Twice { uri, line });
         }
         let given = element.attributes.iter();
