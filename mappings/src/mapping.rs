@@ -3,6 +3,7 @@
 use std::collections::{BTreeMap, HashMap};
 use std::num::NonZeroU16;
 use std::path::PathBuf;
+use std::sync::Arc;
 use std::time::Duration;
 
 use messages::{Leaf, Selection, TypeName};
@@ -415,10 +416,10 @@ pub struct Variable {
     pub lasting: Lasting,
     /// Values that its origin sends.
     pub publish: Publish,
-    /// Meaning of its numbers.
-    pub meaning: Meaning,
-    /// Roles that may read and write it at the server.
-    pub permissions: Permissions,
+    /// Meaning of its numbers. Variables without any share it.
+    pub meaning: Arc<Meaning>,
+    /// Roles that may read and write it at the server. Variables with the default roles share them.
+    pub permissions: Arc<Permissions>,
     /// Maximum ages of its values.
     pub ages: Ages,
     /// Its alarm at the server.

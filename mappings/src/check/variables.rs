@@ -3,6 +3,7 @@
 use std::collections::{HashMap, HashSet};
 use std::num::NonZeroU16;
 use std::ops::RangeInclusive;
+use std::sync::{Arc, LazyLock};
 use std::time::Duration;
 
 use messages::{ArrayRank, Leaf};
@@ -18,9 +19,10 @@ use crate::code::Code;
 use crate::document::{PublishEntry, Queue, UaFieldEntry, VariableEntry};
 use crate::findings::MappingFindings;
 use crate::mapping::{
-    Binding, Lasting, Overflow, Publish, ServiceBinding, ServiceRole, UaField, Variable,
+    Binding, Lasting, Meaning, Overflow, Publish, ServiceBinding, ServiceRole, UaField, Variable,
 };
 use crate::node_id::{Identifier, NodeIdText};
+use crate::permission::Permissions;
 use crate::read::{Located, given, short};
 use crate::topic::{SpaceId, TopicId};
 use crate::tree::TextSpan;
@@ -332,8 +334,8 @@ fn variable(
         overflow,
         lasting,
         publish: publish?,
-        meaning: meaning?,
-        permissions: permissions?,
+        meaning: shared(meaning?, &NO_MEANING),
+        permissions: shared(permissions?, &DEFAULT_ROLES),
         ages: ages?,
         alarm: None,
         reports_alarms: false,
@@ -478,3 +480,14 @@ fn declared_type(text: &str, place: TextSpan, findings: &mut MappingFindings) ->
     }
     declared
 }
+
+/// Returns a shared value: one for all variables with the default, which most have.
+fn shared<T: PartialEq>(value: T, default: &LazyLock<Arc<T>>) -> Arc<T> {
+    match value == ***default {
+        true => Arc::clone(default),
+        false => Arc::new(value),
+    }
+}
+
+static NO_MEANING: LazyLock<Arc<Meaning>> = LazyLock::new(Arc::default);
+static DEFAULT_ROLES: LazyLock<Arc<Permissions>> = LazyLock::new(Arc::default);

@@ -132,8 +132,7 @@ impl Program {
                             if !is_logged {
                                 let _ended = timeout(ERRORS_WITHIN, &mut logging).await;
                             }
-                            let last = last_error.shown();
-                            return unknown(&format!("it has ended without a result{last}"));
+                            return unknown(&last_error.after("it has ended without a result"));
                         }
                         Err(why) => Err(why),
                     };
@@ -302,12 +301,12 @@ impl LastLine {
         }
     }
 
-    /// Returns the line as the end of a reason; empty if there is none.
-    fn shown(&self) -> String {
+    /// Returns a reason with the line, if there is one.
+    fn after(&self, reason: &str) -> String {
         let line = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         match line.is_empty() {
-            true => String::new(),
-            false => format!(", and its last error is `{}`", line.escape_debug()),
+            true => reason.to_owned(),
+            false => format!("{reason}, and its last error is `{}`", line.escape_debug()),
         }
     }
 }

@@ -302,7 +302,7 @@ fn pair<'a>(
     fitting: &mut BTreeMap<SkillRole, Vec<&'a Offer>>,
     (facts, judging): (&dyn Facts, &mut Judging<'_>),
 ) {
-    // One offer of each component.
+    // A single offer of each component.
     let components = |fitting: &BTreeMap<SkillRole, Vec<&'a Offer>>, group: Group| {
         let of_group = fitting.iter().filter(|(role, _)| role.group() == group);
         let offers = of_group.flat_map(|(_, offers)| offers.iter().copied());

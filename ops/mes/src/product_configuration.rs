@@ -12,7 +12,7 @@ use skills::{FieldChange, SetFieldsFault, SkillFault, SkillValue};
 use tokio::time::timeout;
 use tracing::{info, warn};
 
-/// A component whose fields are set.
+/// A component with fields that can be set.
 #[async_trait]
 pub(crate) trait ConfigurationTarget: Send + Sync {
     /// Sets the fields, or only checks them. Returns their values before.
@@ -31,7 +31,7 @@ pub(crate) struct ProductComponent {
     pub(crate) target: Result<Box<dyn ConfigurationTarget>, String>,
 }
 
-/// What became of a product configuration.
+/// The outcome of a product configuration, and of its components.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub(crate) struct ConfigurationReport {
     pub(crate) outcome: ProductOutcome,
@@ -55,7 +55,7 @@ pub(crate) enum ProductOutcome {
     Unknown,
 }
 
-/// What became of the fields of a component.
+/// The outcome for a component, with the reason.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub(crate) struct ComponentReport {
     pub(crate) component: String,
@@ -166,8 +166,8 @@ pub(crate) async fn configure(
     told(outcome, reports)
 }
 
-/// Sets components back, the last one first: those that were configured, and the one whose outcome
-/// is unknown. Returns the new reports by the numbers of the components.
+/// Sets the configured components back, and the component with an unknown outcome, in reverse order.
+/// Returns the new reports by the numbers of the components.
 async fn set_back(
     (components, before): (&[ProductComponent], &[FieldChange]),
     ended: &[ComponentReport],
@@ -309,8 +309,8 @@ mod tests {
         }
     }
 
-    /// Configures a, b and c, whose requests end with faults in turn. Returns the outcome, those of
-    /// the components, and the journal.
+    /// Configures a, b and c. Each has a list of faults, one for each request. Returns the outcome
+    /// of the product, the outcomes of the components, and the journal.
     async fn run(
         faults: [Vec<Option<SetFieldsFault>>; 3],
         checks_only: bool,

@@ -70,7 +70,7 @@ const MOST_REMEMBERED: usize = 10_000;
 pub(crate) fn rules(mapping: &Mapping, layout: &Layout) -> PermissionRules {
     let mut nodes = HashMap::new();
     for topic in &layout.topics {
-        let said = mapping.variable(topic.topic).map(|one| &one.permissions);
+        let said = mapping.variable(topic.topic).map(|one| &*one.permissions);
         let Some(said) = said.filter(|said| **said != Said::default()) else {
             continue;
         };

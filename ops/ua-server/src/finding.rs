@@ -80,7 +80,7 @@ impl DiscoveredServers {
                     Err(error) => (error.id(), None),
                 };
                 let query = self.queries.remove(&id);
-                // A query whose task failed has no answer.
+                // A query with a failed task has no answer.
                 if let Some(answer) = answer.or_else(|| query.map(SearchQuery::unanswered)) {
                     self.search.answered(answer);
                 }

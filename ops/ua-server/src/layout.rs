@@ -240,7 +240,7 @@ fn namespace_array(
 /// Returns the meaning of a variable. Without a description in the mapping, the description names
 /// the topic and its ROS topics.
 fn described(variable: &Variable) -> Meaning {
-    let mut meaning = variable.meaning.clone();
+    let mut meaning = Meaning::clone(&variable.meaning);
     let ros = variable.ros_names();
     let ros: Vec<String> = ros
         .map(|(space, name)| format!("{name} in space {space}"))

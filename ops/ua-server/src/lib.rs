@@ -38,6 +38,8 @@ mod clients;
 mod commanders;
 mod components;
 mod confirm;
+#[cfg(test)]
+mod dice;
 mod endpoint;
 mod executing;
 mod finding;

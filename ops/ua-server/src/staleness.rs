@@ -52,8 +52,7 @@ impl Staleness {
 #[derive(Debug, Default)]
 pub(crate) struct StaleValues {
     ages: HashMap<TopicId, ValueAge>,
-    /// The planned checks. At most one check of a topic is the valid one, see
-    /// [`ValueAge::is_planned`].
+    /// The planned checks. A topic has one valid check at most ([`ValueAge::is_planned`]).
     checks: BinaryHeap<Reverse<(Instant, TopicId)>>,
     /// Topics with a writer that is active again, but without a new value.
     returned: Vec<TopicId>,

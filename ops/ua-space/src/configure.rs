@@ -38,7 +38,7 @@ pub(crate) fn configure(arguments: &ProductArguments) -> Result<(), CommandFailu
     configured.end()
 }
 
-/// What became of a product configuration.
+/// The report of a product configuration.
 #[derive(Debug, Deserialize)]
 struct Configured {
     outcome: String,

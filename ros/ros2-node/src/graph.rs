@@ -100,10 +100,6 @@ impl Graph {
     pub fn snapshot(participant: &DomainParticipant) -> Self {
         let prefix = participant.guid().prefix;
         let mut own = BTreeSet::new();
-        let writers = participant.discovered_writers();
-        let writers = writers.into_iter().map(RemoteEndpoint::of_writer);
-        let readers = participant.discovered_readers();
-        let readers = readers.into_iter().map(RemoteEndpoint::of_reader);
         let mut foreign = |(_, endpoint): &(String, RemoteEndpoint)| {
             let foreign = endpoint.guid.prefix != prefix;
             if !foreign {
@@ -111,7 +107,12 @@ impl Graph {
             }
             foreign
         };
+        // The copies of all announcements of writers are freed before those of readers are made.
+        let writers = participant.discovered_writers().into_iter();
+        let writers = writers.map(RemoteEndpoint::of_writer);
         let writers: Vec<_> = writers.filter(&mut foreign).collect();
+        let readers = participant.discovered_readers().into_iter();
+        let readers = readers.map(RemoteEndpoint::of_reader);
         let readers: Vec<_> = readers.filter(&mut foreign).collect();
         Self {
             own,

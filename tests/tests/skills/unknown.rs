@@ -1,5 +1,4 @@
-//! Skills whose last outcome is unknown: an operator resets them on purpose, and nobody starts them
-//! before.
+//! Skills with an unknown last outcome: they do not start before an operator resets them.
 
 use std::fs;
 

@@ -3,6 +3,7 @@
 use bridge_node::now;
 
 use super::*;
+use crate::dice::Dice;
 
 const fn seconds(count: u64) -> Duration {
     Duration::from_secs(count)
@@ -187,18 +188,6 @@ fn other_ages_of_a_mapping_hold_at_once_and_removed_topics_do_not_change() {
     values.values.add(of, ages(Some(1), None));
     assert!(values.until(60).is_empty());
     assert_eq!(values.values.silent_since(of), None);
-}
-
-/// A reproducible sequence of numbers (xorshift).
-struct Dice(u64);
-
-impl Dice {
-    fn below(&mut self, sides: u64) -> u64 {
-        self.0 ^= self.0 << 13;
-        self.0 ^= self.0 >> 7;
-        self.0 ^= self.0 << 17;
-        self.0 % sides
-    }
 }
 
 /// The reported changes, together with the values that arrive, always give the staleness that

@@ -143,7 +143,7 @@ fn names_of_values(book: &Book, is_wanted: impl Fn(TopicId, &str) -> bool) -> Ve
     names.map(str::to_owned).collect()
 }
 
-/// Returns true if the name is that of a value of the component, which nobody else writes.
+/// Returns whether the name is the name of a value of the component. Only the component writes it.
 fn is_of(name: &str, component: &str) -> bool {
     let rest = name.strip_prefix(component);
     rest.is_some_and(|rest| rest.starts_with('.'))

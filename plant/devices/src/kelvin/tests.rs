@@ -294,7 +294,7 @@ async fn a_tilted_tool_position_is_refused_before_anything_moves() {
 async fn another_tool_than_the_wanted_one_is_named_and_stays_attached() {
     let mut bench = bench().await;
     let mut settings = (*bench.changer.settings).clone();
-    // Somebody has exchanged the tools in the docks.
+    // The tools in the docks were exchanged.
     settings.tools[0].dock = DOCKS[1];
     bench.changer = KelvinChanger::new(settings, bench.changer.mover.clone());
     let given = vec![("ToolAppUri".to_owned(), SkillValue::from(URIS[0]))];

@@ -370,7 +370,7 @@ async fn the_robot_that_reaches_the_positions_is_chosen_with_a_reason_for_each_o
     let named = choose([0.9, 0.0, 0.1], &[], Some("urn:test:short")).await;
     assert!(named.unwrap_err().to_string().contains(too_far));
 
-    // A tool changer is on one robot, which its reach and its tool do not tell.
+    // Neither its reach nor its tool shows which robot carries the tool changer.
     let far = [[0.9, 0.0, 0.1]];
     let any = peers.carrier(None, &far).await.unwrap_err().to_string();
     assert!(any.contains("several robots are found"), "{any}");

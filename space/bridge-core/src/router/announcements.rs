@@ -116,8 +116,8 @@ impl PlannedAnnouncements {
         self.plan(AnnouncedSubject::ActionMetaData(writer_id), now);
     }
 
-    /// Plans the announcements of described topics that have a producer and no value yet. No message
-    /// of such a topic shows others that it exists.
+    /// Plans the announcements of described topics that have a producer and no value yet. No
+    /// message of such a topic shows others that it exists.
     pub(super) fn plan_silent(&mut self, values: &TopicQueues, now: Now) {
         let topics = self.writers.values().flatten();
         let silent = topics.filter(|topic| values.is_silent(**topic));
@@ -460,5 +460,6 @@ impl PlannedAnnouncements {
     }
 }
 
-/// The largest number of topics without a value that are announced for a probe.
+/// The largest number of topics without a value that are announced for a probe. The others follow
+/// with the announcements of all topics.
 const MOST_SILENT: usize = 512;

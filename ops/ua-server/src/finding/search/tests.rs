@@ -6,6 +6,7 @@ use bridge_node::now;
 use discovery::{PresentServer, ServerLoss};
 
 use super::*;
+use crate::dice::Dice;
 
 const MAPPING: &str = "
 namespaces: {41: 'urn:v:oven'}
@@ -346,18 +347,6 @@ fn a_search_that_is_disabled_asks_nobody_and_has_no_deadline() {
     assert_eq!(network.search.poll_query(), None);
     network.search.reload(&mapping(MAPPING));
     assert_eq!(network.round().len(), 1);
-}
-
-/// A reproducible sequence of numbers (xorshift).
-struct Dice(u64);
-
-impl Dice {
-    fn below(&mut self, sides: u64) -> u64 {
-        self.0 ^= self.0 << 13;
-        self.0 ^= self.0 >> 7;
-        self.0 ^= self.0 << 17;
-        self.0 % sides
-    }
 }
 
 /// Servers come and go, answers are late or lost. In the end, each online server has a number.
