@@ -278,12 +278,40 @@ impl NamedQuestion {
                 NamedNode::new(value).map_err(why)?.into()
             };
             // The printed form of a term escapes all characters that could end it.
+            let given = format!("VALUES ?for_{name} {{ {term} }}");
             sparql = sparql.replace(
                 &format!("VALUES ?for_{name} {{ UNDEF }}"),
-                &format!("VALUES ?for_{name} {{ {term} }}"),
+                &match self.narrowed(name, value) {
+                    Some(pattern) => format!("{given} {pattern}"),
+                    None => given,
+                },
             );
         }
         Ok(sparql)
+    }
+
+    /// Returns the pattern that leads from the value of a parameter to its nodes: without it, the
+    /// query would look at all nodes and leave out the others afterwards. It is in the lines
+    /// `#: narrow PARAMETER PATTERN`, in which `$text` is the value as text, `$iri` the value as
+    /// IRI or nothing, and `$node` the same in lines that need an IRI.
+    fn narrowed(self, parameter: &str, value: &str) -> Option<String> {
+        let text = Literal::new_simple_literal(value).to_string();
+        let iri = NamedNode::new(value).ok().map(|iri| iri.to_string());
+        let mut pattern = String::new();
+        for line in self.told("narrow") {
+            let Some((of, line)) = line.split_once(' ') else {
+                continue;
+            };
+            if of != parameter || (line.contains("$node") && iri.is_none()) {
+                continue;
+            }
+            let iri = iri.as_deref().unwrap_or_default();
+            // The text is last, since a value may contain `$iri`.
+            let line = line.replace("$node", iri).replace("$iri", iri);
+            pattern.push_str(&line.replace("$text", &text));
+            pattern.push(' ');
+        }
+        (!pattern.is_empty()).then_some(pattern)
     }
 
     fn told(self, key: &'static str) -> impl Iterator<Item = &'static str> {
