@@ -36,6 +36,7 @@ cargo xtask <verb>
   test [--no-install] [FILTER..] install the peers of the tests (apt, pip), then run all tests whose name contains a FILTER
   page                           drive the page of the cell in Chromium (apt, pip); screenshots are in target/page
   mtp2                           judge our reader and executor of MTP 2.0 by MTPPy2.0 (pip; needs Python 3.13)
+  rml                            count the published cases of RML that `ua-space rml` and morph-kgc pass (pip; needs UA_DATA)
   peers [--build]                only install the peers; of those only what the programs are built with
   lint [--dependencies]          formatting, clippy, documentation; or licences, sources and advisories of dependencies, and the
                                  workspace with all crates as published
@@ -84,6 +85,7 @@ fn run(arguments: &[&str]) -> anyhow::Result<CommandOutcome> {
         ["demo", rest @ ..] => demo::run(&Workspace::find()?, rest),
         ["test", rest @ ..] => test::run(&Workspace::find()?, rest),
         ["mtp2"] => module::run(&Workspace::find()?),
+        ["rml"] => module::rml(&Workspace::find()?),
         ["page"] => page::run(&Workspace::find()?),
         ["peers"] => Ok(peers::run(&Workspace::find()?)),
         ["peers", "--build"] => peers::for_building(),

@@ -1,4 +1,4 @@
-//! `cargo xtask mtp2`: judges MTP 2.0 by MTPPy2.0.
+//! `cargo xtask mtp2` and `cargo xtask rml`: judges by programs that need environments of their own.
 
 use std::process::Command;
 
@@ -24,4 +24,42 @@ pub(crate) fn run(workspace: &Workspace) -> anyhow::Result<CommandOutcome> {
         .arg("--manifest")
         .arg(workspace.root.join("tests/data/mtp/column.aml"));
     Ok(status(&mut judge)?.into())
+}
+
+/// The folders of the published cases of RML with XML sources.
+const RML_CASES: [&str; 2] = ["rml-test-cases", "rml-io"];
+
+/// Installs morph-kgc, builds the programs, and counts the published cases of RML that `ua-space rml`
+/// and morph-kgc pass.
+///
+/// # Errors
+/// Returns an error if the cases are missing, morph-kgc cannot be installed, or the programs cannot be
+/// built.
+pub(crate) fn rml(workspace: &Workspace) -> anyhow::Result<CommandOutcome> {
+    let data = std::env::var_os("UA_DATA").map_or_else(
+        || workspace.root.join("../shared/data"),
+        std::path::PathBuf::from,
+    );
+    let cases = data.join("rml");
+    anyhow::ensure!(
+        cases.is_dir(),
+        "the cases of RML are missing in {}: UA_DATA names the folder of the data",
+        cases.display()
+    );
+    let python = peers::morph_kgc(workspace)?;
+    demo::build(workspace)?;
+    let mut ended = CommandOutcome::WELL;
+    for suite in RML_CASES {
+        step(&format!("running {suite} with ua-space and morph-kgc"));
+        let mut judge = Command::new(&python);
+        judge
+            .arg(workspace.root.join("tests/peers/rml_judge.py"))
+            .arg(workspace.target.join("debug/ua-space"))
+            .arg(cases.join(suite));
+        let outcome = CommandOutcome::from(status(&mut judge)?);
+        if outcome != CommandOutcome::WELL {
+            ended = outcome;
+        }
+    }
+    Ok(ended)
 }

@@ -126,6 +126,17 @@ pub(crate) fn mtppy2(workspace: &Workspace) -> anyhow::Result<PathBuf> {
     Ok(python_of(&workspace.peers().join(folder)))
 }
 
+/// Installs morph-kgc, which needs older versions of its libraries than the other peers. Returns the
+/// Python with it.
+///
+/// # Errors
+/// Returns an error if a package cannot be installed.
+pub(crate) fn morph_kgc(workspace: &Workspace) -> anyhow::Result<PathBuf> {
+    let folder = "morph-kgc";
+    venv(workspace, folder, "rml.txt")?;
+    Ok(python_of(&workspace.peers().join(folder)))
+}
+
 /// Finds Python 3.13 in PATH, or among the versions of pyenv, whose links work only for the chosen
 /// version.
 fn newer_python() -> Option<PathBuf> {
