@@ -3,6 +3,7 @@
 
 mod configuring;
 mod exchange;
+mod judges;
 mod live_servers;
 mod nodeset_url;
 mod opcua_knowledge;

@@ -1,4 +1,5 @@
-//! The report of shapes (SHACL). pySHACL reports the same violations of `shapes/`.
+//! The report of shapes (SHACL). The system tests compare it with
+//! that of pySHACL.
 #![expect(clippy::unwrap_used, reason = "a test may")]
 
 use std::collections::BTreeMap;

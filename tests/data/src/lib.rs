@@ -14,6 +14,7 @@ use std::{env, fs, thread};
 
 /// Third-party data that tests read, by its folder.
 pub const FOREIGN: &[(&str, &str)] = &[
+    ("b2mml", "schemas of B2MML and BatchML (MESA International)"),
     ("mtp", "manifests of eight modules (MIT, ISC)"),
     ("nodesets", "NodeSets of the OPC Foundation (MIT 1.00)"),
     ("ontologies", "CSS and CaSk ontologies (MIT)"),
