@@ -50,6 +50,18 @@ pub(crate) struct CaexElement {
     pub(crate) is_interface: bool,
     pub(crate) attributes: Vec<Attribute>,
     pub(crate) children: Vec<Self>,
+    /// The InternalLinks of the element.
+    pub(crate) links: Vec<CaexLink>,
+}
+
+/// An InternalLink, which joins two interfaces.
+#[derive(Debug, Default)]
+pub(crate) struct CaexLink {
+    /// RefPartnerSideA and RefPartnerSideB: the ID of an interface, or that of its element with the
+    /// name of the interface behind a colon (CAEX 2.15).
+    pub(crate) sides: [String; 2],
+    /// The line of its start, from 1.
+    pub(crate) line: usize,
 }
 
 /// An Attribute of an element. Nested attributes, which are translations, are omitted.
@@ -118,6 +130,8 @@ impl CaexElement {
 #[derive(Debug, Default)]
 struct Building {
     open: Vec<CaexPart>,
+    /// The number of open libraries. Their elements are templates and no part of the module.
+    libraries: usize,
     elements: usize,
     root: Option<CaexElement>,
 }
@@ -127,7 +141,17 @@ enum CaexPart {
     Element(CaexElement),
     Attribute(Attribute),
     Value,
+    Library,
     Other,
+}
+
+impl CaexPart {
+    fn element(&mut self) -> Option<&mut CaexElement> {
+        match self {
+            Self::Element(element) => Some(element),
+            Self::Attribute(_) | Self::Value | Self::Library | Self::Other => None,
+        }
+    }
 }
 
 /// Reason for which an element cannot be read.
@@ -152,6 +176,22 @@ impl XmlVisitor for Building {
         };
         let tag = element.name();
         let part = match tag {
+            "InterfaceClassLib" | "RoleClassLib" | "SystemUnitClassLib" | "AttributeTypeLib" => {
+                self.libraries += 1;
+                CaexPart::Library
+            }
+            _ if self.libraries > 0 => CaexPart::Other,
+            "InternalLink" => {
+                let link = CaexLink {
+                    sides: [text("RefPartnerSideA")?, text("RefPartnerSideB")?],
+                    line: element.line(),
+                };
+                let parent = self.open.iter_mut().rev().find_map(CaexPart::element);
+                if let Some(parent) = parent {
+                    parent.links.push(link);
+                }
+                CaexPart::Other
+            }
             "CAEXFile" | "InstanceHierarchy" | "InternalElement" | "ExternalInterface" => {
                 let mut path = text("RefBaseSystemUnitPath")?;
                 if path.is_empty() {
@@ -192,6 +232,9 @@ impl XmlVisitor for Building {
 
     fn close(&mut self) -> Result<ControlFlow<()>, ElementFault> {
         if let Some(part) = self.open.pop() {
+            if matches!(part, CaexPart::Library) {
+                self.libraries -= 1;
+            }
             self.add(part);
         }
         Ok(ControlFlow::Continue(()))
@@ -201,15 +244,13 @@ impl XmlVisitor for Building {
 impl Building {
     /// Adds a complete part to the element around it.
     fn add(&mut self, part: CaexPart) {
-        let parent = self.open.iter_mut().rev().find_map(|part| match part {
-            CaexPart::Element(element) => Some(element),
-            CaexPart::Attribute(_) | CaexPart::Value | CaexPart::Other => None,
-        });
+        let parent = self.open.iter_mut().rev().find_map(CaexPart::element);
         match (part, parent) {
             (CaexPart::Element(element), Some(parent)) => parent.children.push(element),
             (CaexPart::Element(element), None) => self.root = Some(element),
             (CaexPart::Attribute(attribute), Some(parent)) => parent.attributes.push(attribute),
-            (CaexPart::Attribute(_), None) | (CaexPart::Value | CaexPart::Other, _) => {}
+            (CaexPart::Attribute(_), None)
+            | (CaexPart::Value | CaexPart::Library | CaexPart::Other, _) => {}
         }
     }
 }

@@ -282,6 +282,7 @@ mod tests {
             assemblies: vec![],
             process_values,
             alarms: vec![],
+            pictures: vec![],
             services: vec![],
             findings: vec![],
         }

@@ -9,6 +9,8 @@
 //! (2.15, 3.0) and in references (by RefID or by ID). The model has a single name for each concept.
 //! An inconsistency in a file is a [`MtpFinding`], and the rest of the file is used.
 //!
+//! [`Module::pictures`] has the pictures for operators, and [`ModulePicture::svg`] draws them.
+//!
 //! [`connect::proposals`] finds outputs of modules for the inputs of others.
 //!
 //! [`Module::triples`] returns the same as RDF, in the terms of [`vocabulary`]. [`state`] is the
@@ -19,12 +21,16 @@
 mod caex;
 pub mod connect;
 mod container;
+mod drawing;
 mod elements;
 mod model;
+mod notes;
 pub mod pea;
+mod picture;
 mod product;
 mod rdf;
 mod rdf_module;
+mod rdf_picture;
 mod read;
 pub mod state;
 pub mod vocabulary;
@@ -36,6 +42,7 @@ pub use model::{
     NodeItem, OpcUaNode, OutputRole, ParameterKind, Procedure, ServiceParameter, ValueBound,
     VariableLink,
 };
+pub use picture::{ModulePicture, PictureConnection, PictureObject, PicturePort};
 pub use product::{ConfiguredComponent, ConfiguredValue, ProductFileFault, product_configuration};
 pub use rdf::{Object, Triple, unit_symbol};
 pub use rdf_module::state_iri;

@@ -2,6 +2,8 @@
 
 use std::collections::BTreeMap;
 
+use crate::picture::ModulePicture;
+
 /// A module (PEA) with services.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Module {
@@ -23,6 +25,8 @@ pub struct Module {
     pub process_values: Vec<ModuleOutput>,
     /// Its alarms (MTP 2.0).
     pub alarms: Vec<ModuleAlarm>,
+    /// Its pictures for operators.
+    pub pictures: Vec<ModulePicture>,
     /// Its services, in the order of the file.
     pub services: Vec<MtpService>,
     /// Inconsistencies in the file.
@@ -47,8 +51,8 @@ pub struct MtpFinding {
     pub what: String,
     /// The line of the element, from 1.
     pub line: usize,
-    /// Whether the file is consistent, and the element has no place in the model, such as a
-    /// picture.
+    /// Whether the file is consistent, and the element has no place in the model, such as an
+    /// interface of another standard.
     pub is_note: bool,
 }
 

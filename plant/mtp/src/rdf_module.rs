@@ -48,6 +48,9 @@ impl ModuleStatements<'_> {
         for alarm in &module.alarms {
             self.alarm(iri, alarm);
         }
+        for picture in &module.pictures {
+            self.picture(iri, picture);
+        }
     }
 
     fn assembly(&mut self, module: &str, assembly: &DataAssembly) {

@@ -1,7 +1,7 @@
 //! Converts the tree of elements to the model.
 
 use std::borrow::Cow;
-use std::collections::{BTreeMap, HashMap};
+use std::collections::HashMap;
 
 use crate::caex::{CaexElement, MAX_FILE, ManifestError};
 use crate::container;
@@ -9,6 +9,7 @@ use crate::model::{
     Control, ControlRole, Edition, ItemAccess, ManifestServer, Module, MtpFinding, MtpService,
     NodeIdentifier, NodeItem, OpcUaNode, ParameterKind, Procedure, ServiceParameter, ValueBound,
 };
+use crate::notes::notes;
 
 impl Module {
     /// Reads a manifest as delivered: an `.aml` file in any encoding of [`xml_text`], or a ZIP
@@ -104,7 +105,10 @@ impl Module {
             .flat_map(|set| reading.outputs(&set.name, set))
             .collect();
         let alarms = reading.alarms(root);
-        reading.left_out(root);
+        let (pictures, of_pictures) = reading.pictures(root);
+        for note in notes(root, of_pictures) {
+            reading.add(note);
+        }
         let is_second = root.all().any(|element| {
             element.path.starts_with("MTPServerAssemblySUCLib/")
                 || element.path.starts_with("MTPDataAssemblySUCLib/")
@@ -119,6 +123,7 @@ impl Module {
             assemblies,
             process_values,
             alarms,
+            pictures,
             services,
             findings: reading.findings,
         })
@@ -305,42 +310,6 @@ impl<'a> ElementIndex<'a> {
         found.copied()
     }
 
-    /// Adds a note for each kind of elements that have no place in the model.
-    fn left_out(&mut self, root: &'a CaexElement) {
-        let mut kinds: BTreeMap<&str, (usize, usize)> = BTreeMap::new();
-        let mut waiting = vec![(root, false)];
-        while let Some((element, is_in_list)) = waiting.pop() {
-            let is_read = READ.contains(&element.kind())
-                || is_procedure(element)
-                || is_parameter(element)
-                || is_assembly(element, is_in_list)
-                || (element.path.is_empty() && !element.is_interface);
-            if !is_read {
-                let known = kinds.entry(&element.path).or_insert((0, element.line));
-                known.0 += 1;
-                known.1 = known.1.min(element.line);
-            }
-            let is_list = is_list(element);
-            waiting.extend(element.children.iter().map(|child| (child, is_list)));
-        }
-        for (path, (count, line)) in kinds {
-            let is_note = self.findings.len() < MAX_FINDINGS;
-            if is_note {
-                let about = if path.is_empty() {
-                    "an interface without a class"
-                } else {
-                    path
-                };
-                self.findings.push(MtpFinding {
-                    about: about.to_owned(),
-                    what: format!("not read ({count} in the file)"),
-                    line,
-                    is_note,
-                });
-            }
-        }
-    }
-
     fn service(&mut self, element: &'a CaexElement) -> MtpService {
         let control = match self.assembly(element) {
             Some(assembly) if assembly.kind() == "ServiceControl" => self.control(assembly),
@@ -479,13 +448,25 @@ impl<'a> ElementIndex<'a> {
 
     /// Adds a finding about an element.
     pub(crate) fn find(&mut self, element: &CaexElement, about: &str, what: &str) {
+        self.find_at(element.line, about, what);
+    }
+
+    /// Adds a finding about a line.
+    pub(crate) fn find_at(&mut self, line: usize, about: &str, what: &str) {
         let finding = MtpFinding {
             about: about.to_owned(),
             what: what.to_owned(),
-            line: element.line,
+            line,
             is_note: false,
         };
         if self.findings.len() < MAX_FINDINGS && !self.findings.contains(&finding) {
+            self.findings.push(finding);
+        }
+    }
+
+    /// Adds a finding or a note, as long as there are not too many.
+    pub(crate) fn add(&mut self, finding: MtpFinding) {
+        if self.findings.len() < MAX_FINDINGS {
             self.findings.push(finding);
         }
     }
@@ -514,14 +495,14 @@ pub(crate) fn is_list(element: &CaexElement) -> bool {
         || (element.path.is_empty() && element.name == "DataAssemblies")
 }
 
-fn is_procedure(element: &CaexElement) -> bool {
+pub(crate) fn is_procedure(element: &CaexElement) -> bool {
     matches!(
         element.kind(),
         "Procedure" | "ServiceProcedure" | "ServiceStrategy"
     )
 }
 
-fn is_parameter(element: &CaexElement) -> bool {
+pub(crate) fn is_parameter(element: &CaexElement) -> bool {
     matches!(
         element.kind(),
         "ConfigurationParameter" | "ProcedureParameter" | "StrategyParameter"
@@ -644,34 +625,6 @@ const HANDSHAKE: &[&str] = &[
     "StateOpAct",
     "Sync",
     "VReq",
-];
-
-/// Kinds of elements that the model has, or whose children it has.
-const READ: &[&str] = &[
-    "Alarm",
-    "AlarmGroup",
-    "AlarmMessage",
-    "AlarmSet",
-    "AlarmText",
-    "AspectSetReference",
-    "CommunicationSet",
-    "DataAssemblySet",
-    "ExternalDataConnector",
-    "InstanceList",
-    "ModuleTypePackage",
-    "OPCUAItem",
-    "OPCUAServer",
-    "ProcessValueIn",
-    "ProcessValueOut",
-    "ProcessValueSet",
-    "ReportValue",
-    "RequiredEquipment",
-    "ServerAssemblySet",
-    "Service",
-    "ServiceSet",
-    "ServicesSet",
-    "SourceList",
-    "TextSet",
 ];
 
 const MAX_FINDINGS: usize = 1000;
