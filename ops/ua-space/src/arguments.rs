@@ -24,8 +24,8 @@ pub(crate) use job::{
     GoalArguments, JobArguments, JobVerb, ProcessArguments, ProcessVerb, ProductArguments,
 };
 pub(crate) use module::{
-    AasArguments, MtpAlarms, MtpArguments, MtpConnect, MtpRdf, MtpRun, MtpSkills, MtpVerb,
-    PeaArguments,
+    AasArguments, MtpAlarms, MtpArguments, MtpConnect, MtpPicture, MtpRdf, MtpRun, MtpSkills,
+    MtpVerb, PeaArguments,
 };
 
 use std::path::PathBuf;
@@ -358,7 +358,7 @@ pub(crate) enum Verb {
     /// Exit codes: 0 done, 65 a file is no NodeSet, 74 a file cannot be read or the output cannot
     /// be written.
     Owl(Owl),
-    /// Read manifests of process modules (MTP): check, skills, RDF, run
+    /// Read manifests of process modules (MTP): check, skills, pictures, RDF, run
     ///
     /// Documents that a manifest refers to are read from its folder or its container.
     ///

@@ -35,6 +35,7 @@ mod metadata;
 mod mtp_alarms;
 mod mtp_connect;
 mod mtp_files;
+mod mtp_picture;
 mod mtp_run;
 mod new;
 mod owl;

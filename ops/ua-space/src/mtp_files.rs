@@ -19,6 +19,7 @@ pub(crate) fn mtp(arguments: &MtpArguments) -> Result<(), CommandFailure> {
         MtpVerb::Check(arguments) => check(&arguments.files, arguments.json),
         MtpVerb::Rdf(arguments) => rdf(arguments),
         MtpVerb::Skills(arguments) => skills(arguments),
+        MtpVerb::Picture(arguments) => crate::mtp_picture::picture(arguments),
         MtpVerb::Alarms(arguments) => crate::mtp_alarms::alarms(arguments),
         MtpVerb::Connect(arguments) => crate::mtp_connect::connect(arguments),
         MtpVerb::Run(arguments) => crate::mtp_run::run(arguments),
@@ -58,6 +59,9 @@ struct Checked<'m> {
     servers: usize,
     nodes: usize,
     alarms: usize,
+    pictures: usize,
+    picture_objects: usize,
+    picture_connections: usize,
     findings: Vec<FindingRow<'m>>,
 }
 
@@ -97,6 +101,13 @@ impl<'m> Checked<'m> {
             servers: module.servers.len(),
             nodes: module.items.len(),
             alarms: module.alarms.len(),
+            pictures: module.pictures.len(),
+            picture_objects: module.pictures.iter().map(|one| one.objects.len()).sum(),
+            picture_connections: module
+                .pictures
+                .iter()
+                .map(|one| one.connections.len())
+                .sum(),
             findings: module.findings.iter().map(FindingRow::of).collect(),
         }
     }
@@ -146,7 +157,8 @@ fn check(files: &[String], is_json: bool) -> Result<(), CommandFailure> {
             }
             let line = format!(
                 "{file}: {} (MTP {}): {} services, {} procedures, {} parameters, {} outputs, \
-                 {} sensors, {} actuators, {} servers, {} nodes",
+                 {} sensors, {} actuators, {} servers, {} nodes, {} pictures with {} objects and \
+                 {} connections",
                 module.name,
                 checked.edition,
                 checked.services,
@@ -156,7 +168,10 @@ fn check(files: &[String], is_json: bool) -> Result<(), CommandFailure> {
                 checked.sensors,
                 checked.actuators,
                 checked.servers,
-                checked.nodes
+                checked.nodes,
+                checked.pictures,
+                checked.picture_objects,
+                checked.picture_connections
             );
             writeln!(out, "{}", harmless(&line))?;
         }

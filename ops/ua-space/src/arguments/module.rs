@@ -20,6 +20,8 @@ pub(crate) enum MtpVerb {
     Rdf(MtpRdf),
     /// List the procedures of a manifest with their parameters and outputs
     Skills(MtpSkills),
+    /// List the objects and connections of the HMI pictures of a manifest, or draw a picture
+    Picture(MtpPicture),
     /// Print the alarms of a manifest as a part of a mapping: variables with conditions at
     /// ua-server
     Alarms(MtpAlarms),
@@ -70,6 +72,24 @@ pub(crate) struct MtpSkills {
     pub(crate) file: String,
     /// Print a JSON array
     #[arg(long)]
+    pub(crate) json: bool,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct MtpPicture {
+    /// The manifest (.aml, .mtp, .amlx), or - for stdin
+    #[arg(value_name = "FILE")]
+    pub(crate) file: String,
+    /// The name or the ID of a picture. Without it all are listed, and the only one that is not
+    /// empty is drawn
+    #[arg(value_name = "NAME")]
+    pub(crate) name: Option<String>,
+    /// Draw the picture into this file: boxes with names for objects, lines for connections. A file
+    /// that is there is not replaced
+    #[arg(long, value_name = "FILE")]
+    pub(crate) svg: Option<PathBuf>,
+    /// Print a JSON array of pictures
+    #[arg(long, conflicts_with = "svg")]
     pub(crate) json: bool,
 }
 
