@@ -26,6 +26,9 @@ pub enum Peer {
     Ros1,
     /// Cyclone DDS and asyncua, in the Python environment that `cargo xtask test` makes.
     Python,
+    /// pySHACL, SPARQLWrapper and xmlschema, in the same environment. An environment of an earlier
+    /// version of the tests may lack them.
+    PythonJudges,
     /// Fast DDS from Debian or Ubuntu, in a program that `cargo xtask test` compiles.
     FastDds,
     /// Cyclone DDS from Debian or Ubuntu, in a program that `cargo xtask test` compiles.
@@ -101,6 +104,8 @@ pub(crate) const CYCLONE: &str = "cyclone-peer";
 pub(crate) const ROSCPP: &str = "roscpp-peer";
 pub(crate) const CLOCK: &str = "clock-shift.so";
 pub(crate) const NODE_OPCUA: &str = "node-opcua";
+/// Programs of pySHACL, SPARQLWrapper and xmlschema beside the Python of the environment.
+const PYTHON_JUDGES: [&str; 3] = ["pyshacl", "rqw", "xmlschema-validate"];
 
 impl Cell {
     /// Puts this thread into a new network, or logs why the test is skipped and returns `None`.
@@ -278,6 +283,8 @@ fn find(peer: Peer, python: &Path) -> Result<(), String> {
     let [fastdds, cyclone, roscpp, clock] = [FASTDDS, CYCLONE, ROSCPP, CLOCK].map(compiled);
     let [jazzy, kilted] = Distribution::ALL.map(Distribution::python);
     let node_opcua = compiled(NODE_OPCUA).join("node_modules/node-opcua-client");
+    let [pyshacl, sparqlwrapper, xmlschema] =
+        PYTHON_JUDGES.map(|program| python.with_file_name(program));
     let needed: &[&Path] = match peer {
         Peer::Ros1 => &[
             Path::new("/usr/bin/rosmaster"),
@@ -290,6 +297,7 @@ fn find(peer: Peer, python: &Path) -> Result<(), String> {
             Path::new("/usr/lib/rosbag/record"),
         ],
         Peer::Python => &[python],
+        Peer::PythonJudges => &[python, &pyshacl, &sparqlwrapper, &xmlschema],
         Peer::FastDds => &[&fastdds],
         Peer::CycloneC => &[&cyclone],
         Peer::Roscpp => &[&roscpp],

@@ -40,7 +40,7 @@ fn mes_with(cell: &Cell, key: &str, files: &[&Path]) -> Child {
 
 /// Returns the reports of ua-mes and of pySHACL for data.
 fn reports(data: &Path) -> [Value; 2] {
-    let Some(cell) = Cell::with(&[Peer::Python]) else {
+    let Some(cell) = Cell::with(&[Peer::PythonJudges]) else {
         return [Value::Null, Value::Null];
     };
     let shapes = Path::new(SHAPES).join("shapes.ttl");
@@ -70,7 +70,7 @@ fn pyshacl_reports_the_same_results_for_good_and_for_bad_data() {
 
 #[test]
 fn sparqlwrapper_queries_and_changes_the_knowledge_and_gets_the_codes_of_errors() {
-    let Some(cell) = Cell::with(&[Peer::Python]) else {
+    let Some(cell) = Cell::with(&[Peer::PythonJudges]) else {
         return;
     };
     let _mes = mes_with(&cell, "knowledge", &[]);
@@ -118,7 +118,7 @@ fn rounds(cell: &Cell, file: &Path, process: &str, cases: &Value) -> Vec<[Value;
 
 #[test]
 fn spiffworkflow_runs_the_tasks_of_bpmn_files_in_the_order_of_our_plan() {
-    let Some(cell) = Cell::with(&[Peer::Python]) else {
+    let Some(cell) = Cell::with(&[Peer::PythonJudges]) else {
         return;
     };
     let both = ["dose", "heat the reactor"];
@@ -147,7 +147,7 @@ fn spiffworkflow_runs_the_tasks_of_bpmn_files_in_the_order_of_our_plan() {
 
 #[test]
 fn the_recipe_of_the_examples_is_valid_by_the_schemas_of_b2mml() {
-    let Some(cell) = Cell::with(&[Peer::Python]) else {
+    let Some(cell) = Cell::with(&[Peer::PythonJudges]) else {
         return;
     };
     let Some(schema) = foreign("b2mml/AllSchemas.xsd") else {
