@@ -16,6 +16,7 @@ ACTUATORS = {"AnaVlv", "BinVlv", "AnaDrv", "BinDrv", "PIDCtrl"}
 PROCEDURES = {"Procedure", "ServiceProcedure", "ServiceStrategy"}
 PARAMETERS = {"ConfigurationParameter", "ProcedureParameter", "StrategyParameter"}
 OUTPUTS = {"ReportValue", "ProcessValueOut"}
+LINES = {"Pipe", "MeasurementLine", "FunctionLine"}
 LIBRARIES = {"InterfaceClassLib", "SystemUnitClassLib", "RoleClassLib", "AttributeTypeLib"}
 
 
@@ -46,6 +47,18 @@ def first(values, *names):
     return next((values[name] for name in names if name in values), None)
 
 
+def numbers(values, *names):
+    """Returns the numbers of some attributes, or `None` if one is missing."""
+    found = [values.get(name) for name in names]
+    return None if None in found else [float(number) for number in found]
+
+
+def points(text):
+    """Returns the points of an Edgepath."""
+    each = [point.split(",") for point in (text or "").split(";") if point.strip()]
+    return [[float(number) for number in point] for point in each]
+
+
 class Manifest:
     def __init__(self, file):
         self.items = {}
@@ -54,6 +67,7 @@ class Manifest:
         self.services = []
         self.servers = []
         self.module = None
+        self.pictures = []
         self.walk(etree.parse(file).getroot(), False, None)
 
     def walk(self, element, listed, endpoint):
@@ -68,6 +82,8 @@ class Manifest:
             if kind(element) == "OPCUAServer":
                 endpoint = attributes(element).get("Endpoint", "")
                 self.servers.append(element)
+            if kind(element) == "Picture":
+                self.pictures.append(element)
             if path(element) == "MTPServiceSUCLib/Service":
                 self.services.append(element)
             library = path(element).split("/")[0]
@@ -154,6 +170,52 @@ class Manifest:
                 limits[name] = None
         return {"name": element.get("Name"), "node": self.node(values, "VExt"), **limits}
 
+    def picture(self, picture):
+        """Returns the parts of a picture, and the names of the parts that each link joins."""
+        inner = picture.xpath(".//*[local-name()='InternalElement']")
+        parts = [one for one in inner if "PortObject" not in path(one) and self.is_part(one)]
+        lines = [one for one in parts if kind(one) in LINES]
+        ports = [one for one in inner if one.getparent() in parts]
+        owners = {}
+        for port in ports:
+            owners[port.get("ID")] = port.getparent().get("Name")
+            for connector in port:
+                if local(connector) == "ExternalInterface":
+                    owners[connector.get("ID")] = port.getparent().get("Name")
+        links = []
+        for link in picture.xpath(".//*[local-name()='InternalLink']"):
+            sides = [link.get("RefPartnerSideA"), link.get("RefPartnerSideB")]
+            links.append(sorted(owners[side if side in owners else side.split(":")[0].strip("{}")] for side in sides))
+        values = attributes(picture)
+        return {
+            "name": picture.get("Name"),
+            "size": numbers(values, "Width", "Height"),
+            "objects": [self.shown(one) for one in parts if one not in lines],
+            "connections": [
+                [one.get("Name"), kind(one), points(attributes(one).get("Edgepath"))] for one in lines
+            ],
+            "ports": len(ports),
+            "links": sorted(links),
+            "groups": len(inner) - len(parts) - len(ports),
+        }
+
+    def is_part(self, element):
+        return path(element).split("/")[1:2] in (["VisualObject"], ["TopologyObject"], ["Connection"])
+
+    def shown(self, element):
+        """Returns an object of a picture with the name of its data assembly."""
+        values = attributes(element)
+        assembly = self.by_ref.get(values.get("RefID"))
+        return [
+            element.get("Name"),
+            kind(element),
+            numbers(values, "X", "Y"),
+            numbers(values, "Width", "Height"),
+            float(values.get("Rotation", 0)),
+            values.get("eClassClassificationClass", ""),
+            assembly.get("Name") if assembly is not None else None,
+        ]
+
     def output(self, element):
         values = self.variables(element)
         node = self.node(values, "V", "VExt", "VOut", "VFbk")
@@ -186,6 +248,7 @@ def main():
             assemblies=len(manifest.assemblies),
             access=access,
             services=[manifest.service(one) for one in manifest.services],
+            pictures=[manifest.picture(one) for one in manifest.pictures],
         )
 
 

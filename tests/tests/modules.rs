@@ -1,6 +1,8 @@
 //! Process modules: manifests compared with another XML library and with rdflib, and services that
 //! run as skills with a simulated module.
 
+mod pictures;
+
 use std::collections::BTreeMap;
 use std::process::{Command, Output};
 use std::time::Duration;
@@ -121,6 +123,7 @@ fn are_answered(cell: &Cell, paths: &[String]) {
         let triples = module.triples(&format!("urn:m:{number}"), &BTreeMap::new());
         let source = KnowledgeSource::new(SourceKind::Mtp, &number.to_string());
         knowledge.replace(&source, &triples, 1).unwrap();
+        pictures::are_as_judged(&module, &judged[number]);
         services_of.insert(number, module.services);
     }
     for (number, wanted) in judged.iter().enumerate() {
@@ -327,7 +330,7 @@ fn verbs_show_manifests_and_report_what_is_left_out() {
     let numbers = ["services", "procedures", "sensors", "actuators", "nodes"];
     let numbers = numbers.map(|name| checked[name].as_u64().unwrap());
     assert_eq!(numbers, [2, 3, 6, 5, 117], "{checked}");
-    assert_eq!(checked["findings"][0]["severity"], "note");
+    pictures::are_listed_and_drawn(&column, &checked);
     let skills = space(&["mtp", "skills", "--json", &column]);
     let skills: Value = serde_json::from_str(&stdout(&skills)).unwrap();
     assert_eq!(skills[0]["skill"], "Heating/Ramp", "{skills}");
@@ -348,6 +351,7 @@ fn verbs_show_manifests_and_report_what_is_left_out() {
 
     let broken = std::fs::read_to_string(&column).unwrap();
     let Some(cell) = Cell::with(&[]) else { return };
+    pictures::are_noted_if_left_out(&cell, &broken);
     let broken = broken.replacen("<Value>n-Level.V</Value>", "<Value>n-gone</Value>", 1);
     let broken = cell.file("broken.aml", &broken).display().to_string();
     let refused = space(&["mtp", "check", &broken]);
