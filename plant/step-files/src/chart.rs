@@ -2,12 +2,22 @@
 
 use std::cmp::Ordering;
 
-use crate::edge::TOLERANCE;
-use crate::face::FaceEdge;
+use crate::edge::{EdgeSpan, TOLERANCE};
 use crate::fault::ShapeFault;
 use crate::spline::off_segment;
 use crate::surface::{ChartForm, Surface};
 use crate::vector::Vector;
+
+/// An edge of a face with its direction in the loop.
+#[derive(Debug, Clone)]
+pub(crate) struct FaceEdge<'e> {
+    pub(crate) id: u64,
+    pub(crate) span: &'e EdgeSpan,
+    /// Whether the loop runs from the start to the end of the edge.
+    pub(crate) along: bool,
+    /// Whether the face uses the edge in both directions.
+    pub(crate) is_seam: bool,
+}
 
 /// The place of the points around a point.
 #[derive(Debug, Clone, Copy, PartialEq)]

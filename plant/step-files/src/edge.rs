@@ -5,6 +5,7 @@ use std::f64::consts::TAU;
 use crate::fault::ShapeFault;
 use crate::spline::{BezierCurve, SplineCurve, cost_of, nearest_of};
 use crate::vector::{Placement, Vector};
+use crate::work::ReadingBudget;
 
 /// Largest distance in millimetres at which points, curves and surfaces count as coincident.
 pub(crate) const TOLERANCE: f64 = 0.01;
@@ -137,7 +138,7 @@ impl EdgeSpan {
     }
 
     /// Returns bounds of the largest value in a direction, and counts its work.
-    pub(crate) fn bounds(&self, direction: Vector, work: &mut u64) -> Bounds {
+    pub(crate) fn bounds(&self, direction: Vector, work: &mut ReadingBudget<'_>) -> Bounds {
         let ends = self.first.dot(direction).max(self.last.dot(direction));
         let mut bounds = Bounds::exact(ends);
         match &self.span {
@@ -173,7 +174,7 @@ impl EdgeSpan {
 
 /// Returns bounds of the largest value of Bezier pieces in a direction: pieces whose control points
 /// are above the points of the curve are halved.
-fn extreme(pieces: &[BezierCurve], direction: Vector, work: &mut u64) -> Bounds {
+fn extreme(pieces: &[BezierCurve], direction: Vector, work: &mut ReadingBudget<'_>) -> Bounds {
     let value = |point: Vector| point.dot(direction);
     let ends = pieces
         .iter()
@@ -183,7 +184,7 @@ fn extreme(pieces: &[BezierCurve], direction: Vector, work: &mut u64) -> Bounds 
     let mut open: Vec<BezierCurve> = pieces.to_vec();
     let mut steps = 0;
     while let Some(piece) = open.pop() {
-        *work = work.saturating_add(cost_of(&[piece.cost(), 2]));
+        work.add(cost_of(&[piece.cost(), 2]));
         let most = piece.most(value);
         if most <= bounds.reached + NARROW || steps >= MOST_STEPS {
             bounds.limit = bounds.limit.max(most);
@@ -386,11 +387,32 @@ mod tests {
     fn the_direction_of_an_arc_decides_its_extent() {
         let (right, up) = (Vector::new(5.0, 0.0, 0.0), Vector::new(0.0, 5.0, 0.0));
         let quarter = EdgeSpan::new(&circle(), (right, up), false, true).unwrap();
-        assert!((quarter.bounds(-Vector::X, &mut 0).limit - 0.0).abs() < 1e-9);
+        assert!(
+            (quarter
+                .bounds(-Vector::X, &mut ReadingBudget::new(&|| false))
+                .limit
+                - 0.0)
+                .abs()
+                < 1e-9
+        );
         let rest = EdgeSpan::new(&circle(), (right, up), false, false).unwrap();
-        assert!((rest.bounds(-Vector::X, &mut 0).reached - 5.0).abs() < 1e-9);
+        assert!(
+            (rest
+                .bounds(-Vector::X, &mut ReadingBudget::new(&|| false))
+                .reached
+                - 5.0)
+                .abs()
+                < 1e-9
+        );
         let whole = EdgeSpan::new(&circle(), (right, right), true, true).unwrap();
-        assert!((whole.bounds(-Vector::Y, &mut 0).reached - 5.0).abs() < 1e-9);
+        assert!(
+            (whole
+                .bounds(-Vector::Y, &mut ReadingBudget::new(&|| false))
+                .reached
+                - 5.0)
+                .abs()
+                < 1e-9
+        );
     }
 
     #[test]

@@ -7,23 +7,13 @@
 use std::cmp::Ordering;
 use std::collections::BinaryHeap;
 
-use crate::chart::{FaceChart, FacePlace};
-use crate::edge::{Bounds, EdgeSpan, MOST_STEPS, NARROW};
+use crate::chart::{FaceChart, FaceEdge, FacePlace};
+use crate::edge::{Bounds, MOST_STEPS, NARROW};
 use crate::fault::ShapeFault;
 use crate::spline::{BezierCurve, BezierPatch, cost_of};
 use crate::surface::{PatchGrid, ProfileCurve, Surface};
 use crate::vector::{Placement, Vector};
-
-/// An edge of a face with its direction in the loop.
-#[derive(Debug, Clone)]
-pub(crate) struct FaceEdge<'e> {
-    pub(crate) id: u64,
-    pub(crate) span: &'e EdgeSpan,
-    /// Whether the loop runs from the start to the end of the edge.
-    pub(crate) along: bool,
-    /// Whether the face uses the edge in both directions.
-    pub(crate) is_seam: bool,
-}
+use crate::work::{ReadingBudget, steps_of};
 
 /// A face whose edges enclose it.
 #[derive(Debug)]
@@ -60,7 +50,7 @@ impl CheckedFace {
         surface: Surface,
         is_outward: bool,
         edges: &[FaceEdge<'_>],
-        work: &mut u64,
+        work: &mut ReadingBudget<'_>,
     ) -> Result<Self, ShapeFault> {
         let form = surface.form();
         if form.s.is_none() && form.t.is_none() {
@@ -79,19 +69,10 @@ impl CheckedFace {
             .iter()
             .map(|edge| surface.tried(&edge.span.points).count())
             .sum::<usize>();
-        let most =
-            u64::try_from(count).map_or(u64::MAX, |count| count.saturating_mul(surface.cost()));
-        *work = work.saturating_add(most);
-        if *work > MOST_WORK {
-            return Err(ShapeFault::TooLarge);
-        }
+        work.spend(steps_of(count).saturating_mul(surface.cost()))?;
         let mut chart = FaceChart::new(&surface, is_outward, edges)?;
         let count = chart.segments.len();
-        let most = u64::try_from(count.saturating_mul(count).saturating_mul(2));
-        *work = work.saturating_add(most.unwrap_or(u64::MAX));
-        if *work > MOST_WORK {
-            return Err(ShapeFault::TooLarge);
-        }
+        work.spend(steps_of(count.saturating_mul(count).saturating_mul(2)))?;
         let is_whole = chart.segments.iter().all(|segment| segment.is_seam);
         if is_whole && !form.is_closed() {
             return Err(ShapeFault::Unbounded);
@@ -121,7 +102,12 @@ impl CheckedFace {
 
     /// Returns bounds of the largest values in a direction of length 1 within the face, above a
     /// value that edges reach.
-    pub(crate) fn inner(&self, direction: Vector, reached: f64, work: &mut u64) -> InnerExtreme {
+    pub(crate) fn inner(
+        &self,
+        direction: Vector,
+        reached: f64,
+        work: &mut ReadingBudget<'_>,
+    ) -> InnerExtreme {
         match &self.surface {
             // A straight line goes through each point, so that the extremes are on edges.
             Surface::Plane(_) | Surface::Cylinder { .. } | Surface::Extrusion { .. } => {
@@ -179,14 +165,14 @@ impl CheckedFace {
         &self,
         grid: &PatchGrid,
         (direction, reached): (Vector, f64),
-        work: &mut u64,
+        work: &mut ReadingBudget<'_>,
     ) -> InnerExtreme {
         let value = |point: Vector| point.dot(direction);
         let ranked = |patch: BezierPatch| (patch.most(value), patch);
         let mut search = Search::new(grid.patches.iter().cloned().map(ranked), reached);
-        while let Some(Ranked { most, piece }) = search.next(*work <= MOST_WORK) {
+        while let Some(Ranked { most, piece }) = search.next(work.is_left()) {
             let of_patch = cost_of(&[piece.cost(), 8]);
-            *work = work.saturating_add(self.chart.cost().saturating_add(of_patch));
+            work.add(self.chart.cost().saturating_add(of_patch));
             let (middle, du, dv) = piece.at(0.5, 0.5);
             let (u, v) = (
                 f64::midpoint(piece.u.0, piece.u.1),
@@ -213,7 +199,7 @@ impl CheckedFace {
         &self,
         (placement, profile): (&Placement, &ProfileCurve),
         (direction, reached): (Vector, f64),
-        work: &mut u64,
+        work: &mut ReadingBudget<'_>,
     ) -> InnerExtreme {
         let local = placement.local_direction(direction);
         let flat = Vector::new(local.x, local.y, 0.0);
@@ -227,9 +213,9 @@ impl CheckedFace {
         };
         let ranked = |piece: BezierCurve| (piece.most(height), piece);
         let mut search = Search::new(profile.pieces.iter().cloned().map(ranked), reached);
-        while let Some(Ranked { most, piece }) = search.next(*work <= MOST_WORK) {
+        while let Some(Ranked { most, piece }) = search.next(work.is_left()) {
             let of_search = self.surface.cost();
-            *work = work.saturating_add(self.chart.cost().saturating_add(of_search));
+            work.add(self.chart.cost().saturating_add(of_search));
             let (low, high) = piece.split(0.5);
             let at = placement.local(low.last());
             let middle = turn * at.x.hypot(at.y) + Vector::Z * at.z;
@@ -254,13 +240,13 @@ impl CheckedFace {
     /// Counts the work of some normals.
     ///
     /// # Errors
-    /// The work of the file is too much.
-    pub(crate) fn count_normals(&self, count: u64, work: &mut u64) -> Result<(), ShapeFault> {
-        *work = work.saturating_add(self.surface.cost().saturating_mul(count));
-        if *work > MOST_WORK {
-            return Err(ShapeFault::TooLarge);
-        }
-        Ok(())
+    /// The reading has to end.
+    pub(crate) fn count_normals(
+        &self,
+        count: u64,
+        work: &mut ReadingBudget<'_>,
+    ) -> Result<(), ShapeFault> {
+        work.spend(self.surface.cost().saturating_mul(count))
     }
 
     /// Returns the normal of the face at a point; `None` where it has none.
@@ -384,5 +370,3 @@ impl<T> Search<T> {
 
 /// The largest uncertainty in millimetres of pieces near edges.
 const NEAR_EDGE: f64 = 0.03;
-/// Maximum number of comparisons of edges with each other, of all faces.
-pub(crate) const MOST_WORK: u64 = 200_000_000;

@@ -113,6 +113,9 @@ pub enum ShapeFault {
     /// A limit is exceeded.
     #[error("it is too large or too detailed to be checked")]
     TooLarge,
+    /// The time of the reading is over.
+    #[error("the time to read the file was over before it was checked")]
+    Late,
     /// The bounds of an extent are too far apart.
     #[error("the extent along {axis} is certain only within {gap:.3} mm")]
     Gap {

@@ -11,6 +11,7 @@ use crate::spline::{Knots, MOST_DEGREE, SplineCurve, SplineFault, SplineSurface}
 use crate::surface::{PatchGrid, ProfileCurve, Surface};
 use crate::units::Units;
 use crate::vector::{Placement, Vector};
+use crate::work::ReadingBudget;
 
 /// Records with the units of their context.
 #[derive(Debug, Clone, Copy)]
@@ -206,7 +207,11 @@ impl Geometry<'_> {
         kind.map(|(_, kind)| *kind).ok_or_else(|| self.unknown(id))
     }
 
-    pub(crate) fn surface(&self, id: u64, work: &mut u64) -> Result<Surface, FaultAt> {
+    pub(crate) fn surface(
+        &self,
+        id: u64,
+        work: &mut ReadingBudget<'_>,
+    ) -> Result<Surface, FaultAt> {
         let arguments = self.file.one_of(id, &SURFACES)?;
         if !SPLINE_SURFACES.contains(&arguments.name) && !self.file.is_simple(id) {
             return Err(self.unknown(id));
@@ -279,7 +284,7 @@ impl Geometry<'_> {
         ProfileCurve::new(pieces).at(id)
     }
 
-    fn spline_surface(&self, id: u64, work: &mut u64) -> Result<Surface, FaultAt> {
+    fn spline_surface(&self, id: u64, work: &mut ReadingBudget<'_>) -> Result<Surface, FaultAt> {
         let is_simple = self.file.is_simple(id);
         let (base, skipped) = if is_simple {
             (self.file.one_of(id, &SPLINE_SURFACES)?, 1)

@@ -20,8 +20,8 @@
 //! opens no file. The size, depth and work of a file are bounded.
 //!
 //! Reading order: `part21` and `strings` (text), `records` and `units` (parameters), `vector`,
-//! `spline`, `edge`, `surface` and `geometry` (curves and surfaces), `chart`, `face` and
-//! `solid` (the proof), `structure` and `product` (assemblies).
+//! `spline`, `edge`, `surface` and `geometry` (curves and surfaces), `work` (limits), `chart`,
+//! `face` and `solid` (the proof), `structure` and `product` (assemblies).
 
 mod chart;
 mod edge;
@@ -38,6 +38,7 @@ mod structure;
 mod surface;
 mod units;
 mod vector;
+mod work;
 
 pub use fault::{EdgeUse, ShapeFault};
 pub use part21::StepFault;

@@ -90,17 +90,23 @@ pub enum StepFault {
         /// The schemas of the file.
         found: String,
     },
+    /// The time of the reading is over.
+    #[error("line {line}: the time to read the file was over before its end; split it")]
+    Late {
+        /// The line that was read last, from 1.
+        line: usize,
+    },
     /// No record is a product.
     #[error("the file has no product; export it as AP203, AP214 or AP242")]
     NoProduct,
 }
 
 impl ExchangeFile {
-    /// Reads a file.
+    /// Reads a file, until `is_over` returns true.
     ///
     /// # Errors
     /// The first fault of the text.
-    pub(crate) fn read(bytes: &[u8]) -> Result<Self, StepFault> {
+    pub(crate) fn read(bytes: &[u8], is_over: &dyn Fn() -> bool) -> Result<Self, StepFault> {
         if bytes.len() > LARGEST {
             let (line, most) = (1, LARGEST);
             let what = "bytes";
@@ -111,6 +117,7 @@ impl ExchangeFile {
             at: 0,
             line: 1,
             parameters: 0,
+            is_over,
         };
         reader.file()
     }
@@ -122,6 +129,8 @@ struct Reader<'b> {
     line: usize,
     /// The number of parameters so far.
     parameters: usize,
+    /// Returns whether the time of the reading is over.
+    is_over: &'b dyn Fn() -> bool,
 }
 
 impl Reader<'_> {
@@ -177,6 +186,9 @@ impl Reader<'_> {
             let record = EntityRecord { line, parts };
             if file.records.insert(id, record).is_some() {
                 return Err(StepFault::Twice { line, id });
+            }
+            if file.records.len() % BETWEEN_LOOKS == 1 && (self.is_over)() {
+                return Err(StepFault::Late { line });
             }
             if file.records.len() > MOST_RECORDS {
                 return Err(self.too_many(MOST_RECORDS, "records"));
@@ -452,6 +464,8 @@ fn schemas(part: &EntityPart) -> Vec<String> {
 const LARGEST: usize = 64 << 20;
 /// Maximum number of records.
 const MOST_RECORDS: usize = 1_000_000;
+/// Number of records between two looks at the time.
+const BETWEEN_LOOKS: usize = 4096;
 /// Maximum number of parameters of all records.
 const MOST_PARAMETERS: usize = 3_000_000;
 /// Maximum number of entities of a complex instance.
@@ -476,7 +490,7 @@ mod tests {
         let text = file(
             "#1 = A($,*,-2,+1.5E-1,'it''s \\X2\\00E4\\X0\\', .T., #7, (1., (2.)), LENGTH(3.)) ; /* a\n; comment */\n#2=(B(1)C_D());",
         );
-        let read = ExchangeFile::read(text.as_bytes()).unwrap();
+        let read = ExchangeFile::read(text.as_bytes(), &|| false).unwrap();
         assert_eq!(read.schemas, ["AUTOMOTIVE_DESIGN"]);
         let expected = vec![
             Parameter::Omitted,
@@ -519,12 +533,12 @@ mod tests {
             ),
             (&deep, "more than 16 lists within each other"),
         ] {
-            let fault = ExchangeFile::read(file(data).as_bytes()).unwrap_err();
+            let fault = ExchangeFile::read(file(data).as_bytes(), &|| false).unwrap_err();
             assert!(fault.to_string().contains(expected), "{data}: {fault}");
         }
         let whole = file("#1=A(1);");
         for length in 0..whole.trim_end().len() {
-            let cut = ExchangeFile::read(&whole.as_bytes()[..length]);
+            let cut = ExchangeFile::read(&whole.as_bytes()[..length], &|| false);
             assert!(cut.is_err(), "{length}");
         }
     }

@@ -3,15 +3,14 @@
 use std::collections::HashMap;
 
 use crate::edge::Bounds;
-use crate::face::MOST_WORK;
 use crate::fault::ShapeFault;
 use crate::part21::{ExchangeFile, StepFault};
 use crate::records::{AtEntity, FaultAt};
 use crate::solid::{CheckedSolid, SOLIDS};
-use crate::spline::cost_of;
 use crate::structure::ProductStructure;
 use crate::units::Units;
 use crate::vector::{Placement, Vector};
+use crate::work::{ReadingBudget, steps_of};
 
 /// The products of a STEP file.
 #[derive(Debug, Clone, PartialEq)]
@@ -125,7 +124,17 @@ impl StepProducts {
     /// # Errors
     /// The first reason why the file is not a STEP file of products.
     pub fn read(bytes: &[u8]) -> Result<Self, StepFault> {
-        let file = ExchangeFile::read(bytes)?;
+        Self::read_until(bytes, &|| false)
+    }
+
+    /// Reads the products of a file, like [`Self::read`], until `is_over` returns true. The products
+    /// that are left then have findings.
+    ///
+    /// # Errors
+    /// The first reason why the file is not a STEP file of products, or that its records cannot be
+    /// read in time.
+    pub fn read_until(bytes: &[u8], is_over: &dyn Fn() -> bool) -> Result<Self, StepFault> {
+        let file = ExchangeFile::read(bytes, is_over)?;
         let is_known = |schema: &String| SCHEMAS.iter().any(|known| schema.starts_with(known));
         if !file.schemas.iter().any(is_known) {
             let found = file.schemas.join(", ").chars().take(200).collect();
@@ -140,7 +149,7 @@ impl StepProducts {
             solids: HashMap::new(),
             known: HashMap::new(),
             placements: HashMap::new(),
-            work: 0,
+            work: ReadingBudget::new(is_over),
         };
         let mut all = Self {
             products: Vec::new(),
@@ -197,7 +206,7 @@ struct ShapeReading<'f> {
     /// Bounds by the shape and the direction.
     known: HashMap<(Shape, [u64; 3]), Found>,
     placements: HashMap<u64, Result<Placement, FaultAt>>,
-    work: u64,
+    work: ReadingBudget<'f>,
 }
 
 impl ShapeReading<'_> {
@@ -262,8 +271,8 @@ impl ShapeReading<'_> {
             return known.clone();
         }
         let (Shape::Definition(id) | Shape::Representation(id)) = shape;
-        self.work = self.work.saturating_add(100);
-        if self.work > MOST_WORK || within.len() > DEEPEST {
+        self.work.spend(OF_SHAPE).at(id)?;
+        if within.len() > DEEPEST {
             return Err(ShapeFault::TooLarge).at(id);
         }
         if within.contains(&shape) {
@@ -293,7 +302,10 @@ impl ShapeReading<'_> {
             let found = found.map_err(|fault| {
                 let is_kept = matches!(
                     fault.fault,
-                    ShapeFault::Cycle | ShapeFault::TooLarge | ShapeFault::OfPart(_)
+                    ShapeFault::Cycle
+                        | ShapeFault::TooLarge
+                        | ShapeFault::Late
+                        | ShapeFault::OfPart(_)
                 );
                 if is_kept {
                     fault
@@ -340,7 +352,7 @@ impl ShapeReading<'_> {
         let geometry = structure.geometry(id)?;
         let mut all = (Bounds::NONE, id);
         let items = structure.items(id)?;
-        self.work = self.work.saturating_add(cost_of(&[items.len()]));
+        self.work.spend(steps_of(items.len())).at(id)?;
         for item in items {
             if structure.file.is(item, "AXIS2_PLACEMENT_3D") {
                 continue;
@@ -391,6 +403,8 @@ fn pose(placement: &Placement) -> OccurrencePose {
     }
 }
 
+/// The work of a shape beside that of its items.
+const OF_SHAPE: u64 = 100;
 /// The largest distance of the bounds of an extreme in millimetres.
 const MOST_GAP: f64 = 0.04;
 /// Maximum depth of assemblies and mapped shapes.

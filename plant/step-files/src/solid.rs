@@ -3,14 +3,15 @@
 use std::collections::hash_map::Entry;
 use std::collections::{HashMap, HashSet};
 
+use crate::chart::FaceEdge;
 use crate::edge::{Bounds, Curve, EdgeSpan, TOLERANCE};
-use crate::face::{CheckedFace, FaceEdge, MOST_WORK};
+use crate::face::CheckedFace;
 use crate::fault::{EdgeUse, ShapeFault};
 use crate::geometry::Geometry;
 use crate::records::{AtEntity, EntityArguments, FaultAt};
-use crate::spline::cost_of;
 use crate::surface::Surface;
 use crate::vector::Vector;
+use crate::work::{ReadingBudget, steps_of};
 
 /// A solid whose shell is closed.
 #[derive(Debug)]
@@ -60,7 +61,11 @@ impl CheckedSolid {
     ///
     /// # Errors
     /// The first reason why the solid is not proven to be closed.
-    pub(crate) fn read(geometry: &Geometry<'_>, id: u64, work: &mut u64) -> Result<Self, FaultAt> {
+    pub(crate) fn read(
+        geometry: &Geometry<'_>,
+        id: u64,
+        work: &mut ReadingBudget<'_>,
+    ) -> Result<Self, FaultAt> {
         let solid = geometry.file.one_of(id, &SOLIDS)?;
         if !geometry.file.is_simple(id) {
             return Err(ShapeFault::Kind {
@@ -88,7 +93,7 @@ impl CheckedSolid {
     fn of_shell(
         geometry: &Geometry<'_>,
         (solid, shell): (u64, u64),
-        work: &mut u64,
+        work: &mut ReadingBudget<'_>,
     ) -> Result<Self, FaultAt> {
         let shell = shell_of(geometry, shell)?;
         let ids = shell.references(1)?;
@@ -143,7 +148,7 @@ impl CheckedSolid {
     }
 
     /// Checks that no two faces lie on each other at their edge: one of them has the wrong sense.
-    fn check_folds(&self, work: &mut u64) -> Result<(), FaultAt> {
+    fn check_folds(&self, work: &mut ReadingBudget<'_>) -> Result<(), FaultAt> {
         for edge in &self.edges {
             let middle = edge.span.points.get(edge.span.points.len() / 2);
             let middle = middle.copied().unwrap_or_default();
@@ -192,7 +197,11 @@ impl CheckedSolid {
 
     /// Checks that the solid is inside of the faces at its outermost edge. A solid that is inside
     /// out may have the wrong parts of spheres and tori.
-    fn check_outside(&self, direction: Vector, work: &mut u64) -> Result<(), FaultAt> {
+    fn check_outside(
+        &self,
+        direction: Vector,
+        work: &mut ReadingBudget<'_>,
+    ) -> Result<(), FaultAt> {
         let mut top = (f64::NEG_INFINITY, None);
         for edge in &self.edges {
             for point in &edge.span.points {
@@ -241,19 +250,14 @@ impl CheckedSolid {
     pub(crate) fn bounds(
         &self,
         direction: Vector,
-        work: &mut u64,
+        work: &mut ReadingBudget<'_>,
     ) -> Result<(Bounds, u64), FaultAt> {
         let (mut all, mut decisive) = (Bounds::NONE, self.id);
         let count = self.edges.len() + self.faces.len();
-        *work = work.saturating_add(u64::try_from(count).unwrap_or(u64::MAX));
-        if *work > MOST_WORK {
-            return Err(ShapeFault::TooLarge).at(self.id);
-        }
+        work.spend(steps_of(count)).at(self.id)?;
         for edge in &self.edges {
             let bounds = edge.span.bounds(direction, work);
-            if *work > MOST_WORK {
-                return Err(ShapeFault::TooLarge).at(edge.id);
-            }
+            work.spend(0).at(edge.id)?;
             if bounds.limit > all.limit {
                 decisive = edge.id;
             }
@@ -264,6 +268,7 @@ impl CheckedSolid {
         let mut outward = of_edges;
         for (id, face) in &self.faces {
             let inner = face.inner(direction, of_edges, work);
+            work.spend(0).at(*id)?;
             if inner.bounds.limit > all.limit {
                 decisive = *id;
             }
@@ -283,7 +288,7 @@ impl CheckedSolid {
                 .iter()
                 .map(|edge| edge.span.points.len())
                 .sum::<usize>();
-            *work = work.saturating_add(u64::try_from(count).unwrap_or(u64::MAX));
+            work.spend(steps_of(count)).at(self.id)?;
             self.check_outside(direction, work)?;
         }
         Ok((all, decisive))
@@ -304,7 +309,7 @@ fn read_face(
     geometry: &Geometry<'_>,
     id: u64,
     edges: &mut ReadEdges,
-    work: &mut u64,
+    work: &mut ReadingBudget<'_>,
 ) -> Result<ReadFace, FaultAt> {
     let face = geometry
         .file
@@ -340,7 +345,7 @@ fn read_loop(
     geometry: &Geometry<'_>,
     id: u64,
     edges: &mut ReadEdges,
-    work: &mut u64,
+    work: &mut ReadingBudget<'_>,
 ) -> Result<Vec<(u64, bool)>, FaultAt> {
     let ring = geometry.file.one_of(id, &["EDGE_LOOP"])?;
     let mut uses = Vec::new();
@@ -378,7 +383,7 @@ fn read_edge(
     geometry: &Geometry<'_>,
     id: u64,
     curves: &mut HashMap<u64, Curve>,
-    work: &mut u64,
+    work: &mut ReadingBudget<'_>,
 ) -> Result<ReadEdge, FaultAt> {
     let edge = geometry.file.one_of(id, &["EDGE_CURVE"])?;
     let (start, end) = (edge.reference(1)?, edge.reference(2)?);
@@ -388,12 +393,9 @@ fn read_edge(
         Entry::Occupied(known) => known.into_mut(),
         Entry::Vacant(free) => free.insert(geometry.curve(of)?),
     };
-    *work = work.saturating_add(curve.cost());
-    if *work > MOST_WORK {
-        return Err(ShapeFault::TooLarge).at(id);
-    }
+    work.spend(curve.cost()).at(id)?;
     let span = EdgeSpan::new(curve, ends, start == end, edge.boolean(4)?).at(id)?;
-    *work = work.saturating_add(span.cost());
+    work.spend(span.cost()).at(id)?;
     Ok(ReadEdge { span, start, end })
 }
 
@@ -455,12 +457,11 @@ fn check_face(
     (geometry, surface): (&Geometry<'_>, Surface),
     face: &ReadFace,
     edges: &HashMap<u64, ReadEdge>,
-    work: &mut u64,
+    work: &mut ReadingBudget<'_>,
 ) -> Result<CheckedFace, FaultAt> {
-    *work = work.saturating_add(surface.cost().saturating_mul(cost_of(&[face.points.len()])));
-    if *work > MOST_WORK {
-        return Err(ShapeFault::TooLarge).at(face.id);
-    }
+    let count = steps_of(face.points.len());
+    work.spend(surface.cost().saturating_mul(count))
+        .at(face.id)?;
     for point in &face.points {
         let distance = surface.chart(vertex(geometry, *point)?).distance;
         if !matches!(

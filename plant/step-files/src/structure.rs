@@ -2,14 +2,13 @@
 
 use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet};
 
-use crate::face::MOST_WORK;
 use crate::fault::ShapeFault;
 use crate::geometry::Geometry;
 use crate::part21::ExchangeFile;
 use crate::records::{AtEntity, FaultAt};
-use crate::spline::cost_of;
 use crate::units::Units;
 use crate::vector::Placement;
+use crate::work::{ReadingBudget, steps_of};
 
 /// The relations of products, shapes and parts.
 pub(crate) struct ProductStructure<'f> {
@@ -322,7 +321,7 @@ impl<'f> ProductStructure<'f> {
         &self,
         occurrence: u64,
         (assembly, part): (u64, u64),
-        work: &mut u64,
+        work: &mut ReadingBudget<'_>,
     ) -> Result<Placement, FaultAt> {
         let places = self
             .places
@@ -345,10 +344,8 @@ impl<'f> ProductStructure<'f> {
         let is_forward = self.has(part, first) && self.has(assembly, second);
         let is_backward = self.has(part, second) && self.has(assembly, first);
         let (items, others) = (self.items(first)?, self.items(second)?);
-        *work = work.saturating_add(cost_of(&[items.len() + others.len()]));
-        if *work > MOST_WORK {
-            return Err(ShapeFault::TooLarge).at(*relation);
-        }
+        let count = steps_of(items.len().saturating_add(others.len()));
+        work.spend(count).at(*relation)?;
         if is_forward == is_backward || !items.contains(&of_first) || !others.contains(&of_second) {
             return Err(ShapeFault::Unrelated).at(*relation);
         }

@@ -4,10 +4,10 @@ use std::f64::consts::TAU;
 use std::rc::Rc;
 
 use crate::edge::TOLERANCE;
-use crate::face::MOST_WORK;
 use crate::fault::ShapeFault;
 use crate::spline::{BezierCurve, BezierPatch, OF_SEARCH, SplineSurface, f64_of, nearest_of};
 use crate::vector::{Placement, Vector};
+use crate::work::ReadingBudget;
 
 /// A surface.
 #[derive(Debug, Clone, PartialEq)]
@@ -430,10 +430,13 @@ pub(crate) struct PatchGrid {
 }
 
 impl PatchGrid {
-    pub(crate) fn new(surface: &SplineSurface, work: &mut u64) -> Result<Self, ShapeFault> {
+    pub(crate) fn new(
+        surface: &SplineSurface,
+        work: &mut ReadingBudget<'_>,
+    ) -> Result<Self, ShapeFault> {
         let (count, cost) = surface.size();
-        *work = work.saturating_add(cost);
-        if count > MOST_PATCHES || *work > MOST_WORK {
+        work.spend(cost)?;
+        if count > MOST_PATCHES {
             return Err(ShapeFault::TooLarge);
         }
         let patches = surface.patches();

@@ -2,9 +2,10 @@
 
 #![expect(clippy::unwrap_used, clippy::panic, reason = "a test may")]
 
+use std::cell::Cell;
 use std::path::Path;
 
-use step_files::{StepFault, StepProducts};
+use step_files::{ShapeFault, StepFault, StepProducts};
 
 fn text(name: &str) -> String {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR"));
@@ -346,6 +347,37 @@ fn files_that_are_no_products_are_refused() {
     );
     let deep = StepProducts::read(deep.as_bytes());
     assert!(matches!(deep, Err(StepFault::TooMany { .. })), "{deep:?}");
+}
+
+#[test]
+fn a_reading_ends_when_its_time_is_over() {
+    let cover = text("cover.step");
+    // Returns what is read if the time is over at the look with this number.
+    let until = |over: u32| {
+        let looks = Cell::new(0);
+        let is_over = || {
+            looks.set(looks.get() + 1);
+            looks.get() >= over
+        };
+        let read = StepProducts::read_until(cover.as_bytes(), &is_over);
+        (read, looks.get())
+    };
+    let (late, looks) = until(1);
+    assert!(matches!(late, Err(StepFault::Late { line }) if line > 1));
+    assert_eq!(looks, 1);
+    // The records are read, and the solids are not.
+    let (late, looks) = until(2);
+    let late = late.unwrap();
+    assert_eq!((late.products.len(), looks), (1, 2));
+    let [found] = late.findings.as_slice() else {
+        panic!("{late:?}")
+    };
+    assert_eq!(
+        (&found.fault, late.products[0].extents),
+        (&ShapeFault::Late, None)
+    );
+    let (read, _) = until(u32::MAX);
+    assert_eq!(read, StepProducts::read(cover.as_bytes()));
 }
 
 #[test]
