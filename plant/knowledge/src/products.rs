@@ -46,12 +46,12 @@ fn iris(products: &StepProducts, source: &str) -> HashMap<u64, String> {
         }
     }
     let iri = |product: &StepProduct| {
-        let id = if product.id.is_empty() || twice.contains(&product.id) {
-            format!("{}#{}", product.id, product.entity)
-        } else {
-            product.id.clone()
-        };
-        let iri = format!("urn:ua-bridge:product:{}:{}", escaped(source), escaped(&id));
+        let (source, id) = (escaped(source), escaped(&product.id));
+        let mut iri = format!("urn:ua-bridge:product:{source}:{id}");
+        if product.id.is_empty() || twice.contains(&product.id) {
+            // No escaped id has this character, so that no other product has the IRI.
+            iri.push_str(&format!(";{}", product.entity));
+        }
         (product.entity, iri)
     };
     products.products.iter().map(iri).collect()
@@ -116,6 +116,35 @@ fn rounded(metres: f64) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn each_product_has_an_iri_of_its_own_whatever_its_id_is() {
+        let product = |entity: u64, id: &str| StepProduct {
+            entity,
+            id: id.to_owned(),
+            name: String::new(),
+            extents: None,
+            occurrences: Vec::new(),
+        };
+        let ids = ["4711", "4711#2", "4711;2", "a b<>", "%2342", "", "4711"];
+        let numbered = (1..).zip(ids);
+        let products = numbered.map(|(entity, id)| product(entity, id)).collect();
+        let findings = Vec::new();
+        let all = triples(&StepProducts { products, findings }, "parts of #1.step");
+        let of_type = all.iter().filter(|triple| triple.predicate == v::RDF_TYPE);
+        let iris: Vec<&str> = of_type.map(|triple| triple.subject.as_str()).collect();
+        let base = "urn:ua-bridge:product:parts%20of%20%231.step:";
+        let expected = [
+            "4711;1",
+            "4711%232",
+            "4711%3B2",
+            "a%20b%3C%3E",
+            "%252342",
+            ";6",
+            "4711;7",
+        ];
+        assert_eq!(iris, expected.map(|end| format!("{base}{end}")));
+    }
 
     #[test]
     fn a_pose_has_the_rotations_of_its_axes() {
