@@ -27,6 +27,7 @@ mod component;
 mod http;
 mod journal;
 mod lanes;
+mod node_set_models;
 pub mod nodeset;
 pub mod operations;
 pub mod owl;

@@ -6,13 +6,14 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use mtp::{Object, Triple, escaped};
+use mtp::{Object, Triple};
 pub(crate) use nodeset_files::{MAX_FILE, MAX_NODES};
 pub use nodeset_files::{ModelVersion, NodeSetModel};
 use nodeset_files::{NodeSetDocument, NodeSetFileFault, NodeSetFileNode};
 use thiserror::Error;
 
 use crate::component::{NodeName, OPC_UA};
+use crate::node_set_models;
 use crate::vocabulary as v;
 
 /// The contents of a NodeSet.
@@ -90,22 +91,8 @@ pub fn read_model(xml: &str) -> Result<NodeSetModel, NodeSetReadFault> {
 fn statements(document: &NodeSetDocument, model: &NodeSetModel) -> Vec<Triple> {
     let mut graph = Graph {
         document,
-        all: Vec::new(),
+        all: node_set_models::statements(model),
     };
-    let iri = model_iri(&model.namespace);
-    graph.link(&iri, v::RDF_TYPE, v::NODE_SET);
-    graph.text(&iri, v::RDFS_LABEL, &model.namespace);
-    if !model.version.version.is_empty() {
-        graph.text(&iri, v::MODEL_VERSION, &model.version.version);
-    }
-    let date = model.version.publication_date.trim();
-    if !date.is_empty() {
-        let date = match date.contains('T') {
-            true => Object::Time(date.to_owned()),
-            false => Object::Text(date.to_owned()),
-        };
-        graph.say(&iri, v::PUBLICATION_DATE, date);
-    }
     graph.nodes();
     graph.all
 }
@@ -238,11 +225,6 @@ impl Graph<'_> {
             object,
         });
     }
-}
-
-/// Returns the IRI of the model of a namespace.
-pub(crate) fn model_iri(namespace: &str) -> String {
-    format!("urn:ua-bridge:nodeset:{}", escaped(namespace))
 }
 
 fn is_type(node: &NodeSetFileNode) -> bool {

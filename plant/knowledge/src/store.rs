@@ -17,7 +17,6 @@ use thiserror::Error;
 use tokio::sync::watch;
 
 use crate::journal::Journal;
-use crate::nodeset::{self, ModelVersion};
 use crate::rules::apply::{Derived, StoreRules};
 use crate::source::{KnowledgeSource, SourceKind};
 use crate::vocabulary;
@@ -365,31 +364,6 @@ impl Knowledge {
                 NamedOrBlankNode::NamedNode(_) | NamedOrBlankNode::BlankNode(_) => None,
             }
         })
-    }
-
-    /// Returns the version of the NodeSet of a namespace, from its graph. Parts that the graph does
-    /// not have are empty.
-    pub fn model_version(&self, namespace: &str) -> ModelVersion {
-        let graph = KnowledgeSource::new(SourceKind::NodeSet, namespace).graph();
-        let graph = NamedNodeRef::new_unchecked(&graph);
-        let model = nodeset::model_iri(namespace);
-        let model = NamedNodeRef::new_unchecked(&model);
-        let text = |predicate: &str| {
-            let mut quads = self.store.quads_for_pattern(
-                Some(model.into()),
-                Some(NamedNodeRef::new_unchecked(predicate)),
-                None,
-                Some(graph.into()),
-            );
-            match quads.next()?.ok()?.object {
-                Term::Literal(text) => Some(text.value().to_owned()),
-                Term::NamedNode(_) | Term::BlankNode(_) => None,
-            }
-        };
-        ModelVersion {
-            version: text(vocabulary::MODEL_VERSION).unwrap_or_default(),
-            publication_date: text(vocabulary::PUBLICATION_DATE).unwrap_or_default(),
-        }
     }
 
     /// Returns a number that increases with each change.
