@@ -1,22 +1,22 @@
 //! The current state of the plant: the components in the graph, their skills, and the runs.
 
+mod component;
 mod configuring;
 mod facts;
+mod leases;
 mod opened;
 mod parameters;
 mod tools;
 
-use std::collections::{BTreeMap, BTreeSet, VecDeque};
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
-use std::time::SystemTime;
 
 use async_trait::async_trait;
 use knowledge::{
     ComponentFacts, Knowledge, KnowledgeSource, NodeName, QuestionAnswer, SourceKind,
     SourceLifetime, ValueQuery, ValueQueryFault,
 };
-use serde::Serialize;
 use skills::choosing::Attachment;
 use skills::{
     ClientOptions, FoundSkill, RunnableSkill as RunsOfSkill, SkillClient, SkillValue, Unchosen,
@@ -25,9 +25,12 @@ use tokio::sync::watch;
 use tokio::task::spawn_blocking;
 use tracing::{error, info, warn};
 
+use self::component::{ListedComponent, LostComponent, PresentComponents};
 use self::facts::skill_facts;
+use self::leases::{ComponentLeases, LeaseChange};
 use self::opened::OpenedSkills;
 use self::parameters::{connects, parameter, result, values};
+use crate::clock::now;
 use crate::execute::{OpenFault, Opened, Plant};
 use crate::goal::{GoalAction, GoalConditions, GoalFault, Sequence};
 use crate::parameter_fault::ParameterFault;
@@ -46,54 +49,13 @@ pub(crate) struct PlantState {
     client: ClientOptions,
     /// The components that the user prefers, the most preferred first.
     prefer: Vec<String>,
-    present: Mutex<Present>,
+    present: Mutex<PresentComponents>,
     changed: watch::Sender<u64>,
     runs: NewestRuns,
-    /// The runs that use components, by the IRIs of the components.
-    leases: Mutex<BTreeMap<String, String>>,
+    leases: ComponentLeases,
     /// Held during the search for a sequence, which takes up to 100 MB of memory.
     searching: Mutex<()>,
     next_run: AtomicU64,
-}
-
-#[derive(Default)]
-struct Present {
-    /// The components by their IRIs.
-    components: BTreeMap<String, Component>,
-    gone: VecDeque<Gone>,
-}
-
-/// A component in the graph.
-#[derive(Debug, Clone, Serialize)]
-struct Component {
-    application_uri: String,
-    name: String,
-    endpoint: String,
-    namespace: Option<u16>,
-    /// Times of the discovery, of the query of its skills, and of its entry into the graph; ms
-    /// since 1970.
-    seen_ms: u64,
-    listed_ms: u64,
-    since_ms: u64,
-    skills: Vec<String>,
-    /// The name of the server in discovery.
-    #[serde(skip)]
-    discovered: String,
-    /// The skills by their IRIs.
-    #[serde(skip)]
-    found: BTreeMap<String, FoundSkill>,
-    /// The ApplicationUris of the tools that its tool changers have shown.
-    #[serde(skip)]
-    tools: BTreeSet<String>,
-}
-
-/// A component that was lost.
-#[derive(Debug, Clone, Serialize)]
-struct Gone {
-    application_uri: String,
-    name: String,
-    at_ms: u64,
-    why: String,
 }
 
 /// A goal with a sequence of actions that reaches it.
@@ -126,7 +88,7 @@ impl PlantState {
             present: Mutex::default(),
             changed: watch::channel(0).0,
             runs: NewestRuns::default(),
-            leases: Mutex::default(),
+            leases: ComponentLeases::default(),
             searching: Mutex::default(),
             next_run: AtomicU64::new(1),
         }
@@ -144,9 +106,7 @@ impl PlantState {
 
     /// Returns the components that a run uses.
     pub(crate) fn used_by(&self, run: &str) -> Vec<String> {
-        let leases = self.leases();
-        let own = leases.iter().filter(|(_, holder)| *holder == run);
-        own.map(|(component, _)| component.clone()).collect()
+        self.leases.used_by(run)
     }
 
     /// Gives back the components of a run.
@@ -156,13 +116,7 @@ impl PlantState {
 
     /// Gives back the components of the run with this number.
     pub(crate) fn give_back_of(&self, number: u64) {
-        let end = format!("-{number}");
-        let holder = self
-            .leases()
-            .values()
-            .find(|run| run.ends_with(&end))
-            .cloned();
-        if let Some(run) = holder {
+        if let Some(run) = self.leases.run(number) {
             self.give_back(&run);
         }
     }
@@ -305,7 +259,7 @@ impl PlantState {
         let by_iri = |found: FoundSkill| {
             NodeName::parse(&found.node).map(|node| (facts.skill_iri(&node), found))
         };
-        let component = Component {
+        let component = ListedComponent {
             application_uri: application_uri.to_owned(),
             name: facts.name.clone(),
             endpoint: seen.url.clone(),
@@ -327,14 +281,7 @@ impl PlantState {
             component = component.name,
             skills, endpoint, "a component is in the graph"
         );
-        {
-            let mut present = self.present();
-            let before = present.components.insert(iri.clone(), component);
-            if let Some(component) = present.components.get_mut(&iri) {
-                component.tools = before.map(|before| before.tools).unwrap_or_default();
-                component.keep_tools();
-            }
-        }
+        self.present().put(&iri, component);
         self.changed.send_modify(|changes| *changes += 1);
     }
 
@@ -361,8 +308,9 @@ impl PlantState {
 
     /// Removes the components that a server, which discovery found under this name, has no more.
     pub(crate) fn keeps_only(&self, discovered: &str, is_there: impl Fn(&str) -> bool) {
-        let gone =
-            |known: &Component| known.discovered == discovered && !is_there(&known.application_uri);
+        let gone = |known: &ListedComponent| {
+            known.discovered == discovered && !is_there(&known.application_uri)
+        };
         self.remove(gone, "its station has lost it");
     }
 
@@ -371,19 +319,8 @@ impl PlantState {
         self.remove(|component| component.discovered == discovered, why);
     }
 
-    fn remove(&self, which: impl Fn(&Component) -> bool, why: &str) {
-        let removed: Vec<Component> = {
-            let mut present = self.present();
-            let iris: Vec<String> = present
-                .components
-                .iter()
-                .filter(|(_, component)| which(component))
-                .map(|(iri, _)| iri.clone())
-                .collect();
-            iris.iter()
-                .filter_map(|iri| present.components.remove(iri))
-                .collect()
-        };
+    fn remove(&self, which: impl Fn(&ListedComponent) -> bool, why: &str) {
+        let removed = self.present().remove(which);
         for component in removed {
             let source = KnowledgeSource::new(SourceKind::Component, &component.application_uri);
             if let Err(fault) = self.knowledge.remove(&source) {
@@ -393,17 +330,12 @@ impl PlantState {
                 );
             }
             info!(component = component.name, "a component is gone: {why}");
-            let mut present = self.present();
-            present.gone.push_back(Gone {
+            self.present().lose(LostComponent {
                 application_uri: component.application_uri,
                 name: component.name,
                 at_ms: now(),
                 why: why.to_owned(),
             });
-            if present.gone.len() > MOST_GONE {
-                present.gone.pop_front();
-            }
-            drop(present);
             self.changed.send_modify(|changes| *changes += 1);
         }
     }
@@ -435,17 +367,13 @@ impl PlantState {
         serde_json::json!({
             "program": "ua-mes",
             "components": components,
-            "gone": present.gone,
+            "gone": present.lost(),
             "graphs": self.knowledge.sources(),
             "rules": self.knowledge.rules(),
             "findings": findings,
             "processes": processes.collect::<Vec<_>>(),
             "runs": self.runs.all(),
         })
-    }
-
-    fn leases(&self) -> MutexGuard<'_, BTreeMap<String, String>> {
-        self.leases.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// Returns a skill of a component that is present.
@@ -456,7 +384,7 @@ impl PlantState {
         found.cloned().ok_or(ParameterFault::Gone)
     }
 
-    fn present(&self) -> MutexGuard<'_, Present> {
+    fn present(&self) -> MutexGuard<'_, PresentComponents> {
         self.present.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
@@ -588,32 +516,15 @@ impl Plant for PlantState {
     }
 
     fn used_by_others(&self, run: &str) -> BTreeMap<String, String> {
-        let leases = self.leases();
-        let others = leases.iter().filter(|(_, holder)| *holder != run);
-        others
-            .map(|(component, holder)| (component.clone(), holder.clone()))
-            .collect()
+        self.leases.used_by_others(run)
     }
 
     fn lease(&self, run: &str, components: &BTreeSet<String>) -> bool {
-        let is_given_back = {
-            let mut leases = self.leases();
-            let is_free =
-                |component: &String| leases.get(component).is_none_or(|holder| holder == run);
-            if !components.iter().all(is_free) {
-                return false;
-            }
-            let before = leases.len();
-            leases.retain(|component, holder| holder != run || components.contains(component));
-            let is_given_back = leases.len() < before;
-            let taken = components.iter().map(|one| (one.clone(), run.to_owned()));
-            leases.extend(taken);
-            is_given_back
-        };
-        if is_given_back {
+        let change = self.leases.lease(run, components);
+        if change == LeaseChange::GaveBack {
             self.changed.send_modify(|changes| *changes += 1);
         }
-        true
+        change != LeaseChange::Refused
     }
 
     fn keep(&self, run: &ProcessRun) {
@@ -642,23 +553,5 @@ impl Plant for PlantState {
     }
 }
 
-/// Returns the time in ms since 1970.
-#[expect(
-    clippy::disallowed_methods,
-    reason = "this is the shell; what plans and records takes its time from here"
-)]
-pub(crate) fn now() -> u64 {
-    since_1970(SystemTime::now())
-}
-
-/// Converts a time to ms since 1970.
-pub(crate) fn since_1970(at: SystemTime) -> u64 {
-    let since = at
-        .duration_since(SystemTime::UNIX_EPOCH)
-        .unwrap_or_default();
-    u64::try_from(since.as_millis()).unwrap_or(u64::MAX)
-}
-
-const MOST_GONE: usize = 100;
 /// Number of processes that an error names.
 const MOST_SHOWN: usize = 50;

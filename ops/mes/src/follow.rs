@@ -12,7 +12,8 @@ use skills::{FoundSkill, SkillClient, SkillFault, StationChanges};
 use tokio::task::{AbortHandle, JoinSet};
 use tracing::{debug, warn};
 
-use crate::cell::{PlantState, SeenServer, now, since_1970};
+use crate::cell::{PlantState, SeenServer};
+use crate::clock::{now, since_1970};
 use crate::live;
 use crate::servers::LiveServers;
 

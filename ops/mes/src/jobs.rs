@@ -12,7 +12,8 @@ use skills::JobObserver;
 use tokio::runtime::Handle;
 use tokio::sync::watch;
 
-use crate::cell::{PlantState, now};
+use crate::cell::PlantState;
+use crate::clock::now;
 use crate::execute::{Plant, execute_pausable};
 use crate::job_order::{JobOutcome, JobProgress};
 use crate::job_orders::JobRuns;

@@ -9,9 +9,9 @@
 //! - `plan`: the assignment of skills to steps, with reasons
 //! - `execute`: the execution of a plan, and planning again after a loss
 //! - `record`: the record of runs
-//! - `cell`: the current state of the plant
+//! - `cell`, `clock`: the current state of the plant, and the time
 //! - `follow`: from discovery to the graph
-//! - `servers`: from the address spaces of running servers to the graph
+//! - `servers`, `search_limits`: from the address spaces of running servers to the graph
 //! - `sources`, `nodeset_folder`, `nodeset_url`: from files to the graph, while the program runs
 //! - `goal`: the search for a sequence that reaches a goal
 //! - `jobs`: processes that clients start, several at a time
@@ -20,6 +20,7 @@
 //! - `execution_skill` and `locate_skill`: the skills of the MES
 
 mod cell;
+mod clock;
 mod execute;
 mod execution_skill;
 mod follow;
@@ -41,6 +42,7 @@ mod product_configuration;
 mod read_process;
 mod recipe;
 mod record;
+mod search_limits;
 mod servers;
 mod settings;
 mod sources;
@@ -521,7 +523,7 @@ impl Program for UaMes {
 /// Returns the handlers of changes.
 fn writes(ready: &Ready, access: &Arc<UserAccess>, jobs: Arc<ProcessJobs>) -> Writes {
     Writes {
-        now: cell::now,
+        now: clock::now,
         may: has(access, UserRole::Engineer),
         may_run: has(access, UserRole::Operator),
         files: Arc::clone(ready.cell.sources()) as Arc<dyn SourceFiles>,

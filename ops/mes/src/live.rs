@@ -17,7 +17,7 @@ use tokio::task::{Id, JoinSet};
 use tokio::time::Instant;
 use tracing::{debug, error, info, warn};
 
-use crate::cell::now;
+use crate::clock::now;
 
 /// Publishes the states of the skills of a component until its connection is lost. `iri` returns
 /// the IRI of a skill.

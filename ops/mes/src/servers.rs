@@ -1,8 +1,10 @@
 //! The nodes of running servers in the graph: which servers, and their connections.
 //!
-//! Reading order: `connection` (when a server is read), `searched` and `walk` (the search through
-//! its address space), `facts` (attributes and values), `graph`.
+//! Reading order: `board` (the states of all servers), `connection` (when a server is read),
+//! `searched` and `walk` (the search through its address space), `facts` (attributes and values),
+//! `graph`.
 
+mod board;
 mod connection;
 mod facts;
 mod graph;
@@ -14,16 +16,14 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use discovery::{PresentServer, ServerChange};
-use knowledge::{Knowledge, KnowledgeSource, SourceKind};
-use serde::Serialize;
+use knowledge::Knowledge;
 use skills::ClientOptions;
-use tokio::sync::{Notify, Semaphore, watch};
+use tokio::sync::Notify;
 use tokio::task::JoinHandle;
 use tokio::time::sleep;
 
+use self::board::{ServerBoard, ServerStatus};
 use self::connection::FollowedServer;
-use self::graph::ServerUris;
-pub(crate) use self::searched::SearchLimits;
 use crate::settings::{NamedServers, ServerEntry};
 use crate::sources::MesSources;
 
@@ -44,59 +44,6 @@ struct WantedServers {
     present: BTreeMap<String, PresentServer>,
     /// Number of commands to read all servers again.
     commands: u64,
-}
-
-/// The parts that all connections share.
-struct ServerBoard {
-    knowledge: Arc<Knowledge>,
-    sources: Arc<MesSources>,
-    uris: ServerUris,
-    /// The namespaces of the NodeSets in the graph, whose types are not read from servers.
-    nodesets: watch::Sender<BTreeSet<String>>,
-    reading: Semaphore,
-    statuses: Mutex<BTreeMap<String, ServerStatus>>,
-}
-
-/// The state of a server in `/status`.
-#[derive(Debug, Clone, Default, Serialize)]
-struct ServerStatus {
-    server: String,
-    endpoint: String,
-    state: ServerState,
-    application_uri: String,
-    /// The IRI of its graph.
-    graph: String,
-    nodes: usize,
-    /// Maximum number of nodes of the read that is under way.
-    #[serde(skip)]
-    reserved: usize,
-    statements: usize,
-    /// Whether no nodes and no references are missing.
-    complete: bool,
-    /// Time of the last read in ms since 1970, its duration in ms, and the number of reads.
-    read_ms: u64,
-    took_ms: u64,
-    reads: u64,
-    /// The reason of the last read.
-    reason: String,
-}
-
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
-#[serde(rename_all = "snake_case")]
-enum ServerState {
-    #[default]
-    Connecting,
-    NotConnected,
-    /// Its nodes are being read.
-    Reading,
-    /// The graph has the nodes as they were read last.
-    Current,
-    /// The nodes cannot be read; the graph has the nodes that were read before, if any.
-    Failed,
-    /// Another server has its ApplicationUri.
-    Duplicate,
-    /// Discovery has not found it.
-    NotFound,
 }
 
 /// A server to follow.
@@ -120,14 +67,7 @@ impl LiveServers {
         own_uri: &str,
     ) -> Self {
         Self {
-            board: Arc::new(ServerBoard {
-                nodesets: watch::Sender::new(nodesets(&knowledge)),
-                knowledge,
-                sources,
-                uris: ServerUris::default(),
-                reading: Semaphore::new(READ_AT_A_TIME),
-                statuses: Mutex::default(),
-            }),
+            board: Arc::new(ServerBoard::new(knowledge, sources)),
             options,
             own_uri: own_uri.to_owned(),
             wanted: Mutex::default(),
@@ -160,8 +100,7 @@ impl LiveServers {
 
     /// Returns the states of all servers.
     pub(crate) fn status(&self) -> serde_json::Value {
-        let statuses = self.board.statuses();
-        serde_json::json!(statuses.values().collect::<Vec<_>>())
+        self.board.json()
     }
 
     /// Follows the servers until the program ends.
@@ -191,7 +130,7 @@ impl LiveServers {
                     drop(one.task.await);
                 }
             }
-            self.board.keep_only(&planned, &missing);
+            self.board.keep_only(planned.keys(), &missing);
             for (name, planned) in planned {
                 match running.get(&name) {
                     Some(one) if is_command => one.again.notify_one(),
@@ -295,101 +234,8 @@ impl PlannedServer {
     }
 }
 
-impl ServerBoard {
-    /// Compares the NodeSets in the graph with those that are known. A change makes all servers be
-    /// read again.
-    fn compare_nodesets(&self) {
-        let current = nodesets(&self.knowledge);
-        self.nodesets.send_if_modified(|known| {
-            let is_changed = *known != current;
-            *known = current;
-            is_changed
-        });
-    }
-
-    /// Returns the namespaces whose types a server does not state: those of the NodeSets in the
-    /// graph, and the ApplicationUris of other components and servers.
-    fn left_out(&self, own: &str) -> BTreeSet<String> {
-        let mut all = nodesets(&self.knowledge);
-        let sources = self.knowledge.sources().into_iter();
-        let components = sources
-            .filter(|source| matches!(source.kind, SourceKind::Component | SourceKind::Server))
-            .map(|source| source.name);
-        let others = components.chain(self.uris.all());
-        all.extend(others.filter(|uri| uri != own));
-        all
-    }
-
-    /// Reserves nodes of the number that all servers may have together. Returns their number.
-    fn reserve(&self, name: &str, wanted: usize) -> usize {
-        let mut statuses = self.statuses();
-        let others = statuses.iter().filter(|(other, _)| *other != name);
-        let taken: usize = others
-            .map(|(_, status)| status.nodes.max(status.reserved))
-            .sum();
-        let reserved = wanted.min(MOST_NODES_OF_ALL.saturating_sub(taken));
-        statuses.entry(name.to_owned()).or_default().reserved = reserved;
-        reserved
-    }
-
-    /// Changes the status of a server.
-    fn status(&self, name: &str, change: impl FnOnce(&mut ServerStatus)) {
-        change(self.statuses().entry(name.to_owned()).or_default());
-    }
-
-    /// Replaces the findings about a server. Each has a text, and whether the server is not in the
-    /// graph because of it.
-    fn findings(&self, name: &str, findings: Vec<(String, bool)>) {
-        let source = KnowledgeSource::new(SourceKind::Server, name);
-        self.sources.replace_findings(&source, findings);
-    }
-
-    /// Removes the statuses and findings of servers that are not followed any more.
-    fn keep_only(
-        &self,
-        planned: &BTreeMap<String, PlannedServer>,
-        missing: &BTreeMap<String, String>,
-    ) {
-        let is_kept = |name: &String| planned.contains_key(name) || missing.contains_key(name);
-        let removed: Vec<String> = {
-            let mut statuses = self.statuses();
-            let all: Vec<String> = statuses.keys().cloned().collect();
-            statuses.retain(|name, _| is_kept(name));
-            all.into_iter().filter(|name| !is_kept(name)).collect()
-        };
-        for name in removed {
-            self.findings(&name, Vec::new());
-        }
-        for (name, what) in missing {
-            self.status(name, |status| {
-                *status = ServerStatus {
-                    server: name.clone(),
-                    state: ServerState::NotFound,
-                    ..ServerStatus::default()
-                };
-            });
-            self.findings(name, vec![(what.clone(), true)]);
-        }
-    }
-
-    fn statuses(&self) -> MutexGuard<'_, BTreeMap<String, ServerStatus>> {
-        self.statuses.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-}
-
-/// Returns the namespaces of the NodeSets in the graph.
-fn nodesets(knowledge: &Knowledge) -> BTreeSet<String> {
-    let sources = knowledge.sources().into_iter();
-    let nodesets = sources.filter(|source| source.kind == SourceKind::NodeSet);
-    nodesets.map(|source| source.name).collect()
-}
-
 /// Interval of comparing the NodeSets in the graph.
 const NODESETS_EVERY: Duration = Duration::from_secs(5);
-/// Maximum number of nodes of all servers, without types that are read beside them.
-const MOST_NODES_OF_ALL: usize = 200_000;
-/// Number of servers that are read at a time.
-const READ_AT_A_TIME: usize = 2;
 const MOST_SERVERS: usize = 100;
 
 #[cfg(test)]

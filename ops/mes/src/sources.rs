@@ -20,7 +20,7 @@ use serde::Serialize;
 use tokio::sync::Notify;
 use tracing::{info, warn};
 
-use crate::cell::now;
+use crate::clock::now;
 use crate::nodeset_folder::NodeSetFolder;
 use crate::process::Process;
 use crate::recipe::{self, Recipe};

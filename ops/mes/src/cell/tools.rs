@@ -7,7 +7,8 @@ use skills::choosing::Attachment;
 use skills::{ParameterType, SkillClient, ToolState, Unchosen, plate_between};
 use tokio::time::timeout;
 
-use super::{Component, PlantState};
+use super::PlantState;
+use super::component::ListedComponent;
 use crate::plan::ShownTools;
 
 impl PlantState {
@@ -15,7 +16,8 @@ impl PlantState {
     pub(super) fn attachment_of(&self, component: &str) -> Attachment {
         let present = self.present();
         let endpoint = present.components.get(component).map(|of| &*of.endpoint);
-        let states = present.components.values().flat_map(Component::tool_states);
+        let all = present.components.values();
+        let states = all.flat_map(ListedComponent::tool_states);
         let mut all = states.map(|(_, state)| state.attachment(component, endpoint));
         let attached = all.find(|attachment| *attachment != Attachment::None);
         attached.unwrap_or_default()
@@ -93,7 +95,7 @@ impl PlantState {
     }
 }
 
-impl Component {
+impl ListedComponent {
     /// Returns the states of its tool changer, with the IRIs of their skills.
     fn tool_states(&self) -> impl Iterator<Item = (&String, &ToolState)> {
         let found = self.found.iter();

@@ -13,10 +13,11 @@ use tokio::sync::Notify;
 use tokio::time::{Instant, sleep_until, timeout};
 use tracing::{debug, info};
 
+use super::board::{MOST_NODES_OF_ALL, ServerBoard, ServerState, ServerStatus};
 use super::graph::ServerGraph;
 use super::walk::{self, Searched};
-use super::{MOST_NODES_OF_ALL, SearchLimits, ServerBoard, ServerState, ServerStatus};
-use crate::cell::now;
+use crate::clock::now;
+use crate::search_limits::SearchLimits;
 use crate::settings::{NamedServers, ServerEntry};
 
 /// A server whose nodes are in the graph.

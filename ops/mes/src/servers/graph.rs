@@ -9,7 +9,7 @@ use tokio::runtime::Handle;
 use tokio::sync::watch;
 use tracing::error;
 
-use crate::cell::now;
+use crate::clock::now;
 
 /// The ApplicationUris of servers in the graph, each with the name of the server that has it.
 #[derive(Debug, Clone)]

@@ -1,6 +1,4 @@
-//! The server that is searched, the limits of a search, and its faults.
-
-use std::time::Duration;
+//! The server that is searched, and the faults of a search.
 
 use async_trait::async_trait;
 use plant_opcua::client::{Browse, BrowsedReferences, ClientError, OpcUaClient};
@@ -40,27 +38,6 @@ impl BrowsableServer for OpcUaClient {
         what: &[(NodeId, AttributeId)],
     ) -> Result<Vec<DataValue>, ClientError> {
         self.read_attributes(what).await
-    }
-}
-
-/// The limits of a search.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) struct SearchLimits {
-    /// Maximum number of nodes.
-    pub(crate) nodes: usize,
-    /// Maximum number of references from a start node.
-    pub(crate) depth: usize,
-    /// Time after which the search ends.
-    pub(crate) within: Duration,
-}
-
-impl Default for SearchLimits {
-    fn default() -> Self {
-        Self {
-            nodes: 20_000,
-            depth: 32,
-            within: Duration::from_secs(120),
-        }
     }
 }
 

@@ -1,7 +1,11 @@
 use std::path::Path;
 use std::time::SystemTime;
 
+use ::knowledge::{KnowledgeSource, SourceKind};
+
+use super::graph::ServerUris;
 use super::*;
+use crate::search_limits::SearchLimits;
 use crate::settings::Settings;
 
 fn present(name: &str, url: &str, uri: Option<&str>) -> (String, PresentServer) {

@@ -14,7 +14,8 @@ use plant_opcua::types::{
 use tokio::time::Instant;
 
 use super::facts::{self, NamespaceNames, UnreadValue};
-use super::searched::{BrowsableServer, SearchFaults, SearchLimits, namespaces};
+use super::searched::{BrowsableServer, SearchFaults, namespaces};
+use crate::search_limits::SearchLimits;
 
 /// The nodes of a server, with remarks for people.
 #[derive(Debug)]

@@ -7,13 +7,13 @@ use plant_opcua::client::ClientUser;
 use skills::yaml::{DocumentKind, DocumentNode, YamlFindingCode};
 
 use super::{Reading, shortened};
-use crate::servers::SearchLimits;
+use crate::search_limits::SearchLimits;
 
 /// Servers that the YAML names.
 #[derive(Debug, Clone)]
 pub(crate) struct ServerEntry {
     pub(crate) which: NamedServers,
-    /// The user; `None` for the user of the MES.
+    /// The user: its own, or that of the MES; `None` for anonymous.
     pub(crate) user: Option<ClientUser>,
     /// The nodes at which the search begins; the Objects folder if there are none.
     pub(crate) start: Vec<NodeName>,

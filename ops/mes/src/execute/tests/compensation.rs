@@ -1,5 +1,7 @@
 //! Completed steps that are undone.
 
+use std::sync::atomic::Ordering;
+
 use super::stops::StopAt;
 use super::*;
 
