@@ -503,6 +503,10 @@ impl Plant for PlantState {
         self.plate_of(robot, gripper)
     }
 
+    fn moves(&self, component: &str, changer: &str) -> bool {
+        self.carries(component, changer)
+    }
+
     async fn read_tools(&self) {
         self.read_changers().await;
     }

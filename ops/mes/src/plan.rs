@@ -215,16 +215,25 @@ pub(crate) trait Facts {
         Attachment::None
     }
 
+    /// Returns whether the component of an offer moves a tool changer, given by its IRI.
+    fn moves(&self, _offer: &Offer, _changer: &str) -> bool {
+        false
+    }
+
     /// Returns the components that the user prefers, the most preferred first.
     fn prefer(&self) -> &[String] {
         &[]
     }
 }
 
-/// Returns the rank of an offer for needs.
-fn rank(needs: &[&Need], offer: &Offer, facts: &dyn Facts) -> CandidateRank {
+/// Returns the rank of an offer with an attachment for needs.
+fn rank(
+    needs: &[&Need],
+    (offer, attachment): (&Offer, Attachment),
+    facts: &dyn Facts,
+) -> CandidateRank {
     CandidateRank {
-        attachment: facts.attachment(offer),
+        attachment,
         preference: CandidateRank::preference(facts.prefer(), &offer.component),
         inexact: usize::from(!is_exact(needs, offer)),
         since_ms: offer.since_ms,
@@ -539,8 +548,10 @@ impl<'a> Team<'a> {
                 let best = of_component
                     .min_by_key(|offer| (Reverse(is_exact(needs, offer)), offer.skill.as_str()));
                 if let Some(best) = best {
-                    let rank = rank(needs, best, facts);
+                    let attachment = judging.attachment(*role, best);
+                    let rank = rank(needs, (best, attachment), facts);
                     whole = CandidateRank {
+                        attachment: whole.attachment.min(rank.attachment),
                         inexact: whole.inexact + rank.inexact,
                         ..rank
                     };

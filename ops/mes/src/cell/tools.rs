@@ -38,6 +38,16 @@ impl PlantState {
         plate_between(&changers, (robot, endpoint), gripper)
     }
 
+    /// Returns whether a robot carries a tool changer; both are given by their components.
+    pub(super) fn carries(&self, robot: &str, changer: &str) -> bool {
+        let present = self.present();
+        let endpoint = present.components.get(robot);
+        let endpoint = endpoint.map_or("", |of| &of.endpoint);
+        let changer = present.components.get(changer);
+        let mut states = changer.into_iter().flat_map(ListedComponent::tool_states);
+        states.any(|(_, state)| state.is_at((robot, endpoint)))
+    }
+
     /// Reads the tools of the tool changers.
     pub(super) async fn read_changers(&self) {
         let changers: Vec<(String, String, String)> = {

@@ -127,6 +127,10 @@ impl Facts for OfPlant<'_> {
         self.plant.attachment(&offer.component)
     }
 
+    fn moves(&self, offer: &Offer, changer: &str) -> bool {
+        self.plant.moves(&offer.component, changer)
+    }
+
     fn prefer(&self) -> &[String] {
         self.plant.prefer()
     }

@@ -68,6 +68,11 @@ pub(crate) trait Plant: Send + Sync {
         Ok([0.0; 6])
     }
 
+    /// Returns whether a component moves a tool changer, so that it carries the tool.
+    fn moves(&self, _component: &str, _changer: &str) -> bool {
+        false
+    }
+
     /// Reads the tools of the tool changers.
     async fn read_tools(&self) {}
 

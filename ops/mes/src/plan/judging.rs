@@ -4,6 +4,7 @@ use std::cmp::Reverse;
 use std::collections::{BTreeMap, BTreeSet};
 
 use skills::ParameterType;
+use skills::choosing::Attachment;
 
 use super::tools::{
     AttachedTools, PlannedToolStep, PossibleTools, ToolFault, ToolStep, ToolUser, ToolWork,
@@ -304,6 +305,20 @@ impl<'a> Judging<'a> {
         })
     }
 
+    /// Returns the attachment of the component of an offer when a role begins: as it is shown, or
+    /// by a tool that steps attach to the changer that the component moves.
+    pub(super) fn attachment(&self, role: SkillRole, offer: &Offer) -> Attachment {
+        let shown = self.facts.attachment(offer);
+        let carries = |tools: &StepTools| {
+            let moves = |changer: &str| self.facts.moves(offer, changer);
+            tools.possible.are_carried(&tools.user(), &moves)
+        };
+        match self.tools.get(&role) {
+            Some(tools) if shown == Attachment::None && carries(tools) => Attachment::CarriesTool,
+            Some(_) | None => shown,
+        }
+    }
+
     pub(super) fn planned(
         &self,
         need: &Need,
@@ -504,10 +519,11 @@ impl<'a> Judging<'a> {
         if wrong > self.wrong_tools(need.role, chosen) {
             return "it would fit only while another tool is attached".to_owned();
         }
-        let (mut best, mut rank) = (
-            rank(&[need], chosen, self.facts),
-            rank(&[need], offer, self.facts),
-        );
+        let ranked = |offer: &Offer| {
+            let attachment = self.attachment(need.role, offer);
+            rank(&[need], (offer, attachment), self.facts)
+        };
+        let (mut best, mut rank) = (ranked(chosen), ranked(offer));
         let name = |offer: &Offer| format!("{}.{}", offer.component_name, offer.name);
         (best.name, rank.name) = (chosen.skill.clone(), offer.skill.clone());
         rank.why_not((&name(chosen), &best))

@@ -519,6 +519,15 @@ impl PossibleTools {
         (faults.len(), faults.into_iter().next())
     }
 
+    /// Returns whether steps have attached a tool to a changer that `moves` in each case.
+    pub(super) fn are_carried(&self, user: &ToolUser<'_>, moves: &dyn Fn(&str) -> bool) -> bool {
+        let is_carried = |case: &AttachedTools| {
+            let mut attached = case.attached.iter();
+            attached.any(|tool| tool.by.is_some() && user.follows(tool) && moves(&tool.changer))
+        };
+        !self.cases.is_empty() && self.cases.iter().all(is_carried)
+    }
+
     /// Returns the step of another branch that certainly changes the tool of a component in each
     /// case, although it has no order to the step that uses the tool.
     pub(super) fn changed_by<'a>(

@@ -40,7 +40,7 @@ impl ToolState {
 
     /// Returns whether the tool changer is at a robot, given by its ApplicationUri and its
     /// endpoint.
-    fn is_at(&self, (application_uri, endpoint): (&str, &str)) -> bool {
+    pub fn is_at(&self, (application_uri, endpoint): (&str, &str)) -> bool {
         let is_it = self.mover == application_uri || is_same_endpoint(&self.mover, endpoint);
         !self.mover.is_empty() && is_it
     }

@@ -28,6 +28,53 @@ fn offers() -> Vec<Offer> {
     [changer, gripper("finger"), gripper("vacuum")].concat()
 }
 
+/// Facts by which a robot moves the changer.
+struct Moving(&'static str);
+
+impl Facts for Moving {
+    fn takes(&self, offer: &Offer, step: (usize, &ProcessStep)) -> Result<(), ParameterFault> {
+        KNOWN.takes(offer, step)
+    }
+
+    fn gives(&self, offer: &Offer, result: &str) -> Result<(), ParameterFault> {
+        KNOWN.gives(offer, result)
+    }
+
+    fn connects(&self, from: (&str, &str), to: (&str, &str)) -> Result<(), ParameterFault> {
+        KNOWN.connects(from, to)
+    }
+
+    fn moves(&self, offer: &Offer, changer: &str) -> bool {
+        offer.component_name == self.0 && changer == "urn:example:changer"
+    }
+}
+
+#[test]
+fn the_robot_of_the_changer_moves_while_it_carries_a_tool() {
+    let mut process = sequence(&[MOVE, "urn:change", MOVE, "urn:detach", MOVE]);
+    process.steps[1].parameters = named("urn:example:vacuum");
+    let offers = [offers(), robot("a-robot"), robot("robot")].concat();
+    let chosen = |process: &Process, facts: &dyn Facts| {
+        let found = super::super::plan(process, &offers, situation(&[]), facts);
+        let moves = chosen(&found, 5).into_iter().step_by(2);
+        moves.map(str::to_owned).collect::<Vec<_>>()
+    };
+    let first = "a-robot#Lin";
+    assert_eq!(chosen(&process, &KNOWN), [first; 3]);
+    assert_eq!(
+        chosen(&process, &Moving("robot")),
+        [first, "robot#Lin", first]
+    );
+    let found = super::super::plan(&process, &offers, situation(&[]), &Moving("robot"));
+    assert_eq!(
+        why(&found, SkillRole::Alone(2), "a-robot#Lin"),
+        "it would fit, but robot.Lin carries a tool"
+    );
+    // A tool that may not be attached does not count.
+    process.steps[1].when = if_failed(0);
+    assert_eq!(chosen(&process, &Moving("robot")), [first; 3]);
+}
+
 /// A condition that is decided in the run.
 fn if_failed(step: usize) -> Vec<Vec<StepCondition>> {
     vec![vec![StepCondition {
