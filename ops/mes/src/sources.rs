@@ -131,7 +131,8 @@ impl MesSources {
             let source = KnowledgeSource::new(SourceKind::Product, &file.name);
             named.insert(source.clone());
             self.try_one(source, |source| {
-                self.products(source, &bytes(&file.path)?, SourceLifetime::No)
+                let read = products::read(&bytes(&file.path)?)?;
+                self.products(source, &read, SourceLifetime::No)
             });
         }
         for process in &settings.processes {
@@ -464,6 +465,9 @@ impl SourceFiles for MesSources {
         } else {
             None
         };
+        // Other sources do not wait for the geometry of products.
+        let is_product = kind == SourceKind::Product;
+        let products = is_product.then(|| products::read(contents)).transpose()?;
         let _order = self.order.lock().unwrap_or_else(PoisonError::into_inner);
         self.of_yaml(&source)?;
         let is_new = !self.is_known(&source);
@@ -474,6 +478,10 @@ impl SourceFiles for MesSources {
             None
         };
         match (kind, read) {
+            (SourceKind::Product, _) => {
+                let read = products.as_ref().ok_or("it is not read")?;
+                self.products(&source, read, SourceLifetime::Yes)?;
+            }
             (SourceKind::Process, _) if recipe.is_some() => {
                 if let Some((text, names)) = recipe {
                     let read = recipe::read(&text, &names).map_err(|errors| {
@@ -500,9 +508,6 @@ impl SourceFiles for MesSources {
                     connect: settings::Connect::No,
                 };
                 self.module(&source, contents, &manifest, SourceLifetime::Yes)?;
-            }
-            (SourceKind::Product, _) => {
-                self.products(&source, contents, SourceLifetime::Yes)?;
             }
             (SourceKind::File | SourceKind::Process, _) => {
                 let taken = self.knowledge.take_turtle(&source, &utf8(contents)?, now());

@@ -1,7 +1,10 @@
 //! STEP files as sources.
 
+use std::time::Duration;
+
 use knowledge::{KnowledgeSource, SourceLifetime};
 use step_files::StepProducts;
+use tokio::time::Instant;
 
 use super::MesSources;
 
@@ -10,11 +13,10 @@ impl MesSources {
     pub(super) fn products(
         &self,
         source: &KnowledgeSource,
-        bytes: &[u8],
+        read: &StepProducts,
         lasting: SourceLifetime,
     ) -> Result<(), String> {
-        let read = read(bytes)?;
-        let triples = knowledge::products::triples(&read, &source.name);
+        let triples = knowledge::products::triples(read, &source.name);
         self.put(source, &triples, lasting)?;
         for found in &read.findings {
             self.found(source, found.to_string(), false);
@@ -32,12 +34,42 @@ pub(super) fn examined(contents: &[u8]) -> Result<Vec<String>, String> {
     Ok(read.findings.iter().map(ToString::to_string).collect())
 }
 
-/// Reads a file. A fault of the reader leaves all other sources as they are.
-fn read(contents: &[u8]) -> Result<StepProducts, String> {
-    let read = std::panic::catch_unwind(|| StepProducts::read(contents));
+/// Reads a file. The products that are left after [`READING`] have findings.
+///
+/// # Errors
+/// The reason why the file cannot be read. A fault of the reader leaves all other sources as they
+/// are.
+pub(super) fn read(contents: &[u8]) -> Result<StepProducts, String> {
+    read_within(contents, READING)
+}
+
+fn read_within(contents: &[u8], within: Duration) -> Result<StepProducts, String> {
+    let began = Instant::now();
+    let read = std::panic::catch_unwind(|| {
+        StepProducts::read_until(contents, &|| began.elapsed() >= within)
+    });
     let read = read.map_err(|_panic| {
         "the file cannot be read because of a fault of this program; report it with the file"
             .to_owned()
     })?;
     read.map_err(|fault| fault.to_string())
+}
+
+/// Time limit of the reading of a file.
+const READING: Duration = Duration::from_secs(20);
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_file_that_is_not_read_in_time_is_refused_with_its_line() {
+        let step = include_bytes!("../../../../examples/plant/cover.step");
+        let late = read_within(step, Duration::ZERO).unwrap_err();
+        assert!(
+            late.starts_with("line ") && late.contains("the time to read the file was over"),
+            "{late}"
+        );
+        assert!(read(step).is_ok_and(|read| read.findings.is_empty()));
+    }
 }
