@@ -196,12 +196,16 @@ impl MesSources {
             // NodeSets that completed others before are read again.
             named.contains(&source) || !self.state().of_yaml.contains(&source)
         });
+        let stored = self.added_node_sets(named, &known);
         for (source, model) in &models {
             let added = self.complete(source, model, &mut known, SourceLifetime::No);
             named.extend(added);
         }
+        for model in &stored {
+            self.complete_stored(model, &mut known);
+        }
         let models = models.into_iter().map(|(_, model)| model).collect();
-        self.supply_anew(url, models, named, &mut known);
+        self.supply_anew(url, (models, stored), named, &mut known);
     }
 
     /// Returns the NodeSets of the graph with their versions.

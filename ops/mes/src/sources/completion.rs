@@ -94,6 +94,39 @@ impl MesSources {
         added
     }
 
+    /// Returns the models of the NodeSets that were added by command, also before a restart:
+    /// those of the graph that the YAML does not name.
+    pub(super) fn added_node_sets(
+        &self,
+        named: &BTreeSet<KnowledgeSource>,
+        known: &BTreeMap<String, ModelVersion>,
+    ) -> Vec<NodeSetModel> {
+        let is_added = |namespace: &&String| {
+            let source = KnowledgeSource::new(SourceKind::NodeSet, namespace);
+            !named.contains(&source)
+        };
+        let added = known.keys().filter(is_added);
+        added
+            .map(|namespace| self.knowledge.node_set_model(namespace))
+            .collect()
+    }
+
+    /// Completes a NodeSet that was added by command from the folder, like [`Self::complete`].
+    pub(super) fn complete_stored(
+        &self,
+        model: &NodeSetModel,
+        known: &mut BTreeMap<String, ModelVersion>,
+    ) {
+        let source = KnowledgeSource::new(SourceKind::NodeSet, &model.namespace);
+        self.state().findings.remove(&source);
+        let added = self.complete(&source, model, known, SourceLifetime::Yes);
+        let mut state = self.state();
+        for other in added {
+            // It does not leave with a NodeSet of the YAML that it completed before.
+            state.of_yaml.remove(&other);
+        }
+    }
+
     /// Adds a NodeSet of the folder to the graph.
     fn take_file(&self, file: &FolderNodeSet, lasting: SourceLifetime) -> Result<(), String> {
         let source = KnowledgeSource::new(SourceKind::NodeSet, &file.model.namespace);

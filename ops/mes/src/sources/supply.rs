@@ -59,6 +59,17 @@ struct MissingNodeSet {
     depth: usize,
 }
 
+impl NodeSetRequirer {
+    /// A NodeSet that was added by command.
+    const fn added(model: NodeSetModel) -> Self {
+        Self {
+            model,
+            lasting: SourceLifetime::Yes,
+            depth: 0,
+        }
+    }
+}
+
 impl NodeSetSupply {
     /// Returns the first namespace that a NodeSet requires, that is neither known nor was tried
     /// before, and that is wanted.
@@ -145,13 +156,13 @@ impl MesSources {
         self
     }
 
-    /// Begins to complete NodeSets anew from a URL, or from none. NodeSets of the YAML are given,
-    /// those that were added while the program runs remain. Earlier NodeSets of the same URL are
+    /// Begins to complete NodeSets anew from a URL, or from none: those of the YAML, and those that
+    /// were added by command. Earlier NodeSets of the same URL are
     /// kept, and others are read from the cache; both are added to `named`.
     pub(super) fn supply_anew(
         &self,
         url: Option<&NodeSetUrl>,
-        models: Vec<NodeSetModel>,
+        (models, stored): (Vec<NodeSetModel>, Vec<NodeSetModel>),
         named: &mut BTreeSet<KnowledgeSource>,
         known: &mut BTreeMap<String, ModelVersion>,
     ) {
@@ -161,7 +172,12 @@ impl MesSources {
         let mut kept = requirers.clone();
         kept.retain(|_, requirer| is_same && requirer.lasting == SourceLifetime::No);
         requirers.retain(|_, requirer| requirer.lasting == SourceLifetime::Yes);
-        for namespace in requirers.keys() {
+        for model in stored {
+            let requirer = NodeSetRequirer::added(model);
+            let namespace = requirer.model.namespace.clone();
+            requirers.entry(namespace).or_insert(requirer);
+        }
+        for namespace in requirers.keys().filter(|_| url.is_some()) {
             let source = KnowledgeSource::new(SourceKind::NodeSet, namespace);
             self.state().findings.remove(&source);
         }
@@ -194,7 +210,10 @@ impl MesSources {
                 skipped.insert(namespace);
                 continue;
             };
-            named.insert(source);
+            match missing.lasting {
+                SourceLifetime::No => drop(named.insert(source)),
+                SourceLifetime::Yes => drop(self.state().of_yaml.remove(&source)),
+            }
             known.insert(namespace.clone(), model.version.clone());
             supply.requirers.insert(namespace, missing.requirer(model));
         }
@@ -205,11 +224,7 @@ impl MesSources {
 
     /// Completes a NodeSet that was added while the program runs.
     pub(super) fn supply_for(&self, model: NodeSetModel) {
-        let requirer = NodeSetRequirer {
-            model,
-            lasting: SourceLifetime::Yes,
-            depth: 0,
-        };
+        let requirer = NodeSetRequirer::added(model);
         let namespace = requirer.model.namespace.clone();
         let mut state = self.state();
         state.supply.failed.remove(&namespace);
@@ -232,11 +247,7 @@ impl MesSources {
     /// Returns the models that a NodeSet requires and that would be fetched.
     pub(super) fn would_fetch(&self, model: &NodeSetModel) -> Vec<String> {
         let url = self.state().supply.url.clone();
-        let requirer = NodeSetRequirer {
-            model: model.clone(),
-            lasting: SourceLifetime::Yes,
-            depth: 0,
-        };
+        let requirer = NodeSetRequirer::added(model.clone());
         let known = self.known_node_sets();
         url.map_or_else(Vec::new, |url| {
             NodeSetSupply::default().findings(&url, &requirer, &known)

@@ -156,9 +156,14 @@ fn nodesets_are_completed_from_a_folder_and_leave_with_their_reason() {
     SourceFiles::put(&sources, SourceKind::NodeSet, "late", &late).unwrap();
     assert!(names().contains("urn:late") && names().contains("urn:extra"));
 
-    // Completions leave the graph with the NodeSet that requires them.
+    // Completions leave the graph with the last NodeSet that requires them.
     sources.read(&yaml("nodeset_folder: sets"));
-    assert_eq!(names(), set(&["urn:late", "urn:extra"]));
+    let of_late = ["urn:late", "urn:extra", "urn:di", "urn:core"];
+    assert_eq!(names(), set(&of_late));
+    sources.remove(SourceKind::NodeSet, "urn:late").unwrap();
+    sources.remove(SourceKind::NodeSet, "urn:di").unwrap();
+    sources.read(&yaml("nodeset_folder: sets"));
+    assert_eq!(names(), set(&["urn:extra", "urn:core"]));
     sources.read(&yaml("nodeset_folder: nowhere"));
     let findings = sources.findings();
     assert!(
@@ -268,6 +273,52 @@ fn a_stored_nodeset_that_is_too_old_is_a_finding_after_a_restart() {
     };
     let text = "the given NodeSet has the version of 2020-01-01";
     assert!(found.what.contains(text), "{found:?}");
+    drop(std::fs::remove_dir_all(&folder));
+}
+
+#[test]
+fn a_nodeset_that_was_added_incomplete_is_completed_after_a_restart() {
+    let (folder, yaml) = plant("mes-nodesets-incomplete");
+    write_node_set(&folder, "urn:late", "2023-01-01", &["urn:di"]);
+    write_node_set(&folder.join("sets"), "urn:di", "2023-01-01", &["urn:core"]);
+    write_node_set(&folder.join("sets"), "urn:core", "2023-01-01", &[]);
+    let stored = folder.join("stored");
+    // Returns the sources of the program after a start, without those that it has itself.
+    let started = |keys: &str| {
+        let (knowledge, _) = Knowledge::open(&stored).unwrap();
+        let sources = MesSources::new(Arc::new(knowledge));
+        sources.read(&yaml(keys));
+        sources
+    };
+    let names = |sources: &MesSources| {
+        let known = sources.known_node_sets().into_keys();
+        known
+            .filter(|name| *name != skills::model::NAMESPACE)
+            .collect::<Vec<_>>()
+    };
+    {
+        let sources = started("");
+        let late = std::fs::read(folder.join("urn-late.xml")).unwrap();
+        SourceFiles::put(&sources, SourceKind::NodeSet, "late", &late).unwrap();
+        assert_eq!(names(&sources), ["urn:late"]);
+    }
+    {
+        let sources = started("nodeset_folder: http://127.0.0.1:1/{uri}.xml");
+        let findings = sources.findings();
+        let [found] = findings.as_slice() else {
+            panic!("{findings:?}")
+        };
+        let text = "urn:late requires urn:di, which is fetched from http://127.0.0.1:1/";
+        assert!(found.what.starts_with(text), "{found:?}");
+    }
+    {
+        let sources = started("nodeset_folder: sets");
+        assert_eq!(names(&sources), ["urn:core", "urn:di", "urn:late"]);
+        assert_eq!(sources.findings(), []);
+    }
+    // They are lasting, as the NodeSet that requires them.
+    let sources = started("");
+    assert_eq!(names(&sources), ["urn:core", "urn:di", "urn:late"]);
     drop(std::fs::remove_dir_all(&folder));
 }
 
