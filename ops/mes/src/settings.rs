@@ -157,7 +157,7 @@ impl Reading<'_> {
         let nodeset_folder = nodeset_folder.map(|node| self.nodeset_origin(node));
         let manifests = manifests.map_or_else(Vec::new, |node| self.each(node, Self::manifest));
         let rml = rml.map_or_else(Vec::new, |node| self.each(node, Self::rml));
-        let servers = servers.map_or_else(Vec::new, |node| self.each(node, Self::server));
+        let mut servers = servers.map_or_else(Vec::new, |node| self.each(node, Self::server));
         let products = products.map_or_else(Vec::new, |node| self.files(node));
         let recipes = recipes.map_or_else(Vec::new, |node| self.each(node, Self::recipe));
         let processes = processes.map_or_else(Vec::new, |node| self.each(node, Self::process));
@@ -168,6 +168,10 @@ impl Reading<'_> {
         self.each_once(root, &products, &processes, &recipes);
         let names = servers.iter().map(|server| server.which.text());
         self.once(root, names, "server");
+        let user = user.map_or(Some(None), |user| user.map(Some))?;
+        for server in &mut servers {
+            server.user = server.user.take().or_else(|| user.clone());
+        }
         Some(Settings {
             name: name?,
             application_uri: uri?,
@@ -176,7 +180,7 @@ impl Reading<'_> {
             security: security?,
             lds: lds?,
             open: open?,
-            user: user.map_or(Some(None), |user| user.map(Some))?,
+            user,
             sparql: sparql?,
             store: store
                 .map_or(Some(None), |store| store.map(Some))?

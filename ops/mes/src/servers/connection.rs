@@ -37,11 +37,7 @@ impl FollowedServer {
     pub(super) async fn run(self) {
         let config = ClientConfig {
             pki: self.options.pki.clone(),
-            user: self
-                .entry
-                .user
-                .clone()
-                .or_else(|| self.options.user.clone()),
+            user: self.entry.user.clone(),
             security: self.options.security,
             timeout: REQUEST,
             backoff: BACKOFF,

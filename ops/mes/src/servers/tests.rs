@@ -94,6 +94,26 @@ fn an_entry_with_other_settings_is_another_search() {
     assert_eq!(usual[0].every, Duration::from_secs(600));
 }
 
+#[test]
+fn another_user_of_the_mes_is_another_search_of_the_servers_without_a_user() {
+    let one = |user: &str| {
+        let own = "{server: 'opc.tcp://h:2', user: {name: own, password: '${PATH}'}}";
+        wanted(&format!("  - opc.tcp://h:1\n  - {own}\n{user}")).entries
+    };
+    let of = |name: &str| format!("user: {{name: {name}, password: '${{PATH}}'}}\n");
+    let (anonymous, anna, ben) = (one(""), one(&of("anna")), one(&of("ben")));
+    let user = |entries: &[ServerEntry], at: usize| {
+        let user = entries[at].user.as_ref();
+        user.map(|user| user.name.clone())
+    };
+    assert_eq!(
+        (user(&anonymous, 0), user(&anna, 0)),
+        (None, Some("anna".to_owned()))
+    );
+    assert!(!anna[0].is_same(&ben[0]) && !anna[0].is_same(&anonymous[0]));
+    assert!(anna[1].is_same(&ben[1]) && anna[1].is_same(&anonymous[1]));
+}
+
 #[tokio::test]
 async fn an_application_uri_has_one_server_until_its_graph_is_removed() {
     let uris = ServerUris::default();
