@@ -1,31 +1,14 @@
 //! Codes of findings.
 
-use std::fmt;
-
 macro_rules! codes {
-    ($($(#[$doc:meta])* $name:ident = $text:literal, $explanation:literal;)*) => {
-        /// Kind of a finding. A code keeps its meaning from release to release; new codes may be
-        /// added.
-        #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
-        #[non_exhaustive]
-        pub enum Code { $(#[doc = concat!($text, ": ", $explanation)] $name,)* }
+    ($($name:ident = $text:literal, $explanation:literal;)*) => {
+        documents::finding_codes! {
+            /// Kind of a finding. A code keeps its meaning from release to release; new codes may
+            /// be added.
+            Code { $($name = $text, $explanation;)* }
+        }
 
         impl Code {
-            /// Every code, in ascending order.
-            pub const ALL: &'static [Self] = &[$(Self::$name),*];
-
-            /// Returns the text of the code, such as `M001`.
-            #[must_use]
-            pub const fn as_str(self) -> &'static str {
-                match self { $(Self::$name => $text),* }
-            }
-
-            /// Returns the general meaning of the code and the remedy.
-            #[must_use]
-            pub const fn explanation(self) -> &'static str {
-                match self { $(Self::$name => $explanation),* }
-            }
-
             /// Returns a short document with such a finding, and the findings as
             /// [`Checked::render`](crate::Checked::render) renders them.
             #[must_use]
@@ -176,12 +159,6 @@ impl Code {
                 | Self::NodeSet
                 | Self::NodeSetNode
         )
-    }
-}
-
-impl fmt::Display for Code {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(self.as_str())
     }
 }
 

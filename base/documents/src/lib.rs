@@ -2,6 +2,7 @@
 //! source line, texts that cannot control a terminal, the search for misspelt names, and files of
 //! bounded size.
 
+mod codes;
 mod excerpt;
 mod file;
 mod nearest;

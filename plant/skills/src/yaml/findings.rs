@@ -1,62 +1,30 @@
 //! Errors in a document, formatted like errors of rustc: code, location, the line with a caret, and
 //! help.
 
-use std::fmt;
+use documents::{Excerpt, SourceSpan as Place, finding_codes};
 
-use documents::{Excerpt, SourceSpan as Place};
-
-macro_rules! codes {
-    ($($name:ident = $text:literal, $explanation:literal;)*) => {
-        /// The kind of a finding. The meaning of a code is stable across releases; codes may be
-        /// added.
-        #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
-        #[non_exhaustive]
-        pub enum YamlFindingCode { $(#[doc = concat!($text, ", of which [`explanation`](Self::explanation) tells more.")] $name,)* }
-
-        impl YamlFindingCode {
-            /// All codes, in ascending order.
-            pub const ALL: &'static [Self] = &[$(Self::$name),*];
-
-            /// Returns the code, as `P001`.
-            #[must_use]
-            pub const fn as_str(self) -> &'static str {
-                match self { $(Self::$name => $text),* }
-            }
-
-            /// Returns the meaning of the code and how to correct the document.
-            #[must_use]
-            pub const fn explanation(self) -> &'static str {
-                match self { $(Self::$name => $explanation),* }
-            }
-        }
-    };
-}
-
-codes! {
-    Syntax = "P001", "The text is not YAML, or uses what is not read here: several documents, tags, aliases. Nothing after the place has been looked at.";
-    TooLarge = "P002", "The document passes a limit: 1 MiB, 20 000 values, 16 levels of nesting.";
-    UnknownKey = "P003", "No key of that name is read at this place. Keys are spelt in lower case with underscores.";
-    DuplicateKey = "P004", "A key occurs twice in one map.";
-    WrongValue = "P005", "The value is not what its key takes: a list, a map, a number of a range, or one of a few words.";
-    MissingKey = "P006", "A key that has no default is not there.";
-    Name = "P010", "A name has letters, digits, - and _ only, at most 64 of them: it stands in the names of the space.";
-    NameTwice = "P011", "Two skills or two values of a component have one name.";
-    Uri = "P012", "A URI has a scheme, as urn:example:gripper or https://example.com/grasp, and no blanks.";
-    Namespace = "P013", "The namespace is the number of the component in the space of the cell, from 1 to 65535, and of no other program.";
-    Endpoint = "P014", "An endpoint is opc.tcp://<host>:<port>[/path].";
-    Duration = "P015", "A duration is a number with its unit, as 400 ms, 2.5 s or 10 min.";
-    NodeSet = "P016", "A NodeSet is a file in the form of OPC 10000-6, annex F, beside the document or by its path.";
-    SkillType = "P020", "A skill type is one of urn:ua-bridge:skills by its name, or nsu=<namespace uri>;<BrowseName> of one that a NodeSet brings, and a subtype of SkillType.";
-    AbstractType = "P021", "An abstract type has no skills of its own, only its subtypes have.";
-    Driver = "P022", "Who does the work of a skill: `simulated` for grippers and robots, `device` for what `device` of the component names, `pick_and_place` for PickAndPlaceSkillType, `call` and `action` for what others in the space do.";
-    TooMany = "P023", "A component has from 1 to 1000 skills, and at most 89 values. A component with values needs no skills.";
-    Capability = "P024", "A capability is the IRI of its class in the plant's knowledge.";
-    Source = "P025", "A value has one source: `device` with the name of a value of the component's device, `modbus`, `io_link`, `http`, `topic` for a topic of the space, `exec` for a program, or the runs of a skill as `runs`, `failures`, `mean_duration` or `availability`.";
-}
-
-impl fmt::Display for YamlFindingCode {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(self.as_str())
+finding_codes! {
+    /// The kind of a finding. The meaning of a code is stable across releases; codes may be added.
+    YamlFindingCode {
+        Syntax = "P001", "The text is not YAML, or uses what is not read here: several documents, tags, aliases. Nothing after the place has been looked at.";
+        TooLarge = "P002", "The document passes a limit: 1 MiB, 20 000 values, 16 levels of nesting.";
+        UnknownKey = "P003", "No key of that name is read at this place. Keys are spelt in lower case with underscores.";
+        DuplicateKey = "P004", "A key occurs twice in one map.";
+        WrongValue = "P005", "The value is not what its key takes: a list, a map, a number of a range, or one of a few words.";
+        MissingKey = "P006", "A key that has no default is not there.";
+        Name = "P010", "A name has letters, digits, - and _ only, at most 64 of them: it stands in the names of the space.";
+        NameTwice = "P011", "Two skills or two values of a component have one name.";
+        Uri = "P012", "A URI has a scheme, as urn:example:gripper or https://example.com/grasp, and no blanks.";
+        Namespace = "P013", "The namespace is the number of the component in the space of the cell, from 1 to 65535, and of no other program.";
+        Endpoint = "P014", "An endpoint is opc.tcp://<host>:<port>[/path].";
+        Duration = "P015", "A duration is a number with its unit, as 400 ms, 2.5 s or 10 min.";
+        NodeSet = "P016", "A NodeSet is a file in the form of OPC 10000-6, annex F, beside the document or by its path.";
+        SkillType = "P020", "A skill type is one of urn:ua-bridge:skills by its name, or nsu=<namespace uri>;<BrowseName> of one that a NodeSet brings, and a subtype of SkillType.";
+        AbstractType = "P021", "An abstract type has no skills of its own, only its subtypes have.";
+        Driver = "P022", "Who does the work of a skill: `simulated` for grippers and robots, `device` for what `device` of the component names, `pick_and_place` for PickAndPlaceSkillType, `call` and `action` for what others in the space do.";
+        TooMany = "P023", "A component has from 1 to 1000 skills, and at most 89 values. A component with values needs no skills.";
+        Capability = "P024", "A capability is the IRI of its class in the plant's knowledge.";
+        Source = "P025", "A value has one source: `device` with the name of a value of the component's device, `modbus`, `io_link`, `http`, `topic` for a topic of the space, `exec` for a program, or the runs of a skill as `runs`, `failures`, `mean_duration` or `availability`.";
     }
 }
 
