@@ -4,12 +4,11 @@
 //! `audit`: at level warn if a session is refused, otherwise at level debug. The arguments of calls
 //! are left out because an argument may be a secret.
 
-use opcua::nodes::{BaseEventType, Event, EventField};
+use opcua::nodes::{BaseEventType, Event};
 use opcua::server::node_manager::RequestContext;
 use opcua::server::{ANONYMOUS_USER_TOKEN_ID, SubscriptionCache};
 use opcua::types::{
-    AttributeId, ByteString, DateTime, LocalizedText, NodeId, NumericRange, ObjectId, ObjectTypeId,
-    QualifiedName, StatusCode, Variant,
+    ByteString, DateTime, LocalizedText, NodeId, ObjectId, ObjectTypeId, StatusCode, Variant,
 };
 use tracing::{debug, warn};
 
@@ -273,23 +272,11 @@ impl Told {
     }
 }
 
-crate::impl_event!(Told, |event, id| event.types.contains(id));
-
-impl EventField for Told {
-    fn get_value(
-        &self,
-        attribute_id: AttributeId,
-        index_range: &NumericRange,
-        remaining_path: &[QualifiedName],
-    ) -> Variant {
-        if attribute_id == AttributeId::Value
-            && let [name] = remaining_path
-            && name.namespace_index == 0
-            && let Some(value) = self.field(name.name.as_ref())
-        {
-            return value.range_of_owned(index_range).unwrap_or(Variant::Empty);
-        }
-        self.base
-            .get_value(attribute_id, index_range, remaining_path)
+crate::impl_event!(
+    Told,
+    |event, id| event.types.contains(id),
+    |event, path| match path {
+        [name] if name.namespace_index == 0 => event.field(name.name.as_ref()),
+        _ => None,
     }
-}
+);

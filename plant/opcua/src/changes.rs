@@ -3,11 +3,11 @@
 //! A GeneralModelChangeEvent of the Server object names the changed nodes, so that its subscribers
 //! browse only these nodes again.
 
-use opcua::nodes::{BaseEventType, Event, EventField};
+use opcua::nodes::{BaseEventType, Event};
 use opcua::server::SubscriptionCache;
 use opcua::types::{
-    AttributeId, DateTime, ExtensionObject, LocalizedText, ModelChangeStructureDataType, NodeId,
-    NumericRange, ObjectId, ObjectTypeId, QualifiedName, Variant,
+    DateTime, ExtensionObject, LocalizedText, ModelChangeStructureDataType, NodeId, ObjectId,
+    ObjectTypeId, Variant,
 };
 
 /// The kind of a change.
@@ -92,29 +92,16 @@ impl Changed {
     }
 }
 
-crate::impl_event!(Changed, |_, id| TYPES.iter().any(|known| *id == *known));
-
-impl EventField for Changed {
-    fn get_value(
-        &self,
-        attribute_id: AttributeId,
-        index_range: &NumericRange,
-        remaining_path: &[QualifiedName],
-    ) -> Variant {
-        if attribute_id == AttributeId::Value
-            && let [name] = remaining_path
-            && name.namespace_index == 0
-            && name.name.as_ref() == "Changes"
-        {
-            let changes = self.changes.clone();
-            return changes
-                .range_of_owned(index_range)
-                .unwrap_or(Variant::Empty);
+crate::impl_event!(
+    Changed,
+    |_, id| TYPES.iter().any(|known| *id == *known),
+    |event, path| match path {
+        [name] if name.namespace_index == 0 && name.name.as_ref() == "Changes" => {
+            Some(event.changes.clone())
         }
-        self.base
-            .get_value(attribute_id, index_range, remaining_path)
+        _ => None,
     }
-}
+);
 
 /// The type of the event and its supertypes.
 const TYPES: [ObjectTypeId; 3] = [

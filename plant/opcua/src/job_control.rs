@@ -17,10 +17,11 @@ pub const NAMESPACE: &str = "http://opcfoundation.org/UA/ISA95-JOBCONTROL_V2/";
 /// The NodeSet: the structures, the job order receiver and the job response provider.
 pub const NODESET: &str = include_str!("job_control.xml");
 
-/// Defines a structure with the identifiers of its DataType and of its binary encoding.
+/// Defines a structure with the identifiers of its DataType and of its binary encoding. A field
+/// after `[optional]` may be missing.
 macro_rules! structures {
     ($($(#[$doc:meta])* $name:ident = ($data_type:literal, $binary:literal) {
-        $($(#[$field:meta])* $key:ident: $of:ty,)+
+        $($(#[$field:meta])* $([$optional:ident])? $key:ident: $of:ty,)+
     })+) => {
         $(
             $(#[$doc])*
@@ -29,7 +30,7 @@ macro_rules! structures {
                 XmlType, UaNullable,
             )]
             pub struct $name {
-                $($(#[$field])* pub $key: $of,)+
+                $($(#[$field])* $(#[opcua($optional)])? pub $key: $of,)+
             }
 
             impl ExpandedMessageInfo for $name {
@@ -68,14 +69,11 @@ structures! {
         /// The value.
         value: Variant,
         /// The description.
-        #[opcua(optional)]
-        description: Option<OptionalArray<LocalizedText>>,
+        [optional] description: Option<OptionalArray<LocalizedText>>,
         /// The unit of the value.
-        #[opcua(optional)]
-        units: Option<EUInformation>,
+        [optional] units: Option<EUInformation>,
         /// The properties of the property.
-        #[opcua(optional)]
-        parts: Option<OptionalArray<Property>>,
+        [optional] parts: Option<OptionalArray<Property>>,
     }
     /// ISA95ParameterDataType: a named value.
     Parameter = (3003_u32, 5005_u32) {
@@ -84,34 +82,26 @@ structures! {
         /// The value.
         value: Variant,
         /// The description.
-        #[opcua(optional)]
-        description: Option<OptionalArray<LocalizedText>>,
+        [optional] description: Option<OptionalArray<LocalizedText>>,
         /// The unit of the value.
-        #[opcua(optional)]
-        units: Option<EUInformation>,
+        [optional] units: Option<EUInformation>,
         /// The parameters of the parameter.
-        #[opcua(optional)]
-        parts: Option<OptionalArray<Parameter>>,
+        [optional] parts: Option<OptionalArray<Parameter>>,
     }
     /// ISA95EquipmentDataType: required or used equipment.
     Equipment = (3005_u32, 5008_u32) {
         /// The ID.
         id: UAString,
         /// The description.
-        #[opcua(optional)]
-        description: Option<OptionalArray<LocalizedText>>,
+        [optional] description: Option<OptionalArray<LocalizedText>>,
         /// The use of the equipment.
-        #[opcua(optional)]
-        usage: Option<UAString>,
+        [optional] usage: Option<UAString>,
         /// The quantity.
-        #[opcua(optional)]
-        quantity: Option<UAString>,
+        [optional] quantity: Option<UAString>,
         /// The unit of the quantity.
-        #[opcua(optional)]
-        units: Option<EUInformation>,
+        [optional] units: Option<EUInformation>,
         /// The properties.
-        #[opcua(optional)]
-        properties: Option<OptionalArray<Property>>,
+        [optional] properties: Option<OptionalArray<Property>>,
     }
     /// ISA95StateDataType: a state of a job.
     State = (3006_u32, 5029_u32) {
@@ -127,149 +117,110 @@ structures! {
         /// The ID.
         id: UAString,
         /// The description.
-        #[opcua(optional)]
-        description: Option<LocalizedText>,
+        [optional] description: Option<LocalizedText>,
         /// The parameters.
-        #[opcua(optional)]
-        parameters: Option<OptionalArray<Parameter>>,
+        [optional] parameters: Option<OptionalArray<Parameter>>,
     }
     /// ISA95JobOrderDataType: a job order.
     JobOrder = (3008_u32, 5014_u32) {
         /// The ID, which the client chooses.
         id: UAString,
         /// The description.
-        #[opcua(optional)]
-        description: Option<OptionalArray<LocalizedText>>,
+        [optional] description: Option<OptionalArray<LocalizedText>>,
         /// The possible work.
-        #[opcua(optional)]
-        work_masters: Option<OptionalArray<WorkMaster>>,
+        [optional] work_masters: Option<OptionalArray<WorkMaster>>,
         /// The proposed start.
-        #[opcua(optional)]
-        start: Option<DateTime>,
+        [optional] start: Option<DateTime>,
         /// The proposed end.
-        #[opcua(optional)]
-        end: Option<DateTime>,
+        [optional] end: Option<DateTime>,
         /// The priority; a higher number comes first.
-        #[opcua(optional)]
-        priority: Option<i16>,
+        [optional] priority: Option<i16>,
         /// The parameters.
-        #[opcua(optional)]
-        parameters: Option<OptionalArray<Parameter>>,
+        [optional] parameters: Option<OptionalArray<Parameter>>,
         /// The required persons.
-        #[opcua(optional)]
-        personnel: Option<OptionalArray<Personnel>>,
+        [optional] personnel: Option<OptionalArray<Personnel>>,
         /// The required equipment.
-        #[opcua(optional)]
-        equipment: Option<OptionalArray<Equipment>>,
+        [optional] equipment: Option<OptionalArray<Equipment>>,
         /// The required assets.
-        #[opcua(optional)]
-        assets: Option<OptionalArray<Asset>>,
+        [optional] assets: Option<OptionalArray<Asset>>,
         /// The required material.
-        #[opcua(optional)]
-        material: Option<OptionalArray<Material>>,
+        [optional] material: Option<OptionalArray<Material>>,
     }
     /// ISA95MaterialDataType: required or used material.
     Material = (3010_u32, 5017_u32) {
         /// The ID of its class.
-        #[opcua(optional)]
-        class: Option<UAString>,
+        [optional] class: Option<UAString>,
         /// The ID of its definition.
-        #[opcua(optional)]
-        definition: Option<UAString>,
+        [optional] definition: Option<UAString>,
         /// The ID of its lot.
-        #[opcua(optional)]
-        lot: Option<UAString>,
+        [optional] lot: Option<UAString>,
         /// The ID of its sublot.
-        #[opcua(optional)]
-        sublot: Option<UAString>,
+        [optional] sublot: Option<UAString>,
         /// The description.
-        #[opcua(optional)]
-        description: Option<OptionalArray<LocalizedText>>,
+        [optional] description: Option<OptionalArray<LocalizedText>>,
         /// The use of the material.
-        #[opcua(optional)]
-        usage: Option<UAString>,
+        [optional] usage: Option<UAString>,
         /// The quantity.
-        #[opcua(optional)]
-        quantity: Option<UAString>,
+        [optional] quantity: Option<UAString>,
         /// The unit of the quantity.
-        #[opcua(optional)]
-        units: Option<EUInformation>,
+        [optional] units: Option<EUInformation>,
         /// The properties.
-        #[opcua(optional)]
-        properties: Option<OptionalArray<Property>>,
+        [optional] properties: Option<OptionalArray<Property>>,
     }
     /// ISA95PersonnelDataType: required or working persons.
     Personnel = (3011_u32, 5020_u32) {
         /// The ID.
         id: UAString,
         /// The description.
-        #[opcua(optional)]
-        description: Option<OptionalArray<LocalizedText>>,
+        [optional] description: Option<OptionalArray<LocalizedText>>,
         /// The task of the persons.
-        #[opcua(optional)]
-        usage: Option<UAString>,
+        [optional] usage: Option<UAString>,
         /// The quantity.
-        #[opcua(optional)]
-        quantity: Option<UAString>,
+        [optional] quantity: Option<UAString>,
         /// The unit of the quantity.
-        #[opcua(optional)]
-        units: Option<EUInformation>,
+        [optional] units: Option<EUInformation>,
         /// The properties.
-        #[opcua(optional)]
-        properties: Option<OptionalArray<Property>>,
+        [optional] properties: Option<OptionalArray<Property>>,
     }
     /// ISA95PhysicalAssetDataType: a required or used asset.
     Asset = (3012_u32, 5023_u32) {
         /// The ID.
         id: UAString,
         /// The description.
-        #[opcua(optional)]
-        description: Option<OptionalArray<LocalizedText>>,
+        [optional] description: Option<OptionalArray<LocalizedText>>,
         /// The use of the asset.
-        #[opcua(optional)]
-        usage: Option<UAString>,
+        [optional] usage: Option<UAString>,
         /// The quantity.
-        #[opcua(optional)]
-        quantity: Option<UAString>,
+        [optional] quantity: Option<UAString>,
         /// The unit of the quantity.
-        #[opcua(optional)]
-        units: Option<EUInformation>,
+        [optional] units: Option<EUInformation>,
         /// The properties.
-        #[opcua(optional)]
-        properties: Option<OptionalArray<Property>>,
+        [optional] properties: Option<OptionalArray<Property>>,
     }
     /// ISA95JobResponseDataType: the execution of a job order.
     JobResponse = (3013_u32, 5026_u32) {
         /// The ID.
         id: UAString,
         /// The description.
-        #[opcua(optional)]
-        description: Option<LocalizedText>,
+        [optional] description: Option<LocalizedText>,
         /// The ID of the job order.
         order_id: UAString,
         /// The start.
-        #[opcua(optional)]
-        start: Option<DateTime>,
+        [optional] start: Option<DateTime>,
         /// The end.
-        #[opcua(optional)]
-        end: Option<DateTime>,
+        [optional] end: Option<DateTime>,
         /// The states, the main state first.
         states: Option<Vec<State>>,
         /// The results.
-        #[opcua(optional)]
-        data: Option<OptionalArray<Parameter>>,
+        [optional] data: Option<OptionalArray<Parameter>>,
         /// The persons.
-        #[opcua(optional)]
-        personnel: Option<OptionalArray<Personnel>>,
+        [optional] personnel: Option<OptionalArray<Personnel>>,
         /// The equipment.
-        #[opcua(optional)]
-        equipment: Option<OptionalArray<Equipment>>,
+        [optional] equipment: Option<OptionalArray<Equipment>>,
         /// The assets.
-        #[opcua(optional)]
-        assets: Option<OptionalArray<Asset>>,
+        [optional] assets: Option<OptionalArray<Asset>>,
         /// The material.
-        #[opcua(optional)]
-        material: Option<OptionalArray<Material>>,
+        [optional] material: Option<OptionalArray<Material>>,
     }
     /// ISA95JobOrderAndStateDataType: a job order with its states.
     JobOrderAndState = (3015_u32, 5032_u32) {

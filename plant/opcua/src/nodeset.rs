@@ -203,15 +203,44 @@ pub(crate) fn load(sources: Vec<NodeSetSource>) -> Result<Vec<ImportedNodeSet>, 
     ordered(read.collect::<Result<_, _>>()?)
 }
 
-impl ImportedNodeSet {
+/// A file that was read and is valid.
+struct CheckedNodeSet {
+    file: String,
+    text: Text,
+    facts: Facts,
+    types: NodeSet2Import,
+    /// The nodes that are not DataTypes or encodings.
+    others: UANodeSet,
+}
+
+impl CheckedNodeSet {
     fn read(source: NodeSetSource) -> Result<Self, NodeSetError> {
         let Parsed { file, text, set } = Parsed::read(source)?;
         let facts = Facts::of(&file, &text, &set)?;
         let (types, others) = parted(set);
         Ok(Self {
             file,
+            text,
             facts,
             types: imported(types),
+            others,
+        })
+    }
+}
+
+impl ImportedNodeSet {
+    fn read(source: NodeSetSource) -> Result<Self, NodeSetError> {
+        let CheckedNodeSet {
+            file,
+            facts,
+            types,
+            others,
+            ..
+        } = CheckedNodeSet::read(source)?;
+        Ok(Self {
+            file,
+            facts,
+            types,
             others: imported(others),
             unread: Vec::new(),
         })
@@ -421,6 +450,19 @@ struct Check<'a> {
     aliases: HashMap<&'a str, &'a str>,
 }
 
+/// A NodeId of a file that names no node of the file's namespaces.
+#[derive(Debug, thiserror::Error)]
+enum WrongNodeId {
+    #[error("`{0}` is neither a NodeId nor an alias")]
+    NoNodeId(String),
+    #[error("`{text}` has namespace {index}, but the table of the file has {count}")]
+    Namespace {
+        text: String,
+        index: u16,
+        count: usize,
+    },
+}
+
 impl Check<'_> {
     fn wrong(&self, node: &UANode, reason: impl Into<String>) -> NodeSetError {
         let node = node.base().node_id.0.clone();
@@ -440,17 +482,16 @@ impl Check<'_> {
         self.uris.get(at).map(String::as_str)
     }
 
-    fn id(&self, text: &str) -> Result<NodeId, String> {
+    fn id(&self, text: &str) -> Result<NodeId, WrongNodeId> {
         let resolved = self.aliases.get(text).copied().unwrap_or(text);
-        let id = NodeId::from_str(resolved)
-            .map_err(|_| format!("`{text}` is neither a NodeId nor an alias"))?;
+        let id = NodeId::from_str(resolved).map_err(|_| WrongNodeId::NoNodeId(text.to_owned()))?;
         match self.uri(id.namespace) {
             Some(_) => Ok(id),
-            None => Err(format!(
-                "`{text}` has namespace {}, but the table of the file has {}",
-                id.namespace,
-                self.uris.len()
-            )),
+            None => Err(WrongNodeId::Namespace {
+                text: text.to_owned(),
+                index: id.namespace,
+                count: self.uris.len(),
+            }),
         }
     }
 
@@ -459,7 +500,8 @@ impl Check<'_> {
         let base = node.base();
         let mut used = BTreeSet::new();
         let mut id_of = |text: &str| {
-            let id = self.id(text).map_err(|reason| self.wrong(node, reason))?;
+            let id = self.id(text);
+            let id = id.map_err(|fault| self.wrong(node, fault.to_string()))?;
             used.extend(self.uri(id.namespace).map(str::to_owned));
             Ok(id)
         };

@@ -6,6 +6,7 @@
 //! namespace), `supplement` (attributes and values that the library does not serve), `roles`,
 //! `capabilities`, `sessions`, `events`, `copies` (types and events of other servers).
 
+mod address_spaces;
 mod build;
 mod calls;
 mod capabilities;
@@ -36,8 +37,9 @@ use tokio::net::TcpListener;
 use tokio::task::JoinHandle;
 use tracing::{error, warn};
 
+pub use self::address_spaces::arguments_in;
 pub use self::build::{ServerBuilder, ServerConfig, ServerError, ServerSecurity};
-pub use self::calls::{MethodHandler, MethodRefusal, MethodRequest, arguments_in, method};
+pub use self::calls::{MethodHandler, MethodRefusal, MethodRequest, method};
 pub use self::capabilities::{Facets, capabilities, profiles};
 pub use self::copies::{ForwardedEvent, TypeSpec};
 pub use self::events::{StateRef, TransitionEvent};
@@ -46,15 +48,17 @@ pub use self::instances::{
 };
 pub use self::methods::MethodSpec;
 pub use self::nodes::{WriteHandler, WriteRequest, write};
-pub use self::overlay::{CoreMethod, core_of, core_with};
+pub use self::overlay::CoreMethod;
+pub use self::routed::{core_of, core_with};
 pub(crate) use self::sessions::ANONYMOUS;
 pub use self::sessions::{SessionCaller, SessionPresence};
 pub use self::supplement::{CoreValue, EventHistory, NodeFacts, Supplement};
 pub use self::view::ChildNode;
 pub use crate::endpoint::EndpointUrl;
 
+use self::address_spaces::AddressSpaces;
 use self::calls::MethodCalls;
-use self::nodes::{AddressSpaces, ServerNodes};
+use self::nodes::ServerNodes;
 use crate::changes::{self, ModelChange};
 use crate::door::Door;
 use crate::pki::Pki;

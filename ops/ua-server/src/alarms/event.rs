@@ -368,26 +368,18 @@ pub(crate) struct RefreshEvent {
     base: BaseEventType,
 }
 
-plant_opcua::impl_event!(RefreshEvent, |event, id| {
-    let types = [
-        event.kind,
-        ObjectTypeId::SystemEventType,
-        ObjectTypeId::BaseEventType,
-    ];
-    types.iter().any(|known| *id == *known)
-});
-
-impl EventField for RefreshEvent {
-    fn get_value(
-        &self,
-        attribute_id: AttributeId,
-        index_range: &NumericRange,
-        remaining_path: &[QualifiedName],
-    ) -> Variant {
-        self.base
-            .get_value(attribute_id, index_range, remaining_path)
-    }
-}
+plant_opcua::impl_event!(
+    RefreshEvent,
+    |event, id| {
+        let types = [
+            event.kind,
+            ObjectTypeId::SystemEventType,
+            ObjectTypeId::BaseEventType,
+        ];
+        types.iter().any(|known| *id == *known)
+    },
+    |_, _| None
+);
 
 #[cfg(test)]
 mod tests {

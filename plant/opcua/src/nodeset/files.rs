@@ -9,7 +9,7 @@ use std::os::unix::fs::MetadataExt as _;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use opcua::nodes::{NodeSet2Import, NodeSetImport as _, NodeType};
+use opcua::nodes::{NodeSetImport as _, NodeType};
 use opcua::server::address_space::AddressSpace;
 use opcua::types::{
     Context, DecodingOptions, Identifier, NamespaceMap, NodeId, NodeSetNamespaceMapper, TypeLoader,
@@ -17,11 +17,12 @@ use opcua::types::{
 };
 use opcua::xml::schema::ua_node_set::{UANode, UANodeSet};
 
-use super::document::{Parsed, Text};
+use super::document::Text;
 use super::outline::{self, NodeKind, OutlineEntry, ValueKind};
-use super::structures::{self, Structures};
+use super::structures::{self, LeftOutValue, Structures};
 use super::{
-    CORE, DEEPEST, Facts, ImportedNodeSet, NodeSetError, NodeSetSource, imported, ordered, parted,
+    CORE, CheckedNodeSet, DEEPEST, Facts, ImportedNodeSet, NodeSetError, NodeSetSource, imported,
+    ordered,
 };
 use crate::limits::{LARGEST_NODESETS, MOST_NODESETS};
 
@@ -107,7 +108,7 @@ impl ImportedNodeSets {
             }
             match length(path).and_then(|length| {
                 room = room.checked_sub(length).ok_or_else(|| too_large(path))?;
-                Document::read(NodeSetSource::File(path.clone()))
+                CheckedNodeSet::read(NodeSetSource::File(path.clone()))
             }) {
                 Ok(document) => documents.push((file, document)),
                 Err(error) => fault(error),
@@ -123,14 +124,14 @@ impl ImportedNodeSets {
             name: name.to_owned(),
             bytes: bytes.to_vec(),
         };
-        match Document::read(source) {
+        match CheckedNodeSet::read(source) {
             Ok(document) => Self::assemble(vec![(0, document)], Vec::new(), 0),
             Err(error) => (Self::default(), vec![FileFault { file: 0, error }]),
         }
     }
 
     fn assemble(
-        documents: Vec<(usize, Document)>,
+        documents: Vec<(usize, CheckedNodeSet)>,
         mut faults: Vec<FileFault>,
         fingerprint: u64,
     ) -> (Self, Vec<FileFault>) {
@@ -273,30 +274,7 @@ impl ImportedNodeSets {
     }
 }
 
-/// A file that was read and is valid.
-struct Document {
-    file: String,
-    text: Text,
-    facts: Facts,
-    types: NodeSet2Import,
-    /// The nodes that are not DataTypes or encodings.
-    others: UANodeSet,
-}
-
-impl Document {
-    fn read(source: NodeSetSource) -> Result<Self, NodeSetError> {
-        let Parsed { file, text, set } = Parsed::read(source)?;
-        let facts = Facts::of(&file, &text, &set)?;
-        let (types, others) = parted(set);
-        Ok(Self {
-            file,
-            text,
-            facts,
-            types: imported(types),
-            others,
-        })
-    }
-
+impl CheckedNodeSet {
     /// Returns the NodeSet without the values that cannot be decoded, and the findings for these
     /// values.
     fn into_set(
@@ -348,7 +326,7 @@ const MOST_UNREAD: usize = 10;
 
 /// Registers the structures that the files define. Their namespaces are numbered by the map.
 fn define<'d>(
-    documents: impl Iterator<Item = &'d Document>,
+    documents: impl Iterator<Item = &'d CheckedNodeSet>,
     structures: &Structures,
     map: &mut NamespaceMap,
 ) {
@@ -396,12 +374,12 @@ fn without_unread(
         let Some(written) = value else {
             continue;
         };
-        let read = Variant::from_nodeset(&written.0, &context).map_err(|error| error.to_string());
-        let Err(reason) = read.and_then(|read| structures::check_sent(&read, &context)) else {
+        let read = Variant::from_nodeset(&written.0, &context).map_err(LeftOutValue::from);
+        let Err(fault) = read.and_then(|read| structures::check_sent(&read, &context)) else {
             continue;
         };
         *value = None;
-        unread.push((node.base().node_id.0.clone(), reason));
+        unread.push((node.base().node_id.0.clone(), fault.to_string()));
     }
     unread
 }

@@ -134,13 +134,23 @@ impl ExpandedMessageInfo for Exact {
 /// a field that the structure requires.
 ///
 /// # Errors
-/// Returns the reason.
-pub(super) fn check_sent(value: &Variant, context: &Context<'_>) -> Result<(), String> {
+/// [`LeftOutValue`].
+pub(super) fn check_sent(value: &Variant, context: &Context<'_>) -> Result<(), LeftOutValue> {
     if !is_known(value) {
-        return Err("the type of its structure is unknown".to_owned());
+        return Err(LeftOutValue::UnknownStructure);
     }
-    let encoded = BinaryEncodable::encode(value, &mut std::io::sink(), context);
-    encoded.map_err(|error| error.to_string())
+    BinaryEncodable::encode(value, &mut std::io::sink(), context)?;
+    Ok(())
+}
+
+/// The reason why a value of a file is left out.
+#[derive(Debug, thiserror::Error)]
+pub(super) enum LeftOutValue {
+    #[error("the type of its structure is unknown")]
+    UnknownStructure,
+    /// The value cannot be decoded from XML, or not be encoded.
+    #[error(transparent)]
+    Encoding(#[from] Error),
 }
 
 fn is_known(value: &Variant) -> bool {

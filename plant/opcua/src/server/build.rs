@@ -17,9 +17,10 @@ use opcua::server::{ANONYMOUS_USER_TOKEN_ID, ServerEndpoint};
 use opcua::sync::Mutex;
 use opcua::types::{BuildInfo, DateTime, MessageSecurityMode, TypeLoader, UAString};
 
+use super::address_spaces::AddressSpaces;
 use super::calls::MethodCalls;
 use super::capabilities::{Facets, capabilities};
-use super::nodes::{AddressSpaces, ServerNodes};
+use super::nodes::ServerNodes;
 use super::roles;
 use super::routed::{Front, Routed};
 use super::supplement::Supplement;

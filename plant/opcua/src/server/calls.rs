@@ -6,16 +6,13 @@ use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 
 use async_trait::async_trait;
-use opcua::nodes::{NodeType, TypeTree};
+use opcua::nodes::TypeTree;
 use opcua::server::node_manager::{MethodCall, RequestContext};
 use opcua::sync::RwLock;
-use opcua::types::{
-    Argument, DataEncoding, DataTypeId, DataValue, NodeId, NumericRange, StatusCode,
-    TimestampsToReturn, Variant,
-};
+use opcua::types::{Argument, DataTypeId, NodeId, StatusCode, Variant};
 use tokio::time::{Instant, timeout_at};
 
-use super::nodes::AddressSpaces;
+use super::address_spaces::AddressSpaces;
 use super::sessions::{SessionCaller, SessionPresence, Sessions};
 use crate::client::CallResult;
 use crate::limits::LONGEST_REQUEST;
@@ -332,32 +329,4 @@ pub(crate) fn fits(value: &Variant, data_type: &NodeId, rank: i32, types: &dyn T
             && types.is_subtype_of(data_type, &DataTypeId::Enumeration.into()))
         // Subtypes of a built-in type are encoded as the built-in type.
         || types.is_subtype_of(data_type, &given)
-}
-
-/// Returns the arguments of an InputArguments property.
-pub(crate) fn arguments(property: &NodeType) -> Option<Vec<Argument>> {
-    let NodeType::Variable(variable) = property else {
-        return None;
-    };
-    arguments_in(Some(variable.value(
-        TimestampsToReturn::Neither,
-        &NumericRange::None,
-        &DataEncoding::Binary,
-        0.0,
-    )))
-}
-
-/// Returns the arguments in the value of an InputArguments or OutputArguments property.
-#[must_use]
-pub fn arguments_in(value: Option<DataValue>) -> Option<Vec<Argument>> {
-    let Variant::Array(array) = value?.value? else {
-        return None;
-    };
-    let each = array.values.into_iter().map(|value| {
-        let Variant::ExtensionObject(object) = value else {
-            return None;
-        };
-        object.into_inner_as::<Argument>().map(|one| *one)
-    });
-    each.collect()
 }

@@ -1,10 +1,10 @@
 //! Types and events of other servers: a server that shows the nodes of another server repeats the
 //! names of their types and forwards their events.
 
-use opcua::nodes::{BaseEventType, Event, EventField, ObjectType};
+use opcua::nodes::{BaseEventType, Event, ObjectType};
 use opcua::types::{
-    AttributeId, ByteString, DateTime, LocalizedText, NodeClass, NodeId, NumericRange,
-    ObjectTypeId, QualifiedName, ReferenceTypeId, UAString, Variant,
+    ByteString, DateTime, LocalizedText, NodeClass, NodeId, ObjectTypeId, QualifiedName,
+    ReferenceTypeId, UAString, Variant,
 };
 
 use super::instances::insert;
@@ -130,26 +130,14 @@ impl Forwarded {
     }
 }
 
-crate::impl_event!(Forwarded, |event, id| event.types.contains(id));
-
-impl EventField for Forwarded {
-    fn get_value(
-        &self,
-        attribute_id: AttributeId,
-        index_range: &NumericRange,
-        remaining_path: &[QualifiedName],
-    ) -> Variant {
-        let own = self.fields.iter().find(|(path, _)| path == remaining_path);
-        if attribute_id == AttributeId::Value
-            && let Some((_, value)) = own
-        {
-            let value = value.clone();
-            return value.range_of_owned(index_range).unwrap_or(Variant::Empty);
-        }
-        self.base
-            .get_value(attribute_id, index_range, remaining_path)
+crate::impl_event!(
+    Forwarded,
+    |event, id| event.types.contains(id),
+    |event, path| {
+        let own = event.fields.iter().find(|(own, _)| own == path);
+        own.map(|(_, value)| value.clone())
     }
-}
+);
 
 /// Maximum number of namespaces of a server.
 const MOST_NAMESPACES: usize = 4_096;

@@ -4,11 +4,10 @@
 //! module supports select clauses of the three types of the core namespace and of the declared
 //! type.
 
-use opcua::nodes::{BaseEventType, Event, EventField};
+use opcua::nodes::{BaseEventType, Event};
 use opcua::server::SubscriptionCache;
 use opcua::types::{
-    AttributeId, ByteString, DateTime, LocalizedText, NodeId, NumericRange, ObjectTypeId,
-    QualifiedName, Variant,
+    ByteString, DateTime, LocalizedText, NodeId, ObjectTypeId, QualifiedName, Variant,
 };
 
 /// A state or a transition of a state machine.
@@ -162,24 +161,11 @@ impl Raised {
     }
 }
 
-crate::impl_event!(Raised, |event, id| event.types.contains(id));
-
-impl EventField for Raised {
-    fn get_value(
-        &self,
-        attribute_id: AttributeId,
-        index_range: &NumericRange,
-        remaining_path: &[QualifiedName],
-    ) -> Variant {
-        if attribute_id == AttributeId::Value
-            && let Some(value) = self.field(remaining_path)
-        {
-            return value.range_of_owned(index_range).unwrap_or(Variant::Empty);
-        }
-        self.base
-            .get_value(attribute_id, index_range, remaining_path)
-    }
-}
+crate::impl_event!(
+    Raised,
+    |event, id| event.types.contains(id),
+    |event, path| event.field(path)
+);
 
 /// Returns the types with select clauses that apply to events of this type.
 pub(crate) fn answered(event_type: &NodeId, supertypes: Vec<&NodeId>) -> Vec<NodeId> {

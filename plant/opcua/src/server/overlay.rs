@@ -4,21 +4,15 @@
 use std::sync::Arc;
 
 use opcua::nodes::{NodeType, ReferenceDirection};
-use opcua::server::ServerHandle;
-use opcua::server::address_space::AddressSpace;
-use opcua::server::node_manager::memory::{
-    CoreNodeManager, CoreNodeManagerBuilder, InMemoryNodeManagerBuilder,
-};
-use opcua::server::node_manager::{
-    DynNodeManager, MethodCall, NodeManagerBuilder, RequestContext, ServerContext,
-};
+use opcua::server::node_manager::memory::CoreNodeManager;
+use opcua::server::node_manager::{MethodCall, RequestContext};
 use opcua::types::{Argument, BrowseDirection, NodeId, ReferenceTypeId, StatusCode};
 use tokio::time::Instant;
 
+use super::address_spaces::arguments;
 use super::calls::{self, MethodHandler, MethodRefusal, MethodRequest, check_arguments, within};
-use super::routed::{Front, Routed};
 use super::sessions::{SessionCaller, SessionPresence};
-use super::supplement::{NodeFacts, Supplement};
+use super::supplement::NodeFacts;
 use crate::audit::{Audit, AuditedAction};
 use crate::limits::LONGEST_REQUEST;
 
@@ -87,45 +81,10 @@ fn called(call: &MethodCall) -> AuditedAction {
     }
 }
 
-/// Builds the node manager of the core namespace with handlers for methods. `prepared` edits its
-/// nodes. The library returns its own values for some variables, whatever their nodes contain; the
-/// values of `supplement` replace them.
-#[must_use]
-pub fn core_with(
-    methods: Vec<CoreMethod>,
-    supplement: Supplement,
-    prepared: impl FnOnce(&mut AddressSpace) + Send + 'static,
-) -> impl NodeManagerBuilder + 'static {
-    move |context: ServerContext| {
-        let inner = Box::new(InMemoryNodeManagerBuilder::new(CoreNodeManagerBuilder));
-        let inner: Arc<DynNodeManager> = inner.build(context);
-        let core: Option<Arc<CoreNodeManager>> = Arc::clone(&inner).into_any_arc().downcast().ok();
-        if let Some(core) = &core {
-            prepared(&mut core.address_space().write());
-        }
-        Routed {
-            inner,
-            front: Front::Core(Arc::new(Overlay { methods, core })),
-            last: None,
-            supplement,
-        }
-    }
-}
-
-/// Returns the node manager of the core namespace of a server that was built with [`core_with`].
-#[must_use]
-pub fn core_of(handle: &ServerHandle) -> Option<Arc<CoreNodeManager>> {
-    let routed = handle.node_managers().get_of_type::<Routed>()?;
-    match &routed.front {
-        Front::Core(overlay) => overlay.core.clone(),
-        Front::Calls(_) => None,
-    }
-}
-
 /// The methods, and the address space with their declarations.
 pub(crate) struct Overlay {
-    methods: Vec<CoreMethod>,
-    core: Option<Arc<CoreNodeManager>>,
+    pub(crate) methods: Vec<CoreMethod>,
+    pub(crate) core: Option<Arc<CoreNodeManager>>,
 }
 
 impl Overlay {
@@ -205,7 +164,7 @@ impl Overlay {
             node.as_node().browse_name().name.as_ref() == "InputArguments"
         });
         inputs.next().map_or(Ok(Vec::new()), |node| {
-            calls::arguments(node).ok_or(StatusCode::BadInternalError)
+            arguments(node).ok_or(StatusCode::BadInternalError)
         })
     }
 }

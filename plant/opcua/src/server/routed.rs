@@ -9,22 +9,26 @@ use std::sync::Arc;
 
 use async_trait::async_trait;
 use opcua::nodes::DefaultTypeTree;
-use opcua::server::CreateMonitoredItem;
+use opcua::server::address_space::AddressSpace;
 use opcua::server::diagnostics::NamespaceMetadata;
+use opcua::server::node_manager::memory::{
+    CoreNodeManager, CoreNodeManagerBuilder, InMemoryNodeManagerBuilder,
+};
 use opcua::server::node_manager::{
     AddNodeItem, AddReferenceItem, BrowseNode, BrowsePathItem, DeleteNodeItem, DeleteReferenceItem,
     DynNodeManager, ExternalReferenceRequest, HistoryNode, HistoryUpdateNode, MethodCall,
-    MonitoredItemRef, MonitoredItemUpdateRef, NodeManager, QueryRequest, ReadNode,
-    RegisterNodeItem, RequestContext, ServerContext, WriteNode,
+    MonitoredItemRef, MonitoredItemUpdateRef, NodeManager, NodeManagerBuilder, QueryRequest,
+    ReadNode, RegisterNodeItem, RequestContext, ServerContext, WriteNode,
 };
+use opcua::server::{CreateMonitoredItem, ServerHandle};
 use opcua::types::{
     ExpandedNodeId, MonitoringMode, NodeId, ReadAnnotationDataDetails, ReadAtTimeDetails,
     ReadEventDetails, ReadProcessedDetails, ReadRawModifiedDetails, StatusCode, TimestampsToReturn,
 };
 
+use super::address_spaces::AddressSpaces;
 use super::calls::MethodCalls;
-use super::nodes::AddressSpaces;
-use super::overlay::Overlay;
+use super::overlay::{CoreMethod, Overlay};
 use super::supplement::{NodeFacts, Supplement};
 
 pub(crate) struct Routed {
@@ -44,6 +48,41 @@ impl Routed {
                 spaces.with(|view| view.node(node).map(NodeFacts::of))
             }
         }
+    }
+}
+
+/// Builds the node manager of the core namespace with handlers for methods. `prepared` edits its
+/// nodes. The library returns its own values for some variables, whatever their nodes contain; the
+/// values of `supplement` replace them.
+#[must_use]
+pub fn core_with(
+    methods: Vec<CoreMethod>,
+    supplement: Supplement,
+    prepared: impl FnOnce(&mut AddressSpace) + Send + 'static,
+) -> impl NodeManagerBuilder + 'static {
+    move |context: ServerContext| {
+        let inner = Box::new(InMemoryNodeManagerBuilder::new(CoreNodeManagerBuilder));
+        let inner: Arc<DynNodeManager> = inner.build(context);
+        let core: Option<Arc<CoreNodeManager>> = Arc::clone(&inner).into_any_arc().downcast().ok();
+        if let Some(core) = &core {
+            prepared(&mut core.address_space().write());
+        }
+        Routed {
+            inner,
+            front: Front::Core(Arc::new(Overlay { methods, core })),
+            last: None,
+            supplement,
+        }
+    }
+}
+
+/// Returns the node manager of the core namespace of a server that was built with [`core_with`].
+#[must_use]
+pub fn core_of(handle: &ServerHandle) -> Option<Arc<CoreNodeManager>> {
+    let routed = handle.node_managers().get_of_type::<Routed>()?;
+    match &routed.front {
+        Front::Core(overlay) => overlay.core.clone(),
+        Front::Calls(_) => None,
     }
 }
 
