@@ -1,29 +1,33 @@
 //! The Local Discovery Server: a registry with an OPC UA endpoint, and mDNS on an interface.
 
+mod embedding;
+mod settings;
 mod status;
 
 use std::collections::{BTreeMap, VecDeque};
-use std::net::IpAddr;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, SystemTime};
 
 use log_limit::LogLimit;
+use mdns::{Aside, Mdns, MdnsInterface, OwnAnnouncement, Url, host_name};
 use opcua::types::ApplicationType;
-use plant_opcua::enrolment::{Applicant, DirectoryClient, Enrolment, Invitation};
 use plant_opcua::own;
 use registry::{
-    AnnouncedServer, NetworkRecord, RegistrationRequest, RegistryEvent, RegistrySettings,
-    ServerLoss, instance_name,
+    AnnouncedServer, NetworkRecord, RegistryEvent, RegistrySettings, ServerLoss, instance_name,
 };
 use service::{Failure, FailureKind, Requests};
 use tokio::net::TcpListener;
-use tokio::sync::{mpsc, watch};
-use tokio::task::{JoinSet, spawn_blocking};
+use tokio::sync::mpsc;
+use tokio::task::JoinSet;
 use tokio::time::{MissedTickBehavior, interval, timeout};
 use tracing::{info, warn};
 
+use self::embedding::EmbeddingProgram;
+pub use self::embedding::{Added, Gated, LdsEmbedding, OnLevel};
+use self::settings::own_host;
+pub use self::settings::{EmbeddedIn, LdsSettings};
 pub use self::status::LdsStatus;
 use self::status::{LossStatus, RecordStatus, ServerStatus};
 use crate::clock;
@@ -31,199 +35,9 @@ use crate::connection::{RegistryRequest, RequestCounters, ServerShared};
 use crate::endpoint;
 use crate::keeper::Keeper;
 use crate::listen::{cut, listen};
-use crate::listing::{ListingTask, ServerQuery};
-use crate::security::{ChannelSecurity, TOLD_EVERY};
+use crate::listing::ListingTask;
+use crate::security::TOLD_EVERY;
 use crate::services::{OwnDescription, RegistryAnswer, RegistryQuery, semaphore};
-use mdns::MdnsInterface;
-use mdns::Url;
-use mdns::host_name;
-use mdns::{Aside, Mdns, OwnAnnouncement};
-
-/// The settings of a discovery server.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct LdsSettings {
-    /// The ApplicationUri of the embedding application; `None` for a default with the host name.
-    pub application_uri: Option<String>,
-    /// The endpoint URL, for example `opc.tcp://127.0.0.1:4840`.
-    pub endpoint: String,
-    /// The interface for mDNS.
-    pub interface: MdnsInterface,
-    /// Whether servers of other hosts may register over an unsecured channel.
-    pub allow_unsecured: bool,
-    /// Whether servers of this host must register over a secured channel too.
-    pub secured_only: bool,
-    /// The registration interval of servers. A registration without a semaphore file expires after
-    /// twice this time.
-    pub register_every: Duration,
-    /// The certificate store; `None` disables secured channels.
-    pub pki: Option<PathBuf>,
-    /// The Global Discovery Server that issues the certificate. Requires `pki`.
-    pub gds: Option<Invitation>,
-    /// The Global Discovery Server; its servers are listed too. Requires `pki`.
-    pub listing: Option<ServerQuery>,
-    /// Whether every client certificate is trusted. For tests only.
-    pub trust_any: bool,
-    /// The embedding program; `None` for the program `ua-lds`.
-    pub embedded: Option<EmbeddedIn>,
-}
-
-/// The program that embeds a discovery server.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct EmbeddedIn {
-    /// The name of the program.
-    pub name: String,
-    /// The certificate store that decides on trust; `None` for the store of the discovery server.
-    pub trusts: Option<PathBuf>,
-}
-
-impl LdsSettings {
-    /// Returns the defaults of `ua-lds` at an endpoint: mDNS on loopback, and no secured channels.
-    #[must_use]
-    pub fn at(endpoint: impl Into<String>) -> Self {
-        Self {
-            application_uri: None,
-            endpoint: endpoint.into(),
-            interface: MdnsInterface::LOOPBACK,
-            allow_unsecured: false,
-            secured_only: false,
-            register_every: REGISTER_EVERY,
-            pki: None,
-            gds: None,
-            listing: None,
-            trust_any: false,
-            embedded: None,
-        }
-    }
-
-    /// Returns the application name.
-    fn name(&self) -> String {
-        match &self.embedded {
-            None => NAME.to_owned(),
-            Some(program) => format!("{NAME} in {}", program.name),
-        }
-    }
-
-    /// Creates a missing certificate and key. Generating a key takes seconds on a small computer,
-    /// during which an open port would keep clients waiting.
-    pub(crate) async fn prepare(&self) -> Result<(), Failure> {
-        let place = Url::parse(&self.endpoint).map(|place| place.host);
-        let host = own_host(place.as_deref().unwrap_or_default(), &self.interface);
-        self.open_security(&self.uri(), &host).await.map(drop)
-    }
-
-    fn uri(&self) -> String {
-        let given = self.application_uri.clone();
-        given.unwrap_or_else(|| format!("urn:{}:ua-lds", host_name()))
-    }
-
-    /// Returns the renewal of the certificate at the Global Discovery Server.
-    fn enrolment(&self, own: &OwnDescription) -> Option<Enrolment> {
-        let (root, gds) = (self.pki.as_ref()?, self.gds.clone()?);
-        let applicant = Applicant {
-            application_uri: own.application_uri.clone(),
-            name: own.name.clone(),
-            product_uri: "urn:ua-bridge:lds".to_owned(),
-            urls: vec![own.url.clone()],
-            capabilities: vec!["LDS".to_owned()],
-        };
-        Some(Enrolment::new(root, applicant, gds))
-    }
-
-    /// Returns the queries of the Global Discovery Server, with the identity of the discovery
-    /// server.
-    fn listing_task(&self, own: &OwnDescription) -> Option<ListingTask> {
-        let (query, root) = (self.listing.as_ref()?, self.pki.clone()?);
-        let client = DirectoryClient {
-            root,
-            application_uri: own.application_uri.clone(),
-            name: own.name.clone(),
-            gds: query.gds.clone(),
-        };
-        Some(ListingTask::new(query, client, vec![own.url.clone()]))
-    }
-
-    /// Opens the certificate store, and creates a missing certificate and key.
-    async fn open_security(
-        &self,
-        application_uri: &str,
-        host: &str,
-    ) -> Result<Option<ChannelSecurity>, Failure> {
-        let Some(root) = self.pki.clone() else {
-            return Ok(None);
-        };
-        let (uri, host, trust_any) = (application_uri.to_owned(), host.to_owned(), self.trust_any);
-        // Generating a key takes some time, and must not block the program.
-        let open = move || ChannelSecurity::open(&root, &uri, &host, trust_any);
-        let opened = spawn_blocking(open).await;
-        let opened = opened.map_err(|error| Failure::new(FailureKind::Io, error.to_string()))??;
-        let trusts = self
-            .embedded
-            .as_ref()
-            .and_then(|program| program.trusts.clone());
-        Ok(Some(opened.judging_by(trusts, self.trust_any)))
-    }
-}
-
-/// A server of another level that is reached through this server (OPC 10000-4, 7.2:
-/// GatewayServerUri).
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Gated {
-    /// The ApplicationUri.
-    pub application_uri: String,
-    /// The application name.
-    pub name: String,
-    /// The ApplicationUri of the gateway, which forwards requests.
-    pub gateway_uri: String,
-    /// The URL of the gateway on this level.
-    pub url: String,
-}
-
-/// The information that an embedding program adds to the discovery server.
-#[derive(Debug, Clone, Default)]
-pub struct Added {
-    /// Servers to list in FindServers.
-    pub gated: Vec<Gated>,
-    /// The value of `level` in `/status`.
-    pub status: Option<serde_json::Value>,
-    /// The reasons why the program is not ready.
-    pub not_ready: Vec<String>,
-}
-
-/// The connection between an embedding program and its discovery server.
-#[derive(Debug)]
-pub struct LdsEmbedding {
-    /// The name of the program in `/status`.
-    pub program: &'static str,
-    /// Receives changes of the servers. Events that do not fit into the channel are dropped, and
-    /// counted as `level_missed_total`: the discovery server never waits.
-    pub events: mpsc::Sender<OnLevel>,
-    /// The added information.
-    pub added: watch::Receiver<Added>,
-}
-
-/// A change of the servers.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub enum OnLevel {
-    /// A source, which is an ApplicationUri or an mDNS name, reports a server.
-    Told {
-        /// The source.
-        source: String,
-        /// The URL of the server.
-        url: String,
-        /// Whether the server is registered; otherwise it is announced by mDNS only.
-        registered: bool,
-    },
-    /// A source no longer reports a server.
-    Left {
-        /// The source.
-        source: String,
-    },
-    /// The program behind a URL restarted.
-    Restarted {
-        /// The URL.
-        url: String,
-    },
-}
 
 /// Runs a discovery server until `stop` completes.
 ///
@@ -252,7 +66,7 @@ pub async fn run_around(
         Err(fault) => return Err(fault.told(&settings.endpoint).await),
     };
     let (mut lds, questions) = DiscoveryServer::start(&settings, listening).await?;
-    lds.around = around;
+    lds.around = EmbeddingProgram::new(around);
     service::service_manager::ready();
     lds.run(questions, &mut pages, stop).await;
     Ok(())
@@ -269,8 +83,7 @@ pub(crate) struct DiscoveryServer {
     since: BTreeMap<String, SystemTime>,
     losses: VecDeque<LossStatus>,
     lost: u64,
-    around: Option<LdsEmbedding>,
-    missed: u64,
+    around: EmbeddingProgram,
     register_every: Duration,
     /// Limits the log messages for refused registrations, by URI and reason.
     refused: LogLimit,
@@ -349,8 +162,7 @@ impl DiscoveryServer {
             since: BTreeMap::new(),
             losses: VecDeque::new(),
             lost: 0,
-            around: None,
-            missed: 0,
+            around: EmbeddingProgram::default(),
             register_every: settings.register_every,
             refused: LogLimit::every(TOLD_EVERY),
             accepting,
@@ -426,8 +238,7 @@ impl DiscoveryServer {
                 let uris: Vec<&str> = uris.iter().map(String::as_str).collect();
                 let found = registry.find_servers(&uris);
                 let found = found.map(|(asked, _)| asked.clone());
-                let gated = self.around.iter().flat_map(|around| gated(around, &uris));
-                RegistryAnswer::Servers(found.chain(gated).collect())
+                RegistryAnswer::Servers(found.chain(self.around.gated(&uris)).collect())
             }
             RegistryQuery::FindOnNetwork {
                 from,
@@ -475,7 +286,7 @@ impl DiscoveryServer {
                 if let Some(url) = discovery_urls.into_iter().next() {
                     let source = server_uri.clone();
                     let registered = true;
-                    self.tell(OnLevel::Told {
+                    self.around.report(OnLevel::Told {
                         source,
                         url,
                         registered,
@@ -486,7 +297,7 @@ impl DiscoveryServer {
             RegistryEvent::Seen(record) => self.seen(record),
             RegistryEvent::Restarted { url } => {
                 info!(url, "restarted");
-                self.tell(OnLevel::Restarted { url });
+                self.around.report(OnLevel::Restarted { url });
             }
             RegistryEvent::Gone { server_uri, loss } => self.lose(server_uri, String::new(), loss),
             RegistryEvent::Vanished { record, loss } => {
@@ -507,7 +318,7 @@ impl DiscoveryServer {
         info!(name = ?instance, url, source, after_ms, "seen on the network");
         let source = instance.clone();
         let registered = false;
-        self.tell(OnLevel::Told {
+        self.around.report(OnLevel::Told {
             source,
             url,
             registered,
@@ -521,7 +332,7 @@ impl DiscoveryServer {
         info!(?name, url, loss = loss.label(), silent_ms, "gone");
         self.since.remove(&name);
         let source = name.clone();
-        self.tell(OnLevel::Left { source });
+        self.around.report(OnLevel::Left { source });
         self.lost += 1;
         if self.losses.len() >= MOST_LOSSES {
             self.losses.pop_front();
@@ -533,14 +344,6 @@ impl DiscoveryServer {
             at_ms: clock::millis(clock::wall()),
             silent_ms,
         });
-    }
-
-    fn tell(&mut self, told: OnLevel) {
-        if let Some(around) = &self.around
-            && around.events.try_send(told).is_err()
-        {
-            self.missed += 1;
-        }
     }
 
     fn look_at_semaphores(&mut self) {
@@ -580,12 +383,10 @@ impl DiscoveryServer {
         });
         let no_interface = self.interface.addresses().is_empty();
         let why = format!("the interface {} has no IPv4 address", self.interface);
-        let around = self.around.as_ref();
-        let added = around.map(|around| around.added.borrow().clone());
-        let added = added.unwrap_or_default();
+        let added = self.around.added();
         let no_interface = no_interface.then_some(why).into_iter();
         LdsStatus {
-            program: around.map_or("ua-lds", |around| around.program),
+            program: self.around.name(),
             version: build_info::version(),
             library: plant_opcua::patches::library(),
             application_uri: self.shared.own.application_uri.clone(),
@@ -624,7 +425,7 @@ impl DiscoveryServer {
             ("malformed_total", get(malformed)),
             ("timed_out_total", get(timed_out)),
             ("lost_total", self.lost),
-            ("level_missed_total", self.missed),
+            ("level_missed_total", self.around.missed()),
             (
                 "gds_failures_total",
                 self.listing.as_ref().map_or(0, ListingTask::failures),
@@ -655,17 +456,6 @@ impl DiscoveryServer {
     }
 }
 
-/// Returns the host of the own URL. A server on the wildcard address uses the address of the
-/// interface.
-fn own_host(host: &str, interface: &MdnsInterface) -> String {
-    let address: Option<IpAddr> = host.parse().ok();
-    let is_wildcard = address.is_some_and(|address| address.is_unspecified());
-    match (is_wildcard, interface.addresses().first()) {
-        (true, Some(address)) => address.to_string(),
-        _ => host.to_owned(),
-    }
-}
-
 /// Waits until a Global Discovery Server lists other servers, and returns its servers.
 async fn listed(listing: &mut Option<ListingTask>) -> Vec<AnnouncedServer> {
     match listing {
@@ -674,31 +464,6 @@ async fn listed(listing: &mut Option<ListingTask>) -> Vec<AnnouncedServer> {
     }
 }
 
-/// Returns the servers of other levels with these URIs, or all, in the form of registrations.
-fn gated(around: &LdsEmbedding, uris: &[&str]) -> Vec<RegistrationRequest> {
-    let added = around.added.borrow();
-    let wanted = |one: &&Gated| uris.is_empty() || uris.contains(&&*one.application_uri);
-    let gated = added
-        .gated
-        .iter()
-        .filter(wanted)
-        .map(|one| RegistrationRequest {
-            server_uri: one.application_uri.clone(),
-            product_uri: String::new(),
-            names: vec![(String::new(), one.name.clone())],
-            application_type: registry::ApplicationType::Server,
-            gateway_server_uri: one.gateway_uri.clone(),
-            discovery_urls: vec![one.url.clone()],
-            semaphore_file_path: String::new(),
-            is_online: true,
-            mdns: None,
-        });
-    gated.collect()
-}
-
-const NAME: &str = "UA bridge discovery server";
-/// The default of most discovery servers.
-const REGISTER_EVERY: Duration = Duration::from_secs(600);
 const MOST_LOSSES: usize = 64;
 const SEMAPHORES_EVERY: Duration = Duration::from_secs(5);
 const LEAVE_LIMIT: Duration = Duration::from_secs(1);
