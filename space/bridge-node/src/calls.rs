@@ -200,11 +200,7 @@ impl Asker {
     ) -> impl Future<Output = Result<Bytes, AskFault>> + Send + use<> {
         let asked = self.send(request);
         async move {
-            let not_asked = |text| AskFault {
-                kind: AskErrorKind::Refused,
-                text,
-            };
-            let (mut give_up, answer) = asked.map_err(not_asked)?;
+            let (mut give_up, answer) = asked?;
             let answer = answer.await;
             give_up.place = None;
             answer.unwrap_or_else(|_| {
@@ -219,11 +215,14 @@ impl Asker {
     fn send(
         &self,
         request: Bytes,
-    ) -> Result<(GiveUp, oneshot::Receiver<Result<Bytes, AskFault>>), String> {
+    ) -> Result<(GiveUp, oneshot::Receiver<Result<Bytes, AskFault>>), AskFault> {
         let ask = AskId(self.next.fetch_add(1, Ordering::Relaxed));
         let place = || {
             let place = self.say.clone().try_reserve_owned();
-            place.map_err(|_| format!("more than {MOST_ASKED} calls of the space are in progress"))
+            place.map_err(|_| AskFault {
+                kind: AskErrorKind::Refused,
+                text: format!("more than {MOST_ASKED} calls of the space are in progress"),
+            })
         };
         let (question, later) = (place()?, place()?);
         let (answer, answered) = oneshot::channel();

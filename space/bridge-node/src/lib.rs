@@ -57,7 +57,7 @@ pub use observer::Observer;
 pub use port::{Execution, LinkState, LocalDelivery, Port, PortEvent};
 pub use present::Present;
 pub use program::{Carried, Context, Made, Program, run};
-pub use redundancy::{RedundancyArguments, rank};
+pub use redundancy::{NoRank, RedundancyArguments, rank};
 pub use ros_requests::RosRequests;
 pub use service::logging::hear_log;
 pub use service::restart::{restart, stop};

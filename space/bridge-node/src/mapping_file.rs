@@ -3,6 +3,7 @@
 mod configuration;
 mod look;
 mod reading;
+mod stamps;
 
 use std::collections::BTreeSet;
 use std::io::{self, Write as _};
@@ -19,8 +20,9 @@ use tracing::{error, info, warn};
 use type_files::TypePaths;
 
 pub use self::configuration::ConfigurationFile;
-use self::look::{Before, PollParameters, SeenFiles};
+use self::look::{Before, PollParameters};
 use self::reading::{DefinedTypes, Reading, UnreadMapping, read};
+use self::stamps::SeenFiles;
 use crate::clock::now;
 
 /// Reads NodeSet2 files for the check of a mapping.

@@ -52,11 +52,16 @@ impl RedundancyArguments {
 ///
 /// # Errors
 /// The text is no rank.
-pub fn rank(text: &str) -> Result<RedundancyRank, String> {
+pub fn rank(text: &str) -> Result<RedundancyRank, NoRank> {
     let number = text.trim().parse().ok();
     let rank = number.and_then(RedundancyRank::new);
-    rank.ok_or_else(|| format!("a rank is 1 to {}", RedundancyRank::MOST))
+    rank.ok_or(NoRank)
 }
+
+/// A text that is no rank of a redundant bridge.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("a rank is 1 to {most}", most = RedundancyRank::MOST)]
+pub struct NoRank;
 
 /// Checks that a redundant bridge can carry the mapping.
 ///

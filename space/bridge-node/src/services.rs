@@ -491,10 +491,10 @@ impl BridgeServiceCalls {
                     latched_by: None,
                 }));
             }
-            Err(detail) => {
+            Err(fault) => {
                 let failed = |topic: &TopicId| PortEvent::CallFailed {
                     topic: *topic,
-                    detail: detail.clone(),
+                    detail: fault.to_string(),
                 };
                 match of {
                     // The last response of the service stays valid.

@@ -80,25 +80,33 @@ impl LivePage for Taps {
     }
 }
 
+/// A fault of the query of a request.
+#[derive(Debug, thiserror::Error)]
+enum WrongTap {
+    #[error("from={0}: expected a number")]
+    From(String),
+    #[error("expected a topic, such as /tap?topic=ua_1_2_10")]
+    NoTopic,
+}
+
 impl TapRequest {
     /// Parses the query of a request, as `topic=ua_1_2_10&from=17`.
     ///
     /// # Errors
-    /// Returns the fault as text.
-    fn parse(query: &str) -> Result<Self, String> {
+    /// [`WrongTap`].
+    fn parse(query: &str) -> Result<Self, WrongTap> {
         let (mut topic, mut from) = (None, 0);
         for pair in query.split('&') {
             match pair.split_once('=') {
                 Some(("topic", text)) => topic = text.parse().ok(),
                 Some(("from", text)) => {
-                    from = text
-                        .parse()
-                        .map_err(|_| format!("from={text}: expected a number"))?;
+                    let number = text.parse();
+                    from = number.map_err(|_| WrongTap::From(text.to_owned()))?;
                 }
                 _ => {}
             }
         }
-        let topic = topic.ok_or("expected a topic, such as /tap?topic=ua_1_2_10")?;
+        let topic = topic.ok_or(WrongTap::NoTopic)?;
         Ok(Self { topic, from })
     }
 }

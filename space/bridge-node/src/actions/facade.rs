@@ -155,8 +155,8 @@ async fn begin<N: GraphNewGoal>(asks: &Asks, id: GraphGoalId, new: N) -> Option<
         return None;
     };
     if let Err(why) = send(asks, id, request).await {
-        debug!(why, "the goal from another space was not accepted");
-        new.reject(&why);
+        debug!(%why, "the goal from another space was not accepted");
+        new.reject(&why.to_string());
         return None;
     }
     let accepted = new.accept().await;
@@ -194,9 +194,22 @@ fn hand_to(goal: &impl ServedGoal, feedback: &[u8]) {
     }
 }
 
+/// The reason why a goal was not accepted.
+#[derive(Debug, thiserror::Error)]
+enum GoalNotAccepted {
+    /// The executor rejected the goal, with this message.
+    #[error("{0}")]
+    Rejected(String),
+    #[error("the response to the goal is malformed")]
+    Malformed,
+    /// There is no response, for this reason.
+    #[error("{0}")]
+    NoAnswer(String),
+}
+
 /// Sends a goal. Sends it a second time if it is unknown whether the first request arrived, because
 /// goals with the same id are the same goal, or if it was refused and the executor has returned.
-async fn send(asks: &Asks, id: GraphGoalId, request: Bytes) -> Result<(), String> {
+async fn send(asks: &Asks, id: GraphGoalId, request: Bytes) -> Result<(), GoalNotAccepted> {
     let ask = || asks.goal.ask_for(request.clone());
     let answer = match ask().await {
         Err(fault) if fault.kind == AskErrorKind::Unknown || comes_back(asks, &fault).await => {
@@ -204,24 +217,24 @@ async fn send(asks: &Asks, id: GraphGoalId, request: Bytes) -> Result<(), String
         }
         answer => answer,
     };
-    let text = match answer {
+    let unknown = match answer {
         Ok(answer) => match wire::read_goal_answer(asks.wire, &answer) {
             Some(answer) if answer.accepted => return Ok(()),
-            Some(answer) => return Err(answer.message),
-            None => "the response to the goal is malformed".to_owned(),
+            Some(answer) => return Err(GoalNotAccepted::Rejected(answer.message)),
+            None => GoalNotAccepted::Malformed,
         },
         Err(AskFault {
             kind: AskErrorKind::Refused,
             text,
-        }) => return Err(text),
-        Err(AskFault { text, .. }) => text,
+        }) => return Err(GoalNotAccepted::NoAnswer(text)),
+        Err(AskFault { text, .. }) => GoalNotAccepted::NoAnswer(text),
     };
     // The goal may be running without any client that knows of it.
     let request = wire::CancelSelection { id, until: None };
     let request = wire::cancel_request(asks.wire, request);
     let cancel = asks.cancel.clone().within(CANCEL_WITHIN);
     drop(cancel.ask_for(request).await);
-    Err(text)
+    Err(unknown)
 }
 
 /// Returns whether a goal was refused because the executor was lost, and the executor returns

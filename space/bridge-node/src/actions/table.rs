@@ -142,7 +142,7 @@ impl Goals {
     ) -> Option<(Vec<ExecutionId>, GoalAnswer)> {
         let goal = self.known.get_mut(&id)?;
         let asked = goal.accept(stamp)?;
-        Some((asked, goal.answer(id, Ok(()))))
+        Some((asked, goal.answer(id, None)))
     }
 
     /// Marks the goal as rejected by the server. Returns the requests for the goal, and the
@@ -155,7 +155,7 @@ impl Goals {
     ) -> Option<(Vec<ExecutionId>, GoalAnswer, Vec<ExecutionId>)> {
         let goal = self.known.get_mut(&id)?;
         let asked = goal.reject(why.clone(), now)?;
-        let answer = goal.answer(id, Err(why));
+        let answer = goal.answer(id, Some(why));
         Some((asked, answer, goal.take_waiting()))
     }
 

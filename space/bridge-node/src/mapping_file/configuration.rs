@@ -12,8 +12,8 @@ use tokio::time::{MissedTickBehavior, interval};
 use tracing::info;
 use type_files::read_text_file;
 
-use super::look::{FileStamp, stamp};
 use super::reading::shortened;
+use super::stamps::{FileStamp, stamp};
 use super::{About, LOOK, MappingFile, RunningMapping, seconds};
 
 /// The configuration file of a program without a mapping.

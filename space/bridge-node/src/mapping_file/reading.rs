@@ -18,7 +18,7 @@ use tracing::info;
 use type_files::{RosEnvironment, TypeFiles, TypePaths};
 
 use super::NodeSetReader;
-use super::look::{SeenFiles, see};
+use super::stamps::{SeenFiles, see};
 
 /// A reading of the mapping's files.
 #[derive(Debug)]

@@ -64,7 +64,17 @@ pub struct ServiceOutcome {
     /// The source of the call.
     pub(super) of: CallCause,
     /// The response, or the reason why there is none.
-    pub(super) result: Result<Bytes, String>,
+    pub(super) result: Result<Bytes, FailedCall>,
+}
+
+/// A call without a response.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("{text}{}", if *again { ": trying again" } else { "" })]
+pub(super) struct FailedCall {
+    /// Text for the user.
+    text: String,
+    /// Whether the same request is sent again.
+    again: bool,
 }
 
 /// The cause of calls.
@@ -164,11 +174,11 @@ impl<C: ServiceCall> ServiceCallTask<C> {
         let mut next = Next::Done;
         let result = answer.map_err(|CallFault { text, may_pass, .. }| {
             self.failing = true;
-            if insist && may_pass {
+            let again = insist && may_pass;
+            if again {
                 next = Next::Again;
-                return format!("{text}: trying again");
             }
-            text
+            FailedCall { text, again }
         });
         if result.is_ok() && std::mem::take(&mut self.failing) {
             info!(

@@ -74,28 +74,22 @@ impl ExecutedGoal {
                 asked.push(execution);
                 GoalDecision::Waits
             }
-            State::Running(_) | State::Ended { .. } => {
-                GoalDecision::Answer(self.answer(id, Ok(())))
-            }
+            State::Running(_) | State::Ended { .. } => GoalDecision::Answer(self.answer(id, None)),
             State::Rejected { why, .. } => {
                 let why = why.clone();
-                GoalDecision::Answer(self.answer(id, Err(why)))
+                GoalDecision::Answer(self.answer(id, Some(why)))
             }
         }
     }
 
     /// Returns the response to requests for the goal, which has this id. The server accepted it, or
     /// rejected it for a reason.
-    pub(super) fn answer(&self, id: GraphGoalId, decided: Result<(), String>) -> GoalAnswer {
-        let (accepted, message) = match decided {
-            Ok(()) => (true, String::new()),
-            Err(why) => (false, why),
-        };
+    pub(super) fn answer(&self, id: GraphGoalId, rejected: Option<String>) -> GoalAnswer {
         GoalAnswer {
-            accepted,
+            accepted: rejected.is_none(),
             id,
             stamp: self.stamp,
-            message,
+            message: rejected.unwrap_or_default(),
         }
     }
 
