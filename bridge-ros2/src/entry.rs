@@ -193,25 +193,27 @@ fn given(numbers: &[Option<u16>]) -> Vec<u16> {
     numbers.iter().copied().flatten().collect()
 }
 
-fn domain_number(text: &str) -> Result<Option<u16>, String> {
+/// A number of the command line that is outside of its range.
+#[derive(Debug, PartialEq, Eq, thiserror::Error)]
+#[error("it is {} to {}", .0.start(), .0.end())]
+struct NumberOutOfRange(RangeInclusive<u16>);
+
+fn domain_number(text: &str) -> Result<Option<u16>, NumberOutOfRange> {
     number(text, 0..=232)
 }
 
-fn space_number(text: &str) -> Result<Option<u16>, String> {
+fn space_number(text: &str) -> Result<Option<u16>, NumberOutOfRange> {
     number(text, 2..=232)
 }
 
-fn number(text: &str, range: RangeInclusive<u16>) -> Result<Option<u16>, String> {
-    match text.trim() {
-        "" => Ok(None),
-        text => {
-            let number = text.parse().ok().filter(|number| range.contains(number));
-            let (least, most) = range.into_inner();
-            number.map_or_else(
-                || Err(format!("it is {least} to {most}")),
-                |number| Ok(Some(number)),
-            )
-        }
+fn number(text: &str, range: RangeInclusive<u16>) -> Result<Option<u16>, NumberOutOfRange> {
+    if text.trim().is_empty() {
+        return Ok(None);
+    }
+    let number = text.trim().parse().ok();
+    match number.filter(|number| range.contains(number)) {
+        Some(number) => Ok(Some(number)),
+        None => Err(NumberOutOfRange(range)),
     }
 }
 

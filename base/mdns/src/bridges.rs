@@ -184,9 +184,7 @@ async fn look(monitor: Receiver<DaemonEvent>, interface: MdnsInterface) {
     let why = match timeout(ANNOUNCED_WITHIN, announced(&monitor)).await {
         Ok(Ok(name)) => return info!(?name, "announced by mDNS on {interface}"),
         Ok(Err(why)) => why,
-        Err(_) => {
-            "nothing can be sent: the network is down or does not support multicast".to_owned()
-        }
+        Err(_) => NotAnnounced::NoNetwork,
     };
     warn!(
         "cannot announce this bridge by mDNS on {interface}: {why} (`--mdns none` turns announcements off)"
@@ -194,14 +192,25 @@ async fn look(monitor: Receiver<DaemonEvent>, interface: MdnsInterface) {
     // The dropped receiver gets no more events; the daemon bounds the channel.
 }
 
+/// The reason why nothing is announced.
+#[derive(Debug, thiserror::Error)]
+enum NotAnnounced {
+    #[error(transparent)]
+    Daemon(mdns_sd::Error),
+    #[error("the daemon has ended")]
+    Ended,
+    #[error("nothing can be sent: the network is down or does not support multicast")]
+    NoNetwork,
+}
+
 /// Returns the name of the first announcement, or the reason for which nothing is sent.
-async fn announced(monitor: &Receiver<DaemonEvent>) -> Result<String, String> {
+async fn announced(monitor: &Receiver<DaemonEvent>) -> Result<String, NotAnnounced> {
     loop {
         match monitor.recv_async().await {
             Ok(DaemonEvent::Announce(name, _)) => return Ok(name),
-            Ok(DaemonEvent::Error(error)) => return Err(error.to_string()),
+            Ok(DaemonEvent::Error(error)) => return Err(NotAnnounced::Daemon(error)),
             Ok(_) => {}
-            Err(_) => return Err("the daemon has ended".to_owned()),
+            Err(_) => return Err(NotAnnounced::Ended),
         }
     }
 }

@@ -4,15 +4,24 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 
 use messages::TypeName;
-use tcpros::{Node, ServiceClientOptions};
+use tcpros::{Node, ServiceClientOptions, ServiceError};
 use tokio::task::JoinSet;
 
 /// The types of services, which only their servers know.
 #[derive(Debug, Default)]
 pub(super) struct ServiceTypeLookup {
     known: BTreeMap<String, Kind>,
-    asking: JoinSet<(String, Result<TypeName, String>)>,
+    asking: JoinSet<(String, Result<TypeName, NoServiceType>)>,
     faults: Vec<(String, String)>,
+}
+
+/// The reason why the type of a service is unknown.
+#[derive(Debug, thiserror::Error)]
+enum NoServiceType {
+    #[error(transparent)]
+    Probe(ServiceError),
+    #[error("its server reports `{}`", .0.escape_debug())]
+    Name(String),
 }
 
 #[derive(Debug)]
@@ -70,11 +79,11 @@ impl ServiceTypeLookup {
             kind.asked = true;
             let service = (*service).to_owned();
             self.asking.spawn(async move {
-                let header = client.probe().await.map_err(|error| error.to_string());
+                let header = client.probe().await.map_err(NoServiceType::Probe);
                 let named = header.and_then(|header| {
                     let named = header.get("type").unwrap_or_default();
                     let parsed = named.parse();
-                    parsed.map_err(|_| format!("its server reports `{}`", named.escape_debug()))
+                    parsed.map_err(|_| NoServiceType::Name(named.to_owned()))
                 });
                 (service, named)
             });
@@ -100,7 +109,7 @@ impl ServiceTypeLookup {
             Ok(type_name) => kind.type_name = Some(type_name),
             Err(error) => {
                 kind.wait = ASKED_AGAIN;
-                self.faults.push((service, error));
+                self.faults.push((service, error.to_string()));
             }
         }
     }

@@ -3,8 +3,9 @@
 use std::collections::{BTreeMap, HashMap};
 
 use messages::{DescribedType, TypeHash, TypeName};
-use ros2_node::service::ServicePeers;
-use tokio::task::{Id, JoinSet};
+use ros2_node::service::{ServiceError, ServicePeers};
+use ros2_node::type_description::NotDescribed;
+use tokio::task::{Id, JoinError, JoinSet};
 use tokio::time::Instant;
 
 use super::inquiry::Inquiry;
@@ -27,7 +28,18 @@ pub(super) struct PendingCalls {
 /// A type as an endpoint announces it.
 pub(super) type WantedType = (TypeName, TypeHash);
 /// The type with the types that it references, or the reason for the failure.
-pub(super) type DescriptionAnswer = Result<Vec<DescribedType>, String>;
+pub(super) type DescriptionAnswer = Result<Vec<DescribedType>, NoDescription>;
+
+/// The reason why a node has not described a type.
+#[derive(Debug, thiserror::Error)]
+pub(super) enum NoDescription {
+    #[error(transparent)]
+    Call(#[from] ServiceError),
+    #[error(transparent)]
+    Answer(#[from] NotDescribed),
+    #[error("the call was broken off: {0}")]
+    BrokenOff(JoinError),
+}
 
 impl TypeDescriptions {
     pub(super) fn new(peers: ServicePeers) -> Self {
@@ -67,7 +79,7 @@ impl PendingCalls {
         loop {
             let (task, answer) = match self.tasks.try_join_next_with_id()? {
                 Ok(ended) => ended,
-                Err(error) => (error.id(), Err(format!("the call was broken off: {error}"))),
+                Err(error) => (error.id(), Err(NoDescription::BrokenOff(error))),
             };
             if let Some((wanted, service)) = self.asking.remove(&task) {
                 return Some((wanted, service, answer));

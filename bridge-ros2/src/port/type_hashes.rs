@@ -3,7 +3,7 @@
 
 use std::time::Duration;
 
-use messages::{DescribedType, TypeHash, TypeName};
+use messages::{DefinitionError, DescribedType, TypeHash, TypeName};
 use ros2_node::graph::RemoteEndpoint;
 use ros2_node::service::{ServiceClient, ServiceClientOptions};
 use ros2_node::type_description;
@@ -138,8 +138,8 @@ impl Ros2Side {
         let calls = &mut self.descriptions.calls;
         calls.begin(wanted.clone(), asked, async move {
             match client.call(request).await {
-                Ok(answer) => type_description::read_answer(&answer).map_err(|why| why.to_string()),
-                Err(error) => Err(error.to_string()),
+                Ok(answer) => Ok(type_description::read_answer(&answer)?),
+                Err(error) => Err(error.into()),
             }
         });
         inquiry.asked();
@@ -155,9 +155,9 @@ impl Ros2Side {
                 Ok(types) => match self.described(&wanted, &service, &types) {
                     Ok(()) => (inquiry.told(), String::new()),
                     // A second request to the same node would return the same description.
-                    Err(why) => (inquiry.untold(now), why),
+                    Err(why) => (inquiry.untold(now), why.to_string()),
                 },
-                Err(why) => (inquiry.failed(now), why),
+                Err(why) => (inquiry.failed(now), why.to_string()),
             };
             debug!(message_type = %wanted.0, service, ?outcome, why, "received the response to a type description request");
             self.tell_untold(&wanted, outcome, &format!("{service}: {why}"));
@@ -171,10 +171,9 @@ impl Ros2Side {
         (name, hash): &WantedType,
         service: &str,
         types: &[DescribedType],
-    ) -> Result<(), String> {
+    ) -> Result<(), DefinitionError> {
         let from = format!("type description of {service}");
-        let added = self.definitions.add_described(name, types, *hash, &from);
-        added.map_err(|error| error.to_string())?;
+        self.definitions.add_described(name, types, *hash, &from)?;
         info!(message_type = %name, %hash, service, "received the description of the type from a node that uses it");
         Ok(())
     }

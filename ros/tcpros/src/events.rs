@@ -111,8 +111,8 @@ pub(crate) fn message_too_long(topic: &str, bytes: usize) {
 }
 
 /// `suppressed`: the number of suppressed entries since the last entry.
-pub(crate) fn service_failed(service: &str, client: &str, why: &str, suppressed: u64) {
-    warn!(service, client, why, suppressed, "a service request failed");
+pub(crate) fn service_failed(service: &str, client: &str, why: &dyn Display, suppressed: u64) {
+    warn!(service, client, %why, suppressed, "a service request failed");
 }
 
 pub(crate) fn publisher_joined(topic: &str, publisher: &str) {

@@ -120,6 +120,32 @@ impl Drop for ServiceServer {
     }
 }
 
+/// The reason why a request has no response. The client gets its text.
+#[derive(Debug, thiserror::Error)]
+enum FailedRequest {
+    /// The handler gave this text.
+    #[error("{0}")]
+    Handler(String),
+    #[error(transparent)]
+    TooLong(#[from] FrameTooLong),
+    #[error("service [{service}]: {given_up}")]
+    Aborted {
+        service: String,
+        given_up: AbortedRequest,
+    },
+}
+
+/// The reason why a handler was aborted.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+enum AbortedRequest {
+    #[error("its handler panicked")]
+    Panicked,
+    #[error("its handler did not respond within {limit:?}")]
+    Slow { limit: Duration },
+    #[error("it is being withdrawn")]
+    Withdrawn,
+}
+
 type Answer = Pin<Box<dyn Future<Output = Result<Bytes, String>> + Send>>;
 
 /// An offered service, shared by its server and the tasks that serve its clients.
@@ -313,8 +339,9 @@ impl ServiceSession {
                 Ok(None) => return Ok(()),
                 Err(fault) => {
                     served.counters.refused.fetch_add(1, Ordering::Relaxed);
-                    if let ClientFault::TooLong(_) = fault {
-                        self.answer(&mut writer, Err(fault.to_string())).await?;
+                    if let ClientFault::TooLong(length) = fault {
+                        let refused = Err(FailedRequest::TooLong(length));
+                        self.answer(&mut writer, refused).await?;
                         // A client that is still writing would not read the response of a
                         // connection that is reset.
                         let gone = timeout(DRAIN_LIMIT, until_closed(&mut reader)).await;
@@ -361,7 +388,7 @@ impl ServiceSession {
 
     /// Runs the handler in a task of its own: a panic ends only this task, and an aborted handler
     /// ends with the set.
-    async fn handle(&self, bytes: Bytes) -> Result<Bytes, String> {
+    async fn handle(&self, bytes: Bytes) -> Result<Bytes, FailedRequest> {
         let served = Arc::clone(&self.served);
         count(&served.counters.received, bytes.len());
         let request = ServiceRequest {
@@ -374,23 +401,24 @@ impl ServiceSession {
         let given_up = tokio::select! {
             biased;
             Some(done) = call.join_next() => match done {
-                Ok(result) => return result,
-                Err(_) => "its handler panicked".to_owned(),
+                Ok(result) => return result.map_err(FailedRequest::Handler),
+                Err(_) => AbortedRequest::Panicked,
             },
-            () = sleep(limit) => format!("its handler did not respond within {limit:?}"),
-            () = self.overdue() => "it is being withdrawn".to_owned(),
+            () = sleep(limit) => AbortedRequest::Slow { limit },
+            () = self.overdue() => AbortedRequest::Withdrawn,
         };
         if let Some(more) = lock(&self.served.faults).admit(clock::now()) {
             let client = clipped(&self.client.caller_id);
             events::service_failed(&self.served.service, client, &given_up, more);
         }
-        Err(format!("service [{}]: {given_up}", self.served.service))
+        let service = self.served.service.clone();
+        Err(FailedRequest::Aborted { service, given_up })
     }
 
     async fn answer(
         &self,
         writer: &mut WriteHalf<'_>,
-        result: Result<Bytes, String>,
+        result: Result<Bytes, FailedRequest>,
     ) -> Result<(), ClientFault> {
         let too_long = |bytes: &Bytes| u32::try_from(bytes.len()).is_err();
         let (ok, body) = match result {
@@ -399,7 +427,7 @@ impl ServiceSession {
                 Bytes::from_static(b"the response exceeds the length limit of TCPROS"),
             ),
             Ok(body) => (1, body),
-            Err(text) => (0, Bytes::from(text)),
+            Err(fault) => (0, Bytes::from(fault.to_string())),
         };
         let counters = &self.served.counters;
         // Counted before the response is sent, so that a client that has its response finds it
