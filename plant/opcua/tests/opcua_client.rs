@@ -18,12 +18,12 @@ use async_trait::async_trait;
 use cell::{OpcuaCell, PATIENCE, config, next, next_value, press, variable};
 use opcua::types::{NodeId, ObjectId, QualifiedName, StatusCode, VariableId, Variant};
 use plant_opcua::client::{
-    Browse, CallOptions, ClientConfig, ClientError, Link, MonitoredWatch, Notice, OpcUaClient,
-    SecurityChoice,
+    Browse, CallError, CallOptions, ClientConfig, ClientError, Link, MonitoredWatch, Notice,
+    OpcUaClient, SecurityChoice,
 };
 use plant_opcua::server::{
     MethodHandler, MethodRefusal, MethodRequest, MethodSpec, OpcUaServer, ServerConfig,
-    ServerSecurity,
+    ServerSecurity, method,
 };
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::{TcpListener, TcpStream};
@@ -251,6 +251,32 @@ async fn a_call_takes_no_effect_after_its_caller_has_given_up_where_timeout_hint
         let ended = tokio::time::timeout(PATIENCE, ended).await;
         assert_eq!(*ended.expect("it waits").unwrap(), expected);
     }
+}
+
+#[tokio::test]
+async fn a_method_below_objects_is_called() {
+    let cell = OpcuaCell::new();
+    let objects: NodeId = ObjectId::ObjectsFolder.into();
+    let id = NodeId::new(1, 500);
+    let spec = MethodSpec {
+        node_id: id.clone(),
+        browse_name: QualifiedName::new(1, "Count"),
+        object: objects.clone(),
+        arguments: (NodeId::new(1, 501), NodeId::new(1, 502)),
+        takes: Vec::new(),
+        gives: Vec::new(),
+    };
+    let count = method(|_| Ok(vec![Variant::UInt32(3)]));
+    cell.server.add_method(spec, count).unwrap();
+    let client = cell.client().await;
+    let counted = client.call(&objects, &id, vec![]).await.unwrap();
+    assert_eq!(counted, [Variant::UInt32(3)]);
+    // The method is not a method of other objects.
+    let server: NodeId = ObjectId::Server.into();
+    let elsewhere = client.call(&server, &id, vec![]).await.unwrap_err();
+    let is_invalid = matches!(elsewhere, CallError::Refused { status, .. }
+        if status == StatusCode::BadMethodInvalid);
+    assert!(is_invalid, "{elsewhere}");
 }
 
 fn scratch(name: &str) -> PathBuf {

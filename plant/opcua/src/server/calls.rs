@@ -178,7 +178,8 @@ impl MethodCalls {
         others
     }
 
-    /// Returns the handler of a call; `None` for objects of other node managers.
+    /// Returns the handler of a call; `None` for calls of other node managers. An own method of an
+    /// object in namespace 0, such as Objects, has a route as well.
     #[expect(
         clippy::type_complexity,
         reason = "set in one place and read in one place"
@@ -189,10 +190,7 @@ impl MethodCalls {
     ) -> Option<Result<(NodeId, String, Arc<dyn MethodHandler>), StatusCode>> {
         let object = call.object_id();
         let spaces = self.spaces.get()?;
-        if !spaces.owns(object) {
-            return None;
-        }
-        if !spaces.own().read().node_exists(object) {
+        if spaces.owns(object) && !spaces.own().read().node_exists(object) {
             return Some(Err(StatusCode::BadNodeIdUnknown));
         }
         let given = (object.clone(), call.method_id().clone());
