@@ -13,6 +13,7 @@ mod rtde;
 mod script;
 pub mod simulator;
 mod state;
+mod values;
 pub mod wire;
 
 use std::sync::Arc;
@@ -20,8 +21,8 @@ use std::time::Duration;
 
 use async_trait::async_trait;
 use skills::{
-    Builtin, Device, DeviceValue, Driver, DriverError, DriverFault, InvalidParameter, Measured,
-    ParameterType, Parameters, PeerAccess, RunResults, ValueShape, Work,
+    Device, DeviceValue, Driver, DriverError, DriverFault, InvalidParameter, Measured,
+    ParameterType, Parameters, PeerAccess, RunResults, Work,
 };
 use tokio::io::AsyncWriteExt as _;
 use tokio::net::TcpStream;
@@ -35,7 +36,6 @@ use self::rtde::Rtde;
 pub use self::rtde::RtdeError;
 use self::state::{INPUTS, OUTPUTS, PAUSED, STOPPED, UnfitRobot, UrState};
 use self::wire::RecipeValue;
-use crate::measuring::value;
 use crate::modbus::connected;
 use crate::skill_types::other_type;
 
@@ -107,97 +107,12 @@ impl Device for UrRobot {
     }
 
     fn values(&self) -> &'static [DeviceValue] {
-        &VALUES
+        &values::VALUES
     }
 
-    /// The robot sends its state at the rate of the period.
     async fn measure(&self, period: Duration, out: &Measured) -> String {
-        let hertz = (1.0 / period.as_secs_f64()).clamp(1.0, FASTEST_VALUES);
-        let recipe = MEASURED.map(|(_, output)| output);
-        let opened = Rtde::open(&self.settings.rtde, hertz, &recipe, &[]).await;
-        let mut rtde = match opened {
-            Ok(rtde) => rtde,
-            Err(why) => return why.to_string(),
-        };
-        loop {
-            let values = match rtde.next().await {
-                Ok(values) => values,
-                Err(why) => return why.to_string(),
-            };
-            for ((name, _), value) in MEASURED.iter().zip(values) {
-                out.put(name, shown(name, value));
-            }
-        }
-    }
-}
-
-/// Returns a value of the robot for clients.
-fn shown(name: &str, value: RecipeValue) -> Result<skills::SkillValue, String> {
-    Ok(match value {
-        RecipeValue::Vector(pose) if name == "TcpPose" => of_robot(pose).into(),
-        RecipeValue::Vector(six) => six.into(),
-        RecipeValue::I32(number) => number.into(),
-        RecipeValue::F64(number) if name == "SpeedScaling" => (number * 100.0).into(),
-        RecipeValue::F64(number) => number.into(),
-        other @ (RecipeValue::Bool(_)
-        | RecipeValue::U8(_)
-        | RecipeValue::U32(_)
-        | RecipeValue::U64(_)
-        | RecipeValue::Triple(_)
-        | RecipeValue::Whole(_)) => return Err(format!("the robot sends {name} as {other:?}")),
-    })
-}
-
-/// The values of a robot and the outputs of RTDE with them.
-const MEASURED: [(&str, &str); 7] = [
-    ("TcpPose", "actual_TCP_pose"),
-    ("TcpSpeed", "actual_TCP_speed"),
-    ("TcpForce", "actual_TCP_force"),
-    ("JointPositions", "actual_q"),
-    ("SpeedScaling", "target_speed_fraction"),
-    ("RobotMode", "robot_mode"),
-    ("SafetyMode", "safety_mode"),
-];
-
-const VALUES: [DeviceValue; 7] = [
-    six(
-        "TcpPose",
-        None,
-        "The pose of the flange: x, y, z in m and the rotations about them in rad.",
-    ),
-    six("TcpSpeed", None, "The speed of the flange: m/s, and rad/s."),
-    six("TcpForce", None, "The force at the tool: N, and N m."),
-    six(
-        "JointPositions",
-        Some("rad"),
-        "The positions of the joints.",
-    ),
-    DeviceValue {
-        unit: Some("%"),
-        range: Some((0.0, 100.0)),
-        ..value(
-            "SpeedScaling",
-            Builtin::Double,
-            "The position of the speed slider.",
-        )
-    },
-    value(
-        "RobotMode",
-        Builtin::Int32,
-        "7 runs, 5 waits for the release of its brakes, 3 is switched off.",
-    ),
-    value(
-        "SafetyMode",
-        Builtin::Int32,
-        "1 normal, 2 reduced, 3 protective stop, 5 safeguard stop, 6 and 7 emergency stop, 8 and 9 fault.",
-    ),
-];
-
-const fn six(name: &'static str, unit: Option<&'static str>, about: &'static str) -> DeviceValue {
-    DeviceValue {
-        shape: ValueShape::array(Builtin::Double),
-        unit,
-        ..value(name, Builtin::Double, about)
+        let why = values::measure(&self.settings.rtde, period, out).await;
+        why.to_string()
     }
 }
 
@@ -652,8 +567,6 @@ const JOINT_TARGET: &str = "TargetJointPosition";
 const HERTZ: f64 = 50.0;
 /// Rate of the state of a move with a force limit, Hz.
 const GUARDED: f64 = 125.0;
-/// Highest rate of values for clients, Hz.
-const FASTEST_VALUES: f64 = 125.0;
 const TAKEN: Duration = Duration::from_secs(2);
 const SETTLED: Duration = Duration::from_millis(60);
 const BRAKED: Duration = Duration::from_millis(700);

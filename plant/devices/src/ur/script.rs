@@ -22,7 +22,9 @@ pub(crate) enum Statement {
     Register { number: usize, value: i32 },
     /// `sleep`, s
     Sleep(f64),
-    /// A statement without effect here: `textmsg`, `set_tcp`, `set_payload`.
+    /// `set_payload`: kg, and the centre of mass at the flange, m.
+    Payload { mass: f64, center: [f64; 3] },
+    /// A statement without effect here: `textmsg`, `set_tcp`.
     Nothing,
 }
 
@@ -82,7 +84,7 @@ fn read(line: &str) -> Option<Statement> {
                 None => (inner.strip_prefix('[')?, false),
             };
             let (target, rest) = target.split_once(']')?;
-            let to = six(target)?;
+            let to = numbers(target)?;
             let given: Vec<&str> = rest
                 .split(',')
                 .map(str::trim)
@@ -137,12 +139,25 @@ fn read(line: &str) -> Option<Statement> {
                 .ok()
                 .filter(|s| (0.0..=3600.0).contains(s))?,
         ),
-        "textmsg" | "set_tcp" | "set_payload" => Statement::Nothing,
+        "set_payload" => {
+            let (mass, center) = match inner.split_once(',') {
+                Some((mass, list)) => {
+                    let list = list.trim().strip_prefix('[')?.strip_suffix(']')?;
+                    (mass, numbers(list)?)
+                }
+                None => (inner, [0.0; 3]),
+            };
+            let mass = mass.trim().parse().ok();
+            let mass = mass.filter(|mass: &f64| mass.is_finite() && *mass >= 0.0)?;
+            Statement::Payload { mass, center }
+        }
+        "textmsg" | "set_tcp" => Statement::Nothing,
         _ => return None,
     })
 }
 
-fn six(text: &str) -> Option<[f64; 6]> {
+/// Returns a list of `N` numbers.
+fn numbers<const N: usize>(text: &str) -> Option<[f64; N]> {
     let numbers: Vec<f64> = text
         .split(',')
         .map(|part| part.trim().parse().ok().filter(|n: &f64| n.is_finite()))
@@ -158,7 +173,7 @@ mod tests {
     fn a_program_is_taken_when_it_is_whole() {
         let mut text = "def x():\n  movel(p[0.1,0,0,0,0,0], a=2, v=0.5)".to_owned();
         assert!(programs(&mut text).is_empty());
-        text.push_str("\n\n  write_output_integer_register(25, -3) # done\nend\nstopl(2.0)\nmovej(p[0,0,0,0,0,0], 1, 2)\nmovej([0,1,0,0,0,-1.5], a=3, v=2)\n");
+        text.push_str("\n\n  write_output_integer_register(25, -3) # done\nend\nstopl(2.0)\nmovej(p[0,0,0,0,0,0], 1, 2)\nmovej([0,1,0,0,0,-1.5], a=3, v=2)\nset_payload(1.5, [0, 0, 0.05])\n");
         let expected = [
             Ok(vec![
                 Statement::Move {
@@ -184,6 +199,10 @@ mod tests {
                 acceleration: 3.0,
                 speed: 2.0,
             }]),
+            Ok(vec![Statement::Payload {
+                mass: 1.5,
+                center: [0.0, 0.0, 0.05],
+            }]),
         ];
         assert_eq!(programs(&mut text), expected);
         assert_eq!(text, "");
@@ -199,6 +218,8 @@ mod tests {
             "movel([0,0,0,0,0,0])",
             "write_output_integer_register(48, 1)",
             "servoj(1)",
+            "set_payload(-1)",
+            "set_payload(1, [0, 0])",
             "stopl()",
             "x",
         ] {

@@ -2,7 +2,7 @@
 //!
 //! The robot has no kinematics: the tool moves straight to each pose with the given speed and
 //! acceleration, and the joints turn independently of it. Programs consist of a few statements:
-//! movel to a pose, movej to a pose or to joint positions, stopl, stopj, sleep,
+//! movel to a pose, movej to a pose or to joint positions, stopl, stopj, sleep, set_payload,
 //! write_output_integer_register.
 
 mod motion;
@@ -32,6 +32,8 @@ pub struct UrSimulatorSettings {
     pub surface: Option<f64>,
     /// A hole in that surface.
     pub hole: Option<Hole>,
+    /// Outputs of RTDE that the controller does not have, as in earlier versions.
+    pub lacks: &'static [&'static str],
 }
 
 impl Default for UrSimulatorSettings {
@@ -41,6 +43,7 @@ impl Default for UrSimulatorSettings {
             home: [0.4, 0.0, 0.5, 0.0, 0.0, 0.0],
             surface: None,
             hole: None,
+            lacks: &[],
         }
     }
 }
@@ -61,6 +64,8 @@ struct Robot {
     joints: [f64; 6],
     program: Option<Running>,
     registers: [i32; 48],
+    /// Mass of the payload, kg, and its centre of mass at the flange, m.
+    payload: (f64, [f64; 3]),
     slider: f64,
     safety: i32,
     /// Whether the program is paused, as after a protective stop.
@@ -90,6 +95,7 @@ impl UrSimulator {
             seen: now,
             program: None,
             registers: [0; 48],
+            payload: (0.0, [0.0; 3]),
             slider: 1.0,
             safety: NORMAL,
             paused: false,
@@ -245,6 +251,7 @@ impl Robot {
         match program.waiting.pop_front() {
             None => return false,
             Some(Statement::Nothing | Statement::Stop) => {}
+            Some(Statement::Payload { mass, center }) => self.payload = (mass, center),
             Some(Statement::Sleep(time)) => program.sleep = time,
             Some(Statement::Register { number, value }) => {
                 if let Some(register) = self.registers.get_mut(number) {

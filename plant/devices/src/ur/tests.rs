@@ -268,6 +268,49 @@ async fn its_values_follow_the_robot_and_come_back_after_a_silence() {
 }
 
 #[tokio::test]
+async fn the_load_is_measured_and_unknown_at_a_controller_without_it() {
+    let bench = bench().await;
+    let is = |expected: Vec<f64>| {
+        move |value: &Result<skills::SkillValue, String>| {
+            let found = value.as_ref().ok().and_then(skills::SkillValue::as_f64s);
+            found.as_ref() == Some(&expected)
+        }
+    };
+    let values = crate::sensors::tests::measured(Arc::new(UrRobot::new(bench.settings())));
+    values
+        .until("LoadMass", |value| *value == Ok(0.0.into()))
+        .await;
+    let mut secondary = connected(&bench.settings().secondary).await.unwrap();
+    let program = b"set_payload(1.5, [0, 0.01, 0.05])\n";
+    secondary.write_all(program).await.unwrap();
+    values
+        .until("LoadMass", |value| *value == Ok(1.5.into()))
+        .await;
+    values.until("LoadCenter", is(vec![0.0, 0.01, 0.05])).await;
+    values.until("JointSpeeds", is(vec![0.0; 6])).await;
+
+    let settings = simulator::UrSimulatorSettings {
+        lacks: &["payload", "payload_cog"],
+        ..simulator::UrSimulatorSettings::default()
+    };
+    let simulator = UrSimulator::new(settings);
+    let serving = ServedRobot::start(&simulator, "127.0.0.1:0", "127.0.0.1:0").await;
+    let old = Bench {
+        simulator,
+        serving: serving.unwrap(),
+    };
+    let values = crate::sensors::tests::measured(Arc::new(UrRobot::new(old.settings())));
+    let lacks = |value: &Result<skills::SkillValue, String>| {
+        *value == Err("the robot has no output payload".to_owned())
+    };
+    values.until("LoadMass", lacks).await;
+    // The other values are measured.
+    values
+        .until("SafetyMode", |value| *value == Ok(1.into()))
+        .await;
+}
+
+#[tokio::test]
 async fn a_force_move_ends_at_a_contact_and_says_the_force() {
     let bench = bench_at(1.0, Some(0.45)).await;
     let run = async |z: f64| {

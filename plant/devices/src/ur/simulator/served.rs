@@ -277,9 +277,10 @@ impl<'s> Client<'s> {
     }
 
     fn outputs_agreed(&mut self, names: &str) -> Vec<u8> {
-        let found: Vec<(&str, Option<RecipeType>)> = listed(names)
-            .map(|name| (name, variables::output(name)))
-            .collect();
+        let lacks = self.simulator.lock().settings.lacks;
+        let of = |name: &str| variables::output(name).filter(|_| !lacks.contains(&name));
+        let found: Vec<(&str, Option<RecipeType>)> =
+            listed(names).map(|name| (name, of(name))).collect();
         let mut answer = vec![1];
         answer.extend(kinds(&found).bytes());
         let all: Option<Vec<(String, RecipeType)>> = found

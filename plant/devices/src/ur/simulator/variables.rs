@@ -100,6 +100,8 @@ impl Robot {
             "actual_q" | "target_q" => RecipeValue::Vector(self.joints),
             "actual_TCP_speed" | "target_TCP_speed" => RecipeValue::Vector(self.velocity()),
             "actual_TCP_force" => RecipeValue::Vector(self.force()),
+            "payload" => RecipeValue::F64(self.payload.0),
+            "payload_cog" => RecipeValue::Triple(self.payload.1),
             "robot_mode" => RecipeValue::I32(self.mode()),
             "safety_mode" => RecipeValue::I32(self.safety),
             "runtime_state" => RecipeValue::U32(runtime),
