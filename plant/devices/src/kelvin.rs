@@ -402,7 +402,7 @@ impl Driver for Change {
         };
         if attached == wanted.map(|tool| tool.number) {
             if let Some(tool) = wanted {
-                self.await_ready(tool, &work).await?;
+                self.await_ready(tool, None, &work).await?;
             }
             return Ok(attached_tool(wanted));
         }
@@ -425,9 +425,9 @@ impl Driver for Change {
         let moved = self.moved(&mover, &mut look, (put, wanted), &work).await;
         mover.close().await;
         match moved {
-            Ok(()) => {
+            Ok(locked) => {
                 if let Some(tool) = wanted {
-                    self.await_ready(tool, &work).await?;
+                    self.await_ready(tool, locked, &work).await?;
                 }
                 Ok(attached_tool(wanted))
             }
@@ -516,13 +516,18 @@ impl Change {
         })
     }
 
-    /// Waits until the component of a locked tool is found and its skills have a state.
-    async fn await_ready(&self, tool: &Tool, work: &Work) -> Result<(), KelvinError> {
+    /// Waits until the component of a tool is found and its skills have a state. `locked` is the
+    /// time at which this run locked the tool.
+    async fn await_ready(
+        &self,
+        tool: &Tool,
+        locked: Option<Instant>,
+        work: &Work,
+    ) -> Result<(), KelvinError> {
         let Some(detector) = &self.changer.peers.detector else {
             return Ok(());
         };
         work.step("WaitForReady").await;
-        let began = Instant::now();
         let limit = self.changer.settings.ready_within;
         let mut why = "it is not found".to_owned();
         let any = ParameterType::own("SkillType");
@@ -552,11 +557,11 @@ impl Change {
                 why,
             });
         }
-        let took = began.elapsed().as_millis();
-        work.note(format!(
-            "{} is ready {took} ms after it was locked",
-            tool.uri
-        ))
+        let uri = &tool.uri;
+        work.note(match locked.map(|locked| locked.elapsed().as_millis()) {
+            Some(took) => format!("{uri} is ready {took} ms after it was locked"),
+            None => format!("{uri} is ready"),
+        })
         .await;
         Ok(())
     }
@@ -584,14 +589,16 @@ impl Change {
             .ok_or(KelvinError::NoDock { number })
     }
 
+    /// Puts a tool and takes another one. Returns the time at which the tool was locked.
     async fn moved(
         &self,
         mover: &ConnectedMover,
         look: &mut Look,
         (put, take): (Option<&Tool>, Option<&Tool>),
         work: &Work,
-    ) -> Result<(), KelvinError> {
+    ) -> Result<Option<Instant>, KelvinError> {
         let within = self.changer.settings.within;
+        let mut locked = None;
         if let Some(tool) = put {
             self.power_off(tool, work).await?;
             mover.go(&tool.put(), within, work).await?;
@@ -604,11 +611,12 @@ impl Change {
             mover.go(&tool.take(), within, work).await?;
             work.step("WaitForTool").await;
             look.until(ChangerReading::Tool(tool.number), work).await?;
+            locked = Some(Instant::now());
             self.changer.remember(tool);
             self.changer.show(Some(ChangerReading::Tool(tool.number)));
             mover.go(&[tool.leave()], within, work).await?;
         }
-        Ok(())
+        Ok(locked)
     }
 }
 

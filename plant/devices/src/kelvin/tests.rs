@@ -45,8 +45,12 @@ fn skill(name: &str, driver: Arc<dyn Driver>, authority: &Authority) -> Arc<dyn 
 }
 
 async fn bench() -> Bench {
+    bench_at(50.0).await
+}
+
+async fn bench_at(time_scale: f64) -> Bench {
     let settings = ur::simulator::UrSimulatorSettings {
-        time_scale: 50.0,
+        time_scale,
         ..ur::simulator::UrSimulatorSettings::default()
     };
     let robot = ur::simulator::UrSimulator::new(settings);
@@ -228,6 +232,39 @@ async fn a_ring_that_is_half_way_is_left_to_people() {
     let expected =
         "nothing is moved: its ring is between open and locked, and somebody has to look at it";
     assert_eq!(told, (false, expected.to_owned()));
+}
+
+#[tokio::test]
+async fn a_robot_that_is_lost_while_the_ring_turns_leaves_the_outcome_unknown() {
+    let bench = bench_at(10.0).await;
+    let (converter, robot, following) = bench._served;
+    let attach = async || {
+        let types = [ParameterType::own("AttachToolSkillType")];
+        let driver = bench.changer.driver(&types, &PeerAccess::default());
+        let given = given(URIS[0]);
+        let ran = conformance::run_once("AttachToolSkillType", driver.unwrap(), given);
+        ran.await.unwrap()
+    };
+    let lose = async {
+        let until = Instant::now() + Duration::from_secs(20);
+        while bench.simulator.reading() != ChangerReading::Intermediate {
+            assert!(Instant::now() < until);
+            sleep(Duration::from_millis(2)).await;
+        }
+        drop((robot, following));
+    };
+    let (outcome, ()) = tokio::join!(attach(), lose);
+    let told = &outcome.message;
+    assert!(!outcome.succeeded && outcome.unknown, "{told}");
+    assert!(told.contains("Lock: "), "{told}");
+    let between = "its ring is between open and locked";
+    assert!(told.ends_with(between), "{told}");
+    assert_eq!(bench.changer.shown.borrow().current, None);
+    // Another run moves nothing, and a person has to look at the changer.
+    let again = attach().await;
+    let expected = format!("nothing is moved: {between}, and somebody has to look at it");
+    assert_eq!((again.unknown, again.message), (false, expected));
+    drop(converter);
 }
 
 #[tokio::test]
