@@ -111,7 +111,7 @@ impl Methods {
         }
         let node = self.node(topic);
         let Some(around) = self.insert(&node, (topic, description)) else {
-            warn!(%topic, %node, "cannot show the call as a Method: its NodeId belongs to another node, or to a Method with other arguments");
+            warn!(%topic, name = description.name, %node, "cannot show the call as a Method: its NodeId belongs to another node, or to a Method with other arguments");
             self.refused.insert(topic, Arc::clone(description));
             return;
         };

@@ -12,7 +12,8 @@ pub(crate) use overview::status;
 pub(crate) use pages::{HopPage, StatusPage, TopicPage, of_url as page_of_url};
 pub(crate) use processes::own_drops;
 pub(crate) use tap::{
-    DROPPED, MEASURED, TapEvent, TappedProgram, pages as tapped_pages, tap, topic as tapped_topic,
+    DROPPED, MEASURED, TapEvent, TappedProgram, name as tapped_name, pages as tapped_pages, tap,
+    topic as tapped_topic,
 };
 
 /// Returns the status pages of the programs on this host.

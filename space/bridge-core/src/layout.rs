@@ -8,6 +8,7 @@ use messages::ArrayRank;
 use uadp::discovery::{DataSetMetaDataType, VersionMatch};
 use uadp::{BuiltinType, ConfigurationVersion, DataSetHeader, RawField};
 
+use crate::call::split_name;
 use crate::description::{DescriptionFault, MAX_FIELDS, MAX_NAME};
 use crate::learned::Weight;
 
@@ -16,6 +17,8 @@ use crate::learned::Weight;
 pub(crate) struct DataSetLayout {
     from: SocketAddr,
     version: ConfigurationVersion,
+    /// The display name; may be empty.
+    name: String,
     fields: Vec<Field>,
 }
 
@@ -59,9 +62,12 @@ impl DataSetLayout {
                 max_string_length: field.max_string_length,
             })
         });
+        let (_, name) = meta_data.name.and_then(split_name).unzip();
+        let name = name.filter(|name| name.len() <= MAX_NAME);
         Ok(Self {
             from,
             version: meta_data.configuration_version,
+            name: name.unwrap_or_default().to_owned(),
             fields: fields.collect::<Result<_, _>>()?,
         })
     }
@@ -85,8 +91,14 @@ impl DataSetLayout {
         Self {
             from: (Ipv4Addr::UNSPECIFIED, 0).into(),
             version: ConfigurationVersion::default(),
+            name: variable.name.clone(),
             fields: fields.collect(),
         }
+    }
+
+    /// Returns the display name, which is empty if the writer announced none.
+    pub(crate) fn name(&self) -> &str {
+        &self.name
     }
 
     /// Returns whether the sender at the address announced this layout.
@@ -125,7 +137,10 @@ impl Weight for DataSetLayout {
             .fields
             .iter()
             .map(|field| field.name.len() + size_of_val(&*field.array_dimensions));
-        inner.sum::<usize>() + self.fields.len() * size_of::<Field>() + size_of::<Self>()
+        inner.sum::<usize>()
+            + self.name.len()
+            + self.fields.len() * size_of::<Field>()
+            + size_of::<Self>()
     }
 }
 

@@ -114,6 +114,12 @@ impl<T: Weight + PartialEq> Learned<T> {
         self.known.get(&topic).map(|known| &known.described)
     }
 
+    /// Returns the last description of each topic, even if it has expired, in no particular order.
+    pub(crate) fn iter(&self) -> impl Iterator<Item = (TopicId, &T)> {
+        let known = self.known.iter();
+        known.map(|(topic, known)| (*topic, &*known.described))
+    }
+
     pub(crate) fn forget(&mut self, topic: TopicId) {
         if let Some(known) = self.known.remove(&topic) {
             self.weight -= known.described.weight();

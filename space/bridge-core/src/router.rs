@@ -22,6 +22,7 @@ mod local;
 mod local_sample;
 mod metadata;
 mod muted;
+mod names;
 mod own;
 mod parts;
 mod reassembly;
@@ -113,7 +114,8 @@ use crate::tap::{Crossing, Tapped};
 ///   [`is_to_confirm`](Self::is_to_confirm), [`expiry`](Self::expiry),
 ///   [`is_tapped`](Self::is_tapped).
 /// - calls and programs: [`calls`](Self::calls), [`described_call`](Self::described_call),
-///   [`applications`](Self::applications).
+///   [`applications`](Self::applications), [`name_of`](Self::name_of),
+///   [`names_without_values`](Self::names_without_values).
 /// - the Router: [`mapping`](Self::mapping), [`others`](Self::others), [`hops`](Self::hops),
 ///   [`groups`](Self::groups), [`redundancy`](Self::redundancy), [`is_standby`](Self::is_standby),
 ///   [`muted_samples`](Self::muted_samples), [`interest`](Self::interest).

@@ -277,7 +277,8 @@ impl<S: Send> SpaceCalls<S> {
             return;
         };
         if let State::Offered { server, .. } = known.state {
-            info!(%topic, "the program that executes the call withdrew it: its service is closed");
+            let name = &known.described.name;
+            info!(%topic, name, "the program that executes the call withdrew it: its service is closed");
             if self.asked.values().any(|asked| asked.topic == topic) {
                 self.leaving.push((now, topic, server));
             }
@@ -452,7 +453,8 @@ impl<S: Send> SpaceCalls<S> {
             known.state = match offered {
                 Ok((service_type, server)) => {
                     let (service, service_type_name) = (&target.name, service_type.name());
-                    info!(%topic, service, service_type = %service_type_name, "offered the call to ROS as a service");
+                    let name = &known.described.name;
+                    info!(%topic, name, service, service_type = %service_type_name, "offered the call to ROS as a service");
                     left -= 1;
                     events.push(PortEvent::CallBound {
                         topic,

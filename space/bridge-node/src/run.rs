@@ -405,11 +405,11 @@ impl<P: Port> Shell<P> {
                 selection,
             } => match self.router.bind(topic, &message_type, &selection, now()) {
                 Ok(()) => {
-                    let name = self.name_of(topic);
+                    let name = self.router.name_of(topic);
                     info!(%topic, message_type = %message_type.name(), name, "bridging");
                 }
                 Err(error) => {
-                    let name = self.name_of(topic);
+                    let name = self.router.name_of(topic);
                     warn!(%topic, %error, name, "cannot bridge the topic");
                     // Values would be misread with the previous binding.
                     self.router.unbind(topic, now());
@@ -444,7 +444,7 @@ impl<P: Port> Shell<P> {
     }
 
     fn unbound(&mut self, topic: TopicId) {
-        info!(%topic, "stopped bridging");
+        info!(%topic, name = self.router.name_of(topic), "stopped bridging");
         self.router.unbind(topic, now());
     }
 
@@ -504,11 +504,11 @@ impl<P: Port> Shell<P> {
                     let _reported = self.handed(topic, Some(instance));
                 }
                 Output::CommanderLost { topic } => {
-                    let name = self.name_of(topic);
+                    let name = self.router.name_of(topic);
                     warn!(%topic, name, "the commander is lost: published the value of `on_loss`");
                 }
                 Output::Notice(notice) => {
-                    let name = notice.topic.and_then(|topic| self.name_of(topic));
+                    let name = notice.topic.and_then(|topic| self.router.name_of(topic));
                     tell(&notice, name);
                 }
                 Output::KeysWanted { group } => self.keys.want(&group),
@@ -531,15 +531,10 @@ impl<P: Port> Shell<P> {
         true
     }
 
-    /// Returns the name of a topic in the mapping.
-    fn name_of(&self, topic: TopicId) -> Option<&str> {
-        let variable = self.router.mapping().variable(topic);
-        variable.map(|variable| variable.name.as_str())
-    }
-
     fn silent(&mut self, topic: TopicId, silent: bool, dropped: Option<Reason>) {
         if let Some(reason) = dropped {
-            debug!(%topic, %reason, "messages of the writer are received, but its values are dropped");
+            let name = self.router.name_of(topic);
+            debug!(%topic, %reason, name, "messages of the writer are received, but its values are dropped");
         }
         self.observe(|observer| observer.silent(topic, silent));
         self.port.silent(topic, silent);

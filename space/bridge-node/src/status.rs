@@ -8,7 +8,7 @@ use std::fmt::Write as _;
 use std::time::Duration;
 
 use bridge_core::{CallCounters, Counters, Delays, Hop, Reason, Router};
-use mappings::{SpaceId, Variable};
+use mappings::{SpaceId, TopicId, Variable};
 use serde::Serialize;
 use service::PageState;
 use uadp::Timestamp;
@@ -37,6 +37,9 @@ pub(crate) struct StatusSnapshot {
     /// The secured groups by SecurityGroupId.
     groups: BTreeMap<String, GroupStatus>,
     topics: BTreeMap<String, TopicStatus>,
+    /// Names of topics without a value so far, of the mapping and of other programs.
+    #[serde(skip_serializing_if = "BTreeMap::is_empty")]
+    topics_without_values: BTreeMap<String, TopicNames>,
     /// Calls that are known, requested or executed here.
     calls: BTreeMap<String, CallStatus>,
     /// Other servers to which the program is a client.
@@ -120,12 +123,8 @@ struct GroupStatus {
 
 #[derive(Debug, Clone, Serialize)]
 struct TopicStatus {
-    /// Name in the mapping.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    name: Option<String>,
-    /// ROS topics and services of the value, each with its space.
-    #[serde(skip_serializing_if = "Vec::is_empty")]
-    ros_topics: Vec<RosTopic>,
+    #[serde(flatten)]
+    names: TopicNames,
     sent: u64,
     delivered: u64,
     repeated: u64,
@@ -142,6 +141,17 @@ struct TopicStatus {
     dropped: BTreeMap<&'static str, u64>,
 }
 
+/// The names that people gave a topic.
+#[derive(Debug, Clone, Default, Serialize)]
+struct TopicNames {
+    /// The name in the mapping, or the name that its writer announced.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    name: Option<String>,
+    /// ROS topics and services of the value, each with its space.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    ros_topics: Vec<RosTopic>,
+}
+
 #[derive(Debug, Clone, Serialize)]
 struct RosTopic {
     space: u8,
@@ -150,7 +160,7 @@ struct RosTopic {
 
 #[derive(Debug, Clone, Serialize)]
 struct CallStatus {
-    /// Display name of a call that another program executes.
+    /// Display name of the call.
     #[serde(skip_serializing_if = "Option::is_none")]
     name: Option<String>,
     /// Whether another program executes it at the moment.
@@ -184,11 +194,13 @@ impl StatusSnapshot {
             .topics()
             .map(|(topic, counters)| {
                 let mut status = TopicStatus::from(counters);
-                if let Some(variable) = router.mapping().variable(topic) {
-                    status.take_names(variable);
-                }
+                status.names = TopicNames::of(router, topic);
                 (topic.to_string(), status)
             })
+            .collect();
+        let topics_without_values = router
+            .names_without_values()
+            .map(|(topic, _)| (topic.to_string(), TopicNames::of(router, topic)))
             .collect();
         let groups = router.groups().map(|state| {
             let status = GroupStatus {
@@ -202,9 +214,10 @@ impl StatusSnapshot {
         let calls = router
             .calls()
             .map(|(topic, counters)| {
-                let known = router.described_call(topic);
-                let name = known.map(|known| known.name.clone());
-                (topic.to_string(), CallStatus::of(counters, name))
+                let is_known = router.described_call(topic).is_some();
+                let mut status = CallStatus::of(counters, is_known);
+                status.name = router.name_of(topic).map(str::to_owned);
+                (topic.to_string(), status)
             })
             .collect();
         let hops = HOPS
@@ -225,6 +238,7 @@ impl StatusSnapshot {
             },
             groups: groups.collect(),
             topics,
+            topics_without_values,
             calls,
             servers: Vec::new(),
             certificate: None,
@@ -268,13 +282,19 @@ impl StatusSnapshot {
         self
     }
 
-    /// Returns a figure for Prometheus with the names of each topic that the mapping names.
-    fn topic_names(&self, own: &str) -> String {
-        let named = self.topics.iter().filter_map(|(topic, status)| {
-            let labels = status.named(topic)?;
+    /// Returns a figure for Prometheus with the names of each topic and call that has a name.
+    fn names(&self, own: &str) -> String {
+        let topics = self.topics.iter().filter_map(|(topic, status)| {
+            let labels = status.names.labels(topic)?;
             Some(format!("ua_topic_info{{{own},{labels}}} 1\n"))
         });
-        named.collect()
+        let calls = self.calls.iter().filter_map(|(topic, status)| {
+            let name = escaped(status.name.as_deref()?);
+            Some(format!(
+                "ua_call_info{{{own},call=\"{topic}\",name=\"{name}\"}} 1\n"
+            ))
+        });
+        topics.chain(calls).collect()
     }
 
     pub(crate) fn with_carrier(
@@ -430,7 +450,7 @@ impl PageState for StatusSnapshot {
         for (hop, delays) in &self.hops {
             delays.figures(&format!("{own},hop=\"{hop}\""), &mut line);
         }
-        text.push_str(&self.topic_names(&own));
+        text.push_str(&self.names(&own));
         text
     }
 }
@@ -486,11 +506,12 @@ impl LinkState {
 
 /// Escapes a text for the value of a label.
 fn escaped(text: &str) -> String {
-    text.replace('\\', "\\\\").replace('"', "\\\"")
+    let quoted = text.replace('\\', "\\\\").replace('"', "\\\"");
+    quoted.replace('\n', "\\n")
 }
 
 impl CallStatus {
-    fn of(counters: &CallCounters, name: Option<String>) -> Self {
+    fn of(counters: &CallCounters, known: bool) -> Self {
         let CallCounters {
             asked,
             answered,
@@ -500,8 +521,8 @@ impl CallStatus {
             drops,
         } = counters;
         Self {
-            known: name.is_some(),
-            name: name.filter(|name| !name.is_empty()),
+            known,
+            name: None,
             asked: *asked,
             answered: *answered,
             refused: *refused,
@@ -516,18 +537,22 @@ impl CallStatus {
     }
 }
 
-impl TopicStatus {
-    fn take_names(&mut self, variable: &Variable) {
-        self.name = Some(variable.name.clone());
-        let names = variable.ros_names().map(|(space, topic)| RosTopic {
+impl TopicNames {
+    fn of(router: &Router, topic: TopicId) -> Self {
+        let variable = router.mapping().variable(topic);
+        let ros_topics = variable.into_iter().flat_map(Variable::ros_names);
+        let ros_topics = ros_topics.map(|(space, topic)| RosTopic {
             space: space.get(),
             topic: topic.to_owned(),
         });
-        self.ros_topics = names.collect();
+        Self {
+            name: router.name_of(topic).map(str::to_owned),
+            ros_topics: ros_topics.collect(),
+        }
     }
 
     /// Returns the labels of a topic with its names; `None` without a name.
-    fn named(&self, topic: &str) -> Option<String> {
+    fn labels(&self, topic: &str) -> Option<String> {
         let name = self.name.as_deref()?;
         let of = |ros: &RosTopic| format!("{} {}", ros.space, ros.topic);
         let ros: Vec<String> = self.ros_topics.iter().map(of).collect();
@@ -541,8 +566,7 @@ impl TopicStatus {
 impl From<&Counters> for TopicStatus {
     fn from(counters: &Counters) -> Self {
         Self {
-            name: None,
-            ros_topics: Vec::new(),
+            names: TopicNames::default(),
             sent: counters.sent,
             delivered: counters.delivered,
             repeated: counters.repeated,

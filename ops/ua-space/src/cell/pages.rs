@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr};
 use std::time::Duration;
 
+use mappings::TopicId;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use tokio::task::JoinSet;
@@ -28,6 +29,9 @@ pub(crate) struct StatusPage {
     pub(crate) waiting_for: Vec<String>,
     pub(crate) mapping: MappingPage,
     pub(crate) topics: BTreeMap<String, TopicPage>,
+    /// The topics of the mapping and of announcements without a value so far.
+    #[serde(skip_serializing_if = "BTreeMap::is_empty")]
+    pub(crate) topics_without_values: BTreeMap<String, TopicPage>,
     pub(crate) others: TopicPage,
     pub(crate) certificate: Option<CertificatePage>,
     pub(crate) servers: Vec<ServerPage>,
@@ -100,7 +104,7 @@ pub(crate) struct RosTopicPage {
 }
 
 impl TopicPage {
-    /// Returns the name in the mapping and the ROS topics.
+    /// Returns the name of the mapping or of the announcement, and the ROS topics.
     pub(super) fn names(&self) -> impl Iterator<Item = &str> {
         let ros = self.ros_topics.iter().map(|ros| ros.topic.as_str());
         self.name.as_deref().into_iter().chain(ros)
@@ -141,6 +145,18 @@ impl StatusPage {
     /// Returns the program and its space for output.
     pub(crate) fn label(&self) -> String {
         format!("{} (space {})", self.program, self.space)
+    }
+
+    /// Returns the topics that the program knows, with and without values.
+    pub(super) fn known_topics(&self) -> impl Iterator<Item = (&String, &TopicPage)> {
+        self.topics.iter().chain(&self.topics_without_values)
+    }
+
+    /// Returns a topic that the program knows.
+    pub(crate) fn known_topic(&self, topic: TopicId) -> Option<&TopicPage> {
+        let topic = topic.to_string();
+        let without = || self.topics_without_values.get(&topic);
+        self.topics.get(&topic).or_else(without)
     }
 }
 

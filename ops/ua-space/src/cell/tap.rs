@@ -38,6 +38,7 @@ async fn run(arguments: &TapArguments) -> Result<(), CommandFailure> {
     let mut ticks = interval(PERIOD);
     ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
     let mut told = PrintedEvents::new(arguments, topic);
+    told.name = name(topic, &pages);
     loop {
         let asked = async {
             ticks.tick().await;
@@ -105,7 +106,7 @@ pub(crate) fn topic(target: &NamedTarget, pages: &[StatusPage]) -> Result<TopicI
     };
     let known: Vec<(&str, Vec<&str>)> = pages
         .iter()
-        .flat_map(|page| &page.topics)
+        .flat_map(StatusPage::known_topics)
         .map(|(topic, one)| (topic.as_str(), one.names().collect()))
         .collect();
     let found: BTreeSet<&str> = fitting(&known, name).into_iter().collect();
@@ -132,6 +133,12 @@ pub(crate) fn topic(target: &NamedTarget, pages: &[StatusPage]) -> Result<TopicI
             several.join(", ")
         ))),
     }
+}
+
+/// Returns the name of a topic that a program knows.
+pub(crate) fn name(topic: TopicId, pages: &[StatusPage]) -> Option<String> {
+    let mut pages = pages.iter();
+    pages.find_map(|page| page.known_topic(topic)?.name.clone())
 }
 
 /// A program that is asked.
@@ -231,6 +238,8 @@ impl TappedProgram {
 struct PrintedEvents<'a> {
     arguments: &'a TapArguments,
     topic: TopicId,
+    /// The name of the topic, if it has one.
+    name: Option<String>,
     lines: u64,
     /// The number of samples for each program and step.
     sums: BTreeMap<(String, String), u64>,
@@ -239,6 +248,8 @@ struct PrintedEvents<'a> {
 #[derive(Serialize)]
 struct SampleJson<'a> {
     topic: String,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    name: Option<&'a str>,
     program: &'a str,
     #[serde(flatten)]
     event: &'a TapEvent,
@@ -249,6 +260,7 @@ impl<'a> PrintedEvents<'a> {
         Self {
             arguments,
             topic,
+            name: None,
             lines: 0,
             sums: BTreeMap::new(),
         }
@@ -265,6 +277,7 @@ impl<'a> PrintedEvents<'a> {
             if self.arguments.json {
                 let shown = SampleJson {
                     topic: self.topic.to_string(),
+                    name: self.name.as_deref(),
                     program: &program,
                     event: &event,
                 };
@@ -299,7 +312,9 @@ impl<'a> PrintedEvents<'a> {
         }
         let mut out = io::stdout().lock();
         if self.sums.is_empty() {
-            writeln!(out, "{}: no sample was seen", self.topic)?;
+            let name = self.name.as_deref().map(harmless);
+            let name = name.map_or_else(String::new, |name| format!("{name}, "));
+            writeln!(out, "{name}{}: no sample was seen", self.topic)?;
         }
         let mut last = "";
         for ((program, kind), count) in &self.sums {
@@ -448,7 +463,8 @@ mod tests {
     fn a_topic_is_found_by_the_names_of_the_programs() {
         let status = r#"{"program":"bridge-ros1","topics":{
             "ua_1_2_10":{"name":"Left.Speed","ros_topics":[{"space":1,"topic":"/left/speed"}]},
-            "ua_1_2_11":{"name":"Right.Speed"}}}"#;
+            "ua_1_2_11":{"name":"Right.Speed"}},
+            "topics_without_values":{"ua_0_7_101":{"name":"gripper.Grasp.State"}}}"#;
         let pages = pages::parse(status).unwrap();
         let of = |name: &str| {
             let found = topic(&name.parse().unwrap(), &pages);
@@ -459,6 +475,7 @@ mod tests {
         for name in ["Left.Speed", "/left/speed", "left/speed", "ua_1_2_10"] {
             assert_eq!(of(name).unwrap(), "ua_1_2_10", "{name}");
         }
+        assert_eq!(of("grasp.state").unwrap(), "ua_0_7_101");
         let wrong = of("Speed").unwrap_err();
         assert_eq!(
             wrong,

@@ -188,6 +188,17 @@ impl RouterCalls {
         (!known.gone).then_some(&known.description)
     }
 
+    /// Returns the display name of an own call, or of a call of another program. It may be empty.
+    pub(super) fn name_of(&self, topic: TopicId) -> Option<&str> {
+        let call = self.table.get(&topic)?;
+        let own = call.own.as_ref().map(|own| own.name.as_str());
+        own.or_else(|| {
+            call.known
+                .as_ref()
+                .map(|known| known.description.name.as_str())
+        })
+    }
+
     /// Returns whether a chunk of a request or response waits for the pace.
     pub(super) fn is_chunking(&self) -> bool {
         !self.chunking.is_empty()

@@ -174,7 +174,8 @@ impl Facades {
         let mut events = Vec::new();
         for topic in over {
             if let Some(known) = self.forget(topic) {
-                info!(%topic, "the program that executes the action withdrew it: its action server is closed");
+                let name = &known.described.name;
+                info!(%topic, name, "the program that executes the action withdrew it: its action server is closed");
                 events.extend(known.unbind(topic));
             }
         }
@@ -379,7 +380,8 @@ impl Known {
         };
         let task = tasks.spawn(facade.run());
         let (action, action_type) = (&target.name, &type_name);
-        info!(%topic, action, %action_type, "offered the action to ROS");
+        let name = &self.described.name;
+        info!(%topic, name, action, %action_type, "offered the action to ROS");
         let call = |topic, service_type: &Arc<_>, map: &Arc<CallMap>| PortEvent::CallBound {
             topic,
             service_type: Arc::clone(service_type),

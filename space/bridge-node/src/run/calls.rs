@@ -29,7 +29,8 @@ impl<P: Port> Shell<P> {
             } => {
                 let bound = self.router.bind_as(topic, (&message_type, note), now());
                 if let Err(error) = bound {
-                    warn!(%topic, %error, "cannot bridge the value of the action");
+                    let name = self.router.name_of(topic);
+                    warn!(%topic, %error, name, "cannot bridge the value of the action");
                 }
             }
             PortEvent::CallBound {
@@ -74,9 +75,10 @@ impl<P: Port> Shell<P> {
     ) {
         let bound = self.router.bind_call(topic, (service_type, map), now());
         let service_type = service_type.name();
+        let name = self.router.name_of(topic);
         match bound {
-            Ok(()) => debug!(%topic, %service_type, "knows the types of the call"),
-            Err(why) => warn!(%topic, %service_type, "the call is not available here: {why}"),
+            Ok(()) => debug!(%topic, %service_type, name, "knows the types of the call"),
+            Err(why) => warn!(%topic, %service_type, name, "the call is not available here: {why}"),
         }
     }
 
@@ -87,7 +89,7 @@ impl<P: Port> Shell<P> {
                 info!(%topic, %service_type, name = offered.name, "executing the calls of the space with this service")
             }
             Err(why) => {
-                warn!(%topic, %service_type, "not executing the calls of the space with this service: {why}")
+                warn!(%topic, %service_type, name = offered.name, "not executing the calls of the space with this service: {why}")
             }
         }
     }
@@ -138,7 +140,7 @@ impl<P: Port> Shell<P> {
 
     /// Removes a call of another program from the port.
     pub(super) fn call_gone(&mut self, topic: TopicId) {
-        debug!(%topic, "a program withdrew its call");
+        debug!(%topic, name = self.router.name_of(topic), "a program withdrew its call");
         self.observe(|observer| observer.call_gone(topic));
         self.port.call_gone(topic);
     }

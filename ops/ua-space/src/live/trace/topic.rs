@@ -18,7 +18,7 @@ use super::super::{Go, ListenEnd, in_group, plain, until};
 use super::{USUAL, Window, figures, head};
 use crate::arguments::{NamedTarget, Trace};
 use crate::cell::{
-    DROPPED, HopPage, MEASURED, TapEvent, TappedProgram, tapped_pages, tapped_topic,
+    DROPPED, HopPage, MEASURED, TapEvent, TappedProgram, tapped_name, tapped_pages, tapped_topic,
 };
 use crate::exit::CommandFailure;
 use crate::iso_time;
@@ -67,18 +67,14 @@ pub(super) fn trace(arguments: &Trace, target: &NamedTarget) -> Result<(), Comma
                 program.lost()
             ));
         }
-        let name = live.name_of(topic).or_else(|| {
-            let page = pages
-                .iter()
-                .find_map(|page| page.topics.get(&topic.to_string()));
-            page.and_then(|page| page.name.clone())
-        });
+        let name = live.name_of(topic).or_else(|| tapped_name(topic, &pages));
         Ok((topic, name, path))
     })?;
     let rows = path.rows();
     if rows.is_empty() {
+        let shown = titled(topic, name.as_deref());
         return Err(CommandFailure::Unavailable(format!(
-            "no new sample of {topic} crossed for {seconds} s\n  = help: `ua-space tap {topic}` shows \
+            "no new sample of {shown} crossed for {seconds} s\n  = help: `ua-space tap {topic}` shows \
              where it is dropped, `ua-space status` what the programs wait for"
         )));
     }
@@ -251,6 +247,14 @@ struct PathJson<'a> {
     hops: &'a [PathRow],
 }
 
+/// Returns the name of a topic, if it has one, and the topic.
+fn titled(topic: TopicId, name: Option<&str>) -> String {
+    match name {
+        Some(name) => format!("{} ({topic})", harmless(name)),
+        None => topic.to_string(),
+    }
+}
+
 fn print(
     arguments: &Trace,
     (topic, name): (TopicId, Option<&str>),
@@ -266,10 +270,7 @@ fn print(
         writeln!(out, "{}", json(&shown)?)?;
         return Ok(());
     }
-    match name {
-        Some(name) => writeln!(out, "{} ({topic})", harmless(name))?,
-        None => writeln!(out, "{topic}")?,
-    }
+    writeln!(out, "{}", titled(topic, name))?;
     let mut table = head(&["HOP"]).yielding([0]);
     for row in rows {
         table.row(std::iter::once(row.label(rows)).chain(figures(&row.delays)));

@@ -94,6 +94,7 @@ impl CallTraffic<'_> {
         let calls = self.calls_mut(now);
         let call = calls.table.entry(topic).or_default();
         let before = call.own.take().and_then(|own| own.announcement);
+        let name = description.name.clone();
         let (_, _, writer_id) = topic.triple();
         let said = (description, types, namespaces, calls.target);
         let made = CallAnnouncement::new(topic, said, before.as_ref(), now.utc);
@@ -102,6 +103,7 @@ impl CallTraffic<'_> {
             Err(error) => (None, Some(error)),
         };
         call.own = Some(Own {
+            name,
             open,
             plan,
             announcement,

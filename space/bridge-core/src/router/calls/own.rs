@@ -11,6 +11,8 @@ use crate::call_plan::ExecutedPlan;
 /// A call of this program.
 #[derive(Debug)]
 pub(super) struct Own {
+    /// The display name; may be empty.
+    pub(super) name: String,
     pub(super) open: bool,
     /// The plan for its payloads, if the local side uses ROS messages.
     pub(super) plan: Option<Arc<ExecutedPlan>>,
