@@ -123,17 +123,17 @@ function sampleTable(samples) {
 }
 
 function drawWaterfall(node, programs) {
-  const bars = programs.flatMap(({ program, space, hops }) => HOPS
+  const bars = programs.flatMap(({ program, space, hops, of_topic: isOfTopic }) => HOPS
     .filter(([name]) => hops[name]?.count)
-    .map(([name, label]) => ({ program, space, label, ...hops[name] })));
+    .map(([name, label]) => ({ program, space, label, isOfTopic, ...hops[name] })));
   render(node, bars, () => {
-    const head = [h("h2", { text: "Hops" }), h("p", { class: "muted", text: "Half of the samples of each program are within the dark bar, 99 % within the light bar." })];
+    const head = [h("h2", { text: "Hops" }), h("p", { class: "muted", text: "Half of the samples are within the dark bar, 99 % within the light bar." })];
     if (!bars.length) return [...head, h("p", { class: "muted", text: "No delays were measured yet." })];
     const most = Math.max(...bars.map((bar) => bar.p99_us), 1);
     return [...head, h("table", { class: "hops" },
       h("thead", {}, h("tr", {}, ["Hop", "Bar", "p50", "p99", "max"].map((name) => h("th", { scope: "col" }, h("span", { class: name === "Bar" ? "unseen" : null, text: name }))))),
       h("tbody", {}, bars.map((bar) => h("tr", {},
-        h("th", { scope: "row" }, h("span", { text: bar.label }), h("span", { class: "muted block", text: `${bar.program}, ${count(bar.count)} samples` })),
+        h("th", { scope: "row" }, h("span", { text: bar.label }), h("span", { class: "muted block", text: `${bar.program}, ${count(bar.count)} samples${bar.isOfTopic ? "" : " of all its topics"}` })),
         h("td", { class: "bars" }, s("svg", { viewBox: "0 0 100 14", preserveAspectRatio: "none", "aria-hidden": "true" },
           s("rect", { class: "far", x: 0, y: 2, width: Math.max(0.8, (bar.p99_us / most) * 100), height: 10, rx: 1 }),
           s("rect", { class: "near", x: 0, y: 2, width: Math.max(0.8, (bar.p50_us / most) * 100), height: 10, rx: 1 }))),

@@ -13,6 +13,7 @@ use mappings::{Mapping, NodeIdText, SpaceId, TopicId, Variable};
 use uadp::Timestamp;
 
 use crate::announced::AnnouncedValue;
+use crate::hops::ShownHops;
 use crate::mes::MesClient;
 use crate::operations::ConditionState;
 use crate::program::ProgramStatus;
@@ -58,6 +59,8 @@ pub(crate) struct CellBoard {
     order: Vec<TopicId>,
     is_ordered: bool,
     watched: BTreeMap<TopicId, Watched>,
+    /// The delays of the samples of watched topics.
+    pub(crate) hops: BTreeMap<TopicId, ShownHops>,
     probed: BTreeMap<TopicId, u8>,
 }
 
@@ -285,6 +288,13 @@ impl CellBoard {
         let watched = self.watched.entry(topic).or_default();
         watched.until = now + WATCHED_FOR;
         watched.samples.iter().rev().cloned().collect()
+    }
+
+    /// Returns the topics that browsers show.
+    pub(crate) fn watched(&self, now: Duration) -> Vec<TopicId> {
+        let watched = self.watched.iter();
+        let watched = watched.filter(|(_, watched)| watched.until > now);
+        watched.map(|(topic, _)| *topic).collect()
     }
 
     /// Returns topics with values and without a description, each at most a few times.

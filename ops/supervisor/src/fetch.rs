@@ -69,8 +69,13 @@ pub(crate) enum FetchFault {
 impl StatusUrl {
     /// Reads the status.
     pub(crate) async fn fetch(&self) -> Result<Value, FetchFault> {
+        self.get(Uri::from_static("/status")).await
+    }
+
+    /// Reads the JSON of a path beside the status.
+    pub(crate) async fn get(&self, path: Uri) -> Result<Value, FetchFault> {
         let mut request = Request::new(Bytes::new());
-        *request.uri_mut() = Uri::from_static("/status");
+        *request.uri_mut() = path;
         let limits = HttpLimits {
             within: LIMIT,
             most: MOST_BYTES,

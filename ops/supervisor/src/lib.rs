@@ -6,8 +6,8 @@
 //!
 //! Reading order: `board` (the last value of each topic), `announced` (names and units),
 //! `program` (rows of programs), `skill` (tiles of skills), `timeline` (events), `view` (what a
-//! browser is sent), `stream` (server-sent events), `fetch` (the status of other programs), `page`
-//! (state and events), `session` (signed-in users), `encode` (forms), `operations` (commands),
+//! browser is sent), `stream` (server-sent events), `fetch` (the status of other programs), `hops`
+//! (the delays of a topic), `page` (state and events), `session` (signed-in users), `encode` (forms), `operations` (commands),
 //! `mes` and `table` (the knowledge of the plant), `proxy`, `tls`, `responses` and `site`
 //! (requests).
 
@@ -15,6 +15,7 @@ mod announced;
 mod board;
 mod encode;
 mod fetch;
+mod hops;
 mod mes;
 mod operations;
 mod page;

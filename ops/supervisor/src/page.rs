@@ -17,6 +17,7 @@ use uadp::{NetworkMessage, PublisherId, SecurityHeader, Timestamp};
 use crate::announced::{self, AnnouncedValue};
 use crate::board::{BoardSample, CellBoard, EventTime};
 use crate::fetch::StatusUrl;
+use crate::hops::TapFollower;
 use crate::mes::{MesClient, RequestSlots};
 use crate::operations::Operations;
 use crate::program::ProgramStatus;
@@ -187,6 +188,27 @@ impl Page {
         None
     }
 
+    /// Reads the delays of the topics that browsers show. A program of another host refuses, and so
+    /// does a program whose topics are tapped by many others.
+    async fn follow_taps(&self, taps: &mut TapFollower) {
+        let mut shown = self.board().watched(self.at().since);
+        shown.truncate(MOST_TAPPED);
+        taps.keep(&shown);
+        for topic in &shown {
+            for url in &self.others {
+                let source = url.to_string();
+                let Ok(path) = taps.request(*topic, &source).parse() else {
+                    continue;
+                };
+                if let Ok(response) = url.get(path).await {
+                    taps.take(*topic, &source, &response);
+                }
+            }
+        }
+        let hops = shown.into_iter().map(|topic| (topic, taps.shown(topic)));
+        self.board().hops = hops.collect();
+    }
+
     /// Counts a browser.
     pub(crate) fn came(&self) {
         self.viewers.fetch_add(1, Ordering::Relaxed);
@@ -216,6 +238,7 @@ impl Page {
 
 /// Reads the status of all programs while browsers are present.
 async fn follow(page: Weak<Page>, statuses: Statuses) {
+    let mut taps = TapFollower::default();
     let mut ticks = interval(LOOK);
     ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
     loop {
@@ -232,6 +255,7 @@ async fn follow(page: Weak<Page>, statuses: Statuses) {
             programs.extend(other(url, status));
         }
         page.board().set_programs(programs);
+        page.follow_taps(&mut taps).await;
     }
 }
 
@@ -395,6 +419,8 @@ fn other(url: &StatusUrl, status: Result<Value, String>) -> Vec<ProgramStatus> {
         .collect()
 }
 
+/// The maximum number of topics whose delays are read.
+const MOST_TAPPED: usize = 4;
 /// The period in which the status of programs is read.
 const LOOK: Duration = Duration::from_secs(1);
 

@@ -9,6 +9,7 @@ use serde_json::{Map, Value, json};
 use crate::board::{CellBoard, TopicEntry, quality};
 use crate::mes::MesClient;
 use crate::operations;
+use crate::program::ProgramStatus;
 use crate::skill;
 use crate::value;
 
@@ -359,14 +360,7 @@ fn topic_view(board: &mut CellBoard, topic: TopicId, now: Duration) -> Value {
             subscribers.push(known);
         }
     }
-    let hops: Vec<Value> = board
-        .programs
-        .iter()
-        .filter_map(|program| {
-            let hops = program.hops()?;
-            Some(json!({ "program": program.name(), "space": program.space(), "hops": hops }))
-        })
-        .collect();
+    let hops = topic_hops(board, topic);
     let why = why(board, topic);
     let Some(entry) = board.topics.get_mut(&topic) else {
         return json!({ "topic": text, "known": false, "why": why, "hops": hops });
@@ -395,6 +389,26 @@ fn topic_view(board: &mut CellBoard, topic: TopicId, now: Duration) -> Value {
     })
 }
 
+/// Returns the delays of the topic at each program. A program that does not report its steps has the
+/// delays of all its topics.
+fn topic_hops(board: &CellBoard, topic: TopicId) -> Vec<Value> {
+    let tapped = board.hops.get(&topic);
+    let of_topic = |program: &ProgramStatus| {
+        let spaces = tapped?.get(&program.source)?;
+        let hops = spaces.get(&program.space()?).cloned();
+        Some(hops.unwrap_or_else(|| json!({})))
+    };
+    let programs = board.programs.iter().filter_map(|program| {
+        let of_topic = of_topic(program);
+        let is_of_topic = of_topic.is_some();
+        let hops = of_topic.or_else(|| program.hops().cloned())?;
+        Some(json!({
+            "program": program.name(), "space": program.space(), "hops": hops, "of_topic": is_of_topic,
+        }))
+    });
+    programs.collect()
+}
+
 /// Returns the reasons why a value is missing, most likely first; empty if it is received.
 fn why(board: &CellBoard, topic: TopicId) -> Vec<String> {
     let entry = board.topics.get(&topic);
@@ -412,9 +426,8 @@ fn why(board: &CellBoard, topic: TopicId) -> Vec<String> {
                 }
             }
         }
-        let serves = |program: &&crate::program::ProgramStatus| {
-            program.space() == Some(u64::from(topic.space.get()))
-        };
+        let serves =
+            |program: &&ProgramStatus| program.space() == Some(u64::from(topic.space.get()));
         let mut serving = board.programs.iter().filter(serves).peekable();
         if serving.peek().is_none() && topic.space != SpaceId::UA {
             reasons.push(format!(
@@ -479,7 +492,7 @@ fn map(board: &mut CellBoard, now: Duration) -> Value {
             // Events may never have been sent.
             silent += usize::from(entry.count > 0 && entry.is_silent);
         }
-        let programs: Vec<&crate::program::ProgramStatus> = board
+        let programs: Vec<&ProgramStatus> = board
             .programs
             .iter()
             .filter(|program| program.space() == Some(u64::from(space.get())))

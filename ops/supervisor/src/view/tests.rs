@@ -177,3 +177,28 @@ fn the_knowledge_has_a_mes_once_its_status_was_read() {
     board.set_programs(vec![program(json!({ "processes": [] }))]);
     assert_eq!(shown(&mut board, 2000), Some(json!(true)));
 }
+
+#[test]
+fn a_topic_has_its_own_hops_where_programs_report_its_steps() {
+    let mut board = filled(1);
+    let of_all = json!({ "out": { "count": 9, "p50_us": 1.0 } });
+    let program = |source: &str, space: u64| ProgramStatus {
+        source: source.to_owned(),
+        status: Ok(json!({ "program": "bridge", "space": space, "hops": of_all })),
+    };
+    board.set_programs(vec![program("a", 1), program("b", 2), program("c", 3)]);
+    let own = json!({ "out": { "count": 2, "p50_us": 7.5 } });
+    let reporting = [
+        ("a".to_owned(), [(1, own.clone())].into()),
+        ("b".to_owned(), [].into()),
+    ];
+    board.hops.insert(topic("ua_1_2_1"), reporting.into());
+    let view = BrowserView::parse("view=topic&topic=ua_1_2_1").unwrap();
+    let mut viewer = Viewer::new(view);
+    let shown = data(&viewer.next(&mut board, at(0).since).unwrap());
+    let hops = shown["hops"].as_array().unwrap();
+    let of = |at: usize| (&hops[at]["hops"], hops[at]["of_topic"].as_bool().unwrap());
+    assert_eq!(of(0), (&own, true));
+    assert_eq!(of(1), (&json!({}), true));
+    assert_eq!(of(2), (&of_all, false));
+}
