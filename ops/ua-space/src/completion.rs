@@ -57,6 +57,8 @@ enum Names {
     Skills,
     /// Components and skills.
     Either,
+    /// Skill types.
+    Types,
     Calls,
     /// Values of the OPC UA side, which `write` writes.
     Written,
@@ -144,6 +146,7 @@ impl WordPosition {
         match completed.get_value_names()?.first()?.as_str() {
             "SKILL" => Some(Names::Skills),
             "COMPONENT|SKILL" => Some(Names::Either),
+            "TYPE" => Some(Names::Types),
             "TOPIC|NAME" if self.command.get_name() == "start" => Some(Names::Skills),
             "TOPIC|NAME" if self.command.get_name() == "call" => Some(Names::Calls),
             "TOPIC|NAME" if self.command.get_name() == "write" => Some(Names::Written),
@@ -163,6 +166,7 @@ impl Names {
         let HeardNames {
             components,
             mut skills,
+            types,
             calls,
             mut topics,
             names,
@@ -175,6 +179,7 @@ impl Names {
                 skills.extend(components);
                 skills
             }
+            Self::Types => types,
             Self::Calls if typed.starts_with("ua_") => topics,
             Self::Calls => {
                 // The Start call of a skill is completed by the name of the skill alone.
@@ -194,12 +199,15 @@ impl Names {
     }
 }
 
+/// The options with a value that locate the space.
+const GROUP_OPTIONS: [&str; 5] = ["--interface", "--address", "--broker", "--cell", "--keys"];
+
 /// Returns the location of the space from the words typed so far and the environment.
 fn group(before: &[String]) -> GroupArguments {
     let mut words = vec!["ua-space".to_owned()];
     let mut rest = before.iter();
     while let Some(word) = rest.next() {
-        if ["--interface", "--address", "--cell", "--keys"].contains(&word.as_str()) {
+        if GROUP_OPTIONS.contains(&word.as_str()) {
             words.push(word.clone());
             words.extend(rest.next().cloned());
         } else if word == "--sign" {
@@ -244,6 +252,8 @@ const FISH: &str = r#"complete -c ua-space -a '(ua-space complete -- (commandlin
 
 #[cfg(test)]
 mod tests {
+    use std::path::Path;
+
     use super::*;
 
     fn place(line: &[&str]) -> WordPosition {
@@ -282,6 +292,7 @@ mod tests {
             (&["info"], Some(Names::Topics)),
             (&["write"], Some(Names::Written)),
             (&["trace", "--follow"], Some(Names::Values)),
+            (&["types"], Some(Names::Types)),
             (&["echo", "--seconds"], None),
             (&["check"], None),
         ] {
@@ -290,6 +301,7 @@ mod tests {
         let heard = || HeardNames {
             components: vec!["gripper".to_owned()],
             skills: vec!["gripper.Grasp".to_owned()],
+            types: vec!["GraspSkillType".to_owned()],
             calls: vec![
                 "gripper.Grasp.Start".to_owned(),
                 "gripper.Grasp.Halt".to_owned(),
@@ -308,7 +320,17 @@ mod tests {
             Names::Calls.of(heard(), "g"),
             ["gripper.Grasp", "gripper.Grasp.Halt"]
         );
-        let words = ["skills", "--interface", "lo", "info"].map(str::to_owned);
-        assert_eq!(group(&words).interface.as_deref(), Some("lo"));
+        assert_eq!(Names::Types.of(heard(), "G"), ["GraspSkillType"]);
+        let words = [
+            "skills",
+            "--interface",
+            "lo",
+            "--broker",
+            "cell.yaml",
+            "info",
+        ];
+        let located = group(&words.map(str::to_owned));
+        assert_eq!(located.interface.as_deref(), Some("lo"));
+        assert_eq!(located.broker.as_deref(), Some(Path::new("cell.yaml")));
     }
 }

@@ -201,6 +201,24 @@ impl AnnouncedDescription {
         }
     }
 
+    /// Returns the summary, or the numbers of fields of a call if its summary is longer than
+    /// `limit` characters: a signature that is cut off says less.
+    pub(crate) fn summary_within(&self, limit: usize) -> String {
+        let summary = self.summary();
+        match &self.what {
+            DescribedKind::Call(call) if summary.chars().count() > limit => {
+                let [takes, gives] =
+                    [&call.request, &call.response].map(|fields| match fields.len() {
+                        0 => String::new(),
+                        1 => "1 field".to_owned(),
+                        several => format!("{several} fields"),
+                    });
+                format!("({takes}) -> ({gives})")
+            }
+            DescribedKind::Call(_) | DescribedKind::Value(_) => summary,
+        }
+    }
+
     /// Returns the approximate size in bytes.
     pub(crate) fn weight(&self) -> usize {
         let of = |fields: &[AnnouncedField]| -> usize {
@@ -483,6 +501,26 @@ mod tests {
         let other = described("geometry_msgs/Twist as bytes");
         assert_eq!(other.ros_type(), Some("geometry_msgs/Twist"));
         assert_eq!(other.skill_type(), None);
+    }
+
+    #[test]
+    fn a_long_signature_is_shown_by_its_numbers_of_fields() {
+        let field = |name| AnnouncedField::plain(name, BuiltinType::Boolean, None);
+        let call = AnnouncedDescription {
+            what: DescribedKind::Call(DescribedCall {
+                request: vec![field("on")],
+                response: vec![field("success"), field("is_running")],
+                targets: vec![1],
+                action: None,
+            }),
+            ..described("")
+        };
+        let whole = "(on: Boolean) -> (success: Boolean, is_running: Boolean)";
+        assert_eq!(call.summary_within(60), whole);
+        assert_eq!(call.summary_within(40), "(1 field) -> (2 fields)");
+        // A type of ROS has no shorter form.
+        let value = described("std_msgs/Bool");
+        assert_eq!(value.summary_within(4), "std_msgs/Bool");
     }
 
     #[test]

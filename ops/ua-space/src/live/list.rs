@@ -11,7 +11,7 @@ use uadp::StatusCode;
 use super::book::{Book, DatagramContent, NameKind, TopicValues};
 use super::described::{AnnouncedDescription, AnnouncedField, DescribedKind, ShownField};
 use super::names::unknown;
-use super::text::{TextTable, age, harmless, wrapped};
+use super::text::{TextTable, age, harmless, width, wrapped};
 use super::{Go, Live, in_group, until};
 use crate::arguments::InfoArguments;
 use crate::exit::CommandFailure;
@@ -172,6 +172,8 @@ pub(super) fn table(lines: &[&ListRow<'_>]) -> TextTable {
     let mut table = TextTable::new(HEAD.map(str::to_owned))
         .yielding(YIELDING)
         .leaving_out(SPARE);
+    // The other columns take about 60 characters.
+    let most = width().saturating_sub(60);
     for line in lines {
         let dash = || "-".to_owned();
         let quality = line.quality().filter(|quality| quality != GOOD);
@@ -184,7 +186,7 @@ pub(super) fn table(lines: &[&ListRow<'_>]) -> TextTable {
             line.rate.map_or_else(dash, |rate| format!("{rate:.1}/s")),
             line.age.map_or_else(dash, age),
             quality.unwrap_or_else(dash),
-            line.type_name().unwrap_or_else(dash),
+            line.type_within(most).unwrap_or_else(dash),
         ]);
     }
     table.without_empty_columns()
@@ -246,8 +248,13 @@ impl ListRow<'_> {
     }
 
     fn type_name(&self) -> Option<String> {
+        self.type_within(usize::MAX)
+    }
+
+    /// Returns the type, or a shorter form of a type with more than `limit` characters.
+    fn type_within(&self, limit: usize) -> Option<String> {
         if let Some(described) = self.described {
-            return Some(described.summary());
+            return Some(described.summary_within(limit));
         }
         let heard = self.heard?;
         if heard.secured {

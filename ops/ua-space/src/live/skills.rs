@@ -113,6 +113,10 @@ pub(crate) fn heard_names(group: &GroupArguments) -> Result<HeardNames, CommandF
         Ok(HeardNames {
             components: components.clone(),
             skills: found.iter().map(Skill::name).collect(),
+            types: found
+                .iter()
+                .filter_map(|skill| skill.type_name.clone())
+                .collect(),
             calls: named.filter(|name| !name.is_empty()).collect(),
             topics: live
                 .book
@@ -154,6 +158,8 @@ fn is_of(name: &str, component: &str) -> bool {
 pub(crate) struct HeardNames {
     pub(crate) components: Vec<String>,
     pub(crate) skills: Vec<String>,
+    /// The names of skill types.
+    pub(crate) types: Vec<String>,
     pub(crate) calls: Vec<String>,
     pub(crate) topics: Vec<String>,
     /// The names of values and calls, and the ROS topics.
