@@ -384,7 +384,8 @@ mod tests {
     }
 
     fn add(knowledge: &Knowledge, subject: usize) {
-        let mut writing = knowledge.write().unwrap();
+        let mut writer = knowledge.writer().unwrap();
+        let mut writing = writer.begin().unwrap();
         let change = GraphChange {
             added: vec![triple(subject)],
             removed: Vec::new(),
@@ -399,7 +400,8 @@ mod tests {
         {
             let (knowledge, _) = Knowledge::open(&folder).unwrap();
             add(&knowledge, 0);
-            let mut writing = knowledge.write().unwrap();
+            let mut writer = knowledge.writer().unwrap();
+            let mut writing = writer.begin().unwrap();
             for (added, removed) in [(vec![triple(1)], vec![]), (vec![], vec![triple(1)])] {
                 writing
                     .change(&graph(), GraphChange { added, removed })

@@ -396,7 +396,7 @@ impl Work {
             prepared.dataset_mut().set_available_named_graphs(named);
         }
         let results = prepared
-            .on_store(self.knowledge.store())
+            .on_store(&self.knowledge.store())
             .execute()
             .map_err(|error| self.fault(&error))?;
         self.written(results)

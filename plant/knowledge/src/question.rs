@@ -387,7 +387,7 @@ impl Knowledge {
         let prepared = SparqlEvaluator::new()
             .parse_query(&sparql)
             .map_err(|error| fault(error.to_string()))?;
-        match prepared.on_store(self.store()).execute() {
+        match prepared.on_store(&self.store()).execute() {
             Ok(QueryResults::Solutions(solutions)) => {
                 let answer = question
                     .answer(solutions)

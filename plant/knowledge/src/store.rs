@@ -2,7 +2,7 @@
 
 use std::collections::{BTreeMap, HashSet};
 use std::path::Path;
-use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::sync::{Mutex, MutexGuard, PoisonError, RwLock};
 use std::{fmt, io};
 
 use mtp::{Object, Triple as Statement};
@@ -71,7 +71,8 @@ pub enum KnowledgeFault {
 /// The default graph contains each statement of any source once: the merge as defined by SPARQL,
 /// which counting requires.
 pub struct Knowledge {
-    store: Store,
+    /// The statements. They are copied into another store now and then, see [`StoreWriter`].
+    store: RwLock<Store>,
     /// Serializes the writers.
     written: Mutex<WrittenSources>,
     changed: watch::Sender<u64>,
@@ -83,6 +84,31 @@ pub(crate) struct WrittenSources {
     pub(crate) sources: BTreeMap<KnowledgeSource, SourceStatus>,
     pub(crate) journal: Option<Journal>,
     pub(crate) rules: StoreRules,
+    /// Number of statements that were removed from the current store, which still has them.
+    pub(crate) removed: usize,
+}
+
+/// The only writer of the store.
+///
+/// A store in memory keeps the statements that are removed from it, and their texts. If they are
+/// more than the other statements, the other statements are copied into a new store. Readers of
+/// the old store go on with it.
+pub(crate) struct StoreWriter<'k> {
+    written: MutexGuard<'k, WrittenSources>,
+    store: Store,
+    changed: &'k watch::Sender<u64>,
+}
+
+impl StoreWriter<'_> {
+    /// Begins a change of any number of sources, which readers see as a whole.
+    ///
+    /// # Errors
+    /// [`KnowledgeFault::Store`].
+    pub(crate) fn begin(&mut self) -> Result<StoreChange<'_>, KnowledgeFault> {
+        let transaction = self.store.start_transaction()?;
+        let written = &mut *self.written;
+        Ok(StoreChange::new(written, transaction, self.changed))
+    }
 }
 
 /// Whether a source outlasts the program.
@@ -118,7 +144,7 @@ impl Knowledge {
     /// Fails if memory is not available.
     pub fn new() -> Result<Self, KnowledgeFault> {
         Ok(Self {
-            store: Store::new()?,
+            store: RwLock::new(Store::new()?),
             written: Mutex::default(),
             changed: watch::channel(0).0,
         })
@@ -133,8 +159,9 @@ impl Knowledge {
         let (journal, restored) = Journal::open(folder)?;
         let knowledge = Self::new()?;
         let mut written = knowledge.written();
+        let store = knowledge.store();
         for (source, graph) in restored.graphs {
-            let mut transaction = knowledge.store.start_transaction()?;
+            let mut transaction = store.start_transaction()?;
             let name = named(&source.graph())?;
             for triple in &graph.triples {
                 transaction.insert(triple.as_ref().in_graph(&name));
@@ -183,10 +210,12 @@ impl Knowledge {
         written: &mut WrittenSources,
         rules: StoreRules,
     ) -> Result<(), KnowledgeFault> {
-        let mut transaction = self.store.start_transaction()?;
+        let store = self.store();
+        let mut transaction = store.start_transaction()?;
         let derived = rules.anew(&transaction)?;
         derive(&mut transaction, &derived)?;
         transaction.commit()?;
+        written.removed += derived.removed.len();
         if !written.sources.is_empty() {
             written.derived(derived);
         } else if let Some(rules) = derived.rules {
@@ -270,7 +299,8 @@ impl Knowledge {
                 removed: Vec::new(),
                 added: triples.into_iter().collect(),
             };
-            let mut writing = self.write()?;
+            let mut writer = self.writer()?;
+            let mut writing = writer.begin()?;
             writing.change(source, change)?;
             writing.commit(at)?;
         } else {
@@ -306,7 +336,8 @@ impl Knowledge {
     /// # Errors
     /// [`KnowledgeFault`]; then nothing has changed.
     pub fn remove(&self, source: &KnowledgeSource) -> Result<bool, KnowledgeFault> {
-        let mut writing = self.write()?;
+        let mut writer = self.writer()?;
+        let mut writing = writer.begin()?;
         if !writing.written.sources.contains_key(source) {
             return Ok(false);
         }
@@ -330,26 +361,46 @@ impl Knowledge {
         self.written.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Begins a change of any number of sources, which readers see as a whole.
+    /// Returns the writer of the store.
     ///
     /// # Errors
     /// [`KnowledgeFault::Store`].
-    pub(crate) fn write(&self) -> Result<StoreChange<'_>, KnowledgeFault> {
+    pub(crate) fn writer(&self) -> Result<StoreWriter<'_>, KnowledgeFault> {
         // The sources are locked first: a transaction waits for others without end.
-        let written = self.written();
-        let transaction = self.store.start_transaction()?;
-        Ok(StoreChange::new(written, transaction, &self.changed))
+        let mut written = self.written();
+        let kept = written.sources.values().map(|source| source.statements);
+        if written.removed > kept.sum::<usize>().max(MOST_REMOVED) {
+            self.copy_store()?;
+            written.removed = 0;
+        }
+        Ok(StoreWriter {
+            written,
+            store: self.store(),
+            changed: &self.changed,
+        })
+    }
+
+    /// Copies the statements into a new store, which has nothing of removed statements. The caller
+    /// has locked the sources.
+    fn copy_store(&self) -> Result<(), StorageError> {
+        let (old, new) = (self.store(), Store::new()?);
+        let mut transaction = new.start_transaction()?;
+        for quad in old.quads_for_pattern(None, None, None, None) {
+            transaction.insert(quad?.as_ref());
+        }
+        transaction.commit()?;
+        *self.store.write().unwrap_or_else(PoisonError::into_inner) = new;
+        Ok(())
     }
 
     /// Returns the IRI of a type by its namespace and BrowseName, if a source has it.
     pub fn type_of(&self, namespace: &str, browse_name: &str) -> Option<String> {
+        let store = self.store();
         let find = |subject: Option<NamedOrBlankNodeRef<'_>>, predicate: &str, text: &str| {
             let predicate = NamedNodeRef::new_unchecked(predicate);
             let text = Literal::new_simple_literal(text);
             let object = TermRef::from(&text);
-            let quads = self
-                .store
-                .quads_for_pattern(subject, Some(predicate), Some(object), None);
+            let quads = store.quads_for_pattern(subject, Some(predicate), Some(object), None);
             quads.flatten().map(|quad| quad.subject).collect::<Vec<_>>()
         };
         let named = find(None, vocabulary::BROWSE_NAME, browse_name);
@@ -377,10 +428,10 @@ impl Knowledge {
     /// # Errors
     /// Fails if the store or the writer fails.
     pub fn write_quads(&self, graph: Option<&str>, to: impl io::Write) -> io::Result<Option<()>> {
+        let store = self.store();
         let graph = match graph.map(NamedNodeRef::new) {
             Some(Ok(graph))
-                if self
-                    .store
+                if store
                     .contains_named_graph(graph)
                     .map_err(io::Error::other)? =>
             {
@@ -390,7 +441,7 @@ impl Knowledge {
             None => None,
         };
         let mut to = RdfSerializer::from_format(RdfFormat::NQuads).for_writer(to);
-        for quad in self.store.quads_for_pattern(None, None, None, graph) {
+        for quad in store.quads_for_pattern(None, None, None, graph) {
             let quad = quad.map_err(io::Error::other)?;
             if !quad.graph_name.is_default_graph() {
                 to.serialize_quad(&quad)?;
@@ -410,25 +461,24 @@ impl Knowledge {
         format: RdfFormat,
     ) -> io::Result<Option<Vec<u8>>> {
         let graph = NamedNodeRef::new(graph).map_err(io::Error::other)?;
-        if !self
-            .store
+        let store = self.store();
+        if !store
             .contains_named_graph(graph)
             .map_err(io::Error::other)?
         {
             return Ok(None);
         }
         let mut to = RdfSerializer::from_format(format).for_writer(Vec::new());
-        for quad in self
-            .store
-            .quads_for_pattern(None, None, None, Some(graph.into()))
-        {
+        for quad in store.quads_for_pattern(None, None, None, Some(graph.into())) {
             to.serialize_triple(&Triple::from(quad.map_err(io::Error::other)?))?;
         }
         Ok(Some(to.finish()?))
     }
 
-    pub(crate) fn store(&self) -> &Store {
-        &self.store
+    /// Returns the current store. It may be replaced by a copy at the next change.
+    pub(crate) fn store(&self) -> Store {
+        let store = self.store.read().unwrap_or_else(PoisonError::into_inner);
+        store.clone()
     }
 
     fn put(
@@ -442,7 +492,8 @@ impl Knowledge {
                 most: MAX_STATEMENTS,
             });
         }
-        let mut writing = self.write()?;
+        let mut writer = self.writer()?;
+        let mut writing = writer.begin()?;
         writing.lasting = lasting;
         writing.replace(source, triples)?;
         writing.commit(at)
@@ -542,6 +593,8 @@ pub(crate) fn named(iri: &str) -> Result<NamedNode, KnowledgeFault> {
 /// be larger.
 pub(crate) const MAX_STATEMENTS: usize = 2_000_000;
 pub(crate) const MAX_SOURCES: usize = 2000;
+/// Number of removed statements that a store keeps in any case: copies are for large numbers.
+const MOST_REMOVED: usize = 4096;
 
 #[cfg(test)]
 mod tests {
@@ -569,7 +622,7 @@ mod tests {
             let own = named(&source.graph()).unwrap();
             for graph in [own.as_ref().into(), GraphNameRef::DefaultGraph] {
                 let found = knowledge
-                    .store
+                    .store()
                     .quads_for_pattern(None, None, None, Some(graph))
                     .count();
                 assert_eq!(found, at, "{literal}");
@@ -579,6 +632,40 @@ mod tests {
         knowledge
             .replace_turtle(&source, "<urn:a> <urn:b> <urn:c> .", 0)
             .unwrap();
-        assert_eq!(knowledge.store.len().unwrap(), 2);
+        assert_eq!(knowledge.store().len().unwrap(), 2);
+    }
+
+    #[test]
+    fn removed_statements_do_not_pile_up_in_the_store() {
+        let knowledge = Knowledge::new().unwrap();
+        let stays = KnowledgeSource::new(SourceKind::File, "stays.ttl");
+        let turtle = |run: usize| -> String {
+            let all = 0..100;
+            all.map(|at| format!("<urn:run:{run}> <urn:b> <urn:{run}:{at}> .\n"))
+                .collect()
+        };
+        knowledge.replace_turtle(&stays, &turtle(0), 0).unwrap();
+        let first = knowledge.store();
+        let runs = 3 * MOST_REMOVED / 100;
+        let mut copies = 0;
+        for run in 1..=runs {
+            let before = knowledge.written().removed;
+            let source = KnowledgeSource::new(SourceKind::Run, &run.to_string());
+            knowledge.replace_turtle(&source, &turtle(run), 0).unwrap();
+            assert!(knowledge.remove(&source).unwrap());
+            let removed = knowledge.written().removed;
+            copies += usize::from(removed < before);
+            assert!(removed <= MOST_REMOVED + 200, "{removed}");
+        }
+        assert_eq!(copies, 2);
+        // The statements are in another store, of which readers of the first see nothing.
+        let kept = knowledge.store();
+        assert_eq!(kept.len().unwrap(), 200);
+        let more = KnowledgeSource::new(SourceKind::File, "more.ttl");
+        knowledge.replace_turtle(&more, &turtle(1), 0).unwrap();
+        assert_eq!(kept.len().unwrap(), 400);
+        assert_eq!(first.len().unwrap(), 200);
+        let names: Vec<String> = knowledge.sources().into_iter().map(|of| of.name).collect();
+        assert!(names.contains(&stays.name), "{names:?}");
     }
 }

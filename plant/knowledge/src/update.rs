@@ -69,8 +69,9 @@ impl Knowledge {
         token: &CancellationToken,
         at: u64,
     ) -> Result<Updated, QueryFault> {
+        let mut writer = self.writer()?;
         let mut running = Running {
-            writing: self.write()?,
+            writing: writer.begin()?,
             token,
             changed: 0,
         };

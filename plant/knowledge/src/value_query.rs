@@ -162,7 +162,8 @@ fn evaluated(
 ) -> Result<Value, ValueQueryFault> {
     let failed = |error: QueryEvaluationError| ValueQueryFault::Failed(error.to_string());
     let evaluator = SparqlEvaluator::new().with_cancellation_token(token);
-    let prepared = evaluator.for_query(query).on_store(knowledge.store());
+    let store = knowledge.store();
+    let prepared = evaluator.for_query(query).on_store(&store);
     let QueryResults::Solutions(mut solutions) = prepared.execute().map_err(failed)? else {
         return Err(ValueQueryFault::Form);
     };

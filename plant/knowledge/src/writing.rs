@@ -1,7 +1,6 @@
 //! Changes of the store: statements of graphs, their merge, and the derived statements.
 
 use std::collections::{BTreeMap, BTreeSet, HashSet};
-use std::sync::MutexGuard;
 
 use oxigraph::model::{GraphNameRef, NamedNode, Triple};
 use oxigraph::store::{StorageError, Transaction};
@@ -25,7 +24,7 @@ pub(crate) struct GraphChange {
 
 /// A change of the store. It is undone when it is dropped before the commit.
 pub(crate) struct StoreChange<'a> {
-    pub(crate) written: MutexGuard<'a, WrittenSources>,
+    pub(crate) written: &'a mut WrittenSources,
     pub(crate) transaction: Transaction<'a>,
     changed: &'a watch::Sender<u64>,
     /// Whether the change is about the schema of the rules.
@@ -37,13 +36,15 @@ pub(crate) struct StoreChange<'a> {
     /// Sources that are replaced as a whole, with all their statements.
     whole: BTreeMap<KnowledgeSource, HashSet<Triple>>,
     removed: BTreeSet<KnowledgeSource>,
+    /// Number of removed statements.
+    removed_statements: usize,
     pub(crate) lasting: SourceLifetime,
 }
 
 impl<'a> StoreChange<'a> {
     /// Begins a change of lasting sources.
     pub(crate) fn new(
-        written: MutexGuard<'a, WrittenSources>,
+        written: &'a mut WrittenSources,
         transaction: Transaction<'a>,
         changed: &'a watch::Sender<u64>,
     ) -> Self {
@@ -56,6 +57,7 @@ impl<'a> StoreChange<'a> {
             changes: BTreeMap::new(),
             whole: BTreeMap::new(),
             removed: BTreeSet::new(),
+            removed_statements: 0,
             lasting: SourceLifetime::Yes,
         }
     }
@@ -149,6 +151,7 @@ impl<'a> StoreChange<'a> {
         if extent == Extent::OwlRl {
             self.touched.extend(all().cloned());
         }
+        self.removed_statements += effective.removed.len();
         let count = effective.added.len() + effective.removed.len();
         let kept = self.changes.entry(source.clone()).or_default();
         kept.then(effective);
@@ -200,6 +203,7 @@ impl<'a> StoreChange<'a> {
             rules.after(&self.transaction, &self.touched)?
         };
         derive(&mut self.transaction, &derived)?;
+        self.removed_statements += derived.removed.len();
         let written = &mut *self.written;
         if let Some(journal) = &mut written.journal {
             let known = &written.sources;
@@ -231,6 +235,7 @@ impl<'a> StoreChange<'a> {
             written.sources.remove(source);
         }
         written.sources.extend(statuses);
+        written.removed += self.removed_statements;
         written.derived(derived);
         self.changed.send_modify(|changes| *changes += 1);
         Ok(())
