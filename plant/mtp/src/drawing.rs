@@ -80,7 +80,8 @@ fn line(svg: &mut String, connection: &PictureConnection) {
     );
 }
 
-/// Adds an object. The position of an end of a flow is the corner of its symbol, too.
+/// Adds an object. The position of an end of a flow is the corner of its symbol, too. The width and
+/// height are those of the rotated symbol, so that its box is not rotated.
 fn shape(svg: &mut String, object: &PictureObject, assembly: Option<&DataAssembly>) {
     let Some([x, y]) = object.position else {
         return;
@@ -95,16 +96,9 @@ fn shape(svg: &mut String, object: &PictureObject, assembly: Option<&DataAssembl
     let [middle, below] = match object.size {
         Some([width, height]) => {
             let [middle, centre] = [x + width / 2.0, y + height / 2.0];
-            let turn = match object.rotation == 0.0 {
-                true => String::new(),
-                false => format!(
-                    " transform=\"rotate({} {middle} {centre})\"",
-                    object.rotation
-                ),
-            };
             let _written = write!(
                 svg,
-                "<rect x=\"{x}\" y=\"{y}\" width=\"{width}\" height=\"{height}\" rx=\"4\"{turn}/>"
+                "<rect x=\"{x}\" y=\"{y}\" width=\"{width}\" height=\"{height}\" rx=\"4\"/>"
             );
             [middle, centre]
         }

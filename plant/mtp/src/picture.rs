@@ -42,7 +42,7 @@ pub struct PictureObject {
     pub position: Option<[f64; 2]>,
     /// Its width and height; topology objects have no size.
     pub size: Option<[f64; 2]>,
-    /// Its rotation in degrees.
+    /// The rotation of its symbol in degrees; its size is that of the rotated symbol.
     pub rotation: f64,
     /// Its layer: objects of a higher layer hide those of a lower layer.
     pub layer: f64,
