@@ -8,6 +8,10 @@ pub fn manifest(input: &[u8]) {
         Ok(module) => {
             let triples = module.triples("urn:example:fuzz", &Default::default());
             assert!(!triples.is_empty());
+            for picture in &module.pictures {
+                let drawing = picture.svg(&module.assemblies);
+                assert!(drawing.ends_with("</svg>\n"), "{drawing}");
+            }
         }
         Err(ManifestError::Xml { line, .. }) if !input.starts_with(b"PK") => {
             assert!((1..=input.len() + 1).contains(&line), "{line}");
