@@ -16,6 +16,7 @@ ACTUATORS = {"AnaVlv", "BinVlv", "AnaDrv", "BinDrv", "PIDCtrl"}
 PROCEDURES = {"Procedure", "ServiceProcedure", "ServiceStrategy"}
 PARAMETERS = {"ConfigurationParameter", "ProcedureParameter", "StrategyParameter"}
 OUTPUTS = {"ReportValue", "ProcessValueOut"}
+PARTS = (["VisualObject"], ["TopologyObject"], ["Connection"])
 LINES = {"Pipe", "MeasurementLine", "FunctionLine"}
 LIBRARIES = {"InterfaceClassLib", "SystemUnitClassLib", "RoleClassLib", "AttributeTypeLib"}
 
@@ -185,14 +186,16 @@ class Manifest:
         links = []
         for link in picture.xpath(".//*[local-name()='InternalLink']"):
             sides = [link.get("RefPartnerSideA"), link.get("RefPartnerSideB")]
-            links.append(sorted(owners[side if side in owners else side.split(":")[0].strip("{}")] for side in sides))
+            ids = [side if side in owners else side.split(":")[0].strip("{}") for side in sides]
+            links.append(sorted(owners[side] for side in ids))
         values = attributes(picture)
         return {
             "name": picture.get("Name"),
             "size": numbers(values, "Width", "Height"),
             "objects": [self.shown(one) for one in parts if one not in lines],
             "connections": [
-                [one.get("Name"), kind(one), points(attributes(one).get("Edgepath"))] for one in lines
+                [one.get("Name"), kind(one), points(attributes(one).get("Edgepath"))]
+                for one in lines
             ],
             "ports": len(ports),
             "links": sorted(links),
@@ -200,7 +203,7 @@ class Manifest:
         }
 
     def is_part(self, element):
-        return path(element).split("/")[1:2] in (["VisualObject"], ["TopologyObject"], ["Connection"])
+        return path(element).split("/")[1:2] in PARTS
 
     def shown(self, element):
         """Returns an object of a picture with the name of its data assembly."""

@@ -1,10 +1,10 @@
-"""Runs the published cases of RML with `ua-space rml` and with morph-kgc, and counts both in one run.
+"""Runs the published cases of RML with `ua-space rml` and with morph-kgc, and counts both.
 
     rml_judge.py UA_SPACE CASES
 
-CASES is the folder of the cases. A case without a file of expected statements expects an error. Prints
-a JSON line with the number of cases and, for each program, the number that passed and the others by
-name. The exit code is 1 if a case fails with ua-space. morph-kgc needs numpy 1 and pandas 2.
+CASES is the folder of the cases. A case without a file of expected statements expects an error.
+Prints a JSON line with the number of cases and, for each program, the number that passed and the
+others by name. The exit code is 1 if a case fails with ua-space. morph-kgc needs numpy 1 and pandas 2.
 """
 
 import os

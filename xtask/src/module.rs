@@ -1,4 +1,5 @@
-//! `cargo xtask mtp2` and `cargo xtask rml`: judges by programs that need environments of their own.
+//! `cargo xtask mtp2` and `cargo xtask rml`: judges by programs that need environments of their
+//! own.
 
 use std::process::Command;
 
@@ -29,12 +30,12 @@ pub(crate) fn run(workspace: &Workspace) -> anyhow::Result<CommandOutcome> {
 /// The folders of the published cases of RML with XML sources.
 const RML_CASES: [&str; 2] = ["rml-test-cases", "rml-io"];
 
-/// Installs morph-kgc, builds the programs, and counts the published cases of RML that `ua-space rml`
-/// and morph-kgc pass.
+/// Installs morph-kgc, builds the programs, and counts the published cases of RML that
+/// `ua-space rml` and morph-kgc pass.
 ///
 /// # Errors
-/// Returns an error if the cases are missing, morph-kgc cannot be installed, or the programs cannot be
-/// built.
+/// Returns an error if the cases are missing, morph-kgc cannot be installed, or the programs cannot
+/// be built.
 pub(crate) fn rml(workspace: &Workspace) -> anyhow::Result<CommandOutcome> {
     let data = std::env::var_os("UA_DATA").map_or_else(
         || workspace.root.join("../shared/data"),

@@ -126,8 +126,8 @@ pub(crate) fn mtppy2(workspace: &Workspace) -> anyhow::Result<PathBuf> {
     Ok(python_of(&workspace.peers().join(folder)))
 }
 
-/// Installs morph-kgc, which needs older versions of its libraries than the other peers. Returns the
-/// Python with it.
+/// Installs morph-kgc, which needs older versions of its libraries than the other peers. Returns
+/// the Python with it.
 ///
 /// # Errors
 /// Returns an error if a package cannot be installed.

@@ -7,8 +7,8 @@ use crate::model::MtpFinding;
 use crate::picture::is_picture;
 use crate::read::{is_assembly, is_list, is_parameter, is_procedure};
 
-/// Returns a note for each kind of elements that have no place in the model. `of_pictures` are those
-/// in pictures.
+/// Returns a note for each kind of elements that have no place in the model. `of_pictures` are such
+/// elements in pictures.
 pub(crate) fn notes<'a>(
     root: &'a CaexElement,
     of_pictures: Vec<&'a CaexElement>,

@@ -343,8 +343,8 @@ impl<'a> ElementIndex<'a> {
 }
 
 impl PictureParts<'_> {
-    /// Returns the ID of the port that a side of a link names: the ID of an interface, or that of the
-    /// port with the name of an interface.
+    /// Returns the ID of the port that a side of a link names: the ID of an interface, or the ID of
+    /// the port with the name of an interface.
     fn port(&self, side: &str) -> Option<String> {
         let plain = |id: &str| self.ports.get(id).copied();
         let of_element = || {
