@@ -148,6 +148,22 @@ fn tls_of_clients_knows_no_space() {
 }
 
 #[test]
+fn tls_of_servers_knows_neither_pages_nor_the_space() {
+    does_not_reach(
+        "tls-server",
+        &[
+            "hyper*",
+            "async-opcua*",
+            "uadp",
+            "mappings",
+            "bridge-*",
+            "transport",
+            "service",
+        ],
+    );
+}
+
+#[test]
 fn json_values_reaches_no_io_and_knows_no_space() {
     does_not_reach("json-values", IMPURE);
     does_not_reach(

@@ -40,4 +40,4 @@ pub use operations::{
 pub use page::{Page, Recorded};
 pub use program::is_intended_drop;
 pub use proxy::{ProxyUrl, ProxyUrlError};
-pub use tls::CertificateFiles;
+pub use tls_server::CertificateFiles;

@@ -9,6 +9,7 @@ use bridge_node::{CallDescription, LocalDelivery, Observer, PortEvent, Statuses,
 use bytes::Bytes;
 use mappings::{Mapping, SpaceId, TopicId};
 use serde_json::Value;
+use tls_server::TlsServer;
 use tokio::time::{MissedTickBehavior, interval};
 use tracing::warn;
 use uadp::discovery::{Probe, WireArray};
@@ -25,7 +26,6 @@ use crate::proxy::ProxyUrl;
 use crate::session::BrowserSessions;
 use crate::stream::Worker;
 use crate::timeline;
-use crate::tls::CertificateResolver;
 use crate::view::Viewer;
 
 /// The page of a program.
@@ -35,7 +35,7 @@ pub struct Page {
     /// The reverse proxy through which browsers reach the page, if there is one.
     pub(crate) proxy: Option<ProxyUrl>,
     /// The certificate of the page for browsers of other hosts, if it is served by TLS.
-    pub(crate) tls: OnceLock<Arc<CertificateResolver>>,
+    pub(crate) tls: OnceLock<TlsServer>,
     /// The users and the commands of the program, if it has any.
     pub(crate) operations: OnceLock<Arc<dyn Operations>>,
     pub(crate) sessions: Mutex<BrowserSessions>,
