@@ -8,6 +8,7 @@ mod live_servers;
 mod nodeset_url;
 mod opcua_knowledge;
 mod queries;
+mod remote;
 
 use std::fs;
 use std::io::{Read as _, Write as _};

@@ -452,6 +452,7 @@ mod tests {
         let knowledge = Arc::new(Knowledge::new().unwrap());
         let writes = Writes {
             now: || 1,
+            may_read: Arc::new(|_| Box::pin(async { false })),
             may: Arc::new(|_| Box::pin(async { false })),
             may_run: Arc::new(|_| Box::pin(async { false })),
             files: Arc::new(MesSources::new(Arc::clone(&knowledge))),

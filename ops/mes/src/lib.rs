@@ -13,6 +13,7 @@
 //! - `follow`: from discovery to the graph
 //! - `servers`, `search_limits`: from the address spaces of running servers to the graph
 //! - `sources`, `nodeset_folder`, `nodeset_url`: from files to the graph, while the program runs
+//! - `remote_questions`: questions of users of other hosts
 //! - `goal`: the search for a sequence that reaches a goal
 //! - `jobs`: processes that clients start, several at a time
 //! - `job_orders`, `order_file`, `job_control`: jobs for clients of OPC 10031-4
@@ -42,6 +43,7 @@ mod product_configuration;
 mod read_process;
 mod recipe;
 mod record;
+mod remote_questions;
 mod search_limits;
 mod servers;
 mod settings;
@@ -81,6 +83,7 @@ use crate::jobs::ProcessJobs;
 use crate::knowledge_methods::KnowledgeMethods;
 use crate::locate_skill::LocateObject;
 use crate::order_file::OrderFile;
+use crate::remote_questions::RefusedPasswords;
 use crate::servers::LiveServers;
 use crate::settings::{Connect, Settings};
 use crate::sources::MesSources;
@@ -102,6 +105,10 @@ struct UaMes {
     /// only
     #[arg(long, value_name = "ADDRESS:PORT", env = "UA_SPARQL")]
     sparql: Option<SocketAddr>,
+    /// A further address at which questions of users of other hosts are answered by TLS, with the
+    /// certificate of the MES, in place of the address of the YAML
+    #[arg(long, value_name = "ADDRESS:PORT", env = "UA_SPARQL_TLS")]
+    sparql_tls: Option<SocketAddr>,
     /// The folder for added sources, fetched NodeSets and records of runs, in place of the folder
     /// of the YAML
     #[arg(long, value_name = "DIR", env = "UA_STORE")]
@@ -137,6 +144,8 @@ struct UaMes {
     ready: OnceLock<Ready>,
     #[arg(skip)]
     serving: OnceLock<HttpEndpoint>,
+    #[arg(skip)]
+    serving_tls: OnceLock<HttpEndpoint>,
 }
 
 /// The objects created from the YAML.
@@ -147,6 +156,15 @@ struct Ready {
     knowledge: Arc<Knowledge>,
     servers: Arc<LiveServers>,
     options: ComponentOptions,
+    refused: Arc<RefusedPasswords>,
+}
+
+impl Ready {
+    fn page(&self) -> knowledge::ExtraPages {
+        let has_remote = self.settings.sparql_tls.is_some();
+        let refused = has_remote.then(|| Arc::clone(&self.refused));
+        page(&self.cell, &self.servers, refused)
+    }
 }
 
 impl std::fmt::Debug for Ready {
@@ -236,6 +254,7 @@ impl UaMes {
             knowledge,
             servers,
             options,
+            refused: Arc::default(),
         }))
     }
 
@@ -334,6 +353,7 @@ impl UaMes {
         if let Some(sparql) = self.sparql {
             settings.sparql = sparql;
         }
+        settings.sparql_tls = self.sparql_tls.or(settings.sparql_tls);
         if let Some(lds) = &self.lds {
             settings.lds = Lds::written(lds);
         }
@@ -349,6 +369,7 @@ impl UaMes {
 
     fn options(&self, settings: &Settings) -> ComponentOptions {
         let is_secured = self.gds.gds.is_some()
+            || settings.sparql_tls.is_some()
             || settings
                 .security
                 .contains(&ComponentSecurity::Basic256Sha256);
@@ -376,7 +397,7 @@ impl UaMes {
 
     /// Serves queries, and follows the components of the plant.
     async fn serve(&self, ready: &Ready, queries: Queries, writes: Writes) -> Result<(), Failure> {
-        let page = page(&ready.cell, &ready.servers);
+        let page = ready.page();
         let address = ready.settings.sparql;
         let endpoint = HttpEndpoint::bind_with(address, queries, page, Some(writes)).await;
         let endpoint = endpoint.map_err(|error| {
@@ -493,7 +514,7 @@ impl Program for UaMes {
         let writes = writes(ready, &access, Arc::clone(&jobs));
         let queries = Queries::new(Arc::clone(&ready.knowledge), QueryLimits::default());
         let requests = KnowledgeRequests::new(queries.clone(), &writes);
-        self.serve(ready, queries, writes).await?;
+        self.serve(ready, queries.clone(), writes.clone()).await?;
         let folder = self.store.as_ref().or(ready.settings.store.as_ref());
         let orders = match folder {
             Some(folder) => Orders::of_file(OrderFile::open(folder).map_err(|error| {
@@ -513,6 +534,14 @@ impl Program for UaMes {
             ..ready.options.clone()
         };
         let port = ComponentPort::start(&ready.component, &options)?;
+        if let Some(address) = ready.settings.sparql_tls {
+            // The certificate exists by then.
+            let root = self.pki_root(&ready.settings);
+            let of = (root.as_path(), Arc::clone(&ready.refused));
+            let page = ready.page();
+            let served = remote_questions::serve(address, of, queries, page, writes).await?;
+            drop(self.serving_tls.set(served));
+        }
         if let (Some(iri), Some(skill)) = (&self.run, port.skills().first()) {
             drop(tokio::spawn(run_process(skill.clone(), iri.clone())));
         }
@@ -524,6 +553,7 @@ impl Program for UaMes {
 fn writes(ready: &Ready, access: &Arc<UserAccess>, jobs: Arc<ProcessJobs>) -> Writes {
     Writes {
         now: clock::now,
+        may_read: has(access, UserRole::Observer),
         may: has(access, UserRole::Engineer),
         may_run: has(access, UserRole::Operator),
         files: Arc::clone(ready.cell.sources()) as Arc<dyn SourceFiles>,
@@ -541,7 +571,11 @@ fn has(access: &Arc<UserAccess>, role: UserRole) -> May {
             match user {
                 Some((name, password)) => {
                     let roles = access.roles_by_password(&name, &password, "SPARQL").await;
-                    roles.contains(role) || roles.contains(UserRole::Engineer)
+                    // Each user may read, and engineers do all.
+                    let is_enough = |needed| role == UserRole::Observer || role == needed;
+                    roles
+                        .iter()
+                        .any(|has| is_enough(has) || has == UserRole::Engineer)
                 }
                 None => access.roles_of_anonymous().contains(UserRole::Operator),
             }
@@ -600,13 +634,20 @@ fn read_settings(file: &Path) -> Result<Settings, String> {
 
 /// Returns the pages `/status`, `/plan/IRI` and `/goal/IRI`. `/plan/` shows the plan that would be
 /// run, with its reasons; `/goal/` the sequence that reaches a goal, with its proof.
-fn page(cell: &Arc<PlantState>, servers: &Arc<LiveServers>) -> knowledge::ExtraPages {
+fn page(
+    cell: &Arc<PlantState>,
+    servers: &Arc<LiveServers>,
+    refused: Option<Arc<RefusedPasswords>>,
+) -> knowledge::ExtraPages {
     let (cell, servers) = (Arc::clone(cell), Arc::clone(servers));
     Arc::new(move |path| {
         if path == "/status" {
             let mut status = cell.status();
             if let Some(status) = status.as_object_mut() {
                 status.insert("servers".to_owned(), servers.status());
+                if let Some(refused) = &refused {
+                    status.insert("refused_passwords".to_owned(), refused.status());
+                }
             }
             return Some(status.to_string());
         }

@@ -36,6 +36,8 @@ pub(crate) struct Settings {
     pub(crate) user: Option<ClientUser>,
     /// The address of the SPARQL endpoint.
     pub(crate) sparql: SocketAddr,
+    /// The address for users of other hosts, by TLS.
+    pub(crate) sparql_tls: Option<SocketAddr>,
     /// The folder of the lasting sources.
     pub(crate) store: Option<PathBuf>,
     /// Whether the rules of OWL 2 RL are applied.
@@ -82,7 +84,7 @@ impl Settings {
 }
 
 /// Keys of the document.
-const KEYS: [&str; 21] = [
+const KEYS: [&str; 22] = [
     "mes",
     "application_uri",
     "namespace",
@@ -92,6 +94,7 @@ const KEYS: [&str; 21] = [
     "open",
     "user",
     "sparql",
+    "sparql_tls",
     "store",
     "rules",
     "knowledge",
@@ -123,6 +126,7 @@ impl Reading<'_> {
             open,
             user,
             sparql,
+            sparql_tls,
             store,
             rules,
             knowledge,
@@ -149,7 +153,8 @@ impl Reading<'_> {
         let lds = lds.map_or(Some(Lds::Local), |node| self.lds(node));
         let open = open.map_or(Some(false), |node| self.reader.boolean(node));
         let user = user.map(|node| skills::read_user(node, self.folder, &mut self.reader));
-        let sparql = sparql.map_or(Some(DEFAULT_SPARQL), |node| self.address(node));
+        let sparql = sparql.map_or(Some(DEFAULT_SPARQL), |node| self.address(node, true));
+        let sparql_tls = sparql_tls.map(|node| self.address(node, false));
         let store = store.map(|node| self.folder(node));
         let rules = rules.map_or(Some(false), |node| self.reader.boolean(node));
         let knowledge = knowledge.map_or_else(Vec::new, |node| self.files(node));
@@ -182,6 +187,7 @@ impl Reading<'_> {
             open: open?,
             user,
             sparql: sparql?,
+            sparql_tls: sparql_tls.map_or(Some(None), |address| address.map(Some))?,
             store: store
                 .map_or(Some(None), |store| store.map(Some))?
                 .map(|store| store.path),
@@ -641,21 +647,18 @@ impl Reading<'_> {
         Some(read).filter(|read| !read.is_empty())
     }
 
-    fn address(&mut self, node: &DocumentNode) -> Option<SocketAddr> {
+    /// Reads the address of a listener, which may have to be one of loopback.
+    fn address(&mut self, node: &DocumentNode, is_of_loopback: bool) -> Option<SocketAddr> {
         let text = self.reader.text(node, "an address with a port")?;
-        let address = text
-            .parse::<SocketAddr>()
-            .ok()
-            .filter(|address| address.ip().is_loopback());
+        let address: Option<SocketAddr> = text.parse().ok();
+        let address = address.filter(|address| !is_of_loopback || address.ip().is_loopback());
         address.or_else(|| {
-            self.reader.refuse(
-                node,
-                YamlFindingCode::WrongValue,
-                format!(
-                    "expected an address of loopback, as 127.0.0.1:8087, found `{}`",
-                    shortened(text)
-                ),
-            )
+            let wanted = match is_of_loopback {
+                true => "of loopback, as 127.0.0.1:8087",
+                false => "with a port, as 0.0.0.0:8443",
+            };
+            let why = format!("expected an address {wanted}, found `{}`", shortened(text));
+            self.reader.refuse(node, YamlFindingCode::WrongValue, why)
         })
     }
 }

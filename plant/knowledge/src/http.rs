@@ -1,5 +1,6 @@
-//! The knowledge over HTTP on loopback: the SPARQL 1.1 protocol, named questions, the Graph Store
-//! Protocol, sources as files, and the statements themselves. `writes` has the changes.
+//! The knowledge over HTTP: the SPARQL 1.1 protocol, named questions, the Graph Store Protocol,
+//! sources as files, and the statements themselves. `writes` has the changes, `remote` the clients
+//! of other hosts.
 
 use std::convert::Infallible;
 use std::io;
@@ -10,26 +11,27 @@ use std::time::Duration;
 use bytes::Bytes;
 use http_body_util::{BodyExt as _, Full, LengthLimitError, Limited};
 use hyper::body::Incoming;
-use hyper::header::{
-    ACCEPT, ALLOW, CONTENT_TYPE, HOST, HeaderValue, RETRY_AFTER, WWW_AUTHENTICATE,
-};
+use hyper::header::{ACCEPT, ALLOW, CONTENT_TYPE, HeaderValue, RETRY_AFTER, WWW_AUTHENTICATE};
 use hyper::service::service_fn;
 use hyper::{Method, Request, Response, StatusCode};
 use hyper_util::rt::{TokioIo, TokioTimer};
 use oxigraph::io::RdfFormat;
 use oxigraph::sparql::results::QueryResultsFormat;
 use serde_json::json;
+use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::Semaphore;
 use tokio::task::JoinHandle;
 use tracing::debug;
-use uri_text::{is_loopback_host, unescaped};
+use uri_text::unescaped;
 
 use crate::lanes::Lane;
 use crate::query::{
     BoundedResults, Dataset, Formats, Queries, QueryFault, QueryLimits, QueryOrQuestion,
 };
 use crate::question::{NamedQuestion, QUESTIONS, QuestionFault};
+use crate::remote::{ConnectionSecurity, RemoteAccess, RemoteConnections};
+use crate::sign_ins::LOCKED_FOR;
 use crate::store::Knowledge;
 use crate::writes::{UPDATE, Writes, failed, media, updated};
 
@@ -74,17 +76,43 @@ impl HttpEndpoint {
             );
             return Err(io::Error::new(io::ErrorKind::InvalidInput, why));
         }
-        let listener = TcpListener::bind(address).await?;
-        let address = listener.local_addr()?;
         let site = ServedSite {
             queries,
             page,
             writes,
+            remote: None,
         };
-        Ok(Self {
-            address,
-            task: tokio::spawn(accept(listener, site)),
-        })
+        Self::listen(address, site).await
+    }
+
+    /// Listens at any address for clients with secured connections, who are users: each request has
+    /// the name and the password of a user (HTTP Basic).
+    ///
+    /// # Errors
+    /// Fails if the address is in use.
+    pub async fn bind_secured(
+        address: SocketAddr,
+        queries: Queries,
+        page: ExtraPages,
+        (writes, security): (Writes, Arc<dyn ConnectionSecurity>),
+    ) -> io::Result<Self> {
+        let site = ServedSite {
+            queries,
+            page,
+            writes: Some(writes),
+            remote: Some(RemoteAccess::new(security)),
+        };
+        Self::listen(address, site).await
+    }
+
+    async fn listen(address: SocketAddr, site: ServedSite) -> io::Result<Self> {
+        let listener = TcpListener::bind(address).await?;
+        let address = listener.local_addr()?;
+        let task = match site.remote.clone() {
+            None => tokio::spawn(accept(listener, site)),
+            Some(remote) => tokio::spawn(accept_remote(listener, site, remote)),
+        };
+        Ok(Self { address, task })
     }
 
     /// Returns the address of the listener.
@@ -105,6 +133,8 @@ pub(crate) struct ServedSite {
     pub(crate) queries: Queries,
     page: ExtraPages,
     pub(crate) writes: Option<Writes>,
+    /// The access of clients of other hosts; `None` on loopback.
+    pub(crate) remote: Option<RemoteAccess>,
 }
 
 async fn accept(listener: TcpListener, site: ServedSite) {
@@ -125,17 +155,64 @@ async fn accept(listener: TcpListener, site: ServedSite) {
         let site = site.clone();
         tokio::spawn(async move {
             let _place = place;
-            if tokio::time::timeout(CONNECTION_TIME, serve(stream, peer.ip(), site))
-                .await
-                .is_err()
-            {
-                debug!("a connection for questions was closed for its age");
-            }
+            for_its_time(serve(stream, peer.ip(), site)).await;
         });
     }
 }
 
-async fn serve(stream: TcpStream, peer: IpAddr, site: ServedSite) {
+/// Accepts connections of clients of other hosts.
+async fn accept_remote(listener: TcpListener, site: ServedSite, remote: RemoteAccess) {
+    let mut open = RemoteConnections::default();
+    loop {
+        let (stream, peer) = match listener.accept().await {
+            Ok(accepted) => accepted,
+            Err(error) => {
+                debug!(%error, "a connection of another host was not accepted");
+                tokio::time::sleep(ACCEPT_AGAIN).await;
+                continue;
+            }
+        };
+        if !open.make_room(peer.ip()) {
+            debug!(%peer, "a connection was refused: there are too many");
+            continue;
+        }
+        let access = remote.of_connection();
+        let site = ServedSite {
+            remote: Some(access.clone()),
+            ..site.clone()
+        };
+        let security = Arc::clone(&access.security);
+        let served = secured(stream, peer.ip(), (site, security));
+        let task = tokio::spawn(for_its_time(served));
+        open.add(peer.ip(), &access, task.abort_handle());
+    }
+}
+
+/// Ends a connection for its age.
+async fn for_its_time(served: impl Future<Output = ()>) {
+    let in_time = tokio::time::timeout(CONNECTION_TIME, served).await;
+    if in_time.is_err() {
+        debug!("a connection for questions was closed for its age");
+    }
+}
+
+/// Secures a connection, and serves it.
+async fn secured(
+    stream: TcpStream,
+    peer: IpAddr,
+    (site, security): (ServedSite, Arc<dyn ConnectionSecurity>),
+) {
+    match tokio::time::timeout(HEADER_TIME, security.secure(stream)).await {
+        Ok(Ok(stream)) => serve(stream, peer, site).await,
+        Ok(Err(error)) => debug!(%error, %peer, "a connection was not secured"),
+        Err(_) => debug!(%peer, "a connection was not secured in time"),
+    }
+}
+
+async fn serve<S>(stream: S, peer: IpAddr, site: ServedSite)
+where
+    S: AsyncRead + AsyncWrite + Send + Unpin,
+{
     let service = service_fn(|request| {
         let site = site.clone();
         async move {
@@ -162,7 +239,7 @@ impl ServedSite {
         request: Request<Incoming>,
         peer: IpAddr,
     ) -> Result<Response<Full<Bytes>>, HttpRefusal> {
-        is_local(&request)?;
+        self.admit(&request, peer).await?;
         let path = request.uri().path().to_owned();
         match path.as_str() {
             "/sparql" => return self.sparql(request, peer).await,
@@ -423,6 +500,10 @@ impl HttpRefusal {
                 .headers_mut()
                 .insert(RETRY_AFTER, HeaderValue::from_static("1"));
         }
+        if self.status == StatusCode::TOO_MANY_REQUESTS {
+            let seconds = HeaderValue::from(LOCKED_FOR.as_secs());
+            response.headers_mut().insert(RETRY_AFTER, seconds);
+        }
         response
     }
 }
@@ -462,23 +543,6 @@ impl From<QuestionFault> for HttpRefusal {
                 &fault.to_string(),
             ),
         }
-    }
-}
-
-/// Refuses all names except loopback names: a page of another site in a user's browser can reach
-/// loopback by a name that resolves to it.
-fn is_local(request: &Request<Incoming>) -> Result<(), HttpRefusal> {
-    let Some(host) = request.headers().get(HOST) else {
-        return Ok(());
-    };
-    if is_loopback_host(host.to_str().unwrap_or_default()) {
-        Ok(())
-    } else {
-        Err(HttpRefusal::new(
-            StatusCode::MISDIRECTED_REQUEST,
-            "host",
-            "questions are answered on loopback, by 127.0.0.1, [::1] or localhost",
-        ))
     }
 }
 

@@ -13,13 +13,13 @@
 //! source.
 //!
 //! Reading order: `source` (the named graphs), `store`, `writing` (replacement), `rules` (derived
-//! statements), `journal` (lasting sources), `component`, `nodeset`,
-//! `owl` and `served` (facts to statements),
-//! `question` (named queries), `query` and `bounds` (any SPARQL, within limits), `lanes` (the
-//! queries that run at a time), `http`, `update` and `writes` (changes by users), `shapes` and
-//! `checking` (the SHACL report), `units` (conversion of numbers), `requests` (queries and changes
-//! for other protocols than HTTP), `value_query` (queries with one value),
-//! `operations` (a taxonomy of capabilities), `products` (STEP files).
+//! statements), `journal` (lasting sources), `component`, `nodeset`, `node_set_models`, `owl` and
+//! `served` (facts to statements), `question` (named queries), `query` and `bounds` (any SPARQL,
+//! within limits), `lanes` (the queries that run at a time), `http`, `remote` and `sign_ins`
+//! (clients of other hosts), `update` and `writes` (changes by users), `shapes` and `checking` (the
+//! SHACL report), `units` (conversion of numbers), `requests` (queries and changes for other
+//! protocols than HTTP), `value_query` (queries with one value), `operations` (a taxonomy of
+//! capabilities), `products` (STEP files).
 
 mod bounds;
 mod checking;
@@ -34,10 +34,12 @@ pub mod owl;
 pub mod products;
 mod query;
 mod question;
+mod remote;
 mod requests;
 mod rules;
 mod served;
 mod shapes;
+mod sign_ins;
 mod source;
 mod store;
 pub mod units;
@@ -54,6 +56,7 @@ pub use http::{ExtraPages, HttpEndpoint};
 pub use mtp::vocabulary;
 pub use query::{Queries, QueryLimits};
 pub use question::{NamedQuestion, QUESTIONS, QuestionAnswer, QuestionFault};
+pub use remote::{ConnectionSecurity, PasswordRefusal, SecuredStream, SecuringConnection};
 pub use requests::{KnowledgeRefusal, KnowledgeRequests, LoadedSource, QueryRequest, line_of};
 pub use served::{ServedNode, ServedSpace};
 pub use source::{KnowledgeSource, SourceKind};

@@ -7,7 +7,7 @@ use std::sync::Arc;
 
 use crate::lanes::Lane;
 use crate::query::{BoundedResults, Formats, Queries, QueryFault, QueryOrQuestion};
-use crate::writes::{CHECKS, SourceFiles, SourceFinding, Writes, file_source};
+use crate::writes::{READINGS, SourceFiles, SourceFinding, Writes, file_source};
 use crate::written::{ResultCut, WrittenResult};
 
 /// Answers queries and makes changes. The caller checks the rights of the client before.
@@ -137,7 +137,7 @@ impl KnowledgeRequests {
             return Err(KnowledgeRefusal::new("unknown", why));
         };
         let failed = |error: &dyn fmt::Display| KnowledgeRefusal::new("failed", error.to_string());
-        let place = CHECKS.acquire().await.map_err(|error| failed(&error))?;
+        let place = READINGS.acquire().await.map_err(|error| failed(&error))?;
         let files = Arc::clone(&self.files);
         let done = tokio::task::spawn_blocking(move || {
             let _place = place;
@@ -265,6 +265,7 @@ mod tests {
         knowledge.replace_turtle(&source, &text, 1).unwrap();
         let writes = Writes {
             now: || 9,
+            may_read: Arc::new(|_| Box::pin(async { true })),
             may: Arc::new(|_| Box::pin(async { true })),
             may_run: Arc::new(|_| Box::pin(async { true })),
             files: Arc::new(Files::default()),

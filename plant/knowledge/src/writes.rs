@@ -9,13 +9,13 @@ use base64::engine::general_purpose::STANDARD;
 use bytes::Bytes;
 use http_body_util::{BodyExt as _, Full, LengthLimitError, Limited};
 use hyper::body::Incoming;
-use hyper::header::{AUTHORIZATION, CONTENT_TYPE, ORIGIN};
+use hyper::header::{AUTHORIZATION, CONTENT_TYPE};
 use hyper::{Method, Request, Response, StatusCode};
 use oxigraph::io::RdfFormat;
 use serde::Serialize;
 use serde_json::json;
 use tokio::sync::Semaphore;
-use uri_text::{is_loopback_host, unescaped};
+use uri_text::unescaped;
 
 use crate::http::{HttpRefusal, ServedSite, UPLOAD_TIME, accepted, content, form, json_page};
 use crate::lanes::Lane;
@@ -29,6 +29,8 @@ use crate::update::writable;
 pub struct Writes {
     /// Returns the time in milliseconds since 1970.
     pub now: fn() -> u64,
+    /// Returns whether a user with a password may read over a secured connection.
+    pub may_read: May,
     /// Returns whether a user with a password, or a client without them, may write.
     pub may: May,
     /// Returns whether a client may start and stop jobs.
@@ -39,7 +41,7 @@ pub struct Writes {
     pub jobs: Arc<dyn JobRunner>,
 }
 
-/// Decides whether a client may write.
+/// Decides whether a client may do something.
 pub type May = Arc<
     dyn Fn(Option<(String, String)>) -> Pin<Box<dyn Future<Output = bool> + Send>> + Send + Sync,
 >;
@@ -131,7 +133,7 @@ impl ServedSite {
     async fn may_write(&self, request: &Request<Incoming>) -> Result<&Writes, HttpRefusal> {
         let writes = self.writes.as_ref().ok_or(QueryFault::ReadOnly)?;
         let why = "a change needs the name and password of a user with the role engineer";
-        require(&writes.may, request, why).await?;
+        self.require(&writes.may, request, why).await?;
         Ok(writes)
     }
 
@@ -150,7 +152,7 @@ impl ServedSite {
         let why = "a job needs the name and password of a user with the role operator";
         match (method, number) {
             (Method::POST, "") => {
-                require(&writes.may_run, &request, why).await?;
+                self.require(&writes.may_run, &request, why).await?;
                 let body = self.upload(request, LARGEST_JOB).await?;
                 let asked: Option<serde_json::Value> = serde_json::from_slice(&body).ok();
                 let process = asked
@@ -174,7 +176,7 @@ impl ServedSite {
                 Ok(response)
             }
             (Method::DELETE, number) => {
-                require(&writes.may_run, &request, why).await?;
+                self.require(&writes.may_run, &request, why).await?;
                 if number.parse().is_ok_and(|number| writes.jobs.stop(number)) {
                     Ok(status(StatusCode::NO_CONTENT))
                 } else {
@@ -335,7 +337,7 @@ impl ServedSite {
         let done = match method {
             Method::PUT => {
                 let contents = self.upload(request, LARGEST_FILE).await?;
-                let place = CHECKS.acquire().await.map_err(|error| failed(&error))?;
+                let place = READINGS.acquire().await.map_err(|error| failed(&error))?;
                 let put = tokio::task::spawn_blocking(move || {
                     let _place = place;
                     files.put(kind, &name, &contents)
@@ -371,7 +373,7 @@ impl ServedSite {
         let path = request.uri().path().to_owned();
         let (kind, name) = named(path.strip_prefix("/check").unwrap_or_default())?;
         let files = Arc::clone(&self.may_write(&request).await?.files);
-        let place = CHECKS.acquire().await.map_err(|error| failed(&error))?;
+        let place = READINGS.acquire().await.map_err(|error| failed(&error))?;
         let contents = self.upload(request, LARGEST_FILE).await?;
         // A check goes on after its client has left, and keeps its place.
         let checked = tokio::task::spawn_blocking(move || {
@@ -434,30 +436,13 @@ pub(crate) fn file_source(kind: &str, name: &str) -> Option<(SourceKind, String)
     (is_file && is_name).then(|| (kind, name.to_owned()))
 }
 
-/// Checks whether a client may do something: the request does not come from a page of another site
-/// in a browser, and the user has the role.
-async fn require(may: &May, request: &Request<Incoming>, why: &str) -> Result<(), HttpRefusal> {
-    let origin = request.headers().get(ORIGIN);
-    let is_own = origin.is_none_or(|origin| {
-        let origin = origin.to_str().unwrap_or_default();
-        let host = origin.split_once("://").map_or("", |(_, host)| host);
-        is_loopback_host(host)
-    });
-    if !is_own {
-        let why = "pages of other sites cannot change what is known";
-        return Err(HttpRefusal::new(StatusCode::FORBIDDEN, "origin", why));
-    }
-    let user = request.headers().get(AUTHORIZATION).and_then(|value| {
-        let encoded = value.to_str().ok()?.strip_prefix("Basic ")?;
-        let text = String::from_utf8(STANDARD.decode(encoded.trim()).ok()?).ok()?;
-        let (name, password) = text.split_once(':')?;
-        Some((name.to_owned(), password.to_owned()))
-    });
-    if may(user).await {
-        Ok(())
-    } else {
-        Err(HttpRefusal::new(StatusCode::UNAUTHORIZED, "user", why))
-    }
+/// Returns the user and the password of a request (HTTP Basic).
+pub(crate) fn basic_user(request: &Request<Incoming>) -> Option<(String, String)> {
+    let value = request.headers().get(AUTHORIZATION)?;
+    let encoded = value.to_str().ok()?.strip_prefix("Basic ")?;
+    let text = String::from_utf8(STANDARD.decode(encoded.trim()).ok()?).ok()?;
+    let (name, password) = text.split_once(':')?;
+    Some((name.to_owned(), password.to_owned()))
 }
 
 impl From<KnowledgeFault> for HttpRefusal {
@@ -504,8 +489,8 @@ pub(crate) fn failed(error: &dyn fmt::Display) -> HttpRefusal {
 
 /// Concurrent uploads, each of which is in memory as a whole.
 static UPLOADS: Semaphore = Semaphore::const_new(2);
-/// Concurrent checks of sources.
-pub(crate) static CHECKS: Semaphore = Semaphore::const_new(2);
+/// Concurrent readings of sources, to check or to add them.
+pub(crate) static READINGS: Semaphore = Semaphore::const_new(2);
 const LARGEST_FILE: usize = 256 << 20;
 const LONGEST_NAME: usize = 256;
 const LARGEST_JOB: usize = 4096;

@@ -1,13 +1,16 @@
 //! Changes over HTTP: updates, the Graph Store Protocol, and the users that may make them.
 #![expect(clippy::unwrap_used, reason = "a test may")]
 
-use std::net::SocketAddr;
+use std::net::{IpAddr, SocketAddr};
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex};
 
 use knowledge::{
-    HttpEndpoint, JobRunner, Knowledge, KnowledgeSource, Queries, QueryLimits, SourceCheck,
-    SourceFiles, SourceFinding, SourceKind, Writes,
+    ConnectionSecurity, HttpEndpoint, JobRunner, Knowledge, KnowledgeSource, PasswordRefusal,
+    Queries, QueryLimits, SecuredStream, SecuringConnection, SourceCheck, SourceFiles,
+    SourceFinding, SourceKind, Writes,
 };
+use tokio::net::TcpStream;
 
 use crate::http::{Answered, send};
 
@@ -76,13 +79,14 @@ impl JobRunner for Started {
     }
 }
 
-async fn site(may: bool) -> (HttpEndpoint, Arc<Knowledge>) {
-    let knowledge = Arc::new(Knowledge::new().unwrap());
-    let turtle = "<urn:c:below> <http://www.w3.org/2000/01/rdf-schema#subClassOf> <urn:c:above> .";
-    let source = KnowledgeSource::new(SourceKind::File, "classes");
-    knowledge.replace_turtle(&source, turtle, 5).unwrap();
-    let writes = Writes {
+/// Returns handlers for the users anna, who writes, and otto, who runs jobs; `may` allows all.
+fn writes(may: bool) -> Writes {
+    Writes {
         now: || 9,
+        may_read: Arc::new(|user| {
+            let is_known = user.is_some_and(|(name, _)| name == "anna" || name == "otto");
+            Box::pin(async move { is_known })
+        }),
         may: Arc::new(move |user| {
             let is_anna = user == Some(("anna".to_owned(), "secret: 1".to_owned()));
             Box::pin(async move { may || is_anna })
@@ -93,16 +97,150 @@ async fn site(may: bool) -> (HttpEndpoint, Arc<Knowledge>) {
         }),
         files: Arc::new(Files::default()),
         jobs: Arc::new(Started::default()),
-    };
+    }
+}
+
+async fn site(may: bool) -> (HttpEndpoint, Arc<Knowledge>) {
+    let knowledge = Arc::new(Knowledge::new().unwrap());
+    let turtle = "<urn:c:below> <http://www.w3.org/2000/01/rdf-schema#subClassOf> <urn:c:above> .";
+    let source = KnowledgeSource::new(SourceKind::File, "classes");
+    knowledge.replace_turtle(&source, turtle, 5).unwrap();
     let endpoint = HttpEndpoint::bind_with(
         "127.0.0.1:0".parse().unwrap(),
         Queries::new(Arc::clone(&knowledge), QueryLimits::default()),
         Arc::new(|_: &str| None),
-        Some(writes),
+        Some(writes(may)),
     )
     .await
     .unwrap();
     (endpoint, knowledge)
+}
+
+/// Secures nothing: the connections of a server with one name. It counts the refused passwords.
+#[derive(Default)]
+struct Clear {
+    wrong: AtomicUsize,
+    too_many: AtomicUsize,
+}
+
+impl ConnectionSecurity for Clear {
+    fn secure(&self, stream: TcpStream) -> SecuringConnection {
+        Box::pin(async { Ok(Box::new(stream) as Box<dyn SecuredStream>) })
+    }
+
+    fn is_for(&self, host: &str) -> bool {
+        host == "mes.example"
+    }
+
+    fn refused(&self, _client: IpAddr, refusal: PasswordRefusal) {
+        let counter = match refusal {
+            PasswordRefusal::Wrong => &self.wrong,
+            PasswordRefusal::TooMany => &self.too_many,
+        };
+        counter.fetch_add(1, Ordering::Relaxed);
+    }
+}
+
+#[tokio::test]
+async fn each_request_of_another_host_has_a_user_and_names_the_server() {
+    let knowledge = Arc::new(Knowledge::new().unwrap());
+    let endpoint = HttpEndpoint::bind_secured(
+        "127.0.0.1:0".parse().unwrap(),
+        Queries::new(Arc::clone(&knowledge), QueryLimits::default()),
+        Arc::new(|path: &str| (path == "/status").then(|| "{}".to_owned())),
+        // Clients of this host may do all without a user, and nobody else may.
+        (writes(true), Arc::new(Clear::default())),
+    )
+    .await
+    .unwrap();
+    let at = endpoint.address();
+    let ask = async |host: &str, line: &str, headers: &[(&str, &str)]| {
+        let mut text = format!("{line} HTTP/1.1\r\nHost: {host}\r\nConnection: close\r\n");
+        for (name, value) in headers {
+            text.push_str(&format!("{name}: {value}\r\n"));
+        }
+        send(at, format!("{text}\r\n")).await.status
+    };
+    // base64 of `otto:x` and `eve:x`.
+    let otto = ("Authorization", "Basic b3R0bzp4");
+    let eve = ("Authorization", "Basic ZXZlOng=");
+    let here = "mes.example:8443";
+    for line in [
+        "GET /status",
+        "GET /ask/sources",
+        "GET /sparql?query=ASK%7B%7D",
+        "DELETE /store?default",
+        "GET /jobs",
+        "GET /nothing",
+    ] {
+        assert_eq!(ask(here, line, &[]).await, 401, "{line}");
+        assert_eq!(ask(here, line, &[eve]).await, 401, "{line}");
+        for other in ["127.0.0.1", "evil.example", ""] {
+            assert_eq!(ask(other, line, &[otto]).await, 421, "{line}");
+        }
+    }
+    for line in [
+        "GET /status",
+        "GET /ask/sources",
+        "GET /sparql?query=ASK%7B%7D",
+    ] {
+        assert_eq!(ask(here, line, &[otto]).await, 200, "{line}");
+    }
+    for (origin, status) in [
+        ("https://evil.example", 403),
+        ("http://localhost", 403),
+        ("https://mes.example:8443", 404),
+    ] {
+        let origin = ("Origin", origin);
+        let removed = ask(here, "DELETE /store?graph=urn:none", &[otto, origin]).await;
+        assert_eq!(removed, status, "{origin:?}");
+    }
+}
+
+#[tokio::test]
+async fn a_client_with_too_many_wrong_passwords_is_refused_before_the_check() {
+    let checks = Arc::new(AtomicUsize::new(0));
+    let counted = Arc::clone(&checks);
+    let security = Arc::new(Clear::default());
+    let users = Writes {
+        may_read: Arc::new(move |user| {
+            counted.fetch_add(1, Ordering::Relaxed);
+            let is_otto = user.is_some_and(|(name, _)| name == "otto");
+            Box::pin(async move { is_otto })
+        }),
+        ..writes(false)
+    };
+    let endpoint = HttpEndpoint::bind_secured(
+        "127.0.0.1:0".parse().unwrap(),
+        Queries::new(Arc::new(Knowledge::new().unwrap()), QueryLimits::default()),
+        Arc::new(|_: &str| None),
+        (users, Arc::clone(&security) as Arc<dyn ConnectionSecurity>),
+    )
+    .await
+    .unwrap();
+    let at = endpoint.address();
+    let ask = async |user: &str| {
+        let head = "GET /ask HTTP/1.1\r\nHost: mes.example\r\nConnection: close\r\n";
+        let answered = send(at, format!("{head}Authorization: Basic {user}\r\n\r\n")).await;
+        answered.status
+    };
+    // base64 of `otto:x` and `eve:x`.
+    let (otto, eve) = ("b3R0bzp4", "ZXZlOng=");
+    for _ in 0..30 {
+        // A right password does not count.
+        assert_eq!(ask(otto).await, 200);
+    }
+    let mut wrong = 0;
+    while ask(eve).await == 401 {
+        wrong += 1;
+        assert!(wrong <= 20, "the number of wrong passwords is not limited");
+    }
+    assert_eq!(wrong, 20);
+    let before = checks.load(Ordering::Relaxed);
+    assert_eq!((ask(eve).await, ask(otto).await), (429, 429));
+    assert_eq!(checks.load(Ordering::Relaxed), before);
+    let counts = [&security.wrong, &security.too_many].map(|count| count.load(Ordering::Relaxed));
+    assert_eq!(counts, [20, 3]);
 }
 
 /// Sends a request with headers and a body.

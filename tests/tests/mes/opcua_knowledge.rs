@@ -8,9 +8,9 @@ use system_tests::{Cell, Peer, StartedChild, eventually, program};
 use super::{MANIFEST, SOON, get, list};
 
 const ENDPOINT: &str = "opc.tcp://127.0.0.1:48401";
-const PASSWORD: &str = "correct horse battery";
+pub(super) const PASSWORD: &str = "correct horse battery";
 
-fn add_user(cell: &Cell, name: &str, role: &str) {
+pub(super) fn add_user(cell: &Cell, name: &str, role: &str) {
     let password = cell.file("password", &format!("{PASSWORD}\n"));
     let made = Command::new(program("ua-server"))
         .args(["user", "add", name, "--role", role, "--pki"])

@@ -279,3 +279,29 @@ fn servers_are_named_by_endpoints_uris_and_discovery() {
         .render("mes.yaml", twice);
     assert!(told.contains("two of the server `discovered`"), "{told}");
 }
+
+#[test]
+fn users_of_other_hosts_have_any_address_and_programs_of_this_host_loopback() {
+    let read = |key: &str| {
+        let text = format!("mes: m\napplication_uri: urn:x\nnamespace: 5\n{key}\n");
+        let settings = Settings::from_yaml(&text, Path::new(""));
+        settings.map_err(|findings| findings.render("mes.yaml", &text))
+    };
+    let tls = |key: &str| read(key).unwrap().sparql_tls;
+    assert_eq!(tls("rules: false"), None);
+    let any = Some("0.0.0.0:8443".parse().unwrap());
+    assert_eq!(tls("sparql_tls: 0.0.0.0:8443"), any);
+    for (key, why) in [
+        (
+            "sparql_tls: mes",
+            "an address with a port, as 0.0.0.0:8443, found `mes`",
+        ),
+        (
+            "sparql: 0.0.0.0:8087",
+            "an address of loopback, as 127.0.0.1:8087",
+        ),
+    ] {
+        let told = read(key).unwrap_err();
+        assert!(told.contains(why) && told.contains("mes.yaml:4:"), "{told}");
+    }
+}

@@ -1,0 +1,287 @@
+//! Clients of other hosts: their connections are secured, and each of them is a user.
+
+use std::io;
+use std::net::IpAddr;
+use std::pin::Pin;
+use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
+
+use hyper::body::Incoming;
+use hyper::header::{AUTHORIZATION, HOST, HeaderValue, ORIGIN};
+use hyper::{Request, StatusCode};
+use tokio::io::{AsyncRead, AsyncWrite};
+use tokio::net::TcpStream;
+use tokio::task::AbortHandle;
+use tokio::time::Instant;
+use tracing::debug;
+use uri_text::{is_loopback_host, without_port};
+
+use crate::http::{HttpRefusal, ServedSite};
+use crate::sign_ins::{LOCKED_FOR, WrongPasswords, network};
+use crate::writes::{May, basic_user};
+
+/// A secured connection, such as a TLS stream.
+pub trait SecuredStream: AsyncRead + AsyncWrite + Send + Unpin {}
+
+impl<S: AsyncRead + AsyncWrite + Send + Unpin> SecuredStream for S {}
+
+/// The handshake of a connection: the secured connection, or the reason why there is none.
+pub type SecuringConnection =
+    Pin<Box<dyn Future<Output = io::Result<Box<dyn SecuredStream>>> + Send>>;
+
+/// The reason why the password of a client is refused.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum PasswordRefusal {
+    /// The user does not exist, or has another password.
+    Wrong,
+    /// The client has sent too many wrong passwords. The password was not checked.
+    TooMany,
+}
+
+/// Secures the connections of clients of other hosts.
+pub trait ConnectionSecurity: Send + Sync {
+    /// Secures a connection, such as by a handshake of TLS.
+    fn secure(&self, stream: TcpStream) -> SecuringConnection;
+
+    /// Returns whether the server has a name or an address, without a port.
+    fn is_for(&self, host: &str) -> bool;
+
+    /// Counts a refused password of a client.
+    fn refused(&self, client: IpAddr, refusal: PasswordRefusal);
+}
+
+/// The access of a client of another host, by one connection.
+#[derive(Clone)]
+pub(crate) struct RemoteAccess {
+    pub(crate) security: Arc<dyn ConnectionSecurity>,
+    /// The first user of the connection, as its requests have it.
+    signed_in: Arc<OnceLock<HeaderValue>>,
+    /// The wrong passwords of all clients.
+    wrong: Arc<Mutex<WrongPasswords>>,
+}
+
+impl RemoteAccess {
+    pub(crate) fn new(security: Arc<dyn ConnectionSecurity>) -> Self {
+        Self {
+            security,
+            signed_in: Arc::default(),
+            wrong: Arc::default(),
+        }
+    }
+
+    /// Returns the access by a new connection.
+    pub(crate) fn of_connection(&self) -> Self {
+        Self {
+            signed_in: Arc::default(),
+            ..self.clone()
+        }
+    }
+
+    fn wrong(&self) -> MutexGuard<'_, WrongPasswords> {
+        self.wrong.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl ServedSite {
+    /// Checks whether a request of a client may be answered. On loopback it has to name loopback: a
+    /// page of another site in a user's browser can reach loopback by a name that resolves to it.
+    /// Over a secured connection it names the server, and has the name and the password of a user.
+    pub(crate) async fn admit(
+        &self,
+        request: &Request<Incoming>,
+        client: IpAddr,
+    ) -> Result<(), HttpRefusal> {
+        let host = host(request);
+        let Some(remote) = &self.remote else {
+            return match host {
+                Some(host) if !is_loopback_host(host) => Err(HttpRefusal::new(
+                    StatusCode::MISDIRECTED_REQUEST,
+                    "host",
+                    "questions are answered on loopback, by 127.0.0.1, [::1] or localhost",
+                )),
+                Some(_) | None => Ok(()),
+            };
+        };
+        if !host.is_some_and(|host| remote.security.is_for(without_port(host))) {
+            return Err(HttpRefusal::new(
+                StatusCode::MISDIRECTED_REQUEST,
+                "host",
+                "the certificate of the MES does not have the name or address in the request",
+            ));
+        }
+        let given = request.headers().get(AUTHORIZATION);
+        // The password of a connection is checked once: a check takes processor time and memory.
+        if given.is_some() && remote.signed_in.get() == given {
+            return Ok(());
+        }
+        let refused = || {
+            let why = "clients of other hosts need the name and the password of a user";
+            HttpRefusal::new(StatusCode::UNAUTHORIZED, "user", why)
+        };
+        let user = basic_user(request).ok_or_else(refused)?;
+        let writes = self.writes.as_ref().ok_or_else(refused)?;
+        if !remote.wrong().may_try(client, Instant::now()) {
+            remote.security.refused(client, PasswordRefusal::TooMany);
+            let seconds = LOCKED_FOR.as_secs();
+            let why = format!("too many wrong passwords: try again in {seconds} s");
+            return Err(HttpRefusal::new(
+                StatusCode::TOO_MANY_REQUESTS,
+                "passwords",
+                &why,
+            ));
+        }
+        if !(writes.may_read)(Some(user)).await {
+            remote.security.refused(client, PasswordRefusal::Wrong);
+            return Err(refused());
+        }
+        remote.wrong().succeed(client);
+        if let Some(given) = given {
+            // Another user of the same connection is checked for each request.
+            let _first = remote.signed_in.set(given.clone());
+        }
+        Ok(())
+    }
+
+    /// Checks whether a client may do something: the request does not come from a page of another
+    /// site in a browser, and the user has the role.
+    pub(crate) async fn require(
+        &self,
+        may: &May,
+        request: &Request<Incoming>,
+        why: &str,
+    ) -> Result<(), HttpRefusal> {
+        let origin = request.headers().get(ORIGIN);
+        let is_own = origin.is_none_or(|origin| {
+            let origin = origin.to_str().unwrap_or_default();
+            let of_page = origin.split_once("://").map_or("", |(_, host)| host);
+            match self.remote {
+                None => is_loopback_host(of_page),
+                Some(_) => host(request) == Some(of_page),
+            }
+        });
+        if !is_own {
+            let why = "pages of other sites cannot change what is known";
+            return Err(HttpRefusal::new(StatusCode::FORBIDDEN, "origin", why));
+        }
+        if may(basic_user(request)).await {
+            Ok(())
+        } else {
+            Err(HttpRefusal::new(StatusCode::UNAUTHORIZED, "user", why))
+        }
+    }
+}
+
+/// The open connections of clients of other hosts, oldest first. At a limit the oldest connection
+/// without a user gives way, so that clients without a password keep no user away.
+#[derive(Debug, Default)]
+pub(crate) struct RemoteConnections(Vec<RemoteConnection>);
+
+#[derive(Debug)]
+struct RemoteConnection {
+    client: IpAddr,
+    signed_in: Arc<OnceLock<HeaderValue>>,
+    task: AbortHandle,
+}
+
+impl RemoteConnections {
+    /// Returns whether there is a place for a new connection of a client.
+    pub(crate) fn make_room(&mut self, client: IpAddr) -> bool {
+        let client = network(client);
+        self.0.retain(|open| !open.task.is_finished());
+        let of_client = self.0.iter().filter(|open| open.client == client);
+        let has_share = of_client.count() >= MOST_OF_CLIENT;
+        if !has_share && self.0.len() < MOST_CONNECTIONS {
+            return true;
+        }
+        let gives_way = |open: &RemoteConnection| {
+            open.signed_in.get().is_none() && (!has_share || open.client == client)
+        };
+        let Some(oldest) = self.0.iter().position(gives_way) else {
+            return false;
+        };
+        let open = self.0.remove(oldest);
+        debug!(client = %open.client, "closed a connection without a user for a new connection");
+        open.task.abort();
+        true
+    }
+
+    /// Adds a connection after [`Self::make_room`].
+    pub(crate) fn add(&mut self, client: IpAddr, access: &RemoteAccess, task: AbortHandle) {
+        self.0.push(RemoteConnection {
+            client: network(client),
+            signed_in: Arc::clone(&access.signed_in),
+            task,
+        });
+    }
+}
+
+/// Returns the host that a request names.
+fn host(request: &Request<Incoming>) -> Option<&str> {
+    let host = request.headers().get(HOST)?;
+    Some(host.to_str().unwrap_or_default())
+}
+
+const MOST_CONNECTIONS: usize = 256;
+/// Maximum number of connections of a client, or of an IPv6 network.
+const MOST_OF_CLIENT: usize = 64;
+
+#[cfg(test)]
+mod tests {
+    use std::future::pending;
+
+    use tokio::task::JoinHandle;
+
+    use super::*;
+
+    struct NoSecurity;
+
+    impl ConnectionSecurity for NoSecurity {
+        fn secure(&self, _stream: TcpStream) -> SecuringConnection {
+            Box::pin(async { Err(io::ErrorKind::Unsupported.into()) })
+        }
+
+        fn is_for(&self, _host: &str) -> bool {
+            false
+        }
+
+        fn refused(&self, _client: IpAddr, _refusal: PasswordRefusal) {}
+    }
+
+    #[tokio::test]
+    async fn a_connection_without_a_user_gives_way_and_one_of_a_user_stays() {
+        let all = RemoteAccess::new(Arc::new(NoSecurity));
+        let mut open = RemoteConnections::default();
+        let mut add = |client: &str, is_signed_in: bool| -> Option<JoinHandle<()>> {
+            let client = client.parse().unwrap();
+            open.make_room(client).then(|| {
+                let access = all.of_connection();
+                if is_signed_in {
+                    let header = HeaderValue::from_static("Basic x");
+                    access.signed_in.set(header).unwrap();
+                }
+                let task = tokio::spawn(pending::<()>());
+                open.add(client, &access, task.abort_handle());
+                task
+            })
+        };
+        // The first of a client is a user's.
+        let user = add("192.0.2.7", true).unwrap();
+        let second = add("192.0.2.7", false).unwrap();
+        let more: Vec<_> = (2..MOST_OF_CLIENT)
+            .map(|_| add("192.0.2.7", false).unwrap())
+            .collect();
+        let other = add("192.0.2.8", false).unwrap();
+        assert!(add("192.0.2.7", true).is_some());
+        assert!(second.await.unwrap_err().is_cancelled());
+        for _ in &more {
+            assert!(add("192.0.2.7", true).is_some());
+        }
+        for ended in more {
+            assert!(ended.await.unwrap_err().is_cancelled());
+        }
+        // All connections of this client have users; the share of another client is free.
+        assert!(add("192.0.2.7", false).is_none());
+        assert!(add("192.0.2.8", false).is_some());
+        tokio::task::yield_now().await;
+        assert!(!user.is_finished() && !other.is_finished());
+    }
+}
