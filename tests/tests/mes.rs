@@ -479,19 +479,25 @@ fn reaches_a_goal() {
 
 /// Sends an update of SPARQL. Returns whether it was acknowledged.
 fn update(text: &str) -> bool {
+    post("/update", "application/sparql-update", text) == Some(200)
+}
+
+/// Sends a body of a media type. Returns the status code, if there is an answer.
+fn post(path: &str, media: &str, text: &str) -> Option<u16> {
     let send = || -> std::io::Result<String> {
         let mut stream = TcpStream::connect(AT)?;
         stream.set_read_timeout(Some(SOON))?;
         let length = text.len();
         write!(
             stream,
-            "POST /update HTTP/1.1\r\nHost: {AT}\r\nContent-Type: application/sparql-update\r\nContent-Length: {length}\r\nConnection: close\r\n\r\n{text}"
+            "POST {path} HTTP/1.1\r\nHost: {AT}\r\nContent-Type: {media}\r\nContent-Length: {length}\r\nConnection: close\r\n\r\n{text}"
         )?;
         let mut answer = String::new();
         stream.read_to_string(&mut answer)?;
         Ok(answer)
     };
-    send().is_ok_and(|answer| answer.starts_with("HTTP/1.1 200"))
+    let answer = send().ok()?;
+    answer.split_whitespace().nth(1)?.parse().ok()
 }
 
 #[test]

@@ -598,7 +598,7 @@ mod tests {
             );
             assert!(is_stopped, "{text}: {fault}");
             // Without the check in each operator the thread works for minutes.
-            let deadline = Instant::now() + Duration::from_secs(10);
+            let deadline = Instant::now() + Duration::from_secs(1);
             while queries.lanes.running() > 0 {
                 assert!(Instant::now() < deadline, "its thread goes on: {text}");
                 tokio::time::sleep(LOOK).await;

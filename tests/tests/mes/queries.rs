@@ -1,12 +1,14 @@
-//! Parameters of steps that are given by queries over the knowledge of products.
+//! Parameters of steps that are given by queries over the knowledge of products, and queries that
+//! are stopped.
 
 use std::fs;
 use std::path::Path;
+use std::time::Duration;
 
 use serde_json::Value;
-use system_tests::{Cell, eventually};
+use system_tests::{Cell, StartedChild, eventually, peak, program, resident};
 
-use super::{EXAMPLES, SOON, get, list, rows, space, start};
+use super::{EXAMPLES, SOON, get, list, post, rows, space, start};
 
 /// Grips a part with the force that its data sheet states.
 const PROCESSES: &str = "processes:
@@ -110,4 +112,56 @@ fn are_chosen_by_operations() {
     let mut why = candidates.filter_map(|one| one["why"].as_str());
     let expected = "which is below http://www.hsu-ifa.de/ontologies/VDI2860#Securing";
     assert!(why.any(|why| why.contains(expected)), "{plan}");
+}
+
+/// Returns the number of threads of a program that work on queries.
+fn queries_of(process: u32) -> usize {
+    let threads = fs::read_dir(format!("/proc/{process}/task")).unwrap();
+    let names =
+        threads.filter_map(|thread| fs::read_to_string(thread.ok()?.path().join("comm")).ok());
+    names.filter(|name| name.trim() == "sparql").count()
+}
+
+#[test]
+fn a_stopped_query_gives_back_its_thread_within_a_second_and_its_memory() {
+    let Some(cell) = Cell::with(&[]) else { return };
+    let statement = |number: u32| {
+        let other = number * 7 % 60_000;
+        format!("<urn:s{number}> <urn:p{}> <urn:s{other}> .\n", number % 50)
+    };
+    let many: String = (0..60_000).map(statement).collect();
+    cell.file("many.ttl", &many);
+    let text = "mes: mes\napplication_uri: urn:example:mes\nnamespace: 50\n\
+                endpoint: opc.tcp://127.0.0.1:0\nsecurity: [None]\nknowledge: [many.ttl]\n";
+    let path = cell.file("mes.yaml", text);
+    let mes = StartedChild::new("mes", &program("ua-mes"))
+        .args([path.to_str().unwrap(), "--interface", "lo", "--lds", "none"])
+        .start();
+    let asked = |query: &str| post("/sparql", "application/sparql-query", query);
+    eventually("the statements are known", SOON, || get("/status"));
+    let before = resident(mes.id());
+    for query in [
+        "SELECT (COUNT(*) AS ?n) {?a ?b ?c . ?d ?e ?f . ?g ?h ?i}",
+        "SELECT (COUNT(*) AS ?n) {?a (!<a:b>)* ?b . ?b (!<a:c>)* ?c . ?d (!<a:b>)* ?e}",
+        "SELECT * {?a ?b ?c . ?d ?e ?f} ORDER BY ?f ?c",
+    ] {
+        // The limit of time or of memory.
+        let status = asked(query);
+        assert!(matches!(status, Some(503 | 507)), "{query}: {status:?}");
+        eventually("its thread ends", Duration::from_secs(1), || {
+            (queries_of(mes.id()) == 0).then_some(())
+        });
+        assert_eq!(asked("ASK {<urn:s1> ?p <urn:s7>}"), Some(200), "{query}");
+    }
+    let (most, after) = (peak(mes.id()), resident(mes.id()));
+    assert!(
+        most > 2 * before,
+        "the queries took no memory: {most} bytes"
+    );
+    assert!(
+        after <= before / 2 * 3,
+        "{} MiB before the queries, {} MiB after them",
+        before >> 20,
+        after >> 20
+    );
 }
