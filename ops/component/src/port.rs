@@ -298,7 +298,10 @@ impl Port for ComponentPort {
         let faults: BTreeMap<String, String> = self
             .measured
             .iter()
-            .filter_map(|value| Some((value.facts().name.clone(), value.reading().value.err()?)))
+            .filter_map(|value| {
+                let why = value.reading().value.err()?;
+                Some((value.facts().name.clone(), why.to_string()))
+            })
             .collect();
         vec![LinkState {
             name: "values".to_owned(),

@@ -7,7 +7,7 @@ use std::time::Duration;
 use async_trait::async_trait;
 use bridge_node::LocalDelivery;
 use mappings::TopicId;
-use skills::{Component, Measured, SkillValue, ValueSensor, ValueSource};
+use skills::{Component, Measured, SkillValue, UnknownValue, ValueSensor, ValueSource};
 use tokio::sync::watch;
 
 use crate::fields;
@@ -81,7 +81,8 @@ impl ValueSensor for TopicSensor {
         let mut fields = self.fields.clone();
         loop {
             let newest = fields.borrow_and_update().clone();
-            out.put_single(newest.and_then(|fields| self.value(&fields)));
+            let value = newest.and_then(|fields| self.value(&fields));
+            out.put_single(value.map_err(UnknownValue::Reported));
             if fields.changed().await.is_err() {
                 return "the program ends".to_owned();
             }
@@ -148,7 +149,7 @@ mod tests {
         let mut until = async |wanted: Result<f64, &str>| {
             let found = readings.wait_for(|reading| match (&reading.value, wanted) {
                 (Ok(value), Ok(wanted)) => value.as_f64() == Some(wanted),
-                (Err(why), Err(wanted)) => why.contains(wanted),
+                (Err(why), Err(wanted)) => why.to_string().contains(wanted),
                 _ => false,
             });
             let found = tokio::time::timeout(Duration::from_secs(30), found).await;

@@ -15,7 +15,7 @@ use serde_json::Value as Json;
 use skills::yaml::{DocumentKind, DocumentNode, YamlFindingCode, YamlReader};
 use skills::{
     Builtin, Driver, DriverError, InvalidParameter, Measured, Parameters, RunResults, SensorRead,
-    SkillValue, ValueSensor, ValueShape, Work,
+    SkillValue, UnknownValue, ValueSensor, ValueShape, Work,
 };
 use tokio::time::{Instant, sleep, sleep_until};
 
@@ -344,7 +344,7 @@ impl ValueSensor for HttpValue {
                 None => {
                     let host = self.request.host();
                     let why = format!("the response of {host} has no {}", self.pointer);
-                    out.put_single(Err(why));
+                    out.put_single(Err(UnknownValue::Reported(why)));
                 }
             }
         }

@@ -21,7 +21,7 @@ use skills::frame::Frame;
 use skills::{
     Builtin, COMPOSITE_HALT_TIMEOUT, Chosen, Device, DeviceValue, Driver, DriverError, DriverFault,
     InvalidParameter, Measured, ParameterType, Parameters, Partner, PartnerError, PeerAccess,
-    RunResults, RunnableSkill, SkillFault, SkillValue, ToolState, Work,
+    RunResults, RunnableSkill, SkillFault, SkillValue, ToolState, UnknownValue, Work,
 };
 use tokio::sync::watch;
 use tokio::time::{Instant, sleep, timeout};
@@ -241,7 +241,7 @@ impl Device for KelvinChanger {
                 Ok(between @ ChangerReading::Intermediate) => Err(between.to_string()),
                 Err(why) => Err(why.to_string()),
             };
-            out.put("ToolNumber", number);
+            out.put("ToolNumber", number.map_err(UnknownValue::Reported));
         }
     }
 

@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use async_trait::async_trait;
 use skills::yaml::{DocumentNode, YamlFindingCode, YamlReader};
-use skills::{Builtin, Measured, SensorRead, SkillValue, ValueSensor, ValueShape};
+use skills::{Builtin, Measured, SensorRead, SkillValue, UnknownValue, ValueSensor, ValueShape};
 
 use crate::addresses::{read_address, read_alias, read_line, read_register, read_unit};
 use crate::http_skill;
@@ -44,7 +44,7 @@ impl ValueSensor for Register {
             if self.number.swapped {
                 bytes.rotate_left(2);
             }
-            out.put_single(self.number.of(&bytes));
+            out.put_single(self.number.shown(&bytes));
         }
     }
 
@@ -72,7 +72,8 @@ impl ValueSensor for ProcessData {
                 Ok(bytes) => bytes,
                 Err(why) => return why.to_string(),
             };
-            out.put_single(self.number.of(bytes.get(self.byte..).unwrap_or_default()));
+            let bytes = bytes.get(self.byte..).unwrap_or_default();
+            out.put_single(self.number.shown(bytes));
         }
     }
 
@@ -131,6 +132,14 @@ impl Format {
     }
 }
 
+/// Data that are too short for a number.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+#[error("the data have {found} bytes, and {needed} are needed")]
+struct ShortData {
+    found: usize,
+    needed: usize,
+}
+
 impl Number {
     fn shape(self) -> ValueShape {
         ValueShape::scalar(match (self.bit, self.scaled) {
@@ -140,16 +149,17 @@ impl Number {
         })
     }
 
+    /// Returns the value at the front of some bytes, or the reason why clients get none.
+    fn shown(self, bytes: &[u8]) -> Result<SkillValue, UnknownValue> {
+        let value = self.of(bytes);
+        value.map_err(|short| UnknownValue::Reported(short.to_string()))
+    }
+
     /// Returns the value at the front of some bytes.
-    fn of(self, bytes: &[u8]) -> Result<SkillValue, String> {
-        let (_, count) = self.format.row();
-        let short = || {
-            format!(
-                "the data have {} bytes, and {count} are needed",
-                bytes.len()
-            )
-        };
-        let bytes = bytes.get(..count).ok_or_else(short)?;
+    fn of(self, bytes: &[u8]) -> Result<SkillValue, ShortData> {
+        let (_, needed) = self.format.row();
+        let found = bytes.len();
+        let bytes = bytes.get(..needed).ok_or(ShortData { found, needed })?;
         let whole = bytes
             .iter()
             .fold(0_u32, |number, byte| number << 8 | u32::from(*byte));

@@ -1,6 +1,20 @@
 //! The choice among candidates for a part of the work, with a reason for each of them. Composites
 //! and the MES choose by the same rules and give their reasons in the same words.
 
+use crate::out_of_workspace::OutOfWorkspace;
+use crate::partner_error::AttachedElsewhere;
+
+/// The reason why a candidate cannot do the work.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum UnfitCandidate {
+    /// The robot does not reach a position of the work.
+    #[error(transparent)]
+    OutOfWorkspace(#[from] OutOfWorkspace),
+    /// The tool is attached to another tool changer.
+    #[error(transparent)]
+    AttachedElsewhere(#[from] AttachedElsewhere),
+}
+
 /// A candidate for a part of the work.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SkillCandidate<T> {
@@ -9,7 +23,7 @@ pub struct SkillCandidate<T> {
     /// Its name in the reasons for the others.
     pub name: String,
     /// Whether it can do the work, or the reason why it cannot.
-    pub fits: Result<(), String>,
+    pub fits: Result<(), UnfitCandidate>,
     /// Its rank among the candidates that fit.
     pub rank: CandidateRank,
 }
@@ -121,7 +135,7 @@ pub fn choose<T>(candidates: Vec<SkillCandidate<T>>) -> Result<SkillChoice<T>, N
     for candidate in candidates {
         match candidate.fits {
             Ok(()) => fitting.push((candidate.rank, candidate.name, candidate.of)),
-            Err(why) => others.push((candidate.of, why)),
+            Err(why) => others.push((candidate.of, why.to_string())),
         }
     }
     fitting.sort_by(|(one, ..), (other, ..)| one.cmp(other));
@@ -179,7 +193,11 @@ mod tests {
         let prefer = ["b".to_owned(), "a".to_owned()];
         let rank = |attachment, name| ranked(attachment, CandidateRank::preference(&prefer, name));
         let far = SkillCandidate {
-            fits: Err("it reaches 0.3 m".to_owned()),
+            fits: Err(UnfitCandidate::OutOfWorkspace(OutOfWorkspace::Reach {
+                position: [0.4, 0.0, 0.0],
+                far: 0.4,
+                reach: 0.3,
+            })),
             ..candidate("far", CandidateRank::default())
         };
         let all = vec![
@@ -190,8 +208,9 @@ mod tests {
         ];
         let choice = choose(all).unwrap();
         assert_eq!((choice.chosen, &*choice.reason), ("a", "it is preferred"));
+        let too_far = "0.400, 0.000, 0.000 m is 0.400 m from its base, and it reaches 0.3 m";
         let others = [
-            ("far", "it reaches 0.3 m"),
+            ("far", too_far),
             ("c", "it would fit, but a is preferred"),
             ("b", "it would fit, but a carries a tool"),
         ];
@@ -202,7 +221,7 @@ mod tests {
             choose(one).unwrap().reason,
             "it is the only candidate that fits"
         );
-        let none = vec![("far", "it reaches 0.3 m".to_owned())];
+        let none = vec![("far", too_far.to_owned())];
         assert_eq!(choose(vec![far]), Err(NoChoice::NoneFits(none)));
     }
 

@@ -22,6 +22,7 @@ mod choice_tests;
 mod detector;
 mod fields;
 mod find;
+mod found;
 mod grip;
 mod handle;
 mod mirror;
@@ -41,10 +42,10 @@ use plant_opcua::client::{
 };
 use plant_opcua::types::StatusCode;
 
-pub use choice::{Chosen, Needs, ToolState, plate_between};
+pub use choice::{Chosen, Needs, plate_between};
 pub use detector::{Detected, Detector};
 pub use fields::SetFieldsFault;
-pub use find::{FoundParameter, FoundSkill, FoundType};
+pub use found::{FoundParameter, FoundSkill, FoundType};
 pub use handle::{RemoteState, SkillHandle};
 pub use mirror::{MirroredSkill, Mirrors, StartCondition, Watchable};
 pub use peers::PeerAccess;
@@ -54,7 +55,7 @@ pub use stations::StationChanges;
 
 use crate::parameters::ParameterType;
 pub use crate::partner_error::{
-    FailedLocator, LocatorError, NotLocated, PartnerError, Unchosen, UnfitGrasp,
+    AttachedElsewhere, FailedLocator, LocatorError, NotLocated, PartnerError, Unchosen, UnfitGrasp,
 };
 use crate::skill_fault::SkillFault;
 

@@ -8,7 +8,7 @@ use async_trait::async_trait;
 use tracing::warn;
 
 use crate::driver::{Driver, RunResults, Work};
-use crate::driver_error::{Broken, DriverError, INIT, InvalidParameter};
+use crate::driver_error::{Broken, DriverError, INIT, InvalidParameter, RetreatFault};
 use crate::frame::Frame;
 use crate::grip::{Hold, PartShape};
 use crate::parameters::Parameters;
@@ -71,7 +71,7 @@ enum Fault {
 
 impl Fault {
     /// The fault after a part that could not be halted.
-    fn goes_on(self, part: &str, is_robot: bool) -> Self {
+    fn goes_on(self, part: &UnhaltedSkill, is_robot: bool) -> Self {
         match self {
             Self::RobotLost(why) => Self::RobotLost(format!("{why}; {part}")),
             Self::Stopped(why) => Self::Stopped(format!("{why}; {part}")),
@@ -142,8 +142,8 @@ impl PickAndPlace {
                 Err(fault) => fault,
             };
             let (why, retreated) = match fault {
-                Fault::Stopped(why) => (why, Err(HALTED.to_owned())),
-                Fault::RobotLost(why) => (why.clone(), Err(why)),
+                Fault::Stopped(why) => (why, Err(RetreatFault::Halted)),
+                Fault::RobotLost(why) => (why.clone(), Err(RetreatFault::RobotLost(why))),
                 Fault::Other(why) => (why, self.retreat(retreat, teller).await),
             };
             warn!("pick and place: {step}: {why}");
@@ -180,7 +180,7 @@ impl PickAndPlace {
             Err(Ran::Lost(why) | Ran::NotHalted(why)) if is_robot => Err(Fault::RobotLost(why)),
             Err(Ran::Lost(why) | Ran::NotHalted(why) | Ran::Failed(why)) => Err(Fault::Other(why)),
             Err(Ran::Interrupted(fault, Ok(()))) => Err(fault),
-            Err(Ran::Interrupted(fault, Err(why))) => Err(fault.goes_on(&why, is_robot)),
+            Err(Ran::Interrupted(fault, Err(part))) => Err(fault.goes_on(&part, is_robot)),
         }
     }
 
@@ -188,13 +188,14 @@ impl PickAndPlace {
         &self,
         (step, skill, to): Retreat<'_>,
         teller: &dyn JobObserver,
-    ) -> Result<(), String> {
+    ) -> Result<(), RetreatFault> {
         teller.step(step).await;
         let ran = run(&**skill, Some(to), self.within, teller, teller.stopped());
         ran.await.map_err(|fault| match fault {
-            Ran::Lost(why) | Ran::NotHalted(why) | Ran::Failed(why) => why,
-            Ran::Interrupted((), Ok(())) => HALTED.to_owned(),
-            Ran::Interrupted((), Err(why)) => why,
+            Ran::Lost(why) | Ran::NotHalted(why) => RetreatFault::RobotLost(why),
+            Ran::Failed(why) => RetreatFault::Failed(why),
+            Ran::Interrupted((), Ok(())) => RetreatFault::Halted,
+            Ran::Interrupted((), Err(moving)) => RetreatFault::RobotLost(moving.to_string()),
         })
     }
 }
@@ -205,7 +206,15 @@ enum Ran<T> {
     NotHalted(String),
     Failed(String),
     /// With an error if the skill could not be halted.
-    Interrupted(T, Result<(), String>),
+    Interrupted(T, Result<(), UnhaltedSkill>),
+}
+
+/// A skill that could not be halted.
+#[derive(Debug, thiserror::Error)]
+#[error("{skill} cannot be halted: {fault}")]
+struct UnhaltedSkill {
+    skill: String,
+    fault: SkillFault,
 }
 
 async fn run<T>(
@@ -221,7 +230,7 @@ async fn run<T>(
     let ran = match run_part(skill, parameters, within, teller, interrupted).await {
         PartEnd::Ended(ran) => ran,
         PartEnd::Interrupted { by, halted } => {
-            let halted = halted.map_err(|fault| format!("{name} cannot be halted: {fault}"));
+            let halted = halted.map_err(|fault| UnhaltedSkill { skill: name, fault });
             return Err(Ran::Interrupted(by, halted));
         }
     };
@@ -239,9 +248,6 @@ async fn run<T>(
         Err(fault) => Err(Ran::Failed(format!("{name}: {fault}"))),
     }
 }
-
-/// The reason why a robot has not retreated after its stop was requested.
-const HALTED: &str = "it was halted, and stands still";
 
 fn lost(skill: &dyn RunnableSkill, why: &str) -> String {
     format!("{} is lost: {why}", skill.name())

@@ -2,6 +2,7 @@
 
 use std::error::Error;
 
+use crate::out_of_workspace::OutOfWorkspace;
 use crate::partner_error::PartnerError;
 use crate::value::SkillValue;
 
@@ -138,38 +139,25 @@ pub struct Broken {
     /// The reason.
     pub why: String,
     /// Whether the robot has retreated, or why not.
-    pub retreated: Result<(), String>,
+    pub retreated: Result<(), RetreatFault>,
+}
+
+/// The reason why a robot has not retreated after the failure of a job.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum RetreatFault {
+    /// Halt was requested.
+    #[error("it was halted, and stands still")]
+    Halted,
+    /// The robot is lost or cannot be halted, or its movement is unknown.
+    #[error("{0}")]
+    RobotLost(String),
+    /// The move of the retreat failed.
+    #[error("{0}")]
+    Failed(String),
 }
 
 /// The step before anything moves.
 pub(crate) const INIT: &str = "Init";
-
-/// A position that a robot does not reach.
-#[derive(Debug, Clone, PartialEq, thiserror::Error)]
-pub enum OutOfWorkspace {
-    /// The position is too far from the base.
-    #[error("{} is {far:.3} m from its base, and it reaches {reach} m", metres(*position))]
-    Reach {
-        /// The position, m.
-        position: [f64; 3],
-        /// Its distance from the base, m.
-        far: f64,
-        /// The largest distance, m.
-        reach: f64,
-    },
-    /// The position is in no zone.
-    #[error("{} is in none of its zones: {}", metres(*position), zones.join(", "))]
-    Zones {
-        /// The position, m.
-        position: [f64; 3],
-        /// The names of the zones.
-        zones: Vec<String>,
-    },
-}
-
-fn metres([x, y, z]: [f64; 3]) -> String {
-    format!("{x:.3}, {y:.3}, {z:.3} m")
-}
 
 #[cfg(test)]
 mod tests {

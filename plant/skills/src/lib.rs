@@ -20,6 +20,7 @@ mod grip;
 mod lock;
 mod machine;
 pub mod model;
+mod out_of_workspace;
 mod outcomes;
 mod panics;
 mod parameters;
@@ -33,6 +34,7 @@ mod shown;
 pub mod simulated;
 mod skill;
 mod skill_fault;
+mod tool_state;
 mod value;
 mod values;
 mod variant;
@@ -41,10 +43,10 @@ pub mod yaml;
 
 pub use authority::{Authority, SkillOwner};
 pub use client::{
-    Chosen, ClientOptions, Detected, Detector, FailedLocator, FoundParameter, FoundSkill,
-    FoundType, LocatorError, MirroredSkill, Mirrors, Needs, NotLocated, PartnerError, PeerAccess,
-    RemoteState, SetFieldsFault, SkillClient, SkillHandle, SkillStates, StartCondition,
-    StationChanges, ToolState, Unchosen, UnfitGrasp, Watchable, plate_between,
+    AttachedElsewhere, Chosen, ClientOptions, Detected, Detector, FailedLocator, FoundParameter,
+    FoundSkill, FoundType, LocatorError, MirroredSkill, Mirrors, Needs, NotLocated, PartnerError,
+    PeerAccess, RemoteState, SetFieldsFault, SkillClient, SkillHandle, SkillStates, StartCondition,
+    StationChanges, Unchosen, UnfitGrasp, Watchable, plate_between,
 };
 pub use component::{
     ChangeKind, Component, ComponentSecurity, Device, DeviceKinds, DriverFault, DriverSetup,
@@ -60,9 +62,10 @@ pub use configuration::{
 };
 pub use description::SkillDescription;
 pub use driver::{Driver, RunResults, Work};
-pub use driver_error::{Broken, DriverError, InvalidParameter, OutOfWorkspace, Stopped};
+pub use driver_error::{Broken, DriverError, InvalidParameter, RetreatFault, Stopped};
 pub use grip::{GripError, GripPoint, GripType, NoShape, PartShape};
 pub use model::NAMESPACE;
+pub use out_of_workspace::OutOfWorkspace;
 pub use parameters::{NoTypeName, ParameterType, Parameters, SkillParameter};
 pub use part::{JobObserver, PartEnd, run_part};
 pub use refusal::{RefusalCode, SkillRefusal};
@@ -73,10 +76,11 @@ pub use shown::{
 };
 pub use skill::Skill;
 pub use skill_fault::SkillFault;
+pub use tool_state::ToolState;
 pub use value::{Builtin, SkillValue, ValueError, ValueShape};
 pub use values::{
-    DeviceValue, LiveValue, Measure, Measured, NewestState, Statistics, Tally, ValueFacts,
-    ValueSensor,
+    DeviceValue, LiveValue, Measure, Measured, NewestState, Statistics, Tally, UnknownValue,
+    ValueFacts, ValueSensor,
 };
 pub use variant::{from_variant, to_variant};
 pub use workspace::{RobotWorkspace, Zone};

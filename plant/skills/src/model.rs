@@ -10,11 +10,10 @@ pub use nodeset::{DomainNodeSet, domain_nodesets, nodeset};
 pub use table::{Preset, SkillType, TableUnit, TableVariable};
 pub use types::TYPES;
 
+pub use crate::parameters::NAMESPACE;
 use crate::parameters::SkillParameter;
 use crate::value::{Builtin, SkillValue, ValueShape};
 
-/// The URI of the types' namespace.
-pub const NAMESPACE: &str = "urn:ua-bridge:skills";
 /// The base type of all skills.
 pub const SKILL_TYPE: &str = "SkillType";
 /// The type of the events of transitions.
@@ -23,6 +22,9 @@ pub const EVENT_TYPE: &str = "SkillTransitionEventType";
 pub const CONTROLLER_TYPE: &str = "ISkillControllerType";
 /// The namespace of OPC 10000-100, which defines the locks of components.
 pub(crate) const DEVICES: &str = "http://opcfoundation.org/UA/DI/";
+
+/// The members of the results of SkillType itself.
+pub(crate) const OUTCOME: [&str; 5] = ["Run", "Succeeded", "Message", "Trace", "Unknown"];
 
 /// The method of a component that switches it off.
 pub const POWER_OFF: &str = "PowerOffDevice";

@@ -3,9 +3,11 @@
 use std::fmt;
 use std::str::FromStr;
 
-use crate::model;
 use crate::refusal::{RefusalCode, SkillRefusal};
 use crate::value::{SkillValue, ValueShape};
+
+/// The URI of the types' namespace.
+pub const NAMESPACE: &str = "urn:ua-bridge:skills";
 
 /// A type, identified by the URI of its namespace and its BrowseName.
 ///
@@ -24,7 +26,7 @@ impl ParameterType {
     #[must_use]
     pub fn own(name: &str) -> Self {
         Self {
-            namespace: model::NAMESPACE.to_owned(),
+            namespace: NAMESPACE.to_owned(),
             name: name.to_owned(),
         }
     }
@@ -49,13 +51,12 @@ impl FromStr for ParameterType {
             Some(rest) => rest
                 .rsplit_once(';')
                 .ok_or_else(|| NoTypeName(text.to_owned()))?,
-            None => (model::NAMESPACE, text),
+            None => (NAMESPACE, text),
         };
         let fits = |part: &str| {
             !part.is_empty() && part.len() <= LONGEST_NAME && !part.chars().any(char::is_control)
         };
-        if !fits(namespace) || !fits(name) || (namespace == model::NAMESPACE && name.contains(';'))
-        {
+        if !fits(namespace) || !fits(name) || (namespace == NAMESPACE && name.contains(';')) {
             return Err(NoTypeName(text.chars().take(LONGEST_NAME).collect()));
         }
         Ok(Self {
@@ -240,7 +241,7 @@ mod tests {
     use super::*;
 
     fn move_parameters() -> Vec<SkillParameter> {
-        model::find("PtpMoveSkillType").unwrap().parameters()
+        crate::model::find("PtpMoveSkillType").unwrap().parameters()
     }
 
     fn refusal(given: Vec<(&str, SkillValue)>) -> (RefusalCode, String) {

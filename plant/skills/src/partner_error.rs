@@ -1,7 +1,7 @@
 //! The reasons why the components of a pick and place are not found, or do not fit.
 
-use crate::driver_error::OutOfWorkspace;
 use crate::grip::GripError;
+use crate::out_of_workspace::OutOfWorkspace;
 use crate::skill_fault::SkillFault;
 
 /// The reason why a composite skill has no robot, no tool or no object.
@@ -113,18 +113,8 @@ pub enum Unchosen {
         changer: String,
     },
     /// The tool is attached to a tool changer that is not known to be at the robot.
-    #[error("{tool} is attached to {changer}, {}", match &**robot {
-        "" => "which does not show its robot".to_owned(),
-        robot => format!("which is at another robot, {robot}"),
-    })]
-    AttachedElsewhere {
-        /// The ApplicationUri of the tool.
-        tool: String,
-        /// The ApplicationUri of the changer.
-        changer: String,
-        /// The robot that the changer shows; empty if it shows none.
-        robot: String,
-    },
+    #[error(transparent)]
+    AttachedElsewhere(#[from] AttachedElsewhere),
     /// The named tool is not attached.
     #[error("{named} is not attached to {changer}, which has {current}")]
     OtherTool {
@@ -135,6 +125,21 @@ pub enum Unchosen {
         /// The ApplicationUri of the attached tool.
         current: String,
     },
+}
+
+/// A tool that is attached to a tool changer that is not known to be at the robot.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("{tool} is attached to {changer}, {}", match &**robot {
+    "" => "which does not show its robot".to_owned(),
+    robot => format!("which is at another robot, {robot}"),
+})]
+pub struct AttachedElsewhere {
+    /// The ApplicationUri of the tool.
+    pub tool: String,
+    /// The ApplicationUri of the changer.
+    pub changer: String,
+    /// The robot that the changer shows; empty if it shows none.
+    pub robot: String,
 }
 
 /// A grasp skill that does not fit an object.

@@ -51,7 +51,6 @@ use self::lock::Lock;
 use self::methods::status;
 pub use self::power::PowerOff;
 use self::show::{Shower, SkillNodes};
-pub(crate) use self::types::OUTCOME;
 use self::values::Tallies;
 pub use self::values::status as value_status;
 use crate::authority::{Authority, SkillOwner};

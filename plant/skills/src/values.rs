@@ -18,7 +18,7 @@ use tokio::sync::watch;
 use tokio::time::{Instant, sleep};
 
 pub use self::statistics::{Measure, Statistics, Tally};
-use crate::value::{SkillValue, ValueShape};
+use crate::value::{SkillValue, ValueError, ValueShape};
 
 /// The constant description of a value.
 #[derive(Debug, Clone, PartialEq)]
@@ -70,9 +70,51 @@ pub trait ValueSensor: Debug + Send + Sync + 'static {
 #[derive(Debug, Clone, PartialEq)]
 pub struct NewestState {
     /// The value, or the reason why it is unknown.
-    pub value: Result<SkillValue, String>,
+    pub value: Result<SkillValue, UnknownValue>,
     /// Time of the measurement, or of the loss.
     pub at: SystemTime,
+}
+
+/// The reason why a value is unknown.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum UnknownValue {
+    /// There is no measurement yet.
+    #[error("not measured yet")]
+    NotMeasured,
+    /// The value is computed from successful runs, and there is none.
+    #[error("there is no successful run yet")]
+    NoRun,
+    /// The source states that it does not know the value.
+    #[error("the source does not know the value")]
+    NotAtSource,
+    /// The JSON of the source is no value of the described shape.
+    #[error(transparent)]
+    Json(#[from] ValueError),
+    /// The value of the source has another shape than its description.
+    #[error("the source gives {found}, and the value is {expected}")]
+    OtherShape {
+        /// The shape of the value of the source.
+        found: ValueShape,
+        /// The described shape.
+        expected: ValueShape,
+    },
+    /// The sensor has measured nothing for too long.
+    #[error("{sensor} has measured nothing for {within:?}")]
+    Overdue {
+        /// The address of the source.
+        sensor: String,
+        /// The time without a measurement.
+        within: Duration,
+    },
+    /// The sensor, device or program gave this reason.
+    #[error("{0}")]
+    Reported(String),
+}
+
+impl From<String> for UnknownValue {
+    fn from(why: String) -> Self {
+        Self::Reported(why)
+    }
 }
 
 /// A value with its newest reading. Clones share the reading.
@@ -122,7 +164,7 @@ impl Measured {
     /// Adds a value, which has the name `key` at the source.
     pub fn add(&mut self, key: &str, facts: &Arc<ValueFacts>) -> LiveValue {
         let first = NewestState {
-            value: Err(NOT_MEASURED.to_owned()),
+            value: Err(UnknownValue::NotMeasured),
             at: now(),
         };
         let (reading, watch) = watch::channel(first);
@@ -151,7 +193,7 @@ impl Measured {
     }
 
     /// Takes a measured value, or the reason why it is unknown. Other names are ignored.
-    pub fn put(&self, key: &str, value: Result<SkillValue, String>) {
+    pub fn put(&self, key: &str, value: Result<SkillValue, UnknownValue>) {
         self.touch();
         for slot in self.slots.iter().filter(|slot| slot.key == key) {
             slot.put(value.clone());
@@ -175,11 +217,11 @@ impl Measured {
     /// Takes the reason why all values are unknown.
     pub fn put_fault(&self, why: &str) {
         self.touch();
-        self.lose(why);
+        self.lose(&UnknownValue::Reported(why.to_owned()));
     }
 
     /// Takes the value of a source with a single value.
-    pub fn put_single(&self, value: Result<SkillValue, String>) {
+    pub fn put_single(&self, value: Result<SkillValue, UnknownValue>) {
         self.touch();
         for slot in &self.slots {
             slot.put(value.clone());
@@ -192,9 +234,9 @@ impl Measured {
     }
 
     /// Marks all values as unknown.
-    fn lose(&self, why: &str) {
+    fn lose(&self, why: &UnknownValue) {
         for slot in &self.slots {
-            slot.put(Err(why.to_owned()));
+            slot.put(Err(why.clone()));
         }
     }
 
@@ -214,21 +256,17 @@ impl Measured {
 impl Slot {
     fn put_json(&self, json: &Json) {
         self.put(match json.is_null() {
-            true => Err("the source does not know the value".to_owned()),
-            false => self
-                .facts
-                .shape
-                .read_json(json)
-                .map_err(|error| error.to_string()),
+            true => Err(UnknownValue::NotAtSource),
+            false => self.facts.shape.read_json(json).map_err(Into::into),
         });
     }
 
-    fn put(&self, value: Result<SkillValue, String>) {
-        let shape = self.facts.shape;
+    fn put(&self, value: Result<SkillValue, UnknownValue>) {
+        let expected = self.facts.shape;
         let value = value.and_then(|value| {
             let found = value.shape();
-            let taken = shape.take(value);
-            taken.ok_or_else(|| format!("the source gives {found}, and the value is {shape}"))
+            let taken = expected.take(value);
+            taken.ok_or(UnknownValue::OtherShape { found, expected })
         });
         self.reading.send_if_modified(|reading| {
             // A lost value keeps the time of its loss.
@@ -249,7 +287,7 @@ pub(crate) async fn watch(
     out: Measured,
 ) {
     let mut pause = SHORTEST_PAUSE;
-    let mut logged: Option<String> = None;
+    let mut logged: Option<UnknownValue> = None;
     let mut losses = Throttle::new(TOLD_EVERY);
     let mut is_fixed = false;
     loop {
@@ -262,9 +300,10 @@ pub(crate) async fn watch(
                 is_fixed = changed.is_err();
                 continue;
             }
-            why = sensor.measure(period, &out) => why,
+            why = sensor.measure(period, &out) => UnknownValue::Reported(why),
             () = out.overdue(began, within) => {
-                format!("{} has measured nothing for {within:?}", sensor.source())
+                let sensor = sensor.source();
+                UnknownValue::Overdue { sensor, within }
             }
         };
         let has_measured = out.newest.borrow().is_some_and(|newest| newest > began);
@@ -295,8 +334,6 @@ fn now() -> SystemTime {
     SystemTime::now()
 }
 
-/// The reason before the first measurement.
-pub(crate) const NOT_MEASURED: &str = "not measured yet";
 /// Default period of measurements.
 pub(crate) const PERIOD: Duration = Duration::from_millis(200);
 /// Number of periods without a measurement after which a sensor is restarted.
@@ -375,7 +412,7 @@ mod tests {
     async fn a_value_is_unknown_with_its_reason_until_the_sensor_measures_again() {
         let mut out = Measured::default();
         let value = out.add("Count", &facts("Count", Builtin::UInt32));
-        assert_eq!(value.reading().value, Err(NOT_MEASURED.to_owned()));
+        assert_eq!(value.reading().value, Err(UnknownValue::NotMeasured));
         let mut watch_value = value.watch();
         let permits = Arc::new(Semaphore::new(0));
         let counter = Counter {
@@ -396,7 +433,7 @@ mod tests {
         let expected = [
             Ok(SkillValue::UInt32(1)),
             Ok(SkillValue::UInt32(2)),
-            Err("unplugged".to_owned()),
+            Err(UnknownValue::Reported("unplugged".to_owned())),
             Ok(SkillValue::UInt32(4)),
         ];
         assert_eq!(seen, expected);
@@ -415,8 +452,8 @@ mod tests {
             out,
         ));
         watch_value.changed().await.unwrap();
-        let lost = Err("a wire has measured nothing for 100ms".to_owned());
-        assert_eq!(watch_value.borrow_and_update().value, lost);
+        let lost = watch_value.borrow_and_update().value.clone().unwrap_err();
+        assert_eq!(lost.to_string(), "a wire has measured nothing for 100ms");
         assert!(began.elapsed() >= WITHIN);
         task.abort();
     }
@@ -428,8 +465,8 @@ mod tests {
         out.put_single(Ok(SkillValue::Float(0.5)));
         assert_eq!(level.reading().value, Ok(SkillValue::Double(0.5)));
         out.put_single(Ok("full".into()));
-        let refused = "the source gives String, and the value is Double".to_owned();
-        assert_eq!(level.reading().value, Err(refused));
+        let refused = level.reading().value.unwrap_err().to_string();
+        assert_eq!(refused, "the source gives String, and the value is Double");
         out.put("Other", Ok(1.0.into()));
         assert!(level.reading().value.is_err());
     }

@@ -5,7 +5,8 @@ use std::sync::Arc;
 use async_trait::async_trait;
 
 use crate::driver::{Driver, RunResults, Work};
-use crate::driver_error::{DriverError, InvalidParameter, OutOfWorkspace};
+use crate::driver_error::{DriverError, InvalidParameter};
+use crate::out_of_workspace::OutOfWorkspace;
 use crate::parameters::{Parameters, SkillParameter};
 use crate::value::SkillValue;
 

@@ -143,7 +143,7 @@ mod tests {
 
     async fn until(
         value: &LiveValue,
-        wanted: impl Fn(&Result<skills::SkillValue, String>) -> bool,
+        wanted: impl Fn(&Result<skills::SkillValue, skills::UnknownValue>) -> bool,
     ) {
         let mut readings = value.watch();
         let found = readings.wait_for(|reading| wanted(&reading.value));
@@ -153,8 +153,14 @@ mod tests {
         }
     }
 
-    fn is_lost(why: &'static str) -> impl Fn(&Result<skills::SkillValue, String>) -> bool {
-        move |value| value.as_ref().is_err_and(|found| found.contains(why))
+    fn is_lost(
+        why: &'static str,
+    ) -> impl Fn(&Result<skills::SkillValue, skills::UnknownValue>) -> bool {
+        move |value| {
+            value
+                .as_ref()
+                .is_err_and(|found| found.to_string().contains(why))
+        }
     }
 
     #[tokio::test]

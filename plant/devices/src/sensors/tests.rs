@@ -2,7 +2,7 @@ use std::path::Path;
 use std::sync::Mutex;
 
 use skills::server::{ComponentServer, ServeSettings};
-use skills::{Component, LiveValue};
+use skills::{Component, LiveValue, UnknownValue};
 use tokio::time::timeout;
 
 use super::*;
@@ -38,7 +38,7 @@ fn served(values: &str) -> ComponentServer {
     ComponentServer::build(&component, &ServeSettings::default(), |_, _| Vec::new()).unwrap()
 }
 
-async fn until(value: &LiveValue, wanted: impl Fn(&Result<SkillValue, String>) -> bool) {
+async fn until(value: &LiveValue, wanted: impl Fn(&Result<SkillValue, UnknownValue>) -> bool) {
     let mut readings = value.watch();
     let found = timeout(SOON, readings.wait_for(|reading| wanted(&reading.value))).await;
     if found.is_err() {
@@ -70,7 +70,7 @@ async fn registers_are_values_and_are_unknown_while_the_device_is_silent() {
     until(heat, |value| {
         value
             .as_ref()
-            .is_err_and(|why| why.contains("no answer from unit 3"))
+            .is_err_and(|why| why.to_string().contains("no answer from unit 3"))
     })
     .await;
     meter.0.lock().unwrap()[0] = 0x0032;
@@ -104,8 +104,8 @@ fn numbers_of_process_data_have_their_formats() {
         number(Format::UInt8, Some(3)).of(&bytes[1..]),
         Ok(true.into())
     );
-    let short = "the data have 1 bytes, and 2 are needed".to_owned();
-    assert_eq!(number(Format::UInt16, None).of(&bytes[3..]), Err(short));
+    let short = number(Format::UInt16, None).of(&bytes[3..]).unwrap_err();
+    assert_eq!(short.to_string(), "the data have 1 bytes, and 2 are needed");
 }
 
 #[test]
@@ -155,7 +155,7 @@ impl MeasuredDevice {
     pub(crate) async fn until(
         &self,
         name: &str,
-        wanted: impl Fn(&Result<SkillValue, String>) -> bool,
+        wanted: impl Fn(&Result<SkillValue, UnknownValue>) -> bool,
     ) {
         let live = self.live.iter().find(|live| live.facts().name == name);
         until(live.unwrap(), wanted).await;

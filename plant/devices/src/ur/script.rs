@@ -28,9 +28,14 @@ pub(crate) enum Statement {
     Nothing,
 }
 
+/// A line that is no supported statement, shortened.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+#[error("{0}")]
+pub(crate) struct UnknownStatement(pub(crate) String);
+
 /// Removes complete programs from the front of the received text: programs between `def` and `end`,
 /// and single lines. A program with an unknown statement is returned as an error with its line.
-pub(crate) fn programs(text: &mut String) -> Vec<Result<Vec<Statement>, String>> {
+pub(crate) fn programs(text: &mut String) -> Vec<Result<Vec<Statement>, UnknownStatement>> {
     let mut programs = Vec::new();
     while let Some((program, length)) = first(text) {
         text.drain(..length);
@@ -69,8 +74,8 @@ fn first(text: &str) -> Option<(Vec<String>, usize)> {
     None
 }
 
-fn statement(line: &str) -> Result<Statement, String> {
-    read(line).ok_or_else(|| line.chars().take(80).collect())
+fn statement(line: &str) -> Result<Statement, UnknownStatement> {
+    read(line).ok_or_else(|| UnknownStatement(line.chars().take(80).collect()))
 }
 
 fn read(line: &str) -> Option<Statement> {
@@ -224,7 +229,10 @@ mod tests {
             "x",
         ] {
             let mut text = format!("{wrong}\n");
-            assert_eq!(programs(&mut text), [Err(wrong.to_owned())]);
+            assert_eq!(
+                programs(&mut text),
+                [Err(UnknownStatement(wrong.to_owned()))]
+            );
         }
     }
 }

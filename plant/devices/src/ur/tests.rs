@@ -241,7 +241,7 @@ async fn its_values_follow_the_robot_and_come_back_after_a_silence() {
     let robot: Arc<dyn Device> = Arc::new(UrRobot::new(bench.settings()));
     let values = crate::sensors::tests::measured(robot);
     let at = |x: f64| {
-        move |value: &Result<skills::SkillValue, String>| {
+        move |value: &Result<skills::SkillValue, skills::UnknownValue>| {
             let pose = value.as_ref().ok().and_then(skills::SkillValue::as_f64s);
             pose.is_some_and(|pose| pose.first().is_some_and(|found| (found - x).abs() < 1e-4))
         }

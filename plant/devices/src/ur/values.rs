@@ -23,7 +23,7 @@ pub(super) async fn measure(rtde: &str, period: Duration, out: &Measured) -> Rtd
             Err(why) => return why,
         };
         for ((name, _), value) in measured.iter().zip(values) {
-            out.put(name, shown(name, value));
+            out.put(name, shown(name, value).map_err(|why| why.to_string().into()));
         }
     }
 }
@@ -46,7 +46,7 @@ async fn open(address: &str, hertz: f64, out: &Measured) -> Result<(Rtde, Vec<Ou
         if RecipeType::of(&kind).is_some() {
             known.push(measured);
         } else {
-            out.put(name, Err(format!("the robot has no output {output}")));
+            out.put(name, Err(format!("the robot has no output {output}").into()));
         }
     }
     let outputs: Vec<&str> = known.iter().map(|(_, output)| *output).collect();
@@ -54,8 +54,16 @@ async fn open(address: &str, hertz: f64, out: &Measured) -> Result<(Rtde, Vec<Ou
     Ok((rtde, known))
 }
 
+/// An output of the robot with a type that the value does not have.
+#[derive(Debug, thiserror::Error)]
+#[error("the robot sends {name} as {value:?}")]
+struct UnshownOutput {
+    name: String,
+    value: RecipeValue,
+}
+
 /// Returns a value of the robot for clients.
-fn shown(name: &str, value: RecipeValue) -> Result<SkillValue, String> {
+fn shown(name: &str, value: RecipeValue) -> Result<SkillValue, UnshownOutput> {
     Ok(match value {
         RecipeValue::Vector(pose) if name == "TcpPose" => of_robot(pose).into(),
         RecipeValue::Vector(six) => six.into(),
@@ -67,7 +75,10 @@ fn shown(name: &str, value: RecipeValue) -> Result<SkillValue, String> {
         | RecipeValue::U8(_)
         | RecipeValue::U32(_)
         | RecipeValue::U64(_)
-        | RecipeValue::Whole(_)) => return Err(format!("the robot sends {name} as {other:?}")),
+        | RecipeValue::Whole(_)) => {
+            let name = name.to_owned();
+            return Err(UnshownOutput { name, value: other });
+        }
     })
 }
 

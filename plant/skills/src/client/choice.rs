@@ -5,62 +5,24 @@ use std::time::Duration;
 
 use tokio::time::timeout;
 
-use super::find::FoundSkill;
+use super::found::FoundSkill;
 use super::{Detected, Detector, PeerAccess, SkillClient};
-use crate::choosing::{Attachment, CandidateRank, NoChoice, SkillCandidate, SkillChoice, choose};
+use crate::choosing::{
+    Attachment, CandidateRank, NoChoice, SkillCandidate, SkillChoice, UnfitCandidate, choose,
+};
 use crate::component::{Partner, WorldObject};
-use crate::driver_error::OutOfWorkspace;
 use crate::frame::Frame;
 use crate::grip::PartShape;
+use crate::out_of_workspace::OutOfWorkspace;
 use crate::parameters::ParameterType;
 use crate::partner_error::{
-    FailedLocator, LocatorError, NotLocated, PartnerError, Unchosen, UnfitGrasp,
+    AttachedElsewhere, FailedLocator, LocatorError, NotLocated, PartnerError, Unchosen, UnfitGrasp,
 };
 use crate::runs::RunnableSkill as _;
 use crate::shown::RunOutcome;
+use crate::tool_state::{ToolState, is_same_endpoint};
 use crate::value::SkillValue;
 use crate::workspace::RobotWorkspace;
-
-/// The state of a tool changer, as its component shows it.
-#[derive(Debug, Clone, PartialEq, Default)]
-pub struct ToolState {
-    /// The pose of the tool plate in the frame of the flange.
-    pub plate: [f64; 6],
-    /// The ApplicationUri of the attached tool; empty for none, `None` if it is unknown.
-    pub current: Option<String>,
-    /// The endpoint of the robot that carries the changer; empty if it is unknown.
-    pub mover: String,
-}
-
-impl ToolState {
-    /// Returns the ApplicationUri of the attached tool; `None` for none, and if it is unknown.
-    fn tool(&self) -> Option<&str> {
-        self.current.as_deref().filter(|tool| !tool.is_empty())
-    }
-
-    /// Returns whether the tool changer is at a robot, given by its ApplicationUri and its
-    /// endpoint.
-    pub fn is_at(&self, (application_uri, endpoint): (&str, &str)) -> bool {
-        let is_it = self.mover == application_uri || is_same_endpoint(&self.mover, endpoint);
-        !self.mover.is_empty() && is_it
-    }
-
-    /// Returns what a component is attached to by this tool changer. The component is given by its
-    /// ApplicationUri, and by its endpoint if that is known.
-    pub fn attachment(&self, component: &str, endpoint: Option<&str>) -> Attachment {
-        let Some(tool) = self.tool() else {
-            return Attachment::None;
-        };
-        let is_at_mover = |endpoint: &str| is_same_endpoint(endpoint, &self.mover);
-        if tool == component {
-            Attachment::AtRobot
-        } else if self.mover == component || endpoint.is_some_and(is_at_mover) {
-            Attachment::CarriesTool
-        } else {
-            Attachment::None
-        }
-    }
-}
 
 /// A component that has the skills for a part of the work.
 #[derive(Debug, Clone, PartialEq)]
@@ -101,7 +63,7 @@ impl SkilledComponent {
 
     fn candidate(
         &self,
-        fits: Result<(), String>,
+        fits: Result<(), UnfitCandidate>,
         attachment: Attachment,
         prefer: &[String],
     ) -> SkillCandidate<&Self> {
@@ -161,11 +123,6 @@ pub(super) struct ChosenTool {
     pub(super) reason: String,
 }
 
-/// Compares URLs of endpoints, which may end with a slash.
-fn is_same_endpoint(a: &str, b: &str) -> bool {
-    a.trim_end_matches('/') == b.trim_end_matches('/')
-}
-
 impl PeerAccess {
     /// Chooses the robot. A given robot counts. Otherwise the robot reaches the positions, and of
     /// several such robots it has a tool at its changer or is the most preferred.
@@ -215,7 +172,7 @@ impl PeerAccess {
                 true => Attachment::CarriesTool,
                 false => Attachment::None,
             };
-            let fits = fits.map_err(|why| why.to_string());
+            let fits = fits.map_err(UnfitCandidate::from);
             robot.candidate(fits, attachment, needs.prefer)
         });
         chosen("robot", judged.collect()).map_err(wrong)
@@ -317,7 +274,8 @@ impl PeerAccess {
         };
         if let Some(named) = named {
             let gripper = uri_at(detector, &named);
-            attached_elsewhere(&changers, &gripper).map_err(wrong)?;
+            let elsewhere = attached_elsewhere(&changers, &gripper);
+            elsewhere.map_err(|why| wrong(why.into()))?;
             return Ok(at_flange(named, "named"));
         }
         let grippers = candidates(detector, &["GraspSkillType", "ReleaseSkillType"]).await;
@@ -335,7 +293,7 @@ impl PeerAccess {
         let all = grippers.iter();
         let judged = all.map(|gripper| {
             let fits = attached_elsewhere(&changers, &gripper.application_uri);
-            let fits = fits.map_err(|why| why.to_string());
+            let fits = fits.map_err(UnfitCandidate::from);
             gripper.candidate(fits, Attachment::None, prefer)
         });
         let Chosen {
@@ -449,11 +407,14 @@ pub fn plate_between(
 }
 
 /// Checks that a gripper is attached to no tool changer, so that it may be at a flange.
-fn attached_elsewhere(changers: &[(String, ToolState)], gripper: &str) -> Result<(), Unchosen> {
+fn attached_elsewhere(
+    changers: &[(String, ToolState)],
+    gripper: &str,
+) -> Result<(), AttachedElsewhere> {
     let mut all = changers.iter();
     let holder = all.find(|(_, state)| state.tool() == Some(gripper));
     holder.map_or(Ok(()), |(changer, state)| {
-        Err(Unchosen::AttachedElsewhere {
+        Err(AttachedElsewhere {
             tool: gripper.to_owned(),
             changer: changer.clone(),
             robot: state.mover.clone(),

@@ -7,9 +7,7 @@ use std::time::Duration;
 use async_trait::async_trait;
 use tokio::sync::watch;
 
-use super::{
-    ClientOptions, Detector, Needs, PeerAccess, Remote, SkillClient, ToolState, plate_between,
-};
+use super::{ClientOptions, Detector, Needs, PeerAccess, Remote, SkillClient, plate_between};
 use crate::choosing::Attachment;
 use crate::component::{Component, Device, DriverFault, DriverSetup, Partner};
 use crate::conformance;
@@ -18,6 +16,7 @@ use crate::driver_error::DriverError;
 use crate::parameters::ParameterType;
 use crate::server::{ComponentServer, ServeSettings};
 use crate::shown::RunOutcome;
+use crate::tool_state::ToolState;
 use crate::value::SkillValue;
 
 const ROBOT: &str = include_str!("../../../../examples/plant/robot.yaml");

@@ -9,7 +9,7 @@ use tokio::sync::watch;
 use tokio::task::JoinHandle;
 use tracing::debug;
 
-use super::find::FoundSkill;
+use super::found::FoundSkill;
 use super::{ClientOptions, SkillClient, SkillHandle, StationChanges};
 use crate::lock::lock;
 use crate::model::alias;

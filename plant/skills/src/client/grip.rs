@@ -4,7 +4,7 @@
 use plant_opcua::client::{Browse, OpcUaClient};
 use plant_opcua::types::{DataTypeId, NodeId, ReferenceDescription, Variant};
 
-use super::find::{FoundParameter, Nodes};
+use super::found::{FoundParameter, Nodes, texts};
 use super::lost;
 use super::packed::Packed;
 use crate::grip::{GripPoint, GripType};
@@ -65,7 +65,7 @@ pub(super) async fn workspace(
     let [reach, names, bounds] = values(client, own).await?;
     let reach = reach.and_then(|reach| reach.as_f64());
     let bounds = bounds.and_then(|bounds| bounds.as_f64s());
-    let names = super::find::texts(names);
+    let names = texts(names);
     Ok(Some(RobotWorkspace::of(
         reach,
         names,

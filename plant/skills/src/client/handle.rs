@@ -9,7 +9,7 @@ use plant_opcua::client::{
 use plant_opcua::types::{DataValue, NodeId, QualifiedName, StatusCode, UAString, Variant};
 use program::{ProgramMachineState, ProgramMethod};
 
-use super::find::{FoundParameter, FoundSkill};
+use super::found::{FoundParameter, FoundSkill, texts};
 use super::{called, lost, refused};
 use crate::grip::GripPoint;
 use crate::model::{DEVICES, POWER_OFF};
@@ -294,7 +294,7 @@ impl SkillHandle {
             unknown: more.first() == Some(&Variant::Boolean(true)),
             message: text(message),
             results,
-            trace: super::find::texts(from_variant(trace)),
+            trace: texts(from_variant(trace)),
         }))
     }
 
@@ -532,7 +532,7 @@ impl SkillHandle {
             } else {
                 Vec::new()
             },
-            trace: super::find::texts(trace.as_ref().and_then(from_variant)),
+            trace: texts(trace.as_ref().and_then(from_variant)),
         })
     }
 

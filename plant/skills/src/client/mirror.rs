@@ -19,7 +19,7 @@ use tokio::sync::{mpsc, oneshot, watch};
 use tokio::task::JoinSet;
 
 use self::seen::{SeenSkill, SkillAspect};
-use super::find::{FoundParameter, FoundSkill};
+use super::found::{FoundParameter, FoundSkill};
 use super::handle::{STATE_PATHS, state_in};
 use super::packed::Packed;
 use super::{SkillClient, lost};

@@ -6,7 +6,7 @@ use plant_opcua::client::{ClientSubscription, MonitoredWatch, Notice};
 use program::ProgramMachineState;
 
 use super::SkillClient;
-use super::find::FoundSkill;
+use super::found::FoundSkill;
 use super::handle::{STATE_PATHS, state_in};
 
 impl SkillClient {

@@ -5,7 +5,7 @@ use std::time::Duration;
 use plant_opcua::client::{ClientSubscription, MonitoredWatch, Notice, OpcUaClient, Select};
 use plant_opcua::types::{NodeId, ObjectId, ObjectTypeId, QualifiedName};
 
-use super::find::{self, FoundSkill};
+use super::found::FoundSkill;
 use super::lost;
 use crate::skill_fault::SkillFault;
 
@@ -26,7 +26,7 @@ impl StationChanges {
     pub(super) async fn of(client: &OpcUaClient) -> Result<Option<Self>, SkillFault> {
         let objects: NodeId = ObjectId::ObjectsFolder.into();
         let mut is_station = false;
-        for folder in find::STATION_FOLDERS {
+        for folder in STATION_FOLDERS {
             let path = [QualifiedName::new(1, folder)];
             is_station |= client.translate(&objects, &path).await.is_ok();
         }
@@ -74,6 +74,8 @@ impl FoundSkill {
     }
 }
 
+/// The folders in which a station shows the servers of the other level.
+pub(super) const STATION_FOLDERS: [&str; 2] = ["Devices", "Neighbours"];
 /// Separates the URL of a station from the ApplicationUri of a component behind it.
 pub(super) const BEHIND: char = '#';
 const PUBLISHING: Duration = Duration::from_millis(50);

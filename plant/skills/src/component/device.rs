@@ -9,9 +9,10 @@ use async_trait::async_trait;
 use tokio::sync::watch;
 
 use super::{DriverFault, SensorRead, SkillSetup};
-use crate::client::{PeerAccess, ToolState};
+use crate::client::PeerAccess;
 use crate::driver::Driver;
 use crate::parameters::ParameterType;
+use crate::tool_state::ToolState;
 use crate::values::{
     DeviceValue, LiveValue, Measured, ValueFacts, ValueSensor, watch as watch_sensor,
 };

@@ -7,8 +7,8 @@ use plant_opcua::types::{DataValue, StatusCode, Variant};
 use tokio::sync::watch;
 
 use super::show::SkillNodes;
-use crate::client::ToolState;
 use crate::model::{CURRENT_TOOL, MOVER_ENDPOINT, TOOL_PLATE_OFFSET};
+use crate::tool_state::ToolState;
 use crate::value::SkillValue;
 use crate::variant::to_variant;
 

@@ -4,7 +4,7 @@ use plant_opcua::server::{Instance, OpcUaServer};
 use plant_opcua::types::{NodeId, Variant};
 use program::Rest;
 
-use crate::model::{self, NAMESPACE, SkillType};
+use crate::model::{self, NAMESPACE, OUTCOME, SkillType};
 use crate::parameters::{ParameterType, SkillParameter};
 use crate::value::ValueShape;
 use crate::variant::{builtin_of, from_variant};
@@ -114,6 +114,3 @@ fn range(server: &OpcUaServer, node: &NodeId) -> Option<(f64, f64)> {
     let range = object.inner_as::<plant_opcua::types::Range>()?;
     Some((range.low, range.high))
 }
-
-/// The members of the results of SkillType itself.
-pub(crate) const OUTCOME: [&str; 5] = ["Run", "Succeeded", "Message", "Trace", "Unknown"];

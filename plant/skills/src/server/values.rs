@@ -17,7 +17,7 @@ use crate::configuration::ComponentConfiguration;
 use crate::model::TableUnit;
 use crate::shown::SkillObserver;
 use crate::values::{
-    LiveValue, Measured, NOT_MEASURED, NewestState, Tally, ValueFacts, ValueSensor, watch,
+    LiveValue, Measured, NewestState, Tally, UnknownValue, ValueFacts, ValueSensor, watch,
 };
 use crate::variant::to_variant;
 use crate::yaml::{YamlFinding, YamlFindingCode};
@@ -216,7 +216,11 @@ fn add(
     })?;
     describe(server, node, facts, ids)?;
     let name = QualifiedName::new(node.namespace, REASON);
-    let property = (name, DataTypeId::String, Variant::from(NOT_MEASURED));
+    let property = (
+        name,
+        DataTypeId::String,
+        Variant::from(UnknownValue::NotMeasured.to_string()),
+    );
     add_property(server, node, ids, property)
 }
 
@@ -304,7 +308,7 @@ async fn show(server: OpcUaServer, node: NodeId, reason: NodeId, value: LiveValu
         let status = status(value.facts(), &reading);
         let (variant, why) = match &reading.value {
             Ok(value) => (to_variant(value), String::new()),
-            Err(why) => (Variant::Empty, why.clone()),
+            Err(why) => (Variant::Empty, why.to_string()),
         };
         let shown = DataValue {
             value: Some(variant),
@@ -335,7 +339,7 @@ pub fn status(facts: &ValueFacts, reading: &NewestState) -> StatusCode {
             }
             _ => StatusCode::Good,
         },
-        Err(why) if why == NOT_MEASURED => StatusCode::BadWaitingForInitialData,
+        Err(UnknownValue::NotMeasured) => StatusCode::BadWaitingForInitialData,
         Err(_) => StatusCode::BadNoCommunication,
     }
 }
@@ -426,12 +430,12 @@ mod tests {
         let mut seen = Vec::new();
         while seen.len() < 3 {
             let reading = readings.borrow_and_update().clone();
-            if reading.value != Err(NOT_MEASURED.to_owned()) {
+            if reading.value != Err(UnknownValue::NotMeasured) {
                 seen.push((status(value.facts(), &reading), reading.value));
             }
             readings.changed().await.unwrap();
         }
-        let lost = "the scale does not answer".to_owned();
+        let lost = UnknownValue::Reported("the scale does not answer".to_owned());
         let expected = [
             (StatusCode::Good, Ok(SkillValue::Double(1.5))),
             (
@@ -472,7 +476,7 @@ mod tests {
             about: String::new(),
         };
         let reading = NewestState {
-            value: Err(NOT_MEASURED.to_owned()),
+            value: Err(UnknownValue::NotMeasured),
             at: SystemTime::UNIX_EPOCH,
         };
         assert_eq!(

@@ -9,7 +9,7 @@ use program::ProgramMachineState;
 use tokio::sync::watch;
 use tokio::time::{Instant, MissedTickBehavior, interval};
 
-use super::{Measured, ValueSensor};
+use super::{Measured, UnknownValue, ValueSensor};
 use crate::shown::{SkillEvent, SkillObserver, SkillSnapshot};
 use crate::value::{Builtin, SkillValue, ValueShape};
 
@@ -231,8 +231,7 @@ impl ValueSensor for Tally {
                 for (measure, key) in Measure::ALL {
                     if out.keys().any(|wanted| wanted == key) {
                         let value = statistics.value(measure, now);
-                        let none = || "there is no successful run yet".to_owned();
-                        out.put(key, value.ok_or_else(none));
+                        out.put(key, value.ok_or(UnknownValue::NoRun));
                     }
                 }
             }
