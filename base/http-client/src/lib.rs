@@ -15,6 +15,7 @@ mod url;
 
 pub use connection::{Connection, HttpError};
 pub use host::{HttpHost, HttpLimits, RequestError};
+pub use hyper::http::Error as InvalidRequest;
 pub use hyper::{Method, Request, Response, StatusCode, header};
 #[cfg(feature = "tls")]
 pub use tls_client::{TlsAuthorities, TlsError, TlsVerification};

@@ -16,7 +16,7 @@ use crate::arguments::AasArguments;
 use crate::exit::CommandFailure;
 use crate::input;
 use crate::live::harmless;
-use crate::mtp_files::read;
+use crate::manifest::read;
 use crate::report::warn;
 use crate::source::plain_name;
 

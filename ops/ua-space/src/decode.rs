@@ -87,7 +87,7 @@ impl DecodeContext {
             Ok(found) => found,
             Err(why) => {
                 self.show(sealed, reading, None);
-                reading.refused = Some(why);
+                reading.refused = Some(why.to_string());
                 return;
             }
         };

@@ -4,9 +4,22 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use http_client::header::{ACCEPT, AUTHORIZATION, CONTENT_TYPE, HeaderValue};
-use http_client::{HttpHost, HttpLimits, Method, Request, basic_authorization};
+use http_client::{
+    HttpHost, HttpLimits, InvalidRequest, Method, Request, RequestError, basic_authorization,
+};
 
 use crate::exit::CommandFailure;
+
+/// The reason why a request has no response.
+#[derive(Debug, thiserror::Error)]
+enum ExchangeFault {
+    #[error(transparent)]
+    Request(#[from] InvalidRequest),
+    #[error(transparent)]
+    Host(#[from] RequestError),
+    #[error("an answer that is no text")]
+    NoText,
+}
 
 /// An HTTP response.
 pub(crate) struct HttpResponse {
@@ -145,7 +158,7 @@ impl HttpServer {
         path: &str,
         (accept, content_type, body): (&str, &str, Bytes),
         (user, within): (Option<HeaderValue>, Duration),
-    ) -> Result<HttpResponse, String> {
+    ) -> Result<HttpResponse, ExchangeFault> {
         let is_protobuf = content_type == PROTOBUF;
         let mut request = Request::builder()
             .method(method)
@@ -157,14 +170,13 @@ impl HttpServer {
         if let Some(user) = user {
             request = request.header(AUTHORIZATION, user);
         }
-        let request = request.body(body).map_err(|error| error.to_string())?;
+        let request = request.body(body)?;
         let limits = HttpLimits {
             within,
             most: MOST_BYTES,
         };
         let host = HttpHost::plain(self.authority.clone());
-        let sent = host.send(request, limits).await;
-        let response = sent.map_err(|error| error.to_string())?;
+        let response = host.send(request, limits).await?;
         let status = response.status().as_u16();
         let content_type = response.headers().get(CONTENT_TYPE);
         let content_type = content_type.and_then(|value| value.to_str().ok());
@@ -173,7 +185,7 @@ impl HttpServer {
             Ok(body) => body,
             // A collector of OTLP answers in protobuf, too. The texts in it are legible.
             Err(wrong) if is_protobuf => String::from_utf8_lossy(wrong.as_bytes()).into_owned(),
-            Err(_) => return Err("an answer that is no text".to_owned()),
+            Err(_) => return Err(ExchangeFault::NoText),
         };
         Ok(HttpResponse {
             status,

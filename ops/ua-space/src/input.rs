@@ -6,7 +6,6 @@ use std::io::{self, BufReader, Read};
 use crate::capture::{CaptureError, CaptureReader, is_capture};
 use crate::exit::CommandFailure;
 use crate::hex;
-use crate::recorded::is_mcap;
 
 /// A file with its detected format.
 pub(crate) enum InputFile {
@@ -145,3 +144,8 @@ fn read_lines(text: &str) -> Result<InputFile, hex::HexError> {
 const MAX_BYTES: u64 = 1 << 30;
 /// Maximum size of any other file, in bytes.
 const LARGEST: u64 = 256 << 20;
+
+/// Returns true if these are the first bytes of an MCAP file.
+const fn is_mcap(start: [u8; 4]) -> bool {
+    matches!(start, [0x89, b'M', b'C', b'A'])
+}

@@ -6,11 +6,40 @@ use std::time::Duration;
 
 use serde::Deserialize;
 use serde::de::IgnoredAny;
-use uadp::{NetworkMessage, Opener, SecurityError, SecurityMode, SecurityPolicy, TokenKeys};
+use uadp::{
+    KeyError, NetworkMessage, Opener, SecurityError, SecurityMode, SecurityPolicy, TokenKeys,
+};
 
 use crate::exit::CommandFailure;
 use crate::shape::PublisherIdJson;
 use crate::{hex, json_file, selector};
+
+/// The reason why no key of a file opens a sealed message.
+#[derive(Debug, thiserror::Error)]
+pub(crate) enum NoFittingKey {
+    #[error("no keys of SecurityTokenId {token_id} for this publisher in {file}")]
+    NoToken { token_id: u32, file: String },
+    #[error(
+        "the signature is wrong: {file} has other keys of SecurityTokenId {token_id}, or the datagram was changed"
+    )]
+    Signature { token_id: u32, file: String },
+    #[error("not to be opened: {0}")]
+    Other(SecurityError),
+}
+
+/// A fault of a key in a file.
+#[derive(Debug, thiserror::Error)]
+enum WrongKey {
+    #[error("`{0}` is no SecurityPolicy of PubSub")]
+    Policy(String),
+    #[error("{part}: {error}")]
+    Hex {
+        part: &'static str,
+        error: hex::HexError,
+    },
+    #[error(transparent)]
+    Length(#[from] KeyError),
+}
 
 /// The keys of a file.
 #[derive(Debug)]
@@ -79,7 +108,10 @@ impl KeyFile {
     /// Returns all keys that match the signature of a sealed message, at least one.
     ///
     /// Each message is verified independently, so a message that was sent twice is shown twice.
-    pub(crate) fn find(&self, message: &NetworkMessage<'_>) -> Result<Vec<&TokenKeys>, String> {
+    pub(crate) fn find(
+        &self,
+        message: &NetworkMessage<'_>,
+    ) -> Result<Vec<&TokenKeys>, NoFittingKey> {
         let token_id = message.security().map_or(0, |security| security.token_id);
         let mut found = Vec::new();
         let mut why = None;
@@ -92,16 +124,11 @@ impl KeyFile {
         if !found.is_empty() {
             return Ok(found);
         }
+        let file = self.name.clone();
         Err(match why {
-            None => format!(
-                "no keys of SecurityTokenId {token_id} for this publisher in {}",
-                self.name
-            ),
-            Some(SecurityError::Signature) => format!(
-                "the signature is wrong: {} has other keys of SecurityTokenId {token_id}, or the datagram was changed",
-                self.name
-            ),
-            Some(error) => format!("not to be opened: {error}"),
+            None => NoFittingKey::NoToken { token_id, file },
+            Some(SecurityError::Signature) => NoFittingKey::Signature { token_id, file },
+            Some(error) => NoFittingKey::Other(error),
         })
     }
 
@@ -175,20 +202,20 @@ impl KeyFileEntry {
 }
 
 impl WrittenKey {
-    fn keys(&self) -> Result<TokenKeys, String> {
+    fn keys(&self) -> Result<TokenKeys, WrongKey> {
         let policy = SecurityPolicy::from_uri(&self.policy)
-            .ok_or_else(|| format!("`{}` is no SecurityPolicy of PubSub", self.policy))?;
+            .ok_or_else(|| WrongKey::Policy(self.policy.clone()))?;
         let mut key_data = Vec::new();
         let parts = [
             ("signingKey", &self.signing_key),
             ("encryptingKey", &self.encrypting_key),
             ("keyNonce", &self.key_nonce),
         ];
-        for (key, part) in parts {
-            let bytes = hex::parse(part).map_err(|error| format!("{key}: {error}"))?;
+        for (part, text) in parts {
+            let bytes = hex::parse(text).map_err(|error| WrongKey::Hex { part, error })?;
             key_data.extend(bytes);
         }
-        TokenKeys::from_bytes(policy, &key_data).map_err(|error| error.to_string())
+        Ok(TokenKeys::from_bytes(policy, &key_data)?)
     }
 }
 

@@ -30,6 +30,7 @@ mod keys;
 mod layout;
 mod live;
 mod make_keys;
+mod manifest;
 mod messages;
 mod metadata;
 mod mtp_alarms;

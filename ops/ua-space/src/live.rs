@@ -17,16 +17,18 @@ mod names;
 mod parameters;
 pub(crate) mod plain;
 mod prober;
+mod received;
 mod record;
 mod replay;
 mod robot;
 mod run;
+mod scalars;
 mod sealing;
 mod seen;
 mod serve;
 mod skills;
 mod structure;
-mod text;
+pub(crate) mod text;
 mod top;
 mod trace;
 mod write;
@@ -37,7 +39,7 @@ pub(crate) use bandwidth::bandwidth;
 pub(crate) use call::call;
 pub(crate) use carrier::broker_mapping;
 pub(crate) use echo::{echo, hz};
-pub(crate) use list::{info, json};
+pub(crate) use list::info;
 pub(crate) use names::fitting;
 pub(crate) use record::record;
 pub(crate) use replay::replay;
@@ -45,7 +47,7 @@ pub(crate) use robot::ModelSource;
 pub(crate) use seen::{SenderTiming, TopicSeen, listened};
 pub(crate) use serve::serve;
 pub(crate) use skills::{HeardNames, heard_names, skills, types};
-pub(crate) use text::{TextTable, harmless, help_within_width, is_coloured, wrapped};
+pub(crate) use text::{TextTable, harmless, help_within_width, is_coloured, json, wrapped};
 pub(crate) use top::{Sort, top};
 pub(crate) use trace::trace;
 pub(crate) use write::write;
@@ -270,7 +272,7 @@ impl Live {
                     .try_send(&message)
                     .map_err(|error| error.to_string())
             }
-            Err(error) => Err(error),
+            Err(error) => Err(error.to_string()),
         };
         if let Err(error) = sent {
             warn(&format!("a datagram was not sent: {error}"));

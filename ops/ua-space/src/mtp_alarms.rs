@@ -13,7 +13,7 @@ use crate::live::{harmless, json};
 
 /// Prints the part of a mapping with the alarms of a manifest.
 pub(crate) fn alarms(arguments: &MtpAlarms) -> Result<(), CommandFailure> {
-    let module = crate::mtp_files::read(&arguments.file)?;
+    let module = crate::manifest::read(&arguments.file)?;
     let part = AlarmMapping::of(&module, arguments)?;
     let mut out = io::stdout().lock();
     out.write_all(part.yaml(&module)?.as_bytes())?;
@@ -153,15 +153,36 @@ impl AlarmMapping {
 /// The OPC UA type of a trigger, and its value as YAML.
 type TriggerValue = (&'static str, String);
 
+/// The reason why an alarm of a module has no condition.
+#[derive(Debug, thiserror::Error)]
+enum NoCondition {
+    #[error("its Trigger names no node of the manifest")]
+    NoNode,
+    #[error("its TriggerValue `{text}` is not {expected}")]
+    Value {
+        text: String,
+        expected: &'static str,
+    },
+    #[error("its TriggerValue cannot be written: {0}")]
+    Text(CommandFailure),
+    #[error(
+        "its trigger is an analog value, and the manifest does not say whether the alarm is above or \
+         below {text}: write a variable of {node} with `high` or `low`"
+    )]
+    Analog { text: String, node: String },
+}
+
 /// Returns the node of an alarm, its type, and the value that activates the alarm.
-///
-/// # Errors
-/// Returns the reason why no condition can be made.
-fn trigger<'a>(alarm: &'a ModuleAlarm, pea: &Pea) -> Result<(&'a OpcUaNode, TriggerValue), String> {
-    let node = alarm.trigger.as_ref();
-    let node = node.ok_or("its Trigger names no node of the manifest")?;
+fn trigger<'a>(
+    alarm: &'a ModuleAlarm,
+    pea: &Pea,
+) -> Result<(&'a OpcUaNode, TriggerValue), NoCondition> {
+    let node = alarm.trigger.as_ref().ok_or(NoCondition::NoNode)?;
     let text = alarm.trigger_value.trim();
-    let number = |what: &str| format!("its TriggerValue `{text}` is not {what}");
+    let number = |expected| NoCondition::Value {
+        text: text.to_owned(),
+        expected,
+    };
     let value = match pea.value(&node.item) {
         Some(PeaValue::Boolean(_)) | None => match text.to_ascii_lowercase().as_str() {
             "" | "true" | "1" => ("Boolean", "true".to_owned()),
@@ -181,15 +202,12 @@ fn trigger<'a>(alarm: &'a ModuleAlarm, pea: &Pea) -> Result<(&'a OpcUaNode, Trig
             ("Int32", value.to_string())
         }
         Some(PeaValue::Text(_)) => {
-            let value = json(&text).map_err(|error| error.to_string())?;
+            let value = json(&text).map_err(NoCondition::Text)?;
             ("String", value)
         }
         Some(PeaValue::Number(_)) => {
-            return Err(format!(
-                "its trigger is an analog value, and the manifest does not say whether the alarm is above or \
-                 below {text}: write a variable of {} with `high` or `low`",
-                node.id()
-            ));
+            let (text, node) = (text.to_owned(), node.id());
+            return Err(NoCondition::Analog { text, node });
         }
     };
     Ok((node, value))

@@ -15,7 +15,7 @@ pub(crate) fn connect(arguments: &MtpConnect) -> Result<(), CommandFailure> {
     let modules: Vec<Module> = arguments
         .files
         .iter()
-        .map(|file| crate::mtp_files::read(file))
+        .map(|file| crate::manifest::read(file))
         .collect::<Result<_, _>>()?;
     let named = Named::of(modules);
     let text = yaml(&named, arguments)?;

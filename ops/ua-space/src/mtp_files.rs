@@ -1,8 +1,7 @@
 //! `ua-space mtp`: reads manifests of process modules (MTP).
 
 use std::collections::BTreeMap;
-use std::fs;
-use std::io::{self, Read as _, Write as _};
+use std::io::{self, Write as _};
 use std::path::Path;
 
 use mtp::{Family, Module, MtpFinding, Object, Triple};
@@ -10,8 +9,8 @@ use serde::Serialize;
 
 use crate::arguments::{MtpArguments, MtpRdf, MtpSkills, MtpVerb};
 use crate::exit::CommandFailure;
-use crate::input;
 use crate::live::{TextTable, harmless, is_coloured, json};
+use crate::manifest::read;
 
 /// Runs `ua-space mtp`.
 pub(crate) fn mtp(arguments: &MtpArguments) -> Result<(), CommandFailure> {
@@ -24,20 +23,6 @@ pub(crate) fn mtp(arguments: &MtpArguments) -> Result<(), CommandFailure> {
         MtpVerb::Connect(arguments) => crate::mtp_connect::connect(arguments),
         MtpVerb::Run(arguments) => crate::mtp_run::run(arguments),
     }
-}
-
-/// Reads a manifest, with the documents beside it that it refers to.
-pub(crate) fn read(file: &str) -> Result<Module, CommandFailure> {
-    let bytes = input::read(file)?;
-    let beside = Path::new(file).parent().unwrap_or_else(|| Path::new(""));
-    let mut fetch = |name: &str| {
-        let mut bytes = Vec::new();
-        let file = fs::File::open(beside.join(name)).ok()?;
-        file.take(LARGEST).read_to_end(&mut bytes).ok()?;
-        Some(bytes)
-    };
-    Module::from_files(&bytes, &mut fetch)
-        .map_err(|error| CommandFailure::Data(format!("{}: {error}", input::name(file))))
 }
 
 /// The contents of a manifest, by their numbers.
@@ -400,6 +385,3 @@ fn unit(bound: Option<&mtp::ValueBound>) -> Option<String> {
     let symbol = mtp::unit_symbol(code);
     Some(symbol.map_or_else(|| format!("unit {code}"), str::to_owned))
 }
-
-/// Maximum size of another document in bytes.
-const LARGEST: u64 = 64 << 20;

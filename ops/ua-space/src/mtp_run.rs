@@ -28,7 +28,7 @@ use crate::survey::look;
 
 /// Runs `ua-space mtp run`.
 pub(crate) fn run(arguments: &MtpRun) -> Result<(), CommandFailure> {
-    let module = crate::mtp_files::read(&arguments.file)?;
+    let module = crate::manifest::read(&arguments.file)?;
     let device = ProcessModule::new(ModuleSettings {
         module,
         endpoint: arguments.endpoint.clone(),

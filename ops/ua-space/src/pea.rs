@@ -25,7 +25,7 @@ use crate::survey::look;
 
 /// Runs `ua-space pea` until SIGINT or SIGTERM.
 pub(crate) fn pea(arguments: &PeaArguments) -> Result<(), CommandFailure> {
-    let module = crate::mtp_files::read(&arguments.file)?;
+    let module = crate::manifest::read(&arguments.file)?;
     let endpoint: EndpointUrl = arguments
         .listen
         .parse()

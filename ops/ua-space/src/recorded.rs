@@ -2,6 +2,7 @@
 
 mod json;
 mod mcap;
+mod unusable;
 mod values;
 
 use std::collections::BTreeMap;
@@ -14,9 +15,8 @@ use crate::exit::CommandFailure;
 use crate::input::{self, InputFile};
 use crate::packet::{self, Fragments, PacketContent};
 
-pub(crate) use self::mcap::is_mcap;
+pub(crate) use self::unusable::UnusableValue;
 use self::values::RecordedValues;
-pub(crate) use self::values::UnusableValue;
 
 /// Reads the NetworkMessages of a recording.
 pub(crate) struct RecordingReader {

@@ -54,7 +54,7 @@ impl StyledOutput {
         if unread && self.style == Style::Single {
             return Ok(());
         }
-        let json = crate::live::json(&reading.shape)?;
+        let json = crate::live::text::json(&reading.shape)?;
         let before = match (self.style, self.shown) {
             (Style::Array, 0) => "[\n",
             (Style::Array, _) => ",\n",
@@ -92,7 +92,7 @@ impl StyledOutput {
 /// Writes a line to stdout.
 pub(crate) fn say(text: &str) -> Result<(), CommandFailure> {
     let mut out = io::stdout().lock();
-    writeln!(out, "{}", crate::live::harmless(text))?;
+    writeln!(out, "{}", crate::live::text::harmless(text))?;
     out.flush()?;
     Ok(())
 }

@@ -14,7 +14,7 @@ use std::io::{self, Read};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-pub use documents::read_bounded;
+pub use documents::{FileError, read_bounded};
 use mappings::{FileReaders, PathFault, Surroundings};
 use messages::{DefinitionText, DefinitionTexts, Dialect, Language, TextKind, TypeName};
 use tracing::warn;

@@ -6,8 +6,9 @@ use std::io::{self, Write as _};
 use mappings::SpaceId;
 use serde::Serialize;
 
-use super::list::{self, FIRST_ASKED, ListRow, json, lines, origin};
-use super::text::{TextTable, is_coloured};
+use super::list::{self, ListRow, lines, origin};
+use super::prober::FIRST_ASKED;
+use super::text::{TextTable, is_coloured, json};
 use super::{Go, InGroup, Live, until};
 use crate::arguments::{DiscoverArguments, GroupArguments, ListArguments};
 use crate::discover::{DiscoveredEntry, DiscoveredKind, around_and};

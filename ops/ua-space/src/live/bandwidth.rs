@@ -5,55 +5,17 @@ use std::io::{self, Write as _};
 use std::time::Duration;
 
 use serde::Serialize;
-use uadp::MessageKind;
 
-use super::book::{DatagramContent, NameKind};
-use super::list::{json, unheard};
-use super::names::unknown;
-use super::{Go, ListenEnd, in_group, until};
+use super::received::measured;
+use super::text::json;
 use crate::arguments::Hz;
 use crate::exit::CommandFailure;
-use crate::report::warn;
 
 /// Runs `ua-space bw`.
 pub(crate) fn bandwidth(arguments: &Hz) -> Result<(), CommandFailure> {
-    in_group(&arguments.group, async |mut live| {
-        let end = until(live.now(), arguments.seconds);
-        let seconds = arguments.seconds.unwrap_or_default();
-        let target = (&arguments.target, Some(NameKind::Value));
-        let found = live.resolve(target, end, &mut |_, _| Go::On).await?;
-        let Some(topic) = found else {
-            return Err(unknown(&live, &arguments.target, seconds));
-        };
-        let mut sizes: VecDeque<(Duration, usize)> = VecDeque::new();
-        loop {
-            let next = until(live.now(), Some(REPORT)).min(end);
-            let mut each = |news: DatagramContent<'_>, now| {
-                if let DatagramContent::Sample(sample) = news
-                    && sample.topic == topic
-                    && sample.message.kind != MessageKind::KeepAlive
-                {
-                    if sizes.len() >= arguments.window {
-                        sizes.pop_front();
-                    }
-                    sizes.push_back((now, sample.message.payload().len()));
-                }
-                Go::On
-            };
-            let ended = live.listen(next, &mut each).await?;
-            let last = ended == ListenEnd::Interrupted || live.now() >= end;
-            if let Some(load) = Load::of(&sizes) {
-                load.print(arguments.json)?;
-            } else if !arguments.json && !last {
-                warn("no two values yet");
-            }
-            if last && sizes.is_empty() && ended == ListenEnd::Time {
-                return Err(unheard(&live, topic, seconds));
-            }
-            if last {
-                return Ok(());
-            }
-        }
+    measured(arguments, |received| match Load::of(&received.newest) {
+        Some(load) => load.print(arguments.json).map(Some),
+        None => Ok(None),
     })
 }
 
@@ -124,9 +86,6 @@ fn bytes(count: f64) -> String {
         format!("{:.2} MB", count / 1_000_000.0)
     }
 }
-
-/// Interval of the reports, in seconds.
-const REPORT: f64 = 1.0;
 
 #[cfg(test)]
 mod tests {

@@ -11,8 +11,7 @@ use tokio::time::{Instant, sleep_until};
 use uadp::discovery::ConnectionState;
 
 use super::carrier::{self, NO_BROKER};
-use super::list::json;
-use super::text::{TextTable, is_coloured};
+use super::text::{TextTable, is_coloured, json};
 use crate::arguments::ListArguments;
 use crate::exit::CommandFailure;
 use crate::report::warn;

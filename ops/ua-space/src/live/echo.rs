@@ -10,10 +10,11 @@ use uadp::{DecodeError, MessageKind};
 
 use super::book::{DatagramContent, NameKind, ReceivedSample};
 use super::described::AnnouncedDescription;
-use super::list::{json, unheard};
+use super::list::unheard;
 use super::names::unknown;
 use super::plain::{self, NamedValues};
-use super::text::harmless;
+use super::received::measured;
+use super::text::{harmless, json};
 use super::{Go, ListenEnd, Live, in_group, until};
 use crate::arguments::{EchoArguments, Hz};
 use crate::exit::CommandFailure;
@@ -282,44 +283,12 @@ impl Printing<'_> {
 
 /// Runs `ua-space hz`.
 pub(crate) fn hz(arguments: &Hz) -> Result<(), CommandFailure> {
-    in_group(&arguments.group, async |mut live| {
-        let end = until(live.now(), arguments.seconds);
-        let seconds = arguments.seconds.unwrap_or_default();
-        let target = (&arguments.target, Some(NameKind::Value));
-        let found = live.resolve(target, end, &mut |_, _| Go::On).await?;
-        let Some(topic) = found else {
-            return Err(unknown(&live, &arguments.target, seconds));
-        };
-        let mut times: VecDeque<Duration> = VecDeque::new();
-        let mut all = 0_u64;
-        loop {
-            let next = until(live.now(), Some(REPORT)).min(end);
-            let mut each = |news: DatagramContent<'_>, now| {
-                if let DatagramContent::Sample(sample) = news
-                    && sample.topic == topic
-                    && sample.message.kind != MessageKind::KeepAlive
-                {
-                    all += 1;
-                    if times.len() >= arguments.window {
-                        times.pop_front();
-                    }
-                    times.push_back(now);
-                }
-                Go::On
-            };
-            let ended = live.listen(next, &mut each).await?;
-            let last = ended == ListenEnd::Interrupted || live.now() >= end;
-            if let Some(rhythm) = Rhythm::of(&times, all) {
-                rhythm.print(arguments)?;
-            } else if !arguments.json && !last {
-                warn("no two values yet");
-            }
-            if last && all == 0 && ended == ListenEnd::Time {
-                return Err(unheard(&live, topic, seconds));
-            }
-            if last {
-                return Ok(());
-            }
+    measured(arguments, |received| {
+        let newest = received.newest.iter();
+        let times: VecDeque<Duration> = newest.map(|(at, _)| *at).collect();
+        match Rhythm::of(&times, received.all) {
+            Some(rhythm) => rhythm.print(arguments).map(Some),
+            None => Ok(None),
         }
     })
 }
@@ -391,8 +360,6 @@ const NAMED_WITHIN: f64 = 1.2;
 const MOST_EARLY: usize = 1024;
 /// Maximum number of waiting values.
 const MOST_WAITING: usize = 256;
-/// Interval of the reports of `hz`, in seconds.
-const REPORT: f64 = 1.0;
 
 #[cfg(test)]
 mod tests {

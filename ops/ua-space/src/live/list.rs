@@ -11,7 +11,7 @@ use uadp::StatusCode;
 use super::book::{Book, DatagramContent, NameKind, TopicValues};
 use super::described::{AnnouncedDescription, AnnouncedField, DescribedKind, ShownField};
 use super::names::unknown;
-use super::text::{TextTable, age, harmless, width, wrapped};
+use super::text::{TextTable, age, harmless, json, width, wrapped};
 use super::{Go, Live, in_group, until};
 use crate::arguments::InfoArguments;
 use crate::exit::CommandFailure;
@@ -56,13 +56,6 @@ pub(super) fn unheard(live: &Live, topic: TopicId, seconds: f64) -> CommandFailu
         many => format!("{many} other topics were heard; `ua-space list` shows them"),
     };
     CommandFailure::Unavailable(format!("{what}\n  = help: {help}"))
-}
-
-/// Returns JSON without characters that control a terminal.
-pub(crate) fn json(shown: &impl Serialize) -> Result<String, CommandFailure> {
-    let text =
-        serde_json::to_string(shown).map_err(|error| CommandFailure::Data(error.to_string()))?;
-    Ok(mappings::harmless_json(&text))
 }
 
 /// A topic or call in the list.
@@ -207,9 +200,6 @@ pub(super) fn quality_name(status: StatusCode) -> String {
 }
 
 const GOOD: &str = "Good";
-
-/// Spaces that are probed for calls before any message is received from them.
-pub(super) const FIRST_ASKED: [u16; 3] = [0, 1, 2];
 
 pub(super) fn origin(space: SpaceId) -> &'static str {
     match space {

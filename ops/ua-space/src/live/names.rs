@@ -8,7 +8,7 @@ use mappings::{Mapping, TopicId, Variable};
 
 use super::book::{Book, DatagramContent, NameKind};
 use super::described::AnnouncedDescription;
-use super::list::FIRST_ASKED;
+use super::prober::FIRST_ASKED;
 use super::text::harmless;
 use super::{Go, ListenEnd, Live};
 use crate::arguments::NamedTarget;

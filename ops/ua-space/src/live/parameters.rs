@@ -4,15 +4,55 @@ use serde_json::{Value, json};
 use uadp::BuiltinType;
 
 use super::described::{AnnouncedField, list};
-use crate::values::JsonFieldValue;
-use crate::values::variant_bytes;
+use crate::values::{JsonFieldValue, WrongValue, variant_bytes};
 
 /// A wrong argument, and the parameters that the call takes.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[derive(Debug, thiserror::Error)]
 #[error("{what}\n  = help: {help}")]
 pub(crate) struct WrongParameter {
-    what: String,
+    what: ArgumentFault,
     help: String,
+}
+
+/// A fault of the arguments of a call or a value.
+#[derive(Debug, thiserror::Error)]
+enum ArgumentFault {
+    #[error("`{0}` is no name=value")]
+    NoName(String),
+    #[error("there is no parameter `{0}`")]
+    Unknown(String),
+    #[error("`{0}` is given twice")]
+    Twice(String),
+    #[error("{name}: {fault}")]
+    Value { name: String, fault: TypedFault },
+    #[error("{} is missing", .0.join(", "))]
+    Missing(Vec<String>),
+    #[error("too many parameters")]
+    TooMany,
+    #[error("{}", format!("{name}: {error}").replace(": .Value", ": value"))]
+    Encoding { name: String, error: WrongValue },
+}
+
+/// The reason why a text is no value of a field.
+#[derive(Debug, thiserror::Error)]
+enum TypedFault {
+    #[error("it is of a type that is not known here")]
+    UnknownType,
+    #[error("{kind} cannot be given here")]
+    Rank { kind: String },
+    #[error("`{0}` is no list as [1, 2, 3]")]
+    NoList(String),
+    #[error("{kind} takes {size} values, and {given} are given")]
+    Length {
+        kind: String,
+        size: u32,
+        given: usize,
+    },
+    #[error("expected a {expected}, found `{found}`")]
+    OtherType {
+        expected: &'static str,
+        found: String,
+    },
 }
 
 /// Returns the request: a FieldCount and as many Variants, in the order of the call. An omitted
@@ -34,7 +74,7 @@ pub(super) fn encoded(
     takes: &[AnnouncedField],
     subject: &str,
 ) -> Result<Vec<u8>, WrongParameter> {
-    let wrong = |what: String| WrongParameter {
+    let wrong = |what| WrongParameter {
         what,
         help: match takes {
             [] => format!("this {subject} takes nothing"),
@@ -45,29 +85,33 @@ pub(super) fn encoded(
     for word in words {
         let (name, text) = word
             .split_once('=')
-            .ok_or_else(|| wrong(format!("`{word}` is no name=value")))?;
+            .ok_or_else(|| wrong(ArgumentFault::NoName(word.clone())))?;
         let at = takes.iter().position(|field| field.name == name);
         let place = at.and_then(|at| Some((takes.get(at)?, given.get_mut(at)?)));
         let Some((field, place)) = place else {
-            return Err(wrong(format!("there is no parameter `{name}`")));
+            return Err(wrong(ArgumentFault::Unknown(name.to_owned())));
         };
         if place.is_some() {
-            return Err(wrong(format!("`{name}` is given twice")));
+            return Err(wrong(ArgumentFault::Twice(name.to_owned())));
         }
-        *place = Some(value(field, text).map_err(|why| wrong(format!("{name}: {why}")))?);
+        let value = value(field, text).map_err(|fault| {
+            let name = name.to_owned();
+            wrong(ArgumentFault::Value { name, fault })
+        })?;
+        *place = Some(value);
     }
     let missing = takes.iter().zip(&given);
-    let missing: Vec<&str> = missing
+    let missing: Vec<String> = missing
         .filter(|(field, value)| value.is_none() && !field.optional)
-        .map(|(field, _)| field.name.as_str())
+        .map(|(field, _)| field.name.clone())
         .collect();
     if !missing.is_empty() {
-        return Err(wrong(format!("{} is missing", missing.join(", "))));
+        return Err(wrong(ArgumentFault::Missing(missing)));
     }
     if given.iter().all(Option::is_none) {
         return Ok(vec![0, 0]);
     }
-    let count = u16::try_from(takes.len()).map_err(|_| wrong("too many parameters".to_owned()))?;
+    let count = u16::try_from(takes.len()).map_err(|_| wrong(ArgumentFault::TooMany))?;
     let mut block = count.to_le_bytes().to_vec();
     for (field, value) in takes.iter().zip(given) {
         let shown = JsonFieldValue {
@@ -79,28 +123,29 @@ pub(super) fn encoded(
             value,
             ..JsonFieldValue::default()
         };
-        let bytes = variant_bytes(&shown).map_err(|why| {
-            wrong(format!("{}: {why}", field.name).replace(": .Value", ": value"))
+        let bytes = variant_bytes(&shown).map_err(|error| {
+            let name = field.name.clone();
+            wrong(ArgumentFault::Encoding { name, error })
         })?;
         block.extend(bytes);
     }
     Ok(block)
 }
 
-fn value(field: &AnnouncedField, text: &str) -> Result<Value, String> {
+fn value(field: &AnnouncedField, text: &str) -> Result<Value, TypedFault> {
     let Some(builtin) = field.builtin else {
-        return Err("it is of a type that is not known here".to_owned());
+        return Err(TypedFault::UnknownType);
     };
     if !field.is_array() {
         return scalar(builtin, text);
     }
     if field.rank > 1 {
-        return Err(format!("{} cannot be given here", field.kind()));
+        return Err(TypedFault::Rank { kind: field.kind() });
     }
     let elements = match text.trim().starts_with('[') {
         true => match serde_json::from_str(text) {
             Ok(Value::Array(elements)) => elements,
-            Ok(_) | Err(_) => return Err(format!("`{text}` is no list as [1, 2, 3]")),
+            Ok(_) | Err(_) => return Err(TypedFault::NoList(text.to_owned())),
         },
         false if text.is_empty() => Vec::new(),
         false => text.split(',').map(|text| json!(text.trim())).collect(),
@@ -109,11 +154,11 @@ fn value(field: &AnnouncedField, text: &str) -> Result<Value, String> {
         && *size > 0
         && usize::try_from(*size) != Ok(elements.len())
     {
-        let given = elements.len();
-        return Err(format!(
-            "{} takes {size} values, and {given} are given",
-            field.kind()
-        ));
+        return Err(TypedFault::Length {
+            kind: field.kind(),
+            size: *size,
+            given: elements.len(),
+        });
     }
     let elements = elements.iter().map(|element| match element.as_str() {
         Some(text) => scalar(builtin, text),
@@ -123,8 +168,11 @@ fn value(field: &AnnouncedField, text: &str) -> Result<Value, String> {
 }
 
 /// Converts a typed text to the JSON of its type.
-fn scalar(builtin: BuiltinType, text: &str) -> Result<Value, String> {
-    let expected = || format!("expected a {}, found `{text}`", builtin.name());
+fn scalar(builtin: BuiltinType, text: &str) -> Result<Value, TypedFault> {
+    let expected = || TypedFault::OtherType {
+        expected: builtin.name(),
+        found: text.to_owned(),
+    };
     #[expect(
         clippy::wildcard_enum_match_arm,
         reason = "all others are typed as JSON, or as texts"

@@ -2,9 +2,10 @@
 
 use serde::ser::{Serialize, SerializeMap as _, Serializer};
 use serde_json::{Value, json};
-use uadp::{Array, DataSetMessage, DecodeError, FieldEncoding, Scalar, Variant};
+use uadp::{DataSetMessage, DecodeError, FieldEncoding, Scalar, Variant};
 
 use super::described::{AnnouncedDescription, AnnouncedField};
+use super::scalars::{elements, scalar};
 use super::text::harmless;
 use crate::arguments::RawReading;
 use crate::raw_data::RawDataLayout;
@@ -207,23 +208,6 @@ pub(crate) fn variant(value: &Variant<'_>) -> Result<Value, DecodeError> {
     }
 }
 
-pub(super) fn scalar(value: Scalar<'_>) -> Result<Value, DecodeError> {
-    #[expect(
-        clippy::wildcard_enum_match_arm,
-        reason = "all others as `decode` has them"
-    )]
-    match value {
-        Scalar::Int64(value) => Ok(json!(value)),
-        Scalar::UInt64(value) => Ok(json!(value)),
-        Scalar::LocalizedText(value) => Ok(json!(value.text)),
-        other => show_scalar(other),
-    }
-}
-
-pub(super) fn elements(array: Array<'_>) -> Result<Value, DecodeError> {
-    array.iter().map(scalar).collect()
-}
-
 /// Nests a flat array by its dimensions, the innermost dimension last.
 fn nested(mut flat: Value, dimensions: &[u32]) -> Value {
     for size in dimensions.iter().skip(1).rev() {
@@ -237,7 +221,7 @@ fn nested(mut flat: Value, dimensions: &[u32]) -> Value {
 
 #[cfg(test)]
 mod tests {
-    use uadp::BuiltinType;
+    use uadp::{Array, BuiltinType};
 
     use super::*;
 

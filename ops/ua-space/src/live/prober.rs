@@ -168,6 +168,9 @@ const RENEWED: u32 = 8;
 /// Interval of the probes for the values that a command cannot do without.
 const INSIST: Duration = Duration::from_millis(500);
 
+/// Spaces that are probed for calls before any message is received from them.
+pub(super) const FIRST_ASKED: [u16; 3] = [0, 1, 2];
+
 #[cfg(test)]
 mod tests {
     use uadp::NetworkMessage;

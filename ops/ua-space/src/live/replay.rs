@@ -20,9 +20,8 @@ use uadp::{NetworkMessage, NetworkMessageType};
 
 use self::clock::ReplayClock;
 use self::contents::{Prepared, RecordingContents, ReplayOmission, space};
-use super::list::json;
 use super::sealing::Sealing;
-use super::text::{TextTable, harmless, is_coloured};
+use super::text::{TextTable, harmless, is_coloured, json};
 use super::{Go, Incoming, Live, in_group, until};
 use crate::arguments::ReplayArguments;
 use crate::exit::CommandFailure;

@@ -2,11 +2,20 @@
 
 use std::path::Path;
 
-use uadp::{NetworkMessage, Seal, Sealer, SecurityMode};
+use uadp::{EncodeError, NetworkMessage, Seal, SealError, Sealer, SecurityMode};
 
 use crate::exit::CommandFailure;
 use crate::keys::{self, KeyFile};
 use crate::report::warn;
+
+/// The reason why a message is not secured.
+#[derive(Debug, thiserror::Error)]
+pub(crate) enum UnsealedMessage {
+    #[error(transparent)]
+    Seal(#[from] SealError),
+    #[error(transparent)]
+    Encode(#[from] EncodeError),
+}
 
 /// The keys of a file, and the sealer with the first key.
 #[derive(Debug)]
@@ -67,14 +76,10 @@ impl Sealing {
         }
     }
 
-    pub(crate) fn seal(&mut self, datagram: &[u8]) -> Result<Vec<u8>, String> {
-        let seal = self
-            .sealer
-            .seal(self.mark)
-            .map_err(|error| error.to_string())?;
+    pub(crate) fn seal(&mut self, datagram: &[u8]) -> Result<Vec<u8>, UnsealedMessage> {
+        let seal = self.sealer.seal(self.mark)?;
         let mut sealed = Vec::with_capacity(datagram.len() + Seal::OVERHEAD);
-        let written = seal.secure(datagram, &mut sealed);
-        written.map_err(|error| error.to_string())?;
+        seal.secure(datagram, &mut sealed)?;
         Ok(sealed)
     }
 }

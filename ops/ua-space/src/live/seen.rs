@@ -57,7 +57,7 @@ pub(crate) async fn listened(
 ) -> Result<Listened, CommandFailure> {
     let mut live = Live::join(group)?;
     live.want_all();
-    live.want_calls(super::list::FIRST_ASKED);
+    live.want_calls(super::prober::FIRST_ASKED);
     let end = until(live.now(), Some(seconds));
     let start = live.start_utc();
     let mut senders: BTreeMap<SocketAddr, i128> = BTreeMap::new();

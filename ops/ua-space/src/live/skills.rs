@@ -19,10 +19,9 @@ use uadp::MessageKind;
 
 use super::book::{Book, DatagramContent, NameKind};
 use super::described::{AnnouncedDescription, AnnouncedField};
-use super::list::json;
 use super::names::fitting;
 use super::plain::{self, NamedValues};
-use super::text::{TextTable, age, harmless, is_coloured};
+use super::text::{TextTable, age, harmless, is_coloured, json};
 use super::{Go, ListenEnd, Live, in_group, until};
 use crate::arguments::{GroupArguments, ListSkills, Skills, SkillsVerb};
 use crate::exit::CommandFailure;

@@ -4,7 +4,7 @@ use serde_json::{Map, Value};
 use uadp::discovery::{DataTypeSchemaHeader, StructureField, StructureType};
 use uadp::{BuiltinType, DecodeError, ExtensionBody, NodeId, NodeIdValue, Scalar, StructureReader};
 
-use super::plain;
+use super::scalars;
 
 /// The fields of a structure, including nested structures.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -102,8 +102,12 @@ impl StructureFields {
         let mut shown = Map::new();
         for part in &self.0 {
             let value = match (&part.kind, part.is_array) {
-                (ReadFieldKind::Builtin(builtin), false) => plain::scalar(body.scalar(*builtin)?)?,
-                (ReadFieldKind::Builtin(builtin), true) => plain::elements(body.array(*builtin)?)?,
+                (ReadFieldKind::Builtin(builtin), false) => {
+                    scalars::scalar(body.scalar(*builtin)?)?
+                }
+                (ReadFieldKind::Builtin(builtin), true) => {
+                    scalars::elements(body.array(*builtin)?)?
+                }
                 (ReadFieldKind::Structure(structure), false) => structure.read(body, room)?,
                 (ReadFieldKind::Structure(structure), true) => {
                     (0..body.length()?.unwrap_or_default())

@@ -3,6 +3,10 @@
 use std::borrow::Cow;
 use std::io::{self, IsTerminal as _, Write};
 
+use serde::Serialize;
+
+use crate::exit::CommandFailure;
+
 /// A table that fits the terminal. Columns have the necessary width; if the table is too wide, the
 /// cells of its widest columns are shortened.
 #[derive(Clone)]
@@ -302,6 +306,13 @@ pub(crate) fn micros(us: f64) -> String {
     } else {
         format!("{:.2} s", us / 1_000_000.0)
     }
+}
+
+/// Returns JSON without characters that control a terminal.
+pub(crate) fn json(shown: &impl Serialize) -> Result<String, CommandFailure> {
+    let text =
+        serde_json::to_string(shown).map_err(|error| CommandFailure::Data(error.to_string()))?;
+    Ok(mappings::harmless_json(&text))
 }
 
 #[cfg(test)]

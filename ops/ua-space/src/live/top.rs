@@ -23,7 +23,7 @@ use rows::{Figures, TopView};
 pub(crate) fn top(arguments: &Top) -> Result<(), CommandFailure> {
     in_group(&arguments.group, async |mut live| {
         live.want_all();
-        live.want_calls(super::list::FIRST_ASKED);
+        live.want_calls(super::prober::FIRST_ASKED);
         let mut view = TopView::new(arguments.sort, arguments.filter.clone().unwrap_or_default());
         if !io::stdout().is_terminal() || !io::stdin().is_terminal() {
             return once(&mut live, arguments, &mut view).await;

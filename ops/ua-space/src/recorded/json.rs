@@ -4,7 +4,7 @@ use serde_json::{Map, Value, json};
 use uadp::{BuiltinType, DataSetHeader, DataValue, Fields, NetworkMessageEncoder, StatusCode};
 use uadp::{EncodeError, Variant};
 
-use super::values::UnusableValue;
+use super::unusable::UnusableValue;
 use crate::live::channels::DELTA;
 use crate::live::described::AnnouncedField;
 use crate::live::plain;

@@ -49,11 +49,6 @@ pub(super) struct McapMessage {
     pub(super) data: Vec<u8>,
 }
 
-/// Returns true if these are the first bytes of an MCAP file.
-pub(crate) const fn is_mcap(start: [u8; 4]) -> bool {
-    matches!(start, [0x89, b'M', b'C', b'A'])
-}
-
 impl<R: Read> McapReader<R> {
     /// Reads the start of a file; `reader` returns the bytes after the first four.
     pub(super) fn new(reader: R) -> Result<Self, CaptureError> {

@@ -3,7 +3,6 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::net::SocketAddr;
 use std::path::Path;
-use std::time::Duration;
 
 use serde::Serialize;
 
@@ -162,6 +161,3 @@ impl CellFacts {
         bridges
     }
 }
-
-/// The time limit of a measurement on an interface.
-pub(super) const ROUND_TRIP: Duration = Duration::from_secs(1);

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::fs;
-use std::io::Read as _;
+use std::io::{self, Read as _};
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::path::Path;
 use std::process::{Command, Stdio};
@@ -11,10 +11,9 @@ use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use serde::Serialize;
 use tokio::time::{Instant, timeout};
-use transport::{Udp, UdpOptions};
+use transport::{SendError, Udp, UdpOpenError, UdpOptions};
 
 use super::super::processes::{self, LocalProcess, UdpSocket};
-use super::facts::ROUND_TRIP;
 
 #[derive(Debug, Clone, Default, PartialEq, Serialize)]
 pub(super) struct HostFacts {
@@ -98,43 +97,63 @@ impl HostFacts {
         }
         for interface in &mut self.interfaces {
             if interface.up {
-                interface.round_trip = Some(round_trip(group.ip(), &interface.address).await);
+                let round_trip = round_trip(group.ip(), &interface.address).await;
+                interface.round_trip = Some(round_trip.map_err(|fault| fault.to_string()));
             }
         }
     }
 }
 
-async fn round_trip(group: IpAddr, interface: &str) -> Result<f64, String> {
+/// The reason why a datagram to the group did not come back.
+#[derive(Debug, thiserror::Error)]
+enum RoundTripFault {
+    #[error(transparent)]
+    Port(#[from] io::Error),
+    #[error(transparent)]
+    Open(#[from] UdpOpenError),
+    #[error("cannot send: {0}")]
+    Send(SendError),
+    #[error("cannot receive: {0}")]
+    Receive(io::Error),
+    #[error("nothing came back within {ROUND_TRIP:?}")]
+    Lost,
+}
+
+/// Returns the time until a datagram to the group comes back, in microseconds.
+async fn round_trip(group: IpAddr, interface: &str) -> Result<f64, RoundTripFault> {
     let free = std::net::UdpSocket::bind((Ipv4Addr::UNSPECIFIED, 0));
     let port = free.and_then(|socket| socket.local_addr());
-    let port = port.map_err(|error| error.to_string())?.port();
+    let port = port?.port();
     let options = UdpOptions {
         interface: Some(interface.to_owned()),
         ttl: 0,
         own: true,
         ..UdpOptions::new(SocketAddr::new(group, port))
     };
-    let mut udp = Udp::open(&options).map_err(|error| error.to_string())?;
+    let mut udp = Udp::open(&options)?;
     let sent = format!("ua-space doctor {} {interface}", std::process::id());
     let start = Instant::now();
     udp.try_send(sent.as_bytes())
-        .map_err(|error| format!("cannot send: {error}"))?;
+        .map_err(RoundTripFault::Send)?;
     let mut buffer = [0; 256];
     let received = async {
         loop {
             match udp.recv(&mut buffer).await {
                 Ok((length, _)) if buffer.get(..length) == Some(sent.as_bytes()) => return Ok(()),
                 Ok(_) => {}
-                Err(error) => return Err(format!("cannot receive: {error}")),
+                Err(error) => return Err(RoundTripFault::Receive(error)),
             }
         }
     };
     match timeout(ROUND_TRIP, received).await {
         Ok(Ok(())) => Ok(start.elapsed().as_secs_f64() * 1e6),
         Ok(Err(error)) => Err(error),
-        Err(_over) => Err(format!("nothing came back within {ROUND_TRIP:?}")),
+        Err(_over) => Err(RoundTripFault::Lost),
     }
 }
+
+/// The time limit of a measurement on an interface.
+const ROUND_TRIP: Duration = Duration::from_secs(1);
 
 fn interfaces() -> Vec<InterfaceFacts> {
     let all = transport::interfaces().unwrap_or_default().into_iter();

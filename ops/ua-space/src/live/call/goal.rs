@@ -159,7 +159,8 @@ impl Asking<'_> {
         let fills = described.ros_type().is_some() && described.skill_type().is_none();
         let usage =
             |wrong: String| CommandFailure::Usage(format!("{}: {wrong}", called(topic, described)));
-        let typed = words::spelled(&self.arguments.parameters, &takes, fills).map_err(usage)?;
+        let typed = words::spelled(&self.arguments.parameters, &takes, fills);
+        let typed = typed.map_err(|wrong| usage(wrong.to_string()))?;
         let block =
             parameters::request(&typed, &takes).map_err(|wrong| usage(wrong.to_string()))?;
         let [result, cancel] = self.parts_of(topic, parts).await?;

@@ -7,6 +7,21 @@ use uadp::BuiltinType;
 
 use super::super::described::AnnouncedField;
 
+/// The reason why an argument is no message in YAML.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub(in crate::live) enum NoMessage {
+    #[error("the value is not YAML: {0}")]
+    Yaml(String),
+    #[error("the value may have lists, maps and single values only")]
+    Alias,
+    #[error("the value is not a map, as {{order: 5}}")]
+    NoMap,
+    #[error("the names in a map are texts")]
+    Name,
+    #[error("`{name}` is given twice")]
+    Twice { name: String },
+}
+
 /// Returns the fields of a goal by their names within the goal, without the goal id.
 pub(super) fn fields(takes: &[AnnouncedField]) -> Vec<AnnouncedField> {
     let fields = takes.iter().filter(|field| field.name != GOAL_ID);
@@ -30,12 +45,12 @@ pub(super) fn own<'n>(name: &'n str, part: &str) -> &'n str {
 /// values of a ROS message.
 ///
 /// # Errors
-/// A description of the argument that cannot be parsed.
+/// [`NoMessage`], if an argument is no message in YAML.
 pub(super) fn spelled(
     typed: &[String],
     takes: &[AnnouncedField],
     fills: bool,
-) -> Result<Vec<String>, String> {
+) -> Result<Vec<String>, NoMessage> {
     let typed: Vec<String> = typed
         .iter()
         .map(|word| own(word, GOAL).to_owned())
@@ -46,12 +61,12 @@ pub(super) fn spelled(
 /// Returns the fields of a message as `name=value`, as [`spelled`] does for a goal.
 ///
 /// # Errors
-/// A description of the argument that cannot be parsed.
+/// [`NoMessage`], if an argument is no message in YAML.
 pub(in crate::live) fn message(
     typed: &[String],
     takes: &[AnnouncedField],
     fills: bool,
-) -> Result<Vec<String>, String> {
+) -> Result<Vec<String>, NoMessage> {
     let mut words = Vec::new();
     for word in typed {
         match word.trim_start().starts_with('{') {
@@ -118,7 +133,7 @@ fn flatten(value: &Value, path: &str, words: &mut Vec<String>) {
 }
 
 /// Parses YAML and keeps scalars as text, because their types are the types of the fields.
-fn yaml(text: &str) -> Result<Value, String> {
+fn yaml(text: &str) -> Result<Value, NoMessage> {
     let options = granit_parser::options! {
         emit_comments: false,
         flow_nesting_limit: MOST_DEEP,
@@ -127,7 +142,7 @@ fn yaml(text: &str) -> Result<Value, String> {
     let mut open: Vec<(bool, Vec<Value>)> = Vec::new();
     let mut root = None;
     for event in Parser::new_from_str_with_options(text, options) {
-        let (event, _) = event.map_err(|error| format!("the value is not YAML: {error}"))?;
+        let (event, _) = event.map_err(|error| NoMessage::Yaml(error.to_string()))?;
         let value = match event {
             Event::Scalar(text, ..) => Value::String(text.into_owned()),
             Event::SequenceStart(..) => {
@@ -147,10 +162,10 @@ fn yaml(text: &str) -> Result<Value, String> {
             | Event::DocumentStart(..)
             | Event::DocumentEnd => continue,
             Event::Alias(_) | Event::UnresolvedAlias(_) | Event::Anchor(..) => {
-                return Err(NO_ALIAS.to_owned());
+                return Err(NoMessage::Alias);
             }
             // The enumeration is non-exhaustive.
-            _ => return Err(NO_ALIAS.to_owned()),
+            _ => return Err(NoMessage::Alias),
         };
         match open.last_mut() {
             Some((_, values)) => values.push(value),
@@ -159,11 +174,11 @@ fn yaml(text: &str) -> Result<Value, String> {
     }
     match root {
         Some(value @ Value::Object(_)) => Ok(value),
-        Some(_) | None => Err("the value is not a map, as {order: 5}".to_owned()),
+        Some(_) | None => Err(NoMessage::NoMap),
     }
 }
 
-fn closed(is_map: bool, values: Vec<Value>) -> Result<Value, String> {
+fn closed(is_map: bool, values: Vec<Value>) -> Result<Value, NoMessage> {
     if !is_map {
         return Ok(Value::Array(values));
     }
@@ -171,10 +186,10 @@ fn closed(is_map: bool, values: Vec<Value>) -> Result<Value, String> {
     let mut values = values.into_iter();
     while let (Some(name), Some(value)) = (values.next(), values.next()) {
         let Value::String(name) = name else {
-            return Err("the names in a map are texts".to_owned());
+            return Err(NoMessage::Name);
         };
         if fields.insert(name.clone(), value).is_some() {
-            return Err(format!("`{name}` is given twice"));
+            return Err(NoMessage::Twice { name });
         }
     }
     Ok(Value::Object(fields))
@@ -184,7 +199,6 @@ fn closed(is_map: bool, values: Vec<Value>) -> Result<Value, String> {
 pub(super) const GOAL_ID: &str = "goal_id";
 /// The prefix of the fields of a goal.
 const GOAL: &str = "goal";
-const NO_ALIAS: &str = "the value may have lists, maps and single values only";
 const MOST_DEEP: usize = 32;
 /// Maximum number of default elements of a fixed-length array.
 const MOST_ELEMENTS: usize = 10_000;
@@ -204,7 +218,7 @@ mod tests {
         ])
     }
 
-    fn of(words: &[&str], fills: bool) -> Result<Vec<String>, String> {
+    fn of(words: &[&str], fills: bool) -> Result<Vec<String>, NoMessage> {
         let words: Vec<String> = words.iter().map(|word| (*word).to_owned()).collect();
         spelled(&words, &takes(), fills)
     }

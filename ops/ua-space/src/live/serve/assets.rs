@@ -2,7 +2,8 @@
 
 use std::path::{Component, Path, PathBuf};
 
-use bridge_node::{RosEnvironment, read_bounded};
+use bridge_node::RosEnvironment;
+use type_files::{FileError, read_bounded};
 
 /// The ROS packages of this host with their meshes.
 #[derive(Debug, Clone, Default)]
@@ -30,9 +31,11 @@ impl Assets {
     /// Reads the file of a request. Returns the binary message of the response.
     pub(super) fn response(&self, request: &AssetRequest) -> Vec<u8> {
         let read = self.read(&request.uri);
-        let (status, why, data) = match &read {
-            Ok(data) => (FOUND, "", data.as_slice()),
-            Err(why) => (FAILED, why.as_str(), [].as_slice()),
+        let why = read.as_ref().err().map(AssetFault::to_string);
+        let why = why.unwrap_or_default();
+        let (status, data) = match &read {
+            Ok(data) => (FOUND, data.as_slice()),
+            Err(_) => (FAILED, [].as_slice()),
         };
         let length = u32::try_from(why.len()).unwrap_or_default();
         let mut message = Vec::with_capacity(data.len() + why.len() + 10);
@@ -45,21 +48,25 @@ impl Assets {
         message
     }
 
-    fn read(&self, uri: &str) -> Result<Vec<u8>, String> {
-        let file = self.file(uri)?;
+    fn read(&self, uri: &str) -> Result<Vec<u8>, AssetFault> {
+        let fault = |reason| AssetFault {
+            uri: uri.to_owned(),
+            reason,
+        };
+        let file = self.file(uri).map_err(fault)?;
         // A pipe would wait for its writer.
         if !file.is_file() {
-            return Err(format!("{uri}: the package has no such file"));
+            return Err(fault(NoAsset::NoFile));
         }
-        read_bounded(&file, MOST_BYTES).map_err(|why| format!("{uri}: {why}"))
+        read_bounded(&file, MOST_BYTES).map_err(|error| fault(NoAsset::Read(error)))
     }
 
     /// Returns the file of a URI `package://NAME/PATH`. Every viewer may ask, so only meshes and
     /// textures below their package are read.
-    fn file(&self, uri: &str) -> Result<PathBuf, String> {
+    fn file(&self, uri: &str) -> Result<PathBuf, NoAsset> {
         let known = uri.strip_prefix("package://");
         let Some((package, path)) = known.and_then(|rest| rest.split_once('/')) else {
-            return Err(format!("{uri}: only package://PACKAGE/FILE is served"));
+            return Err(NoAsset::Scheme);
         };
         let path = Path::new(path);
         let is_below = path
@@ -68,15 +75,35 @@ impl Assets {
         let ending = path.extension().and_then(|ending| ending.to_str());
         let ending = ending.unwrap_or_default().to_ascii_lowercase();
         if !is_below || !ENDINGS.contains(&ending.as_str()) {
-            return Err(format!("{uri}: only meshes and textures are served"));
+            return Err(NoAsset::Kind);
         }
-        let folder = self.environment.package(package).ok_or_else(|| {
-            format!(
-                "{uri}: the package {package} is not in ROS_PACKAGE_PATH or AMENT_PREFIX_PATH of ua-space"
-            )
-        })?;
+        let folder = self.environment.package(package);
+        let folder = folder.ok_or_else(|| NoAsset::NoPackage(package.to_owned()))?;
         Ok(folder.join(path))
     }
+}
+
+/// An asset that is not served.
+#[derive(Debug, thiserror::Error)]
+#[error("{uri}: {reason}")]
+struct AssetFault {
+    uri: String,
+    reason: NoAsset,
+}
+
+/// The reason why an asset is not served.
+#[derive(Debug, thiserror::Error)]
+enum NoAsset {
+    #[error("only package://PACKAGE/FILE is served")]
+    Scheme,
+    #[error("only meshes and textures are served")]
+    Kind,
+    #[error("the package {0} is not in ROS_PACKAGE_PATH or AMENT_PREFIX_PATH of ua-space")]
+    NoPackage(String),
+    #[error("the package has no such file")]
+    NoFile,
+    #[error(transparent)]
+    Read(FileError),
 }
 
 /// The opcode of the response, and its states.

@@ -284,7 +284,7 @@ impl ViewerHub {
             return client.refuse(&format!("channel {channel} is not offered"));
         }
         if let Err(why) = client.subscribe(id, channel) {
-            return client.refuse(&why);
+            return client.refuse(&why.to_string());
         }
         if let Some(LastValue { time, data }) = state.kept.get(&channel) {
             client.push(&Publication {
@@ -308,6 +308,15 @@ impl Offered {
             .and_then(Value::as_str)
             .unwrap_or_default()
     }
+}
+
+/// The reason why a viewer does not get a subscription.
+#[derive(Debug, thiserror::Error)]
+enum NotSubscribed {
+    #[error("channel {channel} is subscribed already")]
+    Twice { channel: u16 },
+    #[error("too many subscriptions")]
+    TooMany,
 }
 
 impl ConnectedViewer {
@@ -342,15 +351,15 @@ impl ConnectedViewer {
     /// Adds a subscription.
     ///
     /// # Errors
-    /// The reason, if the viewer subscribes to the channel already, as each subscription would get
-    /// a copy of each value, or has too many subscriptions.
-    fn subscribe(&self, id: u32, channel: u16) -> Result<(), String> {
+    /// The viewer subscribes to the channel already, as each subscription would get a copy of each
+    /// value, or has too many subscriptions.
+    fn subscribe(&self, id: u32, channel: u16) -> Result<(), NotSubscribed> {
         let mut queue = self.queue();
         if queue.subscriptions.values().any(|of| *of == channel) {
-            return Err(format!("channel {channel} is subscribed already"));
+            return Err(NotSubscribed::Twice { channel });
         }
         if queue.subscriptions.len() >= MOST_SUBSCRIPTIONS {
-            return Err("too many subscriptions".to_owned());
+            return Err(NotSubscribed::TooMany);
         }
         queue.subscriptions.insert(id, channel);
         Ok(())

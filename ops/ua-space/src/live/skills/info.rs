@@ -8,10 +8,9 @@ use super::{ListenEnd, Skill, SkillName, chosen, hear, in_group};
 use crate::arguments::InfoSkill;
 use crate::exit::CommandFailure;
 use crate::live::described::{AnnouncedField, ShownField};
-use crate::live::list::json;
 use crate::live::plain::NamedValues;
 use crate::live::run::results;
-use crate::live::text::{TextTable, harmless, is_coloured, wrapped};
+use crate::live::text::{TextTable, harmless, is_coloured, json, wrapped};
 
 pub(super) fn info(arguments: &InfoSkill) -> Result<(), CommandFailure> {
     in_group(&arguments.group, async |mut live| {

@@ -9,8 +9,7 @@ use super::{Skill, hear, in_group};
 use crate::arguments::TypesArguments;
 use crate::exit::CommandFailure;
 use crate::live::described::{AnnouncedField, ShownField};
-use crate::live::list::json;
-use crate::live::text::{harmless, is_coloured, wrapped};
+use crate::live::text::{harmless, is_coloured, json, wrapped};
 
 /// Runs `ua-space types`.
 pub(crate) fn types(arguments: &TypesArguments) -> Result<(), CommandFailure> {

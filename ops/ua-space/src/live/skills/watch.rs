@@ -13,11 +13,10 @@ use crate::arguments::WatchSkills;
 use crate::exit::CommandFailure;
 use crate::iso_time;
 use crate::live::book::{DatagramContent, ReceivedSample};
-use crate::live::list::json;
 use crate::live::names::is_fitting;
 use crate::live::plain::{self, NamedValues};
 use crate::live::run::{RunEvent, percent, results};
-use crate::live::text::harmless;
+use crate::live::text::{harmless, json};
 
 /// The suffix of the name of the transitions.
 const EVENTS: &str = ".Events";

@@ -5,8 +5,7 @@ use std::io::{self, Write as _};
 use serde::Serialize;
 
 use super::super::book::{DatagramContent, NameKind};
-use super::super::list::json;
-use super::super::text::micros;
+use super::super::text::{json, micros};
 use super::super::{Go, ListenEnd, in_group, names, until, utc};
 use super::{Delays, Samples, Times};
 use crate::arguments::{NamedTarget, Trace};

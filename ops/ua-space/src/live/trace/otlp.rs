@@ -127,7 +127,7 @@ impl Exporter<'_> {
     async fn round(&mut self, samples: Vec<SampledValue>) {
         let pages = pages(self.arguments).await;
         let sent = if pages.is_empty() {
-            Err("no program of this host has --metrics".to_owned())
+            Err(ExportFault::NoProgram)
         } else {
             send(&self.collector, METRICS_PATH, request(&pages, unix_nanos())).await
         };
@@ -144,19 +144,21 @@ impl Exporter<'_> {
     }
 
     /// Reports a fault; the same fault is reported once.
-    fn note(&mut self, path: &'static str, sent: Result<(), String>) {
+    fn note(&mut self, path: &'static str, sent: Result<(), ExportFault>) {
         let last = self.last.entry(path).or_default();
         match sent {
             Ok(()) => {
                 self.is_sent = true;
                 last.clear();
             }
-            Err(why) if why != *last => {
-                let what = path.trim_start_matches("/v1/");
-                warn(&format!("{what} were not sent: {why}"));
-                *last = why;
+            Err(fault) => {
+                let why = fault.to_string();
+                if why != *last {
+                    let what = path.trim_start_matches("/v1/");
+                    warn(&format!("{what} were not sent: {why}"));
+                    *last = why;
+                }
             }
-            Err(_) => {}
         }
     }
 }
@@ -175,10 +177,21 @@ async fn pages(arguments: &Trace) -> Vec<StatusPage> {
     pages
 }
 
+/// The reason why metrics or spans were not sent.
+#[derive(Debug, thiserror::Error)]
+enum ExportFault {
+    #[error("no program of this host has --metrics")]
+    NoProgram,
+    #[error("HTTP status {status}: {body}")]
+    Status { status: u16, body: String },
+    #[error(transparent)]
+    Request(#[from] CommandFailure),
+}
+
 /// Sends a request, once more after a pause if the collector does not take it. Counters are totals,
 /// so the next export makes up for a lost one.
-async fn send(collector: &HttpServer, path: &str, body: Vec<u8>) -> Result<(), String> {
-    let mut why = String::new();
+async fn send(collector: &HttpServer, path: &str, body: Vec<u8>) -> Result<(), ExportFault> {
+    let mut last = Ok(());
     for pause in [Duration::ZERO, RETRY] {
         sleep(pause).await;
         let change = ChangeRequest {
@@ -190,16 +203,19 @@ async fn send(collector: &HttpServer, path: &str, body: Vec<u8>) -> Result<(), S
         match collector.change(path, change).await {
             Ok(answer) if (200..300).contains(&answer.status) => return Ok(()),
             Ok(answer) => {
-                why = format!("HTTP status {}: {}", answer.status, harmless(&answer.body));
                 let may_help = [429, 502, 503, 504].contains(&answer.status);
+                last = Err(ExportFault::Status {
+                    status: answer.status,
+                    body: harmless(&answer.body),
+                });
                 if !may_help {
-                    return Err(why);
+                    return last;
                 }
             }
-            Err(failure) => why = failure.to_string(),
+            Err(failure) => last = Err(ExportFault::Request(failure)),
         }
     }
-    Err(why)
+    last
 }
 
 /// Returns the metrics of programs at a time in nanoseconds since 1970.
@@ -220,17 +236,12 @@ type Times = (u64, u64);
 
 fn resource(metrics: &mut ProtobufMessage, page: &StatusPage, times: Times) {
     metrics.message(RESOURCE, |resource| {
-        attribute(resource, RESOURCE_ATTRIBUTES, "service.name", &page.program);
+        resource.attribute(RESOURCE_ATTRIBUTES, "service.name", &page.program);
         let version = page.version.as_deref().unwrap_or_default();
-        attribute(resource, RESOURCE_ATTRIBUTES, "service.version", version);
-        attribute(
-            resource,
-            RESOURCE_ATTRIBUTES,
-            "service.instance.id",
-            &page.url,
-        );
+        resource.attribute(RESOURCE_ATTRIBUTES, "service.version", version);
+        resource.attribute(RESOURCE_ATTRIBUTES, "service.instance.id", &page.url);
         let space = page.space.to_string();
-        attribute(resource, RESOURCE_ATTRIBUTES, "ua.space", &space);
+        resource.attribute(RESOURCE_ATTRIBUTES, "ua.space", &space);
     });
     metrics.message(SCOPE_METRICS, |scoped| {
         scoped.message(SCOPE, |scope| scope.text(SCOPE_NAME, "ua-space"));
@@ -335,7 +346,7 @@ fn counter(
 fn point(sum: &mut ProtobufMessage, (start, now): Times, attributes: &[(&str, &str)], value: u64) {
     sum.message(POINTS, |point| {
         for (name, value) in attributes {
-            attribute(point, POINT_ATTRIBUTES, name, value);
+            point.attribute(POINT_ATTRIBUTES, name, value);
         }
         point.fixed(POINT_START, start);
         point.fixed(POINT_TIME, now);
@@ -345,7 +356,7 @@ fn point(sum: &mut ProtobufMessage, (start, now): Times, attributes: &[(&str, &s
 
 fn quantiles(summary: &mut ProtobufMessage, (start, now): Times, name: &str, hop: &HopPage) {
     summary.message(POINTS, |point| {
-        attribute(point, POINT_ATTRIBUTES, "hop", name);
+        point.attribute(POINT_ATTRIBUTES, "hop", name);
         point.fixed(POINT_START, start);
         point.fixed(POINT_TIME, now);
         point.fixed(SUMMARY_COUNT, hop.count);
@@ -355,13 +366,6 @@ fn quantiles(summary: &mut ProtobufMessage, (start, now): Times, name: &str, hop
                 one.double(QUANTILE_VALUE, value);
             });
         }
-    });
-}
-
-pub(super) fn attribute(of: &mut ProtobufMessage, field: u32, name: &str, value: &str) {
-    of.message(field, |attribute| {
-        attribute.text(KEY, name);
-        attribute.message(VALUE, |any| any.text(STRING_VALUE, value));
     });
 }
 
@@ -401,10 +405,6 @@ const SUMMARY_COUNT: u32 = 4;
 const SUMMARY_QUANTILES: u32 = 6;
 const QUANTILE: u32 = 1;
 const QUANTILE_VALUE: u32 = 2;
-/// Fields of KeyValue and AnyValue.
-const KEY: u32 = 1;
-const VALUE: u32 = 2;
-const STRING_VALUE: u32 = 1;
 
 #[cfg(test)]
 mod tests {

@@ -15,6 +15,14 @@ impl ProtobufMessage {
         self.0
     }
 
+    /// Adds an attribute of OTLP with a text.
+    pub(super) fn attribute(&mut self, field: u32, name: &str, value: &str) {
+        self.message(field, |attribute| {
+            attribute.text(KEY, name);
+            attribute.message(VALUE, |any| any.text(STRING_VALUE, value));
+        });
+    }
+
     fn varint(&mut self, mut value: u64) {
         loop {
             let [low, ..] = value.to_le_bytes();
@@ -63,6 +71,11 @@ impl ProtobufMessage {
         self.bytes(field, &inner.0);
     }
 }
+
+/// Fields of KeyValue and AnyValue of OTLP.
+const KEY: u32 = 1;
+const VALUE: u32 = 2;
+const STRING_VALUE: u32 = 1;
 
 #[cfg(test)]
 pub(super) mod tests {

@@ -18,8 +18,7 @@ use crate::arguments::Trace;
 use crate::cell::HopPage;
 use crate::exit::CommandFailure;
 use crate::live::book::{Book, DatagramContent};
-use crate::live::list::json;
-use crate::live::text::{TextTable, is_coloured, micros};
+use crate::live::text::{TextTable, is_coloured, json, micros};
 use crate::recorded::RecordingReader;
 use crate::report::warn;
 

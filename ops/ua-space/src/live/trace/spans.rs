@@ -6,7 +6,6 @@ use std::collections::BTreeMap;
 
 use mappings::TopicId;
 
-use super::otlp::attribute;
 use super::protobuf::ProtobufMessage;
 use super::{NETWORK, ORIGIN, Times};
 use crate::cell::StatusPage;
@@ -111,7 +110,7 @@ fn writer(topic: TopicId, pages: &[StatusPage]) -> String {
 fn resource(request: &mut ProtobufMessage, service: &str, fill: impl FnOnce(&mut ProtobufMessage)) {
     request.message(RESOURCE_SPANS, |spans| {
         spans.message(RESOURCE, |resource| {
-            attribute(resource, RESOURCE_ATTRIBUTES, "service.name", service);
+            resource.attribute(RESOURCE_ATTRIBUTES, "service.name", service);
         });
         spans.message(SCOPE_SPANS, |scoped| {
             scoped.message(SCOPE, |scope| scope.text(SCOPE_NAME, "ua-space"));
@@ -144,13 +143,13 @@ fn span(
         span.number(KIND, kind);
         span.fixed(START_TIME, from);
         span.fixed(END_TIME, to);
-        attribute(span, SPAN_ATTRIBUTES, "topic", &topic);
-        attribute(span, SPAN_ATTRIBUTES, "hop", hop);
+        span.attribute(SPAN_ATTRIBUTES, "topic", &topic);
+        span.attribute(SPAN_ATTRIBUTES, "hop", hop);
         if let Some(name) = name {
-            attribute(span, SPAN_ATTRIBUTES, "name", name);
+            span.attribute(SPAN_ATTRIBUTES, "name", name);
         }
         if let Some(number) = times.sequence {
-            attribute(span, SPAN_ATTRIBUTES, "sequence", &number.to_string());
+            span.attribute(SPAN_ATTRIBUTES, "sequence", &number.to_string());
         }
     });
 }

@@ -12,8 +12,7 @@ use serde_json::Value;
 use uadp::{MessageKind, Timestamp};
 
 use super::super::book::{DatagramContent, ReceivedSample};
-use super::super::list::json;
-use super::super::text::{harmless, is_coloured};
+use super::super::text::{harmless, is_coloured, json};
 use super::super::{Go, ListenEnd, in_group, plain, until};
 use super::{USUAL, Window, figures, head};
 use crate::arguments::{NamedTarget, Trace};

@@ -138,7 +138,7 @@ async fn connect(
         let client = OpcUaClient::open(config.clone(), url);
         match reached(&client).await {
             Ok(()) => return Ok((client, url.clone())),
-            Err(reason) => why = format!("{}: {}", harmless(url), harmless(&reason)),
+            Err(reason) => why = format!("{}: {}", harmless(url), harmless(&reason.to_string())),
         }
     }
     let help = match pki {
@@ -155,18 +155,29 @@ async fn connect(
     )))
 }
 
+/// The reason why there is no connection to a server.
+#[derive(Debug, thiserror::Error)]
+enum NotReached {
+    #[error("{0}")]
+    Down(String),
+    #[error("the client is closed")]
+    Closed,
+    #[error("no answer within {CONNECT:?}")]
+    NoAnswer,
+}
+
 /// Waits for the connection; returns the first reason why there is none.
-async fn reached(client: &OpcUaClient) -> Result<(), String> {
+async fn reached(client: &OpcUaClient) -> Result<(), NotReached> {
     let mut link = client.link();
     let settled = link.wait_for(|link| !matches!(link, Link::Connecting));
     match tokio::time::timeout(CONNECT, settled).await {
         Ok(Ok(link)) => match &*link {
             Link::Up { .. } => Ok(()),
-            Link::Down { reason, .. } => Err(reason.clone()),
-            Link::Connecting | Link::Closed => Err("the client is closed".to_owned()),
+            Link::Down { reason, .. } => Err(NotReached::Down(reason.clone())),
+            Link::Connecting | Link::Closed => Err(NotReached::Closed),
         },
-        Ok(Err(_)) => Err("the client is closed".to_owned()),
-        Err(_) => Err(format!("no answer within {CONNECT:?}")),
+        Ok(Err(_)) => Err(NotReached::Closed),
+        Err(_) => Err(NotReached::NoAnswer),
     }
 }
 

@@ -18,6 +18,7 @@ use uadp::{BuiltinType, Timestamp};
 
 use super::super::names::mapped;
 use super::super::text::harmless;
+use super::value::NoFieldValue;
 use super::{Tally, WriteOutcome, label, pace, value};
 use crate::arguments::Write;
 use crate::exit::CommandFailure;
@@ -130,7 +131,7 @@ impl Program for Writer {
         let port = WritePort::new(order, variable);
         // A wrong value is reported before anything is sent.
         port.block()
-            .map_err(|wrong| bridge_node::Failure::new(FailureKind::Usage, wrong))?;
+            .map_err(|wrong| bridge_node::Failure::new(FailureKind::Usage, port.unfit(&wrong)))?;
         if variable.loss.is_some() && order.period.is_none() {
             let label = label(variable.topic, &variable.name);
             warn(&format!(
@@ -221,13 +222,16 @@ impl WritePort {
     }
 
     /// Encodes the value.
-    fn block(&self) -> Result<Bytes, String> {
+    fn block(&self) -> Result<Bytes, NoFieldValue> {
         let fields = value::fields_of(&self.variable);
         let block = value::encoded(&self.order.values, &fields, unix_nanos());
-        block.map(Bytes::from).map_err(|wrong| {
-            let label = label(self.variable.topic, &self.variable.name);
-            format!("{label}: {wrong}")
-        })
+        block.map(Bytes::from)
+    }
+
+    /// Returns the text about a value that does not fit the variable.
+    fn unfit(&self, fault: &NoFieldValue) -> String {
+        let label = label(self.variable.topic, &self.variable.name);
+        format!("{label}: {fault}")
     }
 
     /// Records the outcome of the last value.
@@ -268,7 +272,7 @@ impl WritePort {
         let payload = match self.block() {
             Ok(block) => block,
             Err(wrong) => {
-                self.finish(Err(CommandFailure::Usage(wrong)));
+                self.finish(Err(CommandFailure::Usage(self.unfit(&wrong))));
                 return None;
             }
         };

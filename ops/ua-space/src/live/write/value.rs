@@ -7,32 +7,45 @@ use uadp::{BuiltinType, Timestamp};
 
 use super::super::call::words;
 use super::super::described::{AnnouncedField, FieldMeaning};
-use super::super::parameters;
+use super::super::parameters::{self, WrongParameter};
 use crate::iso_time;
+
+/// The reason why a value does not fit the fields of a DataSet.
+#[derive(Debug, thiserror::Error)]
+pub(super) enum NoFieldValue {
+    #[error("its type is not known")]
+    UnknownType,
+    #[error("a single value is expected, and {given} are given")]
+    Several { given: usize },
+    #[error("{number} is out of the range {} to {}", range.0, range.1)]
+    OutOfRange { number: f64, range: (f64, f64) },
+    #[error(transparent)]
+    Message(#[from] words::NoMessage),
+    #[error(transparent)]
+    Parameter(#[from] WrongParameter),
+}
 
 /// Encodes the value as the fields of a DataSet: their number, then a Variant for each field. `now`
 /// is the present time in nanoseconds since 1970, for the stamp of a message.
 ///
 /// # Errors
-/// The reason why the value does not fit the fields.
+/// [`NoFieldValue`].
 pub(super) fn encoded(
     given: &[String],
     fields: &[AnnouncedField],
     now: i128,
-) -> Result<Vec<u8>, String> {
+) -> Result<Vec<u8>, NoFieldValue> {
     let words = match (fields, given) {
-        ([], _) => return Err("its type is not known".to_owned()),
+        ([], _) => return Err(NoFieldValue::UnknownType),
         ([only], [text]) => vec![single(text, only)],
         ([_], _) => {
-            return Err(format!(
-                "a single value is expected, and {} are given",
-                given.len()
-            ));
+            let given = given.len();
+            return Err(NoFieldValue::Several { given });
         }
         (_, _) => parts(given, fields, now)?,
     };
     in_range(&words, fields)?;
-    parameters::encoded(&words, fields, "value").map_err(|wrong| wrong.to_string())
+    Ok(parameters::encoded(&words, fields, "value")?)
 }
 
 /// Returns the only field as `name=value`.
@@ -56,7 +69,11 @@ fn single(text: &str, field: &AnnouncedField) -> String {
 
 /// Returns the parts of a message as `name=value`. Missing parts are zero, and a missing stamp is
 /// `now`.
-fn parts(given: &[String], fields: &[AnnouncedField], now: i128) -> Result<Vec<String>, String> {
+fn parts(
+    given: &[String],
+    fields: &[AnnouncedField],
+    now: i128,
+) -> Result<Vec<String>, words::NoMessage> {
     let mut words = words::message(given, fields, false)?;
     let has = |name: &str| {
         let mut names = words.iter().filter_map(|word| word.split_once('='));
@@ -73,7 +90,7 @@ fn parts(given: &[String], fields: &[AnnouncedField], now: i128) -> Result<Vec<S
 }
 
 /// Checks the numbers of fields with a range.
-fn in_range(words: &[String], fields: &[AnnouncedField]) -> Result<(), String> {
+fn in_range(words: &[String], fields: &[AnnouncedField]) -> Result<(), NoFieldValue> {
     for word in words {
         let Some((name, text)) = word.split_once('=') else {
             continue;
@@ -85,7 +102,8 @@ fn in_range(words: &[String], fields: &[AnnouncedField]) -> Result<(), String> {
         let list = text.trim_matches(['[', ']']).split(',');
         let mut numbers = list.filter_map(|one| one.trim().trim_matches('"').parse::<f64>().ok());
         if let Some(wrong) = numbers.find(|one| !(low..=high).contains(one)) {
-            return Err(format!("{wrong} is out of the range {low} to {high}"));
+            let (number, range) = (wrong, (low, high));
+            return Err(NoFieldValue::OutOfRange { number, range });
         }
     }
     Ok(())
@@ -122,7 +140,7 @@ mod tests {
     use super::*;
     use crate::live::plain;
 
-    fn of(given: &[&str], fields: &[AnnouncedField]) -> Result<Vec<Value>, String> {
+    fn of(given: &[&str], fields: &[AnnouncedField]) -> Result<Vec<Value>, NoFieldValue> {
         let given: Vec<String> = given.iter().map(|word| (*word).to_owned()).collect();
         let block = encoded(&given, fields, 1_700_000_000_123_456_789)?;
         let values = Fields::parse(&block).unwrap().map(Result::unwrap);
@@ -159,7 +177,7 @@ mod tests {
             (&["1,2,3"], &list, "takes 2 values, and 3 are given"),
             (&["1"], &[], "its type is not known"),
         ] {
-            let wrong = of(given, fields).unwrap_err();
+            let wrong = of(given, fields).unwrap_err().to_string();
             assert!(wrong.contains(why), "{given:?}: {wrong}");
         }
     }
@@ -180,7 +198,7 @@ mod tests {
         ] {
             assert_eq!(of(given, &twist).unwrap(), wanted, "{given:?}");
         }
-        let wrong = of(&["linear.x=1"], &twist).unwrap_err();
+        let wrong = of(&["linear.x=1"], &twist).unwrap_err().to_string();
         assert!(
             wrong.contains("there is no parameter `linear.x`"),
             "{wrong}"
@@ -193,7 +211,8 @@ mod tests {
         let mut speed = AnnouncedField::plain("Speed", BuiltinType::Double, None);
         speed.meaning.range = Some((0.0, 2.0));
         assert!(of(&["2"], std::slice::from_ref(&speed)).is_ok());
-        let wrong = of(&["2.5"], std::slice::from_ref(&speed)).unwrap_err();
+        let wrong = of(&["2.5"], std::slice::from_ref(&speed));
+        let wrong = wrong.unwrap_err().to_string();
         assert_eq!(wrong, "2.5 is out of the range 0 to 2");
         let mut list = AnnouncedField::plain("Joints", BuiltinType::Double, Some(2));
         list.meaning.range = Some((0.0, 2.0));

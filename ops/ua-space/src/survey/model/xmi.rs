@@ -6,7 +6,7 @@
 use std::collections::HashMap;
 use std::ops::ControlFlow;
 
-use xml_text::{XmlElement, XmlVisitor, walk};
+use xml_text::{XmlAttributeFault, XmlElement, XmlVisitor, walk};
 
 use super::{Applied, DEEPEST, Element, ElementKind, Finding, MOST_ELEMENTS, Tag, shown};
 
@@ -28,6 +28,22 @@ pub(super) fn elements(xml: &str) -> Result<(Vec<Element>, Vec<Finding>), Findin
         return Err(Finding::new(1, "there is no `uml:Model` in the file"));
     }
     Ok(document.elements())
+}
+
+/// The reason why a file of XMI is not read further.
+#[derive(Debug, thiserror::Error)]
+enum XmiFault {
+    #[error(transparent)]
+    Attribute(#[from] XmlAttributeFault),
+    #[error(
+        "this is a <{}>, no model; Papyrus keeps the model in the file that ends in `.uml`",
+        shown(element)
+    )]
+    NoModel { element: String },
+    #[error("more than {MOST_ELEMENTS} elements are not read")]
+    Elements,
+    #[error("more than {MOST_ELEMENTS} stereotypes are not read")]
+    Stereotypes,
 }
 
 #[derive(Default)]
@@ -77,25 +93,18 @@ struct Application {
 }
 
 impl XmlVisitor for Document {
-    type Fault = String;
+    type Fault = XmiFault;
 
-    fn open(&mut self, element: &XmlElement<'_>) -> Result<(), String> {
+    fn open(&mut self, element: &XmlElement<'_>) -> Result<(), XmiFault> {
         let local = element.name().to_owned();
         let line = element.line();
         let is_uml = element.qualified_name().starts_with("uml:");
         self.text.clear();
-        let attributes = element.attributes();
-        let attributes = attributes.map_err(|fault| fault.to_string())?;
+        let attributes = element.attributes()?;
         let open = match self.path.last() {
             None if local == "XMI" => OpenElement::Xmi,
             None | Some(OpenElement::Xmi) if is_uml => self.node(local, attributes, line)?,
-            None => {
-                return Err(format!(
-                    "this is a <{}>, no model; Papyrus keeps the model in the file that ends in \
-                     `.uml`",
-                    shown(&local)
-                ));
-            }
+            None => return Err(XmiFault::NoModel { element: local }),
             Some(OpenElement::Xmi) => self.application(local, attributes, line)?,
             Some(OpenElement::Application(at)) => self.tag(*at, local, &attributes, line),
             Some(OpenElement::Node(_) | OpenElement::Other) => {
@@ -111,7 +120,7 @@ impl XmlVisitor for Document {
         self.text.push_str(text);
     }
 
-    fn close(&mut self) -> Result<ControlFlow<()>, String> {
+    fn close(&mut self) -> Result<ControlFlow<()>, XmiFault> {
         let text = self.text.trim().to_owned();
         self.text.clear();
         if let Some(OpenElement::Tag(at, name, line)) = self.path.pop()
@@ -141,7 +150,7 @@ impl Document {
         local: String,
         attributes: Vec<(String, String)>,
         line: usize,
-    ) -> Result<OpenElement, String> {
+    ) -> Result<OpenElement, XmiFault> {
         let owner = self.owner();
         let is_direct = matches!(self.path.last(), Some(OpenElement::Node(_)));
         if let Some(owner) = owner
@@ -176,9 +185,9 @@ impl Document {
         tag: String,
         attributes: Vec<(String, String)>,
         line: usize,
-    ) -> Result<OpenElement, String> {
+    ) -> Result<OpenElement, XmiFault> {
         if self.nodes.len() >= MOST_ELEMENTS {
-            return Err(format!("more than {MOST_ELEMENTS} elements are not read"));
+            return Err(XmiFault::Elements);
         }
         let at = self.nodes.len();
         let mut node = XmiNode {
@@ -209,11 +218,9 @@ impl Document {
         stereotype: String,
         attributes: Vec<(String, String)>,
         line: usize,
-    ) -> Result<OpenElement, String> {
+    ) -> Result<OpenElement, XmiFault> {
         if self.applications.len() >= MOST_ELEMENTS {
-            return Err(format!(
-                "more than {MOST_ELEMENTS} stereotypes are not read"
-            ));
+            return Err(XmiFault::Stereotypes);
         }
         let mut application = Application {
             applied: Applied {
