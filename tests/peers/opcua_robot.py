@@ -1,8 +1,8 @@
 """Reads robots like a client of OPC 40010-1, which does not know skills, and prints JSON lines.
 
 It reads each motion device system of the DeviceSet, then each value of its first task control while
-skill 1 of the server's own namespace runs once. With `--values` it reads the axes, the speed override
-and the safety states of the first system instead, and ends.
+skill 1 of the server's own namespace runs once. With `--values` it reads the axes, the speed override,
+the load at the flange and the safety states of the first system instead, and ends.
 """
 
 import argparse
@@ -44,6 +44,12 @@ async def values(node, *wanted):
     return {name: await value(children[name]) for name in wanted}
 
 
+async def with_unit(node):
+    """Returns the value of an analog item and its unit."""
+    unit = await (await names(node))["EngineeringUnits"].read_value()
+    return [await value(node), unit.DisplayName.Text]
+
+
 async def only(node, folder):
     """Returns the only device in a folder, with its type."""
     found = await names((await names(node))[folder])
@@ -53,20 +59,34 @@ async def only(node, folder):
 
 
 async def measured(system):
-    """Returns the axes, the speed override and the safety states of a system."""
+    """Returns the axes, the speed override, the load and the safety states of a system."""
     _, arm, _ = await only(system, "MotionDevices")
     children = await names(arm)
     axes = []
     for name, axis in sorted((await names(children["Axes"])).items()):
         below = await names(axis)
-        position = (await names(below["ParameterSet"]))["ActualPosition"]
-        unit = await (await names(position))["EngineeringUnits"].read_value()
-        axes.append([name, await value(position), unit.DisplayName.Text, await value(below["MotionProfile"])])
+        parameters = await names(below["ParameterSet"])
+        read = [await with_unit(parameters[name]) for name in ("ActualPosition", "ActualSpeed")]
+        axes.append([name, *read, await value(below["MotionProfile"])])
+    load = await names(children["FlangeLoad"])
+    center = load["CenterOfMass"]
+    below = await names(center)
+    parts = [await values(below["CartesianCoordinates"], "X", "Y", "Z"), await values(below["Orientation"], "A", "B", "C")]
+    shown = await center.read_data_value(raise_on_bad_status=False)
+    frame = shown.Value.Value if shown.Value else None
+    at = frame.CartesianCoordinates if frame else None
+    load = {
+        "type": (await children["FlangeLoad"].read_type_definition()).Identifier,
+        "mass": await with_unit(load["Mass"]),
+        "center": [at.X, at.Y, at.Z] if at else None,
+        "parts": parts,
+    }
     safety = {}
     for name, state in (await names((await names(system))["SafetyStates"])).items():
         wanted = ["EmergencyStop", "ProtectiveStop", "OperationalMode"]
         safety[name] = await values((await names(state))["ParameterSet"], *wanted)
-    return {"axes": axes, "speed": await value((await names(children["ParameterSet"]))["SpeedOverride"]), "safety": safety}
+    speed = await value((await names(children["ParameterSet"]))["SpeedOverride"])
+    return {"axes": axes, "speed": speed, "load": load, "safety": safety}
 
 
 async def run(args):

@@ -1,5 +1,7 @@
 //! A robot for clients of OPC 40010-1, which know no skills.
 
+use std::io::Write as _;
+
 use serde_json::{Value, json};
 use system_tests::{Cell, Peer, StartedChild, eventually, program};
 
@@ -76,7 +78,7 @@ skills:
 ";
 
 #[test]
-fn a_client_that_knows_robots_sees_the_axes_the_speed_and_the_safety_state_of_a_ur() {
+fn a_client_that_knows_robots_sees_the_axes_the_speed_the_load_and_the_safety_state_of_a_ur() {
     let Some(cell) = Cell::with(&[Peer::Python]) else {
         return;
     };
@@ -91,6 +93,11 @@ fn a_client_that_knows_robots_sees_the_axes_the_speed_and_the_safety_state_of_a_
     eventually("the simulator serves", SOON, || {
         std::net::TcpStream::connect("127.0.0.1:30004").ok()
     });
+    // The programmer of the robot has set the mass of the tool.
+    let mut secondary = std::net::TcpStream::connect("127.0.0.1:30002").unwrap();
+    secondary
+        .write_all(b"set_payload(1.5, [0, 0.01, 0.05])\n")
+        .unwrap();
     let nodesets = format!("nodesets: ['{}', '{}']\n", robotics.display(), di.display());
     let yaml = cell.file("arm.yaml", &format!("{nodesets}{MEASURED}"));
     let _arm = component(&yaml);
@@ -102,18 +109,30 @@ fn a_client_that_knows_robots_sees_the_axes_the_speed_and_the_safety_state_of_a_
             .clone();
         // A value that has not arrived yet is the name of its status.
         let axes = seen["axes"].as_array()?;
-        let has_axes = axes.iter().all(|axis| axis[1].is_number());
+        let has_axes = axes
+            .iter()
+            .all(|axis| axis[1][0].is_number() && axis[2][0].is_number());
+        let has_load = seen["load"]["mass"][0].is_number() && seen["load"]["center"].is_array();
         let safety = seen["safety"]["SafetyState"].as_object()?;
         let has_safety = safety
             .values()
             .all(|value| value.is_boolean() || value.is_number());
-        (has_axes && has_safety && seen["speed"].is_number()).then_some(seen)
+        (has_axes && has_load && has_safety && seen["speed"].is_number()).then_some(seen)
     });
-    let axis = |number: usize| json!([format!("Axis_{number}"), 0.0, "rad", 1]);
+    let axis = |number: usize| {
+        let name = format!("Axis_{number}");
+        json!([name, [0.0, "rad"], [0.0, "rad/s"], 1])
+    };
     let axes: Vec<Value> = (1..=6).map(axis).collect();
     let expected = json!({
         "axes": axes,
         "speed": 100.0,
+        "load": {
+            "type": 1018,
+            "mass": [1.5, "kg"],
+            "center": [0.0, 0.01, 0.05],
+            "parts": [{"X": 0.0, "Y": 0.01, "Z": 0.05}, {"A": 0.0, "B": 0.0, "C": 0.0}],
+        },
         "safety": {"SafetyState": {"EmergencyStop": false, "ProtectiveStop": false, "OperationalMode": 0}},
     });
     assert_eq!(seen, expected);

@@ -1,8 +1,8 @@
 //! A robot as defined by OPC 40010-1, beside its skills: the running skill is the program of its
 //! only task control.
 //!
-//! The axes, the speed override and the safety state are shown from the values of the component
-//! (`measured`). Power trains and loads are not shown: drivers have no data about them.
+//! The axes, the speed override, the load at the flange and the safety state are shown from the
+//! values of the component (`measured`). Power trains are not shown: drivers have no data about them.
 
 mod measured;
 
@@ -45,7 +45,7 @@ pub(super) fn serve(
         "MotionDeviceType",
         name,
         within(&system, "MotionDevices")?,
-        &[],
+        measured::load_nodes(values),
     )?;
     let controller = format!("{name}-controller");
     let parent = within(&system, "Controllers")?;
@@ -64,6 +64,7 @@ pub(super) fn serve(
     }
     show(server, &arm, "MotionDeviceCategory", robot.category);
     let axes = measured::axes(&mut maker, &arm, (values, robot.axes))?;
+    let load = measured::load(server, &arm, values)?;
     let safety = measured::safety(&mut maker, &system, values)?;
     let speed = measured::speed(server, &arm, values);
     // The controller has no users.
@@ -85,7 +86,7 @@ pub(super) fn serve(
     show(server, &task, "ComponentName", LocalizedText::from(name));
     show(server, &task, "ParameterSet/ExecutionMode", CYCLE);
     let task = keep(server.clone(), task, skills.to_vec());
-    let measured = [axes, safety, speed].into_iter().flatten();
+    let measured = axes.into_iter().chain(load).chain(safety).chain(speed);
     Ok(async move {
         tokio::join!(task, join_all(measured));
     })
