@@ -69,6 +69,7 @@ pub(crate) struct CaexLink {
 pub(crate) struct Attribute {
     pub(crate) name: String,
     pub(crate) data_type: String,
+    pub(crate) unit: String,
     pub(crate) value: String,
     pub(crate) id: String,
     /// Whether its value is the ID of an element, by its type.
@@ -211,6 +212,7 @@ impl XmlVisitor for Building {
                 let link_type = text("RefAttributeType")?;
                 CaexPart::Attribute(Attribute {
                     name: text("Name")?,
+                    unit: text("Unit")?,
                     value: String::new(),
                     id: text("ID")?,
                     is_link: data_type.ends_with(":IDREF") || link_type.ends_with(ID_LINK),

@@ -21,6 +21,8 @@ pub struct ConfiguredComponent {
     pub line: usize,
     /// The fields with their values, in the order of the file.
     pub fields: Vec<(String, ConfiguredValue)>,
+    /// The units of the fields that have one in the file, with the names of the fields.
+    pub units: Vec<(String, String)>,
 }
 
 /// The value of a field.
@@ -109,7 +111,7 @@ pub fn product_configuration(file: &str) -> Result<Vec<ConfiguredComponent>, Pro
         let given = element.attributes.iter();
         let given = given.filter(|attribute| attribute.name != APPLICATION_URI);
         let mut names = BTreeSet::new();
-        let mut fields = Vec::new();
+        let (mut fields, mut units) = (Vec::new(), Vec::new());
         for attribute in given {
             let field = attribute.name.trim().to_owned();
             if !names.insert(field.clone()) {
@@ -122,6 +124,10 @@ pub fn product_configuration(file: &str) -> Result<Vec<ConfiguredComponent>, Pro
                 data_type: attribute.data_type.clone(),
                 line,
             })?;
+            let unit = attribute.unit.trim();
+            if !unit.is_empty() {
+                units.push((field.clone(), unit.to_owned()));
+            }
             fields.push((field, value));
         }
         if fields.is_empty() {
@@ -132,6 +138,7 @@ pub fn product_configuration(file: &str) -> Result<Vec<ConfiguredComponent>, Pro
             name: element.name.clone(),
             line,
             fields,
+            units,
         });
     }
     match components.is_empty() {
@@ -214,7 +221,8 @@ mod tests {
                 attribute("Order", "", "A-1"),
             ],
         );
-        let robot = element("urn:robot", &[attribute("Speed", "xs:float", "0.5")]);
+        let speed = attribute("Speed", "xs:float\" Unit=\"m/s", "0.5");
+        let robot = element("urn:robot", &[speed]);
         let text = file(&format!(
             "<InternalElement Name=\"line\" ID=\"0\">{gripper}</InternalElement>{robot}"
         ));
@@ -239,6 +247,8 @@ mod tests {
             second.fields,
             [field("Speed", ConfiguredValue::Number(0.5))]
         );
+        let speed = ("Speed".to_owned(), "m/s".to_owned());
+        assert_eq!((&first.units, &second.units), (&vec![], &vec![speed]));
     }
 
     #[test]

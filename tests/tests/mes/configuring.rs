@@ -136,6 +136,15 @@ fn a_product_is_configured_at_all_its_components_or_at_none() {
     assert_eq!(refused["components"][1]["reason"], reason);
     assert_eq!(stored(&cell, gripper.0), json!({}));
 
+    // A field in another unit is refused, although its number is in the range.
+    let other_unit = cell.file("unit.aml", &text.replace("Unit=\"N\"", "Unit=\"kN\""));
+    let (code, refused) = configure(&other_unit, &[]);
+    assert_eq!(code, 1, "{refused}");
+    assert_eq!(outcomes(&refused), ["refused", "accepted"]);
+    let reason = "GripForce: expected the unit N, found kN";
+    assert_eq!(refused["components"][0]["reason"], reason);
+    assert_eq!(stored(&cell, gripper.0), json!({}));
+
     let (code, configured) = configure(&product, &[]);
     assert_eq!(
         (code, &configured["outcome"]),

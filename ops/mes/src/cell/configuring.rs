@@ -10,6 +10,8 @@ use crate::product_configuration::{ConfigurationTarget, ProductComponent, fields
 /// A connected component.
 struct ConnectedTarget {
     handle: SkillHandle,
+    /// The units of the fields in the file.
+    units: Vec<(String, String)>,
     /// Keeps the connection.
     _client: SkillClient,
 }
@@ -21,6 +23,9 @@ impl ConfigurationTarget for ConnectedTarget {
         fields: &FieldChange,
         checks_only: bool,
     ) -> Result<FieldChange, SetFieldsFault> {
+        if checks_only {
+            self.handle.check_units(&self.units).await?;
+        }
         self.handle.set_fields(fields, checks_only).await
     }
 }
@@ -28,7 +33,7 @@ impl ConfigurationTarget for ConnectedTarget {
 impl PlantState {
     /// Connects to a component of a product configuration.
     pub(crate) async fn configured(&self, of: &ConfiguredComponent) -> ProductComponent {
-        let target = self.target(&of.application_uri).await;
+        let target = self.target(of).await;
         ProductComponent {
             application_uri: of.application_uri.clone(),
             fields: fields(of),
@@ -36,11 +41,11 @@ impl PlantState {
         }
     }
 
-    async fn target(&self, application_uri: &str) -> Result<ConnectedTarget, String> {
+    async fn target(&self, of: &ConfiguredComponent) -> Result<ConnectedTarget, String> {
         let found = {
             let present = self.present();
             let mut all = present.components.values();
-            let component = all.find(|one| one.application_uri == application_uri);
+            let component = all.find(|one| one.application_uri == of.application_uri);
             component
                 .and_then(|one| Some((one.endpoint.clone(), one.found.values().next()?.clone())))
         };
@@ -49,6 +54,7 @@ impl PlantState {
         let client = client.map_err(|fault| format!("{endpoint}: {fault}"))?;
         Ok(ConnectedTarget {
             handle: client.handle(&skill),
+            units: of.units.clone(),
             _client: client,
         })
     }

@@ -1,7 +1,7 @@
 //! Sets the configured fields of another component.
 
 use plant_opcua::client::{Browse, OpcUaClient};
-use plant_opcua::types::{NodeId, Variant};
+use plant_opcua::types::{EUInformation, NodeId, Variant};
 
 use super::{SkillHandle, called, lost};
 use crate::configuration::FieldChange;
@@ -30,6 +30,42 @@ pub enum SetFieldsFault {
 }
 
 impl SkillHandle {
+    /// Checks that fields of the component have these units: symbols, with the names of the fields.
+    /// Fields without a unit, and fields that the component does not show, have any unit.
+    ///
+    /// # Errors
+    /// [`SetFieldsFault`].
+    pub async fn check_units(&self, units: &[(String, String)]) -> Result<(), SetFieldsFault> {
+        let client = self.client();
+        let object = child(client, self.component(), CONFIGURATION).await?;
+        let object = object.ok_or(SetFieldsFault::None)?;
+        for (field, unit) in units {
+            let Some(variable) = child(client, &object, field).await? else {
+                continue;
+            };
+            let Some(property) = child(client, &variable, "EngineeringUnits").await? else {
+                continue;
+            };
+            let read = client.read(&[property]).await;
+            let read = read.map_err(|error| lost(&error))?;
+            let Some(Some(Variant::ExtensionObject(shown))) = read.first().map(|one| &one.value)
+            else {
+                continue;
+            };
+            let Some(shown) = shown.inner_as::<EUInformation>() else {
+                continue;
+            };
+            let symbol = shown.display_name.text.as_ref();
+            if symbol != unit {
+                return Err(SetFieldsFault::Refused {
+                    field: field.clone(),
+                    reason: format!("expected the unit {symbol}, found {unit}"),
+                });
+            }
+        }
+        Ok(())
+    }
+
     /// Sets configured fields of the component of the skill, or only checks them. A missing value
     /// removes the configured value of a field. Returns the values before.
     ///
