@@ -1,6 +1,8 @@
 //! Skills behind two stations: clients two levels up find, run and follow them as if they stood
 //! beside them.
 
+mod product;
+
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
@@ -53,6 +55,10 @@ fn tower(cell: &Cell) -> Tower {
 }
 
 fn station(tower: &Tower, at: usize) -> Child {
+    station_started(tower, at).start()
+}
+
+fn station_started(tower: &Tower, at: usize) -> StartedChild {
     let name = ["station-low", "station-high"][at];
     StartedChild::new(name, &program("ua-station"))
         .args(["--name", name, "--interface", "lower0"])
@@ -62,7 +68,6 @@ fn station(tower: &Tower, at: usize) -> Child {
         .args(["--upper-lds", "uri=urn:*"])
         .args(["--allow-unsecured", "--metrics", STATUS])
         .at(&tower.stations[at])
-        .start()
 }
 
 /// Returns the endpoint of a station on the level above it.
@@ -91,6 +96,10 @@ fn gripper(cell: &Cell) -> PathBuf {
 }
 
 fn component(file: &Path, site: &PlantSite, last: u8) -> Child {
+    component_started(file, site, last).start()
+}
+
+fn component_started(file: &Path, site: &PlantSite, last: u8) -> StartedChild {
     let endpoint = format!("opc.tcp://{}.{last}:4850", LEVELS[0]);
     StartedChild::new("ua-component", &program("ua-component"))
         .args([file])
@@ -103,7 +112,6 @@ fn component(file: &Path, site: &PlantSite, last: u8) -> Child {
             "dev0",
         ])
         .at(site)
-        .start()
 }
 
 /// Runs a future on the host of the client.

@@ -87,8 +87,8 @@ fn property(id: &NodeId, name: &str, arguments: Vec<Argument>) -> Variable {
         QualifiedName::new(0, name),
         LocalizedText::new("", name),
     );
-    let each = arguments.into_iter().map(ExtensionObject::from_message);
-    let value: Vec<ExtensionObject> = each.collect();
+    let each = arguments.into_iter().map(with_dimensions);
+    let value: Vec<ExtensionObject> = each.map(ExtensionObject::from_message).collect();
     let readable = AccessLevel::CURRENT_READ.bits();
     Variable::new_full(
         base,
@@ -102,3 +102,17 @@ fn property(id: &NodeId, name: &str, arguments: Vec<Argument>) -> Variable {
         None,
     )
 }
+
+/// Adds the dimensions of an array argument, which the library encodes with dimensions only. The
+/// length 0 of a dimension is any length (OPC 10000-3, 8.6).
+fn with_dimensions(mut argument: Argument) -> Argument {
+    let rank = usize::try_from(argument.value_rank).unwrap_or_default();
+    let dimensions = argument.array_dimensions.as_ref().map_or(0, Vec::len);
+    if (1..=HIGHEST_RANK).contains(&rank) && dimensions != rank {
+        argument.array_dimensions = Some(vec![0; rank]);
+    }
+    argument
+}
+
+/// Highest ValueRank of an argument that gets its dimensions.
+const HIGHEST_RANK: usize = 8;
