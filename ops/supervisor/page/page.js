@@ -57,6 +57,8 @@ function route() {
     const own = anchor.getAttribute("href").slice(2);
     const is = own === name || (name === "topic" && own === "values");
     mark(anchor, "aria-current", is ? "page" : null);
+    // A phone shows a part of the views.
+    if (is) anchor.scrollIntoView({ block: "nearest", inline: "nearest" });
   }
   if (session.mustSignIn) {
     shown = null;

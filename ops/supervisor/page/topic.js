@@ -123,9 +123,11 @@ function sampleTable(samples) {
 }
 
 function drawWaterfall(node, programs) {
-  const bars = programs.flatMap(({ program, space, hops, of_topic: isOfTopic }) => HOPS
-    .filter(([name]) => hops[name]?.count)
-    .map(([name, label]) => ({ program, space, label, isOfTopic, ...hops[name] })));
+  const isHere = programs.some(({ hops, of_topic: isOfTopic }) => isOfTopic && hops.out?.count);
+  // In the order of the way. The producer's bridge and its readers measure the same time.
+  const bars = HOPS.flatMap(([name, label]) => programs
+    .filter(({ hops }) => hops[name]?.count && !(isHere && name === "origin"))
+    .map(({ program, space, hops, of_topic: isOfTopic }) => ({ program, space, label, isOfTopic, ...hops[name] })));
   render(node, bars, () => {
     const head = [h("h2", { text: "Hops" }), h("p", { class: "muted", text: "Half of the samples are within the dark bar, 99 % within the light bar." })];
     if (!bars.length) return [...head, h("p", { class: "muted", text: "No delays were measured yet." })];

@@ -7,9 +7,9 @@
 //! Reading order: `board` (the last value of each topic), `announced` (names and units),
 //! `program` (rows of programs), `skill` (tiles of skills), `timeline` (events), `view` (what a
 //! browser is sent), `stream` (server-sent events), `fetch` (the status of other programs), `hops`
-//! (the delays of a topic), `page` (state and events), `session` (signed-in users), `encode` (forms), `operations` (commands),
-//! `mes` and `table` (the knowledge of the plant), `proxy`, `tls`, `responses` and `site`
-//! (requests).
+//! (the delays of a topic), `page` (state and events), `session` (signed-in users), `encode`
+//! (forms), `operations` (commands), `mes` and `table` (the knowledge of the plant), `proxy`,
+//! `tls`, `responses` and `site` (requests).
 
 mod announced;
 mod board;

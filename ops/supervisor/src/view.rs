@@ -389,8 +389,8 @@ fn topic_view(board: &mut CellBoard, topic: TopicId, now: Duration) -> Value {
     })
 }
 
-/// Returns the delays of the topic at each program. A program that does not report its steps has the
-/// delays of all its topics.
+/// Returns the delays of the topic at each program. A program that does not report its steps has
+/// the delays of all its topics.
 fn topic_hops(board: &CellBoard, topic: TopicId) -> Vec<Value> {
     let tapped = board.hops.get(&topic);
     let of_topic = |program: &ProgramStatus| {

@@ -28,8 +28,8 @@ impl Router {
         value.or_else(call).filter(is_given)
     }
 
-    /// Returns the names of topics that have had no value here: variables of the mapping, and topics
-    /// that other programs announced, in no particular order.
+    /// Returns the names of topics that have had no value here: variables of the mapping, and
+    /// topics that other programs announced, in no particular order.
     pub fn names_without_values(&self) -> impl Iterator<Item = (TopicId, &str)> {
         let mapping = &self.values.mapping;
         let mapped = mapping.variables().iter();

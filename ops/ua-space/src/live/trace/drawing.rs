@@ -47,7 +47,7 @@ pub(super) fn svg(delays: &Delays, name_of: &dyn Fn(TopicId) -> Option<String>) 
         20.0,
         "",
         "start",
-        "Median: origin (light), network (dark)",
+        "Median: origin, then network",
     );
     text(
         RIGHT,
