@@ -17,6 +17,7 @@ from selenium import webdriver
 from selenium.webdriver.support.ui import WebDriverWait
 
 SOON = 60
+TURNS = 5
 PAGE = ("127.0.0.1", 8090)
 GROUP = ("239.192.0.40", 4840)
 TICKS = os.sysconf("SC_CLK_TCK")
@@ -113,18 +114,21 @@ def measure(driver, server, seconds):
     }
 
 
-def send(topics):
-    """Sends each topic ten times a second, in 20 slices of a round, until it is ended."""
+def send(topics, rate):
+    """Sends each topic at a rate in Hz, in slices of at least 5 ms, until it is ended."""
     group = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     group.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, socket.inet_aton("127.0.0.1"))
     # A NetworkMessage of ROS 1 (PublisherId 1, WriterGroupId 2) with one key frame of one Variant, a Double.
     head = [struct.pack("<BBHBHBHBHB", 0xF1, 1, 1, 1, 2, 1, topic, 1, 1, 11) for topic in range(1, topics + 1)]
     due, value = time.monotonic(), 0.0
+    parts = max(1, 200 // rate)
+    rounds = max(1, rate // 200)
     while True:
-        value += 0.25
-        for part in range(20):
-            for topic in range(part, topics, 20):
-                group.sendto(head[topic] + struct.pack("<d", value + topic), GROUP)
+        for part in range(parts):
+            for _ in range(rounds):
+                value += 0.25
+                for topic in range(part, topics, parts):
+                    group.sendto(head[topic] + struct.pack("<d", value + topic), GROUP)
             due += 0.005
             late = time.monotonic() - due
             if late < 0:
@@ -170,6 +174,38 @@ def never_read(server, seconds):
     row("after they left", seconds)
 
 
+def traced(binaries, server, seconds):
+    """Prints the processor time of the server for each value, without a trace and with traces, in turns."""
+    program = [binaries / "ua-space", "trace"]
+    usual = ["--interface", "lo", "--seconds", "3600", "--metrics", f"http://{PAGE[0]}:{PAGE[1]}"]
+    kinds = {"none": None, "`ua-space trace`, all values": [*program, *usual],
+             "`ua-space trace ua_1_2_5`, one topic of 10": [*program, "ua_1_2_5", *usual]}
+    each = {name: [] for name in kinds}
+    for turn in range(TURNS):
+        # Another order in each turn, so that a slower minute of the machine affects all.
+        names = list(kinds)
+        for name in names[turn % 3:] + names[:turn % 3]:
+            trace = kinds[name] and subprocess.Popen(kinds[name], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+            time.sleep(2)
+            values, used = delivered(), scheduled(server)
+            time.sleep(seconds)
+            each[name].append((scheduled(server) - used) / (delivered() - values) * 1e6)
+            if trace:
+                trace.terminate()
+                trace.wait(20)
+    print(f"| trace | CPU per value, {TURNS} turns | median | ratio |\n|---|---|---|---|")
+    usual = sorted(each["none"])[TURNS // 2]
+    for name, turns in each.items():
+        median = sorted(turns)[TURNS // 2]
+        print(f"| {name} | {', '.join(f'{one:.2f}' for one in turns)} us | {median:.2f} us | {median / usual:.3f} |")
+
+
+def scheduled(pid):
+    """Returns the processor time of a process by the scheduler's count, in seconds."""
+    threads = pathlib.Path(f"/proc/{pid}/task").iterdir()
+    return sum(int((thread / "schedstat").read_text().split()[0]) for thread in threads) / 1e9
+
+
 def browse(server, seconds):
     """Prints a row for each view that Chromium shows."""
     options = webdriver.ChromeOptions()
@@ -213,10 +249,11 @@ def main():
     parser.add_argument("--binaries", type=pathlib.Path, required=True, help="the folder of ua-space")
     parser.add_argument("--topics", type=int, default=1000)
     parser.add_argument("--seconds", type=float, default=10, help="how long each view is measured")
+    parser.add_argument("--trace", action="store_true", help="measure traces instead, with 10 topics at 1 kHz")
     parser.add_argument("--send", action="store_true", help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.send:
-        send(arguments.topics)
+        send(10 if arguments.trace else arguments.topics, 1000 if arguments.trace else 10)
     for command in ["link set lo up multicast on", "route replace 224.0.0.0/4 dev lo"]:
         subprocess.run(["ip", *command.split()], check=True)
     running = [subprocess.Popen([arguments.binaries / "ua-space", "page", "--interface", "lo"],
@@ -225,6 +262,8 @@ def main():
         running.append(subprocess.Popen([sys.executable, __file__, *sys.argv[1:], "--send"]))
         server = running[0].pid
         time.sleep(5)
+        if arguments.trace:
+            return traced(arguments.binaries, server, arguments.seconds)
         began, before, used = time.monotonic(), delivered(), cpu_seconds(server)
         time.sleep(arguments.seconds)
         took = time.monotonic() - began
