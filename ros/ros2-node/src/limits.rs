@@ -11,7 +11,7 @@ pub const PATCHED: bool = cfg!(feature = "patched-dds");
 
 /// The version and the limits of RustDDS, for log messages.
 pub const RUSTDDS: &str = if PATCHED {
-    "RustDDS 0.15.1 with 60 patches, samples up to 10 MB"
+    "RustDDS 0.15.1 with 61 patches, samples up to 10 MB"
 } else {
     "RustDDS 0.15.1 as published, samples up to 256 kB to Fast DDS, 2 MB to others"
 };
