@@ -127,8 +127,8 @@ impl StepProducts {
         Self::read_until(bytes, &|| false)
     }
 
-    /// Reads the products of a file, like [`Self::read`], until `is_over` returns true. The products
-    /// that are left then have findings.
+    /// Reads the products of a file, like [`Self::read`], until `is_over` returns true. Then the
+    /// products that are left have findings.
     ///
     /// # Errors
     /// The first reason why the file is not a STEP file of products, or that its records cannot be
