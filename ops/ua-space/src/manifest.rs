@@ -25,3 +25,13 @@ pub(crate) fn read(file: &str) -> Result<Module, CommandFailure> {
 
 /// Maximum size of another document in bytes.
 const LARGEST: u64 = 64 << 20;
+
+/// Returns the module of a column, for tests.
+#[cfg(test)]
+pub(crate) fn column() -> Module {
+    let file = concat!(
+        env!("CARGO_MANIFEST_DIR"),
+        "/../../tests/data/mtp/column.aml"
+    );
+    Module::read(&fs::read_to_string(file).unwrap()).unwrap()
+}

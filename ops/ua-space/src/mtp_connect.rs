@@ -219,14 +219,7 @@ mod tests {
     use type_files::Disk;
 
     use super::*;
-
-    fn column() -> Module {
-        let file = concat!(
-            env!("CARGO_MANIFEST_DIR"),
-            "/../../tests/data/mtp/column.aml"
-        );
-        Module::read(&std::fs::read_to_string(file).unwrap()).unwrap()
-    }
+    use crate::manifest::column;
 
     fn arguments() -> MtpConnect {
         MtpConnect {
