@@ -78,6 +78,7 @@ fn state(name: &str) -> (u32, &'static str) {
 }
 
 mod configuration;
+mod expired;
 mod faults;
 mod foreign;
 mod nodesets;
