@@ -16,7 +16,10 @@ use std::time::Duration;
 
 use async_trait::async_trait;
 use cell::{OpcuaCell, PATIENCE, config, next, next_value, press, variable};
-use opcua::types::{NodeId, ObjectId, QualifiedName, StatusCode, VariableId, Variant};
+use opcua::types::{
+    Argument, DataTypeId, LocalizedText, NodeId, ObjectId, QualifiedName, StatusCode, VariableId,
+    Variant,
+};
 use plant_opcua::client::{
     Browse, CallError, CallOptions, ClientConfig, ClientError, Link, MonitoredWatch, Notice,
     OpcUaClient, SecurityChoice,
@@ -263,17 +266,34 @@ async fn a_method_below_objects_is_called() {
         browse_name: QualifiedName::new(1, "Count"),
         object: objects.clone(),
         arguments: (NodeId::new(1, 501), NodeId::new(1, 502)),
-        takes: Vec::new(),
+        takes: vec![Argument {
+            name: "names".into(),
+            data_type: DataTypeId::String.into(),
+            value_rank: 1,
+            array_dimensions: None,
+            description: LocalizedText::null(),
+        }],
         gives: Vec::new(),
     };
     let count = method(|_| Ok(vec![Variant::UInt32(3)]));
     cell.server.add_method(spec, count).unwrap();
     let client = cell.client().await;
-    let counted = client.call(&objects, &id, vec![]).await.unwrap();
+    let names = vec![Variant::from(vec!["a".to_owned()])];
+    let counted = client.call(&objects, &id, names).await.unwrap();
     assert_eq!(counted, [Variant::UInt32(3)]);
+    // Clients read the arguments; the array has any length.
+    let takes = client.read(&[NodeId::new(1, 501)]).await.unwrap();
+    let Some(Variant::Array(takes)) = &takes[0].value else {
+        panic!("{takes:?}");
+    };
+    let [Variant::ExtensionObject(names)] = takes.values.as_slice() else {
+        panic!("{takes:?}");
+    };
+    let names = names.inner_as::<Argument>().unwrap();
+    assert_eq!(names.array_dimensions, Some(vec![0]));
     // The method is not a method of other objects.
     let server: NodeId = ObjectId::Server.into();
-    let elsewhere = client.call(&server, &id, vec![]).await.unwrap_err();
+    let elsewhere = client.call(&server, &id, Vec::new()).await.unwrap_err();
     let is_invalid = matches!(elsewhere, CallError::Refused { status, .. }
         if status == StatusCode::BadMethodInvalid);
     assert!(is_invalid, "{elsewhere}");
