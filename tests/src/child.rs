@@ -307,6 +307,14 @@ impl Child {
         values.map(|line| line.at).collect()
     }
 
+    /// Returns when each line that contains `pattern` arrived, of both streams.
+    #[must_use]
+    pub fn times_of(&self, pattern: &str) -> Vec<Instant> {
+        let lines = self.output.lines.lock().unwrap();
+        let lines = lines.kept.iter().filter(|line| line.text.contains(pattern));
+        lines.map(|line| line.at).collect()
+    }
+
     /// Returns the process id.
     #[must_use]
     pub fn id(&self) -> u32 {

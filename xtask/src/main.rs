@@ -57,7 +57,7 @@ cargo xtask <verb>
   bench redundancy [FAULTS]      measure the gaps of random faults of two redundant bridges at 1 kHz, 200 unless told
   bench knowledge [ARGS]         measure manifests, NodeSets, questions, the journal and plans of the knowledge of the plant
   bench plant [CELLS]            measure many cells at one MQTT broker, 100 cells of 1000 topics unless told
-  bench skills [ARGS]            measure what clients wait for of skills and of servers that are plugged in (finding), and round trips (rtt)
+  bench skills [ARGS]            measure what clients wait for of skills and of servers that are plugged in (finding), round trips (rtt), and locked tools (lock)
   bench charts [--check]         draw the pictures of docs/benchmarks.md from its tables; or only check that they are current
   bench uadp [--instructions]    measure the codec beside another one; only count instructions and hold them against the list
   bench bridge-core [--instructions]  measure a message among 10 and among 10 000 topics; only count instructions

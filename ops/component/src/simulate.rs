@@ -164,6 +164,9 @@ async fn supply(changer: kelvin::simulator::KelvinSimulator, tools: Vec<Powered>
         };
         if locked.map(|(number, _)| number) != now {
             locked = now.map(|number| (number, Instant::now()));
+            if let Some(number) = now {
+                report(&format!("tool {number} is locked"));
+            }
             if let Some((number, mut child)) = running.take() {
                 // An error means that the program has ended by itself.
                 let _killed = child.kill().await;

@@ -1,9 +1,11 @@
 //! `cargo xtask bench skills`: the delays of a client, the duration of a skill's methods compared
-//! with a plain method, many skills in a server, many devices below a station, and the round trips
-//! of a skill beside those of services, methods and values.
+//! with a plain method, many skills in a server, many devices below a station, the round trips of a
+//! skill beside those of services, methods and values, and the time from the lock of a tool until its
+//! skills are found.
 
 mod crowd;
 mod finding;
+mod lock;
 mod rtt;
 
 use std::process::ExitCode;
@@ -23,13 +25,14 @@ fn main() -> ExitCode {
             Some(at) => args.get(at + 1)?.parse().ok(),
         }
     };
-    let is_finding = args.first().is_some_and(|arg| arg == "finding");
-    let is_station = args.first().is_some_and(|arg| arg == "station");
-    let (Some(runs), Some(skills), Some(servers), Some(devices)) = (
-        number("--runs", if is_finding { 20 } else { 200 }),
-        number("--skills", if is_station { 20 } else { 1_000 }),
+    let is = |name: &str| args.first().is_some_and(|arg| arg == name);
+    let few_runs = is("finding") || is("lock");
+    let (Some(runs), Some(skills), Some(servers), Some(devices), Some(boot)) = (
+        number("--runs", if few_runs { 20 } else { 200 }),
+        number("--skills", if is("station") { 20 } else { 1_000 }),
         number("--servers", 500),
         number("--devices", 100),
+        number("--boot", 0),
     ) else {
         print!("{HELP}");
         return ExitCode::from(64);
@@ -42,6 +45,7 @@ fn main() -> ExitCode {
         Some("finding") => Some(finding::all(runs, servers)),
         Some("station") => Some(crowd::all(devices, skills, runs)),
         Some("rtt") => Some(rtt::all(runs)),
+        Some("lock") => Some(lock::all(runs, boot)),
         Some(_) | None => None,
     };
     if let Some(measured) = measured {
@@ -69,11 +73,14 @@ cargo xtask bench skills [--runs N] [--skills N]
 cargo xtask bench skills finding [--runs N] [--servers N]
 cargo xtask bench skills station [--devices N] [--skills N] [--runs N]
 cargo xtask bench skills rtt [--runs N]
+cargo xtask bench skills lock [--runs N] [--boot S]
 
-  --runs N     runs, calls and round trips of each kind (200); servers that are plugged in (20)
+  --runs N     runs, calls and round trips of each kind (200); servers that are plugged in, and
+               tools that are locked (20)
   --skills N   skills in one server (1000), or in each device (20)
   --servers N  servers that register with one discovery server (500)
   --devices N  devices below one station (100)
+  --boot S     time that a locked tool needs to boot, in s (0)
 ";
 
 /// Starts a component with this number of grippers that complete their actions at once.
