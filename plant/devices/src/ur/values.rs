@@ -9,8 +9,8 @@ use super::rtde::{Rtde, RtdeError};
 use super::wire::{RecipeType, RecipeValue};
 use crate::measuring::value;
 
-/// Measures all values until the robot is lost, and returns the reason. The robot sends its state at
-/// the rate of the period. Values of outputs that the controller does not have are unknown.
+/// Measures all values until the robot is lost, and returns the reason. The robot sends its state
+/// at the rate of the period. Values of outputs that the controller does not have are unknown.
 pub(super) async fn measure(rtde: &str, period: Duration, out: &Measured) -> RtdeError {
     let hertz = (1.0 / period.as_secs_f64()).clamp(1.0, FASTEST);
     let (mut rtde, measured) = match open(rtde, hertz, out).await {

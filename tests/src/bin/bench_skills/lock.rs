@@ -95,8 +95,8 @@ fn figures(times: &mut Times) -> String {
     format!("{:.0} | {:.0}", times.at(0.5) / 1e3, times.at(1.0) / 1e3)
 }
 
-/// Locks a tool, which puts the other one back. Returns the times from the lock until its skills are
-/// found, and until the changer has read their states.
+/// Locks a tool, which puts the other one back. Returns the times from the lock until its skills
+/// are found, and until the changer has read their states.
 async fn lock(finder: &Finder, simulators: &[Child], at: usize) -> (Duration, Duration) {
     let tool = &TOOLS[at];
     finder.gone(tool.uri).await;
