@@ -2,7 +2,8 @@
 //! only task control.
 //!
 //! The axes, the speed override, the load at the flange and the safety state are shown from the
-//! values of the component (`measured`). Power trains are not shown: drivers have no data about them.
+//! values of the component (`measured`). Power trains are not shown: drivers have no data about
+//! them.
 
 mod measured;
 

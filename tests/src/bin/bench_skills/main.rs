@@ -1,7 +1,7 @@
 //! `cargo xtask bench skills`: the delays of a client, the duration of a skill's methods compared
 //! with a plain method, many skills in a server, many devices below a station, the round trips of a
-//! skill beside those of services, methods and values, and the time from the lock of a tool until its
-//! skills are found.
+//! skill beside those of services, methods and values, and the time from the lock of a tool until
+//! its skills are found.
 
 mod crowd;
 mod finding;
