@@ -42,13 +42,7 @@ pub(super) fn svg(delays: &Delays, name_of: &dyn Fn(TopicId) -> Option<String>) 
             "<text x=\"{x:.1}\" y=\"{y:.1}\" class=\"{class}\" text-anchor=\"{anchor}\">{text}</text>"
         );
     };
-    text(
-        LEFT,
-        20.0,
-        "",
-        "start",
-        "Median: origin, then network",
-    );
+    text(LEFT, 20.0, "", "start", "Median: origin, then network");
     text(
         RIGHT,
         20.0,
