@@ -40,6 +40,8 @@ pub enum Peer {
     Ros2,
     /// node-opcua, which `cargo xtask test` installs from npm.
     NodeOpcua,
+    /// node-opcua-pubsub-expander, which `cargo xtask test` installs from npm.
+    NodeOpcuaPubSub,
     /// A library that shifts the wall clock of a program, which `cargo xtask test` compiles.
     Clock,
     /// Wireshark's tshark, from Debian or Ubuntu.
@@ -48,6 +50,8 @@ pub enum Peer {
     Mosquitto,
     /// nats-server, which speaks MQTT, from Debian or Ubuntu.
     Nats,
+    /// The MQTT client aiomqtt, in a Python environment that `cargo xtask test` makes.
+    MqttPython,
 }
 
 /// A distribution of ROS 2 that is available as a peer.
@@ -106,6 +110,8 @@ pub(crate) const CLOCK: &str = "clock-shift.so";
 pub(crate) const NODE_OPCUA: &str = "node-opcua";
 /// Programs of pySHACL, SPARQLWrapper and xmlschema beside the Python of the environment.
 const PYTHON_JUDGES: [&str; 3] = ["pyshacl", "rqw", "xmlschema-validate"];
+pub(crate) const NODE_OPCUA_PUBSUB: &str = "node-opcua-pubsub";
+pub(crate) const MQTT_PYTHON: &str = "mqtt/bin/python";
 
 impl Cell {
     /// Puts this thread into a new network, or logs why the test is skipped and returns `None`.
@@ -285,6 +291,9 @@ fn find(peer: Peer, python: &Path) -> Result<(), String> {
     let node_opcua = compiled(NODE_OPCUA).join("node_modules/node-opcua-client");
     let [pyshacl, sparqlwrapper, xmlschema] =
         PYTHON_JUDGES.map(|program| python.with_file_name(program));
+    let node_opcua_pubsub =
+        compiled(NODE_OPCUA_PUBSUB).join("node_modules/node-opcua-pubsub-expander");
+    let mqtt_python = compiled(MQTT_PYTHON);
     let needed: &[&Path] = match peer {
         Peer::Ros1 => &[
             Path::new("/usr/bin/rosmaster"),
@@ -304,9 +313,11 @@ fn find(peer: Peer, python: &Path) -> Result<(), String> {
         Peer::Clock => &[&clock],
         Peer::Ros2 => &[&jazzy, &kilted],
         Peer::NodeOpcua => &[&node_opcua],
+        Peer::NodeOpcuaPubSub => &[&node_opcua_pubsub],
         Peer::Tshark => &[Path::new(TSHARK)],
         Peer::Mosquitto => &[Path::new(MOSQUITTO), Path::new(MOSQUITTO_SUB)],
         Peer::Nats => &[Path::new(NATS)],
+        Peer::MqttPython => &[&mqtt_python],
     };
     match needed.iter().find(|path| !path.exists()) {
         None => Ok(()),

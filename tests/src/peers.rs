@@ -10,7 +10,7 @@ use nix::sys::signal::Signal;
 
 use crate::{
     Cell, Child, GROUP, StartedChild,
-    cell::{CYCLONE, Distribution, FASTDDS, NODE_OPCUA, compiled},
+    cell::{CYCLONE, Distribution, FASTDDS, MQTT_PYTHON, NODE_OPCUA, NODE_OPCUA_PUBSUB, compiled},
     eventually, program, xml_rpc,
 };
 
@@ -257,14 +257,24 @@ impl Cell {
     /// Returns a node-opcua script of `peers/node-opcua`, not started yet.
     #[must_use]
     pub fn node_opcua_started(&self, script: &str, args: &[&str]) -> StartedChild {
-        let modules = compiled(NODE_OPCUA).join("node_modules");
+        self.node_of(NODE_OPCUA, script).args(args)
+    }
+
+    /// Starts a script of `peers/node-opcua-pubsub` that reads orders, and waits until it is ready.
+    #[must_use]
+    pub fn node_opcua_pubsub(&self, script: &str) -> Child {
+        let started = self.node_of(NODE_OPCUA_PUBSUB, script);
+        started.told().start().ready(START)
+    }
+
+    /// Returns a script with the packages of its folder in `peers`.
+    fn node_of(&self, folder: &str, script: &str) -> StartedChild {
         StartedChild::new(script, Path::new("node"))
-            .env("NODE_PATH", modules)
+            .env("NODE_PATH", compiled(folder).join("node_modules"))
             // node-opcua prints warnings about its environment, and keeps its certificates below
             // HOME.
             .env("HOME", self.folder())
-            .args([peer_script("node-opcua").join(script)])
-            .args(args)
+            .args([peer_script(folder).join(script)])
     }
 
     /// Starts a PubSub listener of asyncua on the UADP group.
@@ -293,8 +303,18 @@ impl Cell {
         prefix
     }
 
+    /// Returns a script of `peers/` with the MQTT client aiomqtt, not started yet.
+    #[must_use]
+    pub fn mqtt_python_started(&self, script: &str, args: &[&str]) -> StartedChild {
+        Self::python_of(&compiled(MQTT_PYTHON), script, args)
+    }
+
     fn python(&self, script: &str, args: &[&str]) -> StartedChild {
-        StartedChild::new(script, &self.python)
+        Self::python_of(&self.python, script, args)
+    }
+
+    fn python_of(python: &Path, script: &str, args: &[&str]) -> StartedChild {
+        StartedChild::new(script, python)
             .env("PYTHONUNBUFFERED", "1")
             .args([peer_script(script)])
             .args(args)

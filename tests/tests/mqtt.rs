@@ -3,6 +3,7 @@
 
 mod clusters;
 mod commanded;
+mod judges;
 
 use std::process::Command;
 use std::time::Duration;

@@ -61,14 +61,17 @@ const APT_COMPILED: &[&str] = &[
 
 /// Python environments of the peers, and the lists of their packages in `tests/peers`.
 /// Distributions of ROS 2 have the same packages in different versions.
-const VENVS: [(&str, &str); 3] = [
+const VENVS: [(&str, &str); 4] = [
     (PYTHON, "requirements.txt"),
+    // A client of MQTT.
+    ("mqtt", "mqtt.txt"),
     ("ros2-jazzy", "ros2-jazzy.txt"),
     ("ros2-kilted", "ros2-kilted.txt"),
 ];
 
 const PYTHON: &str = "venv";
-const NODE_OPCUA: &str = "node-opcua";
+/// Folders of the peers from npm in `tests/peers`. The second has another version of node-opcua.
+const NODE_PEERS: [&str; 2] = ["node-opcua", "node-opcua-pubsub"];
 const LOCK: &str = "package-lock.json";
 /// Packages that are installed if npm is missing.
 const APT_NODE: &[&str] = &["nodejs", "npm"];
@@ -175,7 +178,9 @@ pub(crate) fn install(workspace: &Workspace) -> CommandOutcome {
     for (folder, requirements) in VENVS {
         told("from PyPI", venv(workspace, folder, requirements));
     }
-    told("from npm", node_opcua(workspace));
+    for folder in NODE_PEERS {
+        told("from npm", node_peer(workspace, folder));
+    }
     told("that are compiled", native::build(workspace));
     ended
 }
@@ -197,11 +202,11 @@ pub(crate) fn for_building() -> anyhow::Result<CommandOutcome> {
     apt_install(APT_BUILD).map(|()| CommandOutcome::WELL)
 }
 
-/// Installs node-opcua in the versions of `tests/peers/node-opcua`, without the install scripts of
-/// packages.
-fn node_opcua(workspace: &Workspace) -> anyhow::Result<()> {
-    let wanted = workspace.root.join("tests/peers").join(NODE_OPCUA);
-    let folder = workspace.peers().join(NODE_OPCUA);
+/// Installs packages from npm in the versions of a folder of `tests/peers`, without the install
+/// scripts of packages.
+fn node_peer(workspace: &Workspace, name: &str) -> anyhow::Result<()> {
+    let wanted = workspace.root.join("tests/peers").join(name);
+    let folder = workspace.peers().join(name);
     let lock = fs::read_to_string(wanted.join(LOCK))
         .with_context(|| format!("{} cannot be read", wanted.join(LOCK).display()))?;
     let installed = folder.join("installed");
@@ -212,7 +217,7 @@ fn node_opcua(workspace: &Workspace) -> anyhow::Result<()> {
         apt_install(APT_NODE)?;
     }
     step(&format!(
-        "installing from npm into {}: node-opcua",
+        "installing from npm into {}: {name}",
         folder.display()
     ));
     fs::create_dir_all(&folder).with_context(|| format!("{}", folder.display()))?;
