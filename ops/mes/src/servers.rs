@@ -22,7 +22,7 @@ use tokio::sync::Notify;
 use tokio::task::JoinHandle;
 use tokio::time::sleep;
 
-use self::board::{ServerBoard, ServerStatus};
+use self::board::{FollowedServerStatus, ServerBoard};
 use self::connection::FollowedServer;
 use crate::settings::{NamedServers, ServerEntry};
 use crate::sources::MesSources;
@@ -150,10 +150,10 @@ impl LiveServers {
     fn start(&self, name: String, planned: PlannedServer) -> RunningServer {
         let again = Arc::new(Notify::new());
         self.board.status(&name, |status| {
-            *status = ServerStatus {
+            *status = FollowedServerStatus {
                 server: name.clone(),
                 endpoint: planned.endpoint.clone(),
-                ..ServerStatus::default()
+                ..FollowedServerStatus::default()
             };
         });
         let followed = FollowedServer {

@@ -109,6 +109,11 @@ const KEYS: [&str; 22] = [
     "prefer",
 ];
 
+/// Returns the value of a key that may be absent, or `None` if it is there and faulty.
+fn optional<T>(value: Option<Option<T>>) -> Option<Option<T>> {
+    value.map_or(Some(None), |value| value.map(Some))
+}
+
 struct Reading<'a> {
     reader: YamlReader<'a>,
     folder: &'a Path,
@@ -140,12 +145,9 @@ impl Reading<'_> {
             processes,
             prefer,
         ] = self.reader.map(root, KEYS)?;
-        let name = self.reader.needed(name, "mes", root.place);
-        let name = name.and_then(|node| self.name(node));
-        let uri = self.reader.needed(uri, "application_uri", root.place);
-        let uri = uri.and_then(|node| self.iri(node, YamlFindingCode::Uri));
-        let namespace = self.reader.needed(namespace, "namespace", root.place);
-        let namespace = namespace.and_then(|node| self.namespace(node));
+        let name = self.needed(name, ("mes", root), Self::name);
+        let uri = self.needed(uri, ("application_uri", root), Self::application_uri);
+        let namespace = self.needed(namespace, ("namespace", root), Self::namespace);
         let usual = || Some(DEFAULT_ENDPOINT.to_owned());
         let endpoint = endpoint.map_or_else(usual, |node| self.endpoint(node));
         let usual = || Some(vec![ComponentSecurity::None]);
@@ -173,7 +175,7 @@ impl Reading<'_> {
         self.each_once(root, &products, &processes, &recipes);
         let names = servers.iter().map(|server| server.which.text());
         self.once(root, names, "server");
-        let user = user.map_or(Some(None), |user| user.map(Some))?;
+        let user = optional(user)?;
         for server in &mut servers {
             server.user = server.user.take().or_else(|| user.clone());
         }
@@ -187,14 +189,12 @@ impl Reading<'_> {
             open: open?,
             user,
             sparql: sparql?,
-            sparql_tls: sparql_tls.map_or(Some(None), |address| address.map(Some))?,
-            store: store
-                .map_or(Some(None), |store| store.map(Some))?
-                .map(|store| store.path),
+            sparql_tls: optional(sparql_tls)?,
+            store: optional(store)?.map(|store| store.path),
             rules: rules?,
             knowledge,
             nodesets,
-            nodeset_folder: nodeset_folder.map_or(Some(None), |folder| folder.map(Some))?,
+            nodeset_folder: optional(nodeset_folder)?,
             manifests,
             rml,
             servers,
@@ -203,6 +203,21 @@ impl Reading<'_> {
             processes,
             prefer,
         })
+    }
+
+    /// Reads the value of a key that has to be there.
+    fn needed<T>(
+        &mut self,
+        node: Option<&DocumentNode>,
+        (key, root): (&str, &DocumentNode),
+        read: impl FnOnce(&mut Self, &DocumentNode) -> Option<T>,
+    ) -> Option<T> {
+        let node = self.reader.needed(node, key, root.place)?;
+        read(self, node)
+    }
+
+    fn application_uri(&mut self, node: &DocumentNode) -> Option<String> {
+        self.iri(node, YamlFindingCode::Uri)
     }
 
     fn lds(&mut self, node: &DocumentNode) -> Option<Lds> {

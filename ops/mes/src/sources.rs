@@ -149,6 +149,12 @@ impl MesSources {
                 self.recipe(source, read, SourceLifetime::No)
             });
         }
+        self.remove_others(named);
+        self.rules(settings.rules);
+    }
+
+    /// Removes the sources that the YAML named before and does not name now.
+    fn remove_others(&self, named: BTreeSet<KnowledgeSource>) {
         let gone: Vec<KnowledgeSource> = {
             let mut state = self.state();
             let before = std::mem::replace(&mut state.of_yaml, named);
@@ -160,7 +166,6 @@ impl MesSources {
                 warn!(source = source.name, "cannot remove a source: {fault}");
             }
         }
-        self.rules(settings.rules);
     }
 
     /// Reads the NodeSets, and completes them from the folder or the URL.

@@ -14,7 +14,7 @@ use crate::live::{TextTable, harmless, is_coloured, json};
 
 /// Lists the pictures of a manifest, or draws a picture.
 pub(crate) fn picture(arguments: &MtpPicture) -> Result<(), CommandFailure> {
-    let module = crate::mtp_files::read(&arguments.file)?;
+    let module = crate::manifest::read(&arguments.file)?;
     let chosen = chosen(&module, arguments.name.as_deref())?;
     if let Some(path) = &arguments.svg {
         return draw(&module, &chosen, path);

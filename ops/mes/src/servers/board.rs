@@ -18,15 +18,15 @@ pub(super) struct ServerBoard {
     /// The namespaces of the NodeSets in the graph, whose types are not read from servers.
     pub(super) nodesets: watch::Sender<BTreeSet<String>>,
     pub(super) reading: Semaphore,
-    statuses: Mutex<BTreeMap<String, ServerStatus>>,
+    statuses: Mutex<BTreeMap<String, FollowedServerStatus>>,
 }
 
 /// The state of a server in `/status`.
 #[derive(Debug, Clone, Default, Serialize)]
-pub(super) struct ServerStatus {
+pub(super) struct FollowedServerStatus {
     pub(super) server: String,
     pub(super) endpoint: String,
-    pub(super) state: ServerState,
+    pub(super) state: FollowedServerState,
     pub(super) application_uri: String,
     /// The IRI of its graph.
     pub(super) graph: String,
@@ -47,7 +47,7 @@ pub(super) struct ServerStatus {
 
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
-pub(super) enum ServerState {
+pub(super) enum FollowedServerState {
     #[default]
     Connecting,
     NotConnected,
@@ -118,7 +118,7 @@ impl ServerBoard {
     }
 
     /// Changes the status of a server.
-    pub(super) fn status(&self, name: &str, change: impl FnOnce(&mut ServerStatus)) {
+    pub(super) fn status(&self, name: &str, change: impl FnOnce(&mut FollowedServerStatus)) {
         change(self.statuses().entry(name.to_owned()).or_default());
     }
 
@@ -148,17 +148,17 @@ impl ServerBoard {
         }
         for (name, what) in missing {
             self.status(name, |status| {
-                *status = ServerStatus {
+                *status = FollowedServerStatus {
                     server: name.clone(),
-                    state: ServerState::NotFound,
-                    ..ServerStatus::default()
+                    state: FollowedServerState::NotFound,
+                    ..FollowedServerStatus::default()
                 };
             });
             self.findings(name, vec![(what.clone(), true)]);
         }
     }
 
-    fn statuses(&self) -> MutexGuard<'_, BTreeMap<String, ServerStatus>> {
+    fn statuses(&self) -> MutexGuard<'_, BTreeMap<String, FollowedServerStatus>> {
         self.statuses.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }

@@ -13,7 +13,7 @@ use tokio::sync::Notify;
 use tokio::time::{Instant, sleep_until, timeout};
 use tracing::{debug, info};
 
-use super::board::{MOST_NODES_OF_ALL, ServerBoard, ServerState, ServerStatus};
+use super::board::{FollowedServerState, FollowedServerStatus, MOST_NODES_OF_ALL, ServerBoard};
 use super::graph::ServerGraph;
 use super::walk::{self, Searched};
 use crate::clock::now;
@@ -70,7 +70,7 @@ impl FollowedServer {
                     continue;
                 }
                 Link::Down { reason, .. } => {
-                    self.state(ServerState::NotConnected);
+                    self.state(FollowedServerState::NotConnected);
                     self.finding(&format!("it is not connected: {reason}"));
                 }
                 Link::Connecting => {}
@@ -103,7 +103,7 @@ impl FollowedServer {
     async fn connected(&self, client: &OpcUaClient, application_uri: &str, retry: &mut ReadRetry) {
         let only_discovered = self.entry.which == NamedServers::Discovered;
         if let Some(why) = self.other(application_uri) {
-            self.state(ServerState::Failed);
+            self.state(FollowedServerState::Failed);
             if only_discovered {
                 self.board.findings(&self.name, Vec::new());
             } else {
@@ -123,7 +123,7 @@ impl FollowedServer {
                 // The graph of the previous connection is still being removed.
                 Err(owner) if owner == self.name => {}
                 Err(owner) => {
-                    self.state(ServerState::Duplicate);
+                    self.state(FollowedServerState::Duplicate);
                     // Discovery may find a server that has an entry under another address.
                     if only_discovered {
                         self.board.findings(&self.name, Vec::new());
@@ -208,7 +208,7 @@ impl FollowedServer {
         let Ok(_permit) = self.board.reading.acquire().await else {
             return false;
         };
-        self.state(ServerState::Reading);
+        self.state(FollowedServerState::Reading);
         let began = Instant::now();
         let left_out = self.board.left_out(uri);
         let is_known = |namespace: &str| left_out.contains(namespace);
@@ -253,8 +253,8 @@ impl FollowedServer {
             "the nodes of a server are in the graph"
         );
         self.board.status(&self.name, |status| {
-            *status = ServerStatus {
-                state: ServerState::Current,
+            *status = FollowedServerStatus {
+                state: FollowedServerState::Current,
                 application_uri: uri.to_owned(),
                 graph: graph.iri(),
                 nodes,
@@ -275,13 +275,13 @@ impl FollowedServer {
 
     fn failed(&self, why: &str) -> bool {
         self.board.status(&self.name, |status| {
-            (status.state, status.reserved) = (ServerState::Failed, 0);
+            (status.state, status.reserved) = (FollowedServerState::Failed, 0);
         });
         self.finding(&format!("its nodes cannot be read: {why}"));
         false
     }
 
-    fn state(&self, state: ServerState) {
+    fn state(&self, state: FollowedServerState) {
         self.board.status(&self.name, |status| status.state = state);
     }
 

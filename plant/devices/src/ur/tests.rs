@@ -271,7 +271,7 @@ async fn its_values_follow_the_robot_and_come_back_after_a_silence() {
 async fn the_load_is_measured_and_unknown_at_a_controller_without_it() {
     let bench = bench().await;
     let is = |expected: Vec<f64>| {
-        move |value: &Result<skills::SkillValue, String>| {
+        move |value: &Result<skills::SkillValue, skills::UnknownValue>| {
             let found = value.as_ref().ok().and_then(skills::SkillValue::as_f64s);
             found.as_ref() == Some(&expected)
         }
@@ -300,8 +300,9 @@ async fn the_load_is_measured_and_unknown_at_a_controller_without_it() {
         serving: serving.unwrap(),
     };
     let values = crate::sensors::tests::measured(Arc::new(UrRobot::new(old.settings())));
-    let lacks = |value: &Result<skills::SkillValue, String>| {
-        *value == Err("the robot has no output payload".to_owned())
+    let lacks = |value: &Result<skills::SkillValue, skills::UnknownValue>| {
+        let why = value.as_ref().map_err(ToString::to_string);
+        why == Err("the robot has no output payload".to_owned())
     };
     values.until("LoadMass", lacks).await;
     // The other values are measured.

@@ -23,7 +23,10 @@ pub(super) async fn measure(rtde: &str, period: Duration, out: &Measured) -> Rtd
             Err(why) => return why,
         };
         for ((name, _), value) in measured.iter().zip(values) {
-            out.put(name, shown(name, value).map_err(|why| why.to_string().into()));
+            out.put(
+                name,
+                shown(name, value).map_err(|why| why.to_string().into()),
+            );
         }
     }
 }
@@ -46,7 +49,10 @@ async fn open(address: &str, hertz: f64, out: &Measured) -> Result<(Rtde, Vec<Ou
         if RecipeType::of(&kind).is_some() {
             known.push(measured);
         } else {
-            out.put(name, Err(format!("the robot has no output {output}").into()));
+            out.put(
+                name,
+                Err(format!("the robot has no output {output}").into()),
+            );
         }
     }
     let outputs: Vec<&str> = known.iter().map(|(_, output)| *output).collect();
