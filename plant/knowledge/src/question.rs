@@ -292,8 +292,8 @@ impl NamedQuestion {
 
     /// Returns the pattern that leads from the value of a parameter to its nodes: without it, the
     /// query would look at all nodes and leave out the others afterwards. It is in the lines
-    /// `#: narrow PARAMETER PATTERN`, in which `$text` is the value as text, `$iri` the value as
-    /// IRI or nothing, and `$node` the same in lines that need an IRI.
+    /// `#: narrow PARAMETER PATTERN`, in which `$text` is the value as text, and `$iri` the value as
+    /// IRI. A line with `$iri` is left out if the value is no IRI.
     fn narrowed(self, parameter: &str, value: &str) -> Option<String> {
         let text = Literal::new_simple_literal(value).to_string();
         let iri = NamedNode::new(value).ok().map(|iri| iri.to_string());
@@ -302,12 +302,11 @@ impl NamedQuestion {
             let Some((of, line)) = line.split_once(' ') else {
                 continue;
             };
-            if of != parameter || (line.contains("$node") && iri.is_none()) {
+            if of != parameter || (line.contains("$iri") && iri.is_none()) {
                 continue;
             }
-            let iri = iri.as_deref().unwrap_or_default();
             // The text is last, since a value may contain `$iri`.
-            let line = line.replace("$node", iri).replace("$iri", iri);
+            let line = line.replace("$iri", iri.as_deref().unwrap_or_default());
             pattern.push_str(&line.replace("$text", &text));
             pattern.push(' ');
         }

@@ -130,7 +130,7 @@ fn a_stopped_query_gives_back_its_thread_within_a_second_and_its_memory() {
         format!("<urn:s{number}> <urn:p{}> <urn:s{other}> .\n", number % 50)
     };
     let many: String = (0..60_000).map(statement).collect();
-    cell.file("many.ttl", &many);
+    let _many = cell.file("many.ttl", &many);
     let text = "mes: mes\napplication_uri: urn:example:mes\nnamespace: 50\n\
                 endpoint: opc.tcp://127.0.0.1:0\nsecurity: [None]\nknowledge: [many.ttl]\n";
     let path = cell.file("mes.yaml", text);
