@@ -78,7 +78,7 @@ impl Reading<'_> {
         let every = every.map_or(Some(USUALLY_EVERY), |node| self.interval(node));
         Some(ServerEntry {
             which: which?,
-            user: user.map_or(Some(None), |user| user.map(Some))?,
+            user: super::optional(user)?,
             start,
             limits: SearchLimits {
                 nodes: nodes?,
