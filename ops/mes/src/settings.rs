@@ -114,13 +114,6 @@ fn optional<T>(value: Option<Option<T>>) -> Option<Option<T>> {
     value.map_or(Some(None), |value| value.map(Some))
 }
 
-/// Gives servers without a user that of the MES.
-fn give_user(servers: &mut [ServerEntry], user: Option<&ClientUser>) {
-    for server in servers {
-        server.user = server.user.take().or_else(|| user.cloned());
-    }
-}
-
 struct Reading<'a> {
     reader: YamlReader<'a>,
     folder: &'a Path,
@@ -183,7 +176,7 @@ impl Reading<'_> {
         let names = servers.iter().map(|server| server.which.text());
         self.once(root, names, "server");
         let user = optional(user)?;
-        give_user(&mut servers, user.as_ref());
+        servers::give_user(&mut servers, user.as_ref());
         Some(Settings {
             name: name?,
             application_uri: uri?,

@@ -33,6 +33,13 @@ pub(crate) enum NamedServers {
     Discovered,
 }
 
+/// Gives servers without a user that of the MES.
+pub(super) fn give_user(servers: &mut [ServerEntry], user: Option<&ClientUser>) {
+    for server in servers {
+        server.user = server.user.take().or_else(|| user.cloned());
+    }
+}
+
 impl ServerEntry {
     /// Returns whether both entries lead to the same search.
     pub(crate) fn is_same(&self, other: &Self) -> bool {
