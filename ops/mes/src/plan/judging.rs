@@ -305,17 +305,21 @@ impl<'a> Judging<'a> {
         })
     }
 
-    /// Returns the attachment of the component of an offer when a role begins: as it is shown, or
-    /// by a tool that steps attach to the changer that the component moves.
+    /// Returns the attachment of the component of an offer at the start of a role, as it is shown.
+    /// Earlier steps change it: they attach a tool to the tool changer of a robot, or detach it.
     pub(super) fn attachment(&self, role: SkillRole, offer: &Offer) -> Attachment {
         let shown = self.facts.attachment(offer);
-        let carries = |tools: &StepTools| {
-            let moves = |changer: &str| self.facts.moves(offer, changer);
-            tools.possible.are_carried(&tools.user(), &moves)
-        };
-        match self.tools.get(&role) {
-            Some(tools) if shown == Attachment::None && carries(tools) => Attachment::CarriesTool,
-            Some(_) | None => shown,
+        let moves = |changer: &str| self.facts.moves(offer, changer);
+        match (shown, self.tools.get(&role)) {
+            (Attachment::None, Some(tools))
+                if tools.possible.are_carried(&tools.user(), &moves) =>
+            {
+                Attachment::CarriesTool
+            }
+            (Attachment::CarriesTool, Some(tools)) if tools.possible.are_detached(&moves) => {
+                Attachment::None
+            }
+            _ => shown,
         }
     }
 

@@ -67,6 +67,8 @@ struct AttachedTool {
     by: Option<ToolStep>,
     /// The step did so in an earlier round of a loop.
     is_earlier: bool,
+    /// It is not known whether a tool is attached, for example after a failed step.
+    is_uncertain: bool,
 }
 
 /// A step that changes a tool: its number and its name.
@@ -176,6 +178,7 @@ impl AttachedTools {
                 tool,
                 by: None,
                 is_earlier: false,
+                is_uncertain: false,
             })
         });
         let lost = before.iter().filter(|tool| {
@@ -215,6 +218,7 @@ impl AttachedTools {
             tool,
             by: Some(by),
             is_earlier: false,
+            is_uncertain: false,
         });
     }
 
@@ -239,6 +243,7 @@ impl AttachedTools {
             tool: None,
             by: Some(by),
             is_earlier: false,
+            is_uncertain: true,
         });
     }
 
@@ -519,13 +524,30 @@ impl PossibleTools {
         (faults.len(), faults.into_iter().next())
     }
 
-    /// Returns whether steps have attached a tool to a changer that `moves` in each case.
+    /// Returns whether, in each case, an earlier step has attached a tool to a tool changer for which
+    /// `moves` returns true.
     pub(super) fn are_carried(&self, user: &ToolUser<'_>, moves: &dyn Fn(&str) -> bool) -> bool {
-        let is_carried = |case: &AttachedTools| {
+        self.are_all(|case| {
             let mut attached = case.attached.iter();
-            attached.any(|tool| tool.by.is_some() && user.follows(tool) && moves(&tool.changer))
-        };
-        !self.cases.is_empty() && self.cases.iter().all(is_carried)
+            attached.any(|tool| {
+                let is_by_step = tool.by.is_some() && !tool.is_uncertain;
+                is_by_step && user.follows(tool) && moves(&tool.changer)
+            })
+        })
+    }
+
+    /// Returns whether, in each case, the run has changed the tool of a tool changer for which
+    /// `moves` returns true, and no such changer has a tool.
+    pub(super) fn are_detached(&self, moves: &dyn Fn(&str) -> bool) -> bool {
+        self.are_all(|case| {
+            let is_changed = case.changed.iter().any(|changer| moves(changer));
+            is_changed && !case.attached.iter().any(|tool| moves(&tool.changer))
+        })
+    }
+
+    /// Returns whether all cases are known, and each of them meets a condition.
+    fn are_all(&self, condition: impl Fn(&AttachedTools) -> bool) -> bool {
+        !self.has_more && !self.cases.is_empty() && self.cases.iter().all(condition)
     }
 
     /// Returns the step of another branch that certainly changes the tool of a component in each

@@ -75,6 +75,77 @@ fn the_robot_of_the_changer_moves_while_it_carries_a_tool() {
     assert_eq!(chosen(&process, &Moving("robot")), [first; 3]);
 }
 
+/// Facts by which b-robot moves the changer, and shows that it carries a tool.
+struct Carrying;
+
+impl Facts for Carrying {
+    fn takes(&self, offer: &Offer, step: (usize, &ProcessStep)) -> Result<(), ParameterFault> {
+        KNOWN.takes(offer, step)
+    }
+
+    fn gives(&self, offer: &Offer, result: &str) -> Result<(), ParameterFault> {
+        KNOWN.gives(offer, result)
+    }
+
+    fn connects(&self, from: (&str, &str), to: (&str, &str)) -> Result<(), ParameterFault> {
+        KNOWN.connects(from, to)
+    }
+
+    fn attachment(&self, offer: &Offer) -> Attachment {
+        match offer.component_name.as_str() {
+            "b-robot" => Attachment::CarriesTool,
+            _ => Attachment::None,
+        }
+    }
+
+    fn moves(&self, offer: &Offer, changer: &str) -> bool {
+        Moving("b-robot").moves(offer, changer)
+    }
+}
+
+#[test]
+fn a_robot_whose_tool_a_step_detached_carries_none() {
+    let process = sequence(&[MOVE, "urn:detach", MOVE]);
+    let offers = [offers(), robot("a-robot"), robot("b-robot")].concat();
+    let mut tools = AttachedTools::default();
+    let vacuum = Some("urn:example:vacuum".to_owned());
+    tools.observe(&ShownTools {
+        attached: BTreeMap::from([("urn:example:changer".to_owned(), vacuum)]),
+        ..ShownTools::default()
+    });
+    let now = Situation {
+        tools: Some(&tools),
+        ..situation(&[])
+    };
+    let found = super::super::plan(&process, &offers, now, &Carrying);
+    let moves: Vec<&str> = chosen(&found, 3).into_iter().step_by(2).collect();
+    assert_eq!(moves, ["b-robot#Lin", "a-robot#Lin"]);
+}
+
+#[test]
+fn a_robot_of_which_it_is_not_known_whether_a_tool_is_attached_is_not_preferred() {
+    let process = sequence(&[MOVE, MOVE]);
+    let offers = [offers(), robot("a-robot"), robot("robot")].concat();
+    let by = || ToolStep {
+        number: 0,
+        name: "attach".to_owned(),
+    };
+    let vacuum = || Some("urn:example:vacuum".to_owned());
+    let first = |tools: &AttachedTools| {
+        let now = Situation {
+            tools: Some(tools),
+            ..situation(&[])
+        };
+        let found = super::super::plan(&process, &offers, now, &Moving("robot"));
+        chosen(&found, 2)[1].to_owned()
+    };
+    let mut tools = AttachedTools::default();
+    tools.attach("urn:example:changer", vacuum(), by());
+    assert_eq!(first(&tools), "robot#Lin");
+    tools.lose("urn:example:changer", vacuum(), by());
+    assert_eq!(first(&tools), "a-robot#Lin");
+}
+
 /// A condition that is decided in the run.
 fn if_failed(step: usize) -> Vec<Vec<StepCondition>> {
     vec![vec![StepCondition {
