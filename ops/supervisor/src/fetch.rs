@@ -67,9 +67,14 @@ pub(crate) enum FetchFault {
 }
 
 impl StatusUrl {
+    /// Returns the path of the status.
+    pub(crate) fn path() -> Uri {
+        Uri::from_static("/status")
+    }
+
     /// Reads the status.
     pub(crate) async fn fetch(&self) -> Result<Value, FetchFault> {
-        self.get(Uri::from_static("/status")).await
+        self.get(Self::path()).await
     }
 
     /// Reads the JSON of a path beside the status.

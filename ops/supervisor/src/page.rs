@@ -7,6 +7,7 @@ use std::time::{Duration, Instant};
 
 use bridge_node::{CallDescription, LocalDelivery, Observer, PortEvent, Statuses, now};
 use bytes::Bytes;
+use hyper::Uri;
 use mappings::{Mapping, SpaceId, TopicId};
 use serde_json::Value;
 use tls_server::TlsServer;
@@ -17,7 +18,7 @@ use uadp::{NetworkMessage, PublisherId, SecurityHeader, Timestamp};
 
 use crate::announced::{self, AnnouncedValue};
 use crate::board::{BoardSample, CellBoard, EventTime};
-use crate::fetch::StatusUrl;
+use crate::fetch::{FetchFault, StatusUrl};
 use crate::hops::TapFollower;
 use crate::mes::{MesClient, RequestSlots};
 use crate::operations::Operations;
@@ -194,15 +195,19 @@ impl Page {
         let mut shown = self.board().watched(self.at().since);
         shown.truncate(MOST_TAPPED);
         taps.keep(&shown);
+        let (mut of, mut requests) = (Vec::new(), Vec::new());
         for topic in &shown {
             for url in &self.others {
                 let source = url.to_string();
-                let Ok(path) = taps.request(*topic, &source).parse() else {
-                    continue;
-                };
-                if let Ok(response) = url.get(path).await {
-                    taps.take(*topic, &source, &response);
+                if let Ok(path) = taps.request(*topic, &source).parse() {
+                    of.push((*topic, source));
+                    requests.push((url, path));
                 }
+            }
+        }
+        for ((topic, source), response) in of.into_iter().zip(read_all(requests).await) {
+            if let Ok(response) = response {
+                taps.take(topic, &source, &response);
             }
         }
         let hops = shown.into_iter().map(|topic| (topic, taps.shown(topic)));
@@ -236,6 +241,12 @@ impl Page {
     }
 }
 
+/// Reads paths of programs, all at the same time: one that does not respond delays no other.
+async fn read_all(requests: Vec<(&StatusUrl, Uri)>) -> Vec<Result<Value, FetchFault>> {
+    let requests = requests.into_iter().map(|(url, path)| url.get(path));
+    futures_util::future::join_all(requests).await
+}
+
 /// Reads the status of all programs while browsers are present.
 async fn follow(page: Weak<Page>, statuses: Statuses) {
     let mut taps = TapFollower::default();
@@ -250,9 +261,9 @@ async fn follow(page: Weak<Page>, statuses: Statuses) {
             continue;
         }
         let mut programs = own(statuses().await);
-        for url in &page.others {
-            let status = url.fetch().await.map_err(|fault| fault.to_string());
-            programs.extend(other(url, status));
+        let requests = page.others.iter().map(|url| (url, StatusUrl::path()));
+        for (url, status) in page.others.iter().zip(read_all(requests.collect()).await) {
+            programs.extend(other(url, status.map_err(|fault| fault.to_string())));
         }
         page.board().set_programs(programs);
         page.follow_taps(&mut taps).await;
@@ -427,6 +438,8 @@ const LOOK: Duration = Duration::from_secs(1);
 #[cfg(test)]
 mod tests {
     use serde_json::json;
+    use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
+    use tokio::net::TcpListener;
 
     use super::*;
 
@@ -438,5 +451,32 @@ mod tests {
         assert_eq!(two[1].space(), Some(3));
         assert!(!other(&url, Err("gone".to_owned()))[0].is_ready());
         assert_eq!(own(vec!["{}".to_owned(), "?".to_owned()]).len(), 2);
+    }
+
+    #[tokio::test]
+    async fn a_program_is_read_while_another_one_does_not_respond() {
+        let listeners = [
+            TcpListener::bind("127.0.0.1:0").await.unwrap(),
+            TcpListener::bind("127.0.0.1:0").await.unwrap(),
+        ];
+        let urls = listeners.each_ref().map(|listener| {
+            let url = listener.local_addr().unwrap().to_string();
+            url.parse::<StatusUrl>().unwrap()
+        });
+        let [slow, quick] = &listeners;
+        let answer = b"HTTP/1.1 200 OK\r\nconnection: close\r\n\r\n{}";
+        let serve = async {
+            // The first program responds after the second one.
+            let (mut waiting, _) = slow.accept().await.unwrap();
+            let (mut other, _) = quick.accept().await.unwrap();
+            for stream in [&mut other, &mut waiting] {
+                stream.read(&mut [0; 1024]).await.unwrap();
+                stream.write_all(answer).await.unwrap();
+                stream.shutdown().await.unwrap();
+            }
+        };
+        let requests = urls.iter().map(|url| (url, StatusUrl::path())).collect();
+        let (read, ()) = tokio::join!(read_all(requests), serve);
+        assert!(read.iter().all(Result::is_ok), "{read:?}");
     }
 }

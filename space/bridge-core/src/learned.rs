@@ -114,9 +114,12 @@ impl<T: Weight + PartialEq> Learned<T> {
         self.known.get(&topic).map(|known| &known.described)
     }
 
-    /// Returns the last description of each topic, even if it has expired, in no particular order.
-    pub(crate) fn iter(&self) -> impl Iterator<Item = (TopicId, &T)> {
-        let known = self.known.iter();
+    /// Returns the descriptions that have not expired, in no particular order.
+    pub(crate) fn iter(&self, now: Instant) -> impl Iterator<Item = (TopicId, &T)> {
+        let known = self
+            .known
+            .iter()
+            .filter(move |(_, known)| known.until > now);
         known.map(|(topic, known)| (*topic, &*known.described))
     }
 

@@ -530,15 +530,17 @@ fn a_mapped_topic_is_announced_with_its_name_and_its_ros_topics() {
     let topic = "ua_1_2_10".parse().unwrap();
     assert_eq!(reader.router.name_of(topic), None);
     reader.hear(&bridge, &sent, now);
-    let without_values: Vec<_> = reader.router.names_without_values().collect();
-    assert_eq!(without_values, [(topic, "Arm.Joint States")]);
+    let without_values = |at| -> Vec<_> { reader.router.names_without_values(at).collect() };
+    assert_eq!(without_values(now.monotonic), [(topic, "Arm.Joint States")]);
+    // The program has left, and no program announces the topic.
+    assert_eq!(without_values(now.monotonic + SECOND * 400), []);
     reader.hear(&bridge, &values, now);
     assert_eq!(reader.refused(), 0);
     let told = reader.told(now);
     let described = told.iter().find_map(|(_, described)| described.as_ref());
     assert_eq!(described.unwrap().name, "Arm.Joint States");
     assert_eq!(reader.router.name_of(topic), Some("Arm.Joint States"));
-    assert_eq!(reader.router.names_without_values().count(), 0);
+    assert_eq!(reader.router.names_without_values(now.monotonic).count(), 0);
 }
 
 #[test]

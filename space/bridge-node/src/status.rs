@@ -199,7 +199,7 @@ impl StatusSnapshot {
             })
             .collect();
         let topics_without_values = router
-            .names_without_values()
+            .names_without_values(crate::clock::now().monotonic)
             .map(|(topic, _)| (topic.to_string(), TopicNames::of(router, topic)))
             .collect();
         let groups = router.groups().map(|state| {

@@ -1,5 +1,7 @@
 //! The display names of topics and calls.
 
+use std::time::Instant;
+
 use mappings::TopicId;
 
 use super::Router;
@@ -29,12 +31,12 @@ impl Router {
     }
 
     /// Returns the names of topics that have had no value here: variables of the mapping, and
-    /// topics that other programs announced, in no particular order.
-    pub fn names_without_values(&self) -> impl Iterator<Item = (TopicId, &str)> {
+    /// topics that other programs announce at the moment, in no particular order.
+    pub fn names_without_values(&self, now: Instant) -> impl Iterator<Item = (TopicId, &str)> {
         let mapping = &self.values.mapping;
         let mapped = mapping.variables().iter();
         let mapped = mapped.map(|variable| (variable.topic, variable.name.as_str()));
-        let announced = self.values.layouts.iter();
+        let announced = self.values.layouts.iter(now);
         let announced = announced
             .filter(|(topic, _)| mapping.variable(*topic).is_none())
             .map(|(topic, layout)| (topic, layout.name()));
