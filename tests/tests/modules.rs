@@ -75,7 +75,7 @@ fn of_node(node: &Value) -> Option<String> {
 
 #[test]
 fn nine_questions_are_answered_as_the_xml_says() {
-    let Some(cell) = Cell::with(&[Peer::Python]) else {
+    let Some(cell) = Cell::with(&[Peer::PythonJudges]) else {
         return;
     };
     let names = ["stage.aml", "mixer.aml", "column.aml"];
@@ -89,7 +89,7 @@ fn nine_questions_are_answered_as_the_xml_says() {
 
 #[test]
 fn nine_questions_about_modules_of_other_makers_are_answered_as_the_xml_says() {
-    let Some(cell) = Cell::with(&[Peer::Python]) else {
+    let Some(cell) = Cell::with(&[Peer::PythonJudges]) else {
         return;
     };
     let names = [
@@ -521,7 +521,7 @@ fn a_service_is_run_once_by_a_command_that_ctrl_c_stops() {
 
 #[test]
 fn the_test_engines_of_the_association_accept_the_package_of_a_module() {
-    let Some(cell) = Cell::with(&[Peer::Python]) else {
+    let Some(cell) = Cell::with(&[Peer::PythonJudges]) else {
         return;
     };
     for name in ["stage.aml", "column.aml"] {
@@ -545,7 +545,7 @@ fn the_test_engines_of_the_association_accept_the_package_of_a_module() {
 
 #[test]
 fn a_module_of_mtppy_runs_and_its_state_machine_is_ours() {
-    let Some(cell) = Cell::with(&[Peer::Python]) else {
+    let Some(cell) = Cell::with(&[Peer::PythonJudges]) else {
         return;
     };
     let said = cell.asyncua_once("mtppy_pea.py", &["table"]);
@@ -647,7 +647,7 @@ fn a_service_of_a_module_is_a_step_of_a_process_and_its_state_is_in_the_graph() 
 
 #[test]
 fn asyncua_sees_the_simulated_module_follow_the_handshake() {
-    let Some(cell) = Cell::with(&[Peer::Python]) else {
+    let Some(cell) = Cell::with(&[Peer::PythonJudges]) else {
         return;
     };
     let _module = simulated("column.aml", &[]);

@@ -152,7 +152,7 @@ fn join(encoding: MessageMapping, publisher: u16) -> Box<dyn Carrier> {
 /// Starts aiomqtt with a subscription.
 fn client(cell: &Cell, filter: &str) -> Child {
     let started = cell.mqtt_python_started("mqtt_client.py", &[filter]);
-    started.told().start().ready(SOON)
+    started.start().ready(SOON)
 }
 
 /// Sends the value in a form until aiomqtt has received it. Returns its ua-data and ua-metadata
