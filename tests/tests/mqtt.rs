@@ -4,6 +4,7 @@
 mod clusters;
 mod commanded;
 mod judges;
+mod late_joiner;
 
 use std::process::Command;
 use std::time::Duration;

@@ -126,10 +126,11 @@ pub(crate) async fn run(
 ) {
     let mut pause = FIRST_PAUSE;
     let mut version = settings.broker.version.unwrap_or(MqttVersion::V5);
+    let mut retains = true;
     loop {
         let before = shared.state().connections;
         let began = TokioInstant::now();
-        let mut session = Session::new(&settings, &shared, version);
+        let mut session = Session::new(&settings, &shared, (version, retains));
         let ended = session.run(&received).await;
         if session.refuses_version && settings.broker.version.is_none() {
             version = match version {
@@ -137,6 +138,7 @@ pub(crate) async fn run(
                 MqttVersion::V3_1_1 => MqttVersion::V5,
             };
         }
+        retains &= session.retains;
         // A broker that accepts and closes at once is no reason to hurry.
         if shared.state().connections > before && began.elapsed() > LAST_PAUSE {
             pause = FIRST_PAUSE;
@@ -182,6 +184,11 @@ struct Session<'a> {
     subscriptions: Subscriptions,
     at: SocketAddr,
     refuses_version: bool,
+    /// Whether the broker takes retained messages.
+    retains: bool,
+    /// The time at which a broker that retains no messages receives those messages again that
+    /// others would retain.
+    next_kept: Option<TokioInstant>,
     over: Option<String>,
     messages: Vec<ReceivedPublish>,
 }
@@ -190,7 +197,7 @@ impl<'a> Session<'a> {
     fn new(
         settings: &'a BrokerSettings,
         shared: &'a ConnectionShared,
-        version: MqttVersion,
+        (version, retains): (MqttVersion, bool),
     ) -> Self {
         let protocol_version = match version {
             MqttVersion::V3_1_1 => mqtt::Version::V3_1_1,
@@ -217,6 +224,8 @@ impl<'a> Session<'a> {
             subscriptions: Subscriptions::default(),
             at: SocketAddr::from(([0, 0, 0, 0], 0)),
             refuses_version: false,
+            retains,
+            next_kept: None,
             over: None,
             messages: Vec::new(),
         }
@@ -237,7 +246,7 @@ impl<'a> Session<'a> {
             }
             Err(error) => return BrokerConnectionEnd::Lost(error.to_string()),
         };
-        match packets::connect(self.settings, self.version) {
+        match packets::connect(self.settings, (self.version, self.retains)) {
             Ok(packet) => self.send(packet),
             Err(error) => return BrokerConnectionEnd::Lost(format!("cannot connect: {error:?}")),
         }
@@ -325,7 +334,13 @@ impl<'a> Session<'a> {
         let ping = ready.is_none().then_some(self.next_ping);
         let retry = self.subscriptions.poll_timeout().map(TokioInstant::from);
         let retry = retry.filter(|_| ready.is_none());
-        let all = timers.chain(stalled).chain(ready).chain(ping).chain(retry);
+        let kept = self.next_kept;
+        let all = timers
+            .chain(stalled)
+            .chain(ready)
+            .chain(ping)
+            .chain(retry)
+            .chain(kept);
         all.min().unwrap_or(self.next_ping)
     }
 
@@ -379,7 +394,8 @@ impl<'a> Session<'a> {
     }
 
     fn publish(&mut self, message: QueuedMessage) {
-        let publication = with_time_left(&message);
+        let mut publication = with_time_left(&message);
+        publication.retained &= self.retains;
         let id = match publication.confirmed {
             // All identifiers are used only if the broker confirms nothing.
             true => self.protocol.acquire_packet_id().ok(),
@@ -449,6 +465,15 @@ impl<'a> Session<'a> {
         for filter in self.subscriptions.take_due(now.into_std()) {
             self.subscribe(filter);
         }
+        if self.next_kept.is_some_and(|next| next <= now) {
+            self.next_kept = Some(now + KEPT_REPEATED);
+            let mut state = self.shared.state();
+            let SharedState { queue, kept, .. } = &mut *state;
+            for publication in kept.values() {
+                // What does not fit into the queue is published the next time.
+                let _full = queue.push(publication.clone(), now.into_std()).is_err();
+            }
+        }
         let due: Vec<TimerKind> = self
             .timers
             .values()
@@ -493,8 +518,13 @@ impl<'a> Session<'a> {
     fn packet(&mut self, packet: Packet) {
         match packets::event(packet) {
             PacketEvent::Accepted(accepted) => self.accepted(accepted),
-            PacketEvent::Refused { why, version } => {
+            PacketEvent::Refused {
+                why,
+                version,
+                retained_will,
+            } => {
                 self.refuses_version = version;
+                self.retains &= !retained_will;
                 self.over = Some(why);
             }
             PacketEvent::Message(message) => self.messages.push(message),
@@ -505,6 +535,7 @@ impl<'a> Session<'a> {
     }
 
     fn accepted(&mut self, accepted: ConnectAck) {
+        self.retains &= accepted.retains;
         self.accepted = Some(accepted);
         for filter in 0..self.settings.filters.len() {
             self.subscribe(filter);
@@ -537,13 +568,15 @@ impl<'a> Session<'a> {
     fn subscribed(&mut self, id: u16, refused: bool) {
         let response = self.subscriptions.respond(id, refused, instant());
         self.report(response);
-        let Some(ConnectAck { max_packet }) = self.accepted else {
+        let Some(ConnectAck { max_packet, .. }) = self.accepted else {
             return;
         };
         if !self.subscriptions.is_settled() || self.is_connected() {
             return;
         }
-        self.next_ping = TokioInstant::now() + PING;
+        let now = TokioInstant::now();
+        self.next_ping = now + PING;
+        self.next_kept = (!self.retains).then(|| now + KEPT_REPEATED);
         let mut state = self.shared.state();
         state.connections += 1;
         let SharedState { queue, kept, .. } = &mut *state;
@@ -554,7 +587,7 @@ impl<'a> Session<'a> {
             max_packet,
         };
         let broker = &self.settings.broker.address;
-        info!(%broker, version = ?self.version, "connected to the MQTT broker");
+        info!(%broker, version = ?self.version, retains = self.retains, "connected to the MQTT broker");
     }
 
     /// Logs the first refusal of a subscription, and its end.
@@ -633,6 +666,9 @@ const ACCEPT: Duration = Duration::from_secs(5);
 const SUBSCRIBE: Duration = Duration::from_secs(30);
 /// The time for the orderly end of a connection.
 const FINISH: Duration = Duration::from_secs(1);
+/// The interval of the messages for a broker that retains none: who joins later has them within a
+/// second.
+const KEPT_REPEATED: Duration = Duration::from_millis(700);
 /// The first and the longest pause before a reconnection.
 const FIRST_PAUSE: Duration = Duration::from_millis(100);
 const LAST_PAUSE: Duration = Duration::from_secs(10);

@@ -25,12 +25,15 @@ pub(crate) struct ReceivedPublish {
 pub(crate) struct ConnectAck {
     /// The largest packet that the broker takes.
     pub(crate) max_packet: Option<u32>,
+    /// Whether the broker takes retained messages. With MQTT 3.1.1 it does not say so.
+    pub(crate) retains: bool,
 }
 
-/// Returns the packet that opens a session without stored state.
+/// Returns the packet that opens a session without stored state. The broker retains the will if it
+/// takes retained messages.
 pub(crate) fn connect(
     settings: &BrokerSettings,
-    version: MqttVersion,
+    (version, retains): (MqttVersion, bool),
 ) -> Result<Packet, MqttError> {
     let id = settings.client_id.as_str();
     let login = settings.credentials.as_ref();
@@ -41,7 +44,8 @@ pub(crate) fn connect(
                 .clean_session(true)
                 .keep_alive(KEEP_ALIVE);
             if let Some(Will { topic, payload }) = &settings.will {
-                connect = connect.will_message(topic.as_str(), payload, Qos::AtLeastOnce, true)?;
+                connect =
+                    connect.will_message(topic.as_str(), payload, Qos::AtLeastOnce, retains)?;
             }
             if let Some(login) = login {
                 connect = connect
@@ -58,7 +62,8 @@ pub(crate) fn connect(
                 .keep_alive(KEEP_ALIVE)
                 .props(vec![Property::MaximumPacketSize(limit)]);
             if let Some(Will { topic, payload }) = &settings.will {
-                connect = connect.will_message(topic.as_str(), payload, Qos::AtLeastOnce, true)?;
+                connect =
+                    connect.will_message(topic.as_str(), payload, Qos::AtLeastOnce, retains)?;
             }
             if let Some(login) = login {
                 connect = connect
@@ -178,6 +183,8 @@ pub(crate) enum PacketEvent {
     Refused {
         why: String,
         version: bool,
+        /// The broker does not take retained messages, and the will is one.
+        retained_will: bool,
     },
     Message(ReceivedPublish),
     /// The broker confirmed or refused a subscription.
@@ -200,11 +207,15 @@ pub(crate) fn event(packet: Packet) -> PacketEvent {
             let code = packet.return_code();
             let version = code == mqtt::result_code::ConnectReturnCode::UnacceptableProtocolVersion;
             if code.is_success() {
-                PacketEvent::Accepted(ConnectAck { max_packet: None })
+                PacketEvent::Accepted(ConnectAck {
+                    max_packet: None,
+                    retains: true,
+                })
             } else {
                 PacketEvent::Refused {
                     why: format!("the broker refuses the connection: {code:?}"),
                     version,
+                    retained_will: false,
                 }
             }
         }
@@ -217,11 +228,17 @@ pub(crate) fn event(packet: Packet) -> PacketEvent {
                         Property::MaximumPacketSize(size) => Some(size.val()),
                         _ => None,
                     }),
+                    retains: !packet.props().iter().any(|property| {
+                        matches!(property, Property::RetainAvailable(takes) if takes.val() == 0)
+                    }),
                 })
             } else {
+                let retained_will =
+                    code == mqtt::result_code::ConnectReasonCode::RetainNotSupported;
                 PacketEvent::Refused {
                     why: format!("the broker refuses the connection: {code:?}"),
                     version,
+                    retained_will,
                 }
             }
         }

@@ -38,8 +38,9 @@ fn publication(topic: &str, number: u8, is_state: bool) -> QueuedPublish {
 
 /// Returns a session that the broker has accepted.
 fn accepted<'a>(settings: &'a BrokerSettings, shared: &'a ConnectionShared) -> Session<'a> {
-    let mut session = Session::new(settings, shared, MqttVersion::V3_1_1);
-    session.send(packets::connect(settings, MqttVersion::V3_1_1).unwrap());
+    let opened = (MqttVersion::V3_1_1, true);
+    let mut session = Session::new(settings, shared, opened);
+    session.send(packets::connect(settings, opened).unwrap());
     session.receive(&[0x20, 2, 0, 0]);
     session
 }
@@ -132,4 +133,56 @@ fn a_lost_connection_leaves_unconfirmed_states_for_the_next_and_counts_the_other
     assert!(!has(&sent, "event") && !has(&sent, "command"));
     let numbers = next.in_flight.iter().map(|(_, (of, _))| of.payload.clone());
     assert_eq!(numbers.collect::<Vec<_>>(), [[2], [4]]);
+}
+
+#[test]
+fn a_broker_that_retains_nothing_receives_all_announcements_again_and_again() {
+    let (settings, shared) = (settings(), ConnectionShared::default());
+    let announcement = QueuedPublish {
+        retained: true,
+        confirmed: false,
+        ..publication("metadata", 7, true)
+    };
+    let topic = announcement.topic.clone();
+    shared.state().kept.insert(topic, announcement);
+    let opened = (MqttVersion::V5, true);
+    let mut session = Session::new(&settings, &shared, opened);
+    session.send(packets::connect(&settings, opened).unwrap());
+    // CONNACK with Retain Available 0, and the responses to the subscriptions.
+    session.receive(&[0x20, 5, 0, 0, 2, 37, 0]);
+    for id in session.subscriptions.requested_ids().collect::<Vec<_>>() {
+        let [high, low] = id.to_be_bytes();
+        session.receive(&[0x90, 4, high, low, 0, GRANTED]);
+    }
+    assert!(session.is_connected());
+    let _subscribed = written(&mut session);
+    let sent = |session: &mut Session<'_>| {
+        let _is_closed = session.fill();
+        written(session)
+    };
+    let first = sent(&mut session);
+    assert!(has(&first, "metadata"));
+    // The flag RETAIN is the last bit of a PUBLISH (MQTT 5, 3.3.1.3).
+    assert_eq!(first.first(), Some(&0x30));
+    assert!(!has(&sent(&mut session), "metadata"));
+    session.fire(TokioInstant::now() + KEPT_REPEATED);
+    assert!(has(&sent(&mut session), "metadata"));
+}
+
+#[test]
+fn a_broker_that_refuses_a_retained_will_is_opened_without_one() {
+    let (mut settings, shared) = (settings(), ConnectionShared::default());
+    settings.will = Some(crate::settings::Will {
+        topic: "status".to_owned(),
+        payload: vec![1],
+    });
+    let mut session = Session::new(&settings, &shared, (MqttVersion::V5, true));
+    session.receive(&[0x20, 3, 0, 0x9a, 0]);
+    assert!(!session.retains);
+    // The flag Will Retain is bit 5 of the connect flags (MQTT 5, 3.1.2.7).
+    let flags = |retains| {
+        let packet = packets::connect(&settings, (MqttVersion::V5, retains)).unwrap();
+        packet.to_continuous_buffer()[9] & 0x20
+    };
+    assert_eq!((flags(true), flags(false)), (0x20, 0));
 }
