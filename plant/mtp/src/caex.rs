@@ -160,6 +160,8 @@ impl CaexPart {
 enum ElementFault {
     #[error("there are more than {0} elements")]
     Number(usize),
+    #[error("its {name} has more than {LONGEST} bytes")]
+    Long { name: &'static str },
     #[error(transparent)]
     Attribute(#[from] XmlAttributeFault),
 }
@@ -172,8 +174,12 @@ impl XmlVisitor for Building {
         if self.elements > MAX_ELEMENTS {
             return Err(ElementFault::Number(MAX_ELEMENTS));
         }
-        let text = |name: &str| -> Result<String, ElementFault> {
-            Ok(element.attribute(name)?.unwrap_or_default())
+        let text = |name: &'static str| -> Result<String, ElementFault> {
+            let value = element.attribute(name)?.unwrap_or_default();
+            match value.len() > LONGEST {
+                true => Err(ElementFault::Long { name }),
+                false => Ok(value),
+            }
         };
         let tag = element.name();
         let part = match tag {
@@ -263,3 +269,6 @@ const ID_LINK: &str = "/IDLinkAttributeType";
 pub(crate) const MAX_FILE: usize = 64 << 20;
 const MAX_DEPTH: usize = 64;
 const MAX_ELEMENTS: usize = 1 << 20;
+/// Limit of the bytes of a name, an ID or a path, which findings and statements repeat for the
+/// elements below.
+const LONGEST: usize = 4096;

@@ -268,6 +268,18 @@ fn what_is_no_manifest_is_told() {
     let deep = "<InternalElement>".repeat(100);
     let deep = Module::read(&deep).unwrap_err().to_string();
     assert!(deep.contains("deep"), "{deep}");
+    for name in ["Name", "ID", "RefBaseSystemUnitPath"] {
+        let long = |length: usize| {
+            let value = "a".repeat(length);
+            Module::read(&format!(
+                "<CAEXFile>\n<InternalElement {name}=\"{value}\"/></CAEXFile>"
+            ))
+        };
+        assert_eq!(long(4096), Err(ManifestError::NoModule));
+        let fault = long(4097).unwrap_err().to_string();
+        let wanted = format!("line 2: its {name} has more than 4096 bytes");
+        assert_eq!(fault, wanted);
+    }
     let bomb = "<!DOCTYPE a [<!ENTITY b \"b\">]><CAEXFile/>";
     assert!(matches!(
         Module::read(bomb),
