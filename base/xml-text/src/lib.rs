@@ -10,6 +10,7 @@ mod walk;
 
 use std::borrow::Cow;
 
+use quick_xml::escape::escape;
 pub use walk::{LocatedXmlFault, XmlAttributeFault, XmlElement, XmlFault, XmlVisitor, walk};
 
 /// Error of decoding a document.
@@ -27,6 +28,15 @@ pub enum EncodingError {
     /// The declaration names an encoding that is not supported.
     #[error("the encoding `{0}` is not supported; save the file as UTF-8")]
     Unsupported(String),
+}
+
+/// Returns text for the content or an attribute of an XML document: with its special characters
+/// escaped, and without the control characters that XML does not allow.
+#[must_use]
+pub fn xml_printable(text: &str) -> String {
+    let is_allowed = |c: &char| !c.is_control() && !matches!(c, '\u{FFFE}' | '\u{FFFF}');
+    let text: String = text.chars().filter(is_allowed).collect();
+    escape(text).into_owned()
 }
 
 /// Decodes a document. The byte order mark is omitted, the declaration stays unchanged.
@@ -243,6 +253,14 @@ mod tests {
         }
         let euro = b"<?xml version='1.0' encoding='windows-1252'?><a>\x80\x9f</a>";
         assert!(decode(euro).unwrap().ends_with("<a>€Ÿ</a>"));
+    }
+
+    #[test]
+    fn printable_text_is_escaped_and_has_no_control_characters() {
+        assert_eq!(
+            xml_printable("a<b>&\"c\"\u{7}\u{85}\u{FFFE} ö"),
+            "a&lt;b&gt;&amp;&quot;c&quot; ö"
+        );
     }
 
     #[test]

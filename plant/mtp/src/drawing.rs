@@ -3,7 +3,7 @@
 use std::collections::HashMap;
 use std::fmt::Write as _;
 
-use quick_xml::escape::escape;
+use xml_text::xml_printable;
 
 use crate::model::DataAssembly;
 use crate::picture::{ModulePicture, PictureConnection, PictureObject};
@@ -22,7 +22,7 @@ impl ModulePicture {
              <defs><marker id=\"end\" viewBox=\"0 0 8 8\" refX=\"8\" refY=\"4\" markerWidth=\"8\" \
              markerHeight=\"8\" orient=\"auto\"><path d=\"M0 0L8 4L0 8z\"/></marker></defs>\n\
              <rect class=\"picture\" width=\"{width}\" height=\"{height}\"/>\n",
-            printable(&self.name)
+            xml_printable(&self.name)
         );
         let mut connections: Vec<&PictureConnection> = self.connections.iter().collect();
         connections.sort_by(|one, other| one.layer.total_cmp(&other.layer));
@@ -75,13 +75,14 @@ fn line(svg: &mut String, connection: &PictureConnection) {
         svg,
         "<polyline class=\"{class}\" points=\"{}\"{end}><title>{} ({})</title></polyline>",
         points.join(" "),
-        printable(&connection.name),
-        printable(&connection.class)
+        xml_printable(&connection.name),
+        xml_printable(&connection.class)
     );
 }
 
-/// Adds an object. The position of an end of a flow is the corner of its symbol, too. The width and
-/// height are those of the rotated symbol, so that its box is not rotated.
+/// Adds an object. X and Y are the upper left corner, also for sources and sinks. The file gives the
+/// width and height after the rotation, so the box is drawn without a rotation. A device without a
+/// size has its name only.
 fn shape(svg: &mut String, object: &PictureObject, assembly: Option<&DataAssembly>) {
     let Some([x, y]) = object.position else {
         return;
@@ -91,8 +92,8 @@ fn shape(svg: &mut String, object: &PictureObject, assembly: Option<&DataAssembl
         None => object.class.clone(),
     };
     let _written = write!(svg, "<g class=\"{}\"><title>", kind(object));
-    let _written = write!(svg, "{}</title>", printable(&about));
-    let name = printable(&object.name);
+    let _written = write!(svg, "{}</title>", xml_printable(&about));
+    let name = xml_printable(&object.name);
     let [middle, below] = match object.size {
         Some([width, height]) => {
             let [middle, centre] = [x + width / 2.0, y + height / 2.0];
@@ -102,6 +103,7 @@ fn shape(svg: &mut String, object: &PictureObject, assembly: Option<&DataAssembl
             );
             [middle, centre]
         }
+        None if !object.is_topology => [x, y],
         None => {
             let [middle, centre] = [x + END, y + END];
             let _written = write!(svg, "<circle cx=\"{middle}\" cy=\"{centre}\" r=\"{END}\"/>");
@@ -114,17 +116,10 @@ fn shape(svg: &mut String, object: &PictureObject, assembly: Option<&DataAssembl
 /// Returns the class of an object in the style of the drawing.
 fn kind(object: &PictureObject) -> &'static str {
     match (object.size, &object.assembly) {
-        (None, _) => "end",
+        (None, _) if object.is_topology => "end",
         (Some(_), Some(_)) => "device",
-        (Some(_), None) => "plain",
+        (_, None) | (None, _) => "plain",
     }
-}
-
-/// Returns text for XML, without the control characters that XML does not allow.
-fn printable(text: &str) -> String {
-    let is_allowed = |c: &char| !c.is_control() && !matches!(c, '\u{FFFE}' | '\u{FFFF}');
-    let text: String = text.chars().filter(is_allowed).collect();
-    escape(text).into_owned()
 }
 
 /// The margin of a picture without a size.

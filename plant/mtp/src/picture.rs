@@ -2,8 +2,11 @@
 //! links.
 
 use std::collections::{BTreeMap, HashMap};
+use std::ops::RangeInclusive;
 
-use crate::caex::{CaexElement, CaexLink};
+use thiserror::Error;
+
+use crate::caex::CaexElement;
 use crate::model::MtpFinding;
 use crate::read::{ElementIndex, is_true};
 
@@ -35,12 +38,14 @@ pub struct PictureObject {
     pub name: String,
     /// The last part of its type, such as `VisualObject`, `Source` or `Sink`.
     pub class: String,
+    /// Whether it is an end or a junction of flows (TopologyObject), not a device.
+    pub is_topology: bool,
     /// The name of its SemanticGroup, behind the groups around it, with slashes between them: its
     /// first 200 characters. Empty without a group.
     pub group: String,
     /// X and Y of its upper left corner.
     pub position: Option<[f64; 2]>,
-    /// Its width and height; topology objects have no size.
+    /// Its width and height, if the file has them.
     pub size: Option<[f64; 2]>,
     /// The rotation of its symbol in degrees; its size is that of the rotated symbol.
     pub rotation: f64,
@@ -97,7 +102,8 @@ pub struct PicturePort {
 
 impl ModulePicture {
     /// Returns the neighbours of each part that has links: by the ID of an object or a connection,
-    /// the IDs of the objects and connections that links join with it, with their names.
+    /// the IDs of the objects and connections that links join with it, with their names. Parts
+    /// without an ID are left out.
     #[must_use]
     pub fn neighbours(&self) -> BTreeMap<&str, BTreeMap<&str, &str>> {
         let owners: HashMap<&str, (&str, &str)> = self.ports().collect();
@@ -114,27 +120,30 @@ impl ModulePicture {
         found
     }
 
-    /// Returns the ID of each port with the ID and the name of its object or connection.
+    /// Returns the ID of each port with the ID and the name of its object or connection. Objects
+    /// and connections without an ID are left out.
     fn ports(&self) -> impl Iterator<Item = (&str, (&str, &str))> {
-        let of_objects = self.objects.iter().flat_map(|one| {
-            let ports = one.ports.iter();
-            ports.map(|port| (&*port.id, (&*one.id, &*one.name)))
-        });
-        let of_connections = self.connections.iter().flat_map(|one| {
-            let ports = one.ports.iter();
-            ports.map(|port| (&*port.id, (&*one.id, &*one.name)))
-        });
-        of_objects.chain(of_connections)
+        let objects = self.objects.iter();
+        let objects = objects.map(|one| (&one.id, &one.name, &one.ports));
+        let connections = self.connections.iter();
+        let connections = connections.map(|one| (&one.id, &one.name, &one.ports));
+        let parts = objects.chain(connections);
+        parts
+            .filter(|(id, ..)| !id.is_empty())
+            .flat_map(|(id, name, ports)| ports.iter().map(|port| (&*port.id, (&**id, &**name))))
     }
 }
 
 /// The parts of pictures while they are read.
 #[derive(Default)]
 pub(crate) struct PictureParts<'a> {
-    /// The ID of the port of each port and of each of its interfaces.
-    ports: HashMap<&'a str, &'a str>,
+    /// The index of the picture that is read.
+    picture: usize,
+    /// Maps the ID of a port, and the ID of each interface of a port, to the ID of the port. The
+    /// key includes the index of the picture.
+    ports: BTreeMap<(&'a str, usize), &'a str>,
     /// Elements without a place in the model.
-    pub(crate) left_out: Vec<&'a CaexElement>,
+    left_out: Vec<&'a CaexElement>,
 }
 
 impl<'a> ElementIndex<'a> {
@@ -146,22 +155,27 @@ impl<'a> ElementIndex<'a> {
     ) -> (Vec<ModulePicture>, Vec<&'a CaexElement>) {
         let mut parts = PictureParts::default();
         let elements: Vec<&CaexElement> = root.all().filter(|one| is_picture(one)).collect();
-        let mut pictures: Vec<ModulePicture> = elements
-            .iter()
-            .map(|picture| self.picture(picture, &mut parts))
-            .collect();
-        // A port may be linked before it is in the file.
-        for (element, picture) in elements.iter().zip(&mut pictures) {
-            for link in links_of(element) {
-                match link.sides.each_ref().map(|side| parts.port(side)) {
-                    [Some(first), Some(second)] => picture.links.push([first, second]),
-                    _ => {
-                        let about =
-                            format!("{}: {} - {}", picture.name, link.sides[0], link.sides[1]);
-                        let what = "a side of the InternalLink names no port of a picture";
-                        self.find_at(link.line, &about, what);
+        let mut pictures: Vec<ModulePicture> = Vec::new();
+        for element in &elements {
+            parts.picture = pictures.len();
+            pictures.push(self.picture(element, &mut parts));
+        }
+        // Links are resolved after all pictures are read, because a link may precede its ports in
+        // the file.
+        for (at, (element, picture)) in elements.iter().zip(&mut pictures).enumerate() {
+            for link in parts_of(element).flat_map(|part| &part.links) {
+                let what = match link.sides.each_ref().map(|side| parts.port(side, at)) {
+                    [Some((of_first, first)), Some((of_second, second))]
+                        if of_first == at && of_second == at =>
+                    {
+                        picture.links.push([first, second].map(str::to_owned));
+                        continue;
                     }
-                }
+                    [Some(_), Some(_)] => "a side of the InternalLink is in another picture",
+                    _ => "a side of the InternalLink names no port of a picture",
+                };
+                let about = format!("{}: {} - {}", picture.name, link.sides[0], link.sides[1]);
+                self.find_at(link.line, &about, what);
             }
         }
         (pictures, parts.left_out)
@@ -169,7 +183,7 @@ impl<'a> ElementIndex<'a> {
 
     fn picture(&mut self, element: &'a CaexElement, parts: &mut PictureParts<'a>) -> ModulePicture {
         let missing = Some("the picture has no Width or no Height");
-        let size = self.pair(element, &element.name, (["Width", "Height"], missing));
+        let size = self.size(element, &element.name, missing);
         let mut picture = ModulePicture {
             id: element.id.clone(),
             name: element.name.clone(),
@@ -179,7 +193,7 @@ impl<'a> ElementIndex<'a> {
             connections: Vec::new(),
             links: Vec::new(),
         };
-        let picture_name = shortened(&element.name);
+        let picture_name = &element.name;
         let children = |of: &'a CaexElement| of.children.iter().rev();
         let mut waiting: Vec<(&CaexElement, String)> = children(element)
             .map(|child| (child, String::new()))
@@ -188,16 +202,15 @@ impl<'a> ElementIndex<'a> {
             match PartClass::of(part) {
                 Some(PartClass::Picture) => {}
                 Some(PartClass::Group) => {
-                    let name = shortened(&part.name);
                     let inner = match group.is_empty() {
-                        true => name,
-                        false => shortened(&format!("{group}/{name}")),
+                        true => shortened(&part.name),
+                        false => shortened(&format!("{group}/{}", part.name)),
                     };
                     waiting.extend(children(part).map(|child| (child, inner.clone())));
                 }
-                Some(PartClass::Object { has_size }) => {
+                Some(PartClass::Object { is_topology }) => {
                     let about = format!("{picture_name}/{}", part.name);
-                    let mut object = self.object(part, &about, has_size);
+                    let mut object = self.object(part, &about, is_topology);
                     object.group = group;
                     object.ports = self.ports(part, &about, parts);
                     picture.objects.push(object);
@@ -208,17 +221,25 @@ impl<'a> ElementIndex<'a> {
                     let connection = self.connection(part, &about, (group, ports));
                     picture.connections.push(connection);
                 }
-                None => parts.left_out.extend(part.all()),
+                None => parts.leave_out(part),
             }
         }
         picture
     }
 
-    fn object(&mut self, element: &'a CaexElement, about: &str, has_size: bool) -> PictureObject {
+    fn object(
+        &mut self,
+        element: &'a CaexElement,
+        about: &str,
+        is_topology: bool,
+    ) -> PictureObject {
+        if element.id.is_empty() {
+            self.find(element, about, "the object has no ID, so no link joins it");
+        }
         let missing = Some("the object has no position (X and Y)");
         let position = self.pair(element, about, (["X", "Y"], missing));
-        let missing = has_size.then_some("the object has no Width or no Height");
-        let size = self.pair(element, about, (["Width", "Height"], missing));
+        let missing = (!is_topology).then_some("the object has no Width or no Height");
+        let size = self.size(element, about, missing);
         let assembly = self.value_assembly(element).map(|one| one.id.clone());
         if let (None, Some(id)) = (&assembly, element.value(&["RefID"])) {
             // Files have RefIDs of tanks and pipes too, which have no variables.
@@ -233,6 +254,7 @@ impl<'a> ElementIndex<'a> {
             id: element.id.clone(),
             name: element.name.clone(),
             class: element.kind().to_owned(),
+            is_topology,
             group: String::new(),
             position,
             size,
@@ -253,17 +275,24 @@ impl<'a> ElementIndex<'a> {
         about: &str,
         (group, ports): (String, Vec<PicturePort>),
     ) -> PictureConnection {
+        if element.id.is_empty() {
+            let what = "the connection has no ID, so no link joins it";
+            self.find(element, about, what);
+        }
         let edges = element.value(&["Edgepath"]);
         let path = match edges {
             Some(edges) => points(edges),
-            None => Some(ports.iter().filter_map(|port| port.position).collect()),
+            None => Ok(ports.iter().filter_map(|port| port.position).collect()),
         };
+        let edges = edges.unwrap_or_default();
         let fault = match &path {
-            Some(path) if path.len() > 1 => None,
-            Some(_) => Some("the connection has no Edgepath with two points".to_owned()),
-            None => Some(format!(
-                "its Edgepath `{}` is no list of points, as `1,2;3,4`",
-                edges.unwrap_or_default()
+            Ok(path) if path.len() > 1 => None,
+            Ok(_) => Some("the connection has no Edgepath with two points".to_owned()),
+            Err(PictureNumberFault::Text) => Some(format!(
+                "its Edgepath `{edges}` is no list of points, as `1,2;3,4`"
+            )),
+            Err(PictureNumberFault::Magnitude) => Some(format!(
+                "its Edgepath `{edges}` has a number that is too large or too small for a picture"
             )),
         };
         if let Some(fault) = fault {
@@ -290,20 +319,20 @@ impl<'a> ElementIndex<'a> {
         let mut ports = Vec::new();
         for element in &of.children {
             if !is_port(element) {
-                parts.left_out.extend(element.all());
+                parts.leave_out(element);
                 continue;
             }
             let about = format!("{about}/{}", element.name);
             if element.id.is_empty() {
                 self.find(element, &about, "the port has no ID, so nothing links it");
             } else {
-                parts.ports.insert(&element.id, &element.id);
+                parts.add(&element.id, &element.id);
             }
             for child in &element.children {
                 if !is_connector(child) {
-                    parts.left_out.extend(child.all());
-                } else if !child.id.is_empty() {
-                    parts.ports.insert(&child.id, &element.id);
+                    parts.leave_out(child);
+                } else if !child.id.is_empty() && !element.id.is_empty() {
+                    parts.add(&child.id, &element.id);
                 }
             }
             ports.push(PicturePort {
@@ -331,27 +360,63 @@ impl<'a> ElementIndex<'a> {
         Some([first?, second?])
     }
 
+    /// Returns the width and height, see [`pair`](Self::pair).
+    fn size(
+        &mut self,
+        element: &'a CaexElement,
+        about: &str,
+        missing: Option<&str>,
+    ) -> Option<[f64; 2]> {
+        let size = self.pair(element, about, (["Width", "Height"], missing))?;
+        if size.iter().any(|one| *one < 0.0) {
+            self.find(element, about, "the Width or the Height is below 0");
+            return None;
+        }
+        Some(size)
+    }
+
     fn number(&mut self, element: &'a CaexElement, about: &str, name: &str) -> Option<f64> {
         let text = element.value(&[name])?;
-        let number = number(text);
-        if number.is_none() {
-            let what = format!("its {name} is `{text}`, which is no number");
-            self.find(element, about, &what);
+        match number(text) {
+            Ok(number) => Some(number),
+            Err(fault) => {
+                self.find(element, about, &format!("its {name} is `{text}`, {fault}"));
+                None
+            }
         }
-        number
     }
 }
 
-impl PictureParts<'_> {
-    /// Returns the ID of the port that a side of a link names: the ID of an interface, or the ID of
-    /// the port with the name of an interface.
-    fn port(&self, side: &str) -> Option<String> {
-        let plain = |id: &str| self.ports.get(id).copied();
+impl<'a> PictureParts<'a> {
+    /// Adds the ID of a port or of its interface.
+    fn add(&mut self, id: &'a str, port: &'a str) {
+        self.ports.insert((id, self.picture), port);
+    }
+
+    /// Adds an element without a place in the model, with all elements below it, except pictures,
+    /// which are read.
+    fn leave_out(&mut self, element: &'a CaexElement) {
+        if !is_picture(element) {
+            self.left_out.extend(parts_of(element));
+        }
+    }
+
+    /// Returns the ID of the port that a side of a link names, and the index of its picture. A side
+    /// is the ID of an interface, or the ID of the port with the name of an interface. The port is
+    /// in the picture `at` if that has such a port.
+    fn port(&self, side: &str, at: usize) -> Option<(usize, &'a str)> {
+        let plain = |id: &str| {
+            let own = self.ports.get(&(id, at)).map(|port| (at, *port));
+            own.or_else(|| {
+                let mut others = self.ports.range((id, 0)..=(id, usize::MAX));
+                others.next().map(|((_, picture), port)| (*picture, *port))
+            })
+        };
         let of_element = || {
             let (id, _) = side.rsplit_once(':')?;
             plain(id).or_else(|| plain(id.strip_prefix('{')?.strip_suffix('}')?))
         };
-        plain(side).or_else(of_element).map(str::to_owned)
+        plain(side).or_else(of_element)
     }
 }
 
@@ -360,7 +425,7 @@ impl PictureParts<'_> {
 enum PartClass {
     Picture,
     Group,
-    Object { has_size: bool },
+    Object { is_topology: bool },
     Connection,
 }
 
@@ -372,8 +437,8 @@ impl PartClass {
         let mut parts = element.path.split('/').skip(1);
         parts.find_map(|part| match part {
             "SemanticGroup" => Some(Self::Group),
-            "VisualObject" => Some(Self::Object { has_size: true }),
-            "TopologyObject" => Some(Self::Object { has_size: false }),
+            "VisualObject" => Some(Self::Object { is_topology: false }),
+            "TopologyObject" => Some(Self::Object { is_topology: true }),
             "Connection" => Some(Self::Connection),
             _ => None,
         })
@@ -399,9 +464,9 @@ fn is_connector(element: &CaexElement) -> bool {
     element.is_interface && element.path.split('/').any(is_connector)
 }
 
-/// Returns the links of a picture and of its parts.
-fn links_of(picture: &CaexElement) -> impl Iterator<Item = &CaexLink> {
-    let mut waiting = vec![picture];
+/// Returns an element and all elements below it, without the pictures below it and their elements.
+fn parts_of(element: &CaexElement) -> impl Iterator<Item = &CaexElement> {
+    let mut waiting = vec![element];
     std::iter::from_fn(move || {
         let next = waiting.pop()?;
         waiting.extend(
@@ -410,29 +475,43 @@ fn links_of(picture: &CaexElement) -> impl Iterator<Item = &CaexLink> {
                 .rev()
                 .filter(|child| !is_picture(child)),
         );
-        Some(&next.links)
+        Some(next)
     })
-    .flatten()
 }
 
-/// Returns the first characters of a name that is repeated for each part of a picture.
+/// Returns the first characters of the name of a group, which is repeated for each of its parts.
 fn shortened(name: &str) -> String {
     name.chars().take(LONGEST_NAME).collect()
 }
 
 /// Returns the points of an Edgepath, as `1,2;3,4` with or without an end.
-fn points(text: &str) -> Option<Vec<[f64; 2]>> {
+fn points(text: &str) -> Result<Vec<[f64; 2]>, PictureNumberFault> {
     let points = text.split(';').map(str::trim);
     let points = points.filter(|point| !point.is_empty()).map(|point| {
-        let (x, y) = point.split_once(',')?;
-        Some([number(x)?, number(y)?])
+        let (x, y) = point.split_once(',').ok_or(PictureNumberFault::Text)?;
+        Ok([number(x)?, number(y)?])
     });
     points.collect()
 }
 
-fn number(text: &str) -> Option<f64> {
-    let number: f64 = text.trim().parse().ok()?;
-    number.is_finite().then_some(number)
+/// Reason for which a number of a picture is not read.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Error)]
+enum PictureNumberFault {
+    #[error("which is no number")]
+    Text,
+    #[error("which is too large or too small for a picture")]
+    Magnitude,
+}
+
+/// Reads a number: 0, or a number that drawings and statements show in a few characters.
+fn number(text: &str) -> Result<f64, PictureNumberFault> {
+    let number: f64 = text.trim().parse().map_err(|_| PictureNumberFault::Text)?;
+    match number {
+        _ if number.is_nan() => Err(PictureNumberFault::Text),
+        0.0 => Ok(number),
+        _ if MAGNITUDES.contains(&number.abs()) => Ok(number),
+        _ => Err(PictureNumberFault::Magnitude),
+    }
 }
 
 fn text(element: &CaexElement, name: &str) -> String {
@@ -441,3 +520,5 @@ fn text(element: &CaexElement, name: &str) -> String {
 
 /// Limit of the characters of the name of a group.
 const LONGEST_NAME: usize = 200;
+/// The magnitudes of the numbers of a picture, except 0.
+const MAGNITUDES: RangeInclusive<f64> = 1e-6..=1e10;

@@ -1,10 +1,13 @@
 //! Pictures of manifests: objects, connections, links, statements, drawings and findings.
 #![expect(clippy::unwrap_used, clippy::panic, reason = "a test may")]
 
-use std::collections::{BTreeMap, BTreeSet};
+mod common;
 
+use std::collections::BTreeMap;
+
+use common::of_class;
 use mtp::vocabulary as v;
-use mtp::{Module, ModulePicture, Object, PictureObject, Triple};
+use mtp::{Module, ModulePicture, Object, PictureObject};
 use test_data::{read_foreign, read_own};
 
 /// Numbers as counted by another XML library: pictures, objects, connections, ports, links, objects
@@ -46,15 +49,6 @@ fn overview(module: &Module) -> &ModulePicture {
 fn object<'p>(picture: &'p ModulePicture, name: &str) -> &'p PictureObject {
     let mut objects = picture.objects.iter();
     objects.find(|one| one.name == name).unwrap()
-}
-
-/// Returns the subjects of a class.
-fn of_class(all: &[Triple], class: &str) -> usize {
-    let of = all
-        .iter()
-        .filter(|one| one.predicate == v::RDF_TYPE && one.object == Object::Iri(class.to_owned()));
-    let subjects: BTreeSet<&str> = of.map(|one| &*one.subject).collect();
-    subjects.len()
 }
 
 #[test]
@@ -197,6 +191,159 @@ fn a_drawing_has_a_box_for_each_device_and_a_line_for_each_connection() {
 }
 
 #[test]
+fn a_device_without_a_size_is_drawn_as_its_name() {
+    let mut module = column();
+    module.pictures[0].objects[0].size = None;
+    let svg = overview(&module).svg(&module.assemblies);
+    let heater = "<g class=\"plain\"><title>Heater (PIDCtrl)</title>\
+                  <text x=\"100\" y=\"80\">Heater</text></g>";
+    assert!(svg.contains(heater), "{svg}");
+    assert_eq!(svg.matches("<circle").count(), 2, "{svg}");
+}
+
+#[test]
+fn parts_of_a_higher_layer_are_drawn_later() {
+    let module = column();
+    let svg = overview(&module).svg(&module.assemblies);
+    let at = |text: &str| svg.find(text).unwrap_or_else(|| panic!("{text}: {svg}"));
+    // The heater and the pipe are the first in the file.
+    assert!(at(">Level</text>") < at(">Waste</text>"), "{svg}");
+    assert!(at(">Waste</text>") < at(">Heater</text>"), "{svg}");
+    assert!(at(">Interlock (") < at(">Pipe ("), "{svg}");
+}
+
+#[test]
+fn a_drawing_without_a_size_is_as_large_as_its_parts() {
+    let mut module = column();
+    let view_box = |module: &Module| -> String {
+        let svg = overview(module).svg(&module.assemblies);
+        let (_, rest) = svg.split_once("viewBox=\"").unwrap();
+        rest.split('"').next().unwrap().to_owned()
+    };
+    for size in [None, Some([0.0, 240.0])] {
+        module.pictures[0].size = size;
+        // The right side of the level, the lowest corner, and the margin.
+        assert_eq!(view_box(&module), "0 0 320 220");
+    }
+    module.pictures[0].connections[0].path.push([400.0, 300.0]);
+    assert_eq!(view_box(&module), "0 0 420 320");
+}
+
+/// Returns a manifest with a text replaced.
+fn replaced(from: &str, to: &str) -> Module {
+    let text = read_own("mtp/column.aml");
+    assert!(text.contains(from), "{from}");
+    Module::read(&text.replacen(from, to, 1)).unwrap()
+}
+
+/// Returns the findings without their lines.
+fn findings(module: &Module) -> Vec<String> {
+    let all = module.findings.iter();
+    all.map(|one| format!("{}: {}", one.about, one.what))
+        .collect()
+}
+
+/// Returns a picture with a size and contents.
+fn picture(id: &str, contents: &str) -> String {
+    format!(
+        "<InternalElement Name=\"{id}\" ID=\"{id}\" RefBaseSystemUnitPath=\"MTPHMISUCLib/Picture\">\
+         <Attribute Name=\"Width\"><Value>10</Value></Attribute>\
+         <Attribute Name=\"Height\"><Value>10</Value></Attribute>{contents}</InternalElement>"
+    )
+}
+
+#[test]
+fn a_library_has_no_pictures() {
+    let library = format!(
+        "<SystemUnitClassLib Name=\"Own\">{}</SystemUnitClassLib></CAEXFile>",
+        picture("template", "")
+    );
+    let module = replaced("</CAEXFile>", &library);
+    assert_eq!(overview(&module).id, "pic");
+    assert_eq!(findings(&module), Vec::<String>::new());
+}
+
+#[test]
+fn a_picture_within_a_picture_is_read_once_and_is_not_left_out() {
+    let gone = "<InternalLink RefPartnerSideA=\"gone\" RefPartnerSideB=\"gone-too\"/>";
+    let inner = picture("inner", gone);
+    let found = "inner: gone - gone-too: a side of the InternalLink names no port of a picture";
+    let waste = "<InternalElement Name=\"Waste\"";
+    let border = format!(
+        "<InternalElement Name=\"B\" ID=\"b\" RefBaseSystemUnitPath=\"MTPHMISUCLib/Border\">{inner}\
+         </InternalElement>{waste}"
+    );
+    let of_border = "MTPHMISUCLib/Border: not read (1 in the file)";
+    // Below a port, an object, an element of an unknown class, and the picture.
+    let connector = "<ExternalInterface Name=\"Connector\" ID=\"pic-1-in-c\"";
+    let port = "<InternalElement Name=\"In\" ID=\"pic-1-in\"";
+    for (from, to, wanted) in [
+        (connector, format!("{inner}{connector}"), vec![found]),
+        (port, format!("{inner}{port}"), vec![found]),
+        (waste, border, vec![found, of_border]),
+        (waste, format!("{inner}{waste}"), vec![found]),
+    ] {
+        let module = replaced(from, &to);
+        assert_eq!(findings(&module), wanted, "{to}");
+        let names: Vec<&str> = module.pictures.iter().map(|one| &*one.name).collect();
+        assert_eq!(names, ["Overview", "inner"], "{to}");
+        assert_eq!(module.pictures[0].links.len(), 4, "{to}");
+    }
+}
+
+#[test]
+fn links_do_not_join_parts_without_an_id_or_of_different_pictures() {
+    let joined = |module: &Module, id: &str| -> Vec<String> {
+        let neighbours = module.pictures[0].neighbours();
+        let found = neighbours.get(id).into_iter().flatten();
+        found.map(|(_, name)| (*name).to_owned()).collect()
+    };
+    let heater = "Name=\"Heater\" ID=\"pic-1\" RefBaseSystemUnitPath=\"MTPHMISUCLib";
+    let module = replaced(heater, &heater.replace(" ID=\"pic-1\"", ""));
+    assert_eq!(
+        findings(&module),
+        ["Overview/Heater: the object has no ID, so no link joins it"]
+    );
+    assert_eq!(joined(&module, "pic-5"), ["Feed"]);
+    assert_eq!(joined(&module, ""), Vec::<String>::new());
+
+    let pipe = "Name=\"Pipe\" ID=\"pic-5\"";
+    let module = replaced(pipe, "Name=\"Pipe\"");
+    assert_eq!(
+        findings(&module),
+        ["Overview/Pipe: the connection has no ID, so no link joins it"]
+    );
+    assert_eq!(joined(&module, "pic-1"), ["Signal"]);
+
+    let module = replaced(" ID=\"pic-3-out\"", "");
+    let wanted = [
+        "Overview/Feed/Out: the port has no ID, so nothing links it",
+        "Overview: pic-3-out-c - pic-5-1-c: a side of the InternalLink names no port of a picture",
+    ];
+    assert_eq!(findings(&module), wanted);
+
+    let sink = "<InternalElement Name=\"End\" ID=\"end\" \
+                RefBaseSystemUnitPath=\"MTPHMISUCLib/TopologyObject/Termination/Sink\">\
+                <Attribute Name=\"X\"><Value>1</Value></Attribute>\
+                <Attribute Name=\"Y\"><Value>1</Value></Attribute><InternalElement Name=\"In\" \
+                ID=\"end-in\" RefBaseSystemUnitPath=\"MTPHMISUCLib/PortObject/Nozzle\"/>\
+                </InternalElement>";
+    for [from, to] in [
+        ["end-in", "pic-1-in-c"],
+        ["pic-1-in-c", "end-in"],
+        ["pic-3-out-c", "pic-5-1-c"],
+    ] {
+        let link = format!("<InternalLink RefPartnerSideA=\"{from}\" RefPartnerSideB=\"{to}\"/>");
+        let other = picture("other", &format!("{link}{sink}"));
+        let module = replaced("</CAEXFile>", &format!("{other}</CAEXFile>"));
+        let about = format!("other: {from} - {to}");
+        let wanted = format!("{about}: a side of the InternalLink is in another picture");
+        assert_eq!(findings(&module), [wanted]);
+        assert!(module.pictures[1].links.is_empty(), "{from} {to}");
+    }
+}
+
+#[test]
 fn elements_of_pictures_that_are_left_out_are_findings_with_their_lines() {
     let text = read_own("mtp/column.aml");
     let line = text
@@ -227,6 +374,37 @@ fn elements_of_pictures_that_are_left_out_are_findings_with_their_lines() {
         one(&value("X", "100"), &value("X", "NaN")),
         "Overview/Heater: its X is `NaN`, which is no number"
     );
+    for (from, number, read) in [
+        ("100", "1e308", false),
+        ("100", "1e11", false),
+        ("100", "-inf", false),
+        ("100", "1e-7", false),
+        ("100", "1e10", true),
+        ("100", "-1e-6", true),
+        ("100", "-0", true),
+    ] {
+        let all = found(&value("X", from), &value("X", number));
+        let what = format!(
+            "line {line}: Overview/Heater: its X is `{number}`, which is too large or too small for a \
+             picture"
+        );
+        let wanted = if read { vec![] } else { vec![what] };
+        assert_eq!(all, wanted, "{number}");
+    }
+    assert_eq!(
+        one(">260,140;130,200<", ">260,140;130,1e308<"),
+        "Overview/Interlock: its Edgepath `260,140;130,1e308` has a number that is too large or too \
+         small for a picture"
+    );
+    assert_eq!(
+        one(&value("Height", "240"), &value("Height", "-240")),
+        "Overview: the Width or the Height is below 0"
+    );
+    assert_eq!(
+        one(&value("Width", "60"), &value("Width", "-1")),
+        "Overview/Heater: the Width or the Height is below 0"
+    );
+    assert_eq!(found(&value("Width", "60"), &value("Width", "0")), [""; 0]);
     assert_eq!(
         one(&value("Height", "90"), &value("Height", "")),
         "Overview/Heater: the object has no Width or no Height"

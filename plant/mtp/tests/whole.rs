@@ -1,8 +1,11 @@
 //! Every element of a manifest: nodes, servers, sensors, actuators, outputs, equipment, alarms and
 //! the state machine, as a model and as RDF.
 
+mod common;
+
 use std::collections::{BTreeMap, BTreeSet};
 
+use common::of_class;
 use mtp::vocabulary as v;
 use mtp::{Edition, Family, Module, Object, OutputRole, ParameterKind, Triple, ValueBound};
 use test_data::{read_foreign, read_own};
@@ -88,14 +91,6 @@ fn counted(
         process_values,
         assemblies,
     }
-}
-
-fn of_class(all: &[Triple], class: &str) -> usize {
-    let of = all
-        .iter()
-        .filter(|one| one.predicate == v::RDF_TYPE && one.object == Object::Iri(class.to_owned()));
-    let subjects: BTreeSet<&str> = of.map(|one| &*one.subject).collect();
-    subjects.len()
 }
 
 #[test]
