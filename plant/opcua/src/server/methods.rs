@@ -103,16 +103,66 @@ fn property(id: &NodeId, name: &str, arguments: Vec<Argument>) -> Variable {
     )
 }
 
-/// Adds the dimensions of an array argument, which the library encodes with dimensions only. The
-/// length 0 of a dimension is any length (OPC 10000-3, 8.6).
+/// Returns an argument that the library encodes: a positive ValueRank has its dimensions, and other
+/// ValueRanks have none. The length 0 of a dimension is any length (OPC 10000-3, 8.6). A ValueRank
+/// above [`HIGHEST_RANK`] becomes OneOrMoreDimensions.
 fn with_dimensions(mut argument: Argument) -> Argument {
-    let rank = usize::try_from(argument.value_rank).unwrap_or_default();
     let dimensions = argument.array_dimensions.as_ref().map_or(0, Vec::len);
-    if (1..=HIGHEST_RANK).contains(&rank) && dimensions != rank {
-        argument.array_dimensions = Some(vec![0; rank]);
+    match usize::try_from(argument.value_rank) {
+        Ok(rank @ 1..=HIGHEST_RANK) if dimensions != rank => {
+            argument.array_dimensions = Some(vec![0; rank]);
+        }
+        Ok(1..=HIGHEST_RANK) => {}
+        Ok(0) | Err(_) => argument.array_dimensions = None,
+        Ok(_) => {
+            argument.value_rank = ONE_OR_MORE_DIMENSIONS;
+            argument.array_dimensions = None;
+        }
     }
     argument
 }
 
-/// Highest ValueRank of an argument that gets its dimensions.
+/// Highest ValueRank of an argument that keeps its ValueRank.
 const HIGHEST_RANK: usize = 8;
+/// ValueRank of arrays of any dimensions (OPC 10000-3, 8.6).
+const ONE_OR_MORE_DIMENSIONS: i32 = 0;
+
+#[cfg(test)]
+mod tests {
+    use opcua::types::{BinaryDecodable as _, BinaryEncodable as _, ContextOwned};
+
+    use super::*;
+
+    #[test]
+    fn arguments_with_any_dimensions_are_encoded_in_their_length() {
+        let owned = ContextOwned::default();
+        let context = owned.context();
+        let (none, zeros) = (None, |rank| Some(vec![0; rank]));
+        for (rank, dimensions, expected_rank, expected) in [
+            (-3, Some(vec![4]), -3, None),
+            (-1, Some(vec![]), -1, None),
+            (-1, None, -1, None),
+            (0, Some(vec![2, 3]), 0, None),
+            (1, None, 1, zeros(1)),
+            (2, Some(vec![2]), 2, zeros(2)),
+            (2, Some(vec![2, 3]), 2, Some(vec![2, 3])),
+            (8, None, 8, zeros(8)),
+            (9, None, 0, None),
+            (9, zeros(9), 0, None),
+            (i32::MAX, none, 0, None),
+        ] {
+            let argument = with_dimensions(Argument {
+                value_rank: rank,
+                array_dimensions: dimensions,
+                ..Argument::default()
+            });
+            let bytes = argument.encode_to_vec(&context);
+            assert_eq!(bytes.len(), argument.byte_len(&context), "{rank}");
+            let decoded = Argument::decode(&mut bytes.as_slice(), &context).unwrap();
+            assert_eq!(decoded.value_rank, expected_rank, "{rank}");
+            // The library encodes no dimensions as an empty list.
+            let dimensions = decoded.array_dimensions.filter(|all| !all.is_empty());
+            assert_eq!(dimensions, expected, "{rank}");
+        }
+    }
+}
