@@ -37,27 +37,41 @@ type Output = (&'static str, &'static str);
 /// Connects with all outputs that the controller has. Returns them in the order of the recipe.
 async fn open(address: &str, hertz: f64, out: &Measured) -> Result<(Rtde, Vec<Output>), RtdeError> {
     let all = MEASURED.map(|(_, output)| output);
-    let kinds = match Rtde::open(address, hertz, &all, &[]).await {
+    let why = match Rtde::open(address, hertz, &all, &[]).await {
         Ok(rtde) => return Ok((rtde, MEASURED.to_vec())),
-        Err(RtdeError::Outputs { kinds, .. }) if kinds.len() == all.len() => kinds,
-        Err(why) => return Err(why),
+        Err(why) => why,
     };
-    // Controllers of earlier versions have fewer outputs.
-    let mut known = Vec::new();
-    for (measured, kind) in MEASURED.into_iter().zip(kinds) {
-        let (name, output) = measured;
-        if RecipeType::of(&kind).is_some() {
-            known.push(measured);
-        } else {
-            out.put(
-                name,
-                Err(format!("the robot has no output {output}").into()),
-            );
-        }
+    let RtdeError::Outputs { kinds, .. } = &why else {
+        return Err(why);
+    };
+    if kinds.len() != all.len() {
+        return Err(why);
     }
+    // Controllers of earlier versions have fewer outputs.
+    let (known, unknown): (Vec<_>, Vec<_>) = MEASURED
+        .into_iter()
+        .zip(kinds)
+        .partition(|(_, kind)| RecipeType::of(kind).is_some());
+    if known.is_empty() {
+        return Err(why);
+    }
+    for ((name, output), kind) in unknown {
+        out.put(name, Err(unsupported(output, kind).into()));
+    }
+    let known: Vec<Output> = known.into_iter().map(|(measured, _)| measured).collect();
     let outputs: Vec<&str> = known.iter().map(|(_, output)| *output).collect();
     let rtde = Rtde::open(address, hertz, &outputs, &[]).await?;
     Ok((rtde, known))
+}
+
+/// Returns the reason why an output with this type is unknown.
+fn unsupported(output: &str, kind: &str) -> String {
+    if kind == "NOT_FOUND" {
+        return format!("the robot has no output {output}");
+    }
+    let kind: String = kind.chars().take(LONGEST_KIND).collect();
+    let kind = kind.escape_debug();
+    format!("the robot sends {output} as {kind}, which is not supported")
 }
 
 /// An output of the robot with a type that the value does not have.
@@ -160,3 +174,59 @@ const fn list(name: &'static str, unit: Option<&'static str>, about: &'static st
 
 /// Highest rate of values, Hz.
 const FASTEST: f64 = 125.0;
+/// Limit of the characters of a type in a message.
+const LONGEST_KIND: usize = 20;
+
+#[cfg(test)]
+mod tests {
+    use super::super::simulator::{ServedRobot, UrSimulator, UrSimulatorSettings};
+    use super::*;
+
+    #[test]
+    fn an_output_of_another_type_is_not_reported_as_missing() {
+        for (kind, reason) in [
+            ("NOT_FOUND", "the robot has no output payload"),
+            (
+                "FLOAT",
+                "the robot sends payload as FLOAT, which is not supported",
+            ),
+            (
+                "\u{7}34567890123456789012345",
+                "the robot sends payload as \\u{7}3456789012345678901, which is not supported",
+            ),
+        ] {
+            assert_eq!(unsupported("payload", kind), reason);
+        }
+    }
+
+    const OUTPUTS: [&str; 10] = [
+        "actual_TCP_pose",
+        "actual_TCP_speed",
+        "actual_TCP_force",
+        "actual_q",
+        "target_speed_fraction",
+        "robot_mode",
+        "safety_mode",
+        "actual_qd",
+        "payload",
+        "payload_cog",
+    ];
+
+    #[tokio::test]
+    async fn a_robot_without_any_output_is_reported_with_all_outputs() {
+        let settings = UrSimulatorSettings {
+            lacks: &OUTPUTS,
+            ..UrSimulatorSettings::default()
+        };
+        let simulator = UrSimulator::new(settings);
+        let serving = ServedRobot::start(&simulator, "127.0.0.1:0", "127.0.0.1:0").await;
+        let address = serving.as_ref().unwrap().rtde().to_string();
+        match open(&address, FASTEST, &Measured::default()).await {
+            Err(RtdeError::Outputs { outputs, kinds, .. }) => {
+                assert_eq!(outputs, OUTPUTS);
+                assert_eq!(kinds, ["NOT_FOUND"; OUTPUTS.len()]);
+            }
+            other => panic!("{other:?}"),
+        }
+    }
+}
