@@ -1,7 +1,7 @@
 //! Sets the configured fields of another component.
 
 use plant_opcua::client::{Browse, OpcUaClient};
-use plant_opcua::types::{EUInformation, NodeId, Variant};
+use plant_opcua::types::{DataValue, EUInformation, NodeId, StatusCode, Variant};
 
 use super::{SkillHandle, called, lost};
 use crate::configuration::FieldChange;
@@ -31,7 +31,8 @@ pub enum SetFieldsFault {
 
 impl SkillHandle {
     /// Checks that fields of the component have these units: symbols, with the names of the fields.
-    /// Fields without a unit, and fields that the component does not show, have any unit.
+    /// Fields without a unit, and fields that the component does not show, have any unit. A unit
+    /// that cannot be read is an error.
     ///
     /// # Errors
     /// [`SetFieldsFault`].
@@ -48,20 +49,10 @@ impl SkillHandle {
             };
             let read = client.read(&[property]).await;
             let read = read.map_err(|error| lost(&error))?;
-            let Some(Some(Variant::ExtensionObject(shown))) = read.first().map(|one| &one.value)
-            else {
-                continue;
-            };
-            let Some(shown) = shown.inner_as::<EUInformation>() else {
-                continue;
-            };
-            let symbol = shown.display_name.text.as_ref();
-            if symbol != unit {
-                return Err(SetFieldsFault::Refused {
-                    field: field.clone(),
-                    reason: format!("expected the unit {symbol}, found {unit}"),
-                });
-            }
+            check_unit(unit, read.first()).map_err(|reason| SetFieldsFault::Refused {
+                field: field.clone(),
+                reason,
+            })?;
         }
         Ok(())
     }
@@ -106,6 +97,32 @@ impl SkillHandle {
     }
 }
 
+/// Checks that the value of a property EngineeringUnits is a unit, a symbol. Returns the reason if
+/// it is not, or cannot be read.
+fn check_unit(unit: &str, shown: Option<&DataValue>) -> Result<(), String> {
+    let value = shown.and_then(|shown| shown.value.as_ref());
+    let status = shown.map_or(StatusCode::BadNoData, DataValue::status);
+    let symbol = match value {
+        Some(Variant::ExtensionObject(value)) if !status.is_bad() => value
+            .inner_as::<EUInformation>()
+            .map(|shown| shown.display_name.text.as_ref()),
+        _ => None,
+    };
+    let Some(symbol) = symbol else {
+        let why = match status.is_bad() {
+            true => status.to_string(),
+            false => "no EUInformation".to_owned(),
+        };
+        return Err(format!(
+            "cannot read its unit ({why}), so the unit {unit} of the file cannot be checked"
+        ));
+    };
+    match symbol == unit {
+        true => Ok(()),
+        false => Err(format!("expected the unit {symbol}, found {unit}")),
+    }
+}
+
 async fn child(
     client: &OpcUaClient,
     node: &NodeId,
@@ -115,4 +132,43 @@ async fn child(
     let mut below = below.map_err(|error| lost(&error))?.into_iter();
     let found = below.find(|child| child.browse_name.name.as_ref() == name);
     Ok(found.map(|child| child.node_id.node_id))
+}
+
+#[cfg(test)]
+mod tests {
+    use plant_opcua::types::{Argument, ExtensionObject};
+
+    use super::*;
+
+    #[test]
+    fn a_unit_that_cannot_be_read_is_no_unit_that_fits() {
+        let newton = ExtensionObject::from_message(EUInformation {
+            display_name: "N".into(),
+            ..EUInformation::default()
+        });
+        let of = |value: Variant| DataValue::value_only(value);
+        let shown = of(newton.into());
+        let mut bad = shown.clone();
+        bad.status = Some(StatusCode::BadUserAccessDenied);
+        let mut uncertain = shown.clone();
+        uncertain.status = Some(StatusCode::UncertainLastUsableValue);
+        let unread = |why: &str| {
+            format!("cannot read its unit ({why}), so the unit kN of the file cannot be checked")
+        };
+        let other = ExtensionObject::from_message(Argument::default());
+        let differs = "expected the unit N, found kN".to_owned();
+        for (value, reason) in [
+            (Some(&shown), differs.clone()),
+            (Some(&uncertain), differs),
+            (Some(&bad), unread("BadUserAccessDenied")),
+            (Some(&of("N".into())), unread("no EUInformation")),
+            (Some(&of(other.into())), unread("no EUInformation")),
+            (Some(&DataValue::default()), unread("no EUInformation")),
+            (None, unread("BadNoData")),
+        ] {
+            assert_eq!(check_unit("kN", value), Err(reason));
+        }
+        assert_eq!(check_unit("N", Some(&shown)), Ok(()));
+        assert_eq!(check_unit("N", Some(&uncertain)), Ok(()));
+    }
 }
