@@ -143,7 +143,7 @@ impl PickAndPlace {
             };
             let (why, retreated) = match fault {
                 Fault::Stopped(why) => (why, Err(RetreatFault::Halted)),
-                Fault::RobotLost(why) => (why.clone(), Err(RetreatFault::RobotLost(why))),
+                Fault::RobotLost(why) => (why.clone(), Err(RetreatFault::Incomplete(why))),
                 Fault::Other(why) => (why, self.retreat(retreat, teller).await),
             };
             warn!("pick and place: {step}: {why}");
@@ -192,10 +192,11 @@ impl PickAndPlace {
         teller.step(step).await;
         let ran = run(&**skill, Some(to), self.within, teller, teller.stopped());
         ran.await.map_err(|fault| match fault {
-            Ran::Lost(why) | Ran::NotHalted(why) => RetreatFault::RobotLost(why),
-            Ran::Failed(why) => RetreatFault::Failed(why),
+            Ran::Lost(why) | Ran::NotHalted(why) | Ran::Failed(why) => {
+                RetreatFault::Incomplete(why)
+            }
             Ran::Interrupted((), Ok(())) => RetreatFault::Halted,
-            Ran::Interrupted((), Err(moving)) => RetreatFault::RobotLost(moving.to_string()),
+            Ran::Interrupted((), Err(moving)) => RetreatFault::Incomplete(moving.to_string()),
         })
     }
 }

@@ -148,12 +148,10 @@ pub enum RetreatFault {
     /// Halt was requested.
     #[error("it was halted, and stands still")]
     Halted,
-    /// The robot is lost or cannot be halted, or its movement is unknown.
+    /// The move of the retreat failed, or the robot is lost or cannot be halted. Its position is
+    /// unknown.
     #[error("{0}")]
-    RobotLost(String),
-    /// The move of the retreat failed.
-    #[error("{0}")]
-    Failed(String),
+    Incomplete(String),
 }
 
 /// The step before anything moves.
