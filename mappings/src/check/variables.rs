@@ -481,7 +481,7 @@ fn declared_type(text: &str, place: TextSpan, findings: &mut MappingFindings) ->
     declared
 }
 
-/// Returns a shared value: one for all variables with the default, which most have.
+/// Returns the value in an `Arc`. Variables with the default share one allocation.
 fn shared<T: PartialEq>(value: T, default: &LazyLock<Arc<T>>) -> Arc<T> {
     match value == ***default {
         true => Arc::clone(default),

@@ -351,8 +351,8 @@ impl ConnectedViewer {
     /// Adds a subscription.
     ///
     /// # Errors
-    /// The viewer subscribes to the channel already, as each subscription would get a copy of each
-    /// value, or has too many subscriptions.
+    /// [`NotSubscribed`]: a second subscription to the channel, which would double its values, or
+    /// too many subscriptions.
     fn subscribe(&self, id: u32, channel: u16) -> Result<(), NotSubscribed> {
         let mut queue = self.queue();
         if queue.subscriptions.values().any(|of| *of == channel) {
