@@ -187,11 +187,11 @@ fn is_lost_in_between(cell: &Cell, tower: &Tower, mut robot: Child, before: &[Va
         tries += 1;
         assert!(tries < 5, "{response}");
         both_are_known(tower);
-        let (code, again) = eventually("the robot is configured again", SOON * 2, || {
-            let again = ended(configure(tower, &product(cell, 20.0, 0.5), &[]));
-            (again.0 == 0).then_some(again)
+        let again = eventually("the robot is configured again", SOON * 2, || {
+            let (code, again) = ended(configure(tower, &product(cell, 20.0, 0.5), &[]));
+            (code == 0).then_some(again)
         });
-        assert_eq!(code, 0, "{again}");
+        assert_eq!(outcomes(&again), ["configured"; 2], "{again}");
     };
     let [gripper, robot_outcome] = outcomes(&lost)[..] else {
         panic!("{lost}");
