@@ -162,11 +162,24 @@ const YIELDING: [usize; 3] = [8, 2, 1];
 const SPARE: [usize; 1] = [4];
 
 pub(super) fn table(lines: &[&ListRow<'_>]) -> TextTable {
+    table_within(width(), lines)
+}
+
+/// Returns the table with whole types if it fits `limit`, or else with shorter forms of the types
+/// that are too long.
+fn table_within(limit: usize, lines: &[&ListRow<'_>]) -> TextTable {
+    let whole = table_of(lines, usize::MAX);
+    match whole.yielding_room(limit) {
+        None => whole,
+        Some(room) => table_of(lines, room),
+    }
+}
+
+/// Returns the table with shorter forms of the types that have more than `longest` characters.
+fn table_of(lines: &[&ListRow<'_>], longest: usize) -> TextTable {
     let mut table = TextTable::new(HEAD.map(str::to_owned))
         .yielding(YIELDING)
         .leaving_out(SPARE);
-    // The other columns take about 60 characters.
-    let most = width().saturating_sub(60);
     for line in lines {
         let dash = || "-".to_owned();
         let quality = line.quality().filter(|quality| quality != GOOD);
@@ -179,7 +192,7 @@ pub(super) fn table(lines: &[&ListRow<'_>]) -> TextTable {
             line.rate.map_or_else(dash, |rate| format!("{rate:.1}/s")),
             line.age.map_or_else(dash, age),
             quality.unwrap_or_else(dash),
-            line.type_within(most).unwrap_or_else(dash),
+            line.type_within(longest).unwrap_or_else(dash),
         ]);
     }
     table.without_empty_columns()
@@ -359,5 +372,68 @@ impl ListRow<'_> {
             }
         }
         text
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use uadp::BuiltinType;
+
+    use super::super::described::DescribedCall;
+    use super::*;
+
+    fn call(response: &[&str]) -> AnnouncedDescription {
+        let field = |name: &&str| AnnouncedField::plain(name, BuiltinType::Boolean, None);
+        AnnouncedDescription {
+            name: "Switch".to_owned(),
+            what: DescribedKind::Call(DescribedCall {
+                request: vec![field(&"on")],
+                response: response.iter().map(field).collect(),
+                targets: vec![1],
+                action: None,
+            }),
+            description: String::new(),
+            ros_topics: Vec::new(),
+            command: false,
+        }
+    }
+
+    /// Returns the table of calls in `limit` columns.
+    fn shown(limit: usize, calls: &[AnnouncedDescription]) -> String {
+        let rows: Vec<ListRow<'_>> = calls
+            .iter()
+            .map(|described| ListRow {
+                topic: TopicId::new(1, 2, 10).unwrap(),
+                described: Some(described),
+                heard: None,
+                is_call: true,
+                from: String::new(),
+                age: None,
+                rate: None,
+            })
+            .collect();
+        let rows: Vec<&ListRow<'_>> = rows.iter().collect();
+        let mut out = Vec::new();
+        let table = table_within(limit, &rows);
+        table.write_within(limit, &mut out, false).unwrap();
+        String::from_utf8(out).unwrap()
+    }
+
+    #[test]
+    fn a_signature_is_shortened_only_if_the_table_is_too_narrow_for_it() {
+        let whole = "(on: Boolean) -> (ok: Boolean)";
+        let short = call(&["ok"]);
+        // The other columns have 33 characters.
+        let of = |limit| shown(limit, std::slice::from_ref(&short));
+        for limit in [63, 80] {
+            assert!(of(limit).contains(whole), "{}", of(limit));
+        }
+        assert!(of(62).contains("(1 field) -> (1 field)"), "{}", of(62));
+        let both = shown(
+            80,
+            &[short.clone(), call(&["is_set", "is_running", "is_halted"])],
+        );
+        assert!(both.contains(whole), "{both}");
+        assert!(both.contains("(1 field) -> (3 fields)"), "{both}");
     }
 }

@@ -103,6 +103,17 @@ impl TextTable {
         widths.iter().sum::<usize>() + GAP * widths.len().saturating_sub(1)
     }
 
+    /// Returns `None` if the table fits `limit` and no cell is shortened. Otherwise returns the
+    /// width that the other columns leave to the first yielding column.
+    pub(super) fn yielding_room(&self, limit: usize) -> Option<usize> {
+        let table = self.fitted(limit);
+        let widths = table.natural_widths();
+        let all = widths.iter().sum::<usize>() + GAP * widths.len().saturating_sub(1);
+        let first = table.yielding.first().and_then(|at| widths.get(*at));
+        let others = all - first.copied().unwrap_or_default();
+        (all > limit).then(|| limit.saturating_sub(others))
+    }
+
     /// Returns the widths of the columns if no cell is shortened.
     fn natural_widths(&self) -> Vec<usize> {
         let mut widths: Vec<usize> = self.head.iter().map(|text| text.chars().count()).collect();
@@ -119,7 +130,12 @@ impl TextTable {
         self.write_within(width(), out, bold)
     }
 
-    fn write_within(&self, limit: usize, out: &mut impl Write, bold: bool) -> io::Result<()> {
+    pub(super) fn write_within(
+        &self,
+        limit: usize,
+        out: &mut impl Write,
+        bold: bool,
+    ) -> io::Result<()> {
         self.fitted(limit).write_columns(limit, out, bold)
     }
 
