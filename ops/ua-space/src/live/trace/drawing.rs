@@ -3,6 +3,7 @@
 use std::fmt::Write as _;
 
 use mappings::TopicId;
+use xml_text::xml_printable;
 
 use super::super::text::{harmless, micros};
 use super::{Delays, Topic, Window, in_micros};
@@ -35,7 +36,7 @@ pub(super) fn svg(delays: &Delays, name_of: &dyn Fn(TopicId) -> Option<String>) 
          </style>\n<title>Delays of topics, hop by hop</title>\n"
     );
     let mut text = |x: f64, y: f64, class: &str, anchor: &str, text: &str| {
-        let text = escaped(text);
+        let text = xml_printable(text);
         // Writing to a String cannot fail.
         let _written = writeln!(
             svg,
@@ -147,11 +148,6 @@ fn shown(delay: Option<f64>) -> String {
     delay.map_or_else(|| "-".to_owned(), micros)
 }
 
-fn escaped(text: &str) -> String {
-    let text = text.replace('&', "&amp;").replace('<', "&lt;");
-    text.replace('>', "&gt;").replace('"', "&quot;")
-}
-
 #[expect(clippy::cast_precision_loss, reason = "a small number of rows")]
 const fn count(number: usize) -> f64 {
     number as f64
@@ -186,7 +182,8 @@ mod tests {
             topic.network.record(network);
             delays.topics.insert(TopicId::new(1, 2, id).unwrap(), topic);
         }
-        let name = |topic: TopicId| (topic.identifier.get() == 11).then(|| "a<b".to_owned());
+        let name =
+            |topic: TopicId| (topic.identifier.get() == 11).then(|| "a<b\u{FFFE}".to_owned());
         let svg = svg(&delays, &name);
         assert!(svg.starts_with("<svg ") && svg.ends_with("</svg>\n"));
         let slow = svg.find(">a&lt;b<").unwrap();
