@@ -86,13 +86,18 @@ fn chosen<'m>(
     }
 }
 
-/// Returns the sentence with the names of pictures.
+/// Returns the sentence with the names and the IDs of pictures.
 fn names<'m>(pictures: impl IntoIterator<Item = &'m ModulePicture>) -> String {
-    let names = pictures.into_iter().take(SHOWN);
-    let names: Vec<String> = names.map(|one| harmless(&one.name)).collect();
-    match names.is_empty() {
-        true => "it has no pictures".to_owned(),
-        false => format!("its pictures are {}", names.join(", ")),
+    let mut pictures = pictures.into_iter();
+    let shown = pictures.by_ref().take(SHOWN);
+    let shown = shown.map(|one| format!("{} ({})", harmless(&one.name), harmless(&one.id)));
+    let shown: Vec<String> = shown.collect();
+    let shown = shown.join(", ");
+    match (shown.is_empty(), pictures.count()) {
+        (true, _) => "it has no pictures".to_owned(),
+        (false, 0) => format!("its pictures are {shown}"),
+        (false, 1) => format!("its pictures are {shown} and 1 other"),
+        (false, others) => format!("its pictures are {shown} and {others} others"),
     }
 }
 
@@ -268,19 +273,24 @@ fn pair(numbers: Option<[f64; 2]>, between: &str) -> String {
     })
 }
 
-/// Maximum number of names in a message.
+/// Maximum number of pictures in a message.
 const SHOWN: usize = 20;
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::manifest::column;
 
-    fn column() -> Module {
-        let file = concat!(
-            env!("CARGO_MANIFEST_DIR"),
-            "/../../tests/data/mtp/column.aml"
-        );
-        Module::read(&std::fs::read_to_string(file).unwrap()).unwrap()
+    #[test]
+    fn the_message_has_twenty_pictures_and_the_number_of_the_others() {
+        let picture = &column().pictures[0];
+        let of = |number: usize| names(std::iter::repeat_n(picture, number));
+        let twenty = of(20);
+        assert_eq!(twenty.matches("Overview (pic)").count(), 20);
+        assert!(twenty.ends_with(", Overview (pic)"), "{twenty}");
+        assert_eq!(of(21), format!("{twenty} and 1 other"));
+        assert_eq!(of(27), format!("{twenty} and 7 others"));
+        assert_eq!(of(0), "it has no pictures");
     }
 
     /// Returns the failure of drawing a picture into a folder that does not exist.
@@ -315,13 +325,20 @@ mod tests {
         module.pictures[1] = other;
         assert_eq!(
             failure(&module, None),
-            "choose the picture to draw by its name or its ID: its pictures are Overview, Other"
+            "choose the picture to draw by its name or its ID: its pictures are \
+             Overview (pic), Other (other)"
         );
         assert!(failure(&module, Some("other")).starts_with("cannot write"));
         assert_eq!(
             failure(&module, Some("Detail")),
-            "the manifest has no picture `Detail`; its pictures are Overview, Other"
+            "the manifest has no picture `Detail`; its pictures are Overview (pic), Other (other)"
         );
+        // A picture with objects only, or with connections only, is not empty.
+        module.pictures[1].connections.clear();
+        assert!(failure(&module, None).starts_with("choose"));
+        module.pictures[1].connections = module.pictures[0].connections.clone();
+        module.pictures[1].objects.clear();
+        assert!(failure(&module, None).starts_with("choose"));
         module.pictures.clear();
         assert_eq!(
             failure(&module, None),
