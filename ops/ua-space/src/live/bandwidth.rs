@@ -14,8 +14,8 @@ use crate::exit::CommandFailure;
 /// Runs `ua-space bw`.
 pub(crate) fn bandwidth(arguments: &Hz) -> Result<(), CommandFailure> {
     measured(arguments, |received| match Load::of(&received.newest) {
-        Some(load) => load.print(arguments.json).map(Some),
-        None => Ok(None),
+        Some(load) => load.print(arguments.json).map(|()| true),
+        None => Ok(false),
     })
 }
 

@@ -287,8 +287,8 @@ pub(crate) fn hz(arguments: &Hz) -> Result<(), CommandFailure> {
         let newest = received.newest.iter();
         let times: VecDeque<Duration> = newest.map(|(at, _)| *at).collect();
         match Rhythm::of(&times, received.all) {
-            Some(rhythm) => rhythm.print(arguments).map(Some),
-            None => Ok(None),
+            Some(rhythm) => rhythm.print(arguments).map(|()| true),
+            None => Ok(false),
         }
     })
 }

@@ -22,11 +22,11 @@ pub(super) struct ReceivedValues {
     pub(super) all: u64,
 }
 
-/// Listens to a topic. `print` prints figures about its values each second; it returns `None` if
-/// there are too few values.
+/// Listens to a topic. `print` prints figures about its values each second; it returns
+/// `false` if there are too few values to print.
 pub(super) fn measured(
     arguments: &Hz,
-    print: impl Fn(&ReceivedValues) -> Result<Option<()>, CommandFailure>,
+    print: impl Fn(&ReceivedValues) -> Result<bool, CommandFailure>,
 ) -> Result<(), CommandFailure> {
     in_group(&arguments.group, async |mut live| {
         let end = until(live.now(), arguments.seconds);
@@ -55,7 +55,7 @@ pub(super) fn measured(
             };
             let ended = live.listen(next, &mut each).await?;
             let last = ended == ListenEnd::Interrupted || live.now() >= end;
-            if print(&received)?.is_none() && !arguments.json && !last {
+            if !print(&received)? && !arguments.json && !last {
                 warn("no two values yet");
             }
             if last && received.all == 0 && ended == ListenEnd::Time {
