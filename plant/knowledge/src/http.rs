@@ -264,7 +264,7 @@ impl ServedSite {
             "/graphs" => Ok(json_page(
                 &json!({ "graphs": self.queries.knowledge().sources() }),
             )),
-            "/data" => self.data(&pairs),
+            "/data" => self.data(&pairs).await,
             "/report" => {
                 let accepted = accepted(&request);
                 let is_json = accepted.first().is_some_and(|media| media == JSON);
@@ -404,23 +404,18 @@ impl ServedSite {
         }
     }
 
-    fn data(&self, pairs: &[(String, String)]) -> Result<Response<Full<Bytes>>, HttpRefusal> {
-        let graph = pairs
-            .iter()
-            .find(|(key, _)| key == "graph")
-            .map(|(_, graph)| graph.as_str());
-        let mut quads = Vec::new();
-        match self.queries.knowledge().write_quads(graph, &mut quads) {
-            Ok(Some(())) => Ok(content("application/n-quads", quads)),
-            Ok(None) => Err(HttpRefusal::unknown(
-                "there is no such graph; /graphs has those there are".to_owned(),
-            )),
-            Err(error) => Err(HttpRefusal::new(
-                StatusCode::INTERNAL_SERVER_ERROR,
-                "failed",
-                &error.to_string(),
-            )),
-        }
+    /// Returns all graphs, or one of them.
+    async fn data(&self, pairs: &[(String, String)]) -> Result<Response<Full<Bytes>>, HttpRefusal> {
+        let graph = pairs.iter().find(|(key, _)| key == "graph");
+        let graph = graph.map(|(_, graph)| graph.clone());
+        let knowledge = Arc::clone(self.queries.knowledge());
+        let written = self.dumped("application/n-quads", move |to| {
+            knowledge.write_quads(graph.as_deref(), to)
+        });
+        written.await?.ok_or_else(|| {
+            let why = "there is no such graph; /graphs has those there are";
+            HttpRefusal::unknown(why.to_owned())
+        })
     }
 }
 
@@ -621,7 +616,11 @@ pub(crate) fn json_page(page: &serde_json::Value) -> Response<Full<Bytes>> {
 }
 
 pub(crate) fn content(media: &'static str, bytes: Vec<u8>) -> Response<Full<Bytes>> {
-    let mut response = Response::new(Full::new(bytes.into()));
+    content_of(media, bytes.into())
+}
+
+pub(crate) fn content_of(media: &'static str, bytes: Bytes) -> Response<Full<Bytes>> {
+    let mut response = Response::new(Full::new(bytes));
     response
         .headers_mut()
         .insert(CONTENT_TYPE, HeaderValue::from_static(media));

@@ -17,10 +17,11 @@ use oxigraph::sparql::{
 };
 use spargebra::SparqlParser;
 use thiserror::Error;
-use tokio::sync::oneshot;
+use tokio::sync::{AcquireError, OwnedSemaphorePermit, Semaphore, oneshot};
 use tokio::time::Instant;
 
 use crate::bounds;
+use crate::dump::DUMPS;
 use crate::lanes::{Lane, Lanes, Seat};
 use crate::question::{MOST_ROWS, NamedQuestion, QuestionAnswer};
 use crate::store::{Knowledge, KnowledgeFault};
@@ -39,9 +40,12 @@ pub struct QueryLimits {
     pub rows: usize,
     /// Maximum size of a result in bytes.
     pub bytes: usize,
+    /// Maximum size of the document of a graph or of all graphs in bytes.
+    pub dump: usize,
     /// Maximum size of a query in bytes.
     pub query: usize,
-    /// Maximum growth of the program in bytes while queries run, of all of them together.
+    /// Maximum growth of the program in bytes while queries run, of all of them together. The memory
+    /// of a query alone is not known: the growth has that of all other work, too.
     pub memory: u64,
 }
 
@@ -52,6 +56,7 @@ impl Default for QueryLimits {
             parallel: 4,
             rows: 100_000,
             bytes: 16 << 20,
+            dump: 64 << 20,
             query: 16 << 10,
             memory: 512 << 20,
         }
@@ -219,6 +224,8 @@ pub struct Queries {
     knowledge: Arc<Knowledge>,
     limits: QueryLimits,
     lanes: Arc<Lanes>,
+    /// The places of dumps.
+    dumps: Arc<Semaphore>,
 }
 
 impl Queries {
@@ -229,6 +236,7 @@ impl Queries {
             knowledge,
             limits,
             lanes: Lanes::new(limits.parallel),
+            dumps: Arc::new(Semaphore::new(DUMPS)),
         }
     }
 
@@ -238,6 +246,11 @@ impl Queries {
 
     pub(crate) fn knowledge(&self) -> &Arc<Knowledge> {
         &self.knowledge
+    }
+
+    /// Waits for a place of a dump.
+    pub(crate) async fn dump_place(&self) -> Result<OwnedSemaphorePermit, AcquireError> {
+        Arc::clone(&self.dumps).acquire_owned().await
     }
 
     /// Waits for a place of work that is no query.

@@ -429,22 +429,25 @@ impl Knowledge {
     /// Fails if the store or the writer fails.
     pub fn write_quads(&self, graph: Option<&str>, to: impl io::Write) -> io::Result<Option<()>> {
         let store = self.store();
-        let graph = match graph.map(NamedNodeRef::new) {
+        let graphs = match graph.map(NamedNode::new) {
             Some(Ok(graph))
                 if store
-                    .contains_named_graph(graph)
+                    .contains_named_graph(&graph)
                     .map_err(io::Error::other)? =>
             {
-                Some(GraphNameRef::from(graph))
+                vec![graph.into()]
             }
             Some(_) => return Ok(None),
-            None => None,
+            None => store
+                .named_graphs()
+                .collect::<Result<Vec<NamedOrBlankNode>, _>>()
+                .map_err(io::Error::other)?,
         };
         let mut to = RdfSerializer::from_format(RdfFormat::NQuads).for_writer(to);
-        for quad in store.quads_for_pattern(None, None, None, graph) {
-            let quad = quad.map_err(io::Error::other)?;
-            if !quad.graph_name.is_default_graph() {
-                to.serialize_quad(&quad)?;
+        for graph in &graphs {
+            let graph = GraphNameRef::from(graph.as_ref());
+            for quad in store.quads_for_pattern(None, None, None, Some(graph)) {
+                to.serialize_quad(&quad.map_err(io::Error::other)?)?;
             }
         }
         to.finish()?;
@@ -454,12 +457,13 @@ impl Knowledge {
     /// Writes the statements of a graph. Returns `None` if there is no such graph.
     ///
     /// # Errors
-    /// Fails if the store fails.
+    /// Fails if the store or the writer fails.
     pub(crate) fn write_triples(
         &self,
         graph: &str,
         format: RdfFormat,
-    ) -> io::Result<Option<Vec<u8>>> {
+        to: impl io::Write,
+    ) -> io::Result<Option<()>> {
         let graph = NamedNodeRef::new(graph).map_err(io::Error::other)?;
         let store = self.store();
         if !store
@@ -468,11 +472,12 @@ impl Knowledge {
         {
             return Ok(None);
         }
-        let mut to = RdfSerializer::from_format(format).for_writer(Vec::new());
+        let mut to = RdfSerializer::from_format(format).for_writer(to);
         for quad in store.quads_for_pattern(None, None, None, Some(graph.into())) {
             to.serialize_triple(&Triple::from(quad.map_err(io::Error::other)?))?;
         }
-        Ok(Some(to.finish()?))
+        to.finish()?;
+        Ok(Some(()))
     }
 
     /// Returns the current store. It may be replaced by a copy at the next change.

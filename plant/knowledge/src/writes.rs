@@ -17,7 +17,7 @@ use serde_json::json;
 use tokio::sync::Semaphore;
 use uri_text::unescaped;
 
-use crate::http::{HttpRefusal, ServedSite, UPLOAD_TIME, accepted, content, form, json_page};
+use crate::http::{HttpRefusal, ServedSite, UPLOAD_TIME, accepted, form, json_page};
 use crate::lanes::Lane;
 use crate::query::{LARGEST_UPDATE, QueryFault, QueryOrQuestion};
 use crate::source::{SourceKind, UNNAMED};
@@ -266,14 +266,12 @@ impl ServedSite {
                     .find_map(|media| RdfFormat::from_media_type(media))
                     .filter(|format| !format.supports_datasets())
                     .unwrap_or(RdfFormat::Turtle);
-                let written =
-                    tokio::task::spawn_blocking(move || knowledge.write_triples(&graph, format));
-                match written.await {
-                    Ok(Ok(Some(bytes))) => Ok(content(format.media_type(), bytes)),
-                    Ok(Ok(None)) => Err(HttpRefusal::unknown("there is no such graph".to_owned())),
-                    Ok(Err(error)) => Err(failed(&error)),
-                    Err(error) => Err(failed(&error)),
-                }
+                let written = self.dumped(format.media_type(), move |to| {
+                    knowledge.write_triples(&graph, format, to)
+                });
+                written
+                    .await?
+                    .ok_or_else(|| HttpRefusal::unknown("there is no such graph".to_owned()))
             }
             Method::PUT | Method::POST => {
                 let at = (self.may_write(&request).await?.now)();

@@ -79,8 +79,8 @@ impl JobRunner for Started {
     }
 }
 
-/// Returns handlers for the users anna, who writes, and otto, who runs jobs; `may` allows all.
-fn writes(may: bool) -> Writes {
+/// Returns handlers with two users: anna writes, otto runs jobs. `may` allows all.
+pub(super) fn writes(may: bool) -> Writes {
     Writes {
         now: || 9,
         may_read: Arc::new(|user| {
@@ -118,9 +118,9 @@ async fn site(may: bool) -> (HttpEndpoint, Arc<Knowledge>) {
 
 /// Secures nothing: the connections of a server with one name. It counts the refused passwords.
 #[derive(Default)]
-struct Clear {
-    wrong: AtomicUsize,
-    too_many: AtomicUsize,
+pub(super) struct Clear {
+    pub(super) wrong: AtomicUsize,
+    pub(super) too_many: AtomicUsize,
 }
 
 impl ConnectionSecurity for Clear {
@@ -244,7 +244,12 @@ async fn a_client_with_too_many_wrong_passwords_is_refused_before_the_check() {
 }
 
 /// Sends a request with headers and a body.
-async fn request(at: SocketAddr, line: &str, headers: &[(&str, &str)], body: &str) -> Answered {
+pub(super) async fn request(
+    at: SocketAddr,
+    line: &str,
+    headers: &[(&str, &str)],
+    body: &str,
+) -> Answered {
     let mut text = format!("{line} HTTP/1.1\r\nHost: {at}\r\nConnection: close\r\n");
     for (name, value) in headers {
         text.push_str(&format!("{name}: {value}\r\n"));
