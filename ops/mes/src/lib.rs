@@ -22,6 +22,7 @@
 
 mod cell;
 mod clock;
+mod compaction;
 mod execute;
 mod execution_skill;
 mod follow;
@@ -416,6 +417,8 @@ impl UaMes {
         drop(tokio::spawn(self.reload(ready)?));
         let sources = Arc::clone(ready.cell.sources());
         drop(tokio::spawn(sources::supply(sources)));
+        let knowledge = Arc::clone(&ready.knowledge);
+        drop(tokio::spawn(compaction::compact(knowledge)));
         let interface = self.interface();
         let only_loopback = self.arguments.0.flags.interface.is_none()
             || interface == discovery::MdnsInterface::LOOPBACK;

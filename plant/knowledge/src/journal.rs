@@ -384,7 +384,7 @@ mod tests {
     }
 
     fn add(knowledge: &Knowledge, subject: usize) {
-        let mut writer = knowledge.writer().unwrap();
+        let mut writer = knowledge.writer();
         let mut writing = writer.begin().unwrap();
         let change = GraphChange {
             added: vec![triple(subject)],
@@ -400,7 +400,7 @@ mod tests {
         {
             let (knowledge, _) = Knowledge::open(&folder).unwrap();
             add(&knowledge, 0);
-            let mut writer = knowledge.writer().unwrap();
+            let mut writer = knowledge.writer();
             let mut writing = writer.begin().unwrap();
             for (added, removed) in [(vec![triple(1)], vec![]), (vec![], vec![triple(1)])] {
                 writing

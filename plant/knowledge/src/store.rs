@@ -15,6 +15,7 @@ use oxigraph::store::{StorageError, Store};
 use serde::Serialize;
 use thiserror::Error;
 use tokio::sync::watch;
+use tracing::warn;
 
 use crate::journal::Journal;
 use crate::rules::apply::{Derived, StoreRules};
@@ -71,7 +72,8 @@ pub enum KnowledgeFault {
 /// The default graph contains each statement of any source once: the merge as defined by SPARQL,
 /// which counting requires.
 pub struct Knowledge {
-    /// The statements. They are copied into another store now and then, see [`StoreWriter`].
+    /// The current store. A copy without removed statements replaces it, see
+    /// [`Knowledge::compact`].
     store: RwLock<Store>,
     /// Serializes the writers.
     written: Mutex<WrittenSources>,
@@ -84,15 +86,15 @@ pub(crate) struct WrittenSources {
     pub(crate) sources: BTreeMap<KnowledgeSource, SourceStatus>,
     pub(crate) journal: Option<Journal>,
     pub(crate) rules: StoreRules,
-    /// Number of statements that were removed from the current store, which still has them.
+    /// Number of statements that were removed from the current store, or were added by a refused
+    /// change. The store still has them.
     pub(crate) removed: usize,
 }
 
 /// The only writer of the store.
 ///
-/// A store in memory keeps the statements that are removed from it, and their texts. If they are
-/// more than the other statements, the other statements are copied into a new store. Readers of
-/// the old store go on with it.
+/// A store in memory keeps the statements that are removed from it, and their texts, until
+/// [`Knowledge::compact`].
 pub(crate) struct StoreWriter<'k> {
     written: MutexGuard<'k, WrittenSources>,
     store: Store,
@@ -194,7 +196,7 @@ impl Knowledge {
             }
         };
         self.derive_anew(&mut written, rules)?;
-        drop(written);
+        // Still locked: a copy of the store compares the numbers of changes.
         self.changed.send_modify(|changes| *changes += 1);
         Ok(())
     }
@@ -299,7 +301,7 @@ impl Knowledge {
                 removed: Vec::new(),
                 added: triples.into_iter().collect(),
             };
-            let mut writer = self.writer()?;
+            let mut writer = self.writer();
             let mut writing = writer.begin()?;
             writing.change(source, change)?;
             writing.commit(at)?;
@@ -336,7 +338,7 @@ impl Knowledge {
     /// # Errors
     /// [`KnowledgeFault`]; then nothing has changed.
     pub fn remove(&self, source: &KnowledgeSource) -> Result<bool, KnowledgeFault> {
-        let mut writer = self.writer()?;
+        let mut writer = self.writer();
         let mut writing = writer.begin()?;
         if !writing.written.sources.contains_key(source) {
             return Ok(false);
@@ -361,36 +363,66 @@ impl Knowledge {
         self.written.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Returns the writer of the store.
-    ///
-    /// # Errors
-    /// [`KnowledgeFault::Store`].
-    pub(crate) fn writer(&self) -> Result<StoreWriter<'_>, KnowledgeFault> {
+    /// Returns the writer of the store. Copies the store first if it has far too many removed
+    /// statements, for a program that does not [compact](Self::compact) it.
+    pub(crate) fn writer(&self) -> StoreWriter<'_> {
         // The sources are locked first: a transaction waits for others without end.
         let mut written = self.written();
-        let kept = written.sources.values().map(|source| source.statements);
-        if written.removed > kept.sum::<usize>().max(MOST_REMOVED) {
-            self.copy_store()?;
-            written.removed = 0;
+        let most = written.kept().saturating_add(MOST_REMOVED);
+        if written.removed > most.saturating_mul(MOST_OF_KEPT) {
+            match copied(&self.store()) {
+                Ok(copy) => self.replace_store(&mut written, copy),
+                Err(error) => {
+                    warn!(%error, removed = written.removed, "cannot copy the store of statements");
+                }
+            }
         }
-        Ok(StoreWriter {
+        StoreWriter {
             written,
             store: self.store(),
             changed: &self.changed,
-        })
+        }
     }
 
-    /// Copies the statements into a new store, which has nothing of removed statements. The caller
-    /// has locked the sources.
-    fn copy_store(&self) -> Result<(), StorageError> {
-        let (old, new) = (self.store(), Store::new()?);
-        let mut transaction = new.start_transaction()?;
-        for quad in old.quads_for_pattern(None, None, None, None) {
-            transaction.insert(quad?.as_ref());
+    /// Frees the memory of removed statements, if they are more than the present ones: the present
+    /// statements are copied into a new store. Changes do not wait for a copy, unless the
+    /// statements change during each of the first copies. Takes seconds for a million statements.
+    /// Returns whether the memory was freed.
+    ///
+    /// # Errors
+    /// [`KnowledgeFault::Store`]; then the old store is used on.
+    pub fn compact(&self) -> Result<bool, KnowledgeFault> {
+        self.compact_with(&mut || ())
+    }
+
+    /// Calls `copied_once` after each copy that changes do not wait for.
+    fn compact_with(&self, copied_once: &mut dyn FnMut()) -> Result<bool, KnowledgeFault> {
+        for _ in 0..COPIES {
+            let (before, store) = {
+                let written = self.written();
+                if written.removed <= written.kept().max(MOST_REMOVED) {
+                    return Ok(false);
+                }
+                (*self.changed.borrow(), self.store())
+            };
+            let copy = copied(&store)?;
+            copied_once();
+            let mut written = self.written();
+            if *self.changed.borrow() == before {
+                self.replace_store(&mut written, copy);
+                return Ok(true);
+            }
         }
-        transaction.commit()?;
-        *self.store.write().unwrap_or_else(PoisonError::into_inner) = new;
-        Ok(())
+        let mut written = self.written();
+        let copy = copied(&self.store())?;
+        self.replace_store(&mut written, copy);
+        Ok(true)
+    }
+
+    /// Replaces the store by its copy, while no change is made.
+    fn replace_store(&self, written: &mut WrittenSources, copy: Store) {
+        *self.store.write().unwrap_or_else(PoisonError::into_inner) = copy;
+        written.removed = 0;
     }
 
     /// Returns the IRI of a type by its namespace and BrowseName, if a source has it.
@@ -480,7 +512,7 @@ impl Knowledge {
         Ok(Some(()))
     }
 
-    /// Returns the current store. It may be replaced by a copy at the next change.
+    /// Returns the current store. A copy may replace it at any time.
     pub(crate) fn store(&self) -> Store {
         let store = self.store.read().unwrap_or_else(PoisonError::into_inner);
         store.clone()
@@ -497,7 +529,7 @@ impl Knowledge {
                 most: MAX_STATEMENTS,
             });
         }
-        let mut writer = self.writer()?;
+        let mut writer = self.writer();
         let mut writing = writer.begin()?;
         writing.lasting = lasting;
         writing.replace(source, triples)?;
@@ -505,7 +537,23 @@ impl Knowledge {
     }
 }
 
+/// Copies the statements into a new store, which has nothing of removed statements.
+fn copied(store: &Store) -> Result<Store, StorageError> {
+    let new = Store::new()?;
+    let mut transaction = new.start_transaction()?;
+    for quad in store.quads_for_pattern(None, None, None, None) {
+        transaction.insert(quad?.as_ref());
+    }
+    transaction.commit()?;
+    Ok(new)
+}
+
 impl WrittenSources {
+    /// Returns the number of present statements.
+    fn kept(&self) -> usize {
+        self.sources.values().map(|source| source.statements).sum()
+    }
+
     /// Updates the rules and the status of the derived statements.
     pub(crate) fn derived(&mut self, change: Derived) {
         let derived = KnowledgeSource::new(SourceKind::Derived, "");
@@ -600,77 +648,11 @@ pub(crate) const MAX_STATEMENTS: usize = 2_000_000;
 pub(crate) const MAX_SOURCES: usize = 2000;
 /// Number of removed statements that a store keeps in any case: copies are for large numbers.
 const MOST_REMOVED: usize = 4096;
+/// A change copies the store if the removed statements exceed this multiple of the present ones and
+/// [`MOST_REMOVED`].
+const MOST_OF_KEPT: usize = 4;
+/// Number of copies after which changes wait for the next one.
+const COPIES: usize = 3;
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn literals_that_are_not_canonical_stay_when_their_source_is_replaced() {
-        let knowledge = Knowledge::new().unwrap();
-        let source = KnowledgeSource::new(SourceKind::File, "times.ttl");
-        let literals = [
-            r#""2026-11-27T10:00:00.120Z"^^xsd:dateTime"#,
-            r#""2026-11-27T10:00:01.000Z"^^xsd:dateTime"#,
-            r#""007"^^xsd:integer"#,
-            r#""1.50"^^xsd:decimal"#,
-            r#""1e0"^^xsd:double"#,
-            r#""1"^^xsd:boolean"#,
-            r#""P0Y14M"^^xsd:duration"#,
-        ];
-        let mut turtle = "@prefix xsd: <http://www.w3.org/2001/XMLSchema#> .\n".to_owned();
-        for (at, literal) in (1..).zip(literals) {
-            let line = format!("<urn:example:{at}> <urn:example:is> {literal} .\n");
-            turtle.push_str(&line);
-            // Each version repeats the statements of the version before.
-            knowledge.replace_turtle(&source, &turtle, 0).unwrap();
-            let own = named(&source.graph()).unwrap();
-            for graph in [own.as_ref().into(), GraphNameRef::DefaultGraph] {
-                let found = knowledge
-                    .store()
-                    .quads_for_pattern(None, None, None, Some(graph))
-                    .count();
-                assert_eq!(found, at, "{literal}");
-            }
-        }
-        // A statement that is no longer in the file is removed, for any form of its literal.
-        knowledge
-            .replace_turtle(&source, "<urn:a> <urn:b> <urn:c> .", 0)
-            .unwrap();
-        assert_eq!(knowledge.store().len().unwrap(), 2);
-    }
-
-    #[test]
-    fn removed_statements_do_not_pile_up_in_the_store() {
-        let knowledge = Knowledge::new().unwrap();
-        let stays = KnowledgeSource::new(SourceKind::File, "stays.ttl");
-        let turtle = |run: usize| -> String {
-            let all = 0..100;
-            all.map(|at| format!("<urn:run:{run}> <urn:b> <urn:{run}:{at}> .\n"))
-                .collect()
-        };
-        knowledge.replace_turtle(&stays, &turtle(0), 0).unwrap();
-        let first = knowledge.store();
-        let runs = 3 * MOST_REMOVED / 100;
-        let mut copies = 0;
-        for run in 1..=runs {
-            let before = knowledge.written().removed;
-            let source = KnowledgeSource::new(SourceKind::Run, &run.to_string());
-            knowledge.replace_turtle(&source, &turtle(run), 0).unwrap();
-            assert!(knowledge.remove(&source).unwrap());
-            let removed = knowledge.written().removed;
-            copies += usize::from(removed < before);
-            assert!(removed <= MOST_REMOVED + 200, "{removed}");
-        }
-        assert_eq!(copies, 2);
-        // The statements are in another store, of which readers of the first see nothing.
-        let kept = knowledge.store();
-        assert_eq!(kept.len().unwrap(), 200);
-        let more = KnowledgeSource::new(SourceKind::File, "more.ttl");
-        knowledge.replace_turtle(&more, &turtle(1), 0).unwrap();
-        assert_eq!(kept.len().unwrap(), 400);
-        assert_eq!(first.len().unwrap(), 200);
-        let names: Vec<String> = knowledge.sources().into_iter().map(|of| of.name).collect();
-        assert!(names.contains(&stays.name), "{names:?}");
-    }
-}
+mod tests;

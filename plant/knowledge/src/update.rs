@@ -69,7 +69,7 @@ impl Knowledge {
         token: &CancellationToken,
         at: u64,
     ) -> Result<Updated, QueryFault> {
-        let mut writer = self.writer()?;
+        let mut writer = self.writer();
         let mut running = Running {
             writing: writer.begin()?,
             token,

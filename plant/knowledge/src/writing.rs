@@ -38,6 +38,9 @@ pub(crate) struct StoreChange<'a> {
     removed: BTreeSet<KnowledgeSource>,
     /// Number of removed statements.
     removed_statements: usize,
+    /// Number of added statements. The store keeps them if the change is undone, so that they count
+    /// as removed until the commit.
+    added_statements: usize,
     pub(crate) lasting: SourceLifetime,
 }
 
@@ -58,6 +61,7 @@ impl<'a> StoreChange<'a> {
             whole: BTreeMap::new(),
             removed: BTreeSet::new(),
             removed_statements: 0,
+            added_statements: 0,
             lasting: SourceLifetime::Yes,
         }
     }
@@ -134,6 +138,8 @@ impl<'a> StoreChange<'a> {
         for triple in &change.added {
             if stored(&self.transaction, &graph, triple)?.is_none() {
                 self.transaction.insert(triple.as_ref().in_graph(&graph));
+                self.added_statements += 1;
+                self.written.removed += 1;
                 effective
                     .added
                     .extend(stored(&self.transaction, &graph, triple)?);
@@ -204,6 +210,8 @@ impl<'a> StoreChange<'a> {
         };
         derive(&mut self.transaction, &derived)?;
         self.removed_statements += derived.removed.len();
+        self.added_statements += derived.added.len();
+        self.written.removed += derived.added.len();
         let written = &mut *self.written;
         if let Some(journal) = &mut written.journal {
             let known = &written.sources;
@@ -235,7 +243,8 @@ impl<'a> StoreChange<'a> {
             written.sources.remove(source);
         }
         written.sources.extend(statuses);
-        written.removed += self.removed_statements;
+        let undone = written.removed.saturating_sub(self.added_statements);
+        written.removed = undone.saturating_add(self.removed_statements);
         written.derived(derived);
         self.changed.send_modify(|changes| *changes += 1);
         Ok(())
