@@ -85,8 +85,8 @@ impl HttpEndpoint {
         Self::listen(address, site).await
     }
 
-    /// Listens at any address for clients with secured connections, who are users: each request has
-    /// the name and the password of a user (HTTP Basic).
+    /// Listens at any address for secured connections. Each request carries the name and password of
+    /// a user (HTTP Basic).
     ///
     /// # Errors
     /// Fails if the address is in use.
@@ -155,7 +155,7 @@ async fn accept(listener: TcpListener, site: ServedSite) {
         let site = site.clone();
         tokio::spawn(async move {
             let _place = place;
-            for_its_time(serve(stream, peer.ip(), site)).await;
+            serve(stream, peer.ip(), site).await;
         });
     }
 }
@@ -182,17 +182,8 @@ async fn accept_remote(listener: TcpListener, site: ServedSite, remote: RemoteAc
             ..site.clone()
         };
         let security = Arc::clone(&access.security);
-        let served = secured(stream, peer.ip(), (site, security));
-        let task = tokio::spawn(for_its_time(served));
+        let task = tokio::spawn(secured(stream, peer.ip(), (site, security)));
         open.add(peer.ip(), &access, task.abort_handle());
-    }
-}
-
-/// Ends a connection for its age.
-async fn for_its_time(served: impl Future<Output = ()>) {
-    let in_time = tokio::time::timeout(CONNECTION_TIME, served).await;
-    if in_time.is_err() {
-        debug!("a connection for questions was closed for its age");
     }
 }
 
@@ -209,6 +200,8 @@ async fn secured(
     }
 }
 
+/// Serves a connection. At the age of [`CONNECTION_TIME`] its last request is the one that is being
+/// answered, which has [`LAST_REQUEST`].
 async fn serve<S>(stream: S, peer: IpAddr, site: ServedSite)
 where
     S: AsyncRead + AsyncWrite + Send + Unpin,
@@ -223,13 +216,21 @@ where
             )
         }
     });
-    let served = hyper::server::conn::http1::Builder::new()
+    let connection = hyper::server::conn::http1::Builder::new()
         .timer(TokioTimer::new())
         .header_read_timeout(HEADER_TIME)
-        .serve_connection(TokioIo::new(stream), service)
-        .await;
-    if let Err(error) = served {
-        debug!(%error, "a connection for questions broke off");
+        .max_buf_size(LARGEST_BUFFER)
+        .serve_connection(TokioIo::new(stream), service);
+    tokio::pin!(connection);
+    let mut served = tokio::time::timeout(CONNECTION_TIME, connection.as_mut()).await;
+    if served.is_err() {
+        connection.as_mut().graceful_shutdown();
+        served = tokio::time::timeout(LAST_REQUEST, connection).await;
+    }
+    match served {
+        Ok(Ok(())) => {}
+        Ok(Err(error)) => debug!(%error, "a connection for questions broke off"),
+        Err(_) => debug!("a connection for questions was closed for its age"),
     }
 }
 
@@ -639,5 +640,10 @@ const HEADER_TIME: Duration = Duration::from_secs(5);
 const BODY_TIME: Duration = Duration::from_secs(5);
 /// Time for the body of a change.
 pub(crate) const UPLOAD_TIME: Duration = Duration::from_secs(45);
-/// Exceeds the time limit of any query.
+/// Age at which a connection takes no further requests.
 const CONNECTION_TIME: Duration = Duration::from_secs(60);
+/// Time limit of the last request of a connection: its upload, the wait for a place, and the reading
+/// of a source.
+const LAST_REQUEST: Duration = Duration::from_secs(90);
+/// Largest head of a request, in bytes.
+const LARGEST_BUFFER: usize = 64 << 10;

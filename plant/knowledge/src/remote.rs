@@ -1,5 +1,6 @@
 //! Clients of other hosts: their connections are secured, and each of them is a user.
 
+use std::collections::BTreeMap;
 use std::io;
 use std::net::IpAddr;
 use std::pin::Pin;
@@ -16,7 +17,7 @@ use tracing::debug;
 use uri_text::{is_loopback_host, without_port};
 
 use crate::http::{HttpRefusal, ServedSite};
-use crate::sign_ins::{LOCKED_FOR, WrongPasswords, network};
+use crate::sign_ins::{LOCKED_FOR, PasswordCheck, WrongPasswords, network};
 use crate::writes::{May, basic_user};
 
 /// A secured connection, such as a TLS stream.
@@ -53,7 +54,7 @@ pub trait ConnectionSecurity: Send + Sync {
 #[derive(Clone)]
 pub(crate) struct RemoteAccess {
     pub(crate) security: Arc<dyn ConnectionSecurity>,
-    /// The first user of the connection, as its requests have it.
+    /// The Authorization header of the first user that signed in on this connection.
     signed_in: Arc<OnceLock<HeaderValue>>,
     /// The wrong passwords of all clients.
     wrong: Arc<Mutex<WrongPasswords>>,
@@ -73,6 +74,29 @@ impl RemoteAccess {
         Self {
             signed_in: Arc::default(),
             ..self.clone()
+        }
+    }
+
+    /// Returns the number of an attempt to sign in.
+    ///
+    /// # Errors
+    /// The client has sent too many wrong passwords, or passwords that are being checked.
+    fn attempt(&self, client: IpAddr) -> Result<u64, HttpRefusal> {
+        let decided = self.wrong().begin(client, Instant::now());
+        match decided {
+            PasswordCheck::Check(number) => Ok(number),
+            PasswordCheck::Busy => {
+                let why = "other passwords of this client are being checked; ask again";
+                let status = StatusCode::SERVICE_UNAVAILABLE;
+                Err(HttpRefusal::new(status, "busy", why))
+            }
+            PasswordCheck::Locked => {
+                self.security.refused(client, PasswordRefusal::TooMany);
+                let seconds = LOCKED_FOR.as_secs();
+                let why = format!("too many wrong passwords: try again in {seconds} s");
+                let status = StatusCode::TOO_MANY_REQUESTS;
+                Err(HttpRefusal::new(status, "passwords", &why))
+            }
         }
     }
 
@@ -119,21 +143,13 @@ impl ServedSite {
         };
         let user = basic_user(request).ok_or_else(refused)?;
         let writes = self.writes.as_ref().ok_or_else(refused)?;
-        if !remote.wrong().may_try(client, Instant::now()) {
-            remote.security.refused(client, PasswordRefusal::TooMany);
-            let seconds = LOCKED_FOR.as_secs();
-            let why = format!("too many wrong passwords: try again in {seconds} s");
-            return Err(HttpRefusal::new(
-                StatusCode::TOO_MANY_REQUESTS,
-                "passwords",
-                &why,
-            ));
-        }
-        if !(writes.may_read)(Some(user)).await {
+        let attempt = remote.attempt(client)?;
+        let is_right = (writes.may_read)(Some(user)).await;
+        remote.wrong().end(attempt, is_right);
+        if !is_right {
             remote.security.refused(client, PasswordRefusal::Wrong);
             return Err(refused());
         }
-        remote.wrong().succeed(client);
         if let Some(given) = given {
             // Another user of the same connection is checked for each request.
             let _first = remote.signed_in.set(given.clone());
@@ -170,8 +186,8 @@ impl ServedSite {
     }
 }
 
-/// The open connections of clients of other hosts, oldest first. At a limit the oldest connection
-/// without a user gives way, so that clients without a password keep no user away.
+/// The open connections of clients of other hosts, oldest first. At a limit a connection without a
+/// user gives way, so that clients without a password keep no user away.
 #[derive(Debug, Default)]
 pub(crate) struct RemoteConnections(Vec<RemoteConnection>);
 
@@ -182,8 +198,17 @@ struct RemoteConnection {
     task: AbortHandle,
 }
 
+impl RemoteConnection {
+    /// Returns whether no user has signed in on the connection.
+    fn is_of_stranger(&self) -> bool {
+        self.signed_in.get().is_none()
+    }
+}
+
 impl RemoteConnections {
-    /// Returns whether there is a place for a new connection of a client.
+    /// Makes room for a connection of a client. At the limit of the client or its network, closes
+    /// its oldest connection without a user; at the limit of all connections, the oldest of the
+    /// network that has most connections without a user. Returns false if all have users.
     pub(crate) fn make_room(&mut self, client: IpAddr) -> bool {
         let client = network(client);
         self.0.retain(|open| !open.task.is_finished());
@@ -192,10 +217,19 @@ impl RemoteConnections {
         if !has_share && self.0.len() < MOST_CONNECTIONS {
             return true;
         }
-        let gives_way = |open: &RemoteConnection| {
-            open.signed_in.get().is_none() && (!has_share || open.client == client)
-        };
-        let Some(oldest) = self.0.iter().position(gives_way) else {
+        let mut of_strangers: BTreeMap<IpAddr, usize> = BTreeMap::new();
+        for open in self.0.iter().filter(|open| open.is_of_stranger()) {
+            *of_strangers.entry(open.client).or_default() += 1;
+        }
+        let share = |open: &RemoteConnection| of_strangers.get(&open.client).copied();
+        let mut most = None;
+        for (at, open) in self.0.iter().enumerate() {
+            let may_close = open.is_of_stranger() && (!has_share || open.client == client);
+            if may_close && most.is_none_or(|(_, most)| share(open) > most) {
+                most = Some((at, share(open)));
+            }
+        }
+        let Some((oldest, _)) = most else {
             return false;
         };
         let open = self.0.remove(oldest);
@@ -246,22 +280,39 @@ mod tests {
         fn refused(&self, _client: IpAddr, _refusal: PasswordRefusal) {}
     }
 
+    /// Adds a connection, if there is room for it.
+    fn add_to(
+        open: &mut RemoteConnections,
+        all: &RemoteAccess,
+        client: &str,
+        is_signed_in: bool,
+    ) -> Option<JoinHandle<()>> {
+        let client = client.parse().unwrap();
+        open.make_room(client).then(|| {
+            let access = all.of_connection();
+            if is_signed_in {
+                let header = HeaderValue::from_static("Basic x");
+                access.signed_in.set(header).unwrap();
+            }
+            let task = tokio::spawn(pending::<()>());
+            open.add(client, &access, task.abort_handle());
+            task
+        })
+    }
+
+    /// Lets all tasks of connections run, so that closed ones end.
+    async fn all_run() {
+        for _ in 0..2 * MOST_CONNECTIONS {
+            tokio::task::yield_now().await;
+        }
+    }
+
     #[tokio::test]
     async fn a_connection_without_a_user_gives_way_and_one_of_a_user_stays() {
         let all = RemoteAccess::new(Arc::new(NoSecurity));
         let mut open = RemoteConnections::default();
         let mut add = |client: &str, is_signed_in: bool| -> Option<JoinHandle<()>> {
-            let client = client.parse().unwrap();
-            open.make_room(client).then(|| {
-                let access = all.of_connection();
-                if is_signed_in {
-                    let header = HeaderValue::from_static("Basic x");
-                    access.signed_in.set(header).unwrap();
-                }
-                let task = tokio::spawn(pending::<()>());
-                open.add(client, &access, task.abort_handle());
-                task
-            })
+            add_to(&mut open, &all, client, is_signed_in)
         };
         // The first of a client is a user's.
         let user = add("192.0.2.7", true).unwrap();
@@ -283,5 +334,54 @@ mod tests {
         assert!(add("192.0.2.8", false).is_some());
         tokio::task::yield_now().await;
         assert!(!user.is_finished() && !other.is_finished());
+    }
+
+    #[tokio::test]
+    async fn the_network_with_most_connections_without_a_user_gives_way() {
+        let all = RemoteAccess::new(Arc::new(NoSecurity));
+        let mut open = RemoteConnections::default();
+        let mut add = |client: &str, is_signed_in: bool| -> Option<JoinHandle<()>> {
+            add_to(&mut open, &all, client, is_signed_in)
+        };
+        // A client in its handshake, a network of users, and three networks of strangers.
+        let honest = add("192.0.2.1", false).unwrap();
+        let of_users: Vec<_> = (0..MOST_OF_CLIENT)
+            .map(|_| add("192.0.2.2", true).unwrap())
+            .collect();
+        let mut strangers = Vec::new();
+        for (client, number) in [
+            ("2001:db8:0:1::1", MOST_OF_CLIENT - 1),
+            ("192.0.2.3", MOST_OF_CLIENT),
+            ("192.0.2.4", MOST_OF_CLIENT),
+        ] {
+            strangers.extend((0..number).map(|_| add(client, false).unwrap()));
+        }
+        assert_eq!(1 + of_users.len() + strangers.len(), MOST_CONNECTIONS);
+        all_run().await;
+        assert!(!strangers.iter().any(JoinHandle::is_finished));
+        // Of the networks with most connections, the oldest connections are closed in turn.
+        let first = MOST_OF_CLIENT - 1;
+        for closed in [first, first + MOST_OF_CLIENT, 0, first + 1] {
+            assert!(add("192.0.2.5", true).is_some());
+            all_run().await;
+            assert!(strangers[closed].is_finished(), "{closed}");
+        }
+        let ended = strangers.iter().filter(|task| task.is_finished()).count();
+        assert_eq!(ended, 4);
+        assert!(!honest.is_finished());
+        assert!(!of_users.iter().any(JoinHandle::is_finished));
+    }
+
+    #[tokio::test]
+    async fn a_connection_is_refused_if_all_have_users() {
+        let all = RemoteAccess::new(Arc::new(NoSecurity));
+        let mut open = RemoteConnections::default();
+        let mut add = |client: &str| add_to(&mut open, &all, client, true);
+        for client in ["192.0.2.1", "192.0.2.2", "192.0.2.3", "192.0.2.4"] {
+            for _ in 0..MOST_CONNECTIONS / 4 {
+                assert!(add(client).is_some(), "{client}");
+            }
+        }
+        assert!(add("192.0.2.5").is_none());
     }
 }

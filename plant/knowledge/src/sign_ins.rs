@@ -8,39 +8,89 @@ use std::time::Duration;
 
 use tokio::time::Instant;
 
-/// The wrong passwords of the last minute, with the networks of their clients, oldest first.
+/// The wrong passwords of the last minute, and the passwords that are being checked, oldest first.
 #[derive(Debug, Default)]
-pub(crate) struct WrongPasswords(VecDeque<(Instant, IpAddr)>);
+pub(crate) struct WrongPasswords {
+    attempts: VecDeque<PasswordAttempt>,
+    next: u64,
+}
+
+#[derive(Debug)]
+struct PasswordAttempt {
+    number: u64,
+    at: Instant,
+    client: IpAddr,
+    /// Whether the password was wrong. Otherwise it is being checked, or its request was dropped.
+    is_wrong: bool,
+}
+
+/// The decision about the check of a password.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum PasswordCheck {
+    /// The password may be checked, by the number of the attempt.
+    Check(u64),
+    /// Other passwords of the client or its network are being checked, and all of them may be wrong.
+    Busy,
+    /// The client or its network has sent too many wrong passwords.
+    Locked,
+}
 
 impl WrongPasswords {
-    /// Counts an attempt as wrong until [`Self::succeed`], so that attempts at the same time are
-    /// limited, too. Returns whether the password may be checked.
-    pub(crate) fn may_try(&mut self, client: IpAddr, now: Instant) -> bool {
-        let client = network(client);
-        self.0
-            .retain(|(at, _)| now.saturating_duration_since(*at) < LOCKED_FOR);
-        let of_client = self.0.iter().filter(|(_, other)| *other == client);
-        if of_client.count() >= MOST_OF_CLIENT {
-            return false;
+    /// Begins an attempt, which lasts until [`Self::end`], at most for [`LOCKED_FOR`]. Attempts at the
+    /// same time are limited as if all of them were wrong.
+    pub(crate) fn begin(&mut self, client: IpAddr, now: Instant) -> PasswordCheck {
+        let client = client.to_canonical();
+        self.attempts
+            .retain(|attempt| now.saturating_duration_since(attempt.at) < LOCKED_FOR);
+        let of_client = |attempt: &PasswordAttempt| attempt.client == client;
+        let is_v6 = client.is_ipv6();
+        let of_network =
+            |attempt: &PasswordAttempt| is_v6 && network(attempt.client) == network(client);
+        let count = |is_counted: &dyn Fn(&PasswordAttempt) -> bool| {
+            let counted = self.attempts.iter().filter(|attempt| is_counted(attempt));
+            counted.count()
+        };
+        if count(&|attempt| attempt.is_wrong && of_client(attempt)) >= MOST_OF_CLIENT
+            || count(&|attempt| attempt.is_wrong && of_network(attempt)) >= MOST_OF_NETWORK
+        {
+            return PasswordCheck::Locked;
         }
-        if self.0.len() >= MOST {
-            self.0.pop_front();
+        if count(&of_client) >= MOST_OF_CLIENT || count(&of_network) >= MOST_OF_NETWORK {
+            return PasswordCheck::Busy;
         }
-        self.0.push_back((now, client));
-        true
+        if self.attempts.len() >= MOST {
+            self.attempts.pop_front();
+        }
+        let number = self.next;
+        self.next = self.next.wrapping_add(1);
+        self.attempts.push_back(PasswordAttempt {
+            number,
+            at: now,
+            client,
+            is_wrong: false,
+        });
+        PasswordCheck::Check(number)
     }
 
-    /// Forgets the newest attempt of a client, which was right.
-    pub(crate) fn succeed(&mut self, client: IpAddr) {
-        let client = network(client);
-        let newest = self.0.iter().rposition(|(_, other)| *other == client);
-        if let Some(newest) = newest {
-            self.0.remove(newest);
+    /// Ends an attempt, which counts if the password was wrong.
+    pub(crate) fn end(&mut self, number: u64, is_right: bool) {
+        let attempt = self
+            .attempts
+            .iter()
+            .rposition(|other| other.number == number);
+        let Some(attempt) = attempt else {
+            return;
+        };
+        if is_right {
+            self.attempts.remove(attempt);
+        } else if let Some(attempt) = self.attempts.get_mut(attempt) {
+            attempt.is_wrong = true;
         }
     }
 }
 
-/// Returns the address of a client, or its /64 network in IPv6, whose addresses one host may have.
+/// Returns the address of a client; of an IPv6 address its /64 network, since one host may use all
+/// addresses of it.
 pub(crate) fn network(client: IpAddr) -> IpAddr {
     match client.to_canonical() {
         IpAddr::V6(address) => {
@@ -53,46 +103,118 @@ pub(crate) fn network(client: IpAddr) -> IpAddr {
 
 /// Time for which a wrong password counts.
 pub(crate) const LOCKED_FOR: Duration = Duration::from_secs(60);
-/// Maximum number of wrong passwords of a client in that time.
+/// Maximum number of wrong passwords of an address in that time.
 const MOST_OF_CLIENT: usize = 20;
-/// Maximum number of wrong passwords that are known. The oldest gives way.
+/// Maximum number of wrong passwords of an IPv6 network in that time.
+const MOST_OF_NETWORK: usize = 200;
+/// Maximum number of attempts that are known. The oldest gives way.
 const MOST: usize = 10_000;
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
+    fn address(text: &str) -> IpAddr {
+        text.parse().unwrap()
+    }
+
+    /// Tries a password. Returns whether it was checked.
+    fn try_one(wrong: &mut WrongPasswords, client: IpAddr, now: Instant, is_right: bool) -> bool {
+        match wrong.begin(client, now) {
+            PasswordCheck::Check(number) => {
+                wrong.end(number, is_right);
+                true
+            }
+            PasswordCheck::Locked => false,
+            PasswordCheck::Busy => panic!("{client} has another attempt"),
+        }
+    }
+
     #[test]
     fn a_client_is_locked_for_a_minute_after_wrong_passwords_and_others_are_not() {
         let mut wrong = WrongPasswords::default();
         let start = Instant::now();
         let at = |seconds: u64| start + Duration::from_secs(seconds);
-        let client = |text: &str| text.parse::<IpAddr>().unwrap();
-        let bad = client("192.0.2.7");
+        let bad = address("192.0.2.7");
         for _ in 0..MOST_OF_CLIENT {
-            assert!(wrong.may_try(bad, at(0)));
+            assert!(try_one(&mut wrong, bad, at(0), false));
         }
-        assert!(!wrong.may_try(bad, at(59)));
-        assert!(!wrong.may_try(client("::ffff:192.0.2.7"), at(59)));
-        assert!(wrong.may_try(client("192.0.2.8"), at(59)));
-        assert!(wrong.may_try(bad, at(60)));
+        assert!(!try_one(&mut wrong, bad, at(59), true));
+        let mapped = address("::ffff:192.0.2.7");
+        assert!(!try_one(&mut wrong, mapped, at(59), true));
+        assert!(try_one(&mut wrong, address("192.0.2.8"), at(59), false));
+        assert!(try_one(&mut wrong, bad, at(60), false));
         // A right password does not count.
-        for _ in 0..MOST_OF_CLIENT {
-            assert!(wrong.may_try(client("192.0.2.9"), at(61)));
-            wrong.succeed(client("192.0.2.9"));
+        for _ in 0..=MOST_OF_CLIENT {
+            assert!(try_one(&mut wrong, address("192.0.2.9"), at(61), true));
         }
-        assert!(wrong.may_try(client("192.0.2.9"), at(61)));
     }
 
     #[test]
-    fn addresses_of_one_network_share_their_attempts() {
+    fn attempts_at_the_same_time_are_limited_and_do_not_lock() {
+        let mut wrong = WrongPasswords::default();
+        let (client, start) = (address("192.0.2.7"), Instant::now());
+        let numbers: Vec<u64> = (0..MOST_OF_CLIENT)
+            .map(|_| match wrong.begin(client, start) {
+                PasswordCheck::Check(number) => number,
+                other => panic!("{other:?}"),
+            })
+            .collect();
+        assert_eq!(wrong.begin(client, start), PasswordCheck::Busy);
+        wrong.end(numbers[3], true);
+        let next = wrong.begin(client, start);
+        assert!(matches!(next, PasswordCheck::Check(_)), "{next:?}");
+        for number in numbers {
+            wrong.end(number, false);
+        }
+        // One was right, and another is being checked.
+        assert_eq!(wrong.begin(client, start), PasswordCheck::Busy);
+        let PasswordCheck::Check(number) = next else {
+            panic!("{next:?}")
+        };
+        wrong.end(number, false);
+        assert_eq!(wrong.begin(client, start), PasswordCheck::Locked);
+        // The attempt of a dropped request ends by itself.
+        assert!(try_one(&mut wrong, client, start + LOCKED_FOR, false));
+    }
+
+    #[test]
+    fn a_host_locks_its_address_and_many_addresses_lock_their_network() {
         let mut wrong = WrongPasswords::default();
         let now = Instant::now();
-        for host in 0..MOST_OF_CLIENT {
-            let client = format!("2001:db8:0:1::{host}").parse().unwrap();
-            assert!(wrong.may_try(client, now), "{host}");
+        let host = |host: usize| address(&format!("2001:db8:0:1::{host:x}"));
+        let hosts = MOST_OF_NETWORK / MOST_OF_CLIENT;
+        for number in 0..hosts {
+            for _ in 0..MOST_OF_CLIENT {
+                assert!(try_one(&mut wrong, host(number), now, false), "{number}");
+            }
+            assert!(!try_one(&mut wrong, host(number), now, true), "{number}");
         }
-        assert!(!wrong.may_try("2001:db8:0:1:ffff::1".parse().unwrap(), now));
-        assert!(wrong.may_try("2001:db8:0:2::1".parse().unwrap(), now));
+        assert!(!try_one(&mut wrong, host(hosts), now, true));
+        assert!(!try_one(
+            &mut wrong,
+            address("2001:db8:0:1:ffff::1"),
+            now,
+            true
+        ));
+        assert!(try_one(&mut wrong, address("2001:db8:0:2::1"), now, true));
+    }
+
+    #[test]
+    fn the_oldest_of_too_many_attempts_gives_way() {
+        let mut wrong = WrongPasswords::default();
+        let now = Instant::now();
+        let first = address("192.0.2.7");
+        for _ in 0..MOST_OF_CLIENT {
+            assert!(try_one(&mut wrong, first, now, false));
+        }
+        let other = |number: usize| address(&format!("10.{}.{}.1", number / 250, number % 250));
+        for number in MOST_OF_CLIENT..MOST {
+            assert!(try_one(&mut wrong, other(number), now, false));
+        }
+        assert!(!try_one(&mut wrong, first, now, false));
+        assert!(try_one(&mut wrong, other(0), now, false));
+        assert!(try_one(&mut wrong, first, now, false));
+        assert_eq!(wrong.attempts.len(), MOST);
     }
 }

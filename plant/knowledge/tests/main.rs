@@ -1,5 +1,6 @@
 //! The tests of the graph and its stores, in a single program so that they are linked once.
 
+mod connections;
 mod dump;
 mod http;
 mod memory;
