@@ -17,6 +17,7 @@ use knowledge::{
 use mtp::{Module, Triple, escaped};
 use rml::{Folder, RmlMapping};
 use serde::Serialize;
+use step_files::StepProducts;
 use tokio::sync::Notify;
 use tracing::{info, warn};
 
@@ -80,6 +81,17 @@ impl MesSources {
 
     /// Reads all files that the YAML names, and removes the sources that it named before.
     pub(crate) fn read(&self, settings: &Settings) {
+        // Other sources do not wait for the geometry of products.
+        let products: Vec<_> = settings
+            .products
+            .iter()
+            .map(|file| {
+                (
+                    file,
+                    bytes(&file.path).and_then(|bytes| products::read(&bytes)),
+                )
+            })
+            .collect();
         let _order = self.order.lock().unwrap_or_else(PoisonError::into_inner);
         let mut named = BTreeSet::new();
         let ours = skills::model::nodeset();
@@ -127,12 +139,11 @@ impl MesSources {
             named.insert(source.clone());
             self.try_one(source, |source| self.mapped(source, rml));
         }
-        for file in &settings.products {
+        for (file, read) in products {
             let source = KnowledgeSource::new(SourceKind::Product, &file.name);
             named.insert(source.clone());
             self.try_one(source, |source| {
-                let read = products::read(&bytes(&file.path)?)?;
-                self.products(source, &read, SourceLifetime::No)
+                self.products(source, &read?, SourceLifetime::No)
             });
         }
         for process in &settings.processes {
@@ -464,49 +475,63 @@ impl MesSources {
     }
 }
 
-impl SourceFiles for MesSources {
-    fn put(&self, kind: SourceKind, name: &str, contents: &[u8]) -> Result<bool, String> {
-        let mut source = KnowledgeSource::new(kind, name);
-        let read = if kind == SourceKind::NodeSet {
-            let read = node_set(&decoded(contents)?)?;
-            source = KnowledgeSource::new(kind, &read.model.namespace);
-            Some(read)
-        } else {
-            None
-        };
-        // Other sources do not wait for the geometry of products.
-        let is_product = kind == SourceKind::Product;
-        let products = is_product.then(|| products::read(contents)).transpose()?;
-        let _order = self.order.lock().unwrap_or_else(PoisonError::into_inner);
-        self.of_yaml(&source)?;
-        let is_new = !self.is_known(&source);
-        self.state().findings.remove(&source);
-        let recipe = if kind == SourceKind::Process {
-            recipe::in_source(contents)?
-        } else {
-            None
-        };
-        match (kind, read) {
-            (SourceKind::Product, _) => {
-                let read = products.as_ref().ok_or("it is not read")?;
-                self.products(&source, read, SourceLifetime::Yes)?;
-            }
-            (SourceKind::Process, _) if recipe.is_some() => {
-                if let Some((text, names)) = recipe {
+/// The contents of a file that is added while the program runs.
+enum AddedFile {
+    NodeSet(nodeset::NodeSetContents),
+    Products(StepProducts),
+    Recipe(Recipe),
+    Module,
+    Turtle(String),
+}
+
+impl AddedFile {
+    /// Reads a file.
+    ///
+    /// # Errors
+    /// The reason why it cannot be added.
+    fn read(kind: SourceKind, contents: &[u8]) -> Result<Self, String> {
+        match kind {
+            SourceKind::NodeSet => node_set(&decoded(contents)?).map(Self::NodeSet),
+            SourceKind::Product => products::read(contents).map(Self::Products),
+            SourceKind::Process => match recipe::in_source(contents)? {
+                Some((text, names)) => {
                     let read = recipe::read(&text, &names).map_err(|errors| {
                         let errors: Vec<_> = errors.iter().map(ToString::to_string).collect();
                         errors.join("; ")
                     })?;
-                    self.recipe(&source, Ok(read), SourceLifetime::Yes)?;
+                    Ok(Self::Recipe(read))
                 }
-            }
-            (SourceKind::NodeSet, Some(read)) => {
+                None => utf8(contents).map(Self::Turtle),
+            },
+            SourceKind::File => utf8(contents).map(Self::Turtle),
+            SourceKind::Mtp => Ok(Self::Module),
+            _ => Err(format!("a {kind} is not read from a file")),
+        }
+    }
+}
+
+impl SourceFiles for MesSources {
+    fn put(&self, kind: SourceKind, name: &str, contents: &[u8]) -> Result<bool, String> {
+        // Other sources do not wait until the file is read.
+        let read = AddedFile::read(kind, contents)?;
+        let source = match &read {
+            AddedFile::NodeSet(read) => KnowledgeSource::new(kind, &read.model.namespace),
+            _ => KnowledgeSource::new(kind, name),
+        };
+        let _order = self.order.lock().unwrap_or_else(PoisonError::into_inner);
+        self.of_yaml(&source)?;
+        let is_new = !self.is_known(&source);
+        self.state().findings.remove(&source);
+        match read {
+            AddedFile::NodeSet(read) => {
                 Self::put(self, &source, &read.triples, SourceLifetime::Yes)?;
                 let mut known = self.known_node_sets();
                 self.complete(&source, &read.model, &mut known, SourceLifetime::Yes);
                 self.supply_for(read.model);
             }
-            (SourceKind::Mtp, _) => {
+            AddedFile::Products(read) => self.products(&source, &read, SourceLifetime::Yes)?,
+            AddedFile::Recipe(read) => self.recipe(&source, Ok(read), SourceLifetime::Yes)?,
+            AddedFile::Module => {
                 let manifest = Manifest {
                     source: settings::Source {
                         name: name.to_owned(),
@@ -518,11 +543,10 @@ impl SourceFiles for MesSources {
                 };
                 self.module(&source, contents, &manifest, SourceLifetime::Yes)?;
             }
-            (SourceKind::File | SourceKind::Process, _) => {
-                let taken = self.knowledge.take_turtle(&source, &utf8(contents)?, now());
+            AddedFile::Turtle(text) => {
+                let taken = self.knowledge.take_turtle(&source, &text, now());
                 taken.map_err(|fault| fault.to_string())?;
             }
-            _ => return Err(format!("a {kind} is not read from a file")),
         }
         info!(kind = %kind, source = source.name, "a source was added");
         Ok(is_new)

@@ -7,7 +7,7 @@ use std::sync::Arc;
 
 use crate::lanes::Lane;
 use crate::query::{BoundedResults, Formats, Queries, QueryFault, QueryOrQuestion};
-use crate::writes::{READINGS, SourceFiles, SourceFinding, Writes, file_source};
+use crate::writes::{SourceFiles, SourceFinding, Writes, file_source, reading_place};
 use crate::written::{ResultCut, WrittenResult};
 
 /// Answers queries and makes changes. The caller checks the rights of the client before.
@@ -137,7 +137,7 @@ impl KnowledgeRequests {
             return Err(KnowledgeRefusal::new("unknown", why));
         };
         let failed = |error: &dyn fmt::Display| KnowledgeRefusal::new("failed", error.to_string());
-        let place = READINGS.acquire().await.map_err(|error| failed(&error))?;
+        let place = reading_place(kind).await.map_err(|error| failed(&error))?;
         let files = Arc::clone(&self.files);
         let done = tokio::task::spawn_blocking(move || {
             let _place = place;

@@ -14,7 +14,7 @@ use hyper::{Method, Request, Response, StatusCode};
 use oxigraph::io::RdfFormat;
 use serde::Serialize;
 use serde_json::json;
-use tokio::sync::Semaphore;
+use tokio::sync::{AcquireError, Semaphore, SemaphorePermit};
 use uri_text::unescaped;
 
 use crate::http::{HttpRefusal, ServedSite, UPLOAD_TIME, accepted, form, json_page};
@@ -334,8 +334,9 @@ impl ServedSite {
         self.may_write(&request).await?;
         let done = match method {
             Method::PUT => {
+                // A file that waits to be read takes no memory.
+                let place = reading_place(kind).await.map_err(|error| failed(&error))?;
                 let contents = self.upload(request, LARGEST_FILE).await?;
-                let place = READINGS.acquire().await.map_err(|error| failed(&error))?;
                 let put = tokio::task::spawn_blocking(move || {
                     let _place = place;
                     files.put(kind, &name, &contents)
@@ -371,7 +372,7 @@ impl ServedSite {
         let path = request.uri().path().to_owned();
         let (kind, name) = named(path.strip_prefix("/check").unwrap_or_default())?;
         let files = Arc::clone(&self.may_write(&request).await?.files);
-        let place = READINGS.acquire().await.map_err(|error| failed(&error))?;
+        let place = reading_place(kind).await.map_err(|error| failed(&error))?;
         let contents = self.upload(request, LARGEST_FILE).await?;
         // A check goes on after its client has left, and keeps its place.
         let checked = tokio::task::spawn_blocking(move || {
@@ -405,6 +406,16 @@ impl ServedSite {
             }
             Err(_) => Err(HttpRefusal::malformed("the request broke off")),
         }
+    }
+}
+
+/// Waits for a place to read a source of a kind.
+pub(crate) async fn reading_place(
+    kind: SourceKind,
+) -> Result<SemaphorePermit<'static>, AcquireError> {
+    match kind {
+        SourceKind::Product => PRODUCT_READINGS.acquire().await,
+        _ => READINGS.acquire().await,
     }
 }
 
@@ -487,8 +498,10 @@ pub(crate) fn failed(error: &dyn fmt::Display) -> HttpRefusal {
 
 /// Concurrent uploads, each of which is in memory as a whole.
 static UPLOADS: Semaphore = Semaphore::const_new(2);
-/// Concurrent readings of sources, to check or to add them.
-pub(crate) static READINGS: Semaphore = Semaphore::const_new(2);
+/// Concurrent readings of sources except products, to check or to add them.
+static READINGS: Semaphore = Semaphore::const_new(2);
+/// Concurrent readings of products, which take much longer than those of other sources.
+static PRODUCT_READINGS: Semaphore = Semaphore::const_new(1);
 const LARGEST_FILE: usize = 256 << 20;
 const LONGEST_NAME: usize = 256;
 const LARGEST_JOB: usize = 4096;
