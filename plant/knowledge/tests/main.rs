@@ -4,6 +4,7 @@ mod connections;
 mod dump;
 mod http;
 mod memory;
+mod narrowed;
 mod owl;
 mod rules;
 mod shapes;

@@ -25,16 +25,16 @@ fn of_type(namespace: &str, identifier: &str, browse_name: &str) -> TypeFacts {
 
 const OURS: &str = "urn:ua-bridge:skills";
 
-fn skill_type() -> TypeFacts {
+pub(super) fn skill_type() -> TypeFacts {
     of_type(OURS, "i=1000", "SkillType")
 }
 
-fn grasp_type() -> TypeFacts {
+pub(super) fn grasp_type() -> TypeFacts {
     of_type(OURS, "i=1200", "GraspSkillType")
 }
 
 /// Returns a gripper whose Grasp is of these types, most special first.
-fn gripper(uri: &str, types: Vec<TypeFacts>, capability: &str) -> ComponentFacts {
+pub(super) fn gripper(uri: &str, types: Vec<TypeFacts>, capability: &str) -> ComponentFacts {
     ComponentFacts {
         application_uri: uri.into(),
         name: uri.rsplit(':').next().unwrap().into(),
@@ -76,7 +76,11 @@ fn put(knowledge: &Knowledge, facts: &ComponentFacts, at: u64) -> KnowledgeSourc
     source
 }
 
-fn ask(knowledge: &Knowledge, question: &str, parameters: &[(&str, &str)]) -> QuestionAnswer {
+pub(super) fn ask(
+    knowledge: &Knowledge,
+    question: &str,
+    parameters: &[(&str, &str)],
+) -> QuestionAnswer {
     let parameters: Vec<_> = parameters
         .iter()
         .map(|(key, value)| ((*key).to_owned(), (*value).to_owned()))
@@ -96,7 +100,7 @@ fn column(answer: &QuestionAnswer, column: &str) -> Vec<String> {
         .collect()
 }
 
-const GRASP: &str = "urn:example:capability:grasp";
+pub(super) const GRASP: &str = "urn:example:capability:grasp";
 const HOLD: &str = "urn:example:capability:hold-by-vacuum";
 
 #[test]
@@ -192,89 +196,6 @@ fn a_quantity_is_held_by_skills_whose_limits_contain_it_in_any_unit() {
     let text = turtle.replace("5000", "\"5000\"");
     knowledge.replace_turtle(&sheet, &text, 1).unwrap();
     assert_eq!(held("3 kg", GRASP), []);
-}
-
-/// A parameter of a question narrows by its value to the nodes of the answer at once; the result is
-/// the rows of the whole answer that have the value in one of these columns.
-const NARROWED: [(&str, &str, &[&str]); 15] = [
-    ("access-of", "name", &["name", "of"]),
-    ("commands", "skill", &["skill"]),
-    ("components-of", "module", &["module"]),
-    ("modules-with", "what", &["what", "component"]),
-    ("operations", "operation", &["operation"]),
-    ("outputs-of", "skill", &["of_name", "of"]),
-    ("parameters", "skill", &["skill"]),
-    ("parameters-of", "skill", &["skill_name", "skill"]),
-    ("services-of", "module", &["module"]),
-    (
-        "skills-for",
-        "capability",
-        &["capability", "capability_name"],
-    ),
-    ("state-of", "skill", &["skill_name", "skill"]),
-    ("transitions-now", "skill", &["skill_name", "skill"]),
-    ("types", "type", &["supertype"]),
-    ("where-is", "name", &["name"]),
-    ("who-provides", "capability", &["capability"]),
-];
-
-#[test]
-fn a_narrowed_answer_is_the_part_of_the_whole_with_this_value() {
-    let knowledge = Knowledge::new().unwrap();
-    let put = |name: &str, triples: &[mtp::Triple]| {
-        let source = KnowledgeSource::new(SourceKind::Mtp, name);
-        knowledge.replace(&source, triples, 1).unwrap();
-    };
-    for name in ["column", "stage"] {
-        let module = mtp::Module::read(&read_own(&format!("mtp/{name}.aml"))).unwrap();
-        let capability = vec!["urn:example:capability:fill".to_owned()];
-        let capabilities = module
-            .services
-            .iter()
-            .map(|one| (one.name.clone(), capability.clone()));
-        put(
-            name,
-            &module.triples(&format!("urn:m:{name}"), &capabilities.collect()),
-        );
-    }
-    let facts = gripper("urn:g", vec![grasp_type(), skill_type()], GRASP);
-    put("gripper", &facts.triples().0);
-    put("operations", &knowledge::operations::triples());
-    let mut without_rows = Vec::new();
-    for (question, parameter, columns) in NARROWED {
-        let whole = ask(&knowledge, question, &[]);
-        if whole.rows.is_empty() {
-            without_rows.push(question);
-        }
-        let values = whole.rows.iter().flat_map(|row| {
-            columns
-                .iter()
-                .map(|column| QuestionAnswer::text(row, column))
-        });
-        let values: std::collections::BTreeSet<&str> =
-            values.filter(|value| !value.is_empty()).collect();
-        for value in values {
-            let has_value = |row: &&BTreeMap<String, serde_json::Value>| {
-                columns
-                    .iter()
-                    .any(|column| QuestionAnswer::text(row, column) == value)
-            };
-            let expected: Vec<_> = whole.rows.iter().filter(has_value).collect();
-            let narrowed = ask(&knowledge, question, &[(parameter, value)]);
-            assert_eq!(
-                narrowed.rows.iter().collect::<Vec<_>>(),
-                expected,
-                "{question} {value}"
-            );
-        }
-        let none = ask(&knowledge, question, &[(parameter, "urn:example:nothing")]);
-        assert_eq!(none.rows, [], "{question}");
-    }
-    assert_eq!(
-        without_rows,
-        ["transitions-now"],
-        "the states are not known"
-    );
 }
 
 #[test]
