@@ -157,8 +157,8 @@ impl MesSources {
     }
 
     /// Begins to complete NodeSets anew from a URL, or from none: those of the YAML, and those that
-    /// were added by command. Earlier NodeSets of the same URL are
-    /// kept, and others are read from the cache; both are added to `named`.
+    /// were added by command. Earlier NodeSets of the same URL are kept, and others are read from
+    /// the cache; both are added to `named`.
     pub(super) fn supply_anew(
         &self,
         url: Option<&NodeSetUrl>,
@@ -200,7 +200,10 @@ impl MesSources {
         {
             let namespace = missing.namespace.clone();
             let source = KnowledgeSource::new(SourceKind::NodeSet, &namespace);
-            let kept = kept.remove(&namespace).filter(|_| self.is_known(&source));
+            // A NodeSet that only the YAML required is not in the journal: added ones need it there.
+            let kept = kept.remove(&namespace);
+            let kept =
+                kept.filter(|kept| kept.lasting == missing.lasting && self.is_known(&source));
             let model = kept.map(|requirer| requirer.model);
             let model = match supply.exceeded(&missing) {
                 None => model.or_else(|| self.cached(url, &missing, true)),

@@ -197,6 +197,34 @@ fn a_nodeset_that_is_added_is_completed_and_a_removed_one_is_not_fetched_again()
 }
 
 #[test]
+fn a_nodeset_that_only_an_added_one_requires_comes_to_the_journal() {
+    for is_cached in [true, false] {
+        let mut bench = Bench::new("supply-journal", &[("urn:di", "")]);
+        let (knowledge, _) = Knowledge::open(&bench.folder.join("store")).unwrap();
+        let cache = is_cached.then(|| bench.folder.clone());
+        bench.sources = MesSources::new(Arc::new(knowledge)).cached_in(cache);
+        bench.read_with_url();
+        bench.deliver("urn:di", Ok(node_set("urn:di", "", &[])));
+        let late = node_set("urn:late", "2023-01-01", &[("urn:di", "")]);
+        let put = SourceFiles::put(&bench.sources, SourceKind::NodeSet, "late", &late);
+        assert_eq!(put, Ok(true));
+        let is_lasting = || {
+            let all = bench.sources.knowledge.sources().into_iter();
+            let mut di = all.filter(|source| source.name == "urn:di");
+            di.next().is_some_and(|di| di.lasting)
+        };
+        assert!(!is_lasting(), "the YAML requires it");
+        let alone = node_set("urn:robotics", "2023-01-01", &[]);
+        fs::write(bench.folder.join("robotics.xml"), alone).unwrap();
+        bench.read_with_url();
+        if !is_cached {
+            bench.deliver("urn:di", Ok(node_set("urn:di", "", &[])));
+        }
+        assert!(is_lasting(), "in the cache: {is_cached}");
+    }
+}
+
+#[test]
 fn a_result_that_is_late_is_left_out() {
     let bench = Bench::new("supply-late", &[("urn:di", "")]);
     bench.read_with_url();
