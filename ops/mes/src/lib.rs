@@ -538,7 +538,7 @@ impl Program for UaMes {
         };
         let port = ComponentPort::start(&ready.component, &options)?;
         if let Some(address) = ready.settings.sparql_tls {
-            // The certificate exists by then.
+            // `ComponentPort::start` has created the certificate.
             let root = self.pki_root(&ready.settings);
             let of = (root.as_path(), Arc::clone(&ready.refused));
             let page = ready.page();

@@ -109,11 +109,7 @@ pub(crate) async fn serve(
         );
         Failure::new(FailureKind::Unavailable, what)
     })?;
-    info!(
-        "users of other hosts are answered at https://{}/ask and /sparql, by the names in the \
-         certificate",
-        endpoint.address()
-    );
+    info!(address = %endpoint.address(), "serving queries by TLS");
     Ok(endpoint)
 }
 

@@ -464,7 +464,7 @@ fn schemas(part: &EntityPart) -> Vec<String> {
 const LARGEST: usize = 64 << 20;
 /// Maximum number of records.
 const MOST_RECORDS: usize = 1_000_000;
-/// Number of records between two looks at the time.
+/// Number of records between two checks of the time limit.
 const BETWEEN_LOOKS: usize = 4096;
 /// Maximum number of parameters of all records.
 const MOST_PARAMETERS: usize = 3_000_000;

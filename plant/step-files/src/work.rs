@@ -6,7 +6,7 @@ use crate::fault::ShapeFault;
 pub(crate) struct ReadingBudget<'c> {
     /// About the number of comparisons of edges with each other, of all shapes.
     spent: u64,
-    /// The work at which the time is looked at next.
+    /// The value of `spent` at which the time limit is checked next.
     next_look: u64,
     /// Returns whether the time of the reading is over.
     is_over: &'c dyn Fn() -> bool,
@@ -69,5 +69,5 @@ pub(crate) fn steps_of(count: usize) -> u64 {
 
 /// Maximum work of a file.
 const MOST_WORK: u64 = 200_000_000;
-/// The work between two looks at the time: some milliseconds.
+/// Work between two checks of the time limit: some milliseconds.
 const BETWEEN_LOOKS: u64 = 100_000;

@@ -92,7 +92,7 @@ impl ServerBoard {
         });
     }
 
-    /// Returns the namespaces whose types a server does not state: those of the NodeSets in the
+    /// Returns the namespaces that are left out when a server is read: those of the NodeSets in the
     /// graph, and the ApplicationUris of other components and servers.
     pub(super) fn left_out(&self, own: &str) -> BTreeSet<String> {
         let mut all = nodesets(&self.knowledge);
