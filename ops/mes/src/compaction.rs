@@ -15,11 +15,13 @@ pub(crate) async fn compact(knowledge: Arc<Knowledge>) {
     loop {
         ticks.tick().await;
         let knowledge = Arc::clone(&knowledge);
-        match spawn_blocking(move || knowledge.compact()).await {
-            Ok(Ok(true)) => debug!("freed the memory of removed statements"),
-            Ok(Ok(false)) => {}
-            Ok(Err(error)) => warn!(%error, "cannot free the memory of removed statements"),
+        let done = spawn_blocking(move || match knowledge.compact() {
+            Ok(true) => debug!("freed the memory of removed statements"),
+            Ok(false) => {}
             Err(error) => warn!(%error, "cannot free the memory of removed statements"),
+        });
+        if let Err(error) = done.await {
+            warn!(%error, "the copy of the statements ended early");
         }
     }
 }

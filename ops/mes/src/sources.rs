@@ -505,7 +505,12 @@ impl AddedFile {
             },
             SourceKind::File => utf8(contents).map(Self::Turtle),
             SourceKind::Mtp => Ok(Self::Module),
-            _ => Err(format!("a {kind} is not read from a file")),
+            SourceKind::Component
+            | SourceKind::Run
+            | SourceKind::State
+            | SourceKind::Server
+            | SourceKind::Graph
+            | SourceKind::Derived => Err(format!("a {kind} is not read from a file")),
         }
     }
 }
@@ -516,7 +521,10 @@ impl SourceFiles for MesSources {
         let read = AddedFile::read(kind, contents)?;
         let source = match &read {
             AddedFile::NodeSet(read) => KnowledgeSource::new(kind, &read.model.namespace),
-            _ => KnowledgeSource::new(kind, name),
+            AddedFile::Products(_)
+            | AddedFile::Recipe(_)
+            | AddedFile::Module
+            | AddedFile::Turtle(_) => KnowledgeSource::new(kind, name),
         };
         let _order = self.order.lock().unwrap_or_else(PoisonError::into_inner);
         self.of_yaml(&source)?;

@@ -413,10 +413,12 @@ impl ServedSite {
 pub(crate) async fn reading_place(
     kind: SourceKind,
 ) -> Result<SemaphorePermit<'static>, AcquireError> {
-    match kind {
-        SourceKind::Product => PRODUCT_READINGS.acquire().await,
-        _ => READINGS.acquire().await,
-    }
+    let places = if kind == SourceKind::Product {
+        &PRODUCT_READINGS
+    } else {
+        &READINGS
+    };
+    places.acquire().await
 }
 
 /// Returns the source in a path `/KIND/NAME`.

@@ -92,12 +92,12 @@ async fn many_connections_of_a_user_at_the_same_time_are_not_wrong_passwords() {
     let of_clear = Arc::clone(&security) as Arc<dyn ConnectionSecurity>;
     let endpoint = secured_site(users, of_clear).await;
     let at = endpoint.address();
-    let (answered, mut answers) = tokio::sync::mpsc::unbounded_channel();
+    let (answered, mut answers) = tokio::sync::mpsc::channel(30);
     for _ in 0..30 {
         let answered = answered.clone();
         tokio::spawn(async move {
             let answer = send(at, ask(OTTO, "close")).await;
-            answered.send((answer.status, answer.body)).unwrap();
+            answered.send((answer.status, answer.body)).await.unwrap();
         });
     }
     for _ in 0..10 {

@@ -1,5 +1,4 @@
 //! Questions with the value of a parameter: the part of the whole answer with this value.
-#![expect(clippy::unwrap_used, reason = "a test may")]
 
 use std::collections::BTreeMap;
 
