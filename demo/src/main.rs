@@ -1,6 +1,6 @@
 //! Scenarios with simulated robots and the released programs: the fault-tolerant product assembly
 //! line with skills, the same line with topics, plug and produce, the tool change, a batch, the
-//! insertion of fuses, and terminal blocks on a rail.
+//! insertion of fuses, terminal blocks on a rail, and a process with two tools.
 //!
 //! All processes of the demo use the same binary. Without a subcommand it starts the others, which
 //! are hidden subcommands, and the other programs in its directory. The robots and the components
@@ -12,7 +12,8 @@
 //! - `line`: their shared values
 //! - `supervisor` and `orchestra`: the OPC UA client, and the process that starts and watches all
 //!   others
-//! - `skilled`, `plug`, `tools`, `batch`, `fuses` and `terminals`: the other scenarios
+//! - `skilled`, `plug`, `tools`, `batch`, `fuses`, `terminals` and `tool_process`: the other
+//!   scenarios
 //! - `stage`: the shared parts of the scenarios
 
 mod batch;
@@ -30,6 +31,7 @@ mod stage;
 mod stop;
 mod supervisor;
 mod terminals;
+mod tool_process;
 mod tools;
 
 use std::io::Write as _;
@@ -68,9 +70,12 @@ struct PlanArguments {
     /// Of plug and produce: the manifest (MTP) of the module that is imported, in place of that of the example plant
     #[arg(long, value_name = "FILE")]
     manifest: Option<PathBuf>,
-    /// Of the tool change: the tools are in each other's docks
+    /// Of the tool change and the process: the tools are in each other's docks
     #[arg(long)]
     swap_tools: bool,
+    /// Of the process: how often it runs
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=1000))]
+    runs: u32,
     /// Open the page of the cell in a browser
     #[arg(long)]
     open: bool,
@@ -97,6 +102,8 @@ enum Scenario {
     Fuses,
     /// A robot, a tool changer and a gripper that place terminal blocks onto a rail
     Terminals,
+    /// A process of the graph that moves a part and a cover with two tools; a tool is unplugged
+    Process,
 }
 
 /// The demo's own processes.
@@ -187,6 +194,7 @@ fn play(plan: PlanArguments, runtime: &tokio::runtime::Runtime) -> u8 {
         conveyor_off_at,
         manifest,
         swap_tools,
+        runs,
         open,
         json,
     } = plan;
@@ -230,6 +238,15 @@ fn play(plan: PlanArguments, runtime: &tokio::runtime::Runtime) -> u8 {
         Scenario::Terminals => {
             let plan = terminals::TerminalsOptions { speed, json };
             runtime.block_on(Box::pin(terminals::play(plan)))
+        }
+        Scenario::Process => {
+            let plan = tool_process::ProcessOptions {
+                speed,
+                json,
+                runs,
+                swapped: swap_tools,
+            };
+            runtime.block_on(Box::pin(tool_process::play(plan)))
         }
         Scenario::ToolChange => {
             let plan = tools::ToolsOptions {

@@ -216,3 +216,34 @@ fn terminal_blocks_come_onto_the_rail_by_a_gripper_that_the_robot_takes_and_puts
         .map(|visit| visit["nearest_mm"].as_f64().unwrap());
     assert!(nearest.into_iter().all(|mm| mm <= 0.1), "{report}");
 }
+
+#[test]
+fn a_process_of_the_graph_uses_the_attached_tool_and_is_planned_anew_when_it_is_unplugged() {
+    let Some(_cell) = Cell::with(&[]) else { return };
+    for more in [&["--runs", "2"][..], &["--swap-tools"]] {
+        let mut demo = StartedChild::new("demo", &program("demo"))
+            .args(["--scenario", "process", "--speed", "16", "--json"])
+            .args(more)
+            .start();
+        let ended = demo.wait_for_end(Duration::from_secs(170));
+        let report = demo.json_lines().pop().unwrap_or_default();
+        assert!(ended.success(), "{report} {demo}");
+        let runs = report["runs"].as_array().unwrap();
+        let grips = 2 * u64::try_from(runs.len()).unwrap();
+        let counts = ["components", "grips", "right"].map(|of| report[of].as_u64());
+        assert_eq!(counts, [Some(5), Some(grips), Some(grips)], "{report}");
+        // The gripper was unplugged in the first run.
+        assert!(runs[0]["plans"].as_u64() >= Some(2), "{report}");
+        let waited_for = runs[0]["waited_for"].as_str().unwrap();
+        assert!(waited_for.contains("grip the cover"), "{waited_for}");
+        let is_move = |step: &&Value| step["parameters"].get("TargetPosition").is_some();
+        for run in runs {
+            let steps = run["steps"].as_array().unwrap();
+            let mut arms = steps.iter().filter(is_move).map(|of| &of["component"]);
+            assert!(arms.all(|arm| arm == "urn:example:ur5"), "{run}");
+            let first = ["take the fingers", "over the part"];
+            let began = [0, 1].map(|at: usize| steps[at]["step"].as_str().unwrap());
+            assert_eq!(began, first);
+        }
+    }
+}

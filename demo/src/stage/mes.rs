@@ -34,20 +34,71 @@ pub(crate) struct StepRun {
 /// The status page of the MES.
 #[derive(Debug, Deserialize)]
 struct Page {
-    runs: Vec<Run>,
+    #[serde(default)]
+    components: Vec<PageComponent>,
+    runs: Vec<JobRun>,
 }
 
 #[derive(Debug, Deserialize)]
-struct Run {
+struct PageComponent {
+    name: String,
+}
+
+/// A run of a process, as `ua-mes` shows it.
+#[derive(Debug, Default, Deserialize)]
+pub(crate) struct JobRun {
     run: String,
-    outcome: String,
-    reason: Option<String>,
+    pub(crate) outcome: String,
+    pub(crate) reason: Option<String>,
+    /// The needs for whose skills the run waits.
+    pub(crate) waits_for: Option<String>,
     plans: Vec<Planned>,
 }
 
 #[derive(Debug, Deserialize)]
 struct Planned {
     ran: Vec<StepRun>,
+}
+
+impl JobRun {
+    /// Returns whether the run goes on.
+    pub(crate) fn is_running(&self) -> bool {
+        matches!(self.outcome.as_str(), "running" | "")
+    }
+
+    /// Returns the number of plans.
+    pub(crate) fn plans(&self) -> usize {
+        self.plans.len()
+    }
+
+    /// Returns the runs of skills of all plans.
+    pub(crate) fn steps(&self) -> Vec<StepRun> {
+        self.plans
+            .iter()
+            .flat_map(|plan| plan.ran.clone())
+            .collect()
+    }
+
+    /// Returns whether a step has begun.
+    pub(crate) fn began(&self, step: &str) -> bool {
+        let mut steps = self.plans.iter().flat_map(|plan| &plan.ran);
+        steps.any(|known| known.step == step)
+    }
+
+    /// Prints the beginnings and ends of steps. `shown` has the steps as they were printed last.
+    pub(crate) fn show_news(
+        &self,
+        shown: &mut Vec<StepRun>,
+        show: &mut Show,
+        names: &[&'static str],
+    ) -> Result<(), StopReason> {
+        let now = self.steps();
+        for (number, step) in now.iter().enumerate() {
+            describe(step, shown.get(number), show, names)?;
+        }
+        *shown = now;
+        Ok(())
+    }
 }
 
 impl Mes {
@@ -101,19 +152,10 @@ impl Mes {
         names: &[&'static str],
         steps: &mut Vec<StepRun>,
     ) -> Result<(), StopReason> {
-        let end = format!("-{number}");
         let began = Instant::now();
         loop {
-            let page: Page = fetch(self.port)
-                .await
-                .map_err(|error| StopReason::Broken(format!("ua-mes does not answer: {error}")))?;
-            let run = page.runs.into_iter().find(|run| run.run.ends_with(&end));
-            if let Some(run) = run {
-                let now: Vec<StepRun> = run.plans.into_iter().flat_map(|plan| plan.ran).collect();
-                for (number, step) in now.iter().enumerate() {
-                    describe(step, steps.get(number), show, names)?;
-                }
-                *steps = now;
+            if let Some(run) = self.run(number).await? {
+                run.show_news(steps, show, names)?;
                 match run.outcome.as_str() {
                     "running" => {}
                     "done" => return Ok(()),
@@ -130,6 +172,25 @@ impl Mes {
             }
             sleep(POLL).await;
         }
+    }
+
+    /// Returns the state of a run; `None` before it has begun.
+    pub(crate) async fn run(&self, number: u64) -> Result<Option<JobRun>, StopReason> {
+        let end = format!("-{number}");
+        let runs = self.page().await?.runs.into_iter();
+        let mut found = runs.filter(|run| run.run.ends_with(&end));
+        Ok(found.next())
+    }
+
+    /// Returns the names of the components in the graph.
+    pub(crate) async fn components(&self) -> Result<Vec<String>, StopReason> {
+        let components = self.page().await?.components.into_iter();
+        Ok(components.map(|component| component.name).collect())
+    }
+
+    async fn page(&self) -> Result<Page, StopReason> {
+        let page = fetch(self.port).await;
+        page.map_err(|error| StopReason::Broken(format!("ua-mes does not answer: {error}")))
     }
 
     /// Runs `ua-space` to its end.

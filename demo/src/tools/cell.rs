@@ -9,7 +9,7 @@ use plant_opcua::certificates;
 use plant_opcua::pki::Pki;
 
 use crate::pace::Speed;
-use crate::stage::LOOPBACK;
+use crate::stage::{LOOPBACK, swapped_tools};
 
 /// A component: its name, its ApplicationUri, its YAML and the port of its endpoint.
 pub(super) struct ToolsComponent {
@@ -97,13 +97,7 @@ pub(super) fn write(directory: &Path, speed: Speed, swapped: bool) -> io::Result
         );
         text = text.replace("security: [None]", "security: [Basic256Sha256]");
         if swapped && part.name == CHANGER {
-            text = text
-                .replace("number: 1", "number: X")
-                .replace("number: 2", "number: 1")
-                .replace("number: X", "number: 2")
-                .replace("dock: [0.3", "dock: [X")
-                .replace("dock: [-0.3", "dock: [0.3")
-                .replace("dock: [X", "dock: [-0.3");
+            text = swapped_tools(&text);
         }
         fs::write(directory.join(format!("{}.yaml", part.name)), text)?;
     }
