@@ -38,6 +38,15 @@ pub trait RunnableSkill: Send + Sync {
     /// The reason why the skill may not have stopped.
     async fn halt(&self) -> Result<(), SkillFault>;
 
+    /// Ends the lease of the caller on the component, so that other clients may use the component
+    /// until the next run.
+    ///
+    /// # Errors
+    /// A refusal, or no response.
+    async fn release(&self) -> Result<(), SkillFault> {
+        Ok(())
+    }
+
     /// Returns the grip point of a grasp skill, if its component states it.
     fn grip_point(&self) -> Option<GripPoint> {
         None

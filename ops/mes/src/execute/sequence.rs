@@ -330,6 +330,7 @@ impl Execution<'_> {
                         running.push(async move {
                             self.teller.step("Step").await;
                             let tool = tools::named(&values);
+                            self.release_movers(offer, (chosen, skills)).await;
                             let end = self.one(step, (offer, &**skill), values).await;
                             (number, (offer, tool), end)
                         });

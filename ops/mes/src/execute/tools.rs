@@ -1,11 +1,13 @@
 //! The tools that are attached in a run.
 
 use std::collections::BTreeSet;
+use std::sync::Arc;
 
-use skills::SkillValue;
+use skills::{RunnableSkill, SkillValue};
+use tracing::warn;
 
 use super::sequence::{RunProgress, StepEnd};
-use super::{Chosen, Offer, Plant, Process, ProcessStep, SkillRole};
+use super::{Chosen, Execution, Offer, Plant, Process, ProcessStep, SkillRole};
 use crate::plan::{AttachedTools, ShownTools, TOOL, ToolFault, ToolStep, ToolUser, ToolWork};
 use crate::process::By;
 
@@ -62,6 +64,30 @@ pub(super) fn used_by_steps(
         .flat_map(|(_, step)| std::iter::once(step).chain(step.compensation.as_deref()));
     let named = left.filter_map(literal);
     at.chain(named).map(str::to_owned).collect()
+}
+
+impl Execution<'_> {
+    /// Ends the leases of the robot that carries the tool changer of a step: the changer moves it.
+    pub(super) async fn release_movers(
+        &self,
+        changer: &Offer,
+        (chosen, skills): (&Chosen, &[Arc<dyn RunnableSkill>]),
+    ) {
+        if ToolWork::of(changer).is_none() {
+            return;
+        }
+        let mut released = BTreeSet::new();
+        for ((_, offer), skill) in chosen.open.iter().zip(skills) {
+            let is_mover = offer.component != changer.component
+                && self.plant.moves(&offer.component, &changer.component);
+            if !is_mover || !released.insert(&offer.component) {
+                continue;
+            }
+            if let Err(fault) = skill.release().await {
+                warn!(robot = offer.component, "cannot end the lease of a robot: {fault}");
+            }
+        }
+    }
 }
 
 impl Chosen {

@@ -161,6 +161,10 @@ impl RunnableSkill for RecordedSkill {
         self.inner.halt().await
     }
 
+    async fn release(&self) -> Result<(), SkillFault> {
+        self.inner.release().await
+    }
+
     async fn lost(&self) -> String {
         let why = self.inner.lost().await;
         self.went(&why);

@@ -127,16 +127,7 @@ impl SkillHandle {
     /// # Errors
     /// BadLocked if another owner holds the lease, or no response.
     pub async fn lock(&self, what_for: &str) -> Result<bool, SkillFault> {
-        let Some(index) = self.client.namespace(DEVICES) else {
-            return Ok(false);
-        };
-        let name = |name: &str| QualifiedName::new(index, name);
-        let component = &self.found.nodes.component;
-        let path = [name("Lock")];
-        let below = [name("Lock"), name("InitLock")];
-        let object = self.client.translate(component, &path).await;
-        let method = self.client.translate(component, &below).await;
-        let (Ok(object), Ok(method)) = (object, method) else {
+        let Some((object, method)) = self.of_lock("InitLock").await else {
             return Ok(false);
         };
         let context = Variant::String(UAString::from(what_for));
@@ -150,6 +141,18 @@ impl SkillHandle {
                 &format!("InitLock of {}", self.found.component),
             )),
         }
+    }
+
+    /// Returns the lock of the component, and one of its methods.
+    async fn of_lock(&self, method: &str) -> Option<(NodeId, NodeId)> {
+        let index = self.client.namespace(DEVICES)?;
+        let name = |name: &str| QualifiedName::new(index, name);
+        let component = &self.found.nodes.component;
+        let path = [name("Lock")];
+        let below = [name("Lock"), name(method)];
+        let object = self.client.translate(component, &path).await.ok()?;
+        let method = self.client.translate(component, &below).await.ok()?;
+        Some((object, method))
     }
 
     /// Switches the component off after a delay (`PowerOffDevice`). Returns whether the component
@@ -630,6 +633,19 @@ impl RunnableSkill for SkillHandle {
             | CallError::Client(_)
             | CallError::Refused { .. } => Err(called(&error, &format!("Halt of {}", self.name()))),
         }
+    }
+
+    async fn release(&self) -> Result<(), SkillFault> {
+        // ExitLock ends the lease of a lock, and not that of a call.
+        if !self.lock("").await? {
+            return Ok(());
+        }
+        let Some((object, method)) = self.of_lock("ExitLock").await else {
+            return Ok(());
+        };
+        let answer = self.client.call(&object, &method, Vec::new()).await;
+        let what = format!("ExitLock of {}", self.found.component);
+        answer.map(drop).map_err(|error| called(&error, &what))
     }
 
     async fn lost(&self) -> String {
