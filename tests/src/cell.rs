@@ -26,8 +26,8 @@ pub enum Peer {
     Ros1,
     /// Cyclone DDS and asyncua, in the Python environment that `cargo xtask test` makes.
     Python,
-    /// pySHACL, SPARQLWrapper, xmlschema, SpiffWorkflow and lxml, in the same environment. An environment of an earlier
-    /// version of the tests may lack them.
+    /// pySHACL, SPARQLWrapper, xmlschema, SpiffWorkflow and lxml, in the same environment. An
+    /// environment of an earlier version of the tests may lack them.
     PythonJudges,
     /// Fast DDS from Debian or Ubuntu, in a program that `cargo xtask test` compiles.
     FastDds,

@@ -166,7 +166,8 @@ pub(crate) async fn configure(
     told(outcome, reports)
 }
 
-/// Sets the configured components back, and the component with an unknown outcome, in reverse order.
+/// Sets the configured components back, and the component with an unknown outcome, in
+/// reverse order.
 /// Returns the new reports by the numbers of the components.
 async fn set_back(
     (components, before): (&[ProductComponent], &[FieldChange]),

@@ -85,8 +85,8 @@ impl HttpEndpoint {
         Self::listen(address, site).await
     }
 
-    /// Listens at any address for secured connections. Each request carries the name and password of
-    /// a user (HTTP Basic).
+    /// Listens at any address for secured connections. Each request carries the name and password
+    /// of a user (HTTP Basic).
     ///
     /// # Errors
     /// Fails if the address is in use.
@@ -642,8 +642,8 @@ const BODY_TIME: Duration = Duration::from_secs(5);
 pub(crate) const UPLOAD_TIME: Duration = Duration::from_secs(45);
 /// Age at which a connection takes no further requests.
 const CONNECTION_TIME: Duration = Duration::from_secs(60);
-/// Time limit of the last request of a connection: its upload, the wait for a place, and the reading
-/// of a source.
+/// Time limit of the last request of a connection: its upload, the wait for a place, and the
+/// reading of a source.
 const LAST_REQUEST: Duration = Duration::from_secs(90);
 /// Largest head of a request, in bytes.
 const LARGEST_BUFFER: usize = 64 << 10;

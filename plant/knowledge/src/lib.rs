@@ -16,10 +16,10 @@
 //! statements), `journal` (lasting sources), `component`, `nodeset`, `node_set_models`, `owl` and
 //! `served` (facts to statements), `question` (named queries), `query` and `bounds` (any SPARQL,
 //! within limits), `lanes` (the queries that run at a time), `http`, `remote` and `sign_ins`
-//! (clients of other hosts), `dump` (graphs as documents), `update` and `writes` (changes by users), `shapes` and `checking` (the
-//! SHACL report), `units` (conversion of numbers), `requests` (queries and changes for other
-//! protocols than HTTP), `value_query` (queries with one value), `operations` (a taxonomy of
-//! capabilities), `products` (STEP files).
+//! (clients of other hosts), `dump` (graphs as documents), `update` and `writes` (changes by
+//! users), `shapes` and `checking` (the SHACL report), `units` (conversion of numbers), `requests`
+//! (queries and changes for other protocols than HTTP), `value_query` (queries with one value),
+//! `operations` (a taxonomy of capabilities), `products` (STEP files).
 
 mod bounds;
 mod checking;

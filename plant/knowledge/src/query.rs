@@ -44,8 +44,8 @@ pub struct QueryLimits {
     pub dump: usize,
     /// Maximum size of a query in bytes.
     pub query: usize,
-    /// Maximum growth of the program in bytes while queries run, of all of them together. The memory
-    /// of a query alone is not known: the growth has that of all other work, too.
+    /// Maximum growth of the program in bytes while queries run, of all of them together. The
+    /// memory of a query alone is not known: the growth has that of all other work, too.
     pub memory: u64,
 }
 

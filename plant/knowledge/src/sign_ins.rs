@@ -29,15 +29,16 @@ struct PasswordAttempt {
 pub(crate) enum PasswordCheck {
     /// The password may be checked, by the number of the attempt.
     Check(u64),
-    /// Other passwords of the client or its network are being checked, and all of them may be wrong.
+    /// Other passwords of the client or its network are being checked, and all of them may be
+    /// wrong.
     Busy,
     /// The client or its network has sent too many wrong passwords.
     Locked,
 }
 
 impl WrongPasswords {
-    /// Begins an attempt, which lasts until [`Self::end`], at most for [`LOCKED_FOR`]. Attempts at the
-    /// same time are limited as if all of them were wrong.
+    /// Begins an attempt, which lasts until [`Self::end`], at most for [`LOCKED_FOR`]. Attempts at
+    /// the same time are limited as if all of them were wrong.
     pub(crate) fn begin(&mut self, client: IpAddr, now: Instant) -> PasswordCheck {
         let client = client.to_canonical();
         self.attempts

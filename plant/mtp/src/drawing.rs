@@ -80,9 +80,9 @@ fn line(svg: &mut String, connection: &PictureConnection) {
     );
 }
 
-/// Adds an object. X and Y are the upper left corner, also for sources and sinks. The file gives the
-/// width and height after the rotation, so the box is drawn without a rotation. A device without a
-/// size has its name only.
+/// Adds an object. X and Y are the upper left corner, also for sources and sinks. The file gives
+/// the width and height after the rotation, so the box is drawn without a rotation. A device
+/// without a size has its name only.
 fn shape(svg: &mut String, object: &PictureObject, assembly: Option<&DataAssembly>) {
     let Some([x, y]) = object.position else {
         return;

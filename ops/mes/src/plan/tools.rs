@@ -524,7 +524,8 @@ impl PossibleTools {
         (faults.len(), faults.into_iter().next())
     }
 
-    /// Returns whether, in each case, an earlier step has attached a tool to a tool changer for which
+    /// Returns whether, in each case, an earlier step has attached a tool to a tool changer for
+    /// which
     /// `moves` returns true.
     pub(super) fn are_carried(&self, user: &ToolUser<'_>, moves: &dyn Fn(&str) -> bool) -> bool {
         self.are_all(|case| {

@@ -200,7 +200,8 @@ impl MesSources {
         {
             let namespace = missing.namespace.clone();
             let source = KnowledgeSource::new(SourceKind::NodeSet, &namespace);
-            // A NodeSet that only the YAML required is not in the journal: added ones need it there.
+            // A NodeSet that only the YAML required is not in the journal: added ones need it
+            // there.
             let kept = kept.remove(&namespace);
             let kept =
                 kept.filter(|kept| kept.lasting == missing.lasting && self.is_known(&source));
