@@ -410,7 +410,7 @@ impl Execution<'_> {
         let other_step = || Ended::Over("the plan has another step than the process".to_owned());
         let busy: BTreeSet<String> = begun
             .keys()
-            .flat_map(|number| chosen.uses(*number, &progress.tools))
+            .flat_map(|number| chosen.uses(*number, (&progress.tools, self.plant)))
             .collect();
         for (number, step) in self.process.steps.iter().enumerate() {
             let mut waits = step.waits_for(number).into_iter();
@@ -431,7 +431,7 @@ impl Execution<'_> {
             let place = open.position(|(role, _)| *role == SkillRole::Alone(number));
             let place = place.ok_or_else(other_step)?;
             let (_, offer) = chosen.open.get(place).ok_or_else(other_step)?;
-            let mut uses = chosen.uses(number, &progress.tools).into_iter();
+            let mut uses = chosen.uses(number, (&progress.tools, self.plant)).into_iter();
             if uses.any(|component| busy.contains(&component)) {
                 continue;
             }

@@ -71,6 +71,7 @@ fn plant(offers: Vec<Offer>) -> Fakes {
         spare: Mutex::default(),
         powers: None,
         tools: ShownTools::default(),
+        mover: None,
     }
 }
 

@@ -78,9 +78,7 @@ impl Execution<'_> {
         }
         let mut released = BTreeSet::new();
         for ((_, offer), skill) in chosen.open.iter().zip(skills) {
-            let is_mover = offer.component != changer.component
-                && self.plant.moves(&offer.component, &changer.component);
-            if !is_mover || !released.insert(&offer.component) {
+            if !is_mover(self.plant, offer, changer) || !released.insert(&offer.component) {
                 continue;
             }
             if let Err(fault) = skill.release().await {
@@ -90,9 +88,19 @@ impl Execution<'_> {
     }
 }
 
+/// Returns whether the component of an offer moves the tool changer of another.
+fn is_mover(plant: &dyn Plant, offer: &Offer, changer: &Offer) -> bool {
+    offer.component != changer.component && plant.moves(&offer.component, &changer.component)
+}
+
 impl Chosen {
-    /// Returns the components that a step uses: that of its skill, and the tools that it changes.
-    pub(super) fn uses(&self, number: usize, tools: &AttachedTools) -> Vec<String> {
+    /// Returns the components that a step uses: that of its skill, and, if it changes a tool, the
+    /// tools and the robot that carries the changer.
+    pub(super) fn uses(
+        &self,
+        number: usize,
+        (tools, plant): (&AttachedTools, &dyn Plant),
+    ) -> Vec<String> {
         let mut open = self.open.iter();
         let of_step = open.find(|(role, _)| *role == SkillRole::Alone(number));
         let Some((_, offer)) = of_step else {
@@ -103,6 +111,9 @@ impl Chosen {
             uses.extend(tools.at(&offer.component).map(str::to_owned));
             let step = self.steps.get(number);
             uses.extend(step.and_then(literal).map(str::to_owned));
+            let open = self.open.iter().map(|(_, of)| of);
+            let movers = open.filter(|of| is_mover(plant, of, offer));
+            uses.extend(movers.map(|of| of.component.clone()));
         }
         uses
     }

@@ -36,6 +36,8 @@ pub(super) struct Fakes {
     /// A skill, and the offers that appear when it is run.
     pub(super) powers: Option<(&'static str, Vec<Offer>)>,
     pub(super) tools: ShownTools,
+    /// The component that moves the tool changers.
+    pub(super) mover: Option<&'static str>,
 }
 
 struct FakeSkill {
@@ -119,6 +121,10 @@ impl Plant for Arc<Fakes> {
 
     fn connects(&self, _from: (&str, &str), _to: (&str, &str)) -> Result<(), ParameterFault> {
         Ok(())
+    }
+
+    fn moves(&self, component: &str, _changer: &str) -> bool {
+        self.mover == Some(component)
     }
 
     async fn read_tools(&self) {
@@ -279,6 +285,12 @@ impl RunnableSkill for FakeSkill {
             results: self.results(&name),
             trace: vec![],
         })
+    }
+
+    async fn release(&self) -> Result<(), SkillFault> {
+        let line = format!("{} released", self.offer.component_name);
+        self.plant.journal.lock().unwrap().push(line);
+        Ok(())
     }
 
     async fn halt(&self) -> Result<(), SkillFault> {

@@ -373,6 +373,40 @@ async fn a_tool_that_another_run_uses_is_waited_for() {
 }
 
 #[tokio::test]
+async fn a_changer_has_its_robot_alone_once_the_robot_has_ended_its_step() {
+    for (mover, expected) in [
+        (
+            Some("urn:example:arm"),
+            ["arm.Meet", "two.Meet", "arm released", "changer.Change 1"].as_slice(),
+        ),
+        (None, &["arm.Meet", "changer.Change 1", "two.Meet"]),
+    ] {
+        let mut fakes = changing();
+        let offers = ["arm", "two"].map(|name| offer(name, "Meet", &format!("{name}Type")));
+        fakes.offers.get_mut().unwrap().extend(offers);
+        // The step of the arm ends after the last step has begun.
+        fakes.meets = Some(Arc::new(tokio::sync::Barrier::new(2)));
+        fakes.mover = mover;
+        let mut steps = vec![
+            alone(0, "move", "armType"),
+            attach(1, "attach", GRIPPER),
+            alone(2, "meet", "twoType"),
+        ];
+        for step in &mut steps {
+            step.after = Some(vec![]);
+        }
+        let process = Process {
+            work: StepJob::Sequence,
+            steps,
+            ..process()
+        };
+        let (run, fakes, _) = executed(fakes, &process).await;
+        assert_eq!((run.outcome, &run.reason), (How::Done, &None));
+        assert_eq!(ran(&fakes), expected);
+    }
+}
+
+#[tokio::test]
 async fn no_tool_is_waited_for_that_no_component_can_replace() {
     let mut handles = alone(2, "handle", "CountType");
     handles.when = vec![vec![StepCondition {
