@@ -431,7 +431,9 @@ impl Execution<'_> {
             let place = open.position(|(role, _)| *role == SkillRole::Alone(number));
             let place = place.ok_or_else(other_step)?;
             let (_, offer) = chosen.open.get(place).ok_or_else(other_step)?;
-            let mut uses = chosen.uses(number, (&progress.tools, self.plant)).into_iter();
+            let mut uses = chosen
+                .uses(number, (&progress.tools, self.plant))
+                .into_iter();
             if uses.any(|component| busy.contains(&component)) {
                 continue;
             }

@@ -82,7 +82,10 @@ impl Execution<'_> {
                 continue;
             }
             if let Err(fault) = skill.release().await {
-                warn!(robot = offer.component, "cannot end the lease of a robot: {fault}");
+                warn!(
+                    robot = offer.component,
+                    "cannot end the lease of a robot: {fault}"
+                );
             }
         }
     }
