@@ -27,6 +27,39 @@ pub enum CarrierMedium {
     Mqtt(Box<Broker>),
     /// Ethernet frames.
     Ethernet(EthernetGroup),
+    /// Shared memory between programs of this host.
+    SharedMemory(SharedMemoryGroup),
+}
+
+/// The name of a group of programs of one host that exchange messages in shared memory.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct SharedMemoryGroup(String);
+
+impl SharedMemoryGroup {
+    /// The beginning of the address of a group, as `shm:cell`.
+    pub const SCHEME: &str = "shm:";
+    /// The longest name in bytes.
+    pub const LONGEST: usize = 64;
+
+    /// Returns the group with a name: letters, digits, `-` and `_`.
+    #[must_use]
+    pub fn new(name: &str) -> Option<Self> {
+        let is_allowed = |byte: u8| byte.is_ascii_alphanumeric() || matches!(byte, b'-' | b'_');
+        let is_short = (1..=Self::LONGEST).contains(&name.len());
+        (is_short && name.bytes().all(is_allowed)).then(|| Self(name.to_owned()))
+    }
+
+    /// Returns the name.
+    #[must_use]
+    pub fn name(&self) -> &str {
+        &self.0
+    }
+}
+
+impl Default for SharedMemoryGroup {
+    fn default() -> Self {
+        Self("cell".to_owned())
+    }
 }
 
 /// A UDP group or host, and how datagrams reach it.

@@ -28,6 +28,7 @@ mod servers;
 mod services;
 mod several;
 mod shaping;
+mod shared_memory;
 mod site;
 mod types;
 mod variables;

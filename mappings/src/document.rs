@@ -28,7 +28,7 @@ pub(crate) use binding::{
 pub(crate) use call::{CallBindingEntry, CallEntry, FieldMapEntry, MethodEntry};
 pub(crate) use carriers::{
     CarrierEntry, EncodingEntry, EthernetEntry, MqttEntry, MqttVersionEntry, PubSubEntry,
-    PubSubForm, PublisherIdEntry, TopicFormEntry, UdpEntry,
+    PubSubForm, PublisherIdEntry, SharedMemoryEntry, TopicFormEntry, UdpEntry,
 };
 pub(crate) use permissions::{CallPermissionsEntry, PermissionsEntry, RoleEntry, RoleList};
 pub(crate) use request::Request;

@@ -41,7 +41,7 @@ pub use call::{
     Assigned, Assignment, Call, CallBinding, CallKind, CallTarget, ExecutedBy, FieldMap,
     MethodTarget,
 };
-pub use carriers::{CarrierMedium, ConfiguredCarrier, ForwardedName, UdpGroup};
+pub use carriers::{CarrierMedium, ConfiguredCarrier, ForwardedName, SharedMemoryGroup, UdpGroup};
 pub use check::{Checked, TypeOrigin, TypeUse};
 pub use code::{Code, UnknownCode};
 pub use diagnostic::{Diagnostic, Severity, Span};

@@ -3,7 +3,7 @@
 use std::net::SocketAddr;
 
 use super::network::{address, interface, settings, ttl};
-use super::{broker, ethernet};
+use super::{broker, ethernet, shared_memory};
 use crate::broker::{Broker, BrokerAddress};
 use crate::carriers::{CarrierMedium, ConfiguredCarrier, ForwardedName, UdpGroup};
 use crate::code::Code;
@@ -22,11 +22,50 @@ pub(super) fn check(entry: Option<&Located<PubSubForm>>, findings: &mut MappingF
         None => PubSub::default(),
         Some(PubSubForm::One(entry)) => {
             let mut pubsub = settings(entry, findings);
-            pubsub.carriers.extend(ethernet::alone(entry, findings));
+            pubsub.carriers.extend(alone(entry, findings));
             pubsub
         }
         Some(PubSubForm::Several(entries)) => listed(entries, *place, findings),
     }
+}
+
+/// Returns the only carrier of a mapping if it is neither UDP nor MQTT.
+fn alone(entry: &PubSubEntry, findings: &mut MappingFindings) -> Option<ConfiguredCarrier> {
+    let of_ethernet = entry.eth.as_ref().map(|at| ("Ethernet", at.place));
+    let of_memory = entry.shm.as_ref().map(|at| ("shared memory", at.place));
+    let (what, place) = of_ethernet.or(of_memory)?;
+    let both = entry.shm.as_ref().filter(|_| of_ethernet.is_some());
+    let others = [
+        ("address", entry.address.as_ref().map(|at| at.place)),
+        ("mqtt", entry.mqtt.as_ref().map(|at| at.place)),
+        ("shm", both.map(|at| at.place)),
+        ("interface", entry.interface.as_ref().map(|at| at.place)),
+        ("ttl", entry.ttl.as_ref().map(|at| at.place)),
+    ];
+    for (key, place) in others {
+        if let Some(place) = place {
+            let message = format!("`{key}` is not a setting of {what}");
+            let note = findings.error(Code::Carriers, place, message);
+            note.help(match of_ethernet {
+                Some(_) => ETHERNET_EXAMPLE,
+                None => SHARED_MEMORY_EXAMPLE,
+            });
+        }
+    }
+    let medium = match (&entry.eth, &entry.shm) {
+        (Some(eth), _) => {
+            let group = ethernet::group(eth.value.as_ref()?, place, findings)?;
+            CarrierMedium::Ethernet(group)
+        }
+        (None, shm) => {
+            let entry = shm.as_ref()?.value.as_ref()?;
+            CarrierMedium::SharedMemory(shared_memory::group(entry, findings)?)
+        }
+    };
+    Some(ConfiguredCarrier {
+        medium,
+        forward: Vec::new(),
+    })
 }
 
 /// Returns the settings of a list of carriers.
@@ -62,8 +101,9 @@ fn listed(
         let note = findings.error(Code::Carriers, place, message);
         note.label(format!("at most {most}"));
     }
-    let is_settings =
-        |entry: &CarrierEntry| entry.udp.is_none() && entry.mqtt.is_none() && entry.eth.is_none();
+    let is_settings = |entry: &CarrierEntry| {
+        entry.udp.is_none() && entry.mqtt.is_none() && entry.eth.is_none() && entry.shm.is_none()
+    };
     let mut all = entries.iter();
     if all.all(|at| at.value.as_ref().is_some_and(is_settings)) {
         let note = findings.error(Code::Carriers, place, "the list has no carrier");
@@ -89,7 +129,9 @@ fn listed(
 fn adopt(pubsub: &mut PubSub, carriers: Vec<ConfiguredCarrier>) {
     let udp = carriers.iter().find_map(|carrier| match &carrier.medium {
         CarrierMedium::Udp(group) => Some(group.clone()),
-        CarrierMedium::Mqtt(_) | CarrierMedium::Ethernet(_) => None,
+        CarrierMedium::Mqtt(_) | CarrierMedium::Ethernet(_) | CarrierMedium::SharedMemory(_) => {
+            None
+        }
     });
     if let Some(UdpGroup {
         address,
@@ -105,11 +147,13 @@ fn adopt(pubsub: &mut PubSub, carriers: Vec<ConfiguredCarrier>) {
     }
     pubsub.broker = carriers.iter().find_map(|carrier| match &carrier.medium {
         CarrierMedium::Mqtt(broker) => Some(broker.clone()),
-        CarrierMedium::Udp(_) | CarrierMedium::Ethernet(_) => None,
+        CarrierMedium::Udp(_) | CarrierMedium::Ethernet(_) | CarrierMedium::SharedMemory(_) => None,
     });
-    let is_ethernet =
-        |carrier: &ConfiguredCarrier| matches!(carrier.medium, CarrierMedium::Ethernet(_));
-    if carriers.len() > 1 || carriers.iter().any(is_ethernet) {
+    let is_other = |carrier: &ConfiguredCarrier| match carrier.medium {
+        CarrierMedium::Udp(_) | CarrierMedium::Mqtt(_) => false,
+        CarrierMedium::Ethernet(_) | CarrierMedium::SharedMemory(_) => true,
+    };
+    if carriers.len() > 1 || carriers.iter().any(is_other) {
         pubsub.carriers = carriers;
     }
 }
@@ -136,6 +180,7 @@ fn common(entries: &[Located<CarrierEntry>], findings: &mut MappingFindings) -> 
         address,
         mqtt,
         eth,
+        shm,
         interface,
         ttl,
         ..
@@ -144,6 +189,7 @@ fn common(entries: &[Located<CarrierEntry>], findings: &mut MappingFindings) -> 
         ("address", address.as_ref().map(|at| at.place)),
         ("mqtt", mqtt.as_ref().map(|at| at.place)),
         ("eth", eth.as_ref().map(|at| at.place)),
+        ("shm", shm.as_ref().map(|at| at.place)),
         ("interface", interface.as_ref().map(|at| at.place)),
         ("ttl", ttl.as_ref().map(|at| at.place)),
     ];
@@ -163,19 +209,31 @@ fn medium(
     place: TextSpan,
     findings: &mut MappingFindings,
 ) -> Option<CarrierMedium> {
-    match (&entry.udp, &entry.mqtt, &entry.eth, &entry.settings) {
-        (Some(udp), None, None, None) => {
+    let CarrierEntry {
+        udp,
+        mqtt,
+        eth,
+        shm,
+        settings,
+        ..
+    } = entry;
+    match (udp, mqtt, eth, shm, settings) {
+        (Some(udp), None, None, None, None) => {
             udp_group(udp.value.as_ref()?, findings).map(CarrierMedium::Udp)
         }
-        (None, Some(mqtt), None, None) => {
+        (None, Some(mqtt), None, None, None) => {
             let broker = listed_broker(mqtt.value.as_ref()?, mqtt.place, findings)?;
             Some(CarrierMedium::Mqtt(broker))
         }
-        (None, None, Some(eth), None) => {
+        (None, None, Some(eth), None, None) => {
             let group = ethernet::group(eth.value.as_ref()?, eth.place, findings)?;
             Some(CarrierMedium::Ethernet(group))
         }
-        (None, None, None, Some(_)) => {
+        (None, None, None, Some(shm), None) => {
+            let group = shared_memory::group(shm.value.as_ref()?, findings)?;
+            Some(CarrierMedium::SharedMemory(group))
+        }
+        (None, None, None, None, Some(_)) => {
             if let Some(at) = &entry.forward {
                 let message = "`forward` belongs to a carrier";
                 findings
@@ -185,7 +243,7 @@ fn medium(
             None
         }
         _ => {
-            let message = "an entry has one of `udp`, `mqtt`, `eth` and `settings`";
+            let message = "an entry has one of `udp`, `mqtt`, `eth`, `shm` and `settings`";
             findings.error(Code::Carriers, place, message).help(EXAMPLE);
             None
         }
@@ -275,8 +333,12 @@ fn is_same_network(one: &CarrierMedium, other: &CarrierMedium) -> bool {
         (CarrierMedium::Ethernet(one), CarrierMedium::Ethernet(other)) => {
             (&one.interface, one.address, one.vlan) == (&other.interface, other.address, other.vlan)
         }
+        (CarrierMedium::SharedMemory(one), CarrierMedium::SharedMemory(other)) => one == other,
         (
-            CarrierMedium::Udp(_) | CarrierMedium::Mqtt(_) | CarrierMedium::Ethernet(_),
+            CarrierMedium::Udp(_)
+            | CarrierMedium::Mqtt(_)
+            | CarrierMedium::Ethernet(_)
+            | CarrierMedium::SharedMemory(_),
             _different,
         ) => false,
     }
@@ -350,5 +412,7 @@ fn forwarded(
 }
 
 const MOST_NAMES: usize = 1000;
+const ETHERNET_EXAMPLE: &str = "pubsub: {eth: {interface: eth0, address: 01-00-5E-40-00-28}}";
+const SHARED_MEMORY_EXAMPLE: &str = "pubsub: {shm: {group: cell}}";
 const EXAMPLE: &str = "pubsub: [{udp: {address: opc.udp://239.192.0.40:4840}, forward: [ua_1]}, {mqtt: \
                        {address: mqtt://broker.local:1883}}, {settings: {key_frame_period: 1s}}]";

@@ -1,46 +1,12 @@
 //! UADP over Ethernet.
 
 use super::network::interface;
-use crate::carriers::{CarrierMedium, ConfiguredCarrier};
 use crate::code::Code;
-use crate::document::{EthernetEntry, PubSubEntry};
+use crate::document::EthernetEntry;
 use crate::ethernet::{EthernetGroup, EthernetUrl, EthernetUrlFault};
 use crate::findings::MappingFindings;
 use crate::read::{OptionalKey, given, short};
 use crate::tree::TextSpan;
-
-/// Returns the only carrier of a mapping if it is Ethernet.
-pub(super) fn alone(
-    entry: &PubSubEntry,
-    findings: &mut MappingFindings,
-) -> Option<ConfiguredCarrier> {
-    let at = entry.eth.as_ref()?;
-    let PubSubEntry {
-        address,
-        mqtt,
-        interface,
-        ttl,
-        ..
-    } = entry;
-    let others = [
-        ("address", address.as_ref().map(|at| at.place)),
-        ("mqtt", mqtt.as_ref().map(|at| at.place)),
-        ("interface", interface.as_ref().map(|at| at.place)),
-        ("ttl", ttl.as_ref().map(|at| at.place)),
-    ];
-    for (key, place) in others {
-        if let Some(place) = place {
-            let message = format!("`{key}` is not a setting of Ethernet");
-            let note = findings.error(Code::Carriers, place, message);
-            note.help(EXAMPLE);
-        }
-    }
-    let group = group(at.value.as_ref()?, at.place, findings)?;
-    Some(ConfiguredCarrier {
-        medium: CarrierMedium::Ethernet(group),
-        forward: Vec::new(),
-    })
-}
 
 /// Returns the group of an entry; `None` for a faulty entry.
 pub(super) fn group(
@@ -142,5 +108,3 @@ fn number(
         .label(format!("{least} to {most}"));
     None
 }
-
-const EXAMPLE: &str = "pubsub: {eth: {interface: eth0, address: 01-00-5E-40-00-28}}";

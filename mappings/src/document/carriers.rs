@@ -16,6 +16,9 @@ document! {
         mqtt: MqttEntry,
         /// Ethernet frames instead of UDP, without `address`, `mqtt`, `interface` and `ttl`.
         eth: EthernetEntry,
+        /// Shared memory of this host instead of UDP, without `address`, `mqtt`, `interface` and
+        /// `ttl`.
+        shm: SharedMemoryEntry,
         /// Name or address of the network interface. Default: the operating system chooses.
         interface: String,
         /// Hops a multicast datagram may travel. Default 1: it stays on the link.
@@ -110,6 +113,8 @@ document! {
         mqtt: MqttEntry,
         /// Ethernet frames with the EtherType of UADP, B62C; their `interface` is required.
         eth: EthernetEntry,
+        /// Shared memory between programs of this host.
+        shm: SharedMemoryEntry,
         /// Names of publishers at this carrier; their messages are forwarded to the other carriers:
         /// a space (ua_1), a namespace of it (ua_1_2) or a topic (ua_1_2_10), at most 1000. Requests
         /// of calls and confirmations of commands cross in the other direction. Default: none.
@@ -133,6 +138,15 @@ document! {
         /// Priority of sent frames (PCP), 0 to 7. Default 0.
         #[schemars(range(max = 7))]
         priority: u16,
+    }
+
+    /// Shared memory between programs of this host and of one user, by iceoryx2. Only programs that
+    /// were built with the feature `shm` have it.
+    struct SharedMemoryEntry {
+        /// Name of the group: letters, digits, `-` and `_`; default `cell`. Programs with the same name
+        /// receive each other's messages.
+        #[schemars(length(min = 1, max = 64))]
+        group: String,
     }
 
     /// UDP multicast or unicast.

@@ -11,7 +11,7 @@ use bridge_core::{LinkCapacity, Relay};
 use broker::{BrokerIdentity, Mqtt};
 use mappings::{
     Broker, BrokerAddress, CarrierMedium, ConfiguredCarrier, EthernetGroup, Mapping, PubSub,
-    SpaceId, UdpGroup,
+    SharedMemoryGroup, SpaceId, UdpGroup,
 };
 use service::{Failure, FailureKind};
 use tokio::sync::watch;
@@ -41,6 +41,9 @@ pub(crate) fn open(
         publisher: (!arguments.flags.dry_run).then(|| own.into()),
     };
     let url = arguments.flags.address.as_deref();
+    if let Some(group) = url.and_then(|url| url.strip_prefix(SharedMemoryGroup::SCHEME)) {
+        return Ok((open_shared_memory(&shared_memory(group)?)?, None));
+    }
     let listed = &mapping.pubsub().carriers;
     if url.is_none() && !listed.is_empty() {
         let (carriers, options) = open_all(listed, &identity, arguments, (several, hub))?;
@@ -79,6 +82,7 @@ fn open_all(
         let carrier = match medium {
             CarrierMedium::Mqtt(broker) => open_broker(broker, identity)?,
             CarrierMedium::Ethernet(group) => open_ethernet(group, arguments, ethernet_hub)?,
+            CarrierMedium::SharedMemory(group) => open_shared_memory(group)?,
             CarrierMedium::Udp(group) => {
                 let options = udp_options(arguments, group, several)?;
                 let udp = open_udp(&options, hub)?;
@@ -104,6 +108,42 @@ fn open_udp(options: &UdpOptions, hub: Option<&ProcessHub>) -> Result<Box<dyn Ca
         Some(hub) => hub.connect(udp, options),
         None => Box::new(udp),
     })
+}
+
+/// Returns the group of a command line.
+fn shared_memory(name: &str) -> Result<SharedMemoryGroup, Failure> {
+    SharedMemoryGroup::new(name).ok_or_else(|| {
+        let most = SharedMemoryGroup::LONGEST;
+        let message = format!(
+            "--address shm:{name}: use a name of 1 to {most} letters, digits, `-` and `_`, such as shm:cell"
+        );
+        Failure::new(FailureKind::Usage, message)
+    })
+}
+
+/// Opens a carrier in shared memory.
+///
+/// # Errors
+/// The program was built without it, or its files cannot be opened.
+#[cfg(feature = "shm")]
+pub fn open_shared_memory(group: &SharedMemoryGroup) -> Result<Box<dyn Carrier>, Failure> {
+    let memory = transport::SharedMemory::open(group.name())
+        .map_err(|error| Failure::new(FailureKind::Unavailable, error.to_string()))?;
+    Ok(Box::new(memory))
+}
+
+/// Opens a carrier in shared memory.
+///
+/// # Errors
+/// The program was built without it.
+#[cfg(not(feature = "shm"))]
+pub fn open_shared_memory(group: &SharedMemoryGroup) -> Result<Box<dyn Carrier>, Failure> {
+    let message = format!(
+        "the group `{}` in shared memory needs a program with the feature `shm`, which this one \
+         was built without: use UDP, or build the programs with `--features shm`",
+        group.name()
+    );
+    Err(Failure::new(FailureKind::Configuration, message))
 }
 
 /// Opens a carrier of Ethernet. The interface of the command line takes precedence.

@@ -44,7 +44,7 @@ pub use bridge_core::{
 };
 pub use busy_poll::BusyPoll;
 pub use calls::{Asker, CallGraph, SpaceCalls};
-pub use carrier::carrier_rules;
+pub use carrier::{carrier_rules, open_shared_memory};
 pub use cell::{ProgramSet, SharedProgram, check_mapping, run_together};
 pub use clock::{now, timestamp};
 pub use definitions::Definitions;

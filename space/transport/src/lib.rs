@@ -4,7 +4,8 @@
 //! network. A [`Udp`] is a multicast
 //! group (or a unicast address) on a network interface. As in OPC 10000-14, 7.3.2 (UADP over UDP),
 //! the address is used for receiving and sending. An [`Ethernet`] carries UADP without IP
-//! (OPC 10000-14, 7.3.3).
+//! (OPC 10000-14, 7.3.3). With the feature `shm` a `SharedMemory` connects programs of one host
+//! without a network.
 
 mod batch;
 mod carrier;
@@ -14,6 +15,8 @@ mod filter;
 mod in_process;
 mod interface;
 mod key_rule;
+#[cfg(feature = "shm")]
+mod shared_memory;
 mod udp;
 mod watch;
 
@@ -26,5 +29,7 @@ pub use ethernet::{Ethernet, EthernetError, EthernetOptions, VlanTag};
 pub use in_process::ProcessHub;
 pub use interface::{Interface, InterfaceError, interfaces};
 pub use key_rule::{ByteTest, KeyRule};
+#[cfg(feature = "shm")]
+pub use shared_memory::{SharedMemory, SharedMemoryError};
 pub use udp::{Udp, UdpOpenError, UdpOptions};
 pub use watch::{HeldInterfaces, InterfaceChange, InterfaceFinding, LOOK};

@@ -4,7 +4,7 @@ use std::fs;
 use std::path::Path;
 
 use broker::{BrokerIdentity, Mqtt};
-use mappings::{Broker, BrokerAddress, Mapping, PubSub};
+use mappings::{Broker, BrokerAddress, Mapping, PubSub, SharedMemoryGroup};
 use transport::{Carrier, Udp, UdpOptions};
 
 use crate::arguments::GroupArguments;
@@ -64,6 +64,17 @@ fn open_as(
         let mqtt = Mqtt::open(&broker, &identity)
             .map_err(|error| CommandFailure::Usage(format!("MQTT: {error}")))?;
         return Ok((Box::new(mqtt), broker.address.to_string()));
+    }
+    let name = group.address.as_deref();
+    if let Some(name) = name.and_then(|url| url.strip_prefix(SharedMemoryGroup::SCHEME)) {
+        let group = SharedMemoryGroup::new(name).ok_or_else(|| {
+            let message = "--address: the name of a group in shared memory has letters, digits, `-` \
+                           and `_`; for example shm:cell";
+            CommandFailure::Usage(message.to_owned())
+        })?;
+        let memory = bridge_node::open_shared_memory(&group)
+            .map_err(|failure| CommandFailure::Unavailable(failure.to_string()))?;
+        return Ok((memory, format!("{}{name}", SharedMemoryGroup::SCHEME)));
     }
     if group.cell.is_some() {
         return Err(CommandFailure::Usage(NO_BROKER.to_owned()));

@@ -92,7 +92,9 @@ impl End {
     /// Returns the age at which messages of the carrier are late; `None` if it stores no messages.
     const fn within(&self) -> Option<Duration> {
         match &self.medium {
-            CarrierMedium::Udp(_) | CarrierMedium::Ethernet(_) => None,
+            CarrierMedium::Udp(_) | CarrierMedium::Ethernet(_) | CarrierMedium::SharedMemory(_) => {
+                None
+            }
             CarrierMedium::Mqtt(broker) => Some(broker.within),
         }
     }
@@ -324,6 +326,7 @@ impl Routes {
         let is_stranger = end.is_some_and(|end| match &end.medium {
             CarrierMedium::Udp(_) => !path.from.ip().is_loopback(),
             CarrierMedium::Ethernet(_) => true,
+            CarrierMedium::SharedMemory(_) => false,
             CarrierMedium::Mqtt(broker) => !broker.acl,
         });
         let topic = || TopicId::new(scope.publisher, scope.group?, scope.writer?);
