@@ -2,7 +2,7 @@
 //! could deliver late, and programs that forward between UDP and a broker.
 
 mod clusters;
-mod commanded;
+pub(crate) mod commanded;
 mod judges;
 mod late_joiner;
 
@@ -25,7 +25,7 @@ const TOPIC: [&str; 2] = ["/ua_1_5_10", "std_msgs/String"];
 const OVER_MQTT: [&str; 2] = ["--address", BROKER];
 
 /// Runs `ua-space` and returns its output.
-fn space(args: &[&str]) -> String {
+pub(crate) fn space(args: &[&str]) -> String {
     let output = Command::new(program("ua-space"))
         .args(args)
         .output()

@@ -4,7 +4,7 @@ mod access;
 mod alarms;
 mod authorities;
 mod configuration;
-mod confirm;
+pub(crate) mod confirm;
 mod crowd;
 mod events;
 mod folders;

@@ -86,8 +86,18 @@ fn aged(time: Timestamp, now: Timestamp, within: Duration) -> Option<Late> {
 /// The cause of [`Reason::Late`] for a message without a time.
 pub(crate) const GIVEN_UP: &str = "given_up";
 pub(crate) const UNTIMED: &str = "untimed";
+/// The cause of [`Reason::Late`] for a command that waited for a stopped program.
+pub(crate) const WAITED: &str = "waited";
 pub(crate) const NO_TIME: &str =
     "it carries no time, and a broker may deliver it late; its sender must set the Timestamp";
+
+/// Returns the details of a command or request that waited for this program.
+pub(crate) fn waited(waited: Duration) -> String {
+    let millis = waited.as_millis();
+    format!(
+        "it waited {millis} ms for this program, which was stopped or overloaded, and its sender has given it up"
+    )
+}
 
 /// Returns the counted cause of a late message.
 pub(crate) const fn cause(case: &'static str) -> (Reason, &'static str) {

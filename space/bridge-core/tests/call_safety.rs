@@ -392,6 +392,25 @@ fn what_was_asked_of_a_program_before_it_was_started_anew_is_not_executed_again(
 }
 
 #[test]
+fn a_request_that_waited_for_a_stopped_program_is_executed_only_while_its_caller_waits() {
+    for (stopped, executions) in [(1_000, 1), (4_000, 0)] {
+        let mut cell = plugged_in();
+        cell.stop(GRIPPER);
+        cell.ask(BRIDGE, AskId(1), (start(), &large(1)), ms(3_000));
+        cell.run(ms(stopped));
+        cell.resume(GRIPPER);
+        cell.run(ms(1_000));
+        assert_eq!(cell.executions(GRIPPER).len(), executions, "{stopped}");
+        let late = cell.dropped(GRIPPER, Reason::Late);
+        assert_eq!(late, u64::from(executions == 0));
+        // The next request is executed.
+        cell.ask(BRIDGE, AskId(2), (start(), &large(2)), ms(3_000));
+        cell.run(ms(50));
+        assert_eq!(cell.executions(GRIPPER).len(), 1);
+    }
+}
+
+#[test]
 fn who_missed_that_a_program_was_started_anew_asks_what_it_is_when_that_shows() {
     let mut cell = plugged_in();
     let deaf = Rc::new(Shared::new(true));

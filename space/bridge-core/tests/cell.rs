@@ -47,7 +47,7 @@ pub(crate) struct SimulatedProgram {
     dead: bool,
     /// Stopped as by SIGSTOP: its datagrams wait in its socket.
     stopped: bool,
-    socket: Vec<(SocketAddr, Vec<u8>)>,
+    socket: Vec<((SocketAddr, Timestamp), Vec<u8>)>,
 }
 
 impl SimulatedProgram {
@@ -201,7 +201,7 @@ impl SimulatedCell {
         let now = self.now();
         let program = &mut self.programs[at];
         if program.stopped {
-            program.socket.push((from, bytes.to_vec()));
+            program.socket.push(((from, now.utc), bytes.to_vec()));
         } else if !program.dead {
             program.router.handle_datagram(bytes, from, now);
             self.drain(at);
@@ -252,8 +252,11 @@ impl SimulatedCell {
     /// Continues a stopped program, which then reads its socket.
     pub(crate) fn resume(&mut self, at: usize) {
         self.programs[at].stopped = false;
-        for (from, bytes) in std::mem::take(&mut self.programs[at].socket) {
-            self.hear(at, &bytes, from);
+        let now = self.now();
+        for ((from, arrived), bytes) in std::mem::take(&mut self.programs[at].socket) {
+            let from = (from, Some(arrived));
+            self.programs[at].router.handle_received(&bytes, from, now);
+            self.drain(at);
         }
     }
 

@@ -306,6 +306,43 @@ fn a_value_that_nobody_has_in_time_is_unknown_and_does_not_come_later() {
 }
 
 #[test]
+fn a_command_that_waited_for_a_stopped_bridge_until_it_was_given_up_is_not_delivered() {
+    let of = topic("ua_0_2_10");
+    for (stopped, got, late) in [(500, &[7][..], 0), (1100, &[], 1)] {
+        let mut cell = Cell::new(of, &[1]);
+        let mut bridge = cell.programs.pop().unwrap();
+        cell.write(of, 7);
+        // The datagrams wait in the socket of the bridge, the last one for a short time only.
+        let mut waiting = Vec::new();
+        let end = cell.now.monotonic + Duration::from_millis(stopped);
+        while cell.now.monotonic < end {
+            let sent = cell.programs[0].turn(cell.now);
+            waiting.extend(sent.into_iter().map(|datagram| (datagram, cell.now.utc)));
+            cell.now = later(cell.now, STEP);
+        }
+        for (datagram, arrived) in &waiting {
+            let from = (address(100), Some(*arrived));
+            bridge.router.handle_received(datagram, from, cell.now);
+        }
+        cell.programs.push(bridge);
+        cell.run(Duration::from_secs(1));
+        assert_eq!(cell.programs[1].got, got);
+        let counted = cell.programs[1].router.topics();
+        let counted: u64 = counted.map(|(_, of)| of.dropped(Reason::Late)).sum();
+        assert_eq!(counted, late);
+        let expected = match late {
+            0 => ConfirmedArrival::Confirmed,
+            _ => unknown(1),
+        };
+        assert_eq!(cell.arrivals(), [expected]);
+        // The next command arrives.
+        cell.write(of, 8);
+        cell.run(Duration::from_millis(100));
+        assert_eq!(cell.programs[1].got.last(), Some(&8));
+    }
+}
+
+#[test]
 fn a_value_whose_subscriber_gets_it_late_is_confirmed_then() {
     let of = topic("ua_0_2_10");
     let mut cell = Cell::new(of, &[1]);

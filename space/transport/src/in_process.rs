@@ -12,7 +12,7 @@ use std::net::SocketAddr;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::task::{Context, Poll, Waker};
-use std::time::Duration;
+use std::time::{Duration, SystemTime};
 
 use crate::carrier::{
     Capacity, Carrier, CarrierChange, OutgoingMessage, Received, SendError, Senders,
@@ -384,6 +384,8 @@ struct HubQueue {
 struct HubMessage {
     bytes: Vec<u8>,
     from: SocketAddr,
+    /// Time of the arrival, as the kernel stamps datagrams.
+    stamp: SystemTime,
 }
 
 impl HubInbox {
@@ -392,6 +394,10 @@ impl HubInbox {
     }
 
     /// Adds a message, or counts it as dropped if the inbox is full, as a socket does.
+    #[expect(
+        clippy::disallowed_methods,
+        reason = "it stands for the stamp of the kernel"
+    )]
     fn put(&self, bytes: &[u8], from: SocketAddr) {
         let mut queue = self.queue();
         if queue.messages.len() >= MOST_MESSAGES || queue.bytes + bytes.len() > MOST_BYTES {
@@ -401,7 +407,11 @@ impl HubInbox {
         let mut copy = queue.spare.pop().unwrap_or_default();
         copy.extend_from_slice(bytes);
         queue.bytes += bytes.len();
-        queue.messages.push_back(HubMessage { bytes: copy, from });
+        queue.messages.push_back(HubMessage {
+            bytes: copy,
+            from,
+            stamp: SystemTime::now(),
+        });
         let waker = queue.waker.take();
         drop(queue);
         if let Some(waker) = waker {
@@ -430,7 +440,11 @@ impl HubInbox {
 
 impl HubQueue {
     fn take(&mut self, buffer: &mut Vec<u8>) -> Option<Received> {
-        let HubMessage { mut bytes, from } = self.messages.pop_front()?;
+        let HubMessage {
+            mut bytes,
+            from,
+            stamp,
+        } = self.messages.pop_front()?;
         let length = bytes.len();
         self.bytes = self.bytes.saturating_sub(length);
         if buffer.len() < length {
@@ -446,7 +460,7 @@ impl HubQueue {
         Some(Received {
             length,
             from,
-            stamp: None,
+            stamp: Some(stamp),
         })
     }
 }

@@ -11,7 +11,7 @@ use system_tests::{
 
 use super::SOON;
 
-pub(super) const COMMAND: &str = "
+pub(crate) const COMMAND: &str = "
 pubsub: {address: \"mqtt://127.0.0.1:1883\"}
 namespaces: {2: urn:ua-bridge:system-tests}
 spaces: [{id: 1}]
@@ -25,7 +25,7 @@ server: {security: [None]}
 ";
 
 /// A server and a robot of ROS 1 with a broker between them.
-pub(super) struct Commanded<'c> {
+pub(crate) struct Commanded<'c> {
     cell: &'c Cell,
     robot: Child,
     value: f64,
@@ -33,7 +33,7 @@ pub(super) struct Commanded<'c> {
 
 impl<'c> Commanded<'c> {
     /// Starts the robot, which publishes its setpoints.
-    pub(super) fn robot(cell: &'c Cell) -> Self {
+    pub(crate) fn robot(cell: &'c Cell) -> Self {
         let robot = cell.rospy("ros1_arm.py", &["/arm/setpoint", "/arm/reached"]);
         Self {
             cell,
@@ -43,14 +43,14 @@ impl<'c> Commanded<'c> {
     }
 
     /// Writes a value and returns the status.
-    pub(super) fn write(&self, value: f64) -> Value {
+    pub(crate) fn write(&self, value: f64) -> Value {
         let value = value.to_string();
         let args = [SERVER_ENDPOINT, "ns=2;i=30", "Double", &value];
         self.cell.asyncua_once("opcua_write.py", &args)[0]["status"].clone()
     }
 
     /// Writes new values until the robot confirms a value.
-    pub(super) fn arrives(&mut self) {
+    pub(crate) fn arrives(&mut self) {
         eventually("a command is confirmed", SOON * 2, || {
             self.value += 1.0;
             (self.write(self.value) == "Good").then_some(())
@@ -62,7 +62,7 @@ impl<'c> Commanded<'c> {
     }
 
     /// Checks that the robot does not get the value.
-    pub(super) fn never_arrives(&self, value: f64) {
+    pub(crate) fn never_arrives(&self, value: f64) {
         holds_for(
             "the late command does not arrive",
             Duration::from_secs(4),

@@ -1,9 +1,11 @@
 //! Writes that succeed when a bridge confirms them or the robot answers, and not when they have
 //! been sent.
 
-use system_tests::{Distribution, program};
+use nix::sys::signal::Signal;
+use system_tests::{BROKER, Distribution, program};
 
 use super::*;
+use crate::mqtt::commanded::{COMMAND, Commanded};
 
 const MAPPING: &str = "
 namespaces:
@@ -355,4 +357,35 @@ fn the_last_write_that_a_killed_server_confirmed_is_what_the_robot_got() {
         let got = got.max_by(f64::total_cmp)?;
         (got == last || got == last + 1.0).then_some(())
     });
+}
+
+/// Checks that a command that waited for a stopped bridge does not reach the robot. `carrier` is the
+/// carrier in the mapping.
+pub(crate) fn is_never_late_after_a_stop(carrier: &str) {
+    let Some(cell) = Cell::with(&[Peer::Ros1, Peer::Python]) else {
+        return;
+    };
+    let mapping = COMMAND.replace(&format!("address: \"{BROKER}\""), carrier);
+    assert!(mapping.contains(carrier), "{mapping}");
+    let mapping = cell.file("cell.yaml", &mapping);
+    let mapping = mapping.to_str().unwrap();
+    let _master = cell.roscore();
+    let _server = cell.ua_server(&[mapping]);
+    eventually("the server answers clients", SOON, || {
+        cell.asyncua_try("opcua_read.py", &[SERVER_ENDPOINT, "ns=0;i=2258"])
+    });
+    let bridge = cell.bridge_ros1(&[mapping]);
+    let mut commanded = Commanded::robot(&cell);
+    commanded.arrives();
+
+    bridge.signal(Signal::SIGSTOP);
+    assert_eq!(commanded.write(1002.0), "BadTimeout");
+    bridge.signal(Signal::SIGCONT);
+    commanded.never_arrives(1002.0);
+    commanded.arrives();
+}
+
+#[test]
+fn a_command_is_never_late_when_its_bridge_was_stopped() {
+    is_never_late_after_a_stop("interface: lo");
 }

@@ -287,6 +287,7 @@ impl TopicQueues {
             });
         }
         let relay = self.arrival;
+        let waited = self.waited(now);
         let mut place = SequencePosition::of(topic, message, (from, sent), relay.is_some());
         let local = self.settings.local;
         let since_takeover = self.since_takeover(&place, now);
@@ -330,6 +331,13 @@ impl TopicQueues {
         {
             admitted = Some(Err(Reason::Takeover));
         }
+        // Its repetitions are known from here on, so that none of them is delivered either.
+        let is_withdrawn = confirming
+            .as_deref()
+            .is_some_and(|confirming| waited >= confirming.within());
+        if is_withdrawn && matches!(admitted, Some(Ok(_))) {
+            admitted = Some(Err(Reason::Late));
+        }
         if let Some(Ok(admitted)) = &admitted {
             counters.missing += u64::from(admitted.missing);
         }
@@ -352,6 +360,10 @@ impl TopicQueues {
             Some(Err(reason)) => {
                 if reason == Reason::Repeat {
                     self.follow_again(at, message, &place);
+                }
+                if reason == Reason::Late {
+                    return self
+                        .count(about, late::cause(late::WAITED), 1, || late::waited(waited));
                 }
                 self.count(about, reason, 1, String::new);
             }

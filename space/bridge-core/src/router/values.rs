@@ -3,7 +3,7 @@
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, BinaryHeap, VecDeque};
 use std::sync::Arc;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use mappings::{Mapping, Overflow, SpaceId, TopicId};
 use messages::{Dialect, MessageType, PlanError, Selection, Wire};
@@ -143,6 +143,16 @@ impl TopicQueues {
             .received
             .filter(|stamp| (0..=LONGEST_WAIT).contains(&waited(stamp)));
         received.unwrap_or(now.utc)
+    }
+
+    /// Returns how long the current datagram waited for this program, which was stopped or slow.
+    /// The network is not in this time, so it needs no synchronised clocks.
+    pub(super) fn waited(&self, now: Now) -> Duration {
+        let waited = self
+            .received
+            .map(|stamp| now.utc.unix_nanos() - stamp.unix_nanos());
+        let waited = waited.and_then(|nanos| u64::try_from(nanos).ok());
+        Duration::from_nanos(waited.unwrap_or_default())
     }
 
     /// Binds a topic as [`Router::bind`](super::Router::bind) does. Returns whether it is a topic

@@ -22,6 +22,7 @@ use crate::call::{
 use crate::call_announcement::{CallAnnouncement, CallTypes, LASTING_TARGET};
 use crate::call_plan::ExecutedPlan;
 use crate::counters::{DropCause, Reason};
+use crate::late;
 use crate::loop_rule::{Crosses, Side};
 use crate::network::number_of;
 use crate::output::Output;
@@ -177,6 +178,7 @@ impl CallTraffic<'_> {
         // A sender with the keys of the group is trusted at any address.
         let known = origin.group != STRANGERS;
         let group = self.values.mapping.pubsub().address;
+        let waited = self.values.waited(now);
         let Some(calls) = &mut self.calls else {
             let values = &mut self.values;
             return values.count(DropSite::sender(from), Reason::NotAsked, 1, String::new);
@@ -209,6 +211,13 @@ impl CallTraffic<'_> {
                             .to_owned()
                     }
                 });
+            }
+            // The repetitions of the request are refused, too.
+            Ok(RequiredAction::Execute(id)) if waited >= hint(request) => {
+                let refused = calls.responder.refuse(id, Refusal::NotExecutable, since);
+                let _told = refused.is_ok();
+                let cause = late::cause(late::WAITED);
+                self.count_call(topic, Some(from), cause, || late::waited(waited));
             }
             Ok(RequiredAction::Execute(id)) => {
                 if let Ok((fields, plan)) = judged {
@@ -315,8 +324,7 @@ impl CallTraffic<'_> {
                 return self.count_call(topic, None, cause, || detail);
             }
         };
-        let hint = request.action.timeout().unwrap_or(TIMEOUT);
-        let deadline = now.monotonic + hint.min(MAX_TIMEOUT);
+        let deadline = now.monotonic + hint(request);
         let start_by = match self.values.redundant {
             Some(_) => deadline.min(now.monotonic + START_WITHIN),
             None => deadline,
@@ -443,6 +451,12 @@ impl super::RouterCalls {
 type ReadRequest = Result<Vec<u8>, (DropCause, String)>;
 /// The fields of a request, and the plan to read them if the local side uses ROS messages.
 type Executable<'a> = (&'a [u8], Option<Arc<ExecutedPlan>>);
+
+/// Returns the time for which the caller of a request waits.
+fn hint(request: &ActionMessage<'_>) -> Duration {
+    let hint = request.action.timeout().unwrap_or(TIMEOUT);
+    hint.min(MAX_TIMEOUT)
+}
 
 /// Returns the fields of a request if it may be executed.
 fn may_be_executed<'a>(
