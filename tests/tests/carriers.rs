@@ -2,6 +2,8 @@
 //! MQTT together.
 
 mod ethernet;
+#[cfg(feature = "shm")]
+mod shared_memory;
 
 use std::process::Command;
 use std::sync::Arc;
@@ -254,7 +256,16 @@ struct Faults {
 }
 
 /// Runs the suite.
-async fn conforms(network: &mut dyn Network, Faults { loses, reorders }: Faults) {
+async fn conforms(network: &mut dyn Network, faults: Faults) {
+    let (a, b) = delivers(network, faults).await;
+    heals(network, a, b).await;
+}
+
+/// Runs the part of the suite in which the network is there. Returns two of its programs.
+async fn delivers(
+    network: &dyn Network,
+    Faults { loses, reorders }: Faults,
+) -> (Box<dyn Carrier>, Box<dyn Carrier>) {
     let (mut a, mut b, mut c) = (network.join(1), network.join(2), network.join(3));
     meet(a.as_mut(), 1, &mut [&mut b, &mut c]).await;
 
@@ -316,8 +327,11 @@ async fn conforms(network: &mut dyn Network, Faults { loses, reorders }: Faults)
             break;
         }
     }
+    (a, b)
+}
 
-    // The network is lost and comes back: nothing that was sent meanwhile arrives.
+/// The network is lost and comes back: nothing that was sent meanwhile arrives.
+async fn heals(network: &mut dyn Network, mut a: Box<dyn Carrier>, mut b: Box<dyn Carrier>) {
     network.cut();
     until(SOON, || {
         let _change = (a.follow(), b.follow());

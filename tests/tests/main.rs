@@ -65,6 +65,8 @@ mod server;
 mod server_values;
 mod service_manager;
 mod shaped;
+#[cfg(feature = "shm")]
+mod shared_memory;
 mod sharing;
 mod shipped_mappings;
 mod skills;

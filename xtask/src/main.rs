@@ -33,7 +33,9 @@ const VERBS: &str = "\
 cargo xtask <verb>
 
   demo [ARGS]                    build the programs and run the assembly line; ARGS go to it (--help lists them)
-  test [--no-install] [FILTER..] install the peers of the tests (apt, pip), then run all tests whose name contains a FILTER
+  test [--no-install] [--shm] [FILTER..]
+                                 install the peers of the tests (apt, pip), then run all tests whose name contains a FILTER;
+                                 --shm builds the programs with messages in shared memory (needs libclang)
   page                           drive the page of the cell in Chromium (apt, pip); screenshots are in target/page
   mtp2                           judge our reader and executor of MTP 2.0 by MTPPy2.0 (pip; needs Python 3.13)
   rml                            count the published cases of RML that `ua-space rml` and morph-kgc pass (pip; needs UA_DATA)

@@ -32,6 +32,10 @@ use programs::TestProgram;
 /// The targets of a test run. All commands build the same packages, so nothing is built twice.
 const TARGETS: &[&str] = &["--workspace", "--locked"];
 const SYSTEM_TESTS: &str = "system-tests";
+/// The option that builds everything with the carrier in shared memory, which needs libclang.
+const SHARED_MEMORY: &str = "--shm";
+const SHARED_MEMORY_FEATURES: &str =
+    "transport/shm,system-tests/shm,ua-bridge/shm,bridge-ros1/shm,bridge-ros2/shm";
 /// Modules of the system tests that measure the load of the machine; concurrent tests would be
 /// measured too.
 const ALONE: &[&str] = &["large", "rate", "ros2_fuzz", "ros2_large", "sharing"];
@@ -47,18 +51,24 @@ pub(crate) fn run(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<C
         .iter()
         .copied()
         .partition(|argument| argument.starts_with('-'));
-    if let Some(unknown) = options.iter().find(|option| **option != "--no-install") {
-        eprintln!("xtask: test takes --no-install and names of tests, not {unknown}");
+    let is_known = |option: &&str| ["--no-install", SHARED_MEMORY].contains(option);
+    if let Some(unknown) = options.iter().find(|option| !is_known(option)) {
+        eprintln!(
+            "xtask: test takes --no-install, {SHARED_MEMORY} and names of tests, not {unknown}"
+        );
         return Ok(CommandOutcome::USAGE);
     }
-    if options.is_empty() {
+    if !options.contains(&"--no-install") {
         // Tests of missing peers skip themselves, or fail with CI=true; the other tests run.
         peers::install(workspace);
     }
     step("building the programs and the tests (some minutes the first time)");
     let patched = Patched::prepare(workspace)?;
     let built = ["--bins", "--tests", "--examples"];
-    let build = patched.cargo(workspace, &[&["build"][..], TARGETS, &built].concat());
+    let mut build = patched.cargo(workspace, &[&["build"][..], TARGETS, &built].concat());
+    if options.contains(&SHARED_MEMORY) {
+        build.args(["--features", SHARED_MEMORY_FEATURES]);
+    }
     let programs = programs::build(build)?;
     links::make(&workspace.target.join("debug"))?;
 

@@ -15,7 +15,7 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::task::{Context, Poll, Waker};
 use std::thread::JoinHandle;
-use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use iceoryx2::node::Node;
 use iceoryx2::port::listener::Listener;
@@ -46,8 +46,9 @@ const FIRST_SIZE: usize = 2048;
 const LARGEST: usize = 65_507;
 /// Time after which the thread that waits for messages looks whether the carrier is dropped.
 const WAIT: Duration = Duration::from_millis(200);
-/// Period in which the files of programs that were killed are removed.
-const CLEAN_UP: Duration = Duration::from_secs(5);
+/// Period in which the files of programs that were killed are removed, in calls of
+/// [`Carrier::follow`], which come every [`LOOK`](crate::LOOK).
+const CLEAN_UP: u32 = 5;
 
 /// Reason why programs cannot exchange messages in shared memory.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -76,7 +77,8 @@ pub struct SharedMemory {
     notifier: Notifier<Service>,
     node: Node<Service>,
     arrivals: Arrivals,
-    cleaned: Instant,
+    /// The calls of [`Carrier::follow`] until the next clean-up.
+    until_cleaned: u32,
     dropped: Dropped,
 }
 
@@ -175,7 +177,7 @@ impl SharedMemory {
             notifier,
             node,
             arrivals,
-            cleaned: Instant::now(),
+            until_cleaned: CLEAN_UP,
             dropped: Dropped {
                 discarded,
                 unreadable: 0,
@@ -246,6 +248,10 @@ impl SharedMemory {
 }
 
 /// Returns the time of a message: nanoseconds since 1970.
+#[expect(
+    clippy::disallowed_methods,
+    reason = "it stands for the stamp of the kernel"
+)]
 fn now() -> u64 {
     let now = SystemTime::now().duration_since(UNIX_EPOCH);
     u64::try_from(now.unwrap_or_default().as_nanos()).unwrap_or(u64::MAX)
@@ -314,8 +320,9 @@ impl Carrier for SharedMemory {
 
     /// Removes the files of programs that were killed.
     fn follow(&mut self) -> Option<CarrierChange> {
-        if self.cleaned.elapsed() >= CLEAN_UP {
-            self.cleaned = Instant::now();
+        self.until_cleaned = self.until_cleaned.saturating_sub(1);
+        if self.until_cleaned == 0 {
+            self.until_cleaned = CLEAN_UP;
             let cleaned = self.node.try_cleanup_dead_nodes();
             if cleaned.cleanups > 0 {
                 tracing::info!(
@@ -427,7 +434,7 @@ impl Waiting {
                 }
                 Err(error) => {
                     tracing::debug!(%error, "cannot wait for messages in shared memory");
-                    std::thread::sleep(WAIT);
+                    std::thread::park_timeout(WAIT);
                     self.arrived.store(true, Ordering::SeqCst);
                     self.wake();
                 }

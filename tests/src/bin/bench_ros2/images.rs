@@ -10,8 +10,15 @@ use system_tests::{ArrayShape, BareNode, BareSubscription, Cell, Child, eventual
 use crate::ends::{LIMIT, Meter, MeterReport, Pacer, START, SendingPace};
 use crate::floods::bridges_dropped;
 
-pub(crate) fn measure(cell: &Cell, seconds: u64) {
-    let mapping = cell.file("images.yaml", MAPPING);
+pub(crate) fn measure(cell: &Cell, seconds: u64, in_memory: bool) {
+    let carrier = match in_memory {
+        true => format!(
+            "pubsub: {{shm: {{group: images-{}}}}}\n",
+            std::process::id()
+        ),
+        false => String::new(),
+    };
+    let mapping = cell.file("images.yaml", &format!("{carrier}{MAPPING}"));
     let mapping = mapping.to_string_lossy();
     let _bridges = [cell.bridge_ros1(&[&mapping]), cell.bridge_ros2(&[&mapping])];
     println!(

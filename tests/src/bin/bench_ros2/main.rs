@@ -70,7 +70,7 @@ fn main() -> ExitCode {
             work::measure(&cell, plan.seconds);
         }
         if plan.has("images") {
-            images::measure(&cell, plan.seconds.min(IMAGES));
+            images::measure(&cell, plan.seconds.min(IMAGES), plan.in_memory);
         }
         if plan.has("calls") {
             calls::measure(&cell, plan.calls);
@@ -101,6 +101,8 @@ struct Plan {
     turns: u64,
     /// Calls of a service, one at a time and many at a time.
     calls: u64,
+    /// Whether images cross the space in shared memory, which the programs must be built with.
+    in_memory: bool,
 }
 
 impl Plan {
@@ -114,11 +116,13 @@ impl Plan {
             seconds: 20,
             turns: 20,
             calls: 2000,
+            in_memory: false,
         };
         let mut args = args.iter();
         while let Some(arg) = args.next() {
             match arg.as_str() {
                 "--help" | "-h" => plan.help = true,
+                "--shm" => plan.in_memory = true,
                 "--quick" => {
                     plan = Self {
                         messages: 500,
@@ -167,6 +171,7 @@ bench-ros2 [--quick] [--seconds N] [--turn N] [PART..]
 
   --quick      a trial of a minute; its figures are no measurement
   --seconds N  how long each path gets messages at 1 kHz, 20 unless told
+  --shm        images cross the space in shared memory; the bridges need the feature `shm`
   --turn N     samples through one relay before the next has its turn, 50 unless told
   PART         round-trip, throughput, joining, idle, many, through, sealed, bursts, floods, calls, goals, work, images; all unless told
 ";
