@@ -15,13 +15,14 @@ pub(crate) const MOSQUITTO_SUB: &str = "/usr/bin/mosquitto_sub";
 /// The address of a cell's broker.
 pub const BROKER: &str = "mqtt://127.0.0.1:1883";
 
+const FOR_EVERYBODY: &str = "listener 1883 127.0.0.1\nallow_anonymous true\n";
 const START: Duration = Duration::from_secs(20);
 
 impl Cell {
     /// Starts mosquitto with a listener on port 1883 for everybody, and waits until it is ready.
     #[must_use]
     pub fn mosquitto(&self) -> Child {
-        self.mosquitto_with("listener 1883 127.0.0.1\nallow_anonymous true\n")
+        self.mosquitto_with(FOR_EVERYBODY)
     }
 
     /// Starts mosquitto with this configuration, and waits until it is ready.
@@ -30,14 +31,21 @@ impl Cell {
     /// Panics if mosquitto does not start.
     #[must_use]
     pub fn mosquitto_with(&self, configuration: &str) -> Child {
-        self.mosquitto_named("mosquitto", configuration)
+        self.mosquitto_named("mosquitto", configuration, &["-v"])
     }
 
-    fn mosquitto_named(&self, name: &str, configuration: &str) -> Child {
+    /// Starts mosquitto like [`Self::mosquitto`], without a log of each message.
+    #[must_use]
+    pub fn mosquitto_without_log(&self) -> Child {
+        self.mosquitto_named("mosquitto", FOR_EVERYBODY, &[])
+    }
+
+    fn mosquitto_named(&self, name: &str, configuration: &str, args: &[&str]) -> Child {
         let text = format!("user root\nlog_dest stderr\n{configuration}");
         let file = self.file(&format!("{name}.conf"), &text);
         let mut broker = StartedChild::new("mosquitto", Path::new(MOSQUITTO))
-            .args(["-v", "-c", file.to_str().unwrap()])
+            .args(args)
+            .args(["-c", file.to_str().unwrap()])
             .start();
         broker.wait_for_line("running", START);
         broker
@@ -152,7 +160,7 @@ impl Bridged<'_> {
                         connection near\naddress 127.0.0.1:1883\ntopic opcua/# both 1\n\
                         bridge_protocol_version mqttv50\ncleansession true\nnotifications false\n\
                         restart_timeout 1\n";
-            self.cell.mosquitto_named("far", text)
+            self.cell.mosquitto_named("far", text, &["-v"])
         });
     }
 

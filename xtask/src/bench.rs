@@ -69,6 +69,11 @@ pub(crate) fn soak(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<
     measured(workspace, "soak", &packages, arguments)
 }
 
+/// Measures round trips over an MQTT broker beside those of paho.
+pub(crate) fn mqtt(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<CommandOutcome> {
+    measured(workspace, "bench-mqtt", &["system-tests"], arguments)
+}
+
 /// Measures many cells at one broker.
 pub(crate) fn plant(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<CommandOutcome> {
     measured(workspace, "bench-plant", &["system-tests"], arguments)

@@ -58,6 +58,7 @@ cargo xtask <verb>
   bench opcua [ARGS]             measure ua-server beside servers of asyncua and node-opcua, and what comes from the space to clients
   bench redundancy [FAULTS]      measure the gaps of random faults of two redundant bridges at 1 kHz, 200 unless told
   bench knowledge [ARGS]         measure manifests, NodeSets, questions, the journal and plans of the knowledge of the plant
+  bench mqtt [ROUND_TRIPS]       measure round trips over an MQTT broker beside those of paho
   bench plant [CELLS]            measure many cells at one MQTT broker, 100 cells of 1000 topics unless told
   bench skills [ARGS]            measure what clients wait for of skills and of servers that are plugged in (finding), round trips (rtt), and locked tools (lock)
   bench charts [--check]         draw the pictures of docs/benchmarks.md from its tables; or only check that they are current
@@ -113,6 +114,7 @@ fn run(arguments: &[&str]) -> anyhow::Result<CommandOutcome> {
         ["bench", "opcua", rest @ ..] => bench::opcua(&Workspace::find()?, rest),
         ["bench", "redundancy", rest @ ..] => bench::redundancy(&Workspace::find()?, rest),
         ["soak", rest @ ..] => bench::soak(&Workspace::find()?, rest),
+        ["bench", "mqtt", rest @ ..] => bench::mqtt(&Workspace::find()?, rest),
         ["bench", "plant", rest @ ..] => bench::plant(&Workspace::find()?, rest),
         ["bench", "skills", rest @ ..] => bench::skills(&Workspace::find()?, rest),
         ["bench", "ros2", rest @ ..] => bench::ros2(&Workspace::find()?, rest),
