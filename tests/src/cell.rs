@@ -50,7 +50,8 @@ pub enum Peer {
     Mosquitto,
     /// nats-server, which speaks MQTT, from Debian or Ubuntu.
     Nats,
-    /// The MQTT client aiomqtt, in a Python environment that `cargo xtask test` makes.
+    /// The MQTT clients aiomqtt and paho and the broker amqtt, in a Python environment that `cargo
+    /// xtask test` makes.
     MqttPython,
 }
 

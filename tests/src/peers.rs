@@ -303,7 +303,8 @@ impl Cell {
         prefix
     }
 
-    /// Returns a script of `peers/` with the MQTT client aiomqtt, not started yet.
+    /// Returns a script of `peers/` with the clients and the broker of MQTT in Python, not started
+    /// yet.
     #[must_use]
     pub fn mqtt_python_started(&self, script: &str, args: &[&str]) -> StartedChild {
         Self::python_of(&compiled(MQTT_PYTHON), script, args)

@@ -400,6 +400,27 @@ fn mosquitto_conforms(version: MqttVersion) {
     run(conforms(&mut network, faults));
 }
 
+/// amqtt, a broker of another maker.
+struct Amqtt<'c> {
+    cell: &'c Cell,
+    broker: Option<Child>,
+}
+
+impl Network for Amqtt<'_> {
+    fn join(&self, publisher: u16) -> Box<dyn Carrier> {
+        mqtt(BROKER, MqttVersion::V3_1_1, publisher)
+    }
+
+    fn cut(&mut self) {
+        self.broker = None;
+    }
+
+    fn mend(&mut self) {
+        let started = self.cell.mqtt_python_started("mqtt_broker.py", &[]);
+        self.broker = Some(started.start().ready(SOON));
+    }
+}
+
 /// Returns a network with both carriers.
 fn both(cell: &Cell) -> Both<'_> {
     Both {
@@ -470,6 +491,24 @@ fn mqtt_3_1_1_conforms() {
 #[test]
 fn mqtt_5_conforms() {
     mosquitto_conforms(MqttVersion::V5);
+}
+
+#[test]
+fn programs_at_a_broker_of_amqtt_conform() {
+    let Some(cell) = Cell::with(&[Peer::MqttPython]) else {
+        return;
+    };
+    let mut network = Amqtt {
+        cell: &cell,
+        broker: None,
+    };
+    network.mend();
+    // amqtt delivers the flood for longer than the suite looks for it.
+    let faults = Faults {
+        loses: true,
+        reorders: false,
+    };
+    run(conforms(&mut network, faults));
 }
 
 #[test]

@@ -63,7 +63,7 @@ const APT_COMPILED: &[&str] = &[
 /// Distributions of ROS 2 have the same packages in different versions.
 const VENVS: [(&str, &str); 4] = [
     (PYTHON, "requirements.txt"),
-    // A client of MQTT.
+    // Clients and a broker of MQTT.
     ("mqtt", "mqtt.txt"),
     ("ros2-jazzy", "ros2-jazzy.txt"),
     ("ros2-kilted", "ros2-kilted.txt"),
