@@ -16,9 +16,10 @@ use uadp::discovery::ConnectionState;
 use uadp::{NetworkMessage, Timestamp};
 
 use crate::address::{self, Addressed, alone};
-use crate::connection::{BrokerLink, ConnectionShared, SharedState, instant, run};
+use crate::connection::{BrokerLink, SharedState, instant};
 use crate::echo::Echo;
 use crate::json::Json;
+use crate::links::BrokerLinks;
 use crate::packets::ReceivedPublish;
 use crate::producers::Producers;
 use crate::queue::QueuedPublish;
@@ -29,7 +30,7 @@ use crate::topics::{self, Address, JSON, TopicMessageType, UADP};
 /// A connection with an MQTT broker that carries the NetworkMessages of a program.
 pub struct Mqtt {
     settings: Arc<BrokerSettings>,
-    shared: Arc<ConnectionShared>,
+    links: BrokerLinks,
     received: mpsc::Receiver<(ReceivedPublish, SocketAddr)>,
     /// Messages for the caller.
     ready: VecDeque<(Vec<u8>, SocketAddr)>,
@@ -63,18 +64,13 @@ impl Mqtt {
     /// An [`OpenError`] if a file with certificates or the log-in cannot be used.
     pub fn open(broker: &Broker, identity: &BrokerIdentity) -> Result<Self, OpenError> {
         let settings = Arc::new(BrokerSettings::read(broker, identity)?);
-        let shared = Arc::new(ConnectionShared::default());
+        let confirmed = BrokerSettings::of_confirmed(broker, identity)?;
         let reports = BrokerReports::new(settings.will.is_some());
         let (out, received) = mpsc::channel(MAX_RECEIVED);
-        // The task ends when the carrier is closed or dropped.
-        drop(tokio::spawn(run(
-            Arc::clone(&settings),
-            Arc::clone(&shared),
-            out,
-        )));
+        let links = BrokerLinks::open(&settings, confirmed, out);
         Ok(Self {
             settings,
-            shared,
+            links,
             received,
             ready: VecDeque::new(),
             producers: Producers::default(),
@@ -99,12 +95,14 @@ impl Mqtt {
     fn publication(&self, encoding: &str, address: Address, payload: Vec<u8>) -> QueuedPublish {
         let retained = address.kind.is_retained();
         let broker = self.broker();
+        // Discovery messages are published again, and a broker that cannot retain them may end the
+        // connection of the values.
         let is_value = address.kind == TopicMessageType::Data;
         QueuedPublish {
             topic: topics::name(broker, encoding, address),
             payload,
             retained,
-            confirmed: broker.at_least_once && (retained || is_value),
+            confirmed: broker.at_least_once && is_value,
             replaceable: retained,
             outlasts: false,
             within: retained.then_some(RETAINED),
@@ -120,7 +118,8 @@ impl Mqtt {
     /// Publishes a retained message now and with each connection.
     fn keep(&mut self, publication: QueuedPublish) {
         self.echo.sent(&publication.topic, &publication.payload);
-        let mut state = self.shared.state();
+        let shared = self.links.main();
+        let mut state = shared.state();
         let SharedState {
             queue, kept, link, ..
         } = &mut *state;
@@ -132,25 +131,24 @@ impl Mqtt {
             kept.insert(publication.topic.clone(), publication);
         }
         drop(state);
-        self.shared.wake();
+        shared.wake();
     }
 
     /// Returns whether a message is an own retained message.
     fn is_kept(&self, topic: &str, payload: &[u8]) -> bool {
-        let state = self.shared.state();
-        let kept = state.kept.get(topic);
-        kept.is_some_and(|own| own.payload == payload)
+        self.links.keeps(topic, |own| own == payload)
     }
 
     /// Clears a retained message.
     fn clear(&self, topic: String) {
-        let mut state = self.shared.state();
+        let shared = self.links.main();
+        let mut state = shared.state();
         state.kept.remove(&topic);
         let cleared = QueuedPublish {
             topic,
             payload: Vec::new(),
             retained: true,
-            confirmed: true,
+            confirmed: false,
             replaceable: true,
             outlasts: false,
             within: None,
@@ -162,7 +160,7 @@ impl Mqtt {
             let _full = state.queue.push(cleared, instant()).is_err();
         }
         drop(state);
-        self.shared.wake();
+        shared.wake();
     }
 
     /// Clears the discovery messages of a topic.
@@ -177,8 +175,7 @@ impl Mqtt {
             };
             for encoding in [UADP, JSON] {
                 let name = topics::name(self.broker(), encoding, address);
-                let is_kept = self.shared.state().kept.contains_key(&name);
-                if is_kept {
+                if self.links.keeps(&name, |_| true) {
                     self.clear(name);
                 }
             }
@@ -371,11 +368,8 @@ impl Mqtt {
     }
 
     /// Publishes a message that the broker keeps, as UADP, and as JSON if the mapping wants JSON.
-    /// A message that `is_repeated` soon needs no confirmation by the broker.
-    fn announce(&mut self, network: &NetworkMessage<'_>, address: Address, is_repeated: bool) {
-        let mut uadp = self.publication(UADP, address, network.datagram().to_vec());
-        uadp.confirmed &= !is_repeated;
-        self.keep(uadp);
+    fn announce(&mut self, network: &NetworkMessage<'_>, address: Address) {
+        self.keep(self.publication(UADP, address, network.datagram().to_vec()));
         if !self.writes_json() {
             return;
         }
@@ -387,17 +381,15 @@ impl Mqtt {
             _ => None,
         };
         if let Some(json) = json {
-            let mut publication = self.publication(JSON, address, json);
-            publication.confirmed &= !is_repeated;
-            self.keep(publication);
+            self.keep(self.publication(JSON, address, json));
         }
     }
 
     /// Publishes the own status.
-    fn announce_status(&mut self, publisher: u16, status: &[u8], is_repeated: bool) {
+    fn announce_status(&mut self, publisher: u16, status: &[u8]) {
         if let Ok(network) = NetworkMessage::decode(status) {
             let address = alone(TopicMessageType::Status, publisher);
-            self.announce(&network, address, is_repeated);
+            self.announce(&network, address);
         }
     }
 
@@ -408,10 +400,7 @@ impl Mqtt {
         };
         let now = instant();
         if let Some(status) = self.reports.status(publisher, (now, utc())) {
-            // NATS ends the connection of a client if it cannot store its message with QoS 1 in
-            // 4 s, so a cyclic status would end each connection while there is no leader.
-            let is_cyclic = self.settings.will.is_none();
-            self.announce_status(publisher, &status, is_cyclic);
+            self.announce_status(publisher, &status);
         }
         if publisher != 0
             && let Some(connection) = self.reports.connection(publisher, now)
@@ -426,7 +415,7 @@ impl Mqtt {
             return;
         }
         for topic in self.reports.take_strays(now) {
-            if !self.shared.state().kept.contains_key(&topic) {
+            if !self.links.keeps(&topic, |_| true) {
                 self.clear(topic);
             }
         }
@@ -456,7 +445,7 @@ impl Carrier for Mqtt {
             self.withdraw(topic);
         }
         if address.kind.is_retained() {
-            self.announce(&network, address, false);
+            self.announce(&network, address);
             return Ok(());
         }
         // A forwarded value is of another publisher.
@@ -479,7 +468,8 @@ impl Carrier for Mqtt {
         // The time bounds the wait.
         publication.outlasts =
             publication.replaceable && !message.command && message.within.is_some();
-        let mut state = self.shared.state();
+        let shared = self.links.of(publication.confirmed);
+        let mut state = shared.state();
         let (version, max_packet) = match state.link {
             BrokerLink::Connected {
                 version,
@@ -493,12 +483,12 @@ impl Carrier for Mqtt {
         if max_packet.is_some_and(|most| u32::try_from(size).is_ok_and(|size| size > most)) {
             return Err(SendError::TooBig);
         }
-        if version == MqttVersion::V3_1_1 {
+        if self.links.are_returned(version) {
             self.echo.sent(&publication.topic, &publication.payload);
         }
         state.queue.push(publication, instant())?;
         drop(state);
-        self.shared.wake();
+        shared.wake();
         Ok(())
     }
 
@@ -542,12 +532,7 @@ impl Carrier for Mqtt {
     }
 
     fn lost(&self) -> Option<String> {
-        match &self.shared.state().link {
-            BrokerLink::Connected { .. } => None,
-            BrokerLink::Waiting(why) => {
-                Some(format!("waiting for broker {}: {why}", self.interface()))
-            }
-        }
+        self.links.lost(self.broker())
     }
 
     fn source(&self) -> Option<SocketAddr> {
@@ -571,31 +556,17 @@ impl Carrier for Mqtt {
     }
 
     fn limit(&self) -> Option<usize> {
-        match self.shared.state().link {
-            BrokerLink::Connected { max_packet, .. } => {
-                let most = usize::try_from(max_packet?).unwrap_or(usize::MAX);
-                Some(most.saturating_sub(self.broker().prefix.len() + OVERHEAD + LONGEST_TOPIC))
-            }
-            BrokerLink::Waiting(_) => None,
-        }
+        let most = usize::try_from(self.links.max_packet()?).unwrap_or(usize::MAX);
+        Some(most.saturating_sub(self.broker().prefix.len() + OVERHEAD + LONGEST_TOPIC))
     }
 
     fn dropped(&self) -> Vec<(&'static str, u64)> {
-        let state = self.shared.state();
-        let counted = [
-            ("queue_expired", state.queue.expired),
-            ("queue_replaced", state.queue.replaced),
-            ("connection_lost", state.queue.discarded),
-            ("not_confirmed", state.queue.unconfirmed),
-            ("packet_refused", state.queue.refused),
-            ("received_overflow", state.overflow),
-        ];
         let received = self.dropped.iter().map(|(reason, count)| (*reason, *count));
-        counted.into_iter().chain(received).collect()
+        self.links.dropped().into_iter().chain(received).collect()
     }
 
     fn close(&mut self) {
-        let kept: Vec<String> = self.shared.state().kept.keys().cloned().collect();
+        let kept = self.links.kept_topics();
         let status = self
             .settings
             .publisher
@@ -612,14 +583,14 @@ impl Carrier for Mqtt {
         if let Some(publisher) = self.settings.publisher
             && let Some(last) = self.reports.last_status(publisher)
         {
-            self.announce_status(publisher, &last, false);
+            self.announce_status(publisher, &last);
         }
-        self.shared.close();
+        self.links.close();
     }
 
     fn poll_closed(&mut self, cx: &mut Context<'_>) -> Poll<()> {
         loop {
-            if self.shared.is_closed() {
+            if self.links.are_closed() {
                 return Poll::Ready(());
             }
             let wait = self
@@ -635,7 +606,7 @@ impl Carrier for Mqtt {
 
 impl Drop for Mqtt {
     fn drop(&mut self) {
-        self.shared.close();
+        self.links.close();
     }
 }
 

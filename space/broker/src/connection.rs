@@ -22,6 +22,7 @@ use crate::queue::{QueuedMessage, QueuedPublish, SendQueue};
 use crate::settings::{BrokerSettings, random};
 use crate::stream::{BrokerStream, connect};
 use crate::subscriptions::{Response, Subscriptions};
+use crate::version::{VersionChoice, VersionResponse};
 
 /// The state that the task shares with the carrier.
 #[derive(Debug, Default)]
@@ -125,19 +126,17 @@ pub(crate) async fn run(
     received: mpsc::Sender<(ReceivedPublish, SocketAddr)>,
 ) {
     let mut pause = FIRST_PAUSE;
-    let mut version = settings.broker.version.unwrap_or(MqttVersion::V5);
+    let mut version = VersionChoice::new(settings.broker.version);
     let mut retains = true;
     loop {
         let before = shared.state().connections;
         let began = TokioInstant::now();
-        let mut session = Session::new(&settings, &shared, (version, retains));
+        let mut session = Session::new(&settings, &shared, (version.next(), retains));
         let ended = session.run(&received).await;
-        if session.refuses_version && settings.broker.version.is_none() {
-            version = match version {
-                MqttVersion::V5 => MqttVersion::V3_1_1,
-                MqttVersion::V3_1_1 => MqttVersion::V5,
-            };
-        }
+        version.ended(match session.accepted {
+            Some(_) => VersionResponse::Accepted,
+            None => session.response,
+        });
         retains &= session.retains;
         // A broker that accepts and closes at once is no reason to hurry.
         if shared.state().connections > before && began.elapsed() > LAST_PAUSE {
@@ -183,7 +182,8 @@ struct Session<'a> {
     accepted: Option<ConnectAck>,
     subscriptions: Subscriptions,
     at: SocketAddr,
-    refuses_version: bool,
+    /// The response to the version, until the broker accepts it.
+    response: VersionResponse,
     /// Whether the broker takes retained messages.
     retains: bool,
     /// The time at which a broker that retains no messages receives those messages again that
@@ -223,7 +223,7 @@ impl<'a> Session<'a> {
             accepted: None,
             subscriptions: Subscriptions::default(),
             at: SocketAddr::from(([0, 0, 0, 0], 0)),
-            refuses_version: false,
+            response: VersionResponse::Unknown,
             retains,
             next_kept: None,
             over: None,
@@ -302,7 +302,7 @@ impl<'a> Session<'a> {
             tokio::select! {
                 read = reader.read(&mut buffer) => match read {
                     Ok(0) => {
-                        self.refuses_version = self.accepted.is_none();
+                        self.response = VersionResponse::Silent;
                         return BrokerConnectionEnd::Lost("the broker closed the connection".to_owned());
                     }
                     Ok(length) => self.receive(buffer.get(..length).unwrap_or_default()),
@@ -523,7 +523,9 @@ impl<'a> Session<'a> {
                 version,
                 retained_will,
             } => {
-                self.refuses_version = version;
+                if version {
+                    self.response = VersionResponse::Refused;
+                }
                 self.retains &= !retained_will;
                 self.over = Some(why);
             }
@@ -540,6 +542,7 @@ impl<'a> Session<'a> {
         for filter in 0..self.settings.filters.len() {
             self.subscribe(filter);
         }
+        self.settle();
     }
 
     /// Requests a subscription.
@@ -564,10 +567,15 @@ impl<'a> Session<'a> {
         }
     }
 
-    /// Handles the response to a subscription. After the last response, messages are sent.
+    /// Handles the response to a subscription.
     fn subscribed(&mut self, id: u16, refused: bool) {
         let response = self.subscriptions.respond(id, refused, instant());
         self.report(response);
+        self.settle();
+    }
+
+    /// Begins to send messages, if the broker has responded to all subscriptions.
+    fn settle(&mut self) {
         let Some(ConnectAck { max_packet, .. }) = self.accepted else {
             return;
         };

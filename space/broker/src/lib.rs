@@ -7,6 +7,8 @@
 //! A broker stores messages. Therefore:
 //! - Values, commands, requests and responses are never retained, sessions end with the
 //!   connection, and with MQTT 5 messages expire. Nothing is queued for an absent reader.
+//! - Values that the broker confirms (QoS 1) have a connection of their own, so that a broker that
+//!   ends it takes no subscription with it.
 //! - A message waits at most its time in the own queue. While the broker is away, only the newest
 //!   state of each topic waits, and older states that the broker confirms (QoS 1).
 //! - A broker that does not answer for [`STALL`] is left with a reset, which discards the messages
@@ -23,6 +25,7 @@ mod cells;
 mod connection;
 mod echo;
 mod json;
+mod links;
 mod packets;
 mod producers;
 mod queue;
@@ -32,6 +35,7 @@ mod settings;
 mod stream;
 mod subscriptions;
 mod topics;
+mod version;
 
 pub use carrier::Mqtt;
 pub use cells::{CellStatus, CellWatch};

@@ -85,6 +85,24 @@ impl BrokerSettings {
             filters: topics::filters(broker),
         })
     }
+
+    /// Returns the settings of a connection that only sends messages that the broker confirms;
+    /// `None` if the broker confirms none.
+    pub(crate) fn of_confirmed(
+        broker: &Broker,
+        identity: &BrokerIdentity,
+    ) -> Result<Option<Self>, OpenError> {
+        if !broker.at_least_once || identity.publisher.is_none() {
+            return Ok(None);
+        }
+        let main = Self::read(broker, identity)?;
+        Ok(Some(Self {
+            client_id: format!("{}-confirmed", main.client_id),
+            will: None,
+            filters: Vec::new(),
+            ..main
+        }))
+    }
 }
 
 /// Returns the will of a program that alone uses its PublisherId. The programs of space 0 share

@@ -89,6 +89,35 @@ fn a_session_requests_a_subscription_again_that_a_cluster_without_a_leader_refus
 }
 
 #[test]
+fn a_session_without_subscriptions_sends_as_soon_as_the_broker_accepts_it() {
+    let (mut settings, shared) = (settings(), ConnectionShared::default());
+    settings.filters.clear();
+    let opened = (MqttVersion::V3_1_1, true);
+    let mut session = Session::new(&settings, &shared, opened);
+    session.send(packets::connect(&settings, opened).unwrap());
+    let _connect = written(&mut session);
+    let state = publication("state", 1, true);
+    shared.state().queue.push(state, instant()).unwrap();
+    let _is_closed = session.fill();
+    assert!(!session.is_connected() && written(&mut session).is_empty());
+    session.receive(&[0x20, 2, 0, 0]);
+    let _is_closed = session.fill();
+    assert!(session.is_connected() && has(&written(&mut session), "state"));
+}
+
+#[test]
+fn a_session_keeps_the_response_of_the_broker_to_its_version() {
+    let (settings, shared) = (settings(), ConnectionShared::default());
+    let mut session = Session::new(&settings, &shared, (MqttVersion::V3_1_1, true));
+    assert_eq!(session.response, VersionResponse::Unknown);
+    session.send(packets::connect(&settings, (MqttVersion::V3_1_1, true)).unwrap());
+    // The broker does not support the version (MQTT 3.1.1, 3.2.2.3).
+    session.receive(&[0x20, 2, 0, 1]);
+    assert_eq!(session.response, VersionResponse::Refused);
+    assert!(session.accepted.is_none());
+}
+
+#[test]
 fn a_lost_connection_leaves_unconfirmed_states_for_the_next_and_counts_the_other_messages() {
     let (settings, shared) = (settings(), ConnectionShared::default());
     let mut session = accepted(&settings, &shared);
