@@ -3,6 +3,7 @@
 
 mod clusters;
 pub(crate) mod commanded;
+mod foreign_json;
 mod judges;
 mod late_joiner;
 

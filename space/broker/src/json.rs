@@ -8,6 +8,8 @@
 //! of the NetworkMessage, which JSON does not have.
 
 mod descriptions;
+mod forms;
+mod names;
 mod read;
 #[cfg(test)]
 mod tests;

@@ -13,6 +13,8 @@ pub struct JsonStructure {
     pub data_type: u32,
     /// NodeId of its binary encoding in namespace 0.
     pub encoding: u32,
+    /// NodeId of its JSON encoding in namespace 0.
+    json_encoding: u32,
     fields: &'static [(&'static str, StructurePartType)],
 }
 
@@ -33,6 +35,27 @@ impl JsonStructure {
     #[must_use]
     pub fn by_data_type(data_type: u32) -> Option<&'static Self> {
         KNOWN.iter().find(|known| known.data_type == data_type)
+    }
+
+    /// Returns the structure with this NodeId of its type, or of its binary or JSON encoding. The
+    /// numbers of namespace 0 are unique.
+    #[must_use]
+    pub fn by_type_or_encoding(id: u32) -> Option<&'static Self> {
+        KNOWN
+            .iter()
+            .find(|known| [known.data_type, known.encoding, known.json_encoding].contains(&id))
+    }
+
+    /// Converts each field with its type. A missing field is `None`; unknown keys are kept.
+    ///
+    /// # Errors
+    /// The first error of `convert`.
+    pub fn map_fields<E>(
+        &self,
+        json: &Map<String, Value>,
+        convert: &mut impl FnMut(BuiltinType, Option<&Value>) -> Result<Value, E>,
+    ) -> Result<Map<String, Value>, E> {
+        map_fields(self.fields, json, convert)
     }
 
     /// Returns the fields of a body; `None` if the body has other fields, or encoding the fields
@@ -57,6 +80,30 @@ impl JsonStructure {
     pub fn write(&self, json: &Map<String, Value>, out: &mut Vec<u8>) -> Result<(), WrongValue> {
         write_fields(self.fields, &["UaTypeId"], json, out)
     }
+}
+
+fn map_fields<E, C: FnMut(BuiltinType, Option<&Value>) -> Result<Value, E>>(
+    fields: &[(&str, StructurePartType)],
+    json: &Map<String, Value>,
+    convert: &mut C,
+) -> Result<Map<String, Value>, E> {
+    let mut mapped = json.clone();
+    let empty = Map::new();
+    for (name, part) in fields {
+        let value = json.get(*name);
+        let converted = match (part, value) {
+            (StructurePartType::Value(builtin), value) => convert(*builtin, value)?,
+            (StructurePartType::Inline(fields), None | Some(Value::Null)) => {
+                map_fields(fields, &empty, convert)?.into()
+            }
+            (StructurePartType::Inline(fields), Some(Value::Object(inner))) => {
+                map_fields(fields, inner, convert)?.into()
+            }
+            (StructurePartType::Inline(_), Some(other)) => other.clone(),
+        };
+        mapped.insert((*name).to_owned(), converted);
+    }
+    Ok(mapped)
 }
 
 fn show_fields(
@@ -106,16 +153,19 @@ const KNOWN: [JsonStructure; 3] = [
     JsonStructure {
         data_type: 884,
         encoding: 886,
+        json_encoding: 15375,
         fields: RANGE,
     },
     JsonStructure {
         data_type: 887,
         encoding: 889,
+        json_encoding: 15376,
         fields: EU_INFORMATION,
     },
     JsonStructure {
         data_type: 18814,
         encoding: 18823,
+        json_encoding: 19072,
         fields: THREE_D_FRAME,
     },
 ];

@@ -10,6 +10,8 @@ use uadp::discovery::{
 };
 use uadp::{BuiltinType, NetworkMessage, NodeId, PublisherId, SecurityHeader, StatusCode};
 
+use super::names;
+
 /// PublisherId, WriterGroupId and DataSetWriterId.
 pub(super) type WriterIds = (u16, u16, u16);
 
@@ -25,6 +27,8 @@ pub(super) struct DataSetField {
     pub(super) name: String,
     /// The builtin type; `None` if the values have different types.
     pub(super) builtin: Option<BuiltinType>,
+    /// The number of the DataType in namespace 0; `None` in another namespace.
+    pub(super) data_type: Option<u32>,
     pub(super) value_rank: i32,
 }
 
@@ -41,6 +45,7 @@ impl Descriptions {
             builtin: field
                 .builtin_type()
                 .filter(|of| *of != BuiltinType::Variant),
+            data_type: names::standard_number(field.data_type),
             value_rank: field.value_rank,
         });
         self.insert(topic, fields.collect());
@@ -118,6 +123,7 @@ fn field(json: &Value) -> Option<DataSetField> {
     Some(DataSetField {
         name: json.get("Name")?.as_str()?.to_owned(),
         builtin: builtin.filter(|of| *of != BuiltinType::Variant),
+        data_type: json.get("DataType").and_then(names::standard_type),
         value_rank: i32::try_from(rank).ok()?,
     })
 }

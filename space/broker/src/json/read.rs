@@ -4,11 +4,12 @@ use json_values::{JsonFieldValue, iso_time};
 use serde_json::{Map, Value};
 use uadp::discovery::{ConnectionState, CyclicStatus};
 use uadp::{
-    DataSetHeader, DateTime, GroupHeader, Nested, NetworkHeader, NetworkMessageEncoder,
-    PublisherId, Variant,
+    DataSetHeader, DataValue, DateTime, GroupHeader, Nested, NetworkHeader, NetworkMessageEncoder,
+    PublisherId, StatusCode, Variant,
 };
 
-use super::{DataSetField, Json, WriterIds};
+use super::forms::ValueForms;
+use super::{Json, WriterIds};
 use crate::topics::Address;
 
 /// The contents of a JSON message.
@@ -179,49 +180,102 @@ impl Json {
         Ok(bytes)
     }
 
-    /// Returns the Variants of a payload by their index; `None` for a field that is not there.
+    /// Returns the fields of a payload by their index; `None` for a field that is not there.
     fn fields(
         &self,
         topic: WriterIds,
         payload: &Map<String, Value>,
         faults: &mut Vec<&'static str>,
-    ) -> Result<Vec<Option<Vec<u8>>>, &'static str> {
+    ) -> Result<Vec<Option<FieldBytes>>, &'static str> {
+        let mut forms = ValueForms::default();
         let Some(described) = self.others.of(topic) else {
             // The order of several fields is unknown without metadata.
             let mut values = payload.values();
-            return match (values.next(), values.next()) {
-                (Some(value), None) => Ok(vec![Some(variant(value, None)?)]),
-                _ => Err("undescribed_json"),
+            let (Some(value), None) = (values.next(), values.next()) else {
+                return Err("undescribed_json");
             };
+            let value = FieldBytes::encode(forms.field(value, None)?)?;
+            faults.extend(forms.fault());
+            return Ok(vec![Some(value)]);
         };
         let is_known = |key: &String| described.iter().any(|field| field.name == *key);
         if payload.keys().any(|key| !is_known(key)) {
             faults.push("unknown_field");
         }
-        let value = |field: &DataSetField| {
-            let value = payload.get(&field.name);
-            value.map(|value| variant(value, Some(field))).transpose()
-        };
-        described.iter().map(value).collect()
+        let mut fields = Vec::with_capacity(described.len());
+        for field in described {
+            let value = match payload.get(&field.name) {
+                Some(value) => Some(FieldBytes::encode(forms.field(value, Some(field))?)?),
+                None => None,
+            };
+            fields.push(value);
+        }
+        faults.extend(forms.fault());
+        Ok(fields)
     }
 }
 
-/// Writes a key frame or event. A missing field is null.
+/// A field of a payload.
+struct FieldBytes {
+    /// A Variant.
+    variant: Vec<u8>,
+    /// The status of the field, if it is not Good.
+    status: Option<StatusCode>,
+}
+
+impl FieldBytes {
+    fn encode(mut value: JsonFieldValue) -> Result<Self, &'static str> {
+        let status = value.status.take().map(|status| StatusCode(status.code));
+        let variant = json_values::variant_bytes(&value).map_err(|_| "wrong_json_value")?;
+        let status = status.filter(|status| *status != StatusCode::GOOD);
+        Ok(Self { variant, status })
+    }
+
+    fn variant(&self) -> Option<Variant<'_>> {
+        Nested::new(&self.variant).ok()?.get().ok()
+    }
+
+    fn data_value(&self) -> Option<DataValue<'_>> {
+        let value = self.variant()?;
+        Some(DataValue {
+            value: (value != Variant::Null).then_some(value),
+            status: self.status,
+            ..DataValue::default()
+        })
+    }
+}
+
+fn has_status(fields: &[Option<FieldBytes>]) -> bool {
+    fields.iter().flatten().any(|field| field.status.is_some())
+}
+
+/// Writes a key frame or event. A missing field is null. Fields with a status make it a key frame
+/// of DataValues; events have Variants only.
 fn frame(
     encoder: &mut NetworkMessageEncoder<'_>,
     (header, kind): (&DataSetHeader, &str),
-    fields: &[Option<Vec<u8>>],
+    fields: &[Option<FieldBytes>],
 ) -> Option<()> {
-    let mut frame = match kind {
-        "ua-event" => encoder.event(header).ok()?,
-        _ => encoder.key_frame(header).ok()?,
+    let is_event = kind == "ua-event";
+    if !is_event && has_status(fields) {
+        let mut frame = encoder.data_values(header).ok()?;
+        for field in fields {
+            let value = match field {
+                Some(field) => field.data_value()?,
+                None => DataValue::default(),
+            };
+            frame.value(&value).ok()?;
+        }
+        return frame.finish().ok();
+    }
+    let mut frame = if is_event {
+        encoder.event(header).ok()?
+    } else {
+        encoder.key_frame(header).ok()?
     };
     for field in fields {
         match field {
-            Some(bytes) => {
-                let value = Nested::<Variant<'_>>::new(bytes).ok()?.get().ok()?;
-                frame.variant(&value).ok()?;
-            }
+            Some(field) => frame.variant(&field.variant()?).ok()?,
             None => frame.null().ok()?,
         }
     }
@@ -231,69 +285,22 @@ fn frame(
 fn delta(
     encoder: &mut NetworkMessageEncoder<'_>,
     header: &DataSetHeader,
-    fields: &[Option<Vec<u8>>],
+    fields: &[Option<FieldBytes>],
 ) -> Option<()> {
-    let mut frame = encoder.delta_frame(header).ok()?;
-    for (field, index) in fields.iter().zip(0..) {
-        if let Some(bytes) = field {
-            let value = Nested::<Variant<'_>>::new(bytes).ok()?.get().ok()?;
-            frame.field(index).ok()?.variant(&value).ok()?;
+    let changed = fields.iter().zip(0_u16..);
+    let changed = changed.filter_map(|(field, index)| Some((index, field.as_ref()?)));
+    if has_status(fields) {
+        let mut frame = encoder.delta_data_values(header).ok()?;
+        for (index, field) in changed {
+            frame.changed(index, &field.data_value()?).ok()?;
         }
+        return frame.finish().ok();
+    }
+    let mut frame = encoder.delta_frame(header).ok()?;
+    for (index, field) in changed {
+        frame.field(index).ok()?.variant(&field.variant()?).ok()?;
     }
     frame.finish().ok()
-}
-
-/// Returns the bytes of a Variant: with its type (UaType and Value, Type and Body), as a DataValue,
-/// or plain and with the type of the metadata.
-fn variant(json: &Value, field: Option<&DataSetField>) -> Result<Vec<u8>, &'static str> {
-    if let Some(whole) = json.as_object() {
-        let typed = [("UaType", "Value"), ("Type", "Body")]
-            .iter()
-            .find_map(|(kind, value)| Some((whole.get(*kind)?, whole.get(*value))));
-        if let Some((kind, value)) = typed {
-            let kind = kind.as_u64().and_then(|id| u8::try_from(id).ok());
-            let dimensions = ["Dimensions", "UaDimensions"]
-                .iter()
-                .find_map(|key| whole.get(*key));
-            let dimensions = dimensions.and_then(Value::as_array).map(|list| {
-                let number = |of: &Value| of.as_u64().and_then(|of| u32::try_from(of).ok());
-                list.iter().filter_map(number).collect::<Vec<u32>>()
-            });
-            let is_matrix = dimensions.as_ref().is_some_and(|of| of.len() > 1);
-            return encoded(JsonFieldValue {
-                ua_type: Some(kind.ok_or("malformed_json")?),
-                value: value.cloned(),
-                dimensions: dimensions.filter(|_| is_matrix),
-                ..JsonFieldValue::default()
-            });
-        }
-        // A DataValue of version 1.04, or of a stack that leaves the type out.
-        let is_data_value = field.is_none_or(|field| !is_structure(field));
-        if let Some(value) = whole.get("Value").filter(|_| is_data_value) {
-            return variant(value, field);
-        }
-    }
-    let builtin = match (field.map(|field| field.builtin), json) {
-        (_, Value::Null) => return encoded(JsonFieldValue::default()),
-        (Some(Some(builtin)), _) => builtin,
-        (_, Value::Bool(_)) => uadp::BuiltinType::Boolean,
-        (_, Value::String(_)) => uadp::BuiltinType::String,
-        // The type of a number or structure is unknown.
-        _ => return Err("undescribed_json"),
-    };
-    encoded(JsonFieldValue {
-        ua_type: Some(builtin.id()),
-        value: Some(json.clone()),
-        ..JsonFieldValue::default()
-    })
-}
-
-fn is_structure(field: &DataSetField) -> bool {
-    field.builtin == Some(uadp::BuiltinType::ExtensionObject)
-}
-
-fn encoded(value: JsonFieldValue) -> Result<Vec<u8>, &'static str> {
-    json_values::variant_bytes(&value).map_err(|_| "wrong_json_value")
 }
 
 fn status(whole: &Map<String, Value>) -> Option<(ConnectionState, Option<CyclicStatus>)> {

@@ -31,7 +31,7 @@ fn now() -> Timestamp {
     Timestamp::from_unix_nanos(1_700_000_000_123_456_700)
 }
 
-/// Returns an announcement of the fields a to e.
+/// Returns an announcement of the fields of [`value`].
 fn announcement() -> Vec<u8> {
     let field = |name, builtin: BuiltinType, value_rank| FieldMetaData {
         name: Some(name),
@@ -263,4 +263,57 @@ fn a_status_is_read_as_it_was_written() {
         let read = json.read(&text, TOPIC).unwrap();
         assert_eq!(read.status, Some(status));
     }
+}
+
+/// Returns the fields of a message as DataValues: their values, shown, and their status.
+fn with_status(receiver: &mut Json, text: &Value) -> Vec<(u16, Option<Value>, Option<StatusCode>)> {
+    let reading = receiver.read(text.to_string().as_bytes(), TOPIC).unwrap();
+    let message = NetworkMessage::decode(&reading.messages[0]).unwrap();
+    let data = message.messages().next().unwrap().unwrap();
+    let fields = data.values().unwrap().map(|field| {
+        let field = field.unwrap();
+        let value = field.value.value.map(|value| {
+            let shown = json_values::show_variant(&value).unwrap();
+            shown.value.unwrap_or_default()
+        });
+        (field.index, value, field.value.status)
+    });
+    fields.collect()
+}
+
+#[test]
+fn a_field_keeps_its_status_unless_it_is_good() {
+    let (_, mut known) = both(MessageMapping::JsonVerbose);
+    let timeout = StatusCode(0x800A_0000);
+    let uncertain = StatusCode(0x4000_0000);
+    let payload = json!({
+        "zone": {"Value": 1.5, "Status": {"Code": 0x800A_0000_u32, "Symbol": "BadTimeout"}},
+        "count": {"UaType": 8, "Value": "3", "StatusCode": {"Code": 0x4000_0000}},
+        "axes": {"Status": {"Code": 0x800A_0000_u32}},
+        "label": {"Type": 12, "Body": "x", "Status": 0},
+    });
+    let zone = (0, Some(json!(1.5)), Some(timeout));
+    let count = (1, Some(json!("3")), Some(uncertain));
+    let axes = (2, None, Some(timeout));
+    let label = (3, Some(json!("x")), None);
+    assert_eq!(
+        with_status(&mut known, &json!({ "Payload": payload })),
+        [
+            zone.clone(),
+            count.clone(),
+            axes.clone(),
+            label.clone(),
+            (4, None, None)
+        ]
+    );
+    let delta = json!({"MessageType": "ua-deltaframe", "Payload": payload});
+    assert_eq!(with_status(&mut known, &delta), [zone, count, axes, label]);
+    let good =
+        json!({"zone": {"Value": 1.5, "Status": {}, "SourceTimestamp": "2026-01-01T00:00:00Z"}});
+    assert_eq!(
+        read(&mut known, &good).unwrap(),
+        ["Some(11) 1.5, None null, None null, None null, None null"]
+    );
+    let wrong = json!({"zone": {"Value": 1.5, "Status": "bad"}});
+    assert_eq!(read(&mut known, &wrong), Err("wrong_json_value"));
 }
