@@ -71,12 +71,13 @@ impl ValueForms {
             _ => return Err("undescribed_json"),
         };
         let data_type = field.and_then(|field| field.data_type);
-        let value = match json {
-            Value::Array(elements) => elements
+        let value = if let Some(elements) = json.as_array() {
+            elements
                 .iter()
                 .map(|element| self.element(builtin, element, data_type))
-                .collect::<Converted<Value>>()?,
-            _ => self.element(builtin, json, data_type)?,
+                .collect::<Converted<Value>>()?
+        } else {
+            self.element(builtin, json, data_type)?
         };
         Ok(JsonFieldValue {
             ua_type: Some(builtin.id()),
@@ -139,7 +140,9 @@ impl ValueForms {
             Some(value) => self.scalar(builtin, value)?,
         };
         self.is_nonstandard |= whole.contains_key("UaDimensions");
-        let dimensions = whole.get("Dimensions").or(whole.get("UaDimensions"));
+        let dimensions = ["Dimensions", "UaDimensions"]
+            .iter()
+            .find_map(|key| whole.get(*key));
         let dimensions = dimensions.and_then(Value::as_array).map(|list| {
             let number = |of: &Value| of.as_u64().and_then(|of| u32::try_from(of).ok());
             list.iter().filter_map(number).collect::<Vec<u32>>()
@@ -160,9 +163,10 @@ impl ValueForms {
         json: &Value,
         data_type: Option<u32>,
     ) -> Converted<Value> {
-        match builtin {
-            BuiltinType::ExtensionObject => self.structure(json, data_type),
-            _ => self.scalar(builtin, json),
+        if builtin == BuiltinType::ExtensionObject {
+            self.structure(json, data_type)
+        } else {
+            self.scalar(builtin, json)
         }
     }
 
@@ -302,7 +306,8 @@ impl ValueForms {
     /// Returns the status of a DataValue; `None` without one.
     fn status_of(&mut self, whole: &Map<String, Value>) -> Converted<Option<JsonStatus>> {
         self.is_nonstandard |= whole.contains_key("StatusCode");
-        let Some(json) = whole.get("Status").or(whole.get("StatusCode")) else {
+        let keys = ["Status", "StatusCode"];
+        let Some(json) = keys.iter().find_map(|key| whole.get(*key)) else {
             return Ok(None);
         };
         let code = status_number(json).ok_or("wrong_json_value")?;
@@ -333,14 +338,13 @@ fn status(json: &Value) -> Value {
 }
 
 fn status_number(json: &Value) -> Option<u32> {
-    let number = match json {
-        Value::Null => return Some(0),
-        Value::Object(whole) => match whole.get("Code") {
-            Some(code) => code,
-            None => return Some(0),
-        },
-        other => other,
+    let number = match json.as_object() {
+        Some(whole) => whole.get("Code").unwrap_or(&Value::Null),
+        None => json,
     };
+    if number.is_null() {
+        return Some(0);
+    }
     u32::try_from(number.as_u64()?).ok()
 }
 

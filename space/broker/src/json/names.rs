@@ -12,11 +12,11 @@ use uadp::{NodeId, NodeIdValue};
 /// Returns a NodeId, or with `expanded` an ExpandedNodeId. A value of another shape is returned
 /// unchanged.
 pub(super) fn node_id(json: &Value, expanded: bool) -> Value {
-    let converted = match json {
-        Value::String(text) => Some(from_text(text, expanded)),
-        Value::Object(whole) => from_object(whole).map(|text| from_text(&text, expanded)),
-        _ => None,
+    let text = match json.as_object() {
+        Some(whole) => from_object(whole),
+        None => json.as_str().map(str::to_owned),
     };
+    let converted = text.map(|text| from_text(&text, expanded));
     converted.map_or_else(|| json.clone(), Value::from)
 }
 
@@ -68,28 +68,28 @@ fn prefix(value: Option<&Value>, index: &str, uri: &str) -> Option<String> {
 
 /// Returns a QualifiedName. A value of another shape is returned unchanged.
 pub(super) fn qualified_name(json: &Value) -> Value {
-    match json {
-        Value::String(text) => match text.strip_prefix(STANDARD) {
+    if let Some(text) = json.as_str() {
+        return match text.strip_prefix(STANDARD) {
             Some(behind) => json!({ "Name": behind }),
             None if text.starts_with("nsu=") => json!({ "Name": text }),
             None => json.clone(),
-        },
-        Value::Object(whole) => match whole.get("Uri") {
-            Some(Value::String(uri)) => {
-                let name = whole.get("Name").and_then(Value::as_str);
-                let text = format!("nsu={};{}", escaped(uri), name.unwrap_or_default());
-                qualified_name(&text.into())
-            }
-            Some(index) => {
-                let mut indexed = whole.clone();
-                indexed.insert("NamespaceIndex".to_owned(), index.clone());
-                indexed.remove("Uri");
-                indexed.into()
-            }
-            None => json.clone(),
-        },
-        _ => json.clone(),
+        };
     }
+    let Some((whole, namespace)) = json
+        .as_object()
+        .and_then(|whole| Some((whole, whole.get("Uri")?)))
+    else {
+        return json.clone();
+    };
+    if let Some(uri) = namespace.as_str() {
+        let name = whole.get("Name").and_then(Value::as_str);
+        let text = format!("nsu={};{}", escaped(uri), name.unwrap_or_default());
+        return qualified_name(&text.into());
+    }
+    let mut indexed = whole.clone();
+    indexed.insert("NamespaceIndex".to_owned(), namespace.clone());
+    indexed.remove("Uri");
+    indexed.into()
 }
 
 /// Returns the number of a DataType of namespace 0, in one of the forms of a NodeId.
