@@ -463,6 +463,8 @@ pub struct Meaning {
     pub description: Option<String>,
     /// Number of digits after the decimal point that are worth showing.
     pub precision: Option<u8>,
+    /// Whether its fields are copied into message headers (PromotedField: OPC 10000-14, 6.2.3.2.5).
+    pub promoted: bool,
 }
 
 impl Meaning {

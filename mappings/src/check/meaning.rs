@@ -89,6 +89,7 @@ pub(super) fn check(
     Some(Meaning {
         description: description?,
         precision: precision?,
+        promoted: given(&entry.promoted).is_some_and(|(on, _)| *on),
         ..Meaning::new(unit, range, texts)
     })
 }

@@ -41,6 +41,9 @@ document! {
         /// Number of decimal places to show (ValuePrecision), for a number.
         #[schemars(range(max = 15))]
         precision: u16,
+        /// `true` copies the fields of the value into the headers of its MQTT messages, as user
+        /// properties of MQTT 5 (promoted fields), and marks them in its metadata.
+        promoted: bool,
         /// Unit of the value in OPC UA: a symbol such as m/s, a UNECE code such as MTS, or a name.
         unit: String,
         /// Lowest and highest expected value in OPC UA, such as [0, 1.5].

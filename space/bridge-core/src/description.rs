@@ -429,6 +429,7 @@ impl MetaDataSource<'_> {
         FieldMetaData {
             name: Some(&said.name),
             description: text(&said.description),
+            field_flags: self.field_flags(),
             built_in_type: leaf.builtin.id(),
             data_type: data_type(leaf.builtin, of.filter(|_| structure), namespace),
             value_rank: value_rank(leaf.rank),
@@ -437,6 +438,12 @@ impl MetaDataSource<'_> {
             properties: list(if index == 0 { properties } else { &[] }),
             ..FieldMetaData::default()
         }
+    }
+
+    /// Returns the DataSetFieldFlags of each field.
+    fn field_flags(&self) -> u16 {
+        let is_promoted = self.variable.is_some_and(|of| of.meaning.promoted);
+        if is_promoted { PROMOTED_FIELD } else { 0 }
     }
 
     fn names(&self, leaf: &Leaf) -> FieldText {
@@ -622,6 +629,8 @@ pub const ROS_TOPICS: &str = "RosTopics";
 /// The name of the Property of a value that acts where it arrives.
 const COMMAND: &str = "Command";
 /// The separator between the type and the description.
+/// Bit of DataSetFieldFlags (OPC 10000-14, 6.2.3.2.5).
+const PROMOTED_FIELD: u16 = 1;
 const ABOUT: &str = "; ";
 /// The maximum accepted length in bytes of the description after the separator.
 const MAX_ABOUT: usize = 1_024;

@@ -577,6 +577,26 @@ fn a_probe_for_connections_finds_topics_that_have_not_sent_a_value() {
 }
 
 #[test]
+fn the_fields_of_a_promoted_value_are_marked_in_its_metadata() {
+    let promoted = |promoted: bool| {
+        let text = format!(
+            "spaces: [{{id: 1}}]\nnamespaces: {{2: urn:test}}\nvariables:\n  - {{node: ns=2;i=10, \
+             name: Speed, origin: 1, promoted: {promoted}, \
+             ros: {{space: 1, topic: /speed, type: geometry_msgs/Twist}}}}\n"
+        );
+        let (mut bridge, mut now) = (Bridge::new(1, &text), clock());
+        bridge.bind("ua_1_2_10", "geometry_msgs/Twist", &Selection::Whole, now);
+        let mut flags = Vec::new();
+        each_meta_data(&bridge.sent_within(SECOND, &mut now), |_, meta_data| {
+            flags.extend(meta_data.fields.iter().map(|field| field.is_promoted()));
+        });
+        flags
+    };
+    assert_eq!(promoted(true), [true; 6]);
+    assert_eq!(promoted(false), [false; 6]);
+}
+
+#[test]
 fn what_is_written_in_opc_ua_is_announced_as_the_mapping_says_it() {
     let mut now = clock();
     let text = |unit: &str| {

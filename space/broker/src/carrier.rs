@@ -18,7 +18,7 @@ use uadp::{NetworkMessage, Timestamp};
 use crate::address::{self, Addressed, alone};
 use crate::connection::{BrokerLink, SharedState, instant};
 use crate::echo::Echo;
-use crate::json::Json;
+use crate::json::{Json, PromotedTexts};
 use crate::links::BrokerLinks;
 use crate::packets::ReceivedPublish;
 use crate::producers::Producers;
@@ -112,6 +112,7 @@ impl Mqtt {
             } else {
                 CONTENT_UADP
             },
+            promoted: PromotedTexts::default(),
         }
     }
 
@@ -154,6 +155,7 @@ impl Mqtt {
             within: None,
             message_type: "",
             content_type: "",
+            promoted: PromotedTexts::default(),
         };
         if matches!(state.link, BrokerLink::Connected { .. }) {
             // With MQTT 5 the message expires if it cannot be cleared.
@@ -370,6 +372,9 @@ impl Mqtt {
     /// Publishes a message that the broker keeps, as UADP, and as JSON if the mapping wants JSON.
     fn announce(&mut self, network: &NetworkMessage<'_>, address: Address) {
         self.keep(self.publication(UADP, address, network.datagram().to_vec()));
+        if address.kind == TopicMessageType::MetaData {
+            self.json.learn_own(network);
+        }
         if !self.writes_json() {
             return;
         }
@@ -461,6 +466,9 @@ impl Carrier for Mqtt {
             Some(json) => self.publication(JSON, address, json),
             None => self.publication(UADP, address, message.bytes.to_vec()),
         };
+        if address.kind == TopicMessageType::Data {
+            publication.promoted = self.json.promoted(&network);
+        }
         publication.replaceable = message.replaceable && !network.is_chunk();
         publication.within = message.within;
         // Commands are never queued for an absent reader.
@@ -479,7 +487,10 @@ impl Carrier for Mqtt {
             BrokerLink::Waiting(_) if publication.outlasts => (MqttVersion::V3_1_1, None),
             BrokerLink::Waiting(_) => return Err(SendError::Unreachable),
         };
-        let size = publication.payload.len() + publication.topic.len() + OVERHEAD;
+        let size = publication.payload.len()
+            + publication.topic.len()
+            + publication.promoted.size()
+            + OVERHEAD;
         if max_packet.is_some_and(|most| u32::try_from(size).is_ok_and(|size| size > most)) {
             return Err(SendError::TooBig);
         }

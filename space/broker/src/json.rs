@@ -10,6 +10,7 @@
 mod descriptions;
 mod forms;
 mod names;
+mod promoted;
 mod read;
 #[cfg(test)]
 mod tests;
@@ -19,6 +20,8 @@ use mappings::MessageMapping;
 use serde_json::{Map, Value, json};
 use uadp::discovery::{ConnectionState, CyclicStatus};
 use uadp::{DataSetMessage, MessageKind, NetworkMessage, StatusCode, Timestamp, Variant};
+
+pub(crate) use promoted::PromotedTexts;
 
 use descriptions::{DataSetField, Descriptions, WriterIds};
 
@@ -59,6 +62,11 @@ impl Json {
         );
         whole.insert("MetaData".to_owned(), meta_data);
         Some(bytes(whole))
+    }
+
+    /// Records the metadata in an own message, or in a message that is forwarded.
+    pub(crate) fn learn_own(&mut self, message: &NetworkMessage<'_>) {
+        self.own.learn(message);
     }
 
     /// Records the metadata in a received UADP message.

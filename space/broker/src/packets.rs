@@ -117,6 +117,7 @@ pub(crate) fn publish(
         within,
         message_type,
         content_type,
+        promoted,
         ..
     } = publication;
     Ok(match version {
@@ -140,6 +141,10 @@ pub(crate) fn publish(
                     message_type,
                 )?));
                 properties.push(Property::ContentType(ContentType::new(content_type)?));
+            }
+            for (name, text) in promoted.iter() {
+                let property = UserProperty::new(name, text)?;
+                properties.push(Property::UserProperty(property));
             }
             if let Some(within) = within {
                 let seconds = within.as_secs() + u64::from(within.subsec_nanos() > 0);
@@ -278,3 +283,57 @@ pub(crate) fn event(packet: Packet) -> PacketEvent {
 const KEEP_ALIVE: u16 = 10;
 /// The largest packet in bytes that is received.
 pub(crate) const MAX_RECEIVED: u32 = 16 << 20;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use mqtt_protocol_core::mqtt::packet::GenericPacketTrait as _;
+
+    use crate::json::PromotedTexts;
+
+    #[test]
+    fn promoted_fields_are_user_properties_of_mqtt_5_only() {
+        let fields = [("Speed", "12.5"), ("Name", "\"a\"")];
+        let publication = |promoted| QueuedPublish {
+            topic: "opcua/uadp/data/1/2/10".to_owned(),
+            payload: vec![1],
+            retained: false,
+            confirmed: false,
+            replaceable: false,
+            outlasts: false,
+            within: None,
+            message_type: "ua-data",
+            content_type: "application/opcua+uadp",
+            promoted,
+        };
+        let promoted = || PromotedTexts::from_iter(fields);
+        let Packet::V5_0Publish(packet) =
+            publish(publication(promoted()), (MqttVersion::V5, None)).unwrap()
+        else {
+            panic!("a publication")
+        };
+        let properties = packet.props().iter();
+        let seen: Vec<_> = properties
+            .filter_map(|property| {
+                if let Property::UserProperty(pair) = property {
+                    Some((pair.key(), pair.val()))
+                } else {
+                    None
+                }
+            })
+            .collect();
+        assert_eq!(
+            seen,
+            [&[("UAMessageType", "ua-data")], &fields[..]].concat()
+        );
+        let size = |promoted, version| {
+            let packet = publish(publication(promoted), (version, None)).unwrap();
+            packet.size()
+        };
+        let none = PromotedTexts::default;
+        let with = size(promoted(), MqttVersion::V5);
+        assert_eq!(with - size(none(), MqttVersion::V5), promoted().size());
+        let with = size(promoted(), MqttVersion::V3_1_1);
+        assert_eq!(with, size(none(), MqttVersion::V3_1_1));
+    }
+}

@@ -5,6 +5,8 @@ use std::time::{Duration, Instant};
 
 use transport::SendError;
 
+use crate::json::PromotedTexts;
+
 /// A message to publish.
 #[derive(Debug, Clone)]
 pub(crate) struct QueuedPublish {
@@ -25,6 +27,8 @@ pub(crate) struct QueuedPublish {
     pub(crate) message_type: &'static str,
     /// Content Type of MQTT 5.
     pub(crate) content_type: &'static str,
+    /// Promoted fields, as further user properties of MQTT 5.
+    pub(crate) promoted: PromotedTexts,
 }
 
 impl QueuedPublish {
@@ -242,6 +246,7 @@ mod tests {
             within: within.map(Duration::from_millis),
             message_type: "ua-data",
             content_type: "application/opcua+uadp",
+            promoted: PromotedTexts::default(),
         }
     }
 

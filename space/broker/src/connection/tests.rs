@@ -3,6 +3,7 @@
 use mappings::{Broker, BrokerAddress};
 
 use super::*;
+use crate::json::PromotedTexts;
 use crate::topics::TopicFilter;
 
 fn settings() -> BrokerSettings {
@@ -33,6 +34,7 @@ fn publication(topic: &str, number: u8, is_state: bool) -> QueuedPublish {
         within: Some(Duration::from_secs(15)),
         message_type: "ua-data",
         content_type: "application/opcua+uadp",
+        promoted: PromotedTexts::default(),
     }
 }
 

@@ -30,6 +30,8 @@ pub(super) struct DataSetField {
     /// The number of the DataType in namespace 0; `None` in another namespace.
     pub(super) data_type: Option<u32>,
     pub(super) value_rank: i32,
+    /// Whether the field is copied into the headers of messages.
+    pub(super) promoted: bool,
 }
 
 impl Descriptions {
@@ -47,6 +49,7 @@ impl Descriptions {
                 .filter(|of| *of != BuiltinType::Variant),
             data_type: names::standard_number(field.data_type),
             value_rank: field.value_rank,
+            promoted: field.is_promoted(),
         });
         self.insert(topic, fields.collect());
         Some(topic)
@@ -125,6 +128,7 @@ fn field(json: &Value) -> Option<DataSetField> {
         builtin: builtin.filter(|of| *of != BuiltinType::Variant),
         data_type: json.get("DataType").and_then(names::standard_type),
         value_rank: i32::try_from(rank).ok()?,
+        promoted: false,
     })
 }
 

@@ -33,8 +33,14 @@ fn now() -> Timestamp {
 
 /// Returns an announcement of the fields of [`value`].
 fn announcement() -> Vec<u8> {
+    announcement_with(|_| false)
+}
+
+/// Returns the announcement, with the fields that are promoted.
+fn announcement_with(promoted: impl Fn(&str) -> bool) -> Vec<u8> {
     let field = |name, builtin: BuiltinType, value_rank| FieldMetaData {
         name: Some(name),
+        field_flags: promoted(name).into(),
         built_in_type: builtin.id(),
         value_rank,
         ..FieldMetaData::default()
@@ -133,6 +139,36 @@ fn a_value_is_read_as_it_was_written_in_every_form() {
             "{form:?}"
         );
     }
+}
+
+#[test]
+fn promoted_fields_are_texts_in_the_verbose_form() {
+    let datagram = value();
+    let message = NetworkMessage::decode(&datagram).unwrap();
+    let texts = |promoted: &[&str]| {
+        let announcement = announcement_with(|name| promoted.contains(&name));
+        let mut json = Json::new(MessageMapping::Uadp);
+        json.learn_own(&NetworkMessage::decode(&announcement).unwrap());
+        let promoted = json.promoted(&message);
+        let texts = promoted.iter().map(|(name, text)| format!("{name}={text}"));
+        (texts.collect::<Vec<_>>(), promoted.size())
+    };
+    assert_eq!(texts(&[]), (Vec::new(), 0));
+    let (all, size) = texts(&["zone", "count", "axes", "label"]);
+    assert_eq!(
+        all,
+        [
+            r#"zone="Infinity""#,
+            r#"count="-9223372036854775808""#,
+            "axes=[0.1,-2.5]",
+            r#"label="a \"b\"""#,
+        ]
+    );
+    // A user property has an identifier and two lengths instead of the `=`.
+    assert_eq!(size, all.iter().map(|text| text.len() + 4).sum::<usize>());
+    // Without metadata nothing is promoted.
+    let unknown = Json::new(MessageMapping::Uadp).promoted(&message);
+    assert_eq!(unknown, PromotedTexts::default());
 }
 
 #[test]

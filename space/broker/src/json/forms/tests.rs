@@ -25,6 +25,7 @@ fn described(builtin: BuiltinType, data_type: u32, value_rank: i32) -> DataSetFi
         builtin: Some(builtin),
         data_type: Some(data_type),
         value_rank,
+        promoted: false,
     }
 }
 
