@@ -1,9 +1,9 @@
 //! Values in the forms of OPC 10000-6, 5.4 and Annex H (version 1.04), and of other stacks.
 //!
 //! `json-values` encodes a single form of each type; received values are converted to it here. A
-//! form that neither version has, but whose meaning is certain, is read and noted. Its writers are
-//! known: `UaDimensions`, the key StatusCode of a DataValue, structures in UaBody, objects for
-//! current QualifiedNames, and null for numbers that JSON cannot express.
+//! form that neither version has, but whose meaning is certain, is read and noted: `UaDimensions`,
+//! the key StatusCode of a DataValue, structures in UaBody, objects for current QualifiedNames, and
+//! null for numbers that JSON cannot express.
 
 use json_values::{JsonFieldValue, JsonStatus, JsonStructure, iso_time};
 use serde_json::{Map, Value, json};

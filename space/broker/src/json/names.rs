@@ -37,7 +37,7 @@ fn from_text(text: &str, expanded: bool) -> String {
     }
 }
 
-/// Returns the text of a NodeId of version 1.04: an object with IdType, Id, Namespace and ServerUri.
+/// Returns the text of a NodeId of version 1.04, which is an object.
 fn from_object(whole: &Map<String, Value>) -> Option<String> {
     let id = whole.get("Id")?;
     let kind = whole.get("IdType").map_or(Some(0), Value::as_u64)?;

@@ -1,5 +1,5 @@
-//! Tests of the forms of values. The values are those of node-opcua-json 2.186, and of the tables in
-//! OPC 10000-6, 5.4 and Annex H.
+//! Tests of the forms of values: those of node-opcua-json 2.186, and of the tables of OPC 10000-6,
+//! 5.4 and Annex H.
 
 use uadp::{Nested, Variant};
 
@@ -199,7 +199,10 @@ fn a_localized_text_of_the_old_non_reversible_form_has_no_locale() {
 
 #[test]
 fn structures_are_read_in_every_form_and_their_defaults_are_added() {
-    let range = |low: f64, high: f64| json!({"UaType": 22, "Value": {"Low": low, "High": high, "UaTypeId": "i=884"}});
+    let range = |low: f64, high: f64| {
+        let fields = json!({"Low": low, "High": high, "UaTypeId": "i=884"});
+        json!({"UaType": 22, "Value": fields})
+    };
     let fields = json!({"Low": 1, "High": 2});
     are_standard([
         (
