@@ -183,7 +183,8 @@ fn rdflib_answers_every_question_alike() {
         ("two", stage),
         ("mixer", read_own("mtp/mixer.aml")),
     ];
-    let node_sets = ["devices", "machines"].map(|name| read_own(&format!("nodesets/{name}.xml")));
+    let node_sets =
+        ["devices", "machines", "grippers"].map(|name| read_own(&format!("nodesets/{name}.xml")));
     let knowledge = plant(&manifests, &node_sets);
     are_answered_alike(&cell, &knowledge, "urn:ua-bridge:test:devices#i=1002");
 }
@@ -301,7 +302,8 @@ fn owlrl_derives_the_same_statements_before_and_after_a_source_is_removed() {
     let Some(cell) = Cell::with(&[Peer::Python]) else {
         return;
     };
-    let node_sets = ["devices", "machines"].map(|name| read_own(&format!("nodesets/{name}.xml")));
+    let node_sets =
+        ["devices", "machines", "grippers"].map(|name| read_own(&format!("nodesets/{name}.xml")));
     let stage = read_own("mtp/stage.aml");
     let knowledge = plant(&[("one", stage.clone()), ("two", stage)], &node_sets);
     knowledge.set_rules(true).unwrap();

@@ -28,6 +28,7 @@ mod dump;
 mod http;
 mod journal;
 mod lanes;
+mod node_set_limits;
 mod node_set_models;
 pub mod nodeset;
 pub mod operations;

@@ -1,5 +1,5 @@
-//! NodeSets (OPC 10000-6, annex F) as statements: types, their supertypes, and the nodes that types
-//! declare.
+//! NodeSets (OPC 10000-6, annex F) as statements: types, their supertypes, the nodes that types
+//! declare, and the limits of their variables.
 //!
 //! HasSubtype references become direct `rdfs:subClassOf` statements; the rule of the store derives
 //! the indirect statements.
@@ -13,6 +13,7 @@ use nodeset_files::{NodeSetDocument, NodeSetFileFault, NodeSetFileNode};
 use thiserror::Error;
 
 use crate::component::{NodeName, OPC_UA};
+use crate::node_set_limits::{DeclaredLimits, NodesByIri};
 use crate::node_set_models;
 use crate::vocabulary as v;
 
@@ -130,7 +131,8 @@ impl Graph<'_> {
     fn nodes(&mut self) {
         let document = self.document;
         let mut below: BTreeMap<String, BTreeSet<String>> = BTreeMap::new();
-        let mut by_iri = BTreeMap::new();
+        let mut by_iri = NodesByIri::new();
+        let mut limits = DeclaredLimits::default();
         let nodes = document.nodes.iter();
         for node in nodes.filter(|node| CLASSES.contains(&node.class.as_str())) {
             let Some(name) = node_name(document, &node.id) else {
@@ -143,12 +145,12 @@ impl Graph<'_> {
                 let (Some(reference), Some(target)) = (reference, target) else {
                     continue;
                 };
-                let target = target.iri();
-                let (from, to) = if one.is_forward {
-                    (iri.clone(), target)
+                let (from, to, to_name) = if one.is_forward {
+                    (iri.clone(), target.iri(), &target)
                 } else {
-                    (target, iri.clone())
+                    (target.iri(), iri.clone(), &name)
                 };
+                limits.reference(&from, &reference, (&to, to_name));
                 match (reference.namespace.as_str(), reference.identifier.as_str()) {
                     (OPC_UA, HAS_SUBTYPE) => self.link(&to, v::RDFS_SUB_CLASS_OF, &from),
                     (OPC_UA, HAS_PROPERTY | HAS_COMPONENT | HAS_ORDERED_COMPONENT) => {
@@ -187,6 +189,7 @@ impl Graph<'_> {
                 }
             }
         }
+        self.all.extend(limits.statements(&by_iri));
     }
 
     fn about(&mut self, iri: &str, name: &NodeName, node: &NodeSetFileNode) {

@@ -25,6 +25,14 @@ pub fn is_known(symbol: &str) -> bool {
     UNITS.iter().any(|unit| unit.0.contains(&symbol.trim()))
 }
 
+/// Returns the symbol of a unit that is given by one of its symbols, or by its common code of
+/// UN/ECE Recommendation 20, such as `KGM`.
+#[must_use]
+pub fn symbol(of: &str) -> Option<&'static str> {
+    let known = UNITS.iter().find(|unit| unit.0.contains(&of.trim()));
+    known.and_then(|unit| unit.0.first().copied())
+}
+
 /// Returns the units as statements, so that queries can convert numbers: a number times
 /// `ua:factor` plus `ua:zero` is in the SI unit of the quantity.
 #[must_use]
@@ -72,53 +80,62 @@ use Quantity::{
     Time, Turning, Volume,
 };
 
-/// Symbols of a unit, its quantity, and its size and zero in the SI unit of the quantity.
-const UNITS: [(&[&str], Quantity, f64, f64); 40] = [
-    (&["m"], Length, 1.0, 0.0),
-    (&["dm"], Length, 0.1, 0.0),
-    (&["cm"], Length, 0.01, 0.0),
-    (&["mm"], Length, 0.001, 0.0),
-    (&["µm", "μm", "um"], Length, 1e-6, 0.0),
-    (&["in"], Length, 0.0254, 0.0),
-    (&["kg"], Mass, 1.0, 0.0),
-    (&["g"], Mass, 0.001, 0.0),
-    (&["t"], Mass, 1000.0, 0.0),
-    (&["s"], Time, 1.0, 0.0),
-    (&["ms"], Time, 0.001, 0.0),
-    (&["min"], Time, 60.0, 0.0),
-    (&["h"], Time, 3600.0, 0.0),
-    (&["N"], Force, 1.0, 0.0),
-    (&["mN"], Force, 0.001, 0.0),
-    (&["kN"], Force, 1000.0, 0.0),
-    (&["Pa"], Pressure, 1.0, 0.0),
-    (&["hPa", "mbar"], Pressure, 100.0, 0.0),
-    (&["kPa"], Pressure, 1000.0, 0.0),
-    (&["MPa"], Pressure, 1e6, 0.0),
-    (&["bar"], Pressure, 1e5, 0.0),
-    (&["rad"], Angle, 1.0, 0.0),
-    (&["°", "deg"], Angle, std::f64::consts::PI / 180.0, 0.0),
-    (&["m/s"], Speed, 1.0, 0.0),
-    (&["mm/s"], Speed, 0.001, 0.0),
-    (&["m/s²", "m/s2"], Acceleration, 1.0, 0.0),
-    (&["mm/s²", "mm/s2"], Acceleration, 0.001, 0.0),
-    (&["rad/s"], Turning, 1.0, 0.0),
+/// Symbols of a unit with its common code of UN/ECE Recommendation 20, its quantity, and its size
+/// and zero in the SI unit of the quantity.
+const UNITS: [(&[&str], Quantity, f64, f64); 43] = [
+    (&["m", "MTR"], Length, 1.0, 0.0),
+    (&["dm", "DMT"], Length, 0.1, 0.0),
+    (&["cm", "CMT"], Length, 0.01, 0.0),
+    (&["mm", "MMT"], Length, 0.001, 0.0),
+    (&["µm", "μm", "um", "4H"], Length, 1e-6, 0.0),
+    (&["in", "INH"], Length, 0.0254, 0.0),
+    (&["kg", "KGM"], Mass, 1.0, 0.0),
+    (&["g", "GRM"], Mass, 0.001, 0.0),
+    (&["mg", "MGM"], Mass, 1e-6, 0.0),
+    (&["lb", "LBR"], Mass, 0.453_592_37, 0.0),
+    (&["t", "TNE"], Mass, 1000.0, 0.0),
+    (&["s", "SEC"], Time, 1.0, 0.0),
+    (&["ms", "C26"], Time, 0.001, 0.0),
+    (&["min", "MIN"], Time, 60.0, 0.0),
+    (&["h", "HUR"], Time, 3600.0, 0.0),
+    (&["N", "NEW"], Force, 1.0, 0.0),
+    (&["mN", "C20"], Force, 0.001, 0.0),
+    (&["kN", "B47"], Force, 1000.0, 0.0),
+    (&["Pa", "PAL"], Pressure, 1.0, 0.0),
+    (&["hPa", "A97"], Pressure, 100.0, 0.0),
+    (&["mbar", "MBR"], Pressure, 100.0, 0.0),
+    (&["kPa", "KPA"], Pressure, 1000.0, 0.0),
+    (&["MPa", "MPA"], Pressure, 1e6, 0.0),
+    (&["bar", "BAR"], Pressure, 1e5, 0.0),
+    (&["rad", "C81"], Angle, 1.0, 0.0),
     (
-        &["°/s", "deg/s"],
+        &["°", "deg", "DD"],
+        Angle,
+        std::f64::consts::PI / 180.0,
+        0.0,
+    ),
+    (&["m/s", "MTS"], Speed, 1.0, 0.0),
+    (&["mm/s", "C16"], Speed, 0.001, 0.0),
+    (&["m/s²", "m/s2", "MSK"], Acceleration, 1.0, 0.0),
+    (&["mm/s²", "mm/s2"], Acceleration, 0.001, 0.0),
+    (&["rad/s", "2A"], Turning, 1.0, 0.0),
+    (
+        &["°/s", "deg/s", "E96"],
         Turning,
         std::f64::consts::PI / 180.0,
         0.0,
     ),
-    (&["K"], Temperature, 1.0, 0.0),
-    (&["°C", "degC"], Temperature, 1.0, 273.15),
-    (&["Hz"], Frequency, 1.0, 0.0),
-    (&["kHz"], Frequency, 1000.0, 0.0),
-    (&["1"], Ratio, 1.0, 0.0),
-    (&["%"], Ratio, 0.01, 0.0),
-    (&["m³", "m3"], Volume, 1.0, 0.0),
-    (&["l", "L"], Volume, 0.001, 0.0),
-    (&["ml", "mL"], Volume, 1e-6, 0.0),
-    (&["m³/h", "m3/h"], Flow, 1.0 / 3600.0, 0.0),
-    (&["l/min", "L/min"], Flow, 0.001 / 60.0, 0.0),
+    (&["K", "KEL"], Temperature, 1.0, 0.0),
+    (&["°C", "degC", "CEL"], Temperature, 1.0, 273.15),
+    (&["Hz", "HTZ"], Frequency, 1.0, 0.0),
+    (&["kHz", "KHZ"], Frequency, 1000.0, 0.0),
+    (&["1", "C62"], Ratio, 1.0, 0.0),
+    (&["%", "P1"], Ratio, 0.01, 0.0),
+    (&["m³", "m3", "MTQ"], Volume, 1.0, 0.0),
+    (&["l", "L", "LTR"], Volume, 0.001, 0.0),
+    (&["ml", "mL", "MLT"], Volume, 1e-6, 0.0),
+    (&["m³/h", "m3/h", "MQH"], Flow, 1.0 / 3600.0, 0.0),
+    (&["l/min", "L/min", "L2"], Flow, 0.001 / 60.0, 0.0),
 ];
 
 #[cfg(test)]
@@ -135,6 +152,8 @@ mod tests {
             (180.0, "°", "rad", std::f64::consts::PI),
             (50.0, "%", "1", 0.5),
             (7.0, "pieces", "pieces", 7.0),
+            (10.0, "lb", "g", 4535.9237),
+            (3.0, "KGM", "kg", 3.0),
         ] {
             let converted = convert(number, from, to).unwrap();
             assert!(
@@ -143,6 +162,8 @@ mod tests {
             );
         }
         assert!(is_known("l/min") && !is_known("Sekunde"));
+        assert_eq!((symbol("GRM"), symbol("deg")), (Some("g"), Some("°")));
+        assert_eq!(symbol("XYZ"), None);
         assert_eq!(convert(1.0, "mm", "N"), None);
         assert_eq!(convert(1.0, "furlong", "m"), None);
     }

@@ -1,5 +1,5 @@
 //! NodeSet2 files (OPC 10000-6, annex F) as documents: namespaces, aliases, models, and nodes with
-//! their references. Values are not read.
+//! their references. Of the values, only ranges and units are read.
 //!
 //! A file is not trusted: its size, the number and depth of its elements are bounded, and a
 //! document type is refused. NodeIds stay as written; [`NodeSetDocument::resolved`] applies the
@@ -55,6 +55,30 @@ pub struct NodeSetFileNode {
     pub description: String,
     /// The references.
     pub references: Vec<NodeSetFileReference>,
+    /// The value of a variable with a single range, such as an EURange.
+    pub range: Option<NodeSetFileRange>,
+    /// The value of a variable with a single unit, such as EngineeringUnits.
+    pub unit: Option<NodeSetFileUnit>,
+}
+
+/// A value of the DataType Range (OPC 10000-8, 5.6.2).
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct NodeSetFileRange {
+    /// The lowest value.
+    pub low: String,
+    /// The highest value.
+    pub high: String,
+}
+
+/// A value of the DataType EUInformation (OPC 10000-8, 5.6.4.3).
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct NodeSetFileUnit {
+    /// The URI of the organisation that defines the unit.
+    pub namespace: String,
+    /// The UnitId.
+    pub id: String,
+    /// The text of the DisplayName, which is the symbol.
+    pub symbol: String,
 }
 
 /// A reference of a node. NodeIds are as written, or aliases.
@@ -148,6 +172,19 @@ impl NodeSetDocument {
     }
 }
 
+impl NodeSetFileUnit {
+    /// Returns the common code of UN/ECE Recommendation 20 that the UnitId has, such as `KGM`;
+    /// `None` if another organisation defines the unit.
+    #[must_use]
+    pub fn unece_code(&self) -> Option<String> {
+        let id: u32 = self.id.parse().ok()?;
+        let bytes = id.to_be_bytes().into_iter().skip_while(|byte| *byte == 0);
+        let code: String = bytes.map(char::from).collect();
+        let is_code = !code.is_empty() && code.bytes().all(|byte| byte.is_ascii_alphanumeric());
+        (self.namespace == UNECE && is_code).then_some(code)
+    }
+}
+
 impl NodeSetFileNode {
     /// Returns the BrowseName without its namespace index.
     #[must_use]
@@ -177,6 +214,8 @@ pub const MAX_FILE: usize = 64 << 20;
 /// Limit of the number of nodes of a file.
 pub const MAX_NODES: usize = 200_000;
 const MAX_DEPTH: usize = 64;
+/// The URI of the units that common codes name.
+const UNECE: &str = "http://www.opcfoundation.org/UA/units/un/cefact";
 const MAX_REQUIRED: usize = 256;
 
 #[cfg(test)]
@@ -240,6 +279,46 @@ mod tests {
             reference("i=37", true, "i=78"),
         ];
         assert_eq!(range.references, references);
+    }
+
+    #[test]
+    fn a_range_and_a_unit_are_read_from_the_values_of_their_nodes() {
+        let value = |body: &str| {
+            let xml = format!(
+                "<UANodeSet><UAVariable NodeId='i=1'><Value><ExtensionObject><TypeId>\
+                 <Identifier>i=885</Identifier></TypeId><Body>{body}</Body></ExtensionObject>\
+                 </Value></UAVariable></UANodeSet>"
+            );
+            let document = NodeSetDocument::read(&xml).unwrap();
+            document.nodes.into_iter().next().unwrap()
+        };
+        let range = value("<Range><Low>-1.5</Low><High> 5 </High></Range>");
+        let (low, high) = ("-1.5".to_owned(), "5".to_owned());
+        assert_eq!(range.range, Some(NodeSetFileRange { low, high }));
+        assert_eq!(range.unit, None);
+        let unit = |namespace: &str, id: &str| {
+            let body = format!(
+                "<EUInformation><NamespaceUri>{namespace}</NamespaceUri><UnitId>{id}</UnitId>\
+                 <DisplayName><Locale>en</Locale><Text>kg</Text></DisplayName>\
+                 <Description><Text>kilogram</Text></Description></EUInformation>"
+            );
+            let unit = value(&body).unit.unwrap();
+            assert_eq!(unit.symbol, "kg");
+            unit.unece_code()
+        };
+        assert_eq!(unit(UNECE, "4933453").as_deref(), Some("KGM"));
+        assert_eq!(unit(UNECE, "17476").as_deref(), Some("DD"));
+        for (namespace, id) in [
+            ("urn:maker", "4933453"),
+            (UNECE, "0"),
+            (UNECE, "-1"),
+            (UNECE, "kg"),
+            (UNECE, "4294967295"),
+        ] {
+            assert_eq!(unit(namespace, id), None, "{namespace} {id}");
+        }
+        let other = value("<Argument><Name>Low</Name></Argument>");
+        assert_eq!((other.range, other.unit), (None, None));
     }
 
     #[test]

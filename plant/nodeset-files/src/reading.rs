@@ -156,6 +156,9 @@ impl XmlVisitor for NodeSetReading {
                         ["Description"] if node.description.is_empty() => {
                             text.clone_into(&mut node.description);
                         }
+                        ["Value", "ExtensionObject", "Body", part @ ..] => {
+                            value_part(node, part, text);
+                        }
                         _ => {}
                     }
                 }
@@ -165,6 +168,30 @@ impl XmlVisitor for NodeSetReading {
         self.text.clear();
         self.open.pop();
         Ok(flow)
+    }
+}
+
+/// Reads a part of a structure that is the value of a node, by its path.
+fn value_part(node: &mut NodeSetFileNode, path: &[&str], text: &str) {
+    match path {
+        ["Range", bound] => {
+            let range = node.range.get_or_insert_default();
+            match *bound {
+                "Low" => text.clone_into(&mut range.low),
+                "High" => text.clone_into(&mut range.high),
+                _ => {}
+            }
+        }
+        ["EUInformation", part @ ..] => {
+            let unit = node.unit.get_or_insert_default();
+            match part {
+                ["NamespaceUri"] => text.clone_into(&mut unit.namespace),
+                ["UnitId"] => text.clone_into(&mut unit.id),
+                ["DisplayName", "Text"] => text.clone_into(&mut unit.symbol),
+                _ => {}
+            }
+        }
+        _ => {}
     }
 }
 
