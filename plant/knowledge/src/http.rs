@@ -266,17 +266,19 @@ impl ServedSite {
                 &json!({ "graphs": self.queries.knowledge().sources() }),
             )),
             "/data" => self.data(&pairs).await,
+            "/pictures" => self.pictures(&pairs).await,
             "/report" => {
                 let accepted = accepted(&request);
                 let is_json = accepted.first().is_some_and(|media| media == JSON);
                 self.report(is_json, peer).await
             }
-            path => match path.strip_prefix("/ask/") {
-                Some(name) => self.question(name, pairs, accepted(&request)).await,
-                None => match self.made_page(path).await? {
+            path => match (path.strip_prefix("/ask/"), path.strip_prefix("/picture/")) {
+                (Some(name), _) => self.question(name, pairs, accepted(&request)).await,
+                (None, Some(iri)) => self.picture(iri).await,
+                (None, None) => match self.made_page(path).await? {
                     Some(page) => Ok(content(JSON, page.into_bytes())),
                     None => Err(HttpRefusal::unknown(
-                        "there are /sparql, /update, /store, /sources, /check, /configuration, /jobs, /ask, /ask/NAME, /graphs, /data, /report and /status here"
+                        "there are /sparql, /update, /store, /sources, /check, /configuration, /jobs, /ask, /ask/NAME, /graphs, /data, /pictures, /picture/IRI, /report and /status here"
                             .to_owned(),
                     )),
                 },

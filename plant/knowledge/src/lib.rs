@@ -33,6 +33,7 @@ mod node_set_models;
 pub mod nodeset;
 pub mod operations;
 pub mod owl;
+mod pictures;
 pub mod products;
 mod query;
 mod question;
@@ -56,6 +57,7 @@ pub use component::{
 };
 pub use http::{ExtraPages, HttpEndpoint};
 pub use mtp::vocabulary;
+pub use pictures::{ListedPicture, PictureFault};
 pub use query::{Queries, QueryLimits};
 pub use question::{NamedQuestion, QUESTIONS, QuestionAnswer, QuestionFault};
 pub use remote::{ConnectionSecurity, PasswordRefusal, SecuredStream, SecuringConnection};

@@ -37,16 +37,16 @@ async fn site(limits: QueryLimits) -> (HttpEndpoint, Arc<Knowledge>) {
 
 pub(super) struct Answered {
     pub(super) status: u16,
-    head: String,
+    pub(super) head: String,
     pub(super) body: String,
 }
 
 impl Answered {
-    fn json(&self) -> serde_json::Value {
+    pub(super) fn json(&self) -> serde_json::Value {
         serde_json::from_str(&self.body).unwrap_or_else(|_| panic!("{}", self.body))
     }
 
-    fn code(&self) -> (u16, String) {
+    pub(super) fn code(&self) -> (u16, String) {
         (
             self.status,
             self.json()["error"].as_str().unwrap_or_default().to_owned(),

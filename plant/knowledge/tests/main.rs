@@ -6,6 +6,7 @@ mod http;
 mod memory;
 mod narrowed;
 mod owl;
+mod pictures;
 mod rules;
 mod shapes;
 mod store;

@@ -134,6 +134,15 @@ impl ModulePicture {
     }
 }
 
+impl PictureConnection {
+    /// Returns the points of an Edgepath, as `1,2;3,4`. `None` if it has another form, or a number
+    /// that is too large or too small for a picture.
+    #[must_use]
+    pub fn points(edge_path: &str) -> Option<Vec<[f64; 2]>> {
+        points(edge_path).ok()
+    }
+}
+
 /// The parts of pictures while they are read.
 #[derive(Default)]
 pub(crate) struct PictureParts<'a> {

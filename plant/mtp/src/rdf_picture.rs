@@ -15,12 +15,14 @@ impl ModuleStatements<'_> {
         self.text(&iri, v::RDFS_LABEL, &picture.name);
         self.numbers(&iri, [v::WIDTH, v::HEIGHT], picture.size);
         let mut parts: BTreeMap<&str, String> = BTreeMap::new();
-        for object in &picture.objects {
+        for (object, position) in picture.objects.iter().zip(1..) {
             let part = self.picture_object(&iri, object);
+            self.order(&part, (object.layer, position));
             parts.insert(&object.id, part);
         }
-        for connection in &picture.connections {
+        for (connection, position) in picture.connections.iter().zip(1..) {
             let part = self.picture_connection(&iri, connection);
+            self.order(&part, (connection.layer, position));
             parts.insert(&connection.id, part);
         }
         for (id, neighbours) in picture.neighbours() {
@@ -48,6 +50,9 @@ impl ModuleStatements<'_> {
                 self.text(&iri, predicate, text);
             }
         }
+        if object.is_topology {
+            self.say(&iri, v::IS_TOPOLOGY, Object::Boolean(true));
+        }
         if let Some(assembly) = &object.assembly {
             let element = self.element_iri(assembly);
             self.link(&iri, v::SHOWS_ELEMENT, &element);
@@ -64,10 +69,19 @@ impl ModuleStatements<'_> {
         let points = connection.path.iter().map(|[x, y]| format!("{x},{y}"));
         let path: Vec<String> = points.collect();
         self.text(&iri, v::EDGE_PATH, &path.join(";"));
+        if connection.is_directed {
+            self.say(&iri, v::IS_DIRECTED, Object::Boolean(true));
+        }
         if !connection.group.is_empty() {
             self.text(&iri, v::SEMANTIC_GROUP, &connection.group);
         }
         iri
+    }
+
+    /// Adds the layer of a part, and its position in the file, which order the parts of a drawing.
+    fn order(&mut self, part: &str, (layer, position): (f64, i64)) {
+        self.say(part, v::LAYER, Object::Number(layer));
+        self.say(part, v::POSITION, Object::Integer(position));
     }
 
     fn numbers(&mut self, of: &str, predicates: [&str; 2], numbers: Option<[f64; 2]>) {
