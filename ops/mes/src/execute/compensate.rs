@@ -95,6 +95,19 @@ struct Undone<'a> {
     until: &'a [Done],
 }
 
+/// Returns the names of the completed steps that have no compensation, each of them once.
+fn without_compensation(done: &[Done]) -> String {
+    let mut names: Vec<String> = Vec::new();
+    for done in done.iter().rev() {
+        let is_undone = done.step.compensation.is_some() && done.undo.is_some();
+        let name = format!("`{}`", done.step.name);
+        if !is_undone && !names.contains(&name) {
+            names.push(name);
+        }
+    }
+    names.join(", ")
+}
+
 /// Returns the names of the completed steps.
 fn names(steps: &[Undone<'_>]) -> String {
     let names = steps.iter().map(|one| format!("`{}`", one.step.name));
@@ -103,10 +116,16 @@ fn names(steps: &[Undone<'_>]) -> String {
 
 impl Execution<'_> {
     /// Compensates the completed steps of a failed run, and adds the compensations to the reason.
+    /// Completed steps that have none are named too, unless the caller stopped the run.
     ///
     /// Nothing is compensated after the caller stopped the run, and while the end of a skill is not
     /// confirmed: its machine may still move.
-    pub(super) async fn compensated(&self, why: String, progress: &mut RunProgress) -> String {
+    pub(super) async fn compensated(&self, mut why: String, progress: &mut RunProgress) -> String {
+        let is_stopped = self.is_stopped().await;
+        let left = without_compensation(&progress.done);
+        if !left.is_empty() && !is_stopped {
+            why = format!("{why}; without a compensation: {left}");
+        }
         let RunProgress { done, tools, .. } = progress;
         let undone = (1..=done.len()).rev().filter_map(|count| {
             let until = done.get(..count)?;
@@ -123,7 +142,7 @@ impl Execution<'_> {
         if undone.is_empty() {
             return why;
         }
-        let not = match (self.is_stopped().await, is_open(&self.log.run())) {
+        let not = match (is_stopped, is_open(&self.log.run())) {
             (true, _) => Some("it was stopped"),
             (_, true) => Some("the end of a skill is not confirmed"),
             (false, false) => None,

@@ -3,6 +3,7 @@ mod composite;
 mod fakes;
 mod flow;
 mod loops;
+mod losses;
 mod queries;
 mod stops;
 mod tools;
@@ -72,6 +73,7 @@ fn plant(offers: Vec<Offer>) -> Fakes {
         powers: None,
         tools: ShownTools::default(),
         mover: None,
+        mishaps: Mutex::default(),
     }
 }
 

@@ -38,6 +38,29 @@ pub(super) struct Fakes {
     pub(super) tools: ShownTools,
     /// The component that moves the tool changers.
     pub(super) mover: Option<&'static str>,
+    /// Incidents by the numbers of the runs of all skills, from 0.
+    pub(super) mishaps: Mutex<BTreeMap<usize, Mishap>>,
+}
+
+impl Fakes {
+    /// Loses a component.
+    pub(super) fn lose(&self, component: &str) {
+        let mut offers = self.offers.lock().unwrap();
+        offers.retain(|offer| offer.component != component);
+        self.lost
+            .send_modify(|lost| lost.push(component.to_owned()));
+    }
+}
+
+/// An incident of a run.
+#[derive(Debug, Clone)]
+pub(super) enum Mishap {
+    /// The component of the skill is lost.
+    Lost,
+    /// The run of the skill ends so.
+    Ends(Result<RunOutcome, SkillFault>),
+    /// The run succeeds, and another component is lost meanwhile.
+    Loses(&'static str),
 }
 
 struct FakeSkill {
@@ -211,7 +234,12 @@ impl RunnableSkill for FakeSkill {
         } else {
             format!("{name} {}", parameters.len())
         };
-        self.plant.journal.lock().unwrap().push(told);
+        let number = {
+            let mut journal = self.plant.journal.lock().unwrap();
+            let number = journal.iter().filter(|line| *line != "closed").count();
+            journal.push(told);
+            number
+        };
         if let Some((_, more)) = self.plant.powers.as_ref().filter(|(at, _)| *at == name) {
             let mut offers = self.plant.offers.lock().unwrap();
             offers.extend(more.iter().cloned());
@@ -230,23 +258,20 @@ impl RunnableSkill for FakeSkill {
                 }
             }
         }
-        let dies = self
-            .plant
-            .dies_at
-            .lock()
-            .unwrap()
-            .take_if(|at| *at == name)
-            .is_some();
-        if dies {
-            self.plant
-                .offers
-                .lock()
-                .unwrap()
-                .retain(|offer| offer.component != self.offer.component);
-            self.plant
-                .lost
-                .send_modify(|lost| lost.push(self.offer.component.clone()));
-            std::future::pending::<()>().await;
+        let mishap = self.plant.mishaps.lock().unwrap().remove(&number);
+        let dies = self.plant.dies_at.lock().unwrap().take_if(|at| *at == name);
+        match mishap {
+            Some(Mishap::Ends(end)) => return end,
+            Some(Mishap::Loses(component)) => self.plant.lose(component),
+            Some(Mishap::Lost) => {
+                self.plant.lose(&self.offer.component);
+                std::future::pending::<()>().await;
+            }
+            None if dies.is_some() => {
+                self.plant.lose(&self.offer.component);
+                std::future::pending::<()>().await;
+            }
+            None => {}
         }
         let is_halted = self
             .plant
@@ -256,14 +281,7 @@ impl RunnableSkill for FakeSkill {
             .take_if(|at| *at == name)
             .is_some();
         if is_halted {
-            self.plant
-                .offers
-                .lock()
-                .unwrap()
-                .retain(|offer| offer.component != GRIPPER);
-            self.plant
-                .lost
-                .send_modify(|lost| lost.push(GRIPPER.to_owned()));
+            self.plant.lose(GRIPPER);
             let mut halts = self.plant.halts.subscribe();
             halts.wait_for(|halts| *halts > 0).await.unwrap();
             return Ok(failed("halted by session 3"));
