@@ -470,7 +470,7 @@ mod tests {
             let (mut waiting, _) = slow.accept().await.unwrap();
             let (mut other, _) = quick.accept().await.unwrap();
             for stream in [&mut other, &mut waiting] {
-                stream.read(&mut [0; 1024]).await.unwrap();
+                assert_ne!(stream.read(&mut [0; 1024]).await.unwrap(), 0);
                 stream.write_all(answer).await.unwrap();
                 stream.shutdown().await.unwrap();
             }
