@@ -23,6 +23,8 @@ WIDE = (1280, 800)
 PHONE = (390, 844)
 PASSWORD = "correct horse battery"
 SOON = 60
+# A module with a picture.
+MANIFEST = pathlib.Path(__file__).resolve().parent.parent / "data" / "mtp" / "column.aml"
 
 
 class Judge:
@@ -415,6 +417,7 @@ def knowledge(judge, binaries, folder):
         judge.wait("the question is answered", lambda: "skill_name" in [one.text for one in find(".result th")])
         judge.shoot("knowledge-question-light-wide")
         judge.accessible("question")
+        pictures(judge, find, button)
         judge.console()
         judge.driver.get("about:blank")
     finally:
@@ -423,6 +426,43 @@ def knowledge(judge, binaries, folder):
         for process in running:
             process.wait(20)
         log.close()
+
+
+def pictures(judge, find, button):
+    """Loads a manifest with a picture, and shows it by the keyboard, in both colours and widths."""
+    judge.wait("no module has a picture", lambda: "No manifest in the graph has a picture" in judge.text())
+    find("#file")[0].send_keys(str(MANIFEST))
+    button("Check").send_keys(Keys.ENTER)
+    judge.wait("the manifest can be loaded", lambda: button("Load").is_enabled())
+    button("Load").send_keys(Keys.ENTER)
+    choice = judge.wait("the picture is listed by its name", lambda: find("#picture"))[0]
+    listed = [(group.get_attribute("label"), group.text.strip()) for group in find("#picture optgroup")]
+    if listed != [("Column", "Overview")]:
+        judge.faults.append(f"the pictures are {listed}")
+    choice.send_keys(Keys.TAB)
+    button("Show").send_keys(Keys.ENTER)
+    names = lambda: [one.text for one in find(".module-picture g text")]
+    judge.wait("the picture is drawn", names)
+    if "Heater" not in names() or not find(".module-picture polyline.pipe"):
+        judge.faults.append(f"the picture has the objects {names()}")
+    about = find(".module-picture")[0].get_attribute("aria-label")
+    if not about.startswith(f"Picture Overview: {len(names())} objects, "):
+        judge.faults.append(f"the picture is named {about}")
+    find("details summary")[0].send_keys(Keys.ENTER)
+    judge.wait("the objects are in a table", lambda: "Heater" in judge.text("details table"))
+    fills = []
+    for scheme in ["light", "dark"]:
+        for size in [WIDE, PHONE]:
+            judge.look(scheme, size)
+            name = f"knowledge-picture-{scheme}-{'phone' if size == PHONE else 'wide'}"
+            judge.driver.execute_script("document.querySelector('.module-picture').scrollIntoView({block: 'center'})")
+            judge.shoot(name)
+            judge.overflow(name)
+            judge.accessible(name)
+        fills.append(find(".module-picture text")[0].value_of_css_property("fill"))
+    if fills[0] == fills[1]:
+        judge.faults.append(f"the picture has the text colour {fills[0]} in both colours")
+    judge.look("light", WIDE)
 
 
 def main():

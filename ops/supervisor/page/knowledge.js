@@ -2,6 +2,7 @@
 
 import { announce, badge, count, empty, h, render, say, several } from "/dom.js";
 import { draw, text } from "/graph.js";
+import { pictures } from "/pictures.js";
 
 const COMMON = "PREFIX css: <http://www.w3id.org/hsu-aut/css#>\nPREFIX rdfs: <http://www.w3.org/2000/01/rdf-schema#>\n";
 const EXAMPLES = [
@@ -36,8 +37,10 @@ export function show(root, { session }) {
       const response = await fetch("/knowledge/questions");
       const told = await response.json();
       if (!response.ok) throw new Error(told.error);
-      upload = files(session, told);
-      render(body, "queries", () => [...queries(session, told), upload.node]);
+      const shown = pictures();
+      upload = files(session, told, shown.load);
+      render(body, "queries", () => [...queries(session, told), shown.node, upload.node]);
+      shown.load();
       say(summary, several(told.questions.length, "named question"));
     } catch (error) {
       render(body, error.message, () => [empty("The MES does not answer", error.message)]);
@@ -129,8 +132,8 @@ function shown(table, seconds) {
   ].filter(Boolean);
 }
 
-/** Returns the card for files: chosen, checked, and then loaded. */
-function files(session, told) {
+/** Returns the card for files: chosen, checked, and then loaded. `loaded` is called after a load. */
+function files(session, told, loaded) {
   const largest = told.largest_file;
   const node = h("section", { class: "card", "aria-labelledby": "files-title" });
   const update = () => {
@@ -141,13 +144,13 @@ function files(session, told) {
         : "This page has no users: load files with ua-space source add." }));
       return;
     }
-    node.replaceChildren(title, form(session, largest));
+    node.replaceChildren(title, form(session, largest, loaded));
   };
   update();
   return { node, update };
 }
 
-function form(session, largest) {
+function form(session, largest, loaded) {
   const limit = `${largest / 2 ** 20} MiB`;
   const input = h("input", { type: "file", id: "file", accept: ".aml,.mtp,.amlx,.ttl,.nt,.xml,.bpmn,.batchml", required: true, "aria-describedby": "file-kinds" });
   const password = h("input", { type: "password", id: "mes-password", autocomplete: "off" });
@@ -182,7 +185,7 @@ function form(session, largest) {
       }
       load.disabled = answer.loaded || !answer.accepted;
       found.replaceChildren(...findings(file.name, answer));
-      if (answer.loaded) { input.value = ""; password.value = ""; secret.hidden = true; input.focus(); } else if (answer.accepted) load.focus();
+      if (answer.loaded) { input.value = ""; password.value = ""; secret.hidden = true; input.focus(); loaded(); } else if (answer.accepted) load.focus();
       announce(answer.loaded ? `${file.name} is loaded` : answer.accepted ? `${file.name} can be loaded` : `${file.name} cannot be loaded`);
     } catch (error) {
       say(fault, error.message);

@@ -1,5 +1,5 @@
 //! The knowledge of the plant, which `ua-mes` keeps: queries, named questions, the plans of
-//! processes, and sources as files.
+//! processes, the pictures of modules, and sources as files.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -116,6 +116,23 @@ impl MesClient {
     pub(crate) async fn plan(&self, process: &str) -> Result<Value, MesFault> {
         let path = format!("/plan/{}", escaped(process));
         json(&self.send(get(&path)?, LIMIT).await?)
+    }
+
+    /// Returns the pictures of modules, with their names.
+    pub(crate) async fn pictures(&self) -> Result<Value, MesFault> {
+        json(&self.send(get("/pictures")?, LIMIT).await?)
+    }
+
+    /// Returns the drawing of a picture as SVG.
+    pub(crate) async fn picture(&self, picture: &str) -> Result<Bytes, MesFault> {
+        let path = format!("/picture/{}", escaped(picture));
+        let response = self.send(get(&path)?, LIMIT).await?;
+        let media = response.headers().get(CONTENT_TYPE);
+        if media.is_none_or(|media| media != SVG) {
+            let why = format!("it is no drawing of the type {SVG}");
+            return Err(MesFault::Unreadable(why));
+        }
+        Ok(response.into_body())
     }
 
     /// Answers a query of SPARQL as a table.
@@ -260,6 +277,8 @@ const LIMIT: Duration = Duration::from_secs(15);
 /// The time limit of a file that is checked or loaded.
 const UPLOAD_LIMIT: Duration = Duration::from_secs(60);
 const LARGEST_RESULT: usize = 8 << 20;
+/// The media type of a drawing.
+const SVG: &str = "image/svg+xml";
 
 #[cfg(test)]
 mod tests {

@@ -1,6 +1,7 @@
 //! The files of the page, and the headers of each response.
 
 use bridge_node::{PageBody, full};
+use bytes::Bytes;
 use hyper::header::{
     CACHE_CONTROL, CONTENT_SECURITY_POLICY, CONTENT_TYPE, HeaderName, HeaderValue, REFERRER_POLICY,
     SET_COOKIE, X_CONTENT_TYPE_OPTIONS, X_FRAME_OPTIONS,
@@ -46,6 +47,15 @@ pub(crate) fn with_headers(media: &'static str, body: PageBody) -> Response<Page
     response
 }
 
+/// Returns a drawing. A browser that opens it by itself runs no script of it.
+pub(crate) fn drawing(svg: Bytes) -> Response<PageBody> {
+    let mut response = with_headers("image/svg+xml", full(svg));
+    let policy = "default-src 'none'; style-src 'unsafe-inline'; sandbox; frame-ancestors 'none'";
+    let headers = response.headers_mut();
+    headers.insert(CONTENT_SECURITY_POLICY, HeaderValue::from_static(policy));
+    response
+}
+
 const HEADERS: [(HeaderName, &str); 6] = [
     (
         CONTENT_SECURITY_POLICY,
@@ -65,7 +75,7 @@ const HEADERS: [(HeaderName, &str); 6] = [
 const SCRIPT: &str = "text/javascript; charset=utf-8";
 
 /// The files of the page by their paths.
-pub(crate) const FILES: [(&str, &str, &str); 16] = [
+pub(crate) const FILES: [(&str, &str, &str); 17] = [
     (
         "/",
         "text/html; charset=utf-8",
@@ -102,6 +112,7 @@ pub(crate) const FILES: [(&str, &str, &str); 16] = [
         include_str!("../page/knowledge.js"),
     ),
     ("/graph.js", SCRIPT, include_str!("../page/graph.js")),
+    ("/pictures.js", SCRIPT, include_str!("../page/pictures.js")),
 ];
 
 #[cfg(test)]

@@ -176,7 +176,7 @@ impl Page {
                 let events = Events::start(worker, Arc::clone(&self), view, reader);
                 Ok(with_headers("text/event-stream", events.boxed_unsync()))
             }
-            knowledge::QUESTIONS | knowledge::PLAN => {
+            knowledge::QUESTIONS | knowledge::PLAN | knowledge::PICTURES | knowledge::PICTURE => {
                 // A plan is work for `ua-mes`, which the page of another site must not cause.
                 check_site(request.headers())?;
                 check_reader(&browser)?;

@@ -23,7 +23,7 @@ use super::{RequestBody, bytes};
 use crate::mes::{MesClient, MesCredentials, MesFault, SourceFile, source_kind};
 use crate::operations::Operations;
 use crate::page::Page;
-use crate::responses::{RefusedRequest, json_page};
+use crate::responses::{RefusedRequest, drawing, json_page};
 use crate::session::BrowserSession;
 use crate::table::MOST_ROWS;
 use crate::value::cut;
@@ -33,6 +33,10 @@ use crate::view::pairs;
 pub(super) const QUESTIONS: &str = "/knowledge/questions";
 /// The path of the plan of a process.
 pub(super) const PLAN: &str = "/knowledge/plan";
+/// The path of the list of pictures.
+pub(super) const PICTURES: &str = "/knowledge/pictures";
+/// The path of a picture as a drawing.
+pub(super) const PICTURE: &str = "/knowledge/picture";
 /// The path of queries.
 pub(super) const QUERY: &str = "/knowledge/query";
 /// The path of a file that is checked.
@@ -59,7 +63,7 @@ pub(super) fn media(path: &str) -> Option<&'static str> {
     matches!(path, CHECK | LOAD).then_some("application/octet-stream")
 }
 
-/// Answers with the named questions, or with the plan of a process.
+/// Answers with the named questions, the plan of a process, the list of pictures, or a picture.
 pub(super) async fn read(page: &Page, uri: &Uri) -> Result<Response<PageBody>, RefusedRequest> {
     let _place = page
         .places
@@ -67,19 +71,35 @@ pub(super) async fn read(page: &Page, uri: &Uri) -> Result<Response<PageBody>, R
         .try_acquire()
         .map_err(|_| busy("queries"))?;
     let mes = mes(page).await?;
-    if uri.path() == QUESTIONS {
-        let mut shown = mes.questions().await.map_err(refusal)?;
-        if let Some(shown) = shown.as_object_mut() {
-            shown.insert("most_rows".to_owned(), MOST_ROWS.into());
-            shown.insert("largest_file".to_owned(), LARGEST_FILE.into());
+    let page = match uri.path() {
+        QUESTIONS => {
+            let mut shown = mes.questions().await.map_err(refusal)?;
+            if let Some(shown) = shown.as_object_mut() {
+                shown.insert("most_rows".to_owned(), MOST_ROWS.into());
+                shown.insert("largest_file".to_owned(), LARGEST_FILE.into());
+            }
+            shown
         }
-        return Ok(json_page(&shown));
-    }
-    let process = parameter(uri, "process").ok_or_else(|| {
-        RefusedRequest::new(StatusCode::BAD_REQUEST, "name the process as ?process=IRI")
-    })?;
-    let plan = mes.plan(&process).await.map_err(refusal)?;
-    Ok(json_page(&plan))
+        PICTURES => mes.pictures().await.map_err(refusal)?,
+        PICTURE => {
+            let picture = iri(uri, "picture")?;
+            let svg = mes.picture(&picture).await.map_err(refusal)?;
+            return Ok(drawing(svg));
+        }
+        _ => {
+            let process = iri(uri, "process")?;
+            mes.plan(&process).await.map_err(refusal)?
+        }
+    };
+    Ok(json_page(&page))
+}
+
+/// Returns the IRI of a thing that a request names.
+fn iri(uri: &Uri, thing: &str) -> Result<String, RefusedRequest> {
+    parameter(uri, thing).ok_or_else(|| {
+        let why = format!("name the {thing} as ?{thing}=IRI");
+        RefusedRequest::new(StatusCode::BAD_REQUEST, why)
+    })
 }
 
 /// Answers a query.

@@ -204,7 +204,7 @@ async fn the_reason_of_a_refused_query_reaches_the_reader() {
 #[tokio::test]
 async fn without_a_mes_the_option_is_named() {
     let page = Page::new("test", Vec::new(), None);
-    for path in [QUESTIONS, "/knowledge/plan?process=urn:p"] {
+    for path in [QUESTIONS, "/knowledge/plan?process=urn:p", PICTURES] {
         let (status, body) = send(&page, (Method::GET, path), &[], "").await;
         let why = body["error"].as_str().unwrap();
         assert!(status == 404 && why.contains("--status"), "{path}: {why}");
@@ -219,12 +219,76 @@ async fn another_site_causes_no_plan() {
         ("cross-site", 403),
         ("same-site", 403),
     ] {
-        for path in [QUESTIONS, "/knowledge/plan?process=urn:p"] {
+        let plan = "/knowledge/plan?process=urn:p";
+        for path in [QUESTIONS, plan, PICTURES, PICTURE] {
             let from = [("sec-fetch-site", site)];
             let (status, _) = send(&page, (Method::GET, path), &from, "").await;
             assert_eq!(status, expected, "{path} from {site}");
         }
     }
+}
+
+/// Returns a request of a browser for a path.
+async fn respond(page: &Arc<Page>, path: &str) -> Result<Response<PageBody>, RefusedRequest> {
+    let request = Request::get(path).header("host", "127.0.0.1:9100");
+    let request = request.body(Full::new(Bytes::new())).unwrap();
+    let visit = Visit::from("127.0.0.1:5000".parse::<SocketAddr>().unwrap());
+    Arc::clone(page).respond(request, &visit).await
+}
+
+#[tokio::test]
+async fn a_reader_lists_the_pictures_of_modules_and_gets_one_as_a_drawing() {
+    let list = r#"{"pictures":[{"name":"Overview","picture":"urn:m/picture/p"}]}"#;
+    let svg = "<svg xmlns=\"http://www.w3.org/2000/svg\"/>";
+    let Cell { page, received } =
+        cell(&[(200, "application/json", list), (200, "image/svg+xml", svg)]);
+    let (status, listed) = send(&page, (Method::GET, PICTURES), &[], "").await;
+    assert_eq!(
+        (status, &listed["pictures"][0]["name"]),
+        (200, &json!("Overview"))
+    );
+    // The IRI goes to the MES as one part of the path, whatever it contains.
+    let path = "/knowledge/picture?picture=urn%3Am%2Fp%3F%22%3E%3Cscript%3E%0D%0AX%3A+1%2F..%2Fask";
+    let response = respond(&page, path).await.ok().unwrap();
+    let headers = response.headers();
+    assert_eq!(headers["content-type"], "image/svg+xml");
+    assert_eq!(headers["x-content-type-options"], "nosniff");
+    let policy = headers["content-security-policy"].to_str().unwrap();
+    assert!(
+        policy.contains("default-src 'none'") && policy.contains("sandbox"),
+        "{policy}"
+    );
+    let body = response.into_body().collect().await.unwrap().to_bytes();
+    assert_eq!(body, svg);
+    let received = received.join().unwrap();
+    assert!(received[0].0.starts_with("get /pictures http/1.1"));
+    let line = received[1].0.lines().next().unwrap();
+    let sent = "urn%3am%2fp%3f%22%3e%3cscript%3e%0d%0ax%3a%201%2f..%2fask";
+    assert_eq!(line, format!("get /picture/{sent} http/1.1"));
+}
+
+#[tokio::test]
+async fn a_picture_that_is_unknown_too_large_or_no_drawing_is_refused() {
+    let unknown = r#"{"error":"unknown","message":"there is no picture `urn:p`"}"#;
+    let large = r#"{"error":"result_limit","message":"the picture `urn:p` is too large"}"#;
+    let Cell { page, .. } = cell(&[
+        (404, "application/json", unknown),
+        (507, "application/json", large),
+        (200, "text/html", "<script>alert(1)</script>"),
+    ]);
+    let picture = (Method::GET, "/knowledge/picture?picture=urn:p");
+    for (status, why) in [
+        (404, "there is no picture `urn:p`"),
+        (507, "the picture `urn:p` is too large"),
+        (502, "it is no drawing of the type image/svg+xml"),
+    ] {
+        let (refused, body) = send(&page, picture.clone(), &[], "").await;
+        let said = body["error"].as_str().unwrap();
+        assert!(refused == status && said.contains(why), "{refused} {said}");
+    }
+    let (status, body) = send(&page, (Method::GET, PICTURE), &[], "").await;
+    let why = json!({ "error": "name the picture as ?picture=IRI" });
+    assert_eq!((status, body), (400, why));
 }
 
 #[tokio::test]
@@ -234,7 +298,9 @@ async fn behind_a_proxy_only_users_query() {
     let asked = r#"{"query":"ASK {}"}"#;
     let (status, _) = send(&page, (Method::POST, QUERY), &[QUERY_MEDIA], asked).await;
     assert_eq!(status, 401);
-    assert_eq!(send(&page, (Method::GET, QUESTIONS), &[], "").await.0, 401);
+    for path in [QUESTIONS, PICTURES, PICTURE] {
+        assert_eq!(send(&page, (Method::GET, path), &[], "").await.0, 401);
+    }
 }
 
 #[tokio::test]
