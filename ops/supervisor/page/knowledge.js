@@ -132,7 +132,7 @@ function shown(table, seconds) {
   ].filter(Boolean);
 }
 
-/** Returns the card for files: chosen, checked, and then loaded. `loaded` is called after a load. */
+/** Returns the card for files: chosen, checked, and then loaded. `loaded` is called then. */
 function files(session, told, loaded) {
   const largest = told.largest_file;
   const node = h("section", { class: "card", "aria-labelledby": "files-title" });

@@ -209,7 +209,7 @@ impl LimitStatements {
     }
 }
 
-/// Returns the finite bounds of a range; `None` if it is no range, or an empty one, which a file has
+/// Returns the finite bounds of a range; `None` if it is no range, or an empty one, as files have it
 /// for an unknown range.
 fn bounds(range: &NodeSetFileRange) -> Option<(Option<f64>, Option<f64>)> {
     let bound = |text: &str| match text.trim() {
