@@ -112,6 +112,7 @@ impl DeclaredLimits {
             let above: Vec<&str> = above
                 .map(String::as_str)
                 .filter(|above| nodes.contains_key(*above))
+                .take(MOST_ABOVE)
                 .collect();
             let grouping = |node: &str| self.grouping.get(node).copied();
             let is_topmost = above
