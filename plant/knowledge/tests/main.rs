@@ -3,6 +3,7 @@
 mod connections;
 mod dump;
 mod http;
+mod limits;
 mod memory;
 mod narrowed;
 mod owl;
