@@ -25,8 +25,8 @@ use tokio::sync::watch;
 use tokio::task::spawn_blocking;
 use tracing::{error, info, warn};
 
+pub(crate) use self::component::QueriedComponent;
 use self::component::{ListedComponent, LostComponent, PresentComponents};
-use self::facts::skill_facts;
 use self::leases::{ComponentLeases, LeaseChange};
 use self::opened::OpenedSkills;
 use self::parameters::{connects, parameter, result, values};
@@ -224,21 +224,16 @@ impl PlantState {
         &self.sources
     }
 
-    /// Adds a server to the graph after it has listed its skills.
+    /// Adds a component to the graph after it has listed its skills.
     pub(crate) fn came(
         &self,
         seen: &SeenServer,
         application_uri: &str,
-        found: Vec<FoundSkill>,
+        found: QueriedComponent,
         listed_ms: u64,
     ) {
-        let Some(first) = found.first() else { return };
-        let facts = ComponentFacts {
-            application_uri: application_uri.to_owned(),
-            name: first.component.clone(),
-            endpoint: seen.url.clone(),
-            namespace: first.namespace,
-            skills: found.iter().filter_map(skill_facts).collect(),
+        let Some(facts) = found.facts(application_uri, &seen.url) else {
+            return;
         };
         // A component with the ApplicationUri of another component replaces it. A component that
         // changes its description keeps its entry.
@@ -273,7 +268,8 @@ impl PlantState {
                 .map(|skill| skill.name.clone())
                 .collect(),
             discovered: seen.name.clone(),
-            found: found.into_iter().filter_map(by_iri).collect(),
+            found: found.skills.into_iter().filter_map(by_iri).collect(),
+            configuration: found.configuration,
             tools: BTreeSet::new(),
         };
         let (skills, endpoint) = (component.skills.len(), &component.endpoint);

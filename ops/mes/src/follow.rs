@@ -1,7 +1,7 @@
-//! Updates the graph from discovery: queries the skills of discovered servers, and removes lost
-//! servers.
+//! Updates the graph from discovery: queries the skills and configurable fields of discovered
+//! servers, and removes lost servers.
 
-use std::collections::{BTreeMap, HashMap};
+use std::collections::HashMap;
 use std::net::IpAddr;
 use std::sync::Arc;
 use std::time::Duration;
@@ -12,7 +12,7 @@ use skills::{FoundSkill, SkillClient, SkillFault, StationChanges};
 use tokio::task::{AbortHandle, JoinSet};
 use tracing::{debug, warn};
 
-use crate::cell::{PlantState, SeenServer};
+use crate::cell::{PlantState, QueriedComponent, SeenServer};
 use crate::clock::{now, since_1970};
 use crate::live;
 use crate::servers::LiveServers;
@@ -91,18 +91,21 @@ async fn once(cell: &PlantState, seen: &SeenServer) -> Result<(), SkillFault> {
     let client = SkillClient::connect(&seen.url, cell.client()).await?;
     let read = async {
         let changes = client.station_changes().await?;
-        Ok((changes, client.skills().await?))
+        Ok((changes, client.skills_and_configurations().await?))
     };
-    let (changes, found) = match read.await {
+    let (changes, (skills, configurations)) = match read.await {
         Ok(read) => read,
         Err(fault) => {
             client.close().await;
             return Err(fault);
         }
     };
-    if found.is_empty() && changes.is_none() {
+    if skills.is_empty() && configurations.is_empty() && changes.is_none() {
         client.close().await;
-        debug!(url = seen.url, "a server has no skills");
+        debug!(
+            url = seen.url,
+            "a server has no skills and no configurable fields"
+        );
         // Another announcement of the server starts another query.
         return std::future::pending().await;
     }
@@ -113,18 +116,17 @@ async fn once(cell: &PlantState, seen: &SeenServer) -> Result<(), SkillFault> {
             "it does not say who it is".to_owned(),
         ));
     }
-    let components = by_component(&uri, &found);
+    let components = QueriedComponent::all(&uri, (skills.clone(), configurations));
     cell.keeps_only(&seen.name, |uri| components.contains_key(uri));
     let listed = now();
-    for (of, found) in &components {
-        let Some(first) = found.first() else { continue };
+    for (of, component) in components {
         let seen = SeenServer {
-            url: first.endpoint(&seen.url),
+            url: component.endpoint(&seen.url),
             ..seen.clone()
         };
-        cell.came(&seen, of, found.clone(), listed);
+        cell.came(&seen, &of, component, listed);
     }
-    show_states(cell, &client, (&uri, &found), changes).await;
+    show_states(cell, &client, (&uri, &skills), changes).await;
     client.close().await;
     Ok(())
 }
@@ -153,17 +155,6 @@ async fn show_states(
         },
         None => states.await,
     }
-}
-
-/// Returns the skills by the ApplicationUris of their components: the server itself, or the
-/// components behind a station.
-fn by_component(server: &str, found: &[FoundSkill]) -> BTreeMap<String, Vec<FoundSkill>> {
-    let mut components: BTreeMap<String, Vec<FoundSkill>> = BTreeMap::new();
-    for skill in found {
-        let of = skill.behind.as_deref().unwrap_or(server).to_owned();
-        components.entry(of).or_default().push(skill.clone());
-    }
-    components
 }
 
 fn is_loopback(url: &str) -> bool {

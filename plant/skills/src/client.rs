@@ -44,7 +44,7 @@ use plant_opcua::types::StatusCode;
 
 pub use choice::{Chosen, Needs, plate_between};
 pub use detector::{Detected, Detector};
-pub use fields::SetFieldsFault;
+pub use fields::{ConfigurationHandle, FoundConfiguration, SetFieldsFault};
 pub use found::{FoundParameter, FoundSkill, FoundType};
 pub use handle::{RemoteState, SkillHandle};
 pub use mirror::{MirroredSkill, Mirrors, StartCondition, Watchable};
@@ -171,6 +171,21 @@ impl SkillClient {
     pub async fn skills(&self) -> Result<Vec<FoundSkill>, SkillFault> {
         self.skills_of(&ParameterType::own(crate::model::SKILL_TYPE))
             .await
+    }
+
+    /// Returns all skills of the server, and the configurations that can be set, also of components
+    /// without skills.
+    ///
+    /// # Errors
+    /// No response.
+    pub async fn skills_and_configurations(
+        &self,
+    ) -> Result<(Vec<FoundSkill>, Vec<FoundConfiguration>), SkillFault> {
+        let (skills, mut configurations) = find::skills_and_configurations(&self.client).await?;
+        if self.behind.is_some() {
+            configurations.retain(|found| found.behind == self.behind);
+        }
+        Ok((self.of_component(skills), configurations))
     }
 
     /// Returns all Programs of the server, including Programs that are not skills.

@@ -43,10 +43,11 @@ pub mod yaml;
 
 pub use authority::{Authority, SkillOwner};
 pub use client::{
-    AttachedElsewhere, Chosen, ClientOptions, Detected, Detector, FailedLocator, FoundParameter,
-    FoundSkill, FoundType, LocatorError, MirroredSkill, Mirrors, Needs, NotLocated, PartnerError,
-    PeerAccess, RemoteState, SetFieldsFault, SkillClient, SkillHandle, SkillStates, StartCondition,
-    StationChanges, Unchosen, UnfitGrasp, Watchable, plate_between,
+    AttachedElsewhere, Chosen, ClientOptions, ConfigurationHandle, Detected, Detector,
+    FailedLocator, FoundConfiguration, FoundParameter, FoundSkill, FoundType, LocatorError,
+    MirroredSkill, Mirrors, Needs, NotLocated, PartnerError, PeerAccess, RemoteState,
+    SetFieldsFault, SkillClient, SkillHandle, SkillStates, StartCondition, StationChanges,
+    Unchosen, UnfitGrasp, Watchable, plate_between,
 };
 pub use component::{
     ChangeKind, Component, ComponentSecurity, Device, DeviceKinds, DriverFault, DriverSetup,

@@ -27,6 +27,12 @@ const FIELDS: [(&str, &str, &str); 2] = [
     ),
 ];
 
+const SENSOR: (&str, &str, &str) = (
+    "vacuum-sensor.yaml",
+    "urn:example:vacuum-sensor",
+    "configurable:\n  - {name: ReportingPeriod, period: all, range: [50, 5000]}\n",
+);
+
 fn store(cell: &Cell, name: &str) -> PathBuf {
     cell.folder().join(format!("{name}.store"))
 }
@@ -47,10 +53,16 @@ fn component(cell: &Cell, (file, _, fields): (&str, &str, &str)) -> Child {
     let pki = pki.to_str().unwrap();
     let chief = ["user", "add", "chief", "--role", "configure_admin"];
     ua_server(&[&chief[..], &["--pki", pki]].concat(), PASSWORD);
-    let fields = format!("{fields}skills:\n");
+    // A sensor has no skills.
+    let before = if file == SENSOR.0 {
+        "values:\n"
+    } else {
+        "skills:\n"
+    };
+    let fields = format!("{fields}{before}");
     let changes = [
         ("security: [None]", "security: [Basic256Sha256]"),
-        ("skills:\n", fields.as_str()),
+        (before, fields.as_str()),
     ];
     let more = ["--pki", pki, "--trust-any-client-certificate"];
     let child = start(cell, "ua-component", file, &changes, &more);
@@ -81,37 +93,37 @@ fn stored(cell: &Cell, file: &str) -> Value {
     text.map_or_else(|_| json!({}), |text| serde_json::from_str(&text).unwrap())
 }
 
+/// Starts the MES as the user chief, and waits until it knows components.
+fn mes(cell: &Cell, names: [&str; 2]) -> Child {
+    let capabilities = Path::new(EXAMPLES).join("capabilities.ttl");
+    fs::copy(capabilities, cell.folder().join("capabilities.ttl")).unwrap();
+    let _password = cell.file("chief.password", PASSWORD);
+    let user = "user: {name: chief, password_file: chief.password}\nprocesses:\n";
+    let pki = store(cell, "mes");
+    let more = ["--pki", pki.to_str().unwrap()];
+    let changes = [("processes:\n", user)];
+    let mes = start(cell, "ua-mes", "mes.yaml", &changes, &more);
+    eventually("both components are in the graph", SOON, || {
+        let there = rows("components");
+        let is_there = |name: &&str| there.iter().any(|row| row["name"] == **name);
+        names.iter().all(is_there).then_some(())
+    });
+    mes
+}
+
+fn outcomes(response: &Value) -> Vec<Value> {
+    let components = response["components"].as_array().cloned();
+    let all = components.unwrap_or_default();
+    all.iter().map(|one| one["outcome"].clone()).collect()
+}
+
 #[test]
 fn a_product_is_configured_at_all_its_components_or_at_none() {
     let Some(cell) = Cell::with(&[]) else { return };
     let [gripper, robot] = FIELDS;
     let _gripper = component(&cell, gripper);
     let robot_runs = component(&cell, robot);
-    let capabilities = Path::new(EXAMPLES).join("capabilities.ttl");
-    fs::copy(capabilities, cell.folder().join("capabilities.ttl")).unwrap();
-    let _password = cell.file("chief.password", PASSWORD);
-    let user = "user: {name: chief, password_file: chief.password}\nprocesses:\n";
-    let pki = store(&cell, "mes");
-    let more = ["--pki", pki.to_str().unwrap()];
-    let _mes = start(
-        &cell,
-        "ua-mes",
-        "mes.yaml",
-        &[("processes:\n", user)],
-        &more,
-    );
-    eventually("both components are in the graph", SOON, || {
-        let there = rows("components");
-        let is_there = |name: &str| there.iter().any(|row| row["name"] == name);
-        (is_there("parallel-gripper") && is_there("robot")).then_some(())
-    });
-    let outcomes = |response: &Value| {
-        let components = response["components"].as_array().cloned();
-        let all = components.unwrap_or_default();
-        all.iter()
-            .map(|one| one["outcome"].clone())
-            .collect::<Vec<_>>()
-    };
+    let _mes = mes(&cell, ["parallel-gripper", "robot"]);
     let product = Path::new(EXAMPLES).join("product.aml");
 
     let (code, checked) = configure(&product, &["--check"]);
@@ -170,4 +182,76 @@ fn a_product_is_configured_at_all_its_components_or_at_none() {
     );
     assert_eq!(outcomes(&refused), ["accepted", "not_reached"]);
     assert_eq!(stored(&cell, gripper.0)["GripForce"], 40.0);
+}
+
+/// Writes the file of a product with a gripper and a sensor.
+fn gripper_and_sensor(cell: &Cell, force: f64, period: f64) -> PathBuf {
+    let fields = [
+        (FIELDS[0].1, "GripForce", "N", force),
+        (SENSOR.1, "ReportingPeriod", "ms", period),
+    ];
+    let elements = fields.map(|(uri, field, unit, value)| {
+        format!(
+            "<InternalElement Name=\"{field}\" ID=\"{field}\">
+              <Attribute Name=\"ApplicationUri\"><Value>{uri}</Value></Attribute>
+              <Attribute Name=\"{field}\" Unit=\"{unit}\" AttributeDataType=\"xs:double\">
+                <Value>{value}</Value></Attribute>
+            </InternalElement>"
+        )
+    });
+    let text = format!(
+        "<CAEXFile FileName=\"product.aml\" SchemaVersion=\"3.0\" xmlns=\"http://www.dke.de/CAEX\">
+          <InstanceHierarchy Name=\"Cover\">{}</InstanceHierarchy></CAEXFile>",
+        elements.concat()
+    );
+    cell.file("product.aml", &text)
+}
+
+#[test]
+fn a_sensor_without_skills_is_configured_with_a_gripper_or_neither_of_them_is() {
+    let Some(cell) = Cell::with(&[]) else { return };
+    let gripper = FIELDS[0];
+    let _gripper = component(&cell, gripper);
+    let sensor = component(&cell, SENSOR);
+    let _mes = mes(&cell, ["parallel-gripper", "vacuum-sensor"]);
+    let run = |force, period, more: &[&str]| {
+        let (code, response) = configure(&gripper_and_sensor(&cell, force, period), more);
+        (code, outcomes(&response), response)
+    };
+    let stored = || [gripper.0, SENSOR.0].map(|file| stored(&cell, file));
+
+    let (code, checked, response) = run(20.0, 100.0, &["--check"]);
+    assert_eq!(
+        (code, checked),
+        (0, vec![json!("accepted"); 2]),
+        "{response}"
+    );
+    let (code, refused, response) = run(20.0, 7.0, &[]);
+    assert_eq!((code, &refused[1]), (1, &json!("refused")), "{response}");
+    let reason = "ReportingPeriod: expected 50 to 5000 ms, found 7";
+    assert_eq!(response["components"][1]["reason"], reason);
+    assert_eq!(stored(), [json!({}), json!({})]);
+    let (code, set, response) = run(20.0, 100.0, &[]);
+    assert_eq!((code, set), (0, vec![json!("configured"); 2]), "{response}");
+    let first = [
+        json!({"GripForce": 20.0}),
+        json!({"ReportingPeriod": 100.0}),
+    ];
+    assert_eq!(stored(), first);
+
+    // The sensor accepts its field, and then cannot store it: the gripper is set back.
+    let blocked = store(&cell, SENSOR.0).join("configuration.json.new");
+    fs::create_dir(&blocked).unwrap();
+    let (code, back, response) = run(30.0, 200.0, &[]);
+    assert_eq!((code, &response["outcome"]), (1, &json!("set_back")));
+    assert_eq!(back, ["set_back", "refused"], "{response}");
+    assert_eq!(stored(), first);
+    fs::remove_dir(&blocked).unwrap();
+
+    // Without the sensor nothing is set.
+    drop(sensor);
+    let (code, refused, response) = run(30.0, 200.0, &[]);
+    assert_eq!((code, &response["outcome"]), (1, &json!("refused")));
+    assert_eq!(refused, ["accepted", "not_reached"], "{response}");
+    assert_eq!(stored(), first);
 }

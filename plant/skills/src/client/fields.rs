@@ -3,11 +3,54 @@
 use plant_opcua::client::{Browse, OpcUaClient};
 use plant_opcua::types::{DataValue, EUInformation, NodeId, StatusCode, Variant};
 
-use super::{SkillHandle, called, lost};
+use super::stations::BEHIND;
+use super::{SkillClient, called, lost};
 use crate::configuration::FieldChange;
-use crate::server::{CONFIGURATION, CONFIGURED, SET_FIELDS};
+use crate::server::{CONFIGURED, SET_FIELDS};
 use crate::skill_fault::SkillFault;
 use crate::variant::{from_optional_pairs, from_variant, to_optional_pairs};
+
+/// The configuration of a component that was found at a server. The component may have no skills.
+#[derive(Debug, Clone, PartialEq)]
+pub struct FoundConfiguration {
+    /// The name of its component.
+    pub component: String,
+    /// The ApplicationUri of the component behind a station; `None` for a component of the server
+    /// itself.
+    pub behind: Option<String>,
+    /// The number of the component in the space, if the server provides it.
+    pub namespace: Option<u16>,
+    pub(super) object: NodeId,
+}
+
+impl FoundConfiguration {
+    /// Returns the endpoint of the component of a configuration that was found at a server.
+    #[must_use]
+    pub fn endpoint(&self, server: &str) -> String {
+        match &self.behind {
+            Some(uri) => format!("{server}{BEHIND}{uri}"),
+            None => server.to_owned(),
+        }
+    }
+}
+
+/// The fields of a component that can be set. Clones share the connection.
+#[derive(Clone)]
+pub struct ConfigurationHandle {
+    client: OpcUaClient,
+    found: FoundConfiguration,
+}
+
+impl SkillClient {
+    /// Returns a handle to set the fields of a component.
+    #[must_use]
+    pub fn configuration(&self, found: &FoundConfiguration) -> ConfigurationHandle {
+        ConfigurationHandle {
+            client: self.client.clone(),
+            found: found.clone(),
+        }
+    }
+}
 
 /// The reason why fields are not set.
 #[derive(Debug, thiserror::Error)]
@@ -29,7 +72,7 @@ pub enum SetFieldsFault {
     Request(#[from] SkillFault),
 }
 
-impl SkillHandle {
+impl ConfigurationHandle {
     /// Checks that fields of the component have these units: symbols, with the names of the fields.
     /// Fields without a unit, and fields that the component does not show, have any unit. A unit
     /// that cannot be read is an error.
@@ -37,11 +80,9 @@ impl SkillHandle {
     /// # Errors
     /// [`SetFieldsFault`].
     pub async fn check_units(&self, units: &[(String, String)]) -> Result<(), SetFieldsFault> {
-        let client = self.client();
-        let object = child(client, self.component(), CONFIGURATION).await?;
-        let object = object.ok_or(SetFieldsFault::None)?;
+        let client = &self.client;
         for (field, unit) in units {
-            let Some(variable) = child(client, &object, field).await? else {
+            let Some(variable) = child(client, &self.found.object, field).await? else {
                 continue;
             };
             let Some(property) = child(client, &variable, "EngineeringUnits").await? else {
@@ -57,8 +98,8 @@ impl SkillHandle {
         Ok(())
     }
 
-    /// Sets configured fields of the component of the skill, or only checks them. A missing value
-    /// removes the configured value of a field. Returns the values before.
+    /// Sets configured fields of the component, or only checks them. A missing value removes the
+    /// configured value of a field. Returns the values before.
     ///
     /// # Errors
     /// [`SetFieldsFault`]. Nothing is set, except after [`SkillFault::Lost`].
@@ -67,17 +108,14 @@ impl SkillHandle {
         fields: &[(String, Option<crate::value::SkillValue>)],
         checks_only: bool,
     ) -> Result<FieldChange, SetFieldsFault> {
-        let client = self.client();
-        let component = self.component();
-        let object = child(client, component, CONFIGURATION).await?;
-        let object = object.ok_or(SetFieldsFault::None)?;
-        let method = child(client, &object, SET_FIELDS).await?;
+        let (client, object) = (&self.client, &self.found.object);
+        let method = child(client, object, SET_FIELDS).await?;
         let method = method.ok_or(SetFieldsFault::None)?;
         let [names, values] = to_optional_pairs(fields);
         let arguments = vec![names, values, checks_only.into()];
-        let what = format!("{SET_FIELDS} of {}", self.found().component);
-        let answer = client.call(&object, &method, arguments).await;
-        let answer = answer.map_err(|error| called(&error, &what))?;
+        let what = format!("{SET_FIELDS} of {}", self.found.component);
+        let answer = client.call(object, &method, arguments).await;
+        let answer = answer.map_err(|error| may_not(called(&error, &what)))?;
         let wrong = || SkillFault::Unexpected(format!("{what} has another response"));
         let [status, field, reason, names, values] = answer.as_slice() else {
             return Err(wrong().into());
@@ -94,6 +132,24 @@ impl SkillHandle {
             });
         }
         Ok(from_optional_pairs(names, values).ok_or_else(wrong)?)
+    }
+}
+
+/// Adds the missing role to the reason of a denied request.
+fn may_not(fault: SkillFault) -> SkillFault {
+    match fault {
+        SkillFault::Refused { status, text } if status == DENIED.to_string() => {
+            let text = format!(
+                "{text}: the user needs the role configure_admin at this component, or at the \
+                 station before it"
+            );
+            SkillFault::Refused { status, text }
+        }
+        SkillFault::Refused { .. }
+        | SkillFault::Lost(_)
+        | SkillFault::TimedOut(_)
+        | SkillFault::NotHalted(_)
+        | SkillFault::Unexpected(_) => fault,
     }
 }
 
@@ -133,6 +189,8 @@ async fn child(
     let found = below.find(|child| child.browse_name.name.as_ref() == name);
     Ok(found.map(|child| child.node_id.node_id))
 }
+
+const DENIED: StatusCode = StatusCode::BadUserAccessDenied;
 
 #[cfg(test)]
 mod tests {

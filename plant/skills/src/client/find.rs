@@ -9,6 +9,7 @@ use plant_opcua::types::{
     QualifiedName, Range, ReferenceDescription, ReferenceTypeId, VariableId, Variant,
 };
 
+use super::fields::FoundConfiguration;
 use super::found::{FoundParameter, FoundSkill, FoundType, Nodes, texts};
 use super::packed::Packed;
 use super::stations::STATION_FOLDERS;
@@ -18,6 +19,7 @@ use crate::model::{
     alias,
 };
 use crate::parameters::ParameterType;
+use crate::server::{CONFIGURATION, SET_FIELDS};
 use crate::skill_fault::SkillFault;
 use crate::tool_state::ToolState;
 use crate::value::{Builtin, SkillValue, ValueShape};
@@ -29,6 +31,40 @@ pub(super) async fn skills(
     client: &OpcUaClient,
     wanted: &ParameterType,
 ) -> Result<Vec<FoundSkill>, SkillFault> {
+    let SkillTypes { roots, wanted } = skill_types(client, wanted).await?;
+    match roots.is_empty() {
+        true => Ok(Vec::new()),
+        false => all(client, &wanted, &roots).await,
+    }
+}
+
+/// Returns all skills, and the configurations that can be set, also of components without skills.
+pub(super) async fn skills_and_configurations(
+    client: &OpcUaClient,
+) -> Result<(Vec<FoundSkill>, Vec<FoundConfiguration>), SkillFault> {
+    let SkillTypes { roots, wanted } = skill_types(client, &ParameterType::own(SKILL_TYPE)).await?;
+    // Other servers are not searched: each component has names of this namespace.
+    if roots.is_empty() && client.namespace(NAMESPACE).is_none() {
+        return Ok((Vec::new(), Vec::new()));
+    }
+    let below = instances(client, &wanted).await?;
+    let skills = read_all(client, &roots, below.instances).await?;
+    let configurations = configurations(client, below.configurations).await?;
+    Ok((skills, configurations))
+}
+
+/// The types of skills of a server.
+struct SkillTypes {
+    /// SkillType, in each of its namespaces.
+    roots: Vec<NodeId>,
+    /// The wanted type and its subtypes.
+    wanted: HashSet<NodeId>,
+}
+
+async fn skill_types(
+    client: &OpcUaClient,
+    wanted: &ParameterType,
+) -> Result<SkillTypes, SkillFault> {
     let wanted = known_as(wanted).unwrap_or_else(|| wanted.clone());
     let mut roots = Vec::new();
     let mut types = HashSet::new();
@@ -47,10 +83,10 @@ pub(super) async fn skills(
             );
         }
     }
-    if roots.is_empty() {
-        return Ok(Vec::new());
-    }
-    all(client, &types, &roots).await
+    Ok(SkillTypes {
+        roots,
+        wanted: types,
+    })
 }
 
 /// Returns all Programs, including Programs that are not skills.
@@ -68,7 +104,15 @@ async fn all(
     if types.is_empty() {
         return Ok(Vec::new());
     }
-    let instances = instances(client, types).await?;
+    let instances = instances(client, types).await?.instances;
+    read_all(client, roots, instances).await
+}
+
+async fn read_all(
+    client: &OpcUaClient,
+    roots: &[NodeId],
+    instances: Vec<Instance>,
+) -> Result<Vec<FoundSkill>, SkillFault> {
     let shared = Shared::of(client, roots, &instances).await?;
     let reads = instances
         .into_iter()
@@ -77,6 +121,7 @@ async fn all(
 }
 
 /// Data that several skills share and that is read once.
+#[derive(Default)]
 struct Shared {
     /// The supertypes of each type, by NodeId.
     chains: HashMap<NodeId, Vec<FoundType>>,
@@ -92,34 +137,69 @@ impl Shared {
         roots: &[NodeId],
         instances: &[Instance],
     ) -> Result<Self, SkillFault> {
-        let mut shared = Self {
-            chains: HashMap::new(),
-            components: HashMap::new(),
-            behind: HashMap::new(),
-        };
+        let mut shared = Self::default();
         for instance in instances {
             let of = &instance.reference.type_definition.node_id;
             if !shared.chains.contains_key(of) {
                 let chain = chain(client, roots, of).await?;
                 shared.chains.insert(of.clone(), chain);
             }
-            if let Some(node) = behind(&instance.above)
-                && !shared.behind.contains_key(node)
-            {
-                let uri = shown_uri(client, node).await?;
-                shared.behind.insert(node.clone(), uri);
-            }
-            if let Some((node, name)) = component_of(&instance.above)
-                && !shared.components.contains_key(node)
-            {
-                let number = number_of(client, node).await?;
-                shared
-                    .components
-                    .insert(node.clone(), (name.clone(), number));
-            }
+            shared.add_component(client, &instance.above).await?;
         }
         Ok(shared)
     }
+
+    /// Reads the component that the lowest of these objects is or belongs to.
+    async fn add_component(
+        &mut self,
+        client: &OpcUaClient,
+        above: &[(NodeId, String)],
+    ) -> Result<(), SkillFault> {
+        if let Some(node) = behind(above)
+            && !self.behind.contains_key(node)
+        {
+            let uri = shown_uri(client, node).await?;
+            self.behind.insert(node.clone(), uri);
+        }
+        if let Some((node, name)) = component_of(above)
+            && !self.components.contains_key(node)
+        {
+            let number = number_of(client, node).await?;
+            self.components.insert(node.clone(), (name.clone(), number));
+        }
+        Ok(())
+    }
+}
+
+/// Returns the configurations with the method that sets their fields.
+async fn configurations(
+    client: &OpcUaClient,
+    candidates: Vec<Instance>,
+) -> Result<Vec<FoundConfiguration>, SkillFault> {
+    let mut shared = Shared::default();
+    let mut found = Vec::new();
+    for Instance { reference, above } in candidates {
+        let object = reference.node_id.node_id;
+        let methods = Browse {
+            classes: NodeClassMask::METHOD,
+            ..Browse::hierarchical()
+        };
+        let methods = client.browse(&object, methods).await;
+        let mut methods = methods.map_err(|error| lost(&error))?.into_iter();
+        if !methods.any(|method| name_of(&method) == SET_FIELDS) {
+            continue;
+        }
+        shared.add_component(client, &above).await?;
+        let component = component_of(&above).and_then(|(node, _)| shared.components.get(node));
+        let (component, namespace) = component.cloned().unwrap_or_default();
+        found.push(FoundConfiguration {
+            component,
+            behind: behind(&above).and_then(|node| shared.behind.get(node)?.clone()),
+            namespace,
+            object,
+        });
+    }
+    Ok(found)
 }
 
 /// Returns the type of this crate that is the equivalent of a type of the earlier system.
@@ -189,12 +269,21 @@ struct Instance {
     above: Vec<(NodeId, String)>,
 }
 
-/// Returns the objects of these types below Objects, level by level, in the order of the server.
+/// The objects below Objects, level by level, in the order of the server.
+#[derive(Default)]
+struct ObjectsBelow {
+    /// The instances of types.
+    instances: Vec<Instance>,
+    /// The objects with the name of the configuration of a component.
+    configurations: Vec<Instance>,
+}
+
+/// Returns the instances of these types, and the configurations of components.
 async fn instances(
     client: &OpcUaClient,
     types: &HashSet<NodeId>,
-) -> Result<Vec<Instance>, SkillFault> {
-    let mut found = Vec::new();
+) -> Result<ObjectsBelow, SkillFault> {
+    let mut found = ObjectsBelow::default();
     let mut seen: HashSet<NodeId> = HashSet::from([ObjectId::Server.into()]);
     let mut level: Vec<Vec<(NodeId, String)>> =
         vec![vec![(ObjectId::ObjectsFolder.into(), "Objects".to_owned())]];
@@ -218,14 +307,20 @@ async fn instances(
                 if seen.len() >= MOST_OBJECTS || !seen.insert(id.clone()) {
                     continue;
                 }
-                if types.contains(&reference.type_definition.node_id) {
-                    found.push(Instance {
-                        reference,
-                        above: above.clone(),
-                    });
+                let name = name_of(&reference);
+                let is_instance = types.contains(&reference.type_definition.node_id);
+                let list = match (is_instance, name == CONFIGURATION) {
+                    (true, _) => Some(&mut found.instances),
+                    (false, true) => Some(&mut found.configurations),
+                    (false, false) => None,
+                };
+                if let Some(list) = list {
+                    let above = above.clone();
+                    list.push(Instance { reference, above });
+                }
+                if is_instance {
                     continue;
                 }
-                let name = reference.browse_name.name.as_ref().to_owned();
                 next.push(above.iter().cloned().chain([(id, name)]).collect());
             }
         }

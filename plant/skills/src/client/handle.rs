@@ -52,15 +52,6 @@ impl SkillHandle {
         &self.found
     }
 
-    pub(super) fn client(&self) -> &OpcUaClient {
-        &self.client
-    }
-
-    /// Returns the object of its component.
-    pub(super) fn component(&self) -> &NodeId {
-        &self.found.nodes.component
-    }
-
     /// Reads the current state.
     ///
     /// # Errors
