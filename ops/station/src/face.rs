@@ -173,19 +173,32 @@ pub(crate) struct Passing {
 }
 
 impl Passing {
-    /// Returns the session of a caller at the server.
-    async fn session(
-        &self,
-        caller: &SessionCaller,
-        presence: &SessionPresence,
-        what: &str,
-    ) -> Result<OpcUaClient, StatusCode> {
+    /// Checks that calls and writes of a caller are forwarded.
+    fn check(&self, caller: &SessionCaller, what: &str) -> Result<(), StatusCode> {
         self.admission.check(caller).inspect_err(|_| {
             warn!(
                 application = ?caller.application_uri, user = ?caller.user, what,
                 "refused request: the caller needs the role operator"
             );
-        })?;
+        })
+    }
+
+    /// Checks that a caller may set the fields of the servers behind the station.
+    fn check_configures(&self, caller: &SessionCaller) -> Result<(), StatusCode> {
+        self.admission.check_configures(caller).inspect_err(|_| {
+            warn!(
+                application = ?caller.application_uri, user = ?caller.user,
+                "refused {SET_FIELDS}: the caller needs the role configure_admin"
+            );
+        })
+    }
+
+    /// Returns the session of a checked caller at the server.
+    async fn session(
+        &self,
+        caller: &SessionCaller,
+        presence: &SessionPresence,
+    ) -> Result<OpcUaClient, StatusCode> {
         let client = self.callers.client_of(caller.session).await;
         let client = client.map_err(status)?;
         if !presence.lasts() {
@@ -213,18 +226,12 @@ impl MethodHandler for Calling {
     }
 
     async fn call(&self, request: MethodRequest) -> Result<Vec<Variant>, MethodRefusal> {
-        if self.configures {
-            let check = self.passing.admission.check_configures(&request.caller);
-            check.inspect_err(|_| {
-                warn!(
-                    application = ?request.caller.application_uri, user = ?request.caller.user,
-                    "refused {SET_FIELDS}: the caller needs the role configure_admin"
-                );
-            })?;
+        // The role to configure does not include the role of an operator.
+        match self.configures {
+            true => self.passing.check_configures(&request.caller)?,
+            false => self.passing.check(&request.caller, &request.name)?,
         }
-        let session = self
-            .passing
-            .session(&request.caller, &request.presence, &request.name);
+        let session = self.passing.session(&request.caller, &request.presence);
         let client = session.await.map_err(MethodRefusal::Status)?;
         let options = CallOptions {
             // The forwarded call times out first, so that the caller receives its status.
@@ -250,9 +257,8 @@ pub(crate) struct ForwardedWrites {
 impl WriteHandler for ForwardedWrites {
     async fn write(&self, request: WriteRequest) -> Result<(), StatusCode> {
         let what = request.node.to_string();
-        let session = self
-            .passing
-            .session(&request.caller, &request.presence, &what);
+        self.passing.check(&request.caller, &what)?;
+        let session = self.passing.session(&request.caller, &request.presence);
         let client = session.await?;
         let value = request.value.value.unwrap_or_default();
         let written = client.write(&[(self.node.clone(), value)]).await;

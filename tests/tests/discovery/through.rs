@@ -2,6 +2,7 @@
 //! beside them.
 
 mod product;
+mod secured;
 
 use std::path::{Path, PathBuf};
 use std::time::Duration;

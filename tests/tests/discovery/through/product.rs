@@ -11,7 +11,7 @@ use super::super::SOON;
 use super::{GRIPPER, LEVELS, ROBOT, Tower, component_started, station, station_started, tower};
 
 /// The components in the order in which they are set: name, ApplicationUri, skill type, fields.
-const COMPONENTS: [(&str, &str, &str, &str); 2] = [
+pub(super) const COMPONENTS: [(&str, &str, &str, &str); 2] = [
     (
         "gripper",
         GRIPPER,
@@ -55,7 +55,7 @@ fn stored(cell: &Cell) -> [Value; 2] {
 }
 
 /// Writes the file of a product.
-fn product(cell: &Cell, force: f64, speed: f64) -> PathBuf {
+pub(super) fn product(cell: &Cell, force: f64, speed: f64) -> PathBuf {
     let [gripper, robot] = [
         (GRIPPER, "GripForce", force),
         (ROBOT, "SpeedLimit", speed),
@@ -76,7 +76,7 @@ fn product(cell: &Cell, force: f64, speed: f64) -> PathBuf {
 }
 
 /// Starts to configure a product by the MES.
-fn configure(tower: &Tower, product: &Path, more: &[&str]) -> Child {
+pub(super) fn configure(tower: &Tower, product: &Path, more: &[&str]) -> Child {
     StartedChild::new("ua-space", &program("ua-space"))
         .args(["configure", product.to_str().unwrap(), "--json"])
         .args(more)
@@ -85,13 +85,13 @@ fn configure(tower: &Tower, product: &Path, more: &[&str]) -> Child {
 }
 
 /// Returns the exit code and the response, when the product is configured.
-fn ended(mut child: Child) -> (i32, Value) {
+pub(super) fn ended(mut child: Child) -> (i32, Value) {
     let code = child.wait_for_end(SOON * 2).code().unwrap();
     let response = child.json_lines().pop();
     (code, response.unwrap_or_else(|| json!(child.to_string())))
 }
 
-fn outcomes(response: &Value) -> Vec<&str> {
+pub(super) fn outcomes(response: &Value) -> Vec<&str> {
     let components = response["components"].as_array().unwrap();
     let outcomes = components
         .iter()
@@ -100,7 +100,7 @@ fn outcomes(response: &Value) -> Vec<&str> {
 }
 
 /// Waits until the MES has both components in its graph.
-fn both_are_known(tower: &Tower) {
+pub(super) fn both_are_known(tower: &Tower) {
     eventually("both components are known to the MES", SOON * 3, || {
         let path = "/ask/components";
         let page = tower.client.within(|| http_get("127.0.0.1:8087", path))?;
@@ -112,6 +112,17 @@ fn both_are_known(tower: &Tower) {
             .all(|(name, ..)| is_there(name))
             .then_some(())
     });
+}
+
+/// Waits until both components accept their fields: each station has registered at the one above,
+/// and each component at its station, which may configure it then.
+pub(super) fn both_are_supervised(cell: &Cell, tower: &Tower) {
+    let wanted = product(cell, 20.0, 0.5);
+    let accepted = eventually("both components accept their fields", SOON, || {
+        let (code, checked) = ended(configure(tower, &wanted, &["--check"]));
+        (code == 0).then_some(checked)
+    });
+    assert_eq!(outcomes(&accepted), ["accepted"; 2], "{accepted}");
 }
 
 #[test]
@@ -136,12 +147,7 @@ fn a_product_is_configured_behind_two_stations_at_all_its_components_or_at_none(
     both_are_known(&tower);
 
     // All fields are checked before the first one is set.
-    let (code, checked) = ended(configure(&tower, &product(&cell, 20.0, 0.5), &["--check"]));
-    assert_eq!(
-        (code, outcomes(&checked)),
-        (0, vec!["accepted"; 2]),
-        "{checked}"
-    );
+    both_are_supervised(&cell, &tower);
     let (code, refused) = ended(configure(&tower, &product(&cell, 20.0, 7.0), &[]));
     let expected = (1, vec!["accepted", "refused"]);
     assert_eq!((code, outcomes(&refused)), expected, "{refused}");
