@@ -471,8 +471,19 @@ impl Telling {
         }
     }
 
+    /// Registers again after a wait that grows.
+    fn register_later(&mut self) {
+        self.register_at = Instant::now() + spread(self.wait, &self.server.borrow().url);
+        self.wait = (self.wait * 2).min(self.longest_wait());
+    }
+
+    /// Including the share of `spread`, the wait stays below its limit.
+    fn longest_wait(&self) -> Duration {
+        (MOST_WAIT / 2).min(self.register_every() / 2)
+    }
+
     fn registered(&mut self, result: Result<Done, DiscoveryQueryFault>) {
-        let lds = self.settings.lds.as_deref().unwrap_or_default();
+        let lds = self.settings.lds.clone().unwrap_or_default();
         match result {
             Ok(Done::Embedded(here)) => {
                 self.here = Some(here);
@@ -482,11 +493,18 @@ impl Telling {
                 self.soon();
             }
             Ok(Done::Registered(registrar)) => {
+                // A busy discovery server may not describe itself in time. Until it does, it
+                // cannot configure this server as its supervisor.
+                let is_described = registrar.is_some() || self.here.is_some();
                 if let Some(registrar) = registrar {
                     self.settings.supervision.registered_with(registrar);
                 }
-                self.register_at = Instant::now() + self.register_every();
-                self.wait = FIRST_WAIT;
+                if is_described || self.wait >= self.longest_wait() {
+                    self.register_at = Instant::now() + self.register_every();
+                    self.wait = FIRST_WAIT;
+                } else {
+                    self.register_later();
+                }
                 self.state.send_modify(|state| {
                     if state.registered.is_none() {
                         info!(lds, "registered");
@@ -497,16 +515,12 @@ impl Telling {
                 // A killed discovery server loses its registrations, and its announcement after the
                 // restart may be lost.
                 if self.here.is_none() && self.there.is_none() {
-                    self.there = Some(Box::pin(lost(lds.to_owned(), self.look_from)));
+                    self.there = Some(Box::pin(lost(lds, self.look_from)));
                 }
             }
             Err(error) => {
                 self.look_wait = FIRST_WAIT;
-                self.register_at = Instant::now() + spread(self.wait, &self.server.borrow().url);
-                // Including the share of `spread`, the wait stays below its limit.
-                self.wait = (self.wait * 2)
-                    .min(MOST_WAIT / 2)
-                    .min(self.register_every() / 2);
+                self.register_later();
                 let fault = error.to_string();
                 self.state.send_modify(|state| {
                     state.registered = None;
@@ -570,110 +584,4 @@ const MOST_WAIT: Duration = Duration::from_secs(60);
 const LEAVE_LIMIT: Duration = Duration::from_secs(1);
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_discovery_server_is_embedded_where_the_option_says_so() {
-        let written = |text: &str| {
-            let settings = AnnounceSettings::registering(Some(text));
-            (settings.lds.unwrap_or_default(), settings.embed)
-        };
-        let elsewhere = "opc.tcp://10.0.0.2:4841";
-        assert_eq!(written("embed"), (crate::DEFAULT_LDS.to_owned(), true));
-        assert_eq!(
-            written(&format!("embed={elsewhere}")),
-            (elsewhere.to_owned(), true)
-        );
-        for text in [elsewhere, "any", "name=embed", "embedded"] {
-            assert_eq!(written(text), (text.to_owned(), false));
-        }
-        assert_eq!(AnnounceSettings::registering(None).lds, None);
-        assert!(same_port(elsewhere, "opc.tcp://10.0.0.2:4841/server"));
-        assert!(!same_port(elsewhere, "opc.tcp://10.0.0.2:4840/server"));
-    }
-
-    /// Returns the announcement of a server that is registered with a discovery server.
-    fn registered(lds: &str) -> Telling {
-        let server = ServerDescription {
-            application_uri: "urn:arm".to_owned(),
-            product_uri: String::new(),
-            name: "arm".to_owned(),
-            url: "opc.tcp://127.0.0.1:43121/".to_owned(),
-            capabilities: Vec::new(),
-            number: None,
-        };
-        let state = AnnounceState {
-            registered: Some(clock::wall()),
-            ..AnnounceState::default()
-        };
-        Telling {
-            settings: AnnounceSettings::registering(Some(lds)),
-            mdns: None,
-            found: None,
-            server: watch::channel(server).1,
-            state: watch::channel(state).0,
-            start_time: 0,
-            instance: None,
-            lds_run: None,
-            register_at: Instant::now() + MOST_WAIT,
-            wait: FIRST_WAIT,
-            here: None,
-            there: None,
-            look_from: Instant::now(),
-            look_wait: FIRST_WAIT,
-        }
-    }
-
-    #[test]
-    fn a_server_registers_again_when_its_discovery_server_starts_again() {
-        let lds = "opc.tcp://127.0.0.1:4840/";
-        let instance = || "lds".to_owned();
-        let started = |start_time| MdnsEvent::Announced {
-            announcement: AnnouncedServer {
-                instance: instance(),
-                url: lds.to_owned(),
-                capabilities: Vec::new(),
-            },
-            aside: Aside {
-                start_time,
-                number: None,
-            },
-        };
-        let mut telling = registered(lds);
-        let mut registers = |event| {
-            telling.register_at = Instant::now() + MOST_WAIT;
-            telling.hear(event);
-            telling.register_at <= Instant::now()
-        };
-        assert!(!registers(started(None)));
-        assert!(!registers(started(None)), "with other capabilities");
-        let left = MdnsEvent::Withdrawn {
-            instance: instance(),
-        };
-        assert!(!registers(left));
-        assert!(registers(started(None)), "another run without a start time");
-        assert!(registers(started(Some(1))));
-        assert!(!registers(started(Some(1))));
-        assert!(registers(started(Some(2))));
-        // Without mDNS packets, the server does not wait for such an announcement.
-        assert_eq!(telling.register_every(), MOST_UNHEARD);
-    }
-
-    #[test]
-    fn five_hundred_servers_that_failed_at_once_come_again_one_after_the_other_and_nobody_too_soon()
-    {
-        let urls = (0..500).map(|number| format!("opc.tcp://127.0.0.1:{}/", 40_000 + number));
-        let waits: Vec<Duration> = urls.map(|url| spread(FIRST_WAIT, &url)).collect();
-        let too_soon = waits.iter().filter(|wait| **wait < FIRST_WAIT);
-        assert_eq!(too_soon.count(), 0, "{waits:?}");
-        let too_late = waits.iter().filter(|wait| **wait > FIRST_WAIT * 2);
-        assert_eq!(too_late.count(), 0, "{waits:?}");
-        for tenth in 1..10 {
-            let from = FIRST_WAIT + FIRST_WAIT / 10 * tenth;
-            let within = from..from + FIRST_WAIT / 10;
-            let at_once = waits.iter().filter(|wait| within.contains(wait)).count();
-            assert!(at_once < 150, "{at_once} in {within:?}");
-        }
-    }
-}
+mod tests;
