@@ -49,6 +49,13 @@ impl Times {
         let place = (last as f64 * share) as usize;
         self.0.get(place).map_or(f64::NAN, |time| micros(*time))
     }
+
+    /// Returns the mean of the times, in microseconds.
+    #[must_use]
+    pub fn mean(&self) -> f64 {
+        let sum: f64 = self.0.iter().map(|time| micros(*time)).sum();
+        sum / self.0.len() as f64
+    }
 }
 
 /// Returns the time in microseconds.
