@@ -1,8 +1,8 @@
 """Reads robots like a client of OPC 40010-1, which does not know skills, and prints JSON lines.
 
 It reads each motion device system of the DeviceSet, then each value of its first task control while
-skill 1 of the server's own namespace runs once. With `--values` it reads the axes, the speed override,
-the load at the flange and the safety states of the first system instead, and ends.
+skill 1 of the server's own namespace runs once. With `--values` it reads the axes, the power trains,
+the speed override, the load at the flange and the safety states of the first system, and ends.
 """
 
 import argparse
@@ -16,6 +16,9 @@ import opcua_session
 DEVICES = "http://opcfoundation.org/UA/DI/"
 ROBOTICS = "http://opcfoundation.org/UA/Robotics/"
 TASK = ["TaskProgramName", "TaskProgramLoaded"]
+PLATE = ["Manufacturer", "Model", "ProductCode", "SerialNumber"]
+# The ReferenceTypes Moves and Requires.
+MOVES, REQUIRES = 18178, 18179
 # Methods of skill 1.
 RESET, START = 109, 105
 
@@ -28,8 +31,9 @@ class Told:
         lifetime.say(changed=self.names[node.nodeid], value=value)
 
 
-async def names(node):
-    return {(await child.read_browse_name()).Name: child for child in await node.get_children()}
+async def names(node, reference=ua.ObjectIds.HierarchicalReferences):
+    children = await node.get_children(reference)
+    return {(await child.read_browse_name()).Name: child for child in children}
 
 
 async def value(node):
@@ -58,8 +62,42 @@ async def only(node, folder):
     return name, found[name], kind.Identifier
 
 
-async def measured(system):
-    """Returns the axes, the speed override, the load and the safety states of a system."""
+async def targets(node, reference, robotics):
+    """Returns the names of the targets of a reference of OPC 40010-1."""
+    found = await node.get_referenced_nodes(ua.NodeId(reference, robotics))
+    return [(await target.read_browse_name()).Name for target in found]
+
+
+async def power_trains(arm, robotics):
+    """Returns the power trains of an arm with all that is below them."""
+    trains = []
+    for name, train in sorted((await names((await names(arm))["PowerTrains"])).items()):
+        # A power train refers to its axis, which is no part of it.
+        (motor_name, motor), *others = (await names(train, ua.ObjectIds.HasComponent)).items()
+        below = await names(motor)
+        parameters = await names(below["ParameterSet"])
+        current = parameters.get("MotorCurrent")
+        trains.append(
+            {
+                "name": name,
+                "types": [
+                    (await train.read_type_definition()).Identifier,
+                    (await motor.read_type_definition()).Identifier,
+                ],
+                "motor": motor_name,
+                "others": [other for other, _ in others],
+                "temperature": await with_unit(parameters["MotorTemperature"]),
+                "current": await with_unit(current) if current else None,
+                "vendor": current.nodeid.NamespaceIndex != robotics if current else None,
+                "plate": await values(motor, *PLATE),
+                "moves": await targets(train, MOVES, robotics),
+            }
+        )
+    return trains
+
+
+async def measured(system, robotics):
+    """Returns the axes, the power trains, the speed, the load and the safety states of a system."""
     _, arm, _ = await only(system, "MotionDevices")
     children = await names(arm)
     axes = []
@@ -67,7 +105,8 @@ async def measured(system):
         below = await names(axis)
         parameters = await names(below["ParameterSet"])
         read = [await with_unit(parameters[name]) for name in ("ActualPosition", "ActualSpeed")]
-        axes.append([name, *read, await value(below["MotionProfile"])])
+        requires = await targets(axis, REQUIRES, robotics)
+        axes.append([name, *read, await value(below["MotionProfile"]), requires])
     load = await names(children["FlangeLoad"])
     center = load["CenterOfMass"]
     below = await names(center)
@@ -86,7 +125,8 @@ async def measured(system):
         wanted = ["EmergencyStop", "ProtectiveStop", "OperationalMode"]
         safety[name] = await values((await names(state))["ParameterSet"], *wanted)
     speed = await value((await names(children["ParameterSet"]))["SpeedOverride"])
-    return {"axes": axes, "speed": speed, "load": load, "safety": safety}
+    trains = await power_trains(arm, robotics)
+    return {"axes": axes, "trains": trains, "speed": speed, "load": load, "safety": safety}
 
 
 async def run(args):
@@ -98,9 +138,8 @@ async def run(args):
             if await system.read_type_definition() != ua.NodeId(1002, robotics):
                 continue
             if args.values:
-                lifetime.say(**await measured(system))
+                lifetime.say(**await measured(system, robotics))
                 return
-            plate = ["Manufacturer", "Model", "ProductCode", "SerialNumber"]
             arm_name, arm, arm_type = await only(system, "MotionDevices")
             _, controller, controller_type = await only(system, "Controllers")
             _, task, task_type = await only(controller, "TaskControls")
@@ -109,9 +148,9 @@ async def run(args):
             lifetime.say(
                 system=(await system.read_browse_name()).Name,
                 types=[arm_type, controller_type, task_type],
-                arm=await values(arm, *plate, "MotionDeviceCategory"),
+                arm=await values(arm, *PLATE, "MotionDeviceCategory"),
                 speed=await values((await names(arm))["ParameterSet"], "SpeedOverride"),
-                controller=await values(controller, *plate),
+                controller=await values(controller, *PLATE),
                 user=await values((await names(controller))["CurrentUser"], "Level"),
                 task=await values(task, "ComponentName"),
                 mode=await values(parameters, "ExecutionMode"),

@@ -77,6 +77,37 @@ skills:
   - {name: PtpMove, type: PtpMoveSkillType, driver: device}
 ";
 
+/// The power trains of the simulated robot: PowerTrainType and MotorType. RTDE has no nameplates of
+/// motors, and nothing about gears.
+fn power_trains() -> Vec<Value> {
+    let unknown = "BadNotSupported";
+    let train = |(number, temperature, current): (usize, f64, f64)| {
+        json!({
+            "name": format!("PowerTrain_{number}"),
+            "types": [16794, 1019],
+            "motor": format!("Motor_{number}"),
+            "others": [],
+            "temperature": [temperature, "\u{b0}C"],
+            "current": [current, "A"],
+            "vendor": true,
+            "plate": {
+                "Manufacturer": unknown, "Model": unknown,
+                "ProductCode": unknown, "SerialNumber": unknown,
+            },
+            "moves": [format!("Axis_{number}")],
+        })
+    };
+    let trains = [
+        (1, 28.0, 0.0),
+        (2, 29.5, -2.5),
+        (3, 29.0, -1.5),
+        (4, 31.0, -0.25),
+        (5, 31.5, 0.125),
+        (6, 32.0, 0.0),
+    ];
+    trains.map(train).to_vec()
+}
+
 #[test]
 fn a_client_that_knows_robots_sees_the_axes_the_speed_the_load_and_the_safety_state_of_a_ur() {
     let Some(cell) = Cell::with(&[Peer::Python]) else {
@@ -112,20 +143,27 @@ fn a_client_that_knows_robots_sees_the_axes_the_speed_the_load_and_the_safety_st
         let has_axes = axes
             .iter()
             .all(|axis| axis[1][0].is_number() && axis[2][0].is_number());
+        let has_motors = seen["trains"]
+            .as_array()?
+            .iter()
+            .all(|train| train["temperature"][0].is_number() && train["current"][0].is_number());
         let has_load = seen["load"]["mass"][0].is_number() && seen["load"]["center"].is_array();
         let safety = seen["safety"]["SafetyState"].as_object()?;
         let has_safety = safety
             .values()
             .all(|value| value.is_boolean() || value.is_number());
-        (has_axes && has_load && has_safety && seen["speed"].is_number()).then_some(seen)
+        (has_axes && has_motors && has_load && has_safety && seen["speed"].is_number())
+            .then_some(seen)
     });
     let axis = |number: usize| {
         let name = format!("Axis_{number}");
-        json!([name, [0.0, "rad"], [0.0, "rad/s"], 1])
+        let train = format!("PowerTrain_{number}");
+        json!([name, [0.0, "rad"], [0.0, "rad/s"], 1, [train]])
     };
     let axes: Vec<Value> = (1..=6).map(axis).collect();
     let expected = json!({
         "axes": axes,
+        "trains": power_trains(),
         "speed": 100.0,
         "load": {
             "type": 1018,

@@ -288,9 +288,13 @@ async fn the_load_is_measured_and_unknown_at_a_controller_without_it() {
         .await;
     values.until("LoadCenter", is(vec![0.0, 0.01, 0.05])).await;
     values.until("JointSpeeds", is(vec![0.0; 6])).await;
+    let temperatures = vec![28.0, 29.5, 29.0, 31.0, 31.5, 32.0];
+    values.until("JointTemperatures", is(temperatures)).await;
+    let currents = vec![0.0, -2.5, -1.5, -0.25, 0.125, 0.0];
+    values.until("JointCurrents", is(currents)).await;
 
     let settings = simulator::UrSimulatorSettings {
-        lacks: &["payload", "payload_cog"],
+        lacks: &["payload", "payload_cog", "actual_current"],
         ..simulator::UrSimulatorSettings::default()
     };
     let simulator = UrSimulator::new(settings);
@@ -300,11 +304,14 @@ async fn the_load_is_measured_and_unknown_at_a_controller_without_it() {
         serving: serving.unwrap(),
     };
     let values = crate::sensors::tests::measured(Arc::new(UrRobot::new(old.settings())));
-    let lacks = |value: &Result<skills::SkillValue, skills::UnknownValue>| {
-        let why = value.as_ref().map_err(ToString::to_string);
-        why == Err("the robot has no output payload".to_owned())
+    let lacks = |output: &str| {
+        let expected = Err(format!("the robot has no output {output}"));
+        move |value: &Result<skills::SkillValue, skills::UnknownValue>| {
+            value.as_ref().map_err(ToString::to_string).map(drop) == expected
+        }
     };
-    values.until("LoadMass", lacks).await;
+    values.until("LoadMass", lacks("payload")).await;
+    values.until("JointCurrents", lacks("actual_current")).await;
     // The other values are measured.
     values
         .until("SafetyMode", |value| *value == Ok(1.into()))

@@ -102,7 +102,7 @@ fn shown(name: &str, value: RecipeValue) -> Result<SkillValue, UnshownOutput> {
     })
 }
 
-const MEASURED: [Output; 10] = [
+const MEASURED: [Output; 12] = [
     ("TcpPose", "actual_TCP_pose"),
     ("TcpSpeed", "actual_TCP_speed"),
     ("TcpForce", "actual_TCP_force"),
@@ -113,10 +113,12 @@ const MEASURED: [Output; 10] = [
     ("JointSpeeds", "actual_qd"),
     ("LoadMass", "payload"),
     ("LoadCenter", "payload_cog"),
+    ("JointTemperatures", "joint_temperatures"),
+    ("JointCurrents", "actual_current"),
 ];
 
 /// The values of a robot. A new value is the last, because the numbers of values follow this order.
-pub(super) const VALUES: [DeviceValue; 10] = [
+pub(super) const VALUES: [DeviceValue; 12] = [
     list(
         "TcpPose",
         None,
@@ -162,6 +164,16 @@ pub(super) const VALUES: [DeviceValue; 10] = [
         Some("m"),
         "The centre of this mass in the frame of the flange.",
     ),
+    list(
+        "JointTemperatures",
+        Some("\u{b0}C"),
+        "The temperatures of the joints.",
+    ),
+    list(
+        "JointCurrents",
+        Some("A"),
+        "The currents of the motors of the joints.",
+    ),
 ];
 
 const fn list(name: &'static str, unit: Option<&'static str>, about: &'static str) -> DeviceValue {
@@ -199,7 +211,7 @@ mod tests {
         }
     }
 
-    const OUTPUTS: [&str; 10] = [
+    const OUTPUTS: [&str; 12] = [
         "actual_TCP_pose",
         "actual_TCP_speed",
         "actual_TCP_force",
@@ -210,6 +222,8 @@ mod tests {
         "actual_qd",
         "payload",
         "payload_cog",
+        "joint_temperatures",
+        "actual_current",
     ];
 
     #[tokio::test]

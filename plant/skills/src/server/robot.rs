@@ -2,10 +2,11 @@
 //! only task control.
 //!
 //! The axes, the speed override, the load at the flange and the safety state are shown from the
-//! values of the component (`measured`). Power trains are not shown: drivers have no data about
-//! them.
+//! values of the component (`measured`), and so are the motors of its power trains
+//! (`power_trains`).
 
 mod measured;
+mod power_trains;
 
 use std::future::Future;
 
@@ -64,30 +65,22 @@ pub(super) fn serve(
         show_plate(server, device, robot);
     }
     show(server, &arm, "MotionDeviceCategory", robot.category);
-    let axes = measured::axes(&mut maker, &arm, (values, robot.axes))?;
+    let (axes, axis_nodes) = measured::axes(&mut maker, &arm, (values, robot.axes))?;
+    let of = (values, robot.axes);
+    let motors = power_trains::power_trains(&mut maker, &arm, &axis_nodes, of)?;
     let load = measured::load(server, &arm, values)?;
     let safety = measured::safety(&mut maker, &system, values)?;
     let speed = measured::speed(server, &arm, values);
     // The controller has no users.
-    let speed_is_unknown = speed
-        .is_none()
-        .then_some((&arm, "ParameterSet/SpeedOverride"));
-    for (of, path) in [Some((&controller, "CurrentUser/Level")), speed_is_unknown]
-        .into_iter()
-        .flatten()
-    {
-        let unknown = DataValue {
-            status: Some(StatusCode::BadNotSupported),
-            ..DataValue::null()
-        };
-        if let Some(node) = of.node(path) {
-            let _shown = server.show_value(node, unknown);
-        }
+    show_unsupported(server, &controller, "CurrentUser/Level");
+    if speed.is_none() {
+        show_unsupported(server, &arm, "ParameterSet/SpeedOverride");
     }
     show(server, &task, "ComponentName", LocalizedText::from(name));
     show(server, &task, "ParameterSet/ExecutionMode", CYCLE);
     let task = keep(server.clone(), task, skills.to_vec());
-    let measured = axes.into_iter().chain(load).chain(safety).chain(speed);
+    let measured = axes.into_iter().chain(motors).chain(load);
+    let measured = measured.chain(safety).chain(speed);
     Ok(async move {
         tokio::join!(task, join_all(measured));
     })
@@ -154,6 +147,18 @@ fn show(server: &OpcUaServer, of: &Instance, path: &str, value: impl Into<Varian
     if let Some(node) = of.node(path) {
         // The node exists as long as the server.
         let _shown = server.show(node, value);
+    }
+}
+
+/// Shows that no value has the data of a node.
+fn show_unsupported(server: &OpcUaServer, of: &Instance, path: &str) {
+    let unknown = DataValue {
+        status: Some(StatusCode::BadNotSupported),
+        ..DataValue::null()
+    };
+    if let Some(node) = of.node(path) {
+        // The node exists as long as the server.
+        let _shown = server.show_value(node, unknown);
     }
 }
 

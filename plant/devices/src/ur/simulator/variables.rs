@@ -100,6 +100,8 @@ impl Robot {
             "actual_q" | "target_q" => RecipeValue::Vector(self.joints),
             "actual_TCP_speed" | "target_TCP_speed" => RecipeValue::Vector(self.velocity()),
             "actual_TCP_force" => RecipeValue::Vector(self.force()),
+            "joint_temperatures" => RecipeValue::Vector(TEMPERATURES),
+            "actual_current" => RecipeValue::Vector(CURRENTS),
             "payload" => RecipeValue::F64(self.payload.0),
             "payload_cog" => RecipeValue::Triple(self.payload.1),
             "robot_mode" => RecipeValue::I32(self.mode()),
@@ -131,6 +133,10 @@ impl UrSimulator {
     }
 }
 
+/// The temperatures of the joints at rest, in degrees Celsius.
+const TEMPERATURES: [f64; 6] = [28.0, 29.5, 29.0, 31.0, 31.5, 32.0];
+/// The currents of the motors at rest, in A.
+const CURRENTS: [f64; 6] = [0.0, -2.5, -1.5, -0.25, 0.125, 0.0];
 const VECTORS: [&str; 20] = [
     "payload_inertia",
     "target_q",

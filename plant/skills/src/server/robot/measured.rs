@@ -20,14 +20,14 @@ use crate::values::{LiveValue, NewestState};
 pub(super) type NodeUpdates = Pin<Box<dyn Future<Output = ()> + Send>>;
 
 /// Creates an axis for each joint of the value `JointPositions`, with the speeds of the value
-/// `JointSpeeds`. Returns the updates of the axes.
+/// `JointSpeeds`. Returns the updates of the axes, and the axes.
 pub(super) fn axes(
     maker: &mut Maker<'_>,
     arm: &Instance,
     (values, count): (&[LiveValue], usize),
-) -> Result<Vec<NodeUpdates>, InstanceError> {
+) -> Result<(Vec<NodeUpdates>, Vec<NodeId>), InstanceError> {
     let Some(positions) = named(values, "JointPositions") else {
-        return Ok(Vec::new());
+        return Ok((Vec::new(), Vec::new()));
     };
     let speeds = named(values, "JointSpeeds");
     let shown = [(Some(positions), POSITION), (speeds, SPEED)];
@@ -48,18 +48,29 @@ pub(super) fn axes(
         let Some(value) = value else { continue };
         let nodes = axes.iter().map(|axis| within(axis, path));
         let nodes = nodes.collect::<Result<_, _>>()?;
-        let numbers = move |value: Option<&SkillValue>| -> Vec<Option<Variant>> {
-            let numbers = value.and_then(SkillValue::as_f64s).unwrap_or_default();
-            let at = |axis: usize| numbers.get(axis).copied().map(Variant::Double);
-            (0..count).map(at).collect()
-        };
-        updates.push(keep(maker.server, nodes, value, numbers));
+        updates.push(keep(maker.server, nodes, value, numbers(count)));
     }
-    Ok(updates)
+    let axes = axes.into_iter().map(|axis| axis.node_id);
+    Ok((updates, axes.collect()))
+}
+
+/// Returns a function that gives the numbers of an array, one for each joint.
+pub(super) fn numbers(
+    count: usize,
+) -> impl Fn(Option<&SkillValue>) -> Vec<Option<Variant>> + Send + 'static {
+    move |value| {
+        let numbers = value.and_then(SkillValue::as_f64s).unwrap_or_default();
+        let at = |joint: usize| numbers.get(joint).copied().map(Variant::Double);
+        (0..count).map(at).collect()
+    }
 }
 
 /// Shows the unit of a value at an analog item.
-fn show_unit(server: &OpcUaServer, of: &Instance, (value, path): (Option<&LiveValue>, &str)) {
+pub(super) fn show_unit(
+    server: &OpcUaServer,
+    of: &Instance,
+    (value, path): (Option<&LiveValue>, &str),
+) {
     if let Some(unit) = value.and_then(|value| value.facts().unit.as_ref()) {
         let unit = ExtensionObject::from_message(engineering_unit(unit));
         let path = format!("{path}/EngineeringUnits");
@@ -170,12 +181,12 @@ pub(super) fn safety(
     Ok(Some(keep(maker.server, nodes, value, stops)))
 }
 
-fn named<'a>(values: &'a [LiveValue], name: &str) -> Option<&'a LiveValue> {
+pub(super) fn named<'a>(values: &'a [LiveValue], name: &str) -> Option<&'a LiveValue> {
     values.iter().find(|value| value.facts().name == name)
 }
 
 /// Shows the parts of a value at nodes, with the status and time of the value.
-fn keep(
+pub(super) fn keep(
     server: &OpcUaServer,
     nodes: Vec<NodeId>,
     value: &LiveValue,
