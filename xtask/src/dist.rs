@@ -34,8 +34,12 @@ use crate::{
 /// The shipped programs, named like their packages. All other programs are links to the last.
 const PROGRAMS: [&str; 3] = ["bridge-ros1", "bridge-ros2", links::TARGET];
 
-/// Builds the programs without optimisation into `target/debug`.
-pub(crate) fn build(workspace: &Workspace) -> anyhow::Result<CommandOutcome> {
+/// Builds the programs without optimisation into `target/debug`, and an example of `ua-component`
+/// into `target/debug/examples`.
+pub(crate) fn build(
+    workspace: &Workspace,
+    example: Option<&str>,
+) -> anyhow::Result<CommandOutcome> {
     let patched = Patched::prepare(workspace)?;
     step("building the programs (some minutes the first time)");
     let mut build = patched.cargo(workspace, &["build", "--locked", "--bins"]);
@@ -44,6 +48,17 @@ pub(crate) fn build(workspace: &Workspace) -> anyhow::Result<CommandOutcome> {
     }
     must(&mut build)?;
     links::make(&workspace.target.join("debug"))?;
+    if let Some(name) = example {
+        let example = [
+            "build",
+            "--locked",
+            "--package",
+            "ua-component",
+            "--example",
+            name,
+        ];
+        must(&mut patched.cargo(workspace, &example))?;
+    }
     Ok(CommandOutcome::WELL)
 }
 
@@ -340,7 +355,7 @@ fn files(folder: &Path) -> anyhow::Result<Vec<PathBuf>> {
 /// the programs of this machine if the packaged program does not run here.
 fn runnable(workspace: &Workspace, machine: Machine, program: &Path) -> anyhow::Result<PathBuf> {
     if !machine.is_host() {
-        build(workspace)?;
+        build(workspace, None)?;
         return Ok(workspace.target.join("debug"));
     }
     let folder = workspace.target.join(format!("names-{}", machine.debian));

@@ -39,7 +39,7 @@ pub(crate) fn run(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<C
     }
     let check = arguments.contains(&"--check");
     if !arguments.contains(&"--no-build") {
-        dist::build(workspace)?;
+        dist::build(workspace, None)?;
     }
     let programs = workspace.target.join("debug");
     let schema = fs::read_to_string(workspace.root.join("mappings/schema.json"))

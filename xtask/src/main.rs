@@ -42,7 +42,8 @@ cargo xtask <verb>
   peers [--build]                only install the peers; of those only what the programs are built with
   lint [--dependencies]          formatting, clippy, documentation; or licences, sources and advisories of dependencies, and the
                                  workspace with all crates as published
-  build                          build the programs without optimisation into target/debug, with the links of ua-bridge
+  build [--example NAME]         build the programs without optimisation into target/debug, with the links of ua-bridge;
+                                 and an example of ua-component, as own_component, into target/debug/examples
   dist [--deb] [--rpm] [--tar] [--container] [--program FILE]
                                  build the programs that are handed out, with optimisation, into target/dist, with the links;
                                  or packages of them with units, manual pages and completions (docs/packages.md)
@@ -92,7 +93,8 @@ fn run(arguments: &[&str]) -> anyhow::Result<CommandOutcome> {
         ["page"] => page::run(&Workspace::find()?),
         ["peers"] => Ok(peers::run(&Workspace::find()?)),
         ["peers", "--build"] => peers::for_building(),
-        ["build"] => dist::build(&Workspace::find()?),
+        ["build"] => dist::build(&Workspace::find()?, None),
+        ["build", "--example", name] => dist::build(&Workspace::find()?, Some(name)),
         ["dist", rest @ ..] => dist::run(&Workspace::find()?, rest),
         ["docs", rest @ ..] => docs::run(&Workspace::find()?, rest),
         ["patches"] => patches::run(&Workspace::find()?),

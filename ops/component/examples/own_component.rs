@@ -1,7 +1,8 @@
 //! `ua-component` with a device in Rust: a gripper whose fingers need two seconds to close.
 //!
 //! ```sh
-//! cargo run -p ua-component --example own_component -- examples/plant/own-component.yaml
+//! cargo xtask build --example own_component
+//! target/debug/examples/own_component examples/plant/own-component.yaml
 //! ```
 //!
 //! The YAML names the skills, and `driver: device` leaves their work to the device. All options,
@@ -86,4 +87,19 @@ fn read(text: &str, folder: &Path) -> Result<Component, Findings> {
 
 fn main() -> ExitCode {
     ua_component::entry::run_with(std::env::args_os().collect(), read)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    // The clock of the test runs ahead while all tasks wait.
+    #[tokio::test(start_paused = true)]
+    async fn the_fingers_close_open_and_stop_at_halt() {
+        for (of, closes) in [("GraspSkillType", true), ("ReleaseSkillType", false)] {
+            let driver = Arc::new(Move { closes });
+            let checked = skills::conformance::check(of, driver, Vec::new).await;
+            checked.unwrap();
+        }
+    }
 }
