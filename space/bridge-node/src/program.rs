@@ -35,7 +35,7 @@ use crate::port::Port;
 use crate::redundancy;
 use crate::run::{DatagramOutbox, Fixed, LinkLoss, Shell, SideInterfaces, Turn};
 use crate::signals;
-use crate::status::StatusSnapshot;
+use crate::status::{AnnouncedNames, StatusSnapshot};
 
 /// The parts of a program, for [`run`].
 pub trait Program: Parser {
@@ -381,6 +381,7 @@ async fn prepare<P: Program>(
         owned: P::owned,
         claims: P::CLAIMS,
         requests,
+        names: AnnouncedNames::default(),
         taps: Arc::clone(host.taps()),
         changes: changes.clone(),
         switches: switches.clone(),

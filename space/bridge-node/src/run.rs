@@ -38,7 +38,7 @@ use crate::mapping_file::RunningMapping;
 use crate::observer::Observer;
 use crate::policy::NO_SUBSCRIBER;
 use crate::port::{LocalDelivery, Port, PortEvent};
-use crate::status::{Interfaces, Readiness, RedundancyStatus, StatusSnapshot};
+use crate::status::{AnnouncedNames, Interfaces, Readiness, RedundancyStatus, StatusSnapshot};
 use crate::tap::Taps;
 
 pub(crate) use fixed::Fixed;
@@ -71,6 +71,7 @@ pub(crate) struct Shell<P> {
     /// Whether it listens for other writers in these namespaces before it sends.
     pub(crate) claims: bool,
     pub(crate) requests: Requests<StatusSnapshot>,
+    pub(crate) names: AnnouncedNames,
     /// The tapped topics.
     pub(crate) taps: Arc<Taps>,
     pub(crate) changes: watch::Receiver<RunningMapping>,
@@ -133,7 +134,7 @@ impl<P: Port> Shell<P> {
         }
     }
 
-    fn log_end(&self) {
+    fn log_end(&mut self) {
         let status = self.status();
         let [topics, sent, delivered, dropped] = status.summary();
         info!(topics, sent, delivered, dropped, "stopping");
@@ -265,7 +266,7 @@ impl<P: Port> Shell<P> {
         Ok(more)
     }
 
-    fn status(&self) -> StatusSnapshot {
+    fn status(&mut self) -> StatusSnapshot {
         let about = Arc::clone(&self.changes.borrow().about);
         let interfaces = Interfaces {
             pubsub: u8::from(self.carrier.lost().is_none()),
@@ -297,6 +298,7 @@ impl<P: Port> Shell<P> {
         .with_carrier(self.carrier.interface(), self.carrier.dropped())
         .with_carriers(self.carrier.states())
         .with_redundancy(RedundancyStatus::of(&self.router, now().monotonic))
+        .with_names(&self.router, &mut self.names)
     }
 
     /// Returns the messages about secured groups without keys.

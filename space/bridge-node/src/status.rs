@@ -1,9 +1,10 @@
 //! The status of a program: counters per topic and delays per hop, as JSON and for Prometheus.
 
 mod carriers;
+mod names;
 mod redundancy;
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write as _;
 use std::time::Duration;
 
@@ -14,6 +15,7 @@ use service::PageState;
 use uadp::Timestamp;
 
 use self::carriers::CarrierStatus;
+pub(crate) use self::names::AnnouncedNames;
 pub(crate) use self::redundancy::RedundancyStatus;
 use crate::mapping_file::About;
 use crate::port::LinkState;
@@ -42,6 +44,11 @@ pub(crate) struct StatusSnapshot {
     topics_without_values: BTreeMap<String, TopicNames>,
     /// Calls that are known, requested or executed here.
     calls: BTreeMap<String, CallStatus>,
+    /// Topics and calls whose announced names are left out of the figures for Prometheus.
+    #[serde(skip)]
+    names_left_out: BTreeSet<String>,
+    /// The number of names that were left out.
+    names_left_out_total: u64,
     /// Other servers to which the program is a client.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     servers: Vec<LinkState>,
@@ -240,6 +247,8 @@ impl StatusSnapshot {
             topics,
             topics_without_values,
             calls,
+            names_left_out: BTreeSet::new(),
+            names_left_out_total: 0,
             servers: Vec::new(),
             certificate: None,
             cancellations_pending: Vec::new(),
@@ -282,13 +291,25 @@ impl StatusSnapshot {
         self
     }
 
-    /// Returns a figure for Prometheus with the names of each topic and call that has a name.
+    /// Limits the announced names in the figures for Prometheus.
+    pub(crate) fn with_names(mut self, router: &Router, names: &mut AnnouncedNames) -> Self {
+        names.follow(router);
+        self.names_left_out = names.left_out();
+        self.names_left_out_total = names.left_out_total();
+        self
+    }
+
+    /// Returns a figure for Prometheus with the names of each topic and call that has a name, but
+    /// no announced names beyond their limit.
     fn names(&self, own: &str) -> String {
-        let topics = self.topics.iter().filter_map(|(topic, status)| {
+        let is_shown = |topic: &String| !self.names_left_out.contains(topic);
+        let topics = self.topics.iter().filter(|(topic, _)| is_shown(topic));
+        let topics = topics.filter_map(|(topic, status)| {
             let labels = status.names.labels(topic)?;
             Some(format!("ua_topic_info{{{own},{labels}}} 1\n"))
         });
-        let calls = self.calls.iter().filter_map(|(topic, status)| {
+        let calls = self.calls.iter().filter(|(topic, _)| is_shown(topic));
+        let calls = calls.filter_map(|(topic, status)| {
             let name = escaped(status.name.as_deref()?);
             Some(format!(
                 "ua_call_info{{{own},call=\"{topic}\",name=\"{name}\"}} 1\n"
@@ -447,6 +468,7 @@ impl PageState for StatusSnapshot {
         for link in &self.servers {
             link.figures(&own, &mut line);
         }
+        line("names_left_out_total", &own, &self.names_left_out_total);
         for (hop, delays) in &self.hops {
             delays.figures(&format!("{own},hop=\"{hop}\""), &mut line);
         }

@@ -30,6 +30,7 @@ use self::chunks::Chunking;
 use self::executors::{CallState, NamespaceExecutor};
 use self::own::{Own, RunningRequest};
 use super::announcements::PlannedAnnouncements;
+use super::names::NameSource;
 use super::security::MessageSecurity;
 use super::senders::RedundantSenders;
 use super::{DropSite, TopicQueues};
@@ -189,14 +190,13 @@ impl RouterCalls {
     }
 
     /// Returns the display name of an own call, or of a call of another program. It may be empty.
-    pub(super) fn name_of(&self, topic: TopicId) -> Option<&str> {
+    pub(super) fn name_of(&self, topic: TopicId) -> Option<(&str, NameSource)> {
         let call = self.table.get(&topic)?;
-        let own = call.own.as_ref().map(|own| own.name.as_str());
-        own.or_else(|| {
-            call.known
-                .as_ref()
-                .map(|known| known.description.name.as_str())
-        })
+        if let Some(own) = &call.own {
+            return Some((own.name.as_str(), NameSource::Own));
+        }
+        let known = call.known.as_ref()?;
+        Some((known.description.name.as_str(), NameSource::Announcement))
     }
 
     /// Returns whether a chunk of a request or response waits for the pace.

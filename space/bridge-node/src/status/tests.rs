@@ -9,6 +9,7 @@ use bridge_core::{
 use mappings::Overflow;
 use uadp::{DataSetHeader, GroupHeader, NetworkHeader, NetworkMessageEncoder, PublisherId, Scalar};
 
+use super::names::MOST_NAMES;
 use super::*;
 
 /// Returns a datagram with a Boolean of the topic with these parts of its name.
@@ -240,4 +241,19 @@ fn the_names_that_another_program_announces_are_in_both_pages() {
     ] {
         assert!(text.contains(&line), "{text}");
     }
+
+    // The names of a program that changed its names too often have no series.
+    let mut names = AnnouncedNames::default();
+    let call = "ua_0_7_105".parse().unwrap();
+    for number in 0..MOST_NAMES {
+        let name = format!("gripper {number}");
+        names.admit([(call, name.as_str())].into_iter());
+    }
+    let limited = status(&router).with_names(&router, &mut names);
+    let text = limited.prometheus();
+    assert!(!text.contains("_info{"), "{text}");
+    let line = format!("ua_names_left_out_total{{{own}}} 2\n");
+    assert!(text.contains(&line), "{text}");
+    let json: serde_json::Value = serde_json::from_str(&limited.json()).unwrap();
+    assert_eq!(json["topics"]["ua_0_7_101"]["name"], name);
 }
