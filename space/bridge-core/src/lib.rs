@@ -14,6 +14,7 @@
 mod application;
 mod base;
 mod block;
+mod bridge_message;
 mod buffers;
 mod by_name;
 mod call;

@@ -9,11 +9,9 @@ use std::net::SocketAddr;
 use std::time::{Duration, Instant};
 
 use mappings::SpaceId;
-use uadp::{
-    DataSetHeader, EncodeError, MessageKind, NetworkHeader, NetworkMessage, NetworkMessageEncoder,
-    NetworkMessageType, PublisherId, Scalar, Timestamp, Variant,
-};
+use uadp::{EncodeError, NetworkMessage, Scalar, Timestamp};
 
+use crate::bridge_message;
 use crate::settings::Now;
 
 /// The announcement of the namespaces that a bridge of a space carries.
@@ -39,62 +37,33 @@ impl PartAnnouncement {
         utc: Timestamp,
         out: &mut Vec<u8>,
     ) -> Result<(), EncodeError> {
-        let header = NetworkHeader {
-            publisher_id: Some(PublisherId::UInt16(space.into())),
-            timestamp: Some(utc.time),
-            picoseconds: Some(utc.picoseconds),
-            ..NetworkHeader::default()
-        };
         let namespaces: Vec<u8> = self
             .namespaces
             .iter()
             .flat_map(|namespace| namespace.to_le_bytes())
             .collect();
-        let mut message = NetworkMessageEncoder::new(out, &header, Some(&[NO_WRITER]))?;
-        let mut frame = message.key_frame(&DataSetHeader::default())?;
-        frame.scalar(Scalar::String(Some(MARK)))?;
-        frame.scalar(Scalar::UInt32(self.instance))?;
-        frame.scalar(Scalar::Int64(self.started))?;
-        frame.scalar(Scalar::String(Some(&self.name)))?;
-        frame.scalar(Scalar::ByteString(Some(&namespaces)))?;
-        frame.finish()?;
-        message.finish()
+        let fields = [
+            Scalar::UInt32(self.instance),
+            Scalar::Int64(self.started),
+            Scalar::String(Some(&self.name)),
+            Scalar::ByteString(Some(&namespaces)),
+        ];
+        bridge_message::encode((space, utc), MARK, fields, out)
     }
 
     /// Reads the announcement of a bridge of any space; `None` for all other messages.
     pub(crate) fn decode(message: &NetworkMessage<'_>) -> Option<(SpaceId, Self)> {
-        if message.group().is_some()
-            || message.message_type() != NetworkMessageType::DataSet
-            || message.is_chunk()
-            || message.is_action()
-        {
-            return None;
-        }
-        let Some(PublisherId::UInt16(space)) = message.publisher_id() else {
+        let (space, mut fields) = bridge_message::decode(message, MARK)?;
+        let Scalar::UInt32(instance) = fields.scalar()? else {
             return None;
         };
-        let frame = message.messages().next()?.ok()?;
-        if frame.writer_id != Some(NO_WRITER) || frame.kind != MessageKind::KeyFrame {
-            return None;
-        }
-        let mut fields = frame.fields().ok()?;
-        let mut next = || match fields.next()?.ok()? {
-            Variant::Scalar(scalar) => Some(scalar),
-            Variant::Null | Variant::Array(_) | Variant::Matrix(_) => None,
-        };
-        let Scalar::String(Some(MARK)) = next()? else {
+        let Scalar::Int64(started) = fields.scalar()? else {
             return None;
         };
-        let Scalar::UInt32(instance) = next()? else {
+        let Scalar::String(Some(name)) = fields.scalar()? else {
             return None;
         };
-        let Scalar::Int64(started) = next()? else {
-            return None;
-        };
-        let Scalar::String(Some(name)) = next()? else {
-            return None;
-        };
-        let Scalar::ByteString(Some(namespaces)) = next()? else {
+        let Scalar::ByteString(Some(namespaces)) = fields.scalar()? else {
             return None;
         };
         let (namespaces, _) = namespaces.as_chunks::<2>();
@@ -111,7 +80,7 @@ impl PartAnnouncement {
             started,
             instance,
         };
-        Some((SpaceId::new(space)?, announcement))
+        Some((space, announcement))
     }
 }
 
@@ -212,8 +181,6 @@ impl OtherParts {
     }
 }
 
-/// The DataSetWriterId of no topic.
-const NO_WRITER: u16 = 0;
 /// The first field of an announcement.
 const MARK: &str = "ua-bridge part 1";
 /// The period of the announcements.

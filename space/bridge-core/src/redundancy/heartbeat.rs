@@ -3,12 +3,10 @@
 use std::cmp::Reverse;
 
 use mappings::SpaceId;
-use uadp::{
-    DataSetHeader, EncodeError, MessageKind, NetworkHeader, NetworkMessage, NetworkMessageEncoder,
-    NetworkMessageType, PublisherId, Scalar, Timestamp, Variant,
-};
+use uadp::{EncodeError, NetworkMessage, Scalar, Timestamp, Variant};
 
 use super::role::{RedundancyRank, RedundancyRole};
+use crate::bridge_message;
 
 /// The message by which redundant bridges of a space know each other.
 ///
@@ -34,69 +32,38 @@ impl Heartbeat {
         utc: Timestamp,
         out: &mut Vec<u8>,
     ) -> Result<(), EncodeError> {
-        let header = NetworkHeader {
-            publisher_id: Some(PublisherId::UInt16(space.into())),
-            timestamp: Some(utc.time),
-            picoseconds: Some(utc.picoseconds),
-            ..NetworkHeader::default()
-        };
-        let mut message = NetworkMessageEncoder::new(out, &header, Some(&[NO_WRITER]))?;
-        let mut frame = message.key_frame(&DataSetHeader::default())?;
         let flags = u8::from(self.is_fit) | u8::from(self.is_released) << 1;
-        frame.scalar(Scalar::String(Some(MARK)))?;
-        frame.scalar(Scalar::Byte(self.rank.get()))?;
-        frame.scalar(Scalar::Byte(self.role.number()))?;
-        frame.scalar(Scalar::Byte(flags))?;
-        frame.scalar(Scalar::UInt32(self.epoch))?;
-        frame.scalar(Scalar::UInt32(self.instance))?;
+        let fields = [
+            Scalar::Byte(self.rank.get()),
+            Scalar::Byte(self.role.number()),
+            Scalar::Byte(flags),
+            Scalar::UInt32(self.epoch),
+            Scalar::UInt32(self.instance),
+        ];
         // Readers ignore further fields, so that programs of different versions know each other.
-        if let Some(level) = self.service_level {
-            frame.scalar(Scalar::Byte(level))?;
-        }
-        frame.finish()?;
-        message.finish()
+        let level = self.service_level.map(Scalar::Byte);
+        bridge_message::encode((space, utc), MARK, fields.into_iter().chain(level), out)
     }
 
     /// Reads the heartbeat of a bridge of any space; `None` for all other messages.
     pub(crate) fn decode(message: &NetworkMessage<'_>) -> Option<(SpaceId, Self)> {
-        if message.group().is_some()
-            || message.message_type() != NetworkMessageType::DataSet
-            || message.is_chunk()
-            || message.is_action()
-        {
-            return None;
-        }
-        let Some(PublisherId::UInt16(space)) = message.publisher_id() else {
+        let (space, mut fields) = bridge_message::decode(message, MARK)?;
+        let Scalar::Byte(rank) = fields.scalar()? else {
             return None;
         };
-        let frame = message.messages().next()?.ok()?;
-        if frame.writer_id != Some(NO_WRITER) || frame.kind != MessageKind::KeyFrame {
-            return None;
-        }
-        let mut fields = frame.fields().ok()?;
-        let mut next = || match fields.next()?.ok()? {
-            Variant::Scalar(scalar) => Some(scalar),
-            Variant::Null | Variant::Array(_) | Variant::Matrix(_) => None,
-        };
-        let Scalar::String(Some(MARK)) = next()? else {
+        let Scalar::Byte(role) = fields.scalar()? else {
             return None;
         };
-        let Scalar::Byte(rank) = next()? else {
+        let Scalar::Byte(flags) = fields.scalar()? else {
             return None;
         };
-        let Scalar::Byte(role) = next()? else {
+        let Scalar::UInt32(epoch) = fields.scalar()? else {
             return None;
         };
-        let Scalar::Byte(flags) = next()? else {
+        let Scalar::UInt32(instance) = fields.scalar()? else {
             return None;
         };
-        let Scalar::UInt32(epoch) = next()? else {
-            return None;
-        };
-        let Scalar::UInt32(instance) = next()? else {
-            return None;
-        };
-        let level = fields.next().transpose().ok()?;
+        let level = fields.0.next().transpose().ok()?;
         let service_level = if let Some(Variant::Scalar(Scalar::Byte(level))) = level {
             Some(level)
         } else {
@@ -111,7 +78,7 @@ impl Heartbeat {
             is_released: flags & 2 != 0,
             service_level,
         };
-        Some((SpaceId::new(space)?, heartbeat))
+        Some((space, heartbeat))
     }
 
     pub(crate) const fn instance(&self) -> u32 {
@@ -128,7 +95,5 @@ impl Heartbeat {
     }
 }
 
-/// The DataSetWriterId of no topic.
-const NO_WRITER: u16 = 0;
 /// The first field of a heartbeat.
 const MARK: &str = "ua-bridge redundancy 1";
