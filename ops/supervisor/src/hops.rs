@@ -1,7 +1,8 @@
 //! The delays of the topics that browsers show, hop by hop, from `/tap` of the programs.
 
-use std::collections::{BTreeMap, VecDeque};
+use std::collections::BTreeMap;
 
+use bridge_core::RecentDelays;
 use mappings::{SpaceId, TopicId};
 use serde_json::{Map, Value, json};
 
@@ -20,15 +21,7 @@ pub(crate) struct TapFollower {
 struct TappedHops {
     /// The number of the next step.
     from: u64,
-    hops: BTreeMap<(u64, String), RecentDelays>,
-}
-
-/// The last delays of a hop, in microseconds.
-#[derive(Debug, Default)]
-struct RecentDelays {
-    last: VecDeque<f64>,
-    /// Delays below zero, which result from clocks that differ.
-    negative: u64,
+    hops: BTreeMap<(u64, String), RecentDelays<MOST_DELAYS>>,
 }
 
 impl TapFollower {
@@ -70,7 +63,7 @@ impl TappedHops {
         let mut spaces: BTreeMap<u64, Map<String, Value>> = BTreeMap::new();
         for ((space, hop), delays) in &self.hops {
             let hops = spaces.entry(*space).or_default();
-            hops.insert(hop.clone(), delays.shown());
+            hops.insert(hop.clone(), figures(delays));
         }
         let spaces = spaces.into_iter();
         spaces.map(|(space, hops)| (space, hops.into())).collect()
@@ -90,39 +83,17 @@ impl TappedHops {
         };
         if HOPS.contains(&hop) && space <= u64::from(SpaceId::MAX.get()) {
             let delays = self.hops.entry((space, hop.to_owned())).or_default();
-            delays.record(delay);
+            delays.record_us(delay);
         }
     }
 }
 
-impl RecentDelays {
-    fn record(&mut self, micros: f64) {
-        if micros < 0.0 {
-            self.negative += 1;
-            return;
-        }
-        if self.last.len() >= MOST_DELAYS {
-            self.last.pop_front();
-        }
-        self.last.push_back(micros);
-    }
-
-    fn shown(&self) -> Value {
-        let mut sorted: Vec<f64> = self.last.iter().copied().collect();
-        sorted.sort_by(f64::total_cmp);
-        // The nearest rank, as in the table of `ua-space trace`.
-        let at = |percent: usize| {
-            let rank = (sorted.len() * percent).div_ceil(100);
-            sorted
-                .get(rank.saturating_sub(1))
-                .copied()
-                .unwrap_or_default()
-        };
-        json!({
-            "count": sorted.len(), "negative": self.negative,
-            "p50_us": at(50), "p99_us": at(99), "max_us": at(100),
-        })
-    }
+fn figures(delays: &RecentDelays<MOST_DELAYS>) -> Value {
+    let [p50, p99, max] = delays.quantiles_us([500, 990, 1000]);
+    json!({
+        "count": delays.last().len(), "negative": delays.negative(),
+        "p50_us": p50, "p99_us": p99, "max_us": max,
+    })
 }
 
 const HOPS: [&str; 4] = ["out", "origin", "network", "in"];
@@ -189,9 +160,9 @@ mod tests {
     fn the_number_of_delays_is_bounded() {
         let mut delays = RecentDelays::default();
         for delay in 0..5_000_u32 {
-            delays.record(delay.into());
+            delays.record_us(delay.into());
         }
-        let shown = delays.shown();
+        let shown = figures(&delays);
         assert_eq!(
             (&shown["count"], &shown["max_us"]),
             (&json!(1_000), &json!(4_999.0))

@@ -1,5 +1,7 @@
 //! The delays of samples by hop, computed from the timestamps in the messages.
 
+use std::collections::VecDeque;
+
 use hdrhistogram::Histogram;
 use uadp::Timestamp;
 
@@ -85,6 +87,68 @@ impl Delays {
     #[must_use]
     pub fn max_us(&self) -> f64 {
         microseconds(self.histogram.max())
+    }
+}
+
+/// The newest `MOST` delays of a hop, in microseconds.
+#[derive(Debug, Default)]
+pub struct RecentDelays<const MOST: usize> {
+    last: VecDeque<f64>,
+    count: u64,
+    negative: u64,
+}
+
+impl<const MOST: usize> RecentDelays<MOST> {
+    /// Records a delay in nanoseconds. Delays that are negative are counted only.
+    pub fn record(&mut self, nanoseconds: i128) {
+        match u64::try_from(nanoseconds) {
+            Ok(delay) => self.record_us(microseconds(delay)),
+            Err(_) => self.negative += 1,
+        }
+    }
+
+    /// Records a delay in microseconds. Delays that are negative are counted only.
+    pub fn record_us(&mut self, microseconds: f64) {
+        if microseconds < 0.0 {
+            self.negative += 1;
+            return;
+        }
+        self.count += 1;
+        if self.last.len() >= MOST {
+            self.last.pop_front();
+        }
+        self.last.push_back(microseconds);
+    }
+
+    /// Returns the delays in microseconds, oldest first.
+    #[must_use]
+    pub const fn last(&self) -> &VecDeque<f64> {
+        &self.last
+    }
+
+    /// Returns the number of all recorded delays that are not negative.
+    #[must_use]
+    pub const fn count(&self) -> u64 {
+        self.count
+    }
+
+    /// Returns the number of negative delays, which result from clocks that differ.
+    #[must_use]
+    pub const fn negative(&self) -> u64 {
+        self.negative
+    }
+
+    /// Returns for each share the smallest delay in microseconds that at least so many
+    /// `thousandths` of the newest delays do not exceed; 0 without delays.
+    #[must_use]
+    pub fn quantiles_us<const N: usize>(&self, thousandths: [usize; N]) -> [f64; N] {
+        let mut sorted: Vec<f64> = self.last.iter().copied().collect();
+        sorted.sort_by(f64::total_cmp);
+        thousandths.map(|share| {
+            let rank = (sorted.len() * share).div_ceil(1000);
+            let delay = sorted.get(rank.saturating_sub(1)).copied();
+            delay.unwrap_or_default()
+        })
     }
 }
 

@@ -68,7 +68,7 @@ pub use counters::{Counters, Reason, Verdict};
 pub use description::{ROS_TOPICS, TopicMetaData};
 pub use fields::{decode_fields, encode_fields};
 pub use guard::{GroupState, Guard, KeyDelivery, Unopened, policy_of};
-pub use hops::{Delays, Hop, Hops};
+pub use hops::{Delays, Hop, Hops, RecentDelays};
 pub use interest::Interest;
 pub use late::is_aged;
 pub use loop_rule::{Crosses, Owned, Side, may_cross};

@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr};
 use std::time::Duration;
 
+use bridge_core::RecentDelays;
 use mappings::TopicId;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
@@ -139,6 +140,22 @@ pub(crate) struct HopPage {
     pub(crate) count: u64,
     /// Number of negative delays, which are caused by clocks that disagree.
     pub(crate) negative: u64,
+}
+
+impl HopPage {
+    /// Returns the figures of the newest delays; `None` without any delay.
+    pub(crate) fn of<const MOST: usize>(delays: &RecentDelays<MOST>) -> Option<Self> {
+        let (count, negative) = (delays.count(), delays.negative());
+        let [p50_us, p99_us, p999_us, max_us] = delays.quantiles_us([500, 990, 999, 1000]);
+        (count + negative > 0).then_some(Self {
+            p50_us,
+            p99_us,
+            p999_us: Some(p999_us),
+            max_us,
+            count,
+            negative,
+        })
+    }
 }
 
 impl StatusPage {

@@ -15,12 +15,13 @@ mod recordings;
 mod spans;
 mod topic;
 
-use std::collections::{BTreeMap, VecDeque};
+use std::collections::BTreeMap;
 use std::fs;
 use std::io::{self, Write as _};
 use std::net::IpAddr;
 use std::path::Path;
 
+use bridge_core::RecentDelays;
 use mappings::TopicId;
 use serde::Serialize;
 use uadp::MessageKind;
@@ -272,16 +273,12 @@ struct Topic {
     /// The time at which the value of the previous message was taken; a repeated value keeps this
     /// time.
     taken: Option<i128>,
-    origin: Window,
-    network: Window,
+    origin: DelayWindow,
+    network: DelayWindow,
 }
 
-#[derive(Default)]
-struct Window {
-    nanos: VecDeque<u64>,
-    count: u64,
-    negative: u64,
-}
+/// The newest delays of a topic and hop.
+type DelayWindow = RecentDelays<2048>;
 
 impl Delays {
     /// Returns no delays yet, to be corrected by these clocks.
@@ -337,53 +334,11 @@ impl Delays {
                 topic: topic.to_string(),
                 name: None,
                 hop,
-                delays: window.hop()?,
+                delays: HopPage::of(window)?,
             })
         })
         .collect()
     }
-}
-
-impl Window {
-    fn record(&mut self, nanos: i128) {
-        match u64::try_from(nanos) {
-            Ok(nanos) => {
-                self.count += 1;
-                if self.nanos.len() >= MOST_DELAYS {
-                    self.nanos.pop_front();
-                }
-                self.nanos.push_back(nanos);
-            }
-            Err(_) => self.negative += 1,
-        }
-    }
-
-    fn hop(&self) -> Option<HopPage> {
-        if self.count + self.negative == 0 {
-            return None;
-        }
-        let mut sorted: Vec<u64> = self.nanos.iter().copied().collect();
-        sorted.sort_unstable();
-        // The smallest delay that at least `thousandths` of all delays do not exceed.
-        let quantile = |thousandths: usize| {
-            let rank = (sorted.len() * thousandths).div_ceil(1000);
-            let nanos = sorted.get(rank.saturating_sub(1)).copied();
-            in_micros(nanos.unwrap_or_default())
-        };
-        Some(HopPage {
-            p50_us: quantile(500),
-            p99_us: quantile(990),
-            p999_us: Some(quantile(999)),
-            max_us: quantile(1000),
-            count: self.count,
-            negative: self.negative,
-        })
-    }
-}
-
-#[expect(clippy::cast_precision_loss, reason = "a delay shown to people")]
-fn in_micros(nanos: u64) -> f64 {
-    nanos as f64 / 1000.0
 }
 
 fn print(
@@ -506,8 +461,6 @@ const USUAL: f64 = 3.0;
 const MOST_TOPICS: usize = 1024;
 /// The largest number of samples in a file.
 const MOST_SAMPLES: usize = 200_000;
-/// Maximum number of delays of a topic and hop in the statistics.
-const MOST_DELAYS: usize = 2048;
 
 #[cfg(test)]
 mod tests {
@@ -515,18 +468,18 @@ mod tests {
 
     #[test]
     fn figures_are_of_what_came_last_and_clocks_that_disagree_are_told() {
-        let mut window = Window::default();
-        assert_eq!(window.hop(), None);
+        let mut window = DelayWindow::default();
+        assert_eq!(HopPage::of(&window), None);
         window.record(-5);
         for nanos in 1..=100 {
             window.record(nanos * 1000);
         }
-        let hop = window.hop().unwrap();
+        let hop = HopPage::of(&window).unwrap();
         assert_eq!((hop.p50_us, hop.p99_us, hop.max_us), (50.0, 99.0, 100.0));
         assert_eq!((hop.count, hop.negative), (100, 1));
-        for _ in 0..MOST_DELAYS {
+        for _ in 0..2048 {
             window.record(1000);
         }
-        assert_eq!(window.hop().unwrap().max_us, 1.0);
+        assert_eq!(HopPage::of(&window).unwrap().max_us, 1.0);
     }
 }

@@ -6,7 +6,7 @@ use mappings::TopicId;
 use xml_text::xml_printable;
 
 use super::super::text::{harmless, micros};
-use super::{Delays, Topic, Window, in_micros};
+use super::{DelayWindow, Delays, Topic};
 use crate::cell::HopPage;
 
 /// Returns the drawing of the topics with the longest delays.
@@ -14,7 +14,7 @@ pub(super) fn svg(delays: &Delays, name_of: &dyn Fn(TopicId) -> Option<String>) 
     let mut topics: Vec<(String, &Topic)> = delays
         .topics
         .iter()
-        .filter(|(_, topic)| topic.network.count > 0)
+        .filter(|(_, topic)| topic.network.count() > 0)
         .map(|(topic, of)| {
             let name = name_of(*topic).unwrap_or_else(|| topic.to_string());
             (harmless(&name), of)
@@ -59,7 +59,7 @@ pub(super) fn svg(delays: &Delays, name_of: &dyn Fn(TopicId) -> Option<String>) 
         let [origin, network] = [origin, network].map(|hop| shown(hop.map(|hop| hop.p50_us)));
         let label = format!("{origin} + {network}");
         text(LEFT, y + 38.0, "m", "start", &label);
-        let samples = format!("p99 {p99}, {} samples", topic.network.count);
+        let samples = format!("p99 {p99}, {} samples", topic.network.count());
         text(RIGHT, y + 44.0, "m", "start", &samples);
     }
     if topics.is_empty() {
@@ -104,10 +104,10 @@ fn bar(svg: &mut String, class: &str, (x, y): (f64, f64), (width, height): (f64,
 }
 
 /// Draws the distribution of the delays of a hop, by decades.
-fn histogram(svg: &mut String, window: &Window, y: f64) {
+fn histogram(svg: &mut String, window: &DelayWindow, y: f64) {
     let mut bins = [0_u32; BINS];
-    for nanos in &window.nanos {
-        let decades = in_micros(*nanos).max(1.0).log10();
+    for micros in window.last() {
+        let decades = micros.max(1.0).log10();
         #[expect(
             clippy::cast_possible_truncation,
             clippy::cast_sign_loss,
@@ -135,12 +135,12 @@ fn histogram(svg: &mut String, window: &Window, y: f64) {
 }
 
 /// Returns the delays of a hop, if it has any.
-fn delays_of(window: &Window) -> Option<HopPage> {
-    window.hop().filter(|hop| hop.count > 0)
+fn delays_of(window: &DelayWindow) -> Option<HopPage> {
+    HopPage::of(window).filter(|hop| hop.count > 0)
 }
 
 /// Returns the median delay in microseconds; 0 without delays.
-fn median(window: &Window) -> f64 {
+fn median(window: &DelayWindow) -> f64 {
     delays_of(window).map_or(0.0, |hop| hop.p50_us)
 }
 

@@ -13,7 +13,7 @@ use serde::Serialize;
 use uadp::{MessageKind, NetworkMessage};
 
 use super::clocks::{Estimate, Twice, estimate, median};
-use super::{Window, called, figures, head};
+use super::{DelayWindow, called, figures, head};
 use crate::arguments::Trace;
 use crate::cell::HopPage;
 use crate::exit::CommandFailure;
@@ -185,7 +185,7 @@ impl Clock {
 
 /// The delays by topic, and the numbers of the sending and of the receiving host.
 #[derive(Default)]
-struct Delays(BTreeMap<(TopicId, usize, usize), Window>);
+struct Delays(BTreeMap<(TopicId, usize, usize), DelayWindow>);
 
 impl Delays {
     /// Reads the samples of other hosts in a recording. Samples of hosts without a recording have
@@ -242,7 +242,7 @@ impl Delays {
                 topic: topic.to_string(),
                 from: name(*from),
                 to: name(*to),
-                delays: window.hop()?,
+                delays: HopPage::of(window)?,
             })
         });
         rows.collect()

@@ -14,7 +14,7 @@ use uadp::{MessageKind, Timestamp};
 use super::super::book::{DatagramContent, ReceivedSample};
 use super::super::text::{harmless, is_coloured, json};
 use super::super::{Go, ListenEnd, in_group, plain, until};
-use super::{USUAL, Window, figures, head};
+use super::{DelayWindow, USUAL, figures, head};
 use crate::arguments::{NamedTarget, Trace};
 use crate::cell::{
     DROPPED, HopPage, MEASURED, TapEvent, TappedProgram, tapped_name, tapped_pages, tapped_topic,
@@ -84,19 +84,19 @@ pub(super) fn trace(arguments: &Trace, target: &NamedTarget) -> Result<(), Comma
 #[derive(Default)]
 struct TopicPath {
     /// From the stamp of the message to the bridge.
-    application: Window,
+    application: DelayWindow,
     programs: BTreeMap<(String, u8), PassedProgram>,
 }
 
 /// The delays of a topic at a program in a space.
 #[derive(Default)]
 struct PassedProgram {
-    out: Window,
-    origin: Window,
-    network: Window,
-    inward: Window,
+    out: DelayWindow,
+    origin: DelayWindow,
+    network: DelayWindow,
+    inward: DelayWindow,
     /// From the message in the ROS graph or OPC UA of the writer to the publication here.
-    sum: Window,
+    sum: DelayWindow,
     /// The samples that arrived and were not published yet: the time until the arrival, in
     /// microseconds.
     arrived: VecDeque<ArrivedSample>,
@@ -132,12 +132,12 @@ impl TopicPath {
     }
 
     fn rows(&self) -> Vec<PathRow> {
-        let row = |hop, of: Option<&(String, u8)>, window: &Window| {
+        let row = |hop, of: Option<&(String, u8)>, window: &DelayWindow| {
             Some(PathRow {
                 hop,
                 program: of.map(|(program, _)| program.clone()),
                 space: of.map(|(_, space)| *space),
-                delays: window.hop()?,
+                delays: HopPage::of(window)?,
             })
         };
         let mut rows: Vec<PathRow> = row(APPLICATION, None, &self.application)
@@ -211,7 +211,7 @@ impl PassedProgram {
 /// The delays from the stamp of messages to their bridge.
 #[derive(Default)]
 struct StampedMessages {
-    delays: Window,
+    delays: DelayWindow,
     /// The time at which the value of the previous message was taken; a repetition keeps it.
     taken: Option<i128>,
 }
