@@ -12,8 +12,13 @@ use std::path::{Path, PathBuf};
 
 use knowledge::is_iri;
 use plant_opcua::client::ClientUser;
-use skills::yaml::{DocumentKind, DocumentNode, Findings, YamlFindingCode, YamlReader, parse};
-use skills::{ComponentSecurity, Lds, ParameterType};
+use skills::yaml::{
+    DocumentKind, DocumentNode, Findings, YamlFindingCode, YamlReader, read_document, whole,
+};
+use skills::{
+    ComponentSecurity, DEFAULT_ENDPOINT, Lds, ParameterType, read_endpoint, read_lds, read_name,
+    read_positive, read_security, read_user,
+};
 
 use crate::process::{By, MOST_STEPS, Need, Process, ProcessStep, SkillRole, StepJob};
 use crate::read_process::{USUALLY_WAIT, USUALLY_WITHIN};
@@ -65,22 +70,9 @@ impl Settings {
     /// Reads the settings from YAML; paths are relative to `folder`. All errors are reported
     /// together.
     pub(crate) fn from_yaml(text: &str, folder: &Path) -> Result<Self, Findings> {
-        let mut findings = Findings::default();
-        let read = match parse(text) {
-            Ok(root) => Reading {
-                reader: YamlReader::new(&mut findings),
-                folder,
-            }
-            .settings(&root),
-            Err(finding) => {
-                findings.push(finding);
-                None
-            }
-        };
-        match read {
-            Some(settings) if findings.is_empty() => Ok(settings),
-            _ => Err(findings),
-        }
+        read_document(text, |root, reader| {
+            Reading { reader, folder }.settings(root)
+        })
     }
 }
 
@@ -110,17 +102,12 @@ const KEYS: [&str; 22] = [
     "prefer",
 ];
 
-/// Returns the value of a key that may be absent, or `None` if it is there and faulty.
-fn optional<T>(value: Option<Option<T>>) -> Option<Option<T>> {
-    value.map_or(Some(None), |value| value.map(Some))
-}
-
-struct Reading<'a> {
-    reader: YamlReader<'a>,
+struct Reading<'a, 'f> {
+    reader: &'a mut YamlReader<'f>,
     folder: &'a Path,
 }
 
-impl Reading<'_> {
+impl Reading<'_, '_> {
     fn settings(&mut self, root: &DocumentNode) -> Option<Settings> {
         let [
             name,
@@ -146,16 +133,21 @@ impl Reading<'_> {
             processes,
             prefer,
         ] = self.reader.map(root, KEYS)?;
-        let name = self.needed(name, ("mes", root), Self::name);
-        let uri = self.needed(uri, ("application_uri", root), Self::application_uri);
-        let namespace = self.needed(namespace, ("namespace", root), Self::namespace);
+        let name = self.reader.needed(name, "mes", root.place);
+        let name = name.and_then(|node| read_name(node, self.reader));
+        let uri = self.reader.needed(uri, "application_uri", root.place);
+        let uri = uri.and_then(|node| self.iri(node, YamlFindingCode::Uri));
+        let namespace = self
+            .reader
+            .needed(namespace, "namespace", root.place)
+            .and_then(|node| read_positive(node, YamlFindingCode::Namespace, self.reader));
         let usual = || Some(DEFAULT_ENDPOINT.to_owned());
-        let endpoint = endpoint.map_or_else(usual, |node| self.endpoint(node));
-        let usual = || Some(vec![ComponentSecurity::None]);
-        let security = security.map_or_else(usual, |node| self.security(node));
-        let lds = lds.map_or(Some(Lds::Local), |node| self.lds(node));
+        let endpoint = endpoint.map_or_else(usual, |node| read_endpoint(node, self.reader));
+        let usual = || vec![ComponentSecurity::None];
+        let security = security.map_or_else(usual, |node| read_security(node, self.reader));
+        let lds = lds.map_or(Some(Lds::Local), |node| read_lds(node, self.reader));
         let open = open.map_or(Some(false), |node| self.reader.boolean(node));
-        let user = user.map(|node| skills::read_user(node, self.folder, &mut self.reader));
+        let user = user.map(|node| read_user(node, self.folder, self.reader));
         let sparql = sparql.map_or(Some(DEFAULT_SPARQL), |node| self.address(node, true));
         let sparql_tls = sparql_tls.map(|node| self.address(node, false));
         let store = store.map(|node| self.folder(node));
@@ -176,24 +168,24 @@ impl Reading<'_> {
         self.each_once(root, &products, &processes, &recipes);
         let names = servers.iter().map(|server| server.which.text());
         self.once(root, names, "server");
-        let user = optional(user)?;
+        let user = whole(user)?;
         servers::give_user(&mut servers, user.as_ref());
         Some(Settings {
             name: name?,
             application_uri: uri?,
             namespace: namespace?,
             endpoint: endpoint?,
-            security: security?,
+            security,
             lds: lds?,
             open: open?,
             user,
             sparql: sparql?,
-            sparql_tls: optional(sparql_tls)?,
-            store: optional(store)?.map(|store| store.path),
+            sparql_tls: whole(sparql_tls)?,
+            store: whole(store)?.map(|store| store.path),
             rules: rules?,
             knowledge,
             nodesets,
-            nodeset_folder: optional(nodeset_folder)?,
+            nodeset_folder: whole(nodeset_folder)?,
             manifests,
             rml,
             servers,
@@ -202,31 +194,6 @@ impl Reading<'_> {
             processes,
             prefer,
         })
-    }
-
-    /// Reads the value of a key that has to be there.
-    fn needed<T>(
-        &mut self,
-        node: Option<&DocumentNode>,
-        (key, root): (&str, &DocumentNode),
-        read: impl FnOnce(&mut Self, &DocumentNode) -> Option<T>,
-    ) -> Option<T> {
-        let node = self.reader.needed(node, key, root.place)?;
-        read(self, node)
-    }
-
-    fn application_uri(&mut self, node: &DocumentNode) -> Option<String> {
-        self.iri(node, YamlFindingCode::Uri)
-    }
-
-    fn lds(&mut self, node: &DocumentNode) -> Option<Lds> {
-        match Lds::written(self.reader.text(node, "an endpoint, `embed` or `none`")?) {
-            lds @ (Lds::Nowhere | Lds::Local | Lds::Embed(None)) => Some(lds),
-            Lds::Embed(Some(url)) => self
-                .checked_endpoint(&url, node)
-                .map(|url| Lds::Embed(Some(url))),
-            Lds::At(url) => self.checked_endpoint(&url, node).map(Lds::At),
-        }
     }
 
     fn each<T>(
@@ -579,23 +546,6 @@ impl Reading<'_> {
         })
     }
 
-    fn name(&mut self, node: &DocumentNode) -> Option<String> {
-        let text = self.reader.text(node, "a name")?;
-        let fits = (1..=64).contains(&text.len())
-            && text
-                .bytes()
-                .all(|byte| byte.is_ascii_alphanumeric() || matches!(byte, b'-' | b'_'));
-        if fits {
-            Some(text.to_owned())
-        } else {
-            self.reader.refuse(
-                node,
-                YamlFindingCode::Name,
-                format!("`{}` is no name", shortened(text)),
-            )
-        }
-    }
-
     fn iri(&mut self, node: &DocumentNode, code: YamlFindingCode) -> Option<String> {
         let text = self.reader.text(node, "an IRI")?;
         if is_iri(text) && text.len() <= 256 {
@@ -610,21 +560,6 @@ impl Reading<'_> {
                 ),
             )
         }
-    }
-
-    fn namespace(&mut self, node: &DocumentNode) -> Option<u16> {
-        let text = self.reader.text(node, "a number")?;
-        let number = text.parse().ok().filter(|number| *number > 0);
-        number.or_else(|| {
-            self.reader.refuse(
-                node,
-                YamlFindingCode::Namespace,
-                format!(
-                    "expected a number from 1 to 65535, found `{}`",
-                    shortened(text)
-                ),
-            )
-        })
     }
 }
 
@@ -647,7 +582,6 @@ fn shortened(text: &str) -> String {
     text.chars().take(60).collect()
 }
 
-const DEFAULT_ENDPOINT: &str = "opc.tcp://127.0.0.1:0";
 const DEFAULT_SPARQL: SocketAddr =
     SocketAddr::new(std::net::IpAddr::V4(std::net::Ipv4Addr::LOCALHOST), 8087);
 

@@ -23,11 +23,12 @@ use plant_opcua::users::{Roles, UserRole};
 pub use changes::{ChangeKind, Takes, YamlChange};
 pub(crate) use device::DeviceSensor;
 pub use device::{Device, DeviceKinds, NoDevices, measure_device};
-pub use document::read_user;
+pub use document::{read_lds, read_positive, read_security, read_user};
 pub use drivers::{DriverFault, Drivers};
 pub use skills::read_partner;
 pub use space::{Form, RequestKind, SpaceFieldError, SpaceFieldSource, SpaceWork, ValuePart};
 
+pub use texts::{DEFAULT_ENDPOINT, checked_endpoint, read_endpoint, read_name};
 pub use values::{ExecSource, MOST_VALUES, SensorRead, TopicSource, ValueSetup, ValueSource};
 pub use world::{World, WorldObject, read_numbers, read_shape};
 

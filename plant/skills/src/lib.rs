@@ -50,12 +50,13 @@ pub use client::{
     Unchosen, UnfitGrasp, Watchable, plate_between,
 };
 pub use component::{
-    ChangeKind, Component, ComponentSecurity, Device, DeviceKinds, DriverFault, DriverSetup,
-    Drivers, ExecSource, ExecWork, Form, LEASE, Lds, MOST_SKILLS, MOST_VALUES, NoDevices, Partner,
-    Partners, RequestKind, Robot, SensorRead, Simulation, SkillSetup, SpaceFieldError,
-    SpaceFieldSource, SpaceWork, Takes, TopicSource, ValuePart, ValueSetup, ValueSource, World,
-    WorldObject, YamlChange, anonymous_by_default, measure_device, read_numbers, read_partner,
-    read_shape, read_user,
+    ChangeKind, Component, ComponentSecurity, DEFAULT_ENDPOINT, Device, DeviceKinds, DriverFault,
+    DriverSetup, Drivers, ExecSource, ExecWork, Form, LEASE, Lds, MOST_SKILLS, MOST_VALUES,
+    NoDevices, Partner, Partners, RequestKind, Robot, SensorRead, Simulation, SkillSetup,
+    SpaceFieldError, SpaceFieldSource, SpaceWork, Takes, TopicSource, ValuePart, ValueSetup,
+    ValueSource, World, WorldObject, YamlChange, anonymous_by_default, checked_endpoint,
+    measure_device, read_endpoint, read_lds, read_name, read_numbers, read_partner, read_positive,
+    read_security, read_shape, read_user,
 };
 pub use composite::{Job, PickAndPlace};
 pub use configuration::{

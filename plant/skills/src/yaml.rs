@@ -10,5 +10,5 @@ mod tree;
 pub use documents::SourceSpan as Place;
 pub(crate) use documents::nearest;
 pub use findings::{Findings, YamlFinding, YamlFindingCode};
-pub use read::YamlReader;
+pub use read::{YamlReader, read_document, whole};
 pub use tree::{DocumentKind, DocumentNode, parse};

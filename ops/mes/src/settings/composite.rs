@@ -5,7 +5,7 @@ use skills::yaml::{DocumentNode, YamlFindingCode};
 use super::Reading;
 use crate::read_process::USUALLY_APPROACH;
 
-impl Reading<'_> {
+impl Reading<'_, '_> {
     pub(super) fn job(&mut self, node: &DocumentNode) -> Option<skills::Job> {
         let keys = ["pick", "place", "approach", "shape"];
         let [pick, place, approach, shape] = self.reader.map(node, keys)?;
@@ -21,7 +21,7 @@ impl Reading<'_> {
             self.reader.number(node, (0.0, 10.0))
         });
         let shape = match shape {
-            Some(node) => Some(skills::read_shape(node, &mut self.reader)?),
+            Some(node) => Some(skills::read_shape(node, self.reader)?),
             None => None,
         };
         Some(skills::Job {

@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::path::PathBuf;
 
 use skills::yaml::{DocumentKind, DocumentNode, YamlFindingCode};
+use skills::{read_endpoint, read_name};
 
 use super::Reading;
 use crate::nodeset_url::NodeSetUrl;
@@ -62,7 +63,7 @@ pub(crate) enum Connect {
     At(String),
 }
 
-impl Reading<'_> {
+impl Reading<'_, '_> {
     pub(super) fn files(&mut self, node: &DocumentNode) -> Vec<Source> {
         self.each(node, |reading, node| {
             let name = reading.reader.text(node, "the path of a file")?;
@@ -175,7 +176,7 @@ impl Reading<'_> {
             Some(node) => match self.reader.text(node, "true, false or an endpoint")? {
                 "false" => Connect::No,
                 "true" => Connect::Yes,
-                _ => Connect::At(self.endpoint(node)?),
+                _ => Connect::At(read_endpoint(node, self.reader)?),
             },
         };
         let file = self
@@ -183,7 +184,7 @@ impl Reading<'_> {
             .needed(file, "file", node.place)
             .and_then(|node| self.reader.text(node, "the path of a file"));
         let name = match name {
-            Some(node) => self.name(node),
+            Some(node) => read_name(node, self.reader),
             None => file.map(str::to_owned),
         };
         let iri = match iri {

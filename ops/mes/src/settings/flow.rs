@@ -5,7 +5,7 @@ use skills::yaml::{DocumentKind, DocumentNode, YamlFindingCode};
 use super::{Reading, plain, shortened};
 use crate::process::{BadEnd, Compare, ProcessStep, StepCondition, Test};
 
-impl Reading<'_> {
+impl Reading<'_, '_> {
     /// Reads the keys `after`, `when` and `within` of a step, which follows these steps.
     pub(super) fn flow(
         &mut self,

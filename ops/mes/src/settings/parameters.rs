@@ -6,7 +6,7 @@ use super::{Reading, json};
 use crate::process::{GivenParameter, ParameterQuery, ProcessStep, ResultOf};
 use crate::read_process::readable;
 
-impl Reading<'_> {
+impl Reading<'_, '_> {
     /// Reads the parameters of a step, which follows these steps.
     pub(super) fn parameters(
         &mut self,

@@ -4,7 +4,8 @@ use std::time::Duration;
 
 use knowledge::{NodeName, is_iri};
 use plant_opcua::client::ClientUser;
-use skills::yaml::{DocumentKind, DocumentNode, YamlFindingCode};
+use skills::yaml::{DocumentKind, DocumentNode, YamlFindingCode, whole};
+use skills::{checked_endpoint, read_user};
 
 use super::{Reading, shortened};
 use crate::search_limits::SearchLimits;
@@ -63,7 +64,7 @@ impl NamedServers {
     }
 }
 
-impl Reading<'_> {
+impl Reading<'_, '_> {
     /// Reads a server: its endpoint or ApplicationUri, `discovered`, or a map.
     pub(super) fn server(&mut self, node: &DocumentNode) -> Option<ServerEntry> {
         let keys = ["server", "user", "start", "nodes", "depth", "every"];
@@ -77,7 +78,7 @@ impl Reading<'_> {
             .reader
             .needed(server, "server", node.place)
             .and_then(|node| self.named_servers(node));
-        let user = user.map(|node| skills::read_user(node, self.folder, &mut self.reader));
+        let user = user.map(|node| read_user(node, self.folder, self.reader));
         let start = start.map_or_else(Vec::new, |node| self.each(node, Self::start_node));
         let usual = SearchLimits::default();
         let nodes = nodes.map_or(Some(usual.nodes), |node| self.number(node, MOST_NODES));
@@ -85,7 +86,7 @@ impl Reading<'_> {
         let every = every.map_or(Some(USUALLY_EVERY), |node| self.interval(node));
         Some(ServerEntry {
             which: which?,
-            user: super::optional(user)?,
+            user: whole(user)?,
             start,
             limits: SearchLimits {
                 nodes: nodes?,
@@ -104,9 +105,7 @@ impl Reading<'_> {
             return Some(NamedServers::Discovered);
         }
         if text.starts_with("opc.tcp:") {
-            return self
-                .checked_endpoint(text, node)
-                .map(NamedServers::Endpoint);
+            return checked_endpoint(text, node, self.reader).map(NamedServers::Endpoint);
         }
         if is_iri(text) && text.len() <= 256 {
             return Some(NamedServers::Application(text.to_owned()));

@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use serde_json::Value as Json;
 
-use super::texts::{read_name, whole};
+use super::texts::read_name;
 use super::values::{
     LONGEST_ABOUT, LONGEST_UNIT, check_range, read_line, read_range, read_shape_name,
 };
@@ -13,7 +13,7 @@ use crate::configuration::{Configurable, FieldEffect, FieldError};
 use crate::parameters::shortened;
 use crate::value::{Builtin, SkillValue, ValueShape};
 use crate::values::ValueFacts;
-use crate::yaml::{DocumentKind, DocumentNode, YamlFindingCode, YamlReader};
+use crate::yaml::{DocumentKind, DocumentNode, YamlFindingCode, YamlReader, whole};
 
 /// Reads the list `configurable`.
 pub(super) fn read_configurable(

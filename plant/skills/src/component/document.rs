@@ -11,7 +11,7 @@ use plant_opcua::users::{Roles, UserRole};
 use super::configurable::read_configurable;
 use super::skills::read_skills;
 use super::texts::{
-    DEFAULT_ENDPOINT, LONGEST_NAME, checked_endpoint, read_endpoint, read_name, read_uri, whole,
+    DEFAULT_ENDPOINT, LONGEST_NAME, checked_endpoint, read_endpoint, read_name, read_uri,
 };
 use super::values::{Around, read_values};
 use super::world::{read_workspace, read_world};
@@ -21,7 +21,7 @@ use super::{
 };
 use crate::configuration::Configurable;
 use crate::parameters::shortened;
-use crate::yaml::{DocumentNode, Findings, YamlFindingCode, YamlReader, parse};
+use crate::yaml::{DocumentNode, Findings, YamlFindingCode, YamlReader, read_document, whole};
 
 impl Component {
     /// The JSON schema of the YAML.
@@ -46,18 +46,7 @@ impl Component {
         folder: &Path,
         kinds: &dyn DeviceKinds,
     ) -> Result<Self, Findings> {
-        let mut findings = Findings::default();
-        let read = match parse(text) {
-            Ok(root) => component(&root, folder, kinds, &mut YamlReader::new(&mut findings)),
-            Err(finding) => {
-                findings.push(finding);
-                None
-            }
-        };
-        match read {
-            Some(component) if findings.is_empty() => Ok(component),
-            _ => Err(findings),
-        }
+        read_document(text, |root, reader| component(root, folder, kinds, reader))
     }
 }
 
@@ -404,7 +393,8 @@ fn read_category(node: &DocumentNode, reader: &mut YamlReader<'_>) -> Option<i32
     })
 }
 
-fn read_lds(node: &DocumentNode, reader: &mut YamlReader<'_>) -> Option<Lds> {
+/// Reads the discovery server of a component.
+pub fn read_lds(node: &DocumentNode, reader: &mut YamlReader<'_>) -> Option<Lds> {
     match Lds::written(reader.text(node, "an endpoint, `embed` or `none`")?) {
         lds @ (Lds::Nowhere | Lds::Local | Lds::Embed(None)) => Some(lds),
         Lds::Embed(Some(url)) => {
@@ -414,7 +404,8 @@ fn read_lds(node: &DocumentNode, reader: &mut YamlReader<'_>) -> Option<Lds> {
     }
 }
 
-fn read_positive(
+/// Reads a number from 1 to 65535. Another value is a finding with the code.
+pub fn read_positive(
     node: &DocumentNode,
     code: YamlFindingCode,
     reader: &mut YamlReader<'_>,
@@ -430,7 +421,8 @@ fn read_positive(
     })
 }
 
-fn read_security(node: &DocumentNode, reader: &mut YamlReader<'_>) -> Vec<ComponentSecurity> {
+/// Reads the security policies of a server, at least one.
+pub fn read_security(node: &DocumentNode, reader: &mut YamlReader<'_>) -> Vec<ComponentSecurity> {
     let nodes = reader.list(node);
     let policies: Vec<ComponentSecurity> = nodes
         .iter()

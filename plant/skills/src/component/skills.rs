@@ -3,14 +3,14 @@
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use super::texts::{read_endpoint, read_name, read_uri, whole};
+use super::texts::{read_endpoint, read_name, read_uri};
 use super::world::{read_grip_point, read_numbers};
 use super::{
     DeviceKinds, DriverSetup, ExecWork, MOST_SKILLS, Partner, Partners, RequestKind, Simulation,
     SkillSetup,
 };
 use crate::parameters::ParameterType;
-use crate::yaml::{DocumentKind, DocumentNode, Place, YamlFindingCode, YamlReader};
+use crate::yaml::{DocumentKind, DocumentNode, Place, YamlFindingCode, YamlReader, whole};
 
 /// Keys of a skill.
 pub(super) const SKILL_KEYS: [&str; 6] = [

@@ -3,15 +3,8 @@
 use crate::parameters::shortened;
 use crate::yaml::{DocumentNode, YamlFindingCode, YamlReader};
 
-/// Returns the value of an optional key; `None` if the value is invalid.
-pub(super) fn whole<T>(read: Option<Option<T>>) -> Option<Option<T>> {
-    match read {
-        Some(read) => read.map(Some),
-        None => Some(None),
-    }
-}
-
-pub(super) fn read_name(node: &DocumentNode, reader: &mut YamlReader<'_>) -> Option<String> {
+/// Reads the name of a component or skill.
+pub fn read_name(node: &DocumentNode, reader: &mut YamlReader<'_>) -> Option<String> {
     let text = reader.text(node, "a name")?;
     let fits = !text.is_empty()
         && text.len() <= LONGEST_NAME
@@ -58,12 +51,14 @@ fn is_of_scheme(b: u8) -> bool {
     b.is_ascii_alphanumeric() || matches!(b, b'+' | b'-' | b'.')
 }
 
-pub(super) fn read_endpoint(node: &DocumentNode, reader: &mut YamlReader<'_>) -> Option<String> {
+/// Reads the endpoint of a server of OPC UA.
+pub fn read_endpoint(node: &DocumentNode, reader: &mut YamlReader<'_>) -> Option<String> {
     let text = reader.text(node, "an endpoint")?;
     checked_endpoint(text, node, reader)
 }
 
-pub(super) fn checked_endpoint(
+/// Returns an endpoint of a server of OPC UA; `None` if it is invalid, with a finding at the node.
+pub fn checked_endpoint(
     text: &str,
     node: &DocumentNode,
     reader: &mut YamlReader<'_>,
@@ -81,6 +76,7 @@ pub(super) fn checked_endpoint(
     }
 }
 
-pub(super) const DEFAULT_ENDPOINT: &str = "opc.tcp://127.0.0.1:0";
+/// The endpoint of a component without the key `endpoint`.
+pub const DEFAULT_ENDPOINT: &str = "opc.tcp://127.0.0.1:0";
 pub(super) const LONGEST_NAME: usize = 64;
 const LONGEST_URI: usize = 256;

@@ -6,12 +6,12 @@ use std::time::Duration;
 
 use super::skills::read_command;
 use super::space::read_topic;
-use super::texts::{read_name, whole};
+use super::texts::read_name;
 use super::{Device, DeviceKinds, SkillSetup};
 use crate::parameters::shortened;
 use crate::value::{Builtin, ValueShape};
 use crate::values::{Measure, PERIOD, ValueFacts, ValueSensor};
-use crate::yaml::{DocumentKind, DocumentNode, Place, YamlFindingCode, YamlReader};
+use crate::yaml::{DocumentKind, DocumentNode, Place, YamlFindingCode, YamlReader, whole};
 
 /// A value of a component.
 #[derive(Debug, Clone)]

@@ -3,11 +3,11 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use super::texts::{read_name, whole};
+use super::texts::read_name;
 use crate::grip::{GripPoint, GripType, PartShape};
 use crate::parameters::shortened;
 use crate::workspace::{RobotWorkspace, Zone};
-use crate::yaml::{DocumentKind, DocumentNode, YamlFindingCode, YamlReader};
+use crate::yaml::{DocumentKind, DocumentNode, YamlFindingCode, YamlReader, whole};
 
 /// An object of the cell.
 #[derive(Debug, Clone, PartialEq)]

@@ -3,8 +3,33 @@
 use std::time::Duration;
 
 use super::findings::{Findings, YamlFinding, YamlFindingCode};
-use super::{DocumentKind, DocumentNode, Place, nearest};
+use super::{DocumentKind, DocumentNode, Place, nearest, parse};
 use crate::parameters::shortened;
+
+/// Reads a document with `read`, which returns `None` for a faulty document. All errors are reported
+/// together.
+///
+/// # Errors
+/// The findings in the document.
+pub fn read_document<T>(
+    text: &str,
+    read: impl FnOnce(&DocumentNode, &mut YamlReader<'_>) -> Option<T>,
+) -> Result<T, Findings> {
+    let mut findings = Findings::default();
+    let read = match parse(text) {
+        Ok(root) => read(&root, &mut YamlReader::new(&mut findings)),
+        Err(finding) => {
+            findings.push(finding);
+            None
+        }
+    };
+    read.filter(|_| findings.is_empty()).ok_or(findings)
+}
+
+/// Returns the value of an optional key; `None` if the value is invalid.
+pub fn whole<T>(read: Option<Option<T>>) -> Option<Option<T>> {
+    read.map_or(Some(None), |value| value.map(Some))
+}
 
 /// Reads values from nodes and records errors.
 #[derive(Debug)]
