@@ -69,15 +69,8 @@ struct UaComponent {
     /// Trust every client certificate, and keep it as trusted. For tests and demonstrations only
     #[arg(long)]
     trust_any_client_certificate: bool,
-    /// Networks behind routers whose servers are accepted too, as 10.77.0.0/16. Without it only servers with addresses in the
-    /// subnets of the interface are, since anyone on the network can announce any address
-    #[arg(
-        long = "network",
-        value_name = "CIDR",
-        env = "UA_NETWORKS",
-        value_delimiter = ','
-    )]
-    networks: Vec<discovery::scan::Range>,
+    #[command(flatten)]
+    networks: discovery::NetworkArguments,
     #[command(flatten)]
     arguments: WithoutMapping,
     #[arg(skip)]
@@ -173,15 +166,10 @@ impl UaComponent {
         let usual = || self.pki_root(component);
         let pki = self.pki.clone().or_else(|| is_secured.then(usual));
         let interface = self.arguments.0.flags.interface.as_deref();
-        let mdns = match interface {
-            None => discovery::MdnsInterface::LOOPBACK,
-            Some(interface) => discovery::MdnsInterface::parse(interface),
-        };
-        let mdns = mdns.with_networks(self.networks.iter().copied());
         ComponentOptions {
             pki,
             trust_any_client: self.trust_any_client_certificate,
-            mdns: Some(mdns),
+            mdns: Some(self.networks.interface(interface)),
             capabilities: vec!["DA".to_owned()],
             gds: None,
             configuration: Some(self.pki_root(component).join("configuration.json")),

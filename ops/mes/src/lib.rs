@@ -130,15 +130,8 @@ struct UaMes {
     /// Trust every client certificate, and keep it as trusted. For tests and demonstrations only
     #[arg(long)]
     trust_any_client_certificate: bool,
-    /// Networks behind routers whose servers are accepted too, as 10.77.0.0/16. Without it only servers with addresses in the
-    /// subnets of the interface are, since anyone on the network can announce any address
-    #[arg(
-        long = "network",
-        value_name = "CIDR",
-        env = "UA_NETWORKS",
-        value_delimiter = ','
-    )]
-    networks: Vec<discovery::scan::Range>,
+    #[command(flatten)]
+    networks: discovery::NetworkArguments,
     #[command(flatten)]
     arguments: WithoutMapping,
     #[arg(skip)]
@@ -389,11 +382,8 @@ impl UaMes {
     }
 
     fn interface(&self) -> discovery::MdnsInterface {
-        let interface = match self.arguments.0.flags.interface.as_deref() {
-            None => discovery::MdnsInterface::LOOPBACK,
-            Some(interface) => discovery::MdnsInterface::parse(interface),
-        };
-        interface.with_networks(self.networks.iter().copied())
+        let interface = self.arguments.0.flags.interface.as_deref();
+        self.networks.interface(interface)
     }
 
     /// Serves queries, and follows the components of the plant.

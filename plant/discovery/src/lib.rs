@@ -27,6 +27,7 @@ mod line;
 mod listen;
 mod listing;
 mod liveness;
+mod network_arguments;
 mod presence;
 pub mod scan;
 mod security;
@@ -41,6 +42,7 @@ pub use chosen::{Marks, find_lds};
 pub use description::ServerDescription;
 pub use listing::{ListingArguments, ServerQuery};
 pub use mdns::{MdnsFault, MdnsInterface, host_name};
+pub use network_arguments::NetworkArguments;
 pub use presence::be_there;
 /// The detected cause of the loss of a server.
 pub use registry::ServerLoss;

@@ -14,8 +14,7 @@ use service::{
 
 use crate::lds::{self, LdsSettings};
 use crate::listing::ListingArguments;
-use crate::scan::Range;
-use crate::{DEFAULT_LDS, MdnsInterface};
+use crate::{DEFAULT_LDS, NetworkArguments};
 
 /// A Local Discovery Server with multicast extension: lists the OPC UA servers of the network.
 ///
@@ -31,16 +30,8 @@ struct UaLds {
     /// The network interface of mDNS, by name or address. Default: only this host
     #[arg(long, value_name = "NAME|ADDRESS", env = "UA_INTERFACE")]
     interface: Option<String>,
-    /// Networks behind routers with servers that are also accepted, such as 10.77.0.0/16. Default:
-    /// only servers with addresses in the subnets of the interface, because any host can announce
-    /// any address
-    #[arg(
-        long = "network",
-        value_name = "CIDR",
-        env = "UA_NETWORKS",
-        value_delimiter = ','
-    )]
-    networks: Vec<Range>,
+    #[command(flatten)]
+    networks: NetworkArguments,
     /// Allow servers of other hosts to register over unsecured channels. Default: only servers of
     /// this host may, over a loopback address
     #[arg(long)]
@@ -87,15 +78,12 @@ impl ServiceProgram for UaLds {
 
     async fn serve(self, stop: impl Future<Output = ()> + Send + 'static) -> Result<(), Failure> {
         let pages = serve_pages(self.metrics).await?;
-        let interface = self.interface.as_deref().map(MdnsInterface::parse);
         let gds = self.gds.invitation();
         let gds = gds.map_err(|fault| Failure::new(FailureKind::Usage, fault.to_string()))?;
         // A certificate of the plant requires a store.
         let usual = || gds.as_ref().map(|_| default_named("pki-ua-lds"));
         let settings = LdsSettings {
-            interface: interface
-                .unwrap_or(MdnsInterface::LOOPBACK)
-                .with_networks(self.networks),
+            interface: self.networks.interface(self.interface.as_deref()),
             allow_unsecured: self.allow_unsecured,
             secured_only: self.secured_only,
             register_every: Duration::from_secs(self.register_period.into()),
