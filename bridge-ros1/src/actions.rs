@@ -40,7 +40,7 @@ impl ActionGraph for Ros1Graph<'_> {
     type Taker = Taker;
 
     fn action_calls(&mut self, name: &TypeName) -> Result<Arc<ActionCalls>, GraphError> {
-        let calls = self.definitions.action_calls(name);
+        let calls = self.definitions.known.find_action_calls(name);
         calls.map_err(|error| unknown(self.definitions, name, &error))
     }
 
@@ -50,7 +50,7 @@ impl ActionGraph for Ros1Graph<'_> {
         type_name: &TypeName,
         waits: Waits,
     ) -> Result<GoalSender, GraphError> {
-        let found = self.definitions.action(type_name);
+        let found = self.definitions.known.find_action(type_name);
         let action_type = found.map_err(|error| unknown(self.definitions, type_name, &error))?;
         let options = ActionlibClientOptions {
             acknowledge_timeout: waits.answer,
@@ -72,7 +72,7 @@ impl ActionGraph for Ros1Graph<'_> {
     }
 
     fn serve_action(&mut self, action: &str, type_name: &TypeName) -> Result<Taker, GraphError> {
-        let found = self.definitions.action(type_name);
+        let found = self.definitions.known.find_action(type_name);
         let action_type = found.map_err(|error| unknown(self.definitions, type_name, &error))?;
         let empty_result = empty(action_type.result())?;
         let md5 = action_type.action().md5();
@@ -100,7 +100,8 @@ fn unknown(
         name.package(),
         name.name()
     );
-    GraphError::MissingType(definitions.explain_missing((TextKind::Action, name), error, &wanted))
+    let of = (TextKind::Action, name);
+    GraphError::MissingType(definitions.known.explain_missing(of, error, &wanted))
 }
 
 /// Returns the types of the topics of an action.

@@ -5,12 +5,8 @@ use std::path::PathBuf;
 use std::sync::Arc;
 
 use bridge_node::{RosEnvironment, TypePaths};
-use messages::{
-    ActionCalls, ActionType, DefinitionError, Dialect, MessageType, PeerDefinitions, ServiceType,
-    TextKind, TypeName, TypeNameError,
-};
+use messages::{DefinitionError, Dialect, MessageType, PeerDefinitions, TypeName, TypeNameError};
 use tcpros::ConnectionHeader;
-use uadp::BuiltinType;
 
 use crate::brought::{Brought, MAX_BYTES, TypeRoom};
 
@@ -18,7 +14,8 @@ use crate::brought::{Brought, MAX_BYTES, TypeRoom};
 /// disconnected.
 #[derive(Debug)]
 pub(crate) struct Ros1Definitions {
-    known: bridge_node::Definitions,
+    /// The types of all sources.
+    pub(crate) known: bridge_node::Definitions,
     brought: Brought,
 }
 
@@ -128,49 +125,6 @@ impl Ros1Definitions {
     /// packages.
     pub(crate) fn get(&mut self, name: &TypeName) -> Result<Arc<MessageType>, DefinitionError> {
         self.known.find(name)
-    }
-
-    /// Explains an error of [`get`](Self::get) or of [`service`](Self::service).
-    pub(crate) fn explain(&mut self, kind: TextKind, error: &DefinitionError) -> String {
-        self.known.explain(kind, error)
-    }
-
-    /// Explains an error of a type that is defined in files only.
-    pub(crate) fn explain_missing(
-        &mut self,
-        of: (TextKind, &TypeName),
-        error: &DefinitionError,
-        wanted: &str,
-    ) -> String {
-        self.known.explain_missing(of, error, wanted)
-    }
-
-    /// Returns the service type with this name, with the same search.
-    pub(crate) fn service(&mut self, name: &TypeName) -> Result<Arc<ServiceType>, DefinitionError> {
-        self.known.find_service(name)
-    }
-
-    /// Returns the action type with this name, with the same search.
-    pub(crate) fn action(&mut self, name: &TypeName) -> Result<Arc<ActionType>, DefinitionError> {
-        self.known.find_action(name)
-    }
-
-    /// Like [`action`](Self::action), as calls and values of the space.
-    pub(crate) fn action_calls(
-        &mut self,
-        name: &TypeName,
-    ) -> Result<Arc<ActionCalls>, DefinitionError> {
-        self.known.find_action_calls(name)
-    }
-
-    /// Returns the source of the definition that [`get`](Self::get) returns, for output.
-    pub(crate) fn source(&self, name: &TypeName) -> &str {
-        self.known.source(name)
-    }
-
-    /// Returns the ROS type that carries a single value of this builtin type.
-    pub(crate) fn standard_type(&self, builtin: BuiltinType, array: bool) -> Option<TypeName> {
-        self.known.registry().standard_type(builtin, array)
     }
 }
 

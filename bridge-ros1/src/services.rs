@@ -31,7 +31,7 @@ impl ServiceGraph for Ros1Graph<'_> {
     const WIRE: Wire = Wire::Ros1;
 
     fn service_type(&mut self, name: &TypeName) -> Result<Arc<ServiceType>, GraphError> {
-        self.definitions.service(name).map_err(|error| {
+        self.definitions.known.find_service(name).map_err(|error| {
             let wanted = format!(
                 "service connections do not carry the definition: a folder below ROS_PACKAGE_PATH must \
                  contain {}/srv/{}.srv",
@@ -39,7 +39,7 @@ impl ServiceGraph for Ros1Graph<'_> {
                 name.name()
             );
             let of = (TextKind::Service, name);
-            GraphError::MissingType(self.definitions.explain_missing(of, &error, &wanted))
+            GraphError::MissingType(self.definitions.known.explain_missing(of, &error, &wanted))
         })
     }
 
@@ -48,7 +48,11 @@ impl ServiceGraph for Ros1Graph<'_> {
         builtin: BuiltinType,
         array: bool,
     ) -> Result<Option<Arc<MessageType>>, GraphError> {
-        let name = self.definitions.standard_type(builtin, array);
+        let name = self
+            .definitions
+            .known
+            .registry()
+            .standard_type(builtin, array);
         let found = name.map(|name| self.definitions.get(&name));
         Ok(found.transpose()?)
     }

@@ -7,11 +7,10 @@ use std::sync::Arc;
 
 use bridge_node::{RosEnvironment, TypePaths};
 use messages::{
-    ActionCalls, ActionMessages, ActionTypeHashes, DefinitionError, DescribedType, Dialect,
-    MessageType, ServiceType, ServiceTypeHashes, TextKind, TypeHash, TypeName, TypeRegistry,
+    ActionTypeHashes, DefinitionError, DescribedType, Dialect, MessageType, ServiceTypeHashes,
+    TypeHash, TypeName, TypeRegistry,
 };
 use ros2_node::type_description::TypeSource;
-use uadp::BuiltinType;
 
 /// Finds message types by name and caches them.
 ///
@@ -19,7 +18,8 @@ use uadp::BuiltinType;
 /// Their hashes distinguish them.
 #[derive(Debug)]
 pub(crate) struct Ros2Definitions {
-    known: bridge_node::Definitions,
+    /// The types of this host.
+    pub(crate) known: bridge_node::Definitions,
     /// The requested definitions of `known`.
     found: BTreeMap<TypeName, TypeDefinition>,
     told: BTreeMap<(TypeName, TypeHash), DescribedDefinition>,
@@ -230,55 +230,9 @@ impl Ros2Definitions {
         self.known.registry().describe_service(name)
     }
 
-    /// Explains an error of this type, or of [`service`](Self::service), for log messages.
-    pub(crate) fn explain(&mut self, kind: TextKind, error: &DefinitionError) -> String {
-        self.known.explain(kind, error)
-    }
-
-    /// Explains an error of a type that only files can define.
-    pub(crate) fn explain_missing(
-        &mut self,
-        of: (TextKind, &TypeName),
-        error: &DefinitionError,
-        wanted: &str,
-    ) -> String {
-        self.known.explain_missing(of, error, wanted)
-    }
-
-    /// Returns the service with this name; the same sources apply as for messages.
-    ///
-    /// # Errors
-    /// [`DefinitionError`].
-    pub(crate) fn service(&mut self, name: &TypeName) -> Result<Arc<ServiceType>, DefinitionError> {
-        self.known.find_service(name)
-    }
-
     /// Returns the type hashes of a known service.
     pub(crate) fn service_type_hashes(&self, name: &TypeName) -> Option<ServiceTypeHashes> {
         self.known.registry().service_type_hashes(name).ok()
-    }
-
-    /// Returns the calls and values of the action with this name; the same sources apply as for
-    /// messages.
-    ///
-    /// # Errors
-    /// [`DefinitionError`].
-    pub(crate) fn action_calls(
-        &mut self,
-        name: &TypeName,
-    ) -> Result<Arc<ActionCalls>, DefinitionError> {
-        self.known.find_action_calls(name)
-    }
-
-    /// Returns the messages of the action with this name; the same sources apply as for messages.
-    ///
-    /// # Errors
-    /// [`DefinitionError`].
-    pub(crate) fn action_messages(
-        &mut self,
-        name: &TypeName,
-    ) -> Result<ActionMessages, DefinitionError> {
-        self.known.find_action_messages(name)
     }
 
     /// Returns the type hashes of a known action.
@@ -295,11 +249,6 @@ impl Ros2Definitions {
         name: &TypeName,
     ) -> Result<Vec<DescribedType>, DefinitionError> {
         self.known.registry().describe_action(name)
-    }
-
-    /// Returns the ROS type that carries exactly one value of this built-in type.
-    pub(crate) fn standard_type(&self, builtin: BuiltinType, array: bool) -> Option<TypeName> {
-        self.known.registry().standard_type(builtin, array)
     }
 }
 

@@ -135,7 +135,11 @@ impl AdvertisedTopics {
             return;
         }
         let standard = match shape {
-            [(builtin, array)] => side.definitions.standard_type(*builtin, *array),
+            [(builtin, array)] => side
+                .definitions
+                .known
+                .registry()
+                .standard_type(*builtin, *array),
             _ => None,
         };
         let word = Word {
@@ -310,7 +314,7 @@ impl AdvertisedTopics {
                 info!(
                     topic = publisher.topic(),
                     message_type = %message_type.name(),
-                    definition = side.definitions.source(message_type.name()),
+                    definition = side.definitions.known.source(message_type.name()),
                     "advertised"
                 );
                 let open = OpenPublisher {
@@ -432,7 +436,8 @@ fn learned(
 fn tell_unknown(side: &mut Ros1Side, topic: &str, what: &str, error: &DefinitionError) {
     let definitions = &mut side.definitions;
     side.policy.told.once(topic, "unknown type", || {
-        format!("{what}: {}", definitions.explain(TextKind::Message, error))
+        let why = definitions.known.explain(TextKind::Message, error);
+        format!("{what}: {why}")
     });
 }
 

@@ -29,7 +29,7 @@ impl ActionGraph for Ros2Graph<'_> {
     type Taker = DomainActionServer;
 
     fn action_calls(&mut self, name: &TypeName) -> Result<Arc<ActionCalls>, GraphError> {
-        let found = self.definitions.action_calls(name);
+        let found = self.definitions.known.find_action_calls(name);
         found.map_err(|error| {
             let wanted = format!(
                 "discovery does not carry the definition of an action: a prefix in AMENT_PREFIX_PATH or a \
@@ -38,7 +38,7 @@ impl ActionGraph for Ros2Graph<'_> {
                 name.name()
             );
             let of = (TextKind::Action, name);
-            GraphError::MissingType(self.definitions.explain_missing(of, &error, &wanted))
+            GraphError::MissingType(self.definitions.known.explain_missing(of, &error, &wanted))
         })
     }
 
@@ -65,7 +65,7 @@ impl ActionGraph for Ros2Graph<'_> {
         action: &str,
         type_name: &TypeName,
     ) -> Result<DomainActionServer, GraphError> {
-        let messages = self.definitions.action_messages(type_name)?;
+        let messages = self.definitions.known.find_action_messages(type_name)?;
         let empty_result = empty(messages.result_response())?;
         let action = self.action(action, type_name);
         let options = ActionServerOptions {

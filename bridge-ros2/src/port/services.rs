@@ -33,7 +33,7 @@ impl ServiceGraph for Ros2Graph<'_> {
     const WIRE: Wire = Wire::Cdr;
 
     fn service_type(&mut self, name: &TypeName) -> Result<Arc<ServiceType>, GraphError> {
-        self.definitions.service(name).map_err(|error| {
+        self.definitions.known.find_service(name).map_err(|error| {
             let wanted = format!(
                 "discovery does not carry the definition of a service: a prefix in AMENT_PREFIX_PATH must \
                  contain share/{}/srv/{}.srv",
@@ -41,7 +41,7 @@ impl ServiceGraph for Ros2Graph<'_> {
                 name.name()
             );
             let of = (TextKind::Service, name);
-            GraphError::MissingType(self.definitions.explain_missing(of, &error, &wanted))
+            GraphError::MissingType(self.definitions.known.explain_missing(of, &error, &wanted))
         })
     }
 
@@ -50,7 +50,11 @@ impl ServiceGraph for Ros2Graph<'_> {
         builtin: BuiltinType,
         array: bool,
     ) -> Result<Option<Arc<MessageType>>, GraphError> {
-        let name = self.definitions.standard_type(builtin, array);
+        let name = self
+            .definitions
+            .known
+            .registry()
+            .standard_type(builtin, array);
         let found = name.map(|name| self.definitions.here(&name)).transpose()?;
         Ok(found.map(|found| found.message_type))
     }

@@ -97,7 +97,8 @@ impl Ros2Side {
     ) -> bool {
         let definitions = &mut self.definitions;
         self.policy.told.once(topic, "unknown type", || {
-            format!("{what}: {}", definitions.explain(TextKind::Message, error))
+            let why = definitions.known.explain(TextKind::Message, error);
+            format!("{what}: {why}")
         })
     }
 

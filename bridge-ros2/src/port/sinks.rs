@@ -191,7 +191,11 @@ impl WrittenTopics {
             return;
         }
         let standard = match shape {
-            [(builtin, array)] => side.definitions.standard_type(*builtin, *array),
+            [(builtin, array)] => side
+                .definitions
+                .known
+                .registry()
+                .standard_type(*builtin, *array),
             _ => None,
         };
         let word = Word {
