@@ -26,6 +26,7 @@ mod orchestra;
 mod pace;
 mod plug;
 mod robots;
+mod ros2;
 mod skilled;
 mod stage;
 mod stop;

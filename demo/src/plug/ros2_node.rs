@@ -1,17 +1,15 @@
 //! The robot of the scenario as a ROS 2 node. It listens to skills of the space, and starts a skill
 //! on request.
 
-use std::net::{IpAddr, Ipv4Addr};
 use std::pin::Pin;
 
 use anyhow::{Context as _, anyhow};
 use futures_util::stream::{Stream, StreamExt as _, select_all};
 use ros2_client::qos::{History, WhenFull};
 use ros2_client::{
-    Client, Context, Message, MessageTypeName, Name as RosName, Node, NodeName, NodeOptions,
-    QosProfile, ServiceMapping, ServiceTypeName, Subscription,
+    Client, Message, MessageTypeName, Name as RosName, Node, QosProfile, ServiceMapping,
+    ServiceTypeName, Subscription,
 };
-use rustdds::DomainParticipantBuilder;
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use tokio::io::{AsyncBufReadExt as _, BufReader};
@@ -21,7 +19,7 @@ use super::fact::{NodeEvent, PlugComponent, Ros};
 use super::skill_messages::{SkillResult, SkillState};
 use super::{CALL_LIMIT, RESET, RESULT, START, STATE, topic};
 use crate::event::tell;
-use crate::line::DOMAIN;
+use crate::ros2::join;
 use crate::stop::EndSignal;
 
 const ROS: Ros = Ros::Ros2;
@@ -51,7 +49,7 @@ type Events = Pin<Box<dyn Stream<Item = NodeEvent>>>;
 /// first skill.
 pub(crate) async fn run() -> anyhow::Result<()> {
     let mut stop = EndSignal::new()?;
-    let mut node = join()?;
+    let mut node = join("new_robot")?;
     let states: Vec<(u16, Subscription<SkillState>)> = PlugComponent::ALL
         .into_iter()
         .map(|part| {
@@ -170,24 +168,6 @@ fn events<M: Message + DeserializeOwned + 'static>(
 
 impl Message for SkillState {}
 impl Message for SkillResult {}
-
-/// Joins the domain on the loopback interface only.
-fn join() -> anyhow::Result<Node> {
-    let participant = DomainParticipantBuilder::new(DOMAIN)
-        .with_only_networks([IpAddr::V4(Ipv4Addr::LOCALHOST)])
-        .same_host_loopback(true)
-        .build()
-        .with_context(|| format!("cannot join DDS domain {DOMAIN}"))?;
-    let context = Context::from_domain_participant(participant)
-        .map_err(|error| anyhow!("cannot make a ROS 2 context: {error}"))?;
-    let name = NodeName::new("/", "new_robot").map_err(|error| anyhow!("{error:?}"))?;
-    let options = NodeOptions::new()
-        .start_parameter_services(false)
-        .enable_rosout(false);
-    context
-        .new_node(name, options)
-        .map_err(|error| anyhow!("cannot make a ROS 2 node: {error}"))
-}
 
 const LISTENS: QosProfile = QosProfile::publisher_default()
     .reliability_reliable(WhenFull::Fail)

@@ -1,29 +1,24 @@
 //! TurtleBot3 as a ROS 2 node.
 
-use std::net::{IpAddr, Ipv4Addr};
-
 use anyhow::{Context as _, anyhow};
 use futures_util::StreamExt as _;
 use ros2_client::qos::{Durability, History, WhenFull};
-use ros2_client::{
-    Context, MessageTypeName, Name as RosName, Node, NodeName, NodeOptions, Publisher, QosProfile,
-    Subscription,
-};
-use rustdds::DomainParticipantBuilder;
+use ros2_client::{MessageTypeName, Name as RosName, Node, Publisher, QosProfile, Subscription};
 use tokio::time::{Instant, interval, sleep_until};
 
 use super::turtlebot::{Turtlebot, TurtlebotOutputs};
 use super::{REPEAT, far_away};
 use crate::clock::wall_nanos;
 use crate::event::tell_at;
-use crate::line::{DOMAIN, LineValueName};
+use crate::line::LineValueName;
 use crate::pace::{LinePace, Speed};
+use crate::ros2::join;
 use crate::stop::EndSignal;
 
 /// Runs the node until the process is stopped.
 pub(crate) async fn run(speed: Speed) -> anyhow::Result<()> {
     let mut stop = EndSignal::new()?;
-    let mut node = join()?;
+    let mut node = join("turtlebot3")?;
     let outputs = Outputs {
         park: publisher(&mut node, LineValueName::ParkBusy)?,
         bucket: publisher(&mut node, LineValueName::BucketBusy)?,
@@ -61,24 +56,6 @@ pub(crate) async fn run(speed: Speed) -> anyhow::Result<()> {
             tell_at(stamp, event).context("the demo does not listen any more")?;
         }
     }
-}
-
-/// Joins the domain on the loopback interface only.
-fn join() -> anyhow::Result<Node> {
-    let participant = DomainParticipantBuilder::new(DOMAIN)
-        .with_only_networks([IpAddr::V4(Ipv4Addr::LOCALHOST)])
-        .same_host_loopback(true)
-        .build()
-        .with_context(|| format!("cannot join DDS domain {DOMAIN}"))?;
-    let context = Context::from_domain_participant(participant)
-        .map_err(|error| anyhow!("cannot make a ROS 2 context: {error}"))?;
-    let name = NodeName::new("/", "turtlebot3").map_err(|error| anyhow!("{error:?}"))?;
-    let options = NodeOptions::new()
-        .start_parameter_services(false)
-        .enable_rosout(false);
-    context
-        .new_node(name, options)
-        .map_err(|error| anyhow!("cannot make a ROS 2 node: {error}"))
 }
 
 /// The last value counts, and late subscribers receive it.

@@ -1,6 +1,5 @@
 //! The mobile robot as a ROS 2 node, with an action to drive.
 
-use std::net::{IpAddr, Ipv4Addr};
 use std::time::Duration;
 
 use anyhow::{Context as _, anyhow};
@@ -8,18 +7,14 @@ use ros2_client::action::{
     ActionServerQosPolicies, AsyncActionServer, ExecutingGoalHandle, GoalEndStatus,
 };
 use ros2_client::qos::{Durability, History, WhenFull};
-use ros2_client::{
-    ActionTypeName, Context, Message, Name as RosName, Node, NodeName, NodeOptions, QosProfile,
-    ServiceMapping,
-};
-use rustdds::DomainParticipantBuilder;
+use ros2_client::{ActionTypeName, Message, Name as RosName, Node, QosProfile, ServiceMapping};
 use serde::{Deserialize, Serialize};
 use tokio::time::{sleep, timeout};
 
 use super::fact::MachineEvent;
 use crate::event::tell;
-use crate::line::DOMAIN;
 use crate::pace::{LinePace, Speed};
+use crate::ros2::join;
 use crate::stop::EndSignal;
 
 /// The goal of `ua_msgs/NavigateTo`.
@@ -54,7 +49,7 @@ type Server = AsyncActionServer<Goal, Reached, OnTheWay>;
 /// Runs the node until the process is stopped.
 pub(crate) async fn run(speed: Speed) -> anyhow::Result<()> {
     let mut stop = EndSignal::new()?;
-    let mut node = join()?;
+    let mut node = join("turtlebot3")?;
     let spinner = node
         .spinner()
         .map_err(|error| anyhow!("the node cannot watch its domain: {error}"))?;
@@ -124,24 +119,6 @@ fn serve(node: &mut Node) -> anyhow::Result<Server> {
         .create_action_server(ServiceMapping::Enhanced, &name, &of_type, qos)
         .map_err(|error| anyhow!("cannot make an action: {error}"))?;
     Ok(AsyncActionServer::new(server))
-}
-
-/// Joins the domain on the loopback interface only.
-fn join() -> anyhow::Result<Node> {
-    let participant = DomainParticipantBuilder::new(DOMAIN)
-        .with_only_networks([IpAddr::V4(Ipv4Addr::LOCALHOST)])
-        .same_host_loopback(true)
-        .build()
-        .with_context(|| format!("cannot join DDS domain {DOMAIN}"))?;
-    let context = Context::from_domain_participant(participant)
-        .map_err(|error| anyhow!("cannot make a ROS 2 context: {error}"))?;
-    let name = NodeName::new("/", "turtlebot3").map_err(|error| anyhow!("{error:?}"))?;
-    let options = NodeOptions::new()
-        .start_parameter_services(false)
-        .enable_rosout(false);
-    context
-        .new_node(name, options)
-        .map_err(|error| anyhow!("cannot make a ROS 2 node: {error}"))
 }
 
 const ACTION: &str = "/turtlebot3/navigate_to";
