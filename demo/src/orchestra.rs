@@ -225,16 +225,12 @@ impl Director<'_> {
         environment: &[(&'static str, &str)],
         stage: Stage,
     ) -> Result<(), DemoFailure> {
-        self.programs.start(ProgramStart {
-            name,
-            path: self.binaries.demo.clone(),
-            arguments: arguments.iter().copied().map(str::to_owned).collect(),
-            environment: owned(environment),
+        let demo = (name, self.binaries.demo.clone());
+        let program = ProgramStart {
             tells: true,
-            hears: false,
-            stage,
-        })?;
-        Ok(())
+            ..ProgramStart::new(demo, arguments, environment, stage)
+        };
+        self.programs.start(program).map(drop)
     }
 
     fn start(
@@ -244,16 +240,8 @@ impl Director<'_> {
         arguments: &[&str],
         environment: &[(&'static str, &str)],
     ) -> Result<(), DemoFailure> {
-        self.programs.start(ProgramStart {
-            name,
-            path,
-            arguments: arguments.iter().copied().map(str::to_owned).collect(),
-            environment: owned(environment),
-            tells: false,
-            hears: false,
-            stage: Stage::Bridges,
-        })?;
-        Ok(())
+        let program = ProgramStart::new((name, path), arguments, environment, Stage::Bridges);
+        self.programs.start(program).map(drop)
     }
 
     /// Processes events until the condition is met.
@@ -331,13 +319,6 @@ impl Director<'_> {
             logs: self.programs.directory().to_owned(),
         }
     }
-}
-
-fn owned(environment: &[(&'static str, &str)]) -> Vec<(&'static str, String)> {
-    environment
-        .iter()
-        .map(|(key, value)| (*key, (*value).to_owned()))
-        .collect()
 }
 
 const MAPPING: &str = include_str!("../../mappings/assembly-line.yaml");

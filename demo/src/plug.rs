@@ -368,18 +368,10 @@ impl Director<'_> {
 
     fn plug(&mut self, part: PlugComponent) -> Result<(), DemoFailure> {
         let yaml = files::of_part(self.programs.directory(), part);
-        let arguments = [yaml.display().to_string()]
-            .into_iter()
-            .chain(["--interface", LOOPBACK].map(str::to_owned));
-        let started = self.programs.start(ProgramStart {
-            name: part.name(),
-            path: self.binaries.component.clone(),
-            arguments: arguments.collect(),
-            environment: Vec::new(),
-            tells: false,
-            hears: false,
-            stage: Stage::Components,
-        })?;
+        let arguments = [&*yaml.display().to_string(), "--interface", LOOPBACK];
+        let component = (part.name(), self.binaries.component.clone());
+        let program = ProgramStart::new(component, &arguments, &[], Stage::Components);
+        let started = self.programs.start(program)?;
         self.show.takes(started, &Fact::Started(part));
         Ok(())
     }
@@ -391,16 +383,8 @@ impl Director<'_> {
         arguments: &[&str],
         environment: &[(&'static str, &str)],
     ) -> Result<(), DemoFailure> {
-        self.programs.start(ProgramStart {
-            name,
-            path,
-            arguments: arguments.iter().copied().map(str::to_owned).collect(),
-            environment: owned(environment),
-            tells: false,
-            hears: false,
-            stage: Stage::Bridges,
-        })?;
-        Ok(())
+        let program = ProgramStart::new((name, path), arguments, environment, Stage::Bridges);
+        self.programs.start(program).map(drop)
     }
 
     fn start_own(
@@ -410,16 +394,13 @@ impl Director<'_> {
         environment: &[(&'static str, &str)],
         stage: Stage,
     ) -> Result<(), DemoFailure> {
-        self.programs.start(ProgramStart {
-            name,
-            path: self.binaries.demo.clone(),
-            arguments: arguments.iter().copied().map(str::to_owned).collect(),
-            environment: owned(environment),
+        let demo = (name, self.binaries.demo.clone());
+        let program = ProgramStart {
             tells: true,
             hears: stage == Stage::Robots,
-            stage,
-        })?;
-        Ok(())
+            ..ProgramStart::new(demo, arguments, environment, stage)
+        };
+        self.programs.start(program).map(drop)
     }
 
     /// Processes facts until the act is over.
@@ -604,13 +585,6 @@ impl Answer {
                 .collect(),
         }
     }
-}
-
-fn owned(environment: &[(&'static str, &str)]) -> Vec<(&'static str, String)> {
-    environment
-        .iter()
-        .map(|(key, value)| (*key, (*value).to_owned()))
-        .collect()
 }
 
 /// Returns the ROS name of a topic of space 0.

@@ -482,8 +482,12 @@ impl Story<'_> {
         environment: &[(&'static str, &str)],
         stage: Stage,
     ) -> Result<(), DemoFailure> {
-        let demo = self.binaries.demo.clone();
-        self.program((name, demo), arguments, environment, (stage, true))
+        let demo = (name, self.binaries.demo.clone());
+        let program = ProgramStart {
+            tells: true,
+            ..ProgramStart::new(demo, arguments, environment, stage)
+        };
+        self.programs.start(program).map(drop)
     }
 
     fn start(
@@ -493,29 +497,8 @@ impl Story<'_> {
         environment: &[(&'static str, &str)],
         stage: Stage,
     ) -> Result<(), DemoFailure> {
-        self.program(program, arguments, environment, (stage, false))
-    }
-
-    fn program(
-        &mut self,
-        (name, path): (&'static str, PathBuf),
-        arguments: &[&str],
-        environment: &[(&'static str, &str)],
-        (stage, tells): (Stage, bool),
-    ) -> Result<(), DemoFailure> {
-        let environment = environment.iter();
-        self.programs.start(ProgramStart {
-            name,
-            path,
-            arguments: arguments.iter().copied().map(str::to_owned).collect(),
-            environment: environment
-                .map(|(key, value)| (*key, (*value).to_owned()))
-                .collect(),
-            tells,
-            hears: false,
-            stage,
-        })?;
-        Ok(())
+        let program = ProgramStart::new(program, arguments, environment, stage);
+        self.programs.start(program).map(drop)
     }
 
     /// Finds the skills of the line by their types, in any component.

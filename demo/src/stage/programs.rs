@@ -52,6 +52,29 @@ pub(crate) struct ProgramStart {
     pub(crate) stage: Stage,
 }
 
+impl ProgramStart {
+    /// Returns a program that prints no events and reads no input.
+    pub(crate) fn new(
+        (name, path): (&'static str, PathBuf),
+        arguments: &[&str],
+        environment: &[(&'static str, &str)],
+        stage: Stage,
+    ) -> Self {
+        let environment = environment.iter();
+        Self {
+            name,
+            path,
+            arguments: arguments.iter().map(|&text| text.to_owned()).collect(),
+            environment: environment
+                .map(|&(key, value)| (key, value.to_owned()))
+                .collect(),
+            tells: false,
+            hears: false,
+            stage,
+        }
+    }
+}
+
 /// The order in which programs end. Each program needs the programs of later stages for its
 /// shutdown.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -167,15 +190,7 @@ impl RunningPrograms {
         arguments: &[&str],
         stage: Stage,
     ) -> Result<(), DemoFailure> {
-        let program = ProgramStart {
-            name,
-            path,
-            arguments: arguments.iter().map(|&text| text.to_owned()).collect(),
-            environment: Vec::new(),
-            tells: false,
-            hears: false,
-            stage,
-        };
+        let program = ProgramStart::new((name, path), arguments, &[], stage);
         self.start(program).map(drop)
     }
 
