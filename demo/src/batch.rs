@@ -9,7 +9,7 @@ mod report;
 use self::report::BatchReport;
 use crate::pace::Speed;
 use crate::stage::{
-    DemoFailure, EventSource, LOOPBACK, MES_WHO, MesCell, Show, StopReason, watched,
+    DemoFailure, EventSource, LOOPBACK, MES_WHO, MesStory, Show, StopReason, perform,
 };
 
 /// The options of the scenario.
@@ -64,39 +64,19 @@ pub(crate) async fn play(plan: BatchOptions) -> u8 {
         speed: plan.speed.factor(),
         ..BatchReport::default()
     };
-    let outcome = perform(&plan, &mut show, &mut report).await;
+    let ports = MODULES.each_ref().map(|module| module.port);
+    let title = "Batch: three simulated process modules, and a recipe of BatchML";
+    let outcome = perform(
+        (title, &ports, plan.speed),
+        (&plan, &mut show, &mut report),
+        async |story| story.play().await,
+        |report| format!("{} steps had begun", report.steps.len()),
+    )
+    .await;
     show.conclude(&outcome, &report, &report.table())
 }
 
-async fn perform(
-    plan: &BatchOptions,
-    show: &mut Show,
-    report: &mut BatchReport,
-) -> Result<(), DemoFailure> {
-    let ports = MODULES.each_ref().map(|module| module.port);
-    let title = "Batch: three simulated process modules, and a recipe of BatchML";
-    let (cell, mut reports) = MesCell::prepare(&ports, show, title, plan.speed)?;
-    let mut story = Story {
-        plan,
-        cell,
-        show,
-        report,
-    };
-    let played = watched(story.play(), &mut reports).await;
-    let outcome = played.map_err(|stop| {
-        stop.failure(&story.cell.programs, || {
-            format!("{} steps had begun", story.report.steps.len())
-        })
-    });
-    story.cell.programs.conclude(outcome).await
-}
-
-struct Story<'a> {
-    plan: &'a BatchOptions,
-    cell: MesCell,
-    show: &'a mut Show,
-    report: &'a mut BatchReport,
-}
+type Story<'a> = MesStory<'a, BatchOptions, BatchReport>;
 
 impl Story<'_> {
     async fn play(&mut self) -> Result<(), StopReason> {

@@ -9,7 +9,7 @@ use serde_json::Value as Json;
 use self::report::{FuseInsertion, FusesReport};
 use crate::pace::Speed;
 use crate::stage::{
-    DemoFailure, EventSource, MES_WHO, MesCell, Show, StepRun, StopReason, watched,
+    DemoFailure, EventSource, MES_WHO, MesStory, Show, StepRun, StopReason, perform,
 };
 
 /// The options of the scenario.
@@ -62,38 +62,18 @@ pub(crate) async fn play(plan: FusesOptions) -> u8 {
         speed: plan.speed.factor(),
         insertions: Vec::new(),
     };
-    let outcome = perform(&plan, &mut show, &mut report).await;
+    let title = "Fuses: an arm inserts a fuse with a limited force, then an arm of another make";
+    let outcome = perform(
+        (title, &PORTS, plan.speed),
+        (&plan, &mut show, &mut report),
+        async |story| story.play().await,
+        |report| format!("{} fuses were inserted", report.insertions.len()),
+    )
+    .await;
     show.conclude(&outcome, &report, &report.table())
 }
 
-async fn perform(
-    plan: &FusesOptions,
-    show: &mut Show,
-    report: &mut FusesReport,
-) -> Result<(), DemoFailure> {
-    let title = "Fuses: an arm inserts a fuse with a limited force, then an arm of another make";
-    let (cell, mut reports) = MesCell::prepare(&PORTS, show, title, plan.speed)?;
-    let mut story = Story {
-        plan,
-        cell,
-        show,
-        report,
-    };
-    let played = watched(story.play(), &mut reports).await;
-    let outcome = played.map_err(|stop| {
-        stop.failure(&story.cell.programs, || {
-            format!("{} fuses were inserted", story.report.insertions.len())
-        })
-    });
-    story.cell.programs.conclude(outcome).await
-}
-
-struct Story<'a> {
-    plan: &'a FusesOptions,
-    cell: MesCell,
-    show: &'a mut Show,
-    report: &'a mut FusesReport,
-}
+type Story<'a> = MesStory<'a, FusesOptions, FusesReport>;
 
 impl Story<'_> {
     async fn play(&mut self) -> Result<(), StopReason> {

@@ -20,7 +20,7 @@ pub(crate) use failure::{DemoFailure, exit_code};
 pub(crate) use hops::{BridgeHop, RobotHops, delays, micros};
 pub(crate) use interrupt::Interrupt;
 pub(crate) use mes::{JobRun, MES_WHO, StepRun};
-pub(crate) use mes_cell::MesCell;
+pub(crate) use mes_cell::{MesStory, perform};
 pub(crate) use pages::fetch;
 pub(crate) use programs::{ChildReport, ProgramStart, RunningPrograms, Stage, command};
 pub(crate) use show::Show;

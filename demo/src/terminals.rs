@@ -8,7 +8,7 @@ mod tip;
 use self::report::{BlockVisit, TerminalsReport};
 use self::tip::Tip;
 use crate::pace::Speed;
-use crate::stage::{DemoFailure, EventSource, MES_WHO, MesCell, Show, StopReason, watched};
+use crate::stage::{DemoFailure, EventSource, MES_WHO, MesStory, Show, StopReason, perform};
 
 /// The options of the scenario.
 #[derive(Clone, Debug)]
@@ -56,38 +56,18 @@ pub(crate) async fn play(plan: TerminalsOptions) -> u8 {
         speed: plan.speed.factor(),
         ..TerminalsReport::default()
     };
-    let outcome = perform(&plan, &mut show, &mut report).await;
+    let title = "Terminals: a robot, a tool changer and a gripper place terminal blocks on a rail";
+    let outcome = perform(
+        (title, &PORTS, plan.speed),
+        (&plan, &mut show, &mut report),
+        async |story| story.play().await,
+        |report| format!("{} steps had begun", report.steps.len()),
+    )
+    .await;
     show.conclude(&outcome, &report, &report.table())
 }
 
-async fn perform(
-    plan: &TerminalsOptions,
-    show: &mut Show,
-    report: &mut TerminalsReport,
-) -> Result<(), DemoFailure> {
-    let title = "Terminals: a robot, a tool changer and a gripper place terminal blocks on a rail";
-    let (cell, mut reports) = MesCell::prepare(&PORTS, show, title, plan.speed)?;
-    let mut story = Story {
-        plan,
-        cell,
-        show,
-        report,
-    };
-    let played = watched(story.play(), &mut reports).await;
-    let outcome = played.map_err(|stop| {
-        stop.failure(&story.cell.programs, || {
-            format!("{} steps had begun", story.report.steps.len())
-        })
-    });
-    story.cell.programs.conclude(outcome).await
-}
-
-struct Story<'a> {
-    plan: &'a TerminalsOptions,
-    cell: MesCell,
-    show: &'a mut Show,
-    report: &'a mut TerminalsReport,
-}
+type Story<'a> = MesStory<'a, TerminalsOptions, TerminalsReport>;
 
 impl Story<'_> {
     async fn play(&mut self) -> Result<(), StopReason> {

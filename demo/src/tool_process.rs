@@ -17,7 +17,7 @@ use tokio::time::{Instant, sleep};
 use self::report::{ProcessReport, ReportedRun};
 use crate::pace::Speed;
 use crate::stage::{
-    DemoFailure, EventSource, JobRun, MES_WHO, MesCell, Show, StopReason, swapped_tools, watched,
+    DemoFailure, EventSource, JobRun, MES_WHO, MesStory, Show, StopReason, perform, swapped_tools,
 };
 
 /// The options of the scenario.
@@ -75,38 +75,18 @@ pub(crate) async fn play(plan: ProcessOptions) -> u8 {
         swapped: plan.swapped,
         ..ProcessReport::default()
     };
-    let outcome = perform(&plan, &mut show, &mut report).await;
+    let title = "Process: a part and a cover are moved with two tools, by a process of the graph";
+    let outcome = perform(
+        (title, &PORTS, plan.speed),
+        (&plan, &mut show, &mut report),
+        async |story| story.play().await,
+        |report| format!("{} runs were over", report.runs.len()),
+    )
+    .await;
     show.conclude(&outcome, &report, &report.table())
 }
 
-async fn perform(
-    plan: &ProcessOptions,
-    show: &mut Show,
-    report: &mut ProcessReport,
-) -> Result<(), DemoFailure> {
-    let title = "Process: a part and a cover are moved with two tools, by a process of the graph";
-    let (cell, mut reports) = MesCell::prepare(&PORTS, show, title, plan.speed)?;
-    let mut story = Story {
-        plan,
-        cell,
-        show,
-        report,
-    };
-    let played = watched(story.play(), &mut reports).await;
-    let outcome = played.map_err(|stop| {
-        stop.failure(&story.cell.programs, || {
-            format!("{} runs were over", story.report.runs.len())
-        })
-    });
-    story.cell.programs.conclude(outcome).await
-}
-
-struct Story<'a> {
-    plan: &'a ProcessOptions,
-    cell: MesCell,
-    show: &'a mut Show,
-    report: &'a mut ProcessReport,
-}
+type Story<'a> = MesStory<'a, ProcessOptions, ProcessReport>;
 
 impl Story<'_> {
     async fn play(&mut self) -> Result<(), StopReason> {

@@ -7,8 +7,8 @@ use tokio::sync::mpsc;
 
 use super::mes::Mes;
 use super::{
-    ChildReport, DemoFailure, EventSource, LOOPBACK, RunningPrograms, Show, Stage, find, free_port,
-    must_be_free,
+    ChildReport, DemoFailure, EventSource, LOOPBACK, RunningPrograms, Show, Stage, StopReason,
+    find, free_port, must_be_free, watched,
 };
 use crate::pace::Speed;
 
@@ -21,6 +21,35 @@ pub(crate) struct MesCell {
     questions: u16,
 }
 
+/// A scenario in a cell with a MES, with its options and its report.
+pub(crate) struct MesStory<'a, P, R> {
+    pub(crate) plan: &'a P,
+    pub(crate) cell: MesCell,
+    pub(crate) show: &'a mut Show,
+    pub(crate) report: &'a mut R,
+}
+
+/// Plays a scenario with programs at these ports, and ends the programs. `standing` describes its
+/// progress after an interruption.
+pub(crate) async fn perform<P, R>(
+    (title, ports, speed): (&str, &[u16], Speed),
+    (plan, show, report): (&P, &mut Show, &mut R),
+    play: impl AsyncFnOnce(&mut MesStory<'_, P, R>) -> Result<(), StopReason>,
+    standing: impl FnOnce(&R) -> String,
+) -> Result<(), DemoFailure> {
+    let (cell, mut reports) = MesCell::prepare(ports, show, title, speed)?;
+    let mut story = MesStory {
+        plan,
+        cell,
+        show,
+        report,
+    };
+    let played = watched(play(&mut story), &mut reports).await;
+    let outcome =
+        played.map_err(|stop| stop.failure(&story.cell.programs, || standing(story.report)));
+    story.cell.programs.conclude(outcome).await
+}
+
 struct Binaries {
     lds: PathBuf,
     component: PathBuf,
@@ -31,7 +60,7 @@ struct Binaries {
 impl MesCell {
     /// Checks that the programs exist and that their ports are free. Returns the cell, and the
     /// receiver of the reports.
-    pub(crate) fn prepare(
+    fn prepare(
         ports: &[u16],
         show: &mut Show,
         title: &str,
