@@ -6,8 +6,8 @@ use super::findings::{Findings, YamlFinding, YamlFindingCode};
 use super::{DocumentKind, DocumentNode, Place, nearest, parse};
 use crate::parameters::shortened;
 
-/// Reads a document with `read`, which returns `None` for a faulty document. All errors are reported
-/// together.
+/// Reads a document with `read`, which returns `None` for a faulty document. All errors are
+/// reported together.
 ///
 /// # Errors
 /// The findings in the document.
