@@ -351,9 +351,7 @@ async fn prepare<P: Program>(
         own,
     };
     let observer = program.observer();
-    if let Some(observer) = &observer {
-        observer.mapped(&taken);
-    }
+    let observer = observer.inspect(|observer| observer.mapped(&taken));
     let port = program.start(context).await?;
     look_around(&mut router, &port);
     let application = port.application().unwrap_or_else(|| plain(P::NAME, own));
