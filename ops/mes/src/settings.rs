@@ -133,14 +133,7 @@ impl Reading<'_, '_> {
             processes,
             prefer,
         ] = self.reader.map(root, KEYS)?;
-        let name = self.reader.needed(name, "mes", root.place);
-        let name = name.and_then(|node| read_name(node, self.reader));
-        let uri = self.reader.needed(uri, "application_uri", root.place);
-        let uri = uri.and_then(|node| self.iri(node, YamlFindingCode::Uri));
-        let namespace = self
-            .reader
-            .needed(namespace, "namespace", root.place)
-            .and_then(|node| read_positive(node, YamlFindingCode::Namespace, self.reader));
+        let identity = self.identity(root, [name, uri, namespace]);
         let usual = || Some(DEFAULT_ENDPOINT.to_owned());
         let endpoint = endpoint.map_or_else(usual, |node| read_endpoint(node, self.reader));
         let usual = || vec![ComponentSecurity::None];
@@ -168,12 +161,13 @@ impl Reading<'_, '_> {
         self.each_once(root, &products, &processes, &recipes);
         let names = servers.iter().map(|server| server.which.text());
         self.once(root, names, "server");
+        let (name, application_uri, namespace) = identity?;
         let user = whole(user)?;
         servers::give_user(&mut servers, user.as_ref());
         Some(Settings {
-            name: name?,
-            application_uri: uri?,
-            namespace: namespace?,
+            name,
+            application_uri,
+            namespace,
             endpoint: endpoint?,
             security,
             lds: lds?,
@@ -194,6 +188,23 @@ impl Reading<'_, '_> {
             processes,
             prefer,
         })
+    }
+
+    /// Reads the name, the ApplicationUri and the number of the component.
+    fn identity(
+        &mut self,
+        root: &DocumentNode,
+        [name, uri, namespace]: [Option<&DocumentNode>; 3],
+    ) -> Option<(String, String, u16)> {
+        let name = self.reader.needed(name, "mes", root.place);
+        let name = name.and_then(|node| read_name(node, self.reader));
+        let uri = self.reader.needed(uri, "application_uri", root.place);
+        let uri = uri.and_then(|node| self.iri(node, YamlFindingCode::Uri));
+        let namespace = self
+            .reader
+            .needed(namespace, "namespace", root.place)
+            .and_then(|node| read_positive(node, YamlFindingCode::Namespace, self.reader));
+        Some((name?, uri?, namespace?))
     }
 
     fn each<T>(
