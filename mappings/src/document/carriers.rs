@@ -143,8 +143,8 @@ document! {
     /// Shared memory between programs of this host and of one user, by iceoryx2. Only programs that
     /// were built with the feature `shm` have it.
     struct SharedMemoryEntry {
-        /// Name of the group: letters, digits, `-` and `_`; default `cell`. Programs with the same name
-        /// receive each other's messages.
+        /// Name of the group: letters, digits, `-` and `_`; default `cell`. Programs with the same
+        /// name receive each other's messages.
         #[schemars(length(min = 1, max = 64))]
         group: String,
     }

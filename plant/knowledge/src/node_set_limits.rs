@@ -210,8 +210,8 @@ impl LimitStatements {
     }
 }
 
-/// Returns the finite bounds of a range; `None` if it is no range, or an empty one, as files have it
-/// for an unknown range.
+/// Returns the finite bounds of a range; `None` if it is no range, or an empty one, as files have
+/// it for an unknown range.
 fn bounds(range: &NodeSetFileRange) -> Option<(Option<f64>, Option<f64>)> {
     let bound = |text: &str| match text.trim() {
         // The default of an omitted element.

@@ -1,10 +1,10 @@
 //! Messages between programs of one host in shared memory, by iceoryx2, without a network.
 //!
 //! All programs of a group share one service of iceoryx2 with a NetworkMessage as payload, and an
-//! event that wakes the receivers. A message is written to shared memory once, however many programs
-//! receive it. A receiver that does not read its messages loses further ones, which the sender
-//! counts; it never blocks the sender. A message has the time at which it was sent, so a program that
-//! was stopped knows that a command in it is late.
+//! event that wakes the receivers. A message is written to shared memory once, however many
+//! programs receive it. A receiver that does not read its messages loses further ones, which the
+//! sender counts; it never blocks the sender. A message has the time at which it was sent, so a
+//! program that was stopped knows that a command in it is late.
 
 use std::collections::BTreeMap;
 use std::fmt;

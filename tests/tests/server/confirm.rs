@@ -359,8 +359,8 @@ fn the_last_write_that_a_killed_server_confirmed_is_what_the_robot_got() {
     });
 }
 
-/// Checks that a command that waited for a stopped bridge does not reach the robot. `carrier` is the
-/// carrier in the mapping.
+/// Checks that a command that waited for a stopped bridge does not reach the robot. `carrier` is
+/// the carrier in the mapping.
 pub(crate) fn is_never_late_after_a_stop(carrier: &str) {
     let Some(cell) = Cell::with(&[Peer::Ros1, Peer::Python]) else {
         return;
