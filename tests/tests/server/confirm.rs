@@ -190,7 +190,7 @@ fn is_confirmed_by_the_bridge(cell: &Cell, bridge: Child, start: impl FnOnce() -
         came.is_sorted_by(|one, next| one < next),
         "none comes twice or late: {came:?}"
     );
-    bridge.signal(nix::sys::signal::Signal::SIGKILL);
+    bridge.signal(Signal::SIGKILL);
     drop(bridge);
     assert_eq!(set("60.0"), "BadTimeout", "there is no bridge");
     assert_eq!(shown(), (json!(60.0), json!("UncertainLastUsableValue")));
@@ -300,7 +300,7 @@ fn a_write_is_good_when_a_service_of_rospy_has_its_call_and_else_unknown() {
     eventually("the next write calls", SOON, || {
         (calls(&service) > before).then_some(())
     });
-    service.signal(nix::sys::signal::Signal::SIGKILL);
+    service.signal(Signal::SIGKILL);
     service.wait_for_end(SOON);
     assert_eq!(set(), "BadTimeout", "the service is killed");
     assert_eq!(read(&cell, light)["status"], "UncertainLastUsableValue");
@@ -339,7 +339,7 @@ fn the_last_write_that_a_killed_server_confirmed_is_what_the_robot_got() {
     robot.wait_for_json("a hundred setpoints", SOON, |line| {
         (line.get("setpoint")?.as_f64()? >= 100.0).then_some(())
     });
-    server.signal(nix::sys::signal::Signal::SIGKILL);
+    server.signal(Signal::SIGKILL);
     client.wait_for_json("the client is told", SOON, |line| {
         line.get("gone").map(|_| ())
     });
