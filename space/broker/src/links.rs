@@ -138,6 +138,7 @@ mod tests {
     use mappings::BrokerAddress;
 
     use crate::connection::instant;
+    use crate::json::PromotedTexts;
     use crate::queue::QueuedPublish;
 
     use super::*;
@@ -168,6 +169,7 @@ mod tests {
             within: Some(Duration::from_secs(1)),
             message_type: "ua-metadata",
             content_type: "application/opcua+uadp",
+            promoted: PromotedTexts::default(),
         }
     }
 
