@@ -153,7 +153,7 @@ fn publish(kind: &str, message: &Value) {
 fn received(payload: &Value) -> (Vec<(Value, Option<StatusCode>)>, u64) {
     let fields: Vec<Value> = FIELDS
         .map(|(name, builtin, data_type, rank)| {
-            let data_type = data_type.unwrap_or(builtin.id().into());
+            let data_type = data_type.unwrap_or_else(|| builtin.id().into());
             json!({"Name": name, "BuiltInType": builtin.id(), "ValueRank": rank,
             "DataType": format!("i={data_type}")})
         })

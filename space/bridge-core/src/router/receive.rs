@@ -355,19 +355,35 @@ impl TopicQueues {
         if is_confirmed {
             admitted = admitted.map(|admitted| self.receive(topic, &place, admitted, now));
         }
+        self.take_or_count(at, message, (&place, admitted, sent), now);
+    }
+
+    /// Processes a message that was admitted to the sequence, or counts the reason why not.
+    fn take_or_count(
+        &mut self,
+        at: Handle,
+        message: &DataSetMessage<'_>,
+        (place, admitted, sent): (
+            &SequencePosition,
+            Option<Result<AcceptedMessage, Reason>>,
+            Option<Timestamp>,
+        ),
+        now: Now,
+    ) {
+        let about = DropSite::message(at.topic(), place.from);
         match admitted {
             None => {}
+            Some(Ok(admitted)) => self.take_in(at, message, (place, &admitted, sent), now),
+            Some(Err(Reason::Late)) => {
+                let waited = self.waited(now);
+                self.count(about, late::cause(late::WAITED), 1, || late::waited(waited));
+            }
             Some(Err(reason)) => {
                 if reason == Reason::Repeat {
-                    self.follow_again(at, message, &place);
-                }
-                if reason == Reason::Late {
-                    return self
-                        .count(about, late::cause(late::WAITED), 1, || late::waited(waited));
+                    self.follow_again(at, message, place);
                 }
                 self.count(about, reason, 1, String::new);
             }
-            Some(Ok(admitted)) => self.take_in(at, message, (&place, &admitted, sent), now),
         }
     }
 

@@ -195,29 +195,11 @@ impl CallTraffic<'_> {
             .responder
             .handle_judged(request, (origin, verdict), since);
         match requested {
-            // An earlier instance of this program may have executed the request with an unknown
-            // result.
             Ok(RequiredAction::Execute(id)) if !calls.is_of_this_life(request) => {
-                let lost = ActionOutcome::Unknown(uadp::action::Unknown::Lost);
-                // The requestor receives the outcome when it repeats the request.
-                let _told = calls.responder.finish(id, lost, since).is_ok();
-                let cause = (Reason::CallRefused, "earlier life");
-                self.count_call(topic, Some(from), cause, || {
-                    if is_redundant {
-                        "not executed: the request was sent to the bridge that was active before"
-                            .to_owned()
-                    } else {
-                        "not executed: the request was sent before this program was restarted"
-                            .to_owned()
-                    }
-                });
+                self.leave_to_earlier_life((topic, id), from, now);
             }
-            // The repetitions of the request are refused, too.
             Ok(RequiredAction::Execute(id)) if waited >= hint(request) => {
-                let refused = calls.responder.refuse(id, Refusal::NotExecutable, since);
-                let _told = refused.is_ok();
-                let cause = late::cause(late::WAITED);
-                self.count_call(topic, Some(from), cause, || late::waited(waited));
+                self.leave_given_up((topic, id), (from, waited), now);
             }
             Ok(RequiredAction::Execute(id)) => {
                 if let Ok((fields, plan)) = judged {
@@ -253,6 +235,48 @@ impl CallTraffic<'_> {
                 self.count_call(topic, Some(from), cause, || why.to_string());
             }
         }
+    }
+
+    /// Does not execute a request that was sent to an earlier instance of this program, which may
+    /// have executed it with an unknown result.
+    fn leave_to_earlier_life(
+        &mut self,
+        (topic, id): (TopicId, ExecutionId),
+        from: SocketAddr,
+        now: Now,
+    ) {
+        let is_redundant = self.values.redundant.is_some();
+        if let Some(calls) = &mut self.calls {
+            let lost = ActionOutcome::Unknown(uadp::action::Unknown::Lost);
+            // The requestor receives the outcome when it repeats the request.
+            let since = calls.since_start(now);
+            let _told = calls.responder.finish(id, lost, since).is_ok();
+        }
+        let cause = (Reason::CallRefused, "earlier life");
+        self.count_call(topic, Some(from), cause, || {
+            if is_redundant {
+                "not executed: the request was sent to the bridge that was active before".to_owned()
+            } else {
+                "not executed: the request was sent before this program was restarted".to_owned()
+            }
+        });
+    }
+
+    /// Does not execute a request that waited for this program longer than its caller waits. Its
+    /// repetitions are refused, too.
+    fn leave_given_up(
+        &mut self,
+        (topic, id): (TopicId, ExecutionId),
+        (from, waited): (SocketAddr, Duration),
+        now: Now,
+    ) {
+        if let Some(calls) = &mut self.calls {
+            let since = calls.since_start(now);
+            let refused = calls.responder.refuse(id, Refusal::NotExecutable, since);
+            let _told = refused.is_ok();
+        }
+        let cause = late::cause(late::WAITED);
+        self.count_call(topic, Some(from), cause, || late::waited(waited));
     }
 
     /// Returns whether the sender may request any own call in the namespace, so that memory may be
