@@ -37,6 +37,11 @@ impl QueuedPublish {
     const fn is_series(&self) -> bool {
         self.confirmed && self.outlasts
     }
+
+    /// Returns the number of bytes that count for the limit of the queue.
+    fn size(&self) -> usize {
+        self.payload.len() + self.promoted.size()
+    }
 }
 
 /// A message and the time at which it expires.
@@ -72,7 +77,7 @@ impl SendQueue {
                 .iter_mut()
                 .find(|(older, _)| older.replaceable && older.topic == publication.topic)
         {
-            self.bytes = self.bytes - older.payload.len() + publication.payload.len();
+            self.bytes = self.bytes - older.size() + publication.size();
             (*older, *of) = (publication, until);
             self.replaced += 1;
             return Ok(());
@@ -80,7 +85,7 @@ impl SendQueue {
         if !self.make_room(&publication, now) {
             return Err(SendError::Busy);
         }
-        self.bytes += publication.payload.len();
+        self.bytes += publication.size();
         self.waiting.push_back((publication, until));
         Ok(())
     }
@@ -96,7 +101,7 @@ impl SendQueue {
         if self.has_room(publication) {
             return true;
         }
-        let size = publication.payload.len();
+        let size = publication.size();
         let mut superseded = self.superseded(publication);
         let mut oldest = superseded.pop();
         let (mut at, mut removed) = (0, 0);
@@ -104,7 +109,7 @@ impl SendQueue {
             let leaves = oldest == Some(at) && (removed < FREED || self.bytes + size > MAX_BYTES);
             at += 1;
             if leaves {
-                self.bytes = self.bytes.saturating_sub(older.payload.len());
+                self.bytes = self.bytes.saturating_sub(older.size());
                 removed += 1;
                 oldest = superseded.pop();
             }
@@ -118,7 +123,7 @@ impl SendQueue {
         self.waiting.retain(|(publication, until)| {
             let is_expired = until.is_some_and(|until| now > until);
             if is_expired {
-                self.bytes = self.bytes.saturating_sub(publication.payload.len());
+                self.bytes = self.bytes.saturating_sub(publication.size());
                 self.expired += 1;
             }
             !is_expired
@@ -149,7 +154,7 @@ impl SendQueue {
                 continue;
             }
             let message = self.waiting.remove(at)?;
-            self.bytes = self.bytes.saturating_sub(message.0.payload.len());
+            self.bytes = self.bytes.saturating_sub(message.0.size());
             if !is_expired {
                 return Some(message);
             }
@@ -181,7 +186,7 @@ impl SendQueue {
             let waits = publication.is_series()
                 || (publication.outlasts && newest.insert(publication.topic.clone()));
             if waits {
-                self.bytes += publication.payload.len();
+                self.bytes += publication.size();
                 self.waiting.push_front(message);
                 continue;
             }
@@ -209,7 +214,7 @@ impl SendQueue {
         }
         for state in states {
             if self.make_room(&state.0, now) {
-                self.bytes += state.0.payload.len();
+                self.bytes += state.0.size();
                 self.waiting.push_back(state);
             } else {
                 self.discarded += 1;
@@ -218,7 +223,7 @@ impl SendQueue {
     }
 
     fn has_room(&self, publication: &QueuedPublish) -> bool {
-        self.waiting.len() < MAX_WAITING && self.bytes + publication.payload.len() <= MAX_BYTES
+        self.waiting.len() < MAX_WAITING && self.bytes + publication.size() <= MAX_BYTES
     }
 }
 
@@ -413,6 +418,34 @@ mod tests {
         assert!(queue.bytes <= MAX_BYTES);
         let refused = queue.push(large("other", MAX_BYTES), start);
         assert_eq!(refused, Err(SendError::Busy));
+    }
+
+    #[test]
+    fn promoted_fields_count_for_the_bytes_of_the_queue() {
+        let mut queue = SendQueue::default();
+        let start = start();
+        let promoted = |topic, text: &str| QueuedPublish {
+            promoted: std::iter::once(("v", text)).collect(),
+            ..publication(topic, Some(1000), true)
+        };
+        queue.push(promoted("a", "long text"), start).unwrap();
+        queue.push(promoted("a", "text"), start).unwrap();
+        // A payload of 10 bytes, and a property of 5 bytes with its name and its text.
+        assert_eq!((queue.bytes, queue.replaced), (20, 1));
+        let popped = queue.pop(start, true);
+        assert_eq!((popped.is_some(), queue.bytes), (true, 0));
+        let text = "x".repeat(MAX_BYTES);
+        let refused = queue.push(promoted("b", &text), start);
+        assert_eq!(refused, Err(SendError::Busy));
+
+        let state = QueuedPublish {
+            outlasts: true,
+            ..promoted("a", "text")
+        };
+        queue.lose(vec![(state, None)], 0);
+        assert_eq!(queue.bytes, 20);
+        queue.begin(std::iter::empty(), start);
+        assert_eq!(queue.bytes, 20);
     }
 
     #[test]
