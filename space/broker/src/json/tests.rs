@@ -172,6 +172,36 @@ fn promoted_fields_are_texts_in_the_verbose_form() {
 }
 
 #[test]
+fn a_field_that_cannot_be_read_leaves_the_promoted_fields_before_it() {
+    let mut datagram = Vec::new();
+    let network = NetworkHeader {
+        publisher_id: Some(PublisherId::UInt16(1)),
+        group: Some(GroupHeader {
+            writer_group_id: Some(2),
+            ..GroupHeader::default()
+        }),
+        ..NetworkHeader::default()
+    };
+    let mut message = NetworkMessageEncoder::new(&mut datagram, &network, Some(&[10])).unwrap();
+    let mut frame = message.key_frame(&DataSetHeader::default()).unwrap();
+    frame.scalar(Scalar::Double(1.5)).unwrap();
+    frame.array(BuiltinType::String, 1).unwrap();
+    frame.element(Scalar::String(Some("no utf8"))).unwrap();
+    frame.scalar(Scalar::Boolean(true)).unwrap();
+    frame.finish().unwrap();
+    message.finish().unwrap();
+    let start = datagram.windows(7).position(|of| of == b"no utf8");
+    datagram[start.unwrap()] = 0xFF;
+
+    let announcement = announcement_with(|_| true);
+    let mut json = Json::new(MessageMapping::Uadp);
+    json.learn_own(&NetworkMessage::decode(&announcement).unwrap());
+    let promoted = json.promoted(&NetworkMessage::decode(&datagram).unwrap());
+    // The start of the fields behind it is unknown.
+    assert_eq!(promoted, std::iter::once(("zone", "1.5")).collect());
+}
+
+#[test]
 fn verbose_json_is_plain_and_the_other_forms_carry_types() {
     let datagram = value();
     let message = NetworkMessage::decode(&datagram).unwrap();
