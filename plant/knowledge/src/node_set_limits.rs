@@ -28,7 +28,8 @@ pub(crate) struct DeclaredLimits {
 enum Grouping {
     /// A folder, which never has a limit.
     Folder,
-    /// An object without a type of its own. It has the limit if nothing else above does.
+    /// An object without a type of its own. It has the limit only if neither a type nor an object
+    /// of another kind above the variable has it.
     Plain,
 }
 
@@ -210,13 +211,17 @@ impl LimitStatements {
     }
 }
 
-/// Returns the finite bounds of a range; `None` if it is no range, or an empty one, as files have
-/// it for an unknown range.
+/// Returns the bounds of a range, without those that are written as infinite. Returns `None` if a
+/// bound is no number or too large for one. Returns `None` also for an empty range, such as 0 to 0,
+/// which stands for an unknown range in files.
 fn bounds(range: &NodeSetFileRange) -> Option<(Option<f64>, Option<f64>)> {
     let bound = |text: &str| match text.trim() {
         // The default of an omitted element.
         "" => Some(0.0),
-        text => text.parse::<f64>().ok().filter(|bound| !bound.is_nan()),
+        text => text.parse::<f64>().ok().filter(|bound| {
+            let is_written = !text.contains(|digit: char| digit.is_ascii_digit());
+            bound.is_finite() || (bound.is_infinite() && is_written)
+        }),
     };
     let (low, high) = (bound(&range.low)?, bound(&range.high)?);
     let finite = |bound: f64| bound.is_finite().then_some(bound);
@@ -241,3 +246,29 @@ const FUNCTIONAL_GROUP_TYPE: &str = "i=1005";
 const BELOW: [&str; 5] = ["i=35", "i=46", "i=47", "i=49", "i=17604"];
 /// Number of nodes above a node that are looked at.
 const MOST_ABOVE: usize = 64;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_range_with_a_bound_that_cannot_be_read_is_no_limit() {
+        let of = |low: &str, high: &str| {
+            let (low, high) = (low.to_owned(), high.to_owned());
+            bounds(&NodeSetFileRange { low, high })
+        };
+        assert_eq!(of("-1", " 5e3 "), Some((Some(-1.0), Some(5000.0))));
+        assert_eq!(of("", "2"), Some((Some(0.0), Some(2.0))));
+        assert_eq!(of("-INF", "INF"), Some((None, None)));
+        for (low, high) in [
+            ("0", "1e400"),
+            ("-1e400", "5"),
+            ("0", "NaN"),
+            ("0", "five"),
+            ("0", "0"),
+            ("5", "-INF"),
+        ] {
+            assert_eq!(of(low, high), None, "{low} to {high}");
+        }
+    }
+}
