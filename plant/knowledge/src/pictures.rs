@@ -81,8 +81,8 @@ impl Knowledge {
             return Err(PictureFault::UnknownModule(shown(module)));
         }
         let mut found = Vec::new();
-        for (of, picture) in graph.with(v::HAS_PICTURE).take(MOST_SEEN) {
-            if module.is_some_and(|module| module != of) || !graph.is_a(&picture, v::PICTURE) {
+        for (of, picture) in graph.with(module, v::HAS_PICTURE).take(MOST_SEEN) {
+            if !graph.is_a(&picture, v::PICTURE) {
                 continue;
             }
             found.push(ListedPicture {
@@ -143,7 +143,7 @@ impl Knowledge {
         let mut drawing = DrawnPicture::new(graph.picture(iri));
         for (_, part) in parts {
             drawing.add(&graph, &part);
-            // The drawing has each text at least once.
+            // Bounds the memory before the picture is drawn.
             if drawing.texts > Self::LARGEST_PICTURE {
                 return Err(too_large());
             }
@@ -254,8 +254,9 @@ impl DrawnPicture {
             Term::BlankNode(_) | Term::Literal(_) => None,
         });
         let element = elements.next();
-        if let Some(element) = &element {
-            self.assemblies.extend(graph.assembly(element));
+        if let Some(assembly) = element.as_ref().and_then(|element| graph.assembly(element)) {
+            self.texts += assembly.name.len() + assembly.kind.len();
+            self.assemblies.push(assembly);
         }
         let object = PictureObject {
             id: part.to_owned(),
@@ -275,8 +276,6 @@ impl DrawnPicture {
             ports: Vec::new(),
         };
         self.texts += object.name.len() + object.class.len();
-        let assembly = self.assemblies.last().map_or(0, |last| last.name.len());
-        self.texts += assembly;
         self.picture.objects.push(object);
     }
 }
@@ -287,11 +286,16 @@ struct PictureStatements {
 }
 
 impl PictureStatements {
-    /// Returns the subjects and objects of a predicate that are IRIs.
-    fn with(&self, predicate: &str) -> impl Iterator<Item = (String, String)> {
+    /// Returns the subjects and objects of a predicate that are IRIs; of one subject, if it is
+    /// given.
+    fn with(
+        &self,
+        subject: Option<&str>,
+        predicate: &str,
+    ) -> impl Iterator<Item = (String, String)> + use<> {
         let predicate = NamedNodeRef::new_unchecked(predicate);
         let quads = self.store.quads_for_pattern(
-            None,
+            subject.map(|subject| NamedNodeRef::new_unchecked(subject).into()),
             Some(predicate),
             None,
             Some(GraphNameRef::DefaultGraph),

@@ -8,7 +8,7 @@ use knowledge::{
     HttpEndpoint, Knowledge, KnowledgeSource, PictureFault, QueryLimits, SourceKind,
     vocabulary as v,
 };
-use mtp::{Module, escaped};
+use mtp::{Module, PictureObject, escaped};
 use serde_json::json;
 use test_data::read_own;
 
@@ -115,6 +115,58 @@ fn a_picture_that_is_too_large_is_refused() {
         column.pictures[0].objects[0].name = name;
         put(&knowledge, COLUMN, &column);
         assert_eq!(knowledge.picture_svg(&iri).as_ref(), Err(&too_large));
+    }
+}
+
+#[test]
+fn an_object_without_an_element_has_no_share_of_the_name_of_another() {
+    let (knowledge, mut column) = plant();
+    let iri = overview(&knowledge);
+    let objects = &mut column.pictures[0].objects;
+    let shown = objects.iter().find(|object| object.assembly.is_some());
+    let shown = shown.unwrap().clone();
+    let mut plain = shown.clone();
+    plain.assembly = None;
+    let element = shown.assembly.clone().unwrap();
+    *objects = vec![shown];
+    objects.extend((0..8).map(|number| {
+        let id = format!("plain {number}");
+        PictureObject {
+            id,
+            ..plain.clone()
+        }
+    }));
+    let mut assemblies = column.assemblies.iter_mut();
+    let assembly = assemblies.find(|assembly| assembly.id == element).unwrap();
+    let length = Knowledge::LARGEST_PICTURE / 4;
+    assembly.name = "x".repeat(length);
+    put(&knowledge, COLUMN, &column);
+    let drawn = knowledge.picture_svg(&iri).unwrap();
+    assert!(drawn.len() > length, "{}", drawn.len());
+}
+
+#[test]
+fn the_pictures_of_a_module_are_listed_beside_very_many_others() {
+    let knowledge = Knowledge::new().unwrap();
+    let source = KnowledgeSource::new(SourceKind::File, "own.ttl");
+    let ours = v::PICTURE.trim_end_matches("Picture");
+    let others = (0..20_000).map(|number| format!("<urn:other> ua:hasPicture <urn:o{number}> .\n"));
+    let modules = (0..20).map(|number| {
+        format!(
+            "<urn:m{number}> a ua:Module ; ua:hasPicture <urn:p{number}> .
+            <urn:p{number}> a ua:Picture .\n"
+        )
+    });
+    let prefix = format!("@prefix ua: <{ours}> .\n");
+    let turtle: String = std::iter::once(prefix)
+        .chain(others)
+        .chain(modules)
+        .collect();
+    knowledge.replace_turtle(&source, &turtle, 1).unwrap();
+    for number in 0..20 {
+        let found = knowledge.pictures(Some(&format!("urn:m{number}"))).unwrap();
+        let names: Vec<_> = found.iter().map(|one| &*one.picture).collect();
+        assert_eq!(names, [format!("urn:p{number}")]);
     }
 }
 
