@@ -11,6 +11,7 @@ use hyper::header::{AUTHORIZATION, HOST, HeaderValue, ORIGIN};
 use hyper::{Request, StatusCode};
 use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::net::TcpStream;
+use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use tokio::task::AbortHandle;
 use tokio::time::Instant;
 use tracing::debug;
@@ -18,7 +19,7 @@ use uri_text::{is_loopback_host, without_port};
 
 use crate::http::{HttpRefusal, ServedSite};
 use crate::sign_ins::{LOCKED_FOR, PasswordCheck, WrongPasswords, network};
-use crate::writes::{May, basic_user};
+use crate::writes::{May, basic_user, failed};
 
 /// A secured connection, such as a TLS stream.
 pub trait SecuredStream: AsyncRead + AsyncWrite + Send + Unpin {}
@@ -58,6 +59,8 @@ pub(crate) struct RemoteAccess {
     signed_in: Arc<OnceLock<HeaderValue>>,
     /// The wrong passwords of all clients.
     wrong: Arc<Mutex<WrongPasswords>>,
+    /// The passwords that are being checked, and those that wait for their check.
+    checks: Arc<Semaphore>,
 }
 
 impl RemoteAccess {
@@ -66,6 +69,7 @@ impl RemoteAccess {
             security,
             signed_in: Arc::default(),
             wrong: Arc::default(),
+            checks: Arc::new(Semaphore::new(MOST_CONNECTIONS)),
         }
     }
 
@@ -77,18 +81,21 @@ impl RemoteAccess {
         }
     }
 
-    /// Returns the number of an attempt to sign in.
+    /// Returns the number of an attempt to sign in, and its place among the checks.
     ///
     /// # Errors
-    /// The client has sent too many wrong passwords, or passwords that are being checked.
-    fn attempt(&self, client: IpAddr) -> Result<u64, HttpRefusal> {
+    /// The client has sent too many wrong passwords, or passwords that are being checked, or too
+    /// many passwords of all clients are being checked.
+    fn attempt(&self, client: IpAddr) -> Result<(u64, OwnedSemaphorePermit), HttpRefusal> {
+        let busy = |why| HttpRefusal::new(StatusCode::SERVICE_UNAVAILABLE, "busy", why);
+        let place = Arc::clone(&self.checks).try_acquire_owned();
+        let place = place.map_err(|_full| busy("many passwords are being checked; ask again"))?;
         let decided = self.wrong().begin(client, Instant::now());
         match decided {
-            PasswordCheck::Check(number) => Ok(number),
+            PasswordCheck::Check(number) => Ok((number, place)),
             PasswordCheck::Busy => {
                 let why = "other passwords of this client are being checked; ask again";
-                let status = StatusCode::SERVICE_UNAVAILABLE;
-                Err(HttpRefusal::new(status, "busy", why))
+                Err(busy(why))
             }
             PasswordCheck::Locked => {
                 self.security.refused(client, PasswordRefusal::TooMany);
@@ -143,11 +150,20 @@ impl ServedSite {
         };
         let user = basic_user(request).ok_or_else(refused)?;
         let writes = self.writes.as_ref().ok_or_else(refused)?;
-        let attempt = remote.attempt(client)?;
-        let is_right = (writes.may_read)(Some(user)).await;
-        remote.wrong().end(attempt, is_right);
-        if !is_right {
-            remote.security.refused(client, PasswordRefusal::Wrong);
+        let (attempt, place) = remote.attempt(client)?;
+        let (checked, may_read) = (remote.clone(), Arc::clone(&writes.may_read));
+        // In a task of its own: a wrong password counts too if the client closes the connection
+        // during the check.
+        let check = tokio::spawn(async move {
+            let _place = place;
+            let is_right = may_read(Some(user)).await;
+            checked.wrong().end(attempt, is_right);
+            if !is_right {
+                checked.security.refused(client, PasswordRefusal::Wrong);
+            }
+            is_right
+        });
+        if !check.await.map_err(|error| failed(&error))? {
             return Err(refused());
         }
         if let Some(given) = given {

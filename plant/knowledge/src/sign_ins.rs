@@ -20,7 +20,8 @@ struct PasswordAttempt {
     number: u64,
     at: Instant,
     client: IpAddr,
-    /// Whether the password was wrong. Otherwise it is being checked, or its request was dropped.
+    /// Whether the password was wrong. It is false during the check, and after a check that did not
+    /// end, such as one that panicked.
     is_wrong: bool,
 }
 
@@ -175,7 +176,7 @@ mod tests {
         };
         wrong.end(number, false);
         assert_eq!(wrong.begin(client, start), PasswordCheck::Locked);
-        // The attempt of a dropped request ends by itself.
+        // An attempt whose check does not end is removed after a minute.
         assert!(try_one(&mut wrong, client, start + LOCKED_FOR, false));
     }
 

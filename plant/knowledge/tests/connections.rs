@@ -114,6 +114,45 @@ async fn many_connections_of_a_user_at_the_same_time_are_not_wrong_passwords() {
     assert_eq!(counts, [0, 0]);
 }
 
+#[tokio::test]
+async fn a_wrong_password_counts_if_its_client_leaves_during_the_check() {
+    let (begun, go) = (Arc::new(Semaphore::new(0)), Arc::new(Semaphore::new(0)));
+    let (begins, wait) = (Arc::clone(&begun), Arc::clone(&go));
+    let security = Arc::new(Clear::default());
+    let users = Writes {
+        may_read: Arc::new(move |_user| {
+            let (begins, wait) = (Arc::clone(&begins), Arc::clone(&wait));
+            Box::pin(async move {
+                begins.add_permits(1);
+                wait.acquire().await.unwrap().forget();
+                false
+            })
+        }),
+        ..writes(false)
+    };
+    let of_clear = Arc::clone(&security) as Arc<dyn ConnectionSecurity>;
+    let endpoint = secured_site(users, of_clear).await;
+    let at = endpoint.address();
+    for number in 1..=20 {
+        let mut stream = TcpStream::connect(at).await.unwrap();
+        let asked = ask(EVE, "close");
+        stream.write_all(asked.as_bytes()).await.unwrap();
+        begun.acquire().await.unwrap().forget();
+        // The server closes its side when it has noticed that the client leaves.
+        stream.shutdown().await.unwrap();
+        assert_eq!(stream.read_to_end(&mut Vec::new()).await.unwrap(), 0);
+        go.add_permits(1);
+        let counted = async {
+            while security.wrong.load(Ordering::Relaxed) < number {
+                tokio::task::yield_now().await;
+            }
+        };
+        let counted = tokio::time::timeout(Duration::from_secs(20), counted).await;
+        assert!(counted.is_ok(), "attempt {number} is not counted");
+    }
+    assert_eq!(send(at, ask(EVE, "close")).await.status, 429);
+}
+
 /// A security whose handshakes do not end.
 struct Endless;
 
