@@ -50,7 +50,7 @@ pub(crate) struct JobRun {
     run: String,
     pub(crate) outcome: String,
     pub(crate) reason: Option<String>,
-    /// The needs for whose skills the run waits.
+    /// The reason for which the run waits: missing skills, or a component that another run uses.
     pub(crate) waits_for: Option<String>,
     plans: Vec<Planned>,
 }

@@ -27,7 +27,7 @@ pub(super) struct ReportedRun {
     pub(super) reason: Option<String>,
     /// The number of plans.
     pub(super) plans: usize,
-    /// What the process waited for while the gripper was unplugged.
+    /// The reason for which the process waited while the gripper was unplugged.
     pub(super) waited_for: Option<String>,
     pub(super) lasted_ms: f64,
     /// The runs of skills, in the order in which they began.
@@ -76,7 +76,7 @@ impl ReportedRun {
         (grips.iter().filter(|right| **right).count(), grips.len())
     }
 
-    /// Returns what is wrong with the run; `None` if each step was done by the right component.
+    /// Returns the fault of the run; `None` if each step was done by the right component.
     pub(super) fn fault(&self) -> Option<String> {
         if self.outcome != "done" {
             let why = self.reason.clone().unwrap_or_default();

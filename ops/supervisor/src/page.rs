@@ -241,7 +241,8 @@ impl Page {
     }
 }
 
-/// Reads paths of programs, all at the same time: one that does not respond delays no other.
+/// Reads paths of programs, all at the same time. A program that does not respond does not delay
+/// the reading of the others.
 async fn read_all(requests: Vec<(&StatusUrl, Uri)>) -> Vec<Result<Value, FetchFault>> {
     let requests = requests.into_iter().map(|(url, path)| url.get(path));
     futures_util::future::join_all(requests).await

@@ -200,8 +200,8 @@ async fn secured(
     }
 }
 
-/// Serves a connection. At the age of [`CONNECTION_TIME`] its last request is the one that is being
-/// answered, which has [`LAST_REQUEST`].
+/// Serves a connection. At the age of [`CONNECTION_TIME`] it takes no more requests; the request
+/// that is being answered then has [`LAST_REQUEST`] to end.
 async fn serve<S>(stream: S, peer: IpAddr, site: ServedSite)
 where
     S: AsyncRead + AsyncWrite + Send + Unpin,

@@ -45,7 +45,7 @@ pub struct QueryLimits {
     /// Maximum size of a query in bytes.
     pub query: usize,
     /// Maximum growth of the program in bytes while queries run, of all of them together. The
-    /// memory of a query alone is not known: the growth has that of all other work, too.
+    /// memory of a query alone is not known: the growth includes that of all other work.
     pub memory: u64,
 }
 

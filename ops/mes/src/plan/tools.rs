@@ -525,8 +525,7 @@ impl PossibleTools {
     }
 
     /// Returns whether, in each case, an earlier step has attached a tool to a tool changer for
-    /// which
-    /// `moves` returns true.
+    /// which `moves` returns true.
     pub(super) fn are_carried(&self, user: &ToolUser<'_>, moves: &dyn Fn(&str) -> bool) -> bool {
         self.are_all(|case| {
             let mut attached = case.attached.iter();

@@ -200,8 +200,8 @@ impl MesSources {
         {
             let namespace = missing.namespace.clone();
             let source = KnowledgeSource::new(SourceKind::NodeSet, &namespace);
-            // A NodeSet that only the YAML required is not in the journal: added ones need it
-            // there.
+            // A NodeSet that only the YAML required is not in the journal. If an added NodeSet
+            // requires it, it has to be in the journal too.
             let kept = kept.remove(&namespace);
             let kept =
                 kept.filter(|kept| kept.lasting == missing.lasting && self.is_known(&source));

@@ -96,7 +96,7 @@ fn a_server_registers_again_soon_with_a_discovery_server_that_did_not_describe_i
         telling.registered(Ok(Done::Registered(registrar)));
         (telling.register_at - Instant::now()).as_secs()
     };
-    // Each wait has a share of up to itself. The last one is that of a described server.
+    // Each wait is extended by up to its own length. The last wait is that of a described server.
     let waits: Vec<u64> = (0..4).map(|_| wait(None)).collect();
     let every = MOST_UNHEARD.as_secs() - 1;
     assert!(waits[0] < 2 && waits[1] < 4 && waits[2] < 8, "{waits:?}");

@@ -150,7 +150,7 @@ fn show(server: &OpcUaServer, of: &Instance, path: &str, value: impl Into<Varian
     }
 }
 
-/// Shows that no value has the data of a node.
+/// Shows the status BadNotSupported for a node whose data the robot does not provide.
 fn show_unsupported(server: &OpcUaServer, of: &Instance, path: &str) {
     let unknown = DataValue {
         status: Some(StatusCode::BadNotSupported),
