@@ -23,6 +23,8 @@ pub(super) struct ValueForms {
     /// Whether the present value is in the form of version 1.05, which has UaType.
     is_current: bool,
     is_nonstandard: bool,
+    /// The number of Variants and DataValues around the present value.
+    depth: usize,
 }
 
 impl ValueForms {
@@ -47,15 +49,15 @@ impl ValueForms {
         let has_members = is_structure || described == Some(BuiltinType::DataValue);
         let rank = field.map_or(SCALAR, |field| field.value_rank);
         if let Some(whole) = json.as_object() {
-            let converted = if let Some(typed) = self.typed(whole, is_structure, rank) {
+            let converted = if let Some(typed) = self.typed(whole, rank) {
                 Some(typed?)
-            } else if has_members {
+            } else if has_members || !is_data_value(whole) {
                 None
             } else if let Some(value) = whole.get("Value") {
                 // A DataValue of version 1.04, or one without the type that the metadata has.
-                Some(self.field(value, field)?)
+                Some(self.nested(|forms| forms.field(value, field))?)
             } else {
-                is_data_value_without_value(whole).then(JsonFieldValue::default)
+                Some(JsonFieldValue::default())
             };
             if let Some(value) = converted {
                 let status = self.status_of(whole)?;
@@ -86,21 +88,30 @@ impl ValueForms {
         })
     }
 
+    /// Converts a value within another one. Each level copies the value, so their number is
+    /// limited.
+    fn nested<T>(&mut self, convert: impl FnOnce(&mut Self) -> Converted<T>) -> Converted<T> {
+        if self.depth >= MAX_DEPTH {
+            return Err("wrong_json_value");
+        }
+        self.depth += 1;
+        let converted = convert(self);
+        self.depth -= 1;
+        converted
+    }
+
     /// Converts a Variant or DataValue with its type: UaType and Value, or Type and Body. Returns
-    /// `None` for other objects. A structure may have fields with the names of version 1.04.
+    /// `None` for other objects. Only the compact form of version 1.05 leaves out a default value,
+    /// so an object with a Type and no Body is something else.
     fn typed(
         &mut self,
         whole: &Map<String, Value>,
-        is_structure: bool,
         rank: i32,
     ) -> Option<Converted<JsonFieldValue>> {
         let (kind, value, is_current) = match whole.get("UaType") {
             Some(kind) => (kind, whole.get("Value"), true),
-            None => (whole.get("Type")?, whole.get("Body"), false),
+            None => (whole.get("Type")?, Some(whole.get("Body")?), false),
         };
-        if is_structure && !is_current && value.is_none() {
-            return None;
-        }
         let before = std::mem::replace(&mut self.is_current, is_current);
         let converted = self.variant(kind, value, whole, rank);
         self.is_current = before;
@@ -137,16 +148,17 @@ impl ValueForms {
                 .iter()
                 .map(|element| self.scalar(builtin, element))
                 .collect::<Converted<Value>>()?,
+            // A Variant directly in a Variant has no encoding.
+            Some(_) if builtin == BuiltinType::Variant => return Err("wrong_json_value"),
             Some(value) => self.scalar(builtin, value)?,
         };
         self.is_nonstandard |= whole.contains_key("UaDimensions");
         let dimensions = ["Dimensions", "UaDimensions"]
             .iter()
             .find_map(|key| whole.get(*key));
-        let dimensions = dimensions.and_then(Value::as_array).map(|list| {
-            let number = |of: &Value| of.as_u64().and_then(|of| u32::try_from(of).ok());
-            list.iter().filter_map(number).collect::<Vec<u32>>()
-        });
+        let dimensions = dimensions.filter(|of| !of.is_null());
+        let dimensions = dimensions.map(|of| dimensions_of(of).ok_or("malformed_json"));
+        let dimensions = dimensions.transpose()?;
         Ok(JsonFieldValue {
             ua_type: Some(kind),
             value: Some(converted),
@@ -212,8 +224,8 @@ impl ValueForms {
             }
             (BuiltinType::LocalizedText, _) => json.clone(),
             (BuiltinType::ExtensionObject, _) => self.structure(json, None)?,
-            (BuiltinType::DataValue, _) => object(&self.data_value(json)?),
-            (BuiltinType::Variant, _) => object(&self.field(json, None)?),
+            (BuiltinType::DataValue, _) => object(self.nested(|forms| forms.data_value(json))?),
+            (BuiltinType::Variant, _) => object(self.nested(|forms| forms.field(json, None))?),
             (BuiltinType::DiagnosticInfo, _) => diagnostic_info(json),
         })
     }
@@ -221,10 +233,11 @@ impl ValueForms {
     /// Converts a DataValue: flat in version 1.05, with a Variant as Value in version 1.04.
     fn data_value(&mut self, json: &Value) -> Converted<JsonFieldValue> {
         let whole = json.as_object().ok_or("wrong_json_value")?;
-        let value = match self.typed(whole, false, SCALAR) {
+        let value = match self.typed(whole, SCALAR) {
             Some(typed) => typed?,
+            None if !whole.is_empty() && !is_data_value(whole) => return Err("wrong_json_value"),
             None => match whole.get("Value") {
-                Some(value) => self.field(value, None)?,
+                Some(value) => self.nested(|forms| forms.field(value, None))?,
                 None => JsonFieldValue::default(),
             },
         };
@@ -315,10 +328,17 @@ impl ValueForms {
     }
 }
 
-/// Returns whether an object is a DataValue that has a status or times, but no value.
-fn is_data_value_without_value(whole: &Map<String, Value>) -> bool {
-    let known = |key: &String| DATA_VALUE_KEYS.contains(&key.as_str());
+/// Returns whether an object without a type is a DataValue: it has a value, a status or times, and
+/// nothing else.
+fn is_data_value(whole: &Map<String, Value>) -> bool {
+    let known = |key: &String| key == "Value" || DATA_VALUE_KEYS.contains(&key.as_str());
     !whole.is_empty() && whole.keys().all(known)
+}
+
+/// Reads the dimensions of a matrix; `None` if one is no UInt32.
+fn dimensions_of(json: &Value) -> Option<Vec<u32>> {
+    let number = |of: &Value| of.as_u64().and_then(|of| u32::try_from(of).ok());
+    json.as_array()?.iter().map(number).collect()
 }
 
 /// Returns a time within the range of the binary encoding: earlier times are null, later times are
@@ -337,14 +357,22 @@ fn status(json: &Value) -> Value {
     status_number(json).map_or_else(|| json.clone(), |number| json!({ "Code": number }))
 }
 
-fn status_number(json: &Value) -> Option<u32> {
-    let number = match json.as_object() {
-        Some(whole) => whole.get("Code").unwrap_or(&Value::Null),
-        None => json,
+/// Reads a StatusCode: a number, or an object with a Code. Good is null or an empty object too, or
+/// has its Symbol alone.
+pub(super) fn status_number(json: &Value) -> Option<u32> {
+    let number = match json {
+        Value::Null => return Some(0),
+        Value::Object(whole) => match whole.get("Code") {
+            Some(code) => code,
+            None => {
+                let is_good = whole
+                    .iter()
+                    .all(|(key, of)| key == "Symbol" && of == "Good");
+                return is_good.then_some(0);
+            }
+        },
+        _ => json,
     };
-    if number.is_null() {
-        return Some(0);
-    }
     u32::try_from(number.as_u64()?).ok()
 }
 
@@ -395,12 +423,20 @@ fn default_of(builtin: BuiltinType) -> Value {
     }
 }
 
-/// Converts a shape to JSON. It has text keys only, so this does not fail.
-fn object(shape: &JsonFieldValue) -> Value {
-    serde_json::to_value(shape).unwrap_or_default()
+/// Converts a shape to JSON, without a copy of its value. It has text keys only, so this does not
+/// fail.
+fn object(mut shape: JsonFieldValue) -> Value {
+    let value = shape.value.take();
+    let mut json = serde_json::to_value(shape).unwrap_or_default();
+    if let (Some(value), Some(whole)) = (value, json.as_object_mut()) {
+        whole.insert("Value".to_owned(), value);
+    }
+    json
 }
 
 const SCALAR: i32 = -1;
+/// The most Variants and DataValues around a value.
+const MAX_DEPTH: usize = 8;
 /// 9999-12-31T23:59:59Z, from which on a time is the greatest value.
 const LATEST: DateTime = DateTime(2_650_467_743_990_000_000);
 /// The keys of a DataValue of both versions, without the value.

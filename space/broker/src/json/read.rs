@@ -8,7 +8,7 @@ use uadp::{
     PublisherId, StatusCode, Variant,
 };
 
-use super::forms::ValueForms;
+use super::forms::{ValueForms, status_number};
 use super::{Json, WriterIds};
 use crate::topics::Address;
 
@@ -138,11 +138,13 @@ impl Json {
             .get("MetaDataVersion")
             .and_then(|of| of.get("MajorVersion"));
         let version = version.and_then(Value::as_u64);
+        let status = header.get("Status");
+        let status = status.map(|of| status_number(of).ok_or("wrong_json_value"));
         let data_set_header = DataSetHeader {
             // The number is a UInt32 in JSON, and counts on.
             sequence_number: sequence.map(low_word),
             timestamp: taken,
-            status: header.get("Status").and_then(code).map(high_word),
+            status: status.transpose()?.map(high_word),
             major_version: version.and_then(|version| u32::try_from(version).ok()),
             ..DataSetHeader::default()
         };
@@ -323,18 +325,6 @@ fn number(json: &Value) -> Option<u16> {
         Some(text) => text.parse().ok(),
         None => u16::try_from(json.as_u64()?).ok(),
     }
-}
-
-/// Reads a StatusCode: a number or an object with a Code. An object without Code is Good.
-fn code(json: &Value) -> Option<u32> {
-    let number = match json.as_object() {
-        Some(whole) => match whole.get("Code") {
-            Some(code) => code,
-            None => return Some(0),
-        },
-        None => json,
-    };
-    u32::try_from(number.as_u64()?).ok()
 }
 
 /// Returns the time of sending with which a MessageId of this project begins.

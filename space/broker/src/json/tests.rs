@@ -307,6 +307,18 @@ fn faulty_messages_are_refused_with_their_fault() {
             json!({"Payload": {"zone": {"UaType": 99, "Value": 1}}}),
             "wrong_json_value",
         ),
+        (
+            json!({"Status": "BadTimeout", "Payload": {"zone": 1}}),
+            "wrong_json_value",
+        ),
+        (
+            json!({"Status": {"code": 2_147_483_648_u32}, "Payload": {"zone": 1}}),
+            "wrong_json_value",
+        ),
+        (
+            json!({"Status": "2147483648", "Payload": {"zone": 1}}),
+            "wrong_json_value",
+        ),
     ] {
         assert_eq!(read(&mut known, &text), Err(fault), "{text}");
     }

@@ -139,6 +139,69 @@ fn status_codes_are_objects_or_numbers() {
 }
 
 #[test]
+fn a_status_is_good_only_if_it_says_so() {
+    for (json, number) in [
+        (json!(null), Some(0)),
+        (json!({}), Some(0)),
+        (json!({"Symbol": "Good"}), Some(0)),
+        (json!({"Code": 0, "Symbol": "Good"}), Some(0)),
+        (json!({"Symbol": "BadDeviceFailure"}), None),
+        (json!({"Symbol": "Good", "code": 2_147_483_648_u32}), None),
+        (json!({"code": 2_147_483_648_u32}), None),
+        (json!({"Code": null}), None),
+        (json!({"Code": "0"}), None),
+        (json!("BadTimeout"), None),
+        (json!("2148139008"), None),
+        (json!(-1), None),
+    ] {
+        assert_eq!(status_number(&json), number, "{json}");
+    }
+    for wrong in [
+        json!({"UaType": 19, "Value": {"Symbol": "BadDeviceFailure"}}),
+        json!({"Value": true, "Status": {"code": 2_147_483_648_u32}}),
+    ] {
+        assert_eq!(read(&wrong, None), Err("wrong_json_value"), "{wrong}");
+    }
+}
+
+#[test]
+fn objects_with_other_keys_are_no_variants_and_no_data_values() {
+    let variant = described(BuiltinType::Variant, 24, SCALAR);
+    for json in [
+        json!({"Type": 1, "Name": "x"}),
+        json!({"Type": 1}),
+        json!({"Value": true, "Unit": "mm"}),
+    ] {
+        for field in [None, Some(&variant)] {
+            assert_eq!(read(&json, field), Err("undescribed_json"), "{json}");
+        }
+        let truth = described(BuiltinType::Boolean, 1, SCALAR);
+        let read = read(&json, Some(&truth));
+        assert_eq!(read, Err("wrong_json_value"), "{json}");
+    }
+    let times = json!({"Value": true, "ServerTimestamp": "2026-01-02T03:04:05Z"});
+    let wanted = json!({"UaType": 1, "Value": true});
+    assert_eq!(read(&times, None), Ok((wanted, None)));
+    let other = json!({"UaType": 23, "Value": [{"Value": true, "Unit": "mm"}]});
+    assert_eq!(read(&other, None), Err("wrong_json_value"));
+}
+
+#[test]
+fn values_may_be_nested_in_few_levels_only() {
+    let nested = |levels: usize| {
+        let inner = json!({"UaType": 1, "Value": true});
+        (0..levels).fold(inner, |of, _| json!({"UaType": 24, "Value": [of]}))
+    };
+    assert!(read(&nested(MAX_DEPTH), None).is_ok());
+    let deeper = read(&nested(MAX_DEPTH + 1), None);
+    assert_eq!(deeper, Err("wrong_json_value"));
+    let data_values = (0..=MAX_DEPTH).fold(json!(true), |of, _| json!({ "Value": of }));
+    assert_eq!(read(&data_values, None), Err("wrong_json_value"));
+    let direct = json!({"UaType": 24, "Value": {"UaType": 1, "Value": true}});
+    assert_eq!(read(&direct, None), Err("wrong_json_value"));
+}
+
+#[test]
 fn times_beyond_the_range_of_the_binary_encoding_are_its_limits() {
     let latest = iso_time::of_date_time(DateTime(i64::MAX));
     for (text, wanted) in [
@@ -278,6 +341,17 @@ fn a_matrix_has_its_dimensions_under_either_key() {
         json!({"UaType": 6, "Value": [1, 2, 3, 4], "UaDimensions": [2, 2]}),
         wanted,
     )]);
+    for dimensions in [
+        json!([2, -1, 2]),
+        json!([4, "x"]),
+        json!([2, 2.5]),
+        json!([2, 4_294_967_296_u64]),
+        json!(4),
+        json!({}),
+    ] {
+        let json = json!({"UaType": 6, "Value": [1, 2, 3, 4], "Dimensions": dimensions});
+        assert_eq!(read(&json, None), Err("malformed_json"), "{json}");
+    }
 }
 
 #[test]
