@@ -326,7 +326,9 @@ impl Execution<'_> {
                 let all = all.chain(progress.done.iter().filter_map(|done| done.undo.as_ref()));
                 let components = all.map(|offer| offer.component.clone());
                 let mut components: BTreeSet<String> = components.collect();
-                components.extend(tools::used_by_steps(&evaluated.process, progress, &chosen));
+                let used_by_steps = (&chosen, self.plant);
+                let tools = tools::used_by_steps(&evaluated.process, progress, used_by_steps);
+                components.extend(tools);
                 let other = components
                     .iter()
                     .find_map(|one| Some((one, used.get(one)?)));

@@ -423,15 +423,18 @@ impl Driver for Change {
         let opened = ConnectedMover::open(&changer.mover, &changer.peers, &targets, found, &work);
         let mover = opened.await?;
         let moved = self.moved(&mover, &mut look, (put, wanted), &work).await;
-        mover.close().await;
         match moved {
             Ok(locked) => {
-                if let Some(tool) = wanted {
-                    self.await_ready(tool, locked, &work).await?;
-                }
+                let ready = match wanted {
+                    Some(tool) => self.await_ready(tool, locked, &work).await,
+                    None => Ok(()),
+                };
+                mover.close().await;
+                ready?;
                 Ok(attached_tool(wanted))
             }
             Err(why) => {
+                mover.close().await;
                 let now = look.steady().await;
                 self.changer.show(now.as_ref().ok().copied());
                 let error = KelvinError::After {

@@ -309,7 +309,13 @@ impl Execution<'_> {
                 let done: Vec<Done> = progress.current().cloned().collect();
                 preparing.push(async move {
                     let done: Vec<&Done> = done.iter().collect();
-                    let values = self.prepared(step, offer, &done).await;
+                    let values = match self.prepared(step, offer, &done).await {
+                        Ok(values) => {
+                            let released = self.release_movers(offer, (chosen, skills)).await;
+                            released.map(|()| values)
+                        }
+                        Err(end) => Err(end),
+                    };
                     (number, (step, offer, skill), values)
                 });
             }
@@ -330,7 +336,6 @@ impl Execution<'_> {
                         running.push(async move {
                             self.teller.step("Step").await;
                             let tool = tools::named(&values);
-                            self.release_movers(offer, (chosen, skills)).await;
                             let end = self.one(step, (offer, &**skill), values).await;
                             (number, (offer, tool), end)
                         });

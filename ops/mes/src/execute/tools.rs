@@ -4,7 +4,6 @@ use std::collections::BTreeSet;
 use std::sync::Arc;
 
 use skills::{RunnableSkill, SkillValue};
-use tracing::warn;
 
 use super::sequence::{RunProgress, StepEnd};
 use super::{Chosen, Execution, Offer, Plant, Process, ProcessStep, SkillRole};
@@ -47,48 +46,68 @@ fn literal(step: &ProcessStep) -> Option<&str> {
 
 /// Returns the tools that the steps that are left attach or detach, and the tools of the changers
 /// that do so: another run must not use them meanwhile.
+///
+/// The robots that carry the changers are among them: a changer moves its robot.
 pub(super) fn used_by_steps(
     process: &Process,
     progress: &RunProgress,
-    chosen: &Chosen,
+    (chosen, plant): (&Chosen, &dyn Plant),
 ) -> BTreeSet<String> {
     let offers = chosen.open.iter().map(|(_, offer)| offer);
     let offers = offers.chain(chosen.undo.values());
-    let at = offers
-        .filter(|offer| ToolWork::of(offer).is_some())
-        .filter_map(|offer| progress.tools.at(&offer.component));
+    let changers = || {
+        let changers = offers.clone();
+        changers.filter(|offer| ToolWork::of(offer).is_some())
+    };
+    let at = changers().filter_map(|offer| progress.tools.at(&offer.component));
+    let movers = changers().flat_map(|changer| movers(plant, changer));
     let passed = progress.passed_or_ruled_out(process);
     let steps = process.steps.iter().enumerate();
     let left = steps
         .filter(|(number, _)| !progress.is_over(*number) && !passed.contains(number))
         .flat_map(|(_, step)| std::iter::once(step).chain(step.compensation.as_deref()));
     let named = left.filter_map(literal);
-    at.chain(named).map(str::to_owned).collect()
+    let tools = at.chain(named).map(str::to_owned);
+    tools.chain(movers).collect()
 }
 
 impl Execution<'_> {
-    /// Ends the leases of the robot that carries the tool changer of a step: the changer moves it.
+    /// Ends the leases on the robot that carries the tool changer of a step, because the changer
+    /// moves this robot.
+    ///
+    /// # Errors
+    /// The end of the step, which must not begin: it was stopped, or the end of a lease is not
+    /// confirmed.
     pub(super) async fn release_movers(
         &self,
         changer: &Offer,
         (chosen, skills): (&Chosen, &[Arc<dyn RunnableSkill>]),
-    ) {
+    ) -> Result<(), StepEnd> {
         if ToolWork::of(changer).is_none() {
-            return;
+            return Ok(());
         }
         let mut released = BTreeSet::new();
         for ((_, offer), skill) in chosen.open.iter().zip(skills) {
             if !is_mover(self.plant, offer, changer) || !released.insert(&offer.component) {
                 continue;
             }
-            if let Err(fault) = skill.release().await {
-                warn!(
-                    robot = offer.component,
-                    "cannot end the lease of a robot: {fault}"
-                );
-            }
+            let released = self.unless_stopped(skill.release()).await;
+            let released = released.map_err(StepEnd::Stopped)?;
+            released.map_err(|fault| {
+                let (changer, robot) = (&changer.component_name, &offer.component_name);
+                let why = "which has to move it, because the end of its lease is not confirmed";
+                StepEnd::Failed(format!("{robot} is not left to {changer}, {why}: {fault}"))
+            })?;
         }
+        Ok(())
     }
+}
+
+/// Returns the components that move the tool changer of an offer.
+fn movers(plant: &dyn Plant, changer: &Offer) -> BTreeSet<String> {
+    let offers = plant.offers().into_iter();
+    let movers = offers.filter(|of| is_mover(plant, of, changer));
+    movers.map(|of| of.component).collect()
 }
 
 /// Returns whether the component of an offer moves the tool changer of another.
@@ -114,9 +133,7 @@ impl Chosen {
             uses.extend(tools.at(&offer.component).map(str::to_owned));
             let step = self.steps.get(number);
             uses.extend(step.and_then(literal).map(str::to_owned));
-            let open = self.open.iter().map(|(_, of)| of);
-            let movers = open.filter(|of| is_mover(plant, of, offer));
-            uses.extend(movers.map(|of| of.component.clone()));
+            uses.extend(movers(plant, offer));
         }
         uses
     }

@@ -60,12 +60,18 @@ impl ConnectedMover {
         client: &SkillClient,
     ) -> Result<(Arc<dyn RunnableSkill>, Arc<dyn RunnableSkill>), SkillFault> {
         let mut both: Vec<Arc<dyn RunnableSkill>> = Vec::new();
+        // The robot is locked before the tool loses its supply, so that no other client moves it in
+        // the middle of a change.
         for of in ["PtpMoveSkillType", "LinearMoveSkillType"] {
             let found = client.skills_of(&ParameterType::own(of)).await?;
             let first = found
                 .first()
                 .ok_or_else(|| SkillFault::Unexpected(format!("it has no {of}")))?;
-            both.push(Arc::new(client.handle(first)));
+            let skill = client.handle(first);
+            if both.is_empty() {
+                skill.lock("tool change").await?;
+            }
+            both.push(Arc::new(skill));
         }
         let both: [Arc<dyn RunnableSkill>; 2] = both
             .try_into()

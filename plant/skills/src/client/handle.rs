@@ -118,7 +118,7 @@ impl SkillHandle {
     /// # Errors
     /// BadLocked if another owner holds the lease, or no response.
     pub async fn lock(&self, what_for: &str) -> Result<bool, SkillFault> {
-        let Some((object, method)) = self.of_lock("InitLock").await else {
+        let Some((object, method)) = self.of_lock("InitLock").await? else {
             return Ok(false);
         };
         let context = Variant::String(UAString::from(what_for));
@@ -134,16 +134,28 @@ impl SkillHandle {
         }
     }
 
-    /// Returns the lock of the component, and one of its methods.
-    async fn of_lock(&self, method: &str) -> Option<(NodeId, NodeId)> {
-        let index = self.client.namespace(DEVICES)?;
+    /// Returns the lock of the component, and one of its methods; `None` if it has none.
+    ///
+    /// # Errors
+    /// No response.
+    async fn of_lock(&self, method: &str) -> Result<Option<(NodeId, NodeId)>, SkillFault> {
+        let Some(index) = self.client.namespace(DEVICES) else {
+            return Ok(None);
+        };
         let name = |name: &str| QualifiedName::new(index, name);
         let component = &self.found.nodes.component;
         let path = [name("Lock")];
         let below = [name("Lock"), name(method)];
-        let object = self.client.translate(component, &path).await.ok()?;
-        let method = self.client.translate(component, &below).await.ok()?;
-        Some((object, method))
+        let mut nodes = Vec::new();
+        for path in [&path[..], &below] {
+            match self.client.translate(component, path).await {
+                Ok(node) => nodes.push(node),
+                Err(ClientError::Status(StatusCode::BadNoMatch)) => return Ok(None),
+                Err(error) => return Err(lost(&error)),
+            }
+        }
+        let mut nodes = nodes.into_iter();
+        Ok(nodes.next().zip(nodes.next()))
     }
 
     /// Switches the component off after a delay (`PowerOffDevice`). Returns whether the component
@@ -631,12 +643,16 @@ impl RunnableSkill for SkillHandle {
         if !self.lock("").await? {
             return Ok(());
         }
-        let Some((object, method)) = self.of_lock("ExitLock").await else {
+        let Some((object, method)) = self.of_lock("ExitLock").await? else {
             return Ok(());
         };
         let answer = self.client.call(&object, &method, Vec::new()).await;
         let what = format!("ExitLock of {}", self.found.component);
-        answer.map(drop).map_err(|error| called(&error, &what))
+        match answer.as_deref() {
+            Ok([Variant::Int32(0), ..]) => Ok(()),
+            Ok(_) => Err(refused(StatusCode::BadLocked, &what)),
+            Err(error) => Err(called(error, &what)),
+        }
     }
 
     async fn lost(&self) -> String {

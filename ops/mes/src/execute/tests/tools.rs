@@ -373,6 +373,25 @@ async fn a_tool_that_another_run_uses_is_waited_for() {
 }
 
 #[tokio::test]
+async fn a_robot_that_carries_a_changer_is_waited_for_while_another_run_uses_it() {
+    let mut fakes = changing();
+    let arm = "urn:example:arm";
+    fakes.mover = Some(arm);
+    let offers = fakes.offers.get_mut().unwrap();
+    offers.push(offer("arm", "Ptp", "armType"));
+    let leases = fakes.leases.get_mut().unwrap();
+    leases.insert(arm.to_owned(), "another run".to_owned());
+    // No step of the process uses the robot itself.
+    let process = sequence(vec![attach(1, "attach", GRIPPER)]);
+    let (run, fakes, _) = executed(fakes, &process).await;
+    assert_eq!(run.outcome, How::Failed);
+    let reason = run.reason.unwrap();
+    let expected = "the run another run uses urn:example:arm";
+    assert!(reason.contains(expected), "{reason}");
+    assert_eq!(ran(&fakes), Vec::<String>::new());
+}
+
+#[tokio::test]
 async fn a_changer_has_its_robot_alone_once_the_robot_has_ended_its_step() {
     for (mover, expected) in [
         (
