@@ -393,10 +393,16 @@ fn what_was_asked_of_a_program_before_it_was_started_anew_is_not_executed_again(
 
 #[test]
 fn a_request_that_waited_for_a_stopped_program_is_executed_only_while_its_caller_waits() {
-    for (stopped, executions) in [(1_000, 1), (4_000, 0)] {
+    // A caller also gives up an executor that is silent for `receive_timeout`, 3 s.
+    for (timeout, stopped, executions) in [
+        (3_000, 1_000, 1),
+        (3_000, 4_000, 0),
+        (10_000, 1_000, 1),
+        (10_000, 5_000, 0),
+    ] {
         let mut cell = plugged_in();
         cell.stop(GRIPPER);
-        cell.ask(BRIDGE, AskId(1), (start(), &large(1)), ms(3_000));
+        cell.ask(BRIDGE, AskId(1), (start(), &large(1)), ms(timeout));
         cell.run(ms(stopped));
         cell.resume(GRIPPER);
         cell.run(ms(1_000));

@@ -116,6 +116,7 @@ impl TopicQueues {
         now: Now,
     ) -> Result<AcceptedMessage, Reason> {
         let own = self.settings.own;
+        let waited = self.waited(now);
         let Some(Topic {
             role: TopicSide::Theirs(reader),
             confirming: Some(confirming),
@@ -133,7 +134,9 @@ impl TopicQueues {
         let mark = Mark { sequence, stamp };
         let reason = match admitted {
             Ok(admitted) => {
-                reader.receipt = Some(Receipt::new(mark, now.monotonic));
+                // The time of the sender goes on while the message waits for this program.
+                let since = now.monotonic.checked_sub(waited).unwrap_or(now.monotonic);
+                reader.receipt = Some(Receipt::new(mark, since));
                 return Ok(admitted);
             }
             Err(reason) => reason,

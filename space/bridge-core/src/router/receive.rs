@@ -354,6 +354,9 @@ impl TopicQueues {
         }
         if is_confirmed {
             admitted = admitted.map(|admitted| self.receive(topic, &place, admitted, now));
+            if is_withdrawn && matches!(admitted, Some(Ok(_))) {
+                admitted = Some(Err(Reason::Late));
+            }
         }
         self.take_or_count(at, message, (&place, admitted, sent), now);
     }

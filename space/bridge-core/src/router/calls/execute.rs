@@ -179,6 +179,8 @@ impl CallTraffic<'_> {
         let known = origin.group != STRANGERS;
         let group = self.values.mapping.pubsub().address;
         let waited = self.values.waited(now);
+        // A caller gives up an executor that is silent for this time.
+        let silence = self.values.mapping.pubsub().receive_timeout;
         let Some(calls) = &mut self.calls else {
             let values = &mut self.values;
             return values.count(DropSite::sender(from), Reason::NotAsked, 1, String::new);
@@ -198,7 +200,7 @@ impl CallTraffic<'_> {
             Ok(RequiredAction::Execute(id)) if !calls.is_of_this_life(request) => {
                 self.leave_to_earlier_life((topic, id), from, now);
             }
-            Ok(RequiredAction::Execute(id)) if waited >= hint(request) => {
+            Ok(RequiredAction::Execute(id)) if waited >= hint(request).min(silence) => {
                 self.leave_given_up((topic, id), (from, waited), now);
             }
             Ok(RequiredAction::Execute(id)) => {
@@ -335,6 +337,7 @@ impl CallTraffic<'_> {
         (request, read, plan): (&ActionMessage<'_>, ReadRequest, Option<Arc<ExecutedPlan>>),
         now: Now,
     ) {
+        let waited = self.values.waited(now);
         let Some(calls) = &mut self.calls else {
             return;
         };
@@ -348,7 +351,7 @@ impl CallTraffic<'_> {
                 return self.count_call(topic, None, cause, || detail);
             }
         };
-        let deadline = now.monotonic + hint(request);
+        let deadline = now.monotonic + hint(request).saturating_sub(waited);
         let start_by = match self.values.redundant {
             Some(_) => deadline.min(now.monotonic + START_WITHIN),
             None => deadline,
