@@ -34,16 +34,16 @@ use crate::carrier::{
 
 /// Folder of the files of all groups. It lies in memory, and services with a private /tmp see it.
 const FOLDER: &str = "/dev/shm/ua-bridge";
-/// Messages that wait for a receiver. Further ones are dropped for this receiver.
-const WAITING: usize = 512;
-/// Messages of a sender that receivers have not read yet. Further ones are refused.
-const UNREAD: usize = 4 * WAITING;
+/// Messages of a sender that wait for a receiver. Further ones are dropped for this receiver.
+const WAITING: usize = 128;
 /// Maximum number of programs of a group.
 const PROGRAMS: usize = 32;
-/// Size of the memory of a message at first, in bytes. It grows with the messages.
-const FIRST_SIZE: usize = 2048;
-/// The largest message in bytes.
+/// The largest message in bytes. A sender has memory for as many of them as can wait for all
+/// receivers, but only used memory is taken from the system.
 const LARGEST: usize = 65_507;
+/// Free memory in bytes below which no message is sent: a write into shared memory that the system
+/// cannot provide would end the program.
+const RESERVE: u64 = 32 << 20;
 /// Time after which the thread that waits for messages looks whether the carrier is dropped.
 const WAIT: Duration = Duration::from_millis(200);
 /// Period in which the files of programs that were killed are removed, in calls of
@@ -77,6 +77,8 @@ pub struct SharedMemory {
     notifier: Notifier<Service>,
     node: Node<Service>,
     arrivals: Arrivals,
+    /// The reason why nothing is sent.
+    lost: Option<String>,
     /// The calls of [`Carrier::follow`] until the next clean-up.
     until_cleaned: u32,
     dropped: Dropped,
@@ -154,9 +156,8 @@ impl SharedMemory {
             .map_err(|why| of.failed("listener", why))?;
         let publisher = messages
             .publisher_builder()
-            .initial_max_slice_len(FIRST_SIZE)
-            .allocation_strategy(AllocationStrategy::PowerOfTwo)
-            .override_sample_preallocation(|most| most.min(UNREAD))
+            .initial_max_slice_len(LARGEST)
+            .allocation_strategy(AllocationStrategy::Static)
             .max_loaned_samples(1)
             .backpressure_strategy(BackpressureStrategy::DiscardData)
             .set_backpressure_handler(move |_| {
@@ -177,6 +178,7 @@ impl SharedMemory {
             notifier,
             node,
             arrivals,
+            lost: scarce(),
             until_cleaned: CLEAN_UP,
             dropped: Dropped {
                 discarded,
@@ -188,6 +190,9 @@ impl SharedMemory {
     fn put(&self, bytes: &[u8]) -> Result<(), SendError> {
         if bytes.len() > LARGEST {
             return Err(SendError::TooBig);
+        }
+        if self.lost.is_some() {
+            return Err(SendError::Unreachable);
         }
         let memory = self.publisher.loan_slice_uninit(bytes.len());
         let mut memory = memory.map_err(|error| match error {
@@ -245,6 +250,18 @@ impl SharedMemory {
         self.arrivals.set();
         None
     }
+}
+
+/// Returns the reason why no message may be written, if the system has hardly any shared memory left.
+fn scarce() -> Option<String> {
+    let free = rustix::fs::statvfs("/dev/shm").ok()?;
+    let bytes = free.f_bavail.saturating_mul(free.f_frsize);
+    (bytes < RESERVE).then(|| {
+        let [free, least] = [bytes, RESERVE].map(|bytes| bytes >> 20);
+        format!(
+            "/dev/shm has {free} MiB left, and {least} are needed: give it more, e.g. by --shm-size of Docker"
+        )
+    })
 }
 
 /// Returns the time of a message: nanoseconds since 1970.
@@ -318,7 +335,7 @@ impl Carrier for SharedMemory {
         self.take(buffer)
     }
 
-    /// Removes the files of programs that were killed.
+    /// Removes the files of programs that were killed, and looks whether there is memory to send.
     fn follow(&mut self) -> Option<CarrierChange> {
         self.until_cleaned = self.until_cleaned.saturating_sub(1);
         if self.until_cleaned == 0 {
@@ -331,11 +348,17 @@ impl Carrier for SharedMemory {
                 );
             }
         }
-        None
+        let was_lost = self.lost.is_some();
+        self.lost = scarce();
+        match (&self.lost, was_lost) {
+            (Some(reason), false) => Some(CarrierChange::Lost(reason.clone())),
+            (None, true) => Some(CarrierChange::Back(self.interface())),
+            _ => None,
+        }
     }
 
     fn lost(&self) -> Option<String> {
-        None
+        self.lost.clone()
     }
 
     fn source(&self) -> Option<SocketAddr> {
