@@ -426,6 +426,30 @@ impl Mqtt {
         }
     }
 
+    /// Clears the retained messages, publishes the last status, and closes the connections.
+    fn end(&mut self) {
+        let kept = self.links.kept_topics();
+        let status = self
+            .settings
+            .publisher
+            .map(|of| alone(TopicMessageType::Status, of));
+        let stays: Vec<String> = [UADP, JSON]
+            .into_iter()
+            .filter_map(|encoding| Some(topics::name(self.broker(), encoding, status?)))
+            .collect();
+        for topic in kept {
+            if !stays.contains(&topic) {
+                self.clear(topic);
+            }
+        }
+        if let Some(publisher) = self.settings.publisher
+            && let Some(last) = self.reports.last_status(publisher)
+        {
+            self.announce_status(publisher, &last);
+        }
+        self.links.close();
+    }
+
     fn take(&mut self, buffer: &mut Vec<u8>) -> Option<Received> {
         let (bytes, from) = self.ready.pop_front()?;
         if buffer.len() < bytes.len() {
@@ -494,7 +518,7 @@ impl Carrier for Mqtt {
         if max_packet.is_some_and(|most| u32::try_from(size).is_ok_and(|size| size > most)) {
             return Err(SendError::TooBig);
         }
-        if self.links.are_returned(version) {
+        if self.links.is_returned(version, publication.confirmed) {
             self.echo.sent(&publication.topic, &publication.payload);
         }
         state.queue.push(publication, instant())?;
@@ -577,30 +601,17 @@ impl Carrier for Mqtt {
     }
 
     fn close(&mut self) {
-        let kept = self.links.kept_topics();
-        let status = self
-            .settings
-            .publisher
-            .map(|of| alone(TopicMessageType::Status, of));
-        let stays: Vec<String> = [UADP, JSON]
-            .into_iter()
-            .filter_map(|encoding| Some(topics::name(self.broker(), encoding, status?)))
-            .collect();
-        for topic in kept {
-            if !stays.contains(&topic) {
-                self.clear(topic);
-            }
+        self.links.close_confirmed();
+        if self.links.main_is_due() {
+            self.end();
         }
-        if let Some(publisher) = self.settings.publisher
-            && let Some(last) = self.reports.last_status(publisher)
-        {
-            self.announce_status(publisher, &last);
-        }
-        self.links.close();
     }
 
     fn poll_closed(&mut self, cx: &mut Context<'_>) -> Poll<()> {
         loop {
+            if self.links.main_is_due() {
+                self.end();
+            }
             if self.links.are_closed() {
                 return Poll::Ready(());
             }
@@ -617,6 +628,9 @@ impl Carrier for Mqtt {
 
 impl Drop for Mqtt {
     fn drop(&mut self) {
+        if self.links.main_waits() {
+            self.end();
+        }
         self.links.close();
     }
 }
@@ -660,3 +674,6 @@ const LONGEST_TOPIC: usize = 64;
 const MAX_RECEIVED: usize = 4096;
 const MAX_KEPT: usize = 65_536;
 const CLOSED_POLL: Duration = Duration::from_millis(10);
+
+#[cfg(test)]
+mod tests;

@@ -94,7 +94,7 @@ impl ConnectionShared {
     }
 
     /// Records that the connection is closed.
-    fn closed(&self) {
+    pub(crate) fn closed(&self) {
         let mut state = self.state();
         state.link = BrokerLink::Waiting("closed".to_owned());
         state.closed = true;

@@ -3,11 +3,12 @@
 use std::collections::BTreeMap;
 use std::net::SocketAddr;
 use std::sync::Arc;
+use std::time::{Duration, Instant};
 
 use mappings::{Broker, MqttVersion};
 use tokio::sync::mpsc;
 
-use crate::connection::{BrokerLink, ConnectionShared, run};
+use crate::connection::{BrokerLink, ConnectionShared, instant, run};
 use crate::packets::ReceivedPublish;
 use crate::settings::BrokerSettings;
 
@@ -21,6 +22,8 @@ use crate::settings::BrokerSettings;
 pub(crate) struct BrokerLinks {
     main: Arc<ConnectionShared>,
     confirmed: Option<Arc<ConnectionShared>>,
+    /// The time until which the main connection waits for the end of the other, while that closes.
+    main_closes: Option<Instant>,
 }
 
 impl BrokerLinks {
@@ -38,7 +41,11 @@ impl BrokerLinks {
         };
         let confirmed = confirmed.map(|of| start(Arc::new(of), out.clone()));
         let main = start(Arc::clone(settings), out);
-        Self { main, confirmed }
+        Self {
+            main,
+            confirmed,
+            main_closes: None,
+        }
     }
 
     /// Returns the connection for messages that the broker confirms, or for all others.
@@ -58,10 +65,10 @@ impl BrokerLinks {
         [&self.main].into_iter().chain(&self.confirmed)
     }
 
-    /// Returns whether the broker may return own messages: with MQTT 3.1.1 it always does, and with
-    /// MQTT 5 those of another connection.
-    pub(crate) fn are_returned(&self, version: MqttVersion) -> bool {
-        version == MqttVersion::V3_1_1 || self.confirmed.is_some()
+    /// Returns whether the broker may return an own message: with MQTT 3.1.1 it always does, and
+    /// with MQTT 5 a message of another connection than the main one.
+    pub(crate) fn is_returned(&self, version: MqttVersion, confirmed: bool) -> bool {
+        version == MqttVersion::V3_1_1 || !Arc::ptr_eq(self.of(confirmed), &self.main)
     }
 
     /// Returns whether a retained message of this topic is published with each connection, and
@@ -119,6 +126,37 @@ impl BrokerLinks {
         dropped.into_iter().collect()
     }
 
+    /// Closes the connection of the values that the broker confirms, after the queued values. The
+    /// main connection waits for that, so that no value follows the end of the program.
+    pub(crate) fn close_confirmed(&mut self) {
+        self.main_closes = Some(instant() + CONFIRMED_CLOSES);
+        if let Some(second) = &self.confirmed {
+            second.close();
+        }
+    }
+
+    /// Returns whether the main connection waits for the end of the other.
+    pub(crate) const fn main_waits(&self) -> bool {
+        self.main_closes.is_some()
+    }
+
+    /// Returns true once when the main connection is to be closed: the other is closed, or its time
+    /// is over, and the values that still wait are discarded.
+    pub(crate) fn main_is_due(&mut self) -> bool {
+        let Some(until) = self.main_closes else {
+            return false;
+        };
+        if let Some(second) = self.confirmed.as_ref().filter(|of| !of.is_closed()) {
+            if instant() < until {
+                return false;
+            }
+            second.state().queue.discard();
+            second.wake();
+        }
+        self.main_closes = None;
+        true
+    }
+
     /// Closes the connections after the queued messages.
     pub(crate) fn close(&self) {
         for shared in self.all() {
@@ -131,13 +169,14 @@ impl BrokerLinks {
     }
 }
 
+/// The time for the end of the connection of values that the broker confirms. A program waits twice
+/// as long for the end of its carrier.
+const CONFIRMED_CLOSES: Duration = Duration::from_secs(1);
+
 #[cfg(test)]
 mod tests {
-    use std::time::Duration;
-
     use mappings::BrokerAddress;
 
-    use crate::connection::instant;
     use crate::json::PromotedTexts;
     use crate::queue::QueuedPublish;
 
@@ -147,6 +186,7 @@ mod tests {
         BrokerLinks {
             main: Arc::default(),
             confirmed: confirmed.then(Arc::default),
+            main_closes: None,
         }
     }
 
@@ -181,8 +221,12 @@ mod tests {
             assert_eq!(Arc::ptr_eq(confirmed, links.of(false)), !has_second);
             assert!(Arc::ptr_eq(links.of(false), &links.main));
             assert_eq!(links.all().count(), 1 + usize::from(has_second));
-            let returned = [MqttVersion::V3_1_1, MqttVersion::V5].map(|of| links.are_returned(of));
-            assert_eq!(returned, [true, has_second]);
+            // The main connection suppresses its own messages with MQTT 5.
+            for (confirmed, of_another) in [(false, false), (true, has_second)] {
+                let returned = [MqttVersion::V3_1_1, MqttVersion::V5]
+                    .map(|version| links.is_returned(version, confirmed));
+                assert_eq!(returned, [true, of_another]);
+            }
 
             let announcement = announcement(false);
             let mut state = links.main().state();
@@ -221,5 +265,32 @@ mod tests {
         assert_eq!(replaced, Some(("queue_replaced", 2)));
         links.close();
         assert!(!links.are_closed(), "the tasks close them");
+    }
+
+    #[test]
+    fn the_main_connection_waits_for_the_end_of_the_other() {
+        let mut single = links(false);
+        assert!(!single.main_is_due());
+        single.close_confirmed();
+        assert!(single.main_is_due() && !single.main_is_due());
+
+        let mut both = links(true);
+        both.close_confirmed();
+        assert!(!both.main_is_due() && both.main_waits());
+        both.of(true).closed();
+        assert!(both.main_is_due() && !both.main_waits());
+
+        // A broker that confirms nothing is not waited for.
+        let mut late = links(true);
+        let pushed = late
+            .of(true)
+            .state()
+            .queue
+            .push(announcement(true), instant());
+        pushed.unwrap();
+        late.close_confirmed();
+        assert!(!late.main_is_due() && !late.of(true).state().queue.is_empty());
+        late.main_closes = Some(instant());
+        assert!(late.main_is_due() && late.of(true).state().queue.is_empty());
     }
 }

@@ -200,6 +200,13 @@ impl SendQueue {
         }
     }
 
+    /// Discards all messages, at the end of the program.
+    pub(crate) fn discard(&mut self) {
+        self.discarded += count(self.waiting.len());
+        self.waiting.clear();
+        self.bytes = 0;
+    }
+
     /// Puts messages in front of the waiting states, for a new connection.
     pub(crate) fn begin<'a>(
         &mut self,
