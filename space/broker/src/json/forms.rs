@@ -360,9 +360,10 @@ fn status(json: &Value) -> Value {
 /// Reads a StatusCode: a number, or an object with a Code. Good is null or an empty object too, or
 /// has its Symbol alone.
 pub(super) fn status_number(json: &Value) -> Option<u32> {
-    let number = match json {
-        Value::Null => return Some(0),
-        Value::Object(whole) => match whole.get("Code") {
+    let number = match json.as_object() {
+        None if json.is_null() => return Some(0),
+        None => json,
+        Some(whole) => match whole.get("Code") {
             Some(code) => code,
             None => {
                 let is_good = whole
@@ -371,7 +372,6 @@ pub(super) fn status_number(json: &Value) -> Option<u32> {
                 return is_good.then_some(0);
             }
         },
-        _ => json,
     };
     u32::try_from(number.as_u64()?).ok()
 }
