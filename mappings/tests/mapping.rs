@@ -204,6 +204,35 @@ fn ethernet_is_the_only_carrier_or_one_of_several() {
 }
 
 #[test]
+fn shared_memory_is_the_only_carrier_or_one_of_several_and_its_group_has_a_name() {
+    for (text, expected) in [
+        ("pubsub: {shm: {}}", "cell"),
+        ("pubsub: {shm: {group: cell-4}}", "cell-4"),
+        ("pubsub: [{udp: {}}, {shm: {group: a_1}}]", "a_1"),
+    ] {
+        let mapping = sound(text);
+        let carriers = mapping.pubsub().carriers.iter();
+        let groups: Vec<&str> = carriers
+            .filter_map(|carrier| match &carrier.medium {
+                CarrierMedium::SharedMemory(group) => Some(group.name()),
+                _ => None,
+            })
+            .collect();
+        assert_eq!(groups, [expected], "{text}");
+    }
+    for (text, code) in [
+        ("pubsub: {shm: {group: a b}}", Code::Address),
+        ("pubsub: {shm: {group: \"\"}}", Code::Address),
+        ("pubsub: {shm: {}, ttl: 3}", Code::Carriers),
+        ("pubsub: {shm: {}, eth: {interface: eth0}}", Code::Carriers),
+        ("pubsub: [{shm: {}}, {shm: {group: cell}}]", Code::Carriers),
+    ] {
+        let checked = Mapping::from_yaml(text, "cell.yaml");
+        assert_eq!(codes(&checked), [code], "{}", checked.render(text));
+    }
+}
+
+#[test]
 fn a_list_names_several_carriers_with_their_names_and_common_settings() {
     let mapping = sound(
         "pubsub:\n  - udp: {address: opc.udp://239.192.0.41, interface: eth1, ttl: 3}\n    forward: [ua_1_2, \
