@@ -252,7 +252,8 @@ impl SharedMemory {
     }
 }
 
-/// Returns the reason why no message may be written, if the system has hardly any shared memory left.
+/// Returns the reason why no message may be written, if the system has hardly any shared memory
+/// left.
 fn scarce() -> Option<String> {
     let free = rustix::fs::statvfs("/dev/shm").ok()?;
     let bytes = free.f_bavail.saturating_mul(free.f_frsize);
