@@ -1,4 +1,5 @@
 //! Limits that the nodes of a NodeSet declare, as answers of a question.
+#![expect(clippy::unwrap_used, reason = "a test may")]
 
 use knowledge::{
     ComponentFacts, Knowledge, KnowledgeSource, ParameterFacts, QuestionAnswer, SourceKind, nodeset,
@@ -104,7 +105,7 @@ fn data_sheets(sheets: &[(&str, &str)]) -> Knowledge {
     let facts = gripper("urn:example:gripper", vec![grasp_type()], GRASP);
     knowledge.replace(&source, &facts.triples().0, 1).unwrap();
     for (name, turtle) in sheets {
-        let source = KnowledgeSource::new(SourceKind::File, *name);
+        let source = KnowledgeSource::new(SourceKind::File, name);
         let turtle = format!(
             "@prefix ua: <urn:ua-bridge:plant#> . @prefix cask: <http://www.w3id.org/hsu-aut/cask#> .
             <urn:example:gripper> ua:hasLimit <urn:example:limit> . <urn:example:limit> {turtle} ."

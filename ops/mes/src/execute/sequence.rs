@@ -309,13 +309,8 @@ impl Execution<'_> {
                 let done: Vec<Done> = progress.current().cloned().collect();
                 preparing.push(async move {
                     let done: Vec<&Done> = done.iter().collect();
-                    let values = match self.prepared(step, offer, &done).await {
-                        Ok(values) => {
-                            let released = self.release_movers(offer, (chosen, skills)).await;
-                            released.map(|()| values)
-                        }
-                        Err(end) => Err(end),
-                    };
+                    let of_step = (step, offer, &done[..]);
+                    let values = self.prepared_alone(of_step, (chosen, skills)).await;
                     (number, (step, offer, skill), values)
                 });
             }
@@ -504,6 +499,18 @@ impl Execution<'_> {
             return;
         }
         ended.and(why);
+    }
+
+    /// Returns the parameters of a step like [`Self::prepared`], after the leases on a robot that
+    /// its tool changer moves have ended.
+    async fn prepared_alone(
+        &self,
+        (step, offer, done): (&ProcessStep, &Offer, &[&Done]),
+        skills: (&Chosen, &[Arc<dyn RunnableSkill>]),
+    ) -> Result<Vec<(String, SkillValue)>, StepEnd> {
+        let values = self.prepared(step, offer, done).await?;
+        self.release_movers(offer, skills).await?;
+        Ok(values)
     }
 
     /// Returns the parameters of a step as its plan used it, or the end of a step that cannot
