@@ -42,7 +42,7 @@ codes! {
     Interface = "M023", "An interface is given by its name in the operating system (at most 15 characters, `ip link` lists them) or by an address of it.";
     Duration = "M024", "A duration is a number with its unit, such as 500ms, 1s or 2.5s, from 10ms to 1h.";
     Timing = "M025", "A writer without new values sends a message once per keep_alive_period. With a shorter receive_timeout it would be reported as lost each time.";
-    Carriers = "M026", "A list of carriers has 1 to 4 entries with `udp`, `mqtt` or `eth`, each with another address, and at most one entry with `settings` for all of them.";
+    Carriers = "M026", "A list of carriers has 1 to 4 entries with `udp`, `mqtt`, `eth` or `shm`, each with another address, and at most one entry with `settings` for all of them.";
     Forward = "M027", "A name under `forward` is a space (ua_1), a namespace of it (ua_1_2) or a topic (ua_1_2_10). The publisher of a name is at one carrier, so a name and its parts are listed at one carrier only; otherwise its messages would go round in a circle.";
     Namespace = "M030", "A namespace is an index from 1 to 65535 and a URI; each occurs once.";
     UndeclaredNamespace = "M031", "The namespace index of a node is not listed under `namespaces`. An index alone is ambiguous, because servers number their namespaces differently; the URI identifies the namespace.";
